@@ -71,17 +71,24 @@ def test_brackets_and_dots_in_texts_and_comments_are_no_nesting(tmp_path):
     assert len(read_toml(tmp_path / "cell.toml", "cell")) == 103
 
 
-@pytest.mark.parametrize("text", ["[" * 100_000, '{"a": NaN}', '{"a": 1,}', "Infinity", "{"])
+@pytest.mark.parametrize("text", [
+    "[" * 100_000, '{"a": NaN}', '{"a": 1,}', "Infinity", "{", "9" * 5000, "-1e400",
+])  # fmt: skip
 def test_what_is_no_strict_json_is_refused_with_the_remedy(tmp_path, text):
     (tmp_path / "a.json").write_text(text)
     with pytest.raises(InputError, match=r"a\.json.*; write it anew"):
         read_json(tmp_path / "a.json", "result", 1_000_000, "write it anew")
 
 
-def test_a_whole_number_of_five_thousand_digits_is_read_as_a_float(tmp_path):
-    (tmp_path / "a.json").write_text(f"[{'9' * 5000}, -{'9' * 40}, 12]")
-    found = read_json(tmp_path / "a.json", "result", 1_000_000, "write it anew")
-    assert found == [float("inf"), -1e40, 12]
+def test_a_whole_number_of_many_digits_is_read_as_a_float(tmp_path):
+    (tmp_path / "a.json").write_text(f"[-{'9' * 40}, 12]")
+    assert read_json(tmp_path / "a.json", "result", 1_000_000, "write it anew") == [-1e40, 12]
+
+
+def test_a_number_of_five_thousand_digits_is_named_by_its_line(tmp_path):
+    (tmp_path / "a.toml").write_text(f"a = 1\nb = {'7' * 5000}\n")
+    with pytest.raises(InputError, match=r"a\.toml: .*thousands of digits \(at line 2\)$"):
+        read_toml(tmp_path / "a.toml", "cell")
 
 
 def test_a_matrix_that_states_more_than_it_holds_is_refused(tmp_path):

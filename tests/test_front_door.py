@@ -323,7 +323,18 @@ OF_FILES = {
     "cell_out",
     "truth",
 }
-OF_TEXT = {"json", "quiet", "help", "set", "no_noise", "target", "partial", "poses", "fix"}
+OF_TEXT = {
+    "json",
+    "quiet",
+    "help",
+    "set",
+    "no_noise",
+    "target",
+    "partial",
+    "poses",
+    "fix",
+    "details",
+}
 OF_A_TABLE = {"table", "grid", "box", "rotation"}
 
 
@@ -339,7 +350,7 @@ def test_every_flag_of_a_verb_is_a_keyword_of_it(verb):
     ("verb", "kind", "renamed"),
     [
         ("identify", Options, {"faulty": "outliers"}),
-        ("design", DesignOptions, {"done": "augment", "notes": "knowledge"}),
+        ("design", DesignOptions, {"done": "augment", "notes": "knowledge", "pins": "keep"}),
         ("design", DesignSpec, {}),
         ("diagnose", DiagnosisOptions, {}),
     ],

@@ -1,10 +1,11 @@
 """What does the choice of parameters cost?  Ways of choosing, all else known.
 
-    python experiment_design/arm_coverage/choice.py SCENARIO ARMS DRAWS
+    python experiment_design/arm_coverage/choice.py SCENARIO ARMS DRAWS [ERRORS]
 
 The campaigns of campaigns.py, linear about the true arm and with the covariance of the noise known
 up to its scale, so that nothing but the choice differs; errors of the arm and noise are drawn anew
-DRAWS times for each of ARMS campaigns.  Prints a row per way of choosing.
+DRAWS times for each of ARMS campaigns.  ERRORS: "typical" geometry errors, "large" ones of three
+times that, or "few", a third of it but for one in ten of five times that.  Prints a row per way.
 """
 
 from __future__ import annotations
@@ -14,7 +15,7 @@ from collections import defaultdict
 
 import numpy as np
 from campaigns import BY_KEY, GEOMETRY, SIGMA, SPRINGS, Campaign, arm
-from scipy import sparse, stats
+from scipy import optimize, sparse, stats
 
 from elastocal.identification import Weights, held_out_residual, reduce
 from elastocal.identification.residuals import predicts_better, rms_3d
@@ -91,17 +92,66 @@ def shrunk(
     return x - K @ (x * unit) / unit, (C - K @ C) / np.outer(unit, unit)
 
 
-def campaign(s: Setting, full: Reduction, rng: np.random.Generator, found: dict) -> None:
+UNIT = np.array([p.unit for p in MODEL.parameters])
+OFFSET = np.array([p.effect == "joint_offset" for p in MODEL.parameters])
+KINDS = [SPRING, OFFSET, ~SPRING & ~OFFSET & (UNIT == "rad"), ~SPRING & ~OFFSET & (UNIT == "m")]
+
+
+def estimated(
+    s: Setting, full: Reduction, x: np.ndarray, C: np.ndarray, kinds: list[np.ndarray]
+) -> tuple[np.ndarray, np.ndarray]:
+    """Posterior of the complete set under normal errors whose scale the readings tell for each of
+    the `kinds`: marginal likelihood x ~ N(0, C + Σ κ_g² P_g), and to the covariance what the
+    scales' own uncertainty adds (Kass and Steffey 1989, J. Am. Stat. Assoc. 84, 717)."""
+    M, unit = full.mixing, 1 / np.sqrt(np.diag(C))
+
+    def prior(variance: np.ndarray) -> np.ndarray:
+        P = np.diag(variance[full.kept]) + (M * variance[full.dropped]) @ M.T
+        return P * np.outer(unit, unit)
+
+    C, x = C * np.outer(unit, unit), x * unit
+    parts = [prior(np.where(kind & ~FREE, s.sizes, 0.0) ** 2) for kind in kinds]
+    others = ~FREE & ~np.logical_or.reduce(kinds)
+    fixed = C + prior(np.where(FREE, 1e3 * s.sizes, np.where(others, s.sizes, 0.0)) ** 2)
+
+    def whole(log: np.ndarray) -> np.ndarray:
+        return fixed + sum(np.exp(2 * v) * P for v, P in zip(log, parts, strict=True))
+
+    def cost(log: np.ndarray) -> float:
+        L = np.linalg.cholesky(whole(log))
+        z = np.linalg.solve(L, x)
+        # Scales beyond a hundred times are none: a flat prior on log κ far out.
+        return float(0.5 * z @ z + np.log(np.diag(L)).sum() + 0.5 * np.sum((log / 4) ** 2))
+
+    best = optimize.minimize(cost, np.zeros(len(parts)), method="BFGS")
+    step = 1e-3 * np.eye(len(parts))
+    mean = lambda log: x - C @ np.linalg.solve(whole(log), x)  # noqa: E731
+    J = np.array([(mean(best.x + d) - mean(best.x - d)) / 2e-3 for d in step])
+    left = C - C @ np.linalg.solve(whole(best.x), C) + J.T @ best.hess_inv @ J
+    return mean(best.x) / unit, left / np.outer(unit, unit)
+
+
+def drawn(errors: str, n: int, rng: np.random.Generator) -> np.ndarray:
+    """Geometry errors (n,) in m and rad."""
+    few = np.where(rng.random(n) < 0.1, 5.0, 1 / 3) if errors == "few" else 1.0
+    return GEOMETRY * rng.normal(size=n) * (3.0 if errors == "large" else few)
+
+
+def campaign(s: Setting, full: Reduction, rng: np.random.Generator, found: dict, kind: str) -> None:
     errors = np.clip(rng.normal(size=len(FREE)), -2, 2) * SPRINGS * s.sizes
-    errors = np.where(SPRING, errors, GEOMETRY * rng.normal(size=len(FREE)))
+    errors = np.where(SPRING, errors, drawn(kind, len(FREE), rng))
     errors[FREE] = 0.0
     y = s.B @ errors + s.root @ rng.normal(size=len(s.B))
 
-    def judge(name: str, chosen: Reduction, factor: float | None = None) -> None:
+    def judge(
+        name: str, chosen: Reduction, factor: float | None = None, kinds: list | None = None
+    ) -> None:
         kept, dropped = chosen.kept, chosen.dropped
         x, C, dof = fitted(s.B[:, kept], y, s.true)
         if factor is not None:
             x, C = shrunk(s, chosen, x, C, factor)
+        if kinds is not None:
+            x, C = estimated(s, chosen, x, C, kinds)
         std = np.sqrt(np.diag(C))
         told = np.abs(chosen.mixing) * s.sizes[dropped] > 0.1 * std[:, None]
         truth = errors[kept] + np.where(told, chosen.mixing, 0.0) @ errors[dropped]
@@ -124,15 +174,17 @@ def campaign(s: Setting, full: Reduction, rng: np.random.Generator, found: dict)
     judge("prior of typical size", full, 1.0)
     judge("… three times as wide", full, 3.0)
     judge("… a third as wide", full, 1 / 3)
+    judge("prior, one scale of all geometry estimated", full, kinds=[~SPRING])
+    judge("… a scale each: springs, offsets, angles, lengths", full, kinds=KINDS)
 
 
-def main(scenario: str, arms: int, draws: int) -> None:
+def main(scenario: str, arms: int, draws: int, errors: str = "typical") -> None:
     rng, found = np.random.default_rng(7), defaultdict(list)
     for number in range(arms):
         s = Setting(scenario, number)
         full = s.reduced(s.plain, 1.0, 0.0)
         for _ in range(draws):
-            campaign(s, full, rng, found)
+            campaign(s, full, rng, found, errors)
     oracle = np.array(found["complete set"])[:, 5].mean()
     for name, rows in found.items():
         n, at95, at9973, springs, held, error, inside, wider = np.array(rows, dtype=float).T
@@ -144,4 +196,4 @@ def main(scenario: str, arms: int, draws: int) -> None:
 
 
 if __name__ == "__main__":
-    main(sys.argv[1], int(sys.argv[2]), int(sys.argv[3]))
+    main(sys.argv[1], int(sys.argv[2]), int(sys.argv[3]), *sys.argv[4:])

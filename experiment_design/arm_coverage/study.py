@@ -50,7 +50,7 @@ def run(task: dict[str, Any], rng: np.random.Generator) -> list[dict[str, Any]]:
     # What is predicted from the covariance, the values of what was not determined held.
     B = model.regressor(campaign.test, result.x, determined).B
     spread = np.sqrt(np.einsum("ij,jk,ik->i", B, result.covariance, B))
-    quantile = stats.t.isf(0.025, max(float(np.median(dof[np.isfinite(dof)])), 3.0))
+    quantile = stats.t.isf(0.025, result.spread.dof_of(B[:, None, :]))
     row["positions_held"] = float((np.abs(off.ravel()) <= quantile * spread).mean())
     # A reading at a new pose errs by the prediction and by noise of its own, of another campaign.
     noise, clean = campaign.drawn(campaign.test)

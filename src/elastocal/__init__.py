@@ -22,9 +22,10 @@ if TYPE_CHECKING:
     from elastocal.cell.work_cell import Cell, read_cell
     from elastocal.cell.workspace_rules import Workspace
     from elastocal.compensation.compensate import Compensation
+    from elastocal.diagnosis.changes import Comparison, compare
     from elastocal.diagnosis.diagnosis import Diagnosis
+    from elastocal.diagnosis.next_poses import next_poses
     from elastocal.errors import ElastocalError, InputError, InsufficientDataError, UnknownNameError
-    from elastocal.export.changes import Comparison, compare
     from elastocal.identification.knowledge import Knowledge
     from elastocal.identification.result import Calibration
     from elastocal.importing.first_cell import init
@@ -66,7 +67,8 @@ ROOMS = {
     "cell.workspace_rules": "Workspace",
     "compensation.compensate": "Compensation",
     "diagnosis.diagnosis": "Diagnosis",
-    "export.changes": "Comparison compare",
+    "diagnosis.changes": "Comparison compare",
+    "diagnosis.next_poses": "next_poses",
     "errors": "ElastocalError InputError InsufficientDataError UnknownNameError",
     "identification.knowledge": "Knowledge",
     "identification.result": "Calibration",
@@ -85,8 +87,9 @@ __all__ = [
     "CalibratedArm", "Calibration", "Cell", "Comparison", "Compensation", "Diagnosis", "Effect",
     "ElastocalError", "InputError", "InsufficientDataError", "Knowledge", "Measurements",
     "Model", "Parameter", "Plan", "Robot", "Tool", "Tracker", "UnknownNameError", "Workspace",
-    "compare", "compensate", "design", "diagnose", "identify", "init", "read_calibrated",
-    "read_cell", "register_criterion", "register_effect", "register_noise_model", "simulate",
+    "compare", "compensate", "design", "diagnose", "identify", "init", "next_poses",
+    "read_calibrated", "read_cell", "register_criterion", "register_effect",
+    "register_noise_model", "simulate",
 ]  # fmt: skip
 
 __getattr__, __dir__ = loaded_on_demand(__name__, ROOMS)

@@ -17,7 +17,7 @@ from pathlib import Path
 from elastocal.text import did_you_mean, listed, quoted
 
 # Keyword arguments whose flag is another word; everywhere else joint1_x is --joint1-x.
-FLAGS = {"fixed": "--fix", "options": "--set", "presets": "--preset"}
+FLAGS = {"fixed": "--fix", "options": "--set", "presets": "--preset", "extra_poses": "--poses"}
 # Keyword arguments that take a list, and flags that are repeated.
 LISTS = ("fixed", "without", "options", "presets")
 

@@ -7,6 +7,7 @@ without end, and a device such as /dev/zero has no end.
 from __future__ import annotations
 
 import json
+import math
 import os
 import re
 import secrets
@@ -19,6 +20,7 @@ from pathlib import Path
 from typing import Any, BinaryIO, TextIO
 
 from elastocal.errors import InputError
+from elastocal.text import SHOWN
 
 # What is being written ends so.  A process that was killed leaves it, no longer locked.
 UNFINISHED = ".tmp"
@@ -121,14 +123,19 @@ def read_json(path: str | Path, what: str, max_bytes: int, remedy: str) -> Any:
     """
     text = read_text(path, what, max_bytes)
 
+    def number(digits: str) -> float:
+        if math.isinf(value := float(digits)):
+            raise ValueError(f"{digits[:SHOWN]}… is beyond all numbers")
+        return value
+
     def whole(digits: str) -> int | float:
-        return int(digits) if len(digits) <= LONGEST_INTEGER else float(digits)
+        return int(digits) if len(digits) <= LONGEST_INTEGER else number(digits)
 
     def refuse(name: str) -> None:
         raise ValueError(f"{name} is no number of JSON")
 
     try:
-        return json.loads(text, parse_int=whole, parse_constant=refuse)
+        return json.loads(text, parse_int=whole, parse_float=number, parse_constant=refuse)
     except json.JSONDecodeError as error:
         raise InputError(f"{path}, line {error.lineno}: not JSON ({error.msg}); {remedy}") from None
     except ValueError as error:

@@ -14,7 +14,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 from numpy.typing import NDArray
 
-from elastocal.errors import InputError
+from elastocal.errors import InputError, option
 from elastocal.files import atomic_writer, open_input, read_text
 from elastocal.tables import (
     MOST_BYTES,
@@ -318,6 +318,8 @@ def _wrong_count(header: Sequence[str], family: Family) -> str:
 
 # Reading
 
+READING = re.compile("[xyz]_|d[xyz]_|dist")  # headers of what is measured
+
 
 def read_measurements(
     path: str | Path,
@@ -339,11 +341,18 @@ def read_measurements(
     """
 
     def choose(header: Sequence[str]) -> Layout:
+        planned = {"configuration", "level", "order"} <= set(header)
+        if planned and observe not in ("plan", "targets") and not any(map(READING.match, header)):
+            raise InputError(
+                f"{path}: this is a plan, which has no readings yet; give the measurements of its "
+                f"poses (a new plan takes poses of this one by {option('keep')})"
+            )
         return layout_of(str(path), header, joint_kinds, observe)
 
     raw = read_table(path, choose, text=text)
     n = len(raw.row)
-    marker = _marker(raw, marker_names)
+    # A plan without the column is of all markers.
+    marker = _marker(raw, marker_names if observe not in PLANS or "marker" in raw.labels else ())
     configuration = raw.labels.get("configuration")
     if configuration is None:
         configuration = Labels(np.arange(n), tuple(str(i) for i in range(1, n + 1)))
@@ -385,12 +394,17 @@ def read_measurements(
     return with_moves(table)
 
 
-def read_plan(path: str | Path, *, joint_kinds: tuple[str, ...]) -> Measurements:
-    """The poses of a plan: configuration, q1_deg …, and forces where the plan states them.
+def read_plan(
+    path: str | Path, *, joint_kinds: tuple[str, ...], marker_names: tuple[str, ...] = ()
+) -> Measurements:
+    """The poses of a plan: configuration, q1_deg …, and where the plan states them forces and
+    which of the cell's markers are read.
 
     `level` and `order`, which a designed plan has, are passed over.  Errors as for measurements.
     """
-    return read_measurements(path, joint_kinds=joint_kinds, observe="plan")
+    return read_measurements(
+        path, joint_kinds=joint_kinds, marker_names=marker_names, observe="plan"
+    )
 
 
 def _sigma(raw: RawTable) -> Array | None:

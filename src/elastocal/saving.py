@@ -23,8 +23,8 @@ if TYPE_CHECKING:
     from numpy.typing import ArrayLike
 
     from elastocal.compensation.compensate import Compensation
+    from elastocal.diagnosis.changes import Comparison
     from elastocal.diagnosis.diagnosis import Diagnosis
-    from elastocal.export.changes import Comparison
     from elastocal.export.export import Wish
     from elastocal.identification.result import Calibration
     from elastocal.measurements import Measurements
@@ -63,11 +63,10 @@ def save_plan(plan: Plan, path: Path, command: str | None = None) -> None:
     `command` is the command line that repeats the design.  Raises InputError for a path that ends
     in .json, since that of the summary is made of it.
     """
-    from elastocal.planning.plan import plan_rows, write_plan, write_plan_json
+    from elastocal.planning.plan import write_plan, write_plan_json
 
     require(path.suffix.lower() != ".json", f"{path}: name the plan .csv; .json goes beside it")
-    rows = plan_rows(plan.execution, plan.configurations, plan.group + 1, plan.stated_forces)
-    write_plan(path, rows, plan.model.chain.kinds)
+    write_plan(path, plan.rows, plan.model.chain.kinds)
     repeat = {"command": command, "backend": plan.model.backend_report()}
     write_plan_json(path.with_suffix(".json"), plan.to_json() | repeat)
 
@@ -122,13 +121,17 @@ def wish_of(
     Raises InputError that names the option that is wrong.
     """
     from elastocal.export.export import Wish, format_of
-    from elastocal.export.exportable import Conditions
     from elastocal.export.urdf_file import Frames
+    from elastocal.model.valued import Conditions
 
     chosen = format_of(path, format)
-    for name, value in (("temperature_c", temperature_c), ("time_s", time_s)):
-        if value is not None and not np.isfinite(value):
-            raise InputError(f"{option(name)} takes a finite number; found {value}")
+    for name, value, low, high in (
+        ("temperature_c", temperature_c, -273.15, 2000.0), ("time_s", time_s, -1e9, 1e9),
+    ):  # fmt: skip
+        if value is not None and not low <= value <= high:
+            raise InputError(
+                f"{option(name)} takes a number of {low:g} to {high:g}; found {value:g}"
+            )
     force = given_force(load)
     return Wish(
         format=chosen,

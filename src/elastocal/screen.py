@@ -10,11 +10,13 @@ from __future__ import annotations
 import atexit
 import codecs
 import os
+import re
 import signal
 import sys
 import threading
 from collections.abc import Callable, Iterable, Iterator
 from contextlib import contextmanager, suppress
+from time import monotonic
 from types import FrameType
 from typing import TYPE_CHECKING, Any, TextIO, cast
 
@@ -180,17 +182,39 @@ def safe_console(**how: Any) -> Console:
     return SafeConsole(highlight=False, markup=False, emoji=False, **how)
 
 
+SHARE = re.compile(r"\b(\d+) of (\d+)\b")
+
+
 @contextmanager
 def progress_line(quiet: bool) -> Iterator[Callable[[str], None]]:
-    """A status line on stderr; silent where that is no terminal and `quiet` is asked for."""
+    """A status line on stderr with the time since the start and, where a message counts ("3 of
+    12"), the share done; without a terminal a line for each message; nothing where `quiet`."""
     if quiet:
         yield lambda message: None
         return
-    from rich.text import Text
+    from rich.progress import BarColumn, Progress, SpinnerColumn, TextColumn, TimeElapsedColumn
 
     screen = safe_console(stderr=True)
     if not screen.is_terminal:
-        yield lambda message: screen.print(f"… {message}")
+        begun = monotonic()
+        yield lambda message: screen.print(f"… {message} ({monotonic() - begun:.0f} s)")
         return
-    with screen.status("starting") as status:
-        yield lambda message: status.update(Text(message))
+
+    class Share(BarColumn):
+        """The bar, where the share is known."""
+
+        def render(self, task: Any) -> Any:
+            return "" if task.total is None else super().render(task)
+
+    text = TextColumn("{task.description}", markup=False)
+    columns = (SpinnerColumn(), TimeElapsedColumn(), text, Share(bar_width=20))
+    with Progress(*columns, console=screen, transient=True) as shown_line:
+        task = shown_line.add_task("starting", total=None)
+
+        def tell(message: str) -> None:
+            found = SHARE.search(message)
+            total, done = (int(found[2]), int(found[1])) if found else (None, 0)
+            shown_line.update(task, description=message)
+            shown_line.tasks[0].total, shown_line.tasks[0].completed = total, done
+
+        yield tell

@@ -554,19 +554,20 @@ def read_table(
     what: str = "measurement table",
     comments: bool = False,
     text: str | None = None,
+    most: int = MOST_BYTES,
 ) -> RawTable:
     """The columns of a CSV or Parquet (.parquet, .pq) file that `choose` picks from its header.
 
     `what` names the kind of table in messages; `comments`: lines that begin with # are passed
     over, and so are lines of empty cells.  With `text` the table is that CSV text, and `path` only
-    its name.  Raises InputError that names file, line, column and the offending text.
+    its name; a file has `most` bytes.  Raises InputError that names file, line, column and text.
     """
     source = str(path)
     if text is not None:
         return _read_csv(CsvLines(source, BytesIO(text.encode()), what, comments), choose)
     if Path(path).suffix.lower() in (".parquet", ".pq"):
         return _read_parquet(source, choose, what)
-    with open_input(path, what, MOST_BYTES) as handle:
+    with open_input(path, what, most) as handle:
         return _read_csv(CsvLines(source, handle, what, comments), choose)
 
 

@@ -34,6 +34,20 @@ def listed(names: Iterable[str], limit: int = 40) -> str:
     return ", ".join(names[:limit]) + more
 
 
+def gathered(names: Iterable[str]) -> str:
+    """Parameters by their places: "compliance of joints 1, 2 and 5, dx of link 3"."""
+    found: dict[tuple[str, str], list[str]] = {}
+    for name in names:
+        where, _, what = name.rpartition(".")
+        kind = where.rstrip("0123456789")
+        found.setdefault((what, kind), []).append(where[len(kind) :])
+    told = []
+    for (what, kind), places in found.items():
+        several = " and ".join(p for p in (", ".join(places[:-1]), places[-1]) if p)
+        told.append(f"{what} of {kind}{'s' * (len(places) > 1)} {several}".rstrip())
+    return ", ".join(told)
+
+
 def quoted(found: object) -> str:
     """`found` as a message shows it: quoted, on one line, cut when long."""
     text = found if isinstance(found, str) else str(found)

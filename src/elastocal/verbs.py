@@ -32,7 +32,6 @@ if TYPE_CHECKING:
     from elastocal.identification.intervals import IntervalKind
     from elastocal.identification.knowledge import Constraints, GaussianPrior, Knowledge
     from elastocal.identification.options import FaultyReadings, Method
-    from elastocal.identification.prediction import NewPoses
     from elastocal.identification.result import Calibration
     from elastocal.identification.weighted_problem import WeightKind
     from elastocal.model.calibrated_tool import ToolPoint
@@ -58,6 +57,8 @@ def design(
     curve: Sequence[int] = (),
     fixed: str | Sequence[str] = (),
     augment: Table | None = None,
+    keep: str | Path | None = None,
+    strike: str | Path | None = None,
     knowledge: Knowledge | str | Path | None = None,
     prior: Literal["none", "typical"] | Prior | None = None,
     effort: Effort = "normal",
@@ -77,9 +78,11 @@ def design(
     test_path: str | Path | TargetPath | None = None,
     test_box: tuple[ArrayLike, ArrayLike] | TargetBox | None = None,
     elsewhere: float | None = None,
+    elsewhere_cap: float | None = None,
     motion: Motion | None = None,
     load_changes: int | None = None,
     reference_every: int | None = None,
+    doubts: Mapping[tuple[str, str], float] | None = None,
     seed: int = 0,
     jobs: int = 1,
     progress: Progress | None = None,
@@ -93,13 +96,15 @@ def design(
     Args:
         model: The model, or a cell, or the path of a cell file.
         poses: Number of poses.
-        criterion: What is to become small: "test_pose" (error at the test poses), "D", "A", "E",
-            "G", "I", "c", "O1" to "O5".
+        criterion: What is to become small: "test_pose" (error at the test poses), "robust" (the
+            same with what the model may lack), "D", "A", "E", "G", "I", "c", "O1" to "O5".
         target: Find the smallest number of poses that reaches this error, in m; goes with the
             criteria test_pose, I and G, and instead of `poses`.
         curve: Numbers of poses to compare.
         fixed: Parameters, places or effects held as known.
         augment: Measurements already done, or their file, which the plan adds to.
+        keep: An earlier plan's file, whose poses stay in this one: all, or "plan.csv:1,4".
+        strike: "plan.csv:3,7": of that plan these poses are replaced, and all others stay.
         knowledge: `Knowledge`, or a knowledge file (TOML); its priors count for a plan.
         prior: "typical" takes every parameter's typical size as its prior, "none" none; or what
             is known by name, {"joint2.compliance": {"mean": 2.9e-7, "std": 3e-8}}.
@@ -122,10 +127,15 @@ def design(
         test_box: Lower and upper corner (3,) in m of a box of such places, in the data's frame.
         elsewhere: Share of the criterion's weight, 0 to below 1, that poses all over the joint
             ranges have beside the test poses.
+        elsewhere_cap: By how much the error at the test poses may exceed the least, as in 0.05,
+            for as little error all over the joint ranges as can be had; default 0.05 where no
+            test poses are stated, else 0.
         motion: How the arm moves between poses, which decides their order.
         load_changes: How often the load may be hung, exchanged or taken off; default as rarely as
             can be. More of them keep a drift further apart from what the loads show.
         reference_every: Visit a reference pose again after so many stops.
+        doubts: Probability that the model lacks an effect at a place, {("backlash", "joint2"):
+            0.1}, for the criterion robust; default equal shares of the catalogue.
         seed: Of all random draws.
         jobs: Processes; −1 for all cores.
         progress: Is told what is done.
@@ -160,9 +170,12 @@ def design_request(
     curve: Sequence[int] = (),
     fixed: str | Sequence[str] = (),
     augment: Table | None = None,
+    keep: str | Path | None = None,
+    strike: str | Path | None = None,
     knowledge: Knowledge | str | Path | None = None,
     prior: Literal["none", "typical"] | Prior | None = None,
     effort: str = "normal",
+    doubts: Mapping[tuple[str, str], float] | None = None,
     seed: int = 0,
     jobs: int = 1,
     **asked: Any,
@@ -172,12 +185,14 @@ def design_request(
     Raises InputError that names the keyword.
     """
     from elastocal.planning.design import DesignOptions
+    from elastocal.planning.pins import read_pins
 
     cell = model.cell if isinstance(model, Model) else cell_of(_checked_cell(model))
     if isinstance(prior, str):
         asked["prior"], prior = prior, None
     cell = replace(cell, design=_design_of(cell, asked))
-    known = Model(cell) if augment is not None or knowledge is not None else None
+    files = (augment, knowledge, keep, strike)
+    known = None if all(file is None for file in files) else Model(cell)
     done = None
     if augment is not None and known is not None:
         own = model if isinstance(model, Model) else known
@@ -189,6 +204,9 @@ def design_request(
         stated is None or prior is None,
         f"{option('prior')} and {option('knowledge')} both state what is known; drop one",
     )
+    pins = None
+    if known is not None and (keep or strike):
+        cell, pins = read_pins(cell, known, keep, strike, asked.get("poses") is not None)
     options = DesignOptions(
         effort=effort,  # type: ignore[arg-type]
         seed=_whole("seed", seed, 0),
@@ -198,6 +216,8 @@ def design_request(
         done=done,
         curve=tuple(sorted({_whole("curve", n) for n in curve})),
         notes=notes,
+        pins=pins,
+        doubts=doubts,
     )
     return cell, options
 
@@ -235,10 +255,15 @@ def _design_of(cell: Cell, asked: Mapping[str, Any]) -> Any:
         require(len(chosen["levels"]) == 1, f"{option('levels')} takes the values of one joint")
         chosen["levels"] = {k: tuple(map(float, v)) for k, v in chosen["levels"].items()}
         chosen.setdefault("per_level", ())
-    if "elsewhere" in chosen:
-        share = float(chosen["elsewhere"])
-        require(0 <= share < 1, f"{option('elsewhere')} takes a share from 0 to below 1")
-        chosen["elsewhere"] = share
+    for key, other in (("elsewhere", "elsewhere_cap"), ("elsewhere_cap", "elsewhere")):
+        if key in chosen:
+            share = chosen[key] = float(chosen[key])
+            require(0 <= share < 1, f"{option(key)} takes a share from 0 to below 1")
+            require(
+                not (share and chosen.get(other)),
+                f"{option(key)} and {option(other)} both say what the rest is worth; drop one",
+            )
+            chosen.setdefault(other, None)
     motion = {
         key: _whole(key, chosen.pop(key), 1)
         for key in ("load_changes", "reference_every")
@@ -445,6 +470,7 @@ def identify(
     """
     from elastocal.identification.identify import identify as run
     from elastocal.identification.options import Options
+    from elastocal.planning.test_poses import where_used
 
     options = Options(
         method=method,
@@ -476,19 +502,7 @@ def identify(
         prior = prior or known_prior
     if prior is not None or constraints is not None:
         options = replace(options, constraints=constraints, prior=prior)
-    return run(made, table, options, kept_back, tell, _new_poses(made))
-
-
-def _new_poses(model: Model) -> NewPoses | None:
-    """Where the cell says that position must be right; None where it says nothing."""
-    from elastocal.identification.prediction import NewPoses
-    from elastocal.planning.test_poses import test_poses
-
-    spec = model.cell.design
-    if not spec.test_poses and spec.test_path is None and spec.test_box is None:
-        return None
-    found = test_poses(model.cell, model.chain)
-    return NewPoses(found.q, found.force, found.weight, found.source.removeprefix("test poses: "))
+    return run(made, table, options, kept_back, tell, where_used(made))
 
 
 def diagnose(

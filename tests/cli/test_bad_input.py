@@ -231,6 +231,24 @@ def test_flange_that_is_no_link(campaign):
     refused(2, "flnge", "did you mean 'flange'", campaign=campaign)
 
 
+@pytest.mark.parametrize("pattern, new, told", [
+    (r'(<joint name="joint_a2".*?xyz=")[^"]*', r"\g<1>0 0 700", "700 m before joint 2 is too long"),
+    (r'<mass value="[^"]*', '<mass value="1e19', "1e.19 kg is too heavy for link"),
+    (r'(<inertial>\s*<origin[^>]*xyz=")[^"]*', r"\g<1>0 0 1e19", "1e.19 m to the centre of mass is too"),
+])  # fmt: skip
+def test_a_robot_beyond_all_measure(campaign, pattern, new, told):
+    path = campaign[0].parent / "arm.urdf"
+    changed, count = re.subn(pattern, new, path.read_text(), flags=re.S)
+    path.write_text(changed)
+    assert count
+    refused(2, "arm.urdf: " + told, campaign=campaign)
+
+
+def test_a_place_beyond_all_measure(campaign):
+    edit(campaign[0], r"(M1 = )\[[^,]*", "M1 = [1e19")
+    refused(2, r"cell.toml: key tool.markers_m.M1: 1e\+19 m reaches beyond", campaign=campaign)
+
+
 def test_malformed_toml(campaign):
     edit(campaign[0], r"\[model\]", "[model")
     refused(2, "cell.toml", "line", campaign=campaign)
@@ -313,6 +331,18 @@ def test_covariance_of_the_wrong_size(campaign):
     refused(2, "covariance", "36", campaign=campaign, extra=("--covariance", path))
 
 
+def test_a_covariance_that_is_none(campaign):
+    path = campaign[0].parent / "noise.csv"
+    path.write_text(
+        "\n".join(",".join("1" if j <= i else "0" for j in range(36)) for i in range(36))
+    )
+    refused(2, "--covariance is not.* symmetric", campaign=campaign, extra=("--covariance", path))
+
+
+def test_an_empty_argument_is_not_the_folder(campaign):
+    refused(2, "an empty argument after --report", campaign=campaign, extra=("--report", ""))
+
+
 def test_missing_arguments_are_a_usage_error():
     code, message = run("identify")
     assert code == 2 and "Traceback" not in message
@@ -389,6 +419,7 @@ def test_numbers_beyond_all_measure_in_options(campaign):
     for arguments in (
         ("design", cell, "-o", cell.parent / "p.csv", "--poses", huge),
         ("design", cell, "-o", cell.parent / "p.csv", "--candidates", huge),
+        ("diagnose", cell, campaign[1], "--plan", cell.parent / "p.csv", "--poses", huge),
     ):
         code, message = run(*arguments, "-q")
         assert code == 2 and arguments[-2] in message and message.count("\n") == 1, message

@@ -111,6 +111,28 @@ def test_what_another_choice_of_parameters_determined_is_told_in_that_of_the_old
     assert found.distance.max() < 1e-6
 
 
+def test_a_softer_joint_is_seen_under_the_loads_of_the_campaigns(folder):
+    """Without a load no compliance moves the tool."""
+    soft = CELL.replace('"joint_offset", "link_geometry"', '"joint_compliance"')
+    (folder / "soft.toml").write_text(soft)
+    model = ec.Model("soft.toml")
+    rng, name = np.random.default_rng(2), "joint3.compliance"
+    for k, value in enumerate((2e-6, 4e-6)):
+        values = {p.name: 2e-6 for p in model.parameters if p.name.endswith("compliance")}
+        q = rng.uniform(-1.4, 1.0, (10, 6))
+        data = ec.simulate(model, q, load=[0, 0, -300.0], values=values | {name: value}, seed=k)
+        ec.identify(model, data).save(f"soft{k}.json")
+    code, out, err = run("soft0.json", "soft1.json", "--cell", "soft.toml", "-o", "c.json")
+    assert code == 0, err
+    assert "under (0, 0, -300) N, those of the earlier campaign" in " ".join(out.split())
+    found = json.loads(Path("c.json").read_text())
+    assert found["changed"] == [name]
+    assert found["tool"]["forces_N"] == [[0, 0, -300]] == [found["tool"]["force_N"]]
+    assert found["tool"]["rms_um"] > 10 * found["tool"]["by_chance_rms_um"] > 0
+    arms = [ec.read_calibrated("soft.toml", f"soft{k}.json") for k in (0, 1)]
+    assert ec.compare(*arms, load=[0, 0, 0]).distance.max() < 1e-6
+
+
 def test_the_cell_is_that_of_both():
     code, _, err = run("old.json", "bent.json", "--cell", "none.toml")
     assert code == 2 and "none.toml" in err

@@ -26,7 +26,7 @@ PROGRAM = (
 SUMMARY = """
 
 def summary(frame):
-    return f"rows: {len(frame)}, tasks in order: {list(frame.task.unique()) == sorted(frame.task)}"
+    return f"\x1b[31mrows: {len(frame)}, tasks in order: {list(frame.task.unique()) == sorted(frame.task)}"
 """
 SLOW = "import time\n" + SCRIPT.replace("    x = rng", "    time.sleep({sleep})\n    x = rng")
 
@@ -53,7 +53,7 @@ def test_it_runs_once_and_then_finds_nothing_to_do(folder):
 def test_options_seed_output_and_only(folder, tmp_path):
     out = tmp_path / "elsewhere"
     arguments = (folder, "--jobs", 1, "--seed", 3, "--set", "replicates=2", "-o", out)
-    assert "1 of 1 tasks done;" in study(*arguments, "--only", 1).stdout
+    assert "1 of 1 tasks done;" in study(*arguments, "--only", 1, "--jobs", "9" * 20).stdout
     assert "4 of 4 tasks done (1 were there);" in study(*arguments).stdout
     assert set(numbers(out)["replicate"]) == {0, 1} and not (folder / "results").exists()
 
@@ -64,10 +64,11 @@ def test_a_summary_is_written_once_all_is_there(tmp_path):
     study(folder, "--jobs", 1, "--only", 3)
     assert not (folder / "result.md").exists()
     told = study(folder, "--jobs", 1)
-    assert (folder / "result.md").read_text() == "rows: 24, tasks in order: True\n"
-    assert told.stdout.endswith("rows: 24, tasks in order: True\n")
+    page = "\\x1b[31mrows: 24, tasks in order: True\n"
+    assert (folder / "result.md").read_text() == page
+    assert told.stdout.endswith(page)
     study(folder, "--jobs", 1, "-o", tmp_path / "other")
-    assert (tmp_path / "other.md").read_text() == "rows: 24, tasks in order: True\n"
+    assert (tmp_path / "other.md").read_text() == page
 
 
 def test_a_wrong_summary_keeps_the_results(tmp_path):
@@ -117,10 +118,11 @@ def test_a_changed_study_is_refused_and_started_anew_on_demand(folder):
         (("--cluster", "tcp://nowhere at all", "--unencrypted"), "tcp://nowhere at all: no sched"),
         (("--cluster", "tls://a:1", "--tls-ca", "absent.pem"), "absent.pem: no such file"),
         (("--jobs", "2", "--cluster", "config"), "--jobs is for this machine"),
-        (("-o", "{folder}"), "holds study.py, study.toml, which no study wrote"),
+        (("-o", "."), ".: holds study.py, study.toml, which no study wrote"),
     ],
 )
-def test_wrong_arguments_are_told(folder, arguments, told):
+def test_wrong_arguments_are_told(folder, arguments, told, monkeypatch):
+    monkeypatch.chdir(folder)
     result = study(folder, *(a.format(folder=folder) for a in arguments))
     assert result.exit_code == 2
     assert told in result.stderr and "Traceback" not in result.stderr

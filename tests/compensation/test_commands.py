@@ -26,6 +26,7 @@ from elastocal.compensation import nominal_flanges, targets_at
 from elastocal.compensation.compensate import compensate
 from elastocal.errors import InputError
 from elastocal.model import Model, tool_point
+from elastocal.model.calibrated import ShownPoses
 
 EVERYWHERE = ("base_frame", "joint_offset", "link_geometry", "marker_position", "joint_compliance")
 SOME = ("joint_offset", "link_geometry:link3", "joint_compliance")
@@ -305,6 +306,23 @@ def test_uncertainty_is_what_other_values_would_do():
     expected = np.sqrt((np.array(off) ** 2).sum(axis=(0, 2)))
     assert np.allclose(found.uncertainty.std, expected, rtol=1e-3)
     assert not found.uncertainty.blamed
+
+
+def test_targets_far_from_what_was_measured_are_told():
+    cell = kr270_cell(("joint_offset",))
+    arm = calibrated(kr270_chain(), cell, std=0.01)
+    targets = targets_at("t", None, None, "base", DOWN, q=POSTURES)
+
+    def told(most, configurations=30):
+        shown = replace(arm, shown=ShownPoses(most, configurations))
+        warned = compensate(shown, targets, tool_point(cell, "M1")).warnings
+        return [text for text in warned if "extrapolated" in text]
+
+    std = compensate(arm, targets, tool_point(cell, "M1")).uncertainty.std
+    assert not told(std.max())
+    assert "line 1 and 3 more" in told(std.min() / 2)[0]
+    # Of as few poses measured all may be surer than four others by chance.
+    assert not told(std.min() / 2, configurations=2)
 
 
 def _places(model: Model, found, x):

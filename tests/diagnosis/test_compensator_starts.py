@@ -84,6 +84,15 @@ def test_what_many_starts_explain_by_chance_is_paid_for(search: StartSearch) -> 
     assert left[0] <= min(left) + 1e-6
 
 
+def test_a_model_without_parameters_has_starts_too() -> None:
+    model, table = campaign("gear_eccentricity:joint2")
+    bare = Model(replace(model.cell, model=replace(model.cell.model, effects=())))
+    base = fit_baseline(bare, table)
+    h = next(h for h in possible(bare, table)[0] if h.name == "gravity_compensator")
+    columns = compute_columns(base, [h])
+    assert StartSearch.of(columns.full, h, base, columns.x, columns.rows).X.shape[1] == 0
+
+
 def test_from_the_start_that_was_found_the_exact_fit_ends_at_the_noise() -> None:
     """As if it had begun at the truth: the linear estimate is about that start."""
     name = "gravity_compensator:joint2"

@@ -19,6 +19,7 @@ from elastocal.diagnosis import (
     with_returned,
 )
 from elastocal.diagnosis.baseline import Blocks
+from elastocal.diagnosis.component_answer import PROBABLE, TOLD
 from elastocal.diagnosis.component_search import WIDE, Beside
 from elastocal.diagnosis.evidence import direct
 from elastocal.diagnosis.noise_floor import project
@@ -189,6 +190,9 @@ def test_many_effects_at_once_are_one_sum() -> None:
     assert {"joint2", "joint4", "joint5"} <= {c.where for c in d.components if c.family == "angle"}
     assert d.gap.explained < 0.5 * d.gap.calibrated
     assert d.groups[0].share == max(g.share for g in d.groups)
+    shares = {(name, c.where): c.share for c in d.components for name in c.effects}
+    for e in d.effects:
+        assert e.probability >= PROBABLE or abs(shares[e.effect, e.where]) >= TOLD
 
 
 def test_the_campaign_of_many_has_their_model() -> None:

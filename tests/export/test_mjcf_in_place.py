@@ -7,8 +7,9 @@ from support.exports import GEOMETRY, LOAD, SPRINGS, exported, poses_of, write_r
 from support.mjcf_text import ARM, LOADABLE, write_arm
 
 from elastocal.export.export import flanges
-from elastocal.export.exportable import Conditions, evaluate_pieces, keep
+from elastocal.export.exportable import evaluate_pieces, keep
 from elastocal.model import MjcfArm
+from elastocal.model.valued import Conditions
 
 MICROMETRE = 1e-6
 

@@ -226,8 +226,9 @@ preset = "kuka"
 """
 STUDY = """\
 def tasks(options):
-    return [{"n": n, "label": "few" if n < 9 else "many", "replicate": k}
-            for n in (4, 16) for k in range(options["replicates"])]
+    for n in (4, 16):
+        for k in range(options["replicates"]):
+            yield {"n": n, "label": "few" if n < 9 else "many", "replicate": k}
 
 
 def run(task, rng):
@@ -262,6 +263,11 @@ COMMANDS = (
             "--program robot.script --report design.html --fix joint1.compliance",
             ("plan.csv", "plan.json", "robot.script", "design.html"),
             ("arm.csv", "links.csv", "path.csv", "fixture.stl")),
+    Command("design", "wished.toml -o plan.csv --effort quick --poses 4 --candidates 40 "
+            "--criterion robust --keep poses.csv:1,3 -q", ("plan.csv", "plan.json"),
+            ("arm.csv", "links.csv", "poses.csv")),
+    Command("next", "wished.toml data.csv -o next.csv --batch 2 --candidates 40 --require "
+            "new_poses=50", ("next.csv", "next.json"), ("arm.csv", "links.csv")),
     Command("simulate", "deflecting.toml poses.csv -o out.csv --set joint2.compliance=2e-6 "
             "--truth truth.json --draw 0.1 --load 0 0 -98 --repeats 2 --seed 3",
             ("out.csv", "truth.json"), ("arm.csv", "links.csv")),
@@ -278,7 +284,8 @@ COMMANDS = (
             "--residuals out.csv --knowledge knowledge.toml",
             ("out.json", "out.html", "out.csv"), ("arm.csv", "links.csv")),
     Command("identify", "placed.toml placed.csv -o out.json --method huber --outliers keep "
-            "--test placed.csv --report out.html", ("out.json", "out.html"), ("arm.urdf",)),
+            "--test placed.csv --report out.html --certificate done.html --details",
+            ("out.json", "out.html", "done.html"), ("arm.urdf",)),
     Command("identify", "placed.toml placed.csv --residuals out.csv --noise axis --bounded "
             "--physical --seed 4", ("out.csv",), ("arm.urdf",)),
     Command("diagnose", "deflecting.toml data.csv -o out.json --cell-out cell_out.toml -q",

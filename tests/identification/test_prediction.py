@@ -15,6 +15,8 @@ from elastocal.identification import judged, rms_3d
 from elastocal.identification.findings import ENOUGH, spare_equations
 from elastocal.identification.identify import identify
 from elastocal.identification.mistakes import UNHEARD, unheard_of
+from elastocal.identification.prediction import NewPoses
+from elastocal.identification.residuals import told_by_one
 from elastocal.model import Model, observe
 from elastocal.model.calibrated_tool import CalibratedTool, tool_point
 
@@ -85,6 +87,37 @@ def test_few_configurations_and_unknown_noise_are_no_ground_for_trust(fits):
     unknown = replace(fit, noise=replace(fit.noise, ratio_to_stated=None, lack_of_fit=None))
     assert not judged(unknown).verdict.trusted
     assert judged(unknown).finding("noise_unknown") is not None
+
+
+def test_what_single_configurations_hold_is_unseen_by_all_others():
+    rng = np.random.default_rng(0)
+    B, configuration = rng.normal(size=(40, 5)), np.repeat(np.arange(10), 4)
+    B[4:] = B[4:] @ (np.eye(5) - np.ones((5, 5)) / 5)  # the mean is shown by the first alone
+    P = told_by_one(B, np.where(configuration == 0, 0, -1))
+    assert np.allclose(P @ P, P) and np.linalg.matrix_rank(P) == 1
+    assert np.abs(B[4:] @ P).max() < 1e-12 < 1e-3 < np.abs(B[:4] @ P).max()
+    assert not told_by_one(B, np.full(40, -1)).any()
+
+
+@pytest.mark.parametrize("sideways", [0.0, 300.0])
+def test_a_pose_that_alone_shows_a_parameter_counts_by_its_share_of_the_error(sideways):
+    """Only in one pose the load pulls aside, which shows joint 1; under a weight joint 1 matters
+    nothing."""
+    tracker = Tracker(noise=CartesianNoise(np.full(3, SIGMA)))
+    cell = cell_of(("joint_compliance",), observe="deflection", tracker=tracker)
+    model = Model.assembled(planar_chain(), cell)
+    q = random_poses(model.chain, 30, 3)
+    force = np.tile([[0.0, 0, 0], [0, 0, -300]], (30, 1, 1))
+    force[-1, 1, 1] = 30.0
+    x = np.full(len(model.names), 1e-5)
+    table = measured(model, table_at(q, force), x, SIGMA, np.random.default_rng(1))
+    where, load = random_poses(model.chain, 100, 5), np.tile([0.0, sideways, -300], (100, 1))
+    poses = NewPoses(where, load, np.full(100, 0.01), "here")
+    fit = identify(model, table, new_poses=poses)
+    assert np.isinf(fit.heldout_rms)
+    told = fit.finding("not_held_out")
+    assert (told.severity == "note") == fit.verdict.trusted == (not sideways)
+    assert (fit.predicted.unchecked**2 > fit.predicted.rms**2 / 2) == bool(sideways)
 
 
 def test_limits_that_are_not_kept_are_named(fits):

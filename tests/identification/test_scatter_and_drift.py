@@ -6,7 +6,7 @@ import numpy as np
 from support.calibration import PLACED, cell_of, random_chain, table_at, true_values
 from support.cells import random_poses
 
-from elastocal.cell.arm_description import CartesianNoise, Tracker
+from elastocal.cell.arm_description import CartesianNoise, Tracker, Unsteadiness
 from elastocal.identification.identify import identify
 from elastocal.identification.visit_record import in_random_order
 from elastocal.model import Model
@@ -20,20 +20,20 @@ MARKERS = {"M1": np.array([0.3, 0, 0.1]), "M2": np.array([-0.2, 0.2, 0.1])}
 def identified(scatter=0.0, drift=0.0, timed=True, ordered=False, seed=0):
     """36 poses of an arm whose base and markers are unknown."""
     rng = np.random.default_rng(seed)
-    tracker = Tracker(noise=CartesianNoise(np.full(3, SIGMA)))
-    model = Model.assembled(random_chain(3), cell_of((*PLACED, "joint_offset"), MARKERS, tracker))
+    tracker, span = Tracker(noise=CartesianNoise(np.full(3, SIGMA))), 60.0 * 35
+    cell = cell_of(
+        (*PLACED, "joint_offset"), MARKERS, tracker,
+        noise=Unsteadiness(np.array([scatter]), drift, LASTING * span),
+    )  # fmt: skip
+    model = Model.assembled(random_chain(3), cell)
     q = random_poses(model.chain, 36, seed)
     if ordered:
         q = np.clip(np.cumsum(0.4 * rng.normal(size=q.shape), axis=0), -2.4, 2.4)
     table = table_at(q, markers=tuple(MARKERS))
     truth = true_values(model, rng, anywhere=False)
     time = np.repeat(60.0 * np.arange(len(q)), len(MARKERS))
-    shaken = q + scatter * rng.normal(size=q.shape)
-    read = simulate(model, replace(table, q=np.repeat(shaken, len(MARKERS), axis=0)), truth, rng)
-    K = np.exp(-np.abs(time[:, None] - time) / (LASTING * np.ptp(time)))
-    root = np.linalg.cholesky(K + 1e-10 * np.eye(len(K)))
-    position = read.position + drift * root @ rng.normal(size=(len(K), 3))
-    return identify(model, replace(table, position=position, time=time if timed else None))
+    read = simulate(model, replace(table, time=time), truth, rng)
+    return identify(model, replace(read, time=time if timed else None))
 
 
 def test_neither_is_told_where_there_is_none():
@@ -50,7 +50,10 @@ def test_joints_that_settle_anew_are_told_with_their_size():
     assert abs(finding.listed("sigma_urad")[0] / 100 - 1) < 0.3
     assert any("settle anew" in warning for warning in result.warnings)
     assert "µrad" in noise_model_line(result)
-    assert any("sigma_urad" in size for size in result.to_json()["noise"]["variances"])
+    told = result.to_json()
+    assert any("sigma_urad" in size for size in told["noise"]["variances"])
+    assert abs(told["cell_noise"]["joints_urad"][0] / 100 - 1) < 0.3
+    assert (result.unsteadiness.joints > 0).all() and result.unsteadiness.drift == 0
 
 
 def test_a_drift_is_told_and_whole_blocks_are_left_out():
@@ -62,6 +65,23 @@ def test_a_drift_is_told_and_whole_blocks_are_left_out():
     assert noise["held_out_by"] == "blocks in time" and noise["drift"]["seconds"] > 60
     assert any("drift" in warning and "reference pose" in warning for warning in result.warnings)
     assert np.isfinite(result.heldout_rms)
+    assert result.unsteadiness.drift > 0 and result.unsteadiness.lasting > 60
+
+
+def test_how_long_a_drift_lasts_is_not_taken_for_known():
+    result = identified(drift=DRIFT)
+    spread, names = result.spread, result.determined
+    weights, matrices = zip(*spread.among, strict=True)
+    assert len(weights) > 2 and np.isclose(sum(weights), 1)
+    np.testing.assert_allclose(np.tensordot(weights, matrices, 1), spread.matrix)
+    base, offset = names.index("base.x"), names.index("joint3.offset")
+    assert spread.dof[base] < 20 < spread.dof[offset]
+    single = np.eye(len(names))[[base, offset], None]
+    assert spread.dof_of(single)[0] < 20 < spread.dof_of(single)[1]
+    at = result.position(np.zeros(6), point="M1")
+    assert at.dof[0] < 20
+    normal = replace(at, dof=np.full(1, np.inf))
+    assert (at.half_axes() > 1.1 * normal.half_axes()).all()
 
 
 def test_without_times_the_order_of_the_rows_stands_for_them_unless_it_is_one_of_poses():

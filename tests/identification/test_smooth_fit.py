@@ -261,6 +261,8 @@ def test_the_result_says_where_it_was_not_measured():
     assert told is not None and told.numbers["far"] == far.test.far
     assert far.test.std > 2 * inside.test.std > 0
     assert far.to_json()["test"]["far"] == far.test.far
+    assert far.to_json()["measured_poses"]["configurations"] == 100
+    assert far.arm.shown == inside.arm.shown is not None
 
 
 def test_intervals_without_a_prior_are_refused():

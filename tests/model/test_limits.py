@@ -78,3 +78,11 @@ def test_ranges_are_finite_and_keep_every_limit(low, high, kinds) -> None:
     near = np.full(4, 0.7)
     middle = np.mean(finite_ranges(chain, lower, upper, near), axis=0)
     np.testing.assert_allclose(middle[free], 0.7)
+
+
+def test_a_limit_that_only_stands_for_none_gives_a_turn():
+    chain = limited([None] * 4, [None] * 4, ["revolute", "prismatic"] * 2)
+    lower, upper = np.array([-7e18, -4.0, -1.0, -3e9]), np.array([7.0, 1e16, 1.0, 4e9])
+    a, b = finite_ranges(chain, lower, upper)
+    np.testing.assert_allclose(a, [7.0 - 2 * np.pi, -4.0, -1.0, -1.0])
+    np.testing.assert_allclose(b, [7.0, -2.0, 1.0, 1.0])

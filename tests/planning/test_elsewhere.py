@@ -7,10 +7,12 @@ import pytest
 from support.cells import DOWN, kr270_chain, random_poses
 from support.design_cells import all_loads, plan_cell
 
-from elastocal.cell.plan_wishes import TargetPose
+from elastocal.cell.plan_wishes import ELSEWHERE_CAP, TargetPose
+from elastocal.errors import InputError
 from elastocal.model import Model
 from elastocal.planning import Known, Setup, load_states, relax, set_up
 from elastocal.planning import test_poses as target_poses
+from elastocal.planning.elsewhere import share_within
 from elastocal.planning.exact_plan import exact_plan
 from elastocal.planning.plan import Everywhere
 from elastocal.planning.test_poses import ELSEWHERE, everywhere
@@ -20,7 +22,7 @@ Q = random_poses(CHAIN, 60, seed=5)
 ONE = (TargetPose(np.radians([0.0, -90, 90, 0, 30, 0])),)
 
 
-def made(share: float) -> Setup:
+def made(share: float | None) -> Setup:
     cell = plan_cell(loads=DOWN[None], elsewhere=share, test_poses=ONE)
     region = everywhere(cell, CHAIN)
     assert region is not None and len(region.q) == ELSEWHERE
@@ -34,7 +36,7 @@ def made(share: float) -> Setup:
 def errors(setup: Setup, chosen: np.ndarray) -> Everywhere:
     assert setup.target_rows is not None and setup.elsewhere_rows is not None
     M = setup.gathered(setup.information.blocks(Q, all_loads(Q))[:, chosen])[0]
-    return Everywhere.of(setup.target_rows, setup.elsewhere_rows, M, M[None])
+    return Everywhere.of(setup.target_rows, setup.elsewhere_rows, M, M[None], M)
 
 
 def best(setup: Setup) -> np.ndarray:
@@ -62,3 +64,32 @@ def test_a_share_elsewhere_costs_little_at_the_test_poses_and_buys_the_rest() ->
     narrow, wide = errors(alone, best(alone)), errors(shared, best(shared))
     assert wide.elsewhere < narrow.elsewhere
     assert narrow.test_poses <= wide.test_poses < 1.5 * narrow.test_poses
+
+
+def test_the_share_is_the_largest_that_the_cap_allows_and_the_bound_is_another_solvers() -> None:
+    setup, six = made(None), np.array([6])
+    pool = setup.pool(Q, all_loads(Q), np.zeros(60, dtype=np.int64))
+    share = share_within(setup, pool, six, 0.05, lambda message: None)
+    assert 0.02 < share < 0.9
+    own, least = setup.criterion, relax(setup.problem(pool, six)).value
+
+    def price(share: float) -> float:
+        """How much more error at the test poses the relaxed optimum leaves."""
+        problem = setup.sharing(share).problem(pool, six)
+        newton, conic = relax(problem), relax(problem, method="conic")
+        assert newton.bound == pytest.approx(conic.bound, rel=1e-5)
+        found = exact_plan(problem, starts=2)
+        assert conic.bound <= found.value
+        return float(np.sqrt(own.value(problem.information(newton.weights)) / least) - 1)
+
+    assert 0.045 < price(share) < 0.0505
+    assert price(1.3 * share) > 0.05
+
+
+def test_a_cap_stands_where_no_test_poses_are_stated_and_nothing_else_is_said() -> None:
+    assert plan_cell().design.cap == ELSEWHERE_CAP
+    assert plan_cell(elsewhere=0.0).design.cap == plan_cell(elsewhere=0.3).design.cap == 0
+    assert plan_cell(test_poses=ONE).design.cap == plan_cell(criterion="D").design.cap == 0
+    assert plan_cell(test_poses=ONE, elsewhere_cap=0.1).design.cap == 0.1
+    with pytest.raises(InputError, match="drop one"):
+        plan_cell(elsewhere=0.1, elsewhere_cap=0.1)

@@ -8,14 +8,15 @@ import numpy as np
 import pytest
 from support.cells import DOWN, TABLE_2, kr270_cell, kr270_chain
 
-from elastocal.cell.arm_description import CartesianNoise, PolarNoise, Tracker
+from elastocal.cell.arm_description import CartesianNoise, PolarNoise, Tracker, Unsteadiness
 from elastocal.cell.plan_wishes import DesignSpec
 from elastocal.cell.work_cell import Cell
 from elastocal.errors import InputError
 from elastocal.identification import weights_for
+from elastocal.measurements import Measurements
 from elastocal.model import Model, observe
 from elastocal.planning import PoseInformation, load_states
-from elastocal.planning.information import ALL_LOADS
+from elastocal.planning.information import ALL_LOADS, pose_covariance
 from elastocal.simulation import expand_plan
 from elastocal.simulation.simulate import simulate
 
@@ -137,3 +138,26 @@ def test_scenarios_are_linearised_at_their_own_values() -> None:
 def test_what_a_plan_needs_to_know_is_asked_for(cell: Cell, said: str) -> None:
     with pytest.raises(InputError, match=said):
         information_of(cell).blocks(TABLE_2, np.full(15, ALL_LOADS))
+
+
+@pytest.mark.parametrize("observed", ["position", "deflection"])
+def test_joints_that_settle_anew_scatter_simulated_readings_as_planned(observed: str) -> None:
+    loads = np.array([[0.0, 0, 0], DOWN])
+    noise = Unsteadiness(np.array([10.0, 20, 30, 100, 5, 0]) * 1e-6)
+    cell = replace(cell_for(observed, AXIS, loads=loads), noise=noise)
+    information = information_of(cell)
+    model, plan = information.model, _plan(information)
+    rows = expand_plan(plan, tuple(cell.tool.markers), 1, DOWN)
+    planned = pose_covariance(model, observe(rows_read(model, rows), observed), len(plan), None)
+    read = [observe(simulate(model, rows, model.nominal, k), observed).value for k in range(200)]
+    off = np.array(read) - observe(rows_read(model, rows), observed).value
+    off = off.reshape(200, len(plan), -1)
+    found = np.einsum("kni,knj->nij", off, off) / 200
+    ratio = np.trace(found, axis1=1, axis2=2) / np.trace(planned, axis1=1, axis2=2)
+    assert abs(ratio.mean() - 1) < 0.05
+    # What a joint does to the markers of a visit it does to all of them.
+    assert relative(found.mean(axis=0), planned.mean(axis=0)) < 0.15
+
+
+def rows_read(model: Model, rows: Measurements) -> Measurements:
+    return simulate(model, rows, model.nominal, 0, noise=False)

@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 from support.pages import Page
 
-from elastocal.identification import findings as module
+from elastocal.identification import error_budget as module
 from elastocal.identification import gap_budget
 from elastocal.report.figures import waterfall_of_steps
 from elastocal.report.identification_view import budget_steps, budget_table, rms_by_kind

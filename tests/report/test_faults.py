@@ -75,11 +75,11 @@ def test_parameter_is_named_where_the_report_knows_its_name(case: Any) -> None:
 def test_terminal_names_few_and_counts_the_rest(case: Any) -> None:
     single = replace(BLOCK, level="reading", pattern="single", lines=(3,), name="3")
     groups = [replace(BLOCK, level="configuration", name=str(k)) for k in range(MOST_TOLD + 2)]
-    lines = [s for s in summary_lines(with_findings(case.result, *groups, single))
-             if s.startswith("Faulty")]  # fmt: skip
+    summary = summary_lines(with_findings(case.result, *groups, single))
+    lines = [text for label, text in summary if label == "Faulty"]
     assert len(lines) == MOST_TOLD + 1
-    assert lines[0].startswith("Faulty: Configuration 0: ")
-    assert lines[-1] == "Faulty: And 2 more."
+    assert lines[0].startswith("Configuration 0: ")
+    assert lines[-1] == "And 2 more."
     assert fault_lines(with_findings(case.result, single)) == []
     assert fault_lines(replace(case.result, faulty_report=None)) == []
 

@@ -42,7 +42,7 @@ def test_every_parameter_is_on_the_page_and_no_number_where_none_is_known(
 def test_structure(page: str) -> None:
     structure = Page(page)
     structure.check_harmless(page)
-    assert page.count("<figure") == page.count("</figure>") == 14
+    assert page.count("<figure") == page.count("</figure>") == 16
     for heading in (
         "Where the error goes",
         "Parameters",
@@ -62,7 +62,7 @@ def test_structure(page: str) -> None:
 
 def test_figures_are_well_formed_and_follow_the_page_colours(page: str) -> None:
     figures = re.findall(r"<svg xmlns=.*?</svg>", page, re.DOTALL)
-    assert len(figures) == 14
+    assert len(figures) == 16
     for figure in figures:
         ElementTree.fromstring(figure)
         assert "var(--ink)" in figure

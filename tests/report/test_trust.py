@@ -54,7 +54,10 @@ def test_each_doubt_is_named_with_its_remedy(fine: Any) -> None:
         "unseen poses are worse": (
             replace(fine, heldout_rms=3 * fine.residual_rms), "augment"
         ),
-        "is not known": (replace(fine, heldout_rms=float("inf")), "augment"),
+        "is not known": (
+            replace(fine, heldout_rms=float("inf"),
+                    predicted=replace(fine.predicted, unchecked=float("inf"))), "augment"
+        ),
         "test data are off": (
             replace(fine, test=TestErrors(2 * fine.heldout_rms, 0.0, 0.0, 9)), ""
         ),

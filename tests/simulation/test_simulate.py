@@ -9,7 +9,13 @@ from scipy.spatial.transform import Rotation
 from support.calibration import GEOMETRY, cell_of, planar_chain, table_at, true_values, with_values
 from support.cells import COMPLIANCE, kr270_chain, random_poses
 
-from elastocal.cell.arm_description import CartesianNoise, Nominal, PolarNoise, Tracker
+from elastocal.cell.arm_description import (
+    CartesianNoise,
+    Nominal,
+    PolarNoise,
+    Tracker,
+    Unsteadiness,
+)
 from elastocal.errors import InputError
 from elastocal.model import Model, observe
 from elastocal.model.observations import position_covariance
@@ -248,3 +254,23 @@ def test_an_unknown_marker_is_refused():
     model = model_with(effects=("marker_position",), markers={"A": np.zeros(3), "B": np.ones(3)})
     with pytest.raises(InputError, match=r"marker 'C' is not one of the cell's markers: A, B"):
         simulate(model, plan_of(model, 3, markers=("A", "C")), model.nominal, 0)
+
+
+def test_a_drift_is_correlated_in_time_and_the_table_says_when():
+    model = model_with(noise=Unsteadiness(drift=1e-4, lasting=60.0))
+    plan, truth = plan_of(model), true_values(model_with(), np.random.default_rng(0))
+    exact = simulate(model, plan, truth, 0, noise=False)
+    assert exact.time is None
+    tables = [simulate(model, plan, truth, k) for k in range(200)]
+    off = np.array([t.position - exact.position for t in tables])
+    assert abs(np.sqrt(np.mean(off**2)) / 1e-4 - 1) < 0.1
+    time = tables[0].time
+    assert (np.diff(time) == 30.0).all()  # what a visit takes
+    neighbours = np.mean(off[:, 1:] * off[:, :-1]) / np.mean(off**2)
+    assert abs(neighbours - np.exp(-0.5)) < 0.1
+
+
+def test_as_many_numbers_as_joints_are_needed():
+    model = model_with(noise=Unsteadiness(np.full(7, 1e-5)))
+    with pytest.raises(InputError, match=r"noise\.joints_urad has 7 numbers"):
+        simulate(model, plan_of(model), model.nominal, 0)

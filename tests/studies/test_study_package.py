@@ -127,6 +127,7 @@ def test_an_error_in_study_py_is_told_by_its_line(tmp_path, old, new, line, told
         ('{"n": n,', '{"n": {n},', "task 0: Object of type set"),
         ('{"n": n,', '{"n": float("nan"),', "task 0: Out of range float"),
         ('replicates"])]', 'replicates"] * 0)]', "tasks() gives no task"),
+        ("return [", "return ({} for _ in iter(int, 1))\n    [", "more than 200000 tasks"),
     ],
 )
 def test_wrong_tasks_are_told(tmp_path, old, new, told):

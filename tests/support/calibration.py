@@ -11,7 +11,7 @@ from scipy import stats
 from scipy.spatial.transform import Rotation
 from support.cells import choices
 
-from elastocal.cell.arm_description import ModelSpec, Robot, Tool, Tracker
+from elastocal.cell.arm_description import ModelSpec, Robot, Tool, Tracker, Unsteadiness
 from elastocal.cell.work_cell import Cell
 from elastocal.identification import Calibration
 from elastocal.measurements import Measurements
@@ -67,6 +67,7 @@ def cell_of(
     tracker: Tracker | None = None,
     observe: str = "position",
     load_point: Any = (0.1, 0.0, 0.1),
+    noise: Unsteadiness | None = None,
     **model: Any,
 ) -> Cell:
     """A cell with the given effects; one marker at the flange's origin unless stated."""
@@ -75,6 +76,7 @@ def cell_of(
         Tool(np.array(load_point, dtype=float), markers or {"M1": np.zeros(3)}),
         tracker or Tracker(),
         ModelSpec(observe=observe, effects=choices(effects), **model),  # type: ignore[arg-type]
+        noise=noise or Unsteadiness(),
     )  # fmt: skip
 
 

@@ -9,7 +9,7 @@ from elastocal import loaded_on_demand
 ROOMS = {
     "arm_description": (
         "CartesianNoise CompensatorTable EffectChoice ModelSpec Nominal Observe PolarNoise "
-        "Robot Tool Tracker"
+        "Robot Tool Tracker Unsteadiness"
     ),
     "file_keys": "rotation_from_rpy table_of",
     "plan_wishes": "DesignSpec Motion TargetBox TargetPath TargetPose",

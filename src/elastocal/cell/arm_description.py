@@ -40,6 +40,7 @@ from elastocal.units import Array, to_si
 Observe = Literal["position", "deflection", "pose", "distance"]
 Convention = Literal["standard", "modified"]
 Sigma = Annotated[Array, numbers(3, above=0, one_for_all=True)]
+Scatter = Annotated[Array, numbers(least=0, one_for_all=True)]
 Compliances = Annotated[Many[NonNegative], Field(min_length=1)]
 JointName = Annotated[str, Field(pattern=r"^joint[1-9][0-9]{0,2}$")]
 ZEROS = partial(np.zeros, 3)
@@ -246,6 +247,32 @@ class Tracker:
                 "number in µm",
             )
         return {"noise": from_table(PolarNoise, table, spot)}
+
+
+@record
+class Unsteadiness:
+    """What differs from visit to visit, beside the noise of a reading.
+
+    `joints` (joints,) or (1,), in rad or m: by how much each joint settles elsewhere at each visit.
+    `drift` m in each direction: of base or tracker, with the correlation exp(−|t − t′|/`lasting`)
+    of times in s.
+    """
+
+    joints: Scatter = keyed(
+        "a number >= 0 in µrad (µm where a joint slides), or one per joint", "joints_urad",
+        default_factory=partial(np.zeros, 1),
+    )  # fmt: skip
+    drift: NonNegative = keyed("a number >= 0 in µm", "drift_um", default=0.0)
+    lasting: Positive = keyed("a positive number in s", "lasting_s", default=3600.0)
+
+    def of_joints(self, n: int) -> Array:
+        """Standard deviations (n,) of n joints; InputError where there are others."""
+        require(
+            len(self.joints) in (1, n),
+            f"key noise.joints_urad has {len(self.joints)} numbers, but the arm has {n} joints; "
+            "give one number for all, or one per joint",
+        )
+        return np.broadcast_to(self.joints, (n,))
 
 
 @record

@@ -59,6 +59,7 @@ from elastocal.units import Array, to_si
 
 Record = TypeVar("Record")
 Member = TypeVar("Member")
+FARTHEST = 1e5  # m
 JOINT_UNITS = ("deg", "rad", "m", "mm")
 JOINT_KEY = re.compile(r"(joint[1-9][0-9]{0,2})(?:_(deg|rad|mm|m))?", re.ASCII)
 # Units that key names end with, in words, and the SI unit in its place in Python.
@@ -317,9 +318,18 @@ def _value(found: Any, known: Key, spot: Spot) -> Any:
         return tuple(from_table(t.record, t, spot / known.name / i) for i, t in tables)
     if known.into is not None:
         return known.into(found, spot, known.name)
-    if known.unit and isinstance(found, Mapping):
-        return {name: to_si(number, known.unit) for name, number in found.items()}
-    return to_si(found, known.unit) if known.unit else found
+    if not known.unit:
+        return found
+    several = isinstance(found, Mapping)
+    values = {k: to_si(v, known.unit) for k, v in (found if several else {"": found}).items()}
+    if UNITS[known.unit][1] == "m":
+        for name, value in values.items():
+            far = float(np.max(np.abs(value), initial=0.0))
+            key = spot.key(known.name) + (f".{dotted((name,))}" if several else "")
+            spot.require(
+                far <= FARTHEST, f"key {key}: {far:g} m reaches beyond any cell; correct it"
+            )
+    return values if several else values[""]
 
 
 def existing_file(found: str, spot: Spot, name: str) -> Path:

@@ -36,6 +36,7 @@ from elastocal.errors import require
 from elastocal.units import Array
 
 Positives = Annotated[Array, numbers(above=0)]
+ELSEWHERE_CAP = 0.05  # where the user states no test poses: a price that buys most of what can be
 
 
 SPEED_KEYS = (
@@ -158,6 +159,33 @@ class Motion:
         return {"degrees": any(degrees)}
 
 
+Box = Annotated[Array, matrix(2, 3)]
+BOX = "two corners in m, as in [[0.1, -0.2, 0.1], [0.3, 0.2, 0.3]]"
+
+
+@record
+class Freedom:
+    """What may still be chosen before measuring: boxes (2, 3) m, lower and upper corner, for
+    `markers` by name and the `load_point` (flange frame) and for the `tracker` (data's frame), and
+    how many of the design's `loads` that are not zero will hang."""
+
+    markers: dict[str, Box] = keyed(
+        f"per marker {BOX}", "markers_m", form=dict[str, Box], default_factory=dict
+    )
+    load_point: Box | None = keyed(BOX, "load_point_m", default=None)
+    tracker: Box | None = keyed(BOX, "tracker_m", default=None)
+    loads: Count | None = keyed("a whole number >= 1", default=None)
+
+    def __post_init__(self) -> None:
+        boxes = [(f"markers_m.{name}", box) for name, box in self.markers.items()]
+        for name, box in (*boxes, ("load_point_m", self.load_point), ("tracker_m", self.tracker)):
+            require(
+                box is None or bool((box[0] <= box[1]).all()),
+                f"{header(('design', 'choose'))} {name} takes the lower corner and then the upper; "
+                "swap or correct them",
+            )
+
+
 class LevelsTable(Table):
     """One joint's levels under a key such as joint2_deg, and how many poses each gets."""
 
@@ -178,8 +206,9 @@ class DesignSpec:
     deviation of a deviation common to a configuration's readings, per direction; `marker_sigma`
     m per marker instead of the tracker's noise; `interest`: parameters, places or effects that
     D, A, E and O count (default all but base and markers); `elsewhere`: the share of the weight
-    that poses all over the joint ranges have beside the test poses; `combination` name → factor
-    for c."""
+    that poses all over the joint ranges have beside the test poses; `elsewhere_cap`: by how much
+    the test poses may be worse for as little error there as can be had (see `cap`);
+    `combination` name → factor for c."""
 
     poses: Count | None = keyed("a whole number >= 1", default=None)
     criterion: Text = keyed(
@@ -208,12 +237,13 @@ class DesignSpec:
         default_factory=dict,
     )
     prior: Literal["none", "typical"] = keyed(default="none")
-    elsewhere: Annotated[float, Field(ge=0, lt=1)] = keyed(
-        "a number from 0 to below 1", default=0.0
+    elsewhere: Annotated[float, Field(ge=0, lt=1)] | None = keyed(
+        "a number from 0 to below 1", default=None
     )
+    elsewhere_cap: NonNegative | None = keyed("a number >= 0, as in 0.05", default=None)
     robust: Literal["none", "average", "worst"] = keyed(default="none")
     robust_samples: Count = keyed("a whole number >= 1", default=8)
-    candidates: Count = keyed("a whole number >= 1", default=20_000)
+    candidates: Count | None = keyed("a whole number >= 1", default=None)
     target: Positive | None = keyed("a positive number in µm", "target_um", default=None)
     test_poses: Many[TargetPose] = keyed(
         "tables, each headed [[design.test_pose]]", "test_pose", default=()
@@ -221,6 +251,7 @@ class DesignSpec:
     test_path: TargetPath | None = keyed("a table headed [design.test_path]", default=None)
     test_box: TargetBox | None = keyed("a table headed [design.test_box]", default=None)
     motion: Motion = keyed("a table headed [design.motion]", default_factory=Motion)
+    choose: Freedom | None = keyed("a table headed [design.choose]", default=None)
 
     def __post_init__(self) -> None:
         joints = " and ".join(self.levels)
@@ -244,6 +275,23 @@ class DesignSpec:
             "key design.combination has no factor other than zero; give the combination of "
             "parameters that is to be known well",
         )
+        require(
+            not (self.elsewhere and self.elsewhere_cap),
+            "keys design.elsewhere and design.elsewhere_cap both say what the joint ranges are "
+            "worth beside the test poses; drop one",
+        )
+
+    @property
+    def states_test_poses(self) -> bool:
+        return bool(self.test_poses) or self.test_path is not None or self.test_box is not None
+
+    @property
+    def cap(self) -> float:
+        """By how much ρ₀ may exceed the least, for as little error all over the joint ranges as
+        can be had; 0 where `elsewhere` gives that a weight, or nobody asks for it."""
+        if self.elsewhere_cap is not None or self.criterion != "test_pose":
+            return self.elsewhere_cap or 0.0
+        return 0.0 if self.elsewhere is not None or self.states_test_poses else ELSEWHERE_CAP
 
     @classmethod
     def from_keys(cls, table: Any, spot: Spot) -> dict[str, Any]:

@@ -6,7 +6,7 @@ from collections.abc import Collection, Iterable
 from pathlib import Path
 from typing import Annotated, Any
 
-from elastocal.cell.arm_description import ModelSpec, Robot, Tool, Tracker
+from elastocal.cell.arm_description import ModelSpec, Robot, Tool, Tracker, Unsteadiness
 from elastocal.cell.file_keys import (
     TUPLE,
     File,
@@ -100,6 +100,7 @@ class Cell:
     design: DesignSpec = keyed("a table", default_factory=DesignSpec)
     require: Acceptance = keyed("a table", default_factory=Acceptance)
     plugins: Many[Text] = keyed("a table", form=PluginsTable, into=_modules, default=())
+    noise: Unsteadiness = keyed("a table", default_factory=Unsteadiness)
 
     def __post_init__(self) -> None:
         for joint, (low, high) in self.limits.items():
@@ -145,7 +146,15 @@ class Cell:
         load_plugins(self.path or Path(self.name), self.plugins)
         where, sight = self.path or self.name, self.workspace.visibility
         self._check_markers(("workspace", "visibility", "normals"), sight.normals if sight else ())
+        least = None if sight is None else sight.min_markers
+        require(
+            least is None or least <= len(self.tool.markers),
+            f"{where}: key workspace.visibility.min_markers is {least}, but [tool.markers_m] has "
+            f"{listed(self.tool.markers) or 'none'}; ask for fewer",
+        )
         self._check_markers(("design", "marker_sigma_um"), self.design.marker_sigma)
+        freedom = self.design.choose
+        self._check_markers(("design", "choose", "markers_m"), freedom.markers if freedom else ())
         require(
             not self.workspace.urdf_geometry or self.robot.urdf is not None,
             f'{where}: key workspace.geometry = "urdf" needs [robot] urdf; give link_radius_mm '

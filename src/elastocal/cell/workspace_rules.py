@@ -30,7 +30,16 @@ from elastocal.cell.file_keys import (
     rotation_from_rpy,
     stated,
 )
-from elastocal.config import NonNegative, Numbers, Positive, Text, Vector2, Vector3, numbers
+from elastocal.config import (
+    Count,
+    NonNegative,
+    Numbers,
+    Positive,
+    Text,
+    Vector2,
+    Vector3,
+    numbers,
+)
 from elastocal.errors import require
 from elastocal.text import is_label, quoted
 from elastocal.units import Array
@@ -182,7 +191,7 @@ class HangingLoad:
 
 @record
 class Visibility:
-    """What the tracker must see: all markers, past arm and obstacles.
+    """What the tracker must see: all markers, or `min_markers` of them, past arm and obstacles.
 
     `normals` name → (3,) axis of the reflector in the flange frame, `max_incidence` rad from it;
     `range` m; `beam_radius` m of free sight.
@@ -200,6 +209,7 @@ class Visibility:
     )
     beam_radius: NonNegative = keyed("a number >= 0 in mm", "beam_radius_mm", default=0.005)
     line_of_sight: bool = keyed(default=True)
+    min_markers: Count | None = keyed("a whole number >= 1", default=None)
 
     def __post_init__(self) -> None:
         low, high = self.range
@@ -225,7 +235,8 @@ class Workspace:
     """`link_radius` (n,) m: capsules along the links, (1,) where all are alike, () for none;
     `urdf_geometry`: the URDF's own collision shapes.  `clearance` m to obstacles,
     `self_clearance` m between bodies of the arm; `ignored_pairs` of body names that may touch;
-    `torque_limits` (n,) N m static, () none.
+    `torque_limits` (n,) N m static, () none.  `mounting_plane`: links and tool stay on the arm's
+    side of z = 0 of the base; None: where neither obstacles nor half-spaces are stated.
 
     Examples:
         >>> from elastocal.cell import HalfSpace
@@ -256,6 +267,7 @@ class Workspace:
         default=False,
     )
     self_collision: bool = keyed(default=True)
+    mounting_plane: bool | None = keyed("true or false", default=None)
     ignored_pairs: Many[Pair] = keyed('pairs of names, as in [["link2", "link4"]]', default=())
     clearance: NonNegative = keyed(
         "a number >= 0 in {}", "clearance_mm", "clearance_m", default=0.0

@@ -18,6 +18,7 @@ from elastocal.cli import (  # noqa: F401
     identify_command,
     import_command,
     init_command,
+    next_command,
     simulate_command,
     study_command,
 )

@@ -10,8 +10,9 @@ import sys
 import threading
 import traceback
 import warnings
-from collections.abc import Callable, Iterable
+from collections.abc import Callable, Iterable, Sequence
 from io import StringIO
+from itertools import pairwise
 from pathlib import Path
 from types import FrameType
 from typing import TYPE_CHECKING, Annotated, Any, Self
@@ -32,8 +33,8 @@ if TYPE_CHECKING:
 
 # The order of the work, in which --help lists the verbs.
 VERBS = (
-    "init", "effects", "design", "simulate", "import", "identify", "diagnose", "compensate",
-    "export", "compare", "study", "demo",
+    "init", "effects", "design", "simulate", "import", "identify", "diagnose", "next",
+    "compensate", "export", "compare", "study", "demo",
 )  # fmt: skip
 
 
@@ -58,7 +59,11 @@ class InOrder(TyperGroup):
         told, standalone = StringIO(), extra.pop("standalone_mode", True)
         extra["standalone_mode"] = False
         try:
+            _refuse_empty((args[0] if args else extra.get("args")) or sys.argv[1:])
             code = super().main(*args, **extra)
+        except InputError as error:
+            complain(str(error))
+            code = error.exit_code
         except (typer.Abort, KeyboardInterrupt, EOFError):
             code = INTERRUPTED
         except OSError as error:  # of --help and --version
@@ -74,6 +79,17 @@ class InOrder(TyperGroup):
         if not standalone:
             return code
         sys.exit(code or 0)
+
+
+def _refuse_empty(words: Sequence[str]) -> None:
+    """Raises InputError for an empty argument, as a shell's unset variable leaves it: as a path it
+    would mean the folder where one is."""
+    for before, word in pairwise(["", *words]):
+        if not word and before != "--backend":  # empty like its variable: none is chosen
+            place = f" after {before}" if before else ""
+            raise InputError(
+                f"an empty argument{place} says nothing; give a value, or leave it out"
+            )
 
 
 app = typer.Typer(

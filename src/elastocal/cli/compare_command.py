@@ -35,7 +35,10 @@ def compare(
     report: ReportFile = None,
     load: Annotated[
         tuple[float, float, float] | None,
-        typer.Option(metavar="X Y Z", help="Force in N at the load point (tracker's axes)."),
+        typer.Option(
+            metavar="X Y Z",
+            help="Force in N at the load point (tracker's axes); default: the campaigns' loads.",
+        ),
     ] = None,
     level: Annotated[
         float, typer.Option(help="Chance that anything is called changed where nothing is.")
@@ -49,11 +52,10 @@ def compare(
 
     Example: elastocal compare january.json june.json --cell cell.toml --report changes.html
     """
-    from elastocal.export.changes import compare as run
+    from elastocal.diagnosis.changes import compare as run
     from elastocal.files import together
     from elastocal.model.calibrated import read_calibrated
-    from elastocal.report.changes_view import change_rows, changes_lines
-    from elastocal.report.terminal import print_told, table_of
+    from elastocal.report.terminal import print_comparison
     from elastocal.saving import write_json
 
     written = check_outputs(output, report)
@@ -75,9 +77,6 @@ def compare(
     if as_json:
         say(json_text(found.to_json()))
         return
-    screen = console()
-    print_told(screen, changes_lines(found))
-    screen.print()
-    screen.print(table_of("Parameter by parameter", change_rows(found)))
+    print_comparison(console(), found)
     for path in written:
         say(f"wrote {path}")

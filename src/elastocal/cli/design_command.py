@@ -78,6 +78,18 @@ def design(
     augment: Annotated[
         Path | None, typer.Option(help="Measurements already done (CSV), which the plan adds to.")
     ] = None,
+    keep: Annotated[
+        str | None,
+        typer.Option(
+            metavar="PLAN[:3,7]", help="Poses of an earlier plan that stay: all or these."
+        ),
+    ] = None,
+    strike: Annotated[
+        str | None,
+        typer.Option(
+            metavar="PLAN:3,7", help="Replace these poses of a plan; all its others stay."
+        ),
+    ] = None,
     knowledge: Annotated[
         Path | None, typer.Option(help="Priors on parameters (TOML), as for identify.")
     ] = None,
@@ -95,6 +107,14 @@ def design(
         float | None,
         typer.Option(
             min=0, max=0.99, help="Share of the weight for poses beside the test poses, as in 0.2."
+        ),
+    ] = None,
+    elsewhere_cap: Annotated[
+        float | None,
+        typer.Option(
+            min=0,
+            max=0.99,
+            help="How much worse the test poses may be for the least error elsewhere, as in 0.05.",
         ),
     ] = None,
     load_changes: Annotated[
@@ -117,6 +137,10 @@ def design(
     picture: Annotated[
         Path | None, typer.Option(help="Picture of the poses to write (PNG, SVG).")
     ] = None,
+    cell_out: Annotated[
+        Path | None,
+        typer.Option(help="Cell file to write, with what [design.choose] has chosen."),
+    ] = None,
     report: ReportFile = None,
     jobs: Annotated[int, typer.Option(help="Processes; -1 for all cores.")] = 1,
     seed: Seed = 0,
@@ -132,21 +156,23 @@ def design(
     Example: elastocal design cell.toml -o plan.csv --poses 15 --picture poses.png
     """
     from elastocal.files import together
-    from elastocal.planning.design import Checkpoint, key_of
+    from elastocal.planning.checkpoint import Checkpoint, key_of
     from elastocal.planning.design import design as run
+    from elastocal.planning.pins import plan_and_names
     from elastocal.verbs import design_request
 
     summary = output.with_suffix(".json")
     require(output.suffix.lower() != ".json", f"{output}: name the plan .csv; .json goes beside it")
     programs = program or []
     _check_suffixes(programs, picture)
-    written = check_outputs(output, summary, *programs, picture, report)
+    written = check_outputs(output, summary, *programs, picture, report, cell_out)
     asked: dict[str, Any] = {
         "poses": poses,
         "criterion": criterion,
         "target": _target(target, poses),
         "candidates": candidates,
         "elsewhere": elsewhere,
+        "elsewhere_cap": elsewhere_cap,
         "load_changes": load_changes,
         "reference_every": reference_every,
     }
@@ -159,12 +185,19 @@ def design(
         progress("reading")
         wanted, options = design_request(
             cell, **asked, augment=augment, knowledge=knowledge, fixed=fix or (),
-            curve=_numbers(curve), effort=effort, seed=seed, jobs=jobs,
+            keep=keep, strike=strike, curve=_numbers(curve), effort=effort, seed=seed, jobs=jobs,
         )  # fmt: skip
         _check_programs(wanted, programs)
-        files = [p for p in (cell, augment, knowledge, *files_of(wanted)) if p is not None]
+        require(
+            cell_out is None or wanted.design.choose is not None,
+            f"--cell-out {cell_out}: nothing is chosen; state [design.choose] in {cell}",
+        )
+        pinned = [plan_and_names(text)[0] for text in (keep, strike) if text]
+        given = (cell, augment, knowledge, *pinned, *files_of(wanted))
+        files = [p for p in given if p is not None]
         check_apart(written, files)
         told = asked | {"fix": fix, "curve": curve, "effort": effort}
+        told |= {"keep": keep, "strike": strike}
         checkpoint = Checkpoint.beside(output, key_of(files, seed=seed, **told), interrupts.check)
         if checkpoint.begun:
             progress("going on with the design that was interrupted")
@@ -179,6 +212,12 @@ def design(
         interrupts.check()
         with together(written):
             _write_all(plan, output, programs, picture)
+            if cell_out is not None:
+                from elastocal.diagnosis.diagnose import write_extended_cell
+
+                write_extended_cell(
+                    cell, cell_out, (), keys=plan.chosen.keys if plan.chosen else {}
+                )
             if report is not None:
                 from elastocal.report.page import write_page
 
@@ -193,6 +232,18 @@ def design(
     print_plan(console(), plan)
     for path in written:
         say(f"wrote {path}")
+    say(_what_next(cell, output, augment))
+
+
+def _what_next(cell: Path, plan: Path, augment: Path | None) -> str:
+    """What to do with the plan."""
+    added = "" if augment is None else f" (add them to {augment})"
+    return (
+        f"Next: measure {plan} in its order, a row with x_mm, y_mm, z_mm for each marker{added}; "
+        "then\n"
+        f"  elastocal identify {cell} {augment or 'data.csv'} --report report.html\n"
+        f"To try it without an arm: elastocal simulate {cell} {plan} -o data.csv --draw 1"
+    )
 
 
 def _target(target: float | None, poses: int | None) -> float | None:

@@ -41,6 +41,9 @@ def identify(
         Path | None, typer.Option(help="Measurements never fitted, to test the result on.")
     ] = None,
     report: ReportFile = None,
+    certificate: Annotated[
+        Path | None, typer.Option(help="Write a calibration certificate (one HTML page).")
+    ] = None,
     residuals: Annotated[
         Path | None, typer.Option(help="Write residuals of every reading as CSV.")
     ] = None,
@@ -109,6 +112,10 @@ def identify(
     jobs: Annotated[int, typer.Option(help="Processes of a bootstrap; -1 for all cores.")] = 1,
     seed: Seed = 0,
     as_json: Json = False,
+    details: Annotated[
+        bool,
+        typer.Option("--details", help="Also method, noise, residuals, intervals, all lists."),
+    ] = False,
     quiet: Quiet = False,
 ) -> None:
     """What are the parameters of my arm, and how sure are we?
@@ -120,8 +127,8 @@ def identify(
     from elastocal.measurements import read_matrix
     from elastocal.model.choice import cell_of
 
-    written = check_outputs(output, report, residuals)
-    limits = _limits(require or [])
+    written = check_outputs(output, report, residuals, certificate)
+    limits = limits_of(require or [])
     inputs = [p for p in (cell, data, test, covariance, knowledge) if p is not None]
     known = cell_of(cell)  # its plug-ins may have the noise model
     check_apart(written, inputs, known)
@@ -133,26 +140,28 @@ def identify(
             bounded=bounded, physical=physical, knowledge=knowledge, seed=seed, jobs=jobs,
             progress=progress,
         )  # fmt: skip
-        write_results(result, output, report, residuals, inputs, seed=seed)
+        write_results(
+            result, output, report, residuals, inputs, seed=seed, certificate=certificate
+        )  # fmt: skip
     if as_json:
         say(json_text(result.to_json()))
     else:
         from elastocal.report.terminal import print_result
 
-        print_result(console(), result)
+        print_result(console(), result, details=details)
         for path in written:
             say(f"wrote {path}")
     if unmet := result.unmet(**limits):
         raise NotAcceptedError(f"not accepted: {'; '.join(unmet)}")
 
 
-def _limits(stated: list[str]) -> dict[str, float | None]:
-    """NAME=UM as limits in m."""
+def limits_of(stated: list[str], names: tuple[str, ...] = ()) -> dict[str, float | None]:
+    """NAME=UM as limits in m, NAME one of `names`, by default of all."""
     from elastocal.cell.work_cell import Acceptance
     from elastocal.errors import InputError, option
     from elastocal.text import listed
 
-    names = tuple(vars(Acceptance()))
+    names = names or tuple(vars(Acceptance()))
     limits: dict[str, float | None] = {}
     for text in stated:
         name, _, number = text.partition("=")
@@ -178,6 +187,7 @@ def write_results(
     seed: int,
     truth: Truth | None = None,
     published: Published | None = None,
+    certificate: Path | None = None,
 ) -> None:
     """Write what was asked for, all of it or nothing.
 
@@ -187,7 +197,7 @@ def write_results(
     from elastocal.files import together
     from elastocal.saving import save_residuals, write_json
 
-    with together(path for path in (output, residuals, report) if path is not None):
+    with together(p for p in (output, residuals, report, certificate) if p is not None):
         if output is not None:
             write_json(output, result.to_json())
         if residuals is not None:
@@ -196,3 +206,7 @@ def write_results(
             from elastocal.report.page import write_page
 
             write_page(result, report, inputs, repeated(), seed, truth=truth, published=published)
+        if certificate is not None:
+            from elastocal.report.page import write_page
+
+            write_page(result, certificate, inputs, repeated(), seed, certificate=True)

@@ -87,7 +87,9 @@ def study(
     arrow()
     results = folder / "results" if output is None else output
     # Beside the results, not among them: their folder is a dataset that others read whole.
-    page = folder / "result.md" if output is None else output.with_name(f"{output.name}.md")
+    page = folder / "result.md"
+    if output is not None:
+        page = Path(f"{output if output.name else output.resolve()}.md")
     prepared = read_study(folder, seed, set_ or ())
     with StudyStop() as stop, StudyProgress(progress and not quiet) as shown:
         ending = run_study(

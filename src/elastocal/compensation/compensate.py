@@ -157,7 +157,8 @@ def compensate(
         np.column_stack([before[1], found.turn]), status, goals, force, T, place, turn,
         task.errors(nominal, every)[0], uncertainty, (),
     )  # fmt: skip
-    told = notices_of(tool.cell, result, limits, path) + _beyond_functions(arm, result)
+    told = notices_of(tool.cell, result, limits, path)
+    told += _beyond_functions(arm, result) + _beyond_poses(arm, result)
     if of_one_campaign:
         told += (
             f"The {listed(of_one_campaign, 4)} {'is' if len(of_one_campaign) == 1 else 'are'} of "
@@ -346,6 +347,25 @@ def _beyond_functions(arm: CalibratedArm, result: Compensation) -> tuple[str, ..
                 "the uncertainty grows to its whole size"
             )
     return tuple(told)
+
+
+UNLIKELY = 0.01  # probability, were the targets drawn as the poses measured
+
+
+def _beyond_poses(arm: CalibratedArm, result: Compensation) -> tuple[str, ...]:
+    """Targets of which the fit knows less than of every pose measured."""
+    shown, std = arm.shown, result.uncertainty.std
+    if shown is None or arm.model.observe == "distance":
+        return ()
+    far = result.reached & (std > shown.most)
+    if shown.chance(int(far.sum()), int(result.reached.sum())) >= UNLIKELY:
+        return ()
+    return (
+        f"{_rows(result.targets, far)}: what was measured tells less of this place (standard "
+        f"deviation up to {std[far].max() * 1e6:.0f} µm) than of any pose measured "
+        f"({shown.most * 1e6:.0f} µm at most), so that it is extrapolated; measure poses there, "
+        f"or choose a marker that was fitted ({option('point')})",
+    )
 
 
 def _rows(targets: Targets, which: NDArray) -> str:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Callable
 from dataclasses import dataclass, replace
 from typing import Any
@@ -106,7 +107,7 @@ def _counts(counts: tuple[int, ...], n: int, what: str) -> tuple[int, ...]:
     if len(counts) not in (1, n) or min(counts) < 1:
         raise InputError(f"{option('grid')} takes {what}, 1 or more; found '{told}'")
     counts = counts * n if len(counts) == 1 else counts
-    size = int(np.prod([float(k) for k in counts]))
+    size = math.prod(counts)
     if size > MOST_POINTS:
         raise InputError(
             f"{option('grid', told)}: {size:,} points, and {MOST_POINTS:,} is the "

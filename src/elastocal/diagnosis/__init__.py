@@ -32,6 +32,7 @@ ROOMS = {
         "Item ModelSet distances extended fit_extended fit_set packed_columns refine "
         "settings_to_try signal_of"
     ),
+    "next_poses": "NextPoses doubts_after verdict_of with_effects_of",
     "noise_floor": (
         "NoiseValues NoisyData Weighted covariance fit_noise likelihood log_prior noise_draws "
         "posterior project"

@@ -13,7 +13,7 @@ import numpy as np
 from scipy import linalg
 from scipy.special import expit, softmax
 
-from elastocal.diagnosis.component_search import Rivals
+from elastocal.diagnosis.component_search import Rivals, exchanged
 from elastocal.diagnosis.components import Component, FittedSum, presence_cost, side_by_side
 from elastocal.diagnosis.diagnosis import (
     ComponentShare,
@@ -30,7 +30,7 @@ from elastocal.diagnosis.diagnosis_data import DiagnosisData
 from elastocal.diagnosis.model_set import spans_of
 from elastocal.diagnosis.noise_floor import NoisyData, Projection, Weighted, covariance, project
 from elastocal.diagnosis.shrinkage import NEW_POSES, Shrinkage, left_out_residual, rms_with_interval
-from elastocal.identification.findings import BudgetStep
+from elastocal.identification.error_budget import BudgetStep
 from elastocal.model.effects.base import Stage, index
 from elastocal.model.effects.gears import GearSpectrum
 from elastocal.model.effects.smooth import JointCurve
@@ -39,6 +39,7 @@ from elastocal.units import Array, BoolArray, IntArray
 DRAWS, PARTS = 400, 10
 DETERMINED = 1e-4  # of the largest, singular value of columns of unit length
 MOST_POSES = 1500  # that a set of new poses is drawn from
+PROBABLE = 0.5
 NAMED = 0.9  # probability from which a named effect needs no rivals beside it
 CHANCE = 0.05  # probability from which a rival is told
 TOLD = 0.02  # share of the gap from which it matters which of several effects it is
@@ -183,6 +184,19 @@ class SumAnswer:
     @cached_property
     def total(self) -> Array:
         return self.squares(range(len(self._spans)))
+
+    @property
+    def decided(self) -> SumAnswer:
+        """The same without effects that matter next to nothing and are probably something else: as
+        a cause they would be a guess, and what they correct is too little to be missed."""
+        gone = [
+            k for k in self._rivals
+            if self._probability(k) < PROBABLE and abs(float(np.median(self.shares([k])))) < TOLD
+        ]  # fmt: skip
+        if not gone:
+            return self
+        found = exchanged(self.found.plain, self.found, [self.found.components[k] for k in gone])
+        return replace(self, found=found)
 
     # Shares.
 
@@ -412,22 +426,20 @@ class SumAnswer:
                 stated = c.effect.stated(c.where, model.chain, model.cell)
                 settings[c.effect.sized_by] = size * stated[c.effect.sized_by]
         families = [k for k in members if isinstance(self.found.components[k].effect, GearSpectrum)]
-        lines = [line for k in families for line in self._lines(k)]
-        if lines:
-            # One prior size for all lines of a joint.
-            settings["spectrum_size_rad"] = math.sqrt(float(np.mean([s**2 for *_, s in lines])))
+        if families:
+            # One prior size for all families of a joint.
+            each = [np.exp(2 * sizes[k]) for k in families]
+            settings["spectrum_size_rad"] = math.sqrt(float(np.mean(each))) * found[0].unit
             q = self.dataset.table.q[:, index(found[0].where)]
             settings["spectrum_centre_rad"] = float((q.max() + q.min()) / 2)
-            for n, (order, sd, _) in enumerate(sorted(lines), start=1):
+            given = [dict(self.found.components[k].settings) for k in families]
+            lines = sorted(
+                (one[f"order_{n}"], one[f"order_sd_{n}"])
+                for one in given for n in range(1, len(one) // 2 + 1)
+            )  # fmt: skip
+            for n, (order, sd) in enumerate(lines, start=1):
                 settings |= {f"order_{n}": order, f"order_sd_{n}": sd}
         return settings
-
-    def _lines(self, k: int) -> list[tuple[float, float, float]]:
-        """Order, its standard deviation and prior size in rad of each line of a family."""
-        c = self.found.components[k]
-        given, size = dict(c.settings), float(np.exp(self.found.sizes.size[k])) * c.unit
-        numbers = range(1, len(given) // 2 + 1)
-        return [(given[f"order_{n}"], given[f"order_sd_{n}"], size / n) for n in numbers]
 
     def _parameter_sizes(self, k: int) -> Iterator[tuple[str, float]]:
         """Prior size of each parameter of a component that no setting states: key and SI value."""

@@ -351,7 +351,6 @@ def _family_component(dataset: DiagnosisData, family: LineFamily) -> Component:
     parameters = effect.parameters(where, constants.chain, constants.cell)
     typical = [p.typical or 0.0 for p in parameters]
     columns = driven_columns(dataset, effect, where, settings) * np.array(typical) * LINE
-    columns /= np.array([int(p.key.split("_")[1]) for p in parameters])
     kept = tuple((key, v) for key, v in settings.items() if key.startswith("order"))
     return Component(
         "angle", effect, where, columns, LINE, settings=kept, search=family.search,

@@ -139,7 +139,7 @@ def _with_lines(dataset: DiagnosisData, data: NoisyData, found: FittedSum) -> Fi
             joint = found.noise.joint.copy()
             for family in chosen:
                 joint[index(family.where)] = family.scatter
-            fitted = _exchanged(
+            fitted = exchanged(
                 data, replace(found, noise=replace(found.noise, joint=joint)),
                 [c for family in chosen for c in family.instead_of],
                 [family.component for family in chosen if family.component is not None],
@@ -188,7 +188,7 @@ def _reviewed(dataset: DiagnosisData, data: NoisyData, found: FittedSum) -> Fitt
         anew = sought_anew(dataset, found, c)
         others = with_multiples(dataset, c)
         for other in others if anew is None else [anew, *others]:
-            fitted = _exchanged(data, found, [c], [other], refit_noise=False)
+            fitted = exchanged(data, found, [c], [other], refit_noise=False)
             if fitted.score > found.score:
                 found, changed = fitted, True
                 break
@@ -227,7 +227,7 @@ def _spared(data: NoisyData, found: FittedSum) -> FittedSum:
     for c in [found.components[k] for k in order[:SPARED]]:
         if not any(c is other for other in found.components):
             continue
-        fitted = _exchanged(data, found, [c], refit_noise=False)
+        fitted = exchanged(data, found, [c], refit_noise=False)
         if fitted.score > found.score:
             found, spared = fitted, spared + 1
     return fit_sum(data, found.components, found.noise, found.sizes) if spared else found
@@ -241,11 +241,11 @@ def _wider(data: NoisyData, found: FittedSum, more: Sequence[Component]) -> Fitt
     """The sum with these as well, or what is left of them; None where it is no better."""
     if not more:
         return None
-    wider = _exchanged(data, found, [], more)
+    wider = exchanged(data, found, [], more)
     return wider if wider.score > found.score + GAINED else None
 
 
-def _exchanged(
+def exchanged(
     data: NoisyData, found: FittedSum, gone: Sequence[Component],
     more: Sequence[Component] = (), refit_noise: bool = True,
 ) -> FittedSum:  # fmt: skip
@@ -385,7 +385,7 @@ def _swapped(
             break
         _, k, key = best
         tried.add(key)
-        other = _exchanged(data, found, [found.components[k]], [known[key]], refit_noise=False)
+        other = exchanged(data, found, [found.components[k]], [known[key]], refit_noise=False)
         if other.score > found.score:
             found, swapped = other, True
     return fit_sum(data, found.components, found.noise, found.sizes) if swapped else found
@@ -414,13 +414,13 @@ def completed(data: NoisyData, found: FittedSum, components: Sequence[Component]
                 alike = {c.family for c in gone} & {c.family for c in more}
                 if not more or (gone and not alike) or (instead is None and name not in shown):
                     continue
-                fitted = _exchanged(data, found, gone, more, refit_noise=False)
+                fitted = exchanged(data, found, gone, more, refit_noise=False)
                 if fitted.score > (found if better is None else better).score + GAINED:
                     better = fitted
         if better is None:
             # What a kind does at all joints counts as their scatter as long as it is not there.
             hidden = (more for name, more in away.items() if more and more[0].family in OF_JOINTS)
-            fits = (_exchanged(data, found, [], more) for more in hidden)
+            fits = (exchanged(data, found, [], more) for more in hidden)
             better = max(fits, key=lambda fit: fit.score, default=found)
             if better.score <= found.score + GAINED:
                 break

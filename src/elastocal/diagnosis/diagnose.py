@@ -46,7 +46,7 @@ from elastocal.diagnosis.verdict import (
 )
 from elastocal.errors import InputError, InsufficientDataError, option, require
 from elastocal.files import atomic_writer
-from elastocal.identification.findings import BudgetStep
+from elastocal.identification.error_budget import BudgetStep
 from elastocal.identification.mistakes import refuse_nonsense
 from elastocal.identification.start import check_table
 from elastocal.measurements import Measurements
@@ -72,6 +72,7 @@ def write_extended_cell(
     target: str | Path,
     found: Sequence[FoundEffect],
     model_keys: Mapping[str, str] | None = None,
+    keys: Mapping[str, Any] | None = None,
 ) -> Cell:
     """Write the cell file `source` to `target` with the effects `found` switched on; read it back.
 
@@ -79,8 +80,9 @@ def write_extended_cell(
     `[model.nominal.settings]`, the sizes of its parameters, where they were estimated,
     `[model.nominal.sizes]`.  Relative paths are rewritten so that they lead from `target`'s folder
     to the same files; a cell without a name keeps the one that its old file gave it.
-    `model_keys` join [model] as they are.  Comments are not carried over.  Without effects the
-    model is the one that was read.
+    `model_keys` join [model] as they are; with `keys`, which join the whole file by table, nothing
+    is left to be chosen for a plan.  Comments are not carried over.  Without effects the model is
+    the one that was read.
 
     Raises InputError where `source` is no valid cell file or `target` cannot be written.
     """
@@ -91,11 +93,23 @@ def write_extended_cell(
     if found:
         _switch_on(data.setdefault("model", {}), found)
         data["model"] |= dict(model_keys or {})
+    if keys:
+        data.get("design", {}).pop("choose", None)
+        _join(data, keys)
     with atomic_writer(target) as handle:
         handle.write(tomli_w.dumps(data))
         handle.flush()
         # Read before it appears: a cell that cannot be read is not left behind.
         return replace(read_cell(handle.name), path=target)
+
+
+def _join(data: dict[str, Any], keys: Mapping[str, Any]) -> None:
+    """`keys` into `data`, table by table."""
+    for name, value in keys.items():
+        if isinstance(value, Mapping):
+            _join(data.setdefault(name, {}), value)
+        else:
+            data[name] = value
 
 
 def _switch_on(model: dict[str, Any], found: Sequence[FoundEffect]) -> None:
@@ -197,7 +211,7 @@ def diagnose(
     model = with_recorded_drivers(model, table)
     progress("fitting the model as it is")
     base = fit_baseline(model, table, options.seed)
-    refuse_nonsense(model, base.observed, base.x, base.residual)
+    refuse_nonsense(model, base.observed, base.x, base.residual, table)
     hypotheses, untested = possible(model, table, options.without)
     progress("columns of what could be missing")
     dataset = with_likelier_backlash_model(diagnosis_data_of(base, hypotheses))
@@ -208,7 +222,7 @@ def diagnose(
     progress("confirming")
     rng = np.random.default_rng(options.seed)
     few = max(found.chosen.score, found.nothing.score)
-    answer_of_sum = SumAnswer(dataset, full, total, hidden, rng)
+    answer_of_sum = SumAnswer(dataset, full, total, hidden, rng).decided
     gained = compared_score(full, total, found.chosen) - few
     many = gained > CLEARLY and answer_of_sum.n_causes >= MANY
     found = found if many else search.settled(found)

@@ -10,7 +10,7 @@ from typing import Any, Literal
 from elastocal.above import Result
 from elastocal.diagnosis.baseline import Baseline
 from elastocal.errors import option
-from elastocal.identification.findings import BudgetStep
+from elastocal.identification.error_budget import BudgetStep
 from elastocal.identification.result import Finding, Number
 from elastocal.measurements import Measurements
 from elastocal.model.effects.base import Stage

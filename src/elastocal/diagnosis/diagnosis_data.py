@@ -27,13 +27,13 @@ from elastocal.diagnosis.hypotheses import (
     judged_together,
     moments_between,
     recorded,
-    typical_sizes,
 )
 from elastocal.diagnosis.noise_floor import NoiseValues, NoisyData, fit_noise
 from elastocal.measurements import Measurements
 from elastocal.model.effects import CATALOGUE
 from elastocal.model.effects.loads import PayloadError
 from elastocal.model.manipulator import Model
+from elastocal.planning.doubts import usual_sizes
 from elastocal.units import Array, BoolArray, IntArray
 
 KEPT = 20_000_000  # numbers of regressor directions that are kept from scan to scan
@@ -115,7 +115,7 @@ class DiagnosisData:
 
     def sizes_in(self, h: Hypothesis, rows: Array) -> Array:
         """Its typical sizes by columns (n_rows, size, k), what is only planned not counted."""
-        return typical_sizes(h, self.columns.observed(rows)[: self.base.n_measured])
+        return usual_sizes(h.parameters, self.columns.observed(rows)[: self.base.n_measured])
 
     @cached_property
     def directions(self) -> dict[tuple[str, str], RegressorDirection]:

@@ -11,11 +11,12 @@ from scipy.special import logsumexp
 
 from elastocal.diagnosis.baseline import Baseline
 from elastocal.diagnosis.diagnosis_data import DiagnosisData, diagnosis_data_of
-from elastocal.diagnosis.evidence import ANOTHER, SOMETHING, Prior, Scan, exceedance, scan
+from elastocal.diagnosis.evidence import ANOTHER, Prior, Scan, exceedance, scan
 from elastocal.diagnosis.hypotheses import Hypothesis
 from elastocal.diagnosis.model_set import Item, ModelSet, fit_extended, fit_set, refine, signal_of
 from elastocal.diagnosis.noise_floor import NoiseValues, log_prior
 from elastocal.diagnosis.unknown import Generic
+from elastocal.planning.doubts import SOMETHING
 from elastocal.units import Array
 
 # What a search found: the set, what else could stand in each of its places, and the odds.

@@ -15,6 +15,7 @@ from elastocal.diagnosis.diagnosis_data import DiagnosisData
 from elastocal.diagnosis.hypotheses import NO_SETTINGS, SCALES, EntryKey, Hypothesis
 from elastocal.diagnosis.noise_floor import NoiseValues, NoisyData, Projection, project
 from elastocal.diagnosis.unknown import Generic
+from elastocal.planning.doubts import SOMETHING
 from elastocal.units import Array
 
 # Marginal likelihood of a group of columns in closed form.
@@ -130,10 +131,9 @@ def _turned(b: Array, U: Array) -> Array:
 
 # Prior probabilities, fixed before any data: nothing, something unknown, or a known effect.
 
-# Half that nothing more is there; of the rest a twentieth that the catalogue lacks it.
+# SOMETHING that anything is missing; of that a twentieth that the catalogue lacks it.
 # A second effect beside a first is rarer.
-SOMETHING, UNKNOWN = 0.5, 0.05
-ANOTHER = 0.2
+UNKNOWN, ANOTHER = 0.05, 0.2
 
 
 @dataclass(frozen=True)

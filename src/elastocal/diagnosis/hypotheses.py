@@ -439,7 +439,7 @@ class StartSearch:
         X = part.apply(B[rows][:, :, fitted]) * width
         r = base.residual.reshape(-1, size, 1)[chosen]
         r = r + X @ (from_centre(base) / width)[:, None]
-        X, r = ((whitening @ each).reshape(-1, each.shape[2]) for each in (X, r))
+        X, r = ((whitening @ each).reshape(len(part.lead) * size, -1) for each in (X, r))
         r = np.append(r[:, 0], np.zeros(X.shape[1]))
         X = np.vstack([X, np.eye(X.shape[1])])
         return cls(full, h, base, x, part, rows, whitening, X, r)
@@ -591,8 +591,6 @@ def own_columns(full: Model, h: Hypothesis) -> list[int]:
 ENTRIES: tuple[Entry, ...] = (
     JointMotion(), LinkLength(), LinkFrame(), BaseMotion(), MarkerMotion()
 )  # fmt: skip
-# The signal that a parameter without a known size is expected to make, rms over its rows.
-UNSIZED_SIGNAL = 2e-4
 
 
 @dataclass(frozen=True)
@@ -681,19 +679,6 @@ def compute_columns(
         spans.setdefault((p.effect, p.where), []).append(k)
     places = {key: slice(v[0], v[-1] + 1) for key, v in spans.items()}
     return Columns(base, B, places, full, x, shares)
-
-
-def typical_sizes(hypothesis: Hypothesis, columns: Array) -> Array:
-    """Prior standard deviation (k,) of each parameter: its typical size.
-
-    Where none is known, the value whose signal in the columns (…, k) is UNSIZED_SIGNAL rms.
-    """
-    flat = columns.reshape(-1, columns.shape[-1])
-    moved = flat[np.abs(flat).max(axis=1, initial=0.0) > 0]
-    rms = np.sqrt((moved**2).mean(axis=0)) if len(moved) else np.zeros(flat.shape[1])
-    signal = np.divide(UNSIZED_SIGNAL, rms, out=np.zeros(len(rms)), where=rms > 0)
-    sized = zip(signal, hypothesis.parameters, strict=True)
-    return np.array([s if p.typical is None else p.typical for s, p in sized])
 
 
 def _as_placed(model: Model, x: Array) -> Cell:

@@ -31,7 +31,8 @@ from elastocal.diagnosis.model_set import (
 )
 from elastocal.diagnosis.noise_floor import NoiseValues, NoisyData, Projection, noise_draws, project
 from elastocal.diagnosis.stated_floor import supported_floor
-from elastocal.identification.findings import BudgetStep, resampled_rms, stage_of
+from elastocal.identification.error_budget import BudgetStep, resampled_rms
+from elastocal.identification.scrutiny import stage_of
 from elastocal.measurements import Measurements, visits
 from elastocal.model.effects.placements import BaseFrame
 from elastocal.model.manipulator import Model, Regression

@@ -20,16 +20,13 @@ from elastocal.errors import ElastocalError, InputError, option
 from elastocal.export.corrections import corrections_csv
 from elastocal.export.dh_table import CONVENTIONS, FORMULA, dh_csv, dh_lines, without_beta
 from elastocal.export.exportable import (
-    Conditions,
     Cost,
     ExportNumbers,
     Kept,
-    Valued,
     cost_of,
     evaluate_pieces,
     keep,
     link_inertias,
-    random_table,
     rpy,
 )
 from elastocal.export.mjcf_file import RIGID, MujocoRest, calibrated_mjcf
@@ -40,6 +37,7 @@ from elastocal.model.calibrated import CalibratedArm
 from elastocal.model.chain import Chain
 from elastocal.model.effects import effect_of
 from elastocal.model.rigid import nominal_flange
+from elastocal.model.valued import Conditions, Valued, random_table
 from elastocal.text import did_you_mean, json_text, plain
 from elastocal.units import Array
 

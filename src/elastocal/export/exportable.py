@@ -4,10 +4,8 @@ from __future__ import annotations
 
 import math
 from collections import defaultdict
-from collections.abc import Collection
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import Any
 
 import casadi as ca
 import numpy as np
@@ -19,14 +17,21 @@ from elastocal.measurements import Measurements
 from elastocal.model import rigid
 from elastocal.model.arm import Arm
 from elastocal.model.calibrated import CalibratedArm
-from elastocal.model.chain import Chain, LinkMass, finite_ranges, joint_limits
+from elastocal.model.chain import Chain, LinkMass
 from elastocal.model.effects import CATALOGUE
 from elastocal.model.effects.base import Format
 from elastocal.model.effects.compliances import JointCompliance
-from elastocal.model.effects.loads import LinkGravity
 from elastocal.model.manipulator import Model
 from elastocal.model.symbolic import SymbolicArm
 from elastocal.model.urdf import urdf_bytes
+from elastocal.model.valued import (
+    RECORDED,
+    Conditions,
+    Valued,
+    part_of,
+    random_table,
+    unstated_needs,
+)
 from elastocal.units import Array
 
 
@@ -68,43 +73,6 @@ def origin_attributes(T: Array) -> dict[str, str]:
 # What a spring in a file cannot follow, named like effects among the omissions.
 LEVELS, LINEAR, NEGATIVE = "levels of a joint", "linear deflections", "negative compliance"
 OPTIONS = {"time": "time_s", "temperature": "temperature_c"}  # which state what an effect needs
-RECORDED = {"torque": "recorded torques"}  # what an effect needs and only a table has
-
-
-@dataclass(frozen=True)
-class Conditions:
-    """What the arm is compared under: force (3,) N in the tracker frame at the load point, time
-    in s and temperature in °C of the table's columns (None: not stated)."""
-
-    force: Array = field(default_factory=lambda: np.zeros(3))
-    time: float | None = None
-    temperature: float | None = None
-
-    def state(self, need: str) -> bool:
-        """Is what an effect needs ("time", "temperature", …) stated here?"""
-        return need not in RECORDED and getattr(self, need, 0.0) is not None
-
-
-@dataclass(frozen=True)
-class Valued:
-    """A model and the values x (parameters,) to evaluate it at."""
-
-    model: Model
-    x: Array
-
-    @property
-    def values(self) -> dict[str, float]:
-        """Name → value in SI units."""
-        return dict(zip(self.model.names, map(float, self.x), strict=True))
-
-    @property
-    def effects(self) -> list[str]:
-        """Active effects in the catalogue's order, link weights included, the load left out."""
-        spec = self.model.cell.model
-        active = {choice.name for choice in spec.effects}
-        if spec.link_gravity:
-            active.add(LinkGravity.name)
-        return [name for name in CATALOGUE if name in active]
 
 
 @dataclass(frozen=True)
@@ -155,16 +123,11 @@ def keep(calibrated: CalibratedArm, elastic: bool, conditions: Conditions) -> Ke
     Springs follow the load's torque at the deflected pose, whatever `[model] torque` says: a
     file has no column of measured torques.
     """
-    cell = calibrated.model.cell
     chosen = Valued(calibrated.model, calibrated.x).effects
     instrument = tuple(name for name in chosen if CATALOGUE[name].of_the_measurement)
-    unstated = {
-        name: [need for need in CATALOGUE[name].needed(cell) if not conditions.state(need)]
-        for name in chosen
-        if name not in instrument
-    }
+    unstated = unstated_needs(calibrated, conditions)
     stated = [name for name, needs in unstated.items() if not needs]
-    full = _part(calibrated, stated)
+    full = part_of(calibrated, stated)
     format: Format = "elastic" if elastic else "rigid"
     dropped = {}  # effects whose values no physical spring or body has, with the reason
     for name in full.effects if elastic else ():
@@ -174,7 +137,7 @@ def keep(calibrated: CalibratedArm, elastic: bool, conditions: Conditions) -> Ke
         name for name in stated if format in CATALOGUE[name].formats and name not in dropped
     ]
     omissions = [
-        Omission(name, dropped.get(name, ""), _part(calibrated, set(stated) - {name}))
+        Omission(name, dropped.get(name, ""), part_of(calibrated, set(stated) - {name}))
         for name in stated
         if name not in kept_names
     ]
@@ -182,28 +145,13 @@ def keep(calibrated: CalibratedArm, elastic: bool, conditions: Conditions) -> Ke
         if needs:
             missing = " and ".join(RECORDED.get(need) or option(OPTIONS[need]) for need in needs)
             omissions.append(Omission(name, f"no cost without {missing}", None))
-    exported = full if len(kept_names) == len(stated) else _part(calibrated, kept_names)
+    exported = full if len(kept_names) == len(stated) else part_of(calibrated, kept_names)
     if elastic:
         exported, changed = _as_springs(exported)
         omissions += [
             Omission(effect, sentence, _as_springs(full, effect)[0]) for effect, sentence in changed
         ]
     return Kept(full, exported, conditions, tuple(omissions), instrument)
-
-
-def _part(calibrated: CalibratedArm, names: Collection[str]) -> Valued:
-    """The calibrated model with the effects `names` alone."""
-    cell = calibrated.model.cell
-    spec = cell.model
-    spec = replace(
-        spec,
-        effects=tuple(choice for choice in spec.effects if choice.name in names),
-        link_gravity=spec.link_gravity and LinkGravity.name in names,
-        observe="position",
-        torque="computed",
-    )
-    model = Model.assembled(calibrated.model.chain, replace(cell, model=spec))
-    return Valued(model, np.array([calibrated.values[name] for name in model.names]))
 
 
 def _as_springs(part: Valued, only: str | None = None) -> tuple[Valued, list[tuple[str, str]]]:
@@ -429,22 +377,6 @@ def cost_of(kept: Kept, poses: int, seed: int) -> Cost:
         unsettled=int((~settled).sum()),
         force=kept.conditions.force,
     )
-
-
-def random_table(model: Model, conditions: Conditions, poses: int, seed: int) -> Measurements:
-    """`poses` random poses, a row each, with every column that the arm's effects may ask for."""
-    cell, chain = model.cell, model.chain
-    rng = np.random.default_rng(seed)
-    low, high = finite_ranges(chain, *joint_limits(cell, chain))
-    q = rng.uniform(low, high, (poses, chain.n_joints))
-    for joint, levels in cell.model.compliance_levels.items():
-        q[:, int(joint.removeprefix("joint")) - 1] = rng.choice(levels, poses)
-    stated = {"time": conditions.time, "temperature": conditions.temperature}
-    more: dict[str, Any] = {k: np.full(poses, v) for k, v in stated.items() if v is not None}
-    return Measurements.of_poses(
-        "random poses", q, conditions.force, marker_names=tuple(cell.tool.markers)[:1],
-        approach=rng.choice([-1.0, 1.0], (poses, chain.n_joints)), **more,
-    )  # fmt: skip
 
 
 def _positions(part: Valued, table: Measurements, points: Array) -> Array:

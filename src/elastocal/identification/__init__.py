@@ -7,8 +7,9 @@ ROOMS = {
     "constrained": "ActiveConstraint constrained_fit minimise objective_of",
     "constrained_solver": "ConstrainedObjective ResidualLoss",
     "covariance": "Covariance cluster_robust hc t_quantile",
+    "error_budget": "BudgetStep gap_budget",
     "faulty_readings": "FaultyGroup OutlierReport outlier_report",
-    "findings": "BudgetStep gap_budget judged next_steps standings warning_sentences",
+    "findings": "judged next_steps standings warning_sentences",
     "intervals": "cluster_by_parts profile_interval profile_of worth_clustering",
     "knowledge": (
         "Bounds Constraints GaussianPrior Knowledge KnowledgeTable LinearEquality "

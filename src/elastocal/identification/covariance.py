@@ -24,18 +24,35 @@ class Covariance:
     `dof` (p,) belongs to the variance of each parameter on its own: infinite where the variance
     is known, 0 where the estimator cannot tell it (the interval is then unbounded).  The interval
     of a combination Cx needs its own dof: pass B C⁻¹ to the estimator, whose result then refers
-    to Cx.
+    to Cx.  `among`: where it is the mean of covariances under several models, their weights and
+    matrices.
     """
 
     kind: str
     matrix: Array
     dof: Array
     description: str
+    among: tuple[tuple[float, Array], ...] = ()
 
     @property
     def std(self) -> Array:
         """Standard deviations (p,); infinite where `dof` is 0."""
         return np.where(self.dof > 0, np.sqrt(np.diag(self.matrix)), np.inf)
+
+    def dof_of(self, rows: Array) -> Array:
+        """Degrees of freedom (n,) of `variance_of` the combinations rows (n, k, p).
+
+        Satterthwaite's 2 v²/var(v̂): what a typical parameter has, and what models differ by.
+        """
+        typical = float(np.median(self.dof)) if len(self.dof) else np.inf
+        if not self.among:
+            return np.full(len(rows), typical)
+        v = np.maximum(variance_of(rows, self.matrix), 1e-300)
+        between = sum(
+            (w * (variance_of(rows, matrix) - v) ** 2 for w, matrix in self.among),
+            np.zeros(len(v)),
+        )
+        return np.asarray(1 / (1 / max(typical, 1e-300) + between / (2 * v**2)))
 
     def interval(self, x: Array, level: float = 0.95) -> Array:
         """x_j ± t_{dof_j}((1 + level)/2) · std_j as (p, 2), for the estimate x (p,).
@@ -49,6 +66,11 @@ class Covariance:
         )
         half = t_quantile(level, self.dof) * self.std
         return np.column_stack([x - half, x + half])
+
+
+def variance_of(rows: Array, covariance: Array) -> Array:
+    """tr(A_i C A_iᵀ) (n,), the variances of all combinations A_i of rows (n, k, p) together."""
+    return np.asarray(((rows @ covariance) * rows).sum(axis=(1, 2)))
 
 
 def t_quantile(level: float, dof: Array) -> Array:

@@ -8,6 +8,7 @@ from typing import Any
 import numpy as np
 from scipy import linalg
 
+from elastocal.identification.covariance import variance_of
 from elastocal.identification.faulty_readings import report_faulty
 from elastocal.identification.findings import judged, of_solution, warning_sentences
 from elastocal.identification.methods import MethodResult, is_exact
@@ -19,11 +20,19 @@ from elastocal.identification.prediction import (
     over_the_workspace,
     predicted_error,
 )
-from elastocal.identification.residuals import ResidualSummary, rms_3d, summarise_residuals
+from elastocal.identification.residuals import (
+    ResidualSummary,
+    rms_3d,
+    summarise_residuals,
+    told_by_one,
+)
 from elastocal.identification.result import Calibration, Combination, Estimate
+from elastocal.identification.scrutiny import MOST_NUMBERS
 from elastocal.identification.solve import Solution, residual_sigma
 from elastocal.model.arm import Parameter
+from elastocal.model.calibrated import ShownPoses
 from elastocal.model.manipulator import Model
+from elastocal.model.observations import Observations
 from elastocal.units import Array, BoolArray
 
 CORRELATED = 0.9
@@ -59,7 +68,7 @@ def summarise(
         combinations=combinations,
         x=final.x,
         determined=determined,
-        covariance=covariance,
+        spread=found.intervals.covariance,
         correlations=_correlations(covariance, determined, ~model.shrunk[kept]),
         observations=observed,
         residual=final.residual,
@@ -92,15 +101,32 @@ def summarise(
         weights=solution.problem.weights,
         noise_parts=noise_parts(found),
     )
-    dofs = found.intervals.covariance.dof
+    result = replace(result, shown=_shown(solution, covariance, found.leverage))
     predicted = predicted_error(
-        result.arm, observed, result.excess, float(np.median(dofs)) if len(dofs) else np.inf,
+        result.arm, observed, result.excess, result.spread,
         new_poses or over_the_workspace(model.cell, model, observed.table),
-        np.random.default_rng(0),
+        np.random.default_rng(0), _unchecked(result, solution),
     )  # fmt: skip
     result = replace(result, predicted=predicted)
     result = judged(result, of_solution(result, solution))
     return replace(result, warnings=found.warnings + warning_sentences(result))
+
+
+def _unchecked(result: Calibration, solution: Solution) -> Array | None:
+    """What single configurations alone hold (`told_by_one`); None where it is not to be had."""
+    observed, kept = result.observations, solution.reduction.kept
+    lone = ~np.isfinite(result.held_out)
+    weights = solution.problem.weights
+    if not lone.any():
+        return np.zeros((len(kept), len(kept)))
+    usual = not (
+        result.prior_share or result.smooth or result.active or weights.together is not None
+    )
+    if not usual or len(lone) * len(kept) > MOST_NUMBERS:
+        return None
+    B = result.model.regressor(observed.table, result.x, kept, observed).B
+    configuration = np.repeat(observed.configuration, observed.size)
+    return told_by_one(weights.apply(B), np.where(lone, configuration, -1))
 
 
 def _residual_summary(solution: Solution, leverage: Array | None) -> ResidualSummary | None:
@@ -124,6 +150,34 @@ def leverage_of(solution: Solution, known: Array | None) -> Array | None:
     R = fit.r_factor.R[: len(fit.columns)]
     Q = linalg.solve_triangular(R, problem.weights.apply(fit.B).T, trans="T")
     return np.minimum((Q**2).sum(axis=0), 1.0)
+
+
+def uncertainty_of(
+    observed: Observations, B: Array, covariance: Array, left: Array | float = 1.0
+) -> Array:
+    """Standard deviation (configurations,) in m that the fit's own uncertainty gives a predicted
+    position, mean square over a configuration's readings; B (rows, determined).
+
+    A row that the fit holds with leverage h is known with variance v there, with v/(1 − h) by the
+    fit to the others; `left` (rows,) are 1 − h.
+    """
+    B = (B.T / np.sqrt(left)).T.reshape(-1, observed.size, B.shape[1])
+    each = variance_of(B[:, :3], covariance)
+    _, code = np.unique(observed.configuration, return_inverse=True)
+    return np.asarray(np.sqrt(np.bincount(code.ravel(), each) / np.bincount(code.ravel())))
+
+
+SEEN_BY_OTHERS = 1e-6  # of a row: the least that other configurations must see of it
+
+
+def _shown(solution: Solution, covariance: Array, known: Array | None) -> ShownPoses | None:
+    """How sure the fit is where it was measured; None where the table is too large to say."""
+    observed, leverage = solution.problem.observations, leverage_of(solution, known)
+    if solution.problem.large or leverage is None or not np.isfinite(covariance).all():
+        return None
+    left = np.maximum(1 - leverage, SEEN_BY_OTHERS)
+    std = uncertainty_of(observed, solution.fit.B, covariance, left)
+    return ShownPoses(float(std.max()), len(std))
 
 
 def _estimates(

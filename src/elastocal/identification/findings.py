@@ -4,169 +4,22 @@ from __future__ import annotations
 
 import math
 from collections.abc import Iterable, Iterator
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 from scipy import linalg, stats
 
-from elastocal.errors import ElastocalError, option
+from elastocal.errors import option
 from elastocal.identification.assumptions import assumption_findings
 from elastocal.identification.mistakes import unheard_of
 from elastocal.identification.noise_structure import JOINTS, TIME
 from elastocal.identification.outliers import Outlier, blocks
-from elastocal.identification.residuals import ResidualSummary, held_out_residual
+from elastocal.identification.residuals import ResidualSummary
 from elastocal.identification.result import Calibration, Estimate, Finding, Number, Severity
-from elastocal.identification.scrutiny import stage_of
-from elastocal.identification.solve import WORTH_A_COLUMN, Solution, reduce
-from elastocal.identification.weighted_problem import weights_for
-from elastocal.model.manipulator import Model
-from elastocal.text import listed
-from elastocal.units import Array
-
-# Where the error of the nominal arm goes, step by step, as an identification can tell it.
-
-STAGES = ("nominal_arm", "geometry", "compliance", "smooth functions")
-MOST_NUMBERS = 30_000_000  # of a regressor held at once; larger tables get no budget
-STEPS, SETTLED = 4, 1e-3  # Gauss-Newton steps, and the relative gain that ends them
-DRAWS = 1000
-FEWEST_REPEATS = 10  # degrees of freedom within repeats from which on they tell the noise
-
-
-@dataclass(frozen=True)
-class BudgetStep:
-    """A step of a gap budget: 3-D rms error (m) on configurations left out of the fit."""
-
-    step: str
-    heldout_rms: float
-    ci95: tuple[float, float]
-
-
-@dataclass(frozen=True)
-class ErrorBudget:
-    """The steps, and what noise alone gives (m, None where nothing says it), in words."""
-
-    steps: tuple[BudgetStep, ...]
-    floor: float | None
-    floor_name: str
-
-
-def gap_budget(result: Calibration) -> ErrorBudget | None:
-    """Held-out 3-D errors as the model gains base and markers, geometry, compliance, smooth
-    functions.
-
-    Each step fits the parameters of its stages that the whole fit determined, the later ones held
-    at nominal, by a few Gauss-Newton steps from the whole fit; each configuration is predicted by
-    the fit to the others (`held_out_residual`), the last step as the result has it.  The first
-    step is "nominal_arm", with base and markers placed by the other configurations.  Intervals are
-    by resampling configurations.  None where some configuration cannot be left out, and for tables
-    too large to do it in passing.
-    """
-    model = result.model
-    if len(result.residual) * len(result.determined) > MOST_NUMBERS:
-        return None
-    if not np.isfinite(result.held_out).all():
-        return None
-    stage = np.array([stage_of(p.effect) for p in model.parameters], dtype=np.int64)
-    stage[model.shrunk] = len(STAGES) - 1
-    determined = np.isin(model.names, result.determined)
-    last = int(stage[determined].max(initial=0))
-    rng = np.random.default_rng(0)
-    steps = []
-    for k in range(last):
-        if k and not (determined & (stage == k)).any():
-            continue
-        residual = _fitted(result, np.flatnonzero(determined & (stage <= k)), stage > k)
-        if residual is not None:
-            steps.append(_step(STAGES[k], result, residual, rng))
-    steps.append(_step(STAGES[last], result, result.held_out, rng))
-    return ErrorBudget(tuple(steps), *_floor(result))
-
-
-def _fitted(
-    result: Calibration, columns: NDArray[np.int64], held: NDArray[np.bool_]
-) -> Array | None:
-    """Held-out residual (rows,) with `columns` fitted and the parameters `held` at nominal."""
-    model, observed = result.model, result.observations
-    weights = weights_for(observed, model.cell.tracker, "auto")
-    x = np.where(held, model.nominal, result.x)
-    best: tuple[float, Array, Array] | None = None
-    try:
-        for _ in range(STEPS):
-            at = model.regressor(observed.table, x, columns, observed)
-            error = weights.apply(at.residual)
-            if best is None and result.smooth and len(columns):
-                # What has a prior in the whole fit has none here: a minimal complete set.
-                own = _worth_a_column(model, columns, weights.apply(at.B), error)
-                columns, at = columns[own], replace(at, B=at.B[:, own])
-            cost = float(error @ error)
-            if best is not None and cost > (1 - SETTLED) * best[0]:
-                break
-            best = cost, at.B, at.residual
-            if not len(columns):
-                break
-            x = x.copy()
-            x[columns] += np.linalg.lstsq(weights.apply(at.B), error, rcond=None)[0]
-    except (ElastocalError, np.linalg.LinAlgError):
-        return None  # the arm without its compliances stands nowhere near: no step of a budget
-    assert best is not None
-    _, B, residual = best
-    if not len(columns):
-        return residual
-    found = held_out_residual(B, residual, weights, observed.configuration, observed.size)
-    return found if np.isfinite(found).all() else None
-
-
-def _worth_a_column(
-    model: Model, columns: NDArray[np.int64], B: Array, error: Array
-) -> NDArray[np.int64]:
-    """Which columns of the whitened B make up a minimal complete set beside this residual."""
-    sigma = max(float(np.sqrt(np.mean(error**2))), 1e-300)
-    own = tuple(model.parameters[c] for c in columns)
-    sizes = np.array([p.typical or 1.0 for p in own])
-    return reduce(B, sizes, own, sigma, WORTH_A_COLUMN).kept
-
-
-def _step(name: str, result: Calibration, residual: Array, rng: np.random.Generator) -> BudgetStep:
-    observed = result.observations
-    squared = (residual.reshape(-1, observed.size)[:, :3] ** 2).sum(axis=1)
-    _, code = np.unique(observed.configuration, return_inverse=True)
-    rms, ci95 = resampled_rms(np.bincount(code, squared), np.bincount(code), rng)
-    return BudgetStep(name, rms, ci95)
-
-
-def _floor(result: Calibration) -> tuple[float | None, str]:
-    """What repeats scatter, else what the stated noise gives."""
-    observed = result.observations
-    force = np.round(observed.table.force[observed.lead], 3)
-    key = np.column_stack([observed.configuration, observed.table.marker[observed.lead], force])
-    _, code = np.unique(key, axis=0, return_inverse=True)
-    code = code.ravel()
-    parts = result.residual.reshape(-1, observed.size)[:, :3]
-    dof = len(parts) - int(code.max()) - 1
-    if dof >= FEWEST_REPEATS:
-        count = np.bincount(code)
-        mean = np.column_stack([np.bincount(code, p) / count for p in parts.T])
-        return float(np.sqrt(((parts - mean[code]) ** 2).sum() / dof)), "repeats alone"
-    ratio = result.noise.ratio_to_stated
-    if ratio:
-        scatter = result.residual_rms * float(np.sqrt(len(result.residual) / result.dof))
-        return scatter / float(ratio), "stated noise"
-    return None, ""
-
-
-def resampled_rms(
-    squares: NDArray[Any], count: NDArray[Any], rng: np.random.Generator
-) -> tuple[float, tuple[float, float]]:
-    """The rms √(Σ squares / Σ count) of configurations (C,) and its 95 % interval, by weights that
-    a Dirichlet distribution draws for them (the Bayesian bootstrap)."""
-    rms = float(np.sqrt(squares.sum() / count.sum()))
-    weight = rng.dirichlet(np.ones(len(squares)), DRAWS)
-    drawn = np.sqrt((weight @ squares) / (weight @ count))
-    low, high = np.quantile(drawn, [0.025, 0.975])
-    return rms, (float(low), float(high))
-
+from elastocal.identification.solve import Solution
+from elastocal.text import gathered, listed
 
 # What a result is worth, judged once: each finding with its numbers, its threshold and a remedy.
 #
@@ -296,9 +149,15 @@ def _few_poses(result: Calibration) -> Iterator[Finding]:
             "Measure more poses.",
         )  # fmt: skip
     if not math.isfinite(result.heldout_rms):
-        # Test data tell what held-out poses cannot.
-        severity: Severity = "care" if result.test is None else "note"
-        yield Finding("not_held_out", severity, {}, _more_poses())
+        # Test data check it; it matters little where it is the smaller part of the error.
+        found, numbers = result.predicted, dict[str, Number]()
+        if found is not None and math.isfinite(found.unchecked):
+            numbers = {"unchecked_um": _um(found.unchecked), "rms_um": _um(found.rms)}
+        little = found is not None and found.unchecked**2 <= MOSTLY * found.rms**2
+        severity: Severity = "note" if little or result.test is not None else "care"
+        yield Finding(
+            "not_held_out", severity, numbers, _more_poses() if severity == "care" else ""
+        )
 
 
 def _more_poses() -> str:
@@ -375,7 +234,8 @@ def _visits(result: Calibration) -> Iterator[Finding]:
                 "sigma_urad": tuple(_um(s.sigma) for s in joints if s.sigma is not None),
             },
             "Measure more poses rather than one pose longer, and approach each from the same side: "
-            "the joints settle anew at every visit.",
+            "the joints settle anew at every visit. The cell's [noise] joints_urad lets design and "
+            "simulate count with it.",
         )  # fmt: skip
     drifts = [s for s in sizes if s.drift and s.sigma]
     if noise.drift is not None and drifts and p.get(TIME, 1.0) < SCATTERS:
@@ -389,7 +249,8 @@ def _visits(result: Calibration) -> Iterator[Finding]:
             },
             "Measure poses and loads in random order, return to a reference pose every ten poses, "
             + ("" if seconds is not None else "record times, ")
-            + "and let arm and tracker warm up.",
+            + "and let arm and tracker warm up. The cell's [noise] drift_um lets design and "
+            "simulate count with it.",
         )  # fmt: skip
 
 
@@ -697,13 +558,28 @@ SENTENCES = {
         "that the model lacks in some load state, marker or region. {remedy}"
     ),
 }
+# The same of several parameters, whose names are told together.
+OF_SEVERAL = {
+    "at_bound": "{named} stand at their bound {bound:g} {unit}; they are held there and have no "
+    "interval. {remedy}",
+    "beyond_bound": "{named} lie beyond their physical bound {bound:g} {unit} ({values}): {remedy}",
+}
 
 
 def warning_sentences(result: Calibration) -> tuple[str, ...]:
-    """The findings that call for attention as sentences that name the remedy."""
+    """The findings that call for attention as sentences that name the remedy; of those that are
+    alike one sentence."""
     told: list[str] = []
+    alike: dict[tuple[Any, ...], list[Finding]] = {}
     for f in result.findings:
-        if f.kind == "faulty_readings":
+        if f.kind in OF_SEVERAL:
+            alike.setdefault((f.kind, f.numbers["bound"], f.numbers["unit"]), []).append(f)
+    for f in result.findings:
+        same = alike.get((f.kind, f.numbers.get("bound"), f.numbers.get("unit")), [])
+        if len(same) > 1:
+            if f is same[0]:
+                told.append(_of_several(same))
+        elif f.kind == "faulty_readings":
             told += _faulty_readings(result)
         elif f.kind in SENTENCES and f.numbers.get("counted_by", "nothing") == "nothing":
             words = {k: ", ".join(map(_word, v)) if isinstance(v, tuple) else v
@@ -714,6 +590,16 @@ def warning_sentences(result: Calibration) -> tuple[str, ...]:
             remedy = f.remedy[:1].lower() + f.remedy[1:] if within else f.remedy
             told.append(SENTENCES[f.kind].format(**words, remedy=remedy))
     return tuple(told)
+
+
+def _of_several(same: list[Finding]) -> str:
+    first, remedy = same[0].numbers, same[0].remedy
+    if "std" in first:
+        remedy = remedy[:1].lower() + remedy[1:]
+    values = [f"{f.numbers.get('value', 0):.3g} ± {f.numbers.get('std', 0):.2g}" for f in same]
+    named = gathered(str(f.numbers["parameter"]) for f in same)
+    words = first | {"remedy": remedy, "named": named, "values": listed(values, 4)}
+    return OF_SEVERAL[same[0].kind].format(**words)
 
 
 def _word(value: float | str) -> str:

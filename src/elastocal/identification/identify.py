@@ -8,7 +8,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from elastocal.errors import ElastocalError
-from elastocal.identification.estimates import leverage_of, summarise
+from elastocal.identification.estimates import summarise, uncertainty_of
 from elastocal.identification.findings import judged
 from elastocal.identification.methods import (
     MethodResult,
@@ -94,7 +94,7 @@ def identify(
         faulty, sound = find_faulty(every, refit)
     if 0 < faulty.mean() < 1:
         sound = refit(~faulty, final=True)
-    refuse_nonsense(model, sound.problem.observations, sound.fit.x, sound.fit.residual)
+    refuse_nonsense(model, sound.problem.observations, sound.fit.x, sound.fit.residual, table)
     if smooth:
         found = with_smooth(every, sound, faulty, free, options, progress)
     else:
@@ -107,8 +107,7 @@ def identify(
     result = summarise(model, every, sound, found, outliers, new_poses, copies)
     if test is None:
         return result
-    known = None if sound.problem.large else found
-    return judged(replace(result, test=_test_errors(model, result, test, known)))
+    return judged(replace(result, test=_test_errors(model, result, test)))
 
 
 def _kept_where_sensible(
@@ -162,49 +161,20 @@ def _solution(
     return solution
 
 
-def _test_errors(
-    model: Model, result: Calibration, table: Measurements, found: MethodResult | None
-) -> TestErrors:
-    """`found`, where given, says how sure the fit is of each reading."""
+def _test_errors(model: Model, result: Calibration, table: Measurements) -> TestErrors:
     observed = observe(table, model.observe)
     parts = partition(observed, Weights("none", None, False, ""), len(model.parameters))
     error = residual_at(model, parts, result.x)
     length = np.linalg.norm(error.reshape(-1, observed.size)[:, :3], axis=1)
     rms = rms_3d(error, observed.size)
-    errors = TestErrors(rms, float(length.mean()), float(length.max()), len(length))
-    leverage = None if found is None else leverage_of(found.solution, found.leverage)
-    if leverage is None or not np.isfinite(result.covariance).all():
+    errors = TestErrors(rms, float(length.mean()), float(length.max()), len(length), errors=length)
+    if result.shown is None:
         return errors
-    here = _uncertainty(result, observed)
-    there = _uncertainty(result, result.observations, np.maximum(1 - leverage, SEEN_BY_OTHERS))
-    most, far = float(there.max()), int((here > there.max()).sum())
-    return replace(
-        errors, std=float(np.sqrt(np.mean(here**2))), most_fitted=most, far=far,
-        configurations=len(here), p_far=_exceedance(far, len(here), len(there)),
-    )  # fmt: skip
-
-
-SEEN_BY_OTHERS = 1e-6  # of a row: the least that other configurations must see of it
-
-
-def _uncertainty(result: Calibration, observed: Observations, left: Array | float = 1.0) -> Array:
-    """Standard deviation (configurations,) in m that the fit's own uncertainty gives a predicted
-    position, mean square over a configuration's readings.
-
-    A row that the fit holds with leverage h is known with variance v there, with v/(1 − h) by the
-    fit to the others; `left` (rows,) are 1 − h.
-    """
-    model = result.model
     columns = np.array([model.names.index(name) for name in result.determined], dtype=np.int64)
-    B = model.regressor(observed.table, result.x, columns, observed).B
-    variance = np.maximum(((B @ result.covariance) * B).sum(axis=1), 0.0) / left
-    each = variance.reshape(-1, observed.size)[:, :3].sum(axis=1)
-    _, code = np.unique(observed.configuration, return_inverse=True)
-    return np.asarray(np.sqrt(np.bincount(code.ravel(), each) / np.bincount(code.ravel())))
-
-
-def _exceedance(beyond: int, n: int, fitted: int) -> float:
-    """Probability that so many of n poses or more lie beyond all of the `fitted` ones, were all
-    drawn alike: Π (n − i)/(n + fitted − i), i < beyond, as for any exchangeable numbers."""
-    i = np.arange(beyond)
-    return float(np.prod((n - i) / (n + fitted - i)))
+    B = model.regressor(table, result.x, columns, observed).B
+    here = uncertainty_of(observed, B, result.covariance)
+    far = int((here > result.shown.most).sum())
+    return replace(
+        errors, std=float(np.sqrt(np.mean(here**2))), most_fitted=result.shown.most, far=far,
+        configurations=len(here), p_far=result.shown.chance(far, len(here)),
+    )  # fmt: skip

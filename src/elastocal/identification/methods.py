@@ -19,6 +19,7 @@ from elastocal.identification.noise_choice import (
     estimate_noise,
     linearised,
     outlier_screening,
+    over_times,
     settle,
     weights_of,
 )
@@ -92,7 +93,7 @@ def _settled(
             break
     # One that ended at a bound is held there and no longer a column.
     fitted = readings.take(now).of_columns(np.isin(kept, solution.reduction.kept))
-    final = estimate_noise(fitted, noise.kind, noise)
+    final = over_times(estimate_noise(fitted, noise.kind, noise), fitted)
     final = replace(final, trials=noise.trials, reason=noise.reason, tests=noise.tests)
     return solution, final, now
 
@@ -322,7 +323,7 @@ def _holding(
         readings = linearised(problem.model, observed, fit.x, reduction.kept)
         if len(problem.observations.lead) < len(found.good):
             readings = readings.take(found.good)
-        again = estimate_noise(readings, noise.kind, noise)
+        again = over_times(estimate_noise(readings, noise.kind, noise), readings)
         noise = replace(again, trials=noise.trials, reason=noise.reason, tests=noise.tests)
     intervals = intervals_of(solution, options.intervals, noise, options.seed, options.jobs)
     return replace(found, solution=solution, intervals=intervals, noise=noise)

@@ -19,6 +19,7 @@ from elastocal.cell.work_cell import Cell
 from elastocal.errors import InsufficientDataError
 from elastocal.identification.start import RegistrationProblem, register
 from elastocal.measurements import Measurements
+from elastocal.model.chain import Chain
 from elastocal.model.effects import effect_of
 from elastocal.model.effects.base import index
 from elastocal.model.effects.compliances import (
@@ -43,13 +44,17 @@ CONFIRMED = 2  # corrections that are tried in earnest
 @dataclass(frozen=True)
 class NominalFit:
     """Median distance `error` (m) of the readings from the nominal arm with base and markers
-    fitted; `warning` names what would make them fit, "" where they do."""
+    fitted; `warning` names what would make them fit, "" where they do; `mended`: a mistake undone
+    makes them."""
 
     error: float
     warning: str
+    mended: bool = False
 
 
-def nominal_fit(cell: Cell, table: Measurements, spherical: bool = False) -> NominalFit | None:
+def nominal_fit(
+    chain: Chain, cell: Cell, table: Measurements, spherical: bool = False
+) -> NominalFit | None:
     """How well readings fit the nominal arm, and which mistake undone would mend it; None where
     they hold no positions, too few poses, or numbers beyond all measure.
 
@@ -60,7 +65,7 @@ def nominal_fit(cell: Cell, table: Measurements, spherical: bool = False) -> Nom
         return None
     # The nominal arm without effects, its markers at the flange.
     tool = Tool(cell.tool.load_point, {name: np.zeros(3) for name in table.marker_names})
-    rigid = Model(replace(cell, tool=tool, model=ModelSpec()))
+    rigid = Model.assembled(chain, replace(cell, tool=tool, model=ModelSpec()))
     light = np.flatnonzero(~np.any(table.force != 0, axis=1))
     rows = light if len(light) >= FEWEST_POSES else np.arange(len(table))
     if len(rows) > SAMPLE:
@@ -77,7 +82,8 @@ def nominal_fit(cell: Cell, table: Measurements, spherical: bool = False) -> Nom
     best, words = min(tried, key=lambda t: t[0])
     said = f"the readings fit the nominal arm only to {error * 1e3:.3g} mm"
     if best < error / BETTER:
-        return NominalFit(error, f"{said}; {words} they would fit to {best * 1e3:.3g} mm")
+        told = f"{said}; {words} they would fit to {best * 1e3:.3g} mm"
+        return NominalFit(error, told, best <= POOR)
     return NominalFit(
         error,
         f"{said}, and neither another unit, sign or coupling of a joint nor a shift by one pose "
@@ -116,6 +122,13 @@ def _linear_error(model: Model, table: Measurements) -> float:
     if not 0.75**3 < volume < 1.25**3:
         return np.inf
     return float(np.sqrt(np.mean((matrix @ x - target) ** 2)))
+
+
+def _placed(model: Model, table: Measurements) -> bool:
+    """Whether positions, if there are any, agree with the nominal arm at first sight."""
+    if table.position is None or np.abs(table.position).max() > FARTHEST:
+        return True
+    return _linear_error(model, table.take(np.arange(min(len(table), SAMPLE)))) <= POOR
 
 
 def _corrections(table: Measurements, spherical: bool) -> Iterator[tuple[str, Measurements]]:
@@ -267,10 +280,14 @@ POOREST = 0.05
 LARGEST = 10.0  # a fitted length, over that of the arm and the distance of the readings
 
 
-def refuse_nonsense(model: Model, observed: Observations, x: Array, residual: Array) -> None:
+def refuse_nonsense(
+    model: Model, observed: Observations, x: Array, residual: Array, every: Measurements
+) -> None:
     """Raise InsufficientDataError, with the likely cause, where a fit is none of this robot.
 
-    `x` (parameters,) and `residual` (N·size,) of the fit in SI units.
+    `x` (parameters,) and `residual` (N·size,) of the fit in SI units; `every` reading is looked at
+    for the cause, since few may be left in `observed`.  Deflections are small whatever the mistake:
+    there positions that a mistake undone makes fit are enough.
     """
     parts = residual.reshape(-1, observed.size)[:, :3]
     error = float(np.median(np.linalg.norm(parts, axis=1))) if len(parts) else 0.0
@@ -283,13 +300,20 @@ def refuse_nonsense(model: Model, observed: Observations, x: Array, residual: Ar
     far = 0.0 if table.position is None else float(np.abs(table.position).max())
     lengths = np.array([p.unit == "m" for p in model.parameters], dtype=bool)
     beyond = np.flatnonzero(lengths & ~(np.abs(x) <= LARGEST * (length + far)))
-    if np.isfinite(error) and error <= POOREST * length and not len(beyond):
+    sane = np.isfinite(error) and error <= POOREST * length and not len(beyond)
+    if sane and (observed.kind != "deflection" or _placed(model, every)):
+        return
+    fit = nominal_fit(model.chain, model.cell, every)
+    if sane:
+        if fit is not None and fit.mended:
+            raise InsufficientDataError(
+                f"{table.source}: no deflections of this arm: {fit.warning}"
+            )
         return
     what = f"after the fit the readings are {error:.3g} m (median) from the model"
     if len(beyond):
         k = int(beyond[0])
         what += f", whose {model.parameters[k].name} is {x[k]:.3g} m"
-    fit = nominal_fit(model.cell, table)
     cause = fit.warning if fit is not None and fit.warning else (
         "check the units and the order of the columns, which joint values belong to which point, "
         "and whether the cell describes this robot"

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from contextlib import suppress
 from dataclasses import dataclass, replace
 from typing import NamedTuple
 
@@ -35,6 +36,7 @@ from elastocal.identification.reml import (
     Reml,
     Whitened,
     kenward_roger,
+    mean_covariance,
     prior_of_groups,
     reml,
     score_test,
@@ -166,7 +168,7 @@ def estimate_noise(
 TRACE = 0.05
 MOST_TOGETHER = 300  # rows of a configuration, whose covariance is formed
 FEWEST_VISITS, SEVERAL = 8, 2
-LASTING = (0.2, 0.05, 0.8)  # correlation times tried, as shares of the campaign
+LASTING = (0.2, 0.1, 0.4, 0.05, 0.8)  # correlation times tried, as shares of the campaign
 TESTED = 0.2  # the one of them that a drift is looked for with
 
 
@@ -441,6 +443,20 @@ def _result(
     return NoiseFit(
         label, fit, every[:p], covariance, trials, reason, whole, every, adjusted, tests
     )
+
+
+def over_times(found: NoiseFit, readings: Readings) -> NoiseFit:
+    """The same fit with a covariance that does not take for known how long what drifts lasts: the
+    mean (`reml.mean_covariance`) over the correlation times LASTING."""
+    if found.lasting is None:
+        return found
+    basis, T = _orthonormal(readings)
+    fits = [found.fit]
+    for lasting in LASTING:
+        if lasting != found.lasting:
+            with suppress(ElastocalError, np.linalg.LinAlgError):
+                fits.append(_fitted(basis, Kind.of(found.kind), found.fit, lasting))
+    return replace(found, covariance=mean_covariance(fits, T, found.covariance))
 
 
 # Is a reading explained by the others?  Deletion residuals under an estimated noise model.
@@ -722,16 +738,7 @@ def weights_of(noise: NoiseFit, readings: Readings) -> Weights:
     for effect, variance in zip(noise.fit.shared, noise.fit.common, strict=True):
         if variance <= 0:
             continue
-        mine = effect.of(readings)
-        m, r = mine.unit.shape[1], mine.loading.shape[3]
-        units, unit = np.unique(mine.unit, return_inverse=True)
-        column = unit.reshape(n, m, 1, 1) * r + np.arange(r)
-        row = np.arange(n)[:, None, None, None] * size + np.arange(size)[:, None]
-        row, column = np.broadcast_arrays(row, column)
-        value = np.where(mine.unit[:, :, None, None] >= 0, mine.loading, 0.0)
-        place = (value.ravel(), (row.ravel(), column.ravel()))
-        Z = sparse.csr_array(place, shape=(n * size, len(units) * r))
-        Z.eliminate_zeros()
+        Z = effect.of(readings).columns()
         covariance = covariance + variance * (Z @ Z.T)
     whiten = whitener(sparse.csr_array(covariance))
     weights = Weights(noise.kind, whiten, True, noise.description)

@@ -8,6 +8,7 @@ from functools import cached_property
 from typing import Any, ClassVar, NamedTuple
 
 import numpy as np
+from scipy import sparse
 
 from elastocal.errors import InputError, option, require
 from elastocal.identification.visit_record import VisitRecord
@@ -480,6 +481,19 @@ class SharedEffect:
         if self.joints:
             return _of_joints(self.name, readings, self.joints)
         return _common(self.name, self.by, readings, self.axes)
+
+    def columns(self) -> sparse.csr_array:
+        """Z (C·size, units·r) of the loadings: the covariance of all is τ² Z Zᵀ."""
+        n, m, size, r = self.loading.shape
+        units, unit = np.unique(self.unit, return_inverse=True)
+        column = unit.reshape(n, m, 1, 1) * r + np.arange(r)
+        row = np.arange(n)[:, None, None, None] * size + np.arange(size)[:, None]
+        row, column = np.broadcast_arrays(row, column)
+        value = np.where(self.unit[:, :, None, None] >= 0, self.loading, 0.0)
+        place = (value.ravel(), (row.ravel(), column.ravel()))
+        Z = sparse.csr_array(place, shape=(n * size, len(units) * r))
+        Z.eliminate_zeros()
+        return Z
 
     def padded(self, k: int) -> SharedEffect:
         """The same with k more sets that have no part in it."""

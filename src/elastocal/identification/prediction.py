@@ -25,6 +25,7 @@ from scipy import linalg, stats
 
 from elastocal.cell.work_cell import Cell
 from elastocal.errors import ElastocalError
+from elastocal.identification.covariance import Covariance, variance_of
 from elastocal.identification.methods import EXACT
 from elastocal.identification.noise_summary import Noise
 from elastocal.identification.residuals import rms_3d
@@ -113,6 +114,15 @@ def _moves(arm: CalibratedArm, left: OpenParameters, A: Array) -> tuple[Array, A
     size = np.abs(move).max(axis=(0, 1), initial=0.0)
     off[np.abs(off) <= OUTSIDE * np.maximum(size, np.abs(move).max(initial=0.0))] = 0.0
     return known, off
+
+
+def mean_squares(arm: CalibratedArm, B: Array, size: int) -> tuple[float, float]:
+    """Mean squares in m² of the position error of readings of B (n·size, parameters): by what the
+    estimates leave uncertain, and by typical deviations of parameters left open."""
+    left = arm.left or OpenParameters((), np.zeros((len(arm.determined), 0)), np.zeros(0))
+    known, off = _moves(arm, left, B.reshape(-1, size, B.shape[1])[:, :3])
+    own = variance_of(known, arm.covariance)
+    return float(own.mean()), float((off**2).sum(axis=(1, 2)).mean())
 
 
 def _blamed(left: OpenParameters, harm: Array) -> tuple[str, ...]:
@@ -229,25 +239,31 @@ class Position:
     """Where the tool is at n poses, and how sure that is; lengths in m, in the data's frame.
 
     `position` (n, 3).  `covariance` (n, 3, 3) of the place about which visits scatter: estimates,
-    parameters left open and lack of fit; `visit` (n, 3, 3): the scatter of a single visit besides,
-    as far as the noise model has it.
+    parameters left open and lack of fit, known with `dof` (n,) degrees of freedom; `visit`
+    (n, 3, 3): the scatter of a single visit besides, as far as the noise model has it.
     """
 
     position: Array
     covariance: Array
     visit: Array
+    dof: Array
 
     def half_axes(self, level: float = 0.95, visit: bool = False) -> Array:
         """Half axes (n, 3), the longest first, of the ellipsoid that holds the tool with
-        probability `level`: √(χ²₃(level) λ) of the eigenvalues λ; with `visit` at one visit."""
-        return half_axes(self.covariance + (self.visit if visit else 0.0), level)
+        probability `level`: √(3 F_3,dof(level) λ) of the eigenvalues λ; with `visit` at one
+        visit."""
+        normal = half_axes(self.covariance + (self.visit if visit else 0.0), level)
+        return normal * np.sqrt(self._quantile(level) / stats.chi2.ppf(level, 3))[:, None]
+
+    def _quantile(self, level: float) -> Array:
+        return np.asarray(3 * stats.f.ppf(level, 3, np.minimum(self.dof, 1e9)))
 
     def holds(self, places: Array, level: float = 0.95, visit: bool = False) -> NDArray[np.bool_]:
         """Whether the regions of that `level` hold the places (n, 3)."""
         total = self.covariance + (self.visit if visit else 0.0)
         off = np.asarray(places) - self.position
         distance = np.einsum("ni,nij,nj->n", off, np.linalg.pinv(total, hermitian=True), off)
-        return np.asarray(distance <= stats.chi2.ppf(level, 3))
+        return np.asarray(distance <= self._quantile(level))
 
 
 def half_axes(covariance: Array, level: float = 0.95) -> Array:
@@ -258,8 +274,11 @@ def half_axes(covariance: Array, level: float = 0.95) -> Array:
     return np.asarray(np.sqrt(stats.chi2.ppf(level, 3) * size))
 
 
-def position_at(tool: CalibratedTool, table: Measurements, q: Array, scatter: Scatter) -> Position:
-    """The tool's position at joints q (n, joints) in the circumstances of the table (n,).
+def position_at(
+    tool: CalibratedTool, table: Measurements, q: Array, scatter: Scatter, spread: Covariance
+) -> Position:
+    """The tool's position at joints q (n, joints) in the circumstances of the table (n,); `spread`
+    is the covariance of what was determined.
 
     NaN where there is no static equilibrium.
     """
@@ -268,7 +287,10 @@ def position_at(tool: CalibratedTool, table: Measurements, q: Array, scatter: Sc
     place = tool.poses(rows, q)[0]
     J = tool.errors(rows, q, place, None)[1]
     visit = (J * scatter.joints**2) @ J.transpose(0, 2, 1) + scatter.common**2 * np.eye(3)
-    return Position(place, found.total, visit)
+    index = {name: i for i, name in enumerate(tool.calibrated.model.names)}
+    known = [index[name] for name in tool.calibrated.determined]
+    dof = spread.dof_of(tool.sensitivity(rows, q)[..., known])
+    return Position(place, found.total, visit, dof)
 
 
 @dataclass(frozen=True)
@@ -292,6 +314,7 @@ def scatter_of(noise: Noise, n_joints: int) -> Scatter:
 
 # The error to be expected at poses that nobody measured.
 
+MOST_LOADS = 100  # kept with a result
 POSES = 256  # drawn over the joint limits where nobody says where the arm will work
 DRAWS = 2000
 FEWEST_REPEATS = 10  # degrees of freedom within repeats from which on they tell the noise
@@ -316,13 +339,24 @@ def over_the_workspace(cell: Cell, model: Model, table: Measurements) -> NewPose
     for name, levels in cell.model.compliance_levels.items():
         # Elsewhere the model has no compliance for that joint.
         q[:, joint_index(cell, chain, name, "[model.compliance_levels]")] = np.resize(levels, POSES)
-    forces = np.unique(np.round(table.force, 3), axis=0)
-    if model.observe == "deflection":
-        forces = forces[(forces != 0).any(axis=1)]
-    if not len(forces):
-        forces = np.zeros((1, 3))
+    forces = _loads(table.force, model.observe)
     source = f"{POSES} poses drawn over the joint limits, as the cell states no test poses"
     return NewPoses(q, np.resize(forces, (POSES, 3)), np.full(POSES, 1 / POSES), source)
+
+
+def _loads(force: Array, observe: str) -> Array:
+    """The forces (L, 3) of rows (n, 3), each once; of deflections those that deflect."""
+    forces = np.unique(np.round(force, 3), axis=0)
+    if observe == "deflection":
+        forces = forces[(forces != 0).any(axis=1)]
+    return forces if len(forces) else np.zeros((1, 3))
+
+
+def measured_loads(observed: Observations) -> Array:
+    """The forces (L, 3) N of the readings, at most MOST_LOADS of them, evenly chosen."""
+    forces = _loads(observed.table.force, observed.kind)
+    chosen = np.linspace(0, len(forces) - 1, min(len(forces), MOST_LOADS)).round().astype(int)
+    return np.asarray(forces[chosen])
 
 
 @dataclass(frozen=True)
@@ -332,6 +366,8 @@ class PredictedError:
     `rms` is its expectation, `ci95` its 95 % interval.  The parts of the expectation: of the
     `parameters` determined, of those left `open`, of what the model lacks (`lacking`, None where
     nothing tells the noise from it).  `blamed` names open parameters, the worst first.
+    `unchecked` is that part of `parameters` which single configurations alone hold, infinite
+    where it is not known.
     """
 
     rms: float
@@ -342,6 +378,7 @@ class PredictedError:
     blamed: tuple[str, ...]
     poses: int
     source: str
+    unchecked: float = np.inf
 
     def to_json(self) -> dict[str, Any]:
         """JSON-ready, in µm."""
@@ -350,6 +387,7 @@ class PredictedError:
             "rms": self.rms * 1e6, "ci95": [low * 1e6, high * 1e6],
             "parameters": self.parameters * 1e6, "open_parameters": self.open * 1e6,
             "lack_of_fit": None if self.lacking is None else self.lacking * 1e6,
+            "unchecked": self.unchecked * 1e6 if np.isfinite(self.unchecked) else None,
             "blamed": list(self.blamed), "poses": self.poses, "source": self.source,
         }  # fmt: skip
 
@@ -400,15 +438,18 @@ def predicted_error(
     arm: CalibratedArm,
     observed: Observations,
     excess: Excess | None,
-    dof: float,
+    spread: Covariance,
     poses: NewPoses,
     rng: np.random.Generator,
+    unchecked: Array | None = None,
 ) -> PredictedError | None:
-    """The error at new poses, at the markers, in the circumstances of the readings.
+    """The error at new poses, at the markers, in the circumstances of the readings; P of
+    `told_by_one` says how much of it is `unchecked`.
 
     e² = zᵀ G z + τ² with G = Σ_t w_t [A_K L, O S]ᵀ [A_K L, O S] and Σ = L Lᵀ: its distribution
-    by draws of z, normal, and t with `dof` degrees of freedom for what the estimates' covariance
-    holds.  None where nothing was determined, or no position follows from what was read.
+    by draws of z, normal, and t with the degrees of freedom of their mean square for what the
+    estimates' covariance holds.  None where nothing was determined, or no position follows from
+    what was read.
     """
     left = arm.left
     if left is None or not arm.determined or observed.kind == "distance":
@@ -433,6 +474,7 @@ def predicted_error(
     half = vector * np.sqrt(np.maximum(value, 0.0))
     z = rng.standard_normal((DRAWS, len(G)))
     inflated = np.ones(DRAWS) if excess is None else excess.inflated
+    dof = float(spread.dof_of((known * each).reshape(1, -1, n))[0])
     wide = _chi2(max(int(dof), 1), rng) if np.isfinite(dof) else np.ones(DRAWS)
     z[:, :n] *= np.sqrt(wide * inflated)[:, None]
     squares = ((z @ half) ** 2).sum(axis=1)
@@ -440,6 +482,9 @@ def predicted_error(
     squares = squares if excess is None else squares + excess.squared
     own = float(np.trace(G[:n, :n]) * inflated.mean())
     rest = float(np.trace(G[n:, n:]))
+    alone = np.inf
+    if unchecked is not None:
+        alone = float(np.sqrt((((known @ (unchecked @ root)) * each) ** 2).sum() * inflated.mean()))
     low, high = np.sqrt(np.quantile(squares, [0.025, 0.975]))
     return PredictedError(
         float(np.sqrt(own + rest + (lacking or 0.0))),
@@ -450,6 +495,7 @@ def predicted_error(
         _blamed(left, np.diag(G)[n:]),
         len(poses.q),
         poses.source,
+        alone,
     )
 
 

@@ -117,6 +117,23 @@ def _growth(B: Array, Q: Array, R: Array, e: Array, configuration: IntArray) -> 
     return growth
 
 
+def told_by_one(B: Array, configuration: IntArray) -> Array:
+    """P (columns, columns): the part P·δ of a deviation δ of the estimates that the readings of one
+    of these configurations alone hold, so that nothing checks it.
+
+    With whitened B = QR, a direction u of Q_c with Q_cᵀQ_c u = u is shown by configuration c only
+    (all other Q are at right angles to it); with these as columns of U, P = R⁻¹ U Uᵀ R.
+    `configuration` (rows,), −1 where the others can do without it.
+    """
+    Q, R = linalg.qr(B, mode="economic")
+    found = [np.zeros((len(R), 0))]
+    for c in np.unique(configuration[configuration >= 0]):
+        share, direction = np.linalg.eigh(Q[configuration == c].T @ Q[configuration == c])
+        found.append(direction[:, share > 1 - ALONE])
+    U = np.hstack(found)
+    return np.asarray(linalg.solve_triangular(R, U) @ (U.T @ R))
+
+
 def _growth_of_blocks(B: Array, residual: Array, weights: Weights, block: IntArray) -> Array:
     """By how much (rows,) the residual grows where its block is left out, readings being correlated
     by the noise FFᵀ that they have in common.

@@ -12,9 +12,11 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from elastocal.above import Result
+from elastocal.cell.arm_description import Unsteadiness
 from elastocal.errors import UnknownNameError
 from elastocal.identification import scrutiny
 from elastocal.identification.constrained import ActiveConstraint
+from elastocal.identification.covariance import Covariance
 from elastocal.identification.faulty_readings import OutlierReport
 from elastocal.identification.noise_summary import Noise
 from elastocal.identification.outliers import Outlier
@@ -23,6 +25,7 @@ from elastocal.identification.prediction import (
     Position,
     PredictedError,
     excess_of,
+    measured_loads,
     position_at,
     scatter_of,
 )
@@ -31,7 +34,12 @@ from elastocal.identification.scrutiny import MOST_NUMBERS
 from elastocal.identification.smooth_part import SmoothPart
 from elastocal.identification.weighted_problem import Weights
 from elastocal.measurements import Measurements
-from elastocal.model.calibrated import CalibratedArm, OpenParameters, nominal_flange_rows
+from elastocal.model.calibrated import (
+    CalibratedArm,
+    OpenParameters,
+    ShownPoses,
+    nominal_flange_rows,
+)
 from elastocal.model.calibrated_tool import CalibratedTool, tool_point
 from elastocal.model.manipulator import Model
 from elastocal.model.observations import COMPONENTS, Observations
@@ -122,7 +130,7 @@ class TestErrors:
     Of the fit's own uncertainty there `std` is the rms in m, `most_fitted` the largest of any
     configuration fitted, predicted from the others; so many of the test `configurations` lie
     beyond it (`far`), as they would by chance with probability `p_far`.  NaN and 1 where the table
-    is too large to say.
+    is too large to say.  `errors` (n,) are all of them.
     """
 
     __test__ = False  # not a pytest class
@@ -135,6 +143,7 @@ class TestErrors:
     far: int = 0
     configurations: int = 0
     p_far: float = 1.0
+    errors: Array = field(default_factory=lambda: np.zeros(0), compare=False)
 
     def to_json(self) -> dict[str, float | None]:
         known = math.isfinite(self.std)
@@ -225,7 +234,7 @@ class Calibration(Result):
         combinations: Sums of parameters that the data determine although not each member.
         x: Values (parameters,) that the model uses, in SI units.
         determined: The kept parameters in order, alone or as first member of a combination.
-        covariance: (determined, determined), theirs.
+        spread: Their `Covariance`, with degrees of freedom; `covariance` is its matrix.
         correlations: Pairs of names with |ρ| over 0.9, strongest first.
         observations: The readings that were fitted, as observations.
         residual: (rows,), observed minus predicted, in m (rad).
@@ -253,6 +262,7 @@ class Calibration(Result):
         weights: Those of the fit.
         noise_parts: Mean square 3-D noise (m²) of single "readings", and what readings of
             "visits" have in common.
+        shown: How sure the fit is where it was measured; None of a large table.
 
     Examples:
         >>> fit = ec.identify("cell.toml", "data.csv")
@@ -274,7 +284,7 @@ class Calibration(Result):
     combinations: tuple[Combination, ...]
     x: Array
     determined: tuple[str, ...]
-    covariance: Array
+    spread: Covariance
     correlations: tuple[tuple[str, str, float], ...]
     observations: Observations
     residual: Array
@@ -301,6 +311,23 @@ class Calibration(Result):
     copies: tuple[int, ...] = ()
     weights: Weights | None = field(default=None, compare=False)
     noise_parts: dict[str, float] = field(default_factory=dict)
+    shown: ShownPoses | None = None
+
+    @property
+    def covariance(self) -> Array:
+        """(determined, determined), of the parameters `determined`."""
+        return self.spread.matrix
+
+    @property
+    def unsteadiness(self) -> Unsteadiness:
+        """What the readings show of the cell's [noise]: `replace(cell, noise=fit.unsteadiness)` is
+        a cell whose plans and simulations have it."""
+        drift = next((s.sigma for s in self.noise.sizes or () if s.drift), None) or 0.0
+        lasting = None if self.noise.drift is None else self.noise.drift.seconds
+        joints = scatter_of(self.noise, self.model.chain.n_joints).joints
+        if not joints.any():
+            joints = np.zeros(1)
+        return Unsteadiness(joints, drift if lasting else 0.0, lasting or Unsteadiness.lasting)
 
     @cached_property
     def ordinary(self) -> tuple[Estimate, ...]:
@@ -423,7 +450,7 @@ class Calibration(Result):
         columns = np.array([self.model.names.index(name) for name in self.determined])
         return scrutiny.Looked(
             self.model, self.observations, self.weights, self.x, self.B, columns.astype(np.int64),
-            self.covariance, self.residual, self.held_out, self.dof,
+            self.residual, self.held_out, self.dof,
         )  # fmt: skip
 
     def influence(self) -> tuple[scrutiny.Influence, ...]:
@@ -447,7 +474,7 @@ class Calibration(Result):
         fitted; None for tables too large to look again."""
         if self._looked is None:
             return None
-        return scrutiny.uncertainty_budget(self._looked, self.noise_parts, table)
+        return scrutiny.uncertainty_budget(self._looked, self.arm, self.noise_parts, table)
 
     @cached_property
     def autocorrelation(self) -> scrutiny.Autocorrelation | None:
@@ -466,6 +493,8 @@ class Calibration(Result):
             tuple(_estimate_json(e) for e in self.estimates),
             self.left,
             0.0 if self.excess is None else float(np.sqrt(self.excess.squared.mean())),
+            measured_loads(self.observations),
+            self.shown,
         )
 
     @cached_property
@@ -503,7 +532,7 @@ class Calibration(Result):
         tool = CalibratedTool(self.arm, tool_point(model.cell, point))
         table = model.table(q, load)
         scatter = scatter_of(self.noise, model.chain.n_joints)
-        return position_at(tool, table, table.q, scatter)
+        return position_at(tool, table, table.q, scatter, self.spread)
 
     def combination(self, first: str) -> Combination:
         """The combination whose first member is `first`; UnknownNameError where there is none."""
@@ -558,6 +587,7 @@ class Calibration(Result):
             "covariance": self.covariance.tolist(),
             "covariance_of": list(self.determined),
             "correlations": [list(c) for c in self.correlations],
+            "loads_N": measured_loads(self.observations).tolist(),
             "n_rows": len(self.residual),
             "n_readings": len(self.observations.lead),
             "dof": self.dof,
@@ -571,8 +601,13 @@ class Calibration(Result):
             "test_max_um": None if self.test is None else _um(self.test.maximum),
             "verdict": self.verdict.to_json(),
             "predicted_new_poses_um": None if self.predicted is None else self.predicted.to_json(),
+            "measured_poses": None if self.shown is None else self.shown.to_json(),
             "open": None if self.left is None else self.left.to_json(),
             "noise": self.noise.to_json(),
+            "cell_noise": {
+                "joints_urad": (1e6 * self.unsteadiness.joints).tolist(),
+                "drift_um": _um(self.unsteadiness.drift), "lasting_s": self.unsteadiness.lasting,
+            },
             "residual_summary": (
                 None if self.residual_summary is None else self.residual_summary.to_json()
             ),

@@ -13,9 +13,11 @@ from typing import Any
 import numpy as np
 from scipy import linalg
 
+from elastocal.identification.prediction import mean_squares
 from elastocal.identification.residuals import ALONE, held_out_residual, rms_3d
 from elastocal.identification.weighted_problem import Weights
 from elastocal.measurements import Measurements
+from elastocal.model.calibrated import CalibratedArm
 from elastocal.model.effects import CATALOGUE
 from elastocal.model.manipulator import Model
 from elastocal.model.observations import Observations
@@ -27,7 +29,7 @@ MOST_NUMBERS = 10_000_000  # of a B that is looked at in passing
 @dataclass(frozen=True)
 class Looked:
     """The fit as it ended: B (rows, parameters) of all parameters, which of them were fitted
-    (`columns`, by index), their covariance, residual (rows,) and held-out residual, weights."""
+    (`columns`, by index), residual (rows,) and held-out residual, weights."""
 
     model: Model
     observations: Observations
@@ -35,7 +37,6 @@ class Looked:
     x: Array
     B: Array
     columns: IntArray
-    covariance: Array
     residual: Array
     held_out: Array
     dof: int
@@ -327,53 +328,54 @@ def stage_of(effect: str) -> int:
 class UncertaintyBudget:
     """3-D rms errors (m) of a reading that was not fitted, by source; the squares add up.
 
-    `parameters`: the estimates' own, at the poses of `at`.  `repeatability`: what readings of a
-    visit share, scatter of joints and drift included.  `instrument`: single readings.
-    `lack_of_fit`: what the held-out error has beyond these, 0 where it has nothing.
+    `parameters`: the estimates' own, at the poses of `at`; `open_parameters`: typical deviations
+    of those left open.  `repeatability`: what readings of a visit share, scatter of joints and
+    drift included.  `instrument`: single readings.  `lack_of_fit`: what the held-out error has
+    beyond these, 0 where it has nothing.
     """
 
     parameters: float
+    open_parameters: float
     repeatability: float
     instrument: float
     lack_of_fit: float
     at: str
 
     @property
+    def parts(self) -> dict[str, float]:
+        return {k: v for k, v in vars(self).items() if k != "at"}
+
+    @property
     def total(self) -> float:
-        parts = (self.parameters, self.repeatability, self.instrument, self.lack_of_fit)
-        return float(np.sqrt(sum(p**2 for p in parts)))
+        return float(np.sqrt(sum(p**2 for p in self.parts.values())))
 
     def to_json(self) -> dict[str, Any]:
-        parts = ("parameters", "repeatability", "instrument", "lack_of_fit", "total")
-        return {"at": self.at, **{f"{k}_um": _um(getattr(self, k)) for k in parts}}
+        told = self.parts | {"total": self.total}
+        return {"at": self.at, **{f"{k}_um": _um(v) for k, v in told.items()}}
 
 
 def uncertainty_budget(
-    fit: Looked, parts: dict[str, float], table: Measurements | None = None
+    fit: Looked, arm: CalibratedArm, parts: dict[str, float], table: Measurements | None = None
 ) -> UncertaintyBudget:
     """The budget at the poses and loads of a `table`, by default those fitted.
 
     `parts`: mean squares (m²) of the noise, "readings" and "visits".
     """
     size = fit.observations.size
-    B, own = fit.fitted, _spread(fit.fitted, fit.covariance, size)
+    own, left = mean_squares(arm, fit.B, size)
     # Held out, a configuration has no part in the estimate: their own uncertainty is larger there
     # by the share that it paid for.
     rows = len(fit.residual)
     out = own * rows / max(rows - len(fit.columns), 1)
     held = rms_3d(fit.held_out, size) ** 2
     noise = parts.get("readings", 0.0) + parts.get("visits", 0.0)
-    lack = max(held - noise - out, 0.0) if np.isfinite(held) else 0.0
+    lack = max(held - noise - out - left, 0.0) if np.isfinite(held) else 0.0
     at = "the poses fitted"
     if table is not None:
-        B = fit.model.regressor(table, fit.x, fit.columns).B
-        own, at = _spread(B, fit.covariance, size), table.source
-    squares = (own, parts.get("visits", 0.0), parts.get("readings", 0.0), lack)
-    parameters, visits, readings, beyond = (float(np.sqrt(v)) for v in squares)
-    return UncertaintyBudget(parameters, visits, readings, beyond, at)
-
-
-def _spread(B: Array, covariance: Array, size: int) -> float:
-    """Mean over readings of tr(B_i C B_iᵀ), of the position alone."""
-    variance = np.einsum("rj,jk,rk->r", B, covariance, B, optimize=True)
-    return float(variance.reshape(-1, size)[:, :3].sum(axis=1).mean())
+        own, left = mean_squares(arm, fit.model.regressor(table, fit.x).B, size)
+        at = table.source
+    visits, readings = parts.get("visits", 0.0), parts.get("readings", 0.0)
+    parameters, open_, shared, single, beyond = np.sqrt(
+        [own, left, visits, readings, lack]
+    ).tolist()
+    return UncertaintyBudget(parameters, open_, shared, single, beyond, at)

@@ -164,7 +164,7 @@ def _given(observed: Observations, covariance: Array | None) -> Weights:
     )
     need(
         bool(np.isfinite(matrix).all()) and np.allclose(matrix, matrix.T, rtol=1e-9),
-        "the covariance must be finite and symmetric",
+        f"{option('covariance')} is not finite and symmetric; correct the matrix",
     )
     return Weights("covariance", whitener(sparse.csr_array(matrix)), True, "given covariance")
 

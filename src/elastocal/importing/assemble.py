@@ -423,7 +423,7 @@ def against_cell(
             f"{len(table)} rows); correct unit, sign, offset_deg or order in [joints], or "
             "the limits of the cell"
         )
-    return nominal_fit(cell, table, spherical), refused
+    return nominal_fit(chain, cell, table, spherical), refused
 
 
 @dataclass(frozen=True)

@@ -132,6 +132,7 @@ class Arm:
         self.markers = {
             name: rigid.constant(position) for name, position in cell.tool.markers.items()
         }
+        self.load_point = rigid.constant(cell.tool.load_point)
         self.marker_rotation = {name: ca.SX.eye(3) for name in self.markers}
         anchor = cell.tracker.anchor
         self.anchor = ca.SX.zeros(3) if anchor is None else rigid.constant(anchor)

@@ -2,8 +2,9 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Mapping
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 from functools import cached_property
 from pathlib import Path
 from typing import Any
@@ -53,6 +54,25 @@ class OpenParameters:
         }  # fmt: skip
 
 
+@dataclass(frozen=True)
+class ShownPoses:
+    """How sure a fit is where it was measured: of each of `configurations` the standard deviation
+    in m of the place predicted from the others is `most` at most."""
+
+    most: float
+    configurations: int
+
+    def chance(self, beyond: int, n: int) -> float:
+        """Probability that so many of n poses or more are less sure than all that were measured,
+        were they drawn alike: Π (n − i)/(n + m − i), i < beyond, of any exchangeable numbers."""
+        i = np.arange(beyond)
+        return float(np.prod((n - i) / (n + self.configurations - i)))
+
+    def to_json(self) -> dict[str, float]:
+        """JSON-ready."""
+        return {"largest_std_um": self.most * 1e6, "configurations": self.configurations}
+
+
 @dataclass(frozen=True, repr=False)
 class CalibratedArm(Saved):
     """A calibrated arm: a model and the parameter values that it predicts with.
@@ -70,6 +90,8 @@ class CalibratedArm(Saved):
         entries: What identify says of each parameter, as in its JSON, in the model's order.
         left: The parameters that the data left open; None in results that do not say.
         lacking: 3-D rms in m of what the model may lack, as far as the readings told.
+        loads: (L, 3) N, the forces under which it was measured; none in results that do not say.
+        shown: How sure the fit is where it was measured; None in results that do not say.
 
     Examples:
         >>> arm = ec.identify("cell.toml", "data.csv").arm
@@ -87,6 +109,8 @@ class CalibratedArm(Saved):
     entries: tuple[Mapping[str, Any], ...] = ()
     left: OpenParameters | None = None
     lacking: float = 0.0
+    loads: Array = field(default_factory=lambda: np.zeros((0, 3)))
+    shown: ShownPoses | None = None
 
     def __repr__(self) -> str:
         return (
@@ -155,6 +179,8 @@ def lasting(arm: CalibratedArm) -> tuple[CalibratedArm, tuple[str, ...]]:
         tuple(entries[name] for name in rest.names if name in entries),
         None if arm.left is None else replace(arm.left, mixing=arm.left.mixing[kept]),
         arm.lacking,
+        arm.loads,
+        arm.shown,
     ), tuple(gone)  # fmt: skip
 
 
@@ -199,6 +225,8 @@ def read_calibrated(cell_path: str | Path, result_path: str | Path) -> Calibrate
         tuple(entries[name] for name in model.names),
         _left_open(result.get("open"), held, determined, result_path),
         _lacking(result.get("predicted_new_poses_um")),
+        _loads(result.get("loads_N", []), result_path),
+        _shown(result.get("measured_poses")),
     )
 
 
@@ -313,6 +341,27 @@ def _lacking(predicted: Any) -> float:
     """What the result says that the model may lack, in m; 0 where it says nothing."""
     found = predicted.get("lack_of_fit") if isinstance(predicted, dict) else None
     return found * 1e-6 if isinstance(found, int | float) and np.isfinite(found) else 0.0
+
+
+def _loads(stated: Any, path: str | Path) -> Array:
+    try:
+        loads = np.array(stated, dtype=float).reshape(len(stated), 3)
+    except (TypeError, ValueError, OverflowError):
+        loads = np.full((1, 3), np.nan)
+    if not np.isfinite(loads).all():
+        raise InputError(
+            f"{path}: loads_N is no list of forces, three numbers each; write the result anew with "
+            "identify"
+        )
+    return loads
+
+
+def _shown(stated: Any) -> ShownPoses | None:
+    try:
+        found = ShownPoses(float(stated["largest_std_um"]) * 1e-6, int(stated["configurations"]))
+    except (TypeError, KeyError, ValueError, OverflowError):
+        return None
+    return found if math.isfinite(found.most) and found.configurations > 0 else None
 
 
 def _check_same(model: Model, held: dict[str, float], cell: str | Path, result: str | Path) -> None:

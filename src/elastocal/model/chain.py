@@ -14,6 +14,7 @@ from elastocal.units import Array
 JointKind = Literal["revolute", "prismatic"]
 
 MIN_JOINTS, MAX_JOINTS = 4, 9
+MAX_LENGTH, MAX_MASS = 50.0, 1e5  # m, kg: beyond them a unit is wrong, no arm is so long or heavy
 
 
 @dataclass(frozen=True)
@@ -65,7 +66,28 @@ class Chain:
         return tuple(joint.kind for joint in self.joints)
 
 
+def plausible(chain: Chain, source: object) -> Chain:
+    """The chain of the file `source`; raises InputError where it is longer or heavier than any."""
+
+    def check(found: float, most: float, what: str) -> None:
+        if not found <= most:
+            raise InputError(f"{source}: {found:g} {what}; correct it")
+
+    for i, joint in enumerate(chain.joints, start=1):
+        length = float(np.linalg.norm(joint.placement[:3, 3]))
+        check(length, MAX_LENGTH, f"m before joint {i} is too long for a link")
+    length = float(np.linalg.norm(chain.flange_placement[:3, 3]))
+    check(length, MAX_LENGTH, "m before the flange is too long for a link")
+    for i, body in enumerate(chain.masses, start=1):
+        check(body.mass, MAX_MASS, f"kg is too heavy for link {i}")
+        offset = float(np.linalg.norm(body.com))
+        check(offset, MAX_LENGTH, f"m to the centre of mass is too far for link {i}")
+    return chain
+
+
 # Joint limits: the robot's own, narrowed by the cell's.
+
+NO_LIMIT = 100.0  # half turns, or m
 
 
 def joint_limits(cell: Cell, chain: Chain) -> tuple[Array, Array]:
@@ -91,9 +113,12 @@ def finite_ranges(
     chain: Chain, lower: Array, upper: Array, near: Array | None = None
 ) -> tuple[Array, Array]:
     """Ranges (n,) to draw joint values from: the limits, and where there are none, a turn (2 m
-    for a prismatic joint) from the one limit, or about `near` (n,), by default about zero."""
+    for a prismatic joint) from the one limit, or about `near` (n,), by default about zero.  A
+    limit beyond `NO_LIMIT` such half turns (1 m) from there is none: files write 1e16 for it."""
     half = np.where([kind == "revolute" for kind in chain.kinds], np.pi, 1.0)
     centre = np.zeros(len(lower)) if near is None else near
+    lower = np.where(lower < centre - NO_LIMIT * half, -np.inf, lower)
+    upper = np.where(upper > centre + NO_LIMIT * half, np.inf, upper)
     low = np.where(np.isfinite(upper), upper - 2 * half, centre - half)
     low = np.where(np.isfinite(lower), lower, low)
     return low, np.where(np.isfinite(upper), upper, low + 2 * half)

@@ -11,7 +11,7 @@ import casadi as ca
 from elastocal.cell.work_cell import Cell, read_cell
 from elastocal.errors import InputError
 from elastocal.model.arm import ParameterSpec
-from elastocal.model.chain import Chain
+from elastocal.model.chain import Chain, plausible
 from elastocal.model.effects import CATALOGUE
 from elastocal.model.effects.base import Effect
 from elastocal.text import did_you_mean, listed
@@ -32,11 +32,12 @@ def load_chain(cell: Cell) -> Chain:
 
     robot = cell.robot
     if robot.mjcf is not None:
-        return read_mjcf(robot.mjcf, base=robot.base, flange=robot.flange)
+        return plausible(read_mjcf(robot.mjcf, robot.base, robot.flange), robot.mjcf)
     if robot.urdf is not None:
-        return read_urdf(robot.urdf, base=robot.base, flange=robot.flange)
+        return plausible(read_urdf(robot.urdf, robot.base, robot.flange), robot.urdf)
     if robot.dh is not None:
-        return read_dh(robot.dh, convention=robot.dh_convention, masses_path=robot.masses)
+        chain = read_dh(robot.dh, convention=robot.dh_convention, masses_path=robot.masses)
+        return plausible(chain, robot.masses or robot.dh)
     raise InputError(f"{cell.path}: [robot] needs urdf, mjcf or dh")
 
 

@@ -14,7 +14,15 @@ import numpy as np
 
 from elastocal.errors import InputError
 from elastocal.model import rigid
-from elastocal.model.chain import MAX_JOINTS, MIN_JOINTS, Chain, Joint, JointKind, LinkMass
+from elastocal.model.chain import (
+    MAX_JOINTS,
+    MAX_LENGTH,
+    MIN_JOINTS,
+    Chain,
+    Joint,
+    JointKind,
+    LinkMass,
+)
 from elastocal.tables import (
     NO_UNIT,
     Family,
@@ -31,8 +39,9 @@ Convention = Literal["standard", "modified"]
 ANGLE, LENGTH = ("rad", "deg"), ("m", "mm")
 X, Y, Z = (1.0, 0.0, 0.0), (0.0, 1.0, 0.0), (0.0, 0.0, 1.0)
 FIXED = "fixed"
-# Beyond these a unit in the header is wrong: two turns, and longer than any arm's link.
-MAX_ANGLE, MAX_LENGTH = 4 * math.pi, 50.0
+# Two turns: beyond them the unit in the header is wrong.
+MAX_ANGLE = 4 * math.pi
+MOST_BYTES = 1_000_000
 
 # Multiplied, as these tables always were: 115.7 mm / 1000 is not the same float.
 SI = {"rad": 1.0, "deg": math.pi / 180.0, "m": 1.0, "mm": 1e-3, "kg": 1.0}
@@ -121,7 +130,7 @@ def _read(path: Path, known: Sequence[Family], needed: Sequence[str], what: str)
             str(path), present, named, [(n,) for n in needed], f"a {what} needs"
         )
 
-    return read_table(path, choose, what=what, comments=True)
+    return read_table(path, choose, what=what, comments=True, most=MOST_BYTES)
 
 
 def _link(table: RawTable, i: int, convention: str) -> tuple[Array, Array]:

@@ -151,7 +151,8 @@ class Model:
             >>> len(ec.Model("cell.toml").read_plan("plan.csv"))
             15
         """
-        return read_plan(path, joint_kinds=self.chain.kinds)
+        markers = tuple(self.cell.tool.markers) if self._markers_stated else ()
+        return read_plan(path, joint_kinds=self.chain.kinds, marker_names=markers)
 
     def table(
         self, q: ArrayLike, force: ArrayLike | None = None, position: ArrayLike | None = None

@@ -8,13 +8,16 @@ ROOMS = {
         "rotation_to support touches"
     ),
     "candidates": "Candidates JointSpace draw feasible joint_space sobol",
+    "checkpoint": "Checkpoint Stage key_of",
+    "choices": "Choice Chosen",
     "collision": "Collisions Kinematics MotionBound StaticTorque arm_configuration arm_model",
     "criteria": (
         "DeterminantCriterion GCriterion SpectralCriterion TraceCriterion criterion_named "
         "make_criterion register"
     ),
     "criterion": "Criterion CriterionInputs ScenarioCriterion candidate_sums",
-    "design": "Checkpoint DesignOptions DesignSearch Effort Selection Stage key_of ordered",
+    "design": "DesignOptions DesignSearch Effort Selection ordered",
+    "doubts": "in_doubt missing usual_sizes",
     "exact_plan": "Prices efficient_rounding random_plans round_weights size_curve",
     "drift": "Alias Drifting",
     "execution": "greedy_tour held_karp_bound schedule shortest_tour tour_bound tour_cost",
@@ -22,7 +25,7 @@ ROOMS = {
     "information": "Estimable LoadStates PoseInformation load_states measured next_number rows_of",
     "moves": "Blockers Unreachable",
     "plan": (
-        "Certificate Chance Plan PlanRows PlanSize plan_rows predicted reasons write_plan "
+        "Certificate Chance Gain Plan PlanRows PlanSize plan_rows predicted reasons write_plan "
         "write_plan_json"
     ),
     "polish": (

@@ -376,10 +376,12 @@ def _moved(T: Array, solid: Solid) -> Solid:
 
 # Which bodies must keep apart, and how far: the pairs that collision checks look at.
 
-Rule = Literal["keep_out", "load_height", "obstacle", "self_collision"]
+Rule = Literal["mounting_plane", "keep_out", "load_height", "obstacle", "self_collision"]
 RULES: tuple[Rule, ...] = get_args(Rule)
 FLOOR = "min_height"  # name of the half-space under the hanging load
 TOUCH = 1e-6  # m: a body this near to the load point holds the rope
+STANDING = 0.01  # m of joint 2 above z = 0 from which the base's frame is taken to be its foot
+THIN = 1e-3  # m: radius of links and tool points of which the cell states no bodies
 
 
 @dataclass(frozen=True)
@@ -404,7 +406,8 @@ class Pair:
 def cell_pairs(cell: Cell, chain: Chain, bodies: tuple[Body, ...]) -> tuple[Pair, ...]:
     """All pairs that are checked.
 
-    Every moving body against every obstacle (`clearance`) and every half-space (no margin), and
+    Every moving body against every obstacle (`clearance`) and every half-space (no margin), links
+    and tool against the mounting plane, where that stands, and
     the arm's bodies, carried bodies, rope and load among themselves (`self_clearance`), except
     bodies of the same carrier, neighbouring links, links that joints hold together whatever the
     pose, the rope with the bodies that hold it, and `ignored_pairs`.  Raises InputError
@@ -416,6 +419,12 @@ def cell_pairs(cell: Cell, chain: Chain, bodies: tuple[Body, ...]) -> tuple[Pair
     own = [body for body in bodies if body.kind != "obstacle"]
     obstacles = [body for body in bodies if body.kind == "obstacle"]
     pairs = [Pair(body, space, 0.0, "keep_out") for body in moving for space in workspace.keep_out]
+    plane = mounting_plane(cell, chain)
+    if plane is not None:
+        drawn = [*moving, *_outline(cell, chain, bodies)]
+        # What joint 1 turns stays at its height.
+        standing = [body for body in drawn if body.carrier > 0]
+        pairs += [Pair(body, plane, 0.0, "mounting_plane") for body in standing]
     load = workspace.load
     if load is not None and load.min_height is not None:
         floor = HalfSpace(FLOOR, load.min_height * UP, UP)
@@ -432,6 +441,42 @@ def cell_pairs(cell: Cell, chain: Chain, bodies: tuple[Body, ...]) -> tuple[Pair
             if not _joined(a, b, workspace, chain, holding)
         ]
     return tuple(pair for pair in pairs if frozenset(pair.names) not in ignored)
+
+
+def mounting_plane(cell: Cell, chain: Chain) -> HalfSpace | None:
+    """The side of z = 0 of the base on which the arm is; None where it does not count.
+
+    It is known where joint 1 turns about the base's z and joint 2 lies off the plane.  Raises
+    InputError where it is asked for and not known.
+    """
+    asked, stated = cell.workspace.mounting_plane, cell.workspace
+    if asked is False or (asked is None and (stated.keep_out or stated.obstacles)):
+        return None
+    first = chain.joints[0]
+    upright = first.kind == "revolute" and abs((first.placement[:3, :3] @ first.axis)[2]) > 1 - 1e-6
+    height = float((first.placement @ distal_placements(chain)[0])[2, 3])
+    if upright and abs(height) > STANDING:
+        T = data_base(cell)
+        return HalfSpace("mounting plane", T[:3, 3], np.sign(height) * T[:3, 2])
+    if asked:
+        raise InputError(
+            f"{cell.path or cell.name}: key workspace.mounting_plane is true, but the base's frame "
+            f"of robot '{chain.name}' does not stand on it: joint 1 does not turn about its z, or "
+            "joint 2 lies at z = 0; state the plane as [[workspace.keep_out]]"
+        )
+    return None
+
+
+def _outline(cell: Cell, chain: Chain, bodies: tuple[Body, ...]) -> Iterator[Body]:
+    """Load point and markers, and the links as thin capsules where they have no bodies."""
+    if not any(body.kind == "arm" for body in bodies):
+        yield from skeleton(chain, (THIN,), data_base(cell), cell.name)
+    tool = {f"marker {name}": p for name, p in cell.tool.markers.items()}
+    for name, point in {"load point": cell.tool.load_point, **tool}.items():
+        T = np.eye(4)
+        T[:3, 3] = point
+        solid = Solid(name, "sphere", np.array([THIN]), chain.flange_placement @ T)
+        yield Body(solid, chain.n_joints - 1, "carried")
 
 
 def _ignored(cell: Cell, bodies: tuple[Body, ...]) -> set[frozenset[str]]:

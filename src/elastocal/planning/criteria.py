@@ -108,6 +108,12 @@ class TraceCriterion(ScenarioCriterion):
     def each_after_adding(self, M: Array, blocks: Array) -> Array:
         return np.asarray(self.variances.after_adding(M, blocks)[..., 0])
 
+    def turned(self, T: Array) -> TraceCriterion | None:
+        if type(self).each is not TraceCriterion.each:
+            return None
+        C = T.swapaxes(-1, -2) @ self.C @ T
+        return replace(self, C=(C + C.swapaxes(-1, -2)) / 2)
+
     def figure(self, value: float) -> float:
         return self.scale * float(np.sqrt(value))
 
@@ -142,6 +148,22 @@ class RemainingError(TraceCriterion):
         A, weights = inputs.targets(), inputs.target_weights()
         w = weights / weights.sum()
         return cls(np.einsum("t,stri,strj->sij", w, A, A, optimize=True))
+
+
+@dataclass(frozen=True)
+class RobustError(RemainingError):
+    """Φ = tr(C M⁻¹) as of test_pose, with the effects that the model may lack among the parameters.
+
+    Each of their parameters has mean 0 and the variance π s²: the probability π that the effect is
+    missing, its typical size s.  `reported`: √Φ in µm, the error at the test poses of one who
+    reckons with them.  It serves the parameters and shows what may be missing, as far as it matters
+    at the test poses.
+    Source: DuMouchel & Jones 1994, Technometrics 36, 37–47.
+    """
+
+    name = "robust"
+    title = "position error at the test poses, effects that the model may lack included, rms"
+    needs = ("test_poses", "doubts")
 
 
 @dataclass(frozen=True)
@@ -258,6 +280,9 @@ class GCriterion(ScenarioCriterion):
 
     def each_after_adding(self, M: Array, blocks: Array) -> Array:
         return power_mean(self.variances.after_adding(M, blocks), self.order)
+
+    def turned(self, T: Array) -> GCriterion:
+        return replace(self, A=self.A @ T[:, None])
 
     def softened(self, order: float) -> GCriterion:
         return GCriterion(self.A, order)
@@ -636,6 +661,7 @@ CRITERIA: dict[str, type[ScenarioCriterion]] = {
     criterion.name: criterion
     for criterion in (
         RemainingError,
+        RobustError,
         DeterminantCriterion,
         ParameterVariance,
         EigenvalueCriterion,

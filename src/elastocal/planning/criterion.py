@@ -413,6 +413,11 @@ class Criterion(ABC):
         """
         return self
 
+    def turned(self, T: Array) -> Criterion | None:
+        """The same criterion of the parameters z, y = T_s z, T (S, p, p); None where that would
+        be another."""
+        return None
+
     def reported(self, value: float) -> tuple[float, str]:
         """The figure a user knows and its unit, from Φ: ρ₀ in µm, log det, an index."""
         return self.figure(value), self.unit
@@ -507,6 +512,10 @@ class Worst(Criterion):
 
     def after_adding(self, M: Array, blocks: Array) -> Array:
         return power_mean(self.base.each_after_adding(M, blocks), self.order)
+
+    def turned(self, T: Array) -> Worst | None:
+        base = self.base.turned(T)
+        return Worst(base, self.order) if isinstance(base, ScenarioCriterion) else None
 
     def softened(self, order: float) -> Worst:
         return Worst(self.base.softened(order), order)

@@ -2,43 +2,40 @@
 
 from __future__ import annotations
 
-import hashlib
-import io
-import json
-import shutil
-import zipfile
-import zlib
-from collections.abc import Callable, Iterable, Mapping
-from contextlib import suppress
+from collections.abc import Mapping
 from dataclasses import dataclass, field, replace
-from pathlib import Path
+from itertools import count
 from typing import Literal, get_args
 
 import numpy as np
 from numpy.typing import NDArray
 
-from elastocal import __version__
 from elastocal.cell.work_cell import Cell
-from elastocal.errors import InputError, InsufficientDataError, option, require
-from elastocal.files import atomic_write_bytes, open_input
+from elastocal.errors import InsufficientDataError, option, require
 from elastocal.identification.knowledge import GaussianPrior
 from elastocal.measurements import Measurements
 from elastocal.model.chain import joint_limits
 from elastocal.model.effects import effect_of
 from elastocal.model.manipulator import Model
 from elastocal.planning.candidates import draw, joint_space
+from elastocal.planning.checkpoint import Checkpoint, Stage, State
+from elastocal.planning.choices import Choice
 from elastocal.planning.criteria import CRITERIA
-from elastocal.planning.drift import Alias
+from elastocal.planning.doubts import OPEN, Place, gain_of, in_doubt
+from elastocal.planning.drift import Alias, left_by_drift
+from elastocal.planning.elsewhere import share_within
 from elastocal.planning.exact_plan import (
+    SizedPlan,
     exact_plan,
     random_information,
-    random_plans,
+    repaired,
     size_curve,
 )
 from elastocal.planning.execution import Execution, schedule
 from elastocal.planning.feasibility import Feasibility
 from elastocal.planning.information import Done, load_states, measured, next_number, readings_each
 from elastocal.planning.moves import Blockers, Unreachable
+from elastocal.planning.pins import Pins
 from elastocal.planning.plan import (
     CandidateCounts,
     Certificate,
@@ -61,28 +58,32 @@ from elastocal.planning.setup import (
     set_up,
     shares_of,
 )
-from elastocal.planning.test_poses import check_cell, everywhere, test_poses
+from elastocal.planning.test_poses import TargetPoses, check_cell, everywhere, test_poses
 from elastocal.text import did_you_mean, listed, quoted
 from elastocal.units import Array, IntArray, Progress
 
 # How a plan is searched for; what it is to be stands in the cell's [design].
 
-Effort = Literal["quick", "normal", "thorough"]
+Effort = Literal["quick", "normal", "thorough", "batch"]
 
 
 @dataclass(frozen=True)
 class DesignSearch:
     """`rounds` of polishing and of poses from the continuum added to the pool; `starts` of the
-    exchange; new `points` per level and `ascents` when the continuum is searched."""
+    exchange; new `points` per level and `ascents` when the continuum is searched, if it is;
+    `candidates` where the cell asks for no number, and how many of them an exchange `looks` at."""
 
     rounds: int
     starts: int
     points: int
     ascents: int
+    candidates: int = 20_000
+    looks: int | None = None
 
 
 EFFORTS: dict[str, DesignSearch] = {
-    "quick": DesignSearch(rounds=0, starts=4, points=4096, ascents=2),
+    "batch": DesignSearch(rounds=0, starts=2, points=0, ascents=0),
+    "quick": DesignSearch(rounds=0, starts=2, points=4096, ascents=2, candidates=5000, looks=64),
     "normal": DesignSearch(rounds=1, starts=10, points=16_384, ascents=4),
     "thorough": DesignSearch(rounds=3, starts=30, points=65_536, ascents=10),
 }
@@ -92,7 +93,9 @@ EFFORTS: dict[str, DesignSearch] = {
 class DesignOptions:
     """`fixed`: parameters, places or effects held; `prior`: what is known of parameters;
     `done`: measurements that the plan adds to; `curve`: numbers of poses to compare; `notes`:
-    sentences on how these came about, for the plan's warnings."""
+    sentences on how these came about, for the plan's warnings; `pins`: poses that stay or are
+    struck out; `doubts`: probability that an effect is missing at a place, for a criterion that
+    asks."""
 
     effort: Effort = "normal"
     seed: int = 0
@@ -102,6 +105,8 @@ class DesignOptions:
     done: Measurements | None = None
     curve: tuple[int, ...] = field(default=())
     notes: tuple[str, ...] = field(default=())
+    pins: Pins | None = None
+    doubts: Mapping[Place, float] | None = None
 
     def __post_init__(self) -> None:
         efforts = get_args(Effort)
@@ -120,112 +125,19 @@ class DesignOptions:
         )
 
 
-# Where a design stands, on disk: an interrupted run goes on where it was.
-
-State = Mapping[str, NDArray]
-
-
-def key_of(files: Iterable[Path], **options: object) -> str:
-    """A hash of everything a design depends on: input files, options, the version."""
-    digest = hashlib.sha256(__version__.encode())
-    for path in files:
-        with open_input(path, "input file") as handle:
-            digest.update(path.name.encode(errors="surrogateescape") + b"\0")
-            digest.update(hashlib.file_digest(handle, "sha256").digest())  # type: ignore[arg-type]
-    digest.update(json.dumps(options, sort_keys=True, default=str).encode())
-    return digest.hexdigest()
-
-
-@dataclass(frozen=True)
-class Stage:
-    """What one stage of a design has finished so far; nowhere kept if `path` is None.
-
-    `check` is called before anything is kept: it raises where the work was interrupted.
-    """
-
-    path: Path | None
-    check: Callable[[], None] = lambda: None
-
-    def load(self) -> dict[str, NDArray] | None:
-        """What was saved last, None if nothing (readable) was."""
-        if self.path is None or not self.path.is_file():
-            return None
-        try:
-            with open(self.path, "rb") as file, np.load(file, allow_pickle=False) as saved:
-                return {name: saved[name] for name in saved.files}
-        except (OSError, ValueError, EOFError, zipfile.BadZipFile, zlib.error):
-            return None
-
-    def finished(self, make: Callable[[], State]) -> State:
-        """What was saved, or else what `make` returns, saved."""
-        saved = self.load()
-        if saved is not None:
-            return saved
-        self.save(made := make())
-        return made
-
-    def save(self, state: State) -> None:
-        """Keep `state`, whole or not at all."""
-        self.check()
-        if self.path is None:
-            return
-        text = io.BytesIO()
-        np.savez(text, allow_pickle=False, **{k: np.asarray(v) for k, v in state.items()})
-        self.path.parent.mkdir(parents=True, exist_ok=True)
-        try:
-            atomic_write_bytes(self.path, text.getvalue())
-        except InputError:
-            if self.path.parent.is_dir():
-                raise
-            # Another run of the same design has ended, and cleared the folder that both used.
-            self.save(state)
-
-
-@dataclass(frozen=True)
-class Checkpoint:
-    """The stages of one design, in a folder beside its output; nowhere if `folder` is None."""
-
-    folder: Path | None = None
-    check: Callable[[], None] = lambda: None
-
-    @classmethod
-    def beside(cls, output: Path, key: str, check: Callable[[], None] = lambda: None) -> Checkpoint:
-        """In the folder `OUTPUT.resume`, apart from what other input or options left there.
-
-        Nothing is written, nor anything of another design thrown away, before a stage is saved.
-        """
-        return cls(output.with_name(output.name + ".resume") / key[:32], check)
-
-    @property
-    def begun(self) -> bool:
-        """Is there anything to go on from?"""
-        return self.folder is not None and any(self.folder.glob("*.npz"))
-
-    def stage(self, name: str) -> Stage:
-        path = None if self.folder is None else self.folder / f"{name}.npz"
-        return Stage(path, self.check)
-
-    def drop(self) -> None:
-        """This design ends without a plan: nothing to resume, but perhaps of another one."""
-        if self.folder is not None:
-            shutil.rmtree(self.folder, ignore_errors=True)
-            with suppress(OSError):
-                self.folder.parent.rmdir()
-
-    def clear(self) -> None:
-        """The output is written: nothing to resume, whatever else was begun for it."""
-        if self.folder is not None:
-            shutil.rmtree(self.folder.parent, ignore_errors=True)
-
-
 # Choosing the poses: relaxation, exchange, polish, and new candidates from the continuum.
+
+NEAR = 0.97  # of the bound on the pool: a continuum as near as that is not searched again
+REFINED = 4  # times at most
+ROUND = 1000  # added to the seed of each of them, beyond the rounds of polishing
 
 
 @dataclass(frozen=True)
 class Selection:
     """The plan as indices `chosen` (k,) into the `pool`, which has grown; Φ `value`.
 
-    From index `first` on the pool holds what came from local searches and the continuum.
+    From index `first` on the pool holds what came from local searches and the continuum, at its
+    end, once the plan is `whole`, the `pinned` poses that stay.
     """
 
     pool: FeasiblePool
@@ -233,11 +145,23 @@ class Selection:
     value: float
     certificate: Certificate
     first: int
+    pinned: int = 0
 
     @property
     def polished(self) -> int:
         """Poses of the plan that are not candidates of the first pool."""
-        return int((self.chosen >= self.first).sum())
+        own = self.chosen < len(self.pool) - self.pinned
+        return int((own & (self.chosen >= self.first)).sum())
+
+    def whole(self, pinned: FeasiblePool | None) -> Selection:
+        """With the poses that stay, in the order of the levels, so that the table reads like
+        Table 2; of a level those that stay come first."""
+        pool, chosen, n = self.pool, np.sort(self.chosen), 0
+        if pinned is not None:
+            pool, n = pool.joined(pinned), len(pinned)
+            chosen = np.append(np.arange(len(self.pool), len(pool)), chosen)
+        chosen = chosen[np.argsort(pool.group[chosen], kind="stable")]
+        return replace(self, pool=pool, chosen=chosen, pinned=n)
 
     def without(self, lost: IntArray, setup: Setup, shares: IntArray, stage: Stage) -> Selection:
         """The best plan found without the candidates `lost`, from what is left of this one; what
@@ -249,7 +173,7 @@ class Selection:
         pool = self.pool.take(kept)
         left = np.searchsorted(kept, np.setdiff1d(self.chosen, lost))
         problem = setup.problem(pool, shares)
-        state = stage.finished(lambda: {"chosen": exact_plan(problem, warm=left, starts=1).chosen})
+        state = stage.finished(lambda: {"chosen": repaired(problem, left)})
         chosen = state["chosen"]
         value = float(setup.criterion.value(setup.gathered(pool.blocks[:, chosen])))
         c = self.certificate
@@ -272,9 +196,9 @@ def select(
     options: DesignOptions,
     checkpoint: Checkpoint,
     progress: Progress,
-    begun: IntArray | None = None,
+    begun: SizedPlan | None = None,
 ) -> Selection:
-    """The best plan found and its certificates, never worse than the plan `begun`, if given.
+    """The best plan found and its certificates; `begun` is what was found on this pool already.
 
     In each round the exact plan is polished off the pool and the continuum is searched for poses
     of larger sensitivity; both join the pool, on which relaxation and exchange run again.  So the
@@ -283,8 +207,9 @@ def select(
     """
     first = len(pool)
     search = _Rounds(setup, searches, shares, options, checkpoint, progress)
-    relaxed = search.relax(pool)
-    chosen = search.exchange(pool, relaxed, begun, 0)
+    relaxed = search.relax(pool) if begun is None else begun.relaxed
+    found = None if begun is None else begun.plan.chosen
+    chosen = search.exchange(pool, relaxed, None, 0, found)
     effort = EFFORTS[options.effort]
     for k in range(1, effort.rounds + 1):
         grown, chosen = search.polish(pool, chosen, k)
@@ -306,37 +231,47 @@ class _Rounds:
     options: DesignOptions
     checkpoint: Checkpoint
     progress: Progress
+    last: list[tuple[FeasiblePool, DesignProblem]] = field(default_factory=list)
 
     def relax(self, pool: FeasiblePool) -> Relaxed | None:
         """The relaxed optimum on the pool; None for a criterion without a bound."""
         if not self.setup.criterion.certifiable:
             return None
         self.progress(f"relaxation over {len(pool)} candidates")
-        return relax(self.setup.problem(pool, self.shares), progress=self.progress)
+        return relax(self.problem(pool), progress=self.progress)
+
+    def problem(self, pool: FeasiblePool) -> DesignProblem:
+        """That of a pool, kept with what it has formed as long as the pool is the same."""
+        if not self.last or self.last[0][0] is not pool:
+            self.last[:] = [(pool, self.setup.problem(pool, self.shares))]
+        return self.last[0][1]
 
     def exchange(
-        self, pool: FeasiblePool, relaxed: Relaxed | None, warm: IntArray | None, k: int
-    ) -> IntArray:
-        found = exact_plan(
-            self.setup.problem(pool, self.shares),
+        self, pool: FeasiblePool, relaxed: Relaxed | None, warm: IntArray | None, k: int,
+        found: IntArray | None = None,
+    ) -> IntArray:  # fmt: skip
+        effort = EFFORTS[self.options.effort]
+        best = exact_plan(
+            self.problem(pool),
             relaxed_weights=None if relaxed is None else relaxed.weights,
             tangent=None if relaxed is None else relaxed.tangent,
             warm=warm,
-            # A plan that the comparison of sizes found has had as many starts.
-            starts=1 if k == 0 and warm is not None else EFFORTS[self.options.effort].starts,
+            starts=effort.starts,
             seed=self.options.seed,
             jobs=self.options.jobs,
+            looks=effort.looks,
+            found=found,
             checkpoint=self.checkpoint.stage(f"exchange{k}"),
             progress=self.progress,
         )
-        return found.chosen
+        return best.chosen
 
     def polish(self, pool: FeasiblePool, chosen: IntArray, k: int) -> tuple[FeasiblePool, IntArray]:
         """The pool with the polished poses, and the polished plan in it."""
 
         def make() -> State:
             done = polish(
-                self.setup.problem(pool, self.shares), self.searches, pool.q, pool.load, chosen,
+                self.problem(pool), self.searches, pool.q, pool.load, chosen,
                 jobs=self.options.jobs, progress=self.progress,
             )  # fmt: skip
             return {"q": done.q, "moved": done.moved}
@@ -368,9 +303,8 @@ class _Rounds:
     def _continuum(self, pool: FeasiblePool, relaxed: Relaxed, k: int) -> Continuum:
         effort = EFFORTS[self.options.effort]
         # The pool may have grown since: candidates added later have weight 0.
-        problem = self.setup.problem(pool, self.shares)
         return estimate(
-            problem, relaxed.tangent, self.searches, pool.q, pool.load,
+            self.problem(pool), relaxed.tangent, self.searches, pool.q, pool.load,
             points=effort.points, starts=effort.ascents, seed=self.options.seed + k,
             jobs=self.options.jobs, progress=self.progress,
         )  # fmt: skip
@@ -378,15 +312,28 @@ class _Rounds:
     def certificate(self, pool: FeasiblePool, relaxed: Relaxed | None, value: float) -> Certificate:
         if relaxed is None:
             return Certificate(len(pool), None, None)
-        found = self._continuum(pool, relaxed, 0)
+        if not EFFORTS[self.options.effort].points:
+            return Certificate(len(pool), relaxed.bound, efficiency(value, relaxed.bound))
+        found = [self._continuum(pool, relaxed, 0)]
+        # The tangent of the pool's optimum says little of poses far better than the pool's: they
+        # join it, and that of the new optimum says more.
+        grown, optimum = pool, relaxed
+        while found[-1].bound < NEAR * optimum.bound and len(found[-1].q) and len(found) <= REFINED:
+            new = found[-1]
+            grown = grown.joined(self.setup.pool(new.q, new.load, new.group))
+            start = np.concatenate([optimum.weights, np.zeros(len(new.q))])
+            problem = replace(self.problem(grown), most=int(self.shares.sum()))
+            optimum = relax(problem, tolerance=1e-3, start=start)
+            found.append(self._continuum(grown, optimum, len(found) * ROUND))
+        bound = found[-1].bound
         return Certificate(
             pool=len(pool),
             bound_pool=relaxed.bound,
             efficiency_pool=efficiency(value, relaxed.bound),
-            bound_continuum=found.bound,
-            efficiency_continuum=efficiency(value, min(found.bound, relaxed.bound)),
-            searched=found.searched,
-            ascents=found.ascents,
+            bound_continuum=bound,
+            efficiency_continuum=efficiency(value, min(bound, relaxed.bound)),
+            searched=sum(c.searched for c in found),
+            ascents=sum(c.ascents for c in found),
         )
 
 
@@ -404,27 +351,30 @@ def ordered(
     seed: int,
     progress: Progress,
     checkpoint: Checkpoint | None = None,
+    pinned: FeasiblePool | None = None,
 ) -> tuple[Selection, Execution, list[str]]:
     """The selection in the order of its levels, its execution, and warnings.
 
-    Poses that no chain of free moves reaches are replaced by the best others.  Raises
-    InsufficientDataError where that does not end.
+    Poses that no chain of free moves reaches are replaced by the best others, unless they are
+    `pinned`.  Raises InsufficientDataError where that does not end.
     """
     lost = 0
     while True:
-        # In the order of levels, so that the table reads like Table 2.
-        chosen = found.chosen[np.lexsort((found.chosen, found.pool.group[found.chosen]))]
+        plan = found.whole(pinned)
+        chosen = plan.chosen
         try:
-            execution = _execution(setup, found.pool, chosen, feasibility, seed, progress)
+            execution = _execution(setup, plan.pool, chosen, feasibility, seed, progress)
         except Unreachable as error:
-            if lost >= MOST_REPLACED:
+            own = len(found.pool)
+            if lost >= MOST_REPLACED or (chosen[error.poses] >= own).any():
                 raise
             lost += len(error.poses)
             progress(f"{lost} poses that no free move reaches are replaced by the best others")
             stage = (checkpoint or Checkpoint()).stage(f"replaced{lost}")
-            found = found.without(np.unique(chosen[error.poses]), setup, shares, stage)
+            gone = np.unique(chosen[error.poses])
+            found = found.without(gone, setup.having(pinned), shares, stage)
             continue
-        return replace(found, chosen=chosen), execution, _warnings(lost, execution)
+        return plan, execution, _warnings(lost, execution)
 
 
 def _execution(
@@ -462,6 +412,7 @@ def _warnings(lost: int, execution: Execution) -> list[str]:
 # The course of a design.
 
 MOST_POSES = 100  # that a target is sought with
+FEWER = 4  # times: starts of a size that is compared only
 
 
 def design(
@@ -481,33 +432,46 @@ def design(
     InsufficientDataError where no pose is feasible, or a parameter that the criterion needs cannot
     be seen.
     """
-    return _Design(cell, options or DesignOptions(), checkpoint or Checkpoint(), progress).run()
+    rest = options or DesignOptions(), checkpoint or Checkpoint(), progress
+    whole = _Design(cell, *rest)
+    if cell.design.choose is None:
+        return whole.run()
+    targets, region = whole.targets()
+    known = Known(whole.options.fixed, whole.options.prior)
+    chosen = Choice(whole.model, targets, region, known, rest[0].seed, progress).best()
+    return replace(_Design(chosen.applied(cell), *rest, whole.model).run(), chosen=chosen)
 
 
 class _Design:
     """The course of a design; what each step needs of the steps before it."""
 
     def __init__(
-        self, cell: Cell, options: DesignOptions, checkpoint: Checkpoint, progress: Progress
-    ) -> None:
+        self, cell: Cell, options: DesignOptions, checkpoint: Checkpoint, progress: Progress,
+        work: Model | None = None,
+    ) -> None:  # fmt: skip
         self.warnings = list(options.notes)
         if cell.model.torque == "measured":
             cell = replace(cell, model=replace(cell.model, torque="computed"))
             self.warnings.append(
                 "torques of poses that are not measured yet are computed from load and weights"
             )
+        if cell.design.candidates is None:
+            drawn = EFFORTS[options.effort].candidates
+            cell = replace(cell, design=replace(cell.design, candidates=drawn))
         self.checkpoint, self.progress = checkpoint, progress
         self.model = Model(cell, options.done.marker_names if options.done else ())
         if self.model.shrunk.any():
             self.model, options = self._without_functions(options)
         self.model, self.options = self._without_conditions(options)
+        self.work = work or self.model
         self.cell = self.model.cell
         self.chain = self.model.chain
         check_cell(self.cell, self.chain)
         _check_criterion(self.model)
         self.states = load_states(self.cell)
         self.space = joint_space(self.cell, self.chain)
-        self.feasibility = Feasibility(self.cell, self.chain)
+        pins = self.options.pins
+        self.feasibility = Feasibility(self.cell, self.chain, None if pins is None else pins.struck)
         _check_home(self.cell, self.feasibility)
 
     def _without_functions(self, options: DesignOptions) -> tuple[Model, DesignOptions]:
@@ -544,45 +508,81 @@ class _Design:
 
     def run(self) -> Plan:
         progress, options = self.progress, self.options
-        shares = shares_of(self.cell)
-        planned = [shares_of(self.cell, n) for n in options.curve]
+        pins, pinned_at = options.pins, (np.zeros((2, 0), dtype=np.int64))
+        if pins is not None and len(pins.q):
+            pinned_at = pins.placed(self.cell, self.chain, self.states, self.feasibility)
+        self.pinned = np.bincount(pinned_at[1], minlength=self.space.n_groups)
+        shares = self._shares()
+        planned = [self._shares(n) for n in options.curve]
         planned += [shares] if self.cell.design.target is None else []
-        # At the test poses the arm works, and the tracker need not see it.
-        workspace = replace(self.cell.workspace, visibility=None, load=None)
-        at_work = Feasibility(replace(self.cell, workspace=workspace), self.chain)
-        targets = test_poses(self.cell, self.chain, at_work, options.seed)
-        region = None
-        if "test_poses" in CRITERIA[self.cell.design.criterion].needs:
-            region = everywhere(self.cell, self.chain, at_work, options.seed)
+        targets, region = self.targets()
         q, load, group, counts = self._candidates()
         for wanted in planned:
             check_available(self.cell, np.bincount(group), wanted)
-        done = None
+        model, known = self.model, Known(options.fixed, options.prior)
+        if "doubts" in CRITERIA[self.cell.design.criterion].needs:
+            model, known = in_doubt(model, known, self.states, q, load, options.doubts)
         if options.done is not None:
             progress("information of the measurements done")
-            done = measured(self.model, options.done, options.fixed)
+            done = measured(self.model, options.done, options.fixed, model)
+            known = replace(known, done=done)
             self.warnings.append(f"B is taken at {done.note}")
-        known = Known(options.fixed, options.prior, done)
         progress("information of the candidates")
         setup = set_up(
-            self.model,
+            model,
             self.states,
             q,
             load,
-            int(shares.sum()),
+            int((shares + self.pinned).sum()),
             targets,
             known,
             options.seed,
             region,
+            self.feasibility.seen if self.feasibility.partial else None,
+            model if self.work is self.model else self.work.with_effects(model.cell.model.effects),
         )
         self.warnings += setup.warnings
-        pool = setup.pool(q, load, group)
-        curve, shares, begun = self._sizes(setup, pool, shares)
+        pool, pinned = setup.pool(q, load, group), None
+        if pins is not None and len(pins.q):
+            pinned = setup.pool(pins.q, *pinned_at)
+        search = setup.having(pinned)
+        if cap := self.cell.design.cap:
+            state = self.checkpoint.stage("share").finished(
+                lambda: {"share": np.array(share_within(search, pool, shares, cap, progress))}
+            )
+            setup = setup.sharing(float(state["share"]))
+        search = setup.having(pinned)
+        curve, shares, begun = self._sizes(search, pool, shares)
         searches = Searches(setup.information, self.space, self.feasibility, self.feasibility.pairs)
-        found = select(setup, pool, shares, searches, options, self.checkpoint, progress, begun)
+        found = select(search, pool, shares, searches, options, self.checkpoint, progress, begun)
         progress("random plans beside it")
-        drawn = random_plans(setup.problem(pool, shares), options.seed)
-        return self._plan(setup, found, shares, counts, targets.source, curve, done, drawn)
+        drawn = random_information(search.problem(pool, shares), options.seed)
+        return self._plan(
+            setup, found, shares, counts, targets.source, curve, known.done, drawn, pinned
+        )
+
+    def _shares(self, n_poses: int | None = None) -> IntArray:
+        """Poses (L,) to choose per level, beside those that stay."""
+        shares = shares_of(self.cell, n_poses) - self.pinned
+        short = np.flatnonzero(shares < 0)
+        require(
+            not len(short) and bool(shares.any()),
+            f"{self.cell.path or self.cell.name}: {self.pinned.sum()} poses are to be kept, and "
+            f"the plan has no more than {shares_of(self.cell, n_poses).sum()}"
+            f"{' with their shares of the levels' if len(shares) > 1 else ''}; ask for more poses",
+        )
+        return shares
+
+    def targets(self) -> tuple[TargetPoses, TargetPoses | None]:
+        """The test poses of the cell as it stands, and the rest of the joint ranges."""
+        cell, seed = self.work.cell, self.options.seed
+        # There the arm works, and the tracker need not see it.
+        workspace = replace(cell.workspace, visibility=None, load=None)
+        at_work = Feasibility(replace(cell, workspace=workspace), self.chain)
+        targets = test_poses(cell, self.chain, at_work, seed)
+        if "test_poses" not in CRITERIA[cell.design.criterion].needs:
+            return targets, None
+        return targets, everywhere(cell, self.chain, at_work, seed)
 
     def _candidates(self) -> tuple[Array, IntArray, IntArray, CandidateCounts]:
         state = self.checkpoint.stage("candidates").finished(self._drawn)
@@ -596,7 +596,7 @@ class _Design:
         self.progress("drawing candidates")
         drawn = draw(
             self.cell, self.chain, self.states, self.feasibility,
-            self.cell.design.candidates, self.options.seed, self.options.jobs, self.progress,
+            self.cell.design.candidates or 1, self.options.seed, self.options.jobs, self.progress,
         )  # fmt: skip
         return {
             "q": drawn.q,
@@ -609,9 +609,9 @@ class _Design:
 
     def _sizes(
         self, setup: Setup, pool: FeasiblePool, shares: IntArray
-    ) -> tuple[tuple[PlanSize, ...], IntArray, IntArray | None]:
-        """The curve of criterion against number of poses, and where there is a target the shares
-        that meet it and a plan that does."""
+    ) -> tuple[tuple[PlanSize, ...], IntArray, SizedPlan | None]:
+        """The curve of criterion against number of poses, where there is a target the shares that
+        meet it, and what was found for these shares."""
         target, numbers = self.cell.design.target, self.options.curve
         if target is None and not numbers:
             return (), shares, None
@@ -623,8 +623,9 @@ class _Design:
             PlanSize(int(n), reported(value)[0], None if np.isnan(b) else reported(b)[0])
             for n, value, b in zip(state["n"], state["value"], state["bound"], strict=True)
         )
+        begun = SizedPlan.kept(state)
         if target is None:
-            return points, shares, state["plan"] if len(state["plan"]) else None
+            return points, shares, begun
         smallest = int(state["smallest"])
         if not smallest:
             last = points[-1]
@@ -633,35 +634,41 @@ class _Design:
                 f"the target of {target * 1e6:g} µm; the best found reaches {last.value:.4g} µm: "
                 "ask for less, measure more repeats, or take a better tracker"
             )
-        return points, shares_of(self.cell, smallest), state["plan"]
+        return points, self._shares(smallest), begun
 
     def _size_curve(
         self, setup: Setup, pool: FeasiblePool, target: float | None, numbers: tuple[int, ...],
         shares: IntArray,
     ) -> dict[str, NDArray]:  # fmt: skip
-        """As `size_curve`: bounds NaN where there are none, `smallest` 0 where none meets;
-        `plan` that of `smallest`, without a target that of `shares` where it was among them."""
+        """As `size_curve`: bounds NaN where there are none, `smallest` 0 where none meets; what
+        was found of `smallest`, without a target of `shares` where these were among them."""
+        effort = EFFORTS[self.options.effort]
         found = size_curve(
-            lambda n: setup.problem(pool, shares_of(self.cell, n)),
+            lambda n: setup.problem(pool, self._shares(n)),
             numbers,
             None if target is None else self._target(setup, target),
-            between=(pool.n_groups, most_poses(self.cell, np.bincount(pool.group), MOST_POSES)),
-            starts=EFFORTS[self.options.effort].starts,
+            between=(
+                max(pool.n_groups, int(self.pinned.sum()) + 1),
+                most_poses(self.cell, np.bincount(pool.group), MOST_POSES),
+            ),
+            # That of the size that is planned gets its other starts then.
+            starts=max(effort.starts // FEWER, 1),
             seed=self.options.seed,
             jobs=self.options.jobs,
+            looks=effort.looks,
             progress=self.progress,
         )
-        plans = {p.n_poses: p.plan.chosen for p in found.points}
         n = found.smallest or 0
-        if target is None and np.array_equal(shares_of(self.cell, int(shares.sum())), shares):
-            n = int(shares.sum())
+        total = int((shares + self.pinned).sum())
+        if target is None and np.array_equal(self._shares(total), shares):
+            n = total
         bounds = [np.nan if p.bound is None else p.bound for p in found.points]
         return {
             "n": np.array([p.n_poses for p in found.points]),
             "value": np.array([p.value for p in found.points]),
             "bound": np.array(bounds),
             "smallest": np.array(found.smallest or 0),
-            "plan": plans.get(n, np.zeros(0, dtype=np.int64)),
+            **next((p.arrays() for p in found.points if p.n_poses == n), {}),
         }
 
     def _target(self, setup: Setup, target: float) -> float:
@@ -679,20 +686,24 @@ class _Design:
     def _plan(
         self, setup: Setup, found: Selection, shares: IntArray, counts: CandidateCounts,
         targets: str,
-        curve: tuple[PlanSize, ...], done: Done | None, drawn: Array,
+        curve: tuple[PlanSize, ...], done: Done | None, drawn: Array, pinned: FeasiblePool | None,
     ) -> Plan:  # fmt: skip
         self.progress("order of execution")
         found, execution, told = ordered(
             setup, found, shares, self.feasibility, self.options.seed, self.progress,
-            self.checkpoint,
+            self.checkpoint, pinned,
         )  # fmt: skip
         self.warnings += told
         pool, chosen = found.pool, found.chosen
         q, load, blocks = pool.q[chosen], pool.load[chosen], pool.blocks[:, chosen]
-        spec = self.cell.design
+        spec, model = self.cell.design, setup.information.model
         problem = setup.problem(pool, shares)
         M = setup.gathered(blocks)[0]
-        numbers = blocks.shape[1] * blocks.shape[2] * readings_each(self.cell)
+        when = execution.times(len(q), len(self.states.forces))
+        left = left_by_drift(setup, pool, chosen, M, when)
+        phi = np.sort(np.asarray(setup.criterion.value(drawn), dtype=np.float64))
+        seen = setup.information.seen(q, load)
+        numbers = round(blocks.shape[1] * blocks.shape[2] * seen.mean() * readings_each(self.cell))
         numbers += 0 if done is None else done.numbers
         value, unit = setup.criterion.reported(found.value)
         bound = found.certificate.bound_pool
@@ -711,9 +722,13 @@ class _Design:
             execution=execution,
             candidates=counts,
             certificate=found.certificate,
-            predicted=predicted(self.model, setup.found, M, numbers),
+            predicted=tuple(
+                p
+                for p in predicted(model, setup.found, left, numbers)
+                if p.name in self.model.names
+            ),
             reasons=reasons(
-                self.model, setup.found, blocks[0], setup.prior[0],
+                model, setup.found, blocks[0], setup.prior[0],
                 values_without(problem, chosen), found.value,
             ),
             targets=targets,
@@ -722,21 +737,31 @@ class _Design:
             curve=curve,
             bound_reported=None if bound is None else setup.criterion.reported(bound)[0],
             warnings=tuple(self.warnings),
-            first=next_number(self.options.done),
-            chance=Chance.of(drawn, found.value, setup.criterion),
-            everywhere=self._everywhere(setup, problem, M),
+            first=next_number(self.options.done.configuration_labels if self.options.done else ()),
+            names=self._names(found),
+            chance=Chance.of(phi, found.value, setup.criterion),
+            everywhere=self._everywhere(setup, M, drawn[:, 0], left),
+            seen=None if seen.all() else seen,
+            gain=gain_of(setup, done, M, self.model.names, self.options.seed),
         )  # fmt: skip
 
-    def _everywhere(self, setup: Setup, problem: DesignProblem, M: Array) -> Everywhere | None:
-        """The error of the plan of information M (p, p) at the test poses and elsewhere."""
+    def _names(self, found: Selection) -> tuple[str, ...]:
+        """Those that stay keep theirs, and the others are numbered after all there have been."""
+        pins = self.options.pins
+        if pins is None:
+            return ()
+        labels = self.options.done.configuration_labels if self.options.done else ()
+        new = count(next_number((*labels, *pins.taken)))
+        own = len(found.pool) - found.pinned
+        return tuple(pins.names[i - own] if i >= own else str(next(new)) for i in found.chosen)
+
+    def _everywhere(self, setup: Setup, M: Array, random: Array, left: Array) -> Everywhere | None:
+        """The error at the test poses and elsewhere of the plan of information M (p, p), of random
+        plans' (n, p, p), and of what a drift leaves of the plan's (p, p)."""
         own, elsewhere = setup.target_rows, setup.elsewhere_rows
         if own is None or elsewhere is None:
             return None
-        random = random_information(problem, self.options.seed)[:, 0]
-        return Everywhere.of(own, elsewhere, M, random)
-
-
-OPEN = frozenset({"time", "temperature", "approach"})
+        return Everywhere.of(own, elsewhere, M, random, left, setup.share, self.cell.design.cap)
 
 
 def _without(
@@ -773,6 +798,11 @@ def _check_criterion(model: Model) -> None:
         asked in CRITERIA,
         f"{where}: key design.criterion takes {takes}; found {quoted(asked)}"
         f"{did_you_mean(asked, CRITERIA)}",
+    )
+    require(
+        not cell.design.elsewhere_cap or asked == "test_pose",
+        f'{where}: key design.elsewhere_cap goes with criterion = "test_pose", not with '
+        f'"{asked}"; drop it',
     )
     names = cell.design.combination
     require(

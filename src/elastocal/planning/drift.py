@@ -9,8 +9,10 @@ from itertools import groupby
 import numpy as np
 from scipy import linalg
 
+from elastocal.cell.arm_description import Unsteadiness
 from elastocal.cell.plan_wishes import Motion
 from elastocal.errors import require
+from elastocal.identification.visit_record import course_waves
 from elastocal.planning.moves import Costs, Moves
 from elastocal.planning.setup import FeasiblePool, Setup
 from elastocal.units import Array, IntArray
@@ -28,12 +30,15 @@ class Alias:
     `share` (N, L, m, 3): the error (m,) that a shift (3,) m of the readings of pose i in load
     state l leaves: R M⁻¹ B_iᵀ Σ_i⁻¹ D_il, D_il how readings enter the observations, |R x| the rms
     error at the test poses in m where `at_test_poses`, else x in its own standard deviations.
-    `noise`: what the readings' noise leaves, in the same terms.
+    `noise`: what the readings' noise leaves, in the same terms.  `whitened` (N, L, r, 3): the
+    Σ_i^(-1/2) D_il, beside the `blocks` (N, r, p) of the plan's information.
     """
 
     share: Array
     noise: float
     at_test_poses: bool
+    whitened: Array
+    blocks: Array
 
     @classmethod
     def of(cls, setup: Setup, pool: FeasiblePool, chosen: IntArray) -> Alias | None:
@@ -55,12 +60,38 @@ class Alias:
         shift = np.zeros((observed.size, 3))
         shift[:3, :3] = np.eye(3)
         share = np.zeros((n, n_states, len(root), 3))
+        whitened = np.zeros((n, n_states, blocks.shape[1], 3))
         for state, own in enumerate(information.states.forces):
             here = (np.abs(force - own) < 1e-9).all(axis=2)
             D = np.einsum("ak,nk,cx->nacx", T, here.astype(float), shift)
-            whitened = np.linalg.solve(factor, D.reshape(n, -1, 3))
-            share[:, state] = root @ V @ np.einsum("nrp,nrx->npx", blocks, whitened)
-        return cls(share, float(np.sqrt(np.trace(root @ V @ root.T))), R is not None)
+            whitened[:, state] = np.linalg.solve(factor, D.reshape(n, -1, 3))
+            share[:, state] = root @ V @ np.einsum("nrp,nrx->npx", blocks, whitened[:, state])
+        noise = float(np.sqrt(np.trace(root @ V @ root.T)))
+        return cls(share, noise, R is not None, whitened, blocks)
+
+    def information(self, M: Array, time: Array, noise: Unsteadiness) -> Array:
+        """What is left of the information M (p, p) where all drifts as the cell's `noise` says,
+        poses being read at `time` (N, L) in s.
+
+        The drift's course is a sum of waves F u, u ~ N(0, I), that are estimated beside the
+        parameters: M − BᵀF (I + FᵀF)⁻¹ FᵀB.
+        """
+        span = max(float(np.ptp(time)), 1e-9)
+        waves = course_waves((time.ravel() - time.min()) / span, noise.lasting / span)
+        F = np.einsum("nlrx,nlk->nrxk", self.whitened, waves.reshape(*time.shape, -1))
+        F = noise.drift * F.reshape(self.blocks.shape[0] * self.blocks.shape[1], -1)
+        across = F.T @ self.blocks.reshape(len(F), -1)
+        return np.asarray(M - across.T @ np.linalg.solve(np.eye(F.shape[1]) + F.T @ F, across))
+
+
+def left_by_drift(
+    setup: Setup, pool: FeasiblePool, chosen: IntArray, M: Array, time: Array
+) -> Array:
+    """`Alias.information` of the plan `chosen` (N,) under the drift of the cell's [noise]; M where
+    it states none."""
+    noise = setup.information.model.cell.noise
+    alias = Alias.of(setup, pool, chosen) if noise.drift else None
+    return M if alias is None else alias.information(M, time, noise)
 
 
 @dataclass(frozen=True)

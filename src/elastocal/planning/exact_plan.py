@@ -18,6 +18,7 @@ from elastocal.planning.selection import (
     TIE,
     DesignProblem,
     Exchanged,
+    balanced,
     check_enough,
     exchange,
     fitted,
@@ -54,8 +55,9 @@ def random_information(problem: DesignProblem, seed: int, n: int = DRAWN) -> Arr
 # for one seed however the work is spread or interrupted.
 
 ProblemOf = Callable[[int], DesignProblem]
-# Candidates of a group that the search looks at per pose of its share, before all of them.
-NEAR_PER_POSE = 50
+# Candidates of a group that the search looks at before all of them: so many per pose of its share,
+# of many poses fewer, but no less than NEAR_AT_LEAST where the first would be more.
+NEAR_PER_POSE, NEAR_PER_MANY, NEAR_AT_LEAST = 50, 12, 240
 # A better plan must be better by more than rounding: relative slack of what is ruled out.
 SLACK = 1e-9
 # A candidate without weight counts as this share of the smallest weight of its group: it is used
@@ -87,6 +89,8 @@ def exact_plan(
     starts: int = 10,
     seed: int = 0,
     jobs: int = 1,
+    looks: int | None = None,
+    found: IntArray | None = None,
     checkpoint: ArrayStore | None = None,
     progress: Progress = lambda message: None,
 ) -> ExactPlan:
@@ -98,7 +102,9 @@ def exact_plan(
     (roundings drawn at random, greedy, random plans) search what remains.  Each start has its own
     generator, spawned from `seed`, and none sees another's result: the plan does not depend on
     `jobs`, the number of processes (−1: all cores; joblib must be installed), nor on whether the
-    work was interrupted and taken up again from `checkpoint`.
+    work was interrupted and taken up again from `checkpoint`.  With `looks` a search evaluates no
+    more candidates in an exchange and keeps to the near ones; only the best plan is exchanged
+    against all.  `found`: a plan that the first start has found already.
 
     Raises InputError where relaxed_weights do not match, starts < 1 or jobs = 0;
     InsufficientDataError where no plan of these shares determines all parameters.
@@ -110,8 +116,12 @@ def exact_plan(
     require(starts >= 1, f"an exact plan needs at least one start, got {starts}")
     require(jobs != 0, "jobs is the number of processes, or -1 for all cores; got 0")
     check_enough(problem)
+    problem, tangent = balanced(problem, tangent)
     seeds = np.random.SeedSequence(seed).spawn(starts)
     done = load_finished(checkpoint, problem, seed, starts)
+    if found is not None:
+        value = float(problem.criterion.value(problem.prior + problem.sum_of(found)))
+        done.setdefault(0, Exchanged(found, value, 0))
 
     def keep(k: int, finished: Exchanged) -> None:
         done[k] = finished
@@ -123,11 +133,12 @@ def exact_plan(
         tangent = _tangent(problem, relaxed_weights)
     if 0 not in done:
         begun = None if warm is None else fitted(problem, warm)
-        keep(*_start(_PrunedPool.of(problem, tangent, relaxed_weights), 0, seeds[0], begun))
+        whole = _PrunedPool.of(problem, tangent, relaxed_weights, looks=looks)
+        keep(*_start(whole, 0, seeds[0], begun))
     first = done[0]
     if tangent is None:
         tangent = _tangent(problem, np.bincount(first.chosen, minlength=N).astype(float))
-    pool = _PrunedPool.of(problem, tangent, relaxed_weights, first)
+    pool = _PrunedPool.of(problem, tangent, relaxed_weights, first, looks)
     later = [k for k in range(starts) if k not in done]
     for k, finished in _run(pool, later, seeds, jobs):
         keep(k, finished)
@@ -151,6 +162,7 @@ class _PrunedPool:
     near: IntArray
     weights: Array | None
     known: IntArray | None = None
+    looks: int | None = None
 
     @classmethod
     def of(
@@ -159,17 +171,18 @@ class _PrunedPool:
         tangent: Gradient | None,
         weights: Array | None,
         first: Exchanged | None = None,
+        looks: int | None = None,
     ) -> _PrunedPool:
         """All candidates, or those that may be in a better plan than `first`."""
         if tangent is None:
             everything = np.arange(problem.n_candidates)
-            return cls(problem, everything, everything, weights)
+            return cls(problem, everything, everything, weights, None, looks)
         prices = Prices.of(problem, tangent)
         kept = prices.may_better(np.inf if first is None else first.value)
         rest = restrict(problem, kept)
         near = Prices(prices.d[kept], prices.upper[kept]).near(rest)
         known = None if first is None else np.searchsorted(kept, first.chosen)
-        return cls(rest, kept, near, None if weights is None else weights[kept], known)
+        return cls(rest, kept, near, None if weights is None else weights[kept], known, looks)
 
 
 def _start(
@@ -182,7 +195,10 @@ def _start(
     chosen = _begin(pool, k, rng) if begun is None else begun
     chosen = _regular(pool, chosen, rng)
     kept = np.union1d(pool.near, chosen)
-    found = iterated_search(restrict(problem, kept), np.searchsorted(kept, chosen), rng)
+    nearby = replace(restrict(problem, kept), looks=pool.looks)
+    found = iterated_search(nearby, np.searchsorted(kept, chosen), rng)
+    if pool.looks is not None:
+        return k, replace(found, chosen=pool.kept[kept[found.chosen]])
     final = exchange(problem, kept[found.chosen])
     return k, Exchanged(pool.kept[final.chosen], final.value, found.passes + final.passes)
 
@@ -232,6 +248,13 @@ def _best(problem: DesignProblem, done: list[Exchanged]) -> ExactPlan:
     return ExactPlan(final.chosen, final.value, len(done), passes, values)
 
 
+def repaired(problem: DesignProblem, left: IntArray) -> IntArray:
+    """The plan `left`, sorted, brought to the shares of the problem, and no exchange betters it."""
+    problem, _ = balanced(problem, None)
+    chosen = regular_plan(problem, fitted(problem, left), np.random.default_rng(0))
+    return exchange(problem, chosen).chosen
+
+
 def restrict(problem: DesignProblem, kept: IntArray) -> DesignProblem:
     """The same problem with the candidates `kept` (k,), sorted, alone."""
     if len(kept) == problem.n_candidates:
@@ -274,7 +297,7 @@ class Prices:
         return np.flatnonzero(self.upper > (1 - SLACK) / value)
 
     def near(self, problem: DesignProblem) -> IntArray:
-        """The dearest candidates of every group, NEAR_PER_POSE for each pose of its share.
+        """The dearest candidates of every group, as many as its share asks for.
 
         The K of the KL exchange (Atkinson & Donev 1989, Applied Statistics 38, 515–526).
         """
@@ -282,7 +305,8 @@ class Prices:
         for label, share in enumerate(problem.shares):
             members = np.flatnonzero(problem.group == label)
             order = np.argsort(-self.d[members], kind="stable")
-            kept.append(members[order[: NEAR_PER_POSE * share]])
+            near = min(NEAR_PER_POSE * share, max(NEAR_PER_MANY * share, NEAR_AT_LEAST))
+            kept.append(members[order[:near]])
         return np.sort(np.concatenate(kept))
 
 
@@ -381,13 +405,44 @@ def _belongs(state: Mapping[str, NDArray[Any]], problem: DesignProblem) -> bool:
 
 @dataclass(frozen=True)
 class SizedPlan:
-    """The best plan found of `n_poses` poses, its Φ `value`, and the certified lower `bound` on Φ
-    of every plan of so many; None where the criterion has none."""
+    """The best plan found of `n_poses` poses, and the relaxation that bounds every plan of so
+    many; None where the criterion has none."""
 
     n_poses: int
-    value: float
-    bound: float | None
     plan: ExactPlan
+    relaxed: Relaxed | None
+
+    @property
+    def value(self) -> float:
+        return self.plan.value
+
+    @property
+    def bound(self) -> float | None:
+        return None if self.relaxed is None else self.relaxed.bound
+
+    def arrays(self) -> dict[str, NDArray[Any]]:
+        """What `kept` makes it from again."""
+        own = {"chosen": self.plan.chosen, "plan_value": np.array(self.plan.value)}
+        if (r := self.relaxed) is None:
+            return own
+        numbers = np.array([r.value, r.bound, r.gap, r.tangent.value])
+        return own | {"weights": r.weights, "relaxed": numbers, "G": r.tangent.G}
+
+    @classmethod
+    def kept(cls, state: Mapping[str, NDArray[Any]]) -> SizedPlan | None:
+        """From the arrays of one, among others; None where there are none."""
+        if "chosen" not in state:
+            return None
+        value = float(state["plan_value"])
+        plan = ExactPlan(state["chosen"], value, 0, 0, np.array([value]))
+        relaxed = None
+        if "weights" in state:
+            at, bound, gap, tangent = (float(v) for v in state["relaxed"])
+            relaxed = Relaxed(
+                state["weights"], at, bound, gap, 0, "first-order", (),
+                Gradient(tangent, state["G"]),
+            )  # fmt: skip
+        return cls(len(plan.chosen), plan, relaxed)
 
 
 @dataclass(frozen=True)
@@ -413,6 +468,7 @@ def size_curve(
     starts: int = 10,
     seed: int = 0,
     jobs: int = 1,
+    looks: int | None = None,
     progress: Progress = lambda message: None,
 ) -> SizeCurve:
     """The best plans found of the given `numbers` of poses, and the fewest with Φ ≤ `target`.
@@ -429,7 +485,7 @@ def size_curve(
     """
     wanted = sorted(set(numbers))
     require(bool(wanted) or target is not None, "a size curve needs numbers of poses or a target")
-    sizes = _Sizes(problem_of, starts, seed, jobs, progress)
+    sizes = _Sizes(problem_of, starts, seed, jobs, looks, progress)
     for n in wanted:
         sizes.point(n)
     if target is None:
@@ -482,6 +538,7 @@ class _Sizes:
     starts: int
     seed: int
     jobs: int
+    looks: int | None
     progress: Progress
     found: dict[int, SizedPlan] = field(default_factory=dict)
     relaxed: dict[int, Relaxed] = field(default_factory=dict)
@@ -515,10 +572,10 @@ class _Sizes:
             starts=self.starts,
             seed=self.seed,
             jobs=self.jobs,
+            looks=self.looks,
         )
-        bound = None if relaxed is None else relaxed.bound
-        self.found[n] = SizedPlan(n, plan.value, bound, plan)
-        told = "" if bound is None else f", bound {bound:.6g}"
+        self.found[n] = SizedPlan(n, plan, relaxed)
+        told = "" if relaxed is None else f", bound {relaxed.bound:.6g}"
         self.progress(f"{n} poses: {plan.value:.6g}{told}")
 
     def _relaxation(self, n: int, problem: DesignProblem) -> Relaxed | None:

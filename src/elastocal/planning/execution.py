@@ -111,6 +111,18 @@ class Execution:
         """Loads hung, exchanged or taken off; the arm begins and ends without."""
         return sum(stop.change_after is not None for stop in self.stops) + self.take_off
 
+    def times(self, poses: int, states: int) -> Array:
+        """When (poses, states) in s each pose is read in each load state; the mean of several."""
+        step = [
+            stop.travel + self.motion.dwell
+            + self.motion.load_change * (stop.change_after is not None)
+            for stop in self.stops
+        ]  # fmt: skip
+        at = np.array([stop.pose * states + stop.load for stop in self.stops])
+        total = np.bincount(at, np.cumsum(step), poses * states)
+        count = np.maximum(np.bincount(at, minlength=poses * states), 1)
+        return np.asarray(total / count).reshape(poses, states)
+
     @property
     def total(self) -> float:
         """s of travelling, measuring and changing loads."""

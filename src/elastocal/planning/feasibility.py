@@ -93,6 +93,28 @@ class Bound(Rule):
         )
 
 
+NEARBY = 0.2  # rad or m in every joint: what stands in one pose's way will stand in the other's
+
+
+class Struck(Rule):
+    """Not near one of the poses (m, n) that the user has struck out."""
+
+    name = "struck"
+
+    def __init__(self, struck: Array) -> None:
+        self._struck = struck
+
+    def broken(self, poses: Poses) -> BoolArray:
+        off = [np.abs(poses.q - q).max(axis=1) for q in self._struck]
+        return np.asarray(np.min(off, axis=0) < NEARBY)
+
+    def causes(self, poses: Poses) -> dict[str, BoolArray]:
+        return {"a pose struck out": self.broken(poses)}
+
+    def remedy(self, poses: Poses) -> str:
+        return "strike fewer poses"
+
+
 # Rules about bodies: keep-out, obstacles, self-collision, height of the load, line of sight.
 
 # A pose keeps every margin by this much more, so that a move that ends there can be certified.
@@ -100,6 +122,9 @@ POSE_SLACK = 1e-4  # m
 SHOWN = 3  # causes that a remedy names
 
 ADVICE = {
+    "mounting_plane": (
+        "where the arm may reach below z = 0 of its base, set [workspace] mounting_plane = false"
+    ),
     "keep_out": "move the boundary in [[workspace.keep_out]]",
     "load_height": "lower [workspace.load] min_height_m or shorten its rope",
     "obstacle": "move or shrink the obstacle",
@@ -158,6 +183,10 @@ class LineOfSight(Rule):
             hidden[observed] = self._sight.blocked(poses.take(observed), marker)
         return hidden
 
+    def hides(self, poses: Poses, marker: str) -> BoolArray:
+        """(N,): this marker is not seen."""
+        return self._sight.blocked(poses, self._markers[marker])
+
     def causes(self, poses: Poses) -> dict[str, BoolArray]:
         found = {}
         for body in self._sight.bodies:
@@ -168,6 +197,41 @@ class LineOfSight(Rule):
 
     def remedy(self, poses: Poses) -> str:
         return f"{most_frequent(self.causes(poses))}; {ADVICE[self.name]}"
+
+
+class EnoughMarkers(Rule):
+    """At least so many markers are in range, turned towards the tracker, and in its sight."""
+
+    name = "markers_seen"
+
+    def __init__(self, rules: Sequence[Rule], markers: Sequence[str], least: int) -> None:
+        self._bounds = [rule for rule in rules if not isinstance(rule, LineOfSight)]
+        self._sight = [rule for rule in rules if isinstance(rule, LineOfSight)]
+        self._markers, self._least = tuple(markers), least
+
+    def seen(self, poses: Poses) -> BoolArray:
+        """(N, markers): which are seen; nothing is looked for behind bodies where too few remain
+        without."""
+        seen = np.ones((len(poses), len(self._markers)), dtype=bool)
+        for rule in self._bounds:
+            for name, outside in rule.causes(poses).items():
+                seen[:, self._markers.index(name)] &= ~outside
+        hopeful = seen.sum(axis=1) >= self._least
+        for sight in self._sight:
+            for k, name in enumerate(self._markers):
+                rows = np.flatnonzero(hopeful & seen[:, k])
+                seen[rows, k] = ~sight.hides(poses.take(rows), name)
+        return seen
+
+    def broken(self, poses: Poses) -> BoolArray:
+        return np.asarray(self.seen(poses).sum(axis=1) < self._least)
+
+    def causes(self, poses: Poses) -> dict[str, BoolArray]:
+        return dict(zip(self._markers, ~self.seen(poses).T, strict=True))
+
+    def remedy(self, poses: Poses) -> str:
+        told = most_frequent(self.causes(poses))
+        return f"{told} not seen; {ADVICE['line_of_sight']}, or lower min_markers"
 
 
 def most_frequent(causes: Mapping[str, BoolArray]) -> str:
@@ -221,16 +285,21 @@ def rule_book(
     pairs: Sequence[Pair],
 ) -> tuple[Rule, ...]:
     """All rules of the cell.  Raises InputError where they do not fit the robot."""
+    bounds = tuple(_visibility(cell))
+    sight = tuple(_line_of_sight(cell, kinematics, bodies))
+    least = None if cell.workspace.visibility is None else cell.workspace.visibility.min_markers
+    if least is not None and least < len(cell.tool.markers):
+        bounds, sight = (), (EnoughMarkers((*bounds, *sight), tuple(cell.tool.markers), least),)
     return (
         _joints(cell, chain),
-        *_visibility(cell),
+        *bounds,
         *_load(cell, chain),
         *(
             KeepApart(rule, kinematics, own)
             for rule in RULES
             if (own := [pair for pair in pairs if pair.rule == rule])
         ),
-        *_line_of_sight(cell, kinematics, bodies),
+        *sight,
     )
 
 
@@ -341,11 +410,11 @@ MOST_TRIED = 300  # random poses in which a pair must once keep apart to be beli
 _last_restored: dict[str, Feasibility] = {}
 
 
-def _restored(token: str, cell: Cell, chain: Chain) -> Feasibility:
+def _restored(token: str, cell: Cell, chain: Chain, struck: Array | None) -> Feasibility:
     """The rules anew, once per process: with every task the same ones are sent again."""
     if token not in _last_restored:
         _last_restored.clear()
-        _last_restored[token] = Feasibility(cell, chain)
+        _last_restored[token] = Feasibility(cell, chain, struck)
     return _last_restored[token]
 
 
@@ -353,19 +422,23 @@ class Feasibility:
     """The rules of a cell for the nominal, rigid arm.
 
     `bodies` and `pairs`: what there is and what must keep apart; `rules` in the order of
-    checking, cheap ones first.  Pickles by its cell and chain, so that processes can share it.
+    checking, cheap ones first; `struck` (m, n): poses near which none may be.  Pickles by what it
+    is made of, so that processes can share it.
     Raises InputError for a workspace that does not fit the robot.
     """
 
-    def __init__(self, cell: Cell, chain: Chain) -> None:
+    def __init__(self, cell: Cell, chain: Chain, struck: Array | None = None) -> None:
         self.cell, self.chain, self._token = cell, chain, uuid4().hex
+        self._struck = struck
         self.kinematics = Kinematics(cell, chain)
         self.bodies: tuple[Body, ...] = cell_bodies(cell, chain)
         self.pairs: tuple[Pair, ...] = cell_pairs(cell, chain, self.bodies)
         self.rules = rule_book(cell, chain, self.kinematics, self.bodies, self.pairs)
+        if struck is not None and len(struck):
+            self.rules = (self.rules[0], Struck(struck), *self.rules[1:])
 
     def __reduce__(self) -> tuple[Any, ...]:
-        return _restored, (self._token, self.cell, self.chain)
+        return _restored, (self._token, self.cell, self.chain, self._struck)
 
     def check(self, q: Array, force: Array) -> PoseFeasibility:
         """Every rule on every pose q (N, n) rad or m under a force (3,) or (N, 3) N.
@@ -387,6 +460,20 @@ class Feasibility:
         ok = np.zeros(len(poses), dtype=bool)
         ok[left] = True
         return ok
+
+    @property
+    def partial(self) -> bool:
+        """May a pose show only some of the markers?"""
+        return any(isinstance(rule, EnoughMarkers) for rule in self.rules)
+
+    def seen(self, q: Array, force: Array) -> BoolArray:
+        """(N, markers): which markers the tracker sees of poses q (N, n) that are feasible under a
+        force (3,) or (N, 3) N."""
+        poses = self._poses(q, force)
+        for rule in self.rules:
+            if isinstance(rule, EnoughMarkers):
+                return rule.seen(poses)
+        return np.ones((len(poses), len(self.cell.tool.markers)), dtype=bool)
 
     def advice(self, verdict: PoseFeasibility) -> str:
         """Which rule to relax, how many candidates that frees, and how."""
@@ -422,7 +509,10 @@ class Feasibility:
 
     @cached_property
     def _paths(self) -> Paths:
-        return Paths(self.kinematics, self.bodies, self.pairs, self.cell.workspace.load)
+        kept_apart = [item for p in self.pairs for item in (p.body, p.other)]
+        bodies = {item.name: item for item in kept_apart if isinstance(item, Body)}
+        load = self.cell.workspace.load
+        return Paths(self.kinematics, tuple(bodies.values()), self.pairs, load)
 
     def _poses(self, q: Array, force: Array) -> Poses:
         q = np.atleast_2d(np.asarray(q, dtype=float))

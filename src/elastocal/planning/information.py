@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import re
+from collections.abc import Callable, Iterable
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -12,8 +13,10 @@ from scipy import linalg, sparse
 from elastocal.cell.work_cell import Cell
 from elastocal.errors import InputError, InsufficientDataError, option, require
 from elastocal.identification.identify import identify
+from elastocal.identification.noise_structure import VISIT, SharedEffect
 from elastocal.identification.options import Options
 from elastocal.identification.solve import WORTH_A_COLUMN, Reduction, reduce
+from elastocal.identification.visit_record import visit_record
 from elastocal.identification.weighted_problem import (
     Weights,
     stated_covariance,
@@ -27,12 +30,14 @@ from elastocal.model.manipulator import Model
 from elastocal.model.observations import Observations, available_noise, observe
 from elastocal.simulation.simulate import simulate
 from elastocal.text import did_you_mean, listed, quoted
-from elastocal.units import Array, IntArray
+from elastocal.units import Array, BoolArray, IntArray
 
 # What a pose will be read as: its table rows, load states, and the covariance of its readings.
 
+Sight = Callable[[Array, Array], BoolArray]  # joints (N, n), force (3,) → (N, markers): seen?
 ALL_LOADS = -1  # a candidate measured in every load state
 NO_FORCE = 1e-9  # N
+NEVER = 1e9  # m (rad): standard deviation of a reading that is not made
 
 
 @dataclass(frozen=True)
@@ -136,13 +141,14 @@ def reading_covariance(model: Model, observed: Observations) -> Array:
 
 
 def pose_covariance(
-    model: Model, observed: Observations, n_poses: int, states: LoadStates
+    model: Model, observed: Observations, n_poses: int, states: LoadStates, x: Array | None = None
 ) -> Array:
     """Covariance (N, r, r) of a pose's observations, means of `[design] repeats` readings each.
 
-    Σ = T Σ_rows Tᵀ / repeats + τ² per load state and direction: deflections share their unloaded
-    reading, and what the arm does not repeat (τ, `[design] repeatability_um`) is common to the
-    markers of a visit.  A pose that is approached from both sides is visited twice.
+    Σ = T Σ_rows Tᵀ / repeats + τ² per load state and direction + J diag(s²) Jᵀ: deflections share
+    their unloaded reading; what the arm does not repeat, τ of `[design] repeatability_um` and s of
+    the joints of `[noise]`, is common to the markers of a visit.  A pose that is approached from
+    both sides is visited twice.  `x` (parameters,): where J is taken.
     """
     spec = model.cell.design
     visits = 2 if spec.motion.both_directions else 1
@@ -161,7 +167,19 @@ def pose_covariance(
         same = (force[:, None] == force[None]).all(axis=2).astype(float)
         moved = np.diag(np.arange(size) < 3).astype(float)
         covariance = covariance + spec.repeatability**2 * np.kron(same, moved)
+    if model.cell.noise.joints.any():
+        settling = settling_joints(model, observed, model.nominal if x is None else x)
+        members = np.arange(len(observed.lead)).reshape(n_poses, -1)
+        covariance = covariance + settling.product(members, settling, members).reshape(-1, r, r)
     return covariance / visits
+
+
+def settling_joints(model: Model, observed: Observations, x: Array) -> SharedEffect:
+    """What the joints' own scatter of `[noise]` puts on each visit's readings, of variance one."""
+    record = visit_record(model, observed, x)
+    assert record is not None
+    loading = record.motion * model.cell.noise.of_joints(model.chain.n_joints)
+    return SharedEffect("joints", (VISIT,), record.visit, loading, np.zeros(0))
 
 
 def readings_each(cell: Cell) -> int:
@@ -180,6 +198,8 @@ class PoseInformation:
 
     `scenarios` (S, parameters): parameter values at which the arm is linearised; `columns` (p,)
     the parameters to be estimated, `sizes` (p,) what one unit of a scaled parameter is.
+    `sight`: which markers are seen, None for all of them; a reading that is not made counts as
+    one that shows nothing.
     """
 
     model: Model
@@ -187,6 +207,7 @@ class PoseInformation:
     scenarios: Array
     columns: IntArray
     sizes: Array
+    sight: Sight | None = None
 
     @property
     def names(self) -> tuple[str, ...]:
@@ -226,12 +247,38 @@ class PoseInformation:
         one = q[None], np.array([load])
         return np.stack([np.linalg.inv(self.noise(*one, x)[1][0]) for x in self.scenarios])
 
+    def seen(self, q: Array, load: IntArray) -> BoolArray:
+        """(N, L, markers): which markers are seen of poses q (N, n) in each load state; True in
+        those in which a pose is not measured."""
+        markers, forces = len(self.model.cell.tool.markers), self.states.forces
+        found = np.ones((len(q), len(forces), markers), dtype=bool)
+        if self.sight is None:
+            return found
+        for state, force in enumerate(forces):
+            rows = np.flatnonzero((load == ALL_LOADS) | (load == state))
+            found[rows, state] = self.sight(q[rows], force)
+        if not self.states.observed.all():  # a difference takes both of its readings
+            found &= found.all(axis=1, keepdims=True)
+        return found
+
+    def _unread(self, q: Array, load: IntArray, covariance: Array, size: int) -> Array:
+        """The covariance (N, r, r) with that of NEVER in place of what is not seen."""
+        seen = self.seen(q, load)
+        if load[0] != ALL_LOADS:
+            seen = seen[np.arange(len(q)), load][:, None]
+        each = covariance.shape[1] // (size * seen.shape[2])  # load states that are observed
+        read = np.repeat(seen[:, -each:].reshape(len(q), -1), size, axis=1)
+        alone = np.einsum("nr,rs->nrs", ~read * NEVER**2, np.eye(read.shape[1]))
+        return np.asarray(covariance * (read[:, :, None] & read[:, None]) + alone)
+
     def noise(self, q: Array, load: IntArray, x: Array | None = None) -> tuple[Observations, Array]:
         """What is read at the poses of the arm x, by default the one known best, and the Cholesky
         factors (N, r, r) of its covariance."""
         x = self.scenarios[0] if x is None else x
         observed = observe(self.rows(q, load, x), self.model.observe)
-        covariance = pose_covariance(self.model, observed, len(q), self.states)
+        covariance = pose_covariance(self.model, observed, len(q), self.states, x)
+        if self.sight is not None:
+            covariance = self._unread(q, load, covariance, observed.size)
         return observed, np.asarray(np.linalg.cholesky(covariance), dtype=np.float64)
 
 
@@ -387,19 +434,24 @@ def _sample(model: Model, q: Array, load: IntArray) -> IntArray:
 @dataclass(frozen=True)
 class Done:
     """`x` (parameters,) the arm as identified so far, `information` (parameters, parameters) in
-    the parameters' units, `numbers` observed, `note` on where x comes from."""
+    the parameters' units, `pull` (parameters,) = BᵀΣ⁻¹(readings − prediction), `numbers` observed,
+    `note` on where x comes from."""
 
     x: Array
     information: Array
+    pull: Array
     numbers: int
     note: str
 
 
-def measured(model: Model, table: Measurements, fixed: tuple[str, ...]) -> Done:
+def measured(
+    model: Model, table: Measurements, fixed: tuple[str, ...], whole: Model | None = None
+) -> Done:
     """Information BᵀΣ⁻¹B of a table of measurements, at the parameters it identifies.
 
     Where it does not suffice to identify the arm, B is taken at the nominal one.  The noise is
-    the stated one, as for the poses to come.
+    the stated one, as for the poses to come.  `whole`: the model with further effects, which are
+    at nominal, for the information on these too.
     """
     if table.sigma is None:
         table = marker_sigmas(model.cell, table)
@@ -408,25 +460,29 @@ def measured(model: Model, table: Measurements, fixed: tuple[str, ...]) -> Done:
         note = "the arm as identified from the measurements done"
     except InsufficientDataError as error:
         x, note = model.nominal, f"the nominal arm, as the measurements do not suffice ({error})"
+    if whole is not None:
+        known = dict(zip(model.names, x, strict=True))
+        x = np.array([known.get(p.name, p.nominal) for p in whole.parameters])
+        model = whole
     observed = observe(table, model.observe)
-    weights = _weights(model, observed)
-    B = weights.apply(model.regressor(table, x, None, observed).B)
-    return Done(x, B.T @ B, len(B), note)
+    weights = _weights(model, observed, x)
+    at = model.regressor(table, x, None, observed)
+    B = weights.apply(at.B)
+    return Done(x, B.T @ B, B.T @ weights.apply(at.residual), len(B), note)
 
 
-def next_number(table: Measurements | None) -> int:
-    """The number after those of the table's configurations, so that what is measured next can
-    join it: 9 after "8", "8-" and "warm-up"; 1 where there is no table or no number."""
-    labels = () if table is None else table.configuration_labels
+def next_number(labels: Iterable[str]) -> int:
+    """The number after those of the configurations that there are, so that what is measured next
+    can join them: 9 after "8", "8-" and "warm-up"; 1 where there is no number."""
     numbers = [int(m[0]) for m in (re.match(r"[0-9]+", label) for label in labels) if m]
     return max(numbers, default=0) + 1
 
 
-def _weights(model: Model, observed: Observations) -> Weights:
+def _weights(model: Model, observed: Observations, x: Array) -> Weights:
     """The stated noise, and with it what readings of one visit share."""
     stated = weights_for(observed, model.cell.tracker)
-    tau = model.cell.design.repeatability
-    if tau == 0 or stated.whiten is None:
+    tau, scatters = model.cell.design.repeatability, model.cell.noise.joints.any()
+    if (tau == 0 and not scatters) or stated.whiten is None:
         return stated
     inverse = sparse.linalg.inv(sparse.csc_array(stated.whiten))
     key = np.column_stack(
@@ -439,4 +495,7 @@ def _weights(model: Model, observed: Observations) -> Weights:
         shape=(observed.size, observed.size),
     )
     covariance = inverse @ inverse.T + tau**2 * sparse.kron(same @ same.T, moved)
+    if scatters:
+        Z = settling_joints(model, observed, x).columns()
+        covariance = covariance + Z @ Z.T
     return Weights(stated.kind, whitener(sparse.csr_array(covariance)), True, stated.description)

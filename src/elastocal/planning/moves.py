@@ -427,7 +427,9 @@ def check_reachable(moves: Moves, blockers: BlockersOf | None) -> None:
             continue
         _, *lost = roadmap.parts(needed)
         if lost:
-            raise _unreachable(moves, roadmap, lost[0], blockers)
+            every = [point for part in lost for point in part]
+            alone = lost[0] if moves.home in every else every
+            raise _unreachable(moves, roadmap, alone, blockers)
 
 
 def _check_approaches(

@@ -15,12 +15,13 @@ from elastocal.errors import InputError, require
 from elastocal.files import atomic_write_text
 from elastocal.measurements import DEFAULT_MARKER, Measurements, families
 from elastocal.model.manipulator import Model
+from elastocal.planning.choices import Chosen
 from elastocal.planning.criterion import Criterion
 from elastocal.planning.execution import Execution, Stop
 from elastocal.planning.information import Estimable
 from elastocal.tables import column, csv_text
 from elastocal.text import is_label, json_text, quoted
-from elastocal.units import Array, IntArray, to_si
+from elastocal.units import Array, BoolArray, IntArray, to_si
 
 # What a plan promises, and why each pose is in it.
 
@@ -117,7 +118,8 @@ UNITS = {"revolute": "deg", "prismatic": "mm"}
 class PlanRows:
     """R rows of plan.csv: `configuration` names, `q` (R, n) rad or m, `level` (R,) from 1 on,
     `order` (R,) of execution from 1 on, and where the plan states them `force` (R, 3) N and
-    `approach` (R, n) of ±1.  `notes`: further columns for people, passed over when read."""
+    `approach` (R, n) of ±1, and `marker` (R,) of `marker_names` where not all of them are read.
+    `notes`: further columns for people, passed over when read."""
 
     configuration: tuple[str, ...]
     q: Array
@@ -126,6 +128,8 @@ class PlanRows:
     force: Array | None = None
     approach: IntArray | None = None
     notes: Mapping[str, Sequence[str]] | None = None
+    marker: IntArray | None = None
+    marker_names: tuple[str, ...] = (DEFAULT_MARKER,)
 
     def table(self, joint_kinds: Sequence[str]) -> Measurements:
         """What `measurement_reader.read_plan` reads of these rows once they are written."""
@@ -144,8 +148,8 @@ class PlanRows:
             configuration=np.array([labels.index(name) for name in self.configuration]),
             configuration_labels=labels,
             repeat=np.zeros(n, dtype=np.int64),
-            marker=np.zeros(n, dtype=np.int64),
-            marker_names=(DEFAULT_MARKER,),
+            marker=np.zeros(n, dtype=np.int64) if self.marker is None else self.marker,
+            marker_names=self.marker_names,
             force=np.zeros((n, 3)) if self.force is None else self.force,
             approach=None if self.approach is None else self.approach.astype(float),
         )
@@ -156,6 +160,7 @@ def plan_rows(
     configurations: Sequence[str],
     level: IntArray,
     forces: Array | None = None,
+    seen: Mapping[str, BoolArray] | None = None,
 ) -> PlanRows:
     """The rows of an execution, sorted by pose, then side of approach, then load state.
 
@@ -164,7 +169,8 @@ def plan_rows(
     order in the first state, note_order_2 that in the second, and so on.  `configurations` and
     `level`: one per pose.  Where a pose is approached from both sides, they are two
     configurations, 7+ (joints moving up to it) and 7-: the difference between them is what such a
-    plan is for, not noise of repeats.
+    plan is for, not noise of repeats.  With `seen`, which markers are read of each pose in each
+    load state (N, L), there is a row for each of them.
     """
     numbered = list(enumerate(execution.stops, start=1))
     readings: dict[tuple[int, ...], list[tuple[int, Stop]]] = {}
@@ -182,6 +188,13 @@ def plan_rows(
         for i in range(1, most)
     }
     approach = [stop.approach for stop in first if stop.approach is not None]
+    marker = None
+    if seen is not None:
+        read = np.array([[each[stop.pose, stop.load] for each in seen.values()] for stop in first])
+        of, marker = np.nonzero(read)
+        rows, first = [rows[k] for k in of], [first[k] for k in of]
+        approach = [approach[k] for k in of] if approach else []
+        notes = {name: [cells[k] for k in of] for name, cells in notes.items()}
     return PlanRows(
         configuration=tuple(stop.name(configurations) + sides[stop.side] for stop in first),
         q=np.array([stop.q for stop in first]),
@@ -190,6 +203,8 @@ def plan_rows(
         force=None if forces is None else forces[[stop.load for stop in first]],
         approach=np.array(approach) if approach else None,
         notes=notes,
+        marker=marker,
+        marker_names=(DEFAULT_MARKER,) if seen is None else tuple(seen),
     )
 
 
@@ -206,7 +221,9 @@ def write_plan(path: str | Path, rows: PlanRows, joint_kinds: Sequence[str]) -> 
                 f"{path}: configuration name {quoted(name)} cannot stand in a table; use one "
                 "line without blanks at its ends"
             )
-    keys = list(zip(rows.configuration, *([] if rows.force is None else rows.force.T), strict=True))
+    more = [] if rows.marker is None else [rows.marker]
+    more += [] if rows.force is None else list(rows.force.T)
+    keys = list(zip(rows.configuration, *more, strict=True))
     require(len(set(keys)) == len(keys), f"{path}: two rows of the plan have the same name")
     for values in (rows.q, rows.force):
         if values is not None and not np.isfinite(values).all():
@@ -218,6 +235,8 @@ def _columns(rows: PlanRows, joint_kinds: Sequence[str]) -> dict[str, Sequence[s
     """Header → cells, in the units and names of the measurement table."""
     known = families(joint_kinds)
     columns: dict[str, Sequence[str]] = {"configuration": rows.configuration}
+    if rows.marker is not None:
+        columns["marker"] = [rows.marker_names[k] for k in rows.marker]
     for stem, kind, values in zip(known["q"].units, joint_kinds, rows.q.T, strict=True):
         columns[column(stem, UNITS[kind])] = [
             repr(round(float(v), DIGITS) + 0.0) for v in in_unit(values, kind)
@@ -309,27 +328,81 @@ class Chance:
 @dataclass(frozen=True)
 class Everywhere:
     """Rms position error in m after compensation, at the test poses and over all joint ranges, of
-    the plan and of the median random plan (None where that leaves parameters open)."""
+    the plan and of the median random plan (None where that leaves parameters open), and of the
+    plan with the drift that the cell states.  `share` of the criterion's weight lies on the joint
+    ranges, so that the error at the test poses is at most about `cap` above the least; 0 where no
+    such cap was asked for."""
 
     test_poses: float
     elsewhere: float
     random_test_poses: float | None
     random_elsewhere: float | None
+    drifting_test_poses: float
+    drifting_elsewhere: float
+    share: float = 0.0
+    cap: float = 0.0
 
     @classmethod
-    def of(cls, own: Array, elsewhere: Array, M: Array, random: Array) -> Everywhere:
-        """Of R (r, p) at both, the plan's information M (p, p) and random plans' (n, p, p)."""
-
-        def rms(R: Array, M: Array) -> float:
-            try:
-                V = linalg.cho_solve(linalg.cho_factor(M), R.T)
-            except linalg.LinAlgError:
-                return np.inf
-            return float(np.sqrt(max(np.sum(R.T * V), 0.0)))
-
-        chance = [float(np.median([rms(R, m) for m in random])) for R in (own, elsewhere)]
+    def of(
+        cls, own: Array, elsewhere: Array, M: Array, random: Array, left: Array,
+        share: float = 0.0, cap: float = 0.0,
+    ) -> Everywhere:  # fmt: skip
+        """Of R (r, p) at both, the plan's information M (p, p), random plans' (n, p, p), and
+        what a drift leaves of the plan's (p, p)."""
+        chance = [float(np.median([_rms(R, m) for m in random])) for R in (own, elsewhere)]
         told = [value if np.isfinite(value) else None for value in chance]
-        return cls(rms(own, M), rms(elsewhere, M), *told)
+        drifting = _rms(own, left), _rms(elsewhere, left)
+        return cls(_rms(own, M), _rms(elsewhere, M), told[0], told[1], *drifting, share, cap)
+
+
+def _rms(R: Array, M: Array) -> float:
+    """√tr(R M⁻¹ Rᵀ); inf where M (p, p) is singular."""
+    try:
+        V = linalg.cho_solve(linalg.cho_factor(M), R.T)
+    except linalg.LinAlgError:
+        return np.inf
+    return float(np.sqrt(max(np.sum(R.T * V), 0.0)))
+
+
+DRAWS = 2000  # of what the arm may be
+
+
+@dataclass(frozen=True)
+class Gain:
+    """What a plan adds to measurements done: rms position error in m at the test poses.
+
+    `before` and `after` it with the effects in doubt, `model_before` and `model_after` were the
+    model right; inf where the measurements leave parameters open.  `sure`: with 95 % the error of
+    the model as it is now identified is smaller.
+    """
+
+    before: float
+    after: float
+    model_before: float
+    model_after: float
+    sure: float
+
+    @classmethod
+    def of(
+        cls, R: Array, before: Array, after: Array, own: BoolArray, pull: Array, seed: int
+    ) -> Gain:
+        """Of R (r, p) at the test poses, the information (p, p) before and after the plan, which
+        parameters are the model's `own` (p,), and `pull` (p,) = Bᵀ Σ⁻¹ (readings − model).
+
+        The arm is N(V pull, V) away from the model, V the inverse of `before`: what it may lack,
+        as far as the readings show it, and what they leave possible.
+        """
+        of_model = np.ix_(own, own)
+        rms = [_rms(R, M) for M in (before, after)]
+        rms += [_rms(R[:, own], M[of_model]) for M in (before, after)]
+        if not np.isfinite(rms[0]):
+            return cls(*rms, np.inf)
+        factor = linalg.cho_factor(before, lower=True)
+        bias = R @ linalg.cho_solve(factor, pull)
+        root = linalg.solve_triangular(factor[0], R.T, lower=True).T
+        z = np.random.default_rng(seed).standard_normal((len(pull), DRAWS))
+        errors = np.linalg.norm(bias[:, None] + root @ z, axis=0)
+        return cls(*rms, float(np.quantile(errors, 0.95)))
 
 
 @dataclass(frozen=True)
@@ -368,6 +441,10 @@ class Plan(Result):
         first: Number of the first configuration: after those that were measured already.
         chance: What as many random poses would reach.
         everywhere: The error at the test poses and over all joint ranges, in m.
+        seen: Which markers are read of each pose in each load state (N, L, markers); None for all.
+        names: Of the configurations, where poses of an earlier plan were kept.
+        gain: What the plan adds to measurements done, where it does.
+        chosen: What was chosen besides the poses, where [design.choose] asks for it.
 
     Examples:
         >>> plan = ec.design(
@@ -405,6 +482,10 @@ class Plan(Result):
     first: int = 1
     chance: Chance | None = None
     everywhere: Everywhere | None = None
+    seen: BoolArray | None = None
+    names: tuple[str, ...] = ()
+    gain: Gain | None = None
+    chosen: Chosen | None = None
 
     def __repr__(self) -> str:
         sure = self.certificate.efficiency_pool
@@ -419,13 +500,35 @@ class Plan(Result):
 
     def table(self) -> Measurements:
         """The poses as a table for `simulate`, as the plan's file has them."""
-        rows = plan_rows(self.execution, self.configurations, self.group + 1, self.stated_forces)
-        return rows.table(self.model.chain.kinds)
+        return self.rows.table(self.model.chain.kinds)
+
+    @property
+    def rows(self) -> PlanRows:
+        """What its file has."""
+        return plan_rows(
+            self.execution, self.configurations, self.group + 1, self.stated_forces, self._read
+        )
+
+    @property
+    def _read(self) -> dict[str, BoolArray] | None:
+        """Which markers are read of each pose in each load state, where not all are."""
+        if self.seen is None:
+            return None
+        return dict(zip(self.model.cell.tool.markers, np.moveaxis(self.seen, 2, 0), strict=True))
+
+    def markers(self, k: int) -> str:
+        """The markers to be read of pose k, those in brackets under some of the loads only."""
+        names = self.model.cell.tool.markers
+        if self.seen is None:
+            return " ".join(names)
+        every, some = self.seen[k].all(axis=0), self.seen[k].any(axis=0)
+        told = zip(names, every, some, strict=True)
+        return " ".join(name if all_ else f"({name})" for name, all_, any_ in told if any_)
 
     @property
     def configurations(self) -> tuple[str, ...]:
-        """Their names: numbers from `first` on."""
-        return tuple(str(self.first + k) for k in range(len(self.q)))
+        """Their names: numbers from `first` on, unless poses of an earlier plan have theirs."""
+        return self.names or tuple(str(self.first + k) for k in range(len(self.q)))
 
     @property
     def group_names(self) -> tuple[str, ...]:
@@ -443,12 +546,14 @@ class Plan(Result):
 
         Not where every pose is measured unloaded, or unloaded and under one load, which is what
         `simulate` does with a load to a plan without forces; but where poses are visited again
-        for reference, as that is under one of the loads.
+        for reference, as that is under one of the loads, or where the load hides a marker.
         """
         loaded = np.any(self.forces != 0, axis=1)
         usual = not loaded[0] and loaded[1:].all() and len(loaded) <= 2
         again = any(stop.again for stop in self.execution.stops)
-        return None if usual and (self.load < 0).all() and not again else self.forces
+        alike = self.seen is None or bool((self.seen == self.seen[:, :1]).all())
+        every = usual and alike and (self.load < 0).all() and not again
+        return None if every else self.forces
 
     def to_json(self) -> dict[str, Any]:
         """The plan as numbers and texts; the file adds its schema."""
@@ -471,6 +576,8 @@ class Plan(Result):
             },
             "random_plans": None if self.chance is None else asdict(self.chance),
             "everywhere": None if self.everywhere is None else asdict(self.everywhere),
+            "gain": None if self.gain is None else asdict(self.gain),
+            "chosen": None if self.chosen is None else self.chosen.to_json(),
             "drift": None if self.execution.drift is None else asdict(self.execution.drift),
             "predicted": [
                 {
@@ -485,6 +592,8 @@ class Plan(Result):
             "poses": [
                 {
                     "configuration": k + 1,
+                    "markers": self.markers(k),
+                    "name": self.configurations[k],
                     "value_without": None if not np.isfinite(r.loss) else r.loss,
                     "serves": [
                         {"name": name, "std_without": None if not np.isfinite(f) else f}

@@ -116,7 +116,7 @@ def _rope_angle(cell: Cell, arm: _Frames) -> Iterator[ca.SX]:
 
 def _sight(cell: Cell, arm: _Frames) -> Iterator[ca.SX]:
     rules = cell.workspace.visibility
-    if rules is None:
+    if rules is None or rules.min_markers is not None:  # which of them are seen may change
         return
     tracker = rigid.constant(cell.tracker.position)
     for name, marker in cell.tool.markers.items():

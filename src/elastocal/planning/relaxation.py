@@ -19,7 +19,6 @@ from scipy.linalg import cho_factor, cho_solve
 
 from elastocal.errors import InsufficientDataError, require
 from elastocal.planning.criterion import (
-    BATCH_NUMBERS,
     Cone,
     Criterion,
     Gradient,
@@ -27,7 +26,7 @@ from elastocal.planning.criterion import (
     Term,
     Worst,
 )
-from elastocal.planning.selection import DesignProblem, largest_sum, tangent_bound
+from elastocal.planning.selection import DesignProblem, largest_sum, tangent_bound, triangle
 from elastocal.units import Array, IntArray, Progress
 
 # Newton's method for a few hundred candidates: a primal–dual interior point with exact Hessian.
@@ -356,8 +355,6 @@ LEAST_DEPTH, MOST_DEPTH = 1e-3, 0.1
 NEGLIGIBLE = 1e-4
 # Information in a direction, as a part of that of the whole pool, which counts as none.
 UNSEEN = 1e-6
-# Packed information larger than this (bytes) is not stored; pricing then goes through the blocks.
-PACKED_BYTES = 1_500_000_000
 # Smallest eigenvalue of the pool's information, scaled to unit diagonal, that counts as regular.
 LEAST_EIGENVALUE = 1e-13
 # Of clarabel on the scaled program, whose optimum is near 1; the second where the first fails.
@@ -502,19 +499,13 @@ def _thinned(
 class CandidatePool:
     """The candidates of a problem.
 
-    A_si = B_siᵀB_si is stored as its upper triangle with √2 off the diagonal, so that ⟨G, A_si⟩ is
-    a dot product of p(p+1)/2 numbers, where the blocks would need r·p² operations.
     `fixed` (N,): the weights of groups whose share takes every candidate, 0 for others; `levels`:
     the groups that leave a choice.
     """
 
     def __init__(self, problem: DesignProblem) -> None:
         self.problem = problem
-        S, N, _, p = problem.blocks.shape
-        self.rows, self.columns = np.triu_indices(p)
-        self._factor = np.where(self.rows == self.columns, 1.0, np.sqrt(2.0))
-        fits = 8 * S * N * len(self.rows) <= PACKED_BYTES
-        self._packed = self._pack() if fits else None
+        self.sensitivity, self.matrices = problem.sensitivity, problem.matrices
         size = np.bincount(problem.group, minlength=len(problem.shares))
         full = size * problem.most == problem.shares
         self.fixed = np.where(full[problem.group], float(problem.most), 0.0)
@@ -553,22 +544,14 @@ class CandidatePool:
 
     def information(self, weights: Array) -> Array:
         """M (S, p, p) at weights (N,)."""
-        used = np.flatnonzero(weights)
-        if self._packed is None or len(used) * 4 < len(weights):
+        packed = self.problem.packed
+        if packed is None or np.count_nonzero(weights) * 4 < len(weights):
             return self.problem.information(weights)
-        return self.problem.prior + self._unpack(weights @ self._packed)
-
-    def sensitivity(self, G: Array) -> Array:
-        """d (N,) = Σ_s ⟨G_s, A_si⟩, as `DesignProblem.sensitivity`."""
-        if self._packed is None:
-            return self.problem.sensitivity(G)
-        packed = G[:, self.rows, self.columns] * self._factor
-        return np.asarray((self._packed @ packed[:, :, None])[..., 0].sum(axis=0))
-
-    def matrices(self, chosen: IntArray) -> Array:
-        """A (S, k, p, p) of the candidates `chosen` (k,)."""
-        B = self.problem.blocks[:, chosen]
-        return np.asarray(B.transpose(0, 1, 3, 2) @ B)
+        p = self.problem.blocks.shape[-1]
+        rows, columns, factor = triangle(p)
+        M = np.empty((len(packed), p, p))
+        M[:, rows, columns] = M[:, columns, rows] = weights @ packed / factor
+        return self.problem.prior + M
 
     def restricted(self, chosen: IntArray) -> Restricted:
         """The problem with no other candidates than `chosen`, all of them free."""
@@ -600,22 +583,6 @@ class CandidatePool:
             found.append(of_level[np.argpartition(score[of_level], rest)[rest:]])
         best = np.concatenate(found)
         return best[score[best] > -np.inf]
-
-    def _pack(self) -> Array:
-        S, N, _, p = self.problem.blocks.shape
-        packed = np.empty((S, N, len(self.rows)))
-        step = max(BATCH_NUMBERS // (S * p * p), 1)
-        for start in range(0, N, step):
-            A = self.matrices(np.arange(start, min(start + step, N)))
-            packed[:, start : start + step] = A[..., self.rows, self.columns] * self._factor
-        return packed
-
-    def _unpack(self, packed: Array) -> Array:
-        p = self.problem.blocks.shape[-1]
-        M = np.empty((len(packed), p, p))
-        M[:, self.rows, self.columns] = packed / self._factor
-        M[:, self.columns, self.rows] = packed / self._factor
-        return M
 
 
 @dataclass(frozen=True)

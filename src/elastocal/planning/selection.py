@@ -3,14 +3,27 @@
 from __future__ import annotations
 
 from dataclasses import dataclass, replace
+from functools import cached_property, lru_cache
+from typing import Any
 
 import numpy as np
 
 from elastocal.errors import InsufficientDataError, require
-from elastocal.planning.criterion import SINGULAR, Criterion, Gradient, factorise
+from elastocal.planning.criterion import (
+    BATCH_NUMBERS,
+    SINGULAR,
+    Criterion,
+    Gradient,
+    factorise,
+    trustworthy,
+)
 from elastocal.units import Array, BoolArray, IntArray
 
 # The choice of poses as a problem: candidates with their information, shares, a criterion.
+
+# Packed information larger than this (bytes) is not stored; pricing then goes through the blocks.
+PACKED_BYTES = 1_500_000_000
+MANY = 0.25  # of the candidates: pricing so many, one product with all costs less than a choice
 
 
 @dataclass(frozen=True)
@@ -20,7 +33,8 @@ class DesignProblem:
     `blocks` (S, N, r, p): whitened, scaled B of candidate i under scenario s of the arm;
     M_s(w) = prior_s + Σ_i w_i B_siᵀ B_si with `prior` (S, p, p) from prior knowledge and from
     measurements already done.  `group` (N,) in 0 … L−1 and `shares` (L,) the numbers of poses.
-    `most`: how often one candidate may be measured in a plan.
+    `most`: how often one candidate may be measured in a plan.  `looks`: how many candidates an
+    exchange evaluates at most, the most promising; None: as many as may be the best.
     """
 
     blocks: Array
@@ -29,6 +43,7 @@ class DesignProblem:
     shares: IntArray
     criterion: Criterion
     most: int = 1
+    looks: int | None = None
 
     def __post_init__(self) -> None:
         S, N, _, p = self.blocks.shape
@@ -63,14 +78,86 @@ class DesignProblem:
         B = B.reshape(S, len(chosen) * r, p)
         return np.asarray(B.transpose(0, 2, 1) @ B)
 
-    def sensitivity(self, G: Array) -> Array:
-        """d (N,): d_i = Σ_s tr(B_si G_s B_siᵀ) = −∂Φ/∂w_i for G (S, p, p) of the criterion."""
-        S, N, r, p = self.blocks.shape
+    def sensitivity(self, G: Array, some: IntArray | None = None) -> Array:
+        """d (N,): d_i = Σ_s tr(B_si G_s B_siᵀ) = −∂Φ/∂w_i for G (S, p, p) of the criterion; of
+        the candidates `some` (k,) alone where given."""
+        if self.packed is not None:
+            rows, columns, factor = triangle(G.shape[-1])
+            flat = G[:, rows, columns] * factor
+            few = some is not None and len(some) < MANY * self.n_candidates
+            of = self.packed[:, some] if few else self.packed
+            d = np.asarray((of @ flat[:, :, None])[..., 0].sum(axis=0))
+            return d if few or some is None else d[some]
+        blocks = self.blocks if some is None else self.blocks[:, some]
+        S, N, r, p = blocks.shape
         d = np.zeros(N)
         for s in range(S):
-            flat = self.blocks[s].reshape(N * r, p)
+            flat = blocks[s].reshape(N * r, p)
             d += np.einsum("ij,ij->i", flat @ G[s], flat).reshape(N, r).sum(axis=1)
         return d
+
+    def matrices(self, chosen: IntArray) -> Array:
+        """A (S, k, p, p), B_siᵀB_si of the candidates `chosen` (k,)."""
+        B = self.blocks[:, chosen]
+        return np.asarray(B.swapaxes(-1, -2) @ B)
+
+    @cached_property
+    def packed(self) -> Array | None:
+        """A_si = B_siᵀB_si as its upper triangle with √2 off the diagonal (S, N, p(p+1)/2), so
+        that ⟨G, A_si⟩ is a dot product, where the blocks would need r·p² operations; None where
+        that takes too much memory."""
+        S, N, _, p = self.blocks.shape
+        rows, columns, factor = triangle(p)
+        if 8 * S * N * len(rows) > PACKED_BYTES:
+            return None
+        found = np.empty((S, N, len(rows)))
+        step = max(BATCH_NUMBERS // (S * p * p), 1)
+        for start in range(0, N, step):
+            A = self.matrices(np.arange(start, min(start + step, N)))
+            found[:, start : start + step] = A[..., rows, columns] * factor
+        return found
+
+    def __getstate__(self) -> dict[str, Any]:
+        """Without what can be formed anew: tasks for other processes stay small."""
+        return {name: value for name, value in self.__dict__.items() if name != "packed"}
+
+
+@lru_cache
+def triangle(p: int) -> tuple[IntArray, IntArray, Array]:
+    """Rows, columns (k,) of the upper triangle of (p, p), and √2 off its diagonal, else 1."""
+    rows, columns = np.triu_indices(p)
+    return rows, columns, np.where(rows == columns, 1.0, np.sqrt(2.0))
+
+
+def balanced(
+    problem: DesignProblem, tangent: Gradient | None
+) -> tuple[DesignProblem, Gradient | None]:
+    """The problem, and a tangent of it, for other parameters: those whose information at even
+    weights is 1.  The same plans have the same Φ.
+
+    Where base, markers and geometry are identified together, information is conditioned so badly
+    that no update of Φ by one pose keeps its digits, and each candidate would need a new inverse.
+    Left as it is where that is not so, or where the criterion belongs to its parameters.
+    """
+    size = np.bincount(problem.group, minlength=len(problem.shares))
+    even = (problem.shares / np.maximum(size, 1))[problem.group]
+    factor = factorise(problem.information(even))
+    if trustworthy(factor) or not factor.regular.all():
+        return problem, tangent
+    T, L = factor.inverse.swapaxes(-1, -2), factor.L
+    criterion = problem.criterion.turned(T)
+    if criterion is None:
+        return problem, tangent
+    prior = factor.inverse @ problem.prior @ T
+    turned = replace(
+        problem,
+        blocks=problem.blocks @ T[:, None],
+        prior=(prior + prior.swapaxes(-1, -2)) / 2,
+        criterion=criterion,
+    )
+    if tangent is not None:
+        tangent = Gradient(tangent.value, L.swapaxes(-1, -2) @ tangent.G @ L)
+    return turned, tangent
 
 
 # How good the best plan can be at most: a lower bound on Φ from the concavity of 1/Φ.
@@ -245,6 +332,8 @@ def best_addition(
     candidates, upper = candidates[order], upper[order]
     values = np.empty(0)
     best, size = below * (1 - IMPROVEMENT), FIRST
+    if problem.looks is not None and len(upper) and np.isfinite(upper[0]):
+        candidates, upper = candidates[: problem.looks], upper[: problem.looks]
     while len(values) < len(candidates) and upper[len(values)] * best > 1 - TIE:
         part = candidates[len(values) : len(values) + size]
         added = problem.criterion.after_adding(M, problem.blocks[:, part])
@@ -263,10 +352,7 @@ def _upper(problem: DesignProblem, M: Array, candidates: IntArray) -> Array:
         gradient = problem.criterion.gradient(M)
     except InsufficientDataError:
         return unknown
-    B = problem.blocks[:, candidates]
-    S, k, r, p = B.shape
-    weighted = B.reshape(S, k * r, p) @ gradient.G
-    d = np.einsum("skj,skj->k", weighted.reshape(S, k, r * p), B.reshape(S, k, r * p))
+    d = problem.sensitivity(gradient.G, candidates)
     return np.asarray((1 + d / gradient.value) / gradient.value)
 
 

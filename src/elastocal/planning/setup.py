@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
+from contextlib import suppress
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -20,6 +22,7 @@ from elastocal.planning.information import (
     Estimable,
     LoadStates,
     PoseInformation,
+    Sight,
     estimable,
     interest_of,
     typical_sizes,
@@ -77,7 +80,7 @@ def check_available(cell: Cell, available: IntArray, shares: IntArray) -> None:
     short = np.flatnonzero(available < shares)
     if not len(short):
         return
-    k, drawn = int(short[0]), cell.design.candidates
+    k, drawn = int(short[0]), cell.design.candidates or int(available.sum())
     level = f" takes {shares[k]} at level {k + 1} of {next(iter(cell.design.levels), '')}"
     where = f"{cell.path or cell.name}: a plan of {int(shares.sum())} poses"
     where += level if len(shares) > 1 else ""
@@ -150,6 +153,7 @@ class Setup:
 
     `target_rows` (r, p): |R x| is the rms error at the test poses in m, `elsewhere_rows` that over
     all joint ranges; None where the criterion knows of none, or nothing can be said of them.
+    `share` of the criterion's weight lies on the latter, `weighed` makes the criterion of another.
     """
 
     information: PoseInformation
@@ -159,9 +163,20 @@ class Setup:
     warnings: tuple[str, ...]
     target_rows: Array | None = None
     elsewhere_rows: Array | None = None
+    share: float = 0.0
+    weighed: Callable[[float], Criterion] | None = None
+
+    def sharing(self, share: float) -> Setup:
+        """With this share of the weight on what lies beside the test poses."""
+        assert self.weighed is not None
+        return replace(self, criterion=self.weighed(share), share=share)
 
     def pool(self, q: Array, load: IntArray, group: IntArray) -> FeasiblePool:
         return FeasiblePool(q, load, group, self.information.blocks(q, load))
+
+    def having(self, pinned: FeasiblePool | None) -> Setup:
+        """For what is chosen beside poses that stay: their information is known before."""
+        return self if pinned is None else replace(self, prior=self.gathered(pinned.blocks))
 
     def problem(self, pool: FeasiblePool, shares: IntArray) -> DesignProblem:
         return DesignProblem(pool.blocks, self.prior, pool.group, shares, self.criterion)
@@ -185,11 +200,14 @@ def set_up(
     known: Known,
     seed: int,
     region: TargetPoses | None = None,
+    sight: Sight | None = None,
+    work: Model | None = None,
 ) -> Setup:
     """The parameters that the candidates q (N, n) show, and the criterion on them.
 
     `region`: poses all over the joint ranges, which count for the criterion with the share
-    `[design] elsewhere`.
+    `[design] elsewhere`.  `sight` as of `PoseInformation`.
+    `work`: the model at the test poses, where its tool is not the one to measure with.
 
     Raises InsufficientDataError where no pose shows a parameter that the criterion needs, named
     with what it is combined with; InputError for unknown names.
@@ -197,7 +215,7 @@ def set_up(
     spec = model.cell.design
     scenarios = _scenarios(model, known, seed)
     every = np.arange(len(model.parameters))
-    raw = PoseInformation(model, states, scenarios, every, np.ones(len(every)))
+    raw = PoseInformation(model, states, scenarios, every, np.ones(len(every)), sight)
     sizes = typical_sizes(raw, q, load)
     information = replace(raw, sizes=sizes)
     prior = _prior(model, known, sizes)
@@ -210,52 +228,61 @@ def set_up(
     units = {p.unit for p in model.parameters if p.name in spec.combination}
     # A sentence per free parameter that no feasible pose shows at all.
     unseen = [int(i) for i in found.structure.invisible if i in free]
-    A, warnings = None, _unseen(model, found, unseen)
-    counted, own, elsewhere = targets, None, None
+    A, beyond, warnings = None, None, _unseen(model, found, unseen)
+    own, share = None, 0.0
     if "test_poses" in criterion_named(spec.criterion).needs:
-        T = len(targets.q)
-        both = targets if region is None else joined(targets, region, spec.elsewhere)
-        rows = np.stack([prediction_rows(information, both, x) for x in scenarios])
+        T, share = len(targets.q), spec.elsewhere or 0.0
+        both = targets if region is None else joined(targets, region, share)
+        at_work = information if work is None else replace(information, model=work)
+        moved = at_work.model.nominal - model.nominal
+        rows = np.stack([prediction_rows(at_work, both, x + moved) for x in scenarios])
+        A = on_kept(model, rows[:, :T], found)
         if region is not None:
-            elsewhere = _rms_rows(model, rows[:1, T:], region.weight, found)
-        if not spec.elsewhere:
-            rows = rows[:, :T]
-        elif elsewhere is None:
+            # None where no plan could make the position at all of them certain.
+            with suppress(InsufficientDataError):
+                beyond = on_kept(model, rows[:, T:], found)
+        if share and beyond is None:
             raise InsufficientDataError(
                 f"{model.cell.path or model.cell.name}: [design] elsewhere asks for poses all over "
                 "the joint ranges, but the rules allow none, or no plan can make all of them "
                 "certain; leave it out"
             )
-        else:
-            counted = both
-        A = on_kept(model, rows, found)
-        own = _root(A[0, :T], targets.weight)
-        warnings += _held(model, found, remaining_bias(rows[0], counted.weight, found))
-    criterion = make_criterion(
-        spec.criterion,
-        parameters=len(kept),
-        interest=interest,
-        scenarios=len(scenarios),
-        A=A,
-        weights=counted.weight,
-        combination=_combination(model, found),
-        unit=units.pop() if len(units) == 1 else "",
-        n_poses=n_poses,
-        names=information.names,
-        sizes=information.sizes,
-        robust=spec.robust,
+        own = _root(A[0], targets.weight)
+        warnings += _held(model, found, remaining_bias(rows[0], both.weight, found))
+    combination = _combination(model, found)
+    unit = units.pop() if len(units) == 1 else ""
+
+    def weighed(share: float) -> Criterion:
+        rows, weights = A, targets.weight
+        if share and A is not None and beyond is not None and region is not None:
+            rows = np.concatenate([A, beyond], axis=1)
+            weights = joined(targets, region, share).weight
+        return make_criterion(
+            spec.criterion,
+            parameters=len(kept),
+            interest=interest,
+            scenarios=len(scenarios),
+            A=rows,
+            weights=weights,
+            combination=combination,
+            unit=unit,
+            n_poses=n_poses,
+            names=information.names,
+            sizes=information.sizes,
+            robust=spec.robust,
+        )
+
+    return Setup(
+        information,
+        found,
+        weighed(share),
+        np.repeat(prior[np.ix_(kept, kept)][None], len(scenarios), axis=0),
+        warnings,
+        own,
+        None if beyond is None or region is None else _root(beyond[0], region.weight),
+        share,
+        weighed,
     )
-    prior = np.repeat(prior[np.ix_(kept, kept)][None], len(scenarios), axis=0)
-    return Setup(information, found, criterion, prior, warnings, own, elsewhere)
-
-
-def _rms_rows(model: Model, rows: Array, weight: Array, found: Estimable) -> Array | None:
-    """R (r, p) of A (1, T, r, parameters): |R x| is the rms error in m at these poses; None where
-    no plan could make the position at all of them certain."""
-    try:
-        return _root(on_kept(model, rows, found)[0], weight)
-    except InsufficientDataError:
-        return None
 
 
 def _root(A: Array, weight: Array) -> Array:

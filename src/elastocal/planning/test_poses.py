@@ -16,6 +16,7 @@ from elastocal.cell.plan_wishes import TargetBox, TargetPath
 from elastocal.cell.work_cell import Cell
 from elastocal.config import place
 from elastocal.errors import InputError, InsufficientDataError, require
+from elastocal.identification.prediction import NewPoses
 from elastocal.identification.solve import Reduction
 from elastocal.measurements import NUMBERED, Measurements, families, layout_of, rotation_column
 from elastocal.model.arm import LEVEL_TOLERANCE
@@ -402,6 +403,15 @@ def test_poses(
         groups.append(_drawn(cell, chain, point, feasibility, seed))
     sources += [g.source for g in groups if g.source]
     return _together(groups, working_loads(cell), "test poses: " + ", ".join(sources))
+
+
+def where_used(model: Model) -> NewPoses | None:
+    """Where the cell says that position must be right; None where it says nothing."""
+    spec = model.cell.design
+    if not spec.states_test_poses:
+        return None
+    found = test_poses(model.cell, model.chain)
+    return NewPoses(found.q, found.force, found.weight, found.source.removeprefix("test poses: "))
 
 
 def everywhere(

@@ -6,7 +6,7 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from elastocal.export.changes import Comparison
+from elastocal.diagnosis.changes import Comparison
 from elastocal.report.effect_names import p_value, size_of
 from elastocal.report.formatting import ShownTable, estimate, length
 from elastocal.text import listed, printable
@@ -32,15 +32,13 @@ def headline(c: Comparison) -> str:
 def changes_lines(c: Comparison) -> list[tuple[str, str]]:
     """Verdict, displacement, chance, what was compared, what to do."""
     far, chance = c.distance, np.sqrt(np.mean(c.chance**2))
-    force = ", ".join(f"{v:g}" for v in c.force)
     lines = [
         ("Verdict", headline(c)),
         (
             "Tool",
             f"Commanded alike it stands {length(float(np.sqrt(np.mean(far**2))))} rms away from "
             f"where it stood, {length(float(far.max()))} at most, at {len(far)} random poses "
-            f"within the joint limits under ({force}) N; noise alone gives "
-            f"{length(float(chance))} rms.",
+            f"within the joint limits {under(c)}; noise alone gives {length(float(chance))} rms.",
         ),
         (
             "Chance",
@@ -63,6 +61,26 @@ def changes_lines(c: Comparison) -> list[tuple[str, str]]:
             )
         )
     return [*lines, *(("Next", step) for step in steps(c))]
+
+
+def under(c: Comparison) -> str:
+    """Under which loads the tool was compared, and whose they are."""
+    if len(c.forces) == 1:
+        force = ", ".join(f"{v:g}" for v in c.forces[0])
+        told = f"under ({force}) N"
+    else:
+        sizes = np.linalg.norm(c.forces, axis=1)
+        told = f"under {len(c.forces)} loads in turn, {sizes.min():.4g} to {sizes.max():.4g} N"
+    return f"{told}, {OF_LOADS[c.loads_of]}"
+
+
+OF_LOADS = {
+    "": "as no load is stated",
+    "the option": "as asked for",
+    "the earlier campaign": "those of the earlier campaign",
+    "the later campaign": "those of the later campaign",
+    "the cell's plan": "those of the cell's plan",
+}
 
 
 def steps(c: Comparison) -> list[str]:

@@ -18,7 +18,7 @@ from elastocal.diagnosis.diagnosis import (
     NearRepeats,
     NoiseFloor,
 )
-from elastocal.identification.findings import BudgetStep
+from elastocal.identification.error_budget import BudgetStep
 from elastocal.report.causes_view import (
     assumed_order,
     cause_rows,

@@ -170,6 +170,13 @@ class ShownTable:
     groups: dict[int, str] = field(default_factory=dict)
 
 
+def without(shown: ShownTable, *columns: int) -> ShownTable:
+    """The table without some columns."""
+    kept = [k for k in range(len(shown.heads)) if k not in columns]
+    heads, *rows = (tuple(row[k] for k in kept) for row in (shown.heads, *shown.rows))
+    return ShownTable(heads, rows, tuple(n for n, k in enumerate(kept) if k in shown.words))
+
+
 MOST_FAULTY = 100  # rows of the table of faulty readings
 
 

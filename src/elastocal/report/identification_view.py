@@ -10,6 +10,7 @@ from typing import Any
 import numpy as np
 
 from elastocal.errors import option
+from elastocal.identification.error_budget import ErrorBudget, pose_accuracy
 from elastocal.identification.findings import (
     ABSORBED,
     ALONE,
@@ -17,11 +18,9 @@ from elastocal.identification.findings import (
     FIXED,
     INVISIBLE,
     WEAK,
-    ErrorBudget,
-    stage_of,
     standings,
 )
-from elastocal.identification.prediction import PredictedError
+from elastocal.identification.prediction import PredictedError, measured_loads
 from elastocal.identification.residuals import ResidualSummary
 from elastocal.identification.result import (
     LOPSIDED,
@@ -30,6 +29,7 @@ from elastocal.identification.result import (
     Estimate,
     deviation,
 )
+from elastocal.identification.scrutiny import stage_of
 from elastocal.report.formatting import (
     ShownTable,
     capital,
@@ -65,7 +65,8 @@ from elastocal.report.method_and_noise import (
     size_rows,
 )
 from elastocal.report.smooth_view import counted_functions, smooth_lines, smooth_table
-from elastocal.text import printable
+from elastocal.text import listed, printable
+from elastocal.units import Array
 
 LARGEST_TERMS = 4
 Truth = dict[str, float]
@@ -158,9 +159,13 @@ def nominal_known(result: Calibration, name: str) -> bool:
     return parameter.nominal != 0 or parameter.typical is not None
 
 
-def undetermined_lines(result: Calibration) -> list[str]:
-    """Which parameters have no number of their own, and why, one line per reason."""
+def undetermined_lines(result: Calibration, most: int | None = None) -> list[str]:
+    """Which parameters have no number of their own, and why, one line per reason; `most` names."""
     lines = []
+
+    def told(names: list[str]) -> str:
+        return listed(names, most or len(names))
+
     extra = {printable(name) for name in result.left.redundant} if result.left else set()
     weak = [
         f"{printable(e.name)} ({limits(result, e)})"
@@ -168,21 +173,21 @@ def undetermined_lines(result: Calibration) -> list[str]:
         if e.limits is not None
     ]
     if weak:
-        lines.append(f"hardly shown, so without a value (95 %): {', '.join(weak)}")
+        lines.append(f"hardly shown, so without a value (95 %): {told(weak)}")
     if names := [n for n in names_of(result, INVISIBLE) if n not in extra]:
         where = held_where(result, names)
-        lines.append(f"{where} (not visible in these data): {', '.join(names)}")
+        lines.append(f"{where} (not visible in these data): {told(names)}")
     if names := [n for n in names_of(result, ABSORBED) if n not in extra]:
         where = held_where(result, names)
-        lines.append(f"{where}, absorbed in a combination: {', '.join(names)}")
+        lines.append(f"{where}, absorbed in a combination: {told(names)}")
     if names := [n for s in (INVISIBLE, ABSORBED) for n in names_of(result, s) if n in extra]:
         where = held_where(result, names)
         lines.append(
             f"{where}, redundant by construction (no pose under such loads shows them; nothing to "
-            f"do): {', '.join(names)}"
+            f"do): {told(names)}"
         )
     if names := names_of(result, FIXED):
-        lines.append(f"fixed by the user: {', '.join(names)}")
+        lines.append(f"fixed by the user: {told(names)}")
     return lines
 
 
@@ -359,27 +364,35 @@ def held_lines(result: Calibration) -> list[tuple[str, str]]:
     return [(label, text) for label, text in found if text is not None]
 
 
-def summary_lines(result: Calibration, truth: Truth | None = None) -> list[str]:
-    """The result in words, one statement per line, warnings last."""
-    lines = [
-        f"Readings: {readings(result)}",
-        f"Method: {method_and_weights(result)}",
-        f"Error (rms): {error_line(result)}",
-        f"Degrees of freedom: {result.dof}",
-        f"Identified: {what_was_identified(result)}",
-        f"Prediction: {how_well_it_predicts(result)}",
-        f"Noise: {does_noise_explain_it(result)}",
-    ]
-    lines += [f"{label}: {text}" for label, text in noise_lines(result)]
-    lines.append(f"Intervals: {intervals_line(result)}")
-    lines += [f"{label}: {text}" for label, text in held_lines(result)]
-    lines += [f"Smooth function: {text}" for text in smooth_lines(result)]
+def leading_lines(result: Calibration) -> list[tuple[str, str]]:
+    """Label and sentence of what comes first: verdict, errors, what to do, warnings."""
+    (verdict, *steps) = judgement(result).lines
+    new = [] if result.predicted is None else [("Expected", at_new_poses(result.predicted))]
+    warnings = [("Warning", printable(w)) for w in result.warnings]
+    return [verdict, ("Error (rms)", error_line(result)), *new, *steps, *warnings]
+
+
+def summary_lines(
+    result: Calibration, truth: Truth | None = None, details: bool = True
+) -> list[tuple[str, str]]:
+    """Label and sentence of what else there is to say; `details`: of method, noise, intervals."""
+    lines = [("Readings", readings(result)), ("Identified", what_was_identified(result))]
+    if details:
+        lines += [
+            ("Method", method_and_weights(result)),
+            ("Degrees of freedom", str(result.dof)),
+            ("Prediction", how_well_it_predicts(result)),
+        ]
+    lines.append(("Noise", does_noise_explain_it(result)))
+    if details:
+        lines += [*noise_lines(result), ("Intervals", intervals_line(result))]
+    lines += held_lines(result)
+    lines += [("Smooth function", text) for text in smooth_lines(result)]
     if truth:
-        lines.append(f"Truth: {coverage_line(result, truth)}")
-    if pairs := correlation_lines(result):
-        lines.append("Correlated over 0.9: " + "; ".join(pairs))
-    lines += [f"Faulty: {text}" for text in fault_lines(result, MOST_TOLD)]
-    return lines + [f"Warning: {printable(w)}" for w in result.warnings]
+        lines.append(("Truth", coverage_line(result, truth)))
+    if details and (pairs := correlation_lines(result)):
+        lines.append(("Correlated over 0.9", "; ".join(pairs)))
+    return lines + [("Faulty", text) for text in fault_lines(result, MOST_TOLD)]
 
 
 # Bars have the true or nominal value in the middle and reach HALF_LENGTH to either side.
@@ -476,6 +489,69 @@ def budget_table(result: Calibration, budget: ErrorBudget) -> ShownTable:
     """The steps with their intervals and what each changes; noise alone last."""
     floor = None if budget.floor is None else (budget.floor_name, budget.floor)
     return gap_table(budget_steps(result, budget), floor)
+
+
+def before_and_after(
+    result: Calibration, budget: ErrorBudget | None, by_place: bool = False
+) -> dict[str, Array]:
+    """Length (n,) in m of the errors by name: of the nominal arm and of the calibrated one in poses
+    that were not fitted, and on test data; `by_place` of the mean of what was read at one place."""
+    found = {}
+    if budget is not None and len(budget.steps) > 1:
+        ends = {nominal_arm_held_out(result): budget.steps[0], "calibrated": budget.steps[-1]}
+        for name, step in ends.items():
+            found[name] = np.linalg.norm(step.errors, axis=1)
+            if by_place:
+                found[name] = pose_accuracy(result.observations, step.errors)
+    if result.test is not None and len(result.test.errors) and not by_place:
+        found["calibrated, test data"] = result.test.errors
+    return found
+
+
+def spread_table(found: dict[str, Array], count: str = "readings") -> ShownTable:
+    """Mean, standard deviation, 95 % quantile and maximum of lengths (n,) in m, by name."""
+    rows = []
+    for name, e in found.items():
+        sizes = (e.mean(), e.std(), np.quantile(e, 0.95), e.max())
+        rows.append((name, str(len(e)), *(length(float(size)) for size in sizes)))
+    return ShownTable(("error of the position", count, "mean", "std", "95 %", "max"), rows)
+
+
+def _newtons(force: Array) -> str:
+    return f"({', '.join(f'{v:g}' for v in force)}) N"
+
+
+def certificate_contents(result: Calibration, budget: ErrorBudget | None) -> dict[str, Any]:
+    """Words and tables of the calibration certificate."""
+    tracker = result.model.cell.tracker
+    noise = (
+        "none stated"
+        if tracker.noise is None
+        else ", ".join(
+            f"{name.replace('_', ' ')} {', '.join(length(float(v)) for v in np.atleast_1d(value))}"
+            + (" per m" if name.endswith("per_m") else "")
+            for name, value in vars(tracker.noise).items()
+        )
+    )
+    facts = [
+        ("Robot", printable(result.model.chain.name)),
+        ("Instrument, standard deviations", noise),
+        ("Readings", readings(result)),
+        ("Loads", "; ".join(_newtons(f) for f in measured_loads(result.observations))),
+        ("Identified", what_was_identified(result)),
+        ("Method", _sentence(method_and_weights(result))),
+    ]
+    if result.predicted is not None:
+        facts.append(("Expected where nobody measured", at_new_poses(result.predicted)))
+    if result.test is not None:
+        t = result.test
+        told = f"{length(t.mean)} mean, {length(t.maximum)} at most of {counted(t.n, 'reading')}"
+        facts.append(("Test data", told))
+    return {
+        "judgement": judgement(result),
+        "facts": facts,
+        "accuracy": spread_table(before_and_after(result, budget, by_place=True), "places"),
+    }
 
 
 def texts(e: Estimate | Combination, true: float | None) -> tuple[str, str, str, str]:
@@ -612,6 +688,7 @@ def _signed(metres: float) -> str:
 
 SOURCES = {
     "parameters": "parameters: what the estimates leave uncertain",
+    "open_parameters": "parameters left open, by their typical deviations",
     "repeatability": "repeatability: what readings of a visit have in common",
     "instrument": "instrument: single readings",
     "lack_of_fit": "lack of fit: what the held-out error has beyond these",
@@ -683,6 +760,7 @@ def identification_contents(
         "error_line": _sentence(error_line(result)),
         "warnings": [printable(w) for w in result.warnings],
         "budget": None if budget is None else budget_table(result, budget),
+        "spread": spread_table(before_and_after(result, budget)),
         "floor": "Nothing says how large the noise alone is."
         if budget is None or budget.floor is None
         else f"The dashed line is what noise alone gives ({budget.floor_name}).",

@@ -78,6 +78,12 @@ DOUBTS: dict[str, Callable[[Finding], str]] = {
     "not_held_out": lambda f: (
         "how well it predicts poses left out is not known: some pose alone determines a parameter, "
         "and nothing checks it"
+        + (
+            f" ({_length(f, 'unchecked_um')} of the {_length(f, 'rms_um')} to be expected at new "
+            "poses)"
+            if f.numbers
+            else ""
+        )
     ),
     "residual_above_stated_noise": lambda f: (
         f"the residual is {significant(f.number('ratio'))} times the stated noise"

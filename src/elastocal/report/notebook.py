@@ -19,9 +19,9 @@ from elastocal.compensation.compensate import (
     joint_columns,
     summary,
 )
+from elastocal.diagnosis.changes import Comparison
 from elastocal.diagnosis.diagnosis import Diagnosis
 from elastocal.errors import InputError
-from elastocal.export.changes import Comparison
 from elastocal.identification.result import Calibration
 from elastocal.model.effects import effect_of
 from elastocal.planning.plan import Plan
@@ -36,8 +36,12 @@ from elastocal.report.diagnosis_view import (
 )
 from elastocal.report.effect_names import effect_at, name_of
 from elastocal.report.formatting import display, length, minus
-from elastocal.report.identification_view import combination_rows, parameter_rows, summary_lines
-from elastocal.report.judgement_view import judgement
+from elastocal.report.identification_view import (
+    combination_rows,
+    leading_lines,
+    parameter_rows,
+    summary_lines,
+)
 from elastocal.report.plan_picture import COLOURS, STYLE, draw_plan, pose_lines
 from elastocal.report.plan_view import first_stops, plan_lines
 from elastocal.report.residual_view import residuals_of
@@ -324,8 +328,8 @@ def _identification_html(result: Calibration) -> str:
         for r in (*known, *combination_rows(result, None))
     ]  # fmt: skip
     heads = ("parameter", "value", "95 %", "unit", "nominal")
-    lines = [(label, text) for label, _, text in (x.partition(": ") for x in summary_lines(result))]
-    return _table("Identification", heads, rows) + _lines(lines + judgement(result).lines)
+    table = _table("Identification", heads, rows)
+    return _lines(leading_lines(result)) + table + _lines(summary_lines(result))
 
 
 def _plan_html(plan: Plan) -> str:

@@ -11,7 +11,9 @@ import gzip
 import hashlib
 import io
 import platform
+import re
 from collections.abc import Callable, Iterable, Mapping
+from datetime import date
 from functools import cache
 from importlib import metadata, resources
 from pathlib import Path
@@ -19,10 +21,10 @@ from typing import TYPE_CHECKING, Any
 
 from elastocal import __version__
 from elastocal.compensation.compensate import Compensation
+from elastocal.diagnosis.changes import Comparison
 from elastocal.diagnosis.diagnosis import Diagnosis
-from elastocal.export.changes import Comparison
 from elastocal.files import atomic_write_text, open_input
-from elastocal.identification.findings import gap_budget
+from elastocal.identification.error_budget import gap_budget
 from elastocal.identification.result import Calibration
 from elastocal.model.manipulator import Model
 from elastocal.model.observations import Observations
@@ -51,7 +53,12 @@ from elastocal.report.figures import (
     unknown_curves,
 )
 from elastocal.report.formatting import minus
-from elastocal.report.identification_view import Published, Truth, identification_contents
+from elastocal.report.identification_view import (
+    Published,
+    Truth,
+    certificate_contents,
+    identification_contents,
+)
 from elastocal.report.notebook import view_of
 from elastocal.report.plan_view import plan_contents
 from elastocal.report.residual_figures import (
@@ -73,6 +80,7 @@ from elastocal.text import printable
 if TYPE_CHECKING:
     from jinja2 import Environment
 
+FEWEST_SECTIONS = 4  # that are worth a list
 LIBRARIES = ("numpy", "scipy", "casadi")
 Inputs = Mapping[str, str] | Iterable[str | Path] | None
 
@@ -98,8 +106,8 @@ def page_of(
 
     `inputs` are the files read, or a map from their names to their SHA-256; `command` and `seed`
     tell how to repeat the run.  To a calibration `truth` (SI) adds true values, and `published`
-    values (SI) and half widths that others found.  Raises InputError where an input cannot be
-    read.
+    values (SI) and half widths that others found; `certificate` makes a certificate of it.  Raises
+    InputError where an input cannot be read.
 
     Where the page has a 3-D view, plotly.js comes along.  It runs these two scripts, named by
     their hashes, and no other: not even one that slipped into a name.
@@ -107,11 +115,13 @@ def page_of(
     from markupsafe import Markup
 
     template, contents = next(page for kind, page in PAGES.items() if isinstance(result, kind))
+    if told.pop("certificate", False):
+        template, contents = "certificate.html.j2", _certificate
     content: dict[str, Any] = {"seed": seed, "backend": ""} | contents(result, **told)
     drawn = bool(content.get("view"))
     source, packed = plotly() if drawn else ("", "")
     script = resource("report.js")
-    return str(
+    return with_contents(
         environment()
         .get_template(template)
         .render(
@@ -125,6 +135,7 @@ def page_of(
                 ),
                 "plotly": Markup(packed),
                 "version": __version__,
+                "date": date.today().isoformat(),
                 "environment": software(drawn),
                 "command": None if command is None else printable(command),
                 "inputs": {printable(k): printable(v) for k, v in digests(inputs).items()},
@@ -132,6 +143,17 @@ def page_of(
             }
         )
     )
+
+
+def with_contents(page: str) -> str:
+    """The page with a list of its sections where `<nav></nav>` stands."""
+    heads = re.findall(r"<h2>(.*?)</h2>", page)
+    links = "".join(f'<a href="#part{k}">{head}</a>' for k, head in enumerate(heads))
+    if len(heads) < FEWEST_SECTIONS:
+        return page.replace("<nav></nav>\n", "", 1)
+    number = iter(range(len(heads)))
+    page = re.sub("<h2>", lambda _: f'<a id="part{next(number)}"></a><h2>', page)
+    return page.replace("<nav></nav>", f'<nav aria-label="Contents">{links}</nav>', 1)
 
 
 @cache
@@ -219,6 +241,10 @@ def _calibration(
         "n_markers": len(residuals.markers),
         **_thinning(result, residuals),
     }
+
+
+def _certificate(result: Calibration) -> dict[str, Any]:
+    return {**_of(result.model, {}), **certificate_contents(result, gap_budget(result))}
 
 
 def _diagnosis(d: Diagnosis) -> dict[str, Any]:

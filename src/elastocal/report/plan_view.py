@@ -3,9 +3,10 @@
 from __future__ import annotations
 
 import math
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 from elastocal.errors import option
+from elastocal.planning.bodies import mounting_plane
 from elastocal.planning.criteria import CRITERIA
 from elastocal.planning.drift import DRIFT
 from elastocal.planning.plan import Plan, Predicted, Reason
@@ -21,6 +22,9 @@ from elastocal.report.formatting import (
 )
 from elastocal.text import printable
 
+if TYPE_CHECKING:
+    from elastocal.diagnosis.next_poses import NextPoses
+
 TOLD = 2  # parameters that a pose serves, in the table
 SERVES = "serves (standard deviation without it)"
 
@@ -30,6 +34,7 @@ def pose_rows(plan: Plan, reasons: bool = True, decimals: int = 2) -> ShownTable
     kinds = plan.model.chain.kinds
     loads = len(plan.forces) > 1 and bool((plan.load >= 0).any())
     heads = ["pose", *joint_heads(kinds), *(["load N"] if loads else []), "order"]
+    heads += [] if plan.seen is None else ["markers"]
     heads += [SERVES] if reasons else []
     order = first_stops(plan)
     rows: list[tuple[str, ...]] = []
@@ -37,8 +42,10 @@ def pose_rows(plan: Plan, reasons: bool = True, decimals: int = 2) -> ShownTable
         row = [plan.configurations[k], *joint_texts(plan.q[k], kinds, decimals)]
         if loads:
             row.append(force_text(plan, int(plan.load[k])))
-        rows.append((*row, str(order[k]), *([served(reason)] if reasons else [])))
-    return ShownTable(tuple(heads), rows, (len(heads) - 1,) if reasons else ())
+        row += [str(order[k]), *([] if plan.seen is None else [printable(plan.markers(k))])]
+        rows.append((*row, *([served(reason)] if reasons else [])))
+    texts = [k for k, head in enumerate(heads) if head in ("markers", SERVES)]
+    return ShownTable(tuple(heads), rows, tuple(texts))
 
 
 def first_stops(plan: Plan) -> dict[int, int]:
@@ -128,6 +135,7 @@ def stop_rows(plan: Plan) -> ShownTable:
 
 
 CLOSE = 0.95  # efficiency from which a plan is called near the best
+VAIN = 0.1  # below which the bound says nothing: so few poses cannot be spread as its weights are
 
 
 def plan_lead(plan: Plan) -> str:
@@ -140,9 +148,7 @@ def plan_headline(plan: Plan) -> str:
     """What the plan is worth and how far from the best it is, in one sentence."""
     n = counted(len(plan.q), "pose")
     if plan.criterion == "test_pose":
-        share, rho = plan.model.cell.design.elsewhere, plan.reported
-        if share and plan.everywhere is not None:
-            rho = plan.everywhere.test_poses * 1e6
+        rho = plan.reported if plan.everywhere is None else plan.everywhere.test_poses * 1e6
         text = (
             f"{n} leave a position error of ρ₀ = {rho:.3g} µm rms at the test poses "
             "after compensation"
@@ -150,7 +156,7 @@ def plan_headline(plan: Plan) -> str:
     else:
         text = f"{n} reach {plan.criterion} = {plan.reported:.4g} {plan.unit}".rstrip()
     found = plan.certificate.efficiency_pool
-    if found is None:
+    if found is None or found < VAIN:
         return f"{text}; how far that is from the best, no bound says."
     away = 100 * (1 - found)
     text += "; no plan from these candidates is "
@@ -199,7 +205,8 @@ def plan_steps(plan: Plan) -> list[str]:
 
 def plan_lines(plan: Plan) -> list[tuple[str, str]]:
     """What the plan is worth, as (label, sentence)."""
-    lines = [_criterion_line(plan), *_everywhere_lines(plan), *_chance_lines(plan)]
+    lines = [*_chosen_lines(plan), _criterion_line(plan)]
+    lines += [*_everywhere_lines(plan), *_chance_lines(plan)]
     lines.append(_candidate_line(plan))
     lines += _certificate_lines(plan)
     lines += [_execution_line(plan), *_drift_lines(plan)]
@@ -209,20 +216,39 @@ def plan_lines(plan: Plan) -> list[tuple[str, str]]:
     return lines + [("Warning", printable(text)) for text in plan.warnings]
 
 
+def _chosen_lines(plan: Plan) -> list[tuple[str, str]]:
+    """What was chosen besides the poses, and what it is worth."""
+    c = plan.chosen
+    if c is None:
+        return []
+
+    def at(place: Any) -> str:
+        return f"[{', '.join(f'{v:.4g}' for v in place)}]"
+
+    told = [
+        f"{printable(name)} at {at(after)} m instead of {at(before)}"
+        for name, (before, after) in c.places.items()
+    ]
+    if c.loads is not None:
+        told.append(f"loads {', '.join(at(load) for load in c.loads)} N")
+    stood = "no plan" if c.before is None else f"{c.before:.4g}"
+    seen = "none" if c.share[0] is None else f"{100 * c.share[0]:.1f} %"
+    worth = (
+        f"the best that any plan can reach goes from {stood} to {c.after:.4g} {c.unit}".rstrip()
+        + f" (relaxed, {c.candidates} candidates each), feasible poses from {seen} to "
+        f"{100 * c.share[1]:.1f} %"
+    )
+    return [("Chosen", f"{'; '.join(told)}."), ("Chosen", f"{worth}.")]
+
+
 def _criterion_line(plan: Plan) -> tuple[str, str]:
-    share = plan.model.cell.design.elsewhere
-    if plan.criterion == "test_pose" and share:
-        return "Criterion", (
-            f"{plan.reported:.4g} µm, the rms position error that remains after compensation, "
-            f"{100 * (1 - share):.0f} % of it at the test poses ({printable(plan.targets)}) and "
-            f"{100 * share:.0f} % all over the joint ranges."
-        )
-    if plan.criterion == "test_pose":
-        return "Criterion", (
-            f"ρ₀ = {plan.reported:.4g} µm, the rms position error that remains at the test poses "
-            f"after compensation ({printable(plan.targets)})."
-        )
-    return "Criterion", f"{plan.criterion} = {plan.reported:.6g} {plan.unit}".rstrip() + "."
+    if plan.criterion != "test_pose":
+        return "Criterion", f"{plan.criterion} = {plan.reported:.6g} {plan.unit}".rstrip() + "."
+    rho = plan.reported if plan.everywhere is None else plan.everywhere.test_poses * 1e6
+    return "Criterion", (
+        f"ρ₀ = {rho:.4g} µm, the rms position error that remains at the test poses after "
+        f"compensation ({printable(plan.targets)})."
+    )
 
 
 def _everywhere_lines(plan: Plan) -> list[tuple[str, str]]:
@@ -231,23 +257,30 @@ def _everywhere_lines(plan: Plan) -> list[tuple[str, str]]:
     if e is None:
         return []
 
-    def both(own: float | None, random: float | None) -> str:
-        chance = "none" if random is None else f"{random * 1e6:.4g}"
-        return f"{(own or 0.0) * 1e6:.4g} µm (a random plan {chance})"
+    def micrometres(error: float | None) -> str:
+        return "none" if error is None else f"{error * 1e6:.4g}"
 
+    own = "" if plan.criterion == "test_pose" else f"; at the test poses {e.test_poses * 1e6:.4g}"
     text = (
-        f"rms error after compensation {both(e.test_poses, e.random_test_poses)} at the test "
-        f"poses, {both(e.elsewhere, e.random_elsewhere)} all over the joint ranges"
+        f"{e.elsewhere * 1e6:.4g} µm rms all over the joint ranges{own}; a random plan leaves "
+        f"{micrometres(e.random_elsewhere)} there and {micrometres(e.random_test_poses)} at the "
+        "test poses"
     )
-    if worse_elsewhere(plan):
-        text += f"; {option('elsewhere', '0.2')} gives part of the weight to poses there"
+    noise = plan.model.cell.noise
+    if noise.drift:
+        text += (
+            f"; with the drift of {noise.drift * 1e6:.3g} µm that [noise] states "
+            f"{e.drifting_test_poses * 1e6:.4g} and {e.drifting_elsewhere * 1e6:.4g} µm"
+        )
+    if e.share:
+        text += f"; the joint ranges have {100 * e.share:.0f} % of the criterion's weight"
+        text += f", for which ρ₀ may be {100 * e.cap:g} % above the least" if e.cap else ""
+    elif plan.criterion == "test_pose":
+        text += (
+            f"; {option('elsewhere_cap', '0.05')} finds the least there for 5 % more at the test "
+            "poses"
+        )
     return [("Elsewhere", f"{text}.")]
-
-
-def worse_elsewhere(plan: Plan) -> bool:
-    """Does the plan serve its test poses at the cost of the rest, where random plans do better?"""
-    e = plan.everywhere
-    return e is not None and e.random_elsewhere is not None and e.elsewhere > e.random_elsewhere
 
 
 def _chance_lines(plan: Plan) -> list[tuple[str, str]]:
@@ -261,6 +294,8 @@ def _chance_lines(plan: Plan) -> list[tuple[str, str]]:
     if c.median is None or c.best is None:
         return [("Chance", f"{lost}.")]
     name = "ρ₀" if plan.criterion == "test_pose" else plan.criterion
+    if plan.everywhere is not None and plan.everywhere.share:
+        name = "the weighted error"
     unit = f" {plan.unit}" if plan.unit else ""
     worst = "no value" if c.worst is None else f"{c.worst:.4g}"
     text = (
@@ -288,11 +323,17 @@ def _certificate_lines(plan: Plan) -> list[tuple[str, str]]:
     lines = [
         (
             "Certificate",
-            f"certified on the pool: efficiency {c.efficiency_pool:.4f} against the best plan "
+            f"certified on the pool: efficiency {_share(c.efficiency_pool)} against the best plan "
             f"of these shares from {c.pool} candidates, each in it once"
             f"{told.replace(' )', ')')}.",
         )
     ]
+    if c.efficiency_pool < VAIN:
+        text = (
+            "the bound spreads weights over many candidates, which so few poses cannot follow: "
+            "they leave parameters to what was known before; it says nothing here"
+        )
+        return [*lines, ("Certificate", f"{text}.")]
     if c.efficiency_continuum is not None:
         lines.append(
             (
@@ -303,6 +344,10 @@ def _certificate_lines(plan: Plan) -> list[tuple[str, str]]:
             )
         )
     return lines
+
+
+def _share(value: float) -> str:
+    return f"{value:.4f}" if value >= VAIN else f"{value:.1g}"
 
 
 def _execution_line(plan: Plan) -> tuple[str, str]:
@@ -320,13 +365,18 @@ def _execution_line(plan: Plan) -> tuple[str, str]:
     if via:
         text += f", {via} points in between to get around obstacles"
     space = plan.model.cell.workspace
-    bodies = len(space.link_radius) > 0 or space.urdf_geometry or len(space.bodies) > 0
-    checked = (
-        "every move checked"
-        if bodies
-        else "no move was checked, as [workspace] states no bodies, and poses may reach below the "
-        "mounting plane"
-    )
+    if len(space.link_radius) > 0 or space.urdf_geometry or len(space.bodies) > 0:
+        checked = "every move checked"
+    elif mounting_plane(plan.model.cell, plan.model.chain) is not None:
+        checked = (
+            "every move checked against the mounting plane (z = 0 of the base; [workspace] "
+            "mounting_plane = false lifts it) and nothing else, as [workspace] states no bodies"
+        )
+    else:
+        checked = (
+            "no move was checked, as [workspace] states no bodies, and poses may reach below the "
+            "mounting plane"
+        )
     return "Execution", f"{text}, {e.total / 60:.0f} min in all; {checked}."
 
 
@@ -345,6 +395,42 @@ def _drift_lines(plan: Plan) -> list[tuple[str, str]]:
     if d.bias < d.shortest:
         text += f" (in the shortest order {other})"
     return [("Drift", f"{text}.")]
+
+
+def next_lines(found: NextPoses) -> list[tuple[str, str]]:
+    """Whether to measure more, what it brings, and what may be missing, as (label, sentence)."""
+    g, n = found.gain, counted(found.batch, "pose")
+    limit = "" if found.required is None else f" (required: {found.required * 1e6:.3g} µm)"
+    verdicts = {
+        "measure": f"measure {n} more; then ask again with all readings in one table",
+        "enough": "no further pose is needed: the required error is kept with 95 %",
+        "no_gain": f"no {n} lower the error by a hundredth: more of them do not pay; what does is "
+        "more repeats, a better instrument, or another kind of measurement",
+    }
+    now = "not known yet, as the measurements leave parameters open"
+    if math.isfinite(found.reached):
+        now = f"with 95 % at most {found.reached * 1e6:.3g} µm at new poses{limit}"
+
+    def both(before: float, after: float) -> str:
+        begun = f"{before * 1e6:.3g} µm" if math.isfinite(before) else "an unknown error"
+        return f"{begun} to {after * 1e6:.3g} µm"
+
+    lines = [("Next", verdicts[found.verdict] + "."), ("Error now", now + ".")]
+    lines.append(
+        (
+            "Gain",
+            f"{n} lower the rms error at the test poses from {both(g.before, g.after)}; were the "
+            f"model right, from {both(g.model_before, g.model_after)}.",
+        )
+    )
+    named = [f"{f.effect} at {f.where} ({f.probability:.2f})" for f in found.found]
+    if named:
+        text = f"{', '.join(named)}, which the model is given here; write the cell with it"
+        lines.append(("Found", printable(f"{text} (diagnose, {option('cell_out')}).")))
+    doubts = [f"{e} at {w} ({p:.2g})" for e, w, p in found.doubts[:3]]
+    if doubts:
+        lines.append(("In doubt", printable(f"likeliest {', '.join(doubts)}.")))
+    return lines
 
 
 def plan_contents(plan: Plan) -> dict[str, Any]:

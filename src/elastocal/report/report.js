@@ -213,7 +213,7 @@ class View {
       range: this.data.range[AXES.indexOf(name)], autorange: false });
     return {
       scene: { xaxis: axis("x"), yaxis: axis("y"), zaxis: axis("z"), aspectmode: "manual",
-        aspectratio: this.shape(), camera: { eye: { x: 0.88, y: -1.1, z: 0.48 } }, uirevision: "kept" },
+        aspectratio: this.shape(), camera: this.camera ?? { eye: { x: 0.88, y: -1.1, z: 0.48 } }, uirevision: "kept" },
       paper_bgcolor: "rgba(0,0,0,0)", font: { color: colour("ink"), size: 12 },
       margin: { l: 0, r: 0, t: 0, b: 0 }, uirevision: "kept",
       legend: { orientation: "h", y: 0, x: 0, bgcolor: "rgba(0,0,0,0)" },
@@ -223,7 +223,8 @@ class View {
   draw() {
     this.told.textContent = this.words();
     return Plotly.react(this.plot, this.traces(), this.layout(),
-      { responsive: true, displaylogo: false, displayModeBar: false });
+      { responsive: true, displaylogo: false, scrollZoom: false,  // the wheel scrolls the page
+        modeBarButtons: [["zoom3d", "pan3d", "tableRotation", "resetCameraDefault3d"]] });
   }
 
   words() {
@@ -275,6 +276,10 @@ class View {
     this.live.append(this.controls(), this.plot);
     this.live.hidden = false;
     await this.draw();
+    // Where it was turned to stays, whatever is drawn next.
+    this.plot.on("plotly_relayout", change => {
+      this.camera = change["scene.camera"] ?? this.camera;
+    });
     this.figure.classList.add("drawn");
     matchMedia("(prefers-color-scheme: dark)").addEventListener("change", () => this.draw());
   }

@@ -8,8 +8,11 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 from scipy import stats
 
+from elastocal.compensation.compensate import nominal_flanges
+from elastocal.errors import ElastocalError
+from elastocal.identification.error_budget import ErrorBudget
 from elastocal.identification.estimates import CORRELATED
-from elastocal.identification.findings import ErrorBudget
+from elastocal.identification.prediction import over_the_workspace
 from elastocal.identification.residuals import GroupSummary, ResidualSummary
 from elastocal.identification.result import Calibration
 from elastocal.identification.scrutiny import Autocorrelation
@@ -26,7 +29,7 @@ from elastocal.report.figures import (
     waterfall_of_steps,
 )
 from elastocal.report.formatting import length, short_name, significant
-from elastocal.report.identification_view import budget_steps, rms_by_kind
+from elastocal.report.identification_view import before_and_after, budget_steps, rms_by_kind
 from elastocal.report.residual_view import Residuals, reach, rms_by_pose, running_mean
 from elastocal.report.smooth_view import smooth_figure
 from elastocal.units import Array
@@ -137,6 +140,27 @@ def errors(result: Calibration) -> str:
         micrometre_axis(axes, "rms error")
 
     return drawn(draw, WIDTH / 2, 2.9, "Nominal, fitted, held-out and test error")
+
+
+def before_after(found: dict[str, Array]) -> str:
+    """Histograms of error lengths (n,) in m by name, on one logarithmic axis."""
+    every = np.maximum(np.concatenate(list(found.values())) * 1e6, 1e-6)
+    low, high = np.quantile(every, 0.005), 1.001 * every.max()
+    edges = np.geomspace(min(low, high / 2), high, 31)
+
+    def draw(figure: Figure) -> None:
+        axes = figure.subplots()
+        for k, (name, e) in enumerate(found.items()):
+            counts = np.histogram(np.clip(e * 1e6, edges[0], None), edges)[0] / len(e)
+            axes.stairs(counts, edges, fill=True, color=SERIES[k], alpha=0.35)
+            axes.stairs(counts, edges, color=SERIES[k], linewidth=1.4, label=name,
+                        linestyle=("-", "--", ":")[k % 3])  # fmt: skip
+        axes.set_xscale("log")
+        micrometre_axis(axes, "length of the error")
+        axes.set_ylabel("share of the readings")
+        axes.legend(fontsize=8)
+
+    return drawn(draw, WIDTH, 2.7, "Errors before and after calibration")
 
 
 def held_out(result: Calibration, residuals: Residuals) -> str:
@@ -291,6 +315,7 @@ def _histogram_bars(axes: Axes, group: GroupSummary, edges: np.ndarray, label: s
 
 CELLS = 6  # of the work space's longest side
 FEWEST = 3  # readings from which on a cell is told
+FEWEST_ON_MAP = 30  # poses
 MOST_IN_MATRIX = 48  # of the correlation matrix
 MOST_WRITTEN = 16  # parameters up to which the numbers are written into it
 
@@ -363,6 +388,34 @@ def by_region(position: Array, residual: Array) -> str:
             axes.set_ylabel(f"{'xyz'[b]} in m")
 
     return drawn(draw, WIDTH, 3.9, "Rms residual by region of the work space")
+
+
+def uncertainty_map(result: Calibration) -> str:
+    """How sure the tool's place is over reach and height, under the loads measured: rms in µm of
+    each part of the workspace; empty where the model asks for more than joints and load."""
+    model, point = result.model, None
+    markers, load_point = model.cell.tool.markers, model.cell.tool.load_point
+    if not load_point.any() and len(markers) != 1:
+        point = next(iter(markers), "0,0,0")
+    poses = over_the_workspace(model.cell, model, result.observations.table)
+    try:
+        found = result.position(poses.q, poses.force, point)
+        nominal = nominal_flanges(model.chain, poses.q)[:, :3, 3]
+    except ElastocalError:
+        return ""
+    variance = np.trace(found.covariance, axis1=1, axis2=2)
+    good = np.isfinite(variance)
+    if good.sum() < FEWEST_ON_MAP:
+        return ""
+    at = np.column_stack([np.hypot(nominal[:, 0], nominal[:, 1]), nominal[:, 2]])[good]
+
+    def draw(figure: Figure) -> None:
+        axes = figure.subplots()
+        _map(axes, at, 1e12 * variance[good], float(np.ptp(at, axis=0).max()) / CELLS)
+        axes.set_xlabel("distance from the base's z axis in m")
+        axes.set_ylabel("height over the base in m")
+
+    return drawn(draw, WIDTH / 2, 3.6, "How sure the place of the tool is over the work space")
 
 
 def _map(axes: Axes, at: Array, squared: Array, side: float) -> None:
@@ -467,6 +520,7 @@ def drawn_for(
     space: Space,
 ) -> dict[str, str]:
     """Every figure of an identification's page: name → SVG, empty where nothing is to be drawn."""
+    spread = before_and_after(result, budget)
     found = residual_figures(
         result.model, result.observations, result.x, residuals, space,
         "Residuals as arrows on the posed arm",
@@ -477,6 +531,8 @@ def drawn_for(
         "matrix": correlation_matrix(result),
         "waterfall": "",
         "smooth": smooth_figure(result),
+        "sureness": uncertainty_map(result),
+        "spread": before_after(spread) if spread else "",
         "in_time": "" if result.autocorrelation is None else in_time(result.autocorrelation),
     }  # fmt: skip
     if budget is not None:

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Iterable, Sequence
 from io import StringIO
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 from rich.box import SIMPLE_HEAD
 from rich.console import Console
@@ -12,8 +12,9 @@ from rich.table import Table
 from rich.text import Text
 
 from elastocal.compensation.compensate import Compensation, summary
+from elastocal.diagnosis.changes import Comparison
 from elastocal.diagnosis.diagnosis import Diagnosis
-from elastocal.export.changes import Comparison
+from elastocal.errors import option
 from elastocal.identification.findings import ALONE
 from elastocal.identification.result import Calibration
 from elastocal.planning.plan import Plan
@@ -30,30 +31,42 @@ from elastocal.report.diagnosis_view import (
     pair_rows,
     untested_rows,
 )
-from elastocal.report.formatting import ShownTable, capital, length
+from elastocal.report.formatting import ShownTable, capital, length, without
 from elastocal.report.identification_view import (
     ParameterRow,
     Truth,
     any_lopsided,
     combination_rows,
     half_head,
+    leading_lines,
     names_of,
     parameter_rows,
     summary_lines,
     undetermined_lines,
 )
-from elastocal.report.judgement_view import judgement
 from elastocal.report.method_and_noise import candidate_rows, size_rows
-from elastocal.report.plan_view import curve_rows, interval_rows, plan_lines, pose_rows, reason_rows
+from elastocal.report.plan_view import (
+    curve_rows,
+    interval_rows,
+    next_lines,
+    plan_lines,
+    pose_rows,
+    reason_rows,
+)
 from elastocal.screen import safe_console
 from elastocal.text import printable
+
+if TYPE_CHECKING:
+    from elastocal.diagnosis.next_poses import NextPoses
+
+NARROW_FOR_BOTH = 96  # columns; below, a comparison tells changes alone
 
 PRINTED_WIDTH = 100  # columns of a result as plain text
 
 
 def identification_text(result: Calibration) -> str:
     """What `print` shows of an identification: parameters with their intervals, and what holds."""
-    return _plain_text(lambda console: print_result(console, result))
+    return _plain_text(lambda console: print_result(console, result, details=True))
 
 
 def plan_text(plan: Plan) -> str:
@@ -85,12 +98,17 @@ def _plain_text(printed: Callable[[Console], None]) -> str:
 
 def comparison_text(c: Comparison) -> str:
     """What `print` shows of a comparison: the verdict, and every parameter."""
+    return _plain_text(lambda console: print_comparison(console, c))
 
-    def printed(console: Console) -> None:
-        print_told(console, changes_lines(c))
-        console.print(table_of("Parameter by parameter", change_rows(c)))
 
-    return _plain_text(printed)
+def print_comparison(console: Console, c: Comparison) -> None:
+    """The verdict, and every parameter; in a narrow terminal its change without both values."""
+    print_told(console, changes_lines(c))
+    console.print()
+    shown = change_rows(c)
+    if console.width < NARROW_FOR_BOTH:
+        shown = without(shown, 1, 2)
+    console.print(table_of("Parameter by parameter", shown))
 
 
 def titled(title: str | None) -> Table:
@@ -114,11 +132,22 @@ def table_of(title: str | None, shown: ShownTable, whole: bool = False) -> Table
     for k, head in enumerate(shown.heads):
         words = k in shown.words
         wraps = not whole or (words and head != "unit") or head.startswith("q")
-        table.add_column(head, justify="left" if words else "right",
+        whole_words = words and (not k or head == "unit")
+        least = longest_word(row[k] for row in shown.rows) if whole_words else None
+        table.add_column(head, justify="left" if words else "right", min_width=least,
                          overflow="fold" if wraps else "ellipsis")  # fmt: skip
     for row in shown.rows:
         table.add_row(*map(Text, row))
     return table
+
+
+LONGEST_WHOLE = 28  # letters; a longer name breaks where its column ends
+
+
+def longest_word(texts: Iterable[str]) -> int | None:
+    """How wide a column of names has to be for none to break within a word."""
+    longest = max((len(word) for text in texts for word in text.split()), default=0)
+    return longest if longest <= LONGEST_WHOLE else None
 
 
 def _print_lines(console: Console, lines: Iterable[tuple[str, str]]) -> None:
@@ -149,7 +178,8 @@ def parameter_table(
     """
     notes = undetermined or any(e.note for e in result.ordinary if e.identifiable)
     lopsided = any_lopsided(result.ordinary)
-    table = _numbers_table("Parameters", "parameter", truth is not None, brief, lopsided)
+    least = longest_word(e.name for e in result.ordinary if e.identifiable or undetermined)
+    table = _numbers_table("Parameters", "parameter", truth is not None, brief, lopsided, least)
     if not brief:
         table.add_column("nominal", justify="right", overflow="fold")
     if notes:
@@ -175,10 +205,12 @@ def combination_table(
     return table
 
 
-def _numbers_table(title: str, first: str, compared: bool, brief: bool, lopsided: bool) -> Table:
+def _numbers_table(
+    title: str, first: str, compared: bool, brief: bool, lopsided: bool, least: int | None = None
+) -> Table:
     half = half_head(lopsided)
     table = titled(title)
-    table.add_column(first, overflow="fold")
+    table.add_column(first, overflow="fold", min_width=least)
     for name in (f"value {half}",) if brief else ("value", half):
         table.add_column(name, justify="left" if brief else "right", overflow="fold")
     if not brief:
@@ -216,23 +248,31 @@ def noise_tables(result: Calibration) -> list[Table]:
     return [table_of(title, table) for title, table in named if len(table.rows) > 1]
 
 
-def print_result(console: Console, result: Calibration, truth: Truth | None = None) -> None:
-    """Single estimates, combinations, what is not determined, and the summary in words."""
+def print_result(
+    console: Console, result: Calibration, truth: Truth | None = None, details: bool = False
+) -> None:
+    """Verdict, errors and what to do; single estimates and combinations; the rest in words.
+
+    Without `details` long lists are cut short, and noise, method and intervals left out.
+    """
+    _print_lines(console, leading_lines(result))
+    console.print()
     brief = console.width < NARROW
     alone = len(names_of(result, ALONE))
     listed = console.width >= WIDE and 0 < len(result.ordinary) - alone <= FEW
     if alone or listed:
         console.print(parameter_table(result, truth, listed, brief))
-    if result.combinations:
+    if result.combinations and (details or len(result.combinations) <= FEW):
         console.print(combination_table(result, truth, brief))
-    for line in undetermined_lines(result):
+    for line in undetermined_lines(result, None if details else FEW):
         console.print(Text(line, style="dim"))
-    for table in noise_tables(result):
+    for table in noise_tables(result) if details else ():
         console.print(table)
     console.print()
-    lines = (line.partition(": ") for line in summary_lines(result, truth))
-    _print_lines(console, ((label, text) for label, _, text in lines))
-    _print_lines(console, judgement(result).lines)
+    _print_lines(console, summary_lines(result, truth, details))
+    if not details:
+        more = f"{option('details', True)} tells of method, noise, residuals, intervals"
+        console.print(Text(f"{more} and every combination; so does the report.", style="dim"))
 
 
 WIDE_FOR_REASONS = 110  # columns, from which on the reasons stand beside the poses
@@ -251,6 +291,14 @@ def print_plan(console: Console, plan: Plan) -> None:
         console.print(table_of(title, table, whole=True))
     console.print()
     _print_lines(console, plan_lines(plan))
+
+
+def print_next(console: Console, found: NextPoses) -> None:
+    """Whether to measure more and what it brings, and the poses."""
+    if found.plan is not None:
+        print_plan(console, found.plan)
+        console.print()
+    _print_lines(console, next_lines(found))
 
 
 def _narrow_poses(console: Console, plan: Plan) -> Table:
@@ -284,7 +332,7 @@ def print_diagnosis(console: Console, d: Diagnosis, kinds: Sequence[str]) -> Non
     alone = " one at a time" if d.groups else ""
     title = f"Candidates{alone}, the best {len(best.rows) - 2} of {len(d.candidates)}"
     if console.width < NARROW_FOR_SETTINGS or not any(row[-1] for row in best.rows):
-        best = ShownTable(best.heads[:-1], [row[:-1] for row in best.rows])
+        best = without(best, len(best.heads) - 1)
     console.print(table_of(title, best))
     console.print(
         Text(
@@ -317,11 +365,7 @@ def _tables_of_causes(console: Console, d: Diagnosis) -> Iterable[Table | Text]:
         )
     if at.rows:
         # What it is as effects stands in the table of parameters too.
-        narrow = console.width < WIDE
-        kept = [k for k in range(len(at.heads)) if not (narrow and k == 2)]
-        rows = [tuple(row[k] for k in kept) for row in at.rows]
-        words = tuple(n for n, k in enumerate(kept) if k in at.words)
-        yield table_of("Place by place", ShownTable(tuple(at.heads[k] for k in kept), rows, words))
+        yield table_of("Place by place", without(at, 2) if console.width < WIDE else at)
     if fields.rows:
         yield table_of("Corrections without a name", fields)
 

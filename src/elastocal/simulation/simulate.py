@@ -8,7 +8,7 @@ import numpy as np
 from scipy.spatial.transform import Rotation
 
 from elastocal.errors import InputError, option
-from elastocal.measurements import Measurements, with_moves
+from elastocal.measurements import Measurements, visits, with_moves
 from elastocal.model.effects.compliances import JointCompliance
 from elastocal.model.manipulator import Model, check_equilibrium
 from elastocal.model.observations import available_noise, position_covariance
@@ -86,7 +86,8 @@ def expand_plan(
     """Every pose of a plan once per load state, repeat and marker.
 
     `load` (3,) in N adds a loaded reading after each unloaded one where the plan itself states
-    no forces.  Rows are ordered as one would measure: configuration, repeat, load, marker.
+    no forces.  Where rows are of another marker than the first, each stays with its own.  Rows
+    are ordered as one would measure: configuration, repeat, load, marker.
     """
     forces = [plan.force]
     if load is not None:
@@ -96,12 +97,13 @@ def expand_plan(
                 "or drop them"
             )
         forces = [plan.force, plan.force + load]
+    stated = plan.marker_names == marker_names and plan.marker.any()
     parts = [
         (i, r, f, m)
         for i in range(len(plan))
         for r in range(repeats)
         for f in range(len(forces))
-        for m in range(len(marker_names))
+        for m in ([plan.marker[i]] if stated else range(len(marker_names)))
     ]
     index, repeat, state, marker = (np.array(v) for v in zip(*parts, strict=True))
     rows = replace(
@@ -121,12 +123,43 @@ def simulate(
     """Readings of the model at parameter values x for every row, with the cell's noise.
 
     Per-row sigmas of `rows` win over the cell's tracker noise, as when identifying; without
-    either the readings are exact.  Positions in m in the tracker frame; rotations and distances
-    where the model observes them.
+    either a reading has none.  At each visit joints settle anew, and positions drift, as the
+    cell's [noise] states.  Positions in m in the tracker frame; rotations and distances where the
+    model observes them.
 
     Raises ElastocalError where a pose has no static equilibrium.
     """
     rng = np.random.default_rng(rng)
+    if noise:
+        return _unsteady(model, rows, x, rng)
+    return _read(model, rows, x, rng, False)
+
+
+def _unsteady(model: Model, rows: Measurements, x: Array, rng: np.random.Generator) -> Measurements:
+    """Readings of joints that settle anew at each visit, by a base or tracker that drifts."""
+    cell, n_joints, visit = model.cell, model.chain.n_joints, visits(rows)
+    settled, scatter = rows, cell.noise.of_joints(n_joints)
+    if scatter.any():
+        shift = rng.normal(size=(visit.max(initial=-1) + 1, n_joints)) * scatter
+        settled = replace(rows, q=rows.q + shift[visit])
+    found = replace(_read(model, settled, x, rng, True), q=rows.q)
+    if not cell.noise.drift or found.position is None:
+        return found
+    # Where nobody says when, visits follow each other in the order of the rows.
+    _, first, code = np.unique(visit, return_index=True, return_inverse=True)
+    order = np.argsort(np.argsort(first))[code.ravel()].astype(float)
+    time = order * cell.design.motion.dwell if rows.time is None else rows.time
+    when, place = np.unique(time, return_inverse=True)
+    course = cell.noise.drift * rng.normal(size=(len(when), 3))
+    for k, same in enumerate(np.exp(-np.diff(when) / cell.noise.lasting), start=1):
+        course[k] = same * course[k - 1] + np.sqrt(1 - same**2) * course[k]
+    return replace(found, position=found.position + course[place.ravel()], time=time)
+
+
+def _read(
+    model: Model, rows: Measurements, x: Array, rng: np.random.Generator, noise: bool
+) -> Measurements:
+    """What the tracker reads at every row."""
     n = len(rows)
     if model.observe == "distance":
         length = model.predict(replace(rows, distance=np.ones(n)), x)

@@ -24,6 +24,7 @@ from dataclasses import dataclass
 from functools import cached_property
 from importlib.machinery import ModuleSpec, SourceFileLoader
 from importlib.util import module_from_spec, spec_from_loader
+from itertools import islice
 from pathlib import Path, PurePosixPath
 from types import ModuleType
 from typing import Any, cast
@@ -37,6 +38,7 @@ from elastocal.errors import InputError, option, require
 from elastocal.files import read_bytes
 from elastocal.text import did_you_mean, listed, quoted
 
+MAX_TASKS = 200_000  # each is kept in memory, and has a row or more in the results
 RESERVED = ("task", "task_hash", "task_row", "task_seconds", "elastocal", "task_error")
 MAX_BYTES = 1_000_000_000  # of a file that study.toml names: a table, at most
 TAKEN = f"{', '.join(RESERVED)} are columns of every study"
@@ -231,8 +233,14 @@ def _tasks(
             f"{script}: defines no function {name}(); a study has tasks(options) "
             "and run(task, rng)",
         )
-    found = calling(folder, "tasks()", lambda: list(module.tasks(dict(options))))
+    found = calling(
+        folder, "tasks()", lambda: list(islice(module.tasks(dict(options)), MAX_TASKS + 1))
+    )
     require(bool(found), f"{script}: tasks() gives no task with these options; nothing to do")
+    require(
+        len(found) <= MAX_TASKS,
+        f"{script}: tasks() gives more than {MAX_TASKS} tasks with these options; let each do more",
+    )
     for index, task in enumerate(found):
         where = f"{script}, task {index}"
         if not isinstance(task, Mapping):

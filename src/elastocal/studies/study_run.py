@@ -30,7 +30,7 @@ from elastocal.errors import ElastocalError, InputError, option, require
 from elastocal.files import atomic_write_text, read_bytes
 from elastocal.studies.study_folder import Outcome, Sources, Study, StudyTask, calling, execute
 from elastocal.studies.study_results import SOONEST, Recorder, StudyResults, opened, read_results
-from elastocal.text import quoted
+from elastocal.text import printable, quoted
 
 GRACE = 30.0  # s that running tasks are waited for
 ANSWER = 10.0  # s in which a scheduler answers
@@ -149,7 +149,7 @@ def run_local(
     """Outcomes of tasks on the cores of this machine; with `jobs` of 1 in this process."""
     import joblib
 
-    jobs = jobs or joblib.cpu_count()
+    jobs = min(jobs or joblib.cpu_count(), len(tasks))
     if jobs > 1 and tasks:
         yield from hand_out(Processes(jobs), study.sources, tasks, stop)
         return
@@ -507,7 +507,8 @@ def summarise(study: Study, output: str | Path, page: str | Path) -> str | None:
     if not isinstance(text, str):
         kind = type(text).__name__
         raise InputError(f"{study.folder / 'study.py'}: summary() returned {kind}; it returns text")
-    atomic_write_text(page, text.rstrip("\n") + "\n")
+    lines = (printable(line).replace("\\t", "\t") for line in text.rstrip("\n").split("\n"))
+    atomic_write_text(page, "\n".join(lines) + "\n")
     return text
 
 

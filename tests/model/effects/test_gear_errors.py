@@ -128,6 +128,12 @@ def test_a_spectrum_has_the_lines_that_the_cell_names() -> None:
     )
 
 
+def test_a_multiple_of_a_line_is_smaller_beforehand() -> None:
+    lines = {f"order_{k}": order for k, order in enumerate((17.4, 22.0, 2 * 17.4, 3 * 17.4), 1)}
+    m = model(stick("z"), "gear_spectrum", settings={"joint1": lines | {"spectrum_size_rad": 6e-5}})
+    assert [p.typical for p in m.parameters][::2] == pytest.approx([6e-5, 6e-5, 3e-5, 2e-5])
+
+
 def test_beside_a_line_stands_its_derivative_by_the_order() -> None:
     """A line of an order a little off, turned about the middle of the angles, is their sum."""
     m = model(stick("z"), "gear_spectrum", settings={"joint1": LINES})

@@ -19,7 +19,7 @@ GIVEN = {
 
 
 def test_every_criterion_is_made_under_its_own_name():
-    assert set(CRITERIA) == set("ADEGIc") | {"test_pose", "O1", "O2", "O3", "O4", "O5"}
+    assert set(CRITERIA) == set("ADEGIc") | {"test_pose", "robust", "O1", "O2", "O3", "O4", "O5"}
     for name in CRITERIA:
         assert make_criterion(name, **GIVEN).name == name
         arms = GIVEN | {"scenarios": 2, "A": np.ones((2, 2, 3, P))}
@@ -31,7 +31,7 @@ def test_every_criterion_is_made_under_its_own_name():
     [
         ("d", {}, "criterion 'd' is unknown .did you mean 'D'"),
         ("test-pose", {}, "did you mean 'test_pose'"),
-        ("V", {}, "there are test_pose, D, A, E, G, I, c, O1, O2, O3, O4, O5"),
+        ("V", {}, "there are test_pose, robust, D, A, E, G, I, c, O1, O2, O3, O4, O5"),
         ("D", {"robust": "avrage"}, "did you mean 'average'"),
         ("D", {"scenarios": 3}, 'robust = "average" or "worst"'),
         ("D", {"interest": []}, "no parameter of interest is left"),

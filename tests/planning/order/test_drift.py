@@ -8,8 +8,10 @@ from support.cells import DOWN, kr270_chain, random_poses
 from support.design_cells import all_loads, plan_cell, setup_of
 from support.discs import Discs
 
+from elastocal.cell.arm_description import Unsteadiness
 from elastocal.cell.plan_wishes import Motion
 from elastocal.errors import InputError
+from elastocal.identification.visit_record import course_waves
 from elastocal.planning import Alias, plan_rows, schedule
 from elastocal.planning import test_poses as target_poses
 from elastocal.planning.drift import DRIFT, turns
@@ -21,7 +23,7 @@ RNG = np.random.default_rng(1)
 Q = RNG.uniform(-2, 2, (12, 2))
 # Loaded minus unloaded: what a shift does has opposite signs.
 OWN = RNG.normal(size=(12, 1, 4, 3))
-PAIRS = Alias(np.concatenate([-OWN, OWN], axis=1) / 12, 5e-6, True)
+PAIRS = Alias(np.concatenate([-OWN, OWN], axis=1) / 12, 5e-6, True, OWN, OWN)
 
 
 def ordered(alias=PAIRS, **motion):
@@ -108,3 +110,18 @@ def test_the_alias_is_what_least_squares_make_of_shifted_readings():
     assert np.linalg.norm(found) == pytest.approx(rms, rel=1e-8)
     assert alias.noise == pytest.approx(np.sqrt(setup.value(q, all_loads(q))), rel=1e-9)
     assert DRIFT > 0
+
+    # What is left of the information where all drifts: generalised least squares with V + FFᵀ.
+    noise = Unsteadiness(drift=40e-6, lasting=0.5)
+    waves = course_waves((time.ravel() - time.min()) / np.ptp(time), 0.5 / np.ptp(time))
+    course = waves.reshape(*time.shape, -1)[table.configuration, state]
+    F = [observed.apply(c[:, None] * axis) for c in course.T for axis in np.eye(3)]
+    F = 40e-6 * np.array([np.linalg.solve(root, f.reshape(8, -1, 1)).ravel() for f in F]).T
+    B = B.reshape(-1, B.shape[-1]) * information.sizes
+    M = B.T @ B
+    expected = B.T @ np.linalg.solve(np.eye(len(F)) + F @ F.T, B)
+    left = alias.information(M, time, noise)
+    scale = np.sqrt(np.diag(M))
+    np.testing.assert_allclose(left / scale / scale[:, None], expected / scale / scale[:, None],
+                               atol=1e-9)  # fmt: skip
+    assert np.linalg.eigvalsh(M - left)[0] > -1e-9 * np.linalg.eigvalsh(M)[-1]

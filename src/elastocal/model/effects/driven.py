@@ -113,6 +113,18 @@ class MarkerMotion(Entry):
         arm.markers[place.removeprefix("marker:")] += u
 
 
+class HookMotion(Entry):
+    """The point where the load hangs moves by u (3,) in the flange frame."""
+
+    name = "hook_motion"
+    stage: ClassVar[Stage] = "load"
+    at = "load"
+    units = ("m", "m", "m")
+
+    def enter(self, arm: Arm, place: str, u: ca.SX) -> None:
+        arm.load_point += u
+
+
 class DrivenEffect(Effect):
     """u = D(row) p at an `entry` of the chain: linear in its parameters p.
 

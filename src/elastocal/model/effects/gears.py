@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from typing import ClassVar
 
 import casadi as ca
@@ -138,12 +139,13 @@ class GearSpectrum(DrivenEffect):
 
     A gear with several stages has lines at each wheel's turns, at its teeth and at their
     multiples, at once.  Settings: `order_1` … `order_40` in periods per turn (0, the default: no
-    line; as many as the cell names), the prior size `spectrum_size_rad` of each a_k and b_k.
+    line; as many as the cell names), the prior size `spectrum_size_rad` of a_k and b_k, an n-th of
+    it where N_k is n times another line's order.
 
     An order that was estimated with the standard deviation `order_sd_k` brings the derivative by
     N_k beside its line, (q − q₀)(c_k cos N_k q − d_k sin N_k q) with c_k = a_k δN_k and
-    d_k = b_k δN_k of the prior size `spectrum_size_rad` · `order_sd_k`; q₀ =
-    `spectrum_centre_rad` is the middle of the angles that the order was estimated from.
+    d_k = b_k δN_k of that prior size times `order_sd_k`; q₀ = `spectrum_centre_rad` is the middle
+    of the angles that the order was estimated from.
     """
 
     name = "gear_spectrum"
@@ -167,16 +169,20 @@ class GearSpectrum(DrivenEffect):
             *spreads,
         )
 
-    def lines(self, place: str, chain: Chain, cell: Cell) -> dict[int, float]:
-        """Numbers of the lines that there are, and how uncertain their orders are."""
+    def lines(self, place: str, chain: Chain, cell: Cell) -> dict[int, tuple[float, float]]:
+        """Numbers of the lines that there are: each one's order, and how uncertain that is."""
         given = self.stated(place, chain, cell)
         known = range(1, MOST_LINES + 1)
-        return {k: given[f"order_sd_{k}"] for k in known if given.get(f"order_{k}", 0.0) > 0}
+        return {
+            k: (given[f"order_{k}"], given[f"order_sd_{k}"])
+            for k in known if given.get(f"order_{k}", 0.0) > 0
+        }  # fmt: skip
 
     def parameters(self, place: str, chain: Chain, cell: Cell) -> tuple[ParameterSpec, ...]:
-        size = self.stated(place, chain, cell)[self.sized_by]
-        specs = []
-        for k, sd in self.lines(place, chain, cell).items():
+        whole = self.stated(place, chain, cell)[self.sized_by]
+        lines, specs = self.lines(place, chain, cell), []
+        for k, (order, sd) in lines.items():
+            size = whole / _multiple_of([other for other, _ in lines.values()], order)
             parts = [("sin", size), ("cos", size)]
             parts += [("sin_shift", size * sd), ("cos_shift", size * sd)] if sd > 0 else []
             specs += [
@@ -186,13 +192,22 @@ class GearSpectrum(DrivenEffect):
 
     def drive(self, arm: Arm, place: str, p: Symbols) -> ca.SX:
         q, u = arm.q_commanded[index(place)], ca.SX(0)
-        for k, sd in self.lines(place, arm.chain, arm.cell).items():
+        for k, (_, sd) in self.lines(place, arm.chain, arm.cell).items():
             sine, cosine = ca.sin(p[f"order_{k}"] * q), ca.cos(p[f"order_{k}"] * q)
             u += p[f"line_{k}_sin"] * sine + p[f"line_{k}_cos"] * cosine
             if sd > 0:
                 turned = p[f"line_{k}_sin_shift"] * cosine - p[f"line_{k}_cos_shift"] * sine
                 u += (q - p["spectrum_centre_rad"]) * turned
         return u
+
+
+def _multiple_of(orders: Sequence[float], order: float) -> int:
+    """How many times the lowest of `orders` that it is a multiple of an order is."""
+    ratios = (order / other for other in orders)
+    return max((round(r) for r in ratios if abs(r - round(r)) < WHOLE), default=1)
+
+
+WHOLE = 1e-9
 
 
 class WristCoupling(DrivenEffect):

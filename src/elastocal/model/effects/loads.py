@@ -46,8 +46,7 @@ class Payload(Effect):
         return False
 
     def load(self, arm: Arm, place: str, p: Symbols) -> None:
-        point = rigid.point(arm.T_tracker_flange, rigid.constant(arm.cell.tool.load_point))
-        arm.add_force(point, arm.input("force", 3))
+        arm.add_force(rigid.point(arm.T_tracker_flange, arm.load_point), arm.input("force", 3))
 
 
 class PayloadError(Effect):
@@ -72,7 +71,7 @@ class PayloadError(Effect):
         force, T = arm.input("force", 3), arm.T_tracker_flange
         scale = p["payload_scale"]
         shift = ca.vertcat(*[p[f"load_point_{k}"] for k in "xyz"])
-        arm.add_force(rigid.point(T, rigid.constant(arm.cell.tool.load_point)), scale * force)
+        arm.add_force(rigid.point(T, arm.load_point), scale * force)
         arm.add_potential(-(1 + scale) * ca.dot(force, T[:3, :3] @ shift))
 
 

@@ -26,13 +26,13 @@ from scipy import stats
 from elastocal.above import Result
 from elastocal.cell.arm_description import Tool
 from elastocal.errors import InputError, InsufficientDataError, option, require
-from elastocal.export.exportable import Conditions, Valued, keep, random_table
 from elastocal.identification.result import Calibration
 from elastocal.measurements import Measurements
 from elastocal.model.arm import given_force
 from elastocal.model.calibrated import CalibratedArm, given_arm
 from elastocal.model.effects import CATALOGUE
 from elastocal.model.manipulator import Model
+from elastocal.model.valued import Conditions, Valued, part_of, random_table, unstated_needs
 from elastocal.units import Array
 
 SCHEMA = "elastocal/comparison/1"
@@ -74,7 +74,9 @@ class Comparison(Result):
         moved: (poses, 3) m: how the tool's point moves, commanded alike, set up alike.
         chance: (poses,) m: the standard deviation of that by the campaigns' noise alone.
         place: (poses, 3) m: where the point is, in the data's frame of the old campaign.
-        force: (3,) N that acts at these poses.
+        forces: (L, 3) N that act at these poses, in turn.
+        loads_of: Where they come from: "the option", "the earlier campaign", "the later campaign",
+            "the cell's plan"; empty where nothing states a load.
         first_order: Whether the new parameters were told in those of the old.
 
     Examples:
@@ -91,7 +93,8 @@ class Comparison(Result):
     moved: Array
     chance: Array
     place: Array
-    force: Array
+    forces: Array
+    loads_of: str
     first_order: bool
 
     @property
@@ -134,7 +137,8 @@ class Comparison(Result):
             "first_order": self.first_order,
             "tool": {
                 "poses": len(far),
-                "force_N": self.force,
+                "force_N": self.forces[0] if len(self.forces) == 1 else None,
+                "forces_N": self.forces,
                 "rms_um": float(np.sqrt(np.mean(far**2))),
                 "p95_um": float(np.quantile(far, CENTRAL)),
                 "max_um": float(far.max()),
@@ -160,7 +164,8 @@ def compare(
     Args:
         old: The earlier calibration, or its arm (`fit.arm`, `read_calibrated`).
         new: The later one, of the same cell.
-        load: Force (3,) in N at the load point under which the tool is compared; default none.
+        load: Force (3,) in N at the load point under which the tool is compared; by default the
+            loads of the campaigns, in turn.
         level: Chance that any parameter is called changed where none is.
         poses: Random poses within the joint limits.
         seed: Of these poses.
@@ -182,24 +187,43 @@ def compare(
         whole = isinstance(count, int | np.integer) and not isinstance(count, bool)
         require(whole and count >= least, f"{option(name)} takes a whole number, {least} or more")
     require(0 < level < 1, f"{option('level')} takes a number between 0 and 1; found {level}")
-    force = given_force(load)
-    return _compared(before, after, force, float(level), int(poses), int(seed))
+    loads = _loads(before, after, given_force(load))
+    return _compared(before, after, *loads, float(level), int(poses), int(seed))
+
+
+def _loads(old: CalibratedArm, new: CalibratedArm, force: Array | None) -> tuple[Array, str]:
+    """The forces (L, 3) to compare under and whose they are: those given, else of the earlier
+    campaign, in whose frame the tool is compared, the later one, the cell's plan, where any."""
+    planned = old.model.cell.design.loads
+    for whose, loads in (
+        ("the option", None if force is None else force[None]),
+        ("the earlier campaign", old.loads),
+        ("the later campaign", new.loads),
+        ("the cell's plan", planned),
+    ):
+        if loads is not None and (loads.any() or force is not None):
+            return loads if force is not None else loads[loads.any(axis=1)], whose
+    return np.zeros((1, 3)), ""
 
 
 def _compared(
-    old: CalibratedArm, new: CalibratedArm, force: Array | None, level: float, poses: int, seed: int
-) -> Comparison:
+    old: CalibratedArm, new: CalibratedArm, forces: Array, whose: str, level: float, poses: int,
+    seed: int,
+) -> Comparison:  # fmt: skip
     require(
         old.model.names == new.model.names,
         f"{old.source} and {new.source} are of two models: their parameters differ; identify both "
         "with the same cell",
     )
-    conditions = Conditions(np.zeros(3) if force is None else force)
-    before = keep(old, elastic=True, conditions=conditions).full
-    after = keep(new, elastic=True, conditions=conditions).full
+    conditions = Conditions()
+    before, after = (
+        part_of(arm, [n for n, needs in unstated_needs(arm, conditions).items() if not needs])
+        for arm in (old, new)
+    )
     own = _own(before.model)
     determined = [[n for n in arm.determined if n in own] for arm in (old, new)]
     table = random_table(before.model, conditions, poses, seed)
+    table = replace(table, force=np.resize(forces, (poses, 3)))
     names, z, V, first_order = _difference(old, new, before, after, determined, table)
     if not names:
         raise InsufficientDataError(
@@ -226,7 +250,7 @@ def _compared(
     changes, p = _tested(old, new, names, z, V, level, np.sqrt((B**2).sum(axis=1).mean(axis=0)))
     return Comparison(
         old, new, changes, p, level, (there - here)[settled], chance, here[settled],
-        conditions.force, first_order,
+        forces, whose, first_order,
     )  # fmt: skip
 
 

@@ -1,0 +1,223 @@
+"""Which poses next, and whether more are worth measuring: plans from what was measured so far.
+
+The arm is diagnosed and identified.  Effects found join the model; what else it may lack is in
+doubt, with the probability that the diagnosis leaves it.  The next poses make the error at the test
+poses small that counts both, parameters and doubts (`planning.doubts`), with all readings so far.
+"""
+
+from __future__ import annotations
+
+import math
+from collections import Counter
+from contextlib import suppress
+from dataclasses import asdict, dataclass, replace
+from pathlib import Path
+from typing import Any, Literal
+
+import numpy as np
+
+from elastocal.cell.arm_description import EffectChoice
+from elastocal.cell.work_cell import Cell
+from elastocal.diagnosis.diagnose import FEWEST, DiagnosisOptions, diagnose
+from elastocal.diagnosis.diagnosis import Diagnosis, FoundEffect
+from elastocal.diagnosis.discrimination import load_forces
+from elastocal.diagnosis.evidence import ANOTHER
+from elastocal.errors import InsufficientDataError, option
+from elastocal.errors import require as check
+from elastocal.identification.identify import identify
+from elastocal.measurements import Measurements
+from elastocal.model.manipulator import Model
+from elastocal.planning.design import DesignOptions, design
+from elastocal.planning.doubts import SOMETHING, Place, missing
+from elastocal.planning.plan import Gain, Plan
+from elastocal.planning.test_poses import where_used
+from elastocal.units import Progress
+
+CRITERION, EFFORT = "robust", "batch"
+PAYS = 0.01  # share of the error by which a batch has to lower it
+
+NextVerdict = Literal["measure", "enough", "no_gain"]
+
+
+@dataclass(frozen=True, repr=False)
+class NextPoses:
+    """The next poses to measure, or why none are needed.
+
+    Attributes:
+        verdict: "measure"; "enough", the required error is kept with 95 %; "no_gain", no batch
+            lowers the error by a hundredth.
+        plan: The poses; None where nothing more is to be measured.
+        gain: What the batch adds, with and without what the model may lack, in m.
+        required: The error at new poses that is asked for, in m; None where none is.
+        reached: The error that the model as it is now keeps with 95 %, in m.
+        found: The effects that the diagnosis found, which the model then has.
+        doubts: What it may lack besides, the likeliest first.
+    """
+
+    verdict: NextVerdict
+    plan: Plan | None
+    batch: int
+    gain: Gain
+    required: float | None
+    reached: float
+    found: tuple[FoundEffect, ...]
+    doubts: tuple[tuple[str, str, float], ...]
+
+    def __repr__(self) -> str:
+        told = f"at most {self.reached * 1e6:.3g} µm with 95 %"
+        return f"<NextPoses {self.verdict}: {told}, {self.batch} more poses>"
+
+    def to_json(self) -> dict[str, Any]:
+        """The answer as numbers and texts; lengths in m."""
+        return {
+            "schema": "elastocal/next/1",
+            "verdict": self.verdict,
+            "required": self.required,
+            "reached": self.reached,
+            "batch": self.batch,
+            "gain": asdict(self.gain),
+            "found": [{"effect": f.effect, "where": f.where, "probability": f.probability}
+                      for f in self.found],
+            "doubts": [{"effect": e, "where": w, "probability": p} for e, w, p in self.doubts],
+            "plan": None if self.plan is None else self.plan.to_json(),
+        }  # fmt: skip
+
+    def save(self, path: str | Path) -> None:
+        """Write the plan as `Plan.save` does; nothing where there is none."""
+        if self.plan is not None:
+            self.plan.save(path)
+
+
+def next_poses(
+    model: Model | Cell | str | Path,
+    data: Measurements | str | Path,
+    *,
+    batch: int = 5,
+    require: float | None = None,
+    candidates: int = 400,
+    seed: int = 0,
+    jobs: int = 1,
+    progress: Progress = lambda message: None,
+) -> NextPoses:
+    """Which poses should I measure next, or are these enough?
+
+    The data are diagnosed and identified.  The next poses make the error at the test poses small
+    that counts the parameters and, with the probability that the diagnosis leaves them, the
+    effects that the model may lack.  Enough is what both say: the error that `identify` predicts,
+    and that which counts what the model may lack.
+
+    Args:
+        model: The model, or a cell, or the path of a cell file.
+        data: All readings so far, or their file.
+        batch: Number of poses.
+        require: Error in m at new poses that has to be kept with 95 %; default the cell's.
+        candidates: Feasible candidates to choose from.
+        seed: Of all random draws.
+        jobs: Processes; −1 for all cores.
+        progress: Is told what is done.
+
+    Returns:
+        The `NextPoses`: verdict, plan, what it adds.
+
+    Raises:
+        InputError: Data contradict robot or cell, or an option is wrong.
+        InsufficientDataError: No pose is feasible.
+
+    Examples:
+        >>> cell = ec.read_cell("cell.toml")
+        >>> more = ec.next_poses(cell, "data.csv", batch=5, candidates=60)
+        >>> more.verdict, len(more.plan)
+        ('measure', 5)
+    """
+    check(batch >= 1, f"{option('batch')} takes a number of poses, found {batch}")
+    check(
+        require is None or require > 0, f"{option('require')} takes an error in m, found {require}"
+    )
+    model = model if isinstance(model, Model) else Model(model)
+    table = data if isinstance(data, Measurements) else model.read(data)
+    model = model.with_markers_of(table)
+    required = model.cell.require.new_poses if require is None else require
+    why = None
+    if len(np.unique(table.configuration)) >= FEWEST:
+        progress("diagnosing")
+        why = diagnose(model, table, DiagnosisOptions(seed), progress)
+        model = with_effects_of(model, why)
+    progress("identifying")
+    predicted = None
+    with suppress(InsufficientDataError):  # then these are not enough
+        predicted = identify(model, table, new_poses=where_used(model)).predicted
+    chances = doubts_after(model, why)
+    spec = model.cell.design
+    spec = replace(
+        spec, poses=batch, per_level=(), target=None, criterion=CRITERION, candidates=candidates,
+        loads=load_forces(table) if spec.loads is None else spec.loads,
+        # A joint whose compliance is known at its levels only can be nowhere else.
+        levels=spec.levels or model.cell.model.compliance_levels,
+    )  # fmt: skip
+    cell = replace(model.cell, design=spec)
+    options = DesignOptions(EFFORT, seed, jobs, done=table, doubts=chances)
+    plan = design(cell, options, progress=progress)
+    gain = plan.gain
+    assert gain is not None  # the criterion has test poses
+    reached = math.inf if predicted is None else max(gain.sure, predicted.ci95[1])
+    verdict = verdict_of(gain, reached, required)
+    likeliest = sorted(chances.items(), key=lambda item: -item[1])
+    return NextPoses(
+        verdict=verdict,
+        plan=plan if verdict == "measure" else None,
+        batch=batch,
+        gain=gain,
+        required=required,
+        reached=reached,
+        found=() if why is None else why.effects,
+        doubts=tuple((*key, p) for key, p in likeliest),
+    )
+
+
+def verdict_of(gain: Gain, reached: float, required: float | None) -> NextVerdict:
+    """Whether to measure a batch with this gain, where `reached` is kept and `required` asked."""
+    if required is not None and reached <= required:
+        return "enough"
+    pays = not np.isfinite(gain.before) or gain.after < (1 - PAYS) * gain.before
+    return "measure" if pays else "no_gain"
+
+
+def with_effects_of(model: Model, why: Diagnosis) -> Model:
+    """The model with the effects that a diagnosis found, at their settings."""
+    spec = model.cell.model
+    settings, sizes = (
+        {place: dict(values) for place, values in given.items()}
+        for given in (spec.nominal.settings, spec.nominal.sizes)
+    )
+    effects = list(spec.effects)
+    for f in why.effects:
+        effects.append(EffectChoice(f.effect, f.where))
+        settings[f.where] = settings.get(f.where, {}) | f.settings
+        sizes[f.where] = sizes.get(f.where, {}) | f.sizes
+    nominal = replace(spec.nominal, settings=settings, sizes=sizes)
+    spec = replace(spec, effects=tuple(effects), nominal=nominal, **why.model_keys)  # type: ignore[arg-type]
+    cell = replace(model.cell, model=spec)
+    return Model.assembled(model.chain, cell) if why.effects else model
+
+
+def doubts_after(model: Model, why: Diagnosis | None) -> dict[Place, float]:
+    """Probability that the model lacks an effect at a place.
+
+    As the diagnosis has it, where nothing was found.  Beside what was found it is that of the
+    effect instead of it, or of one effect more: ANOTHER in equal shares, times what evidence at
+    the distance d costs where nothing shows, 1/√(1 + d²).
+    """
+    places = missing(model)
+    kinds = Counter(name for name, _ in places)
+    share = {key: 1 / (len(kinds) * kinds[key[0]]) for key in places}
+    if why is None:
+        return {key: SOMETHING * p for key, p in share.items()}
+    judged = {(c.effect, c.where): c for c in why.candidates}
+    out = {}
+    for key, p in share.items():
+        found = judged.get(key)
+        seen = 0.0 if found is None else found.detectable
+        instead = SOMETHING * p if found is None else found.probability
+        more = ANOTHER * p / math.hypot(1.0, seen) if why.effects else 0.0
+        out[key] = max(instead, more)
+    return out

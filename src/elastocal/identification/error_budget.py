@@ -1,0 +1,174 @@
+"""The error budget: where the error of the nominal arm goes, step by step."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field, replace
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from elastocal.errors import ElastocalError
+from elastocal.identification.prediction import FEWEST_REPEATS
+from elastocal.identification.residuals import held_out_residual
+from elastocal.identification.result import Calibration
+from elastocal.identification.scrutiny import stage_of
+from elastocal.identification.solve import WORTH_A_COLUMN, reduce
+from elastocal.identification.weighted_problem import weights_for
+from elastocal.model.manipulator import Model
+from elastocal.model.observations import Observations
+from elastocal.units import Array
+
+STAGES = ("nominal_arm", "geometry", "compliance", "smooth functions")
+MOST_NUMBERS = 30_000_000  # of a regressor held at once; larger tables get no budget
+STEPS, SETTLED = 4, 1e-3  # Gauss-Newton steps, and the relative gain that ends them
+DRAWS = 1000
+
+
+@dataclass(frozen=True)
+class BudgetStep:
+    """A step of a gap budget: 3-D rms error (m) on configurations left out of the fit, and the
+    error (N, 3) in m of every reading (of distances (N, 1))."""
+
+    step: str
+    heldout_rms: float
+    ci95: tuple[float, float]
+    errors: Array = field(default_factory=lambda: np.zeros((0, 3)), compare=False)
+
+
+@dataclass(frozen=True)
+class ErrorBudget:
+    """The steps, and what noise alone gives (m, None where nothing says it), in words."""
+
+    steps: tuple[BudgetStep, ...]
+    floor: float | None
+    floor_name: str
+
+
+def gap_budget(result: Calibration) -> ErrorBudget | None:
+    """Held-out 3-D errors as the model gains base and markers, geometry, compliance, smooth
+    functions.
+
+    Each step fits the parameters of its stages that the whole fit determined, the later ones held
+    at nominal, by a few Gauss-Newton steps from the whole fit; each configuration is predicted by
+    the fit to the others (`held_out_residual`), the last step as the result has it.  The first
+    step is "nominal_arm", with base and markers placed by the other configurations.  Intervals are
+    by resampling configurations.  None where some configuration cannot be left out, and for tables
+    too large to do it in passing.
+    """
+    model = result.model
+    if len(result.residual) * len(result.determined) > MOST_NUMBERS:
+        return None
+    if not np.isfinite(result.held_out).all():
+        return None
+    stage = np.array([stage_of(p.effect) for p in model.parameters], dtype=np.int64)
+    stage[model.shrunk] = len(STAGES) - 1
+    determined = np.isin(model.names, result.determined)
+    last = int(stage[determined].max(initial=0))
+    rng = np.random.default_rng(0)
+    steps = []
+    for k in range(last):
+        if k and not (determined & (stage == k)).any():
+            continue
+        residual = _fitted(result, np.flatnonzero(determined & (stage <= k)), stage > k)
+        if residual is not None:
+            steps.append(_step(STAGES[k], result, residual, rng))
+    steps.append(_step(STAGES[last], result, result.held_out, rng))
+    return ErrorBudget(tuple(steps), *_floor(result))
+
+
+def _fitted(
+    result: Calibration, columns: NDArray[np.int64], held: NDArray[np.bool_]
+) -> Array | None:
+    """Held-out residual (rows,) with `columns` fitted and the parameters `held` at nominal."""
+    model, observed = result.model, result.observations
+    weights = weights_for(observed, model.cell.tracker, "auto")
+    x = np.where(held, model.nominal, result.x)
+    best: tuple[float, Array, Array] | None = None
+    try:
+        for _ in range(STEPS):
+            at = model.regressor(observed.table, x, columns, observed)
+            error = weights.apply(at.residual)
+            if best is None and result.smooth and len(columns):
+                # What has a prior in the whole fit has none here: a minimal complete set.
+                own = _worth_a_column(model, columns, weights.apply(at.B), error)
+                columns, at = columns[own], replace(at, B=at.B[:, own])
+            cost = float(error @ error)
+            if best is not None and cost > (1 - SETTLED) * best[0]:
+                break
+            best = cost, at.B, at.residual
+            if not len(columns):
+                break
+            x = x.copy()
+            x[columns] += np.linalg.lstsq(weights.apply(at.B), error, rcond=None)[0]
+    except (ElastocalError, np.linalg.LinAlgError):
+        return None  # the arm without its compliances stands nowhere near: no step of a budget
+    assert best is not None
+    _, B, residual = best
+    if not len(columns):
+        return residual
+    found = held_out_residual(B, residual, weights, observed.configuration, observed.size)
+    return found if np.isfinite(found).all() else None
+
+
+def _worth_a_column(
+    model: Model, columns: NDArray[np.int64], B: Array, error: Array
+) -> NDArray[np.int64]:
+    """Which columns of the whitened B make up a minimal complete set beside this residual."""
+    sigma = max(float(np.sqrt(np.mean(error**2))), 1e-300)
+    own = tuple(model.parameters[c] for c in columns)
+    sizes = np.array([p.typical or 1.0 for p in own])
+    return reduce(B, sizes, own, sigma, WORTH_A_COLUMN).kept
+
+
+def _step(name: str, result: Calibration, residual: Array, rng: np.random.Generator) -> BudgetStep:
+    observed = result.observations
+    parts = residual.reshape(-1, observed.size)[:, :3]
+    squared = (parts**2).sum(axis=1)
+    _, code = np.unique(observed.configuration, return_inverse=True)
+    rms, ci95 = resampled_rms(np.bincount(code, squared), np.bincount(code), rng)
+    return BudgetStep(name, rms, ci95, parts)
+
+
+def _floor(result: Calibration) -> tuple[float | None, str]:
+    """What repeats scatter, else what the stated noise gives."""
+    observed = result.observations
+    code = places(observed)
+    parts = result.residual.reshape(-1, observed.size)[:, :3]
+    dof = len(parts) - int(code.max()) - 1
+    if dof >= FEWEST_REPEATS:
+        count = np.bincount(code)
+        mean = np.column_stack([np.bincount(code, p) / count for p in parts.T])
+        return float(np.sqrt(((parts - mean[code]) ** 2).sum() / dof)), "repeats alone"
+    ratio = result.noise.ratio_to_stated
+    if ratio:
+        scatter = result.residual_rms * float(np.sqrt(len(result.residual) / result.dof))
+        return scatter / float(ratio), "stated noise"
+    return None, ""
+
+
+def places(observed: Observations) -> NDArray[np.int64]:
+    """For each observation (N,) the number of its place: configuration, marker and load."""
+    force = np.round(observed.table.force[observed.lead], 3)
+    key = np.column_stack([observed.configuration, observed.table.marker[observed.lead], force])
+    return np.unique(key, axis=0, return_inverse=True)[1].ravel()
+
+
+def pose_accuracy(observed: Observations, errors: Array) -> Array:
+    """AP (places,) in m as ISO 9283 has it: how far the mean of the readings of one place lies from
+    where it should, of errors (N, 3) in m."""
+    code = places(observed)
+    mean = np.column_stack([np.bincount(code, e) for e in errors.T]) / np.bincount(code)[:, None]
+    return np.asarray(np.linalg.norm(mean, axis=1))
+
+
+def resampled_rms(
+    squares: NDArray[Any], count: NDArray[Any], rng: np.random.Generator
+) -> tuple[float, tuple[float, float]]:
+    """The rms √(Σ squares / Σ count) of configurations (C,) and its 95 % interval, by weights that
+    a Dirichlet distribution draws for them (the Bayesian bootstrap)."""
+    rms = float(np.sqrt(squares.sum() / count.sum()))
+    weight = rng.dirichlet(np.ones(len(squares)), DRAWS)
+    drawn = np.sqrt((weight @ squares) / (weight @ count))
+    low, high = np.quantile(drawn, [0.025, 0.975])
+    return rms, (float(low), float(high))

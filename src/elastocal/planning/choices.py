@@ -1,0 +1,314 @@
+"""What can be chosen besides poses: places of markers, hook and tracker, and which loads hang.
+
+The relaxed optimum Φ*(z) = min_w Φ(Σ w_i A_i(z)) over weights w is what the best plan at places z
+can reach at most.  It is made small over w and z in turn: at weights w the places by L-BFGS-B
+(Byrd, Lu, Nocedal & Zhu 1995) within their boxes, at places z the weights by the certified
+relaxation, on candidates that the cell's rules allow there.  Both steps lower the same Φ, and where
+neither does ∂Φ*/∂z = ∂Φ/∂z|_w (envelope theorem) vanishes or points out of the boxes.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from copy import copy
+from dataclasses import dataclass, replace
+from itertools import combinations
+from typing import Any
+
+import numpy as np
+from scipy.optimize import minimize
+from scipy.stats import qmc
+
+from elastocal.cell.work_cell import Cell
+from elastocal.errors import ElastocalError, InsufficientDataError, require
+from elastocal.model.effects.driven import Entry, HookMotion, MarkerMotion
+from elastocal.model.manipulator import Model
+from elastocal.planning.candidates import draw
+from elastocal.planning.criteria import CRITERIA
+from elastocal.planning.feasibility import Feasibility
+from elastocal.planning.information import PoseInformation, load_states
+from elastocal.planning.relaxation import Relaxed, relax
+from elastocal.planning.setup import FeasiblePool, Known, Setup, set_up, shares_of
+from elastocal.planning.test_poses import TargetPoses
+from elastocal.units import Array, IntArray, Progress
+
+STARTS = 8  # places drawn in the boxes, besides those that the cell states
+SEARCHED, COMPARED = 400, 2000  # candidates while searching, and for the figures that are told
+ROUNDS = 8  # of weights and places in turn, at most
+GAIN = 3e-3  # relative, of Φ, below which a round is the last one
+STEP = 1e-6  # of a box, for differences of B, which has twelve digits
+DIGITS = 6  # of a place in m: more cannot be built
+USED = 1e-4  # of the largest weight: candidates that count while places move
+MOST_CHOICES = 100  # of loads
+
+
+HOOK, TRACKER = "load point", "tracker"  # beside the markers' names
+
+
+@dataclass(frozen=True)
+class Chosen:
+    """`places` name → before and after (2, 3) m, `loads` (k, 3) N where they were chosen; the
+    relaxed optimum `before` and `after` in `unit`, and the `share` of feasible poses, each on
+    `candidates` that the rules allow there; None where the cell as it stands has no plan."""
+
+    places: dict[str, Array]
+    loads: Array | None
+    before: float | None
+    after: float
+    unit: str
+    candidates: int
+    share: tuple[float | None, float]
+
+    def applied(self, cell: Cell) -> Cell:
+        """The cell with what was chosen."""
+        after = np.array([at[1] for at in self.places.values()])
+        cell = Boxes(tuple(self.places), after, after).placed(cell, after)
+        return cell if self.loads is None else _with_loads(cell, self.loads)
+
+    def to_json(self) -> dict[str, Any]:
+        """As numbers and texts."""
+        return {
+            "cell": self.keys,
+            "relaxed": {"before": self.before, "after": self.after, "candidates": self.candidates},
+            "feasible": {"before": self.share[0], "after": self.share[1]},
+        }
+
+    @property
+    def keys(self) -> dict[str, dict[str, Any]]:
+        """What is to stand in the cell file, by table."""
+        at = {name: place[1].tolist() for name, place in self.places.items()}
+        found: dict[str, dict[str, Any]] = {"tool": {}, "tracker": {}, "design": {}}
+        if HOOK in at:
+            found["tool"]["load_point_m"] = at.pop(HOOK)
+        if TRACKER in at:
+            found["tracker"]["position_m"] = at.pop(TRACKER)
+        if at:
+            found["tool"]["markers_m"] = at
+        if self.loads is not None:
+            found["design"]["loads_N"] = self.loads.tolist()
+        return {table: keys for table, keys in found.items() if keys}
+
+
+@dataclass(frozen=True)
+class Boxes:
+    """Places that may move: `names` (k,), their `lower` and `upper` corners (k, 3) m."""
+
+    names: tuple[str, ...]
+    lower: Array
+    upper: Array
+
+    @classmethod
+    def of(cls, cell: Cell) -> Boxes:
+        freedom = cell.design.choose
+        assert freedom is not None
+        boxes = dict(freedom.markers)
+        boxes |= {} if freedom.load_point is None else {HOOK: freedom.load_point}
+        boxes |= {} if freedom.tracker is None else {TRACKER: freedom.tracker}
+        corners = np.array(list(boxes.values())).reshape(-1, 2, 3)
+        return cls(tuple(boxes), corners[:, 0], corners[:, 1])
+
+    def places(self, cell: Cell) -> Array:
+        """Where the cell has them (k, 3)."""
+        known = cell.tool.markers | {HOOK: cell.tool.load_point, TRACKER: cell.tracker.position}
+        return np.array([known[name] for name in self.names]).reshape(-1, 3)
+
+    def at(self, unit: Array) -> Array:
+        """Places (k, 3) of a point (3 k,) of the unit cube."""
+        return self.lower + unit.reshape(-1, 3) * (self.upper - self.lower)
+
+    def unit(self, places: Array) -> Array:
+        """The point of the unit cube whose places are nearest; 0.5 where a box has no width."""
+        width = self.upper - self.lower
+        part = (places - self.lower) / np.where(width > 0, width, 1.0)
+        return np.clip(np.where(width > 0, part, 0.5), 0.0, 1.0).ravel()
+
+    def placed(self, cell: Cell, places: Array) -> Cell:
+        """The cell with everything at its place."""
+        at = dict(zip(self.names, np.round(places, DIGITS), strict=True))
+        hook = at.pop(HOOK, cell.tool.load_point)
+        tracker = replace(cell.tracker, position=at.pop(TRACKER, cell.tracker.position))
+        tool = replace(cell.tool, load_point=hook, markers=cell.tool.markers | at)
+        return replace(cell, tool=tool, tracker=tracker)
+
+
+@dataclass(frozen=True)
+class _Point:
+    """The relaxed optimum of a cell on candidates that its rules allow."""
+
+    cell: Cell
+    setup: Setup
+    pool: FeasiblePool
+    relaxed: Relaxed
+    share: float
+
+    @property
+    def value(self) -> float:
+        return self.relaxed.value
+
+
+@dataclass(frozen=True)
+class Choice:
+    """The search for places and loads; `work` is the model of the cell as it stands, whose test
+    poses `targets` (and `region`) are what every choice is judged by."""
+
+    work: Model
+    targets: TargetPoses
+    region: TargetPoses | None
+    known: Known
+    seed: int
+    progress: Progress
+
+    def best(self) -> Chosen:
+        """The best places and loads found.  Raises InputError where they cannot be compared,
+        InsufficientDataError where the cell allows no pose for any of them."""
+        cell = self.work.cell
+        where, freedom = cell.path or cell.name, cell.design.choose
+        assert freedom is not None
+        require(
+            CRITERIA[cell.design.criterion].certifiable,
+            f"{where}: [design.choose] compares relaxed optima, which criterion "
+            f"{cell.design.criterion} has none of; choose another criterion",
+        )
+        require(
+            self.known.done is None,
+            f"{where}: [design.choose] moves what measurements were made with; leave it out where "
+            "a plan adds to some",
+        )
+        boxes = Boxes.of(cell)
+        loads = self._loads(freedom.loads)
+        found = self._placed(boxes, loads) if boxes.names else loads
+        if found is None:
+            raise InsufficientDataError(
+                f"{where}: no choice within [design.choose] gives a plan; widen the boxes"
+            )
+        self.progress("comparing what was chosen with the cell as it stands")
+        before, after = (self._relaxed(c, COMPARED) for c in (cell, found.cell))
+        if after is None or (
+            freedom.loads is None and before is not None and before.value <= after.value
+        ):
+            found, after = replace(found, cell=cell), before
+        assert after is not None
+        figure, unit = after.setup.criterion.reported(after.value)
+        places = np.stack([boxes.places(cell), boxes.places(found.cell)], axis=1)
+        return Chosen(
+            places=dict(zip(boxes.names, places, strict=True)),
+            loads=None if freedom.loads is None else found.cell.design.loads,
+            before=None if before is None else after.setup.criterion.figure(before.value),
+            after=figure,
+            unit=unit,
+            candidates=len(after.pool),
+            share=(None if before is None else before.share, after.share),
+        )
+
+    def _loads(self, most: int | None) -> _Point | None:
+        """The best `most` of the loads that are not zero, where the cell has its places."""
+        cell, given = self.work.cell, self.work.cell.design.loads
+        if most is None or given is None:
+            return self._relaxed(cell)
+        heavy = np.flatnonzero(given.any(axis=1))
+        sets = list(combinations(heavy, min(most, len(heavy))))
+        require(
+            len(sets) <= MOST_CHOICES,
+            f"{cell.path or cell.name}: {len(sets)} choices of {most} of {len(heavy)} loads; state "
+            f"fewer loads, up to {MOST_CHOICES} choices of them",
+        )
+        points = []
+        for k, kept in enumerate(sets):
+            self.progress(f"choosing loads, {k + 1} of {len(sets)}")
+            hung = [i for i in range(len(given)) if i in kept or i not in heavy]
+            points.append(self._relaxed(_with_loads(cell, given[hung])))
+        return _least(points)
+
+    def _placed(self, boxes: Boxes, begun: _Point | None) -> _Point | None:
+        """The best places found from where the cell has them and from others in the boxes."""
+        cell = self.work.cell if begun is None else begun.cell
+        draws = qmc.Sobol(3 * len(boxes.names), rng=np.random.default_rng(self.seed))
+        starts = [boxes.unit(boxes.places(cell)), *draws.random(STARTS)]
+        points = []
+        for k, unit in enumerate(starts):
+            self.progress(f"choosing places, start {k + 1} of {len(starts)}")
+            points.append(self._relaxed(boxes.placed(cell, boxes.at(unit))))
+        best = _least(points)
+        for k in range(ROUNDS if best is not None else 0):
+            assert best is not None
+            unit, there = boxes.unit(boxes.places(best.cell)), self._moved(boxes, best)
+            self.progress(f"choosing places, round {k + 1}")
+            # All the way, or a part of it where the rules leave too little there.
+            way = (self._relaxed(boxes.placed(cell, boxes.at(unit + part * (there - unit))))
+                   for part in (1.0, 0.5, 0.25))  # fmt: skip
+            better = next((p for p in way if p is not None and p.value < best.value), None)
+            if better is None:
+                break
+            gain, best = 1 - better.value / best.value, better
+            if gain < GAIN:
+                break
+        return best
+
+    def _moved(self, boxes: Boxes, point: _Point) -> Array:
+        """The point (3 k,) of the unit cube that lowers Φ most at the weights of `point`."""
+        setup, pool, w = point.setup, point.pool, point.relaxed.weights
+        used = np.flatnonzero(w > USED * w.max())
+        there = _mobile(boxes, point.cell, setup.information)
+
+        def value(unit: Array) -> float:
+            B = there(boxes.at(unit)).blocks(pool.q[used], pool.load[used])
+            M = setup.gathered(B * np.sqrt(w[used])[:, None, None])
+            return float(np.log(setup.criterion.value(M)))
+
+        unit = boxes.unit(boxes.places(point.cell))
+        limits = [(0.0, 1.0)] * len(unit)
+        how = {"maxiter": 20, "eps": STEP, "ftol": 1e-4}
+        return np.asarray(minimize(value, unit, method="L-BFGS-B", bounds=limits, options=how).x)
+
+    def _relaxed(self, cell: Cell, candidates: int = SEARCHED) -> _Point | None:
+        """The relaxed optimum of a cell; None where it leaves something open."""
+        chain, states = self.work.chain, load_states(cell)
+        shares: IntArray = shares_of(cell)
+        try:
+            rules = Feasibility(cell, chain)
+            drawn = draw(cell, chain, states, rules, candidates, self.seed)
+            setup = set_up(
+                Model.assembled(chain, cell), states, drawn.q, drawn.load, int(shares.sum()),
+                self.targets, self.known, self.seed, self.region,
+                rules.seen if rules.partial else None, self.work,
+            )  # fmt: skip
+            pool = setup.pool(drawn.q, drawn.load, drawn.group)
+            relaxed = relax(setup.problem(pool, shares), tolerance=GAIN / 10)
+        except ElastocalError:
+            return None
+        return _Point(cell, setup, pool, relaxed, drawn.feasible / drawn.tried)
+
+
+def _mobile(
+    boxes: Boxes, cell: Cell, information: PoseInformation
+) -> Callable[[Array], PoseInformation]:
+    """Information as at `cell`, of the same readings, with everything at other places (k, 3).
+
+    One model serves them all: places on the tool are its parameters.
+    """
+    base, on_tool = boxes.places(cell), [n != TRACKER for n in boxes.names]
+    motions: list[tuple[Entry, str]] = [
+        (HookMotion(), HookMotion.at) if name == HOOK else (MarkerMotion(), f"marker:{name}")
+        for name, own in zip(boxes.names, on_tool, strict=True)
+        if own
+    ]
+    mobile = Model.assembled(information.model.chain, cell, motions)
+
+    def there(places: Array) -> PoseInformation:
+        model = copy(mobile)
+        model.cell = boxes.placed(cell, places)  # of which the noise asks the tracker
+        shift = (places - base)[on_tool].ravel()
+        x = np.stack([np.concatenate([one, shift]) for one in information.scenarios])
+        return replace(information, model=model, scenarios=x)
+
+    return there
+
+
+def _with_loads(cell: Cell, loads: Array) -> Cell:
+    return replace(cell, design=replace(cell.design, loads=loads))
+
+
+def _least(points: list[_Point | None]) -> _Point | None:
+    """The point with the least Φ."""
+    found = [point for point in points if point is not None]
+    return min(found, key=lambda point: point.value, default=None)

@@ -1,0 +1,128 @@
+"""Effects that the model may lack, as parameters with a prior: what a robust plan shows as well.
+
+The model is given every effect of the catalogue that poses and loads can show, at every place; each
+parameter of them has mean 0 and variance π s², π the probability that the effect is missing and s
+its typical size.  Of what is known beforehand the best linear estimate asks these two moments only
+(Goldstein & Wooff 2007, Bayes Linear Statistics, ch. 3), so that
+
+    tr(C M⁻¹),   M = diag(0, 1/(π s²)) + Σ_i B_iᵀ Σ_i⁻¹ B_i
+
+is the mean square error at the test poses of one who reckons with what may be missing; who judges
+every effect by its evidence does no worse.  A plan that makes it small determines the model's own
+parameters, and tells the effects from them and from each other as far as the test poses ask for it.
+
+Source: DuMouchel & Jones 1994, Technometrics 36, 37–47, there with D and π = 1.
+"""
+
+from __future__ import annotations
+
+from collections import Counter
+from collections.abc import Mapping, Sequence
+from dataclasses import replace
+
+import numpy as np
+from scipy import linalg
+
+from elastocal.cell.arm_description import EffectChoice
+from elastocal.identification.knowledge import GaussianPrior
+from elastocal.model.arm import Parameter, ParameterSpec
+from elastocal.model.effects import CATALOGUE
+from elastocal.model.manipulator import Model
+from elastocal.model.observations import observe
+from elastocal.planning.information import Done, LoadStates, PoseInformation
+from elastocal.planning.plan import Gain
+from elastocal.planning.setup import Known, Setup
+from elastocal.units import Array, IntArray
+
+# Probability that an effect is missing; in equal shares it is each of them, at each of its places.
+SOMETHING = 0.5
+# What a parameter of unknown typical size moves the readings by, rms in m.
+UNSIZED_SIGNAL = 2e-4
+POSES = 100  # that show how far
+# What a pose has only once it stands in an order.
+OPEN = frozenset({"time", "temperature", "approach"})
+
+Place = tuple[str, str]  # an effect and where it acts
+
+
+def in_doubt(
+    model: Model, known: Known, states: LoadStates, q: Array, load: IntArray,
+    probability: Mapping[Place, float] | None = None,
+) -> tuple[Model, Known]:  # fmt: skip
+    """The model with all that it may lack, and what is known of it: the prior of the parameters
+    that it then has more, sized at some of the poses q (N, n) in load states `load` (N,); those
+    that none of these shows are held.
+
+    `probability` that an effect is missing at a place, where more is known of it than its share of
+    SOMETHING; places that it does not name are not in doubt.
+    """
+    places = missing(model)
+    if probability is None:
+        of_each = Counter(name for name, _ in places)
+        probability = {key: SOMETHING / (len(of_each) * of_each[key[0]]) for key in places}
+    places = [key for key in places if probability.get(key, 0.0) > 0]
+    if not places:
+        return model, known
+    whole = model.with_effects((*model.cell.model.effects, *(EffectChoice(*key) for key in places)))
+    every = np.arange(len(whole.parameters))
+    information = PoseInformation(whole, states, whole.nominal[None], every, np.ones(len(every)))
+    step = -(-len(q) // POSES)
+    table = information.rows(q[::step], load[::step], whole.nominal)
+    added = np.flatnonzero(~np.isin(whole.names, model.names))
+    B = whole.regressor(table, whole.nominal, added, observe(table, whole.observe)).B
+    specs = [whole.parameters[k] for k in added]
+    std = np.sqrt([probability[p.effect, p.where] for p in specs]) * usual_sizes(specs, B)
+    shown = np.abs(B).max(axis=0, initial=0.0) > 0
+    unseen = tuple(p.name for p, seen in zip(specs, shown, strict=True) if not seen)
+    prior, own = known.prior, [p for p, seen in zip(specs, shown, strict=True) if seen]
+    names, mean = [p.name for p in own], [p.nominal for p in own]
+    covariance = np.diag(std[shown] ** 2)
+    if prior is not None:
+        names, mean = [*prior.names, *names], [*prior.mean, *mean]
+        covariance = linalg.block_diag(prior.covariance, covariance)
+    both = GaussianPrior(tuple(names), np.array(mean), covariance) if names else None
+    return whole, replace(known, fixed=(*known.fixed, *unseen), prior=both)
+
+
+def missing(model: Model) -> list[Place]:
+    """Effects and places of the catalogue that the model lacks, but for what it needs an order of
+    the poses to see, a search for the effect's constants, or belongs to the instrument."""
+    chain, cell = model.chain, model.cell
+    active = {(p.effect, p.where) for p in model.parameters}
+    stated = cell.model.nominal.settings
+    return [
+        (name, where)
+        for name, effect in CATALOGUE.items()
+        if effect.may_be_missing(cell) and not effect.of_the_measurement
+        if OPEN.isdisjoint(effect.needed(cell))
+        for where in effect.places(chain, cell)
+        if (name, where) not in active and effect.parameters(where, chain, cell)
+        if all(
+            s.default is not None or s.key in stated.get(where, {})
+            for s in effect.settings(where, chain, cell)
+        )
+    ]  # fmt: skip
+
+
+def usual_sizes(specs: Sequence[Parameter | ParameterSpec], columns: Array) -> Array:
+    """Prior standard deviation (k,) of each parameter: its typical size.
+
+    Where none is known, the value whose signal in the columns (…, k) is UNSIZED_SIGNAL rms.
+    """
+    flat = columns.reshape(-1, columns.shape[-1])
+    moved = flat[np.abs(flat).max(axis=1, initial=0.0) > 0]
+    rms = np.sqrt((moved**2).mean(axis=0)) if len(moved) else np.zeros(flat.shape[1])
+    signal = np.divide(UNSIZED_SIGNAL, rms, out=np.zeros(len(rms)), where=rms > 0)
+    return np.array(
+        [s if p.typical is None else p.typical for s, p in zip(signal, specs, strict=True)]
+    )
+
+
+def gain_of(setup: Setup, done: Done, after: Array, names: Sequence[str], seed: int) -> Gain | None:
+    """What a plan that leads to the information `after` (p, p) adds to the measurements done;
+    parameters that are not among `names` are in doubt.  None without any, or without test poses."""
+    if done is None or setup.target_rows is None:
+        return None
+    kept, own = setup.information.columns, np.isin(setup.information.names, names)
+    pull = done.pull[kept] * setup.information.sizes
+    return Gain.of(setup.target_rows, setup.prior[0], after, own, pull, seed)

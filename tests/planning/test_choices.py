@@ -1,0 +1,149 @@
+"""Where markers, hook and tracker stand and which loads hang: chosen by the relaxed optimum."""
+
+from __future__ import annotations
+
+import json
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+from planning.test_information import information_of
+from support.cells import DOWN, TABLE_2, kr270_chain
+from support.design_cells import plan_cell
+from support.design_commands import DEFLECTION, design, write_cell
+
+from elastocal.cell.arm_description import PolarNoise
+from elastocal.cell.plan_wishes import Freedom, TargetPose
+from elastocal.cell.work_cell import Cell
+from elastocal.errors import InputError
+from elastocal.model import Model
+from elastocal.planning import Choice, Chosen, Known, choices
+from elastocal.planning import test_poses as target_poses
+from elastocal.planning.information import ALL_LOADS
+
+CHAIN = kr270_chain()
+ONE = (TargetPose(np.radians([0.0, -90, 90, 0, 30, 0])),)
+
+
+def around(place: np.ndarray, by: float = 0.1) -> np.ndarray:
+    return np.array([place - by, place + by])
+
+
+def cell_with(freedom: Freedom, loads: np.ndarray = DOWN[None], **more: object) -> Cell:
+    return plan_cell(loads=loads, test_poses=ONE, poses=6, choose=freedom, **more)
+
+
+@pytest.fixture(autouse=True)
+def short(monkeypatch: pytest.MonkeyPatch) -> None:
+    for name, value in {"STARTS": 1, "SEARCHED": 40, "COMPARED": 60, "ROUNDS": 3}.items():
+        monkeypatch.setattr(choices, name, value)
+
+
+def search(cell: Cell) -> Choice:
+    targets = target_poses.test_poses(cell, CHAIN)
+    model = Model.assembled(CHAIN, cell)
+    return Choice(model, targets, None, Known(), 0, lambda message: None)
+
+
+def best(cell: Cell) -> Chosen:
+    return search(cell).best()
+
+
+def test_places_stay_in_their_boxes_and_lower_the_relaxed_optimum() -> None:
+    tool = plan_cell().tool
+    boxes = {name: around(at) for name, at in tool.markers.items()}
+    found = best(cell_with(Freedom(boxes, around(tool.load_point))))
+    assert found.before is not None and found.after < 0.95 * found.before
+    assert [*found.places] == [*boxes, "load point"]
+    for (before, after), box in zip(found.places.values(), [*boxes.values()], strict=False):
+        assert (np.abs(after - before) <= 0.1 + 1e-9).all()
+        assert (after >= box[0] - 1e-9).all() and (after <= box[1] + 1e-9).all()
+    # The same cell again, as it would be measured with.
+    placed = found.applied(cell_with(Freedom()))
+    assert placed.tool.load_point == pytest.approx(found.places["load point"][1])
+
+
+def test_moved_places_give_the_information_of_the_cell_that_has_them() -> None:
+    tool = plan_cell().tool
+    freedom = Freedom({"M2": around(tool.markers["M2"])}, around(tool.load_point))
+    cell = cell_with(freedom, repeatability=20e-6)
+    boxes, q = choices.Boxes.of(cell), TABLE_2[:4]
+    places = boxes.lower + 0.03
+    here, there = (
+        information_of(replace(c, design=replace(c.design, choose=None)))
+        for c in (cell, boxes.placed(cell, places))
+    )
+    found = choices._mobile(boxes, cell, here)(places)
+    load = np.full(4, ALL_LOADS)
+    assert np.allclose(found.blocks(q, load), there.blocks(q, load), rtol=1e-9, atol=1e-6)
+
+
+def test_what_is_asked_for_at_the_test_poses_does_not_move_with_the_markers() -> None:
+    """Without a load point in the cell the test point is the mean of the markers: of those that
+    the cell states, wherever others stand."""
+    cell = cell_with(Freedom())
+    cell = replace(cell, tool=replace(cell.tool, load_point=np.zeros(3)))
+    made = search(cell)
+    moved = {name: at + 0.2 for name, at in cell.tool.markers.items()}
+    there = made._relaxed(replace(cell, tool=replace(cell.tool, markers=moved)))
+    here = made._relaxed(cell)
+    assert here is not None and there is not None
+    assert np.allclose(here.setup.target_rows.T @ here.setup.target_rows,
+                       there.setup.target_rows.T @ there.setup.target_rows)  # fmt: skip
+
+
+def test_the_tracker_goes_where_its_noise_is_least() -> None:
+    """Nearer is better where noise grows with the range."""
+    noise = PolarNoise(5e-6, 20e-6, 5e-6, 20e-6)
+    box = np.array([[3.0, -2.0, 0.5], [12.0, -2.0, 0.5]])
+    cell = plan_cell(
+        noise=noise, loads=DOWN[None], test_poses=ONE, poses=6, choose=Freedom(tracker=box)
+    )
+    far = replace(cell, tracker=replace(cell.tracker, position=np.array([11.0, -2.0, 0.5])))
+    found = best(far)
+    assert found.places["tracker"][1, 0] == pytest.approx(3.0, abs=0.05)
+    assert found.before is not None and found.after < 0.6 * found.before
+
+
+def test_of_given_loads_the_best_hang() -> None:
+    loads = np.array([[0.0, 0, 0], DOWN / 10, DOWN, DOWN / 2])
+    found = best(cell_with(Freedom(loads=1), loads))
+    assert found.loads is not None and found.loads.tolist() == [[0, 0, 0], DOWN.tolist()]
+    assert found.before is not None and found.after > found.before  # fewer readings at each pose
+    with pytest.raises(InputError, match="252 choices of 5 of 10 loads"):
+        best(cell_with(Freedom(loads=5), DOWN * np.arange(1, 11)[:, None] / 10))
+
+
+CHOOSE = """
+[design.choose]
+load_point_m = [[0.1, -0.1, 0.2], [0.3, 0.1, 0.3]]
+
+[design.choose.markers_m]
+M2 = [[-0.2, 0.1, 0.1], [-0.1, 0.3, 0.2]]
+"""
+
+
+def test_the_command_plans_for_what_it_chose_and_writes_the_cell(tmp_path: Path) -> None:
+    cell = write_cell(tmp_path, DEFLECTION + CHOOSE)
+    again = tmp_path / "chosen.toml"
+    result = design(cell, "--cell-out", again)
+    assert result.exit_code == 0, result.stderr
+    assert "M2 at [" in result.stdout and "the best that any plan can reach goes from" in (
+        " ".join(result.stdout.split())
+    )
+    found = json.loads((tmp_path / "plan.json").read_text())["chosen"]
+    placed = Cell.read(again)
+    assert placed.design.choose is None
+    assert placed.tool.load_point.tolist() == found["cell"]["tool"]["load_point_m"]
+    assert placed.tool.markers["M2"].tolist() == found["cell"]["tool"]["markers_m"]["M2"]
+    assert placed.tool.markers["M1"].tolist() == [0.25, 0.0, 0.05]
+    assert found["relaxed"]["after"] < found["relaxed"]["before"]
+    # Nothing is chosen any more.
+    assert design(again, "--cell-out", tmp_path / "no.toml").exit_code == 2
+
+
+def test_a_box_is_stated_from_its_lower_corner(tmp_path: Path) -> None:
+    wrong = CHOOSE.replace("[[-0.2, 0.1", "[[-0.05, 0.1")
+    result = design(write_cell(tmp_path, DEFLECTION + wrong))
+    assert result.exit_code == 2 and "markers_m.M2 takes the lower corner" in result.stderr

@@ -1,0 +1,127 @@
+"""Plans that reckon with effects the model may lack."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+from planning.relaxation.test_two_methods import assert_agreement
+from support.cells import DOWN, kr270_chain, random_poses
+from support.design_cells import all_loads, plan_cell, set_up, target_poses
+
+from elastocal.identification.knowledge import GaussianPrior
+from elastocal.model import Model
+from elastocal.planning import Gain, Known, Setup, in_doubt, load_states, missing
+from elastocal.planning.doubts import SOMETHING
+
+CHAIN = kr270_chain()
+POSES = random_poses(CHAIN, 60, seed=1)
+FEW = {("joint_hardening", "joint3"): 0.3, ("off_axis_compliance", "joint2"): 0.1}
+
+
+def setup_with(doubts: dict | None, known: Known | None = None, n_poses: int = 5) -> Setup:
+    cell = plan_cell(loads=DOWN[None], criterion="robust")
+    states, load = load_states(cell), all_loads(POSES)
+    model, known = in_doubt(
+        Model.assembled(CHAIN, cell), known or Known(), states, POSES, load, doubts
+    )
+    targets = target_poses.test_poses(cell, CHAIN, None, 0)
+    return set_up(model, states, POSES, load, n_poses, targets, known, 0)
+
+
+@pytest.fixture(scope="module")
+def setup() -> Setup:
+    return setup_with(FEW)
+
+
+def test_what_may_be_missing_is_what_poses_and_loads_can_show() -> None:
+    model = Model.assembled(CHAIN, plan_cell(loads=DOWN[None]))
+    found = missing(model)
+    assert ("gear_eccentricity", "joint2") in found and len(found) == len(set(found))
+    names = {name for name, _ in found}
+    # In the model; asks for times, for sides of approach; an order is searched; the instrument's.
+    absent = {"joint_compliance", "joint_drift", "hysteresis", "gear_ripple", "tracker_distortion"}
+    assert not names & absent
+
+
+def test_equal_shares_of_doubt_add_up() -> None:
+    cell = plan_cell(("base_frame",), "position", loads=DOWN[None])
+    model = Model.assembled(CHAIN, cell)
+    whole, known = in_doubt(model, Known(), load_states(cell), POSES, all_loads(POSES))
+    prior = known.prior
+    assert prior is not None
+    at = {p.name: p for p in whole.parameters}
+    std = dict(zip(prior.names, np.sqrt(np.diag(prior.covariance)), strict=True))
+    share = {
+        (at[n].effect, at[n].where): (s / at[n].typical) ** 2
+        for n, s in std.items()
+        if at[n].typical
+    }
+    kinds = {name for name, _ in missing(model)}
+    joints = [p for (name, _), p in share.items() if name == "gear_eccentricity"]
+    assert len(joints) == 6 and sum(joints) == pytest.approx(SOMETHING / len(kinds))
+    assert max(share.values()) < SOMETHING / len(kinds) * (1 + 1e-9)
+
+
+def test_a_stated_prior_stays() -> None:
+    stated = GaussianPrior.independent(["joint2.compliance"], [3e-7], [1e-8])
+    cell = plan_cell(loads=DOWN[None])
+    known = in_doubt(
+        Model.assembled(CHAIN, cell), Known(("joint1",), stated), load_states(cell), POSES,
+        all_loads(POSES), FEW,
+    )[1]  # fmt: skip
+    assert known.prior is not None and known.prior.names[0] == "joint2.compliance"
+    assert known.prior.covariance[0, 0] == pytest.approx(1e-16) and "joint1" in known.fixed
+
+
+def test_without_doubts_it_is_the_error_at_the_test_poses() -> None:
+    robust = setup_with({})
+    cell = plan_cell(loads=DOWN[None], criterion="test_pose")
+    model = Model.assembled(CHAIN, cell)
+    targets = target_poses.test_poses(cell, CHAIN, None, 0)
+    other = set_up(model, load_states(cell), POSES, all_loads(POSES), 5, targets, Known(), 0)
+    q, load = POSES[:8], all_loads(POSES[:8])
+    assert robust.value(q, load) == pytest.approx(other.value(q, load), rel=1e-9)
+    assert robust.information.names == other.information.names
+
+
+def test_it_is_the_error_of_the_best_linear_estimate(setup: Setup) -> None:
+    """By the covariance of the readings, as in kriging with a trend: y = B x + Z u + noise."""
+    own = np.array(["hardening" not in n and "off_axis" not in n for n in setup.information.names])
+    blocks = setup.information.blocks(POSES[:8], all_loads(POSES[:8]))[0]
+    Y = blocks.reshape(-1, blocks.shape[2])
+    D = np.linalg.inv(setup.prior[0][np.ix_(~own, ~own)])
+    V = np.eye(len(Y)) + Y[:, ~own] @ D @ Y[:, ~own].T
+    R = setup.target_rows
+    assert R is not None
+    W = np.linalg.inv(V)
+    K = D @ Y[:, ~own].T @ W  # of u on the readings
+    B = Y[:, own]
+    rest = R[:, own] - R[:, ~own] @ K @ B
+    error = R[:, ~own] @ (D - K @ Y[:, ~own] @ D) @ R[:, ~own].T
+    error += rest @ np.linalg.inv(B.T @ W @ B) @ rest.T
+    assert setup.value(POSES[:8], all_loads(POSES[:8])) == pytest.approx(np.trace(error), rel=1e-6)
+
+
+def test_the_bound_is_that_of_another_solver(setup: Setup) -> None:
+    pool = setup.pool(POSES, all_loads(POSES), np.zeros(len(POSES), dtype=np.int64))
+    assert_agreement(setup.problem(pool, np.array([8])))
+
+
+def test_doubt_costs_and_poses_pay_it_back() -> None:
+    """More doubt, more error; and more poses lower it."""
+    q, load = POSES[:10], all_loads(POSES[:10])
+    sure, doubtful = (setup_with({key: p for key in FEW}) for p in (1e-4, 0.5))
+    assert doubtful.value(q, load) > sure.value(q, load)
+    more, all_of_them = POSES[:30], all_loads(POSES[:30])
+    assert doubtful.value(more, all_of_them) < doubtful.value(q, load)
+
+
+def test_gain_counts_what_the_readings_show_and_leave_open() -> None:
+    """One parameter, one in doubt, which the model has at zero: by hand."""
+    R, before = np.eye(2), np.diag([4.0, 1.0])
+    own = np.array([True, False])
+    gain = Gain.of(R, before, 4 * before, own, np.array([0.0, 100.0]), 0)
+    assert gain.before == pytest.approx(np.sqrt(0.25 + 1)) == pytest.approx(2 * gain.after)
+    assert gain.model_before == pytest.approx(0.5) and gain.model_after == pytest.approx(0.25)
+    assert gain.sure == pytest.approx(100 + 1.645, abs=0.1)
+    assert Gain.of(R, np.diag([0.0, 1.0]), before, own, np.zeros(2), 0).sure == np.inf

@@ -1,0 +1,96 @@
+"""Poses that show only some of the markers: what they tell, and what becomes of them in files."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from functools import lru_cache
+from pathlib import Path
+
+import numpy as np
+import pytest
+from planning.feasibility.small_cells import NOTHING, gantry_at, gantry_rules, sphere
+from planning.test_information import AXIS, cell_for, gathered, information_of, relative
+from support.cells import DOWN, TABLE_2
+from support.design_cells import plan_cell
+
+import elastocal as ec
+from elastocal.cell.arm_description import Tool, Tracker
+from elastocal.cell.plan_wishes import Motion
+from elastocal.cell.workspace_rules import Visibility, Workspace
+from elastocal.errors import InputError
+from elastocal.model import observe
+from elastocal.planning import Plan
+from elastocal.planning.information import ALL_LOADS, _weights
+
+STATES = np.array([[0.0, 0, 0], DOWN])
+Q = TABLE_2[:6]
+
+
+def test_a_marker_is_seen_in_range_turned_to_the_tracker_and_behind_nothing() -> None:
+    markers = {"L": np.array([0, -1.0, 0]), "C": np.zeros(3), "R": np.array([0, 1.0, 0])}
+    sight = Visibility({"L": np.array([-1.0, 0, 0])}, np.radians(30), (1.0, 3.1), min_markers=1)
+    space = Workspace(obstacles=(sphere("ball", 0.2, (1.6, 0.5, 0.0)),), visibility=sight)
+    eye = Tracker(position=np.array([3.0, 0.0, 0.0]))
+
+    def rules(least: int) -> ec.Feasibility:
+        seen = replace(sight, min_markers=least)
+        return gantry_rules(replace(space, visibility=seen), Tool(markers=markers), eye)
+
+    # L is turned away; R is behind the ball, then out of range as well as C; then C behind it.
+    q = gantry_at((0.2, 0, 0), (-0.05, 0, 0), (0.2, 1.0, 0), (-2, 0, 0))
+    one = rules(1)
+    assert one.partial
+    assert one.seen(q[:2], NOTHING).tolist() == [[False, True, False]] * 2
+    assert one.feasible(q, NOTHING).tolist() == [True, True, False, False]
+    assert not rules(2).feasible(q, NOTHING).any()
+    assert not rules(3).partial
+    assert "min_markers" in rules(2).advice(rules(2).check(q, NOTHING))
+
+
+@pytest.mark.parametrize("observed", ["position", "deflection"])
+@pytest.mark.parametrize("tau", [0.0, 30e-6])
+def test_information_is_that_of_the_readings_that_are_made(observed: str, tau: float) -> None:
+    """With what an arm does not repeat, which the markers of a visit share."""
+    whole = information_of(cell_for(observed, AXIS, loads=STATES, repeatability=tau))
+    model, x = whole.model, whole.scenarios[0]
+    rng = np.random.default_rng(3)
+    shown = {tuple(f): rng.random((len(Q), 3)) < 0.7 for f in STATES}
+    part = replace(whole, sight=lambda q, force: shown[tuple(force)])
+    load = np.full(len(Q), ALL_LOADS)
+    seen = part.seen(Q, load)
+    assert 0 < seen.mean() < 1
+    read = observe(part.rows(Q, load, x).take(seen.reshape(-1)), observed)
+    B = _weights(model, read, x).apply(model.regressor(read.table, x, None, read).B)
+    assert relative(gathered(part, Q), B.T @ B) < 1e-9
+
+
+@lru_cache
+def planned() -> Plan:
+    """Reflectors on three sides of the tool, of which at most two are seen at a time."""
+    still = Motion(extra_time=0.0)
+    cell = plan_cell(loads=DOWN[None], poses=6, candidates=60, criterion="D", motion=still)
+    axes = {"M1": [1.0, 0, 0], "M2": [0, 1.0, 0], "M3": [-0.5, -0.5, 0.7]}
+    normals = {name: np.array(axis) for name, axis in axes.items()}
+    sight = Visibility(normals, np.radians(60), line_of_sight=False, min_markers=1)
+    return ec.design(replace(cell, workspace=Workspace(visibility=sight)), effort="quick")
+
+
+def test_a_plan_names_the_markers_and_its_readings_are_identified(tmp_path: Path) -> None:
+    plan = planned()
+    assert plan.seen is not None and plan.seen.any(axis=2).all() and not plan.seen.all()
+    plan.save(tmp_path / "plan.csv")
+    rows = plan.model.read_plan(tmp_path / "plan.csv")
+    assert len(rows) == plan.seen.all(axis=1).sum()
+    assert np.array_equal(rows.marker, plan.table().marker)
+    data = ec.simulate(plan.model, tmp_path / "plan.csv", load=DOWN, seed=1)
+    assert len(data) == 2 * len(rows)
+    found = ec.identify(plan.model, data, method="wls", weights="axis")
+    # The stated noise, where identification takes what the residuals say of it.
+    ratio = [found[p.name].std / p.std for p in plan.predicted]
+    assert np.ptp(ratio) < 0.01 and 0.5 < np.mean(ratio) < 1.5
+
+
+def test_more_markers_than_there_are_cannot_be_asked_for() -> None:
+    space = Workspace(visibility=Visibility(min_markers=4))
+    with pytest.raises(InputError, match="min_markers is 4, but"):
+        replace(plan_cell(), workspace=space).check()

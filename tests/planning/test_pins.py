@@ -1,0 +1,102 @@
+"""Poses of a plan stay or are struck out, and the rest is the best around them."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from functools import lru_cache
+from pathlib import Path
+
+import numpy as np
+import pytest
+from support.cells import DOWN
+from support.design_cells import plan_cell
+
+import elastocal as ec
+from elastocal.cell.workspace_rules import HalfSpace, Workspace
+from elastocal.errors import InputError
+from elastocal.planning import Plan, relax
+from elastocal.planning import design as design_module
+from elastocal.planning.feasibility import NEARBY
+
+CELL = plan_cell(loads=DOWN[None], poses=6, candidates=60)
+LEVELS = {"joint2": (-0.5, -1.2, -2.0)}
+
+
+@lru_cache
+def first() -> Plan:
+    return ec.design(CELL, effort="quick")
+
+
+@pytest.fixture
+def file(tmp_path: Path) -> Path:
+    first().save(tmp_path / "plan.csv")
+    return tmp_path / "plan.csv"
+
+
+def searched(monkeypatch: pytest.MonkeyPatch, **asked) -> tuple[Plan, list]:
+    """A plan, and the problem that was solved for it."""
+    problems = []
+
+    def watched(problem, **given):
+        problems.append(problem)
+        return relax(problem, **given)
+
+    monkeypatch.setattr(design_module, "relax", watched)
+    return ec.design(CELL, effort="quick", **asked), problems
+
+
+def test_one_pose_struck_is_replaced_by_the_best_other(file, monkeypatch) -> None:
+    plan, problems = searched(monkeypatch, strike=f"{file}:3")
+    assert plan.configurations == ("1", "2", "4", "5", "6", "7")
+    kept = [k for k, name in enumerate(first().configurations) if name != "3"]
+    assert np.allclose(plan.q[:5], first().q[kept], atol=1e-9)
+    assert np.abs(plan.q[5] - first().q[2]).max() >= NEARBY
+    problem = problems[0]
+    assert problem.shares.tolist() == [1]
+    each = problem.prior + problem.blocks.transpose(1, 0, 3, 2) @ problem.blocks.swapaxes(0, 1)
+    assert plan.value == pytest.approx(float(problem.criterion.value(each).min()), rel=1e-9)
+    conic = relax(problem, method="conic")
+    assert plan.certificate.bound_pool == pytest.approx(conic.bound, rel=1e-5)
+    assert plan.candidates.removed_by["struck"] >= 0
+    assert [stop.pose for stop in plan.execution.stops].count(5) == 2  # without and with load
+
+
+def test_poses_kept_are_part_of_a_larger_plan(file, monkeypatch) -> None:
+    plan, problems = searched(monkeypatch, keep=f"{file}:1,5", poses=7)
+    assert plan.configurations == ("1", "5", "7", "8", "9", "10", "11")
+    assert np.allclose(plan.q[:2], first().q[[0, 4]], atol=1e-9)
+    assert problems[0].shares.tolist() == [5]
+    assert plan.certificate.bound_pool <= plan.value
+    all_ = ec.design(CELL, effort="quick", keep=file, poses=8)
+    assert all_.value < first().value
+
+
+def test_what_stays_counts_for_its_level(tmp_path) -> None:
+    cell = plan_cell(loads=DOWN[None], candidates=90, levels=LEVELS, per_level=(2, 2, 2))
+    plan = ec.design(cell, effort="quick")
+    plan.save(tmp_path / "levels.csv")
+    again = ec.design(cell, effort="quick", strike=f"{tmp_path / 'levels.csv'}:1,4")
+    assert np.bincount(again.group).tolist() == [2, 2, 2]
+    assert sorted(again.configurations, key=int) == ["2", "3", "5", "6", "7", "8"]
+
+
+@pytest.mark.parametrize(
+    ("asked", "told"),
+    [
+        ({"strike": ":9"}, "no pose '9'"),
+        ({"strike": ""}, "takes poses"),
+        ({"keep": "", "poses": 5}, "no more than 5"),
+        ({"keep": ":1", "strike": ":2"}, "kept twice"),
+    ],
+)
+def test_what_cannot_be_is_said(file, asked, told) -> None:
+    files = {k: f"{file}{v}" if k != "poses" else v for k, v in asked.items()}
+    with pytest.raises(InputError, match=told):
+        ec.design(CELL, effort="quick", **files)
+
+
+def test_a_pose_that_breaks_a_rule_cannot_stay(file) -> None:
+    low = HalfSpace("low roof", np.array([0.0, 0, 0.8]), np.array([0.0, 0, -1]))
+    cell = replace(CELL, workspace=Workspace(keep_out=(low,), link_radius=(0.1,) * 6))
+    with pytest.raises(InputError, match=r"pose '\d', .* breaks keep_out"):
+        ec.design(cell, effort="quick", keep=file, poses=8)
