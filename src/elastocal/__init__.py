@@ -84,40 +84,12 @@ ROOMS = {
 }
 
 __all__ = [
-    "CalibratedArm",
-    "Calibration",
-    "Cell",
-    "Comparison",
-    "Compensation",
-    "Diagnosis",
-    "Effect",
-    "ElastocalError",
-    "InputError",
-    "InsufficientDataError",
-    "Knowledge",
-    "Measurements",
-    "Model",
-    "Parameter",
-    "Plan",
-    "Robot",
-    "Tool",
-    "Tracker",
-    "UnknownNameError",
-    "Workspace",
-    "compare",
-    "compensate",
-    "design",
-    "diagnose",
-    "identify",
-    "init",
-    "next_poses",
-    "read_calibrated",
-    "read_cell",
-    "register_criterion",
-    "register_effect",
-    "register_noise_model",
-    "simulate",
-]
-
+    "CalibratedArm", "Calibration", "Cell", "Comparison", "Compensation", "Diagnosis", "Effect",
+    "ElastocalError", "InputError", "InsufficientDataError", "Knowledge", "Measurements",
+    "Model", "Parameter", "Plan", "Robot", "Tool", "Tracker", "UnknownNameError", "Workspace",
+    "compare", "compensate", "design", "diagnose", "identify", "init", "next_poses",
+    "read_calibrated", "read_cell", "register_criterion", "register_effect",
+    "register_noise_model", "simulate",
+]  # fmt: skip
 
 __getattr__, __dir__ = loaded_on_demand(__name__, ROOMS)

@@ -9,7 +9,7 @@ import re
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, fields, replace
 from pathlib import Path
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -106,6 +106,24 @@ class Measurements:
     temperature: Array | None = None
     move: Array | None = None
     direction: Array | None = None
+
+    @classmethod
+    def of_poses(
+        cls, source: str, q: Array, force: Array, marker: str = DEFAULT_MARKER, **more: Any
+    ) -> Measurements:
+        """Rows that no file states: a configuration for each row of q, its one marker, its force
+        (n, 3) or (3,); `more` are other columns."""
+        n = len(q)
+        known: dict[str, Any] = dict(
+            row=np.arange(1, n + 1),
+            configuration=np.arange(n),
+            configuration_labels=tuple(map(str, range(1, n + 1))),
+            repeat=np.zeros(n, dtype=np.int64),
+            marker=np.zeros(n, dtype=np.int64),
+            marker_names=(marker,),
+            force=np.broadcast_to(force, (n, 3)).copy(),
+        )
+        return cls(source=source, q=q, **(known | more))
 
     def __len__(self) -> int:
         return len(self.row)

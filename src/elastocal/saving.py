@@ -115,22 +115,10 @@ def wish_of(
     poses: int = 500,
     seed: int = 0,
 ) -> Wish:
-    """How to export an arm, checked.
+    """How to export an arm to `path`, checked; the others are the options of `elastocal export`:
+    no format goes by the file's ending, costs are stated under `load` (3,) N at random `poses`.
 
-    Args:
-        path: The file to write.
-        format: urdf, mjcf, dh, mdh (modified DH), yaml, json or corrections (smooth functions as
-            CSV); None goes by the file's ending.
-        load: Force (3,) in N at the load point (data's axes) to state costs under; default none.
-        frames: URDF: links for markers and load point.
-        base_frame: URDF: the data's frame above the robot's base.
-        temperature_c: Temperature in °C to write the arm at, where it depends on it.
-        time_s: Time in s to write the arm at, where it depends on it.
-        poses: Random poses to find costs at, drawn with `seed`.
-        seed: Of these poses.
-
-    Raises:
-        InputError: An option is wrong; the message names it.
+    Raises InputError that names the option that is wrong.
     """
     from elastocal.export.export import Wish, format_of
     from elastocal.export.urdf_file import Frames

@@ -365,23 +365,13 @@ def simulate(
         >>> ec.identify("cell.toml", data)["joint3.compliance"].ci95
         (3.3...e-07, 3.4...e-07)
     """
-    return simulated(
-        _model(model), plan, values=values, draw=draw, load=load, repeats=repeats, noise=noise,
-        seed=seed,
-    )[0]  # fmt: skip
+    return simulated(_model(model), plan, values, draw, load, repeats, noise, seed)[0]
 
 
 def simulated(
-    made: Model,
-    plan: Plan | Table | ArrayLike,
-    *,
-    values: Mapping[str, float] | ArrayLike | None,
-    draw: float,
-    load: ArrayLike | None,
-    repeats: int,
-    noise: bool,
-    seed: int,
-) -> tuple[Measurements, NDArray[np.float64]]:
+    made: Model, plan: Plan | Table | ArrayLike, values: Mapping[str, float] | ArrayLike | None,
+    draw: float, load: ArrayLike | None, repeats: int, noise: bool, seed: int,
+) -> tuple[Measurements, NDArray[np.float64]]:  # fmt: skip
     """What `simulate` gives, and the true values (parameters,) behind it."""
     from elastocal.identification.start import check_limits
     from elastocal.simulation.simulate import draw_errors, expand_plan, values_from

@@ -105,16 +105,6 @@ def targets_at(
     known = position if position is not None else q
     if known is None:
         raise InputError(f"{source}: neither positions nor joints")
-    n = len(known)
-    table = Measurements(
-        source=source,
-        row=np.arange(1, n + 1),
-        q=np.zeros((n, 0)),
-        configuration=np.arange(n),
-        configuration_labels=tuple(map(str, range(1, n + 1))),
-        repeat=np.zeros(n, dtype=np.int64),
-        marker=np.zeros(n, dtype=np.int64),
-        marker_names=("M1",),
-        force=np.tile(np.zeros(3) if force is None else force, (n, 1)),
-    )
+    pull = np.zeros(3) if force is None else force
+    table = Measurements.of_poses(source, np.zeros((len(known), 0)), pull)
     return Targets(table, frame, position, rotation, q)

@@ -29,7 +29,7 @@ from elastocal.diagnosis.diagnosis import (
 from elastocal.diagnosis.diagnosis_data import DiagnosisData
 from elastocal.diagnosis.model_set import spans_of
 from elastocal.diagnosis.noise_floor import NoisyData, Projection, Weighted, covariance, project
-from elastocal.diagnosis.shrinkage import NEW_POSES, left_out_residual, rms_with_interval
+from elastocal.diagnosis.shrinkage import NEW_POSES, Shrinkage, left_out_residual, rms_with_interval
 from elastocal.identification.error_budget import BudgetStep
 from elastocal.model.effects.base import Stage, index
 from elastocal.model.effects.gears import GearSpectrum
@@ -238,12 +238,12 @@ class SumAnswer:
         share = self.shares(members)
         low, high = np.quantile(share, [0.05, 0.95]).tolist()
         chosen = [self.found.components[k] for k in members]
-        reduction, ci90, _ = self._reduction(members)
+        places = tuple(sorted({c.where for c in chosen}))
+        effects = tuple(dict.fromkeys(c.effect.name for c in chosen))
+        fall = self._reduction(members)
         return EffectGroup(
-            name, tuple(sorted(dict.fromkeys(c.where for c in chosen))),
-            tuple(dict.fromkeys(c.effect.name for c in chosen)),
-            float(np.median(share)), (low, high), reduction, ci90,
-        )  # fmt: skip
+            name, places, effects, float(np.median(share)), (low, high), fall.reduction, fall.ci90
+        )
 
     # How far the gap falls.
 
@@ -256,9 +256,7 @@ class SumAnswer:
         each = np.diagonal(uncertain, axis1=1, axis2=2)[rows]
         return float(each.sum() / (len(each) / min(self.found.data.blocks.size, 3)))
 
-    def _reduction(
-        self, members: Sequence[int]
-    ) -> tuple[float, tuple[float, float], tuple[float, float]]:
+    def _reduction(self, members: Sequence[int]) -> Shrinkage:
         """Fraction by which the noise-free error of new poses falls by these components.
 
         Before, the error is all that is not in the model; after, what is left of it beside the
@@ -272,11 +270,7 @@ class SumAnswer:
         part = np.median(self.squares(members)) / np.maximum(np.median(self.total), 1e-300)
         # Draws about the mean already hold the error at the poses measured; at others it is more.
         after = after + min(part, 1.0) * self._excess
-        fall = 1 - np.sqrt(after / np.maximum(before, 1e-300))
-        low95, low90, middle, high90, high95 = np.quantile(
-            fall, [0.025, 0.05, 0.5, 0.95, 0.975]
-        ).tolist()
-        return middle, (low90, high90), (low95, high95)
+        return Shrinkage.of(1 - np.sqrt(after / np.maximum(before, 1e-300)))
 
     # Names.
 
@@ -327,9 +321,7 @@ class SumAnswer:
     def unnamed_share(self) -> float:
         """Median share of the gap of what has no name."""
         members = [k for k, c in enumerate(self.found.components) if not c.named]
-        if not members:
-            return 0.0
-        return float(np.median(self.shares(members)))
+        return float(np.median(self.shares(members))) if members else 0.0
 
     @property
     def n_causes(self) -> int:
@@ -393,13 +385,11 @@ class SumAnswer:
         order = sorted(at_place.items(), key=lambda pair: -float(np.median(self.squares(pair[1]))))
         for (name, where), members in order:
             settings = self._settings(members)
-            reduction, ci90, ci95 = self._reduction(members)
+            fall = self._reduction(members)
             probability = max(self._probability(k) for k in members)
             parameters = tuple(p for k in members for p in self._parameters(k))
-            yield FoundEffect(
-                name, where, probability, reduction, ci90, ci95, parameters, settings,
-                {key: size for k in members for key, size in self._parameter_sizes(k)},
-            )  # fmt: skip
+            sizes = {key: size for k in members for key, size in self._parameter_sizes(k)}
+            yield FoundEffect(name, where, probability, *fall, parameters, settings, sizes)
 
     @cached_property
     def _present(self) -> Array:

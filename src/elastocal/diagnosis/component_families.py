@@ -5,7 +5,7 @@ from __future__ import annotations
 import math
 from collections import Counter
 from collections.abc import Iterator, Sequence
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, replace
 
 import numpy as np
 
@@ -144,12 +144,7 @@ class LineFamily:
     search: float
     scatter: float = 0.0
     instead_of: tuple[Component, ...] = ()
-    component: Component = field(init=False)
-
-    def placed(self, component: Component) -> LineFamily:
-        """The same with its component."""
-        object.__setattr__(self, "component", component)
-        return self
+    component: Component | None = None
 
 
 def line_families(dataset: DiagnosisData, found: FittedSum) -> list[LineFamily]:
@@ -167,10 +162,8 @@ def line_families(dataset: DiagnosisData, found: FittedSum) -> list[LineFamily]:
         if np.ptp(dataset.table.q[:, i]) < MOVED:
             continue
         own = [c for c in found.components if c.where == h.where]
-        if (
-            sum(len(c.settings) // 2 for c in own if isinstance(c.effect, GearSpectrum))
-            > MOST_FOUND
-        ):
+        lines = sum(len(c.settings) // 2 for c in own if isinstance(c.effect, GearSpectrum))
+        if lines > MOST_FOUND:
             continue
         tried = [_best(dataset, beside, h, 0.0, float(found.noise.joint[i]), ())]
         curves = tuple(c for c in own if isinstance(c.effect, JointCurve))
@@ -182,7 +175,7 @@ def line_families(dataset: DiagnosisData, found: FittedSum) -> list[LineFamily]:
             tried.append(_best(dataset, grams, h, grams.at.marginal - now, scatter, curves))
         best = max(tried, key=lambda family: family.gain)
         if best.gain > HOPELESS:
-            out.append(best.placed(_family_component(dataset, best)))
+            out.append(replace(best, component=_family_component(dataset, best)))
     return sorted(out, key=lambda family: -family.gain)
 
 
@@ -209,13 +202,10 @@ def _best(
 ) -> LineFamily:  # fmt: skip
     """The best family of a joint, of any number of multiples; `gain` is that of what it is in the
     place of."""
-    families = [_best_family(dataset, grams, h, m) for m in _multiples(dataset)]
+    tried = MULTIPLES[:1] if len(dataset.blocks.member) > FEW_POSES else MULTIPLES
+    families = [_best_family(dataset, grams, h, m) for m in tried]
     best = max(families, key=lambda family: family.gain)
     return replace(best, gain=best.gain + gain, scatter=float(scatter), instead_of=curves)
-
-
-def _multiples(dataset: DiagnosisData) -> tuple[int, ...]:
-    return MULTIPLES[:1] if len(dataset.blocks.member) > FEW_POSES else MULTIPLES
 
 
 def _best_family(dataset: DiagnosisData, grams: Grams, h: Hypothesis, m: int) -> LineFamily:
@@ -286,7 +276,7 @@ def sought_anew(dataset: DiagnosisData, found: FittedSum, c: Component) -> Compo
     another one than c and more probable."""
     if not isinstance(c.effect, GearSpectrum):
         return None
-    h = _ripple_at(dataset, c.where)
+    h = next(h for h in dataset.hypotheses if h.key == (GearRipple.name, c.where))
     scatter = float(found.noise.joint[index(c.where)])
     grams = _grams(dataset, found.without_these((c,)), found.noise)
     best = _best(dataset, grams, h, 0.0, scatter, ())
@@ -296,12 +286,6 @@ def sought_anew(dataset: DiagnosisData, found: FittedSum, c: Component) -> Compo
     if near or best.gain <= own - c.search:
         return None
     return _family_component(dataset, best)
-
-
-def _ripple_at(dataset: DiagnosisData, where: str) -> Hypothesis:
-    return next(
-        h for h in dataset.hypotheses if isinstance(h.effect, GearRipple) and h.where == where
-    )
 
 
 def with_multiples(dataset: DiagnosisData, c: Component) -> list[Component]:

@@ -142,7 +142,7 @@ def _with_lines(dataset: DiagnosisData, data: NoisyData, found: FittedSum) -> Fi
             fitted = exchanged(
                 data, replace(found, noise=replace(found.noise, joint=joint)),
                 [c for family in chosen for c in family.instead_of],
-                [family.component for family in chosen],
+                [family.component for family in chosen if family.component is not None],
             )  # fmt: skip
             if fitted.score > found.score + GAINED:
                 wider = fitted

@@ -56,8 +56,6 @@ from elastocal.plugin_loader import is_plugin_file
 from elastocal.text import did_you_mean, listed
 from elastocal.units import BoolArray, Progress
 
-# The user's cell file with the effects found by a diagnosis switched on.
-
 # Tables of the cell file, and the keys in them whose values are paths.  A list of tables counts
 # as each of its members.
 PATHS = (
@@ -158,9 +156,6 @@ def _change(
             _change(data[table[0]], table[1:], keys, changed)
     else:
         data.update({key: changed(data[key]) for key in keys if key in data})
-
-
-# Why the arm still differs from its model: the whole diagnosis, step by step.
 
 
 @dataclass(frozen=True)

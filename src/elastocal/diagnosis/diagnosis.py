@@ -17,8 +17,6 @@ from elastocal.model.effects.base import Stage
 from elastocal.model.manipulator import Model
 from elastocal.text import plain
 
-# What the design of extra poses promises.
-
 
 @dataclass(frozen=True)
 class RivalPair:
@@ -56,8 +54,6 @@ class ExtraPlan:
     probability_random: float
     advice: tuple[str, ...]
 
-
-# What a diagnosis says: verdict, effects, candidates, location, noise floor, budget.
 
 Verdict = Literal["explained", "nothing_significant", "unknown_effect", "ambiguous"]
 Interval = tuple[float, float]
@@ -473,8 +469,6 @@ def _remedy(verdict: Verdict) -> str:
     }[verdict]
 
 
-# A diagnosis as JSON: schema elastocal/diagnosis/1.
-
 SCHEMA = "elastocal/diagnosis/1"
 NORMAL_95 = 1.959964
 
@@ -556,7 +550,7 @@ def _noise(noise: NoiseFloor, kinds: tuple[str, ...]) -> dict[str, Any]:
         ],
         "shared": noise.shared,
         "pure_error_um": _um(noise.pure_error),
-        "near_repeat_um": _um(near and near.scatter),
+        "near_repeat_um": _um(None if near is None else near.scatter),
         "near_repeats": None if near is None else _near_repeats(near),
         "faulty": [_faulty(reading) for reading in noise.faulty],
     }

@@ -37,8 +37,6 @@ from elastocal.planning.information import LoadStates
 from elastocal.simulation.simulate import simulate
 from elastocal.units import Array, IntArray
 
-# The visits that could still be made: feasible poses after the campaign, in its load states.
-
 CANDIDATES, FEWEST_POSES = 256, 64
 NEWTON = 1.0  # forces are told apart to this
 RARE = 0.1  # share of the visits below which a load state is not asked for again
@@ -156,9 +154,6 @@ def joined(first: Measurements, second: Measurements) -> Measurements:
         if isinstance(getattr(first, f.name), np.ndarray)
     }
     return replace(second, source=first.source, **arrays)
-
-
-# Whitened columns of the campaign so far and of every candidate, for one set of rivals.
 
 
 @dataclass(frozen=True)

@@ -75,7 +75,9 @@ FAR = 2e-4
 
 def is_far(dataset: DiagnosisData, chosen: ModelSet) -> bool:
     """Whether one of the set's effects that are not mere motions is large."""
-    return any(_rms(dataset, chosen, k) > FAR for k in _direct(chosen))
+    used = ~dataset.data.left_out
+    signals = (signal_of(dataset, chosen, k)[used] for k in _direct(chosen))
+    return any(float(np.sqrt((signal**2).mean())) > FAR for signal in signals)
 
 
 def relinearised(dataset: DiagnosisData, chosen: ModelSet) -> DiagnosisData:
@@ -127,13 +129,6 @@ def _direct(chosen: ModelSet) -> list[int]:
         if isinstance(item.what, Hypothesis) and not item.what.driven
     ]
 
-
-def _rms(dataset: DiagnosisData, chosen: ModelSet, k: int) -> float:
-    signal = signal_of(dataset, chosen, k)
-    return float(np.sqrt((signal[~dataset.data.left_out] ** 2).mean()))
-
-
-# Forward selection of what is missing, each step re-examined, under noise fitted beside it.
 
 FLIPS = 199
 CLOSE = 6  # candidates whose noise is fitted for themselves

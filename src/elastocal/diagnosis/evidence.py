@@ -270,8 +270,6 @@ def direct(C: Array, at: Projection, signs: Array | None = None) -> Spectrum:
     return spectrum((A - Z.T @ Z)[None], b[None], flips[:, None, :])
 
 
-# Spectra of hypotheses and blocks beside a model, each entry's sums computed once.
-
 HELD = 4_000_000  # numbers of regressor directions that are held at a time
 
 
@@ -312,9 +310,6 @@ class Grams:
 
     def _direct(self, columns: Array) -> Spectrum:
         return direct(self.data.masked(columns), self.at, self.signs)
-
-
-# The evidence of everything that could be added to a model, under one noise.
 
 
 @dataclass(frozen=True)

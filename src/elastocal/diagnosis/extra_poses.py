@@ -181,8 +181,6 @@ def recording_advice(sets: Sequence[RivalSet]) -> list[str]:
     return out
 
 
-# Which further poses would tell the rivals of a diagnosis apart, and how surely.
-
 # What a plan can aim at, and from which probability it goes without saying that one is at work.
 MOST_CERTAIN, MOSTLY = 0.99, 0.9
 NUMBERS = 20_000_000  # of the configurations' covariances that are held at once

@@ -28,8 +28,6 @@ from elastocal.diagnosis.unknown import Generic
 from elastocal.model.manipulator import Model
 from elastocal.units import Array
 
-# A set of additions to the model, with the noise that goes with it and its evidence.
-
 REFINED_ROUNDS = 3  # of settings that depend on each other
 
 
@@ -306,9 +304,6 @@ def settings_to_try(dataset: DiagnosisData, rival: Hypothesis, item: Item) -> Ar
         s.lower <= v <= s.upper for s, v in zip(rival.settings, item.settings, strict=True)
     )
     return np.vstack([values, item.settings]) if within else values
-
-
-# The model with found effects added.
 
 
 def extended(model: Model, items: Sequence[Item]) -> Model:

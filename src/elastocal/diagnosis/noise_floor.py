@@ -328,8 +328,6 @@ def likelihood(data: NoisyData, noise: NoiseValues) -> tuple[float, Array]:
     return -2 * marginal + prior, slope + prior_slope
 
 
-# The most probable noise values of data, by a search in their logarithms.
-
 STRIDE, ROUNDS = 1.5, 10  # of the logarithms
 SOME = 250  # configurations that show where the optimum is
 ENOUGH, LEVEL = 1e-3, 3e-3  # change of −2ℓ, and its slope, at which a search ends

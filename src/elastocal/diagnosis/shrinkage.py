@@ -188,6 +188,14 @@ class Shrinkage(NamedTuple):
     ci90: tuple[float, float]
     ci95: tuple[float, float]
 
+    @classmethod
+    def of(cls, drawn: Array) -> Shrinkage:
+        """The median and the intervals of draws (n,)."""
+        low95, low90, middle, high90, high95 = np.quantile(
+            drawn, [0.025, 0.05, 0.5, 0.95, 0.975]
+        ).tolist()
+        return cls(middle, (low90, high90), (low95, high95))
+
 
 @dataclass(frozen=True)
 class PosteriorDraw:
@@ -229,11 +237,7 @@ def shrinkage(
         _reductions(posterior_draws[k], int((which == k).sum()), measured, unnamed, change, rng)
         for k in np.unique(which)
     ]
-    drawn = np.concatenate(parts)
-    low95, low90, middle, high90, high95 = np.quantile(
-        drawn, [0.025, 0.05, 0.5, 0.95, 0.975]
-    ).tolist()
-    return Shrinkage(middle, (low90, high90), (low95, high95))
+    return Shrinkage.of(np.concatenate(parts))
 
 
 def _reductions(

@@ -13,8 +13,6 @@ from elastocal.diagnosis.diagnosis_data import DiagnosisData
 from elastocal.diagnosis.noise_floor import NoiseValues, NoisyData, Projection, covariance, project
 from elastocal.units import Array, BoolArray, IntArray
 
-# The noise floor as the report states it.
-
 
 def noise_floor(dataset: DiagnosisData, data: NoisyData, noise: NoiseValues) -> NoiseFloor:
     """Tracker noise, repeatability, shared scatter, (near-)repeats and faulty readings."""
@@ -53,14 +51,19 @@ def describe_faulty(
 
 def pure_error(dataset: DiagnosisData) -> float | None:
     """Scatter in m per axis among repeats of the same pose, load and marker; None without any."""
-    observed, table, good = dataset.base.observed, dataset.table, ~dataset.data.faulty
+    square, dof = _within(*_repeats(dataset, ~dataset.data.faulty))
+    return float(np.sqrt(square)) if dof else None
+
+
+def _repeats(dataset: DiagnosisData, good: BoolArray) -> tuple[IntArray, Array]:
+    """Of the `good` observations (N,) the number of their pose, load and marker (n,), and what was
+    read in m (n, 1 or 3)."""
+    observed, table = dataset.base.observed, dataset.table
     rows = observed.lead[good]
     force = np.round(table.force[rows], 6)
     key = np.column_stack([table.configuration[rows], table.marker[rows], force])
-    group = np.unique(key, axis=0, return_inverse=True)[1].ravel()
     values = observed.value.reshape(-1, observed.size)[good][:, : min(observed.size, 3)]
-    square, dof = _within(group, values)
-    return float(np.sqrt(square)) if dof else None
+    return np.unique(key, axis=0, return_inverse=True)[1].ravel(), values
 
 
 # Near-repeats: readings of the same marker under the same load at poses that nearly coincide.
@@ -153,19 +156,15 @@ def returned(dataset: DiagnosisData) -> tuple[float, int]:
 
     Readings one after the other, the arm standing still, show the tracker's noise alone.
     """
-    observed, table, good = dataset.base.observed, dataset.table, ~dataset.data.faulty
-    rows, moment = observed.lead[good], dataset.moment[good]
-    order = np.argsort(moment, kind="stable")
-    moved = np.diff(table.configuration[rows][order], prepend=-1) != 0
-    stay = np.empty(len(rows), dtype=np.int64)
+    good = ~dataset.data.faulty
+    order = np.argsort(dataset.moment[good], kind="stable")
+    moved = np.diff(dataset.table.configuration[dataset.lead[good]][order], prepend=-1) != 0
+    stay = np.empty(len(order), dtype=np.int64)
     stay[order] = np.cumsum(moved)
-    force = np.round(table.force[rows], 6)
-    key = np.column_stack([table.configuration[rows], table.marker[rows], force])
-    _, group = np.unique(key, axis=0, return_inverse=True)
-    values = observed.value.reshape(-1, observed.size)[good][:, : min(observed.size, 3)]
+    group, values = _repeats(dataset, good)
     # The first reading of each stay.
-    first = np.unique(np.column_stack([group.ravel(), stay]), axis=0, return_index=True)[1]
-    return _within(group.ravel()[first], values[first])
+    first = np.unique(np.column_stack([group, stay]), axis=0, return_index=True)[1]
+    return _within(group[first], values[first])
 
 
 def _within(group: IntArray, values: Array) -> tuple[float, int]:

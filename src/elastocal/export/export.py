@@ -125,15 +125,12 @@ def estimates_of(calibrated: CalibratedArm) -> list[dict[str, Any]]:
     ]
 
 
-def held_values(estimates: list[dict[str, Any]]) -> dict[str, float]:
-    """Parameters that the data did not determine, with the values used for them (SI)."""
-    return {e["name"]: e["held"] for e in estimates if e["identifiable"] is not True}
-
-
-def _ordinary(calibrated: CalibratedArm, estimates: list[dict[str, Any]]) -> list[dict[str, Any]]:
-    """Those of no smooth function, which is zero where nothing shows it."""
+def held_values(calibrated: CalibratedArm, estimates: list[dict[str, Any]]) -> dict[str, float]:
+    """Parameters that the data did not determine, with the values used for them (SI), but those of
+    smooth functions, which are zero where nothing shows them."""
     both = zip(estimates, calibrated.model.shrunk, strict=True)
-    return [entry for entry, shrunk in both if not shrunk]
+    left = [e for e, shrunk in both if not shrunk and e["identifiable"] is not True]
+    return {e["name"]: e["held"] for e in left}
 
 
 def parameter_document(
@@ -377,7 +374,7 @@ def export(
         cost=cost,
         checked=checked,
         checked_with=tool,
-        held=held_values(_ordinary(calibrated, estimates)),
+        held=held_values(calibrated, estimates),
         of_the_measurement=kept.of_the_measurement,
         warnings=(*_warnings(calibrated, cost), *warnings),
         without_beta=beta,

@@ -141,11 +141,10 @@ def keep(calibrated: CalibratedArm, elastic: bool, conditions: Conditions) -> Ke
         for name in stated
         if name not in kept_names
     ]
-    omissions += [
-        Omission(name, f"no cost without {' and '.join(map(_stating, needs))}", None)
-        for name, needs in unstated.items()
-        if needs
-    ]
+    for name, needs in unstated.items():
+        if needs:
+            missing = " and ".join(RECORDED.get(need) or option(OPTIONS[need]) for need in needs)
+            omissions.append(Omission(name, f"no cost without {missing}", None))
     exported = full if len(kept_names) == len(stated) else part_of(calibrated, kept_names)
     if elastic:
         exported, changed = _as_springs(exported)
@@ -153,11 +152,6 @@ def keep(calibrated: CalibratedArm, elastic: bool, conditions: Conditions) -> Ke
             Omission(effect, sentence, _as_springs(full, effect)[0]) for effect, sentence in changed
         ]
     return Kept(full, exported, conditions, tuple(omissions), instrument)
-
-
-def _stating(need: str) -> str:
-    """What would state what an effect needs."""
-    return RECORDED.get(need) or option(OPTIONS[need])
 
 
 def _as_springs(part: Valued, only: str | None = None) -> tuple[Valued, list[tuple[str, str]]]:

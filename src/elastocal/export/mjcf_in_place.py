@@ -148,11 +148,6 @@ def corrected_mjcf(
     return text.result(), told
 
 
-def flange_of(text: str, robot: Robot) -> str | None:
-    """The name of the calibrated flange in a written text."""
-    return FLANGE if f'name="{FLANGE}"' in text else robot.flange
-
-
 def _check_located(arm: MjcfArm, text: MjcfText) -> None:
     model = arm.model
     names = [model.body(i).name for i in range(model.nbody)]
@@ -358,7 +353,8 @@ def held_arm(text: str, robot: Robot, pieces: ExportNumbers) -> tuple[Any, Array
     import mujoco
 
     assert robot.mjcf is not None
-    arm = MjcfArm.read(robot.mjcf, robot.base, flange_of(text, robot), text)
+    flange = FLANGE if f'name="{FLANGE}"' in text else robot.flange
+    arm = MjcfArm.read(robot.mjcf, robot.base, flange, text)
     spec, model = parsed(robot.mjcf, text), arm.model
     strip(spec, list(spec.geoms))
     spec.compiler.boundmass = spec.compiler.boundinertia = SMALLEST
@@ -376,12 +372,12 @@ def held_arm(text: str, robot: Robot, pieces: ExportNumbers) -> tuple[Any, Array
             joint.actfrclimited = mujoco.mjtLimited.mjLIMITED_FALSE
         elif not joint.name.startswith(SPRING):
             spec.delete(joint)
-    flange = next(body for body in spec.bodies if body.id == arm.flange)
+    last = next(body for body in spec.bodies if body.id == arm.flange)
     names = [f"{HELD}{k}" for k in range(len(pieces.points))]
     for name, point in zip(
         [*names, f"{HELD}load"], [*pieces.points, pieces.load_point], strict=True
     ):
-        site = flange.add_site(name=name, pos=(arm.flange_in_body @ [*point, 1.0])[:3])
+        site = last.add_site(name=name, pos=(arm.flange_in_body @ [*point, 1.0])[:3])
         site.material = ""  # which the file's defaults may give it
     spec.option.gravity = model.opt.gravity if pieces.masses else np.zeros(3)
     spec.compiler.inertiafromgeom = mujoco.mjtInertiaFromGeom.mjINERTIAFROMGEOM_FALSE

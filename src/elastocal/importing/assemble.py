@@ -269,11 +269,11 @@ def _family(
 
 def table_text(made: Assembled) -> str:
     """The CSV of docs/file-formats.md; numbers with the digits that read back exactly."""
-    return csv_text(made.columns, zip(*map(_texts, made.columns.values()), strict=True))
-
-
-def _texts(values: Sequence[str] | NDArray) -> Sequence[object]:
-    return [repr(v + 0) for v in values.tolist()] if isinstance(values, np.ndarray) else values
+    columns = [
+        [repr(v + 0) for v in values.tolist()] if isinstance(values, np.ndarray) else values
+        for values in made.columns.values()
+    ]
+    return csv_text(made.columns, zip(*columns, strict=True))
 
 
 def validated(text: str, name: str, made: Assembled, cell: Cell | None) -> Measurements:

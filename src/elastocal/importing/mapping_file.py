@@ -33,8 +33,6 @@ from elastocal.tables import column
 from elastocal.text import did_you_mean, listed, quoted
 from elastocal.units import FACTORS, known_unit, quantities, split_unit
 
-# The keys of a mapping file: what the columns of somebody's export mean.
-
 Place = Annotated[int, Field(ge=1)] | Text
 Where = Place | Annotated[list[Place], Field(min_length=1)]
 Texts = Annotated[list[Text], Field(min_length=1)]

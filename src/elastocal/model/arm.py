@@ -16,8 +16,6 @@ from elastocal.measurements import LARGEST_FORCE, Measurements, with_moves
 from elastocal.model import rigid
 from elastocal.model.chain import Chain
 
-# Parameters: what an effect brings into the model, with name, unit, nominal value and size.
-
 
 @dataclass(frozen=True)
 class ParameterSpec:

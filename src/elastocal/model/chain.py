@@ -11,8 +11,6 @@ from elastocal.cell.work_cell import Cell
 from elastocal.errors import InputError
 from elastocal.units import Array
 
-# The nominal serial chain: what a URDF or a DH table says, before any error.
-
 JointKind = Literal["revolute", "prismatic"]
 
 MIN_JOINTS, MAX_JOINTS = 4, 9

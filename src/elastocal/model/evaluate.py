@@ -170,8 +170,6 @@ def summary(reports: Iterable[BackendReport]) -> str:
     return "; ".join(lines) or "nothing evaluated yet"
 
 
-# Batch evaluation: a list of expressions on all rows of a table at once, behind one call.
-
 CHUNK = 8192  # rows at a time: registers stay in cache, numpy's call overhead is spread
 COMPILED_CHUNK = 1024  # compiled code has no overhead to spread; small pieces share out evenly
 LARGEST_BUFFER = 2**23  # numbers in the registers and outputs of one block
@@ -209,15 +207,11 @@ class BatchFunction:
         self.shapes = self._function.shapes
         self._sizes = self._function.sizes
         self.n_instructions = self._function.n_instructions
-        self._forget()
-        self._wider, self._columns = wider, tuple(columns)
+        self._forget(wider, columns)
 
-    _wider: BatchFunction | None
-    _columns: tuple[int, ...]
-
-    def _forget(self) -> None:
+    def _forget(self, wider: BatchFunction | None = None, columns: Sequence[int] = ()) -> None:
         self._lock = threading.Lock()
-        self._wider, self._columns = None, ()
+        self._wider, self._columns = wider, tuple(columns)
         self._work = Work(self.n_instructions)
         self._compiled: Compiled | None = None
         self._looked = False

@@ -17,8 +17,6 @@ import casadi as ca
 from elastocal.errors import InputError
 from elastocal.files import HOW_TO_OPEN, atomic_write_bytes, remove_abandoned
 
-# A function of a table's rows: as given, by content, and without repeated subexpressions.
-
 # Finding common subexpressions takes 7 µs per instruction.  It saves 2 to 14 % of the instructions
 # of B and 1 % of a Jacobian of 170 000, where it would take longer than all the rest.
 LARGEST_REDUCED = 60_000
@@ -216,11 +214,8 @@ def prune(folder: Path, keep: Path, largest: int | None = None) -> None:
 def _is_entry(path: Path) -> bool:
     """Only what `store` wrote may be removed: ELASTOCAL_CACHE may name any folder."""
     parts = path.name.split(".")
-    return len(parts) >= 3 and _is_key(parts[0]) and len(parts[1]) == 64
-
-
-def _is_key(text: str) -> bool:
-    return re.fullmatch("[0-9a-f]{32}", text) is not None
+    key = len(parts) >= 3 and re.fullmatch("[0-9a-f]{32}", parts[0])
+    return bool(key) and len(parts[1]) == 64
 
 
 def _digest(data: bytes) -> str:

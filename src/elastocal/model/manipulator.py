@@ -179,18 +179,10 @@ class Model:
             joints.shape == (n, self.chain.n_joints),
             f"q takes {self.chain.n_joints} joints per row; found an array of shape {np.shape(q)}",
         )
-        return Measurements(
-            source="table",
-            row=np.arange(1, n + 1),
-            q=joints,
-            configuration=np.arange(n),
-            configuration_labels=tuple(map(str, range(1, n + 1))),
-            repeat=np.zeros(n, dtype=np.int64),
-            marker=np.zeros(n, dtype=np.int64),
-            marker_names=tuple(self.cell.tool.markers)[:1] or (DEFAULT_MARKER,),
-            force=np.zeros((n, 3)) if force is None else _rows_of_three("force", force, n),
-            position=None if position is None else _rows_of_three("position", position, n),
-        )
+        pull = np.zeros(3) if force is None else _rows_of_three("force", force, n)
+        place = None if position is None else _rows_of_three("position", position, n)
+        marker = next(iter(self.cell.tool.markers), DEFAULT_MARKER)
+        return Measurements.of_poses("table", joints, pull, marker, position=place)
 
     def pose(
         self, q: ArrayLike, x: ArrayLike | None = None, force: ArrayLike | None = None

@@ -144,11 +144,6 @@ class Equilibrium:
         return theta
 
 
-# The symbolic arm: effects applied to the chain, its expressions, and B of a configuration.
-
-# The symbolic arm: effects applied to the chain, its expressions, and functions of tables.
-
-
 class SymbolicArm:
     """h(inputs, X, θ) and F(inputs, X, θ) = θ − law(τ) of one row, as CasADi expressions.
 

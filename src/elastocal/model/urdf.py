@@ -19,7 +19,7 @@ import numpy as np
 
 from elastocal.errors import InputError, require
 from elastocal.files import DEEPEST, read_bytes
-from elastocal.model.chain import MAX_JOINTS, MIN_JOINTS, Chain, Joint, LinkMass
+from elastocal.model.chain import MAX_JOINTS, MIN_JOINTS, Chain, Joint, JointKind, LinkMass
 from elastocal.text import did_you_mean, listed, printable
 from elastocal.units import Array
 
@@ -68,10 +68,9 @@ def read_urdf(path: str | Path, base: str | None = None, flange: str | None = No
         # for unbounded ones that store (cos q, sin q).
         along, about = np.asarray(data.joints[i].S).reshape(2, 3)
         limits = source.limit or (-np.inf, np.inf)
-        if source.kind == "prismatic":
-            joints.append(Joint(source.name, "prismatic", placement, along, *limits))
-        else:
-            joints.append(Joint(source.name, "revolute", placement, about, *limits))
+        slides = source.kind == "prismatic"
+        kind: JointKind = "prismatic" if slides else "revolute"
+        joints.append(Joint(source.name, kind, placement, along if slides else about, *limits))
     masses = tuple(LinkMass(float(body.mass), np.array(body.lever)) for body in model.inertias[1:])
     return Chain(
         tree.name, tuple(joints), _link_placement(model, flange).homogeneous,
@@ -310,7 +309,7 @@ def check_urdf(path: str | Path) -> Tree:
     and for elements with missing, duplicate or unknown names or with bad numbers.
     """
     path = Path(path)
-    root = _without_namespace(path, _parse(path))
+    root = _without_namespace(path, xml_tree(path, urdf_bytes(path), "a URDF"))
     links: dict[str, LinkMass] = {}
     for element in root.findall("link"):
         require(len(links) < MOST_LINKS, f"{path}: more than {MOST_LINKS} links; remove some")
@@ -329,10 +328,6 @@ def check_urdf(path: str | Path) -> Tree:
                 f"{did_you_mean(joint.mimic, joints)}; name an existing joint"
             )
     return Tree(path, root.get("name") or path.stem, links, joints)
-
-
-def _parse(path: Path) -> ET.Element:
-    return xml_tree(path, urdf_bytes(path), "a URDF")
 
 
 def xml_tree(path: Path, data: bytes, what: str) -> ET.Element:

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Collection
 from dataclasses import dataclass, field, replace
+from typing import Any
 
 import numpy as np
 
@@ -90,19 +91,9 @@ def random_table(model: Model, conditions: Conditions, poses: int, seed: int) ->
     q = rng.uniform(low, high, (poses, chain.n_joints))
     for joint, levels in cell.model.compliance_levels.items():
         q[:, int(joint.removeprefix("joint")) - 1] = rng.choice(levels, poses)
-    return Measurements(
-        source="random poses",
-        row=np.arange(poses) + 2,
-        q=q,
-        configuration=np.arange(poses),
-        configuration_labels=tuple(str(i + 1) for i in range(poses)),
-        repeat=np.zeros(poses, dtype=np.int64),
-        marker=np.zeros(poses, dtype=np.int64),
-        marker_names=tuple(cell.tool.markers)[:1],
-        force=np.tile(conditions.force, (poses, 1)),
-        approach=rng.choice([-1.0, 1.0], (poses, chain.n_joints)),
-        time=None if conditions.time is None else np.full(poses, conditions.time),
-        temperature=None
-        if conditions.temperature is None
-        else np.full(poses, conditions.temperature),
-    )
+    stated = {"time": conditions.time, "temperature": conditions.temperature}
+    more: dict[str, Any] = {k: np.full(poses, v) for k, v in stated.items() if v is not None}
+    return Measurements.of_poses(
+        "random poses", q, conditions.force, marker_names=tuple(cell.tool.markers)[:1],
+        approach=rng.choice([-1.0, 1.0], (poses, chain.n_joints)), **more,
+    )  # fmt: skip

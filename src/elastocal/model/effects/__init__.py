@@ -8,94 +8,63 @@ file of the user's own that calls `register`.
 from __future__ import annotations
 
 from elastocal.errors import require
+from elastocal.model.effects import (
+    changes_in_time,
+    compliances,
+    gears,
+    gravity_sag,
+    loads,
+    placements,
+    play,
+    smooth,
+    torque_couplings,
+    tracker_distortion,
+)
 from elastocal.model.effects.base import Effect, check
-from elastocal.model.effects.changes_in_time import (
-    BaseDrift,
-    EncoderJump,
-    FrameJump,
-    JointDrift,
-    MarkerSlip,
-    ThermalExpansion,
-)
-from elastocal.model.effects.compliances import (
-    BaseCompliance,
-    JointCompliance,
-    JointHardening,
-    LinkBending,
-    OffAxisCompliance,
-)
-from elastocal.model.effects.gears import (
-    EncoderScale,
-    GearEccentricity,
-    GearRipple,
-    GearSecondHarmonic,
-    GearSpectrum,
-    JointOffset,
-    WristCoupling,
-)
-from elastocal.model.effects.gravity_sag import GravitySag, LinkWeights
-from elastocal.model.effects.loads import (
-    GravityCompensator,
-    LinkGravity,
-    LinkMassError,
-    Payload,
-    PayloadError,
-)
-from elastocal.model.effects.placements import (
-    BaseFrame,
-    DistanceSensor,
-    LinkGeometry,
-    MarkerOrientation,
-    MarkerPosition,
-)
-from elastocal.model.effects.play import Backlash, Hysteresis, MoveLag
-from elastocal.model.effects.smooth import JointCurve, ResidualField
-from elastocal.model.effects.torque_couplings import TorqueCoupling, TorqueTilt
-from elastocal.model.effects.tracker_distortion import TrackerDistortion
 from elastocal.plugin_loader import same_class
 
 # Effects act in this order: what sets a frame or a marker stands before what moves it.
 CATALOGUE: dict[str, Effect] = {
     effect.name: effect
     for effect in (
-        BaseFrame(),
-        JointOffset(),
-        EncoderScale(),
-        GearEccentricity(),
-        GearSecondHarmonic(),
-        GearRipple(),
-        GearSpectrum(),
-        JointCurve(),
-        WristCoupling(),
-        JointDrift(),
-        EncoderJump(),
-        MoveLag(),
-        GravitySag(),
-        TorqueCoupling(),
-        LinkGeometry(),
-        TorqueTilt(),
-        ThermalExpansion(),
-        ResidualField(),
-        JointCompliance(),
-        JointHardening(),
-        Backlash(),
-        Hysteresis(),
-        OffAxisCompliance(),
-        LinkBending(),
-        BaseCompliance(),
-        GravityCompensator(),
-        LinkGravity(),
-        LinkMassError(),
-        LinkWeights(),
-        Payload(),
-        PayloadError(),
-        MarkerPosition(),
-        MarkerSlip(),
-        MarkerOrientation(),
-        BaseDrift(),
-        FrameJump(),
-        DistanceSensor(),
-        TrackerDistortion(),
+        placements.BaseFrame(),
+        gears.JointOffset(),
+        gears.EncoderScale(),
+        gears.GearEccentricity(),
+        gears.GearSecondHarmonic(),
+        gears.GearRipple(),
+        gears.GearSpectrum(),
+        smooth.JointCurve(),
+        gears.WristCoupling(),
+        changes_in_time.JointDrift(),
+        changes_in_time.EncoderJump(),
+        play.MoveLag(),
+        gravity_sag.GravitySag(),
+        torque_couplings.TorqueCoupling(),
+        placements.LinkGeometry(),
+        torque_couplings.TorqueTilt(),
+        changes_in_time.ThermalExpansion(),
+        smooth.ResidualField(),
+        compliances.JointCompliance(),
+        compliances.JointHardening(),
+        play.Backlash(),
+        play.Hysteresis(),
+        compliances.OffAxisCompliance(),
+        compliances.LinkBending(),
+        compliances.BaseCompliance(),
+        loads.GravityCompensator(),
+        loads.LinkGravity(),
+        loads.LinkMassError(),
+        gravity_sag.LinkWeights(),
+        loads.Payload(),
+        loads.PayloadError(),
+        placements.MarkerPosition(),
+        changes_in_time.MarkerSlip(),
+        placements.MarkerOrientation(),
+        changes_in_time.BaseDrift(),
+        changes_in_time.FrameJump(),
+        placements.DistanceSensor(),
+        tracker_distortion.TrackerDistortion(),
     )
 }
 BUILT_IN = frozenset(CATALOGUE)
