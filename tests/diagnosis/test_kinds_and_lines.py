@@ -10,7 +10,12 @@ import pytest
 from support.diagnosis_data import campaign, random_data
 
 from elastocal.diagnosis import Component, NoiseValues, NoisyData, fit_baseline
-from elastocal.diagnosis.component_families import line_families, sharpened
+from elastocal.diagnosis.component_families import (
+    line_families,
+    sharpened,
+    whole_families,
+    with_multiples,
+)
 from elastocal.diagnosis.component_search import completed, hidden_fellows
 from elastocal.diagnosis.components import PRESENT, Pool, fit_sum, log_odds, presence_cost
 from elastocal.diagnosis.diagnosis_data import diagnosis_data_of
@@ -102,3 +107,8 @@ def test_orders_of_lines_are_found_beside_each_other() -> None:
     settings = dict(again[0].settings)
     order, sd = settings["order_1"], settings["order_sd_1"]
     assert sd < 0.2 and abs(order - 81.3 / round(81.3 / order)) < 4 * sd
+    one = with_multiples(dataset, again[0]).get(1, again[0])
+    ((family, whole),) = whole_families(dataset, [one])
+    orders = [value for key, value in whole.settings if not key.startswith("order_sd")]
+    assert family is one and orders == pytest.approx([order, 2 * order, 3 * order])
+    assert not whole_families(dataset, [whole])

@@ -288,17 +288,31 @@ def sought_anew(dataset: DiagnosisData, found: FittedSum, c: Component) -> Compo
     return _family_component(dataset, best)
 
 
-def with_multiples(dataset: DiagnosisData, c: Component) -> list[Component]:
-    """A family of lines with one multiple more, and with one less; none of another component."""
+def with_multiples(dataset: DiagnosisData, c: Component) -> dict[int, Component]:
+    """A family of lines with any other number of them; none of another component."""
     if not isinstance(c.effect, GearSpectrum):
-        return []
+        return {}
     given = dict(c.settings)
     m, order, sd = len(given) // 2, given["order_1"], given["order_sd_1"]
-    return [
-        _family_component(dataset, LineFamily(c.where, order, n, 0.0, sd, c.search))
-        for n in (m + 1, m - 1)
-        if n in MULTIPLES and n * order <= HIGHEST
-    ]
+    return {
+        n: _family_component(dataset, LineFamily(c.where, order, n, 0.0, sd, c.search))
+        for n in MULTIPLES
+        if n != m and n * order <= HIGHEST
+    }
+
+
+def whole_families(
+    dataset: DiagnosisData, components: Sequence[Component]
+) -> list[tuple[Component, Component]]:
+    """Each family of lines that has fewer than it may have, and the same with all."""
+    families = Counter(c.where for c in components if isinstance(c.effect, GearSpectrum))
+    found = []
+    for c in components:
+        others = with_multiples(dataset, c)
+        most = max(others, default=0)
+        if most > len(c.settings) // 2 and families[c.where] * most <= MOST_LINES:
+            found.append((c, others[most]))
+    return found
 
 
 def _lines_and_shifts(span: slice) -> tuple[IntArray, IntArray]:

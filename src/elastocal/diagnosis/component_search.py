@@ -21,6 +21,7 @@ from elastocal.diagnosis.component_families import (
     line_families,
     sharpened,
     sought_anew,
+    whole_families,
     with_multiples,
 )
 from elastocal.diagnosis.components import (
@@ -104,6 +105,8 @@ def search_components(
         found = wider
     progress("what can be left out")
     found = _spared(data, found)
+    if len(full.blocks.member) <= FEW_POSES:
+        found = _with_all_multiples(full, data, found)
     return full, found, hidden_fellows(found, others)
 
 
@@ -186,13 +189,27 @@ def _reviewed(dataset: DiagnosisData, data: NoisyData, found: FittedSum) -> Fitt
     changed = False
     for c in found.components:
         anew = sought_anew(dataset, found, c)
-        others = with_multiples(dataset, c)
-        for other in others if anew is None else [anew, *others]:
+        m, others = len(c.settings) // 2, with_multiples(dataset, c)
+        near = [other for n in (m + 1, m - 1) if (other := others.get(n)) is not None]
+        for other in near if anew is None else [anew, *near]:
             fitted = exchanged(data, found, [c], [other], refit_noise=False)
             if fitted.score > found.score:
                 found, changed = fitted, True
                 break
     return _tuned(dataset, data, found) if changed else found
+
+
+def _with_all_multiples(dataset: DiagnosisData, data: NoisyData, found: FittedSum) -> FittedSum:
+    """The sum with every multiple that its families of lines may have.
+
+    Which of them stand out was decided by what they earn.  At new poses it costs more to leave out
+    what half shows than to have it shrunk.
+    """
+    pairs = whole_families(dataset, found.components)
+    if not pairs:
+        return found
+    whole = exchanged(data, found, [c for c, _ in pairs], [w for _, w in pairs])
+    return whole if len(whole.components) == len(found.components) else found
 
 
 def hidden_fellows(found: FittedSum, components: Sequence[Component]) -> tuple[Component, ...]:
