@@ -29,7 +29,12 @@ from elastocal.model.arm import Parameter, ParameterSpec
 from elastocal.model.effects import CATALOGUE
 from elastocal.model.manipulator import Model
 from elastocal.model.observations import observe
-from elastocal.planning.information import Done, LoadStates, PoseInformation
+from elastocal.planning.information import (
+    Done,
+    LoadStates,
+    PoseInformation,
+    observed_weights,
+)
 from elastocal.planning.plan import Gain
 from elastocal.planning.setup import Known, Setup
 from elastocal.units import Array, IntArray
@@ -39,6 +44,7 @@ SOMETHING = 0.5
 # What a parameter of unknown typical size moves the readings by, rms in m.
 UNSIZED_SIGNAL = 2e-4
 POSES = 100  # that show how far
+SHOWN = 1.0  # standard deviation from 0 that all of these poses together would give it at least
 # What a pose has only once it stands in an order.
 OPEN = frozenset({"time", "temperature", "approach"})
 
@@ -50,8 +56,8 @@ def in_doubt(
     probability: Mapping[Place, float] | None = None,
 ) -> tuple[Model, Known]:  # fmt: skip
     """The model with all that it may lack, and what is known of it: the prior of the parameters
-    that it then has more, sized at some of the poses q (N, n) in load states `load` (N,); those
-    that none of these shows are held.
+    that it then has more, sized at some of the poses q (N, n) in load states `load` (N,).  Those
+    that these do not show are held: no plan would lower what they add at the test poses.
 
     `probability` that an effect is missing at a place, where more is known of it than its share of
     SOMETHING; places that it does not name are not in doubt.
@@ -69,10 +75,12 @@ def in_doubt(
     step = -(-len(q) // POSES)
     table = information.rows(q[::step], load[::step], whole.nominal)
     added = np.flatnonzero(~np.isin(whole.names, model.names))
-    B = whole.regressor(table, whole.nominal, added, observe(table, whole.observe)).B
+    observed = observe(table, whole.observe)
+    B = whole.regressor(table, whole.nominal, added, observed).B
     specs = [whole.parameters[k] for k in added]
     std = np.sqrt([probability[p.effect, p.where] for p in specs]) * usual_sizes(specs, B)
-    shown = np.abs(B).max(axis=0, initial=0.0) > 0
+    whitened = observed_weights(whole, observed, whole.nominal).apply(B)
+    shown = np.linalg.norm(whitened * std, axis=0) >= SHOWN
     unseen = tuple(p.name for p, seen in zip(specs, shown, strict=True) if not seen)
     prior, own = known.prior, [p for p, seen in zip(specs, shown, strict=True) if seen]
     names, mean = [p.name for p in own], [p.nominal for p in own]
