@@ -227,6 +227,7 @@ def test_a_forgotten_load_is_mentioned(folder):
         (("--target", "1,2"), "--target takes"),
         (("--target", "1,2,x"), "--target takes"),
         (("--table", "t.csv", "--grid", "a"), "whole numbers"),
+        (("--table", "t.csv", "--grid", "1000,1000,1000,1000,1000,1"), "1,000,000,000,000,000 po"),
         (("--table", "t.csv", "--rotation", "0,0,0"), "belongs to --box"),
         (("--table", "t.csv", "--box", "1,2,3"), "--box takes"),
         (("missing.csv",), "no such file"),
