@@ -360,7 +360,8 @@ class _Design:
 
     def run(self) -> Plan:
         progress, options = self.progress, self.options
-        pins, pinned_at = options.pins, (np.zeros((2, 0), dtype=np.int64))
+        nothing = np.zeros(0, dtype=np.int64)
+        pins, pinned_at = options.pins, (nothing, nothing)
         if pins is not None and len(pins.q):
             pinned_at = pins.placed(self.cell, self.chain, self.states, self.feasibility)
         self.pinned = np.bincount(pinned_at[1], minlength=self.space.n_groups)
