@@ -124,7 +124,10 @@ def planned(name: str, effort: Effort = "quick", seed: int = 0) -> tuple[Plan, S
             cell = cell_for(chain)
             patch.setattr("elastocal.model.manipulator.load_chain", lambda cell: chain)
         plan = design(cell, DesignOptions(effort, seed))
-    return plan, observed[0], Feasibility(plan.model.cell, plan.model.chain)
+    setup, e = observed[0], plan.everywhere
+    if e is not None and e.share:
+        setup = setup.sharing(e.share)
+    return plan, setup, Feasibility(plan.model.cell, plan.model.chain)
 
 
 def loads_of(plan: Plan, k: int) -> NDArray:

@@ -15,6 +15,7 @@ from support.design_cells import as_table, plan_cell
 
 from elastocal.cell.arm_description import PolarNoise
 from elastocal.cell.work_cell import Cell
+from elastocal.cell.workspace_rules import Workspace
 from elastocal.identification import Options
 from elastocal.identification.identify import identify
 from elastocal.measurements import Measurements
@@ -32,9 +33,11 @@ RARE = 1e-4  # probability that a right program fails, had the seed not been fix
 
 
 def plan_of(cell: Cell, fixed: Sequence[str] = ()) -> Plan:
-    design_ = replace(cell.design, candidates=250)
+    # The test poses that `errors_at_test_poses` draws, and nothing beside them.
+    design_ = replace(cell.design, candidates=250, elsewhere=0.0)
+    space = Workspace(mounting_plane=False)
     options = DesignOptions(effort="quick", fixed=tuple(fixed))
-    return design(replace(cell, design=design_), options)
+    return design(replace(cell, design=design_, workspace=space), options)
 
 
 def campaigns(plan: Plan, truth: NDArray, number: int, scatter: float = 0.0) -> list[Measurements]:

@@ -43,7 +43,8 @@ def test_every_key_figure_is_told_within_the_width(plan, width):
     text = printed(plan, width)
     assert max(cell_len(line) for line in text.splitlines()) <= width
     told = words(text)
-    assert f"ρ₀ = {plan.reported:.4g} µm" in told
+    assert f"ρ₀ = {1e6 * plan.everywhere.test_poses:.4g} µm" in told
+    assert f"{1e6 * plan.everywhere.elsewhere:.4g} µm rms all over the joint ranges" in told
     assert f"certified on the pool: efficiency {plan.certificate.efficiency_pool:.4f}" in told
     assert (
         f"estimated on the continuum: efficiency {plan.certificate.efficiency_continuum:.4f}"
@@ -78,7 +79,9 @@ def test_what_chance_would_have_given(plan):
         return dict(plan_lines(other))["Chance"]
 
     text = told(median=9.876, best=8.0, worst=None, efficiency=0.254, determined=18, n=20)
-    assert "median of 20 random plans" in text and "ρ₀ = 9.876 µm (best 8, worst no value)" in text
+    name = "the weighted error" if plan.everywhere.share else "ρ₀"
+    assert "median of 20 random plans" in text
+    assert f"{name} = 9.876 µm (best 8, worst no value)" in text
     assert "efficiency of 0.25 against this plan" in text
     assert "2 of 20 random plans of as many feasible poses leave parameters open" in text
     text = told(median=None, best=8.0, worst=None, efficiency=None, determined=3, n=20)

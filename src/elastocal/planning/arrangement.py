@@ -16,7 +16,7 @@ from elastocal.planning.moves import Blockers, Unreachable
 from elastocal.planning.plan import Certificate
 from elastocal.planning.setup import FeasiblePool, Setup
 from elastocal.planning.time_budget import at_stops
-from elastocal.units import IntArray, Progress
+from elastocal.units import Array, IntArray, Progress
 
 
 @dataclass(frozen=True)
@@ -79,6 +79,7 @@ class Selection:
 
 SAME = 1e-9  # of the largest number of the blocks: rounding
 MOST_REPLACED = 50  # poses that cannot be reached, before that is said instead
+TRIED = 6  # poses of a plan that a candidate must be able to reach one of
 VIA = 200  # candidates through which a blocked move may go
 
 
@@ -97,7 +98,7 @@ def ordered(
     Poses that no chain of free moves reaches are replaced by the best others, unless they are
     `pinned`.  Raises InsufficientDataError where that does not end.
     """
-    lost, unwound = 0, False
+    lost, unwound, apart = 0, False, False
     while True:
         plan = found.whole(pinned)
         if unwound:
@@ -116,6 +117,9 @@ def ordered(
             progress(f"{lost} poses that no free move reaches are replaced by the best others")
             stage = (checkpoint or Checkpoint()).stage(f"replaced{lost}")
             gone = np.unique(chosen[error.poses])
+            if not apart:
+                apart = True
+                gone = np.union1d(gone, _apart(plan, own, gone, shares, feasibility))
             found = found.without(gone, setup.having(pinned), shares, stage)
             continue
         return plan, execution, _warnings(lost, execution)
@@ -143,21 +147,50 @@ def _execution(
     )  # fmt: skip
 
 
+def _apart(
+    plan: Selection, own: int, gone: IntArray, shares: IntArray, feasibility: Feasibility
+) -> IntArray:
+    """Candidates among the first `own` of the pool that no free move joins to one of the TRIED
+    poses of the plan next to them, those `gone` aside: not to be put in their place.
+
+    None where too few would be left to choose from.
+    """
+    pool, kept = plan.pool, np.setdiff1d(plan.chosen, gone)
+    q = _nearer(feasibility, pool.q)
+    open_ = np.setdiff1d(np.arange(own), plan.chosen)
+    off = np.abs(q[open_, None] - pool.q[kept]).max(axis=2)
+    next_to = np.argsort(off, axis=1)[:, :TRIED]
+    loaded = bool(np.any(feasibility.cell.design.loads))
+    alone = np.arange(len(open_))
+    for k in range(next_to.shape[1]):
+        goals = pool.q[kept[next_to[alone, k]]]
+        alone = alone[~feasibility.paths_free(q[open_[alone]], goals, loaded)]
+    left = np.setdiff1d(np.arange(own), np.append(open_[alone], gone))
+    enough = np.bincount(pool.group[left], minlength=len(shares)) >= 2 * shares
+    return open_[alone] if enough.all() else open_[:0]
+
+
+def _nearer(feasibility: Feasibility, q: Array) -> Array:
+    """Postures q (N, n) whole turns nearer to home, or to the middle of the joint ranges."""
+    chain = feasibility.chain
+    lower, upper = finite_ranges(chain, *joint_limits(feasibility.cell, chain))
+    home = feasibility.cell.design.motion.home
+    middle = (lower + upper) / 2 if home is None else home
+    turning = np.array([kind == "revolute" for kind in chain.kinds])
+    near = q - np.where(turning, 2 * np.pi * np.round((q - middle) / (2 * np.pi)), 0.0)
+    return np.where((near >= lower) & (near <= upper), near, q)
+
+
 def _unwound(setup: Setup, plan: Selection, feasibility: Feasibility) -> Selection:
     """The same postures, whole turns nearer to home, or to the middle of the joint ranges.
 
     Between an arm's posture and the same a turn on, there is often no way: the floor, or the arm
     itself.  Poses whose information would be another, and those that stay, are left as they are.
     """
-    chain, pool = feasibility.chain, plan.pool
+    pool = plan.pool
     own = plan.chosen[plan.chosen < len(pool) - plan.pinned]
-    lower, upper = finite_ranges(chain, *joint_limits(feasibility.cell, chain))
-    home = feasibility.cell.design.motion.home
-    middle = (lower + upper) / 2 if home is None else home
-    turning = np.array([kind == "revolute" for kind in chain.kinds])
     was = pool.q[own]
-    near = was - np.where(turning, 2 * np.pi * np.round((was - middle) / (2 * np.pi)), 0.0)
-    near = np.where((near >= lower) & (near <= upper), near, was)
+    near = _nearer(feasibility, was)
     blocks, before = setup.information.blocks(near, pool.load[own]), pool.blocks[:, own]
     off = np.abs(blocks - before).max(axis=(0, 2, 3)) > SAME * np.abs(before).max()
     q = pool.q.copy()

@@ -405,8 +405,8 @@ class _Design:
 
     def _chosen(self) -> Plan:
         progress, options = self.progress, self.options
-        none = np.zeros(0, dtype=np.int64)
-        pins, pinned_at = options.pins, (none, none)
+        nothing = np.zeros(0, dtype=np.int64)
+        pins, pinned_at = options.pins, (nothing, nothing)
         if pins is not None and len(pins.q):
             pinned_at = pins.placed(self.cell, self.chain, self.states, self.feasibility)
         self.pinned = np.bincount(pinned_at[1], minlength=self.space.n_groups)

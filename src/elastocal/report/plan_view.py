@@ -158,9 +158,8 @@ def plan_headline(plan: Plan) -> str:
     """What the plan is worth and how far from the best it is, in one sentence."""
     n = counted(len(plan.q), "pose")
     if plan.criterion == "test_pose":
-        rho = plan.reported if plan.everywhere is None else plan.everywhere.test_poses * 1e6
         text = (
-            f"{n} leave a position error of ρ₀ = {rho:.3g} µm rms at the test poses "
+            f"{n} leave a position error of ρ₀ = {_rho(plan):.3g} µm rms at the test poses "
             "after compensation"
         )
     else:
@@ -174,6 +173,12 @@ def plan_headline(plan: Plan) -> str:
     if (beyond := _beyond(plan)) is not None:
         return f"{text} (certified), but poses between them may be, by up to {beyond:.0f} %."
     return f"{text} (certified)."
+
+
+def _rho(plan: Plan) -> float:
+    """ρ₀ in µm, also where the criterion weighs it with the error elsewhere."""
+    e = plan.everywhere
+    return plan.reported if e is None or not e.share else e.test_poses * 1e6
 
 
 def _beyond(plan: Plan) -> float | None:
@@ -265,9 +270,8 @@ def _chosen_lines(plan: Plan) -> list[tuple[str, str]]:
 def _criterion_line(plan: Plan) -> tuple[str, str]:
     if plan.criterion != "test_pose":
         return "Criterion", f"{plan.criterion} = {plan.reported:.6g} {plan.unit}".rstrip() + "."
-    rho = plan.reported if plan.everywhere is None else plan.everywhere.test_poses * 1e6
     return "Criterion", (
-        f"ρ₀ = {rho:.4g} µm, the rms position error that remains at the test poses after "
+        f"ρ₀ = {_rho(plan):.4g} µm, the rms position error that remains at the test poses after "
         f"compensation ({printable(plan.targets)})."
     )
 
