@@ -293,6 +293,8 @@ COMMANDS = (
     Command("diagnose", "deflecting.toml data.csv -o out.json --report out.html --plan extra.csv "
             "--poses 3 --cell-out cell_out.toml --without backlash",
             ("out.json", "out.html", "cell_out.toml"), ("arm.csv", "links.csv")),
+    Command("next", "deflecting.toml data.csv -o plan.csv --batch 3 --candidates 20 --json -q "
+            "--require new_poses=0.01", ("plan.csv", "plan.json"), ("arm.csv", "links.csv")),
     Command("compensate", "deflecting.toml result.json targets.csv -o out.csv --frame base "
             "--partial", ("out.csv",), ("arm.csv", "links.csv")),
     Command("compensate", "placed.toml placed.json --target 1500,200,1200,0,90,0 --point M1 "

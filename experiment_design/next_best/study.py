@@ -1,0 +1,216 @@
+"""Poses until an arm is good enough: chosen as one goes, planned once, at random.
+
+elastocal study experiment_design/next_best [--set arms=100] [--set named=100]
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from dataclasses import replace
+from functools import lru_cache
+from importlib.resources import files
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pandas as pd
+
+from elastocal.cell.arm_description import (
+    CartesianNoise,
+    EffectChoice,
+    ModelSpec,
+    Nominal,
+    Robot,
+    Tool,
+    Tracker,
+)
+from elastocal.cell.plan_wishes import DesignSpec
+from elastocal.cell.work_cell import Cell
+from elastocal.diagnosis.diagnose import diagnose
+from elastocal.diagnosis.next_poses import next_poses, with_effects_of
+from elastocal.errors import ElastocalError
+from elastocal.identification.identify import identify
+from elastocal.measurements import Measurements
+from elastocal.model import Model
+from elastocal.planning import Known, in_doubt, load_states, missing, rows_of
+from elastocal.planning.candidates import draw
+from elastocal.planning.design import DesignOptions, design
+from elastocal.planning.feasibility import Feasibility
+from elastocal.planning.information import ALL_LOADS
+from elastocal.simulation.simulate import simulate
+
+EFFECTS = ("base_frame", "joint_offset", "joint_compliance", "marker_position")
+COMPLIANCE = (3.5e-7, 0.287e-6, 0.416e-6, 2.786e-6, 3.483e-6, 2.074e-6)  # rad/(N m)
+LOADS = np.array([[0.0, 0.0, 0.0], [0.0, 0.0, -2600.0]])
+SIGMA = 60e-6  # m, of a camera
+REQUIRED = 50e-6  # m
+SIZES = (8, 12, 16, 20, 24, 28, 32)  # poses; the first is what every policy begins with
+CANDIDATES = 120
+NAMED_FROM = 30  # poses
+NEW = 200  # poses that nobody measured
+
+
+@lru_cache(maxsize=1)
+def model() -> Model:
+    """The KR 270 with one marker, its links as drawn; all but these is free."""
+    robot = Robot(
+        urdf=Path(str(files("elastocal.demo") / "kr270_2.urdf")), base="base_link", flange="flange"
+    )
+    spec = ModelSpec(
+        observe="position",
+        effects=tuple(EffectChoice(name, None) for name in EFFECTS),
+        nominal=Nominal(joint_compliance=COMPLIANCE),
+    )
+    tool = Tool(np.array([0.20, 0.0, 0.25]), {"M1": np.array([0.25, 0.0, 0.05])})
+    tracker = Tracker(noise=CartesianNoise(np.full(3, SIGMA)))
+    wishes = DesignSpec(loads=LOADS, candidates=CANDIDATES)
+    return Model(Cell("arm", None, robot, tool, tracker, spec, design=wishes))
+
+
+@lru_cache(maxsize=8)
+def feasible(n: int, seed: int) -> np.ndarray:
+    """Random poses that the cell allows."""
+    cell, chain = model().cell, model().chain
+    return draw(cell, chain, load_states(cell), Feasibility(cell, chain), n, seed).q
+
+
+@lru_cache(maxsize=16)
+def planned(n: int, criterion: str = "test_pose") -> np.ndarray:
+    """The poses of the best plan found, before any data."""
+    spec = replace(model().cell.design, poses=n, criterion=criterion)
+    return design(replace(model().cell, design=spec), DesignOptions("batch")).q
+
+
+class TrueArm:
+    """Arm `number`: deviations of typical size, every other one with an effect that is missing."""
+
+    def __init__(self, number: int, lacking: bool) -> None:
+        self.number = number
+        rng = np.random.default_rng([number, 0])
+        self.effect = self.where = ""
+        self.model, own = model(), model()
+        names, std = [p.name for p in own.parameters], [p.typical or 0.0 for p in own.parameters]
+        if lacking:
+            places = missing(own)
+            kinds = sorted({name for name, _ in places})
+            self.effect = kinds[rng.integers(len(kinds))]
+            self.where = str(rng.choice([w for name, w in places if name == self.effect]))
+            q = feasible(100, 0)
+            self.model, known = in_doubt(
+                own, Known(), load_states(own.cell), q, np.full(len(q), ALL_LOADS),
+                {(self.effect, self.where): 1.0},
+            )  # fmt: skip
+            if known.prior is not None:
+                names += known.prior.names
+                std += np.sqrt(np.diag(known.prior.covariance)).tolist()
+        sizes = dict(zip(names, std, strict=True))
+        self.x = np.array(
+            [p.nominal + sizes.get(p.name, 0.0) * rng.standard_normal()
+             for p in self.model.parameters]
+        )  # fmt: skip
+
+    def read(self, q: np.ndarray, noise: bool = True) -> Measurements:
+        """The poses q (n, joints) under both loads; a pose's noise follows from its number."""
+        rows = rows_of(q, np.full(len(q), ALL_LOADS), load_states(model().cell), ("M1",))
+        exact = simulate(self.model, rows, self.x, 0, noise=False)
+        drawn = np.random.default_rng([self.number, 1]).standard_normal((1000, 3))
+        return replace(exact, position=exact.position + noise * SIGMA * drawn[: len(exact)])
+
+    def judged(self, q: np.ndarray) -> dict[str, Any]:
+        """What diagnosis and identification make of the readings at q, and how wrong that is."""
+        table = self.read(q)
+        why = diagnose(model(), table)
+        fit = identify(with_effects_of(model(), why), table)
+        new = self.read(feasible(NEW, 1), noise=False)
+        off = fit.model.predict(new, fit.x).reshape(-1, 3) - new.position
+        names = [(f.effect, f.where) for f in why.effects]
+        return {
+            "poses": len(q), "error_um": 1e6 * float(np.sqrt((off**2).sum(axis=1).mean())),
+            "found": len(names), "named": int((self.effect, self.where) in names),
+        }  # fmt: skip
+
+
+def tasks(options: dict[str, Any]) -> Iterator[dict[str, Any]]:
+    for number in range(options["arms"]):
+        for policy in ("adaptive", "planned", "random"):
+            yield {"kind": "stop", "policy": policy, "arm": number}
+    for number in range(options["named"]):
+        for policy in ("random", "planned", "robust"):
+            yield {"kind": "name", "policy": policy, "arm": number}
+
+
+def run(task: dict[str, Any], rng: np.random.Generator) -> dict[str, Any]:
+    """A row of study.toml's columns; an arm's seed follows from its number."""
+    number, policy = task["arm"], task["policy"]
+    arm = TrueArm(number, task["kind"] == "name" or number % 2 == 1)
+    row = {"effect": arm.effect, "where": arm.where, "verdict": "", "kept_um": np.nan, "first": 0}
+    if task["kind"] == "name":
+        return row | arm.judged(poses(policy, NAMED_FROM, number))
+    return row | (adaptive(arm) if policy == "adaptive" else grown(arm, policy))
+
+
+def poses(policy: str, n: int, number: int) -> np.ndarray:
+    if policy == "random":
+        return feasible(NAMED_FROM + SIZES[-1], 10 + number)[:n]
+    return planned(n, "robust" if policy == "robust" else "test_pose")
+
+
+def grown(arm: TrueArm, policy: str) -> dict[str, Any]:
+    """Campaigns of growing size until the true error is below what is required."""
+    for n in SIZES:
+        seen = arm.judged(poses(policy, n, arm.number))
+        if seen["error_um"] <= 1e6 * REQUIRED:
+            return seen | {"first": n}
+    return seen
+
+
+def adaptive(arm: TrueArm) -> dict[str, Any]:
+    """Batches of the next best poses until they say enough."""
+    q, first = planned(SIZES[0]), 0
+    while True:
+        seen = arm.judged(q)
+        if not first and seen["error_um"] <= 1e6 * REQUIRED:
+            first = len(q)
+        try:
+            more = next_poses(
+                model(), arm.read(q), batch=SIZES[1] - SIZES[0], require=REQUIRED,
+                candidates=CANDIDATES,
+            )  # fmt: skip
+        except ElastocalError as error:
+            return seen | {"first": first, "verdict": f"refused: {error}"[:80]}
+        if more.plan is None or len(q) >= SIZES[-1]:
+            said = {"verdict": more.verdict, "kept_um": 1e6 * more.reached}
+            return seen | said | {"first": first}
+        q = np.vstack([q, more.plan.q])
+
+
+def summary(frame: pd.DataFrame) -> str:
+    """The tables of the README."""
+    lines = ["| policy | lacking | arms | below 50 µm | after poses, median (mean) | named |",
+             "|---|---|---|---|---|---|"]  # fmt: skip
+    stop, name = (frame[frame["kind"] == kind] for kind in ("stop", "name"))
+    for (lacking, policy), some in stop.groupby([stop["effect"] != "", "policy"]):
+        there = some["first"][some["first"] > 0]
+        named = f"{int(some['named'].sum())} of {len(some)}" if lacking else "–"
+        lines.append(
+            f"| {policy} | {'an effect' if lacking else 'nothing'} | {len(some)} | {len(there)} | "
+            f"{there.median():.0f} ({there.mean():.1f}) | {named} |"
+        )
+    enough = stop[stop["verdict"] == "enough"]
+    right = int((enough["error_um"] <= 1e6 * REQUIRED).sum())
+    lines.append(
+        f'\nStops at "enough": {len(enough)}, after {enough["poses"].mean():.1f} poses in '
+        f"the mean; the true error was below 50 µm in {right} of them."
+    )
+    if len(name):
+        lines += [
+            "",
+            "| 30 poses | arms | effect named | true error, median |",
+            "|---|---|---|---|",
+        ]
+        for policy, some in name.groupby("policy"):
+            lines.append(
+                f"| {policy} | {len(some)} | {int(some['named'].sum())} | "
+                f"{some['error_um'].median():.1f} µm |"
+            )
+    return "\n".join(lines) + "\n"
