@@ -18,7 +18,7 @@ from elastocal.model.manipulator import Model
 from elastocal.planning.candidates import draw, joint_space
 from elastocal.planning.checkpoint import Checkpoint, Stage, State
 from elastocal.planning.choices import Choice
-from elastocal.planning.conditions import Conditions
+from elastocal.planning.conditions import ScheduledEffects
 from elastocal.planning.criteria import CRITERIA
 from elastocal.planning.drift import Alias
 from elastocal.planning.exact_plan import (
@@ -460,7 +460,7 @@ class _Design:
             "plan.csv: keep its order, and record times"
         )
         rest, fewer = _without(whole, late, options)
-        self.conditions = Conditions(whole, rest), options.fixed
+        self.conditions = ScheduledEffects(whole, rest), options.fixed
         return rest, fewer
 
     def run(self) -> Plan:
