@@ -51,7 +51,7 @@ def clocked(execution: Execution) -> Execution:
 
 
 @dataclass(frozen=True)
-class Conditions:
+class ScheduledEffects:
     """The model `whole` with its effects of time and approach, of which `without` lacks some."""
 
     whole: Model

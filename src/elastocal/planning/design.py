@@ -20,7 +20,7 @@ from elastocal.planning.arrangement import Selection, ordered
 from elastocal.planning.candidates import draw, joint_space
 from elastocal.planning.checkpoint import Checkpoint, State
 from elastocal.planning.choices import Choice
-from elastocal.planning.conditions import Conditions
+from elastocal.planning.conditions import ScheduledEffects
 from elastocal.planning.criteria import CRITERIA
 from elastocal.planning.doubts import OPEN, Place, gain_of, in_doubt
 from elastocal.planning.drift import left_by_drift
@@ -392,7 +392,7 @@ class _Design:
             "plan.csv: keep its order, and record times"
         )
         rest, fewer = _without(whole, late, options)
-        self.conditions = Conditions(whole, rest), options.fixed
+        self.conditions = ScheduledEffects(whole, rest), options.fixed
         return rest, fewer
 
     def run(self) -> Plan:
