@@ -99,7 +99,8 @@ class Result(Saved):
             >>> figure = ec.identify("cell.toml", "data.csv").plot("parameters")
             >>> figure.savefig("parameters.png")
         """
-        return _view(self).plot(self, kind, interactive)
+        pages = import_module(PAGES)
+        return _view(self).plot(self, kind, interactive, lambda: pages.figures_of(self))
 
     def to_dataframe(self) -> pd.DataFrame:
         """The result's main table as a pandas data frame; units stand in the column names.

@@ -32,7 +32,7 @@ from elastocal.model.arm import given_force
 from elastocal.model.calibrated import CalibratedArm, given_arm
 from elastocal.model.effects import CATALOGUE
 from elastocal.model.manipulator import Model
-from elastocal.model.valued import Conditions, Valued, part_of, random_table, unstated_needs
+from elastocal.model.valued import Conditions, Valued, arm_with, random_table, unstated_needs
 from elastocal.units import Array
 
 SCHEMA = "elastocal/comparison/1"
@@ -217,7 +217,7 @@ def _compared(
     )
     conditions = Conditions()
     before, after = (
-        part_of(arm, [n for n, needs in unstated_needs(arm, conditions).items() if not needs])
+        arm_with(arm, [n for n, needs in unstated_needs(arm, conditions).items() if not needs])
         for arm in (old, new)
     )
     own = _own(before.model)

@@ -28,7 +28,7 @@ from elastocal.model.valued import (
     RECORDED,
     Conditions,
     Valued,
-    part_of,
+    arm_with,
     random_table,
     unstated_needs,
 )
@@ -127,7 +127,7 @@ def keep(calibrated: CalibratedArm, elastic: bool, conditions: Conditions) -> Ke
     instrument = tuple(name for name in chosen if CATALOGUE[name].of_the_measurement)
     unstated = unstated_needs(calibrated, conditions)
     stated = [name for name, needs in unstated.items() if not needs]
-    full = part_of(calibrated, stated)
+    full = arm_with(calibrated, stated)
     format: Format = "elastic" if elastic else "rigid"
     dropped = {}  # effects whose values no physical spring or body has, with the reason
     for name in full.effects if elastic else ():
@@ -137,7 +137,7 @@ def keep(calibrated: CalibratedArm, elastic: bool, conditions: Conditions) -> Ke
         name for name in stated if format in CATALOGUE[name].formats and name not in dropped
     ]
     omissions = [
-        Omission(name, dropped.get(name, ""), part_of(calibrated, set(stated) - {name}))
+        Omission(name, dropped.get(name, ""), arm_with(calibrated, set(stated) - {name}))
         for name in stated
         if name not in kept_names
     ]
@@ -145,7 +145,7 @@ def keep(calibrated: CalibratedArm, elastic: bool, conditions: Conditions) -> Ke
         if needs:
             missing = " and ".join(RECORDED.get(need) or option(OPTIONS[need]) for need in needs)
             omissions.append(Omission(name, f"no cost without {missing}", None))
-    exported = full if len(kept_names) == len(stated) else part_of(calibrated, kept_names)
+    exported = full if len(kept_names) == len(stated) else arm_with(calibrated, kept_names)
     if elastic:
         exported, changed = _as_springs(exported)
         omissions += [

@@ -133,7 +133,7 @@ def _step(name: str, result: Calibration, residual: Array, rng: np.random.Genera
 def _floor(result: Calibration) -> tuple[float | None, str]:
     """What repeats scatter, else what the stated noise gives."""
     observed = result.observations
-    code = places(observed)
+    code = places_read(observed)
     parts = result.residual.reshape(-1, observed.size)[:, :3]
     dof = len(parts) - int(code.max()) - 1
     if dof >= FEWEST_REPEATS:
@@ -147,7 +147,7 @@ def _floor(result: Calibration) -> tuple[float | None, str]:
     return None, ""
 
 
-def places(observed: Observations) -> NDArray[np.int64]:
+def places_read(observed: Observations) -> NDArray[np.int64]:
     """For each observation (N,) the number of its place: configuration, marker and load."""
     force = np.round(observed.table.force[observed.lead], 3)
     key = np.column_stack([observed.configuration, observed.table.marker[observed.lead], force])
@@ -157,7 +157,7 @@ def places(observed: Observations) -> NDArray[np.int64]:
 def pose_accuracy(observed: Observations, errors: Array) -> Array:
     """AP (places,) in m as ISO 9283 has it: how far the mean of the readings of one place lies from
     where it should, of errors (N, 3) in m."""
-    code = places(observed)
+    code = places_read(observed)
     mean = np.column_stack([np.bincount(code, e) for e in errors.T]) / np.bincount(code)[:, None]
     return np.asarray(np.linalg.norm(mean, axis=1))
 

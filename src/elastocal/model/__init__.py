@@ -22,7 +22,7 @@ ROOMS = {
     "rigid": "nominal_flange",
     "symbolic": "SymbolicArm configuration_rows",
     "urdf": "check_urdf read_urdf",
-    "valued": "Conditions Valued part_of random_table unstated_needs",
+    "valued": "Conditions Valued arm_with random_table unstated_needs",
 }
 __all__ = [name for names in ROOMS.values() for name in names.split()]
 __getattr__, __dir__ = loaded_on_demand(__name__, ROOMS)

@@ -68,7 +68,7 @@ def unstated_needs(calibrated: CalibratedArm, conditions: Conditions) -> dict[st
     }
 
 
-def part_of(calibrated: CalibratedArm, names: Collection[str]) -> Valued:
+def arm_with(calibrated: CalibratedArm, names: Collection[str]) -> Valued:
     """The calibrated model with the effects `names` alone."""
     cell = calibrated.model.cell
     spec = cell.model

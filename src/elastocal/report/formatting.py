@@ -170,7 +170,7 @@ class ShownTable:
     groups: dict[int, str] = field(default_factory=dict)
 
 
-def without(shown: ShownTable, *columns: int) -> ShownTable:
+def without_columns(shown: ShownTable, *columns: int) -> ShownTable:
     """The table without some columns."""
     kept = [k for k in range(len(shown.heads)) if k not in columns]
     heads, *rows = (tuple(row[k] for k in kept) for row in (shown.heads, *shown.rows))

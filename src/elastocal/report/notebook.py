@@ -316,17 +316,18 @@ class View:
     frame: Callable[[Any], pd.DataFrame]
     figures: Mapping[str, Drawn]
 
-    def plot(self, result: Any, kind: str | None, interactive: bool) -> Any:
-        """The figure `kind`: one of these, or one of the page's, which stand still.
+    def plot(
+        self, result: Any, kind: str | None, interactive: bool,
+        of_page: Callable[[], Mapping[str, Any]] = dict,
+    ) -> Any:  # fmt: skip
+        """The figure `kind`: one of these, or one `of_page`, by name, which stand still.
 
         Raises InputError for a kind that the result does not have.
         """
         chosen = next(iter(self.figures)) if kind is None else kind
         if chosen in self.figures:
             return self.figures[chosen](result, interactive)
-        from elastocal.report.page import figures_of
-
-        found = figures_of(result)
+        found = of_page()
         if chosen not in found:
             every = [*self.figures, *(name for name in found if name not in self.figures)]
             hint = did_you_mean(chosen, every)

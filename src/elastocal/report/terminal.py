@@ -31,7 +31,7 @@ from elastocal.report.diagnosis_view import (
     pair_rows,
     untested_rows,
 )
-from elastocal.report.formatting import ShownTable, capital, length, without
+from elastocal.report.formatting import ShownTable, capital, length, without_columns
 from elastocal.report.identification_view import (
     ParameterRow,
     Truth,
@@ -108,7 +108,7 @@ def print_comparison(console: Console, c: Comparison) -> None:
     console.print()
     shown = change_rows(c)
     if console.width < NARROW_FOR_BOTH:
-        shown = without(shown, 1, 2)
+        shown = without_columns(shown, 1, 2)
     console.print(table_of("Parameter by parameter", shown))
 
 
@@ -335,7 +335,7 @@ def print_diagnosis(console: Console, d: Diagnosis, kinds: Sequence[str]) -> Non
     alone = " one at a time" if d.groups else ""
     title = f"Candidates{alone}, the best {len(best.rows) - 2} of {len(d.candidates)}"
     if console.width < NARROW_FOR_SETTINGS or not any(row[-1] for row in best.rows):
-        best = without(best, len(best.heads) - 1)
+        best = without_columns(best, len(best.heads) - 1)
     console.print(table_of(title, best))
     console.print(
         Text(
@@ -368,7 +368,7 @@ def _tables_of_causes(console: Console, d: Diagnosis) -> Iterable[Table | Text]:
         )
     if at.rows:
         # What it is as effects stands in the table of parameters too.
-        yield table_of("Place by place", without(at, 2) if console.width < WIDE else at)
+        yield table_of("Place by place", without_columns(at, 2) if console.width < WIDE else at)
     if fields.rows:
         yield table_of("Corrections without a name", fields)
 
