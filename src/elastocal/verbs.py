@@ -15,7 +15,7 @@ from typing import TYPE_CHECKING, Any, Literal, TypeAlias, TypeVar
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from elastocal.cell.plan_wishes import Motion, TargetBox, TargetPath, TargetPose
+from elastocal.cell.plan_wishes import Freedom, Motion, TargetBox, TargetPath, TargetPose
 from elastocal.cell.work_cell import Cell
 from elastocal.errors import InputError, option, require
 from elastocal.measurements import Measurements
@@ -80,6 +80,7 @@ def design(
     test_box: tuple[ArrayLike, ArrayLike] | TargetBox | None = None,
     elsewhere: float | None = None,
     elsewhere_cap: float | None = None,
+    choose: Freedom | None = None,
     motion: Motion | None = None,
     load_changes: int | None = None,
     reference_every: int | None = None,
@@ -133,6 +134,7 @@ def design(
         elsewhere_cap: By how much the error at the test poses may exceed the least, as in 0.05,
             for as little error all over the joint ranges as can be had; default 0.05 where no
             test poses are stated, else 0.
+        choose: Boxes in which markers, load point and tracker may still be placed before.
         motion: How the arm moves between poses, which decides their order.
         load_changes: How often the load may be hung, exchanged or taken off; default as rarely as
             can be. More of them keep a drift further apart from what the loads show.

@@ -148,7 +148,7 @@ OPTIONS = {
     "curve of nothing": (("--curve", "0,3"), 2, ("curve", "0, 3")),
     "curve beyond the candidates": (("--curve", "3,99"), 2, ("99 poses", "60 candidates")),
     "target in µm for D": (
-        ("--criterion", "D", "--target", "9"), 2, ("test_pose, G and I", "not with D"),
+        ("--criterion", "D", "--target", "9"), 2, ("test_pose, robust, G and I", "not with D"),
     ),
     "target that cannot be met": (
         ("--target", "0.01"), 1,

@@ -185,8 +185,8 @@ def test_distances_and_poses_need_their_own_sigma():
     ("matrix", "message"),
     [
         (np.eye(35), r"the covariance is \(35, 35\), but there are 36 rows"),
-        (np.eye(36) + np.eye(36, k=1), "must be finite and symmetric"),
-        (np.diag([np.nan, *np.ones(35)]), "must be finite and symmetric"),
+        (np.eye(36) + np.eye(36, k=1), "is not finite and symmetric"),
+        (np.diag([np.nan, *np.ones(35)]), "is not finite and symmetric"),
         (np.diag([-1.0, *np.ones(35)]), "not positive definite; check what states it"),
         (np.ones((36, 36)), "not positive definite"),
     ],

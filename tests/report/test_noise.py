@@ -41,7 +41,7 @@ from elastocal.report.method_and_noise import (
 from elastocal.report.page import page_of
 from elastocal.report.terminal import print_result
 
-MISFIT = LackOfFit(F=9.31, p=2e-9, dof_between=30, dof_pure=200)
+MISFIT = LackOfFit(F=9.31, p=2e-9, dof_between=30, dof_pure=60)
 AXES = tuple(NoiseSize(n, v * 1e-6) for n, v in (("x", 12.0), ("y", 31.4), ("rz", 5.0)))
 TRIED = (Trial("independent", 1, -90.0), Trial("axis+configuration", 4, -104.25))
 NONE = Noise("none", "")
@@ -135,7 +135,7 @@ def test_lack_of_fit_says_what_follows_for_the_intervals(case: Any) -> None:
         assert text is not None
         assert "include it" in text
         assert "too narrow" not in text
-        assert "F = 9.31 on 30 and 200 degrees of freedom, p < 1e-6" in (text)
+        assert "F = 9.31 on 30 and 60 degrees of freedom, p < 1e-6" in (text)
         assert "does not come back" in text.replace("\n", " ")
     assert repeats_line(changed(case.result, {"lack_of_fit": None})) is None
 
@@ -269,7 +269,7 @@ def test_names_from_the_result_are_text(noisy: Any, no_figures: None) -> None:
 def test_without_residuals_the_page_has_no_distribution(case: Any) -> None:
     nothing = changed(case.result, residual=np.zeros_like(case.result.residual), residual_rms=0.0)
     page = page_of(changed(nothing, residual_summary=None))
-    assert page.count("<figure>") == 8
+    assert page.count("<figure>") == 10
     assert "Histograms by group" not in page
     assert noise_model_line(changed(case.result, {"sizes": (), "reason": None})) is None
 

@@ -12,7 +12,7 @@ ROOMS = {
         "Robot Tool Tracker Unsteadiness"
     ),
     "file_keys": "rotation_from_rpy table_of",
-    "plan_wishes": "DesignSpec Motion TargetBox TargetPath TargetPose",
+    "plan_wishes": "DesignSpec Freedom Motion TargetBox TargetPath TargetPose",
     "work_cell": "Cell read_cell",
     "workspace_rules": "CarriedBody HalfSpace HangingLoad Shape Solid Visibility Workspace",
 }
