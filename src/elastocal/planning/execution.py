@@ -422,8 +422,13 @@ def _against_drift(
     begun = in_turns(tour, load, sequence)
     tries = [balanced(begun, load, clock, seed + k, STEPS, HOT) for k in range(TRIES)]
     new, rounds = min(tries, key=clock.price), 0
-    while moves.check(new, costs):
+    again = 0
+    while (blocked := moves.check(new, costs)) or (not clock.possible(new) and again < TRIES):
         progress(f"order of execution against drift: {moves.checked} moves checked")
+        if not blocked:  # the ways around take too long: another order, with what they are known
+            again, rounds = again + 1, 0
+            new = balanced(new, load, clock, seed + TRIES + again, STEPS, HOT / 2)
+            continue
         rounds += 1
         costs = moves.costs()
         clock = clock.at(costs)

@@ -251,7 +251,7 @@ def test_a_copy_in_another_process_judges_alike():
 
 
 def test_a_cell_without_rules_lets_all_pass_within_the_limits():
-    rules = Feasibility(cell(Workspace()), KR270_CHAIN)
+    rules = Feasibility(cell(Workspace(mounting_plane=False)), KR270_CHAIN)
     assert rules.check(kr270_poses(50), DOWN).ok.all()
     assert rules.paths_free(kr270_poses(5), kr270_poses(5, 1), True).all()
 

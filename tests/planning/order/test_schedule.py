@@ -4,13 +4,14 @@ from itertools import pairwise
 
 import numpy as np
 import pytest
-from hypothesis import given, settings
+from hypothesis import assume, given, settings
 from hypothesis import strategies as st
 from support.discs import Discs, best_time
 
 from elastocal.cell.plan_wishes import Motion
 from elastocal.errors import InputError, InsufficientDataError
 from elastocal.planning import schedule
+from elastocal.planning.moves import Unreachable
 
 BOTH = np.array([[0.0, 0, 0], [0, 0, -100.0]])
 LIMITS = (np.full(2, -3.0), np.full(2, 3.0))
@@ -91,9 +92,12 @@ def test_every_move_driven_is_free_and_every_reading_is_made_once(seed, at_home,
     q = poses(seed, 7, checker)
     home = np.array([-2.0, -2.0]) if at_home else None
     motion = Motion(home=home, both_directions=both, overshoot=0.03, speed=np.array([0.5, 2.0]))
-    execution = schedule(
-        q, motion, checker, loads=forces, limits=LIMITS, via=CORNERS, iterations=300
-    )
+    try:
+        execution = schedule(
+            q, motion, checker, loads=forces, limits=LIMITS, via=CORNERS, iterations=300
+        )
+    except Unreachable:
+        assume(False)  # discs all around a pose: rare, or hypothesis complains
     moves = driven(execution, q, forces)
     assert all(checker.free(a, b, loaded) for a, b, loaded in moves)
     assert execution.travel == pytest.approx(travelled(moves, motion.speed), abs=1e-9)

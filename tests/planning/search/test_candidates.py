@@ -37,7 +37,7 @@ def test_same_seed_same_candidates_whatever_the_jobs(case: Build) -> None:
 
 
 def test_every_joint_is_covered_evenly(case: Build) -> None:
-    arm = case()
+    arm = case(Workspace(mounting_plane=False))
     q = arm.draw(CHUNK).q
     lower, upper = arm.space.bounds(0)
     unit = (q - lower) / (upper - lower)
@@ -68,7 +68,7 @@ def test_only_feasible_poses_and_all_tries_counted(case: Build) -> None:
 
 
 LOADS = np.array([[0.0, 0.0, -20.0], [0.0, 0.0, -200.0]])
-WEAK = Workspace(torque_limits=(1e3, 150.0, 150.0, 150.0))
+WEAK = Workspace(torque_limits=(1e3, 150.0, 150.0, 150.0), mounting_plane=False)
 
 
 def test_a_chosen_load_is_one_that_the_pose_bears(case: Build) -> None:

@@ -12,6 +12,7 @@ import numpy as np
 import pytest
 
 from elastocal.cell.arm_description import PolarNoise, Tracker
+from elastocal.cell.workspace_rules import Workspace
 from elastocal.planning import (
     Goal,
     LocalSearch,
@@ -103,7 +104,7 @@ def search_at(arm: Any, q: Array, **changes: Any) -> LocalSearch:
 
 
 def test_ends_are_stationary_within_the_limits(case: Build) -> None:
-    arm = case()
+    arm = case(Workspace(mounting_plane=False))
     starts = some_poses(arm, 6)
     search, goal = search_at(arm, starts[0]), Coupling()
     lower, upper = arm.space.bounds(0)

@@ -78,6 +78,7 @@ def test_bounds_on_the_pose_are_the_rules_themselves(case: Build) -> None:
         ),
         torque_limits=(50.0, 180.0, 120.0, 60.0),
         self_collision=False,
+        mounting_plane=False,
     )
     tracker = Tracker(position=np.array([0.5, 2.0, 0.6]))
     arm = case(workspace, tracker=tracker, observe="position")
