@@ -280,7 +280,12 @@ def load(sources: Sources) -> ModuleType:
             loader = SourceFileLoader(name, str(folder / "study.py"))
             module = module_from_spec(cast(ModuleSpec, spec_from_loader(name, loader)))
             sys.modules[name] = module  # dataclasses and pickle look a class's module up there
-            calling(folder, "importing study.py", lambda: loader.exec_module(module))
+            # No bytecode in the user's folder: it would be left, half written, by a kill.
+            before, sys.dont_write_bytecode = sys.dont_write_bytecode, True
+            try:
+                calling(folder, "importing study.py", lambda: loader.exec_module(module))
+            finally:
+                sys.dont_write_bytecode = before
             _LOADED[sources.digest] = module
         return _LOADED[sources.digest]
 
