@@ -59,15 +59,15 @@ class Blocks:
 
     def pack(self, rows: Array) -> Array:
         """(N, size, k) → (C, M·size, k), zeros where there is no observation."""
-        k = rows.shape[2]
+        (C, M), k = self.member.shape, rows.shape[2]
         padded = np.concatenate([rows, np.zeros((1, self.size, k))])
-        return padded[self.member].reshape(len(self.member), -1, k)
+        return padded[self.member].reshape(C, M * self.size, k)
 
     def unpack(self, packed: Array) -> Array:
         """(C, M·size, k) → (N, size, k)."""
         C, M = self.member.shape
         rows = np.empty((self.n + 1, self.size, packed.shape[2]))
-        rows[self.member.ravel()] = packed.reshape(C * M, self.size, -1)
+        rows[self.member.ravel()] = packed.reshape(C * M, self.size, packed.shape[2])
         return rows[:-1]
 
     def pack_square(self, blocks: Array) -> Array:

@@ -29,6 +29,7 @@ from elastocal.diagnosis.hypotheses import (
     recorded,
 )
 from elastocal.diagnosis.noise_floor import NoiseValues, NoisyData, fit_noise
+from elastocal.errors import InsufficientDataError
 from elastocal.measurements import Measurements
 from elastocal.model.effects import CATALOGUE
 from elastocal.model.effects.loads import PayloadError
@@ -231,6 +232,12 @@ def diagnosis_data_of(
         B = np.concatenate([B, shift * LOAD_POINT_TOLERANCE], axis=2)
         effects += [h.name] * len(keys)
     used = np.abs(B).max(axis=(0, 1), initial=0.0) > 0
+    if not used.any():
+        raise InsufficientDataError(
+            f"{observed.table.source}: these readings show nothing that the model has: no "
+            "parameter moves a marker in any pose under these loads; check robot, poses and loads, "
+            "or measure others"
+        )
     B = B[:, :, used]
     joints = tuple(f"joint{i + 1}" for i in range(model.chain.n_joints))
     data = NoisyData(
