@@ -62,6 +62,8 @@ def test_names_are_not_taken_as_markup():
 def test_a_message_is_one_line(capsys):
     complain(f"a\nb{TITLE}\r\n{MARK}")
     assert capsys.readouterr().err == "elastocal: a b\\x1b]0;owned\\x07 \\u202egpj.exe\n"
+    complain("\u2028: no such file")
+    assert capsys.readouterr().err == "elastocal: \\u2028: no such file\n"
 
 
 def test_streams_without_the_letters_spell_them_out():

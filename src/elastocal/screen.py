@@ -163,7 +163,9 @@ def say(text: str, error: bool = False, end: str = "\n") -> None:
 
 def complain(message: str) -> None:
     """The one line on stderr by which a command says why it ended."""
-    say(f"elastocal: {' '.join(printable(line) for line in message.splitlines())}", error=True)
+    # splitlines() would swallow \u2028 and the like, which a name may be made of.
+    lines = map(printable, message.replace("\r\n", "\n").split("\n"))
+    say(f"elastocal: {' '.join(lines)}", error=True)
 
 
 def safe_console(**how: Any) -> Console:
