@@ -10,7 +10,6 @@ from __future__ import annotations
 from dataclasses import dataclass, replace
 
 import numpy as np
-from scipy import linalg
 
 from elastocal.errors import InsufficientDataError
 from elastocal.identification.start import fixed_and_free
@@ -25,11 +24,10 @@ from elastocal.planning.information import (
     minimal_set,
     observed_weights,
 )
-from elastocal.planning.plan import Plan, Scheduled, predicted
+from elastocal.planning.plan import Plan, Scheduled, predicted, remaining_rms
 from elastocal.planning.setup import Known, known_before
 from elastocal.planning.test_poses import TargetPoses, on_kept, prediction_rows
 from elastocal.simulation.simulate import expand_plan, simulate
-from elastocal.units import Array
 
 
 def clocked(execution: Execution) -> Execution:
@@ -86,9 +84,5 @@ class ScheduledEffects:
             return replace(plan, predicted=shown, scheduled=Scheduled(tuple(names), None, None))
         weight = np.sqrt(targets.weight)[:, None, None]
         R = np.asarray((weight * A).reshape(-1, A.shape[-1]))
-        errors = _rms(M, R), _rms(M[np.ix_(own, own)], R[:, own])
+        errors = remaining_rms(R, M), remaining_rms(R[:, own], M[np.ix_(own, own)])
         return replace(plan, predicted=shown, scheduled=Scheduled(tuple(names), *errors))
-
-
-def _rms(M: Array, R: Array) -> float:
-    return float(np.sqrt(np.sum(R.T * linalg.cho_solve(linalg.cho_factor(M), R.T))))

@@ -358,13 +358,13 @@ class Everywhere:
     ) -> Everywhere:  # fmt: skip
         """Of R (r, p) at both, the plan's information M (p, p), random plans' (n, p, p), and
         what a drift leaves of the plan's (p, p)."""
-        chance = [float(np.median([_rms(R, m) for m in random])) for R in (own, elsewhere)]
+        chance = [float(np.median([remaining_rms(R, m) for m in random])) for R in (own, elsewhere)]
         told = [value if np.isfinite(value) else None for value in chance]
-        drifting = _rms(own, left), _rms(elsewhere, left)
-        return cls(_rms(own, M), _rms(elsewhere, M), told[0], told[1], *drifting, share, cap)
+        still, drifting = ((remaining_rms(own, K), remaining_rms(elsewhere, K)) for K in (M, left))
+        return cls(*still, told[0], told[1], *drifting, share, cap)
 
 
-def _rms(R: Array, M: Array) -> float:
+def remaining_rms(R: Array, M: Array) -> float:
     """√tr(R M⁻¹ Rᵀ); inf where M (p, p) is singular."""
     try:
         V = linalg.cho_solve(linalg.cho_factor(M), R.T)
@@ -402,8 +402,8 @@ class Gain:
         as far as the readings show it, and what they leave possible.
         """
         part = np.ix_(own, own)
-        rms = _rms(R, before), _rms(R, after)
-        right = _rms(R[:, own], before[part]), _rms(R[:, own], after[part])
+        rms = remaining_rms(R, before), remaining_rms(R, after)
+        right = remaining_rms(R[:, own], before[part]), remaining_rms(R[:, own], after[part])
         if not np.isfinite(rms[0]):
             return cls(*rms, *right, np.inf)
         factor = linalg.cho_factor(before, lower=True)
