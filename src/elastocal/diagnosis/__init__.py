@@ -9,7 +9,7 @@ ROOMS = {
     ),
     "component_answer": "SumAnswer",
     "component_families": "catalogue_components driven_columns joint_curves line_families",
-    "component_search": "about_weights compared_score search_components with_returned",
+    "component_search": "about_sum compared_score search_components with_returned",
     "components": "Component FittedSum Sizes SumOfComponents fit_sum posed",
     "diagnose": "DiagnosisOptions write_extended_cell",
     "diagnosis": (

@@ -101,7 +101,7 @@ class SumAnswer:
         """
         data, before = self.found.data, self.before
         rows = _position_rows(data)
-        fitted = np.isin(before.fitted, [p.effect for p in before.base.model.parameters])
+        fitted = np.isin(before.fitted, before.base.model.names)
         B = before.data.X[rows][:, fitted]
         U, size, _ = linalg.svd(
             B / np.maximum(np.linalg.norm(B, axis=0), 1e-300), full_matrices=False
@@ -188,15 +188,24 @@ class SumAnswer:
     @property
     def decided(self) -> SumAnswer:
         """The same without effects that matter next to nothing and are probably something else: as
-        a cause they would be a guess, and what they correct is too little to be missed."""
+        a cause they would be a guess, and what they correct is too little to be missed.  What they
+        may take from others is in the shares still."""
         gone = [
             k for k in self._rivals
             if self._probability(k) < PROBABLE and abs(float(np.median(self.shares([k])))) < TOLD
         ]  # fmt: skip
         if not gone:
             return self
+        first = self.found.plain.X.shape[2]
+        deviation = np.sqrt(self.found.variances)
+        unnamed = []
+        for k in gone:
+            c, span = self.found.components[k], self.found.spans[k]
+            unnamed.append(
+                replace(c, columns=c.columns * deviation[span.start - first :][: c.width])
+            )
         found = exchanged(self.found.plain, self.found, [self.found.components[k] for k in gone])
-        return replace(self, found=found)
+        return replace(self, found=found, hidden=(*self.hidden, *unnamed))
 
     # Shares.
 

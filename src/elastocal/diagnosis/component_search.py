@@ -10,7 +10,7 @@ import numpy as np
 from scipy import linalg
 from scipy.special import expit
 
-from elastocal.diagnosis.baseline import fit_baseline
+from elastocal.diagnosis.baseline import from_centre, prior_deviations
 from elastocal.diagnosis.component_families import (
     FEW_POSES,
     catalogue_components,
@@ -38,7 +38,7 @@ from elastocal.diagnosis.effect_search import about
 from elastocal.diagnosis.evidence import ANOTHER, Prior, spectrum
 from elastocal.diagnosis.hypotheses import Hypothesis, judged_together
 from elastocal.diagnosis.model_set import Item, ModelSet, extended, packed_columns
-from elastocal.diagnosis.noise_floor import NoiseValues, NoisyData
+from elastocal.diagnosis.noise_floor import NoiseValues, NoisyData, project
 from elastocal.model.effects.base import index
 from elastocal.model.effects.gravity_sag import GravitySag, LinkWeights
 from elastocal.model.effects.smooth import JointCurve
@@ -58,7 +58,7 @@ def search_components(
     `chosen` is what the forward search found: its searched constants are tried as they are.
     """
     full = _with_together(dataset)
-    for weighed in (False, True):
+    for again in range(1 + TWICE):
         data = with_equal_noise(full)
         instrument = chosen.noise.of_instrument() if data.stated else _started(data)
         curves = list(joint_curves(full))
@@ -67,12 +67,10 @@ def search_components(
         progress(f"sizes of {len(curves) + len(others)} components at once")
         both = [*curves, *others]
         found = _swapped(full, data, fit_sum(data, both, instrument), both)
-        kept = (c.hypothesis for c in found.components)
-        weights = [h for h in kept if h is not None and isinstance(h.effect, LinkWeights)]
-        if weighed or not weights:
+        if again == TWICE or not any(isinstance(c.effect, LinkWeights) for c in found.components):
             break
         # A compliance that was fitted without weights is wrong, and so are their columns by it.
-        full = about_weights(full, weights)
+        full = about_sum(full, found)
     lined = False
     if len(full.blocks.member) <= FEW_POSES:
         # A curve takes up the lines of its joint as far as these few poses show them, and then
@@ -110,13 +108,30 @@ def search_components(
     return full, found, hidden_fellows(found, others)
 
 
-def about_weights(dataset: DiagnosisData, weights: Sequence[Hypothesis]) -> DiagnosisData:
-    """The data about a fit of the model with these weights in it."""
-    base = dataset.base
+def about_sum(dataset: DiagnosisData, found: FittedSum) -> DiagnosisData:
+    """The data about where the sum has the arm's own parameters and the weights of its links.
+
+    Not about a fit of these alone: a compliance that little else holds, and the moment that
+    deflects its joint, would take up what the other components explain, and the product of both
+    stand in the columns.
+    """
+    base, beta = dataset.base, project(found.data, found.noise).beta
+    x = dict(zip(base.model.names, base.x - from_centre(base), strict=True))
+    width = dict(zip(base.model.names, prior_deviations(base), strict=True))
+    own = zip(dataset.fitted, beta[: len(dataset.fitted)], strict=True)
+    x |= {name: x[name] + width[name] * b for name, b in own if name in x}
+    weights = []
+    for c, span in zip(found.components, found.spans, strict=True):
+        if (h := c.hypothesis) is not None and isinstance(c.effect, LinkWeights):
+            weights.append(h)
+            moved = beta[span] * dataset.sizes[h.key]
+            keyed = zip(h.parameters, moved, strict=True)
+            x |= {f"{h.where}.{p.key}": p.nominal + m for p, m in keyed}
     model = extended(base.model, [Item(h, np.zeros(0), 0.0) for h in weights])
-    start = dict(zip(base.model.names, base.x, strict=True))
-    x0 = np.array([start.get(p.name, p.nominal) for p in model.parameters])
-    return about(dataset, fit_baseline(model, base.observed.table, x0=x0), weights)
+    at_sum = np.array([x[name] for name in model.names])
+    readings = base.observed
+    residual = readings.value - model.predict(readings.table, at_sum, readings)
+    return about(dataset, replace(base, model=model, x=at_sum, residual=residual), weights)
 
 
 def _first(components: Sequence[Component]) -> list[Component]:

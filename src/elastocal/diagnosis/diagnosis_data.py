@@ -47,8 +47,8 @@ class DiagnosisData:
     """A baseline with the columns of all hypotheses, packed by configuration.
 
     `data` holds the residual at the prior's centre, linearised at the fit, the fitted columns
-    (scaled to their prior deviations) and noise shapes; `fitted` names the effect of each of these
-    columns, `load_point` (C, m, 3) is what a shift of the load point does, per m, None without a
+    (scaled to their prior deviations) and noise shapes; `fitted` names the parameter of each of these
+    columns (of the load point the effect), `load_point` (C, m, 3) is what a shift of the load point does, per m, None without a
     load.  `other_backlash` is the probability that play follows the backlash model that the base's
     model does not have.
     """
@@ -221,7 +221,7 @@ def diagnosis_data_of(
     own = np.array([around.names.index(name) for name in model.names], dtype=np.int64)
     at = around.regressor(observed.table, x, own, observed)
     width = prior_deviations(base)
-    effects = [p.effect for p in model.parameters]
+    names = list(model.names)
     B = at.B.reshape(len(observed.lead), observed.size, -1) * width
     residual = base.residual.reshape(-1, observed.size) + B @ (from_centre(base) / width)
     load_point = None
@@ -230,7 +230,7 @@ def diagnosis_data_of(
         shift = columns.observed(columns.of(h)[:, :, keys])
         load_point = blocks.pack(shift)
         B = np.concatenate([B, shift * LOAD_POINT_TOLERANCE], axis=2)
-        effects += [h.name] * len(keys)
+        names += [h.name] * len(keys)
     used = np.abs(B).max(axis=(0, 1), initial=0.0) > 0
     if not used.any():
         raise InsufficientDataError(
@@ -251,7 +251,7 @@ def diagnosis_data_of(
         left_out=blocks.absent,
         stated=base.stated is not None,
     )
-    fitted = tuple(e for e, u in zip(effects, used, strict=True) if u)
+    fitted = tuple(n for n, u in zip(names, used, strict=True) if u)
     return DiagnosisData(base, columns, tuple(hypotheses), data, fitted, load_point)
 
 

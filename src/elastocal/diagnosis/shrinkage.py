@@ -158,7 +158,8 @@ def _step(
 
 def _fitted_steps(dataset: DiagnosisData) -> Iterator[tuple[str, NoisyData]]:
     """The model's own effects, stage by stage, those of the later step held at nominal."""
-    stage, data = np.array([stage_of(effect) for effect in dataset.fitted]), dataset.data
+    data, effects = dataset.data, {p.name: p.effect for p in dataset.base.model.parameters}
+    stage = np.array([stage_of(effects.get(name, name)) for name in dataset.fitted])
     for k, name in ((1, "geometry"), (2, "compliance")):
         if (stage == k).any():
             free = stage <= k
