@@ -8,6 +8,7 @@ from dataclasses import dataclass
 from typing import Any
 
 from elastocal.diagnosis.diagnosis import (
+    NORMAL_95,
     Candidate,
     Curve,
     Diagnosis,
@@ -318,7 +319,6 @@ def extra_lines(extra: ExtraPlan) -> list[str]:
 
 
 Rows = list[tuple[str, ...]]
-HALF_WIDTHS = 1.959964  # standard deviations in half a 95 % interval
 
 
 def error_steps(d: Diagnosis) -> tuple[BudgetStep, ...]:
@@ -359,7 +359,7 @@ def added_parameter_rows(d: Diagnosis) -> ShownTable:
     rows: Rows = []
     for f in d.effects:
         for p in f.parameters:
-            rows.append((printable(p.name), *estimate(p.value, HALF_WIDTHS * p.std, p.unit)))
+            rows.append((printable(p.name), *estimate(p.value, NORMAL_95 * p.std, p.unit)))
         if f.settings:
             rows.append((effect_at(f), settings_text(f.settings), "", ""))
     return ShownTable(("parameter", "value", "± 95 %", "unit"), rows, (0, 3))
