@@ -47,7 +47,7 @@ ROOMS = {
         "SupportedFloor describe_faulty near_pairs near_repeats noise_rms pure_error returned "
         "smooth_scatter supported_floor"
     ),
-    "unknown": "Covariates Generic generic_blocks monomials waves",
+    "unknown": "Generic generic_blocks monomials waves wrenches",
     "verdict": "warnings",
 }
 __all__ = [name for names in ROOMS.values() for name in names.split()]
