@@ -79,7 +79,7 @@ def test_a_block_scores_as_the_columns_it_stands_for() -> None:
     for g in blocks()[::17]:
         C = packed_columns(dataset, Item(g, np.zeros(0), 0.0))
         expected = direct(C, grams.at).evidence()
-        np.testing.assert_allclose(grams.of_block(g).evidence(), expected, atol=1e-6)
+        np.testing.assert_allclose(grams.of(g).evidence(), expected, atol=1e-6)
 
 
 @pytest.mark.parametrize(
@@ -101,7 +101,7 @@ def test_a_planted_dependence_is_told_from_every_other(covariate: str, where: st
     moved = E @ amount * along[:, None]
     data = replace(dataset.data, r=dataset.data.r + dataset.pack(moved[:, :, None])[:, :, 0])
     grams = Grams(dataset, data, project(data, NOISE))
-    scores = [float(grams.of_block(g).evidence()[0]) for g in blocks()]
+    scores = [float(grams.of(g).evidence()[0]) for g in blocks()]
     best = blocks()[int(np.argmax(scores))]
     assert (best.covariate, best.where) == (covariate, where)
 

@@ -81,6 +81,18 @@ class DiagnosisData:
         return self.base.observed.lead
 
     @cached_property
+    def kind(self) -> IntArray:
+        """The marker and load of each observation (N,), numbered."""
+        each = np.column_stack([self.table.marker, self.table.force.round(6)])[self.lead]
+        return np.unique(each, axis=0, return_inverse=True)[1].ravel()
+
+    @cached_property
+    def repeated(self) -> IntArray:
+        """The pose, marker and load of each observation (N,), numbered."""
+        each = np.column_stack([self.table.configuration[self.lead], self.kind])
+        return np.unique(each, axis=0, return_inverse=True)[1].ravel()
+
+    @cached_property
     def noise(self) -> NoiseValues:
         """The most probable noise beside the fitted parameters alone."""
         return fit_noise(self.data)

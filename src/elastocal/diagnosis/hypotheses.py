@@ -6,6 +6,7 @@ import math
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property
+from typing import ClassVar
 
 import casadi as ca
 import numpy as np
@@ -75,6 +76,8 @@ class Hypothesis:
     where: str
     parameters: tuple[ParameterSpec, ...]
     settings: tuple[Setting, ...]
+
+    known: ClassVar[bool] = True
 
     @property
     def name(self) -> str:
@@ -703,11 +706,8 @@ class Constants:
 
     @classmethod
     def of(cls, model: Model, where: str, settings: dict[str, float]) -> Constants:
-        spec = model.cell.model
-        places = {place: dict(values) for place, values in spec.nominal.settings.items()}
-        places[where] = places.get(where, {}) | settings
-        nominal = replace(spec.nominal, settings=places)
-        return cls(model.chain, replace(model.cell, model=replace(spec, nominal=nominal)))
+        spec = replace(model.cell.model, nominal=model.cell.model.nominal.at(where, settings))
+        return cls(model.chain, replace(model.cell, model=spec))
 
 
 class RegressorDirection:

@@ -2,8 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Iterator, Mapping, Sequence
-from copy import copy
+from collections.abc import Iterable, Iterator, Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -24,8 +23,8 @@ from elastocal.diagnosis.model_set import (
     with_items,
 )
 from elastocal.diagnosis.noise_floor import SMALLEST_NOISE, NoiseValues, project
-from elastocal.diagnosis.unknown import Generic, generic_blocks
-from elastocal.diagnosis.verdict import TOO_NEAR, UNKNOWN_EFFECT
+from elastocal.diagnosis.unknown import UNKNOWN_EFFECT, Generic, generic_blocks
+from elastocal.diagnosis.verdict import TOO_NEAR
 from elastocal.errors import InputError, require
 from elastocal.measurements import Measurements
 from elastocal.model.effects.compliances import JointCompliance
@@ -35,17 +34,12 @@ from elastocal.units import Array
 # The noise that a diagnosis found, and the readings that it left out, in the campaign's terms.
 
 
-def noise_found(diagnosis: Diagnosis) -> NoiseValues:
-    """Factor, repeatability (joints,) and shared scatter."""
+def as_diagnosed(dataset: DiagnosisData, diagnosis: Diagnosis) -> tuple[DiagnosisData, NoiseValues]:
+    """The data, planned ones included, less the faulty readings, and the noise."""
     found = diagnosis.noise
+    faulty = np.isin(dataset.table.row[dataset.lead], [f.line for f in found.faulty])
     joint = np.maximum(found.repeatability, SMALLEST_NOISE)
-    return NoiseValues(found.stated_factor, joint, found.shared)
-
-
-def left_out(base: Baseline, diagnosis: Diagnosis) -> NDArray[np.bool_]:
-    """Which observations (N,) of the base, planned ones included, are faulty readings."""
-    lines = [f.line for f in diagnosis.noise.faulty]
-    return np.isin(base.observed.table.row[base.observed.lead], lines)
+    return dataset.without(faulty), NoiseValues(found.stated_factor, joint, found.shared)
 
 
 # Who the rivals are: the named sets of an ambiguous verdict, or what an unknown effect may be.
@@ -135,12 +129,6 @@ class Suspects:
         others = sum(p for key, (_, p) in self.known.items() if key not in ours)
         missed = d.probability_nothing + others + (0.0 if self.unknown else d.probability_unknown)
         return min(max(1 - missed, 0.0), 1.0)
-
-    def with_sets(self, sets: tuple[RivalSet, ...]) -> Suspects:
-        """The same with other sets of rivals."""
-        other = copy(self)
-        other.sets = sets
-        return other
 
     def _named_sets(self) -> Iterator[RivalSet]:
         """The sets that the diagnosis calls indistinguishable."""
@@ -233,19 +221,13 @@ def check_open(diagnosis: Diagnosis) -> None:
 NEAR, MOST = 3.76, 10
 
 
-def with_neighbours(
-    base: Baseline, diagnosis: Diagnosis, sets: tuple[RivalSet, ...],
-    known: Mapping[tuple[str, str], tuple[Item, float]],
-) -> tuple[RivalSet, ...]:  # fmt: skip
-    """The sets with what each of their rivals may also be.
-
-    `known`: the items of the diagnosis with their probabilities.
-    """
+def with_neighbours(base: Baseline, suspects: Suspects) -> tuple[RivalSet, ...]:
+    """The suspects' sets with what each of their rivals may also be."""
+    sets, known, diagnosis = suspects.sets, suspects.known, suspects.diagnosis
     if not sets:
         return ()
     hypotheses = [i.what for i, _ in known.values() if isinstance(i.what, Hypothesis)]
-    dataset = diagnosis_data_of(base, hypotheses)
-    dataset, noise = dataset.without(left_out(base, diagnosis)), noise_found(diagnosis)
+    dataset, noise = as_diagnosed(diagnosis_data_of(base, hypotheses), diagnosis)
     out = []
     for s in sets:
         near = dict.fromkeys(known, np.inf)
@@ -323,7 +305,7 @@ def _of_rival(
         return ()
     lists = [settings_to_try(dataset, what, rivals[a]) for a in others]
     tried = np.unique(np.vstack([each for each in lists if each is not None]), axis=0)
-    explained = np.array([grams[a].of_hypothesis(what, tried).explained(size) for a in others])
+    explained = np.array([grams[a].of(what, tried).explained(size) for a in others])
     short = explained.max(axis=1, keepdims=True) - explained
     near = np.flatnonzero((short <= NEARLY).any(axis=0))
     evenly = near[np.linspace(0, len(near) - 1, min(SETTINGS, len(near))).round().astype(int)]

@@ -11,8 +11,11 @@ from numpy.typing import NDArray
 
 from elastocal.diagnosis.diagnosis_data import DiagnosisData
 from elastocal.diagnosis.hypotheses import SCALES, EntryKey, recorded
+from elastocal.model.arm import Setting
 from elastocal.model.effects.base import Stage
 from elastocal.units import Array
+
+UNKNOWN_EFFECT = "unknown_effect"  # the name of all that has none
 
 # What an unknown effect may depend on: angles, time, torque, load, direction, force, view.
 
@@ -163,6 +166,12 @@ class Generic:
     source: Covariate | None = None
 
     scales: ClassVar[Array] = SCALES
+    known: ClassVar[bool] = False
+    settings: ClassVar[tuple[Setting, ...]] = ()
+
+    @property
+    def key(self) -> tuple[str, str]:
+        return UNKNOWN_EFFECT, self.where
 
     @property
     def label(self) -> str:

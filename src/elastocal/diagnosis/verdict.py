@@ -27,7 +27,6 @@ from elastocal.diagnosis.reading_faults import OutlierScreening
 # From scores to an answer: explained, ambiguous, unknown, or nothing significant.
 
 NAMED = 0.9  # probability from which an effect is named
-UNKNOWN_EFFECT = "unknown_effect"
 SET, LARGEST_SET = 0.95, 3  # probability that the named set holds, as far as so many can
 # Two known alternatives at distance d are told apart with probability Φ(d/2) at best: closer than
 # this, no evidence can be trusted to name one of them.
@@ -47,15 +46,10 @@ class Answer:
     @property
     def indistinguishable(self) -> tuple[tuple[EffectAt, ...], ...]:
         return tuple(
-            tuple(EffectAt(*_named(item)) for item, _ in rivals)
+            tuple(EffectAt(*item.key) for item, _ in rivals)
             for rivals in self.rivals
             if len(rivals) > 1
         )
-
-
-def _named(item: Item) -> tuple[str, str]:
-    """(effect, place); a block without a name is an unknown effect at its place."""
-    return item.key if item.known else (UNKNOWN_EFFECT, item.what.where)
 
 
 def judge(found: SelectedEffects) -> Answer:
@@ -212,7 +206,7 @@ def candidates(
     """Every hypothesis with its probability: in the slot where it is likeliest."""
     best: dict[tuple[str, str], Candidate] = {}
     distance = {
-        h.key: s.distance for h, s in zip(dataset.hypotheses, found.alone.scored, strict=True)
+        h.key: s.distance for h, s in zip(dataset.hypotheses, found.alone.scored, strict=False)
     }
     for k, slot in enumerate(found.slots):
         rivals = answer.rivals[k] if k < len(answer.rivals) else ()
@@ -241,7 +235,7 @@ def too_small(dataset: DiagnosisData, found: SelectedEffects) -> tuple[Untested,
     advice = "spread the poses over more of the work space, or raise the load"
     return tuple(
         Untested(*h.key, reason, advice)
-        for h, s in zip(dataset.hypotheses, found.alone.scored, strict=True)
+        for h, s in zip(dataset.hypotheses, found.alone.scored, strict=False)
         if s.distance < DETECTABLE and id(h) not in chosen
     )
 
