@@ -22,6 +22,7 @@ from elastocal.diagnosis.effect_search import SelectedEffects
 from elastocal.diagnosis.evidence import Scan, exceedance
 from elastocal.diagnosis.hypotheses import Hypothesis
 from elastocal.diagnosis.model_set import Item, ModelSet, distances, settings_of
+from elastocal.diagnosis.noise_floor import NoiseValues
 from elastocal.diagnosis.reading_faults import OutlierScreening
 
 # From scores to an answer: explained, ambiguous, unknown, or nothing significant.
@@ -241,11 +242,10 @@ def too_small(dataset: DiagnosisData, found: SelectedEffects) -> tuple[Untested,
 
 
 def warnings(
-    dataset: DiagnosisData, found: SelectedEffects, screened: OutlierScreening
+    dataset: DiagnosisData, found: SelectedEffects, screened: OutlierScreening, noise: NoiseValues
 ) -> tuple[str, ...]:
-    """What a reader should know before trusting the verdict."""
-    out = []
-    noise, data = found.chosen.noise, found.chosen.data
+    """What a reader should know before trusting the verdict, by the `noise` that the answer has."""
+    out, data = [], found.chosen.data
     if data.stated and not STATED_LOW < noise.factor < STATED_HIGH:
         out.append(
             f"the readings scatter {noise.factor:.2g} times as much as cell or table state; "
