@@ -24,6 +24,7 @@ from elastocal.report.causes_view import (
     assumed_order,
     cause_rows,
     curve_line,
+    curve_span,
     field_rows,
     headline_of_causes,
     place_rows,
@@ -47,7 +48,6 @@ from elastocal.report.formatting import (
     ShownTable,
     capital,
     counted,
-    display,
     estimate,
     faulty_rows,
     gap_table,
@@ -245,14 +245,8 @@ def _dependence(d: Diagnosis) -> list[str]:
 
 def _shape(curve: Curve) -> str:
     """How much the driver moves the entry, from its lowest to its highest point."""
-    moved = max(curve.y) - min(curve.y)
-    how_far = length(moved) if curve.y_unit == "m" else _in_unit(moved, curve.y_unit)
-    return f"{driver_name(curve.driver)} moves {driver_name(curve.entry)} by {how_far} in all."
-
-
-def _in_unit(value: float, unit: str) -> str:
-    shown, text = display(value, unit)
-    return f"{significant(shown)} {text}"
+    moved = f"{driver_name(curve.driver)} moves {driver_name(curve.entry)}"
+    return f"{moved} by {curve_span(curve)} in all."
 
 
 def _chance(d: Diagnosis) -> str:
