@@ -13,7 +13,7 @@ from elastocal.cell.work_cell import Cell
 from elastocal.diagnosis.components import Component, Family, FittedSum
 from elastocal.diagnosis.diagnosis_data import DiagnosisData
 from elastocal.diagnosis.evidence import Grams
-from elastocal.diagnosis.hypotheses import Constants, Hypothesis, RegressorDirection, recorded
+from elastocal.diagnosis.hypotheses import Hypothesis, RegressorDirection, cell_with, recorded
 from elastocal.diagnosis.noise_floor import NoiseValues, project
 from elastocal.diagnosis.unknown import Generic
 from elastocal.model.effects.base import Effect, Stage, index, turning_joints
@@ -60,10 +60,9 @@ def _direction(
     dataset: DiagnosisData, effect: DrivenEffect, where: str, settings: dict[str, float]
 ) -> tuple[Hypothesis, RegressorDirection]:
     """A driven effect as a hypothesis that searches nothing, and its direction."""
-    constants = Constants.of(dataset.base.model, where, settings)
-    parameters = effect.parameters(where, constants.chain, constants.cell)
-    h = Hypothesis(effect, where, parameters, ())
-    return h, RegressorDirection(h, constants)
+    chain, cell = dataset.base.model.chain, cell_with(dataset.base.model.cell, where, settings)
+    h = Hypothesis(effect, where, effect.parameters(where, chain, cell), ())
+    return h, RegressorDirection(h, chain, cell)
 
 
 # What is tried from the start: a curve of every joint, and every effect that needs no search.
@@ -86,10 +85,10 @@ def joint_curves(dataset: DiagnosisData) -> Iterator[Component]:
         longest = max(min(LONGEST, 2 * span), 2 * shortest)
         measured = {"curve_low_rad": float(q.min()), "curve_high_rad": float(q.max())}
         tried = {"curve_size_rad": 1.0, "curve_length_rad": shortest, **measured}
-        constants = Constants.of(model, where, tried)
+        cell = cell_with(model.cell, where, tried)
         yield Component(
             "angle", effect, where, driven_columns(dataset, effect, where, tried) * CURVE, CURVE,
-            waves=effect.course(where, constants.chain, constants.cell).waves,
+            waves=effect.course(where, model.chain, cell).waves,
             lengths=(math.log(shortest), math.log(longest)), settings=tuple(measured.items()),
             fellows=len(joints),
         )  # fmt: skip
@@ -364,8 +363,8 @@ def _family_component(dataset: DiagnosisData, family: LineFamily) -> Component:
     settings = {"spectrum_size_rad": 1.0, "spectrum_centre_rad": float((q.max() + q.min()) / 2)}
     for k in range(1, family.multiples + 1):
         settings |= {f"order_{k}": k * family.order, f"order_sd_{k}": k * family.sd}
-    constants = Constants.of(dataset.base.model, where, settings)
-    parameters = effect.parameters(where, constants.chain, constants.cell)
+    cell = cell_with(dataset.base.model.cell, where, settings)
+    parameters = effect.parameters(where, dataset.base.model.chain, cell)
     typical = [p.typical or 0.0 for p in parameters]
     columns = driven_columns(dataset, effect, where, settings) * np.array(typical) * LINE
     kept = tuple((key, v) for key, v in settings.items() if key.startswith("order"))
@@ -440,8 +439,8 @@ def _field_component(
 ) -> Component:
     settings = _field_settings(dataset, name, FIELD_LENGTHS[0])
     span = settings[f"field_{name}_high"] - settings[f"field_{name}_low"]
-    constants = Constants.of(dataset.base.model, where, settings)
-    (course,) = effect.courses(where, constants.chain, constants.cell)
+    cell = cell_with(dataset.base.model.cell, where, settings)
+    (course,) = effect.courses(where, dataset.base.model.chain, cell)
     columns = driven_columns(dataset, effect, where, settings) * MOTION
     low, high = (math.log(share * span) for share in FIELD_LENGTHS)
     ranges = {k: v for k, v in settings.items() if k.endswith(("low", "high"))}

@@ -22,6 +22,7 @@ from elastocal.diagnosis.hypotheses import (
     Hypothesis,
     RegressorDirection,
     SettingsGrid,
+    as_placed,
     compute_columns,
     grid_of,
     judged_together,
@@ -132,9 +133,8 @@ class DiagnosisData:
 
     @cached_property
     def directions(self) -> dict[tuple[str, str], RegressorDirection]:
-        base = self.base
-        driven = (h for h in self.hypotheses if h.driven)
-        return {h.key: RegressorDirection(h, base.model, base.x) for h in driven}
+        chain, cell = self.base.model.chain, as_placed(self.base.model, self.base.x)
+        return {h.key: RegressorDirection(h, chain, cell) for h in self.hypotheses if h.driven}
 
     @cached_property
     def grids(self) -> dict[tuple[str, str], SettingsGrid]:

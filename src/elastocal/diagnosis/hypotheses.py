@@ -663,51 +663,38 @@ def compute_columns(
     return Columns(base, B, places, full, x, shares)
 
 
-def _as_placed(model: Model, x: Array) -> Cell:
+def as_placed(model: Model, x: Array) -> Cell:
     """The model's cell with the base turned as it is at x (parameters,)."""
     vector = [v for p, v in zip(model.parameters, x, strict=True)
               if p.effect == BaseFrame.name and p.unit == "rad"]  # fmt: skip
     if len(vector) != 3:
         return model.cell
-    nominal = replace(
-        model.cell.model.nominal, base_rotation=Rotation.from_rotvec(vector).as_matrix()
-    )
+    turned = Rotation.from_rotvec(vector).as_matrix()
+    nominal = replace(model.cell.model.nominal, base_rotation=turned)
     return replace(model.cell, model=replace(model.cell.model, nominal=nominal))
 
 
-@dataclass(frozen=True)
-class Constants:
-    """A chain and a cell with further settings: all that the direction of a driven effect asks of
-    a model, which need not be assembled for it."""
-
-    chain: Chain
-    cell: Cell
-
-    @classmethod
-    def of(cls, model: Model, where: str, settings: dict[str, float]) -> Constants:
-        spec = replace(model.cell.model, nominal=model.cell.model.nominal.at(where, settings))
-        return cls(model.chain, replace(model.cell, model=spec))
+def cell_with(cell: Cell, where: str, settings: Mapping[str, float]) -> Cell:
+    """The cell with further constants of an effect: all that its direction asks of a model, which
+    need not be assembled for it."""
+    nominal = cell.model.nominal.at(where, settings)
+    return replace(cell, model=replace(cell.model, nominal=nominal))
 
 
 class RegressorDirection:
     """D(row, settings) = ∂u/∂p (d, k) of a driven hypothesis, from its CasADi expression.
 
-    With `x` (parameters,) of the model the base stands as fitted, else as the cell says; settings
-    of the effect are the cell's where the hypothesis searches none.
+    The base stands as the cell says; settings of the effect are the cell's where the hypothesis
+    searches none.
     """
 
-    def __init__(
-        self, hypothesis: Hypothesis, model: Model | Constants, x: Array | None = None
-    ) -> None:
-        effect = hypothesis.effect
+    def __init__(self, hypothesis: Hypothesis, chain: Chain, cell: Cell) -> None:
+        effect, where = hypothesis.effect, hypothesis.where
         assert isinstance(effect, DrivenEffect)
-        self.hypothesis = hypothesis
-        placed = _as_placed(model, x) if isinstance(model, Model) and x is not None else model.cell
-        self._arm = Arm(model.chain, placed)
+        self._arm = Arm(chain, cell)
         fitted = {s.key: ca.SX.sym(s.key) for s in hypothesis.parameters}
         searched = {s.key: ca.SX.sym(s.key) for s in hypothesis.settings}
-        where, cell = hypothesis.where, self._arm.cell
-        held = {} if searched else set_constants(effect, where, model.chain, cell)
+        held = {} if searched else set_constants(effect, where, chain, cell)
         u = effect.drive(self._arm, where, {**held, **fitted, **searched})
         D = ca.jacobian(u, ca.vertcat(*fitted.values()))
         constants = ca.vertcat(ca.SX.zeros(0, 1), *searched.values())
