@@ -82,7 +82,7 @@ def distances(base: Baseline, world: World, without: tuple[str, ...] = ()) -> li
 
 
 def _explained(grams: Grams, h: Hypothesis) -> float:
-    return float(grams.of_hypothesis(h).explained(float(h.scales.max())).max())
+    return float(grams.of(h).explained(float(h.scales.max())).max())
 
 
 def _beside(

@@ -98,7 +98,10 @@ def cell_meaning(cell: str) -> str:
 
 
 def plain(value: Any) -> Any:
-    """`value` with numpy numbers and arrays as plain ones, and None for numbers not finite."""
+    """`value` with dataclasses as their fields, numpy numbers and arrays as plain ones, and None
+    for numbers not finite."""
+    if hasattr(value, "__dataclass_fields__"):
+        value = vars(value)
     if isinstance(value, Mapping):
         return {str(key): plain(v) for key, v in value.items()}
     if isinstance(value, list | tuple):

@@ -111,7 +111,7 @@ def test_the_reader_is_told_that_the_law_is_open(doubt_of_it: float, told: bool)
     screened = OutlierScreening(one.data.faulty, one.data.faulty)
     for items, expected in (((Item(play, np.zeros(0), 0.0),), told), ((), False)):
         found = SelectedEffects(one, fit_set(one, items), (), (), plain, nothing, nothing)
-        texts = [t for t in warnings(one, found, screened) if "play of joint3" in t]
+        texts = [t for t in warnings(one, found, screened, plain.noise) if "play of joint3" in t]
         assert bool(texts) == expected
 
 

@@ -10,7 +10,7 @@ from support.cells import COMPLIANCE, kr270_cell, kr270_chain, random_table
 
 from elastocal.cell.arm_description import EffectChoice, Nominal
 from elastocal.diagnosis import Hypothesis, compute_columns, fit_baseline
-from elastocal.diagnosis.hypotheses import RegressorDirection
+from elastocal.diagnosis.hypotheses import RegressorDirection, as_placed
 from elastocal.measurements import with_moves
 from elastocal.model import Model
 from elastocal.model.effects import CATALOGUE
@@ -42,7 +42,7 @@ def test_columns_by_entry_and_drive_are_those_of_the_model_with_the_effect(
     table = replace(table, position=model.predict(table).reshape(-1, 3), distance=None)
     base = fit_baseline(model, table, x0=model.nominal)
     h = Hypothesis(effect, where, effect.parameters(where, chain, cell), ())
-    D = RegressorDirection(h, model, base.x)(table, np.zeros((1, 0)))[:, 0]
+    D = RegressorDirection(h, model.chain, as_placed(model, base.x))(table, np.zeros((1, 0)))[:, 0]
     E = compute_columns(base, []).entry(h.entry_key(model))
     whole = model.with_effects((*cell.model.effects, EffectChoice(name, where)))
     own = [k for k, p in enumerate(whole.parameters) if p.effect == name]

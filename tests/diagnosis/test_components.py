@@ -211,5 +211,5 @@ def test_what_went_under_a_larger_noise_comes_back() -> None:
     r = r + large.columns @ np.array([30.0, -20.0, 25.0]) + small.columns @ np.array([0.1])
     data, quiet = replace(data, r=r), NoiseValues.usual(3).of_instrument()
     found = fit_sum(data, [large], quiet, refit_noise=False)
-    again = with_returned(data, found, [large, small])
+    again = with_returned(found, [large, small])
     assert {id(c) for c in again.components} == {id(large), id(small)}

@@ -57,7 +57,7 @@ def test_every_setting_scores_as_the_columns_it_stands_for(
     at = project(made().data, NOISE)
     signs = np.random.default_rng(1).choice([-1.0, 1.0], (5, len(made().blocks.member)))
     h = hypothesis(name)
-    found = Grams(unused(), made().data, at, signs).of_hypothesis(h)
+    found = Grams(unused(), made().data, at, signs).of(h)
     values = made().grids[h.name, h.where].values
     assert len(found.lam) == len(values)
     for k in range(0, len(values), max(len(values) // 7, 1)):

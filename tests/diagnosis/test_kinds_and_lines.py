@@ -75,7 +75,7 @@ def test_many_of_a_kind_come_in_together_where_none_would_alone() -> None:
     stranger = fellow(0, columns[0], GearEccentricity)
     begun = fit_sum(data, some[1:4], QUIET, refit_noise=False)
     start = begun if len(begun.components) == 3 else together
-    assert len(completed(data, start, [*some, stranger]).components) == 6
+    assert len(completed(start, [*some, stranger]).components) == 6
 
 
 def test_what_cannot_be_seen_is_reckoned_with_where_its_fellows_are() -> None:

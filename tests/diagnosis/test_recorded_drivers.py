@@ -10,7 +10,7 @@ from support.cells import kr270_cell, kr270_chain, random_table
 from support.diagnoses import ECCENTRICITY
 
 from elastocal.diagnosis import Hypothesis, model_keys, with_recorded_drivers
-from elastocal.diagnosis.hypotheses import RegressorDirection
+from elastocal.diagnosis.hypotheses import RegressorDirection, as_placed
 from elastocal.model import Model
 from elastocal.model.effects import CATALOGUE
 
@@ -63,9 +63,9 @@ def test_the_vertical_of_a_driven_effect_is_that_of_the_fitted_base() -> None:
     spec = effect.parameters("joint1", model.chain, model.cell)
     h = Hypothesis(effect, "joint1", spec, ())
     x = model.nominal
-    upright = RegressorDirection(h, model, x)(table(), np.zeros((1, 0)))
+    upright = RegressorDirection(h, model.chain, as_placed(model, x))(table(), np.zeros((1, 0)))
     x[3:6] = [0.2, 0.0, 0.0]
-    tilted = RegressorDirection(h, model, x)(table(), np.zeros((1, 0)))
+    tilted = RegressorDirection(h, model.chain, as_placed(model, x))(table(), np.zeros((1, 0)))
     assert np.abs(upright).max() < 1e-12 < 0.1 < np.abs(tilted).max()
 
 

@@ -10,7 +10,6 @@ import pytest
 from support.diagnosis_data import campaign
 
 from elastocal.diagnosis import (
-    Covariates,
     DiagnosisData,
     Generic,
     Grams,
@@ -24,6 +23,7 @@ from elastocal.diagnosis import (
     packed_columns,
     project,
     waves,
+    wrenches,
 )
 from elastocal.measurements import Measurements
 
@@ -79,7 +79,7 @@ def test_a_block_scores_as_the_columns_it_stands_for() -> None:
     for g in blocks()[::17]:
         C = packed_columns(dataset, Item(g, np.zeros(0), 0.0))
         expected = direct(C, grams.at).evidence()
-        np.testing.assert_allclose(grams.of_block(g).evidence(), expected, atol=1e-6)
+        np.testing.assert_allclose(grams.of(g).evidence(), expected, atol=1e-6)
 
 
 @pytest.mark.parametrize(
@@ -101,7 +101,7 @@ def test_a_planted_dependence_is_told_from_every_other(covariate: str, where: st
     moved = E @ amount * along[:, None]
     data = replace(dataset.data, r=dataset.data.r + dataset.pack(moved[:, :, None])[:, :, 0])
     grams = Grams(dataset, data, project(data, NOISE))
-    scores = [float(grams.of_block(g).evidence()[0]) for g in blocks()]
+    scores = [float(grams.of(g).evidence()[0]) for g in blocks()]
     best = blocks()[int(np.argmax(scores))]
     assert (best.covariate, best.where) == (covariate, where)
 
@@ -120,7 +120,7 @@ def test_waves_follow_any_smooth_function_and_vanish_where_no_visit_is() -> None
 
 def test_monomials_are_every_product_up_to_the_second_degree() -> None:
     x = np.random.default_rng(0).normal(size=(50, 3))
-    made = monomials(x, 2)
+    made = monomials(x)
     assert made.shape == (50, 9)
     quadratic = x @ [1.0, -2, 0.5] + (x[:, 0] - 2 * x[:, 2]) ** 2 + x[:, 1] * x[:, 2]
     solution = np.linalg.lstsq(made, quadratic)[0]
@@ -131,7 +131,7 @@ def test_the_wrench_at_a_link_is_the_load_in_that_links_axes() -> None:
     """R_flangeᵀ F at the last link, largest component one; the load turns the flange a little."""
     dataset = data_without()
     model, table = dataset.base.model, dataset.base.observed.table
-    force, _ = list(Covariates.of(dataset).wrenches())[-1]
+    force, _ = list(wrenches(dataset))[-1]
     R = model.flange_poses(table, dataset.base.x)[:, :3, :3]
     expected = np.einsum("nji,nj->ni", R, table.force)
     expected /= np.abs(expected).max()

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping
+from dataclasses import replace
 from functools import partial
 from pathlib import Path
 from typing import Annotated, Any, Literal
@@ -361,6 +363,16 @@ class Nominal:
         listed = {k: list(v) if isinstance(v, tuple) else v for k, v in spring.items()}
         checked(CompensatorTable, listed, "Nominal: gravity_compensator")
 
+    def at(
+        self, place: str, settings: Mapping[str, float], sizes: Mapping[str, float] = {}
+    ) -> Nominal:
+        """The same with these constants, and sizes, of the effects at a place."""
+        both = (self.settings, settings), (self.sizes, sizes)
+        merged = (
+            known | ({place: {**known.get(place, {}), **new}} if new else {}) for known, new in both
+        )
+        return replace(self, **dict(zip(("settings", "sizes"), merged, strict=True)))
+
 
 @record
 class ModelSpec:
@@ -387,6 +399,13 @@ class ModelSpec:
     play_side: Literal["load", "load_and_approach"] = keyed(default="load")
     approach: Literal["column", "order"] = keyed(default="column")
     nominal: Nominal = keyed("a table", default_factory=Nominal)
+
+    def with_effect(
+        self, name: str, where: str, settings: Mapping[str, float], sizes: Mapping[str, float] = {}
+    ) -> ModelSpec:
+        """The same with one effect more, at these constants and of these sizes."""
+        nominal = self.nominal.at(where, settings, sizes)
+        return replace(self, effects=(*self.effects, EffectChoice(name, where)), nominal=nominal)
 
     def __post_init__(self) -> None:
         for i, choice in enumerate(self.effects):

@@ -22,7 +22,7 @@ ROOMS = {
         "Discrimination VisitPool campaign_of joined load_forces rows_of visit_pool_of"
     ),
     "effect_search": "ForwardSelection SelectedEffects Slot base_score is_far relinearised",
-    "evidence": "EntrySums Grams Prior Scan direct evidence_of exceedance scan",
+    "evidence": "EntrySums Grams Scan direct evidence_of exceedance log_prior_odds scan",
     "extra_poses": "expected expected_of_random fewest measuring_order plan_extra",
     "hypotheses": (
         "Hypothesis SettingsGrid change_times compute_columns grid_of judged_together model_keys "
@@ -47,7 +47,7 @@ ROOMS = {
         "SupportedFloor describe_faulty near_pairs near_repeats noise_rms pure_error returned "
         "smooth_scatter supported_floor"
     ),
-    "unknown": "Covariates Generic generic_blocks monomials waves",
+    "unknown": "Generic generic_blocks monomials waves wrenches",
     "verdict": "warnings",
 }
 __all__ = [name for names in ROOMS.values() for name in names.split()]

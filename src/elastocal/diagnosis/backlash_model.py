@@ -59,7 +59,7 @@ def _likeliest(dataset: DiagnosisData, noise: NoiseValues) -> ModelSet:
     """Play in the joint where it is likeliest, the noise fitted beside it."""
     play = [h for h in dataset.hypotheses if h.name == EFFECT]
     grams = Grams(dataset, dataset.data, project(dataset.data, noise))
-    evidence = [float(grams.of_hypothesis(h).evidence(h.scales).max()) for h in play]
+    evidence = [float(grams.of(h).evidence(h.scales).max()) for h in play]
     likeliest = play[int(np.argmax(evidence))]
     return fit_set(dataset, (Item(likeliest, np.zeros(0), 0.0),), noise)
 

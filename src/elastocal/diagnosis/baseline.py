@@ -114,17 +114,12 @@ class VisitPlaces:
         member = blocks.member
         visit = np.concatenate([blocks.visit, [-1]])[member]
         local = np.full(visit.shape, -1)
-        most = 1
-        for c, row in enumerate(visit):
-            known, first, inverse = np.unique(row, return_index=True, return_inverse=True)
-            order = np.argsort(np.argsort(np.where(known < 0, len(row), first)))
-            local[c] = np.where(row < 0, -1, order[inverse])
-            most = max(most, int(local[c].max()) + 1)
-        one_hot = (local[:, :, None] == np.arange(most)).astype(float)
-        example = np.full((len(member), most), -1, dtype=np.int64)
-        for v in range(most):
-            there = one_hot[:, :, v].any(axis=1)
-            example[there, v] = member[there, one_hot[there, :, v].argmax(axis=1)]
+        for c, row in enumerate(visit.tolist()):
+            number = {v: k for k, v in enumerate(dict.fromkeys(v for v in row if v >= 0))}
+            local[c] = [number.get(v, -1) for v in row]
+        one_hot = (local[:, :, None] == np.arange(max(local.max() + 1, 1))).astype(float)
+        first = np.take_along_axis(member, one_hot.argmax(axis=1), axis=1)
+        example = np.where(one_hot.any(axis=1), first, -1)
         return cls(np.repeat(one_hot, blocks.size, axis=1), example)
 
     def gather(self, values: Array) -> Array:

@@ -223,7 +223,8 @@ def _compared(
     own = _own(before.model)
     determined = [[n for n in arm.determined if n in own] for arm in (old, new)]
     table = random_table(before.model, conditions, poses, seed)
-    table = replace(table, force=np.resize(forces, (poses, 3)))
+    # Where the tool is predicted to be; what is read there counts for nothing.
+    table = replace(table, force=np.resize(forces, (poses, 3)), position=np.zeros((poses, 3)))
     names, z, V, first_order = _difference(old, new, before, after, determined, table)
     if not names:
         raise InsufficientDataError(
@@ -232,11 +233,13 @@ def _compared(
         )
     tool = _tool_model(before.model)
     at_tool = replace(table, marker=np.zeros_like(table.marker), marker_names=(POINT,))
-    x = _values(tool, before.values)
-    here = _positions(tool, at_tool, x)
     # The set-up of the old campaign for both.
     set_up = {name: value for name, value in before.values.items() if name not in own}
-    there = _positions(tool, at_tool, _values(tool, after.values | set_up))
+    x, moved = (
+        np.array([values[name] for name in tool.names])
+        for values in (before.values, after.values | set_up)
+    )
+    here, there = _positions(tool, at_tool, x), _positions(tool, at_tool, moved)
     settled = np.isfinite(here).all(axis=1) & np.isfinite(there).all(axis=1)
     if not settled.any():
         raise InsufficientDataError(
@@ -245,7 +248,7 @@ def _compared(
         )
     columns = np.array([tool.names.index(name) for name in names])
     rows = at_tool.take(np.flatnonzero(settled))
-    B = tool.regressor(_measured(rows), x, columns).B.reshape(len(rows.q), 3, len(names))
+    B = tool.regressor(rows, x, columns).B.reshape(len(rows.q), 3, len(names))
     chance = np.sqrt(np.einsum("nik,kl,nil->n", B, V, B))
     changes, p = _tested(old, new, names, z, V, level, np.sqrt((B**2).sum(axis=1).mean(axis=0)))
     return Comparison(
@@ -257,14 +260,6 @@ def _compared(
 def _own(model: Model) -> set[str]:
     """Parameters of the arm itself; base and markers are set up anew in each campaign."""
     return {p.name for p in model.parameters if not CATALOGUE[p.effect].registered}
-
-
-def _values(model: Model, values: dict[str, float]) -> Array:
-    return np.array([values[name] for name in model.names])
-
-
-def _measured(table: Measurements) -> Measurements:
-    return replace(table, position=np.zeros((len(table.q), 3)))
 
 
 def _tool_model(model: Model) -> Model:
@@ -319,7 +314,7 @@ def _difference(
     if before.model.cell.tool.markers:
         marked = tuple(before.model.cell.tool.markers)
         tables = [replace(t, marker_names=marked) for t in tables]
-    B = np.vstack([before.model.regressor(_measured(t), x).B for t in tables])
+    B = np.vstack([before.model.regressor(t, x).B for t in tables])
     index = {name: k for k, name in enumerate(before.model.names)}
     onto = _spanned(B, before.model.names, known, old, new)
     fitted = [n for n in before.model.names if n in new.determined]
@@ -373,8 +368,7 @@ def _tested(
         f"{old.source} and {new.source}: a variance is not positive; write both anew with identify",
     )
     std = np.sqrt(variance)
-    dofs = [_dof(arm, names) for arm in (old, new)]
-    shares = [np.maximum(_own_variance(arm, names), 0.0) for arm in (old, new)]
+    shares, dofs = zip(*(_variances_and_dof(arm, names) for arm in (old, new)), strict=True)
     both = sum(s**2 / nu for s, nu in zip(shares, dofs, strict=True))
     nu = np.divide(sum(shares) ** 2, both, out=np.full(len(z), np.inf), where=both > 0)
     p = 2 * stats.t.sf(np.abs(z) / std, np.maximum(nu, 1.0))
@@ -398,12 +392,9 @@ def _tested(
     return changes, float(stats.f.sf(together, len(z), smallest))
 
 
-def _own_variance(arm: CalibratedArm, names: list[str]) -> Array:
+def _variances_and_dof(arm: CalibratedArm, names: list[str]) -> tuple[Array, Array]:
+    """Of each parameter; an older result states no degrees of freedom: normal."""
     variance = dict(zip(arm.determined, np.diag(arm.covariance), strict=True))
-    return np.array([variance.get(name, 0.0) for name in names])
-
-
-def _dof(arm: CalibratedArm, names: list[str]) -> Array:
-    """Degrees of freedom of each parameter; an older result states none: normal."""
     stated = {str(entry["name"]): entry.get("dof") for entry in arm.entries}
-    return np.array([float(stated.get(name) or np.inf) for name in names])
+    dof = np.array([float(stated.get(name) or np.inf) for name in names])
+    return np.array([max(variance.get(name, 0.0), 0.0) for name in names]), dof

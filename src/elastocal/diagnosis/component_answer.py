@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 from collections import Counter
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property
 from typing import Any
@@ -22,6 +22,7 @@ from elastocal.diagnosis.diagnosis import (
     EffectGroup,
     FittedParameter,
     FoundEffect,
+    Interval,
     Location,
     StructureTest,
     Verdict,
@@ -76,13 +77,24 @@ class SumAnswer:
     def _spans(self) -> tuple[slice, ...]:
         """Of the components' coefficients and the hidden ones', the fitted columns not counted."""
         every = (*self.found.components, *self.hidden)
-        spans = spans_of(every, self._wide.X.shape[2])
-        return tuple(slice(s.start - self._own, s.stop - self._own) for s in spans)
+        return spans_of(every, sum(c.width for c in every))
 
     @cached_property
     def _own(self) -> int:
         """Number of the columns that were fitted before."""
         return self.dataset.data.X.shape[2]
+
+    @cached_property
+    def _rows(self) -> BoolArray:
+        """Rows (C, m) that count and are positions (or distances)."""
+        data = self.found.data
+        of_size = np.arange(data.r.shape[1]) % data.blocks.size < 3
+        return np.asarray(~data.left_out & of_size[None, :])
+
+    @property
+    def _axes(self) -> int:
+        """Rows of a reading among these."""
+        return min(self.found.data.blocks.size, 3)
 
     @cached_property
     def draws(self) -> Array:
@@ -99,8 +111,7 @@ class SumAnswer:
         They follow in the directions that the readings determine, not in what rounding leaves of
         parallel axes; what is only uncertain of the load's point is no fitted parameter.
         """
-        data, before = self.found.data, self.before
-        rows = _position_rows(data)
+        before, rows = self.before, self._rows
         fitted = np.isin(before.fitted, before.base.model.names)
         B = before.data.X[rows][:, fitted]
         U, size, _ = linalg.svd(
@@ -113,16 +124,14 @@ class SumAnswer:
     @cached_property
     def gram(self) -> Array:
         """G (Σ k, Σ k): w'Gw is the mean square in m² per reading that coefficients w leave."""
-        readings = len(self.moved) / min(self.found.data.blocks.size, 3)
-        return np.asarray(self.moved.T @ self.moved / readings)
+        return np.asarray(self.moved.T @ self.moved / (len(self.moved) / self._axes))
 
     @cached_property
     def _poses(self) -> tuple[IntArray, Array, Array]:
         """Rows that show what new poses may be like, how often each of their configurations is
         drawn among NEW_POSES (configurations, draws), and what the draws of all components leave
         of them (rows, draws)."""
-        data = self.found.data
-        rows = np.nonzero(_position_rows(data))[0]
+        rows = np.nonzero(self._rows)[0]
         known = np.unique(rows)
         some = known[np.linspace(0, len(known) - 1, min(MOST_POSES, len(known))).astype(int)]
         kept: IntArray = np.flatnonzero(np.isin(rows, some))
@@ -134,10 +143,10 @@ class SumAnswer:
     def _of_new_poses(self, left: Array) -> Array:
         """Mean square (draws,) per reading in a set of new poses of what is left (rows, draws)."""
         kept, drawn, _ = self._poses
-        rows = np.nonzero(_position_rows(self.found.data))[0][kept]
+        rows = np.nonzero(self._rows)[0][kept]
         starts = np.flatnonzero(np.diff(rows, prepend=-1))
         each = np.add.reduceat(left**2, starts, axis=0)
-        count = np.diff(np.append(starts, len(rows))) / min(self.found.data.blocks.size, 3)
+        count = np.diff(np.append(starts, len(rows))) / self._axes
         return np.asarray((drawn * each).sum(axis=0) / (drawn * count[:, None]).sum(axis=0))
 
     def squares(self, members: Sequence[int]) -> Array:
@@ -201,10 +210,9 @@ class SumAnswer:
         unnamed = []
         for k in gone:
             c, span = self.found.components[k], self.found.spans[k]
-            unnamed.append(
-                replace(c, columns=c.columns * deviation[span.start - first :][: c.width])
-            )
-        found = exchanged(self.found.plain, self.found, [self.found.components[k] for k in gone])
+            own = deviation[span.start - first : span.stop - first]
+            unnamed.append(replace(c, columns=c.columns * own))
+        found = exchanged(self.found, [self.found.components[k] for k in gone])
         return replace(self, found=found, hidden=(*self.hidden, *unnamed))
 
     # Shares.
@@ -212,9 +220,7 @@ class SumAnswer:
     @cached_property
     def components(self) -> tuple[ComponentShare, ...]:
         """One for each kind of dependence at each place, the largest first."""
-        groups: dict[tuple[str, str], list[int]] = {}
-        for k, c in enumerate(self.found.components):
-            groups.setdefault((c.family, c.where), []).append(k)
+        groups = self._by(lambda c: (c.family, c.where))
         rows = [self._share(family, where, own) for (family, where), own in groups.items()]
         return tuple(sorted(rows, key=lambda row: -row.share))
 
@@ -225,34 +231,40 @@ class SumAnswer:
             if (c.family, c.where) == (family, where)
         ]  # fmt: skip
         everything = [*members, *unseen]
-        share, rms = self.shares(everything), np.sqrt(self.squares(everything))
-        low, high = np.quantile(share, [0.05, 0.95]).tolist()
+        rms = np.sqrt(self.squares(everything))
         low95, high95 = np.quantile(rms, [0.025, 0.975]).tolist()
         return ComponentShare(
             family, where, tuple(dict.fromkeys(c.effect.name for c in chosen)),
-            float(np.median(share)), (low, high), float(np.median(rms)), (low95, high95),
-            max(self._there(k) for k in members), any(c.named for c in chosen),
+            *self._share_with_ends(everything), float(np.median(rms)), (low95, high95),
+            max(map(self._there, members)), any(c.named for c in chosen),
         )  # fmt: skip
 
     @cached_property
     def groups(self) -> tuple[EffectGroup, ...]:
         """One for each effect at all its places, lines and curves of joints as one."""
-        kinds: dict[str, list[int]] = {}
-        for k, c in enumerate(self.found.components):
-            if c.named:
-                kinds.setdefault(GEARS if _of_gear(c) else c.effect.name, []).append(k)
+        kinds = self._by(lambda c: c.named and (GEARS if _of_gear(c) else c.effect.name))
         return tuple(sorted((self._group(*item) for item in kinds.items()), key=lambda g: -g.share))
 
     def _group(self, name: str, members: list[int]) -> EffectGroup:
-        share = self.shares(members)
-        low, high = np.quantile(share, [0.05, 0.95]).tolist()
         chosen = [self.found.components[k] for k in members]
         places = tuple(sorted({c.where for c in chosen}))
         effects = tuple(dict.fromkeys(c.effect.name for c in chosen))
-        fall = self._reduction(members)
-        return EffectGroup(
-            name, places, effects, float(np.median(share)), (low, high), fall.reduction, fall.ci90
-        )
+        share, fall = self._share_with_ends(members), self._reduction(members)
+        return EffectGroup(name, places, effects, *share, fall.reduction, fall.ci90)
+
+    def _share_with_ends(self, members: Sequence[int]) -> tuple[float, Interval]:
+        """Median and 90 % interval of a share."""
+        share = self.shares(members)
+        low, high = np.quantile(share, [0.05, 0.95]).tolist()
+        return float(np.median(share)), (low, high)
+
+    def _by(self, key: Callable[[Component], Any]) -> dict[Any, list[int]]:
+        """The components' numbers by what `key` says of each; without those that it denies."""
+        groups: dict[Any, list[int]] = {}
+        for k, c in enumerate(self.found.components):
+            if own := key(c):
+                groups.setdefault(own, []).append(k)
+        return groups
 
     # How far the gap falls.
 
@@ -261,9 +273,8 @@ class SumAnswer:
         """Mean square in m² per reading that the fit itself is uncertain by at poses left out."""
         V = covariance(self.found.data, self.found.noise)
         uncertain = np.linalg.inv(self.at.P) - V
-        rows = _position_rows(self.found.data)
-        each = np.diagonal(uncertain, axis1=1, axis2=2)[rows]
-        return float(each.sum() / (len(each) / min(self.found.data.blocks.size, 3)))
+        each = np.diagonal(uncertain, axis1=1, axis2=2)[self._rows]
+        return float(each.sum() / (len(each) / self._axes))
 
     def _reduction(self, members: Sequence[int]) -> Shrinkage:
         """Fraction by which the noise-free error of new poses falls by these components.
@@ -327,15 +338,13 @@ class SumAnswer:
         return tuple(s for s in sets if len(s) > 1)
 
     @property
-    def unnamed_share(self) -> float:
-        """Median share of the gap of what has no name."""
-        members = [k for k, c in enumerate(self.found.components) if not c.named]
-        return float(np.median(self.shares(members))) if members else 0.0
+    def _unnamed(self) -> list[int]:
+        return [k for k, c in enumerate(self.found.components) if not c.named]
 
     @property
     def n_causes(self) -> int:
         """How many kinds of dependence at how many places."""
-        return len({(c.family, c.where) for c in self.found.components})
+        return len(self._by(lambda c: (c.family, c.where)))
 
     @property
     def without_names(self) -> tuple[FoundEffect, ...]:
@@ -346,23 +355,19 @@ class SumAnswer:
     @property
     def unnamed_probability(self) -> float:
         """Probability that something without a name is at work."""
-        members = [k for k, c in enumerate(self.found.components) if not c.named]
-        return max((self._probability(k) for k in members), default=0.0)
+        return max(map(self._probability, self._unnamed), default=0.0)
 
     def location(self, tests: Sequence[StructureTest]) -> Location:
         """Where the largest cause acts, the largest without a name where the verdict is open;
         what each stage contributes, and how surely anything acts at each stage and place."""
-        members = range(len(self.found.components))
-        at_stage: dict[Stage, list[int]] = {}
-        places: dict[str, float] = {}
-        for k in members:
-            c = self.found.components[k]
-            at_stage.setdefault(_stage_of(c), []).append(k)
-            places[c.where] = max(places.get(c.where, 0.0), self._there(k))
-        stages = {stage: max(map(self._there, own)) for stage, own in at_stage.items()}
+        at_stage, at_place = self._by(_stage_of), self._by(lambda c: c.where)
+        stages, places = (
+            {key: max(map(self._there, own)) for key, own in groups.items()}
+            for groups in (at_stage, at_place)
+        )
         shares = {stage: float(np.median(self.shares(own))) for stage, own in at_stage.items()}
-        open_ones = [k for k in members if not self.found.components[k].named]
-        chosen = open_ones if self.verdict == "unknown_effect" else list(members)
+        unknown = self.verdict == "unknown_effect"
+        chosen = self._unnamed if unknown else range(len(self.found.components))
         largest = max(chosen, key=lambda k: float(np.median(self.squares([k]))))
         c = self.found.components[largest]
         return Location(
@@ -372,7 +377,7 @@ class SumAnswer:
 
     @property
     def verdict(self) -> Verdict:
-        if self.unnamed_share > LARGE:
+        if self._unnamed and float(np.median(self.shares(self._unnamed))) > LARGE:
             return "unknown_effect"
         return "ambiguous" if self.indistinguishable else "explained"
 
@@ -387,10 +392,7 @@ class SumAnswer:
         return tuple(self._found_effects(named=False))
 
     def _found_effects(self, named: bool) -> Iterator[FoundEffect]:
-        at_place: dict[tuple[str, str], list[int]] = {}
-        for k, c in enumerate(self.found.components):
-            if c.named == named:
-                at_place.setdefault((c.effect.name, c.where), []).append(k)
+        at_place = self._by(lambda c: c.named == named and (c.effect.name, c.where))
         order = sorted(at_place.items(), key=lambda pair: -float(np.median(self.squares(pair[1]))))
         for (name, where), members in order:
             settings = self._settings(members)
@@ -536,9 +538,3 @@ def _falling(values: Mapping[Any, float]) -> dict[str, float]:
 
 def _of_gear(c: Component) -> bool:
     return c.family == "angle" and c.where.startswith("joint")
-
-
-def _position_rows(data: NoisyData) -> BoolArray:
-    """Rows (C, m) that count and are positions (or distances)."""
-    of_size = np.arange(data.r.shape[1]) % data.blocks.size < 3
-    return np.asarray(~data.left_out & of_size[None, :])

@@ -13,8 +13,8 @@ from elastocal.cell.work_cell import Cell
 from elastocal.diagnosis.components import Component, Family, FittedSum
 from elastocal.diagnosis.diagnosis_data import DiagnosisData
 from elastocal.diagnosis.evidence import Grams
-from elastocal.diagnosis.hypotheses import Constants, Hypothesis, RegressorDirection, recorded
-from elastocal.diagnosis.noise_floor import NoiseValues, NoisyData, project
+from elastocal.diagnosis.hypotheses import Hypothesis, RegressorDirection, cell_with, recorded
+from elastocal.diagnosis.noise_floor import NoiseValues, project
 from elastocal.diagnosis.unknown import Generic
 from elastocal.model.effects.base import Effect, Stage, index, turning_joints
 from elastocal.model.effects.driven import DrivenEffect
@@ -51,13 +51,18 @@ def driven_columns(
     dataset: DiagnosisData, effect: DrivenEffect, where: str, settings: dict[str, float]
 ) -> Array:
     """Packed columns (C, m, k) of a driven effect at these settings, per parameter."""
-    constants = Constants.of(dataset.base.model, where, settings)
-    parameters = effect.parameters(where, constants.chain, constants.cell)
-    direction = RegressorDirection(Hypothesis(effect, where, parameters, ()), constants)
+    h, direction = _direction(dataset, effect, where, settings)
     D = direction(dataset.table, np.zeros((1, 0)))[:, 0]
-    entry = effect.entry_at(where)
-    E = dataset.columns.entry((entry.name, effect.entered_at(where, constants.chain)))
-    return dataset.pack(E @ D)
+    return dataset.pack(dataset.columns.entry(h.entry_key(dataset.base.model)) @ D)
+
+
+def _direction(
+    dataset: DiagnosisData, effect: DrivenEffect, where: str, settings: dict[str, float]
+) -> tuple[Hypothesis, RegressorDirection]:
+    """A driven effect as a hypothesis that searches nothing, and its direction."""
+    chain, cell = dataset.base.model.chain, cell_with(dataset.base.model.cell, where, settings)
+    h = Hypothesis(effect, where, effect.parameters(where, chain, cell), ())
+    return h, RegressorDirection(h, chain, cell)
 
 
 # What is tried from the start: a curve of every joint, and every effect that needs no search.
@@ -80,10 +85,10 @@ def joint_curves(dataset: DiagnosisData) -> Iterator[Component]:
         longest = max(min(LONGEST, 2 * span), 2 * shortest)
         measured = {"curve_low_rad": float(q.min()), "curve_high_rad": float(q.max())}
         tried = {"curve_size_rad": 1.0, "curve_length_rad": shortest, **measured}
-        constants = Constants.of(model, where, tried)
+        cell = cell_with(model.cell, where, tried)
         yield Component(
             "angle", effect, where, driven_columns(dataset, effect, where, tried) * CURVE, CURVE,
-            waves=effect.course(where, constants.chain, constants.cell).waves,
+            waves=effect.course(where, model.chain, cell).waves,
             lengths=(math.log(shortest), math.log(longest)), settings=tuple(measured.items()),
             fellows=len(joints),
         )  # fmt: skip
@@ -153,7 +158,7 @@ def line_families(dataset: DiagnosisData, found: FittedSum) -> list[LineFamily]:
     What is not found yet counts as scatter of its joint, or as its curve: so a family is tried
     beside these, and in their place.
     """
-    beside = _grams(dataset, found.without_these(), found.noise)
+    beside = _beside(dataset, found, found.noise)
     out, now = [], beside.at.marginal
     for h in dataset.hypotheses:
         if not isinstance(h.effect, GearRipple):
@@ -165,14 +170,13 @@ def line_families(dataset: DiagnosisData, found: FittedSum) -> list[LineFamily]:
         lines = sum(len(c.settings) // 2 for c in own if isinstance(c.effect, GearSpectrum))
         if lines > MOST_FOUND:
             continue
-        tried = [_best(dataset, beside, h, 0.0, float(found.noise.joint[i]), ())]
+        tried = [_best(beside, h, 0.0, float(found.noise.joint[i]), ())]
         curves = tuple(c for c in own if isinstance(c.effect, JointCurve))
         for scatter in _less(found.noise, i) or ([found.noise.joint[i]] if curves else []):
             joint = found.noise.joint.copy()
             joint[i] = scatter
-            noise, data = replace(found.noise, joint=joint), found.without_these(curves)
-            grams = _grams(dataset, data, noise)
-            tried.append(_best(dataset, grams, h, grams.at.marginal - now, scatter, curves))
+            grams = _beside(dataset, found, replace(found.noise, joint=joint), curves)
+            tried.append(_best(grams, h, grams.at.marginal - now, scatter, curves))
         best = max(tried, key=lambda family: family.gain)
         if best.gain > HOPELESS:
             out.append(replace(best, component=_family_component(dataset, best)))
@@ -197,27 +201,26 @@ MOST_FOUND = MOST_LINES - 3
 
 
 def _best(
-    dataset: DiagnosisData, grams: Grams, h: Hypothesis, gain: float, scatter: float,
-    curves: tuple[Component, ...],
-) -> LineFamily:  # fmt: skip
+    grams: Grams, h: Hypothesis, gain: float, scatter: float, curves: tuple[Component, ...]
+) -> LineFamily:
     """The best family of a joint, of any number of multiples; `gain` is that of what it is in the
     place of."""
-    tried = MULTIPLES[:1] if len(dataset.blocks.member) > FEW_POSES else MULTIPLES
-    families = [_best_family(dataset, grams, h, m) for m in tried]
+    tried = MULTIPLES[:1] if len(grams.dataset.blocks.member) > FEW_POSES else MULTIPLES
+    families = [_best_family(grams, h, m) for m in tried]
     best = max(families, key=lambda family: family.gain)
     return replace(best, gain=best.gain + gain, scatter=float(scatter), instead_of=curves)
 
 
-def _best_family(dataset: DiagnosisData, grams: Grams, h: Hypothesis, m: int) -> LineFamily:
-    q = dataset.table.q[:, index(h.where)]
+def _best_family(grams: Grams, h: Hypothesis, m: int) -> LineFamily:
+    q = grams.dataset.table.q[:, index(h.where)]
     step = STEP / max(float(np.ptp(q)), 1e-3) / m
     orders = np.arange(LOWEST, HIGHEST / m, step)
     # An order of 10 to 20 is as probable as one of 100 to 200 beforehand.
     log_prior = -np.log(orders) - np.log((1 / orders).sum() * len(MULTIPLES))
-    each = _family_evidence(dataset, grams, h, orders, m) + log_prior
+    each = _family_evidence(grams, h, orders, m) + log_prior
     k = int(np.argmax(each))
     search = -float(log_prior[k])
-    order, sd, evidence = _refined(dataset, grams, h, float(orders[k]), m, step)
+    order, sd, evidence = _refined(grams, h, float(orders[k]), m, step)
     return LineFamily(h.where, order, m, evidence - search, sd, search)
 
 
@@ -278,10 +281,10 @@ def sought_anew(dataset: DiagnosisData, found: FittedSum, c: Component) -> Compo
         return None
     h = next(h for h in dataset.hypotheses if h.key == (GearRipple.name, c.where))
     scatter = float(found.noise.joint[index(c.where)])
-    grams = _grams(dataset, found.without_these((c,)), found.noise)
-    best = _best(dataset, grams, h, 0.0, scatter, ())
+    grams = _beside(dataset, found, found.noise, (c,))
+    best = _best(grams, h, 0.0, scatter, ())
     given = dict(c.settings)
-    own = _family_evidence(dataset, grams, h, np.array([given["order_1"]]), c.width // 4)[0]
+    own = _family_evidence(grams, h, np.array([given["order_1"]]), c.width // 4)[0]
     near = abs(best.order - given["order_1"]) < best.sd + given["order_sd_1"]
     if near or best.gain <= own - c.search:
         return None
@@ -322,15 +325,15 @@ def _lines_and_shifts(span: slice) -> tuple[IntArray, IntArray]:
 
 
 def _refined(
-    dataset: DiagnosisData, grams: Grams, h: Hypothesis, order: float, m: int, width: float
-) -> tuple[float, float, float]:  # fmt: skip
+    grams: Grams, h: Hypothesis, order: float, m: int, width: float
+) -> tuple[float, float, float]:
     """Lowest order of a family, its standard deviation and log evidence, sought within `width` of
     `order`: the curvature of the evidence says how well it is known."""
     for narrowed in width / 4.0 ** np.arange(3):
         trial = np.clip(order + np.linspace(-narrowed, narrowed, 17), LOWEST, HIGHEST / m)
-        order = float(trial[int(np.argmax(_family_evidence(dataset, grams, h, trial, m)))])
+        order = float(trial[int(np.argmax(_family_evidence(grams, h, trial, m)))])
     trial = np.linspace(-width, width, 33)
-    each = _family_evidence(dataset, grams, h, order + trial, m)
+    each = _family_evidence(grams, h, order + trial, m)
     evidence = float(each[16])
     # The parabola through the highest five points, or all that are nearly as high.
     near = np.abs(trial) <= max(np.abs(trial[each > evidence - 2.0]).min(initial=0.0), trial[18])
@@ -340,10 +343,9 @@ def _refined(
     return order, sd, evidence
 
 
-def _family_evidence(
-    dataset: DiagnosisData, grams: Grams, h: Hypothesis, orders: Array, m: int
-) -> Array:
+def _family_evidence(grams: Grams, h: Hypothesis, orders: Array, m: int) -> Array:
     """Log evidence (G,) of the families of m lines at `orders` (G,)."""
+    dataset = grams.dataset
     sums = grams.entry(h.entry_key(dataset.base.model))
     piece = max(1, PIECE // (sums.b.size * 2 * m))
     out = []
@@ -361,8 +363,8 @@ def _family_component(dataset: DiagnosisData, family: LineFamily) -> Component:
     settings = {"spectrum_size_rad": 1.0, "spectrum_centre_rad": float((q.max() + q.min()) / 2)}
     for k in range(1, family.multiples + 1):
         settings |= {f"order_{k}": k * family.order, f"order_sd_{k}": k * family.sd}
-    constants = Constants.of(dataset.base.model, where, settings)
-    parameters = effect.parameters(where, constants.chain, constants.cell)
+    cell = cell_with(dataset.base.model.cell, where, settings)
+    parameters = effect.parameters(where, dataset.base.model.chain, cell)
     typical = [p.typical or 0.0 for p in parameters]
     columns = driven_columns(dataset, effect, where, settings) * np.array(typical) * LINE
     kept = tuple((key, v) for key, v in settings.items() if key.startswith("order"))
@@ -377,48 +379,43 @@ def _family_component(dataset: DiagnosisData, family: LineFamily) -> Component:
 FIELD_LENGTHS = (0.25, 1.5)  # of the range of what a field follows
 
 
-def _grams(dataset: DiagnosisData, data: NoisyData, noise: NoiseValues) -> Grams:
+def _beside(
+    dataset: DiagnosisData, found: FittedSum, noise: NoiseValues, some: Sequence[Component] = ()
+) -> Grams:
+    """What scores columns beside all of a sum but some of its components."""
+    data = found.without_these(some)
     return Grams(dataset, data, project(data, noise))
 
 
-def fields(
-    dataset: DiagnosisData, data: NoisyData, noise: NoiseValues, taken: Sequence[Component],
-    most: int,
-) -> list[Component]:  # fmt: skip
-    """The smooth dependences without a name that explain most beside what is in `data`."""
+def fields(dataset: DiagnosisData, found: FittedSum, most: int) -> list[Component]:
+    """The smooth dependences without a name that explain most beside the sum."""
     effect, model = ResidualField(), dataset.base.model
     chain, cell = model.chain, model.cell
     follow = [w for w in turning_joints(chain) if np.ptp(dataset.table.q[:, index(w)]) > MOVED]
     if recorded(dataset.table, "time"):
         follow.append("time")
-    at, found = project(data, noise), []
-    known = {(c.where, c.follows) for c in taken}
+    beside, conspicuous = _beside(dataset, found, found.noise), []
+    known = {(c.where, c.follows) for c in found.components}
     for where in effect.places(chain, cell):
         if where.startswith("marker") and "time" not in follow:
             continue
         # Of one place at a time: what a large table's entries sum up to would fill the memory.
-        grams = Grams(dataset, data, at)
+        grams = Grams(dataset, beside.data, beside.at)
         for name in follow:
             own = where == name and where.startswith("joint")
             if own or (where, name) in known or (where.startswith("marker") and name != "time"):
                 continue
             coarse = _field(dataset, effect, where, name, FIELD_LENGTHS[0] * 2)
-            evidence = float(grams.of_block(coarse).evidence()[0])
+            evidence = float(grams.of(coarse).evidence()[0])
             if evidence > 3.0:
-                found.append((evidence, where, name))
-    best = sorted(found, reverse=True)[:most]
+                conspicuous.append((evidence, where, name))
+    best = sorted(conspicuous, reverse=True)[:most]
     return [_field_component(dataset, effect, where, name) for _, where, name in best]
 
 
-def _range(dataset: DiagnosisData, name: str) -> Array:
-    if name == "time":
-        assert dataset.table.time is not None
-        return dataset.table.time
-    return dataset.table.q[:, index(name)]
-
-
 def _field_settings(dataset: DiagnosisData, name: str, length: float) -> dict[str, float]:
-    x = _range(dataset, name)
+    x = dataset.table.time if name == "time" else dataset.table.q[:, index(name)]
+    assert x is not None  # a field follows what is recorded
     keys = ("size", "length", "low", "high")
     values = (1.0, length * float(np.ptp(x)), float(x.min()), float(x.max()))
     return {f"field_{name}_{key}": value for key, value in zip(keys, values, strict=True)}
@@ -429,10 +426,8 @@ def _field(
 ) -> Generic:
     """A field as a block, for a search: its direction at every visit."""
     settings = _field_settings(dataset, name, length)
-    constants = Constants.of(dataset.base.model, where, settings)
-    parameters = effect.parameters(where, constants.chain, constants.cell)
-    sd = np.array([p.typical for p in parameters])
-    direction = RegressorDirection(Hypothesis(effect, where, parameters, ()), constants)
+    h, direction = _direction(dataset, effect, where, settings)
+    sd = np.array([p.typical for p in h.parameters])
     D = direction(dataset.visit_table, np.zeros((1, 0)))[:, 0] * sd * MOTION
     D = D.reshape(*dataset.present.shape, *D.shape[1:]) * dataset.present[:, :, None, None]
     key = (effect.entry_at(where).name, (where,))
@@ -442,10 +437,10 @@ def _field(
 def _field_component(
     dataset: DiagnosisData, effect: ResidualField, where: str, name: str
 ) -> Component:
-    span = float(np.ptp(_range(dataset, name)))
     settings = _field_settings(dataset, name, FIELD_LENGTHS[0])
-    constants = Constants.of(dataset.base.model, where, settings)
-    (course,) = effect.courses(where, constants.chain, constants.cell)
+    span = settings[f"field_{name}_high"] - settings[f"field_{name}_low"]
+    cell = cell_with(dataset.base.model.cell, where, settings)
+    (course,) = effect.courses(where, dataset.base.model.chain, cell)
     columns = driven_columns(dataset, effect, where, settings) * MOTION
     low, high = (math.log(share * span) for share in FIELD_LENGTHS)
     ranges = {k: v for k, v in settings.items() if k.endswith(("low", "high"))}

@@ -35,7 +35,7 @@ from elastocal.diagnosis.components import (
 )
 from elastocal.diagnosis.diagnosis_data import DiagnosisData
 from elastocal.diagnosis.effect_search import about
-from elastocal.diagnosis.evidence import ANOTHER, Prior, spectrum
+from elastocal.diagnosis.evidence import ANOTHER, log_prior_odds, spectrum
 from elastocal.diagnosis.hypotheses import Hypothesis, judged_together
 from elastocal.diagnosis.model_set import Item, ModelSet, extended, packed_columns
 from elastocal.diagnosis.noise_floor import NoiseValues, NoisyData, project
@@ -60,13 +60,14 @@ def search_components(
     full = _with_together(dataset)
     for again in range(1 + TWICE):
         data = with_equal_noise(full)
-        instrument = chosen.noise.of_instrument() if data.stated else _started(data)
+        begun = replace(NoiseValues.usual(data.G.shape[2]), factor=0.3)
+        instrument = (chosen.noise if data.stated else begun).of_instrument()
         curves = list(joint_curves(full))
         every = [*drifts(full), *catalogue_components(full), *_searched(full, chosen)]
         others = _first(every)
         progress(f"sizes of {len(curves) + len(others)} components at once")
         both = [*curves, *others]
-        found = _swapped(full, data, fit_sum(data, both, instrument), both)
+        found = _swapped(full, fit_sum(data, both, instrument), both)
         if again == TWICE or not any(isinstance(c.effect, LinkWeights) for c in found.components):
             break
         # A compliance that was fitted without weights is wrong, and so are their columns by it.
@@ -76,35 +77,34 @@ def search_components(
         # A curve takes up the lines of its joint as far as these few poses show them, and then
         # none of them stands out.
         progress("families of lines before curves")
-        first = _swapped(full, data, fit_sum(data, others, instrument), others)
-        first = _spared(data, completed(data, first, others))
+        first = _swapped(full, fit_sum(data, others, instrument), others)
+        first = _spared(completed(first, others))
         for _ in range(TWICE):
             before = first
-            first = completed(data, _with_lines(full, data, first), both)
+            first = completed(_with_lines(full, first), both)
             if first.score <= before.score + GAINED:
                 break
-        other = _wider(data, first, curves) or first
+        other = _wider(first, curves)
         lined = other.score > found.score
         found = other if lined else found
     if not lined:
         progress("families of lines beside the components")
-        found = _with_lines(full, data, found)
+        found = _with_lines(full, found)
     progress("what shows now that the noise is smaller")
-    again = with_returned(data, found, every)
+    again = with_returned(found, every)
     if again is not found and len(full.blocks.member) <= FEW_POSES:
-        again = with_returned(data, _with_lines(full, data, again), every)
+        again = with_returned(_with_lines(full, again), every)
     found = again
     for _ in range(FIELD_SEARCHES):
         progress("fields beside the components")
-        more = fields(full, found.without_these(), found.noise, found.components, MOST_FIELDS)
-        wider = _wider(data, found, more)
-        if wider is None:
+        wider = _wider(found, fields(full, found, MOST_FIELDS))
+        if wider is found:
             break
         found = wider
     progress("what can be left out")
-    found = _spared(data, found)
+    found = _spared(found)
     if len(full.blocks.member) <= FEW_POSES:
-        found = _with_all_multiples(full, data, found)
+        found = _with_all_multiples(full, found)
     return full, found, hidden_fellows(found, others)
 
 
@@ -141,7 +141,7 @@ def _first(components: Sequence[Component]) -> list[Component]:
     return [c for c in components if not (shared and isinstance(c.effect, GravitySag))]
 
 
-def _with_lines(dataset: DiagnosisData, data: NoisyData, found: FittedSum) -> FittedSum:
+def _with_lines(dataset: DiagnosisData, found: FittedSum) -> FittedSum:
     """The sum and the families of lines that stand out beside it, the best first.
 
     With many poses all that stand out come in at once: what one hides from another is little.
@@ -158,7 +158,7 @@ def _with_lines(dataset: DiagnosisData, data: NoisyData, found: FittedSum) -> Fi
             for family in chosen:
                 joint[index(family.where)] = family.scatter
             fitted = exchanged(
-                data, replace(found, noise=replace(found.noise, joint=joint)),
+                replace(found, noise=replace(found.noise, joint=joint)),
                 [c for family in chosen for c in family.instead_of],
                 [family.component for family in chosen if family.component is not None],
             )  # fmt: skip
@@ -167,11 +167,11 @@ def _with_lines(dataset: DiagnosisData, data: NoisyData, found: FittedSum) -> Fi
                 break
         if wider is None:
             break
-        found = wider if many else _tuned(dataset, data, wider)
-    return found if many else _reviewed(dataset, data, found)
+        found = wider if many else _tuned(dataset, wider)
+    return found if many else _reviewed(dataset, found)
 
 
-def with_returned(data: NoisyData, found: FittedSum, components: Sequence[Component]) -> FittedSum:
+def with_returned(found: FittedSum, components: Sequence[Component]) -> FittedSum:
     """The sum with components that went under a larger noise and show under this one."""
     for _ in range(RETURNS):
         taken = {id(c) for c in found.components}
@@ -180,8 +180,8 @@ def with_returned(data: NoisyData, found: FittedSum, components: Sequence[Compon
         each = beside.evidence(slice(0, 0), beside.spans)
         evidence = [e + log_odds(found.components, c) for e, c in zip(each, away, strict=True)]
         order = np.argsort(evidence)[::-1][:MOST_RETURNED]
-        wider = _wider(data, found, [away[k] for k in order if evidence[k] > 0])
-        if wider is None:
+        wider = _wider(found, [away[k] for k in order if evidence[k] > 0])
+        if wider is found:
             break
         found = wider
     return found
@@ -190,15 +190,15 @@ def with_returned(data: NoisyData, found: FittedSum, components: Sequence[Compon
 RETURNS, MOST_RETURNED = 4, 6
 
 
-def _tuned(dataset: DiagnosisData, data: NoisyData, found: FittedSum) -> FittedSum:
+def _tuned(dataset: DiagnosisData, found: FittedSum) -> FittedSum:
     """The sum with the orders of all its lines where they fit best, each beside the others."""
     components = sharpened(dataset, found)
     if components is None:
         return found
-    return fit_sum(data, components, found.noise, found.sizes, refit_noise=False)
+    return fit_sum(found.sums.data, components, found.noise, found.sizes, refit_noise=False)
 
 
-def _reviewed(dataset: DiagnosisData, data: NoisyData, found: FittedSum) -> FittedSum:
+def _reviewed(dataset: DiagnosisData, found: FittedSum) -> FittedSum:
     """The sum with other orders of a joint's lines, or one multiple more or less, where that is
     better beside all that has been found since."""
     changed = False
@@ -207,14 +207,14 @@ def _reviewed(dataset: DiagnosisData, data: NoisyData, found: FittedSum) -> Fitt
         m, others = len(c.settings) // 2, with_multiples(dataset, c)
         near = [other for n in (m + 1, m - 1) if (other := others.get(n)) is not None]
         for other in near if anew is None else [anew, *near]:
-            fitted = exchanged(data, found, [c], [other], refit_noise=False)
+            fitted = exchanged(found, [c], [other], refit_noise=False)
             if fitted.score > found.score:
                 found, changed = fitted, True
                 break
-    return _tuned(dataset, data, found) if changed else found
+    return _tuned(dataset, found) if changed else found
 
 
-def _with_all_multiples(dataset: DiagnosisData, data: NoisyData, found: FittedSum) -> FittedSum:
+def _with_all_multiples(dataset: DiagnosisData, found: FittedSum) -> FittedSum:
     """The sum with every multiple that its families of lines may have.
 
     Which of them stand out was decided by what they earn.  At new poses it costs more to leave out
@@ -223,7 +223,7 @@ def _with_all_multiples(dataset: DiagnosisData, data: NoisyData, found: FittedSu
     pairs = whole_families(dataset, found.components)
     if not pairs:
         return found
-    whole = exchanged(data, found, [c for c, _ in pairs], [w for _, w in pairs])
+    whole = exchanged(found, [c for c, _ in pairs], [w for _, w in pairs])
     return whole if len(whole.components) == len(found.components) else found
 
 
@@ -252,34 +252,37 @@ def hidden_fellows(found: FittedSum, components: Sequence[Component]) -> tuple[C
 CHANCE = 0.05  # probability from which what is not shown is reckoned with
 
 
-def _spared(data: NoisyData, found: FittedSum) -> FittedSum:
+def _spared(found: FittedSum) -> FittedSum:
     """The sum without what the others can stand in for, once their sizes have followed."""
     spared = 0
     order = np.argsort(found.earned - found.costs)
     for c in [found.components[k] for k in order[:SPARED]]:
         if not any(c is other for other in found.components):
             continue
-        fitted = exchanged(data, found, [c], refit_noise=False)
+        fitted = exchanged(found, [c], refit_noise=False)
         if fitted.score > found.score:
             found, spared = fitted, spared + 1
-    return fit_sum(data, found.components, found.noise, found.sizes) if spared else found
+    return _refitted(found) if spared else found
 
 
 SPARED = 6  # components that are tried to be left out, those first that earn least
 TRIED = 3  # families that are tried, the best first, before a search is given up
 
 
-def _wider(data: NoisyData, found: FittedSum, more: Sequence[Component]) -> FittedSum | None:
-    """The sum with these as well, or what is left of them; None where it is no better."""
-    if not more:
-        return None
-    wider = exchanged(data, found, [], more)
-    return wider if wider.score > found.score + GAINED else None
+def _wider(found: FittedSum, more: Sequence[Component]) -> FittedSum:
+    """The sum with these as well, or what is left of them; as it is where that is no better."""
+    wider = exchanged(found, [], more) if more else found
+    return wider if wider.score > found.score + GAINED else found
+
+
+def _refitted(found: FittedSum) -> FittedSum:
+    """The sum with its noise fitted anew beside it."""
+    return fit_sum(found.sums.data, found.components, found.noise, found.sizes)
 
 
 def exchanged(
-    data: NoisyData, found: FittedSum, gone: Sequence[Component],
-    more: Sequence[Component] = (), refit_noise: bool = True,
+    found: FittedSum, gone: Sequence[Component], more: Sequence[Component] = (),
+    refit_noise: bool = True,
 ) -> FittedSum:  # fmt: skip
     """The sum with `more` components in the place of those `gone`, fitted from where it is."""
     kept = [k for k, c in enumerate(found.components) if not any(c is other for other in gone)]
@@ -287,7 +290,7 @@ def exchanged(
     for component in more:
         start = start.and_one(component)
     components = [*(found.components[k] for k in kept), *more]
-    return fit_sum(data, components, found.noise, start, refit_noise, found.sums)
+    return fit_sum(found.sums.data, components, found.noise, start, refit_noise, found.sums)
 
 
 GAINED = 0.5  # nats that a search must bring for another one
@@ -300,8 +303,8 @@ def compared_score(dataset: DiagnosisData, found: FittedSum, chosen: ModelSet) -
     few, the first of each kind has to pay what one more effect of the catalogue pays there, and a
     line or what has no name what its search costs.
     """
-    prior = Prior.of(dataset.hypotheses, [], ANOTHER)
-    odds = {h.key: float(w) for h, w in zip(dataset.hypotheses, prior.hypotheses, strict=True)}
+    prior = log_prior_odds(dataset.hypotheses, [], ANOTHER)
+    odds = {h.key: float(w) for h, w in zip(dataset.hypotheses, prior, strict=True)}
     usual = min(odds.values(), default=0.0)
     known = {item.key: item.log_prior for item in chosen.items if item.known}
 
@@ -332,7 +335,7 @@ class Beside:
     """Log evidence of other columns beside a sum, by sums over the rows."""
 
     def __init__(self, found: FittedSum, columns: Sequence[Array]) -> None:
-        sums, data, root = found.sums.weighted, found.plain, found.sums.weighted.root
+        sums, data, root = found.sums.weighted, found.sums.data, found.sums.weighted.root
         p, self.spans, end = len(sums.z), [], len(sums.z)
         for c in columns:
             self.spans.append(slice(end, end := end + c.shape[2]))
@@ -392,7 +395,7 @@ class Rivals:
 
 
 def _swapped(
-    dataset: DiagnosisData, data: NoisyData, found: FittedSum, components: Sequence[Component]
+    dataset: DiagnosisData, found: FittedSum, components: Sequence[Component]
 ) -> FittedSum:
     """The sum with every named component that another one beats replaced by it.
 
@@ -417,13 +420,13 @@ def _swapped(
             break
         _, k, key = best
         tried.add(key)
-        other = exchanged(data, found, [found.components[k]], [known[key]], refit_noise=False)
+        other = exchanged(found, [found.components[k]], [known[key]], refit_noise=False)
         if other.score > found.score:
             found, swapped = other, True
-    return fit_sum(data, found.components, found.noise, found.sizes) if swapped else found
+    return _refitted(found) if swapped else found
 
 
-def completed(data: NoisyData, found: FittedSum, components: Sequence[Component]) -> FittedSum:
+def completed(found: FittedSum, components: Sequence[Component]) -> FittedSum:
     """The sum with a kind of cause at all its places, or in the place of another kind, where that
     is more probable.
 
@@ -446,17 +449,17 @@ def completed(data: NoisyData, found: FittedSum, components: Sequence[Component]
                 alike = {c.family for c in gone} & {c.family for c in more}
                 if not more or (gone and not alike) or (instead is None and name not in shown):
                     continue
-                fitted = exchanged(data, found, gone, more, refit_noise=False)
+                fitted = exchanged(found, gone, more, refit_noise=False)
                 if fitted.score > (found if better is None else better).score + GAINED:
                     better = fitted
         if better is None:
             # What a kind does at all joints counts as their scatter as long as it is not there.
             hidden = (more for name, more in away.items() if more and more[0].family in OF_JOINTS)
-            fits = (exchanged(data, found, [], more) for more in hidden)
+            fits = (exchanged(found, [], more) for more in hidden)
             better = max(fits, key=lambda fit: fit.score, default=found)
             if better.score <= found.score + GAINED:
                 break
-        found = fit_sum(data, better.components, better.noise, better.sizes)
+        found = _refitted(better)
     return found
 
 
@@ -515,7 +518,3 @@ def with_equal_noise(dataset: DiagnosisData) -> NoisyData:
     variance[3:] = variance[3:].mean() if size > 3 else 0.0
     equal = np.tile(np.diag(variance[:size]), (dataset.blocks.n, 1, 1))
     return replace(data, covariance=dataset.blocks.pack_square(equal))
-
-
-def _started(data: NoisyData) -> NoiseValues:
-    return replace(NoiseValues.usual(data.G.shape[2]).of_instrument(), factor=0.3)

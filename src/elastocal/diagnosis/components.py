@@ -221,18 +221,21 @@ def log_odds(components: Sequence[Component], another: Component) -> float:
 
 @dataclass(frozen=True)
 class SumOfComponents:
-    """Components beside fitted columns, under a noise whose factor is free: −2ℓ and its slope.
+    """Components beside the data's own columns, under a noise whose factor is free: −2ℓ and its
+    slope.
 
     `weighted` is the data whitened by that `noise`; its M and z hold the components last, which
     are not kept as rows.
     """
 
-    weighted: Weighted
-    own: Array  # prior precision (p,) of the fitted columns
+    data: NoisyData
     components: tuple[Component, ...]
-    stated: bool
-    rows: int
     noise: NoiseValues
+    weighted: Weighted
+
+    @cached_property
+    def rows(self) -> int:
+        return self.data.n_rows
 
     @cached_property
     def squares(self) -> float:
@@ -247,7 +250,15 @@ class SumOfComponents:
         w, a = self.weighted, float(np.exp(factor))
         alone = w.alone - self.squares + self.squares / a**2 + 2 * self.rows * factor
         weighted = Weighted(w.root / a, w.X / a, w.r / a, w.M / a**2, w.z / a**2, alone)
-        return replace(self, weighted=weighted, noise=_scaled(self.noise, factor))
+        noise = replace(self.noise, factor=self.noise.factor * a, joint=self.noise.joint * a)
+        return replace(self, weighted=weighted, noise=noise)
+
+    def only(self, kept: Sequence[int]) -> SumOfComponents:
+        """The same with these components alone, without whitening anything anew."""
+        w, own = self.weighted, np.arange(len(self.data.precision))
+        index = np.concatenate([own, *(np.r_[self.spans[k]] for k in kept)]).astype(int)
+        narrow = replace(w, M=w.M[np.ix_(index, index)], z=w.z[index])
+        return replace(self, weighted=narrow, components=tuple(self.components[k] for k in kept))
 
     @cached_property
     def pool(self) -> Pool:
@@ -257,7 +268,7 @@ class SumOfComponents:
         """Prior variances of all coefficients (p + Σ k,)."""
         shares = [c.shares(length)[0] for c, length in zip(self.components, at.length, strict=True)]
         sized = [np.exp(2 * s) * share for s, share in zip(at.size, shares, strict=True)]
-        return np.concatenate([1 / self.own, *sized])
+        return np.concatenate([1 / self.data.precision, *sized])
 
     def factored(self, at: Sizes) -> tuple[Array, Array, Array, float]:
         """√v, L of LLᵀ = I + √v M √v/a², b = (LLᵀ)⁻¹ √v z/a², and −2ℓ."""
@@ -297,7 +308,7 @@ class SumOfComponents:
         M = self.weighted.M
         rss = self.squares - 2 * float(beta @ self.weighted.z) + float(beta @ (M @ beta))
         slope[0] = 2 * (self.rows - (len(left) - left.sum()) - rss / a2)
-        if self.stated:
+        if self.data.stated:
             value += (at.factor / 0.5) ** 2
             slope[0] += 2 * at.factor / 0.25
         return value, slope
@@ -370,10 +381,7 @@ def posed(
             np.matmul(own.root, data.masked(c.columns), out=X[:, :, span])
         flat = X.reshape(-1, total)
         M, z = flat.T @ flat, flat.T @ own.r.ravel()
-    weighted = replace(own, M=M, z=z)
-    return SumOfComponents(
-        weighted, data.precision, tuple(components), data.stated, data.n_rows, noise
-    )
+    return SumOfComponents(data, tuple(components), noise, replace(own, M=M, z=z))
 
 
 def crossed(
@@ -392,8 +400,8 @@ class FittedSum:
     """The components that are left, their sizes, the noise beside them and the log posterior.
 
     `earned` (K,) nats of each, `costs` (K,) what it has to earn, the others there; `sums` are those
-    over the rows of `plain`, the data without their columns, `variances` (Σ k,) their coefficients'
-    prior.
+    over the rows of the data, which are without their columns, `variances` (Σ k,) their
+    coefficients' prior.
     """
 
     components: tuple[Component, ...]
@@ -401,20 +409,20 @@ class FittedSum:
     noise: NoiseValues
     earned: Array
     score: float
-    plain: NoisyData
     sums: SumOfComponents
     variances: Array
 
     @cached_property
     def data(self) -> NoisyData:
         """The data with the components' columns and their prior precisions."""
-        columns = side_by_side(self.plain, [self.plain.masked(c.columns) for c in self.components])
-        return self.plain.with_columns(columns, 1 / self.variances)
+        plain = self.sums.data
+        columns = side_by_side(plain, [plain.masked(c.columns) for c in self.components])
+        return plain.with_columns(columns, 1 / self.variances)
 
     @cached_property
     def _shown(self) -> tuple[Array, ...]:
         """The directions (C, m, k) of each component that these data show."""
-        plain, first = self.plain, self.plain.X.shape[2]
+        plain, first = self.sums.data, self.sums.data.X.shape[2]
         return tuple(
             _compressed(
                 plain.masked(c.columns), self.variances[span.start - first : span.stop - first],
@@ -439,8 +447,8 @@ class FittedSum:
             shown for c, shown in zip(self.components, self._shown, strict=True)
             if not any(c is other for other in some)
         ]  # fmt: skip
-        joined = side_by_side(self.plain, columns)
-        return self.plain.with_columns(joined, np.ones(joined.shape[2]))
+        joined = side_by_side(self.sums.data, columns)
+        return self.sums.data.with_columns(joined, np.ones(joined.shape[2]))
 
 
 STEPS, ROUNDS = 30, 12
@@ -465,7 +473,7 @@ def fit_sum(
             if len(kept) == len(components):
                 break
             components, at = [components[k] for k in kept], at.chosen(kept)
-            problem = replace(problem, **_narrowed(problem, kept))
+            problem = problem.only(kept)
         problem = problem.scaled(at.factor)
         noise, at = problem.noise, replace(at, factor=0.0)
         if refit_noise:
@@ -478,10 +486,8 @@ def fit_sum(
     value = problem.factored(at)[3]
     score = -value / 2 - problem.pool.penalty(at.size)[0] / 2 - problem.pool.cost
     score -= 0.5 * log_prior(data.stated, noise)[0]
-    return FittedSum(
-        tuple(components), at, noise, problem.earned(at), score, data, problem,
-        variances[len(data.precision) :],
-    )  # fmt: skip
+    earned, own = problem.earned(at), variances[len(data.precision) :]
+    return FittedSum(tuple(components), at, noise, earned, score, problem, own)
 
 
 def _kept(problem: SumOfComponents, at: Sizes, strict: bool) -> list[int]:
@@ -496,21 +502,6 @@ def _kept(problem: SumOfComponents, at: Sizes, strict: bool) -> list[int]:
     gone = (at.size < GONE) | ((earned < MOST_AT_ONCE) & poor)
     gone[np.argmin(spare)] = True
     return [k for k in range(len(spare)) if not gone[k]]
-
-
-def _narrowed(problem: SumOfComponents, kept: list[int]) -> dict:
-    """The problem with fewer components, without whitening anything anew."""
-    p = len(problem.own)
-    index = np.concatenate([np.arange(p), *(np.r_[problem.spans[k]] for k in kept)]).astype(int)
-    w = problem.weighted
-    narrow = replace(w, M=w.M[np.ix_(index, index)], z=w.z[index])
-    return {"weighted": narrow, "components": tuple(problem.components[k] for k in kept)}
-
-
-def _scaled(noise: NoiseValues, factor: float) -> NoiseValues:
-    return NoiseValues(
-        noise.factor * float(np.exp(factor)), noise.joint * np.exp(factor), noise.shared
-    )
 
 
 def _noise_beside(

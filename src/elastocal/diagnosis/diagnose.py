@@ -10,6 +10,7 @@ from typing import Any
 
 import numpy as np
 import tomli_w
+from scipy.special import expit
 
 from elastocal.cell.work_cell import Cell, read_cell
 from elastocal.config import read_toml
@@ -17,7 +18,13 @@ from elastocal.diagnosis.backlash_model import with_likelier_backlash_model
 from elastocal.diagnosis.baseline import Baseline, fit_baseline, thinned
 from elastocal.diagnosis.component_answer import SumAnswer
 from elastocal.diagnosis.component_search import compared_score, search_components
-from elastocal.diagnosis.diagnosis import Diagnosis, FoundEffect, Gap, StructureTest
+from elastocal.diagnosis.diagnosis import (
+    SMALLEST_P,
+    Diagnosis,
+    FoundEffect,
+    Gap,
+    StructureTest,
+)
 from elastocal.diagnosis.diagnosis_data import DiagnosisData, diagnosis_data_of
 from elastocal.diagnosis.effect_search import ForwardSelection, SelectedEffects
 from elastocal.diagnosis.evidence import exceedance
@@ -221,10 +228,10 @@ def diagnose(
     full, total, hidden = search_components(dataset, found.chosen, progress)
     progress("confirming")
     rng = np.random.default_rng(options.seed)
-    few = max(found.chosen.score, found.nothing.score)
+    few, none = max(found.chosen.score, found.nothing.score), found.nothing.score
     answer_of_sum = SumAnswer(dataset, full, total, hidden, rng).decided
-    gained = compared_score(full, total, found.chosen) - few
-    many = gained > CLEARLY and answer_of_sum.n_causes >= MANY
+    score = compared_score(full, total, found.chosen)
+    many = score - few > CLEARLY and answer_of_sum.n_causes >= MANY
     found = found if many else search.settled(found)
     tests, judged = structure_tests(found.first), judge(found)
     if many:
@@ -233,15 +240,22 @@ def diagnose(
         answers = _of_few(answer_of_sum, dataset, found, judged, tests)
     there = {(f.effect, f.where) for f in answers["effects"]} if many else ()
     small = [u for u in too_small(dataset, found) if (u.effect, u.where) not in there]
-    p_first = exceedance(found.first.flipped, found.first.odds)
+    p = found.p_values[0] if found.p_values else exceedance(found.first.flipped, found.first.odds)
+    nothing = found.slots[0].probabilities()[1]
+    if many:
+        # The flips are of the forward search.  Of a sum, noise alone yields e nats with a chance of
+        # exp(−e) at most (Markov's inequality).
+        p = max(min(p, float(np.exp(none - score))), SMALLEST_P)
+        nothing = min(nothing, float(expit(none - score)))
+    beside = answer_of_sum.found if many else found.chosen
     return Diagnosis(
         **answers,
         candidates=candidates(dataset, found, judged),
         structure=tests,
-        probability_nothing=found.slots[0].probabilities()[1],
-        p_value=found.p_values[0] if found.p_values else p_first,
+        probability_nothing=nothing,
+        p_value=p,
         untested=(*untested, *small),
-        warnings=(*filter(None, [left_out]), *warnings(dataset, found, screened)),
+        warnings=(*filter(None, [left_out]), *warnings(dataset, found, screened, beside.noise)),
         n_readings=dataset.blocks.n,
         n_configurations=len(dataset.blocks.member),
         model_keys=model_keys(base.model, answers["effects"]),

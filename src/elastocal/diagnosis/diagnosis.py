@@ -480,7 +480,8 @@ def publish(diagnosis: Diagnosis, model: Model, data: str) -> dict[str, Any]:
     the key says _um, everything else in the SI unit that stands beside it.  A number that is not
     known or not finite is null, as JSON has none.
     """
-    d = diagnosis
+    d, noise, near = diagnosis, diagnosis.noise, diagnosis.noise.near_repeats
+    units = ["rad" if kind == "revolute" else "m" for kind in model.chain.kinds]
     content = {
         "schema": SCHEMA,
         "robot": model.chain.name,
@@ -490,22 +491,40 @@ def publish(diagnosis: Diagnosis, model: Model, data: str) -> dict[str, Any]:
         "p_value": d.p_value,
         "probability_nothing": d.probability_nothing,
         "probability_unknown": d.probability_unknown,
-        "gap": {f"{name}_um": value * MICRO for name, value in vars(d.gap).items()},
-        "budget": [_step(step) for step in d.budget],
+        "gap": _in_um(d.gap, *vars(d.gap)),
+        "budget": [
+            {"step": s.step, "heldout_rms_um": _um(s.heldout_rms), "ci95": _um(s.ci95)}
+            for s in d.budget
+        ],
         "effects": [_found(effect) for effect in d.effects],
-        "components": [_component(component) for component in d.components],
-        "groups": [vars(group) for group in d.groups],
+        "components": [
+            _in_um(c, "rms", "rms_ci95") | {"effect": c.effects[0]} for c in d.components
+        ],
+        "groups": d.groups,
         "fields": [_found(effect) for effect in d.fields],
-        "candidates": [vars(candidate) for candidate in d.candidates],
-        "indistinguishable": [[vars(e) for e in rivals] for rivals in d.indistinguishable],
-        "location": None if d.location is None else _location(d.location),
-        "structure": [vars(test) for test in d.structure],
-        "curves": [vars(curve) for curve in d.curves],
-        "noise": _noise(d.noise, model.chain.kinds),
-        "untested": [vars(u) for u in d.untested],
-        "extra_plan": None if d.extra is None else _extra(d.extra),
+        "candidates": d.candidates,
+        "indistinguishable": d.indistinguishable,
+        "location": d.location and _location(d.location),
+        "structure": d.structure,
+        "curves": d.curves,
+        "noise": {
+            "stated": noise.stated,
+            "stated_factor": noise.stated_factor,
+            "reading_sigma_um": _um(noise.reading_sigma),
+            "repeatability": [
+                {"where": f"joint{i}", "value": value, "unit": unit}
+                for i, (value, unit) in enumerate(zip(noise.repeatability, units, strict=True), 1)
+            ],
+            "shared": noise.shared,
+            "pure_error_um": _um(noise.pure_error),
+            "near_repeat_um": near and _um(near.scatter),
+            "near_repeats": near and _without(_in_um(near, "soon", "later"), "scatter"),
+            "faulty": [_in_um(reading, "error") for reading in noise.faulty],
+        },
+        "untested": d.untested,
+        "extra_plan": d.extra and _without(vars(d.extra), "plan"),
         "model_keys": d.model_keys,
-        "warnings": list(d.warnings),
+        "warnings": d.warnings,
         "findings": [f.to_json() for f in d.findings],
         "backend": model.backend_report(),
         "n_readings": d.n_readings,
@@ -514,9 +533,23 @@ def publish(diagnosis: Diagnosis, model: Model, data: str) -> dict[str, Any]:
     return {key: plain(value) for key, value in content.items()}
 
 
-def _step(step: BudgetStep) -> dict[str, Any]:
-    ends = [end * MICRO for end in step.ci95]
-    return {"step": step.step, "heldout_rms_um": step.heldout_rms * MICRO, "ci95": ends}
+def _um(length: Any) -> Any:
+    """A length in m, several, or None, in µm."""
+    if length is None:
+        return None
+    return [each * MICRO for each in length] if isinstance(length, tuple) else length * MICRO
+
+
+def _in_um(part: Any, *lengths: str) -> dict[str, Any]:
+    """Fields of a part of the result by name, the `lengths` in µm and named so."""
+    return {
+        f"{key}_um" if key in lengths else key: _um(value) if key in lengths else value
+        for key, value in vars(part).items()
+    }
+
+
+def _without(content: dict[str, Any], key: str) -> dict[str, Any]:
+    return {name: value for name, value in content.items() if name != key}
 
 
 def _found(f: FoundEffect) -> dict[str, Any]:
@@ -526,51 +559,7 @@ def _found(f: FoundEffect) -> dict[str, Any]:
     return vars(f) | {"parameters": [vars(p) | {"ci95": ends(p)} for p in f.parameters]}
 
 
-def _component(c: ComponentShare) -> dict[str, Any]:
-    content = {key: value for key, value in vars(c).items() if key not in ("rms", "rms_ci95")}
-    ends = [end * MICRO for end in c.rms_ci95]
-    return content | {"effect": c.effects[0], "rms_um": c.rms * MICRO, "rms_ci95_um": ends}
-
-
 def _location(location: Location) -> dict[str, Any]:
     out = dict(vars(location))
     parts = ("stages", "places", "drivers", "shares")
     return out | {"evidence": {key: out.pop(key) for key in parts}}
-
-
-def _noise(noise: NoiseFloor, kinds: tuple[str, ...]) -> dict[str, Any]:
-    near = noise.near_repeats
-    return {
-        "stated": noise.stated,
-        "stated_factor": noise.stated_factor,
-        "reading_sigma_um": noise.reading_sigma * MICRO,
-        "repeatability": [
-            {"where": f"joint{i}", "value": value, "unit": "rad" if kind == "revolute" else "m"}
-            for i, (value, kind) in enumerate(zip(noise.repeatability, kinds, strict=True), 1)
-        ],
-        "shared": noise.shared,
-        "pure_error_um": _um(noise.pure_error),
-        "near_repeat_um": _um(None if near is None else near.scatter),
-        "near_repeats": None if near is None else _near_repeats(near),
-        "faulty": [_faulty(reading) for reading in noise.faulty],
-    }
-
-
-def _um(metres: float | None) -> float | None:
-    return None if metres is None else metres * MICRO
-
-
-def _near_repeats(near: NearRepeats) -> dict[str, Any]:
-    parts = {"soon_um": _um(near.soon), "later_um": _um(near.later)}
-    return {"pairs": near.pairs, "independent": near.independent} | parts
-
-
-def _faulty(reading: FaultyReading) -> dict[str, Any]:
-    names = {"error": "error_um"}
-    both = vars(reading) | {"error": reading.error * MICRO}
-    return {names.get(key, key): value for key, value in both.items()}
-
-
-def _extra(extra: ExtraPlan) -> dict[str, Any]:
-    content = {key: value for key, value in vars(extra).items() if key != "plan"}
-    return content | {"pairs": [vars(pair) for pair in extra.pairs]}

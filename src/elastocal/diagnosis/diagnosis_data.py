@@ -22,6 +22,7 @@ from elastocal.diagnosis.hypotheses import (
     Hypothesis,
     RegressorDirection,
     SettingsGrid,
+    as_placed,
     compute_columns,
     grid_of,
     judged_together,
@@ -47,10 +48,10 @@ class DiagnosisData:
     """A baseline with the columns of all hypotheses, packed by configuration.
 
     `data` holds the residual at the prior's centre, linearised at the fit, the fitted columns
-    (scaled to their prior deviations) and noise shapes; `fitted` names the parameter of each of these
-    columns (of the load point the effect), `load_point` (C, m, 3) is what a shift of the load point does, per m, None without a
-    load.  `other_backlash` is the probability that play follows the backlash model that the base's
-    model does not have.
+    (scaled to their prior deviations) and noise shapes; `fitted` names the parameter of each of
+    these columns, of the load point's the effect; `load_point` (C, m, 3) is what a shift of the
+    load point does, per m, None without a load.  `other_backlash` is the probability that play
+    follows the backlash model that the base's model does not have.
     """
 
     base: Baseline
@@ -79,6 +80,18 @@ class DiagnosisData:
     def lead(self) -> IntArray:
         """Row (N,) of the table that each observation stands in first."""
         return self.base.observed.lead
+
+    @cached_property
+    def kind(self) -> IntArray:
+        """The marker and load of each observation (N,), numbered."""
+        each = np.column_stack([self.table.marker, self.table.force.round(6)])[self.lead]
+        return np.unique(each, axis=0, return_inverse=True)[1].ravel()
+
+    @cached_property
+    def repeated(self) -> IntArray:
+        """The pose, marker and load of each observation (N,), numbered."""
+        each = np.column_stack([self.table.configuration[self.lead], self.kind])
+        return np.unique(each, axis=0, return_inverse=True)[1].ravel()
 
     @cached_property
     def noise(self) -> NoiseValues:
@@ -120,9 +133,8 @@ class DiagnosisData:
 
     @cached_property
     def directions(self) -> dict[tuple[str, str], RegressorDirection]:
-        base = self.base
-        driven = (h for h in self.hypotheses if h.driven)
-        return {h.key: RegressorDirection(h, base.model, base.x) for h in driven}
+        chain, cell = self.base.model.chain, as_placed(self.base.model, self.base.x)
+        return {h.key: RegressorDirection(h, chain, cell) for h in self.hypotheses if h.driven}
 
     @cached_property
     def grids(self) -> dict[tuple[str, str], SettingsGrid]:

@@ -23,9 +23,8 @@ from elastocal.diagnosis.rivals import (
     RivalSet,
     Suspects,
     alternatives,
+    as_diagnosed,
     columns_of_starts,
-    left_out,
-    noise_found,
 )
 from elastocal.diagnosis.verdict import TOO_NEAR, TOO_NEAR_PROBABILITY
 from elastocal.measurements import Measurements, visits, with_moves
@@ -194,8 +193,8 @@ def campaign_of(
         residual=np.concatenate([base.residual, np.zeros(size * len(later))]), planned=len(later),
     )  # fmt: skip
     measured = len(np.unique(table.configuration[base.observed.lead]))
-    dataset = diagnosis_data_of(both, hypotheses).without(left_out(both, diagnosis))
-    return Campaign(dataset, measured, noise_found(diagnosis))
+    dataset, noise = as_diagnosed(diagnosis_data_of(both, hypotheses), diagnosis)
+    return Campaign(dataset, measured, noise)
 
 
 @dataclass(frozen=True)

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass, field, replace
+from functools import cached_property
 
 import numpy as np
 from numpy.typing import NDArray
@@ -11,7 +12,7 @@ from scipy.special import logsumexp
 
 from elastocal.diagnosis.baseline import Baseline
 from elastocal.diagnosis.diagnosis_data import DiagnosisData, diagnosis_data_of
-from elastocal.diagnosis.evidence import ANOTHER, Prior, Scan, exceedance, scan
+from elastocal.diagnosis.evidence import ANOTHER, Scan, exceedance, log_prior_odds, scan
 from elastocal.diagnosis.hypotheses import Hypothesis
 from elastocal.diagnosis.model_set import Item, ModelSet, fit_extended, fit_set, refine, signal_of
 from elastocal.diagnosis.noise_floor import NoiseValues, log_prior
@@ -153,12 +154,6 @@ def base_score(dataset: DiagnosisData, current: ModelSet, scanned: Scan) -> floa
     return scanned.at.marginal + items - 0.5 * log_prior(dataset.data.stated, scanned.noise)[0]
 
 
-def _rivalled(slot: Slot) -> bool:
-    """Whether some named effect alone does a good part of what a block without a name does."""
-    named = [s for item, s in zip(slot.items, slot.scores, strict=True) if item.known]
-    return max(named, default=-np.inf) > PART * slot.scores.max()
-
-
 @dataclass
 class ForwardSelection:
     """The search's means: data, blocks, flips of signs, and the level of a claim."""
@@ -168,16 +163,16 @@ class ForwardSelection:
     noise: NoiseValues
     level: float
     seed: int
-    signs: Array = field(init=False)
     _start: DiagnosisData = field(init=False)
     _visited: set[frozenset[int]] = field(init=False, default_factory=set)
     _fitted: dict[tuple, ModelSet] = field(init=False, default_factory=dict)
     _scanned: dict[tuple, Scan] = field(init=False, default_factory=dict)
 
-    def __post_init__(self) -> None:
+    @cached_property
+    def signs(self) -> Array:
+        """The flips (FLIPS, C)."""
         rng = np.random.default_rng(self.seed)
-        C = len(self.dataset.blocks.member)
-        self.signs = rng.choice([-1.0, 1.0], (FLIPS, C))
+        return rng.choice([-1.0, 1.0], (FLIPS, len(self.dataset.blocks.member)))
 
     def run(self) -> SelectedEffects:
         self._start = dataset = self.dataset
@@ -202,8 +197,11 @@ class ForwardSelection:
                 break
             after = self._scan(best, flips=True)
             p = exceedance(after.flipped, observed.odds)
-            if p > self.level or self._been_at(best):
+            # The search may have come round to a set that it had.
+            key = frozenset(id(item.what) for item in best.items)
+            if p > self.level or key in self._visited:
                 break
+            self._visited.add(key)
             current, scanned = best, after
             slots.append(slot)
             p_values.append(p)
@@ -226,7 +224,10 @@ class ForwardSelection:
         A block without a name fits a little of everything, and may come first where several
         effects act at once.
         """
-        if not found.chosen.unknown or not _rivalled(found.slots[0]):
+        first = found.slots[0]
+        alone = max((s for i, s in zip(first.items, first.scores, strict=True) if i.known),
+                    default=-np.inf)  # fmt: skip
+        if not found.chosen.unknown or alone <= PART * first.scores.max():
             return found
         named = ForwardSelection(self._start, [], self.noise, self.level, self.seed).run()
         if not named.chosen.items or named.chosen.score < found.chosen.score + CLEARLY:
@@ -242,13 +243,6 @@ class ForwardSelection:
         """What was fitted and scanned about another fit is void."""
         self._fitted.clear()
         self._scanned.clear()
-
-    def _been_at(self, chosen: ModelSet) -> bool:
-        """Whether the search has come round to a set that it had; noted either way."""
-        key = frozenset(id(item.what) for item in chosen.items)
-        known = key in self._visited
-        self._visited.add(key)
-        return known
 
     def _scan(
         self, current: ModelSet, noise: NoiseValues | None = None, flips: bool = False
@@ -268,10 +262,10 @@ class ForwardSelection:
             self._scanned.pop(next(iter(self._scanned)))
         return scanned
 
-    def _prior(self, current: ModelSet) -> Prior:
-        """Of one item more."""
+    def _prior(self, current: ModelSet) -> Array:
+        """Log odds of one item more."""
         something = ANOTHER if current.items else SOMETHING
-        return Prior.of(self.dataset.hypotheses, self.generic, something)
+        return log_prior_odds(self.dataset.hypotheses, self.generic, something)
 
     def _best_addition(
         self, current: ModelSet, scanned: Scan, behind: float = FAR_BEHIND
@@ -301,14 +295,13 @@ class ForwardSelection:
         prior = self._prior(current)
         # Scores count from the set as it is, under the noise that suits it best.
         offset = base_score(self.dataset, current, scanned) - current.score
-        items, scores = [], []
-        for h, s, w in zip(self.dataset.hypotheses, scanned.scored, prior.hypotheses, strict=True):
-            # What the search over settings costs stays with the item.
-            items.append(Item(h, s.settings, float(w + s.evidence - s.best)))
-            scores.append(float(w + s.evidence + offset))
-        for g, s, w in zip(self.generic, scanned.blocks, prior.blocks, strict=True):
-            items.append(Item(g, s.settings, float(w)))
-            scores.append(float(w + s.evidence + offset))
+        whats = (*self.dataset.hypotheses, *self.generic)
+        # What the search over settings costs stays with the item.
+        items = [
+            Item(what, s.settings, float(w + s.evidence - s.best if what.known else w))
+            for what, s, w in zip(whats, scanned.scored, prior, strict=True)
+        ]
+        scores = [w + s.evidence + offset for s, w in zip(scanned.scored, prior, strict=True)]
         return Slot(tuple(items), np.array(scores))
 
     def _with(self, current: ModelSet, item: Item) -> ModelSet:

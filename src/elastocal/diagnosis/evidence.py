@@ -2,7 +2,8 @@
 
 from __future__ import annotations
 
-from collections import Counter
+from collections import Counter, defaultdict
+from collections.abc import Sequence
 from dataclasses import dataclass, field, replace
 from functools import cached_property
 
@@ -136,35 +137,21 @@ def _turned(b: Array, U: Array) -> Array:
 UNKNOWN, ANOTHER = 0.05, 0.2
 
 
-@dataclass(frozen=True)
-class Prior:
-    """Log prior odds against nothing: of each hypothesis (H,) and each block (G,).
+def log_prior_odds(
+    hypotheses: Sequence[Hypothesis], blocks: Sequence[Generic], something: float = SOMETHING
+) -> Array:
+    """Log prior odds against nothing, of each hypothesis and then of each block.
 
     Effects are equally probable, and so are the places of one effect; kinds of blocks are equally
     probable, and so are the blocks of one kind.
     """
-
-    hypotheses: Array
-    blocks: Array
-
-    @property
-    def total(self) -> float:
-        """Log prior odds of anything against nothing."""
-        return float(logsumexp(np.concatenate([self.hypotheses, self.blocks])))
-
-    @classmethod
-    def of(
-        cls, hypotheses: tuple[Hypothesis, ...], blocks: list[Generic], something: float = SOMETHING
-    ) -> Prior:
-        odds = something / (1 - something)
-        known = _shares([h.name for h in hypotheses]) * (1 - UNKNOWN)
-        unknown = _shares([g.kind for g in blocks]) * UNKNOWN
-        return cls(np.log(odds * known), np.log(odds * unknown))
-
-
-def _shares(names: list[str]) -> Array:
-    count = Counter(names)
-    return np.array([1 / (len(count) * count[name]) for name in names])
+    shares = []
+    for names, whole in (
+        ([h.name for h in hypotheses], 1 - UNKNOWN), ([g.kind for g in blocks], UNKNOWN),
+    ):  # fmt: skip
+        count = Counter(names)
+        shares += [1 / (len(count) * count[name]) * whole for name in names]
+    return np.log(something / (1 - something) * np.array(shares))
 
 
 # Gram matrices of regressor directions at an entry of the chain, without forming columns.
@@ -290,8 +277,14 @@ class Grams:
             self._entries[key] = EntrySums.of(E, self.dataset.places, self.at, self.signs)
         return self._entries[key]
 
-    def of_hypothesis(self, h: Hypothesis, settings: Array | None = None) -> Spectrum:
-        """At every one of the `settings` (G, …), by default those of the search."""
+    def of(self, h: Hypothesis | Generic, settings: Array | None = None) -> Spectrum:
+        """A block, or a hypothesis at every one of the `settings` (G, …), by default those of the
+        search."""
+        if isinstance(h, Generic):
+            if h.columns is not None:
+                return self._direct(h.columns)
+            assert h.entry is not None and h.direction is not None
+            return self.entry(h.entry).driven(h.direction[:, :, :, None, :])
         if not h.driven:
             return self._direct(self.dataset.packed(h, np.zeros(0)))
         if settings is None:
@@ -301,12 +294,6 @@ class Grams:
         each = max(1, HELD // (sums.b.size * len(h.parameters)))
         pieces = [settings[i : i + each] for i in range(0, len(settings), each)]
         return Spectrum.joined([sums.driven(self.dataset.direction(h, piece)) for piece in pieces])
-
-    def of_block(self, g: Generic) -> Spectrum:
-        if g.columns is not None:
-            return self._direct(g.columns)
-        assert g.entry is not None and g.direction is not None
-        return self.entry(g.entry).driven(g.direction[:, :, :, None, :])
 
     def _direct(self, columns: Array) -> Spectrum:
         return direct(self.data.masked(columns), self.at, self.signs)
@@ -328,7 +315,7 @@ class Scored:
 
 @dataclass(frozen=True)
 class Scan:
-    """Everything scored under one noise: hypotheses, blocks, and the odds of all together.
+    """Everything scored under one noise: hypotheses, then blocks, and the odds of all together.
 
     `odds` is the log of the mean evidence over catalogue and blocks, weighted by prior,
     `flipped` (F,) the same for residuals whose configurations had their signs flipped;
@@ -336,7 +323,6 @@ class Scan:
     """
 
     scored: tuple[Scored, ...]
-    blocks: tuple[Scored, ...]
     odds: float
     flipped: Array
     covariate_odds: dict[str, float]
@@ -346,40 +332,30 @@ class Scan:
 
 
 def scan(
-    dataset: DiagnosisData, generic: list[Generic], prior: Prior, data: NoisyData,
+    dataset: DiagnosisData, generic: list[Generic], prior: Array, data: NoisyData,
     noise: NoiseValues, signs: Array,
 ) -> Scan:  # fmt: skip
-    """Score all hypotheses and blocks beside the columns already in `data`.
+    """Score all hypotheses and blocks, of log odds `prior`, beside the columns already in `data`.
 
     `signs` (F, C) of ±1 are the flips.
     """
-    at = project(data, noise)
-    grams = Grams(dataset, data, at, signs)
-    scored, blocks, total, flips = [], [], [], []
-    for h, weight in zip(dataset.hypotheses, prior.hypotheses, strict=True):
-        found, grid = grams.of_hypothesis(h), dataset.grids.get(h.key, NO_SETTINGS)
-        each = found.evidence(h.scales)
+    grams = Grams(dataset, data, project(data, noise), signs)
+    scored, flips, of_covariate = [], [], defaultdict[str, list[int]](list)
+    for n, what in enumerate((*dataset.hypotheses, *generic)):
+        found, grid = grams.of(what), dataset.grids.get(what.key, NO_SETTINGS)
+        if isinstance(what, Generic):
+            of_covariate[what.covariate].append(n)
+        each = found.evidence(what.scales)
         evidence = float(log_sum(each + grid.log_prior))
         k = int(np.argmax(each + grid.log_prior))
         scored.append(Scored(evidence, float(each[k]), grid.values[k], float(found.distance[k])))
-        total.append(weight + evidence)
         if len(signs):
-            flips.append(weight + log_sum(found.flipped(h.scales) + grid.log_prior))
-    covariate_odds: dict[str, list[float]] = {}
-    covariate_flips: dict[str, list[Array]] = {}
-    for g, weight in zip(generic, prior.blocks, strict=True):
-        found = grams.of_block(g)
-        evidence = float(found.evidence()[0])
-        blocks.append(Scored(evidence, evidence, np.zeros(0), float(found.distance[0])))
-        total.append(weight + evidence)
-        covariate_odds.setdefault(g.covariate, []).append(evidence)
-        if len(signs):
-            flipped = found.flipped()[:, 0]
-            flips.append(weight + flipped)
-            covariate_flips.setdefault(g.covariate, []).append(flipped)
+            flips.append(log_sum(found.flipped(what.scales) + grid.log_prior))
+    total, by_covariate = float(logsumexp(prior)), of_covariate.items()
     return Scan(
-        tuple(scored), tuple(blocks), float(log_sum(np.array(total))) - prior.total,
-        log_sum(np.array(flips), axis=0) - prior.total if flips else np.zeros(0),
-        {c: max(v) for c, v in covariate_odds.items()},
-        {c: np.max(v, axis=0) for c, v in covariate_flips.items()}, at, noise,
+        tuple(scored), float(log_sum(prior + [s.evidence for s in scored])) - total,
+        log_sum(prior[:, None] + flips, axis=0) - total if flips else np.zeros(0),
+        {c: max(scored[n].evidence for n in own) for c, own in by_covariate},
+        {c: np.max([flips[n] for n in own], axis=0) for c, own in by_covariate if flips},
+        grams.at, noise,
     )  # fmt: skip

@@ -218,7 +218,7 @@ def plan_extra(
     progress("extra poses: fitting the model as it is")
     base = fit_baseline(model, table, seed)
     progress("extra poses: what else the rivals may be")
-    suspects = suspects.with_sets(with_neighbours(base, diagnosis, suspects.sets, suspects.known))
+    suspects.sets = with_neighbours(base, suspects)
     progress("extra poses: drawing candidates")
     try:
         pool = draw_pool(
@@ -267,9 +267,7 @@ def _chosen(
                 f"would reach {reachable:.2f}: allow more poses ({option('poses')}), or repeat "
                 "each of them"
             )
-        pulled = _pulled(base, pool, suspects, seed)
-        n, newton = len(chosen), _newton(pool)
-        notes += _pull_notes(tasks, hopeless, pulled, n, after, newton, covered)
+        notes += _pull_notes(base, pool, suspects, seed, tasks, hopeless, len(chosen), after)
     if not worthwhile:
         nothing = _nothing(sets, suspects, tuple(notes))
         return replace(nothing, pairs=pairs_of(tasks, chosen), inseparable=groups)
@@ -306,31 +304,22 @@ def _names(sets: Sequence[RivalSet]) -> tuple[str, ...]:
     return tuple(dict.fromkeys(name for s in sets for name in s.names))
 
 
-def _newton(pool: VisitPool) -> float:
-    return float(np.linalg.norm(pool.forces, axis=1).max())
-
-
-def _pulled(base: Baseline, pool: VisitPool, suspects: Suspects, seed: int) -> list[Discrimination]:
-    """What is to be told apart, every candidate also pulled along x and y as hard as by its load.
+def _pull_notes(
+    base: Baseline, pool: VisitPool, suspects: Suspects, seed: int,
+    tasks: Sequence[Discrimination], hopeless: dict[tuple[str, str], float], n: int, after: float,
+) -> list[str]:  # fmt: skip
+    """Advice to pull along x and y as well, as hard as by the load, where that helps.
 
     None without a load, nor for what is unknown: how it takes a pull nobody can say.
     """
-    if _newton(pool) == 0 or suspects.unknown:
+    newton, notes = float(np.linalg.norm(pool.forces, axis=1).max()), []
+    if newton == 0 or suspects.unknown:
         return []
-    forces = np.vstack([pool.forces, _newton(pool) * np.eye(3)[:2]])
-    table = base.observed.table
+    forces, table = np.vstack([pool.forces, newton * np.eye(3)[:2]]), base.observed.table
     wide = visit_pool_of(base.model, base.x, table, pool.q, pool.approach, pool.time, forces)
-    return discriminations_of(base, wide, suspects, seed)
-
-
-def _pull_notes(
-    tasks: Sequence[Discrimination], hopeless: dict[tuple[str, str], float],
-    pulled: Sequence[Discrimination], n: int, after: float, newton: float, covered: float,
-) -> list[str]:  # fmt: skip
-    """Advice to pull sideways, where that helps."""
+    pulled = discriminations_of(base, wide, suspects, seed)
     still = judged(pulled)[1] if pulled else hopeless
     apart = ", ".join(" and ".join(pair) for pair in hopeless if pair not in still)
-    notes = []
     if apart:
         notes.append(
             f"a horizontal pull of {newton:.3g} N along x and along y, e.g. by a rope over a "
@@ -344,6 +333,7 @@ def _pull_notes(
             notes.append(
                 f"pull horizontally: {len(chosen)} poses that are also measured under "
                 f"{newton:.3g} N along x and along y, e.g. by a rope over a pulley, raise the "
-                f"probability from {covered * after:.2f} to {covered * reached:.2f}"
+                f"probability from {suspects.covered * after:.2f} to "
+                f"{suspects.covered * reached:.2f}"
             )
     return notes

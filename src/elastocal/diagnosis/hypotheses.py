@@ -6,6 +6,7 @@ import math
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property
+from typing import ClassVar
 
 import casadi as ca
 import numpy as np
@@ -76,6 +77,8 @@ class Hypothesis:
     parameters: tuple[ParameterSpec, ...]
     settings: tuple[Setting, ...]
 
+    known: ClassVar[bool] = True
+
     @property
     def name(self) -> str:
         return self.effect.name
@@ -130,20 +133,28 @@ def possible(
         if name in without or not effect.may_be_missing(cell):
             continue
         places = [w for w in effect.places(chain, cell) if (name, w) not in active]
-        at = [_at(effect, w, chain, cell) for w in places]
-        lacking = [need for need in _needed(at, effect, cell) if not recorded(table, need)]
-        if lacking:
+        settings = {w: effect.settings(w, chain, cell) for w in places}
+        # Only a driven effect can be evaluated at many settings; others' stay as the model has
+        # them.
+        searched = isinstance(effect, DrivenEffect)
+        kinds = {s.kind for each in settings.values() for s in each} if searched else set()
+        needed = [*effect.needed(cell), *["time"] * bool(kinds & {"change_time", "time_constant"})]
+        if lacking := [need for need in needed if not recorded(table, need)]:
             reason, advice = RECORD[lacking[0]]
             untested += [Untested(name, w, reason, advice) for w in places]
             continue
-        for h in at:
-            if key := _unset(h, chain, cell):
-                reason = f"{key} is not known, and only settings of a driven effect are searched"
-                advice = f"state {key} in [model.nominal.settings.{h.where}]"
-                untested.append(Untested(*h.key, reason, advice))
-            else:
-                hypotheses.append(h)
-    return [h for h in hypotheses if h.parameters], untested
+        for where, held in settings.items():
+            given = cell.model.nominal.settings.get(where, {})
+            unset = [s.key for s in held if s.default is None and s.key not in given]
+            if unset and not searched:
+                reason = (
+                    f"{unset[0]} is not known, and only settings of a driven effect are searched"
+                )
+                advice = f"state {unset[0]} in [model.nominal.settings.{where}]"
+                untested.append(Untested(name, where, reason, advice))
+            elif parameters := effect.parameters(where, chain, cell):
+                hypotheses.append(Hypothesis(effect, where, parameters, held if searched else ()))
+    return hypotheses, untested
 
 
 def judged_together(model: Model, table: Measurements) -> list[Hypothesis]:
@@ -169,29 +180,6 @@ def recorded(table: Measurements, need: str) -> bool:
         return bool(np.any(table.force != 0))
     values = getattr(table, need)
     return values is not None and bool(np.any(values != values[:1]))
-
-
-def _at(effect: Effect, where: str, chain: Chain, cell: Cell) -> Hypothesis:
-    """Only a driven effect can be evaluated at many settings; those of other effects stay as the
-    model has them."""
-    parameters = effect.parameters(where, chain, cell)
-    searched = isinstance(effect, DrivenEffect)
-    settings = effect.settings(where, chain, cell) if searched else ()
-    return Hypothesis(effect, where, parameters, settings)
-
-
-def _unset(h: Hypothesis, chain: Chain, cell: Cell) -> str | None:
-    """A setting that is neither searched nor stated."""
-    given = cell.model.nominal.settings.get(h.where, {})
-    held = () if h.settings else h.effect.settings(h.where, chain, cell)
-    return next((s.key for s in held if s.default is None and s.key not in given), None)
-
-
-def _needed(at: list[Hypothesis], effect: Effect, cell: Cell) -> tuple[str, ...]:
-    """What the effect needs, times included where it has settings that are times."""
-    kinds = {setting.kind for hypothesis in at for setting in hypothesis.settings}
-    timed = ("time",) if kinds & {"change_time", "time_constant"} else ()
-    return tuple(dict.fromkeys((*effect.needed(cell), *timed)))
 
 
 # What the table records decides how some effects are driven.
@@ -274,12 +262,17 @@ def grid_of(hypothesis: Hypothesis, visits: Measurements) -> SettingsGrid:
     setting is tried at fewer values, and its step grows with their distance.
     """
     axes = [_axis(setting, hypothesis.where, visits) for setting in hypothesis.settings]
-    if not axes:
-        return NO_SETTINGS
-    if len(axes) == 1:
-        return axes[0]
+    if len(axes) < 2:
+        return axes[0] if axes else NO_SETTINGS
     share = min(1.0, MOST_POINTS / math.prod(len(axis.values) for axis in axes))
-    return _product([_thinned(axis, share ** (1 / len(axes))) for axis in axes])
+    axes = [_thinned(axis, share ** (1 / len(axes))) for axis in axes]
+    chosen = np.indices([len(axis.values) for axis in axes]).reshape(len(axes), -1)
+    picked = list(zip(axes, chosen, strict=True))
+    return SettingsGrid(
+        np.concatenate([axis.values[k] for axis, k in picked], axis=1),
+        np.sum([axis.log_prior[k] for axis, k in picked], axis=0),  # of settings independent
+        np.concatenate([axis.step[k] for axis, k in picked], axis=1),
+    )
 
 
 def _axis(setting: Setting, where: str, visits: Measurements) -> SettingsGrid:
@@ -301,17 +294,6 @@ def _axis(setting: Setting, where: str, visits: Measurements) -> SettingsGrid:
 def _time(visits: Measurements) -> Array:
     assert visits.time is not None  # else the hypothesis is not tested
     return visits.time
-
-
-def _product(axes: list[SettingsGrid]) -> SettingsGrid:
-    """Every combination of the axes' values; the priors of settings are independent."""
-    chosen = np.indices([len(axis.values) for axis in axes]).reshape(len(axes), -1)
-    picked = list(zip(axes, chosen, strict=True))
-    return SettingsGrid(
-        np.concatenate([axis.values[k] for axis, k in picked], axis=1),
-        np.sum([axis.log_prior[k] for axis, k in picked], axis=0),
-        np.concatenate([axis.step[k] for axis, k in picked], axis=1),
-    )
 
 
 def _thinned(axis: SettingsGrid, share: float) -> SettingsGrid:
@@ -681,54 +663,38 @@ def compute_columns(
     return Columns(base, B, places, full, x, shares)
 
 
-def _as_placed(model: Model, x: Array) -> Cell:
+def as_placed(model: Model, x: Array) -> Cell:
     """The model's cell with the base turned as it is at x (parameters,)."""
     vector = [v for p, v in zip(model.parameters, x, strict=True)
               if p.effect == BaseFrame.name and p.unit == "rad"]  # fmt: skip
     if len(vector) != 3:
         return model.cell
-    nominal = replace(
-        model.cell.model.nominal, base_rotation=Rotation.from_rotvec(vector).as_matrix()
-    )
+    turned = Rotation.from_rotvec(vector).as_matrix()
+    nominal = replace(model.cell.model.nominal, base_rotation=turned)
     return replace(model.cell, model=replace(model.cell.model, nominal=nominal))
 
 
-@dataclass(frozen=True)
-class Constants:
-    """A chain and a cell with further settings: all that the direction of a driven effect asks of
-    a model, which need not be assembled for it."""
-
-    chain: Chain
-    cell: Cell
-
-    @classmethod
-    def of(cls, model: Model, where: str, settings: dict[str, float]) -> Constants:
-        spec = model.cell.model
-        places = {place: dict(values) for place, values in spec.nominal.settings.items()}
-        places[where] = places.get(where, {}) | settings
-        nominal = replace(spec.nominal, settings=places)
-        return cls(model.chain, replace(model.cell, model=replace(spec, nominal=nominal)))
+def cell_with(cell: Cell, where: str, settings: Mapping[str, float]) -> Cell:
+    """The cell with further constants of an effect: all that its direction asks of a model, which
+    need not be assembled for it."""
+    nominal = cell.model.nominal.at(where, settings)
+    return replace(cell, model=replace(cell.model, nominal=nominal))
 
 
 class RegressorDirection:
     """D(row, settings) = ∂u/∂p (d, k) of a driven hypothesis, from its CasADi expression.
 
-    With `x` (parameters,) of the model the base stands as fitted, else as the cell says; settings
-    of the effect are the cell's where the hypothesis searches none.
+    The base stands as the cell says; settings of the effect are the cell's where the hypothesis
+    searches none.
     """
 
-    def __init__(
-        self, hypothesis: Hypothesis, model: Model | Constants, x: Array | None = None
-    ) -> None:
-        effect = hypothesis.effect
+    def __init__(self, hypothesis: Hypothesis, chain: Chain, cell: Cell) -> None:
+        effect, where = hypothesis.effect, hypothesis.where
         assert isinstance(effect, DrivenEffect)
-        self.hypothesis = hypothesis
-        placed = _as_placed(model, x) if isinstance(model, Model) and x is not None else model.cell
-        self._arm = Arm(model.chain, placed)
+        self._arm = Arm(chain, cell)
         fitted = {s.key: ca.SX.sym(s.key) for s in hypothesis.parameters}
         searched = {s.key: ca.SX.sym(s.key) for s in hypothesis.settings}
-        where, cell = hypothesis.where, self._arm.cell
-        held = {} if searched else set_constants(effect, where, model.chain, cell)
+        held = {} if searched else set_constants(effect, where, chain, cell)
         u = effect.drive(self._arm, where, {**held, **fitted, **searched})
         D = ca.jacobian(u, ca.vertcat(*fitted.values()))
         constants = ca.vertcat(ca.SX.zeros(0, 1), *searched.values())

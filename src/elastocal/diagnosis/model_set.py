@@ -44,7 +44,7 @@ class Item:
 
     @property
     def known(self) -> bool:
-        return isinstance(self.what, Hypothesis)
+        return self.what.known
 
     @property
     def label(self) -> str:
@@ -52,8 +52,7 @@ class Item:
 
     @property
     def key(self) -> tuple[str, str]:
-        """(effect, place) of a known item."""
-        assert isinstance(self.what, Hypothesis)
+        """(effect, place); a block without a name is an unknown effect at its place."""
         return self.what.key
 
     @property
@@ -203,14 +202,14 @@ def refine(dataset: DiagnosisData, chosen: ModelSet, k: int) -> ModelSet:
     """
     item = chosen.items[k]
     what = item.what
-    if not isinstance(what, Hypothesis) or not what.driven or not what.settings:
+    if not what.settings:
         return chosen
     data = beside(dataset, chosen, k)
     grams = Grams(dataset, data, project(data, chosen.noise))
     grid = dataset.grids[what.key]
 
     def evidence(tried: Array) -> Array:
-        return grams.of_hypothesis(what, tried).evidence(item.scales)
+        return grams.of(what, tried).evidence(item.scales)
 
     settings, searched = item.settings, False
     widths = grid.step[grid.nearest(settings)]
@@ -283,7 +282,7 @@ def distances(
     out: dict[tuple[str, str], float] = {}
     for h in dataset.hypotheses:
         if h is not chosen.items[k].what:
-            found = grams.of_hypothesis(h, settings_to_try(dataset, h, chosen.items[k]))
+            found = grams.of(h, settings_to_try(dataset, h, chosen.items[k]))
             explained = float(found.explained(PLAUSIBLE * float(h.scales.max())).max())
             out[h.key] = float(np.sqrt(max(signal - explained, 0.0)))
     return float(np.sqrt(max(signal, 0.0))), out
@@ -293,13 +292,10 @@ def settings_to_try(dataset: DiagnosisData, rival: Hypothesis, item: Item) -> Ar
     """Settings (G, …) at which a rival may imitate an item: those of the search and, where both
     have the same kind of constant, the item's own, which was refined between them.  None where
     the rival has none."""
-    what = item.what
     if not rival.settings:
         return None
     values = dataset.grids[rival.key].values
-    if not isinstance(what, Hypothesis):
-        return values
-    same_kinds = [s.kind for s in rival.settings] == [s.kind for s in what.settings]
+    same_kinds = [s.kind for s in rival.settings] == [s.kind for s in item.what.settings]
     within = same_kinds and all(
         s.lower <= v <= s.upper for s, v in zip(rival.settings, item.settings, strict=True)
     )
@@ -309,26 +305,17 @@ def settings_to_try(dataset: DiagnosisData, rival: Hypothesis, item: Item) -> Ar
 def extended(model: Model, items: Sequence[Item]) -> Model:
     """The model with the effects of the known items active, at their settings."""
     spec = model.cell.model
-    settings = {place: dict(values) for place, values in spec.nominal.settings.items()}
-    effects = list(spec.effects)
     for item in items:
-        if not isinstance(item.what, Hypothesis):
-            continue
-        effects.append(item.what.choice)
-        for setting, value in zip(item.what.settings, item.settings, strict=True):
-            settings.setdefault(item.what.where, {})[setting.key] = float(value)
-    nominal = replace(spec.nominal, settings=settings)
-    cell: Cell = replace(model.cell, model=replace(spec, effects=tuple(effects), nominal=nominal))
-    key = "extended", tuple(effects), repr(settings)
+        if item.known:
+            spec = spec.with_effect(*item.key, settings_of(item))
+    key = "extended", spec.effects, repr(spec.nominal.settings)
+    cell: Cell = replace(model.cell, model=spec)
     return made_once(model, key, lambda: Model.assembled(model.chain, cell))
 
 
 def settings_of(item: Item) -> dict[str, float]:
-    """Searched constants of a known item by their keys."""
-    if not isinstance(item.what, Hypothesis):
-        return {}
-    keys = [s.key for s in item.what.settings]
-    return {k: float(v) for k, v in zip(keys, item.settings, strict=True)}
+    """Searched constants of an item by their keys."""
+    return {s.key: float(v) for s, v in zip(item.what.settings, item.settings, strict=True)}
 
 
 # Estimates of a set: what its columns stand for, and the fit of the model with them in it.

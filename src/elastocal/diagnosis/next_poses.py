@@ -16,7 +16,6 @@ from typing import Any, Literal
 
 import numpy as np
 
-from elastocal.cell.arm_description import EffectChoice
 from elastocal.cell.work_cell import Cell
 from elastocal.diagnosis.diagnose import FEWEST, DiagnosisOptions, diagnose
 from elastocal.diagnosis.diagnosis import Diagnosis, FoundEffect
@@ -184,18 +183,9 @@ def verdict_of(gain: Gain, reached: float, required: float | None) -> NextVerdic
 
 def with_effects_of(model: Model, why: Diagnosis) -> Model:
     """The model with the effects that a diagnosis found, at their settings."""
-    spec = model.cell.model
-    settings, sizes = (
-        {place: dict(values) for place, values in given.items()}
-        for given in (spec.nominal.settings, spec.nominal.sizes)
-    )
-    effects = list(spec.effects)
+    spec = replace(model.cell.model, **why.model_keys)  # type: ignore[arg-type]
     for f in why.effects:
-        effects.append(EffectChoice(f.effect, f.where))
-        settings[f.where] = settings.get(f.where, {}) | f.settings
-        sizes[f.where] = sizes.get(f.where, {}) | f.sizes
-    nominal = replace(spec.nominal, settings=settings, sizes=sizes)
-    spec = replace(spec, effects=tuple(effects), nominal=nominal, **why.model_keys)  # type: ignore[arg-type]
+        spec = spec.with_effect(f.effect, f.where, f.settings, f.sizes)
     cell = replace(model.cell, model=spec)
     return Model.assembled(model.chain, cell) if why.effects else model
 

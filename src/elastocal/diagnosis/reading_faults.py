@@ -62,7 +62,7 @@ def screen_outliers(dataset: DiagnosisData, data: NoisyData) -> OutlierScreening
         conspicuous |= suspect
         suspect &= ~in_a_run(dataset, suspect)
         now = suspect.copy()
-        for group in (blocks.visit, check.repeats):
+        for group in (blocks.visit, dataset.repeated):
             worst = np.zeros(int(group.max()) + 1)
             np.maximum.at(worst, group, np.where(suspect, excess, 0.0))
             now &= excess == worst[group]
@@ -80,18 +80,11 @@ def screen_outliers(dataset: DiagnosisData, data: NoisyData) -> OutlierScreening
 
 
 class DirectChecks:
-    """How far a reading is beyond what its model, its visit, its repeats and its neighbours allow.
-
-    `repeats` (N,) numbers the readings of one marker at one pose under one load.
-    """
+    """How far a reading is beyond what its model, its visit, its repeats and its neighbours
+    allow."""
 
     def __init__(self, dataset: DiagnosisData) -> None:
-        table, lead = dataset.table, dataset.lead
-        force = np.unique(np.round(table.force[lead], 6), axis=0, return_inverse=True)[1].ravel()
-        pose = np.column_stack([table.configuration[lead], table.marker[lead], force])
         self.dataset = dataset
-        self.repeats = np.unique(pose, axis=0, return_inverse=True)[1].ravel()
-        self.kind = np.unique(pose[:, 1:], axis=0, return_inverse=True)[1].ravel()
         self.size = dataset.blocks.size
         self.scales: dict[str, dict[int, float]] = {"visits": {}, "repeats": {}}
         self.stated = dataset.data.stated
@@ -195,7 +188,7 @@ class DirectChecks:
     def _repeated(self, e: Array, error: Array, used: BoolArray) -> tuple[Array, Array]:
         """The same by the other readings of the same marker at the same pose and load, in other
         visits."""
-        group = self.repeats
+        group = self.dataset.repeated
         count = np.bincount(group, used, minlength=int(group.max()) + 1)
         others = count[group] - used
         total = np.zeros((len(count), self.size))
@@ -229,20 +222,20 @@ class DirectChecks:
     ) -> Array:
         """Squared difference (k,) of the `chosen` readings' errors from the mean error of the
         nearest poses, as if that were exact; `weight` (N, size, size) is P_ii."""
-        table, lead = self.dataset.table, self.dataset.lead
-        q = table.q[lead]
+        kind, repeats = self.dataset.kind, self.dataset.repeated
+        q = self.dataset.table.q[self.dataset.lead]
         q = q / np.maximum(q.std(axis=0), 1e-12)
         out = np.full(len(chosen), np.inf)
-        for kind in np.unique(self.kind[chosen]):
-            mine = np.flatnonzero((self.kind == kind) & used)
-            mine = mine[np.unique(self.repeats[mine], return_index=True)[1]]
+        for own in np.unique(kind[chosen]):
+            mine = np.flatnonzero((kind == own) & used)
+            mine = mine[np.unique(repeats[mine], return_index=True)[1]]
             if len(mine) <= NEIGHBOURS + 1:
                 continue
             tree = cKDTree(q[mine])
-            for place in np.flatnonzero(self.kind[chosen] == kind):
+            for place in np.flatnonzero(kind[chosen] == own):
                 i = chosen[place]
                 near = mine[tree.query(q[i], k=NEIGHBOURS + 1)[1]]
-                near = near[self.repeats[near] != self.repeats[i]][:NEIGHBOURS]
+                near = near[repeats[near] != repeats[i]][:NEIGHBOURS]
                 off = error[i] - error[near].mean(axis=0)
                 out[place] = float(off @ weight[i] @ off) / (1 + 1 / len(near))
         return out

@@ -2,8 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Iterator, Mapping, Sequence
-from copy import copy
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -24,8 +23,8 @@ from elastocal.diagnosis.model_set import (
     with_items,
 )
 from elastocal.diagnosis.noise_floor import SMALLEST_NOISE, NoiseValues, project
-from elastocal.diagnosis.unknown import Generic, generic_blocks
-from elastocal.diagnosis.verdict import TOO_NEAR, UNKNOWN_EFFECT
+from elastocal.diagnosis.unknown import UNKNOWN_EFFECT, Generic, generic_blocks
+from elastocal.diagnosis.verdict import TOO_NEAR
 from elastocal.errors import InputError, require
 from elastocal.measurements import Measurements
 from elastocal.model.effects.compliances import JointCompliance
@@ -35,17 +34,12 @@ from elastocal.units import Array
 # The noise that a diagnosis found, and the readings that it left out, in the campaign's terms.
 
 
-def noise_found(diagnosis: Diagnosis) -> NoiseValues:
-    """Factor, repeatability (joints,) and shared scatter."""
+def as_diagnosed(dataset: DiagnosisData, diagnosis: Diagnosis) -> tuple[DiagnosisData, NoiseValues]:
+    """The data, planned ones included, less the faulty readings, and the noise."""
     found = diagnosis.noise
+    faulty = np.isin(dataset.table.row[dataset.lead], [f.line for f in found.faulty])
     joint = np.maximum(found.repeatability, SMALLEST_NOISE)
-    return NoiseValues(found.stated_factor, joint, found.shared)
-
-
-def left_out(base: Baseline, diagnosis: Diagnosis) -> NDArray[np.bool_]:
-    """Which observations (N,) of the base, planned ones included, are faulty readings."""
-    lines = [f.line for f in diagnosis.noise.faulty]
-    return np.isin(base.observed.table.row[base.observed.lead], lines)
+    return dataset.without(faulty), NoiseValues(found.stated_factor, joint, found.shared)
 
 
 # Who the rivals are: the named sets of an ambiguous verdict, or what an unknown effect may be.
@@ -105,50 +99,40 @@ class Suspects:
     def __init__(self, model: Model, table: Measurements, diagnosis: Diagnosis) -> None:
         self.diagnosis = diagnosis
         hypotheses = {h.key: h for h in possible(model, table)[0]}
-        # Every effect that was tried, with its probability.
-        self.known: dict[tuple[str, str], tuple[Item, float]] = {}
+        # Every effect that was tried, and its probability.
+        self.items: dict[tuple[str, str], Item] = {}
+        self.p: dict[tuple[str, str], float] = {}
         for c in diagnosis.candidates:
             if h := hypotheses.get((c.effect, c.where)):
                 settings = np.array([c.settings[s.key] for s in h.settings])
-                self.known[h.key] = Item(h, settings, 0.0), c.probability
+                self.items[h.key], self.p[h.key] = Item(h, settings, 0.0), c.probability
         self._found = [(f.effect, f.where) for f in diagnosis.effects]
         named = [(e.effect, e.where) for group in diagnosis.indistinguishable for e in group]
         for effect, where in [*self._found, *named]:
             require(
-                effect == UNKNOWN_EFFECT or (effect, where) in self.known,
+                effect == UNKNOWN_EFFECT or (effect, where) in self.items,
                 f"{table.source}: the diagnosis names {effect} at {where}, which this model and "
                 "table cannot test; plan with those that were diagnosed",
             )
         self.sets = tuple(self._named_sets())
-
-    def _items(self, keys: Iterable[tuple[str, str]]) -> list[Item]:
-        return [self.known[key][0] for key in keys]
-
-    def _probabilities(self, keys: Iterable[tuple[str, str]]) -> list[float]:
-        return [self.known[key][1] for key in keys]
 
     @property
     def covered(self) -> float:
         """Probability that the right answer is among the rivals: that there is something, and that
         it is none of the effects that are no rivals."""
         d, ours = self.diagnosis, set(self._rivals())
-        others = sum(p for key, (_, p) in self.known.items() if key not in ours)
+        others = sum(p for key, p in self.p.items() if key not in ours)
         missed = d.probability_nothing + others + (0.0 if self.unknown else d.probability_unknown)
         return min(max(1 - missed, 0.0), 1.0)
-
-    def with_sets(self, sets: tuple[RivalSet, ...]) -> Suspects:
-        """The same with other sets of rivals."""
-        other = copy(self)
-        other.sets = sets
-        return other
 
     def _named_sets(self) -> Iterator[RivalSet]:
         """The sets that the diagnosis calls indistinguishable."""
         for group in self.diagnosis.indistinguishable:
             keys = [(e.effect, e.where) for e in group if e.effect != UNKNOWN_EFFECT]
             if len(keys) > 1:
-                beside = self._items(k for k in self._found if k not in keys)
-                yield RivalSet.of(self._items(keys), self._probabilities(keys), beside)
+                beside = [self.items[key] for key in self._found if key not in keys]
+                p = [self.p[key] for key in keys]
+                yield RivalSet.of([self.items[key] for key in keys], p, beside)
 
     def _rivals(self) -> list[tuple[str, str]]:
         """The known rivals, and what is at work beside them."""
@@ -162,8 +146,8 @@ class Suspects:
         keys = self._rivals()
         if self.unknown:
             # Torques, which may drive what is unknown, come from the compliances' columns.
-            keys += [k for k in self.known if k[0] == JointCompliance.name]
-        whats = [item.what for item in self._items(dict.fromkeys(keys))]
+            keys += [key for key in self.items if key[0] == JointCompliance.name]
+        whats = [self.items[key].what for key in dict.fromkeys(keys)]
         return [h for h in whats if isinstance(h, Hypothesis)]
 
     @property
@@ -197,16 +181,16 @@ class Suspects:
         share = self.diagnosis.probability_unknown * softmax(evidence[best])
         keys = self._likeliest()
         return RivalSet.of(
-            [*(items[k] for k in best), *self._items(keys)],
-            [*share, *self._probabilities(keys)],
-            self._items(self._found),
+            [*(items[k] for k in best), *(self.items[key] for key in keys)],
+            [*share, *(self.p[key] for key in keys)],
+            [self.items[key] for key in self._found],
             LEAST_PROBABILITY_UNKNOWN,
         )
 
     def _likeliest(self) -> list[tuple[str, str]]:
-        p = {key: p for key, (_, p) in self.known.items() if key not in self._found}
-        free = sorted(p, key=lambda key: -p[key])[:MOST_KNOWN]
-        return [key for n, key in enumerate(free) if n < FEWEST_KNOWN or p[key] >= CHANCE]
+        free = [key for key in self.p if key not in self._found]
+        free = sorted(free, key=lambda key: -self.p[key])[:MOST_KNOWN]
+        return [key for n, key in enumerate(free) if n < FEWEST_KNOWN or self.p[key] >= CHANCE]
 
 
 def check_open(diagnosis: Diagnosis) -> None:
@@ -233,38 +217,32 @@ def check_open(diagnosis: Diagnosis) -> None:
 NEAR, MOST = 3.76, 10
 
 
-def with_neighbours(
-    base: Baseline, diagnosis: Diagnosis, sets: tuple[RivalSet, ...],
-    known: Mapping[tuple[str, str], tuple[Item, float]],
-) -> tuple[RivalSet, ...]:  # fmt: skip
-    """The sets with what each of their rivals may also be.
-
-    `known`: the items of the diagnosis with their probabilities.
-    """
-    if not sets:
+def with_neighbours(base: Baseline, suspects: Suspects) -> tuple[RivalSet, ...]:
+    """The suspects' sets with what each of their rivals may also be."""
+    if not suspects.sets:
         return ()
-    hypotheses = [i.what for i, _ in known.values() if isinstance(i.what, Hypothesis)]
-    dataset = diagnosis_data_of(base, hypotheses)
-    dataset, noise = dataset.without(left_out(base, diagnosis)), noise_found(diagnosis)
+    items, chance, diagnosis = suspects.items, suspects.p, suspects.diagnosis
+    hypotheses = [i.what for i in items.values() if isinstance(i.what, Hypothesis)]
+    dataset, noise = as_diagnosed(diagnosis_data_of(base, hypotheses), diagnosis)
     out = []
-    for s in sets:
-        near = dict.fromkeys(known, np.inf)
+    for s in suspects.sets:
+        near = dict.fromkeys(items, np.inf)
         for rival in s.rivals:
             found = distances(dataset, fit_set(dataset, (rival, *s.beside), noise), 0)[1]
             near |= {key: min(near[key], d) for key, d in found.items()}
         taken = {item.key for item in (*s.rivals, *s.beside)}
         free = [
             key
-            for key, (_, p) in known.items()
+            for key, p in chance.items()
             if key not in taken and (near[key] < TOO_NEAR or (near[key] < NEAR and p >= CHANCE))
         ]
         free = sorted(free, key=lambda key: near[key])[: max(MOST - len(s.rivals), 0)]
-        rivals = [*s.rivals, *(known[key][0] for key in free)]
+        rivals = [*s.rivals, *(items[key] for key in free)]
         # Those named have their probability given that there is something, as these need, too.
         something = max(1 - diagnosis.probability_nothing, 1e-9)
-        named = [known[item.key][1] for item in s.rivals]
-        p = [*named, *(known[key][1] / something for key in free)]
-        out.append(RivalSet.of(rivals, p, s.beside))
+        probable = [chance[item.key] for item in s.rivals]
+        probable += [chance[key] / something for key in free]
+        out.append(RivalSet.of(rivals, probable, s.beside))
     return tuple(out)
 
 
@@ -323,7 +301,7 @@ def _of_rival(
         return ()
     lists = [settings_to_try(dataset, what, rivals[a]) for a in others]
     tried = np.unique(np.vstack([each for each in lists if each is not None]), axis=0)
-    explained = np.array([grams[a].of_hypothesis(what, tried).explained(size) for a in others])
+    explained = np.array([grams[a].of(what, tried).explained(size) for a in others])
     short = explained.max(axis=1, keepdims=True) - explained
     near = np.flatnonzero((short <= NEARLY).any(axis=0))
     evenly = near[np.linspace(0, len(near) - 1, min(SETTINGS, len(near))).round().astype(int)]

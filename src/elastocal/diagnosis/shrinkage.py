@@ -504,8 +504,8 @@ def other_settings(dataset: DiagnosisData, chosen: ModelSet, k: int) -> list[tup
     data = beside(dataset, chosen, k)
     grid = dataset.grids[what.key]
     grams = Grams(dataset, data, project(data, chosen.noise))
-    own = float(grams.of_hypothesis(what, item.settings[None]).evidence(item.scales)[0])
-    each = grams.of_hypothesis(what).evidence(item.scales)
+    own = float(grams.of(what, item.settings[None]).evidence(item.scales)[0])
+    each = grams.of(what).evidence(item.scales)
     # The chosen one stands for the point of the grid that it was refined from.
     nearest = grid.nearest(item.settings)
     each[nearest] = own

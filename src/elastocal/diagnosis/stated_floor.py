@@ -5,7 +5,8 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 import numpy as np
-from scipy import stats
+from scipy import sparse, stats
+from scipy.sparse.csgraph import connected_components
 from scipy.spatial import cKDTree
 
 from elastocal.diagnosis.diagnosis import FaultyReading, NearRepeats, NoiseFloor
@@ -58,12 +59,9 @@ def pure_error(dataset: DiagnosisData) -> float | None:
 def _repeats(dataset: DiagnosisData, good: BoolArray) -> tuple[IntArray, Array]:
     """Of the `good` observations (N,) the number of their pose, load and marker (n,), and what was
     read in m (n, 1 or 3)."""
-    observed, table = dataset.base.observed, dataset.table
-    rows = observed.lead[good]
-    force = np.round(table.force[rows], 6)
-    key = np.column_stack([table.configuration[rows], table.marker[rows], force])
+    observed = dataset.base.observed
     values = observed.value.reshape(-1, observed.size)[good][:, : min(observed.size, 3)]
-    return np.unique(key, axis=0, return_inverse=True)[1].ravel(), values
+    return dataset.repeated[good], values
 
 
 # Near-repeats: readings of the same marker under the same load at poses that nearly coincide.
@@ -111,41 +109,37 @@ def near_pairs(dataset: DiagnosisData, good: BoolArray) -> IntArray:
     """Pairs (k, 2) of `good` (N,) observations of one marker and load in different configurations,
     each with its nearest neighbour in the joints, all within NEAR."""
     table, lead = dataset.table, dataset.lead
-    force = np.unique(np.round(table.force[lead], 6), axis=0, return_inverse=True)[1].ravel()
-    found: list[IntArray] = []
-    for kind in np.unique(np.column_stack([table.marker[lead], force]), axis=0):
-        mine = np.flatnonzero((table.marker[lead] == kind[0]) & (force == kind[1]) & good)
+    found = [np.zeros((0, 2), dtype=np.int64)]
+    for kind in np.unique(dataset.kind):
+        mine = np.flatnonzero((dataset.kind == kind) & good)
         # One reading of each configuration: the others are repeats.
         mine = mine[np.unique(table.configuration[lead[mine]], return_index=True)[1]]
-        if len(mine) < 2:
-            continue
-        tree = cKDTree(table.q[lead[mine]])
-        distance, other = tree.query(table.q[lead[mine]], k=2, p=np.inf)
-        # Of a pose that stands there twice, either one may come first.
-        itself = other[:, 0] == np.arange(len(mine))
-        near = np.where(itself, other[:, 1], other[:, 0])
-        close = np.where(itself, distance[:, 1], distance[:, 0]) <= NEAR
-        pairs = np.column_stack([mine[close], mine[near[close]]])
-        found.append(np.unique(np.sort(pairs, axis=1), axis=0))
-    return np.concatenate(found) if found else np.zeros((0, 2), dtype=np.int64)
+        if len(mine) > 1:
+            pairs, distance = _nearest(table.q[lead[mine]], np.inf)
+            found.append(_unordered(mine[pairs[distance <= NEAR]]))
+    return np.concatenate(found)
+
+
+def _nearest(x: Array, norm: float = 2.0) -> tuple[IntArray, Array]:
+    """Each of the points x (n, d) beside the nearest other one (n, 2), and how far that is (n,)."""
+    distance, near = cKDTree(x).query(x, k=2, p=norm)
+    own = np.arange(len(x))
+    # Of a point that stands there twice, either one may come first.
+    other = (near[:, 0] == own).astype(int)
+    return np.column_stack([own, near[own, other]]), distance[own, other]
+
+
+def _unordered(pairs: IntArray) -> IntArray:
+    """Each pair once, the smaller number first."""
+    return np.unique(np.sort(pairs, axis=1), axis=0)
 
 
 def _independent(pairs: IntArray) -> int:
     """Number of differences between paired readings that do not follow from each other: of a
     group of k that hang together k − 1."""
-    group: dict[int, int] = {}
-
-    def root(k: int) -> int:
-        while group.setdefault(k, k) != k:
-            k = group[k]
-        return k
-
-    joined = 0
-    for i, j in pairs.tolist():
-        a, b = root(i), root(j)
-        if a != b:
-            group[b], joined = a, joined + 1
-    return joined
+    known, at = np.unique(pairs, return_inverse=True)
+    n, (i, j) = len(known), at.reshape(pairs.shape).T
+    return n - int(connected_components(sparse.csr_array((np.ones(len(i)), (i, j)), (n, n)))[0])
 
 
 # Repeats to which the arm came back: it was elsewhere in between, in the order of times or rows.
@@ -214,7 +208,9 @@ def smooth_scatter(dataset: DiagnosisData, data: NoisyData, at: Projection) -> A
             continue
         z = a[known, j] / np.sqrt(h[known, j])
         pairs = [*(_next_to(q[known, k]) for k in range(J)), _next_to(moment[known])]
-        rho = np.array([_correlation(z, *p, limit) for p in (*pairs, _nearest(q[known]))])
+        scaled = q[known] / np.maximum(q[known].std(axis=0), 1e-12)
+        pairs.append(tuple(_unordered(_nearest(scaled)[0]).T))
+        rho = np.array([_correlation(z, *p, limit) for p in pairs])
         share = min(max(float(rho[:J].sum()), float(rho[J:].max())), 1.0)
         out[j] = share * float((z**2).mean()) / float(h[known, j].mean())
     return out
@@ -225,16 +221,6 @@ def _next_to(x: Array) -> tuple[IntArray, IntArray]:
     drawn = np.random.default_rng(len(x)).permutation(len(x))
     order = drawn[np.argsort(x[drawn], kind="stable")]
     return order[:-1], order[1:]
-
-
-def _nearest(q: Array) -> tuple[IntArray, IntArray]:
-    """Each pose of q (n, joints) and the one nearest to it, every joint by its own spread."""
-    scaled = q / np.maximum(q.std(axis=0), 1e-12)
-    near = cKDTree(scaled).query(scaled, k=2)[1]
-    every = np.arange(len(q))
-    pairs = np.column_stack([every, np.where(near[:, 0] == every, near[:, 1], near[:, 0])])
-    pairs = np.unique(np.sort(pairs, axis=1), axis=0)
-    return pairs[:, 0], pairs[:, 1]
 
 
 def _correlation(z: Array, one: IntArray, other: IntArray, limit: float) -> float:

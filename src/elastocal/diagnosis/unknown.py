@@ -11,8 +11,11 @@ from numpy.typing import NDArray
 
 from elastocal.diagnosis.diagnosis_data import DiagnosisData
 from elastocal.diagnosis.hypotheses import SCALES, EntryKey, recorded
+from elastocal.model.arm import Setting
 from elastocal.model.effects.base import Stage
 from elastocal.units import Array
+
+UNKNOWN_EFFECT = "unknown_effect"  # the name of all that has none
 
 # What an unknown effect may depend on: angles, time, torque, load, direction, force, view.
 
@@ -32,139 +35,85 @@ class Covariate:
     joint: int | None = None
 
 
-@dataclass(frozen=True)
-class Covariates:
-    """What was recorded of each visit (C, v, …)."""
+def covariates(dataset: DiagnosisData) -> Iterator[Covariate]:
+    """Every covariate that was recorded and is one number per visit, and every product of two."""
+    table, present = dataset.table, dataset.present
 
-    dataset: DiagnosisData
-    angle: Array
-    torque: Array
-    time: Array | None
-    temperature: Array | None
-    approach: Array | None
-    load: Array | None
+    def of_visits(values: Array) -> Array:
+        return dataset.places.gather(values[dataset.lead])
 
-    @classmethod
-    def of(cls, dataset: DiagnosisData) -> Covariates:
-        table = dataset.table
+    def if_recorded(name: str) -> Array | None:
+        return of_visits(getattr(table, name)) if recorded(table, name) else None
 
-        def visits(values: Array) -> Array:
-            return dataset.places.gather(values[dataset.lead])
-
-        def if_recorded(name: str) -> Array | None:
-            return visits(getattr(table, name)) if recorded(table, name) else None
-
+    q, torque = of_visits(table.q), of_visits(dataset.columns.torques())
+    time, approach = if_recorded("time"), if_recorded("approach")
+    load, joints = None, range(q.shape[2])
+    loaded = [i for i in joints if np.ptp(torque[:, :, i][present]) > 0]
+    few = [waves(q[:, :, i], present, FEW_WAVES) for i in joints]
+    slow = None if time is None else waves(time, present, FEW_WAVES)
+    for i in joints:
+        angle = q[:, :, i]
+        yield Covariate("angle", f"joint{i + 1} angle", waves(angle, present, WAVES), angle, "rad")
+    for i in loaded:
+        tau = torque[:, :, i]
+        u = tau / max(float(np.abs(tau[present]).max()), 1e-12)
+        odd_and_even = np.stack([u, u**3, np.tanh(u / 0.05), np.abs(u), u**2], axis=2)
+        odd_and_even *= present[:, :, None]
+        yield Covariate("torque", f"joint{i + 1} torque", odd_and_even, tau, "N m")
+    if time is not None:
+        yield Covariate("time", "time", waves(time, present, WAVES), time, "s")
+    if (warmth := if_recorded("temperature")) is not None:
+        functions = waves(warmth, present, FEW_WAVES)
+        yield Covariate("temperature", "temperature", functions, warmth, "°C")
+    if recorded(table, "load"):
         force = np.linalg.norm(table.force, axis=1)
-        return cls(
-            dataset, visits(table.q), visits(dataset.columns.torques()), if_recorded("time"),
-            if_recorded("temperature"), if_recorded("approach"),
-            visits(force / force.max()) if recorded(table, "load") else None,
-        )  # fmt: skip
-
-    def smooth(self) -> Iterator[Covariate]:
-        """Every covariate that is one number per visit, and every product of two."""
-        yield from self._single()
-        yield from self._with_load()
-        yield from self._with_approach()
-        yield from self._at_own_joint()
-        if self.time is not None:
-            time = waves(self.time, self.dataset.present, FEW_WAVES)
-            for i in range(self.n):
-                both = _product(self._angle(i, FEW_WAVES), time)
-                yield Covariate("time × angle", f"time × joint{i + 1} angle", both)
-
-    @property
-    def n(self) -> int:
-        return self.angle.shape[2]
-
-    def _angle(self, i: int, count: int) -> Array:
-        return waves(self.angle[:, :, i], self.dataset.present, count)
-
-    def _loaded_joints(self) -> list[int]:
-        return [i for i in range(self.n) if np.ptp(self.torque[:, :, i][self.dataset.present]) > 0]
-
-    def _single(self) -> Iterator[Covariate]:
-        present = self.dataset.present
-        for i in range(self.n):
-            angle = self.angle[:, :, i]
-            yield Covariate("angle", f"joint{i + 1} angle", self._angle(i, WAVES), angle, "rad")
-        for i in self._loaded_joints():
-            tau = self.torque[:, :, i]
-            functions = _odd_and_even(tau, present)
-            yield Covariate("torque", f"joint{i + 1} torque", functions, tau, "N m")
-        if self.time is not None:
-            yield Covariate("time", "time", waves(self.time, present, WAVES), self.time, "s")
-        if self.temperature is not None:
-            warmth = waves(self.temperature, present, FEW_WAVES)
-            yield Covariate("temperature", "temperature", warmth, self.temperature, "°C")
-
-    def _with_load(self) -> Iterator[Covariate]:
-        load, present = self.load, self.dataset.present
-        if load is None:
-            return
+        load = of_visits(force / force.max())
         levels = len(np.unique(load[present].round(6)))
-        powers = [load] if levels < 3 else [load, load**2]
-        both = np.stack(powers, axis=2) * present[:, :, None]
+        both = np.stack([load] if levels < 3 else [load, load**2], axis=2) * present[:, :, None]
         yield Covariate("load", "load", both, load, "of the largest load")
-        for i in range(self.n):
-            few = self._angle(i, FEW_WAVES) * load[:, :, None]
-            yield Covariate("load × angle", f"load × joint{i + 1} angle", few)
-        if self.time is not None:
-            time = waves(self.time, present, FEW_WAVES)
-            yield Covariate("load × time", "load × time", time * load[:, :, None])
+        for i in joints:
+            by_angle = few[i] * load[:, :, None]
+            yield Covariate("load × angle", f"load × joint{i + 1} angle", by_angle)
+        if slow is not None:
+            yield Covariate("load × time", "load × time", slow * load[:, :, None])
+    for i in joints if approach is not None else ():
+        a = approach[:, :, i]
+        by = [a] if load is None else [a, a * load]
+        size = np.abs(torque[:, :, i])
+        if size.max() > 0:
+            by.append(a * size / size.max())
+        yield Covariate("approach", f"approach of joint{i + 1}", np.stack(by, axis=2), joint=i)
+    # A stiffness that changes with the joint's own angle, or with time.
+    for i in loaded:
+        name = f"joint{i + 1} torque"
+        tau = (torque[:, :, i] / np.abs(torque[:, :, i][present]).max())[:, :, None]
+        by_angle = waves(q[:, :, i], present, WAVES - FEW_WAVES) * tau
+        yield Covariate("torque × angle", f"{name} × its angle", by_angle, joint=i)
+        if slow is not None:
+            yield Covariate("torque × time", f"{name} × time", slow * tau, joint=i)
+    for i in joints if slow is not None else ():
+        product = few[i][:, :, :, None] * slow[:, :, None, :]
+        both = product.reshape(*product.shape[:2], -1)
+        yield Covariate("time × angle", f"time × joint{i + 1} angle", both)
 
-    def _with_approach(self) -> Iterator[Covariate]:
-        if self.approach is None:
+
+def wrenches(dataset: DiagnosisData) -> Iterator[tuple[Array, Array]]:
+    """The load's force and moment (C, v, 3) at each link's end along its axes, largest 1.
+
+    A link's end moved by e moves every marker by R e, so the columns of its frame are R; and
+    turned about e they move a marker by R e × lever, whose product with the force is the moment
+    about e, the load taken at the marker.
+    """
+    if not recorded(dataset.table, "load"):
+        return
+    for k in range(dataset.table.q.shape[1]):
+        E = dataset.columns.entry(("link_frame", (f"link{k + 1}",)))
+        if E.shape[1] < 3:
             return
-        for i in range(self.n):
-            a = self.approach[:, :, i]
-            by = [a] if self.load is None else [a, a * self.load]
-            torque = np.abs(self.torque[:, :, i])
-            if torque.max() > 0:
-                by.append(a * torque / torque.max())
-            functions = np.stack(by, axis=2)
-            yield Covariate("approach", f"approach of joint{i + 1}", functions, joint=i)
-
-    def _at_own_joint(self) -> Iterator[Covariate]:
-        """A stiffness that changes with the joint's own angle, or with time."""
-        present = self.dataset.present
-        for i in self._loaded_joints():
-            tau = self.torque[:, :, i] / np.abs(self.torque[:, :, i][present]).max()
-            name = f"joint{i + 1} torque"
-            by_angle = self._angle(i, WAVES - FEW_WAVES) * tau[:, :, None]
-            yield Covariate("torque × angle", f"{name} × its angle", by_angle, joint=i)
-            if self.time is not None:
-                by_time = waves(self.time, present, FEW_WAVES) * tau[:, :, None]
-                yield Covariate("torque × time", f"{name} × time", by_time, joint=i)
-
-    def wrenches(self) -> Iterator[tuple[Array, Array]]:
-        """The load's force and moment (C, v, 3) at each link's end along its axes, largest 1.
-
-        A link's end moved by e moves every marker by R e, so the columns of its frame are R; and
-        turned about e they move a marker by R e × lever, whose product with the force is the
-        moment about e, the load taken at the marker.
-        """
-        dataset = self.dataset
-        if self.load is None:
-            return
-        for k in range(self.n):
-            E = dataset.columns.entry(("link_frame", (f"link{k + 1}",)))
-            if E.shape[1] < 3:
-                return
-            wrench = np.einsum("nsd,ns->nd", E[:, :3], dataset.table.force)
-            wrench = dataset.places.gather(wrench[dataset.lead])
-            force, moment = wrench[:, :, :3], wrench[:, :, 3:]
-            yield force / max(np.abs(force).max(), 1e-12), moment / max(np.abs(moment).max(), 1e-12)
-
-    def view(self) -> Array:
-        """Unit vector (n_rows, 3) from each marker to the instrument, in the flange frame."""
-        base = self.dataset.base
-        table = base.observed.table
-        T = base.model.flange_poses(table, base.x)
-        assert table.position is not None
-        line = base.model.cell.tracker.position - table.position
-        line = line / np.linalg.norm(line, axis=1, keepdims=True)
-        return np.einsum("nij,ni->nj", T[:, :3, :3], line)
+        wrench = np.einsum("nsd,ns->nd", E[:, :3], dataset.table.force)
+        wrench = dataset.places.gather(wrench[dataset.lead])
+        force, moment = wrench[:, :, :3], wrench[:, :, 3:]
+        yield force / max(np.abs(force).max(), 1e-12), moment / max(np.abs(moment).max(), 1e-12)
 
 
 def waves(x: Array, present: NDArray[np.bool_], count: int) -> Array:
@@ -179,24 +128,11 @@ def waves(x: Array, present: NDArray[np.bool_], count: int) -> Array:
     return np.cos(np.pi * u[:, :, None] * k) / k * present[:, :, None]
 
 
-def _product(a: Array, b: Array) -> Array:
-    """Products of the functions a (C, v, f) and b (C, v, g): (C, v, f·g)."""
-    return np.asarray((a[:, :, :, None] * b[:, :, None, :]).reshape(*a.shape[:2], -1))
-
-
-def monomials(x: Array, degree: int) -> Array:
-    """Products of the components of x (n, 3) up to `degree`, without the constant."""
-    out = [x[:, [i]] for i in range(x.shape[1])]
-    if degree > 1:
-        out += [x[:, [i]] * x[:, [j]] for i in range(x.shape[1]) for j in range(i + 1)]
-    return np.concatenate(out, axis=1)
-
-
-def _odd_and_even(x: Array, present: NDArray[np.bool_]) -> Array:
-    """x, x³, sign and size of a torque, x scaled to its largest."""
-    u = x / max(float(np.abs(x[present]).max()), 1e-12)
-    functions = np.stack([u, u**3, np.tanh(u / 0.05), np.abs(u), u**2], axis=2)
-    return functions * present[:, :, None]
+def monomials(x: Array) -> Array:
+    """The components of x (n, 3) and their products, without the constant."""
+    several = range(x.shape[1])
+    products = [x[:, [i]] * x[:, [j]] for i in several for j in range(i + 1)]
+    return np.concatenate([x, *products], axis=1)
 
 
 # Blocks: each is one covariate at one place of the chain.  Joint i's angle moves joint k or frame
@@ -230,6 +166,12 @@ class Generic:
     source: Covariate | None = None
 
     scales: ClassVar[Array] = SCALES
+    known: ClassVar[bool] = False
+    settings: ClassVar[tuple[Setting, ...]] = ()
+
+    @property
+    def key(self) -> tuple[str, str]:
+        return UNKNOWN_EFFECT, self.where
 
     @property
     def label(self) -> str:
@@ -245,67 +187,49 @@ class Generic:
 
 def generic_blocks(dataset: DiagnosisData) -> list[Generic]:
     """Every block that the recorded columns allow."""
-    covariates = Covariates.of(dataset)
-    return [
-        *_driven(dataset, covariates),
-        *_of_force(dataset, covariates),
-        *_of_reading(dataset, covariates),
-    ]
+    return [*_driven(dataset), *_of_force(dataset), *_of_reading(dataset)]
 
 
-def _driven(dataset: DiagnosisData, covariates: Covariates) -> Iterator[Generic]:
+def _driven(dataset: DiagnosisData) -> Iterator[Generic]:
     model = dataset.base.model
     numbers = range(1, model.chain.n_joints + 1)
 
     def block(by: Covariate, entry: str, place: str, stage: Stage) -> Generic:
         # Six components each: fewer functions do, since the components share their shape.
         some = by.functions if entry == "joint_motion" else by.functions[:, :, :FRAME_WAVES]
-        direction = _each_component(dataset, entry, place, some)
+        span = dataset.columns.places[entry, place]
+        d, size = span.stop - span.start, BASE_MOTION if entry == "base_motion" else MOTION
+        direction = np.einsum("de,cvf->cvdef", size * np.eye(d), some)
+        direction = direction.reshape(*some.shape[:2], d, -1)
         return Generic(by.kind, by.name, place, stage, (entry, (place,)), direction, source=by)
 
-    for by in covariates.smooth():
+    for by in covariates(dataset):
         under_load = by.kind.startswith(("torque", "load"))
         for k in numbers:
             if by.joint is None or by.joint == k - 1:
                 stage: Stage = "compliance" if under_load else "transmission"
                 yield block(by, "joint_motion", f"joint{k}", stage)
         if by.kind in ("angle", "time", "load", "temperature"):
-            for k in numbers:
-                yield block(
-                    by, "link_frame", f"link{k}", "compliance" if under_load else "geometry"
-                )
+            stage = "compliance" if under_load else "geometry"
+            yield from (block(by, "link_frame", f"link{k}", stage) for k in numbers)
         if by.kind in ("angle", "time", "load", "temperature", "approach"):
             yield block(by, "base_motion", "base", "tracker")
         if by.kind in ("time", "temperature", "load"):
             for marker in model.cell.tool.markers:
                 yield block(by, "marker_motion", f"marker:{marker}", "tool")
         if by.kind in ("angle", "time") and dataset.load_point is not None:
-            yield _of_load_point(dataset, by)
+            # The load point moves: few functions for each of its directions, under load only.
+            few = by.functions[:, :, :FEW_WAVES]
+            W = np.einsum("cmv,cvf->cmf", dataset.places.one_hot, few) * LOAD_POINT_MOTION
+            moved = np.einsum("cmd,cmf->cmdf", dataset.load_point, W)
+            columns = moved.reshape(*moved.shape[:2], -1)
+            yield Generic(f"{by.kind} → load", by.name, "load", "load", columns=columns)
 
 
-def _of_load_point(dataset: DiagnosisData, by: Covariate) -> Generic:
-    """The load point moves: few functions for each of its directions, under load only."""
-    assert dataset.load_point is not None
-    few = by.functions[:, :, :FEW_WAVES]
-    W = np.einsum("cmv,cvf->cmf", dataset.places.one_hot, few) * LOAD_POINT_MOTION
-    columns = np.einsum("cmd,cmf->cmdf", dataset.load_point, W)
-    packed = columns.reshape(*columns.shape[:2], -1)
-    return Generic(f"{by.kind} → load", by.name, "load", "load", columns=packed)
-
-
-def _each_component(dataset: DiagnosisData, entry: str, place: str, W: Array) -> Array:
-    """Each of the functions W (C, v, f) moves each component of the entry: (C, v, d, d·f)."""
-    span = dataset.columns.places[entry, place]
-    d = span.stop - span.start
-    size = BASE_MOTION if entry == "base_motion" else MOTION
-    return np.einsum("de,cvf->cvdef", size * np.eye(d), W).reshape(*W.shape[:2], d, -1)
-
-
-def _of_force(dataset: DiagnosisData, covariates: Covariates) -> Iterator[Generic]:
+def _of_force(dataset: DiagnosisData) -> Iterator[Generic]:
     """Force and moment at a link's end, each moving or turning it along any axis."""
-    for k, (force, moment) in enumerate(covariates.wrenches()):
-        C, v, _ = force.shape
-        direction = np.zeros((C, v, 6, 18))
+    for k, (force, moment) in enumerate(wrenches(dataset)):
+        direction = np.zeros((*force.shape[:2], 6, 18))
         for a in range(3):
             direction[:, :, a, 3 * a : 3 * a + 3] = MOTION * force
             direction[:, :, 3 + a, 9 + 3 * a : 12 + 3 * a] = MOTION * moment
@@ -316,27 +240,31 @@ def _of_force(dataset: DiagnosisData, covariates: Covariates) -> Iterator[Generi
                       direction)  # fmt: skip
 
 
-def _of_reading(dataset: DiagnosisData, covariates: Covariates) -> Iterator[Generic]:
+def _of_reading(dataset: DiagnosisData) -> Iterator[Generic]:
     """What differs from marker to marker in one visit: a field in space, the angle of view."""
-    table, size = dataset.table, dataset.base.observed.size
-    if table.position is None or size < 3:
+    table, base = dataset.table, dataset.base
+    if table.position is None or base.observed.size < 3:
         return
-    offset = table.position - dataset.base.model.cell.tracker.position
-    field = monomials(_standard(offset), 2) * MOTION
-    shift = np.zeros((len(table), size, 3))
+    cell, n = base.model.cell, len(table)
+    offset = table.position - cell.tracker.position
+    middle, half = (offset.max(axis=0) + offset.min(axis=0)) / 2, np.ptp(offset, axis=0) / 2
+    field = monomials((offset - middle) / np.maximum(half, 1e-9)) * MOTION
+    shift = np.zeros((n, base.observed.size, 3))
     shift[:, :3] = np.eye(3)
-    rows = np.einsum("nsd,nf->nsdf", shift, field).reshape(len(table), size, -1)
+
+    def of_rows(columns: Array, functions: Array) -> Array:
+        rows = np.einsum("nsd,nf->nsdf", columns, functions)
+        return dataset.pack(rows.reshape(*columns.shape[:2], -1))
+
     yield Generic("field", "position in the workspace", "tracker", "tracker",
-                  columns=dataset.pack(rows))  # fmt: skip
-    view = covariates.view()
-    for marker in dataset.base.model.cell.tool.markers:
+                  columns=of_rows(shift, field))  # fmt: skip
+    # The unit vector from each marker to the instrument, in the flange frame.
+    R = base.model.flange_poses(table, base.x)[:, :3, :3]
+    line = cell.tracker.position - table.position
+    line = line / np.linalg.norm(line, axis=1, keepdims=True)
+    view = monomials(np.einsum("nij,ni->nj", R, line)) * MOTION
+    for marker in cell.tool.markers:
         place = f"marker:{marker}"
         E = dataset.columns.entry(("marker_motion", (place,)))
-        rows = np.einsum("nsd,nf->nsdf", E, monomials(view, 2) * MOTION)
         yield Generic("view", f"angle of view of {marker}", place, "tool",
-                      columns=dataset.pack(rows.reshape(len(table), size, -1)))  # fmt: skip
-
-
-def _standard(values: Array) -> Array:
-    spread = np.maximum(np.ptp(values, axis=0) / 2, 1e-9)
-    return (values - (values.max(axis=0) + values.min(axis=0)) / 2) / spread
+                      columns=of_rows(E, view))  # fmt: skip

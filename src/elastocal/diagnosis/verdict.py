@@ -22,12 +22,12 @@ from elastocal.diagnosis.effect_search import SelectedEffects
 from elastocal.diagnosis.evidence import Scan, exceedance
 from elastocal.diagnosis.hypotheses import Hypothesis
 from elastocal.diagnosis.model_set import Item, ModelSet, distances, settings_of
+from elastocal.diagnosis.noise_floor import NoiseValues
 from elastocal.diagnosis.reading_faults import OutlierScreening
 
 # From scores to an answer: explained, ambiguous, unknown, or nothing significant.
 
 NAMED = 0.9  # probability from which an effect is named
-UNKNOWN_EFFECT = "unknown_effect"
 SET, LARGEST_SET = 0.95, 3  # probability that the named set holds, as far as so many can
 # Two known alternatives at distance d are told apart with probability Φ(d/2) at best: closer than
 # this, no evidence can be trusted to name one of them.
@@ -47,15 +47,10 @@ class Answer:
     @property
     def indistinguishable(self) -> tuple[tuple[EffectAt, ...], ...]:
         return tuple(
-            tuple(EffectAt(*_named(item)) for item, _ in rivals)
+            tuple(EffectAt(*item.key) for item, _ in rivals)
             for rivals in self.rivals
             if len(rivals) > 1
         )
-
-
-def _named(item: Item) -> tuple[str, str]:
-    """(effect, place); a block without a name is an unknown effect at its place."""
-    return item.key if item.known else (UNKNOWN_EFFECT, item.what.where)
 
 
 def judge(found: SelectedEffects) -> Answer:
@@ -212,7 +207,7 @@ def candidates(
     """Every hypothesis with its probability: in the slot where it is likeliest."""
     best: dict[tuple[str, str], Candidate] = {}
     distance = {
-        h.key: s.distance for h, s in zip(dataset.hypotheses, found.alone.scored, strict=True)
+        h.key: s.distance for h, s in zip(dataset.hypotheses, found.alone.scored, strict=False)
     }
     for k, slot in enumerate(found.slots):
         rivals = answer.rivals[k] if k < len(answer.rivals) else ()
@@ -241,17 +236,16 @@ def too_small(dataset: DiagnosisData, found: SelectedEffects) -> tuple[Untested,
     advice = "spread the poses over more of the work space, or raise the load"
     return tuple(
         Untested(*h.key, reason, advice)
-        for h, s in zip(dataset.hypotheses, found.alone.scored, strict=True)
+        for h, s in zip(dataset.hypotheses, found.alone.scored, strict=False)
         if s.distance < DETECTABLE and id(h) not in chosen
     )
 
 
 def warnings(
-    dataset: DiagnosisData, found: SelectedEffects, screened: OutlierScreening
+    dataset: DiagnosisData, found: SelectedEffects, screened: OutlierScreening, noise: NoiseValues
 ) -> tuple[str, ...]:
-    """What a reader should know before trusting the verdict."""
-    out = []
-    noise, data = found.chosen.noise, found.chosen.data
+    """What a reader should know before trusting the verdict, by the `noise` that the answer has."""
+    out, data = [], found.chosen.data
     if data.stated and not STATED_LOW < noise.factor < STATED_HIGH:
         out.append(
             f"the readings scatter {noise.factor:.2g} times as much as cell or table state; "

@@ -6,7 +6,7 @@ import math
 from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
 
-from elastocal.diagnosis.diagnosis import ComponentShare, Diagnosis, FoundEffect, Interval
+from elastocal.diagnosis.diagnosis import ComponentShare, Curve, Diagnosis, FoundEffect, Interval
 from elastocal.report.effect_names import (
     effect_at_places,
     place,
@@ -169,12 +169,18 @@ def lengths(ends: Interval) -> str:
     return f"{low.removesuffix(unit)} to {high}" if low.endswith(unit) else f"{low} to {high}"
 
 
+def curve_span(curve: Curve) -> str:
+    """How far a curve goes from its lowest to its highest point."""
+    moved = max(curve.y) - min(curve.y)
+    if curve.y_unit == "m":
+        return length(moved)
+    shown, unit = display(moved, curve.y_unit)
+    return f"{significant(shown)} {unit}"
+
+
 def curve_line(d: Diagnosis) -> str:
     """How far the error curve of each joint goes from its lowest to its highest point."""
-    told = []
-    for curve in d.curves:
-        shown, unit = display(max(curve.y) - min(curve.y), curve.y_unit)
-        told.append(f"{significant(shown)} {unit} ({place(curve.entry)})")
+    told = [f"{curve_span(curve)} ({place(curve.entry)})" for curve in d.curves]
     return f"the joints' errors against their own angles span {together(told)}." if told else ""
 
 

@@ -8,6 +8,7 @@ from dataclasses import dataclass
 from typing import Any
 
 from elastocal.diagnosis.diagnosis import (
+    NORMAL_95,
     Candidate,
     Curve,
     Diagnosis,
@@ -23,6 +24,7 @@ from elastocal.report.causes_view import (
     assumed_order,
     cause_rows,
     curve_line,
+    curve_span,
     field_rows,
     headline_of_causes,
     place_rows,
@@ -46,7 +48,6 @@ from elastocal.report.formatting import (
     ShownTable,
     capital,
     counted,
-    display,
     estimate,
     faulty_rows,
     gap_table,
@@ -244,14 +245,8 @@ def _dependence(d: Diagnosis) -> list[str]:
 
 def _shape(curve: Curve) -> str:
     """How much the driver moves the entry, from its lowest to its highest point."""
-    moved = max(curve.y) - min(curve.y)
-    how_far = length(moved) if curve.y_unit == "m" else _in_unit(moved, curve.y_unit)
-    return f"{driver_name(curve.driver)} moves {driver_name(curve.entry)} by {how_far} in all."
-
-
-def _in_unit(value: float, unit: str) -> str:
-    shown, text = display(value, unit)
-    return f"{significant(shown)} {text}"
+    moved = f"{driver_name(curve.driver)} moves {driver_name(curve.entry)}"
+    return f"{moved} by {curve_span(curve)} in all."
 
 
 def _chance(d: Diagnosis) -> str:
@@ -318,7 +313,6 @@ def extra_lines(extra: ExtraPlan) -> list[str]:
 
 
 Rows = list[tuple[str, ...]]
-HALF_WIDTHS = 1.959964  # standard deviations in half a 95 % interval
 
 
 def error_steps(d: Diagnosis) -> tuple[BudgetStep, ...]:
@@ -359,7 +353,7 @@ def added_parameter_rows(d: Diagnosis) -> ShownTable:
     rows: Rows = []
     for f in d.effects:
         for p in f.parameters:
-            rows.append((printable(p.name), *estimate(p.value, HALF_WIDTHS * p.std, p.unit)))
+            rows.append((printable(p.name), *estimate(p.value, NORMAL_95 * p.std, p.unit)))
         if f.settings:
             rows.append((effect_at(f), settings_text(f.settings), "", ""))
     return ShownTable(("parameter", "value", "± 95 %", "unit"), rows, (0, 3))

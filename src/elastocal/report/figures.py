@@ -15,7 +15,6 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 from numpy.typing import NDArray
 
-from elastocal.cell.arm_description import EffectChoice
 from elastocal.diagnosis.diagnosis import Curve, Diagnosis
 from elastocal.errors import ElastocalError
 from elastocal.model.manipulator import Model
@@ -359,12 +358,8 @@ def effect_shapes(d: Diagnosis) -> list[EffectShape]:
     B = model.regressor(observed.table, base.x, observations=observed).B if wanted else None
     for f in wanted[:MOST_SHAPES]:
         assert B is not None
-        spec, new = model.cell.model, {p.name: p.value for p in f.parameters}
-        settings = {**spec.nominal.settings, **({f.where: f.settings} if f.settings else {})}
-        more = replace(
-            spec, effects=(*spec.effects, EffectChoice(f.effect, f.where)),
-            nominal=replace(spec.nominal, settings=settings),
-        )  # fmt: skip
+        more = model.cell.model.with_effect(f.effect, f.where, f.settings)
+        new = {p.name: p.value for p in f.parameters}
         values = dict(zip(model.names, base.x, strict=True)) | new
         try:
             full = Model.assembled(model.chain, replace(model.cell, model=more))

@@ -141,7 +141,7 @@ def test_an_unlisted_rival_is_as_probable_as_the_listed_ones_are(narrow) -> None
     diagnosis.probability_nothing = 0.5
     suspects = Suspects(model, table, diagnosis)
     base = fit_baseline(model, table)
-    (rivals,) = with_neighbours(base, diagnosis, suspects.sets, suspects.known)
+    (rivals,) = with_neighbours(base, suspects)
     np.testing.assert_allclose(rivals.probability, [0.5, 0.4, 0.1])
 
 
