@@ -5,7 +5,7 @@ import pytest
 from scipy import linalg
 
 from elastocal.identification import least_trimmed_squares
-from elastocal.identification.outliers import STEPS, TOGETHER, _searched
+from elastocal.identification.robust_fits import STEPS, TOGETHER, _searched
 
 
 def one_by_one(B, e, subset):

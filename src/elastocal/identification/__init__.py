@@ -27,7 +27,7 @@ ROOMS = {
     ),
     "noise_summary": "LackOfFit Noise NoiseSize lack_of_fit",
     "options": "Method Options",
-    "outliers": "Outlier blocks describe find_faulty least_trimmed_squares majority verdict",
+    "outliers": "Outlier blocks describe find_faulty verdict",
     "prediction": "NewPoses Position PredictedError Uncertainty position_at predicted_error",
     "published": "eq14 eq14_weights group_sigma ols wls",
     "reml": "LogPrior evaluate kenward_roger prior_of_groups slope stacks",
@@ -41,7 +41,9 @@ ROOMS = {
         "Absolute Bisquare Huber StudentT bisquare breakdown_bisquare design efficiency huber "
         "m_scale normal_mean normal_moments"
     ),
-    "robust_fits": "log_likelihood m_estimate mm_estimate student_t",
+    "robust_fits": (
+        "least_trimmed_squares log_likelihood m_estimate majority mm_estimate student_t"
+    ),
     "solve": "Problem Reduction Solution reduce residual_sigma sizes_and_check",
     "start": "RegistrationProblem check_limits check_table fixed_and_free register start_values",
     "weighted_problem": (

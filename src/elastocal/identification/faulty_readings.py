@@ -12,7 +12,7 @@ from scipy import special
 
 from elastocal.errors import ElastocalError, require
 from elastocal.identification.noise_choice import NoiseFit, linearised, own_noise, weights_of
-from elastocal.identification.outliers import FALSE_ALARM, blocks
+from elastocal.identification.outliers import FALSE_ALARM, blocks, studentised
 from elastocal.identification.robust_core import Design, design
 from elastocal.identification.solve import Solution
 from elastocal.identification.weighted_problem import block_diagonal, inverse_factor
@@ -85,17 +85,13 @@ class CleanFit:
         observation, follow F.  1 where the others do not predict it.
         """
         size = self.problem.size
-        H = self.T @ self.T.transpose(0, 2, 1)
-        sign = np.where(self.good, -1.0, 1.0)[:, None, None]
-        spread = np.eye(size) + sign * H
-        alone = (np.linalg.eigvalsh(spread)[:, 0] < NOTHING) | self.undetermined
-        spread[alone] = np.eye(size)
-        drop = (self.e * np.linalg.solve(spread, self.e[..., None])[..., 0]).sum(axis=1)
+        drop = studentised(self.T, self.e, self.good, np.zeros((len(self.e), size, 0)))
+        drop[self.undetermined] = 0.0
         dof = self.dof - size * self.good
         floor = len(drop) * self.problem.floor**2
         rest = np.maximum(self.rss - np.where(self.good, drop, 0.0), floor)
         p = special.fdtrc(size, np.maximum(dof, 1), drop / size * np.maximum(dof, 1) / rest)
-        return np.where(alone | (dof < 1), 1.0, p)
+        return np.where(dof < 1, 1.0, p)
 
     def group_test(self, members: BoolArray, may_shift: bool = True) -> GroupTest | None:
         """Test the observations `members` (n,) together, whether good ones or not; for a common

@@ -1,13 +1,13 @@
-"""Robust linear fits: least absolute values, S, M and MM estimates, Student's t."""
+"""Robust linear fits: least absolute values, trimmed squares, S, M, MM, Student's t."""
 
 from __future__ import annotations
 
-from dataclasses import replace
+from collections.abc import Callable
 from operator import itemgetter
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
-from scipy import linalg, optimize, special
+from scipy import linalg, optimize, special, stats
 
 from elastocal.errors import ElastocalError, InputError, InsufficientDataError, require
 from elastocal.identification.robust_core import (
@@ -21,10 +21,8 @@ from elastocal.identification.robust_core import (
     breakdown_bisquare,
     design,
     estimate_at,
-    expected_rho,
     lengths,
     m_scale,
-    median_length,
     median_scale,
 )
 from elastocal.units import Array
@@ -154,19 +152,143 @@ def _line_search(
     return 0.0
 
 
-# S-estimates by random subsets: the fit with the smallest M-scale of its residuals.
+# Least trimmed squares: the fit of the majority, whatever the rest says.
+
+STARTS = 500
+FINALISTS = 10
+SEARCH_ROWS = 2000
+STEPS = 2  # of every start before the best are chosen
+TOGETHER = 100  # starts whose residuals are held at a time
+RIDGE = 1e-12
+INSIDE = 0.99
+
+
+def least_trimmed_squares(
+    B: Array, e: Array, size: int, seed: int = 0, starts: int = STARTS
+) -> Array:
+    """Shift Δ (columns,) minimising the sum of the smaller half of |e_i − B_i Δ|².
+
+    B (n·size, columns) and e (n·size,) whitened, `size` rows per observation; up to half of the
+    observations may be arbitrarily wrong.  FAST-LTS (Rousseeuw and Van Driessen 2006): many
+    smallest possible random subsets, concentration steps, the best few run to the end.
+    """
+    n, p = len(e) // size, B.shape[1]
+    if p == 0:
+        return np.zeros(0)
+    B3, e2 = B.reshape(n, size, p), e.reshape(n, size)
+    rng = np.random.default_rng(seed)
+    search = np.arange(n) if n <= SEARCH_ROWS else rng.choice(n, SEARCH_ROWS, replace=False)
+    need = min(-(-p // size) + 1, n)
+    subsets = np.array([rng.choice(len(search), need, replace=False) for _ in range(starts)])
+    shifts, costs = _searched(B3[search], e2[search], subsets)
+    finalists = shifts[np.argsort(costs, kind="stable")[:FINALISTS]]
+    best, best_cost = np.zeros(p), np.inf
+    for shift in [*finalists, np.zeros(p)]:
+        cost = np.inf
+        for _ in range(100):
+            previous = cost
+            shift, cost = _concentrate(B3, e2, shift)
+            if cost >= previous * (1 - 1e-10):
+                break
+        if cost < best_cost:
+            best, best_cost = shift, cost
+    return best
+
+
+def _searched(B: Array, e: Array, subsets: NDArray[np.int64]) -> tuple[Array, Array]:
+    """Shifts (starts, p) and trimmed costs (starts,) two steps from `subsets` (starts, need).
+
+    The normal equations of any choice of observations are a sum of those of single ones, so one
+    product sets them up for all starts.  They cost half the digits, which a search can spare: the
+    finalists go on with B itself.
+    """
+    n, size, p = B.shape
+    scale = np.linalg.norm(B.reshape(-1, p), axis=0)
+    scale[scale == 0] = 1.0
+    unit = B / scale
+    back = unit.transpose(0, 2, 1)
+    products = np.concatenate([back @ unit, back @ e[:, :, None]], axis=2).reshape(n, -1)
+    half = (n + p // size + 1) // 2
+    shifts, costs = np.empty((len(subsets), p)), np.empty(len(subsets))
+    for first in range(0, len(subsets), TOGETHER):
+        which = slice(first, first + TOGETHER)
+        nearest = subsets[which]
+        for step in range(STEPS + 1):
+            shift = _solve_normal(products, nearest)
+            left = e.ravel()[:, None] - unit.reshape(-1, p) @ shift.T
+            squared = (left.reshape(n, size, -1) ** 2).sum(axis=1).T  # (starts, n)
+            if step < STEPS:
+                nearest = np.argpartition(squared, half - 1, axis=1)[:, :half]
+        shifts[which] = shift / scale
+        costs[which] = np.partition(squared, half - 1, axis=1)[:, :half].sum(axis=1)
+    return shifts, costs
+
+
+def _solve_normal(products: Array, chosen: NDArray[np.int64]) -> Array:
+    """Least squares (starts, p) of the `chosen` (starts, k) observations, from their products.
+
+    A ridge keeps a direction that they do not show where it is.
+    """
+    inside = np.zeros((len(chosen), len(products)))
+    np.put_along_axis(inside, chosen, 1.0, axis=1)
+    p = int(np.sqrt(products.shape[1]))
+    summed = (inside @ products).reshape(len(chosen), p, p + 1)
+    normal, right = summed[:, :, :p].copy(), summed[:, :, p:]
+    own = np.arange(p)
+    normal[:, own, own] += RIDGE * np.maximum(
+        np.trace(normal, axis1=1, axis2=2)[:, None], np.finfo(float).tiny / RIDGE
+    )
+    return np.asarray(np.linalg.solve(normal, right)[..., 0], dtype=np.float64)
+
+
+def _concentrate(B: Array, e: Array, shift: Array) -> tuple[Array, float]:
+    """Refit to the half with the smallest residuals; the trimmed cost never rises."""
+    squared = ((e - B @ shift) ** 2).sum(axis=1)
+    half = (len(e) + len(shift) // e.shape[1] + 1) // 2
+    chosen = np.argpartition(squared, half - 1)[:half]
+    shift = _solve(B[chosen], e[chosen])
+    squared = np.sort(((e - B @ shift) ** 2).sum(axis=1))
+    return shift, float(squared[:half].sum())
+
+
+def _solve(B: Array, e: Array) -> Array:
+    if B.shape[2] == 0:
+        return np.zeros(0)
+    return linalg.lstsq(B.reshape(-1, B.shape[2]), e.ravel(), cond=1e-10, check_finite=False)[0]
+
+
+def majority(B: Array, e: Array, size: int, seed: int = 0) -> NDArray[np.bool_]:
+    """Observations (n,) that agree with the least trimmed squares fit of the majority.
+
+    Reweighted LTS, repeated: fit to the observations inside the 99 % limit of χ²(size), scale
+    from those corrected for the cut, new limit.  Up to one in a hundred clean observations is
+    left outside, so this is a suspicion, not a verdict.
+    """
+    n = len(e) // size
+    B3, e2 = B.reshape(n, size, B.shape[1]), e.reshape(n, size)
+    limit = stats.chi2.ppf(INSIDE, size)
+    # Mean of a χ² variable cut at its 99 % point, per degree of freedom.
+    cut = stats.chi2.cdf(limit, size + 2) / INSIDE
+    squared = ((e2 - B3 @ least_trimmed_squares(B, e, size, seed)) ** 2).sum(axis=1)
+    good = squared <= limit * median_scale(np.sqrt(squared), size) ** 2
+    for _ in range(50):
+        shift = _solve(B3[good], e2[good])
+        squared = ((e2 - B3 @ shift) ** 2).sum(axis=1)
+        scale2 = squared[good].mean() / (size * cut)
+        updated = squared <= limit * scale2
+        if np.array_equal(updated, good) or updated.sum() <= n // 2:
+            break
+        good = updated
+    return good
+
+
+# S-estimates: the fit with the smallest M-scale of its residuals, from the fit of the majority.
 #
-# FAST-S (Salibian-Barrera and Yohai 2006) for observations of `size` rows.  Subsets grow one
-# random observation at a time until they determine every parameter (nonsingular subsampling,
-# Koller and Stahel 2017): a compliance that only a fifth of the configurations see would make
-# nearly all subsets of the smallest size singular.  All subsets are refined at once by stacked
-# normal equations in the orthonormal coordinates of the design.
+# Least trimmed squares has the same breakdown point, and its search is the one that is also made
+# for faulty readings; an S-estimate's own (FAST-S, Salibian-Barrera and Yohai 2006) ends at the
+# same fit.  Each step from there lowers the M-scale, so that the breakdown point stays.
 
 SUBSETS = 300
-FINALISTS, WINNERS = 6, 2  # candidates refined further, and to the end
-FIRST_STEPS, MORE_STEPS = 2, 12
-SEARCH = 1500  # observations searched; the winners are refined on all
-DETERMINED = 1e-4  # share of a subset's mean information that its worst direction must have
 SETTLED = 1e-9
 MAX_REFINE = 100
 
@@ -174,112 +296,12 @@ MAX_REFINE = 100
 def s_estimate(
     problem: Design, loss: Bisquare, seed: int, subsets: int = SUBSETS, starts: Array | None = None
 ) -> tuple[Array, float]:
-    """Coordinates z (p,) and scale of the S-estimate, over random subsets and `starts` (k, p)."""
-    search = _searched(problem, np.random.default_rng(seed))
-    candidates = (problem.Q.T @ problem.y)[None]
-    if starts is not None:
-        candidates = np.concatenate([candidates, starts])
+    """Coordinates z (p,) and scale of the S-estimate, from the trimmed fit of random `subsets`,
+    from `starts` (k, p) and from least squares."""
+    candidates = [problem.Q.T @ problem.y, *([] if starts is None else starts)]
     if subsets:
-        drawn = _subset_fits(search, np.random.default_rng(seed + 1), subsets)
-        drawn = _improve(search, drawn, loss, FIRST_STEPS)
-        best = np.argsort(_scales(search, drawn, loss), kind="stable")[:FINALISTS]
-        candidates = np.concatenate([candidates, drawn[best]])
-    candidates = _improve(search, candidates, loss, MORE_STEPS)
-    order = np.argsort(_scales(search, candidates, loss), kind="stable")[:WINNERS]
-    return min((_refine(problem, candidates[k], loss) for k in order), key=itemgetter(1))
-
-
-def _searched(problem: Design, rng: np.random.Generator) -> Design:
-    """All of the problem, or a random part of it that still determines every parameter."""
-    if problem.n <= SEARCH:
-        return problem
-    chosen = np.sort(rng.choice(problem.n, SEARCH, replace=False))
-    rows = (chosen[:, None] * problem.size + np.arange(problem.size)).ravel()
-    Q = problem.Q[rows]
-    information = np.linalg.eigvalsh(Q.T @ Q) * problem.n / SEARCH
-    if information[0] < DETERMINED:
-        return problem
-    return replace(problem, B=problem.B[rows], y=problem.y[rows], Q=Q)
-
-
-def _products(problem: Design) -> tuple[Array, Array]:
-    """Q_iᵀQ_i (n, p·p) and Q_iᵀy_i (n, p) of every observation."""
-    Q3 = problem.Q.reshape(problem.n, problem.size, problem.p)
-    gram = (Q3.transpose(0, 2, 1) @ Q3).reshape(problem.n, -1)
-    return gram, np.einsum("nij,ni->nj", Q3, problem.y.reshape(problem.n, -1))
-
-
-def _subset_fits(problem: Design, rng: np.random.Generator, subsets: int) -> Array:
-    """Least-squares fits (subsets, p) to random subsets just large enough to determine them."""
-    n, p = problem.n, problem.p
-    gram, moment = _products(problem)
-    order = rng.permuted(np.tile(np.arange(n), (subsets, 1)), axis=1)
-    smallest = min(-(-p // problem.size), n)
-    first = order[:, :smallest]
-    G = gram[first].sum(axis=1).reshape(subsets, p, p)
-    g = moment[first].sum(axis=1)
-    taken = np.full(subsets, smallest)
-    open_ = ~_determined(G)
-    while open_.any() and taken.max() < n:
-        k = np.flatnonzero(open_)
-        added = order[k, taken[k]]
-        G[k] += gram[added].reshape(-1, p, p)
-        g[k] += moment[added]
-        taken[k] += 1
-        open_[k] = ~_determined(G[k])
-    return np.asarray(np.linalg.solve(_regular(G), g[..., None]))[..., 0]
-
-
-def _regular(G: Array) -> Array:
-    """G (k, p, p) with a ridge at rounding size, so that no factorisation fails."""
-    p = G.shape[-1]
-    ridge = 1e-13 * np.trace(G, axis1=1, axis2=2) + np.finfo(float).tiny
-    return G + ridge[:, None, None] * np.eye(p)
-
-
-def _determined(G: Array) -> NDArray[np.bool_]:
-    p = G.shape[-1]
-    pivots = np.diagonal(np.linalg.cholesky(_regular(G)), axis1=1, axis2=2) ** 2
-    mean = np.trace(G, axis1=1, axis2=2) / p
-    return np.asarray(pivots.min(axis=1) > DETERMINED * mean)
-
-
-def _improve(problem: Design, z: Array, loss: Bisquare, steps: int) -> Array:
-    """`steps` concentration steps of every candidate z (k, p) at once."""
-    gram, moment = _products(problem)
-    p = problem.p
-    d = _lengths(problem, z)
-    scale = np.maximum(np.median(d, axis=1) / median_length(problem.size), problem.floor)
-    for _ in range(steps):
-        scale = _scale_step(problem, d, scale, loss)
-        w = loss.weight(d / scale[:, None])
-        G = _regular((w @ gram).reshape(-1, p, p))
-        z = np.asarray(np.linalg.solve(G, (w @ moment)[..., None]))[..., 0]
-        d = _lengths(problem, z)
-    return z
-
-
-def _lengths(problem: Design, z: Array) -> Array:
-    """|e_i| (k, n) of the candidates z (k, p)."""
-    r = problem.y - z @ problem.Q.T
-    return np.sqrt((r.reshape(len(z), problem.n, problem.size) ** 2).sum(axis=2))
-
-
-def _scale_step(problem: Design, d: Array, scale: Array, loss: Bisquare) -> Array:
-    """One fixed-point step of the M-scale for every candidate; d (k, n), scale (k,)."""
-    target = expected_rho(loss) * (problem.n - problem.p / problem.size)
-    share = loss.rho(d / scale[:, None]).sum(axis=1) / target
-    return np.maximum(scale * np.sqrt(share), problem.floor)
-
-
-def _scales(problem: Design, z: Array, loss: Bisquare) -> Array:
-    """M-scale (k,) of every candidate to a few digits, enough to rank them."""
-    d = _lengths(problem, z)
-    scale = np.median(d, axis=1) / median_length(problem.size)
-    scale = np.maximum(scale, problem.floor)
-    for _ in range(8):
-        scale = _scale_step(problem, d, scale, loss)
-    return scale
+        candidates += [least_trimmed_squares(problem.Q, problem.y, problem.size, seed, subsets)]
+    return min((_refine(problem, z, loss) for z in candidates), key=itemgetter(1))
 
 
 def _refine(problem: Design, z: Array, loss: Bisquare) -> tuple[Array, float]:
@@ -330,34 +352,35 @@ def m_estimate(B: ArrayLike, y: ArrayLike, loss: Loss, *, size: int = 1) -> Robu
     )
     if isinstance(loss, Absolute):
         return least_absolute(problem, loss)
-    return reweighted(problem, loss, problem.Q.T @ problem.y)
+    z = problem.Q.T @ problem.y
+    sigma = max(median_scale(lengths(problem.residual(z), size), size), problem.floor)
+    return reweighted(problem, loss, z, sigma, lambda length, _: median_scale(length, size))
 
 
-def reweighted(problem: Design, loss: Loss, z: Array, known: float | None = None) -> RobustEstimate:
+def reweighted(
+    problem: Design, loss: Loss, z: Array, scale: float,
+    rescaled: Callable[[Array, Array], float] | None = None, most: int = MAX_ITER,
+) -> RobustEstimate:  # fmt: skip
     """IRLS from coordinates z; each step lowers Σ ρ at its scale (Huber 1981, section 7.8).
 
-    The scale is the `known` one, or by the median of every residual anew.
+    The `scale` is known, or `rescaled` says it anew after each step, of lengths and weights (n,).
     """
-
-    def scale_of(residual: Array) -> float:
-        if known is not None:
-            return known
-        return max(median_scale(lengths(residual, problem.size), problem.size), problem.floor)
-
     r = problem.residual(z)
-    sigma, converged, count = scale_of(r), False, 0
-    while not converged and count < MAX_ITER:
-        weights = loss.weight(lengths(r, problem.size) / sigma)
+    converged, count = False, 0
+    while not converged and count < most:
+        weights = loss.weight(lengths(r, problem.size) / scale)
         step = problem.weighted_step(weights, r)
         z = z + step
         r = problem.residual(z)
-        before, sigma = sigma, scale_of(r)
+        before = scale
+        if rescaled is not None:
+            scale = max(rescaled(lengths(r, problem.size), weights), problem.floor)
         count += 1
         moved = float(np.linalg.norm(step))
         still = moved <= 4 * np.finfo(float).eps * np.linalg.norm(z)  # no more digits in z
-        settled = moved <= TOLERANCE * sigma and abs(sigma - before) <= TOLERANCE * sigma
-        converged = bool(settled or still)
-    return estimate_at(problem, loss, z, sigma, converged, count)
+        same = abs(scale - before) <= TOLERANCE * scale
+        converged = bool((moved <= TOLERANCE * scale or still) and same)
+    return estimate_at(problem, loss, z, scale, converged, count)
 
 
 # MM-estimates: the breakdown point of an S-estimate with the efficiency of an M-estimate.
@@ -456,21 +479,7 @@ def log_likelihood(found: RobustEstimate) -> float:
 
 
 def _estimate(problem: Design, loss: StudentT, z: Array, scale: float) -> RobustEstimate:
-    size = problem.size
-    r = problem.residual(z)
-    converged, count = False, 0
-    while not converged and count < MOST_EM_STEPS:
-        w = loss.weight(lengths(r, size) / scale)
-        step = problem.weighted_step(w, r)
-        z = z + step
-        r = problem.residual(z)
-        before = scale
-        squared = lengths(r, size) ** 2
-        scale = max(float(np.sqrt(w @ squared / (size * w.sum()))), problem.floor)
-        count += 1
-        moved = float(np.linalg.norm(step))
-        still = moved <= 4 * np.finfo(float).eps * np.linalg.norm(z)
-        converged = bool(
-            (moved <= TOLERANCE * scale or still) and abs(scale - before) <= TOLERANCE * scale
-        )
-    return estimate_at(problem, loss, z, scale, converged, count)
+    def rescaled(length: Array, w: Array) -> float:
+        return float(np.sqrt(w @ length**2 / (problem.size * w.sum())))
+
+    return reweighted(problem, loss, z, scale, rescaled, MOST_EM_STEPS)

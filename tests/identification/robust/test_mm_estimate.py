@@ -7,11 +7,9 @@ from elastocal.errors import InputError, InsufficientDataError
 from elastocal.identification import (
     bisquare,
     breakdown_bisquare,
-    design,
     least_trimmed_squares,
     mm_estimate,
 )
-from elastocal.identification.robust_fits import DETERMINED, _products, _subset_fits
 
 
 def least_squares(B, y):
@@ -117,17 +115,6 @@ def test_a_start_from_trimmed_squares_leads_to_the_same_fit(arm):
     alone = mm_estimate(arm.B, y, size=3, subsets=0, start=start)
     searched = mm_estimate(arm.B, y, size=3)
     assert np.abs(in_std(arm, alone.x) - in_std(arm, searched.x)).max() < 1e-6
-
-
-def test_subsets_grow_until_they_determine_every_level(arm):
-    """Three readings have nine rows, but not all five levels: every fit must be to more."""
-    exact = arm.B @ arm.x
-    problem = design(arm.B, exact, 3)
-    fits = _subset_fits(problem, np.random.default_rng(0), 50)
-    expected = problem.coordinates(arm.x)
-    # conditioned to DETERMINED, with a ridge of 1e-13
-    np.testing.assert_allclose(fits, np.tile(expected, (50, 1)), atol=1e-10 / DETERMINED)
-    assert _products(problem)[0].shape == (270, 81)
 
 
 def test_large_tables_are_searched_in_part_and_fitted_whole():
