@@ -2,13 +2,21 @@
 
 from __future__ import annotations
 
+import gc
 from collections.abc import Iterator
 from dataclasses import replace
 from typing import Any
 
 import pytest
 
+gc.disable()  # what is collected stays: to look for garbage in it is a third of the time
+
 WHOLE = {"order"}  # tests of that search itself
+
+
+def pytest_collection_finish() -> None:
+    gc.freeze()
+    gc.enable()
 
 
 @pytest.fixture(scope="module", autouse=True)

@@ -24,7 +24,7 @@ from elastocal.report import figures, residual_view
 from elastocal.report.formatting import length
 from elastocal.report.judgement_view import judgement
 from elastocal.report.page import page_of, write_page
-from elastocal.report.residual_figures import by_region
+from elastocal.report.residual_figures import by_region, held_out
 
 
 @pytest.fixture(scope="module")
@@ -160,10 +160,12 @@ def test_same_result_same_page_whatever_matplotlib_is_set_to(case: Any, page: st
     assert engine.sub("", again) == engine.sub("", page)
 
 
-def test_configuration_without_held_out_error(case: Any) -> None:
-    held_out = case.result.held_out.copy()
-    held_out[:12] = np.inf  # 2 markers × 2 loads × 3 coordinates
-    page = page_of(replace(case.result, held_out=held_out, heldout_rms=float("inf")))
+def test_configuration_without_held_out_error(case: Any, no_figures: None) -> None:
+    errors = case.result.held_out.copy()
+    errors[:12] = np.inf  # 2 markers × 2 loads × 3 coordinates
+    found = replace(case.result, held_out=errors, heldout_rms=float("inf"))
+    assert "</svg>" in held_out(found, residual_view.residuals_of(found))
+    page = page_of(found)
     Page(page)
     assert "1 without held-out error" in page
     assert "is not known" in page
