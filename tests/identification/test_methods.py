@@ -64,6 +64,11 @@ def z(result, truth):
     return (result.x[kept] - truth[kept]) / np.sqrt(np.diag(result.covariance))
 
 
+@pytest.fixture
+def few_draws(monkeypatch):
+    monkeypatch.setattr("elastocal.identification.intervals.DRAWS", 60)
+
+
 # --- methods --------------------------------------------------------------------------------
 
 
@@ -103,7 +108,7 @@ def test_the_published_methods_are_those_of_the_paper():
 
 
 @pytest.mark.parametrize("method", ["reml", "ols", "eq14"])
-def test_a_bootstrap_is_drawn_by_the_seed_asked_for(method):
+def test_a_bootstrap_is_drawn_by_the_seed_asked_for(method, few_draws):
     model, table, _ = campaign(poses=8)
     options = [Options(method=method, intervals="wild", seed=seed) for seed in (1, 1, 2)]
     ends = [np.array([e.ci95 for e in identify(model, table, o).estimates]) for o in options]
@@ -191,9 +196,9 @@ def test_auto_says_what_it_chose_and_from_what():
 
 
 def test_intervals_hold_where_the_arm_does_not_come_back_to_the_same_place():
-    """20 tables of 7 parameters with 100 µm common to a configuration, twice the noise."""
+    """12 tables of 7 parameters with 100 µm common to a configuration, twice the noise."""
     hits = plain_hits = total = 0
-    for seed in range(20):
+    for seed in range(12):
         model, table, truth = campaign(seed, effect=1e-4)
         both = identify(model, table), identify(model, table, Options(method="ols"))
         for name, true in zip(model.names, truth, strict=True):
@@ -226,7 +231,7 @@ def test_every_kind_of_intervals(kind):
 
 def test_clustered_intervals_hold_under_a_configuration_effect():
     hits = total = 0
-    for seed in range(20):
+    for seed in range(12):
         model, table, truth = campaign(seed, effect=1e-4)
         result = identify(model, table, Options(method="ols", intervals="cr2"))
         for name, true in zip(model.names, truth, strict=True):
@@ -235,7 +240,7 @@ def test_clustered_intervals_hold_under_a_configuration_effect():
     assert hits >= binomial_band(total, 0.95)[0]
 
 
-def test_a_bootstrap_does_not_depend_on_the_number_of_processes():
+def test_a_bootstrap_does_not_depend_on_the_number_of_processes(few_draws):
     model, table, _ = campaign(5)
     one, two = (
         identify(model, table, Options(intervals="bootstrap", seed=7, jobs=jobs)) for jobs in (1, 2)

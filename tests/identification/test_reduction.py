@@ -307,13 +307,13 @@ def test_every_member_of_a_combination_names_the_others():
     assert with_height and set(with_height) <= {"base.x", "base.y", "base.z"}
 
 
-SEEDS = 30
+SEEDS = 20
 
 
 def test_combinations_cover_the_true_combination():
-    """Over 30 arms: each parameter's 95 % interval, and the joint 95 % ellipsoid of all.
+    """Over 20 arms: each parameter's 95 % interval, and the joint 95 % ellipsoid of all.
 
-    Counts per seed are independent, so the ellipsoid's count is Binomial(30, 0.95); per name the
+    Counts per seed are independent, so the ellipsoid's count is Binomial(20, 0.95); per name the
     limit is Bonferroni's over the names.  Dropped parameters may bias by 0.1 std each at most.
     """
     inside, hits = 0, {}

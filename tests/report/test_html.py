@@ -5,6 +5,7 @@ from __future__ import annotations
 import json
 import re
 import warnings
+from collections.abc import Iterator
 from dataclasses import replace
 from datetime import date
 from pathlib import Path
@@ -19,15 +20,21 @@ from support.pages import Page
 from elastocal.identification import gap_budget
 from elastocal.identification.error_budget import places_read, pose_accuracy
 from elastocal.model import observe
-from elastocal.report import residual_view
+from elastocal.report import figures, residual_view
 from elastocal.report.formatting import length
 from elastocal.report.judgement_view import judgement
 from elastocal.report.page import page_of, write_page
-from elastocal.report.residual_figures import by_region
+from elastocal.report.residual_figures import by_region, held_out
 
 
 @pytest.fixture(scope="module")
-def page(case: Any) -> str:
+def page(case: Any) -> Iterator[str]:
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(figures, "LAYOUT", "constrained")
+        yield told(case)
+
+
+def told(case: Any) -> str:
     return page_of(case.result, command="elastocal identify c.toml d.csv", seed=3, truth=case.truth)
 
 
@@ -147,18 +154,18 @@ def test_small_tables_are_drawn_whole(page: str, case: Any) -> None:
 
 def test_same_result_same_page_whatever_matplotlib_is_set_to(case: Any, page: str) -> None:
     with mpl.rc_context({"text.usetex": True, "axes.facecolor": "red", "font.size": 30}):
-        again = page_of(
-            case.result, command="elastocal identify c.toml d.csv", seed=3, truth=case.truth
-        )
+        again = told(case)
     # What evaluated the model so far is another thing the second time.
     engine = re.compile(r"<td class=\"name\">model evaluated by</td><td>.*?</td>")
     assert engine.sub("", again) == engine.sub("", page)
 
 
-def test_configuration_without_held_out_error(case: Any) -> None:
-    held_out = case.result.held_out.copy()
-    held_out[:12] = np.inf  # 2 markers × 2 loads × 3 coordinates
-    page = page_of(replace(case.result, held_out=held_out, heldout_rms=float("inf")))
+def test_configuration_without_held_out_error(case: Any, no_figures: None) -> None:
+    errors = case.result.held_out.copy()
+    errors[:12] = np.inf  # 2 markers × 2 loads × 3 coordinates
+    found = replace(case.result, held_out=errors, heldout_rms=float("inf"))
+    assert "</svg>" in held_out(found, residual_view.residuals_of(found))
+    page = page_of(found)
     Page(page)
     assert "1 without held-out error" in page
     assert "is not known" in page

@@ -274,7 +274,7 @@ def test_without_residuals_the_page_has_no_distribution(case: Any) -> None:
     assert noise_model_line(changed(case.result, {"sizes": (), "reason": None})) is None
 
 
-def test_interval_without_an_end_has_no_bar(case: Any) -> None:
+def test_interval_without_an_end_has_no_bar(case: Any, no_figures: None) -> None:
     e = copy.copy(case.result.estimates[0])
     object.__setattr__(e, "ci95", (-np.inf, np.inf))
     page = page_of(changed(case.result, estimates=(e, *case.result.estimates[1:])))

@@ -6,7 +6,6 @@ import json
 import os
 from pathlib import Path
 from typing import Any
-from unittest.mock import patch
 
 from support.robots import KR270
 from typer.testing import CliRunner, Result
@@ -75,9 +74,7 @@ def elastocal(*arguments: object) -> Result:
 def design(cell: Path, *extra: object, output: str = "plan.csv", quiet: bool = True) -> Result:
     """`design --effort quick` of a cell, into its folder."""
     how = ["--effort", "quick", *(["-q"] if quiet else [])]
-    # The search for an order would take longer than that for a plan; tests/planning/order has it.
-    with patch("elastocal.planning.execution.STEPS", 1000):
-        return elastocal("design", cell, "-o", cell.parent / output, *how, *extra)
+    return elastocal("design", cell, "-o", cell.parent / output, *how, *extra)
 
 
 def planned(cell: Path, *extra: object, output: str = "plan.csv") -> dict[str, Any]:

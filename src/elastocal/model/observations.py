@@ -122,27 +122,39 @@ def pair_loaded_with_unloaded(table: Measurements) -> tuple[NDArray[np.int64], s
             f"{table.source}: observe = 'deflection' needs loaded rows, but force_x_N, force_y_N, "
             "force_z_N are zero or missing in every row"
         )
-    exact: dict[tuple[int, ...], list[int]] = {}
-    shared: dict[tuple[int, ...], list[int]] = {}
-    for i in np.flatnonzero(~loaded):
-        c, r, m = (int(v[i]) for v in (table.configuration, table.repeat, table.marker))
-        exact.setdefault((c, r, m), []).append(int(i))
-        shared.setdefault((c, m), []).append(int(i))
-    lead = np.flatnonzero(loaded)
-    rows, columns, values = [], [], []
-    for k, i in enumerate(lead):
-        c, r, m = (int(v[i]) for v in (table.configuration, table.repeat, table.marker))
-        partners = exact.get((c, r, m)) or shared.get((c, m))
-        if not partners:
-            raise InputError(
-                f"{table.source}, line {table.row[i]}: the loaded reading of configuration "
-                f"{table.configuration_labels[c]}, marker {table.marker_names[m]} has no unloaded "
-                "reading to subtract; measure it without load, or use observe = 'position'"
-            )
-        rows += [k] * (1 + len(partners))
-        columns += [int(i), *partners]
-        values += [1.0] + [-1.0 / len(partners)] * len(partners)
-    combine = sparse.csr_array((values, (rows, columns)), shape=(len(lead), len(table)))
+    lead, rest = np.flatnonzero(loaded), np.flatnonzero(~loaded)
+
+    def partners(*keys: NDArray[np.int64]) -> tuple[NDArray, NDArray, NDArray]:
+        """Unloaded rows by their keys; where those of each loaded row begin, and how many."""
+        order = np.lexsort(keys)
+        ranked = np.stack(keys)[:, order]
+        group = np.empty(len(table), dtype=np.int64)
+        group[order] = np.append(0, (ranked[:, 1:] != ranked[:, :-1]).any(axis=0)).cumsum()
+        count = np.bincount(group[rest], minlength=len(table))
+        own = rest[np.argsort(group[rest], kind="stable")]
+        return own, (count.cumsum() - count)[group[lead]], count[group[lead]]
+
+    rows, first, number = partners(table.configuration, table.repeat, table.marker)
+    if not number.all():
+        more, begin, count = partners(table.configuration, table.marker)
+        first = np.where(number == 0, len(rows) + begin, first)
+        rows, number = np.append(rows, more), np.where(number == 0, count, number)
+    if not number.all():
+        i = lead[number.argmin()]
+        raise InputError(
+            f"{table.source}, line {table.row[i]}: the loaded reading of configuration "
+            f"{table.configuration_labels[table.configuration[i]]}, marker "
+            f"{table.marker_names[table.marker[i]]} has no unloaded reading to subtract; measure "
+            "it without load, or use observe = 'position'"
+        )
+    each = 1 + number  # the loaded row itself and its partners
+    ends = np.append(0, each.cumsum())
+    place = np.arange(ends[-1]) - np.repeat(ends[:-1], each)
+    columns = np.repeat(lead, each)
+    columns[place > 0] = rows[(np.repeat(first, each) + place - 1)[place > 0]]
+    values = np.where(place == 0, 1.0, np.repeat(-1.0 / number, each))
+    combine = sparse.csr_array((values, columns, ends), shape=(len(lead), len(table)))
+    combine.sort_indices()
     return lead, combine
 
 

@@ -10,7 +10,6 @@ from typing import Any
 
 import numpy as np
 from scipy.optimize import linear_sum_assignment
-from scipy.sparse.csgraph import minimum_spanning_tree
 
 from elastocal.cell.plan_wishes import Motion
 from elastocal.errors import require
@@ -213,14 +212,19 @@ def held_karp_bound(cost: Array, upper: float) -> float:
 
 
 def _one_tree(cost: Array) -> tuple[float, Array]:
-    """Cost and node degrees (V,) of the minimum 1-tree."""
+    """Cost and node degrees (V,) of the minimum 1-tree: Prim's tree of all nodes but node 0."""
     n = len(cost)
-    rest = cost[1:, 1:]
-    shift = 1.0 - float(rest.min())  # csgraph reads zeros of a dense matrix as missing edges
-    tree = minimum_spanning_tree(rest + shift).tocoo()
     ends = np.argsort(cost[0, 1:], kind="stable")[:2] + 1
-    total = float(tree.data.sum()) - shift * (n - 2) + float(cost[0, ends].sum())
-    degree = np.bincount(np.concatenate([tree.row, tree.col]) + 1, minlength=n).astype(float)
+    total, degree = float(cost[0, ends].sum()), np.zeros(n)
+    rest = cost[1:, 1:].copy()
+    near, via, last = np.full(n - 1, np.inf), np.zeros(n - 1, dtype=np.int64), 0
+    for _ in range(n - 2):
+        rest[:, last] = near[last] = np.inf  # it is in the tree
+        closer = rest[last] < near
+        near[closer], via[closer] = rest[last, closer], last
+        last = int(near.argmin())
+        total += float(near[last])
+        degree[[last + 1, via[last] + 1]] += 1
     degree[ends] += 1
     degree[0] = 2
     return total, degree

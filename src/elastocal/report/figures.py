@@ -70,6 +70,7 @@ _STYLE: dict[str, Any] = {
     "legend.frameon": False,
     "path.simplify": False,
 }
+LAYOUT: Any = "constrained"  # half of what drawing takes
 Draw = Callable[["Figure"], None]
 
 
@@ -103,7 +104,7 @@ def drawn(draw: Draw, width: float, height: float, title: str) -> Any:
     from matplotlib.figure import Figure
 
     with style():
-        figure = Figure(figsize=(width, height), layout="constrained")
+        figure = Figure(figsize=(width, height), layout=LAYOUT)
         draw(figure)
         if _as_figures.get():
             figure.draw_without_rendering()  # what is made when drawing is made in this style

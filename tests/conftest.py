@@ -1,0 +1,68 @@
+"""What takes long and is not what a test is of is short here, or done once."""
+
+from __future__ import annotations
+
+import gc
+from collections.abc import Iterator
+from dataclasses import replace
+from typing import Any
+
+import pytest
+
+gc.disable()  # what is collected stays: to look for garbage in it is a third of the time
+
+WHOLE = {"order"}  # tests of that search itself
+
+
+def pytest_collection_finish() -> None:
+    gc.freeze()
+    gc.enable()
+
+
+@pytest.fixture(scope="module", autouse=True)
+def short_search(request: pytest.FixtureRequest) -> Iterator[None]:
+    """One lot of new points and no second for the bound on the continuum, which in pools as small
+    as those of tests is searched again and again; few steps in search of an order.
+
+    The plan of `--effort quick` is not touched by either, its order may be.
+    """
+    if WHOLE & {*request.path.parts} or getattr(request.module, "WHOLE_SEARCH", False):
+        yield
+        return
+    from elastocal.planning import design, execution
+
+    with pytest.MonkeyPatch.context() as patch:
+        quick = replace(design.EFFORTS["quick"], points=1, ascents=1)
+        patch.setitem(design.EFFORTS, "quick", quick)
+        patch.setattr(design, "REFINED", 0)
+        patch.setattr(execution, "STEPS", 1000)
+        patch.setattr(execution, "FEW", 1000)
+        yield
+
+
+@pytest.fixture(scope="module", autouse=True)
+def plain_layout() -> Iterator[None]:
+    """Figures whose labels may overlap: to lay them out takes as long as to draw them."""
+    from elastocal.report import figures
+
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(figures, "LAYOUT", None)
+        yield
+
+
+@pytest.fixture(scope="session", autouse=True)
+def known_instructions() -> Iterator[None]:
+    """Models of the same cell are made in hundreds of tests: half of what that takes is to ask
+    CasADi for the instructions, which are the same wherever the expressions are."""
+    from elastocal.model import numpy_engine
+
+    ask, known = numpy_engine._extracted, {}
+
+    def extracted(function: Any) -> Any:
+        if function.digest not in known:
+            known[function.digest] = ask(function)
+        return known[function.digest]
+
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(numpy_engine, "_extracted", extracted)
+        yield
