@@ -528,7 +528,8 @@ def certificate_contents(result: Calibration, budget: ErrorBudget | None) -> dic
         "none stated"
         if tracker.noise is None
         else ", ".join(
-            f"{name.replace('_', ' ')} {', '.join(length(float(v)) for v in np.atleast_1d(value))}"
+            f"{name.replace('_', ' ')} "
+            + ", ".join(dict.fromkeys(length(float(v)) for v in np.atleast_1d(value)))
             + (" per m" if name.endswith("per_m") else "")
             for name, value in vars(tracker.noise).items()
         )
@@ -691,7 +692,7 @@ SOURCES = {
     "open_parameters": "parameters left open, by their typical deviations",
     "repeatability": "repeatability: what readings of a visit have in common",
     "instrument": "instrument: single readings",
-    "lack_of_fit": "lack of fit: what the held-out error has beyond these",
+    "lack_of_fit": "lack of fit: what configurations scatter by beyond these",
     "total": "together",
 }
 
