@@ -521,6 +521,12 @@ def _newtons(force: Array) -> str:
     return f"({', '.join(f'{v:g}' for v in force)}) N"
 
 
+def _each(value: Any) -> Array:
+    """A number, the numbers of three axes, or the one that all have."""
+    values = np.atleast_1d(value)
+    return values if np.ptp(values) else values[:1]
+
+
 def certificate_contents(result: Calibration, budget: ErrorBudget | None) -> dict[str, Any]:
     """Words and tables of the calibration certificate."""
     tracker = result.model.cell.tracker
@@ -528,8 +534,7 @@ def certificate_contents(result: Calibration, budget: ErrorBudget | None) -> dic
         "none stated"
         if tracker.noise is None
         else ", ".join(
-            f"{name.replace('_', ' ')} "
-            + ", ".join(dict.fromkeys(length(float(v)) for v in np.atleast_1d(value)))
+            f"{name.replace('_', ' ')} {', '.join(length(float(v)) for v in _each(value))}"
             + (" per m" if name.endswith("per_m") else "")
             for name, value in vars(tracker.noise).items()
         )
