@@ -173,8 +173,8 @@ def _accuracy(result: Calibration) -> str:
     if (at := result.verdict.at) is not None:
         most = "no more, rms," if result.verdict.trusted else f"{length(at)} rms at most"
         own = (
-            f"the arm itself, without the noise of a reading, is off by {most} at new poses (95 %). "
-            "With that noise, "
+            f"the arm itself, without the noise of a reading, is off by {most} at new poses "
+            "(95 %). With that noise, "
         )
     if not math.isfinite(result.heldout_rms):
         return f"{own}{what} that were fitted are reproduced to {length(result.residual_rms)} rms"
