@@ -17,6 +17,7 @@ if TYPE_CHECKING:
 
 VIEWS = "elastocal.report.notebook"
 PAGES = "elastocal.report.page"
+WORDS = "elastocal.report.judgement_view"
 WRITERS = "elastocal.saving"
 
 
@@ -111,6 +112,11 @@ class Result(Saved):
             ['parameter', 'unit', 'value', 'std']
         """
         return _view(self).frame(self)
+
+
+def headline(result: object) -> str:
+    """The verdict on a calibration, in the words of terminal, page and notebook."""
+    return str(import_module(WORDS).judgement(result).headline)
 
 
 def _view(result: object) -> Any:

@@ -19,6 +19,7 @@ METHODS = [
     (ec.CalibratedArm, ("pose",)),
     (Saved, ("save",)),
     (Result, ("report", "plot", "to_dataframe")),
+    (ec.Calibration, ("certificate",)),
 ]
 SHOWN = {name: getattr(ec, name) for name in ec.__all__}
 SHOWN |= {f"{cls.__name__}.{m}": getattr(cls, m) for cls, names in METHODS for m in names}

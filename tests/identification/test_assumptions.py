@@ -17,8 +17,8 @@ from elastocal.identification.noise_choice import NoiseTest
 from elastocal.model import Model
 from elastocal.model.observations import observe
 from elastocal.report.identification_view import (
-    how_well_it_predicts,
     judgement,
+    prediction_lines,
     undetermined_lines,
 )
 
@@ -233,7 +233,7 @@ def test_readings_set_apart_count(clean):
     n, k = len(result.observations.lead), len(result.excluded)
     apart = sum(o.residual**2 for o in result.excluded)
     assert (n + k) * result.heldout_all_rms**2 == pytest.approx(n * result.heldout_rms**2 + apart)
-    assert "set apart as faulty" in how_well_it_predicts(result)
+    assert "set apart as faulty" in prediction_lines(result)[0][1]
     assert result.to_json()["heldout_all_rms_um"] == pytest.approx(result.heldout_all_rms * 1e6)
 
 

@@ -131,9 +131,18 @@ def test_the_budget_adds_up_to_the_held_out_error(fitted):
     own = rms_3d(np.sqrt(np.einsum("rj,jk,rk->r", B, result.covariance, B)), 3)
     assert budget.parameters == pytest.approx(own)
     assert budget.total == pytest.approx(result.heldout_rms, rel=0.1)
+    assert budget.lack_of_fit == pytest.approx(result.predicted.lacking)
     there = result.uncertainty(table.take(np.arange(6)))
     assert there.instrument == budget.instrument and there.parameters != budget.parameters
     assert uncertainty_table(result).rows[-1][2] == "100 %"
+
+
+def test_what_the_stated_noise_does_not_explain_is_lack_of_fit(fitted):
+    """As in the error expected at new poses, and no part of the instrument's."""
+    _, _, result = fitted
+    budget = replace(result, noise=replace(result.noise, ratio_to_stated=3.0)).uncertainty()
+    assert budget.lack_of_fit == pytest.approx(SIGMA * np.sqrt(3 * 8 / 9), rel=0.1)
+    assert budget.instrument == pytest.approx(SIGMA * np.sqrt(3 / 9), rel=0.3)
 
 
 def test_scatter_of_a_configuration_counts_as_repeatability():

@@ -91,8 +91,11 @@ def test_errors_before_and_after_are_told_by_mean_spread_and_quantile(page: str,
         assert step.heldout_rms == pytest.approx(float(np.sqrt(np.mean(e**2))))
 
 
-def test_the_certificate_is_one_page_of_accuracy_data_and_verdict(case: Any) -> None:
-    text = page_of(case.result, {"d.csv": "abc123"}, certificate=True)
+def test_the_certificate_is_one_page_of_accuracy_data_and_verdict(
+    case: Any, tmp_path: Path
+) -> None:
+    case.result.certificate(tmp_path / "c.html", inputs={"d.csv": "abc123"})
+    text = (tmp_path / "c.html").read_text(encoding="utf-8")
     page = Page(text)
     page.check_harmless(text)
     rows = page.named_rows()

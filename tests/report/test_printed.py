@@ -21,7 +21,7 @@ def test_an_identification_prints_its_parameters_and_what_they_are_worth(case: A
     for e in case.result.estimates:
         assert e.name in text
     assert judgement(case.result).headline in " ".join(text.split())
-    assert "Prediction: In poses that were not fitted" in text
+    assert "Prediction: At new poses" in text
     assert not re.search(r"e-0\d", text)  # units suit the sizes
     assert max(map(len, text.splitlines())) <= PRINTED_WIDTH
     assert not re.search(r"[ \t]$", text, re.MULTILINE) and "\x1b" not in text

@@ -2,13 +2,17 @@
 
 from __future__ import annotations
 
+import re
 from dataclasses import replace
+from html import unescape
 from typing import Any
 
 import pytest
 
 from elastocal.identification import LackOfFit, TestErrors, judged
 from elastocal.report import judgement_view
+from elastocal.report.formatting import length
+from elastocal.report.page import page_of
 
 MISFIT = LackOfFit(9.0, 1e-5, 30, 200)
 
@@ -34,13 +38,27 @@ def fine(case: Any) -> Any:
 def test_what_nothing_speaks_against_can_be_trusted(fine: Any) -> None:
     found = judgement(fine)
     assert found.tone == "good"
-    at = f"{1e6 * fine.predicted.ci95[1]:.3g}"
-    assert found.headline.startswith("This calibration can be trusted at ")
-    assert at[:2] in found.headline.partition(": positions in poses that")[0]
+    at = length(fine.predicted.ci95[1])
+    assert found.headline.startswith(f"This calibration can be trusted at {at}: ")
     assert any("give them with `test`" in step for step in found.steps)
     assert not any("diagnose" in step for step in found.steps)
     tested = replace(fine, test=TestErrors(fine.heldout_rms, 0.0, 0.0, 9))
     assert not any("give them with `test`" in step for step in judgement(tested).steps)
+
+
+def test_one_sentence_says_which_error_has_the_noise_of_a_reading(case: Any) -> None:
+    """In terminal, page, notebook, certificate and JSON."""
+    fit = case.result
+    sentence = judgement_view.judgement(fit).headline
+    own, _, read = sentence.partition(". With that noise, ")
+    assert "without the noise of a reading, is off by" in own and length(fit.verdict.at) in own
+    assert length(fit.heldout_rms) in read
+    json = fit.to_json()
+    assert json["verdict"]["sentence"] == sentence
+    assert json["verdict"]["at_um"] == pytest.approx(fit.predicted.ci95[1] * 1e6)
+    shown = [str(fit), fit._repr_html_(), page_of(fit), page_of(fit, certificate=True)]
+    for text in shown:
+        assert sentence in " ".join(unescape(re.sub("<.*?>", "", text)).split())
 
 
 def test_each_doubt_is_named_with_its_remedy(fine: Any) -> None:

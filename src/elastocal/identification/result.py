@@ -6,12 +6,14 @@ import math
 from collections.abc import Iterator, KeysView
 from dataclasses import dataclass, field
 from functools import cached_property
+from importlib import import_module
+from pathlib import Path
 from typing import Any, Literal
 
 import numpy as np
 from numpy.typing import ArrayLike
 
-from elastocal.above import Result
+from elastocal.above import PAGES, Result, headline
 from elastocal.cell.arm_description import Unsteadiness
 from elastocal.errors import UnknownNameError
 from elastocal.identification import scrutiny
@@ -377,6 +379,21 @@ class Calibration(Result):
                 told.append(f"{name}: {value} where at most {most * 1e6:.3g} µm is required")
         return tuple(told)
 
+    def certificate(
+        self, path: str | Path, *, inputs: Any = None, command: str | None = None,
+        seed: int | None = None,
+    ) -> None:  # fmt: skip
+        """Write the calibration certificate: one HTML page to print and file away.
+
+        Pose accuracy before and after in the sense of ISO 9283, instrument, loads, date, SHA-256
+        of cell and data, verdict.  Arguments and errors are those of `report`.
+
+        Examples:
+            >>> ec.identify("cell.toml", "data.csv").certificate("certificate.html")
+        """
+        pages = import_module(PAGES)
+        pages.write_page(self, Path(path), inputs, command, seed, certificate=True)
+
     @property
     def faulty(self) -> tuple[Outlier, ...]:
         """Readings beyond the noise, whether they had a part in the fit or were set apart."""
@@ -450,7 +467,7 @@ class Calibration(Result):
         columns = np.array([self.model.names.index(name) for name in self.determined])
         return scrutiny.Looked(
             self.model, self.observations, self.weights, self.x, self.B, columns.astype(np.int64),
-            self.residual, self.held_out, self.dof,
+            self.residual, self.dof,
         )  # fmt: skip
 
     def influence(self) -> tuple[scrutiny.Influence, ...]:
@@ -599,7 +616,7 @@ class Calibration(Result):
             "test_rms_um": None if self.test is None else _um(self.test.rms),
             "test_mean_um": None if self.test is None else _um(self.test.mean),
             "test_max_um": None if self.test is None else _um(self.test.maximum),
-            "verdict": self.verdict.to_json(),
+            "verdict": self.verdict.to_json() | {"sentence": headline(self)},
             "predicted_new_poses_um": None if self.predicted is None else self.predicted.to_json(),
             "measured_poses": None if self.shown is None else self.shown.to_json(),
             "open": None if self.left is None else self.left.to_json(),

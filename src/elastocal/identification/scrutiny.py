@@ -29,7 +29,7 @@ MOST_NUMBERS = 10_000_000  # of a B that is looked at in passing
 @dataclass(frozen=True)
 class Looked:
     """The fit as it ended: B (rows, parameters) of all parameters, which of them were fitted
-    (`columns`, by index), residual (rows,) and held-out residual, weights."""
+    (`columns`, by index), residual (rows,), weights."""
 
     model: Model
     observations: Observations
@@ -38,7 +38,6 @@ class Looked:
     B: Array
     columns: IntArray
     residual: Array
-    held_out: Array
     dof: int
 
     @property
@@ -330,8 +329,8 @@ class UncertaintyBudget:
 
     `parameters`: the estimates' own, at the poses of `at`; `open_parameters`: typical deviations
     of those left open.  `repeatability`: what readings of a visit share, scatter of joints and
-    drift included.  `instrument`: single readings.  `lack_of_fit`: what the held-out error has
-    beyond these, 0 where it has nothing.
+    drift included.  `lack_of_fit`: what configurations scatter by beyond that and the noise, as in
+    the error expected at new poses.  `instrument`: the rest, of single readings.
     """
 
     parameters: float
@@ -361,21 +360,11 @@ def uncertainty_budget(
 
     `parts`: mean squares (m²) of the noise, "readings" and "visits".
     """
-    size = fit.observations.size
-    own, left = mean_squares(arm, fit.B, size)
-    # Held out, a configuration has no part in the estimate: their own uncertainty is larger there
-    # by the share that it paid for.
-    rows = len(fit.residual)
-    out = own * rows / max(rows - len(fit.columns), 1)
-    held = rms_3d(fit.held_out, size) ** 2
-    noise = parts.get("readings", 0.0) + parts.get("visits", 0.0)
-    lack = max(held - noise - out - left, 0.0) if np.isfinite(held) else 0.0
-    at = "the poses fitted"
+    B, at = fit.B, "the poses fitted"
     if table is not None:
-        own, left = mean_squares(arm, fit.model.regressor(table, fit.x).B, size)
-        at = table.source
+        B, at = fit.model.regressor(table, fit.x).B, table.source
+    own, left = mean_squares(arm, B, fit.observations.size)
     visits, readings = parts.get("visits", 0.0), parts.get("readings", 0.0)
-    parameters, open_, shared, single, beyond = np.sqrt(
-        [own, left, visits, readings, lack]
-    ).tolist()
-    return UncertaintyBudget(parameters, open_, shared, single, beyond, at)
+    lack = min(max(arm.lacking**2 - visits, 0.0), readings)
+    squares = own, left, visits, readings - lack, lack
+    return UncertaintyBudget(*np.sqrt(squares).tolist(), at)

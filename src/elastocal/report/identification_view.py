@@ -220,48 +220,29 @@ def what_was_identified(result: Calibration) -> str:
     return text + counted_functions(result) + "."
 
 
-def how_well_it_predicts(result: Calibration) -> str:
-    """Held-out error beside the nominal one, and the error on test data."""
-    what = {"deflection": "deflection", "distance": "distance"}.get(
-        result.observations.kind, "position"
-    )
-    nominal, held = result.nominal_rms, result.heldout_rms
-    if math.isfinite(held):
-        drifts = result.noise.drift is not None
-        left_out = " (whole blocks in time left out, another day's drift)" if drifts else ""
-        text = (
-            f"In poses that were not fitted{left_out} the {what} is predicted to {length(held)} rms"
-        )
-        if held > 0 and nominal > held:
-            text += (
-                f"; the {nominal_arm(result)} is off by {length(nominal)}, "
-                f"{significant(nominal / held, 2)} times as much"
-            )
-        elif result.finding("no_better_than_nominal") is not None:
-            text += f", no better than the nominal arm ({length(nominal)})"
-        text += "."
-        if result.excluded:
-            apart = counted(len(result.excluded), "reading")
-            text += f" With the {apart} set apart as faulty: {length(result.heldout_all_rms)}."
-        if result.finding("fit_flatters") is not None:
-            text += (
-                f" The fitted poses look better ({length(result.residual_rms)}) than unseen ones: "
-                "more poses would help."
-            )
-    else:
-        text = (
+def prediction_lines(result: Calibration) -> list[tuple[str, str]]:
+    """What the verdict does not say of it: what was left out, new poses, test data."""
+    told, held = [], math.isfinite(result.heldout_rms)
+    if not held:
+        told.append(
             "How well unseen poses are predicted is not known: some configuration alone "
             "determines a parameter, so none can be held out."
         )
+    elif result.noise.drift is not None:
+        told.append("Held out were whole blocks in time, with another day's drift.")
+    if held and result.excluded:
+        told.append(
+            f"With the {counted(len(result.excluded), 'reading')} set apart as faulty, poses that "
+            f"were not fitted are predicted to {length(result.heldout_all_rms)} rms."
+        )
     if result.predicted is not None:
-        text += f" {at_new_poses(result.predicted)}"
-    if result.test is not None:
-        t = result.test
-        text += (
-            f" On {counted(t.n, 'test reading')} never fitted: {length(t.rms)} rms, "
+        told.append(at_new_poses(result.predicted))
+    if (t := result.test) is not None:
+        told.append(
+            f"On {counted(t.n, 'test reading')} never fitted: {length(t.rms)} rms, "
             f"{length(t.mean)} mean, {length(t.maximum)} at most."
         )
-    return text
+    return [("Prediction", " ".join(told))] if told else []
 
 
 def at_new_poses(found: PredictedError) -> str:
@@ -381,7 +362,7 @@ def summary_lines(
         lines += [
             ("Method", method_and_weights(result)),
             ("Degrees of freedom", str(result.dof)),
-            ("Prediction", how_well_it_predicts(result)),
+            *prediction_lines(result),
         ]
     lines.append(("Noise", does_noise_explain_it(result)))
     if details:
@@ -521,6 +502,12 @@ def _newtons(force: Array) -> str:
     return f"({', '.join(f'{v:g}' for v in force)}) N"
 
 
+def _each(value: Any) -> Array:
+    """A number, the numbers of three axes, or the one that all have."""
+    values = np.atleast_1d(value)
+    return values if np.ptp(values) else values[:1]
+
+
 def certificate_contents(result: Calibration, budget: ErrorBudget | None) -> dict[str, Any]:
     """Words and tables of the calibration certificate."""
     tracker = result.model.cell.tracker
@@ -528,7 +515,7 @@ def certificate_contents(result: Calibration, budget: ErrorBudget | None) -> dic
         "none stated"
         if tracker.noise is None
         else ", ".join(
-            f"{name.replace('_', ' ')} {', '.join(length(float(v)) for v in np.atleast_1d(value))}"
+            f"{name.replace('_', ' ')} {', '.join(length(float(v)) for v in _each(value))}"
             + (" per m" if name.endswith("per_m") else "")
             for name, value in vars(tracker.noise).items()
         )
@@ -691,7 +678,7 @@ SOURCES = {
     "open_parameters": "parameters left open, by their typical deviations",
     "repeatability": "repeatability: what readings of a visit have in common",
     "instrument": "instrument: single readings",
-    "lack_of_fit": "lack of fit: what the held-out error has beyond these",
+    "lack_of_fit": "lack of fit: what configurations scatter by beyond these",
     "total": "together",
 }
 
@@ -726,7 +713,7 @@ def identification_contents(
     sentences = [text for label, text in noise_lines(result) if label != "Residuals"]
     verdict = [
         ("Identified", what_was_identified(result)),
-        ("Prediction", how_well_it_predicts(result)),
+        *prediction_lines(result),
         ("Noise", does_noise_explain_it(result)),
         *held_lines(result),
         *([("Truth", coverage_line(result, truth))] if truth else []),

@@ -48,9 +48,7 @@ def judgement(result: Calibration, sections: bool = False) -> Judgement:
     verdict = result.verdict
     if trust.severity == "care":
         named = "; and ".join(DOUBTS[f.kind](f) for f in verdict.missing)
-        at = "" if verdict.at is None else f", at new poses to {length(verdict.at)} at 95 %"
-        text = f"Use this calibration with care: {told}{at}, but {named}."
-        return Judgement("care", text, steps)
+        return Judgement("care", f"Use this calibration with care: {told}. But {named}.", steps)
     compared = result.finding("residual_agrees_with_stated_noise", "residual_below_stated_noise")
     noise = "" if compared is None else ", and the residual is noise"
     at = "" if verdict.at is None else f" at {length(verdict.at)}"
@@ -167,12 +165,23 @@ def _unheard_of(f: Finding) -> str:
 
 
 def _accuracy(result: Calibration) -> str:
+    """The arm's own error where nobody measured, and that of readings, which has their noise."""
     what = {"deflection": "deflections", "distance": "distances"}.get(
         result.observations.kind, "positions"
     )
+    own = "the error at new poses is not known. With the noise of a reading, "
+    if (at := result.verdict.at) is not None:
+        most = "no more, rms," if result.verdict.trusted else f"{length(at)} rms at most"
+        own = (
+            f"the arm itself, without the noise of a reading, is off by {most} at new poses "
+            "(95 %). With that noise, "
+        )
     if not math.isfinite(result.heldout_rms):
-        return f"it reproduces the {what} that were fitted to {length(result.residual_rms)} rms"
-    text = f"{what} in poses that were not fitted are predicted to {length(result.heldout_rms)} rms"
+        return f"{own}{what} that were fitted are reproduced to {length(result.residual_rms)} rms"
+    text = (
+        f"{own}{what} in poses that were not fitted are predicted to {length(result.heldout_rms)} "
+        "rms"
+    )
     gain = result.nominal_rms / result.heldout_rms if result.heldout_rms > 0 else math.inf
     if math.isfinite(gain):
         text += f", {significant(gain, 2)} times better than by the nominal arm"
