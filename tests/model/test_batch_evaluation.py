@@ -302,24 +302,3 @@ def test_what_numpy_has_for_real_numbers_only_is_refused_not_wrong(name: str) ->
 @pytest.mark.parametrize("name", ["fabs", "sign"])
 def test_complex_step_of_kinks(name: str) -> None:
     assert_complex_step(UNARY[name], np.array([[-1.3], [0.9]]))
-
-
-@pytest.mark.parametrize("columns", [[], [1], [3, 0], [0, 1, 2, 3]])
-def test_columns_of_a_known_function_have_the_same_values(columns: list[int]) -> None:
-    """The instructions taken from a function of all columns are those CasADi would be asked for."""
-    v = ca.SX.sym("v", 4)
-    head = ca.sin(v[0]) * v[1]
-    matrix = ca.jacobian(ca.vertcat(head * v[2], ca.exp(v[3]) * head, v[1]), v)
-    rows = np.random.default_rng(4).normal(size=(7, 4))
-    whole = BatchFunction([v], [head, matrix])
-    whole_head, whole_matrix = whole(rows)
-    part = BatchFunction([v], [head, matrix[:, columns]], None, whole, columns)
-    alone = BatchFunction([v], [head, matrix[:, columns]])
-    for found, expected in zip(part(rows), alone(rows), strict=True):
-        np.testing.assert_array_equal(found, expected)
-    np.testing.assert_array_equal(part(rows)[0], whole_head)
-    np.testing.assert_array_equal(part(rows)[1], whole_matrix[:, :, columns])
-    unused = BatchFunction(
-        [v], [head, matrix[:, columns]], None, BatchFunction([v], [head, matrix]), columns
-    )
-    np.testing.assert_array_equal(unused(rows)[1], alone(rows)[1])

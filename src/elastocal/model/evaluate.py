@@ -186,32 +186,22 @@ class BatchFunction:
     input is.  `backend` is "auto", "numpy" or "compiled"; None follows ELASTOCAL_BACKEND.
     Complex numbers are always evaluated by numpy.
 
-    `wider`, where given, is a function of the same inputs and outputs whose last output has more
-    columns, and `columns` says which of them this one's are: where its instructions are known
-    already, they serve here too.
-
     A call raises NotImplementedError for an operation that numpy lacks, ValueError
     for arrays of other shapes, InputError where `backend` is "compiled" and nothing can compile.
     """
 
     def __init__(
-        self,
-        inputs: Sequence[ca.SX],
-        outputs: Sequence[ca.SX],
-        backend: str | None = None,
-        wider: BatchFunction | None = None,
-        columns: Sequence[int] = (),
+        self, inputs: Sequence[ca.SX], outputs: Sequence[ca.SX], backend: str | None = None
     ) -> None:
         self._asked = None if backend is None else checked(backend, "backend")
         self._function = HashedFunction(inputs, outputs)
         self.shapes = self._function.shapes
         self._sizes = self._function.sizes
         self.n_instructions = self._function.n_instructions
-        self._forget(wider, columns)
+        self._forget()
 
-    def _forget(self, wider: BatchFunction | None = None, columns: Sequence[int] = ()) -> None:
+    def _forget(self) -> None:
         self._lock = threading.Lock()
-        self._wider, self._columns = wider, tuple(columns)
         self._work = Work(self.n_instructions)
         self._compiled: Compiled | None = None
         self._looked = False
@@ -229,8 +219,7 @@ class BatchFunction:
 
     @cached_property
     def _by_numpy(self) -> NumpyFunction:
-        known = None if self._wider is None else self._wider.__dict__.get("_by_numpy")
-        return NumpyFunction(self._function, known, self._columns)
+        return NumpyFunction(self._function)
 
     @property
     def report(self) -> BackendReport:

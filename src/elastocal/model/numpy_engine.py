@@ -111,42 +111,6 @@ def instructions(function: HashedFunction) -> tuple[NDArray[np.int32], NDArray, 
     return table, constants, registers
 
 
-def of_columns(
-    table: NDArray[np.int32], output: int, width: int, columns: Sequence[int]
-) -> NDArray[np.int32]:
-    """The instructions of `table` that make the `columns` of its last output, `output`.
-
-    That output has `width` columns; the others stay whole.  What remains is in the same order, so
-    the values are the same to the last digit.
-    """
-    position = {c: k for k, c in enumerate(columns)}
-    live: set[int] = set()
-    kept: list[int] = []
-    places: list[int] = []
-    rows = zip(*(column.tolist() for column in table[::-1].T), strict=True)
-    for back, (kind, _, register, a, b) in enumerate(rows):
-        if kind == WRITE:
-            if a == output:
-                row, column = divmod(b, width)
-                if column not in position:
-                    continue
-                b = row * len(columns) + position[column]
-            live.add(register)
-        elif register in live:
-            live.remove(register)
-            if kind >= UNARY_OP:
-                live.add(a)
-                if kind == BINARY_OP:
-                    live.add(b)
-        else:
-            continue
-        kept.append(len(table) - 1 - back)
-        places.append(b)
-    chosen = table[kept[::-1]]
-    chosen[:, 4] = places[::-1]
-    return chosen
-
-
 def _extracted(function: HashedFunction) -> tuple[NDArray[np.int32], NDArray, int]:
     reduced = function.reduced
     constants: list[float] = []
@@ -193,21 +157,8 @@ class NumpyFunction:
     for.
     """
 
-    def __init__(
-        self,
-        function: HashedFunction,
-        wider: NumpyFunction | None = None,
-        columns: Sequence[int] = (),
-    ) -> None:
-        """`wider`, where given, evaluates the same with more columns in its last output: of its
-        instructions, those for `columns` are taken instead of asking CasADi again."""
-        self.shapes = function.shapes
-        if wider is None:
-            self._table, self._constants, self.n_registers = instructions(function)
-        else:
-            output, (_, width) = len(wider.shapes) - 1, wider.shapes[-1]
-            self._table = of_columns(wider._table, output, width, columns)
-            self._constants, self.n_registers = wider._constants, wider.n_registers
+    def __init__(self, function: HashedFunction) -> None:
+        self._table, self._constants, self.n_registers = instructions(function)
         self._steps: dict[tuple[bool, ...], Steps] = {}
 
     def evaluate(

@@ -314,16 +314,18 @@ class Total:
         slopes = [self._slopes] if "_slopes" in self.__dict__ else []
         return [function.report for function in (*self._functions.values(), *slopes)]
 
-    def _function(self, columns: tuple[int, ...]) -> BatchFunction:
-        """y and the `columns` of dy/dz."""
+    def _function(self, columns: tuple[int, ...]) -> tuple[BatchFunction, slice | list[int]]:
+        """A function of y and dy/dz, and where the `columns` stand in that: one of all columns,
+        where there is one already and they are most of them, else one of their own."""
+        every = tuple(range(self._z.shape[0]))
+        if columns != every and every in self._functions and 2 * len(columns) >= len(every):
+            return self._functions[every], list(columns)
         if columns not in self._functions:
-            wider = self._functions.get(tuple(range(self._z.shape[0])))
             adjoint, slope = self._derivative
             inputs = [*self._inputs, *([ca.vec(adjoint.T)] if self._arm.implicit else [])]
             outputs = [self._y, slope[:, list(columns)]]
-            backend = self._arm.backend
-            self._functions[columns] = BatchFunction(inputs, outputs, backend, wider, columns)
-        return self._functions[columns]
+            self._functions[columns] = BatchFunction(inputs, outputs, self._arm.backend)
+        return self._functions[columns], slice(None)
 
     def __call__(
         self,
@@ -337,10 +339,11 @@ class Total:
         `columns` are those of z, by default all.
         """
         arm, given = self._arm, [*inputs, *extra, x]
-        function = self._function(tuple(range(self._z.shape[0])) if columns is None else columns)
+        every = tuple(range(self._z.shape[0]))
+        function, chosen = self._function(every if columns is None else columns)
         if not arm.implicit:
             y, slope = function(*given, np.zeros((len(inputs[0]), arm.arm.theta.shape[0])))
-            return y[..., 0], slope
+            return y[..., 0], slope[..., chosen]
         theta, F_theta = arm.equilibrium.solve(inputs, x)
         y_theta = self._slopes(*given, theta)[0]
         y_theta[~np.isfinite(y_theta).all(axis=(1, 2))] = 0.0
@@ -348,7 +351,7 @@ class Total:
         adjoint = adjoint.transpose(0, 2, 1).reshape(len(theta), -1)
         y, slope = function(*given, theta, adjoint)
         y[~np.isfinite(theta).all(axis=1)] = np.nan
-        return y[..., 0], slope
+        return y[..., 0], slope[..., chosen]
 
 
 def _check_names(parameters: Sequence[Parameter], cell: Cell) -> None:
