@@ -205,7 +205,7 @@ class SumAnswer:
         ]  # fmt: skip
         if not gone:
             return self
-        first = self.found.plain.X.shape[2]
+        first = self.found.sums.data.X.shape[2]
         deviation = np.sqrt(self.found.variances)
         unnamed = []
         for k in gone:
