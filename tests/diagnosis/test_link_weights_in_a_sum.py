@@ -11,12 +11,16 @@ from support.diagnosis_data import REPEATABILITY, SIGMA, Fault, cell, measured, 
 from elastocal.diagnosis import (
     DiagnosisData,
     Hypothesis,
-    about_weights,
+    about_sum,
+    catalogue_components,
     diagnosis_data_of,
     fit_baseline,
+    fit_sum,
     judged_together,
 )
+from elastocal.diagnosis.noise_floor import NoiseValues
 from elastocal.model import Model
+from elastocal.model.effects.gravity_sag import LinkWeights
 from elastocal.units import Array
 
 MOMENTS = {"link2_moment_x": 500.0, "link2_moment_y": 40.0, "link3_moment_x": -230.0}
@@ -63,19 +67,30 @@ def test_where_nothing_yields_there_is_nothing_to_weigh() -> None:
     assert not bare.changed(hypotheses=(h,)).packed(h, np.zeros(0)).any()
 
 
-def test_about_a_fit_with_the_weights_nothing_is_left_but_noise() -> None:
+def summed(dataset: DiagnosisData, *effects: str) -> DiagnosisData:
+    """The data about the sum of all components of these effects, twice as a search does."""
+    for _ in range(2):
+        some = [c for c in catalogue_components(dataset) if c.effect.name in effects]
+        found = fit_sum(dataset.data, some, NoiseValues.usual(6))
+        assert LinkWeights.name in [c.effect.name for c in found.components]
+        dataset = about_sum(dataset, found)
+    return dataset
+
+
+def test_about_a_sum_with_the_weights_nothing_is_left_but_noise() -> None:
     """Without them the springs answer for the weights, and the columns are wrong by as much."""
     dataset, h = heavy()
-    about = about_weights(dataset, [h])
+    about = summed(dataset, LinkWeights.name)
     expected = float(np.hypot(SIGMA, 2.0 * REPEATABILITY))
     assert left(dataset, h) > 3 * expected
     assert left(about, h) < 1.5 * expected
     assert (np.abs(compliances(dataset) / COMPLIANCE[1:3] - 1) > 0.1).any()
+    assert np.allclose(compliances(summed(about, LinkWeights.name)), compliances(about), rtol=0.01)
 
 
 def test_the_residual_of_the_cells_own_parameters_stays_what_it_was() -> None:
     """What the weights explain is put back: sums with and without them stand on one footing."""
     dataset, h = heavy()
-    about = about_weights(dataset, [h])
+    about = summed(dataset, LinkWeights.name)
     rms = [float(np.sqrt(np.mean(d.base.residual**2))) for d in (dataset, about)]
     assert rms[0] <= rms[1] < 5 * rms[0] and rms[0] > 10 * SIGMA
