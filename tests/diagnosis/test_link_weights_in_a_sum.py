@@ -90,7 +90,7 @@ def test_about_a_sum_with_the_weights_nothing_is_left_but_noise() -> None:
 
 def test_the_residual_of_the_cells_own_parameters_stays_what_it_was() -> None:
     """What the weights explain is put back: sums with and without them stand on one footing."""
-    dataset, h = heavy()
+    dataset, _ = heavy()
     about = summed(dataset, LinkWeights.name)
     rms = [float(np.sqrt(np.mean(d.base.residual**2))) for d in (dataset, about)]
     assert rms[0] <= rms[1] < 5 * rms[0] and rms[0] > 10 * SIGMA
