@@ -65,9 +65,11 @@ def test_it_says_what_they_bring(answer) -> None:
 def test_measuring_ends_where_enough_is_kept_or_nothing_is_won() -> None:
     inf = float("inf")
     won, lost, first = Gain(3, 2, 1, 1, 6), Gain(3, 2.99, 1, 1, 6), Gain(inf, inf, inf, 1, inf)
-    assert verdict_of(won, 6, None) == verdict_of(won, 6, 5) == "measure"
-    assert verdict_of(won, 5, 5) == verdict_of(lost, 5, 5) == "enough"
-    assert verdict_of(lost, 6, 5) == "no_gain" and verdict_of(first, inf, 5) == "measure"
+    assert verdict_of(won, 6, None, 0.01) == verdict_of(won, 6, 5, 0.01) == "measure"
+    assert verdict_of(won, 5, 5, 0.01) == verdict_of(lost, 5, 5, 0.01) == "enough"
+    assert (
+        verdict_of(lost, 6, 5, 0.01) == "no_gain" and verdict_of(first, inf, 5, 0.01) == "measure"
+    )
 
 
 @pytest.mark.long

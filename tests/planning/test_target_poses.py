@@ -277,8 +277,12 @@ class Elbow:
 
     least: float
     forces: tuple[float, ...] = (0.0, -2600.0)
+    of_force = True
 
-    def check(self, q: NDArray, force: NDArray) -> Any:
+    def feasible(self, q: NDArray, force: NDArray) -> Any:
+        return self.check(q, np.broadcast_to(force, (len(q), 3))).ok
+
+    def check(self, q: NDArray, force: NDArray, every: bool = True) -> Any:
         assert force.shape == (len(q), 3)
         return type(
             "Verdict", (), {"ok": (q[:, 2] > self.least) & np.isin(force[:, 2], self.forces)}
@@ -301,7 +305,7 @@ def test_a_posture_that_the_cell_allows_is_preferred() -> None:
 class Wrist:
     """Allows joint 6 in a narrow range: one posture in forty."""
 
-    def check(self, q: NDArray, force: NDArray) -> Any:
+    def check(self, q: NDArray, force: NDArray, every: bool = True) -> Any:
         return type("Verdict", (), {"ok": np.abs(q[:, 5] - 3.0) < 0.15})
 
 

@@ -159,10 +159,14 @@ def design(
 
     Example: elastocal design cell.toml -o plan.csv --poses 15 --picture poses.png
     """
+    given = locals()
+    from inspect import signature
+
     from elastocal.files import together
     from elastocal.planning.checkpoint import Checkpoint, key_of
     from elastocal.planning.design import design as run
     from elastocal.planning.pins import plan_and_names
+    from elastocal.verbs import design as verb
     from elastocal.verbs import design_request
 
     summary = output.with_suffix(".json")
@@ -170,17 +174,9 @@ def design(
     programs = program or []
     _check_suffixes(programs, picture)
     written = check_outputs(output, summary, *programs, picture, report, cell_out)
-    asked: dict[str, Any] = {
-        "poses": poses,
-        "criterion": criterion,
-        "target": _target(target, poses),
-        "minutes": minutes,
-        "candidates": candidates,
-        "elsewhere": elsewhere,
-        "elsewhere_cap": elsewhere_cap,
-        "load_changes": load_changes,
-        "reference_every": reference_every,
-    }
+    # What this command and `ec.design` call the same goes from one to the other.
+    asked = {name: given[name] for name in signature(verb).parameters if name in given}
+    asked |= {"target": _target(target, poses), "curve": _numbers(curve), "fixed": fix or ()}
     with progress_line(quiet) as tell, Interrupts() as interrupts:
 
         def progress(message: str) -> None:
@@ -188,22 +184,19 @@ def design(
             tell(message)
 
         progress("reading")
-        wanted, options = design_request(
-            cell, **asked, augment=augment, knowledge=knowledge, fixed=fix or (),
-            keep=keep, strike=strike, curve=_numbers(curve), effort=effort, seed=seed, jobs=jobs,
-        )  # fmt: skip
+        wanted, options = design_request(cell, **asked)
         _check_programs(wanted, programs)
         require(
             cell_out is None or wanted.design.choose is not None,
             f"--cell-out {cell_out}: nothing is chosen; state [design.choose] in {cell}",
         )
         pinned = [plan_and_names(text)[0] for text in (keep, strike) if text]
-        given = (cell, augment, knowledge, *pinned, *files_of(wanted))
-        files = [p for p in given if p is not None]
+        read = (cell, augment, knowledge, *pinned, *files_of(wanted))
+        files = [p for p in read if p is not None]
         check_apart(written, files)
-        told = asked | {"fix": fix, "curve": curve, "effort": effort}
-        told |= {"keep": keep, "strike": strike}
-        checkpoint = Checkpoint.beside(output, key_of(files, seed=seed, **told), interrupts.check)
+        apart = ("jobs", "augment", "knowledge")  # these are among the files
+        told = {name: value for name, value in asked.items() if name not in apart}
+        checkpoint = Checkpoint.beside(output, key_of(files, **told), interrupts.check)
         if checkpoint.begun:
             progress("going on with the design that was interrupted")
         try:

@@ -40,6 +40,10 @@ def next_command(
             "[require] of the cell says.",
         ),
     ] = None,
+    least_gain: Annotated[
+        float,
+        typer.Option(min=0, max=99, metavar="%", help="A batch pays that lowers the error so far."),
+    ] = 1.0,
     candidates: Annotated[
         int, typer.Option(min=1, help="Feasible candidates to choose from.")
     ] = 400,
@@ -69,8 +73,9 @@ def next_command(
     check_apart(written, [cell, data], known)
     with progress_line(quiet) as progress:
         found = next_poses(
-            known, data, batch=batch, require=limits.get("new_poses"), candidates=candidates,
-            seed=seed, jobs=jobs, progress=progress,
+            known, data, batch=batch, require=limits.get("new_poses"),
+            least_gain=least_gain / 100, candidates=candidates, seed=seed, jobs=jobs,
+            progress=progress,
         )  # fmt: skip
         if found.plan is not None:
             with together(written):

@@ -34,7 +34,7 @@ from elastocal.planning.candidates import draw
 from elastocal.planning.feasibility import Feasibility
 from elastocal.planning.information import LoadStates
 from elastocal.simulation.simulate import simulate
-from elastocal.units import Array, IntArray
+from elastocal.units import Array, BoolArray, IntArray
 
 CANDIDATES, FEWEST_POSES = 256, 64
 NEWTON = 1.0  # forces are told apart to this
@@ -47,7 +47,7 @@ class VisitPool:
 
     `q` (N, n); `approach` (N, n) of ±1 and `time` (N,) s where the table has them; `forces`
     (L, 3) N.  `table` holds their rows: candidate by candidate, load by load, marker by marker,
-    with the readings that the fitted model expects.
+    with the readings that the fitted model expects; those `hidden` (rows,) the tracker cannot make.
     """
 
     q: Array
@@ -55,6 +55,7 @@ class VisitPool:
     time: Array | None
     forces: Array
     table: Measurements
+    hidden: BoolArray
 
     def __len__(self) -> int:
         return len(self.q)
@@ -120,7 +121,22 @@ def visit_pool_of(
         rows = replace(rows, temperature=np.full(len(rows), np.median(table.temperature)))
     if table.move is not None:
         rows = with_moves(rows)  # from one candidate to the next, as good as any order
-    return VisitPool(q, approach, time, forces, simulate(model, rows, x, 0, noise=False))
+    read = simulate(model, rows, x, 0, noise=False)
+    return VisitPool(q, approach, time, forces, read, _hidden(model, q, forces, table.marker_names))
+
+
+def _hidden(model: Model, q: Array, forces: Array, markers: tuple[str, ...]) -> BoolArray:
+    """(N·L·M,): the tracker does not see the marker of pose q (N, n) under that of `forces` (L, 3),
+    or for deflections under another of them."""
+    sight, stated = model.cell.workspace.visibility, list(model.cell.tool.markers)
+    if sight is None or sight.min_markers is None:
+        return np.zeros(len(q) * len(forces) * len(markers), dtype=bool)
+    rules = Feasibility(model.cell, model.chain)
+    own = [stated.index(name) for name in markers]
+    hidden = np.stack([~rules.seen(q, force)[:, own] for force in forces], axis=1)
+    if model.observe == "deflection":
+        hidden |= hidden.any(axis=1, keepdims=True)
+    return hidden.ravel()
 
 
 def load_forces(table: Measurements) -> Array:
@@ -175,7 +191,8 @@ class Campaign:
 def campaign_of(
     base: Baseline, pool: VisitPool, hypotheses: list[Hypothesis], diagnosis: Diagnosis
 ) -> Campaign:
-    """Columns of the data so far and of the pool at the fit, faulty readings left out.
+    """Columns of the data so far and of the pool at the fit; faulty readings and those of markers
+    that are not seen left out.
 
     Candidates are read as precisely as the same marker was on average.
     """
@@ -194,7 +211,8 @@ def campaign_of(
     )  # fmt: skip
     measured = len(np.unique(table.configuration[base.observed.lead]))
     dataset, noise = as_diagnosed(diagnosis_data_of(both, hypotheses), diagnosis)
-    return Campaign(dataset, measured, noise)
+    hidden = np.concatenate([np.zeros(len(table), dtype=bool), pool.hidden])[observed.lead]
+    return Campaign(dataset.without(dataset.data.faulty | hidden), measured, noise)
 
 
 @dataclass(frozen=True)

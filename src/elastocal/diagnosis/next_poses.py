@@ -33,7 +33,6 @@ from elastocal.planning.test_poses import where_used
 from elastocal.units import Progress
 
 CRITERION = "robust"
-PAYS = 0.01  # share of the error by which a batch has to lower it
 
 NextVerdict = Literal["measure", "enough", "no_gain"]
 
@@ -44,13 +43,13 @@ class NextPoses:
 
     Attributes:
         verdict: "measure"; "enough", the required error is kept with 95 %; "no_gain", no batch
-            lowers the error by a hundredth.
+            lowers the error by `least_gain`, a share of it.
         plan: The poses; None where nothing more is to be measured.
         gain: What the batch adds, with and without what the model may lack, in m.
         required: The error at new poses that is asked for, in m; None where none is.
         reached: The error that the model as it is now keeps with 95 %, in m.
         found: The effects that the diagnosis found, which the model then has.
-        doubts: What it may lack besides, the likeliest first.
+        doubts: What it may lack besides and the poses can show, the likeliest first.
     """
 
     verdict: NextVerdict
@@ -61,6 +60,7 @@ class NextPoses:
     reached: float
     found: tuple[FoundEffect, ...]
     doubts: tuple[tuple[str, str, float], ...]
+    least_gain: float = 0.01
 
     def __repr__(self) -> str:
         told = f"at most {self.reached * 1e6:.3g} µm with 95 %"
@@ -74,6 +74,7 @@ class NextPoses:
             "required": self.required,
             "reached": self.reached,
             "batch": self.batch,
+            "least_gain": self.least_gain,
             "gain": asdict(self.gain),
             "found": [{"effect": f.effect, "where": f.where, "probability": f.probability}
                       for f in self.found],
@@ -93,6 +94,7 @@ def next_poses(
     *,
     batch: int = 5,
     require: float | None = None,
+    least_gain: float = 0.01,
     candidates: int = 400,
     seed: int = 0,
     jobs: int = 1,
@@ -110,6 +112,7 @@ def next_poses(
         data: All readings so far, or their file.
         batch: Number of poses.
         require: Error in m at new poses that has to be kept with 95 %; default the cell's.
+        least_gain: Share of the error, 0 to below 1, by which a batch has to lower it to pay.
         candidates: Feasible candidates to choose from.
         seed: Of all random draws.
         jobs: Processes; −1 for all cores.
@@ -132,6 +135,7 @@ def next_poses(
     check(
         require is None or require > 0, f"{option('require')} takes an error in m, found {require}"
     )
+    check(0 <= least_gain < 1, f"{option('least_gain')} takes a share from 0 to below 1")
     model = model if isinstance(model, Model) else Model(model)
     table = data if isinstance(data, Measurements) else model.read(data)
     model = model.with_markers_of(table)
@@ -159,8 +163,8 @@ def next_poses(
     gain = plan.gain
     assert gain is not None  # the criterion has test poses
     reached = math.inf if predicted is None else max(gain.sure, predicted.ci95[1])
-    verdict = verdict_of(gain, reached, required)
-    likeliest = sorted(chances.items(), key=lambda item: -item[1])
+    verdict = verdict_of(gain, reached, required, least_gain)
+    likeliest = sorted(plan.doubts, key=lambda place: -chances[place])
     return NextPoses(
         verdict=verdict,
         plan=plan if verdict == "measure" else None,
@@ -169,15 +173,18 @@ def next_poses(
         required=required,
         reached=reached,
         found=() if why is None else why.effects,
-        doubts=tuple((*key, p) for key, p in likeliest),
+        doubts=tuple((*place, chances[place]) for place in likeliest),
+        least_gain=least_gain,
     )
 
 
-def verdict_of(gain: Gain, reached: float, required: float | None) -> NextVerdict:
+def verdict_of(
+    gain: Gain, reached: float, required: float | None, least_gain: float
+) -> NextVerdict:
     """Whether to measure a batch with this gain, where `reached` is kept and `required` asked."""
     if required is not None and reached <= required:
         return "enough"
-    pays = not np.isfinite(gain.before) or gain.after < (1 - PAYS) * gain.before
+    pays = not np.isfinite(gain.before) or gain.after < (1 - least_gain) * gain.before
     return "measure" if pays else "no_gain"
 
 

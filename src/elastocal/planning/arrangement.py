@@ -3,20 +3,22 @@
 from __future__ import annotations
 
 from dataclasses import dataclass, replace
+from functools import partial
 
 import numpy as np
 
 from elastocal.model.chain import finite_ranges, joint_limits
-from elastocal.planning.checkpoint import Checkpoint, Stage
+from elastocal.planning.checkpoint import Checkpoint, State
 from elastocal.planning.drift import Alias
-from elastocal.planning.exact_plan import repaired
+from elastocal.planning.exact_plan import repaired, restrict
 from elastocal.planning.execution import Execution, schedule
 from elastocal.planning.feasibility import Feasibility
 from elastocal.planning.moves import Blockers, Unreachable
 from elastocal.planning.plan import Certificate
+from elastocal.planning.selection import DesignProblem
 from elastocal.planning.setup import FeasiblePool, Setup
 from elastocal.planning.time_budget import at_stops
-from elastocal.units import Array, IntArray, Progress
+from elastocal.units import Array, BoolArray, IntArray, Progress
 
 
 @dataclass(frozen=True)
@@ -24,7 +26,8 @@ class Selection:
     """The plan as indices `chosen` (k,) into the `pool`, which has grown; Φ `value`.
 
     From index `first` on the pool holds what came from local searches and the continuum, at its
-    end, once the plan is `whole`, the `pinned` poses that stay.
+    end, once the plan is `whole`, the `pinned` poses that stay.  `alias`: what a shift of its
+    readings does, once it is in order.
     """
 
     pool: FeasiblePool
@@ -33,6 +36,7 @@ class Selection:
     certificate: Certificate
     first: int
     pinned: int = 0
+    alias: Alias | None = None
 
     @property
     def polished(self) -> int:
@@ -50,36 +54,32 @@ class Selection:
         chosen = chosen[np.argsort(pool.group[chosen], kind="stable")]
         return replace(self, pool=pool, chosen=chosen, pinned=n)
 
-    def without(self, lost: IntArray, setup: Setup, shares: IntArray, stage: Stage) -> Selection:
-        """The best plan found without the candidates `lost`, from what is left of this one; what
-        `stage` has finished is taken from there.
+    def without(self, gone: IntArray, chosen: IntArray, setup: Setup) -> Selection:
+        """The plan `chosen` (k,) without the candidates `gone`, which leave the pool.
 
         The bounds hold: those of a pool are those of every part of it.
         """
-        kept = np.setdiff1d(np.arange(len(self.pool)), lost)
-        pool = self.pool.take(kept)
-        left = np.searchsorted(kept, np.setdiff1d(self.chosen, lost))
-        problem = setup.problem(pool, shares)
-        state = stage.finished(lambda: {"chosen": repaired(problem, left)})
-        chosen = state["chosen"]
-        value = float(setup.criterion.value(setup.gathered(pool.blocks[:, chosen])))
+        kept = np.setdiff1d(np.arange(len(self.pool)), gone)
+        value = float(setup.criterion.value(setup.gathered(self.pool.blocks[:, chosen])))
         c = self.certificate
         of_pool, of_continuum = (
             None if share is None else share * (self.value / value)
             for share in (c.efficiency_pool, c.efficiency_continuum)
         )
         certificate = replace(
-            c, pool=len(pool), efficiency_pool=of_pool, efficiency_continuum=of_continuum
+            c, pool=len(kept), efficiency_pool=of_pool, efficiency_continuum=of_continuum
         )
-        first = self.first - int((lost < self.first).sum())
-        return Selection(pool, chosen, value, certificate, first)
+        first = self.first - int((gone < self.first).sum())
+        own = np.searchsorted(kept, chosen)
+        return Selection(self.pool.take(kept), own, value, certificate, first)
 
 
 # The order of execution of a selection, and what becomes of poses that no move reaches.
 
 SAME = 1e-9  # of the largest number of the blocks: rounding
 MOST_REPLACED = 50  # poses that cannot be reached, before that is said instead
-TRIED = 6  # poses of a plan that a candidate must be able to reach one of
+TRIED = 6  # poses of a plan one of which a pose put into it must be able to reach
+LIKELY = 200  # candidates that gain most, of which that is found out
 VIA = 200  # candidates through which a blocked move may go
 
 
@@ -98,76 +98,112 @@ def ordered(
     Poses that no chain of free moves reaches are replaced by the best others, unless they are
     `pinned`.  Raises InsufficientDataError where that does not end.
     """
-    lost, unwound, apart = 0, False, False
+    lost, unwound, paths = 0, False, _Paths(feasibility)
     while True:
         plan = found.whole(pinned)
+        q = plan.pool.q[plan.chosen]
+        unwound = unwound or bool(_apart(paths, q, q).any())
         if unwound:
             plan = _unwound(setup, plan, feasibility)
         chosen = plan.chosen
         try:
-            execution = _execution(setup, plan.pool, chosen, feasibility, seed, progress)
+            plan = replace(plan, alias=Alias.of(setup, plan.pool, chosen))
+            execution = _execution(setup, plan, paths, seed, progress)
         except Unreachable as error:
             if not unwound:
                 unwound = True
                 continue
-            own = len(found.pool)
-            if lost >= MOST_REPLACED or (chosen[error.poses] >= own).any():
+            if lost >= MOST_REPLACED or (chosen[error.poses] >= len(found.pool)).any():
                 raise
             lost += len(error.poses)
             progress(f"{lost} poses that no free move reaches are replaced by the best others")
-            stage = (checkpoint or Checkpoint()).stage(f"replaced{lost}")
             gone = np.unique(chosen[error.poses])
-            if not apart:
-                apart = True
-                gone = np.union1d(gone, _apart(plan, own, gone, shares, feasibility))
-            found = found.without(gone, setup.having(pinned), shares, stage)
+            stage = (checkpoint or Checkpoint()).stage(f"replaced{lost}")
+            state = stage.finished(
+                partial(
+                    _replaced,
+                    setup.having(pinned).problem(found.pool, shares),
+                    found.chosen,
+                    gone,
+                    _nearer(feasibility, found.pool.q),
+                    plan.pool.q[np.setdiff1d(chosen, gone)],
+                    paths,
+                )
+            )
+            found = found.without(gone, state["chosen"], setup.having(pinned))
             continue
         return plan, execution, _warnings(lost, execution)
 
 
+class _Paths:
+    """The cell's moves, each checked once however often a plan changes around it."""
+
+    def __init__(self, feasibility: Feasibility) -> None:
+        self.feasibility = feasibility
+        self.known: dict[tuple[bytes, bytes, bool], bool] = {}
+
+    def paths_free(self, q_from: Array, q_to: Array, loaded: bool) -> BoolArray:
+        """As `Feasibility.paths_free`, of moves (M, n)."""
+        ends = zip(q_from, q_to, strict=True)
+        keys = [(*sorted((a.tobytes(), b.tobytes())), loaded) for a, b in ends]
+        new = [k for k, key in enumerate(keys) if key not in self.known]
+        if new:
+            free = self.feasibility.paths_free(q_from[new], q_to[new], loaded)
+            self.known.update((keys[k], bool(f)) for k, f in zip(new, free, strict=True))
+        return np.array([self.known[key] for key in keys], dtype=bool)
+
+
 def _execution(
-    setup: Setup,
-    pool: FeasiblePool,
-    chosen: IntArray,
-    feasibility: Feasibility,
-    seed: int,
-    progress: Progress,
+    setup: Setup, plan: Selection, paths: _Paths, seed: int, progress: Progress
 ) -> Execution:
+    feasibility, pool, chosen = paths.feasibility, plan.pool, plan.chosen
     cell, states = feasibility.cell, setup.information.states
     return schedule(
-        pool.q[chosen], at_stops(cell), feasibility,
+        pool.q[chosen], at_stops(cell), paths,
         loads=states.forces,
         load=pool.load[chosen] if states.chosen else None,
         limits=joint_limits(cell, feasibility.chain),
         via=pool.q[:: max(len(pool) // VIA, 1)],
         blockers=Blockers(feasibility),
-        alias=Alias.of(setup, pool, chosen),
+        alias=plan.alias,
         paired=not states.observed.all(),
         seed=seed, progress=progress,
     )  # fmt: skip
 
 
-def _apart(
-    plan: Selection, own: int, gone: IntArray, shares: IntArray, feasibility: Feasibility
-) -> IntArray:
-    """Candidates among the first `own` of the pool that no free move joins to one of the TRIED
-    poses of the plan next to them, those `gone` aside: not to be put in their place.
+def _replaced(
+    problem: DesignProblem, were: IntArray, gone: IntArray, q: Array, there: Array, paths: _Paths
+) -> State:
+    """What is `chosen` instead of the plan `were` without the candidates `gone`.
 
-    None where too few would be left to choose from.
+    In their place, and by exchange in that of others, come those of the LIKELY candidates of a
+    level that a free move joins, as postures q (N, n), to poses of the plan that are `there`.
     """
-    pool, kept = plan.pool, np.setdiff1d(plan.chosen, gone)
-    q = _nearer(feasibility, pool.q)
-    open_ = np.setdiff1d(np.arange(own), plan.chosen)
-    off = np.abs(q[open_, None] - pool.q[kept]).max(axis=2)
-    next_to = np.argsort(off, axis=1)[:, :TRIED]
-    loaded = bool(np.any(feasibility.cell.design.loads))
-    alone = np.arange(len(open_))
-    for k in range(next_to.shape[1]):
-        goals = pool.q[kept[next_to[alone, k]]]
-        alone = alone[~feasibility.paths_free(q[open_[alone]], goals, loaded)]
-    left = np.setdiff1d(np.arange(own), np.append(open_[alone], gone))
-    enough = np.bincount(pool.group[left], minlength=len(shares)) >= 2 * shares
-    return open_[alone] if enough.all() else open_[:0]
+    kept, pool = np.setdiff1d(were, gone), [were]
+    worth = problem.sensitivity(problem.criterion.gradient(problem.prior + problem.sum_of(were)).G)
+    for level, share in enumerate(problem.shares):
+        own = np.setdiff1d(np.flatnonzero(problem.group == level), were)
+        ranked, found = own[np.argsort(-worth[own], kind="stable")], 0
+        while len(ranked) and found < share:
+            tried, ranked = ranked[:LIKELY], ranked[LIKELY:]
+            pool.append(tried[~_apart(paths, q[tried], there)])
+            found += len(pool[-1])
+    some = np.setdiff1d(np.concatenate(pool), gone)
+    if (np.bincount(problem.group[some], minlength=len(problem.shares)) < problem.shares).any():
+        some = np.setdiff1d(np.arange(problem.n_candidates), gone)  # it is said once all have gone
+    return {"chosen": some[repaired(restrict(problem, some), np.searchsorted(some, kept))]}
+
+
+def _apart(paths: _Paths, q: Array, there: Array) -> BoolArray:
+    """(N,): no free move joins the posture q (N, n) to one of the TRIED others next to it that are
+    `there` (k, n)."""
+    loaded = bool(np.any(paths.feasibility.cell.design.loads))
+    off = np.abs(q[:, None] - there).max(axis=2)
+    next_to = np.argsort(np.where(off > 0, off, np.inf), axis=1)
+    alone = np.arange(len(q))
+    for k in range(min(TRIED, len(there))):
+        alone = alone[~paths.paths_free(q[alone], there[next_to[alone, k]], loaded)]
+    return np.isin(np.arange(len(q)), alone)
 
 
 def _nearer(feasibility: Feasibility, q: Array) -> Array:

@@ -77,8 +77,11 @@ TRIES = 200  # per pose wanted, at most
 class Checker(Protocol):
     """The cell's rules: `Feasibility`, or what stands in for it.  It pickles."""
 
-    def check(self, q: Array, force: Array) -> PoseFeasibility:
-        """Every rule on poses q (N, n) under a force (3,) N."""
+    of_force: bool
+
+    def check(self, q: Array, force: Array, every: bool = True) -> PoseFeasibility:
+        """Every rule on poses q (N, n) under a force (3,) N; of each up to the first that it
+        breaks where not `every`."""
 
     def feasible(self, q: Array, force: Array) -> BoolArray:
         """(N,) as check(q, force).ok, quicker."""
@@ -145,9 +148,10 @@ def draw(
         chunks = _checked(checker, states, group, sobol(space, group, stream), jobs)
         lot, verdict = _fill(chunks, n // groups + (group < n % groups))
         if not len(lot.q):
+            every = checker.check(verdict.q, verdict.force)
             raise InsufficientDataError(
                 f"{cell.path or cell.name}: no feasible pose found{_at(chain, space, group)}; "
-                f"{checker.advice(verdict)}"
+                f"{checker.advice(replace(every, broken=every.broken | verdict.broken))}"
             )
         drawn.append(lot)
     return Candidates.join(drawn)
@@ -164,30 +168,37 @@ def sobol(space: JointSpace, group: int, stream: np.random.SeedSequence) -> Iter
 def feasible(checker: Checker, q: Array, forces: Array) -> BoolArray:
     """(N,): poses q (N, n) break no rule under any of `forces` (k, 3) N."""
     ok = np.ones(len(q), dtype=bool)
-    for force in forces:
+    for force in deciding(checker, forces):
         ok[ok] = checker.feasible(q[ok], force)
     return ok
+
+
+def deciding(checker: Checker, forces: Array) -> Array:
+    """The `forces` (k, 3), the heaviest first, that say under which of them a pose is feasible:
+    where no rule asks how heavy the load is, where it hangs everything counts that counts at all.
+    """
+    ranked = forces[np.argsort(-np.linalg.norm(forces, axis=1), kind="stable")]
+    return ranked if checker.of_force else ranked[:1]
 
 
 def _check(
     checker: Checker, states: LoadStates, group: int, q: Array
 ) -> tuple[Candidates, PoseFeasibility]:
-    """The feasible candidates among poses q (N, n) of a group, and the verdict on all.
+    """The feasible candidates among poses q (N, n) of a group, and the first rule that each breaks.
 
     A pose measured in all load states must be feasible in each, and its verdict is that of the
     first state that forbids it; where the state is chosen, (pose, state) pairs are judged.
     """
     if states.chosen:
-        verdict = PoseFeasibility.join([checker.check(q, force) for force in states.forces])
+        verdict = PoseFeasibility.join([checker.check(q, f, every=False) for f in states.forces])
         pose = np.tile(np.arange(len(q)), len(states.forces))[verdict.ok]
         load = np.repeat(np.arange(len(states.forces)), len(q))[verdict.ok]
     else:
-        # The heaviest load first: what it allows, lighter ones hardly ever forbid.
-        heaviest, *others = states.forces[np.argsort(-np.linalg.norm(states.forces, axis=1))]
-        verdict = checker.check(q, heaviest)
+        heaviest, *others = deciding(checker, states.forces)
+        verdict = checker.check(q, heaviest, every=False)
         for force in others:
             left = np.flatnonzero(verdict.ok)
-            verdict.broken[left] = checker.check(q[left], force).broken
+            verdict.broken[left] = checker.check(q[left], force, every=False).broken
         pose = np.flatnonzero(verdict.ok)
         load = np.full(len(pose), ALL_LOADS)
     order = np.lexsort((load, pose))

@@ -112,8 +112,9 @@ class TraceCriterion(ScenarioCriterion):
     def turned(self, T: Array) -> TraceCriterion | None:
         if type(self).each is not TraceCriterion.each:
             return None
-        C = T.swapaxes(-1, -2) @ self.C @ T
-        return replace(self, C=(C + C.swapaxes(-1, -2)) / 2)
+        # From a root: TᵀCT itself is positive semidefinite to rounding of its largest parts only.
+        F = self.variances.F[:, 0] @ T
+        return replace(self, C=F.swapaxes(-1, -2) @ F)
 
     def figure(self, value: float) -> float:
         return self.scale * float(np.sqrt(value))

@@ -23,7 +23,6 @@ from elastocal.planning.choices import Choice
 from elastocal.planning.conditions import ScheduledEffects
 from elastocal.planning.criteria import CRITERIA
 from elastocal.planning.doubts import OPEN, Place, gain_of, in_doubt
-from elastocal.planning.drift import left_by_drift
 from elastocal.planning.elsewhere import share_within
 from elastocal.planning.exact_plan import (
     SizedPlan,
@@ -317,7 +316,7 @@ def design(
         folder, own = rest[1].folder, rest[1]
         if folder is not None and spec.minutes:  # poses come in several numbers
             own = replace(own, folder=folder / f"{cell.design.poses}x{cell.design.repeats}")
-        made = _Design(cell, rest[0], own, progress, whole.model)
+        made = _Design(cell, rest[0], own, progress, whole)
         return replace(made.run(), chosen=chosen)
 
     return plan_of(placed) if not spec.minutes else within(choice, placed, plan_of, spec.minutes)
@@ -328,7 +327,7 @@ class _Design:
 
     def __init__(
         self, cell: Cell, options: DesignOptions, checkpoint: Checkpoint, progress: Progress,
-        work: Model | None = None,
+        first: _Design | None = None,
     ) -> None:  # fmt: skip
         self.warnings = list(options.notes)
         if cell.model.torque == "measured":
@@ -340,11 +339,14 @@ class _Design:
             drawn = EFFORTS[options.effort].candidates
             cell = replace(cell, design=replace(cell.design, candidates=drawn))
         self.checkpoint, self.progress = checkpoint, progress
+        self.doubts: tuple[Place, ...] = ()
         self.model = Model(cell, options.done.marker_names if options.done else ())
         if self.model.shrunk.any():
             self.model, options = self._without_functions(options)
         self.model, self.options = self._without_conditions(options)
-        self.work = work or self.model
+        # What the cell as it stands says of test poses and of measurements holds for others too.
+        self.work = self.model if first is None else first.work
+        self.done: dict[tuple[str, ...], Done] = {} if first is None else first.done
         self.cell = self.model.cell
         self.chain = self.model.chain
         check_cell(self.cell, self.chain)
@@ -419,7 +421,7 @@ class _Design:
             check_available(self.cell, np.bincount(group), wanted)
         model, known = self.model, Known(options.fixed, options.prior)
         if "doubts" in CRITERIA[self.cell.design.criterion].needs:
-            model, known = in_doubt(model, known, self.states, q, load, options.doubts)
+            model, known, self.doubts = in_doubt(model, known, self.states, q, load, options.doubts)
         known = self._with_done(known, model)
         progress("information of the candidates")
         setup = set_up(
@@ -476,10 +478,11 @@ class _Design:
         options = self.options
         if options.done is None:
             return known
-        self.progress("information of the measurements done")
-        done = measured(self.model, options.done, options.fixed, model)
-        self.warnings.append(f"B is taken at {done.note}")
-        return replace(known, done=done)
+        if model.names not in self.done:
+            self.progress("information of the measurements done")
+            self.done[model.names] = measured(self.model, options.done, options.fixed, model)
+            self.warnings.append(f"B is taken at {self.done[model.names].note}")
+        return replace(known, done=self.done[model.names])
 
     def targets(self) -> tuple[TargetPoses, TargetPoses | None]:
         """The test poses of the cell as it stands, and the rest of the joint ranges."""
@@ -608,7 +611,8 @@ class _Design:
         problem = setup.problem(pool, shares)
         M = setup.gathered(blocks)[0]
         when = execution.times(len(q), len(self.states.forces))
-        left = left_by_drift(setup, pool, chosen, M, when)
+        noise, alias = model.cell.noise, found.alias
+        left = M if alias is None or not noise.drift else alias.information(M, when, noise)
         phi = np.sort(np.asarray(setup.criterion.value(drawn), dtype=np.float64))
         seen = setup.information.seen(q, load)
         numbers = round(blocks.shape[1] * blocks.shape[2] * seen.mean() * readings_each(self.cell))
@@ -650,6 +654,7 @@ class _Design:
             chance=Chance.of(phi, found.value, setup.criterion),
             everywhere=self._everywhere(setup, M, drawn[:, 0], left),
             seen=None if seen.all() else seen,
+            doubts=self.doubts,
             gain=gain_of(setup, done, M, self.model.names, self.options.seed),
         )  # fmt: skip
 

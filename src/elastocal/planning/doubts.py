@@ -54,10 +54,11 @@ Place = tuple[str, str]  # an effect and where it acts
 def in_doubt(
     model: Model, known: Known, states: LoadStates, q: Array, load: IntArray,
     probability: Mapping[Place, float] | None = None,
-) -> tuple[Model, Known]:  # fmt: skip
-    """The model with all that it may lack, and what is known of it: the prior of the parameters
-    that it then has more, sized at some of the poses q (N, n) in load states `load` (N,).  Those
-    that these do not show are held: no plan would lower what they add at the test poses.
+) -> tuple[Model, Known, tuple[Place, ...]]:  # fmt: skip
+    """The model with all that it may lack, what is known of it, and the places that count: the
+    prior of the parameters that it then has more, sized at some of the poses q (N, n) in load
+    states `load` (N,).  Those that these do not show are held: no plan would lower what they add at
+    the test poses.
 
     `probability` that an effect is missing at a place, where more is known of it than its share of
     SOMETHING; places that it does not name are not in doubt.
@@ -68,7 +69,7 @@ def in_doubt(
         probability = {key: SOMETHING / (len(of_each) * of_each[key[0]]) for key in places}
     places = [key for key in places if probability.get(key, 0.0) > 0]
     if not places:
-        return model, known
+        return model, known, ()
     whole = model.with_effects((*model.cell.model.effects, *(EffectChoice(*key) for key in places)))
     every = np.arange(len(whole.parameters))
     information = PoseInformation(whole, states, whole.nominal[None], every, np.ones(len(every)))
@@ -89,7 +90,8 @@ def in_doubt(
         names, mean = [*prior.names, *names], [*prior.mean, *mean]
         covariance = linalg.block_diag(prior.covariance, covariance)
     both = GaussianPrior(tuple(names), np.array(mean), covariance) if names else None
-    return whole, replace(known, fixed=(*known.fixed, *unseen), prior=both)
+    kept = tuple(dict.fromkeys((p.effect, p.where) for p in own))
+    return whole, replace(known, fixed=(*known.fixed, *unseen), prior=both), kept
 
 
 def missing(model: Model) -> list[Place]:

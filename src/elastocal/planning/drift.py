@@ -6,7 +6,6 @@ import math
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property
-from itertools import pairwise
 
 import numpy as np
 from scipy import linalg
@@ -84,16 +83,6 @@ class Alias:
         F = noise.drift * F.reshape(self.blocks.shape[0] * self.blocks.shape[1], -1)
         across = F.T @ self.blocks.reshape(len(F), -1)
         return np.asarray(M - across.T @ np.linalg.solve(np.eye(F.shape[1]) + F.T @ F, across))
-
-
-def left_by_drift(
-    setup: Setup, pool: FeasiblePool, chosen: IntArray, M: Array, time: Array
-) -> Array:
-    """`Alias.information` of the plan `chosen` (N,) under the drift of the cell's [noise]; M where
-    it states none."""
-    noise = setup.information.model.cell.noise
-    alias = Alias.of(setup, pool, chosen) if noise.drift else None
-    return M if alias is None else alias.information(M, time, noise)
 
 
 @dataclass(frozen=True)
@@ -282,11 +271,7 @@ def _moved(tour: list[int], load: list[int], kind: float, i: int, j: int) -> lis
     if alone:
         return None  # its block would be gone
     new.insert(j, new.pop(i))
-    return new if _blocks(new, load) <= _blocks(tour, load) else None
-
-
-def _blocks(tour: list[int], load: list[int]) -> int:
-    return sum(load[a] != load[b] for a, b in pairwise([0, *tour]))
+    return new
 
 
 # Reference poses: the same pose again and again, which shows a drift by itself.

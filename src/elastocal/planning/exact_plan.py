@@ -66,17 +66,13 @@ FLOOR = 1e-6
 
 
 @dataclass(frozen=True)
-class ExactPlan:
-    """`chosen` (n_poses,): candidate indices, sorted, repeated where measured more than once.
+class ExactPlan(Exchanged):
+    """The best of several starts: no single exchange on the whole pool lowers its Φ.
 
-    `value` is Φ; no single exchange on the whole pool lowers it.  `starts` were made, each ended
-    at one of `values` (starts,) after altogether `passes` passes of exchanges.
+    A candidate is repeated where it is measured more than once.  The starts ended at `values`
+    (starts,) after altogether `passes` passes.
     """
 
-    chosen: IntArray
-    value: float
-    starts: int
-    passes: int
     values: Array
 
 
@@ -245,7 +241,7 @@ def _best(problem: DesignProblem, done: list[Exchanged]) -> ExactPlan:
     # Candidates ruled out cannot better a plan, but for what rounding leaves: looked at once more.
     final = exchange(problem, np.array(min(tied)))
     passes = sum(f.passes for f in done) + final.passes
-    return ExactPlan(final.chosen, final.value, len(done), passes, values)
+    return ExactPlan(final.chosen, final.value, passes, values)
 
 
 def repaired(problem: DesignProblem, left: IntArray) -> IntArray:
@@ -434,7 +430,7 @@ class SizedPlan:
         if "chosen" not in state:
             return None
         value = float(state["plan_value"])
-        plan = ExactPlan(state["chosen"], value, 0, 0, np.array([value]))
+        plan = ExactPlan(state["chosen"], value, 0, np.array([value]))
         relaxed = None
         if "weights" in state:
             at, bound, gap, tangent = (float(v) for v in state["relaxed"])

@@ -367,15 +367,15 @@ def schedule(
         done, thorough = thorough and not blocked, not blocked
     refuse_impossible(moves, tour, costs, blockers)
     # The bound leaves open in which order the load states come: their number alone is fixed.
-    open_cost = costs.cost - costs.changed
-    bound = tour_bound(open_cost, tour_cost(open_cost, tour)) - tour_cost(costs.apart, tour)
-    drift = None
+    way, fixed = costs.cost - costs.changed, tour_cost(costs.apart, tour)
+    drift, shortest = None, tour
     if (alias is not None or motion.load_changes) and motion.extra_time > 0:
-        tour, costs, drift = _against_drift(moves, motion, tour, costs, alias, seed, progress)
+        tour, later, drift = _against_drift(moves, motion, tour, costs, alias, seed, progress)
         if len(set(moves.visits.load.tolist())) > 1:
             # Load states may come more than once: nothing but the way itself bounds that.
-            way = costs.cost - costs.apart - costs.changed
-            bound = tour_bound(way, tour_cost(way, tour))
+            way, fixed, shortest = later.cost - later.apart - later.changed, 0.0, tour
+        costs = later
+    bound = tour_bound(way, tour_cost(way, shortest)) - fixed
     order = [(node, 0) for node in tour]
     if motion.reference_every:
         order = with_references(tour, moves, costs, motion.reference_every, paired)

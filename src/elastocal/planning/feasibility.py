@@ -440,26 +440,29 @@ class Feasibility:
     def __reduce__(self) -> tuple[Any, ...]:
         return _restored, (self._token, self.cell, self.chain, self._struck)
 
-    def check(self, q: Array, force: Array) -> PoseFeasibility:
-        """Every rule on every pose q (N, n) rad or m under a force (3,) or (N, 3) N.
+    def check(self, q: Array, force: Array, every: bool = True) -> PoseFeasibility:
+        """Every rule on every pose q (N, n) rad or m under a force (3,) or (N, 3) N; not `every`:
+        a pose that broke a rule is not looked at again.
 
         The load hangs wherever the force is not zero.  Raises InputError for joint values that
         are not finite or of another robot.
         """
         poses = self._poses(q, force)
-        broken = np.stack([rule.broken(poses) for rule in self.rules], axis=1)
-        names = tuple(rule.name for rule in self.rules)
-        return PoseFeasibility(names, broken, poses.q, poses.force)
+        broken = np.zeros((len(poses), len(self.rules)), dtype=bool)
+        left = np.arange(len(poses))
+        for k, rule in enumerate(self.rules):
+            broken[left, k] = hit = rule.broken(poses.take(left))
+            left = left if every else left[~hit]
+        return PoseFeasibility(tuple(r.name for r in self.rules), broken, poses.q, poses.force)
 
     def feasible(self, q: Array, force: Array) -> BoolArray:
-        """(N,) as check(q, force).ok, without looking at a pose again that broke a rule."""
-        poses = self._poses(q, force)
-        left = np.arange(len(poses))
-        for rule in self.rules:
-            left = left[~rule.broken(poses.take(left))]
-        ok = np.zeros(len(poses), dtype=bool)
-        ok[left] = True
-        return ok
+        """(N,) as check(q, force).ok, quicker."""
+        return self.check(q, force, every=False).ok
+
+    @property
+    def of_force(self) -> bool:
+        """Does a rule ask for more of the force than whether the load hangs?"""
+        return bool(self.cell.workspace.torque_limits)
 
     @property
     def partial(self) -> bool:

@@ -474,6 +474,7 @@ class Plan(Result):
         seen: Which markers are read of each pose in each load state (N, L, markers); None for all.
         names: Of the configurations, where poses of an earlier plan were kept.
         gain: What the plan adds to measurements done, where it does.
+        doubts: Effects and places that the model may lack and the plan counts, where it does.
         chosen: What was chosen besides the poses, where [design.choose] asks for it.
         scheduled: What effects of time and approach make of it, where the cell has some.
         timed: Numbers of poses and readings that a time allows, where one was given.
@@ -517,6 +518,7 @@ class Plan(Result):
     seen: BoolArray | None = None
     names: tuple[str, ...] = ()
     gain: Gain | None = None
+    doubts: tuple[tuple[str, str], ...] = ()
     chosen: Chosen | None = None
     timed: tuple[TimedSize, ...] = ()
     scheduled: Scheduled | None = None

@@ -248,18 +248,8 @@ IPOPT_OPTIONS: dict[str, Any] = {
 
 
 @dataclass(frozen=True)
-class PolishStep:
-    """In sweep `sweep` pose `pose` of the plan moved, and Φ fell from `before` to `after`."""
-
-    sweep: int
-    pose: int
-    before: float
-    after: float
-
-
-@dataclass(frozen=True)
 class Polished:
-    """The plan's poses q (k, n) in the order given, Φ before and after, and every step taken.
+    """The plan's poses q (k, n) in the order given, and Φ before and after.
 
     `moved` (k,) marks the poses that are no longer the candidates they were.
     """
@@ -268,7 +258,6 @@ class Polished:
     before: float
     after: float
     moved: NDArray[np.bool_]
-    steps: tuple[PolishStep, ...]
 
 
 def polish(
@@ -300,18 +289,16 @@ def polish(
     require(starts >= 0, f"polish needs a number of starts, got {starts}")
     require(sweeps >= 1, f"polish needs at least one sweep, got {sweeps}")
     plan = _Plan(problem, searches, q, load, np.asarray(chosen), starts, jobs)
-    before, steps = plan.value, []
+    before = plan.value
     for sweep in range(sweeps):
         progress(f"polishing poses, sweep {sweep + 1}: {problem.criterion.name} {plan.value:.6g}")
         at_start, shortlist = plan.value, plan.shortlist()
         for j in range(len(plan.q)):
-            old = plan.value
-            if plan.improve(j, shortlist):
-                steps.append(PolishStep(sweep, j, old, plan.value))
+            plan.improve(j, shortlist)
         if plan.value > at_start * (1 - tolerance):
             break
     moved = (plan.q != q[plan.chosen]).any(axis=1)
-    return Polished(plan.q, before, plan.value, moved, tuple(steps))
+    return Polished(plan.q, before, plan.value, moved)
 
 
 class _Plan:
@@ -350,8 +337,8 @@ class _Plan:
             best[group, load] = own[np.argsort(-d[own], kind="stable")[:SHORTLIST]]
         return best
 
-    def improve(self, j: int, shortlist: dict[tuple[int, int], IntArray]) -> bool:
-        """Move pose j if that lowers Φ; says whether it did."""
+    def improve(self, j: int, shortlist: dict[tuple[int, int], IntArray]) -> None:
+        """Move pose j if that lowers Φ."""
         group, load = self._kind(j)
         M = self.information(without=j)
         starts = np.vstack([self.q[j], self._others(M, shortlist[group, load])])
@@ -364,11 +351,10 @@ class _Plan:
         values = self.problem.criterion.after_adding(M, blocks)
         better = np.flatnonzero(values < self.value * (1 - LEAST_GAIN))
         better = better[self.searches.feasible(poses[better], load)] if len(better) else better
-        if not len(better):
-            return False
-        best = better[values[better].argmin()]
-        self.q[j], self.blocks[:, j], self.value = poses[best], blocks[:, best], float(values[best])
-        return True
+        if len(better):
+            best = better[values[better].argmin()]
+            self.q[j], self.blocks[:, j] = poses[best], blocks[:, best]
+            self.value = float(values[best])
 
     def _others(self, M: Array, shortlist: IntArray) -> Array:
         """The best candidates for a place in a plan whose rest has information M."""

@@ -26,7 +26,7 @@ from elastocal.model.effects.placements import MarkerPosition
 from elastocal.model.inverse_kinematics import Postures, inverse_kinematics
 from elastocal.model.manipulator import Model
 from elastocal.planning.bodies import data_base
-from elastocal.planning.candidates import Checker, told
+from elastocal.planning.candidates import Checker, feasible, told
 from elastocal.planning.information import Estimable, PoseInformation, why
 from elastocal.tables import NO_UNIT, Family, Layout, RawTable, read_table
 from elastocal.text import listed, quoted
@@ -310,7 +310,8 @@ def _take_allowed(
     loads = working_loads(cell)[:, None] if places.force is None else places.force[None]
     for load in loads:
         of_each = np.repeat(np.broadcast_to(load, (T, 3)), K, axis=0)
-        allowed &= np.asarray(rules.check(found.q.reshape(T * K, n), of_each).ok).reshape(T, K)
+        verdict = rules.check(found.q.reshape(T * K, n), of_each, every=False)
+        allowed &= np.asarray(verdict.ok).reshape(T, K)
     some = allowed.any(axis=1)
     q[rows[some]] = found.q[some, allowed[some].argmax(axis=1)]
     return rows[~some]
@@ -341,7 +342,8 @@ def remedy(cell: Cell) -> str:
 DEFAULT_COUNT = 100
 ELSEWHERE = 200  # postures that stand for all of the joint ranges
 APART = 1  # added to the seed: not the postures that are drawn as test poses
-DRAWN = 4096  # postures among which the default test poses are sought, where a cell has rules
+# Postures among which the default test poses are sought where a cell has rules, so many at a time.
+DRAWN, LOT = 4096, 512
 
 
 @dataclass(frozen=True)
@@ -533,11 +535,12 @@ def _drawn(
         # Elsewhere the model has no compliance for that joint.
         q[:, joint_index(cell, chain, name, "[model.compliance_levels]")] = np.resize(levels, count)
     if rules is not None:
-        loads = working_loads(cell)
-        ok = np.logical_and.reduce(
-            [rules.check(q, np.broadcast_to(f, (count, 3))).ok for f in loads]
-        )
-        q = q[ok][:most]
+        found = [q[:0]]
+        for part in np.split(q, range(LOT, count, LOT)):
+            found.append(part[feasible(rules, part, working_loads(cell))])
+            if sum(map(len, found)) >= most:
+                break
+        q = np.concatenate(found)[:most]
         if not len(q):
             raise InsufficientDataError(
                 f"{cell.path or cell.name}: the cell states no test poses, and its rules allow "

@@ -429,7 +429,8 @@ def next_lines(found: NextPoses) -> list[tuple[str, str]]:
     verdicts = {
         "measure": f"measure {n} more; then ask again with all readings in one table",
         "enough": "no further pose is needed: the required error is kept with 95 %",
-        "no_gain": f"no {n} lower the error by a hundredth: more of them do not pay; what does is "
+        "no_gain": f"no {n} lower the error by {100 * found.least_gain:g} % "
+        f"({option('least_gain')}): more of them do not pay; what does is "
         "more repeats, a better instrument, or another kind of measurement",
     }
     now = "not known yet, as the measurements leave parameters open"
