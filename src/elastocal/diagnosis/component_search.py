@@ -58,7 +58,7 @@ def search_components(
     `chosen` is what the forward search found: its searched constants are tried as they are.
     """
     full = _with_together(dataset)
-    for turn in range(1 + TWICE):
+    for weighed in (False, True):
         data = with_equal_noise(full)
         begun = replace(NoiseValues.usual(data.G.shape[2]), factor=0.3)
         instrument = (chosen.noise if data.stated else begun).of_instrument()
@@ -68,7 +68,7 @@ def search_components(
         progress(f"sizes of {len(curves) + len(others)} components at once")
         both = [*curves, *others]
         found = _swapped(full, fit_sum(data, both, instrument), both)
-        if turn == TWICE or not any(isinstance(c.effect, LinkWeights) for c in found.components):
+        if weighed or not any(isinstance(c.effect, LinkWeights) for c in found.components):
             break
         # A compliance that was fitted without weights is wrong, and so are their columns by it.
         full = about_sum(full, found)
