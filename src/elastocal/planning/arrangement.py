@@ -113,11 +113,13 @@ def ordered(
             if not unwound:
                 unwound = True
                 continue
-            if lost >= MOST_REPLACED or (chosen[error.poses] >= len(found.pool)).any():
+            gone = np.unique(chosen[error.poses])
+            others = np.delete(found.pool.group, gone[gone < len(found.pool)])
+            few = np.bincount(others, minlength=len(shares)) < shares
+            if lost >= MOST_REPLACED or (gone >= len(found.pool)).any() or few.any():
                 raise
             lost += len(error.poses)
             progress(f"{lost} poses that no free move reaches are replaced by the best others")
-            gone = np.unique(chosen[error.poses])
             stage = (checkpoint or Checkpoint()).stage(f"replaced{lost}")
             state = stage.finished(
                 partial(
