@@ -72,3 +72,12 @@ def test_a_cell_without_any_free_move_is_said_to_be_one() -> None:
     assert len(pool) > MOST_REPLACED
     with pytest.raises(Unreachable, match="cannot be reached"):
         ordered(setup, replace(found, pool=pool), SHARES, walled(-np.inf), 0, lambda text: None)
+
+
+def test_where_no_other_candidates_are_left_the_poses_are_named() -> None:
+    setup, found = selection()
+    pool = found.pool.take(found.chosen)
+    bare = replace(found, pool=pool, chosen=np.arange(6), first=6)
+    wall = np.sort(pool.q[:, 0])[4]
+    with pytest.raises(Unreachable, match=r"pose \d+ \(joints .* cannot be reached"):
+        ordered(setup, bare, SHARES, walled(wall), 0, lambda text: None)

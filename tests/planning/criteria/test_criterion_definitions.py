@@ -152,3 +152,16 @@ def test_a_target_of_low_rank_is_kept_exactly():
     M = information(blocks(rng, 2, 5))
     expected = [np.trace(c @ np.linalg.inv(m)) for c, m in zip(C, M, strict=True)]
     assert TraceCriterion(C).each(M) == pytest.approx(np.array(expected), rel=1e-10)
+
+
+def test_a_criterion_in_other_parameters_is_one_however_they_are_scaled(plan):
+    """TᵀCT, whose entries are differences of far larger numbers, must not lose its definiteness."""
+    rng = np.random.default_rng(3)
+    root = rng.normal(size=(3, P))
+    phi = TraceCriterion((root.T @ root)[None])
+    turn, M = rng.normal(size=(P, P)), plan.T @ plan
+    assert phi.turned(turn @ np.diag(10.0 ** np.linspace(-9, 9, P))) is not None
+    other = phi.turned(turn)
+    assert other is not None
+    value = float(other.value((turn.T @ M @ turn)[None]))
+    assert value == pytest.approx(float(phi.value(M[None])), rel=1e-6)
