@@ -76,8 +76,8 @@ class SumAnswer:
     @cached_property
     def _spans(self) -> tuple[slice, ...]:
         """Of the components' coefficients and the hidden ones', the fitted columns not counted."""
-        every = (*self.found.components, *self.hidden)
-        return spans_of(every, sum(c.width for c in every))
+        widths = [c.width for c in (*self.found.components, *self.hidden)]
+        return spans_of(widths, sum(widths))
 
     @cached_property
     def _own(self) -> int:

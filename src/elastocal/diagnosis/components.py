@@ -82,11 +82,6 @@ class Component:
     fellows: int = 1
 
     @property
-    def label(self) -> str:
-        follows = f" following {self.follows}" if self.follows else ""
-        return f"{self.effect.name} at {self.where}{follows}"
-
-    @property
     def named(self) -> bool:
         return not isinstance(self.effect, ResidualField)
 
@@ -243,7 +238,7 @@ class SumOfComponents:
 
     @cached_property
     def spans(self) -> tuple[slice, ...]:
-        return spans_of(self.components, len(self.weighted.z))
+        return spans_of([c.width for c in self.components], len(self.weighted.z))
 
     def scaled(self, factor: float) -> SumOfComponents:
         """The same under e^factor times the noise."""
@@ -357,9 +352,9 @@ def posed(
 
     What a sum that is `known` of the same data has summed up under this noise is not summed anew.
     """
-    own, p = Weighted.of(data, noise), data.X.shape[2]
-    total = p + sum(c.width for c in components)
-    spans = spans_of(components, total)
+    own, p, widths = Weighted.of(data, noise), data.X.shape[2], [c.width for c in components]
+    total = p + sum(widths)
+    spans = spans_of(widths, total)
     old = {} if known is None or known.noise is not noise else dict(
         zip(map(id, known.components), known.spans, strict=True)
     )  # fmt: skip

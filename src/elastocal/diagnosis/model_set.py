@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property
-from typing import Protocol
+from itertools import pairwise
 
 import numpy as np
 from scipy.special import log_ndtr, logsumexp
@@ -45,10 +45,6 @@ class Item:
     @property
     def known(self) -> bool:
         return self.what.known
-
-    @property
-    def label(self) -> str:
-        return self.what.label
 
     @property
     def key(self) -> tuple[str, str]:
@@ -93,25 +89,16 @@ class ModelSet:
     @property
     def spans(self) -> tuple[slice, ...]:
         """Where each item's coefficients stand among those of the data, last of all."""
-        return spans_of(self.items, self.data.X.shape[2])
+        return spans_of([item.width for item in self.items], self.data.X.shape[2])
 
     def without(self, k: int) -> tuple[Item, ...]:
         return self.items[:k] + self.items[k + 1 :]
 
 
-class HasWidth(Protocol):
-    """Something with columns, `width` of them."""
-
-    @property
-    def width(self) -> int: ...
-
-
-def spans_of(items: Sequence[HasWidth], total: int) -> tuple[slice, ...]:
-    """Where the coefficients of `items` stand, the last of `total`."""
-    ends = total - sum(item.width for item in items) + np.cumsum([i.width for i in items])
-    return tuple(
-        slice(int(end) - item.width, int(end)) for item, end in zip(items, ends, strict=True)
-    )
+def spans_of(widths: Sequence[int], total: int) -> tuple[slice, ...]:
+    """Where groups of so many coefficients each stand, the last of `total`."""
+    ends = np.cumsum([total - sum(widths), *widths]).tolist()
+    return tuple(slice(*pair) for pair in pairwise(ends))
 
 
 def packed_columns(dataset: DiagnosisData, item: Item) -> Array:
@@ -162,9 +149,10 @@ def _within_bounds(items: tuple[Item, ...], at: Projection) -> float:
     A compliance's size prior is one half of the Gaussian; the evidence gains or loses by the
     posterior's share of that half, each parameter taken by itself.
     """
+    spans = spans_of([item.width for item in items], len(at.beta))
     bounded = [
         (span.start + k)
-        for item, span in zip(items, spans_of(items, len(at.beta)), strict=True)
+        for item, span in zip(items, spans, strict=True)
         if isinstance(item.what, Hypothesis)
         for k, p in enumerate(item.what.parameters)
         if p.lower == p.nominal

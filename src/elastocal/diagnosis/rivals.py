@@ -83,7 +83,7 @@ class RivalSet:
 
 def name_of(item: Item) -> str:
     """ "gear_eccentricity:joint2", or a block's label."""
-    return ":".join(item.key) if item.known else item.label
+    return ":".join(item.key) if item.known else item.what.label
 
 
 def _depends(what: Hypothesis | Generic, column: str) -> bool:
