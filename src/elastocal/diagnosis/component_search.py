@@ -113,7 +113,8 @@ def about_sum(dataset: DiagnosisData, found: FittedSum) -> DiagnosisData:
 
     Not about a fit of these alone: a compliance that little else holds, and the moment that
     deflects its joint, would take up what the other components explain, and the product of both
-    stand in the columns.
+    stand in the columns.  Nor do weights stand in the columns of the compliances: twice as soft an
+    arm under half the load would look like one that bends by its weight.
     """
     base, beta = dataset.base, project(found.data, found.noise).beta
     x = dict(zip(base.model.names, base.x - from_centre(base), strict=True))
@@ -131,7 +132,8 @@ def about_sum(dataset: DiagnosisData, found: FittedSum) -> DiagnosisData:
     at_sum = np.array([x[name] for name in model.names])
     readings = base.observed
     residual = readings.value - model.predict(readings.table, at_sum, readings)
-    return about(dataset, replace(base, model=model, x=at_sum, residual=residual), weights)
+    at = replace(base, model=model, x=at_sum, residual=residual)
+    return about(dataset, at, weights, apart=True)
 
 
 def _first(components: Sequence[Component]) -> list[Component]:

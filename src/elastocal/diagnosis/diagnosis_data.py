@@ -217,11 +217,13 @@ def diagnosis_data_of(
     hypotheses: list[Hypothesis],
     around: Model | None = None,
     x: Array | None = None,
+    apart: bool = False,
 ) -> DiagnosisData:
     """Compute all columns at the baseline's fit and gather them by configuration.
 
     `around` is the base's model with some of the hypotheses in it, at its values x: columns are
-    those there, and the residual is the baseline's.
+    those there, and the residual is the baseline's.  `apart`: those of the base's own parameters
+    are without the hypotheses.
     """
     model, observed, blocks = base.model, base.observed, base.blocks
     loads = _load_hypotheses(base)
@@ -230,6 +232,8 @@ def diagnosis_data_of(
     if around is None or x is None:
         around, x = model, base.x
     columns = compute_columns(base, asked, dict(zip(around.names, x, strict=True)))
+    if apart:
+        around, x = model, base.x
     own = np.array([around.names.index(name) for name in model.names], dtype=np.int64)
     at = around.regressor(observed.table, x, own, observed)
     width = prior_deviations(base)

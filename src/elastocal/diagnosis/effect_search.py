@@ -92,15 +92,17 @@ def relinearised(dataset: DiagnosisData, chosen: ModelSet) -> DiagnosisData:
     return about(dataset, fitted, [i.what for i in items if isinstance(i.what, Hypothesis)])
 
 
-def about(dataset: DiagnosisData, fitted: Baseline, added: Sequence[Hypothesis]) -> DiagnosisData:
+def about(
+    dataset: DiagnosisData, fitted: Baseline, added: Sequence[Hypothesis], apart: bool = False
+) -> DiagnosisData:
     """The data about a fit of the model with some of the hypotheses in it, what these explain put
-    back."""
+    back; `apart`: what they are to the model's own parameters is not in the columns of these."""
     base, model = dataset.base, fitted.model
     x = dict(zip(model.names, fitted.x, strict=True))
     moved = replace(
         base, x=np.array([x[name] for name in base.model.names]), residual=fitted.residual
     )
-    about_fit = diagnosis_data_of(moved, list(dataset.hypotheses), model, fitted.x)
+    about_fit = diagnosis_data_of(moved, list(dataset.hypotheses), model, fitted.x, apart)
     # Put back by the data's own columns, which will have to explain it: those of the equilibrium
     # differ from them by a thousandth, and a large effect is a thousand deviations.
     back = np.zeros((*fitted.residual.reshape(-1, base.observed.size).shape, 1))
