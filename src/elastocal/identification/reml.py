@@ -429,10 +429,13 @@ class _VarianceSearch:
         if not free.any():
             return score, step
         inside = np.ix_(free, free)
-        try:
-            step[free] = _solve((expected + curvature)[inside], score[free])
-        except np.linalg.LinAlgError:
-            step[free] = _solve(expected[inside], score[free])
+        # Variances of which rounding leaves no information together are stepped one by one.
+        for H in (expected + curvature, expected, np.diag(np.diag(expected))):
+            try:
+                step[free] = _solve(H[inside], score[free])
+                break
+            except np.linalg.LinAlgError:
+                continue
         return score, step
 
     def moved(self, theta: Array, step: Array) -> Array:
