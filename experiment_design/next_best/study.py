@@ -96,7 +96,7 @@ class TrueArm:
             self.effect = kinds[rng.integers(len(kinds))]
             self.where = str(rng.choice([w for name, w in places if name == self.effect]))
             q = feasible(100, 0)
-            self.model, known = in_doubt(
+            self.model, known, _ = in_doubt(
                 own, Known(), load_states(own.cell), q, np.full(len(q), ALL_LOADS),
                 {(self.effect, self.where): 1.0},
             )  # fmt: skip
