@@ -12,10 +12,11 @@ from elastocal.cell.arm_description import CartesianNoise, Nominal, Tracker
 from elastocal.errors import InputError
 from elastocal.identification import GaussianPrior, Options, non_negative
 from elastocal.identification.identify import identify
+from elastocal.identification.smooth_part import SmoothPart
 from elastocal.measurements import Measurements
 from elastocal.model import Model
 from elastocal.model.observations import observe, subset
-from elastocal.model.smooth_groups import smooth_groups
+from elastocal.model.smooth_groups import SmoothGroup, smooth_groups
 from elastocal.units import Array
 
 SIGMA = 2e-5  # m
@@ -334,3 +335,14 @@ def test_a_field_that_follows_time_needs_it_and_is_of_one_campaign():
     )
     units = [entry["unit"] for entry in fit.to_json()["smooth"]]
     assert units == ["m", "rad"]
+
+
+def test_the_size_of_lines_is_the_root_of_their_sum_of_squares() -> None:
+    """They are no function of one quantity whose mean square could be taken."""
+    value, sd = np.array([[3e-5, -4e-5, 1e-6, 0.0]]), 1e-7
+    columns, nan = np.arange(4)[None], np.nan
+    group = SmoothGroup("gear_spectrum", "joint1", "", columns, ("rad",), 5e-5, nan, nan, nan, None)
+    part = SmoothPart(group, 1.0, 4.0, value, np.eye(4) * sd**2, np.zeros(0))
+    size, (low, high), half = part.sizes["rad"]
+    assert size == pytest.approx(np.linalg.norm(value), rel=1e-2) and low < size < high
+    assert half == pytest.approx(1.96 * 2 * sd, rel=1e-2)

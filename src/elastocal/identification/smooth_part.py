@@ -112,7 +112,7 @@ class SmoothPart:
             total, spread = np.zeros(DRAWS), 0.0
             for c, m in zip(own, mean, strict=True):
                 drawn = rng.normal(size=(DRAWS, k)) @ _root(self._block(c, k)).T @ waves.T
-                total += ((m + drawn) ** 2).mean(axis=1) * (len(m) if basis is None else 1)
+                total += ((m + drawn) ** 2).mean(axis=1)
                 spread += float(((waves @ self._block(c, k)) * waves).sum(axis=1).mean())
             rms = np.sqrt(total / (1 if basis is None else len(own)))
             low, high = np.quantile(rms, [(1 - LEVEL) / 2, (1 + LEVEL) / 2])
