@@ -115,6 +115,17 @@ def test_the_reader_is_told_that_the_law_is_open(doubt_of_it: float, told: bool)
         assert bool(texts) == expected
 
 
+def test_the_scatter_that_is_told_is_that_of_the_answer() -> None:
+    """A sum may explain what the forward search took for noise, and the other way round."""
+    one = dataset("load")
+    plain, nothing = fit_set(one, ()), None
+    found = SelectedEffects(one, plain, (), (), plain, nothing, nothing)  # type: ignore[arg-type]
+    screened = OutlierScreening(one.data.faulty, one.data.faulty)
+    for factor in (1.0, 3.0):
+        told = warnings(one, found, screened, replace(plain.noise, factor=factor))
+        assert any("scatter 3 times" in t for t in told) == (factor == 3.0)
+
+
 def test_play_by_either_law_may_be_true_at_fresh_poses() -> None:
     """As probable as each model is; nothing else is drawn under another."""
     told = replace(with_likelier_backlash_model(dataset("load")), other_backlash=0.3)

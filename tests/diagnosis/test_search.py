@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from dataclasses import replace
 from functools import lru_cache
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
@@ -30,6 +31,7 @@ from elastocal.diagnosis import (
     project,
     scan,
 )
+from elastocal.diagnosis.diagnose import chance_of_noise
 from elastocal.diagnosis.diagnosis import SMALLEST_P
 from elastocal.diagnosis.effect_search import FLIPS
 
@@ -166,6 +168,18 @@ def test_priors_share_out_what_is_not_nothing() -> None:
     for h, share in zip(dataset.hypotheses, prior, strict=False):
         each[h.name] += share
     assert list(each.values()) == pytest.approx([0.95 / len(TRIED)] * len(TRIED))
+
+
+def test_a_sum_has_a_p_of_its_own() -> None:
+    """The forward search may have found nothing where many causes explain the gap together."""
+    slot = Slot((item(*BEND),), np.array([-1.0]))
+    scanned = SimpleNamespace(flipped=np.zeros(FLIPS), odds=-1.0)
+    found = SelectedEffects(empty(), None, (slot,), (), None, scanned, scanned)  # type: ignore
+    p, nothing = chance_of_noise(found, 0.0)
+    assert p == 1.0 and nothing == pytest.approx(1 / (1 + np.exp(-1.0)))
+    p, nothing = chance_of_noise(found, 5.0)
+    assert (p, nothing) == pytest.approx((np.exp(-5.0), 1 / (1 + np.exp(5.0))))
+    assert chance_of_noise(found, 50.0)[0] == SMALLEST_P
 
 
 def test_a_slots_probabilities_and_nothings_sum_to_one() -> None:

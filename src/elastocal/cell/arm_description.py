@@ -367,11 +367,14 @@ class Nominal:
         self, place: str, settings: Mapping[str, float], sizes: Mapping[str, float] = {}
     ) -> Nominal:
         """The same with these constants, and sizes, of the effects at a place."""
-        both = (self.settings, settings), (self.sizes, sizes)
-        merged = (
-            known | ({place: {**known.get(place, {}), **new}} if new else {}) for known, new in both
-        )
-        return replace(self, **dict(zip(("settings", "sizes"), merged, strict=True)))
+
+        def merged(
+            known: dict[str, dict[str, float]], new: Mapping[str, float]
+        ) -> dict[str, dict[str, float]]:
+            return {**known, place: {**known.get(place, {}), **new}} if new else known
+
+        both = merged(self.settings, settings), merged(self.sizes, sizes)
+        return replace(self, settings=both[0], sizes=both[1])
 
 
 @record

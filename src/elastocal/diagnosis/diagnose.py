@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 import os
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, replace
@@ -240,13 +241,7 @@ def diagnose(
         answers = _of_few(answer_of_sum, dataset, found, judged, tests)
     there = {(f.effect, f.where) for f in answers["effects"]} if many else ()
     small = [u for u in too_small(dataset, found) if (u.effect, u.where) not in there]
-    p = found.p_values[0] if found.p_values else exceedance(found.first.flipped, found.first.odds)
-    nothing = found.slots[0].probabilities()[1]
-    if many:
-        # The flips are of the forward search.  Of a sum, noise alone yields e nats with a chance of
-        # exp(−e) at most (Markov's inequality).
-        p = max(min(p, float(np.exp(none - score))), SMALLEST_P)
-        nothing = min(nothing, float(expit(none - score)))
+    p, nothing = chance_of_noise(found, score - none if many else 0.0)
     beside = answer_of_sum.found if many else found.chosen
     return Diagnosis(
         **answers,
@@ -263,6 +258,19 @@ def diagnose(
         data=source,
         calibrated=base,
     )
+
+
+def chance_of_noise(found: SelectedEffects, nats: float) -> tuple[float, float]:
+    """p of what was found, and the probability that it is nothing.
+
+    By the flips of the forward search; of a sum that is so many `nats` more probable than nothing,
+    noise alone yields as much with a chance of exp(−nats) at most (Markov's inequality).
+    """
+    p = found.p_values[0] if found.p_values else exceedance(found.first.flipped, found.first.odds)
+    nothing = found.slots[0].probabilities()[1]
+    if nats <= 0:
+        return p, nothing
+    return max(min(p, math.exp(-nats)), SMALLEST_P), min(nothing, float(expit(-nats)))
 
 
 # Nats by which a sum of components must be more probable than what the forward search found.
