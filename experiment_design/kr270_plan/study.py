@@ -16,7 +16,7 @@ from campaigns import realised
 from compared import Study, table_2
 
 from elastocal.planning import Plan, plan_rows, write_plan
-from elastocal.report.plan_picture import write_plan_picture
+from elastocal.report.arm_view import write_plan_picture
 
 HERE = Path(__file__).parent
 
@@ -107,10 +107,7 @@ def _keep(study: Study, plan: Plan, name: str) -> None:
     chain = plan.model.chain
     rows = plan_rows(plan.execution, plan.configurations, plan.group + 1, plan.stated_forces)
     write_plan(HERE / f"plan_{name}.csv", rows, chain.kinds)
-    write_plan_picture(
-        HERE / f"poses_{name}.png", plan.model.cell, chain, plan.q,
-        names=plan.configurations, group=plan.group, group_names=plan.group_names,
-    )  # fmt: skip
+    write_plan_picture(HERE / f"poses_{name}.png", plan)
 
 
 if __name__ == "__main__":

@@ -1,9 +1,9 @@
 """The picture of poses: what is drawn is where the arm stands."""
 
-import re
 import warnings
 import xml.etree.ElementTree as ET
 from dataclasses import replace
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
@@ -13,7 +13,7 @@ from support.cells import TABLE_2, kr270_cell, kr270_chain, nominal_flanges, ran
 from elastocal.cell.arm_description import Nominal, Tracker
 from elastocal.cell.workspace_rules import HalfSpace, Solid, Workspace
 from elastocal.errors import InputError
-from elastocal.report.plan_picture import draw_plan, wireframe, write_plan_picture
+from elastocal.report.arm_view import plan_figure, write_plan_picture
 
 PLACED = np.eye(4)
 PLACED[:3, :3] = Rotation.from_rotvec([0.3, -0.5, 0.8]).as_matrix()
@@ -38,84 +38,61 @@ def cell():
     return replace(cell, workspace=workspace, tracker=Tracker(np.array([4.0, 1.0, 1.2])))
 
 
-def options(q):
-    level = np.array([int(np.argmin(np.abs(np.subtract(LEVELS, v)))) for v in q[:, 1]])
-    return {
-        "names": [str(i + 1) for i in range(len(q))],
-        "group": level,
-        "group_names": [f"q2 = {np.degrees(v):.2f}°" for v in LEVELS],
-    }
+def plan_at(cell, q, group, group_names, names=None):
+    """What a picture takes of a plan."""
+    stops = [SimpleNamespace(pose=k, again=0) for k in range(len(q))]
+    return SimpleNamespace(
+        model=SimpleNamespace(cell=cell, chain=kr270_chain()), q=q, group=np.asarray(group),
+        group_names=tuple(group_names), configurations=names or [str(i + 1) for i in range(len(q))],
+        level_joint=1, execution=SimpleNamespace(stops=stops),
+    )  # fmt: skip
 
 
-def distance(solid, points):
-    """Signed distance of points (k, 3) from the solid's surface, by its definition."""
-    p = (points - solid.placement[:3, 3]) @ solid.placement[:3, :3]
-    if solid.shape == "box":
-        return np.abs(np.abs(p) - solid.size / 2).min(axis=1) + np.maximum(
-            np.abs(p) - solid.size / 2, 0
-        ).max(axis=1)
-    if solid.shape == "sphere":
-        return np.linalg.norm(p, axis=1) - solid.size[0]
-    along = np.clip(p[:, 2], -solid.size[1] / 2, solid.size[1] / 2)
-    if solid.shape == "capsule":
-        return np.linalg.norm(p - np.outer(along, [0, 0, 1]), axis=1) - solid.size[0]
-    return np.linalg.norm(p[:, :2], axis=1) - solid.size[0] + np.abs(p[:, 2] - along)
+def of_table_2(cell):
+    level = [int(np.argmin(np.abs(np.subtract(LEVELS, v)))) for v in TABLE_2[:, 1]]
+    return plan_at(cell, TABLE_2, level, [f"q2 = {np.degrees(v):.2f}°" for v in LEVELS])
 
 
-@pytest.mark.parametrize("solid", SOLIDS, ids=lambda s: s.shape)
-def test_every_line_of_a_wireframe_lies_on_the_surface_and_spans_it(solid):
-    lines = np.concatenate(wireframe(solid))
-    assert np.allclose(distance(solid, lines), 0, atol=1e-12)
-    local = (lines - solid.placement[:3, 3]) @ solid.placement[:3, :3]
-    full = {"box": solid.size / 2, "sphere": np.repeat(solid.size, 3)}.get(solid.shape)
-    if full is None:
-        cap = solid.size[0] if solid.shape == "capsule" else 0.0
-        full = np.array([solid.size[0], solid.size[0], solid.size[1] / 2 + cap])
-    assert np.allclose(local.max(axis=0), full) and np.allclose(local.min(axis=0), -full)
-
-
-def test_a_box_has_its_twelve_edges():
-    edges = wireframe(SOLIDS[0])
-    lengths = [float(np.linalg.norm(a - b)) for a, b in edges]
-    assert np.allclose(sorted(lengths), sorted([0.5, 0.8, 1.2] * 4))
+def tips(axes):
+    return [line for line in axes.lines if str(line.get_label()).startswith(("q2", "g"))]
 
 
 def test_flanges_are_drawn_where_the_model_puts_them_in_every_view(cell):
-    chain = kr270_chain()
-    figure = draw_plan(cell, chain, TABLE_2, **options(TABLE_2))
+    figure = plan_figure(of_table_2(cell))
     T = np.eye(4)
     T[:3, :3], T[:3, 3] = cell.model.nominal.base_rotation, cell.model.nominal.base_position
-    expected = (T @ nominal_flanges(chain, TABLE_2))[:, :3, 3]
-    space, top, side = figure.axes
+    expected = (T @ nominal_flanges(kr270_chain(), TABLE_2))[:, :3, 3]
+    _, top, side = figure.axes
     for axes, pick in ((top, [0, 1]), (side, [0, 2])):
-        tips = [line for line in axes.lines if re.match("q2", str(line.get_label()))]
-        drawn = np.concatenate([line.get_xydata() for line in tips])
-        assert len(tips) == 5 and np.allclose(drawn, expected[:, pick])
-    tips = [line for line in space.lines if re.match("q2", str(line.get_label()))]
-    drawn = np.concatenate([np.array(line.get_data_3d()).T for line in tips])
-    assert np.allclose(drawn, expected)
-    assert {t.get_text() for t in top.texts} >= set(NAMES)
+        drawn = np.concatenate([line.get_xydata() for line in tips(axes)])
+        order = np.argsort([LEVELS.index(v) for v in TABLE_2[:, 1]], kind="stable")
+        assert len(tips(axes)) == len(LEVELS) and np.allclose(drawn, expected[order][:, pick])
+    told = {t.get_text() for t in top.texts}
+    assert told >= {*NAMES, *(solid.name for solid in SOLIDS), "tracker"}
+    (legend,) = figure.legends
+    assert [t.get_text() for t in legend.get_texts()] == [line.get_label() for line in tips(top)]
+
+
+def test_a_floor_is_a_line_in_the_view_in_which_it_stands_upright(cell):
+    _, top, side = plan_figure(of_table_2(cell)).axes
+    dashed = [[line for line in axes.lines if line.get_linestyle() == "--"] for axes in (top, side)]
+    assert list(map(len, dashed)) == [0, 1]
 
 
 def test_groups_differ_in_colour_and_sign_even_when_there_are_many(cell):
     q = random_poses(kr270_chain(), 20, 0)
-    figure = draw_plan(cell, kr270_chain(), q, names=[""] * 20, group=np.arange(20),
-                       group_names=[f"g{k}" for k in range(20)])  # fmt: skip
-    marks = {
-        (line.get_color(), line.get_marker())
-        for line in figure.axes[1].lines
-        if str(line.get_label()).startswith("g")
-    }
+    figure = plan_figure(plan_at(cell, q, np.arange(20), [f"g{k}" for k in range(20)]))
+    marks = {(line.get_color(), line.get_marker()) for line in tips(figure.axes[1])}
     assert len(marks) == 20
 
 
 def test_names_from_files_are_not_formulas_and_sixty_poses_are_drawn(cell, tmp_path):
     q = random_poses(kr270_chain(), 60, 0)
+    names = [f'${i}_<&"' for i in range(60)]
     with warnings.catch_warnings():
         warnings.simplefilter("error")
-        write_plan_picture(tmp_path / "plan.svg", cell, kr270_chain(), q,
-                           names=[f"${i}_<&\"" for i in range(60)], group=np.zeros(60, int),
-                           group_names=["no load $x^$"])  # fmt: skip
+        plan = plan_at(cell, q, np.zeros(60, int), ["no load $x^$"], names)
+        write_plan_picture(tmp_path / "plan.svg", plan)
     ET.parse(tmp_path / "plan.svg")
 
 
@@ -123,7 +100,7 @@ def test_names_from_files_are_not_formulas_and_sixty_poses_are_drawn(cell, tmp_p
 def test_the_same_plan_gives_the_same_file(cell, tmp_path, suffix):
     files = [tmp_path / f"{k}{suffix}" for k in range(2)]
     for file in files:
-        write_plan_picture(file, cell, kr270_chain(), TABLE_2, **options(TABLE_2))
+        write_plan_picture(file, of_table_2(cell))
     content = [file.read_bytes() for file in files]
     assert content[0] == content[1]
     assert content[0].startswith({".png": b"\x89PNG", ".svg": b"<?xml"}[suffix])
@@ -131,5 +108,5 @@ def test_the_same_plan_gives_the_same_file(cell, tmp_path, suffix):
 
 def test_other_formats_are_refused(cell, tmp_path):
     with pytest.raises(InputError, match=r"\.png or \.svg"):
-        write_plan_picture(tmp_path / "plan.pdf", cell, kr270_chain(), TABLE_2, **options(TABLE_2))
+        write_plan_picture(tmp_path / "plan.pdf", of_table_2(cell))
     assert not list(tmp_path.iterdir())

@@ -14,7 +14,7 @@ from elastocal.cell.plan_wishes import DesignSpec
 from elastocal.planning import Certificate, DesignOptions, PlanSize
 from elastocal.planning.design import design
 from elastocal.report.plan_view import plan_lines, served
-from elastocal.report.terminal import PRINTED_WIDTH, plan_text, print_plan
+from elastocal.report.terminal import PRINTED_WIDTH, print_plan, printed_text
 
 LOADS = np.array([[0, 0, 0], [0, 0, -2600.0]])
 
@@ -118,7 +118,7 @@ def test_loads_curve_sums_and_warnings_fit_too(plan, width):
 
 def test_print_of_a_plan_is_what_the_terminal_shows(plan):
     text = str(plan)
-    assert text == plan_text(plan)
+    assert text == printed_text(print_plan, plan)
     joined = " ".join(text.split())
     for label, sentence in plan_lines(plan):
         assert f"{label}: {sentence}" in joined

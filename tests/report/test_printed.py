@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import re
 from dataclasses import replace
+from functools import partial
 from typing import Any
 
 import numpy as np
@@ -12,12 +13,12 @@ from support.diagnoses import VERDICTS
 
 from elastocal.identification import judged
 from elastocal.report.judgement_view import judgement
-from elastocal.report.terminal import PRINTED_WIDTH, diagnosis_text, identification_text
+from elastocal.report.terminal import PRINTED_WIDTH, print_diagnosis, print_result, printed_text
 
 
 def test_an_identification_prints_its_parameters_and_what_they_are_worth(case: Any) -> None:
     text = str(case.result)
-    assert text == identification_text(case.result)
+    assert text == printed_text(partial(print_result, details=True), case.result)
     for e in case.result.estimates:
         assert e.name in text
     assert judgement(case.result).headline in " ".join(text.split())
@@ -46,7 +47,7 @@ def test_digits_go_with_the_uncertainty(case: Any) -> None:
 @pytest.mark.parametrize("name", VERDICTS)
 def test_a_diagnosis_prints_verdict_budget_and_candidates(name: str) -> None:
     text = str(VERDICTS[name])
-    assert text == diagnosis_text(VERDICTS[name])
+    assert text == printed_text(print_diagnosis, VERDICTS[name])
     assert text.startswith("Verdict: ")
     for head in ("Gap budget", "Candidates", "Noise: "):
         assert head in text

@@ -313,12 +313,9 @@ def _write_all(plan: Plan, output: Path, programs: list[Path], picture: Path | N
         check_program(text, list(steps_of(plan.execution, plan.configurations, plan.forces)))
         atomic_write_text(path, text)
     if picture is not None:
-        from elastocal.report.plan_picture import write_plan_picture
+        from elastocal.report.arm_view import write_plan_picture
 
-        write_plan_picture(
-            picture, plan.model.cell, chain, plan.q,
-            names=plan.configurations, group=plan.group, group_names=plan.group_names,
-        )  # fmt: skip
+        write_plan_picture(picture, plan)
 
 
 def _program(

@@ -65,7 +65,7 @@ def effects(
     from rich.padding import Padding
 
     from elastocal import demo
-    from elastocal.report.effects_view import effect_entries, effect_lines
+    from elastocal.report.effect_names import effect_entries, effect_lines
 
     entries = effect_entries(cell or Path(demo.__file__).parent / "cell.toml")
     if as_json:

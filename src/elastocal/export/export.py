@@ -1,13 +1,14 @@
 """A calibrated arm written in one of the formats, read back, and with what that costs.
 
-The formats of geometry have rooms of their own; the parameters as YAML or JSON are written here.
+The formats of geometry have rooms of their own; the parameters as YAML or JSON and the smooth
+functions are written here.
 """
 
 from __future__ import annotations
 
 import json
 import tempfile
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
 from dataclasses import dataclass, field
 from functools import partial
 from pathlib import Path
@@ -17,7 +18,6 @@ import casadi as ca
 import numpy as np
 
 from elastocal.errors import ElastocalError, InputError, option
-from elastocal.export.corrections import corrections_csv
 from elastocal.export.dh_table import CONVENTIONS, FORMULA, dh_csv, dh_lines, without_beta
 from elastocal.export.exportable import (
     Cost,
@@ -33,11 +33,14 @@ from elastocal.export.mjcf_file import RIGID, MujocoRest, calibrated_mjcf
 from elastocal.export.mjcf_in_place import NotInPlace, corrected_mjcf, held_arm
 from elastocal.export.urdf_file import BASE, FLANGE, Frames, calibrated_urdf, new_urdf
 from elastocal.files import atomic_write_text
+from elastocal.identification.covariance import t_quantile
 from elastocal.model.calibrated import CalibratedArm
 from elastocal.model.chain import Chain
 from elastocal.model.effects import effect_of
 from elastocal.model.rigid import nominal_flange
+from elastocal.model.smooth_groups import SmoothGroup, smooth_groups
 from elastocal.model.valued import Conditions, Valued, random_table
+from elastocal.tables import csv_text
 from elastocal.text import did_you_mean, json_text, plain
 from elastocal.units import Array
 
@@ -185,6 +188,72 @@ def _placed(T: Array) -> dict[str, list[float]]:
         "xyz_m": [float(v) + 0.0 for v in T[:3, 3]],
         "rpy_rad": [v + 0.0 for v in rpy(T[:3, :3])],
     }
+
+
+# Smooth functions as a table: what no format of geometry holds, for controllers of one's own.
+
+CORRECTIONS_HEADER = (
+    "effect", "where", "follows", "position_deg", "time_s", "component", "unit", "value", "half95",
+)  # fmt: skip
+LEVEL = 0.95
+PER_LENGTH = 10  # rows for each correlation length
+FEWEST, MOST = 21, 5001
+MICRO = {"rad": "urad", "m": "um"}
+
+
+def corrections_csv(calibrated: CalibratedArm, note: str) -> str:
+    """Every smooth function over its range, with the half width of its 95 % band.
+
+    A row says by how much (urad or um) the place has moved beyond its commanded or identified
+    position: of a joint its angle, of a link its end frame along and about its axes (components 1
+    to 6), of the base along and about the data's axes, of a marker its position in the flange
+    frame.  `position_deg` or `time_s` is what it follows.  A line that begins with # says where
+    the numbers come from.
+
+    Raises InputError where the arm has no such function.
+    """
+    rows = [
+        row
+        for group in smooth_groups(calibrated.model)
+        for row in _correction_rows(calibrated, group)
+    ]
+    if not rows:
+        raise InputError(
+            f"{calibrated.source}: this arm has no smooth function to be written as corrections; "
+            "elastocal diagnose finds those that the readings show"
+        )
+    return csv_text(CORRECTIONS_HEADER, rows, [note])
+
+
+def _correction_rows(calibrated: CalibratedArm, group: SmoothGroup) -> Iterator[tuple[str, ...]]:
+    names, place = calibrated.model.names, {n: k for k, n in enumerate(calibrated.determined)}
+    if group.basis is None or not any(names[c] in place for c in group.columns.ravel()):
+        return
+    steps = int(np.ceil((group.high - group.low) / group.length * PER_LENGTH))
+    x = group.grid(min(max(steps + 1, FEWEST), MOST))
+    waves = group.basis(x)
+    quantile = float(t_quantile(LEVEL, np.array(np.inf)))
+    for component, (columns, unit) in enumerate(zip(group.columns, group.units, strict=True)):
+        value = waves @ calibrated.x[columns]
+        known = np.array([names[c] in place for c in columns])
+        at = [place[names[c]] for c in columns[known]]
+        own = waves[:, known]
+        variance = np.einsum("nk,kl,nl->n", own, calibrated.covariance[np.ix_(at, at)], own)
+        half = quantile * np.sqrt(np.maximum(variance, 0.0))
+        for position, moved, width in zip(x, value, half, strict=True):
+            yield (
+                group.effect, group.where, group.follows, *_position(group, position),
+                str(component + 1), MICRO.get(unit, unit), _micro(moved), _micro(width),
+            )  # fmt: skip
+
+
+def _position(group: SmoothGroup, x: float) -> tuple[str, str]:
+    return (f"{np.degrees(x):.4f}", "") if group.lasting else ("", f"{x:.1f}")
+
+
+def _micro(value: float) -> str:
+    """In µm or µrad, to a thousandth of one."""
+    return f"{value * 1e6 + 0.0:.3f}"
 
 
 # Which format a file is written in: by its ending, or as asked for.

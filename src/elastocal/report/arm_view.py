@@ -4,14 +4,17 @@ from __future__ import annotations
 
 import json
 from collections.abc import Sequence
-from dataclasses import dataclass
-from typing import TYPE_CHECKING
+from dataclasses import dataclass, replace
+from io import BytesIO
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
 from elastocal.cell.work_cell import Cell
-from elastocal.cell.workspace_rules import Solid
-from elastocal.errors import ElastocalError
+from elastocal.cell.workspace_rules import HalfSpace, Solid
+from elastocal.errors import ElastocalError, require
+from elastocal.files import atomic_write_bytes
 from elastocal.model.chain import Chain
 from elastocal.model.manipulator import Model
 from elastocal.model.observations import Observations
@@ -26,7 +29,7 @@ from elastocal.planning.bodies import (
 )
 from elastocal.planning.collision import Kinematics
 from elastocal.planning.plan import Plan
-from elastocal.report.figures import ARM, FAINT, INK, SERIES, drawn
+from elastocal.report.figures import ARM, FAINT, INK, SERIES, as_figures, drawn, style
 from elastocal.report.formatting import joint_heads, joint_texts, length, short_name
 from elastocal.report.plan_view import first_stops
 from elastocal.text import printable
@@ -55,14 +58,16 @@ class Shell:
     points: Array
     faces: IntArray
     carrier: int
+    name: str = ""
 
 
 @dataclass(frozen=True)
 class Shells:
-    """What is drawn of a cell: the arm with what it carries, what stands around it, and how."""
+    """What is drawn of a cell: the arm with what it carries, and how; what stands around it."""
 
     arm: tuple[Shell, ...]
     around: tuple[Shell, ...]
+    walls: tuple[HalfSpace, ...]
     drawn_from: str
 
 
@@ -78,6 +83,7 @@ def shells_of(cell: Cell, chain: Chain) -> Shells:
     return Shells(
         (*arm, *_shells([(b.solid, b.carrier) for b in carried])),
         _shells([(b.solid, b.carrier) for b in around]),
+        cell.workspace.keep_out,
         drawn_from,
     )
 
@@ -109,7 +115,7 @@ def _shells(solids: Sequence[tuple[Solid, int]]) -> tuple[Shell, ...]:
     found = []
     for solid, carrier in solids:
         try:
-            found.append(Shell(*triangles_of(solid), carrier))
+            found.append(Shell(*triangles_of(solid), carrier, solid.name))
         except ElastocalError:
             continue  # an unreadable mesh: the others are still worth drawing
     return tuple(found)
@@ -173,7 +179,8 @@ FAR = 1.2  # a tracker further off than this many extents would shrink the arm t
 @dataclass(frozen=True)
 class Posed:
     """The arm in one pose.  `frames` (n + 1, 4, 4): base and joints after their motion; `markers`
-    (m, 3) m with their `names`; `arrows` (m, 3) m, what is shown at each marker, or None."""
+    (m, 3) m with their `names`; `arrows` (m, 3) m, what is shown at each marker, or None; `group`
+    indexes the groups of the space."""
 
     name: str
     about: str
@@ -182,6 +189,7 @@ class Posed:
     markers: Array
     names: tuple[str, ...]
     arrows: Array | None = None
+    group: int = 0
 
     @property
     def line(self) -> Array:
@@ -191,13 +199,15 @@ class Posed:
 
 @dataclass(frozen=True)
 class Space:
-    """All poses, bodies, and the instrument where it stands near; `first` is shown first."""
+    """All poses, bodies, and the instrument where it stands near; `first` is shown first, and a
+    legend names the `groups` of poses."""
 
     poses: tuple[Posed, ...]
     shells: Shells
     tracker: Array | None
     first: int
     what: str
+    groups: tuple[str, ...] = ()
 
     @property
     def has_arrows(self) -> bool:
@@ -257,17 +267,18 @@ def frames_at(
 
 
 def space_of(
-    cell: Cell, chain: Chain, poses: Sequence[Posed], first: int = 0, what: str = "pose"
-) -> Space:
+    cell: Cell, chain: Chain, poses: Sequence[Posed], first: int = 0, what: str = "pose",
+    groups: tuple[str, ...] = (),
+) -> Space:  # fmt: skip
     """The poses with the bodies of the cell, and the tracker where it is known to stand near."""
-    space = Space(tuple(poses), shells_of(cell, chain), None, first, what)
+    space = Space(tuple(poses), shells_of(cell, chain), None, first, what, groups)
     low, high = space.extent
     at = cell.tracker.position
     if not at.any():
         return space  # the origin of its own data: most likely nobody said where it stands
     away = np.maximum(np.maximum(low - at, at - high), 0.0)
     near = float(np.linalg.norm(away)) < FAR * float((high - low).max())
-    return Space(space.poses, space.shells, at if near else None, first, what)
+    return replace(space, tracker=at if near else None)
 
 
 def space_json(space: Space) -> Markup:
@@ -419,7 +430,8 @@ def _load(force: Array) -> str:
 
 
 WIDTH = 9.9
-MOST_NUMBERED = 40
+MOST_NUMBERED = 80  # beyond that numbers hide each other
+SIGNS = ("o", "s", "^", "D", "v", "P")  # of groups, which differ in more than colour
 # Rows: to the right and upwards on paper, and towards the reader.
 _TURN, _TILT = np.radians(-50.0), np.radians(22.0)
 OBLIQUE = np.array(
@@ -450,27 +462,56 @@ def space_picture(space: Space, title: str) -> str:
             axes.set_title(name)
             axes.set_xlabel("x in m")
             axes.set_ylabel(f"{up} in m")
+        if space.groups:
+            handles = axes.get_legend_handles_labels()
+            figure.legend(*handles, loc="outside lower center", ncols=7, fontsize=8)
 
     return drawn(draw, WIDTH, 5.6, title)
+
+
+SUFFIXES = (".png", ".svg")
+
+
+def write_plan_picture(path: str | Path, plan: Plan) -> None:
+    """Draw the poses of a plan; PNG or SVG by suffix, and the same plan gives the same file.
+
+    Raises InputError for another suffix and an unwritable place.
+    """
+    suffix = Path(path).suffix.lower()
+    require(suffix in SUFFIXES, f"{path}: a picture of poses is written as .png or .svg")
+    picture, figure = BytesIO(), plan_figure(plan)
+    nothing = {"Date": None, "Creator": None} if suffix == ".svg" else {"Software": None}
+    with style():
+        figure.savefig(picture, format=suffix[1:], dpi=200, metadata=nothing, facecolor="white")
+    atomic_write_bytes(path, picture.getvalue())
+
+
+def plan_figure(plan: Plan) -> Any:
+    """The poses of a plan as matplotlib's Figure."""
+    with as_figures():
+        return space_picture(plan_space(plan), "The arm in the poses of the plan")
 
 
 def _draw(axes: Axes, space: Space, view: Array, whole: bool) -> None:
     """`whole`: all poses as lines; else the first as bodies, and with arrows it alone."""
     shown = space.poses[space.first]
     for shell in space.shells.around:
-        _fill(axes, shell.points @ view.T, FAINT, 0.25)
+        points = shell.points @ view.T
+        _fill(axes, points, FAINT, 0.25)
+        if whole:
+            top = (float(points[:, 0].mean()), float(points[:, 1].max()))
+            axes.annotate(short_name(shell.name, LONGEST_NAME), top, (0, 2), ha="center",
+                          textcoords="offset points", fontsize=7, clip_on=True)  # fmt: skip
+    if whole:
+        _walls(axes, space, view)
     if whole or not space.has_arrows:
         for pose in space.poses:
-            line = pose.line @ view.T
-            axes.plot(line[:, 0], line[:, 1], color=SERIES[0], linewidth=0.9, alpha=0.5)
-    if whole:
-        for pose in space.poses:
-            if not space.has_arrows and len(space.poses) <= MOST_NUMBERED:
-                tip = pose.line[-1] @ view.T
-                axes.annotate(short_name(pose.name, 6), (tip[0], tip[1]), (3, 2),
-                              textcoords="offset points", fontsize=7)  # fmt: skip
-    else:
+            line, colour = pose.line @ view.T, SERIES[pose.group % len(SERIES)]
+            axes.plot(line[:, 0], line[:, 1], color=colour, linewidth=0.9, alpha=0.5)
+    if not whole:
         _bodies(axes, space, view)
+    elif not space.has_arrows:
+        _tips(axes, space, view)
     for pose in space.poses if whole else (shown,):
         _markers(axes, pose, view, spokes=not whole)
         if pose.arrows is not None:
@@ -482,6 +523,34 @@ def _draw(axes: Axes, space: Space, view: Array, whole: bool) -> None:
     axes.set_aspect("equal")
     drawn_poses = space.poses if whole or not space.has_arrows else (shown,)
     _limit_view(axes, space, view, drawn_poses, [] if whole else space.bodies)
+
+
+LONGEST_NAME = 24
+
+
+def _walls(axes: Axes, space: Space, view: Array) -> None:
+    """Boundaries of keep-out half-spaces that stand upright in a view."""
+    for wall in space.shells.walls:
+        normal, at = (view @ wall.normal)[:2], (view @ wall.point)[:2]
+        if abs(float(np.linalg.norm(normal)) - 1) < 1e-6:
+            beyond = (float(at[0] - normal[1]), float(at[1] + normal[0]))
+            axes.axline((float(at[0]), float(at[1])), beyond, color=FAINT, linestyle="--")
+
+
+def _tips(axes: Axes, space: Space, view: Array) -> None:
+    """The flange of each pose, its group by colour and sign, and its name."""
+    tips = np.array([pose.line[-1] for pose in space.poses]) @ view.T
+    group = np.array([pose.group for pose in space.poses])
+    for k in np.unique(group):
+        own = tips[group == k]
+        name = f"{printable(space.groups[k])} ({len(own)})" if space.groups else ""
+        axes.plot(own[:, 0], own[:, 1], SIGNS[(k + k // len(SERIES)) % len(SIGNS)], label=name,
+                  color=SERIES[k % len(SERIES)], markersize=4.5, markeredgecolor="white",
+                  markeredgewidth=0.5)  # fmt: skip
+    for pose, tip in zip(space.poses, tips, strict=True):
+        if len(space.poses) <= MOST_NUMBERED:
+            axes.annotate(short_name(pose.name, 6), (tip[0], tip[1]), (3, 2),
+                          textcoords="offset points", fontsize=7)  # fmt: skip
 
 
 def _limit_view(
@@ -553,6 +622,7 @@ def plan_space(plan: Plan) -> Space:
                 flange=T,
                 markers=local @ T[:3, :3].T + T[:3, 3],
                 names=names,
+                group=int(plan.group[k]),
             )
         )
-    return space_of(cell, chain, poses)
+    return space_of(cell, chain, poses, groups=plan.group_names)

@@ -11,6 +11,8 @@ from io import BytesIO
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
+from rich.table import Table
+from rich.text import Text
 
 from elastocal.compensation.compensate import (
     Compensation,
@@ -25,34 +27,30 @@ from elastocal.errors import InputError
 from elastocal.identification.result import Calibration, Estimate
 from elastocal.model.effects import effect_of
 from elastocal.planning.plan import Plan
-from elastocal.report.causes_view import cause_rows, causes, field_rows, place_rows
-from elastocal.report.changes_view import change_rows, changes_frame, changes_lines, draw_map
+from elastocal.report.arm_view import plan_figure, plan_space
+from elastocal.report.causes_view import causes
+from elastocal.report.changes_view import changes_frame, draw_map
 from elastocal.report.diagnosis_view import (
-    diagnosis_lines,
-    diagnosis_steps,
     error_steps,
-    gap_rows,
-    hypothesis_rows,
 )
 from elastocal.report.effect_names import effect_at, name_of
-from elastocal.report.formatting import display, length, minus
+from elastocal.report.figures import SERIES, as_figures, drawn
+from elastocal.report.formatting import ShownTable, display, length, minus
 from elastocal.report.identification_view import (
-    combination_rows,
-    leading_lines,
-    parameter_rows,
     signed_half,
-    summary_lines,
     texts,
 )
-from elastocal.report.plan_picture import COLOURS, STYLE, draw_plan, pose_lines
-from elastocal.report.plan_view import first_stops, plan_lines
+from elastocal.report.plan_view import first_stops
+from elastocal.report.residual_figures import by_configuration
 from elastocal.report.residual_view import residuals_of
 from elastocal.report.terminal import (
-    comparison_text,
-    compensation_text,
-    diagnosis_text,
-    identification_text,
-    plan_text,
+    print_comparison,
+    print_compensation,
+    print_diagnosis,
+    print_plan,
+    print_result,
+    printed_text,
+    table_of,
 )
 from elastocal.text import cell_meaning, did_you_mean, listed, printable, quoted
 from elastocal.units import Array
@@ -67,6 +65,12 @@ MOST_TICKS = 20
 def residuals(result: Calibration, interactive: bool) -> Any:
     """Residual of every reading (at most 5000) over its configuration, one panel a component."""
     found = residuals_of(result)
+    if not interactive:
+        with as_figures():
+            return _showing(by_configuration(found))
+    import plotly.graph_objects as go
+    from plotly.subplots import make_subplots
+
     panels = [f"{c} in {u}" for c, u in zip(found.components, found.units, strict=True)]
     rows = found.shown
     at_poses = list(range(0, len(found.labels), -(-len(found.labels) // MOST_TICKS)))
@@ -76,43 +80,23 @@ def residuals(result: Calibration, interactive: bool) -> Any:
         f"{printable(found.markers[found.marker[i]])}"
         for i in rows
     ]
-    if interactive:
-        import plotly.graph_objects as go
-        from plotly.subplots import make_subplots
-
-        figure = make_subplots(rows=len(panels), cols=1, shared_xaxes=True)
-        for k, title in enumerate(panels):
-            for m, name in enumerate(found.markers):
-                at = np.flatnonzero(found.marker[rows] == m)
-                figure.add_trace(
-                    go.Scatter(
-                        x=found.pose[rows[at]], y=found.value[rows[at], k], mode="markers",
-                        marker={"color": COLOURS[m % len(COLOURS)], "size": 5},
-                        name=_plain(name), legendgroup=str(m), showlegend=k == 0,
-                        text=[_plain(hover[i]) for i in at], hovertemplate="%{text}: %{y:.1f}",
-                    ),
-                    row=k + 1, col=1,
-                )  # fmt: skip
-            figure.update_yaxes(title_text=title, row=k + 1, col=1)
-        figure.update_xaxes(title_text="configuration", row=len(panels), col=1, tickvals=at_poses,
-                            ticktext=[_plain(name) for name in names])  # fmt: skip
-        return figure.update_layout(height=160 + 180 * len(panels), template="plotly_white")
-
-    def draw(figure: Any) -> None:
-        grid = figure.subplots(len(panels), 1, sharex=True, squeeze=False)[:, 0]
-        for k, (axes, title) in enumerate(zip(grid, panels, strict=True)):
-            axes.axhline(0, color="#7f7f7f", linewidth=0.8)
-            for m, name in enumerate(found.markers):
-                at = rows[found.marker[rows] == m]
-                axes.plot(found.pose[at], found.value[at, k], ".", markersize=4,
-                          color=COLOURS[m % len(COLOURS)], label=printable(name))  # fmt: skip
-            axes.set_ylabel(title)
-        grid[-1].set_xticks(at_poses, names)
-        grid[-1].set_xlabel("configuration")
-        if 1 < len(found.markers) <= 12:
-            figure.legend(*grid[0].get_legend_handles_labels(), loc="outside upper right", ncols=6)
-
-    return _figure(draw, (9.0, 0.8 + 1.5 * len(panels)))
+    figure = make_subplots(rows=len(panels), cols=1, shared_xaxes=True)
+    for k, title in enumerate(panels):
+        for m, name in enumerate(found.markers):
+            at = np.flatnonzero(found.marker[rows] == m)
+            figure.add_trace(
+                go.Scatter(
+                    x=found.pose[rows[at]], y=found.value[rows[at], k], mode="markers",
+                    marker={"color": SERIES[m % len(SERIES)], "size": 5},
+                    name=_plain(name), legendgroup=str(m), showlegend=k == 0,
+                    text=[_plain(hover[i]) for i in at], hovertemplate="%{text}: %{y:.1f}",
+                ),
+                row=k + 1, col=1,
+            )  # fmt: skip
+        figure.update_yaxes(title_text=title, row=k + 1, col=1)
+    figure.update_xaxes(title_text="configuration", row=len(panels), col=1, tickvals=at_poses,
+                        ticktext=[_plain(name) for name in names])  # fmt: skip
+    return figure.update_layout(height=160 + 180 * len(panels), template="plotly_white")
 
 
 def parameters(result: Calibration, interactive: bool) -> Any:
@@ -191,37 +175,26 @@ def _of_targets(c: Compensation, metres: Array, axis: str, interactive: bool) ->
 
 def poses(plan: Plan, interactive: bool) -> Any:
     """The arm in every pose; interactive: in space, to be turned."""
-    cell, chain = plan.model.cell, plan.model.chain
     if not interactive:
-        from matplotlib.style import context
-
-        with context(["default", STYLE]):
-            figure = draw_plan(
-                cell, chain, plan.q, names=plan.configurations, group=plan.group,
-                group_names=plan.group_names,
-            )  # fmt: skip
-        return _showing(figure)
+        return _showing(plan_figure(plan))
     import plotly.graph_objects as go
 
-    arms, markers = pose_lines(cell, chain, plan.q)
     figure = go.Figure()
-    for k, name in enumerate(plan.configurations):
-        colour = COLOURS[int(plan.group[k]) % len(COLOURS)]
-        figure.add_trace(
-            go.Scatter3d(
-                x=arms[k, :, 0], y=arms[k, :, 1], z=arms[k, :, 2], mode="lines+markers",
-                line={"color": colour, "width": 4}, marker={"size": 2, "color": colour},
-                name=f"pose {name}",
-            )
-        )  # fmt: skip
-        figure.add_trace(
-            go.Scatter3d(
-                x=markers[k, :, 0], y=markers[k, :, 1], z=markers[k, :, 2], mode="markers",
-                marker={"size": 3, "color": colour, "symbol": "diamond"}, showlegend=False,
-                text=[_plain(marker) for marker in cell.tool.markers], hoverinfo="text",
-            )
-        )  # fmt: skip
-    tracker = cell.tracker.position
+    for pose in plan_space(plan).poses:
+        colour = SERIES[pose.group % len(SERIES)]
+        for points, how in (
+            (pose.line, {
+                "mode": "lines+markers", "line": {"color": colour, "width": 4},
+                "marker": {"size": 2, "color": colour}, "name": f"pose {pose.name}",
+            }),
+            (pose.markers, {
+                "mode": "markers", "marker": {"size": 3, "color": colour, "symbol": "diamond"},
+                "showlegend": False, "text": [*map(_plain, pose.names)], "hoverinfo": "text",
+            }),
+        ):  # fmt: skip
+            x, y, z = points.T
+            figure.add_trace(go.Scatter3d(x=x, y=y, z=z, **how))
+    tracker = plan.model.cell.tracker.position
     figure.add_trace(
         go.Scatter3d(x=[tracker[0]], y=[tracker[1]], z=[tracker[2]], mode="markers",
                      marker={"size": 5, "color": "#1a1a1a"}, name="tracker")
@@ -245,7 +218,7 @@ def _bars(
                  "arrayminus": np.nan_to_num(below)}  # fmt: skip
         figure = go.Figure(
             go.Scatter(x=value, y=[_plain(name) for name in names], mode="markers",
-                       marker={"color": COLOURS[0], "size": 9}, error_x=error)
+                       marker={"color": SERIES[0], "size": 9}, error_x=error)
         )  # fmt: skip
         figure.update_xaxes(title_text=axis, type="log" if logarithmic else "linear")
         figure.update_yaxes(autorange="reversed")
@@ -255,7 +228,7 @@ def _bars(
         axes = figure.subplots()
         at = np.arange(n)
         widths = np.nan_to_num(np.vstack([below, above]))
-        axes.errorbar(value, at, xerr=widths, fmt="o", color=COLOURS[0], elinewidth=1.6)
+        axes.errorbar(value, at, xerr=widths, fmt="o", color=SERIES[0], elinewidth=1.6)
         axes.set_yticks(at, [_axis_label(printable(name)) for name in names])
         axes.set_ylim(n - 0.4, -0.6)
         axes.margins(x=0.06)
@@ -271,13 +244,8 @@ def _bars(
 
 def _figure(draw: Any, size: tuple[float, float]) -> Any:
     """A matplotlib Figure that shows itself in a notebook and belongs to no global state."""
-    from matplotlib.figure import Figure
-    from matplotlib.style import context
-
-    with context(["default", STYLE]):
-        figure = Figure(figsize=size, layout="constrained")
-        draw(figure)
-    return _showing(figure)
+    with as_figures():
+        return _showing(drawn(draw, *size, ""))
 
 
 def _showing(figure: Any) -> Any:
@@ -288,7 +256,7 @@ def _showing(figure: Any) -> Any:
 
 def _png(figure: Any) -> bytes:
     picture = BytesIO()
-    figure.savefig(picture, format="png", dpi=100)
+    figure.savefig(picture, format="png", dpi=100, facecolor="white")
     return picture.getvalue()
 
 
@@ -303,18 +271,27 @@ def _plain(name: str) -> str:
 
 
 MOST_ROWS = 60
-MOST_CANDIDATES_SHOWN = 8
 Drawn = Callable[[Any, bool], Any]
 
 
 @dataclass(frozen=True)
 class View:
-    """How one kind of result shows itself; `figures` by kind, the first is the default."""
+    """How one kind of result shows itself: `show` prints it on a console; `figures` by kind, the
+    first is the default."""
 
-    text: Callable[[Any], str]
-    html: Callable[[Any], str]
+    show: Callable[[Any, Any], None]
     frame: Callable[[Any], pd.DataFrame]
     figures: Mapping[str, Drawn]
+
+    def text(self, result: Any) -> str:
+        """What the command line prints."""
+        return printed_text(self.show, result)
+
+    def html(self, result: Any) -> str:
+        """The same as HTML."""
+        console = HtmlConsole()
+        self.show(console, result)
+        return "".join(console.parts)
 
     def plot(
         self, result: Any, kind: str | None, interactive: bool,
@@ -343,83 +320,58 @@ def view_of(result: object) -> View:
     raise TypeError(type(result).__name__)
 
 
-def _identification_html(result: Calibration) -> str:
-    known = [row for row in parameter_rows(result, None) if row.determined]
-    rows = [
-        (r.name if r.effect else minus(r.name), minus(r.value), minus(r.interval), r.unit,
-         minus(r.nominal))
-        for r in (*known, *combination_rows(result, None))
-    ]  # fmt: skip
-    heads = ("parameter", "value", "95 %", "unit", "nominal")
-    table = _table("Identification", heads, rows)
-    return _lines(leading_lines(result)) + table + _lines(summary_lines(result))
+class HtmlConsole:
+    """What is printed for a terminal of any width as HTML; every text is escaped."""
+
+    width = 200
+
+    def __init__(self) -> None:
+        self.parts: list[str] = []
+
+    def print(self, what: Any = "", **_: Any) -> None:
+        """Add a table, its first MOST_ROWS rows, or a paragraph."""
+        if isinstance(what, Table):
+            self.parts.append(_html_table(what))
+        elif text := str(what).strip():
+            label = what.spans[0].end if isinstance(what, Text) and what.spans else 0
+            first, rest = _readable(text[:label].strip()), _readable(text[label:])
+            self.parts.append(f"<p><b>{first}</b> {rest}</p>" if label else f"<p>{rest}</p>")
 
 
-def _plan_html(plan: Plan) -> str:
-    frame = _plan_frame(plan)
-    rows = [tuple(_short(v) for v in row) for row in frame.itertuples(index=False)]
-    return _table("Measurement plan", list(frame.columns), rows) + _lines(plan_lines(plan))
+def _readable(text: str) -> str:
+    return escape(printable(text))
 
 
-def _diagnosis_html(d: Diagnosis) -> str:
-    tables = {
-        "What the gap is made of": cause_rows(d),
-        "Place by place": place_rows(d),
-        "Corrections without a name": field_rows(d),
-        "Gap budget (3-D rms error on held-out poses)": gap_rows(d),
-    }
-    if not d.groups:
-        tables["Candidates"] = hypothesis_rows(d, MOST_CANDIDATES_SHOWN)
-    lines = _lines(diagnosis_lines(d) + [("Next", step) for step in diagnosis_steps(d)])
-    return lines + "".join(_table(title, t.heads, t.rows) for title, t in tables.items() if t.rows)
-
-
-def _compensation_html(c: Compensation) -> str:
-    told = summary(c, c.chain.kinds, commands=False)
-    rows = [
-        (name, *("–" if v is None else length(v * 1e-6) for v in told[key].values()))
-        for name, key in (
-            ("nominal command", "error_before_um"),
-            ("new command", "error_after_um"),
-            ("standard uncertainty", "std_um"),
-            ("within, at 95 %", "within95_um"),
-        )
+def _html_table(table: Table) -> str:
+    head = "".join(f"<th>{_readable(str(column.header))}</th>" for column in table.columns)
+    columns = [
+        [minus(str(cell)) if column.justify == "right" else str(cell) for cell in column.cells]
+        for column in table.columns
     ]
-    frame = _commands(c)
-    chosen = ["configuration", *joint_columns(c.chain.kinds), "std_um", "status"]
-    commands = [
-        tuple("" if v != v else _short(v) for v in row)
-        for row in frame[chosen].itertuples(index=False)
-    ]
-    reached = f"{told['reached']} of {told['n']} targets reached by the {told['point']}"
-    lines = [("Reached", f"{reached}; targets in the {told['frame']} frame.")]
-    return (
-        _lines([*lines, *(("Warning", text) for text in c.warnings)])
-        + _table("Position of the tool, predicted", ("", "rms", "95 %", "max"), rows)
-        + _table("Commands", chosen, commands)
-    )
-
-
-def _short(value: object) -> str:
-    return f"{value:.2f}" if isinstance(value, float) else str(value)
-
-
-def _table(title: str, heads: Sequence[str], rows: Sequence[Sequence[str]]) -> str:
-    """A table whose every cell is escaped; the first MOST_ROWS rows."""
-    head = "".join(f"<th>{escape(text)}</th>" for text in heads)
+    rows = list(zip(*columns, strict=True))
     body = "".join(
-        "<tr>" + "".join(f"<td>{escape(str(cell))}</td>" for cell in row) + "</tr>"
+        f"<tr>{''.join(f'<td>{_readable(cell)}</td>' for cell in row)}</tr>"
         for row in rows[:MOST_ROWS]
     )
     more = f"<p>… and {len(rows) - MOST_ROWS} more rows</p>" if len(rows) > MOST_ROWS else ""
+    title = _readable(str(table.title or ""))
     return (
-        f"<table><caption>{escape(title)}</caption><thead><tr>{head}</tr></thead>"
+        f"<table><caption>{title}</caption><thead><tr>{head}</tr></thead>"
         f"<tbody>{body}</tbody></table>{more}"
     )
 
 
-def _lines(lines: Sequence[tuple[str, str]]) -> str:
-    return "".join(f"<p><b>{escape(label)}:</b> {escape(text)}</p>" for label, text in lines)
+def _show_compensation(console: Any, c: Compensation) -> None:
+    """Errors before and after, and what could not be reached; as HTML the commands too."""
+    print_compensation(console, {"commands": summary(c, c.chain.kinds, commands=False)})
+    if isinstance(console, HtmlConsole):
+        chosen = ["configuration", *joint_columns(c.chain.kinds), "std_um", "status"]
+        rows = [
+            tuple("" if v != v else f"{v:.2f}" if isinstance(v, float) else str(v) for v in row)
+            for row in _commands(c)[chosen].itertuples(index=False)
+        ]
+        words = (0, len(chosen) - 1)
+        console.print(table_of("Commands", ShownTable(tuple(chosen), rows, words)))
 
 
 def _estimates(result: Calibration) -> pd.DataFrame:
@@ -505,11 +457,6 @@ def _commands(c: Compensation) -> pd.DataFrame:
     return frame
 
 
-def _comparison_html(c: Comparison) -> str:
-    shown = change_rows(c)
-    return _lines(changes_lines(c)) + _table("Parameter by parameter", shown.heads, shown.rows)
-
-
 def moved(c: Comparison, interactive: bool) -> Any:
     """How far the tool has moved over the workspace, from above and from the side."""
     from matplotlib.figure import Figure
@@ -529,23 +476,18 @@ def moved(c: Comparison, interactive: bool) -> Any:
 
 
 VIEWS: dict[type, View] = {
-    Comparison: View(comparison_text, _comparison_html, changes_frame, {"moved": moved}),
+    Comparison: View(print_comparison, changes_frame, {"moved": moved}),
     Calibration: View(
-        identification_text,
-        _identification_html,
+        partial(print_result, details=True),
         _estimates,
         {"residuals": residuals, "parameters": parameters},
     ),
-    Plan: View(plan_text, _plan_html, _plan_frame, {"poses": poses, "intervals": intervals}),
+    Plan: View(print_plan, _plan_frame, {"poses": poses, "intervals": intervals}),
     Compensation: View(
-        compensation_text,
-        _compensation_html,
-        _commands,
-        {"errors": errors, "uncertainty": uncertainties},
+        _show_compensation, _commands, {"errors": errors, "uncertainty": uncertainties}
     ),
     Diagnosis: View(
-        diagnosis_text,
-        _diagnosis_html,
+        print_diagnosis,
         _candidates,
         {"budget": budget, "candidates": candidates, "shares": shares},
     ),

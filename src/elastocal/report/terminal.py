@@ -11,7 +11,6 @@ from rich.console import Console
 from rich.table import Table
 from rich.text import Text
 
-from elastocal.compensation.compensate import Compensation, summary
 from elastocal.diagnosis.changes import Comparison
 from elastocal.diagnosis.diagnosis import Diagnosis
 from elastocal.errors import option
@@ -65,41 +64,12 @@ NARROW_FOR_BOTH = 96  # columns; below, a comparison tells changes alone
 PRINTED_WIDTH = 100  # columns of a result as plain text
 
 
-def identification_text(result: Calibration) -> str:
-    """What `print` shows of an identification: parameters with their intervals, and what holds."""
-    return _plain_text(lambda console: print_result(console, result, details=True))
-
-
-def plan_text(plan: Plan) -> str:
-    """What `print` shows of a plan: its poses, what it promises, how far from the best it is."""
-    return _plain_text(lambda console: print_plan(console, plan))
-
-
-def diagnosis_text(d: Diagnosis) -> str:
-    """What `print` shows of a diagnosis: the verdict, the gap budget, the candidates."""
-    base = d.calibrated
-    joints = len(d.noise.repeatability)
-    kinds = ("revolute",) * joints if base is None else base.model.chain.kinds
-    return _plain_text(lambda console: print_diagnosis(console, d, kinds))
-
-
-def compensation_text(c: Compensation) -> str:
-    """What `print` shows of commands: errors before and after, and what could not be reached."""
-    content = {"commands": summary(c, c.chain.kinds, commands=False)}
-    return _plain_text(lambda console: print_compensation(console, content))
-
-
-def _plain_text(printed: Callable[[Console], None]) -> str:
-    """What is printed, without colours and trailing blanks."""
+def printed_text(show: Callable[[Console, Any], None], result: Any) -> str:
+    """What `show` prints of a result, without colours and trailing blanks."""
     console = safe_console(file=StringIO(), width=PRINTED_WIDTH, color_system=None)
     with console.capture() as capture:
-        printed(console)
+        show(console, result)
     return "\n".join(line.rstrip() for line in capture.get().rstrip().splitlines())
-
-
-def comparison_text(c: Comparison) -> str:
-    """What `print` shows of a comparison: the verdict, and every parameter."""
-    return _plain_text(lambda console: print_comparison(console, c))
 
 
 def print_comparison(console: Console, c: Comparison) -> None:
@@ -322,8 +292,11 @@ MOST_CANDIDATES_PRINTED = 8
 NARROW_FOR_SETTINGS = 100  # columns; below, a candidate is told without its settings
 
 
-def print_diagnosis(console: Console, d: Diagnosis, kinds: Sequence[str]) -> None:
-    """The whole answer for an engineer; `kinds` of the joints ("revolute" or "prismatic")."""
+def print_diagnosis(console: Console, d: Diagnosis, kinds: Sequence[str] = ()) -> None:
+    """The whole answer for an engineer; `kinds` of the joints ("revolute" or "prismatic") where
+    the diagnosis does not say them."""
+    joints = ("revolute",) * len(d.noise.repeatability)
+    kinds = kinds or (joints if d.calibrated is None else d.calibrated.model.chain.kinds)
     print_told(console, diagnosis_lines(d))
     console.print()
     for told in _tables_of_causes(console, d):
