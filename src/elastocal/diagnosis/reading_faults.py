@@ -10,6 +10,7 @@ from scipy.spatial import cKDTree
 
 from elastocal.diagnosis.diagnosis_data import DiagnosisData
 from elastocal.diagnosis.noise_floor import NoiseValues, NoisyData, Projection, project
+from elastocal.measurements import numbered
 from elastocal.units import Array, BoolArray, IntArray
 
 # A reading i left out has the error e = P_ii⁻¹u_i with covariance P_ii⁻¹ (u = P r), so uᵢᵀP_ii⁻¹u_i
@@ -87,11 +88,9 @@ class DirectChecks:
 
     def __init__(self, dataset: DiagnosisData) -> None:
         table, lead = dataset.table, dataset.lead
-        force = np.unique(np.round(table.force[lead], 6), axis=0, return_inverse=True)[1].ravel()
-        pose = np.column_stack([table.configuration[lead], table.marker[lead], force])
         self.dataset = dataset
-        self.repeats = np.unique(pose, axis=0, return_inverse=True)[1].ravel()
-        self.kind = np.unique(pose[:, 1:], axis=0, return_inverse=True)[1].ravel()
+        self.repeats = dataset.base.observed.place
+        self.kind = numbered(table.marker[lead], dataset.base.observed.load)
         self.size = dataset.blocks.size
         self.scales: dict[str, dict[int, float]] = {"visits": {}, "repeats": {}}
         self.stated = dataset.data.stated
