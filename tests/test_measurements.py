@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 
 from elastocal.errors import InputError
-from elastocal.measurements import read_measurements, write_measurements
+from elastocal.measurements import numbered, read_measurements, write_measurements
 
 HEADER = "q1_deg,q2_deg,x_mm,y_mm,z_mm"
 ROW = "1,2,3,4,5"
@@ -528,3 +528,12 @@ def test_what_cannot_be_read_back_is_not_written(read, tmp_path):
     with pytest.raises(InputError, match="does not exist"):
         write_measurements(got, tmp_path / "absent" / "out.csv")
     assert os.listdir(tmp_path) == ["data.csv"]
+
+
+def test_rows_are_numbered_by_their_combination_of_values():
+    """As numpy numbers whole rows, −0 being 0, at any size of the values."""
+    rng = np.random.default_rng(0)
+    table = rng.integers(-2, 3, (400, 4)) * np.array([1.0, -0.0, 1e9, 1e-6])
+    expected = np.unique(table, axis=0, return_inverse=True)[1].ravel()
+    assert np.array_equal(numbered(*table.T), expected)
+    assert len(numbered(np.zeros(0))) == 0

@@ -46,6 +46,11 @@ class Saved:
         import_module(WRITERS).save(self, path, **how)
 
 
+def pages() -> Any:
+    """The module that writes a result as a page."""
+    return import_module(PAGES)
+
+
 class Result(Saved):
     """What every result of a verb offers: `report`, `plot`, `to_dataframe`, `save`, HTML."""
 
@@ -78,7 +83,7 @@ class Result(Saved):
             >>> commands = ec.compensate(fit, [1.8, 0.0, 0.9], load=[0, 0, -2600])
             >>> commands.report("commands.html", inputs=["cell.toml", "data.csv"])
         """
-        import_module(PAGES).write_page(self, Path(path), inputs, command, seed)
+        pages().write_page(self, Path(path), inputs, command, seed)
 
     def plot(self, kind: str | None = None, interactive: bool = False) -> Any:
         """A figure of the result.
@@ -100,8 +105,7 @@ class Result(Saved):
             >>> figure = ec.identify("cell.toml", "data.csv").plot("parameters")
             >>> figure.savefig("parameters.png")
         """
-        pages = import_module(PAGES)
-        return _view(self).plot(self, kind, interactive, lambda: pages.figures_of(self))
+        return _view(self).plot(self, kind, interactive, lambda: pages().figures_of(self))
 
     def to_dataframe(self) -> pd.DataFrame:
         """The result's main table as a pandas data frame; units stand in the column names.

@@ -180,16 +180,26 @@ class Measurements:
 STILL = 1e-4  # rad or m; a joint that moved by less has stayed where it was
 
 
-def visits(table: Measurements) -> IntArray:
-    """Number (n,) of each row's visit: its configuration, repeat and force."""
-    number = np.zeros(len(table), dtype=np.int64)
-    with np.errstate(over="ignore"):  # of forces beyond all measure
-        force = np.round(table.force, 6)
-    for values in (table.configuration, table.repeat, *force.T):
+def numbered(*columns: NDArray[Any]) -> IntArray:
+    """Number (n,) of each row's combination of values in the `columns` (n,), in their order; column
+    by column, since sorting whole rows takes far longer."""
+    number = np.zeros(len(columns[0]), dtype=np.int64)
+    for values in columns:
         codes = np.unique(values, return_inverse=True)[1].ravel()
         number = number * (int(codes.max(initial=0)) + 1) + codes
         number = np.unique(number, return_inverse=True)[1].ravel()
     return number
+
+
+def load_states(force: Array) -> IntArray:
+    """Number (n,) of each force (n, 3) in N, alike to a µN."""
+    with np.errstate(over="ignore"):  # of forces beyond all measure
+        return numbered(*np.round(force, 6).T)
+
+
+def visits(table: Measurements) -> IntArray:
+    """Number (n,) of each row's visit: its configuration, repeat and force."""
+    return numbered(table.configuration, table.repeat, load_states(table.force))
 
 
 def with_moves(table: Measurements) -> Measurements:

@@ -64,7 +64,7 @@ def test_the_likelihood_is_that_of_a_normal_distribution() -> None:
         V += C @ np.diag(np.exp(2 * s) * c.shares(length)[0]) @ C.T
     r = data.r.ravel()[used_rows(data)]
     expected = multivariate_normal(np.zeros(len(r)), V).logpdf(r)
-    assert -problem.factored(at)[3] / 2 == pytest.approx(expected, abs=1e-6)
+    assert -problem.factored(at)[2] / 2 == pytest.approx(expected, abs=1e-6)
 
 
 def test_the_slope_is_that_of_the_value() -> None:
@@ -83,11 +83,11 @@ def test_the_slope_is_that_of_the_value() -> None:
 def test_what_a_component_earns_is_what_the_likelihood_loses_without_it() -> None:
     data, components, at = some()
     problem = posed(data, components, NOISE)
-    whole, earned = problem.factored(at)[3], problem.earned(at)
+    whole, earned = problem.factored(at)[2], problem.earned(at)
     for k in range(len(components)):
         kept = [i for i in range(len(components)) if i != k]
         fewer = posed(data, [components[i] for i in kept], NOISE)
-        lost = (fewer.factored(at.chosen(kept))[3] - whole) / 2
+        lost = (fewer.factored(at.chosen(kept))[2] - whole) / 2
         assert earned[k] == pytest.approx(lost, abs=1e-6)
 
 
@@ -102,7 +102,7 @@ def test_sums_that_are_known_serve_another_fit() -> None:
     larger = known.scaled(0.3)
     expected = posed(data, components, larger.noise)
     np.testing.assert_allclose(larger.weighted.M, expected.weighted.M, rtol=1e-9)
-    assert larger.factored(at)[3] == pytest.approx(expected.factored(at)[3], abs=1e-6)
+    assert larger.factored(at)[2] == pytest.approx(expected.factored(at)[2], abs=1e-6)
 
 
 def test_evidence_beside_a_sum_is_that_of_the_rows() -> None:

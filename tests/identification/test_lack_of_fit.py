@@ -11,6 +11,7 @@ from support.cells import random_poses
 from elastocal.identification import Options, lack_of_fit
 from elastocal.identification.identify import identify
 from elastocal.model import Model, observe
+from elastocal.model.observations import pure_error
 
 PLACED = ("base_frame", "marker_position")
 SIGMA, POSES, REPEATS = 5e-5, 14, 4
@@ -90,3 +91,12 @@ def test_without_repeats_there_is_no_test():
     result = identify(model, table)
     assert result.noise.lack_of_fit is None
     assert not any(w.startswith(SENTENCE) for w in result.warnings)
+
+
+def test_pure_error_is_that_about_the_means_of_groups():
+    rng = np.random.default_rng(1)
+    group, values = rng.integers(0, 5, 40) * 3, rng.normal(size=(40, 3))
+    square, dof = pure_error(group, values)
+    own = [values[group == g] for g in np.unique(group)]
+    assert dof == 3 * (40 - len(own))
+    assert abs(square / sum(((v - v.mean(axis=0)) ** 2).sum() for v in own) - 1) < 1e-12

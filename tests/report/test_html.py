@@ -18,7 +18,7 @@ import pytest
 from support.pages import Page
 
 from elastocal.identification import gap_budget
-from elastocal.identification.error_budget import places_read, pose_accuracy
+from elastocal.identification.error_budget import pose_accuracy
 from elastocal.model import observe
 from elastocal.report import figures, residual_view
 from elastocal.report.formatting import length
@@ -99,7 +99,7 @@ def test_the_certificate_is_one_page_of_accuracy_data_and_verdict(
     page = Page(text)
     page.check_harmless(text)
     rows = page.named_rows()
-    n = len(np.unique(places_read(case.result.observations)))
+    n = len(np.unique(case.result.observations.place))
     accuracy = pose_accuracy(case.result.observations, gap_budget(case.result).steps[-1].errors)
     assert rows["calibrated"][1:3] == [str(n), length(float(accuracy.mean()))]
     assert rows["d.csv"][1] == "SHA-256abc123" and rows["made on"][1]

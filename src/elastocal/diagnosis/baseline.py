@@ -10,19 +10,17 @@ from weakref import WeakKeyDictionary
 import numpy as np
 from numpy.typing import NDArray
 
-from elastocal.errors import InputError
 from elastocal.identification.solve import PLACING, Problem, is_placed, sizes_and_check, tied_fit
 from elastocal.identification.start import start_values
 from elastocal.identification.weighted_problem import (
-    Weights,
     residual_at,
-    stated_covariance,
+    stated_by_observation,
     weights_for,
 )
-from elastocal.measurements import Measurements, visits
+from elastocal.measurements import Measurements, load_states, numbered, visits
 from elastocal.model.effects import effect_of
 from elastocal.model.manipulator import Model
-from elastocal.model.observations import Observations, available_noise, observe
+from elastocal.model.observations import Observations, observe
 from elastocal.units import Array, IntArray
 
 
@@ -197,20 +195,8 @@ def fit_baseline(
     if nominal is None:
         unknown = np.full_like(residual, np.nan)
         nominal = unknown if started else residual_at(model, problem.parts, problem.x0)
-    return Baseline(model, observed, x, sizes, residual, nominal, _stated(observed, model, weights))
-
-
-def _stated(observed: Observations, model: Model, weights: Weights) -> Array | None:
-    """Stated covariance (N, size, size) of each observation, None where none is stated."""
-    if weights.kind == "none":
-        return None
-    kind = available_noise(observed.table, model.cell.tracker)
-    try:
-        rows = stated_covariance(observed, model.cell.tracker, kind)[0]
-    except InputError:
-        return None
-    stated = observed.combine.power(2) @ rows.reshape(len(rows), -1)
-    return np.asarray(stated).reshape(-1, observed.size, observed.size)
+    stated = stated_by_observation(observed, model.cell.tracker)
+    return Baseline(model, observed, x, sizes, residual, nominal, stated)
 
 
 # Prior standard deviations of the fitted parameters about the fit, in typical sizes: wide enough
@@ -279,10 +265,8 @@ def thinned(table: Measurements) -> tuple[Measurements, str | None]:
 def _first_of_each(table: Measurements) -> NDArray[np.bool_]:
     """Rows that are among the first of their configuration, load and marker, as many of each as
     leave MOST_IN_ONE in the configuration."""
-    force = np.unique(table.force.round(6), axis=0, return_inverse=True)[1].ravel()
-    kinds = np.column_stack([table.configuration, force, table.marker])
-    _, kind, count = np.unique(kinds, axis=0, return_inverse=True, return_counts=True)
-    kind = kind.ravel()
+    kind = numbered(table.configuration, load_states(table.force), table.marker)
+    count = np.bincount(kind)
     order = np.argsort(kind, kind="stable")
     rank = np.empty(len(table), dtype=np.int64)
     rank[order] = np.arange(len(table)) - np.repeat(np.cumsum(count) - count, count)

@@ -39,6 +39,7 @@ from elastocal.diagnosis.noise_floor import (
     log_prior,
     posterior,
 )
+from elastocal.identification.smooth_prior import Standardised
 from elastocal.model.effects.base import Effect
 from elastocal.model.effects.smooth import ResidualField, Waves
 from elastocal.units import Array
@@ -265,28 +266,23 @@ class SumOfComponents:
         sized = [np.exp(2 * s) * share for s, share in zip(at.size, shares, strict=True)]
         return np.concatenate([1 / self.data.precision, *sized])
 
-    def factored(self, at: Sizes) -> tuple[Array, Array, Array, float]:
-        """√v, L of LLᵀ = I + √v M √v/a², b = (LLᵀ)⁻¹ √v z/a², and −2ℓ."""
-        a2 = np.exp(2 * at.factor)
+    def factored(self, at: Sizes) -> tuple[Array, Standardised, float]:
+        """√v, the coefficients in units of it under e^factor times the noise, and −2ℓ."""
+        a = float(np.exp(at.factor))
         root = np.sqrt(self.variances(at))
-        A = self.weighted.M * (root / a2)
-        A *= root[:, None]
-        A[np.diag_indices_from(A)] += 1
-        L = linalg.cholesky(A, lower=True, overwrite_a=True, check_finite=False)
-        z = root * self.weighted.z / a2
-        b = linalg.cho_solve((L, True), z, check_finite=False)
+        found = Standardised.of(self.weighted.M, self.weighted.z / a, root / a)
         value = (
-            self.weighted.alone - self.squares + self.squares / a2 + 2 * self.rows * at.factor
-            + 2 * float(np.log(np.diag(L)).sum()) - float(z @ b)
+            self.weighted.alone - self.squares + self.squares / a**2 + 2 * self.rows * at.factor
+            + found.log_det - found.explained
         )  # fmt: skip
-        return root, L, b, value
+        return root, found, value
 
     def objective(self, theta: Array) -> tuple[float, Array]:
         """−2 log posterior of the logarithms and its slope."""
         K = len(self.components)
         at = Sizes(float(theta[0]), theta[1 : K + 1], theta[K + 1 :])
-        root, L, b, value = self.factored(at)
-        inverse = linalg.lapack.dtrtri(L, lower=1, overwrite_c=1)[0]
+        root, found, value = self.factored(at)
+        b, inverse = found.b, linalg.lapack.dtrtri(found.L, lower=1, overwrite_c=1)[0]
         # A coefficient's posterior over its prior variance.
         left = np.einsum("ij,ij->j", inverse, inverse)
         each = (1 - left) - b**2  # ∂(−2ℓ)/∂ log v
@@ -327,8 +323,8 @@ class SumOfComponents:
         Of the posterior: with S its covariance block of a component's standardised coefficients
         and b their mean, leaving it out changes −2ℓ by log|S| + bᵀS⁻¹b.
         """
-        _, L, b, _ = self.factored(at)
-        inverse = linalg.lapack.dpotri(L, lower=1)[0]
+        _, found, _ = self.factored(at)
+        b, inverse = found.b, found.covariance
         out = np.zeros(len(self.components))
         for k, span in enumerate(self.spans):
             S = inverse[span, span]
@@ -478,7 +474,7 @@ def fit_sum(
     if refit_noise:
         problem = posed(data, components, noise)
     variances = problem.variances(at)
-    value = problem.factored(at)[3]
+    value = problem.factored(at)[2]
     score = -value / 2 - problem.pool.penalty(at.size)[0] / 2 - problem.pool.cost
     score -= 0.5 * log_prior(data.stated, noise)[0]
     earned, own = problem.earned(at), variances[len(data.precision) :]

@@ -31,7 +31,7 @@ from elastocal.diagnosis.hypotheses import (
 )
 from elastocal.diagnosis.noise_floor import NoiseValues, NoisyData, fit_noise
 from elastocal.errors import InsufficientDataError
-from elastocal.measurements import Measurements
+from elastocal.measurements import Measurements, numbered
 from elastocal.model.effects import CATALOGUE
 from elastocal.model.effects.loads import PayloadError
 from elastocal.model.manipulator import Model
@@ -84,14 +84,12 @@ class DiagnosisData:
     @cached_property
     def kind(self) -> IntArray:
         """The marker and load of each observation (N,), numbered."""
-        each = np.column_stack([self.table.marker, self.table.force.round(6)])[self.lead]
-        return np.unique(each, axis=0, return_inverse=True)[1].ravel()
+        return numbered(self.table.marker[self.lead], self.base.observed.load)
 
     @cached_property
     def repeated(self) -> IntArray:
         """The pose, marker and load of each observation (N,), numbered."""
-        each = np.column_stack([self.table.configuration[self.lead], self.kind])
-        return np.unique(each, axis=0, return_inverse=True)[1].ravel()
+        return self.base.observed.place
 
     @cached_property
     def noise(self) -> NoiseValues:

@@ -9,6 +9,7 @@ import numpy as np
 from scipy import linalg, optimize
 
 from elastocal.diagnosis.baseline import Blocks
+from elastocal.identification.weighted_problem import WhitenedBlocks
 from elastocal.units import Array, BoolArray
 
 # The noise floor: tracker noise, repeatability of each joint, scatter common to a configuration.
@@ -231,10 +232,8 @@ class Weighted:
 
     @classmethod
     def of(cls, data: NoisyData, noise: NoiseValues) -> Weighted:
-        K = np.asarray(np.linalg.cholesky(covariance(data, noise)), dtype=np.float64)
-        log_det = 2 * float(np.log(np.diagonal(K, axis1=1, axis2=2)).sum())
-        root = _inverse(K)
-        X, r = root @ data.counting.X, (root @ data.counting.r[..., None])[..., 0]
+        of = data.counting
+        root, X, r, log_det = WhitenedBlocks.of(covariance(data, noise), of.X, of.r)
         flat = X.reshape(-1, X.shape[2])
         alone = log_det + float(np.vdot(r, r)) + data.n_rows * float(np.log(2 * np.pi))
         return cls(root, X, r, flat.T @ flat, flat.T @ r.ravel(), alone)
@@ -264,18 +263,6 @@ class Weighted:
         u = (back @ self.r[..., None])[..., 0] - H @ z
         beta = linalg.solve_triangular(L, z, lower=True, trans="T", check_finite=False)
         return Projection(back @ self.root, H, u, beta, marginal, L)
-
-
-def _inverse(K: Array) -> Array:
-    """K⁻¹ of lower triangular K (C, m, m), by halves: a general inverse takes twice as long."""
-    if K.shape[1] == 1:
-        return 1 / K
-    h = K.shape[1] // 2
-    out = np.zeros_like(K)
-    out[:, :h, :h] = upper = _inverse(K[:, :h, :h])
-    out[:, h:, h:] = lower = _inverse(K[:, h:, h:])
-    out[:, h:, :h] = -lower @ (K[:, h:, :h] @ upper)
-    return out
 
 
 def _divided(rows: Array, L: Array, overwrite: bool = False) -> Array:

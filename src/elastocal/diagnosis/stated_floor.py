@@ -12,6 +12,7 @@ from scipy.spatial import cKDTree
 from elastocal.diagnosis.diagnosis import FaultyReading, NearRepeats, NoiseFloor
 from elastocal.diagnosis.diagnosis_data import DiagnosisData
 from elastocal.diagnosis.noise_floor import NoiseValues, NoisyData, Projection, covariance, project
+from elastocal.model.observations import pure_error as pure_error_of
 from elastocal.units import Array, BoolArray, IntArray
 
 
@@ -52,8 +53,8 @@ def describe_faulty(
 
 def pure_error(dataset: DiagnosisData) -> float | None:
     """Scatter in m per axis among repeats of the same pose, load and marker; None without any."""
-    square, dof = _within(*_repeats(dataset, ~dataset.data.faulty))
-    return float(np.sqrt(square)) if dof else None
+    square, dof = pure_error_of(*_repeats(dataset, ~dataset.data.faulty))
+    return float(np.sqrt(square / dof)) if dof else None
 
 
 def _repeats(dataset: DiagnosisData, good: BoolArray) -> tuple[IntArray, Array]:
@@ -158,21 +159,8 @@ def returned(dataset: DiagnosisData) -> tuple[float, int]:
     group, values = _repeats(dataset, good)
     # The first reading of each stay.
     first = np.unique(np.column_stack([group, stay]), axis=0, return_index=True)[1]
-    return _within(group[first], values[first])
-
-
-def _within(group: IntArray, values: Array) -> tuple[float, int]:
-    """Mean square of `values` (n, d) about the mean of their `group` (n,), and its degrees of
-    freedom; (0, 0) where no group has two."""
-    _, group, count = np.unique(group, return_inverse=True, return_counts=True)
-    group = group.ravel()
-    dof = int((count - 1).sum()) * values.shape[1]
-    if not dof:
-        return 0.0, 0
-    mean = np.zeros((len(count), values.shape[1]))
-    np.add.at(mean, group, values)
-    mean /= count[:, None]
-    return float(((values - mean[group]) ** 2).sum() / dof), dof
+    square, dof = pure_error_of(group[first], values[first])
+    return square / max(dof, 1), dof
 
 
 # Scatter of a joint that goes with pose or time is no scatter.

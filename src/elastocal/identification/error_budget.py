@@ -16,7 +16,7 @@ from elastocal.identification.scrutiny import stage_of
 from elastocal.identification.solve import WORTH_A_COLUMN, reduce
 from elastocal.identification.weighted_problem import weights_for
 from elastocal.model.manipulator import Model
-from elastocal.model.observations import Observations
+from elastocal.model.observations import Observations, pure_error
 from elastocal.units import Array
 
 STAGES = ("nominal_arm", "geometry", "compliance", "smooth functions")
@@ -133,13 +133,11 @@ def _step(name: str, result: Calibration, residual: Array, rng: np.random.Genera
 def _floor(result: Calibration) -> tuple[float | None, str]:
     """What repeats scatter, else what the stated noise gives."""
     observed = result.observations
-    code = places_read(observed)
     parts = result.residual.reshape(-1, observed.size)[:, :3]
-    dof = len(parts) - int(code.max()) - 1
+    square, dof = pure_error(observed.place, parts)
+    dof //= parts.shape[1]
     if dof >= FEWEST_REPEATS:
-        count = np.bincount(code)
-        mean = np.column_stack([np.bincount(code, p) / count for p in parts.T])
-        return float(np.sqrt(((parts - mean[code]) ** 2).sum() / dof)), "repeats alone"
+        return float(np.sqrt(square / dof)), "repeats alone"
     ratio = result.noise.ratio_to_stated
     if ratio:
         scatter = result.residual_rms * float(np.sqrt(len(result.residual) / result.dof))
@@ -147,17 +145,10 @@ def _floor(result: Calibration) -> tuple[float | None, str]:
     return None, ""
 
 
-def places_read(observed: Observations) -> NDArray[np.int64]:
-    """For each observation (N,) the number of its place: configuration, marker and load."""
-    force = np.round(observed.table.force[observed.lead], 3)
-    key = np.column_stack([observed.configuration, observed.table.marker[observed.lead], force])
-    return np.unique(key, axis=0, return_inverse=True)[1].ravel()
-
-
 def pose_accuracy(observed: Observations, errors: Array) -> Array:
     """AP (places,) in m as ISO 9283 has it: how far the mean of the readings of one place lies from
     where it should, of errors (N, 3) in m."""
-    code = places_read(observed)
+    code = observed.place
     mean = np.column_stack([np.bincount(code, e) for e in errors.T]) / np.bincount(code)[:, None]
     return np.asarray(np.linalg.norm(mean, axis=1))
 

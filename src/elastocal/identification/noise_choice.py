@@ -47,11 +47,13 @@ from elastocal.identification.visit_record import VisitRecord, visit_record
 from elastocal.identification.weighted_problem import (
     Weights,
     block_diagonal,
-    stated_covariance,
+    same_size,
+    stated_by_observation,
     whitener,
 )
+from elastocal.measurements import numbered
 from elastocal.model.manipulator import Model
-from elastocal.model.observations import Observations, available_noise, polar_axes
+from elastocal.model.observations import Observations, polar_axes
 from elastocal.units import Array, BoolArray, IntArray
 
 # Which noise model: what the readings allow is tried, and an information criterion decides.
@@ -627,21 +629,18 @@ def outlier_screening(
         residual = residual / np.sqrt(np.diagonal(readings.stated, axis1=1, axis2=2))
     table = _scale(np.abs(residual if good is None else residual[good]))
     deviation, scale = np.abs(residual), np.broadcast_to(table, residual.shape).copy()
-    key = np.column_stack([readings.configuration, readings.load])
-    _, group, count = np.unique(key, axis=0, return_inverse=True, return_counts=True)
-    order = np.argsort(group.ravel(), kind="stable")
-    starts = np.concatenate([[0], np.cumsum(count)[:-1]])
-    for n in np.unique(count[count >= OWN_SCALE]):
-        members = order[starts[count == n, None] + np.arange(n)]  # (groups, n)
-        r = residual[members]
-        deviation[members] = np.abs(r - np.median(r, axis=1, keepdims=True))
-        scale[members] = _scale(deviation[members], axis=1)[:, None]
+    group = numbered(readings.configuration, readings.load)
+    for members in same_size(group):
+        if members.shape[1] >= OWN_SCALE:
+            r = residual[members]
+            deviation[members] = np.abs(r - np.median(r, axis=1, keepdims=True))
+            scale[members] = _scale(deviation[members], axis=1)[:, None]
     # A group that happens to agree is no reason to suspect the one reading that differs a little.
     scale = np.maximum(scale, 0.2 * table)
     near = (deviation <= LIMIT * scale).all(axis=1)
     if good is None:
         return np.asarray(near)
-    share = np.bincount(group.ravel(), ~good)[group.ravel()] / count[group.ravel()]
+    share = (np.bincount(group, ~good) / np.bincount(group))[group]
     return np.asarray(near & (good | (share < MOVED)))
 
 
@@ -724,13 +723,12 @@ def linearised(
     at = model.regressor(observed.table, x, columns, observed)
     n, size = len(observed.lead), observed.size
     table = observed.table
-    force = np.round(table.force[observed.lead], 6)
-    load = np.unique(force, axis=0, return_inverse=True)[1].ravel()
     sight, reach = _sight(model, observed)
     return Readings(
-        at.B.reshape(n, size, -1), at.residual.reshape(n, size), table.configuration[observed.lead],
-        load, table.marker[observed.lead], sight, reach, _stated(model, observed),
-        table, observed.lead, visit_record(model, observed, x),
+        at.B.reshape(n, size, -1), at.residual.reshape(n, size), observed.configuration,
+        observed.load, table.marker[observed.lead], sight, reach,
+        stated_by_observation(observed, model.cell.tracker), table, observed.lead,
+        visit_record(model, observed, x),
     )  # fmt: skip
 
 
@@ -780,20 +778,3 @@ def _sight(model: Model, observed: Observations) -> tuple[Array | None, Array | 
     if not (reach > 0).all():
         return None, None
     return polar_axes(offset), reach
-
-
-def _stated(model: Model, observed: Observations) -> Array | None:
-    """Stated covariance (N, size, size) of each observation, None where none is stated.
-
-    Observations that share a reading are correlated; here each stands for itself.
-    """
-    kind = available_noise(observed.table, model.cell.tracker)
-    if kind == "none" and observed.kind != "distance":
-        return None
-    try:
-        rows = stated_covariance(observed, model.cell.tracker, kind)[0]
-    except InputError:
-        return None
-    n = len(observed.lead)
-    squared = sparse.csr_array(observed.combine.power(2))
-    return (squared @ rows.reshape(len(rows), -1)).reshape(n, observed.size, observed.size)

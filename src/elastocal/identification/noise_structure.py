@@ -12,7 +12,7 @@ from scipy import sparse
 
 from elastocal.errors import InputError, option, require
 from elastocal.identification.visit_record import VisitRecord
-from elastocal.measurements import Measurements
+from elastocal.measurements import Measurements, numbered
 from elastocal.plugin_loader import check_registered, same_class
 from elastocal.text import did_you_mean, quoted
 from elastocal.units import Array, BoolArray, IntArray
@@ -79,7 +79,7 @@ class Readings:
         labels = [self.configuration, self.load, self.marker]
         if self.apart and self.visits is not None:
             labels.append(self.visits.visit[:, 0])
-        return np.unique(np.column_stack(labels), axis=0, return_inverse=True)[1].ravel()
+        return numbered(*labels)
 
     @cached_property
     def sets(self) -> RepeatSets:
@@ -539,9 +539,7 @@ def shared_effects(sets: RepeatSets, size: int, wanted: bool = True) -> tuple[Sh
         return ()
     kept: dict[tuple[str, ...], IntArray] = {}
     for by in PARTITIONS:
-        unit = np.unique(
-            np.column_stack([getattr(sets, label) for label in by]), axis=0, return_inverse=True
-        )[1].ravel()
+        unit = numbered(*(getattr(sets, label) for label in by))
         # Alone in its unit and not repeated, a reading's own noise covers it.
         observed = np.bincount(unit, sets.repeats)
         if (observed < 2).all() or any(np.array_equal(unit, other) for other in kept.values()):

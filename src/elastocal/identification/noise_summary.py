@@ -21,7 +21,7 @@ from elastocal.identification.noise_choice import (
 from elastocal.identification.noise_structure import DRIFT, SHARED
 from elastocal.identification.weighted_problem import Weights, block_diagonal, weights_for, whitener
 from elastocal.measurements import Measurements
-from elastocal.model.observations import Observations
+from elastocal.model.observations import Observations, pure_error
 from elastocal.units import Array
 
 # Lack of fit: do configurations scatter more than repeats of one configuration?
@@ -45,24 +45,12 @@ def lack_of_fit(observed: Observations, whitened: Array, n_parameters: int) -> L
     of freedom; what is left of the residual sum of squares lies between them (Draper and Smith
     1998, section 2.1).  None where nothing is repeated, or no degree of freedom is left.
     """
-    table, size = observed.table, observed.size
-    key = np.column_stack(
-        [table.configuration, table.marker, np.round(table.force, 6)],
-    )[observed.lead]
-    _, group, count = np.unique(key, axis=0, return_inverse=True, return_counts=True)
-    group = group.ravel()
-    dof_pure = int((count - 1).sum()) * size
+    residual = whitened.reshape(-1, observed.size)
+    pure, dof_pure = pure_error(observed.place, residual)
     dof_between = len(whitened) - n_parameters - dof_pure
-    if dof_pure < 1 or dof_between < 1:
+    if dof_pure < 1 or dof_between < 1 or pure <= 0:
         return None
-    residual = whitened.reshape(-1, size)
-    mean = np.zeros((len(count), size))
-    np.add.at(mean, group, residual)
-    mean /= count[:, None]
-    pure = float(((residual - mean[group]) ** 2).sum())
     between = max(float((residual**2).sum()) - pure, 0.0)
-    if pure <= 0:
-        return None
     F = (between / dof_between) / (pure / dof_pure)
     return LackOfFit(F, float(stats.f.sf(F, dof_between, dof_pure)), dof_between, dof_pure)
 

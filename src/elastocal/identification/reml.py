@@ -12,6 +12,7 @@ from scipy import linalg, sparse, special, stats
 from elastocal.errors import InsufficientDataError
 from elastocal.identification.covariance import Covariance
 from elastocal.identification.noise_structure import RepeatSets, SharedEffect, Structure
+from elastocal.identification.weighted_problem import WhitenedBlocks
 from elastocal.units import Array, BoolArray, IntArray
 
 # Clusters of correlated sets of repeats, stacked by size: linear algebra runs on whole stacks.
@@ -272,12 +273,9 @@ def _within(
 def _whiten(stack: Stack, theta: Array) -> Whitened:
     G, L, n, _ = stack.part.shape
     V = (theta[stack.index][:, None] @ stack.part.reshape(G, L, -1)).reshape(G, n, n)
-    R = np.linalg.cholesky(V)
-    inverse = np.linalg.inv(R)
+    inverse, B, e, log_det = WhitenedBlocks.of(V, stack.B, stack.e)
     A = inverse[:, None] @ stack.part @ inverse.transpose(0, 2, 1)[:, None]
-    e = (inverse @ stack.e[:, :, None])[..., 0]
-    log_det = 2 * float(np.log(np.diagonal(R, axis1=1, axis2=2)).sum())
-    return Whitened(stack, inverse, A, inverse @ stack.B, e, log_det)
+    return Whitened(stack, inverse, A, B, e, log_det)
 
 
 # Variances by restricted maximum likelihood: Newton and Fisher steps, variances kept ≥ 0.

@@ -18,6 +18,7 @@ from elastocal.identification.weighted_problem import (
     Weights,
     in_order,
     regressor,
+    same_size,
 )
 from elastocal.model.manipulator import Model
 from elastocal.model.observations import COMPONENTS, Observations
@@ -100,12 +101,9 @@ def held_out_by_parts(
 def _growth(B: Array, Q: Array, R: Array, e: Array, configuration: IntArray) -> Array:
     """By how much (rows,) the residual grows where its configuration is left out."""
     growth = np.empty(len(e))
-    order = np.argsort(configuration, kind="stable")
-    _, starts, counts = np.unique(configuration[order], return_index=True, return_counts=True)
-    for count in np.unique(counts):
-        rows = order[starts[counts == count][:, None] + np.arange(count)]
+    for rows in same_size(configuration):
         Qc, ec = Q[rows], e[rows]
-        if count > Q.shape[1]:
+        if rows.shape[1] > Q.shape[1]:
             # (I − Q_cᵀQ_c)⁻¹ Q_cᵀ is the same map, by a matrix of the parameters' size.
             moved, alone = _moved(Qc.transpose(0, 2, 1) @ Qc, _times(Qc.transpose(0, 2, 1), ec))
         else:
@@ -144,10 +142,8 @@ def _growth_of_blocks(B: Array, residual: Array, weights: Weights, block: IntArr
     F = weights.common
     assert F is not None
     (n, p), k = B.shape, F.shape[1]
-    held = np.hstack([np.zeros((k, p)), np.eye(k)])
-    rows = np.vstack([weights.alone(np.hstack([B, F])), held])
+    rows, e = weights.beside_common(B, residual)
     Q, R = linalg.qr(rows, mode="economic")
-    e = np.concatenate([weights.alone(residual), np.zeros(k)])
     e = e - Q @ (Q.T @ e)
     seen = np.hstack([np.vstack([B, np.zeros((k, p))]), np.zeros((n + k, k))])
     labels = np.concatenate([block, block.max() + 1 + np.arange(k)])
@@ -168,8 +164,7 @@ def as_of_another_campaign(B: Array, weights: Weights, size: int) -> Array:
     F, together = weights.common, weights.together
     assert F is not None and together is not None and weights.whiten is not None
     p, k = B.shape[1], F.shape[1]
-    held = np.hstack([np.zeros((k, p)), np.eye(k)])
-    Q, R = linalg.qr(np.vstack([weights.alone(np.hstack([B, F])), held]), mode="economic")
+    Q, R = linalg.qr(weights.beside_common(B, np.zeros(len(B)))[0], mode="economic")
     T = linalg.solve_triangular(R, np.eye(p + k))
     factor = np.ones(len(B))
     block, whiten = np.repeat(together, size), weights.whiten.tocsr()

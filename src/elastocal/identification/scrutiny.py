@@ -80,13 +80,8 @@ class Influence:
 def influence(fit: Looked) -> tuple[Influence, ...]:
     """Leverage and influence of every configuration, in the order of the table."""
     observed, weights, B = fit.observations, fit.weights, fit.fitted
-    p, F = B.shape[1], fit.weights.common
-    if F is None:
-        rows, e = weights.apply(B), weights.apply(fit.residual)
-    else:  # what all readings share is fitted along, held by rows of its own that stay
-        k = F.shape[1]
-        rows = np.vstack([weights.alone(np.hstack([B, F])), np.eye(k, p + k, p)])
-        e = np.concatenate([weights.alone(fit.residual), np.zeros(k)])
+    p = B.shape[1]
+    rows, e = weights.beside_common(B, fit.residual)  # what all share is fitted along
     Q, R = linalg.qr(rows, mode="economic")
     e = e - Q @ (Q.T @ e)
     s2 = float(e @ e) / max(fit.dof, 1)

@@ -13,7 +13,6 @@ exactly under the model, the smooth functions as random as their prior says.
 
 from __future__ import annotations
 
-from collections.abc import Iterator
 from dataclasses import dataclass, replace
 from functools import reduce
 from typing import NamedTuple
@@ -66,6 +65,7 @@ from elastocal.identification.weighted_problem import (
     in_order,
     partition,
     regressor,
+    same_size,
 )
 from elastocal.model.manipulator import Model
 from elastocal.model.observations import Observations, subset
@@ -363,7 +363,7 @@ def crossed(fit: JointFit, step: Array | None = None) -> Crossed:
         standard, growth = np.empty(len(e)), np.empty(len(e))
         lost = np.zeros(len(e), dtype=bool)
         rows_of = np.repeat(part.observations.configuration, observed.size)
-        for rows in _same_size(rows_of):
+        for rows in same_size(rows_of):
             Qc, ec = Q[rows], e[rows]
             gap = np.eye(rows.shape[1]) - Qc @ Qc.transpose(0, 2, 1)
             values, vectors = np.linalg.eigh(gap)
@@ -419,14 +419,6 @@ def _unwhitened(weights: Weights, e: Array) -> Array:
     if weights.whiten is None:
         return e
     return np.asarray(sparse.linalg.spsolve(weights.whiten.tocsc(), e))
-
-
-def _same_size(codes: IntArray) -> Iterator[IntArray]:
-    """Rows (groups, k) of groups with the same code, by their number k of rows."""
-    order = np.argsort(codes, kind="stable")
-    _, starts, counts = np.unique(codes[order], return_index=True, return_counts=True)
-    for count in np.unique(counts):
-        yield order[starts[counts == count][:, None] + np.arange(count)]
 
 
 def with_functions_free(solution: Solution) -> Solution:

@@ -68,6 +68,38 @@ class Sums:
         )  # fmt: skip
 
 
+class Standardised(NamedTuple):
+    """Coefficients with a prior, in units of their prior deviations √v: L of A = LLᵀ = 1 + √v M √v
+    and A b = √v z, of the sums M = CᵀC and z = Cᵀe over whitened columns and rows.
+
+    Their likelihood, integrated out, is that of e without them but for −2ℓ = log|A| − `explained`.
+    """
+
+    L: Array
+    b: Array
+    explained: float
+
+    @classmethod
+    def of(cls, M: Array, z: Array, root: Array) -> Standardised:
+        """Of prior deviations `root` (k,)."""
+        A = M * root
+        A *= root[:, None]
+        A[np.diag_indices_from(A)] += 1.0
+        L = linalg.cholesky(A, lower=True, overwrite_a=True, check_finite=False)
+        right = root * z
+        b = linalg.cho_solve((L, True), right, check_finite=False)
+        return cls(L, b, float(b @ right))
+
+    @property
+    def log_det(self) -> float:
+        return 2 * float(np.log(np.diag(self.L)).sum())
+
+    @property
+    def covariance(self) -> Array:
+        """A⁻¹ (k, k), its lower triangle."""
+        return np.asarray(linalg.lapack.dpotri(self.L, lower=1)[0])
+
+
 class _Terms(NamedTuple):
     """−2ℓ, its slope in log T (groups,), q, and |b|²/T (groups,) in it."""
 
@@ -159,11 +191,6 @@ class ShrunkProblem(LinearRows):
         """Rows less ordinary parameters."""
         return max(self.rows - self.ordinary, 1)
 
-    @cached_property
-    def _scaled(self) -> tuple[Array, Array, float]:
-        """s BᵀB s and s Bᵀe of the shrunk columns, the ordinary ones projected out, and |e|²."""
-        return self.std[:, None] * self.gram * self.std, self.std * self.right, self.total
-
     def scales(self, start: Scales | None = None) -> Scales:
         """λ and σ² of the largest restricted likelihood, where λ above 1 has its PRICE; what is 0
         at the `start` stays so.
@@ -224,28 +251,16 @@ class ShrunkProblem(LinearRows):
 
     def _terms(self, ratio: Array, slopes: bool = False) -> _Terms:
         """−2ℓ at T (groups,), with its slope in log T where that is asked for."""
-        M, y, total = self._scaled
-        root = np.sqrt(ratio)[self.group]
-        own = np.flatnonzero(root > 0)
-        root, zero = root[own], np.zeros(self.n_groups)
-        if not len(own):
-            q = max(total, 1e-300)
-            return _Terms(self.spare * float(np.log(q)), zero, q, zero)
-        A = M[np.ix_(own, own)] if len(own) < len(M) else M.copy()
-        A *= root[:, None]
-        A *= root
-        A[np.diag_indices_from(A)] += 1.0
-        L = linalg.cholesky(A, lower=True, overwrite_a=True, check_finite=False)
-        right = root * y[own]
-        b = linalg.cho_solve((L, True), right, check_finite=False)
-        q = max(total - float(b @ right), 1e-300)
-        value = self.spare * float(np.log(q)) + 2 * float(np.log(np.diag(L)).sum())
-        if not slopes:
+        root = np.sqrt(ratio)[self.group] * self.std
+        own, zero = np.flatnonzero(root > 0), np.zeros(self.n_groups)
+        at = Standardised.of(self.gram[np.ix_(own, own)], self.right[own], root[own])
+        q = max(self.total - at.explained, 1e-300)
+        value = self.spare * float(np.log(q)) + at.log_det
+        if not slopes or not len(own):
             return _Terms(value, zero, q, zero)
-        inverse, _ = linalg.lapack.dpotri(L, lower=1, overwrite_c=1)
         squares, known = (
             np.asarray(np.bincount(self.group[own], each, self.n_groups), dtype=np.float64)
-            for each in (b**2, 1 - np.diag(inverse))
+            for each in (at.b**2, 1 - np.diag(at.covariance))
         )
         return _Terms(value, known - self.spare / q * squares, q, squares)
 
@@ -254,13 +269,10 @@ class ShrunkProblem(LinearRows):
         root = np.sqrt(scales.scale / scales.variance)[self.group] * self.std
         own = np.flatnonzero(root > 0)
         root, across = root[own], self.across[:, own]
-        A = root[:, None] * self.gram[np.ix_(own, own)] * root
-        A[np.diag_indices_from(A)] += 1.0
+        at = Standardised.of(self.gram[np.ix_(own, own)], self.right[own], root)
+        b = root * at.b
         # UᵀU = B_sᵀB_s + σ²/Λ, ordinary columns projected out.
-        U = linalg.cholesky(A, overwrite_a=True, check_finite=False) / root
-        b = linalg.solve_triangular(
-            U, linalg.solve_triangular(U, self.right[own], trans="T"), check_finite=False
-        )
+        U = at.L.T / root
         R = np.block([[self.R, across], [np.zeros((len(own), self.ordinary)), U]])
         return ShrunkPosterior(
             R, self.z, b, self.ordinary, own, 1 / root, scales.variance, self.rows

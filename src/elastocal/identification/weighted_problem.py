@@ -6,7 +6,7 @@ from collections.abc import Callable, Iterable, Iterator, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass, replace
 from functools import cached_property, reduce
-from typing import Literal, TypeVar
+from typing import Literal, NamedTuple, TypeVar
 
 import numpy as np
 from numpy.typing import NDArray
@@ -64,6 +64,15 @@ class Weights:
     def alone(self, rows: Array) -> Array:
         """The same by what is not common to all readings, W₀."""
         return rows if self.whiten is None else self.whiten @ rows
+
+    def beside_common(self, B: Array, e: Array) -> tuple[Array, Array]:
+        """The whitened rows of B (rows, p) and e, with the coefficients of what all have in common
+        as further columns, held by rows of their own that are the last."""
+        if self.common is None:
+            return self.apply(B), self.apply(e)
+        p, k = B.shape[1], self.common.shape[1]
+        rows = np.vstack([self.alone(np.hstack([B, self.common])), np.eye(k, p + k, p)])
+        return rows, np.concatenate([self.alone(e), np.zeros(k)])
 
     def with_common(self, F: Array, together: IntArray) -> Weights:
         """With noise FFᵀ more, F (rows, k), that readings far from each other share."""
@@ -135,6 +144,22 @@ def stated_covariance(observed: Observations, tracker: Tracker, kind: str) -> tu
     return blocks, text
 
 
+def stated_by_observation(observed: Observations, tracker: Tracker) -> Array | None:
+    """Stated covariance (N, size, size) of each observation, None where none is stated.
+
+    Observations that share a reading are correlated; here each stands for itself.
+    """
+    kind = available_noise(observed.table, tracker)
+    if kind == "none" and observed.kind != "distance":
+        return None
+    try:
+        rows = stated_covariance(observed, tracker, kind)[0]
+    except InputError:
+        return None
+    stated = observed.combine.power(2) @ rows.reshape(len(rows), -1)
+    return np.asarray(stated).reshape(-1, observed.size, observed.size)
+
+
 def scaled_by_component(observed: Observations, sigma: Array) -> Weights:
     """Weights from one sigma per component (size,), known up to a common factor.
 
@@ -187,19 +212,53 @@ def inverse_factor(blocks: Array) -> Array:
             "the noise covariance is not positive definite; check what states it: "
             f"{option('covariance')}, the sigma columns of the table, or [tracker] of the cell"
         ) from None
-    return np.linalg.solve(factor, np.broadcast_to(np.eye(blocks.shape[1]), factor.shape))
+    return lower_inverse(factor)
+
+
+def lower_inverse(K: Array) -> Array:
+    """K⁻¹ of lower triangular K (C, m, m), by halves: a general inverse takes twice as long."""
+    if K.shape[1] == 1:
+        return 1 / K
+    h = K.shape[1] // 2
+    out = np.zeros_like(K)
+    out[:, :h, :h] = upper = lower_inverse(K[:, :h, :h])
+    out[:, h:, h:] = lower = lower_inverse(K[:, h:, h:])
+    out[:, h:, :h] = -lower @ (K[:, h:, :h] @ upper)
+    return out
+
+
+class WhitenedBlocks(NamedTuple):
+    """Blocks of rows whitened by their covariances V = KKᵀ, as every restricted likelihood has
+    them: `root` K⁻¹ (C, m, m), K⁻¹B (C, m, p), K⁻¹e (C, m) and log|V| of all."""
+
+    root: Array
+    B: Array
+    e: Array
+    log_det: float
+
+    @classmethod
+    def of(cls, V: Array, B: Array, e: Array) -> WhitenedBlocks:
+        """Raises LinAlgError where V (C, m, m) is not positive definite."""
+        K = np.asarray(np.linalg.cholesky(V), dtype=np.float64)
+        log_det = 2 * float(np.log(np.diagonal(K, axis1=1, axis2=2)).sum())
+        root = lower_inverse(K)
+        return cls(root, root @ B, (root @ e[..., None])[..., 0], log_det)
+
+
+def same_size(codes: NDArray[np.integer]) -> Iterator[IntArray]:
+    """Members (groups, k) of the groups that have one code, by their number k of members."""
+    order = np.argsort(codes, kind="stable")
+    _, starts, counts = np.unique(codes[order], return_index=True, return_counts=True)
+    for count in np.unique(counts):
+        yield order[starts[counts == count][:, None] + np.arange(count)]
 
 
 def whitener(covariance: sparse.csr_array) -> sparse.csr_array:
     """L⁻¹ of the Cholesky factor, block by block over groups of correlated rows."""
-    count, label = sparse.csgraph.connected_components(covariance, directed=False)
-    order = np.argsort(label, kind="stable")
-    sizes = np.bincount(label, minlength=count)
-    starts = np.concatenate([[0], np.cumsum(sizes)])
+    _, label = sparse.csgraph.connected_components(covariance, directed=False)
     rows, columns, values = [], [], []
-    for size in np.unique(sizes):
-        groups = np.flatnonzero(sizes == size)
-        members = order[starts[groups][:, None] + np.arange(size)]
+    for members in same_size(label):
+        size = members.shape[1]
         i, j = members[:, :, None], members[:, None, :]
         i, j = np.broadcast_arrays(i, j)
         dense = np.asarray(covariance[i.ravel(), j.ravel()]).reshape(i.shape)

@@ -10,8 +10,8 @@ from scipy import sparse
 
 from elastocal.cell.arm_description import CartesianNoise, PolarNoise, Tracker
 from elastocal.errors import InputError, require
-from elastocal.measurements import Measurements
-from elastocal.units import Array
+from elastocal.measurements import Measurements, load_states, numbered
+from elastocal.units import Array, IntArray
 
 SIZE = {"position": 3, "deflection": 3, "pose": 6, "distance": 1}
 COMPONENTS = {
@@ -44,6 +44,17 @@ class Observations:
     @property
     def configuration(self) -> NDArray[np.int64]:
         return self.table.configuration[self.lead]
+
+    @property
+    def load(self) -> IntArray:
+        """Number (N,) of the load state."""
+        return load_states(self.table.force[self.lead])
+
+    @property
+    def place(self) -> IntArray:
+        """Number (N,) of what was read: configuration, marker and load; of one number are repeats
+        of each other."""
+        return numbered(self.configuration, self.table.marker[self.lead], self.load)
 
     def apply(self, rows: NDArray) -> NDArray:
         """Combine a per-row array (n_rows, size, …) to observations (N, size, …)."""
@@ -78,6 +89,16 @@ def observe(table: Measurements, kind: str) -> Observations:
     if kind == "deflection":
         value = np.asarray(combine @ value)
     return Observations(kind, value.ravel(), combine, lead, table)
+
+
+def pure_error(group: IntArray, values: Array) -> tuple[float, int]:
+    """Sum of squares of `values` (n, d) about the mean of their `group` (n,), and its degrees of
+    freedom."""
+    _, group, count = np.unique(group, return_inverse=True, return_counts=True)
+    mean = np.zeros((len(count), values.shape[1]))
+    np.add.at(mean, group.ravel(), values)
+    left = values - (mean / count[:, None])[group.ravel()]
+    return float((left**2).sum()), int((count - 1).sum()) * values.shape[1]
 
 
 def alone(n: int) -> sparse.csr_array:
