@@ -78,7 +78,7 @@ class Result(Saved):
             >>> commands = ec.compensate(fit, [1.8, 0.0, 0.9], load=[0, 0, -2600])
             >>> commands.report("commands.html", inputs=["cell.toml", "data.csv"])
         """
-        import_module(PAGES).write_page(self, Path(path), inputs, command, seed)
+        write_page(self, path, inputs, command, seed)
 
     def plot(self, kind: str | None = None, interactive: bool = False) -> Any:
         """A figure of the result.
@@ -112,6 +112,14 @@ class Result(Saved):
             ['parameter', 'unit', 'value', 'std']
         """
         return _view(self).frame(self)
+
+
+def write_page(
+    result: object, path: str | Path, inputs: Any, command: str | None, seed: int | None,
+    **told: Any,
+) -> None:  # fmt: skip
+    """Write a result's page; `told` is what its kind of page takes besides."""
+    import_module(PAGES).write_page(result, Path(path), inputs, command, seed, **told)
 
 
 def headline(result: object) -> str:

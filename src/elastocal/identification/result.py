@@ -6,14 +6,13 @@ import math
 from collections.abc import Iterator, KeysView
 from dataclasses import dataclass, field
 from functools import cached_property
-from importlib import import_module
 from pathlib import Path
 from typing import Any, Literal
 
 import numpy as np
 from numpy.typing import ArrayLike
 
-from elastocal.above import PAGES, Result, headline
+from elastocal.above import Result, headline, write_page
 from elastocal.cell.arm_description import Unsteadiness
 from elastocal.errors import UnknownNameError
 from elastocal.identification import scrutiny
@@ -391,8 +390,7 @@ class Calibration(Result):
         Examples:
             >>> ec.identify("cell.toml", "data.csv").certificate("certificate.html")
         """
-        pages = import_module(PAGES)
-        pages.write_page(self, Path(path), inputs, command, seed, certificate=True)
+        write_page(self, path, inputs, command, seed, certificate=True)
 
     @property
     def faulty(self) -> tuple[Outlier, ...]:
