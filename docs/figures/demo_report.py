@@ -14,6 +14,7 @@ import sys
 import tempfile
 from pathlib import Path
 
+from PIL import Image
 from playwright.sync_api import sync_playwright
 
 PICTURE = Path(__file__).resolve().parents[1] / "images" / "demo_report.png"
@@ -31,3 +32,4 @@ if __name__ == "__main__":
         page.goto((Path(folder) / "demo_out" / "report.html").as_uri(), timeout=0)
         page.screenshot(path=PICTURE, timeout=0)
         browser.close()
+    Image.open(PICTURE).convert("RGB").quantize(200).save(PICTURE, optimize=True)
