@@ -14,6 +14,7 @@ import sys
 import tempfile
 from pathlib import Path
 
+from PIL import Image
 from playwright.sync_api import sync_playwright
 
 PICTURE = Path(__file__).resolve().parents[1] / "images" / "demo_report.png"
@@ -26,8 +27,9 @@ if __name__ == "__main__":
         demo = [sys.executable, "-m", "elastocal", "demo", "-q"]
         subprocess.run(demo, cwd=folder, env=environment, check=True, stdout=subprocess.DEVNULL)
         found = next(filter(None, map(shutil.which, NAMES)), None)
-        browser = started.chromium.launch(executable_path=found, args=["--no-sandbox"])
+        browser = started.chromium.launch(executable_path=found, args=["--no-sandbox"], timeout=0)
         page = browser.new_page(viewport=SIZE)
-        page.goto((Path(folder) / "demo_out" / "report.html").as_uri())
-        page.screenshot(path=PICTURE)
+        page.goto((Path(folder) / "demo_out" / "report.html").as_uri(), timeout=0)
+        page.screenshot(path=PICTURE, timeout=0)
         browser.close()
+    Image.open(PICTURE).convert("RGB").quantize(200).save(PICTURE, optimize=True)

@@ -46,11 +46,6 @@ class Saved:
         import_module(WRITERS).save(self, path, **how)
 
 
-def pages() -> Any:
-    """The module that writes a result as a page."""
-    return import_module(PAGES)
-
-
 class Result(Saved):
     """What every result of a verb offers: `report`, `plot`, `to_dataframe`, `save`, HTML."""
 
@@ -83,7 +78,7 @@ class Result(Saved):
             >>> commands = ec.compensate(fit, [1.8, 0.0, 0.9], load=[0, 0, -2600])
             >>> commands.report("commands.html", inputs=["cell.toml", "data.csv"])
         """
-        pages().write_page(self, Path(path), inputs, command, seed)
+        write_page(self, path, inputs, command, seed)
 
     def plot(self, kind: str | None = None, interactive: bool = False) -> Any:
         """A figure of the result.
@@ -105,7 +100,8 @@ class Result(Saved):
             >>> figure = ec.identify("cell.toml", "data.csv").plot("parameters")
             >>> figure.savefig("parameters.png")
         """
-        return _view(self).plot(self, kind, interactive, lambda: pages().figures_of(self))
+        pages = import_module(PAGES)
+        return _view(self).plot(self, kind, interactive, lambda: pages.figures_of(self))
 
     def to_dataframe(self) -> pd.DataFrame:
         """The result's main table as a pandas data frame; units stand in the column names.
@@ -116,6 +112,14 @@ class Result(Saved):
             ['parameter', 'unit', 'value', 'std']
         """
         return _view(self).frame(self)
+
+
+def write_page(
+    result: object, path: str | Path, inputs: Any, command: str | None, seed: int | None,
+    **told: Any,
+) -> None:  # fmt: skip
+    """Write a result's page; `told` is what its kind of page takes besides."""
+    import_module(PAGES).write_page(result, Path(path), inputs, command, seed, **told)
 
 
 def headline(result: object) -> str:

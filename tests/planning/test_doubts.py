@@ -21,7 +21,7 @@ FEW = {("joint_hardening", "joint3"): 0.3, ("off_axis_compliance", "joint2"): 0.
 def setup_with(doubts: dict | None, known: Known | None = None, n_poses: int = 5) -> Setup:
     cell = plan_cell(loads=DOWN[None], criterion="robust")
     states, load = load_states(cell), all_loads(POSES)
-    model, known = in_doubt(
+    model, known, _ = in_doubt(
         Model.assembled(CHAIN, cell), known or Known(), states, POSES, load, doubts
     )
     targets = target_poses.test_poses(cell, CHAIN, None, 0)
@@ -46,7 +46,7 @@ def test_what_may_be_missing_is_what_poses_and_loads_can_show() -> None:
 def test_equal_shares_of_doubt_add_up() -> None:
     cell = plan_cell(("base_frame",), "position", loads=DOWN[None])
     model = Model.assembled(CHAIN, cell)
-    whole, known = in_doubt(model, Known(), load_states(cell), POSES, all_loads(POSES))
+    whole, known, _ = in_doubt(model, Known(), load_states(cell), POSES, all_loads(POSES))
     prior = known.prior
     assert prior is not None
     at = {p.name: p for p in whole.parameters}

@@ -12,7 +12,7 @@ from typing import Any, Literal
 import numpy as np
 from numpy.typing import ArrayLike
 
-from elastocal.above import Result, headline, pages
+from elastocal.above import Result, headline, write_page
 from elastocal.cell.arm_description import Unsteadiness
 from elastocal.errors import UnknownNameError
 from elastocal.identification import scrutiny
@@ -390,7 +390,7 @@ class Calibration(Result):
         Examples:
             >>> ec.identify("cell.toml", "data.csv").certificate("certificate.html")
         """
-        pages().write_page(self, Path(path), inputs, command, seed, certificate=True)
+        write_page(self, path, inputs, command, seed, certificate=True)
 
     @property
     def faulty(self) -> tuple[Outlier, ...]:

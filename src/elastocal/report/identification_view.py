@@ -510,16 +510,14 @@ def _each(value: Any) -> Array:
 
 def certificate_contents(result: Calibration, budget: ErrorBudget | None) -> dict[str, Any]:
     """Words and tables of the calibration certificate."""
-    tracker = result.model.cell.tracker
-    noise = (
-        "none stated"
-        if tracker.noise is None
-        else ", ".join(
+    stated = result.model.cell.tracker.noise
+    noise = "none stated" if result.observations.table.sigma is None else "stated with each reading"
+    if stated is not None:
+        noise = ", ".join(
             f"{name.replace('_', ' ')} {', '.join(length(float(v)) for v in _each(value))}"
             + (" per m" if name.endswith("per_m") else "")
-            for name, value in vars(tracker.noise).items()
+            for name, value in vars(stated).items()
         )
-    )
     facts = [
         ("Robot", printable(result.model.chain.name)),
         ("Instrument, standard deviations", noise),
