@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections import Counter
 from dataclasses import replace
 from typing import Any
 
@@ -19,11 +20,14 @@ SHARES = np.array([6])
 
 
 class Walled(Feasibility):
-    """No move begins or ends beyond joint1 = `wall`."""
+    """No move begins or ends beyond joint1 = `wall`; counts how often it is asked for each."""
 
     wall = np.inf
+    asked: Counter[Any]
 
     def paths_free(self, q_from: Any, q_to: Any, loaded: Any) -> Any:
+        ends = zip(q_from, q_to, strict=True)
+        self.asked.update((frozenset((a.tobytes(), b.tobytes())), loaded) for a, b in ends)
         return (np.atleast_2d(q_from)[:, 0] < self.wall) & (np.atleast_2d(q_to)[:, 0] < self.wall)
 
 
@@ -39,7 +43,7 @@ def selection() -> tuple[Any, Selection]:
 
 def walled(wall: float) -> Walled:
     feasibility = Walled(CELL, CHAIN)
-    feasibility.wall = wall
+    feasibility.wall, feasibility.asked = wall, Counter()
     return feasibility
 
 
@@ -53,7 +57,9 @@ def test_a_plan_whose_moves_are_free_is_left_alone() -> None:
 def test_unreachable_poses_are_replaced_and_the_bound_still_holds() -> None:
     setup, found = selection()
     wall = np.sort(found.pool.q[:, 0])[45]
-    after, _, told = ordered(setup, found, SHARES, walled(wall), 0, lambda text: None)
+    cell = walled(wall)
+    after, _, told = ordered(setup, found, SHARES, cell, 0, lambda text: None)
+    assert max(cell.asked.values()) == 1, "each move is checked once, however often plans change"
     q = after.pool.q[after.chosen]
     assert (q[:, 0] < wall).all() and len(q) == 6
     assert after.value == pytest.approx(

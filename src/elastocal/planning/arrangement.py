@@ -79,7 +79,7 @@ class Selection:
 SAME = 1e-9  # of the largest number of the blocks: rounding
 MOST_REPLACED = 50  # poses that cannot be reached, before that is said instead
 TRIED = 6  # poses of a plan one of which a pose put into it must be able to reach
-LIKELY = 200  # candidates that gain most, of which that is found out
+LIKELY = 400  # candidates that gain most, of which that is found out
 VIA = 200  # candidates through which a blocked move may go
 
 
@@ -142,13 +142,13 @@ class _Paths:
 
     def __init__(self, feasibility: Feasibility) -> None:
         self.feasibility = feasibility
-        self.known: dict[tuple[bytes, bytes, bool], bool] = {}
+        self.known: dict[tuple[object, ...], bool] = {}
 
     def paths_free(self, q_from: Array, q_to: Array, loaded: bool) -> BoolArray:
         """As `Feasibility.paths_free`, of moves (M, n)."""
         ends = zip(q_from, q_to, strict=True)
         keys = [(*sorted((a.tobytes(), b.tobytes())), loaded) for a, b in ends]
-        new = [k for k, key in enumerate(keys) if key not in self.known]
+        new = list({key: k for k, key in enumerate(keys) if key not in self.known}.values())
         if new:
             free = self.feasibility.paths_free(q_from[new], q_to[new], loaded)
             self.known.update((keys[k], bool(f)) for k, f in zip(new, free, strict=True))

@@ -77,7 +77,9 @@ TRIES = 200  # per pose wanted, at most
 class Checker(Protocol):
     """The cell's rules: `Feasibility`, or what stands in for it.  It pickles."""
 
-    of_force: bool
+    @property
+    def of_force(self) -> bool:
+        """Does a rule ask how heavy the load is?"""
 
     def check(self, q: Array, force: Array, every: bool = True) -> PoseFeasibility:
         """Every rule on poses q (N, n) under a force (3,) N; of each up to the first that it

@@ -169,25 +169,20 @@ class RobustError(RemainingError):
 
 
 @dataclass(frozen=True)
-class PredictionVariance(TraceCriterion):
-    """Φ = (1/T) Σ_t tr(A_t V A_tᵀ), V = M⁻¹, in m²: the mean over a region's T points.
+class PredictionVariance(RemainingError):
+    """Φ = (1/T) Σ_t tr(A_t V A_tᵀ), V = M⁻¹, in m²: `test_pose` with equal weights, the mean over a
+    region's T points of the variance of what is predicted there.
 
-    A (S, T, r, p) in m per scaled parameter: what is predicted at point t, as r components.
-    `reported`: √Φ in µm, the root mean square error of prediction.  With the test poses as region
-    it is `test_pose` with equal weights.
+    `reported`: √Φ in µm, the root mean square error of prediction.
     Source: Fedorov 1972; Atkinson, Donev & Tobias 2007, ch. 10 (I- and V-optimality).
     """
 
     name = "I"
     title = "I-optimality: mean error of prediction over the test poses, rms"
-    unit = "µm"
-    scale = 1e6
-    needs = ("test_poses",)
 
     @classmethod
     def of(cls, inputs: CriterionInputs) -> Self:
-        A = inputs.targets()
-        return cls(np.einsum("stri,strj->sij", A, A, optimize=True) / A.shape[1])
+        return super().of(replace(inputs, weights=None))
 
 
 @dataclass(frozen=True)

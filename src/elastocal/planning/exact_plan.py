@@ -4,12 +4,13 @@ from __future__ import annotations
 
 from collections.abc import Callable, Iterable, Iterator, Mapping
 from dataclasses import dataclass, field, replace
-from typing import Any, Protocol
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
 from elastocal.errors import InsufficientDataError, require
+from elastocal.planning.checkpoint import Stage
 from elastocal.planning.criterion import Gradient
 from elastocal.planning.relaxation import Relaxed, relax
 from elastocal.planning.selection import (
@@ -76,6 +77,9 @@ class ExactPlan(Exchanged):
     values: Array
 
 
+NOWHERE = Stage(None)
+
+
 def exact_plan(
     problem: DesignProblem,
     *,
@@ -87,7 +91,7 @@ def exact_plan(
     jobs: int = 1,
     looks: int | None = None,
     found: IntArray | None = None,
-    checkpoint: ArrayStore | None = None,
+    checkpoint: Stage = NOWHERE,
     progress: Progress = lambda message: None,
 ) -> ExactPlan:
     """The plan of least Φ found from `starts` starts: exchange and iterated local search each.
@@ -351,29 +355,18 @@ def round_weights(
     return np.sort(np.concatenate(plan))
 
 
-class ArrayStore(Protocol):
-    """Where named arrays are kept, whole or not at all."""
-
-    def load(self) -> dict[str, NDArray[Any]] | None:
-        """What was saved last, None if nothing was."""
-
-    def save(self, state: Mapping[str, NDArray[Any]]) -> None:
-        """Keep `state` instead of what was saved before."""
-
-
-def save_finished(checkpoint: ArrayStore | None, done: Mapping[int, Exchanged], seed: int) -> None:
+def save_finished(checkpoint: Stage, done: Mapping[int, Exchanged], seed: int) -> None:
     """Keep all starts `done` so far, by their numbers."""
-    if checkpoint is not None:
-        fields = ("chosen", "value", "passes")
-        ends = {name: np.array([getattr(f, name) for f in done.values()]) for name in fields}
-        checkpoint.save({"seed": np.array(seed), "start": np.array(list(done)), **ends})
+    fields = ("chosen", "value", "passes")
+    ends = {name: np.array([getattr(f, name) for f in done.values()]) for name in fields}
+    checkpoint.save({"seed": np.array(seed), "start": np.array(list(done)), **ends})
 
 
 def load_finished(
-    checkpoint: ArrayStore | None, problem: DesignProblem, seed: int, starts: int
+    checkpoint: Stage, problem: DesignProblem, seed: int, starts: int
 ) -> dict[int, Exchanged]:
     """The starts that need not be made again; none where they are of another problem or seed."""
-    state = None if checkpoint is None else checkpoint.load()
+    state = checkpoint.load()
     if state is None or int(state["seed"]) != seed or not _belongs(state, problem):
         return {}
     numbered = zip(state["start"], state["chosen"], state["value"], state["passes"], strict=True)

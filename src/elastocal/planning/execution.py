@@ -355,7 +355,7 @@ def schedule(
     check_reachable(moves, blockers)
     costs = moves.costs()
     tour = greedy_tour(costs.cost)
-    thorough, done = False, False
+    thorough, done, rounds = False, False, 0
     while not done:
         effort = iterations if thorough else min(iterations, FEW_ITERATIONS)
         tour = shortest_tour(costs.cost, tour, seed, effort)
@@ -363,6 +363,8 @@ def schedule(
         blocked = moves.check(tour, costs)
         progress(f"order of execution: {moves.checked} moves checked, {moves.blocked} blocked")
         if blocked:
+            if (rounds := rounds + 1) > ROUNDS:  # one move at a time would take too long
+                moves.look_around(costs)
             costs = moves.costs()
         done, thorough = thorough and not blocked, not blocked
     refuse_impossible(moves, tour, costs, blockers)
@@ -404,7 +406,7 @@ def schedule(
     )
 
 
-ROUNDS = 12  # of blocked moves found and the order mended, before the ways around are taken
+ROUNDS = 12  # of blocked moves found and the order mended, before it is done at less expense
 
 
 def _against_drift(

@@ -240,6 +240,8 @@ class Roadmap:
 
 # The points of a schedule, its visits, and the moves between them, checked when needed.
 
+AROUND = 5  # visits next to each whose moves are checked where most moves are blocked
+
 
 @dataclass(frozen=True)
 class Moves:
@@ -338,8 +340,16 @@ class Moves:
 
     def check(self, tour: list[int], costs: Costs) -> bool:
         """Check every straight move of the tour not yet checked; is one of them news, blocked?"""
+        return self._blocked(pairwise([0, *tour, 0]), costs)
+
+    def look_around(self, costs: Costs) -> None:
+        """Check the moves to the AROUND visits that are next to each at these costs."""
+        ranked = np.argsort(costs.cost + np.diag(np.full(len(costs.cost), np.inf)), axis=1)
+        self._blocked(((u, int(v)) for u, row in enumerate(ranked) for v in row[:AROUND]), costs)
+
+    def _blocked(self, steps: Iterable[tuple[int, int]], costs: Costs) -> bool:
         wanted: list[list[tuple[int, int]]] = [[], []]
-        for u, v in pairwise([0, *tour, 0]):
+        for u, v in steps:
             roadmap, way = self.way(u, v, costs)
             # Where no way is left, every move has been checked: nothing to be learnt.
             wanted[roadmap.loaded] += [m for m in pairwise(way) if np.isfinite(roadmap.direct[m])]

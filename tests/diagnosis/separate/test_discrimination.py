@@ -3,13 +3,17 @@
 from __future__ import annotations
 
 from dataclasses import replace
+from types import SimpleNamespace
+from typing import Any
 
 import numpy as np
 import pytest
+from planning.feasibility.small_cells import gantry_at, gantry_rules
 from scipy import stats
 from support.cells import choices, kr270_cell, kr270_chain, random_poses, table_of
 
-from elastocal.cell.arm_description import CartesianNoise
+from elastocal.cell.arm_description import CartesianNoise, Tool, Tracker
+from elastocal.cell.workspace_rules import Visibility, Workspace
 from elastocal.diagnosis import (
     Baseline,
     Discrimination,
@@ -30,7 +34,7 @@ from elastocal.diagnosis import (
     rows_of,
     visit_pool_of,
 )
-from elastocal.diagnosis.discrimination import DRAWS
+from elastocal.diagnosis.discrimination import DRAWS, _hidden
 from elastocal.diagnosis.rivals import SETTINGS
 from elastocal.diagnosis.verdict import TOO_NEAR, TOO_NEAR_PROBABILITY
 from elastocal.measurements import Measurements
@@ -234,3 +238,14 @@ def test_a_rival_with_settings_imitates_by_its_best_ones(base, pool, discriminat
     assert 1 < len({float(item.settings[0]) for item in drifts}) == len(drifts) <= SETTINGS
     d = Discrimination.of(rivals, rows_of(whole, rivals), np.random.default_rng(0))
     assert d.distances(d.before)[0, 1] < 0.1
+
+
+@pytest.mark.parametrize("observe", ["position", "deflection"])
+def test_markers_that_the_tracker_does_not_see_are_not_read(observe: str) -> None:
+    markers = {"L": np.array([0, -1.0, 0]), "R": np.array([0, 1.0, 0])}
+    sight = Visibility({"L": np.array([-1.0, 0, 0])}, np.radians(30), min_markers=1)
+    eye = Tracker(position=np.array([3.0, 0.0, 0.0]))
+    rules = gantry_rules(Workspace(visibility=sight), Tool(markers=markers), eye)
+    arm: Any = SimpleNamespace(cell=rules.cell, chain=rules.chain, observe=observe)
+    hidden = _hidden(arm, gantry_at((0.2, 0, 0), (0, 0.1, 0)), np.zeros((2, 3)), ("R", "L"))
+    assert hidden.tolist() == [False, True] * 4

@@ -228,6 +228,17 @@ def test_the_order_of_rules_changes_who_removes_but_not_what_remains():
         assert (shuffled.feasible(q, DOWN) == verdict.ok).all()
 
 
+def test_a_pose_that_the_hanging_load_allows_needs_no_second_look_without_it():
+    given = full_cell()
+    light = replace(given, workspace=replace(given.workspace, torque_limits=()))
+    rules, q = Feasibility(light, KR270_CHAIN), kr270_poses(2000)
+    assert not rules.of_force and Feasibility(given, KR270_CHAIN).of_force
+    loaded = rules.check(q, DOWN)
+    assert rules.check(q[loaded.ok], NOTHING).ok.all()
+    first = rules.check(q, DOWN, every=False)
+    assert first.removed_by == loaded.removed_by and (first.ok == loaded.ok).all()
+
+
 def test_counts_add_up():
     rules = Feasibility(full_cell(), KR270_CHAIN)
     q, force = kr270_poses(3000), np.where(np.arange(3000)[:, None] % 2 == 0, DOWN, NOTHING)
