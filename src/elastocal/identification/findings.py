@@ -651,7 +651,7 @@ def next_steps(result: Calibration) -> list[Finding]:
     """Findings whose remedy is still to be told, each remedy once."""
     steps = {f.remedy: f for f in reversed(result.findings) if f.kind not in TOLD_ELSEWHERE}
     # One that begins with another says that too.
-    whole = {r for r in steps if not any(s != r and s.startswith(r) for s in steps)}
+    whole = {r for r in steps if r and not any(s != r and s.startswith(r) for s in steps)}
     order = [f for f in result.findings if f.remedy in whole and steps[f.remedy] is f]
     trust = [f for f in order if f.kind == "trust"]
     return [f for f in order if f.kind != "trust"] + trust

@@ -614,7 +614,8 @@ class Calibration(Result):
             "test_rms_um": None if self.test is None else _um(self.test.rms),
             "test_mean_um": None if self.test is None else _um(self.test.mean),
             "test_max_um": None if self.test is None else _um(self.test.maximum),
-            "verdict": self.verdict.to_json() | {"sentence": headline(self)},
+            "verdict": self.verdict.to_json()
+            | {"sentence": headline(self) if self.findings else None},
             "predicted_new_poses_um": None if self.predicted is None else self.predicted.to_json(),
             "measured_poses": None if self.shown is None else self.shown.to_json(),
             "open": None if self.left is None else self.left.to_json(),
