@@ -22,7 +22,7 @@ from elastocal.measurements import (
 from elastocal.text import is_label
 
 SETTINGS = settings(
-    deadline=None, max_examples=150, suppress_health_check=[HealthCheck.function_scoped_fixture]
+    deadline=None, max_examples=60, suppress_health_check=[HealthCheck.function_scoped_fixture]
 )
 KINDS = ("revolute", "revolute")
 HEADER = "q1_rad,q2_rad,x_m,y_m,z_m\n"

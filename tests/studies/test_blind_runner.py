@@ -316,7 +316,8 @@ OPTIONS = dict.fromkeys({name.partition("-")[0] for name in suites.SUITES}, 1)
 
 
 def test_a_task_is_the_suites_world_of_that_name_under_the_studys_seed(monkeypatch):
-    """However many worlds the study has: a part of it draws the same ones."""
+    """However many worlds the study has: a part of it draws the same ones.  The first and the last
+    of every suite."""
     drawn = []
 
     def one(task, origin):
@@ -324,11 +325,16 @@ def test_a_task_is_the_suites_world_of_that_name_under_the_studys_seed(monkeypat
         return origin | {"suite": task.suite, "answer": None, "seconds": 1.0}
 
     monkeypatch.setattr(study, "in_own_worker", one)
-    for k, given in enumerate(study.tasks(OPTIONS)):
+    every = list(study.tasks(OPTIONS))
+    ends = [{given["suite"]: given for given in order} for order in (every, every[::-1])]
+    chosen = [given for end in ends for given in end.values()]
+    for k, given in enumerate(chosen):
         rng = np.random.default_rng(np.random.SeedSequence(7, spawn_key=(k,)))
         assert json.loads(study.run(given, rng)["record"])["seed"] == 7
     whole = [task for suite in suites.SUITES for task in suites.tasks(suite, 7, 1)]
-    assert sorted(drawn, key=str) == sorted(whole, key=str)
+    found = {(task.suite, task.recipe.name): task for task in whole}
+    assert sorted(found) == sorted((given["suite"], given["world"]) for given in every)
+    assert drawn == [found[given["suite"], given["world"]] for given in chosen]
     two = [t["world"] for t in study.tasks(OPTIONS | {"catalogue": 2}) if t["suite"] == "catalogue"]
     assert two[: len(two) // 2] == [t.recipe.name for t in whole if t.suite == "catalogue"]
     fewer = list(study.tasks(OPTIONS | {"catalogue": 0, "clean": 0}))

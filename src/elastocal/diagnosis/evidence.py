@@ -145,13 +145,13 @@ def log_prior_odds(
     Effects are equally probable, and so are the places of one effect; kinds of blocks are equally
     probable, and so are the blocks of one kind.
     """
-    shares = []
+    shares: list[float] = []
     for names, whole in (
         ([h.name for h in hypotheses], 1 - UNKNOWN), ([g.kind for g in blocks], UNKNOWN),
     ):  # fmt: skip
         count = Counter(names)
         shares += [1 / (len(count) * count[name]) * whole for name in names]
-    return np.log(something / (1 - something) * np.array(shares))
+    return np.asarray(np.log(something / (1 - something) * np.array(shares)))
 
 
 # Gram matrices of regressor directions at an entry of the chain, without forming columns.

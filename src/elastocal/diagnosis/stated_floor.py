@@ -197,7 +197,8 @@ def smooth_scatter(dataset: DiagnosisData, data: NoisyData, at: Projection) -> A
         z = a[known, j] / np.sqrt(h[known, j])
         pairs = [*(_next_to(q[known, k]) for k in range(J)), _next_to(moment[known])]
         scaled = q[known] / np.maximum(q[known].std(axis=0), 1e-12)
-        pairs.append(tuple(_unordered(_nearest(scaled)[0]).T))
+        one, other = _unordered(_nearest(scaled)[0]).T
+        pairs.append((one, other))
         rho = np.array([_correlation(z, *p, limit) for p in pairs])
         share = min(max(float(rho[:J].sum()), float(rho[J:].max())), 1.0)
         out[j] = share * float((z**2).mean()) / float(h[known, j].mean())

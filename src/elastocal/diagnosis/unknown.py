@@ -47,7 +47,7 @@ def covariates(dataset: DiagnosisData) -> Iterator[Covariate]:
 
     q, torque = of_visits(table.q), of_visits(dataset.columns.torques())
     time, approach = if_recorded("time"), if_recorded("approach")
-    load, joints = None, range(q.shape[2])
+    joints = range(q.shape[2])
     loaded = [i for i in joints if np.ptp(torque[:, :, i][present]) > 0]
     few = [waves(q[:, :, i], present, FEW_WAVES) for i in joints]
     slow = None if time is None else waves(time, present, FEW_WAVES)
@@ -65,6 +65,7 @@ def covariates(dataset: DiagnosisData) -> Iterator[Covariate]:
     if (warmth := if_recorded("temperature")) is not None:
         functions = waves(warmth, present, FEW_WAVES)
         yield Covariate("temperature", "temperature", functions, warmth, "°C")
+    load: Array | None = None
     if recorded(table, "load"):
         force = np.linalg.norm(table.force, axis=1)
         load = of_visits(force / force.max())
@@ -76,7 +77,9 @@ def covariates(dataset: DiagnosisData) -> Iterator[Covariate]:
             yield Covariate("load × angle", f"load × joint{i + 1} angle", by_angle)
         if slow is not None:
             yield Covariate("load × time", "load × time", slow * load[:, :, None])
-    for i in joints if approach is not None else ():
+    for i in joints:
+        if approach is None:
+            break
         a = approach[:, :, i]
         by = [a] if load is None else [a, a * load]
         size = np.abs(torque[:, :, i])
@@ -91,7 +94,9 @@ def covariates(dataset: DiagnosisData) -> Iterator[Covariate]:
         yield Covariate("torque × angle", f"{name} × its angle", by_angle, joint=i)
         if slow is not None:
             yield Covariate("torque × time", f"{name} × time", slow * tau, joint=i)
-    for i in joints if slow is not None else ():
+    for i in joints:
+        if slow is None:
+            break
         product = few[i][:, :, :, None] * slow[:, :, None, :]
         both = product.reshape(*product.shape[:2], -1)
         yield Covariate("time × angle", f"time × joint{i + 1} angle", both)
