@@ -206,7 +206,7 @@ def block_diagonal(blocks: Array) -> sparse.csr_array:
 def inverse_factor(blocks: Array) -> Array:
     """L⁻¹ of each block (n, d, d) = L Lᵀ."""
     try:
-        factor = np.linalg.cholesky(blocks)
+        factor = np.asarray(np.linalg.cholesky(blocks), dtype=np.float64)
     except np.linalg.LinAlgError:
         raise InputError(
             "the noise covariance is not positive definite; check what states it: "

@@ -345,7 +345,7 @@ class _Design:
             self.model, options = self._without_functions(options)
         self.model, self.options = self._without_conditions(options)
         # What the cell as it stands says of test poses and of measurements holds for others too.
-        self.work = self.model if first is None else first.work
+        self.work: Model = self.model if first is None else first.work
         self.done: dict[tuple[str, ...], Done] = {} if first is None else first.done
         self.cell = self.model.cell
         self.chain = self.model.chain
