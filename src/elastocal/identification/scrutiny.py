@@ -7,6 +7,7 @@ from the fit's B, its weights and its residual; nothing is fitted anew.
 
 from __future__ import annotations
 
+import math
 from dataclasses import asdict, dataclass
 from typing import Any
 
