@@ -26,7 +26,7 @@ from elastocal.model.manipulator import Model, Regression
 from elastocal.model.observations import Observations
 from elastocal.units import Array
 
-# Levenberg–Marquardt on R factors, where one evaluation is a pass over a large table.
+# Levenberg–Marquardt on R factors, as a trust region.
 
 SETTLED = "the sum of squares no longer fell"
 NEGLIGIBLE = "the steps became negligible"
@@ -87,8 +87,8 @@ class SumOfSquares:
 
 
 def _within(s: Array, z: Array, radius: float) -> Array:
-    """Minimiser w of |z − s w|² over |w| ≤ radius, by Newton's method on the damping (Moré and
-    Sorensen 1983, SIAM J. Sci. Stat. Comput. 4, 553)."""
+    """Minimiser w of |z − s w|² over |w| ≤ radius, by Newton's method on the damping (Moré 1978,
+    Lecture Notes in Mathematics 630, 105)."""
     w, damping = z / s, 0.0
     for _ in range(20):
         length = float(np.linalg.norm(w))

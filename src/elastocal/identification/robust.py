@@ -10,7 +10,7 @@ from numpy.typing import ArrayLike, NDArray
 from scipy import linalg, stats
 
 from elastocal.errors import ElastocalError, InsufficientDataError, require
-from elastocal.identification.covariance import Covariance
+from elastocal.identification.covariance import Covariance, SatterthwaiteSums
 from elastocal.identification.least_squares import FitProblem
 from elastocal.identification.robust_core import Absolute, RobustEstimate, huber, lengths
 from elastocal.identification.robust_fits import SUBSETS, m_estimate, mm_estimate, student_t
@@ -195,12 +195,9 @@ def _satterthwaite(W_g: Array, rest: Array, inverse: Array, P: Array) -> Array:
     reach = np.linalg.solve(rest, np.broadcast_to(P.T, rest.shape))  # (G, p, p), by parameter
     m = W_g @ reach
     # T = diag(own) − K with K_gh = m_gᵀ W⁻¹ m_h, never formed: there may be thousands of clusters.
-    own = np.einsum("gij,gij->gj", reach, m)
-    shared = np.einsum("gij,gij->gj", m, inverse @ m)
-    product = inverse @ np.einsum("gij,gkj->jik", m, m)
-    trace = (own - shared).sum(axis=0)
-    square = (own**2 - 2 * own * shared).sum(axis=0) + np.einsum("jik,jki->j", product, product)
-    return np.asarray(trace**2 / square)
+    sums = SatterthwaiteSums(len(P))
+    sums.add(np.einsum("gij,gij->gj", reach, m), linalg.cholesky(inverse) @ m)
+    return sums.dof()
 
 
 # Robust fit of the nonlinear model: linear robust steps on the exact B.

@@ -16,6 +16,7 @@ from scipy import linalg
 
 from elastocal.identification.prediction import mean_squares
 from elastocal.identification.residuals import ALONE, held_out_residual, rms_3d
+from elastocal.identification.smooth_prior import Standardised
 from elastocal.identification.weighted_problem import Weights
 from elastocal.measurements import Measurements
 from elastocal.model.calibrated import CalibratedArm
@@ -302,10 +303,8 @@ def _restricted(
     if placed.any():
         basis = linalg.qr(white[:, placed], mode="economic")[0]
         A, y = A - basis @ (basis.T @ A), y - basis @ (basis.T @ y)
-    U, s, _ = linalg.svd(A, full_matrices=False)
-    along = U.T @ y
-    rest = float(y @ y) - float((along**2 * s**2 / (s**2 + s2)).sum())
-    return -0.5 * (float(np.log1p(s**2 / s2).sum()) + rest / s2)
+    found = Standardised.of(A.T @ A, A.T @ y, np.full(A.shape[1], 1 / np.sqrt(s2)))
+    return -0.5 * (found.log_det + (float(y @ y) - found.explained) / s2)
 
 
 def stage_of(effect: str) -> int:
