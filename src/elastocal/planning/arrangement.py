@@ -121,15 +121,11 @@ def ordered(
             stage = (checkpoint or Checkpoint()).stage(f"replaced{lost}")
             state = stage.finished(
                 partial(
-                    _replaced,
-                    setup.having(pinned).problem(found.pool, shares),
-                    found.chosen,
-                    gone,
-                    _nearer(feasibility, found.pool.q),
-                    plan.pool.q[np.setdiff1d(chosen, gone)],
+                    _replaced, setup.having(pinned).problem(found.pool, shares), found.chosen, gone,
+                    _nearer(feasibility, found.pool.q), plan.pool.q[np.setdiff1d(chosen, gone)],
                     paths,
                 )
-            )
+            )  # fmt: skip
             found = found.without(gone, state["chosen"], setup.having(pinned))
             continue
         return plan, execution, _warnings(lost, execution)
