@@ -19,7 +19,7 @@ ROOMS = {
     "arrangement": "Selection ordered",
     "design": "DesignOptions DesignSearch Effort",
     "doubts": "in_doubt missing usual_sizes",
-    "exact_plan": "Prices efficient_rounding random_plans round_weights size_curve",
+    "exact_plan": "Prices efficient_rounding round_weights size_curve",
     "drift": "Alias Drifting",
     "execution": "greedy_tour held_karp_bound schedule shortest_tour tour_bound tour_cost",
     "feasibility": "Feasibility PoseFeasibility",

@@ -101,8 +101,6 @@ def ordered(
     lost, unwound, paths = 0, False, _Paths(feasibility)
     while True:
         plan = found.whole(pinned)
-        q = plan.pool.q[plan.chosen]
-        unwound = unwound or bool(_apart(paths, q, q).any())
         if unwound:
             plan = _unwound(setup, plan, feasibility)
         chosen = plan.chosen
@@ -123,15 +121,11 @@ def ordered(
             stage = (checkpoint or Checkpoint()).stage(f"replaced{lost}")
             state = stage.finished(
                 partial(
-                    _replaced,
-                    setup.having(pinned).problem(found.pool, shares),
-                    found.chosen,
-                    gone,
-                    _nearer(feasibility, found.pool.q),
-                    plan.pool.q[np.setdiff1d(chosen, gone)],
+                    _replaced, setup.having(pinned).problem(found.pool, shares), found.chosen, gone,
+                    _nearer(feasibility, found.pool.q), plan.pool.q[np.setdiff1d(chosen, gone)],
                     paths,
                 )
-            )
+            )  # fmt: skip
             found = found.without(gone, state["chosen"], setup.having(pinned))
             continue
         return plan, execution, _warnings(lost, execution)
@@ -197,11 +191,10 @@ def _replaced(
 
 
 def _apart(paths: _Paths, q: Array, there: Array) -> BoolArray:
-    """(N,): no free move joins the posture q (N, n) to one of the TRIED others next to it that are
-    `there` (k, n)."""
+    """(N,): no free move joins the posture q (N, n) to one of the TRIED next to it of those that
+    are `there` (k, n)."""
     loaded = bool(np.any(paths.feasibility.cell.design.loads))
-    off = np.abs(q[:, None] - there).max(axis=2)
-    next_to = np.argsort(np.where(off > 0, off, np.inf), axis=1)
+    next_to = np.argsort(np.abs(q[:, None] - there).max(axis=2), axis=1)
     alone = np.arange(len(q))
     for k in range(min(TRIED, len(there))):
         alone = alone[~paths.paths_free(q[alone], there[next_to[alone, k]], loaded)]

@@ -5,7 +5,6 @@ from __future__ import annotations
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, replace
 from itertools import islice
-from typing import Protocol
 
 import numpy as np
 from scipy.stats import qmc
@@ -13,7 +12,7 @@ from scipy.stats import qmc
 from elastocal.cell.work_cell import Cell
 from elastocal.errors import InsufficientDataError, require
 from elastocal.model.chain import Chain, finite_ranges, joint_index, joint_limits
-from elastocal.planning.feasibility import PoseFeasibility
+from elastocal.planning.feasibility import Feasibility, PoseFeasibility
 from elastocal.planning.information import ALL_LOADS, LoadStates
 from elastocal.units import Array, BoolArray, IntArray, Progress
 
@@ -74,24 +73,6 @@ PER_TASK = 4  # chunks that a process checks at a time
 TRIES = 200  # per pose wanted, at most
 
 
-class Checker(Protocol):
-    """The cell's rules: `Feasibility`, or what stands in for it.  It pickles."""
-
-    @property
-    def of_force(self) -> bool:
-        """Does a rule ask how heavy the load is?"""
-
-    def check(self, q: Array, force: Array, every: bool = True) -> PoseFeasibility:
-        """Every rule on poses q (N, n) under a force (3,) N; of each up to the first that it
-        breaks where not `every`."""
-
-    def feasible(self, q: Array, force: Array) -> BoolArray:
-        """(N,) as check(q, force).ok, quicker."""
-
-    def advice(self, verdict: PoseFeasibility) -> str:
-        """Which rule to relax."""
-
-
 @dataclass(frozen=True)
 class Candidates:
     """Feasible poses q (N, n) with their load state `load` (N,), ALL_LOADS where a pose is
@@ -124,7 +105,7 @@ def draw(
     cell: Cell,
     chain: Chain,
     states: LoadStates,
-    checker: Checker,
+    checker: Feasibility,
     n: int,
     seed: int,
     jobs: int = 1,
@@ -167,7 +148,7 @@ def sobol(space: JointSpace, group: int, stream: np.random.SeedSequence) -> Iter
         yield space.poses(engine.random(CHUNK), group)
 
 
-def feasible(checker: Checker, q: Array, forces: Array) -> BoolArray:
+def feasible(checker: Feasibility, q: Array, forces: Array) -> BoolArray:
     """(N,): poses q (N, n) break no rule under any of `forces` (k, 3) N."""
     ok = np.ones(len(q), dtype=bool)
     for force in deciding(checker, forces):
@@ -175,7 +156,7 @@ def feasible(checker: Checker, q: Array, forces: Array) -> BoolArray:
     return ok
 
 
-def deciding(checker: Checker, forces: Array) -> Array:
+def deciding(checker: Feasibility, forces: Array) -> Array:
     """The `forces` (k, 3), the heaviest first, that say under which of them a pose is feasible:
     where no rule asks how heavy the load is, where it hangs everything counts that counts at all.
     """
@@ -184,7 +165,7 @@ def deciding(checker: Checker, forces: Array) -> Array:
 
 
 def _check(
-    checker: Checker, states: LoadStates, group: int, q: Array
+    checker: Feasibility, states: LoadStates, group: int, q: Array
 ) -> tuple[Candidates, PoseFeasibility]:
     """The feasible candidates among poses q (N, n) of a group, and the first rule that each breaks.
 
@@ -211,7 +192,7 @@ def _check(
 
 
 def _checked(
-    checker: Checker, states: LoadStates, group: int, chunks: Iterator[Array], jobs: int
+    checker: Feasibility, states: LoadStates, group: int, chunks: Iterator[Array], jobs: int
 ) -> Iterator[tuple[Candidates, PoseFeasibility]]:
     """Each chunk checked, in order, on `jobs` processes."""
     if jobs == 1:

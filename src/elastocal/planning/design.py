@@ -198,15 +198,10 @@ class _Rounds:
             self.problem(pool),
             relaxed_weights=None if relaxed is None else relaxed.weights,
             tangent=None if relaxed is None else relaxed.tangent,
-            warm=warm,
-            starts=effort.starts,
-            seed=self.options.seed,
-            jobs=self.options.jobs,
-            looks=effort.looks,
-            found=found,
-            checkpoint=self.checkpoint.stage(f"exchange{k}"),
-            progress=self.progress,
-        )
+            starts=effort.starts, looks=effort.looks, found=found, warm=warm,
+            seed=self.options.seed, jobs=self.options.jobs,
+            checkpoint=self.checkpoint.stage(f"exchange{k}"), progress=self.progress,
+        )  # fmt: skip
         return best.chosen
 
     def polish(self, pool: FeasiblePool, chosen: IntArray, k: int) -> tuple[FeasiblePool, IntArray]:
@@ -425,18 +420,10 @@ class _Design:
         known = self._with_done(known, model)
         progress("information of the candidates")
         setup = set_up(
-            model,
-            self.states,
-            q,
-            load,
-            int((shares + self.pinned).sum()),
-            targets,
-            known,
-            options.seed,
-            region,
-            self.feasibility.seen if self.feasibility.partial else None,
+            model, self.states, q, load, int((shares + self.pinned).sum()), targets, known,
+            options.seed, region, self.feasibility.seen if self.feasibility.partial else None,
             model if self.work is self.model else self.work.with_effects(model.cell.model.effects),
-        )
+        )  # fmt: skip
         self.warnings += setup.warnings
         pool, pinned = setup.pool(q, load, group), None
         if pins is not None and len(pins.q):
@@ -564,11 +551,9 @@ class _Design:
             ),
             # That of the size that is planned gets its other starts then.
             starts=max(effort.starts // FEWER, 1),
-            seed=self.options.seed,
-            jobs=self.options.jobs,
-            looks=effort.looks,
+            seed=self.options.seed, jobs=self.options.jobs, looks=effort.looks,
             progress=self.progress,
-        )
+        )  # fmt: skip
         n = found.smallest or 0
         total = int((shares + self.pinned).sum())
         if target is None and np.array_equal(self._shares(total), shares):

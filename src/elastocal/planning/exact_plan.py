@@ -37,15 +37,8 @@ DRAWN = 20
 STREAM = 10_000  # of the seed's children, beyond those that draw candidates and begin searches
 
 
-def random_plans(problem: DesignProblem, seed: int, n: int = DRAWN) -> Array:
-    """Φ (n,), ascending, of plans drawn uniformly from the candidates of `problem`, with its
-    shares; inf for one that leaves a parameter open."""
-    M = random_information(problem, seed, n)
-    return np.sort(np.asarray(problem.criterion.value(M), dtype=np.float64))
-
-
 def random_information(problem: DesignProblem, seed: int, n: int = DRAWN) -> Array:
-    """M (n, S, p, p) of the plans of `random_plans`, as they were drawn."""
+    """M (n, S, p, p) of plans drawn uniformly from the candidates of `problem`, with its shares."""
     rng = np.random.default_rng(np.random.SeedSequence(seed, spawn_key=(STREAM,)))
     return np.stack([problem.prior + problem.sum_of(random_plan(problem, rng)) for _ in range(n)])
 

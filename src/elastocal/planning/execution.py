@@ -363,7 +363,7 @@ def schedule(
         blocked = moves.check(tour, costs)
         progress(f"order of execution: {moves.checked} moves checked, {moves.blocked} blocked")
         if blocked:
-            if (rounds := rounds + 1) > ROUNDS:  # one move at a time would take too long
+            if (rounds := rounds + 1) > CROWDED:  # one move at a time would take too long
                 moves.look_around(costs)
             costs = moves.costs()
         done, thorough = thorough and not blocked, not blocked
@@ -406,7 +406,8 @@ def schedule(
     )
 
 
-ROUNDS = 12  # of blocked moves found and the order mended, before it is done at less expense
+ROUNDS = 12  # of blocked moves found and the order mended, before the ways around are taken
+CROWDED = 30  # rounds of the shortest order, from which on the moves around it are looked at too
 
 
 def _against_drift(

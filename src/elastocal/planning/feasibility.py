@@ -278,11 +278,7 @@ class PoseFeasibility:
 
 
 def rule_book(
-    cell: Cell,
-    chain: Chain,
-    kinematics: Kinematics,
-    bodies: Sequence[Body],
-    pairs: Sequence[Pair],
+    cell: Cell, chain: Chain, kinematics: Kinematics, bodies: Sequence[Body], pairs: Sequence[Pair]
 ) -> tuple[Rule, ...]:
     """All rules of the cell.  Raises InputError where they do not fit the robot."""
     bounds = tuple(_visibility(cell))

@@ -74,10 +74,7 @@ class Costs:
 
 
 def visit_costs(
-    visits: Visits,
-    loaded: NDArray[np.bool_],
-    times: tuple[Array, Array],
-    home: int | None,
+    visits: Visits, loaded: NDArray[np.bool_], times: tuple[Array, Array], home: int | None
 ) -> Costs:
     """Costs of all moves, from the times (m, m) between points without and with load.
 

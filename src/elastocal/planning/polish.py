@@ -20,10 +20,10 @@ from elastocal.model.chain import Chain
 from elastocal.model.effects.loads import STANDARD_GRAVITY
 from elastocal.model.symbolic import SymbolicArm, configuration_rows
 from elastocal.planning.bodies import HANGING, WORLD, Body, Pair, data_base, few_points, mesh_hull
-from elastocal.planning.candidates import CHUNK, Checker, JointSpace, feasible, sobol
+from elastocal.planning.candidates import CHUNK, JointSpace, feasible, sobol
 from elastocal.planning.collision import arm_frames
 from elastocal.planning.criterion import Criterion, Gradient
-from elastocal.planning.feasibility import POSE_SLACK
+from elastocal.planning.feasibility import POSE_SLACK, Feasibility
 from elastocal.planning.information import PoseInformation
 from elastocal.planning.selection import DesignProblem
 from elastocal.units import Array, IntArray, Progress
@@ -373,7 +373,7 @@ class Searches:
 
     information: PoseInformation
     space: JointSpace
-    checker: Checker
+    checker: Feasibility
     pairs: Sequence[Pair]
     _built: dict[tuple[int, int], SymbolicBlocks] = field(default_factory=dict)
     _margins: dict[int, ca.Function | None] = field(default_factory=dict)

@@ -26,7 +26,8 @@ from elastocal.model.effects.placements import MarkerPosition
 from elastocal.model.inverse_kinematics import Postures, inverse_kinematics
 from elastocal.model.manipulator import Model
 from elastocal.planning.bodies import data_base
-from elastocal.planning.candidates import Checker, feasible, told
+from elastocal.planning.candidates import feasible, told
+from elastocal.planning.feasibility import Feasibility
 from elastocal.planning.information import Estimable, PoseInformation, why
 from elastocal.tables import NO_UNIT, Family, Layout, RawTable, read_table
 from elastocal.text import listed, quoted
@@ -278,7 +279,7 @@ def reach(cell: Cell, chain: Chain, places: Places, seed: int, postures: int = F
 
 
 def preferred(
-    cell: Cell, chain: Chain, places: Places, found: Postures, rules: Checker | None, seed: int
+    cell: Cell, chain: Chain, places: Places, found: Postures, rules: Feasibility | None, seed: int
 ) -> tuple[Array, str]:
     """Per place the first posture that the rules allow, and what to tell.
 
@@ -297,13 +298,8 @@ def preferred(
 
 
 def _take_allowed(
-    cell: Cell,
-    places: Places,
-    found: Postures,
-    rules: Checker,
-    q: Array,
-    rows: NDArray[np.int64],
-) -> NDArray[np.int64]:
+    cell: Cell, places: Places, found: Postures, rules: Feasibility, q: Array, rows: IntArray
+) -> IntArray:
     """Put the first allowed posture of each place into q[rows]; the rows that have none."""
     T, K, n = found.q.shape
     allowed = found.reached.copy()
@@ -374,7 +370,7 @@ class _Group:
 
 
 def test_poses(
-    cell: Cell, chain: Chain, feasibility: Checker | None = None, seed: int = 0
+    cell: Cell, chain: Chain, feasibility: Feasibility | None = None, seed: int = 0
 ) -> TargetPoses:
     """The test poses of the cell: [[design.test_pose]], [design.test_path], [design.test_box].
 
@@ -417,7 +413,7 @@ def where_used(model: Model) -> NewPoses | None:
 
 
 def everywhere(
-    cell: Cell, chain: Chain, feasibility: Checker | None = None, seed: int = 0
+    cell: Cell, chain: Chain, feasibility: Feasibility | None = None, seed: int = 0
 ) -> TargetPoses | None:
     """Postures drawn over the joint limits that the rules allow, under each of the cell's loads:
     what an arm may be used for besides the test poses.  None where none was found."""
@@ -462,7 +458,7 @@ def _together(groups: Sequence[_Group], loads: Array, source: str) -> TargetPose
 
 
 def _along_path(
-    cell: Cell, chain: Chain, spec: TargetPath, point: Array, rules: Checker | None, seed: int
+    cell: Cell, chain: Chain, spec: TargetPath, point: Array, rules: Feasibility | None, seed: int
 ) -> _Group:
     path = read_path(spec.file, chain.kinds)
     stated = spec.point is not None
@@ -502,7 +498,7 @@ def _check_path_limits(cell: Cell, chain: Chain, path: PathTable, q: Array) -> N
 
 
 def _in_box(
-    cell: Cell, chain: Chain, box: TargetBox, point: Array, rules: Checker | None, seed: int
+    cell: Cell, chain: Chain, box: TargetBox, point: Array, rules: Feasibility | None, seed: int
 ) -> _Group:
     stated = box.point is not None
     point = point if box.point is None else box.point
@@ -525,7 +521,7 @@ def _in_box(
 
 
 def _drawn(
-    cell: Cell, chain: Chain, point: Array, rules: Checker | None, seed: int,
+    cell: Cell, chain: Chain, point: Array, rules: Feasibility | None, seed: int,
     most: int = DEFAULT_COUNT,
 ) -> _Group:  # fmt: skip
     low, high = finite_ranges(chain, *joint_limits(cell, chain))
