@@ -367,4 +367,4 @@ def uncertainty_budget(
     visits, readings = parts.get("visits", 0.0), parts.get("readings", 0.0)
     lack = min(max(arm.lacking**2 - visits, 0.0), readings)
     squares = own, left, visits, readings - lack, lack
-    return UncertaintyBudget(*np.sqrt(squares).tolist(), at)
+    return UncertaintyBudget(*np.sqrt(squares).tolist(), at=at)
