@@ -7,7 +7,6 @@ from the fit's B, its weights and its residual; nothing is fitted anew.
 
 from __future__ import annotations
 
-import math
 from dataclasses import asdict, dataclass
 from typing import Any
 
@@ -361,7 +360,5 @@ def uncertainty_budget(
     own, left = mean_squares(arm, B, fit.observations.size)
     visits, readings = parts.get("visits", 0.0), parts.get("readings", 0.0)
     lack = min(max(arm.lacking**2 - visits, 0.0), readings)
-    of_model = math.sqrt(own), math.sqrt(left)
-    return UncertaintyBudget(
-        *of_model, math.sqrt(visits), math.sqrt(readings - lack), math.sqrt(lack), at
-    )
+    squares = own, left, visits, readings - lack, lack
+    return UncertaintyBudget(*np.sqrt(squares).tolist(), at=at)

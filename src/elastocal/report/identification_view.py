@@ -222,7 +222,8 @@ def what_was_identified(result: Calibration) -> str:
 
 def prediction_lines(result: Calibration) -> list[tuple[str, str]]:
     """What the verdict does not say of it: what was left out, new poses, test data."""
-    told, held = [], math.isfinite(result.heldout_rms)
+    told: list[str] = []
+    held = math.isfinite(result.heldout_rms)
     if not held:
         told.append(
             "How well unseen poses are predicted is not known: some configuration alone "
@@ -504,7 +505,7 @@ def _newtons(force: Array) -> str:
 
 def _each(value: Any) -> Array:
     """A number, the numbers of three axes, or the one that all have."""
-    values = np.atleast_1d(value)
+    values: Array = np.atleast_1d(value)
     return values if np.ptp(values) else values[:1]
 
 
