@@ -360,5 +360,7 @@ def uncertainty_budget(
     own, left = mean_squares(arm, B, fit.observations.size)
     visits, readings = parts.get("visits", 0.0), parts.get("readings", 0.0)
     lack = min(max(arm.lacking**2 - visits, 0.0), readings)
-    squares = own, left, visits, readings - lack, lack
-    return UncertaintyBudget(*np.sqrt(squares).tolist(), at=at)
+    parameters, open_, shared, single, beyond = np.sqrt(
+        [own, left, visits, readings - lack, lack]
+    ).tolist()
+    return UncertaintyBudget(parameters, open_, shared, single, beyond, at)
