@@ -295,7 +295,7 @@ class ForwardSelection:
         prior = self._prior(current)
         # Scores count from the set as it is, under the noise that suits it best.
         offset = base_score(self.dataset, current, scanned) - current.score
-        whats = (*self.dataset.hypotheses, *self.generic)
+        whats: list[Hypothesis | Generic] = [*self.dataset.hypotheses, *self.generic]
         # What the search over settings costs stays with the item.
         items = [
             Item(what, s.settings, float(w + s.evidence - s.best if what.known else w))

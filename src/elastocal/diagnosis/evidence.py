@@ -341,7 +341,8 @@ def scan(
     """
     grams = Grams(dataset, data, project(data, noise), signs)
     scored, flips, of_covariate = [], [], defaultdict[str, list[int]](list)
-    for n, what in enumerate((*dataset.hypotheses, *generic)):
+    whats: list[Hypothesis | Generic] = [*dataset.hypotheses, *generic]
+    for n, what in enumerate(whats):
         found, grid = grams.of(what), dataset.grids.get(what.key, NO_SETTINGS)
         if isinstance(what, Generic):
             of_covariate[what.covariate].append(n)
