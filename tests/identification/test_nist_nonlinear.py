@@ -8,7 +8,6 @@ fit in the place of an arm.
 
 import json
 from pathlib import Path
-from types import SimpleNamespace
 
 import casadi as ca
 import numpy as np
@@ -21,7 +20,6 @@ from elastocal.model.manipulator import Regression
 from elastocal.model.observations import Observations
 
 FOLDER = Path(__file__).parent / "nist"
-TABLE = SimpleNamespace(source="NIST")
 SETS = json.loads((FOLDER / "nonlinear.json").read_text(encoding="utf-8"))
 LINEAR = json.loads((FOLDER / "certified.json").read_text(encoding="utf-8"))
 MODELS = {
@@ -68,7 +66,7 @@ def digits(value, certified):
 def fitted(model, y, start, sizes, sigma=None):
     """The fit from a start, and the standard deviations of its parameters."""
     n, p = len(y), len(start)
-    observed = Observations("distance", y, sparse.csr_array(np.eye(n)), np.arange(n), TABLE)
+    observed = Observations("distance", y, sparse.csr_array(np.eye(n)), np.arange(n), None)
     whiten = None if sigma is None else sparse.csr_array(np.eye(n) / sigma)
     weights = Weights("test", whiten, sigma is not None, "")
     found = fit(FitProblem(model, observed, weights, start, np.arange(p), sizes), max_steps=2000)

@@ -9,7 +9,7 @@ from functools import cached_property
 import numpy as np
 from numpy.typing import NDArray
 from scipy import linalg
-from scipy.optimize import lsq_linear
+from scipy.optimize import least_squares, lsq_linear
 
 from elastocal.errors import ElastocalError
 from elastocal.identification.linear_solver import solve_weighted
@@ -26,14 +26,13 @@ from elastocal.model.manipulator import Model, Regression
 from elastocal.model.observations import Observations
 from elastocal.units import Array
 
-# Levenberg–Marquardt on R factors, as a trust region.
+# Levenberg–Marquardt on R factors, where one evaluation is a pass over a large table.
 
 SETTLED = "the sum of squares no longer fell"
 NEGLIGIBLE = "the steps became negligible"
 EXHAUSTED = "the step limit was reached; the start may be far off or the data ill-conditioned"
 
-FIRST_RADIUS = 3.0  # in typical sizes
-POOR, GOOD = 0.25, 0.75  # actual over promised fall
+FIRST_DAMPING = 1e-3  # of the largest squared column, once a full step has failed
 ROUNDING = 1e-12  # relative: what separates two evaluations at the minimum
 
 
@@ -69,41 +68,25 @@ class SumOfSquares:
         """The sum of squares, ties included."""
         return at.r_factor.rss + float(np.sum(((u - self.centre) / self.tie) ** 2))
 
-    def step(self, u: Array, at: Evaluation, radius: float) -> tuple[Array, float]:
-        """Minimiser of the linearised cost over |step| ≤ radius, and by how much the cost falls;
-        where there are bounds, no component of the step is longer."""
+    def step(self, u: Array, at: Evaluation, damping: float) -> tuple[Array, float]:
+        """Minimiser of the linearised cost + damping · |step|², and by how much the cost falls."""
         p = len(u)
         A = np.vstack([at.r_factor.R, np.diag(1 / self.tie)])
         b = np.concatenate([at.r_factor.projected, (self.centre - u) / self.tie])
+        damped = np.vstack([A, np.sqrt(damping) * np.eye(p)])
+        target = np.concatenate([b, np.zeros(p)])
         if np.isfinite(self.lower).any() or np.isfinite(self.upper).any():
-            box = (np.maximum(self.lower - u, -radius), np.minimum(self.upper - u, radius))
-            step = lsq_linear(A, b, box, method="bvls", tol=1e-14).x
+            box = (self.lower - u, self.upper - u)
+            step = lsq_linear(damped, target, box, method="bvls", tol=1e-14).x
         else:
-            U, s, Vt = linalg.svd(A, full_matrices=False)
-            known = s > max(at.r_factor.rows, p) * np.finfo(float).eps * s.max(initial=0.0)
-            step = _within(s[known], U[:, known].T @ b, radius) @ Vt[known]
+            cond = max(at.r_factor.rows, p) * np.finfo(float).eps
+            step = linalg.lstsq(damped, target, cond=cond)[0]
         left = b - A @ step
         return step, float(b @ b - left @ left)
 
 
-def _within(s: Array, z: Array, radius: float) -> Array:
-    """Minimiser w of |z − s w|² over |w| ≤ radius, by Newton's method on the damping (Moré 1978,
-    Lecture Notes in Mathematics 630, 105)."""
-    w, damping = z / s, 0.0
-    for _ in range(20):
-        length = float(np.linalg.norm(w))
-        if length <= 1.01 * radius:
-            break
-        damping += (length - radius) / radius * length**2 / float(w @ (w / (s**2 + damping)))
-        w = s * z / (s**2 + damping)
-    return w
-
-
-def descend(
-    objective: SumOfSquares, u: Array, tolerance: float, max_evaluations: int,
-    radius: float = np.inf,
-) -> Descent:  # fmt: skip
-    """Gauss–Newton steps within a trust region of that `radius` to begin with.
+def descend(objective: SumOfSquares, u: Array, tolerance: float, max_evaluations: int) -> Descent:
+    """Full Gauss–Newton steps while they lower the cost, damped ones where they do not.
 
     Ends where the linearised cost promises less than `tolerance` of itself: that last step is
     still taken, and leaves an error smaller than itself by the factor with which Gauss–Newton
@@ -113,12 +96,11 @@ def descend(
     """
     ending = objective.evaluate_last or objective.evaluate
     at = objective.evaluate(u)
-    cost, evaluations = objective.cost(u, at), 1
+    cost, damping, evaluations = objective.cost(u, at), 0.0, 1
     while evaluations < max_evaluations:
-        step, promised = objective.step(u, at, radius)
-        length = float(np.linalg.norm(step))
-        last = promised <= tolerance * cost and length < 0.9 * radius
-        if np.abs(step).max(initial=0.0) <= ROUNDING:
+        step, promised = objective.step(u, at, damping)
+        last = promised <= tolerance * cost
+        if last and np.abs(step).max(initial=0.0) <= ROUNDING:
             return Descent(u, at, True, NEGLIGIBLE, evaluations)
         evaluations += 1
         try:
@@ -126,30 +108,43 @@ def descend(
             trial_cost = objective.cost(u + step, trial)
         except ElastocalError:
             trial, trial_cost = at, np.inf
-        if last:
+        if last and damping == 0:
             kept = trial_cost <= cost * (1 + ROUNDING)
             at, u = (trial, u + step) if kept else (at, u)
             return Descent(u, at, True, SETTLED, evaluations)
-        gained = cost - trial_cost
-        if not gained > POOR * promised:
-            radius = POOR * length
-        elif gained > GOOD * promised and length > 0.9 * radius:
-            radius = 2 * radius
-        if gained > 0:
+        if cost - trial_cost > 1e-4 * promised:
             u, at, cost = u + step, trial, trial_cost
+            damping = damping / 10 if damping > 1e-9 * _steepest(at) else 0.0
+        elif np.abs(step).max(initial=0.0) <= ROUNDING:
+            return Descent(u, at, True, NEGLIGIBLE, evaluations)
+        else:
+            damping = max(10 * damping, FIRST_DAMPING * _steepest(at))
     return Descent(u, at, False, EXHAUSTED, evaluations)
+
+
+def _steepest(at: Evaluation) -> float:
+    """The largest squared column of B."""
+    return float((at.r_factor.R**2).sum(axis=0).max(initial=0.0))
 
 
 # Nonlinear weighted least squares on the exact B.
 
-# What the last step may promise, of the cost.  It is taken, and one with the exact linear solver
-# follows where nothing but the readings decides: each squares what error is left.
+# Relative change of the cost at which the trust region stops; one exact Gauss–Newton step follows
+# and squares what error is left.
 TOLERANCE = 1e-10
 FIRST, LAST, MOST_POLISHES = 1e-6, 1e-11, 50
-LARGEST = 1e150  # of a residual, whose square is still a number
-# The same of a large table, whose evaluations are dear: at a million rows the last step is a tenth
-# of a standard deviation, and what it leaves behind is smaller by orders.
+# The same of a large table, whose evaluations are dear.  The last step is taken: at a million rows
+# it is a tenth of a standard deviation, and what it leaves behind is smaller by orders.
 LARGE_TOLERANCE = 1e-8
+
+REASON = {
+    -1: "the solver reported improper input",
+    0: "the step limit was reached; the start may be far off or the data ill-conditioned",
+    1: "the gradient vanished",
+    2: "the sum of squares no longer fell",
+    3: "the steps became negligible",
+    4: "sum of squares and steps both settled",
+}
 
 
 @dataclass(frozen=True)
@@ -252,54 +247,14 @@ class Fit:
 def fit(problem: FitProblem, max_steps: int = 60, tolerance: float = LARGE_TOLERANCE) -> Fit:
     """Levenberg–Marquardt from the problem's x, derivatives exact.
 
-    On R factors, with the cost and the gradient of all rows, until a step promises less than
-    `tolerance` of the cost.
+    A large table is fitted on R factors, with the cost and the gradient of all rows, until a step
+    promises less than `tolerance` of the cost.
 
     Raises ElastocalError where the start has poses without equilibrium.
     """
-    columns, large = problem.columns, problem.large
-    size, weights = problem.sizes[columns], problem.weights
-    known: list[tuple[Array, Regression]] = []  # of a small table: what was evaluated last
-
-    def evaluated(u: Array) -> Evaluation:
-        if large:
-            at = evaluate(problem.model, problem.parts, problem.values(u), columns)
-            return Evaluation(_finite(problem, at.residual), at.r_factor.scaled(size))
-        here = _regression(problem, problem.values(u))
-        known[:] = [(u, here)]
-        e = weights.apply(_finite(problem, here.residual))
-        return Evaluation(here.residual, RFactor.of(weights.apply(here.B * size), e))
-
-    def among_others(u: Array) -> Evaluation:
-        among = columns if problem.among is None else problem.among
-        at = evaluate(problem.model, problem.parts, problem.values(u), among)
-        own = at.r_factor.of_columns(np.searchsorted(among, columns))
-        return Evaluation(at.residual, own.scaled(size), at.r_factor)
-
-    lower, upper = problem.limits
-    objective = SumOfSquares(
-        evaluated, np.full(len(columns), np.inf) if problem.tie is None else problem.tie / size,
-        (problem.tied_to - problem.x[columns]) / size, lower, upper,
-        among_others if large and problem.among is not None else None,
-    )  # fmt: skip
-    start = np.clip(np.zeros(len(columns)), lower, upper)
-    if not large:
-        tolerance = min(tolerance, TOLERANCE)
-    radius = np.inf if large else FIRST_RADIUS
-    found = descend(objective, start, tolerance, max_steps, radius)
-    x, at = problem.values(found.u), found.at
-    residual, r_factor = at.residual, at.r_factor.scaled(1 / size)
-    if not large and problem.tie is None and not problem.bounded and found.converged:
-        u, here = known[0]
-        x, here = _polished(
-            problem, x, here if np.array_equal(u, found.u) else _regression(problem, x)
-        )
-        residual, e = here.residual, weights.apply(here.residual)
-        r_factor = RFactor.of(weights.apply(here.B), e)
-    return Fit(
-        x, residual, weights.apply(residual), r_factor, found.converged, found.reason,
-        found.evaluations, problem, at.wide,
-    )  # fmt: skip
+    if problem.large:
+        return _fit_in_parts(problem, max_steps, tolerance)
+    return _fit_whole(problem, max_steps)
 
 
 def _regression(problem: FitProblem, x: Array) -> Regression:
@@ -307,13 +262,83 @@ def _regression(problem: FitProblem, x: Array) -> Regression:
     return problem.model.regressor(observed.table, x, problem.columns, observed)
 
 
-def _finite(problem: FitProblem, residual: Array) -> Array:
-    if not np.abs(residual).max(initial=0.0) < LARGEST:
+def _fit_whole(problem: FitProblem, max_steps: int) -> Fit:
+    size, weights, observed = problem.sizes[problem.columns], problem.weights, problem.observations
+    last: dict[bytes, Regression] = {}  # residual and B come from one evaluation
+
+    def regression_at(u: Array) -> Regression:
+        if u.tobytes() not in last:
+            at = _regression(problem, problem.values(u))
+            last.clear()
+            last[u.tobytes()] = at
+        return last[u.tobytes()]
+
+    def residual(u: Array) -> Array:
+        """Predicted minus observed, NaN where a pose has no equilibrium."""
+        try:
+            raw = -regression_at(u).residual
+        except ElastocalError:
+            predicted = problem.model.predict(observed.table, problem.values(u), observed)
+            raw = predicted - observed.value
+        r = weights.apply(raw)
+        if problem.tie is None:
+            return r
+        x = problem.values(u)
+        return np.concatenate([r, (x[problem.columns] - problem.tied_to) / problem.tie])
+
+    def jacobian(u: Array) -> Array:
+        B = weights.apply(regression_at(u).B * size)
+        return B if problem.tie is None else np.vstack([B, np.diag(size / problem.tie)])
+
+    lower, upper = problem.limits
+    start = np.clip(np.zeros(len(problem.columns)), lower, upper)
+    if not np.isfinite(residual(start)).all():
+        regression_at(start)  # names the row
         raise ElastocalError(
-            f"{problem.observations.table.source}: the model predicts no finite numbers at the "
-            "start values; look in the cell for a length, force or compliance far too large"
+            f"{observed.table.source}: the model predicts no finite numbers at the start "
+            "values; look in the cell for a length, force or compliance far too large"
         )
-    return residual
+    found = least_squares(
+        residual, start, jacobian, bounds=(lower, upper), method="trf", x_scale=1.0,
+        ftol=TOLERANCE, xtol=TOLERANCE, gtol=TOLERANCE, max_nfev=max_steps,
+    )  # fmt: skip
+    x, final = problem.values(found.x), regression_at(found.x)
+    if problem.tie is None and not problem.bounded and found.status > 0:
+        x, final = _polished(problem, x, final)
+    whitened = weights.apply(final.residual)
+    return Fit(
+        x, final.residual, whitened, RFactor.of(weights.apply(final.B), whitened),
+        bool(found.status > 0), REASON[int(found.status)], int(found.nfev), problem,
+    )  # fmt: skip
+
+
+def _fit_in_parts(problem: FitProblem, max_steps: int, tolerance: float) -> Fit:
+    columns = problem.columns
+    size = problem.sizes[columns]
+    lower, upper = problem.limits
+
+    def evaluated(u: Array) -> Evaluation:
+        at = evaluate(problem.model, problem.parts, problem.values(u), columns)
+        return Evaluation(at.residual, at.r_factor.scaled(size))
+
+    def among_others(u: Array) -> Evaluation:
+        among = columns if problem.among is None else problem.among
+        at = evaluate(problem.model, problem.parts, problem.values(u), among)
+        own = at.r_factor.of_columns(np.searchsorted(among, columns))
+        return Evaluation(at.residual, own.scaled(size), at.r_factor)
+
+    objective = SumOfSquares(
+        evaluated, np.full(len(columns), np.inf) if problem.tie is None else problem.tie / size,
+        (problem.tied_to - problem.x[columns]) / size, lower, upper,
+        None if problem.among is None else among_others,
+    )  # fmt: skip
+    start = np.clip(np.zeros(len(columns)), lower, upper)
+    found = descend(objective, start, tolerance, max_steps)
+    return Fit(
+        problem.values(found.u), found.at.residual, problem.weights.apply(found.at.residual),
+        found.at.r_factor.scaled(1 / size), found.converged, found.reason, found.evaluations,
+        problem, found.at.wide,
+    )  # fmt: skip
 
 
 def _polished(problem: FitProblem, x: Array, at: Regression) -> tuple[Array, Regression]:
