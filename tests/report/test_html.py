@@ -163,7 +163,7 @@ def test_same_result_same_page_whatever_matplotlib_is_set_to(case: Any, page: st
     assert engine.sub("", again) == engine.sub("", page)
 
 
-def test_configuration_without_held_out_error(case: Any, no_figures: None) -> None:
+def test_configuration_without_held_out_error(case: Any) -> None:
     errors = case.result.held_out.copy()
     errors[:12] = np.inf  # 2 markers × 2 loads × 3 coordinates
     found = replace(case.result, held_out=errors, heldout_rms=float("inf"))
