@@ -114,9 +114,7 @@ def rows_of(arm: str, stated: bool, candidates: int, campaigns: int) -> list[str
             for R in (fresh.target_rows, fresh.elsewhere_rows)
         ]
     drawn = random_information(setup.problem(pool, shares), 0)[:, 0]
-    chance = Everywhere.of(
-        fresh.target_rows, fresh.elsewhere_rows, drawn[0], drawn, drawn[0]
-    )
+    chance = Everywhere.of(fresh.target_rows, fresh.elsewhere_rows, drawn[0], drawn, drawn[0])
     figures["random, median"] = [chance.random_test_poses, chance.random_elsewhere]
     least = figures["least ρ₀"][0]
     where = "eight stated" if stated else "drawn over the joint ranges"
