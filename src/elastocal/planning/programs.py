@@ -112,9 +112,8 @@ def program_name(text: str, most: int = 24) -> str:
     a letter first, at most `most` of them, and none of their own words."""
     ascii_only = unicodedata.normalize("NFKD", text).encode("ascii", "ignore").decode()
     name = re.sub(r"[^A-Za-z0-9_]+", "_", ascii_only).strip("_")
-    name = name if name[:1].isalpha() else f"p_{name}".rstrip("_")
-    name = f"{name}_plan" if name.lower() in RESERVED or name == "p" else name
-    return name[:most]
+    name = (name if name[:1].isalpha() else f"p_{name}")[:most].rstrip("_")
+    return f"{name}_plan"[:most] if name.lower() in RESERVED or name == "p" else name
 
 
 def check_driven(steps: Sequence[Step], chain: Chain, limits: Limits | None) -> None:

@@ -143,7 +143,12 @@ def test_other_arms_than_six_revolute_joints_are_refused(chain, write):
         write(execution, sliding, NAMES)
 
 
-@given(st.text() | st.sampled_from(["", "1plan", "my plan", "a" * 25, "plän", "a\nb", "END", "p"]))
+@given(
+    st.text()
+    | st.sampled_from(
+        ["", "1plan", "my plan", "a" * 25, "plän", "a\nb", "END", "p", "A" * 23 + ":0"]
+    )
+)
 def test_any_name_is_reduced_to_one_that_both_languages_allow(name):
     reduced = program_name(name)
     assert re.fullmatch(r"[A-Za-z][A-Za-z0-9_]{0,23}", reduced, re.ASCII)
