@@ -59,7 +59,7 @@ from elastocal.units import Array, to_si
 
 Record = TypeVar("Record")
 Member = TypeVar("Member")
-FARTHEST = 1e5  # m
+FARTHEST = 1e4  # m; no cell is as large, and a move of a tool that long is checked for minutes
 JOINT_UNITS = ("deg", "rad", "m", "mm")
 JOINT_KEY = re.compile(r"(joint[1-9][0-9]{0,2})(?:_(deg|rad|mm|m))?", re.ASCII)
 # Units that key names end with, in words, and the SI unit in its place in Python.
