@@ -205,14 +205,12 @@ class SumAnswer:
         ]  # fmt: skip
         if not gone:
             return self
-        first = self.found.sums.data.X.shape[2]
-        deviation = np.sqrt(self.found.variances)
-        unnamed = []
-        for k in gone:
-            c, span = self.found.components[k], self.found.spans[k]
-            own = deviation[span.start - first : span.stop - first]
-            unnamed.append(replace(c, columns=c.columns * own))
-        found = exchanged(self.found, [self.found.components[k] for k in gone])
+        removed = [self.found.components[k] for k in gone]
+        unnamed = [
+            replace(c, columns=c.columns * np.sqrt(self.found.priors[k]))
+            for k, c in zip(gone, removed, strict=True)
+        ]
+        found = exchanged(self.found, removed)
         return replace(self, found=found, hidden=(*self.hidden, *unnamed))
 
     # Shares.

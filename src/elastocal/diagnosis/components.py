@@ -411,16 +411,19 @@ class FittedSum:
         return plain.with_columns(columns, 1 / self.variances)
 
     @cached_property
+    def priors(self) -> tuple[Array, ...]:
+        """The prior variances (k,) of each component's coefficients."""
+        first = self.sums.data.X.shape[2]
+        return tuple(self.variances[span.start - first : span.stop - first] for span in self.spans)
+
+    @cached_property
     def _shown(self) -> tuple[Array, ...]:
         """The directions (C, m, k) of each component that these data show."""
-        plain, first = self.sums.data, self.sums.data.X.shape[2]
+        plain, root = self.sums.data, self.sums.weighted.root
         return tuple(
-            _compressed(
-                plain.masked(c.columns), self.variances[span.start - first : span.stop - first],
-                self.sums.weighted.root, HARDLY,
-            )
-            for c, span in zip(self.components, self.spans, strict=True)
-        )  # fmt: skip
+            _compressed(plain.masked(c.columns), prior, root, HARDLY)
+            for c, prior in zip(self.components, self.priors, strict=True)
+        )
 
     @property
     def costs(self) -> Array:
