@@ -7,9 +7,9 @@ from operator import itemgetter
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
-from scipy import linalg, optimize, special, stats
+from scipy import linalg, optimize, sparse, special, stats
 
-from elastocal.errors import ElastocalError, InputError, InsufficientDataError, require
+from elastocal.errors import InputError, InsufficientDataError, require
 from elastocal.identification.robust_core import (
     Absolute,
     Bisquare,
@@ -32,16 +32,10 @@ from elastocal.units import Array
 #     minimise  Σ |e_i|,  e = y − B x         dual:  maximise Σ y_iᵀ λ_i,  Bᵀ λ = 0,  |λ_i| ≤ 1
 #
 # Any feasible λ bounds the minimum from below, so the gap Σ|e_i| − yᵀλ proves how good x is.
-# For size 1 the dual is a linear program in n bounded variables with p equations.  For vectors it
-# is a second-order cone program, solved by smoothing: at the minimum of Σ s_i, s_i = √(|e_i|² +
-# ε²), λ_i = e_i/s_i is feasible and the gap at most n ε; ε falls to rounding.  Newton's method
-# solves for x and λ in s_i λ_i = e_i together (Chan, Golub and Mulet 1999), which unlike Newton
-# for x alone is not slowed down where observations are met exactly.
 
 OPTIMAL = 5e-6  # relative duality gap that counts as solved
-ENOUGH = 1e-9  # gap at which to stop; met exactly by many observations, rounding may forbid it
-SMOOTHING = 1e-9  # last ε in units of the scale
-MAX_NEWTON = 400
+ACCURATE = 1e-12  # asked of the cone solver, which ends where rounding allows no more
+NEWTON_STEPS = 3
 
 
 def least_absolute(problem: Design, loss: Absolute) -> RobustEstimate:
@@ -49,7 +43,7 @@ def least_absolute(problem: Design, loss: Absolute) -> RobustEstimate:
 
     The median's scale is only reported: x does not depend on it.
     """
-    z, dual, count = _linear_program(problem) if problem.size == 1 else _newton(problem)
+    z, dual, count = _cone_program(problem)
     r = problem.residual(z)
     length = lengths(r, problem.size)
     optimality = _gap(problem, r, dual)
@@ -59,31 +53,42 @@ def least_absolute(problem: Design, loss: Absolute) -> RobustEstimate:
 
 
 def _gap(problem: Design, r: Array, dual: Array) -> float:
-    """Duality gap over the minimum, less what rounding of y may leave of both."""
+    """Duality gap over the minimum, less what rounding of y may leave of both.
+
+    The bound is that of the nearest λ with Bᵀλ = 0, shrunk until every |λ_i| ≤ 1.
+    """
     minimum = float(lengths(r, problem.size).sum())
     rounding = 30 * len(r) * problem.floor
-    gap = minimum - float(problem.y @ _feasible(problem, dual))
-    return max(gap - rounding, 0.0) / max(minimum, rounding)
+    feasible = dual - problem.Q @ (problem.Q.T @ dual)
+    feasible /= max(1.0, float(lengths(feasible, problem.size).max()))
+    return max(minimum - float(problem.y @ feasible) - rounding, 0.0) / max(minimum, rounding)
 
 
-def _feasible(problem: Design, dual: Array) -> Array:
-    """The nearest λ with Bᵀλ = 0, shrunk until every |λ_i| ≤ 1."""
-    projected = dual - problem.Q @ (problem.Q.T @ dual)
-    return projected / max(1.0, float(lengths(projected, problem.size).max()))
+def _cone_program(problem: Design) -> tuple[Array, Array, int]:
+    """z, the optimal λ and the solver's steps: min Σ t_i with every (t_i, e_i) in its cone, from
+    least squares on and in units of its residual."""
+    import clarabel
 
-
-def _linear_program(problem: Design) -> tuple[Array, Array, int]:
-    """z, the optimal λ and the simplex steps; z are the multipliers of Qᵀλ = 0."""
-    Q = problem.Q
-    first = problem.residual(Q.T @ problem.y)
-    unit = max(float(np.abs(first).mean()), problem.floor)  # HiGHS has absolute tolerances
-    found = optimize.linprog(
-        -first / unit, A_eq=Q.T, b_eq=np.zeros(problem.p), bounds=(-1, 1), method="highs-ds"
-    )
-    if not found.success:
-        raise ElastocalError(f"the L1 linear program was not solved: {found.message}")
-    z = Q.T @ problem.y - unit * np.asarray(found.eqlin.marginals)
-    return _vertex(problem, z), np.asarray(found.x), int(found.nit)
+    n, p, size = problem.n, problem.p, problem.size
+    start = problem.Q.T @ problem.y
+    first = problem.residual(start)
+    unit = max(float(np.abs(first).mean()), problem.floor)
+    # Rows of a cone: t_i, then the components of e_i, as A (δz, t) + s = b.
+    of_e = (np.arange(n)[:, None] * (size + 1) + 1 + np.arange(size)).ravel()
+    A, b = np.zeros((n * (size + 1), p)), np.zeros(n * (size + 1))
+    A[of_e], b[of_e] = problem.Q, first / unit
+    lengths_of = sparse.kron(sparse.eye_array(n), -np.eye(size + 1, 1))
+    settings = clarabel.DefaultSettings()
+    settings.verbose = False
+    settings.tol_gap_abs = settings.tol_gap_rel = settings.tol_feas = ACCURATE
+    found = clarabel.DefaultSolver(
+        sparse.csc_matrix((n + p, n + p)), np.repeat([0.0, 1.0], [p, n]),
+        sparse.hstack([sparse.csc_matrix(A), lengths_of], format="csc"), b,
+        [clarabel.SecondOrderConeT(size + 1)] * n, settings,
+    ).solve()  # fmt: skip
+    z = start + unit * np.array(found.x[:p])
+    z = _vertex(problem, z) if size == 1 else _stationary(problem, z)
+    return z, -np.array(found.z)[of_e], found.iterations
 
 
 def _vertex(problem: Design, z: Array) -> Array:
@@ -97,59 +102,16 @@ def _vertex(problem: Design, z: Array) -> Array:
     return exact if np.abs(problem.residual(exact)).sum() <= np.abs(r).sum() else z
 
 
-def _newton(problem: Design) -> tuple[Array, Array, int]:
-    """z with the smallest certified gap, its λ and the number of steps."""
-    Q, size = problem.Q, problem.size
-    Q3 = Q.reshape(-1, size, problem.p)
-    z = Q.T @ problem.y
-    r = problem.residual(z)
-    scale = max(median_scale(lengths(r, size), size), problem.floor)
-    smoothing, count = scale, 0
-    s = np.hypot(lengths(r, size), smoothing)
-    dual = r / problem.rows(s)
-    best = np.inf, z, dual
-    while count < MAX_NEWTON:
-        weight = 1 / problem.rows(s)
-        gradient = -(Q.T @ (r * weight))
-        along_r = np.einsum("nij,ni->nj", Q3, r.reshape(-1, size)) / s[:, None] ** 2
-        along_dual = np.einsum("nij,ni->nj", Q3, dual.reshape(-1, size))
-        mixed = along_r.T @ along_dual
-        hessian = (Q.T * weight) @ Q - (mixed + mixed.T) / 2
-        step = -linalg.lstsq(hessian, gradient)[0]
-        slope = float(gradient @ step)
-        share = _line_search(problem, z, step, slope, smoothing, float(s.sum()))
-        toward = weight * (r - Q @ step + dual * problem.rows(along_r @ step) * problem.rows(s))
-        dual = toward / problem.rows(np.maximum(lengths(toward, size), 1.0))
-        z = z + share * step
+def _stationary(problem: Design, z: Array) -> Array:
+    """z with the digits that the cone program leaves open, by Newton's steps on Σ |e_i|."""
+    for _ in range(NEWTON_STEPS):
         r = problem.residual(z)
-        count += 1
-        s = np.hypot(lengths(r, size), smoothing)
-        for proof in (dual, r / problem.rows(s)):
-            gap = _gap(problem, r, proof)
-            if gap < best[0]:
-                best = gap, z, proof
-        if best[0] <= ENOUGH:
-            break
-        if share < 1e-3 or -slope <= 1e-3 * smoothing * len(s):
-            if smoothing <= SMOOTHING * scale:
-                break
-            smoothing = max(smoothing / 5, SMOOTHING * scale)
-            s = np.hypot(lengths(r, size), smoothing)
-    return best[1], best[2], count
-
-
-def _line_search(
-    problem: Design, z: Array, step: Array, slope: float, smoothing: float, cost: float
-) -> float:
-    """Largest of 1, ½, ¼, … that lowers Σ s_i enough; 0 where rounding lets none."""
-    share = 1.0
-    while share > 1e-8:
-        r = problem.residual(z + share * step)
-        lowered = float(np.hypot(lengths(r, problem.size), smoothing).sum())
-        if lowered <= cost + 1e-4 * share * slope:
-            return share
-        share /= 2
-    return 0.0
+        length = np.maximum(lengths(r, problem.size), problem.floor)
+        along = (problem.Q * (r / problem.rows(length))[:, None]).reshape(problem.n, -1, problem.p)
+        along = along.sum(axis=1)
+        hessian = (problem.Q.T / problem.rows(length)) @ problem.Q - (along.T / length) @ along
+        z = z + linalg.lstsq(hessian, along.sum(axis=0))[0]
+    return z
 
 
 # Least trimmed squares: the fit of the majority, whatever the rest says.
