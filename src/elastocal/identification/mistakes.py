@@ -17,7 +17,7 @@ from scipy import stats
 from elastocal.cell.arm_description import ModelSpec, Tool
 from elastocal.cell.work_cell import Cell
 from elastocal.errors import InsufficientDataError
-from elastocal.identification.start import RegistrationProblem, register
+from elastocal.identification.start import RegistrationProblem, any_matrix, register
 from elastocal.measurements import Measurements
 from elastocal.model.chain import Chain
 from elastocal.model.effects import effect_of
@@ -92,36 +92,26 @@ def nominal_fit(
     )
 
 
-def _error(model: Model, table: Measurements) -> float:
+def _problem_of(model: Model, table: Measurements) -> RegistrationProblem:
     T = model.rigid.flange_poses(table)
-    problem = RegistrationProblem(
+    return RegistrationProblem(
         T[:, :3, :3], T[:, :3, 3], np.asarray(table.position), table.marker,
         np.zeros((len(table.marker_names), 3)), np.ones(len(table.marker_names), dtype=bool),
         True, np.eye(3), np.zeros(3),
     )  # fmt: skip
-    return register(problem).error
+
+
+def _error(model: Model, table: Measurements) -> float:
+    return register(_problem_of(model, table)).error
 
 
 def _linear_error(model: Model, table: Measurements) -> float:
-    """Rms of A p + s - R_i m - t_i over readings p, with any matrix A, shift s and markers m.
+    """Rms of the registration by any matrix in the place of a rotation.
 
-    Infinite where A is no rotation at all: it mirrors, or its scale is off by a quarter.
+    Infinite where that is none at all: it mirrors, or its scale is off by a quarter.
     """
-    T = model.rigid.flange_poses(table)
-    n, markers = len(table), len(table.marker_names)
-    columns = np.zeros((n, 3, 12 + 3 * markers))
-    for k in range(3):
-        columns[:, k, 3 * k : 3 * k + 3] = table.position
-        columns[:, k, 9 + k] = 1.0
-    for c in range(markers):
-        here = (table.marker == c)[:, None, None]
-        columns[:, :, 12 + 3 * c : 15 + 3 * c] = -(here * T[:, :3, :3])
-    matrix, target = columns.reshape(3 * n, -1), T[:, :3, 3].ravel()
-    x = np.linalg.lstsq(matrix, target, rcond=1e-9)[0]
-    volume = float(np.linalg.det(x[:9].reshape(3, 3)))
-    if not 0.75**3 < volume < 1.25**3:
-        return np.inf
-    return float(np.sqrt(np.mean((matrix @ x - target) ** 2)))
+    matrix, left = any_matrix(_problem_of(model, table))
+    return left if 0.75**3 < np.linalg.det(matrix) < 1.25**3 else np.inf
 
 
 def _placed(model: Model, table: Measurements) -> bool:

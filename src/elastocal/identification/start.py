@@ -195,6 +195,7 @@ def check_enough(model: Model, observed: Observations, scaled: Array) -> None:
 SAMPLE = 400  # readings used: a start needs no more
 ROUGH_SWEEPS, SWEEPS = 6, 60
 FINALISTS = 4
+SETTLED = 1e-6  # change of the median distance, relative, with which the sweeps end
 RCOND = 1e-6  # a direction the poses do not show stays at zero instead of running away
 
 
@@ -241,47 +242,61 @@ def register(problem: RegistrationProblem, seed: int = 0) -> Registration:
         chosen = np.random.default_rng(seed).choice(n, SAMPLE, replace=False)
         of_rows = ("flange_rotation", "flange_position", "points", "marker")
         problem = replace(problem, **{name: getattr(problem, name)[chosen] for name in of_rows})
-    if not problem.free_base:
-        return _descend(problem, problem.base_rotation, sweeps=3)
-    body = _body_points(problem, problem.start_markers)
-    starts = [
-        _linear_rotation(problem),
-        _rotation_between(body, problem.points, np.ones(len(body))),
-    ]
-    starts += list(Rotation.create_group("O").as_matrix())
-    # All starts together show which ones lead where; those are gone through again with all digits.
-    nearest = np.argsort(_errors(problem, np.array(starts)), kind="stable")[:FINALISTS]
-    best = [_descend(problem, starts[k], ROUGH_SWEEPS) for k in nearest]
-    return min((_descend(problem, r.rotation, SWEEPS, r) for r in best), key=lambda r: r.error)
+    starts = problem.base_rotation[None]
+    if problem.free_base:
+        U, _, Vt = np.linalg.svd(any_matrix(problem)[0].T)
+        body = _body_points(problem, problem.start_markers)
+        starts = np.stack([
+            U @ np.diag([1.0, 1.0, np.linalg.det(U @ Vt)]) @ Vt,
+            _rotation_between(body, problem.points, np.ones(len(body))),
+            *Rotation.create_group("O").as_matrix(),
+        ])  # fmt: skip
+    rough = _descended(problem, starts, np.ones((len(starts), len(problem.points))), ROUGH_SWEEPS)
+    # A few sweeps show which starts lead where; the others need not be gone through to the end.
+    nearest = np.argsort(rough[3], kind="stable")[:FINALISTS]
+    rotation, translation, markers, error, _ = _descended(
+        problem, rough[0][nearest], rough[4][nearest], SWEEPS
+    )
+    best = int(np.argmin(error))
+    return Registration(rotation[best], translation[best], markers[best], float(error[best]))
 
 
-def _errors(problem: RegistrationProblem, rotation: Array) -> Array:
-    """Median distances (starts,) after a few sweeps of `_descend` from every `rotation`
-    (starts, 3, 3), all of them together."""
-    weight = np.ones((len(rotation), len(problem.points)))
-    for sweep in range(ROUGH_SWEEPS + 1):
-        translation, markers = _linear_parts(problem, rotation, weight)
-        turned = np.einsum("nij,snj->sni", problem.flange_rotation, markers[:, problem.marker])
-        body = turned + problem.flange_position
-        if sweep < ROUGH_SWEEPS:
+def _descended(
+    problem: RegistrationProblem, rotation: Array, weight: Array, sweeps: int
+) -> tuple[Array, Array, Array, Array, Array]:
+    """Rotations, translations, markers, median distances and weights after `sweeps` from every
+    `rotation` (s, 3, 3) and `weight` (s, n), all of them together.
+
+    Translation and markers (linear) and rotation (Kabsch) in turn, reweighted by distance so that
+    a share of wrong readings does not pull the start.
+    """
+    translation, markers = _linear_parts(problem, rotation, weight)
+    error = np.full(len(rotation), np.inf)
+    for _ in range(sweeps):
+        if problem.free_base:
+            body = _body_points(problem, markers)
             rotation = _rotation_between(body, problem.points, weight)
-        predicted = body @ rotation.transpose(0, 2, 1) + translation[:, None]
+        translation, markers = _linear_parts(problem, rotation, weight)
+        predicted = _body_points(problem, markers) @ rotation.swapaxes(1, 2) + translation[:, None]
         distance = np.linalg.norm(problem.points - predicted, axis=2)
-        error = np.median(distance, axis=1)
+        previous, error = error, np.median(distance, axis=1)
         weight = 1.0 / np.maximum(distance, np.maximum(error, 1e-9)[:, None])
-    return np.asarray(error, dtype=np.float64)
+        if (np.abs(previous - error) <= SETTLED * error).all():
+            break
+    return rotation, translation, markers, error, weight
 
 
 def _linear_parts(problem: RegistrationProblem, R: Array, weight: Array) -> tuple[Array, Array]:
-    """As `_linear_part` with a free base, for every rotation R (s, 3, 3) and weight (s, n).
+    """Translation (s, 3) and markers (s, M, 3) for every rotation R (s, 3, 3) and weight (s, n).
 
     With u = Rᵀt the equations u + R_i m = Rᵀp − t_i have one matrix for all rotations, of
-    orthogonal blocks.  Its normal equations cost half the digits, which a search can spare.
+    orthogonal blocks.  Its normal equations cost half the digits, which a start can spare.
     """
     turn, code = problem.flange_rotation, problem.marker
     free = np.flatnonzero(problem.free_markers)
     fixed = problem.start_markers * ~problem.free_markers[:, None]
-    y = problem.points @ R - _body_points(problem, fixed)
+    known = np.zeros(3) if problem.free_base else problem.base_translation
+    y = (problem.points - known) @ R - _body_points(problem, fixed)
     size = 3 + 3 * len(free)
     normal, right = np.zeros((len(R), size, size)), np.empty((len(R), size))
     own = np.arange(3)
@@ -294,70 +309,21 @@ def _linear_parts(problem: RegistrationProblem, R: Array, weight: Array) -> tupl
         normal[:, :3, at], normal[:, at, :3] = cross, cross.transpose(0, 2, 1)
         normal[:, 3 + 3 * k + own, 3 + 3 * k + own] = w.sum(axis=1)[:, None]
         right[:, at] = np.einsum("nij,sni->sj", turn[here], w[..., None] * y[:, here])
-    values, vectors = np.linalg.eigh(normal)
+    sought = slice(0 if problem.free_base else 3, size)
+    values, vectors = np.linalg.eigh(normal[:, sought, sought])
     shown = values > RCOND**2 * values[:, -1:]
-    along = (right[:, None] @ vectors)[:, 0] / np.where(shown, values, np.inf)
-    x = (vectors @ along[..., None])[..., 0]
+    along = (right[:, None, sought] @ vectors)[:, 0] / np.where(shown, values, np.inf)
+    x = np.zeros((len(R), size))
+    x[:, sought] = (vectors @ along[..., None])[..., 0]
     markers = np.broadcast_to(fixed, (len(R), *fixed.shape)).copy()
     markers[:, free] = x[:, 3:].reshape(len(R), -1, 3)
-    return (R @ x[:, :3, None])[..., 0], markers
-
-
-def _descend(
-    problem: RegistrationProblem, rotation: Array, sweeps: int, start: Registration | None = None
-) -> Registration:
-    """Alternate between translation and markers (linear) and rotation (Kabsch), reweighted
-    by distance so that a share of wrong readings does not pull the start."""
-    translation = problem.base_translation if start is None else start.translation
-    markers = problem.start_markers.copy() if start is None else start.markers
-    weight = np.ones(len(problem.points))
-    error = np.inf
-    for _ in range(sweeps):
-        translation, markers = _linear_part(problem, rotation, markers, weight)
-        if problem.free_base:
-            body = _body_points(problem, markers)
-            rotation = _rotation_between(body, problem.points, weight)
-        distance = _distance(problem, rotation, translation, markers)
-        previous, error = error, float(np.median(distance))
-        weight = 1.0 / np.maximum(distance, max(error, 1e-9))
-        if abs(previous - error) <= 1e-6 * error:
-            break
-    translation, markers = _linear_part(problem, rotation, markers, weight)
-    distance = _distance(problem, rotation, translation, markers)
-    return Registration(rotation, translation, markers, float(np.median(distance)))
+    return known + (R @ x[:, :3, None])[..., 0], markers
 
 
 def _body_points(problem: RegistrationProblem, markers: Array) -> Array:
-    turned = np.einsum("nij,nj->ni", problem.flange_rotation, markers[problem.marker])
-    return turned + problem.flange_position
-
-
-def _distance(problem: RegistrationProblem, R: Array, t: Array, markers: Array) -> Array:
-    return np.linalg.norm(problem.points - _body_points(problem, markers) @ R.T - t, axis=1)
-
-
-def _linear_part(
-    problem: RegistrationProblem, R: Array, markers: Array, weight: Array
-) -> tuple[Array, Array]:
-    """Base translation and free markers at a fixed base rotation, by weighted least squares."""
-    n, M = len(problem.points), len(markers)
-    fixed = markers * ~problem.free_markers[:, None]
-    target = problem.points - _body_points(problem, fixed) @ R.T
-    columns = [np.tile(np.eye(3), (n, 1, 1))] if problem.free_base else []
-    for c in range(M):
-        if problem.free_markers[c]:
-            columns.append((problem.marker == c)[:, None, None] * (R @ problem.flange_rotation))
-    if not problem.free_base:
-        target = target - problem.base_translation
-    if not columns:
-        return problem.base_translation, fixed
-    w = np.sqrt(weight)[:, None]
-    A = (np.concatenate(columns, axis=2) * w[..., None]).reshape(3 * n, -1)
-    x = np.linalg.lstsq(A, (target * w).ravel(), rcond=RCOND)[0]
-    translation = x[:3] if problem.free_base else problem.base_translation
-    found = fixed.copy()
-    found[problem.free_markers] = x[3 if problem.free_base else 0 :].reshape(-1, 3)
-    return np.asarray(translation, dtype=float), found
+    """Where `markers` (…, M, 3) are read (…, n, 3) in the base frame."""
+    turned = np.einsum("nij,...nj->...ni", problem.flange_rotation, markers[..., problem.marker, :])
+    return np.asarray(turned + problem.flange_position)
 
 
 def _rotation_between(body: Array, points: Array, weight: Array) -> Array:
@@ -369,19 +335,20 @@ def _rotation_between(body: Array, points: Array, weight: Array) -> Array:
     return np.asarray(U @ Vt, dtype=np.float64)
 
 
-def _linear_rotation(problem: RegistrationProblem) -> Array:
-    """Rotation nearest to the matrix A in A p + s − R_i m = t_i, all unknowns free at once."""
+def any_matrix(problem: RegistrationProblem) -> tuple[Array, float]:
+    """A (3, 3) of the least squares A p + s − R_i m = t_i with any matrix A, shift s and markers
+    m, and the rms that it leaves."""
     n, M = len(problem.points), len(problem.start_markers)
-    A = np.zeros((n, 3, 12 + 3 * M))
+    columns = np.zeros((n, 3, 12 + 3 * M))
     for k in range(3):
-        A[:, k, 3 * k : 3 * k + 3] = problem.points
-        A[:, k, 9 + k] = 1.0
+        columns[:, k, 3 * k : 3 * k + 3] = problem.points
+        columns[:, k, 9 + k] = 1.0
     for c in range(M):
         here = (problem.marker == c)[:, None, None]
-        A[:, :, 12 + 3 * c : 15 + 3 * c] = -(here * problem.flange_rotation)
-    x = np.linalg.lstsq(A.reshape(3 * n, -1), problem.flange_position.ravel(), rcond=1e-9)[0]
-    U, _, Vt = np.linalg.svd(x[:9].reshape(3, 3).T)
-    return U @ np.diag([1.0, 1.0, np.linalg.det(U @ Vt)]) @ Vt
+        columns[:, :, 12 + 3 * c : 15 + 3 * c] = -(here * problem.flange_rotation)
+    matrix, target = columns.reshape(3 * n, -1), problem.flange_position.ravel()
+    x = np.linalg.lstsq(matrix, target, rcond=1e-9)[0]
+    return x[:9].reshape(3, 3), float(np.sqrt(np.mean((matrix @ x - target) ** 2)))
 
 
 # Starting values found from the data: base, markers and target orientation, or cable geometry.
