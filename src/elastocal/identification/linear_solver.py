@@ -27,7 +27,6 @@ from elastocal.units import Array
 # Nothing here needs an extended `long double`, which several platforms do not have.
 
 SLICES = 3
-BLOCK = 2**14  # entries of a product at a time, so that temporaries stay in cache
 _VELTKAMP = 2.0**27 + 1.0
 
 
@@ -75,9 +74,7 @@ def _cut(hi: Array, lo: Array, bits: int) -> tuple[list[Array], list[Array]]:
 class ExactMatrix:
     """A fixed matrix hi + lo: (m, p) with entries of at most 1 in size, sliced once, used often.
 
-    `times` and `transposed_times` return hi, lo of the product with an (unrounded) right hand
-    side.  The error is below 2^-100 times (inner dimension) times the largest entries; it does
-    not grow with cancellation.  Memory: five arrays of the size of the matrix.
+    Memory: five arrays of the size of the matrix.
     """
 
     def __init__(self, hi: Array, lo: Array):
@@ -86,49 +83,29 @@ class ExactMatrix:
         self._slices, rests = _cut(hi, lo, self._bits)
         self._rest = rests[-1]
 
-    def times(self, right: Array, right_lo: Array | None = None) -> tuple[Array, Array]:
-        """(hi + lo) @ right; right: (p,) or (p, q)."""
-        exponent, right_slices, right_rests = self._cut_right(right, right_lo)
-        shape = (self.hi.shape[0], *right.shape[1:])
-        hi, lo = np.empty(shape), np.empty(shape)
-        count = max(1, BLOCK * shape[0] // max(1, hi.size))
-        for start in range(0, shape[0], count):
-            rows = slice(start, start + count)
-            left = [part[rows] for part in self._slices]
-            hi[rows], lo[rows] = _multiply(left, self._rest[rows], right_slices, right_rests)
-        return np.ldexp(hi, exponent), np.ldexp(lo, exponent)
+    def times(
+        self, right: Array, right_lo: Array | None = None, transposed: bool = False
+    ) -> tuple[Array, Array]:
+        """hi, lo of (hi + lo) @ (right + right_lo), (p,) or (p, q); with (hi + lo).T `transposed`.
 
-    def transposed_times(self, right: Array, right_lo: Array | None = None) -> tuple[Array, Array]:
-        """(hi + lo).T @ right; right: (m,) or (m, q)."""
-        exponent, right_slices, right_rests = self._cut_right(right, right_lo)
-        left = [part.T for part in self._slices]
-        hi, lo = _multiply(left, self._rest.T, right_slices, right_rests)
-        return np.ldexp(hi, exponent), np.ldexp(lo, exponent)
-
-    def _cut_right(
-        self, right: Array, right_lo: Array | None
-    ) -> tuple[NDArray[np.int32], list[Array], list[Array]]:
-        """Scale each column to at most 1 in size and cut it; the rests start with the whole."""
+        The error is below 2^-100 times (inner dimension) times the largest entries; it does not
+        grow with cancellation: the large products of slices have none, the small ones are rounded.
+        """
+        left = [part.T if transposed else part for part in (*self._slices, self._rest)]
         exponent = power_of_two_above(np.max(np.abs(right), axis=0, initial=0.0))
-        hi = np.ldexp(right, -exponent)
-        lo = np.zeros_like(right) if right_lo is None else np.ldexp(right_lo, -exponent)
-        slices, rests = _cut(hi, lo, self._bits)
-        return exponent, slices, [hi, *rests]
-
-
-def _multiply(
-    slices: list[Array], rest: Array, right_slices: list[Array], right_rests: list[Array]
-) -> tuple[Array, Array]:
-    """Sum of all products of parts: the large ones without error, the small ones rounded."""
-    hi = slices[0] @ right_slices[0]
-    lo = rest @ right_rests[0]
-    for i, left in enumerate(slices):
-        for j in range(SLICES - i):
-            if i + j > 0:
-                hi, error = two_sum(hi, left @ right_slices[j])  # the product has no error
-                lo += error
-        lo += left @ right_rests[SLICES - i]
-    return two_sum(hi, lo)
+        right = np.ldexp(right, -exponent)
+        right_lo = np.zeros_like(right) if right_lo is None else np.ldexp(right_lo, -exponent)
+        slices, rests = _cut(right, right_lo, self._bits)
+        rests = [right, *rests]
+        hi, lo = left[0] @ slices[0], left[-1] @ right
+        for i in range(SLICES):
+            for j in range(SLICES - i):
+                if i + j > 0:
+                    hi, error = two_sum(hi, left[i] @ slices[j])  # the product has no error
+                    lo += error
+            lo += left[i] @ rests[SLICES - i]
+        hi, lo = two_sum(hi, lo)
+        return np.ldexp(hi, exponent), np.ldexp(lo, exponent)
 
 
 # Check of the arrays that enter a weighted linear least-squares problem.
@@ -344,7 +321,7 @@ def _refine(A: ExactMatrix, V: Array, b_hi: Array, b_lo: Array) -> tuple[Array, 
         fit_hi, fit_lo = A.times(z_hi, z_lo)
         r_hi, error = two_sum(b_hi, -fit_hi)
         r_hi, r_lo = two_sum(r_hi, error + (b_lo - fit_lo))
-        gradient, _ = A.transposed_times(r_hi, r_lo)
+        gradient, _ = A.times(r_hi, r_lo, transposed=True)
         step = V @ (V.T @ gradient)
         size = float(np.max(np.abs(step), initial=0.0))
         negligible = EPS / 4 * np.abs(z_hi) + EPS**2 * np.max(np.abs(z_hi), initial=0.0)
