@@ -422,7 +422,8 @@ def _urdf(calibrated: CalibratedArm, wish: Wish, kept: Kept, pieces: ExportNumbe
         base, flange = BASE, FLANGE
     read = partial(read_urdf, base=base, flange=flange)
     chain = pieces.calibrated_chain()
-    return text, check_chain(text, ".urdf", read, chain, kept, wish.seed), "pinocchio", [], None
+    distance = check_chain(text, ".urdf", read, chain, kept, wish.seed)
+    return text, distance, "elastocal's own reader of URDF files", [], None
 
 
 def _mjcf(calibrated: CalibratedArm, wish: Wish, kept: Kept, pieces: ExportNumbers) -> Written:

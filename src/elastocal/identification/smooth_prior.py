@@ -129,22 +129,8 @@ class LinearRows:
     group: IntArray
 
     @classmethod
-    def of(
-        cls, r_factor: RFactor, ordinary: int, away: Array, std: Array, group: IntArray
-    ) -> LinearRows:
-        """From the R factor of [B_f B_s e], the functions `away` (shrunk,) from nominal."""
-        R, k = r_factor.R, ordinary
-        z = r_factor.projected + R[:, k:] @ away
-        lower = R[k:, k:]
-        total = float(z[k:] @ z[k:]) + r_factor.rest**2
-        return cls(
-            R[:k, :k], R[:k, k:], z[:k], lower.T @ lower, lower.T @ z[k:], total, r_factor.rows,
-            std, group,
-        )  # fmt: skip
-
-    @classmethod
     def summed(cls, sums: Sums, away: Array, std: Array, group: IntArray) -> LinearRows:
-        """The same from sums over the rows, which take a third of the time of a QR of all."""
+        """From sums over the rows, the functions `away` (shrunk,) from nominal."""
         R = sums.own.R
         # Directions in which the ordinary columns hold nothing but rounding take nothing.
         norms = np.linalg.norm(R, axis=0)
