@@ -16,7 +16,7 @@ from pydantic import Field
 from scipy import linalg
 
 from elastocal.config import Positive, Table, Text, checked, read_toml, required
-from elastocal.errors import InputError, require
+from elastocal.errors import InputError, option, require
 from elastocal.model.manipulator import Model
 from elastocal.text import did_you_mean, listed, quoted
 from elastocal.units import Array
@@ -401,8 +401,6 @@ def physical_constraints(model: Model) -> Constraints:
 
 # Prior knowledge of parameters: data sheets, an earlier calibration, a sister robot.
 
-KEYS = ("mean", "std")
-
 
 @dataclass(frozen=True)
 class GaussianPrior:
@@ -444,26 +442,9 @@ class GaussianPrior:
     def from_dict(cls, table: Mapping[str, Any]) -> GaussianPrior:
         """From {"joint2.compliance": {"mean": 2.9e-7, "std": 3e-8}, …}, in SI units."""
         require(bool(table), "the prior is empty; name at least one parameter")
-        stated: dict[str, list[float]] = {key: [] for key in KEYS}
-        for name, entry in table.items():
-            where = f"prior of {quoted(name)}"
-            require(
-                isinstance(entry, Mapping),
-                f"{where}: expected {{ mean = …, std = … }}, found {quoted(entry)}",
-            )
-            nested = [f'"{name}.{key}"' for key in entry if isinstance(entry[key], Mapping)]
-            require(not nested, f"{where}: write the full name in quotes: {listed(nested)}")
-            for key in entry:
-                require(key in KEYS, f"{where}: unknown key {quoted(key)}{did_you_mean(key, KEYS)}")
-            for key, values in stated.items():
-                require(key in entry, f"{where}: '{key}' is missing")
-                value = entry[key]
-                require(
-                    isinstance(value, int | float) and not isinstance(value, bool),
-                    f"{where}: '{key}' must be a number, found {quoted(value)}",
-                )
-                values.append(float(value))
-        return cls.independent(tuple(table), **stated)
+        stated = {k: dict(v) if isinstance(v, Mapping) else v for k, v in table.items()}
+        known = checked(KnowledgeTable, {"prior": stated}, option("prior")).prior.values()
+        return cls.independent(tuple(table), [p.mean for p in known], [p.std for p in known])
 
     def rows(self, names: Sequence[str]) -> tuple[Array, Array]:
         """P (k, p) and target (k,) with |target − P x|² = (x − mean)ᵀ covariance⁻¹ (x − mean).
@@ -625,9 +606,4 @@ def _constraints(table: KnowledgeTable) -> Constraints:
 
 
 def _prior(table: KnowledgeTable) -> GaussianPrior | None:
-    if not table.prior:
-        return None
-    stated = table.prior.values()
-    return GaussianPrior.independent(
-        tuple(table.prior), [p.mean for p in stated], [p.std for p in stated]
-    )
+    return GaussianPrior.from_dict(table.model_dump()["prior"]) if table.prior else None
