@@ -348,7 +348,8 @@ def any_matrix(problem: RegistrationProblem) -> tuple[Array, float]:
         columns[:, :, 12 + 3 * c : 15 + 3 * c] = -(here * problem.flange_rotation)
     matrix, target = columns.reshape(3 * n, -1), problem.flange_position.ravel()
     x = np.linalg.lstsq(matrix, target, rcond=1e-9)[0]
-    return x[:9].reshape(3, 3), float(np.sqrt(np.mean((matrix @ x - target) ** 2)))
+    left = float(np.sqrt(np.mean((matrix @ x - target) ** 2)))
+    return np.asarray(x[:9].reshape(3, 3), dtype=np.float64), left
 
 
 # Starting values found from the data: base, markers and target orientation, or cable geometry.
