@@ -5,18 +5,29 @@ from collections.abc import Sequence
 import numpy as np
 
 from elastocal.identification import (
+    ConstrainedObjective,
     Constraints,
     GaussianPrior,
     constrained_bootstrap,
     minimise,
-    objective_of,
     profile_linear_interval,
 )
 from elastocal.identification.bootstrap import ParametricBootstrap
 from elastocal.identification.constrained import Minimum
+from elastocal.identification.constrained_solver import loss_of
 from elastocal.identification.intervals import ProfileInterval
 
 NONE = Constraints()
+
+
+def objective_of(B, y, names, prior, loss, size, sigma) -> ConstrainedObjective:
+    """Σ ρ(y − B x) + σ² (x − m)ᵀ C⁻¹ (x − m) with rows of standard deviation `sigma`."""
+    p = len(names)
+    P, target = (np.zeros((0, p)), np.zeros(0)) if prior is None else prior.rows(names)
+    return ConstrainedObjective(
+        np.asarray(B, dtype=float), np.asarray(y, dtype=float), sigma * P, sigma * target,
+        loss_of(loss, size, sigma),
+    )  # fmt: skip
 
 
 def solve(

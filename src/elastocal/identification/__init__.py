@@ -4,7 +4,7 @@ from elastocal import loaded_on_demand
 
 ROOMS = {
     "bootstrap": "ParametricBootstrap parametric_bootstrap wild_cluster_bootstrap",
-    "constrained": "ActiveConstraint constrained_fit minimise objective_of",
+    "constrained": "ActiveConstraint constrained_fit minimise",
     "constrained_solver": "ConstrainedObjective ResidualLoss",
     "covariance": "Covariance cluster_robust hc t_quantile",
     "error_budget": "BudgetStep gap_budget",

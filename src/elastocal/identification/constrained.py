@@ -2,12 +2,11 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import Literal, NoReturn
 
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import NDArray
 from scipy import linalg
 
 from elastocal.errors import ElastocalError, InputError, InsufficientDataError, option, require
@@ -248,39 +247,6 @@ def _named(
             price = 2 * float(matrix.balance**2 @ np.diag(Z))
             found.append(ActiveConstraint(matrix.label, "semidefinite", names, 0.0, price))
     return tuple(found)
-
-
-def objective_of(
-    B: ArrayLike,
-    y: ArrayLike,
-    names: Sequence[str],
-    prior: GaussianPrior | None,
-    loss: LossName,
-    size: int,
-    sigma: float,
-) -> ConstrainedObjective:
-    """The checked objective Σ ρ(y − B x) + σ² (x − m)ᵀ C⁻¹ (x − m).
-
-    B (rows, p) and y (rows,) are whitened with rows of standard deviation `sigma`; `names` (p,)
-    are the columns; m and C come from the prior (maximum a posteriori).  "squares" is ρ = |r|²;
-    "huber" is Huber's loss of the length of each observation of `size` rows, with the threshold
-    of 95 % efficiency.
-
-    Raises InputError where names are unknown or numbers not finite.
-    """
-    B, y = np.asarray(B, dtype=float), np.asarray(y, dtype=float)
-    p = len(names)
-    require(
-        B.ndim == 2 and B.shape[1] == p and y.shape == B.shape[:1],
-        f"B must be (rows, {p}) for {p} names and y (rows,); found {B.shape} and {y.shape}",
-    )
-    require(len(set(names)) == p and p > 0, "the names of the columns must differ, at least one")
-    require(bool(np.isfinite(B).all() and np.isfinite(y).all()), "B and y must be finite")
-    require(bool(np.isfinite(sigma) and sigma > 0), f"sigma must be positive, found {sigma}")
-    rho = loss_of(loss, size, sigma)
-    require(len(y) % size == 0, f"{len(y)} rows are no multiple of {size} per observation")
-    P, target = (np.zeros((0, p)), np.zeros(0)) if prior is None else prior.rows(names)
-    return ConstrainedObjective(B, y, sigma * P, sigma * target, rho)
 
 
 # Constrained fit of the nonlinear model: sequential convex programming on the exact B.

@@ -19,7 +19,6 @@ from elastocal.identification.constrained import (
     fit_system,
     fitted_columns,
     minimise,
-    objective_of,
     own_bounds,
 )
 from elastocal.identification.constrained_solver import (
@@ -300,6 +299,10 @@ class LinearisedFit:
         """The same with every active constraint taken for an equality."""
         return self._half_on_face.T @ self._half_on_face
 
+    def objective(self, B: Array, y: Array, loss: ResidualLoss) -> ConstrainedObjective:
+        """Of x with these rows for the readings, and the prior."""
+        return ConstrainedObjective(B, y, self.P, self.lack + self.P @ self.x, loss)
+
     @property
     def covariance(self) -> Array:
         """Posterior covariance (columns, columns), equalities exact, inequalities left out."""
@@ -390,10 +393,7 @@ def intervals_with_knowledge(
         lower, upper = local.system.lower[:, None], local.system.upper[:, None]
         return Intervals(covariance, np.clip(ci95, lower, upper))
     if kind == "bootstrap":
-        objective = objective_of(
-            local.B, local.e + local.B @ local.x, local.names, prior,
-            "squares" if local.loss.quadratic else "huber", local.loss.size, local.sigma,
-        )  # fmt: skip
+        objective = local.objective(local.B, local.e + local.B @ local.x, local.loss)
         drawn = constrained_bootstrap(
             objective, local.system, local.sigma, draws=DRAWS, seed=options.seed, jobs=options.jobs
         )
@@ -403,16 +403,17 @@ def intervals_with_knowledge(
         )
     ends = []
     plain = Covariance("t", matrix, dof, "").interval(local.x, LEVEL)
+    # The prior is as wide as the noise is taken for, so that their ratio stays.
+    linear = local.objective(*local.r_factor, ResidualLoss())
     for k, (name, wide) in enumerate(zip(local.names, _inflation(local, dof), strict=True)):
         if name in (many or ()):
             ends.append((float(plain[k, 0]), float(plain[k, 1])))
             continue
-        wider = None if prior is None else replace(prior, covariance=prior.covariance * wide**2)
         sigma = local.sigma * wide
         if kind == "profile":
+            wider = None if prior is None else replace(prior, covariance=prior.covariance * wide**2)
             one = profile_fit_interval(problem, found, name, constraints, sigma, prior=wider)
         else:
-            linear = objective_of(*local.r_factor, local.names, wider, "squares", 1, sigma)
             one = profile_linear_interval(linear, local.system, name, sigma)
         ends.append((one.lower, one.upper))
     model = "nonlinear" if kind == "profile" else "linearised"
