@@ -156,7 +156,7 @@ def run():
 """,
     "by CasADi": """
 import casadi as ca
-from elastocal.screen import check_interrupted
+from elastocal.cli.app import Interrupts
 from elastocal.planning.polish import IPOPT_OPTIONS
 class Goal(ca.Callback):
     def __init__(self):
@@ -167,11 +167,12 @@ class Goal(ca.Callback):
         return [given[0]]
 def run():
     x, goal = ca.MX.sym("x"), Goal()
-    try:
-        ca.nlpsol("s", "ipopt", {"x": x, "f": goal(x) ** 2}, IPOPT_OPTIONS)(x0=1.0)
-    except RuntimeError:
-        pass
-    check_interrupted()
+    with Interrupts() as stop:
+        try:
+            ca.nlpsol("s", "ipopt", {"x": x, "f": goal(x) ** 2}, IPOPT_OPTIONS)(x0=1.0)
+        except RuntimeError:
+            pass
+        stop.check()
 """,
     "by nobody, when Python is half taken down": """
 class Late:

@@ -121,13 +121,6 @@ def noting_interrupts() -> Iterator[list[int]]:
         sys.excepthook, sys.unraisablehook = hooks
 
 
-def check_interrupted() -> None:
-    """Raise KeyboardInterrupt where there was one, since CasADi catches it inside a solver and
-    returns where the search stood: results would depend on when the key was pressed."""
-    if interrupts:
-        raise KeyboardInterrupt
-
-
 def _press_again() -> None:
     if not _ended:
         os.kill(os.getpid(), signal.SIGINT)

@@ -11,6 +11,7 @@ from typer.core import TyperCommand, TyperOption
 
 from elastocal.cli.app import (
     CellFile,
+    Interrupts,
     Json,
     Quiet,
     ReportFile,
@@ -23,7 +24,7 @@ from elastocal.cli.app import (
     repeated,
 )
 from elastocal.errors import InputError, require
-from elastocal.screen import check_interrupted, progress_line, say
+from elastocal.screen import progress_line, say
 
 if TYPE_CHECKING:
     from elastocal.cell.work_cell import Cell
@@ -176,10 +177,10 @@ def design(
     # What this command and `ec.design` call the same goes from one to the other.
     asked = {name: given[name] for name in signature(verb).parameters if name in given}
     asked |= {"target": _target(target, poses), "curve": _numbers(curve), "fixed": fix or ()}
-    with progress_line(quiet) as tell:
+    with progress_line(quiet) as tell, Interrupts() as interrupts:
 
         def progress(message: str) -> None:
-            check_interrupted()
+            interrupts.check()
             tell(message)
 
         progress("reading")
@@ -195,18 +196,18 @@ def design(
         check_apart(written, files)
         apart = ("jobs", "augment", "knowledge")  # these are among the files
         told = {name: value for name, value in asked.items() if name not in apart}
-        checkpoint = Checkpoint.beside(output, key_of(files, **told), check_interrupted)
+        checkpoint = Checkpoint.beside(output, key_of(files, **told), interrupts.check)
         if checkpoint.begun:
             progress("going on with the design that was interrupted")
         try:
             plan = run(wanted, options, checkpoint, progress)
         except Exception as error:
-            check_interrupted()
+            interrupts.check()
             if not isinstance(error, OSError):
                 # The same input ends here again: there is nothing to go on with.
                 checkpoint.drop()
             raise
-        check_interrupted()
+        interrupts.check()
         with together(written):
             _write_all(plan, output, programs, picture)
             if cell_out is not None:
