@@ -346,3 +346,9 @@ def test_no_module_but_the_catalogue_names_an_effect() -> None:
         if isinstance(node, ast.Constant) and node.value in CATALOGUE
     ]
     assert named == []
+
+
+def test_no_module_imports_scipy_stats_when_it_is_imported() -> None:
+    """A third of a second at every start; `scipy.special` has the quantiles."""
+    first = re.compile(r"^from scipy(\.stats import|(.*[ ,])stats\b)|^import scipy\.stats", re.M)
+    assert not [path for path in SOURCE.rglob("*.py") if first.search(path.read_text("utf-8"))]

@@ -389,7 +389,7 @@ def _tested(
         )
         for k, n in enumerate(names)
     )  # fmt: skip
-    return changes, float(special.fdtrc(len(z), smallest, together))
+    return changes, float(special.fdtrc(len(z), min(smallest, 1e9), together))
 
 
 def _variances_and_dof(arm: CalibratedArm, names: list[str]) -> tuple[Array, Array]:
