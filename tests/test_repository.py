@@ -9,6 +9,7 @@ import re
 import subprocess
 import tomllib
 from collections.abc import Iterator
+from functools import cache
 from graphlib import CycleError, TopologicalSorter
 from pathlib import Path
 
@@ -186,12 +187,14 @@ def test_no_file_name_stands_for_two_things() -> None:
     assert {stem for stem in stems if stems.count(stem) > 1} == set()
 
 
+@cache
+def nodes(path: Path) -> list[ast.AST]:
+    return list(ast.walk(ast.parse(path.read_text())))
+
+
 def test_no_class_name_stands_for_two_things() -> None:
     classes = [
-        node.name
-        for path in LENGTHS
-        for node in ast.walk(ast.parse(path.read_text()))
-        if isinstance(node, ast.ClassDef)
+        node.name for path in LENGTHS for node in nodes(path) if isinstance(node, ast.ClassDef)
     ]
     assert {name for name in classes if classes.count(name) > 1} == set()
 
@@ -212,7 +215,7 @@ def imported(module: str, path: Path) -> set[str]:
     """The modules of elastocal that `module` imports, at its top or inside a function."""
     package = module if path.name == "__init__.py" else module.rpartition(".")[0]
     full: list[str] = []
-    for node in ast.walk(ast.parse(path.read_text())):
+    for node in nodes(path):
         if isinstance(node, ast.Import):
             full += [alias.name for alias in node.names]
         elif isinstance(node, ast.ImportFrom):
@@ -232,7 +235,9 @@ def _module_of(name: str) -> str:
     return name
 
 
-IMPORTS = {module: imported(module, path) for module, path in MODULES.items()}
+@cache
+def imports() -> dict[str, set[str]]:
+    return {module: imported(module, path) for module, path in MODULES.items()}
 
 
 def unit(module: str) -> str:
@@ -250,7 +255,7 @@ def rank(module: str) -> int:
 def test_imports_point_down_the_layers() -> None:
     up = [
         f"{module} imports {target}"
-        for module, targets in IMPORTS.items()
+        for module, targets in imports().items()
         for target in sorted(targets)
         if rank(target) > rank(module)
     ]
@@ -259,14 +264,14 @@ def test_imports_point_down_the_layers() -> None:
 
 def test_no_circle_of_packages() -> None:
     units: dict[str, set[str]] = {}
-    for module, targets in IMPORTS.items():
+    for module, targets in imports().items():
         others = {unit(target) for target in targets} - {unit(module)}
         units.setdefault(unit(module), set()).update(others)
     assert _circle(units) == []
 
 
 def test_no_circle_of_modules() -> None:
-    assert _circle(IMPORTS) == []
+    assert _circle(imports()) == []
 
 
 def _circle(graph: dict[str, set[str]]) -> list[str]:
@@ -282,7 +287,7 @@ def test_nobody_within_goes_by_the_front_door() -> None:
     taken = {
         (module, alias.name)
         for module, path in MODULES.items()
-        for node in ast.walk(ast.parse(path.read_text()))
+        for node in nodes(path)
         if isinstance(node, ast.ImportFrom) and node.module == "elastocal"
         for alias in node.names
         if alias.name not in ("__version__", "loaded_on_demand", *map(unit, MODULES))
@@ -312,9 +317,8 @@ def test_no_message_of_the_library_names_a_flag() -> None:
 
 def _strings(path: Path) -> Iterator[str]:
     """Sentences in a module's code: no docstrings, no words that are passed to other programs."""
-    tree = ast.parse(path.read_text())
-    told = {id(node.value) for node in ast.walk(tree) if isinstance(node, ast.Expr)}
-    for node in ast.walk(tree):
+    told = {id(node.value) for node in nodes(path) if isinstance(node, ast.Expr)}
+    for node in nodes(path):
         words = isinstance(node, ast.Constant) and isinstance(node.value, str)
         if words and id(node) not in told and " " in node.value.strip():
             yield node.value
@@ -322,13 +326,19 @@ def _strings(path: Path) -> Iterator[str]:
 
 def test_imports_are_recognised() -> None:
     """Guard of the guard: absolute, relative and function-level imports are all seen."""
-    assert "errors" in IMPORTS["files"]
-    assert {"cell.work_cell", "errors", "measurements"} <= IMPORTS["model.manipulator"]
+    assert "errors" in imports()["files"]
+    assert {"cell.work_cell", "errors", "measurements"} <= imports()["model.manipulator"]
     assert rank("model.manipulator") < rank("identification.solve") < rank("cli.identify_command")
     assert rank("cell") == rank("measurements") == rank("errors") == rank("files") == 0
 
 
 # Effects
+
+
+def options(path: Path) -> set[int]:
+    """What `option` is called with."""
+    calls = [n for n in nodes(path) if isinstance(n, ast.Call) and isinstance(n.func, ast.Name)]
+    return {id(word) for n in calls if n.func.id == "option" for word in n.args}
 
 
 def test_no_module_but_the_catalogue_names_an_effect() -> None:
@@ -342,7 +352,14 @@ def test_no_module_but_the_catalogue_names_an_effect() -> None:
         f"{module}, line {node.lineno}: {node.value}"
         for module, path in MODULES.items()
         if not module.startswith("model.effects")
-        for node in ast.walk(ast.parse(re.sub(r"option\('\w+'\)", "option()", path.read_text())))
+        for node in nodes(path)
         if isinstance(node, ast.Constant) and node.value in CATALOGUE
+        if id(node) not in options(path)
     ]
     assert named == []
+
+
+def test_no_module_imports_scipy_stats_when_it_is_imported() -> None:
+    """A third of a second at every start; `scipy.special` has the quantiles."""
+    first = re.compile(r"^from scipy(\.stats import|(.*[ ,])stats\b)|^import scipy\.stats", re.M)
+    assert not [path for path in SOURCE.rglob("*.py") if first.search(path.read_text("utf-8"))]

@@ -145,9 +145,9 @@ def test_gross_errors_do_not_bend_a_robust_fit(method, share):
 
 
 def test_robust_intervals_hold_with_outliers():
-    """12 tables of 7 parameters with 5 % errors: MM intervals at 95 %, in the binomial band."""
+    """8 tables of 7 parameters with 5 % errors: MM intervals at 95 %, in the binomial band."""
     hits = total = 0
-    for seed in range(12):
+    for seed in range(8):
         model, table, truth = campaign(seed)
         result = identify(model, with_errors(table, 0.05, seed), Options(method="tukey"))
         for name, true in zip(model.names, truth, strict=True):
@@ -196,9 +196,9 @@ def test_auto_says_what_it_chose_and_from_what():
 
 
 def test_intervals_hold_where_the_arm_does_not_come_back_to_the_same_place():
-    """12 tables of 7 parameters with 100 µm common to a configuration, twice the noise."""
+    """8 tables of 7 parameters with 100 µm common to a configuration, twice the noise."""
     hits = plain_hits = total = 0
-    for seed in range(12):
+    for seed in range(8):
         model, table, truth = campaign(seed, effect=1e-4)
         both = identify(model, table), identify(model, table, Options(method="ols"))
         for name, true in zip(model.names, truth, strict=True):
@@ -231,7 +231,7 @@ def test_every_kind_of_intervals(kind):
 
 def test_clustered_intervals_hold_under_a_configuration_effect():
     hits = total = 0
-    for seed in range(12):
+    for seed in range(8):
         model, table, truth = campaign(seed, effect=1e-4)
         result = identify(model, table, Options(method="ols", intervals="cr2"))
         for name, true in zip(model.names, truth, strict=True):

@@ -9,7 +9,6 @@ from typing import Any
 
 import numpy as np
 from scipy.spatial.transform import Rotation
-from scipy.stats import qmc
 
 from elastocal.compensation.commands import Goals
 from elastocal.compensation.compensate import Compensation, compensate, nominal_flanges
@@ -136,6 +135,8 @@ def correction_table(
     Beside singular postures and limits, where q_c is far from the nominal command or beyond
     reach, it is the tool's error there with its sign changed (FIRST_ORDER).
     """
+    from scipy.stats import qmc
+
     arm = lasting(arm)[0]
     points = grid.points()
     progress(f"{len(points)} grid points")

@@ -10,8 +10,7 @@ from __future__ import annotations
 from dataclasses import replace
 
 import numpy as np
-from scipy.special import expit
-from scipy.stats import norm
+from scipy.special import expit, ndtr
 
 from elastocal.diagnosis.diagnosis_data import DiagnosisData, diagnosis_data_of
 from elastocal.diagnosis.evidence import Grams
@@ -75,7 +74,7 @@ def doubt(better: ModelSet, other: ModelSet) -> float:
     others = _squares(other.data, project(other.data, better.noise))
     d = (others - _squares(better.data, better.at)) / 2
     odds, scatter = max(float(d.sum()), 0.0), max(float(np.linalg.norm(d)), 1e-300)
-    return float(max(expit(-odds), norm.cdf(-odds / scatter)))
+    return float(max(expit(-odds), ndtr(-odds / scatter)))
 
 
 def _squares(data: NoisyData, at: Projection) -> Array:

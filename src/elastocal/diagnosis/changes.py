@@ -21,7 +21,7 @@ from typing import Any
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
-from scipy import stats
+from scipy import special
 
 from elastocal.above import Result
 from elastocal.cell.arm_description import Tool
@@ -371,7 +371,7 @@ def _tested(
     shares, dofs = zip(*(_variances_and_dof(arm, names) for arm in (old, new)), strict=True)
     both = sum(s**2 / nu for s, nu in zip(shares, dofs, strict=True))
     nu = np.divide(sum(shares) ** 2, both, out=np.full(len(z), np.inf), where=both > 0)
-    p = 2 * stats.t.sf(np.abs(z) / std, np.maximum(nu, 1.0))
+    p = 2 * special.stdtr(np.maximum(nu, 1.0), -np.abs(z) / std)
     order = np.argsort(p)
     family = np.empty(len(p))
     family[order] = np.minimum(np.maximum.accumulate(p[order] * np.arange(len(p), 0, -1)), 1.0)
@@ -389,7 +389,7 @@ def _tested(
         )
         for k, n in enumerate(names)
     )  # fmt: skip
-    return changes, float(stats.f.sf(together, len(z), smallest))
+    return changes, float(special.fdtrc(len(z), min(smallest, 1e9), together))
 
 
 def _variances_and_dof(arm: CalibratedArm, names: list[str]) -> tuple[Array, Array]:

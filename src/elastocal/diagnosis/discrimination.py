@@ -8,9 +8,8 @@ from itertools import chain, islice, pairwise, permutations
 from typing import Any
 
 import numpy as np
-from scipy import linalg
+from scipy import linalg, special
 from scipy.sparse.csgraph import connected_components
-from scipy.stats import norm
 
 from elastocal.diagnosis.baseline import Baseline
 from elastocal.diagnosis.diagnosis import Diagnosis, RivalPair
@@ -390,7 +389,7 @@ class Discrimination:
         odds = np.log(np.bincount(self.classes, p)[self.classes])
         L = (odds[:, None] - odds[None, :])[..., None]
         delta = np.sqrt(np.maximum(self.gained(squared), 1e-12))
-        beaten = norm.cdf(-(L + delta**2 / 2) / delta)
+        beaten = special.ndtr(-(L + delta**2 / 2) / delta)
         beaten = np.where(
             squared < TOO_NEAR**2, np.maximum(beaten, 1 - TOO_NEAR_PROBABILITY), beaten
         )
@@ -461,7 +460,7 @@ def judged(
     out, hopeless = [], {}
     for c in tasks:
         d = c.distances(c.squared(c.gram(range(len(c.rows.pool)))))
-        near = d < 2 * float(norm.ppf(HOPE))
+        near = d < 2 * float(special.ndtri(HOPE))
         classes = connected_components(near, directed=False)[1].astype(np.int64)
         out.append(c.in_classes(classes))
         names = c.rivals.names

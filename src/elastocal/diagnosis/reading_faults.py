@@ -5,7 +5,7 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 import numpy as np
-from scipy import optimize, stats
+from scipy import optimize, special
 from scipy.spatial import cKDTree
 
 from elastocal.diagnosis.diagnosis_data import DiagnosisData
@@ -104,9 +104,9 @@ class DirectChecks:
         """
         at, used = project(data, self.usual), ~data.faulty
         squared, error, weight = left_out_errors(self.dataset, at, used)
-        chi2 = float(stats.chi2.isf(LEVEL / len(used), self.size))
+        chi2 = float(special.chdtri(self.size, LEVEL / len(used)))
         median = max(float(np.median(squared[used])), TINY)
-        scale = median / float(stats.chi2.median(self.size))
+        scale = median / float(special.chdtri(self.size, 0.5))
         out = np.where(used, squared, 0.0) / (chi2 * scale)
         suspect = out > 1
         if not suspect.any():
@@ -134,22 +134,22 @@ class DirectChecks:
         """
         k, n, median = self.size, len(squared), max(float(np.median(squared)), TINY)
         level, ninth = LEVEL / self.dataset.blocks.n, float(np.quantile(squared, 0.9))
-        chi2 = stats.chi2(k)
-        beyond = int((squared > chi2.ppf(0.9) * median / chi2.median()).sum())
-        by_chi2 = float(chi2.isf(level) / chi2.median()) * median
-        if stats.binom.sf(beyond - 1, n, 0.1) > ACCIDENT:
+        tenth, half, limit = special.chdtri(k, [0.1, 0.5, level])
+        beyond = int((squared > tenth * median / half).sum())
+        by_chi2 = float(limit / half) * median
+        if special.bdtrc(beyond - 1, n, 0.1) > ACCIDENT:
             return by_chi2
 
         def too_heavy(log_dof: float) -> float:
-            tail = stats.f(k, np.exp(log_dof))
-            return float(tail.ppf(0.9) / tail.median() - ninth / median)
+            high, half = special.fdtri(k, np.exp(log_dof), [0.9, 0.5])
+            return float(high / half - ninth / median)
 
         low, high = float(np.log(HEAVIEST)), float(np.log(LIGHTEST))
         if too_heavy(high) >= 0:
             return by_chi2
         nu = np.exp(low if too_heavy(low) <= 0 else optimize.brentq(too_heavy, low, high))
-        tail = stats.f(k, nu)
-        return float(tail.isf(level) / tail.median()) * median
+        limit, half = special.fdtri(k, nu, [1 - level, 0.5])
+        return float(limit / half) * median
 
     def _within_visits(
         self, e: Array, error: Array, used: BoolArray, suspect: BoolArray
@@ -210,9 +210,9 @@ class DirectChecks:
         found, would = np.zeros_like(squared), np.zeros_like(power)
         for k in np.unique(dof[dof > 0]):
             own = dof == k
-            limit = float(stats.chi2.isf(LEVEL / len(dof), k))
+            limit = float(special.chdtri(k, LEVEL / len(dof)))
             # Readings better than stated are not faulty yet.
-            scale = float(np.median(squared[own])) / float(stats.chi2.median(k))
+            scale = float(np.median(squared[own])) / float(special.chdtri(k, 0.5))
             scale = self.scales[check].setdefault(int(k), max(scale, 1.0 if self.stated else TINY))
             found[own], would[own] = squared[own] / (limit * scale), power[own] / (limit * scale)
         return found, would
@@ -258,6 +258,8 @@ def left_out_errors(
 
 def accidental(dataset: DiagnosisData, faulty: BoolArray) -> bool:
     """Whether the faulty readings (N,) spread over markers, load states and time as all do."""
+    from scipy.stats import hypergeom  # slow to import, seldom asked for
+
     table, lead, moment = dataset.table, dataset.lead, dataset.moment
     loaded = np.any(table.force != 0, axis=1)[lead]
     for label in (table.marker[lead], loaded, moment > np.median(moment)):
@@ -267,7 +269,7 @@ def accidental(dataset: DiagnosisData, faulty: BoolArray) -> bool:
         counts = np.array([[(faulty & (label == g)).sum(), (label == g).sum()] for g in groups])
         found, size = counts.T
         # Each group's count given the total is hypergeometric; the most conspicuous one decides.
-        p = stats.hypergeom.sf(found - 1, size.sum(), found.sum(), size).min() * len(groups)
+        p = hypergeom.sf(found - 1, size.sum(), found.sum(), size).min() * len(groups)
         if p < ACCIDENT:
             return False
     return True

@@ -5,7 +5,7 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 import numpy as np
-from scipy import sparse, stats
+from scipy import sparse, special
 from scipy.sparse.csgraph import connected_components
 from scipy.spatial import cKDTree
 
@@ -187,7 +187,7 @@ def smooth_scatter(dataset: DiagnosisData, data: NoisyData, at: Projection) -> A
     out = np.zeros(J)
     first = dataset.lead[dataset.blocks.member[:, 0]]
     q, moment = dataset.table.q[first], dataset.moment[dataset.blocks.member[:, 0]]
-    limit = float(stats.norm.isf(FALSE_SMOOTH / (J * (J + 2))))
+    limit = -float(special.ndtri(FALSE_SMOOTH / (J * (J + 2))))
     h = np.einsum("cmj,cmj->cj", of.G, at.P @ of.G)
     a = np.einsum("cmj,cm->cj", of.G, at.u)
     for j in range(J):
@@ -270,8 +270,8 @@ def supported_floor(
         dof += near.independent * size
     if dof:
         shown = size * total / dof
-        low = float(stats.chi2.ppf(CONTRADICTED, dof)) / dof
-        high = float(stats.chi2.isf(CONTRADICTED, dof)) / dof
+        low = float(special.chdtri(dof, 1 - CONTRADICTED)) / dof
+        high = float(special.chdtri(dof, CONTRADICTED)) / dof
         if shown < low * fitted**2 or shown > high * variance:
             variance = shown
     floor = min(float(np.sqrt(variance)), fitted)

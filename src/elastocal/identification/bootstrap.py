@@ -8,7 +8,7 @@ from typing import Literal, get_args
 
 import numpy as np
 from numpy.typing import ArrayLike
-from scipy import optimize, stats
+from scipy import optimize, special
 
 from elastocal.errors import ElastocalError, InsufficientDataError, require
 from elastocal.identification.covariance import (
@@ -75,9 +75,9 @@ class ParametricBootstrap:
             f"a level of {level} needs at least {np.ceil(2 / (1 - level)):.0f} draws; got {n}",
         )
         below = np.mean(self.draws < x, axis=0) + np.mean(self.draws == x, axis=0) / 2
-        bias = stats.norm.ppf(np.clip(below, 0.5 / n, 1 - 0.5 / n))
-        z = stats.norm.ppf((1 + level) / 2)
-        ends = stats.norm.cdf(2 * bias[:, None] + [-z, z])
+        bias = special.ndtri(np.clip(below, 0.5 / n, 1 - 0.5 / n))
+        z = special.ndtri((1 + level) / 2)
+        ends = special.ndtr(2 * bias[:, None] + [-z, z])
         columns = [np.quantile(self.draws[:, j], ends[j]) for j in range(p)]
         return np.array(columns)
 

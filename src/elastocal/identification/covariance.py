@@ -8,7 +8,7 @@ from typing import Literal, get_args
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
-from scipy import linalg, stats
+from scipy import linalg, special
 
 from elastocal.errors import InputError, InsufficientDataError, require
 from elastocal.identification.linear_solver import checked_problem
@@ -79,8 +79,9 @@ def t_quantile(level: float, dof: Array) -> Array:
     Infinite at dof 0.  Raises InputError unless 0 < level < 1.
     """
     require(0 < level < 1, f"level must lie between 0 and 1, for example 0.95; got {level}")
-    known = np.where(dof > 0, dof, 1.0)
-    return np.where(dof > 0, stats.t.ppf((1 + level) / 2, known), np.inf)
+    p, few = (1 + level) / 2, np.where((dof > 0) & np.isfinite(dof), dof, 1.0)
+    t = np.where(np.isinf(dof), special.ndtri(p), special.stdtrit(few, p))
+    return np.where(dof > 0, t, np.inf)
 
 
 # Orthogonal factors of B, in which every covariance estimator of this package works.

@@ -9,7 +9,7 @@ from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy import linalg, stats
+from scipy import linalg, special
 
 from elastocal.errors import option
 from elastocal.identification.assumptions import assumption_findings
@@ -173,7 +173,7 @@ def _against_stated_noise(result: Calibration) -> Iterator[Finding]:
         remedy = "" if _lacks_fit(result) else STATE_NOISE
         yield Finding("noise_not_compared", "note", {}, remedy)
         return
-    low, high = np.sqrt(stats.chi2.ppf(STATED, result.dof) / result.dof)
+    low, high = np.sqrt(special.chdtri(result.dof, 1 - np.array(STATED)) / result.dof)
     numbers: dict[str, Number] = {
         "ratio": float(ratio), "by_chance_from": float(low), "by_chance_to": float(high),
         "dof": result.dof,
@@ -303,7 +303,7 @@ def _new_poses(result: Calibration) -> Iterator[Finding]:
 # Equations left between configurations from which their scatter says to a factor of 1.25, with
 # 95 % probability, what errors there are beyond the parameters: √(ν/χ²_ν(5 %)) ≤ 1.25.
 FACTOR = 1.25
-ENOUGH = next(n for n in range(1, 1000) if n <= FACTOR**2 * stats.chi2.ppf(0.05, n))
+ENOUGH = next(n for n in range(1, 1000) if n <= FACTOR**2 * special.chdtri(n, 0.95))
 
 
 def spare_equations(result: Calibration) -> int:
@@ -437,7 +437,7 @@ def _test(result: Calibration) -> Iterator[Finding]:
             f"{option('test')}.",
         )  # fmt: skip
     elif math.isfinite(held):
-        allowed = math.sqrt(stats.f.ppf(1 - CHANCE, test.n, result.dof))
+        allowed = math.sqrt(special.fdtri(test.n, result.dof, 1 - CHANCE))
         if test.rms > max(WORSE, allowed) * held:
             numbers: dict[str, Number] = {"test_rms_um": _um(test.rms), "heldout_rms_um": _um(held)}
             yield Finding("test_data_worse", "care", numbers, COMPARE)

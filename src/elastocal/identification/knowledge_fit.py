@@ -8,7 +8,7 @@ from functools import cached_property, partial
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy import linalg, sparse, stats
+from scipy import linalg, sparse, special
 
 from elastocal.errors import ElastocalError, InputError, option, require
 from elastocal.identification.bootstrap import ParametricBootstrap, parametric_bootstrap
@@ -431,7 +431,7 @@ def _posterior(prior: GaussianPrior | None, local: LinearisedFit) -> tuple[str, 
 def _inflation(local: LinearisedFit, dof: Array) -> Array:
     """Factors (p,) on σ that turn the normal quantile of a known noise into t of `dof`."""
     t = t_quantile(LEVEL, np.maximum(dof, 1.0))
-    return t / stats.norm.ppf((1 + LEVEL) / 2) * np.sqrt(local.variance) / local.sigma
+    return t / special.ndtri((1 + LEVEL) / 2) * np.sqrt(local.variance) / local.sigma
 
 
 # The fit of a method, its knowledge added: one more step on the weights that the method ends with.
@@ -570,7 +570,8 @@ def _contradiction(
     if own is not None:
         grown, dof = grown - own.stands, own.dof
     F = max(grown, 0.0) / (stated * local.sigma**2)
-    p = float(stats.f.sf(F, stated, dof) if np.isfinite(dof) else stats.chi2.sf(F * stated, stated))
+    known = np.isinf(dof)
+    p = float(special.chdtrc(stated, F * stated) if known else special.fdtrc(stated, dof, F))
     if p > CONTRADICTED:
         return ()
     what = [f"'{a.label}'" for a in found.active]

@@ -12,7 +12,7 @@ from dataclasses import dataclass, replace
 from functools import partial
 
 import numpy as np
-from scipy import stats
+from scipy import special
 
 from elastocal.cell.arm_description import ModelSpec, Tool
 from elastocal.cell.work_cell import Cell
@@ -223,7 +223,7 @@ def copied(observed: Observations) -> BoolArray:
     # A reading with k others before it is like one of them with probability 1 - (1 - P)^k.
     before = np.arange(int(np.bincount(group).max()))
     alike_by_chance = np.cumsum(1 - (1 - share) ** before)[np.bincount(group) - 1]
-    chance = stats.poisson.sf(int(found.sum()) - 1, float(alike_by_chance.sum()))
+    chance = special.gammainc(int(found.sum()), float(alike_by_chance.sum()))
     return found & bool(chance < COPIED)
 
 

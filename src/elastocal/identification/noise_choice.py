@@ -8,7 +8,7 @@ from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy import linalg, sparse, stats
+from scipy import linalg, sparse, special
 
 from elastocal.errors import ElastocalError, InputError, InsufficientDataError
 from elastocal.identification.covariance import Covariance, orthogonal
@@ -491,7 +491,7 @@ def unexplained_readings(
     outside = np.maximum(dof - 1, 1.0)
     deleted = np.sqrt(squared * outside / (dof - squared))
     size = np.where(good[:, None], deleted, np.abs(t))
-    p = 2 * stats.t.sf(size, np.where(good[:, None], outside, dof))
+    p = 2 * special.stdtr(np.where(good[:, None], outside, dof), -size)
     return np.asarray(p.min(axis=1) < level / readings.e.size)
 
 
@@ -645,7 +645,7 @@ def outlier_screening(
 
 
 def _scale(deviation: Array, axis: int = 0) -> Array:
-    return np.median(deviation, axis=axis) / stats.norm.ppf(0.75)
+    return np.median(deviation, axis=axis) / special.ndtri(0.75)
 
 
 # The default estimate: faulty readings set apart, noise model chosen, x by its weights.
@@ -698,7 +698,7 @@ def settle(
             break
     last, best = visited[-1], min(visited, key=lambda v: v[0])
     half = (len(readings) // 2 + 1) * readings.size
-    if last[0] > best[0] * stats.f.isf(FALSE_ALARM, half, half):
+    if last[0] > best[0] * special.fdtri(half, half, 1 - FALSE_ALARM):
         last = best
     _, good, noise = last
     if len(visited) > 1 and kind == "auto":

@@ -7,7 +7,7 @@ from dataclasses import asdict, dataclass, replace
 from typing import Any
 
 import numpy as np
-from scipy import stats
+from scipy import special
 
 from elastocal.errors import InputError
 from elastocal.identification.methods import MethodResult
@@ -52,7 +52,7 @@ def lack_of_fit(observed: Observations, whitened: Array, n_parameters: int) -> L
         return None
     between = max(float((residual**2).sum()) - pure, 0.0)
     F = (between / dof_between) / (pure / dof_pure)
-    return LackOfFit(F, float(stats.f.sf(F, dof_between, dof_pure)), dof_between, dof_pure)
+    return LackOfFit(F, float(special.fdtrc(dof_between, dof_pure, F)), dof_between, dof_pure)
 
 
 # The noise of a result: which model, its size, why, and whether repeats agree.

@@ -6,7 +6,7 @@ from collections.abc import Callable
 from dataclasses import dataclass, replace
 
 import numpy as np
-from scipy import linalg, stats
+from scipy import linalg, special
 
 from elastocal.errors import ElastocalError, InsufficientDataError
 from elastocal.identification.robust_core import median_scale
@@ -102,7 +102,7 @@ def verdict(
     final = next((v for v in reversed(tried) if np.array_equal(v[1], good)), tried[-1])
     best = min(tried, key=lambda v: v[0])
     half = len(good) // 2
-    if final[0] > best[0] * stats.f.isf(FALSE_ALARM, half, half):
+    if final[0] > best[0] * special.fdtri(half, half, 1 - FALSE_ALARM):
         final = best
     return ~final[1], final[2]
 
@@ -146,7 +146,7 @@ def judge(whole: Solution, fitted: Solution, good: BoolArray) -> tuple[BoolArray
         pass
     dof = max(int(good.sum()) * size - len(kept), 1)
     trimmed = float(np.sort(squared)[: n // 2 + 1].sum())
-    return alone_squared > size * s2 * stats.f.isf(FALSE_ALARM / n, size, dof), trimmed
+    return alone_squared > size * s2 * special.fdtri(size, dof, 1 - FALSE_ALARM / n), trimmed
 
 
 def _inside(whole: Solution, fitted: Solution, good: BoolArray) -> RFactor:

@@ -21,7 +21,7 @@ from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy import linalg, stats
+from scipy import linalg, special
 
 from elastocal.cell.work_cell import Cell
 from elastocal.errors import ElastocalError
@@ -253,10 +253,10 @@ class Position:
         probability `level`: √(3 F_3,dof(level) λ) of the eigenvalues λ; with `visit` at one
         visit."""
         normal = half_axes(self.covariance + (self.visit if visit else 0.0), level)
-        return normal * np.sqrt(self._quantile(level) / stats.chi2.ppf(level, 3))[:, None]
+        return normal * np.sqrt(self._quantile(level) / special.chdtri(3, 1 - level))[:, None]
 
     def _quantile(self, level: float) -> Array:
-        return np.asarray(3 * stats.f.ppf(level, 3, np.clip(self.dof, 1, 1e9)))
+        return np.asarray(3 * special.fdtri(3, np.clip(self.dof, 1, 1e9), level))
 
     def holds(self, places: Array, level: float = 0.95, visit: bool = False) -> NDArray[np.bool_]:
         """Whether the regions of that `level` hold the places (n, 3)."""
@@ -271,7 +271,7 @@ def half_axes(covariance: Array, level: float = 0.95) -> Array:
     size = np.full(covariance.shape[:2], np.nan)
     known = np.isfinite(covariance).all(axis=(1, 2))
     size[known] = np.maximum(np.linalg.eigvalsh(covariance[known])[:, ::-1], 0.0)
-    return np.asarray(np.sqrt(stats.chi2.ppf(level, 3) * size))
+    return np.asarray(np.sqrt(special.chdtri(3, 1 - level) * size))
 
 
 def position_at(

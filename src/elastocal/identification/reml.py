@@ -7,7 +7,7 @@ from functools import cached_property
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy import linalg, sparse, special, stats
+from scipy import linalg, sparse, special
 
 from elastocal.errors import InsufficientDataError
 from elastocal.identification.covariance import Covariance
@@ -569,7 +569,7 @@ def _tail(score: float, mean: float, variance: float, across: Array, own: Array)
     left = variance - float(across @ np.linalg.pinv(own, hermitian=True) @ across)
     if mean <= 0 or left <= LEAST_TOLD * variance:
         return 1.0
-    return float(stats.chi2.sf(2 * mean * (mean + score) / left, 2 * mean**2 / left))
+    return float(special.chdtrc(2 * mean**2 / left, 2 * mean * (mean + score) / left))
 
 
 # Covariance and degrees of freedom of an estimate whose weights were estimated too.

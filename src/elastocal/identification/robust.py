@@ -7,7 +7,7 @@ from typing import Literal, get_args
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
-from scipy import linalg, stats
+from scipy import linalg, special
 
 from elastocal.errors import ElastocalError, InsufficientDataError, require
 from elastocal.identification.covariance import Covariance, SatterthwaiteSums
@@ -132,8 +132,8 @@ def _density_at_zero(r: Array, p: int) -> float:
     The p residuals that an L1 fit makes zero are left out (Koenker 2005, section 3.4).
     """
     kept = np.sort(r[np.argsort(np.abs(r))[p:]])
-    h = len(kept) ** (-1 / 3) * stats.norm.isf(0.025) ** (2 / 3)
-    h = min(h * (1.5 * stats.norm.pdf(0) ** 2) ** (1 / 3), 0.49)
+    h = len(kept) ** (-1 / 3) * special.ndtri(0.975) ** (2 / 3)
+    h = min(h * (1.5 / (2 * np.pi)) ** (1 / 3), 0.49)
     low, high = np.quantile(kept, [0.5 - h, 0.5 + h])
     return float(2 * h / max(high - low, np.finfo(float).tiny))
 

@@ -11,7 +11,7 @@ from typing import ClassVar
 
 import numpy as np
 from numpy.typing import ArrayLike
-from scipy import integrate, linalg, optimize, stats
+from scipy import integrate, linalg, optimize, special
 
 from elastocal.errors import InsufficientDataError, require
 from elastocal.identification.linear_solver import checked_problem
@@ -272,14 +272,15 @@ EFFICIENCY = 0.95
 
 def normal_mean(g: Callable[[Array], Array], size: int, kink: float | None = None) -> float:
     """E g(d) for d ~ χ(size), g smooth except perhaps at `kink`."""
-    density = stats.chi(size).pdf
-    end = float(stats.chi.isf(1e-17, size))
+    area = special.gamma(size / 2) * 2 ** (size / 2 - 1)
+    end = float(np.sqrt(special.chdtri(size, 1e-17)))
     edges = [0.0, end] if kink is None or not 0 < kink < end else [0.0, kink, end]
     total = 0.0
     for low, high in pairwise(edges):
         part, _ = integrate.quad(
-            lambda d: float(g(np.asarray(d))) * density(d), low, high, epsabs=1e-13, epsrel=1e-12
-        )
+            lambda d: float(g(np.asarray(d))) * d ** (size - 1) * np.exp(-d * d / 2) / area,
+            low, high, epsabs=1e-13, epsrel=1e-12,
+        )  # fmt: skip
         total += part
     return total
 
@@ -349,7 +350,7 @@ def _solve(rising: Callable[[float], float], target: float, low: float) -> float
 @lru_cache
 def median_length(size: int) -> float:
     """Median of χ(size); 0.6745 for size 1."""
-    return float(stats.chi.median(size))
+    return float(np.sqrt(special.chdtri(size, 0.5)))
 
 
 def median_scale(length: Array, size: int) -> float:

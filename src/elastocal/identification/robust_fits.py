@@ -7,7 +7,7 @@ from operator import itemgetter
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
-from scipy import linalg, optimize, sparse, special, stats
+from scipy import linalg, optimize, sparse, special
 
 from elastocal.errors import InputError, InsufficientDataError, require
 from elastocal.identification.robust_core import (
@@ -228,9 +228,9 @@ def majority(B: Array, e: Array, size: int, seed: int = 0) -> NDArray[np.bool_]:
     """
     n = len(e) // size
     B3, e2 = B.reshape(n, size, B.shape[1]), e.reshape(n, size)
-    limit = stats.chi2.ppf(INSIDE, size)
+    limit = special.chdtri(size, 1 - INSIDE)
     # Mean of a χ² variable cut at its 99 % point, per degree of freedom.
-    cut = stats.chi2.cdf(limit, size + 2) / INSIDE
+    cut = special.chdtr(size + 2, limit) / INSIDE
     squared = ((e2 - B3 @ least_trimmed_squares(B, e, size, seed)) ** 2).sum(axis=1)
     good = squared <= limit * median_scale(np.sqrt(squared), size) ** 2
     for _ in range(50):

@@ -18,7 +18,7 @@ from functools import reduce
 from typing import NamedTuple
 
 import numpy as np
-from scipy import linalg, sparse, stats
+from scipy import linalg, sparse, special
 
 from elastocal.errors import ElastocalError
 from elastocal.identification.covariance import Covariance
@@ -566,7 +566,8 @@ class _Course:
             n, size = len(self.standard), self.observed.size
             s2 = squared[good].mean() / size
             dof = max(int(good.sum()) * size, 1)
-            return None, np.asarray(squared <= size * s2 * stats.f.isf(FALSE_ALARM / n, size, dof))
+            limit = size * s2 * special.fdtri(size, dof, 1 - FALSE_ALARM / n)
+            return None, np.asarray(squared <= limit)
         readings = self.readings.moved(self.standard)
         if first:
             good = outlier_screening(readings, readings.e, good)

@@ -9,7 +9,6 @@ from numpy.typing import NDArray
 from scipy import linalg
 from scipy.optimize import least_squares
 from scipy.spatial.transform import Rotation
-from scipy.stats import qmc
 
 from elastocal.errors import InputError, InsufficientDataError, option
 from elastocal.measurements import Measurements
@@ -433,6 +432,8 @@ def _distance_start(
     A distance tells the side of the robot on which the anchor lies only through all poses
     together, so anchors are tried on a sphere around the poses; the best robust cost wins.
     """
+    from scipy.stats import qmc  # slow to import, seldom asked for
+
     columns = np.array(
         [i for i, p in enumerate(model.parameters)
          if i in movable and p.effect in (DistanceSensor.name, MarkerPosition.name)]

@@ -6,7 +6,7 @@ from dataclasses import dataclass, replace
 from functools import cached_property
 
 import numpy as np
-from scipy import optimize, stats
+from scipy import optimize, special
 
 from elastocal.measurements import Measurements, visits
 from elastocal.model.effects.driven import JointMotion
@@ -93,7 +93,7 @@ def in_random_order(table: Measurements) -> bool:
         return False
     ratio = (np.diff(q, axis=0) ** 2).sum(axis=0) / n
     deviation = np.sqrt(4 * (n - 2) / (n**2 - 1) / q.shape[1])
-    return bool(ratio.mean() - 2 > stats.norm.ppf(SYSTEMATIC) * deviation)
+    return bool(ratio.mean() - 2 > special.ndtri(SYSTEMATIC) * deviation)
 
 
 def _joint_motion(model: Model, table: Measurements, x: Array) -> Array:

@@ -7,7 +7,6 @@ from dataclasses import dataclass
 import casadi as ca
 import numpy as np
 from numpy.typing import NDArray
-from scipy.stats import qmc
 
 from elastocal.model import rigid
 from elastocal.model.chain import Chain, finite_ranges
@@ -223,6 +222,8 @@ def inverse_kinematics(
     the free rotation leave a choice, the first posture is moved to the nearest one; the others
     stand where the solver met them, so that there is a choice.
     """
+    from scipy.stats import qmc  # slow to import, seldom asked for
+
     lower, upper = limits
     task = Reaching(chain, position, rotation, point, T_data_base, lower, upper)
     low, high = finite_ranges(chain, lower, upper, near)

@@ -7,7 +7,6 @@ from dataclasses import dataclass, replace
 from itertools import islice
 
 import numpy as np
-from scipy.stats import qmc
 
 from elastocal.cell.work_cell import Cell
 from elastocal.errors import InsufficientDataError, require
@@ -142,6 +141,8 @@ def draw(
 
 def sobol(space: JointSpace, group: int, stream: np.random.SeedSequence) -> Iterator[Array]:
     """Chunks (CHUNK, n) of an endless scrambled Sobol sequence of poses of a group."""
+    from scipy.stats import qmc  # slow to import, and identify needs this module
+
     free = len(space.lower) - (space.held is not None)
     engine = qmc.Sobol(free, seed=np.random.default_rng(stream))
     while True:

@@ -17,7 +17,6 @@ from typing import Any
 
 import numpy as np
 from scipy.optimize import minimize
-from scipy.stats import qmc
 
 from elastocal.cell.work_cell import Cell
 from elastocal.errors import ElastocalError, InsufficientDataError, require
@@ -221,6 +220,8 @@ class Choice:
 
     def _placed(self, boxes: Boxes, begun: RelaxedPoint | None) -> RelaxedPoint | None:
         """The best places found from where the cell has them and from others in the boxes."""
+        from scipy.stats import qmc  # slow to import, and identify needs this module
+
         cell = self.work.cell if begun is None else begun.cell
         draws = qmc.Sobol(3 * len(boxes.names), rng=np.random.default_rng(self.seed))
         starts = [boxes.unit(boxes.places(cell)), *draws.random(STARTS)]

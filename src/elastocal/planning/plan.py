@@ -8,7 +8,7 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-from scipy import linalg, stats
+from scipy import linalg, special
 
 from elastocal.above import Result
 from elastocal.errors import InputError, require
@@ -62,7 +62,7 @@ def predicted(model: Model, found: Estimable, M: Array, n_numbers: int) -> tuple
     """
     r, sizes = found.reduction, found.sizes
     std = np.sqrt(np.diag(_inverse(M))) * sizes[r.kept]
-    quantile = float(stats.t.ppf(0.975, max(n_numbers - len(r.kept), 1)))
+    quantile = float(special.stdtrit(max(n_numbers - len(r.kept), 1), 0.975))
     return tuple(
         Predicted(
             model.names[c], model.parameters[c].unit, float(std[k]), float(quantile * std[k]),

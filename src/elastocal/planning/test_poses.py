@@ -9,7 +9,6 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
-from scipy.stats import qmc
 
 from elastocal.cell.arm_description import EffectChoice
 from elastocal.cell.plan_wishes import TargetBox, TargetPath
@@ -549,6 +548,8 @@ def _drawn(
 
 def _sobol(dimension: int, count: int, seed: int) -> Array:
     """`count` scrambled Sobol points (count, dimension) in the unit cube."""
+    from scipy.stats import qmc  # slow to import, seldom asked for
+
     sampler = qmc.Sobol(dimension, scramble=True, seed=seed)
     return np.asarray(sampler.random_base2(int(np.ceil(np.log2(count))))[:count])
 

@@ -109,16 +109,21 @@ def drawn(draw: Draw, width: float, height: float, title: str) -> Any:
         if _as_figures.get():
             figure.draw_without_rendering()  # what is made when drawing is made in this style
             return figure
-        buffer = io.StringIO()
-        nothing = {"Date": None, "Creator": None, "Format": None, "Type": None}
-        figure.savefig(buffer, format="svg", metadata=nothing)
-    text = buffer.getvalue()
+        text = rendered(figure)
     text = text[text.index("<svg") :]
     text = re.sub(r'<g id="[^"]*"', "<g", text)  # several figures share a page
     text = re.sub(r"<svg [^>]*viewBox=\"([^\"]*)\"[^>]*>", _head(title, width), text, count=1)
     for colour, variable in _VARIABLES.items():
         text = text.replace(colour, variable)
     return _numbered(text, title)
+
+
+def rendered(figure: Figure) -> str:
+    """matplotlib's SVG file of a figure."""
+    buffer = io.StringIO()
+    nothing = {"Date": None, "Creator": None, "Format": None, "Type": None}
+    figure.savefig(buffer, format="svg", metadata=nothing)
+    return buffer.getvalue()
 
 
 def _numbered(text: str, title: str) -> str:

@@ -6,7 +6,7 @@ from collections.abc import Sequence
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
-from scipy import stats
+from scipy import special
 
 from elastocal.compensation.compensate import nominal_flanges
 from elastocal.errors import ElastocalError
@@ -264,7 +264,7 @@ def scatter_by_group(summary: ResidualSummary) -> str:
 def _scatter_panel(axes: Axes, groups: tuple[GroupSummary, ...]) -> None:
     x = np.arange(len(groups))
     f = np.array([g.dof for g in groups])
-    low, high = (np.sqrt(stats.chi2.ppf(q, f) / f) for q in (0.025, 0.975))
+    low, high = (np.sqrt(special.chdtri(f, 1 - q) / f) for q in (0.025, 0.975))
     axes.axhline(1, color=INK, linewidth=0.8)
     axes.bar(x, high - low, 0.7, low, color=FAINT, alpha=0.3, label="chance alone, 95 % of each")
     value = np.sqrt([g.mean_square for g in groups])

@@ -104,7 +104,7 @@ def test_coverage_near_a_bound(truth, exact):
     # in between at least 95 %.
     rng = np.random.default_rng(int(10 * truth) + 1)
     x = STD * [truth, 2.0, -1.0]
-    n, held = 120, 0
+    n, held = 60, 0
     for _ in range(n):
         y = B @ x + rng.normal(size=30)
         found = profile(B, y, NAMES, non_negative("a"), "a")

@@ -48,9 +48,9 @@ def coverage(arm, name, share, count):
 @pytest.mark.parametrize("share", [0.0, 0.05])
 @pytest.mark.parametrize("name", ["huber", "tukey", "l1", "student-t"])
 def test_intervals_hold_the_truth(arm, name, share):
-    """95 % of 120 tables × 9 parameters; parameters of a table are nearly independent (each level
+    """95 % of 60 tables × 9 parameters; parameters of a table are nearly independent (each level
     has its own column), and the band of 99.9 % is that of a third as many."""
-    held = coverage(arm, name, share, 120)
+    held = coverage(arm, name, share, 60)
     low, high = binomial_band(held.size // 3, 0.95)
     assert low <= held.sum() / 3 <= high
 
@@ -81,16 +81,14 @@ def test_weights_taken_for_inverse_variances_give_wrong_intervals(arm, name, nar
     large, because s² counts these in full; by residual, as in eq. (14), 13 % hold."""
     for share in (0.0, 0.05):
         ratio, held = [], []
-        for y in tables(arm, share, 100):
+        for y in tables(arm, share, 50):
             found = FITS[name](arm.B, y)
             stated, per_residual = from_weights(arm, found)
             ratio.append(stated / asymptotic_covariance(found).std)
             held.append(np.abs(found.x - arm.x) < 1.96 * per_residual)
         assert np.mean(ratio) < narrow if share == 0 else np.mean(ratio) > 2
         assert np.mean(held) < 0.3
-    # and the deviations they were compared with are the true ones
-    held = coverage(arm, name, 0.0, 100)
-    assert held.sum() / 3 >= binomial_band(held.size // 3, 0.95)[0]
+    # The deviations they are compared with are the true ones: test_intervals_hold_the_truth.
 
 
 def test_intervals_hold_where_blunders_are_leverage_points(arm):

@@ -147,7 +147,7 @@ def test_false_alarms_on_clean_tables_are_as_rare_as_stated(kind):
     rng = np.random.default_rng(12)
     r = table(1, configurations=10, repeats=3, unbalanced=False)
     alarms = 0
-    tables = 200 if kind == "independent" else 100
+    tables = 200 if kind == "independent" else 50
     for _ in range(tables):
         verdict = settle(r.moved(1e-5 * rng.normal(size=r.e.shape)), kind)
         alarms += not verdict.good.all()
