@@ -87,7 +87,9 @@ def compared(folder: Path, nominal: Path, written: Path, load: Array) -> tuple[f
     arm = ec.read_calibrated(folder / "cell.toml", folder / "result.json")
     truth = json.loads((folder / "truth.json").read_text(encoding="utf-8"))
     model = arm.model
-    lower, upper = np.array([model.cell.limits[f"joint{i + 1}"] for i in range(model.chain.n_joints)]).T
+    lower, upper = np.array(
+        [model.cell.limits[f"joint{i + 1}"] for i in range(model.chain.n_joints)]
+    ).T
     q = np.random.default_rng(7).uniform(lower, upper, (POSES, len(lower)))
     places = [
         ec.simulate(model, q, values=values, load=load, noise=False).position
