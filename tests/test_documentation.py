@@ -16,6 +16,7 @@ from elastocal.model.effects import CATALOGUE
 
 ROOT = Path(__file__).parents[1]
 DOCS = ROOT / "docs"
+SCREEN = 62  # lines
 PAGES = [ROOT / "README.md", *sorted(DOCS.rglob("*.md"))]
 # Made from the code when the site is built; tests/documentation/test_generated_pages.py has them.
 GENERATED = {
@@ -35,11 +36,21 @@ def test_every_cell_shown_is_a_cell(tmp_path):
         r"```toml design\n(.*?)```", (DOCS / "designing.md").read_text(encoding="utf-8"), re.S
     )
     (tmp_path / "arm.urdf").write_text(KR270.read_text(encoding="utf-8"), encoding="utf-8")
-    for block in [*blocks, blocks[0] + design]:
+    first = blocks[0].partition("[design]")[0]
+    assert "loads_N" in blocks[0] and "[workspace]" in blocks[0]
+    for block in [*blocks, first + design]:
         path = tmp_path / "cell.toml"
         path.write_text(block, encoding="utf-8")
         model = Model(read_cell(path, known_effects=tuple(CATALOGUE)))
         assert model.parameters
+
+
+def test_each_part_of_the_readme_fits_a_screen():
+    parts = re.split(r"^##+ ", PAGES[0].read_text(encoding="utf-8"), flags=re.M)
+    heads = [part.partition("\n")[0] for part in parts]
+    assert {"The verbs", "identify", "design", "diagnose"} <= set(heads)
+    assert {head: n for head, part in zip(heads, parts, strict=True)
+            if (n := part.count("\n")) > SCREEN} == {}  # fmt: skip
 
 
 def test_links_between_pages_lead_somewhere():

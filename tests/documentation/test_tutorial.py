@@ -4,6 +4,9 @@ import re
 from pathlib import Path
 
 import console_blocks
+import numpy as np
+
+import elastocal as ec
 
 TUTORIAL = Path(__file__).parents[2] / "docs" / "tutorial"
 
@@ -36,6 +39,16 @@ def test_with_a_stretched_wrist_only_the_sum_of_joints_4_and_6_is_known(course):
     (known,) = first["combinations"]
     true = TRUTH["joint4.compliance"] + TRUTH["joint6.compliance"]
     assert abs(known["value"] - true) < 4 * known["std"] < 0.1 * true
+
+
+def test_two_configurations_are_no_ground_for_trust(course, tmp_path):
+    """`head -40 data.csv`: the residual agrees with the noise, and yet it says nothing."""
+    lines = (course.folder / "data.csv").read_text(encoding="utf-8").splitlines(keepends=True)
+    (tmp_path / "head.csv").write_text("".join(lines[:40]), encoding="utf-8")
+    fit = ec.identify(course.folder / "cell.toml", tmp_path / "head.csv")
+    assert len(np.unique(fit.observations.configuration)) <= 3
+    assert not fit.verdict.trusted
+    assert "few_configurations" in fit.verdict.to_json()["missing"]
 
 
 def test_one_more_pose_separates_them(course):

@@ -11,7 +11,7 @@ from elastocal.export.exportable import evaluate_pieces, keep
 from elastocal.model import MjcfArm
 from elastocal.model.valued import Conditions
 
-MICROMETRE = 1e-6
+MICROMETRE, NANOMETRE = 1e-6, 1e-9
 
 
 def corrected(folder, robot, effects, model="", text=LOADABLE, **how):
@@ -50,7 +50,8 @@ def test_both_files_loaded_in_mujoco_differ_by_the_calibration(robot, tmp_path):
 def test_springs_weights_and_all_else_of_the_file(tmp_path):
     effects = (*SPRINGS, "off_axis_compliance:joint2", "link_mass_error")
     _, done = corrected(tmp_path, "", effects, "link_gravity = true")
-    assert done.checked is not None and done.checked < MICROMETRE
+    # The hand and its fingers weigh where the model has them, though the flange has moved.
+    assert done.checked is not None and done.checked < NANOMETRE
     assert not [w for w in done.warnings if "cannot take" in w]
     for kept in ("<!-- a comment that stays -->", 'name="drive2"', 'timestep="0.001"',
                  '<site name="reflector" pos="0.05 0 0.02"/>'):  # fmt: skip

@@ -1,6 +1,7 @@
 """Held-out residuals in closed form against explicit fits that leave configurations out."""
 
 from dataclasses import replace
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
@@ -29,6 +30,7 @@ from elastocal.identification import (
 )
 from elastocal.identification.identify import identify
 from elastocal.identification.residuals import predicts_better
+from elastocal.identification.solve import fits_better
 from elastocal.model import Model, subset
 
 UNIT = Weights("none", None, False, "")
@@ -115,6 +117,25 @@ def test_a_wider_set_is_needed_where_the_parameters_it_adds_are_something():
 
     assert sum(needed(0.0) for _ in range(500)) <= 11  # 5 expected at most; p < 0.01 of more
     assert sum(needed(6.0) for _ in range(50)) > 35
+
+
+def test_a_wider_set_fits_better_than_by_chance():
+    """An F-test at 1 %: of 500 tables without anything 5 are expected, p < 0.01 of more than 11."""
+    rng = np.random.default_rng(6)
+    B = rng.normal(size=(60, 9))
+    unit = B[:, 8] - B[:, :4] @ np.linalg.lstsq(B[:, :4], B[:, 8], rcond=None)[0]
+
+    def better(size):
+        y = rng.normal(size=60) + size * unit / np.linalg.norm(unit)
+        found = [
+            SimpleNamespace(whitened=y - Q @ (Q.T @ y), columns=np.arange(p))
+            for p in (4, 9)
+            for Q in [np.linalg.qr(B[:, :p])[0]]
+        ]
+        return fits_better(*found)
+
+    assert sum(better(0.0) for _ in range(500)) <= 11
+    assert sum(better(7.0) for _ in range(50)) > 40
 
 
 def test_infinite_where_one_configuration_alone_determines_a_parameter():

@@ -153,6 +153,26 @@ def test_another_pose_moves_arm_and_arrows(opened: dict[str, Opened]) -> None:
     page.select_option("select.pose", first)
 
 
+def test_the_view_keeps_its_turn_and_the_wheel_scrolls_the_page(opened: dict[str, Opened]) -> None:
+    page = opened["identification"].page
+    camera = "document.querySelector('.plot').layout.scene.camera.eye.x"
+    page.evaluate(
+        """Plotly.relayout(document.querySelector('.plot'),
+          {'scene.camera': {eye: {x: 0.3, y: 0.4, z: 1.5}}})"""
+    )
+    first = page.locator("select.pose").input_value()
+    page.select_option("select.pose", "0" if first != "0" else "1")
+    assert page.evaluate(camera) == pytest.approx(0.3)
+    page.select_option("select.pose", first)
+    canvas = page.locator(".plot canvas").first
+    canvas.scroll_into_view_if_needed()
+    box, before = canvas.bounding_box(), page.evaluate("scrollY")
+    page.mouse.move(box["x"] + box["width"] / 2, box["y"] + box["height"] / 2)
+    page.mouse.wheel(0, 200)
+    page.wait_for_function("was => scrollY > was", arg=before)
+    assert page.evaluate(camera) == pytest.approx(0.3)
+
+
 @pytest.mark.parametrize("kind", KINDS)
 def test_tables_are_filled_and_sorted_by_click_and_key(
     opened: dict[str, Opened], kind: str

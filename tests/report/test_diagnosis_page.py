@@ -12,11 +12,14 @@ from support.cells import kr270_cell, kr270_chain
 from support.diagnoses import EXPLAINED, EXTRA, HOSTILE, TWO, VERDICTS
 from support.pages import Page
 
-from elastocal.diagnosis import FaultyReading
+from elastocal.cell.arm_description import EffectChoice
+from elastocal.diagnosis import Baseline, FaultyReading
 from elastocal.errors import InputError
 from elastocal.identification import BudgetStep
-from elastocal.model import Model
+from elastocal.model import Model, joint_limits, observe
+from elastocal.report.figures import effect_shapes
 from elastocal.report.page import page_of, write_page
+from elastocal.simulation.simulate import simulate
 
 
 @pytest.fixture(scope="module")
@@ -86,6 +89,27 @@ def test_every_number_of_the_answer_is_on_the_page(pages):
         name = f"{candidate.effect.replace('_', ' ')}"
         assert any(key.startswith(name) for key in rows), name
     assert "elastocal diagnose" in page.text
+
+
+def test_a_found_effect_stands_over_its_driver_with_what_was_read():
+    """An eccentricity of joint 2 over its angle, and readings within their noise of it."""
+    cell = kr270_cell(("base_frame", "joint_offset"))
+    model, rng = Model.assembled(kr270_chain(), cell), np.random.default_rng(2)
+    found = {p.name: p.value for p in EXPLAINED.effects[0].parameters}
+    real = model.with_effects((*cell.model.effects, EffectChoice("gear_eccentricity", "joint2")))
+    q = rng.uniform(*np.array(joint_limits(cell, model.chain)), (60, 6))
+    x = np.array([found.get(n, v) for n, v in zip(real.names, real.nominal, strict=True)])
+    observed = observe(simulate(real, model.table(q), x, rng, False), "position")
+    read = observed.value + 1e-5 * rng.normal(size=observed.value.shape)
+    B = model.regressor(observed.table, model.nominal, observations=observed).B
+    left = read - model.predict(observed.table, model.nominal, observed)
+    left = left - B @ np.linalg.lstsq(B, left, rcond=None)[0]
+    base = Baseline(model, observed, model.nominal, np.ones(len(model.names)), left, left, None)
+    (shape,) = effect_shapes(replace(EXPLAINED, calibrated=base, model=model))
+    sin, cos = (found[f"joint2.eccentricity_{k}"] for k in ("sin", "cos"))
+    expected = sin * np.sin(shape.q) + cos * np.cos(shape.q)
+    np.testing.assert_allclose(shape.explained, expected, atol=1e-6)
+    assert np.std(shape.seen - shape.explained) < 2e-5 < np.std(shape.explained)
 
 
 def test_shade_of_the_chain_is_the_evidence(pages):

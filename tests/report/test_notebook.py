@@ -15,7 +15,7 @@ from elastocal.errors import InputError
 from elastocal.measurements import read_measurements, write_measurements
 from elastocal.report.figures import INK
 from elastocal.report.notebook import view_of
-from elastocal.report.page import figures_of
+from elastocal.report.page import figures_of, page_of
 from elastocal.report.residual_view import residuals_of
 
 VOID = {"br", "hr", "img"}
@@ -238,6 +238,13 @@ def test_commands_as_html_say_what_is_reached_and_escape_names(commands):
     assert "2 of 3 targets reached by the marker M1" in words
     assert "<b>1" in words
     assert "not reached" in words and "nan" not in words
+
+
+def test_the_page_of_commands_is_drawn_in_its_own_colours(commands):
+    text = page_of(commands)
+    assert text.count("<svg xmlns") == 2 and "data:image" not in text
+    drawn = text[text.index("<svg xmlns") :]
+    assert "var(--ink)" in drawn and INK not in drawn
 
 
 def test_figures_of_commands_hold_every_target_reached(commands):

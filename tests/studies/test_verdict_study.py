@@ -22,6 +22,12 @@ def test_a_trusted_campaign_is_as_good_as_said():
     assert row == study.run({"number": 0}, np.random.default_rng(1))
 
 
+def test_where_screening_leaves_too_little_all_readings_are_judged():
+    """Six poses of a seven-axis arm; without those that stand out, 36 equations are dependent."""
+    row = study.run({"number": 16}, np.random.default_rng(0))
+    assert not row["refused"] and row["tone"] == "care"
+
+
 def test_what_has_too_few_readings_is_refused_or_not_trusted():
     assert study.run({"number": 3}, np.random.default_rng(0))["refused"]
     row = study.run({"number": 4}, np.random.default_rng(0))

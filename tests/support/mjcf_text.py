@@ -5,8 +5,8 @@ from __future__ import annotations
 from pathlib import Path
 
 # Degrees and another Euler sequence, defaults by class, a frame, an arm that is turned and moved,
-# an off-centre joint with ref, a slide, two fingers, sites, a free box, a mesh that is not there,
-# a keyframe; joint5 has no name.
+# an off-centre joint with ref, a slide, a full inertia tensor, two fingers, sites, a free box, a
+# mesh that is not there, a keyframe; joint5 has no name.
 ARM = """\
 <?xml version="1.0"?>
 <mujoco model="test arm">
@@ -35,7 +35,7 @@ ARM = """\
               <inertial pos="0.1 0 0" mass="4" diaginertia="0.1 0.1 0.1"/>
               <joint name="a3" type="slide" axis="1 0 0" range="0 0.3"/>
               <body name="l4" pos="0.4 0 0" childclass="wrist" axisangle="0 0 1 40">
-                <inertial pos="0 0 0.05" mass="2" diaginertia="0.01 0.01 0.01"/>
+                <inertial pos="0 0 0.05" mass="2" fullinertia="0.02 0.02 0.02 0 0.001 0"/>
                 <joint name="a4"/>
                 <body name="l5" pos="0 0 0.2" quat="0.9 0.1 0 0.2">
                   <inertial pos="0 0 0" mass="1" diaginertia="0.01 0.01 0.01"/>

@@ -138,12 +138,12 @@ def corrected_mjcf(
     for i, j in enumerate(arm.joints):
         _correct_joint(arm, text, pieces, i, j)
         sprung[j] = _add_springs(arm, text, pieces, i, j)
-    _correct_masses(arm, text, pieces)
     if any(sprung.values()):
         _lengthen_keys(arm, text, sprung)
         if pieces.masses:
             _turn_gravity(arm, text, pieces)
     told += _flange_and_sites(arm, text, pieces, frames)
+    _correct_masses(arm, text, pieces)
     text.insert(tag_end(text.data, text.root), f"\n  <!-- {comment(note)} -->")
     return text.result(), told
 
@@ -173,12 +173,15 @@ def _correct_joint(arm: MjcfArm, text: MjcfText, pieces: ExportNumbers, i: int, 
 
 
 def _move(arm: MjcfArm, text: MjcfText, body: int, error: Array) -> None:
-    """T ← T · error for the body's own attributes, whatever frames stand around it."""
+    """T ← T · error for the body's own attributes, whatever frames stand around it, and in MuJoCo's
+    model of the file."""
     start = text.bodies[body].start
     own = arm.local(body)
     if text.bodies[body].framed:
         own = _stated(arm, text, start)
     text.set_attributes(start, _placed(own @ error), ORIENTATIONS[1:])
+    for name, value in _placed(arm.local(body) @ error).items():
+        getattr(arm.model, f"body_{name}")[body] = np.array(value.split(), dtype=float)
 
 
 def _stated(arm: MjcfArm, text: MjcfText, start: int) -> Array:
@@ -253,9 +256,9 @@ def _spring(spring: SpringValue, F: Array) -> str:
 
 
 def _correct_masses(arm: MjcfArm, text: MjcfText, pieces: ExportNumbers) -> None:
-    chain, model = arm.chain, arm.model
-    for i, (j, new) in enumerate(zip(arm.joints, pieces.masses, strict=False)):
-        old = chain.masses[i]
+    """What each joint carries is what the model says, also where a flange moved with its mass."""
+    model = arm.model
+    for j, old, new in zip(arm.joints, arm.masses(), pieces.masses, strict=False):
         mass = new.mass - old.mass
         moment = new.mass * new.com - old.mass * old.com
         if abs(mass) < SMALLEST and np.abs(moment).max() < SMALLEST:
@@ -363,6 +366,7 @@ def held_arm(text: str, robot: Robot, pieces: ExportNumbers) -> tuple[Any, Array
         body.explicitinertial = 1
         body.mass, body.inertia = model.body_mass[body.id], model.body_inertia[body.id]
         body.ipos, body.iquat = model.body_ipos[body.id], model.body_iquat[body.id]
+        body.fullinertia = np.full(6, np.nan)  # told by the two above
     driven = {j: f"joint{i + 1}" for i, j in enumerate(arm.joints)}
     for joint, j in [(joint, joint.id) for joint in spec.joints]:  # numbers change with the first
         if j in driven:

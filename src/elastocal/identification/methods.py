@@ -357,7 +357,6 @@ def _reml(
         return solution, noise, good
 
     solution, noise, good = found(options.noise)
-    warnings: tuple[str, ...] = ()
     if options.noise == "auto" and Kind.of(noise.kind).by_visit:
         # What the model lacks looks like scatter of the joints as well.  That is no noise: weights
         # which make light of it let the fit go where poses left out are predicted worse.
@@ -366,16 +365,12 @@ def _reml(
         if _held_out_rms(solution, solution) > WORSE * _held_out_rms(plain[0], solution):
             tests = noise.tests
             solution, noise, good = plain
-            noise, warnings = replace(noise, tests=tests), (LACKING,)
+            noise = replace(noise, tests=tests)  # which say what is not counted
     intervals = intervals_of(solution, options.intervals, noise, options.seed, options.jobs)
-    return MethodResult("reml", solution, intervals, noise, good, warnings=warnings)
+    return MethodResult("reml", solution, intervals, noise, good)
 
 
 WORSE = 1.02  # held-out errors that differ by less are alike
-LACKING = (
-    "The residuals scatter from visit to visit as if joints settled anew, but with weights for "
-    "that poses left out are predicted worse: more likely the model lacks something. Run diagnose."
-)
 
 
 def _held_out_rms(solution: Solution, judge: Solution) -> float:

@@ -676,7 +676,11 @@ def settle(
     allows, that set stands.
     """
     good = np.ones(len(readings), dtype=bool) if good is None else good
-    noise = estimate_noise(readings.take(good), kind)
+    try:
+        noise = estimate_noise(readings.take(good), kind)
+    except ElastocalError:
+        good = np.ones(len(readings), dtype=bool)  # the others alone do not show all parameters
+        noise = estimate_noise(readings, kind)
     own = np.asarray(np.linalg.inv(own_noise(noise.fit, readings)[0]), dtype=np.float64)
     visited = [(_misfit(noise, readings, own), good, noise)]
     for _ in range(ROUNDS):

@@ -7,12 +7,13 @@ from functools import cached_property
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy import linalg
+from scipy import linalg, stats
 
 from elastocal.errors import ElastocalError, InsufficientDataError
 from elastocal.identification.least_squares import Fit, FitProblem, fit
 from elastocal.identification.linear_solver import solve_weighted
 from elastocal.identification.residuals import (
+    CHANCE,
     as_of_another_campaign,
     held_out_by_parts,
     held_out_residual,
@@ -270,6 +271,16 @@ def wider_is_needed(problem: Problem, narrow: Array, wide: Array) -> bool:
     return predicts_better(narrow, wide, problem.weights, observed.configuration, observed.size)
 
 
+def fits_better(narrow: Fit, wide: Fit) -> bool:
+    """Does the wider set fit the readings better than chance alone in CHANCE of all cases (F)?
+
+    Beside the held-out residuals, which a few configurations of weight can sway.
+    """
+    before, after = (float(found.whitened @ found.whitened) for found in (narrow, wide))
+    more, dof = len(wide.columns) - len(narrow.columns), len(wide.whitened) - len(wide.columns)
+    return before - after > stats.f.isf(CHANCE, more, max(dof, 1)) * after * more / max(dof, 1)
+
+
 def prefer_wider(
     problem: Problem, sizes: Array, found: Fit, reduction: Reduction, heldout: Array,
     r_factor: RFactor,
@@ -295,7 +306,8 @@ def prefer_wider(
             # Along an undetermined direction the wide set may leave every valid arm, or come to
             # rest where it is singular.
             continue
-        if wide.converged and wider_is_needed(problem, heldout, wide_heldout):
+        needed = wide.converged and fits_better(found, wide)
+        if needed and wider_is_needed(problem, heldout, wide_heldout):
             found, reduction, heldout = wide, wider, wide_heldout
             r_factor = free_r_factor(problem, found)
     return found, reduction, heldout

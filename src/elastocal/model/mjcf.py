@@ -168,7 +168,7 @@ class MjcfArm:
                     Joint(self.joint_name(j), self._kind(j), placement, axis, lower, upper)
                 )
                 T = shift(-self.model.jnt_pos[j])
-        return Chain(self.name, tuple(joints), T @ self.flange_in_body, self._masses())
+        return Chain(self.name, tuple(joints), T @ self.flange_in_body, self.masses())
 
     @property
     def flange_in_body(self) -> Array:
@@ -217,7 +217,8 @@ class MjcfArm:
             body = int(self.model.body_parentid[body])
         return None
 
-    def _masses(self) -> tuple[LinkMass, ...]:
+    def masses(self) -> tuple[LinkMass, ...]:
+        """What each joint carries, in its frame; none where the file's meshes would state it."""
         if not self.weighed:
             return ()
         world = self._world()

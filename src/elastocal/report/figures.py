@@ -109,10 +109,17 @@ def drawn(draw: Draw, width: float, height: float, title: str) -> Any:
         if _as_figures.get():
             figure.draw_without_rendering()  # what is made when drawing is made in this style
             return figure
+        return svg_of(figure, title)
+
+
+def svg_of(figure: Figure, title: str) -> str:
+    """The SVG element of a figure, in the colours of the page."""
+    with style():
         text = rendered(figure)
     text = text[text.index("<svg") :]
     text = re.sub(r'<g id="[^"]*"', "<g", text)  # several figures share a page
-    text = re.sub(r"<svg [^>]*viewBox=\"([^\"]*)\"[^>]*>", _head(title, width), text, count=1)
+    head = _head(title, figure.get_figwidth())
+    text = re.sub(r"<svg [^>]*viewBox=\"([^\"]*)\"[^>]*>", head, text, count=1)
     for colour, variable in _VARIABLES.items():
         text = text.replace(colour, variable)
     return _numbered(text, title)
@@ -409,12 +416,13 @@ def effects_over_joints(d: Diagnosis) -> str:
                 dots(axes, q[own], 1e6 * shape.seen[own], SERIES[k], 1.8, f"readings{told}")
                 axes.plot(q[own], 1e6 * shape.explained[own], "_", color=SERIES[k], markersize=9,
                           markeredgewidth=1.8, label=f"effect{told}")  # fmt: skip
-            axes.set_title(shape.name)
+            axes.set_title(shape.name, loc="left")
             axes.set_xlabel(f"joint in {'°' if revolute else 'mm'}")
             axes.set_ylabel(f"motion of the joint in {'µrad' if revolute else 'µm'}")
             height = reach(1e6 * np.concatenate([shape.seen, shape.explained]))
             axes.set_ylim(-height, height)
-            axes.legend(fontsize=7, loc="upper right", ncols=2)
+            # Above the axes: inside, it would hide readings.
+            axes.legend(fontsize=7, loc="lower right", bbox_to_anchor=(1, 1), ncols=2)
         for axes in panels[len(shapes) :]:
             axes.set_visible(False)
 

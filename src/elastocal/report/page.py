@@ -9,7 +9,6 @@ from __future__ import annotations
 import base64
 import gzip
 import hashlib
-import io
 import platform
 import re
 from collections.abc import Callable, Iterable, Mapping
@@ -52,6 +51,7 @@ from elastocal.report.figures import (
     plan_intervals,
     plan_removed,
     share_bars,
+    svg_of,
     unknown_curves,
 )
 from elastocal.report.formatting import minus
@@ -299,14 +299,8 @@ def _compensation(found: Compensation) -> dict[str, Any]:
     from markupsafe import Markup
 
     view = view_of(found)
-    pictures = []
-    for kind in view.figures:
-        picture = io.BytesIO()
-        view.plot(found, kind, False).savefig(picture, format="png", dpi=110)
-        packed = base64.b64encode(picture.getvalue()).decode()
-        tag = Markup('<img alt="{}" src="data:image/png;base64,{}">')
-        pictures.append(tag.format(kind, packed))
-    return {"title": found.chain.name, "shown": Markup(view.html(found)), "drawn": pictures}
+    drawn = [Markup(svg_of(view.plot(found, kind, False), kind)) for kind in view.figures]
+    return {"title": found.chain.name, "shown": Markup(view.html(found)), "drawn": drawn}
 
 
 def _of(model: Model, figures: Mapping[str, str]) -> dict[str, Any]:

@@ -213,7 +213,7 @@ class View {
       range: this.data.range[AXES.indexOf(name)], autorange: false });
     return {
       scene: { xaxis: axis("x"), yaxis: axis("y"), zaxis: axis("z"), aspectmode: "manual",
-        aspectratio: this.shape(), camera: this.camera ?? { eye: { x: 0.88, y: -1.1, z: 0.48 } }, uirevision: "kept" },
+        aspectratio: this.shape(), camera: this.camera ?? { eye: { x: 1, y: -1.25, z: 0.55 } }, uirevision: "kept" },
       paper_bgcolor: "rgba(0,0,0,0)", font: { color: colour("ink"), size: 12 },
       margin: { l: 0, r: 0, t: 0, b: 0 }, uirevision: "kept",
       legend: { orientation: "h", y: 0, x: 0, bgcolor: "rgba(0,0,0,0)" },
