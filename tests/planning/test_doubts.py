@@ -12,6 +12,7 @@ from elastocal.identification.knowledge import GaussianPrior
 from elastocal.model import Model
 from elastocal.planning import Gain, Known, Setup, in_doubt, load_states, missing
 from elastocal.planning.doubts import SOMETHING
+from elastocal.planning.plan import Doubt
 
 CHAIN = kr270_chain()
 POSES = random_poses(CHAIN, 60, seed=1)
@@ -117,11 +118,59 @@ def test_doubt_costs_and_poses_pay_it_back() -> None:
 
 
 def test_gain_counts_what_the_readings_show_and_leave_open() -> None:
-    """One parameter, one in doubt, which the model has at zero: by hand."""
-    R, before = np.eye(2), np.diag([4.0, 1.0])
-    own = np.array([True, False])
-    gain = Gain.of(R, before, 4 * before, own, np.array([0.0, 100.0]), 0)
-    assert gain.before == pytest.approx(np.sqrt(0.25 + 1)) == pytest.approx(2 * gain.after)
-    assert gain.model_before == pytest.approx(0.5) and gain.model_after == pytest.approx(0.25)
-    assert gain.sure == pytest.approx(100 + 1.645, abs=0.1)
-    assert Gain.of(R, np.diag([0.0, 1.0]), before, own, np.zeros(2), 0).sure == np.inf
+    """One parameter, and one that may be missing, which the model has at zero: by hand."""
+    R, before, pull = np.eye(2), np.diag([4.0, 1.0]), np.array([0.0, 100.0])
+    one = np.array([1])
+
+    def gain(p: float, spare: float = 0.0) -> Gain:
+        return Gain.of(R, before, 4 * before, [Doubt(p, one, np.array([spare]))], pull, 0)
+
+    there = gain(1.0)
+    assert there.before == pytest.approx(np.sqrt(0.25 + 1)) == pytest.approx(2 * there.after)
+    assert there.model_before == pytest.approx(0.5) and there.model_after == pytest.approx(0.25)
+    assert there.sure == pytest.approx(100 + 1.645, abs=0.1)
+    # Known less well if it is there than with its chance alone: 1/(1 - spare) times the variance.
+    assert gain(1.0, 0.5).sure == pytest.approx(200 + 1.645 * np.sqrt(2), abs=0.2)
+    # What is missing with a few per cent alone leaves the error that of the model: N(0, 1/4).
+    assert gain(1e-9).sure == pytest.approx(1.96 / 2, abs=0.05)
+    assert 1.96 / 2 < gain(0.03).sure < 1.5 and gain(0.1).sure > 98
+    assert Gain.of(R, np.diag([0.0, 1.0]), before, [], np.zeros(2), 0).sure == np.inf
+
+
+def test_the_stated_error_holds_in_as_many_campaigns_as_it_says() -> None:
+    """Arms drawn from what is believed: the right one of the effects, or none, with its size."""
+    rng = np.random.default_rng(0)
+    B, R, s, p = rng.standard_normal((30, 5)), rng.standard_normal((4, 5)), 2.0, 0.15
+    own, places = np.arange(3), (np.array([3]), np.array([4]))
+    held = []
+    for _ in range(300):
+        x = np.append(rng.standard_normal(3), [0.0, 0.0])
+        which = rng.choice(3, p=[1 - 2 * p, p, p])
+        if which:
+            x[2 + which] = s * rng.standard_normal()
+        y = B @ x + 3 * rng.standard_normal(30)
+        fit = np.append(np.linalg.lstsq(B[:, own], y, rcond=None)[0], [0.0, 0.0])
+        chance = _posterior(B, y, own, places, s, p)
+        spare = (1 - chance) / (chance * s**2)
+        before = B.T @ B / 9 + np.diag([0.0, 0.0, 0.0, *(1 / (chance * s**2))])
+        doubts = [Doubt(c, k, v[None]) for c, k, v in zip(chance, places, spare, strict=True)]
+        sure = Gain.of(R, before, before, doubts, B.T @ (y - B @ fit) / 9, 1).sure
+        held.append(np.linalg.norm(R @ (x - fit)) <= sure)
+    assert 0.92 < np.mean(held) < 0.98
+
+
+def _posterior(
+    B: np.ndarray, y: np.ndarray, own: np.ndarray, places: tuple, s: float, p: float
+) -> np.ndarray:
+    """Probability of each effect by its marginal likelihood, the others' sizes flat."""
+    Q = np.linalg.qr(B[:, own], mode="complete")[0][:, len(own) :]
+    logs = [np.log(1 - 2 * p)]
+    for k in (None, *places):
+        V = 9 * np.eye(Q.shape[1])
+        if k is not None:
+            V += s**2 * (Q.T @ B[:, k]) @ (Q.T @ B[:, k]).T
+        z = Q.T @ y
+        log = -0.5 * (np.linalg.slogdet(V)[1] + z @ np.linalg.solve(V, z))
+        logs = [logs[0] + log] if k is None else [*logs, np.log(p) + log]
+    odds = np.exp(np.array(logs) - max(logs))
+    return odds[1:] / odds.sum()

@@ -24,6 +24,8 @@ from elastocal.diagnosis.evidence import ANOTHER
 from elastocal.errors import InsufficientDataError, option
 from elastocal.errors import require as check
 from elastocal.identification.identify import identify
+from elastocal.identification.prediction import over_the_workspace, predicted_error
+from elastocal.identification.result import Calibration
 from elastocal.measurements import Measurements
 from elastocal.model.manipulator import Model
 from elastocal.planning.design import DesignOptions, design
@@ -104,8 +106,8 @@ def next_poses(
 
     The data are diagnosed and identified.  The next poses make the error at the test poses small
     that counts the parameters and, with the probability that the diagnosis leaves them, the
-    effects that the model may lack.  Enough is what both say: the error that `identify` predicts,
-    and that which counts what the model may lack.
+    effects that the model may lack.  Enough is what both say: the error of the estimates, and
+    that averaged over what the model may lack.
 
     Args:
         model: The model, or a cell, or the path of a cell file.
@@ -146,9 +148,9 @@ def next_poses(
         why = diagnose(model, table, DiagnosisOptions(seed), progress)
         model = with_effects_of(model, why)
     progress("identifying")
-    predicted = None
+    kept = math.inf
     with suppress(InsufficientDataError):  # then these are not enough
-        predicted = identify(model, table, new_poses=where_used(model)).predicted
+        kept = _kept(identify(model, table), 1.0 if why is None else why.probability_unknown)
     chances = doubts_after(model, why)
     spec = model.cell.design
     spec = replace(
@@ -162,7 +164,7 @@ def next_poses(
     plan = design(cell, options, progress=progress)
     gain = plan.gain
     assert gain is not None  # the criterion has test poses
-    reached = math.inf if predicted is None else max(gain.sure, predicted.ci95[1])
+    reached = max(gain.sure, kept)
     verdict = verdict_of(gain, reached, required, least_gain)
     likeliest = sorted(plan.doubts, key=lambda place: -chances[place])
     return NextPoses(
@@ -176,6 +178,19 @@ def next_poses(
         doubts=tuple((*place, chances[place]) for place in likeliest),
         least_gain=least_gain,
     )
+
+
+def _kept(fit: Calibration, unknown: float) -> float:
+    """The error at new poses that the estimates keep with 95 %, in m.
+
+    That configurations scatter beyond their noise is lack of fit with the probability that
+    something `unknown` is at work; else it is their noise.  What has a name is in doubt by itself.
+    """
+    model, observed, rng = fit.model, fit.observations, np.random.default_rng(0)
+    excess = None if fit.excess is None else fit.excess.with_chance(unknown, rng)
+    poses = where_used(model) or over_the_workspace(model.cell, model, observed.table)
+    found = predicted_error(fit.arm, observed, excess, fit.spread, poses, rng)
+    return math.inf if found is None else found.sure
 
 
 def verdict_of(

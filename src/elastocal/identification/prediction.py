@@ -365,9 +365,10 @@ def measured_loads(observed: Observations) -> Array:
 class PredictedError:
     """The noise-free position error to be expected at new poses: 3-D rms over poses, in m.
 
-    `rms` is its expectation, `ci95` its 95 % interval.  The parts of the expectation: of the
-    `parameters` determined, of those left `open`, of what the model lacks (`lacking`, None where
-    nothing tells the noise from it).  `blamed` names open parameters, the worst first.
+    `rms` is its expectation, `ci95` its 95 % interval; with 95 % it is below `sure`.  The parts of
+    the expectation: of the `parameters` determined, of those left `open`, of what the model lacks
+    (`lacking`, None where nothing tells the noise from it).  `blamed` names open parameters, the
+    worst first.
     `unchecked` is that part of `parameters` which single configurations alone hold, infinite
     where it is not known.
     """
@@ -381,6 +382,7 @@ class PredictedError:
     poses: int
     source: str
     unchecked: float = np.inf
+    sure: float = np.inf
 
     def to_json(self) -> dict[str, Any]:
         """JSON-ready, in µm."""
@@ -402,6 +404,11 @@ class Excess:
 
     squared: Array
     inflated: Array
+
+    def with_chance(self, chance: float, rng: np.random.Generator) -> Excess:
+        """As it is in that share of the draws; in the others nothing is missing."""
+        there = rng.random(DRAWS) < chance
+        return Excess(np.where(there, self.squared, 0.0), np.where(there, self.inflated, 1.0))
 
 
 def excess_of(
@@ -487,7 +494,7 @@ def predicted_error(
     alone = np.inf
     if unchecked is not None:
         alone = float(np.sqrt((((known @ (unchecked @ root)) * each) ** 2).sum() * inflated.mean()))
-    low, high = np.sqrt(np.quantile(squares, [0.025, 0.975]))
+    low, high, sure = np.sqrt(np.quantile(squares, [0.025, 0.975, 0.95]))
     return PredictedError(
         float(np.sqrt(own + rest + (lacking or 0.0))),
         (float(low), float(high)),
@@ -498,6 +505,7 @@ def predicted_error(
         len(poses.q),
         poses.source,
         alone,
+        float(sure),
     )
 
 

@@ -334,7 +334,7 @@ class _Design:
             drawn = EFFORTS[options.effort].candidates
             cell = replace(cell, design=replace(cell.design, candidates=drawn))
         self.checkpoint, self.progress = checkpoint, progress
-        self.doubts: tuple[Place, ...] = ()
+        self.doubts: dict[Place, float] = {}
         self.model = Model(cell, options.done.marker_names if options.done else ())
         if self.model.shrunk.any():
             self.model, options = self._without_functions(options)
@@ -440,9 +440,7 @@ class _Design:
         found = select(search, pool, shares, searches, options, self.checkpoint, progress, begun)
         progress("random plans beside it")
         drawn = random_information(search.problem(pool, shares), options.seed)
-        return self._plan(
-            setup, found, shares, counts, targets.source, curve, known.done, drawn, pinned
-        )
+        return self._plan(setup, found, shares, counts, targets.source, curve, known, drawn, pinned)
 
     def _shares(self, n_poses: int | None = None) -> IntArray:
         """Poses (L,) to choose per level, beside those that stay."""
@@ -582,7 +580,7 @@ class _Design:
     def _plan(
         self, setup: Setup, found: Selection, shares: IntArray, counts: CandidateCounts,
         targets: str,
-        curve: tuple[PlanSize, ...], done: Done | None, drawn: Array, pinned: FeasiblePool | None,
+        curve: tuple[PlanSize, ...], known: Known, drawn: Array, pinned: FeasiblePool | None,
     ) -> Plan:  # fmt: skip
         self.progress("order of execution")
         found, execution, told = ordered(
@@ -601,7 +599,7 @@ class _Design:
         phi = np.sort(np.asarray(setup.criterion.value(drawn), dtype=np.float64))
         seen = setup.information.seen(q, load)
         numbers = round(blocks.shape[1] * blocks.shape[2] * seen.mean() * readings_each(self.cell))
-        numbers += 0 if done is None else done.numbers
+        numbers += 0 if known.done is None else known.done.numbers
         value, unit = setup.criterion.reported(found.value)
         bound = found.certificate.bound_pool
         return Plan(
@@ -639,8 +637,8 @@ class _Design:
             chance=Chance.of(phi, found.value, setup.criterion),
             everywhere=self._everywhere(setup, M, drawn[:, 0], left),
             seen=None if seen.all() else seen,
-            doubts=self.doubts,
-            gain=gain_of(setup, done, M, self.model.names, self.options.seed),
+            doubts=tuple(self.doubts),
+            gain=gain_of(setup, known, M, self.doubts, self.options.seed),
         )  # fmt: skip
 
     def _names(self, found: Selection) -> tuple[str, ...]:

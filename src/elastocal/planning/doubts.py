@@ -30,12 +30,11 @@ from elastocal.model.effects import CATALOGUE
 from elastocal.model.manipulator import Model
 from elastocal.model.observations import observe
 from elastocal.planning.information import (
-    Done,
     LoadStates,
     PoseInformation,
     observed_weights,
 )
-from elastocal.planning.plan import Gain
+from elastocal.planning.plan import Doubt, Gain
 from elastocal.planning.setup import Known, Setup
 from elastocal.units import Array, IntArray
 
@@ -54,11 +53,11 @@ Place = tuple[str, str]  # an effect and where it acts
 def in_doubt(
     model: Model, known: Known, states: LoadStates, q: Array, load: IntArray,
     probability: Mapping[Place, float] | None = None,
-) -> tuple[Model, Known, tuple[Place, ...]]:  # fmt: skip
-    """The model with all that it may lack, what is known of it, and the places that count: the
-    prior of the parameters that it then has more, sized at some of the poses q (N, n) in load
-    states `load` (N,).  Those that these do not show are held: no plan would lower what they add at
-    the test poses.
+) -> tuple[Model, Known, dict[Place, float]]:  # fmt: skip
+    """The model with all that it may lack, what is known of it, and the places that count, with
+    their probability: the prior of the parameters that it then has more, sized at some of the poses
+    q (N, n) in load states `load` (N,).  Those that these do not show are held: no plan would lower
+    what they add at the test poses.
 
     `probability` that an effect is missing at a place, where more is known of it than its share of
     SOMETHING; places that it does not name are not in doubt.
@@ -69,7 +68,7 @@ def in_doubt(
         probability = {key: SOMETHING / (len(of_each) * of_each[key[0]]) for key in places}
     places = [key for key in places if probability.get(key, 0.0) > 0]
     if not places:
-        return model, known, ()
+        return model, known, {}
     whole = model.with_effects((*model.cell.model.effects, *(EffectChoice(*key) for key in places)))
     every = np.arange(len(whole.parameters))
     information = PoseInformation(whole, states, whole.nominal[None], every, np.ones(len(every)))
@@ -90,7 +89,7 @@ def in_doubt(
         names, mean = [*prior.names, *names], [*prior.mean, *mean]
         covariance = linalg.block_diag(prior.covariance, covariance)
     both = GaussianPrior(tuple(names), np.array(mean), covariance) if names else None
-    kept = tuple(dict.fromkeys((p.effect, p.where) for p in own))
+    kept = {(p.effect, p.where): probability[p.effect, p.where] for p in own}
     return whole, replace(known, fixed=(*known.fixed, *unseen), prior=both), kept
 
 
@@ -129,12 +128,22 @@ def usual_sizes(specs: Sequence[Parameter | ParameterSpec], columns: Array) -> A
 
 
 def gain_of(
-    setup: Setup, done: Done | None, after: Array, names: Sequence[str], seed: int
+    setup: Setup, known: Known, after: Array, places: Mapping[Place, float], seed: int
 ) -> Gain | None:
     """What a plan that leads to the information `after` (p, p) adds to the measurements done;
-    parameters that are not among `names` are in doubt.  None without any, or without test poses."""
+    effects at `places` are in doubt.  None without any measured, or without test poses."""
+    done, information = known.done, setup.information
     if done is None or setup.target_rows is None:
         return None
-    kept, own = setup.information.columns, np.isin(setup.information.names, names)
-    pull = done.pull[kept] * setup.information.sizes
-    return Gain.of(setup.target_rows, setup.prior[0], after, own, pull, seed)
+    columns, sizes = information.columns, information.sizes
+    at = [information.model.parameters[c] for c in columns]
+    prior = known.prior
+    variance = dict(zip(prior.names, np.diag(prior.covariance), strict=True)) if prior else {}
+    doubts = []
+    for place, p in places.items():
+        own = np.array([k for k, a in enumerate(at) if (a.effect, a.where) == place], dtype=int)
+        known_of = sizes[own] ** 2 / np.array([variance[at[k].name] for k in own])
+        doubts.append(Doubt(p, own, (1 - p) * known_of))
+    return Gain.of(
+        setup.target_rows, setup.prior[0], after, doubts, done.pull[columns] * sizes, seed
+    )

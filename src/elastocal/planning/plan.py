@@ -377,6 +377,16 @@ DRAWS = 2000  # of what the arm may be
 
 
 @dataclass(frozen=True)
+class Doubt:
+    """An effect that may be missing: its `probability` π, the `columns` (k,) of its parameters, and
+    `spare` (k,), by how much less is known of them before if it is there: (1 − π)/(π s²)."""
+
+    probability: float
+    columns: IntArray
+    spare: Array
+
+
+@dataclass(frozen=True)
 class Gain:
     """What a plan adds to measurements done: rms position error in m at the test poses.
 
@@ -393,25 +403,38 @@ class Gain:
 
     @classmethod
     def of(
-        cls, R: Array, before: Array, after: Array, own: BoolArray, pull: Array, seed: int
+        cls, R: Array, before: Array, after: Array, doubts: Sequence[Doubt], pull: Array, seed: int
     ) -> Gain:
-        """Of R (r, p) at the test poses, the information (p, p) before and after the plan, which
-        parameters are the model's `own` (p,), and `pull` (p,) = Bᵀ Σ⁻¹ (readings − model).
+        """Of R (r, p) at the test poses, the information (p, p) before and after the plan, the
+        effects in doubt, and `pull` (p,) = Bᵀ Σ⁻¹ (readings − model).
 
-        The arm is N(V pull, V) away from the model, V the inverse of `before`: what it may lack,
-        as far as the readings show it, and what they leave possible.
+        The arm is averaged over what may be missing (Hoeting et al. 1999, Statistical Science 14):
+        nothing, or one of the effects, each with its probability; it is then N(V pull, V) away from
+        the model, V⁻¹ the information on the model's parameters and those of that effect.
         """
+        own = np.setdiff1d(np.arange(len(before)), [k for d in doubts for k in d.columns])
         part = np.ix_(own, own)
         rms = remaining_rms(R, before), remaining_rms(R, after)
         right = remaining_rms(R[:, own], before[part]), remaining_rms(R[:, own], after[part])
         if not np.isfinite(rms[0]):
             return cls(*rms, *right, np.inf)
-        factor = linalg.cho_factor(before, lower=True)
-        bias = R @ linalg.cho_solve(factor, pull)
-        root = linalg.solve_triangular(factor[0], R.T, lower=True).T
-        z = np.random.default_rng(seed).standard_normal((len(pull), DRAWS))
-        errors = np.linalg.norm(bias[:, None] + root @ z, axis=0)
-        return cls(*rms, *right, float(np.quantile(errors, 0.95)))
+        rng = np.random.default_rng(seed)
+        chance = np.array([d.probability for d in doubts])
+        nothing = Doubt(max(1 - chance.sum(), 0.0), own[:0], np.zeros(0))
+        shares = np.array([nothing.probability, *chance]) / max(chance.sum(), 1.0)
+        errors = []
+        for n, doubt in zip(rng.multinomial(DRAWS, shares), (nothing, *doubts), strict=True):
+            if not n:
+                continue
+            there = np.append(own, doubt.columns)
+            M = before[np.ix_(there, there)].copy()
+            M[len(own) :, len(own) :] -= np.diag(doubt.spare)
+            factor = linalg.cholesky(M, lower=True)
+            z = rng.standard_normal((len(there), n))
+            z += linalg.solve_triangular(factor, pull[there], lower=True)[:, None]
+            off = R[:, there] @ linalg.solve_triangular(factor, z, lower=True, trans="T")
+            errors.append(np.linalg.norm(off, axis=0))
+        return cls(*rms, *right, float(np.quantile(np.concatenate(errors), 0.95)))
 
 
 @dataclass(frozen=True)
