@@ -64,7 +64,7 @@ def test_json_says_what_the_terminal_says(campaign, tmp_path: Path) -> None:
     told = json.loads(result.stdout)
     assert told["schema"] == "elastocal/export/1" and told["format"] == "urdf"
     assert told["output"] == str(output) and output.exists()
-    assert "reader of URDF" in told["read_back"]["with"] and told["read_back"]["max_um"] < 1e-3
+    assert told["read_back"]["with"] == "pinocchio" and told["read_back"]["max_um"] < 1e-3
     (entry,) = told["cannot_hold"]["effects"]
     assert entry["effect"] == "joint_compliance"
     assert entry["difference"]["marker_max_um"] >= entry["difference"]["marker_rms_um"] > 1

@@ -422,8 +422,7 @@ def _urdf(calibrated: CalibratedArm, wish: Wish, kept: Kept, pieces: ExportNumbe
         base, flange = BASE, FLANGE
     read = partial(read_urdf, base=base, flange=flange)
     chain = pieces.calibrated_chain()
-    distance = check_chain(text, ".urdf", read, chain, kept, wish.seed)
-    return text, distance, "elastocal's own reader of URDF files", [], None
+    return text, check_chain(text, ".urdf", read, chain, kept, wish.seed), "pinocchio", [], None
 
 
 def _mjcf(calibrated: CalibratedArm, wish: Wish, kept: Kept, pieces: ExportNumbers) -> Written:

@@ -12,6 +12,7 @@ from xml.parsers import expat
 from xml.sax.saxutils import quoteattr
 
 import numpy as np
+from scipy.spatial.transform import Rotation
 
 from elastocal.cell.arm_description import Robot
 from elastocal.errors import InputError, option
@@ -210,11 +211,11 @@ def _tracker_frame(tree: Tree, text: UrdfText, pieces: ExportNumbers, base: str)
             f"{tree.path}: the cell's base is {TRACKER}, the tracker's frame of an earlier export; "
             "name the robot's own base link as [robot] base"
         )
-    T = pieces.T_tracker_base @ np.linalg.inv(tree.placed(base))
+    T = pieces.T_tracker_base @ np.linalg.inv(_placed(tree, tree.root, base))
     if tree.root != TRACKER:
         return _fixed(tree, text, TRACKER, TRACKER, tree.root, T)
     below = next(joint for joint in tree.joints.values() if joint.parent == TRACKER)
-    text.set_origin(below.name, origin_attributes(T @ below.origin))
+    text.set_origin(below.name, origin_attributes(T @ _origin(below)))
     return []
 
 
@@ -252,7 +253,7 @@ def _correct_joints(
 ) -> None:
     for i, joint in enumerate(moving):
         if not nothing(correction := correction_of_joint(pieces, i)):
-            text.set_origin(joint.name, origin_attributes(joint.origin @ correction))
+            text.set_origin(joint.name, origin_attributes(_origin(joint) @ correction))
 
 
 def _correct_flange(
@@ -263,7 +264,7 @@ def _correct_flange(
         return []
     last = tree.parent_joint[flange]
     if last.kind == "fixed":
-        text.set_origin(last.name, origin_attributes(last.origin @ error))
+        text.set_origin(last.name, origin_attributes(_origin(last) @ error))
         return []
     # The flange is the link that the last joint moves: a link in between takes the correction.
     text.set_child(last.name, MOUNT)
@@ -305,6 +306,21 @@ def _fixed(tree: Tree, text: UrdfText, new: str, parent: str, child: str, T: Arr
             f"or leave the frame out ({option('frames', False)}, or no {option('base_frame')})"
         )
     return fixed_link(new, parent, child, T)
+
+
+def _origin(joint: UrdfJoint) -> Array:
+    T = np.eye(4)
+    T[:3, :3] = Rotation.from_euler("xyz", joint.rpy).as_matrix()
+    T[:3, 3] = joint.xyz
+    return T
+
+
+def _placed(tree: Tree, root: str, link: str) -> Array:
+    """T_root_link (4, 4) with every joint between them at zero."""
+    T = np.eye(4)
+    for joint in tree.joints_between(root, link) or ():
+        T = T @ _origin(joint)
+    return T
 
 
 # A URDF for an arm that has none: a robot described by a DH table.

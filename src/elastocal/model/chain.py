@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
 from dataclasses import dataclass, field
 from typing import Literal
 
@@ -42,13 +41,6 @@ class LinkMass:
 
     mass: float
     com: Array
-
-    @classmethod
-    def together(cls, bodies: Sequence[LinkMass]) -> LinkMass:
-        """Of bodies in one frame."""
-        mass = float(sum(body.mass for body in bodies))
-        moment = sum((body.mass * body.com for body in bodies), np.zeros(3))
-        return cls(mass, moment / mass if mass > 0 else moment)
 
 
 @dataclass(frozen=True)

@@ -1,4 +1,4 @@
-"""URDF → nominal chain: what is wrong with the file is said by name.
+"""URDF → nominal chain: what is wrong with the file is said by name; Pinocchio reads the rest.
 
 Only what kinematics and weights need is read: links with mass and centre of mass, joints with
 parent, child, origin, axis and limits.  Meshes, materials, plugins and transmissions are ignored.
@@ -9,14 +9,13 @@ from __future__ import annotations
 import math
 import re
 import xml.etree.ElementTree as ET
-from collections.abc import Iterator, Mapping
+from collections.abc import Collection, Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from functools import cached_property
 from pathlib import Path
 from typing import Any
 
 import numpy as np
-from scipy.spatial.transform import Rotation
 
 from elastocal.errors import InputError, require
 from elastocal.files import DEEPEST, read_bytes
@@ -44,8 +43,13 @@ def read_urdf(path: str | Path, base: str | None = None, flange: str | None = No
     per joint in kg with its centre of mass in m in the joint's frame (none if all are zero).
     Bodies beyond the flange and on side branches count, those carried by the base do not.
 
-    Everything off the path from base to flange is held still, its joints at zero, so that its
-    bodies are carried by the joint on the path that they hang on.
+    Everything off the path from base to flange is held still: those joints become fixed at their
+    neutral position, so that pinocchio merges their bodies into the joint on the path that carries
+    them.  With X_i pinocchio's placement of joint i in its parent joint, the chain is
+
+        T_base_flange(q) = (T_p0_base)⁻¹ X_1 J_1(q_1) X_2 J_2(q_2) … X_n J_n(q_n) T_n_flange
+
+    where p0 is the (immobile) joint frame that carries the base link.
 
     Raises InputError, naming file, element and remedy, for anything `check_urdf` or `Tree` refuses.
     """
@@ -53,31 +57,74 @@ def read_urdf(path: str | Path, base: str | None = None, flange: str | None = No
     base = tree.root if base is None else tree.find_link("base", base)
     flange = tree.last_link(base) if flange is None else tree.find_link("flange", flange)
     moving = tree.serial_chain(base, flange)
-    before, joints = np.linalg.inv(tree.placed(base)), []
-    # Of each link the joint on the path that carries it (−1: none), and where it stands there.
-    held: dict[str, tuple[int, Array]] = {tree.root: (-1, np.eye(4))}
-    bodies: list[list[LinkMass]] = [[] for _ in moving]
-    for link in tree.below(tree.root):
-        if link != tree.root:
-            joint = tree.parent_joint[link]
-            carrier, T = held[joint.parent]
-            T = T @ joint.origin
-            if joint in moving:
-                kind: JointKind = "prismatic" if joint.kind == "prismatic" else "revolute"
-                limits, first = joint.limit or (-np.inf, np.inf), carrier < 0
-                placement = before @ T if first else T
-                joints.append(Joint(joint.name, kind, placement, np.array(joint.axis), *limits))
-                carrier, T = carrier + 1, np.eye(4)
-            held[link] = carrier, T
-        carrier, T = held[link]
-        if carrier >= 0:
-            body = tree.links[link]
-            bodies[carrier].append(LinkMass(body.mass, T[:3, :3] @ body.com + T[:3, 3]))
-    masses = tuple(LinkMass.together(found) for found in bodies)
+    model = _pinocchio_model(tree, moving)
+    before = _link_placement(model, base).inverse().homogeneous
+    placements = [placement.homogeneous for placement in model.jointPlacements[1:]]
+    placements[0] = before @ placements[0]
+    data = model.createData()
+    joints = []
+    for i, (source, placement) in enumerate(zip(moving, placements, strict=True), start=1):
+        # The motion subspace is (linear, angular) for every pinocchio joint, aligned or not, also
+        # for unbounded ones that store (cos q, sin q).
+        along, about = np.asarray(data.joints[i].S).reshape(2, 3)
+        limits = source.limit or (-np.inf, np.inf)
+        slides = source.kind == "prismatic"
+        kind: JointKind = "prismatic" if slides else "revolute"
+        joints.append(Joint(source.name, kind, placement, along if slides else about, *limits))
+    masses = tuple(LinkMass(float(body.mass), np.array(body.lever)) for body in model.inertias[1:])
     return Chain(
-        tree.name, tuple(joints), held[flange][1],
+        tree.name, tuple(joints), _link_placement(model, flange).homogeneous,
         masses if any(body.mass > 0 for body in masses) else (),
     )  # fmt: skip
+
+
+def _link_placement(model: Any, link: str) -> Any:
+    import pinocchio as pin
+
+    return model.frames[model.getFrameId(link, pin.FrameType.BODY)].placement
+
+
+def _pinocchio_model(tree: Tree, moving: Sequence[UrdfJoint]) -> Any:
+    import pinocchio as pin
+
+    expected = [joint.name for joint in moving]
+    try:
+        model = pin.buildModelFromXML(_skeleton(tree, expected))
+    except Exception as error:  # pinocchio raises ValueError, RuntimeError and its own
+        raise InputError(f"{tree.path}: pinocchio cannot read it: {error}") from error
+    found = list(model.names)[1:]
+    require(
+        found == expected and list(model.parents)[1:] == list(range(len(found))),
+        f"{tree.path}: pinocchio reads the joints {found} as something else than the serial "
+        f"chain {expected}; simplify the URDF",
+    )
+    return model
+
+
+def _skeleton(tree: Tree, moving: Collection[str]) -> str:
+    """URDF text with links, masses and joints only; joints not in `moving` are fixed."""
+    robot = ET.Element("robot", name=tree.name)
+
+    def text(vector: Sequence[float] | Array) -> str:
+        return " ".join(repr(float(value)) for value in vector)
+
+    for name, body in tree.links.items():
+        inertial = ET.SubElement(ET.SubElement(robot, "link", name=name), "inertial")
+        ET.SubElement(inertial, "mass", value=repr(body.mass))
+        ET.SubElement(inertial, "origin", xyz=text(body.com))
+        zero = dict.fromkeys(("ixx", "ixy", "ixz", "iyy", "iyz", "izz"), "0")
+        ET.SubElement(inertial, "inertia", zero)
+    for joint in tree.joints.values():
+        kind = joint.kind if joint.name in moving else "fixed"
+        element = ET.SubElement(robot, "joint", name=joint.name, type=kind)
+        ET.SubElement(element, "parent", link=joint.parent)
+        ET.SubElement(element, "child", link=joint.child)
+        ET.SubElement(element, "origin", xyz=text(joint.xyz), rpy=text(joint.rpy))
+        ET.SubElement(element, "axis", xyz=text(joint.axis))
+        if kind != "fixed" and joint.limit is not None:
+            lower, upper = map(repr, joint.limit)
+            ET.SubElement(element, "limit", lower=lower, upper=upper, effort="0", velocity="0")
+    return ET.tostring(robot, encoding="unicode")
 
 
 # The tree of links and joints in a URDF, and the one path through it from base to flange.
@@ -96,14 +143,6 @@ class UrdfJoint:
     axis: Vector
     limit: tuple[float, float] | None = None
     mimic: str | None = None
-
-    @property
-    def origin(self) -> Array:
-        """T (4, 4) of the joint's frame in its parent link's."""
-        T = np.eye(4)
-        T[:3, :3] = Rotation.from_euler("xyz", self.rpy).as_matrix()
-        T[:3, 3] = self.xyz
-        return T
 
 
 @dataclass(frozen=True)
@@ -129,7 +168,7 @@ class Tree:
                 f"'{joint.name}'; kinematic loops are not supported, remove one of them",
             )
         roots = [name for name in self.links if name not in parents]
-        reached = {link for root in roots for link in self.below(root)}
+        reached = {link for root in roots for link in self._below(root)}
         if lost := [name for name in self.links if name not in reached]:
             way = [lost[0]]
             while way.count(way[-1]) < 2:
@@ -160,8 +199,7 @@ class Tree:
     def root(self) -> str:
         return next(name for name in self.links if name not in self.parent_joint)
 
-    def below(self, link: str) -> Iterator[str]:
-        """The link and all that hang on it, each after what it hangs on."""
+    def _below(self, link: str) -> Iterator[str]:
         waiting = [link]
         while waiting:
             link = waiting.pop()
@@ -179,13 +217,6 @@ class Tree:
             link = joints[-1].parent
         return tuple(reversed(joints))
 
-    def placed(self, link: str) -> Array:
-        """T_root_link (4, 4) with every joint between them at zero."""
-        T = np.eye(4)
-        for joint in self.joints_between(self.root, link) or ():
-            T = T @ joint.origin
-        return T
-
     def find_link(self, role: str, name: str) -> str:
         """`name`, or an InputError with the nearest name and all links if there is no such link."""
         require(
@@ -199,7 +230,7 @@ class Tree:
         """The only leaf below `base` that enough moving joints carry to be a flange."""
         # Nothing hangs on a leaf but tool frames that `export` has added.
         leaves = [
-            link for link in self.below(base)
+            link for link in self._below(base)
             if not link.startswith(TOOL_FRAMES)
             and all(child.startswith(TOOL_FRAMES) for child in self._children[link])
         ]  # fmt: skip
@@ -225,7 +256,7 @@ class Tree:
         if joints is None:
             raise InputError(
                 f"{self.path}: flange '{flange}' is not below base '{base}'; links below "
-                f"'{base}': {listed(link for link in self.below(base) if link != base)}"
+                f"'{base}': {listed(link for link in self._below(base) if link != base)}"
             )
         for joint in joints:
             _check_on_path(joint, f"{self.path}: joint '{joint.name}'")
