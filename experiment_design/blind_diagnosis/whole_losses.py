@@ -31,7 +31,7 @@ STANDS_FOR = {
     "gear_eccentricity": ("eccentricity",), "gear_spectrum": ("lines",), "gear_ripple": ("lines",),
     "joint_curve": ("eccentricity", "lines"), "gravity_sag": ("sag",), "move_lag": ("move",),
     "hysteresis": ("move",), "base_drift": ("creep",), "residual_field": ("creep",),
-    "link_weights": ("sag",),
+    "link_weights": ("sag",), "move_hysteresis": ("move",),
 }  # fmt: skip
 SHOWN = 6
 
@@ -68,7 +68,7 @@ def fitted_geometry(sights: Sights) -> list[Block]:
 
 
 def named(answer: Mapping[str, Any], every: Iterable[Unit]) -> set[Unit]:
-    found = [*answer["effects"], *(answer.get("fields") or ())]
+    found = [*answer["effects"], *(answer.get("slight") or ()), *(answer.get("fields") or ())]
     said = {(kind, e["where"]) for e in found for kind in STANDS_FOR.get(e["effect"], ())}
     return said & set(every)
 

@@ -28,6 +28,7 @@ FAMILY = {
     "gear_eccentricity": "angle", "gear_ripple": "angle", "link_mass_error": "load",
     "hysteresis": "move", "backlash": "move", "base_drift": "time", "joint_drift": "time",
     "gear_spectrum": "angle", "gravity_sag": "load", "move_lag": "move",
+    "move_hysteresis": "move",
     "link_weights": "load",
 }  # fmt: skip
 ABSENT = (

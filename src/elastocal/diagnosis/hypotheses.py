@@ -168,6 +168,7 @@ def judged_together(model: Model, table: Measurements) -> list[Hypothesis]:
         if effect.together
         and not isinstance(effect, JointCurve | ResidualField | GearSpectrum)
         and all(recorded(table, need) for need in effect.needed(cell))
+        and not (effect.unless and recorded(table, effect.unless))
         for where in effect.places(chain, cell)
         if (effect.name, where) not in active
         and (parameters := effect.parameters(where, chain, cell))

@@ -77,6 +77,22 @@ def test_an_arm_lags_by_its_share_of_the_longest_way() -> None:
     np.testing.assert_allclose(ahead, 1e-3 * np.sign(MOVE[:, 1]), atol=1e-9)
 
 
+@pytest.mark.parametrize("effect", ["move_lag", "move_hysteresis"])
+def test_what_came_before_the_first_visit_has_an_error_of_its_own(effect: str) -> None:
+    m = model(stick("zz", (1.0, 1.0)), f"{effect}:joint1")
+    moved = positions(m, rows(Q), **{f"{effect}_first": 1e-3}) - positions(m, rows(Q))
+    unknown = DIRECTION[:, 0] == 0 if effect == "move_hysteresis" else ~MOVE.any(axis=1)
+    assert unknown[0] and not unknown.all()
+    np.testing.assert_array_equal(np.linalg.norm(moved, axis=1) > 1e-9, unknown)
+
+
+def test_a_joint_stays_behind_its_own_last_motion() -> None:
+    m = model(stick("zz", (1.0, 1.0)), "move_hysteresis:joint2")
+    moved = positions(m, rows(Q), move_hysteresis=1e-3) - positions(m, rows(Q))
+    turned = positions(m, rows(Q + np.array([0.0, 1e-3]))) - positions(m, rows(Q))
+    np.testing.assert_allclose(moved, turned * DIRECTION[:, 1:], atol=1e-6)
+
+
 @pytest.mark.parametrize("effect", ["hysteresis", "backlash"])
 def test_the_order_of_visits_says_what_a_missing_column_would(effect: str) -> None:
     chain, side = kr270_chain(), "load_and_approach"

@@ -55,7 +55,7 @@ def test_what_a_diagnosis_may_suspect_and_what_acts_unasked(observe: str) -> Non
     only = {"marker_orientation": "pose", "distance_sensor": "distance"}
     together = {  # judged with all other components of the gap
         "joint_curve", "residual_field", "gear_spectrum", "gravity_sag", "link_weights", "move_lag",
-        "torque_coupling", "torque_tilt",
+        "torque_coupling", "torque_tilt", "move_hysteresis",
     }  # fmt: skip
     loads = {"payload", "link_gravity"}
     assert never == loads | together | {n for n, o in only.items() if o != observe}

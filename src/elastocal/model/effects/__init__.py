@@ -39,6 +39,7 @@ CATALOGUE: dict[str, Effect] = {
         changes_in_time.JointDrift(),
         changes_in_time.EncoderJump(),
         play.MoveLag(),
+        play.MoveHysteresis(),
         gravity_sag.GravitySag(),
         torque_couplings.TorqueCoupling(),
         placements.LinkGeometry(),

@@ -116,6 +116,8 @@ class Effect:
     formats: ClassVar[tuple[Format, ...]] = ()
     # One of many causes at once: a diagnosis judges it only in the sum of all components.
     together: ClassVar[bool] = False
+    # A column of the table that says better what it takes from elsewhere.
+    unless: ClassVar[str] = ""
     # The setting that is the prior size of its shrunk parameters.
     sized_by: ClassVar[str] = ""
     # What it depends on in the first place, where its stage and needs do not say so.

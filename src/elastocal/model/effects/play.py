@@ -113,7 +113,8 @@ class MoveLag(DrivenEffect):
     settle only after the reading leave an error in proportion to that speed (a), friction one of
     a fixed size (b).  Δq is the visit's q minus that of the visit before it, in the order of the
     times, or of the rows where there are none: an assumption that can be tested, for the same
-    visits in another order must fit worse.  The first visit has no move.
+    visits in another order must fit worse.  How the arm came to the first visit nobody knows: it
+    has an error c of its own.
     """
 
     name = "move_lag"
@@ -125,10 +126,37 @@ class MoveLag(DrivenEffect):
     unknowns = (
         ParameterSpec("move_lag", "rad", 0.0, 1e-4),
         ParameterSpec("move_lag_sign", "rad", 0.0, 5e-5),
+        ParameterSpec("move_lag_first", "rad", 0.0, 5e-5),
     )
 
     def drive(self, arm: Arm, place: str, p: Symbols) -> ca.SX:
         move = arm.input("move", arm.chain.n_joints)
         own = move[index(place)]
-        longest = ca.mmax(ca.fabs(move)) + NEVER
-        return p["move_lag"] * own / longest + p["move_lag_sign"] * ca.sign(own)
+        longest = ca.mmax(ca.fabs(move))
+        moved = p["move_lag"] * own / (longest + NEVER) + p["move_lag_sign"] * ca.sign(own)
+        return moved + p["move_lag_first"] * (longest < NEVER)
+
+
+class MoveHysteresis(DrivenEffect):
+    """δq_j = b sgn Δq_j, Δq_j the last motion of the joint itself; b in rad.
+
+    `Hysteresis` that does not grow with the load, for tables without `approach`: from which side
+    the joint came is taken from the order of the visits, with the assumption that `MoveLag` makes.
+    Until the joint has moved it has an error of its own.
+    """
+
+    name = "move_hysteresis"
+    stage = "transmission"
+    at = "turning joints"
+    together = True
+    unless = "approach"
+    family = "move"
+    entry = JointMotion()
+    unknowns = (
+        ParameterSpec("move_hysteresis", "rad", 0.0, 5e-5),
+        ParameterSpec("move_hysteresis_first", "rad", 0.0, 5e-5),
+    )
+
+    def drive(self, arm: Arm, place: str, p: Symbols) -> ca.SX:
+        side = arm.input("direction", arm.chain.n_joints)[index(place)]
+        return p["move_hysteresis"] * side + p["move_hysteresis_first"] * (side == 0)
