@@ -57,7 +57,8 @@ def distances(base: Baseline, world: World, without: tuple[str, ...] = ()) -> li
     hypotheses, _ = possible(base.model, base.observed.table)
     scene = diagnosis_data_of(base, hypotheses)
     known = {(h.name, h.where): h for h in hypotheses}
-    noise = NoiseValues(1 / world.noise.stated, world.noise.repeatability, 1e-6)
+    joint = world.noise.repeatability
+    noise = NoiseValues(1 / world.noise.stated, joint, np.full_like(joint, 1e-6))
     whole = world.noise_free(world.visits)
     out = []
     for effect in world.effects:

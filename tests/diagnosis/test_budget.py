@@ -23,7 +23,7 @@ from elastocal.diagnosis import (
 )
 from elastocal.diagnosis.shrinkage import _left_out_together
 
-NOISE = NoiseValues(1.2, np.array([4e-6, 9e-6, 1e-5]), 0.4)
+NOISE = NoiseValues(1.2, np.array([4e-6, 9e-6, 1e-5]), np.full(3, 0.4))
 SEEDS = range(4)
 
 

@@ -20,14 +20,14 @@ from elastocal.diagnosis import (
 )
 from elastocal.diagnosis.baseline import Blocks
 from elastocal.diagnosis.component_answer import PROBABLE, TOLD
-from elastocal.diagnosis.component_search import WIDE, Beside
+from elastocal.diagnosis.component_search import WIDE, Beside, evidence_beside
 from elastocal.diagnosis.evidence import direct
 from elastocal.diagnosis.noise_floor import project
 from elastocal.model.effects.gears import EncoderScale
 from elastocal.model.effects.smooth import JointCurve, Waves
 
 Array = np.ndarray
-NOISE = NoiseValues(1.1, np.array([2e-6, 4e-6, 3e-6]), 0.4)
+NOISE = NoiseValues(1.1, np.array([2e-6, 4e-6, 3e-6]), np.full(3, 0.4))
 
 
 def component(data: NoisyData, seed: int, k: int, smooth: bool = False) -> Component:
@@ -132,7 +132,7 @@ def test_scatter_of_joints_that_the_instrument_has_taken_is_found() -> None:
     rng = np.random.default_rng(2)
     scatter = data.same_visit @ (2e-4 * rng.normal(size=(*data.r.shape, 3)))
     r = 2e-5 * rng.normal(size=data.r.shape) + (data.G * scatter).sum(axis=2)
-    start = NoiseValues(30.0, np.full(3, 1e-9), 0.2)
+    start = NoiseValues(30.0, np.full(3, 1e-9), np.full(3, 0.2))
     found = fit_sum(replace(data, r=r), [component(data, 1, 2)], start)
     assert (found.noise.joint > 1e-4).all()
 
@@ -156,6 +156,29 @@ def test_of_causes_only_those_at_work_are_left() -> None:
                     refit_noise=False)  # fmt: skip
     assert {id(c) for c in found.components} == {id(components[k]) for k in true}
     assert np.exp(found.sizes.size) == pytest.approx([1.1, 1.4], rel=0.5)
+
+
+def test_what_the_columns_of_others_are_about_stays() -> None:
+    data, components, _ = some()
+    quiet = NoiseValues.usual(3).of_instrument()
+    free = fit_sum(replace(data, r=0 * data.r), components[:1], quiet, refit_noise=False)
+    given = replace(components[0], given=True)
+    held = fit_sum(replace(data, r=0 * data.r), [given], quiet, refit_noise=False)
+    assert not free.components and held.components == (given,)
+
+
+def test_a_smooth_function_is_tried_at_several_lengths() -> None:
+    """Beside a sum its evidence is that of the length that suits it best."""
+    data, components, _ = some()
+    smooth = next(c for c in components if c.waves is not None)
+    low, high = smooth.lengths
+    assert low < high and len(smooth.at_lengths) == 3
+    for columns, length in zip(smooth.at_lengths, (low, (low + high) / 2, high), strict=True):
+        np.testing.assert_allclose(columns, smooth.columns * np.sqrt(smooth.shares(length)[0]))
+    found = fit_sum(data, [c for c in components if c is not smooth], NOISE, refit_noise=False)
+    beside = Beside(found, smooth.at_lengths)
+    best = max(beside.evidence(slice(0, 0), beside.spans))
+    assert evidence_beside(found, [smooth]) == pytest.approx([best])
 
 
 def test_nothing_is_found_in_noise() -> None:
@@ -191,6 +214,7 @@ def test_many_effects_at_once_are_one_sum() -> None:
     assert d.gap.explained < 0.5 * d.gap.calibrated
     assert d.groups[0].share == max(g.share for g in d.groups)
     shares = {(name, c.where): c.share for c in d.components for name in c.effects}
+    assert not {(e.effect, e.where) for e in d.effects} & {(e.effect, e.where) for e in d.slight}
     for e in d.effects:
         assert e.probability >= PROBABLE or abs(shares[e.effect, e.where]) >= TOLD
 

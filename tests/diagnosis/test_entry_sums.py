@@ -8,7 +8,7 @@ from support.diagnosis_data import random_blocks, random_data
 
 from elastocal.diagnosis import EntrySums, NoiseValues, VisitPlaces, direct, project
 
-NOISE = NoiseValues(1.1, np.array([4e-6, 9e-6, 1e-5]), 0.5)
+NOISE = NoiseValues(1.1, np.array([4e-6, 9e-6, 1e-5]), np.full(3, 0.5))
 SEEDS = range(4)
 
 

@@ -14,7 +14,7 @@ from elastocal.diagnosis import NoiseValues, NoisyData, direct, evidence_of, exc
 from elastocal.diagnosis.diagnosis import SMALLEST_P
 from elastocal.diagnosis.evidence import SCALES
 
-NOISE = NoiseValues(0.9, np.array([4e-6, 9e-6, 1e-5]), 0.5)
+NOISE = NoiseValues(0.9, np.array([4e-6, 9e-6, 1e-5]), np.full(3, 0.5))
 SEEDS = range(4)
 
 

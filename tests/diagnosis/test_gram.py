@@ -22,7 +22,7 @@ from elastocal.diagnosis import (
 from elastocal.diagnosis import diagnosis_data as dataset
 from elastocal.diagnosis import evidence as gram
 
-NOISE = NoiseValues(1.0, np.full(6, 3e-6), 0.2)
+NOISE = NoiseValues(1.0, np.full(6, 3e-6), np.full(6, 0.2))
 TRIED = (
     ("gear_ripple", "joint5"), ("encoder_jump", "joint2"), ("frame_jump", "tracker"),
     ("base_drift", "base"), ("encoder_scale", "joint3"),

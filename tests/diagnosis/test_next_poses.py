@@ -55,7 +55,8 @@ def test_the_next_poses_go_on_where_the_campaign_ended(folder, answer) -> None:
 def test_it_says_what_they_bring(answer) -> None:
     gain = answer["gain"]
     assert gain["after"] < gain["before"] and gain["model_after"] < gain["model_before"]
-    assert gain["model_before"] < gain["before"] < answer["reached"]
+    # What is counted with all doubts at once is more than their mean, which is what is reached.
+    assert gain["model_before"] < min(gain["before"], answer["reached"])
     assert answer["plan"]["gain"] == gain
     assert answer["plan"]["value"] == pytest.approx(1e6 * gain["after"])
     # No parameter in doubt is promised an interval.

@@ -36,7 +36,7 @@ from elastocal.diagnosis.diagnosis import SMALLEST_P
 from elastocal.diagnosis.effect_search import FLIPS
 
 TRIED = ("gear_eccentricity", "encoder_scale", "encoder_jump", "marker_slip", "hysteresis")
-NOISE = NoiseValues(1.0, np.full(6, 3e-6), 0.2)
+NOISE = NoiseValues(1.0, np.full(6, 3e-6), np.full(6, 0.2))
 
 
 @lru_cache

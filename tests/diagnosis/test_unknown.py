@@ -28,7 +28,7 @@ from elastocal.diagnosis import (
 from elastocal.measurements import Measurements
 
 N = 24
-NOISE = NoiseValues(1.0, np.full(6, 3e-6), 0.2)
+NOISE = NoiseValues(1.0, np.full(6, 3e-6), np.full(6, 0.2))
 
 
 @lru_cache

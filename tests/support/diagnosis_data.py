@@ -236,10 +236,10 @@ def dense_noise(data: NoisyData, noise: NoiseValues) -> Array:
             if i // m != j // m:
                 continue
             one, other = observation[i], observation[j]
-            joint = float((noise.joint**2 * G[i] * G[j]).sum())
-            V[a, b] = joint * noise.shared**2
+            joint = noise.joint**2 * G[i] * G[j]
+            V[a, b] = float(joint @ noise.shared**2)
             if blocks.visit[one] == blocks.visit[other]:
-                V[a, b] += joint
+                V[a, b] += float(joint.sum())
             if one == other:
                 V[a, b] += noise.factor**2 * data.covariance[i // m, i % m, j % m]
     return V

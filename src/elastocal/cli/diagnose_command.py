@@ -101,7 +101,7 @@ def diagnose(
             if plan is not None:
                 told.append(_write_extra_poses(plan, found.extra, kinds, bool(found.groups)))
             if cell_out is not None:
-                extra = (*found.effects, *found.fields)
+                extra = (*found.effects, *found.slight, *found.fields)
                 write_extended_cell(cell, cell_out, extra, found.model_keys)
                 added = added_text(extra)
                 told.append(f"wrote {cell_out} with {added or 'no further effect'}")

@@ -44,6 +44,7 @@ PROBABLE = 0.5
 NAMED = 0.9  # probability from which a named effect needs no rivals beside it
 CHANCE = 0.05  # probability from which a rival is told
 TOLD = 0.02  # share of the gap from which it matters which of several effects it is
+SLIGHT = 0.01  # of the gap's rms: what moves the markers by less is next to nothing
 LARGE = 0.1  # share of the gap from which what has no name leaves the verdict open
 
 
@@ -234,14 +235,16 @@ class SumAnswer:
         return ComponentShare(
             family, where, tuple(dict.fromkeys(c.effect.name for c in chosen)),
             *self._share_with_ends(everything), float(np.median(rms)), (low95, high95),
-            max(map(self._there, members)), any(c.named for c in chosen),
+            self._matters(members), any(c.named for c in chosen),
         )  # fmt: skip
 
     @cached_property
     def groups(self) -> tuple[EffectGroup, ...]:
         """One for each effect at all its places, lines and curves of joints as one."""
         kinds = self._by(lambda c: c.named and (GEARS if _of_gear(c) else c.effect.name))
-        return tuple(sorted((self._group(*item) for item in kinds.items()), key=lambda g: -g.share))
+        counting = {name: [k for k in own if k not in self._slight] for name, own in kinds.items()}
+        groups = (self._group(name, own) for name, own in counting.items() if own)
+        return tuple(sorted(groups, key=lambda g: -g.share))
 
     def _group(self, name: str, members: list[int]) -> EffectGroup:
         chosen = [self.found.components[k] for k in members]
@@ -385,12 +388,35 @@ class SumAnswer:
         return tuple(self._found_effects(named=True))
 
     @cached_property
+    def slight(self) -> tuple[FoundEffect, ...]:
+        """What has a name and moves the markers by next to nothing, or perhaps not at all."""
+        return tuple(self._found_effects(named=True, slight=True))
+
+    @cached_property
     def fields(self) -> tuple[FoundEffect, ...]:
         """What has none, and corrects the arm all the same."""
         return tuple(self._found_effects(named=False))
 
-    def _found_effects(self, named: bool) -> Iterator[FoundEffect]:
-        at_place = self._by(lambda c: c.named == named and (c.effect.name, c.where))
+    @property
+    def _at_place(self) -> dict[tuple[str, str], list[int]]:
+        return self._by(lambda c: (c.effect.name, c.where))
+
+    @cached_property
+    def _slight(self) -> set[int]:
+        """Named components, by effect and place, that probably do not matter."""
+        doubtful = (own for own in self._at_place.values() if self._matters(own) < PROBABLE)
+        return {k for own in doubtful for k in own if self.found.components[k].named}
+
+    def _matters(self, members: Sequence[int]) -> float:
+        """Probability that these are there, and move the markers by SLIGHT of the whole or more."""
+        enough = self.squares(members) >= SLIGHT**2 * self.total
+        return max(map(self._there, members)) * float(enough.mean())
+
+    def _found_effects(self, named: bool, slight: bool = False) -> Iterator[FoundEffect]:
+        at_place = {
+            key: own for key, own in self._at_place.items()
+            if self.found.components[own[0]].named == named and (own[0] in self._slight) == slight
+        }  # fmt: skip
         order = sorted(at_place.items(), key=lambda pair: -float(np.median(self.squares(pair[1]))))
         for (name, where), members in order:
             settings = self._settings(members)
@@ -483,6 +509,7 @@ class SumAnswer:
             members += [
                 k for k, c in enumerate(self.found.components)
                 if c.named and c.where in group.places and c.effect.name in group.effects
+                and k not in self._slight
             ]  # fmt: skip
             steps.append(self._step(f"{group.name}:{'+'.join(group.places)}", members))
         if len(members) < len(self.found.components):

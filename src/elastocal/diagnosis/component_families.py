@@ -139,7 +139,8 @@ PIECE = 4_000_000  # numbers of directions that are held at a time
 class LineFamily:
     """Lines of the joint `where` at `order` and its multiples: `gain` in nats less the search,
     `sd` how well these data know the order, `search` what finding it cost, the joint's `scatter`
-    beside them, and the components that they are `instead_of`."""
+    beside them, of a visit and as a multiple of it that of a configuration, and the components
+    that they are `instead_of`."""
 
     where: str
     order: float
@@ -147,7 +148,7 @@ class LineFamily:
     gain: float
     sd: float
     search: float
-    scatter: float = 0.0
+    scatter: tuple[float, float] = (0.0, 0.0)
     instead_of: tuple[Component, ...] = ()
     component: Component | None = None
 
@@ -170,12 +171,10 @@ def line_families(dataset: DiagnosisData, found: FittedSum) -> list[LineFamily]:
         lines = sum(len(c.settings) // 2 for c in own if isinstance(c.effect, GearSpectrum))
         if lines > MOST_FOUND:
             continue
-        tried = [_best(beside, h, 0.0, float(found.noise.joint[i]), ())]
+        tried = [_best(beside, h, 0.0, _scatter(found.noise, i), ())]
         curves = tuple(c for c in own if isinstance(c.effect, JointCurve))
-        for scatter in _less(found.noise, i) or ([found.noise.joint[i]] if curves else []):
-            joint = found.noise.joint.copy()
-            joint[i] = scatter
-            grams = _beside(dataset, found, replace(found.noise, joint=joint), curves)
+        for scatter in _less(found.noise, i) or ([_scatter(found.noise, i)] if curves else []):
+            grams = _beside(dataset, found, with_scatter(found.noise, i, scatter), curves)
             tried.append(_best(grams, h, grams.at.marginal - now, scatter, curves))
         best = max(tried, key=lambda family: family.gain)
         if best.gain > HOPELESS:
@@ -188,27 +187,41 @@ def line_families(dataset: DiagnosisData, found: FittedSum) -> list[LineFamily]:
 HOPELESS = -3.0
 
 
-def _less(noise: NoiseValues, i: int) -> list[float]:
-    """Scatter that joint i (0-based) may have once its lines are known: half, and as usual, whether
-    from visit to visit or from pose to pose."""
-    usual = NoiseValues.usual(len(noise.joint))
-    quiet = float(usual.joint[i] * np.hypot(1, usual.shared) / np.hypot(1, noise.shared))
-    now = float(noise.joint[i])
-    return [] if now <= quiet else sorted({max(quiet, now / 2), quiet}, reverse=True)
+def with_scatter(noise: NoiseValues, i: int, scatter: tuple[float, float]) -> NoiseValues:
+    """The noise with another scatter of joint i (0-based)."""
+    joint, shared = noise.joint.copy(), noise.shared.copy()
+    joint[i], shared[i] = scatter
+    return replace(noise, joint=joint, shared=shared)
+
+
+def _scatter(noise: NoiseValues, i: int) -> tuple[float, float]:
+    return float(noise.joint[i]), float(noise.shared[i])
+
+
+def _less(noise: NoiseValues, i: int) -> list[tuple[float, float]]:
+    """Scatter that joint i (0-based) may have once its lines are known: half of it, as usual from
+    pose to pose, and as usual from visit to visit as well."""
+    s, c = _scatter(noise, i)
+    s_usual, c_usual = _scatter(NoiseValues.usual(len(noise.joint)), i)
+    s_least, c_least = min(s, s_usual), min(c, c_usual)
+    half = (s, c / 2) if c > 1 else (s / 2, c)
+    tried = {(max(half[0], s_least), max(half[1], c_least)), (s, c_least), (s_least, c_least)}
+    return sorted(tried - {(s, c)}, reverse=True)
 
 
 MOST_FOUND = MOST_LINES - 3
 
 
 def _best(
-    grams: Grams, h: Hypothesis, gain: float, scatter: float, curves: tuple[Component, ...]
-) -> LineFamily:
+    grams: Grams, h: Hypothesis, gain: float, scatter: tuple[float, float],
+    curves: tuple[Component, ...],
+) -> LineFamily:  # fmt: skip
     """The best family of a joint, of any number of multiples; `gain` is that of what it is in the
     place of."""
     tried = MULTIPLES[:1] if len(grams.dataset.blocks.member) > FEW_POSES else MULTIPLES
     families = [_best_family(grams, h, m) for m in tried]
     best = max(families, key=lambda family: family.gain)
-    return replace(best, gain=best.gain + gain, scatter=float(scatter), instead_of=curves)
+    return replace(best, gain=best.gain + gain, scatter=scatter, instead_of=curves)
 
 
 def _best_family(grams: Grams, h: Hypothesis, m: int) -> LineFamily:
@@ -280,9 +293,8 @@ def sought_anew(dataset: DiagnosisData, found: FittedSum, c: Component) -> Compo
     if not isinstance(c.effect, GearSpectrum):
         return None
     h = next(h for h in dataset.hypotheses if h.key == (GearRipple.name, c.where))
-    scatter = float(found.noise.joint[index(c.where)])
     grams = _beside(dataset, found, found.noise, (c,))
-    best = _best(grams, h, 0.0, scatter, ())
+    best = _best(grams, h, 0.0, (0.0, 0.0), ())
     given = dict(c.settings)
     own = _family_evidence(grams, h, np.array([given["order_1"]]), c.width // 4)[0]
     near = abs(best.order - given["order_1"]) < best.sd + given["order_sd_1"]

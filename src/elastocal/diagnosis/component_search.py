@@ -23,6 +23,7 @@ from elastocal.diagnosis.component_families import (
     sought_anew,
     whole_families,
     with_multiples,
+    with_scatter,
 )
 from elastocal.diagnosis.components import (
     Component,
@@ -63,7 +64,9 @@ def search_components(
         begun = replace(NoiseValues.usual(data.G.shape[2]), factor=0.3)
         instrument = (chosen.noise if data.stated else begun).of_instrument()
         curves = list(joint_curves(full))
-        every = [*drifts(full), *catalogue_components(full), *_searched(full, chosen)]
+        known = (replace(c, given=weighed and isinstance(c.effect, LinkWeights))
+                 for c in catalogue_components(full))  # fmt: skip
+        every = [*drifts(full), *known, *_searched(full, chosen)]
         others = _first(every)
         progress(f"sizes of {len(curves) + len(others)} components at once")
         both = [*curves, *others]
@@ -104,7 +107,7 @@ def search_components(
     progress("what can be left out")
     found = _spared(found)
     if len(full.blocks.member) <= FEW_POSES:
-        found = _with_all_multiples(full, found)
+        found = _with_all_multiples(full, completed(found, both))
     return full, found, hidden_fellows(found, others)
 
 
@@ -156,11 +159,11 @@ def _with_lines(dataset: DiagnosisData, found: FittedSum) -> FittedSum:
         some = [[family] for family in stand_out[:TRIED]]
         some += [stand_out[:n] for n in range(2, min(TRIED, len(stand_out)) + 1)]
         for chosen in [stand_out] if many else some:
-            joint = found.noise.joint.copy()
+            noise = found.noise
             for family in chosen:
-                joint[index(family.where)] = family.scatter
+                noise = with_scatter(noise, index(family.where), family.scatter)
             fitted = exchanged(
-                replace(found, noise=replace(found.noise, joint=joint)),
+                replace(found, noise=noise),
                 [c for family in chosen for c in family.instead_of],
                 [family.component for family in chosen if family.component is not None],
             )  # fmt: skip
@@ -178,8 +181,7 @@ def with_returned(found: FittedSum, components: Sequence[Component]) -> FittedSu
     for _ in range(RETURNS):
         taken = {id(c) for c in found.components}
         away = [c for c in components if id(c) not in taken]
-        beside = Beside(found, [c.columns for c in away])
-        each = beside.evidence(slice(0, 0), beside.spans)
+        each = evidence_beside(found, away)
         evidence = [e + log_odds(found.components, c) for e, c in zip(each, away, strict=True)]
         order = np.argsort(evidence)[::-1][:MOST_RETURNED]
         wider = _wider(found, [away[k] for k in order if evidence[k] > 0])
@@ -226,7 +228,7 @@ def _with_all_multiples(dataset: DiagnosisData, found: FittedSum) -> FittedSum:
     if not pairs:
         return found
     whole = exchanged(found, [c for c, _ in pairs], [w for _, w in pairs])
-    return whole if len(whole.components) == len(found.components) else found
+    return _tuned(dataset, whole) if len(whole.components) == len(found.components) else found
 
 
 def hidden_fellows(found: FittedSum, components: Sequence[Component]) -> tuple[Component, ...]:
@@ -259,7 +261,7 @@ def _spared(found: FittedSum) -> FittedSum:
     spared = 0
     order = np.argsort(found.earned - found.costs)
     for c in [found.components[k] for k in order[:SPARED]]:
-        if not any(c is other for other in found.components):
+        if c.given or not any(c is other for other in found.components):
             continue
         fitted = exchanged(found, [c], refit_noise=False)
         if fitted.score > found.score:
@@ -379,6 +381,14 @@ class Beside:
         return out
 
 
+def evidence_beside(found: FittedSum, components: Sequence[Component]) -> list[float]:
+    """Log evidence of each component beside the sum, of a smooth one at its best length."""
+    tried = [c.at_lengths for c in components]
+    beside = Beside(found, [columns for own in tried for columns in own])
+    each = iter(beside.evidence(slice(0, 0), beside.spans))
+    return [max(next(each) for _ in own) for own in tried]
+
+
 class Rivals:
     """What else could stand in a component's place."""
 
@@ -410,7 +420,7 @@ def _swapped(
     for _ in range(SWAPS):
         best, rivals = None, Rivals(dataset, found)
         for k, c in enumerate(found.components):
-            if c.hypothesis is None or c.settings:
+            if c.hypothesis is None or c.settings or c.given:
                 continue
             own, others = rivals.of(k)
             for key, evidence in others.items():
@@ -449,7 +459,8 @@ def completed(found: FittedSum, components: Sequence[Component]) -> FittedSum:
             for instead in (None, *(n for n in kinds if n != name and present[n])):
                 gone = [c for c in found.components if c.effect.name == instead]
                 alike = {c.family for c in gone} & {c.family for c in more}
-                if not more or (gone and not alike) or (instead is None and name not in shown):
+                alone = instead is None and name not in shown
+                if not more or alone or (gone and not alike) or any(c.given for c in gone):
                     continue
                 fitted = exchanged(found, gone, more, refit_noise=False)
                 if fitted.score > (found if better is None else better).score + GAINED:
@@ -473,8 +484,7 @@ def _kinds_that_show(found: FittedSum, away: Mapping[str, list[Component]]) -> s
     """Kinds that are in the sum at other places, or whose evidence at all of these together is more
     than what their being there costs."""
     every = [c for own in away.values() for c in own]
-    beside = Beside(found, [c.columns for c in every])
-    each = dict(zip(map(id, every), beside.evidence(slice(0, 0), beside.spans), strict=True))
+    each = dict(zip(map(id, every), evidence_beside(found, every), strict=True))
     shown = {c.effect.name for c in found.components}
     for name, own in away.items():
         gains = [each[id(c)] for c in own if each[id(c)] > 0]

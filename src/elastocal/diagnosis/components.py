@@ -66,6 +66,7 @@ class Component:
     logarithms `lengths`; they stand in the columns `repeat` times, once for each component of the
     motion.  `settings` are constants of the effect by key, `search` what finding them cost in nats;
     `follows` is what a field depends on; `fellows` at how many places there may be one of its kind.
+    One that is `given` stays in the sum: the columns of others are about it.
     """
 
     family: Family
@@ -81,6 +82,7 @@ class Component:
     hypothesis: Hypothesis | None = None
     search: float = 0.0
     fellows: int = 1
+    given: bool = False
 
     @property
     def named(self) -> bool:
@@ -105,6 +107,15 @@ class Component:
         slope = 30 / length**2 / (5 / length**2 + np.tile(self.waves.frequency, 2) ** 2)
         slope = slope - (spectrum @ slope) / spectrum.sum()
         return np.tile(spectrum, self.repeat), np.tile(slope, self.repeat)
+
+    @property
+    def at_lengths(self) -> tuple[Array, ...]:
+        """Its columns of equal prior variance; of a smooth function for some lengths."""
+        if self.waves is None:
+            return (self.columns,)
+        return tuple(
+            self.columns * np.sqrt(self.shares(v)[0]) for v in np.linspace(*self.lengths, 3)
+        )
 
 
 @dataclass(frozen=True)
@@ -490,11 +501,13 @@ def _kept(problem: SumOfComponents, at: Sizes, strict: bool) -> list[int]:
     the others may earn too little."""
     earned = problem.earned(at) - problem.pool.penalties(at.size)
     spare = earned - (problem.pool.costs_of(earned) if strict else MOST_AT_ONCE)
-    poor = spare < 0
+    stays = np.array([c.given for c in problem.components], dtype=bool)
+    poor = (spare < 0) & ~stays
     if not poor.any():
         return list(range(len(spare)))
     gone = (at.size < GONE) | ((earned < MOST_AT_ONCE) & poor)
-    gone[np.argmin(spare)] = True
+    gone[np.argmin(np.where(stays, np.inf, spare))] = True
+    gone &= ~stays
     return [k for k in range(len(spare)) if not gone[k]]
 
 

@@ -239,7 +239,8 @@ def diagnose(
         answers = _of_sum(answer_of_sum, dataset, found, tests)
     else:
         answers = _of_few(answer_of_sum, dataset, found, judged, tests)
-    there = {(f.effect, f.where) for f in answers["effects"]} if many else ()
+    added = (*answers["effects"], *answers.get("slight", ()))
+    there = {(f.effect, f.where) for f in added} if many else ()
     small = [u for u in too_small(dataset, found) if (u.effect, u.where) not in there]
     p, nothing = chance_of_noise(found, score - none if many else 0.0)
     beside = answer_of_sum.found if many else found.chosen
@@ -253,7 +254,7 @@ def diagnose(
         warnings=(*filter(None, [left_out]), *warnings(dataset, found, screened, beside.noise)),
         n_readings=dataset.blocks.n,
         n_configurations=len(dataset.blocks.member),
-        model_keys=model_keys(base.model, answers["effects"]),
+        model_keys=model_keys(base.model, added),
         model=given,
         data=source,
         calibrated=base,
@@ -328,6 +329,7 @@ def _of_sum(
         "components": answer.components,
         "groups": answer.groups,
         "fields": answer.fields,
+        "slight": answer.slight,
     }
 
 

@@ -113,8 +113,8 @@ class ComponentShare:
     "load", "move" (the last one), "time", "temperature", "pose", "tool".  `share` is what it
     adds to the mean square gap after geometry, over that, with its 90 % interval: shares sum to
     one, and that of a component which cancels a part of others may be negative.  `rms` in m, with
-    its 95 % interval.  `probability` that it is there at all; `named` where some effect of the
-    catalogue is in it.
+    its 95 % interval.  `probability` that it is there and moves the markers by a hundredth of the
+    gap's rms or more; `named` where some effect of the catalogue is in it.
     """
 
     family: str
@@ -287,8 +287,9 @@ class NoiseFloor:
     `stated_factor`: tracker noise in units of what is stated (`stated` says whether anything
     was).  `reading_sigma` (m): rms per axis of a single reading.  `repeatability` (joints,) in rad
     or m: scatter of each joint from visit to visit.  `shared`: scatter common to all visits of
-    a configuration, as a multiple of it.  `pure_error` (m): rms per axis within repeats, None
-    without repeats.  `near_repeats`: what readings at nearly the same pose differ by, None without.
+    a configuration, as a multiple of it, `shared_by_joint` (joints,) that of each joint.
+    `pure_error` (m): rms per axis within repeats, `near_repeats`: what readings at nearly the same
+    pose differ by, None without.
     """
 
     stated: bool
@@ -297,6 +298,7 @@ class NoiseFloor:
     repeatability: tuple[float, ...]
     shared: float
     pure_error: float | None
+    shared_by_joint: tuple[float, ...] = ()
     faulty: tuple[FaultyReading, ...] = ()
     near_repeats: NearRepeats | None = None
 
@@ -324,6 +326,8 @@ class Diagnosis(Result):
         components: What errors of each kind at each place contribute, where many act at once.
         groups: The same by effect, at all its places: one finding each.
         fields: Smooth corrections without a name, which explain nothing.
+        slight: Of many causes those that move the markers by less than a hundredth of the gap's
+            rms, or perhaps not at all: they correct the arm, and are no findings.
         findings: The judgements about it, the verdict first, each with its numbers and what to do.
         warnings: What to know before one relies on it, in sentences.
         n_readings: Number of readings; `n_configurations` that of configurations.
@@ -357,6 +361,7 @@ class Diagnosis(Result):
     components: tuple[ComponentShare, ...] = ()
     groups: tuple[EffectGroup, ...] = ()
     fields: tuple[FoundEffect, ...] = ()
+    slight: tuple[FoundEffect, ...] = ()
     n_readings: int = 0
     n_configurations: int = 0
     extra: ExtraPlan | None = field(default=None)
@@ -433,6 +438,9 @@ def _findings(d: Diagnosis) -> Iterator[Finding]:
         beside = "the effects named and " if d.effects else ""
         smooth = "smooth corrections for what has no name, which explain nothing: keep it"
         yield Finding("corrected_without_a_name", "care", numbers, _kept_back(beside + smooth))
+    if d.slight:
+        numbers = {"effects": tuple(f"{f.effect}:{f.where}" for f in d.slight)}
+        yield Finding("slight_causes", "note", numbers)
     if d.open and d.extra is None:
         remedy = f"{option('plan', 'extra.csv')} designs the poses that tell the rivals apart."
         yield Finding("rivals_open", "note", {}, remedy)
@@ -502,6 +510,7 @@ def publish(diagnosis: Diagnosis, model: Model, data: str) -> dict[str, Any]:
         ],
         "groups": d.groups,
         "fields": [_found(effect) for effect in d.fields],
+        "slight": [_found(effect) for effect in d.slight],
         "candidates": d.candidates,
         "indistinguishable": d.indistinguishable,
         "location": d.location and _location(d.location),
@@ -516,6 +525,7 @@ def publish(diagnosis: Diagnosis, model: Model, data: str) -> dict[str, Any]:
                 for i, (value, unit) in enumerate(zip(noise.repeatability, units, strict=True), 1)
             ],
             "shared": noise.shared,
+            "shared_by_joint": noise.shared_by_joint,
             "pure_error_um": _um(noise.pure_error),
             "near_repeat_um": near and _um(near.scatter),
             "near_repeats": near and _without(_in_um(near, "soon", "later"), "scatter"),

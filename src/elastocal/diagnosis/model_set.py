@@ -16,6 +16,7 @@ from elastocal.diagnosis.diagnosis_data import DiagnosisData
 from elastocal.diagnosis.evidence import Grams
 from elastocal.diagnosis.hypotheses import Hypothesis
 from elastocal.diagnosis.noise_floor import (
+    SHARED,
     NoiseValues,
     NoisyData,
     Projection,
@@ -184,16 +185,29 @@ def _mixed_scales(
 
 
 def refine(dataset: DiagnosisData, chosen: ModelSet, k: int) -> ModelSet:
-    """Item k's settings refined between the grid's points, at the set's noise.
+    """Item k's settings refined between the grid's points, at the set's noise; and, where its wrong
+    settings may have made joints scatter from pose to pose, at one with no more of that than usual.
+    """
+    noise = chosen.noise
+    quiet = replace(noise, shared=np.minimum(noise.shared, SHARED))
+    tried = [noise, quiet] if (noise.shared > 2 * SHARED).any() else [noise]
+    found = [refined for n in tried if (refined := _refined(dataset, chosen, k, n)) is not None]
+    return max(found, key=lambda refined: refined.score, default=chosen)
+
+
+def _refined(
+    dataset: DiagnosisData, chosen: ModelSet, k: int, noise: NoiseValues
+) -> ModelSet | None:
+    """The same at one noise; None where nothing was searched.
 
     One setting after the other; where there are several, they go round REFINED_ROUNDS times.
     """
     item = chosen.items[k]
     what = item.what
     if not what.settings:
-        return chosen
+        return None
     data = beside(dataset, chosen, k)
-    grams = Grams(dataset, data, project(data, chosen.noise))
+    grams = Grams(dataset, data, project(data, noise))
     grid = dataset.grids[what.key]
 
     def evidence(tried: Array) -> Array:
@@ -215,9 +229,9 @@ def refine(dataset: DiagnosisData, chosen: ModelSet, k: int) -> ModelSet:
                     settings = _best_along(settings, s, trial, evidence)
             searched = True
     if not searched:
-        return chosen
+        return None
     refined = replace(item, settings=settings)
-    return fit_set(dataset, (*chosen.items[:k], refined, *chosen.items[k + 1 :]), chosen.noise)
+    return fit_set(dataset, (*chosen.items[:k], refined, *chosen.items[k + 1 :]), noise)
 
 
 def _best_along(settings: Array, s: int, trial: Array, evidence: Callable[[Array], Array]) -> Array:

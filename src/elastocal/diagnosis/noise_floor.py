@@ -14,45 +14,52 @@ from elastocal.units import Array, BoolArray
 
 # The noise floor: tracker noise, repeatability of each joint, scatter common to a configuration.
 #
-#     V = a² Σ_stated + Σ_j s_j² g_j g_jᵀ ∘ (same visit + c² · same configuration)
+#     V = a² Σ_stated + Σ_j s_j² g_j g_jᵀ ∘ (same visit + c_j² · same configuration)
 #
-# with g_j = ∂(reading)/∂q_j.  a, s_j and c maximise the marginal likelihood of the residuals
+# with g_j = ∂(reading)/∂q_j.  a, s_j and c_j maximise the marginal likelihood of the residuals
 # (below) times priors that keep what the data do not show near its usual size.
 
 # Logarithms' prior standard deviations.  Stated tracker noise is rarely wrong by more than 1.6
 # times; a joint repeats to some 5 µrad on a heavy arm and to 50 on a light one; the joints of an
-# arm differ by a factor of two.
+# arm differ by a factor of two.  What a joint does at a configuration, whenever it comes there, is
+# mostly an error of its angle that is not modelled yet: that of one says nothing of another's.
 STATED_SPREAD, UNSTATED_SPREAD = 0.5, 3.0
 REPEATABILITY, REPEATABILITY_SPREAD = 8e-6, 1.5
 JOINT_SPREAD = 0.7
-SHARED, SHARED_SPREAD = 0.2, 1.2
+SHARED, SHARED_SPREAD = 0.2, 1.5
 SMALLEST_NOISE, LARGEST = 1e-9, 2e-2  # rad or m: a joint that is exact
 
 
 @dataclass(frozen=True)
 class NoiseValues:
-    """`factor` a of the stated noise, `joint` s (joints,) in rad or m, `shared` c."""
+    """`factor` a of the stated noise, `joint` s (joints,) in rad or m, `shared` c (joints,)."""
 
     factor: float
     joint: Array
-    shared: float
+    shared: Array
 
     @classmethod
     def usual(cls, joints: int) -> NoiseValues:
         """What one expects before any reading: noise as stated, joints as good as usual."""
-        return cls(1.0, np.full(joints, REPEATABILITY), SHARED)
+        return cls(1.0, np.full(joints, REPEATABILITY), np.full(joints, SHARED))
 
     def of_instrument(self) -> NoiseValues:
         """The instrument's part alone: joints that repeat exactly."""
-        return NoiseValues(self.factor, np.full(len(self.joint), SMALLEST_NOISE), SHARED)
+        exact = np.full_like(self.joint, SMALLEST_NOISE)
+        return replace(self, joint=exact, shared=np.full_like(exact, SHARED))
+
+    @property
+    def shared_by_all(self) -> float:
+        """c of all joints together: rms of what a configuration has over that of a visit."""
+        return float(np.linalg.norm(self.shared * self.joint) / np.linalg.norm(self.joint))
 
     def logs(self) -> Array:
-        return np.log(np.concatenate([[self.factor, self.shared], self.joint]))
+        return np.log(np.concatenate([[self.factor], self.shared, self.joint]))
 
     @classmethod
     def of_logs(cls, theta: Array) -> NoiseValues:
-        v = np.exp(theta)
-        return cls(float(v[0]), v[2:], float(v[1]))
+        factor, values = float(np.exp(theta[0])), np.exp(theta[1:])
+        return cls(factor, values[len(values) // 2 :], values[: len(values) // 2])
 
 
 @dataclass(frozen=True)
@@ -135,8 +142,10 @@ class Counting:
 def covariance(data: NoisyData, noise: NoiseValues) -> Array:
     """V (C, m, m); rows left out have unit variance of their own."""
     of = data.counting
-    V = (of.G * noise.joint**2) @ of.G.transpose(0, 2, 1)
-    V *= data.same_visit + noise.shared**2
+    back = of.G.transpose(0, 2, 1)
+    V = (of.G * noise.joint**2) @ back
+    V *= data.same_visit
+    V += (of.G * (noise.joint * noise.shared) ** 2) @ back
     V += noise.factor**2 * of.covariance
     m = np.arange(V.shape[1])
     V[:, m, m] += data.left_out
@@ -148,17 +157,18 @@ def log_prior(stated: bool, noise: NoiseValues) -> tuple[float, Array]:
 
     The joints' logarithms have a common mean that is itself uncertain.
     """
-    theta = noise.logs()
+    theta, n = noise.logs(), len(noise.joint)
     spread = STATED_SPREAD if stated else UNSTATED_SPREAD
-    z = np.array([theta[0] / spread, (theta[1] - np.log(SHARED)) / SHARED_SPREAD])
-    slope = np.zeros_like(theta)
-    slope[:2] = 2 * z / np.array([spread, SHARED_SPREAD])
-    joints = theta[2:]
-    n = len(joints)
-    inverse = np.linalg.inv(JOINT_SPREAD**2 * np.eye(n) + REPEATABILITY_SPREAD**2)
-    off = joints - np.log(REPEATABILITY)
-    slope[2:] = 2 * inverse @ off
-    return float(z @ z + off @ inverse @ off), slope
+    value, slope = float(theta[0] / spread) ** 2, np.empty_like(theta)
+    slope[0] = 2 * theta[0] / spread**2
+    for own, usual, apart, common in (
+        (slice(1, 1 + n), SHARED, SHARED_SPREAD, 0.0),
+        (slice(1 + n, None), REPEATABILITY, JOINT_SPREAD, REPEATABILITY_SPREAD),
+    ):
+        off = theta[own] - np.log(usual)
+        scaled = np.linalg.solve(apart**2 * np.eye(n) + common**2, off)
+        value, slope[own] = value + float(off @ scaled), 2 * scaled
+    return value, slope
 
 
 # Data under one noise: what is left of the residual, and how probable the noise is.
@@ -284,7 +294,7 @@ def posterior(data: NoisyData, noise: NoiseValues) -> float:
 
 
 def likelihood(data: NoisyData, noise: NoiseValues) -> tuple[float, Array]:
-    """−2 log of marginal likelihood times prior, and its slope in the logarithms (2 + joints,).
+    """−2 log of marginal likelihood times prior, and its slope in the logarithms (1 + 2 joints,).
 
     The slope wants gᵀQg, Q = P − uuᵀ, of the joints' columns g in every visit and configuration:
     with g̃ = K⁻¹g and ẽ = K⁻¹(r − Xβ̂) it is g̃ᵀg̃ − |L⁻¹X̃ᵀg̃|² − (g̃ᵀẽ)².  What is left of V is
@@ -307,10 +317,10 @@ def likelihood(data: NoisyData, noise: NoiseValues) -> tuple[float, Array]:
         by_block += sign * np.einsum("cjk,cjk->j", together, together)
     inverse = linalg.solve_triangular(L, np.eye(len(L)), lower=True, check_finite=False)
     fitted = len(L) - float((inverse**2 @ at.prior(data.precision)).sum())
-    slope = np.empty(2 + J)
-    slope[1] = 2 * noise.shared**2 * float(by_block @ noise.joint**2)
-    slope[2:] = 2 * noise.joint**2 * (by_visit + noise.shared**2 * by_block)
-    slope[0] = 2 * (data.n_rows - fitted - float(np.vdot(e, e))) - slope[2:].sum()
+    of_shared = 2 * (noise.joint * noise.shared) ** 2 * by_block
+    of_joint = 2 * noise.joint**2 * by_visit + of_shared
+    whole = 2 * (data.n_rows - fitted - float(np.vdot(e, e)))
+    slope = np.concatenate([[whole - of_joint.sum()], of_shared, of_joint])
     prior, prior_slope = log_prior(data.stated, noise)
     return -2 * marginal + prior, slope + prior_slope
 
@@ -347,31 +357,35 @@ def balanced(data: NoisyData) -> NoiseValues:
     shape = float(np.diagonal(data.covariance, axis1=1, axis2=2)[used].mean())
     moved = np.maximum((data.G[used] ** 2).mean(axis=0), 1e-300)
     joint = np.clip(np.sqrt(0.5 * square / (len(moved) * moved)), SMALLEST_NOISE, LARGEST)
-    return NoiseValues(float(np.sqrt(0.5 * square / shape)), joint, SHARED)
+    return NoiseValues(float(np.sqrt(0.5 * square / shape)), joint, np.full_like(joint, SHARED))
 
 
 def _climbed(data: NoisyData, start: NoiseValues, enough: float) -> NoiseValues:
     n = data.G.shape[2]
+    # Roughly the roots of −2ℓ's curvatures: a first step along its slope else is one of the factor.
+    curved = np.sqrt([3 * data.n_rows, *[len(data.r) / 9] * n, *[len(data.r)] * n])
     known: dict[bytes, tuple[float, Array]] = {}
 
-    def cost(theta: Array) -> tuple[float, Array]:
+    def cost(scaled: Array) -> tuple[float, Array]:
         # A search begins where it has been: at the start, and where the last stride ended.
-        key = theta.tobytes()
+        key = scaled.tobytes()
         if key not in known:
-            known[key] = likelihood(data, NoiseValues.of_logs(theta))
+            value, slope = likelihood(data, NoiseValues.of_logs(scaled / curved))
+            known[key] = value, slope / curved
         value, slope = known[key]
         return value, slope.copy()
 
     spread = STATED_SPREAD if data.stated else UNSTATED_SPREAD
-    lower = np.array([-4 * spread, -5.0] + [np.log(SMALLEST_NOISE)] * n)
-    upper = np.array([4 * spread, 2.0] + [np.log(LARGEST)] * n)
-    theta = np.clip(start.logs(), lower, upper)
+    lower = curved * np.array([-4 * spread, *[-5.0] * n, *[np.log(SMALLEST_NOISE)] * n])
+    upper = curved * np.array([4 * spread, *[5.0] * n, *[np.log(LARGEST)] * n])
+    theta = np.clip(curved * start.logs(), lower, upper)
     ftol = enough / max(abs(cost(theta)[0]), 1.0)
     # Step by step: one long stride of the line search ends where V is singular to rounding.
     # A round ends at the first small gain, often that of a poor first direction: the search is
     # over when a whole round gains nothing.
     for _ in range(ROUNDS):
-        low, high = np.maximum(lower, theta - STRIDE), np.minimum(upper, theta + STRIDE)
+        stride = STRIDE * curved
+        low, high = np.maximum(lower, theta - stride), np.minimum(upper, theta + stride)
         found = optimize.minimize(
             cost, theta, jac=True, method="L-BFGS-B", bounds=list(zip(low, high, strict=True)),
             options={"maxiter": 60, "ftol": ftol, "gtol": LEVEL * enough / ENOUGH},
@@ -380,7 +394,7 @@ def _climbed(data: NoisyData, start: NoiseValues, enough: float) -> NoiseValues:
         inside = (theta > low) & (theta < high) | (theta == lower) | (theta == upper)
         if inside.all() and gain < enough:
             break
-    return NoiseValues.of_logs(theta)
+    return NoiseValues.of_logs(theta / curved)
 
 
 # What the noise may be instead: draws about its most probable values.
@@ -412,7 +426,8 @@ def noise_draws(
     root = vectors * np.sqrt(2 / np.maximum(values, FLATTEST))
     z = rng.normal(size=(TRIED * n, k))
     drawn = theta + z @ root.T
-    drawn[:, 2:] = np.clip(drawn[:, 2:], np.log(SMALLEST_NOISE), np.log(LARGEST))
+    joints = slice(1 + len(noise.joint), None)
+    drawn[:, joints] = np.clip(drawn[:, joints], np.log(SMALLEST_NOISE), np.log(LARGEST))
     minus_two = np.array([posterior(data, NoiseValues.of_logs(t)) for t in drawn])
     log_weight = -0.5 * minus_two + 0.5 * (z**2).sum(axis=1)
     weight = np.exp(log_weight - log_weight.max())

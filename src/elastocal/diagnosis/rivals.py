@@ -39,7 +39,8 @@ def as_diagnosed(dataset: DiagnosisData, diagnosis: Diagnosis) -> tuple[Diagnosi
     found = diagnosis.noise
     faulty = np.isin(dataset.table.row[dataset.lead], [f.line for f in found.faulty])
     joint = np.maximum(found.repeatability, SMALLEST_NOISE)
-    return dataset.without(faulty), NoiseValues(found.stated_factor, joint, found.shared)
+    shared = np.array(found.shared_by_joint or [found.shared] * len(joint))
+    return dataset.without(faulty), NoiseValues(found.stated_factor, joint, shared)
 
 
 # Who the rivals are: the named sets of an ambiguous verdict, or what an unknown effect may be.

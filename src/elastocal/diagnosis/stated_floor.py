@@ -22,8 +22,9 @@ def noise_floor(dataset: DiagnosisData, data: NoisyData, noise: NoiseValues) -> 
     variance = np.diagonal(data.covariance, axis1=1, axis2=2)[used]
     return NoiseFloor(
         data.stated, noise.factor, float(noise.factor * np.sqrt(variance.mean())),
-        tuple(float(s) for s in noise.joint), noise.shared, pure_error(dataset),
-        describe_faulty(dataset, data, noise), near_repeats(dataset, data, project(data, noise)),
+        tuple(noise.joint.tolist()), noise.shared_by_all, pure_error(dataset),
+        tuple(noise.shared.tolist()), describe_faulty(dataset, data, noise),
+        near_repeats(dataset, data, project(data, noise)),
     )  # fmt: skip
 
 

@@ -195,6 +195,16 @@ def assumed_order(d: Diagnosis) -> str:
     )
 
 
+def slight_text(d: Diagnosis) -> str:
+    """What is in the model and no finding; nothing where all matters."""
+    if not d.slight:
+        return ""
+    return (
+        f"{added_text(d.slight)}: each probably moves the markers by less than a hundredth of the "
+        "gap, if it is there at all. They correct the arm, and are no findings."
+    )
+
+
 # Corrections that have no name.
 
 

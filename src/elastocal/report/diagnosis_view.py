@@ -29,6 +29,7 @@ from elastocal.report.causes_view import (
     headline_of_causes,
     place_rows,
     share_text,
+    slight_text,
 )
 from elastocal.report.effect_names import (
     STAGES,
@@ -496,6 +497,7 @@ def diagnosis_contents(d: Diagnosis, kinds: tuple[str, ...]) -> dict[str, Any]:
         "parameters": added_parameter_rows(d),
         "candidates": hypothesis_rows(d, MOST_CANDIDATES),
         "n_candidates": len(d.candidates),
+        "slight": slight_text(d),
         "alike": [capital(text) for text in alike(d)],
         "structure": structure_rows(d, MOST_TESTS),
         "n_structure": len(d.structure),

@@ -17,7 +17,7 @@ from elastocal.errors import option
 from elastocal.identification.findings import ALONE
 from elastocal.identification.result import Calibration
 from elastocal.planning.plan import Plan
-from elastocal.report.causes_view import cause_rows, field_rows, place_rows
+from elastocal.report.causes_view import cause_rows, field_rows, place_rows, slight_text
 from elastocal.report.changes_view import change_rows, changes_lines
 from elastocal.report.diagnosis_view import (
     added_parameter_rows,
@@ -323,6 +323,7 @@ def print_diagnosis(console: Console, d: Diagnosis, kinds: Sequence[str] = ()) -
             console.print(table_of(title, table))
     console.print()
     lines = [("Alike here", f"{text}: these data cannot tell them apart.") for text in alike(d)]
+    lines += [("Slight", text)] if (text := slight_text(d)) else []
     lines += [("Noise", text) for text in noise_floor_lines(d.noise, kinds)]
     lines += [("Next", text) for text in diagnosis_steps(d)]
     print_told(console, [*lines, *(("Warning", printable(text)) for text in d.warnings)])

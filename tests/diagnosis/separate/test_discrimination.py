@@ -47,7 +47,7 @@ FITTED = ("base_frame", "joint_offset", "marker_position")
 RIVALS = (("gear_eccentricity", "joint3"), ("encoder_scale", "joint3"), ("joint_drift", "joint2"))
 TIME_CONSTANT = 1800.0
 SIGMA = 20e-6
-NOISE = NoiseValues(1.3, np.linspace(4e-6, 9e-6, 6), 0.5)
+NOISE = NoiseValues(1.3, np.linspace(4e-6, 9e-6, 6), np.linspace(0.2, 0.9, 6))
 CHOSEN = (4, 1, 7)
 PROBABILITY = np.array([0.5, 0.3, 0.2])
 
@@ -83,7 +83,8 @@ def discrimination(base: Baseline, pool: VisitPool) -> Discrimination:
     known = {(h.name, h.where): h for h in possible(base.model, base.observed.table)[0]}
     settings = [[], [], [TIME_CONSTANT]]
     items = [Item(known[k], np.array(s), 0.0) for k, s in zip(RIVALS, settings, strict=True)]
-    found = NoiseFloor(True, NOISE.factor, SIGMA, tuple(NOISE.joint), NOISE.shared, None)
+    joints = tuple(NOISE.joint), 0.5, None, tuple(NOISE.shared)
+    found = NoiseFloor(True, NOISE.factor, SIGMA, *joints)
     diagnosis = type("Found", (), {"noise": found})
     whole = campaign_of(base, pool, [known[k] for k in RIVALS], diagnosis)  # type: ignore
     rivals = RivalSet.of(items, list(PROBABILITY), [])
@@ -116,7 +117,7 @@ def dense_distance(base: Baseline, table: Measurements, a: int, b: int, size: Ar
         moved = [replace(table, q=table.q + s * step * np.eye(6)[j]) for s in (1, -1)]
         g = (whole.predict(moved[0], x) - whole.predict(moved[1], x)) / (2 * step)
         same = np.repeat(table.configuration, 3)
-        shared = (same[:, None] == same[None, :]) * (1 + NOISE.shared**2)
+        shared = (same[:, None] == same[None, :]) * (1 + NOISE.shared[j] ** 2)
         V += NOISE.joint[j] ** 2 * np.outer(g, g) * shared
     L = np.linalg.cholesky(V)
     white = np.linalg.solve(L, np.column_stack([Z, signal]))
@@ -230,7 +231,8 @@ def test_a_rival_with_settings_imitates_by_its_best_ones(base, pool, discriminat
     """A drift of 1800 s is imitated by the same drift, whatever constant was found for it."""
     drift = discrimination.rivals.rivals[2]
     quick = replace(drift, settings=np.array([700.0]))
-    found = NoiseFloor(True, NOISE.factor, SIGMA, tuple(NOISE.joint), NOISE.shared, None)
+    joints = tuple(NOISE.joint), 0.5, None, tuple(NOISE.shared)
+    found = NoiseFloor(True, NOISE.factor, SIGMA, *joints)
     whole = campaign_of(base, pool, [drift.what], type("Found", (), {"noise": found}))
     rivals = RivalSet.of([drift, quick], [0.5, 0.5], [])
     drifts = alternatives(whole.so_far, NOISE, rivals)[1]

@@ -34,7 +34,7 @@ def log_evidence(model: Model, table: Measurements, x0: Array, key: Key) -> floa
     h = next(h for h in possible(model, table)[0] if (h.name, h.where) == key)
     base = fit_baseline(model, table, x0=x0)
     dataset = diagnosis_data_of(base, [h])
-    at = project(dataset.data, NoiseValues(1.0, np.full(6, REPEATABILITY), 1e-3))
+    at = project(dataset.data, NoiseValues(1.0, np.full(6, REPEATABILITY), np.full(6, 1e-3)))
     return float(direct(dataset.data.masked(dataset.packed(h, np.zeros(0))), at).evidence()[0])
 
 
