@@ -7,7 +7,7 @@ from functools import cached_property
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy import linalg, stats
+from scipy import linalg, special
 
 from elastocal.errors import ElastocalError, InsufficientDataError
 from elastocal.identification.least_squares import Fit, FitProblem, fit
@@ -278,7 +278,9 @@ def fits_better(narrow: Fit, wide: Fit) -> bool:
     """
     before, after = (float(found.whitened @ found.whitened) for found in (narrow, wide))
     more, dof = len(wide.columns) - len(narrow.columns), len(wide.whitened) - len(wide.columns)
-    return before - after > stats.f.isf(CHANCE, more, max(dof, 1)) * after * more / max(dof, 1)
+    return before - after > special.fdtri(more, max(dof, 1), 1 - CHANCE) * after * more / max(
+        dof, 1
+    )
 
 
 def prefer_wider(

@@ -445,7 +445,8 @@ def next_lines(found: NextPoses) -> list[tuple[str, str]]:
     lines.append(
         (
             "Gain",
-            f"{n} lower the rms error at the test poses from {both(g.before, g.after)}; were the "
+            f"{n} lower the rms error at the test poses, all that is in doubt counted at once, "
+            f"from {both(g.before, g.after)}; were the "
             f"model right, from {both(g.model_before, g.model_after)}.",
         )
     )
