@@ -8,7 +8,7 @@ from dataclasses import dataclass
 
 from elastocal.identification.findings import next_steps
 from elastocal.identification.result import Calibration, Finding
-from elastocal.report.formatting import Tone, display, length, significant
+from elastocal.report.formatting import Tone, counted, display, length, significant
 from elastocal.text import listed, printable
 
 # Sections of the page, by the finding they tell of, and the words that they are named after.
@@ -111,9 +111,9 @@ DOUBTS: dict[str, Callable[[Finding], str]] = {
     "unheard_of": lambda f: _unheard_of(f),
     "little_gain": lambda f: "that is hardly better than the nominal arm",
     "few_configurations": lambda f: (
-        f"{f.numbers['configurations']} configurations leave {f.numbers['equations_left']} "
-        f"equations beyond {f.numbers['parameters']} parameters, too few to judge by (needed: "
-        f"{f.numbers['needed']})"
+        f"in {counted(int(str(f.numbers['configurations'])), 'configuration')} there are only "
+        f"{f.numbers['equations_left']} equations beyond {f.numbers['parameters']} parameters, too "
+        f"few to judge by (needed: {f.numbers['needed']})"
     ),
     "noise_unknown": lambda f: (
         "nothing says how large the noise is (no stated noise, no repeats), so the residual may "
