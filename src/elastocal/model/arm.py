@@ -242,6 +242,9 @@ def _one(arm: Arm, table: Measurements, name: str, marker: NDArray) -> NDArray:
         return _one_hot(marker, len(arm.markers))
     if name.startswith("level:"):
         return _levels(arm, table, name.removeprefix("level:"))
+    if name == "unmoved":
+        known = np.ones_like(table.q) if table.direction is None else table.direction
+        return (known == 0).astype(np.float64)
     if name in ("move", "direction") and getattr(table, name) is None:
         table = with_moves(table)
     value = getattr(table, name)

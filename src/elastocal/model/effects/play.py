@@ -31,6 +31,11 @@ def came_from(arm: Arm) -> ca.SX:
     return arm.input("direction" if ordered else "approach", arm.chain.n_joints)
 
 
+def unmoved(arm: Arm) -> ca.SX:
+    """1 (n,) where a joint has not moved yet in the campaign, else 0; 0 at all other poses."""
+    return arm.input("unmoved", arm.chain.n_joints)
+
+
 class Backlash(TorqueEffect):
     """δq = (β/2) tanh(τ/τ_s): the joint rests at the end of its play that the load τ drives it to.
 
@@ -132,9 +137,9 @@ class MoveLag(DrivenEffect):
     def drive(self, arm: Arm, place: str, p: Symbols) -> ca.SX:
         move = arm.input("move", arm.chain.n_joints)
         own = move[index(place)]
-        longest = ca.mmax(ca.fabs(move))
-        moved = p["move_lag"] * own / (longest + NEVER) + p["move_lag_sign"] * ca.sign(own)
-        return moved + p["move_lag_first"] * (longest < NEVER)
+        longest = ca.mmax(ca.fabs(move)) + NEVER
+        moved = p["move_lag"] * own / longest + p["move_lag_sign"] * ca.sign(own)
+        return moved + p["move_lag_first"] * unmoved(arm)[index(place)]
 
 
 class MoveHysteresis(DrivenEffect):
@@ -159,4 +164,4 @@ class MoveHysteresis(DrivenEffect):
 
     def drive(self, arm: Arm, place: str, p: Symbols) -> ca.SX:
         side = arm.input("direction", arm.chain.n_joints)[index(place)]
-        return p["move_hysteresis"] * side + p["move_hysteresis_first"] * (side == 0)
+        return p["move_hysteresis"] * side + p["move_hysteresis_first"] * unmoved(arm)[index(place)]
