@@ -20,7 +20,7 @@ from support.cells import COMPENSATOR, COMPLIANCE, MARKERS, kr270_cell, kr270_ch
 from support.robots import random_chain_urdf
 
 from elastocal.cell.arm_description import Nominal
-from elastocal.measurements import Measurements
+from elastocal.measurements import Measurements, with_moves
 from elastocal.model import Model, observe, read_urdf
 from elastocal.model.effects import CATALOGUE
 from elastocal.model.observations import COMPONENTS
@@ -104,7 +104,7 @@ def with_everything(observed: str, deflection_model: str) -> Model:
 @lru_cache
 def everything(observed: str, deflection_model: str, disturbed: bool = True) -> Case:
     """All effects together, so that each acts on the others' derivatives."""
-    table = random_table(kr270_chain(), 4, seed=3)
+    table = with_moves(random_table(kr270_chain(), 4, seed=3))
     return case(with_everything(observed, deflection_model), table, disturbed)
 
 
