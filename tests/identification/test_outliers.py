@@ -1,6 +1,8 @@
 """Faulty readings: none invented, the gross ones found, nothing dropped in silence."""
 
+import importlib
 from dataclasses import replace
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
@@ -20,10 +22,12 @@ from support.cells import random_poses
 
 from elastocal.identification import Options, blocks, least_trimmed_squares, majority
 from elastocal.identification.identify import identify
+from elastocal.identification.mistakes import UNHEARD
 from elastocal.identification.outliers import FALSE_ALARM
 from elastocal.identification.robust_core import median_scale
 from elastocal.model import Model
 
+module = importlib.import_module("elastocal.identification.identify")
 SIGMA = 5e-5
 
 
@@ -266,3 +270,30 @@ def test_blocks_of_lines():
     assert blocks([9, 2, 3, 4, 20, 23]) == [(2, 4), (9, 9), (20, 23)]
     assert blocks([2, 6], gap=3) == [(2, 2), (6, 6)]
     assert blocks([2, 5, 8], gap=3) == [(2, 8)]
+
+
+@pytest.mark.parametrize("sure", [True, False])
+def test_readings_are_taken_back_for_a_value_no_arm_has_but_not_for_one_hardly_determined(
+    monkeypatch, sure
+):
+    model = Model.assembled(planar_chain(), cell_of(GEOMETRY))
+    k = next(i for i, p in enumerate(model.parameters) if p.effect == "joint_offset")
+    size = model.parameters[k].typical
+    far = model.nominal.copy()
+    far[k] += 1.1 * UNHEARD * size
+    std = (0.01 if sure else 1.0) * size
+
+    def fitted(x):
+        reduction = SimpleNamespace(kept=np.array([k]))
+        covariance = SimpleNamespace(std=np.array([std]))
+        return SimpleNamespace(
+            solution=SimpleNamespace(fit=SimpleNamespace(x=x), reduction=reduction),
+            intervals=SimpleNamespace(covariance=covariance),
+        )
+
+    set_apart, all_of_them = fitted(far), fitted(model.nominal)
+    monkeypatch.setattr(module, "run_method", lambda *given: all_of_them)
+    every = SimpleNamespace(problem=SimpleNamespace(model=model))
+    given = (every, None, None, None, Options(), lambda text: None)
+    kept = module._kept_where_sensible(set_apart, *given)
+    assert kept is (all_of_them if sure else set_apart)

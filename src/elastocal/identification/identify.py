@@ -110,21 +110,28 @@ def identify(
     return judged(replace(result, test=_test_errors(model, result, test)))
 
 
+CHANCE = 3.0  # standard deviations that a value may be off by
+
+
 def _kept_where_sensible(
     found: MethodResult, every: Solution, sound: Solution,
     faulty: NDArray[np.bool_], refit: Refit, options: Options, progress: Progress,
 ) -> MethodResult:  # fmt: skip
     """The result with all readings, where setting some apart leaves values that no arm has and
-    keeping them does not: then an effect is missing, and those readings show it."""
-    model = every.problem.model
-    if not unheard_of(model, found.solution.fit.x):
+    keeping them does not: then an effect is missing, and those readings show it.  A value that is
+    hardly determined, and so far out by chance alone, shows nothing."""
+    model, kept = every.problem.model, found.solution.reduction.kept
+    nearest = found.solution.fit.x.copy()
+    reach = CHANCE * found.intervals.covariance.std
+    nearest[kept] -= np.clip(nearest[kept] - model.nominal[kept], -reach, reach)
+    if not unheard_of(model, nearest):
         return found
     progress("fitting all readings: without some, the values are none of an arm")
     try:
-        kept = run_method(every, sound, faulty, refit, replace(options, faulty="keep"), progress)
+        whole = run_method(every, sound, faulty, refit, replace(options, faulty="keep"), progress)
     except (ElastocalError, np.linalg.LinAlgError):
         return found
-    return found if unheard_of(model, kept.solution.fit.x) else kept
+    return found if unheard_of(model, whole.solution.fit.x) else whole
 
 
 def _without(options: Options, left_out: NDArray[np.bool_], size: int) -> Options:
