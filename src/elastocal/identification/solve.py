@@ -57,7 +57,8 @@ class Reduction:
     The data determine β_k = X_k + Σ_d mixing[k, d] X_d, the kept parameter with what it stands
     for.  `invisible` are dropped parameters that move no reading at all,
     `at_bound` those that a bounded fit holds at their bound, `with_prior` those that were no part
-    of this choice: a prior makes up for what the readings do not say of them.
+    of this choice: a prior makes up for what the readings do not say of them.  `threshold`: what
+    it takes to be kept (`reduce`).
     """
 
     kept: NDArray[np.int64]
@@ -66,6 +67,7 @@ class Reduction:
     invisible: NDArray[np.int64]
     at_bound: NDArray[np.int64] = field(default_factory=lambda: np.zeros(0, dtype=np.int64))
     with_prior: NDArray[np.int64] = field(default_factory=lambda: np.zeros(0, dtype=np.int64))
+    threshold: float = 0.0
 
     def seen(self, free: IntArray, R: Array, sizes: Array) -> Reduction:
         """Without the kept parameters that move nothing any more, R (…, free) being that of the
@@ -146,7 +148,7 @@ def reduce(
         mixing = scaled * sizes[kept][:, None] / sizes[dropped][None, :]
     unseen = np.array([d for d in dropped if not visible[d]], dtype=np.int64)
     return Reduction(np.array(kept, dtype=np.int64), np.array(dropped, dtype=np.int64),
-                     mixing, unseen)  # fmt: skip
+                     mixing, unseen, threshold=threshold)  # fmt: skip
 
 
 def _groups(parameters: tuple[Parameter, ...]) -> list[list[int]]:
@@ -222,7 +224,16 @@ def choose(
             f"{observed.table.source}: the readings do not depend on any parameter of the model; "
             "measure other poses or loads, or choose other effects"
         )
-    return Reduction(free[local.kept], free[local.dropped], local.mixing, free[local.invisible])
+    return replace(
+        local, kept=free[local.kept], dropped=free[local.dropped], invisible=free[local.invisible]
+    )
+
+
+def chosen_again(solution: Solution) -> Reduction:
+    """The choice by the weights and at the values that the solution has come to."""
+    problem, found = solution.problem, solution.fit
+    sigma, threshold = residual_sigma(found, len(found.columns)), solution.reduction.threshold
+    return choose(problem, solution.sizes, free_r_factor(problem, found), sigma, threshold)
 
 
 def fit_kept(
