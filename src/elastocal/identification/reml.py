@@ -56,7 +56,7 @@ class Stack:
 def stacks(structure: Structure, shared: tuple[SharedEffect, ...]) -> list[Stack]:
     """The clusters of a structure: a configuration where effects are shared, else a set."""
     sets = structure.sets
-    label = sets.configuration if shared else np.arange(len(sets))
+    label = sets.configuration if shared or structure.faster else np.arange(len(sets))
     _, cluster, count = np.unique(label, return_inverse=True, return_counts=True)
     order = np.argsort(cluster, kind="stable")
     starts = np.concatenate([[0], np.cumsum(count)[:-1]])
@@ -64,7 +64,8 @@ def stacks(structure: Structure, shared: tuple[SharedEffect, ...]) -> list[Stack
     size, p = sets.e.shape[1], sets.B.shape[2]
     for m in np.unique(count):
         groups = np.flatnonzero(count == m)
-        n, parts = int(m) * size, structure.index.shape[1] * int(m) + len(shared)
+        more = len(shared) + len(structure.faster)
+        n, parts = int(m) * size, structure.index.shape[1] * int(m) + more
         step = max(1, MOST_NUMBERS // (parts * n * (n + p) + parts * p * p))
         for first in range(0, len(groups), step):
             members = order[starts[groups[first : first + step], None] + np.arange(m)]
@@ -78,10 +79,12 @@ def _stack(structure: Structure, shared: tuple[SharedEffect, ...], members: IntA
     size, p = sets.e.shape[1], sets.B.shape[2]
     index, part = _own(structure, members)
     n_own = len(structure.names)
-    for k, effect in enumerate(shared):
+    # What is left of a course has its variances, which are the last of the structure's.
+    first = n_own - len(structure.faster)
+    for k, effect in enumerate((*structure.faster, *shared), first):
         block = effect.product(members, effect, members)
         part = np.concatenate([part, block.reshape(G, 1, m * size, m * size)], axis=1)
-        index = np.concatenate([index, np.full((G, 1), n_own + k)], axis=1)
+        index = np.concatenate([index, np.full((G, 1), k)], axis=1)
     B = sets.B[members].reshape(G, m * size, p)
     e = sets.e[members].reshape(G, m * size)
     return Stack(members, B, e, index, part, n_own + len(shared))
@@ -331,6 +334,13 @@ class Reml:
     @property
     def common(self) -> Array:
         return self.state.theta[len(self.structure.names) :]
+
+    @property
+    def deviations(self) -> list[tuple[SharedEffect, float]]:
+        """All that readings share beside the waves of a course, and its variance."""
+        effects = (*self.structure.faster, *self.shared)
+        values = self.state.theta[len(self.state.theta) - len(effects) :]
+        return list(zip(effects, values.tolist(), strict=True))
 
 
 def reml(
