@@ -630,20 +630,19 @@ def kenward_roger(fit: Reml, combinations: Array | None = None) -> tuple[Array, 
 def mean_covariance(fits: list[Reml], T: Array, like: Covariance) -> Covariance:
     """Σ = Σ_m w_m Σ_m of the parameters T (p, p) times those of the `fits`, which come first there.
 
-    w_m ∝ the restricted likelihoods.  The variances v_m differ most for base and tracker: degrees
-    of freedom are Satterthwaite's 2 v²/var, var = Σ_m w_m (2 v_m²/f_m + (v_m − v)²).
+    w_m ∝ the restricted likelihoods.  To what the degrees of freedom f_m leave unknown,
+    Σ_m w_m/f_m, comes what the models differ by (`Covariance.tails`), most for base and tracker.
     """
     level = np.array([fit.log_likelihood for fit in fits])
     weight = np.exp(level - level.max()) / np.exp(level - level.max()).sum()
     rows = [np.pad(T, ((0, 0), (0, len(fit.state.x) - len(T)))) for fit in fits]
     found = [kenward_roger(fit, own) for fit, own in zip(fits, rows, strict=True)]
     matrices, dof = (np.array(part) for part in zip(*found, strict=True))
-    matrix, each = np.tensordot(weight, matrices, 1), np.diagonal(matrices, axis1=1, axis2=2)
-    v = np.diag(matrix)
-    spread = weight @ (2 * each**2 / dof + (each - v) ** 2)
-    mean = np.divide(2 * v**2, spread, out=np.full(len(v), np.inf), where=spread > 0)
     among = tuple(zip(weight.tolist(), matrices, strict=True))
-    return replace(like, matrix=matrix, dof=mean, among=among)
+    mean = replace(like, matrix=np.tensordot(weight, matrices, 1), among=among)
+    between = 1 / replace(mean, dof=np.full(len(T), np.inf)).tails(np.eye(len(T))[:, None])[0]
+    left = weight @ (1 / dof) + between
+    return replace(mean, dof=np.divide(1, left, out=np.full(len(left), np.inf), where=left > 0))
 
 
 # Many variances from few readings each: shrink their logarithms towards one another.
