@@ -62,8 +62,8 @@ def _adapted(
     `every` holds all observations, `sound` the fit to those that are not `faulty` (N,) at equal or
     stated weights.  At its values readings are screened, noise model and faulty readings settled
     (`noise_choice.settle`) and the kept parameters fitted anew with the weights found, until
-    neither changes nor more parameters show under these weights.  Where other readings turn out good than `sound` was fitted to, its parameters
-    are chosen again for these.
+    neither changes nor more parameters show under these weights.  Where other readings turn out
+    good than `sound` was fitted to, its parameters are chosen again for these.
     """
     start, good = sound, ~faulty
     for _ in range(RESTARTS):

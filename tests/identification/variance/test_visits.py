@@ -10,7 +10,7 @@ from elastocal.errors import InputError
 from elastocal.identification import Readings, estimate_noise, kenward_roger
 from elastocal.identification.noise_choice import NoiseFit, time_blocks, weights_of
 from elastocal.identification.residuals import as_of_another_campaign, held_out_residual
-from elastocal.identification.visit_record import VisitRecord, course_waves
+from elastocal.identification.visit_record import VisitRecord
 
 SIGMA, SCATTER, DRIFT, LASTING = 2e-5, 2e-5, 4e-5, 0.2
 
