@@ -98,8 +98,9 @@ def _settled(
         moved = np.abs(solution.fit.x[kept] - expected) / noise.covariance.std
         if moved.max(initial=0.0) < SETTLED and np.array_equal(now, before):
             # Weights that make light of what is noisy may show more than those of the first fit.
-            more = chosen_again(solution)
-            if not left or len(more.kept) <= len(kept):
+            other = noise.kind not in FIRST and left > 0
+            more = chosen_again(solution) if other else start.reduction
+            if len(more.kept) <= len(kept):
                 break
             start, kept = replace(start, reduction=more), more.kept
             readings = _linearised(model, observed, solution.fit.x, kept, kind)
@@ -110,6 +111,7 @@ def _settled(
     return solution, final, now
 
 
+FIRST = ("independent", "stated")  # noise whose weights are those of the first fit
 OF_READINGS = "auto, of readings"  # the best noise model but those that know the arm's visits
 
 
