@@ -216,8 +216,10 @@ class VisitTimes:
     def price(self, tour: list[int]) -> float:
         """What annealing makes small: bias beyond `enough`, travel beyond `longest`, travel."""
         ring = np.array([0, *tour, 0])
-        errors = self._errors(ring)
-        bias = math.sqrt(errors @ errors) / self.enough
+        errors = self._errors(ring).reshape(-1, 3)
+        across = errors.T @ errors
+        # Between rms and worst direction, which is what counts: Schatten's norm of order 4.
+        bias = math.sqrt(math.sqrt(np.vdot(across, across))) / self.enough
         driving = float(np.add.reduce(self.travel[ring[:-1], ring[1:]])) / self.longest
         return max(bias - 1, 0.0) + 100 * max(driving - 1, 0.0) + 0.1 * driving
 
