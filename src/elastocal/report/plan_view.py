@@ -445,7 +445,7 @@ def next_lines(found: NextPoses) -> list[tuple[str, str]]:
     lines.append(
         (
             "Gain",
-            f"{n} lower the rms error at the test poses, all that is in doubt counted at once, "
+            f"{n} lower the rms error at the test poses, averaged over what is in doubt, "
             f"from {both(g.before, g.after)}; were the "
             f"model right, from {both(g.model_before, g.model_after)}.",
         )
