@@ -307,6 +307,7 @@ def shortest_tour(cost: Array, start: list[int], seed: int, iterations: int) -> 
 
 ITERATIONS = 5000
 FEW_ITERATIONS = 300  # while moves of the tour still turn out to be blocked
+PATIENT = 5  # times, before all ways are checked
 
 
 def schedule(
@@ -363,8 +364,8 @@ def schedule(
         blocked = moves.check(tour, costs)
         progress(f"order of execution: {moves.checked} moves checked, {moves.blocked} blocked")
         if blocked:
-            if (rounds := rounds + 1) > CROWDED:  # one move at a time would take too long
-                moves.look_around(costs)
+            if moves.crowded or (rounds := rounds + 1) > PATIENT:
+                moves.settle()
             costs = moves.costs()
         done, thorough = thorough and not blocked, not blocked
     refuse_impossible(moves, tour, costs, blockers)
@@ -407,7 +408,6 @@ def schedule(
 
 
 ROUNDS = 12  # of blocked moves found and the order mended, before the ways around are taken
-CROWDED = 30  # rounds of the shortest order, from which on the moves around it are looked at too
 
 
 def _against_drift(
@@ -437,6 +437,8 @@ def _against_drift(
             new = balanced(new, load, clock, seed + TRIES + again, STEPS, HOT / 2)
             continue
         rounds += 1
+        if moves.crowded or rounds == ROUNDS:
+            moves.settle()
         costs = moves.costs()
         clock = clock.at(costs)
         if rounds <= ROUNDS:
