@@ -171,6 +171,9 @@ class VisitTimes:
         share = np.zeros((1 + visits.pose.max(), 1 + visits.load.max(), 1, 3))
         if alias is not None:
             share = alias.share
+        times = np.zeros(share.shape[:2])  # that each is read; each time with a part of it
+        np.add.at(times, (visits.pose, visits.load), 1.0)
+        share = share / np.maximum(times, 1.0)[..., None, None]
         made = cls(
             travel=_travel(costs),
             change=np.where(costs.changed > 0, motion.load_change, 0.0),

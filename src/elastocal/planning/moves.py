@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import dataclasses
 from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass
 from itertools import pairwise, product
@@ -328,6 +329,18 @@ class Moves:
         """The load state on the arm at a node of a tour, −1 for none; node 0 is without."""
         state = -1 if node == 0 else int(self.visits.load[node - 1])
         return state if state >= 0 and self.loaded[state] else -1
+
+    def unloaded_twice(self, tour: list[int]) -> tuple[Moves, list[int]]:
+        """With another visit of each pose that is read without load, and these nodes, in the
+        reverse order of the tour; none where nothing is read under load."""
+        visits = self.visits
+        if not self.loaded[visits.load].any():
+            return self, []
+        again = np.array([v - 1 for v in tour[::-1] if not self.loaded[visits.load[v - 1]]], int)
+        fields = ((f.name, getattr(visits, f.name)) for f in dataclasses.fields(visits))
+        more = Visits(**{name: np.concatenate([v, v[again]]) for name, v in fields})
+        nodes = len(visits.pose) + 1 + np.arange(len(again))
+        return dataclasses.replace(self, visits=more), nodes.tolist()
 
     def costs(self) -> Costs:
         """Costs between visits as known so far."""

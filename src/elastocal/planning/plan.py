@@ -169,7 +169,8 @@ def plan_rows(
 
     With `forces` (L, 3) N of the load states one row per reading, under its force; without, one
     row per pose and side, to be measured in every load state, `order` being its place in the
-    order in the first state, note_order_2 that in the second, and so on.  `configurations` and
+    order in the first state, note_order_2 that in the second, and so on; what is read in two parts
+    has the place of the second behind these.  `configurations` and
     `level`: one per pose.  Where a pose is approached from both sides, they are two
     configurations, 7+ (joints moving up to it) and 7-: the difference between them is what such a
     plan is for, not noise of repeats.  With `seen`, which markers are read of each pose in each
@@ -178,7 +179,8 @@ def plan_rows(
     numbered = list(enumerate(execution.stops, start=1))
     readings: dict[tuple[int, ...], list[tuple[int, Stop]]] = {}
     for k, stop in sorted(
-        numbered, key=lambda s: (s[1].again > 0, s[1].pose, s[1].again, s[1].side, s[1].load)
+        numbered,
+        key=lambda s: (s[1].again > 0, s[1].pose, s[1].again, s[1].side, s[1].part, s[1].load),
     ):
         key = (stop.pose, stop.again, stop.side, -1 if forces is None else stop.load)
         readings.setdefault(key, []).append((k, stop))
@@ -200,7 +202,7 @@ def plan_rows(
         rows, first = [rows[k] for k in of], [first[k] for k in of]
         approach = [approach[k] for k in of] if approach else []
         notes = {name: [cells[k] for k in of] for name, cells in notes.items()}
-    time = [stop.time for stop in first if stop.time is not None]
+    time = [np.mean([stop.time for _, stop in row]) for row in rows if row[0][1].time is not None]
     return PlanRows(
         configuration=tuple(stop.name(configurations) + sides[stop.side] for stop in first),
         q=np.array([stop.q for stop in first]),
