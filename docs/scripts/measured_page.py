@@ -140,6 +140,12 @@ ROOMS: dict[str, tuple[Part, ...]] = {
             f"{STUDIES}/kr270_plan/assumptions.md",
         ),
         Part(
+            "What a steady drift of 50 µm does, by the order of the poses",
+            "",
+            "python experiment_design/kr270_plan/drift_order.py",
+            f"{STUDIES}/kr270_plan/drift.md",
+        ),
+        Part(
             "The error elsewhere",
             "",
             "python experiment_design/everywhere/study.py",
