@@ -78,6 +78,13 @@ def test_the_summary_has_every_key_of_its_schema(levels):
     assert any(UNSEEN in text for text in plan["warnings"])
 
 
+def test_the_certificate_says_that_no_pose_is_in_the_plan_twice(levels):
+    told = " ".join(levels[1].split())
+    assert re.search(
+        r"efficiency [\d.]+ against the best plan .* candidates, each in it once", told
+    )
+
+
 def test_every_file_asked_for_is_written_and_told(levels):
     folder, told = levels
     written = ["plan.csv", "plan.json", "picture.png", "moves.src", "moves.script"]

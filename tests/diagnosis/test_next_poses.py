@@ -55,10 +55,10 @@ def test_the_next_poses_go_on_where_the_campaign_ended(folder, answer) -> None:
 def test_it_says_what_they_bring(answer) -> None:
     gain = answer["gain"]
     assert gain["after"] < gain["before"] and gain["model_after"] < gain["model_before"]
-    # What is counted with all doubts at once is more than their mean, which is what is reached.
-    assert gain["model_before"] < min(gain["before"], answer["reached"])
+    assert gain["model_before"] < gain["before"] < answer["reached"]
     assert answer["plan"]["gain"] == gain
-    assert answer["plan"]["value"] == pytest.approx(1e6 * gain["after"])
+    # The plan is chosen by the mean square with all doubts at once, which is more.
+    assert answer["plan"]["value"] > 1e6 * gain["after"] > 1e6 * gain["model_after"]
     # No parameter in doubt is promised an interval.
     assert all("compliance" in p["name"] for p in answer["plan"]["predicted"])
 

@@ -258,6 +258,15 @@ def test_more_effort_is_never_worse(cell: Callable[[], Cell]) -> None:
         assert plan.certificate.bound_pool <= plan.value * (1 + 1e-9)
 
 
+@pytest.mark.long
+def test_quick_plans_of_a_whole_geometry_are_certified_on_the_continuum() -> None:
+    effects = ("base_frame", "joint_offset", "link_geometry", "joint_compliance", "marker_position")
+    cell = plan_cell(effects, "position", loads=BOTH, poses=30, candidates=None)
+    c = design(cell, DesignOptions("quick")).certificate
+    assert c.efficiency_continuum is not None and c.efficiency_pool is not None
+    assert 0.85 < c.efficiency_continuum <= c.efficiency_pool
+
+
 @pytest.mark.parametrize("make", [plan_cell, pytest.param(work_cell, marks=pytest.mark.long)])
 def test_normal_effort_polishes_off_the_pool_and_stays_inside_the_rules(
     make: Callable[..., Cell], monkeypatch: pytest.MonkeyPatch

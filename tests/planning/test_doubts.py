@@ -126,7 +126,8 @@ def test_gain_counts_what_the_readings_show_and_leave_open() -> None:
         return Gain.of(R, before, 4 * before, [Doubt(p, one, np.array([spare]))], pull, 0)
 
     there = gain(1.0)
-    assert there.before == pytest.approx(np.sqrt(0.25 + 1)) == pytest.approx(2 * there.after)
+    assert there.before == pytest.approx(np.sqrt(0.25 + 1 + 100**2))
+    assert there.after == pytest.approx(np.sqrt(1 / 16 + 1 / (3 + 1 / (1 + 100**2))))
     assert there.model_before == pytest.approx(0.5) and there.model_after == pytest.approx(0.25)
     assert there.sure == pytest.approx(100 + 1.645, abs=0.1)
     # Known less well if it is there than with its chance alone: 1/(1 - spare) times the variance.
@@ -134,6 +135,7 @@ def test_gain_counts_what_the_readings_show_and_leave_open() -> None:
     # What is missing with a few per cent alone leaves the error that of the model: N(0, 1/4).
     assert gain(1e-9).sure == pytest.approx(1.96 / 2, abs=0.05)
     assert 1.96 / 2 < gain(0.03).sure < 1.5 and gain(0.1).sure > 98
+    assert gain(1e-9).before == pytest.approx(there.model_before, rel=1e-4)
     assert Gain.of(R, np.diag([0.0, 1.0]), before, [], np.zeros(2), 0).sure == np.inf
 
 
@@ -157,6 +159,30 @@ def test_the_stated_error_holds_in_as_many_campaigns_as_it_says() -> None:
         sure = Gain.of(R, before, before, doubts, B.T @ (y - B @ fit) / 9, 1).sure
         held.append(np.linalg.norm(R @ (x - fit)) <= sure)
     assert 0.92 < np.mean(held) < 0.98
+
+
+def test_before_and_after_are_errors_of_drawn_arms() -> None:
+    """Arms as likely as believed, measured once more: the best linear estimate, fitted to them."""
+    rng = np.random.default_rng(3)
+    B, A, R = (rng.standard_normal((n, 4)) for n in (12, 5, 3))
+    own, pull, spare = np.arange(2), rng.standard_normal(4), np.full(1, 0.2)
+    before = B.T @ B + np.diag([0.0, 0.0, 1.0, 1.0])
+    places = {2: 0.3, 3: 0.2}
+    doubts = [Doubt(p, np.array([k]), spare) for k, p in places.items()]
+    gain = Gain.of(R, before, before + A.T @ A, doubts, pull, 0)
+    n, arms = 60_000, []
+    for k, p in {None: 0.5, **places}.items():
+        there = own if k is None else np.append(own, k)
+        M = before[np.ix_(there, there)] - np.diag([0.0, 0.0, 0.2][: len(there)])
+        V = np.linalg.inv(M)
+        x = np.zeros((round(p * n), 4))
+        x[:, there] = rng.multivariate_normal(V @ pull[there], V, len(x))
+        arms.append(x)
+    x = np.concatenate(arms)
+    y = x @ A.T + rng.standard_normal((n, 5))
+    off = (x - y @ np.linalg.lstsq(y, x, rcond=None)[0]) @ R.T
+    rms = [np.sqrt((e**2).sum(axis=1).mean()) for e in (x @ R.T, off)]
+    assert rms == pytest.approx([gain.before, gain.after], rel=0.015)
 
 
 def _posterior(

@@ -171,6 +171,9 @@ class VisitTimes:
         share = np.zeros((1 + visits.pose.max(), 1 + visits.load.max(), 1, 3))
         if alias is not None:
             share = alias.share
+        times = np.zeros(share.shape[:2])  # that each is read; each time with a part of it
+        np.add.at(times, (visits.pose, visits.load), 1.0)
+        share = share / np.maximum(times, 1.0)[..., None, None]
         made = cls(
             travel=_travel(costs),
             change=np.where(costs.changed > 0, motion.load_change, 0.0),
@@ -216,8 +219,10 @@ class VisitTimes:
     def price(self, tour: list[int]) -> float:
         """What annealing makes small: bias beyond `enough`, travel beyond `longest`, travel."""
         ring = np.array([0, *tour, 0])
-        errors = self._errors(ring)
-        bias = math.sqrt(errors @ errors) / self.enough
+        errors = self._errors(ring).reshape(-1, 3)
+        across = errors.T @ errors
+        # Between rms and worst direction, which is what counts: Schatten's norm of order 4.
+        bias = math.sqrt(math.sqrt(np.vdot(across, across))) / self.enough
         driving = float(np.add.reduce(self.travel[ring[:-1], ring[1:]])) / self.longest
         return max(bias - 1, 0.0) + 100 * max(driving - 1, 0.0) + 0.1 * driving
 

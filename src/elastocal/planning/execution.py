@@ -48,7 +48,8 @@ class Stop:
     `travel` s.  `change_after`: the load is changed once that many of these k + 1 moves are done;
     None: it stays.  `approach` (n,): +1 or −1, the direction of each joint's last motion, and
     `side` 0 or 1 where the pose is approached from both sides.  `again`: how often it has been
-    visited for reference, this time included; 0 for the plan's own reading.  `time` s from the
+    visited for reference, this time included; 0 for the plan's own reading.  `part`: how often it
+    was visited for it before, with an equal part of the readings each time.  `time` s from the
     beginning to its readings, where that is asked for.
     """
 
@@ -61,6 +62,7 @@ class Stop:
     approach: IntArray | None = None
     side: int = 0
     again: int = 0
+    part: int = 0
     time: float | None = None
 
     def name(self, configurations: Sequence[str]) -> str:
@@ -307,6 +309,7 @@ def shortest_tour(cost: Array, start: list[int], seed: int, iterations: int) -> 
 
 ITERATIONS = 5000
 FEW_ITERATIONS = 300  # while moves of the tour still turn out to be blocked
+PATIENT = 5  # times, before all ways are checked
 
 
 def schedule(
@@ -363,8 +366,8 @@ def schedule(
         blocked = moves.check(tour, costs)
         progress(f"order of execution: {moves.checked} moves checked, {moves.blocked} blocked")
         if blocked:
-            if (rounds := rounds + 1) > CROWDED:  # one move at a time would take too long
-                moves.look_around(costs)
+            if moves.crowded or (rounds := rounds + 1) > PATIENT:
+                moves.settle()
             costs = moves.costs()
         done, thorough = thorough and not blocked, not blocked
     refuse_impossible(moves, tour, costs, blockers)
@@ -372,7 +375,9 @@ def schedule(
     way, fixed = costs.cost - costs.changed, tour_cost(costs.apart, tour)
     drift, shortest = None, tour
     if (alias is not None or motion.load_changes) and motion.extra_time > 0:
-        tour, later, drift = _against_drift(moves, motion, tour, costs, alias, seed, progress)
+        tour, moves, later, drift = _against_drift(
+            moves, motion, tour, costs, alias, seed, progress
+        )
         if len(set(moves.visits.load.tolist())) > 1:
             # Load states may come more than once: nothing but the way itself bounds that.
             way, fixed, shortest = later.cost - later.apart - later.changed, 0.0, tour
@@ -390,6 +395,11 @@ def schedule(
         for (u, (v, again)) in zip([0, *nodes], order, strict=False)
         for stop in _stops(moves, u, v, costs)
     ]
+    visited: Counter[tuple[int, ...]] = Counter()
+    for k, stop in enumerate(stops):
+        key = (stop.pose, stop.load, stop.side, stop.again)
+        stops[k] = replace(stop, part=visited[key])
+        visited[key] += 1
     _, home = moves.way(nodes[-1], 0, costs)  # empty without a home
     home_travel = _time(moves, home)
     travel = sum(stop.travel for stop in stops) + home_travel
@@ -407,7 +417,6 @@ def schedule(
 
 
 ROUNDS = 12  # of blocked moves found and the order mended, before the ways around are taken
-CROWDED = 30  # rounds of the shortest order, from which on the moves around it are looked at too
 
 
 def _against_drift(
@@ -418,15 +427,43 @@ def _against_drift(
     alias: Alias | None,
     seed: int,
     progress: Callable[[str], None],
-) -> tuple[list[int], Costs, Drifting | None]:
-    """The visits of the shortest `tour` in the order that a drift harms least, its costs, and what
-    the drift does to it; the shortest tour itself where no other is better."""
+) -> tuple[list[int], Moves, Costs, Drifting | None]:
+    """The visits of the shortest `tour` in the order that a drift harms least, with the moves and
+    costs that they are nodes of, and what the drift does to it; the shortest tour itself where no
+    other is better.  Where there is time for it, all poses are read twice without load."""
     load = moves.visits.load
     used = [int(s) for s in dict.fromkeys(load[np.array(tour) - 1])]
     sequence = turns(moves.loaded.tolist(), used, motion.load_changes)
     clock = VisitTimes.of(moves, motion, costs, alias, tour)
     before = clock.bias(tour)
     begun = in_turns(tour, load, sequence)
+    new, costs, clock = _searched(begun, moves, costs, clock, seed, progress)
+    more = bool(motion.load_changes) and alias is None
+    found = new if clock.possible(new) and (more or clock.bias(new) < before) else tour
+    if alias is None:
+        return found, moves, costs, None
+    bias, (twice, again) = clock.bias(found), moves.unloaded_twice(tour)
+    left = clock.longest - len(again) * clock.visit
+    if bias > clock.enough and len(again) and left >= clock.driving(tour):
+        spread = VisitTimes.of(twice, motion, costs := twice.costs(), alias, tour)
+        begun = in_turns([*tour, *again], twice.visits.load, sequence)
+        new, later, spread = _searched(
+            begun, twice, costs, replace(spread, longest=left), seed, progress
+        )
+        if spread.possible(new) and spread.bias(new) < bias:
+            found, moves, costs, bias = new, twice, later, spread.bias(new)
+        else:
+            costs = moves.costs()
+    noise, at_test = alias.noise, alias.at_test_poses
+    return found, moves, costs, Drifting(DRIFT * bias, DRIFT * before, noise, at_test)
+
+
+def _searched(
+    begun: list[int], moves: Moves, costs: Costs, clock: VisitTimes, seed: int,
+    progress: Callable[[str], None],
+) -> tuple[list[int], Costs, VisitTimes]:  # fmt: skip
+    """The order of least price found from one that has `begun`, its moves checked."""
+    load = moves.visits.load
     tries = [balanced(begun, load, clock, seed + k, STEPS, HOT) for k in range(TRIES)]
     new, rounds = min(tries, key=clock.price), 0
     again = 0
@@ -437,17 +474,13 @@ def _against_drift(
             new = balanced(new, load, clock, seed + TRIES + again, STEPS, HOT / 2)
             continue
         rounds += 1
+        if moves.crowded or rounds == ROUNDS:
+            moves.settle()
         costs = moves.costs()
         clock = clock.at(costs)
         if rounds <= ROUNDS:
             new = balanced(new, load, clock, seed + rounds, FEW, HOT / 2**rounds)
-    more = bool(motion.load_changes) and alias is None
-    keep = clock.possible(new) and (more or clock.bias(new) < before)
-    found = new if keep else tour
-    if alias is None:
-        return found, costs, None
-    noise, at_test = alias.noise, alias.at_test_poses
-    return found, costs, Drifting(DRIFT * clock.bias(found), DRIFT * before, noise, at_test)
+    return new, costs, clock
 
 
 def _unloaded_first(tour: list[int], cost: Array, moves: Moves) -> list[int]:

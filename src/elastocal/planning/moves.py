@@ -2,9 +2,10 @@
 
 from __future__ import annotations
 
+import dataclasses
 from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass
-from itertools import pairwise
+from itertools import pairwise, product
 from typing import Protocol
 
 import numpy as np
@@ -190,6 +191,15 @@ class Roadmap:
             way.append(int(before[way[-1]]))
         return way[::-1]
 
+    def settle(self, pairs: Iterable[tuple[int, int]]) -> None:
+        """Check the fastest ways between these pairs of points until what is fastest is free."""
+        left = list(pairs)
+        while left:
+            times = self.costs()
+            ways = [[i, *self.way(i, j)] for i, j in left if np.isfinite(times[i, j])]
+            self.check(move for way in ways for move in pairwise(way))
+            left = [(w[0], w[-1]) for w in ways if np.isinf(self.direct[w[:-1], w[1:]]).any()]
+
     def _shortest(self) -> tuple[Array, NDArray[np.integer]]:
         if self._ways is None:
             finite = self.direct[np.isfinite(self.direct)]
@@ -237,7 +247,7 @@ class Roadmap:
 
 # The points of a schedule, its visits, and the moves between them, checked when needed.
 
-AROUND = 5  # visits next to each whose moves are checked where most moves are blocked
+FEW = 2000  # pairs of visits: so many ways are checked at once where orders need them one by one
 
 
 @dataclass(frozen=True)
@@ -310,10 +320,27 @@ class Moves:
     def blocked(self) -> int:
         return sum(roadmap.blocked for roadmap in self.maps)
 
+    @property
+    def crowded(self) -> bool:
+        """Are most moves blocked?"""
+        return 2 * self.blocked > self.checked
+
     def carries(self, node: int) -> int:
         """The load state on the arm at a node of a tour, −1 for none; node 0 is without."""
         state = -1 if node == 0 else int(self.visits.load[node - 1])
         return state if state >= 0 and self.loaded[state] else -1
+
+    def unloaded_twice(self, tour: list[int]) -> tuple[Moves, list[int]]:
+        """With another visit of each pose that is read without load, and these nodes, in the
+        reverse order of the tour; none where nothing is read under load."""
+        visits = self.visits
+        if not self.loaded[visits.load].any():
+            return self, []
+        again = np.array([v - 1 for v in tour[::-1] if not self.loaded[visits.load[v - 1]]], int)
+        fields = ((f.name, getattr(visits, f.name)) for f in dataclasses.fields(visits))
+        more = Visits(**{name: np.concatenate([v, v[again]]) for name, v in fields})
+        nodes = len(visits.pose) + 1 + np.arange(len(again))
+        return dataclasses.replace(self, visits=more), nodes.tolist()
 
     def costs(self) -> Costs:
         """Costs between visits as known so far."""
@@ -339,10 +366,21 @@ class Moves:
         """Check every straight move of the tour not yet checked; is one of them news, blocked?"""
         return self._blocked(pairwise([0, *tour, 0]), costs)
 
-    def look_around(self, costs: Costs) -> None:
-        """Check the moves to the AROUND visits that are next to each at these costs."""
-        ranked = np.argsort(costs.cost + np.diag(np.full(len(costs.cost), np.inf)), axis=1)
-        self._blocked(((u, int(v)) for u, row in enumerate(ranked) for v in row[:AROUND]), costs)
+    def settle(self) -> None:
+        """Check the ways between all visits, where these are few or most moves are blocked: many
+        at once take less time than a few again and again."""
+        visits = self.visits
+        pairs: list[set[tuple[int, int]]] = [set(), set()]
+        every = np.ones(len(visits.load), dtype=bool)
+        for k, here in enumerate((every, self.loaded[visits.load])):
+            ends = visits.entry[here][np.isfinite(visits.inside[here])].tolist()
+            starts = visits.leave[here].tolist()
+            if not k and self.home is not None:
+                starts, ends = [self.home, *starts], [self.home, *ends]
+            pairs[k] = {(min(m), max(m)) for m in product(starts, ends) if m[0] != m[1]}
+        if self.crowded or len(pairs[0]) + len(pairs[1]) <= FEW:
+            for roadmap, wanted in zip(self.maps, pairs, strict=True):
+                roadmap.settle(sorted(wanted))
 
     def _blocked(self, steps: Iterable[tuple[int, int]], costs: Costs) -> bool:
         wanted: list[list[tuple[int, int]]] = [[], []]

@@ -169,7 +169,8 @@ def plan_rows(
 
     With `forces` (L, 3) N of the load states one row per reading, under its force; without, one
     row per pose and side, to be measured in every load state, `order` being its place in the
-    order in the first state, note_order_2 that in the second, and so on.  `configurations` and
+    order in the first state, note_order_2 that in the second, and so on; what is read in two parts
+    has the place of the second behind these.  `configurations` and
     `level`: one per pose.  Where a pose is approached from both sides, they are two
     configurations, 7+ (joints moving up to it) and 7-: the difference between them is what such a
     plan is for, not noise of repeats.  With `seen`, which markers are read of each pose in each
@@ -178,7 +179,8 @@ def plan_rows(
     numbered = list(enumerate(execution.stops, start=1))
     readings: dict[tuple[int, ...], list[tuple[int, Stop]]] = {}
     for k, stop in sorted(
-        numbered, key=lambda s: (s[1].again > 0, s[1].pose, s[1].again, s[1].side, s[1].load)
+        numbered,
+        key=lambda s: (s[1].again > 0, s[1].pose, s[1].again, s[1].side, s[1].part, s[1].load),
     ):
         key = (stop.pose, stop.again, stop.side, -1 if forces is None else stop.load)
         readings.setdefault(key, []).append((k, stop))
@@ -200,7 +202,7 @@ def plan_rows(
         rows, first = [rows[k] for k in of], [first[k] for k in of]
         approach = [approach[k] for k in of] if approach else []
         notes = {name: [cells[k] for k in of] for name, cells in notes.items()}
-    time = [stop.time for stop in first if stop.time is not None]
+    time = [np.mean([stop.time for _, stop in row]) for row in rows if row[0][1].time is not None]
     return PlanRows(
         configuration=tuple(stop.name(configurations) + sides[stop.side] for stop in first),
         q=np.array([stop.q for stop in first]),
@@ -374,6 +376,7 @@ def remaining_rms(R: Array, M: Array) -> float:
 
 
 DRAWS = 2000  # of what the arm may be
+HARDLY = 1e-6  # probability of an effect below which what it would do is not asked
 
 
 @dataclass(frozen=True)
@@ -390,9 +393,9 @@ class Doubt:
 class Gain:
     """What a plan adds to measurements done: rms position error in m at the test poses.
 
-    `before` and `after` it with the effects in doubt, `model_before` and `model_after` were the
-    model right; inf where the measurements leave parameters open.  `sure`: with 95 % the error of
-    the model as it is now identified is smaller.
+    `before` and `after` it averaged over what may be missing, `model_before` and `model_after` were
+    the model right; inf where the measurements leave parameters open.  `sure`: with 95 % the error
+    of the model as it is now identified, of which `before` is the rms, is smaller.
     """
 
     before: float
@@ -410,30 +413,38 @@ class Gain:
 
         The arm is averaged over what may be missing (Hoeting et al. 1999, Statistical Science 14):
         nothing, or one of the effects, each with its probability; it is then N(V pull, V) away from
-        the model, V⁻¹ the information on the model's parameters and those of that effect.
+        the model, V⁻¹ the information on the model's parameters and those of that effect.  Of mean
+        square C in all, it is (C⁻¹ + after − before)⁻¹ away from the best linear estimate that
+        starts with the model and adds the plan's readings.
         """
         own = np.setdiff1d(np.arange(len(before)), [k for d in doubts for k in d.columns])
         part = np.ix_(own, own)
-        rms = remaining_rms(R, before), remaining_rms(R, after)
         right = remaining_rms(R[:, own], before[part]), remaining_rms(R[:, own], after[part])
-        if not np.isfinite(rms[0]):
-            return cls(*rms, *right, np.inf)
+        if not np.isfinite(remaining_rms(R, before)):
+            return cls(np.inf, remaining_rms(R, after), *right, np.inf)
         rng = np.random.default_rng(seed)
         chance = np.array([d.probability for d in doubts])
         nothing = Doubt(max(1 - chance.sum(), 0.0), own[:0], np.zeros(0))
         shares = np.array([nothing.probability, *chance]) / max(chance.sum(), 1.0)
-        errors = []
-        for n, doubt in zip(rng.multinomial(DRAWS, shares), (nothing, *doubts), strict=True):
-            if not n:
+        errors, C, drawn = [], np.zeros_like(before), rng.multinomial(DRAWS, shares)
+        for share, n, doubt in zip(shares, drawn, (nothing, *doubts), strict=True):
+            if share < HARDLY:
                 continue
             there = np.append(own, doubt.columns)
             M = before[np.ix_(there, there)].copy()
             M[len(own) :, len(own) :] -= np.diag(doubt.spare)
             factor = linalg.cholesky(M, lower=True)
-            z = rng.standard_normal((len(there), n))
-            z += linalg.solve_triangular(factor, pull[there], lower=True)[:, None]
-            off = R[:, there] @ linalg.solve_triangular(factor, z, lower=True, trans="T")
-            errors.append(np.linalg.norm(off, axis=0))
+            root = linalg.solve_triangular(factor, np.eye(len(there)), lower=True, trans="T")
+            off = root @ (root.T @ pull[there])
+            C[np.ix_(there, there)] += share * (root @ root.T + np.outer(off, off))
+            away = off[:, None] + root @ rng.standard_normal((len(there), n))
+            errors.append(np.linalg.norm(R[:, there] @ away, axis=0))
+        size = np.sqrt(np.diag(C))
+        scale = np.where(size > 0, size, 1.0)
+        values, turned = np.linalg.eigh(C / scale / scale[:, None])
+        S = size[:, None] * turned * np.sqrt(np.maximum(values, 0.0))
+        shown = np.eye(len(C)) + S.T @ (after - before) @ S
+        rms = float(np.linalg.norm(R @ S)), remaining_rms(R @ S, shown)
         return cls(*rms, *right, float(np.quantile(np.concatenate(errors), 0.95)))
 
 

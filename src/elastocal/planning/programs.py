@@ -74,7 +74,8 @@ def steps_of(
             steps.insert(stop.change_after, ("load", hang))
         yield from steps
         side = "" if stop.approach is None else f", approached from {('below', 'above')[stop.side]}"
-        yield "measure", execution.motion.dwell, f"{name}, {loads[stop.load]}{side}"
+        part = ", once more" if stop.part else ""
+        yield "measure", execution.motion.dwell, f"{name}, {loads[stop.load]}{side}{part}"
     if execution.take_off:
         yield "load", TAKE_OFF
     if home is not None:

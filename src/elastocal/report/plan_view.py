@@ -302,7 +302,7 @@ def _everywhere_lines(plan: Plan) -> list[tuple[str, str]]:
         text += f", for which ρ₀ may be {100 * e.cap:g} % above the least" if e.cap else ""
     elif plan.criterion == "test_pose":
         text += (
-            f"; {option('elsewhere_cap', '0.05')} finds the least there for 5 % more at the test "
+            f"; {option('elsewhere_cap', 0.05)} finds the least there for 5 % more at the test "
             "poses"
         )
     return [("Elsewhere", f"{text}.")]
@@ -382,6 +382,9 @@ def _execution_line(plan: Plan) -> tuple[str, str]:
     again = sum(stop.again > 0 for stop in e.stops)
     if again:
         text = f"{stops} stops, {again} of them at reference poses, {e.travel:.0f} s of travel"
+    parts = sum(stop.part > 0 for stop in e.stops)
+    if parts:
+        text += f"; {parts} poses are read twice without load, half of the readings each time"
     if e.gap > 5e-4 and (e.drift is None or e.drift.bias == e.drift.shortest) and not again:
         text += f" (at most {100 * e.gap:.1f} % above the shortest order)"
     if changes:
@@ -445,7 +448,7 @@ def next_lines(found: NextPoses) -> list[tuple[str, str]]:
     lines.append(
         (
             "Gain",
-            f"{n} lower the rms error at the test poses, all that is in doubt counted at once, "
+            f"{n} lower the rms error at the test poses, averaged over what is in doubt, "
             f"from {both(g.before, g.after)}; were the "
             f"model right, from {both(g.model_before, g.model_after)}.",
         )

@@ -69,6 +69,26 @@ def test_every_visit_once_in_turns_and_the_drift_does_little(changes, sequence):
     assert execution.travel <= shortest.travel + 0.05 * shortest.total
 
 
+def test_where_there_is_time_poses_are_read_before_and_after_their_load():
+    once, twice = ordered(), ordered(extra_time=0.5)
+    assert blocks(twice) == "ULU" and len(twice.stops) == 36
+    assert sorted((s.pose, s.load, s.part) for s in twice.stops) == [
+        (pose, load, part) for pose in range(12) for load, part in ((0, 0), (0, 1), (1, 0))
+    ]
+    assert twice.drift.bias < 0.2 * once.drift.bias
+    shortest = ordered(alias=None)
+    assert once.total < twice.total < 1.5 * shortest.total and twice.bound <= twice.travel
+    names, level = tuple(map(str, range(1, 13))), np.zeros(12, dtype=int)
+    rows = plan_rows(twice, names, level)
+    assert rows.configuration == names and set(rows.notes) == {"note_order_2", "note_order_3"}
+    places = np.array([rows.order, *([int(v) for v in note] for note in rows.notes.values())]).T
+    assert sorted(places.ravel()) == list(range(1, 37)) and (places[:, 0] < places[:, 2]).all()
+    loaded = [k + 1 for k, stop in enumerate(twice.stops) if stop.load]
+    assert sorted(places[:, 1]) == loaded
+    # With forces stated, the second part stands in the row of the first.
+    assert len(plan_rows(twice, names, level, BOTH).configuration) == 24
+
+
 def test_without_extra_time_the_order_is_the_shortest():
     there, shortest = ordered(extra_time=0.0), ordered(alias=None)
     assert [(s.pose, s.load) for s in there.stops] == [(s.pose, s.load) for s in shortest.stops]

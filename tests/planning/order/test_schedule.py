@@ -6,12 +6,12 @@ import numpy as np
 import pytest
 from hypothesis import assume, given, settings
 from hypothesis import strategies as st
-from support.discs import Discs, best_time
+from support.discs import Discs, best_time, ways
 
 from elastocal.cell.plan_wishes import Motion
 from elastocal.errors import InputError, InsufficientDataError
 from elastocal.planning import schedule
-from elastocal.planning.moves import Unreachable
+from elastocal.planning.moves import Moves, Unreachable, check_reachable
 
 BOTH = np.array([[0.0, 0, 0], [0, 0, -100.0]])
 LIMITS = (np.full(2, -3.0), np.full(2, 3.0))
@@ -149,6 +149,28 @@ def test_only_few_of_all_moves_are_checked():
     execution = schedule(q, Motion(), checker, iterations=1000)
     assert execution.checked == len(checker.asked) == len(set(checker.asked))
     assert execution.checked < 0.3 * 25 * 24 / 2
+
+
+def test_where_most_moves_are_blocked_all_ways_are_found_at_once():
+    """Against all moves checked, from a few calls of the checker."""
+    rng = np.random.default_rng(0)
+    checker = Discs(np.column_stack([rng.uniform(-2, 2, (40, 2)), np.full(40, 0.15)]), grow=0.05)
+    q, via = poses(5, 8, checker), poses(6, 40, checker)
+    moves = Moves.of(q, Motion(home=q[0]), checker, BOTH, None, None, via)
+    check_reachable(moves, None)
+    asked = len(checker.asked)
+    calls, paths_free = [], checker.paths_free
+
+    def counted(*args):
+        calls.append(args)
+        return paths_free(*args)
+
+    checker.paths_free = counted
+    moves.settle()
+    assert moves.crowded and 10 * len(calls) < len(checker.asked) - asked
+    for roadmap in moves.maps:
+        best = ways(moves.points, checker, roadmap.loaded)
+        np.testing.assert_allclose(roadmap.costs()[:9, :9], best[:9, :9], atol=1e-9)
 
 
 def test_the_same_seed_gives_the_same_order():

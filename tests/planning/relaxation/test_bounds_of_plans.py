@@ -62,6 +62,14 @@ def test_the_relaxed_optimum_lies_between_bound_and_best_plan(name, seed):
     assert relaxed.value * (1 - relaxed.gap) == pytest.approx(relaxed.bound, rel=1e-12)
 
 
+def test_the_bound_is_one_of_plans_of_different_poses():
+    """A pose measured twice may be worth more, which the bound does not deny: it is said."""
+    problem = tiny("test_pose", seed=2)
+    bound = relax(problem).bound
+    assert best_plan(replace(problem, most=2)) < bound <= best_plan(problem)
+    assert relax(replace(problem, most=2)).bound <= best_plan(replace(problem, most=2))
+
+
 def test_without_prior_and_box_it_is_the_published_bound():
     problem = random_problem("test_pose", shares=(3, 2), most=3)
     w = even_weights(problem)
