@@ -46,11 +46,12 @@ def cell_of(scenario: campaigns.Scenario) -> Cell:
     cell, key = campaigns.arm().cell, scenario.key
     spec = DesignSpec(
         poses=scenario.configurations, loads=campaigns.LOADS, candidates=200, elsewhere=0.0,
-        repeatability=campaigns.EFFECT if key == "effect" else 0.0, motion=MOTION,
+        motion=MOTION,
     )  # fmt: skip
     unsteady = Unsteadiness(
         np.array([campaigns.SCATTER if key == "joints" else 0.0]),
         campaigns.DRIFT if key == "drift" else 0.0, LASTING,
+        campaigns.EFFECT if key == "effect" else 0.0,
     )  # fmt: skip
     urdf = str(files("elastocal.demo") / "kr270_2.urdf")
     return replace(
