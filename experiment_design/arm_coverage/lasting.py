@@ -44,8 +44,9 @@ def main(arms: int, draws: int, lasting: float = 0.2) -> None:
             off = np.abs(new @ one.x)
             for fit in (one, over_times(one, replace(readings, e=e))):
                 C = fit.covariance
-                std = np.sqrt(((new @ C.matrix) * new).sum(axis=1))
-                t = [stats.t.isf(p / 2, C.dof_of(new[:, None])) for p in (0.05, 0.0027)]
+                dof, share = C.tails(new[:, None])
+                std = np.sqrt(share * ((new @ C.matrix) * new).sum(axis=1))
+                t = [stats.t.isf(p / 2, dof) for p in (0.05, 0.0027)]
                 found.append([(off <= q * std).mean() for q in t])
     held = 100 * np.array(found).reshape(-1, 2, 2)
     for k, name in enumerate(("the most likely", "the mean over all")):

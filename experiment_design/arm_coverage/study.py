@@ -49,8 +49,9 @@ def run(task: dict[str, Any], rng: np.random.Generator) -> list[dict[str, Any]]:
     row["error_of_oracle"] = campaign.oracle_error()
     # What is predicted from the covariance, the values of what was not determined held.
     B = model.regressor(campaign.test, result.x, determined).B
-    spread = np.sqrt(np.einsum("ij,jk,ik->i", B, result.covariance, B))
-    quantile = stats.t.isf(0.025, result.spread.dof_of(B[:, None, :]))
+    dof, share = result.spread.tails(B[:, None, :])
+    spread = np.sqrt(share * np.einsum("ij,jk,ik->i", B, result.covariance, B))
+    quantile = stats.t.isf(0.025, dof)
     row["positions_held"] = float((np.abs(off.ravel()) <= quantile * spread).mean())
     # A reading at a new pose errs by the prediction and by noise of its own, of another campaign.
     noise, clean = campaign.drawn(campaign.test)

@@ -79,10 +79,15 @@ class World:
         return self.measure(self.visits, np.random.default_rng((*self.seed, 1)))
 
     def fresh(self) -> Visits:
-        """100 other poses, unloaded and loaded, over the same period."""
+        """100 other poses, unloaded and loaded, over the same period.
+
+        Where no approach is told, joints stand free at the first: nobody knows where it came from.
+        """
         rng = np.random.default_rng((*self.seed, 2))
         poses = draw_poses(self.spec, FRESH_POSES, rng)
         visits = draw_visits(self.spec, poses, "interleaved", self.approach_by_motion, rng)
+        if not self.told.approach:
+            visits.approach[visits.pose == visits.pose[0]] = 0.0
         return replace(visits, time=visits.time * (self.visits.time[-1] / visits.time[-1]))
 
     def noise_free(self, visits: Visits) -> Array:

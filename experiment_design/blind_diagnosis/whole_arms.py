@@ -14,6 +14,7 @@ from __future__ import annotations
 import argparse
 import json
 import shutil
+import sys
 import tempfile
 import time
 from collections.abc import Mapping
@@ -29,8 +30,8 @@ from whole_world import judged, over_oracle
 from world_files import write_world
 
 HEAD = (
-    f"{'world':>5} {'arm':<10} {'noise':>5} {'told':<5} {'geometry':>8} {'tool':>8} {'oracle':>8} "
-    f"{'ratio':>6} {'geo/or':>6} {'s':>6}  verdict; shares held, wrong names, missed; named"
+    "| world | arm | noise, µm | approach told | geometry, mm | as diagnosed | oracle | ratio "
+    "| searching | s | verdict | shares held | wrong names | missed | named |\n" + "|" + "---|" * 15
 )
 
 
@@ -49,21 +50,19 @@ def main() -> None:
         recipe = WholeRecipe(f"whole-{asked.poses}-{k:03d}", (asked.seed, 9, k), asked.poses)
         folder = Path(tempfile.mkdtemp()) if asked.keep is None else asked.keep / recipe.name
         try:
-            line, ratio = one_world(recipe, folder)
-            if asked.search:
-                line += f"\n      {search_line(recipe)}"
+            line, ratio = one_world(recipe, folder, search_ratio(recipe) if asked.search else "–")
         finally:
             if asked.keep is None:
                 shutil.rmtree(folder)
-        print(f"{k:5d} {line}", flush=True)
+        print(f"| {k} | {line} |", flush=True)
         ratios.append(ratio)
     known = np.array([r for r in ratios if np.isfinite(r)])
     if len(known):
-        print(f"ratio: median {np.median(known):.2f}, 90 % {np.quantile(known, 0.9):.2f}")
+        print(f"\nRatio: median {np.median(known):.2f}, 90 % {np.quantile(known, 0.9):.2f}.")
 
 
-def one_world(recipe: WholeRecipe, folder: Path) -> tuple[str, float]:
-    """Its line, and the tool's error over the oracle's."""
+def one_world(recipe: WholeRecipe, folder: Path, searching: str) -> tuple[str, float]:
+    """Its row, and the tool's error over the oracle's."""
     world = recipe.draw()
     observed, sealed = folder / "seen", folder / "sealed"
     write_world(world, observed, sealed)
@@ -71,7 +70,8 @@ def one_world(recipe: WholeRecipe, folder: Path) -> tuple[str, float]:
     def command(*arguments: str) -> int:
         done = run(str(observed), list(arguments))
         if done["exit"] != 0:
-            print(f"      {arguments[0]}: {str(done['message']).strip()[-300:]}", flush=True)
+            told = str(done["message"]).strip()[-300:]
+            print(f"{arguments[0]}: {told}", file=sys.stderr, flush=True)
         return int(str(done["exit"]))
 
     start, answer = time.perf_counter(), None
@@ -82,32 +82,34 @@ def one_world(recipe: WholeRecipe, folder: Path) -> tuple[str, float]:
     whole = judged(world, observed, sealed / "fresh.csv", command, answer, "extended.toml")
     (folder / "judged.json").write_text(json.dumps(whole, indent=2), encoding="utf-8")
     errors = [whole[key] or np.nan for key in ("geometry_mm", "tool_mm", "oracle_mm")]
-    told = "came" if world.told.approach else "-"
-    line = f"{world.spec.name:<10} {1e6 * world.noise.level:5.0f} {told:<5} " + " ".join(
-        f"{e:8.4f}" for e in errors
-    )
     ratio = over_oracle(whole)
-    line += f" {ratio:6.2f} {over_oracle(whole, 'geometry_mm'):6.1f} {seconds:6.1f}"
-    return f"{line}  {said(answer, whole)}", ratio
+    parts = [
+        world.spec.name,
+        f"{1e6 * world.noise.level:.0f}",
+        "yes" if world.told.approach else "no",
+    ]
+    parts += [*(f"{e:.4f}" for e in errors), f"{ratio:.2f}", searching, f"{seconds:.0f}"]
+    return " | ".join(parts + said(answer, whole)), ratio
 
 
-def search_line(recipe: WholeRecipe) -> str:
-    """What is left of the oracle where it has to search for orders, and which it finds."""
+def search_ratio(recipe: WholeRecipe) -> str:
+    """Error of an oracle who has to search for the orders over that of one who knows them."""
     sights = Sights.of(recipe.draw())
     error, found = searched(sights)
     true = true_orders(sights)
     orders = ", ".join(f"{j + 1}: {found.get(j, 0):.2f} ({true[j]:.2f})" for j in sorted(true))
-    return f"searching for orders: {error / oracle_error(sights):.2f} of the oracle's; {orders}"
+    print(f"orders found (true): {orders}", file=sys.stderr, flush=True)
+    return f"{error / oracle_error(sights):.2f}"
 
 
-def said(answer: Mapping[str, Any] | None, whole: Mapping[str, Any]) -> str:
+def said(answer: Mapping[str, Any] | None, whole: Mapping[str, Any]) -> list[str]:
     """What is claimed, and how right that is."""
     if answer is None:
-        return "failed"
+        return ["failed", "–", "–", "–", "–"]
     names = ", ".join(f"{e['effect']}:{e['where']}" for e in answer["effects"])
-    held = f"{sum(s['held'] for s in whole['shares'])}/{len(whole['shares'])}"
-    wrong = f"{sum(not n['right'] for n in whole['names'])}/{len(whole['names'])}"
-    return f"{answer['verdict']}; {held}, {wrong}, {len(whole['missed'])}; {names or 'nothing'}"
+    held = f"{sum(s['held'] for s in whole['shares'])} of {len(whole['shares'])}"
+    wrong = f"{sum(not n['right'] for n in whole['names'])} of {len(whole['names'])}"
+    return [answer["verdict"], held, wrong, str(len(whole["missed"])), names or "nothing"]
 
 
 if __name__ == "__main__":

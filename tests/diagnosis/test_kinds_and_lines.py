@@ -1,4 +1,5 @@
-"""What acts at many joints at once: the prior of kinds, kinds made whole, orders of lines."""
+"""What acts at many joints at once: the prior of kinds, kinds made whole, orders of lines; and how
+fast the base drifts."""
 
 from __future__ import annotations
 
@@ -11,12 +12,18 @@ from support.diagnosis_data import campaign, random_data
 
 from elastocal.diagnosis import Component, NoiseValues, NoisyData, fit_baseline
 from elastocal.diagnosis.component_families import (
+    drifts,
     line_families,
     sharpened,
+    shorter,
     whole_families,
     with_multiples,
 )
-from elastocal.diagnosis.component_search import completed, hidden_fellows
+from elastocal.diagnosis.component_search import (
+    completed,
+    hidden_fellows,
+    with_shorter_drifts,
+)
 from elastocal.diagnosis.components import PRESENT, Pool, fit_sum, log_odds, presence_cost
 from elastocal.diagnosis.diagnosis_data import diagnosis_data_of
 from elastocal.diagnosis.hypotheses import possible
@@ -112,3 +119,27 @@ def test_orders_of_lines_are_found_beside_each_other() -> None:
     orders = [value for key, value in whole.settings if not key.startswith("order_sd")]
     assert family is one and orders == pytest.approx([order, 2 * order, 3 * order])
     assert not whole_families(dataset, [whole])
+
+
+@pytest.mark.parametrize("share", [0.07, 0.6])
+def test_a_drift_is_as_fast_as_the_readings_show(share: float) -> None:
+    """Of the campaign's time; one that a slow drift explains stays as it is."""
+    model, table = campaign(n=60)
+    base = fit_baseline(model, table)
+    dataset = diagnosis_data_of(base, possible(model, table)[0])
+    (slow,) = drifts(dataset)
+    span = float(np.ptp(table.time))
+    fast = slow
+    while (finer := shorter(dataset, fast, fast.lengths[0])) is not None:
+        assert finer.lengths[0] < fast.lengths[0] and finer.width > fast.width
+        fast = finer
+    spread = 2 * np.sqrt(fast.shares(np.log(share * span))[0])
+    drift = fast.columns @ (spread * np.random.default_rng(2).normal(size=fast.width))
+    data = replace(dataset.data, r=dataset.data.r + drift)
+    begun = fit_sum(data, [slow], dataset.noise, refit_noise=False)
+    found = with_shorter_drifts(dataset, begun)
+    if share > np.exp(slow.lengths[0]) / span:
+        assert found is begun
+    else:
+        assert found.score > begun.score + 10
+        assert np.exp(found.sizes.length[0]) == pytest.approx(share * span, rel=0.5)

@@ -7,6 +7,7 @@ import cell_keys_page
 import commands_page
 import criteria_page
 import effects_page
+import measured_page
 import pytest
 import typer
 
@@ -85,3 +86,9 @@ def test_links_out_of_the_documentation_become_paths():
     assert "[files](file-formats.md#y)" in after and "![](../x.png)" in after
     inside = "[formats](../file-formats.md)"
     assert hook.links_inside(inside, "explanation/chain.md") == inside
+
+
+def test_the_measured_page_is_what_the_studies_wrote():
+    assert measured_page.PAGE.read_text(encoding="utf-8") == measured_page.page(), (
+        "run python docs/scripts/measured_page.py"
+    )

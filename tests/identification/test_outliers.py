@@ -1,8 +1,6 @@
 """Faulty readings: none invented, the gross ones found, nothing dropped in silence."""
 
-import importlib
 from dataclasses import replace
-from types import SimpleNamespace
 
 import numpy as np
 import pytest
@@ -20,14 +18,13 @@ from support.calibration import (
 )
 from support.cells import random_poses
 
+from elastocal.cell.arm_description import EffectChoice
 from elastocal.identification import Options, blocks, least_trimmed_squares, majority
 from elastocal.identification.identify import identify
-from elastocal.identification.mistakes import UNHEARD
 from elastocal.identification.outliers import FALSE_ALARM
 from elastocal.identification.robust_core import median_scale
 from elastocal.model import Model
 
-module = importlib.import_module("elastocal.identification.identify")
 SIGMA = 5e-5
 
 
@@ -272,28 +269,20 @@ def test_blocks_of_lines():
     assert blocks([2, 5, 8], gap=3) == [(2, 8)]
 
 
-@pytest.mark.parametrize("sure", [True, False])
-def test_readings_are_taken_back_for_a_value_no_arm_has_but_not_for_one_hardly_determined(
-    monkeypatch, sure
-):
-    model = Model.assembled(planar_chain(), cell_of(GEOMETRY))
-    k = next(i for i, p in enumerate(model.parameters) if p.effect == "joint_offset")
-    size = model.parameters[k].typical
-    far = model.nominal.copy()
-    far[k] += 1.1 * UNHEARD * size
-    std = (0.01 if sure else 1.0) * size
-
-    def fitted(x):
-        reduction = SimpleNamespace(kept=np.array([k]))
-        covariance = SimpleNamespace(std=np.array([std]))
-        return SimpleNamespace(
-            solution=SimpleNamespace(fit=SimpleNamespace(x=x), reduction=reduction),
-            intervals=SimpleNamespace(covariance=covariance),
-        )
-
-    set_apart, all_of_them = fitted(far), fitted(model.nominal)
-    monkeypatch.setattr(module, "run_method", lambda *given: all_of_them)
-    every = SimpleNamespace(problem=SimpleNamespace(model=model))
-    given = (every, None, None, None, Options(), lambda text: None)
-    kept = module._kept_where_sensible(set_apart, *given)
-    assert kept is (all_of_them if sure else set_apart)
+@pytest.mark.parametrize("missing", [True, False])
+def test_readings_that_a_missing_effect_explains_are_not_set_apart(missing):
+    chain = random_chain(6)
+    model = Model.assembled(chain, cell_of(GEOMETRY))
+    real = model.with_effects((*model.cell.model.effects, EffectChoice("hysteresis", "joint2")))
+    rng = np.random.default_rng(5)
+    approach = np.where(rng.random((60, chain.n_joints)) < 0.5, -1.0, 1.0)
+    approach[:, 1] = np.where(np.arange(60) < 4, -1.0, 1.0)  # four poses come from the other side
+    plan = replace(table_at(random_poses(chain, 60, 5)), approach=approach)
+    x = true_values(real, rng)
+    x[real.names.index("joint2.hysteresis")] = 2e-3 if missing else 0.0
+    table = measured(real, plan, x, SIGMA, rng)
+    if not missing:  # as many readings are off by as much, but by nothing that an arm does
+        table.position[:4] += rng.normal(size=(4, 3)) * 1e-3
+    fit = identify(model, table)
+    assert bool(fit.faulty) == (not missing)
+    assert any("hysteresis of joint2" in text for text in fit.warnings) == missing

@@ -1,5 +1,6 @@
 """Which parameters the data determine, on arms whose redundancies are known by name."""
 
+from dataclasses import replace
 from functools import lru_cache
 
 import numpy as np
@@ -23,7 +24,7 @@ from support.cells import choices, kr270_chain, random_poses
 from support.parts import SIGMA, arm, solved
 
 from elastocal.cell.arm_description import Nominal
-from elastocal.identification import reduce
+from elastocal.identification import Options, reduce
 from elastocal.identification import solve as solving
 from elastocal.identification.identify import identify
 from elastocal.identification.solve import STRUCTURAL, solve
@@ -369,3 +370,15 @@ def test_a_wider_set_that_is_singular_where_it_comes_to_rest_is_not_preferred(mo
     after = solve(problem)
     assert len(asked) > 1
     np.testing.assert_array_equal(after.reduction.kept, before.reduction.kept)
+
+
+def test_readings_of_one_precise_axis_show_more_than_equal_weights_do():
+    """What two noisy axes hide is chosen by the weights that are found, and held no longer."""
+    model, rng = Model.assembled(random_chain(3), cell_of(GEOMETRY)), np.random.default_rng(1)
+    truth = true_values(model, rng, anywhere=False)
+    plan = table_at(random_poses(model.chain, 30, 0))
+    exact = measured(model, plan, truth, 0.0, rng)
+    noise = np.array([2e-5, 1e-3, 1e-3]) * rng.normal(size=exact.position.shape)
+    read = replace(exact, position=exact.position + noise)
+    equal, own = (identify(model, read, Options(noise=kind)) for kind in ("independent", "axis"))
+    assert len(own.determined) > len(equal.determined)

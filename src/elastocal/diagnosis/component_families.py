@@ -118,6 +118,23 @@ def drifts(dataset: DiagnosisData) -> Iterator[Component]:
         yield from (_field_component(dataset, effect, w, "time") for w in places if w == "base")
 
 
+def shorter(dataset: DiagnosisData, c: Component, log_length: float) -> Component | None:
+    """A drift that varies over less time than its shortest so far, where that is its length; None
+    where it is not, or no shorter one shows between the readings' times.
+
+    A campaign is as long as one likes, and what shares of it the base moves over nobody knows.
+    """
+    shortest, time = math.exp(c.lengths[0]), dataset.table.time
+    if c.follows != "time" or time is None or log_length > c.lengths[0] + AT_END:
+        return None
+    resolved = RESOLVED * float(np.ptp(time)) / len(np.unique(time))
+    share = shortest / float(np.ptp(time)) / SHORTER
+    if shortest / SHORTER < resolved or share < LEAST_SHARE:
+        return None
+    assert isinstance(c.effect, ResidualField)
+    return _field_component(dataset, c.effect, c.where, "time", share)
+
+
 # What is looked for beside those: families of lines of a joint's error, and smooth fields.
 #
 # A wheel that turns N times per turn of the joint makes lines at N and its multiples: sought
@@ -389,6 +406,9 @@ def _family_component(dataset: DiagnosisData, family: LineFamily) -> Component:
 # Smooth fields.
 
 FIELD_LENGTHS = (0.25, 1.5)  # of the range of what a field follows
+# What a drift's shortest length is divided by where it is not short enough, the least share of a
+# campaign, for which it takes forty waves, and of a length's logarithm: as good as its end.
+SHORTER, LEAST_SHARE, AT_END = 2.0, 0.03, 0.05
 
 
 def _beside(
@@ -447,14 +467,15 @@ def _field(
 
 
 def _field_component(
-    dataset: DiagnosisData, effect: ResidualField, where: str, name: str
-) -> Component:
-    settings = _field_settings(dataset, name, FIELD_LENGTHS[0])
+    dataset: DiagnosisData, effect: ResidualField, where: str, name: str,
+    shortest: float = FIELD_LENGTHS[0],
+) -> Component:  # fmt: skip
+    settings = _field_settings(dataset, name, shortest)
     span = settings[f"field_{name}_high"] - settings[f"field_{name}_low"]
     cell = cell_with(dataset.base.model.cell, where, settings)
     (course,) = effect.courses(where, dataset.base.model.chain, cell)
     columns = driven_columns(dataset, effect, where, settings) * MOTION
-    low, high = (math.log(share * span) for share in FIELD_LENGTHS)
+    low, high = (math.log(share * span) for share in (shortest, FIELD_LENGTHS[1]))
     ranges = {k: v for k, v in settings.items() if k.endswith(("low", "high"))}
     return Component(
         "time" if name == "time" else "pose", effect, where, columns, MOTION, name, course.waves,

@@ -20,6 +20,7 @@ from elastocal.diagnosis.component_families import (
     joint_curves,
     line_families,
     sharpened,
+    shorter,
     sought_anew,
     whole_families,
     with_multiples,
@@ -94,6 +95,7 @@ def search_components(
         progress("families of lines beside the components")
         found = _with_lines(full, found)
     progress("what shows now that the noise is smaller")
+    found = with_shorter_drifts(full, found)
     again = with_returned(found, every)
     if again is not found and len(full.blocks.member) <= FEW_POSES:
         again = with_returned(_with_lines(full, again), every)
@@ -105,7 +107,7 @@ def search_components(
             break
         found = wider
     progress("what can be left out")
-    found = _spared(found)
+    found = with_shorter_drifts(full, _spared(found))
     if len(full.blocks.member) <= FEW_POSES:
         found = _with_all_multiples(full, completed(found, both))
     return full, found, hidden_fellows(found, others)
@@ -174,6 +176,19 @@ def _with_lines(dataset: DiagnosisData, found: FittedSum) -> FittedSum:
             break
         found = wider if many else _tuned(dataset, wider)
     return found if many else _reviewed(dataset, found)
+
+
+def with_shorter_drifts(dataset: DiagnosisData, found: FittedSum) -> FittedSum:
+    """The sum with drifts that vary over as short a time as the readings show."""
+    before = found
+    while True:
+        lengths = zip(found.components, found.sizes.length.tolist(), strict=True)
+        pairs = [(c, short) for c, at in lengths if (short := shorter(dataset, c, at)) is not None]
+        gone, more = ([pair[k] for pair in pairs] for k in (0, 1))
+        fitted = exchanged(found, gone, more, refit_noise=False) if pairs else found
+        if fitted.score <= found.score + GAINED:
+            return found if found is before else _refitted(found)
+        found = fitted
 
 
 def with_returned(found: FittedSum, components: Sequence[Component]) -> FittedSum:

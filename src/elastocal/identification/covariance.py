@@ -25,7 +25,7 @@ class Covariance:
     is known, 0 where the estimator cannot tell it (the interval is then unbounded).  The interval
     of a combination Cx needs its own dof: pass B C⁻¹ to the estimator, whose result then refers
     to Cx.  `among`: where it is the mean of covariances under several models, their weights and
-    matrices.
+    matrices; `dof` then is that of `tails`.
     """
 
     kind: str
@@ -39,23 +39,30 @@ class Covariance:
         """Standard deviations (p,); infinite where `dof` is 0."""
         return np.where(self.dof > 0, np.sqrt(np.diag(self.matrix)), np.inf)
 
-    def dof_of(self, rows: Array) -> Array:
-        """Degrees of freedom (n,) of `variance_of` the combinations rows (n, k, p).
+    def tails(self, rows: Array) -> tuple[Array, Array]:
+        """Degrees of freedom (n,) of `variance_of` the combinations rows (n, k, p), which a typical
+        parameter has, and the share (n,) of that variance which is the squared scale of t.
 
-        Satterthwaite's 2 v²/var(v̂): what a typical parameter has, and what models differ by.
+        Where it is a mean over models, of weights w and variances v_m, normal errors mixed in these
+        shares have the variance v = Σ w v_m and the kurtosis 3 (1 + 2 x), x = Σ w (v_m − v)²/2v².
+        The same two has t with f = 4 + 1/x degrees of freedom and the squared scale v (f − 2)/f;
+        with v itself for the latter, what the models differ by would count twice.
         """
         typical = float(np.median(self.dof)) if len(self.dof) else np.inf
-        if not self.among:
-            return np.full(len(rows), typical)
+        x = self._apart(rows)
+        unsure = 1 / max(typical, 1e-300) + x / (1 + 4 * x)
+        dof = np.divide(1, unsure, out=np.full(len(x), np.inf), where=unsure > 0)
+        return dof, (1 + 2 * x) / (1 + 4 * x)
+
+    def _apart(self, rows: Array) -> Array:
+        """x (n,) of the combinations `rows`: by how much the models differ."""
         v = np.maximum(variance_of(rows, self.matrix), 1e-300)
-        between = sum(
-            (w * (variance_of(rows, matrix) - v) ** 2 for w, matrix in self.among),
-            np.zeros(len(v)),
-        )
-        return np.asarray(1 / (1 / max(typical, 1e-300) + between / (2 * v**2)))
+        parts = (w * (variance_of(rows, matrix) / v - 1) ** 2 / 2 for w, matrix in self.among)
+        return sum(parts, np.zeros(len(v)))
 
     def interval(self, x: Array, level: float = 0.95) -> Array:
-        """x_j ± t_{dof_j}((1 + level)/2) · std_j as (p, 2), for the estimate x (p,).
+        """x_j ± t_{dof_j}((1 + level)/2) · std_j as (p, 2), for the estimate x (p,); std_j by the
+        share of `tails`.
 
         Raises InputError where x does not match or `level` is not between 0 and 1.
         """
@@ -64,7 +71,8 @@ class Covariance:
             x.shape == self.dof.shape,
             f"the covariance is of {self.dof.size} parameters, but x has shape {x.shape}",
         )
-        half = t_quantile(level, self.dof) * self.std
+        share = self.tails(np.eye(len(x))[:, None])[1] if self.among else 1.0
+        half = t_quantile(level, self.dof) * self.std * np.sqrt(share)
         return np.column_stack([x - half, x + half])
 
 

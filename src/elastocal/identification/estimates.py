@@ -28,7 +28,7 @@ from elastocal.identification.residuals import (
 )
 from elastocal.identification.result import Calibration, Combination, Estimate
 from elastocal.identification.scrutiny import MOST_NUMBERS
-from elastocal.identification.solve import Solution, residual_sigma
+from elastocal.identification.solve import Solution, bent, residual_sigma
 from elastocal.model.arm import Parameter
 from elastocal.model.calibrated import ShownPoses
 from elastocal.model.manipulator import Model
@@ -184,7 +184,7 @@ def _estimates(
     model: Model, solution: Solution, method: MethodResult, left_out: set[int]
 ) -> tuple[tuple[Estimate, ...], tuple[Combination, ...]]:
     reduction, x, intervals = solution.reduction, solution.fit.x, method.intervals
-    std, dof = intervals.covariance.std, intervals.covariance.dof
+    std, dof, bends = intervals.covariance.std, intervals.covariance.dof, bent(solution)
     partners: dict[int, list[str]] = {int(d): [] for d in reduction.dropped}
     found: dict[int, Estimate] = {}
     combinations = []
@@ -197,7 +197,8 @@ def _estimates(
         parameter = model.parameters[c]
         terms = reduction.terms(k, solution.sizes, std[k])
         value = float(x[c])
-        spread, ci = reduction.widened(k, solution.sizes, std[k], value, intervals.ci95[k])
+        ends = intervals.ci95[k]
+        spread, ci = reduction.widened(k, solution.sizes, std[k], value, ends, bends[k])
         for d in terms:
             partners[d].append(parameter.name)
         if terms:

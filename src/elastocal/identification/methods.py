@@ -29,7 +29,14 @@ from elastocal.identification.residuals import held_out_residual, rms_3d
 from elastocal.identification.robust import robust_fit
 from elastocal.identification.smooth_fit import fit_smooth, with_functions_free
 from elastocal.identification.smooth_part import SmoothPart
-from elastocal.identification.solve import Problem, Solution, fit_kept, held_at_bounds, heldout_of
+from elastocal.identification.solve import (
+    Problem,
+    Solution,
+    chosen_again,
+    fit_kept,
+    held_at_bounds,
+    heldout_of,
+)
 from elastocal.identification.weighted_problem import Weights
 from elastocal.model.manipulator import Model
 from elastocal.model.observations import Observations, subset
@@ -55,8 +62,8 @@ def _adapted(
     `every` holds all observations, `sound` the fit to those that are not `faulty` (N,) at equal or
     stated weights.  At its values readings are screened, noise model and faulty readings settled
     (`noise_choice.settle`) and the kept parameters fitted anew with the weights found, until
-    neither changes.  Where other readings turn out good than `sound` was fitted to, its parameters
-    are chosen again for these.
+    neither changes nor more parameters show under these weights.  Where other readings turn out
+    good than `sound` was fitted to, its parameters are chosen again for these.
     """
     start, good = sound, ~faulty
     for _ in range(RESTARTS):
@@ -78,7 +85,7 @@ def _settled(
     solution, everything = start, np.ones(len(observed.lead), dtype=bool)
     readings = _linearised(model, observed, start.fit.x, kept, kind)
     now = everything if good is None else outlier_screening(readings, readings.e, good)
-    for _ in range(ROUNDS):
+    for left in reversed(range(ROUNDS)):
         before = now
         if good is None:
             noise = estimate_noise(readings, asked)
@@ -90,7 +97,13 @@ def _settled(
         readings = _linearised(model, observed, solution.fit.x, kept, kind)
         moved = np.abs(solution.fit.x[kept] - expected) / noise.covariance.std
         if moved.max(initial=0.0) < SETTLED and np.array_equal(now, before):
-            break
+            # Weights that make light of what is noisy may show more than those of the first fit.
+            other = noise.kind not in FIRST and left > 0
+            more = chosen_again(solution) if other else start.reduction
+            if len(more.kept) <= len(kept):
+                break
+            start, kept = replace(start, reduction=more), more.kept
+            readings = _linearised(model, observed, solution.fit.x, kept, kind)
     # One that ended at a bound is held there and no longer a column.
     fitted = readings.take(now).of_columns(np.isin(kept, solution.reduction.kept))
     final = over_times(estimate_noise(fitted, noise.kind, noise), fitted)
@@ -98,6 +111,7 @@ def _settled(
     return solution, final, now
 
 
+FIRST = ("independent", "stated")  # noise whose weights are those of the first fit
 OF_READINGS = "auto, of readings"  # the best noise model but those that know the arm's visits
 
 

@@ -567,10 +567,10 @@ def _not_fitted(found: NoiseFit, rest: Readings, own: Array) -> Array:
     F = found.columns(rest).copy()
     d, spread = rest.e - F @ found.every, own.copy()
     each = np.arange(len(rest))[:, None]
-    for effect, variance in zip(fit.shared, fit.common, strict=True):
+    for effect, variance in fit.deviations:
         mine = effect.of(rest)
         spread += variance * mine.product(each, mine, each)[:, 0, :, 0]
-    if fit.shared:
+    if fit.deviations:
         for w in fit.state.whitened:
             here, u = _common(fit, w, rest)
             back = u.transpose(0, 2, 1)
@@ -594,7 +594,7 @@ def _common(fit: Reml, w: Whitened, rest: Readings) -> tuple[tuple[IntArray, Int
     here = np.flatnonzero(mates >= 0)
     members = w.stack.sets[mates[here]]  # (n, sets)
     k = np.zeros((len(here), members.shape[1] * size, size))
-    for effect, variance in zip(fit.shared, fit.common, strict=True):
+    for effect, variance in fit.deviations:
         both = effect.product(members, effect.of(rest), here[:, None])
         k += variance * both.reshape(k.shape)
     return (here, mates[here]), w.inverse[mates[here]] @ k
@@ -740,7 +740,7 @@ def weights_of(noise: NoiseFit, readings: Readings) -> Weights:
     """Weights of the readings (N,) under an estimated noise; whitened residuals have size 1."""
     n, size = len(readings), readings.size
     covariance = block_diagonal(own_noise(noise.fit, readings)[0])
-    for effect, variance in zip(noise.fit.shared, noise.fit.common, strict=True):
+    for effect, variance in noise.fit.deviations:
         if variance <= 0:
             continue
         Z = effect.of(readings).columns()

@@ -190,7 +190,8 @@ class Structure:
     `index` (C, L) into the `names` of the variances θ, in m² (rad²); `matrix` (C, L, size, size)
     for a single reading.  The set's mean has that covariance with `mean_matrix` in its place.
     `shrunk` says that the variances are many and share a prior (see shrinkage).  Where there is a
-    course in time, it is `lasting` so long (`with_drift`) and its coefficients' sets come last.
+    course in time, it is `lasting` so long (`with_drift`), its coefficients' sets come last, and
+    what changes `faster`, common to a visit, has the variances of the course.
     """
 
     name: str
@@ -202,6 +203,7 @@ class Structure:
     mean_matrix: Array
     shrunk: bool = False
     lasting: float | None = None
+    faster: tuple[SharedEffect, ...] = ()
 
     @property
     def n_own(self) -> int:
@@ -466,7 +468,7 @@ class SharedEffect:
 
     Sets are of one unit where they agree in the labels `by`; at an unit of −1 there is nothing.  A
     joint that settles elsewhere at each visit is the deviation of a visit with ℓ = ∂(reading)/∂q of
-    the `joints`.
+    the `joints`; what is left of a course so long `lasting`, one along the axes.
     """
 
     name: str
@@ -475,11 +477,14 @@ class SharedEffect:
     loading: Array
     axes: Array
     joints: tuple[int, ...] = ()
+    lasting: float = 0.0
 
     def of(self, readings: Readings) -> SharedEffect:
         """The same deviation for single readings (N in the place of C)."""
         if self.joints:
             return _of_joints(self.name, readings, self.joints)
+        if self.lasting:
+            return _of_course(self.name, readings, self.lasting, self.axes)
         return _common(self.name, self.by, readings, self.axes)
 
     def columns(self) -> sparse.csr_array:
@@ -585,13 +590,23 @@ def _of_joints(name: str, labelled: RepeatSets | Readings, joints: tuple[int, ..
 DRIFT = "drift in time"
 
 
+def _of_course(
+    name: str, labelled: RepeatSets | Readings, lasting: float, axes: Array
+) -> SharedEffect:
+    record = labelled.visits
+    assert record is not None
+    loading = record.faster(lasting)[:, :, None, None] * np.diag(axes)[:, axes > 0]
+    return SharedEffect(name, (VISIT,), record.visit, loading, axes, lasting=lasting)
+
+
 def with_drift(structure: Structure, lasting: float) -> Structure:
     """The structure with a course in time common to all readings, of unknown variance.
 
     The course's coefficients (`VisitRecord.waves`) are columns of
     B, along x, y and z (and of rotations), which readings of zero with the unknown variance hold:
     restricted likelihood is then the same as that of the course taken for noise (Henderson 1975),
-    and nothing that is as large as the table squared is formed.
+    and nothing that is as large as the table squared is formed.  What changes faster than these
+    waves is a deviation of each visit.
     """
     sets = structure.sets
     assert sets.visits is not None
@@ -621,7 +636,9 @@ def with_drift(structure: Structure, lasting: float) -> Structure:
     index = np.zeros((C + k, L), dtype=np.int64)
     index[:C, : structure.index.shape[1]] = structure.index
     index[C:, : len(kinds)] = K + np.arange(len(kinds))
-    parts = np.array([np.diag(np.isin(np.arange(size), kind).astype(float)) for kind in kinds])
+    along = [np.isin(np.arange(size), kind).astype(float) for kind in kinds]
+    parts = np.array([np.diag(axes) for axes in along])
+    faster = [_of_course(n, sets, lasting, a).padded(k) for n, a in zip(names, along, strict=True)]
 
     def padded(matrix: Array) -> Array:
         out = np.zeros((C + k, L, size, size))
@@ -632,7 +649,7 @@ def with_drift(structure: Structure, lasting: float) -> Structure:
     return replace(
         structure, names=(*structure.names, *names), sets=grown, index=index,
         matrix=padded(structure.matrix), mean_matrix=padded(structure.mean_matrix),
-        lasting=lasting,
+        lasting=lasting, faster=tuple(faster),
     )  # fmt: skip
 
 

@@ -239,14 +239,16 @@ class Position:
     """Where the tool is at n poses, and how sure that is; lengths in m, in the data's frame.
 
     `position` (n, 3).  `covariance` (n, 3, 3) of the place about which visits scatter: estimates,
-    parameters left open and lack of fit, known with `dof` (n,) degrees of freedom; `visit`
-    (n, 3, 3): the scatter of a single visit besides, as far as the noise model has it.
+    parameters left open and lack of fit, known with `dof` (n,) degrees of freedom, of which a
+    `share` (n,) is the scale of F (`Covariance.tails`); `visit` (n, 3, 3): the scatter of a single
+    visit besides, as far as the noise model has it.
     """
 
     position: Array
     covariance: Array
     visit: Array
     dof: Array
+    share: Array
 
     def half_axes(self, level: float = 0.95, visit: bool = False) -> Array:
         """Half axes (n, 3), the longest first, of the ellipsoid that holds the tool with
@@ -256,7 +258,7 @@ class Position:
         return normal * np.sqrt(self._quantile(level) / special.chdtri(3, 1 - level))[:, None]
 
     def _quantile(self, level: float) -> Array:
-        return np.asarray(3 * special.fdtri(3, np.clip(self.dof, 1, 1e9), level))
+        return np.asarray(3 * self.share * special.fdtri(3, np.clip(self.dof, 1, 1e9), level))
 
     def holds(self, places: Array, level: float = 0.95, visit: bool = False) -> NDArray[np.bool_]:
         """Whether the regions of that `level` hold the places (n, 3)."""
@@ -292,7 +294,7 @@ def position_at(
     if spread.among:
         known = [arm.model.names.index(name) for name in arm.determined]
         moved = tool.sensitivity(rows, q)[..., known]
-    return Position(place, found.total, visit, spread.dof_of(moved))
+    return Position(place, found.total, visit, *spread.tails(moved))
 
 
 @dataclass(frozen=True)
@@ -483,9 +485,9 @@ def predicted_error(
     half = vector * np.sqrt(np.maximum(value, 0.0))
     z = rng.standard_normal((DRAWS, len(G)))
     inflated = np.ones(DRAWS) if excess is None else excess.inflated
-    dof = float(spread.dof_of((known * each).reshape(1, -1, n))[0])
+    (dof,), (share,) = spread.tails((known * each).reshape(1, -1, n))
     wide = _chi2(max(int(dof), 1), rng) if np.isfinite(dof) else np.ones(DRAWS)
-    z[:, :n] *= np.sqrt(wide * inflated)[:, None]
+    z[:, :n] *= np.sqrt(share * wide * inflated)[:, None]
     squares = ((z @ half) ** 2).sum(axis=1)
     lacking = None if excess is None else float(excess.squared.mean())
     squares = squares if excess is None else squares + excess.squared

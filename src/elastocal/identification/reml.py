@@ -56,7 +56,7 @@ class Stack:
 def stacks(structure: Structure, shared: tuple[SharedEffect, ...]) -> list[Stack]:
     """The clusters of a structure: a configuration where effects are shared, else a set."""
     sets = structure.sets
-    label = sets.configuration if shared else np.arange(len(sets))
+    label = sets.configuration if shared or structure.faster else np.arange(len(sets))
     _, cluster, count = np.unique(label, return_inverse=True, return_counts=True)
     order = np.argsort(cluster, kind="stable")
     starts = np.concatenate([[0], np.cumsum(count)[:-1]])
@@ -64,7 +64,8 @@ def stacks(structure: Structure, shared: tuple[SharedEffect, ...]) -> list[Stack
     size, p = sets.e.shape[1], sets.B.shape[2]
     for m in np.unique(count):
         groups = np.flatnonzero(count == m)
-        n, parts = int(m) * size, structure.index.shape[1] * int(m) + len(shared)
+        more = len(shared) + len(structure.faster)
+        n, parts = int(m) * size, structure.index.shape[1] * int(m) + more
         step = max(1, MOST_NUMBERS // (parts * n * (n + p) + parts * p * p))
         for first in range(0, len(groups), step):
             members = order[starts[groups[first : first + step], None] + np.arange(m)]
@@ -78,10 +79,12 @@ def _stack(structure: Structure, shared: tuple[SharedEffect, ...], members: IntA
     size, p = sets.e.shape[1], sets.B.shape[2]
     index, part = _own(structure, members)
     n_own = len(structure.names)
-    for k, effect in enumerate(shared):
+    # What is left of a course has its variances, which are the last of the structure's.
+    first = n_own - len(structure.faster)
+    for k, effect in enumerate((*structure.faster, *shared), first):
         block = effect.product(members, effect, members)
         part = np.concatenate([part, block.reshape(G, 1, m * size, m * size)], axis=1)
-        index = np.concatenate([index, np.full((G, 1), n_own + k)], axis=1)
+        index = np.concatenate([index, np.full((G, 1), k)], axis=1)
     B = sets.B[members].reshape(G, m * size, p)
     e = sets.e[members].reshape(G, m * size)
     return Stack(members, B, e, index, part, n_own + len(shared))
@@ -331,6 +334,13 @@ class Reml:
     @property
     def common(self) -> Array:
         return self.state.theta[len(self.structure.names) :]
+
+    @property
+    def deviations(self) -> list[tuple[SharedEffect, float]]:
+        """All that readings share beside the waves of a course, and its variance."""
+        effects = (*self.structure.faster, *self.shared)
+        values = self.state.theta[len(self.state.theta) - len(effects) :]
+        return list(zip(effects, values.tolist(), strict=True))
 
 
 def reml(
@@ -620,20 +630,19 @@ def kenward_roger(fit: Reml, combinations: Array | None = None) -> tuple[Array, 
 def mean_covariance(fits: list[Reml], T: Array, like: Covariance) -> Covariance:
     """Σ = Σ_m w_m Σ_m of the parameters T (p, p) times those of the `fits`, which come first there.
 
-    w_m ∝ the restricted likelihoods.  The variances v_m differ most for base and tracker: degrees
-    of freedom are Satterthwaite's 2 v²/var, var = Σ_m w_m (2 v_m²/f_m + (v_m − v)²).
+    w_m ∝ the restricted likelihoods.  To what the degrees of freedom f_m leave unknown,
+    Σ_m w_m/f_m, comes what the models differ by (`Covariance.tails`), most for base and tracker.
     """
     level = np.array([fit.log_likelihood for fit in fits])
     weight = np.exp(level - level.max()) / np.exp(level - level.max()).sum()
     rows = [np.pad(T, ((0, 0), (0, len(fit.state.x) - len(T)))) for fit in fits]
     found = [kenward_roger(fit, own) for fit, own in zip(fits, rows, strict=True)]
     matrices, dof = (np.array(part) for part in zip(*found, strict=True))
-    matrix, each = np.tensordot(weight, matrices, 1), np.diagonal(matrices, axis1=1, axis2=2)
-    v = np.diag(matrix)
-    spread = weight @ (2 * each**2 / dof + (each - v) ** 2)
-    mean = np.divide(2 * v**2, spread, out=np.full(len(v), np.inf), where=spread > 0)
     among = tuple(zip(weight.tolist(), matrices, strict=True))
-    return replace(like, matrix=matrix, dof=mean, among=among)
+    mean = replace(like, matrix=np.tensordot(weight, matrices, 1), among=among)
+    between = 1 / replace(mean, dof=np.full(len(T), np.inf)).tails(np.eye(len(T))[:, None])[0]
+    left = weight @ (1 / dof) + between
+    return replace(mean, dof=np.divide(1, left, out=np.full(len(left), np.inf), where=left > 0))
 
 
 # Many variances from few readings each: shrink their logarithms towards one another.

@@ -57,7 +57,8 @@ class Reduction:
     The data determine β_k = X_k + Σ_d mixing[k, d] X_d, the kept parameter with what it stands
     for.  `invisible` are dropped parameters that move no reading at all,
     `at_bound` those that a bounded fit holds at their bound, `with_prior` those that were no part
-    of this choice: a prior makes up for what the readings do not say of them.
+    of this choice: a prior makes up for what the readings do not say of them.  `threshold`: what
+    it takes to be kept (`reduce`).
     """
 
     kept: NDArray[np.int64]
@@ -66,6 +67,7 @@ class Reduction:
     invisible: NDArray[np.int64]
     at_bound: NDArray[np.int64] = field(default_factory=lambda: np.zeros(0, dtype=np.int64))
     with_prior: NDArray[np.int64] = field(default_factory=lambda: np.zeros(0, dtype=np.int64))
+    threshold: float = 0.0
 
     def seen(self, free: IntArray, R: Array, sizes: Array) -> Reduction:
         """Without the kept parameters that move nothing any more, R (…, free) being that of the
@@ -96,13 +98,15 @@ class Reduction:
         }
 
     def widened(
-        self, k: int, sizes: Array, std: float, value: float, ci95: Array
+        self, k: int, sizes: Array, std: float, value: float, ci95: Array, bent: float = 0.0
     ) -> tuple[float, tuple[float, float]]:
         """Standard deviation and interval of kept parameter number k at `value`, with what the
         dropped parameters d that are not among `terms` add: √(std² + Σ_d (m_kd s_d)²), their
-        typical deviations s_d being a prior N(0, s_d²)."""
+        typical deviations s_d being a prior N(0, s_d²); and what a combination leaves out by being
+        linear (`bent`)."""
         shift = np.abs(self.mixing[k]) * sizes[self.dropped]
-        wide = float(np.sqrt(1 + ((shift[shift <= std] / std) ** 2).sum())) if std > 0 else 1.0
+        shift = np.append(shift[shift <= std], bent)
+        wide = float(np.sqrt(1 + ((shift / std) ** 2).sum())) if std > 0 else 1.0
         low, high = (float(value + wide * (end - value)) for end in ci95)
         return wide * float(std), (low, high)
 
@@ -146,7 +150,7 @@ def reduce(
         mixing = scaled * sizes[kept][:, None] / sizes[dropped][None, :]
     unseen = np.array([d for d in dropped if not visible[d]], dtype=np.int64)
     return Reduction(np.array(kept, dtype=np.int64), np.array(dropped, dtype=np.int64),
-                     mixing, unseen)  # fmt: skip
+                     mixing, unseen, threshold=threshold)  # fmt: skip
 
 
 def _groups(parameters: tuple[Parameter, ...]) -> list[list[int]]:
@@ -222,7 +226,16 @@ def choose(
             f"{observed.table.source}: the readings do not depend on any parameter of the model; "
             "measure other poses or loads, or choose other effects"
         )
-    return Reduction(free[local.kept], free[local.dropped], local.mixing, free[local.invisible])
+    return replace(
+        local, kept=free[local.kept], dropped=free[local.dropped], invisible=free[local.invisible]
+    )
+
+
+def chosen_again(solution: Solution) -> Reduction:
+    """The choice by the weights and at the values that the solution has come to."""
+    problem, found = solution.problem, solution.fit
+    sigma, threshold = residual_sigma(found, len(found.columns)), solution.reduction.threshold
+    return choose(problem, solution.sizes, free_r_factor(problem, found), sigma, threshold)
 
 
 def fit_kept(
@@ -472,6 +485,36 @@ def sizes_and_check(problem: Problem) -> Array:
     if few:
         check_enough(model, observed, merge(t for t in factors if t is not None).R * sizes[free])
     return sizes
+
+
+BENDS = 8  # draws of what is dropped
+
+
+def bent(solution: Solution) -> Array:
+    """Root mean square (kept,) of what the combinations leave out by being linear.
+
+    The readings determine a nonlinear function of the parameters.  Typical deviations δ of those
+    dropped, with −mixing · δ of those kept, leave them where they are in the first order; what
+    estimates do in the second is found from the mean of the readings at δ and −δ.
+    """
+    problem, found, chosen = solution.problem, solution.fit, solution.reduction
+    kept, dropped = chosen.kept, chosen.dropped
+    none = np.zeros(len(kept))
+    if problem.large or not len(dropped) or not np.array_equal(found.columns, kept):
+        return none
+    typical = np.where(is_placed(problem.model), 0.0, solution.sizes)[dropped]
+    rng, moved = np.random.default_rng(0), -2 * np.tile(found.residual, (BENDS, 1))
+    for k, delta in enumerate(typical * rng.standard_normal((BENDS, len(dropped)))):
+        step = np.zeros(len(found.x))
+        step[dropped], step[kept] = delta, -chosen.mixing @ delta
+        for sign in (1, -1):
+            moved[k] += residual_at(problem.model, problem.parts, found.x + sign * step)
+    if not np.isfinite(moved).all():
+        return none  # so far out the arm has no equilibrium
+    size = solution.sizes[kept]
+    B = problem.weights.apply(found.B * size)
+    step = linalg.lstsq(B, problem.weights.apply(moved.T / 2))[0]
+    return np.asarray(size * np.sqrt((step**2).mean(axis=1)))
 
 
 def tied_fit(problem: Problem, sizes: Array, tolerance: float) -> Fit:

@@ -45,7 +45,7 @@ from elastocal.report.formatting import (
     significant,
     with_ends,
 )
-from elastocal.report.judgement_view import judgement
+from elastocal.report.judgement_view import judgement, warnings_beside
 from elastocal.report.method_and_noise import (
     MOST_TOLD,
     candidate_rows,
@@ -350,7 +350,7 @@ def leading_lines(result: Calibration) -> list[tuple[str, str]]:
     """Label and sentence of what comes first: verdict, errors, what to do, warnings."""
     (verdict, *steps) = judgement(result).lines
     new = [] if result.predicted is None else [("Expected", at_new_poses(result.predicted))]
-    warnings = [("Warning", printable(w)) for w in result.warnings]
+    warnings = [("Warning", text) for text in warnings_beside(result)]
     return [verdict, ("Error (rms)", error_line(result)), *new, *steps, *warnings]
 
 
@@ -744,7 +744,7 @@ def identification_contents(
             "the noise model."
         ),
         "error_line": _sentence(error_line(result)),
-        "warnings": [printable(w) for w in result.warnings],
+        "warnings": warnings_beside(result),
         "budget": None if budget is None else budget_table(result, budget),
         "spread": spread_table(before_and_after(result, budget)),
         "floor": "Nothing says how large the noise alone is."

@@ -302,7 +302,7 @@ def _everywhere_lines(plan: Plan) -> list[tuple[str, str]]:
         text += f", for which ρ₀ may be {100 * e.cap:g} % above the least" if e.cap else ""
     elif plan.criterion == "test_pose":
         text += (
-            f"; {option('elsewhere_cap', '0.05')} finds the least there for 5 % more at the test "
+            f"; {option('elsewhere_cap', 0.05)} finds the least there for 5 % more at the test "
             "poses"
         )
     return [("Elsewhere", f"{text}.")]

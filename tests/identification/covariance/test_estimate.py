@@ -25,6 +25,22 @@ def test_the_quantile_holds_its_level(level):
     np.testing.assert_allclose(inside, level, rtol=1e-9)
 
 
+@pytest.mark.parametrize("sizes", [(1.0, 1.0, 1.0), (0.5, 1.0, 2.0), (0.3, 1.0, 4.0)])
+def test_a_mixture_of_models_holds_what_it_says(sizes):
+    """Errors that are normal with one of several variances: t with their variance and kurtosis."""
+    weights = (0.3, 0.5, 0.2)
+    among = tuple((w, np.diag([s, 1.0])) for w, s in zip(weights, sizes, strict=True))
+    mean = sum(w * C for w, C in among)
+    found = Covariance("x", mean, np.full(2, np.inf), "", among)
+    dof, share = found.tails(np.eye(2)[:, None])
+    assert dof[1] == np.inf and share[1] == 1.0
+    found = Covariance("x", mean, dof, "", among)
+    for level, slack in ((0.95, 0.008), (0.9973, 0.003)):
+        half = found.interval(np.zeros(2), level)[0, 1]
+        beyond = sum(w * 2 * stats.norm.sf(half / np.sqrt(C[0, 0])) for w, C in among)
+        assert beyond == pytest.approx(1 - level, abs=slack)
+
+
 def test_bad_input_is_told():
     found = Covariance("x", np.eye(2), np.full(2, 5.0), "")
     for level in (0.0, 1.0, 95.0, np.nan):

@@ -1,0 +1,269 @@
+"""docs/measured.md, made from what the studies wrote into their own folders.
+
+    python docs/scripts/measured_page.py
+
+Words stand here, figures in the files that studies and benchmarks write or print: a part names
+its file, and where that is longer than the part, the heading whose tables it shows.
+"""
+
+# ruff: noqa: E501
+from __future__ import annotations
+
+import re
+from dataclasses import dataclass
+from pathlib import Path
+
+ROOT = Path(__file__).resolve().parents[2]
+PAGE = ROOT / "docs" / "measured.md"
+STUDIES = "experiment_design"
+
+HEAD = """\
+# What was measured
+
+Made by `docs/scripts/measured_page.py` from what the studies wrote; each table stands under the command that prints it,
+from a checkout. Real arms are public data; where to get them: `experiment_design/real_arms/README.md`.
+"""
+
+TESTED = """\
+## What the tests hold
+
+These are no single figures but bounds that `make test` checks anew each time.
+
+| what | bound | test |
+|---|---|---|
+| B against independent derivatives, every effect and observation | 1e-7 relative | `tests/model/test_derivatives.py` |
+| equilibrium against MuJoCo, KR 270, 2.6 kN | 1 µm | `tests/simulation/test_mujoco_arm.py` |
+| exported arms read back (URDF by pinocchio, MJCF at equilibrium under load by MuJoCo, DH tables) | 1 µm | `tests/export` |
+| NIST reference regressions, certified digits: eleven linear sets by the linear solver | 9; 7 on Filip, Wampler4, Wampler5 | `tests/identification/test_nist_linear.py` |
+| the same through the fit of an arm under estimated noise of one size | 9; 7 on Filip | `tests/identification/test_nist_nonlinear.py` |
+| twelve nonlinear NIST sets through the fit of an arm, from both of NIST's starts | 7 | `tests/identification/test_nist_nonlinear.py` |
+"""
+
+
+@dataclass(frozen=True)
+class Part:
+    """A heading, a sentence, the command, and where its tables stand: file, then heading."""
+
+    title: str
+    says: str
+    command: str
+    file: str
+    under: str = ""
+    tables: int = 0
+
+
+ROOMS: dict[str, tuple[Part, ...]] = {
+    "Real arms": (
+        Part(
+            "Identified",
+            "Poses that no fit has seen, mm (UR5 published: 0.155 for a hybrid method, 2.57 "
+            "uncalibrated; WAM 2.92).",
+            "python experiment_design/real_arms/run.py",
+            f"{STUDIES}/real_arms/result.md",
+        ),
+        Part(
+            "Diagnosed",
+            "Before `diagnose`, what one diagnosis named before it judged all causes together, "
+            "and now, mm; identified with `--test` where there is a second run.",
+            "python experiment_design/real_arms/diagnose.py",
+            f"{STUDIES}/real_arms/diagnosis.md",
+            tables=1,
+        ),
+        Part(
+            "Rows that the tool names as faulty, IRB 120 by cable",
+            "",
+            "python experiment_design/real_arms/faulty_rows.py",
+            f"{STUDIES}/real_arms/faulty_rows.md",
+        ),
+    ),
+    "Intervals and noise": (
+        Part(
+            "Linear campaigns on the KR 270, noise of the paper's Table 1 or a polar tracker",
+            "",
+            "elastocal study experiment_design/coverage",
+            f"{STUDIES}/coverage/result.md",
+        ),
+        Part(
+            "Whole arms, parameters and noise chosen anew in each campaign",
+            "",
+            "elastocal study experiment_design/arm_coverage",
+            f"{STUDIES}/arm_coverage/result.md",
+        ),
+        Part(
+            "How long a drift lasts",
+            "",
+            "python experiment_design/arm_coverage/lasting.py 8 15",
+            f"{STUDIES}/arm_coverage/README.md",
+            "How long a drift lasts",
+            tables=1,
+        ),
+        Part(
+            "The Cramér–Rao bound",
+            "",
+            "elastocal study experiment_design/cramer_rao",
+            f"{STUDIES}/cramer_rao/result.md",
+        ),
+        Part(
+            "What the paper's iterated weights are worth: noise of Table 1",
+            "",
+            "python experiment_design/kr270_reproduction/reproduce.py",
+            f"{STUDIES}/kr270_reproduction/result.md",
+            "What it is worth: noise of Table 1",
+        ),
+        Part(
+            'A verdict that says "trusted at X"',
+            "Arms, sizes, plans and hidden effects drawn at random; "
+            "[how](../experiment_design/verdict/README.md).",
+            "elastocal study experiment_design/verdict",
+            f"{STUDIES}/verdict/result.md",
+        ),
+    ),
+    "Plans": (
+        Part(
+            "As the paper's Table 2, joint limits alone",
+            "",
+            "python experiment_design/kr270_plan/study.py",
+            f"{STUDIES}/kr270_plan/result.md",
+            "KR 270-2, joint limits alone",
+        ),
+        Part(
+            "The same in a work cell with obstacles, hanging load and tracker",
+            "",
+            "python experiment_design/kr270_plan/study.py",
+            f"{STUDIES}/kr270_plan/result.md",
+            "KR 270-2 in a work cell",
+        ),
+        Part(
+            "Table 2 under other assumptions on tool and markers",
+            "",
+            "python experiment_design/kr270_plan/assumptions.py",
+            f"{STUDIES}/kr270_plan/assumptions.md",
+        ),
+        Part(
+            "What a steady drift of 50 µm does, by the order of the poses",
+            "",
+            "python experiment_design/kr270_plan/drift_order.py",
+            f"{STUDIES}/kr270_plan/drift.md",
+        ),
+        Part(
+            "The error elsewhere",
+            "",
+            "python experiment_design/everywhere/study.py",
+            f"{STUDIES}/everywhere/result.md",
+        ),
+        Part(
+            "All subsets of small pools",
+            "",
+            "elastocal study experiment_design/exact_quality",
+            f"{STUDIES}/exact_quality/result.md",
+        ),
+        Part(
+            "Feasible poses and free moves, looked at by MuJoCo",
+            "",
+            "python experiment_design/feasibility_check/check.py",
+            f"{STUDIES}/feasibility_check/result.md",
+        ),
+        Part(
+            "Beside FIGAROH: UR10, its own pool and regressor",
+            "",
+            "python benchmarks/design_peers.py",
+            "benchmarks/README.md",
+            "UR10: 1000 poses",
+            tables=2,
+        ),
+        Part(
+            "Beside pyDOE3 and scipy: KR 270",
+            "",
+            "python benchmarks/design_peers.py",
+            "benchmarks/README.md",
+            "KR 270: 15 poses, pool of 5000",
+            tables=1,
+        ),
+    ),
+    "Diagnosis of simulated arms": (
+        Part(
+            "One withheld effect",
+            "Arms simulated in MuJoCo; [how](../experiment_design/blind_diagnosis/README.md).",
+            "elastocal study experiment_design/blind_diagnosis",
+            f"{STUDIES}/blind_diagnosis/result.md",
+            "Bars",
+        ),
+        Part(
+            "Whole arms",
+            "Lines, eccentricity, sag, compliance, the last move, scatter and drift act at every "
+            "joint at once; the oracle knows structure and orders, `searching` is one who has to "
+            "search for the orders. Arms that nothing had been built on or tried with.",
+            "python experiment_design/blind_diagnosis/whole_arms.py --seed 9 --worlds 12 "
+            "--poses 60 --search",
+            f"{STUDIES}/blind_diagnosis/result_whole.md",
+        ),
+    ),
+    "Speed": (
+        Part("Goals", "", "make bench", "benchmarks/result.md", "Benchmarks: result", 1),
+        Part(
+            "Whole fits beside their peers, UR10, 300 poses",
+            "",
+            "make bench",
+            "benchmarks/result.md",
+            "Truth mdh, 300 poses",
+            tables=1,
+        ),
+        Part(
+            "The verbs on the demo",
+            "",
+            "make bench",
+            "benchmarks/result.md",
+            "The verbs on the demo",
+            tables=1,
+        ),
+    ),
+    "Compensation and export": (
+        Part(
+            "Commands of `compensate` in MuJoCo",
+            "",
+            "python experiment_design/compensation/study.py --arms 3",
+            f"{STUDIES}/compensation/result.md",
+        ),
+        Part(
+            "MuJoCo models as their users have them",
+            "From `init` to `export` in place; [each arm](../experiment_design/mujoco_arms/README.md).",
+            "python experiment_design/mujoco_arms/walk.py",
+            f"{STUDIES}/mujoco_arms/README.md",
+            "From a MuJoCo model",
+            tables=1,
+        ),
+    ),
+}
+
+
+def shown(part: Part) -> str:
+    """What a part shows: a file or what stands under one of its headings, or its first tables."""
+    text = (ROOT / part.file).read_text(encoding="utf-8")
+    pieces = re.split(r"^(#+ .*)$", text, flags=re.M)
+    found = [] if part.under else [pieces[0].strip()]
+    for heading, body in zip(pieces[1::2], pieces[2::2], strict=True):
+        words = heading.lstrip("# ")
+        if not part.under and not heading.startswith("# "):
+            found.append(f"*{words}*")
+        if words.startswith(part.under):
+            found.append(body.strip())
+    blocks = "\n\n".join(b for b in found if b)
+    if not part.tables:
+        return blocks
+    tables = [b for b in blocks.split("\n\n") if b.startswith("|")]
+    return "\n\n".join(tables[: part.tables])
+
+
+def page() -> str:
+    """The whole page."""
+    parts = [HEAD]
+    for room, inside in ROOMS.items():
+        parts.append(f"## {room}\n")
+        for part in inside:
+            says = f"{part.says}\n\n" if part.says else ""
+            parts.append(f"### {part.title}\n\n{says}    {part.command}\n\n{shown(part)}\n")
+    return "\n".join([*parts, TESTED])
+
+
+if __name__ == "__main__":
+    PAGE.write_text(page(), encoding="utf-8")
