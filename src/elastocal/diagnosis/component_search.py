@@ -123,8 +123,8 @@ def about_sum(dataset: DiagnosisData, found: FittedSum) -> DiagnosisData:
     one size here: the eccentricity of a joint, which looks like its sag, must not take the weights.
     """
     sizes = found.sizes.size.copy()
-    for own in found.sums.pool.kinds:
-        sizes[own] = np.median(sizes[own])
+    for kind in found.sums.pool.kinds:
+        sizes[kind] = np.median(sizes[kind])
     widths = [c.width for c in found.components]
     grown = np.repeat(np.exp(2 * (sizes - found.sizes.size)), widths)
     alike = replace(found, variances=found.variances * grown)
