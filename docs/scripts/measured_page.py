@@ -98,6 +98,14 @@ ROOMS: dict[str, tuple[Part, ...]] = {
             tables=1,
         ),
         Part(
+            "What plans promise under nine kinds of noise",
+            "Rms error at the test poses over the one promised; plans of quick effort.",
+            "python experiment_design/arm_coverage/planned.py 200",
+            f"{STUDIES}/arm_coverage/README.md",
+            "What plans promise",
+            tables=1,
+        ),
+        Part(
             "The Cramér–Rao bound",
             "",
             "elastocal study experiment_design/cramer_rao",

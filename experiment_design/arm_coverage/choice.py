@@ -170,6 +170,7 @@ def campaign(s: Setting, full: Reduction, rng: np.random.Generator, found: dict,
     least = s.reduced(s.plain, sigma, 1.0)
     judge("complete set", full)
     judge("minimal set", least)
+    judge("minimal set, by the weights of the noise", s.reduced(s.true, 1.0, 1.0))
     judge("wider where held out better", widened(s, y, least, tested=False))
     judge("wider where a test says so", widened(s, y, least, tested=True))
     judge("prior of typical size", full, 1.0)

@@ -11,6 +11,7 @@ from support.calibration import (
     GEOMETRY,
     binomial_band,
     cell_of,
+    combination_truth,
     covered,
     measured,
     placement,
@@ -382,3 +383,20 @@ def test_readings_of_one_precise_axis_show_more_than_equal_weights_do():
     read = replace(exact, position=exact.position + noise)
     equal, own = (identify(model, read, Options(noise=kind)) for kind in ("independent", "axis"))
     assert len(own.determined) > len(equal.determined)
+
+
+def test_combinations_hold_where_the_readings_are_too_good_for_a_linear_sum():
+    """At 1 µm what a millimetre and a milliradian do together is above the noise."""
+    model, held, plain = Model.assembled(random_chain(3), cell_of(GEOMETRY)), [], []
+    for seed in range(3):
+        rng = np.random.default_rng(seed)
+        truth = true_values(model, rng, anywhere=False)
+        plan = table_at(random_poses(model.chain, 40, seed))
+        found = identify(model, measured(model, plan, truth, 1e-6, rng))
+        for name in found.determined:
+            single = found[name].identifiable
+            value = found[name] if single else found.combination(name)
+            low, high = value.ci95
+            held.append(low <= combination_truth(found, truth, name) <= high)
+        plain.append(covered(found, truth).mean())
+    assert np.mean(plain) < 0.85 < 0.9 < np.mean(held)

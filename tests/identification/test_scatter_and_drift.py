@@ -17,7 +17,7 @@ SIGMA, SCATTER, DRIFT, LASTING = 2e-5, 1e-4, 1e-4, 0.2
 MARKERS = {"M1": np.array([0.3, 0, 0.1]), "M2": np.array([-0.2, 0.2, 0.1])}
 
 
-def identified(scatter=0.0, drift=0.0, timed=True, ordered=False, seed=0):
+def identified(scatter=0.0, drift=0.0, timed=True, ordered=False, stated=True, seed=0):
     """36 poses of an arm whose base and markers are unknown."""
     rng = np.random.default_rng(seed)
     tracker, span = Tracker(noise=CartesianNoise(np.full(3, SIGMA))), 60.0 * 35
@@ -33,6 +33,8 @@ def identified(scatter=0.0, drift=0.0, timed=True, ordered=False, seed=0):
     truth = true_values(model, rng, anywhere=False)
     time = np.repeat(60.0 * np.arange(len(q)), len(MARKERS))
     read = simulate(model, replace(table, time=time), truth, rng)
+    if not stated:
+        model = Model.assembled(model.chain, replace(cell, noise=Unsteadiness()))
     return identify(model, replace(read, time=time if timed else None))
 
 
@@ -89,6 +91,8 @@ def test_without_times_the_order_of_the_rows_stands_for_them_unless_it_is_one_of
     told = identified(drift=DRIFT, timed=False).finding("drift")
     assert told is not None and told.numbers["by"] == "order of the rows"
     assert "record times" in told.remedy
-    along = identified(drift=DRIFT, timed=False, ordered=True)
+    along = identified(drift=DRIFT, timed=False, ordered=True, stated=False)
     assert along.finding("drift") is None
     assert not in_random_order(along.observations.table)
+    # Whoever states one knows that it is there.
+    assert identified(drift=DRIFT, timed=False, ordered=True).finding("drift") is not None

@@ -140,10 +140,11 @@ def test_what_a_plan_needs_to_know_is_asked_for(cell: Cell, said: str) -> None:
         information_of(cell).blocks(TABLE_2, np.full(15, ALL_LOADS))
 
 
+@pytest.mark.parametrize("own", [0.0, 60e-6])
 @pytest.mark.parametrize("observed", ["position", "deflection"])
-def test_joints_that_settle_anew_scatter_simulated_readings_as_planned(observed: str) -> None:
+def test_joints_and_configurations_scatter_readings_as_planned(observed: str, own: float) -> None:
     loads = np.array([[0.0, 0, 0], DOWN])
-    noise = Unsteadiness(np.array([10.0, 20, 30, 100, 5, 0]) * 1e-6)
+    noise = Unsteadiness(np.array([10.0, 20, 30, 100, 5, 0]) * 1e-6, configuration=own)
     cell = replace(cell_for(observed, AXIS, loads=loads), noise=noise)
     information = information_of(cell)
     model, plan = information.model, _plan(information)

@@ -257,7 +257,8 @@ class Unsteadiness:
 
     `joints` (joints,) or (1,), in rad or m: by how much each joint settles elsewhere at each visit.
     `drift` m in each direction: of base or tracker, with the correlation exp(−|t − t′|/`lasting`)
-    of times in s.
+    of times in s.  `configuration` m in each direction: a deviation that all readings of a
+    configuration share, whatever the load.
     """
 
     joints: Scatter = keyed(
@@ -266,6 +267,7 @@ class Unsteadiness:
     )  # fmt: skip
     drift: NonNegative = keyed("a number >= 0 in µm", "drift_um", default=0.0)
     lasting: Positive = keyed("a positive number in s", "lasting_s", default=3600.0)
+    configuration: NonNegative = keyed("a number >= 0 in µm", "configuration_um", default=0.0)
 
     def of_joints(self, n: int) -> Array:
         """Standard deviations (n,) of n joints; InputError where there are others."""

@@ -84,6 +84,11 @@ class NoiseSize:
         return self.name.startswith(COMMON)
 
     @property
+    def of_configuration(self) -> bool:
+        """Whether all readings of a configuration have it in common, whatever load and marker."""
+        return self.name == f"{COMMON} configuration"
+
+    @property
     def drift(self) -> bool:
         """Whether it is what changes in the course of the campaign."""
         return self.name.startswith(DRIFT)

@@ -328,7 +328,9 @@ class Calibration(Result):
         joints = scatter_of(self.noise, self.model.chain.n_joints).joints
         if not joints.any():
             joints = np.zeros(1)
-        return Unsteadiness(joints, drift if lasting else 0.0, lasting or Unsteadiness.lasting)
+        own = next((s.sigma for s in self.noise.sizes or () if s.of_configuration), None) or 0.0
+        lasting, drift = (lasting, drift) if lasting else (Unsteadiness.lasting, 0.0)
+        return Unsteadiness(joints, drift, lasting, own)
 
     @cached_property
     def ordinary(self) -> tuple[Estimate, ...]:
@@ -623,6 +625,7 @@ class Calibration(Result):
             "cell_noise": {
                 "joints_urad": (1e6 * self.unsteadiness.joints).tolist(),
                 "drift_um": _um(self.unsteadiness.drift), "lasting_s": self.unsteadiness.lasting,
+                "configuration_um": _um(self.unsteadiness.configuration),
             },
             "residual_summary": (
                 None if self.residual_summary is None else self.residual_summary.to_json()

@@ -27,8 +27,9 @@ class VisitRecord:
     its time as a share of the campaign's `span` in s; where the table has no times (`timed`), the
     order of the rows stands for them.  `turning` (joints,) says which joints are revolute.  No
     drift of the noise is looked for (`drifts`) where the model itself has what changes with time,
-    and where readings follow each other from pose to neighbouring pose: they err alike because of
-    what the model lacks, and a drift in its place would leave the base as uncertain as it is large.
+    and, unless the cell states one, where readings follow each other from pose to neighbouring
+    pose: they err alike because of what the model lacks, and a drift in its place would leave the
+    base as uncertain as it is large.
     """
 
     visit: IntArray
@@ -79,7 +80,8 @@ def visit_record(model: Model, observed: Observations, x: Array) -> VisitRecord 
     when, span, timed = _when(table)
     turning = np.array([kind != "prismatic" for kind in model.chain.kinds])
     visit = np.where(place, visits(table)[row], -1)
-    drifts = in_random_order(table.take(np.argsort(when, kind="stable")))
+    stated = model.cell.noise.drift > 0
+    drifts = stated or in_random_order(table.take(np.argsort(when, kind="stable")))
     return VisitRecord(visit, moved, share, when[row], turning, timed, span, drifts)
 
 

@@ -148,7 +148,8 @@ def pose_covariance(
     Σ = T Σ_rows Tᵀ / repeats + τ² per load state and direction + J diag(s²) Jᵀ: deflections share
     their unloaded reading; what the arm does not repeat, τ of `[design] repeatability_um` and s of
     the joints of `[noise]`, is common to the markers of a visit.  A pose that is approached from
-    both sides is visited twice.  `x` (parameters,): where J is taken.
+    both sides is visited twice, but what its readings share by `[noise]` remains; deflections do
+    not have that.  `x` (parameters,): where J is taken.
     """
     spec = model.cell.design
     visits = 2 if spec.motion.both_directions else 1
@@ -171,7 +172,12 @@ def pose_covariance(
         settling = settling_joints(model, observed, model.nominal if x is None else x)
         members = np.arange(len(observed.lead)).reshape(n_poses, -1)
         covariance = covariance + settling.product(members, settling, members).reshape(-1, r, r)
-    return covariance / visits
+    covariance = covariance / visits
+    if model.cell.noise.configuration and observed.kind != "deflection":
+        moved = np.diag(np.arange(size) < 3).astype(float)
+        same = np.ones((T.shape[0], T.shape[0]))
+        covariance = covariance + model.cell.noise.configuration**2 * np.kron(same, moved)
+    return covariance
 
 
 def settling_joints(model: Model, observed: Observations, x: Array) -> SharedEffect:

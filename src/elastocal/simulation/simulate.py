@@ -123,9 +123,9 @@ def simulate(
     """Readings of the model at parameter values x for every row, with the cell's noise.
 
     Per-row sigmas of `rows` win over the cell's tracker noise, as when identifying; without
-    either a reading has none.  At each visit joints settle anew, and positions drift, as the
-    cell's [noise] states.  Positions in m in the tracker frame; rotations and distances where the
-    model observes them.
+    either a reading has none.  At each visit joints settle anew, configurations are off, and
+    positions drift, as the cell's [noise] states.  Positions in m in the tracker frame; rotations
+    and distances where the model observes them.
 
     Raises ElastocalError where a pose has no static equilibrium.
     """
@@ -136,13 +136,17 @@ def simulate(
 
 
 def _unsteady(model: Model, rows: Measurements, x: Array, rng: np.random.Generator) -> Measurements:
-    """Readings of joints that settle anew at each visit, by a base or tracker that drifts."""
+    """Readings of joints that settle anew at each visit and of configurations that are off as a
+    whole, by a base or tracker that drifts."""
     cell, n_joints, visit = model.cell, model.chain.n_joints, visits(rows)
     settled, scatter = rows, cell.noise.of_joints(n_joints)
     if scatter.any():
         shift = rng.normal(size=(visit.max(initial=-1) + 1, n_joints)) * scatter
         settled = replace(rows, q=rows.q + shift[visit])
     found = replace(_read(model, settled, x, rng, True), q=rows.q)
+    if cell.noise.configuration and found.position is not None:
+        off = rng.normal(size=(rows.configuration.max(initial=-1) + 1, 3))[rows.configuration]
+        found = replace(found, position=found.position + cell.noise.configuration * off)
     if not cell.noise.drift or found.position is None:
         return found
     # Where nobody says when, visits follow each other in the order of the rows.
