@@ -154,6 +154,22 @@ ROOMS: dict[str, tuple[Part, ...]] = {
             f"{STUDIES}/kr270_plan/drift.md",
         ),
         Part(
+            "CPU of a quick plan where nine moves of ten are blocked",
+            "",
+            "time elastocal design experiment_design/kr270_plan/crowded.toml --effort quick -o plan.csv",
+            f"{STUDIES}/kr270_plan/README.md",
+            "CPU of a quick plan",
+            tables=1,
+        ),
+        Part(
+            "Effects named from 30 poses, 16 arms that lack one",
+            "",
+            "elastocal study experiment_design/next_best --set arms=0 --set named=16",
+            f"{STUDIES}/next_best/README.md",
+            "Effects named from 30 poses",
+            tables=1,
+        ),
+        Part(
             "The error elsewhere",
             "",
             "python experiment_design/everywhere/study.py",

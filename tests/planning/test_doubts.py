@@ -10,9 +10,10 @@ from support.design_cells import all_loads, plan_cell, set_up, target_poses
 
 from elastocal.identification.knowledge import GaussianPrior
 from elastocal.model import Model
-from elastocal.planning import Gain, Known, Setup, in_doubt, load_states, missing
-from elastocal.planning.doubts import SOMETHING
+from elastocal.planning import Gain, Known, Setup, in_doubt, load_states, missing, relax
+from elastocal.planning.doubts import SOMETHING, WORTH, leading_directions
 from elastocal.planning.plan import Doubt
+from elastocal.planning.selection import in_terms, random_plan
 
 CHAIN = kr270_chain()
 POSES = random_poses(CHAIN, 60, seed=1)
@@ -106,6 +107,26 @@ def test_it_is_the_error_of_the_best_linear_estimate(setup: Setup) -> None:
 def test_the_bound_is_that_of_another_solver(setup: Setup) -> None:
     pool = setup.pool(POSES, all_loads(POSES), np.zeros(len(POSES), dtype=np.int64))
     assert_agreement(setup.problem(pool, np.array([8])))
+
+
+def test_the_search_is_one_in_directions_that_count() -> None:
+    """What they leave out counts as known: no plan errs more, and the best hardly less."""
+    setup = setup_with(None)
+    pool = setup.pool(POSES, all_loads(POSES), np.zeros(len(POSES), dtype=np.int64))
+    problem, R = setup.problem(pool, np.array([8])), setup.target_rows
+    own = np.isin(setup.information.names, Model.assembled(CHAIN, plan_cell()).names)
+    assert R is not None
+    T = leading_directions(problem, R, ~own)
+    assert T is not None and own.sum() < T.shape[2] <= WORTH * len(own)
+    fewer = in_terms(problem, T)
+    assert fewer is not None
+    rng = np.random.default_rng(0)
+    for chosen in (random_plan(problem, rng) for _ in range(10)):
+        whole, some = (p.criterion.value(p.prior + p.sum_of(chosen)) for p in (problem, fewer))
+        assert some <= whole * (1 + 1e-9)
+    bound = relax(problem).bound
+    assert 0.99 * bound < relax(fewer).bound <= bound * (1 + 1e-6)
+    assert leading_directions(problem, R, np.zeros(len(own), dtype=bool)) is None
 
 
 def test_doubt_costs_and_poses_pay_it_back() -> None:

@@ -14,7 +14,13 @@ from scipy import linalg
 from scipy.special import expit, softmax
 
 from elastocal.diagnosis.component_search import Rivals, exchanged
-from elastocal.diagnosis.components import Component, FittedSum, presence_cost, side_by_side
+from elastocal.diagnosis.components import (
+    Component,
+    FittedSum,
+    drawn,
+    presence_cost,
+    side_by_side,
+)
 from elastocal.diagnosis.diagnosis import (
     ComponentShare,
     Curve,
@@ -65,7 +71,11 @@ class SumAnswer:
 
     @cached_property
     def at(self) -> Projection:
-        return project(self._wide, self.found.noise)
+        return self._weighted.projection(self._wide.precision)
+
+    @cached_property
+    def _weighted(self) -> Weighted:
+        return Weighted.of(self._wide, self.found.noise)
 
     @cached_property
     def _wide(self) -> NoisyData:
@@ -100,9 +110,8 @@ class SumAnswer:
     @cached_property
     def draws(self) -> Array:
         """Posterior draws (Σ k, draws) of the components' coefficients."""
-        at = self.at
-        normal = self.rng.normal(size=(len(at.beta), DRAWS))
-        return np.asarray((at.beta[:, None] + at.beta_deviation.T @ normal)[self._own :])
+        precision = self._wide.precision
+        return drawn(self.found, self._weighted, precision, DRAWS, self.rng)[self._own :]
 
     @cached_property
     def moved(self) -> Array:
@@ -180,10 +189,9 @@ class SumAnswer:
     @cached_property
     def deleted(self) -> Array:
         """The coefficients (Σ k, PARTS) without one part of the configurations after the other."""
-        data = self._wide
-        all_ = Weighted.of(data, self.found.noise)
-        prior = np.diag(all_.prior(data.precision))
-        part, out = np.random.default_rng(0).permutation(len(data.r)) % PARTS, []
+        all_ = self._weighted
+        prior = np.diag(all_.prior(self._wide.precision))
+        part, out = np.random.default_rng(0).permutation(len(all_.r)) % PARTS, []
         for g in range(PARTS):
             X, r = all_.X[part == g], all_.r[part == g]
             X = X.reshape(-1, X.shape[2])

@@ -119,9 +119,16 @@ def about_sum(dataset: DiagnosisData, found: FittedSum) -> DiagnosisData:
     Not about a fit of these alone: a compliance that little else holds, and the moment that
     deflects its joint, would take up what the other components explain, and the product of both
     stand in the columns.  Nor do weights stand in the columns of the compliances: twice as soft an
-    arm under half the load would look like one that bends by its weight.
+    arm under half the load would look like one that bends by its weight.  Of one kind all are of
+    one size here: the eccentricity of a joint, which looks like its sag, must not take the weights.
     """
-    base, beta = dataset.base, project(found.data, found.noise).beta
+    sizes = found.sizes.size.copy()
+    for kind in found.sums.pool.kinds:
+        sizes[kind] = np.median(sizes[kind])
+    widths = [c.width for c in found.components]
+    grown = np.repeat(np.exp(2 * (sizes - found.sizes.size)), widths)
+    alike = replace(found, variances=found.variances * grown)
+    base, beta = dataset.base, project(alike.data, found.noise).beta
     x = dict(zip(base.model.names, base.x - from_centre(base), strict=True))
     width = dict(zip(base.model.names, prior_deviations(base), strict=True))
     own = zip(dataset.fitted, beta[: len(dataset.fitted)], strict=True)

@@ -20,7 +20,7 @@ components of one kind, the share that is present and their common size are unkn
 from __future__ import annotations
 
 from collections import Counter
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property
 from typing import Literal
@@ -42,7 +42,7 @@ from elastocal.diagnosis.noise_floor import (
 from elastocal.identification.smooth_prior import Standardised
 from elastocal.model.effects.base import Effect
 from elastocal.model.effects.smooth import ResidualField, Waves
-from elastocal.units import Array
+from elastocal.units import Array, IntArray
 
 Family = Literal[
     "angle", "gravity", "torque", "load", "move", "time", "temperature", "pose", "tool"
@@ -548,3 +548,83 @@ def _compressed(columns: Array, variances: Array, root: Array, faint: float = FA
     white = (root @ scaled).reshape(-1, scaled.shape[2])
     values, vectors = np.linalg.eigh(white.T @ white)
     return np.asarray(scaled @ vectors[:, values > faint])
+
+
+# What the coefficients may be: draws, the sizes of what is narrow drawn with them.
+
+GRID = np.linspace(GONE, LARGEST, 41)  # logarithms of sizes
+SETTLING = 30  # sweeps
+
+
+def drawn(
+    found: FittedSum, at: Weighted, precision: Array, n: int, rng: np.random.Generator
+) -> Array:
+    """Posterior draws (p, n) of the coefficients of a sum, or of one with more columns behind it.
+
+    Two causes that look alike share what they do by their sizes; which of these are the most
+    probable decides little.  So those of effects that need no search are drawn as well, one after
+    the other given the others (Gibbs), their coefficients integrated out: with A and b what the
+    others leave of its normal matrix and right side, a component of size s, or none, has the log
+    evidence −½ log|1 + s²A| + ½ bᵀ(s⁻² + A)⁻¹b, beside the prior of `Pool`.
+    """
+    components, prior = found.components, at.prior(precision)
+    own = [k for k, c in enumerate(components) if c.hypothesis is not None and not c.settings]
+    c = _indices([found.spans[k] for k in own])
+    x = np.setdiff1d(np.arange(len(prior)), c)
+    L = linalg.cholesky(at.M[np.ix_(x, x)] + np.diag(prior[x]), lower=True)
+    right = np.column_stack([at.M[np.ix_(x, c)], at.z[x]])
+    half = linalg.solve_triangular(L, right, lower=True)
+    across, z = half[:, :-1], half[:, -1]
+    S, t = at.M[np.ix_(c, c)] - across.T @ across, at.z[c] - across.T @ z
+    spans = dict(zip(own, spans_of([components[k].width for k in own], len(c)), strict=True))
+    pool, sizes = Pool(components), dict(zip(own, found.sizes.size[own].tolist(), strict=True))
+    kinds = [(kind.tolist(), n) for kind, n in zip(pool.kinds, pool.places, strict=True)]
+    steps = [(k, kind, n) for kind, n in kinds for k in kind if k in spans]
+    out = np.zeros((len(prior), n))
+    for sweep in range(-SETTLING, n):
+        for k, kind, places in steps:
+            sizes.pop(k, None)
+            fellows = [sizes[j] for j in kind if j in sizes]
+            m, mean = len(fellows), float(sum(fellows))
+            weight = COMMON**2 / (ALONE**2 + m * COMMON**2)
+            variance = ALONE**2 * (1 + weight)
+            cost = presence_cost(places, m + 1) - presence_cost(places, m) + pool.sought[k]
+            log_p = _at_sizes(S, t, spans, sizes, k) - 0.5 * (GRID - weight * mean) ** 2 / variance
+            log_p += np.log(GRID[1] - GRID[0]) - 0.5 * np.log(2 * np.pi * variance) - cost
+            log_p = np.append(log_p, -np.inf if components[k].given else 0.0)
+            chosen = int(rng.choice(len(log_p), p=special.softmax(log_p)))
+            if chosen < len(GRID):
+                sizes[k] = float(GRID[chosen])
+        if sweep >= 0:
+            A, i = _beside(S, spans, sizes)
+            spread = np.linalg.solve(np.linalg.cholesky(A).T, rng.normal(size=len(i)))
+            out[c[i], sweep] = np.linalg.solve(A, t[i]) + spread
+    rest = z[:, None] - across @ out[c] + rng.normal(size=(len(x), n))
+    out[x] = linalg.solve_triangular(L, rest, lower=True, trans="T")
+    return out
+
+
+def _indices(spans: Sequence[slice]) -> IntArray:
+    return np.concatenate([np.zeros(0, dtype=np.int64), *(np.r_[span] for span in spans)])
+
+
+def _beside(
+    S: Array, spans: Mapping[int, slice], sizes: Mapping[int, float]
+) -> tuple[Array, IntArray]:
+    """The normal matrix with its prior of the components that have a size, and their columns."""
+    i = _indices([spans[k] for k in sizes])
+    precision = [np.full(spans[k].stop - spans[k].start, np.exp(-2 * s)) for k, s in sizes.items()]
+    return S[np.ix_(i, i)] + np.diag(np.concatenate([np.zeros(0), *precision])), i
+
+
+def _at_sizes(
+    S: Array, t: Array, spans: Mapping[int, slice], sizes: Mapping[int, float], k: int
+) -> Array:
+    """Log evidence of component k at every size of the GRID, over none, beside those of `sizes`."""
+    (A, i), span = _beside(S, spans, sizes), spans[k]
+    solved = np.linalg.solve(A, np.column_stack([S[i, span], t[i]]))
+    left = np.column_stack([S[span, span], t[span]]) - S[span][:, i] @ solved
+    values, vectors = np.linalg.eigh(left[:, :-1])
+    values, b = np.maximum(values, 0.0), vectors.T @ left[:, -1]
+    v = np.exp(2 * GRID)[:, None]
+    return np.asarray(0.5 * (v * b**2 / (1 + v * values) - np.log1p(v * values)).sum(axis=1))

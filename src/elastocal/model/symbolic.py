@@ -5,6 +5,7 @@ from __future__ import annotations
 from collections.abc import Sequence
 from dataclasses import dataclass
 from functools import cached_property
+from typing import Any
 
 import casadi as ca
 import numpy as np
@@ -34,6 +35,7 @@ LARGEST = 0.5  # rad or m
 LARGEST_JACOBIAN = 60_000
 ROWS_THAT_PAY = 2000
 AT_A_TIME = 16_384  # rows × directions evaluated together
+KEPT = 4_000_000  # numbers of F_θ up to which an answer is kept
 TOLERANCE = 1e-14  # rad (m for prismatic springs); Newton converges quadratically past it
 
 
@@ -58,6 +60,7 @@ class Equilibrium:
         self._value = BatchFunction(self._symbols, [residual], backend)
         self._large = self._value.n_instructions * self.size / 2 > LARGEST_JACOBIAN
         self._last = self._value
+        self._solved: tuple[Any, NDArray, NDArray] | None = None
 
     @cached_property
     def _whole(self) -> BatchFunction:
@@ -99,8 +102,18 @@ class Equilibrium:
     def solve(self, inputs: Sequence[NDArray], p: NDArray) -> tuple[NDArray, NDArray]:
         """θ (n, size) by Newton's method on all rows, and F_θ (n, size, size) there.
 
-        Rows that do not settle become NaN, with F_θ = 1 so that it can still be solved with.
+        Rows that do not settle become NaN, with F_θ = 1 so that it can still be solved with.  The
+        last answer is kept: readings are predicted and then differentiated at the same place.
         """
+        if len(inputs[0]) * self.size**2 > KEPT:
+            return self._solve(inputs, p)
+        key = [(a.dtype.char, a.shape, a.tobytes()) for a in (*inputs, p)]
+        known = self._solved
+        if known is None or known[0] != key:
+            known = self._solved = (key, *self._solve(inputs, p))
+        return known[1].copy(), known[2].copy()
+
+    def _solve(self, inputs: Sequence[NDArray], p: NDArray) -> tuple[NDArray, NDArray]:
         theta = self._stationary(inputs, p, len(inputs[0]))
         with np.errstate(invalid="ignore"):
             theta[(np.abs(theta.real) > LARGEST).any(axis=1)] = np.nan

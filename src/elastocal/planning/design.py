@@ -22,12 +22,14 @@ from elastocal.planning.checkpoint import Checkpoint, State
 from elastocal.planning.choices import Choice
 from elastocal.planning.conditions import ScheduledEffects
 from elastocal.planning.criteria import CRITERIA
-from elastocal.planning.doubts import OPEN, Place, gain_of, in_doubt
+from elastocal.planning.criterion import Gradient
+from elastocal.planning.doubts import OPEN, Place, gain_of, in_doubt, leading_directions
 from elastocal.planning.elsewhere import share_within
 from elastocal.planning.exact_plan import (
     SizedPlan,
     exact_plan,
     random_information,
+    repaired,
     size_curve,
 )
 from elastocal.planning.feasibility import Feasibility
@@ -46,7 +48,7 @@ from elastocal.planning.plan import (
 )
 from elastocal.planning.polish import Continuum, Searches, estimate, polish
 from elastocal.planning.relaxation import Relaxed, relax
-from elastocal.planning.selection import DesignProblem, efficiency, values_without
+from elastocal.planning.selection import DesignProblem, efficiency, in_terms, values_without
 from elastocal.planning.setup import (
     FeasiblePool,
     Known,
@@ -59,7 +61,7 @@ from elastocal.planning.setup import (
 from elastocal.planning.test_poses import TargetPoses, check_cell, everywhere, test_poses
 from elastocal.planning.time_budget import within
 from elastocal.text import did_you_mean, listed, quoted
-from elastocal.units import Array, IntArray, Progress
+from elastocal.units import Array, BoolArray, IntArray, Progress
 
 # How a plan is searched for; what it is to be stands in the cell's [design].
 
@@ -140,8 +142,10 @@ def select(
     checkpoint: Checkpoint,
     progress: Progress,
     begun: SizedPlan | None = None,
+    doubtful: BoolArray | None = None,
 ) -> Selection:
-    """The best plan found and its certificates; `begun` is what was found on this pool already.
+    """The best plan found and its certificates; `begun` is what was found on this pool already,
+    `doubtful` (p,) are parameters of which the search may leave out what hardly counts.
 
     In each round the exact plan is polished off the pool and the continuum is searched for poses
     of larger sensitivity; both join the pool, on which relaxation and exchange run again.  So the
@@ -149,7 +153,10 @@ def select(
     grown one.
     """
     first = len(pool)
-    search = _Rounds(setup, searches, shares, options, checkpoint, progress)
+    R, terms = setup.target_rows, None
+    if begun is None and doubtful is not None and R is not None:
+        terms = leading_directions(setup.problem(pool, shares), R, doubtful)
+    search = _Rounds(setup, searches, shares, options, checkpoint, progress, terms)
     relaxed = search.relax(pool) if begun is None else begun.relaxed
     found = None if begun is None else begun.plan.chosen
     chosen = search.exchange(pool, relaxed, None, 0, found)
@@ -166,7 +173,11 @@ def select(
 
 @dataclass(frozen=True)
 class _Rounds:
-    """One step of a round each; what is finished is taken from the checkpoint."""
+    """One step of a round each; what is finished is taken from the checkpoint.
+
+    The search is one in `terms` (S, p, k) of the parameters, where there are such; its bounds hold
+    for all of them, as what is left out counts as known there.
+    """
 
     setup: Setup
     searches: Searches
@@ -174,6 +185,7 @@ class _Rounds:
     options: DesignOptions
     checkpoint: Checkpoint
     progress: Progress
+    terms: Array | None = None
     last: list[tuple[FeasiblePool, DesignProblem]] = field(default_factory=list)
 
     def relax(self, pool: FeasiblePool) -> Relaxed | None:
@@ -186,7 +198,9 @@ class _Rounds:
     def problem(self, pool: FeasiblePool) -> DesignProblem:
         """That of a pool, kept with what it has formed as long as the pool is the same."""
         if not self.last or self.last[0][0] is not pool:
-            self.last[:] = [(pool, self.setup.problem(pool, self.shares))]
+            whole = self.setup.problem(pool, self.shares)
+            some = None if self.terms is None else in_terms(whole, self.terms)
+            self.last[:] = [(pool, some or whole)]
         return self.last[0][1]
 
     def exchange(
@@ -202,14 +216,17 @@ class _Rounds:
             seed=self.options.seed, jobs=self.options.jobs,
             checkpoint=self.checkpoint.stage(f"exchange{k}"), progress=self.progress,
         )  # fmt: skip
-        return best.chosen
+        if self.terms is None:
+            return best.chosen
+        # No pose of the plan has a better one in its place, with all parameters.
+        return repaired(self.setup.problem(pool, self.shares), best.chosen)
 
     def polish(self, pool: FeasiblePool, chosen: IntArray, k: int) -> tuple[FeasiblePool, IntArray]:
         """The pool with the polished poses, and the polished plan in it."""
 
         def make() -> State:
             done = polish(
-                self.problem(pool), self.searches, pool.q, pool.load, chosen,
+                self.setup.problem(pool, self.shares), self.searches, pool.q, pool.load, chosen,
                 jobs=self.options.jobs, progress=self.progress,
             )  # fmt: skip
             return {"q": done.q, "moved": done.moved}
@@ -240,9 +257,13 @@ class _Rounds:
 
     def _continuum(self, pool: FeasiblePool, relaxed: Relaxed, k: int) -> Continuum:
         effort = EFFORTS[self.options.effort]
+        problem, tangent, T = self.problem(pool), relaxed.tangent, self.terms
+        if T is not None:
+            problem = self.setup.problem(pool, self.shares)
+            tangent = Gradient(tangent.value, T @ tangent.G @ T.swapaxes(-1, -2))
         # The pool may have grown since: candidates added later have weight 0.
         return estimate(
-            self.problem(pool), relaxed.tangent, self.searches, pool.q, pool.load,
+            problem, tangent, self.searches, pool.q, pool.load,
             points=effort.points, starts=effort.ascents, seed=self.options.seed + k,
             jobs=self.options.jobs, progress=self.progress,
         )  # fmt: skip
@@ -437,7 +458,10 @@ class _Design:
         search = setup.having(pinned)
         curve, shares, begun = self._sizes(search, pool, shares)
         searches = Searches(setup.information, self.space, self.feasibility, self.feasibility.pairs)
-        found = select(search, pool, shares, searches, options, self.checkpoint, progress, begun)
+        own = np.isin(setup.information.names, self.model.names)
+        found = select(
+            search, pool, shares, searches, options, self.checkpoint, progress, begun, ~own
+        )
         progress("random plans beside it")
         drawn = random_information(search.problem(pool, shares), options.seed)
         return self._plan(setup, found, shares, counts, targets.source, curve, known, drawn, pinned)

@@ -35,8 +35,9 @@ from elastocal.planning.information import (
     observed_weights,
 )
 from elastocal.planning.plan import Doubt, Gain
+from elastocal.planning.selection import DesignProblem, is_regular, random_plan
 from elastocal.planning.setup import Known, Setup
-from elastocal.units import Array, IntArray
+from elastocal.units import Array, BoolArray, IntArray
 
 # Probability that an effect is missing; in equal shares it is each of them, at each of its places.
 SOMETHING = 0.5
@@ -44,6 +45,9 @@ SOMETHING = 0.5
 UNSIZED_SIGNAL = 2e-4
 POSES = 100  # that show how far
 SHOWN = 1.0  # standard deviation from 0 that all of these poses together would give it at least
+# Of Φ, what combinations of what is in doubt may add that the search for a plan passes over; and
+# the share of the parameters that may remain for it to be worth it; plans that this is judged by.
+LOST, WORTH, PLANS = 0.005, 0.8, 8
 # What a pose has only once it stands in an order.
 OPEN = frozenset({"time", "temperature", "approach"})
 
@@ -125,6 +129,42 @@ def usual_sizes(specs: Sequence[Parameter | ParameterSpec], columns: Array) -> A
     return np.array(
         [s if p.typical is None else p.typical for s, p in zip(signal, specs, strict=True)]
     )
+
+
+def leading_directions(problem: DesignProblem, R: Array, doubtful: BoolArray) -> Array | None:
+    """T (1, p, k) of the parameters y = T z that count: all but the `doubtful` (p,), and of these
+    the combinations that could err most at the test poses, |R y| there in m, were they left out.
+
+    Whoever leaves out z errs by (R_z − R_y M_yy⁻¹ M_yz) z, y being what is estimated, and Φ is less
+    by the square of that at most.  To y are added singular directions of it, over PLANS drawn at
+    random and that of even weights, z of prior variance 1, until LOST of Φ is left to all others.
+    None where hardly any can go.
+    """
+    if len(problem.prior) > 1 or not doubtful.any():
+        return None
+    size = np.bincount(problem.group, minlength=len(problem.shares))
+    even = problem.information((problem.shares / np.maximum(size, 1))[problem.group])
+    rng = np.random.default_rng(0)
+    drawn = [problem.prior + problem.sum_of(random_plan(problem, rng)) for _ in range(PLANS)]
+    x, u = np.flatnonzero(~doubtful), np.flatnonzero(doubtful)
+    unit = np.eye(len(doubtful))
+    unit[np.ix_(u, u)] = np.linalg.inv(np.linalg.cholesky(problem.prior[0][np.ix_(u, u)])).T
+    kept, target = np.eye(len(doubtful))[:, x], R @ unit  # in units of the prior
+    plans = [M for M in (even, *drawn) if is_regular(M[:, x[:, None], x])]
+    while plans and kept.shape[1] <= WORTH * len(doubtful):
+        errors = []
+        for M in plans:
+            known = kept.T @ unit.T @ M[0] @ unit
+            error = target - target @ kept @ np.linalg.solve(known @ kept, known)
+            errors.append(error / np.sqrt(float(problem.criterion.value(M)) * len(plans)))
+        new = np.vstack(errors)
+        _, values, turned = np.linalg.svd(new - new @ kept @ kept.T, full_matrices=False)
+        rest = np.append(np.cumsum(values[::-1] ** 2)[::-1], 0.0)
+        k = int(np.argmax(rest <= LOST))
+        if not k:
+            return (unit @ kept)[None]
+        kept = np.column_stack([kept, turned[:k].T])
+    return None
 
 
 def gain_of(

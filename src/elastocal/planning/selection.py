@@ -129,6 +129,21 @@ def triangle(p: int) -> tuple[IntArray, IntArray, Array]:
     return rows, columns, np.where(rows == columns, 1.0, np.sqrt(2.0))
 
 
+def in_terms(problem: DesignProblem, T: Array) -> DesignProblem | None:
+    """The problem of the parameters z, y = T_s z, T (S, p, k); None where the criterion belongs to
+    its own.  Where k < p, what T leaves out is taken for known: no plan has a larger Φ than before.
+    """
+    criterion, prior = problem.criterion.turned(T), T.swapaxes(-1, -2) @ problem.prior @ T
+    if criterion is None:
+        return None
+    return replace(
+        problem,
+        blocks=problem.blocks @ T[:, None],
+        prior=(prior + prior.swapaxes(-1, -2)) / 2,
+        criterion=criterion,
+    )
+
+
 def balanced(
     problem: DesignProblem, tangent: Gradient | None
 ) -> tuple[DesignProblem, Gradient | None]:
@@ -145,16 +160,9 @@ def balanced(
     if trustworthy(factor) or not factor.regular.all():
         return problem, tangent
     T, L = factor.inverse.swapaxes(-1, -2), factor.L
-    criterion = problem.criterion.turned(T)
-    if criterion is None:
+    turned = in_terms(problem, T)
+    if turned is None:
         return problem, tangent
-    prior = factor.inverse @ problem.prior @ T
-    turned = replace(
-        problem,
-        blocks=problem.blocks @ T[:, None],
-        prior=(prior + prior.swapaxes(-1, -2)) / 2,
-        criterion=criterion,
-    )
     if tangent is not None:
         tangent = Gradient(tangent.value, L.swapaxes(-1, -2) @ tangent.G @ L)
     return turned, tangent

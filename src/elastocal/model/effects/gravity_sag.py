@@ -138,10 +138,12 @@ WEIGHT = 30.0  # kg/m²
 HOUSING = 0.1  # m, that even the last link stands out
 
 
-def lengths_carried(chain: Chain) -> Array:
-    """The stretched length (joints,) in m of what each joint carries, a housing's at least."""
-    lengths = [float(np.linalg.norm(T[:3, 3])) for T in link_ends(chain)]
-    return np.cumsum(lengths[::-1])[::-1] + HOUSING
+def extents(chain: Chain) -> tuple[list[Array], Array]:
+    """The way (3,) in m from each joint to its link's end, and the stretched length (joints,) of
+    what follows there, a housing at least."""
+    ends = [T[:3, 3] for T in link_ends(chain)]
+    lengths = np.array([np.linalg.norm(end) for end in ends])
+    return ends, np.cumsum(lengths[::-1])[::-1] - lengths + HOUSING
 
 
 class LinkWeights(Effect):
@@ -152,8 +154,8 @@ class LinkWeights(Effect):
     make up the torques of any masses about all joints, which then yield by their compliances: so
     it shows where the cell has `joint_compliance` or other springs, and `gravity_sag` is what can
     be had elsewhere.  With `link_gravity` they are what is missing from the masses stated.  Each is
-    as large as in a rod of `weights_kg_per_m` that reaches from the joint to the flange (setting,
-    the prior size), m ℓ²/2 or m ℓ.
+    as large as where everything weighs `weights_kg_per_m` (setting, the prior size): along the way
+    to the link's end, half of the link and all that follows; across it, the link a housing away.
     """
 
     name = "link_weights"
@@ -164,20 +166,24 @@ class LinkWeights(Effect):
     sized_by = "weights_kg_per_m"
 
     def settings(self, place: str, chain: Chain, cell: Cell) -> tuple[Setting, ...]:
-        density = WEIGHT * float(lengths_carried(chain)[0])
+        ends, further = extents(chain)
+        density = WEIGHT * float(np.linalg.norm(ends[0]) + further[0])
         return (Setting(self.sized_by, "range", density, 1e-9, 1e9),)
 
     def parameters(self, place: str, chain: Chain, cell: Cell) -> tuple[ParameterSpec, ...]:
         density = self.stated(place, chain, cell)[self.sized_by]
         found: list[ParameterSpec] = []
-        described = zip(links(chain), chain.kinds, lengths_carried(chain).tolist(), strict=True)
-        for link, kind, length in described:
-            if kind == REVOLUTE:
-                size = density * length**2 / 2
-                keys = (f"{link}_moment_x", f"{link}_moment_y")
-                found += [ParameterSpec(key, "kg*m", 0.0, size, shrunk=True) for key in keys]
+        described = zip(links(chain), chain.joints, *extents(chain), strict=True)
+        for link, joint, end, further in described:
+            own, across = float(np.linalg.norm(end)), np.array(transverse_axes(joint.axis))
+            mass = density * (own + HOUSING)
+            if joint.kind == REVOLUTE:
+                for key, way in zip("xy", np.abs(across @ end).tolist(), strict=True):
+                    size = density * way * (own / 2 + further) + mass * HOUSING
+                    name = f"{link}_moment_{key}"
+                    found.append(ParameterSpec(name, "kg*m", 0.0, size, shrunk=True))
             else:
-                size = density * length
+                size = density * (own + further)
                 found.append(ParameterSpec(f"{link}_mass", "kg", 0.0, size, shrunk=True))
         return tuple(found)
 
