@@ -7,13 +7,16 @@ A line per arm: the tool's error over the oracle's; that of an oracle whose colu
 the effects alone that the tool names (sag by moments of each joint's own, or by those that all
 joints share), with the true orders, noise, scatter and priors; and what is left out, by how much
 each in µm would lower that error (root of the fall of the mean square).  Where the first two agree,
-structure is what is missing.
+structure is what is missing.  Then the error of one who searches for orders (`whole_search.py`)
+where he is given those that the tool wrote, and where he adds the families that he finds himself
+at joints without one: what the tool's orders cost, and what the families cost that it missed.
 """
 
 from __future__ import annotations
 
 import argparse
 import json
+import tomllib
 from collections.abc import Iterable, Iterator, Mapping
 from dataclasses import replace
 from pathlib import Path
@@ -24,6 +27,7 @@ from whole_columns import moments
 from whole_draw import WholeRecipe
 from whole_laws import LAST_MOVE, LINES, WEIGHTS
 from whole_oracle import Block, Sights, effects, error_of, geometry
+from whole_search import Search, searched
 
 Unit = tuple[str, str]  # what it is, and where
 # Which of them an effect of elastocal stands for.
@@ -96,19 +100,32 @@ def losses(sights: Sights, answer: Mapping[str, Any]) -> tuple[float, list[tuple
     return whole, sorted(((float(np.sqrt(max(f, 0.0))), u) for f, u in falls), reverse=True)
 
 
+def family_losses(sights: Sights, cell: Path) -> tuple[float, float]:
+    """Rms lengths (m) of a searcher's error with the families of lines of a cell, and with those
+    that he finds at other joints as well."""
+    stated = tomllib.loads(cell.read_text(encoding="utf-8"))["model"]["nominal"]
+    known = stated.get("settings", {}).items()
+    told = {int(w.removeprefix("joint")) - 1: s["order_1"] for w, s in known if "order_1" in s}
+    search = Search(sights)
+    return search.error(told), search.error(searched(sights)[1] | told)
+
+
 def lines(folder: Path, seed: int) -> Iterator[str]:
     for path in sorted(folder.glob("whole-*/judged.json")):
         _, poses, number = path.parent.name.split("-")
         world = WholeRecipe("", (seed, 9, int(number)), int(poses)).draw()
         answer = json.loads((path.parent / "seen" / "diagnosis.json").read_text(encoding="utf-8"))
         judged = json.loads(path.read_text(encoding="utf-8"))
-        error, left = losses(Sights.of(world), answer)
+        sights = Sights.of(world)
+        error, left = losses(sights, answer)
+        own, more = family_losses(sights, path.parent / "seen" / "extended.toml")
         told = ", ".join(f"{k} {w} {1e6 * fall:.0f}" for fall, (k, w) in left[:SHOWN])
         tool = np.nan if judged["tool_mm"] is None else judged["tool_mm"]
         oracle = judged["oracle_mm"]
         yield (
             f"{path.parent.name}: tool {tool / oracle:.2f} of the oracle's, its structure alone "
-            f"{1e3 * error / oracle:.2f}; left out, µm: {told}"
+            f"{1e3 * error / oracle:.2f}; left out, µm: {told}; searching with its families "
+            f"{1e3 * own / oracle:.2f}, with others as well {1e3 * more / oracle:.2f}"
         )
 
 
