@@ -215,10 +215,9 @@ ROOMS: dict[str, tuple[Part, ...]] = {
         Part(
             "Whole arms",
             "Lines, eccentricity, sag, compliance, the last move, scatter and drift act at every "
-            "joint at once; the oracle knows structure and orders, `searching` is one who has to "
-            "search for the orders. Arms that nothing had been built on or tried with.",
-            "python experiment_design/blind_diagnosis/whole_arms.py --seed 9 --worlds 12 "
-            "--poses 60 --search",
+            "joint at once; the oracle knows structure and orders. Seed 11 was looked at while shares were "
+            "mended, seed 12 was not.",
+            "python experiment_design/blind_diagnosis/whole_arms.py --seed 11 --worlds 6 --poses 60",
             f"{STUDIES}/blind_diagnosis/result_whole.md",
         ),
     ),
