@@ -130,7 +130,8 @@ class Motion:
     `both_directions`: approach every pose from both sides (`overshoot` rad), to show backlash.
     `load_changes`: how often at most the load may be hung, exchanged or taken off (None: as rarely
     as can be), `extra_time`: how much longer than by the shortest way all may take so that a
-    drift does less (0: the shortest order); `reference_every`: after so many visits one pose is
+    drift does less (0: the shortest order; None: a little, and as much as pays for reading poses
+    twice); `reference_every`: after so many visits one pose is
     visited again.
     `degrees`: speed or home were stated in degrees, which fits revolute joints only."""
 
@@ -142,7 +143,7 @@ class Motion:
     both_directions: bool = keyed(default=False)
     overshoot: Positive = keyed("a positive number in degrees", "overshoot_deg", default=0.05)
     load_changes: Count | None = keyed("a whole number >= 1", default=None)
-    extra_time: NonNegative = keyed("a number >= 0, a share of the time", default=0.05)
+    extra_time: NonNegative | None = keyed("a number >= 0, a share of the time", default=None)
     reference_every: Count | None = keyed("a whole number >= 1", default=None)
     degrees: bool = False
 

@@ -263,7 +263,7 @@ class SumOfComponents:
     def only(self, kept: Sequence[int]) -> SumOfComponents:
         """The same with these components alone, without whitening anything anew."""
         w, own = self.weighted, np.arange(len(self.data.precision))
-        index = np.concatenate([own, *(np.r_[self.spans[k]] for k in kept)]).astype(int)
+        index = np.concatenate([own, _indices([self.spans[k] for k in kept])])
         narrow = replace(w, M=w.M[np.ix_(index, index)], z=w.z[index])
         return replace(self, weighted=narrow, components=tuple(self.components[k] for k in kept))
 

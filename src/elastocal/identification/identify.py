@@ -121,6 +121,7 @@ def _fitted(
             try:
                 kept = replace(options, faulty="keep")
                 found = run_method(every, sound, faulty, refit, kept, progress)
+                told = (*told, *found.warnings)
                 found = replace(found, good=np.ones_like(found.good), warnings=told)
             except (ElastocalError, np.linalg.LinAlgError):
                 pass  # they bend the fit so far that no arm is left: better without

@@ -21,6 +21,7 @@ from elastocal.units import Array, IntArray
 # What a steady drift of tracker or base does to what the readings are evaluated for.
 
 DRIFT = 50e-6  # m, from the first reading to the last: a tracker or a base over an hour
+EXTRA_TIME = 0.05  # of the shortest time, for a longer way where the cell states none
 HARMLESS = 0.1  # of what noise leaves: adds half a per cent to the error
 
 
@@ -182,10 +183,8 @@ class VisitTimes:
             longest=np.inf,
             enough=1.0 if alias is None else HARMLESS * alias.noise / DRIFT,
         )
-        ring = np.array([0, *shortest, 0])
-        waiting = made.visit * len(shortest) + float(made.change[ring[:-1], ring[1:]].sum())
-        driving = made.driving(shortest)
-        return replace(made, longest=driving + motion.extra_time * (driving + waiting))
+        extra = EXTRA_TIME if motion.extra_time is None else motion.extra_time
+        return replace(made, longest=made.driving(shortest) + extra * made.time(shortest))
 
     def at(self, costs: Costs) -> VisitTimes:
         """With what is known of the moves since."""
@@ -202,6 +201,12 @@ class VisitTimes:
     @cached_property
     def _step(self) -> Array:
         return self.travel + self.change + self.visit
+
+    def time(self, tour: list[int]) -> float:
+        """s from the first move to the last."""
+        ring = np.array([0, *tour, 0])
+        changing = float(self.change[ring[:-1], ring[1:]].sum())
+        return self.driving(tour) + self.visit * len(tour) + changing
 
     def _errors(self, ring: IntArray) -> Array:
         """(m·3,) error per m of drift in x, y, z, counted from the readings' mean time; the visits

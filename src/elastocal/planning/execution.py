@@ -343,8 +343,9 @@ def schedule(
     nowhere above the true ones.  The same seed gives the same order.
 
     With an `alias` the order found is one in which a drift does little to what the plan is for,
-    as far as `motion.extra_time` allows more travel than the shortest takes and
-    `motion.load_changes` more changes of load.  `motion.reference_every` visits one pose is
+    as far as `motion.extra_time` allows more travel than the shortest takes (None: EXTRA_TIME,
+    and poses are read twice without load where that pays) and `motion.load_changes` more changes
+    of load.  `motion.reference_every` visits one pose is
     visited again; where readings are `paired`, loaded with unloaded, no more often loaded.
 
     Raises InsufficientDataError that names a pose which no free move reaches, or which cannot
@@ -374,7 +375,7 @@ def schedule(
     # The bound leaves open in which order the load states come: their number alone is fixed.
     way, fixed = costs.cost - costs.changed, tour_cost(costs.apart, tour)
     drift, shortest = None, tour
-    if (alias is not None or motion.load_changes) and motion.extra_time > 0:
+    if (alias is not None or motion.load_changes) and motion.extra_time != 0:
         tour, moves, later, drift = _against_drift(
             moves, motion, tour, costs, alias, seed, progress
         )
@@ -430,7 +431,9 @@ def _against_drift(
 ) -> tuple[list[int], Moves, Costs, Drifting | None]:
     """The visits of the shortest `tour` in the order that a drift harms least, with the moves and
     costs that they are nodes of, and what the drift does to it; the shortest tour itself where no
-    other is better.  Where there is time for it, all poses are read twice without load."""
+    other is better.  Where there is time for it, all poses are read twice without load; where no
+    extra time is stated, if (ρ² + b²) t falls, of the error at the test poses ρ, the drift's
+    part of it b and the time t: if more readings, by which ρ² falls as 1/t, would give less."""
     load = moves.visits.load
     used = [int(s) for s in dict.fromkeys(load[np.array(tour) - 1])]
     sequence = turns(moves.loaded.tolist(), used, motion.load_changes)
@@ -443,19 +446,29 @@ def _against_drift(
     if alias is None:
         return found, moves, costs, None
     bias, (twice, again) = clock.bias(found), moves.unloaded_twice(tour)
-    left = clock.longest - len(again) * clock.visit
+    as_pays = motion.extra_time is None
+    left = clock.longest - (0.0 if as_pays else len(again) * clock.visit)
     if bias > clock.enough and len(again) and left >= clock.driving(tour):
+        price = _squared_error(alias, bias) * clock.time(found)
         spread = VisitTimes.of(twice, motion, costs := twice.costs(), alias, tour)
         begun = in_turns([*tour, *again], twice.visits.load, sequence)
         new, later, spread = _searched(
             begun, twice, costs, replace(spread, longest=left), seed, progress
         )
-        if spread.possible(new) and spread.bias(new) < bias:
+        better = spread.bias(new) < bias
+        if as_pays:
+            better = _squared_error(alias, spread.bias(new)) * spread.time(new) < price
+        if spread.possible(new) and better:
             found, moves, costs, bias = new, twice, later, spread.bias(new)
         else:
             costs = moves.costs()
     noise, at_test = alias.noise, alias.at_test_poses
     return found, moves, costs, Drifting(DRIFT * bias, DRIFT * before, noise, at_test)
+
+
+def _squared_error(alias: Alias, bias: float) -> float:
+    """ρ² + b² in m², b by DRIFT at `bias` per m of it."""
+    return alias.noise**2 + (DRIFT * bias) ** 2
 
 
 def _searched(
@@ -464,9 +477,10 @@ def _searched(
 ) -> tuple[list[int], Costs, VisitTimes]:  # fmt: skip
     """The order of least price found from one that has `begun`, its moves checked."""
     load = moves.visits.load
-    tries = [balanced(begun, load, clock, seed + k, STEPS, HOT) for k in range(TRIES)]
-    new, rounds = min(tries, key=clock.price), 0
-    again = 0
+    tries: list[list[int]] = []
+    while len(tries) < TRIES and not any(clock.bias(one) <= clock.enough for one in tries):
+        tries.append(balanced(begun, load, clock, seed + len(tries), STEPS, HOT))
+    new, rounds, again = min(tries, key=clock.price), 0, 0
     while (blocked := moves.check(new, costs)) or (not clock.possible(new) and again < TRIES):
         progress(f"order of execution against drift: {moves.checked} moves checked")
         if not blocked:  # the ways around take too long: another order, with what they are known

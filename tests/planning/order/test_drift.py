@@ -1,5 +1,6 @@
 """The order keeps a drift apart from what the plan is for, within time and changes of load."""
 
+from dataclasses import replace
 from itertools import groupby
 
 import numpy as np
@@ -13,6 +14,7 @@ from elastocal.cell.plan_wishes import Motion
 from elastocal.errors import InputError
 from elastocal.identification.visit_record import course_waves
 from elastocal.planning import Alias, plan_rows, schedule
+from elastocal.planning import execution as execution_module
 from elastocal.planning import test_poses as target_poses
 from elastocal.planning.drift import DRIFT, turns
 from elastocal.planning.information import pose_covariance
@@ -24,6 +26,12 @@ Q = RNG.uniform(-2, 2, (12, 2))
 # Loaded minus unloaded: what a shift does has opposite signs.
 OWN = RNG.normal(size=(12, 1, 4, 3))
 PAIRS = Alias(np.concatenate([-OWN, OWN], axis=1) / 12, 5e-6, True, OWN, OWN)
+
+
+@pytest.fixture(autouse=True)
+def brief_annealing(monkeypatch):
+    monkeypatch.setattr(execution_module, "STEPS", 8000)
+    monkeypatch.setattr(execution_module, "TRIES", 1)
 
 
 def ordered(alias=PAIRS, **motion):
@@ -58,7 +66,7 @@ def test_fewer_changes_than_the_loads_need_are_refused():
 
 @pytest.mark.parametrize(("changes", "sequence"), [(None, "ULU"), (4, "ULULU")])
 def test_every_visit_once_in_turns_and_the_drift_does_little(changes, sequence):
-    execution = ordered(load_changes=changes)
+    execution = ordered(load_changes=changes, extra_time=0.05)
     assert sorted((s.pose, s.load) for s in execution.stops) == [
         (pose, load) for pose in range(12) for load in (0, 1)
     ]
@@ -87,6 +95,16 @@ def test_where_there_is_time_poses_are_read_before_and_after_their_load():
     assert sorted(places[:, 1]) == loaded
     # With forces stated, the second part stands in the row of the first.
     assert len(plan_rows(twice, names, level, BOTH).configuration) == 24
+
+
+@pytest.mark.parametrize(("noise", "read"), [(1e-6, 36), (100e-6, 24)])
+def test_poses_are_read_twice_where_that_pays_more_than_further_readings(noise, read):
+    execution = ordered(replace(PAIRS, noise=noise))
+    assert len(execution.stops) == read
+    once = ordered(replace(PAIRS, noise=noise), extra_time=0.05)
+    assert len(once.stops) == 24
+    squared = [(noise**2 + e.drift.bias**2) * e.total for e in (execution, once)]
+    assert (squared[0] < squared[1]) is (read == 36)
 
 
 def test_without_extra_time_the_order_is_the_shortest():
