@@ -174,11 +174,11 @@ def test_every_reading_has_a_stop_and_every_move_is_free(name: str) -> None:
         for s in (states if load == ALL_LOADS else [load])
     }
     assert visits == wanted
-    assert len({(s.pose, s.load, s.side) for s in execution.stops}) == len(execution.stops)
+    assert len({(s.pose, s.load, s.side, s.part) for s in execution.stops}) == len(execution.stops)
     most = 2 if motion.both_directions else 1
-    times = Counter((s.pose, s.load) for s in execution.stops)
+    times = Counter((s.pose, s.load, s.part) for s in execution.stops)
     assert set(times.values()) <= {1, most}
-    assert {pose for (pose, _), n in times.items() if n < most} == set(execution.one_sided)
+    assert {pose for (pose, *_), n in times.items() if n < most} == set(execution.one_sided)
 
 
 @pytest.mark.parametrize("name", ALL)
