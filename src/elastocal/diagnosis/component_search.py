@@ -267,20 +267,23 @@ def with_likelier_orders(dataset: DiagnosisData, found: FittedSum) -> FittedSum:
     A single line may be the first of a family, or the second of one at half its order; which it
     is shows in the others.  A multiple that is not there costs as much as one that is missed.
     """
-    changed = False
-    for h in ripples(dataset) * SWEEPS:
-        lines_of_joints = (c for c in found.components if isinstance(c.effect, GearSpectrum))
-        own = [c for c in lines_of_joints if c.where == h.where]
-        if len(own) != 1:
-            continue
-        now, lines = dict(own[0].settings)["order_1"], len(own[0].settings) // 2
-        orders = order_posterior(dataset, found, h, own)
-        best, m = orders.best
-        if abs(best - now) > orders.resolution or m != lines:
-            other = orders.family(dataset, best, m)
-            other = replace(other, search=own[0].search, given=True)
-            found, changed = _tuned(dataset, exchanged(found, own, [other], False)), True
-    return _tuned(dataset, _refitted(found)) if changed else found
+    begun = found
+    for _ in range(SWEEPS):
+        before = found
+        for h in ripples(dataset):
+            lines_of_joints = (c for c in found.components if isinstance(c.effect, GearSpectrum))
+            own = [c for c in lines_of_joints if c.where == h.where]
+            if len(own) != 1:
+                continue
+            now, lines = dict(own[0].settings)["order_1"], len(own[0].settings) // 2
+            orders = order_posterior(dataset, found, h, own)
+            best, m = orders.best
+            if abs(best - now) > orders.resolution or m != lines:
+                other = replace(orders.family(dataset, best, m), search=own[0].search)
+                found = _tuned(dataset, exchanged(found, own, [other], refit_noise=False))
+        if found is before:
+            break
+    return found if found is begun else _tuned(dataset, _refitted(found))
 
 
 SWEEPS = 2
