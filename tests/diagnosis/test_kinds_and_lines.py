@@ -4,7 +4,7 @@ fast the base drifts."""
 from __future__ import annotations
 
 from dataclasses import replace
-from math import comb, exp
+from math import comb, exp, log
 
 import numpy as np
 import pytest
@@ -12,24 +12,30 @@ from support.diagnosis_data import campaign, random_data
 
 from elastocal.diagnosis import Component, NoiseValues, NoisyData, fit_baseline
 from elastocal.diagnosis.component_families import (
+    LineFamily,
     drifts,
+    family_component,
     line_families,
     sharpened,
     shorter,
-    whole_families,
     with_multiples,
 )
 from elastocal.diagnosis.component_search import (
+    PROBABLE,
     completed,
     hidden_fellows,
+    with_expected_families,
+    with_likelier_orders,
     with_shorter_drifts,
 )
 from elastocal.diagnosis.components import PRESENT, Pool, fit_sum, log_odds, presence_cost
-from elastocal.diagnosis.diagnosis_data import diagnosis_data_of
+from elastocal.diagnosis.diagnosis_data import DiagnosisData, diagnosis_data_of
 from elastocal.diagnosis.hypotheses import possible
+from elastocal.diagnosis.line_orders import Family, log_prior_of, order_posterior, ripples
 from elastocal.model.effects.gears import EncoderScale, GearEccentricity
 
 QUIET = NoiseValues.usual(3).of_instrument()
+QUIET6 = NoiseValues.usual(6).of_instrument()
 
 
 def plain_data() -> NoisyData:
@@ -100,25 +106,106 @@ def test_what_cannot_be_seen_is_reckoned_with_where_its_fellows_are() -> None:
     np.testing.assert_allclose(hidden.columns, sixth.columns * size)
 
 
-def test_orders_of_lines_are_found_beside_each_other() -> None:
-    """And how well each is known is honest."""
+@pytest.fixture(scope="module")
+def rippled() -> DiagnosisData:
+    """Sixty poses of an arm whose joint 5 has a ripple of order 81.3."""
     model, table = campaign("gear_ripple:joint5", n=60, sigma=2e-5)
-    base = fit_baseline(model, table)
     hypotheses, _ = possible(model, table)
-    dataset = diagnosis_data_of(base, hypotheses)
-    start = fit_sum(dataset.data, [], dataset.noise)
-    best = line_families(dataset, start)[0]
+    return diagnosis_data_of(fit_baseline(model, table), hypotheses)
+
+
+def test_orders_of_lines_are_found_beside_each_other(rippled: DiagnosisData) -> None:
+    """And how well each is known is honest; nothing is expected of joints that have none."""
+    start = fit_sum(rippled.data, [], rippled.noise)
+    assert with_expected_families(rippled, start) is start
+    best = line_families(rippled, start)[0]
     assert best.where == "joint5" and best.gain > 10
-    found = fit_sum(dataset.data, [best.component], start.noise)
-    again = sharpened(dataset, found) or list(found.components)
+    found = fit_sum(rippled.data, [best.component], start.noise)
+    again = sharpened(rippled, found) or list(found.components)
     settings = dict(again[0].settings)
     order, sd = settings["order_1"], settings["order_sd_1"]
     assert sd < 0.2 and abs(order - 81.3 / round(81.3 / order)) < 4 * sd
-    one = with_multiples(dataset, again[0]).get(1, again[0])
-    ((family, whole),) = whole_families(dataset, [one])
-    orders = [value for key, value in whole.settings if not key.startswith("order_sd")]
-    assert family is one and orders == pytest.approx([order, 2 * order, 3 * order])
-    assert not whole_families(dataset, [whole])
+    one = with_multiples(rippled, again[0]).get(1, again[0])
+    orders = [dict(one.settings)["order_1"]]
+    orders += [dict(with_multiples(rippled, one)[3].settings)[f"order_{k}"] for k in (2, 3)]
+    assert orders == pytest.approx([order, 2 * order, 3 * order])
+    assert with_expected_families(rippled, found) is found
+
+
+LINED = {"joint1": 24.3, "joint3": 17.8, "joint4": 31.4, "joint5": 40.65}
+
+
+@pytest.fixture(scope="module")
+def lined(rippled: DiagnosisData) -> tuple[DiagnosisData, dict[str, Component]]:
+    """Four joints with families of two lines each, of similar sizes, and noise as stated."""
+    families = {
+        w: family_component(rippled, LineFamily(w, order, 2, 0.0, 0.02, 7.0))
+        for w, order in LINED.items()
+    }
+    rng, data = np.random.default_rng(4), rippled.data
+    root = np.linalg.cholesky(data.covariance)
+    r = (root @ rng.normal(size=(*data.r.shape, 1)))[:, :, 0]
+    for c in families.values():
+        amplitudes = rng.normal(size=c.width) * np.tile([0.8, 0.8, 0.0, 0.0], 2)
+        r = r + c.columns @ amplitudes
+    return rippled.changed(data=replace(data, r=r)), families
+
+
+def test_what_other_joints_have_is_expected_of_the_next(
+    lined: tuple[DiagnosisData, dict[str, Component]],
+) -> None:
+    """With k of n joints odds of k + 1 to n − k; its order is that of the readings, and joints
+    without lines get none."""
+    dataset, families = lined
+    h = next(h for h in ripples(dataset) if h.where == "joint5")
+    chances = []
+    for k in (1, 3):
+        some = [families[w] for w in list(LINED)[:k]]
+        found = fit_sum(dataset.data, some, QUIET6, refit_noise=False)
+        assert len(found.components) == k
+        orders = order_posterior(dataset, found, h)
+        assert orders.presence == pytest.approx(log((k + 1) / (6 - k)))
+        order, _ = orders.best
+        assert order == pytest.approx(LINED["joint5"], abs=orders.resolution)
+        chances.append(orders.probability(order))
+        assert orders.log_odds.size == orders.orders.size
+    assert chances[1] > PROBABLE
+    wider = with_expected_families(dataset, found)
+    assert {c.where for c in wider.components} == set(LINED)
+    again = fit_sum(dataset.data, wider.components, wider.noise, wider.sizes)
+    assert len(again.components) == len(LINED)
+
+
+@pytest.mark.parametrize("ratio", [0.5, 2.0])
+def test_half_an_order_or_twice_it_is_put_right(
+    lined: tuple[DiagnosisData, dict[str, Component]], ratio: float
+) -> None:
+    """And lines that are not there go."""
+    dataset, families = lined
+    wrong = LineFamily("joint3", ratio * LINED["joint3"], 3, 0.0, 0.02, 7.0)
+    some = [c for w, c in families.items() if w != "joint3"]
+    some.append(replace(family_component(dataset, wrong), given=True))
+    found = fit_sum(dataset.data, some, QUIET6, refit_noise=False)
+    better = with_likelier_orders(dataset, found)
+    (c,) = (c for c in better.components if c.where == "joint3")
+    assert dict(c.settings)["order_1"] == pytest.approx(LINED["joint3"], abs=0.1)
+    assert len(c.settings) // 2 == 2
+    assert better.score > found.score
+
+
+def test_a_next_line_is_as_probable_as_other_joints_have_it() -> None:
+    """Prior over orders and numbers of lines sums to one; of n families that k have the third."""
+    unit = 0.2
+    grid = [np.arange(2.5, 250.0 / m, 0.5 * unit / m) for m in (1, 2, 3)]
+    orders, lines = np.concatenate(grid), np.repeat([1, 2, 3], [len(g) for g in grid])
+    for third in range(4):
+        fellows = [Family(f"joint{k}", 20.0 + k, 3 if k < third else 2, 0.0) for k in range(3)]
+        prior = np.exp(log_prior_of(orders, lines, unit, fellows))
+        assert prior.sum() == pytest.approx(1.0, abs=0.02)
+        at = [prior[(lines == m) & (np.abs(orders - 20.0) < 5.0)].sum() for m in (2, 3)]
+        assert at[1] / at[0] == pytest.approx((third + 1) / (4 - third), rel=0.05)
+        # Those of other joints are where an order is looked for first.
+        assert prior[np.abs(orders - 20.0) < 5.0].sum() > 2 * prior[orders > 100.0].sum()
 
 
 @pytest.mark.parametrize("share", [0.07, 0.6])

@@ -176,8 +176,8 @@ def line_families(dataset: DiagnosisData, found: FittedSum) -> list[LineFamily]:
     What is not found yet counts as scatter of its joint, or as its curve: so a family is tried
     beside these, and in their place.
     """
-    beside = _beside(dataset, found, found.noise)
-    out, now = [], beside.at.marginal
+    sums = beside(dataset, found, found.noise)
+    out, now = [], sums.at.marginal
     for h in dataset.hypotheses:
         if not isinstance(h.effect, GearRipple):
             continue
@@ -188,14 +188,15 @@ def line_families(dataset: DiagnosisData, found: FittedSum) -> list[LineFamily]:
         lines = sum(len(c.settings) // 2 for c in own if isinstance(c.effect, GearSpectrum))
         if lines > MOST_FOUND:
             continue
-        tried = [_best(beside, h, 0.0, _scatter(found.noise, i), ())]
+        tried = [_best(sums, h, 0.0, scatter_of(found.noise, i), ())]
         curves = tuple(c for c in own if isinstance(c.effect, JointCurve))
-        for scatter in _less(found.noise, i) or ([_scatter(found.noise, i)] if curves else []):
-            grams = _beside(dataset, found, with_scatter(found.noise, i, scatter), curves)
+        now_scatter = [scatter_of(found.noise, i)] if curves else []
+        for scatter in less_scatter(found.noise, i) or now_scatter:
+            grams = beside(dataset, found, with_scatter(found.noise, i, scatter), curves)
             tried.append(_best(grams, h, grams.at.marginal - now, scatter, curves))
         best = max(tried, key=lambda family: family.gain)
         if best.gain > HOPELESS:
-            out.append(replace(best, component=_family_component(dataset, best)))
+            out.append(replace(best, component=family_component(dataset, best)))
     return sorted(out, key=lambda family: -family.gain)
 
 
@@ -211,15 +212,15 @@ def with_scatter(noise: NoiseValues, i: int, scatter: tuple[float, float]) -> No
     return replace(noise, joint=joint, shared=shared)
 
 
-def _scatter(noise: NoiseValues, i: int) -> tuple[float, float]:
+def scatter_of(noise: NoiseValues, i: int) -> tuple[float, float]:
     return float(noise.joint[i]), float(noise.shared[i])
 
 
-def _less(noise: NoiseValues, i: int) -> list[tuple[float, float]]:
+def less_scatter(noise: NoiseValues, i: int) -> list[tuple[float, float]]:
     """Scatter that joint i (0-based) may have once its lines are known: half of it, as usual from
     pose to pose, and as usual from visit to visit as well."""
-    s, c = _scatter(noise, i)
-    s_usual, c_usual = _scatter(NoiseValues.usual(len(noise.joint)), i)
+    s, c = scatter_of(noise, i)
+    s_usual, c_usual = scatter_of(NoiseValues.usual(len(noise.joint)), i)
     s_least, c_least = min(s, s_usual), min(c, c_usual)
     half = (s, c / 2) if c > 1 else (s / 2, c)
     tried = {(max(half[0], s_least), max(half[1], c_least)), (s, c_least), (s_least, c_least)}
@@ -247,10 +248,10 @@ def _best_family(grams: Grams, h: Hypothesis, m: int) -> LineFamily:
     orders = np.arange(LOWEST, HIGHEST / m, step)
     # An order of 10 to 20 is as probable as one of 100 to 200 beforehand.
     log_prior = -np.log(orders) - np.log((1 / orders).sum() * len(MULTIPLES))
-    each = _family_evidence(grams, h, orders, m) + log_prior
+    each = family_evidence(grams, h, orders, m) + log_prior
     k = int(np.argmax(each))
     search = -float(log_prior[k])
-    order, sd, evidence = _refined(grams, h, float(orders[k]), m, step)
+    order, sd, evidence = refined_order(grams, h, float(orders[k]), m, step)
     return LineFamily(h.where, order, m, evidence - search, sd, search)
 
 
@@ -296,7 +297,7 @@ def sharpened(dataset: DiagnosisData, found: FittedSum) -> list[Component] | Non
             m = c.width // 4
             order = min(max(dict(c.settings)["order_1"] + float(step), LOWEST), HIGHEST / m)
             family = LineFamily(c.where, order, m, 0.0, float(known), c.search)
-            components[k] = _family_component(dataset, family)
+            components[k] = replace(family_component(dataset, family), given=c.given)
         now = replace(now, components=tuple(components))
     return list(found.components) if moved else None
 
@@ -310,14 +311,14 @@ def sought_anew(dataset: DiagnosisData, found: FittedSum, c: Component) -> Compo
     if not isinstance(c.effect, GearSpectrum):
         return None
     h = next(h for h in dataset.hypotheses if h.key == (GearRipple.name, c.where))
-    grams = _beside(dataset, found, found.noise, (c,))
+    grams = beside(dataset, found, found.noise, (c,))
     best = _best(grams, h, 0.0, (0.0, 0.0), ())
     given = dict(c.settings)
-    own = _family_evidence(grams, h, np.array([given["order_1"]]), c.width // 4)[0]
+    own = family_evidence(grams, h, np.array([given["order_1"]]), c.width // 4)[0]
     near = abs(best.order - given["order_1"]) < best.sd + given["order_sd_1"]
     if near or best.gain <= own - c.search:
         return None
-    return _family_component(dataset, best)
+    return family_component(dataset, best)
 
 
 def with_multiples(dataset: DiagnosisData, c: Component) -> dict[int, Component]:
@@ -327,24 +328,13 @@ def with_multiples(dataset: DiagnosisData, c: Component) -> dict[int, Component]
     given = dict(c.settings)
     m, order, sd = len(given) // 2, given["order_1"], given["order_sd_1"]
     return {
-        n: _family_component(dataset, LineFamily(c.where, order, n, 0.0, sd, c.search))
+        n: replace(
+            family_component(dataset, LineFamily(c.where, order, n, 0.0, sd, c.search)),
+            given=c.given,
+        )
         for n in MULTIPLES
         if n != m and n * order <= HIGHEST
     }
-
-
-def whole_families(
-    dataset: DiagnosisData, components: Sequence[Component]
-) -> list[tuple[Component, Component]]:
-    """Each family of lines that has fewer than it may have, and the same with all."""
-    families = Counter(c.where for c in components if isinstance(c.effect, GearSpectrum))
-    found = []
-    for c in components:
-        others = with_multiples(dataset, c)
-        most = max(others, default=0)
-        if most > len(c.settings) // 2 and families[c.where] * most <= MOST_LINES:
-            found.append((c, others[most]))
-    return found
 
 
 def _lines_and_shifts(span: slice) -> tuple[IntArray, IntArray]:
@@ -353,16 +343,16 @@ def _lines_and_shifts(span: slice) -> tuple[IntArray, IntArray]:
     return columns[:, :2].ravel(), columns[:, 2:].ravel()
 
 
-def _refined(
-    grams: Grams, h: Hypothesis, order: float, m: int, width: float
+def refined_order(
+    grams: Grams, h: Hypothesis, order: float, m: int, width: float, scales: Array = LINE_SCALES
 ) -> tuple[float, float, float]:
     """Lowest order of a family, its standard deviation and log evidence, sought within `width` of
     `order`: the curvature of the evidence says how well it is known."""
     for narrowed in width / 4.0 ** np.arange(3):
         trial = np.clip(order + np.linspace(-narrowed, narrowed, 17), LOWEST, HIGHEST / m)
-        order = float(trial[int(np.argmax(_family_evidence(grams, h, trial, m)))])
+        order = float(trial[int(np.argmax(family_evidence(grams, h, trial, m, scales)))])
     trial = np.linspace(-width, width, 33)
-    each = _family_evidence(grams, h, order + trial, m)
+    each = family_evidence(grams, h, order + trial, m, scales)
     evidence = float(each[16])
     # The parabola through the highest five points, or all that are nearly as high.
     near = np.abs(trial) <= max(np.abs(trial[each > evidence - 2.0]).min(initial=0.0), trial[18])
@@ -372,7 +362,9 @@ def _refined(
     return order, sd, evidence
 
 
-def _family_evidence(grams: Grams, h: Hypothesis, orders: Array, m: int) -> Array:
+def family_evidence(
+    grams: Grams, h: Hypothesis, orders: Array, m: int, scales: Array = LINE_SCALES
+) -> Array:
     """Log evidence (G,) of the families of m lines at `orders` (G,)."""
     dataset = grams.dataset
     sums = grams.entry(h.entry_key(dataset.base.model))
@@ -382,11 +374,11 @@ def _family_evidence(grams: Grams, h: Hypothesis, orders: Array, m: int) -> Arra
         some = orders[start : start + piece, None]
         # The amplitudes of multiples fall with their number, in the mean.
         D = [dataset.direction(h, some * k) / k for k in range(1, m + 1)]
-        out.append(sums.driven(np.concatenate(D, axis=4)).evidence(LINE_SCALES))
+        out.append(sums.driven(np.concatenate(D, axis=4)).evidence(scales))
     return np.concatenate(out)
 
 
-def _family_component(dataset: DiagnosisData, family: LineFamily) -> Component:
+def family_component(dataset: DiagnosisData, family: LineFamily) -> Component:
     effect, where = GearSpectrum(), family.where
     q = dataset.table.q[:, index(where)]
     settings = {"spectrum_size_rad": 1.0, "spectrum_centre_rad": float((q.max() + q.min()) / 2)}
@@ -411,7 +403,7 @@ FIELD_LENGTHS = (0.25, 1.5)  # of the range of what a field follows
 SHORTER, LEAST_SHARE, AT_END = 2.0, 0.03, 0.05
 
 
-def _beside(
+def beside(
     dataset: DiagnosisData, found: FittedSum, noise: NoiseValues, some: Sequence[Component] = ()
 ) -> Grams:
     """What scores columns beside all of a sum but some of its components."""
@@ -426,13 +418,13 @@ def fields(dataset: DiagnosisData, found: FittedSum, most: int) -> list[Componen
     follow = [w for w in turning_joints(chain) if np.ptp(dataset.table.q[:, index(w)]) > MOVED]
     if recorded(dataset.table, "time"):
         follow.append("time")
-    beside, conspicuous = _beside(dataset, found, found.noise), []
+    sums, conspicuous = beside(dataset, found, found.noise), []
     known = {(c.where, c.follows) for c in found.components}
     for where in effect.places(chain, cell):
         if where.startswith("marker") and "time" not in follow:
             continue
         # Of one place at a time: what a large table's entries sum up to would fill the memory.
-        grams = Grams(dataset, beside.data, beside.at)
+        grams = Grams(dataset, sums.data, sums.at)
         for name in follow:
             own = where == name and where.startswith("joint")
             if own or (where, name) in known or (where.startswith("marker") and name != "time"):

@@ -22,7 +22,6 @@ from elastocal.diagnosis.component_families import (
     sharpened,
     shorter,
     sought_anew,
-    whole_families,
     with_multiples,
     with_scatter,
 )
@@ -39,9 +38,11 @@ from elastocal.diagnosis.diagnosis_data import DiagnosisData
 from elastocal.diagnosis.effect_search import about
 from elastocal.diagnosis.evidence import ANOTHER, log_prior_odds, spectrum
 from elastocal.diagnosis.hypotheses import Hypothesis, judged_together
+from elastocal.diagnosis.line_orders import families_of, order_posterior, ripples
 from elastocal.diagnosis.model_set import Item, ModelSet, extended, packed_columns
 from elastocal.diagnosis.noise_floor import NoiseValues, NoisyData, project
 from elastocal.model.effects.base import index
+from elastocal.model.effects.gears import GearSpectrum
 from elastocal.model.effects.gravity_sag import GravitySag, LinkWeights
 from elastocal.model.effects.smooth import JointCurve
 from elastocal.units import Array, Progress
@@ -109,7 +110,8 @@ def search_components(
     progress("what can be left out")
     found = with_shorter_drifts(full, _spared(found))
     if len(full.blocks.member) <= FEW_POSES:
-        found = _with_all_multiples(full, completed(found, both))
+        found = with_expected_families(full, completed(found, both))
+        found = with_likelier_orders(full, found)
     return full, found, hidden_fellows(found, others)
 
 
@@ -240,17 +242,51 @@ def _reviewed(dataset: DiagnosisData, found: FittedSum) -> FittedSum:
     return _tuned(dataset, found) if changed else found
 
 
-def _with_all_multiples(dataset: DiagnosisData, found: FittedSum) -> FittedSum:
-    """The sum with every multiple that its families of lines may have.
+def with_expected_families(dataset: DiagnosisData, found: FittedSum) -> FittedSum:
+    """The sum with a family of lines at each joint where the others let expect one, and one order
+    is more probable than all others and none together; the most probable first."""
+    while lined := {family.where for family in families_of(found)}:
+        others = (h for h in ripples(dataset) if h.where not in lined)
+        each = [order_posterior(dataset, found, h) for h in others]
+        likeliest = max(each, key=lambda p: p.probability(p.best[0]), default=None)
+        if likeliest is None or likeliest.probability(likeliest.best[0]) <= PROBABLE:
+            break
+        family = likeliest.family(dataset, *likeliest.best)
+        noise = with_scatter(found.noise, index(family.where), likeliest.scatter)
+        found = _tuned(dataset, exchanged(replace(found, noise=noise), [], [family]))
+    return found
 
-    Which of them stand out was decided by what they earn.  At new poses it costs more to leave out
-    what half shows than to have it shrunk.
+
+PROBABLE = 0.5
+
+
+def with_likelier_orders(dataset: DiagnosisData, found: FittedSum) -> FittedSum:
+    """The sum with the lines of each joint at another order, a half of it or any, or with more of
+    its multiples or fewer, where this is more probable beside all others.
+
+    A single line may be the first of a family, or the second of one at half its order; which it
+    is shows in the others.  A multiple that is not there costs as much as one that is missed.
     """
-    pairs = whole_families(dataset, found.components)
-    if not pairs:
-        return found
-    whole = exchanged(found, [c for c, _ in pairs], [w for _, w in pairs])
-    return _tuned(dataset, whole) if len(whole.components) == len(found.components) else found
+    begun = found
+    for _ in range(SWEEPS):
+        before = found
+        for h in ripples(dataset):
+            lines_of_joints = (c for c in found.components if isinstance(c.effect, GearSpectrum))
+            own = [c for c in lines_of_joints if c.where == h.where]
+            if len(own) != 1:
+                continue
+            now, lines = dict(own[0].settings)["order_1"], len(own[0].settings) // 2
+            orders = order_posterior(dataset, found, h, own)
+            best, m = orders.best
+            if abs(best - now) > orders.resolution or m != lines:
+                other = replace(orders.family(dataset, best, m), search=own[0].search)
+                found = _tuned(dataset, exchanged(found, own, [other], refit_noise=False))
+        if found is before:
+            break
+    return found if found is begun else _tuned(dataset, _refitted(found))
+
+
+SWEEPS = 2
 
 
 def hidden_fellows(found: FittedSum, components: Sequence[Component]) -> tuple[Component, ...]:

@@ -66,7 +66,8 @@ class Component:
     logarithms `lengths`; they stand in the columns `repeat` times, once for each component of the
     motion.  `settings` are constants of the effect by key, `search` what finding them cost in nats;
     `follows` is what a field depends on; `fellows` at how many places there may be one of its kind.
-    One that is `given` stays in the sum: the columns of others are about it.
+    One that is `given` stays in the sum: the columns of others are about it, or it has been
+    compared with its absence already.
     """
 
     family: Family
