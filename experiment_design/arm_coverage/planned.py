@@ -52,7 +52,7 @@ def cell_of(scenario: campaigns.Scenario) -> Cell:
     unsteady = Unsteadiness(
         np.array([campaigns.SCATTER if key == "joints" else 0.0]),
         campaigns.DRIFT if key == "drift" else 0.0, LASTING,
-        campaigns.EFFECT if key == "effect" else 0.0,
+        campaigns.EFFECT if key == "effect" else 0.0, 3.0 if key == "tails" else None,
     )  # fmt: skip
     urdf = str(files("elastocal.demo") / "kr270_2.urdf")
     return replace(

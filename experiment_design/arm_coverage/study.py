@@ -25,7 +25,7 @@ LEVELS = {"held_95": 0.95, "held_9973": 0.9973}
 
 def tasks(options: dict[str, Any]) -> Iterator[dict[str, Any]]:
     chosen = [s for s in SCENARIOS if options["only"] in ("", s.key)]
-    for number in range(options["replicates"]):
+    for number in range(options["first"], options["first"] + options["replicates"]):
         for scenario in chosen:
             yield {"scenario": scenario.key, "number": number}
 

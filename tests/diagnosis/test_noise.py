@@ -7,20 +7,25 @@ from dataclasses import replace
 import numpy as np
 import pytest
 from scipy import linalg, optimize, stats
-from support.diagnosis_data import dense_noise, kept_only, random_data, used_rows
+from support.diagnosis_data import campaign, dense_noise, kept_only, random_data, used_rows
 
+from elastocal.cell.arm_description import Unsteadiness
 from elastocal.diagnosis import (
     Blocks,
     NoiseValues,
     NoisyData,
     Weighted,
     covariance,
+    diagnosis_data_of,
+    fit_baseline,
     fit_noise,
     likelihood,
     log_prior,
     posterior,
     project,
 )
+from elastocal.measurements import visits
+from elastocal.model import Model
 
 NOISE = NoiseValues(1.3, np.array([4e-6, 9e-6, 2e-5]), np.array([0.4, 0.1, 0.9]))
 SEEDS = range(4)
@@ -185,3 +190,31 @@ def test_the_start_of_the_search_does_not_matter() -> None:
     far = NoiseValues(2.5, np.array([1e-4, 1e-7]), np.full(2, 1.5))
     ends = [likelihood(data, fit_noise(data, start))[0] for start in (None, far)]
     assert ends[0] == pytest.approx(ends[1], abs=0.05)
+
+
+def test_a_stated_drift_is_noise_that_readings_have_in_common_by_their_times() -> None:
+    """Its waves and what changes faster, common to a visit, make drift² exp(−|t − t′|/lasting)."""
+    size, lasting = 40e-6, 900.0
+    model, table = campaign(n=12)
+    visit = visits(table)
+    table = replace(table, time=60.0 * visit)
+    noise = Unsteadiness(drift=size, lasting=lasting)
+    stated = Model.assembled(model.chain, replace(model.cell, noise=noise))
+    base = fit_baseline(model, table)
+    plain, data = (diagnosis_data_of(replace(base, model=m), []) for m in (model, stated))
+    assert plain.drift == 0 and data.drift == size
+    blocks, new = data.blocks, len(data.fitted) - len(plain.fitted)
+    waves = blocks.unpack(data.data.X[:, :, -new:])
+    found = np.einsum("nik,mjk->nmij", waves, waves)
+    faster = data.data.covariance - plain.data.covariance
+    for members, own in zip(blocks.member, faster, strict=True):
+        here = members[members < blocks.n]
+        square = own.reshape(len(members), 3, -1, 3)[: len(here), :, : len(here)]
+        found[np.ix_(here, here)] += square.transpose(0, 2, 1, 3)
+    own_visit, when = visit[data.lead], table.time[data.lead]
+    expected = (
+        size**2 * np.exp(-np.abs(when[:, None] - when) / lasting)[..., None, None] * np.eye(3)
+    )
+    same = own_visit[:, None] == own_visit
+    np.testing.assert_allclose(found[same], expected[same], atol=1e-9 * size**2)
+    assert np.abs(found - expected).max() < 0.1 * size**2

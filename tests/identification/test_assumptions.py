@@ -225,15 +225,21 @@ def test_heavy_tails_call_for_care_where_least_squares_wastes_readings(clean, ku
 
 def test_readings_set_apart_count(clean):
     model, table, x, _ = clean
-    rng = np.random.default_rng(8)
+    rng = np.random.default_rng(9)
     exact = measured(model, table, x, 0.0, rng)
     tails = SIGMA * rng.standard_t(3, size=exact.position.shape)
+    mistakes = np.array([7, 40])
+    tails[mistakes] += 0.01
     result = identify(model, replace(exact, position=exact.position + tails))
-    assert result.excluded and result.heldout_all_rms > 1.02 * result.heldout_rms
-    n, k = len(result.observations.lead), len(result.excluded)
-    apart = sum(o.residual**2 for o in result.excluded)
-    assert (n + k) * result.heldout_all_rms**2 == pytest.approx(n * result.heldout_rms**2 + apart)
-    assert "set apart as faulty" in prediction_lines(result)[0][1]
+    n, kept, own = len(result.observations.lead), result.heldout_kept_rms, result.tails.counted
+    apart = np.array([o.residual**2 for o in result.excluded])
+    lines = np.array([o.line for o in result.excluded])
+    assert own.any() and set(lines[~own]) == set(exact.row[mistakes])
+    for rms, counts in ((result.heldout_rms, own), (result.heldout_all_rms, own | True)):
+        assert (n + counts.sum()) * rms**2 == pytest.approx(n * kept**2 + apart[counts].sum())
+    assert 1.02 * kept < result.heldout_rms < result.heldout_all_rms / 2
+    told = prediction_lines(result)[0][1]
+    assert "Errors have far tails" in told and "set apart as faulty" in told
     assert result.to_json()["heldout_all_rms_um"] == pytest.approx(result.heldout_all_rms * 1e6)
 
 

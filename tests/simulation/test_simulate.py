@@ -270,6 +270,24 @@ def test_a_drift_is_correlated_in_time_and_the_table_says_when():
     assert abs(neighbours - np.exp(-0.5)) < 0.1
 
 
+def test_tails_have_the_stated_standard_deviation_and_many_far_readings():
+    sigma = 1e-5
+    noise = CartesianNoise(np.full(3, sigma))
+    normal, far = (
+        model_with(tracker=Tracker(noise=noise), noise=Unsteadiness(tails=t)) for t in (None, 5.0)
+    )
+    plan, truth = plan_of(normal), true_values(normal, np.random.default_rng(0))
+    exact = simulate(normal, plan, truth, 0, noise=False).position
+    found = []
+    for model in (normal, far):
+        off = np.array([simulate(model, plan, truth, k).position - exact for k in range(120)])
+        assert np.sqrt(np.mean(off**2)) == pytest.approx(sigma, rel=0.06)
+        found.append(np.mean(np.abs(off) > 4 * sigma))
+    assert found[1] > 10 * max(found[0], 1e-4)
+    with pytest.raises(InputError, match=r"noise\.tails is 2\.0: .* take a number > 2"):
+        Unsteadiness(tails=2.0)
+
+
 def test_as_many_numbers_as_joints_are_needed():
     model = model_with(noise=Unsteadiness(np.full(7, 1e-5)))
     with pytest.raises(InputError, match=r"noise\.joints_urad has 7 numbers"):

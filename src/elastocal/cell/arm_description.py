@@ -253,12 +253,13 @@ class Tracker:
 
 @record
 class Unsteadiness:
-    """What differs from visit to visit, beside the noise of a reading.
+    """What differs from visit to visit, beside the noise of a reading, and the tails of that noise.
 
     `joints` (joints,) or (1,), in rad or m: by how much each joint settles elsewhere at each visit.
     `drift` m in each direction: of base or tracker, with the correlation exp(−|t − t′|/`lasting`)
     of times in s.  `configuration` m in each direction: a deviation that all readings of a
-    configuration share, whatever the load.
+    configuration share, whatever the load.  `tails`: degrees of freedom of Student's t, of which
+    the noise of a reading is drawn, its standard deviation the stated one; None: normal.
     """
 
     joints: Scatter = keyed(
@@ -268,6 +269,14 @@ class Unsteadiness:
     drift: NonNegative = keyed("a number >= 0 in µm", "drift_um", default=0.0)
     lasting: Positive = keyed("a positive number in s", "lasting_s", default=3600.0)
     configuration: NonNegative = keyed("a number >= 0 in µm", "configuration_um", default=0.0)
+    tails: Positive | None = keyed("a number > 2", default=None)
+
+    def __post_init__(self) -> None:
+        require(
+            self.tails is None or self.tails > 2,
+            f"key noise.tails is {self.tails}: Student's t with two degrees of freedom or fewer "
+            "has no standard deviation, which is what [tracker] states; take a number > 2, as 3",
+        )
 
     def of_joints(self, n: int) -> Array:
         """Standard deviations (n,) of n joints; InputError where there are others."""

@@ -289,7 +289,7 @@ class NoiseFloor:
     or m: scatter of each joint from visit to visit.  `shared`: scatter common to all visits of
     a configuration, as a multiple of it, `shared_by_joint` (joints,) that of each joint.
     `pure_error` (m): rms per axis within repeats, `near_repeats`: what readings at nearly the same
-    pose differ by, None without.
+    pose differ by, None without.  `drift` (m): what the cell states of it and nobody has to find.
     """
 
     stated: bool
@@ -301,6 +301,7 @@ class NoiseFloor:
     shared_by_joint: tuple[float, ...] = ()
     faulty: tuple[FaultyReading, ...] = ()
     near_repeats: NearRepeats | None = None
+    drift: float = 0.0
 
 
 @dataclass(frozen=True, repr=False)
@@ -526,6 +527,7 @@ def publish(diagnosis: Diagnosis, model: Model, data: str) -> dict[str, Any]:
             ],
             "shared": noise.shared,
             "shared_by_joint": noise.shared_by_joint,
+            "drift_um": _um(noise.drift),
             "pure_error_um": _um(noise.pure_error),
             "near_repeat_um": near and _um(near.scatter),
             "near_repeats": near and _without(_in_um(near, "soon", "later"), "scatter"),

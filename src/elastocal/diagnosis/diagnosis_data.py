@@ -31,10 +31,14 @@ from elastocal.diagnosis.hypotheses import (
 )
 from elastocal.diagnosis.noise_floor import NoiseValues, NoisyData, fit_noise
 from elastocal.errors import InsufficientDataError
+from elastocal.identification.noise_structure import VISIT, SharedEffect
+from elastocal.identification.visit_record import visit_record
 from elastocal.measurements import Measurements, numbered
 from elastocal.model.effects import CATALOGUE
 from elastocal.model.effects.loads import PayloadError
+from elastocal.model.effects.placements import BaseFrame
 from elastocal.model.manipulator import Model
+from elastocal.model.observations import subset
 from elastocal.planning.doubts import usual_sizes
 from elastocal.units import Array, BoolArray, IntArray
 
@@ -49,9 +53,10 @@ class DiagnosisData:
 
     `data` holds the residual at the prior's centre, linearised at the fit, the fitted columns
     (scaled to their prior deviations) and noise shapes; `fitted` names the parameter of each of
-    these columns, of the load point's the effect; `load_point` (C, m, 3) is what a shift of the
-    load point does, per m, None without a load.  `other_backlash` is the probability that play
-    follows the backlash model that the base's model does not have.
+    these columns, of the load point's the effect, of a stated drift's that of the base.
+    `load_point` (C, m, 3) is what a shift of the load point does, per m, None without a load.
+    `other_backlash` is the probability that play follows the backlash model that the base's model
+    does not have.
     """
 
     base: Baseline
@@ -67,6 +72,11 @@ class DiagnosisData:
     @property
     def blocks(self) -> Blocks:
         return self.data.blocks
+
+    @property
+    def drift(self) -> float:
+        """The drift in m that the cell states, and that is noise here; of distances none is."""
+        return self.base.model.cell.noise.drift if self.blocks.size > 1 else 0.0
 
     @property
     def places(self) -> VisitPlaces:
@@ -245,6 +255,9 @@ def diagnosis_data_of(
         load_point = blocks.pack(shift)
         B = np.concatenate([B, shift * LOAD_POINT_TOLERANCE], axis=2)
         names += [h.name] * len(keys)
+    drift, faster = _stated_drift(base)
+    B = np.concatenate([B, drift], axis=2)
+    names += [BaseFrame.name] * drift.shape[2]
     used = np.abs(B).max(axis=(0, 1), initial=0.0) > 0
     if not used.any():
         raise InsufficientDataError(
@@ -259,7 +272,7 @@ def diagnosis_data_of(
         r=blocks.pack(residual[:, :, None])[:, :, 0],
         X=blocks.pack(B),
         precision=np.ones(B.shape[2]),
-        covariance=blocks.pack_square(base.covariance),
+        covariance=blocks.pack_square(base.covariance) + faster,
         G=blocks.pack(columns.entry(("joint_motion", joints))[observed.lead]),
         same_visit=blocks.same_visit,
         left_out=blocks.absent,
@@ -267,6 +280,36 @@ def diagnosis_data_of(
     )
     fitted = tuple(n for n, u in zip(names, used, strict=True) if u)
     return DiagnosisData(base, columns, tuple(hypotheses), data, fitted, load_point)
+
+
+def _stated_drift(base: Baseline) -> tuple[Array, Array | float]:
+    """Columns (N, size, k) of the drift that the cell's [noise] states, coefficients of variance
+    one, and the covariance (C, m, m) of what changes faster than its waves.
+
+    It is noise that neighbours in time have in common: left out, it passes for an effect that goes
+    with time.
+    """
+    observed, blocks, noise = base.observed, base.blocks, base.model.cell.noise
+    n, size = len(observed.lead), observed.size
+    some = subset(observed, np.arange(n) < base.n_measured)
+    record = visit_record(base.model, some, base.x) if noise.drift and size > 1 else None
+    if record is None:
+        return np.zeros((n, size, 0)), 0.0
+    # Without times a visit takes as long as the arm stands still, as in a simulation.
+    span = record.span * (1.0 if record.timed else base.model.cell.design.motion.dwell)
+    lasting = noise.lasting / span
+    moved = noise.drift * np.eye(size)[:, :3]
+    waves = record.waves(lasting)
+    drift = np.zeros((n, size, waves.shape[1] * 3))
+    each = waves[:, None, :, None] * moved[:, None, :]
+    drift[: base.n_measured] = each.reshape(len(waves), size, -1)
+    loading = np.zeros((n + 1, record.visit.shape[1], size, 3))
+    loading[: base.n_measured] = record.faster(lasting)[:, :, None, None] * moved
+    visit = np.full((n + 1, record.visit.shape[1]), -1)
+    visit[: base.n_measured] = record.visit
+    left = SharedEffect("drift", (VISIT,), visit, loading, np.zeros(0))
+    m = blocks.member.shape[1] * size
+    return drift, left.product(blocks.member, left, blocks.member).reshape(-1, m, m)
 
 
 def _load_hypotheses(base: Baseline) -> list[Hypothesis]:

@@ -24,7 +24,7 @@ def noise_floor(dataset: DiagnosisData, data: NoisyData, noise: NoiseValues) -> 
         data.stated, noise.factor, float(noise.factor * np.sqrt(variance.mean())),
         tuple(noise.joint.tolist()), noise.shared_by_all, pure_error(dataset),
         tuple(noise.shared.tolist()), describe_faulty(dataset, data, noise),
-        near_repeats(dataset, data, project(data, noise)),
+        near_repeats(dataset, data, project(data, noise)), dataset.drift,
     )  # fmt: skip
 
 

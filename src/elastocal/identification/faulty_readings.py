@@ -11,7 +11,13 @@ from numpy.typing import ArrayLike, NDArray
 from scipy import special
 
 from elastocal.errors import ElastocalError, require
-from elastocal.identification.noise_choice import NoiseFit, linearised, own_noise, weights_of
+from elastocal.identification.noise_choice import (
+    NoiseFit,
+    linearised,
+    own_noise,
+    standard_errors,
+    weights_of,
+)
 from elastocal.identification.outliers import FALSE_ALARM, blocks, studentised
 from elastocal.identification.robust_core import Design, design
 from elastocal.identification.solve import Solution
@@ -482,6 +488,32 @@ def report_faulty(
     except (ElastocalError, np.linalg.LinAlgError):
         return None
     return replace(report, names=tuple(problem.model.names[c] for c in columns))
+
+
+def standardised(
+    whole: Solution,
+    clean: Solution,
+    noise: NoiseFit | None,
+    fitted: BoolArray,
+    residual: Array | None = None,
+) -> Array:
+    """Errors (N, size) of all readings under the fit to the `fitted` ones (N,), in units of the
+    noise of a single reading.
+
+    `residual` (N, size): errors to take in place of those that the noise was found with."""
+    problem, columns = whole.problem, clean.fit.columns
+    if residual is not None:
+        columns = columns[~np.isin(columns, clean.reduction.with_prior)]
+    readings = linearised(problem.model, problem.observations, clean.fit.x, columns)
+    if residual is None and noise is not None:
+        return standard_errors(noise, readings, fitted)[0]
+    e = readings.e if residual is None else residual
+    if noise is None:
+        z = problem.weights.apply(e.ravel())
+    else:
+        z = block_diagonal(inverse_factor(own_noise(noise.fit, readings)[0])) @ e.ravel()
+    z = z.reshape(e.shape)
+    return np.asarray(z / np.sqrt(np.mean(z[fitted] ** 2)))
 
 
 def _fitted_markers(model: Model, columns: NDArray[np.int64]) -> set[str]:

@@ -19,6 +19,7 @@ from elastocal.identification.outliers import Outlier, blocks
 from elastocal.identification.residuals import ResidualSummary
 from elastocal.identification.result import Calibration, Estimate, Finding, Number, Severity
 from elastocal.identification.solve import Solution
+from elastocal.identification.tails import kept_of
 from elastocal.text import gathered, listed
 
 # What a result is worth, judged once: each finding with its numbers, its threshold and a remedy.
@@ -93,6 +94,7 @@ def judged(result: Calibration, of_solution: tuple[Finding, ...] | None = None) 
         *_undetermined(result),
         *_prior(result),
         *_shape(result),
+        *_tails(result),
         *_test(result),
     ]
     return replace(result, findings=(_trust(found), *found))
@@ -173,7 +175,9 @@ def _against_stated_noise(result: Calibration) -> Iterator[Finding]:
         remedy = "" if _lacks_fit(result) else STATE_NOISE
         yield Finding("noise_not_compared", "note", {}, remedy)
         return
-    low, high = np.sqrt(special.chdtri(result.dof, 1 - np.array(STATED)) / result.dof)
+    # A mean square varies by (2 + excess kurtosis) / n.
+    told = result.dof / (1 + max(_stated_kurtosis(result), 0.0) / 2)
+    low, high = np.sqrt(special.chdtri(told, 1 - np.array(STATED)) / told)
     numbers: dict[str, Number] = {
         "ratio": float(ratio), "by_chance_from": float(low), "by_chance_to": float(high),
         "dof": result.dof,
@@ -189,6 +193,15 @@ def _against_stated_noise(result: Calibration) -> Iterator[Finding]:
         )  # fmt: skip
     else:
         yield Finding("residual_agrees_with_stated_noise", "good", numbers)
+
+
+def _stated_kurtosis(result: Calibration) -> float:
+    """Of what is kept of noise with the tails that the cell states; normal noise has none."""
+    tails, size = result.model.cell.noise.tails, result.observations.size
+    if tails is None:
+        return 0.0
+    values = (len(result.observations.lead) + len(result.excluded)) * size
+    return kept_of(tails, values, size).excess_kurtosis
 
 
 def _lacks_fit(result: Calibration) -> bool:
@@ -255,7 +268,7 @@ def _visits(result: Calibration) -> Iterator[Finding]:
 
 
 def _prediction(result: Calibration) -> Iterator[Finding]:
-    held, fitted, nominal = result.heldout_rms, result.residual_rms, result.nominal_rms
+    held, fitted, nominal = result.heldout_kept_rms, result.residual_rms, result.nominal_rms
     # Under a drift the held-out error is that of another day, which more poses make no better.
     if math.isfinite(held) and held > FLATTERS * fitted and result.noise.drift is None:
         numbers: dict[str, Number] = {"heldout_rms_um": _um(held), "residual_rms_um": _um(fitted)}
@@ -424,6 +437,21 @@ def shape_of(summary: ResidualSummary) -> Finding:
         "differ by more than their intervals, far readings decide them; look for what makes single "
         "readings err (line of sight, vibration, a tracker that has not settled).",
     )  # fmt: skip
+
+
+def _tails(result: Calibration) -> Iterator[Finding]:
+    """Far errors that are the noise's own, whether they were set apart or not."""
+    tails = result.tails
+    if tails is not None:
+        yield Finding(
+            "far_tails", "note",
+            {
+                "dof": tails.dof, "p": tails.p, "set_apart": len(tails.counted),
+                "counted": int(tails.counted.sum()),
+                "heldout_rms_um": _um(result.heldout_rms),
+                "heldout_kept_rms_um": _um(result.heldout_kept_rms),
+            },
+        )  # fmt: skip
 
 
 def _test(result: Calibration) -> Iterator[Finding]:

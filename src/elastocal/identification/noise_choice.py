@@ -43,6 +43,7 @@ from elastocal.identification.reml import (
     score_test_of_columns,
     usual_start,
 )
+from elastocal.identification.tails import rejection_point
 from elastocal.identification.visit_record import VisitRecord, visit_record
 from elastocal.identification.weighted_problem import (
     Weights,
@@ -476,10 +477,16 @@ def unexplained_readings(
 ) -> BoolArray:
     """Readings (N,) that the noise does not explain, at `level` for the whole table (Bonferroni).
 
-    `found` was estimated from the `good` readings (N,); they and the others are judged by the
-    error of predicting them from good readings that are not they.  Each component of it, in
-    units of its own deviation, is compared with t on the degrees of freedom behind that.
+    `found` was estimated from the `good` readings (N,); each component of a reading's
+    `standard_errors` is compared with t on the degrees of freedom behind it.
     """
+    size, dof = standard_errors(found, readings, good)
+    return np.asarray((size > rejection_point(size.size, dof, level)).any(axis=1))
+
+
+def standard_errors(found: NoiseFit, readings: Readings, good: BoolArray) -> tuple[Array, Array]:
+    """Errors (N, size) of predicting each reading from the `good` ones (N,) that are not it, in
+    units of their own deviation, and the degrees of freedom (N, size) behind that."""
     readings = found.of(readings)
     own, dof = own_noise(found.fit, readings)
     t = np.zeros(readings.e.shape)
@@ -490,9 +497,8 @@ def unexplained_readings(
     squared = np.minimum(t**2, dof * (1 - 1e-12))
     outside = np.maximum(dof - 1, 1.0)
     deleted = np.sqrt(squared * outside / (dof - squared))
-    size = np.where(good[:, None], deleted, np.abs(t))
-    p = 2 * special.stdtr(np.where(good[:, None], outside, dof), -size)
-    return np.asarray(p.min(axis=1) < level / readings.e.size)
+    fitted = good[:, None]
+    return np.where(fitted, deleted, np.abs(t)), np.where(fitted, outside, dof)
 
 
 def own_noise(fit: Reml, readings: Readings) -> tuple[Array, Array]:

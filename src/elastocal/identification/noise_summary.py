@@ -19,6 +19,7 @@ from elastocal.identification.noise_choice import (
     own_noise,
 )
 from elastocal.identification.noise_structure import DRIFT, SHARED
+from elastocal.identification.tails import kept_of
 from elastocal.identification.weighted_problem import Weights, block_diagonal, weights_for, whitener
 from elastocal.measurements import Measurements
 from elastocal.model.observations import Observations, pure_error
@@ -271,10 +272,15 @@ def noise_parts(found: MethodResult) -> dict[str, float]:
 
 
 def _ratio_to_stated(found: MethodResult, sigma: float) -> float | None:
-    """Root mean square of the residual in units of the stated noise, per degree of freedom."""
+    """Root mean square of the residual in units of the stated noise, per degree of freedom; of
+    stated tails, in units of what is left of that noise where far readings are set apart."""
     solution = found.solution
+    observed, dof = solution.problem.observations, solution.problem.model.cell.noise.tails
+    unit = 1.0
+    if dof is not None and not found.good.all():
+        unit = kept_of(dof, len(found.good) * observed.size, observed.size).sigma
     if found.method == "wls" and solution.problem.weights.absolute:
-        return sigma
+        return sigma / unit
     try:
         stated = weights_for(solution.problem.observations, solution.problem.model.cell.tracker)
     except InputError:
@@ -282,7 +288,7 @@ def _ratio_to_stated(found: MethodResult, sigma: float) -> float | None:
     if not stated.absolute:
         return None
     e = stated.apply(solution.fit.residual)
-    return float(np.sqrt(e @ e / max(len(e) - _spent(found), 1)))
+    return float(np.sqrt(e @ e / max(len(e) - _spent(found), 1))) / unit
 
 
 def _spent(found: MethodResult) -> int:

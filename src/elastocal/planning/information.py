@@ -16,6 +16,7 @@ from elastocal.identification.identify import identify
 from elastocal.identification.noise_structure import VISIT, SharedEffect
 from elastocal.identification.options import Options
 from elastocal.identification.solve import WORTH_A_COLUMN, Reduction, reduce
+from elastocal.identification.tails import kept_of
 from elastocal.identification.visit_record import visit_record
 from elastocal.identification.weighted_problem import (
     Weights,
@@ -126,7 +127,7 @@ def marker_sigmas(cell: Cell, table: Measurements) -> Measurements:
 
 
 def reading_covariance(model: Model, observed: Observations) -> Array:
-    """Covariance (n_rows, size, size) of a single reading of each table row.
+    """Covariance (n_rows, size, size) by which a single reading of each table row counts.
 
     Raises InputError where neither tracker nor markers state a noise.
     """
@@ -137,7 +138,20 @@ def reading_covariance(model: Model, observed: Observations) -> Array:
         f"{cell.path or cell.name}: a plan needs the noise of a reading; state [tracker] sigma_um, "
         "range_um and transverse_um, or distance_um, as the instrument's data sheet says",
     )
-    return stated_covariance(observed, cell.tracker, kind)[0]
+    single, spec = stated_covariance(observed, cell.tracker, kind)[0], cell.design
+    states = 1 if spec.loads is None else len(spec.loads)
+    readings = (spec.poses or TYPICAL) * len(cell.tool.markers) * states * spec.repeats
+    return single * _told(cell, readings, single.shape[1])
+
+
+TYPICAL = 30  # poses of a plan that states none: what is set apart hardly depends on how many
+
+
+def _told(cell: Cell, readings: int, size: int) -> float:
+    """The factor on the variance of a reading that has the tails of `[noise]`, since
+    identification sets the far ones apart."""
+    dof = cell.noise.tails
+    return 1.0 if dof is None else kept_of(dof, readings * size, size).variance
 
 
 def pose_covariance(
@@ -501,7 +515,8 @@ def observed_weights(model: Model, observed: Observations, x: Array) -> Weights:
     """The stated noise, and with it what readings of one visit share."""
     stated = weights_for(observed, model.cell.tracker)
     tau, scatters = model.cell.design.repeatability, model.cell.noise.joints.any()
-    if (tau == 0 and not scatters) or stated.whiten is None:
+    told = _told(model.cell, len(observed.lead), observed.size)
+    if (tau == 0 and not scatters and told == 1) or stated.whiten is None:
         return stated
     inverse = sparse.linalg.inv(sparse.csc_array(stated.whiten))
     key = np.column_stack(
@@ -513,7 +528,7 @@ def observed_weights(model: Model, observed: Observations, x: Array) -> Weights:
         (np.where(np.arange(observed.size) < 3, 1.0, 0.0)[None], [0]),
         shape=(observed.size, observed.size),
     )
-    covariance = inverse @ inverse.T + tau**2 * sparse.kron(same @ same.T, moved)
+    covariance = told * (inverse @ inverse.T) + tau**2 * sparse.kron(same @ same.T, moved)
     if scatters:
         Z = settling_joints(model, observed, x).columns()
         covariance = covariance + Z @ Z.T

@@ -85,6 +85,11 @@ def noise_floor_lines(noise: NoiseFloor, kinds: Iterable[str]) -> list[str]:
             "All visits of a configuration share a further scatter of "
             f"{significant(noise.shared, 2)} times that."
         )
+    if noise.drift > 0:
+        lines.append(
+            f"The drift of {length(noise.drift)} that [noise] of the cell states counts as noise: "
+            "no cause is sought for it."
+        )
     if noise.pure_error is None:
         lines.append("No reading is repeated, so the noise is known from the residuals only.")
     else:

@@ -169,7 +169,7 @@ def _read(
         length = model.predict(replace(rows, distance=np.ones(n)), x)
         check_equilibrium(rows, length[:, None])
         sigma = (model.cell.tracker.distance_sigma or 0.0) if noise else 0.0
-        return replace(rows, distance=length + sigma * rng.normal(size=n))
+        return replace(rows, distance=length + sigma * _standard(model, rng, (n,)))
     # A pose model asks each row for the measured rotation it is compared with; any will do here.
     rotation, position = model.target_poses(replace(rows, rotation=np.zeros((n, 3))), x)
     check_equilibrium(rows, position)
@@ -177,12 +177,21 @@ def _read(
     if model.observe == "pose":
         turn = rotation
         if noise and model.cell.tracker.rotation_sigma is not None:
-            shake = rng.normal(size=(n, 3)) * model.cell.tracker.rotation_sigma
+            shake = _standard(model, rng, (n, 3)) * model.cell.tracker.rotation_sigma
             turn = (Rotation.from_matrix(rotation) * Rotation.from_rotvec(shake)).as_matrix()
         exact = replace(exact, rotation=Rotation.from_matrix(turn).as_rotvec())
     kind = available_noise(exact, model.cell.tracker) if noise else "none"
     if kind == "none":
         return exact
     covariance, _ = position_covariance(exact, model.cell.tracker, kind)
-    shake = np.einsum("nij,nj->ni", np.linalg.cholesky(covariance), rng.normal(size=(n, 3)))
+    drawn = _standard(model, rng, (n, 3))
+    shake = np.einsum("nij,nj->ni", np.linalg.cholesky(covariance), drawn)
     return replace(exact, position=position + shake)
+
+
+def _standard(model: Model, rng: np.random.Generator, shape: tuple[int, ...]) -> Array:
+    """Numbers of variance one, with the tails that the cell's [noise] states."""
+    dof = model.cell.noise.tails
+    if dof is None:
+        return rng.normal(size=shape)
+    return np.asarray(rng.standard_t(dof, shape) * np.sqrt(1 - 2 / dof))
