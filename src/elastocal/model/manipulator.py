@@ -182,7 +182,9 @@ class Model:
         pull = np.zeros(3) if force is None else _rows_of_three("force", force, n)
         place = None if position is None else _rows_of_three("position", position, n)
         marker = next(iter(self.cell.tool.markers), DEFAULT_MARKER)
-        return Measurements.of_poses("table", joints, pull, marker, position=place)
+        return Measurements.of_poses(
+            "table", joints, pull, marker, position=place, joint_kinds=self.chain.kinds
+        )
 
     def pose(
         self, q: ArrayLike, x: ArrayLike | None = None, force: ArrayLike | None = None
