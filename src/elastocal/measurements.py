@@ -170,7 +170,13 @@ class Measurements(Result):
         return str(self.to_dataframe()._repr_html_())
 
     def take(self, index: NDArray | slice) -> Measurements:
-        """The rows `index` (integers, mask or slice) as a table of their own; labels are kept."""
+        """The rows `index` (integers, mask or slice) as a table of their own; labels are kept.
+
+        Examples:
+            >>> data = ec.Model("cell.toml").read("data.csv")
+            >>> data.take(data.marker == 0)
+            <Measurements data.csv: 180 rows, 15 configurations, markers M1, M2, M3>
+        """
         changes = {
             f.name: getattr(self, f.name)[index]
             for f in fields(self)

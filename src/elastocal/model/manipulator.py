@@ -142,7 +142,10 @@ class Model:
         )
 
     def read_plan(self, path: str | Path) -> Measurements:
-        """The poses of a plan (CSV): configuration, q1_deg …, and forces where it states them.
+        """The poses of a plan, a row each; forces (N) where it states them.
+
+        Args:
+            path: The plan (CSV): configuration, q1_deg …
 
         Raises:
             InputError: As `read` does.
