@@ -1,4 +1,4 @@
-"""Does a compensated command put a real tool where it shall be?  Asked of an arm in MuJoCo.
+"""Does a compensated command put a real tool where it should be?  Asked of an arm in MuJoCo.
 
     python experiment_design/compensation/study.py [--arms 8] [--targets 500] [--jobs 2]
 
