@@ -21,6 +21,9 @@ from elastocal.diagnosis import DiagnosisOptions
 from elastocal.errors import option, options_as_flags
 from elastocal.identification import Options
 from elastocal.planning import DesignOptions
+from elastocal.report.notebook import VIEWS
+from elastocal.report.page import PAGES
+from elastocal.saving import WRITERS
 
 HEAVY = ("numpy", "casadi", "pandas", "scipy", "pydantic", "matplotlib", "plotly", "pinocchio")
 LOAD = list(LOAD_N)
@@ -263,15 +266,27 @@ def test_targets_may_be_poses(fit):
 
 def test_every_result_reports_plots_and_tabulates_itself(fit, plan):
     commands = ec.compensate(fit.arm, TARGETS, load=LOAD)
-    for result in (plan, commands):
+    readings = ec.simulate("cell.toml", "plan.csv", load=LOAD)
+    for result in (plan, commands, readings):
         result.report("report.html")
         page = Path("report.html").read_text()
         assert page.startswith("<!doctype html>") and "To repeat this" in page
         assert len(result.to_dataframe()) == len(result)
         assert result.plot().axes
+        assert str(result).count("\n") > 5
         assert repr(result).startswith(f"<{type(result).__name__} ") and "\n" not in repr(result)
+    readings.save("saved.csv")
+    assert np.array_equal(ec.Model("cell.toml").read("saved.csv").position, readings.position)
     with pytest.raises(ec.InputError, match="no figure 'pose'"):
         plan.plot("pose")
+
+
+def test_whatever_a_verb_returns_is_a_result():
+    """Its `save`, `report`, `plot` and `to_dataframe` find what they need by the class's name."""
+    returned = {inspect.signature(getattr(ec, name)).return_annotation
+                for name in ("design", "simulate", "identify", "diagnose", "compensate", "compare",
+                             "next_poses")}  # fmt: skip
+    assert returned == set(VIEWS) == set(PAGES) == set(WRITERS) - {"CalibratedArm"}
 
 
 def test_a_report_names_the_files_it_came_from(fit):

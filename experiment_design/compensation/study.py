@@ -1,4 +1,4 @@
-"""Does a compensated command put a real tool where it shall be?  Asked of an arm in MuJoCo.
+"""Does a compensated command put a real tool where it should be?  Asked of an arm in MuJoCo.
 
     python experiment_design/compensation/study.py [--arms 8] [--targets 500] [--jobs 2]
 
@@ -134,7 +134,7 @@ def one_arm(name: str, seed: int, count: int) -> dict[str, np.ndarray]:
         load = np.array([0.0, 0.0, -FORCE[name]])
         data, result = Path(folder) / "data.csv", Path(folder) / "result.json"
         q = regular_poses(chain, cell, POSES, rng)
-        write_measurements(measured(truth, q, load, rng), data, chain.kinds)
+        write_measurements(measured(truth, q, load, rng), data)
         command = [sys.executable, "-m", "elastocal", "identify", cell_path, data, "-o", result]
         subprocess.run([*command, "-q"], check=True, capture_output=True)
         targets = Path(folder) / "targets.csv"

@@ -30,8 +30,9 @@ class Saved:
         Args:
             path: The file.  A `Calibration` becomes JSON, or where the name ends in .csv the table
                 of its residuals; a `Plan` a CSV and the JSON beside it; a `Diagnosis` JSON; a
-                `Compensation` the table of commands (CSV); a `CalibratedArm` what the ending
-                says: .urdf, .xml or .mjcf (MuJoCo), .csv (DH table), .yaml, .json.
+                `Compensation` the table of commands (CSV); `Measurements` their table (CSV);
+                `NextPoses` their plan, if any; a `CalibratedArm` what the ending says: .urdf, .xml
+                or .mjcf (MuJoCo), .csv (DH table), .yaml, .json.
             **how: For an arm: `format` (as "mdh"), `load` (3,) N, `time_s`, `temperature_c`,
                 `frames`, `base_frame`, `poses` and `seed`, as `elastocal export` has them.
 
@@ -86,8 +87,9 @@ class Result(Saved):
         Args:
             kind: Which of the result's figures; default the first.  A `Calibration` has
                 "residuals" and "parameters", a `Plan` "poses" and "intervals", a `Diagnosis`
-                "budget" and "candidates", a `Compensation` "errors" and "uncertainty"; and each has
-                those of its page, such as "waterfall" or "spread" (they stand still).
+                "budget" and "candidates", a `Compensation` "errors" and "uncertainty",
+                `Measurements` "joints", `NextPoses` "gain" and "doubts"; and each has those of its
+                page, such as "waterfall" or "spread" (they stand still).
             interactive: A figure to zoom and hover.
 
         Returns:

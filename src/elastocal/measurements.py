@@ -14,6 +14,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 from numpy.typing import NDArray
 
+from elastocal.above import Result
 from elastocal.errors import InputError, option
 from elastocal.files import atomic_writer, open_input, read_text
 from elastocal.tables import (
@@ -65,7 +66,7 @@ AT_A_TIME = 50_000  # rows
 
 
 @dataclass(frozen=True, repr=False)
-class Measurements:
+class Measurements(Result):
     """n rows: one per pose, load state, repeat and marker.
 
     `q` (n, joints) rad or m; `position` (n, 3) m in the tracker frame (z vertical);
@@ -76,7 +77,8 @@ class Measurements:
     `configuration` and `marker` are integer codes into their label tuples; `row` is the
     line number in the source file, for messages.  `move` and `direction` (n, joints) are no
     columns: they follow from the order of the visits (`with_moves`), are found when a table is
-    read, and stay with the rows that are taken from it.
+    read, and stay with the rows that are taken from it.  `joint_kinds` has "revolute" or
+    "prismatic" for each joint; none are all revolute.
 
     Examples:
         >>> data = ec.Model("cell.toml").read("data.csv")
@@ -106,6 +108,7 @@ class Measurements:
     temperature: Array | None = None
     move: Array | None = None
     direction: Array | None = None
+    joint_kinds: tuple[str, ...] = ()
 
     @classmethod
     def of_poses(
@@ -132,19 +135,20 @@ class Measurements:
         said = f"{len(self)} rows, {len(self.configuration_labels)} configurations"
         return f"<Measurements {self.source}: {said}, markers {', '.join(self.marker_names)}>"
 
-    def to_dataframe(self, joint_kinds: Sequence[str] | None = None) -> pd.DataFrame:
-        """The table with the columns of the canonical CSV, one row per reading, in SI units.
+    @property
+    def kinds(self) -> tuple[str, ...]:
+        """Of every joint, "revolute" or "prismatic"."""
+        return self.joint_kinds or ("revolute",) * self.q.shape[1]
 
-        `joint_kinds`: "revolute" (default for all joints) or "prismatic", which decides q1_rad or
-        q1_m.
-        """
+    def to_dataframe(self) -> pd.DataFrame:
+        """The table with the columns of the canonical CSV, one row per reading, in SI units."""
         import pandas as pd
 
-        return pd.DataFrame(self.columns(joint_kinds), copy=False)
+        return pd.DataFrame(self.columns(), copy=False)
 
-    def columns(self, joint_kinds: Sequence[str] | None = None) -> dict[str, np.ndarray]:
+    def columns(self) -> dict[str, np.ndarray]:
         """The same as header → (n,) numbers or labels."""
-        known = families(joint_kinds or ("revolute",) * self.q.shape[1])
+        known = families(self.kinds)
         columns: dict[str, np.ndarray] = {
             "configuration": np.array(self.configuration_labels, dtype=object)[self.configuration],
             "marker": np.array(self.marker_names, dtype=object)[self.marker],
@@ -166,7 +170,13 @@ class Measurements:
         return str(self.to_dataframe()._repr_html_())
 
     def take(self, index: NDArray | slice) -> Measurements:
-        """The rows `index` (integers, mask or slice) as a table of their own; labels are kept."""
+        """The rows `index` (integers, mask or slice) as a table of their own; labels are kept.
+
+        Examples:
+            >>> data = ec.Model("cell.toml").read("data.csv")
+            >>> data.take(data.marker == 0)
+            <Measurements data.csv: 180 rows, 15 configurations, markers M1, M2, M3>
+        """
         changes = {
             f.name: getattr(self, f.name)[index]
             for f in fields(self)
@@ -398,6 +408,7 @@ def read_measurements(
         time=None if time is None else time[:, 0],
         approach=approach,
         temperature=None if temperature is None else temperature[:, 0],
+        joint_kinds=() if q is None else joint_kinds,
     )
     if observe != "targets":  # a path may pass a place twice
         _check_duplicates(raw, table)
@@ -514,14 +525,11 @@ def _check_duplicates(raw: RawTable, table: Measurements) -> None:
 # Writing
 
 
-def write_measurements(
-    measurements: Measurements, path: str | Path, joint_kinds: Sequence[str] | None = None
-) -> None:
+def write_measurements(measurements: Measurements, path: str | Path) -> None:
     """Write the table to a CSV that reads back bit for bit; whole or not at all.
 
-    `joint_kinds`: "revolute" (default for all joints) or "prismatic", which decides q1_rad or
-    q1_m.  Raises InputError where the folder is missing or not writable, and for values or
-    labels that no table can hold (NaN, infinite, control characters).
+    Raises InputError where the folder is missing or not writable, and for values or labels that no
+    table can hold (NaN, infinite, control characters).
     """
     for name in (*measurements.configuration_labels, *measurements.marker_names):
         if not is_label(name):
@@ -529,11 +537,10 @@ def write_measurements(
                 f"label {quoted(name)} cannot stand in a table; use one line without blanks at "
                 "its ends"
             )
-    kinds = joint_kinds or ("revolute",) * measurements.q.shape[1]
-    columns = measurements.columns(kinds)
+    columns = measurements.columns()
     meaning = {
         header: family.meaning
-        for family in families(kinds).values()
+        for family in families(measurements.kinds).values()
         for stem in family.units
         for header in family.columns(stem)
     }

@@ -15,6 +15,7 @@ import numpy as np
 
 from elastocal.errors import InputError, option, require
 from elastocal.files import atomic_write_text
+from elastocal.measurements import Measurements, write_measurements
 from elastocal.model.arm import given_force
 from elastocal.tables import csv_text
 from elastocal.text import json_text
@@ -25,9 +26,9 @@ if TYPE_CHECKING:
     from elastocal.compensation.compensate import Compensation
     from elastocal.diagnosis.changes import Comparison
     from elastocal.diagnosis.diagnosis import Diagnosis
+    from elastocal.diagnosis.next_poses import NextPoses
     from elastocal.export.export import Wish
     from elastocal.identification.result import Calibration
-    from elastocal.measurements import Measurements
     from elastocal.model.calibrated import CalibratedArm
     from elastocal.planning.plan import Plan
 
@@ -172,6 +173,12 @@ def save_extra_poses(path: str | Path, plan: Measurements, kinds: Sequence[str])
     write_plan(path, rows, kinds)
 
 
+def save_next(found: NextPoses, path: Path) -> None:
+    """The poses to measure next as a plan; nothing where none are to be."""
+    if found.plan is not None:
+        save_plan(found.plan, path)
+
+
 def save_comparison(found: Comparison, path: Path) -> None:
     """The comparison as JSON (schema elastocal/comparison/1)."""
     write_json(path, found.to_json())
@@ -184,4 +191,6 @@ WRITERS: dict[str, Callable[..., Any]] = {
     "Diagnosis": save_diagnosis,
     "Compensation": save_compensation,
     "CalibratedArm": save_arm,
+    "Measurements": write_measurements,
+    "NextPoses": save_next,
 }

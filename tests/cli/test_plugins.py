@@ -22,7 +22,7 @@ from elastocal.cell.work_cell import read_cell
 from elastocal.cli.app import app
 from elastocal.diagnosis import write_extended_cell
 from elastocal.errors import InputError
-from elastocal.measurements import Measurements, write_measurements
+from elastocal.measurements import Measurements
 from elastocal.model import Chain, Model
 from elastocal.model.effects import CATALOGUE
 from elastocal.plugins import load_plugins
@@ -71,7 +71,7 @@ def folder(tmp_path: Path) -> Path:
     plain = read_cell(path)
     chain = kr270_chain()
     table = measured(chain, plain, [LOBES], unloaded(chain, 25), 1)
-    write_measurements(table, tmp_path / "data.csv", chain.kinds)
+    table.save(tmp_path / "data.csv")
     return tmp_path
 
 
@@ -167,7 +167,7 @@ def noisy_days(folder: Path) -> Path:
     read = exact + scatter * rng.normal(size=exact.shape)
     table = replace(table, position=read, time=DAY * day + table.configuration.astype(float))
     data = folder / "days.csv"
-    write_measurements(table, data, model.chain.kinds)
+    table.save(data)
     return cell
 
 

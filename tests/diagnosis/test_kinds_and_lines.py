@@ -28,7 +28,14 @@ from elastocal.diagnosis.component_search import (
     with_likelier_orders,
     with_shorter_drifts,
 )
-from elastocal.diagnosis.components import PRESENT, Pool, fit_sum, log_odds, presence_cost
+from elastocal.diagnosis.components import (
+    PRESENT,
+    Pool,
+    fit_sum,
+    given_fellows,
+    log_odds,
+    presence_cost,
+)
 from elastocal.diagnosis.diagnosis_data import DiagnosisData, diagnosis_data_of
 from elastocal.diagnosis.hypotheses import possible
 from elastocal.diagnosis.line_orders import Family, log_prior_of, order_posterior, ripples
@@ -65,7 +72,11 @@ def test_a_cost_is_that_of_leaving_one_out() -> None:
         assert pool.costs[k] == pytest.approx(pool.cost - others.cost)
         sizes = np.linspace(-1.0, 1.5, len(some))
         less = others.penalty(np.delete(sizes, k))[0]
-        assert pool.penalties(sizes)[k] == pytest.approx((pool.penalty(sizes)[0] - less) / 2)
+        lost = pool.penalties(sizes)[k]
+        assert lost == pytest.approx((pool.penalty(sizes)[0] - less) / 2)
+        (own,) = [kind for kind in pool.kinds if k in kind]
+        mean, precision = given_fellows(sizes[own[own != k]])
+        assert lost == pytest.approx(precision * (sizes[k] - mean) ** 2 / 2)
     # The last of a kind costs less than the first, and may be expected.
     assert log_odds(some, fellow(4, columns)) > log_odds([], fellow(4, columns))
 

@@ -129,3 +129,5 @@ def test_no_gain_says_what_else_helps(answer) -> None:
     assert "do not pay" in told["Next"] and "at most 60 µm" in told["Error now"]
     assert "30 µm to 30 µm" in told["Gain"] and "Found" not in told
     assert repr(found) == "<NextPoses no_gain: at most 60 µm with 95 %, 5 more poses>"
+    assert "do not pay" in str(found) and found.to_dataframe().empty
+    assert found.plot("gain").axes and found.plot("doubts").axes

@@ -368,7 +368,7 @@ def write(folder: Path) -> None:
             read_plan(folder / plan, joint_kinds=kinds),
             tuple(known.tool.markers), 2 if data == "data.csv" else 1, np.array(load),
         )  # fmt: skip
-        write_measurements(simulate(model, wanted, model.nominal, 7), folder / data, kinds)
+        write_measurements(simulate(model, wanted, model.nominal, 7), folder / data)
         fit = verbs.identify(folder / cell, folder / data)
         (folder / result).write_text(json.dumps(fit.to_json(), indent=1), encoding="utf-8")
     n = 3 * len(fit_rows(folder))

@@ -5,7 +5,7 @@ from types import SimpleNamespace
 
 import numpy as np
 import pytest
-from scipy import sparse
+from scipy import sparse, stats
 from support.calibration import (
     GEOMETRY,
     SPRINGS,
@@ -29,7 +29,7 @@ from elastocal.identification import (
     weights_for,
 )
 from elastocal.identification.identify import identify
-from elastocal.identification.residuals import predicts_better
+from elastocal.identification.residuals import f_test, predicts_better
 from elastocal.identification.solve import fits_better
 from elastocal.model import Model, subset
 
@@ -191,3 +191,11 @@ def test_held_out_covers_all_rows_of_a_configuration_together():
                         np.array([model.names.index(n) for n in result.determined])).B  # fmt: skip
     one_by_one = held_out_residual(B, result.residual, UNIT, np.arange(30), 3)
     assert np.abs(result.held_out).mean() > np.abs(one_by_one).mean()
+
+
+def test_the_p_value_of_an_F_test_is_uniform_where_the_columns_are_none():
+    """Of normal noise, 3 columns take a χ² of 3 and leave one of 20."""
+    rng = np.random.default_rng(8)
+    _, p = f_test(rng.chisquare(3, 4000), 3, rng.chisquare(20, 4000), 20)
+    assert stats.kstest(p, "uniform").pvalue > 1e-3
+    assert f_test(1.0, 2, 0.0, 5)[1] == 0.0

@@ -12,7 +12,7 @@ from support.cells import MARKERS, kr270_chain, random_table
 from support.diagnoses import VERDICTS
 
 from elastocal.errors import InputError
-from elastocal.measurements import read_measurements, write_measurements
+from elastocal.measurements import read_measurements
 from elastocal.report.figures import INK
 from elastocal.report.notebook import view_of
 from elastocal.report.page import figures_of, page_of
@@ -181,8 +181,8 @@ def test_interactive_plan_shows_every_pose(plan):
 def test_measurements_as_a_frame_are_what_is_written(tmp_path):
     chain = kr270_chain()
     table = random_table(chain, 3, 1, markers=tuple(MARKERS))
-    frame = table.to_dataframe(chain.kinds)
-    write_measurements(table, tmp_path / "t.csv", chain.kinds)
+    frame = table.to_dataframe()
+    table.save(tmp_path / "t.csv")
     header = (tmp_path / "t.csv").read_text().split("\n")[0].split(",")
     assert list(frame.columns) == header
     back = read_measurements(tmp_path / "t.csv", joint_kinds=chain.kinds)

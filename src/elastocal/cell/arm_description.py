@@ -110,8 +110,9 @@ class Robot:
         Raises:
             InputError: a value is of the wrong type.
 
-        >>> Robot.from_urdf("arm.urdf", flange="tool0").flange
-        'tool0'
+        Examples:
+            >>> ec.Robot.from_urdf("kr270_2.urdf", flange="flange").flange
+            'flange'
         """
         return cls(urdf=Path(path), base=base, flange=flange)
 
@@ -129,8 +130,9 @@ class Robot:
         Raises:
             InputError: a value is of the wrong type.
 
-        >>> Robot.from_mjcf("arm.xml", flange="attachment_site").flange
-        'attachment_site'
+        Examples:
+            >>> ec.Robot.from_mjcf("arm.xml", flange="attachment_site").flange
+            'attachment_site'
         """
         return cls(mjcf=Path(path), base=base, flange=flange)
 
@@ -148,8 +150,9 @@ class Robot:
         Raises:
             InputError: a value is of the wrong type, or the convention is unknown.
 
-        >>> Robot.from_dh("dh.csv", convention="modified").dh_convention
-        'modified'
+        Examples:
+            >>> ec.Robot.from_dh("dh.csv", convention="modified").dh_convention
+            'modified'
         """
         links = None if masses is None else Path(masses)
         return cls(dh=Path(path), dh_convention=convention, masses=links)

@@ -118,6 +118,9 @@ class Cell:
             path: the cell file; paths in it are relative to it, and its files must exist.
             known_effects: as of `check`.
 
+        Returns:
+            The `Cell`; `Model` takes it as it takes the file.
+
         Raises:
             InputError: names file, key, what the key takes and the nearest valid name.
 

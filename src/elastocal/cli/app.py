@@ -11,6 +11,7 @@ import threading
 import traceback
 import warnings
 from collections.abc import Callable, Iterable, Sequence
+from contextlib import suppress
 from io import StringIO
 from itertools import pairwise
 from pathlib import Path
@@ -38,6 +39,7 @@ VERBS = (
 )  # fmt: skip
 
 
+HELP = ["-h", "--help"]
 INTERRUPTED = 130  # 128 + SIGINT, as shells count
 # Arguments and options that name what a command reads.
 READ = (
@@ -59,8 +61,9 @@ class InOrder(TyperGroup):
         told, standalone = StringIO(), extra.pop("standalone_mode", True)
         extra["standalone_mode"] = False
         try:
-            _refuse_empty((args[0] if args else extra.get("args")) or sys.argv[1:])
-            code = super().main(*args, **extra)
+            words = (args[0] if args else extra.get("args")) or sys.argv[1:]
+            _refuse_empty(words)
+            code = 0 if self._helped(words) else super().main(*args, **extra)
         except InputError as error:
             complain(str(error))
             code = error.exit_code
@@ -80,6 +83,16 @@ class InOrder(TyperGroup):
             return code
         sys.exit(code or 0)
 
+    def _helped(self, words: Sequence[str]) -> bool:
+        """Whether `words` are VERB --help, which is then shown.  As inherited it would wait for the
+        options before the verb, whose reading loads pydantic and CasADi (0.3 s)."""
+        if len(words) != 2 or words[0] not in self.commands or words[1] not in HELP:
+            return False
+        above = typer.Context(self, info_name="elastocal", **self.context_settings)
+        with suppress(typer.Exit):
+            self.commands[words[0]].make_context(words[0], [words[1]], parent=above)
+        return True
+
 
 def _refuse_empty(words: Sequence[str]) -> None:
     """Raises InputError for an empty argument, as a shell's unset variable leaves it: as a path it
@@ -98,7 +111,7 @@ app = typer.Typer(
     no_args_is_help=True,
     rich_markup_mode=None,
     pretty_exceptions_enable=False,
-    context_settings={"help_option_names": ["-h", "--help"], "max_content_width": 100},
+    context_settings={"help_option_names": HELP, "max_content_width": 100},
 )
 
 # What several commands take.

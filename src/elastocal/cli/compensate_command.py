@@ -91,7 +91,7 @@ def compensate(
     as_json: Json = False,
     quiet: Quiet = False,
 ) -> None:
-    """Which commands put the tool where it shall be?
+    """Which commands put the tool where it should be?
 
     Solves the calibrated arm, under its load, for every target.  With --table it writes the
     corrections that a controller adds to its nominal targets.

@@ -57,7 +57,6 @@ def simulate(
     --load 0 0 -2600 --repeats 6
     """
     from elastocal.files import together
-    from elastocal.measurements import write_measurements
     from elastocal.model.manipulator import Model
     from elastocal.saving import write_json
     from elastocal.verbs import simulated
@@ -72,7 +71,7 @@ def simulate(
     )  # fmt: skip
     named = dict(zip(model.names, x.tolist(), strict=True))
     with together(written):
-        write_measurements(table, output, model.chain.kinds)
+        table.save(output)
         if truth is not None:
             write_json(truth, named)
     if as_json:

@@ -46,7 +46,6 @@ def run_demo(
     """
     from elastocal.cell.work_cell import read_cell
     from elastocal.identification.identify import identify
-    from elastocal.measurements import read_plan, write_measurements
     from elastocal.model.manipulator import Model
     from elastocal.simulation.simulate import expand_plan, simulate, values_from
 
@@ -54,14 +53,14 @@ def run_demo(
     cell_path, plan_path = _copy_example(folder)
     cell = read_cell(cell_path)
     model = Model(cell)
-    plan = read_plan(plan_path, joint_kinds=model.chain.kinds)
+    plan = model.read_plan(plan_path)
     rows = expand_plan(plan, tuple(cell.tool.markers), REPEATS, np.array(LOAD_N))
     rows = replace(rows, sigma=reading_sigma(folder)[rows.configuration])
     truth, published = published_compliances(folder)
     progress(f"measuring {len(rows)} simulated readings")
     table = simulate(model, rows, values_from(model, truth), seed)
     data_path = folder / "data.csv"
-    write_measurements(table, data_path, model.chain.kinds)
+    table.save(data_path)
     result = identify(model, replace(table, source=str(data_path)), progress=progress)
     return Demo(cell_path, plan_path, data_path, truth, published, result)
 

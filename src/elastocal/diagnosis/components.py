@@ -22,7 +22,7 @@ from __future__ import annotations
 from collections import Counter
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
-from functools import cached_property
+from functools import cache, cached_property
 from typing import Literal
 
 import numpy as np
@@ -143,13 +143,25 @@ class Sizes:
         )
 
 
+@cache
+def precision_of_sizes(k: int) -> Array:
+    """Of the logarithms of k sizes of a kind (k, k): the inverse of ALONE² I + COMMON² 11ᵀ."""
+    return np.asarray(np.linalg.inv(ALONE**2 * np.eye(k) + COMMON**2))
+
+
+def given_fellows(sizes: Sequence[float]) -> tuple[float, float]:
+    """Mean and precision of the logarithm of a size where those (k,) of its kind are known."""
+    own, *others = precision_of_sizes(len(sizes) + 1)[0]
+    return float(-np.dot(others, sizes) / own), float(own)
+
+
 class Pool:
     """The prior of which components are there, and of the logarithms of their sizes.
 
     A kind has n places, the k-th family of lines of a joint as one of the k-th ones.  It is there
     with probability PRESENT, then at any number of them with equal probability, and at any k of
     them (Scott and Berger 2010, Annals of Statistics 38, 2587): k cost log (1/PRESENT − 1) n (n
-    over k) nats.  Sizes of a kind have the covariance ALONE² I + COMMON² 11ᵀ.
+    over k) nats.  Sizes of a kind have the precision of `precision_of_sizes`.
     """
 
     def __init__(self, components: Sequence[Component]) -> None:
@@ -166,8 +178,7 @@ class Pool:
         self.sought = np.array([c.sought for c in components])
         self.precision = np.zeros((len(components), len(components)))
         for own in self.kinds:
-            whole = ALONE**2 * np.eye(len(own)) + COMMON**2
-            self.precision[np.ix_(own, own)] = np.linalg.inv(whole)
+            self.precision[np.ix_(own, own)] = precision_of_sizes(len(own))
 
     @property
     def cost(self) -> float:
@@ -586,12 +597,10 @@ def drawn(
         for k, kind, places in steps:
             sizes.pop(k, None)
             fellows = [sizes[j] for j in kind if j in sizes]
-            m, mean = len(fellows), float(sum(fellows))
-            weight = COMMON**2 / (ALONE**2 + m * COMMON**2)
-            variance = ALONE**2 * (1 + weight)
+            m, (mean, inverse) = len(fellows), given_fellows(fellows)
             cost = presence_cost(places, m + 1) - presence_cost(places, m) + pool.sought[k]
-            log_p = _at_sizes(S, t, spans, sizes, k) - 0.5 * (GRID - weight * mean) ** 2 / variance
-            log_p += np.log(GRID[1] - GRID[0]) - 0.5 * np.log(2 * np.pi * variance) - cost
+            log_p = _at_sizes(S, t, spans, sizes, k) - 0.5 * inverse * (GRID - mean) ** 2
+            log_p += np.log(GRID[1] - GRID[0]) + 0.5 * np.log(inverse / (2 * np.pi)) - cost
             log_p = np.append(log_p, -np.inf if components[k].given else 0.0)
             chosen = int(rng.choice(len(log_p), p=special.softmax(log_p)))
             if chosen < len(GRID):

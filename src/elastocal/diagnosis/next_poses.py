@@ -16,6 +16,7 @@ from typing import Any, Literal
 
 import numpy as np
 
+from elastocal.above import Result
 from elastocal.cell.work_cell import Cell
 from elastocal.diagnosis.diagnose import FEWEST, DiagnosisOptions, diagnose
 from elastocal.diagnosis.diagnosis import Diagnosis, FoundEffect
@@ -40,7 +41,7 @@ NextVerdict = Literal["measure", "enough", "no_gain"]
 
 
 @dataclass(frozen=True, repr=False)
-class NextPoses:
+class NextPoses(Result):
     """The next poses to measure, or why none are needed.
 
     Attributes:
@@ -52,6 +53,7 @@ class NextPoses:
         reached: The error that the model as it is now keeps with 95 %, in m.
         found: The effects that the diagnosis found, which the model then has.
         doubts: What it may lack besides and the poses can show, the likeliest first.
+        source: The readings that it is said of.
     """
 
     verdict: NextVerdict
@@ -63,6 +65,7 @@ class NextPoses:
     found: tuple[FoundEffect, ...]
     doubts: tuple[tuple[str, str, float], ...]
     least_gain: float = 0.01
+    source: str = ""
 
     def __repr__(self) -> str:
         told = f"at most {self.reached * 1e6:.3g} µm with 95 %"
@@ -83,11 +86,6 @@ class NextPoses:
             "doubts": [{"effect": e, "where": w, "probability": p} for e, w, p in self.doubts],
             "plan": None if self.plan is None else self.plan.to_json(),
         }  # fmt: skip
-
-    def save(self, path: str | Path) -> None:
-        """Write the plan as `Plan.save` does; nothing where there is none."""
-        if self.plan is not None:
-            self.plan.save(path)
 
 
 def next_poses(
@@ -177,6 +175,7 @@ def next_poses(
         found=() if why is None else why.effects,
         doubts=tuple((*place, chances[place]) for place in likeliest),
         least_gain=least_gain,
+        source=table.source,
     )
 
 

@@ -19,6 +19,7 @@ from elastocal.identification.noise_choice import (
     weights_of,
 )
 from elastocal.identification.outliers import FALSE_ALARM, blocks, studentised
+from elastocal.identification.residuals import f_test
 from elastocal.identification.robust_core import Design, design
 from elastocal.identification.solve import Solution
 from elastocal.identification.weighted_problem import block_diagonal, inverse_factor
@@ -96,7 +97,7 @@ class CleanFit:
         dof = self.dof - size * self.good
         floor = len(drop) * self.problem.floor**2
         rest = np.maximum(self.rss - np.where(self.good, drop, 0.0), floor)
-        p = special.fdtrc(size, np.maximum(dof, 1), drop / size * np.maximum(dof, 1) / rest)
+        p = f_test(drop, size, rest, np.maximum(dof, 1))[1]
         return np.where(dof < 1, 1.0, p)
 
     def group_test(self, members: BoolArray, may_shift: bool = True) -> GroupTest | None:
@@ -124,14 +125,13 @@ class CleanFit:
             b = e - S @ solved[:, size]
             shift = np.linalg.solve(M, b)
             gain = float(b @ shift)
-            F = gain / size * (dof_with - size) / max(rss_with - gain, floor)
-            p_common = float(special.fdtrc(size, dof_with - size, F))
+            p_common = float(f_test(gain, size, max(rss_with - gain, floor), dof_with - size)[1])
         excess, p_any = 0.0, 1.0
         rss_without, dof_without, G, _ = self._changed(members & self.good, -1.0)
         if dof_without > 0 and np.linalg.eigvalsh(G)[0] > ABSORBED:
-            drop, s2 = max(rss_with - rss_without, 0.0), max(rss_without, floor) / dof_without
-            p_any = float(special.fdtrc(n * size, dof_without, drop / (n * size) / s2))
-            excess = drop - n * size * s2
+            drop, rest = max(rss_with - rss_without, 0.0), max(rss_without, floor)
+            p_any = float(f_test(drop, n * size, rest, dof_without)[1])
+            excess = drop - n * size * rest / dof_without
         if p_common == p_any == 1.0:
             return None
         common = may_shift and gain >= excess / 2

@@ -6,7 +6,6 @@ from dataclasses import replace
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy import special
 
 from elastocal.cell.arm_description import EffectChoice
 from elastocal.errors import ElastocalError
@@ -23,7 +22,7 @@ from elastocal.identification.mistakes import copied, refuse_nonsense
 from elastocal.identification.options import Options
 from elastocal.identification.outliers import FALSE_ALARM, describe, find_faulty
 from elastocal.identification.prediction import NewPoses
-from elastocal.identification.residuals import rms_3d
+from elastocal.identification.residuals import f_test, rms_3d
 from elastocal.identification.result import Calibration, TestErrors
 from elastocal.identification.solve import Problem, Solution, solve
 from elastocal.identification.start import (
@@ -117,12 +116,12 @@ def _fitted(
         missing = _shown_to_be_missing(every, sound, found, table, options, progress)
         if missing:
             progress(f"fitting all readings: {missing} explains those set apart")
-            told = (EXPLAINED.format((~found.good).sum(), missing),)
+            told = EXPLAINED.format((~found.good).sum(), missing)
             try:
                 kept = replace(options, faulty="keep")
                 found = run_method(every, sound, faulty, refit, kept, progress)
-                told = (*told, *found.warnings)
-                found = replace(found, good=np.ones_like(found.good), warnings=told)
+                warnings = (told, *found.warnings)
+                found = replace(found, good=np.ones_like(found.good), warnings=warnings)
             except (ElastocalError, np.linalg.LinAlgError):
                 pass  # they bend the fit so far that no arm is left: better without
     return every, sound, with_limits(every, found, options)
@@ -194,9 +193,8 @@ def _most_telling(every: Solution, sound: Solution, most: int) -> EffectChoice |
             U = U[:, s > 1e-6 * s[0]] if s[0] else U[:, :0]
             dof, gain = len(e) - Q.shape[1] - U.shape[1], float(((U.T @ e) ** 2).sum())
             if 0 < U.shape[1] < most and dof > 0:
-                F = gain / U.shape[1] * dof / (float(e @ e) - gain)
-                p = float(special.fdtrc(U.shape[1], dof, F))
-                tried.append((p, -F, replace(chosen, where=place)))
+                F, p = f_test(gain, U.shape[1], float(e @ e) - gain, dof)
+                tried.append((float(p), -float(F), replace(chosen, where=place)))
     p, _, best = min(tried, key=lambda one: one[:2], default=(1.0, 0.0, None))
     return best if p * len(tried) < FALSE_ALARM else None
 

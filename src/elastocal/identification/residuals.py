@@ -212,6 +212,16 @@ def rms_3d(residual: Array, size: int) -> float:
 CHANCE = 0.01  # of the wider set being taken though the parameters it adds are none
 
 
+def f_test(
+    gain: float | Array, columns: int, rest: float | Array, dof: float | Array
+) -> tuple[Any, Any]:
+    """F and its p-value where `columns` took `gain` off a sum of squares of whitened residuals, of
+    which `rest` is left with `dof` degrees of freedom: p is the chance of that if they are none."""
+    with np.errstate(divide="ignore", invalid="ignore"):  # nothing is left
+        F = np.divide(gain, columns) * dof / rest
+    return F, special.fdtrc(columns, dof, F)
+
+
 def predicts_better(
     narrow: Array, wide: Array, weights: Weights, configuration: NDArray, size: int
 ) -> bool:

@@ -393,7 +393,16 @@ class Calibration(Result):
         """Write the calibration certificate: one HTML page to print and file away.
 
         Pose accuracy before and after in the sense of ISO 9283, instrument, loads, date, SHA-256
-        of cell and data, verdict.  Arguments and errors are those of `report`.
+        of cell and data, verdict.
+
+        Args:
+            path: The page.
+            inputs: As for `report`, like the others.
+            command: The command line that repeats the run, where there is one.
+            seed: The seed of the run, to be named.
+
+        Raises:
+            InputError: An input cannot be read, or the page not written.
 
         Examples:
             >>> ec.identify("cell.toml", "data.csv").certificate("certificate.html")

@@ -7,7 +7,7 @@ from functools import cached_property
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy import linalg, special
+from scipy import linalg
 
 from elastocal.errors import ElastocalError, InsufficientDataError
 from elastocal.identification.least_squares import Fit, FitProblem, fit
@@ -15,6 +15,7 @@ from elastocal.identification.linear_solver import solve_weighted
 from elastocal.identification.residuals import (
     CHANCE,
     as_of_another_campaign,
+    f_test,
     held_out_by_parts,
     held_out_residual,
     predicts_better,
@@ -291,9 +292,7 @@ def fits_better(narrow: Fit, wide: Fit) -> bool:
     """
     before, after = (float(found.whitened @ found.whitened) for found in (narrow, wide))
     more, dof = len(wide.columns) - len(narrow.columns), len(wide.whitened) - len(wide.columns)
-    return before - after > special.fdtri(more, max(dof, 1), 1 - CHANCE) * after * more / max(
-        dof, 1
-    )
+    return bool(f_test(before - after, more, after, max(dof, 1))[1] < CHANCE)
 
 
 def prefer_wider(

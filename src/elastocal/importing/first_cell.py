@@ -229,7 +229,7 @@ def _rest(chain: Chain, reach: float, sites: dict[str, Array]) -> str:
     """Tool, tracker, model, workspace and wishes for a plan."""
     side, n = reach / 12, chain.n_joints
     # Off the last joint's axis, which a load on it would not turn.
-    hook = f"load_point_m = {_vector([side, 0, side])}"
+    hangs = f"load_point_m = {_vector([side, 0, side])}"
     station = f"position_m = {_vector([round(2 * reach, 1), 0.0, round(0.5 * reach, 1)])}"
     placed, geometry = (
         " ".join(f'"{effect.name}",' for effect in pair)
@@ -250,7 +250,7 @@ def _rest(chain: Chain, reach: float, sites: dict[str, Array]) -> str:
     load = max(_one(LOAD * (reach / REACH) ** 4), 5.0)
     return f"""\
 [tool]                                 # all in m, in the flange frame
-{hook:<38} # guess: where a load hangs
+{hangs:<38} # guess: where a load hangs
 
 {_markers(side, sites)}
 

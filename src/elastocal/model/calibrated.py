@@ -191,6 +191,9 @@ def read_calibrated(cell_path: str | Path, result_path: str | Path) -> Calibrate
         cell_path: The cell file that it was run with.
         result_path: Its result (`Calibration.save`, or the command identify).
 
+    Returns:
+        The `CalibratedArm`, as `fit.arm` is.
+
     Raises:
         InputError: A file is invalid, or the result belongs to another model than the cell
             describes; the message names the parameters that differ.

@@ -142,7 +142,10 @@ class Model:
         )
 
     def read_plan(self, path: str | Path) -> Measurements:
-        """The poses of a plan (CSV): configuration, q1_deg …, and forces where it states them.
+        """The poses of a plan, a row each; forces (N) where it states them.
+
+        Args:
+            path: The plan (CSV): configuration, q1_deg …
 
         Raises:
             InputError: As `read` does.
@@ -182,7 +185,9 @@ class Model:
         pull = np.zeros(3) if force is None else _rows_of_three("force", force, n)
         place = None if position is None else _rows_of_three("position", position, n)
         marker = next(iter(self.cell.tool.markers), DEFAULT_MARKER)
-        return Measurements.of_poses("table", joints, pull, marker, position=place)
+        return Measurements.of_poses(
+            "table", joints, pull, marker, position=place, joint_kinds=self.chain.kinds
+        )
 
     def pose(
         self, q: ArrayLike, x: ArrayLike | None = None, force: ArrayLike | None = None

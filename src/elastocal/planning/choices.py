@@ -1,4 +1,4 @@
-"""What can be chosen besides poses: places of markers, hook and tracker, and which loads hang.
+"""What can be chosen besides poses: places of markers, load point and tracker, and which loads.
 
 The relaxed optimum Φ*(z) = min_w Φ(Σ w_i A_i(z)) over weights w is what the best plan at places z
 can reach at most.  It is made small over w and z in turn: at weights w the places by L-BFGS-B
@@ -20,7 +20,7 @@ from scipy.optimize import minimize
 
 from elastocal.cell.work_cell import Cell
 from elastocal.errors import ElastocalError, InsufficientDataError, require
-from elastocal.model.effects.driven import Entry, HookMotion, MarkerMotion
+from elastocal.model.effects.driven import Entry, LoadPointMotion, MarkerMotion
 from elastocal.model.manipulator import Model
 from elastocal.planning.candidates import Candidates, draw
 from elastocal.planning.criteria import CRITERIA
@@ -41,7 +41,7 @@ USED = 1e-4  # of the largest weight: candidates that count while places move
 MOST_CHOICES = 100  # of loads
 
 
-HOOK, TRACKER = "load point", "tracker"  # beside the markers' names
+LOAD_POINT, TRACKER = "load point", "tracker"  # beside the markers' names
 
 
 @dataclass(frozen=True)
@@ -77,8 +77,8 @@ class Chosen:
         """What is to stand in the cell file, by table."""
         at = {name: place[1].tolist() for name, place in self.places.items()}
         found: dict[str, dict[str, Any]] = {"tool": {}, "tracker": {}, "design": {}}
-        if HOOK in at:
-            found["tool"]["load_point_m"] = at.pop(HOOK)
+        if LOAD_POINT in at:
+            found["tool"]["load_point_m"] = at.pop(LOAD_POINT)
         if TRACKER in at:
             found["tracker"]["position_m"] = at.pop(TRACKER)
         if at:
@@ -101,14 +101,17 @@ class Boxes:
         freedom = cell.design.choose
         assert freedom is not None
         boxes = dict(freedom.markers)
-        boxes |= {} if freedom.load_point is None else {HOOK: freedom.load_point}
+        boxes |= {} if freedom.load_point is None else {LOAD_POINT: freedom.load_point}
         boxes |= {} if freedom.tracker is None else {TRACKER: freedom.tracker}
         corners = np.array(list(boxes.values())).reshape(-1, 2, 3)
         return cls(tuple(boxes), corners[:, 0], corners[:, 1])
 
     def places(self, cell: Cell) -> Array:
         """Where the cell has them (k, 3)."""
-        known = cell.tool.markers | {HOOK: cell.tool.load_point, TRACKER: cell.tracker.position}
+        known = cell.tool.markers | {
+            LOAD_POINT: cell.tool.load_point,
+            TRACKER: cell.tracker.position,
+        }
         return np.array([known[name] for name in self.names]).reshape(-1, 3)
 
     def at(self, unit: Array) -> Array:
@@ -124,9 +127,9 @@ class Boxes:
     def placed(self, cell: Cell, places: Array) -> Cell:
         """The cell with everything at its place."""
         at = dict(zip(self.names, np.round(places, DIGITS), strict=True))
-        hook = at.pop(HOOK, cell.tool.load_point)
+        point = at.pop(LOAD_POINT, cell.tool.load_point)
         tracker = replace(cell.tracker, position=at.pop(TRACKER, cell.tracker.position))
-        tool = replace(cell.tool, load_point=hook, markers=cell.tool.markers | at)
+        tool = replace(cell.tool, load_point=point, markers=cell.tool.markers | at)
         return replace(cell, tool=tool, tracker=tracker)
 
 
@@ -295,7 +298,9 @@ def _mobile(
     """
     base, on_tool = boxes.places(cell), [n != TRACKER for n in boxes.names]
     motions: list[tuple[Entry, str]] = [
-        (HookMotion(), HookMotion.at) if name == HOOK else (MarkerMotion(), f"marker:{name}")
+        (LoadPointMotion(), LoadPointMotion.at)
+        if name == LOAD_POINT
+        else (MarkerMotion(), f"marker:{name}")
         for name, own in zip(boxes.names, on_tool, strict=True)
         if own
     ]

@@ -155,6 +155,7 @@ class PlanRows:
             force=np.zeros((n, 3)) if self.force is None else self.force,
             approach=None if self.approach is None else self.approach.astype(float),
             time=None if self.time is None else np.round(self.time, 3),
+            joint_kinds=tuple(joint_kinds),
         )
 
 

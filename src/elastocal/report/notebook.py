@@ -47,6 +47,7 @@ from elastocal.report.terminal import (
     print_comparison,
     print_compensation,
     print_diagnosis,
+    print_next,
     print_plan,
     print_result,
     printed_text,
@@ -57,6 +58,9 @@ from elastocal.units import Array
 
 if TYPE_CHECKING:
     import pandas as pd
+
+    from elastocal.diagnosis.next_poses import NextPoses
+    from elastocal.measurements import Measurements
 
 MOST_BARS = 40
 MOST_TICKS = 20
@@ -171,6 +175,31 @@ def _of_targets(c: Compensation, metres: Array, axis: str, interactive: bool) ->
     table = c.targets.table
     names = [table.configuration_labels[table.configuration[i]] for i in rows]
     return _bars(names, metres[rows] * 1e6, axis, interactive)
+
+
+def gain(found: NextPoses, interactive: bool) -> Any:
+    """The error at the test poses before and after the batch; none where it is not known yet."""
+    g = found.gain
+    value = np.array([g.before, g.after, g.model_before, g.model_after]) * 1e6
+    names = ["measured so far", "with this batch"]
+    names += [f"{name}, were the model right" for name in names]
+    axis = "rms error at the test poses in µm"
+    return _bars(names, np.where(np.isfinite(value), value, np.nan), axis, interactive)
+
+
+def doubts(found: NextPoses, interactive: bool) -> Any:
+    """Probability of each effect that the model may lack."""
+    some = found.doubts[:MOST_BARS]
+    names = [f"{name_of(effect)} at {where}" for effect, where, _ in some]
+    return _bars(names, np.array([p for *_, p in some]), "probability", interactive)
+
+
+def joints(table: Measurements, interactive: bool) -> Any:
+    """Where each joint stood, in the middle of its range and from end to end."""
+    q = in_file_units(table.q, table.kinds)
+    ends = np.column_stack([q.min(axis=0), q.max(axis=0)]) if len(q) else np.zeros((q.shape[1], 2))
+    axis = "middle and ends of the values, in ° or mm"
+    return _bars(joint_columns(table.kinds), ends.mean(axis=1), axis, interactive, ends)
 
 
 def poses(plan: Plan, interactive: bool) -> Any:
@@ -314,10 +343,10 @@ class View:
 
 def view_of(result: object) -> View:
     """The view of a result's type; TypeError for a type without one, a mistake of the program."""
-    for kind, view in VIEWS.items():
-        if isinstance(result, kind):
-            return view
-    raise TypeError(type(result).__name__)
+    name = type(result).__name__
+    if name not in VIEWS:
+        raise TypeError(name)
+    return VIEWS[name]
 
 
 class HtmlConsole:
@@ -359,6 +388,19 @@ def _html_table(table: Table) -> str:
         f"<table><caption>{title}</caption><thead><tr>{head}</tr></thead>"
         f"<tbody>{body}</tbody></table>{more}"
     )
+
+
+def _show_readings(console: Any, table: Measurements) -> None:
+    """What it has of each column: labels are counted, numbers from the least to the largest."""
+    rows = [
+        (name, str(len(np.unique(values.astype(str)))), "", "")
+        if values.dtype == object
+        else (name, str(len(np.unique(values))), f"{values.min():.6g}", f"{values.max():.6g}")
+        for name, values in table.columns().items() if len(values)
+    ]  # fmt: skip
+    heads = ("column", "different", "least", "largest")
+    title = f"{len(table)} rows of {printable(table.source)}"
+    console.print(table_of(title, ShownTable(heads, rows, (0,))))
 
 
 def _show_compensation(console: Any, c: Compensation) -> None:
@@ -414,6 +456,13 @@ def _plan_frame(plan: Plan) -> pd.DataFrame:
         for k, axis in enumerate("xyz"):
             columns[f"force_{axis}_N"] = plan.forces[plan.load, k]
     return pd.DataFrame(columns)
+
+
+def _next_frame(found: NextPoses) -> pd.DataFrame:
+    """The poses, as of a plan; empty where none are needed."""
+    import pandas as pd
+
+    return pd.DataFrame() if found.plan is None else _plan_frame(found.plan)
 
 
 def _candidates(d: Diagnosis) -> pd.DataFrame:
@@ -475,18 +524,20 @@ def moved(c: Comparison, interactive: bool) -> Any:
     return figure
 
 
-VIEWS: dict[type, View] = {
-    Comparison: View(print_comparison, changes_frame, {"moved": moved}),
-    Calibration: View(
+VIEWS: dict[str, View] = {
+    "Measurements": View(_show_readings, lambda t: t.to_dataframe(), {"joints": joints}),
+    "NextPoses": View(print_next, _next_frame, {"gain": gain, "doubts": doubts}),
+    "Comparison": View(print_comparison, changes_frame, {"moved": moved}),
+    "Calibration": View(
         partial(print_result, details=True),
         _estimates,
         {"residuals": residuals, "parameters": parameters},
     ),
-    Plan: View(print_plan, _plan_frame, {"poses": poses, "intervals": intervals}),
-    Compensation: View(
+    "Plan": View(print_plan, _plan_frame, {"poses": poses, "intervals": intervals}),
+    "Compensation": View(
         _show_compensation, _commands, {"errors": errors, "uncertainty": uncertainties}
     ),
-    Diagnosis: View(
+    "Diagnosis": View(
         print_diagnosis,
         _candidates,
         {"budget": budget, "candidates": candidates, "shares": shares},

@@ -1,4 +1,4 @@
-"""Results as HTML pages: identification, plan, diagnosis, compensation.
+"""Results as HTML pages: identification, plan, diagnosis, compensation and what else there is.
 
 Each page needs no network and no other file.  Its words and tables come from the result's view,
 its figures are drawn here; the templates lie beside this module.
@@ -13,7 +13,7 @@ import platform
 import re
 from collections.abc import Callable, Iterable, Mapping
 from datetime import date
-from functools import cache
+from functools import cache, partial
 from importlib import metadata, resources
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -116,7 +116,7 @@ def page_of(
     """
     from markupsafe import Markup
 
-    template, contents = next(page for kind, page in PAGES.items() if isinstance(result, kind))
+    template, contents = PAGES[type(result).__name__]
     if told.pop("certificate", False):
         template, contents = "certificate.html.j2", _certificate
     content: dict[str, Any] = {"seed": seed, "backend": ""} | contents(result, **told)
@@ -194,7 +194,7 @@ def figures_of(result: object) -> dict[str, Any]:
     """The figures of a result's page as matplotlib's, by name; none where it has no model."""
     if isinstance(result, Diagnosis) and result.model is None:
         return {}
-    contents = next(contents for kind, (_, contents) in PAGES.items() if isinstance(result, kind))
+    contents = PAGES[type(result).__name__][1]
     with as_figures():
         return {name: f for name, f in contents(result).get("figures", {}).items() if f}
 
@@ -205,6 +205,8 @@ def sources(result: Any) -> list[Path]:
         named = [result.old.model.cell.path, result.old.source, result.new.source]
     elif isinstance(result, Compensation):
         named = [result.targets.table.source]
+    elif not hasattr(result, "model"):
+        named = [result.source]
     else:
         named = [result.model.cell.path]
         if isinstance(result, Calibration):
@@ -295,12 +297,14 @@ def _plan(plan: Plan) -> dict[str, Any]:
     }
 
 
-def _compensation(found: Compensation) -> dict[str, Any]:
+def _shown(what: str, found: Any) -> dict[str, Any]:
+    """What a notebook shows of it, and its figures."""
     from markupsafe import Markup
 
     view = view_of(found)
     drawn = [Markup(svg_of(view.plot(found, kind, False), kind)) for kind in view.figures]
-    return {"title": found.chain.name, "shown": Markup(view.html(found)), "drawn": drawn}
+    title = found.chain.name if isinstance(found, Compensation) else found.source
+    return {"what": what, "title": title, "shown": Markup(view.html(found)), "drawn": drawn}
 
 
 def _of(model: Model, figures: Mapping[str, str]) -> dict[str, Any]:
@@ -346,10 +350,12 @@ def _comparison(c: Comparison) -> dict[str, Any]:
     return {**_of(c.old.model, figures), **changes_contents(c)}
 
 
-PAGES: dict[type, tuple[str, Callable[..., dict[str, Any]]]] = {
-    Calibration: ("identification.html.j2", _calibration),
-    Comparison: ("changes.html.j2", _comparison),
-    Plan: ("plan.html.j2", _plan),
-    Diagnosis: ("diagnosis.html.j2", _diagnosis),
-    Compensation: ("compensation.html.j2", _compensation),
+PAGES: dict[str, tuple[str, Callable[..., dict[str, Any]]]] = {
+    "Calibration": ("identification.html.j2", _calibration),
+    "Comparison": ("changes.html.j2", _comparison),
+    "Plan": ("plan.html.j2", _plan),
+    "Diagnosis": ("diagnosis.html.j2", _diagnosis),
+    "Compensation": ("shown.html.j2", partial(_shown, "Compensation")),
+    "Measurements": ("shown.html.j2", partial(_shown, "Readings")),
+    "NextPoses": ("shown.html.j2", partial(_shown, "Next poses")),
 }

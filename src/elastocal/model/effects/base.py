@@ -42,7 +42,7 @@ RECORD_TORQUES = (
     "record the joints' torques or motor currents, which a wrong weight or spring changes "
     "and a gear error does not"
 )
-WEIGH_LOAD = "weigh the load and measure its hook"
+WEIGH_LOAD = "weigh the load and measure where it hangs"
 
 
 @dataclass(frozen=True)

@@ -113,10 +113,10 @@ class MarkerMotion(Entry):
         arm.markers[place.removeprefix("marker:")] += u
 
 
-class HookMotion(Entry):
+class LoadPointMotion(Entry):
     """The point where the load hangs moves by u (3,) in the flange frame."""
 
-    name = "hook_motion"
+    name = "load_point_motion"
     stage: ClassVar[Stage] = "load"
     at = "load"
     units = ("m", "m", "m")
