@@ -92,7 +92,7 @@ ROOMS: dict[str, tuple[Part, ...]] = {
         Part(
             "How long a drift lasts",
             "",
-            "python experiment_design/arm_coverage/lasting.py 8 15",
+            "python experiment_design/arm_coverage/lasting.py 8 8",
             f"{STUDIES}/arm_coverage/README.md",
             "How long a drift lasts",
             tables=1,

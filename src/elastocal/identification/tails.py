@@ -139,7 +139,7 @@ NODES, STEPS = 200, 50
 
 
 @dataclass(frozen=True)
-class Kept:
+class TrimmedNoise:
     """Noise of variance one of which far readings are set apart: the standard deviation `sigma` and
     the `excess_kurtosis` of what is kept, and the `variance` of an estimate over that by least
     squares of normal noise of variance one."""
@@ -150,7 +150,7 @@ class Kept:
 
 
 @lru_cache(maxsize=256)
-def kept_of(dof: float, values: int, size: int) -> Kept:
+def kept_of(dof: float, values: int, size: int) -> TrimmedNoise:
     """What `rejection_point` keeps of a table of so many `values`, `size` independent components to
     a reading, whose noise is Student's t on `dof` > 2 degrees of freedom."""
     nodes, weights = np.polynomial.legendre.leggauss(NODES)
@@ -173,4 +173,4 @@ def kept_of(dof: float, values: int, size: int) -> Kept:
     slope = float(f @ (r**2 * (dof + 1) / (dof * squared_scale + r**2)))
     others = share ** (size - 1)  # the reading's other components are near as well
     kurtosis = float(f @ r**4) / share / sigma**4 - 3
-    return Kept(sigma, kurtosis, second / (slope**2 * others))
+    return TrimmedNoise(sigma, kurtosis, second / (slope**2 * others))
