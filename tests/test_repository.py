@@ -359,6 +359,21 @@ def test_no_module_but_the_catalogue_names_an_effect() -> None:
     assert named == []
 
 
+def test_no_module_compares_the_name_of_a_criterion() -> None:
+    """They are written where the classes are; others ask the class, or the plan."""
+    from elastocal.planning.criteria import CRITERIA
+
+    compared = [
+        f"{module}, line {node.lineno}"
+        for module, path in MODULES.items()
+        for node in nodes(path)
+        if isinstance(node, ast.Compare)
+        for word in (node.left, *node.comparators)
+        if isinstance(word, ast.Constant) and word.value in set(CRITERIA) - {"c"}
+    ]
+    assert compared == []
+
+
 def test_no_module_imports_scipy_stats_when_it_is_imported() -> None:
     """A third of a second at every start; `scipy.special` has the quantiles."""
     first = re.compile(r"^from scipy(\.stats import|(.*[ ,])stats\b)|^import scipy\.stats", re.M)

@@ -64,7 +64,7 @@ def figure(colours: Colours) -> Figure:
     fig, axis = plt.subplots(figsize=(9.8, 7.8))
     axis.axis("off")
     for room, direct in uses().items():
-        for target in direct:
+        for target in sorted(direct):
             _arrow(axis, room, target, colours)
     for room, (x, floor, half, what) in ROOMS.items():
         colour = colours.two if room in MISSION else colours.one
@@ -95,8 +95,9 @@ def _arrow(axis: plt.Axes, room: str, target: str, colours: Colours) -> None:
     start = x + max(-0.7 * half, min(0.7 * half, 0.25 * (to - x)))
     end = to + max(-0.7 * wide, min(0.7 * wide, 0.3 * (x - to)))
     style = {"arrowstyle": "-|>", "color": colours.text, "shrinkA": 0, "shrinkB": 0, "alpha": 0.75}
-    axis.annotate("", (end, below * STEP + HEIGHT / 2), (start, floor * STEP - HEIGHT / 2),
-                  arrowprops=style)  # fmt: skip
+    drawn = axis.annotate("", (end, below * STEP + HEIGHT / 2), (start, floor * STEP - HEIGHT / 2),
+                          arrowprops=style)  # fmt: skip
+    drawn.arrow_patch.set_gid(f"{room} uses {target}".replace(" ", "_"))
 
 
 if __name__ == "__main__":

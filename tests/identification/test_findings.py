@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import ast
 import json
+import pickle
 from dataclasses import replace
 from pathlib import Path
 
@@ -26,6 +27,7 @@ from elastocal.identification import (
 from elastocal.identification import findings as module
 from elastocal.identification.identify import identify
 from elastocal.model import Model
+from elastocal.report.judgement_view import warnings_beside
 
 SIGMA = 5e-5
 PAGE = Path(__file__).parents[2] / "docs" / "file-formats.md"
@@ -63,6 +65,18 @@ def test_residual_and_stated_noise_have_one_threshold(result, above):
     assert (found.finding("residual_above_stated_noise") is not None) == above
     assert (found.findings[0].severity == "care") == above
     assert any("times the stated noise" in w for w in warning_sentences(found)) == above
+
+
+def test_a_warning_that_the_verdict_tells_is_not_told_beside_it(result):
+    """By the kind of finding that it knows; in a file it is a text."""
+    found = with_noise(result, ratio_to_stated=3.0)
+    found = replace(found, warnings=("from before", *warning_sentences(found)))
+    (kind,) = (w.kind for w in found.warnings[1:] if "times the stated noise" in w)
+    assert kind == "residual_above_stated_noise" in {f.kind for f in found.verdict.missing}
+    assert warnings_beside(found) == [w for w in found.warnings if "times the stated" not in w]
+    again = pickle.loads(pickle.dumps(found.warnings))
+    assert [w.kind for w in again[1:]] == [w.kind for w in found.warnings[1:]]
+    assert json.loads(json.dumps(found.warnings)) == list(found.warnings)
 
 
 @pytest.mark.parametrize("above", [False, True])

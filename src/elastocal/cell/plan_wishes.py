@@ -36,6 +36,7 @@ from elastocal.errors import require
 from elastocal.units import Array
 
 Positives = Annotated[Array, numbers(above=0)]
+TEST_POSE = "test_pose"  # the criterion where none is asked for
 ELSEWHERE_CAP = 0.05  # where the user states no test poses: a price that buys most of what can be
 
 
@@ -214,7 +215,7 @@ class DesignSpec:
 
     poses: Count | None = keyed("a whole number >= 1", default=None)
     criterion: Text = keyed(
-        'the name of a planning criterion, as "test_pose" or "D"', default="test_pose"
+        'the name of a planning criterion, as "test_pose" or "D"', default=TEST_POSE
     )
     levels: dict[str, Many[float]] = keyed(
         "a list of numbers per joint, as in joint2_deg = [-25.2, 0.0]",
@@ -296,7 +297,7 @@ class DesignSpec:
     def cap(self) -> float:
         """By how much ρ₀ may exceed the least, for as little error all over the joint ranges as
         can be had; 0 where `elsewhere` gives that a weight, or nobody asks for it."""
-        if self.elsewhere_cap is not None or self.criterion != "test_pose":
+        if self.elsewhere_cap is not None or self.criterion != TEST_POSE:
             return self.elsewhere_cap or 0.0
         return 0.0 if self.elsewhere is not None or self.states_test_poses else ELSEWHERE_CAP
 

@@ -29,13 +29,14 @@ from elastocal.identification.prediction import over_the_workspace, predicted_er
 from elastocal.identification.result import Calibration
 from elastocal.measurements import Measurements
 from elastocal.model.manipulator import Model
+from elastocal.planning.criteria import RobustError
 from elastocal.planning.design import DesignOptions, design
 from elastocal.planning.doubts import SOMETHING, Place, missing
 from elastocal.planning.plan import Gain, Plan
 from elastocal.planning.test_poses import where_used
 from elastocal.units import Progress
 
-CRITERION = "robust"
+CRITERION = RobustError.name
 
 NextVerdict = Literal["measure", "enough", "no_gain"]
 

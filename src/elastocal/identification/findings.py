@@ -601,10 +601,21 @@ OF_SEVERAL = {
 }
 
 
-def warning_sentences(result: Calibration) -> tuple[str, ...]:
+class Told(str):
+    """A sentence that knows the `kind` of the finding it tells; in JSON a text as any other."""
+
+    kind: str
+
+    def __new__(cls, text: str, kind: str = "") -> Told:
+        told = super().__new__(cls, text)
+        told.kind = kind
+        return told
+
+
+def warning_sentences(result: Calibration) -> tuple[Told, ...]:
     """The findings that call for attention as sentences that name the remedy; of those that are
     alike one sentence."""
-    told: list[str] = []
+    told: list[Told] = []
     alike: dict[tuple[Any, ...], list[Finding]] = {}
     for f in result.findings:
         if f.kind in OF_SEVERAL:
@@ -613,9 +624,9 @@ def warning_sentences(result: Calibration) -> tuple[str, ...]:
         same = alike.get((f.kind, f.numbers.get("bound"), f.numbers.get("unit")), [])
         if len(same) > 1:
             if f is same[0]:
-                told.append(_of_several(same))
+                told.append(Told(_of_several(same), f.kind))
         elif f.kind == "faulty_readings":
-            told += _faulty_readings(result)
+            told += [Told(text, f.kind) for text in _faulty_readings(result)]
         elif f.kind in SENTENCES and f.numbers.get("counted_by", "nothing") == "nothing":
             words = {k: ", ".join(map(_word, v)) if isinstance(v, tuple) else v
                      for k, v in f.numbers.items()}  # fmt: skip
@@ -623,7 +634,7 @@ def warning_sentences(result: Calibration) -> tuple[str, ...]:
                 words["lines"] = _runs(result.copies)
             within = f.kind == "beyond_bound"  # there the remedy ends a sentence
             remedy = f.remedy[:1].lower() + f.remedy[1:] if within else f.remedy
-            told.append(SENTENCES[f.kind].format(**words, remedy=remedy))
+            told.append(Told(SENTENCES[f.kind].format(**words, remedy=remedy), f.kind))
     return tuple(told)
 
 

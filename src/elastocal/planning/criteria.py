@@ -23,6 +23,7 @@ from typing import Any, ClassVar, Self, TypeVar, get_args
 
 import numpy as np
 
+from elastocal.cell.plan_wishes import TEST_POSE
 from elastocal.errors import InputError, require
 from elastocal.planning.criterion import (
     Cone,
@@ -139,7 +140,7 @@ class RemainingError(TraceCriterion):
     161–170.
     """
 
-    name = "test_pose"
+    name = TEST_POSE
     title = "position error ρ₀ that remains at the test poses after compensation, rms"
     unit = "µm"
     scale = 1e6

@@ -10,6 +10,7 @@ from typing import Literal, get_args
 import numpy as np
 from numpy.typing import NDArray
 
+from elastocal.cell.plan_wishes import TEST_POSE
 from elastocal.cell.work_cell import Cell
 from elastocal.errors import InsufficientDataError, option, require
 from elastocal.identification.knowledge import GaussianPrior
@@ -720,8 +721,8 @@ def _check_criterion(model: Model) -> None:
         f"{did_you_mean(asked, CRITERIA)}",
     )
     require(
-        not cell.design.elsewhere_cap or asked == "test_pose",
-        f'{where}: key design.elsewhere_cap goes with criterion = "test_pose", not with '
+        not cell.design.elsewhere_cap or asked == TEST_POSE,
+        f'{where}: key design.elsewhere_cap goes with criterion = "{TEST_POSE}", not with '
         f'"{asked}"; drop it',
     )
     names = cell.design.combination

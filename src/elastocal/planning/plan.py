@@ -11,6 +11,7 @@ import numpy as np
 from scipy import linalg, special
 
 from elastocal.above import Result
+from elastocal.cell.plan_wishes import TEST_POSE
 from elastocal.errors import InputError, require
 from elastocal.files import atomic_write_text
 from elastocal.measurements import DEFAULT_MARKER, Measurements, families
@@ -572,6 +573,11 @@ class Plan(Result):
     def table(self) -> Measurements:
         """The poses as a table for `simulate`, as the plan's file has them."""
         return self.rows.table(self.model.chain.kinds)
+
+    @property
+    def of_test_poses(self) -> bool:
+        """What was made small is the error at the test poses alone."""
+        return self.criterion == TEST_POSE
 
     @property
     def rows(self) -> PlanRows:

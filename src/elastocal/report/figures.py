@@ -500,7 +500,7 @@ def plan_curve(plan: Plan) -> str:
                       label="no plan can be better (on the pool)")  # fmt: skip
         axes.set_xticks([s.poses for s in points])
         axes.set_xlabel("poses")
-        name = "ρ₀" if plan.criterion == "test_pose" else plan.criterion
+        name = "ρ₀" if plan.of_test_poses else plan.criterion
         axes.set_ylabel(f"{name} in {plan.unit}" if plan.unit else name)
         axes.set_ylim(bottom=0)
         axes.legend(fontsize=8)

@@ -4,9 +4,9 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 
-from elastocal.identification.findings import next_steps, warning_sentences
+from elastocal.identification.findings import next_steps
 from elastocal.identification.result import Calibration, Finding
 from elastocal.report.formatting import Tone, counted, display, length, significant
 from elastocal.text import listed, printable
@@ -61,9 +61,8 @@ SAID = ("residual_above_stated_noise", "scatter_not_counted")
 
 def warnings_beside(result: Calibration) -> list[str]:
     """The warnings that say more than the verdict and what to do next."""
-    said = tuple(f for f in result.verdict.missing if f.kind in SAID)
-    told = warning_sentences(replace(result, findings=said)) if said else ()
-    return [printable(w) for w in result.warnings if w not in told]
+    said = {f.kind for f in result.verdict.missing} & set(SAID)
+    return [printable(str(w)) for w in result.warnings if getattr(w, "kind", "") not in said]
 
 
 def _step(f: Finding, sections: bool) -> str:

@@ -157,7 +157,7 @@ def plan_lead(plan: Plan) -> str:
 def plan_headline(plan: Plan) -> str:
     """What the plan is worth and how far from the best it is, in one sentence."""
     n = counted(len(plan.q), "pose")
-    if plan.criterion == "test_pose":
+    if plan.of_test_poses:
         text = (
             f"{n} leave a position error of ρ₀ = {_rho(plan):.3g} µm rms at the test poses "
             "after compensation"
@@ -198,7 +198,7 @@ def plan_steps(plan: Plan) -> list[str]:
         "Measure the poses in the order given, which keeps a drift apart from what is sought, and "
         "record the time of each reading."
     ]
-    if plan.criterion == "test_pose":
+    if plan.of_test_poses:
         steps.append(
             f"If ρ₀ is not small enough: {option('target')} finds the fewest poses that reach a "
             f"value, {option('curve')} compares numbers of poses."
@@ -268,7 +268,7 @@ def _chosen_lines(plan: Plan) -> list[tuple[str, str]]:
 
 
 def _criterion_line(plan: Plan) -> tuple[str, str]:
-    if plan.criterion != "test_pose":
+    if not plan.of_test_poses:
         return "Criterion", f"{plan.criterion} = {plan.reported:.6g} {plan.unit}".rstrip() + "."
     return "Criterion", (
         f"ρ₀ = {_rho(plan):.4g} µm, the rms position error that remains at the test poses after "
@@ -285,7 +285,7 @@ def _everywhere_lines(plan: Plan) -> list[tuple[str, str]]:
     def micrometres(error: float | None) -> str:
         return "none" if error is None else f"{error * 1e6:.4g}"
 
-    own = "" if plan.criterion == "test_pose" else f"; at the test poses {e.test_poses * 1e6:.4g}"
+    own = "" if plan.of_test_poses else f"; at the test poses {e.test_poses * 1e6:.4g}"
     text = (
         f"{e.elsewhere * 1e6:.4g} µm rms all over the joint ranges{own}; a random plan leaves "
         f"{micrometres(e.random_elsewhere)} there and {micrometres(e.random_test_poses)} at the "
@@ -300,7 +300,7 @@ def _everywhere_lines(plan: Plan) -> list[tuple[str, str]]:
     if e.share:
         text += f"; the joint ranges have {100 * e.share:.0f} % of the criterion's weight"
         text += f", for which ρ₀ may be {100 * e.cap:g} % above the least" if e.cap else ""
-    elif plan.criterion == "test_pose":
+    elif plan.of_test_poses:
         text += (
             f"; {option('elsewhere_cap', 0.05)} finds the least there for 5 % more at the test "
             "poses"
@@ -318,7 +318,7 @@ def _chance_lines(plan: Plan) -> list[tuple[str, str]]:
     lost = f"{open_} of {whole} leave parameters open that this plan determines"
     if c.median is None or c.best is None:
         return [("Chance", f"{lost}.")]
-    name = "ρ₀" if plan.criterion == "test_pose" else plan.criterion
+    name = "ρ₀" if plan.of_test_poses else plan.criterion
     if plan.everywhere is not None and plan.everywhere.share:
         name = "the weighted error"
     unit = f" {plan.unit}" if plan.unit else ""
