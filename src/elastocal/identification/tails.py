@@ -161,13 +161,8 @@ def kept_of(dof: float, values: int, size: int) -> TrimmedNoise:
     for _ in range(STEPS):
         reach = point * sigma
         r = reach * (nodes + 1) / 2
-        f = (
-            reach
-            * weights
-            * np.exp(  # both sides of zero
-                constant - (dof + 1) / 2 * np.log1p(r**2 / (dof * squared_scale))
-            )
-        )
+        log_f = constant - (dof + 1) / 2 * np.log1p(r**2 / (dof * squared_scale))
+        f = reach * weights * np.exp(log_f)  # both sides of zero
         share, second = float(f.sum()), float(f @ r**2)
         sigma = float(np.sqrt(second / share))
     slope = float(f @ (r**2 * (dof + 1) / (dof * squared_scale + r**2)))
