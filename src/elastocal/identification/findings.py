@@ -64,10 +64,8 @@ COMPARE = (
     "Compare the test poses with those fitted: where they lie elsewhere (joints, load), fit some "
     "like them; where they do not, the arm or the tracker has changed in between."
 )
-# A random walk's likelihood is that of a course with fewer correlation times in the campaign.
-FEW_TIMES = 3
 WANDERS = (
-    " It lasts nearly as long as the campaign: these readings do not tell it from a random walk, "
+    " It may last as long as the campaign: these readings do not tell it from a random walk, "
     "nor where the base is on another day; measure for longer, or on several days."
 )
 USE = (
@@ -270,7 +268,7 @@ def _visits(result: Calibration) -> Iterator[Finding]:
             + ("" if seconds is not None else "record times, ")
             + "and let arm and tracker warm up. The cell's [noise] drift_um lets design and "
             "simulate count with it."
-            + (WANDERS if noise.drift.share > 1 / FEW_TIMES else ""),
+            + ("" if noise.drift.ends else WANDERS),
         )  # fmt: skip
 
 

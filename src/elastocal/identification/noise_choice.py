@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from contextlib import suppress
 from dataclasses import dataclass, replace
 from typing import NamedTuple
@@ -111,6 +112,7 @@ class NoiseFit:
     spread: Array
     tests: tuple[NoiseTest, ...] = ()
     course: VisitRecord | None = None  # whose times those of what drifts are
+    to_longest: float = 0.0  # log-likelihood that the longest of LASTING is short of the best
 
     @property
     def description(self) -> str:
@@ -462,7 +464,10 @@ def over_times(found: NoiseFit, readings: Readings) -> NoiseFit:
         if lasting != found.lasting:
             with suppress(ElastocalError, np.linalg.LinAlgError):
                 fits.append(_fitted(basis, Kind.of(found.kind), found.fit, lasting))
-    return replace(found, covariance=mean_covariance(fits, T, found.covariance))
+    level = {fit.structure.lasting: fit.log_likelihood for fit in fits}
+    short = max(level.values()) - level.get(max(LASTING), -math.inf)
+    mean = mean_covariance(fits, T, found.covariance)
+    return replace(found, covariance=mean, to_longest=short)
 
 
 # Is a reading explained by the others?  Deletion residuals under an estimated noise model.

@@ -100,13 +100,19 @@ class NoiseSize:
         return size if self.factor is None else size | {"factor": self.factor}
 
 
+LIKELY = 0.5 * float(special.chdtri(1, 0.05))  # nats within which a likelihood has its 95 %
+
+
 @dataclass(frozen=True)
 class Drift:
     """The correlation time of what drifts, as a `share` of the campaign and in `seconds`; None
-    where the table has no times, and the order of its rows was taken for that of the visits."""
+    where the table has no times, and the order of its rows was taken for that of the visits.
+    `ends`: whether the times as likely as 95 % ask for leave out the longest one tried, whose
+    likelihood is that of a random walk."""
 
     share: float
     seconds: float | None
+    ends: bool = True
 
 
 @dataclass(frozen=True)
@@ -228,7 +234,9 @@ def _estimated(noise: Noise, found: NoiseFit, table: Measurements) -> Noise:
     drift = None
     if found.lasting is not None and found.course is not None:
         drift = Drift(
-            found.lasting, found.lasting * found.course.span if found.course.timed else None
+            found.lasting,
+            found.lasting * found.course.span if found.course.timed else None,
+            found.to_longest > LIKELY,
         )
     alone = fit.structure.name == "independent" and len(fit.own) == 1
     return replace(
