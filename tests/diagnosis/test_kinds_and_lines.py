@@ -38,7 +38,7 @@ from elastocal.diagnosis.components import (
 )
 from elastocal.diagnosis.diagnosis_data import DiagnosisData, diagnosis_data_of
 from elastocal.diagnosis.hypotheses import possible
-from elastocal.diagnosis.line_orders import Family, log_prior_of, order_posterior, ripples
+from elastocal.diagnosis.line_orders import KnownFamily, log_prior_of, order_posterior, ripples
 from elastocal.model.effects.gears import EncoderScale, GearEccentricity
 
 QUIET = NoiseValues.usual(3).of_instrument()
@@ -210,7 +210,7 @@ def test_a_next_line_is_as_probable_as_other_joints_have_it() -> None:
     grid = [np.arange(2.5, 250.0 / m, 0.5 * unit / m) for m in (1, 2, 3)]
     orders, lines = np.concatenate(grid), np.repeat([1, 2, 3], [len(g) for g in grid])
     for third in range(4):
-        fellows = [Family(f"joint{k}", 20.0 + k, 3 if k < third else 2, 0.0) for k in range(3)]
+        fellows = [KnownFamily(f"joint{k}", 20.0 + k, 3 if k < third else 2, 0.0) for k in range(3)]
         prior = np.exp(log_prior_of(orders, lines, unit, fellows))
         assert prior.sum() == pytest.approx(1.0, abs=0.02)
         at = [prior[(lines == m) & (np.abs(orders - 20.0) < 5.0)].sum() for m in (2, 3)]

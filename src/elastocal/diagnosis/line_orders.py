@@ -60,7 +60,7 @@ ORDERS = math.log(HIGHEST / LOWEST) / math.sqrt(12)
 
 
 @dataclass(frozen=True)
-class Family:
+class KnownFamily:
     """Lines of the joint `where`: lowest order, how many, logarithm of their size."""
 
     where: str
@@ -163,7 +163,7 @@ def order_posterior(
 
 
 def log_prior_of(
-    orders: Array, multiples: IntArray, unit: float, fellows: Sequence[Family]
+    orders: Array, multiples: IntArray, unit: float, fellows: Sequence[KnownFamily]
 ) -> Array:
     """Log prior (G,) of a family's lowest order and number of lines, from those of other joints.
 
@@ -196,11 +196,11 @@ def alike(others: Array, usual: float, spread: float) -> tuple[float, float]:
     return mean, variance * (1 + 1 / (k + 1))
 
 
-def families_of(found: FittedSum) -> list[Family]:
+def families_of(found: FittedSum) -> list[KnownFamily]:
     """Of every joint with lines the largest family."""
     sized = zip(found.components, found.sizes.size.tolist(), strict=True)
     every = [
-        Family(c.where, dict(c.settings)["order_1"], len(c.settings) // 2, size)
+        KnownFamily(c.where, dict(c.settings)["order_1"], len(c.settings) // 2, size)
         for c, size in sized if isinstance(c.effect, GearSpectrum)
     ]  # fmt: skip
     return list({f.where: f for f in sorted(every, key=lambda f: f.size)}.values())
