@@ -37,6 +37,7 @@ from elastocal.units import Array
 
 Positives = Annotated[Array, numbers(above=0)]
 TEST_POSE = "test_pose"  # the criterion where none is asked for
+EXTRA_TIME = 0.05  # of the shortest time, for a longer way where none is stated
 ELSEWHERE_CAP = 0.05  # where the user states no test poses: a price that buys most of what can be
 
 
@@ -147,6 +148,11 @@ class Motion:
     extra_time: NonNegative | None = keyed("a number >= 0, a share of the time", default=None)
     reference_every: Count | None = keyed("a whole number >= 1", default=None)
     degrees: bool = False
+
+    @property
+    def longer(self) -> float:
+        """The share of time by which the way may be longer than the shortest."""
+        return EXTRA_TIME if self.extra_time is None else self.extra_time
 
     @classmethod
     def from_keys(cls, table: Any, spot: Spot) -> dict[str, Any]:

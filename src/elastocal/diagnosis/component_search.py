@@ -242,6 +242,10 @@ def _reviewed(dataset: DiagnosisData, found: FittedSum) -> FittedSum:
     return _tuned(dataset, found) if changed else found
 
 
+PROBABLE = 0.5
+SWEEPS = 2
+
+
 def with_expected_families(dataset: DiagnosisData, found: FittedSum) -> FittedSum:
     """The sum with a family of lines at each joint where the others let expect one, and one order
     is more probable than all others and none together; the most probable first."""
@@ -255,9 +259,6 @@ def with_expected_families(dataset: DiagnosisData, found: FittedSum) -> FittedSu
         noise = with_scatter(found.noise, index(family.where), likeliest.scatter)
         found = _tuned(dataset, exchanged(replace(found, noise=noise), [], [family]))
     return found
-
-
-PROBABLE = 0.5
 
 
 def with_likelier_orders(dataset: DiagnosisData, found: FittedSum) -> FittedSum:
@@ -284,9 +285,6 @@ def with_likelier_orders(dataset: DiagnosisData, found: FittedSum) -> FittedSum:
         if found is before:
             break
     return found if found is begun else _tuned(dataset, _refitted(found))
-
-
-SWEEPS = 2
 
 
 def hidden_fellows(found: FittedSum, components: Sequence[Component]) -> tuple[Component, ...]:

@@ -21,6 +21,7 @@ from __future__ import annotations
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
+from functools import cached_property
 
 import numpy as np
 from scipy.special import logit, logsumexp, ndtri
@@ -95,7 +96,7 @@ class OrderPosterior:
         near &= True if m is None else self.multiples == m
         return float(logsumexp(self.log_odds[near])) if near.any() else -math.inf
 
-    @property
+    @cached_property
     def best(self) -> tuple[float, int]:
         """The most probable order, at its highest peak, and the most probable number of lines."""
         top = np.argsort(self.log_odds)[-PEAKS:]

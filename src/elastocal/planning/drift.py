@@ -21,7 +21,6 @@ from elastocal.units import Array, IntArray
 # What a steady drift of tracker or base does to what the readings are evaluated for.
 
 DRIFT = 50e-6  # m, from the first reading to the last: a tracker or a base over an hour
-EXTRA_TIME = 0.05  # of the shortest time, for a longer way where the cell states none
 HARMLESS = 0.1  # of what noise leaves: adds half a per cent to the error
 
 
@@ -183,8 +182,8 @@ class VisitTimes:
             longest=np.inf,
             enough=1.0 if alias is None else HARMLESS * alias.noise / DRIFT,
         )
-        extra = EXTRA_TIME if motion.extra_time is None else motion.extra_time
-        return replace(made, longest=made.driving(shortest) + extra * made.time(shortest))
+        longest = made.driving(shortest) + motion.longer * made.time(shortest)
+        return replace(made, longest=longest)
 
     def at(self, costs: Costs) -> VisitTimes:
         """With what is known of the moves since."""

@@ -375,7 +375,7 @@ def schedule(
     # The bound leaves open in which order the load states come: their number alone is fixed.
     way, fixed = costs.cost - costs.changed, tour_cost(costs.apart, tour)
     drift, shortest = None, tour
-    if (alias is not None or motion.load_changes) and motion.extra_time != 0:
+    if (alias is not None or motion.load_changes) and motion.longer > 0:
         tour, moves, later, drift = _against_drift(
             moves, motion, tour, costs, alias, seed, progress
         )
@@ -447,18 +447,19 @@ def _against_drift(
         return found, moves, costs, None
     bias, (twice, again) = clock.bias(found), moves.unloaded_twice(tour)
     as_pays = motion.extra_time is None
+
+    def harm(clock: VisitTimes, order: list[int]) -> float:
+        b = clock.bias(order)
+        return (alias.noise**2 + (DRIFT * b) ** 2) * clock.time(order) if as_pays else b
+
     left = clock.longest - (0.0 if as_pays else len(again) * clock.visit)
     if bias > clock.enough and len(again) and left >= clock.driving(tour):
-        price = _squared_error(alias, bias) * clock.time(found)
         spread = VisitTimes.of(twice, motion, costs := twice.costs(), alias, tour)
         begun = in_turns([*tour, *again], twice.visits.load, sequence)
         new, later, spread = _searched(
             begun, twice, costs, replace(spread, longest=left), seed, progress
         )
-        better = spread.bias(new) < bias
-        if as_pays:
-            better = _squared_error(alias, spread.bias(new)) * spread.time(new) < price
-        if spread.possible(new) and better:
+        if spread.possible(new) and harm(spread, new) < harm(clock, found):
             found, moves, costs, bias = new, twice, later, spread.bias(new)
         else:
             costs = moves.costs()
@@ -466,20 +467,16 @@ def _against_drift(
     return found, moves, costs, Drifting(DRIFT * bias, DRIFT * before, noise, at_test)
 
 
-def _squared_error(alias: Alias, bias: float) -> float:
-    """ρ² + b² in m², b by DRIFT at `bias` per m of it."""
-    return alias.noise**2 + (DRIFT * bias) ** 2
-
-
 def _searched(
     begun: list[int], moves: Moves, costs: Costs, clock: VisitTimes, seed: int,
     progress: Callable[[str], None],
 ) -> tuple[list[int], Costs, VisitTimes]:  # fmt: skip
     """The order of least price found from one that has `begun`, its moves checked."""
-    load = moves.visits.load
-    tries: list[list[int]] = []
-    while len(tries) < TRIES and not any(clock.bias(one) <= clock.enough for one in tries):
-        tries.append(balanced(begun, load, clock, seed + len(tries), STEPS, HOT))
+    load, tries = moves.visits.load, []
+    for k in range(TRIES):
+        tries.append(balanced(begun, load, clock, seed + k, STEPS, HOT))
+        if clock.share.any() and clock.bias(tries[-1]) <= clock.enough:
+            break  # it does no harm any more; without an alias the way alone counts
     new, rounds, again = min(tries, key=clock.price), 0, 0
     while (blocked := moves.check(new, costs)) or (not clock.possible(new) and again < TRIES):
         progress(f"order of execution against drift: {moves.checked} moves checked")

@@ -18,7 +18,6 @@ from elastocal.cell.work_cell import Cell
 from elastocal.errors import ElastocalError, InsufficientDataError
 from elastocal.planning.candidates import Candidates
 from elastocal.planning.choices import Choice
-from elastocal.planning.drift import EXTRA_TIME
 from elastocal.planning.exact_plan import exact_plan
 from elastocal.planning.execution import greedy_tour, tour_cost
 from elastocal.planning.information import load_states
@@ -125,9 +124,8 @@ class _Budget:
 
 
 def _sized(cell: Cell, poses: int, repeats: int) -> Cell:
-    motion = cell.design.motion
-    if motion.extra_time is None:  # what poses read twice would take, more poses may have
-        motion = replace(motion, extra_time=EXTRA_TIME)
+    # What poses read twice would take, more poses may have.
+    motion = replace(cell.design.motion, extra_time=cell.design.motion.longer)
     spec = replace(
         cell.design, poses=poses, per_level=(), repeats=repeats, minutes=None, motion=motion
     )
@@ -145,4 +143,4 @@ def _minutes(cell: Cell, q: Array) -> float:
     waiting = visits * len(q) * motion.dwell * (2 if motion.both_directions else 1)
     travel = visits * tour_cost(cost, greedy_tour(cost))
     total = waiting + travel + changes * motion.load_change
-    return float(total * (1 + (motion.extra_time or 0.0)) / 60)
+    return float(total * (1 + motion.longer) / 60)
