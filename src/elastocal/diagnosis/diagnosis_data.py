@@ -31,7 +31,7 @@ from elastocal.diagnosis.hypotheses import (
 )
 from elastocal.diagnosis.noise_floor import NoiseValues, NoisyData, fit_noise
 from elastocal.errors import InsufficientDataError
-from elastocal.identification.noise_structure import VISIT, SharedEffect
+from elastocal.identification.noise_structure import along_axes, faster_course
 from elastocal.identification.visit_record import visit_record
 from elastocal.measurements import Measurements, numbered
 from elastocal.model.effects import CATALOGUE
@@ -298,16 +298,10 @@ def _stated_drift(base: Baseline) -> tuple[Array, Array | float]:
     # Without times a visit takes as long as the arm stands still, as in a simulation.
     span = record.span * (1.0 if record.timed else base.model.cell.design.motion.dwell)
     lasting = noise.lasting / span
-    moved = noise.drift * np.eye(size)[:, :3]
-    waves = record.waves(lasting)
-    drift = np.zeros((n, size, waves.shape[1] * 3))
-    each = waves[:, None, :, None] * moved[:, None, :]
-    drift[: base.n_measured] = each.reshape(len(waves), size, -1)
-    loading = np.zeros((n + 1, record.visit.shape[1], size, 3))
-    loading[: base.n_measured] = record.faster(lasting)[:, :, None, None] * moved
-    visit = np.full((n + 1, record.visit.shape[1]), -1)
-    visit[: base.n_measured] = record.visit
-    left = SharedEffect("drift", (VISIT,), visit, loading, np.zeros(0))
+    along = np.where(np.arange(size) < 3, noise.drift, 0.0)
+    waves = along_axes(record.waves(lasting), along)
+    drift = np.concatenate([waves, np.zeros((n - base.n_measured, *waves.shape[1:]))])
+    left = faster_course("drift", record, lasting, along).padded(n + 1 - base.n_measured)
     m = blocks.member.shape[1] * size
     return drift, left.product(blocks.member, left, blocks.member).reshape(-1, m, m)
 

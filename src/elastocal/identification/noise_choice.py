@@ -136,7 +136,7 @@ class NoiseFit:
         if self.lasting is None or readings.visits is None:
             return readings.B
         waves = readings.visits.waves(self.lasting)
-        return np.concatenate([readings.B, along_axes(waves, readings.size)], axis=2)
+        return np.concatenate([readings.B, along_axes(waves, np.ones(readings.size))], axis=2)
 
     def of(self, readings: Readings) -> Readings:
         """The readings as the model takes them: repeats of different visits apart, or together."""
@@ -292,7 +292,7 @@ class _Choice:
             assert sets.visits is not None
             waves = sets.visits.waves(TESTED)
             # Of a pose, only positions.
-            columns = along_axes(waves, min(self.readings.size, 3))
+            columns = along_axes(waves, np.ones(min(self.readings.size, 3)))
             if self.readings.size == 6:
                 columns = np.concatenate([columns, 0 * columns], axis=1)
             return score_test_of_columns(fit, columns)

@@ -484,7 +484,7 @@ class SharedEffect:
         if self.joints:
             return _of_joints(self.name, readings, self.joints)
         if self.lasting:
-            return _of_course(self.name, readings, self.lasting, self.axes)
+            return faster_course(self.name, readings.visits, self.lasting, self.axes)
         return _common(self.name, self.by, readings, self.axes)
 
     def columns(self) -> sparse.csr_array:
@@ -590,10 +590,10 @@ def _of_joints(name: str, labelled: RepeatSets | Readings, joints: tuple[int, ..
 DRIFT = "drift in time"
 
 
-def _of_course(
-    name: str, labelled: RepeatSets | Readings, lasting: float, axes: Array
+def faster_course(
+    name: str, record: VisitRecord | None, lasting: float, axes: Array
 ) -> SharedEffect:
-    record = labelled.visits
+    """What of a course in time changes faster than its waves, of deviations `axes` (size,)."""
     assert record is not None
     loading = record.faster(lasting)[:, :, None, None] * np.diag(axes)[:, axes > 0]
     return SharedEffect(name, (VISIT,), record.visit, loading, axes, lasting=lasting)
@@ -614,7 +614,7 @@ def with_drift(structure: Structure, lasting: float) -> Structure:
     (C, size, p), k = sets.B.shape, waves.shape[1]
     kinds = [np.arange(3), np.arange(3, 6)] if size == 6 else [np.arange(size)]
     names = (DRIFT, f"{DRIFT} (rotation)")[: len(kinds)]
-    more = along_axes(waves, size)
+    more = along_axes(waves, np.ones(size))
     held = np.concatenate([np.zeros((k, size, p)), np.eye(k * size).reshape(k, size, -1)], axis=2)
     none = np.zeros((k, size, size))
 
@@ -638,7 +638,10 @@ def with_drift(structure: Structure, lasting: float) -> Structure:
     index[C:, : len(kinds)] = K + np.arange(len(kinds))
     along = [np.isin(np.arange(size), kind).astype(float) for kind in kinds]
     parts = np.array([np.diag(axes) for axes in along])
-    faster = [_of_course(n, sets, lasting, a).padded(k) for n, a in zip(names, along, strict=True)]
+    faster = [
+        faster_course(name, sets.visits, lasting, axes).padded(k)
+        for name, axes in zip(names, along, strict=True)
+    ]
 
     def padded(matrix: Array) -> Array:
         out = np.zeros((C + k, L, size, size))
@@ -653,7 +656,8 @@ def with_drift(structure: Structure, lasting: float) -> Structure:
     )  # fmt: skip
 
 
-def along_axes(waves: Array, size: int) -> Array:
-    """Columns (N, size, k·size) of a course's coefficients, from `waves` (N, k)."""
-    each = waves[:, None, :, None] * np.eye(size)[:, None, :]
-    return np.asarray(each.reshape(len(waves), size, -1))
+def along_axes(waves: Array, axes: Array) -> Array:
+    """Columns (N, size, k·r) of a course's coefficients, from `waves` (N, k) and its deviations
+    `axes` (size,), r of which are not zero."""
+    each = waves[:, None, :, None] * np.diag(axes)[:, None, axes > 0]
+    return np.asarray(each.reshape(len(waves), len(axes), -1))
