@@ -214,7 +214,8 @@ def _error_lines(d: Diagnosis) -> list[str]:
         shrinks = f"The noise-free error of new poses shrinks by {reduction(d.effects[0])}."
         return [f"{text} {shrinks}", *rest]
     each = [f"{effect_at(f)} takes away {reduction(f)}" for f in d.effects]
-    return [f"{text} Of the noise-free error of new poses {together(each)}.", *rest]
+    last = f"As the last to join the model, {together(each)} of the noise-free error of new poses."
+    return [f"{text} {last}", *rest]
 
 
 MATERIAL = 0.2  # of the noise: 2 % more in all
