@@ -174,15 +174,19 @@ class SumAnswer:
         The draws are as wide as a jackknife over PARTS of the configurations says, where that is
         wider than the posterior, which takes model and sizes for true.
         """
-        drawn = self._shares(members, self.draws)
-        apart = self._shares(members, self.deleted)
+        drawn, apart = (self._shares(members, *both) for both in self._moved_by)
         spread = np.sqrt((PARTS - 1) * np.mean((apart - apart.mean()) ** 2))
         middle = np.median(drawn)
         return np.asarray(middle + max(1.0, spread / max(drawn.std(), 1e-300)) * (drawn - middle))
 
-    def _shares(self, members: Sequence[int], w: Array) -> Array:
+    @cached_property
+    def _moved_by(self) -> tuple[tuple[Array, Array], ...]:
+        """w and G w (Σ k, n) of the draws, and of the fits without one part."""
+        return tuple((w, self.gram @ w) for w in (self.draws, self.deleted))
+
+    def _shares(self, members: Sequence[int], w: Array, moved: Array) -> Array:
         """Of each of the coefficients w (Σ k, n)."""
-        index, moved = self._index(members), self.gram @ w
+        index = self._index(members)
         whole = np.einsum("kd,kd->d", w, moved)
         return np.einsum("kd,kd->d", w[index], moved[index]) / np.maximum(whole, 1e-300)
 

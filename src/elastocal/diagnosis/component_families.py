@@ -16,6 +16,7 @@ from elastocal.diagnosis.evidence import Grams
 from elastocal.diagnosis.hypotheses import Hypothesis, RegressorDirection, cell_with, recorded
 from elastocal.diagnosis.noise_floor import NoiseValues, project
 from elastocal.diagnosis.unknown import Generic
+from elastocal.measurements import Measurements
 from elastocal.model.effects.base import Effect, Stage, index, turning_joints
 from elastocal.model.effects.driven import DrivenEffect
 from elastocal.model.effects.gears import MOST_LINES, GearRipple, GearSpectrum
@@ -438,8 +439,7 @@ def fields(dataset: DiagnosisData, found: FittedSum, most: int) -> list[Componen
 
 
 def _field_settings(dataset: DiagnosisData, name: str, length: float) -> dict[str, float]:
-    x = dataset.table.time if name == "time" else dataset.table.q[:, index(name)]
-    assert x is not None  # a field follows what is recorded
+    x = _followed(dataset.table, name)
     keys = ("size", "length", "low", "high")
     values = (1.0, length * float(np.ptp(x)), float(x.min()), float(x.max()))
     return {f"field_{name}_{key}": value for key, value in zip(keys, values, strict=True)}
@@ -448,14 +448,23 @@ def _field_settings(dataset: DiagnosisData, name: str, length: float) -> dict[st
 def _field(
     dataset: DiagnosisData, effect: ResidualField, where: str, name: str, length: float
 ) -> Generic:
-    """A field as a block, for a search: its direction at every visit."""
-    settings = _field_settings(dataset, name, length)
-    h, direction = _direction(dataset, effect, where, settings)
-    sd = np.array([p.typical for p in h.parameters])
-    D = direction(dataset.visit_table, np.zeros((1, 0)))[:, 0] * sd * MOTION
-    D = D.reshape(*dataset.present.shape, *D.shape[1:]) * dataset.present[:, :, None, None]
-    key = (effect.entry_at(where).name, (where,))
-    return Generic("angle", name, where, "geometry", key, D)
+    """A field as a block, for a search: its direction at every visit, the same waves in each
+    component of the motion."""
+    cell = cell_with(dataset.base.model.cell, where, _field_settings(dataset, name, length))
+    (course,) = effect.courses(where, dataset.base.model.chain, cell)
+    sd = np.sqrt(course.waves.variances(course.size, course.length))
+    F = course.waves.at(_followed(dataset.visit_table, name)) * sd * MOTION
+    F = F.reshape(*dataset.present.shape, -1) * dataset.present[:, :, None]
+    entry = effect.entry_at(where)
+    D = np.asarray(np.kron(np.eye(entry.size), F[:, :, None, :]), dtype=np.float64)
+    return Generic("angle", name, where, "geometry", (entry.name, (where,)), D)
+
+
+def _followed(table: Measurements, name: str) -> Array:
+    """What a field follows in each row (n_rows,): the angle of a joint, or the time."""
+    x = table.time if name == "time" else table.q[:, index(name)]
+    assert x is not None  # a field follows what is recorded
+    return x
 
 
 def _field_component(

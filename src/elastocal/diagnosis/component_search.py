@@ -33,6 +33,7 @@ from elastocal.diagnosis.components import (
     fit_sum,
     log_odds,
     presence_cost,
+    with_own_noise,
 )
 from elastocal.diagnosis.diagnosis_data import DiagnosisData
 from elastocal.diagnosis.effect_search import about
@@ -510,7 +511,7 @@ def completed(found: FittedSum, components: Sequence[Component]) -> FittedSum:
         taken = {id(c) for c in found.components}
         away = {n: [c for c in own if id(c) not in taken] for n, own in kinds.items()}
         shown = _kinds_that_show(found, away)
-        better = None
+        better, wider = None, {}
         for name, more in away.items():
             for instead in (None, *(n for n in kinds if n != name and present[n])):
                 gone = [c for c in found.components if c.effect.name == instead]
@@ -519,13 +520,18 @@ def completed(found: FittedSum, components: Sequence[Component]) -> FittedSum:
                 if not more or alone or (gone and not alike) or any(c.given for c in gone):
                     continue
                 fitted = exchanged(found, gone, more, refit_noise=False)
+                if instead is None:
+                    wider[name] = fitted
                 if fitted.score > (found if better is None else better).score + GAINED:
                     better = fitted
         if better is None:
             # What a kind does at all joints counts as their scatter as long as it is not there.
-            hidden = (more for name, more in away.items() if more and more[0].family in OF_JOINTS)
-            fits = (exchanged(found, [], more) for more in hidden)
-            better = max(fits, key=lambda fit: fit.score, default=found)
+            hidden = (name for name, more in away.items() if more and more[0].family in OF_JOINTS)
+            fits = (
+                wider.get(name) or exchanged(found, [], away[name], refit_noise=False)
+                for name in hidden
+            )
+            better = max(map(with_own_noise, fits), key=lambda fit: fit.score, default=found)
             if better.score <= found.score + GAINED:
                 break
         found = _refitted(better)

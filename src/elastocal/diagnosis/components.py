@@ -300,8 +300,8 @@ class SumOfComponents:
         )  # fmt: skip
         return root, found, value
 
-    def objective(self, theta: Array) -> tuple[float, Array]:
-        """−2 log posterior of the logarithms and its slope."""
+    def objective(self, theta: Array) -> tuple[float, Array, Array]:
+        """−2 log posterior of the logarithms, its slope and about its curvatures (1 + 2 K,)."""
         K = len(self.components)
         at = Sizes(float(theta[0]), theta[1 : K + 1], theta[K + 1 :])
         root, found, value = self.factored(at)
@@ -309,11 +309,14 @@ class SumOfComponents:
         # A coefficient's posterior over its prior variance.
         left = np.einsum("ij,ij->j", inverse, inverse)
         each = (1 - left) - b**2  # ∂(−2ℓ)/∂ log v
-        slope = np.zeros_like(theta)
+        slope, curvature = np.zeros_like(theta), np.ones_like(theta)
         for k, (c, span) in enumerate(zip(self.components, self.spans, strict=True)):
-            slope[1 + k] = 2 * each[span].sum()
+            slope[1 + k], shown = 2 * each[span].sum(), (1 - left[span]) ** 2
+            curvature[1 + k] = 2 * (shown.sum() + self.pool.precision[k, k])
             if c.waves is not None:
-                slope[1 + K + k] = each[span] @ c.shares(at.length[k])[1]
+                steep = c.shares(at.length[k])[1]
+                slope[1 + K + k] = each[span] @ steep
+                curvature[1 + K + k] += shown @ steep**2 / 2
         prior, of_sizes = self.pool.penalty(at.size)
         value += prior
         slope[1 : K + 1] += of_sizes
@@ -322,22 +325,33 @@ class SumOfComponents:
         M = self.weighted.M
         rss = self.squares - 2 * float(beta @ self.weighted.z) + float(beta @ (M @ beta))
         slope[0] = 2 * (self.rows - (len(left) - left.sum()) - rss / a2)
+        curvature[0] = 4 * self.rows
         if self.data.stated:
             value += (at.factor / 0.5) ** 2
             slope[0] += 2 * at.factor / 0.25
-        return value, slope
+        return value, slope, curvature
 
     def climbed(self, at: Sizes, steps: int) -> Sizes:
-        """The sizes after so many steps of a quasi-Newton search."""
+        """The sizes after so many steps of a quasi-Newton search, in units of the roots of the
+        curvatures at its start: a noise's factor shows a hundred times better than a size."""
         K = len(self.components)
         bounds = [(at.factor - 4, at.factor + 4), *[(GONE - 1, LARGEST)] * K]
         bounds += [c.lengths for c in self.components]
         theta = np.concatenate([[at.factor], at.size, at.length])
+        value, slope, curvature = self.objective(theta)
+        unit = 1 / np.sqrt(curvature)
+        begun = {(theta / unit).tobytes(): (value, slope)}
+
+        def cost(scaled: Array) -> tuple[float, Array]:
+            value, slope = begun.get(scaled.tobytes()) or self.objective(scaled * unit)[:2]
+            return value, slope * unit
+
         found = optimize.minimize(
-            self.objective, theta, jac=True, method="L-BFGS-B", bounds=bounds,
+            cost, theta / unit, jac=True, method="L-BFGS-B",
+            bounds=np.array(bounds) / unit[:, None],
             options={"maxiter": steps, "ftol": 2e-7, "gtol": 1e-2},
         )  # fmt: skip
-        x = found.x
+        x = found.x * unit
         return Sizes(float(x[0]), x[1 : K + 1], x[K + 1 :])
 
     def earned(self, at: Sizes) -> Array:
@@ -482,8 +496,8 @@ def fit_sum(
     `known` are the sums of a fit to the same data, which are not summed anew."""
     components, at = list(components), start or Sizes.start(components)
     rounds = 2 if refit_noise and start is None else 1
+    problem = posed(data, components, noise, known)
     for last in range(rounds):
-        problem = posed(data, components, noise, known)
         for _ in range(ROUNDS * 4):
             at = problem.climbed(at, STEPS)
             kept = _kept(problem, at, strict=last == rounds - 1)
@@ -491,20 +505,32 @@ def fit_sum(
                 break
             components, at = [components[k] for k in kept], at.chosen(kept)
             problem = problem.only(kept)
-        problem = problem.scaled(at.factor)
-        noise, at = problem.noise, replace(at, factor=0.0)
+        problem, at = problem.scaled(at.factor), replace(at, factor=0.0)
         if refit_noise:
-            noise = _noise_beside(data, components, at, noise)
-            if last == rounds - 1 or not components:
-                break
-    if refit_noise:
-        problem = posed(data, components, noise)
+            problem = _under_own_noise(problem, at)
+        if not components:
+            break
+    return _at_maximum(problem, at)
+
+
+def with_own_noise(found: FittedSum) -> FittedSum:
+    """The sum at its sizes with the noise fitted anew beside it."""
+    return _at_maximum(_under_own_noise(found.sums, found.sizes), found.sizes)
+
+
+def _under_own_noise(problem: SumOfComponents, at: Sizes) -> SumOfComponents:
+    noise = _noise_beside(problem.data, problem.components, at, problem.noise)
+    return posed(problem.data, problem.components, noise)
+
+
+def _at_maximum(problem: SumOfComponents, at: Sizes) -> FittedSum:
+    """The sum of all its components at these sizes."""
     variances = problem.variances(at)
     value = problem.factored(at)[2]
     score = -value / 2 - problem.pool.penalty(at.size)[0] / 2 - problem.pool.cost
-    score -= 0.5 * log_prior(data.stated, noise)[0]
-    earned, own = problem.earned(at), variances[len(data.precision) :]
-    return FittedSum(tuple(components), at, noise, earned, score, problem, own)
+    score -= 0.5 * log_prior(problem.data.stated, problem.noise)[0]
+    earned, own = problem.earned(at), variances[len(problem.data.precision) :]
+    return FittedSum(problem.components, at, problem.noise, earned, score, problem, own)
 
 
 def _kept(problem: SumOfComponents, at: Sizes, strict: bool) -> list[int]:
@@ -615,7 +641,8 @@ def drawn(
 
 
 def _indices(spans: Sequence[slice]) -> IntArray:
-    return np.concatenate([np.zeros(0, dtype=np.int64), *(np.r_[span] for span in spans)])
+    each = (np.arange(span.start, span.stop) for span in spans)
+    return np.concatenate([np.zeros(0, dtype=np.int64), *each])
 
 
 def _beside(

@@ -256,8 +256,10 @@ class Weighted:
 
     def factored(self, precision: Array) -> tuple[Array, Array, float]:
         """L of LLᵀ = M + Λ, L⁻¹z, and ℓ, for a prior of precision Λ (p,)."""
-        M = self.M + np.diag(self.prior(precision))
-        L: Array = linalg.cholesky(M, lower=True, check_finite=False)
+        M = self.M.copy()
+        M[np.diag_indices_from(M)] += self.prior(precision)
+        # Symmetric, and LAPACK's own way round: nothing is copied.
+        L: Array = linalg.cholesky(M.T, lower=True, overwrite_a=True, check_finite=False)
         z = linalg.solve_triangular(L, self.z, lower=True, check_finite=False)
         log_det = 2 * float(np.log(np.diag(L)).sum()) - float(np.log(precision).sum())
         return L, z, -0.5 * (self.alone + log_det - float(z @ z))
@@ -275,11 +277,11 @@ class Weighted:
         return Projection(back @ self.root, H, u, beta, marginal, L)
 
 
-def _divided(rows: Array, L: Array, overwrite: bool = False) -> Array:
+def _divided(rows: Array, L: Array) -> Array:
     """rows L⁻ᵀ (…, p) of rows (…, p) and a lower triangular L (p, p)."""
     flat = rows.reshape(-1, rows.shape[-1])
     # BLAS itself, since scipy's solver hands the rows back column by column.
-    divided = linalg.blas.dtrsm(1.0, L, flat.T, lower=1, overwrite_b=overwrite).T
+    divided = linalg.blas.dtrsm(1.0, L, flat.T, lower=1).T
     return np.asarray(divided.reshape(rows.shape))
 
 
@@ -297,30 +299,28 @@ def likelihood(data: NoisyData, noise: NoiseValues) -> tuple[float, Array]:
     """−2 log of marginal likelihood times prior, and its slope in the logarithms (1 + 2 joints,).
 
     The slope wants gᵀQg, Q = P − uuᵀ, of the joints' columns g in every visit and configuration:
-    with g̃ = K⁻¹g and ẽ = K⁻¹(r − Xβ̂) it is g̃ᵀg̃ − |L⁻¹X̃ᵀg̃|² − (g̃ᵀẽ)².  What is left of V is
-    the instrument's, and tr QV = n − tr (M + Λ)⁻¹M − ẽᵀẽ.
+    with g̃ = K⁻¹g, H̃ = X̃L⁻ᵀ and ẽ = K⁻¹(r − Xβ̂) it is g̃ᵀ(1 − H̃H̃ᵀ − ẽẽᵀ)g̃.  What is left of V
+    is the instrument's, and tr QV = n − tr (M + Λ)⁻¹M − ẽᵀẽ.
     """
     of, at = data.counting, Weighted.of(data, noise)
     L, z, marginal = at.factored(data.precision)
     beta = linalg.solve_triangular(L, z, lower=True, trans="T", check_finite=False)
-    e = at.r - at.X @ beta
     g = of.by_visit @ at.root.transpose(0, 2, 1)
+    back, e = g.transpose(0, 2, 1), (at.r - at.X @ beta)[..., None]
+    whole = 2 * (data.n_rows - float(np.vdot(e, e)))
     # Few rows are divided by L rather than many.
-    many = g.shape[1] >= g.shape[2]
-    Xg = g @ _divided(at.X, L) if many else _divided(g @ at.X, L, overwrite=True)
+    few = g.shape[1] < g.shape[2]
+    Q, X, e = (g @ back, g @ at.X, g @ e) if few else (np.eye(g.shape[2]), at.X, e)
+    H = _divided(X, L)
+    Q = Q - H @ H.transpose(0, 2, 1) - e @ e.transpose(0, 2, 1)
     J = data.G.shape[2]
-    by_visit, by_block = np.zeros(J), np.zeros(J)
-    for sign, part in ((1, g), (-1, Xg), (-1, g @ e[..., None])):
-        each = part.reshape(len(part), -1, J, part.shape[2])
-        together = each.sum(axis=1)
-        by_visit += sign * np.einsum("cvjk,cvjk->j", each, each)
-        by_block += sign * np.einsum("cjk,cjk->j", together, together)
-    inverse = linalg.solve_triangular(L, np.eye(len(L)), lower=True, check_finite=False)
+    each = (Q if few else g @ Q @ back).reshape(len(g), -1, J, g.shape[1] // J, J)
+    by_visit, by_block = np.einsum("cvjvj->j", each), np.einsum("cvjwj->j", each)
+    inverse = linalg.lapack.dtrtri(L, lower=1)[0]
     fitted = len(L) - float((inverse**2 @ at.prior(data.precision)).sum())
     of_shared = 2 * (noise.joint * noise.shared) ** 2 * by_block
     of_joint = 2 * noise.joint**2 * by_visit + of_shared
-    whole = 2 * (data.n_rows - fitted - float(np.vdot(e, e)))
-    slope = np.concatenate([[whole - of_joint.sum()], of_shared, of_joint])
+    slope = np.concatenate([[whole - 2 * fitted - of_joint.sum()], of_shared, of_joint])
     prior, prior_slope = log_prior(data.stated, noise)
     return -2 * marginal + prior, slope + prior_slope
 

@@ -258,13 +258,15 @@ def left_out_errors(
 
 def accidental(dataset: DiagnosisData, faulty: BoolArray) -> bool:
     """Whether the faulty readings (N,) spread over markers, load states and time as all do."""
+    if not faulty.any():
+        return True
     from scipy.stats import hypergeom  # slow to import, seldom asked for
 
     table, lead, moment = dataset.table, dataset.lead, dataset.moment
     loaded = np.any(table.force != 0, axis=1)[lead]
     for label in (table.marker[lead], loaded, moment > np.median(moment)):
         groups = np.unique(label)
-        if len(groups) < 2 or not faulty.any():
+        if len(groups) < 2:
             continue
         counts = np.array([[(faulty & (label == g)).sum(), (label == g).sum()] for g in groups])
         found, size = counts.T

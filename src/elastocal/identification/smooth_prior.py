@@ -85,7 +85,8 @@ class Standardised(NamedTuple):
         A = M * root
         A *= root[:, None]
         A[np.diag_indices_from(A)] += 1.0
-        L = linalg.cholesky(A, lower=True, overwrite_a=True, check_finite=False)
+        # Symmetric, and LAPACK's own way round: nothing is copied.
+        L = linalg.cholesky(A.T, lower=True, overwrite_a=True, check_finite=False)
         right = root * z
         b = linalg.cho_solve((L, True), right, check_finite=False)
         return cls(L, b, float(b @ right))
