@@ -263,7 +263,7 @@ def test_sizes_are_drawn_with_the_coefficients() -> None:
     at = Sizes(0.0, np.array([3.0, 1.0, 0.0]), np.zeros(3))
     both = replace(found, components=wide.components, sizes=at, sums=wide)
     precision = np.concatenate([data.precision, np.exp(-2 * at.size)])
-    w = drawn(both, wide.weighted, precision, 400, rng)
+    w = drawn(both, (), wide.weighted, precision, 400, rng)
     one_of, other, twin_of = w[-3:]
     known = np.linalg.inv(wide.weighted.M + np.diag(precision))
     sd = np.sqrt(known[-2, -2])

@@ -14,7 +14,7 @@ from scipy import linalg
 from scipy.special import expit, softmax
 
 from elastocal.diagnosis.component_families import lines_of
-from elastocal.diagnosis.component_search import Rivals, exchanged
+from elastocal.diagnosis.component_search import Rivals, exchanged, size_of_fellows
 from elastocal.diagnosis.components import (
     Component,
     FittedSum,
@@ -75,6 +75,11 @@ class SumAnswer:
         return self._weighted.projection(self._wide.precision)
 
     @cached_property
+    def _fitted(self) -> Projection:
+        """The estimates without what is hidden, as a cell has them that lacks it."""
+        return project(self.found.data, self.found.noise)
+
+    @cached_property
     def _weighted(self) -> Weighted:
         return Weighted.of(self._wide, self.found.noise)
 
@@ -83,7 +88,10 @@ class SumAnswer:
         """The data of the sum with the columns of what is hidden last."""
         data = self.found.data
         extra = side_by_side(data, [data.masked(c.columns) for c in self.hidden])
-        return data.with_columns(extra, np.ones(extra.shape[2]))
+        precision = [
+            np.full(c.width, np.exp(-2 * size_of_fellows(self.found, c))) for c in self.hidden
+        ]
+        return data.with_columns(extra, np.concatenate([np.zeros(0), *precision]))
 
     @cached_property
     def _spans(self) -> tuple[slice, ...]:
@@ -112,7 +120,8 @@ class SumAnswer:
     def draws(self) -> Array:
         """Posterior draws (Σ k, draws) of the components' coefficients."""
         precision = self._wide.precision
-        return drawn(self.found, self._weighted, precision, DRAWS, self.rng)[self._own :]
+        every = drawn(self.found, self.hidden, self._weighted, precision, DRAWS, self.rng)
+        return every[self._own :]
 
     @cached_property
     def moved(self) -> Array:
@@ -220,12 +229,7 @@ class SumAnswer:
         if not gone:
             return self
         removed = [self.found.components[k] for k in gone]
-        unnamed = [
-            replace(c, columns=c.columns * np.sqrt(self.found.priors[k]))
-            for k, c in zip(gone, removed, strict=True)
-        ]
-        found = exchanged(self.found, removed)
-        return replace(self, found=found, hidden=(*self.hidden, *unnamed))
+        return replace(self, found=exchanged(self.found, removed), hidden=(*self.hidden, *removed))
 
     # Shares.
 
@@ -254,17 +258,23 @@ class SumAnswer:
     @cached_property
     def groups(self) -> tuple[EffectGroup, ...]:
         """One for each effect at all its places, lines and curves of joints as one."""
-        kinds = self._by(lambda c: c.named and (GEARS if _of_gear(c) else c.effect.name))
+        kinds = self._by(_kind)
         counting = {name: [k for k in own if k not in self._slight] for name, own in kinds.items()}
         groups = (self._group(name, own) for name, own in counting.items() if own)
         return tuple(sorted(groups, key=lambda g: -g.share))
 
     def _group(self, name: str, members: list[int]) -> EffectGroup:
+        """At its places; what the same does at others, where it hardly shows, is in the share."""
         chosen = [self.found.components[k] for k in members]
         places = tuple(sorted({c.where for c in chosen}))
         effects = tuple(dict.fromkeys(c.effect.name for c in chosen))
-        share, fall = self._share_with_ends(members), self._reduction(members)
+        share, fall = self._share_with_ends(self._of_kind(name)), self._reduction(members)
         return EffectGroup(name, places, effects, *share, fall.reduction, fall.ci90)
+
+    def _of_kind(self, name: str) -> list[int]:
+        """All components of a kind, the hidden ones with them."""
+        every = (*self.found.components, *self.hidden)
+        return [k for k, c in enumerate(every) if _kind(c) == name]
 
     def _share_with_ends(self, members: Sequence[int]) -> tuple[float, Interval]:
         """Median and 90 % interval of a share."""
@@ -299,7 +309,7 @@ class SumAnswer:
         index = self._index(members)
         kept, _, whole = self._poses
         before = self._of_new_poses(whole)
-        estimate = self.moved[np.ix_(kept, index)] @ self.at.beta[self._own :][index]
+        estimate = self.moved[np.ix_(kept, index)] @ self._fitted.beta[self._own :][index]
         after = self._of_new_poses(whole - estimate[:, None])
         part = np.median(self.squares(members)) / np.maximum(np.median(self.total), 1e-300)
         # Draws about the mean already hold the error at the poses measured; at others it is more.
@@ -344,7 +354,8 @@ class SumAnswer:
         for k, rivals in self._rivals.items():
             own = self.found.components[k].hypothesis
             assert own is not None
-            if abs(float(np.median(self.shares([k])))) < TOLD:
+            alike = self._of_kind(_kind(self.found.components[k]))
+            if abs(float(np.median(self.shares(alike)))) < TOLD:
                 continue
             if rivals.get(own.key, 0.0) < NAMED:
                 keys = [own.key, *(key for key in rivals if key != own.key)][:3]
@@ -416,13 +427,25 @@ class SumAnswer:
 
     @cached_property
     def _slight(self) -> set[int]:
-        """Named components, by effect and place, that probably do not matter."""
-        doubtful = (own for own in self._at_place.values() if self._matters(own) < PROBABLE)
-        return {k for own in doubtful for k in own if self.found.components[k].named}
+        """Named components, by effect and place, that probably do not matter.
 
-    def _matters(self, members: Sequence[int]) -> float:
-        """Probability that these are there, and move the markers by SLIGHT of the whole or more."""
-        enough = self.squares(members) >= SLIGHT**2 * self.total
+        Where a kind does, and at which of its places these data do not tell, one of them stands for
+        all: the most probable.
+        """
+        chance = {own[0]: self._matters(own) for own in self._at_place.values()}
+        slight = set()
+        for name, members in self._by(_kind).items():
+            own = {k: p for k, p in chance.items() if k in members}
+            likeliest = max(own, key=lambda k: own[k])
+            spared = own[likeliest] < PROBABLE <= self._matters(members, self._of_kind(name))
+            doubtful = {k for k, p in own.items() if p < PROBABLE}
+            slight |= doubtful - {likeliest} if spared else doubtful
+        return {k for own in self._at_place.values() if own[0] in slight for k in own}
+
+    def _matters(self, members: Sequence[int], together: Sequence[int] = ()) -> float:
+        """Probability that these are there, and move the markers, `together` with others, by SLIGHT
+        of the whole or more."""
+        enough = self.squares(together or members) >= SLIGHT**2 * self.total
         return max(map(self._there, members)) * float(enough.mean())
 
     def _found_effects(self, named: bool, slight: bool = False) -> Iterator[FoundEffect]:
@@ -501,8 +524,8 @@ class SumAnswer:
         if c.hypothesis is None or any(p.shrunk for p in c.hypothesis.parameters):
             return
         span, sizes = self.found.spans[k], self.dataset.sizes[c.hypothesis.key]
-        mean = self.at.beta[span]
-        std = np.linalg.norm(self.at.beta_deviation[:, span], axis=0)
+        mean = self._fitted.beta[span]
+        std = np.linalg.norm(self._fitted.beta_deviation[:, span], axis=0)
         for p, size, m, s in zip(c.hypothesis.parameters, sizes, mean, std, strict=True):
             yield FittedParameter(
                 f"{c.where}.{p.key}", float(p.nominal + m * size), p.unit, float(s * size)
@@ -568,6 +591,11 @@ def _stage_of(c: Component) -> Stage:
 
 def _falling(values: Mapping[Any, float]) -> dict[str, float]:
     return {str(key): v for key, v in sorted(values.items(), key=lambda item: -item[1])}
+
+
+def _kind(c: Component) -> str:
+    """What a component is one of, wherever it acts; nothing where it has no name."""
+    return (GEARS if _of_gear(c) else c.effect.name) if c.named else ""
 
 
 def _of_gear(c: Component) -> bool:

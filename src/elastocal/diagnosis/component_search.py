@@ -80,7 +80,8 @@ def search_components(
             break
         # A compliance that was fitted without weights is wrong, and so are their columns by it.
         full = about_sum(full, found)
-    lined = False
+    found = with_own_axes(found)
+    lined, data = False, found.sums.data
     if len(full.blocks.member) <= FEW_POSES:
         # A curve takes up the lines of its joint as far as these few poses show them, and then
         # none of them stands out.
@@ -111,6 +112,7 @@ def search_components(
             break
         found = wider
     progress("what can be left out")
+    found = _swapped(full, with_own_axes(found), both)
     found = with_shorter_drifts(full, _spared(found))
     if len(full.blocks.member) <= FEW_POSES:
         found = with_expected_families(full, completed(found, both))
@@ -317,24 +319,30 @@ def with_possible_orders(dataset: DiagnosisData, found: FittedSum) -> FittedSum:
 
 def hidden_fellows(found: FittedSum, components: Sequence[Component]) -> tuple[Component, ...]:
     """Causes of kinds that are in the sum, at places where they are not, which may be there all
-    the same: with columns of the size that their fellows have on average.
+    the same, or in the place of those that are.
 
     What looks like something else that is in the sum, as an eccentricity of joint 2 looks like its
     sag, has no evidence of its own, and what it may take from the other is uncertain.
     """
-    hidden = []
-    for c in components:
-        fellows = [k for k, o in enumerate(found.components) if o.effect.name == c.effect.name]
-        if not fellows or c.fellows < 2 or any(c is other for other in found.components):
-            continue
-        size = float(np.sqrt(np.mean(np.exp(2 * found.sizes.size[fellows]))))
-        hidden.append(replace(c, columns=c.columns * size))
-    beside = Beside(found, [c.columns for c in hidden])
+    here = {c.effect.name for c in found.components}
+    taken = {id(c) for c in found.components}
+    hidden = [
+        c for c in components if c.effect.name in here and c.fellows > 1 and id(c) not in taken
+    ]
+    sized = [c.columns * np.exp(size_of_fellows(found, c)) for c in hidden]
+    beside = Beside(found, sized)
     each = beside.evidence(slice(0, 0), beside.spans, np.ones(1))
     odds = [
         evidence + log_odds(found.components, c) for evidence, c in zip(each, hidden, strict=True)
     ]
     return tuple(c for c, own in zip(hidden, odds, strict=True) if expit(own) > CHANCE)
+
+
+def size_of_fellows(found: FittedSum, c: Component) -> float:
+    """Logarithm of the size that the fellows of a component have in the sum on average; 0, a
+    typical one, where it has none."""
+    own = [k for k, o in enumerate(found.components) if o.effect.name == c.effect.name]
+    return 0.5 * float(np.log(np.mean(np.exp(2 * found.sizes.size[own])))) if own else 0.0
 
 
 CHANCE = 0.05  # probability from which what is not shown is reckoned with
@@ -501,7 +509,7 @@ def _swapped(
     with any.
     """
     known = {(c.effect.name, c.where): c for c in components if c.hypothesis is not None}
-    tried: set[tuple[str, str]] = set()
+    tried: set[tuple[tuple[str, str], tuple[str, str]]] = set()
     swapped = False
     for _ in range(SWAPS):
         best, rivals = None, Rivals(dataset, found)
@@ -509,16 +517,25 @@ def _swapped(
             if c.hypothesis is None or c.settings or c.given:
                 continue
             own, others = rivals.of(k)
+            several = sum(o.effect.name == c.effect.name for o in found.components) > 1
             for key, evidence in others.items():
-                if key in tried or key not in known or evidence <= own + BETTER:
+                pair = (c.hypothesis.key, key)
+                # Two of a kind with opposite signs may stand for a third, and cost more.
+                spared = found.costs[k] if several and key[0] == c.effect.name else 0.0
+                better = evidence + spared - own
+                if pair in tried or key not in known or better <= BETTER:
                     continue
-                if best is None or evidence - own > best[0]:
-                    best = evidence - own, k, key
+                if best is None or better > best[0]:
+                    best = better, k, pair
         if best is None:
             break
-        _, k, key = best
-        tried.add(key)
-        other = exchanged(found, [found.components[k]], [known[key]], refit_noise=False)
+        _, k, pair = best
+        tried.add(pair)
+        rival, c = known[pair[1]], found.components[k]
+        alike = [o for o in found.components if o.effect.name == c.effect.name]
+        instead = [[c], alike] if len(alike) > 1 and rival.effect.name == c.effect.name else [[c]]
+        others = (exchanged(found, gone, [rival], refit_noise=False) for gone in instead)
+        other = max(others, key=lambda fit: fit.score)
         if other.score > found.score:
             found, swapped = other, True
     return _refitted(found) if swapped else found
@@ -605,6 +622,41 @@ def _searched(dataset: DiagnosisData, chosen: ModelSet) -> list[Component]:
             )
             found.append(component)
     return found
+
+
+def with_own_axes(found: FittedSum) -> FittedSum:
+    """The sum under an instrument that reads each axis as well as it does, where none is stated and
+    the readings show that it is another one along each.
+
+    A camera is worse along its line of sight, a tracker across it.  Beside the sum the residual is
+    the instrument's, as it was not before.  Variances v_i of the axes maximise the restricted
+    likelihood, uᵢᵀuᵢ = tr Pᵢᵢ at the maximum (Harville 1977); the logarithm of a ratio, known to
+    √(1/2n) afterwards, costs what finding it costs.
+    """
+    data, size = found.sums.data, min(found.data.blocks.size, 3)
+    if data.stated or size < 2:
+        return found
+    used, axis = ~data.left_out, np.arange(data.r.shape[1]) % data.blocks.size
+    own = [used & (axis == i) for i in range(size)]
+    cost = (size - 1) * float(np.log(AXES / np.sqrt(0.5 / own[0].sum())))
+    V = data.covariance
+    for _ in range(AXIS_STEPS):
+        at = project(replace(found.data, covariance=V), found.noise)
+        left = np.diagonal(at.P, axis1=1, axis2=2)
+        ratio = np.array([(at.u[k] ** 2).sum() / left[k].sum() for k in own])
+        ratio /= np.exp(np.log(ratio).mean())
+        if np.abs(np.log(ratio)).max() < SETTLED:
+            break
+        each = np.ones(len(axis))
+        each[axis < size] = np.sqrt(ratio)[axis[axis < size]]
+        V = V * each[:, None] * each
+    other = replace(data, covariance=V)
+    fitted = fit_sum(other, found.components, found.noise, found.sizes)
+    return fitted if fitted.score > found.score + cost else found
+
+
+AXES = 0.5  # spread of the logarithms of an instrument's noise along its axes
+AXIS_STEPS, SETTLED = 20, 0.02
 
 
 def with_equal_noise(dataset: DiagnosisData) -> NoisyData:

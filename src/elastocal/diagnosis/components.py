@@ -597,19 +597,23 @@ SETTLING = 30  # sweeps
 
 
 def drawn(
-    found: FittedSum, at: Weighted, precision: Array, n: int, rng: np.random.Generator
-) -> Array:
-    """Posterior draws (p, n) of the coefficients of a sum, or of one with more columns behind it.
+    found: FittedSum, hidden: Sequence[Component], at: Weighted, precision: Array, n: int,
+    rng: np.random.Generator,
+) -> Array:  # fmt: skip
+    """Posterior draws (p, n) of the coefficients of a sum and of components that are `hidden` by
+    it, whose columns stand behind its own.
 
     Two causes that look alike share what they do by their sizes; which of these are the most
     probable decides little.  So those of effects that need no search are drawn as well, one after
     the other given the others (Gibbs), their coefficients integrated out: with A and b what the
     others leave of its normal matrix and right side, a component of size s, or none, has the log
-    evidence −½ log|1 + s²A| + ½ bᵀ(s⁻² + A)⁻¹b, beside the prior of `Pool`.
+    evidence −½ log|1 + s²A| + ½ bᵀ(s⁻² + A)⁻¹b, beside the prior of `Pool`.  What is hidden is not
+    there at first, and pays for being there as all others do.
     """
-    components, prior = found.components, at.prior(precision)
+    components, prior = (*found.components, *hidden), at.prior(precision)
+    every, first = spans_of([c.width for c in components], len(prior)), len(found.components)
     own = [k for k, c in enumerate(components) if c.hypothesis is not None and not c.settings]
-    c = _indices([found.spans[k] for k in own])
+    c = _indices([every[k] for k in own])
     x = np.setdiff1d(np.arange(len(prior)), c)
     L = linalg.cholesky(at.M[np.ix_(x, x)] + np.diag(prior[x]), lower=True)
     right = np.column_stack([at.M[np.ix_(x, c)], at.z[x]])
@@ -617,7 +621,8 @@ def drawn(
     across, z = half[:, :-1], half[:, -1]
     S, t = at.M[np.ix_(c, c)] - across.T @ across, at.z[c] - across.T @ z
     spans = dict(zip(own, spans_of([components[k].width for k in own], len(c)), strict=True))
-    pool, sizes = Pool(components), dict(zip(own, found.sizes.size[own].tolist(), strict=True))
+    pool = Pool(components)
+    sizes = {k: float(found.sizes.size[k]) for k in own if k < first}
     kinds = [(kind.tolist(), n) for kind, n in zip(pool.kinds, pool.places, strict=True)]
     steps = [(k, kind, n) for kind, n in kinds for k in kind if k in spans]
     out = np.zeros((len(prior), n))

@@ -56,6 +56,10 @@ RECORD = {
         "measure some poses with and without a load, or give the links' masses and set "
         "[model] link_gravity = true",
     ),
+    "station": (
+        "the instrument would stand among the markers: the readings are not in its own frame",
+        "state where it stands, [tracker] position_m",
+    ),
     "torque": ("the table has no torque columns", "record torque_1_Nm … of every joint"),
 }
 
@@ -176,11 +180,21 @@ def judged_together(model: Model, table: Measurements) -> list[Hypothesis]:
 
 
 def recorded(table: Measurements, need: str) -> bool:
-    """Whether the table says what an effect needs, with more than one value of it."""
+    """Whether the table says what an effect needs, with more than one value of it; of the station,
+    which no cell states, whether it may be the origin."""
     if need == "load":
         return bool(np.any(table.force != 0))
+    if need == "station":
+        return table.position is not None and not among(table.position[:, :2])
     values = getattr(table, need)
     return values is not None and bool(np.any(values != values[:1]))
+
+
+def among(points: Array) -> bool:
+    """Whether the origin lies within the convex hull of points (n, 2): then no angle of half a
+    turn, as seen from there, is free of them."""
+    seen = np.sort(np.arctan2(points[:, 1], points[:, 0]))
+    return bool(np.diff(seen, append=seen[0] + 2 * np.pi).max() < np.pi)
 
 
 # What the table records decides how some effects are driven.

@@ -39,6 +39,9 @@ class TrackerDistortion(Effect):
     def places(self, chain: Chain, cell: Cell) -> tuple[str, ...]:
         return () if cell.model.observe == "distance" else ("tracker",)
 
+    def needed(self, cell: Cell) -> tuple[str, ...]:
+        return (*self.needs, *["station"] * (not cell.tracker.position.any()))
+
     def read(self, arm: Arm, place: str, p: Symbols) -> None:
         station = rigid.constant(arm.cell.tracker.position)
         x, y, z = ca.vertsplit(ca.densify(arm.reading["position"] - station))
