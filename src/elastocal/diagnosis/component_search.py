@@ -113,9 +113,9 @@ def search_components(
         found = wider
     progress("what can be left out")
     found = _swapped(full, with_own_axes(found), both)
-    found = with_shorter_drifts(full, _spared(found))
+    found = completed(with_shorter_drifts(full, _spared(found)), both)
     if len(full.blocks.member) <= FEW_POSES:
-        found = with_expected_families(full, completed(found, both))
+        found = with_expected_families(full, found)
         found = with_possible_orders(full, with_likelier_orders(full, found))
     return full, found, hidden_fellows(found, others)
 
