@@ -92,3 +92,22 @@ def test_a_misspelt_effect_is_refused_with_the_nearest_name() -> None:
     with pytest.raises(InputError, match="false_alarm"):
         DiagnosisOptions(false_alarm=0.0)
     assert DiagnosisOptions(without=tuple(CATALOGUE)).without == tuple(CATALOGUE)
+
+
+def test_an_instrument_does_not_stand_among_the_markers() -> None:
+    """Readings about the origin were turned into another frame: nothing says where the instrument
+    stood, unless the cell does."""
+    plain = MODEL.cell
+    silent = Model.assembled(
+        MODEL.chain, replace(plain, tracker=replace(plain.tracker, position=np.zeros(3)))
+    )
+    around = TABLE.position - TABLE.position.mean(axis=0)
+    aside = around + np.array([4.0, 0.0, 0.0])
+    key = ("tracker_distortion", "tracker")
+    for model, position, asked in (
+        (silent, around, False), (silent, aside, True), (MODEL, around, True),
+    ):  # fmt: skip
+        tried, untested = possible(model, replace(TABLE, position=position))
+        assert (key in {(h.name, h.where) for h in tried}) == asked
+        (*_, advice) = [u.advice for u in untested if u.effect == key[0]] or ["position_m"]
+        assert "position_m" in advice

@@ -29,12 +29,14 @@ from elastocal.diagnosis.component_search import (
     size_of_fellows,
     with_expected_families,
     with_likelier_orders,
+    with_own_axes,
     with_possible_orders,
     with_shorter_drifts,
 )
 from elastocal.diagnosis.components import (
     PRESENT,
     Pool,
+    drawn,
     fit_sum,
     given_fellows,
     log_odds,
@@ -43,6 +45,7 @@ from elastocal.diagnosis.components import (
 from elastocal.diagnosis.diagnosis_data import DiagnosisData, diagnosis_data_of
 from elastocal.diagnosis.hypotheses import possible
 from elastocal.diagnosis.line_orders import KnownFamily, log_prior_of, order_posterior, ripples
+from elastocal.diagnosis.noise_floor import Weighted
 from elastocal.model.effects.gears import EncoderScale, GearEccentricity
 
 QUIET = NoiseValues.usual(3).of_instrument()
@@ -120,6 +123,46 @@ def test_what_cannot_be_seen_is_reckoned_with_where_its_fellows_are() -> None:
     size = np.sqrt(np.mean(np.exp(2 * found.sizes.size)))
     assert hidden is sixth
     assert size_of_fellows(found, hidden) == pytest.approx(np.log(size))
+
+
+@pytest.mark.parametrize("worse", [1.0, 3.0])
+def test_an_instrument_that_states_nothing_may_read_one_axis_worse(worse: float) -> None:
+    """It is seen beside the sum; where all axes are alike nothing changes."""
+    data, rng = plain_data(), np.random.default_rng(4)
+    data = replace(data, stated=False)
+    axis = np.arange(data.r.shape[1]) % data.blocks.size
+    sigma = np.sqrt(np.diagonal(data.covariance, axis1=1, axis2=2)) * np.where(
+        axis == 0, worse, 1.0
+    )
+    columns = rng.normal(size=(*data.r.shape, 1)) * sigma[..., None]
+    r = sigma * rng.normal(size=data.r.shape) + 10 * columns[..., 0]
+    found = fit_sum(replace(data, r=r), [fellow(0, columns)], QUIET, refit_noise=False)
+    own = with_own_axes(found)
+    if worse == 1.0:
+        assert own is found
+    else:
+        variance = np.diagonal(own.sums.data.covariance, axis1=1, axis2=2)[0]
+        ratio = np.sqrt(variance[axis == 0].mean() / variance[axis == 1].mean())
+        assert ratio == pytest.approx(worse, rel=0.25)
+        assert own.score > found.score + 5.0
+
+
+def test_what_is_hidden_pays_for_being_there() -> None:
+    """Of two causes that are alike, the one in the sum does not lose what it does to the other
+    because this one hides."""
+    data, rng = plain_data(), np.random.default_rng(5)
+    one, other = rng.normal(size=(2, *data.r.shape, 1))
+    h = possible(*campaign(n=20))[0][0]
+    mine, twin = (
+        replace(fellow(k, c), hypothesis=h) for k, c in enumerate((one, one + 0.3 * other))
+    )
+    r = rng.normal(size=data.r.shape) + 10 * one[..., 0]
+    found = fit_sum(replace(data, r=r), [mine], QUIET, refit_noise=False)
+    extra = np.full(1, np.exp(-2 * size_of_fellows(found, twin)))
+    wide = found.data.with_columns(data.masked(twin.columns), extra)
+    w = drawn(found, (twin,), Weighted.of(wide, found.noise), wide.precision, 200, rng)
+    assert np.median(w[-2]) == pytest.approx(10.0, rel=0.05)
+    assert (w[-1] == 0).mean() > 0.5
 
 
 @pytest.fixture(scope="module")

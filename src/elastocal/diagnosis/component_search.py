@@ -534,8 +534,8 @@ def _swapped(
         rival, c = known[pair[1]], found.components[k]
         alike = [o for o in found.components if o.effect.name == c.effect.name]
         instead = [[c], alike] if len(alike) > 1 and rival.effect.name == c.effect.name else [[c]]
-        others = (exchanged(found, gone, [rival], refit_noise=False) for gone in instead)
-        other = max(others, key=lambda fit: fit.score)
+        fits = (exchanged(found, gone, [rival], refit_noise=False) for gone in instead)
+        other = max(fits, key=lambda fit: fit.score)
         if other.score > found.score:
             found, swapped = other, True
     return _refitted(found) if swapped else found
@@ -639,9 +639,9 @@ def with_own_axes(found: FittedSum) -> FittedSum:
     used, axis = ~data.left_out, np.arange(data.r.shape[1]) % data.blocks.size
     own = [used & (axis == i) for i in range(size)]
     cost = (size - 1) * float(np.log(AXES / np.sqrt(0.5 / own[0].sum())))
-    V = data.covariance
+    at = project(found.data, found.noise)
+    equal, V = at.marginal, data.covariance
     for _ in range(AXIS_STEPS):
-        at = project(replace(found.data, covariance=V), found.noise)
         left = np.diagonal(at.P, axis1=1, axis2=2)
         ratio = np.array([(at.u[k] ** 2).sum() / left[k].sum() for k in own])
         ratio /= np.exp(np.log(ratio).mean())
@@ -650,9 +650,11 @@ def with_own_axes(found: FittedSum) -> FittedSum:
         each = np.ones(len(axis))
         each[axis < size] = np.sqrt(ratio)[axis[axis < size]]
         V = V * each[:, None] * each
+        at = project(replace(found.data, covariance=V), found.noise)
+    if at.marginal < equal + cost:
+        return found
     other = replace(data, covariance=V)
-    fitted = fit_sum(other, found.components, found.noise, found.sizes)
-    return fitted if fitted.score > found.score + cost else found
+    return fit_sum(other, found.components, found.noise, found.sizes)
 
 
 AXES = 0.5  # spread of the logarithms of an instrument's noise along its axes
