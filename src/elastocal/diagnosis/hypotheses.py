@@ -57,7 +57,7 @@ RECORD = {
         "[model] link_gravity = true",
     ),
     "station": (
-        "the instrument would stand among the markers: the readings are not in its own frame",
+        "the instrument would stand where the arm reaches: the readings are not in its own frame",
         "state where it stands, [tracker] position_m",
     ),
     "torque": ("the table has no torque columns", "record torque_1_Nm … of every joint"),
@@ -191,10 +191,11 @@ def recorded(table: Measurements, need: str) -> bool:
 
 
 def among(points: Array) -> bool:
-    """Whether the origin lies within the convex hull of points (n, 2): then no angle of half a
-    turn, as seen from there, is free of them."""
-    seen = np.sort(np.arctan2(points[:, 1], points[:, 0]))
-    return bool(np.diff(seen, append=seen[0] + 2 * np.pi).max() < np.pi)
+    """Whether the origin is nearer to the middle of points (n, 2) than the farthest of these: who
+    stands there stands where the arm reaches."""
+    middle = points.mean(axis=0)
+    farthest = np.linalg.norm(points - middle, axis=1).max()
+    return bool(np.linalg.norm(middle) < farthest)
 
 
 # What the table records decides how some effects are driven.
