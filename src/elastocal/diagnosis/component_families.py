@@ -17,6 +17,7 @@ from elastocal.diagnosis.hypotheses import Hypothesis, RegressorDirection, cell_
 from elastocal.diagnosis.noise_floor import NoiseValues, project
 from elastocal.diagnosis.unknown import Generic
 from elastocal.model.effects.base import Effect, Stage, index, turning_joints
+from elastocal.model.effects.compliances import LoadedEffect
 from elastocal.model.effects.driven import DrivenEffect
 from elastocal.model.effects.gears import MOST_LINES, GearRipple, GearSpectrum
 from elastocal.model.effects.smooth import JointCurve, ResidualField
@@ -42,7 +43,7 @@ def family_of(effect: Effect, cell: Cell) -> Family:
     for need, family in OF_NEED.items():
         if need in needed:
             return family
-    if effect.stage == "transmission" and "load" in needed:
+    if effect.stage == "transmission" and isinstance(effect, LoadedEffect):
         return "torque"
     return OF_STAGE[effect.stage]
 
