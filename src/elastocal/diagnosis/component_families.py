@@ -19,6 +19,7 @@ from elastocal.diagnosis.noise_floor import NoiseValues, project
 from elastocal.diagnosis.unknown import Generic
 from elastocal.measurements import Measurements
 from elastocal.model.effects.base import Effect, Stage, index, turning_joints
+from elastocal.model.effects.compliances import LoadedEffect
 from elastocal.model.effects.driven import DrivenEffect
 from elastocal.model.effects.gears import MOST_LINES, GearRipple, GearSpectrum
 from elastocal.model.effects.smooth import JointCurve, ResidualField
@@ -44,7 +45,7 @@ def family_of(effect: Effect, cell: Cell) -> Family:
     for need, family in OF_NEED.items():
         if need in needed:
             return family
-    if effect.stage == "transmission" and "load" in needed:
+    if effect.stage == "transmission" and isinstance(effect, LoadedEffect):
         return "torque"
     return OF_STAGE[effect.stage]
 
