@@ -16,8 +16,6 @@ from elastocal.diagnosis.component_families import (
     drifts,
     family_component,
     line_families,
-    lines_component,
-    lines_of,
     sharpened,
     shorter,
     with_multiples,
@@ -30,7 +28,6 @@ from elastocal.diagnosis.component_search import (
     with_expected_families,
     with_likelier_orders,
     with_own_axes,
-    with_possible_orders,
     with_shorter_drifts,
 )
 from elastocal.diagnosis.components import (
@@ -250,38 +247,6 @@ def test_half_an_order_or_twice_it_is_put_right(
     assert dict(c.settings)["order_1"] == pytest.approx(LINED["joint3"], abs=0.1)
     assert len(c.settings) // 2 == 2
     assert better.score > found.score
-
-
-def test_lines_that_may_be_there_have_their_probability_of_the_prior(
-    lined: tuple[DiagnosisData, dict[str, Component]],
-) -> None:
-    """Of all orders of a joint together, here one and its double; what is certain stays alone."""
-    dataset, families = lined
-    flat = families["joint5"].columns.reshape(dataset.data.r.size, -1)
-    r = dataset.data.r.ravel()
-    weaker = (r - 0.6 * flat @ np.linalg.lstsq(flat, r)[0]).reshape(dataset.data.r.shape)
-    dataset = dataset.changed(data=replace(dataset.data, r=weaker))
-    some = [c for w, c in families.items() if w != "joint5"]
-    found = fit_sum(dataset.data, some, QUIET6, refit_noise=False)
-    wider = with_possible_orders(dataset, found)
-    lines = {c.where: lines_of(c) for c in wider.components}
-    assert set(lines) == set(LINED) and all(c.given for c in wider.components)
-    for where, c in families.items():
-        if where != "joint5":
-            assert lines[where][0].share == 1.0
-            assert {round(line.order / lines_of(c)[0].order) for line in lines[where]} <= {1, 2, 3}
-    (h,) = (h for h in ripples(dataset) if h.where == "joint5")
-    orders = order_posterior(dataset, found, h)
-    lowest = [line for line in lines["joint5"] if 2 * line.sd < 0.12]
-    assert [line.share for line in lowest] == [
-        pytest.approx(orders.probability(line.order), abs=0.006) for line in lowest
-    ]
-    assert len(lowest) == 2 and sum(line.share for line in lowest) == pytest.approx(1, abs=0.05)
-    (c,) = (c for c in wider.components if c.where == "joint5")
-    whole = lines_component(dataset, "joint5", [x._replace(share=1.0) for x in lines_of(c)], 0.0)
-    shares = np.repeat([line.share for line in lines_of(c)], 4)
-    np.testing.assert_allclose(c.columns, whole.columns * np.sqrt(shares), rtol=1e-9)
-    assert with_possible_orders(dataset, fit_sum(dataset.data, [], QUIET6)).components == ()
 
 
 def test_a_next_line_is_as_probable_as_other_joints_have_it() -> None:

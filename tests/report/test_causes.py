@@ -199,7 +199,6 @@ def test_orders_of_a_spectrum_have_their_uncertainty_and_do_not_drown_the_rest()
     assert text.startswith("spectrum size 0.0500 mrad, orders 18.519 ± 0.024, 37.04 ± 0.05, ")
     assert text.endswith("and 2 more") and "centre" not in text
     assert settings_text({"order_1": 2.0}) == "order 2.000"
-    assert settings_text({"order_1": 2.0, "order_share_1": 0.41}) == "order 2.000 (41 %)"
 
 
 def test_a_written_cell_is_told_in_short_where_much_was_added():

@@ -13,7 +13,6 @@ import numpy as np
 from scipy import linalg
 from scipy.special import expit, softmax
 
-from elastocal.diagnosis.component_families import lines_of
 from elastocal.diagnosis.component_search import Rivals, exchanged, size_of_fellows
 from elastocal.diagnosis.components import (
     Component,
@@ -503,9 +502,13 @@ class SumAnswer:
             settings["spectrum_size_rad"] = math.sqrt(float(np.mean(each))) * found[0].unit
             q = self.dataset.table.q[:, index(found[0].where)]
             settings["spectrum_centre_rad"] = float((q.max() + q.min()) / 2)
-            lines = sorted(line for k in families for line in lines_of(self.found.components[k]))
-            for n, line in enumerate(lines, start=1):
-                settings |= line.settings(n)
+            given = [dict(self.found.components[k].settings) for k in families]
+            lines = sorted(
+                (one[f"order_{n}"], one[f"order_sd_{n}"])
+                for one in given for n in range(1, len(one) // 2 + 1)
+            )  # fmt: skip
+            for n, (order, sd) in enumerate(lines, start=1):
+                settings |= {f"order_{n}": order, f"order_sd_{n}": sd}
         return settings
 
     def _parameter_sizes(self, k: int) -> Iterator[tuple[str, float]]:

@@ -6,7 +6,6 @@ import math
 from collections import Counter
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, replace
-from typing import NamedTuple
 
 import numpy as np
 
@@ -382,49 +381,18 @@ def family_evidence(
 
 
 def family_component(dataset: DiagnosisData, family: LineFamily) -> Component:
-    lines = [Line(k * family.order, k * family.sd) for k in range(1, family.multiples + 1)]
-    return lines_component(dataset, family.where, lines, family.search)
-
-
-class Line(NamedTuple):
-    """An order of a joint's error with its standard deviation, and the `share` of the prior
-    variance of a line that it has: the probability that it is there."""
-
-    order: float
-    sd: float
-    share: float = 1.0
-
-    def settings(self, k: int) -> dict[str, float]:
-        """Those of the k-th line of a `GearSpectrum`."""
-        own = {f"order_{k}": self.order, f"order_sd_{k}": self.sd}
-        return own | ({f"order_share_{k}": self.share} if self.share < 1 else {})
-
-
-def lines_of(c: Component) -> list[Line]:
-    """The lines of a joint that a component stands for."""
-    given = dict(c.settings)
-    return [
-        Line(given[f"order_{k}"], given[f"order_sd_{k}"], given.get(f"order_share_{k}", 1.0))
-        for k in range(1, c.width // 4 + 1)
-    ]
-
-
-def lines_component(
-    dataset: DiagnosisData, where: str, lines: Sequence[Line], search: float
-) -> Component:
-    """Lines of one joint, of one size."""
-    effect = GearSpectrum()
+    effect, where = GearSpectrum(), family.where
     q = dataset.table.q[:, index(where)]
     settings = {"spectrum_size_rad": 1.0, "spectrum_centre_rad": float((q.max() + q.min()) / 2)}
-    for k, line in enumerate(lines, start=1):
-        settings |= line.settings(k)
+    for k in range(1, family.multiples + 1):
+        settings |= {f"order_{k}": k * family.order, f"order_sd_{k}": k * family.sd}
     cell = cell_with(dataset.base.model.cell, where, settings)
     parameters = effect.parameters(where, dataset.base.model.chain, cell)
     typical = [p.typical or 0.0 for p in parameters]
     columns = driven_columns(dataset, effect, where, settings) * np.array(typical) * LINE
     kept = tuple((key, v) for key, v in settings.items() if key.startswith("order"))
     return Component(
-        "angle", effect, where, columns, LINE, settings=kept, search=search,
+        "angle", effect, where, columns, LINE, settings=kept, search=family.search,
         fellows=len(turning_joints(dataset.base.model.chain)),
     )  # fmt: skip
 

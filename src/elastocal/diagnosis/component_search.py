@@ -19,8 +19,6 @@ from elastocal.diagnosis.component_families import (
     fields,
     joint_curves,
     line_families,
-    lines_component,
-    lines_of,
     sharpened,
     shorter,
     sought_anew,
@@ -116,7 +114,7 @@ def search_components(
     found = completed(with_shorter_drifts(full, _spared(found)), both)
     if len(full.blocks.member) <= FEW_POSES:
         found = with_expected_families(full, found)
-        found = with_possible_orders(full, with_likelier_orders(full, found))
+        found = with_likelier_orders(full, found)
     return full, found, hidden_fellows(found, others)
 
 
@@ -292,31 +290,6 @@ def with_likelier_orders(dataset: DiagnosisData, found: FittedSum) -> FittedSum:
     return found if found is begun else _tuned(dataset, _refitted(found))
 
 
-def with_possible_orders(dataset: DiagnosisData, found: FittedSum) -> FittedSum:
-    """The sum with every line that a joint may have, of any order, in the place of its most
-    probable family; each has its probability's share of the prior variance.
-
-    An average over all orders errs less at new poses than the best of them.  Last of all, and
-    nothing else goes by it: what has been found was judged beside families of one order each.
-    """
-    gone, more, noise = [], [], found.noise
-    lined = {family.where for family in families_of(found)}
-    for h in ripples(dataset) if lined else ():
-        at_joint = (c for c in found.components if c.where == h.where)
-        own = [c for c in at_joint if isinstance(c.effect, GearSpectrum)]
-        if len(own) > 1 or lined <= {h.where}:
-            continue
-        orders = order_posterior(dataset, found, h, own)
-        known = [line for c in own for line in lines_of(c)]
-        if orders.any > 0 and (lines := orders.possible(known)):
-            search = own[0].search if own else 0.0
-            more.append(replace(lines_component(dataset, h.where, lines, search), given=True))
-            gone += own
-            noise = with_scatter(noise, index(h.where), orders.scatter)
-    at = replace(found, noise=noise)
-    return exchanged(at, gone, more, all_stay=True) if more else found
-
-
 def hidden_fellows(found: FittedSum, components: Sequence[Component]) -> tuple[Component, ...]:
     """Causes of kinds that are in the sum, at places where they are not, which may be there all
     the same, or in the place of those that are.
@@ -378,7 +351,7 @@ def _refitted(found: FittedSum) -> FittedSum:
 
 def exchanged(
     found: FittedSum, gone: Sequence[Component], more: Sequence[Component] = (),
-    refit_noise: bool = True, all_stay: bool = False,
+    refit_noise: bool = True,
 ) -> FittedSum:  # fmt: skip
     """The sum with `more` components in the place of those `gone`, fitted from where it is."""
     kept = [k for k, c in enumerate(found.components) if not any(c is other for other in gone)]
@@ -386,9 +359,7 @@ def exchanged(
     for component in more:
         start = start.and_one(component)
     components = [*(found.components[k] for k in kept), *more]
-    return fit_sum(
-        found.sums.data, components, found.noise, start, refit_noise, found.sums, all_stay
-    )
+    return fit_sum(found.sums.data, components, found.noise, start, refit_noise, found.sums)
 
 
 GAINED = 0.5  # nats that a search must bring for another one

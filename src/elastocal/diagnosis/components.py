@@ -490,10 +490,8 @@ SOME = 400  # configurations, at most, from which the noise is estimated
 def fit_sum(
     data: NoisyData, components: Sequence[Component], noise: NoiseValues,
     start: Sizes | None = None, refit_noise: bool = True, known: SumOfComponents | None = None,
-    all_stay: bool = False,
 ) -> FittedSum:  # fmt: skip
-    """Maximise over all sizes; leave out, one after the other, what does not earn its cost, unless
-    `all_stay`.
+    """Maximise over all sizes; leave out, one after the other, what does not earn its cost.
 
     `known` are the sums of a fit to the same data, which are not summed anew."""
     components, at = list(components), start or Sizes.start(components)
@@ -503,7 +501,7 @@ def fit_sum(
         for _ in range(ROUNDS * 4):
             at = problem.climbed(at, STEPS)
             kept = _kept(problem, at, strict=last == rounds - 1)
-            if all_stay or len(kept) == len(components):
+            if len(kept) == len(components):
                 break
             components, at = [components[k] for k in kept], at.chosen(kept)
             problem = problem.only(kept)

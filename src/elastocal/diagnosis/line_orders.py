@@ -31,7 +31,6 @@ from elastocal.diagnosis.component_families import (
     LOWEST,
     MOVED,
     MULTIPLES,
-    Line,
     LineFamily,
     beside,
     family_component,
@@ -56,8 +55,6 @@ STEP, SAME = 0.5, math.pi
 SIZES = 7  # of a family, equally probable
 PEAKS = 40  # points of the grid that may be the middle of the most probable order
 CERTAIN = 1 - 1e-9
-# Orders of a joint that are reckoned with, those of CHANCE or more.
-MOST_ORDERS, CHANCE = 4, 0.05
 # Logarithms: the middle of the orders and their spread, if any is as probable as any.
 USUAL_ORDER = math.log(LOWEST * HIGHEST) / 2
 ORDERS = math.log(HIGHEST / LOWEST) / math.sqrt(12)
@@ -113,12 +110,7 @@ class OrderPosterior:
 
     def probability(self, order: float) -> float:
         """Of a family at this order, beside all others and none."""
-        return math.exp(self.odds_near(order) - np.logaddexp(0.0, self.any))
-
-    @cached_property
-    def any(self) -> float:
-        """Log odds of any family against none."""
-        return float(logsumexp(self.log_odds))
+        return math.exp(self.odds_near(order) - np.logaddexp(0.0, logsumexp(self.log_odds)))
 
     def family(self, dataset: DiagnosisData, order: float, m: int) -> Component:
         """The family of m lines near this order, where it fits best.
@@ -127,38 +119,14 @@ class OrderPosterior:
         there is any family, its odds against none and all other orders; what is decided here is
         not asked again.
         """
-        lowest, sd = self._refined(order, m)
+        k = self._peak(order, m)
+        width = STEP / SAME * self.resolution / m
+        at = float(self.orders[k])
+        lowest, sd, _ = refined_order(self.grams, self.h, at, m, width, self.scales)
         own = float(logit(min(self.probability(order), CERTAIN)))
-        search = max(float(self.evidence[self._peak(order, m)]) + self.presence - own, 0.0)
+        search = max(float(self.evidence[k]) + self.presence - own, 0.0)
         family = LineFamily(self.h.where, lowest, m, own, sd, search)
         return replace(family_component(dataset, family), given=True)
-
-    def _refined(self, order: float, m: int) -> tuple[float, float]:
-        """Where near this order a family of m lines fits best, and how well that is known."""
-        at, width = float(self.orders[self._peak(order, m)]), STEP / SAME * self.resolution / m
-        return refined_order(self.grams, self.h, at, m, width, self.scales)[:2]
-
-    def possible(self, known: Sequence[Line] = ()) -> list[Line]:
-        """Every line that there may be, with its probability; those of a family that is `known`
-        where they are."""
-        lines, left = list[Line](), self
-        all_ = np.logaddexp(0.0, self.any)
-        for _ in range(MOST_ORDERS):
-            order, m = left.best
-            each = [math.exp(left.odds_near(order, n) - all_) for n in MULTIPLES]
-            # Two digits are enough, and what is all but certain is certain.
-            shares = [round(sum(each[k:]), 2) for k in range(len(each))]
-            if shares[0] < CHANCE:
-                break
-            own = [line for line in known[:1] if abs(line.order - order) <= left.resolution]
-            lowest, sd = own[0][:2] if own else left._refined(order, m)
-            lines += [
-                Line(n * lowest, n * sd, share) for n, share in zip(MULTIPLES, shares, strict=True)
-                if share >= CHANCE and n * lowest <= HIGHEST
-            ]  # fmt: skip
-            near = np.abs(left.orders - order) <= left.resolution
-            left = replace(left, log_odds=np.where(near, -np.inf, left.log_odds))
-        return lines
 
 
 def order_posterior(

@@ -177,23 +177,19 @@ def settings_text(settings: Mapping[str, float]) -> str:
     return ", ".join([*texts, *_orders(settings)])
 
 
-# Of a spectrum: an order, how uncertain it is, and with what probability it is there.
-LINE = re.compile(r"order_(sd_|share_)?[0-9]+")
+LINE = re.compile(r"order_(sd_)?[0-9]+")  # of a spectrum: an order and how uncertain it is
 REFERENCE = "_centre_rad"  # where phases count from says nothing
 MOST_ORDERS = 6
 
 
 def _orders(settings: Mapping[str, float]) -> list[str]:
-    """ "orders 1.000 ± 0.002, 18.52 ± 0.03 (41 %) and 4 more", with 95 % half widths, and the
-    probability of a line that may be there."""
+    """ "orders 1.000 ± 0.002, 18.52 ± 0.03 and 4 more", with 95 % half widths."""
     told = []
     orders = [key for key in settings if (known := LINE.fullmatch(key)) and not known[1]]
     for key in orders[:MOST_ORDERS]:
         sd = settings.get(key.replace("_", "_sd_"), 0.0)
         value, half = with_uncertainty(settings[key], 1.96 * sd)
-        line = f"{value} ± {half}" if sd > 0 else significant(settings[key], 4)
-        share = settings.get(key.replace("_", "_share_"), 1.0)
-        told.append(line if share == 1 else f"{line} ({percent(share)})")
+        told.append(f"{value} ± {half}" if sd > 0 else significant(settings[key], 4))
     if more := len(orders) - len(told):
         told.append(f"{more} more")
     return [f"order{'s' * (len(orders) > 1)} {together(told)}"] if told else []

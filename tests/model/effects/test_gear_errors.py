@@ -134,13 +134,6 @@ def test_a_multiple_of_a_line_is_smaller_beforehand() -> None:
     assert [p.typical for p in m.parameters][::2] == pytest.approx([6e-5, 6e-5, 3e-5, 2e-5])
 
 
-def test_a_line_that_may_be_there_is_smaller_beforehand() -> None:
-    lines = {"order_1": 17.4, "order_sd_1": 0.1, "order_share_1": 0.25, "order_2": 22.0}
-    m = model(stick("z"), "gear_spectrum", settings={"joint1": lines})
-    sizes = [2.5e-5, 2.5e-5, 2.5e-6, 2.5e-6, 5e-5, 5e-5]
-    assert [p.typical for p in m.parameters] == pytest.approx(sizes)
-
-
 def test_beside_a_line_stands_its_derivative_by_the_order() -> None:
     """A line of an order a little off, turned about the middle of the angles, is their sum."""
     m = model(stick("z"), "gear_spectrum", settings={"joint1": LINES})

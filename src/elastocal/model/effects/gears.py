@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import math
 from collections.abc import Sequence
 from typing import ClassVar
 
@@ -147,9 +146,6 @@ class GearSpectrum(DrivenEffect):
     N_k beside its line, (q − q₀)(c_k cos N_k q − d_k sin N_k q) with c_k = a_k δN_k and
     d_k = b_k δN_k of that prior size times `order_sd_k`; q₀ = `spectrum_centre_rad` is the middle
     of the angles that the order was estimated from.
-
-    A line that is there with the probability `order_share_k` alone, one of several orders that are
-    possible, has that share of the prior variance: what it has on average.
     """
 
     name = "gear_spectrum"
@@ -166,13 +162,11 @@ class GearSpectrum(DrivenEffect):
         lines = max((k for k in known if f"order_{k}" in stated), default=1)
         orders = (Setting(f"order_{k}", "order", 0.0, 0.0, 1000.0) for k in known[:lines])
         spreads = (Setting(f"order_sd_{k}", "range", 0.0, 0.0, 10.0) for k in known[:lines])
-        shares = (Setting(f"order_share_{k}", "range", 1.0, 1e-6, 1.0) for k in known[:lines])
         return (
             Setting("spectrum_size_rad", "range", 5e-5, 1e-12, 1.0),
             Setting("spectrum_centre_rad", "range", 0.0, -100.0, 100.0),
             *orders,
             *spreads,
-            *shares,
         )
 
     def lines(self, place: str, chain: Chain, cell: Cell) -> dict[int, tuple[float, float]]:
@@ -185,11 +179,10 @@ class GearSpectrum(DrivenEffect):
         }  # fmt: skip
 
     def parameters(self, place: str, chain: Chain, cell: Cell) -> tuple[ParameterSpec, ...]:
-        stated = self.stated(place, chain, cell)
+        whole = self.stated(place, chain, cell)[self.sized_by]
         lines, specs = self.lines(place, chain, cell), []
         for k, (order, sd) in lines.items():
-            size = stated[self.sized_by] * math.sqrt(stated[f"order_share_{k}"])
-            size /= _multiple_of([other for other, _ in lines.values()], order)
+            size = whole / _multiple_of([other for other, _ in lines.values()], order)
             parts = [("sin", size), ("cos", size)]
             parts += [("sin_shift", size * sd), ("cos_shift", size * sd)] if sd > 0 else []
             specs += [
