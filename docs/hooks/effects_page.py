@@ -28,6 +28,7 @@ COLUMNS = {
     "temperature": "`temperature_C`",
     "load": "`force_x_N …`",
     "torque": "`torque_1_Nm …`",
+    "station": "a tracker outside the arm's reach, or `[tracker] position_m`",
 }
 OBSERVED = ("position", "deflection", "pose", "distance")
 # Order of size where the parameters' own size is known only from the cell.

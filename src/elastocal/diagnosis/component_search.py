@@ -528,6 +528,9 @@ def completed(found: FittedSum, components: Sequence[Component]) -> FittedSum:
         taken = {id(c) for c in found.components}
         away = {n: [c for c in own if id(c) not in taken] for n, own in kinds.items()}
         shown = _kinds_that_show(found, away)
+        if len(found.sums.data.r) > FEW_POSES:
+            # What shows beside so many poses shows by itself, and each fit takes its time.
+            away = {name: more for name, more in away.items() if name in shown}
         better, wider = None, {}
         for name, more in away.items():
             for instead in (None, *(n for n in kinds if n != name and present[n])):
@@ -560,14 +563,19 @@ OF_JOINTS = ("angle", "move")
 
 
 def _kinds_that_show(found: FittedSum, away: Mapping[str, list[Component]]) -> set[str]:
-    """Kinds that are in the sum at other places, or whose evidence at all of these together is more
-    than what their being there costs."""
+    """Kinds whose evidence at all of these places together is more than what their being there
+    costs, and with few poses those that are in the sum at others."""
     every = [c for own in away.values() for c in own]
     each = dict(zip(map(id, every), evidence_beside(found, every), strict=True))
-    shown = {c.effect.name for c in found.components}
+    present = Counter(c.effect.name for c in found.components)
+    shown = set() if len(found.sums.data.r) > FEW_POSES else set(present)
     for name, own in away.items():
         gains = [each[id(c)] for c in own if each[id(c)] > 0]
-        if gains and sum(gains) > presence_cost(own[0].fellows, len(gains)):
+        if not gains:
+            continue
+        n, more = own[0].fellows, len(gains)
+        k = max(min(present[name], n - more), 0)
+        if sum(gains) > presence_cost(n, k + more) - presence_cost(n, k):
             shown.add(name)
     return shown
 
@@ -610,7 +618,8 @@ def with_own_axes(found: FittedSum) -> FittedSum:
     used, axis = ~data.left_out, np.arange(data.r.shape[1]) % data.blocks.size
     own = [used & (axis == i) for i in range(size)]
     cost = (size - 1) * float(np.log(AXES / np.sqrt(0.5 / own[0].sum())))
-    at = project(found.data, found.noise)
+    wide = found.without_these()
+    at = project(wide, found.noise)
     equal, V = at.marginal, data.covariance
     for _ in range(AXIS_STEPS):
         left = np.diagonal(at.P, axis1=1, axis2=2)
@@ -621,7 +630,7 @@ def with_own_axes(found: FittedSum) -> FittedSum:
         each = np.ones(len(axis))
         each[axis < size] = np.sqrt(ratio)[axis[axis < size]]
         V = V * each[:, None] * each
-        at = project(replace(found.data, covariance=V), found.noise)
+        at = project(replace(wide, covariance=V), found.noise)
     if at.marginal < equal + cost:
         return found
     other = replace(data, covariance=V)

@@ -484,7 +484,7 @@ class FittedSum:
 
 STEPS, ROUNDS = 30, 12
 MOST_AT_ONCE = 0.5  # nats: components that earn less go together
-SOME = 400  # configurations, at most, from which the noise is estimated
+SOME = 400  # configurations, or up to twice as many, from which the noise is estimated
 
 
 def fit_sum(
@@ -553,7 +553,7 @@ def _noise_beside(
     data: NoisyData, components: Sequence[Component], at: Sizes, noise: NoiseValues
 ) -> NoiseValues:
     """The most probable noise beside the components at their sizes, from SOME configurations."""
-    some = data.every(step) if (step := -(-len(data.r) // SOME)) > 1 else data
+    some = data.every(step) if (step := max(1, len(data.r) // SOME)) > 1 else data
     root = Weighted.of(some, noise).root
     columns = [
         _compressed(some.masked(c.columns[::step]), np.exp(2 * s) * c.shares(length)[0], root)
