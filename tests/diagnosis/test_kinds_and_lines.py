@@ -85,7 +85,11 @@ def test_a_cost_is_that_of_leaving_one_out() -> None:
     assert log_odds(some, fellow(4, columns)) > log_odds([], fellow(4, columns))
 
 
-def test_many_of_a_kind_come_in_together_where_none_would_alone() -> None:
+@pytest.mark.parametrize("few_poses", [300, 0])
+def test_many_of_a_kind_come_in_together_where_none_would_alone(
+    few_poses: int, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr("elastocal.diagnosis.component_search.FEW_POSES", few_poses)
     data, rng = plain_data(), np.random.default_rng(3)
     p = data.X.shape[2]
     # Six directions at right angles to each other and to the fitted columns; noise in all others.

@@ -523,21 +523,22 @@ def completed(found: FittedSum, components: Sequence[Component]) -> FittedSum:
     for c in components:
         if c.fellows > 1 and (not c.settings or isinstance(c.effect, JointCurve)):
             kinds.setdefault(c.effect.name, []).append(c)
+    # What shows beside many poses shows by itself, and each fit takes its time.
+    many = len(found.sums.data.r) > FEW_POSES
     for _ in range(COMPLETED):
         present = Counter(c.effect.name for c in found.components)
         taken = {id(c) for c in found.components}
         away = {n: [c for c in own if id(c) not in taken] for n, own in kinds.items()}
         shown = _kinds_that_show(found, away)
-        if len(found.sums.data.r) > FEW_POSES:
-            # What shows beside so many poses shows by itself, and each fit takes its time.
-            away = {name: more for name, more in away.items() if name in shown}
+        if many:
+            away = {n: more for n, more in away.items() if n in shown or present[n]}
         better, wider = None, {}
         for name, more in away.items():
             for instead in (None, *(n for n in kinds if n != name and present[n])):
                 gone = [c for c in found.components if c.effect.name == instead]
                 alike = {c.family for c in gone} & {c.family for c in more}
-                alone = instead is None and name not in shown
-                if not more or alone or (gone and not alike) or any(c.given for c in gone):
+                hopeless = (many or instead is None) and name not in shown
+                if not more or hopeless or (gone and not alike) or any(c.given for c in gone):
                     continue
                 fitted = exchanged(found, gone, more, refit_noise=False)
                 if instead is None:
