@@ -53,18 +53,10 @@ def driven_columns(
     dataset: DiagnosisData, effect: DrivenEffect, where: str, settings: dict[str, float]
 ) -> Array:
     """Packed columns (C, m, k) of a driven effect at these settings, per parameter."""
-    h, direction = _direction(dataset, effect, where, settings)
-    D = direction(dataset.table, np.zeros((1, 0)))[:, 0]
-    return dataset.pack(dataset.columns.entry(h.entry_key(dataset.base.model)) @ D)
-
-
-def _direction(
-    dataset: DiagnosisData, effect: DrivenEffect, where: str, settings: dict[str, float]
-) -> tuple[Hypothesis, RegressorDirection]:
-    """A driven effect as a hypothesis that searches nothing, and its direction."""
     chain, cell = dataset.base.model.chain, cell_with(dataset.base.model.cell, where, settings)
     h = Hypothesis(effect, where, effect.parameters(where, chain, cell), ())
-    return h, RegressorDirection(h, chain, cell)
+    D = RegressorDirection(h, chain, cell)(dataset.table, np.zeros((1, 0)))[:, 0]
+    return dataset.pack(dataset.columns.entry(h.entry_key(dataset.base.model)) @ D)
 
 
 # What is tried from the start: a curve of every joint, and every effect that needs no search.

@@ -523,14 +523,16 @@ def completed(found: FittedSum, components: Sequence[Component]) -> FittedSum:
     for c in components:
         if c.fellows > 1 and (not c.settings or isinstance(c.effect, JointCurve)):
             kinds.setdefault(c.effect.name, []).append(c)
-    # What shows beside many poses shows by itself, and each fit takes its time.
+    # Each fit to many poses takes its time: what is tried there shows, or is there at other places.
     many = len(found.sums.data.r) > FEW_POSES
     for _ in range(COMPLETED):
         present = Counter(c.effect.name for c in found.components)
         taken = {id(c) for c in found.components}
         away = {n: [c for c in own if id(c) not in taken] for n, own in kinds.items()}
-        shown = _kinds_that_show(found, away)
-        if many:
+        shown = _kinds_that_show(found, away, present)
+        if not many:
+            shown |= set(present)
+        else:
             away = {n: more for n, more in away.items() if n in shown or present[n]}
         better, wider = None, {}
         for name, more in away.items():
@@ -563,13 +565,14 @@ COMPLETED = 3
 OF_JOINTS = ("angle", "move")
 
 
-def _kinds_that_show(found: FittedSum, away: Mapping[str, list[Component]]) -> set[str]:
+def _kinds_that_show(
+    found: FittedSum, away: Mapping[str, list[Component]], present: Mapping[str, int]
+) -> set[str]:
     """Kinds whose evidence at all of these places together is more than what their being there
-    costs, and with few poses those that are in the sum at others."""
+    costs, beside those that are `present`."""
     every = [c for own in away.values() for c in own]
     each = dict(zip(map(id, every), evidence_beside(found, every), strict=True))
-    present = Counter(c.effect.name for c in found.components)
-    shown = set() if len(found.sums.data.r) > FEW_POSES else set(present)
+    shown = set()
     for name, own in away.items():
         gains = [each[id(c)] for c in own if each[id(c)] > 0]
         if not gains:

@@ -185,7 +185,7 @@ MOST_ORDERS = 6
 def _orders(settings: Mapping[str, float]) -> list[str]:
     """ "orders 1.000 ± 0.002, 18.52 ± 0.03 and 4 more", with 95 % half widths."""
     told = []
-    orders = [key for key in settings if (known := LINE.fullmatch(key)) and not known[1]]
+    orders = [key for key in settings if (line := LINE.fullmatch(key)) and not line[1]]
     for key in orders[:MOST_ORDERS]:
         sd = settings.get(key.replace("_", "_sd_"), 0.0)
         value, half = with_uncertainty(settings[key], 1.96 * sd)
