@@ -21,7 +21,7 @@ import campaigns
 import numpy as np
 from scipy import stats
 
-from elastocal.identification import held_out_residual, noise_choice, reduce
+from elastocal.identification import held_out_residual, reduce
 from elastocal.identification.noise_choice import (
     NoiseFit,
     estimate_noise,
@@ -36,7 +36,6 @@ from elastocal.model import observe
 MODEL = campaigns.arm()
 COORDINATES = 100  # at new poses
 WALK = 60e-6  # m in each direction, from the first reading to the last
-EVERY = noise_choice.LASTING
 
 
 def main(arms: int, draws: int, lasting: str = "0.2") -> None:
@@ -63,9 +62,8 @@ def main(arms: int, draws: int, lasting: str = "0.2") -> None:
             e = root @ rng.normal(size=len(root))
             oracle = np.linalg.lstsq(known, np.linalg.solve(root, e), rcond=None)[0]
             one = replace(readings, e=e.reshape(readings.e.shape))
-            noise_choice.LASTING = (campaigns.LASTING,)
-            of_truth = estimate_noise(one, "independent+time")
-            noise_choice.LASTING = EVERY
+            stated = replace(readings.visits, lasting=(campaigns.LASTING,))
+            of_truth = estimate_noise(replace(one, visits=stated), "independent+time")
             likeliest = estimate_noise(one, "independent+time")
             chosen[likeliest.lasting] += 1
             for fit in (of_truth, likeliest, over_times(likeliest, one)):

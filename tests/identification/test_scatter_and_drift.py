@@ -7,6 +7,7 @@ from support.calibration import PLACED, cell_of, random_chain, table_at, true_va
 from support.cells import random_poses
 
 from elastocal.cell.arm_description import CartesianNoise, Tracker, Unsteadiness
+from elastocal.identification import visit_record
 from elastocal.identification.findings import judged
 from elastocal.identification.identify import identify
 from elastocal.identification.visit_record import in_random_order
@@ -76,8 +77,14 @@ def test_a_drift_is_told_and_whole_blocks_are_left_out():
         assert ("random walk" in drift.remedy) != ends
 
 
-def test_how_long_a_drift_lasts_is_not_taken_for_known():
-    result = identified(drift=DRIFT)
+def test_how_long_a_drift_lasts_is_not_taken_for_known_unless_the_cell_states_it():
+    stated = identified(drift=DRIFT)
+    drift, (_, only) = stated.noise.drift, *stated.spread.among
+    assert drift is not None and drift.ends and drift.seconds == LASTING * 60 * 35
+    np.testing.assert_allclose(only, stated.spread.matrix)
+    # In an order without times no seconds can be told.
+    assert identified(drift=DRIFT, timed=False).noise.drift.share in visit_record.LASTING
+    result = identified(drift=DRIFT, stated=False)
     spread, names = result.spread, result.determined
     weights, matrices = zip(*spread.among, strict=True)
     assert len(weights) > 2 and np.isclose(sum(weights), 1)

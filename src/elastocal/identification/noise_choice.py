@@ -45,7 +45,7 @@ from elastocal.identification.reml import (
     usual_start,
 )
 from elastocal.identification.tails import rejection_point
-from elastocal.identification.visit_record import VisitRecord, visit_record
+from elastocal.identification.visit_record import LONGEST, VisitRecord, visit_record
 from elastocal.identification.weighted_problem import (
     Weights,
     block_diagonal,
@@ -112,7 +112,7 @@ class NoiseFit:
     spread: Array
     tests: tuple[NoiseTest, ...] = ()
     course: VisitRecord | None = None  # whose times those of what drifts are
-    to_longest: float = 0.0  # log-likelihood that the longest of LASTING is short of the best
+    to_longest: float = 0.0  # log-likelihood that the longest time tried is short of the best
 
     @property
     def description(self) -> str:
@@ -173,8 +173,6 @@ def estimate_noise(
 TRACE = 0.05
 MOST_TOGETHER = 300  # rows of a configuration, whose covariance is formed
 FEWEST_VISITS, SEVERAL = 8, 2
-LASTING = (0.2, 0.1, 0.4, 0.05, 0.8)  # correlation times tried, as shares of the campaign
-TESTED = 0.2  # the one of them that a drift is looked for with
 
 
 class _Choice:
@@ -274,7 +272,8 @@ class _Choice:
             return
         name = next((own for own in self._plain(first) if own != "groups"), first)
         kind = self.best[1]._replace(own=name, time=True)
-        for lasting in LASTING:
+        assert self.readings.visits is not None
+        for lasting in self.readings.visits.lasting:
             self.attempt(kind, lasting)
         if not self.best[1].time:
             return
@@ -290,7 +289,7 @@ class _Choice:
         if part == TIME:
             sets = fit.structure.sets
             assert sets.visits is not None
-            waves = sets.visits.waves(TESTED)
+            waves = sets.visits.waves(sets.visits.lasting[0])
             # Of a pose, only positions.
             columns = along_axes(waves, np.ones(min(self.readings.size, 3)))
             if self.readings.size == 6:
@@ -367,9 +366,9 @@ def _fitted(
             "no drift can be told in these readings: the model itself has what changes with time, "
             "or successive poses are near each other; visit poses in random order"
         )
-    if kind.time and lasting is None:
+    if kind.time and readings.visits is not None and lasting is None:
         if like is None or like.structure.lasting is None:
-            tried = [_fitted(readings, kind, like, each) for each in LASTING]
+            tried = [_fitted(readings, kind, like, each) for each in readings.visits.lasting]
             return max(tried, key=lambda fit: fit.log_likelihood)
         lasting = like.structure.lasting
     structure, effects = _parts(readings, kind._replace(time=False), None)
@@ -454,18 +453,18 @@ def _result(
 
 
 def over_times(found: NoiseFit, readings: Readings) -> NoiseFit:
-    """The same fit with a covariance that does not take for known how long what drifts lasts: the
-    mean (`reml.mean_covariance`) over the correlation times LASTING."""
-    if found.lasting is None:
+    """The same fit with a covariance that does not take for known how long what drifts lasts, where
+    the cell does not say: the mean (`reml.mean_covariance`) over the correlation times tried."""
+    if found.lasting is None or readings.visits is None:
         return found
     basis, T = _orthonormal(readings)
     fits = [found.fit]
-    for lasting in LASTING:
+    for lasting in readings.visits.lasting:
         if lasting != found.lasting:
             with suppress(ElastocalError, np.linalg.LinAlgError):
                 fits.append(_fitted(basis, Kind.of(found.kind), found.fit, lasting))
     level = {fit.structure.lasting: fit.log_likelihood for fit in fits}
-    short = max(level.values()) - level.get(max(LASTING), -math.inf)
+    short = max(level.values()) - level.get(LONGEST, -math.inf)
     mean = mean_covariance(fits, T, found.covariance)
     return replace(found, covariance=mean, to_longest=short)
 

@@ -18,6 +18,12 @@ from elastocal.units import Array, BoolArray, IntArray
 # drifted by then, would do to it.
 
 
+# Correlation times of a drift that are tried, as shares of the campaign; whether there is any is
+# tested with the first.
+LASTING = (0.2, 0.1, 0.4, 0.05, 0.8)
+LONGEST = max(LASTING)
+
+
 @dataclass(frozen=True)
 class VisitRecord:
     """The rows of the table behind each of N readings: m of them, one but for deflections.
@@ -29,7 +35,8 @@ class VisitRecord:
     drift of the noise is looked for (`drifts`) where the model itself has what changes with time,
     and, unless the cell states one, where readings follow each other from pose to neighbouring
     pose: they err alike because of what the model lacks, and a drift in its place would leave the
-    base as uncertain as it is large.
+    base as uncertain as it is large.  `lasting`: the correlation times of a drift that may be, as
+    shares of the span; the cell's own alone, where it states a drift and the table has times.
     """
 
     visit: IntArray
@@ -40,6 +47,7 @@ class VisitRecord:
     timed: bool
     span: float
     drifts: bool = True
+    lasting: tuple[float, ...] = LASTING
 
     def take(self, chosen: BoolArray | IntArray) -> VisitRecord:
         """That of the `chosen` readings."""
@@ -80,9 +88,11 @@ def visit_record(model: Model, observed: Observations, x: Array) -> VisitRecord 
     when, span, timed = _when(table)
     turning = np.array([kind != "prismatic" for kind in model.chain.kinds])
     visit = np.where(place, visits(table)[row], -1)
-    stated = model.cell.noise.drift > 0
+    noise = model.cell.noise
+    stated = noise.drift > 0
     drifts = stated or in_random_order(table.take(np.argsort(when, kind="stable")))
-    return VisitRecord(visit, moved, share, when[row], turning, timed, span, drifts)
+    lasting = (noise.lasting / span,) if stated and timed else LASTING
+    return VisitRecord(visit, moved, share, when[row], turning, timed, span, drifts, lasting)
 
 
 SYSTEMATIC = 0.01
@@ -136,7 +146,9 @@ def _when(table: Measurements) -> tuple[Array, float, bool]:
 # deviation of each configuration look more likely than the short course that there is.
 
 MOST_WAVES = 20
-ENOUGH = 0.97  # of the variance
+# Of the variance.  A course that lasts longer than the campaign is nearly a constant, which the
+# base takes over, and varies about it by little more than the inverse of how much longer.
+LEFT = 0.03
 
 
 def course_waves(t: Array, lasting: float) -> Array:
@@ -157,6 +169,6 @@ def course_waves(t: Array, lasting: float) -> Array:
         wave = np.cos(w * (t - 0.5)) if even else np.sin(w * (t - 0.5))
         found.append(wave * np.sqrt(value / norm))
         told += value
-        if told > ENOUGH:
+        if 1 - told < LEFT * min(c, 1.0):
             break
     return np.column_stack(found)

@@ -10,7 +10,7 @@ from elastocal.errors import InputError
 from elastocal.identification import Readings, estimate_noise, kenward_roger
 from elastocal.identification.noise_choice import NoiseFit, time_blocks, weights_of
 from elastocal.identification.residuals import as_of_another_campaign, held_out_residual
-from elastocal.identification.visit_record import VisitRecord
+from elastocal.identification.visit_record import VisitRecord, course_waves
 
 SIGMA, SCATTER, DRIFT, LASTING = 2e-5, 2e-5, 4e-5, 0.2
 
@@ -188,6 +188,16 @@ def test_readings_without_visits_have_neither():
         estimate_noise(r, "independent+joints")
     with pytest.raises(InputError, match="takes one of"):
         estimate_noise(r, "axis+sometimes")
+
+
+def test_of_a_course_longer_than_the_campaign_the_waves_make_what_varies_about_its_mean():
+    """Nearly all of a walk is a level that the base takes over."""
+    t = np.linspace(0, 1, 200)
+    about = np.eye(len(t)) - 1 / len(t)
+    for lasting in (1.0, 20.0, 1000.0):
+        waves = about @ course_waves(t, lasting)
+        true = about @ np.exp(-np.abs(t[:, None] - t) / lasting) @ about
+        assert np.linalg.norm(waves @ waves.T - true) < 0.1 * np.linalg.norm(true)
 
 
 def test_what_the_waves_leave_of_a_drift_is_not_taken_for_noise_of_readings():
