@@ -57,7 +57,8 @@ RECORD = {
         "[model] link_gravity = true",
     ),
     "station": (
-        "the instrument would stand where the arm reaches: the readings are not in its own frame",
+        "the readings do not tell where the instrument stands: they are deflections, or lie around "
+        "the origin of their frame",
         "state where it stands, [tracker] position_m",
     ),
     "torque": ("the table has no torque columns", "record torque_1_Nm … of every joint"),
