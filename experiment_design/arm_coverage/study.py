@@ -10,6 +10,7 @@ task is one campaign.
 from __future__ import annotations
 
 from collections.abc import Iterator
+from functools import lru_cache
 from typing import Any
 
 import numpy as np
@@ -80,10 +81,11 @@ def estimates(result: Calibration, true: np.ndarray) -> tuple[np.ndarray, np.nda
                 factor * (true[index[part]] - c.held.get(part, 0.0))
                 for part, factor in c.terms.items()
             )
-        found.append([value - truth, std, dof_of((end - value) / std)])
+        found.append([value - truth, std, dof_of(round((end - value) / std, 10))])
     return tuple(np.array(found).T)
 
 
+@lru_cache(maxsize=64)
 def dof_of(quantile: float) -> float:
     """Degrees of freedom with this 97.5 % quantile of t."""
     if quantile < stats.norm.ppf(0.975) * (1 + 1e-6):

@@ -216,7 +216,8 @@ def _estimates(
     model: Model, solution: Solution, method: MethodResult, left_out: set[int]
 ) -> tuple[tuple[Estimate, ...], tuple[Combination, ...]]:
     reduction, x, intervals = solution.reduction, solution.fit.x, method.intervals
-    std, dof, bends = intervals.covariance.std, intervals.covariance.dof, bent(solution)
+    std, dof = intervals.covariance.std, intervals.covariance.dof
+    bends = bent(solution, intervals.covariance.matrix)
     partners: dict[int, list[str]] = {int(d): [] for d in reduction.dropped}
     found: dict[int, Estimate] = {}
     combinations = []
