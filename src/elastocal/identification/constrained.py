@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Literal, NoReturn
 
 import numpy as np
@@ -19,7 +19,6 @@ from elastocal.identification.constrained_solver import (
     ResidualLoss,
     active_at,
     active_from_duals,
-    bounded_least_squares,
     equality_space,
     kkt,
     least_excess,
@@ -70,7 +69,6 @@ def raise_conflict(system: System) -> NoReturn:
 
 CONTRADICTION = 1e-9  # what equalities may miss each other by, of the size of x
 CERTIFIED = 1e-6  # KKT residual above which the point is no minimum
-FAR_OFF, MAX_RESCALINGS = 10.0, 3  # solve anew where x is that much longer than supposed
 UNDETERMINED = 1e-11  # singular value of unit columns, of the largest
 
 
@@ -117,9 +115,9 @@ def minimise(
     """Minimise the objective over the system's x; `active` in the terms of `stated`, if given,
     where x is a step and `stated` the constraints on the parameters themselves.
 
-    Squares under bounds and equalities are solved by Lawson and Hanson's LDP; matrices and
-    Huber's loss by an interior-point method (Clarabel); both end with Newton steps on the active
-    face, so that the result is good to rounding and not to a solver's tolerance.
+    Inequalities and Huber's loss are solved by an interior-point method (Clarabel), and Newton
+    steps on the active face end it, so that the result is good to rounding and not to a solver's
+    tolerance.
 
     Raises InputError where constraints contradict each other, which it names, and
     InsufficientDataError where data, prior and equalities leave a direction undetermined.
@@ -178,28 +176,24 @@ def _least_squares(
 def _constrained_start(
     objective: ConstrainedObjective, system: System, basis: Array, R: Array
 ) -> tuple[Array, Active]:
-    """A minimum to a solver's accuracy, and its active constraints; 0 is the free minimum."""
-    none = np.zeros(len(system.names), dtype=bool)
-    no_nulls = tuple(np.zeros((len(m.balance), 0)) for m in system.matrices)
-    found = bounded_least_squares(R, basis, system.lower, system.upper)
-    if found is None:
-        raise_conflict(system)
-    x, at_lower, at_upper = found
+    """A minimum to a solver's accuracy, and what is active; 0 is the free one of squares."""
+    x, threshold = np.zeros(len(system.names)), objective.loss.threshold
+    outside, size = (system.lower > 0) | (system.upper < 0), system.distance(x)
+    active = Active(outside, outside, tuple(np.zeros((len(m.balance), 0)) for m in system.matrices))
+    T = linalg.solve_triangular(R, basis.T, trans="T").T
+
+    def solved(size: float, loss: ResidualLoss) -> tuple[Array, Active]:
+        point = solve_conic(replace(objective, loss=loss), system, T, size)
+        if point is None:
+            raise_conflict(system)
+        return point.x, active_from_duals(system, point)
+
+    if outside.any() or not all(_semidefinite(m, x) for m in system.matrices):
+        x, active = solved(size, ResidualLoss())
     # Where no reading is beyond Huber's threshold, his loss is squares.
-    longest = np.max(objective.loss.lengths(objective.y - objective.B @ x), initial=0.0)
-    if longest <= objective.loss.threshold and all(_semidefinite(m, x) for m in system.matrices):
-        return x, Active(at_lower, at_upper, no_nulls)
-    size = system.distance(none.astype(float))
-    if not objective.loss.quadratic:
-        size = max(size, objective.loss.threshold)
-    for _ in range(1 + MAX_RESCALINGS):
-        point = solve_conic(objective, system, basis, size)
-        if point is None or (length := float(np.linalg.norm(point.x))) <= FAR_OFF * size:
-            break
-        size = length
-    if point is None:
-        raise_conflict(system)
-    return point.x, active_from_duals(system, point)
+    if np.max(objective.loss.lengths(objective.y - objective.B @ x), initial=0.0) <= threshold:
+        return x, active
+    return solved(max(size, threshold), objective.loss)
 
 
 def _semidefinite(matrix: Matrix, x: Array) -> bool:

@@ -9,18 +9,16 @@ from typing import Any, Literal
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy import linalg
-from scipy.optimize import nnls
+from scipy import linalg, sparse
 
 from elastocal.errors import ElastocalError, require
 from elastocal.identification.knowledge import Matrix, System
 from elastocal.identification.robust_core import huber
 from elastocal.units import Array, BoolArray
 
-# Least squares under bounds and linear equalities: exact, finite, without a cone solver.
+# Linear equalities, by the space that they leave.
 
 RANK = 1e-10  # of unit rows or columns: what is smaller is taken for round-off
-INFEASIBLE = 1e-7  # residual of the dual problem, 1/√(1 + |t|²) for a feasible one of size |t|
 
 
 @dataclass(frozen=True)
@@ -46,54 +44,6 @@ def equality_space(A: Array, b: Array) -> Affine:
     origin = Q[:, :rank] @ np.linalg.lstsq(rows @ Q[:, :rank], values, rcond=None)[0]
     gap = float(np.max(np.abs(rows @ origin - values)))
     return Affine(origin, Q[:, rank:], max(gap, float(np.max(np.abs(b[norms == 0]), initial=0.0))))
-
-
-def least_distance(G: Array, h: Array) -> tuple[Array, Array] | None:
-    """(t, u) with t = argmin |t|² subject to G t ≥ h, and multipliers u ≥ 0, t = Gᵀu.
-
-    G (k, q), h (k,).  None where no t satisfies the inequalities.  Lawson and Hanson 1974,
-    problem LDP of chapter 23: with v = argmin |[Gᵀ; hᵀ] v − e_{q+1}|, v ≥ 0, and r that residual,
-    t_j = −r_j/r_{q+1}; r = 0 exactly where the inequalities contradict each other (Farkas).
-    """
-    k, q = G.shape
-    norms = np.linalg.norm(G, axis=1)
-    largest = float(np.max(np.abs(G), initial=0.0))
-    fixed = norms <= RANK * largest
-    unit = np.where(fixed, 1.0, norms)
-    need = h / unit
-    if not k or np.max(need) <= 0:
-        return np.zeros(q), np.zeros(k)
-    # Farthest constraint at distance 1: then |t| ≥ 1 and 1/(1 + |t|²) loses no digits.
-    eta = float(np.max(need))
-    if fixed.any() and np.max(need[fixed]) > RANK:
-        return None
-    rows, need = G[~fixed] / unit[~fixed, None], need[~fixed] / eta
-    v, length = nnls(np.vstack([rows.T, need]), np.append(np.zeros(q), 1.0))
-    r_last = need @ v - 1.0
-    if length <= INFEASIBLE or not r_last < 0:
-        return None
-    u = np.zeros(k)
-    u[~fixed] = -v / r_last * eta / unit[~fixed]
-    return G.T @ u, u
-
-
-def bounded_least_squares(
-    R: Array, basis: Array, lower: Array, upper: Array
-) -> tuple[Array, BoolArray, BoolArray] | None:
-    """x = basis w with least |R w|² and lower ≤ x ≤ upper, and which bounds hold it back.
-
-    R (q, q) upper triangular and regular, basis (p, q), lower and upper (p,).  None where the
-    bounds leave no x.
-    """
-    below, above = np.isfinite(lower), np.isfinite(upper)
-    G = linalg.solve_triangular(R, np.vstack([basis[below], -basis[above]]).T, trans="T").T
-    found = least_distance(G, np.concatenate([lower[below], -upper[above]]))
-    if found is None:
-        return None
-    t, u = found
-    at_lower, at_upper = np.zeros(len(lower), dtype=bool), np.zeros(len(lower), dtype=bool)
-    at_lower[below], at_upper[above] = (u > 0)[: below.sum()], (u > 0)[below.sum() :]
-    return basis @ linalg.solve_triangular(R, t), at_lower, at_upper
 
 
 # What a constrained fit minimises: squares or Huber losses of the data, and a prior.
@@ -298,11 +248,8 @@ def kkt(
     bounds[active.lower] += lower
     bounds[active.upper] += upper
     matrices, wrong = [], [np.max(-lower, initial=0.0), np.max(upper, initial=0.0)]
-    for N in active.nulls:
-        i, j, factor = _triangle(N.shape[1])
-        inner = np.zeros((N.shape[1], N.shape[1]))
-        inner[i, j] = inner[j, i] = rest[: len(i)] / factor
-        rest = rest[len(i) :]
+    inners = _matrices(rest, [N.shape[1] for N in active.nulls])
+    for N, inner in zip(active.nulls, inners, strict=True):
         if inner.size:
             wrong.append(max(0.0, -float(np.linalg.eigvalsh(inner)[0])))
         matrices.append(N @ inner @ N.T)
@@ -384,14 +331,33 @@ def _refreshed(system: System, active: Active, x: Array) -> Active:
 
 
 def _triangle(k: int) -> tuple[NDArray[np.intp], NDArray[np.intp], Array]:
-    i, j = np.triu_indices(k)
+    """The upper triangle (i, j) column by column, and √2 off the diagonal."""
+    j, i = np.tril_indices(k)
     return i, j, np.where(i == j, 1.0, np.sqrt(2.0))
 
 
-# Fits as conic programs, solved by Clarabel through CVXPY: matrix inequalities, Huber losses.
+def _matrices(entries: Array, sizes: list[int]) -> tuple[Array, ...]:
+    """Symmetric matrices (k, k) of the `sizes`, from their triangles one after the other."""
+    found = []
+    for k in sizes:
+        i, j, factor = _triangle(k)
+        matrix = np.zeros((k, k))
+        matrix[i, j] = matrix[j, i] = entries[: len(i)] / factor
+        entries = entries[len(i) :]
+        found.append(matrix)
+    return tuple(found)
+
+
+# Fits as conic programs, solved by Clarabel.
+#
+# With x = T u such that squares have the minimum |u|², and a constant, at u = 0, a fit of squares
+# is the least |u|² under bounds and matrices.  For Huber's loss of r_i = y_i − B_i x it is
+#
+#     minimise  |e|² + 2 threshold Σ t_i,    |r_i − e_i| ≤ t_i,    e = target − P x beside these.
 
 TOLERANCES = (1e-10, 1e-8, 1e-6)  # the next where the solver gives up
-LONGER = (1.0, 1e2, 1e4)  # times the expected length, where the solver stops without a point
+FAR_OFF, LONGER = 10.0, 1e2  # times the expected length: where x is longer; without an x
+ATTEMPTS = 5
 OPTIMAL = ("optimal", "optimal_inaccurate")
 
 
@@ -406,62 +372,85 @@ class ConicPoint:
 
 
 def solve_conic(
-    objective: ConstrainedObjective, system: System, basis: Array, size: float
+    objective: ConstrainedObjective, system: System, T: Array, size: float
 ) -> ConicPoint | None:
-    """Minimise the objective over x = basis w under bounds and matrices; None where infeasible.
+    """Minimise the objective over x = T u under bounds and matrices; None where infeasible.
 
-    `size` is the length of x to expect: the program is posed in x/size, objective by size².
-    The equalities are to be met by every x = basis w.
+    `size` is the length of x to expect: the program is posed in x/size, objective by size², and
+    solved again where x comes out far longer.  The equalities are to be met by every T u.
     """
-    for longer in LONGER:
-        status, point = _posed(objective, system, basis, longer * size)
-        if status in ("infeasible", "infeasible_inaccurate"):
+    moves = np.linalg.norm(T, axis=1)
+    fixed = moves <= RANK * np.max(moves, initial=0.0)
+    if np.max(np.maximum(system.lower, -system.upper)[fixed], initial=0.0) > RANK:
+        return None
+    free = np.where(fixed, np.inf, 0.0)
+    system = replace(system, lower=system.lower - free, upper=system.upper + free)
+    for _ in range(ATTEMPTS):
+        status, point = _posed(objective, system, T, size)
+        if "PrimalInfeasible" in status:
             return None
-        if point is not None:
-            return point
-    raise ElastocalError(
-        f"the cone solver stopped with '{status}'; the problem may be badly scaled: check the "
-        "units of the bounds and of the prior"
-    )
+        length = LONGER * size if point is None else float(np.linalg.norm(point.x))
+        if point is not None and length <= FAR_OFF * size:
+            break
+        size = length
+    if point is None:
+        raise ElastocalError(
+            f"the cone solver stopped with '{status}'; the problem may be badly scaled: check the "
+            "units of the bounds and of the prior"
+        )
+    return point
 
 
 def _posed(
-    objective: ConstrainedObjective, system: System, basis: Array, size: float
+    objective: ConstrainedObjective, system: System, T: Array, size: float
 ) -> tuple[str, ConicPoint | None]:
     """Status, and the minimiser where one was found, of the program in x/size."""
-    import cvxpy as cp
+    import clarabel
 
-    w = cp.Variable(basis.shape[1])
-    J, loss = objective.B @ basis, objective.loss
-    if loss.quadratic:
-        J = np.vstack([J, objective.P @ basis])
-        Q, R = np.linalg.qr(J)
-        observed = Q.T @ np.concatenate([objective.y, objective.target])
-        cost = cp.sum_squares(R @ w - observed / size)
+    # No x of the length expected reaches a farther bound, whose size would cost digits.
+    below, above = system.lower >= -FAR_OFF * size, system.upper <= FAR_OFF * size
+    rows, limits = [-T[below], T[above]], [-system.lower[below], system.upper[above]]
+    cones = [clarabel.NonnegativeConeT(int(below.sum() + above.sum()))]
+    for m in system.matrices:
+        i, j, factor = _triangle(len(m.balance))
+        rows.append(-(m.slopes[:, i, j] * factor).T @ T)
+        limits.append(m.constant[i, j] * factor)
+        cones.append(clarabel.PSDTriangleConeT(len(m.balance)))
+    A, b = sparse.csr_array(np.vstack(rows)), np.concatenate(limits) / size
+    bends, cost = np.ones(T.shape[1]), np.zeros(T.shape[1])
+    if not objective.loss.quadratic:
+        J = np.vstack([objective.B, objective.P]) @ T
+        d = np.concatenate([objective.y, objective.target]) / size
+        loss, k, n = objective.loss, len(J), len(objective.y) // objective.loss.size
+        bends = np.repeat([0.0, 1.0, 0.0], [T.shape[1], k, n])
+        cost = np.repeat([0.0, 2 * loss.threshold / size], [T.shape[1] + k, n])
+        of_t = sparse.hstack([sparse.csr_array((n, T.shape[1] + k)), -sparse.eye_array(n)])
+        of_r = sparse.hstack([J, sparse.eye_array(k), sparse.csr_array((k, n))])
+        # A reading's cone has its t_i, then its rows; those of the prior are equations.
+        order = np.insert(np.arange(n, n + k), np.arange(n) * loss.size, np.arange(n))
+        A = sparse.hstack([A, sparse.csr_array((len(b), k + n))])
+        A = sparse.vstack([A, sparse.vstack([of_t, of_r]).tocsr()[order]])
+        b = np.concatenate([b, np.append(np.zeros(n), d)[order]])
+        cones += [clarabel.SecondOrderConeT(loss.size + 1)] * n
+        cones += [clarabel.ZeroConeT(len(objective.P))]
+    settings = clarabel.DefaultSettings()
+    settings.verbose = False
+    P = sparse.csc_matrix(sparse.diags_array(2 * bends))
+    for tolerance in TOLERANCES:
+        settings.tol_gap_abs = settings.tol_gap_rel = settings.tol_feas = tolerance
+        found = clarabel.DefaultSolver(P, cost, sparse.csc_matrix(A), b, cones, settings).solve()
+        status = str(found.status)
+        if status in ("Solved", "AlmostSolved"):
+            break
+        if "PrimalInfeasible" in status:
+            return status, None
     else:
-        r = objective.y / size - J @ w
-        if loss.size > 1:
-            r = cp.norm(
-                cp.reshape(r, (len(objective.y) // loss.size, loss.size), order="C"), axis=1
-            )
-        cost = cp.sum(cp.huber(r, loss.threshold / size))  # type: ignore[arg-type]
-        if len(objective.P):
-            cost += cp.sum_squares(objective.P @ basis @ w - objective.target / size)
-    below, above = np.isfinite(system.lower), np.isfinite(system.upper)
-    at_least = basis[below] @ w >= system.lower[below] / size
-    at_most = basis[above] @ w <= system.upper[above] / size
-    cones = [_value(cp, m, basis @ w, size) >> 0 for m in system.matrices]
-    wanted = ([at_least] if below.any() else []) + ([at_most] if above.any() else [])
-    status = _solve(cp.Problem(cp.Minimize(cost), wanted + cones))
-    if status not in OPTIMAL or w.value is None:
         return status, None
-    lower, upper = np.zeros(len(below)), np.zeros(len(above))
-    if below.any():
-        lower[below] = at_least.dual_value
-    if above.any():
-        upper[above] = at_most.dual_value
-    duals = tuple(size * np.asarray(cone.dual_value) for cone in cones)
-    return status, ConicPoint(size * (basis @ w.value), size * lower, size * upper, duals)
+    u, z = np.array(found.x)[: T.shape[1]], size * np.array(found.z)
+    lower, upper = np.zeros(len(T)), np.zeros(len(T))
+    lower[below], upper[above], z = np.split(z, np.cumsum([below.sum(), above.sum()]))
+    matrices = _matrices(z, [len(m.balance) for m in system.matrices])
+    return status, ConicPoint(size * (T @ u), lower, upper, matrices)
 
 
 def least_excess(system: System) -> dict[str, float]:

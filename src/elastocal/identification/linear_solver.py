@@ -189,38 +189,14 @@ class LinearSolution:
     cofactor: Array  # (rank, rank) (B^T W^2 B)^-1 of the kept columns
     rss: float  # weighted sum of squares, sum (w_i r_i)^2
     dof: int  # m - rank
-    condition: float  # of the weighted matrix with unit columns (or `scale`), kept columns
-    optimality: float  # max_j |a_j^T r| / |a_j| over |b| + sum_k |a_k x_k|, with b = W y and the
-    # columns a_j of W B, before x was rounded; at a minimum 1e-16 or less
 
-    @property
-    def rank(self) -> int:
-        return self.kept.size
-
-    @property
-    def sigma2(self) -> float | None:
-        """Variance of unit weight rss / dof; None where no degree of freedom is left."""
-        return self.rss / self.dof if self.dof > 0 else None
-
-    def std(self, sigma2: float | None = None) -> Array:
-        """Standard deviations (p,): sqrt(sigma2 * cofactor_jj), NaN for dropped columns.
-
-        `sigma2` is the known variance of unit weight (1 where w_i = 1/sigma_i); by default it is
-        estimated from the residual, and all entries are NaN where that is impossible.
-        """
-        std = np.full(self.x.size, np.nan)
-        std[self.kept] = np.sqrt(self._variance(sigma2)) * np.sqrt(np.diag(self.cofactor))
-        return std
-
-    def covariance(self, sigma2: float | None = None) -> Array:
-        """Covariance (p, p): sigma2 * cofactor, NaN in rows and columns of dropped ones."""
+    def covariance(self) -> Array:
+        """Covariance (p, p): rss / dof * cofactor, NaN in rows and columns of dropped ones, and
+        throughout where no degree of freedom is left."""
+        variance = self.rss / self.dof if self.dof > 0 else np.nan
         covariance = np.full((self.x.size, self.x.size), np.nan)
-        covariance[np.ix_(self.kept, self.kept)] = self._variance(sigma2) * self.cofactor
+        covariance[np.ix_(self.kept, self.kept)] = variance * self.cofactor
         return covariance
-
-    def _variance(self, given: float | None) -> float:
-        variance = self.sigma2 if given is None else given
-        return np.nan if variance is None else variance
 
 
 def solve_weighted(
@@ -229,22 +205,16 @@ def solve_weighted(
     weights: ArrayLike | None = None,
     *,
     scale: ArrayLike | None = None,
-    rank_tolerance: float | None = None,
 ) -> LinearSolution:
     """Solve min sum_i (w_i (B x - y)_i)^2 to nearly full double precision.
 
     B: (m, p), y: (m,), weights: (m,) positive, default 1.
     scale: (p,) typical sizes of the parameters; columns are multiplied by them before the rank
-    is judged.  By default every weighted column is scaled to unit length.
-    rank_tolerance: a column is dropped where its pivot |R_kk| is at most this fraction of |R_00|;
-    default max(m, p) * 2.2e-16.
+    is judged.  By default every weighted column is scaled to unit length.  A column is dropped
+    where its pivot |R_kk| is at most max(m, p) * 2.2e-16 of |R_00|.
     """
     B, y, weights, scale = checked_problem(B, y, weights, scale)
     m, p = B.shape
-    if rank_tolerance is None:
-        rank_tolerance = max(m, p) * EPS
-    elif not 0 <= rank_tolerance < 1:
-        raise InputError(f"rank_tolerance must lie in [0, 1), got {rank_tolerance}")
 
     # Exact scaling by powers of two: all weights and columns at most 1, b at most 1.
     weight_exponent = math.frexp(np.max(weights))[1]
@@ -261,10 +231,8 @@ def solve_weighted(
         unit = 1.0 / np.where(norms > 0, norms, 1.0)
     else:
         unit = np.ldexp(scale, exponent)
-    kept, A, V, condition = _factor(hi, lo, unit, rank_tolerance)
-    z, r, gradient = _refine(A, V, b_hi, b_lo)
-    lengths = np.linalg.norm(A.hi, axis=0)
-    terms = float(np.linalg.norm(b_hi) + lengths @ np.abs(z))
+    kept, A, V = _factor(hi, lo, unit)
+    z, r = _refine(A, V, b_hi, b_lo)
     x = np.zeros(p)
     x[kept] = np.ldexp(z, y_exponent - exponent[kept])
     back = weight_exponent + exponent[kept]  # (B^T W^2 B)^-1 in the units of B and w
@@ -277,24 +245,21 @@ def solve_weighted(
         cofactor=np.ldexp(np.ldexp(V @ V.T, -back), -back[:, None]),
         rss=rss,
         dof=m - kept.size,
-        condition=condition,
-        optimality=float(np.max(np.abs(gradient) / lengths, initial=0.0)) / (terms or 1.0),
     )
 
 
-def _factor(
-    hi: Array, lo: Array, unit: Array, rank_tolerance: float
-) -> tuple[Indices, ExactMatrix, Array, float]:
-    """Kept columns, the matrix A of these, V with V V^T = (A^T A)^-1, condition number."""
+def _factor(hi: Array, lo: Array, unit: Array) -> tuple[Indices, ExactMatrix, Array]:
+    """Kept columns, the matrix A of these, V with V V^T = (A^T A)^-1."""
     R, pivots = linalg.qr(hi * unit, mode="r", pivoting=True)
     pivot_sizes = np.abs(np.diag(R))
-    rank = int(np.count_nonzero(pivot_sizes > rank_tolerance * np.max(pivot_sizes, initial=0.0)))
+    tolerance = max(hi.shape) * EPS * np.max(pivot_sizes, initial=0.0)
+    rank = int(np.count_nonzero(pivot_sizes > tolerance))
     while True:
         order = np.argsort(pivots[:rank])
         kept = np.asarray(pivots[:rank][order], dtype=np.intp)
         A = ExactMatrix(hi[:, kept], lo[:, kept])
         if rank == 0:
-            return kept, A, np.zeros((0, 0)), np.nan
+            return kept, A, np.zeros((0, 0))
         inverse = linalg.solve_triangular(R[:rank, :rank], np.eye(rank))
         T = unit[kept, None] * inverse[order]
         nearly_orthonormal, _ = A.times(T)
@@ -304,12 +269,11 @@ def _factor(
             rank -= 1
             continue
         V = linalg.solve_triangular(L, T.T, lower=True).T
-        sigma = linalg.svdvals(R[:rank, :rank])
-        return kept, A, V, float(sigma[0] / sigma[-1])
+        return kept, A, V
 
 
-def _refine(A: ExactMatrix, V: Array, b_hi: Array, b_lo: Array) -> tuple[Array, Array, Array]:
-    """Least-squares z of A z = b, its residual r = b - A z, and A^T r.
+def _refine(A: ExactMatrix, V: Array, b_hi: Array, b_lo: Array) -> tuple[Array, Array]:
+    """Least-squares z of A z = b, and its residual r = b - A z.
 
     z itself is carried as hi + lo: its rounding alone would leave a gradient that the next step
     amplifies by the square of the condition number.
@@ -329,4 +293,4 @@ def _refine(A: ExactMatrix, V: Array, b_hi: Array, b_lo: Array) -> tuple[Array, 
             break
         z_hi, z_lo = two_sum(z_hi, z_lo + step)
         last = size
-    return z_hi, r_hi, gradient
+    return z_hi, r_hi

@@ -26,7 +26,7 @@ from elastocal.identification.noise_choice import (
 from elastocal.identification.noise_structure import Kind, Readings
 from elastocal.identification.options import ROBUST, Options
 from elastocal.identification.residuals import held_out_residual, rms_3d
-from elastocal.identification.robust import robust_fit
+from elastocal.identification.robust import asymptotic_covariance, clustered_covariance, robust_fit
 from elastocal.identification.smooth_fit import fit_smooth, with_functions_free
 from elastocal.identification.smooth_part import SmoothPart
 from elastocal.identification.solve import (
@@ -454,9 +454,11 @@ def _robust(
         )
     problem, kept = every.problem, sound.reduction.kept
     observed = problem.observations
-    found = robust_fit(problem.fit_of(kept, sound.fit.x, sound.sizes), method, None, options.seed)  # type: ignore[arg-type]
-    clustered = options.intervals == "cr3"
-    covariance = found.clustered(observed.configuration) if clustered else found.covariance()
+    found = robust_fit(problem.fit_of(kept, sound.fit.x, sound.sizes), method, options.seed)  # type: ignore[arg-type]
+    if options.intervals == "cr3":
+        covariance = clustered_covariance(found.linear, observed.configuration)
+    else:
+        covariance = asymptotic_covariance(found.linear)
     fit = replace(
         sound.fit, x=found.x, residual=found.residual, whitened=found.whitened,
         converged=found.converged, steps=found.steps,
@@ -464,7 +466,7 @@ def _robust(
         reason=sound.fit.reason if found.converged else "the robust steps did not settle",
     )  # fmt: skip
     # Only for predicting left-out configurations do ψ(d)/d stand in as weights.
-    share = np.sqrt(np.repeat(np.minimum(found.weights, 1e6), observed.size))
+    share = np.sqrt(np.repeat(np.minimum(found.linear.weights, 1e6), observed.size))
     whiten = sparse.csr_array(sparse.diags_array(share))
     if problem.weights.whiten is not None:
         whiten = sparse.csr_array(whiten @ problem.weights.whiten)

@@ -211,11 +211,8 @@ SEARCHES = 2  # steps whose S-estimate is searched by random subsets; later ones
 
 @dataclass(frozen=True)
 class RobustFit:
-    """x (parameters,), raw and whitened residual (rows,), observation weights (n,), scale.
-
-    `scale` is that of a whitened row.  `linear` is the robust estimate of the linearised model at
-    x, whose step is negligible; `weights` are ψ(d)/d, not inverse variances.
-    """
+    """x (parameters,), raw and whitened residual (rows,), and the robust estimate of the `linear`
+    model at x, whose step is negligible."""
 
     x: Array
     residual: Array
@@ -224,32 +221,14 @@ class RobustFit:
     converged: bool
     steps: int
 
-    @property
-    def scale(self) -> float:
-        return self.linear.scale
 
-    @property
-    def weights(self) -> Array:
-        return self.linear.weights
-
-    def covariance(self) -> Covariance:
-        """Covariance of the fitted columns for independent errors (`asymptotic_covariance`)."""
-        return asymptotic_covariance(self.linear)
-
-    def clustered(self, cluster: NDArray[np.int64]) -> Covariance:
-        """Covariance of the fitted columns under dependence within `cluster` (n,)."""
-        return clustered_covariance(self.linear, cluster)
-
-
-def robust_fit(
-    problem: FitProblem, loss_name: LossName = "tukey", size: int | None = None, seed: int = 0
-) -> RobustFit:
+def robust_fit(problem: FitProblem, loss_name: LossName = "tukey", seed: int = 0) -> RobustFit:
     """Minimise Σ ρ(|W (y − h(X))_i|/σ) over X[columns] by damped Gauss–Newton steps.
 
     Each step is the robust linear fit of the whitened residual to the whitened B at X: "huber"
     (95 % efficient, σ by the median), "tukey" (MM-estimate), "l1", or "student-t" (ML, ν
-    estimated); it is halved until Σ ρ at the step's σ falls.  `size` rows per observation share a
-    weight (by default the observations' size); `seed` fixes the search of the S-estimate.
+    estimated); it is halved until Σ ρ at the step's σ falls.  The rows of an observation share a
+    weight; `seed` fixes the search of the S-estimate.
 
     Whitening by a covariance that couples observations (deflections that share an unloaded
     reading) mixes them: a bad reading then also shows in those whitened after it.
@@ -266,7 +245,6 @@ def robust_fit(
         "a robust fit takes neither ties nor bounds: fit the reduced set of parameters, unbounded",
     )
     model, observed, columns = problem.model, problem.observations, problem.columns
-    per_reading = observed.size if size is None else size
     sizes = problem.sizes[columns]
     x, converged, steps = problem.x.copy(), False, 0
 
@@ -276,7 +254,7 @@ def robust_fit(
 
     B, e, raw = linearised(x)
     while True:
-        found = _step(B * sizes, e, loss_name, per_reading, seed, steps < SEARCHES)
+        found = _step(B * sizes, e, loss_name, observed.size, seed, steps < SEARCHES)
         moved = float(np.linalg.norm(B @ (found.x * sizes)))
         converged = moved <= SETTLED * found.scale * np.sqrt(len(columns))
         if converged or steps == MAX_STEPS:
@@ -287,7 +265,7 @@ def robust_fit(
         x[columns] += share * found.x * sizes
         B, e, raw = linearised(x)
         steps += 1
-    linear = _step(B, e, loss_name, per_reading, seed, False)
+    linear = _step(B, e, loss_name, observed.size, seed, False)
     return RobustFit(x, raw, e, linear, converged, steps)
 
 

@@ -224,9 +224,6 @@ class Absolute(Loss):
     def weight(self, d: Array) -> Array:
         return 1 / np.maximum(np.abs(d), np.finfo(float).tiny)
 
-    def psi(self, d: Array) -> Array:
-        return np.sign(d)
-
     def slope(self, d: Array) -> Array:
         return np.zeros_like(d)
 

@@ -8,7 +8,14 @@ from support.calibration import PLACED, cell_of, measured, planar_chain, table_a
 from support.cells import random_poses
 
 from elastocal.errors import InputError
-from elastocal.identification import FitProblem, fit, robust_fit, weights_for
+from elastocal.identification import (
+    FitProblem,
+    asymptotic_covariance,
+    clustered_covariance,
+    fit,
+    robust_fit,
+    weights_for,
+)
 from elastocal.model import Model, observe
 
 SIGMA = 5e-5
@@ -46,12 +53,12 @@ def test_settles_where_the_estimating_equation_holds(name):
     problem, _, _ = arm_problem(1, 0.1)
     found = robust_fit(problem, name)
     assert found.converged and found.steps < 15
-    step = (found.linear.x * np.linalg.norm(found.linear.design.B, axis=0)) / found.scale
+    step = (found.linear.x * np.linalg.norm(found.linear.design.B, axis=0)) / found.linear.scale
     assert np.abs(step).max() < 1e-5
     observed = problem.observations
     residual = observed.value - problem.model.predict(observed.table, found.x, observed)
     np.testing.assert_allclose(found.residual, residual, atol=1e-14)
-    assert found.weights.shape == (40,)
+    assert found.linear.weights.shape == (40,)
 
 
 @pytest.mark.parametrize("name", NAMES)
@@ -71,18 +78,18 @@ def test_blunders_hardly_move_it(name):
 def test_tukey_withstands_thirty_per_cent(seed):
     problem, truth, bad = arm_problem(seed, 0.3)
     found = robust_fit(problem)
-    std = found.covariance().std
+    std = asymptotic_covariance(found.linear).std
     assert (np.abs(found.x - truth)[problem.columns] < 6 * std).all()
-    assert (found.weights[bad] < 1e-3).all()
+    assert (found.linear.weights[bad] < 1e-3).all()
 
 
 def test_without_blunders_it_is_near_least_squares():
     """The robust and the clean fit differ by about √(1/0.95 − 1) = 0.23 standard deviations."""
     problem, _, _ = arm_problem(3)
     robust, clean = robust_fit(problem, "huber"), fit(problem)
-    std = robust.covariance().std
+    std = asymptotic_covariance(robust.linear).std
     assert (np.abs(robust.x - clean.x)[problem.columns] < 4 * 0.23 * std).all()
-    assert robust.scale == pytest.approx(SIGMA, rel=0.4)
+    assert robust.linear.scale == pytest.approx(SIGMA, rel=0.4)
 
 
 def test_exact_readings_give_the_truth():
@@ -94,8 +101,8 @@ def test_covariances_are_of_the_fitted_columns():
     problem, _, _ = arm_problem(5)
     found = robust_fit(problem)
     k = len(problem.columns)
-    assert found.covariance().matrix.shape == (k, k)
-    clustered = found.clustered(np.arange(40) % 20)
+    assert asymptotic_covariance(found.linear).matrix.shape == (k, k)
+    clustered = clustered_covariance(found.linear, np.arange(40) % 20)
     assert clustered.matrix.shape == (k, k) and (clustered.dof < 20).all()
 
 
