@@ -10,9 +10,10 @@ from support.cells import COMPLIANCE, DOWN, LOAD_POINT, kr270_cell, kr270_chain
 from support.commands import calibrated
 from support.elastic_arms import MujocoArm
 
-from elastocal.compensation import nominal_flanges, targets_at
+from elastocal.compensation import targets_at
 from elastocal.compensation.compensate import compensate
 from elastocal.model import tool_point
+from elastocal.model.rigid import nominal_flanges
 
 POSTURES = np.radians(
     [[10, -80, 90, 30, 50, -20], [-60, -60, 60, -80, 60, 100], [80, -110, 100, 120, -70, -150]]

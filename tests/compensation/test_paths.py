@@ -8,9 +8,10 @@ import numpy as np
 from support.cells import DOWN, kr270_cell, kr270_chain
 from support.commands import calibrated
 
-from elastocal.compensation import nominal_flanges, nominal_path, targets_at
+from elastocal.compensation import nominal_path, targets_at
 from elastocal.compensation.compensate import compensate
 from elastocal.model import joint_limits, tool_point
+from elastocal.model.rigid import nominal_flanges
 
 HOME = np.radians([0, -90, 90, 0, 40, 0])
 PLACE = np.array([0.1, 0.0, 0.2])

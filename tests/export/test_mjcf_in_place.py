@@ -6,9 +6,9 @@ import pytest
 from support.exports import GEOMETRY, LOAD, SPRINGS, exported, poses_of, write_result
 from support.mjcf_text import ARM, LOADABLE, write_arm
 
-from elastocal.export.export import flanges
 from elastocal.export.exportable import evaluate_pieces, keep
 from elastocal.model import MjcfArm
+from elastocal.model.rigid import nominal_flanges
 from elastocal.model.valued import Conditions
 
 MICROMETRE, NANOMETRE = 1e-6, 1e-9
@@ -34,16 +34,16 @@ def test_both_files_loaded_in_mujoco_differ_by_the_calibration(robot, tmp_path):
     kept = keep(calibrated, elastic=True, conditions=Conditions())
     expected = evaluate_pieces(kept.exported, Conditions()).calibrated_chain()
     q = poses_of(calibrated, 20, seed=3)
-    assert np.abs(flanges(arm.chain, q) - flanges(expected, q)).max() < 1e-9
+    assert np.abs(nominal_flanges(arm.chain, q) - nominal_flanges(expected, q)).max() < 1e-9
     # And by MuJoCo alone, where it was wrong by millimetres before.
     model, data = (lambda m: (m, mujoco.MjData(m)))(mujoco.MjModel.from_xml_string(done.text))
     data.qpos[[model.jnt_qposadr[j] for j in arm.joints]] = q[0]
     mujoco.mj_kinematics(model, data)
     T = np.eye(4) if arm.base == 0 else arm.placed(arm.base)
     end = data.site(flange) if arm.site is not None else data.body(flange)
-    wanted = (T @ flanges(expected, q[:1])[0])[:3, 3]
+    wanted = (T @ nominal_flanges(expected, q[:1])[0])[:3, 3]
     assert np.linalg.norm(end.xpos - wanted) < MICROMETRE
-    before = (T @ flanges(calibrated.model.chain, q[:1])[0])[:3, 3]
+    before = (T @ nominal_flanges(calibrated.model.chain, q[:1])[0])[:3, 3]
     assert np.linalg.norm(end.xpos - before) > 1e-4
 
 

@@ -8,8 +8,8 @@ from support.mjcf_text import ARM, LOADABLE, write_arm
 from elastocal.cell.arm_description import Robot
 from elastocal.cell.work_cell import Cell, read_cell
 from elastocal.errors import InputError
-from elastocal.export.export import flanges
 from elastocal.model import MjcfArm, load_chain, read_mjcf
+from elastocal.model.rigid import nominal_flanges
 
 
 def in_mujoco(model, q, joints, base, flange):
@@ -41,7 +41,7 @@ def test_the_flange_is_where_mujoco_has_it(base, flange, kind, tmp_path):
     q = np.random.default_rng(1).uniform(-1, 1, (20, 5))
     model = mujoco.MjModel.from_xml_string(LOADABLE)
     found = in_mujoco(model, q, arm.joints, base, (kind, flange))
-    assert np.abs(flanges(arm.chain, q) - found).max() < 1e-12
+    assert np.abs(nominal_flanges(arm.chain, q) - found).max() < 1e-12
 
 
 def test_fingers_leave_the_hand_as_the_flange(tmp_path):

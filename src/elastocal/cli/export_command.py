@@ -154,21 +154,18 @@ def _rounding(metres: float | None) -> str:
 
 
 def _cost_table(title: str, cost: Cost) -> Table:
-    from elastocal.report.formatting import length
-    from elastocal.report.terminal import titled
+    from elastocal.report.formatting import ShownTable, length
+    from elastocal.report.terminal import table_of
     from elastocal.text import printable
 
-    table = titled(title)
-    for head in ("effect", "markers rms", "max", "flange rms", "max", ""):
-        table.add_column(head, justify="left" if head in ("effect", "") else "right")
-    rows = [(e.effect.replace("_", " "), e.difference, e.note) for e in cost.effects]
-    for name, d, note in [*rows, ("all of it", cost.total, "")]:
-        cells = [""] * 4
-        if d is not None:
-            sizes = (d.marker_rms, d.marker_max, d.flange_rms, d.flange_max)
-            cells = [length(size) for size in sizes]
-        table.add_row(printable(name), *cells, printable(note))
-    return table
+    rows = []
+    every = [(e.effect.replace("_", " "), e.difference, e.note) for e in cost.effects]
+    for name, d, note in [*every, ("all of it", cost.total, "")]:
+        sizes = () if d is None else (d.marker_rms, d.marker_max, d.flange_rms, d.flange_max)
+        cells = [length(size) for size in sizes] or [""] * 4
+        rows.append((printable(name), *cells, printable(note)))
+    heads = ("effect", "markers rms", "max", "flange rms", "max", "")
+    return table_of(title, ShownTable(heads, rows, (0, 5)))
 
 
 # At the start of a sentence and in a title.

@@ -4,7 +4,7 @@ from elastocal import loaded_on_demand
 
 ROOMS = {
     "commands": "nominal_path",
-    "compensate": "Compensation commands_csv nominal_flanges summary",
+    "compensate": "Compensation commands_csv summary",
     "correction_table": "CorrectionGrid box_grid joint_grid",
     "targets": "one_target read_targets targets_at",
 }

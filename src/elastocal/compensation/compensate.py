@@ -6,7 +6,6 @@ from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, replace
 from typing import Any
 
-import casadi as ca
 import numpy as np
 from numpy.typing import NDArray
 
@@ -18,13 +17,12 @@ from elastocal.errors import InsufficientDataError, option
 from elastocal.identification.prediction import Uncertainty, uncertainty_at
 from elastocal.identification.start import check_limits
 from elastocal.measurements import families
-from elastocal.model import rigid
 from elastocal.model.calibrated import CalibratedArm, lasting
 from elastocal.model.calibrated_tool import CalibratedTool, ToolPoint
 from elastocal.model.chain import Chain, joint_limits
 from elastocal.model.effects import effect_of
-from elastocal.model.evaluate import BatchFunction
 from elastocal.model.inverse_kinematics import Reaching, inverse_kinematics
+from elastocal.model.rigid import nominal_flanges
 from elastocal.model.smooth_groups import smooth_groups
 from elastocal.tables import column, csv_text
 from elastocal.text import listed, plain
@@ -180,12 +178,6 @@ def _goals(targets: Targets, chain: Chain, T: Array, place: Array, turn: Array) 
         position = T[:, :3, 3] + np.einsum("nij,nj->ni", T[:, :3, :3], position)
         rotation = None if rotation is None else T[:, :3, :3] @ rotation
     return Goals(position, rotation)
-
-
-def nominal_flanges(chain: Chain, q: Array) -> Array:
-    """T_base_flange (n, 4, 4) of the nominal chain at q (n, joints)."""
-    symbol = ca.SX.sym("q", chain.n_joints)
-    return np.asarray(BatchFunction([symbol], [rigid.nominal_flange(chain, symbol)])(q)[0])
 
 
 def _other_postures(

@@ -11,13 +11,14 @@ import numpy as np
 from scipy.spatial.transform import Rotation
 
 from elastocal.compensation.commands import Goals
-from elastocal.compensation.compensate import Compensation, compensate, nominal_flanges
+from elastocal.compensation.compensate import Compensation, compensate
 from elastocal.compensation.targets import Targets, targets_at
 from elastocal.errors import InputError, option
 from elastocal.model.calibrated import CalibratedArm, lasting
 from elastocal.model.calibrated_tool import CalibratedTool, ToolPoint
 from elastocal.model.chain import finite_ranges, joint_limits
 from elastocal.model.inverse_kinematics import Reaching
+from elastocal.model.rigid import nominal_flanges
 from elastocal.units import Array
 
 LEAST_STEP = 1e-9  # m between levels

@@ -4,7 +4,7 @@ from elastocal import loaded_on_demand
 
 ROOMS = {
     "dh_table": "split",
-    "export": "Exported Wish flanges to_yaml",
+    "export": "Exported Wish to_yaml",
     "exportable": "Conditions cost_of evaluate_pieces keep random_table rpy",
     "mjcf_file": "MujocoRest",
     "urdf_file": "Frames read_urdf_text",

@@ -13,7 +13,6 @@ from functools import partial
 from pathlib import Path
 from typing import Any
 
-import casadi as ca
 import numpy as np
 
 from elastocal.errors import ElastocalError, InputError, option
@@ -36,7 +35,7 @@ from elastocal.identification.covariance import t_quantile
 from elastocal.model.calibrated import CalibratedArm
 from elastocal.model.chain import Chain
 from elastocal.model.effects import effect_of
-from elastocal.model.rigid import nominal_flange
+from elastocal.model.rigid import nominal_flanges
 from elastocal.model.smooth_groups import SmoothGroup, smooth_groups
 from elastocal.model.valued import Conditions, Valued, random_table
 from elastocal.tables import csv_text
@@ -240,13 +239,6 @@ CORNERS = np.vstack([np.hstack([np.zeros((3, 1)), 0.1 * np.eye(3)]), np.ones((1,
 LARGEST_AT_REST = 1e-6  # m
 
 
-def flanges(chain: Chain, q: Array) -> Array:
-    """T_base_flange (n, 4, 4) of a chain at joint values q (n, joints)."""
-    symbol = ca.SX.sym("q", chain.n_joints)
-    function = ca.Function("flange", [symbol], [nominal_flange(chain, symbol)])
-    return np.array([function(row).full() for row in q])
-
-
 def check_chain(
     text: str,
     ending: str,
@@ -266,7 +258,7 @@ def check_chain(
         atomic_write_text(path, text)
         back = read(path)
     q = random_table(kept.full.model, kept.conditions, 100, seed).q
-    apart = (flanges(back, q) - flanges(chain, q))[:, :3] @ CORNERS
+    apart = (nominal_flanges(back, q) - nominal_flanges(chain, q))[:, :3] @ CORNERS
     worst = float(np.linalg.norm(apart, axis=1).max())
     return worst if largest is None else _accepted(worst, largest)
 

@@ -138,14 +138,21 @@ def _body(
 
 def _passive(body: ET.Element, spring: SpringValue, offset: Array) -> None:
     """A spring of the model; its axis stands before the body was turned by the joint's offset."""
-    back = np.linalg.inv(offset)
+    ET.SubElement(body, "joint", spring_joint("spring_", spring, np.asarray(np.linalg.inv(offset))))
+
+
+def spring_joint(prefix: str, spring: SpringValue, F: Array) -> dict[str, str]:
+    """Attributes of the passive joint of a spring whose frame is F (4, 4) in the moved body's."""
     stiffness = 1.0 / spring.compliance
-    ET.SubElement(
-        body, "joint", name=f"spring_{spring.name}", type=MOTIONS[spring.kind],
-        pos=numbers(back[:3, 3]), axis=numbers(back[:3, :3] @ spring.axis),
-        stiffness=repr(stiffness), damping=repr(SETTLING * stiffness),
-        armature=armature(stiffness),
-    )  # fmt: skip
+    return {
+        "name": prefix + spring.name,
+        "type": MOTIONS[spring.kind],
+        "pos": numbers(F[:3, 3]),
+        "axis": numbers(F[:3, :3] @ spring.axis),
+        "stiffness": repr(stiffness),
+        "damping": repr(SETTLING * stiffness),
+        "armature": armature(stiffness),
+    }
 
 
 def armature(stiffness: float) -> str:

@@ -23,8 +23,8 @@ import numpy as np
 
 from elastocal.cell.arm_description import Robot
 from elastocal.errors import ElastocalError
-from elastocal.export.exportable import ExportNumbers, SpringValue, numbers, placed_body
-from elastocal.export.mjcf_file import MOTIONS, RIGID, SETTLING, armature, springs_at
+from elastocal.export.exportable import ExportNumbers, numbers, placed_body
+from elastocal.export.mjcf_file import RIGID, spring_joint, springs_at
 from elastocal.export.urdf_file import (
     PREFIX,
     XmlText,
@@ -45,6 +45,11 @@ ORIENTATIONS = ("quat", "axisangle", "xyaxes", "zaxis", "euler")
 FLANGE = f"{PREFIX}flange"
 MOST_JOINTS = 6  # of one body in MuJoCo
 SMALLEST = 1e-9  # kg, kg m and of directions: less is rounding
+# Of a spring's joint, whatever the defaults of the file say.
+WITHOUT_DEFAULTS = {
+    "limited": "false", "frictionloss": "0", "ref": "0", "springref": "0",
+    "actuatorfrclimited": "false",
+}  # fmt: skip
 
 
 class NotInPlace(ElastocalError):
@@ -228,31 +233,9 @@ def _add_springs(arm: MjcfArm, text: MjcfText, pieces: ExportNumbers, i: int, j:
         raise NotInPlace(f"{count} joints would stand on one body, and MuJoCo takes {MOST_JOINTS}")
     # The springs' frame in that of the moved body: before the joint turns by its offset.
     F = arm.before(j) @ np.linalg.inv(pieces.offset_motion(i))
-    lines = "".join(f"{_spring(spring, F)} " for spring in springs)
-    text.insert(tags[j - first], lines)
+    joints = (element("joint", spring_joint(SPRING, s, F) | WITHOUT_DEFAULTS) for s in springs)
+    text.insert(tags[j - first], "".join(f"{joint} " for joint in joints))
     return len(springs) - len(old)
-
-
-def _spring(spring: SpringValue, F: Array) -> str:
-    stiffness = 1.0 / spring.compliance
-    return element(
-        "joint",
-        {
-            "name": f"{SPRING}{spring.name}",
-            "type": MOTIONS[spring.kind],
-            "pos": numbers(F[:3, 3]),
-            "axis": numbers(F[:3, :3] @ spring.axis),
-            "stiffness": repr(stiffness),
-            "damping": repr(SETTLING * stiffness),
-            "armature": armature(stiffness),
-            # Whatever the defaults of the file say.
-            "limited": "false",
-            "frictionloss": "0",
-            "ref": "0",
-            "springref": "0",
-            "actuatorfrclimited": "false",
-        },
-    )
 
 
 def _correct_masses(arm: MjcfArm, text: MjcfText, pieces: ExportNumbers) -> None:

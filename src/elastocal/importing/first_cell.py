@@ -18,13 +18,13 @@ from elastocal.cell.arm_description import SOURCES, Convention, Robot
 from elastocal.cell.work_cell import Cell
 from elastocal.errors import InputError, option, require
 from elastocal.files import atomic_write_text
-from elastocal.model.chain import Chain, Joint
+from elastocal.model.chain import Chain, Joint, finite_ranges
 from elastocal.model.choice import load_chain
 from elastocal.model.effects.compliances import JointCompliance
 from elastocal.model.effects.gears import JointOffset
 from elastocal.model.effects.placements import BaseFrame, LinkGeometry, MarkerPosition
 from elastocal.model.mjcf import MjcfArm
-from elastocal.model.rigid import nominal_flange
+from elastocal.model.rigid import nominal_flanges
 from elastocal.model.urdf import check_urdf
 from elastocal.text import printable
 from elastocal.units import Array
@@ -144,16 +144,10 @@ def first_cell(robot: Robot, folder: str | Path = ".") -> str:
 
 def reach_of(chain: Chain) -> float:
     """How far the flange gets from the first joint, in m: the largest of 500 drawn poses."""
-    import casadi as ca
-
-    from elastocal.model.chain import finite_ranges
-
-    symbol = ca.SX.sym("q", chain.n_joints)
-    flange = ca.Function("reach", [symbol], [nominal_flange(chain, symbol)[:3, 3]])
     limits = [np.array([getattr(j, end) for j in chain.joints]) for end in ("lower", "upper")]
     q = np.random.default_rng(0).uniform(*finite_ranges(chain, *limits), (500, chain.n_joints))
-    away = np.asarray(flange.map(len(q))(q.T).full()) - chain.joints[0].placement[:3, 3][:, None]
-    return float(np.linalg.norm(away, axis=0).max())
+    away = nominal_flanges(chain, q)[:, :3, 3] - chain.joints[0].placement[:3, 3]
+    return float(np.linalg.norm(away, axis=1).max())
 
 
 def _text(value: str) -> str:

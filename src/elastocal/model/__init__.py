@@ -19,7 +19,7 @@ ROOMS = {
     "manipulator": "Model",
     "mjcf": "MjcfArm read_mjcf",
     "observations": "Observations observe pair_loaded_with_unloaded subset",
-    "rigid": "nominal_flange",
+    "rigid": "nominal_flange nominal_flanges",
     "symbolic": "SymbolicArm configuration_rows",
     "urdf": "check_urdf read_urdf",
     "valued": "Conditions Valued arm_with random_table unstated_needs",

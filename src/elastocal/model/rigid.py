@@ -1,7 +1,7 @@
 """Rigid motions as CasADi expressions: the only place where kinematics is written down.
 
-Every function takes and returns CasADi `SX` (or numbers, which CasADi promotes).
-Homogeneous transforms are (4, 4), rotations (3, 3), vectors (3, 1).
+Every function takes and returns CasADi `SX` (or numbers, which CasADi promotes), but the last,
+which is of arrays.  Homogeneous transforms are (4, 4), rotations (3, 3), vectors (3, 1).
 """
 
 from __future__ import annotations
@@ -10,6 +10,9 @@ from typing import TYPE_CHECKING, Any
 
 import casadi as ca
 import numpy as np
+
+from elastocal.model.evaluate import BatchFunction
+from elastocal.units import Array
 
 if TYPE_CHECKING:
     from elastocal.model.chain import Chain
@@ -101,3 +104,9 @@ def nominal_flange(chain: Chain, q: ca.SX) -> ca.SX:
     for i, joint in enumerate(chain.joints):
         T = T @ constant(joint.placement) @ joint_motion(joint.kind, joint.axis, q[i])
     return T @ constant(chain.flange_placement)
+
+
+def nominal_flanges(chain: Chain, q: Array) -> Array:
+    """T_base_flange (n, 4, 4) of the nominal chain at q (n, joints)."""
+    symbol = ca.SX.sym("q", chain.n_joints)
+    return np.asarray(BatchFunction([symbol], [nominal_flange(chain, symbol)])(q)[0])

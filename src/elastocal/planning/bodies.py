@@ -130,23 +130,29 @@ def _mesh_hull(
     path: Path, scale: tuple[float, float, float], name: str
 ) -> tuple[Array, NDArray[np.int64]]:
     import coal
-    from scipy.spatial import ConvexHull, QhullError
+    from scipy.spatial import QhullError
 
     try:
         check_size(path, "mesh", check_regular(path, "mesh"), MOST_MESH_BYTES)
     except InputError as error:
         raise InputError(f"mesh of body '{name}': {error}") from None
     try:
-        vertices = np.array(coal.MeshLoader().load(str(path), np.array(scale)).vertices())
-        found = ConvexHull(vertices)
+        return outward(np.array(coal.MeshLoader().load(str(path), np.array(scale)).vertices()))
     except QhullError:
         raise InputError(f"mesh '{path}' of body '{name}' is flat: it encloses no volume") from None
     except Exception as error:  # assimp's failures surface as several kinds
         raise InputError(
             f"mesh '{path}' of body '{name}' cannot be read: {error}; STL, OBJ and DAE can"
         ) from None
+
+
+def outward(cloud: Array) -> tuple[Array, NDArray[np.int64]]:
+    """Vertices (k, 3) of the convex hull of points (n, 3), and its triangles, turned outwards."""
+    from scipy.spatial import ConvexHull
+
+    found = ConvexHull(cloud)
     used, index = np.unique(found.simplices, return_inverse=True)
-    points, triangles = vertices[used], index.reshape(found.simplices.shape)
+    points, triangles = cloud[used], index.reshape(found.simplices.shape)
     # coal wants every normal to point outwards; Qhull's simplices are in no order.
     a, b, c = (points[triangles[:, k]] for k in range(3))
     inward = np.einsum("ij,ij->i", np.cross(b - a, c - a), found.equations[:, :3]) < 0

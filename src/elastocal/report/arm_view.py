@@ -24,6 +24,7 @@ from elastocal.planning.bodies import (
     cell_bodies,
     hull,
     mesh_hull,
+    outward,
     skeleton,
     urdf_bodies,
 )
@@ -138,19 +139,7 @@ def triangles_of(solid: Solid) -> tuple[Array, IntArray]:
         centres, radius = hull(solid)
         ball = _ball() @ solid.placement[:3, :3].T
         cloud = (centres[:, None] + radius * ball).reshape(-1, 3) if radius else centres
-    return _outward(cloud)
-
-
-def _outward(cloud: Array) -> tuple[Array, IntArray]:
-    from scipy.spatial import ConvexHull
-
-    found = ConvexHull(cloud)
-    used, index = np.unique(found.simplices, return_inverse=True)
-    points, faces = cloud[used], index.reshape(found.simplices.shape)
-    a, b, c = (points[faces[:, k]] for k in range(3))
-    inward = np.einsum("ij,ij->i", np.cross(b - a, c - a), found.equations[:, :3]) < 0
-    faces[inward] = faces[inward][:, ::-1]
-    return points, faces.astype(np.int64)
+    return outward(cloud)
 
 
 def _ring() -> Array:

@@ -8,6 +8,7 @@ import numpy as np
 
 from elastocal.diagnosis.changes import Comparison
 from elastocal.report.effect_names import p_value, size_of
+from elastocal.report.figures import INK, SERIES
 from elastocal.report.formatting import ShownTable, estimate, length
 from elastocal.text import listed, printable
 
@@ -117,14 +118,14 @@ def changes_frame(c: Comparison) -> pd.DataFrame:
     return pd.DataFrame([vars(change) for change in c.changes])
 
 
-def draw_map(figure: Figure, c: Comparison, colour: str, faint: str) -> None:
+def draw_map(figure: Figure, c: Comparison) -> None:
     """The poses from above and from the side, each a disc as large as the tool moves there."""
     far = c.distance
     area = 120.0 * far / max(float(far.max()), 1e-12)
     for k, (i, j, title) in enumerate(((0, 1, "from above"), (0, 2, "from the side"))):
         axes = figure.add_subplot(1, 2, k + 1)
-        axes.scatter(c.place[:, i], c.place[:, j], s=area, color=colour, alpha=0.6, linewidths=0)
-        axes.scatter(c.place[:, i], c.place[:, j], s=2, color=faint)
+        axes.scatter(c.place[:, i], c.place[:, j], s=area, color=SERIES[0], alpha=0.6, linewidths=0)
+        axes.scatter(c.place[:, i], c.place[:, j], s=2, color=INK)
         axes.set_aspect("equal", adjustable="datalim")
         axes.set_title(f"{title}; the largest disc is {length(float(far.max()))}")
         axes.set_xlabel(f"{'xyz'[i]} in m")

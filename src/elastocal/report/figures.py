@@ -171,6 +171,14 @@ def dots(axes: Axes, x: NDArray, y: NDArray, colour: str, size: float, label: st
     axes.autoscale_view()
 
 
+def panels_of(figure: Figure, n: int, across: int, **how: Any) -> list[Axes]:
+    """The first `n` axes of a grid `across` wide; the others are not seen."""
+    grid = figure.subplots(max(-(-n // across), 1), across, squeeze=False, **how).ravel()
+    for axes in grid[n:]:
+        axes.set_visible(False)
+    return list(grid[:n])
+
+
 WIDTH = 9.9
 STEP_HEIGHT = 0.42  # inches per step
 LONGEST_NAME = 46
@@ -311,20 +319,16 @@ def share_bars(d: Diagnosis) -> str:
 
 def unknown_curves(d: Diagnosis) -> str:
     """How the unknown effect depends on what drives it: smooth curves with bands of 2 sd."""
-    across = min(2, len(d.curves))
-    down = -(-len(d.curves) // 2)
 
     def draw(figure: Figure) -> None:
-        grid = figure.subplots(down, across, squeeze=False).ravel()
-        for axes, curve in zip(grid, d.curves, strict=False):
+        panels = panels_of(figure, len(d.curves), min(2, len(d.curves)))
+        for axes, curve in zip(panels, d.curves, strict=True):
             _curve(axes, curve)
-        for axes in grid[len(d.curves) :]:
-            axes.set_visible(False)
-        handles = grid[0].get_legend_handles_labels()
+        handles = panels[0].get_legend_handles_labels()
         figure.legend(*handles, loc="outside upper right", ncols=2, fontsize=8)
 
     title = "Error curves of the joints" if d.groups else "Shape of the unknown dependence"
-    return drawn(draw, WIDTH, 0.4 + 2.6 * down, title)
+    return drawn(draw, WIDTH, 0.4 + 2.6 * -(-len(d.curves) // 2), title)
 
 
 def _curve(axes: Axes, curve: Curve) -> None:
@@ -405,8 +409,8 @@ def effects_over_joints(d: Diagnosis) -> str:
         return ""
 
     def draw(figure: Figure) -> None:
-        panels = figure.subplots(-(-len(shapes) // 2), min(2, len(shapes)), squeeze=False).ravel()
-        for axes, shape in zip(panels, shapes, strict=False):
+        panels = panels_of(figure, len(shapes), min(2, len(shapes)))
+        for axes, shape in zip(panels, shapes, strict=True):
             revolute = shape.kind == "revolute"
             q = np.degrees(shape.q) if revolute else shape.q * 1e3
             sides = np.unique(np.sign(shape.side))
@@ -423,8 +427,6 @@ def effects_over_joints(d: Diagnosis) -> str:
             axes.set_ylim(-height, height)
             # Above the axes: inside, it would hide readings.
             axes.legend(fontsize=7, loc="lower right", bbox_to_anchor=(1, 1), ncols=2)
-        for axes in panels[len(shapes) :]:
-            axes.set_visible(False)
 
     return drawn(
         draw, WIDTH, 0.3 + 2.7 * -(-len(shapes) // 2), "Found effects over the joints they act at"

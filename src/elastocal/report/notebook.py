@@ -30,16 +30,11 @@ from elastocal.planning.plan import Plan
 from elastocal.report.arm_view import plan_figure, plan_space
 from elastocal.report.causes_view import causes
 from elastocal.report.changes_view import changes_frame, draw_map
-from elastocal.report.diagnosis_view import (
-    error_steps,
-)
+from elastocal.report.diagnosis_view import error_steps
 from elastocal.report.effect_names import effect_at, name_of
 from elastocal.report.figures import SERIES, as_figures, drawn
-from elastocal.report.formatting import ShownTable, display, length, minus
-from elastocal.report.identification_view import (
-    signed_half,
-    texts,
-)
+from elastocal.report.formatting import ShownTable, display, length, minus, short_name
+from elastocal.report.identification_view import signed_half, texts
 from elastocal.report.plan_view import first_stops
 from elastocal.report.residual_figures import by_configuration
 from elastocal.report.residual_view import residuals_of
@@ -64,6 +59,7 @@ if TYPE_CHECKING:
 
 MOST_BARS = 40
 MOST_TICKS = 20
+LONGEST_NAME = 64
 
 
 def residuals(result: Calibration, interactive: bool) -> Any:
@@ -258,7 +254,7 @@ def _bars(
         at = np.arange(n)
         widths = np.nan_to_num(np.vstack([below, above]))
         axes.errorbar(value, at, xerr=widths, fmt="o", color=SERIES[0], elinewidth=1.6)
-        axes.set_yticks(at, [_axis_label(printable(name)) for name in names])
+        axes.set_yticks(at, [short_name(name, LONGEST_NAME) for name in names])
         axes.set_ylim(n - 0.4, -0.6)
         axes.margins(x=0.06)
         if logarithmic:
@@ -289,14 +285,9 @@ def _png(figure: Any) -> bytes:
     return picture.getvalue()
 
 
-def _axis_label(name: str, most: int = 64) -> str:
-    return name if len(name) <= most else name[: most - 1] + "…"
-
-
 def _plain(name: str) -> str:
     """A name for plotly, which reads some HTML in its texts."""
-    text = _axis_label(printable(name))
-    return text.replace("&", "&amp;").replace("<", "&lt;").replace(">", "&gt;")
+    return escape(short_name(name, LONGEST_NAME), quote=False)
 
 
 MOST_ROWS = 60
@@ -508,8 +499,6 @@ def _commands(c: Compensation) -> pd.DataFrame:
 
 def moved(c: Comparison, interactive: bool) -> Any:
     """How far the tool has moved over the workspace, from above and from the side."""
-    from matplotlib.figure import Figure
-
     if interactive:
         import plotly.graph_objects as go
 
@@ -519,9 +508,7 @@ def moved(c: Comparison, interactive: bool) -> Any:
             marker={"color": c.distance * 1e6, "size": 4, "colorbar": {"title": "µm"}},
         )  # fmt: skip
         return go.Figure(marks)
-    figure = Figure(figsize=(8, 4), layout="constrained")
-    draw_map(figure, c, "C0", "0.4")
-    return figure
+    return _figure(lambda figure: draw_map(figure, c), (8.0, 4.0))
 
 
 VIEWS: dict[str, View] = {

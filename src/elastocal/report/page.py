@@ -40,8 +40,6 @@ from elastocal.report.arm_view import (
 from elastocal.report.changes_view import changes_contents, draw_map
 from elastocal.report.diagnosis_view import diagnosis_contents
 from elastocal.report.figures import (
-    INK,
-    SERIES,
     as_figures,
     candidate_bars,
     diagnosis_waterfall,
@@ -343,9 +341,7 @@ def _thinning(result: Calibration, residuals: Residuals) -> dict[str, str]:
 
 
 def _comparison(c: Comparison) -> dict[str, Any]:
-    def draw(figure: Any) -> None:
-        draw_map(figure, c, SERIES[0], INK)
-
+    draw = partial(draw_map, c=c)
     figures = {"map": drawn(draw, 8.0, 3.6, "How far the tool has moved")}
     return {**_of(c.old.model, figures), **changes_contents(c)}
 

@@ -8,7 +8,6 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 from scipy import special
 
-from elastocal.compensation.compensate import nominal_flanges
 from elastocal.errors import ElastocalError
 from elastocal.identification.error_budget import ErrorBudget
 from elastocal.identification.estimates import CORRELATED
@@ -18,6 +17,7 @@ from elastocal.identification.result import Calibration
 from elastocal.identification.scrutiny import Autocorrelation
 from elastocal.model.manipulator import Model
 from elastocal.model.observations import Observations
+from elastocal.model.rigid import nominal_flanges
 from elastocal.report.arm_view import Space, marker_positions, space_picture
 from elastocal.report.figures import (
     FAINT,
@@ -26,13 +26,14 @@ from elastocal.report.figures import (
     dots,
     drawn,
     micrometre_axis,
+    panels_of,
     waterfall_of_steps,
 )
 from elastocal.report.formatting import length, short_name, significant
 from elastocal.report.identification_view import before_and_after, budget_steps, rms_by_kind
 from elastocal.report.residual_view import Residuals, reach, rms_by_pose, running_mean
 from elastocal.report.smooth_view import smooth_figure
-from elastocal.units import Array
+from elastocal.units import Array, IntArray
 
 if TYPE_CHECKING:
     from matplotlib.artist import Artist
@@ -90,32 +91,39 @@ def against_joints(kinds: Sequence[str], residuals: Residuals) -> str:
     """Residual over the position of each joint, of `kinds`, with the running mean by direction."""
     rows = -(-len(kinds) // 3)
     n = residuals.positions
-    values = residuals.value[:, :n]
     shown = residuals.shown
     if len(shown) * n > MOST_JOINT_DOTS:
         shown = np.random.default_rng(0).choice(shown, MOST_JOINT_DOTS // n, replace=False)
-    height = reach(values)
 
     def draw(figure: Figure) -> None:
-        grid = figure.subplots(rows, min(3, len(kinds)), sharey=True, squeeze=False).ravel()
-        for j, (axes, kind) in enumerate(zip(grid, kinds, strict=False)):
+        panels = panels_of(figure, len(kinds), min(3, len(kinds)), sharey=True)
+        for j, (axes, kind) in enumerate(zip(panels, kinds, strict=True)):
             q = np.degrees(residuals.q[:, j]) if kind == "revolute" else residuals.q[:, j] * 1e3
-            axes.axhline(0, color=FAINT, linewidth=0.8)
-            for k in range(n):
-                dots(axes, q[shown], values[shown, k], SERIES[k], 1.3)
-            for k in range(n):
-                middle, mean, error = running_mean(q, values[:, k])
-                axes.errorbar(middle, mean, 2 * error, color=SERIES[k], linewidth=1.4,
-                              elinewidth=0.8, label=residuals.components[k])  # fmt: skip
+            _over(axes, q, residuals, shown, 1.3)
             axes.set_xlabel(f"joint {j + 1} in {'°' if kind == 'revolute' else 'mm'}")
-            axes.set_ylim(-height, height)
-        for axes in grid[len(kinds) :]:
-            axes.set_visible(False)
         figure.supylabel("residual in µm", fontsize=9)
-        handles = grid[0].get_legend_handles_labels()
+        handles = panels[0].get_legend_handles_labels()
         figure.legend(*handles, loc="outside upper right", ncols=n)
 
     return drawn(draw, WIDTH, 0.4 + 2.0 * rows, "Residuals against joint positions")
+
+
+def _over(
+    axes: Axes, x: Array, residuals: Residuals, shown: IntArray, size: float,
+    styles: Sequence[str] = ("-",),
+) -> None:  # fmt: skip
+    """Residuals of positions over x (observations,): dots of the `shown`, running means of all."""
+    values = residuals.value[:, : residuals.positions]
+    axes.axhline(0, color=FAINT, linewidth=0.8)
+    for k, own in enumerate(values.T):
+        dots(axes, x[shown], own[shown], SERIES[k], size)
+    for k, own in enumerate(values.T):
+        middle, mean, error = running_mean(x, own)
+        axes.errorbar(middle, mean, 2 * error, color=SERIES[k], linewidth=1.4, elinewidth=0.8,
+                      linestyle=styles[k % len(styles)],
+                      label=residuals.components[k])  # fmt: skip
+    height = reach(values)
+    axes.set_ylim(-height, height)
 
 
 def errors(result: Calibration) -> str:
@@ -294,14 +302,12 @@ def histograms_by_group(summary: ResidualSummary) -> str:
     rows = max(-(-len(panels) // ACROSS), 1)
 
     def draw(figure: Figure) -> None:
-        grid = figure.subplots(rows, ACROSS, squeeze=False).ravel()
-        for axes, (title, group, edges) in zip(grid, panels, strict=False):
+        grid = panels_of(figure, len(panels), ACROSS)
+        for axes, (title, group, edges) in zip(grid, panels, strict=True):
             _histogram_bars(axes, group, edges, "")
             axes.set_title(title, fontsize=7.5)
             axes.xaxis.label.set_fontsize(7)
             axes.tick_params(labelsize=7)
-        for axes in grid[len(panels) :]:
-            axes.set_visible(False)
 
     return drawn(draw, WIDTH, 0.2 + 1.45 * rows, "Histograms of standardised residuals by group")
 
@@ -323,30 +329,19 @@ MOST_WRITTEN = 16  # parameters up to which the numbers are written into it
 def over_time(observed: Observations, residuals: Residuals) -> str:
     """Residual of every reading over time, or over the table's order where no time was recorded."""
     table, lead = observed.table, observed.lead
-    n = residuals.positions
     if table.time is None:
         at, label = np.arange(len(lead), dtype=float), "reading, in the order of the table"
     else:
         seconds = table.time[lead]
         hours = float(np.ptp(seconds)) > 3 * 3600
         at, label = seconds / (3600 if hours else 60), f"time in {'h' if hours else 'min'}"
-    values = residuals.value[:, :n]
 
     def draw(figure: Figure) -> None:
         axes = figure.subplots()
-        axes.axhline(0, color=FAINT, linewidth=0.8)
-        for k in range(n):
-            dots(axes, at[residuals.shown], values[residuals.shown, k], SERIES[k], 1.5)
-        for k in range(n):
-            middle, mean, error = running_mean(at, values[:, k])
-            axes.errorbar(middle, mean, 2 * error, color=SERIES[k], linewidth=1.4, elinewidth=0.8,
-                          linestyle=("-", "--", ":")[k % 3],
-                          label=residuals.components[k])  # fmt: skip
-        height = reach(values)
-        axes.set_ylim(-height, height)
+        _over(axes, at, residuals, residuals.shown, 1.5, ("-", "--", ":"))
         axes.set_xlabel(label)
         axes.set_ylabel("residual in µm")
-        figure.legend(loc="outside upper right", ncols=n)
+        figure.legend(loc="outside upper right", ncols=residuals.positions)
 
     return drawn(draw, WIDTH, 2.6, "Residuals over time")
 

@@ -8,7 +8,7 @@ import numpy as np
 
 from elastocal.identification.result import Calibration
 from elastocal.identification.smooth_part import SmoothPart
-from elastocal.report.figures import FAINT, SERIES, drawn
+from elastocal.report.figures import FAINT, SERIES, drawn, panels_of
 from elastocal.report.formatting import ShownTable, counted, display, significant
 from elastocal.text import printable
 from elastocal.units import Array
@@ -70,11 +70,9 @@ def smooth_figure(result: Calibration) -> str:
     rows = -(-len(found) // 3)
 
     def draw(figure: Figure) -> None:
-        grid = figure.subplots(rows, min(3, len(found)), squeeze=False).ravel()
-        for axes, (part, unit) in zip(grid, found, strict=False):
+        panels = panels_of(figure, len(found), min(3, len(found)))
+        for axes, (part, unit) in zip(panels, found, strict=True):
             _panel(axes, part, unit)
-        for axes in grid[len(found) :]:
-            axes.set_visible(False)
 
     return drawn(draw, WIDTH, 0.3 + 2.2 * rows, "Smooth functions with their 95 % bands")
 

@@ -391,10 +391,8 @@ def _fine_length(um: float) -> str:
 
 
 def _print_spreads(console: Console, title: str, rows: dict[str, dict[str, Any]]) -> None:
-    shown = titled(title)
-    shown.add_column("")
-    for head in ("rms", "95 %", "max"):
-        shown.add_column(head, justify="right")
-    for name, values in rows.items():
-        shown.add_row(name, *("–" if v is None else _fine_length(v) for v in values.values()))
-    console.print(shown)
+    cells = [
+        (name, *("–" if v is None else _fine_length(v) for v in values.values()))
+        for name, values in rows.items()
+    ]
+    console.print(table_of(title, ShownTable(("", "rms", "95 %", "max"), cells)))
