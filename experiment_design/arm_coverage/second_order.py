@@ -21,7 +21,6 @@ import study
 from elastocal.identification import estimates
 from elastocal.identification.identify import identify
 
-AXES = {"independent": (1.0, 1.0, 1.0), "axes": (0.5, 1.0, 2.0)}
 MOST = 12  # lines
 
 
@@ -45,7 +44,7 @@ def main(key: str, first: int, number: int) -> None:
             held[result[name].identifiable].append(holds)
         x, chosen = seen["solution"].fit.x, seen["solution"].reduction
         size = seen["solution"].sizes[chosen.kept]
-        w = 1 / np.tile(campaigns.SIGMA * np.array(AXES[key]), len(campaign.exact))
+        w = 1 / np.sqrt(np.diag(campaign.covariance))
         B = model.regressor(campaign.exact, x, chosen.kept).B * size * w[:, None]
         linear = size * np.linalg.lstsq(B, w * campaign.noise.ravel(), rcond=None)[0]
         away = campaign.true - x
