@@ -27,9 +27,11 @@ from elastocal.cell.arm_description import (
 from elastocal.cell.plan_wishes import DesignSpec
 from elastocal.cell.work_cell import Cell
 from elastocal.diagnosis.diagnose import diagnose
+from elastocal.diagnosis.diagnosis import Diagnosis
 from elastocal.diagnosis.next_poses import next_poses, with_effects_of
 from elastocal.errors import ElastocalError
 from elastocal.identification.identify import identify
+from elastocal.identification.result import Calibration
 from elastocal.measurements import Measurements
 from elastocal.model import Model
 from elastocal.planning import Known, in_doubt, load_states, missing, rows_of
@@ -121,12 +123,15 @@ class TrueArm:
         """What diagnosis and identification make of the readings at q, and how wrong that is."""
         table = self.read(q)
         why = diagnose(model(), table)
-        fit = identify(with_effects_of(model(), why), table)
+        return self.told(len(q), why, identify(with_effects_of(model(), why), table))
+
+    def told(self, poses: int, why: Diagnosis, fit: Calibration) -> dict[str, Any]:
+        """How wrong they are at new poses, and whether the effect is among those found."""
         new = self.read(feasible(NEW, 1), noise=False)
         off = fit.model.predict(new, fit.x).reshape(-1, 3) - new.position
         names = [(f.effect, f.where) for f in why.effects]
         return {
-            "poses": len(q), "error_um": 1e6 * float(np.sqrt((off**2).sum(axis=1).mean())),
+            "poses": poses, "error_um": 1e6 * float(np.sqrt((off**2).sum(axis=1).mean())),
             "found": len(names), "named": int((self.effect, self.where) in names),
         }  # fmt: skip
 
@@ -173,17 +178,19 @@ def adaptive(arm: TrueArm) -> dict[str, Any]:
     """Batches of the next best poses until they say enough."""
     q, first, same = planned(SIZES[0]), 0, np.nan
     while True:
-        seen = arm.judged(q)
-        same = seen["error_um"] if len(q) == SAME else same
-        if not first and seen["error_um"] <= 1e6 * REQUIRED:
-            first = len(q)
         try:
             more = next_poses(
                 model(), arm.read(q), batch=SIZES[1] - SIZES[0], require=REQUIRED,
                 candidates=CANDIDATES,
             )  # fmt: skip
         except ElastocalError as error:
-            return seen | {"first": first, "same_um": same, "verdict": f"refused: {error}"[:80]}
+            row = {"first": first, "same_um": same, "verdict": f"refused: {error}"[:80]}
+            return arm.judged(q) | row
+        assert more.diagnosis is not None and more.calibration is not None
+        seen = arm.told(len(q), more.diagnosis, more.calibration)
+        same = seen["error_um"] if len(q) == SAME else same
+        if not first and seen["error_um"] <= 1e6 * REQUIRED:
+            first = len(q)
         if more.plan is None or len(q) >= SIZES[-1]:
             said = {"verdict": more.verdict, "kept_um": 1e6 * more.reached}
             return seen | said | {"first": first, "same_um": same}

@@ -55,6 +55,8 @@ class NextPoses(Result):
         found: The effects that the diagnosis found, which the model then has.
         doubts: What it may lack besides and the poses can show, the likeliest first.
         source: The readings that it is said of.
+        diagnosis: Of these readings; None for fewer than can be diagnosed.
+        calibration: The arm identified with what was found; None where they do not suffice.
     """
 
     verdict: NextVerdict
@@ -67,6 +69,8 @@ class NextPoses(Result):
     doubts: tuple[tuple[str, str, float], ...]
     least_gain: float = 0.01
     source: str = ""
+    diagnosis: Diagnosis | None = None
+    calibration: Calibration | None = None
 
     def __repr__(self) -> str:
         told = f"at most {self.reached * 1e6:.3g} µm with 95 %"
@@ -147,9 +151,10 @@ def next_poses(
         why = diagnose(model, table, DiagnosisOptions(seed), progress)
         model = with_effects_of(model, why)
     progress("identifying")
-    kept = math.inf
+    kept, fit = math.inf, None
     with suppress(InsufficientDataError):  # then these are not enough
-        kept = _kept(identify(model, table), 1.0 if why is None else why.probability_unknown)
+        fit = identify(model, table)
+        kept = _kept(fit, 1.0 if why is None else why.probability_unknown)
     chances = doubts_after(model, why)
     spec = model.cell.design
     spec = replace(
@@ -177,6 +182,8 @@ def next_poses(
         doubts=tuple((*place, chances[place]) for place in likeliest),
         least_gain=least_gain,
         source=table.source,
+        diagnosis=why,
+        calibration=fit,
     )
 
 

@@ -11,7 +11,7 @@ from dataclasses import asdict, dataclass
 from typing import Any
 
 import numpy as np
-from scipy import linalg
+from scipy import linalg, special
 
 from elastocal.identification.prediction import mean_squares
 from elastocal.identification.residuals import ALONE, held_out_residual, rms_3d
@@ -119,6 +119,7 @@ def _name(fit: Looked, k: int) -> str:
 LAGS = 10
 FEWEST_VISITS = 12
 PERMUTATIONS = 999
+MOST_PERMUTED = 1000  # visits; of more, the sum of products is normal for all that a p-value shows
 
 
 @dataclass(frozen=True)
@@ -144,7 +145,8 @@ def autocorrelation(residual: Array, observed: Observations) -> Autocorrelation 
     than 12 visits.
 
     The p-value is that of a permutation test: exact where visits are exchangeable, whatever the
-    distribution of the noise.
+    distribution of the noise; for more than a thousand visits from the exact mean and variance
+    over all permutations (after Wald and Wolfowitz 1943).
     """
     parts = residual.reshape(-1, observed.size)[:, :3]
     spread = np.sqrt((parts**2).mean(axis=0))
@@ -163,14 +165,35 @@ def autocorrelation(residual: Array, observed: Observations) -> Autocorrelation 
     total = float((mean**2).sum())
     lags = range(1, min(LAGS, number // 4) + 1)
     found = tuple(float((mean[:-k] * mean[k:]).sum()) / total for k in lags)
-    rng = np.random.default_rng(0)
-    chance = np.empty(PERMUTATIONS)
-    for k in range(PERMUTATIONS):
-        other = mean[rng.permutation(number)]
-        chance[k] = float((other[:-1] * other[1:]).sum()) / total
-    p = (1 + int((chance >= found[0]).sum())) / (1 + PERMUTATIONS)
-    band = float(np.quantile(np.abs(chance), 0.95))
+    if number > MOST_PERMUTED:
+        centre, width = _over_permutations(mean)
+        p = float(special.ndtr((centre / total - found[0]) / (width / total)))
+        band = float(special.ndtri(0.975)) * width / total
+    else:
+        rng = np.random.default_rng(0)
+        chance = np.empty(PERMUTATIONS)
+        for k in range(PERMUTATIONS):
+            other = mean[rng.permutation(number)]
+            chance[k] = float((other[:-1] * other[1:]).sum()) / total
+        p = (1 + int((chance >= found[0]).sum())) / (1 + PERMUTATIONS)
+        band = float(np.quantile(np.abs(chance), 0.95))
     return Autocorrelation(found, p, band, number, "times" if timed else "order of the rows")
+
+
+def _over_permutations(mean: Array) -> tuple[float, float]:
+    """Mean and standard deviation of Σ m_i·m_{i+1} over all orders of the rows m of `mean` (n, k),
+    which sum to zero.
+
+    Two products of neighbours share both rows, one or none; the mean of their product over all
+    distinct rows follows for each from T = Σ |m|², F = |Σ m mᵀ|² and Q = Σ |m|⁴.
+    """
+    n, square = len(mean), (mean**2).sum(axis=1)
+    T, F, Q = square.sum(), ((mean.T @ mean) ** 2).sum(), (square**2).sum()
+    two = (F - Q) / (n * (n - 1))
+    three = (2 * Q - F) / (n * (n - 1) * (n - 2))
+    four = (T**2 + 2 * F - 6 * Q) / (n * (n - 1) * (n - 2) * (n - 3))
+    second = (n - 1) * two + 2 * (n - 2) * three + (n - 2) * (n - 3) * four
+    return -float(T / n), float(np.sqrt(second - (T / n) ** 2))
 
 
 # Sets of parameters side by side, on the model linearised at the fit.

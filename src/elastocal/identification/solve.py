@@ -34,6 +34,7 @@ from elastocal.identification.weighted_problem import (
     partition,
     regressor,
     residual_at,
+    residual_of,
     sample,
 )
 from elastocal.model.arm import Parameter
@@ -489,6 +490,7 @@ def sizes_and_check(problem: Problem) -> Array:
 # Draws of what is dropped, and of the errors of what is kept: from eight the result is a third
 # too small.
 BENDS = 24
+BENT_SAMPLE = 1000  # observations it is found from: what readings at random poses have in common
 
 
 def bent(solution: Solution, covariance: Array) -> Array:
@@ -510,17 +512,22 @@ def bent(solution: Solution, covariance: Array) -> Array:
     typical = np.where(is_placed(problem.model), 0.0, solution.sizes)[dropped]
     value, axes = linalg.eigh(covariance / np.outer(size, size))
     root = size[:, None] * axes * np.sqrt(np.maximum(value, 0.0))
-    rng, moved = np.random.default_rng(0), -2 * np.tile(found.residual, (BENDS, 1))
+    # Of many readings some tell it as well: it is no smaller where there are more of them.
+    n = len(problem.observations.lead)
+    parts = problem.parts
+    looked = parts.part((0, n)) if n <= BENT_SAMPLE else sample(parts, BENT_SAMPLE)
+    residual, B = found.residual[looked.rows], found.B[looked.rows] * size
+    rng, moved = np.random.default_rng(0), -2 * np.tile(residual, (BENDS, 1))
     for k, delta in enumerate(typical * rng.standard_normal((BENDS, len(dropped)))):
         step = np.zeros(len(found.x))
         step[dropped] = delta
         step[kept] = root @ rng.standard_normal(len(kept)) - chosen.mixing @ delta
         for sign in (1, -1):
-            moved[k] += residual_at(problem.model, problem.parts, found.x + sign * step)
+            moved[k] += residual_of(problem.model, looked, found.x + sign * step)
     if not np.isfinite(moved).all():
         return none  # so far out the arm has no equilibrium
-    B = problem.weights.apply(found.B * size)
-    step = linalg.lstsq(B, problem.weights.apply(moved.T / 2))[0]
+    apply = looked.weights.apply
+    step = linalg.lstsq(apply(B), apply(moved.T / 2))[0]
     return np.asarray(size * np.sqrt((step**2).mean(axis=1)))
 
 

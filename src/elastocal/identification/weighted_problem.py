@@ -348,10 +348,11 @@ def part_of(observed: Observations, weights: Weights, index: IntArray) -> Part:
         value = observed.value[_run(rows)]
         table = observed.table.take(_run(observed.lead[index]))
         own = Observations(observed.kind, value, alone(len(index)), np.arange(len(index)), table)
-    if weights.whiten is None:
-        return Part(index, rows, own, weights)
-    inside = weights.whiten[_run(rows)][:, _run(rows)]
-    return Part(index, rows, own, replace(weights, whiten=inside))
+    inside = None if weights.whiten is None else weights.whiten[_run(rows)][:, _run(rows)]
+    alone = replace(weights, whiten=inside, low=None, common=None, together=None)
+    if weights.common is None or weights.together is None:
+        return Part(index, rows, own, alone)
+    return Part(index, rows, own, alone.with_common(weights.common[rows], weights.together[index]))
 
 
 def _run(index: IntArray) -> IntArray | slice:
@@ -604,12 +605,17 @@ def residual_at(model: Model, parts: Partition, x: Array) -> Array:
     residual = np.empty(len(parts.observed.value))
 
     def predicted(part: Part) -> None:
-        observed = part.observations
-        residual[part.rows] = observed.value - model.predict(observed.table, x, observed)
+        residual[part.rows] = residual_of(model, part, x)
 
     for _ in each(parts, predicted):
         pass
     return residual
+
+
+def residual_of(model: Model, part: Part, x: Array) -> Array:
+    """Observed minus predicted (rows,) of a part at x; NaN in readings without equilibrium."""
+    observed = part.observations
+    return np.asarray(observed.value - model.predict(observed.table, x, observed))
 
 
 def regressor(model: Model, part: Part, x: Array, columns: NDArray[np.integer]) -> Regression:
