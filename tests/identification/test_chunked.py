@@ -85,6 +85,18 @@ def test_in_parts_equals_whole(case, in_parts):
     assert np.array_equal(faulty_of(parts)[0], accused)
 
 
+@pytest.mark.parametrize("case", CASES, ids=lambda case: case.__name__)
+def test_many_readings_on_their_triangle_equal_the_exact_solver(case, monkeypatch):
+    whole = solved(*case())
+    monkeypatch.setattr(partition, "MANY", 0)
+    reduced = solved(*case())
+    assert not reduced.problem.large and len(reduced.problem.parts.spans) == 1
+    assert_same_estimates(reduced, whole)
+    np.testing.assert_allclose(
+        reduced.heldout, whole.heldout, atol=1e-5 * np.abs(whole.heldout).max()
+    )
+
+
 def test_the_last_evaluation_leaves_the_triangle_of_all_columns_to_choose_from(in_parts):
     """It is that of another pass at the fitted values, and the fit's own is a part of it.
 

@@ -19,7 +19,7 @@ from elastocal.identification.weighted_problem import (
     RFactor,
     Weights,
     evaluate,
-    is_large,
+    is_reduced,
     partition,
 )
 from elastocal.model.manipulator import Model, Regression
@@ -199,9 +199,9 @@ class FitProblem:
         return x
 
     @property
-    def large(self) -> bool:
-        """Whether B is reduced part by part instead of being formed."""
-        return is_large(self.observations, int((~self.model.shrunk).sum()))
+    def reduced(self) -> bool:
+        """Whether B is reduced to its R factor at once, part by part where the table is large."""
+        return is_reduced(self.observations, int((~self.model.shrunk).sum()))
 
 
 @dataclass(frozen=True)
@@ -234,11 +234,11 @@ class Fit:
     def cofactor(self) -> Array:
         """(BᵀW²B)⁻¹ (fitted, fitted): covariance at unit variance (eq. 7 and 13).
 
-        Exact to working precision for tables of ordinary size; of a large one from the R factor,
+        Exact to working precision for tables of ordinary size; of many readings from the R factor,
         exact to working precision times condition number.
         """
         scale = self.problem.sizes[self.columns]
-        if self.problem.large:
+        if self.problem.reduced:
             return self.r_factor.cofactor(scale)
         B = self.problem.weights.apply(self.B)
         return solve_weighted(B, self.whitened, scale=scale).cofactor
@@ -247,12 +247,12 @@ class Fit:
 def fit(problem: FitProblem, max_steps: int = 60, tolerance: float = LARGE_TOLERANCE) -> Fit:
     """Levenberg–Marquardt from the problem's x, derivatives exact.
 
-    A large table is fitted on R factors, with the cost and the gradient of all rows, until a step
+    Many readings are fitted on R factors, with the cost and the gradient of all rows, until a step
     promises less than `tolerance` of the cost.
 
     Raises ElastocalError where the start has poses without equilibrium.
     """
-    if problem.large:
+    if problem.reduced:
         return _fit_in_parts(problem, max_steps, tolerance)
     return _fit_whole(problem, max_steps)
 

@@ -70,6 +70,8 @@ ROWS_PER_VARIANCE = 5  # degrees of freedom that a variance needs before it is w
 LEAST_START = 1e-6  # of the largest: a variance smaller than that of a former fit is no start
 FEWEST_TELLING = 10  # degrees of freedom of repeats, from which on they tell the noise
 MOST_GROUPS = 1000  # configurations: their information matrix has (3 · 1000)² entries
+# Readings, and those per parameter, that the choice is made from: so many tell a variance to 3 %.
+CHOSEN_FROM, PER_PARAMETER = 2000, 20
 
 
 @dataclass(frozen=True)
@@ -158,14 +160,11 @@ def estimate_noise(
 
     Raises InputError for an unknown kind or one that the readings do not support.
     """
-    asked = Kind.of(kind)
-    basis, T = _orthonormal(readings)
-    if kind != "auto":
-        fit = _fitted(basis, asked, None if like is None else like.fit)
-        found = _result(kind, fit, T, (), "as asked for")
-    else:
-        found = _Choice(basis).result(T)
-    return replace(found, course=readings.visits)
+    asked, (basis, T) = Kind.of(kind), _orthonormal(readings)
+    if kind == "auto":
+        return replace(_chosen(basis, T), course=readings.visits)
+    fit = _fitted(basis, asked, None if like is None else like.fit)
+    return replace(_result(kind, fit, T, (), "as asked for"), course=readings.visits)
 
 
 # What may be added to the best model of single readings and configurations.  Only a trace of it is
@@ -175,20 +174,44 @@ MOST_TOGETHER = 300  # rows of a configuration, whose covariance is formed
 FEWEST_VISITS, SEVERAL = 8, 2
 
 
-class _Choice:
-    """The search for the model with the smallest criterion."""
+def _chosen(readings: Readings, T: Array) -> NoiseFit:
+    """The model with the smallest criterion; of many readings a sample chooses it, and all of them
+    tell its variances."""
+    names = _supported(readings)
+    some = readings.sample(max(CHOSEN_FROM, PER_PARAMETER * readings.n_parameters))
+    if some is readings:
+        return _Choice(readings, names).result(T)
+    try:
+        found = _Choice(some, names).result(T)
+        kind = Kind.of(found.kind)
+        fit = _fitted(readings, kind, found.fit, found.lasting)
+    except ElastocalError:  # the sample does not show all parameters, or not all labels
+        return _Choice(readings, names).result(T)
+    why = f"{found.reason}; chosen from {len(some)} readings at random, estimated from all"
+    return _result(_found(kind, fit)[0].name, fit, T, found.trials, why, found.tests)
 
-    def __init__(self, readings: Readings) -> None:
-        self.readings = readings
+
+def _found(kind: Kind, fit: Reml) -> tuple[Kind, list[SharedEffect]]:
+    """The kind without what is shared and was not found, with which it is the same model."""
+    told = [e for e, v in zip(fit.shared, fit.common, strict=True) if v > 0]
+    joints = kind.joints if any(e.joints for e in told) else ""
+    shared = kind.shared and any(not e.joints for e in told)
+    return kind._replace(shared=shared, joints=joints), told
+
+
+class _Choice:
+    """The search for the model with the smallest criterion, among those of these `names`."""
+
+    def __init__(self, readings: Readings, names: list[str]) -> None:
+        self.readings, self.names = readings, names
         self.trials: list[Trial] = []
         self.price = float(np.log(max(readings.e.size - readings.n_parameters, 3)))
         self.best: tuple[float, Kind, Reml] | None = None
         self.tests: list[NoiseTest] = []
 
     def result(self, T: Array) -> NoiseFit:
-        readings = self.readings
+        readings, names = self.readings, self.names
         could_share = bool(shared_effects(STRUCTURES["independent"](readings).sets, readings.size))
-        names = _supported(readings)
         for name in names:
             self.attempt(Kind(name, could_share))
         if self.best is None:
@@ -203,8 +226,8 @@ class _Choice:
             if self.readings.visits is not None and self.readings.visits.drifts:
                 self._with_time(names[0])
         _, kind, fit = self.best
-        tests, trials = tuple(self.tests), tuple(self.trials)
-        return _result(kind.name, fit, T, trials, _reason(kind.name, self.trials), tests)
+        reason, trials = _reason(kind.name, self.trials), tuple(self.trials)
+        return _result(kind.name, fit, T, trials, reason, tuple(self.tests))
 
     def attempt(self, kind: Kind, lasting: float | None = None) -> None:
         """Fit a kind of noise and keep it where it is better than what there is."""
@@ -212,12 +235,7 @@ class _Choice:
             fit = _fitted(self.readings, kind, self.best[2] if self.best else None, lasting)
         except InsufficientDataError:
             return
-        told = [e for e, v in zip(fit.shared, fit.common, strict=True) if v > 0]
-        # Where none was found, it is the same model without.
-        kind = kind._replace(
-            shared=kind.shared and any(not e.joints for e in told),
-            joints=kind.joints if any(e.joints for e in told) else "",
-        )
+        kind, told = _found(kind, fit)
         own, common = fit.structure.n_own, len(told)
         if fit.structure.shrunk:
             own = self.readings.size + 2  # means of log θ and its two variances
@@ -765,21 +783,9 @@ def weights_of(noise: NoiseFit, readings: Readings) -> Weights:
     ]
     columns = noise.columns(readings)[:, :, k:].reshape(n * size, -1)
     deviation = np.tile(np.sqrt(kinds), columns.shape[1] // size)
-    return weights.with_common(columns * deviation, time_blocks(readings, noise.lasting))
-
-
-FEWEST_BLOCKS, MOST_BLOCKS = 5, 10
-
-
-def time_blocks(readings: Readings, lasting: float) -> IntArray:
-    """Blocks (N,) of whole configurations that follow each other in time, as long as what drifts
-    is `lasting`, if that makes neither too few nor too many."""
-    assert readings.visits is not None
-    number = int(np.clip(round(1 / lasting), FEWEST_BLOCKS, MOST_BLOCKS))
-    _, code = np.unique(readings.configuration, return_inverse=True)
-    when = np.bincount(code, readings.visits.place[:, 0]) / np.bincount(code)
-    rank = np.argsort(np.argsort(when, kind="stable"))
-    return (rank * min(number, len(when)) // len(when))[code]
+    return weights.with_common(
+        columns * deviation, readings.visits.blocks(readings.configuration, noise.lasting)
+    )
 
 
 def _sight(model: Model, observed: Observations) -> tuple[Array | None, Array | None]:

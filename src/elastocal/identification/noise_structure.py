@@ -94,6 +94,14 @@ class Readings:
         parts = {k: v[chosen] for k, v in parts.items() if v is not None}
         return replace(self, **parts, visits=own)
 
+    def sample(self, n: int) -> Readings:
+        """Those of whole configurations at random, about n of them; all where they are no more."""
+        if len(self) <= n:
+            return self
+        _, code, count = np.unique(self.configuration, return_inverse=True, return_counts=True)
+        order = np.random.default_rng(0).permutation(len(count))
+        return self.take(np.isin(code, order[: np.searchsorted(np.cumsum(count[order]), n) + 1]))
+
     def by_visit(self, apart: bool = True) -> Readings:
         """The same with repeats of different visits `apart`, or all together."""
         return self if apart == self.apart else replace(self, apart=apart)

@@ -7,117 +7,13 @@ from functools import cached_property
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy import linalg, sparse, special
+from scipy import linalg, special
 
 from elastocal.errors import InsufficientDataError
+from elastocal.identification.correlated_stacks import ClusterSums, Stack, Whitened, stacks
 from elastocal.identification.covariance import Covariance
 from elastocal.identification.noise_structure import RepeatSets, SharedEffect, Structure
-from elastocal.identification.weighted_problem import WhitenedBlocks
-from elastocal.units import Array, BoolArray, IntArray
-
-# Clusters of correlated sets of repeats, stacked by size: linear algebra runs on whole stacks.
-
-MOST_NUMBERS = 4_000_000  # in a temporary array of a stack
-
-
-@dataclass(frozen=True)
-class Stack:
-    """G clusters of n rows each: B (G, n, p), e (G, n) and V = Σ_l θ[index[g, l]] part[g, l].
-
-    `index` (G, L) into the K variances, `part` (G, L, n, n); unused places of a cluster hold
-    index 0 and a zero part.
-    """
-
-    sets: IntArray  # (G, sets per cluster)
-    B: Array
-    e: Array
-    index: IntArray
-    part: Array
-    K: int
-
-    @cached_property
-    def uniform(self) -> bool:
-        """Whether all clusters have the same variances at the same places."""
-        return bool((self.index == self.index[0]).all())
-
-    @cached_property
-    def pairs(self) -> IntArray:
-        """Place (G·L·L,) of each pair of a cluster's variances in a flat (K, K) matrix."""
-        return (self.index[:, :, None] * self.K + self.index[:, None, :]).ravel()
-
-    @cached_property
-    def gather(self) -> sparse.csr_array:
-        """(K, G·L): sums per variance what is given per cluster and place."""
-        flat = self.index.ravel()
-        ones = np.ones(len(flat))
-        return sparse.csr_array((ones, (flat, np.arange(len(flat)))), shape=(self.K, len(flat)))
-
-
-def stacks(structure: Structure, shared: tuple[SharedEffect, ...]) -> list[Stack]:
-    """The clusters of a structure: a configuration where effects are shared, else a set."""
-    sets = structure.sets
-    label = sets.configuration if shared or structure.faster else np.arange(len(sets))
-    _, cluster, count = np.unique(label, return_inverse=True, return_counts=True)
-    order = np.argsort(cluster, kind="stable")
-    starts = np.concatenate([[0], np.cumsum(count)[:-1]])
-    found = []
-    size, p = sets.e.shape[1], sets.B.shape[2]
-    for m in np.unique(count):
-        groups = np.flatnonzero(count == m)
-        more = len(shared) + len(structure.faster)
-        n, parts = int(m) * size, structure.index.shape[1] * int(m) + more
-        step = max(1, MOST_NUMBERS // (parts * n * (n + p) + parts * p * p))
-        for first in range(0, len(groups), step):
-            members = order[starts[groups[first : first + step], None] + np.arange(m)]
-            found.append(_stack(structure, shared, members))
-    return found
-
-
-def _stack(structure: Structure, shared: tuple[SharedEffect, ...], members: IntArray) -> Stack:
-    sets = structure.sets
-    G, m = members.shape
-    size, p = sets.e.shape[1], sets.B.shape[2]
-    index, part = _own(structure, members)
-    n_own = len(structure.names)
-    # What is left of a course has its variances, which are the last of the structure's.
-    first = n_own - len(structure.faster)
-    for k, effect in enumerate((*structure.faster, *shared), first):
-        block = effect.product(members, effect, members)
-        part = np.concatenate([part, block.reshape(G, 1, m * size, m * size)], axis=1)
-        index = np.concatenate([index, np.full((G, 1), k)], axis=1)
-    B = sets.B[members].reshape(G, m * size, p)
-    e = sets.e[members].reshape(G, m * size)
-    return Stack(members, B, e, index, part, n_own + len(shared))
-
-
-def _own(structure: Structure, members: IntArray) -> tuple[IntArray, Array]:
-    """Own variances of each cluster, each once: index (G, L) and part (G, L, n, n)."""
-    G, m = members.shape
-    size = structure.sets.e.shape[1]
-    index = structure.index[members].reshape(G, -1)  # (G, m * L)
-    if (index.reshape(G, m, -1) == index.reshape(G, m, -1)[:, :1]).all():
-        place = np.tile(np.arange(index.shape[1] // m), m)[None].repeat(G, axis=0)
-        distinct = index[:, : index.shape[1] // m]
-    else:
-        distinct, place = _distinct(index)
-    L = distinct.shape[1]
-    blocks = structure.mean_matrix[members]  # (G, m, L0, size, size)
-    part = np.zeros((G, L, m, size, m, size))
-    place = place.reshape(G, m, -1)
-    g = np.arange(G)
-    for k in range(m):
-        for j in range(place.shape[2]):
-            part[g, place[:, k, j], k, :, k, :] += blocks[:, k, j]
-    return distinct, part.reshape(G, L, m * size, m * size)
-
-
-def _distinct(index: IntArray) -> tuple[IntArray, IntArray]:
-    """Different entries of each row (G, L), padded with 0, and where each entry stands in it."""
-    rows = [np.unique(row, return_inverse=True) for row in index]
-    L = max(len(values) for values, _ in rows)
-    distinct = np.array([np.pad(values, (0, L - len(values))) for values, _ in rows])
-    return distinct, np.array([place.ravel() for _, place in rows])
-
+from elastocal.units import Array, BoolArray
 
 # Restricted likelihood of variances, its slope and information, and the estimate under them.
 #
@@ -129,18 +25,6 @@ def _distinct(index: IntArray) -> tuple[IntArray, IntArray]:
 # with Φ = (BᵀV⁻¹B)⁻¹.  Repeats enter as their means, and their scatter as Wishart terms.
 
 LEAST_TOLD = 1e-9  # of the information on θ_k that there would be if Δx were known
-
-
-@dataclass(frozen=True)
-class Whitened:
-    """A stack under V = R Rᵀ: R⁻¹ (G, n, n), A_l = R⁻¹ V_l R⁻ᵀ (G, L, n, n), R⁻¹B, R⁻¹e, log|V|."""
-
-    stack: Stack
-    inverse: Array
-    A: Array
-    B: Array
-    e: Array
-    log_det: float
 
 
 @dataclass(frozen=True)
@@ -179,9 +63,10 @@ def evaluate(structure: Structure, stacked: list[Stack], theta: Array) -> State:
     """
     sets = structure.sets
     p, size = sets.B.shape[2], sets.e.shape[1]
-    whitened = [_whiten(stack, theta) for stack in stacked]
-    normal = sum((np.tensordot(w.B, w.B, ((0, 1), (0, 1))) for w in whitened), np.zeros((p, p)))
-    right = sum((np.tensordot(w.B, w.e, ((0, 1), (0, 1))) for w in whitened), np.zeros(p))
+    whitened = [stack.under(theta) for stack in stacked]
+    normal, right, squares = np.zeros((p, p)), np.zeros(p), 0.0
+    for N, r, square in (w.normal() for w in whitened):
+        normal, right, squares = normal + N, right + r, squares + square
     try:
         factor = linalg.cholesky(normal, lower=True)
     except linalg.LinAlgError:
@@ -190,7 +75,7 @@ def evaluate(structure: Structure, stacked: list[Stack], theta: Array) -> State:
         ) from None
     x = linalg.cho_solve((factor, True), right)
     Phi = linalg.cho_solve((factor, True), np.eye(p))
-    squares = sum(float(w.e.ravel() @ w.e.ravel()) for w in whitened) - float(right @ x)
+    squares -= float(right @ x)
     repeated = sets.dof > 0
     single = np.einsum("cl,clij->cij", theta[structure.index[repeated]], structure.matrix[repeated])
     inner = np.linalg.inv(single)
@@ -207,42 +92,18 @@ def evaluate(structure: Structure, stacked: list[Stack], theta: Array) -> State:
 def slope(structure: Structure, state: State) -> Slope:
     """Score and information of θ at a state."""
     K, p = len(state.theta), len(state.x)
-    score, summed, D = np.zeros(K), np.zeros((K, p * p)), np.zeros((K, p))
-    known, mean = np.zeros(K), np.zeros(K)
-    twice_expected, product = np.zeros(K * K), np.zeros(K * K)
+    w = ClusterSums.of(state.whitened, state.x, state.Phi)
+    taken = 0.5 * w.C.reshape(K, p * p) @ state.Phi.ravel()
+    score, mean = 0.5 * (w.squares - w.trace) + taken, 0.5 * w.trace - taken
     half = linalg.cholesky(state.Phi, lower=True)
-    for w in state.whitened:
-        G, L = w.stack.index.shape
-        flat = w.stack.index.ravel()
-        z = w.e - w.B @ state.x
-        AB = w.A @ w.B[:, None]  # (G, L, n, p)
-        Az = (w.A @ z[:, None, :, None])[..., 0]  # (G, L, n)
-        if w.stack.uniform:
-            whole = AB.transpose(1, 0, 2, 3).reshape(L, -1, p)
-            np.add.at(summed, flat[:L], (w.B.reshape(-1, p).T @ whole).reshape(L, -1))
-        else:
-            summed += w.stack.gather @ (w.B.transpose(0, 2, 1)[:, None] @ AB).reshape(G * L, -1)
-        D += w.stack.gather @ (Az @ w.B).reshape(-1, p)
-        squares = (Az @ z[:, :, None])[..., 0]
-        trace = np.trace(w.A, axis1=2, axis2=3)
-        score += np.bincount(flat, 0.5 * (squares - trace).ravel(), K)
-        mean += np.bincount(flat, 0.5 * trace.ravel(), K)
-        spread, whole = (AB @ half).reshape(G, L, -1), w.A.reshape(G, L, -1)
-        known += np.bincount(flat, 0.5 * (whole**2).sum(axis=2).ravel(), K)
-        local = whole @ whole.transpose(0, 2, 1) - 2 * spread @ spread.transpose(0, 2, 1)
-        twice_expected += np.bincount(w.stack.pairs, local.ravel(), K * K)
-        product += np.bincount(w.stack.pairs, (Az @ Az.transpose(0, 2, 1)).ravel(), K * K)
-    C = summed.reshape(K, p, p)
-    taken = 0.5 * summed @ state.Phi.ravel()
-    score, mean = score + taken, mean - taken
-    rotated = (half.T @ C @ half).reshape(K, -1)
-    information = 0.5 * (twice_expected.reshape(K, K) + rotated @ rotated.T)
+    rotated = (half.T @ w.C @ half).reshape(K, -1)
+    information = 0.5 * (w.twice_expected + rotated @ rotated.T)
     # −∂²ℓ/∂θ_k∂θ_l = eᵀP V_k P V_l P e − ½ tr(P V_k P V_l)
-    Dh = D @ half
-    observed = product.reshape(K, K) - Dh @ Dh.T - information
+    Dh = w.D @ half
+    observed = w.product - Dh @ Dh.T - information
     _within(structure, state, score, mean, information, observed)
-    told = np.diag(information) > LEAST_TOLD * known
-    return Slope(score, information, observed, C, told, mean)
+    told = np.diag(information) > LEAST_TOLD * 0.5 * w.known
+    return Slope(score, information, observed, w.C, told, mean)
 
 
 def _within(
@@ -271,14 +132,6 @@ def _within(
     product = (product + product.transpose(0, 2, 1)) / 2
     information += np.bincount(pairs, expected.ravel(), K * K).reshape(K, K)
     observed += np.bincount(pairs, (product - expected).ravel(), K * K).reshape(K, K)
-
-
-def _whiten(stack: Stack, theta: Array) -> Whitened:
-    G, L, n, _ = stack.part.shape
-    V = (theta[stack.index][:, None] @ stack.part.reshape(G, L, -1)).reshape(G, n, n)
-    inverse, B, e, log_det = WhitenedBlocks.of(V, stack.B, stack.e)
-    A = inverse[:, None] @ stack.part @ inverse.transpose(0, 2, 1)[:, None]
-    return Whitened(stack, inverse, A, B, e, log_det)
 
 
 # Variances by restricted maximum likelihood: Newton and Fisher steps, variances kept ≥ 0.
@@ -604,12 +457,7 @@ def kenward_roger(fit: Reml, combinations: Array | None = None) -> tuple[Array, 
     p = len(Phi)
     middle = np.zeros((p, p))
     for w in fit.state.whitened:
-        index = w.stack.index
-        G, L = index.shape
-        AB = w.A @ w.B[:, None]  # (G, L, n, p)
-        weight = W[index[:, :, None], index[:, None, :]]
-        mixed = (weight @ AB.reshape(G, L, -1)).reshape(AB.shape)
-        middle += np.tensordot(AB, mixed, ((0, 1, 2), (0, 1, 2)))
+        middle += w.between(W)
     mixed = (W @ C.reshape(len(W), -1)).reshape(C.shape)
     middle -= (C @ Phi @ mixed).sum(axis=0)
     # No less than zero but for rounding, which shows where variances differ by many powers of ten.

@@ -117,7 +117,7 @@ def _stationary(problem: Design, z: Array) -> Array:
 # Least trimmed squares: the fit of the majority, whatever the rest says.
 
 STARTS = 500
-FINALISTS = 10
+FINALISTS, FEW = 10, 3
 SEARCH_ROWS = 2000
 STEPS = 2  # of every start before the best are chosen
 TOGETHER = 100  # starts whose residuals are held at a time
@@ -143,18 +143,26 @@ def least_trimmed_squares(
     need = min(-(-p // size) + 1, n)
     subsets = np.array([rng.choice(len(search), need, replace=False) for _ in range(starts)])
     shifts, costs = _searched(B3[search], e2[search], subsets)
-    finalists = shifts[np.argsort(costs, kind="stable")[:FINALISTS]]
-    best, best_cost = np.zeros(p), np.inf
-    for shift in [*finalists, np.zeros(p)]:
-        cost = np.inf
-        for _ in range(100):
-            previous = cost
-            shift, cost = _concentrate(B3, e2, shift)
-            if cost >= previous * (1 - 1e-10):
-                break
-        if cost < best_cost:
-            best, best_cost = shift, cost
-    return best
+    finalists = [*shifts[np.argsort(costs, kind="stable")[:FINALISTS]], np.zeros(p)]
+    if len(search) < n:  # many end at the same fit: all readings decide among the best few
+        ended = sorted((_ended(B3[search], e2[search], one) for one in finalists), key=_cost)
+        finalists = [shift for shift, _ in ended[:FEW]]
+    return min((_ended(B3, e2, one) for one in finalists), key=_cost)[0]
+
+
+def _cost(ended: tuple[Array, float]) -> float:
+    return ended[1]
+
+
+def _ended(B: Array, e: Array, shift: Array) -> tuple[Array, float]:
+    """Where concentration steps from `shift` end, and the trimmed cost there."""
+    cost = np.inf
+    for _ in range(100):
+        previous = cost
+        shift, cost = _concentrate(B, e, shift)
+        if cost >= previous * (1 - 1e-10):
+            break
+    return shift, cost
 
 
 def _searched(B: Array, e: Array, subsets: NDArray[np.int64]) -> tuple[Array, Array]:

@@ -30,6 +30,7 @@ from elastocal.identification.weighted_problem import (
     each,
     evaluate,
     is_large,
+    is_reduced,
     merge,
     partition,
     regressor,
@@ -534,11 +535,11 @@ def bent(solution: Solution, covariance: Array) -> Array:
 def tied_fit(problem: Problem, sizes: Array, tolerance: float) -> Fit:
     """Fit of all free parameters with weak ties, scaled by a noise level found on the way.
 
-    A large table starts where such a fit to a sample of it ends.
+    Many readings start where such a fit to a sample of them ends.
     """
-    x = problem.x0
-    if problem.large:
-        part = sample(problem.parts, SAMPLE)
+    x, n = problem.x0, len(problem.observations.lead)
+    if is_reduced(problem.observations, int((~problem.model.shrunk).sum())):
+        part = sample(problem.parts, min(SAMPLE, n // 4))
         rough = replace(problem, observations=part.observations, weights=part.weights)
         found = _tied_from(rough, sizes, x, _misfit(rough), tolerance)
         try:

@@ -22,6 +22,7 @@ from elastocal.units import Array, BoolArray, IntArray
 # tested with the first.
 LASTING = (0.2, 0.1, 0.4, 0.05, 0.8)
 LONGEST = max(LASTING)
+FEWEST_BLOCKS, MOST_BLOCKS = 5, 10  # of time
 
 
 @dataclass(frozen=True)
@@ -67,6 +68,15 @@ class VisitRecord:
         """Loadings (N, m) on what the waves leave of the course's variance at each row's time."""
         left = 1 - (self._each(lasting) ** 2).sum(axis=2)
         return self.share * np.sqrt(np.maximum(left, 0.0))
+
+    def blocks(self, configuration: IntArray, lasting: float) -> IntArray:
+        """Blocks (N,) of whole configurations that follow each other in time, as long as what
+        drifts is `lasting`, if that makes neither too few nor too many."""
+        number = int(np.clip(round(1 / lasting), FEWEST_BLOCKS, MOST_BLOCKS))
+        _, code = np.unique(configuration, return_inverse=True)
+        when = np.bincount(code, self.place[:, 0]) / np.bincount(code)
+        rank = np.argsort(np.argsort(when, kind="stable"))
+        return np.asarray((rank * min(number, len(when)) // len(when))[code], dtype=np.int64)
 
     def _each(self, lasting: float) -> Array:
         return course_waves(self.place.ravel(), lasting).reshape(*self.place.shape, -1)

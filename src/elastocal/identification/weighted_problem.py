@@ -279,12 +279,20 @@ Span = tuple[int, int]
 # part keeps the evaluation of B at full speed, and the copies that QR makes small.
 LARGE = 2**21
 PART = 2**21
+# From here on a fit steps on R factors, whose digits suffice: what they leave of a step is 1e-9 of
+# a standard deviation, and the exact solver costs more than all else.
+MANY = 2**18
 OF_A_MARKER = 30  # observations of each marker at least, where there are as many, in a sample
 
 
 def is_large(observed: Observations, n_parameters: int) -> bool:
     """Whether B of all parameters is too large to be formed at once."""
     return len(observed.value) * n_parameters > LARGE
+
+
+def is_reduced(observed: Observations, n_parameters: int) -> bool:
+    """Whether a fit works on the R factor of B."""
+    return len(observed.value) * n_parameters > min(MANY, LARGE)
 
 
 @dataclass(frozen=True)
@@ -349,10 +357,10 @@ def part_of(observed: Observations, weights: Weights, index: IntArray) -> Part:
         table = observed.table.take(_run(observed.lead[index]))
         own = Observations(observed.kind, value, alone(len(index)), np.arange(len(index)), table)
     inside = None if weights.whiten is None else weights.whiten[_run(rows)][:, _run(rows)]
-    alone = replace(weights, whiten=inside, low=None, common=None, together=None)
-    if weights.common is None or weights.together is None:
-        return Part(index, rows, own, alone)
-    return Part(index, rows, own, alone.with_common(weights.common[rows], weights.together[index]))
+    mine = replace(weights, whiten=inside, low=None, common=None, together=None)
+    if weights.common is not None and weights.together is not None:
+        mine = mine.with_common(weights.common[rows], weights.together[index])
+    return Part(index, rows, own, mine)
 
 
 def _run(index: IntArray) -> IntArray | slice:

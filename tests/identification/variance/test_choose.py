@@ -75,6 +75,20 @@ def test_variances_are_the_simulated_ones():
     np.testing.assert_allclose(np.median(stated, axis=0), 1.0, rtol=0.1)
 
 
+@pytest.mark.parametrize("kind", ["axis", "polar"])
+def test_a_sample_of_many_readings_chooses_and_all_tell_the_variances(kind, monkeypatch):
+    r = readings(replace(BASE, configurations=60), 9)
+    r = r.moved(drawn(kind, np.random.default_rng(5), r))
+    by_all = estimate_noise(r)
+    monkeypatch.setattr("elastocal.identification.noise_choice.CHOSEN_FROM", 300)
+    found = estimate_noise(r)
+    assert found.kind == by_all.kind == kind
+    np.testing.assert_allclose(found.fit.own, by_all.fit.own, rtol=1e-6)
+    np.testing.assert_allclose(found.x, by_all.x, rtol=1e-6)
+    assert "chosen from 300 readings at random, estimated from all" in found.reason
+    assert "at random" not in by_all.reason
+
+
 def test_the_reason_names_what_came_next():
     r = readings(BASE, 9)
     found = estimate_noise(r.moved(drawn("axis", np.random.default_rng(0), r)))

@@ -8,7 +8,7 @@ from scipy import linalg, stats
 
 from elastocal.errors import InputError
 from elastocal.identification import Readings, estimate_noise, kenward_roger
-from elastocal.identification.noise_choice import NoiseFit, time_blocks, weights_of
+from elastocal.identification.noise_choice import NoiseFit, weights_of
 from elastocal.identification.residuals import as_of_another_campaign, held_out_residual
 from elastocal.identification.visit_record import VisitRecord, course_waves
 
@@ -110,7 +110,7 @@ def test_weights_whiten_what_drifts_and_blocks_are_left_out_as_by_fits_to_the_ot
     B, e = r.B.reshape(len(V), -1), r.e.ravel()
     residual = e - B @ found.x
     held = held_out_residual(B, residual, weights, r.configuration, 3)
-    block = np.repeat(time_blocks(r, found.lasting), 3)
+    block = np.repeat(r.visits.blocks(r.configuration, found.lasting), 3)
     assert len(np.unique(block)) == 5
     for b in range(5):
         others = block != b
