@@ -24,6 +24,7 @@ from elastocal.diagnosis import (
     posterior,
     project,
 )
+from elastocal.diagnosis.noise_floor import curved_likelihood, prior_curvature
 from elastocal.measurements import visits
 from elastocal.model import Model
 
@@ -60,6 +61,23 @@ def test_the_slope_is_that_of_finite_differences(seed: int, stated: bool) -> Non
     for k, step in enumerate(h * np.eye(len(at))):
         up, down = (likelihood(data, NoiseValues.of_logs(at + s * step))[0] for s in (1, -1))
         assert slope[k] == pytest.approx((up - down) / (2 * h), rel=1e-5, abs=1e-5)
+
+
+@pytest.mark.parametrize("stated", [True, False])
+def test_the_curvature_is_that_of_the_dense_gaussian(stated: bool) -> None:
+    """tr P V_k P V_l with P dense but for what links configurations, which the fit's few columns
+    make small; V_k by differences of the dense covariance."""
+    data, at, h = random_data(3, stated=stated), NOISE.logs(), 1e-4
+    data = replace(data, X=1e-9 * data.X)  # P = V⁻¹: configurations are independent
+    rows = used_rows(data)
+    inverse = np.linalg.inv(dense_noise(data, NOISE))
+    both = [[NoiseValues.of_logs(at + s), NoiseValues.of_logs(at - s)] for s in h * np.eye(len(at))]
+    parts = [(dense_noise(data, a) - dense_noise(data, b)) / (2 * h) for a, b in both]
+    assert len(inverse) == len(rows)
+    PV = [inverse @ V for V in parts]
+    expected = np.array([[np.vdot(a.T, b) for b in PV] for a in PV])
+    expected += prior_curvature(stated, data.G.shape[2])
+    np.testing.assert_allclose(curved_likelihood(data, NOISE)[2], expected, rtol=1e-5, atol=1e-5)
 
 
 @pytest.mark.parametrize(("readings", "visits"), [(3, 3), (6, 1), (4, 2)])

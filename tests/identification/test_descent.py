@@ -82,3 +82,20 @@ def test_descent_within_bounds_and_ties_is_the_minimum():
 def test_descent_says_when_it_has_not_arrived():
     found = descend(objective_of(rosenbrock, rosenbrock_slope, 2), np.array([-1.2, 1.0]), 1e-12, 3)
     assert not found.converged and found.evaluations == 3 and "step limit" in found.reason
+
+
+@pytest.mark.parametrize(("steep", "most"), [(10.0, 30), (20.0, 75), (50.0, 100)])
+def test_a_narrow_valley_takes_few_evaluations(steep, most):
+    """Full steps fail along it, and long ones with much damping gain nothing: a failed step is cut
+    to a length at which the next one gains."""
+
+    def residual(u):
+        return np.array([steep * (u[1] - u[0] ** 2), 1 - u[0], 1e-3])
+
+    def slope(u):
+        return np.array([[-2 * steep * u[0], steep], [-1.0, 0.0], [0.0, 0.0]])
+
+    start = np.array([-1.2, 1.0])
+    found = descend(objective_of(residual, slope, 2), start, 1e-8, 200)
+    assert found.converged and found.evaluations < most
+    np.testing.assert_allclose(found.u, [1, 1], atol=1e-6)

@@ -171,6 +171,14 @@ def log_prior(stated: bool, noise: NoiseValues) -> tuple[float, Array]:
     return value, slope
 
 
+def prior_curvature(stated: bool, joints: int) -> Array:
+    """Second derivatives (1 + 2 joints, 1 + 2 joints) of −2 log prior."""
+    one, common = np.eye(joints), np.full((joints, joints), REPEATABILITY_SPREAD**2)
+    factor = np.array([[STATED_SPREAD if stated else UNSTATED_SPREAD]]) ** 2
+    own = factor, SHARED_SPREAD**2 * one, JOINT_SPREAD**2 * one + common
+    return np.asarray(2 * linalg.block_diag(*map(np.linalg.inv, own)))
+
+
 # Data under one noise: what is left of the residual, and how probable the noise is.
 #
 # With V the noise's covariance and the fitted parameters β ~ N(0, Λ⁻¹) integrated out,
@@ -296,11 +304,17 @@ def posterior(data: NoisyData, noise: NoiseValues) -> float:
 
 
 def likelihood(data: NoisyData, noise: NoiseValues) -> tuple[float, Array]:
-    """−2 log of marginal likelihood times prior, and its slope in the logarithms (1 + 2 joints,).
+    """−2 log of marginal likelihood times prior, and slope (1 + 2 joints,) in the logarithms."""
+    return curved_likelihood(data, noise)[:2]
+
+
+def curved_likelihood(data: NoisyData, noise: NoiseValues) -> tuple[float, Array, Array]:
+    """−2 log of marginal likelihood times prior, its slope in the logarithms (1 + 2 joints,), and
+    the curvature to expect there, tr P V_k P V_l, of each configuration by itself.
 
     The slope wants gᵀQg, Q = P − uuᵀ, of the joints' columns g in every visit and configuration:
     with g̃ = K⁻¹g, H̃ = X̃L⁻ᵀ and ẽ = K⁻¹(r − Xβ̂) it is g̃ᵀ(1 − H̃H̃ᵀ − ẽẽᵀ)g̃.  What is left of V
-    is the instrument's, and tr QV = n − tr (M + Λ)⁻¹M − ẽᵀẽ.
+    is the instrument's: tr QV = n − tr (M + Λ)⁻¹M − ẽᵀẽ, and tr P V P V_l = tr P V_l.
     """
     of, at = data.counting, Weighted.of(data, noise)
     L, z, marginal = at.factored(data.precision)
@@ -311,21 +325,36 @@ def likelihood(data: NoisyData, noise: NoiseValues) -> tuple[float, Array]:
     # Few rows are divided by L rather than many.
     few = g.shape[1] < g.shape[2]
     Q, X, e = (g @ back, g @ at.X, g @ e) if few else (np.eye(g.shape[2]), at.X, e)
-    H = _divided(X, L)
-    Q = Q - H @ H.transpose(0, 2, 1) - e @ e.transpose(0, 2, 1)
-    J = data.G.shape[2]
-    each = (Q if few else g @ Q @ back).reshape(len(g), -1, J, g.shape[1] // J, J)
-    by_visit, by_block = np.einsum("cvjvj->j", each), np.einsum("cvjwj->j", each)
+    H, J = _divided(X, L), data.G.shape[2]
+    P = Q - H @ H.transpose(0, 2, 1)
+    shape = len(g), g.shape[1] // J, J, g.shape[1] // J, J
+    P, Q = ((N if few else g @ N @ back).reshape(shape) for N in (P, P - e @ e.transpose(0, 2, 1)))
     inverse = linalg.lapack.dtrtri(L, lower=1)[0]
     fitted = len(L) - float((inverse**2 @ at.prior(data.precision)).sum())
-    of_shared = 2 * (noise.joint * noise.shared) ** 2 * by_block
-    of_joint = 2 * noise.joint**2 * by_visit + of_shared
-    slope = np.concatenate([[whole - 2 * fitted - of_joint.sum()], of_shared, of_joint])
+    single, shared = 2 * noise.joint**2, 2 * (noise.joint * noise.shared) ** 2
+
+    def traces(N: Array, of_all: float) -> Array:
+        of_shared = shared * np.einsum("cvjwj->j", N)
+        of_joint = single * np.einsum("cvjvj->j", N) + of_shared
+        return np.concatenate([[of_all - of_joint.sum()], of_shared, of_joint])
+
     prior, prior_slope = log_prior(data.stated, noise)
-    return -2 * marginal + prior, slope + prior_slope
+    slope = traces(Q, whole - 2 * fitted) + prior_slope
+    # From gᵀPg of every two visits of a configuration: those of visits, of both, of configurations.
+    by_visit = P.sum(axis=3)
+    vv = np.outer(single, single) * np.einsum("cvjwk,cvjwk->jk", P, P)
+    vs = np.outer(single, shared) * np.einsum("cvjk,cvjk->jk", by_visit, by_visit)
+    ss = np.outer(shared, shared) * (by_visit.sum(axis=1) ** 2).sum(axis=0)
+    joints = np.block([[ss, vs.T + ss], [vs + ss, vv + vs + vs.T + ss]])
+    trace = traces(P, 2 * (data.n_rows - fitted))
+    across = 2 * trace[1:] - joints[J:].sum(axis=0)
+    alone = 2 * trace[0] - across[J:].sum()
+    curvature = np.block([[np.array([[alone]]), across[None]], [across[:, None], joints]])
+    return -2 * marginal + prior, slope, curvature + prior_curvature(data.stated, J)
 
 
 STRIDE, ROUNDS = 1.5, 10  # of the logarithms
+SCORED = 30  # steps by the expected curvature
 SOME = 250  # configurations that show where the optimum is
 ENOUGH, LEVEL = 1e-3, 3e-3  # change of −2ℓ, and its slope, at which a search ends
 
@@ -361,6 +390,44 @@ def balanced(data: NoisyData) -> NoiseValues:
 
 
 def _climbed(data: NoisyData, start: NoiseValues, enough: float) -> NoiseValues:
+    """Steps by the expected curvature, which few of them need; where they do not end, by L-BFGS."""
+    n = data.G.shape[2]
+    lower, upper = _limits(data)
+    theta = np.clip(start.logs(), lower, upper)
+    value, slope, curvature = curved_likelihood(data, NoiseValues.of_logs(theta))
+    for _ in range(SCORED):
+        free = ((theta > lower) | (slope < 0)) & ((theta < upper) | (slope > 0))
+        step = np.zeros(1 + 2 * n)
+        try:
+            factor = linalg.cho_factor(curvature[np.ix_(free, free)])
+        except linalg.LinAlgError:
+            break
+        step[free] = -linalg.cho_solve(factor, slope[free])
+        step = np.clip(theta + np.clip(step, -STRIDE, STRIDE), lower, upper) - theta
+        if -float(slope @ step) < enough:
+            return NoiseValues.of_logs(theta)
+        for length in (1.0, 0.5, 0.25, 0.0625):
+            tried = curved_likelihood(data, NoiseValues.of_logs(theta + length * step))
+            if tried[0] < value:
+                break
+        else:
+            break
+        theta, (value, slope, curvature) = theta + length * step, tried
+    return _climbed_far(data, NoiseValues.of_logs(theta), enough)
+
+
+def _limits(data: NoisyData) -> tuple[Array, Array]:
+    """Least and largest logarithms (1 + 2 joints,) that are tried."""
+    n = data.G.shape[2]
+    spread = STATED_SPREAD if data.stated else UNSTATED_SPREAD
+    least, most = np.log(SMALLEST_NOISE), np.log(LARGEST)
+    return (
+        np.array([-4 * spread, *[-5.0] * n, *[least] * n]),
+        np.array([4 * spread, *[5.0] * n, *[most] * n]),
+    )
+
+
+def _climbed_far(data: NoisyData, start: NoiseValues, enough: float) -> NoiseValues:
     n = data.G.shape[2]
     # Roughly the roots of −2ℓ's curvatures: a first step along its slope else is one of the factor.
     curved = np.sqrt([3 * data.n_rows, *[len(data.r) / 9] * n, *[len(data.r)] * n])
@@ -375,9 +442,7 @@ def _climbed(data: NoisyData, start: NoiseValues, enough: float) -> NoiseValues:
         value, slope = known[key]
         return value, slope.copy()
 
-    spread = STATED_SPREAD if data.stated else UNSTATED_SPREAD
-    lower = curved * np.array([-4 * spread, *[-5.0] * n, *[np.log(SMALLEST_NOISE)] * n])
-    upper = curved * np.array([4 * spread, *[5.0] * n, *[np.log(LARGEST)] * n])
+    lower, upper = (curved * limit for limit in _limits(data))
     theta = np.clip(curved * start.logs(), lower, upper)
     ftol = enough / max(abs(cost(theta)[0]), 1.0)
     # Step by step: one long stride of the line search ends where V is singular to rounding.

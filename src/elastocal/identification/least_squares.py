@@ -32,7 +32,8 @@ SETTLED = "the sum of squares no longer fell"
 NEGLIGIBLE = "the steps became negligible"
 EXHAUSTED = "the step limit was reached; the start may be far off or the data ill-conditioned"
 
-FIRST_DAMPING = 1e-3  # of the largest squared column, once a full step has failed
+LEAST_DAMPING = 1e-18  # of the largest squared column, once a full step has failed
+SHORTER = 0.3
 ROUNDING = 1e-12  # relative: what separates two evaluations at the minimum
 
 
@@ -97,6 +98,7 @@ def descend(objective: SumOfSquares, u: Array, tolerance: float, max_evaluations
     ending = objective.evaluate_last or objective.evaluate
     at = objective.evaluate(u)
     cost, damping, evaluations = objective.cost(u, at), 0.0, 1
+    failed = -1.0  # the damping that was too little a step ago
     while evaluations < max_evaluations:
         step, promised = objective.step(u, at, damping)
         last = promised <= tolerance * cost
@@ -108,18 +110,30 @@ def descend(objective: SumOfSquares, u: Array, tolerance: float, max_evaluations
             trial_cost = objective.cost(u + step, trial)
         except ElastocalError:
             trial, trial_cost = at, np.inf
-        if last and damping == 0:
+        if last and (damping == 0 or failed >= 0):  # more than what is left is not to be had
             kept = trial_cost <= cost * (1 + ROUNDING)
             at, u = (trial, u + step) if kept else (at, u)
             return Descent(u, at, True, SETTLED, evaluations)
         if cost - trial_cost > 1e-4 * promised:
             u, at, cost = u + step, trial, trial_cost
-            damping = damping / 10 if damping > 1e-9 * _steepest(at) else 0.0
+            less = damping / 10 if damping > LEAST_DAMPING * _steepest(at) else 0.0
+            damping, failed = (damping, failed / 100) if less <= failed else (less, failed)
         elif np.abs(step).max(initial=0.0) <= ROUNDING:
             return Descent(u, at, True, NEGLIGIBLE, evaluations)
         else:
-            damping = max(10 * damping, FIRST_DAMPING * _steepest(at))
+            failed, damping = damping, _shortened(objective, u, at, damping, step)
     return Descent(u, at, False, EXHAUSTED, evaluations)
+
+
+def _shortened(
+    objective: SumOfSquares, u: Array, at: Evaluation, damping: float, step: Array
+) -> float:
+    """The damping with which a step that failed has at most SHORTER of its length."""
+    longest = SHORTER * float(np.linalg.norm(step))
+    damping = max(10 * damping, LEAST_DAMPING * _steepest(at))
+    while np.linalg.norm(objective.step(u, at, damping)[0]) > longest:
+        damping *= 10
+    return damping
 
 
 def _steepest(at: Evaluation) -> float:
