@@ -77,10 +77,10 @@ def measure(size: str) -> Part:
     with tempfile.TemporaryDirectory() as name:
         folder = Path(name)
         cell = EXAMPLE / "cell.toml"
-        cases = [("blind check: 60 poses × 2 loads × 3 markers", EXAMPLE / "data.csv", 10)]
+        cases = [("blind check: 60 poses × 2 loads × 3 markers", EXAMPLE / "data.csv", 2.5)]
         for rows in ROWS[size]:
             data = simulated(folder, rows)
-            cases.append((f"simulated, {rows} rows", data, {10_000: 60}.get(rows, 0)))
+            cases.append((f"simulated, {rows} rows", data, {10_000: 15}.get(rows, 0)))
         for what, data, limit in cases:
             print(what, file=sys.stderr, flush=True)
             answer = folder / "diagnosis.json"
