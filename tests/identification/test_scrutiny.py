@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import itertools
 import json
 from dataclasses import replace
 
@@ -11,7 +12,7 @@ from support.calibration import SPRINGS, cell_of, measured, random_chain, table_
 from support.cells import random_poses
 
 from elastocal.cell.arm_description import CartesianNoise, Nominal, Tracker
-from elastocal.identification import judged
+from elastocal.identification import judged, scrutiny
 from elastocal.identification.identify import identify
 from elastocal.identification.options import Options
 from elastocal.identification.residuals import rms_3d
@@ -90,6 +91,29 @@ def test_residuals_alike_in_time_are_found_and_clean_ones_seldom(fitted):
     assert course.p < 0.01 and course.correlations[0] > course.band
     f = judged(replace(result, residual=drift.ravel())).finding("autocorrelated")
     assert f.severity == "care" and "random order" in f.remedy
+
+
+@pytest.mark.parametrize("size", [1, 3])
+def test_moments_over_permutations_are_those_of_all_orders(size):
+    mean = np.random.default_rng(size).standard_t(3, (6, size))
+    mean -= mean.mean(axis=0)
+    all_orders = (mean[list(order)] for order in itertools.permutations(range(6)))
+    sums = [float((m[:-1] * m[1:]).sum()) for m in all_orders]
+    assert scrutiny.over_permutations(mean) == pytest.approx((np.mean(sums), np.std(sums)))
+
+
+def test_many_visits_are_judged_by_the_moments(fitted, monkeypatch):
+    """25 visits already: the p-values are those of permutations to a few hundredths."""
+    observed = fitted[2].observations
+    rng = np.random.default_rng(2)
+    residuals = rng.normal(size=(20, 3 * len(observed.lead)))
+    drawn = [autocorrelation(e, observed) for e in residuals]
+    monkeypatch.setattr(scrutiny, "MOST_PERMUTED", 12)
+    found = [autocorrelation(e, observed) for e in residuals]
+    for one, other in zip(found, drawn, strict=True):
+        assert one.correlations == other.correlations
+        assert one.p == pytest.approx(other.p, abs=0.06)
+        assert one.band == pytest.approx(other.band, rel=0.15)
 
 
 def test_order_is_that_of_times_where_there_are_any(fitted):

@@ -166,7 +166,7 @@ def autocorrelation(residual: Array, observed: Observations) -> Autocorrelation 
     lags = range(1, min(LAGS, number // 4) + 1)
     found = tuple(float((mean[:-k] * mean[k:]).sum()) / total for k in lags)
     if number > MOST_PERMUTED:
-        centre, width = _over_permutations(mean)
+        centre, width = over_permutations(mean)
         p = float(special.ndtr((centre / total - found[0]) / (width / total)))
         band = float(special.ndtri(0.975)) * width / total
     else:
@@ -180,7 +180,7 @@ def autocorrelation(residual: Array, observed: Observations) -> Autocorrelation 
     return Autocorrelation(found, p, band, number, "times" if timed else "order of the rows")
 
 
-def _over_permutations(mean: Array) -> tuple[float, float]:
+def over_permutations(mean: Array) -> tuple[float, float]:
     """Mean and standard deviation of Σ m_i·m_{i+1} over all orders of the rows m of `mean` (n, k),
     which sum to zero.
 
