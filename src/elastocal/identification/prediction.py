@@ -350,7 +350,9 @@ def over_the_workspace(cell: Cell, model: Model, table: Measurements) -> NewPose
 
 def _loads(force: Array, observe: str) -> Array:
     """The forces (L, 3) of rows (n, 3), each once; of deflections those that deflect."""
-    forces = np.unique(np.round(force, 3), axis=0)
+    forces = np.round(force, 3)
+    changes = (forces[1:] != forces[:-1]).any(axis=1)  # sorting rows takes long
+    forces = np.unique(forces[np.concatenate([[True], changes])], axis=0)
     if observe == "deflection":
         forces = forces[(forces != 0).any(axis=1)]
     return forces if len(forces) else np.zeros((1, 3))
