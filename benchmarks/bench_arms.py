@@ -73,7 +73,7 @@ def truth(model: Model) -> np.ndarray:
 def poses(model: Model, n: int, loaded: bool = False, everything: bool = False) -> Measurements:
     """n rows at random joint angles, positions zero; every other row loaded where asked.
 
-    `everything` adds time, temperature and side of approach, which some effects ask for.
+    `everything` adds time, temperature, torques and side of approach, which some effects ask for.
     """
     rng = np.random.default_rng([SEED, n])
     low, high = finite_ranges(model.chain, *joint_limits(model.cell, model.chain))
@@ -96,4 +96,5 @@ def poses(model: Model, n: int, loaded: bool = False, everything: bool = False) 
         time=np.linspace(0.0, 7200.0, n) if everything else None,
         approach=np.where(rng.random(q.shape) < 0.5, -1.0, 1.0) if everything else None,
         temperature=np.linspace(20.0, 26.0, n) if everything else None,
+        torque=rng.normal(0.0, 500.0, q.shape) if everything else None,
     )
