@@ -143,6 +143,7 @@ SMALLEST = 1e-10  # of the start: a variance that falls below this (σ by 1e5) s
 # A variance that goes to zero falls by e with every Newton step in its logarithm, and the gain with
 # it.  Once no step promises more than this, one step takes it all the way.
 LITTLE = 1e-3
+LONGEST = 2.0  # step of a logarithm
 TINY = 1e-100  # stands for the variance of perfect data: its square is still a number
 
 
@@ -329,8 +330,9 @@ class _VarianceSearch:
 
     def along(self, state: State, value: float, step: Array) -> tuple[State, float] | None:
         """The first of ever shorter steps that raises the objective; None where none does."""
-        largest = float(np.abs(step[: self.own]).max(initial=0.0))
-        length = min(1.0, 2.0 / largest) if largest > 0 else 1.0
+        # Each by itself: one that rounding sends far must not keep the others where they are.
+        step, length = step.copy(), 1.0
+        step[: self.own] = np.clip(step[: self.own], -LONGEST, LONGEST)
         for _ in range(30):
             found = self.better(self.moved(state.theta, length * step), value)
             if found is not None:
