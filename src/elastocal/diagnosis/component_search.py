@@ -26,6 +26,7 @@ from elastocal.diagnosis.component_families import (
     with_scatter,
 )
 from elastocal.diagnosis.components import (
+    SOME,
     Component,
     FittedSum,
     Pool,
@@ -41,7 +42,7 @@ from elastocal.diagnosis.evidence import ANOTHER, log_prior_odds, spectrum
 from elastocal.diagnosis.hypotheses import Hypothesis, judged_together
 from elastocal.diagnosis.line_orders import families_of, order_posterior, ripples
 from elastocal.diagnosis.model_set import Item, ModelSet, extended, packed_columns
-from elastocal.diagnosis.noise_floor import NoiseValues, NoisyData, project
+from elastocal.diagnosis.noise_floor import NoiseValues, NoisyData, posterior, project
 from elastocal.model.effects.base import index
 from elastocal.model.effects.gears import GearSpectrum
 from elastocal.model.effects.gravity_sag import GravitySag, LinkWeights
@@ -79,7 +80,7 @@ def search_components(
         # A compliance that was fitted without weights is wrong, and so are their columns by it.
         full = about_sum(full, found)
     found = with_own_axes(found)
-    lined, data = False, found.sums.data
+    lined, data, whole = False, found.sums.data, None
     if len(full.blocks.member) <= FEW_POSES:
         # A curve takes up the lines of its joint as far as these few poses show them, and then
         # none of them stands out.
@@ -88,7 +89,7 @@ def search_components(
         first = _spared(completed(first, others))
         for _ in range(TWICE):
             before = first
-            first = completed(_with_lines(full, first), both)
+            first = whole = completed(_with_lines(full, first), both)
             if first.score <= before.score + GAINED:
                 break
         other = _wider(first, curves)
@@ -111,7 +112,8 @@ def search_components(
         found = wider
     progress("what can be left out")
     found = _swapped(full, with_own_axes(found), both)
-    found = completed(with_shorter_drifts(full, _spared(found)), both)
+    found = with_shorter_drifts(full, _spared(found))
+    found = found if found is whole else completed(found, both)
     if len(full.blocks.member) <= FEW_POSES:
         found = with_expected_families(full, found)
         found = with_likelier_orders(full, found)
@@ -619,23 +621,24 @@ def with_own_axes(found: FittedSum) -> FittedSum:
     data, size = found.sums.data, min(found.data.blocks.size, 3)
     if data.stated or size < 2:
         return found
-    used, axis = ~data.left_out, np.arange(data.r.shape[1]) % data.blocks.size
+    wide = found.without_these()
+    some = wide.every(max(1, len(wide.r) // SOME))  # that show the ratios
+    used, axis = ~some.left_out, np.arange(data.r.shape[1]) % data.blocks.size
     own = [used & (axis == i) for i in range(size)]
     cost = (size - 1) * float(np.log(AXES / np.sqrt(0.5 / own[0].sum())))
-    wide = found.without_these()
-    at = project(wide, found.noise)
-    equal, V = at.marginal, data.covariance
+    each = np.ones(len(axis))
     for _ in range(AXIS_STEPS):
+        at = project(replace(some, covariance=some.covariance * each[:, None] * each), found.noise)
         left = np.diagonal(at.P, axis1=1, axis2=2)
         ratio = np.array([(at.u[k] ** 2).sum() / left[k].sum() for k in own])
         ratio /= np.exp(np.log(ratio).mean())
         if np.abs(np.log(ratio)).max() < SETTLED:
             break
-        each = np.ones(len(axis))
-        each[axis < size] = np.sqrt(ratio)[axis[axis < size]]
-        V = V * each[:, None] * each
-        at = project(replace(wide, covariance=V), found.noise)
-    if at.marginal < equal + cost:
+        each[axis < size] *= np.sqrt(ratio)[axis[axis < size]]
+    V = data.covariance * each[:, None] * each
+    equal, own_axes = (posterior(replace(wide, covariance=c), found.noise)
+                       for c in (data.covariance, V))  # fmt: skip
+    if own_axes > equal - 2 * cost:
         return found
     other = replace(data, covariance=V)
     return fit_sum(other, found.components, found.noise, found.sizes)

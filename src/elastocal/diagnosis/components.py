@@ -26,7 +26,7 @@ from functools import cache, cached_property
 from typing import Literal
 
 import numpy as np
-from scipy import linalg, optimize, special
+from scipy import linalg, special
 
 from elastocal.diagnosis.hypotheses import Hypothesis
 from elastocal.diagnosis.model_set import spans_of
@@ -38,6 +38,7 @@ from elastocal.diagnosis.noise_floor import (
     fit_noise,
     log_prior,
     posterior,
+    scored_climb,
 )
 from elastocal.identification.smooth_prior import Standardised
 from elastocal.model.effects.base import Effect
@@ -264,6 +265,20 @@ class SumOfComponents:
     def spans(self) -> tuple[slice, ...]:
         return spans_of([c.width for c in self.components], len(self.weighted.z))
 
+    @cached_property
+    def waved(self) -> IntArray:
+        """Those components (W,) that have a length."""
+        return np.array([k for k, c in enumerate(self.components) if c.waves is not None], int)
+
+    @cached_property
+    def sized(self) -> Array:
+        """By how much (p + Σ k, 1 + K + W) the logarithms of prior variances grow with those of
+        sizes; zero where a noise's factor and lengths stand."""
+        out = np.zeros((len(self.weighted.z), 1 + len(self.components) + len(self.waved)))
+        for k, span in enumerate(self.spans):
+            out[span, 1 + k] = 2.0
+        return out
+
     def scaled(self, factor: float) -> SumOfComponents:
         """The same under e^factor times the noise."""
         w, a = self.weighted, float(np.exp(factor))
@@ -301,57 +316,59 @@ class SumOfComponents:
         return root, found, value
 
     def objective(self, theta: Array) -> tuple[float, Array, Array]:
-        """−2 log posterior of the logarithms, its slope and about its curvatures (1 + 2 K,)."""
-        K = len(self.components)
+        """−2 log posterior of the logarithms, its slope and its average information (1 + 2 K,
+        1 + 2 K): the mean of observed and expected curvature (Gilmour, Thompson and Cullis 1995,
+        Biometrics 51, 1440).
+
+        With A the coefficients' precision in units of their prior deviations and b their mean, two
+        parameters that change the logarithms of prior variances by s and t share sᵀb(1 − A⁻¹)bt.
+        """
+        K, waved = len(self.components), self.waved
         at = Sizes(float(theta[0]), theta[1 : K + 1], theta[K + 1 :])
         root, found, value = self.factored(at)
-        b, inverse = found.b, linalg.lapack.dtrtri(found.L, lower=1, overwrite_c=1)[0]
+        b, a2 = found.b, np.exp(2 * at.factor)
+        beta = root * b
+        rss = self.squares - 2 * float(beta @ self.weighted.z)
+        rss += float(beta @ (self.weighted.M @ beta))
+        inverse = linalg.lapack.dtrtri(found.L, lower=1, overwrite_c=1)[0]
         # A coefficient's posterior over its prior variance.
         left = np.einsum("ij,ij->j", inverse, inverse)
-        each = (1 - left) - b**2  # ∂(−2ℓ)/∂ log v
-        slope, curvature = np.zeros_like(theta), np.ones_like(theta)
-        for k, (c, span) in enumerate(zip(self.components, self.spans, strict=True)):
-            slope[1 + k], shown = 2 * each[span].sum(), (1 - left[span]) ** 2
-            curvature[1 + k] = 2 * (shown.sum() + self.pool.precision[k, k])
-            if c.waves is not None:
-                steep = c.shares(at.length[k])[1]
-                slope[1 + K + k] = each[span] @ steep
-                curvature[1 + K + k] += shown @ steep**2 / 2
+        each, changed = (1 - left) - b**2, self.sized.copy()  # ∂(−2ℓ)/∂ log v
+        for n, k in enumerate(waved, 1 + K):
+            changed[self.spans[k], n] = self.components[k].shares(at.length[k])[1]
+        index = np.concatenate([np.arange(1 + K), 1 + K + waved])
+        slope, information = np.zeros_like(theta), np.zeros((len(theta), len(theta)))
+        slope[index] = each @ changed
+        slope[0] = 2 * (self.rows - (len(left) - left.sum()) - rss / a2)
+        changed *= b[:, None]
+        half, own = inverse @ changed, changed.T @ changed
+        own[0] = own[:, 0] = 0.0
+        information[np.ix_(index, index)] = own - half.T @ half
+        of_noise = 2 * (inverse @ b)
+        information[0, index] = information[index, 0] = of_noise @ half
+        information[0, 0] = 4 * rss / a2 - float(of_noise @ of_noise)
         prior, of_sizes = self.pool.penalty(at.size)
         value += prior
         slope[1 : K + 1] += of_sizes
-        beta = root * b
-        a2 = np.exp(2 * at.factor)
-        M = self.weighted.M
-        rss = self.squares - 2 * float(beta @ self.weighted.z) + float(beta @ (M @ beta))
-        slope[0] = 2 * (self.rows - (len(left) - left.sum()) - rss / a2)
-        curvature[0] = 4 * self.rows
+        information[1 : K + 1, 1 : K + 1] += 2 * self.pool.precision
         if self.data.stated:
             value += (at.factor / 0.5) ** 2
             slope[0] += 2 * at.factor / 0.25
-        return value, slope, curvature
+            information[0, 0] += 2 / 0.25
+        return value, slope, information
 
-    def climbed(self, at: Sizes, steps: int) -> Sizes:
-        """The sizes after so many steps of a quasi-Newton search, in units of the roots of the
-        curvatures at its start: a noise's factor shows a hundred times better than a size."""
+    def climbed(self, at: Sizes, steps: int, factor_alone: bool = False) -> Sizes:
+        """The sizes after so many steps by the average information; the noise's factor alone, the
+        others as they are."""
         K = len(self.components)
-        bounds = [(at.factor - 4, at.factor + 4), *[(GONE - 1, LARGEST)] * K]
-        bounds += [c.lengths for c in self.components]
         theta = np.concatenate([[at.factor], at.size, at.length])
-        value, slope, curvature = self.objective(theta)
-        unit = 1 / np.sqrt(curvature)
-        begun = {(theta / unit).tobytes(): (value, slope)}
-
-        def cost(scaled: Array) -> tuple[float, Array]:
-            value, slope = begun.get(scaled.tobytes()) or self.objective(scaled * unit)[:2]
-            return value, slope * unit
-
-        found = optimize.minimize(
-            cost, theta / unit, jac=True, method="L-BFGS-B",
-            bounds=np.array(bounds) / unit[:, None],
-            options={"maxiter": steps, "ftol": 2e-7, "gtol": 1e-2},
-        )  # fmt: skip
-        x = found.x * unit
+        lower, upper = theta.copy(), theta.copy()
+        lower[0], upper[0] = at.factor - 4, at.factor + 4
+        if not factor_alone:
+            lengths = np.array([c.lengths for c in self.components]).reshape(K, 2)
+            lower[1:] = np.concatenate([np.full(K, GONE - 1), lengths[:, 0]])
+            upper[1:] = np.concatenate([np.full(K, LARGEST), lengths[:, 1]])
+        x = scored_climb(self.objective, theta, lower, upper, SETTLED, steps)[0]
         return Sizes(float(x[0]), x[1 : K + 1], x[K + 1 :])
 
     def earned(self, at: Sizes) -> Array:
@@ -385,25 +402,23 @@ def posed(
 
     What a sum that is `known` of the same data has summed up under this noise is not summed anew.
     """
-    own, p, widths = Weighted.of(data, noise), data.X.shape[2], [c.width for c in components]
+    p, widths = data.X.shape[2], [c.width for c in components]
     total = p + sum(widths)
     spans = spans_of(widths, total)
-    old = {} if known is None or known.noise is not noise else dict(
-        zip(map(id, known.components), known.spans, strict=True)
-    )  # fmt: skip
-    if old and known is not None:
+    if known is not None and known.noise is noise:
+        own, old = known.weighted, dict(zip(map(id, known.components), known.spans, strict=True))
         M, z = np.empty((total, total)), np.empty(total)
         there = [k for k, c in enumerate(components) if id(c) in old]
         at = np.r_[(slice(0, p), *(spans[k] for k in there))]
         before = np.r_[(slice(0, p), *(old[id(components[k])] for k in there))]
-        M[np.ix_(at, at)] = known.weighted.M[np.ix_(before, before)]
-        z[at] = known.weighted.z[before]
+        M[np.ix_(at, at)] = own.M[np.ix_(before, before)]
+        z[at] = own.z[before]
         for c, span in zip(components, spans, strict=True):
             if id(c) not in old:
                 M[:, span], z[span] = crossed(data, components, own.root, c.columns)
                 M[span] = M[:, span].T
     else:
-        X = np.empty((*data.r.shape, total))
+        own, X = Weighted.of(data, noise), np.empty((*data.r.shape, total))
         X[:, :, :p] = own.X
         for c, span in zip(components, spans, strict=True):
             np.matmul(own.root, data.masked(c.columns), out=X[:, :, span])
@@ -483,6 +498,7 @@ class FittedSum:
 
 
 STEPS, ROUNDS = 30, 12
+SETTLED = 2e-3  # change of −2ℓ at which sizes are settled
 MOST_AT_ONCE = 0.5  # nats: components that earn less go together
 SOME = 400  # configurations, or up to twice as many, from which the noise is estimated
 
@@ -519,8 +535,14 @@ def with_own_noise(found: FittedSum) -> FittedSum:
 
 
 def _under_own_noise(problem: SumOfComponents, at: Sizes) -> SumOfComponents:
-    noise = _noise_beside(problem.data, problem.components, at, problem.noise)
-    return posed(problem.data, problem.components, noise)
+    data = problem.data
+    noise = _noise_beside(data, problem.components, at, problem.noise)
+    found = posed(data, problem.components, noise)
+    if len(data.r) < 2 * SOME:
+        return found
+    # Some of the configurations do not tell its size as all do: a sum under it would be worth less
+    # than the next one, whose factor is free.
+    return found.scaled(found.climbed(replace(at, factor=0.0), STEPS, factor_alone=True).factor)
 
 
 def _at_maximum(problem: SumOfComponents, at: Sizes) -> FittedSum:

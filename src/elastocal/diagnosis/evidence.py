@@ -257,7 +257,9 @@ def direct(C: Array, at: Projection, signs: Array | None = None) -> Spectrum:
     return spectrum((A - Z.T @ Z)[None], b[None], flips[:, None, :])
 
 
-HELD = 4_000_000  # numbers of regressor directions that are held at a time
+# Numbers of regressor directions that are held at a time: with more of them the sums over thousands
+# of visits wait for memory.
+HELD = 100_000
 
 
 @dataclass
@@ -290,7 +292,6 @@ class Grams:
         if settings is None:
             settings = self.dataset.grids[h.key].values
         sums = self.entry(h.entry_key(self.dataset.base.model))
-        # A large table's directions at thousands of settings do not fit into memory at once.
         each = max(1, HELD // (sums.b.size * len(h.parameters)))
         pieces = [settings[i : i + each] for i in range(0, len(settings), each)]
         return Spectrum.joined([sums.driven(self.dataset.direction(h, piece)) for piece in pieces])

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import dataclass, replace
 from functools import cached_property
 
@@ -314,21 +315,20 @@ def curved_likelihood(data: NoisyData, noise: NoiseValues) -> tuple[float, Array
 
     The slope wants gᵀQg, Q = P − uuᵀ, of the joints' columns g in every visit and configuration:
     with g̃ = K⁻¹g, H̃ = X̃L⁻ᵀ and ẽ = K⁻¹(r − Xβ̂) it is g̃ᵀ(1 − H̃H̃ᵀ − ẽẽᵀ)g̃.  What is left of V
-    is the instrument's: tr QV = n − tr (M + Λ)⁻¹M − ẽᵀẽ, and tr P V P V_l = tr P V_l.
+    is the instrument's: tr QV = n − tr (M + Λ)⁻¹M − ẽᵀẽ; and of a configuration by itself
+    PVP = K⁻ᵀ(1 − H̃H̃ᵀ)²K⁻¹.
     """
     of, at = data.counting, Weighted.of(data, noise)
     L, z, marginal = at.factored(data.precision)
     beta = linalg.solve_triangular(L, z, lower=True, trans="T", check_finite=False)
-    g = of.by_visit @ at.root.transpose(0, 2, 1)
-    back, e = g.transpose(0, 2, 1), (at.r - at.X @ beta)[..., None]
+    e = (at.r - at.X @ beta)[..., None]
     whole = 2 * (data.n_rows - float(np.vdot(e, e)))
-    # Few rows are divided by L rather than many.
-    few = g.shape[1] < g.shape[2]
-    Q, X, e = (g @ back, g @ at.X, g @ e) if few else (np.eye(g.shape[2]), at.X, e)
-    H, J = _divided(X, L), data.G.shape[2]
-    P = Q - H @ H.transpose(0, 2, 1)
+    H, J = _divided(at.X, L), data.G.shape[2]
+    P = np.eye(e.shape[1]) - H @ H.transpose(0, 2, 1)
+    g = of.by_visit @ at.root.transpose(0, 2, 1)
     shape = len(g), g.shape[1] // J, J, g.shape[1] // J, J
-    P, Q = ((N if few else g @ N @ back).reshape(shape) for N in (P, P - e @ e.transpose(0, 2, 1)))
+    Q, PVP, P_white = P - e @ e.transpose(0, 2, 1), P @ P, P
+    P, Q, PVP = ((g @ N @ g.transpose(0, 2, 1)).reshape(shape) for N in (P, Q, PVP))
     inverse = linalg.lapack.dtrtri(L, lower=1)[0]
     fitted = len(L) - float((inverse**2 @ at.prior(data.precision)).sum())
     single, shared = 2 * noise.joint**2, 2 * (noise.joint * noise.shared) ** 2
@@ -346,7 +346,7 @@ def curved_likelihood(data: NoisyData, noise: NoiseValues) -> tuple[float, Array
     vs = np.outer(single, shared) * np.einsum("cvjk,cvjk->jk", by_visit, by_visit)
     ss = np.outer(shared, shared) * (by_visit.sum(axis=1) ** 2).sum(axis=0)
     joints = np.block([[ss, vs.T + ss], [vs + ss, vv + vs + vs.T + ss]])
-    trace = traces(P, 2 * (data.n_rows - fitted))
+    trace = traces(PVP, 2 * float((P_white**2).sum()) - 2 * float(data.left_out.sum()))
     across = 2 * trace[1:] - joints[J:].sum(axis=0)
     alone = 2 * trace[0] - across[J:].sum()
     curvature = np.block([[np.array([[alone]]), across[None]], [across[:, None], joints]])
@@ -391,29 +391,54 @@ def balanced(data: NoisyData) -> NoiseValues:
 
 def _climbed(data: NoisyData, start: NoiseValues, enough: float) -> NoiseValues:
     """Steps by the expected curvature, which few of them need; where they do not end, by L-BFGS."""
-    n = data.G.shape[2]
     lower, upper = _limits(data)
-    theta = np.clip(start.logs(), lower, upper)
-    value, slope, curvature = curved_likelihood(data, NoiseValues.of_logs(theta))
-    for _ in range(SCORED):
-        free = ((theta > lower) | (slope < 0)) & ((theta < upper) | (slope > 0))
-        step = np.zeros(1 + 2 * n)
+    theta, ended = scored_climb(
+        lambda theta: curved_likelihood(data, NoiseValues.of_logs(theta)),
+        np.clip(start.logs(), lower, upper), lower, upper, enough, SCORED,
+    )  # fmt: skip
+    found = NoiseValues.of_logs(theta)
+    return found if ended else _climbed_far(data, found, enough)
+
+
+def scored_climb(
+    evaluate: Callable[[Array], tuple[float, Array, Array]], theta: Array, lower: Array,
+    upper: Array, enough: float, steps: int,
+) -> tuple[Array, bool]:  # fmt: skip
+    """Where −2ℓ of logarithms between limits is least, by steps of its information, and whether
+    it ended there: `evaluate` gives −2ℓ, its slope and information.  A step that promises less
+    than `enough` is not taken any more; none is longer than STRIDE in any logarithm.
+    """
+    value, slope, information = evaluate(theta)
+    free = np.flatnonzero(lower < upper)
+    excess = np.zeros_like(information)  # of the curvature over the information, as steps met it
+    for _ in range(steps):
+        step, H = np.zeros(len(theta)), information + excess
         try:
-            factor = linalg.cho_factor(curvature[np.ix_(free, free)])
+            root = linalg.cholesky(H[np.ix_(free, free)])
         except linalg.LinAlgError:
             break
-        step[free] = -linalg.cho_solve(factor, slope[free])
-        step = np.clip(theta + np.clip(step, -STRIDE, STRIDE), lower, upper) - theta
+        low, high = np.maximum(lower - theta, -STRIDE), np.minimum(upper - theta, STRIDE)
+        step[free] = -linalg.cho_solve((root, False), slope[free])
+        if ((step < low) | (step > high)).any():
+            target = -linalg.solve_triangular(root, slope[free], trans="T")
+            box = low[free], high[free]
+            step[free] = optimize.lsq_linear(root, target, box, method="bvls").x
         if -float(slope @ step) < enough:
-            return NoiseValues.of_logs(theta)
+            return theta, True
         for length in (1.0, 0.5, 0.25, 0.0625):
-            tried = curved_likelihood(data, NoiseValues.of_logs(theta + length * step))
+            tried = evaluate(theta + length * step)
             if tried[0] < value:
                 break
         else:
             break
-        theta, (value, slope, curvature) = theta + length * step, tried
-    return _climbed_far(data, NoiseValues.of_logs(theta), enough)
+        curved, Hs = float((tried[1] - slope) @ step) / length, H @ step
+        missing, more = curved - float(step @ Hs), float(step @ excess @ step)
+        if missing > 0:
+            excess += missing * np.outer(Hs, Hs) / float(step @ Hs) ** 2
+        elif more > 0:
+            excess *= max(1 + missing / more, 0.0)
+        theta, (value, slope, information) = theta + length * step, tried
+    return theta, False
 
 
 def _limits(data: NoisyData) -> tuple[Array, Array]:
