@@ -12,7 +12,7 @@ import numpy as np
 from elastocal.cell.work_cell import Cell
 from elastocal.diagnosis.components import Component, Family, FittedSum
 from elastocal.diagnosis.diagnosis_data import DiagnosisData
-from elastocal.diagnosis.evidence import Grams
+from elastocal.diagnosis.evidence import HELD, Grams
 from elastocal.diagnosis.hypotheses import Hypothesis, RegressorDirection, cell_with, recorded
 from elastocal.diagnosis.noise_floor import NoiseValues, project
 from elastocal.diagnosis.unknown import Generic
@@ -143,7 +143,6 @@ STEP = 1.5  # of the highest order of a family, in units of 1/range(q)
 FEW_POSES = 300
 LINE = 5e-5  # rad, a typical line
 LINE_SCALES = np.array([0.3, 1.0, 3.0, 10.0])
-PIECE = 4_000_000  # numbers of directions that are held at a time
 
 
 @dataclass(frozen=True)
@@ -362,7 +361,7 @@ def family_evidence(
     """Log evidence (G,) of the families of m lines at `orders` (G,)."""
     dataset = grams.dataset
     sums = grams.entry(h.entry_key(dataset.base.model))
-    piece = max(1, PIECE // (sums.b.size * 2 * m))
+    piece = max(1, HELD // (sums.b.size * 2 * m))
     out = []
     for start in range(0, len(orders), piece):
         some = orders[start : start + piece, None]

@@ -189,12 +189,12 @@ class EntrySums:
         v = places.one_hot.shape[2]
         wide = (places.one_hot[:, :, :, None] * E[:, :, None, :]).reshape(C, m, v * d)
         local = wide.transpose(0, 2, 1) @ (at.inverse @ wide)
-        H = at.H.transpose(0, 2, 1) @ wide  # (C, p, v·d)
+        H = np.ascontiguousarray((at.H.transpose(0, 2, 1) @ wide).transpose(1, 0, 2))  # (p, C, v·d)
         b = np.einsum("cmk,cm->ck", wide, at.u)
         signs, u, h = _flipped(at, signs)
         flip = np.einsum("cmk,cm->ck", wide, u)
         return cls(
-            local.reshape(C, v, d, v, d), H.transpose(1, 0, 2).reshape(-1, C, v, d),
+            local.reshape(C, v, d, v, d), H.reshape(-1, C, v, d),
             b.reshape(C, v, d), signs, flip.reshape(C, v, d), h,
         )  # fmt: skip
 
@@ -259,7 +259,7 @@ def direct(C: Array, at: Projection, signs: Array | None = None) -> Spectrum:
 
 # Numbers of regressor directions that are held at a time: with more of them the sums over thousands
 # of visits wait for memory.
-HELD = 100_000
+HELD = 300_000
 
 
 @dataclass
