@@ -206,6 +206,8 @@ def block_diagonal(blocks: Array) -> sparse.csr_array:
 
 def inverse_factor(blocks: Array) -> Array:
     """L⁻¹ of each block (n, d, d) = L Lᵀ."""
+    if len(blocks) > 1 and not blocks.strides[0]:  # one for all
+        return np.broadcast_to(inverse_factor(blocks[:1]), blocks.shape)
     try:
         factor = np.asarray(np.linalg.cholesky(blocks), dtype=np.float64)
     except np.linalg.LinAlgError:
