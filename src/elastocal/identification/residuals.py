@@ -509,14 +509,14 @@ def summarise_residuals(
     Raises InputError where lengths differ, a residual is not finite or a leverage not in [0, 1].
     """
     e = _rows(whitened, len(observed.value), "whitened residuals")
-    h = np.zeros(len(e)) if leverage is None else _rows(leverage, len(e), "leverages")
+    h = np.zeros(1) if leverage is None else _rows(leverage, len(e), "leverages")
     require(bool(np.isfinite(e).all()), "whitened residuals must be finite")
     require(
         bool(((h >= -1e-9) & (h <= 1 + 1e-9)).all()),
         f"leverages lie between 0 and 1; found {h.min(initial=0):.3g} to {h.max(initial=0):.3g}",
     )
     held = None if held_out is None else _rows(held_out, len(e), "held-out residuals")
-    spare = 1 - h
+    spare = np.broadcast_to(1 - h, e.shape)
     free = spare > ALONE
     if not free.all():
         e, spare, held = e[free], spare[free], None if held is None else held[free]
@@ -525,7 +525,8 @@ def summarise_residuals(
         return None
     if not absolute:
         e = e / np.sqrt((e @ e) / f)
-    table = _Table(e / np.sqrt(spare), e**2, spare, held, None if absolute else f)
+    z = e if leverage is None else e / np.sqrt(spare)
+    table = _Table(z, e**2, spare, held, None if absolute else f)
 
     judged = [(labels, table.judged(labels)) for labels in groupings(observed, free)]
     holm = _holm(np.concatenate([p for _, p in judged] or [np.zeros(0)]))
