@@ -444,7 +444,7 @@ def settle(
         nominal = residual_at(model, problem.parts, problem.x0)
     progress("first fit, tied weakly to the start")
     few = _sampled(problem)
-    found = tied_fit(few, sizes, CHOOSING)
+    found = _tied_from(few, sizes, problem.x0, _misfit(few), CHOOSING)
     progress("choosing the parameters that the data determine")
     more = np.sqrt(len(problem.observations.value) / len(few.observations.value))
     sigma, kept = residual_sigma(found, 0), None
