@@ -9,7 +9,13 @@ import numpy as np
 import pytest
 
 from elastocal.errors import InputError
-from elastocal.measurements import numbered, read_measurements, write_measurements
+from elastocal.measurements import (
+    firsts,
+    numbered,
+    ranked,
+    read_measurements,
+    write_measurements,
+)
 
 HEADER = "q1_deg,q2_deg,x_mm,y_mm,z_mm"
 ROW = "1,2,3,4,5"
@@ -528,6 +534,17 @@ def test_what_cannot_be_read_back_is_not_written(read, tmp_path):
     with pytest.raises(InputError, match="does not exist"):
         write_measurements(got, tmp_path / "absent" / "out.csv")
     assert os.listdir(tmp_path) == ["data.csv"]
+
+
+@pytest.mark.parametrize("low, high", [(-5, 6), (10**9, 10**9 + 40), (-(10**12), 10**12)])
+def test_codes_are_ranked_as_sorting_ranks_them(low, high):
+    """Close ones by a mask, others and numbers that are not whole by sorting."""
+    codes = np.random.default_rng(3).integers(low, high, 50)
+    different, first, number = np.unique(codes, return_index=True, return_inverse=True)
+    assert np.array_equal(ranked(codes), number)
+    assert np.array_equal(ranked(codes / 7), number)
+    assert np.array_equal(firsts(number, len(different)), first)
+    assert firsts(number, len(different) + 1)[-1] == len(codes)
 
 
 def test_rows_are_numbered_by_their_combination_of_values():

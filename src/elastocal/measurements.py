@@ -190,14 +190,36 @@ class Measurements(Result):
 STILL = 1e-4  # rad or m; a joint that moved by less has stayed where it was
 
 
+def ranked(values: NDArray[Any]) -> IntArray:
+    """Number (n,) of each of the `values` (n,) among the different ones, in their order; whole
+    numbers that lie close, as codes do, without sorting."""
+    n = len(values)
+    if n and values.dtype.kind == "i":
+        low, high = int(values.min()), int(values.max())
+        if high - low < 4 * n:
+            there = np.zeros(high - low + 1, dtype=bool)
+            there[values - low] = True
+            return (np.cumsum(there) - 1)[values - low]
+    return np.unique(values, return_inverse=True)[1].ravel()
+
+
+def firsts(number: IntArray, count: int) -> IntArray:
+    """The first row (count,) of each number below `count`; the number of rows where it has none."""
+    rows = np.arange(len(number))
+    first = np.full(count, len(number))
+    first[number[::-1]] = rows[::-1]  # what is written last stays
+    return first
+
+
 def numbered(*columns: NDArray[Any]) -> IntArray:
     """Number (n,) of each row's combination of values in the `columns` (n,), in their order; column
     by column, since sorting whole rows takes far longer."""
     number = np.zeros(len(columns[0]), dtype=np.int64)
     for values in columns:
-        codes = np.unique(values, return_inverse=True)[1].ravel()
-        number = number * (int(codes.max(initial=0)) + 1) + codes
-        number = np.unique(number, return_inverse=True)[1].ravel()
+        if (values == values[:1]).all():
+            continue
+        codes = ranked(values)
+        number = ranked(number * (int(codes.max(initial=0)) + 1) + codes)
     return number
 
 

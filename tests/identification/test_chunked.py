@@ -122,6 +122,23 @@ def test_the_last_evaluation_leaves_the_triangle_of_all_columns_to_choose_from(i
     assert any(left)
 
 
+def test_what_is_dropped_of_base_or_marker_is_placed_to_the_last_digit(in_parts):
+    """Where joint 1 stands still the marker's way out of the plane is the base's as well.  It is
+    held for good where placing ends, on an arm whose joints are off by 30 mrad; a placing that
+    ends where the choice of parameters may begin leaves 7e-11 m."""
+    model, plan, truth, rng = arm(("base_frame", "marker_position", "joint_offset"), 12, 120)
+    truth[[p.effect == "joint_offset" for p in model.parameters]] *= 30
+    plan.q[:, 0] = 0.3
+    table = measured(model, plan, truth, SIGMA, rng)
+    whole = solved(model, table)
+    held = whole.reduction.dropped[solve.is_placed(model)[whole.reduction.dropped]]
+    assert len(held)
+    in_parts()
+    parts = solved(model, table)
+    assert_same_estimates(parts, whole)
+    np.testing.assert_allclose(parts.fit.x[held], whole.fit.x[held], rtol=0, atol=3e-11)
+
+
 def test_a_covariance_that_links_configurations_keeps_them_together(in_parts):
     """Neighbouring observations are correlated in runs of five, across configurations."""
     model, plan, truth, rng = arm(GEOMETRY, 7)
@@ -149,6 +166,38 @@ def test_faulty_readings_are_found_in_parts_too(in_parts):
     one, other = (describe(solution, fitted, faulty) for faulty, fitted in (found, expected))
     np.testing.assert_allclose([o.ratio for o in one], [o.ratio for o in other], rtol=0.01)
     np.testing.assert_allclose([o.residual for o in one], [o.residual for o in other], rtol=0.01)
+
+
+@pytest.mark.parametrize("configurations", [120, 40])
+def test_bounds_spare_b_and_change_no_verdict(configurations, in_parts, monkeypatch):
+    """Readings by themselves and three to a configuration: some are looked at, all judged alike."""
+    model, plan, truth, rng = arm(GEOMETRY, 8, 120)
+    table = measured(model, plan, truth, SIGMA, rng)
+    table = replace(table, configuration=np.arange(120) * configurations // 120)
+    table.position[::20] += rng.uniform(-5e-4, 5e-4, (6, 3))
+    in_parts(3000, 70)
+    solution = solved(model, table)
+    looked = []
+
+    def counted(parts, chosen, work):
+        looked.append(int(chosen.sum()))
+        return partition.of_some(parts, chosen, work)
+
+    monkeypatch.setattr(outliers, "of_some", counted)
+    every = np.ones(120, dtype=bool)
+    few = every.copy()
+    few[60:] = False
+    few[::20] = False
+    for good in (every, few):
+        least = outliers.judge(solution, solution, good)
+        spared, looked[:] = looked[-1], []
+        with monkeypatch.context() as all_of_them:
+            unknown = np.full(120, np.inf), np.empty(120)
+            all_of_them.setattr(outliers, "_at_most", lambda *_, told=unknown: told)
+            expected = outliers.judge(solution, solution, good)
+        assert spared < looked[-1] == 120
+        assert 0 < expected[0].sum() < 60 and np.array_equal(least[0], expected[0])
+        assert least[1] == pytest.approx(expected[1], rel=1e-9)
 
 
 def test_a_bounded_fit_in_parts_is_the_constrained_minimum(in_parts):

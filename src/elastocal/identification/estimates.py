@@ -31,6 +31,7 @@ from elastocal.identification.scrutiny import MOST_NUMBERS
 from elastocal.identification.solve import Solution, bent, residual_sigma
 from elastocal.identification.tails import Tails, tails_of
 from elastocal.identification.weighted_problem import residual_at
+from elastocal.measurements import ranked
 from elastocal.model.arm import Parameter
 from elastocal.model.calibrated import ShownPoses
 from elastocal.model.manipulator import Model
@@ -195,8 +196,8 @@ def uncertainty_of(
     """
     B = (B.T / np.sqrt(left)).T.reshape(-1, observed.size, B.shape[1])
     each = variance_of(B[:, :3], covariance)
-    _, code = np.unique(observed.configuration, return_inverse=True)
-    return np.asarray(np.sqrt(np.bincount(code.ravel(), each) / np.bincount(code.ravel())))
+    code = ranked(observed.configuration)
+    return np.asarray(np.sqrt(np.bincount(code, each) / np.bincount(code)))
 
 
 SEEN_BY_OTHERS = 1e-6  # of a row: the least that other configurations must see of it

@@ -20,6 +20,7 @@ from elastocal.identification.residuals import ResidualSummary
 from elastocal.identification.result import Calibration, Estimate, Finding, Number, Severity
 from elastocal.identification.solve import Solution
 from elastocal.identification.tails import kept_of
+from elastocal.measurements import firsts, numbered
 from elastocal.text import gathered, listed
 
 # What a result is worth, judged once: each finding with its numbers, its threshold and a remedy.
@@ -332,9 +333,9 @@ def spare_equations(result: Calibration) -> int:
     """
     observed = result.observations
     table, lead = observed.table, observed.lead
-    state = np.column_stack([table.configuration, np.round(table.force, 3)])[lead]
-    _, code = np.unique(state, axis=0, return_inverse=True)
-    seen = np.unique(np.column_stack([code.ravel(), table.marker[lead]]), axis=0)[:, 0]
+    code = numbered(observed.configuration, *np.round(table.force[lead], 3).T)
+    marked = numbered(code, table.marker[lead])
+    seen = code[firsts(marked, int(marked.max()) + 1)]
     size = 1 if observed.kind == "distance" else observed.size
     told = np.minimum(size * np.bincount(seen), 6)
     return int(told.sum()) - int(np.sum(~result.model.shrunk[_columns(result)]))

@@ -199,12 +199,14 @@ def copied(observed: Observations) -> BoolArray:
         value = np.hstack([value[:, :3], table.rotation[own]])
     said = [table.q, table.force, table.marker[:, None]]
     said += [] if table.torque is None else [table.torque]
-    key = np.column_stack(said)[own]
     found = np.zeros(n, dtype=bool)
     # Sorting whole rows takes long, and most tables have none to look at.
-    _, code, count = np.unique(value[:, 0], return_inverse=True, return_counts=True)
-    alike = np.flatnonzero(count[code.ravel()] > 1)
-    _, first = np.unique(np.hstack([key, value])[alike], axis=0, return_index=True)
+    ordered = np.sort(value[:, 0])
+    alike = np.flatnonzero(np.isin(value[:, 0], ordered[1:][ordered[1:] == ordered[:-1]]))
+    if not len(alike):
+        return found
+    key = np.column_stack(said)[own]
+    _, first = np.unique(np.hstack([key[alike], value[alike]]), axis=0, return_index=True)
     found[np.delete(alike, first)] = True
     if not found.any():
         return found

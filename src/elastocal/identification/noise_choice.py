@@ -26,7 +26,7 @@ from elastocal.identification.noise_structure import (
     Structure,
     along_axes,
     joint_effects,
-    polar,
+    of_readings,
     shared_effects,
     with_drift,
 )
@@ -528,22 +528,13 @@ def own_noise(fit: Reml, readings: Readings) -> tuple[Array, Array]:
 
     A reading of a group that has none in the fit gets the mean of all variances.
     """
-    name = fit.structure.name
-    whole = (
-        polar(readings, "angular" in fit.structure.names)
-        if name == "polar"
-        else STRUCTURES[name](readings)
-    )
+    names, index, matrix = of_readings(fit.structure, readings)
     place = {name: k for k, name in enumerate(fit.structure.names[: fit.structure.n_own])}
-    known = np.array([place.get(name, -1) for name in whole.names])
+    known = np.array([place.get(name, -1) for name in names])
     own = fit.own[: fit.structure.n_own]
     theta = np.where(known >= 0, own[known], own.mean())
     W = fit.covariance[: len(own), : len(own)]
     spread = np.where(known >= 0, np.diag(W)[known], np.diag(W).max())
-    set_of = readings.set_of
-    index, matrix = whole.index[set_of], whole.matrix[set_of]
-    if name == "stated":
-        matrix = np.asarray(readings.stated)[:, None]
     covariance = np.einsum("nl,nlij->nij", theta[index], matrix)
     parts = np.diagonal(matrix, axis1=2, axis2=3)  # (N, L, size)
     variance = np.einsum("nl,nla->na", spread[index], parts**2)

@@ -12,7 +12,7 @@ from scipy import sparse
 
 from elastocal.errors import InputError, option, require
 from elastocal.identification.visit_record import VisitRecord
-from elastocal.measurements import Measurements, numbered
+from elastocal.measurements import Measurements, firsts, numbered
 from elastocal.plugin_loader import check_registered, same_class
 from elastocal.text import did_you_mean, quoted
 from elastocal.units import Array, BoolArray, IntArray
@@ -149,7 +149,7 @@ def reduce_repeats(readings: Readings, stated: bool = False) -> RepeatSets:
     """The sets of repeats; weighted by the stated covariances if `stated`, else plainly."""
     set_of = readings.set_of
     n_sets = int(set_of.max()) + 1
-    first = np.unique(set_of, return_index=True)[1]
+    first = firsts(set_of, n_sets)
     repeats = np.bincount(set_of, minlength=n_sets)
     size = readings.size
     if stated:
@@ -182,7 +182,10 @@ def reduce_repeats(readings: Readings, stated: bool = False) -> RepeatSets:
 
 def _sum(values: Array, set_of: IntArray, n_sets: int) -> Array:
     total = np.zeros((n_sets, *values.shape[1:]))
-    np.add.at(total, set_of, values)
+    if n_sets == len(set_of):  # no repeats
+        total[set_of] += values
+    else:
+        np.add.at(total, set_of, values)
     return total
 
 
@@ -322,6 +325,24 @@ STRUCTURES: dict[str, Callable[[Readings], Structure]] = {
     "polar": polar,
     "stated": as_stated,
 }
+
+
+def of_readings(
+    structure: Structure, readings: Readings
+) -> tuple[tuple[str, ...], IntArray, Array]:
+    """Names, `index` (N, L) and `matrix` (N, L, size, size) of such a structure for each of the
+    `readings`, be they those that it is of or others."""
+    if structure.name == "stated":  # whatever their sets
+        matrix = np.asarray(readings.stated)[:, None]
+        return structure.names[:1], np.zeros((len(readings), 1), dtype=np.int64), matrix
+    whole = (
+        polar(readings, "angular" in structure.names)
+        if structure.name == "polar"
+        else STRUCTURES[structure.name](readings)
+    )
+    return whole.names, whole.index[readings.set_of], whole.matrix[readings.set_of]
+
+
 SHARED = "+configuration"
 JOINTS, EACH, TIME = "+joints", "+each-joint", "+time"
 

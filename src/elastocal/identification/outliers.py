@@ -22,9 +22,9 @@ from elastocal.identification.solve import (
 from elastocal.identification.weighted_problem import (
     Part,
     RFactor,
-    each,
     evaluate,
     merge,
+    of_some,
     part_of,
     regressor,
     residual_at,
@@ -124,7 +124,11 @@ def judge(whole: Solution, fitted: Solution, good: BoolArray) -> tuple[BoolArray
     kept = fitted.reduction.kept
     r_factor = _inside(whole, fitted, good)
     s2 = r_factor.rss / max(r_factor.rows - len(kept), 1)
-    alone_squared, squared = np.empty(n), np.empty(n)
+    dof = max(int(good.sum()) * size - len(kept), 1)
+    limit = size * s2 * special.fdtri(size, dof, 1 - FALSE_ALARM / n)
+    most, squared = _at_most(whole, fitted, good)
+    undecided = ~(most <= limit)
+    beyond = np.zeros(n, dtype=bool)
     reduction, held, mixing = fitted.reduction, kept[:0], np.zeros((len(kept), 0))
     if len(kept) < len(whole.reduction.kept):
         held, mixing = reduction.dropped, reduction.mixing
@@ -137,23 +141,52 @@ def judge(whole: Solution, fitted: Solution, good: BoolArray) -> tuple[BoolArray
         unknown = (beside - WB @ mixing) * fitted.sizes[held] / np.sqrt(max(s2, TINY))
         e2 = e.reshape(-1, size)
         squared[part.index] = (e2**2).sum(axis=1)
-        alone_squared[part.index] = studentised(
+        beyond[part.index] = limit < studentised(
             Q.reshape(-1, size, len(kept)), e2, good[part.index],
             unknown.reshape(len(part.index), size, len(held)),
         )  # fmt: skip
 
-    for _ in each(problem.parts, of_part):
+    for _ in of_some(problem.parts, undecided, of_part):
         pass
-    dof = max(int(good.sum()) * size - len(kept), 1)
-    trimmed = float(np.sort(squared)[: n // 2 + 1].sum())
-    return alone_squared > size * s2 * special.fdtri(size, dof, 1 - FALSE_ALARM / n), trimmed
+    return beyond, float(np.partition(squared, n // 2)[: n // 2 + 1].sum())
+
+
+def _at_most(whole: Solution, fitted: Solution, good: BoolArray) -> tuple[Array, Array]:
+    """What the squared length (N,) that an observation is judged by is at most, so that few need
+    their B, and the squared length of its whitened residual.
+
+    That of an observation outside the fit is no longer than its prediction error e; eᵀ(I − H)⁻¹e of
+    one in the fit no longer than that of its whole configuration, where e and the residual as if
+    left out are whitened independently.  Infinite where it is not told without B.
+    """
+    problem, n = whole.problem, len(good)
+    most, squared = np.full(n, np.inf), np.empty(n)
+    if not problem.large:
+        return most, squared
+    if _is_of_all(whole, fitted, good):
+        e = whole.fit.whitened.reshape(n, -1)
+        squared = (e**2).sum(axis=1)
+        if problem.parts.blocks is None:
+            own = (e * problem.weights.apply(whole.heldout).reshape(n, -1)).sum(axis=1)
+            code = problem.observations.configuration
+            most = np.bincount(code, own)[code]
+    elif good.mean() < 1 / 2:
+        e = problem.weights.apply(residual_at(problem.model, problem.parts, fitted.fit.x))
+        squared = (e.reshape(n, -1) ** 2).sum(axis=1)
+        most[~good] = squared[~good]
+    return most, squared
+
+
+def _is_of_all(whole: Solution, fitted: Solution, good: BoolArray) -> bool:
+    own = len(whole.fit.whitened) == len(good) * whole.problem.observations.size
+    return fitted.fit is whole.fit and bool(good.all()) and own
 
 
 def _inside(whole: Solution, fitted: Solution, good: BoolArray) -> RFactor:
     """The R factor of the good observations at the fit, whitened as the whole table is."""
     problem = whole.problem
     kept, size = fitted.reduction.kept, problem.observations.size
-    if fitted.fit is whole.fit and good.all() and len(whole.fit.whitened) == len(good) * size:
+    if _is_of_all(whole, fitted, good):
         return whole.fit.r_factor
 
     def of_part(part: Part) -> RFactor:
@@ -162,7 +195,7 @@ def _inside(whole: Solution, fitted: Solution, good: BoolArray) -> RFactor:
         e = part.weights.apply(at.residual)
         return RFactor.of(part.weights.apply(at.B)[inside], e[inside])
 
-    return merge(each(problem.parts, of_part))
+    return merge(of_some(problem.parts, good, of_part))
 
 
 def studentised(Q: Array, e: Array, good: BoolArray, unknown: Array) -> Array:
@@ -305,6 +338,8 @@ def _fit_to(solution: Solution, good: BoolArray) -> Solution:
 
 def describe(solution: Solution, fitted: Solution, faulty: BoolArray) -> tuple[Outlier, ...]:
     """The faulty observations with their error under the fit to the others, in table order."""
+    if not faulty.any():
+        return ()
     observed, model = solution.problem.observations, solution.problem.model
     error = residual_at(model, solution.problem.parts, fitted.fit.x)
     length = np.linalg.norm(error.reshape(-1, observed.size)[:, :3], axis=1)

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
+from functools import cached_property
 from typing import Any
 
 import numpy as np
@@ -20,6 +21,7 @@ from elastocal.identification.weighted_problem import (
     regressor,
     same_size,
 )
+from elastocal.measurements import firsts, numbered, ranked
 from elastocal.model.manipulator import Model
 from elastocal.model.observations import COMPONENTS, Observations
 from elastocal.units import Array, IntArray
@@ -238,7 +240,7 @@ def predicts_better(
     if not after < before < np.inf:
         return bool(after < before)
     n, w = weights.apply(narrow), weights.apply(wide)
-    own = np.repeat(np.unique(configuration, return_inverse=True)[1], size)
+    own = np.repeat(ranked(configuration), size)
     f = np.bincount(own, 2 * n * (n - w))
     if len(f) < 2:
         return False
@@ -338,7 +340,7 @@ class RowLabels:
 
     by: str
     code: IntArray
-    names: tuple[str, ...]
+    names: NDArray[np.object_]
 
 
 def groupings(observed: Observations, chosen: NDArray[np.bool_]) -> list[RowLabels]:
@@ -346,29 +348,29 @@ def groupings(observed: Observations, chosen: NDArray[np.bool_]) -> list[RowLabe
     table, size = observed.table, observed.size
     load, loads = _loads(np.round(table.force[observed.lead], 3))
     coded: list[tuple[str, IntArray, tuple[str, ...]]] = [
-        ("component", np.tile(np.arange(size), len(observed.lead)), COMPONENTS[observed.kind]),
-        ("marker", np.repeat(table.marker[observed.lead], size), table.marker_names),
-        ("configuration", np.repeat(observed.configuration, size), table.configuration_labels),
-        ("load state", np.repeat(load, size), loads),
+        ("component", np.arange(size)[None], COMPONENTS[observed.kind]),
+        ("marker", table.marker[observed.lead][:, None], table.marker_names),
+        ("configuration", observed.configuration[:, None], table.configuration_labels),
+        ("load state", load[:, None], loads),
     ]
     found = []
-    for by, code, names in coded:
-        used, first, index = np.unique(code[chosen], return_index=True, return_inverse=True)
+    for by, own, names in coded:
+        code = np.broadcast_to(own, (len(observed.lead), size)).ravel()[chosen]
+        first = firsts(code, len(names))
+        used = np.flatnonzero(first < len(code))
         if len(used) < 2:
             continue
-        order = np.argsort(first)
-        place = np.argsort(order)
-        found.append(RowLabels(by, place[index], tuple(names[k] for k in used[order].tolist())))
+        order = used[np.argsort(first[used])]
+        place = np.empty(len(names), dtype=np.int64)
+        place[order] = np.arange(len(order))
+        found.append(RowLabels(by, place[code], np.array(names, dtype=object)[order]))
     return found
 
 
 def _loads(force: NDArray[np.float64]) -> tuple[IntArray, tuple[str, ...]]:
     """Load state (N,) of each observation, and its force in words."""
-    code = np.zeros(len(force), dtype=np.int64)
-    for axis in force.T:  # column by column: sorting whole rows takes far longer
-        values, index = np.unique(axis, return_inverse=True)
-        code = np.unique(code * len(values) + index, return_inverse=True)[1]
-    first = np.unique(code, return_index=True)[1]
+    code = numbered(*force.T)
+    first = firsts(code, int(code.max(initial=-1)) + 1)
     return code, tuple(_named(f) for f in force[first])
 
 
@@ -507,23 +509,24 @@ def summarise_residuals(
     Raises InputError where lengths differ, a residual is not finite or a leverage not in [0, 1].
     """
     e = _rows(whitened, len(observed.value), "whitened residuals")
-    h = np.zeros(len(e)) if leverage is None else _rows(leverage, len(e), "leverages")
+    h = np.zeros(1) if leverage is None else _rows(leverage, len(e), "leverages")
     require(bool(np.isfinite(e).all()), "whitened residuals must be finite")
     require(
         bool(((h >= -1e-9) & (h <= 1 + 1e-9)).all()),
         f"leverages lie between 0 and 1; found {h.min(initial=0):.3g} to {h.max(initial=0):.3g}",
     )
-    free = 1 - h > ALONE
-    f = float((1 - h[free]).sum())
-    if free.sum() < FEWEST or not e[free] @ e[free] > 0:
+    held = None if held_out is None else _rows(held_out, len(e), "held-out residuals")
+    spare = np.broadcast_to(1 - h, e.shape)
+    free = spare > ALONE
+    if not free.all():
+        e, spare, held = e[free], spare[free], None if held is None else held[free]
+    f = float(spare.sum())
+    if len(e) < FEWEST or not e @ e > 0:
         return None
     if not absolute:
-        e = e / np.sqrt((e[free] @ e[free]) / f)
-    held = None if held_out is None else _rows(held_out, len(e), "held-out residuals")
-    table = _Table(
-        e[free] / np.sqrt(1 - h[free]), e[free] ** 2, 1 - h[free],
-        None if held is None else held[free], None if absolute else f,
-    )  # fmt: skip
+        e = e / np.sqrt((e @ e) / f)
+    z = e if leverage is None else e / np.sqrt(spare)
+    table = _Table(z, e**2, spare, held, None if absolute else f)
 
     judged = [(labels, table.judged(labels)) for labels in groupings(observed, free)]
     holm = _holm(np.concatenate([p for _, p in judged] or [np.zeros(0)]))
@@ -532,8 +535,7 @@ def summarise_residuals(
         adjusted, holm = holm[: len(p)], holm[len(p) :]
         found.append(table.grouping(labels, adjusted))
     edges = table.edges(len(table.z))
-    everything = np.arange(len(table.z))
-    whole = table.summary("all", everything, edges, None)
+    whole = table.summary("all", slice(None), edges, None)
     return ResidualSummary(whole, edges, tuple(found), absolute, int((~free).sum()))
 
 
@@ -549,10 +551,12 @@ class _Table:
 
     def judged(self, labels: RowLabels) -> Array:
         """Two-sided p (groups,) of each group's mean square; NaN where it has too few values."""
-        total = np.bincount(labels.code, self.squared, len(labels.names))
-        f = np.bincount(labels.code, self.spare, len(labels.names))
-        p = _two_sided(total, f)
-        p[np.bincount(labels.code, minlength=len(labels.names)) < FEWEST] = np.nan
+        p = np.full(len(labels.names), np.nan)
+        enough = np.bincount(labels.code, minlength=len(labels.names)) >= FEWEST
+        if enough.any():
+            total = np.bincount(labels.code, self.squared, len(labels.names))
+            f = np.bincount(labels.code, self.spare, len(labels.names))
+            p[enough] = _two_sided(total[enough], f[enough])
         return p
 
     def grouping(self, labels: RowLabels, holm: Array) -> Grouping:
@@ -561,10 +565,8 @@ class _Table:
         order = large[np.argsort(holm[large], kind="stable")]
         shown = np.sort(order[:MOST_LISTED])
         edges = self.edges(int(np.median(count[large])) if len(large) else FEWEST)
-        by_code = np.argsort(labels.code, kind="stable")
-        start = np.concatenate([[0], np.cumsum(count)])
         groups = tuple(
-            self.summary(labels.names[k], by_code[start[k] : start[k + 1]], edges, float(holm[k]))
+            self.summary(labels.names[k], np.flatnonzero(labels.code == k), edges, float(holm[k]))
             for k in shown
         )
         return Grouping(
@@ -577,15 +579,20 @@ class _Table:
 
         They reach to the largest value, or to 6 robust deviations where some lie far beyond.
         """
-        low, high = np.quantile(self.z, [0.25, 0.75])
-        largest = float(np.abs(self.z).max())
-        spread = float(high - low) or largest
+        spread, largest = self._spread
         reach = min(1.0001 * largest, 6 * spread / 1.349)
         bins = int(np.clip(np.ceil(reach / (spread * n ** (-1 / 3))), 3, MOST_BINS))
         return np.linspace(-reach, reach, (bins | 1) + 1)  # 0 in the middle of a bin
 
+    @cached_property
+    def _spread(self) -> tuple[float, float]:
+        """Interquartile range of z, and its largest value."""
+        low, high = np.quantile(self.z, [0.25, 0.75])
+        largest = float(np.abs(self.z).max())
+        return float(high - low) or largest, largest
+
     def summary(
-        self, name: str, rows: NDArray[np.int64], edges: Array, holm: float | None
+        self, name: str, rows: NDArray[np.int64] | slice, edges: Array, holm: float | None
     ) -> GroupSummary:
         z = self.z[rows]
         counts = np.histogram(z, edges)[0]
@@ -598,7 +605,8 @@ class _Table:
         if len(z) >= FEWEST_FOR_SHAPE and not same:
             omnibus = _p_normal(*shape, len(z))
         out = None
-        if self.held is not None and (finite := self.held[rows][np.isfinite(self.held[rows])]).size:
+        held = np.zeros(0) if self.held is None else self.held[rows]
+        if (finite := held[np.isfinite(held)]).size:
             out = float(np.mean(finite**2))
         points = GROUP_POINTS if holm is not None else 4 * GROUP_POINTS
         return GroupSummary(
@@ -648,7 +656,8 @@ def _p_normal(skewness: float, kurtosis: float, n: int) -> float:
 def _holm(p: Array) -> Array:
     """Holm's adjusted p-values (1979, Scand. J. Stat. 6, 65): valid under any dependence."""
     adjusted = np.full(len(p), np.nan)
-    order = np.argsort(p)[: np.isfinite(p).sum()]  # NaN sorts last
+    order = np.flatnonzero(np.isfinite(p))
+    order = order[np.argsort(p[order])]
     steps = p[order] * np.arange(len(order), 0, -1)
     adjusted[order] = np.minimum(np.maximum.accumulate(steps), 1.0)
     return adjusted

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable
+from itertools import pairwise
 from operator import itemgetter
 
 import numpy as np
@@ -121,6 +122,7 @@ FINALISTS, FEW = 10, 3
 SEARCH_ROWS = 2000
 STEPS = 2  # of every start before the best are chosen
 TOGETHER = 100  # starts whose residuals are held at a time
+SAME = 1e-9  # relative: costs that differ by less are those of one fit
 RIDGE = 1e-12
 INSIDE = 0.99
 
@@ -146,7 +148,8 @@ def least_trimmed_squares(
     finalists = [*shifts[np.argsort(costs, kind="stable")[:FINALISTS]], np.zeros(p)]
     if len(search) < n:  # many end at the same fit: all readings decide among the best few
         ended = sorted((_ended(B3[search], e2[search], one) for one in finalists), key=_cost)
-        finalists = [shift for shift, _ in ended[:FEW]]
+        apart = [True, *(b > a * (1 + SAME) for (_, a), (_, b) in pairwise(ended))]
+        finalists = [shift for (shift, _), new in zip(ended[:FEW], apart, strict=False) if new]
     return min((_ended(B3, e2, one) for one in finalists), key=_cost)[0]
 
 

@@ -377,8 +377,8 @@ def held_at_bounds(
 # Width of the weak tie that keeps undetermined directions still before they are recognised:
 # in typical sizes for deviations from nominal, in m and rad for what registration placed.
 LOOSE, PLACED = 3.0, 0.3
-# Relative change of the cost at which the tied fits of a large table end: what is placed is where
-# parameters that get dropped are held for good; the fit of all is only where their choice begins.
+# Relative change of the cost at which the tied fits of many readings end: what is placed, where a
+# parameter of it gets dropped and is held for good, and where the choice and the fit only begin.
 PLACING, CHOOSING = 1e-14, 1e-2
 # Observations that a large table's fit starts from.
 SAMPLE = 5000
@@ -433,23 +433,29 @@ def settle(
 
     Raises InsufficientDataError where the data determine nothing.
     """
-    model = problem.model
+    model, started, exact = problem.model, problem.x0, not _many(problem)
     placed = problem.free[is_placed(model)[problem.free]]
     if len(placed):
         progress("placing base and markers")
-        base = tied_fit(replace(problem, free=placed), sizes, PLACING)
+        base = tied_fit(replace(problem, free=placed), sizes, CHOOSING)
         problem = replace(problem, x0=base.x)
         nominal = base.residual
     else:
         nominal = residual_at(model, problem.parts, problem.x0)
     progress("first fit, tied weakly to the start")
-    found = tied_fit(problem, sizes, CHOOSING)
+    few = _sampled(problem)
+    found = _tied_from(few, sizes, problem.x0, _misfit(few), CHOOSING)
     progress("choosing the parameters that the data determine")
-    sigma, kept, r_factor = residual_sigma(found, 0), None, found.r_factor
+    more = np.sqrt(len(problem.observations.value) / len(few.observations.value))
+    sigma, kept = residual_sigma(found, 0), None
+    r_factor = found.r_factor.scaled(np.full(len(problem.free), more))
     for _ in range(5):
         reduction = choose(problem, sizes, r_factor, sigma, WORTH_A_COLUMN)
         if kept is not None and np.array_equal(kept, reduction.kept):
             break
+        if not exact and is_placed(model)[reduction.dropped].any():
+            asked = replace(problem, free=placed, x0=started)
+            problem, exact = replace(problem, x0=tied_fit(asked, sizes, PLACING).x), True
         # The threshold is in units of the noise, and the noise is known only after the fit.
         kept = reduction.kept
         found = fit_kept(problem, sizes, found.x, reduction, again=True)
@@ -472,6 +478,10 @@ def sizes_and_check(problem: Problem) -> Array:
     # What is shrunk has its size from its prior.
     every = np.flatnonzero(~model.shrunk | np.isin(np.arange(len(model.shrunk)), free))
     few = len(observed.value) <= len(free)  # more equations than unknowns need no rank
+    placed = is_placed(model)
+    known = placed | np.array([p.typical is not None for p in model.parameters], dtype=bool)
+    if known.all() and not few:  # then sizes need no B
+        return np.where(placed, PLACED, model.sizes(np.zeros((1, len(known)))))
 
     def of_part(part: Part) -> tuple[Array, RFactor | None]:
         at = regressor(model, part, problem.x0, every)
@@ -482,7 +492,7 @@ def sizes_and_check(problem: Problem) -> Array:
     moved = np.zeros((len(largest), len(model.parameters)))
     moved[:, every] = np.stack(largest)
     sizes = model.sizes(moved)
-    sizes[is_placed(model)] = PLACED
+    sizes[placed] = PLACED
     if few:
         check_enough(model, observed, merge(t for t in factors if t is not None).R * sizes[free])
     return sizes
@@ -537,16 +547,27 @@ def tied_fit(problem: Problem, sizes: Array, tolerance: float) -> Fit:
 
     Many readings start where such a fit to a sample of them ends.
     """
-    x, n = problem.x0, len(problem.observations.lead)
-    if is_reduced(problem.observations, int((~problem.model.shrunk).sum())):
-        part = sample(problem.parts, min(SAMPLE, n // 4))
-        rough = replace(problem, observations=part.observations, weights=part.weights)
+    x = problem.x0
+    if _many(problem):
+        rough = _sampled(problem)
         found = _tied_from(rough, sizes, x, _misfit(rough), tolerance)
         try:
             return _tied_from(problem, sizes, found.x, residual_sigma(found, 0), tolerance)
         except ElastocalError:
             pass  # the sample has led where other readings have no equilibrium
     return _tied_from(problem, sizes, x, _misfit(problem), tolerance)
+
+
+def _many(problem: Problem) -> bool:
+    return is_reduced(problem.observations, int((~problem.model.shrunk).sum()))
+
+
+def _sampled(problem: Problem) -> Problem:
+    """The problem of a sample, where there are many readings."""
+    if not _many(problem):
+        return problem
+    part = sample(problem.parts, min(SAMPLE, len(problem.observations.lead) // 4))
+    return replace(problem, observations=part.observations, weights=part.weights)
 
 
 def _misfit(problem: Problem) -> float:

@@ -10,7 +10,7 @@ from scipy import sparse
 
 from elastocal.cell.arm_description import CartesianNoise, PolarNoise, Tracker
 from elastocal.errors import InputError, require
-from elastocal.measurements import Measurements, load_states, numbered
+from elastocal.measurements import Measurements, load_states, numbered, ranked
 from elastocal.units import Array, IntArray
 
 SIZE = {"position": 3, "deflection": 3, "pose": 6, "distance": 1}
@@ -94,10 +94,13 @@ def observe(table: Measurements, kind: str) -> Observations:
 def pure_error(group: IntArray, values: Array) -> tuple[float, int]:
     """Sum of squares of `values` (n, d) about the mean of their `group` (n,), and its degrees of
     freedom."""
-    _, group, count = np.unique(group, return_inverse=True, return_counts=True)
+    group = ranked(group)
+    count = np.bincount(group)
+    if len(count) == len(group):
+        return 0.0, 0
     mean = np.zeros((len(count), values.shape[1]))
-    np.add.at(mean, group.ravel(), values)
-    left = values - (mean / count[:, None])[group.ravel()]
+    np.add.at(mean, group, values)
+    left = values - (mean / count[:, None])[group]
     return float((left**2).sum()), int((count - 1).sum()) * values.shape[1]
 
 
@@ -209,8 +212,8 @@ def position_covariance(table: Measurements, tracker: Tracker, kind: str) -> tup
         noise = tracker.noise
         if not isinstance(noise, CartesianNoise):
             raise InputError("these weights cannot be formed: the cell has no [tracker] sigma_um")
-        sigma, polar = np.tile(noise.sigma, (n, 1)), False
         text = f"tracker sigma {np.round(noise.sigma * 1e6, 3).tolist()} µm along x, y, z"
+        return np.broadcast_to(np.eye(3) * noise.sigma**2, (n, 3, 3)), text
     else:
         noise = tracker.noise
         if not isinstance(noise, PolarNoise):

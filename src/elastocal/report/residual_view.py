@@ -160,7 +160,7 @@ def residual_table(observed: Observations, residuals: Residuals) -> ShownTable:
             continue
         code = labels.code[:: observed.size]
         groups[len(rows)] = labels.by
-        rows += _group_rows(part, code, labels.names[:MOST_CONFIGURATIONS])
+        rows += _group_rows(part, code, tuple(labels.names[:MOST_CONFIGURATIONS]))
     return ShownTable(HEADS, rows, words=(0, 5), groups=groups)
 
 
