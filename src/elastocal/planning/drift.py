@@ -142,9 +142,9 @@ def _travel(costs: Costs) -> Array:
 # The order: first little bias, then little travel, by simulated annealing.
 
 # Temperatures in units of a bias that is as good as none: the searches begin at those of HOT, the
-# first two from anywhere, the others near the best found; an order that is nearly good, by its
+# first three from anywhere, the others near the best found; an order that is nearly good, by its
 # making or but for moves that turn out to be blocked, is bettered from WARM.
-HOT, WARM, COLD = (4.0, 4.0, 1.0, 0.25), 0.06, 1e-3
+HOT, WARM, COLD = (4.0, 4.0, 4.0, 1.0, 0.25), 0.06, 1e-3
 STEPS, FEW, MENDING = 40_000, 10_000, 2_500  # from HOT, from WARM, and of blocked moves
 
 
