@@ -212,19 +212,17 @@ class Variances:
 
         Raises InsufficientDataError where M_s is singular.
         """
-        factor = factorise(M)
+        factor, Z = self._at(M)
         factor.require_regular()
-        Z = self._roots(factor)
         gains = factor.inverse.swapaxes(-1, -2) @ Z
         return self._grouped(Z), gains.reshape(self._columns.shape[:2] + self.F.shape[1:3])
 
     def after_adding(self, M: Array, blocks: Array) -> Array:
         """φ (N, S, T) at M_s + B_siᵀ B_si; M (S, p, p), blocks (S, N, r, p)."""
-        factor = factorise(M)
+        factor, Z = self._at(M)
         n = blocks.shape[1]
         if not trustworthy(factor):
             return self._anew(M, blocks)
-        Z = self._roots(factor)
         before = self._grouped(Z)
         values = np.empty((n, *before.shape))
         for part, W, K in whitened_rows(factor, blocks):
@@ -239,6 +237,17 @@ class Variances:
         """F_sᵀ (S, p, T q)."""
         S, T, q, p = self.F.shape
         return np.ascontiguousarray(self.F.reshape(S, T * q, p).swapaxes(-1, -2))
+
+    @cached_property
+    def _last(self) -> list[tuple[Array, InformationFactor, Array]]:
+        return []
+
+    def _at(self, M: Array) -> tuple[InformationFactor, Array]:
+        """The factor of M, and Z; an exchange asks for slope and values at the same M."""
+        if not self._last or self._last[0][0] is not M:
+            factor = factorise(M)
+            self._last[:] = [(M, factor, self._roots(factor))]
+        return self._last[0][1:]
 
     def _roots(self, factor: InformationFactor) -> Array:
         """Z = L⁻¹ Fᵀ (..., S, p, T q), whose squares sum to φ."""

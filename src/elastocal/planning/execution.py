@@ -17,8 +17,9 @@ from elastocal.planning.drift import (
     DRIFT,
     FEW,
     HOT,
+    MENDING,
     STEPS,
-    TRIES,
+    WARM,
     Alias,
     Drifting,
     VisitTimes,
@@ -418,6 +419,42 @@ def schedule(
 
 
 ROUNDS = 12  # of blocked moves found and the order mended, before the ways around are taken
+HOPED = 0.5  # of its bias is left by a whole search, at best, to an order that is nearly good
+
+
+@dataclass(frozen=True)
+class _Order:
+    """Visits in an order, with the moves, costs and times that they are nodes of."""
+
+    tour: list[int]
+    moves: Moves
+    costs: Costs
+    clock: VisitTimes
+
+    @property
+    def bias(self) -> float:
+        return self.clock.bias(self.tour)
+
+    @property
+    def time(self) -> float:
+        return self.clock.time(self.tour)
+
+    @property
+    def possible(self) -> bool:
+        return self.clock.possible(self.tour)
+
+    @property
+    def price(self) -> float:
+        return self.clock.price(self.tour)
+
+    def annealed(self, seed: int, steps: int, hot: float) -> _Order:
+        load = self.moves.visits.load
+        return replace(self, tour=balanced(self.tour, load, self.clock, seed, steps, hot))
+
+    def known(self) -> _Order:
+        """With what is known of the moves since."""
+        costs = self.moves.costs()
+        return replace(self, costs=costs, clock=self.clock.at(costs))
 
 
 def _against_drift(
@@ -438,60 +475,59 @@ def _against_drift(
     used = [int(s) for s in dict.fromkeys(load[np.array(tour) - 1])]
     sequence = turns(moves.loaded.tolist(), used, motion.load_changes)
     clock = VisitTimes.of(moves, motion, costs, alias, tour)
-    before = clock.bias(tour)
-    begun = in_turns(tour, load, sequence)
-    new, costs, clock = _searched(begun, moves, costs, clock, seed, progress)
-    more = bool(motion.load_changes) and alias is None
-    found = new if clock.possible(new) and (more or clock.bias(new) < before) else tour
-    if alias is None:
-        return found, moves, costs, None
-    bias, (twice, again) = clock.bias(found), moves.unloaded_twice(tour)
+    before, noise = clock.bias(tour), 0.0 if alias is None else alias.noise
     as_pays = motion.extra_time is None
 
-    def harm(clock: VisitTimes, order: list[int]) -> float:
-        b = clock.bias(order)
-        return (alias.noise**2 + (DRIFT * b) ** 2) * clock.time(order) if as_pays else b
+    def harm(bias: float, time: float) -> float:
+        squared = noise**2 + (DRIFT * bias) ** 2
+        return squared * time if as_pays else max(bias, clock.enough)
 
-    left = clock.longest - (0.0 if as_pays else len(again) * clock.visit)
-    if bias > clock.enough and len(again) and left >= clock.driving(tour):
-        spread = VisitTimes.of(twice, motion, costs := twice.costs(), alias, tour)
-        begun = in_turns([*tour, *again], twice.visits.load, sequence)
-        new, later, spread = _searched(
-            begun, twice, costs, replace(spread, longest=left), seed, progress
-        )
-        if spread.possible(new) and harm(spread, new) < harm(clock, found):
-            found, moves, costs, bias = new, twice, later, spread.bias(new)
-        else:
-            costs = moves.costs()
-    noise, at_test = alias.noise, alias.at_test_poses
-    return found, moves, costs, Drifting(DRIFT * bias, DRIFT * before, noise, at_test)
+    once = _Order(in_turns(tour, load, sequence), moves, costs, clock).annealed(seed, FEW, WARM)
+    (spread, again), twice = moves.unloaded_twice(tour), None
+    longer = len(again) * clock.visit
+    left = clock.longest - (0.0 if as_pays else longer)
+    # Can it pay, if no drift is left at all?
+    pays = harm(0.0, clock.time(tour) + longer) < harm(once.bias, once.time)
+    if alias is not None and len(again) and pays and left >= clock.driving(tour):
+        own = VisitTimes.of(spread, motion, spread.costs(), alias, tour)
+        begun = in_turns([*tour, *again], spread.visits.load, sequence)
+        found = _Order(begun, spread, spread.costs(), replace(own, longest=left))
+        found = _searched(found.annealed(seed, FEW, WARM), seed, progress)
+        twice = found if found.possible else None
+    if twice is None or harm(HOPED * once.bias, once.time) <= harm(twice.bias, twice.time):
+        once = _searched(once.known(), seed, progress)
+        more = bool(motion.load_changes) and alias is None
+        if not once.possible or not (more or once.bias < before):
+            once = replace(once, tour=tour)
+    best = once
+    if twice is not None and harm(twice.bias, twice.time) < harm(once.bias, once.time):
+        best = twice
+    while best.moves.check(best.tour, best.costs):
+        best = best.known()
+    drift = None
+    if alias is not None:
+        drift = Drifting(DRIFT * best.bias, DRIFT * before, noise, alias.at_test_poses)
+    return best.tour, best.moves, best.costs, drift
 
 
-def _searched(
-    begun: list[int], moves: Moves, costs: Costs, clock: VisitTimes, seed: int,
-    progress: Callable[[str], None],
-) -> tuple[list[int], Costs, VisitTimes]:  # fmt: skip
-    """The order of least price found from one that has `begun`, its moves checked."""
-    load, tries = moves.visits.load, []
-    for k in range(TRIES):
-        tries.append(balanced(begun, load, clock, seed + k, STEPS, HOT))
-        if clock.share.any() and clock.bias(tries[-1]) <= clock.enough:
-            break  # it does no harm any more; without an alias the way alone counts
-    new, rounds, again = min(tries, key=clock.price), 0, 0
-    while (blocked := moves.check(new, costs)) or (not clock.possible(new) and again < TRIES):
-        progress(f"order of execution against drift: {moves.checked} moves checked")
-        if not blocked:  # the ways around take too long: another order, with what they are known
-            again, rounds = again + 1, 0
-            new = balanced(new, load, clock, seed + TRIES + again, STEPS, HOT / 2)
-            continue
-        rounds += 1
-        if moves.crowded or rounds == ROUNDS:
-            moves.settle()
-        costs = moves.costs()
-        clock = clock.at(costs)
-        if rounds <= ROUNDS:
-            new = balanced(new, load, clock, seed + rounds, FEW, HOT / 2**rounds)
-    return new, costs, clock
+def _searched(near: _Order, seed: int, progress: Callable[[str], None]) -> _Order:
+    """The order of least price found from one that is `near` a good one."""
+    best, moves = near, near.moves
+    for k, hot in enumerate((None, *HOT)):
+        new, rounds = near if hot is None else best.annealed(seed + k, STEPS, hot), 0
+        while moves.check(new.tour, new.costs):
+            progress(f"order of execution against drift: {moves.checked} moves checked")
+            rounds += 1
+            if moves.crowded or rounds == ROUNDS:
+                moves.settle()
+            new = new.known()
+            if rounds <= ROUNDS:
+                new = new.annealed(seed + rounds, MENDING, WARM)
+        best = min(replace(new, tour=best.tour), new, key=lambda order: order.price)
+        # Enough where a drift does no harm any more; without an alias the way alone counts.
+        if best.possible and best.clock.share.any() and best.bias <= best.clock.enough:
+            break
+    return best
 
 
 def _unloaded_first(tour: list[int], cost: Array, moves: Moves) -> list[int]:

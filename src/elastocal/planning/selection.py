@@ -246,7 +246,7 @@ IMPROVEMENT = 1e-9
 # Values that differ less are equal, and the candidate that comes first in the pool is taken.
 TIE = 1e-11
 # Candidates evaluated at first; each further batch is larger by GROWTH.
-FIRST, GROWTH = 32, 4
+FIRST, GROWTH = 8, 4
 # Ridges, as shares of a candidate's mean information, under which a regular plan is looked for.
 RIDGES = (1e-3, 1e-6, 1e-9)
 ATTEMPTS = 20
@@ -298,15 +298,13 @@ def exchange(problem: DesignProblem, chosen: IntArray) -> Exchanged:
     evaluated in the order of that bound until the best found exceeds all that are left: the result
     is that of evaluating the whole pool, for a few per cent of its candidates.
     """
-    state = _State.of(problem, chosen)
-    passes, improved = 0, True
-    while improved:
-        passes, improved = passes + 1, False
-        poses = np.unique(state.chosen)
-        for out in poses[np.argsort(state.d[poses], kind="stable")]:
-            better = _exchanged(problem, state, int(out))
-            if better is not None:
-                state, improved = better, True
+    state, passes = _State.of(problem, chosen), 0
+    in_vain: set[int] = set()  # poses of the plan as it stands for which none is better
+    while len(in_vain) < len(poses := np.unique(state.chosen)):
+        passes += 1
+        for out in poses[np.argsort(state.d[poses], kind="stable")].tolist():
+            better = None if out in in_vain else _exchanged(problem, state, out)
+            state, in_vain = (state, in_vain | {out}) if better is None else (better, set())
     return Exchanged(state.chosen, state.value, passes)
 
 
@@ -342,8 +340,8 @@ def best_addition(
     best, size = below * (1 - IMPROVEMENT), FIRST
     if problem.looks is not None and len(upper) and np.isfinite(upper[0]):
         candidates, upper = candidates[: problem.looks], upper[: problem.looks]
-    while len(values) < len(candidates) and upper[len(values)] * best > 1 - TIE:
-        part = candidates[len(values) : len(values) + size]
+    while (left := int(np.count_nonzero(upper * best > 1 - TIE))) > len(values):
+        part = candidates[len(values) : min(len(values) + size, left)]
         added = problem.criterion.after_adding(M, problem.blocks[:, part])
         values = np.concatenate([values, added])
         best, size = min(best, float(added.min())), size * GROWTH

@@ -31,7 +31,8 @@ PAIRS = Alias(np.concatenate([-OWN, OWN], axis=1) / 12, 5e-6, True, OWN, OWN)
 @pytest.fixture(autouse=True)
 def brief_annealing(monkeypatch):
     monkeypatch.setattr(execution_module, "STEPS", 8000)
-    monkeypatch.setattr(execution_module, "TRIES", 1)
+    monkeypatch.setattr(execution_module, "FEW", 2000)
+    monkeypatch.setattr(execution_module, "HOT", (4.0,))
 
 
 def ordered(alias=PAIRS, **motion):
