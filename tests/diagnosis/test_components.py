@@ -55,18 +55,42 @@ def rows_of(data: NoisyData, packed: Array) -> Array:
     return packed.reshape(-1, packed.shape[2])[used_rows(data)]
 
 
-def test_the_likelihood_is_that_of_a_normal_distribution() -> None:
-    data, components, at = some()
-    problem = posed(data, components, NOISE)
+def dense(data: NoisyData, components: list[Component], at: Sizes) -> Array:
+    """The covariance of all readings, the data's own columns integrated out too."""
     V = np.exp(2 * at.factor) * dense_noise(data, NOISE)
     X = rows_of(data, data.X)
     V += X @ np.diag(1 / data.precision) @ X.T
     for c, s, length in zip(components, at.size, at.length, strict=True):
         C = rows_of(data, c.columns)
         V += C @ np.diag(np.exp(2 * s) * c.shares(length)[0]) @ C.T
+    return V
+
+
+def test_the_likelihood_is_that_of_a_normal_distribution() -> None:
+    data, components, at = some()
+    problem = posed(data, components, NOISE)
     r = data.r.ravel()[used_rows(data)]
-    expected = multivariate_normal(np.zeros(len(r)), V).logpdf(r)
+    expected = multivariate_normal(np.zeros(len(r)), dense(data, components, at)).logpdf(r)
     assert -problem.factored(at)[2] / 2 == pytest.approx(expected, abs=1e-6)
+
+
+def test_the_information_is_the_average_of_the_dense_gaussian() -> None:
+    """rᵀPV_iPV_jPr and the prior's curvatures; V_i by differences of the dense covariance."""
+    data, components, at = some()
+    theta, K, h = np.concatenate([[at.factor], at.size, at.length]), len(components), 1e-5
+
+    def covariance(theta: Array) -> Array:
+        return dense(data, components, Sizes(theta[0], theta[1 : K + 1], theta[K + 1 :]))
+
+    inverse = np.linalg.inv(covariance(theta))
+    u = inverse @ data.r.ravel()[used_rows(data)]
+    moved = [(covariance(theta + s) - covariance(theta - s)) @ u / (2 * h)
+             for s in h * np.eye(len(theta))]  # fmt: skip
+    expected = np.array([[a @ inverse @ b for a in moved] for b in moved])
+    problem = posed(data, components, NOISE)
+    expected[1 : K + 1, 1 : K + 1] += 2 * problem.pool.precision
+    expected[0, 0] += 8.0 if data.stated else 0.0
+    np.testing.assert_allclose(problem.objective(theta)[2], expected, rtol=1e-5, atol=1e-5)
 
 
 def test_the_slope_is_that_of_the_value() -> None:

@@ -24,7 +24,7 @@ from elastocal.diagnosis import (
     posterior,
     project,
 )
-from elastocal.diagnosis.noise_floor import curved_likelihood, prior_curvature
+from elastocal.diagnosis.noise_floor import curved_likelihood, prior_curvature, scored_climb
 from elastocal.measurements import visits
 from elastocal.model import Model
 
@@ -78,6 +78,40 @@ def test_the_curvature_is_that_of_the_dense_gaussian(stated: bool) -> None:
     expected = np.array([[np.vdot(a.T, b) for b in PV] for a in PV])
     expected += prior_curvature(stated, data.G.shape[2])
     np.testing.assert_allclose(curved_likelihood(data, NOISE)[2], expected, rtol=1e-5, atol=1e-5)
+
+
+def test_the_curvature_has_no_saddle_where_joints_explain_nearly_all() -> None:
+    """One reading of three coordinates at each configuration, six joints, many columns fitted: a
+    part that is left over as a difference of large ones would be negative."""
+    blocks = Blocks.of(np.arange(60), np.arange(60), 3)
+    data = random_data(5, blocks, p=30, joints=6)
+    noise = NoiseValues(0.05, np.geomspace(3e-6, 3e-5, 6), np.full(6, 0.3))
+    assert np.linalg.eigvalsh(curved_likelihood(data, noise)[2]).min() > 0
+
+
+@pytest.mark.parametrize("corner", [False, True])
+def test_a_climb_ends_where_the_value_is_least(corner: bool) -> None:
+    """Of a function whose information is half its curvature along one axis, a limit in the way."""
+    A = np.array([[3.0, 0.4, 0.0], [0.4, 2.0, 0.3], [0.0, 0.3, 8.0]])
+    least = np.array([4.0, -1.0, 0.5])
+    evaluations = 0
+
+    def evaluate(x: np.ndarray) -> tuple[float, np.ndarray, np.ndarray]:
+        nonlocal evaluations
+        evaluations += 1
+        d = x - least
+        return float(d @ A @ d) / 2, A @ d, A - np.diag([0.0, 0.0, 4.0])
+
+    upper = np.array([2.0 if corner else 10.0, 10.0, 10.0])
+    found, ended = scored_climb(evaluate, np.zeros(3), np.full(3, -10.0), upper, 1e-10, 40)
+    expected = least.copy()
+    if corner:
+        expected[0] = 2.0
+        inner = A[1:, 1:], -A[1:, 0] * (2.0 - least[0])
+        expected[1:] = least[1:] + np.linalg.solve(*inner)
+    assert ended
+    assert evaluations < 15
+    np.testing.assert_allclose(found, expected, atol=1e-5)
 
 
 @pytest.mark.parametrize(("readings", "visits"), [(3, 3), (6, 1), (4, 2)])
