@@ -162,9 +162,9 @@ ROOMS: dict[str, tuple[Part, ...]] = {
             tables=1,
         ),
         Part(
-            "Effects named from 30 poses, 16 arms that lack one",
+            "Effects named from 30 poses, 100 arms that lack one",
             "",
-            "elastocal study experiment_design/next_best --set arms=0 --set named=16",
+            "elastocal study experiment_design/next_best --set arms=0 --set named=100",
             f"{STUDIES}/next_best/README.md",
             "Effects named from 30 poses",
             tables=1,
