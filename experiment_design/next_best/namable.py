@@ -19,6 +19,7 @@ import argparse
 from collections import Counter
 from collections.abc import Callable
 from dataclasses import replace
+from itertools import pairwise
 
 import numpy as np
 from study import LOADS, NAMED_FROM, SIGMA, TrueArm, feasible, model, planned, poses
@@ -150,8 +151,8 @@ def main() -> None:
         columns, own = own_columns(arm.model, own_B)
         d["best for it alone"].append(best_alone(columns, own_B[..., ~own] @ off[~own]))
     for what, each in (("d, from what the model follows", d), ("r, from the nearest rival", r)):
-        ends = [f"{a} to {b}" if np.isfinite(b) else f"above {a}" for a, b in
-                zip(CLASSES[:-1], CLASSES[1:], strict=True)]  # fmt: skip
+        between = pairwise(CLASSES)
+        ends = [f"{a} to {b}" if np.isfinite(b) else f"above {a}" for a, b in between]
         print(f"| {what} | median | {' | '.join(ends)} |\n|{'---|' * (len(ends) + 2)}")
         for name, values in each.items():
             counts = np.histogram(values, CLASSES)[0]
