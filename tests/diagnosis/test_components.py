@@ -21,11 +21,9 @@ from elastocal.diagnosis import (
 from elastocal.diagnosis.baseline import Blocks
 from elastocal.diagnosis.component_answer import PROBABLE, TOLD
 from elastocal.diagnosis.component_search import WIDE, Beside, evidence_beside
-from elastocal.diagnosis.components import drawn
 from elastocal.diagnosis.evidence import direct
-from elastocal.diagnosis.hypotheses import possible
 from elastocal.diagnosis.noise_floor import project
-from elastocal.model.effects.gears import EncoderScale, GearEccentricity, GearRipple
+from elastocal.model.effects.gears import EncoderScale
 from elastocal.model.effects.smooth import JointCurve, Waves
 
 Array = np.ndarray
@@ -263,35 +261,3 @@ def test_what_went_under_a_larger_noise_comes_back() -> None:
     found = fit_sum(data, [large], quiet, refit_noise=False)
     again = with_returned(found, [large, small])
     assert {id(c) for c in again.components} == {id(large), id(small)}
-
-
-def test_sizes_are_drawn_with_the_coefficients() -> None:
-    """Of two causes that look alike either may be it; what one alone does is known as well as by
-    the posterior at its size."""
-    model, table = campaign(n=20)
-    h = possible(model, table)[0][0]
-    data = random_data(5, p=2)
-    unit = np.tile(np.eye(data.r.shape[1]), (len(data.r), 1, 1))
-    data = replace(data, left_out=data.left_out & False, covariance=unit, r=0 * data.r)
-    rng, quiet = np.random.default_rng(0), NoiseValues.usual(3).of_instrument()
-    one, two = (rng.normal(size=(*data.r.shape, 1)) for _ in range(2))
-    effects = (EncoderScale(), GearEccentricity(), GearRipple())
-    alike, twin, alone = (
-        Component("angle", e, "joint1", columns, hypothesis=h)
-        for e, columns in zip(effects, (one, one, two), strict=True)
-    )
-    noise = rng.normal(size=data.r.shape)
-    data = replace(data, r=noise + 30 * one[..., 0] + 4 * two[..., 0])
-    found = fit_sum(data, [alike, alone], quiet, refit_noise=False)
-    wide = posed(data, [alike, alone, twin], found.noise)
-    at = Sizes(0.0, np.array([3.0, 1.0, 0.0]), np.zeros(3))
-    both = replace(found, components=wide.components, sizes=at, sums=wide)
-    precision = np.concatenate([data.precision, np.exp(-2 * at.size)])
-    w = drawn(both, (), wide.weighted, precision, 400, rng)
-    one_of, other, twin_of = w[-3:]
-    known = np.linalg.inv(wide.weighted.M + np.diag(precision))
-    sd = np.sqrt(known[-2, -2])
-    assert abs(other.mean() - (known @ wide.weighted.z)[-2]) < 4 * sd / 20
-    assert other.std() == pytest.approx(sd, rel=0.15)
-    np.testing.assert_allclose(one_of + twin_of, 30.0, atol=1.0)
-    assert min((one_of > 25).mean(), (twin_of > 25).mean()) > 0.1

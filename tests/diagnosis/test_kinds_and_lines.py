@@ -33,7 +33,6 @@ from elastocal.diagnosis.component_search import (
 from elastocal.diagnosis.components import (
     PRESENT,
     Pool,
-    drawn,
     fit_sum,
     given_fellows,
     log_odds,
@@ -42,7 +41,6 @@ from elastocal.diagnosis.components import (
 from elastocal.diagnosis.diagnosis_data import DiagnosisData, diagnosis_data_of
 from elastocal.diagnosis.hypotheses import possible
 from elastocal.diagnosis.line_orders import KnownFamily, log_prior_of, order_posterior, ripples
-from elastocal.diagnosis.noise_floor import Weighted
 from elastocal.model.effects.gears import EncoderScale, GearEccentricity
 
 QUIET = NoiseValues.usual(3).of_instrument()
@@ -146,24 +144,6 @@ def test_an_instrument_that_states_nothing_may_read_one_axis_worse(worse: float)
         ratio = np.sqrt(variance[axis == 0].mean() / variance[axis == 1].mean())
         assert ratio == pytest.approx(worse, rel=0.25)
         assert own.score > found.score + 5.0
-
-
-def test_what_is_hidden_pays_for_being_there() -> None:
-    """Of two causes that are alike, the one in the sum does not lose what it does to the other
-    because this one hides."""
-    data, rng = plain_data(), np.random.default_rng(5)
-    one, other = rng.normal(size=(2, *data.r.shape, 1))
-    h = possible(*campaign(n=20))[0][0]
-    mine, twin = (
-        replace(fellow(k, c), hypothesis=h) for k, c in enumerate((one, one + 0.3 * other))
-    )
-    r = rng.normal(size=data.r.shape) + 10 * one[..., 0]
-    found = fit_sum(replace(data, r=r), [mine], QUIET, refit_noise=False)
-    extra = np.full(1, np.exp(-2 * size_of_fellows(found, twin)))
-    wide = found.data.with_columns(data.masked(twin.columns), extra)
-    w = drawn(found, (twin,), Weighted.of(wide, found.noise), wide.precision, 200, rng)
-    assert np.median(w[-2]) == pytest.approx(10.0, rel=0.05)
-    assert (w[-1] == 0).mean() > 0.5
 
 
 @pytest.fixture(scope="module")

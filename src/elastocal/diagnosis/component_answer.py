@@ -13,11 +13,11 @@ import numpy as np
 from scipy import linalg
 from scipy.special import expit, softmax
 
+from elastocal.diagnosis.component_draws import drawn
 from elastocal.diagnosis.component_search import Rivals, exchanged, size_of_fellows
 from elastocal.diagnosis.components import (
     Component,
     FittedSum,
-    drawn,
     presence_cost,
     side_by_side,
 )

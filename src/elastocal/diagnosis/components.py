@@ -20,7 +20,7 @@ components of one kind, the share that is present and their common size are unkn
 from __future__ import annotations
 
 from collections import Counter
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from functools import cache, cached_property
 from typing import Literal
@@ -145,14 +145,15 @@ class Sizes:
 
 
 @cache
-def precision_of_sizes(k: int) -> Array:
-    """Of the logarithms of k sizes of a kind (k, k): the inverse of ALONE² I + COMMON² 11ᵀ."""
-    return np.asarray(np.linalg.inv(ALONE**2 * np.eye(k) + COMMON**2))
+def precision_of_sizes(k: int, alone: float = ALONE) -> Array:
+    """Of the logarithms of k sizes of a kind (k, k), which have SPREAD in all, `alone` of it their
+    own: the inverse of alone² I + (SPREAD² − alone²) 11ᵀ."""
+    return np.asarray(np.linalg.inv(alone**2 * np.eye(k) + SPREAD**2 - alone**2))
 
 
-def given_fellows(sizes: Sequence[float]) -> tuple[float, float]:
+def given_fellows(sizes: Sequence[float], alone: float = ALONE) -> tuple[float, float]:
     """Mean and precision of the logarithm of a size where those (k,) of its kind are known."""
-    own, *others = precision_of_sizes(len(sizes) + 1)[0]
+    own, *others = precision_of_sizes(len(sizes) + 1, alone)[0]
     return float(-np.dot(others, sizes) / own), float(own)
 
 
@@ -290,7 +291,7 @@ class SumOfComponents:
     def only(self, kept: Sequence[int]) -> SumOfComponents:
         """The same with these components alone, without whitening anything anew."""
         w, own = self.weighted, np.arange(len(self.data.precision))
-        index = np.concatenate([own, _indices([self.spans[k] for k in kept])])
+        index = np.concatenate([own, indices([self.spans[k] for k in kept])])
         narrow = replace(w, M=w.M[np.ix_(index, index)], z=w.z[index])
         return replace(self, weighted=narrow, components=tuple(self.components[k] for k in kept))
 
@@ -610,85 +611,6 @@ def _compressed(columns: Array, variances: Array, root: Array, faint: float = FA
     return np.asarray(scaled @ vectors[:, values > faint])
 
 
-# What the coefficients may be: draws, the sizes of what is narrow drawn with them.
-
-GRID = np.linspace(GONE, LARGEST, 41)  # logarithms of sizes
-SETTLING = 30  # sweeps
-
-
-def drawn(
-    found: FittedSum, hidden: Sequence[Component], at: Weighted, precision: Array, n: int,
-    rng: np.random.Generator,
-) -> Array:  # fmt: skip
-    """Posterior draws (p, n) of the coefficients of a sum and of components that are `hidden` by
-    it, whose columns stand behind its own.
-
-    Two causes that look alike share what they do by their sizes; which of these are the most
-    probable decides little.  So those of effects that need no search are drawn as well, one after
-    the other given the others (Gibbs), their coefficients integrated out: with A and b what the
-    others leave of its normal matrix and right side, a component of size s, or none, has the log
-    evidence −½ log|1 + s²A| + ½ bᵀ(s⁻² + A)⁻¹b, beside the prior of `Pool`.  What is hidden is not
-    there at first, and pays for being there as all others do.
-    """
-    components, prior = (*found.components, *hidden), at.prior(precision)
-    every, first = spans_of([c.width for c in components], len(prior)), len(found.components)
-    own = [k for k, c in enumerate(components) if c.hypothesis is not None and not c.settings]
-    c = _indices([every[k] for k in own])
-    x = np.setdiff1d(np.arange(len(prior)), c)
-    L = linalg.cholesky(at.M[np.ix_(x, x)] + np.diag(prior[x]), lower=True)
-    right = np.column_stack([at.M[np.ix_(x, c)], at.z[x]])
-    half = linalg.solve_triangular(L, right, lower=True)
-    across, z = half[:, :-1], half[:, -1]
-    S, t = at.M[np.ix_(c, c)] - across.T @ across, at.z[c] - across.T @ z
-    spans = dict(zip(own, spans_of([components[k].width for k in own], len(c)), strict=True))
-    pool = Pool(components)
-    sizes = {k: float(found.sizes.size[k]) for k in own if k < first}
-    kinds = [(kind.tolist(), n) for kind, n in zip(pool.kinds, pool.places, strict=True)]
-    steps = [(k, kind, n) for kind, n in kinds for k in kind if k in spans]
-    out = np.zeros((len(prior), n))
-    for sweep in range(-SETTLING, n):
-        for k, kind, places in steps:
-            sizes.pop(k, None)
-            fellows = [sizes[j] for j in kind if j in sizes]
-            m, (mean, inverse) = len(fellows), given_fellows(fellows)
-            cost = presence_cost(places, m + 1) - presence_cost(places, m) + pool.sought[k]
-            log_p = _at_sizes(S, t, spans, sizes, k) - 0.5 * inverse * (GRID - mean) ** 2
-            log_p += np.log(GRID[1] - GRID[0]) + 0.5 * np.log(inverse / (2 * np.pi)) - cost
-            log_p = np.append(log_p, -np.inf if components[k].given else 0.0)
-            chosen = int(rng.choice(len(log_p), p=special.softmax(log_p)))
-            if chosen < len(GRID):
-                sizes[k] = float(GRID[chosen])
-        if sweep >= 0:
-            A, i = _beside(S, spans, sizes)
-            spread = np.linalg.solve(np.linalg.cholesky(A).T, rng.normal(size=len(i)))
-            out[c[i], sweep] = np.linalg.solve(A, t[i]) + spread
-    rest = z[:, None] - across @ out[c] + rng.normal(size=(len(x), n))
-    out[x] = linalg.solve_triangular(L, rest, lower=True, trans="T")
-    return out
-
-
-def _indices(spans: Sequence[slice]) -> IntArray:
+def indices(spans: Sequence[slice]) -> IntArray:
     each = (np.arange(span.start, span.stop) for span in spans)
     return np.concatenate([np.zeros(0, dtype=np.int64), *each])
-
-
-def _beside(
-    S: Array, spans: Mapping[int, slice], sizes: Mapping[int, float]
-) -> tuple[Array, IntArray]:
-    """The normal matrix with its prior of the components that have a size, and their columns."""
-    i = _indices([spans[k] for k in sizes])
-    precision = [np.full(spans[k].stop - spans[k].start, np.exp(-2 * s)) for k, s in sizes.items()]
-    return S[np.ix_(i, i)] + np.diag(np.concatenate([np.zeros(0), *precision])), i
-
-
-def _at_sizes(
-    S: Array, t: Array, spans: Mapping[int, slice], sizes: Mapping[int, float], k: int
-) -> Array:
-    """Log evidence of component k at every size of the GRID, over none, beside those of `sizes`."""
-    (A, i), span = _beside(S, spans, sizes), spans[k]
-    solved = np.linalg.solve(A, np.column_stack([S[i, span], t[i]]))
-    left = np.column_stack([S[span, span], t[span]]) - S[span][:, i] @ solved
-    values, vectors = np.linalg.eigh(left[:, :-1])
-    values, b = np.maximum(values, 0.0), vectors.T @ left[:, -1]
-    v = np.exp(2 * GRID)[:, None]
-    return np.asarray(0.5 * (v * b**2 / (1 + v * values) - np.log1p(v * values)).sum(axis=1))

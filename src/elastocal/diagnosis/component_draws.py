@@ -1,0 +1,168 @@
+"""Posterior draws of a sum's coefficients, the sizes of its components drawn with them.
+
+Two causes that look alike share what they do by their sizes; which of these are the most probable
+decides little.  So the sizes of effects that need no search are drawn as well, one after the other
+given the others (Gibbs), their coefficients integrated out: with A and b what the others leave of
+its normal matrix and right side, a component of size s, or none, has the log evidence
+
+    −½ log|1 + s²A| + ½ bᵀ(s⁻² + A)⁻¹b,
+
+beside the prior of `Pool`.  What is hidden is not there at first, and pays for being there as all
+others do.  How alike the sizes of one kind are is unknown too, and drawn: where the eccentricities
+of six joints are alike, that of the seventh, which looks like its sag, hardly is ten times as
+large.  The weights of all links, which are given where they stand, have a size for every moment:
+those along the links are large, those across them next to nothing.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+
+import numpy as np
+from scipy import linalg, special
+
+from elastocal.diagnosis.components import (
+    GONE,
+    LARGEST,
+    SPREAD,
+    Component,
+    FittedSum,
+    Pool,
+    given_fellows,
+    indices,
+    precision_of_sizes,
+    presence_cost,
+)
+from elastocal.diagnosis.model_set import spans_of
+from elastocal.diagnosis.noise_floor import Weighted
+from elastocal.units import Array, IntArray
+
+GRID = np.linspace(GONE, LARGEST, 41)  # logarithms of sizes
+ALIKE = np.linspace(0.1, 0.9, 9) * SPREAD  # what sizes of a kind may spread by
+SETTLING = 30  # sweeps
+
+Key = int | tuple[int, int]  # a component's number, with that of its column where each has a size
+
+
+def drawn(
+    found: FittedSum, hidden: Sequence[Component], at: Weighted, precision: Array, n: int,
+    rng: np.random.Generator,
+) -> Array:  # fmt: skip
+    """Draws (p, n) of the coefficients of a sum and of components that are `hidden` by it, whose
+    columns stand behind its own."""
+    components, prior = (*found.components, *hidden), at.prior(precision)
+    every = spans_of([c.width for c in components], len(prior))
+    own = [k for k, c in enumerate(components) if c.hypothesis is not None and not c.settings]
+    c = indices([every[k] for k in own])
+    x = np.setdiff1d(np.arange(len(prior)), c)
+    L = linalg.cholesky(at.M[np.ix_(x, x)] + np.diag(prior[x]), lower=True)
+    right = np.column_stack([at.M[np.ix_(x, c)], at.z[x]])
+    half = linalg.solve_triangular(L, right, lower=True)
+    across, z = half[:, :-1], half[:, -1]
+    S, t = at.M[np.ix_(c, c)] - across.T @ across, at.z[c] - across.T @ z
+    kinds = _kinds(components, own)
+    spans = {key: span for kind in kinds for key, span in kind.spans.items()}
+    sizes = {key: float(found.sizes.size[k]) for kind in kinds
+             for key, k in kind.component.items() if k < len(found.components)}  # fmt: skip
+    out = np.zeros((len(prior), n))
+    for sweep in range(-SETTLING, n):
+        for kind in kinds:
+            spread = kind.spread(sizes, rng)
+            for key in kind.spans:
+                sizes.pop(key, None)
+                evidence = np.append(_at_sizes(S, t, spans, sizes, key), 0.0)
+                log_p = evidence + kind.log_prior(key, sizes, spread)
+                chosen = int(rng.choice(len(log_p), p=special.softmax(log_p)))
+                if chosen < len(GRID):
+                    sizes[key] = float(GRID[chosen])
+        if sweep >= 0:
+            A, i = _beside(S, spans, sizes)
+            spread_of = np.linalg.solve(np.linalg.cholesky(A).T, rng.normal(size=len(i)))
+            out[c[i], sweep] = np.linalg.solve(A, t[i]) + spread_of
+    rest = z[:, None] - across @ out[c] + rng.normal(size=(len(x), n))
+    out[x] = linalg.solve_triangular(L, rest, lower=True, trans="T")
+    return out
+
+
+@dataclass(frozen=True)
+class _Kind:
+    """What has sizes that are alike: a kind's components, or an effect's parameters.
+
+    Its members' `spans` of the columns, and the `component` that each is, or is a parameter of;
+    what finding them `sought`; at how many `places` there may be one, none where it is there in
+    any case.
+    """
+
+    spans: Mapping[Key, slice]
+    component: Mapping[Key, int]
+    sought: Mapping[Key, float]
+    places: int | None
+
+    def _logs(self, sizes: Mapping[Key, float]) -> Array:
+        return np.array([sizes[key] for key in self.spans if key in sizes])
+
+    def spread(self, sizes: Mapping[Key, float], rng: np.random.Generator) -> float:
+        """One of ALIKE, any of them as probable beforehand."""
+        logs = self._logs(sizes)
+        log_p = [_log_density(logs, a) for a in ALIKE.tolist()]
+        return float(ALIKE[rng.choice(len(ALIKE), p=special.softmax(log_p))])
+
+    def log_prior(self, key: Key, sizes: Mapping[Key, float], spread: float) -> Array:
+        """Of another size on the GRID beside `sizes`, and of none."""
+        others = self._logs(sizes)
+        m, (mean, precision) = len(others), given_fellows(others.tolist(), spread)
+        out = 0.5 * np.log(precision / (2 * np.pi)) - 0.5 * precision * (GRID - mean) ** 2
+        out += np.log(GRID[1] - GRID[0])
+        if self.places is None:
+            return np.append(out, -np.inf)
+        cost = presence_cost(self.places, m + 1) - presence_cost(self.places, m)
+        return np.append(out - cost - self.sought[key], 0.0)
+
+
+def _kinds(components: Sequence[Component], own: Sequence[int]) -> list[_Kind]:
+    """The kinds of these of all components; their spans are those among the columns of `own`."""
+    widths = [components[k].width for k in own]
+    spans = dict(zip(own, spans_of(widths, sum(widths)), strict=True))
+    pool, out = Pool(components), []
+    for members, places in zip(pool.kinds, pool.places, strict=True):
+        mine = [k for k in members.tolist() if k in spans]
+        for k in (k for k in mine if components[k].given):
+            parts: dict[Key, slice] = {
+                (k, i): slice(i, i + 1) for i in range(spans[k].start, spans[k].stop)
+            }
+            out.append(_Kind(parts, dict.fromkeys(parts, k), {}, None))
+        free = [k for k in mine if not components[k].given]
+        sought = {k: float(pool.sought[k]) for k in free}
+        out.append(_Kind({k: spans[k] for k in free}, {k: k for k in free}, sought, places))
+    return out
+
+
+def _log_density(logs: Array, spread: float) -> float:
+    """Of the logarithms (k,) of sizes, but for a constant: k − 1 times they vary on their own."""
+    k = len(logs)
+    log_det = -2 * (k - 1) * np.log(spread) - np.log(k * SPREAD**2 - (k - 1) * spread**2)
+    return 0.5 * float(log_det - logs @ precision_of_sizes(k, spread) @ logs) if k else 0.0
+
+
+def _beside(
+    S: Array, spans: Mapping[Key, slice], sizes: Mapping[Key, float]
+) -> tuple[Array, IntArray]:
+    """The normal matrix with its prior of what has a size, and its columns."""
+    i = indices([spans[key] for key in sizes])
+    precision = [np.full(spans[k].stop - spans[k].start, np.exp(-2 * s)) for k, s in sizes.items()]
+    return S[np.ix_(i, i)] + np.diag(np.concatenate([np.zeros(0), *precision])), i
+
+
+def _at_sizes(
+    S: Array, t: Array, spans: Mapping[Key, slice], sizes: Mapping[Key, float],
+    key: Key,
+) -> Array:  # fmt: skip
+    """Log evidence of `key` at every size of the GRID, over none, beside those of `sizes`."""
+    (A, i), span = _beside(S, spans, sizes), spans[key]
+    solved = np.linalg.solve(A, np.column_stack([S[i, span], t[i]]))
+    left = np.column_stack([S[span, span], t[span]]) - S[span][:, i] @ solved
+    values, vectors = np.linalg.eigh(left[:, :-1])
+    values, b = np.maximum(values, 0.0), vectors.T @ left[:, -1]
+    v = np.exp(2 * GRID)[:, None]
+    return np.asarray(0.5 * (v * b**2 / (1 + v * values) - np.log1p(v * values)).sum(axis=1))
