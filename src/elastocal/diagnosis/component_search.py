@@ -632,9 +632,11 @@ def with_own_axes(found: FittedSum) -> FittedSum:
         left = np.diagonal(at.P, axis1=1, axis2=2)
         ratio = np.array([(at.u[k] ** 2).sum() / left[k].sum() for k in own])
         ratio /= np.exp(np.log(ratio).mean())
-        if np.abs(np.log(ratio)).max() < SETTLED:
+        if np.abs(np.log(ratio)).max() < AXES_SETTLED:
             break
         each[axis < size] *= np.sqrt(ratio)[axis[axis < size]]
+    if (each == 1.0).all():
+        return found
     V = data.covariance * each[:, None] * each
     equal, own_axes = (posterior(replace(wide, covariance=c), found.noise)
                        for c in (data.covariance, V))  # fmt: skip
@@ -645,7 +647,7 @@ def with_own_axes(found: FittedSum) -> FittedSum:
 
 
 AXES = 0.5  # spread of the logarithms of an instrument's noise along its axes
-AXIS_STEPS, SETTLED = 20, 0.02
+AXIS_STEPS, AXES_SETTLED = 20, 0.02
 
 
 def with_equal_noise(dataset: DiagnosisData) -> NoisyData:

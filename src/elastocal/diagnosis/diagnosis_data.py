@@ -68,6 +68,7 @@ class DiagnosisData:
     other_backlash: float = 0.0
     _packed: dict[EntryKey | tuple[str, str], Array] = field(init=False, default_factory=dict)
     _kept: dict[tuple[str, str, bytes], Array] = field(init=False, default_factory=dict)
+    _room: list[int] = field(init=False, default_factory=lambda: [KEPT])  # what more may be kept
 
     @property
     def blocks(self) -> Blocks:
@@ -170,7 +171,8 @@ class DiagnosisData:
         D = self.directions[h.key](visits, settings) * self.sizes[h.key]
         D = D.reshape(*present.shape, *D.shape[1:]) * present[:, :, None, None, None]
         D = np.ascontiguousarray(D.transpose(0, 1, 3, 2, 4))
-        if D.size + sum(kept.size for kept in self._kept.values()) <= KEPT:
+        if D.size <= self._room[0]:
+            self._room[0] -= D.size
             self._kept[key] = D
         return D
 

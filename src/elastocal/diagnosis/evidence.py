@@ -207,6 +207,11 @@ class EntrySums:
             flip=self.flip.sum(axis=1, keepdims=True),
         )  # fmt: skip
 
+    def pieces(self, settings: Array, k: int) -> list[Array]:
+        """`settings` (G, …) of directions with k columns each, as many at a time as are held."""
+        each = max(1, HELD // (self.b.size * k))
+        return [settings[i : i + each] for i in range(0, len(settings), each)]
+
     def driven(self, D: Array) -> Spectrum:
         """Spectrum of the groups with directions D (C, v, d, V, k), or (C, 1, d, V, k) where they
         are the same in all visits of a configuration."""
@@ -292,8 +297,7 @@ class Grams:
         if settings is None:
             settings = self.dataset.grids[h.key].values
         sums = self.entry(h.entry_key(self.dataset.base.model))
-        each = max(1, HELD // (sums.b.size * len(h.parameters)))
-        pieces = [settings[i : i + each] for i in range(0, len(settings), each)]
+        pieces = sums.pieces(settings, len(h.parameters))
         return Spectrum.joined([sums.driven(self.dataset.direction(h, piece)) for piece in pieces])
 
     def _direct(self, columns: Array) -> Spectrum:
