@@ -139,10 +139,10 @@ HOPELESS = -6.0  # score below which none is
 # How far behind the best one is not worth a noise of its own: under noise that an effect still
 # missing has swollen, and under the noise of a set that is complete but for the item in question.
 FAR_BEHIND, BEHIND_COMPLETE = 60.0, 20.0
-# Probability that nothing (more) is there above which nothing is claimed.  For a first effect the
-# flips keep the false alarms at their level; many weak candidates together may make it probable
-# that there is something, though none of them is probable by itself.
-DOUBT, DOUBT_MORE = 0.7, 0.05
+# Probability that nothing (more) is there above which nothing is claimed.  A first effect has to be
+# the more probable, and the flips keep the false alarms at their level; many weak candidates
+# together may make it probable that there is something, though none of them is so by itself.
+DOUBT, DOUBT_MORE = 0.5, 0.05
 CLOSE_BLOCKS = 3
 CLEARLY = 10.0  # nats by which several named effects must beat fewer without a name
 PART = 0.3
