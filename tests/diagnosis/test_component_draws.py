@@ -60,7 +60,7 @@ def test_what_is_drawn_from_the_prior_lies_where_draws_say(any_hypothesis: Hypot
     data, rng, held = unit_data(), np.random.default_rng(1), []
     columns = 0.3 * rng.normal(size=(4, *data.r.shape, 2))
     components = [of_kind(k, c, any_hypothesis) for k, c in enumerate(columns)]
-    for seed in range(40):
+    for seed in range(25):
         spread = rng.choice(ALIKE)
         common = np.sqrt(SPREAD**2 - spread**2) * rng.normal()
         size = np.exp(common + spread * rng.normal(size=4))
@@ -80,7 +80,7 @@ def test_where_something_is_the_draws_hold_it(any_hypothesis: Hypothesis) -> Non
     data, rng, held = unit_data(), np.random.default_rng(2), []
     columns = 0.3 * rng.normal(size=(4, *data.r.shape, 2))
     components = [of_kind(k, c, any_hypothesis) for k, c in enumerate(columns)]
-    for seed in range(40):
+    for seed in range(25):
         spread = rng.choice(ALIKE)
         common = 1.0 + 0.1 * rng.normal()
         w = np.exp(common + spread * rng.normal(size=4))[:, None] * rng.normal(size=(4, 2))

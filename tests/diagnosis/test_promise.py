@@ -52,7 +52,8 @@ def crooked(q: np.ndarray) -> np.ndarray:
     return out
 
 
-@pytest.mark.parametrize("seed", [1, pytest.param(2, marks=pytest.mark.long)])
+@pytest.mark.long
+@pytest.mark.parametrize("seed", [1, 2])
 def test_what_curves_make_is_not_promised_away(seed: int) -> None:
     """An eccentricity beside error curves of joints, which go into the sum: what new poses gain by
     naming it alone is inside the 95 % interval that is promised."""

@@ -4,6 +4,7 @@ import json
 from dataclasses import replace
 
 import numpy as np
+import pytest
 from scipy import stats
 from support.calibration import cell_of, planar_chain, table_at
 from support.cells import random_poses
@@ -50,6 +51,7 @@ def test_it_is_the_textbook_decomposition():
     np.testing.assert_allclose(found.F, between / dof_between / (pure / dof_pure), rtol=1e-12)
 
 
+@pytest.mark.long
 def test_p_values_are_uniform_where_nothing_lacks():
     """Kolmogorov-Smirnov over 40 clean campaigns, at a level of one in a thousand."""
     p = []

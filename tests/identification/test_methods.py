@@ -144,6 +144,7 @@ def test_gross_errors_do_not_bend_a_robust_fit(method, share):
     assert np.sqrt(np.mean(bent**2)) > 2 * np.sqrt(np.mean(error**2))
 
 
+@pytest.mark.long
 def test_robust_intervals_hold_with_outliers():
     """8 tables of 7 parameters with 5 % errors: MM intervals at 95 %, in the binomial band."""
     hits = total = 0

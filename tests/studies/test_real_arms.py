@@ -88,6 +88,7 @@ def test_wam_is_no_matter_of_geometry_alone(folder):
     assert found["heldout_rms_um"] > 1000
 
 
+@pytest.mark.long
 def test_iiwa_bends_at_its_joints(folder):
     """Three payloads, one tool point each, springs driven by the measured torques."""
     rigid = identified(folder, "iiwa7_rigid.toml", "iiwa7.csv")
@@ -99,6 +100,7 @@ def test_iiwa_bends_at_its_joints(folder):
     assert compliance["identifiable"] and 5e-5 < compliance["value"] < 2e-4
 
 
+@pytest.mark.long
 def test_the_faulty_block_of_the_cable_data_is_found(folder):
     """A shift by some 4 mm over lines 142 to 507, seen by the tool itself."""
     as_is = identified(folder, "irb120.toml", "irb120.csv")
