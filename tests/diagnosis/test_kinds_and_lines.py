@@ -40,7 +40,13 @@ from elastocal.diagnosis.components import (
 )
 from elastocal.diagnosis.diagnosis_data import DiagnosisData, diagnosis_data_of
 from elastocal.diagnosis.hypotheses import possible
-from elastocal.diagnosis.line_orders import KnownFamily, log_prior_of, order_posterior, ripples
+from elastocal.diagnosis.line_orders import (
+    KnownFamily,
+    OrderPosterior,
+    log_prior_of,
+    order_posterior,
+    ripples,
+)
 from elastocal.model.effects.gears import EncoderScale, GearEccentricity
 
 QUIET = NoiseValues.usual(3).of_instrument()
@@ -270,3 +276,23 @@ def test_a_drift_is_as_fast_as_the_readings_show(share: float) -> None:
     else:
         assert found.score > begun.score + 10
         assert np.exp(found.sizes.length[0]) == pytest.approx(share * span, rel=0.5)
+
+
+def test_a_line_is_as_probable_as_all_families_that_have_it(rippled: DiagnosisData) -> None:
+    """Alone, or the second one of half its order: neither is more probable than not, the line is.
+    And of a family whose multiples are open the first line is the one to have."""
+    h = ripples(rippled)[0]
+    grid = np.arange(10.0, 100.0, 0.1)
+    orders, multiples = np.tile(grid, 3), np.repeat([1, 2, 3], len(grid))
+    weights = {(48.8, 1): 9.0, (24.4, 2): 9.5, (30.0, 1): 1.0}
+    log_odds = np.full(len(orders), -30.0)
+    for (order, m), odds in weights.items():
+        log_odds[np.argmin(np.abs(orders - order) + 100 * (multiples != m))] = log(odds)
+    none = np.zeros(0)
+    posterior = OrderPosterior(
+        h, orders, multiples, log_odds, 0.0, log_odds, 0.2, None, none, (0.0, 0.0)
+    )  # type: ignore[arg-type]
+    assert posterior.best == (pytest.approx(24.4), 2)
+    assert posterior.likeliest_line == (pytest.approx(48.8), 1)
+    assert posterior.probability(48.8) == pytest.approx(18.5 / 20.5, rel=1e-6)
+    assert posterior.probability(24.4) == pytest.approx(9.5 / 20.5, rel=1e-6)

@@ -252,15 +252,16 @@ SWEEPS = 2
 
 
 def with_expected_families(dataset: DiagnosisData, found: FittedSum) -> FittedSum:
-    """The sum with a family of lines at each joint where the others let expect one, and one order
-    is more probable than all others and none together; the most probable first."""
+    """The sum with a family of lines at each joint where the others let expect one, and a line at
+    one order is more probable than all others and none together; the most probable first."""
     while lined := {family.where for family in families_of(found)}:
         others = (h for h in ripples(dataset) if h.where not in lined)
         each = [order_posterior(dataset, found, h) for h in others]
-        likeliest = max(each, key=lambda p: p.probability(p.best[0]), default=None)
-        if likeliest is None or likeliest.probability(likeliest.best[0]) <= PROBABLE:
+        chances = [p.probability(p.likeliest_line[0]) for p in each]
+        if max(chances, default=0.0) <= PROBABLE:
             break
-        family = likeliest.family(dataset, *likeliest.best)
+        likeliest = each[int(np.argmax(chances))]
+        family = likeliest.family(dataset, *likeliest.likeliest_line)
         noise = with_scatter(found.noise, index(family.where), likeliest.scatter)
         found = _tuned(dataset, exchanged(replace(found, noise=noise), [], [family]))
     return found

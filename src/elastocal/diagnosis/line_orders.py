@@ -100,7 +100,17 @@ class OrderPosterior:
     def best(self) -> tuple[float, int]:
         """The most probable order, at its highest peak, and the most probable number of lines."""
         top = np.argsort(self.log_odds)[-PEAKS:]
-        middle = max(self.orders[top].tolist(), key=self.odds_near)
+        return self._at(max(self.orders[top].tolist(), key=self.odds_near))
+
+    @cached_property
+    def likeliest_line(self) -> tuple[float, int]:
+        """The order that most probably has a line, of whichever family, and how many lines a family
+        that begins there most probably has."""
+        top = np.argsort(self.log_odds)[-PEAKS:]
+        every = {k * order for order in self.orders[top].tolist() for k in MULTIPLES}
+        return self._at(max((o for o in every if o <= HIGHEST), key=self.probability))
+
+    def _at(self, middle: float) -> tuple[float, int]:
         m = max(MULTIPLES, key=lambda n: self.odds_near(middle, n))
         return float(self.orders[self._peak(middle, m)]), m
 
@@ -109,8 +119,13 @@ class OrderPosterior:
         return int(np.argmax(np.where(near, self.log_odds, -np.inf)))
 
     def probability(self, order: float) -> float:
-        """Of a family at this order, beside all others and none."""
-        return math.exp(self.odds_near(order) - np.logaddexp(0.0, logsumexp(self.log_odds)))
+        """Of a line at this order, the lowest of its family or a multiple, beside all others and
+        none: half an order with twice as many lines has it as well."""
+        its = np.zeros(len(self.orders), dtype=bool)
+        for k in MULTIPLES:
+            its |= (np.abs(k * self.orders - order) <= self.resolution) & (self.multiples >= k)
+        with_it = float(logsumexp(self.log_odds[its])) if its.any() else -math.inf
+        return math.exp(with_it - np.logaddexp(0.0, logsumexp(self.log_odds)))
 
     def family(self, dataset: DiagnosisData, order: float, m: int) -> Component:
         """The family of m lines near this order, where it fits best.
