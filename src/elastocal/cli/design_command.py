@@ -4,11 +4,11 @@ from __future__ import annotations
 
 import math
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Any
+from typing import TYPE_CHECKING, Annotated
 
 import typer
-from typer.core import TyperCommand, TyperOption
 
+from elastocal.cell import criterion_names
 from elastocal.cli.app import (
     CellFile,
     Interrupts,
@@ -37,23 +37,7 @@ PROGRAMS = {".src": "KUKA KRL", ".script": "URScript"}
 PICTURES = (".png", ".svg")
 
 
-def _criteria() -> list[str]:
-    from elastocal.planning.criteria import CRITERIA
-
-    return list(CRITERIA)
-
-
-class NamingCriteria(TyperCommand):
-    """A command whose help lists the criteria that there are; only help waits for them."""
-
-    def format_help(self, *args: Any) -> None:
-        for parameter in self.params:
-            if isinstance(parameter, TyperOption) and parameter.name == "criterion":
-                parameter.help = f"{', '.join(_criteria())}; default as the cell says."
-        super().format_help(*args)
-
-
-@command(cls=NamingCriteria)
+@command()
 def design(
     cell: CellFile,
     output: Annotated[Path, typer.Option("-o", "--output", help="The plan to write (CSV).")],
@@ -61,7 +45,8 @@ def design(
     criterion: Annotated[
         str | None,
         typer.Option(
-            help="What makes a plan good; default as the cell says.", autocompletion=_criteria
+            help=f"{', '.join(criterion_names.NAMES)}; default as the cell says.",
+            autocompletion=lambda: list(criterion_names.NAMES),
         ),
     ] = None,
     target: Annotated[
