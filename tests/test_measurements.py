@@ -8,6 +8,7 @@ import time
 import numpy as np
 import pytest
 
+from elastocal import tables
 from elastocal.errors import InputError
 from elastocal.measurements import (
     firsts,
@@ -19,6 +20,12 @@ from elastocal.measurements import (
 
 HEADER = "q1_deg,q2_deg,x_mm,y_mm,z_mm"
 ROW = "1,2,3,4,5"
+
+
+@pytest.fixture(autouse=True, params=[0, tables.SMALL_BYTES], ids=["pandas", "cells"])
+def reader(request, monkeypatch):
+    """Whether such small tables are read by pandas or cell by cell makes no difference."""
+    monkeypatch.setattr(tables, "SMALL_BYTES", request.param)
 
 
 @pytest.fixture
@@ -436,8 +443,6 @@ def test_a_file_that_vanishes_between_two_looks_is_refused(tmp_path, monkeypatch
 
 @pytest.fixture
 def small_chunks(monkeypatch):
-    from elastocal import tables
-
     monkeypatch.setattr(tables, "CHUNK_BYTES", 1)
 
 
@@ -461,8 +466,6 @@ def test_mixed_decimal_marks_are_found_across_pieces(refusal, small_chunks, firs
 
 
 def test_more_rows_than_any_campaign_has_are_refused(refusal, small_chunks, monkeypatch):
-    from elastocal import tables
-
     monkeypatch.setattr(tables, "MAX_ROWS", 3)
     assert "more than 3 rows" in refusal(table(*(f"{i},2,3,4,5" for i in range(9))))
 

@@ -8,6 +8,7 @@ fit in the place of an arm.
 
 import json
 from pathlib import Path
+from types import SimpleNamespace
 
 import casadi as ca
 import numpy as np
@@ -63,10 +64,13 @@ def digits(value, certified):
     return float(np.min(-np.log10(np.maximum(np.abs(value / certified - 1), 1e-17))))
 
 
+TABLE = SimpleNamespace(source="data")
+
+
 def fitted(model, y, start, sizes, sigma=None):
     """The fit from a start, and the standard deviations of its parameters."""
     n, p = len(y), len(start)
-    observed = Observations("distance", y, sparse.csr_array(np.eye(n)), np.arange(n), None)
+    observed = Observations("distance", y, sparse.csr_array(np.eye(n)), np.arange(n), TABLE)
     whiten = None if sigma is None else sparse.csr_array(np.eye(n) / sigma)
     weights = Weights("test", whiten, sigma is not None, "")
     found = fit(FitProblem(model, observed, weights, start, np.arange(p), sizes), max_steps=2000)

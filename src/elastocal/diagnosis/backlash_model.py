@@ -22,12 +22,14 @@ from elastocal.model.manipulator import Model
 from elastocal.units import Array
 
 EFFECT, BY_LOAD, BY_BOTH = Backlash.name, "load", "load_and_approach"
+ALIKE = 1e-3  # nats: the rounding of two fits must not choose between models that predict the same
 
 
 def with_likelier_backlash_model(dataset: DiagnosisData) -> DiagnosisData:
     """The data under the backlash model that its readings make likelier.
 
-    Where no side of approach is recorded, or the cell has play already, it stays as it is.
+    Where no side of approach is recorded, the cell has play already, or no reading tells the two
+    apart, it stays as it is.
     """
     model, noise = dataset.base.model, dataset.noise
     play = [h for h in dataset.hypotheses if h.name == EFFECT]
@@ -37,7 +39,7 @@ def with_likelier_backlash_model(dataset: DiagnosisData) -> DiagnosisData:
     under_other = diagnosis_data_of(other, play)
     data = replace(under_other.data, left_out=dataset.data.left_out)
     here, there = (_likeliest(d, noise) for d in (dataset, replace(under_other, data=data)))
-    if there.score <= here.score:
+    if there.score <= here.score + ALIKE:
         return dataset.changed(other_backlash=doubt(here, there))
     rows = dataset.columns.rows.copy()
     for h in play:

@@ -47,6 +47,20 @@ KEPT = 20_000_000  # numbers of regressor directions that are kept from scan to 
 LOAD_POINT_TOLERANCE = 2e-3
 
 
+@dataclass
+class KeptArrays:
+    """Arrays by key, for as long as there is `room`, in numbers, for one more."""
+
+    room: int
+    arrays: dict[tuple[str, str, bytes], Array] = field(default_factory=dict)
+
+    def keep(self, key: tuple[str, str, bytes], array: Array) -> None:
+        """Keep one that is not kept yet."""
+        if array.size <= self.room:
+            self.room -= array.size
+            self.arrays[key] = array
+
+
 @dataclass(frozen=True)
 class DiagnosisData:
     """A baseline with the columns of all hypotheses, packed by configuration.
@@ -67,8 +81,7 @@ class DiagnosisData:
     load_point: Array | None = None
     other_backlash: float = 0.0
     _packed: dict[EntryKey | tuple[str, str], Array] = field(init=False, default_factory=dict)
-    _kept: dict[tuple[str, str, bytes], Array] = field(init=False, default_factory=dict)
-    _room: list[int] = field(init=False, default_factory=lambda: [KEPT])  # what more may be kept
+    _kept: KeptArrays = field(init=False, default_factory=lambda: KeptArrays(KEPT))
 
     @property
     def blocks(self) -> Blocks:
@@ -165,15 +178,13 @@ class DiagnosisData:
         """D (C, v, d, G, k) at each visit, per typical size, at `settings` (G, …); (C, 1, d, G, k)
         where it is the same in all visits of a configuration."""
         key = *h.key, settings.tobytes()
-        if key in self._kept:
-            return self._kept[key]
+        if key in self._kept.arrays:
+            return self._kept.arrays[key]
         visits, present = self._driven_visits[h.key]
         D = self.directions[h.key](visits, settings) * self.sizes[h.key]
         D = D.reshape(*present.shape, *D.shape[1:]) * present[:, :, None, None, None]
         D = np.ascontiguousarray(D.transpose(0, 1, 3, 2, 4))
-        if D.size <= self._room[0]:
-            self._room[0] -= D.size
-            self._kept[key] = D
+        self._kept.keep(key, D)
         return D
 
     @cached_property

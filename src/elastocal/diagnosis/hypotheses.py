@@ -381,14 +381,19 @@ class Tangent:
 
 
 def with_tangents(
-    full: Model, hypotheses: list[Hypothesis], base: Baseline, x: Array, B: Array
+    full: Model,
+    places: dict[tuple[str, str], slice],
+    hypotheses: list[Hypothesis],
+    base: Baseline,
+    x: Array,
+    B: Array,
 ) -> tuple[Array, Array, dict[tuple[str, str], float]]:
-    """B (n_rows, size, K) with the columns of such hypotheses replaced where x (K,) has none, x
-    with the best start in it, and of each effect that was screened the log of its mean likelihood
-    over that at its best start."""
+    """B (n_rows, size, K) with the columns of such hypotheses replaced where x (K,) has none, in
+    place, x with the best start in it, and of each effect that was screened the log of its mean
+    likelihood over that at its best start."""
     shares: dict[tuple[str, str], float] = {}
     for h in hypotheses:
-        own = own_columns(full, h)
+        own = places[h.key]
         shown = np.abs(B[:, :, own]).max(axis=(0, 1)) > 0
         if shown.all() or shown.sum() != 1:
             continue
@@ -397,7 +402,7 @@ def with_tangents(
             best = min(search.tangents(), key=lambda tangent: tangent.left)
         else:
             best, shares[h.key] = next(search.tangents()), search.screened[1]
-        B, x = B.copy(), x.copy()
+        x = x.copy()
         B[:, :, own], x[own] = best.columns, best.at
     return B, x, shares
 
@@ -672,11 +677,11 @@ def compute_columns(
     x = np.array([at.get(p.name, p.nominal) for p in full.parameters])
     observed = observe(table, full.observe)
     B = full.regressor(table, x, observations=observed).B.reshape(len(table), observed.size, -1)
-    B, x, shares = with_tangents(full, direct, base, x, B)
     spans: dict[tuple[str, str], list[int]] = {}
     for k, p in enumerate(full.parameters):
         spans.setdefault((p.effect, p.where), []).append(k)
     places = {key: slice(v[0], v[-1] + 1) for key, v in spans.items()}
+    B, x, shares = with_tangents(full, places, direct, base, x, B)
     return Columns(base, B, places, full, x, shares)
 
 

@@ -290,7 +290,7 @@ def _new_poses(result: Calibration) -> Iterator[Finding]:
     left, wanted = spare_equations(result), ENOUGH
     if left < wanted:
         numbers: dict[str, Number] = {
-            "configurations": len(np.unique(result.observations.configuration)),
+            "configurations": result.observations.n_configurations,
             "parameters": len(result.observations.value) - result.dof,
             "equations_left": left, "needed": wanted,
         }  # fmt: skip

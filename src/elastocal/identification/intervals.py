@@ -17,7 +17,6 @@ from elastocal.identification.least_squares import Fit, FitProblem, fit
 from elastocal.identification.noise_choice import NoiseFit, estimate_noise, linearised
 from elastocal.identification.solve import Solution, residual_sigma
 from elastocal.identification.weighted_problem import Partition, Span, in_order, regressor
-from elastocal.measurements import ranked
 from elastocal.units import Array
 
 # Cluster-robust covariance of a fit to a table too large for its B to be formed.
@@ -29,7 +28,7 @@ ENOUGH = 10
 
 def worth_clustering(parts: Partition, n_parameters: int) -> bool:
     """Whether configurations hold several readings, and are enough for their scatter to count."""
-    configurations = int(ranked(parts.observed.configuration).max()) + 1
+    configurations = parts.observed.n_configurations
     return len(parts.observed.lead) > configurations >= ENOUGH * n_parameters
 
 
@@ -62,7 +61,7 @@ def cluster_by_parts(fit: Fit, parts: Partition) -> Covariance:
         return np.asarray(S.T @ S)
 
     middle = sum(in_order(parts.groups, meat), np.zeros((p, p)))
-    n, G = len(parts.observed.value), int(ranked(parts.observed.configuration).max()) + 1
+    n, G = len(parts.observed.value), parts.observed.n_configurations
     factor = G / (G - 1) * (n - 1) / (n - p)
     cofactor = fit.cofactor() / np.outer(size, size)
     matrix = factor * cofactor @ middle @ cofactor * np.outer(size, size)

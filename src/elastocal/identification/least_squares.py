@@ -9,7 +9,7 @@ from functools import cached_property
 import numpy as np
 from numpy.typing import NDArray
 from scipy import linalg
-from scipy.optimize import least_squares, lsq_linear
+from scipy.optimize import lsq_linear
 
 from elastocal.errors import ElastocalError
 from elastocal.identification.linear_solver import solve_weighted
@@ -143,22 +143,13 @@ def _steepest(at: Evaluation) -> float:
 
 # Nonlinear weighted least squares on the exact B.
 
-# Relative change of the cost at which the trust region stops; one exact Gauss–Newton step follows
-# and squares what error is left.
+# What a step promises of the cost where the descent ends; one exact Gauss–Newton step follows and
+# squares what error is left.
 TOLERANCE = 1e-10
 FIRST, LAST, MOST_POLISHES = 1e-6, 1e-11, 50
 # The same of a large table, whose evaluations are dear.  The last step is taken: at a million rows
 # it is a tenth of a standard deviation, and what it leaves behind is smaller by orders.
 LARGE_TOLERANCE = 1e-8
-
-REASON = {
-    -1: "the solver reported improper input",
-    0: "the step limit was reached; the start may be far off or the data ill-conditioned",
-    1: "the gradient vanished",
-    2: "the sum of squares no longer fell",
-    3: "the steps became negligible",
-    4: "sum of squares and steps both settled",
-}
 
 
 @dataclass(frozen=True)
@@ -277,59 +268,54 @@ def _regression(problem: FitProblem, x: Array) -> Regression:
 
 
 def _fit_whole(problem: FitProblem, max_steps: int) -> Fit:
-    size, weights, observed = problem.sizes[problem.columns], problem.weights, problem.observations
-    last: dict[bytes, Regression] = {}  # residual and B come from one evaluation
+    weights, columns = problem.weights, problem.columns
+    size = problem.sizes[columns]
+    last: dict[bytes, Regression] = {}
 
-    def regression_at(u: Array) -> Regression:
-        if u.tobytes() not in last:
-            at = _regression(problem, problem.values(u))
-            last.clear()
-            last[u.tobytes()] = at
-        return last[u.tobytes()]
+    def evaluated(u: Array) -> Evaluation:
+        at = _regression(problem, problem.values(u))
+        whitened = weights.apply(at.residual)
+        if not np.isfinite(whitened).all():
+            raise ElastocalError(
+                f"{problem.observations.table.source}: the model predicts no finite numbers at the "
+                "start values; look in the cell for a length, force or compliance far too large"
+            )
+        last.clear()
+        last[u.tobytes()] = at
+        return Evaluation(at.residual, RFactor.of(weights.apply(at.B * size), whitened))
 
-    def residual(u: Array) -> Array:
-        """Predicted minus observed, NaN where a pose has no equilibrium."""
-        try:
-            raw = -regression_at(u).residual
-        except ElastocalError:
-            predicted = problem.model.predict(observed.table, problem.values(u), observed)
-            raw = predicted - observed.value
-        r = weights.apply(raw)
-        if problem.tie is None:
-            return r
-        x = problem.values(u)
-        return np.concatenate([r, (x[problem.columns] - problem.tied_to) / problem.tie])
-
-    def jacobian(u: Array) -> Array:
-        B = weights.apply(regression_at(u).B * size)
-        return B if problem.tie is None else np.vstack([B, np.diag(size / problem.tie)])
-
-    lower, upper = problem.limits
-    start = np.clip(np.zeros(len(problem.columns)), lower, upper)
-    if not np.isfinite(residual(start)).all():
-        regression_at(start)  # names the row
-        raise ElastocalError(
-            f"{observed.table.source}: the model predicts no finite numbers at the start "
-            "values; look in the cell for a length, force or compliance far too large"
-        )
-    found = least_squares(
-        residual, start, jacobian, bounds=(lower, upper), method="trf", x_scale=1.0,
-        ftol=TOLERANCE, xtol=TOLERANCE, gtol=TOLERANCE, max_nfev=max_steps,
-    )  # fmt: skip
-    x, final = problem.values(found.x), regression_at(found.x)
-    if problem.tie is None and not problem.bounded and found.status > 0:
+    found = _descent(problem, evaluated, None, TOLERANCE, max_steps)
+    x = problem.values(found.u)
+    final = last.get(found.u.tobytes()) or _regression(problem, x)
+    if problem.tie is None and not problem.bounded and found.converged:
         x, final = _polished(problem, x, final)
     whitened = weights.apply(final.residual)
     return Fit(
         x, final.residual, whitened, RFactor.of(weights.apply(final.B), whitened),
-        bool(found.status > 0), REASON[int(found.status)], int(found.nfev), problem,
+        found.converged, found.reason, found.evaluations, problem,
     )  # fmt: skip
+
+
+def _descent(
+    problem: FitProblem,
+    evaluated: Callable[[Array], Evaluation],
+    evaluated_last: Callable[[Array], Evaluation] | None,
+    tolerance: float,
+    max_steps: int,
+) -> Descent:
+    """The descent from the problem's x, in typical sizes of its columns."""
+    columns, (lower, upper) = problem.columns, problem.limits
+    size = problem.sizes[columns]
+    tie = np.full(len(columns), np.inf) if problem.tie is None else problem.tie / size
+    centre = (problem.tied_to - problem.x[columns]) / size
+    objective = SumOfSquares(evaluated, tie, centre, lower, upper, evaluated_last)
+    start = np.clip(np.zeros(len(columns)), lower, upper)
+    return descend(objective, start, tolerance, max_steps)
 
 
 def _fit_in_parts(problem: FitProblem, max_steps: int, tolerance: float) -> Fit:
     columns = problem.columns
     size = problem.sizes[columns]
-    lower, upper = problem.limits
 
     def evaluated(u: Array) -> Evaluation:
         at = evaluate(problem.model, problem.parts, problem.values(u), columns)
@@ -341,13 +327,8 @@ def _fit_in_parts(problem: FitProblem, max_steps: int, tolerance: float) -> Fit:
         own = at.r_factor.of_columns(np.searchsorted(among, columns))
         return Evaluation(at.residual, own.scaled(size), at.r_factor)
 
-    objective = SumOfSquares(
-        evaluated, np.full(len(columns), np.inf) if problem.tie is None else problem.tie / size,
-        (problem.tied_to - problem.x[columns]) / size, lower, upper,
-        None if problem.among is None else among_others,
-    )  # fmt: skip
-    start = np.clip(np.zeros(len(columns)), lower, upper)
-    found = descend(objective, start, tolerance, max_steps)
+    last = None if problem.among is None else among_others
+    found = _descent(problem, evaluated, last, tolerance, max_steps)
     return Fit(
         problem.values(found.u), found.at.residual, problem.weights.apply(found.at.residual),
         found.at.r_factor.scaled(1 / size), found.converged, found.reason, found.evaluations,

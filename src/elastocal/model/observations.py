@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
+from functools import cached_property
 
 import numpy as np
 from numpy.typing import NDArray
@@ -44,6 +45,11 @@ class Observations:
     @property
     def configuration(self) -> NDArray[np.int64]:
         return self.table.configuration[self.lead]
+
+    @cached_property
+    def n_configurations(self) -> int:
+        """How many configurations there are."""
+        return int(ranked(self.configuration).max(initial=-1)) + 1
 
     @property
     def load(self) -> IntArray:

@@ -6,6 +6,7 @@ which is of arrays.  Homogeneous transforms are (4, 4), rotations (3, 3), vector
 
 from __future__ import annotations
 
+from functools import lru_cache
 from typing import TYPE_CHECKING, Any
 
 import casadi as ca
@@ -34,10 +35,16 @@ def skew(v: Any) -> ca.SX:
 
 def rotation_about(axis: Any, angle: Any) -> ca.SX:
     """Rotation by `angle` about the constant unit `axis` (Rodrigues)."""
-    a = np.asarray(axis, dtype=float)
-    along = constant(np.outer(a, a))
-    across = constant(np.eye(3) - np.outer(a, a))
-    return along + ca.cos(angle) * across + ca.sin(angle) * constant(ca.DM(skew(a)))
+    along, across, about = _rodrigues(tuple(map(float, axis)))
+    return along + ca.cos(angle) * across + ca.sin(angle) * about
+
+
+@lru_cache(maxsize=64)
+def _rodrigues(axis: tuple[float, float, float]) -> tuple[ca.SX, ca.SX, ca.SX]:
+    """a aᵀ, 1 − a aᵀ and skew(a): an arm turns about the same few axes in every model of it."""
+    a = np.array(axis)
+    along = np.outer(a, a)
+    return constant(along), constant(np.eye(3) - along), constant(ca.DM(skew(a)))
 
 
 def rotation_from_vector(r: Any) -> ca.SX:

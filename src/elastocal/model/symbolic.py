@@ -114,10 +114,9 @@ class Equilibrium:
         return known[1].copy(), known[2].copy()
 
     def _solve(self, inputs: Sequence[NDArray], p: NDArray) -> tuple[NDArray, NDArray]:
-        theta = self._stationary(inputs, p, len(inputs[0]))
+        theta, F_theta = self._stationary(inputs, p, len(inputs[0]))
         with np.errstate(invalid="ignore"):
             theta[(np.abs(theta.real) > LARGEST).any(axis=1)] = np.nan
-        F_theta = self._residual(inputs, p, theta)[1]
         theta[self._unstable(F_theta.real)] = np.nan
         F_theta[~np.isfinite(theta).all(axis=1)] = np.eye(self.size)
         return theta, F_theta
@@ -132,8 +131,11 @@ class Equilibrium:
             return rows
         return rows[np.linalg.eigvals(F_theta[rows]).real.min(axis=1) <= 0]
 
-    def _stationary(self, inputs: Sequence[NDArray], p: NDArray, n: int) -> NDArray:
+    def _stationary(self, inputs: Sequence[NDArray], p: NDArray, n: int) -> tuple[NDArray, NDArray]:
+        """θ (n, size), NaN where it does not settle, and F_θ where the last step was taken: that
+        step is rounding, so F_θ is that of θ."""
         theta = np.zeros((n, self.size), dtype=np.result_type(np.float64, p, *inputs))
+        slope = np.full((n, self.size, self.size), np.nan, dtype=theta.dtype)
         active = np.arange(n)
         for _ in range(MAX_STEPS):
             rows = [a[active] for a in inputs]
@@ -142,19 +144,20 @@ class Equilibrium:
             theta[active[~finite]] = np.nan
             active, F, F_theta = active[finite], F[finite], F_theta[finite]
             if not len(active):
-                return theta
+                return theta, slope
             try:
                 step = np.linalg.solve(F_theta, F)[..., 0]
             except np.linalg.LinAlgError:  # a pose at the verge of buckling
                 theta[active] = np.nan
-                return theta
+                return theta, slope
             theta[active] -= step
+            slope[active] = F_theta
             settled = np.abs(step).max(axis=1) <= TOLERANCE + 1e-12 * np.abs(theta[active]).max(1)
             active = active[~settled]
             if not len(active):
-                return theta
+                return theta, slope
         theta[active] = np.nan
-        return theta
+        return theta, slope
 
 
 class SymbolicArm:

@@ -316,7 +316,7 @@ def error_line(result: Calibration) -> str:
 
 def readings(result: Calibration) -> str:
     observed = result.observations
-    poses = len(np.unique(observed.configuration))
+    poses = observed.n_configurations
     markers = len(np.unique(observed.table.marker[observed.lead]))
     return (
         f"{len(observed.lead)} {READINGS[observed.kind]} in {counted(poses, 'configuration')}, "

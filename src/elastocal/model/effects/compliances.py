@@ -117,7 +117,7 @@ def weight_torque(chain: Chain, i: int) -> float:
     ends = [T[:3, 3] for T in link_ends(chain)]
 
     def off_axis(point: Array) -> float:
-        return float(np.linalg.norm(np.cross(axis, point)))
+        return float(np.linalg.norm(point - axis * (axis @ point)))
 
     moment, reach = 0.0, 0.0
     for j, body in enumerate(chain.masses[i:], start=i):

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
+from functools import cache
 from typing import Any
 
 import casadi as ca
@@ -24,6 +25,7 @@ from elastocal.model.effects.base import (
     links,
 )
 from elastocal.model.effects.placements import SHORTEST, link_ends
+from elastocal.model.evaluate import BatchFunction
 from elastocal.units import Array
 
 
@@ -186,6 +188,14 @@ def spring_energy(q: Any, x: Any, y: Any, arm: Any, free: Any) -> ca.SX:
     return (s - free) ** 2 / 2
 
 
+@cache
+def spring_torque() -> BatchFunction:
+    """The torque of that spring, of the angle and the geometry (x, y, arm, free)."""
+    angle, shape = ca.SX.sym("q"), ca.SX.sym("shape", len(GEOMETRY))
+    energy = spring_energy(angle, *ca.vertsplit(shape))
+    return BatchFunction([angle, shape], [ca.gradient(energy, angle)])
+
+
 class GravityCompensator(Effect):
     """Spring of stiffness K_c and free length s₀ acting at arm L, anchored at (a_x, a_y).
 
@@ -237,13 +247,10 @@ class GravityCompensator(Effect):
 
     def profiles(self, place: str, starts: Sequence[Mapping[str, float]], q: Array) -> Array | None:
         """The torque of a spring of unit stiffness."""
-        angle, shape = ca.SX.sym("q"), ca.SX.sym("shape", len(GEOMETRY))
-        energy = spring_energy(angle, *ca.vertsplit(shape))
-        torque = ca.Function("torque", [angle, shape], [ca.gradient(energy, angle)])
-        shapes = np.array([[start[key] for key in GEOMETRY] for start in starts]).T
+        shapes = np.array([[start[key] for key in GEOMETRY] for start in starts])
         known, row = np.unique(q[:, index(place)], return_inverse=True)
-        angles, every = np.repeat(known, len(starts)), np.tile(shapes, len(known))
-        values = torque.map(len(angles))(angles[None], every).full()
+        angles, every = np.repeat(known, len(starts)), np.tile(shapes, (len(known), 1))
+        (values,) = spring_torque()(angles[:, None], every)
         return np.asarray(values.reshape(len(known), len(starts))[row.ravel()])
 
     def hints(self, place: str, values: Mapping[str, float]) -> dict[str, Any]:
