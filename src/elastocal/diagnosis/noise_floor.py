@@ -250,9 +250,14 @@ class Weighted:
     alone: float
 
     @classmethod
-    def of(cls, data: NoisyData, noise: NoiseValues) -> Weighted:
+    def of(cls, data: NoisyData, noise: NoiseValues, room: Array | None = None) -> Weighted:
+        """`room` (C, m, p) is where K⁻¹X is put: at many noises one after the other the system
+        would else hand out the same pages anew each time, a fifth of all that an evaluation costs.
+        """
         of = data.counting
-        root, X, r, log_det = WhitenedBlocks.of(covariance(data, noise), of.X, of.r)
+        white = WhitenedBlocks.of(covariance(data, noise), of.X[:, :, :0], of.r)
+        root, r, log_det = white.root, white.e, white.log_det
+        X = np.matmul(root, of.X, out=room)
         flat = X.reshape(-1, X.shape[2])
         alone = log_det + float(np.vdot(r, r)) + data.n_rows * float(np.log(2 * np.pi))
         return cls(root, X, r, flat.T @ flat, flat.T @ r.ravel(), alone)
@@ -280,27 +285,39 @@ class Weighted:
     def projection(self, precision: Array) -> Projection:
         L, z, marginal = self.factored(precision)
         back = self.root.transpose(0, 2, 1)
-        H = back @ _divided(self.X, L)
-        u = (back @ self.r[..., None])[..., 0] - H @ z
+        H = back @ _times_transposed(self.X, _inverse(L))
+        u = (back @ self.r[..., None])[..., 0] - _times(H, z)
         beta = linalg.solve_triangular(L, z, lower=True, trans="T", check_finite=False)
         return Projection(back @ self.root, H, u, beta, marginal, L)
 
 
-def _divided(rows: Array, L: Array) -> Array:
-    """rows L⁻ᵀ (…, p) of rows (…, p) and a lower triangular L (p, p)."""
+def _inverse(L: Array) -> Array:
+    """L⁻¹ of a lower triangular L (p, p)."""
+    return np.asarray(linalg.lapack.dtrtri(L, lower=1)[0])
+
+
+def _times_transposed(rows: Array, lower: Array, overwrite: bool = False) -> Array:
+    """rows Tᵀ (…, p) of rows (…, p), in whose place they may be, and a lower triangular T (p, p).
+
+    By BLAS's triangular product: with T = L⁻¹ half the time of solving for every row.
+    """
     flat = rows.reshape(-1, rows.shape[-1])
-    # BLAS itself, since scipy's solver hands the rows back column by column.
-    divided = linalg.blas.dtrsm(1.0, L, flat.T, lower=1).T
-    return np.asarray(divided.reshape(rows.shape))
+    product = linalg.blas.dtrmm(1.0, lower, flat.T, lower=1, overwrite_b=overwrite)
+    return np.asarray(product.T.reshape(rows.shape))
+
+
+def _times(rows: Array, vector: Array) -> Array:
+    """rows (C, m, p) times a vector (p,), as one product: (C, m)."""
+    return np.asarray((rows.reshape(-1, rows.shape[2]) @ vector).reshape(rows.shape[:2]))
 
 
 def project(data: NoisyData, noise: NoiseValues) -> Projection:
     return Weighted.of(data, noise).projection(data.precision)
 
 
-def posterior(data: NoisyData, noise: NoiseValues) -> float:
+def posterior(data: NoisyData, noise: NoiseValues, room: Array | None = None) -> float:
     """−2 log of marginal likelihood times prior of the noise."""
-    marginal = Weighted.of(data, noise).marginal(data.precision)
+    marginal = Weighted.of(data, noise, room).marginal(data.precision)
     return -2 * marginal + log_prior(data.stated, noise)[0]
 
 
@@ -309,47 +326,59 @@ def likelihood(data: NoisyData, noise: NoiseValues) -> tuple[float, Array]:
     return curved_likelihood(data, noise)[:2]
 
 
-def curved_likelihood(data: NoisyData, noise: NoiseValues) -> tuple[float, Array, Array]:
+def curved_likelihood(
+    data: NoisyData, noise: NoiseValues, room: Array | None = None
+) -> tuple[float, Array, Array]:
     """−2 log of marginal likelihood times prior, its slope in the logarithms (1 + 2 joints,), and
     the curvature to expect there, tr P V_k P V_l, of each configuration by itself.
 
     The slope wants gᵀQg, Q = P − uuᵀ, of the joints' columns g in every visit and configuration:
     with g̃ = K⁻¹g, H̃ = X̃L⁻ᵀ and ẽ = K⁻¹(r − Xβ̂) it is g̃ᵀ(1 − H̃H̃ᵀ − ẽẽᵀ)g̃.  What is left of V
     is the instrument's: tr QV = n − tr (M + Λ)⁻¹M − ẽᵀẽ; and of a configuration by itself
-    PVP = K⁻ᵀ(1 − H̃H̃ᵀ)²K⁻¹.
+    PVP = K⁻ᵀ(1 − H̃H̃ᵀ)²K⁻¹, so that g'PVPg is the square of h = (1 − H̃H̃ᵀ)g̃.
     """
-    of, at = data.counting, Weighted.of(data, noise)
+    of, at, J = data.counting, Weighted.of(data, noise, room), data.G.shape[2]
     L, z, marginal = at.factored(data.precision)
     beta = linalg.solve_triangular(L, z, lower=True, trans="T", check_finite=False)
-    e = (at.r - at.X @ beta)[..., None]
-    whole = 2 * (data.n_rows - float(np.vdot(e, e)))
-    H, J = _divided(at.X, L), data.G.shape[2]
-    P = np.eye(e.shape[1]) - H @ H.transpose(0, 2, 1)
+    inverse, e = _inverse(L), at.r - _times(at.X, beta)
+    H = _times_transposed(at.X, inverse, overwrite=True)
+    white = H @ H.transpose(0, 2, 1)
+    white *= -1.0
+    np.einsum("cii->ci", white)[:] += 1.0
     g = of.by_visit @ at.root.transpose(0, 2, 1)
-    shape = len(g), g.shape[1] // J, J, g.shape[1] // J, J
-    Q, PVP, P_white = P - e @ e.transpose(0, 2, 1), P @ P, P
-    P, Q, PVP = ((g @ N @ g.transpose(0, 2, 1)).reshape(shape) for N in (P, Q, PVP))
-    inverse = linalg.lapack.dtrtri(L, lower=1)[0]
+    by_visit = len(g), g.shape[1] // J, J
+    h = g @ white
+    P = (h @ g.transpose(0, 2, 1)).reshape(*by_visit, *by_visit[1:])
+    h, f = h.reshape(*by_visit, -1), (g @ e[..., None]).reshape(by_visit)
     fitted = len(L) - float((inverse**2 @ at.prior(data.precision)).sum())
     single, shared = 2 * noise.joint**2, 2 * (noise.joint * noise.shared) ** 2
 
-    def traces(N: Array, of_all: float) -> Array:
-        of_shared = shared * np.einsum("cvjwj->j", N)
-        of_joint = single * np.einsum("cvjvj->j", N) + of_shared
+    def traces(of_all: float, of_visits: Array, of_both: Array) -> Array:
+        """tr N V_k of tr N V, and of Σ gᵀNg (joints,) of each visit and of every two of one
+        configuration."""
+        of_shared = shared * of_both
+        of_joint = single * of_visits + of_shared
         return np.concatenate([[of_all - of_joint.sum()], of_shared, of_joint])
 
     prior, prior_slope = log_prior(data.stated, noise)
-    slope = traces(Q, whole - 2 * fitted) + prior_slope
+    whole = 2 * (data.n_rows - float(np.vdot(e, e)) - fitted)
+    slope = prior_slope + traces(
+        whole, np.einsum("cvjvj->j", P) - np.einsum("cvj,cvj->j", f, f),
+        np.einsum("cvjwj->j", P) - (f.sum(axis=1) ** 2).sum(axis=0),
+    )  # fmt: skip
     # From gᵀPg of every two visits of a configuration: those of visits, of both, of configurations.
-    by_visit = P.sum(axis=3)
+    across = np.einsum("cvjwk->cvjk", P)
     vv = np.outer(single, single) * np.einsum("cvjwk,cvjwk->jk", P, P)
-    vs = np.outer(single, shared) * np.einsum("cvjk,cvjk->jk", by_visit, by_visit)
-    ss = np.outer(shared, shared) * (by_visit.sum(axis=1) ** 2).sum(axis=0)
+    vs = np.outer(single, shared) * np.einsum("cvjk,cvjk->jk", across, across)
+    ss = np.outer(shared, shared) * (across.sum(axis=1) ** 2).sum(axis=0)
     joints = np.block([[ss, vs.T + ss], [vs + ss, vv + vs + vs.T + ss]])
-    trace = traces(PVP, 2 * float((P_white**2).sum()) - 2 * float(data.left_out.sum()))
-    across = 2 * trace[1:] - joints[J:].sum(axis=0)
-    alone = 2 * trace[0] - across[J:].sum()
-    curvature = np.block([[np.array([[alone]]), across[None]], [across[:, None], joints]])
+    trace = traces(
+        2 * float(np.vdot(white, white)) - 2 * float(data.left_out.sum()),
+        np.einsum("cvjm,cvjm->j", h, h), (h.sum(axis=1) ** 2).sum(axis=(0, 2)),
+    )  # fmt: skip
+    mixed = 2 * trace[1:] - joints[J:].sum(axis=0)
+    alone = 2 * trace[0] - mixed[J:].sum()
+    curvature = np.block([[np.array([[alone]]), mixed[None]], [mixed[:, None], joints]])
     return -2 * marginal + prior, slope, curvature + prior_curvature(data.stated, J)
 
 
@@ -392,8 +421,9 @@ def balanced(data: NoisyData) -> NoiseValues:
 def _climbed(data: NoisyData, start: NoiseValues, enough: float) -> NoiseValues:
     """Steps by the expected curvature, which few of them need; where they do not end, by L-BFGS."""
     lower, upper = _limits(data)
+    room = np.empty_like(data.X)
     theta, ended = scored_climb(
-        lambda theta: curved_likelihood(data, NoiseValues.of_logs(theta)),
+        lambda theta: curved_likelihood(data, NoiseValues.of_logs(theta), room),
         np.clip(start.logs(), lower, upper), lower, upper, enough, SCORED,
     )  # fmt: skip
     found = NoiseValues.of_logs(theta)
@@ -503,11 +533,11 @@ def noise_draws(
     are kept, each with the probability that it has beside what the Gaussian gives it (sampling
     importance resampling, Rubin 1988): a joint's scatter may be anything below what shows.
     """
-    theta = noise.logs()
+    theta, room = noise.logs(), np.empty_like(data.X)
     k = len(theta)
 
     def slope(at: Array) -> Array:
-        return likelihood(data, NoiseValues.of_logs(at))[1]
+        return curved_likelihood(data, NoiseValues.of_logs(at), room)[1]
 
     H = np.empty((k, k))
     for i, e in enumerate(STEP * np.eye(k)):
@@ -518,7 +548,7 @@ def noise_draws(
     drawn = theta + z @ root.T
     joints = slice(1 + len(noise.joint), None)
     drawn[:, joints] = np.clip(drawn[:, joints], np.log(SMALLEST_NOISE), np.log(LARGEST))
-    minus_two = np.array([posterior(data, NoiseValues.of_logs(t)) for t in drawn])
+    minus_two = np.array([posterior(data, NoiseValues.of_logs(t), room) for t in drawn])
     log_weight = -0.5 * minus_two + 0.5 * (z**2).sum(axis=1)
     weight = np.exp(log_weight - log_weight.max())
     kept = rng.choice(len(drawn), n, p=weight / weight.sum())
