@@ -12,7 +12,7 @@ import numpy as np
 from elastocal.cell.work_cell import Cell
 from elastocal.diagnosis.components import Component, Family, FittedSum
 from elastocal.diagnosis.diagnosis_data import DiagnosisData
-from elastocal.diagnosis.evidence import HELD, Grams
+from elastocal.diagnosis.evidence import Grams
 from elastocal.diagnosis.hypotheses import Hypothesis, RegressorDirection, cell_with, recorded
 from elastocal.diagnosis.noise_floor import NoiseValues, project
 from elastocal.diagnosis.unknown import Generic
@@ -361,10 +361,8 @@ def family_evidence(
     """Log evidence (G,) of the families of m lines at `orders` (G,)."""
     dataset = grams.dataset
     sums = grams.entry(h.entry_key(dataset.base.model))
-    piece = max(1, HELD // (sums.b.size * 2 * m))
     out = []
-    for start in range(0, len(orders), piece):
-        some = orders[start : start + piece, None]
+    for some in sums.in_pieces(orders[:, None], 2 * m):
         # The amplitudes of multiples fall with their number, in the mean.
         D = [dataset.direction(h, some * k) / k for k in range(1, m + 1)]
         out.append(sums.driven(np.concatenate(D, axis=4)).evidence(scales))

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections import Counter, defaultdict
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, field, replace
 from functools import cached_property
 
@@ -207,6 +207,12 @@ class EntrySums:
             flip=self.flip.sum(axis=1, keepdims=True),
         )  # fmt: skip
 
+    def in_pieces(self, settings: Array, width: int) -> Iterator[Array]:
+        """The settings (G, …), so many at a time that directions of `width` columns at each are
+        HELD numbers."""
+        each = max(1, HELD // (self.b.size * width))
+        return (settings[k : k + each] for k in range(0, len(settings), each))
+
     def driven(self, D: Array) -> Spectrum:
         """Spectrum of the groups with directions D (C, v, d, V, k), or (C, 1, d, V, k) where they
         are the same in all visits of a configuration."""
@@ -292,8 +298,7 @@ class Grams:
         if settings is None:
             settings = self.dataset.grids[h.key].values
         sums = self.entry(h.entry_key(self.dataset.base.model))
-        each = max(1, HELD // (sums.b.size * len(h.parameters)))
-        pieces = [settings[i : i + each] for i in range(0, len(settings), each)]
+        pieces = sums.in_pieces(settings, len(h.parameters))
         return Spectrum.joined([sums.driven(self.dataset.direction(h, piece)) for piece in pieces])
 
     def _direct(self, columns: Array) -> Spectrum:
