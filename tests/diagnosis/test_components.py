@@ -196,11 +196,11 @@ def test_a_smooth_function_is_tried_at_several_lengths() -> None:
     data, components, _ = some()
     smooth = next(c for c in components if c.waves is not None)
     low, high = smooth.lengths
-    assert low < high and len(smooth.at_lengths) == 3
-    for columns, length in zip(smooth.at_lengths, (low, (low + high) / 2, high), strict=True):
-        np.testing.assert_allclose(columns, smooth.columns * np.sqrt(smooth.shares(length)[0]))
+    assert low < high and len(smooth.scalings) == 3
+    for scaling, length in zip(smooth.scalings, (low, (low + high) / 2, high), strict=True):
+        np.testing.assert_allclose(scaling, np.sqrt(smooth.shares(length)[0]))
     found = fit_sum(data, [c for c in components if c is not smooth], NOISE, refit_noise=False)
-    beside = Beside(found, smooth.at_lengths)
+    beside = Beside(found, [smooth.columns * scaling for scaling in smooth.scalings])
     best = max(beside.evidence(slice(0, 0), beside.spans))
     assert evidence_beside(found, [smooth]) == pytest.approx([best])
 

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections import Counter
+from collections import Counter, defaultdict
 from collections.abc import Mapping, Sequence
 from dataclasses import replace
 
@@ -30,7 +30,6 @@ from elastocal.diagnosis.components import (
     Component,
     FittedSum,
     Pool,
-    crossed,
     fit_sum,
     log_odds,
     presence_cost,
@@ -41,7 +40,7 @@ from elastocal.diagnosis.effect_search import about
 from elastocal.diagnosis.evidence import ANOTHER, log_prior_odds, spectrum
 from elastocal.diagnosis.hypotheses import Hypothesis, judged_together
 from elastocal.diagnosis.line_orders import families_of, order_posterior, ripples
-from elastocal.diagnosis.model_set import Item, ModelSet, extended, packed_columns
+from elastocal.diagnosis.model_set import Item, ModelSet, extended, packed_columns, spans_of
 from elastocal.diagnosis.noise_floor import NoiseValues, NoisyData, posterior, project
 from elastocal.model.effects.base import index
 from elastocal.model.effects.gears import GearSpectrum
@@ -80,7 +79,7 @@ def search_components(
         # A compliance that was fitted without weights is wrong, and so are their columns by it.
         full = about_sum(full, found)
     found = with_own_axes(found)
-    lined, data, whole = False, found.sums.data, None
+    lined, data = False, found.sums.data
     if len(full.blocks.member) <= FEW_POSES:
         # A curve takes up the lines of its joint as far as these few poses show them, and then
         # none of them stands out.
@@ -89,7 +88,7 @@ def search_components(
         first = _spared(completed(first, others))
         for _ in range(TWICE):
             before = first
-            first = whole = completed(_with_lines(full, first), both)
+            first = completed(_with_lines(full, first), both)
             if first.score <= before.score + GAINED:
                 break
         other = _wider(first, curves)
@@ -112,8 +111,7 @@ def search_components(
         found = wider
     progress("what can be left out")
     found = _swapped(full, with_own_axes(found), both)
-    found = with_shorter_drifts(full, _spared(found))
-    found = found if found is whole else completed(found, both)
+    found = completed(with_shorter_drifts(full, _spared(found)), both)
     if len(full.blocks.member) <= FEW_POSES:
         found = with_expected_families(full, found)
         found = with_likelier_orders(full, found)
@@ -305,9 +303,9 @@ def hidden_fellows(found: FittedSum, components: Sequence[Component]) -> tuple[C
     hidden = [
         c for c in components if c.effect.name in here and c.fellows > 1 and id(c) not in taken
     ]
-    sized = [c.columns * np.exp(size_of_fellows(found, c)) for c in hidden]
-    beside = Beside(found, sized)
-    each = beside.evidence(slice(0, 0), beside.spans, np.ones(1))
+    sizes = [np.full((1, c.width), np.exp(size_of_fellows(found, c))) for c in hidden]
+    beside = Beside(found, [c.columns for c in hidden])
+    each = beside.evidence(slice(0, 0), beside.spans, np.ones(1), sizes)
     odds = [
         evidence + log_odds(found.components, c) for evidence, c in zip(each, hidden, strict=True)
     ]
@@ -407,24 +405,24 @@ class Beside:
     """Log evidence of other columns beside a sum, by sums over the rows."""
 
     def __init__(self, found: FittedSum, columns: Sequence[Array]) -> None:
-        sums, data, root = found.sums.weighted, found.sums.data, found.sums.weighted.root
-        p, self.spans, end = len(sums.z), [], len(sums.z)
-        for c in columns:
-            self.spans.append(slice(end, end := end + c.shape[2]))
-        pairs = [crossed(data, found.components, root, c) for c in columns]
-        cross = np.concatenate([np.zeros((p, 0)), *(M for M, _ in pairs)], axis=1)
-        self.z = np.concatenate([sums.z, *(z for _, z in pairs)])
-        self.M = np.zeros((len(self.z), len(self.z)))
-        self.M[:p, :p], self.M[:p, p:], self.M[p:, :p] = sums.M, cross, cross.T
-        for c, span in zip(columns, self.spans, strict=True):
-            white = (root @ data.masked(c)).reshape(-1, c.shape[2])
-            self.M[span, span] = white.T @ white
-        precision = np.concatenate([data.precision, 1 / found.variances])
-        self.prior = sums.prior(precision)
+        sums, p = found.sums, len(found.sums.weighted.z)
+        products = sums.products(columns)
+        total = p + sum(len(each.z) for each in products)
+        self.spans = spans_of([len(each.z) for each in products], total)
+        self.z = np.concatenate([sums.weighted.z, *(each.z for each in products)])
+        self.M = np.zeros((total, total))
+        self.M[:p, :p] = sums.weighted.M
+        for each, span in zip(products, self.spans, strict=True):
+            self.M[:p, span], self.M[span, :p] = each.beside, each.beside.T
+            self.M[span, span] = each.own
+        self.prior = sums.weighted.prior(np.concatenate([sums.data.precision, 1 / found.variances]))
 
-    def evidence(self, gone: slice, tried: Sequence[slice], scales: Array = WIDE) -> list[float]:
+    def evidence(
+        self, gone: slice, tried: Sequence[slice], scales: Array = WIDE,
+        scalings: Sequence[Array] | None = None,
+    ) -> list[float]:  # fmt: skip
         """Of each of the columns `tried`, over none, beside all of the sum but those that are
-        `gone`.
+        `gone`; times its `scalings` (L, k) where given, at the best of these.
 
         With M the normal matrix of all columns, those of the others (x) integrated out,
         A = M_cc − M_cx (M_xx + Λ)⁻¹ M_xc, and b the same of z.
@@ -437,24 +435,29 @@ class Beside:
         c = np.r_[(slice(0, 0), *tried)]
         right = np.column_stack([self.M[np.ix_(x, c)], self.z[x]])
         half = linalg.solve_triangular(L, right, lower=True, check_finite=False)
-        out, start = [], 0
-        for span in tried:
+        # Those of one width at once: hundreds of tiny decompositions cost a call each.
+        of_width = defaultdict[int, list[tuple[int, Array, Array]]](list)
+        start = 0
+        for n, span in enumerate(tried):
             k = span.stop - span.start
             own = half[:, start : start + k]
             A = self.M[span, span] - own.T @ own
             b = self.z[span] - own.T @ half[:, -1]
-            found = spectrum(A[None], b[None], np.zeros((0, 1, k)))
-            out.append(float(found.evidence(scales)[0]))
+            for d in np.ones((1, k)) if scalings is None else scalings[n]:
+                of_width[k].append((n, A * d * d[:, None], b * d))
             start += k
-        return out
+        best = np.full(len(tried), -np.inf)
+        for k, same in of_width.items():
+            of, A, b = (np.array(each) for each in zip(*same, strict=True))
+            found = spectrum(A, b, np.zeros((0, len(b), k)))
+            np.maximum.at(best, of, found.evidence(scales))
+        return best.tolist()
 
 
 def evidence_beside(found: FittedSum, components: Sequence[Component]) -> list[float]:
     """Log evidence of each component beside the sum, of a smooth one at its best length."""
-    tried = [c.at_lengths for c in components]
-    beside = Beside(found, [columns for own in tried for columns in own])
-    each = iter(beside.evidence(slice(0, 0), beside.spans))
-    return [max(next(each) for _ in own) for own in tried]
+    beside = Beside(found, [c.columns for c in components])
+    return beside.evidence(slice(0, 0), beside.spans, scalings=[c.scalings for c in components])
 
 
 class Rivals:
@@ -522,6 +525,8 @@ def completed(found: FittedSum, components: Sequence[Component]) -> FittedSum:
     What acts at every joint, a little at each, comes in together or not at all; and a single one of
     another kind that stands in its place goes with it.
     """
+    if found.complete is components:
+        return found
     kinds: dict[str, list[Component]] = {}
     for c in components:
         if c.fellows > 1 and (not c.settings or isinstance(c.effect, JointCurve)):
@@ -557,11 +562,17 @@ def completed(found: FittedSum, components: Sequence[Component]) -> FittedSum:
                 wider.get(name) or exchanged(found, [], away[name], refit_noise=False)
                 for name in hidden
             )
-            better = max(map(with_own_noise, fits), key=lambda fit: fit.score, default=found)
+            # Of many kinds nothing is left: the same sum, whose noise is fitted once.
+            ends: dict[frozenset[int], FittedSum] = {}
+            for fit in sorted(fits, key=lambda fit: fit.score):
+                ends[frozenset(map(id, fit.components))] = fit
+            better = max(
+                map(with_own_noise, ends.values()), key=lambda fit: fit.score, default=found
+            )
             if better.score <= found.score + GAINED:
                 break
         found = _refitted(better)
-    return found
+    return replace(found, complete=components)
 
 
 COMPLETED = 3

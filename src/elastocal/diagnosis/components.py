@@ -20,10 +20,10 @@ components of one kind, the share that is present and their common size are unkn
 from __future__ import annotations
 
 from collections import Counter
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, replace
 from functools import cache, cached_property
-from typing import Literal
+from typing import Literal, NamedTuple
 
 import numpy as np
 from scipy import linalg, special
@@ -111,13 +111,11 @@ class Component:
         return np.tile(spectrum, self.repeat), np.tile(slope, self.repeat)
 
     @property
-    def at_lengths(self) -> tuple[Array, ...]:
-        """Its columns of equal prior variance; of a smooth function for some lengths."""
-        if self.waves is None:
-            return (self.columns,)
-        return tuple(
-            self.columns * np.sqrt(self.shares(v)[0]) for v in np.linspace(*self.lengths, 3)
-        )
+    def scalings(self) -> Array:
+        """What makes its columns ones of equal prior variance (L, k), of a smooth function at L
+        lengths."""
+        lengths = [0.0] if self.waves is None else np.linspace(*self.lengths, 3)
+        return np.sqrt([self.shares(v)[0] for v in lengths])
 
 
 @dataclass(frozen=True)
@@ -240,6 +238,16 @@ def log_odds(components: Sequence[Component], another: Component) -> float:
     return presence_cost(n, k - 1) - presence_cost(n, k) - another.sought
 
 
+class Products(NamedTuple):
+    """Of columns C (C, m, k) under a noise: XᵀV⁻¹C (p, k) of those that they stand beside, CᵀV⁻¹C
+    (k, k) and CᵀV⁻¹r (k,).  `columns` are the given ones."""
+
+    columns: Array
+    beside: Array
+    own: Array
+    z: Array
+
+
 @dataclass(frozen=True)
 class SumOfComponents:
     """Components beside the data's own columns, under a noise whose factor is free: −2ℓ and its
@@ -298,6 +306,36 @@ class SumOfComponents:
     @cached_property
     def pool(self) -> Pool:
         return Pool(self.components)
+
+    def white(self, columns: Array) -> Array:
+        """V⁻¹C (C·m, k) of other columns C (C, m, k)."""
+        return _rows(self._inverse @ self.data.masked(columns))
+
+    @cached_property
+    def _inverse(self) -> Array:
+        """V⁻¹ (C, m, m)."""
+        root = self.weighted.root
+        return root.transpose(0, 2, 1) @ root
+
+    @cached_property
+    def _known(self) -> dict[int, Products]:
+        return {}
+
+    def products(self, columns: Sequence[Array]) -> list[Products]:
+        """Of each of these columns beside the data's own and the components'; kept, since a search
+        comes back to the same ones."""
+        new = {id(c): c for c in columns if id(c) not in self._known}
+        if new:
+            beside = side_by_side(self.data, [self.data.X, *(c.columns for c in self.components)])
+            beside, r = _rows(beside), self.data.r.ravel()
+            for some in _in_bundles(list(new.values())):
+                joined = side_by_side(self.data, some)
+                white = self.white(joined)
+                across, z = beside.T @ white, white.T @ r
+                for c, span in zip(some, spans_of([c.shape[2] for c in some], len(z)), strict=True):
+                    own = _rows(joined[:, :, span]).T @ white[:, span]
+                    self._known[id(c)] = Products(c, across[:, span], own, z[span])
+        return [self._known[id(c)] for c in columns]
 
     def variances(self, at: Sizes) -> Array:
         """Prior variances of all coefficients (p + Σ k,)."""
@@ -395,6 +433,23 @@ def side_by_side(data: NoisyData, columns: Sequence[Array]) -> Array:
     return np.concatenate([np.zeros((*data.r.shape, 0)), *columns], axis=2)
 
 
+# Columns that are multiplied together at least, since a few by themselves wait for memory, and
+# numbers that are whitened at a time.
+BUNDLE, PIECE = 48, 2_000_000
+
+
+def _in_bundles(columns: Sequence[Array]) -> Iterator[list[Array]]:
+    """Columns (C, m, k) one after the other, BUNDLE columns or more at a time."""
+    some: list[Array] = []
+    for c in columns:
+        some.append(c)
+        if sum(each.shape[2] for each in some) >= BUNDLE:
+            yield some
+            some = []
+    if some:
+        yield some
+
+
 def posed(
     data: NoisyData, components: Sequence[Component], noise: NoiseValues,
     known: SumOfComponents | None = None,
@@ -414,29 +469,32 @@ def posed(
         before = np.r_[(slice(0, p), *(old[id(components[k])] for k in there))]
         M[np.ix_(at, at)] = own.M[np.ix_(before, before)]
         z[at] = own.z[before]
-        for c, span in zip(components, spans, strict=True):
-            if id(c) not in old:
-                M[:, span], z[span] = crossed(data, components, own.root, c.columns)
-                M[span] = M[:, span].T
+        new = [k for k, c in enumerate(components) if id(c) not in old]
+        if new:
+            columns = side_by_side(data, [components[k].columns for k in new])
+            white = known.white(columns)
+            parts = (data.X, *(c.columns for c in components))
+            own_columns = np.r_[tuple(spans[k] for k in new)]
+            M[:, own_columns] = np.concatenate([_rows(X).T @ white for X in parts])
+            M[own_columns], z[own_columns] = M[:, own_columns].T, white.T @ data.r.ravel()
     else:
-        own, X = Weighted.of(data, noise), np.empty((*data.r.shape, total))
-        X[:, :, :p] = own.X
-        for c, span in zip(components, spans, strict=True):
-            np.matmul(own.root, data.masked(c.columns), out=X[:, :, span])
-        flat = X.reshape(-1, total)
-        M, z = flat.T @ flat, flat.T @ own.r.ravel()
+        own, M, z = Weighted.of(data, noise), np.zeros((total, total)), np.zeros(total)
+        # In pieces: all columns of thousands of poses would take hundreds of megabytes.
+        piece = max(1, PIECE // (data.r.shape[1] * total))
+        for some in (slice(k, k + piece) for k in range(0, len(data.r), piece)):
+            X = np.empty((*own.r[some].shape, total))
+            X[:, :, :p] = own.X[some]
+            for c, span in zip(components, spans, strict=True):
+                np.matmul(own.root[some], data.masked(c.columns)[some], out=X[:, :, span])
+            flat = _rows(X)
+            M += flat.T @ flat
+            z += flat.T @ own.r[some].ravel()
     return SumOfComponents(data, tuple(components), noise, replace(own, M=M, z=z))
 
 
-def crossed(
-    data: NoisyData, components: Sequence[Component], root: Array, columns: Array
-) -> tuple[Array, Array]:
-    """XᵀV⁻¹C (p + Σ k, n) of the data's own columns and the components', and CᵀV⁻¹r (n,), of other
-    columns C (C, m, n); `root` is K⁻¹ of V = KKᵀ."""
-    white = root.transpose(0, 2, 1) @ (root @ data.masked(columns))
-    flat = white.reshape(-1, white.shape[2])
-    parts = [X.reshape(-1, X.shape[2]).T @ flat for X in (data.X, *(c.columns for c in components))]
-    return np.concatenate(parts), flat.T @ data.r.ravel()
+def _rows(columns: Array) -> Array:
+    """Columns (C, m, k) as (C·m, k)."""
+    return columns.reshape(-1, columns.shape[2])
 
 
 @dataclass(frozen=True)
@@ -445,7 +503,8 @@ class FittedSum:
 
     `earned` (K,) nats of each, `costs` (K,) what it has to earn, the others there; `sums` are those
     over the rows of the data, which are without their columns, `variances` (Σ k,) their
-    coefficients' prior.
+    coefficients' prior.  `complete` are the components whose kinds have been tried at all their
+    places beside it.
     """
 
     components: tuple[Component, ...]
@@ -455,6 +514,7 @@ class FittedSum:
     score: float
     sums: SumOfComponents
     variances: Array
+    complete: Sequence[Component] = ()
 
     @cached_property
     def data(self) -> NoisyData:
