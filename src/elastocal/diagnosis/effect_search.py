@@ -14,7 +14,15 @@ from elastocal.diagnosis.baseline import Baseline
 from elastocal.diagnosis.diagnosis_data import DiagnosisData, diagnosis_data_of
 from elastocal.diagnosis.evidence import ANOTHER, Scan, exceedance, log_prior_odds, scan
 from elastocal.diagnosis.hypotheses import Hypothesis
-from elastocal.diagnosis.model_set import Item, ModelSet, fit_extended, fit_set, refine, signal_of
+from elastocal.diagnosis.model_set import (
+    Item,
+    ModelSet,
+    fit_extended,
+    fit_set,
+    fit_sets,
+    refine,
+    signal_of,
+)
 from elastocal.diagnosis.noise_floor import NoiseValues, log_prior
 from elastocal.diagnosis.unknown import Generic
 from elastocal.planning.doubts import SOMETHING
@@ -278,13 +286,12 @@ class ForwardSelection:
         """
         slot, base = self._options(current, scanned), current.score
         best: ModelSet | None = None
-        scores = slot.scores.copy()
-        for k in self._close(slot, behind):
-            item = slot.items[k]
-            if any(item.same_as(other) for other in current.items):
-                scores[k] = -np.inf
-                continue
-            fitted = self._with(current, item)
+        scores, close = slot.scores.copy(), self._close(slot, behind)
+        there = {k for k in close if any(slot.items[k].same_as(o) for o in current.items)}
+        scores[list(there)] = -np.inf
+        added = [k for k in close if k not in there]
+        fits = self._with_each(current, [slot.items[k] for k in added])
+        for k, fitted in zip(added, fits, strict=True):
             scores[k] = fitted.score - base
             if best is None or fitted.score > best.score:
                 best = fitted
@@ -306,15 +313,16 @@ class ForwardSelection:
         scores = [w + s.evidence + offset for s, w in zip(scanned.scored, prior, strict=True)]
         return Slot(tuple(items), np.array(scores))
 
-    def _with(self, current: ModelSet, item: Item) -> ModelSet:
-        """The set with one item more, its noise and settings fitted; kept, since it is asked for
-        again."""
-        items = (*current.items, item)
-        key = tuple((id(i.what), i.settings.tobytes(), i.log_prior) for i in items)
-        if key not in self._fitted:
-            fitted = fit_set(self.dataset, items, current.noise)
-            self._fitted[key] = refine(self.dataset, fitted, len(items) - 1)
-        return self._fitted[key]
+    def _with_each(self, current: ModelSet, added: Sequence[Item]) -> list[ModelSet]:
+        """The set with each of the items more, its noise and settings fitted; kept, since they are
+        asked for again."""
+        sets = [(*current.items, item) for item in added]
+        keys = [tuple((id(i.what), i.settings.tobytes(), i.log_prior) for i in s) for s in sets]
+        new = {key: items for key, items in zip(keys, sets, strict=True) if key not in self._fitted}
+        fits = fit_sets(self.dataset, list(new.values()), current.noise)
+        for key, fitted in zip(new, fits, strict=True):
+            self._fitted[key] = refine(self.dataset, fitted, len(fitted.items) - 1)
+        return [self._fitted[key] for key in keys]
 
     def _close(self, slot: Slot, behind: float) -> NDArray[np.int64]:
         known = np.array([item.known for item in slot.items])

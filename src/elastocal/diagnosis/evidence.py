@@ -14,7 +14,7 @@ from elastocal.diagnosis.baseline import VisitPlaces
 from elastocal.diagnosis.diagnosis import SMALLEST_P
 from elastocal.diagnosis.diagnosis_data import DiagnosisData
 from elastocal.diagnosis.hypotheses import NO_SETTINGS, SCALES, EntryKey, Hypothesis
-from elastocal.diagnosis.noise_floor import NoiseValues, NoisyData, Projection, project
+from elastocal.diagnosis.noise_floor import NoiseValues, NoisyData, Projection, ahead, project
 from elastocal.diagnosis.unknown import Generic
 from elastocal.planning.doubts import SOMETHING
 from elastocal.units import Array
@@ -298,7 +298,8 @@ class Grams:
             settings = self.dataset.grids[h.key].values
         sums = self.entry(h.entry_key(self.dataset.base.model))
         pieces = sums.pieces(settings, len(h.parameters))
-        return Spectrum.joined([sums.driven(self.dataset.direction(h, piece)) for piece in pieces])
+        directions = (self.dataset.direction(h, piece) for piece in pieces)
+        return Spectrum.joined(list(ahead(sums.driven, directions, self.data)))
 
     def _direct(self, columns: Array) -> Spectrum:
         return direct(self.data.masked(columns), self.at, self.signs)

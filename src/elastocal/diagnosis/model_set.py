@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property
 from itertools import pairwise
@@ -21,6 +21,7 @@ from elastocal.diagnosis.noise_floor import (
     NoisyData,
     Projection,
     Weighted,
+    ahead,
     fit_noise,
     log_prior,
     project,
@@ -118,8 +119,26 @@ def fit_set(
     dataset: DiagnosisData, items: tuple[Item, ...], start: NoiseValues | None = None
 ) -> ModelSet:
     """Fit the noise beside the items, twice where their best scale is not the typical one."""
-    scales, noise = tuple(1.0 for _ in items), start
-    joined = with_items(dataset, items, scales)
+    return next(fit_sets(dataset, [items], start))
+
+
+def fit_sets(
+    dataset: DiagnosisData, each: Sequence[tuple[Item, ...]], start: NoiseValues | None = None
+) -> Iterator[ModelSet]:
+    """The same for several sets, from one noise."""
+
+    def fitted(joined: tuple[tuple[Item, ...], NoisyData]) -> ModelSet:
+        return _fitted(dataset, *joined, start)
+
+    with_columns = ((items, with_items(dataset, items, (1.0,) * len(items))) for items in each)
+    return ahead(fitted, with_columns, dataset.data)
+
+
+def _fitted(
+    dataset: DiagnosisData, items: tuple[Item, ...], joined: NoisyData, start: NoiseValues | None
+) -> ModelSet:
+    """The set of the items whose columns, of typical size, stand last in `joined`."""
+    scales, noise = (1.0,) * len(items), start
 
     def at(scales: tuple[float, ...]) -> NoisyData:
         return replace(joined, precision=_precision(dataset.data, items, scales))

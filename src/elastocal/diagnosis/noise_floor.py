@@ -2,16 +2,51 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections import deque
+from collections.abc import Callable, Iterable, Iterator
+from concurrent.futures import Future, ThreadPoolExecutor
 from dataclasses import dataclass, replace
 from functools import cached_property
+from typing import TypeVar
 
 import numpy as np
 from scipy import linalg, optimize
 
 from elastocal.diagnosis.baseline import Blocks
 from elastocal.identification.weighted_problem import WhitenedBlocks
+from elastocal.model.evaluate import thread_count
 from elastocal.units import Array, BoolArray
+
+Item = TypeVar("Item")
+Result = TypeVar("Result")
+
+# Many numbers at a time: products of large matrices, while which Python lets other threads run.
+
+LARGE = 2**19  # numbers of a data's columns; below, threads would wait for each other
+
+
+def ahead(
+    work: Callable[[Item], Result], items: Iterable[Item], data: NoisyData
+) -> Iterator[Result]:
+    """`work` on each of the items, results in order; on large `data` by as many threads as there
+    are, while the next items are made.
+
+    All items are made one after the other in the caller's thread: what they count and keep does
+    not depend on which work is done first, nor does any result.
+    """
+    threads = thread_count() if data.X.size > LARGE else 1
+    if threads == 1:
+        yield from map(work, items)
+        return
+    waiting: deque[Future[Result]] = deque()
+    with ThreadPoolExecutor(threads) as pool:
+        for item in items:
+            waiting.append(pool.submit(work, item))
+            if len(waiting) > threads:
+                yield waiting.popleft().result()
+        while waiting:
+            yield waiting.popleft().result()
+
 
 # The noise floor: tracker noise, repeatability of each joint, scatter common to a configuration.
 #
@@ -315,9 +350,9 @@ def project(data: NoisyData, noise: NoiseValues) -> Projection:
     return Weighted.of(data, noise).projection(data.precision)
 
 
-def posterior(data: NoisyData, noise: NoiseValues, room: Array | None = None) -> float:
+def posterior(data: NoisyData, noise: NoiseValues) -> float:
     """−2 log of marginal likelihood times prior of the noise."""
-    marginal = Weighted.of(data, noise, room).marginal(data.precision)
+    marginal = Weighted.of(data, noise).marginal(data.precision)
     return -2 * marginal + log_prior(data.stated, noise)[0]
 
 
@@ -533,22 +568,23 @@ def noise_draws(
     are kept, each with the probability that it has beside what the Gaussian gives it (sampling
     importance resampling, Rubin 1988): a joint's scatter may be anything below what shows.
     """
-    theta, room = noise.logs(), np.empty_like(data.X)
+    theta = noise.logs()
     k = len(theta)
 
     def slope(at: Array) -> Array:
-        return curved_likelihood(data, NoiseValues.of_logs(at), room)[1]
+        return likelihood(data, NoiseValues.of_logs(at))[1]
 
-    H = np.empty((k, k))
-    for i, e in enumerate(STEP * np.eye(k)):
-        H[i] = (slope(theta + e) - slope(theta - e)) / (2 * STEP)
+    steps = STEP * np.concatenate([np.eye(k), -np.eye(k)])
+    up, down = np.split(np.array(list(ahead(slope, theta + steps, data))), 2)
+    H = (up - down) / (2 * STEP)
     values, vectors = np.linalg.eigh((H + H.T) / 2)
     root = vectors * np.sqrt(2 / np.maximum(values, FLATTEST))
     z = rng.normal(size=(TRIED * n, k))
     drawn = theta + z @ root.T
     joints = slice(1 + len(noise.joint), None)
     drawn[:, joints] = np.clip(drawn[:, joints], np.log(SMALLEST_NOISE), np.log(LARGEST))
-    minus_two = np.array([posterior(data, NoiseValues.of_logs(t), room) for t in drawn])
+    each = ahead(lambda at: posterior(data, NoiseValues.of_logs(at)), drawn, data)
+    minus_two = np.array(list(each))
     log_weight = -0.5 * minus_two + 0.5 * (z**2).sum(axis=1)
     weight = np.exp(log_weight - log_weight.max())
     kept = rng.choice(len(drawn), n, p=weight / weight.sum())
