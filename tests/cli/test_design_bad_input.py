@@ -16,6 +16,8 @@ from support.design_commands import (
     write_cell,
 )
 
+from elastocal.planning.criteria import CRITERIA
+
 CAPSULES = "\n[workspace]\nlink_radius_mm = [200, 200, 150, 150, 100, 100]\n"
 BLOCK = """
 [[workspace.obstacle]]
@@ -289,3 +291,5 @@ def test_help_says_what_the_verb_is_for():
     result = elastocal("design", "--help")
     assert result.exit_code == 0
     assert "Which poses should I measure?" in result.stdout
+    named = result.stdout.partition("--criterion <str>")[2].partition(";")[0]
+    assert re.findall(r"\w+", named) == [*CRITERIA]

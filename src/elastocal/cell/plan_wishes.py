@@ -7,7 +7,6 @@ from typing import Annotated, Any, Literal
 import numpy as np
 from pydantic import ConfigDict, Field
 
-from elastocal.cell.criterion_names import TEST_POSE
 from elastocal.cell.file_keys import (
     File,
     Key,
@@ -37,6 +36,7 @@ from elastocal.errors import require
 from elastocal.units import Array
 
 Positives = Annotated[Array, numbers(above=0)]
+TEST_POSE = "test_pose"  # the criterion where none is asked for
 EXTRA_TIME = 0.05  # of the shortest time, for a longer way where none is stated
 ELSEWHERE_CAP = 0.05  # where the user states no test poses: a price that buys most of what can be
 

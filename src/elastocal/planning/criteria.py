@@ -23,7 +23,7 @@ from typing import Any, ClassVar, Self, TypeVar, get_args
 
 import numpy as np
 
-from elastocal.cell import criterion_names as names
+from elastocal.cell.plan_wishes import TEST_POSE
 from elastocal.errors import InputError, require
 from elastocal.planning.criterion import (
     Cone,
@@ -140,7 +140,7 @@ class RemainingError(TraceCriterion):
     161–170.
     """
 
-    name = names.TEST_POSE
+    name = TEST_POSE
     title = "position error ρ₀ that remains at the test poses after compensation, rms"
     unit = "µm"
     scale = 1e6
@@ -164,7 +164,7 @@ class RobustError(RemainingError):
     Source: DuMouchel & Jones 1994, Technometrics 36, 37–47.
     """
 
-    name = names.ROBUST
+    name = "robust"
     title = "position error at the test poses, effects that the model may lack included, rms"
     needs = ("test_poses", "doubts")
 
@@ -178,7 +178,7 @@ class PredictionVariance(RemainingError):
     Source: Fedorov 1972; Atkinson, Donev & Tobias 2007, ch. 10 (I- and V-optimality).
     """
 
-    name = names.PREDICTION
+    name = "I"
     title = "I-optimality: mean error of prediction over the test poses, rms"
 
     @classmethod
@@ -196,7 +196,7 @@ class ParameterVariance(TraceCriterion):
     """
 
     scale: float = 1.0
-    name = names.VARIANCES
+    name = "A"
     title = "A-optimality: mean standard deviation of the parameters, rms"
     unit = "typical sizes"
 
@@ -219,7 +219,7 @@ class CombinationVariance(TraceCriterion):
     """
 
     unit: str = ""
-    name = names.COMBINATION
+    name = "c"
     title = "c-optimality: standard deviation of one parameter or combination"
     needs = ("combination",)
 
@@ -243,7 +243,7 @@ class GCriterion(ScenarioCriterion):
 
     A: Array
     order: float = np.inf
-    name = names.WORST_PREDICTION
+    name = "G"
     title = "G-optimality: error of prediction at the worst test pose, rms"
     unit = "µm"
     needs = ("test_poses",)
@@ -386,7 +386,7 @@ class DeterminantCriterion(SpectralCriterion):
     Source: Wald 1943; Pukelsheim 2006, ch. 6 and 9; Atkinson, Donev & Tobias 2007, ch. 11.
     """
 
-    name = names.DETERMINANT
+    name = "D"
     title = "D-optimality: volume of the confidence ellipsoid"
     unit = "log det"
     certifiable = True
@@ -451,7 +451,7 @@ class EigenvalueCriterion(SpectralCriterion):
     """
 
     order: float = np.inf
-    name = names.EIGENVALUE
+    name = "E"
     title = "E-optimality: standard deviation of the worst-known direction"
     unit = "typical sizes"
     certifiable = True
@@ -514,7 +514,7 @@ class FirstObservability(ObservabilityIndex, DeterminantCriterion):
     """
 
     n_poses: int
-    name = names.O1
+    name = "O1"
     title = "observability index: volume of the ellipsoid of the singular values"
 
     def __post_init__(self) -> None:
@@ -546,7 +546,7 @@ class SecondObservability(ObservabilityIndex):
     Source: Driels & Pathre 1990, J. Robotic Systems 7(1), 27–53.
     """
 
-    name = names.O2
+    name = "O2"
     title = "observability index: inverse condition number"
     without_bound = "is not convex"
 
@@ -567,7 +567,7 @@ class ThirdObservability(ObservabilityIndex, EigenvalueCriterion):
     Source: Nahvi, Hollerbach & Hayward 1994, IEEE Int. Conf. Robotics and Automation, 407–412.
     """
 
-    name = names.O3
+    name = "O3"
     title = "observability index: smallest singular value"
 
 
@@ -580,7 +580,7 @@ class FourthObservability(ObservabilityIndex):
     Source: Nahvi & Hollerbach 1996, IEEE Int. Conf. Robotics and Automation, 647–654.
     """
 
-    name = names.O4
+    name = "O4"
     title = "observability index: noise amplification"
     without_bound = "is not convex"
 
@@ -603,7 +603,7 @@ class FifthObservability(ObservabilityIndex):
     related to D, O3 to E and O5 to A; Pukelsheim 2006, ch. 6.
     """
 
-    name = names.O5
+    name = "O5"
     title = "observability index: harmonic sum of the singular values"
     certifiable = True
 

@@ -10,7 +10,7 @@ from typing import Literal, get_args
 import numpy as np
 from numpy.typing import NDArray
 
-from elastocal.cell.criterion_names import TEST_POSE
+from elastocal.cell.plan_wishes import TEST_POSE
 from elastocal.cell.work_cell import Cell
 from elastocal.errors import InsufficientDataError, option, require
 from elastocal.identification.knowledge import GaussianPrior

@@ -11,7 +11,7 @@ import numpy as np
 from scipy import linalg, special
 
 from elastocal.above import Result
-from elastocal.cell.criterion_names import TEST_POSE
+from elastocal.cell.plan_wishes import TEST_POSE
 from elastocal.errors import InputError, require
 from elastocal.files import atomic_write_text
 from elastocal.measurements import DEFAULT_MARKER, Measurements, families

@@ -4,7 +4,6 @@ import numpy as np
 import pytest
 from planning.criteria.cases import INTEREST, P
 
-from elastocal.cell.criterion_names import NAMES
 from elastocal.errors import InputError
 from elastocal.planning import DeterminantCriterion, GCriterion, TraceCriterion, make_criterion
 from elastocal.planning.criteria import CRITERIA
@@ -20,8 +19,7 @@ GIVEN = {
 
 
 def test_every_criterion_is_made_under_its_own_name():
-    assert tuple(CRITERIA) == NAMES
-    assert set(NAMES) == set("ADEGIc") | {"test_pose", "robust", "O1", "O2", "O3", "O4", "O5"}
+    assert set(CRITERIA) == set("ADEGIc") | {"test_pose", "robust", "O1", "O2", "O3", "O4", "O5"}
     for name in CRITERIA:
         assert make_criterion(name, **GIVEN).name == name
         arms = GIVEN | {"scenarios": 2, "A": np.ones((2, 2, 3, P))}
