@@ -49,7 +49,7 @@ MAX_BLANK_LINES = 10_000
 MAX_ROWS = 5_000_000
 MOST_BYTES = 1_000_000_000  # of a table: 5 million rows of 200 characters
 CHUNK_BYTES = 1 << 20
-SMALL_BYTES = 300_000  # read cell by cell in 0.1 s; to load pandas takes 0.2 s
+SMALL_BYTES = 300_000  # of a table read cell by cell in 0.1 s; to load pandas takes 0.2 s
 DELIMITERS = ",;\t"
 BOM = b"\xef\xbb\xbf"
 UTF16 = (b"\xff\xfe", b"\xfe\xff")
@@ -575,10 +575,8 @@ def read_table(
 
 def _read_csv(lines: CsvLines, choose: ChooseLayout) -> RawTable:
     layout = choose(lines.header)
-    chunks = lines.chunks()
-    first = next(chunks)
-    small = len(first.data) < min(SMALL_BYTES, CHUNK_BYTES)  # then it is the only one
-    by_cells = small or layout.blanks or lines.comments
+    first = next(chunks := lines.chunks())
+    by_cells = layout.blanks or lines.comments or len(first.data) < min(SMALL_BYTES, CHUNK_BYTES)
     parser = (_CellParser if by_cells else _PandasParser)(lines, layout)
     rows, numbers, labels = zip(*map(parser.parse, chain([first], chunks)), strict=True)
     # Taken out, so that no column is held twice for longer than it takes.
@@ -663,7 +661,6 @@ def _parquet_labels(source: str, name: str, column: pd.Series) -> Labels:
 
 # Cells of CSV files
 
-
 # Columns of a chunk: lines of the rows, numbers and labels by header.
 Parsed = tuple[IntArray, dict[str, Array], dict[str, Coded]]
 
@@ -732,9 +729,8 @@ class _PandasParser(_CellParser):
         if not all(np.isfinite(values).all() for values in numbers.values()):
             raise self.problem([chunk]) or self._unclear("not finite")
         self.first = False
-        row = np.array(chunk.numbers, dtype=np.int64)
         labels = {name: frame[name].factorize() for name in self.layout.labels}
-        return row, numbers, labels
+        return np.array(chunk.numbers, dtype=np.int64), numbers, labels
 
     def _frame(self, chunk: Chunk) -> pd.DataFrame:
         import pandas as pd

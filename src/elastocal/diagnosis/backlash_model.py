@@ -12,9 +12,9 @@ from dataclasses import replace
 import numpy as np
 from scipy.special import expit, ndtr
 
-from elastocal.diagnosis.diagnosis_data import DiagnosisData, diagnosis_data_of
+from elastocal.diagnosis.diagnosis_data import DiagnosisData
 from elastocal.diagnosis.evidence import Grams
-from elastocal.diagnosis.hypotheses import with_keys
+from elastocal.diagnosis.hypotheses import columns_alone, with_keys
 from elastocal.diagnosis.model_set import Item, ModelSet, fit_set
 from elastocal.diagnosis.noise_floor import NoiseValues, NoisyData, Projection, project
 from elastocal.model.effects.play import Backlash
@@ -36,18 +36,15 @@ def with_likelier_backlash_model(dataset: DiagnosisData) -> DiagnosisData:
     if model.cell.model.play_side != BY_BOTH or not play:
         return dataset
     other = replace(dataset.base, model=under_other_backlash_model(model))
-    under_other = diagnosis_data_of(other, play)
-    data = replace(under_other.data, left_out=dataset.data.left_out)
-    here, there = (_likeliest(d, noise) for d in (dataset, replace(under_other, data=data)))
+    columns = replace(dataset.columns, base=other, rows=dataset.columns.rows.copy())
+    for h, own in zip(play, columns_alone(other, play), strict=True):
+        columns.rows[:, :, columns.places[h.key]] = own
+    # Of the fitted parameters none is of play: their columns are those they were.
+    under_other = dataset.changed(base=other, columns=columns)
+    here, there = (_likeliest(d, noise) for d in (dataset, under_other))
     if there.score <= here.score + ALIKE:
         return dataset.changed(other_backlash=doubt(here, there))
-    rows = dataset.columns.rows.copy()
-    for h in play:
-        rows[:, :, dataset.columns.places[h.key]] = under_other.columns.of(h)
-    return dataset.changed(
-        base=other, columns=replace(dataset.columns, base=other, rows=rows),
-        other_backlash=doubt(there, here),
-    )  # fmt: skip
+    return under_other.changed(other_backlash=doubt(there, here))
 
 
 def under_other_backlash_model(model: Model) -> Model:

@@ -82,6 +82,7 @@ class DiagnosisData:
     other_backlash: float = 0.0
     _packed: dict[EntryKey | tuple[str, str], Array] = field(init=False, default_factory=dict)
     _kept: KeptArrays = field(init=False, default_factory=lambda: KeptArrays(KEPT))
+    _directions: dict[tuple[str, str], RegressorDirection] = field(init=False, default_factory=dict)
 
     @property
     def blocks(self) -> Blocks:
@@ -156,7 +157,10 @@ class DiagnosisData:
     @cached_property
     def directions(self) -> dict[tuple[str, str], RegressorDirection]:
         chain, cell = self.base.model.chain, as_placed(self.base.model, self.base.x)
-        return {h.key: RegressorDirection(h, chain, cell) for h in self.hypotheses if h.driven}
+        for h in self.hypotheses:
+            if h.driven and h.key not in self._directions:
+                self._directions[h.key] = RegressorDirection(h, chain, cell)
+        return self._directions
 
     @cached_property
     def grids(self) -> dict[tuple[str, str], SettingsGrid]:
@@ -224,13 +228,19 @@ class DiagnosisData:
         other = replace(self, **changes)
         if "noise" in self.__dict__:
             other.__dict__["noise"] = self.noise
+        return other if changes.keys() & {"base", "columns", "data"} else self._shared(other)
+
+    def _shared(self, other: DiagnosisData) -> DiagnosisData:
+        """The `other` of the same columns, with what was packed and evaluated of them here."""
+        for name in ("_packed", "_kept", "_directions"):
+            object.__setattr__(other, name, getattr(self, name))
         return other
 
     def without(self, faulty: BoolArray) -> DiagnosisData:
         """The same with the observations where `faulty` (N,) holds left out."""
         if (faulty == self.data.faulty).all():
             return self
-        return replace(self, data=self.data.without(faulty))
+        return self._shared(replace(self, data=self.data.without(faulty)))
 
 
 def diagnosis_data_of(

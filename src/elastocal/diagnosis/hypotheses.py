@@ -661,20 +661,12 @@ def compute_columns(
     Deflections enter by eq. (3), the load's torques at the undeflected pose: the columns differ
     from those of the equilibrium by the ratio of deflection to lever arm, a part in a thousand.
     """
-    model, table = base.model, base.observed.table
-    chain, cell = model.chain, model.cell
+    table = base.observed.table
+    chain, cell = base.model.chain, base.model.cell
     direct = [h for h in hypotheses if not h.driven]
-    spec = replace(
-        cell.model,
-        effects=(*cell.model.effects, *(h.choice for h in direct)),
-        observe="position" if cell.model.observe == "deflection" else cell.model.observe,
-        deflection_model="linear",
+    full, x = _with_all(
+        base, direct, [(e, w) for e in ENTRIES for w in e.places(chain, cell)], found or {}
     )
-    extra = [(e, w) for e in ENTRIES for w in e.places(chain, cell)]
-    key = "columns", spec.effects
-    full = made_once(model, key, lambda: Model.assembled(chain, replace(cell, model=spec), extra))
-    at = dict(zip(model.names, base.x, strict=True)) | (found or {})
-    x = np.array([at.get(p.name, p.nominal) for p in full.parameters])
     observed = observe(table, full.observe)
     B = full.regressor(table, x, observations=observed).B.reshape(len(table), observed.size, -1)
     spans: dict[tuple[str, str], list[int]] = {}
@@ -683,6 +675,39 @@ def compute_columns(
     places = {key: slice(v[0], v[-1] + 1) for key, v in spans.items()}
     B, x, shares = with_tangents(full, places, direct, base, x, B)
     return Columns(base, B, places, full, x, shares)
+
+
+def columns_alone(base: Baseline, hypotheses: Sequence[Hypothesis]) -> list[Array]:
+    """The columns (n_rows, size, k) that `Columns.of` has of each of these, none of them driven or
+    looked for from starts, and nothing else of B."""
+    table = base.observed.table
+    full, x = _with_all(base, hypotheses, (), {})
+    owns = [own_columns(full, h) for h in hypotheses]
+    every = np.array([k for own in owns for k in own])
+    observed = observe(table, full.observe)
+    B = full.regressor(table, x, every, observed).B.reshape(len(table), observed.size, -1)
+    return np.split(B, np.cumsum([len(own) for own in owns])[:-1], axis=2)
+
+
+def _with_all(
+    base: Baseline,
+    direct: Sequence[Hypothesis],
+    extra: Sequence[tuple[Effect, str]],
+    found: dict[str, float],
+) -> tuple[Model, Array]:
+    """The base's model with all of these in it, by eq. (3), and its values (K,)."""
+    model = base.model
+    chain, cell = model.chain, model.cell
+    spec = replace(
+        cell.model,
+        effects=(*cell.model.effects, *(h.choice for h in direct)),
+        observe="position" if cell.model.observe == "deflection" else cell.model.observe,
+        deflection_model="linear",
+    )
+    key = "columns", spec.effects, bool(extra)
+    full = made_once(model, key, lambda: Model.assembled(chain, replace(cell, model=spec), extra))
+    at = dict(zip(model.names, base.x, strict=True)) | found
+    return full, np.array([at.get(p.name, p.nominal) for p in full.parameters])
 
 
 def as_placed(model: Model, x: Array) -> Cell:

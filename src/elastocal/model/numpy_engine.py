@@ -84,8 +84,8 @@ ON_NUMBERS: dict[Any, Any] = {
 CONSTANT, READ, WRITE, UNARY_OP, BINARY_OP = range(5)
 SUFFIX = ".tape.npz"
 # Asking CasADi for its instructions takes 15 µs for each, with their common subexpressions; what
-# is made in less than 50 ms is not worth a file.
-SMALLEST_CACHED = 4000
+# is made in less than 15 ms is not worth a file.
+SMALLEST_CACHED = 1000
 
 
 def instructions(function: HashedFunction) -> tuple[NDArray[np.int32], NDArray, int]:

@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 
 from elastocal.cell.work_cell import Cell
 from elastocal.errors import require
-from elastocal.measurements import Measurements
+from elastocal.measurements import Measurements, firsts, numbered
 from elastocal.model import rigid
 from elastocal.model.arm import Arm, Parameter, row_inputs
 from elastocal.model.chain import Chain
@@ -113,7 +113,24 @@ class Equilibrium:
             known = self._solved = (key, *self._solve(inputs, p))
         return known[1].copy(), known[2].copy()
 
+    @cached_property
+    def _asked(self) -> NDArray[np.bool_]:
+        """Which numbers of a row's inputs F depends on: a marker is none of them."""
+        *inputs, _, _ = self._symbols
+        return np.array(ca.which_depends(self._expression, ca.vertcat(*inputs), 1, False), bool)
+
     def _solve(self, inputs: Sequence[NDArray], p: NDArray) -> tuple[NDArray, NDArray]:
+        """As `solve`, each state of the arm once: its markers' rows have the same answer."""
+        asked = np.concatenate(inputs, axis=1)[:, self._asked]
+        state = numbered(np.zeros(len(asked)), *asked.T)
+        count = int(state.max(initial=-1)) + 1
+        if count == len(state):
+            return self._settled(inputs, p)
+        first = firsts(state, count)
+        theta, F_theta = self._settled([a[first] for a in inputs], p)
+        return theta[state], F_theta[state]
+
+    def _settled(self, inputs: Sequence[NDArray], p: NDArray) -> tuple[NDArray, NDArray]:
         theta, F_theta = self._stationary(inputs, p, len(inputs[0]))
         with np.errstate(invalid="ignore"):
             theta[(np.abs(theta.real) > LARGEST).any(axis=1)] = np.nan
