@@ -9,7 +9,7 @@ import pytest
 from support.diagnosis_data import campaign, random_data
 
 from elastocal.diagnosis import Component, NoiseValues, NoisyData, Sizes, fit_sum, posed
-from elastocal.diagnosis.component_draws import ALIKE, drawn
+from elastocal.diagnosis.component_draws import SPREADS, drawn
 from elastocal.diagnosis.component_search import size_of_fellows
 from elastocal.diagnosis.components import PRESENT, SPREAD
 from elastocal.diagnosis.hypotheses import Hypothesis, possible
@@ -61,7 +61,7 @@ def test_what_is_drawn_from_the_prior_lies_where_draws_say(any_hypothesis: Hypot
     columns = 0.3 * rng.normal(size=(4, *data.r.shape, 2))
     components = [of_kind(k, c, any_hypothesis) for k, c in enumerate(columns)]
     for seed in range(25):
-        spread = rng.choice(ALIKE)
+        spread = rng.choice(SPREADS)
         common = np.sqrt(SPREAD**2 - spread**2) * rng.normal()
         size = np.exp(common + spread * rng.normal(size=4))
         places = rng.permutation(4)[: rng.integers(1, 5)] if rng.random() < PRESENT else []
@@ -81,7 +81,7 @@ def test_where_something_is_the_draws_hold_it(any_hypothesis: Hypothesis) -> Non
     columns = 0.3 * rng.normal(size=(4, *data.r.shape, 2))
     components = [of_kind(k, c, any_hypothesis) for k, c in enumerate(columns)]
     for seed in range(25):
-        spread = rng.choice(ALIKE)
+        spread = rng.choice(SPREADS)
         common = 1.0 + 0.1 * rng.normal()
         w = np.exp(common + spread * rng.normal(size=4))[:, None] * rng.normal(size=(4, 2))
         r = np.einsum("kcmi,ki->cm", columns, w)

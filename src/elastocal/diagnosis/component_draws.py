@@ -39,7 +39,7 @@ from elastocal.diagnosis.noise_floor import Weighted
 from elastocal.units import Array, IntArray
 
 GRID = np.linspace(GONE, LARGEST, 41)  # logarithms of sizes
-ALIKE = np.linspace(0.1, 0.9, 9) * SPREAD  # what sizes of a kind may spread by
+SPREADS = np.linspace(0.1, 0.9, 9) * SPREAD  # what sizes of a kind may spread by
 SETTLING = 30  # sweeps
 
 Key = int | tuple[int, int]  # a component's number, with that of its column where each has a size
@@ -103,10 +103,10 @@ class _Kind:
         return np.array([sizes[key] for key in self.spans if key in sizes])
 
     def spread(self, sizes: Mapping[Key, float], rng: np.random.Generator) -> float:
-        """One of ALIKE, any of them as probable beforehand."""
+        """One of SPREADS, any of them as probable beforehand."""
         logs = self._logs(sizes)
-        log_p = [_log_density(logs, a) for a in ALIKE.tolist()]
-        return float(ALIKE[rng.choice(len(ALIKE), p=special.softmax(log_p))])
+        log_p = [_log_density(logs, a) for a in SPREADS.tolist()]
+        return float(SPREADS[rng.choice(len(SPREADS), p=special.softmax(log_p))])
 
     def log_prior(self, key: Key, sizes: Mapping[Key, float], spread: float) -> Array:
         """Of another size on the GRID beside `sizes`, and of none."""
