@@ -11,6 +11,7 @@ from support.diagnosis_data import campaign, dense_noise, diagnosed, random_data
 
 from elastocal.diagnosis import (
     Component,
+    FittedSum,
     NoiseValues,
     NoisyData,
     Sizes,
@@ -22,6 +23,7 @@ from elastocal.diagnosis.baseline import Blocks
 from elastocal.diagnosis.component_answer import PROBABLE, TOLD
 from elastocal.diagnosis.component_search import WIDE, Beside, evidence_beside
 from elastocal.diagnosis.evidence import direct
+from elastocal.diagnosis.hypotheses import possible
 from elastocal.diagnosis.noise_floor import project
 from elastocal.model.effects.gears import EncoderScale
 from elastocal.model.effects.smooth import JointCurve, Waves
@@ -107,12 +109,35 @@ def test_the_slope_is_that_of_the_value() -> None:
 def test_what_a_component_earns_is_what_the_likelihood_loses_without_it() -> None:
     data, components, at = some()
     problem = posed(data, components, NOISE)
-    whole, earned = problem.factored(at)[2], problem.earned(at)
+    whole, (earned, within) = problem.factored(at)[2], problem.earned(at)
+    assert not within.any()
     for k in range(len(components)):
         kept = [i for i in range(len(components)) if i != k]
         fewer = posed(data, [components[i] for i in kept], NOISE)
         lost = (fewer.factored(at.chosen(kept))[2] - whole) / 2
         assert earned[k] == pytest.approx(lost, abs=1e-6)
+
+
+def test_a_compliance_below_zero_is_no_cause() -> None:
+    """Evidence of a half Gaussian: of what is positive twice as much, of what is not next to none,
+    and so it is not in the sum."""
+    h = next(h for h in possible(*campaign(n=20))[0] if h.effect.name == "base_compliance")
+    data = random_data(5, p=2)
+    unit = np.tile(1e-14 * np.eye(data.r.shape[1]), (len(data.r), 1, 1))
+    data = replace(data, left_out=data.left_out & False, covariance=unit)
+    free, quiet = component(data, 1, 1), NOISE.of_instrument()
+    half = replace(free, hypothesis=replace(h, parameters=h.parameters[:1]))
+    assert half.bounded.tolist() == [0] and not free.bounded.any()
+    noise = 1e-7 * np.random.default_rng(7).normal(size=data.r.shape)
+
+    def sums(w: float) -> list[FittedSum]:
+        read = replace(data, r=w * free.columns[..., 0] + noise)
+        return [fit_sum(read, [c], quiet, refit_noise=False) for c in (free, half)]
+
+    (either, positive), (negative, none) = sums(1.0), sums(-1.0)
+    assert positive.score - either.score == pytest.approx(np.log(2), abs=1e-6)
+    assert positive.earned[0] - either.earned[0] == pytest.approx(np.log(2), abs=1e-6)
+    assert negative.components and not none.components
 
 
 def test_sums_that_are_known_serve_another_fit() -> None:

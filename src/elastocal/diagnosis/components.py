@@ -29,7 +29,7 @@ import numpy as np
 from scipy import linalg, special
 
 from elastocal.diagnosis.hypotheses import Hypothesis
-from elastocal.diagnosis.model_set import spans_of
+from elastocal.diagnosis.model_set import spans_of, within_bounds
 from elastocal.diagnosis.noise_floor import (
     NoiseValues,
     NoisyData,
@@ -93,6 +93,11 @@ class Component:
     @property
     def width(self) -> int:
         return self.columns.shape[2]
+
+    @cached_property
+    def bounded(self) -> IntArray:
+        """Columns whose coefficients cannot be negative."""
+        return np.flatnonzero(np.zeros(0) if self.hypothesis is None else self.hypothesis.bounded)
 
     @property
     def sought(self) -> float:
@@ -410,22 +415,25 @@ class SumOfComponents:
         x = scored_climb(self.objective, theta, lower, upper, SETTLED, steps)[0]
         return Sizes(float(x[0]), x[1 : K + 1], x[K + 1 :])
 
-    def earned(self, at: Sizes) -> Array:
-        """By how much ℓ falls (K,) where a component is left out, all else as it is.
+    def earned(self, at: Sizes) -> tuple[Array, Array]:
+        """By how much ℓ falls (K,) where a component is left out, all else as it is; and what of it
+        (K,) is due to coefficients that cannot be negative.
 
         Of the posterior: with S its covariance block of a component's standardised coefficients
         and b their mean, leaving it out changes −2ℓ by log|S| + bᵀS⁻¹b.
         """
         _, found, _ = self.factored(at)
         b, inverse = found.b, found.covariance
-        out = np.zeros(len(self.components))
+        out, within = np.zeros((2, len(self.components)))
         for k, span in enumerate(self.spans):
             S = inverse[span, span]
             S = np.tril(S) + np.tril(S, -1).T
             C = linalg.cholesky(S, lower=True)
             y = linalg.solve_triangular(C, b[span], lower=True)
             out[k] = 0.5 * float(y @ y + 2 * np.log(np.diag(C)).sum())
-        return out
+            i = self.components[k].bounded
+            within[k] = within_bounds(b[span][i] / np.sqrt(np.diag(S)[i]))
+        return out + within, within
 
 
 def side_by_side(data: NoisyData, columns: Sequence[Array]) -> Array:
@@ -612,7 +620,8 @@ def _at_maximum(problem: SumOfComponents, at: Sizes) -> FittedSum:
     value = problem.factored(at)[2]
     score = -value / 2 - problem.pool.penalty(at.size)[0] / 2 - problem.pool.cost
     score -= 0.5 * log_prior(problem.data.stated, problem.noise)[0]
-    earned, own = problem.earned(at), variances[len(problem.data.precision) :]
+    (earned, within), own = problem.earned(at), variances[len(problem.data.precision) :]
+    score += float(within.sum())
     return FittedSum(problem.components, at, problem.noise, earned, score, problem, own)
 
 
@@ -620,7 +629,7 @@ def _kept(problem: SumOfComponents, at: Sizes, strict: bool) -> list[int]:
     """Components that stay: not the worst of those that do not earn their cost, nor those that are
     next to nothing; only these go where not `strict`, since under a noise that does not suit them
     the others may earn too little."""
-    earned = problem.earned(at) - problem.pool.penalties(at.size)
+    earned = problem.earned(at)[0] - problem.pool.penalties(at.size)
     spare = earned - (problem.pool.costs_of(earned) if strict else MOST_AT_ONCE)
     stays = np.array([c.given for c in problem.components], dtype=bool)
     poor = (spare < 0) & ~stays

@@ -41,7 +41,7 @@ from elastocal.model.effects.smooth import JointCurve, ResidualField
 from elastocal.model.evaluate import BatchFunction
 from elastocal.model.manipulator import Model
 from elastocal.model.observations import Observations, observe, rows_needed, subset
-from elastocal.units import Array, IntArray
+from elastocal.units import Array, BoolArray, IntArray
 
 # What each need of an effect asks the user to record.
 RECORD = {
@@ -113,6 +113,12 @@ class Hypothesis:
     def width(self) -> int:
         """Number of columns."""
         return len(self.parameters)
+
+    @property
+    def bounded(self) -> BoolArray:
+        """Which parameters (k,) cannot be below their nominal value, as no compliance is below
+        zero."""
+        return np.array([p.lower == p.nominal for p in self.parameters], dtype=bool)
 
     @property
     def scales(self) -> Array:

@@ -164,23 +164,27 @@ def _precision(data: NoisyData, items: tuple[Item, ...], scales: tuple[float, ..
 
 
 def _within_bounds(items: tuple[Item, ...], at: Projection) -> float:
-    """Σ log 2Φ(mean/deviation) over parameters that cannot be below their nominal zero.
+    """`within_bounds` of all items' parameters."""
+    spans = spans_of([item.width for item in items], len(at.beta))
+    bounded = [
+        span.start + k
+        for item, span in zip(items, spans, strict=True)
+        if isinstance(item.what, Hypothesis)
+        for k in np.flatnonzero(item.what.bounded).tolist()
+    ]
+    if not bounded:
+        return 0.0
+    return within_bounds((at.beta / np.linalg.norm(at.beta_deviation, axis=0))[bounded])
+
+
+def within_bounds(z: Array) -> float:
+    """Σ log 2Φ(z) over parameters that cannot be below their nominal value, z = mean/deviation of
+    each above it.
 
     A compliance's size prior is one half of the Gaussian; the evidence gains or loses by the
     posterior's share of that half, each parameter taken by itself.
     """
-    spans = spans_of([item.width for item in items], len(at.beta))
-    bounded = [
-        (span.start + k)
-        for item, span in zip(items, spans, strict=True)
-        if isinstance(item.what, Hypothesis)
-        for k, p in enumerate(item.what.parameters)
-        if p.lower == p.nominal
-    ]
-    if not bounded:
-        return 0.0
-    z = at.beta / np.linalg.norm(at.beta_deviation, axis=0)
-    return sum(float(np.log(2) + share) for share in log_ndtr(z[bounded]))
+    return float((np.log(2) + log_ndtr(z)).sum())
 
 
 def _mixed_scales(
