@@ -14,6 +14,7 @@ from elastocal.diagnosis.component_search import size_of_fellows
 from elastocal.diagnosis.components import PRESENT, SPREAD
 from elastocal.diagnosis.hypotheses import Hypothesis, possible
 from elastocal.diagnosis.noise_floor import Weighted
+from elastocal.model.arm import ParameterSpec
 from elastocal.model.effects.base import Effect
 from elastocal.model.effects.gears import EncoderScale, GearEccentricity, GearRipple
 from elastocal.model.effects.gravity_sag import LinkWeights
@@ -38,6 +39,8 @@ def unit_data() -> NoisyData:
 def of_kind(
     k: int, columns: Array, h: Hypothesis, effect: type[Effect] = EncoderScale
 ) -> Component:
+    if len(h.parameters) != columns.shape[2]:
+        h = replace(h, parameters=h.parameters[:1] * columns.shape[2])
     return Component("angle", effect(), f"joint{k}", columns, hypothesis=h, fellows=4)
 
 
@@ -116,6 +119,27 @@ def test_each_moment_has_a_size_of_its_own(any_hypothesis: Hypothesis) -> None:
     draws = draws_of(replace(data, r=columns @ w), [weights], np.array([log_size]), 4)
     assert draws[0].mean() == pytest.approx(20.0, abs=2 * draws[0].std())
     assert np.sqrt(np.mean(draws[1:] ** 2)) < 0.2
+
+
+def test_moments_along_the_links_are_alike(any_hypothesis: Hypothesis) -> None:
+    """Three moments of 100 among four of 0.1, and an eccentricity that looks like the third: it is
+    believed to be the weight's where moments along the links are told from those across."""
+    data, rng, taken = unit_data(), np.random.default_rng(6), []
+    columns = rng.normal(size=(*data.r.shape, 7))
+    w = np.append(np.full(3, 100.0), 0.1 * rng.normal(size=4))
+    fellow, twin = (
+        of_kind(k, c, any_hypothesis)
+        for k, c in enumerate((rng.normal(size=data.r.shape)[..., None], columns[..., 2:3]))
+    )
+    r = columns @ w + 5 * fellow.columns[..., 0]
+    for words in (["along"] * 3 + ["across"] * 4, [""] * 7):
+        parameters = tuple(ParameterSpec(f"m{k}", "kg*m", 0.0, 1.0, shrunk=True, alike=word)
+                           for k, word in enumerate(words))  # fmt: skip
+        h = replace(any_hypothesis, parameters=parameters)
+        weights = replace(of_kind(1, columns, h, LinkWeights), given=True)
+        draws = draws_of(replace(data, r=r), [fellow, twin, weights], np.array([1.5, 3, 4]), 3)
+        taken.append((np.abs(draws[1]) > 30).mean())
+    assert taken[0] < taken[1]
 
 
 def test_sizes_are_drawn_with_the_coefficients(any_hypothesis: Hypothesis) -> None:

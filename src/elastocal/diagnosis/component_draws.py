@@ -11,7 +11,7 @@ beside the prior of `Pool`.  What is hidden is not there at first, and pays for 
 others do.  How alike the sizes of one kind are is unknown too, and drawn: where the eccentricities
 of six joints are alike, that of the seventh, which looks like its sag, hardly is ten times as
 large.  The weights of all links, which are given where they stand, have a size for every moment:
-those along the links are large, those across them next to nothing.
+those along the links are large, all alike, those across them next to nothing.
 """
 
 from __future__ import annotations
@@ -128,14 +128,22 @@ def _kinds(components: Sequence[Component], own: Sequence[int]) -> list[_Kind]:
     for members, places in zip(pool.kinds, pool.places, strict=True):
         mine = [k for k in members.tolist() if k in spans]
         for k in (k for k in mine if components[k].given):
-            parts: dict[Key, slice] = {
-                (k, i): slice(i, i + 1) for i in range(spans[k].start, spans[k].stop)
-            }
-            out.append(_Kind(parts, dict.fromkeys(parts, k), {}, None))
+            for some in _alike(components[k]):
+                parts: dict[Key, slice] = {
+                    (k, i): slice(i, i + 1) for i in (spans[k].start + some).tolist()
+                }
+                out.append(_Kind(parts, dict.fromkeys(parts, k), {}, None))
         free = [k for k in mine if not components[k].given]
         sought = {k: float(pool.sought[k]) for k in free}
         out.append(_Kind({k: spans[k] for k in free}, {k: k for k in free}, sought, places))
     return out
+
+
+def _alike(c: Component) -> list[IntArray]:
+    """The numbers of its parameters, those that are of similar sizes together."""
+    assert c.hypothesis is not None
+    words = np.array([p.alike for p in c.hypothesis.parameters])
+    return [np.flatnonzero(words == word) for word in np.unique(words)]
 
 
 def _log_density(logs: Array, spread: float) -> float:

@@ -27,7 +27,8 @@ class ParameterSpec:
     `Model.sizes` then finds one from what moves the readings.
 
     A `shrunk` parameter is one of many that a smooth function or a family of lines consists of:
-    it has the prior N(nominal, typical²), which every fit counts.
+    it has the prior N(nominal, typical²), which every fit counts.  Those `alike` by the same word
+    are of similar sizes, in typical ones.
     """
 
     key: str
@@ -37,6 +38,7 @@ class ParameterSpec:
     lower: float = -np.inf
     upper: float = np.inf
     shrunk: bool = False
+    alike: str = ""
 
 
 @dataclass(frozen=True)

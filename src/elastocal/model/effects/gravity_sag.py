@@ -179,9 +179,10 @@ class LinkWeights(Effect):
             mass = density * (own + HOUSING)
             if joint.kind == REVOLUTE:
                 for key, way in zip("xy", np.abs(across @ end).tolist(), strict=True):
-                    size = density * way * (own / 2 + further) + mass * HOUSING
-                    name = f"{link}_moment_{key}"
-                    found.append(ParameterSpec(name, "kg*m", 0.0, size, shrunk=True))
+                    along, across_it = density * way * (own / 2 + further), mass * HOUSING
+                    name, size = f"{link}_moment_{key}", along + across_it
+                    alike = "along" if along > across_it else "across"
+                    found.append(ParameterSpec(name, "kg*m", 0.0, size, shrunk=True, alike=alike))
             else:
                 size = density * (own + further)
                 found.append(ParameterSpec(f"{link}_mass", "kg", 0.0, size, shrunk=True))
