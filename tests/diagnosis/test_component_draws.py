@@ -9,7 +9,7 @@ import pytest
 from support.diagnosis_data import campaign, random_data
 
 from elastocal.diagnosis import Component, NoiseValues, NoisyData, Sizes, fit_sum, posed
-from elastocal.diagnosis.component_draws import SPREADS, drawn
+from elastocal.diagnosis.component_draws import SPREADS, Unseen, drawn
 from elastocal.diagnosis.component_search import size_of_fellows
 from elastocal.diagnosis.components import PRESENT, SPREAD
 from elastocal.diagnosis.hypotheses import Hypothesis, possible
@@ -54,7 +54,7 @@ def draws_of(data: NoisyData, components: list[Component], log_sizes: Array, see
     widths = [c.width for c in components]
     precision = np.concatenate([data.precision, np.exp(-2 * np.repeat(log_sizes, widths))])
     rng = np.random.default_rng(seed)
-    return drawn(whole, (), wide.weighted, precision, 200, rng)[-sum(widths) :]
+    return drawn(whole, (), wide.weighted, precision, 200, rng).coefficients[-sum(widths) :]
 
 
 def test_what_is_drawn_from_the_prior_lies_where_draws_say(any_hypothesis: Hypothesis) -> None:
@@ -159,7 +159,7 @@ def test_sizes_are_drawn_with_the_coefficients(any_hypothesis: Hypothesis) -> No
     at = Sizes(0.0, np.array([3.0, 1.0, 0.0]), np.zeros(3))
     both = replace(found, components=wide.components, sizes=at, sums=wide)
     precision = np.concatenate([data.precision, np.exp(-2 * at.size)])
-    w = drawn(both, (), wide.weighted, precision, 400, rng)
+    w = drawn(both, (), wide.weighted, precision, 400, rng).coefficients
     one_of, other, twin_of = w[-3:]
     known = np.linalg.inv(wide.weighted.M + np.diag(precision))
     sd = np.sqrt(known[-2, -2])
@@ -179,6 +179,55 @@ def test_what_is_hidden_pays_for_being_there(any_hypothesis: Hypothesis) -> None
     found = fit_sum(replace(data, r=r), [mine], QUIET, refit_noise=False)
     extra = np.full(1, np.exp(-2 * size_of_fellows(found, twin)))
     wide = found.data.with_columns(data.masked(twin.columns), extra)
-    w = drawn(found, (twin,), Weighted.of(wide, found.noise), wide.precision, 200, rng)
+    w = drawn(found, (twin,), Weighted.of(wide, found.noise), wide.precision, 200, rng).coefficients
     assert np.median(w[-2]) == pytest.approx(10.0, rel=0.05)
     assert (w[-1] == 0).mean() > 0.5
+
+
+@pytest.mark.parametrize("fellows", [(), (0.0, 0.3, -0.4)])
+def test_lines_that_are_not_seen_are_drawn_as_they_are(
+    any_hypothesis: Hypothesis, fellows: tuple[float, ...]
+) -> None:
+    """Another error of two joints at every configuration beside two columns and a component, and
+    a third joint that has none: 90 % of the intervals hold them, and what they are together."""
+    data, rng = unit_data(), np.random.default_rng(8)
+    columns = rng.normal(size=(3, *data.r.shape))
+    mine = of_kind(1, 0.3 * rng.normal(size=(*data.r.shape, 2)), any_hypothesis)
+    mine = replace(mine, given=True)
+    held, squares, none = [], [], []
+    for seed in range(20):
+        noise, errors = (rng.normal(size=shape) for shape in (data.r.shape, (3, len(data.r))))
+        errors *= np.array([1.0, 1.4, 0.0])[:, None]
+        r = noise + mine.columns @ np.ones(2) + np.einsum("ucm,uc->cm", columns, errors)
+        found = fit_sum(replace(data, r=r), [mine], QUIET, refit_noise=False)
+        at, unseen = Weighted.of(found.data, QUIET), Unseen(columns, fellows, 3 + len(fellows))
+        draws = drawn(
+            found, (), at, found.data.precision, 200, np.random.default_rng(seed), unseen
+        ).unseen
+        low, high = np.quantile(draws[:2], [0.05, 0.95], axis=-1)
+        held += ((low <= errors[:2]) & (errors[:2] <= high)).ravel().tolist()
+        low, high = np.quantile((draws[:2] ** 2).sum(axis=1), [0.05, 0.95], axis=-1)
+        each = (errors[:2] ** 2).sum(axis=1)
+        squares += ((low <= each) & (each <= high)).tolist()
+        none.append(np.mean(draws[2] ** 2))
+    assert abs(np.mean(held) - 0.9) < 0.04
+    assert np.mean(squares) >= 0.8
+    assert np.mean(none) < 0.05
+
+
+def test_a_joint_without_lines_has_what_the_others_let_expect(any_hypothesis: Hypothesis) -> None:
+    """Where the readings show nothing of it, and nothing where no other joint has any."""
+    data, drawn_rms = unit_data(), []
+    mine = of_kind(1, 0.3 * np.random.default_rng(9).normal(size=(*data.r.shape, 2)),
+                   any_hypothesis)  # fmt: skip
+    found = fit_sum(replace(data, r=mine.columns @ np.ones(2)), [mine], QUIET, refit_noise=False)
+    for fellows in ((), (0.0,) * 5):
+        unseen = Unseen(np.full((1, *data.r.shape), 1e-4), fellows, 6)
+        draws = drawn(
+            found, (), Weighted.of(found.data, QUIET), found.data.precision, 300,
+            np.random.default_rng(0), unseen,
+        ).unseen  # fmt: skip
+        drawn_rms.append(np.sqrt((draws**2).mean(axis=(0, 1))))
+    nothing, expected = drawn_rms
+    assert (nothing == 0).mean() > 0.5
+    assert (expected > 0).mean() > 0.7 and 0.5 < np.median(expected[expected > 0]) < 2.0

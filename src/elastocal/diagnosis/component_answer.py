@@ -13,7 +13,8 @@ import numpy as np
 from scipy import linalg
 from scipy.special import expit, softmax
 
-from elastocal.diagnosis.component_draws import drawn
+from elastocal.diagnosis.component_draws import Draws, Unseen, drawn
+from elastocal.diagnosis.component_families import LINE
 from elastocal.diagnosis.component_search import Rivals, exchanged, size_of_fellows
 from elastocal.diagnosis.components import (
     Component,
@@ -34,11 +35,12 @@ from elastocal.diagnosis.diagnosis import (
     Verdict,
 )
 from elastocal.diagnosis.diagnosis_data import DiagnosisData
+from elastocal.diagnosis.line_orders import families_of, ripples
 from elastocal.diagnosis.model_set import spans_of
 from elastocal.diagnosis.noise_floor import NoisyData, Projection, Weighted, covariance, project
 from elastocal.diagnosis.shrinkage import NEW_POSES, Shrinkage, left_out_residual, rms_with_interval
 from elastocal.identification.error_budget import BudgetStep
-from elastocal.model.effects.base import Stage, index
+from elastocal.model.effects.base import Stage, index, turning_joints
 from elastocal.model.effects.gears import GearSpectrum
 from elastocal.model.effects.smooth import JointCurve
 from elastocal.units import Array, BoolArray, IntArray
@@ -83,6 +85,13 @@ class SumAnswer:
         return Weighted.of(self._wide, self.found.noise)
 
     @cached_property
+    def _without_lines(self) -> tuple[str, ...]:
+        """Joints of which neither lines have been found nor a curve that may hold them."""
+        angular = (JointCurve, GearSpectrum)
+        seen = {c.where for c in self.found.components if isinstance(c.effect, angular)}
+        return tuple(h.where for h in ripples(self.dataset) if h.where not in seen)
+
+    @cached_property
     def _wide(self) -> NoisyData:
         """The data of the sum with the columns of what is hidden last."""
         data = self.found.data
@@ -116,11 +125,34 @@ class SumAnswer:
         return min(self.found.data.blocks.size, 3)
 
     @cached_property
+    def _drawn(self) -> Draws:
+        """Posterior draws of all coefficients, and of lines that are not seen in the place of what
+        their joints scatter by from configuration to configuration."""
+        wide, noise, joints = self._wide, self.found.noise, list(map(index, self._without_lines))
+        if not joints:
+            return drawn(self.found, self.hidden, self._weighted, wide.precision, DRAWS, self.rng)
+        columns = np.moveaxis(wide.counting.G[:, :, joints], 2, 0) * LINE
+        fellows = tuple(f.size + np.log(f.rms) for f in families_of(self.found))
+        unseen = Unseen(columns, fellows, len(turning_joints(self.dataset.base.model.chain)))
+        shared = noise.shared.copy()
+        shared[joints] = 0.0
+        at = Weighted.of(wide, replace(noise, shared=shared))
+        return drawn(self.found, self.hidden, at, wide.precision, DRAWS, self.rng, unseen)
+
+    @property
     def draws(self) -> Array:
         """Posterior draws (Σ k, draws) of the components' coefficients."""
-        precision = self._wide.precision
-        every = drawn(self.found, self.hidden, self._weighted, precision, DRAWS, self.rng)
-        return every[self._own :]
+        return self._drawn.coefficients[self._own :]
+
+    @cached_property
+    def _unseen(self) -> dict[str, Array]:
+        """What the draws of lines that are not seen leave of the positions (rows, draws), at the
+        places of their joints, once the fitted parameters have followed."""
+        configuration, G = np.nonzero(self._rows)[0], self.found.data.G[self._rows] * LINE
+        return {
+            where: self._followed(G[:, [index(where)]] * errors[configuration])
+            for where, errors in zip(self._without_lines, self._drawn.unseen, strict=True)
+        }
 
     @cached_property
     def moved(self) -> Array:
@@ -130,20 +162,31 @@ class SumAnswer:
         They follow in the directions that the readings determine, not in what rounding leaves of
         parallel axes; what is only uncertain of the load's point is no fitted parameter.
         """
-        before, rows = self.before, self._rows
+        return self._followed(self._wide.X[self._rows][:, self._own :])
+
+    def _followed(self, moved: Array) -> Array:
+        """What is left (rows, n) of motions of the positions."""
+        return np.asarray(moved - self._fitted_directions @ (self._fitted_directions.T @ moved))
+
+    @cached_property
+    def _fitted_directions(self) -> Array:
+        """Orthonormal (rows, q)."""
+        before = self.before
         fitted = np.isin(before.fitted, before.base.model.names)
-        B = before.data.X[rows][:, fitted]
+        B = before.data.X[self._rows][:, fitted]
         U, size, _ = linalg.svd(
             B / np.maximum(np.linalg.norm(B, axis=0), 1e-300), full_matrices=False
         )
-        Q = U[:, size > DETERMINED * size.max(initial=0.0)]
-        moved = self._wide.X[rows][:, self._own :]
-        return np.asarray(moved - Q @ (Q.T @ moved))
+        return np.asarray(U[:, size > DETERMINED * size.max(initial=0.0)])
 
     @cached_property
     def gram(self) -> Array:
         """G (Σ k, Σ k): w'Gw is the mean square in m² per reading that coefficients w leave."""
-        return np.asarray(self.moved.T @ self.moved / (len(self.moved) / self._axes))
+        return np.asarray(self.moved.T @ self.moved / self._readings)
+
+    @property
+    def _readings(self) -> float:
+        return len(self.moved) / self._axes
 
     @cached_property
     def _poses(self) -> tuple[IntArray, Array, Array]:
@@ -157,7 +200,10 @@ class SumAnswer:
         # What poses there are is known from the campaign's only (Bayesian bootstrap, Rubin 1981).
         share = self.rng.dirichlet(np.full(len(some), len(known) / len(some)), DRAWS)
         times = self.rng.multinomial(NEW_POSES, share).T.astype(np.float64)
-        return kept, times, self.moved[kept] @ self.draws
+        left = self.moved[kept] @ self.draws
+        for u in self._unseen.values():
+            left += u[kept]
+        return kept, times, left
 
     def _of_new_poses(self, left: Array) -> Array:
         """Mean square (draws,) per reading in a set of new poses of what is left (rows, draws)."""
@@ -168,36 +214,43 @@ class SumAnswer:
         count = np.diff(np.append(starts, len(rows))) / self._axes
         return np.asarray((drawn * each).sum(axis=0) / (drawn * count[:, None]).sum(axis=0))
 
-    def squares(self, members: Sequence[int]) -> Array:
-        """Mean squares (draws,) in m² of what these components do together."""
+    def squares(self, members: Sequence[int], lines: Sequence[str] = ()) -> Array:
+        """Mean squares (draws,) in m² of what these components do together, with the lines that are
+        not seen of these joints."""
         w = self.draws[index := self._index(members)]
-        return np.einsum("kd,kd->d", w, self.gram[np.ix_(index, index)] @ w)
+        if not (unseen := [self._unseen[where] for where in lines if where in self._unseen]):
+            return np.einsum("kd,kd->d", w, self.gram[np.ix_(index, index)] @ w)
+        left = self.moved[:, index] @ w + sum(unseen)
+        return np.asarray(np.einsum("nd,nd->d", left, left) / self._readings)
 
     def _index(self, members: Sequence[int]) -> IntArray:
-        return np.concatenate([np.r_[self._spans[k]] for k in members])
+        return np.r_[(slice(0, 0), *(self._spans[k] for k in members))]
 
-    def shares(self, members: Sequence[int]) -> Array:
-        """What these components add to the mean square of the whole, over that (draws,): shares
-        sum to one, and one that cancels a part of others is negative.
+    def shares(self, members: Sequence[int], lines: Sequence[str] = ()) -> Array:
+        """What these components, and the lines that are not seen of these joints, add to the mean
+        square of the whole, over that (draws,): shares sum to one, and one that cancels a part of
+        others is negative.
 
         The draws are as wide as a jackknife over PARTS of the configurations says, where that is
         wider than the posterior, which takes model and sizes for true.
         """
-        drawn, apart = (self._shares(members, *both) for both in self._moved_by)
+        index = self._index(members)
+        drawn, apart = (of.share(index, lines) for of in self._added)
         spread = np.sqrt((PARTS - 1) * np.mean((apart - apart.mean()) ** 2))
         middle = np.median(drawn)
         return np.asarray(middle + max(1.0, spread / max(drawn.std(), 1e-300)) * (drawn - middle))
 
     @cached_property
-    def _moved_by(self) -> tuple[tuple[Array, Array], ...]:
-        """w and G w (Σ k, n) of the draws, and of the fits without one part."""
-        return tuple((w, self.gram @ w) for w in (self.draws, self.deleted))
-
-    def _shares(self, members: Sequence[int], w: Array, moved: Array) -> Array:
-        """Of each of the coefficients w (Σ k, n)."""
-        index = self._index(members)
-        whole = np.einsum("kd,kd->d", w, moved)
-        return np.einsum("kd,kd->d", w[index], moved[index]) / np.maximum(whole, 1e-300)
+    def _added(self) -> tuple[_Added, _Added]:
+        """By the draws, and by the fits without one part."""
+        w = self.draws
+        pull, unseen = self.gram @ w, {}
+        if self._unseen:
+            left = self.moved @ w + sum(self._unseen.values())
+            pull = self.moved.T @ left / self._readings
+            unseen = {where: np.einsum("nd,nd->d", u, left) / self._readings
+                      for where, u in self._unseen.items()}  # fmt: skip
+        return _Added.of(w, pull, unseen), _Added.of(self.deleted, self.gram @ self.deleted, {})
 
     @cached_property
     def deleted(self) -> Array:
@@ -212,9 +265,10 @@ class SumAnswer:
             out.append(linalg.cho_solve(factor, all_.z - X.T @ r.ravel())[self._own :])
         return np.array(out).T
 
-    @cached_property
+    @property
     def total(self) -> Array:
-        return self.squares(range(len(self._spans)))
+        """Mean squares (draws,) in m² of the whole."""
+        return self._added[0].whole
 
     @property
     def decided(self) -> SumAnswer:
@@ -236,22 +290,27 @@ class SumAnswer:
     def components(self) -> tuple[ComponentShare, ...]:
         """One for each kind of dependence at each place, the largest first."""
         groups = self._by(lambda c: (c.family, c.where))
+        for where in self._unseen:
+            groups.setdefault(("angle", where), [])
         rows = [self._share(family, where, own) for (family, where), own in groups.items()]
         return tuple(sorted(rows, key=lambda row: -row.share))
 
     def _share(self, family: str, where: str, members: list[int]) -> ComponentShare:
+        """Of these components; of none where there are only lines that are not seen."""
         chosen = [self.found.components[k] for k in members]
-        unseen = [
+        hidden = [
             k for k, c in enumerate(self.hidden, start=len(self.found.components))
             if (c.family, c.where) == (family, where)
         ]  # fmt: skip
-        everything = [*members, *unseen]
-        rms = np.sqrt(self.squares(everything))
+        everything, lines = [*members, *hidden], [where] * (family == "angle")
+        rms = np.sqrt(self.squares(everything, lines))
         low95, high95 = np.quantile(rms, [0.025, 0.975]).tolist()
+        names = (c.effect.name for c in chosen) if chosen else (JointCurve.name,)
+        matters = self._matters(members) if members else float((rms > 0).mean())
         return ComponentShare(
-            family, where, tuple(dict.fromkeys(c.effect.name for c in chosen)),
-            *self._share_with_ends(everything), float(np.median(rms)), (low95, high95),
-            self._matters(members), any(c.named for c in chosen),
+            family, where, tuple(dict.fromkeys(names)),
+            *self._share_with_ends(everything, lines), float(np.median(rms)), (low95, high95),
+            matters, any(c.named for c in chosen),
         )  # fmt: skip
 
     @cached_property
@@ -267,7 +326,8 @@ class SumAnswer:
         chosen = [self.found.components[k] for k in members]
         places = tuple(sorted({c.where for c in chosen}))
         effects = tuple(dict.fromkeys(c.effect.name for c in chosen))
-        share, fall = self._share_with_ends(self._of_kind(name)), self._reduction(members)
+        lines = tuple(self._unseen) if name == GEARS else ()
+        share, fall = self._share_with_ends(self._of_kind(name), lines), self._reduction(members)
         return EffectGroup(name, places, effects, *share, fall.reduction, fall.ci90)
 
     def _of_kind(self, name: str) -> list[int]:
@@ -275,9 +335,11 @@ class SumAnswer:
         every = (*self.found.components, *self.hidden)
         return [k for k, c in enumerate(every) if _kind(c) == name]
 
-    def _share_with_ends(self, members: Sequence[int]) -> tuple[float, Interval]:
+    def _share_with_ends(
+        self, members: Sequence[int], lines: Sequence[str] = ()
+    ) -> tuple[float, Interval]:
         """Median and 90 % interval of a share."""
-        share = self.shares(members)
+        share = self.shares(members, lines)
         low, high = np.quantile(share, [0.05, 0.95]).tolist()
         return float(np.median(share)), (low, high)
 
@@ -578,6 +640,27 @@ class SumAnswer:
             values = (tuple(v.tolist()) for v in (x, y - y.mean(), sd))
             out.append(Curve(f"{c.where} angle", "rad", c.where, "rad", *values))
         return tuple(out)
+
+
+@dataclass(frozen=True)
+class _Added:
+    """What each coefficient adds to the mean square of the whole (Σ k, n), each joint's lines that
+    are not seen (n,), and the `whole` (n,), in m²."""
+
+    each: Array
+    unseen: Mapping[str, Array]
+    whole: Array
+
+    @classmethod
+    def of(cls, w: Array, pull: Array, unseen: Mapping[str, Array]) -> _Added:
+        """Of coefficients w (Σ k, n), `pull` (Σ k, n) the products of their columns with the whole
+        motion."""
+        each = w * pull
+        return cls(each, unseen, each.sum(axis=0) + sum(unseen.values()))
+
+    def share(self, index: IntArray, lines: Sequence[str]) -> Array:
+        part = self.each[index].sum(axis=0) + sum(self.unseen.get(where, 0.0) for where in lines)
+        return np.asarray(part / np.maximum(self.whole, 1e-300))
 
 
 GEARS = "gear_errors"

@@ -42,65 +42,153 @@ GRID = np.linspace(GONE, LARGEST, 41)  # logarithms of sizes
 SPREADS = np.linspace(0.1, 0.9, 9) * SPREAD  # what sizes of a kind may spread by
 SETTLING = 30  # sweeps
 
-Key = int | tuple[int, int]  # a component's number, with that of its column where each has a size
+# A component's number, with that of its column where each has a size; or "unseen" and a number.
+Key = int | tuple[int | str, int]
+
+
+@dataclass(frozen=True)
+class Unseen:
+    """Lines of joints that these poses do not show: as those of an order that nobody knows, they
+    are another error at every configuration.
+
+    `columns` (U, C, m) are the joints', per typical line and zero where nothing counts; `fellows`
+    the logarithms of the sizes of lines found at other joints, `places` at how many joints there
+    may be any.
+    """
+
+    columns: Array
+    fellows: tuple[float, ...]
+    places: int
+
+    def kind(self) -> _Kind:
+        keys: dict[Key, int] = {("unseen", u): u for u in range(len(self.columns))}
+        return _Kind({}, keys, dict.fromkeys(keys, 0.0), self.places, self.fellows)
+
+
+@dataclass(frozen=True)
+class Draws:
+    """Of a sum: coefficients (p, n), and what the joints of `Unseen` err by in every configuration
+    (U, C, n), in typical lines."""
+
+    coefficients: Array
+    unseen: Array
 
 
 def drawn(
     found: FittedSum, hidden: Sequence[Component], at: Weighted, precision: Array, n: int,
-    rng: np.random.Generator,
-) -> Array:  # fmt: skip
-    """Draws (p, n) of the coefficients of a sum and of components that are `hidden` by it, whose
-    columns stand behind its own."""
+    rng: np.random.Generator, unseen: Unseen | None = None,
+) -> Draws:  # fmt: skip
+    """n draws of a sum and of components that are `hidden` by it, whose columns stand behind its
+    own, and of what is `unseen`, for which the noise of `at` has no place."""
     components, prior = (*found.components, *hidden), at.prior(precision)
     every = spans_of([c.width for c in components], len(prior))
     own = [k for k, c in enumerate(components) if c.hypothesis is not None and not c.settings]
     c = indices([every[k] for k in own])
     x = np.setdiff1d(np.arange(len(prior)), c)
     L = linalg.cholesky(at.M[np.ix_(x, x)] + np.diag(prior[x]), lower=True)
-    right = np.column_stack([at.M[np.ix_(x, c)], at.z[x]])
-    half = linalg.solve_triangular(L, right, lower=True)
-    across, z = half[:, :-1], half[:, -1]
-    S, t = at.M[np.ix_(c, c)] - across.T @ across, at.z[c] - across.T @ z
+    across = linalg.solve_triangular(L, at.M[np.ix_(x, c)], lower=True)
+    S = at.M[np.ix_(c, c)] - across.T @ across
     kinds = _kinds(components, own)
     spans = {key: span for kind in kinds for key, span in kind.spans.items()}
     sizes = {key: float(found.sizes.size[k]) for kind in kinds
              for key, k in kind.component.items() if k < len(found.components)}  # fmt: skip
-    out = np.zeros((len(prior), n))
+    scatter = _Scatter.of(unseen, at) if unseen is not None and len(unseen.columns) else None
+    out, errors = np.zeros((len(prior), n)), np.zeros((scatter.n if scatter else 0, len(at.r), n))
     for sweep in range(-SETTLING, n):
+        right = at.z if scatter is None else scatter.without(at)
+        z = linalg.solve_triangular(L, right[x], lower=True)
+        t = right[c] - across.T @ z
         for kind in kinds:
             spread = kind.spread(sizes, rng)
             for key in kind.spans:
                 sizes.pop(key, None)
                 evidence = np.append(_at_sizes(S, t, spans, sizes, key), 0.0)
-                log_p = evidence + kind.log_prior(key, sizes, spread)
-                chosen = int(rng.choice(len(log_p), p=special.softmax(log_p)))
-                if chosen < len(GRID):
-                    sizes[key] = float(GRID[chosen])
+                kind.choose(key, evidence, sizes, spread, rng)
+        if sweep < 0 and scatter is None:
+            continue
+        beta = np.zeros(len(prior))
+        A, i = _beside(S, spans, sizes)
+        apart = np.linalg.solve(np.linalg.cholesky(A).T, rng.normal(size=len(i)))
+        beta[c[i]] = np.linalg.solve(A, t[i]) + apart
+        rest = z - across @ beta[c] + rng.normal(size=len(x))
+        beta[x] = linalg.solve_triangular(L, rest, lower=True, trans="T")
+        if scatter is not None:
+            scatter.draw(at.r - at.X @ beta, rng)
         if sweep >= 0:
-            A, i = _beside(S, spans, sizes)
-            spread_of = np.linalg.solve(np.linalg.cholesky(A).T, rng.normal(size=len(i)))
-            out[c[i], sweep] = np.linalg.solve(A, t[i]) + spread_of
-    rest = z[:, None] - across @ out[c] + rng.normal(size=(len(x), n))
-    out[x] = linalg.solve_triangular(L, rest, lower=True, trans="T")
-    return out
+            out[:, sweep] = beta
+            if scatter is not None:
+                errors[:, :, sweep] = scatter.errors
+    return Draws(out, errors)
+
+
+class _Scatter:
+    """What is unseen, whitened, as it is drawn: sizes and errors (U, C)."""
+
+    def __init__(self, kind: _Kind, columns: Array) -> None:
+        self.kind, self.columns, self.n = kind, columns, len(columns)
+        self.own = np.einsum("ucm,ucm->uc", columns, columns)
+        self.errors = np.zeros(columns.shape[:2])
+        self.sizes: dict[Key, float] = {}
+
+    @classmethod
+    def of(cls, unseen: Unseen, at: Weighted) -> _Scatter:
+        return cls(unseen.kind(), np.einsum("cij,ucj->uci", at.root, unseen.columns))
+
+    def without(self, at: Weighted) -> Array:
+        """XᵀV⁻¹(r − Gε) (p,)."""
+        moved = np.einsum("ucm,uc->cm", self.columns, self.errors)
+        return np.asarray(at.z - at.X.reshape(-1, len(at.z)).T @ moved.ravel())
+
+    def draw(self, left: Array, rng: np.random.Generator) -> None:
+        """Sizes and errors anew, where the sum leaves (C, m) of the whitened readings.
+
+        With a = gᵀg and b = gᵀe of a joint's column in every configuration, a size s has the log
+        evidence Σ ½ s²b²/(1 + s²a) − ½ log(1 + s²a), and errors the mean s²b/(1 + s²a).
+        """
+        left = left - np.einsum("ucm,uc->cm", self.columns, self.errors)
+        spread = self.kind.spread(self.sizes, rng)
+        for u, key in enumerate(self.kind.component):
+            left = left + self.columns[u] * self.errors[u][:, None]
+            a, b = self.own[u], np.einsum("cm,cm->c", self.columns[u], left)
+            v = np.exp(2 * GRID)[:, None]
+            each = 0.5 * (v * b**2 / (1 + v * a) - np.log1p(v * a)).sum(axis=1)
+            self.sizes.pop(key, None)
+            size = self.kind.choose(key, np.append(each, 0.0), self.sizes, spread, rng)
+            variance = 1 / (np.exp(-2 * size) + a)
+            self.errors[u] = variance * b + np.sqrt(variance) * rng.normal(size=len(b))
+            left = left - self.columns[u] * self.errors[u][:, None]
 
 
 @dataclass(frozen=True)
 class _Kind:
     """What has sizes that are alike: a kind's components, or an effect's parameters.
 
-    Its members' `spans` of the columns, and the `component` that each is, or is a parameter of;
-    what finding them `sought`; at how many `places` there may be one, none where it is there in
-    any case.
+    Its members' `spans` of the columns, where these are a sum's, and the `component` that each is,
+    or is a parameter of; what finding them `sought`; at how many `places` there may be one, none
+    where it is there in any case; the logarithms of sizes of `fellows` that are not drawn.
     """
 
     spans: Mapping[Key, slice]
     component: Mapping[Key, int]
     sought: Mapping[Key, float]
     places: int | None
+    fellows: tuple[float, ...] = ()
+
+    def choose(
+        self, key: Key, evidence: Array, sizes: dict[Key, float], spread: float,
+        rng: np.random.Generator,
+    ) -> float:  # fmt: skip
+        """A size of `key` beside `sizes`, to which it is added, by its log evidence at those on the
+        GRID and at none; the logarithm, −∞ of none."""
+        log_p = evidence + self.log_prior(key, sizes, spread)
+        chosen = int(rng.choice(len(log_p), p=special.softmax(log_p)))
+        if chosen == len(GRID):
+            return -np.inf
+        sizes[key] = float(GRID[chosen])
+        return sizes[key]
 
     def _logs(self, sizes: Mapping[Key, float]) -> Array:
-        return np.array([sizes[key] for key in self.spans if key in sizes])
+        return np.array([*self.fellows, *(sizes[key] for key in self.component if key in sizes)])
 
     def spread(self, sizes: Mapping[Key, float], rng: np.random.Generator) -> float:
         """One of SPREADS, any of them as probable beforehand."""

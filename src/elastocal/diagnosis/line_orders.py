@@ -69,6 +69,12 @@ class KnownFamily:
     multiples: int
     size: float
 
+    @property
+    def rms(self) -> float:
+        """Of the joint's error, where that of a line of the same size is one: the amplitudes of
+        multiples fall with their number."""
+        return math.sqrt(sum(1 / k**2 for k in range(1, self.multiples + 1)))
+
 
 @dataclass(frozen=True, eq=False)
 class OrderPosterior:
