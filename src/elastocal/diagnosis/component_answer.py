@@ -290,8 +290,10 @@ class SumAnswer:
     def components(self) -> tuple[ComponentShare, ...]:
         """One for each kind of dependence at each place, the largest first."""
         groups = self._by(lambda c: (c.family, c.where))
-        for where in self._unseen:
-            groups.setdefault(("angle", where), [])
+        for where, left in self._unseen.items():
+            squares = np.einsum("nd,nd->d", left, left) / self._readings
+            if (squares >= SLIGHT**2 * self.total).mean() >= PROBABLE:
+                groups.setdefault(("angle", where), [])
         rows = [self._share(family, where, own) for (family, where), own in groups.items()]
         return tuple(sorted(rows, key=lambda row: -row.share))
 
@@ -306,7 +308,8 @@ class SumAnswer:
         rms = np.sqrt(self.squares(everything, lines))
         low95, high95 = np.quantile(rms, [0.025, 0.975]).tolist()
         names = (c.effect.name for c in chosen) if chosen else (JointCurve.name,)
-        matters = self._matters(members) if members else float((rms > 0).mean())
+        enough = rms >= SLIGHT * np.sqrt(self.total)
+        matters = self._matters(members) if members else float(enough.mean())
         return ComponentShare(
             family, where, tuple(dict.fromkeys(names)),
             *self._share_with_ends(everything, lines), float(np.median(rms)), (low95, high95),
