@@ -92,6 +92,9 @@ def drawn(
     spans = {key: span for kind in kinds for key, span in kind.spans.items()}
     sizes = {key: float(found.sizes.size[k]) for kind in kinds
              for key, k in kind.component.items() if k < len(found.components)}  # fmt: skip
+    sized = np.full(len(c), np.inf)  # prior precisions; infinite where there is nothing
+    for key, size in sizes.items():
+        sized[spans[key]] = np.exp(-2 * size)
     scatter = _Scatter.of(unseen, at) if unseen is not None and len(unseen.columns) else None
     out, errors = np.zeros((len(prior), n)), np.zeros((scatter.n if scatter else 0, len(at.r), n))
     for sweep in range(-SETTLING, n):
@@ -102,12 +105,12 @@ def drawn(
             spread = kind.spread(sizes, rng)
             for key in kind.spans:
                 sizes.pop(key, None)
-                evidence = np.append(_at_sizes(S, t, spans, sizes, key), 0.0)
-                kind.choose(key, evidence, sizes, spread, rng)
+                evidence = np.append(_at_sizes(S, t, sized, spans[key]), 0.0)
+                sized[spans[key]] = np.exp(-2 * kind.choose(key, evidence, sizes, spread, rng))
         if sweep < 0 and scatter is None:
             continue
         beta = np.zeros(len(prior))
-        A, i = _beside(S, spans, sizes)
+        A, i = _beside(S, sized)
         apart = np.linalg.solve(np.linalg.cholesky(A).T, rng.normal(size=len(i)))
         beta[c[i]] = np.linalg.solve(A, t[i]) + apart
         rest = z - across @ beta[c] + rng.normal(size=len(x))
@@ -241,24 +244,26 @@ def _log_density(logs: Array, spread: float) -> float:
     return 0.5 * float(log_det - logs @ precision_of_sizes(k, spread) @ logs) if k else 0.0
 
 
-def _beside(
-    S: Array, spans: Mapping[Key, slice], sizes: Mapping[Key, float]
-) -> tuple[Array, IntArray]:
+def _beside(S: Array, sized: Array) -> tuple[Array, IntArray]:
     """The normal matrix with its prior of what has a size, and its columns."""
-    i = indices([spans[key] for key in sizes])
-    precision = [np.full(spans[k].stop - spans[k].start, np.exp(-2 * s)) for k, s in sizes.items()]
-    return S[np.ix_(i, i)] + np.diag(np.concatenate([np.zeros(0), *precision])), i
+    i = np.flatnonzero(sized < np.inf)
+    A = S[np.ix_(i, i)]
+    A[np.diag_indices_from(A)] += sized[i]
+    return A, i
 
 
-def _at_sizes(
-    S: Array, t: Array, spans: Mapping[Key, slice], sizes: Mapping[Key, float],
-    key: Key,
-) -> Array:  # fmt: skip
-    """Log evidence of `key` at every size of the GRID, over none, beside those of `sizes`."""
-    (A, i), span = _beside(S, spans, sizes), spans[key]
+def _at_sizes(S: Array, t: Array, sized: Array, span: slice) -> Array:
+    """Log evidence of the columns `span` at every size of the GRID, over none, beside all others
+    that have one."""
+    others = sized.copy()
+    others[span] = np.inf
+    A, i = _beside(S, others)
     solved = np.linalg.solve(A, np.column_stack([S[i, span], t[i]]))
     left = np.column_stack([S[span, span], t[span]]) - S[span][:, i] @ solved
-    values, vectors = np.linalg.eigh(left[:, :-1])
-    values, b = np.maximum(values, 0.0), vectors.T @ left[:, -1]
+    if len(left) > 1:
+        values, vectors = np.linalg.eigh(left[:, :-1])
+        values, b = np.maximum(values, 0.0), vectors.T @ left[:, -1]
+    else:
+        values, b = np.maximum(left[0, :1], 0.0), left[0, 1:]
     v = np.exp(2 * GRID)[:, None]
     return np.asarray(0.5 * (v * b**2 / (1 + v * values) - np.log1p(v * values)).sum(axis=1))
