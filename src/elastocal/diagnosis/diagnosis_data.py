@@ -48,17 +48,21 @@ LOAD_POINT_TOLERANCE = 2e-3
 
 
 @dataclass
-class KeptArrays:
-    """Arrays by key, for as long as there is `room`, in numbers, for one more."""
+class KeptColumns:
+    """What was packed and evaluated of the same columns, whatever hypotheses and noise stand
+    beside them: `packed` ones of entries and hypotheses, `regressors` of driven hypotheses, and
+    their `directions` at settings, for as long as there is `room`, in numbers, for one more."""
 
-    room: int
-    arrays: dict[tuple[str, str, bytes], Array] = field(default_factory=dict)
+    packed: dict[EntryKey | tuple[str, str], Array] = field(default_factory=dict)
+    regressors: dict[tuple[str, str], RegressorDirection] = field(default_factory=dict)
+    directions: dict[tuple[str, str, bytes], Array] = field(default_factory=dict)
+    room: int = KEPT
 
-    def keep(self, key: tuple[str, str, bytes], array: Array) -> None:
-        """Keep one that is not kept yet."""
-        if array.size <= self.room:
-            self.room -= array.size
-            self.arrays[key] = array
+    def keep(self, key: tuple[str, str, bytes], direction: Array) -> None:
+        """Keep a direction that is not kept yet."""
+        if direction.size <= self.room:
+            self.room -= direction.size
+            self.directions[key] = direction
 
 
 @dataclass(frozen=True)
@@ -80,9 +84,7 @@ class DiagnosisData:
     fitted: tuple[str, ...]
     load_point: Array | None = None
     other_backlash: float = 0.0
-    _packed: dict[EntryKey | tuple[str, str], Array] = field(init=False, default_factory=dict)
-    _kept: KeptArrays = field(init=False, default_factory=lambda: KeptArrays(KEPT))
-    _directions: dict[tuple[str, str], RegressorDirection] = field(init=False, default_factory=dict)
+    kept: KeptColumns = field(default_factory=KeptColumns, repr=False)
 
     @property
     def blocks(self) -> Blocks:
@@ -137,9 +139,9 @@ class DiagnosisData:
 
     def entry(self, key: EntryKey) -> Array:
         """Packed columns (C, m, d) of an entry; not to be written to."""
-        if key not in self._packed:
-            self._packed[key] = self.pack(self.columns.entry(key))
-        return self._packed[key]
+        if key not in self.kept.packed:
+            self.kept.packed[key] = self.pack(self.columns.entry(key))
+        return self.kept.packed[key]
 
     @cached_property
     def sizes(self) -> dict[tuple[str, str], Array]:
@@ -157,10 +159,11 @@ class DiagnosisData:
     @cached_property
     def directions(self) -> dict[tuple[str, str], RegressorDirection]:
         chain, cell = self.base.model.chain, as_placed(self.base.model, self.base.x)
-        for h in self.hypotheses:
-            if h.driven and h.key not in self._directions:
-                self._directions[h.key] = RegressorDirection(h, chain, cell)
-        return self._directions
+        known, driven = self.kept.regressors, [h for h in self.hypotheses if h.driven]
+        for h in driven:
+            if h.key not in known:
+                known[h.key] = RegressorDirection(h, chain, cell)
+        return {h.key: known[h.key] for h in driven}
 
     @cached_property
     def grids(self) -> dict[tuple[str, str], SettingsGrid]:
@@ -182,13 +185,13 @@ class DiagnosisData:
         """D (C, v, d, G, k) at each visit, per typical size, at `settings` (G, …); (C, 1, d, G, k)
         where it is the same in all visits of a configuration."""
         key = *h.key, settings.tobytes()
-        if key in self._kept.arrays:
-            return self._kept.arrays[key]
+        if key in self.kept.directions:
+            return self.kept.directions[key]
         visits, present = self._driven_visits[h.key]
         D = self.directions[h.key](visits, settings) * self.sizes[h.key]
         D = D.reshape(*present.shape, *D.shape[1:]) * present[:, :, None, None, None]
         D = np.ascontiguousarray(D.transpose(0, 1, 3, 2, 4))
-        self._kept.keep(key, D)
+        self.kept.keep(key, D)
         return D
 
     @cached_property
@@ -211,9 +214,9 @@ class DiagnosisData:
         written to."""
         size = self.sizes[h.key]
         if not h.driven:
-            if h.key not in self._packed:
-                self._packed[h.key] = self.pack(self.columns.of(h)) * size
-            return self._packed[h.key]
+            if h.key not in self.kept.packed:
+                self.kept.packed[h.key] = self.pack(self.columns.of(h)) * size
+            return self.kept.packed[h.key]
         D = self.directions[h.key](self.table, settings[None])[:, 0]
         return self.pack(self.columns.entry(h.entry_key(self.base.model)) @ D) * size
 
@@ -225,22 +228,17 @@ class DiagnosisData:
 
     def changed(self, **changes: Any) -> DiagnosisData:
         """The same readings with other columns: their noise beside the fitted parameters stays."""
-        other = replace(self, **changes)
+        anew = changes.keys() & {"base", "columns", "data"}
+        other = replace(self, kept=KeptColumns() if anew else self.kept, **changes)
         if "noise" in self.__dict__:
             other.__dict__["noise"] = self.noise
-        return other if changes.keys() & {"base", "columns", "data"} else self._shared(other)
-
-    def _shared(self, other: DiagnosisData) -> DiagnosisData:
-        """The `other` of the same columns, with what was packed and evaluated of them here."""
-        for name in ("_packed", "_kept", "_directions"):
-            object.__setattr__(other, name, getattr(self, name))
         return other
 
     def without(self, faulty: BoolArray) -> DiagnosisData:
         """The same with the observations where `faulty` (N,) holds left out."""
         if (faulty == self.data.faulty).all():
             return self
-        return self._shared(replace(self, data=self.data.without(faulty)))
+        return replace(self, data=self.data.without(faulty))
 
 
 def diagnosis_data_of(
