@@ -113,8 +113,13 @@ def search_components(
     found = _swapped(full, with_own_axes(found), both)
     found = completed(with_shorter_drifts(full, _spared(found)), both)
     if len(full.blocks.member) <= FEW_POSES:
-        found = with_expected_families(full, found)
-        found = with_likelier_orders(full, found)
+        for _ in range(TWICE):
+            before = with_likelier_orders(full, with_expected_families(full, found))
+            # Which of two laws the last move follows shows where the lines are right.
+            found = completed(before, both)
+            if found.score <= before.score + GAINED:
+                break
+            found = _with_lines(full, found)
     return full, found, hidden_fellows(found, others)
 
 
