@@ -380,7 +380,7 @@ class SumOfComponents:
         slope[index] = each @ changed
         slope[0] = 2 * (self.rows - (len(left) - left.sum()) - rss / a2)
         changed *= b[:, None]
-        half, own = inverse @ changed, changed.T @ changed
+        half, own = linalg.blas.dtrmm(1.0, inverse, changed, lower=1), changed.T @ changed
         own[0] = own[:, 0] = 0.0
         information[np.ix_(index, index)] = own - half.T @ half
         of_noise = 2 * (inverse @ b)

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections import Counter, defaultdict
-from collections.abc import Sequence
+from collections.abc import Hashable, Iterator, Sequence
 from dataclasses import dataclass, field, replace
 from functools import cached_property
 
@@ -207,10 +207,11 @@ class EntrySums:
             flip=self.flip.sum(axis=1, keepdims=True),
         )  # fmt: skip
 
-    def pieces(self, settings: Array, k: int) -> list[Array]:
-        """`settings` (G, …) of directions with k columns each, as many at a time as are held."""
-        each = max(1, HELD // (self.b.size * k))
-        return [settings[i : i + each] for i in range(0, len(settings), each)]
+    def pieces(self, n: int, width: int) -> Iterator[slice]:
+        """Spans of n settings or blocks whose directions, of `width` columns each, are HELD
+        numbers."""
+        each = max(1, HELD // (self.b.size * width))
+        return (slice(k, k + each) for k in range(0, n, each))
 
     def driven(self, D: Array) -> Spectrum:
         """Spectrum of the groups with directions D (C, v, d, V, k), or (C, 1, d, V, k) where they
@@ -297,8 +298,32 @@ class Grams:
         if settings is None:
             settings = self.dataset.grids[h.key].values
         sums = self.entry(h.entry_key(self.dataset.base.model))
-        pieces = sums.pieces(settings, len(h.parameters))
-        directions = (self.dataset.direction(h, piece) for piece in pieces)
+        pieces = sums.pieces(len(settings), len(h.parameters))
+        directions = (self.dataset.direction(h, settings[piece]) for piece in pieces)
+        return Spectrum.joined(list(ahead(sums.driven, directions, self.data)))
+
+    def of_each(
+        self, whats: Sequence[Hypothesis | Generic]
+    ) -> Iterator[tuple[Sequence[int], Spectrum]]:
+        """Numbers of hypotheses or blocks and their spectra: a hypothesis by itself, at all of its
+        settings; blocks that move one entry by as many functions together, since hundreds of small
+        products cost a call each."""
+        alike = defaultdict[Hashable, list[int]](list)
+        for n, what in enumerate(whats):
+            moved = what.entry if isinstance(what, Generic) else None
+            alike[n if moved is None else (moved, what.width)].append(n)
+        for members in alike.values():
+            blocks = [what for n in members if isinstance(what := whats[n], Generic)]
+            yield members, self._of_blocks(blocks) if blocks else self.of(whats[members[0]])
+
+    def _of_blocks(self, blocks: Sequence[Generic]) -> Spectrum:
+        """Of blocks that move one entry by as many functions, or of one block."""
+        if len(blocks) == 1 or blocks[0].entry is None:
+            return self.of(blocks[0])
+        sums = self.entry(blocks[0].entry)
+        functions = [b.direction for b in blocks if b.direction is not None]
+        pieces = sums.pieces(len(blocks), blocks[0].width)
+        directions = (np.stack(functions[piece], axis=3) for piece in pieces)
         return Spectrum.joined(list(ahead(sums.driven, directions, self.data)))
 
     def _direct(self, columns: Array) -> Spectrum:
@@ -346,23 +371,29 @@ def scan(
     `signs` (F, C) of ±1 are the flips.
     """
     grams = Grams(dataset, data, project(data, noise), signs)
-    scored, flips, of_covariate = [], [], defaultdict[str, list[int]](list)
     whats: tuple[Hypothesis | Generic, ...] = (*dataset.hypotheses, *generic)
-    for n, what in enumerate(whats):
-        found, grid = grams.of(what), dataset.grids.get(what.key, NO_SETTINGS)
-        if isinstance(what, Generic):
-            of_covariate[what.covariate].append(n)
-        each = found.evidence(what.scales)
-        evidence = float(log_sum(each + grid.log_prior))
-        k = int(np.argmax(each + grid.log_prior))
-        scored.append(Scored(evidence, float(each[k]), grid.values[k], float(found.distance[k])))
-        if len(signs):
-            flips.append(log_sum(found.flipped(what.scales) + grid.log_prior))
+    found: dict[int, Scored] = {}
+    flips = np.empty((len(whats), len(signs)))
+    for members, spectra in grams.of_each(whats):
+        scales = whats[members[0]].scales
+        each, flipped = spectra.evidence(scales), spectra.flipped(scales)
+        # A hypothesis has all of its settings, of several blocks each has one.
+        for n, own in zip(members, np.split(np.arange(len(each)), len(members)), strict=True):
+            grid = dataset.grids.get(whats[n].key, NO_SETTINGS)
+            weighed = each[own] + grid.log_prior
+            k = int(np.argmax(weighed))
+            best, d = float(each[own[k]]), float(spectra.distance[own[k]])
+            found[n] = Scored(float(log_sum(weighed)), best, grid.values[k], d)
+            flips[n] = log_sum(flipped[:, own] + grid.log_prior)
+    scored = tuple(found[n] for n in range(len(whats)))
+    of_covariate = defaultdict[str, list[int]](list)
+    for n, block in enumerate(generic, start=len(dataset.hypotheses)):
+        of_covariate[block.covariate].append(n)
     total, by_covariate = float(logsumexp(prior)), of_covariate.items()
     return Scan(
-        tuple(scored), float(log_sum(prior + [s.evidence for s in scored])) - total,
-        log_sum(prior[:, None] + flips, axis=0) - total if flips else np.zeros(0),
+        scored, float(log_sum(prior + [s.evidence for s in scored])) - total,
+        log_sum(prior[:, None] + flips, axis=0) - total,
         {c: max(scored[n].evidence for n in own) for c, own in by_covariate},
-        {c: np.max([flips[n] for n in own], axis=0) for c, own in by_covariate if flips},
+        {c: flips[own].max(axis=0) for c, own in by_covariate if len(signs)},
         grams.at, noise,
     )  # fmt: skip
