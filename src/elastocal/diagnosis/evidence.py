@@ -14,7 +14,14 @@ from elastocal.diagnosis.baseline import VisitPlaces
 from elastocal.diagnosis.diagnosis import SMALLEST_P
 from elastocal.diagnosis.diagnosis_data import DiagnosisData
 from elastocal.diagnosis.hypotheses import NO_SETTINGS, SCALES, EntryKey, Hypothesis
-from elastocal.diagnosis.noise_floor import NoiseValues, NoisyData, Projection, ahead, project
+from elastocal.diagnosis.noise_floor import (
+    ROUNDING,
+    NoiseValues,
+    NoisyData,
+    Projection,
+    ahead,
+    project,
+)
 from elastocal.diagnosis.unknown import Generic
 from elastocal.planning.doubts import SOMETHING
 from elastocal.units import Array
@@ -206,6 +213,25 @@ class EntrySums:
             H=self.H.sum(axis=2, keepdims=True), b=self.b.sum(axis=1, keepdims=True),
             flip=self.flip.sum(axis=1, keepdims=True),
         )  # fmt: skip
+
+    @cached_property
+    def most_explained(self) -> float:
+        """What motions of the entry that differ from visit to visit in any way take off eᵀPe, of no
+        size charged: no directions take off more.
+
+        bᵀ(K − HᵀH)⁺b with K = `local`: with b̃ = K^−½b and H̃ = HK^−½ it is
+        b̃ᵀb̃ + (H̃b̃)ᵀ(1 − H̃H̃ᵀ)⁻¹H̃b̃.
+        """
+        C, n = len(self.b), self.b[0].size
+        values, U = np.linalg.eigh(self.local.reshape(C, n, n))
+        # What moves nothing takes off nothing.
+        shown = values > ROUNDING * values.max(initial=1e-300)
+        U = U * np.where(shown, values, np.inf)[:, None, :] ** -0.5
+        b = np.einsum("ci,cik->ck", self.b.reshape(C, n), U).ravel()
+        H = (self.H.reshape(-1, C, n).transpose(1, 0, 2) @ U).transpose(1, 0, 2).reshape(-1, C * n)
+        left, vectors = np.linalg.eigh(np.eye(len(H)) - H @ H.T)
+        moved = vectors.T @ (H @ b)
+        return float(b @ b + (moved**2 / np.maximum(left, ROUNDING)).sum())
 
     def pieces(self, n: int, width: int) -> Iterator[slice]:
         """Spans of n settings or blocks whose directions, of `width` columns each, are HELD
