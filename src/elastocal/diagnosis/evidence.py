@@ -376,7 +376,8 @@ class Scan:
 
     `odds` is the log of the mean evidence over catalogue and blocks, weighted by prior,
     `flipped` (F,) the same for residuals whose configurations had their signs flipped;
-    `covariate_odds` the largest evidence among the blocks of a covariate, and its flips.
+    `covariate_odds` the largest evidence among the blocks of a covariate, and its flips;
+    `marginal` the log marginal likelihood of the data beside which they were scored.
     """
 
     scored: tuple[Scored, ...]
@@ -384,7 +385,7 @@ class Scan:
     flipped: Array
     covariate_odds: dict[str, float]
     covariate_flips: dict[str, Array]
-    at: Projection
+    marginal: float
     noise: NoiseValues
 
 
@@ -421,5 +422,5 @@ def scan(
         log_sum(prior[:, None] + flips, axis=0) - total,
         {c: max(scored[n].evidence for n in own) for c, own in by_covariate},
         {c: flips[own].max(axis=0) for c, own in by_covariate if len(signs)},
-        grams.at, noise,
+        grams.at.marginal, noise,
     )  # fmt: skip
