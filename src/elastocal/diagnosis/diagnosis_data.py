@@ -34,12 +34,12 @@ from elastocal.errors import InsufficientDataError
 from elastocal.identification.noise_structure import along_axes, faster_course
 from elastocal.identification.visit_record import visit_record
 from elastocal.measurements import Measurements, numbered
+from elastocal.model.arm import usual_sizes
 from elastocal.model.effects import CATALOGUE
 from elastocal.model.effects.loads import PayloadError
 from elastocal.model.effects.placements import BaseFrame
 from elastocal.model.manipulator import Model
 from elastocal.model.observations import subset
-from elastocal.planning.doubts import usual_sizes
 from elastocal.units import Array, BoolArray, IntArray
 
 KEPT = 20_000_000  # numbers of regressor directions that are kept from scan to scan

@@ -23,7 +23,7 @@ from elastocal.diagnosis.noise_floor import (
     project,
 )
 from elastocal.diagnosis.unknown import Generic
-from elastocal.planning.doubts import SOMETHING
+from elastocal.model.effects import SOMETHING
 from elastocal.units import Array
 
 # Marginal likelihood of a group of columns in closed form.
