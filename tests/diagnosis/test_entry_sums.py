@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 import pytest
+from scipy.special import logsumexp
 from support.diagnosis_data import random_blocks, random_data
 
 from elastocal.diagnosis import EntrySums, NoiseValues, VisitPlaces, direct, project
@@ -51,6 +52,10 @@ def test_driven_groups_are_groups_of_the_columns_they_stand_for(seed: int, d: in
     signs = rng.choice([-1.0, 1.0], (4, C))
     entry = EntrySums.of(E, places, at, signs)
     found = entry.driven(D)
+    flips = found.flipped(np.zeros((5, 1)))
+    weights = rng.normal(size=5)
+    together = logsumexp(flips + weights[:, None], axis=0)
+    np.testing.assert_allclose(found.flipped(weights[None])[0], together, atol=1e-9)
     for g in range(5):
         columns = np.einsum("cmd,cmv,cvdk->cmk", E, places.one_hot, D[:, :, :, g])
         expected = direct(columns, at, signs)
@@ -58,11 +63,11 @@ def test_driven_groups_are_groups_of_the_columns_they_stand_for(seed: int, d: in
             found.lam[g], expected.lam[0], rtol=1e-8, atol=1e-9 * found.lam[g].max()
         )
         np.testing.assert_allclose(found.evidence()[g], expected.evidence()[0], atol=1e-8)
-        np.testing.assert_allclose(found.flipped()[:, g], expected.flipped()[:, 0], atol=1e-8)
+        np.testing.assert_allclose(flips[g], expected.flipped(np.zeros((1, 1)))[0], atol=1e-8)
     # Visits of a configuration that are driven alike may be given as one.
     alike = entry.driven(D[:, :1, :, 4:])
     np.testing.assert_allclose(alike.evidence()[0], found.evidence()[4], atol=1e-8)
-    np.testing.assert_allclose(alike.flipped()[:, 0], found.flipped()[:, 4], atol=1e-8)
+    np.testing.assert_allclose(alike.flipped(np.zeros((1, 1)))[0], flips[4], atol=1e-8)
 
 
 @pytest.mark.parametrize("d", [1, 3])

@@ -70,9 +70,15 @@ class Spectrum:
         """Log evidence (V,) over the model without the group."""
         return evidence_of(self.lam, self.beta, scales)
 
-    def flipped(self, scales: Array = SCALES) -> Array:
-        """Log evidence (F, V) of the residuals with flipped signs."""
-        return evidence_of(self.lam, self.flips, scales)
+    def flipped(self, log_prior: Array, scales: Array = SCALES) -> Array:
+        """Log evidence (W, F) of the residuals with flipped signs: of W hypotheses, whose V/W
+        groups stand one after the other and are weighed by `log_prior` (W, V/W)."""
+        each = _at_scales(self.lam, self.flips, scales)
+        each = each.reshape(*log_prior.shape, *each.shape[1:])
+        each += (log_prior - np.log(len(scales)))[:, :, None, None]
+        top = each.max(axis=(1, 2))
+        each -= top[:, None, None]
+        return np.asarray(top + np.log(np.exp(each, out=each).sum(axis=(1, 2))))
 
 
 # Beyond the flips the tail of a log evidence: e nats more are at most exp(−e) times as frequent,
@@ -101,14 +107,18 @@ def exceedance(flipped: Array, observed: float) -> float:
 
 def evidence_of(lam: Array, beta: Array, scales: Array) -> Array:
     """Log evidence (…,) from eigenvalues (V, K) and β (…, V, K); mixed over `scales` (S,)."""
-    squared = scales[:, None, None] ** 2
-    log_det = np.log1p(squared * lam).sum(axis=-1)
-    each = np.einsum("...vk,svk->s...v", beta**2, squared / (1 + squared * lam))
-    each -= log_det.reshape(len(scales), *[1] * (beta.ndim - 2), -1)
-    each *= 0.5
-    top = each.max(axis=0)
-    each -= top
-    return np.asarray(top + np.log(np.exp(each, out=each).mean(axis=0)))
+    each = log_sum(_at_scales(lam, beta.reshape(-1, *lam.shape), scales), axis=1)
+    return np.asarray((each - np.log(len(scales))).T.reshape(beta.shape[:-1]))
+
+
+def _at_scales(lam: Array, beta: Array, scales: Array) -> Array:
+    """Log evidence (V, S, F) at each of the scales, from eigenvalues (V, K) and β (F, V, K)."""
+    squared = scales[:, None] ** 2
+    shrunk = squared * lam[:, None, :]
+    # Flips last: a product for every group, and sums over the others that run along them.
+    each = (0.5 * squared / (1 + shrunk)) @ np.square(beta.transpose(1, 2, 0), order="C")
+    each -= 0.5 * np.log1p(shrunk).sum(axis=2)[:, :, None]
+    return np.asarray(each)
 
 
 def log_sum(values: Array, axis: int = -1) -> Array:
@@ -403,15 +413,15 @@ def scan(
     flips = np.empty((len(whats), len(signs)))
     for members, spectra in grams.of_each(whats):
         scales = whats[members[0]].scales
-        each, flipped = spectra.evidence(scales), spectra.flipped(scales)
         # A hypothesis has all of its settings, of several blocks each has one.
-        for n, own in zip(members, np.split(np.arange(len(each)), len(members)), strict=True):
-            grid = dataset.grids.get(whats[n].key, NO_SETTINGS)
+        grids = [dataset.grids.get(whats[n].key, NO_SETTINGS) for n in members]
+        each, spans = spectra.evidence(scales), np.arange(len(spectra.lam)).reshape(len(grids), -1)
+        flips[list(members)] = spectra.flipped(np.stack([g.log_prior for g in grids]), scales)
+        for n, own, grid in zip(members, spans, grids, strict=True):
             weighed = each[own] + grid.log_prior
             k = int(np.argmax(weighed))
             best, d = float(each[own[k]]), float(spectra.distance[own[k]])
             found[n] = Scored(float(log_sum(weighed)), best, grid.values[k], d)
-            flips[n] = log_sum(flipped[:, own] + grid.log_prior)
     scored = tuple(found[n] for n in range(len(whats)))
     of_covariate = defaultdict[str, list[int]](list)
     for n, block in enumerate(generic, start=len(dataset.hypotheses)):
