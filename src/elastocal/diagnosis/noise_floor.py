@@ -235,6 +235,7 @@ def prior_curvature(stated: bool, joints: int) -> Array:
 # ∂(−2ℓ)/∂θ = tr(P V_θ) − rᵀP V_θ P r.
 
 ROUNDING = 1e-12
+WHITENED = 100  # configurations at a time
 
 
 @dataclass(frozen=True)
@@ -301,10 +302,13 @@ class Weighted:
         of = data.counting
         white = WhitenedBlocks.of(covariance(data, noise), of.X[:, :, :0], of.r)
         root, r, log_det = white.root, white.e, white.log_det
-        X = np.matmul(root, of.X, out=room)
-        flat = X.reshape(-1, X.shape[2])
+        X, M = np.empty_like(of.X) if room is None else room, np.zeros((of.X.shape[2],) * 2)
+        # A piece is multiplied with itself while it is in the cache.
+        for some in (slice(k, k + WHITENED) for k in range(0, len(r), WHITENED)):
+            flat = np.matmul(root[some], of.X[some], out=X[some]).reshape(-1, len(M))
+            M += flat.T @ flat
         alone = log_det + float(np.vdot(r, r)) + data.n_rows * float(np.log(2 * np.pi))
-        return cls(root, X, r, flat.T @ flat, flat.T @ r.ravel(), alone)
+        return cls(root, X, r, M, X.reshape(-1, len(M)).T @ r.ravel(), alone)
 
     def prior(self, precision: Array) -> Array:
         """Λ's diagonal (p,), and a little more: what others show as well and the prior leaves wide
