@@ -26,6 +26,7 @@ from elastocal.diagnosis import (
 )
 from elastocal.diagnosis.noise_floor import (
     curved_likelihood,
+    inverse_triangle,
     least_within,
     prior_curvature,
     scored_climb,
@@ -247,6 +248,14 @@ def test_the_start_of_the_search_does_not_matter() -> None:
     far = NoiseValues(2.5, np.array([1e-4, 1e-7]), np.full(2, 1.5))
     ends = [likelihood(data, fit_noise(data, start))[0] for start in (None, far)]
     assert ends[0] == pytest.approx(ends[1], abs=0.05)
+
+
+@pytest.mark.parametrize("n", [1, 64, 65, 131])
+def test_the_inverse_of_a_triangle_is_one(n: int) -> None:
+    L = np.tril(np.random.default_rng(n).normal(size=(n, n)) / n) + np.eye(n)
+    found = inverse_triangle(L)
+    np.testing.assert_allclose(found @ L, np.eye(n), atol=1e-12)
+    assert not np.triu(found, 1).any()
 
 
 @pytest.mark.parametrize("n", [1, 4, 30])

@@ -36,6 +36,7 @@ from elastocal.diagnosis.noise_floor import (
     Weighted,
     balanced,
     fit_noise,
+    inverse_triangle,
     log_prior,
     posterior,
     scored_climb,
@@ -369,7 +370,7 @@ class SumOfComponents:
         beta = root * b
         rss = self.squares - 2 * float(beta @ self.weighted.z)
         rss += float(beta @ (self.weighted.M @ beta))
-        inverse = linalg.lapack.dtrtri(found.L, lower=1, overwrite_c=1)[0]
+        inverse = inverse_triangle(found.L)
         # A coefficient's posterior over its prior variance.
         left = np.einsum("ij,ij->j", inverse, inverse)
         each, changed = (1 - left) - b**2, self.sized.copy()  # ∂(−2ℓ)/∂ log v

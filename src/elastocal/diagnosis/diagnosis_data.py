@@ -185,9 +185,10 @@ class DiagnosisData:
         if key in self._kept.arrays:
             return self._kept.arrays[key]
         visits, present = self._driven_visits[h.key]
-        D = self.directions[h.key](visits, settings) * self.sizes[h.key]
-        D = D.reshape(*present.shape, *D.shape[1:]) * present[:, :, None, None, None]
-        D = np.ascontiguousarray(D.transpose(0, 1, 3, 2, 4))
+        D = self.directions[h.key](visits, settings)
+        D = D.reshape(*present.shape, *D.shape[1:]).transpose(0, 1, 3, 2, 4)
+        D = np.multiply(D, self.sizes[h.key], order="C")
+        D[~present] = 0.0
         self._kept.keep(key, D)
         return D
 

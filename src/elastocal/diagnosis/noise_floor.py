@@ -333,15 +333,25 @@ class Weighted:
     def projection(self, precision: Array) -> Projection:
         L, z, marginal = self.factored(precision)
         back = self.root.transpose(0, 2, 1)
-        H = back @ _times_transposed(self.X, _inverse(L))
+        H = back @ _times_transposed(self.X, inverse_triangle(L))
         u = (back @ self.r[..., None])[..., 0] - _times(H, z)
         beta = linalg.solve_triangular(L, z, lower=True, trans="T", check_finite=False)
         return Projection(back @ self.root, H, u, beta, marginal, L)
 
 
-def _inverse(L: Array) -> Array:
-    """L⁻¹ of a lower triangular L (p, p)."""
-    return np.asarray(linalg.lapack.dtrtri(L, lower=1)[0])
+SMALL = 64  # triangles that LAPACK inverts
+
+
+def inverse_triangle(L: Array) -> Array:
+    """L⁻¹ of a lower triangular L (p, p), by halves: BLAS's products of triangles are two to three
+    times as fast as LAPACK's inverse."""
+    if len(L) <= SMALL:
+        return np.asarray(linalg.lapack.dtrtri(L, lower=1)[0])
+    h, out, multiply = len(L) // 2, np.zeros(L.shape, order="F"), linalg.blas.dtrmm
+    out[:h, :h] = upper = inverse_triangle(L[:h, :h])
+    out[h:, h:] = lower = inverse_triangle(L[h:, h:])
+    out[h:, :h] = multiply(-1.0, upper, multiply(1.0, lower, L[h:, :h], lower=1), side=1, lower=1)
+    return out
 
 
 def _times_transposed(rows: Array, lower: Array, overwrite: bool = False) -> Array:
@@ -388,7 +398,7 @@ def curved_likelihood(
     of, at, J = data.counting, Weighted.of(data, noise, room), data.G.shape[2]
     L, z, marginal = at.factored(data.precision)
     beta = linalg.solve_triangular(L, z, lower=True, trans="T", check_finite=False)
-    inverse, e = _inverse(L), at.r - _times(at.X, beta)
+    inverse, e = inverse_triangle(L), at.r - _times(at.X, beta)
     H = _times_transposed(at.X, inverse, overwrite=True)
     white = H @ H.transpose(0, 2, 1)
     white *= -1.0
