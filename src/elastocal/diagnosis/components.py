@@ -485,8 +485,10 @@ def posed(
         for some in (slice(k, k + piece) for k in range(0, len(data.r), piece)):
             X = np.empty((*own.r[some].shape, total))
             X[:, :, :p] = own.X[some]
+            # Rows that do not count are left out once, not of every component's columns.
+            root = own.root[some] * ~data.left_out[some, None, :]
             for c, span in zip(components, spans, strict=True):
-                np.matmul(own.root[some], data.masked(c.columns)[some], out=X[:, :, span])
+                np.matmul(root, c.columns[some], out=X[:, :, span])
             flat = _rows(X)
             M += flat.T @ flat
             z += flat.T @ own.r[some].ravel()
