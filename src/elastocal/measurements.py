@@ -220,6 +220,8 @@ def numbered(*columns: NDArray[Any]) -> IntArray:
             continue
         codes = ranked(values)
         number = ranked(number * (int(codes.max(initial=0)) + 1) + codes)
+        if int(number.max()) + 1 == len(number):  # no two are left to tell apart
+            break
     return number
 
 
@@ -523,21 +525,18 @@ def _marker(raw: RawTable, known: tuple[str, ...]) -> Labels:
 
 
 def _check_duplicates(raw: RawTable, table: Measurements) -> None:
-    import pandas as pd
-
     if "configuration" in raw.labels:
         key = [table.configuration, table.repeat, table.marker, *table.force.T]
         what = "the same configuration, repeat, marker and force"
     else:
         key = [*raw.numbers.values(), *(labels.codes for labels in raw.labels.values())]
         what = "the same values in all columns"
-    # Adding zero makes -0.0 and 0.0 the same key.
-    frame = pd.DataFrame({k: values + 0 for k, values in enumerate(key)}, copy=False)
-    repeated = frame.duplicated().to_numpy()
+    number = numbered(*key)
+    earliest = firsts(number, int(number.max()) + 1)[number]
+    repeated = earliest < np.arange(len(number))
     if repeated.any():
         i = int(np.argmax(repeated))
-        same = np.logical_and.reduce([values == values[i] for values in key])
-        first = int(np.argmax(same))
+        first = int(earliest[i])
         raise InputError(
             f"{raw.source}: {raw.noun}s {raw.row[first]} and {raw.row[i]} have {what}; drop one, "
             "or number true repetitions in a `repeat` column"

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 import pytest
+from scipy.special import logsumexp
 from support.diagnosis_data import random_blocks, random_data
 
 from elastocal.diagnosis import EntrySums, NoiseValues, VisitPlaces, direct, project
@@ -51,6 +52,10 @@ def test_driven_groups_are_groups_of_the_columns_they_stand_for(seed: int, d: in
     signs = rng.choice([-1.0, 1.0], (4, C))
     entry = EntrySums.of(E, places, at, signs)
     found = entry.driven(D)
+    flips = found.flipped(np.zeros((5, 1)))
+    weights = rng.normal(size=5)
+    together = logsumexp(flips + weights[:, None], axis=0)
+    np.testing.assert_allclose(found.flipped(weights[None])[0], together, atol=1e-9)
     for g in range(5):
         columns = np.einsum("cmd,cmv,cvdk->cmk", E, places.one_hot, D[:, :, :, g])
         expected = direct(columns, at, signs)
@@ -58,8 +63,30 @@ def test_driven_groups_are_groups_of_the_columns_they_stand_for(seed: int, d: in
             found.lam[g], expected.lam[0], rtol=1e-8, atol=1e-9 * found.lam[g].max()
         )
         np.testing.assert_allclose(found.evidence()[g], expected.evidence()[0], atol=1e-8)
-        np.testing.assert_allclose(found.flipped()[:, g], expected.flipped()[:, 0], atol=1e-8)
+        np.testing.assert_allclose(flips[g], expected.flipped(np.zeros((1, 1)))[0], atol=1e-8)
     # Visits of a configuration that are driven alike may be given as one.
     alike = entry.driven(D[:, :1, :, 4:])
     np.testing.assert_allclose(alike.evidence()[0], found.evidence()[4], atol=1e-8)
-    np.testing.assert_allclose(alike.flipped()[:, 0], found.flipped()[:, 4], atol=1e-8)
+    np.testing.assert_allclose(alike.flipped(np.zeros((1, 1)))[0], flips[4], atol=1e-8)
+
+
+@pytest.mark.parametrize("d", [1, 3])
+@pytest.mark.parametrize("seed", SEEDS)
+def test_no_directions_explain_more_than_motions_free_at_every_visit(seed: int, d: int) -> None:
+    """By the pseudo-inverse of all of them as columns; some are zero, where a visit is absent."""
+    data = random_data(seed)
+    places, at = VisitPlaces.of(data.blocks), project(data, NOISE)
+    rng = np.random.default_rng((seed, 6))
+    E = data.masked(1e-5 * rng.normal(size=(*data.r.shape, d)))
+    C, v = places.example.shape
+    entry = EntrySums.of(E, places, at)
+    free = np.zeros((C, data.r.shape[1], C, v, d))
+    free[np.arange(C), :, np.arange(C)] = np.einsum("cmd,cmv->cmvd", E, places.one_hot)
+    columns = free.reshape(C, -1, C * v * d)
+    b = np.einsum("cmk,cm->k", columns, at.u)
+    H = np.einsum("cmk,cmp->kp", columns, at.H)
+    A = np.einsum("cmk,cmn,cnl->kl", columns, at.inverse, columns) - H @ H.T
+    expected = b @ np.linalg.pinv(A, rcond=1e-10, hermitian=True) @ b
+    assert entry.most_explained == pytest.approx(expected, rel=1e-5)
+    found = entry.driven(rng.normal(size=(C, v, d, 20, 2)))
+    assert (found.explained(1e9) <= entry.most_explained * (1 + 1e-9)).all()

@@ -77,7 +77,7 @@ def test_flipped_configurations_are_flipped_residuals_projected_anew(seed: int) 
     data = random_data(seed)
     C, at = group(data, seed), project(data, NOISE)
     signs = np.random.default_rng(seed).choice([-1.0, 1.0], (6, len(data.r)))
-    found = direct(C, at, signs).flipped()[:, 0]
+    found = direct(C, at, signs).flipped(np.zeros((1, 1)))[0]
     rows = used_rows(data)
     X, c = (a.reshape(-1, a.shape[2])[rows] for a in (data.X, C))
     inverse = np.linalg.inv(dense_noise(data, NOISE))

@@ -75,6 +75,22 @@ def test_distances_are_what_no_rival_and_no_fitted_parameter_explains() -> None:
         assert each[h.name, h.where] == pytest.approx(expected, rel=1e-3)
 
 
+def test_of_those_far_away_a_lower_bound_is_enough() -> None:
+    """Eccentricities and lines of another joint are far, whatever their settings."""
+    model, table = campaign("gear_eccentricity:joint2", n=16)
+    hypotheses = [h for h in possible(model, table)[0] if h.name in (*RIVALS, "gear_ripple")]
+    dataset = diagnosis_data_of(fit_baseline(model, table), hypotheses)
+    ripple = next(h for h in dataset.hypotheses if h.key == ("gear_ripple", "joint2"))
+    both = fit_set(dataset, (Item(ripple, dataset.grids[ripple.key].values[5], 0.0),))
+    large = replace(both, data=replace(both.data, r=both.data.masked(
+        50.0 * packed_columns(dataset, both.items[0])[:, :, 0]
+    )))  # fmt: skip
+    (_, each), (_, some) = distances(dataset, large, 0), distances(dataset, large, 0, 3.0)
+    assert each.keys() == some.keys()
+    bounded = [key for key in each if some[key] != each[key]]
+    assert bounded and all(3.0 < some[key] <= each[key] for key in bounded)
+
+
 def test_a_weight_on_the_second_link_is_near_and_other_joints_are_far() -> None:
     dataset, both, _ = found()
     nothing, each = distances(dataset, both, 1)

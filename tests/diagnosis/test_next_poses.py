@@ -21,8 +21,8 @@ from elastocal.diagnosis import (
     verdict_of,
     with_effects_of,
 )
+from elastocal.model.effects import SOMETHING
 from elastocal.planning import Gain, missing
-from elastocal.planning.doubts import SOMETHING
 from elastocal.report.plan_view import next_lines
 
 FEW = ["--candidates", "60", "-q"]

@@ -24,7 +24,13 @@ from elastocal.diagnosis import (
     posterior,
     project,
 )
-from elastocal.diagnosis.noise_floor import curved_likelihood, prior_curvature, scored_climb
+from elastocal.diagnosis.noise_floor import (
+    curved_likelihood,
+    inverse_triangle,
+    least_within,
+    prior_curvature,
+    scored_climb,
+)
 from elastocal.measurements import visits
 from elastocal.model import Model
 
@@ -242,6 +248,32 @@ def test_the_start_of_the_search_does_not_matter() -> None:
     far = NoiseValues(2.5, np.array([1e-4, 1e-7]), np.full(2, 1.5))
     ends = [likelihood(data, fit_noise(data, start))[0] for start in (None, far)]
     assert ends[0] == pytest.approx(ends[1], abs=0.05)
+
+
+@pytest.mark.parametrize("n", [1, 64, 65, 131])
+def test_the_inverse_of_a_triangle_is_one(n: int) -> None:
+    L = np.tril(np.random.default_rng(n).normal(size=(n, n)) / n) + np.eye(n)
+    found = inverse_triangle(L)
+    np.testing.assert_allclose(found @ L, np.eye(n), atol=1e-12)
+    assert not np.triu(found, 1).any()
+
+
+@pytest.mark.parametrize("n", [1, 4, 30])
+def test_a_step_within_bounds_is_that_of_bounded_least_squares(n: int) -> None:
+    """Bounds through the start among them, and curvatures that differ by orders."""
+    rng = np.random.default_rng(n)
+    for _ in range(20):
+        B = rng.normal(size=(n + 2, n)) * 10 ** rng.uniform(-2, 2, n)
+        H, slope = B.T @ B + 1e-6 * np.eye(n), 10 * rng.normal(size=n)
+        low = -rng.uniform(0.1, 1.5, n) * (rng.random(n) > 0.2)
+        high = low + rng.uniform(0.2, 1.5, n)
+        root = linalg.cholesky(H)
+        target = -linalg.solve_triangular(root, slope, trans="T")
+        expected = optimize.lsq_linear(root, target, (low, high), method="bvls", tol=1e-13).x
+        found = least_within(H, slope, low, high)
+        assert (found >= low).all() and (found <= high).all()
+        values = [slope @ s + s @ H @ s / 2 for s in (found, expected)]
+        assert values[0] == pytest.approx(values[1], rel=1e-9)
 
 
 def test_a_stated_drift_is_noise_that_readings_have_in_common_by_their_times() -> None:

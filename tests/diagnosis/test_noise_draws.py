@@ -2,13 +2,23 @@
 
 from __future__ import annotations
 
+import threading
+from collections.abc import Iterator
 from dataclasses import replace
 
 import numpy as np
 import pytest
 from support.diagnosis_data import random_blocks, random_data
 
-from elastocal.diagnosis import NoiseValues, NoisyData, fit_noise, likelihood, noise_draws
+from elastocal.diagnosis import (
+    NoiseValues,
+    NoisyData,
+    fit_noise,
+    likelihood,
+    noise_draws,
+    noise_floor,
+)
+from elastocal.diagnosis.noise_floor import ahead
 
 N = 300
 
@@ -66,3 +76,24 @@ def test_the_same_seed_draws_the_same_noise() -> None:
     one, two = (noise_draws(made, best, 5, np.random.default_rng(2)) for _ in range(2))
     for a, b in zip(one, two, strict=True):
         np.testing.assert_array_equal(a.logs(), b.logs())
+
+
+def test_no_result_depends_on_the_number_of_threads(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Of large data; what is worked on is made in the caller's thread, one after the other."""
+    made = data()
+    best = fit_noise(made)
+    alone = noise_draws(made, best, 20, np.random.default_rng(0))
+    monkeypatch.setattr(noise_floor, "LARGE", 0)
+    monkeypatch.setenv("OMP_NUM_THREADS", "3")
+    several = noise_draws(made, best, 20, np.random.default_rng(0))
+    for one, other in zip(alone, several, strict=True):
+        np.testing.assert_array_equal(one.logs(), other.logs())
+    makers = []
+
+    def items() -> Iterator[int]:
+        for k in range(20):
+            makers.append(threading.current_thread())
+            yield k
+
+    assert list(ahead(lambda k: k**2, items(), made)) == [k**2 for k in range(20)]
+    assert set(makers) == {threading.current_thread()}

@@ -10,8 +10,9 @@ from support.design_cells import all_loads, plan_cell, set_up, target_poses
 
 from elastocal.identification.knowledge import GaussianPrior
 from elastocal.model import Model
+from elastocal.model.effects import SOMETHING
 from elastocal.planning import Gain, Known, Setup, in_doubt, load_states, missing, relax
-from elastocal.planning.doubts import SOMETHING, WORTH, leading_directions
+from elastocal.planning.doubts import WORTH, leading_directions
 from elastocal.planning.plan import Doubt
 from elastocal.planning.selection import in_terms, random_plan
 

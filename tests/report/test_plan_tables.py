@@ -13,8 +13,9 @@ from elastocal.cell.arm_description import CartesianNoise, Tracker
 from elastocal.cell.plan_wishes import DesignSpec
 from elastocal.planning import Certificate, DesignOptions, PlanSize
 from elastocal.planning.design import design
+from elastocal.report.plan_terminal import print_plan
 from elastocal.report.plan_view import plan_lines, served
-from elastocal.report.terminal import PRINTED_WIDTH, print_plan, printed_text
+from elastocal.report.terminal import PRINTED_WIDTH, printed_text
 
 LOADS = np.array([[0, 0, 0], [0, 0, -2600.0]])
 

@@ -214,7 +214,7 @@ def design(
     if as_json:
         say(summary.read_text(encoding="utf-8"), end="")
         return
-    from elastocal.report.terminal import print_plan
+    from elastocal.report.plan_terminal import print_plan
 
     print_plan(console(), plan)
     for path in written:

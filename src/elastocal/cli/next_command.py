@@ -83,7 +83,7 @@ def next_command(
     if as_json:
         say(json_text(found.to_json()))
         return
-    from elastocal.report.terminal import print_next
+    from elastocal.report.plan_terminal import print_next
 
     print_next(console(), found)
     say(f"{output} not written" if found.plan is None else f"wrote {output}\nwrote {beside}")

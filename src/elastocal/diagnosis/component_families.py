@@ -362,7 +362,8 @@ def family_evidence(
     dataset = grams.dataset
     sums = grams.entry(h.entry_key(dataset.base.model))
     out = []
-    for some in sums.pieces(orders[:, None], 2 * m):
+    for piece in sums.pieces(len(orders), 2 * m):
+        some = orders[piece, None]
         # The amplitudes of multiples fall with their number, in the mean.
         D = [dataset.direction(h, some * k) / k for k in range(1, m + 1)]
         out.append(sums.driven(np.concatenate(D, axis=4)).evidence(scales))

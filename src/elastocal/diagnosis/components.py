@@ -36,6 +36,7 @@ from elastocal.diagnosis.noise_floor import (
     Weighted,
     balanced,
     fit_noise,
+    inverse_triangle,
     log_prior,
     posterior,
     scored_climb,
@@ -374,7 +375,7 @@ class SumOfComponents:
         beta = root * b
         rss = self.squares - 2 * float(beta @ self.weighted.z)
         rss += float(beta @ (self.weighted.M @ beta))
-        inverse = linalg.lapack.dtrtri(found.L, lower=1, overwrite_c=1)[0]
+        inverse = inverse_triangle(found.L)
         # A coefficient's posterior over its prior variance.
         left = np.einsum("ij,ij->j", inverse, inverse)
         each, changed = (1 - left) - b**2, self.sized.copy()  # ∂(−2ℓ)/∂ log v
@@ -385,7 +386,7 @@ class SumOfComponents:
         slope[index] = each @ changed
         slope[0] = 2 * (self.rows - (len(left) - left.sum()) - rss / a2)
         changed *= b[:, None]
-        half, own = inverse @ changed, changed.T @ changed
+        half, own = linalg.blas.dtrmm(1.0, inverse, changed, lower=1), changed.T @ changed
         own[0] = own[:, 0] = 0.0
         information[np.ix_(index, index)] = own - half.T @ half
         of_noise = 2 * (inverse @ b)
@@ -492,8 +493,10 @@ def posed(
         for some in (slice(k, k + piece) for k in range(0, len(data.r), piece)):
             X = np.empty((*own.r[some].shape, total))
             X[:, :, :p] = own.X[some]
+            # Rows that do not count are left out once, not of every component's columns.
+            root = own.root[some] * ~data.left_out[some, None, :]
             for c, span in zip(components, spans, strict=True):
-                np.matmul(own.root[some], data.masked(c.columns)[some], out=X[:, :, span])
+                np.matmul(root, c.columns[some], out=X[:, :, span])
             flat = _rows(X)
             M += flat.T @ flat
             z += flat.T @ own.r[some].ravel()

@@ -34,12 +34,12 @@ from elastocal.errors import InsufficientDataError
 from elastocal.identification.noise_structure import along_axes, faster_course
 from elastocal.identification.visit_record import visit_record
 from elastocal.measurements import Measurements, numbered
+from elastocal.model.arm import usual_sizes
 from elastocal.model.effects import CATALOGUE
 from elastocal.model.effects.loads import PayloadError
 from elastocal.model.effects.placements import BaseFrame
 from elastocal.model.manipulator import Model
 from elastocal.model.observations import subset
-from elastocal.planning.doubts import usual_sizes
 from elastocal.units import Array, BoolArray, IntArray
 
 KEPT = 20_000_000  # numbers of regressor directions that are kept from scan to scan
@@ -188,9 +188,10 @@ class DiagnosisData:
         if key in self.kept.directions:
             return self.kept.directions[key]
         visits, present = self._driven_visits[h.key]
-        D = self.directions[h.key](visits, settings) * self.sizes[h.key]
-        D = D.reshape(*present.shape, *D.shape[1:]) * present[:, :, None, None, None]
-        D = np.ascontiguousarray(D.transpose(0, 1, 3, 2, 4))
+        D = self.directions[h.key](visits, settings)
+        D = D.reshape(*present.shape, *D.shape[1:]).transpose(0, 1, 3, 2, 4)
+        D = np.multiply(D, self.sizes[h.key], order="C")
+        D[~present] = 0.0
         self.kept.keep(key, D)
         return D
 

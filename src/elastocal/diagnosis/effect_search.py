@@ -25,7 +25,7 @@ from elastocal.diagnosis.model_set import (
 )
 from elastocal.diagnosis.noise_floor import NoiseValues, log_prior
 from elastocal.diagnosis.unknown import Generic
-from elastocal.planning.doubts import SOMETHING
+from elastocal.model.effects import SOMETHING
 from elastocal.units import Array
 
 # What a search found: the set, what else could stand in each of its places, and the odds.
@@ -161,7 +161,7 @@ KEPT = 4  # scans that are kept, the last ones
 def base_score(dataset: DiagnosisData, current: ModelSet, scanned: Scan) -> float:
     """Log posterior of the set as it is under the scan's noise."""
     items = sum(item.log_prior for item in current.items)
-    return scanned.at.marginal + items - 0.5 * log_prior(dataset.data.stated, scanned.noise)[0]
+    return scanned.marginal + items - 0.5 * log_prior(dataset.data.stated, scanned.noise)[0]
 
 
 @dataclass
@@ -224,6 +224,7 @@ class ForwardSelection:
                 current, slots, scanned = self._reexamined(current, slots, scanned)
         if len(current.items) > 1:
             alone = self._scan(nothing, current.noise)
+        self._forget()
         return SelectedEffects(
             self.dataset, current, tuple(slots or [slot]), tuple(p_values), nothing, first, alone
         )
@@ -250,7 +251,8 @@ class ForwardSelection:
         )
 
     def _forget(self) -> None:
-        """What was fitted and scanned about another fit is void."""
+        """What was fitted and scanned about another fit is void, and after a search only fills the
+        memory: each set holds its columns."""
         self._fitted.clear()
         self._scanned.clear()
 

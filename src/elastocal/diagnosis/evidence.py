@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections import Counter, defaultdict
-from collections.abc import Sequence
+from collections.abc import Hashable, Iterator, Sequence
 from dataclasses import dataclass, field, replace
 from functools import cached_property
 
@@ -14,9 +14,16 @@ from elastocal.diagnosis.baseline import VisitPlaces
 from elastocal.diagnosis.diagnosis import SMALLEST_P
 from elastocal.diagnosis.diagnosis_data import DiagnosisData
 from elastocal.diagnosis.hypotheses import NO_SETTINGS, SCALES, EntryKey, Hypothesis
-from elastocal.diagnosis.noise_floor import NoiseValues, NoisyData, Projection, ahead, project
+from elastocal.diagnosis.noise_floor import (
+    ROUNDING,
+    NoiseValues,
+    NoisyData,
+    Projection,
+    ahead,
+    project,
+)
 from elastocal.diagnosis.unknown import Generic
-from elastocal.planning.doubts import SOMETHING
+from elastocal.model.effects import SOMETHING
 from elastocal.units import Array
 
 # Marginal likelihood of a group of columns in closed form.
@@ -63,9 +70,15 @@ class Spectrum:
         """Log evidence (V,) over the model without the group."""
         return evidence_of(self.lam, self.beta, scales)
 
-    def flipped(self, scales: Array = SCALES) -> Array:
-        """Log evidence (F, V) of the residuals with flipped signs."""
-        return evidence_of(self.lam, self.flips, scales)
+    def flipped(self, log_prior: Array, scales: Array = SCALES) -> Array:
+        """Log evidence (W, F) of the residuals with flipped signs: of W hypotheses, whose V/W
+        groups stand one after the other and are weighed by `log_prior` (W, V/W)."""
+        each = _at_scales(self.lam, self.flips, scales)
+        each = each.reshape(*log_prior.shape, *each.shape[1:])
+        each += (log_prior - np.log(len(scales)))[:, :, None, None]
+        top = each.max(axis=(1, 2))
+        each -= top[:, None, None]
+        return np.asarray(top + np.log(np.exp(each, out=each).sum(axis=(1, 2))))
 
 
 # Beyond the flips the tail of a log evidence: e nats more are at most exp(−e) times as frequent,
@@ -94,14 +107,18 @@ def exceedance(flipped: Array, observed: float) -> float:
 
 def evidence_of(lam: Array, beta: Array, scales: Array) -> Array:
     """Log evidence (…,) from eigenvalues (V, K) and β (…, V, K); mixed over `scales` (S,)."""
-    squared = scales[:, None, None] ** 2
-    log_det = np.log1p(squared * lam).sum(axis=-1)
-    each = np.einsum("...vk,svk->s...v", beta**2, squared / (1 + squared * lam))
-    each -= log_det.reshape(len(scales), *[1] * (beta.ndim - 2), -1)
-    each *= 0.5
-    top = each.max(axis=0)
-    each -= top
-    return np.asarray(top + np.log(np.exp(each, out=each).mean(axis=0)))
+    each = log_sum(_at_scales(lam, beta.reshape(-1, *lam.shape), scales), axis=1)
+    return np.asarray((each - np.log(len(scales))).T.reshape(beta.shape[:-1]))
+
+
+def _at_scales(lam: Array, beta: Array, scales: Array) -> Array:
+    """Log evidence (V, S, F) at each of the scales, from eigenvalues (V, K) and β (F, V, K)."""
+    squared = scales[:, None] ** 2
+    shrunk = squared * lam[:, None, :]
+    # Flips last: a product for every group, and sums over the others that run along them.
+    each = (0.5 * squared / (1 + shrunk)) @ np.square(beta.transpose(1, 2, 0), order="C")
+    each -= 0.5 * np.log1p(shrunk).sum(axis=2)[:, :, None]
+    return np.asarray(each)
 
 
 def log_sum(values: Array, axis: int = -1) -> Array:
@@ -207,10 +224,30 @@ class EntrySums:
             flip=self.flip.sum(axis=1, keepdims=True),
         )  # fmt: skip
 
-    def pieces(self, settings: Array, k: int) -> list[Array]:
-        """`settings` (G, …) of directions with k columns each, as many at a time as are held."""
-        each = max(1, HELD // (self.b.size * k))
-        return [settings[i : i + each] for i in range(0, len(settings), each)]
+    @cached_property
+    def most_explained(self) -> float:
+        """What motions of the entry that differ from visit to visit in any way take off eᵀPe, of no
+        size charged: no directions take off more.
+
+        bᵀ(K − HᵀH)⁺b with K = `local`: with b̃ = K^−½b and H̃ = HK^−½ it is
+        b̃ᵀb̃ + (H̃b̃)ᵀ(1 − H̃H̃ᵀ)⁻¹H̃b̃.
+        """
+        C, n = len(self.b), self.b[0].size
+        values, U = np.linalg.eigh(self.local.reshape(C, n, n))
+        # What moves nothing takes off nothing.
+        shown = values > ROUNDING * values.max(initial=1e-300)
+        U = U * np.where(shown, values, np.inf)[:, None, :] ** -0.5
+        b = np.einsum("ci,cik->ck", self.b.reshape(C, n), U).ravel()
+        H = (self.H.reshape(-1, C, n).transpose(1, 0, 2) @ U).transpose(1, 0, 2).reshape(-1, C * n)
+        left, vectors = np.linalg.eigh(np.eye(len(H)) - H @ H.T)
+        moved = vectors.T @ (H @ b)
+        return float(b @ b + (moved**2 / np.maximum(left, ROUNDING)).sum())
+
+    def pieces(self, n: int, width: int) -> Iterator[slice]:
+        """Spans of n settings or blocks whose directions, of `width` columns each, are HELD
+        numbers."""
+        each = max(1, HELD // (self.b.size * width))
+        return (slice(k, k + each) for k in range(0, n, each))
 
     def driven(self, D: Array) -> Spectrum:
         """Spectrum of the groups with directions D (C, v, d, V, k), or (C, 1, d, V, k) where they
@@ -297,8 +334,32 @@ class Grams:
         if settings is None:
             settings = self.dataset.grids[h.key].values
         sums = self.entry(h.entry_key(self.dataset.base.model))
-        pieces = sums.pieces(settings, len(h.parameters))
-        directions = (self.dataset.direction(h, piece) for piece in pieces)
+        pieces = sums.pieces(len(settings), len(h.parameters))
+        directions = (self.dataset.direction(h, settings[piece]) for piece in pieces)
+        return Spectrum.joined(list(ahead(sums.driven, directions, self.data)))
+
+    def of_each(
+        self, whats: Sequence[Hypothesis | Generic]
+    ) -> Iterator[tuple[Sequence[int], Spectrum]]:
+        """Numbers of hypotheses or blocks and their spectra: a hypothesis by itself, at all of its
+        settings; blocks that move one entry by as many functions together, since hundreds of small
+        products cost a call each."""
+        alike = defaultdict[Hashable, list[int]](list)
+        for n, what in enumerate(whats):
+            moved = what.entry if isinstance(what, Generic) else None
+            alike[n if moved is None else (moved, what.width)].append(n)
+        for members in alike.values():
+            blocks = [what for n in members if isinstance(what := whats[n], Generic)]
+            yield members, self._of_blocks(blocks) if blocks else self.of(whats[members[0]])
+
+    def _of_blocks(self, blocks: Sequence[Generic]) -> Spectrum:
+        """Of blocks that move one entry by as many functions, or of one block."""
+        if len(blocks) == 1 or blocks[0].entry is None:
+            return self.of(blocks[0])
+        sums = self.entry(blocks[0].entry)
+        functions = [b.direction for b in blocks if b.direction is not None]
+        pieces = sums.pieces(len(blocks), blocks[0].width)
+        directions = (np.stack(functions[piece], axis=3) for piece in pieces)
         return Spectrum.joined(list(ahead(sums.driven, directions, self.data)))
 
     def _direct(self, columns: Array) -> Spectrum:
@@ -325,7 +386,8 @@ class Scan:
 
     `odds` is the log of the mean evidence over catalogue and blocks, weighted by prior,
     `flipped` (F,) the same for residuals whose configurations had their signs flipped;
-    `covariate_odds` the largest evidence among the blocks of a covariate, and its flips.
+    `covariate_odds` the largest evidence among the blocks of a covariate, and its flips;
+    `marginal` the log marginal likelihood of the data beside which they were scored.
     """
 
     scored: tuple[Scored, ...]
@@ -333,7 +395,7 @@ class Scan:
     flipped: Array
     covariate_odds: dict[str, float]
     covariate_flips: dict[str, Array]
-    at: Projection
+    marginal: float
     noise: NoiseValues
 
 
@@ -346,23 +408,29 @@ def scan(
     `signs` (F, C) of ±1 are the flips.
     """
     grams = Grams(dataset, data, project(data, noise), signs)
-    scored, flips, of_covariate = [], [], defaultdict[str, list[int]](list)
     whats: tuple[Hypothesis | Generic, ...] = (*dataset.hypotheses, *generic)
-    for n, what in enumerate(whats):
-        found, grid = grams.of(what), dataset.grids.get(what.key, NO_SETTINGS)
-        if isinstance(what, Generic):
-            of_covariate[what.covariate].append(n)
-        each = found.evidence(what.scales)
-        evidence = float(log_sum(each + grid.log_prior))
-        k = int(np.argmax(each + grid.log_prior))
-        scored.append(Scored(evidence, float(each[k]), grid.values[k], float(found.distance[k])))
-        if len(signs):
-            flips.append(log_sum(found.flipped(what.scales) + grid.log_prior))
+    found: dict[int, Scored] = {}
+    flips = np.empty((len(whats), len(signs)))
+    for members, spectra in grams.of_each(whats):
+        scales = whats[members[0]].scales
+        # A hypothesis has all of its settings, of several blocks each has one.
+        grids = [dataset.grids.get(whats[n].key, NO_SETTINGS) for n in members]
+        each, spans = spectra.evidence(scales), np.arange(len(spectra.lam)).reshape(len(grids), -1)
+        flips[list(members)] = spectra.flipped(np.stack([g.log_prior for g in grids]), scales)
+        for n, own, grid in zip(members, spans, grids, strict=True):
+            weighed = each[own] + grid.log_prior
+            k = int(np.argmax(weighed))
+            best, d = float(each[own[k]]), float(spectra.distance[own[k]])
+            found[n] = Scored(float(log_sum(weighed)), best, grid.values[k], d)
+    scored = tuple(found[n] for n in range(len(whats)))
+    of_covariate = defaultdict[str, list[int]](list)
+    for n, block in enumerate(generic, start=len(dataset.hypotheses)):
+        of_covariate[block.covariate].append(n)
     total, by_covariate = float(logsumexp(prior)), of_covariate.items()
     return Scan(
-        tuple(scored), float(log_sum(prior + [s.evidence for s in scored])) - total,
-        log_sum(prior[:, None] + flips, axis=0) - total if flips else np.zeros(0),
+        scored, float(log_sum(prior + [s.evidence for s in scored])) - total,
+        log_sum(prior[:, None] + flips, axis=0) - total,
         {c: max(scored[n].evidence for n in own) for c, own in by_covariate},
-        {c: np.max([flips[n] for n in own], axis=0) for c, own in by_covariate if flips},
-        grams.at, noise,
+        {c: flips[own].max(axis=0) for c, own in by_covariate if len(signs)},
+        grams.at.marginal, noise,
     )  # fmt: skip

@@ -283,6 +283,7 @@ def beside(dataset: DiagnosisData, chosen: ModelSet, k: int) -> NoisyData:
 # Which other effects would look the same in these poses: what no size of noise can tell apart.
 
 PLAUSIBLE = 5.0
+SURELY = 1e-6  # of a signal's square: far beyond rounding
 
 
 def signal_of(dataset: DiagnosisData, chosen: ModelSet, k: int) -> Array:
@@ -292,13 +293,15 @@ def signal_of(dataset: DiagnosisData, chosen: ModelSet, k: int) -> Array:
 
 
 def distances(
-    dataset: DiagnosisData, chosen: ModelSet, k: int
+    dataset: DiagnosisData, chosen: ModelSet, k: int, beyond: float = np.inf
 ) -> tuple[float, dict[tuple[str, str], float]]:
     """d of item k from nothing, and from each other hypothesis that the data could mean instead.
 
     d² = min over β, γ of |v − Xβ − Cγ|²_V⁻¹ + |γ|²/s² with the item's signal v, the rival's
     columns C at its best settings and s = PLAUSIBLE times the widest of the size prior: in
     standard deviations.  A rival larger than usual is less probable, but it is no less alike.
+    `beyond`: of one that is farther than so much at any settings, whatever its motion at each
+    visit, it is only said how far it is at least.
     """
     v, data = signal_of(dataset, chosen, k), beside(dataset, chosen, k)
     at = project(replace(data, r=v), chosen.noise)
@@ -307,6 +310,11 @@ def distances(
     out: dict[tuple[str, str], float] = {}
     for h in dataset.hypotheses:
         if h is not chosen.items[k].what:
+            if h.settings and beyond < np.inf:
+                most = grams.entry(h.entry_key(dataset.base.model)).most_explained
+                if signal * (1 - SURELY) - most > beyond**2:
+                    out[h.key] = float(np.sqrt(signal - most))
+                    continue
             found = grams.of(h, settings_to_try(dataset, h, chosen.items[k]))
             explained = float(found.explained(PLAUSIBLE * float(h.scales.max())).max())
             out[h.key] = float(np.sqrt(max(signal - explained, 0.0)))

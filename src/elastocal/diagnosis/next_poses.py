@@ -28,10 +28,11 @@ from elastocal.identification.identify import identify
 from elastocal.identification.prediction import over_the_workspace, predicted_error
 from elastocal.identification.result import Calibration
 from elastocal.measurements import Measurements
+from elastocal.model.effects import SOMETHING
 from elastocal.model.manipulator import Model
 from elastocal.planning.criteria import RobustError
 from elastocal.planning.design import DesignOptions, design
-from elastocal.planning.doubts import SOMETHING, Place, missing
+from elastocal.planning.doubts import Place, missing
 from elastocal.planning.plan import Gain, Plan
 from elastocal.planning.test_poses import where_used
 from elastocal.units import Progress

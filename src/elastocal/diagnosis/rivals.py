@@ -229,7 +229,8 @@ def with_neighbours(base: Baseline, suspects: Suspects) -> tuple[RivalSet, ...]:
     for s in suspects.sets:
         near = dict.fromkeys(items, np.inf)
         for rival in s.rivals:
-            found = distances(dataset, fit_set(dataset, (rival, *s.beside), noise), 0)[1]
+            of_rival = fit_set(dataset, (rival, *s.beside), noise)
+            found = distances(dataset, of_rival, 0, NEAR)[1]
             near |= {key: min(near[key], d) for key, d in found.items()}
         taken = {item.key for item in (*s.rivals, *s.beside)}
         free = [

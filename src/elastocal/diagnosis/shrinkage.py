@@ -401,9 +401,11 @@ def _recombined(
     configuration = new.configuration
     own = {name: getattr(new, name) for name in OF_JOINTS}
     donors = rng.integers(len(codes), size=(n, table.q.shape[1]))
+    count, every = np.array([len(rows) for rows in rows_of]), np.concatenate(rows_of)
+    begin = np.cumsum(count) - count
     for j, of_joint in enumerate(donors.T):
-        of = [rows_of[k] for k in of_joint]
-        source = [of[c][i % len(of[c])] for c, i in zip(configuration, place, strict=True)]
+        of = of_joint[configuration]
+        source = every[begin[of] + place % count[of]]
         for name, values in own.items():
             if values is not None:
                 values[:, j] = getattr(table, name)[source, j]

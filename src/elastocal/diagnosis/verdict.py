@@ -84,7 +84,7 @@ def _of_item(
     own = next(i for i, other in enumerate(slot.items) if other.same_as(item))
     if not item.known:
         return float(each[own]), ((item, float(each[own])),)
-    near = distances(found.dataset, found.chosen, k)[1]
+    near = distances(found.dataset, found.chosen, k, TOO_NEAR)[1]
     taken = {id(other.what) for other in found.chosen.items}
     same = [
         i

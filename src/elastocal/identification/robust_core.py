@@ -11,7 +11,7 @@ from typing import ClassVar
 
 import numpy as np
 from numpy.typing import ArrayLike
-from scipy import integrate, linalg, optimize, special
+from scipy import linalg, optimize, special
 
 from elastocal.errors import InsufficientDataError, require
 from elastocal.identification.linear_solver import checked_problem
@@ -269,6 +269,8 @@ EFFICIENCY = 0.95
 
 def normal_mean(g: Callable[[Array], Array], size: int, kink: float | None = None) -> float:
     """E g(d) for d ~ χ(size), g smooth except perhaps at `kink`."""
+    from scipy import integrate  # slow to import, and every fit needs this module
+
     area = special.gamma(size / 2) * 2 ** (size / 2 - 1)
     end = float(np.sqrt(special.chdtri(size, 1e-17)))
     edges = [0.0, end] if kink is None or not 0 < kink < end else [0.0, kink, end]

@@ -3,7 +3,7 @@
 from elastocal import loaded_on_demand
 
 ROOMS = {
-    "arm": "Arm Parameter ParameterSpec Setting row_inputs",
+    "arm": "Arm Parameter ParameterSpec Setting row_inputs usual_sizes",
     "c_engine": "find_compiler",
     "calibrated": "CalibratedArm nominal_flange_rows read_calibrated",
     "calibrated_tool": "CalibratedTool ToolPoint share_of_levels tool_point",

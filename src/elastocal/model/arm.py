@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from typing import Any, Literal
 
@@ -15,6 +15,7 @@ from elastocal.errors import InputError, option
 from elastocal.measurements import LARGEST_FORCE, Measurements, with_moves
 from elastocal.model import rigid
 from elastocal.model.chain import Chain
+from elastocal.units import Array
 
 
 @dataclass(frozen=True)
@@ -81,6 +82,24 @@ class Parameter:
     lower: float = -np.inf
     upper: float = np.inf
     shrunk: bool = False
+
+
+# What a parameter of unknown typical size moves the readings by, rms in m.
+UNSIZED_SIGNAL = 2e-4
+
+
+def usual_sizes(specs: Sequence[Parameter | ParameterSpec], columns: Array) -> Array:
+    """Prior standard deviation (k,) of each parameter: its typical size.
+
+    Where none is known, the value whose signal in the columns (…, k) is UNSIZED_SIGNAL rms.
+    """
+    flat = columns.reshape(-1, columns.shape[-1])
+    moved = flat[np.abs(flat).max(axis=1, initial=0.0) > 0]
+    rms = np.sqrt((moved**2).mean(axis=0)) if len(moved) else np.zeros(flat.shape[1])
+    signal = np.divide(UNSIZED_SIGNAL, rms, out=np.zeros(len(rms)), where=rms > 0)
+    return np.array(
+        [s if p.typical is None else p.typical for s, p in zip(signal, specs, strict=True)]
+    )
 
 
 # The chain under construction: what effects change, and how it is put together.

@@ -21,7 +21,7 @@ from elastocal.model.choice import choose_effects, set_constants, sized_paramete
 from elastocal.model.effects.base import Effect
 from elastocal.model.evaluate import BackendReport, BatchFunction, row_blocks
 from elastocal.model.observations import observe
-from elastocal.units import Array
+from elastocal.units import Array, IntArray
 
 # The static equilibrium of all poses at once, and the exact derivative through it.
 
@@ -61,6 +61,7 @@ class Equilibrium:
         self._large = self._value.n_instructions * self.size / 2 > LARGEST_JACOBIAN
         self._last = self._value
         self._solved: tuple[Any, NDArray, NDArray] | None = None
+        self._states: tuple[NDArray, IntArray, IntArray] | None = None
 
     @cached_property
     def _whole(self) -> BatchFunction:
@@ -122,11 +123,14 @@ class Equilibrium:
     def _solve(self, inputs: Sequence[NDArray], p: NDArray) -> tuple[NDArray, NDArray]:
         """As `solve`, each state of the arm once: its markers' rows have the same answer."""
         asked = np.concatenate(inputs, axis=1)[:, self._asked]
-        state = numbered(np.zeros(len(asked)), *asked.T)
-        count = int(state.max(initial=-1)) + 1
-        if count == len(state):
+        known = self._states  # once: other threads solve other parts of a table
+        if known is None or not np.array_equal(known[0], asked):
+            state = numbered(np.zeros(len(asked)), *asked.T)
+            known = asked, state, firsts(state, int(state.max(initial=-1)) + 1)
+            self._states = known
+        _, state, first = known
+        if len(first) == len(state):
             return self._settled(inputs, p)
-        first = firsts(state, count)
         theta, F_theta = self._settled([a[first] for a in inputs], p)
         return theta[state], F_theta[state]
 

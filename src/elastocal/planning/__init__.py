@@ -18,7 +18,7 @@ ROOMS = {
     "criterion": "Criterion CriterionInputs ScenarioCriterion candidate_sums",
     "arrangement": "Selection ordered",
     "design": "DesignOptions DesignSearch Effort",
-    "doubts": "in_doubt missing usual_sizes",
+    "doubts": "in_doubt missing",
     "exact_plan": "Prices efficient_rounding round_weights size_curve",
     "drift": "Alias Drifting",
     "execution": "greedy_tour held_karp_bound schedule shortest_tour tour_bound tour_cost",

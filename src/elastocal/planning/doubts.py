@@ -17,7 +17,7 @@ Source: DuMouchel & Jones 1994, Technometrics 36, 37–47, there with D and π =
 from __future__ import annotations
 
 from collections import Counter
-from collections.abc import Mapping, Sequence
+from collections.abc import Mapping
 from dataclasses import replace
 
 import numpy as np
@@ -25,8 +25,8 @@ from scipy import linalg
 
 from elastocal.cell.arm_description import EffectChoice
 from elastocal.identification.knowledge import GaussianPrior
-from elastocal.model.arm import Parameter, ParameterSpec
-from elastocal.model.effects import CATALOGUE
+from elastocal.model.arm import usual_sizes
+from elastocal.model.effects import CATALOGUE, SOMETHING
 from elastocal.model.manipulator import Model
 from elastocal.model.observations import observe
 from elastocal.planning.information import (
@@ -39,10 +39,6 @@ from elastocal.planning.selection import DesignProblem, is_regular, random_plan
 from elastocal.planning.setup import Known, Setup
 from elastocal.units import Array, BoolArray, IntArray
 
-# Probability that an effect is missing; in equal shares it is each of them, at each of its places.
-SOMETHING = 0.5
-# What a parameter of unknown typical size moves the readings by, rms in m.
-UNSIZED_SIGNAL = 2e-4
 POSES = 100  # that show how far
 SHOWN = 1.0  # standard deviation from 0 that all of these poses together would give it at least
 # Of Φ, what combinations of what is in doubt may add that the search for a plan passes over; and
@@ -115,20 +111,6 @@ def missing(model: Model) -> list[Place]:
             for s in effect.settings(where, chain, cell)
         )
     ]  # fmt: skip
-
-
-def usual_sizes(specs: Sequence[Parameter | ParameterSpec], columns: Array) -> Array:
-    """Prior standard deviation (k,) of each parameter: its typical size.
-
-    Where none is known, the value whose signal in the columns (…, k) is UNSIZED_SIGNAL rms.
-    """
-    flat = columns.reshape(-1, columns.shape[-1])
-    moved = flat[np.abs(flat).max(axis=1, initial=0.0) > 0]
-    rms = np.sqrt((moved**2).mean(axis=0)) if len(moved) else np.zeros(flat.shape[1])
-    signal = np.divide(UNSIZED_SIGNAL, rms, out=np.zeros(len(rms)), where=rms > 0)
-    return np.array(
-        [s if p.typical is None else p.typical for s, p in zip(signal, specs, strict=True)]
-    )
 
 
 def leading_directions(problem: DesignProblem, R: Array, doubtful: BoolArray) -> Array | None:

@@ -18,17 +18,17 @@ from numpy.typing import NDArray
 from elastocal.diagnosis.diagnosis import Curve, Diagnosis
 from elastocal.errors import ElastocalError
 from elastocal.model.manipulator import Model
-from elastocal.planning.plan import Plan
 from elastocal.report.causes_view import causes, family, share_text
 from elastocal.report.diagnosis_view import error_steps
 from elastocal.report.effect_names import driver_name, effect_at, name_of, place, probability
 from elastocal.report.formatting import display, length, short_name, significant
-from elastocal.report.plan_view import removed
 from elastocal.report.residual_view import reach
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
     from matplotlib.figure import Figure
+
+    from elastocal.planning.plan import Plan
 
 # The colours of a figure by itself; a page has its style sheet's in their place, for light and
 # dark, screen and print.
@@ -468,6 +468,9 @@ def plan_intervals(plan: Plan) -> str:
 
 def plan_removed(plan: Plan) -> str:
     """How many candidates each rule of the cell removed, and how many are feasible."""
+    # What designs plans is slow to import, and other figures do not need it.
+    from elastocal.report.plan_view import removed
+
     c = plan.candidates
     rows = [*removed(plan), ("feasible", c.feasible)]
 

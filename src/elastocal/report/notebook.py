@@ -35,6 +35,7 @@ from elastocal.report.effect_names import effect_at, name_of
 from elastocal.report.figures import SERIES, as_figures, drawn
 from elastocal.report.formatting import ShownTable, display, length, minus, short_name
 from elastocal.report.identification_view import signed_half, texts
+from elastocal.report.plan_terminal import print_next, print_plan
 from elastocal.report.plan_view import first_stops
 from elastocal.report.residual_figures import by_configuration
 from elastocal.report.residual_view import residuals_of
@@ -42,8 +43,6 @@ from elastocal.report.terminal import (
     print_comparison,
     print_compensation,
     print_diagnosis,
-    print_next,
-    print_plan,
     print_result,
     printed_text,
     table_of,

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Iterable, Sequence
 from io import StringIO
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 from rich.box import SIMPLE_HEAD
 from rich.console import Console
@@ -16,7 +16,6 @@ from elastocal.diagnosis.diagnosis import Diagnosis
 from elastocal.errors import option
 from elastocal.identification.findings import ALONE
 from elastocal.identification.result import Calibration
-from elastocal.planning.plan import Plan
 from elastocal.report.causes_view import cause_rows, field_rows, place_rows, slight_text
 from elastocal.report.changes_view import change_rows, changes_lines
 from elastocal.report.diagnosis_view import (
@@ -44,20 +43,8 @@ from elastocal.report.identification_view import (
     undetermined_lines,
 )
 from elastocal.report.method_and_noise import candidate_rows, size_rows
-from elastocal.report.plan_view import (
-    curve_rows,
-    interval_rows,
-    next_lines,
-    plan_lines,
-    pose_rows,
-    reason_rows,
-    timed_rows,
-)
 from elastocal.screen import safe_console
 from elastocal.text import printable
-
-if TYPE_CHECKING:
-    from elastocal.diagnosis.next_poses import NextPoses
 
 NARROW_FOR_BOTH = 96  # columns; below, a comparison tells changes alone
 
@@ -121,7 +108,7 @@ def longest_word(texts: Iterable[str]) -> int | None:
     return longest if longest <= LONGEST_WHOLE else None
 
 
-def _print_lines(console: Console, lines: Iterable[tuple[str, str]]) -> None:
+def print_lines(console: Console, lines: Iterable[tuple[str, str]]) -> None:
     for label, text in lines:
         style = "bold yellow" if label == "Warning" else "bold"
         console.print(Text.assemble((f"{label}: ", style), text))
@@ -226,7 +213,7 @@ def print_result(
 
     Without `details` long lists are cut short, and noise, method and intervals left out.
     """
-    _print_lines(console, leading_lines(result))
+    print_lines(console, leading_lines(result))
     console.print()
     brief = console.width < NARROW
     alone = len(names_of(result, ALONE))
@@ -240,52 +227,10 @@ def print_result(
     for table in noise_tables(result) if details else ():
         console.print(table)
     console.print()
-    _print_lines(console, summary_lines(result, truth, details))
+    print_lines(console, summary_lines(result, truth, details))
     if not details:
         more = f"{option('details', True)} tells of method, noise, residuals, intervals"
         console.print(Text(f"{more} and every combination; so does the report.", style="dim"))
-
-
-WIDE_FOR_REASONS = 110  # columns, from which on the reasons stand beside the poses
-
-
-def print_plan(console: Console, plan: Plan) -> None:
-    """Poses in the order of the plan, predicted intervals, and what the plan is worth in words."""
-    wide = console.width >= WIDE_FOR_REASONS
-    tables = {"Predicted intervals": interval_rows(plan)}
-    if not wide:
-        tables = {"Why each pose": reason_rows(plan)} | tables
-    if plan.curve:
-        tables["Number of poses"] = curve_rows(plan)
-    if plan.timed:
-        tables["Poses and readings within the time"] = timed_rows(plan)
-    console.print(_pose_table(plan, 2, reasons=True) if wide else _narrow_poses(console, plan))
-    for title, table in tables.items():
-        console.print(table_of(title, table, whole=True))
-    console.print()
-    _print_lines(console, plan_lines(plan))
-
-
-def print_next(console: Console, found: NextPoses) -> None:
-    """Whether to measure more and what it brings, and the poses."""
-    if found.plan is not None:
-        print_plan(console, found.plan)
-        console.print()
-    _print_lines(console, next_lines(found))
-
-
-def _narrow_poses(console: Console, plan: Plan) -> Table:
-    """The poses with as many decimals as there is room for; plan.csv has all of them."""
-    room = console.options.update(max_width=WIDE_FOR_REASONS)
-    for decimals in (2, 1):
-        table = _pose_table(plan, decimals)
-        if console.measure(table, options=room).maximum <= console.width:
-            return table
-    return _pose_table(plan, 0)
-
-
-def _pose_table(plan: Plan, decimals: int, reasons: bool = False) -> Table:
-    return table_of("Poses", pose_rows(plan, reasons, decimals), whole=True)
 
 
 MOST_CANDIDATES_PRINTED = 8
@@ -348,7 +293,7 @@ def _tables_of_causes(console: Console, d: Diagnosis) -> Iterable[Table | Text]:
 
 
 def print_told(console: Console, lines: Iterable[tuple[str, str]]) -> None:
-    _print_lines(console, ((label, capital(text)) for label, text in lines))
+    print_lines(console, ((label, capital(text)) for label, text in lines))
 
 
 def print_compensation(console: Console, content: dict[str, Any]) -> None:
