@@ -95,10 +95,10 @@ def drawn(
     sized = np.full(len(c), np.inf)  # prior precisions; infinite where there is nothing
     for key, size in sizes.items():
         sized[spans[key]] = np.exp(-2 * size)
-    scatter = _Scatter.of(unseen, at) if unseen is not None and len(unseen.columns) else None
+    scatter = _Scatter(unseen, at) if unseen is not None and len(unseen.columns) else None
     out, errors = np.zeros((len(prior), n)), np.zeros((scatter.n if scatter else 0, len(at.r), n))
     for sweep in range(-SETTLING, n):
-        right = at.z if scatter is None else scatter.without(at)
+        right = at.z if scatter is None else scatter.without(at.z)
         z = linalg.solve_triangular(L, right[x], lower=True)
         t = right[c] - across.T @ z
         for kind in kinds:
@@ -116,7 +116,7 @@ def drawn(
         rest = z - across @ beta[c] + rng.normal(size=len(x))
         beta[x] = linalg.solve_triangular(L, rest, lower=True, trans="T")
         if scatter is not None:
-            scatter.draw(at.r - at.X @ beta, rng)
+            scatter.draw(beta, rng)
         if sweep >= 0:
             out[:, sweep] = beta
             if scatter is not None:
@@ -125,41 +125,43 @@ def drawn(
 
 
 class _Scatter:
-    """What is unseen, whitened, as it is drawn: sizes and errors (U, C)."""
+    """What is unseen as it is drawn: sizes and errors ε (U, C), by sums over the rows alone.
 
-    def __init__(self, kind: _Kind, columns: Array) -> None:
-        self.kind, self.columns, self.n = kind, columns, len(columns)
-        self.own = np.einsum("ucm,ucm->uc", columns, columns)
-        self.errors = np.zeros(columns.shape[:2])
+    With g the whitened columns of a joint, `own` are gᵀg' of every two joints (U, U, C), `across`
+    gᵀX (U, C, p) and `of_rows` gᵀr (U, C).
+    """
+
+    def __init__(self, unseen: Unseen, at: Weighted) -> None:
+        g = np.einsum("cij,ucj->uci", at.root, unseen.columns)
+        self.kind, self.n = unseen.kind(), len(g)
+        self.own = np.einsum("ucm,wcm->uwc", g, g)
+        self.across = np.stack([np.einsum("cm,cmp->cp", each, at.X) for each in g])
+        self.of_rows = np.einsum("ucm,cm->uc", g, at.r)
+        self.errors = np.zeros(g.shape[:2])
         self.sizes: dict[Key, float] = {}
 
-    @classmethod
-    def of(cls, unseen: Unseen, at: Weighted) -> _Scatter:
-        return cls(unseen.kind(), np.einsum("cij,ucj->uci", at.root, unseen.columns))
+    def without(self, z: Array) -> Array:
+        """XᵀV⁻¹(r − Gε) (p,) of z = XᵀV⁻¹r."""
+        return np.asarray(z - np.tensordot(self.errors, self.across, axes=2))
 
-    def without(self, at: Weighted) -> Array:
-        """XᵀV⁻¹(r − Gε) (p,)."""
-        moved = np.einsum("ucm,uc->cm", self.columns, self.errors)
-        return np.asarray(at.z - at.X.reshape(-1, len(at.z)).T @ moved.ravel())
+    def draw(self, beta: Array, rng: np.random.Generator) -> None:
+        """Sizes and errors anew beside the coefficients.
 
-    def draw(self, left: Array, rng: np.random.Generator) -> None:
-        """Sizes and errors anew, where the sum leaves (C, m) of the whitened readings.
-
-        With a = gᵀg and b = gᵀe of a joint's column in every configuration, a size s has the log
-        evidence Σ ½ s²b²/(1 + s²a) − ½ log(1 + s²a), and errors the mean s²b/(1 + s²a).
+        With a = gᵀg and b = gᵀe of a joint in every configuration, e what is left of the readings,
+        a size s has the log evidence Σ ½ s²b²/(1 + s²a) − ½ log(1 + s²a), and errors have the mean
+        s²b/(1 + s²a).
         """
-        left = left - np.einsum("ucm,uc->cm", self.columns, self.errors)
+        left = self.of_rows - self.across @ beta
         spread = self.kind.spread(self.sizes, rng)
         for u, key in enumerate(self.kind.component):
-            left = left + self.columns[u] * self.errors[u][:, None]
-            a, b = self.own[u], np.einsum("cm,cm->c", self.columns[u], left)
+            a = self.own[u, u]
+            b = left[u] - np.einsum("wc,wc->c", self.own[u], self.errors) + a * self.errors[u]
             v = np.exp(2 * GRID)[:, None]
             each = 0.5 * (v * b**2 / (1 + v * a) - np.log1p(v * a)).sum(axis=1)
             self.sizes.pop(key, None)
             size = self.kind.choose(key, np.append(each, 0.0), self.sizes, spread, rng)
             variance = 1 / (np.exp(-2 * size) + a)
             self.errors[u] = variance * b + np.sqrt(variance) * rng.normal(size=len(b))
-            left = left - self.columns[u] * self.errors[u][:, None]
 
 
 @dataclass(frozen=True)
