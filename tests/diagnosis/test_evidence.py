@@ -12,7 +12,7 @@ from support.diagnosis_data import dense_noise, random_data, used_rows
 
 from elastocal.diagnosis import NoiseValues, NoisyData, direct, evidence_of, exceedance, project
 from elastocal.diagnosis.diagnosis import SMALLEST_P
-from elastocal.diagnosis.evidence import SCALES
+from elastocal.diagnosis.evidence import SCALES, _principal
 
 NOISE = NoiseValues(0.9, np.array([4e-6, 9e-6, 1e-5]), np.full(3, 0.5))
 SEEDS = range(4)
@@ -146,3 +146,14 @@ def test_p_values_from_the_tail_are_not_below_what_they_are(kind: str, true: flo
     observed = float(np.quantile(draw(rng, 100_000), 1 - true))
     told = [exceedance(draw(rng, 199), observed) for _ in range(200)]
     assert true < np.median(told) < 9 * true
+
+
+def test_pairs_of_columns_have_the_eigenvalues_of_lapack() -> None:
+    """Also where the two are parallel, one is zero, or both are alike."""
+    X = np.random.default_rng(0).normal(size=(50, 4, 2))
+    X[0, :, 1], X[1, :, 1], X[2] = 2 * X[0, :, 0], 0.0, np.eye(4)[:, :2]
+    A = X.transpose(0, 2, 1) @ X
+    (lam, U), (known, _) = _principal(A), np.linalg.eigh(A)
+    np.testing.assert_allclose(lam, known, atol=1e-13)
+    np.testing.assert_allclose(U * lam[:, None] @ U.transpose(0, 2, 1), A, atol=1e-13)
+    np.testing.assert_allclose(U.transpose(0, 2, 1) @ U, np.tile(np.eye(2), (50, 1, 1)), atol=1e-13)

@@ -129,11 +129,22 @@ def log_sum(values: Array, axis: int = -1) -> Array:
 
 def spectrum(A: Array, b: Array, flips: Array) -> Spectrum:
     """Of Gram matrices A (V, K, K), b (V, K) and those of flipped residuals (F, V, K)."""
-    lam, U = np.linalg.eigh(A)
+    lam, U = _principal(A) if A.shape[1] == 2 else np.linalg.eigh(A)
     beta, flips = _turned(b[None], U)[0], _turned(flips, U)
     # Rounding leaves a tiny β along directions that P removes altogether.
     gone = lam <= 1e-9 * np.abs(lam).max(axis=1, keepdims=True, initial=1e-300)
     return Spectrum(*(np.where(gone, 0.0, each) for each in (lam, beta, flips)))
+
+
+def _principal(A: Array) -> tuple[Array, Array]:
+    """Eigenvalues (V, 2), the smaller first, and eigenvectors of A (V, 2, 2), whose larger one lies
+    at the angle ½ atan2(2A₁₂, A₁₁ − A₂₂): of thousands a tenth of what a call for each takes."""
+    a, b, c = A[:, 0, 0], A[:, 1, 1], A[:, 0, 1]
+    middle, half = (a + b) / 2, np.hypot((a - b) / 2, c)
+    angle = np.arctan2(2 * c, a - b) / 2
+    x, y = np.cos(angle), np.sin(angle)
+    U = np.stack([np.stack([-y, x], axis=1), np.stack([x, y], axis=1)], axis=2)
+    return np.stack([middle - half, middle + half], axis=1), U
 
 
 def _turned(b: Array, U: Array) -> Array:
@@ -213,7 +224,16 @@ class EntrySums:
         return cls(
             local.reshape(C, v, d, v, d), H.reshape(-1, C, v, d),
             b.reshape(C, v, d), signs, flip.reshape(C, v, d), h,
-        )  # fmt: skip
+        )._by_fewest  # fmt: skip
+
+    @property
+    def _by_fewest(self) -> EntrySums:
+        """The same by no more rows of H than it has columns: only HᵀH and hH count."""
+        H = self.H.reshape(len(self.H), -1)
+        if len(H) <= H.shape[1]:
+            return self
+        Q, R = np.linalg.qr(H)
+        return replace(self, H=R.reshape(-1, *self.H.shape[1:]), h=self.h @ Q)
 
     @cached_property
     def _of_configurations(self) -> EntrySums:
@@ -222,7 +242,7 @@ class EntrySums:
             self, local=self.local.sum(axis=(1, 3), keepdims=True),
             H=self.H.sum(axis=2, keepdims=True), b=self.b.sum(axis=1, keepdims=True),
             flip=self.flip.sum(axis=1, keepdims=True),
-        )  # fmt: skip
+        )._by_fewest  # fmt: skip
 
     @cached_property
     def most_explained(self) -> float:
