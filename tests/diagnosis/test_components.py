@@ -19,9 +19,10 @@ from elastocal.diagnosis import (
     posed,
     with_returned,
 )
-from elastocal.diagnosis.baseline import Blocks
-from elastocal.diagnosis.component_answer import PROBABLE, TOLD
+from elastocal.diagnosis.baseline import Blocks, fit_baseline
+from elastocal.diagnosis.component_answer import PROBABLE, TOLD, SumAnswer
 from elastocal.diagnosis.component_search import WIDE, Beside, evidence_beside
+from elastocal.diagnosis.diagnosis_data import diagnosis_data_of
 from elastocal.diagnosis.evidence import direct
 from elastocal.diagnosis.hypotheses import possible
 from elastocal.diagnosis.noise_floor import project
@@ -286,3 +287,34 @@ def test_what_went_under_a_larger_noise_comes_back() -> None:
     found = fit_sum(data, [large], quiet, refit_noise=False)
     again = with_returned(found, [large, small])
     assert {id(c) for c in again.components} == {id(large), id(small)}
+
+
+def answer_without_components(every: bool) -> SumAnswer:
+    """Of a campaign whose joint 5 has another error in every configuration, of `every` visit or of
+    the unloaded ones alone."""
+    model, table = campaign(n=40)
+    table = table if every else table.take((table.force == 0).all(axis=1))
+    dataset = diagnosis_data_of(fit_baseline(model, table), possible(model, table)[0])
+    errors = 2e-4 * np.random.default_rng(0).normal(size=len(dataset.data.r))
+    data = replace(dataset.data, r=dataset.data.r + dataset.data.G[:, :, 4] * errors[:, None])
+    dataset = dataset.changed(data=data)
+    found = fit_sum(data, [], NoiseValues.usual(6))
+    return SumAnswer(dataset, dataset, found, (), np.random.default_rng(1))
+
+
+def test_what_a_joint_errs_by_at_every_configuration_is_its_angle_s() -> None:
+    """It has a row without a name, of the size that it has."""
+    answer = answer_without_components(every=True)
+    (row,) = answer.components
+    assert (row.family, row.where, row.named) == ("angle", "joint5", False)
+    errors = 2e-4 * np.random.default_rng(0).normal(size=40)
+    moved = answer.dataset.data.G[:, :, [4]] * errors[:, None, None]
+    left = answer._followed(moved[answer._rows])
+    true = float(np.sqrt((left**2).sum() / answer._readings))
+    assert row.rms_ci95[0] < true < row.rms_ci95[1] < 1.3 * row.rms_ci95[0]
+    assert row.share > 0.9 and row.probability > 0.99
+
+
+def test_without_visits_again_nothing_is_called_an_error_of_the_angle() -> None:
+    """What repeats is not told from what does not."""
+    assert not answer_without_components(every=False).components

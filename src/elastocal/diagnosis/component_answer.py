@@ -46,6 +46,7 @@ from elastocal.model.effects.smooth import JointCurve
 from elastocal.units import Array, BoolArray, IntArray
 
 DRAWS, PARTS = 400, 10
+VISITS_AGAIN = 5  # for each joint: what it scatters by is known to 1/√10 then
 DETERMINED = 1e-4  # of the largest, singular value of columns of unit length
 MOST_POSES = 1500  # that a set of new poses is drawn from
 PROBABLE = 0.5
@@ -86,7 +87,11 @@ class SumAnswer:
 
     @cached_property
     def _without_lines(self) -> tuple[str, ...]:
-        """Joints of which neither lines have been found nor a curve that may hold them."""
+        """Joints of which neither lines have been found nor a curve that may hold them; none where
+        visits again are too few to tell what repeats at a configuration from what does not."""
+        again = self.dataset.present.sum() - len(self.dataset.present)
+        if again < VISITS_AGAIN * self.dataset.data.G.shape[2]:
+            return ()
         angular = (JointCurve, GearSpectrum)
         seen = {c.where for c in self.found.components if isinstance(c.effect, angular)}
         return tuple(h.where for h in ripples(self.dataset) if h.where not in seen)
