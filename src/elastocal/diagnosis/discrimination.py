@@ -161,13 +161,19 @@ def time_step(table: Measurements) -> float:
 
 
 def joined(first: Measurements, second: Measurements) -> Measurements:
-    """Both tables' rows; the second's labels hold for both, its columns are the first's."""
+    """Both tables' rows; the second's labels hold for both, its columns are the first's.
+
+    How the arm came to each visit follows from the order of them all.
+    """
     arrays: dict[str, Any] = {
-        f.name: np.concatenate([getattr(first, f.name), getattr(second, f.name)])
+        f.name: np.concatenate([value, getattr(second, f.name)])
+        if isinstance(value, np.ndarray) else value
         for f in fields(first)
-        if isinstance(getattr(first, f.name), np.ndarray)
-    }
-    return replace(second, source=first.source, **arrays)
+        if isinstance(value := getattr(first, f.name), np.ndarray) or value is None
+    }  # fmt: skip
+    arrays |= {"move": None, "direction": None}
+    table = replace(second, source=first.source, **arrays)
+    return table if first.move is None else with_moves(table)
 
 
 @dataclass(frozen=True)

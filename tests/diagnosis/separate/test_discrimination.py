@@ -37,7 +37,7 @@ from elastocal.diagnosis import (
 from elastocal.diagnosis.discrimination import DRAWS, _hidden
 from elastocal.diagnosis.rivals import SETTINGS
 from elastocal.diagnosis.verdict import TOO_NEAR, TOO_NEAR_PROBABILITY
-from elastocal.measurements import Measurements
+from elastocal.measurements import Measurements, with_moves
 from elastocal.model import Model
 from elastocal.simulation import values_from
 from elastocal.simulation.simulate import simulate
@@ -251,3 +251,17 @@ def test_markers_that_the_tracker_does_not_see_are_not_read(observe: str) -> Non
     arm: Any = SimpleNamespace(cell=rules.cell, chain=rules.chain, observe=observe)
     hidden = _hidden(arm, gantry_at((0.2, 0, 0), (0, 0.1, 0)), np.zeros((2, 3)), ("R", "L"))
     assert hidden.tolist() == [False, True] * 4
+
+
+def test_what_one_of_two_tables_lacks_both_lack(base: Baseline) -> None:
+    """Rows of a simulation know how the arm came to them; joined to others that do not, all take
+    it from their order or none."""
+    whole = base.observed.table
+    half = np.arange(len(whole)) < len(whole) // 2
+    first, second = whole.take(half), whole.take(~half)
+    bare = replace(first, move=None, direction=None)
+    assert joined(bare, with_moves(second)).move is None
+    both, known = joined(with_moves(first), replace(second, move=None)), with_moves(whole)
+    np.testing.assert_array_equal(both.move, known.move)
+    np.testing.assert_array_equal(both.direction, known.direction)
+    assert len(both) == len(whole) and both.q.shape == whole.q.shape
