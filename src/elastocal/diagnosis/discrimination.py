@@ -165,15 +165,15 @@ def joined(first: Measurements, second: Measurements) -> Measurements:
 
     How the arm came to each visit follows from the order of them all.
     """
+    first, known = replace(first, move=None, direction=None), first.move is not None
     arrays: dict[str, Any] = {
         f.name: np.concatenate([value, getattr(second, f.name)])
         if isinstance(value, np.ndarray) else value
         for f in fields(first)
         if isinstance(value := getattr(first, f.name), np.ndarray) or value is None
     }  # fmt: skip
-    arrays |= {"move": None, "direction": None}
     table = replace(second, source=first.source, **arrays)
-    return table if first.move is None else with_moves(table)
+    return with_moves(table) if known else table
 
 
 @dataclass(frozen=True)
