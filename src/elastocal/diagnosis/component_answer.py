@@ -295,9 +295,8 @@ class SumAnswer:
     def components(self) -> tuple[ComponentShare, ...]:
         """One for each kind of dependence at each place, the largest first."""
         groups = self._by(lambda c: (c.family, c.where))
-        for where, left in self._unseen.items():
-            squares = np.einsum("nd,nd->d", left, left) / self._readings
-            if (squares >= SLIGHT**2 * self.total).mean() >= PROBABLE:
+        for where in self._unseen:
+            if (self.squares([], [where]) >= SLIGHT**2 * self.total).mean() >= PROBABLE:
                 groups.setdefault(("angle", where), [])
         rows = [self._share(family, where, own) for (family, where), own in groups.items()]
         return tuple(sorted(rows, key=lambda row: -row.share))

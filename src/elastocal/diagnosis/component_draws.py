@@ -148,18 +148,15 @@ class _Scatter:
         """Sizes and errors anew beside the coefficients.
 
         With a = gᵀg and b = gᵀe of a joint in every configuration, e what is left of the readings,
-        a size s has the log evidence Σ ½ s²b²/(1 + s²a) − ½ log(1 + s²a), and errors have the mean
-        s²b/(1 + s²a).
+        errors of size s have the mean s²b/(1 + s²a).
         """
         left = self.of_rows - self.across @ beta
         spread = self.kind.spread(self.sizes, rng)
         for u, key in enumerate(self.kind.component):
             a = self.own[u, u]
             b = left[u] - np.einsum("wc,wc->c", self.own[u], self.errors) + a * self.errors[u]
-            v = np.exp(2 * GRID)[:, None]
-            each = 0.5 * (v * b**2 / (1 + v * a) - np.log1p(v * a)).sum(axis=1)
             self.sizes.pop(key, None)
-            size = self.kind.choose(key, np.append(each, 0.0), self.sizes, spread, rng)
+            size = self.kind.choose(key, np.append(_on_grid(a, b), 0.0), self.sizes, spread, rng)
             variance = 1 / (np.exp(-2 * size) + a)
             self.errors[u] = variance * b + np.sqrt(variance) * rng.normal(size=len(b))
 
@@ -267,5 +264,12 @@ def _at_sizes(S: Array, t: Array, sized: Array, span: slice) -> Array:
         values, b = np.maximum(values, 0.0), vectors.T @ left[:, -1]
     else:
         values, b = np.maximum(left[0, :1], 0.0), left[0, 1:]
+    return _on_grid(values, b)
+
+
+def _on_grid(a: Array, b: Array) -> Array:
+    """Σ ½ s²b²/(1 + s²a) − ½ log(1 + s²a) at every size s of the GRID: the log evidence, over none,
+    of coefficients that do not hang together, with a and b (k,) their normal matrix' diagonal and
+    their right side."""
     v = np.exp(2 * GRID)[:, None]
-    return np.asarray(0.5 * (v * b**2 / (1 + v * values) - np.log1p(v * values)).sum(axis=1))
+    return np.asarray(0.5 * (v * b**2 / (1 + v * a) - np.log1p(v * a)).sum(axis=1))
