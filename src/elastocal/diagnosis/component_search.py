@@ -79,22 +79,10 @@ def search_components(
         # A compliance that was fitted without weights is wrong, and so are their columns by it.
         full = about_sum(full, found)
     found = with_own_axes(found)
-    lined, data = False, found.sums.data
     if len(full.blocks.member) <= FEW_POSES:
-        # A curve takes up the lines of its joint as far as these few poses show them, and then
-        # none of them stands out.
         progress("families of lines before curves")
-        first = _swapped(full, fit_sum(data, others, instrument), others)
-        first = _spared(completed(first, others))
-        for _ in range(TWICE):
-            before = first
-            first = completed(_with_lines(full, first), both)
-            if first.score <= before.score + GAINED:
-                break
-        other = _wider(first, curves)
-        lined = other.score > found.score
-        found = other if lined else found
-    if not lined:
+        found = _with_lines_first(full, found, curves, others, both, instrument)
+    else:
         progress("families of lines beside the components")
         found = _with_lines(full, found)
     progress("what shows now that the noise is smaller")
@@ -121,6 +109,31 @@ def search_components(
                 break
             found = _with_lines(full, found)
     return full, found, hidden_fellows(found, others)
+
+
+def _with_lines_first(
+    dataset: DiagnosisData, found: FittedSum, curves: Sequence[Component],
+    others: Sequence[Component], both: Sequence[Component], instrument: NoiseValues,
+) -> FittedSum:  # fmt: skip
+    """The sum with families of lines, sought beside the others before curves join.
+
+    A curve takes up the lines of its joint as far as few poses show them, and then none of them
+    stands out.  A sum without curves is one of the others already.
+    """
+    curved = any(c is curve for c in found.components for curve in curves)
+    first, pool = found, both
+    if curved:
+        alone = fit_sum(found.sums.data, others, instrument)
+        first, pool = _swapped(dataset, alone, others), others
+    first = begun = _spared(completed(first, pool))
+    for _ in range(TWICE):
+        before = first
+        first = completed(_with_lines(dataset, first), both)
+        if first.score <= before.score + GAINED:
+            break
+    if curved or first is not begun:
+        first = _wider(first, curves)
+    return first if not curved or first.score > found.score else _with_lines(dataset, found)
 
 
 def about_sum(dataset: DiagnosisData, found: FittedSum) -> DiagnosisData:
@@ -567,10 +580,11 @@ def completed(found: FittedSum, components: Sequence[Component]) -> FittedSum:
                 wider.get(name) or exchanged(found, [], away[name], refit_noise=False)
                 for name in hidden
             )
-            # Of many kinds nothing is left: the same sum, whose noise is fitted once.
+            # Of many kinds nothing is left: the same sum, under the noise that it has.
             ends: dict[frozenset[int], FittedSum] = {}
             for fit in sorted(fits, key=lambda fit: fit.score):
                 ends[frozenset(map(id, fit.components))] = fit
+            ends.pop(frozenset(map(id, found.components)), None)
             better = max(
                 map(with_own_noise, ends.values()), key=lambda fit: fit.score, default=found
             )

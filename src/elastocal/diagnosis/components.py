@@ -254,6 +254,10 @@ class Products(NamedTuple):
     z: Array
 
 
+# Change of −2ℓ at which sizes are settled, and at which they tell what is of no use; steps to it.
+SETTLED, ROUGHLY, STEPS = 2e-3, 0.1, 30
+
+
 @dataclass(frozen=True)
 class SumOfComponents:
     """Components beside the data's own columns, under a noise whose factor is free: −2ℓ and its
@@ -402,9 +406,9 @@ class SumOfComponents:
             information[0, 0] += 2 / 0.25
         return value, slope, information
 
-    def climbed(self, at: Sizes, steps: int, factor_alone: bool = False) -> Sizes:
-        """The sizes after so many steps by the average information; the noise's factor alone, the
-        others as they are."""
+    def climbed(self, at: Sizes, enough: float = SETTLED, factor_alone: bool = False) -> Sizes:
+        """The sizes after steps by the average information until one promises less than `enough` of
+        −2ℓ; the noise's factor alone, the others as they are."""
         K = len(self.components)
         theta = np.concatenate([[at.factor], at.size, at.length])
         lower, upper = theta.copy(), theta.copy()
@@ -413,7 +417,7 @@ class SumOfComponents:
             lengths = np.array([c.lengths for c in self.components]).reshape(K, 2)
             lower[1:] = np.concatenate([np.full(K, GONE - 1), lengths[:, 0]])
             upper[1:] = np.concatenate([np.full(K, LARGEST), lengths[:, 1]])
-        x = scored_climb(self.objective, theta, lower, upper, SETTLED, steps)[0]
+        x = scored_climb(self.objective, theta, lower, upper, enough, STEPS)[0]
         return Sizes(float(x[0]), x[1 : K + 1], x[K + 1 :])
 
     def earned(self, at: Sizes) -> tuple[Array, Array]:
@@ -569,8 +573,7 @@ class FittedSum:
         return self.sums.data.with_columns(joined, np.ones(joined.shape[2]))
 
 
-STEPS, ROUNDS = 30, 12
-SETTLED = 2e-3  # change of −2ℓ at which sizes are settled
+ROUNDS = 48
 MOST_AT_ONCE = 0.5  # nats: components that earn less go together
 SOME = 400  # configurations, or up to twice as many, from which the noise is estimated
 
@@ -586,13 +589,17 @@ def fit_sum(
     rounds = 2 if refit_noise and start is None else 1
     problem = posed(data, components, noise, known)
     for last in range(rounds):
-        for _ in range(ROUNDS * 4):
-            at = problem.climbed(at, STEPS)
+        enough = ROUGHLY
+        for _ in range(ROUNDS):
+            at = problem.climbed(at, enough)
             kept = _kept(problem, at, strict=last == rounds - 1)
-            if len(kept) == len(components):
+            if len(kept) < len(components):
+                components, at = [components[k] for k in kept], at.chosen(kept)
+                problem, enough = problem.only(kept), ROUGHLY
+            elif enough == SETTLED:
                 break
-            components, at = [components[k] for k in kept], at.chosen(kept)
-            problem = problem.only(kept)
+            else:
+                enough = SETTLED
         problem, at = problem.scaled(at.factor), replace(at, factor=0.0)
         if refit_noise:
             problem = _under_own_noise(problem, at)
@@ -614,7 +621,7 @@ def _under_own_noise(problem: SumOfComponents, at: Sizes) -> SumOfComponents:
         return found
     # Some of the configurations do not tell its size as all do: a sum under it would be worth less
     # than the next one, whose factor is free.
-    return found.scaled(found.climbed(replace(at, factor=0.0), STEPS, factor_alone=True).factor)
+    return found.scaled(found.climbed(replace(at, factor=0.0), factor_alone=True).factor)
 
 
 def _at_maximum(problem: SumOfComponents, at: Sizes) -> FittedSum:
