@@ -36,9 +36,9 @@ def plain(model: Model, table: Measurements) -> tuple[np.ndarray, int]:
     every = np.arange(len(model.parameters))
     weights = Weights("none", None, False, "")
     problem = Problem(model, observed, weights, start_values(model, table), every)
-    settled = settle(problem, sizes_and_check(problem))
-    settled.fit.cofactor()
-    return settled.fit.x, len(settled.reduction.kept)
+    _, found, reduction, *_ = settle(problem, sizes_and_check(problem))
+    found.cofactor()
+    return found.x, len(reduction.kept)
 
 
 def main(how: str, folder: Path, out: Path) -> None:

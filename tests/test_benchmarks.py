@@ -14,7 +14,8 @@ import pytest
 
 BENCHMARKS = Path(__file__).parents[1] / "benchmarks"
 MODULES = ("bench_part", "bench_clock", "bench_arms", "evaluation_numpy", "evaluation_rivals",
-           "evaluation", "scaling", "startup", "diagnosis", "million_rows", "run")  # fmt: skip
+           "evaluation", "scaling", "startup", "diagnosis", "million_rows", "run", "fits_clock",
+           "fits_arm", "fits_elastocal")  # fmt: skip
 
 
 @pytest.fixture(scope="module")
@@ -46,6 +47,22 @@ def test_b_by_hand_and_every_other_way_is_the_models_b(bench, tmp_path: Path) ->
     for way in (rivals.python_loop, rivals.buffered_loop, rivals.Mapped(f, 7)):
         found = way(arrays, 20) if isinstance(way, rivals.Mapped) else way(f, arrays, 20)
         np.testing.assert_allclose(found[0][..., 0], position, rtol=0, atol=1e-12)
+
+
+@pytest.mark.parametrize("how", ["plain", "ols"])
+def test_a_fit_beside_its_peers_ends_at_the_arm(
+    bench, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, how: str
+) -> None:
+    """At 30 poses of 50 µm, 25 parameters: new poses within 100 µm of where the arm is."""
+    monkeypatch.setenv("ELASTOCAL_BACKEND", "")  # which the script sets
+    arm = bench["fits_arm"]
+    given = arm.campaign("mdh", 30, 1)
+    arm.write(given, tmp_path)
+    bench["fits_elastocal"].main(how, tmp_path, tmp_path / "found.npz")
+    found = np.load(tmp_path / "found.npz")
+    error = np.linalg.norm(found["predicted"] - given.fresh_exact, axis=1)
+    assert np.sqrt((error**2).mean()) < 1e-4
+    assert found["parameters"] >= 25
 
 
 def test_an_exponent_is_the_slope_of_the_logarithms(bench) -> None:

@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-import threading
-from collections.abc import Iterator
 from dataclasses import replace
 
 import numpy as np
@@ -18,7 +16,6 @@ from elastocal.diagnosis import (
     noise_draws,
     noise_floor,
 )
-from elastocal.diagnosis.noise_floor import ahead
 
 N = 300
 
@@ -79,7 +76,7 @@ def test_the_same_seed_draws_the_same_noise() -> None:
 
 
 def test_no_result_depends_on_the_number_of_threads(monkeypatch: pytest.MonkeyPatch) -> None:
-    """Of large data; what is worked on is made in the caller's thread, one after the other."""
+    """Of large data, on which several work."""
     made = data()
     best = fit_noise(made)
     alone = noise_draws(made, best, 20, np.random.default_rng(0))
@@ -88,12 +85,3 @@ def test_no_result_depends_on_the_number_of_threads(monkeypatch: pytest.MonkeyPa
     several = noise_draws(made, best, 20, np.random.default_rng(0))
     for one, other in zip(alone, several, strict=True):
         np.testing.assert_array_equal(one.logs(), other.logs())
-    makers = []
-
-    def items() -> Iterator[int]:
-        for k in range(20):
-            makers.append(threading.current_thread())
-            yield k
-
-    assert list(ahead(lambda k: k**2, items(), made)) == [k**2 for k in range(20)]
-    assert set(makers) == {threading.current_thread()}

@@ -5,6 +5,7 @@ from __future__ import annotations
 import os
 import threading
 import warnings
+from collections.abc import Iterator
 
 import casadi as ca
 import numpy as np
@@ -15,7 +16,7 @@ from support.backends import system_compiler
 
 from elastocal.model import BatchFunction, row_blocks, run_blocks, thread_count
 from elastocal.model import evaluate as tape_module
-from elastocal.model.evaluate import CHUNK
+from elastocal.model.evaluate import CHUNK, ahead
 
 
 @pytest.fixture(autouse=True)
@@ -45,6 +46,19 @@ def test_every_block_is_worked_on_once(n: int, threads: int) -> None:
 def test_as_many_threads_as_asked_for() -> None:
     together = threading.Barrier(3)  # passed only where three threads wait at once
     run_blocks(lambda share: together.wait(timeout=60) and None, row_blocks(6, 1), 3)
+
+
+@pytest.mark.parametrize("threads", [1, 3])
+def test_items_are_made_in_the_callers_thread_and_results_come_in_order(threads: int) -> None:
+    makers = []
+
+    def items() -> Iterator[int]:
+        for k in range(20):
+            makers.append(threading.current_thread())
+            yield k
+
+    assert list(ahead(lambda k: k**2, items(), threads)) == [k**2 for k in range(20)]
+    assert set(makers) == {threading.current_thread()}
 
 
 def test_an_error_in_a_thread_is_the_callers() -> None:

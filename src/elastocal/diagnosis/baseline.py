@@ -241,7 +241,7 @@ MOST_CONFIGURATIONS = 2_000
 MOST_IN_ONE = 60
 
 
-def thinned(table: Measurements) -> tuple[Measurements, str | None]:
+def thinned(table: Measurements, most_rows: int = MOST_ROWS) -> tuple[Measurements, str | None]:
     """The table, or a part of it that is large enough, and what was left out.
 
     Of each configuration the first readings of every marker under every load; of too many
@@ -251,7 +251,7 @@ def thinned(table: Measurements) -> tuple[Measurements, str | None]:
     part = table.take(_first_of_each(table))
     labels, first, rows = np.unique(part.configuration, return_index=True, return_counts=True)
     order = labels[np.argsort(first)]
-    wanted = min(int(MOST_ROWS / rows.mean()), MOST_CONFIGURATIONS)
+    wanted = min(int(most_rows / rows.mean()), MOST_CONFIGURATIONS)
     if len(order) > wanted:
         chosen = order[np.linspace(0, len(order) - 1, wanted).round().astype(int)]
         part = part.take(np.isin(part.configuration, chosen))

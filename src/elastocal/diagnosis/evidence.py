@@ -19,11 +19,11 @@ from elastocal.diagnosis.noise_floor import (
     NoiseValues,
     NoisyData,
     Projection,
-    ahead,
     project,
 )
 from elastocal.diagnosis.unknown import Generic
 from elastocal.model.effects import SOMETHING
+from elastocal.model.evaluate import ahead
 from elastocal.units import Array
 
 # Marginal likelihood of a group of columns in closed form.
@@ -356,7 +356,7 @@ class Grams:
         sums = self.entry(h.entry_key(self.dataset.base.model))
         pieces = sums.pieces(len(settings), len(h.parameters))
         directions = (self.dataset.direction(h, settings[piece]) for piece in pieces)
-        return Spectrum.joined(list(ahead(sums.driven, directions, self.data)))
+        return Spectrum.joined(list(ahead(sums.driven, directions, self.data.threads)))
 
     def of_each(
         self, whats: Sequence[Hypothesis | Generic]
@@ -380,7 +380,7 @@ class Grams:
         functions = [b.direction for b in blocks if b.direction is not None]
         pieces = sums.pieces(len(blocks), blocks[0].width)
         directions = (np.stack(functions[piece], axis=3) for piece in pieces)
-        return Spectrum.joined(list(ahead(sums.driven, directions, self.data)))
+        return Spectrum.joined(list(ahead(sums.driven, directions, self.data.threads)))
 
     def _direct(self, columns: Array) -> Spectrum:
         return direct(self.data.masked(columns), self.at, self.signs)

@@ -21,12 +21,12 @@ from elastocal.diagnosis.noise_floor import (
     NoisyData,
     Projection,
     Weighted,
-    ahead,
     fit_noise,
     log_prior,
     project,
 )
 from elastocal.diagnosis.unknown import Generic
+from elastocal.model.evaluate import ahead
 from elastocal.model.manipulator import Model
 from elastocal.units import Array
 
@@ -131,7 +131,7 @@ def fit_sets(
         return _fitted(dataset, *joined, start)
 
     with_columns = ((items, with_items(dataset, items, (1.0,) * len(items))) for items in each)
-    return ahead(fitted, with_columns, dataset.data)
+    return ahead(fitted, with_columns, dataset.data.threads)
 
 
 def _fitted(

@@ -2,51 +2,17 @@
 
 from __future__ import annotations
 
-from collections import deque
-from collections.abc import Callable, Iterable, Iterator
-from concurrent.futures import Future, ThreadPoolExecutor
+from collections.abc import Callable
 from dataclasses import dataclass, replace
 from functools import cache, cached_property
-from typing import TypeVar
 
 import numpy as np
 from scipy import linalg, optimize
 
 from elastocal.diagnosis.baseline import Blocks
 from elastocal.identification.weighted_problem import WhitenedBlocks
-from elastocal.model.evaluate import thread_count
+from elastocal.model.evaluate import ahead, thread_count
 from elastocal.units import Array, BoolArray
-
-Item = TypeVar("Item")
-Result = TypeVar("Result")
-
-# Many numbers at a time: products of large matrices, while which Python lets other threads run.
-
-LARGE = 2**19  # numbers of a data's columns; below, threads would wait for each other
-
-
-def ahead(
-    work: Callable[[Item], Result], items: Iterable[Item], data: NoisyData
-) -> Iterator[Result]:
-    """`work` on each of the items, results in order; on large `data` by as many threads as there
-    are, while the next items are made.
-
-    All items are made one after the other in the caller's thread: what they count and keep does
-    not depend on which work is done first, nor does any result.
-    """
-    threads = thread_count() if data.X.size > LARGE else 1
-    if threads == 1:
-        yield from map(work, items)
-        return
-    waiting: deque[Future[Result]] = deque()
-    with ThreadPoolExecutor(threads) as pool:
-        for item in items:
-            waiting.append(pool.submit(work, item))
-            if len(waiting) > threads:
-                yield waiting.popleft().result()
-        while waiting:
-            yield waiting.popleft().result()
-
 
 # The noise floor: tracker noise, repeatability of each joint, scatter common to a configuration.
 #
@@ -64,6 +30,7 @@ REPEATABILITY, REPEATABILITY_SPREAD = 8e-6, 1.5
 JOINT_SPREAD = 0.7
 SHARED, SHARED_SPREAD = 0.2, 1.5
 SMALLEST_NOISE, LARGEST = 1e-9, 2e-2  # rad or m: a joint that is exact
+LARGE = 2**19  # numbers of a data's columns; below, threads would wait for each other
 
 
 @dataclass(frozen=True)
@@ -141,6 +108,11 @@ class NoisyData:
     @property
     def n_rows(self) -> int:
         return int((~self.left_out).sum())
+
+    @property
+    def threads(self) -> int:
+        """How many work on it: products of large matrices let other threads run."""
+        return thread_count() if self.X.size > LARGE else 1
 
     def masked(self, packed: Array) -> Array:
         """Rows that do not count set to zero (C, m, …)."""
@@ -623,7 +595,7 @@ def noise_draws(
         return likelihood(data, NoiseValues.of_logs(at))[1]
 
     steps = STEP * np.concatenate([np.eye(k), -np.eye(k)])
-    up, down = np.split(np.array(list(ahead(slope, theta + steps, data))), 2)
+    up, down = np.split(np.array(list(ahead(slope, theta + steps, data.threads))), 2)
     H = (up - down) / (2 * STEP)
     values, vectors = np.linalg.eigh((H + H.T) / 2)
     root = vectors * np.sqrt(2 / np.maximum(values, FLATTEST))
@@ -631,7 +603,7 @@ def noise_draws(
     drawn = theta + z @ root.T
     joints = slice(1 + len(noise.joint), None)
     drawn[:, joints] = np.clip(drawn[:, joints], np.log(SMALLEST_NOISE), np.log(LARGEST))
-    each = ahead(lambda at: posterior(data, NoiseValues.of_logs(at)), drawn, data)
+    each = ahead(lambda at: posterior(data, NoiseValues.of_logs(at)), drawn, data.threads)
     minus_two = np.array(list(each))
     log_weight = -0.5 * minus_two + 0.5 * (z**2).sum(axis=1)
     weight = np.exp(log_weight - log_weight.max())

@@ -5,12 +5,13 @@ from __future__ import annotations
 import contextvars
 import os
 import threading
-from collections.abc import Callable, Iterable, Sequence
-from concurrent.futures import ThreadPoolExecutor
+from collections import deque
+from collections.abc import Callable, Iterable, Iterator, Sequence
+from concurrent.futures import Future, ThreadPoolExecutor
 from dataclasses import dataclass, replace
 from functools import cached_property
 from itertools import pairwise
-from typing import Any
+from typing import Any, TypeVar
 
 import casadi as ca
 import numpy as np
@@ -28,7 +29,10 @@ from elastocal.model.function_cache import HashedFunction
 from elastocal.model.numpy_engine import NumpyFunction
 from elastocal.text import did_you_mean
 
-# Threads over blocks of rows: how many, how rows are cut, and running them.
+Item = TypeVar("Item")
+Result = TypeVar("Result")
+
+# Threads over blocks of rows, or over items one after the other: how many, and running them.
 
 
 def thread_count() -> int:
@@ -67,6 +71,25 @@ def run_blocks(
         running = [pool.submit(contextvars.copy_context().run, work, share) for share in shares]
         for future in running:
             future.result()
+
+
+def ahead(work: Callable[[Item], Result], items: Iterable[Item], threads: int) -> Iterator[Result]:
+    """`work` on each of the items, results in order, while the next items are made.
+
+    All items are made one after the other in the caller's thread: what they count and keep does
+    not depend on which work is done first, nor does any result.
+    """
+    if threads == 1:
+        yield from map(work, items)
+        return
+    waiting: deque[Future[Result]] = deque()
+    with ThreadPoolExecutor(threads) as pool:
+        for item in items:
+            waiting.append(pool.submit(work, item))
+            if len(waiting) > threads:
+                yield waiting.popleft().result()
+        while waiting:
+            yield waiting.popleft().result()
 
 
 # Which engine evaluates a function: numpy or compiled C, asked for and reported.
