@@ -381,6 +381,24 @@ def test_what_was_settled_last_is_not_settled_again() -> None:
     np.testing.assert_array_equal(kr270().regressor(poses, x).B, B)
 
 
+def test_what_is_kept_of_an_evaluation_is_nobodys_to_spoil() -> None:
+    """Of the same rows and values B and prediction come again, whatever was written into them."""
+    model, poses = kr270(), table_of(kr270_poses(5), SLANTED, tuple(MARKERS), True)
+    x = model.nominal
+    first = model.regressor(poses, x)
+    B, h = first.B.copy(), first.prediction.copy()
+    first.B[:], first.prediction[:] = 0.0, 0.0
+    chosen = np.arange(0, len(x), 2)
+    for again in (model.regressor(poses, x), model.regressor(poses.take(np.arange(len(poses))), x)):
+        np.testing.assert_array_equal(again.B, B)
+        np.testing.assert_array_equal(again.prediction, h)
+    np.testing.assert_allclose(model.regressor(poses, x, chosen).B, B[:, chosen], atol=1e-15)
+    other = x + 1e-6
+    assert (model.regressor(poses, other).prediction != h).any()
+    fewer = poses.take(np.arange(len(poses)) > 0)
+    assert len(model.regressor(fewer, x).B) == len(B) * (len(poses) - 1) // len(poses)
+
+
 def test_an_arm_settles_once_for_all_its_markers() -> None:
     """Rows that differ in the marker alone have one equilibrium, in whatever order they stand."""
     poses, alone = kr270_poses(5), kr270()

@@ -171,10 +171,8 @@ def autocorrelation(residual: Array, observed: Observations) -> Autocorrelation 
         band = float(special.ndtri(0.975)) * width / total
     else:
         rng = np.random.default_rng(0)
-        chance = np.empty(PERMUTATIONS)
-        for k in range(PERMUTATIONS):
-            other = mean[rng.permutation(number)]
-            chance[k] = float((other[:-1] * other[1:]).sum()) / total
+        other = mean[[rng.permutation(number) for _ in range(PERMUTATIONS)]]
+        chance = np.einsum("knd,knd->k", other[:, :-1], other[:, 1:]) / total
         p = (1 + int((chance >= found[0]).sum())) / (1 + PERMUTATIONS)
         band = float(np.quantile(np.abs(chance), 0.95))
     return Autocorrelation(found, p, band, number, "times" if timed else "order of the rows")

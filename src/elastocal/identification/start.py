@@ -303,7 +303,8 @@ def _linear_parts(problem: RegistrationProblem, R: Array, weight: Array) -> tupl
         cross = (w @ turn[here].reshape(-1, 9)).reshape(-1, 3, 3)
         normal[:, :3, at], normal[:, at, :3] = cross, cross.transpose(0, 2, 1)
         normal[:, 3 + 3 * k + own, 3 + 3 * k + own] = w.sum(axis=1)[:, None]
-        right[:, at] = np.einsum("nij,sni->sj", turn[here], w[..., None] * y[:, here])
+        weighted = (w[..., None] * y[:, here]).reshape(len(R), -1)
+        right[:, at] = weighted @ turn[here].reshape(-1, 3)
     sought = slice(0 if problem.free_base else 3, size)
     values, vectors = np.linalg.eigh(normal[:, sought, sought])
     shown = values > RCOND**2 * values[:, -1:]
@@ -317,8 +318,15 @@ def _linear_parts(problem: RegistrationProblem, R: Array, weight: Array) -> tupl
 
 def _body_points(problem: RegistrationProblem, markers: Array) -> Array:
     """Where `markers` (…, M, 3) are read (…, n, 3) in the base frame."""
-    turned = np.einsum("nij,...nj->...ni", problem.flange_rotation, markers[..., problem.marker, :])
-    return np.asarray(turned + problem.flange_position)
+    turn, code = problem.flange_rotation, problem.marker
+    out = np.empty((*markers.shape[:-2], *problem.flange_position.shape))
+    for k in range(markers.shape[-2]):
+        here = code == k
+        turned = markers[..., k, :] @ turn[here].reshape(-1, 3).T
+        out[..., here, :] = (
+            turned.reshape(*turned.shape[:-1], -1, 3) + problem.flange_position[here]
+        )
+    return out
 
 
 def _rotation_between(body: Array, points: Array, weight: Array) -> Array:
