@@ -400,8 +400,8 @@ class Total:
         key = id(function), *_content((*inputs, *extra, x))
         found = self._kept.pop(key, None) or self._evaluated(function, inputs, extra, x)
         self._kept[key] = found
-        while len(self._kept) > EVALUATIONS:
-            self._kept.pop(next(iter(self._kept)), None)
+        for old in list(self._kept)[:-EVALUATIONS]:
+            self._kept.pop(old, None)
         y, slope = found
         return y.copy(), slope.copy()
 
