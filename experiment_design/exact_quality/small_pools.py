@@ -38,7 +38,7 @@ def all_plans(problem: DesignProblem) -> IntArray:
         [
             plan
             for plan in combinations_with_replacement(np.flatnonzero(problem.group == g), share)
-            if share == 0 or np.unique(plan, return_counts=True)[1].max() <= problem.most
+            if all(one != later for one, later in zip(plan, plan[problem.most :], strict=False))
         ]
         for g, share in enumerate(problem.shares)
     ]
