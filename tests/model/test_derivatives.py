@@ -10,7 +10,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
-from functools import lru_cache
+from functools import cached_property, lru_cache
 from pathlib import Path
 
 import numpy as np
@@ -80,6 +80,18 @@ class Case:
     def columns(self, effect: str) -> list[int]:
         return [k for k, p in enumerate(self.model.parameters) if p.effect == effect]
 
+    @cached_property
+    def largest(self) -> NDArray:
+        """The largest entry of each column, whose rounding B has.
+
+        A deflection is a difference of two positions: its rounding is that of their derivatives.
+        """
+        B = self.B
+        if self.model.observe == "deflection":
+            every_row = observe(self.table, "position")
+            B = self.model.regressor(self.table, self.x, observations=every_row).B
+        return np.abs(B).max(axis=0)
+
 
 def case(model: Model, table: Measurements, disturbed: bool = True) -> Case:
     sizes = model.sizes(model.regressor(table).B)
@@ -136,11 +148,6 @@ def difference_step(c: Case, k: int) -> float:
 
 def largest_excess(c: Case, columns: Sequence[int]) -> float:
     """Largest |B − derivative| as a multiple of what is allowed in its column."""
-    positions = c.B
-    if c.model.observe == "deflection":
-        # A difference of two positions: its rounding is that of the positions' derivatives.
-        every_row = observe(c.table, "position")
-        positions = c.model.regressor(c.table, c.x, observations=every_row).B
     worst = 0.0
     for k in columns:
         if c.model.observe == "pose":
@@ -148,7 +155,7 @@ def largest_excess(c: Case, columns: Sequence[int]) -> float:
             floor = 10 * EPS * np.abs(c.prediction).max() / difference_step(c, k)
         else:
             derivative = complex_step(c, k)
-            floor = 100 * EPS * np.abs(positions[:, k]).max()
+            floor = 100 * EPS * c.largest[k]
         error = np.abs(c.B[:, k] - derivative).max()
         if error > 0:
             allowed = TOLERANCE * np.abs(derivative).max() + floor
