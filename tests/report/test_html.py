@@ -5,7 +5,6 @@ from __future__ import annotations
 import json
 import re
 import warnings
-from collections.abc import Iterator
 from dataclasses import replace
 from datetime import date
 from pathlib import Path
@@ -28,14 +27,17 @@ from elastocal.report.residual_figures import by_region, held_out
 
 
 @pytest.fixture(scope="module")
-def page(case: Any) -> Iterator[str]:
+def page(case: Any) -> str:
+    return laid_out(case)
+
+
+def laid_out(case: Any) -> str:
+    """The one page of these tests whose figures' labels do not overlap."""
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr(figures, "LAYOUT", "constrained")
-        yield told(case)
-
-
-def told(case: Any) -> str:
-    return page_of(case.result, command="elastocal identify c.toml d.csv", seed=3, truth=case.truth)
+        return page_of(
+            case.result, command="elastocal identify c.toml d.csv", seed=3, truth=case.truth
+        )
 
 
 def test_every_parameter_is_on_the_page_and_no_number_where_none_is_known(
@@ -157,7 +159,7 @@ def test_small_tables_are_drawn_whole(page: str, case: Any) -> None:
 
 def test_same_result_same_page_whatever_matplotlib_is_set_to(case: Any, page: str) -> None:
     with mpl.rc_context({"text.usetex": True, "axes.facecolor": "red", "font.size": 30}):
-        again = told(case)
+        again = laid_out(case)
     # What evaluated the model so far is another thing the second time.
     engine = re.compile(r"<td class=\"name\">model evaluated by</td><td>.*?</td>")
     assert engine.sub("", again) == engine.sub("", page)

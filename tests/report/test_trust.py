@@ -46,7 +46,9 @@ def test_what_nothing_speaks_against_can_be_trusted(fine: Any) -> None:
     assert not any("give them with `test`" in step for step in judgement(tested).steps)
 
 
-def test_one_sentence_says_which_error_has_the_noise_of_a_reading(case: Any) -> None:
+def test_one_sentence_says_which_error_has_the_noise_of_a_reading(
+    case: Any, no_figures: None
+) -> None:
     """In terminal, page, notebook, certificate and JSON."""
     fit = case.result
     sentence = judgement_view.judgement(fit).headline
