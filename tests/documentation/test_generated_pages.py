@@ -17,13 +17,17 @@ from elastocal.model.effects.base import Effect
 from elastocal.planning.criteria import CRITERIA
 
 DOCS = Path(__file__).parents[2] / "docs"
-EFFECTS = effects_page.page()
-COMMANDS = commands_page.page()
+
+
+@pytest.fixture(scope="module")
+def effects() -> str:
+    """Made where it is looked at: every process that collects the tests would make it."""
+    return effects_page.page()
 
 
 @pytest.mark.parametrize("name", CATALOGUE)
-def test_every_effect_has_text_places_and_columns(name):
-    part = EFFECTS.split(f"### `{name}` ", 1)[1].split("\n### ", 1)[0]
+def test_every_effect_has_text_places_and_columns(effects, name):
+    part = effects.split(f"### `{name}` ", 1)[1].split("\n### ", 1)[0]
     first = CATALOGUE[name].__class__.__doc__.strip().splitlines()[0]
     assert first in part and first != Effect.__doc__.splitlines()[0]
     assert re.search(r"- \*\*Places\*\*: `", part)
@@ -31,11 +35,11 @@ def test_every_effect_has_text_places_and_columns(name):
     assert "| parameter | unit |" in part or "No parameters." in part
 
 
-def test_parameters_stand_with_unit_and_size():
-    assert "| `joint1.offset` | rad | 0 | 1 mrad | – |" in EFFECTS
-    assert "| `joint1.compliance` | rad/(N·m) | 2e-06 | 2 µrad/(N·m) | ≥ 0 |" in EFFECTS
-    assert "`time_constant_s` (default 1800, 60 to 1000000)" in EFFECTS
-    distortion = EFFECTS.split("### `tracker_distortion`")[1]
+def test_parameters_stand_with_unit_and_size(effects):
+    assert "| `joint1.offset` | rad | 0 | 1 mrad | – |" in effects
+    assert "| `joint1.compliance` | rad/(N·m) | 2e-06 | 2 µrad/(N·m) | ≥ 0 |" in effects
+    assert "`time_constant_s` (default 1800, 60 to 1000000)" in effects
+    distortion = effects.split("### `tracker_distortion`")[1]
     assert "- **Not with** `observe` = `distance`" in distortion
 
 
@@ -52,8 +56,9 @@ def test_every_criterion_says_what_it_is_and_whether_it_has_a_bound(name):
 
 
 def test_every_verb_and_option_is_on_the_page():
+    page = commands_page.page()
     for name, command in typer.main.get_command(app).commands.items():
-        part = COMMANDS.split(f"\n## {name}\n", 1)[1].split("\n## ", 1)[0]
+        part = page.split(f"\n## {name}\n", 1)[1].split("\n## ", 1)[0]
         for parameter in command.params:
             shown = parameter.opts[-1] if parameter.param_type_name == "option" else parameter.name
             assert f"`{shown.upper()}`" in part or f"`{shown}`" in part, f"{name}: {shown}"

@@ -19,14 +19,19 @@ def house():
         return house
 
 
+@pytest.fixture(scope="module")
+def uses(house):
+    """Read from every module of the package once."""
+    return house.uses()
+
+
 def test_every_package_has_a_room_and_a_line_of_text(house):
     packages = {path.parent.name for path in (ROOT / "src" / "elastocal").glob("*/__init__.py")}
     told = set(re.findall(r"`(\w+)`", PAGE))
     assert packages - {"demo"} <= set(house.ROOMS) & told
 
 
-def test_every_arrow_leads_downwards(house):
-    uses = house.uses()
+def test_every_arrow_leads_downwards(house, uses):
     assert uses["model"] == {"cell", "measurements"}
     assert "model" in uses["identification"]
     for room, direct in uses.items():
@@ -34,9 +39,9 @@ def test_every_arrow_leads_downwards(house):
 
 
 @pytest.mark.parametrize("scheme", ["light", "dark"])
-def test_the_picture_shows_the_imports_of_today(house, scheme):
+def test_the_picture_shows_the_imports_of_today(uses, scheme):
     picture = (ROOT / "docs" / "images" / f"house_{scheme}.svg").read_text(encoding="utf-8")
-    arrows = {f"{room} uses {one}" for room, direct in house.uses().items() for one in direct}
+    arrows = {f"{room} uses {one}" for room, direct in uses.items() for one in direct}
     assert set(re.findall(r'id="(\w+_uses_\w+)"', picture)) == {a.replace(" ", "_") for a in arrows}
 
 
