@@ -115,6 +115,22 @@ def test_the_least_recently_used_goes_first(monkeypatch: pytest.MonkeyPatch) -> 
     assert [fetch(key, ".bin") is not None for key in keys] == [True, False, True]
 
 
+def test_what_is_too_much_is_looked_for_now_and_then(
+    folder: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """At first, since others have written too, and after each fiftieth of all that may be there."""
+    monkeypatch.setattr(tape_cache, "LARGEST_TOTAL", 10_000)
+    looked, largest, prune = [], 0, tape_cache.prune
+    monkeypatch.setattr(tape_cache, "prune", lambda *a, **k: looked.append(prune(*a, **k)))
+    for k in range(50):
+        store(content_key(str(k)), ".bin", bytes(50))
+    assert len(looked) == 13  # the first, and every fourth
+    for k in range(300):
+        store(content_key(str(k)), ".bin", bytes(70))
+        largest = max(largest, sum(path.stat().st_size for path in folder.iterdir()))
+    assert 10_000 <= largest <= 10_200
+
+
 def test_pruning_leaves_files_of_others_alone(
     folder: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:

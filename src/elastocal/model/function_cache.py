@@ -162,10 +162,13 @@ def entry_bytes(path: Path) -> bytes:
 
 def fetch(key: str, suffix: str) -> Path | None:
     """The whole, undamaged entry of `key`, marked as just used; None where there is none."""
-    folder = usable_folder()
+    folder, names = usable_folder(), list[str]()
     if folder is None:
         return None
-    for path in sorted(folder.glob(f"{key}.*{suffix}")):
+    with suppress(OSError):  # another process may clear the folder away
+        names = os.listdir(folder)
+    for name in sorted(n for n in names if n.startswith(f"{key}.") and n.endswith(suffix)):
+        path = folder / name
         with suppress(OSError):
             try:
                 whole = _digest(entry_bytes(path)) == path.name[len(key) + 1 : -len(suffix)]
@@ -188,8 +191,17 @@ def store(key: str, suffix: str, data: bytes) -> Path | None:
         atomic_write_bytes(path, data)
     except InputError:
         return None
-    prune(folder, keep=path)
+    # To look at thousands of entries takes longer than to write one.
+    written = _written.get(folder, LARGEST_TOTAL) + len(data)
+    if written >= LARGEST_TOTAL * UNPRUNED:
+        prune(folder, keep=path)
+        written = 0
+    _written[folder] = written
     return path
+
+
+UNPRUNED = 0.02  # share of the cache that a process writes before it looks for what is too much
+_written: dict[Path, int] = {}  # bytes by this process since then; at first it looks
 
 
 def prune(folder: Path, keep: Path, largest: int | None = None) -> None:
@@ -197,25 +209,24 @@ def prune(folder: Path, keep: Path, largest: int | None = None) -> None:
     largest = LARGEST_TOTAL if largest is None else largest
     entries = []
     remove_abandoned(folder, r"[0-9a-f]{32}\..{,7}")  # the first 40 letters of an entry's name
-    for path in folder.iterdir():
+    for found in os.scandir(folder):
         with suppress(OSError):
-            facts = path.stat()
-            if _is_entry(path) and path != keep:
-                entries.append((facts.st_mtime, facts.st_size, path))
-            elif path == keep:
-                largest -= facts.st_size
+            if found.name == keep.name:
+                largest -= found.stat().st_size
+            elif _is_entry(found.name):
+                facts = found.stat()
+                entries.append((facts.st_mtime, facts.st_size, found.path))
     for _, size, path in sorted(entries, reverse=True):
         largest -= size
         if largest < 0:
             with suppress(OSError):
-                path.unlink()
+                os.unlink(path)
 
 
-def _is_entry(path: Path) -> bool:
+def _is_entry(name: str) -> bool:
     """Only what `store` wrote may be removed: ELASTOCAL_CACHE may name any folder."""
-    parts = path.name.split(".")
-    key = len(parts) >= 3 and re.fullmatch("[0-9a-f]{32}", parts[0])
-    return bool(key) and len(parts[1]) == 64
+    key, *others = name.split(".")
+    return len(others) >= 2 and len(others[0]) == 64 and bool(re.fullmatch("[0-9a-f]{32}", key))
 
 
 def _digest(data: bytes) -> str:
