@@ -7,6 +7,7 @@ import pytest
 
 from elastocal.errors import InputError
 from elastocal.identification import linear_solver, solve_weighted
+from elastocal.identification.linear_solver import least_norm
 
 
 def rational_solution(B, y, w):
@@ -209,3 +210,24 @@ def test_bad_input_is_named(change, message):
     arguments = {"B": np.array([[1.0, 2], [3, 4], [5, 7]]), "y": [1, 2, 3]} | change
     with pytest.raises(InputError, match=message):
         solve_weighted(**arguments)
+
+
+@pytest.mark.parametrize("shape", [(9, 4), (4, 9), (6, 6)])
+def test_least_norm_where_divide_and_conquer_does_not_converge(
+    monkeypatch: pytest.MonkeyPatch, shape: tuple[int, int]
+) -> None:
+    """Full rank or not, the solution of least norm, by whichever of LAPACK's two ways."""
+    rng = np.random.default_rng(0)
+    A, b = rng.normal(size=shape), rng.normal(size=(shape[0], 2))
+    A[:, 1] = 2 * A[:, 0]
+    expected = np.linalg.pinv(A, rcond=1e-12) @ b
+    np.testing.assert_allclose(least_norm(A, b, cond=1e-12), expected, atol=1e-12)
+    lstsq = linear_solver.linalg.lstsq
+
+    def failing(*arguments, lapack_driver=None, **options):
+        if lapack_driver is None:
+            raise linear_solver.linalg.LinAlgError("SVD did not converge")
+        return lstsq(*arguments, lapack_driver=lapack_driver, **options)
+
+    monkeypatch.setattr(linear_solver.linalg, "lstsq", failing)
+    np.testing.assert_allclose(least_norm(A, b, cond=1e-12), expected, atol=1e-12)

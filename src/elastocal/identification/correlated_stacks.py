@@ -11,6 +11,7 @@ from functools import cached_property
 import numpy as np
 from scipy import linalg, sparse
 
+from elastocal.identification.linear_solver import least_norm
 from elastocal.identification.noise_structure import SharedEffect, Structure
 from elastocal.identification.weighted_problem import WhitenedBlocks
 from elastocal.units import Array, IntArray
@@ -33,7 +34,7 @@ class Moments:
     def of(cls, B: Array, e: Array) -> Moments:
         n, p = B.shape[1:]
         flat = B.reshape(-1, p)
-        x0 = linalg.lstsq(flat.T @ flat, flat.T @ e.ravel())[0]
+        x0 = least_norm(flat.T @ flat, flat.T @ e.ravel())
         rows = np.concatenate([B, (e - B @ x0)[:, :, None]], axis=2).transpose(1, 0, 2)
         pairs = np.empty((n, n, p + 1, p + 1))
         for i, first in enumerate(rows):

@@ -8,12 +8,13 @@ from dataclasses import dataclass, replace
 from typing import Literal, get_args
 
 import numpy as np
-from scipy import linalg, optimize, sparse
+from scipy import optimize, sparse
 
 from elastocal.errors import ElastocalError, InputError, option, require
 from elastocal.identification.bootstrap import parametric_bootstrap, wild_cluster_bootstrap
 from elastocal.identification.covariance import Covariance, cluster_robust, hc, t_quantile
 from elastocal.identification.least_squares import Fit, FitProblem, fit
+from elastocal.identification.linear_solver import least_norm
 from elastocal.identification.noise_choice import NoiseFit, estimate_noise, linearised
 from elastocal.identification.solve import Solution, residual_sigma
 from elastocal.identification.weighted_problem import Partition, Span, in_order, regressor
@@ -313,7 +314,7 @@ def _bootstrapped(
 
     def estimate(e: Array) -> Array:
         if noise is None:
-            return linalg.lstsq(B, weights.apply(e))[0] * size
+            return least_norm(B, weights.apply(e)) * size
         return estimate_noise(readings.moved(e.reshape(readings.e.shape)), noise.kind).x
 
     found = parametric_bootstrap(draw, estimate, draws=DRAWS, seed=seed, jobs=jobs)

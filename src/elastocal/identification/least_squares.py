@@ -8,11 +8,10 @@ from functools import cached_property
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy import linalg
 from scipy.optimize import lsq_linear
 
 from elastocal.errors import ElastocalError
-from elastocal.identification.linear_solver import solve_weighted
+from elastocal.identification.linear_solver import least_norm, solve_weighted
 from elastocal.identification.weighted_problem import (
     Evaluation,
     Partition,
@@ -81,7 +80,7 @@ class SumOfSquares:
             step = lsq_linear(damped, target, box, method="bvls", tol=1e-14).x
         else:
             cond = max(at.r_factor.rows, p) * np.finfo(float).eps
-            step = linalg.lstsq(damped, target, cond=cond)[0]
+            step = least_norm(damped, target, cond=cond)
         left = b - A @ step
         return step, float(b @ b - left @ left)
 

@@ -294,3 +294,20 @@ def _refine(A: ExactMatrix, V: Array, b_hi: Array, b_lo: Array) -> tuple[Array, 
         z_hi, z_lo = two_sum(z_hi, z_lo + step)
         last = size
     return z_hi, r_hi
+
+
+# Plain least squares, where the working precision will do.
+
+
+def least_norm(A: Array, b: Array, cond: float | None = None, check_finite: bool = True) -> Array:
+    """x (k, …) of least norm among those that minimise |A x − b|, by singular values; those below
+    `cond` of the largest count as zero, by default below the rounding.
+
+    By LAPACK's divide and conquer.  That may fail to converge on finite numbers (a matrix of
+    condition 3e6 did, by AVX-512 kernels, where it does not a rounding away); the slower
+    iteration then converges.
+    """
+    try:
+        return np.asarray(linalg.lstsq(A, b, cond=cond, check_finite=check_finite)[0])
+    except linalg.LinAlgError:
+        return np.asarray(linalg.lstsq(A, b, cond=cond, lapack_driver="gelss")[0])

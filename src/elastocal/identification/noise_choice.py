@@ -13,6 +13,7 @@ from scipy import linalg, sparse, special
 
 from elastocal.errors import ElastocalError, InputError, InsufficientDataError
 from elastocal.identification.covariance import Covariance, orthogonal
+from elastocal.identification.linear_solver import least_norm
 from elastocal.identification.noise_structure import (
     EACH,
     JOINTS,
@@ -429,7 +430,7 @@ def _prior(structure: Structure) -> LogPrior:
     sets = structure.sets
     B, e = sets.B.reshape(-1, sets.B.shape[2]), sets.e.ravel()
     weight = np.repeat(np.sqrt(sets.repeats), sets.e.shape[1])
-    x = linalg.lstsq(B * weight[:, None], e * weight)[0]
+    x = least_norm(B * weight[:, None], e * weight)
     return prior_of_groups(structure, (e - B @ x).reshape(sets.e.shape))
 
 

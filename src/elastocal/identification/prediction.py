@@ -26,6 +26,7 @@ from scipy import linalg, special
 from elastocal.cell.work_cell import Cell
 from elastocal.errors import ElastocalError
 from elastocal.identification.covariance import Covariance, variance_of
+from elastocal.identification.linear_solver import least_norm
 from elastocal.identification.methods import EXACT
 from elastocal.identification.noise_summary import Noise
 from elastocal.identification.residuals import rms_3d
@@ -182,7 +183,7 @@ def _redundant(solution: Solution, open_: IntArray, typical: Array) -> tuple[str
 
 def _shares(B_K: Array, B_D: Array, kept: Array, left: Array) -> Array:
     """mixing (K, D) with B_D ≈ B_K · mixing, of columns scaled by the sizes `kept`, `left`."""
-    found = linalg.lstsq(B_K, B_D, cond=1e-10)[0]
+    found = least_norm(B_K, B_D, cond=1e-10)
     known = left > 0
     found[:, known] *= kept[:, None] / left[known]
     return np.asarray(found)

@@ -11,6 +11,7 @@ from numpy.typing import ArrayLike, NDArray
 from scipy import linalg, optimize, sparse, special
 
 from elastocal.errors import InputError, InsufficientDataError, require
+from elastocal.identification.linear_solver import least_norm
 from elastocal.identification.robust_core import (
     Absolute,
     Bisquare,
@@ -111,7 +112,7 @@ def _stationary(problem: Design, z: Array) -> Array:
         along = (problem.Q * (r / problem.rows(length))[:, None]).reshape(problem.n, -1, problem.p)
         along = along.sum(axis=1)
         hessian = (problem.Q.T / problem.rows(length)) @ problem.Q - (along.T / length) @ along
-        z = z + linalg.lstsq(hessian, along.sum(axis=0))[0]
+        z = z + least_norm(hessian, along.sum(axis=0))
     return z
 
 
@@ -227,7 +228,7 @@ def _concentrate(B: Array, e: Array, shift: Array) -> tuple[Array, float]:
 def _solve(B: Array, e: Array) -> Array:
     if B.shape[2] == 0:
         return np.zeros(0)
-    return linalg.lstsq(B.reshape(-1, B.shape[2]), e.ravel(), cond=1e-10, check_finite=False)[0]
+    return least_norm(B.reshape(-1, B.shape[2]), e.ravel(), cond=1e-10, check_finite=False)
 
 
 def majority(B: Array, e: Array, size: int, seed: int = 0) -> NDArray[np.bool_]:

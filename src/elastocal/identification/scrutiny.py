@@ -13,6 +13,7 @@ from typing import Any
 import numpy as np
 from scipy import linalg, special
 
+from elastocal.identification.linear_solver import least_norm
 from elastocal.identification.prediction import mean_squares
 from elastocal.identification.residuals import ALONE, held_out_residual, rms_3d
 from elastocal.identification.smooth_prior import Standardised
@@ -267,7 +268,7 @@ def parameter_sets(fit: Looked) -> tuple[ParameterSet, ...]:
     held, plain = [], []
     for _, chosen in sets:
         # Whole rows count by the fit's weights, whatever the set.
-        left = y - fit.B[:, chosen] @ linalg.lstsq(white[:, chosen], target)[0]
+        left = y - fit.B[:, chosen] @ least_norm(white[:, chosen], target)
         plain.append(rms_3d(left, size))
         own = held_out_residual(
             fit.B[:, chosen], left, weights, observed.configuration, observed.size

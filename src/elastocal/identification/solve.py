@@ -11,7 +11,7 @@ from scipy import linalg
 
 from elastocal.errors import ElastocalError, InsufficientDataError
 from elastocal.identification.least_squares import Fit, FitProblem, fit
-from elastocal.identification.linear_solver import solve_weighted
+from elastocal.identification.linear_solver import least_norm, solve_weighted
 from elastocal.identification.residuals import (
     CHANCE,
     as_of_another_campaign,
@@ -147,7 +147,7 @@ def reduce(
         basis = linalg.qr(chosen, mode="economic")[0] if kept else basis
     kept.sort()
     dropped = [c for c in range(R.shape[1]) if c not in set(kept)]
-    scaled = linalg.lstsq(R[:, kept], R[:, dropped])[0] if kept and dropped else None
+    scaled = least_norm(R[:, kept], R[:, dropped]) if kept and dropped else None
     mixing = np.zeros((len(kept), len(dropped)))
     if scaled is not None:
         mixing = scaled * sizes[kept][:, None] / sizes[dropped][None, :]
@@ -538,7 +538,7 @@ def bent(solution: Solution, covariance: Array) -> Array:
     if not np.isfinite(moved).all():
         return none  # so far out the arm has no equilibrium
     apply = looked.weights.apply
-    step = linalg.lstsq(apply(B), apply(moved.T / 2))[0]
+    step = least_norm(apply(B), apply(moved.T / 2))
     return np.asarray(size * np.sqrt((step**2).mean(axis=1)))
 
 

@@ -15,6 +15,7 @@ from scipy import linalg, sparse
 
 from elastocal.cell.arm_description import Tracker
 from elastocal.errors import InputError, option
+from elastocal.identification.linear_solver import least_norm
 from elastocal.model.manipulator import Model, Regression
 from elastocal.model.observations import (
     Observations,
@@ -537,7 +538,7 @@ class RFactor:
         `scale` (p,) are typical sizes; the rank is judged with columns multiplied by them.
         """
         cond = max(self.rows, self.columns) * np.finfo(float).eps
-        return scale * linalg.lstsq(self.R * scale, self.projected, cond=cond)[0]
+        return scale * least_norm(self.R * scale, self.projected, cond=cond)
 
     def cofactor(self, scale: Array) -> Array:
         """(BᵀB)⁻¹ (p, p) of a B with full column rank."""
