@@ -273,7 +273,7 @@ def load(sources: Sources) -> ModuleType:
     with _LOCK:
         if sources.digest not in _LOADED:
             folder = _standing(sources)
-            _forget_others()
+            _forget_earlier()
             _FOLDERS.add(folder)
             sys.path.insert(0, str(folder))
             name = f"elastocal_study_{sources.digest[:16]}"
@@ -303,8 +303,8 @@ def _standing(sources: Sources) -> Path:
     return folder
 
 
-def _forget_others() -> None:
-    """Drop what other studies, or an earlier state of this one, imported from their folders.
+def _forget_earlier() -> None:
+    """Drop what earlier studies, or an earlier state of this one, imported from their folders.
 
     A worker outlives a study, and two studies may both have a scenarios.py.
     """
@@ -314,6 +314,7 @@ def _forget_others() -> None:
         if file and not own and any(Path(file).is_relative_to(folder) for folder in _FOLDERS):
             del sys.modules[name]
     sys.path[:] = [place for place in sys.path if place not in map(str, _FOLDERS)]
+    _FOLDERS.clear()
     importlib.invalidate_caches()
 
 
