@@ -2,10 +2,9 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from functools import cached_property
-from typing import Any
 
 import casadi as ca
 import numpy as np
@@ -36,7 +35,31 @@ LARGEST_JACOBIAN = 60_000
 ROWS_THAT_PAY = 2000
 AT_A_TIME = 16_384  # rows × directions evaluated together
 KEPT = 4_000_000  # numbers of F_θ up to which an answer is kept
+EVALUATIONS, KEPT_ROWS = 3, 2000  # of y and dy/dz that are kept, each of so many rows at most
 TOLERANCE = 1e-14  # rad (m for prismatic springs); Newton converges quadratically past it
+
+
+class LastAnswers:
+    """The last `number` pairs of arrays that a function gave for arrays of at most `rows` rows: a
+    fit is looked at from many sides, and each asks for the same where it ended."""
+
+    def __init__(
+        self, function: Callable[..., tuple[NDArray, NDArray]], number: int, rows: int
+    ) -> None:
+        self._function, self._number, self._rows = function, number, rows
+        self._kept: dict[tuple, tuple[NDArray, NDArray]] = {}
+
+    def __call__(self, *given: NDArray) -> tuple[NDArray, NDArray]:
+        """What the function gives, the caller's own to write to."""
+        if len(given[0]) > self._rows:
+            return self._function(*given)
+        key = tuple((a.dtype.char, a.shape, a.tobytes()) for a in given)
+        found = self._kept.pop(key, None) or self._function(*given)
+        self._kept[key] = found
+        for old in list(self._kept)[: -self._number]:
+            self._kept.pop(old, None)  # of threads one
+        one, other = found
+        return one.copy(), other.copy()
 
 
 class Equilibrium:
@@ -60,7 +83,7 @@ class Equilibrium:
         self._value = BatchFunction(self._symbols, [residual], backend)
         self._large = self._value.n_instructions * self.size / 2 > LARGEST_JACOBIAN
         self._last = self._value
-        self._solved: tuple[Any, NDArray, NDArray] | None = None
+        self._answers = LastAnswers(self._solve, 1, KEPT // max(self.size**2, 1))
         self._states: tuple[NDArray, IntArray, IntArray] | None = None
 
     @cached_property
@@ -106,13 +129,7 @@ class Equilibrium:
         Rows that do not settle become NaN, with F_θ = 1 so that it can still be solved with.  The
         last answer is kept: readings are predicted and then differentiated at the same place.
         """
-        if len(inputs[0]) * self.size**2 > KEPT:
-            return self._solve(inputs, p)
-        key = _content((*inputs, p))
-        known = self._solved
-        if known is None or known[0] != key:
-            known = self._solved = (key, *self._solve(inputs, p))
-        return known[1].copy(), known[2].copy()
+        return self._answers(*inputs, p)
 
     @cached_property
     def _asked(self) -> NDArray[np.bool_]:
@@ -120,8 +137,9 @@ class Equilibrium:
         *inputs, _, _ = self._symbols
         return np.array(ca.which_depends(self._expression, ca.vertcat(*inputs), 1, False), bool)
 
-    def _solve(self, inputs: Sequence[NDArray], p: NDArray) -> tuple[NDArray, NDArray]:
+    def _solve(self, *given: NDArray) -> tuple[NDArray, NDArray]:
         """As `solve`, each state of the arm once: its markers' rows have the same answer."""
+        *inputs, p = given
         asked = np.concatenate(inputs, axis=1)[:, self._asked]
         known = self._states  # once: other threads solve other parts of a table
         if known is None or not np.array_equal(known[0], asked):
@@ -317,14 +335,6 @@ class SymbolicArm:
         return y if self.implicit else self.explicit(y, 0)
 
 
-def _content(arrays: Sequence[NDArray]) -> tuple[tuple[str, tuple[int, ...], bytes], ...]:
-    """What tells the same arrays from others."""
-    return tuple((a.dtype.char, a.shape, a.tobytes()) for a in arrays)
-
-
-EVALUATIONS, KEPT_ROWS = 3, 2000  # that are kept, each of so many rows at most
-
-
 class Total:
     """y(inputs, X, extra; θ) and dy/dz at the static equilibrium F(inputs, X; θ) = 0.
 
@@ -338,7 +348,7 @@ class Total:
         self._arm, self._y, self._z = arm, arm.settled(y), z
         self._inputs = [*arm.arm.inputs.values(), *extra, arm.p, arm.arm.theta]
         self._functions: dict[tuple[int, ...], BatchFunction] = {}
-        self._kept: dict[tuple, tuple[Array, Array]] = {}
+        self._answers = LastAnswers(self._evaluated, EVALUATIONS, KEPT_ROWS)
 
     @cached_property
     def _derivative(self) -> tuple[ca.SX, ca.SX]:
@@ -360,18 +370,20 @@ class Total:
         slopes = [self._slopes] if "_slopes" in self.__dict__ else []
         return [function.report for function in (*self._functions.values(), *slopes)]
 
-    def _function(self, columns: tuple[int, ...]) -> tuple[BatchFunction, slice | list[int]]:
-        """A function of y and dy/dz, and where the `columns` stand in that: one of all columns,
-        where there is one already and they are most of them, else one of their own."""
+    def _held(self, columns: tuple[int, ...]) -> tuple[int, ...]:
+        """The columns of the function that serves these: all, where there is one of all already
+        and they are most of them, else their own."""
         every = tuple(range(self._z.shape[0]))
-        if columns != every and every in self._functions and 2 * len(columns) >= len(every):
-            return self._functions[every], list(columns)
+        return every if every in self._functions and 2 * len(columns) >= len(every) else columns
+
+    def _function(self, columns: tuple[int, ...]) -> BatchFunction:
+        """A function of y and these columns of dy/dz."""
         if columns not in self._functions:
             adjoint, slope = self._derivative
             inputs = [*self._inputs, *([ca.vec(adjoint.T)] if self._arm.implicit else [])]
             outputs = [self._y, slope[:, list(columns)]]
             self._functions[columns] = BatchFunction(inputs, outputs, self._arm.backend)
-        return self._functions[columns], slice(None)
+        return self._functions[columns]
 
     def __call__(
         self,
@@ -384,36 +396,20 @@ class Total:
 
         `columns` are those of z, by default all.
         """
-        every = tuple(range(self._z.shape[0]))
-        function, chosen = self._function(every if columns is None else columns)
-        y, slope = self._kept_or_new(function, inputs, extra, x)
-        return y[..., 0], slope[..., chosen]
+        asked = tuple(range(self._z.shape[0])) if columns is None else columns
+        held = self._held(asked)
+        y, slope = self._answers(*inputs, *extra, x, np.array(held, dtype=np.int64))
+        return y[..., 0], slope if held == asked else slope[..., list(asked)]
 
-    def _kept_or_new(
-        self, function: BatchFunction, inputs: list[NDArray], extra: Sequence[NDArray], x: Array
-    ) -> tuple[Array, Array]:
-        """What the function gives, of a small table kept from one of its last calls: a fit is
-        looked at from many sides, and each asks for B where it ended.  The caller's own to write
-        to."""
-        if len(inputs[0]) > KEPT_ROWS:
-            return self._evaluated(function, inputs, extra, x)
-        key = id(function), *_content((*inputs, *extra, x))
-        found = self._kept.pop(key, None) or self._evaluated(function, inputs, extra, x)
-        self._kept[key] = found
-        for old in list(self._kept)[:-EVALUATIONS]:
-            self._kept.pop(old, None)
-        y, slope = found
-        return y.copy(), slope.copy()
-
-    def _evaluated(
-        self, function: BatchFunction, inputs: list[NDArray], extra: Sequence[NDArray], x: Array
-    ) -> tuple[Array, Array]:
-        """y (n, m, 1) and dy/dz (n, m, k) by the function of some columns."""
-        arm, given = self._arm, [*inputs, *extra, x]
+    def _evaluated(self, *arrays: NDArray) -> tuple[Array, Array]:
+        """y (n, m, 1) and dy/dz (n, m, k) of inputs, further ones and x, by the function of the
+        columns that stand last."""
+        *given, columns = arrays
+        arm, function = self._arm, self._function(tuple(columns.tolist()))
         if not arm.implicit:
-            y, slope = function(*given, np.zeros((len(inputs[0]), arm.arm.theta.shape[0])))
+            y, slope = function(*given, np.zeros((len(given[0]), arm.arm.theta.shape[0])))
             return y, slope
-        theta, F_theta = arm.equilibrium.solve(inputs, x)
+        theta, F_theta = arm.equilibrium.solve(given[: len(arm.arm.inputs)], given[-1])
         y_theta = self._slopes(*given, theta)[0]
         y_theta[~np.isfinite(y_theta).all(axis=(1, 2))] = 0.0
         adjoint = np.linalg.solve(F_theta.transpose(0, 2, 1), y_theta.transpose(0, 2, 1))
