@@ -37,6 +37,7 @@ from elastocal.identification.knowledge import (
     share_of_prior,
 )
 from elastocal.identification.least_squares import FitProblem
+from elastocal.identification.linear_solver import least_norm
 from elastocal.identification.solve import WORTH_A_COLUMN, Solution
 from elastocal.model.manipulator import Regression
 from elastocal.text import listed, quoted
@@ -482,7 +483,7 @@ def _told_apart(
     J = np.vstack([J, A])
     lengths = np.linalg.norm(J, axis=0)
     J = J / np.where(lengths > 0, lengths, 1.0)
-    left = J[:, -1] - J[:, :-1] @ np.linalg.lstsq(J[:, :-1], J[:, -1], rcond=None)[0]
+    left = J[:, -1] - J[:, :-1] @ least_norm(J[:, :-1], J[:, -1])
     off = float(np.linalg.norm(left))
     return off > TOLD_APART and off * lengths[-1] > WORTH_A_COLUMN
 

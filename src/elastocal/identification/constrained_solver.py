@@ -13,6 +13,7 @@ from scipy import linalg, sparse
 
 from elastocal.errors import ElastocalError, require
 from elastocal.identification.knowledge import Matrix, System
+from elastocal.identification.linear_solver import least_norm
 from elastocal.identification.robust_core import huber
 from elastocal.units import Array, BoolArray
 
@@ -41,7 +42,7 @@ def equality_space(A: Array, b: Array) -> Affine:
     Q, R, _ = linalg.qr(rows.T, pivoting=True)
     sizes = np.abs(np.diag(R))
     rank = int(np.count_nonzero(sizes > RANK * sizes[0]))
-    origin = Q[:, :rank] @ np.linalg.lstsq(rows @ Q[:, :rank], values, rcond=None)[0]
+    origin = Q[:, :rank] @ least_norm(rows @ Q[:, :rank], values)
     gap = float(np.max(np.abs(rows @ origin - values)))
     return Affine(origin, Q[:, rank:], max(gap, float(np.max(np.abs(b[norms == 0]), initial=0.0))))
 
@@ -240,14 +241,15 @@ def kkt(
     """
     rows, _ = tangent_rows(system, active, x)
     gradient = objective.half_gradient(x)
-    multipliers = np.linalg.lstsq(rows.T, gradient, rcond=None)[0]
+    multipliers = least_norm(rows.T, gradient)
     left = gradient - rows.T @ multipliers
     cuts = np.cumsum([len(system.b), int(active.lower.sum()), int(active.upper.sum())])
     equalities, lower, upper, rest = np.split(multipliers, cuts)
     bounds = np.zeros(len(x))
     bounds[active.lower] += lower
     bounds[active.upper] += upper
-    matrices, wrong = [], [np.max(-lower, initial=0.0), np.max(upper, initial=0.0)]
+    matrices: list[Array] = []
+    wrong = [float(np.max(-lower, initial=0.0)), float(np.max(upper, initial=0.0))]
     inners = _matrices(rest, [N.shape[1] for N in active.nulls])
     for N, inner in zip(active.nulls, inners, strict=True):
         if inner.size:

@@ -9,6 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from elastocal.errors import ElastocalError
+from elastocal.identification.linear_solver import least_norm
 from elastocal.identification.prediction import FEWEST_REPEATS
 from elastocal.identification.residuals import held_out_residual
 from elastocal.identification.result import Calibration
@@ -100,7 +101,7 @@ def _fitted(
             if not len(columns):
                 break
             x = x.copy()
-            x[columns] += np.linalg.lstsq(weights.apply(at.B), error, rcond=None)[0]
+            x[columns] += least_norm(weights.apply(at.B), error)
     except (ElastocalError, np.linalg.LinAlgError):
         return None  # the arm without its compliances stands nowhere near: no step of a budget
     assert best is not None

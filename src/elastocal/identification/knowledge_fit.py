@@ -46,6 +46,7 @@ from elastocal.identification.knowledge import (
     share_of_prior,
 )
 from elastocal.identification.least_squares import Fit, FitProblem
+from elastocal.identification.linear_solver import least_norm
 from elastocal.identification.options import Options
 from elastocal.identification.residuals import held_out_residual
 from elastocal.identification.robust_core import median_scale
@@ -331,7 +332,7 @@ class LinearisedFit:
         R = linalg.qr(self.K * self.unit, mode="r")[0][:p]
         R = np.vstack([R, np.zeros((p - len(R), p))])
         gradient = self.unit * (self.B.T @ (self.loss.weights(self.e) * self.e))
-        z = np.linalg.lstsq(R.T, gradient, rcond=None)[0]
+        z = least_norm(R.T, gradient)
         return R / self.unit, z + R @ (self.x / self.unit)
 
     @cached_property

@@ -11,6 +11,7 @@ from scipy.optimize import least_squares
 from scipy.spatial.transform import Rotation
 
 from elastocal.errors import InputError, InsufficientDataError, option
+from elastocal.identification.linear_solver import least_norm
 from elastocal.measurements import Measurements
 from elastocal.model.chain import joint_limits
 from elastocal.model.effects.placements import BaseFrame, DistanceSensor, MarkerPosition
@@ -350,7 +351,7 @@ def any_matrix(problem: RegistrationProblem) -> tuple[Array, float]:
         here = (problem.marker == c)[:, None, None]
         columns[:, :, 12 + 3 * c : 15 + 3 * c] = -(here * problem.flange_rotation)
     matrix, target = columns.reshape(3 * n, -1), problem.flange_position.ravel()
-    x = np.linalg.lstsq(matrix, target, rcond=1e-9)[0]
+    x = least_norm(matrix, target, cond=1e-9)
     left = float(np.sqrt(np.mean((matrix @ x - target) ** 2)))
     return np.asarray(x[:9].reshape(3, 3), dtype=np.float64), left
 

@@ -17,6 +17,7 @@ from numpy.typing import NDArray
 
 from elastocal.diagnosis.diagnosis import Curve, Diagnosis
 from elastocal.errors import ElastocalError
+from elastocal.identification.linear_solver import least_norm
 from elastocal.model.manipulator import Model
 from elastocal.report.causes_view import causes, family, share_text
 from elastocal.report.diagnosis_view import error_steps
@@ -385,7 +386,7 @@ def effect_shapes(d: Diagnosis) -> list[EffectShape]:
         except (ElastocalError, KeyError):
             continue  # what it needs besides is not in the table
         moved = moved - model.predict(observed.table, base.x, observed)
-        left = base.residual - moved + B @ np.linalg.lstsq(B, moved, rcond=None)[0]
+        left = base.residual - moved + B @ least_norm(B, moved)
         b = B[:, model.names.index(f"{f.where}.offset")].reshape(-1, observed.size)
         size = (b**2).sum(axis=1)
         good = size > 0.1 * np.median(size)
