@@ -15,16 +15,19 @@ from elastocal.diagnosis import (
     NoiseValues,
     NoisyData,
     Sizes,
+    component_search,
     fit_sum,
     posed,
     with_returned,
 )
 from elastocal.diagnosis.baseline import Blocks, fit_baseline
 from elastocal.diagnosis.component_answer import PROBABLE, TOLD, SumAnswer
-from elastocal.diagnosis.component_search import WIDE, Beside, evidence_beside
+from elastocal.diagnosis.component_search import WIDE, Beside, evidence_beside, promised
+from elastocal.diagnosis.diagnose import diagnose
 from elastocal.diagnosis.diagnosis_data import diagnosis_data_of
 from elastocal.diagnosis.evidence import direct
 from elastocal.diagnosis.hypotheses import possible
+from elastocal.diagnosis.model_set import ModelSet
 from elastocal.diagnosis.noise_floor import project
 from elastocal.model.effects.gears import EncoderScale
 from elastocal.model.effects.smooth import JointCurve, Waves
@@ -172,6 +175,39 @@ def test_evidence_beside_a_sum_is_that_of_the_rows() -> None:
     # Without directions that hardly show the rest of the readings is as probable.
     shown = project(found.without_these(), found.noise).marginal
     assert shown == pytest.approx(project(found.data, found.noise).marginal, abs=1e-3)
+
+
+def test_what_components_promise_counts_once_what_two_of_them_say() -> None:
+    """Of one it is its evidence, of another besides what that has beside the first; a copy, or one
+    of which the readings say nothing, promises nothing more."""
+    data = random_data(5, p=2)
+    data = replace(data, left_out=data.left_out & False, r=0 * data.r)
+    each = 1e-14 * np.eye(data.r.shape[1])
+    data = replace(data, covariance=np.tile(each, (len(data.r), 1, 1)))
+    first, second, idle = (component(data, k, 1) for k in (1, 2, 3))
+    quiet = NoiseValues.usual(3).of_instrument()
+    r = 1e-7 * np.random.default_rng(3).normal(size=data.r.shape)
+    r = r + first.columns @ np.array([0.01]) + second.columns @ np.array([0.01])
+    data = replace(data, r=r)
+    chosen = ModelSet((), quiet, data, 0.0, ())
+    at = project(data, quiet)
+    own = [float(direct(c.columns, at).evidence(WIDE)[0]) for c in (first, second, idle)]
+    assert promised(chosen, [first]) == pytest.approx(own[0])
+    both = promised(chosen, [first, second, idle])
+    assert both == pytest.approx(own[0] + own[1], rel=0.2) and both > own[0] > 20 > 5 * own[2]
+    assert promised(chosen, [first, replace(first), second]) == pytest.approx(both, rel=0.05)
+
+
+def test_where_no_sum_is_promised_none_is_looked_for(monkeypatch: pytest.MonkeyPatch) -> None:
+    """One effect: the answer is that of a diagnosis which looks for a sum all the same."""
+    model, table = campaign("gear_eccentricity:joint4")
+    said: list[str] = []
+    short = diagnose(model, table, progress=said.append)
+    assert not any("components at once" in line for line in said)
+    monkeypatch.setattr(component_search, "PROMISING", -1.0)
+    longer = diagnose(model, table, progress=said.append)
+    assert any("components at once" in line for line in said)
+    assert short.verdict == longer.verdict == "explained" and short.effects == longer.effects
 
 
 def test_scatter_of_joints_that_the_instrument_has_taken_is_found() -> None:

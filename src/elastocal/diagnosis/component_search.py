@@ -32,6 +32,7 @@ from elastocal.diagnosis.components import (
     Pool,
     fit_sum,
     log_odds,
+    posed,
     presence_cost,
     with_own_noise,
 )
@@ -41,13 +42,24 @@ from elastocal.diagnosis.evidence import ANOTHER, log_prior_odds, spectrum
 from elastocal.diagnosis.hypotheses import Hypothesis, judged_together
 from elastocal.diagnosis.line_orders import families_of, order_posterior, ripples
 from elastocal.diagnosis.model_set import Item, ModelSet, extended, packed_columns, spans_of
-from elastocal.diagnosis.noise_floor import NoiseValues, NoisyData, posterior, project
+from elastocal.diagnosis.noise_floor import (
+    ROUNDING,
+    NoiseValues,
+    NoisyData,
+    posterior,
+    project,
+)
 from elastocal.model.effects.base import index
 from elastocal.model.effects.gears import GearSpectrum
 from elastocal.model.effects.gravity_sag import GravitySag, LinkWeights
 from elastocal.model.effects.smooth import JointCurve
-from elastocal.units import Array, Progress
+from elastocal.units import Array, IntArray, Progress
 
+# Nats by which a sum must be more probable than what the forward search found; and those that its
+# components must promise before one is looked for, since beside each other, their sizes and the
+# noise fitted, they bring up to twice as many.
+CLEARLY = 10.0
+PROMISING = CLEARLY / 2
 # Searches for more beside what has been found.
 LINE_SEARCHES, FIELD_SEARCHES, TWICE = 16, 3, 2
 MOST_FIELDS = 4  # that one search adds
@@ -55,11 +67,12 @@ MOST_FIELDS = 4  # that one search adds
 
 def search_components(
     dataset: DiagnosisData, chosen: ModelSet, progress: Progress = lambda message: None
-) -> tuple[DiagnosisData, FittedSum, tuple[Component, ...]]:
+) -> tuple[DiagnosisData, FittedSum, tuple[Component, ...]] | None:
     """The most probable sum beside the fitted parameters, the data with all its columns, and what
     may be there as well though these data do not show it.
 
-    `chosen` is what the forward search found: its searched constants are tried as they are.
+    `chosen` is what the forward search found: its searched constants are tried as they are.  None
+    where it has names and all else beside it does not promise that a sum is CLEARLY better.
     """
     full = _with_together(dataset)
     for weighed in (False, True):
@@ -71,6 +84,8 @@ def search_components(
                  for c in catalogue_components(full))  # fmt: skip
         every = [*drifts(full), *known, *_searched(full, chosen)]
         others = _first(every)
+        if not (weighed or chosen.unknown or promised(chosen, [*curves, *others]) > PROMISING):
+            return None
         progress(f"sizes of {len(curves) + len(others)} components at once")
         both = [*curves, *others]
         found = _swapped(full, fit_sum(data, both, instrument), both)
@@ -440,36 +455,73 @@ class Beside:
         scalings: Sequence[Array] | None = None,
     ) -> list[float]:  # fmt: skip
         """Of each of the columns `tried`, over none, beside all of the sum but those that are
-        `gone`; times its `scalings` (L, k) where given, at the best of these.
+        `gone`; times its `scalings` (L, k) where given, at the best of these."""
+        x = np.r_[0 : gone.start, gone.stop : len(self.prior)]
+        half = _half(self.M, self.z, self.prior, x, np.r_[(slice(0, 0), *tried)])
+        blocks, start = [], 0
+        for span in tried:
+            own = half[:, start : start + span.stop - span.start]
+            blocks.append((self.M[span, span] - own.T @ own, self.z[span] - own.T @ half[:, -1]))
+            start += own.shape[1]
+        return _evidence_of(blocks, scales, scalings)
 
-        With M the normal matrix of all columns, those of the others (x) integrated out,
-        A = M_cc − M_cx (M_xx + Λ)⁻¹ M_xc, and b the same of z.
-        """
-        p = len(self.prior)
-        x = np.r_[0 : gone.start, gone.stop : p]
-        L = self.M[np.ix_(x, x)]
-        L[np.diag_indices_from(L)] += self.prior[x]
-        L = linalg.cholesky(L, lower=True, overwrite_a=True, check_finite=False)
-        c = np.r_[(slice(0, 0), *tried)]
-        right = np.column_stack([self.M[np.ix_(x, c)], self.z[x]])
-        half = linalg.solve_triangular(L, right, lower=True, check_finite=False)
-        # Those of one width at once: hundreds of tiny decompositions cost a call each.
-        of_width = defaultdict[int, list[tuple[int, Array, Array]]](list)
-        start = 0
-        for n, span in enumerate(tried):
-            k = span.stop - span.start
-            own = half[:, start : start + k]
-            A = self.M[span, span] - own.T @ own
-            b = self.z[span] - own.T @ half[:, -1]
-            for d in np.ones((1, k)) if scalings is None else scalings[n]:
-                of_width[k].append((n, A * d * d[:, None], b * d))
-            start += k
-        best = np.full(len(tried), -np.inf)
-        for k, same in of_width.items():
-            of, A, b = (np.array(each) for each in zip(*same, strict=True))
-            found = spectrum(A, b, np.zeros((0, len(b), k)))
-            np.maximum.at(best, of, found.evidence(scales))
-        return best.tolist()
+
+def _half(M: Array, z: Array, prior: Array, x: IntArray, c: IntArray) -> Array:
+    """L⁻¹ (M_xc, z_x) (x, c + 1), LLᵀ = M_xx + Λ.
+
+    With M the normal matrix of all columns, those of the others (x) integrated out,
+    A = M_cc − M_cx (M_xx + Λ)⁻¹ M_xc, and b the same of z.
+    """
+    L = M[np.ix_(x, x)]
+    L[np.diag_indices_from(L)] += prior[x]
+    L = linalg.cholesky(L, lower=True, overwrite_a=True, check_finite=False)
+    right = np.column_stack([M[np.ix_(x, c)], z[x]])
+    return np.asarray(linalg.solve_triangular(L, right, lower=True, check_finite=False))
+
+
+def _evidence_of(
+    blocks: Sequence[tuple[Array, Array]], scales: Array, scalings: Sequence[Array] | None
+) -> list[float]:
+    """Log evidence of each group of columns by its A (k, k) and b (k,), times its `scalings`
+    (L, k) where given, at the best of these."""
+    # Those of one width at once: hundreds of tiny decompositions cost a call each.
+    of_width = defaultdict[int, list[tuple[int, Array, Array]]](list)
+    for n, (A, b) in enumerate(blocks):
+        for d in np.ones((1, len(b))) if scalings is None else scalings[n]:
+            of_width[len(b)].append((n, A * d * d[:, None], b * d))
+    best = np.full(len(blocks), -np.inf)
+    for k, same in of_width.items():
+        of, A, b = (np.array(each) for each in zip(*same, strict=True))
+        found = spectrum(A, b, np.zeros((0, len(b), k)))
+        np.maximum.at(best, of, found.evidence(scales))
+    return best.tolist()
+
+
+def promised(chosen: ModelSet, components: Sequence[Component]) -> float:
+    """Nats that components bring beside a set, whatever their being there costs: the best of them,
+    the best other one beside the set and this at its typical size, and so on.
+
+    About what a sum of all can be more probable by than the set.
+    """
+    taken, data = {id(item.what) for item in chosen.items}, chosen.data
+    others = [c for c in components if id(c.hypothesis) not in taken]
+    sums, p = posed(data, others, chosen.noise), len(data.precision)
+    M, z = sums.weighted.M, sums.weighted.z
+    prior = data.precision + ROUNDING * np.diag(M)[:p]
+    half = _half(M, z, prior, np.arange(p), np.arange(p, len(M)))
+    A = M[p:, p:] - half[:, :-1].T @ half[:, :-1]
+    b = z[p:] - half[:, :-1].T @ half[:, -1]
+    total, left = 0.0, list(zip(spans_of([c.width for c in others], len(b)), others, strict=True))
+    while left:
+        blocks = [(A[span, span], b[span]) for span, _ in left]
+        each = _evidence_of(blocks, WIDE, [c.scalings for _, c in left])
+        if (best := max(each)) <= 0:
+            break
+        total += best
+        own, _ = left.pop(int(np.argmax(each)))
+        across = np.linalg.solve(A[own, own] + np.eye(own.stop - own.start), A[own])
+        A, b = A - A[:, own] @ across, b - across.T @ b[own]
+    return total
 
 
 def evidence_beside(found: FittedSum, components: Sequence[Component]) -> list[float]:

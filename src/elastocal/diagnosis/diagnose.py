@@ -18,7 +18,7 @@ from elastocal.config import read_toml
 from elastocal.diagnosis.backlash_model import with_likelier_backlash_model
 from elastocal.diagnosis.baseline import Baseline, fit_baseline, thinned
 from elastocal.diagnosis.component_answer import SumAnswer
-from elastocal.diagnosis.component_search import compared_score, search_components
+from elastocal.diagnosis.component_search import CLEARLY, compared_score, search_components
 from elastocal.diagnosis.diagnosis import (
     SMALLEST_P,
     Diagnosis,
@@ -225,25 +225,21 @@ def diagnose(
     dataset = with_likelier_backlash_model(diagnosis_data_of(base, hypotheses))
     base = dataset.base
     dataset, search, found, screened = _searched(dataset, options, progress)
-    progress("judging all that may act at once")
-    full, total, hidden = search_components(dataset, found.chosen, progress)
-    progress("confirming")
     rng = np.random.default_rng(options.seed)
-    few, none = max(found.chosen.score, found.nothing.score), found.nothing.score
-    answer_of_sum = SumAnswer(dataset, full, total, hidden, rng).decided
-    score = compared_score(full, total, found.chosen)
-    many = score - few > CLEARLY and answer_of_sum.n_causes >= MANY
-    found = found if many else search.settled(found)
+    whole, nats, fields = _sum_of_all(dataset, found, rng, progress)
+    progress("confirming")
+    found = search.settled(found) if whole is None else found
     tests, judged = structure_tests(found.first), judge(found)
-    if many:
-        answers = _of_sum(answer_of_sum, dataset, found, tests)
+    if whole is None:
+        answers = _of_few(dataset, found, judged, tests, rng)
+        answers["fields"] = fields if judged.verdict == "unknown_effect" else ()
     else:
-        answers = _of_few(answer_of_sum, dataset, found, judged, tests)
+        answers = _of_sum(whole, dataset, found, tests)
     added = (*answers["effects"], *answers.get("slight", ()))
-    there = {(f.effect, f.where) for f in added} if many else ()
+    there = () if whole is None else {(f.effect, f.where) for f in added}
     small = [u for u in too_small(dataset, found) if (u.effect, u.where) not in there]
-    p, nothing = chance_of_noise(found, score - none if many else 0.0)
-    beside = answer_of_sum.found if many else found.chosen
+    p, nothing = chance_of_noise(found, nats)
+    beside = found.chosen if whole is None else whole.found
     return Diagnosis(
         **answers,
         candidates=candidates(dataset, found, judged),
@@ -274,29 +270,42 @@ def chance_of_noise(found: SelectedEffects, nats: float) -> tuple[float, float]:
     return max(min(p, math.exp(-nats)), SMALLEST_P), min(nothing, float(expit(-nats)))
 
 
-# Nats by which a sum of components must be more probable than what the forward search found.
-CLEARLY = 10.0
 # Causes from which on a sum is a sum: of one or two the forward search is the better judge.
 MANY = 3
 
 
+def _sum_of_all(
+    dataset: DiagnosisData, found: SelectedEffects, rng: np.random.Generator, progress: Progress
+) -> tuple[SumAnswer | None, float, tuple[FoundEffect, ...]]:
+    """The sum of all that may act at once, None where a few causes are the better answer, by how
+    many nats it is more probable than nothing, and what has no name in it."""
+    progress("judging all that may act at once")
+    if (searched := search_components(dataset, found.chosen, progress)) is None:
+        return None, 0.0, ()
+    full, total, hidden = searched
+    answer, nothing = SumAnswer(dataset, full, total, hidden, rng).decided, found.nothing.score
+    over = compared_score(full, total, found.chosen) - nothing
+    if over <= CLEARLY + max(found.chosen.score - nothing, 0.0) or answer.n_causes < MANY:
+        return None, 0.0, answer.without_names if found.chosen.unknown else ()
+    return answer, over, ()
+
+
 def _of_few(
-    answer_of_sum: SumAnswer, dataset: DiagnosisData, found: SelectedEffects, answer: Answer,
-    tests: tuple[StructureTest, ...],
+    dataset: DiagnosisData, found: SelectedEffects, answer: Answer,
+    tests: tuple[StructureTest, ...], rng: np.random.Generator,
 ) -> dict[str, Any]:  # fmt: skip
     """What a diagnosis says of what the forward search found."""
-    gap, steps = budget(dataset, found, answer_of_sum.rng)
+    gap, steps = budget(dataset, found, rng)
     return {
         "verdict": answer.verdict,
         "gap": gap,
         "budget": steps,
-        "effects": _findings(found, answer, dataset.base, gap, answer_of_sum.rng),
+        "effects": _findings(found, answer, dataset.base, gap, rng),
         "indistinguishable": answer.indistinguishable,
         "location": location(found, tests),
         "noise": noise_floor(found.dataset, found.chosen.data, found.chosen.noise),
         "probability_unknown": _unknown(found),
         "curves": curves_of(found.dataset, found.chosen),
-        "fields": answer_of_sum.without_names if answer.verdict == "unknown_effect" else (),
     }
 
 
