@@ -35,7 +35,7 @@ LARGEST_JACOBIAN = 60_000
 ROWS_THAT_PAY = 2000
 AT_A_TIME = 16_384  # rows × directions evaluated together
 KEPT = 4_000_000  # numbers of F_θ up to which an answer is kept
-EVALUATIONS, KEPT_ROWS = 3, 2000  # of y and dy/dz that are kept, each of so many rows at most
+EVALUATIONS, KEPT_ROWS = 3, 12_000  # of y and dy/dz that are kept, each of so many rows at most
 TOLERANCE = 1e-14  # rad (m for prismatic springs); Newton converges quadratically past it
 
 
