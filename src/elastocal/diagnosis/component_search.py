@@ -4,7 +4,8 @@ from __future__ import annotations
 
 from collections import Counter, defaultdict
 from collections.abc import Mapping, Sequence
-from dataclasses import replace
+from dataclasses import dataclass, replace
+from functools import cached_property
 
 import numpy as np
 from scipy import linalg
@@ -65,6 +66,19 @@ LINE_SEARCHES, FIELD_SEARCHES, TWICE = 16, 3, 2
 MOST_FIELDS = 4  # that one search adds
 
 
+@dataclass(frozen=True, eq=False)
+class TriedComponents:
+    """What a sum is looked for among: error curves of joints, and all other components."""
+
+    curves: Sequence[Component]
+    others: Sequence[Component]
+
+    @cached_property
+    def both(self) -> Sequence[Component]:
+        """One object, by which a sum knows what it has been completed from."""
+        return [*self.curves, *self.others]
+
+
 def search_components(
     dataset: DiagnosisData, chosen: ModelSet, progress: Progress = lambda message: None
 ) -> tuple[DiagnosisData, FittedSum, tuple[Component, ...]] | None:
@@ -79,16 +93,14 @@ def search_components(
         data = with_equal_noise(full)
         begun = replace(NoiseValues.usual(data.G.shape[2]), factor=0.3)
         instrument = (chosen.noise if data.stated else begun).of_instrument()
-        curves = list(joint_curves(full))
         known = (replace(c, given=weighed and isinstance(c.effect, LinkWeights))
                  for c in catalogue_components(full))  # fmt: skip
         every = [*drifts(full), *known, *_searched(full, chosen)]
-        others = _first(every)
-        if not (weighed or chosen.unknown or promised(chosen, [*curves, *others]) > PROMISING):
+        tried = TriedComponents(list(joint_curves(full)), _first(every))
+        if not (weighed or chosen.unknown or promised(chosen, tried.both) > PROMISING):
             return None
-        progress(f"sizes of {len(curves) + len(others)} components at once")
-        both = [*curves, *others]
-        found = _swapped(full, fit_sum(data, both, instrument), both)
+        progress(f"sizes of {len(tried.both)} components at once")
+        found = _swapped(full, fit_sum(data, tried.both, instrument), tried.both)
         if weighed or not any(isinstance(c.effect, LinkWeights) for c in found.components):
             break
         # A compliance that was fitted without weights is wrong, and so are their columns by it.
@@ -96,7 +108,7 @@ def search_components(
     found = with_own_axes(found)
     if len(full.blocks.member) <= FEW_POSES:
         progress("families of lines before curves")
-        found = _with_lines_first(full, found, curves, others, both, instrument)
+        found = _with_lines_first(full, found, tried, instrument)
     else:
         progress("families of lines beside the components")
         found = _with_lines(full, found)
@@ -113,41 +125,40 @@ def search_components(
             break
         found = wider
     progress("what can be left out")
-    found = _swapped(full, with_own_axes(found), both)
-    found = completed(with_shorter_drifts(full, _spared(found)), both)
+    found = _swapped(full, with_own_axes(found), tried.both)
+    found = completed(with_shorter_drifts(full, _spared(found)), tried.both)
     if len(full.blocks.member) <= FEW_POSES:
         for _ in range(TWICE):
             before = with_likelier_orders(full, with_expected_families(full, found))
             # Which of two laws the last move follows shows where the lines are right.
-            found = completed(before, both)
+            found = completed(before, tried.both)
             if found.score <= before.score + GAINED:
                 break
             found = _with_lines(full, found)
-    return full, found, hidden_fellows(found, others)
+    return full, found, hidden_fellows(found, tried.others)
 
 
 def _with_lines_first(
-    dataset: DiagnosisData, found: FittedSum, curves: Sequence[Component],
-    others: Sequence[Component], both: Sequence[Component], instrument: NoiseValues,
-) -> FittedSum:  # fmt: skip
+    dataset: DiagnosisData, found: FittedSum, tried: TriedComponents, instrument: NoiseValues
+) -> FittedSum:
     """The sum with families of lines, sought beside the others before curves join.
 
     A curve takes up the lines of its joint as far as few poses show them, and then none of them
     stands out.  A sum without curves is one of the others already.
     """
-    curved = any(c is curve for c in found.components for curve in curves)
-    first, pool = found, both
+    curved = any(c is curve for c in found.components for curve in tried.curves)
+    first, pool = found, tried.both
     if curved:
-        alone = fit_sum(found.sums.data, others, instrument)
-        first, pool = _swapped(dataset, alone, others), others
+        alone = fit_sum(found.sums.data, tried.others, instrument)
+        first, pool = _swapped(dataset, alone, tried.others), tried.others
     first = begun = _spared(completed(first, pool))
     for _ in range(TWICE):
         before = first
-        first = completed(_with_lines(dataset, first), both)
+        first = completed(_with_lines(dataset, first), tried.both)
         if first.score <= before.score + GAINED:
             break
     if curved or first is not begun:
-        first = _wider(first, curves)
+        first = _wider(first, tried.curves)
     return first if not curved or first.score > found.score else _with_lines(dataset, found)
 
 
