@@ -44,7 +44,7 @@ def test_the_cell_it_writes_plans_and_simulates_as_it_is(name, arms):
     assert cell.workspace.keep_out[0].name == "mounting plane" and cell.tool.markers
     assert cell.model.link_gravity == bool(model.chain.masses)
     code, _, err = run("design", "cell.toml", "-o", "plan.csv", "--effort", "quick", "--poses",
-                       "12", "--candidates", "60", "-q")  # fmt: skip
+                       "12", "--candidates", "30", "-q")  # fmt: skip
     assert code == 0, err
     code, out, err = run(*out.splitlines()[-1].split()[1:], "--truth", "t.json")  # as init says it
     assert code == 0, err

@@ -57,6 +57,7 @@ def draws_of(data: NoisyData, components: list[Component], log_sizes: Array, see
     return drawn(whole, (), wide.weighted, precision, 200, rng).coefficients[-sum(widths) :]
 
 
+@pytest.mark.long
 def test_what_is_drawn_from_the_prior_lies_where_draws_say(any_hypothesis: Hypothesis) -> None:
     """Kinds that are there or not, at some of four places, as alike as they happen to be: 90 % of
     the draws' intervals hold what is true, over all that the prior may bring."""
@@ -184,7 +185,7 @@ def test_what_is_hidden_pays_for_being_there(any_hypothesis: Hypothesis) -> None
     assert (w[-1] == 0).mean() > 0.5
 
 
-@pytest.mark.parametrize("fellows", [(), (0.0, 0.3, -0.4)])
+@pytest.mark.parametrize("fellows", [pytest.param((), marks=pytest.mark.long), (0.0, 0.3, -0.4)])
 def test_lines_that_are_not_seen_are_drawn_as_they_are(
     any_hypothesis: Hypothesis, fellows: tuple[float, ...]
 ) -> None:

@@ -24,6 +24,7 @@ from elastocal.model import evaluate as backend_module
 
 X = ca.SX.sym("x", 2)
 ROWS = np.linspace(0.1, 2.0, 20).reshape(10, 2)
+MANY = np.linspace(0.1, 2.0, 400).reshape(200, 2)  # too many for CasADi row by row
 
 
 @pytest.fixture(autouse=True)
@@ -94,12 +95,25 @@ def test_compiled_compiles_at_once_and_once(
 # --- chosen by rule ------------------------------------------------------------------------
 
 
+def test_few_rows_are_evaluated_by_casadi_as_by_numpy() -> None:
+    """Sparse outputs, what is the same in all rows, no row at all; and no more of them than pay."""
+    p = ca.SX.sym("p", 2)
+    sparse = ca.diagcat(X[0] * p[1], ca.atan2(X[1], p[0]), ca.if_else(X[0] > 1, X[1] ** 3, 0))
+    few, plain = (BatchFunction([X, p], [sparse, X + p], name) for name in (None, "numpy"))
+    for n in (0, 1, 10):
+        for found, expected in zip(*(f(ROWS[:n], ROWS[3]) for f in (few, plain)), strict=True):
+            np.testing.assert_array_equal(found, expected)
+        assert few.report.backend == "casadi"
+    few(MANY, ROWS[3])
+    assert few.report.backend == "numpy"
+
+
 def test_auto_replays_what_compiling_would_not_pay_for(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setenv("CC", str(counting_compiler(tmp_path)))
     once = function()
-    once(ROWS)
+    once(MANY)
     assert once.report.backend == "numpy"
     assert compilations(tmp_path) == 0
 
@@ -110,11 +124,11 @@ def test_auto_compiles_once_replaying_has_cost_as_much(monkeypatch: pytest.Monke
     calls = function()
     # Of five calls' waste the price of the compiler, so that the fifth call buys it.
     each = Work(calls.n_instructions)
-    each.add(len(ROWS), 1)
+    each.add(len(MANY), 1)
     monkeypatch.setattr(backend_module, "COMPILE_START", 4.5 * each.wasted)
     used = []
     for _ in range(7):
-        calls(ROWS)
+        calls(MANY)
         used.append(calls.report.backend)
     assert used == ["numpy"] * 4 + ["compiled"] * 3
 
@@ -122,8 +136,9 @@ def test_auto_compiles_once_replaying_has_cost_as_much(monkeypatch: pytest.Monke
 def test_the_call_itself_counts_before_it_is_made(monkeypatch: pytest.MonkeyPatch) -> None:
     system_compiler()
     monkeypatch.setattr(backend_module, "NUMPY_ROW", 1.0)
+    monkeypatch.setattr(backend_module, "CASADI_ROW", 1.0)
     large = function()
-    large(ROWS)
+    large(MANY)
     assert large.report.backend == "compiled"
 
 
@@ -158,7 +173,7 @@ def test_no_compiler_is_replayed_and_said(tmp_path: Path, monkeypatch: pytest.Mo
     without_compiler(monkeypatch, tmp_path)
     impatient(monkeypatch)
     without = function()
-    np.testing.assert_allclose(without(ROWS)[0][:, 1, 0], ROWS[:, 0] / ROWS[:, 1])
+    np.testing.assert_allclose(without(MANY)[0][:, 1, 0], MANY[:, 0] / MANY[:, 1])
     assert without.report.backend == "numpy"
     assert "no C compiler on the PATH" in without.report.reason
 
@@ -190,7 +205,7 @@ def test_a_compiler_that_fails_is_replayed_and_said(
     monkeypatch.setenv("CC", str(failing_compiler(tmp_path)))
     impatient(monkeypatch)
     failing = function()
-    failing(ROWS)
+    failing(MANY)
     assert failing.report.backend == "numpy"
     assert "exit code 3: out of ink" in failing.report.reason
     with pytest.raises(InputError, match="out of ink"):

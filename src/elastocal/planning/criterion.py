@@ -163,14 +163,22 @@ class Interest:
     def count(self) -> int:
         return len(self.interest)
 
+    @cached_property
+    def _orders(self) -> dict[int, IntArray]:
+        """What `ordered` gave before: a search asks for the same at every exchange."""
+        return {}
+
     def ordered(self, parameters: int) -> IntArray:
         """Indices (p,) of nuisance parameters first, then `interest`."""
+        if parameters in self._orders:
+            return self._orders[parameters]
         require(
             int(np.max(self.interest)) < parameters,
             f"parameter of interest {int(np.max(self.interest))} does not exist: there are "
             f"{parameters}",
         )
-        return np.concatenate([np.setdiff1d(np.arange(parameters), self.interest), self.interest])
+        nuisance = np.setdiff1d(np.arange(parameters), self.interest)
+        return self._orders.setdefault(parameters, np.concatenate([nuisance, self.interest]))
 
     def factor(self, M: Array) -> InformationFactor:
         """L L' = M in that order; its last k rows and columns give those of M_I."""

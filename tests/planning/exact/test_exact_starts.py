@@ -30,8 +30,8 @@ def rough(seed: int = 0) -> DesignProblem:
     """A pool in whose local optima starts end that differ."""
     rng = np.random.default_rng(seed)
     criterion = make_criterion("E", parameters=7, interest=np.arange(7))
-    blocks = rng.normal(size=(1, 45, 2, 7))
-    group = np.arange(45) % 3
+    blocks = rng.normal(size=(1, 30, 2, 7))
+    group = np.arange(30) % 3
     return DesignProblem(blocks, np.zeros((1, 7, 7)), group, np.array([3, 3, 3]), criterion)
 
 
