@@ -1,4 +1,5 @@
-"""B of a whole table, seven ways: CasADi's, numpy by hand, a bare C loop, and elastocal's two.
+"""B of a whole table, seven ways: CasADi's, numpy by hand, a bare C loop, and elastocal's two; and
+of few rows by elastocal's third, which is CasADi again.
 
     python benchmarks/evaluation.py [--size tiny|short|full] [--json FILE]
 
@@ -30,6 +31,7 @@ from elastocal.model import BatchFunction, Model, row_inputs
 
 ROWS = {"tiny": (300, 2000), "short": (300, 10_000, 100_000, 1_000_000)}
 ROWS["full"] = ROWS["short"]
+FEW = (1, 4, 16, 64)
 AT_A_TIME = 100_000  # rows whose B is held at once: 122 MB
 LOOP, BUFFER, MAP = "CasADi, Python loop", "CasADi, FunctionBuffer in a loop", "CasADi, map"
 HAND, BARE = "numpy, by hand", "C by CasADi, -O3, bare loop"
@@ -130,6 +132,23 @@ def whole_calls(folder: Path, part: Part, sizes: tuple[int, ...]) -> None:
     part.tables.append(table)
 
 
+def few_rows(model: Model, part: Part) -> None:
+    """A call for so few rows that numpy's calls are most of it."""
+    ways = Ways(model, FEW[-1])
+    tape = BatchFunction(ways.f.sx_in(), ways.f(*ways.f.sx_in()))
+    table = Table(
+        "A call for few rows, prediction and B, `--backend auto`",
+        ["rows", "evaluated by", "wall, ms", "numpy, wall, ms", "numpy over it"],
+    )
+    for n in FEW:
+        arrays = ways.arrays(model, n)
+        took = race({"auto": lambda a=arrays: tape(*a),
+                     REPLAY: lambda a=arrays, n=n: ways.run[REPLAY](a, n)}, 5, 0.3)  # fmt: skip
+        auto, numpy = took["auto"].wall * 1e3, took[REPLAY].wall * 1e3
+        table.rows.append([n, tape.report.backend, auto, numpy, numpy / auto])
+    part.tables.append(table)
+
+
 def threads(model: Model, part: Part, n: int) -> None:
     """Ours on one thread and on all cores."""
     cores = len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count()
@@ -196,6 +215,7 @@ def measure(size: str) -> Part:
                 table.rows.append([way, *times, differences.get(way)])
             part.tables.append(table)
         whole_calls(folder, part, rows_of[:2])
+        few_rows(model, part)
     os.environ.pop("OMP_NUM_THREADS")
     threads(model, part, largest)
     memory(part, size, largest)
