@@ -132,9 +132,8 @@ def whole_calls(folder: Path, part: Part, sizes: tuple[int, ...]) -> None:
     part.tables.append(table)
 
 
-def few_rows(model: Model, part: Part) -> None:
+def few_rows(ways: Ways, model: Model, part: Part) -> None:
     """A call for so few rows that numpy's calls are most of it."""
-    ways = Ways(model, FEW[-1])
     tape = BatchFunction(ways.f.sx_in(), ways.f(*ways.f.sx_in()))
     table = Table(
         "A call for few rows, prediction and B, `--backend auto`",
@@ -203,7 +202,8 @@ def measure(size: str) -> Part:
     with tempfile.TemporaryDirectory() as name:
         folder = Path(name)
         model = kr270(folder, GEOMETRY)
-        differences = agreement(Ways(model, 97), model)
+        ways = Ways(model, 97)
+        differences = agreement(ways, model)
         micro = {rows: timed(model, rows, size) for rows in rows_of}
         for k, clock in ((1, "CPU"), (0, "wall")):
             table = Table(
@@ -215,7 +215,7 @@ def measure(size: str) -> Part:
                 table.rows.append([way, *times, differences.get(way)])
             part.tables.append(table)
         whole_calls(folder, part, rows_of[:2])
-        few_rows(model, part)
+        few_rows(ways, model, part)
     os.environ.pop("OMP_NUM_THREADS")
     threads(model, part, largest)
     memory(part, size, largest)

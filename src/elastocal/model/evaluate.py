@@ -254,7 +254,7 @@ class BatchFunction:
     input is.  `backend` is "auto", "numpy" or "compiled"; None follows ELASTOCAL_BACKEND.
     Complex numbers are always evaluated by numpy; under "auto" few rows by CasADi.
 
-    A call raises NotImplementedError for an operation that numpy lacks, ValueError
+    By numpy a call raises NotImplementedError for an operation that it lacks, by all ValueError
     for arrays of other shapes, InputError where `backend` is "compiled" and nothing can compile.
     """
 
