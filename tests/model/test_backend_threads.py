@@ -14,8 +14,7 @@ from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 from support.backends import system_compiler
 
-from elastocal.model import BatchFunction, row_blocks, run_blocks, thread_count
-from elastocal.model import evaluate as tape_module
+from elastocal.model import BatchFunction, c_engine, row_blocks, run_blocks, thread_count
 from elastocal.model.evaluate import CHUNK, ahead
 
 
@@ -98,7 +97,7 @@ def test_results_do_not_depend_on_the_number_of_threads(
 ) -> None:
     if backend == "compiled":
         system_compiler()
-    monkeypatch.setattr(tape_module, "WORK_OF_A_THREAD", 1)
+    monkeypatch.setattr(c_engine, "WORK_OF_A_THREAD", 1)
     x = np.abs(np.random.default_rng(0).normal(size=(3 * CHUNK + 17, 3)))
     found = {}
     for threads in (1, 3):

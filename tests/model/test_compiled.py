@@ -13,7 +13,7 @@ from support.expressions import X, Y, built
 
 from elastocal.measurements import Measurements
 from elastocal.model import BatchFunction, Model
-from elastocal.model.evaluate import COMPILED_CHUNK
+from elastocal.model.c_engine import COMPILED_CHUNK
 
 RELATIVE = 1e-12
 EFFECTS = ("joint_offset", "joint_compliance", "marker_position")

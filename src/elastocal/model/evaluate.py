@@ -202,10 +202,6 @@ def summary(reports: Iterable[BackendReport]) -> str:
 
 
 CHUNK = 8192  # rows at a time: registers stay in cache, numpy's call overhead is spread
-COMPILED_CHUNK = 1024  # compiled code has no overhead to spread; small pieces share out evenly
-LARGEST_BUFFER = 2**23  # numbers in the registers and outputs of one block
-# Compiled code takes about 0.15 ns per instruction and row; a thread must have 0.5 ms to do.
-WORK_OF_A_THREAD = 3_000_000  # instructions × rows
 
 
 class RowByRow:
@@ -215,10 +211,16 @@ class RowByRow:
     instructions one row takes CasADi 0.2 ms and numpy 2 to 3 ms, 16 rows 0.7 and 2.3 ms.
     """
 
+    name, largest_block = "casadi", CHUNK
+
     def __init__(self, function: HashedFunction) -> None:
         self._function = function.function
         outputs = range(self._function.n_out())
         self._places = [row_by_row(self._function.sparsity_out(k)) for k in outputs]
+
+    def threads(self, rows: int) -> int:
+        """One: CasADi evaluates few rows, and holds the interpreter's lock."""
+        return 1
 
     def evaluate(
         self, inputs: Sequence[NDArray], results: Sequence[NDArray], blocks: Sequence[slice]
@@ -303,16 +305,8 @@ class BatchFunction:
         dtype = np.result_type(np.float64, *arrays)
         results = [np.zeros((n, r, c), dtype=dtype) for r, c in self.shapes]
         engine = self._engine(dtype, n, -(-n // max(chunk, 1)))
-        if isinstance(engine, RowByRow):
-            blocks, threads = [slice(0, n)], 1
-        elif isinstance(engine, Compiled):
-            blocks = row_blocks(n, min(chunk, COMPILED_CHUNK))
-            threads = 1 + n * self.n_instructions // WORK_OF_A_THREAD
-        else:
-            width = engine.n_registers + sum(r * c for r, c in self.shapes)
-            blocks = row_blocks(n, min(chunk, max(LARGEST_BUFFER // max(width, 1), 1)))
-            threads = len(blocks)
-        threads = min(threads, len(blocks), _threads_here())
+        blocks = row_blocks(n, min(chunk, engine.largest_block))
+        threads = max(1, min(engine.threads(n), len(blocks), _threads_here()))
         self._note(engine, threads)
         run_blocks(lambda share: engine.evaluate(arrays, results, share), blocks, threads)
         return results
@@ -359,13 +353,11 @@ class BatchFunction:
         return None
 
     def _note(self, engine: Engine, threads: int) -> None:
-        threads = max(threads, 1)
         if isinstance(engine, Compiled):
             compiler = str(engine.compiler)
-            self._report = BackendReport("compiled", compiler, threads, engine.cached)
+            self._report = BackendReport(engine.name, compiler, threads, engine.cached)
         else:
-            name = "casadi" if isinstance(engine, RowByRow) else "numpy"
-            self._report = BackendReport(name, threads=threads, reason=self._refused)
+            self._report = BackendReport(engine.name, threads=threads, reason=self._refused)
 
 
 def _threads_here() -> int:

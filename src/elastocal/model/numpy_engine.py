@@ -141,6 +141,8 @@ def _steps(f: ca.Function, constants: list[float]) -> Iterator[tuple[int, int, i
             raise NotImplementedError(f"CasADi operation {code} has no numpy counterpart")
 
 
+LARGEST_BUFFER = 2**23  # numbers in the registers and outputs of one block
+
 # Instructions carried out on numpy arrays, one call per instruction and block of rows.
 #
 # A CasADi `SX` function is a list of scalar instructions.  Carrying out each once on an
@@ -157,9 +159,17 @@ class NumpyFunction:
     for.
     """
 
+    name = "numpy"
+
     def __init__(self, function: HashedFunction) -> None:
         self._table, self._constants, self.n_registers = instructions(function)
+        width = self.n_registers + sum(r * c for r, c in function.shapes)
+        self.largest_block = max(LARGEST_BUFFER // max(width, 1), 1)
         self._steps: dict[tuple[bool, ...], Steps] = {}
+
+    def threads(self, rows: int) -> int:
+        """As many as there are blocks: numpy lets others run while it computes a long array."""
+        return rows
 
     def evaluate(
         self, inputs: Sequence[NDArray], results: Sequence[NDArray], blocks: Sequence[slice]
