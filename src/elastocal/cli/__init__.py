@@ -27,7 +27,7 @@ from elastocal.screen import close_streams, prepare_streams
 
 # New containers between two searches for garbage in cycles.  Python's own 700 has every import and
 # every fit walked through all that is loaded, 0.07 s each time, and finds nothing.
-COLLECT_AFTER = 20_000
+COLLECT_AFTER = 100_000
 
 
 def main() -> None:

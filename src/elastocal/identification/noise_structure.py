@@ -538,13 +538,18 @@ class SharedEffect:
     def product(self, members: IntArray, other: SharedEffect, others: IntArray) -> Array:
         """Σ ℓ ℓᵀ (G, n, size, k, size) of the sets `members` (G, n) and `others` (G, k)."""
         mine, theirs = self.unit[members], other.unit[others]
-        same = (mine[:, :, None, :, None] == theirs[:, None, :, None, :]) & (
-            mine[:, :, None, :, None] >= 0
-        )
         a, b = self.loading[members], other.loading[others]
-        return np.asarray(
-            np.einsum("gnkab,gnasr,gkbtr->gnskt", same.astype(float), a, b, optimize=True)
-        )
+        (G, n, own, size, r), (k, units) = a.shape, theirs.shape[1:]
+        out = np.zeros((G, n, size, k, size))
+        # Products of matrices for the one or two units of a set: einsum took twenty times as long.
+        for i, j in np.ndindex(own, units):
+            unit = mine[:, :, None, i]
+            same = (unit == theirs[:, None, :, j]) & (unit >= 0)
+            rows = a[:, :, i].reshape(G, n * size, r)
+            columns = b[:, :, j].reshape(G, k * size, r)
+            each = (rows @ columns.transpose(0, 2, 1)).reshape(out.shape)
+            out += np.multiply(each, same[:, :, None, :, None], out=each)
+        return out
 
 
 def _common(

@@ -228,20 +228,27 @@ class RowByRow:
         """Rows of `blocks` of `results` (n, rows, columns)."""
         call: Any
         call, run = self._function.buffer()
-        given = [np.zeros(a.shape[-1]) if a.ndim == 2 else a.copy() for a in inputs]
-        found = [np.zeros(len(places)) for places in self._places]
-        for k, array in enumerate(given):
-            call.set_arg(k, array.data)
-        for k, array in enumerate(found):
-            call.set_res(k, array.data)
-        varying = [(array, a) for array, a in zip(given, inputs, strict=True) if a.ndim == 2]
-        flat = [r.reshape(len(r), r.shape[1] * r.shape[2]) for r in results]
-        for i in (i for block in blocks for i in range(block.start, block.stop)):
-            for array, a in varying:
-                array[:] = a[i]
+        # All that varies by row side by side, and all that is found: one copy each for a row.
+        varying = [a for a in inputs if a.ndim == 2]
+        rows = np.concatenate(varying, axis=1) if varying else np.zeros((1, 0))
+        edges = np.cumsum([0, *(len(places) for places in self._places)]).tolist()
+        given, found = np.zeros(rows.shape[1]), np.zeros(edges[-1])
+        held, at = [], 0
+        for k, a in enumerate(inputs):
+            held.append(given[at : at + a.shape[1]] if a.ndim == 2 else a.copy())
+            at += a.shape[1] if a.ndim == 2 else 0
+            call.set_arg(k, held[k].data)
+        for k, (first, last) in enumerate(pairwise(edges)):
+            call.set_res(k, found[first:last].data)
+        numbers = [i for block in blocks for i in range(block.start, block.stop)]
+        all_found = np.empty((len(numbers), len(found)))
+        for i, out in zip(numbers, all_found, strict=True):
+            given[:] = rows[i]
             run()
-            for f, places, array in zip(flat, self._places, found, strict=True):
-                f[i, places] = array
+            out[:] = found
+        for result, places, first in zip(results, self._places, edges, strict=False):
+            flat = result.reshape(len(result), result.shape[1] * result.shape[2])
+            flat[np.ix_(numbers, places)] = all_found[:, first : first + len(places)]
 
 
 Engine = RowByRow | NumpyFunction | Compiled
