@@ -438,3 +438,8 @@ def test_many_springs_settle_by_slopes_along_directions_as_by_the_whole_jacobian
         if solver._rows <= 2 * len(poses):
             assert "_whole" not in vars(solver)
     assert "_along" in vars(solver) and "_whole" in vars(solver)
+    monkeypatch.setattr(equilibrium, "ROWS_THAT_PAY", 10**6)
+    model = kr270("joint_compliance", "off_axis_compliance", "marker_position")
+    several = model.predict(poses, np.stack([whole.nominal, x]))
+    np.testing.assert_allclose(several[1], expected.prediction, rtol=0, atol=1e-14)
+    assert "_whole" not in vars(model._symbolic.equilibrium)

@@ -528,13 +528,13 @@ def bent(solution: Solution, covariance: Array) -> Array:
     parts = problem.parts
     looked = parts.part((0, n)) if n <= BENT_SAMPLE else sample(parts, BENT_SAMPLE)
     residual, B = found.residual[looked.rows], found.B[looked.rows] * size
-    rng, moved = np.random.default_rng(0), -2 * np.tile(residual, (BENDS, 1))
-    for k, delta in enumerate(typical * rng.standard_normal((BENDS, len(dropped)))):
-        step = np.zeros(len(found.x))
-        step[dropped] = delta
-        step[kept] = root @ rng.standard_normal(len(kept)) - chosen.mixing @ delta
-        for sign in (1, -1):
-            moved[k] += residual_of(problem.model, looked, found.x + sign * step)
+    rng, steps = np.random.default_rng(0), np.zeros((BENDS, len(found.x)))
+    steps[:, dropped] = delta = typical * rng.standard_normal((BENDS, len(dropped)))
+    steps[:, kept] = rng.standard_normal((BENDS, len(kept))) @ root.T - delta @ chosen.mixing.T
+    there, opposite = np.split(
+        residual_of(problem.model, looked, found.x + np.concatenate([steps, -steps])), 2
+    )
+    moved = there + opposite - 2 * residual
     if not np.isfinite(moved).all():
         return none  # so far out the arm has no equilibrium
     apply = looked.weights.apply

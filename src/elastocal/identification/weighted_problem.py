@@ -628,7 +628,8 @@ def residual_at(model: Model, parts: Partition, x: Array) -> Array:
 
 
 def residual_of(model: Model, part: Part, x: Array) -> Array:
-    """Observed minus predicted (rows,) of a part at x; NaN in readings without equilibrium."""
+    """Observed minus predicted (rows,) of a part at x, or (k, rows) at several; NaN in readings
+    without equilibrium."""
     observed = part.observations
     return np.asarray(observed.value - model.predict(observed.table, x, observed))
 

@@ -20,7 +20,7 @@ from elastocal.model.choice import cell_of, load_chain
 from elastocal.model.effects import effect_of
 from elastocal.model.effects.base import Effect
 from elastocal.model.effects.driven import JointMotion
-from elastocal.model.evaluate import summary
+from elastocal.model.evaluate import CHUNK, row_blocks, summary
 from elastocal.model.observations import Observations, observe
 from elastocal.model.symbolic import SymbolicArm
 from elastocal.text import listed
@@ -327,12 +327,13 @@ class Model:
 
         Args:
             table: Readings, or rows of `simulate`: what was commanded and how it was loaded.
-            x: Parameter values (parameters,) in SI units; default the nominal ones.
+            x: Parameter values (parameters,) in SI units, or several (k, parameters); default the
+                nominal ones.
             observations: What `observe` made of the table, which spares pairing it anew.
 
         Returns:
-            (rows,), observations × components in m (rad), in the table's order; NaN where there
-            is no static equilibrium.
+            (rows,), observations × components in m (rad), in the table's order, or (k, rows); NaN
+            where there is no static equilibrium.
 
         Examples:
             >>> model = ec.Model("cell.toml")
@@ -341,8 +342,24 @@ class Model:
         """
         x = self.nominal if x is None else np.asarray(x)
         inputs = row_inputs(self._symbolic.arm, table)
+        observed = observations or observe(table, self.observe)
+        if x.ndim == 2:
+            # Together, as many as make up a block: a call for each takes several times as long.
+            blocks = row_blocks(len(x), CHUNK // max(len(table), 1))
+            h = np.concatenate([self._readings(inputs, x[some]) for some in blocks])
+            return observed.apply(h.transpose(1, 2, 0)).reshape(-1, len(x)).T
         h = self._symbolic.function("reading")(*inputs, x, self._settle(inputs, x))[0][..., 0]
-        return (observations or observe(table, self.observe)).apply(h).ravel()
+        return observed.apply(h).ravel()
+
+    def _readings(self, inputs: list[NDArray], several: Array) -> Array:
+        """Readings (k, rows, size) of the rows at each of `several` parameter values (k, …)."""
+        symbolic, (k, n) = self._symbolic, (len(several), len(inputs[0]))
+        theta = np.zeros((k * n, len(symbolic.arm.springs)))
+        if symbolic.implicit:
+            theta = symbolic.equilibrium.solve_each(inputs, several).reshape(theta.shape)
+        rows = [np.tile(a, (k, 1)) for a in inputs]
+        (h,) = symbolic.function("reading")(*rows, np.repeat(several, n, axis=0), theta)
+        return h.reshape(k, n, -1)
 
     def B(self, table: Measurements, x: Array | None = None) -> NDArray:
         """The regressor B = ∂prediction/∂X (eq. 4 of Klimchik et al. 2013) of a whole table.

@@ -107,7 +107,7 @@ class Equilibrium:
     def _residual(
         self, inputs: Sequence[NDArray], p: NDArray, theta: NDArray
     ) -> tuple[NDArray, NDArray]:
-        """F (n, size, 1) and F_θ (n, size, size)."""
+        """F (n, size, 1) and F_θ (n, size, size); p (parameters,), or (n, parameters) by row."""
         self._rows += len(theta)
         if not self._large or self._rows > ROWS_THAT_PAY:
             self._last = self._whole
@@ -118,8 +118,11 @@ class Equilibrium:
         F_theta = np.empty((len(theta), self.size, self.size), dtype=F.dtype)
         for block in row_blocks(len(theta), max(AT_A_TIME // self.size, 1)):
             n = block.stop - block.start
-            rows = [np.repeat(a[block], self.size, axis=0) for a in (*inputs, theta)]
-            (slope,) = self._along(*rows[:-1], p, rows[-1], np.tile(np.eye(self.size), (n, 1)))
+            rows = [
+                np.repeat(a[block], self.size, axis=0) if a.ndim == 2 else a
+                for a in (*inputs, p, theta)
+            ]
+            (slope,) = self._along(*rows, np.tile(np.eye(self.size), (n, 1)))
             F_theta[block] = slope.reshape(n, self.size, self.size).transpose(0, 2, 1)
         return F, F_theta
 
@@ -137,20 +140,31 @@ class Equilibrium:
         *inputs, _, _ = self._symbols
         return np.array(ca.which_depends(self._expression, ca.vertcat(*inputs), 1, False), bool)
 
+    def solve_each(self, inputs: Sequence[NDArray], several: NDArray) -> NDArray:
+        """θ (k, n, size) of all rows at each of `several` parameter values (k, parameters)."""
+        state, first = self._states_of(inputs)
+        rows = [np.tile(a[first], (len(several), 1)) for a in inputs]
+        theta, _ = self._settled(rows, np.repeat(several, len(first), axis=0))
+        return theta.reshape(len(several), len(first), self.size)[:, state]
+
     def _solve(self, *given: NDArray) -> tuple[NDArray, NDArray]:
         """As `solve`, each state of the arm once: its markers' rows have the same answer."""
         *inputs, p = given
+        state, first = self._states_of(inputs)
+        if len(first) == len(state):
+            return self._settled(inputs, p)
+        theta, F_theta = self._settled([a[first] for a in inputs], p)
+        return theta[state], F_theta[state]
+
+    def _states_of(self, inputs: Sequence[NDArray]) -> tuple[IntArray, IntArray]:
+        """Number (n,) of each row's state of the arm, and the first row of each."""
         asked = np.concatenate(inputs, axis=1)[:, self._asked]
         known = self._states  # once: other threads solve other parts of a table
         if known is None or not np.array_equal(known[0], asked):
             state = numbered(np.zeros(len(asked)), *asked.T)
             known = asked, state, firsts(state, int(state.max(initial=-1)) + 1)
             self._states = known
-        _, state, first = known
-        if len(first) == len(state):
-            return self._settled(inputs, p)
-        theta, F_theta = self._settled([a[first] for a in inputs], p)
-        return theta[state], F_theta[state]
+        return known[1:]
 
     def _settled(self, inputs: Sequence[NDArray], p: NDArray) -> tuple[NDArray, NDArray]:
         theta, F_theta = self._stationary(inputs, p, len(inputs[0]))
@@ -177,8 +191,8 @@ class Equilibrium:
         slope = np.full((n, self.size, self.size), np.nan, dtype=theta.dtype)
         active = np.arange(n)
         for _ in range(MAX_STEPS):
-            rows = [a[active] for a in inputs]
-            F, F_theta = self._residual(rows, p, theta[active])
+            *rows, at = [a[active] if a.ndim == 2 else a for a in (*inputs, p)]
+            F, F_theta = self._residual(rows, at, theta[active])
             finite = np.isfinite(F_theta).all(axis=(1, 2)) & np.isfinite(F[..., 0]).all(axis=1)
             theta[active[~finite]] = np.nan
             active, F, F_theta = active[finite], F[finite], F_theta[finite]
