@@ -169,5 +169,6 @@ def test_pinocchio_failure_becomes_an_input_error(tmp_path: Path, monkeypatch) -
         raise ValueError("bad tree")
 
     monkeypatch.setattr(pin, "buildModelFromXML", fail)
+    monkeypatch.setenv("ELASTOCAL_CACHE", str(tmp_path / "empty"))
     with pytest.raises(InputError, match="pinocchio cannot read it: bad tree"):
         read(tmp_path, arm())

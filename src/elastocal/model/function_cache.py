@@ -3,16 +3,21 @@
 from __future__ import annotations
 
 import hashlib
+import io
 import os
 import re
 import stat
 import sys
-from collections.abc import Sequence
+import zipfile
+import zlib
+from collections.abc import Mapping, Sequence
 from contextlib import suppress
 from functools import cached_property
 from pathlib import Path
 
 import casadi as ca
+import numpy as np
+from numpy.typing import NDArray
 
 from elastocal.errors import InputError
 from elastocal.files import HOW_TO_OPEN, atomic_write_bytes, remove_abandoned
@@ -179,6 +184,25 @@ def fetch(key: str, suffix: str) -> Path | None:
                 return path
             path.unlink()
     return None
+
+
+def fetch_arrays(key: str, suffix: str) -> dict[str, NDArray] | None:
+    """The arrays by name of an entry that `store_arrays` wrote; None where there is none."""
+    found = fetch(key, suffix)
+    if found is None:
+        return None
+    try:
+        with np.load(found, allow_pickle=False) as saved:
+            return {name: saved[name] for name in saved.files}
+    except (OSError, ValueError, KeyError, EOFError, zipfile.BadZipFile, zlib.error):
+        return None  # another process removed it, or it is none of ours
+
+
+def store_arrays(key: str, suffix: str, arrays: Mapping[str, NDArray]) -> None:
+    """Arrays by name as the entry of `key`, where the cache can be written."""
+    data = io.BytesIO()
+    np.savez(data, **arrays)  # type: ignore[arg-type]
+    store(key, suffix, data.getvalue())
 
 
 def store(key: str, suffix: str, data: bytes) -> Path | None:

@@ -2,18 +2,22 @@
 
 from __future__ import annotations
 
-import io
 import operator
-import zipfile
-import zlib
 from collections.abc import Callable, Iterator, Sequence
+from contextlib import suppress
 from typing import Any
 
 import casadi as ca
 import numpy as np
 from numpy.typing import NDArray
 
-from elastocal.model.function_cache import HashedFunction, content_key, fetch, row_by_row, store
+from elastocal.model.function_cache import (
+    HashedFunction,
+    content_key,
+    fetch_arrays,
+    row_by_row,
+    store_arrays,
+)
 
 # CasADi's scalar operations as numpy functions of arrays, real or complex.
 
@@ -97,17 +101,12 @@ def instructions(function: HashedFunction) -> tuple[NDArray[np.int32], NDArray, 
     if function.n_instructions < SMALLEST_CACHED:
         return _extracted(function)
     key = content_key("instructions", function.digest)
-    found = fetch(key, SUFFIX)
-    if found is not None:
-        try:
-            with np.load(found, allow_pickle=False) as saved:
-                return saved["table"], saved["constants"], int(saved["registers"])
-        except (OSError, ValueError, KeyError, EOFError, zipfile.BadZipFile, zlib.error):
-            pass  # another process removed it, or it is none of ours
+    if found := fetch_arrays(key, SUFFIX):
+        with suppress(KeyError, TypeError):  # of another version
+            return found["table"], found["constants"], int(found["registers"])
     table, constants, registers = _extracted(function)
-    data = io.BytesIO()
-    np.savez(data, table=table, constants=constants, registers=registers)
-    store(key, SUFFIX, data.getvalue())
+    kept = {"table": table, "constants": constants, "registers": np.array(registers)}
+    store_arrays(key, SUFFIX, kept)
     return table, constants, registers
 
 

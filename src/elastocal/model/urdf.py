@@ -20,6 +20,7 @@ import numpy as np
 from elastocal.errors import InputError, require
 from elastocal.files import DEEPEST, read_bytes
 from elastocal.model.chain import MAX_JOINTS, MIN_JOINTS, Chain, Joint, JointKind, LinkMass
+from elastocal.model.function_cache import content_key, fetch_arrays, store_arrays
 from elastocal.text import did_you_mean, listed, printable
 from elastocal.units import Array
 
@@ -57,25 +58,51 @@ def read_urdf(path: str | Path, base: str | None = None, flange: str | None = No
     base = tree.root if base is None else tree.find_link("base", base)
     flange = tree.last_link(base) if flange is None else tree.find_link("flange", flange)
     moving = tree.serial_chain(base, flange)
-    model = _pinocchio_model(tree, moving)
-    before = _link_placement(model, base).inverse().homogeneous
-    placements = [placement.homogeneous for placement in model.jointPlacements[1:]]
-    placements[0] = before @ placements[0]
-    data = model.createData()
+    read = _read_by_pinocchio(tree, [joint.name for joint in moving], base, flange)
     joints = []
-    for i, (source, placement) in enumerate(zip(moving, placements, strict=True), start=1):
-        # The motion subspace is (linear, angular) for every pinocchio joint, aligned or not, also
-        # for unbounded ones that store (cos q, sin q).
-        along, about = np.asarray(data.joints[i].S).reshape(2, 3)
+    for source, placement, (along, about) in zip(
+        moving, read["placements"], read["subspaces"], strict=True
+    ):
         limits = source.limit or (-np.inf, np.inf)
         slides = source.kind == "prismatic"
         kind: JointKind = "prismatic" if slides else "revolute"
         joints.append(Joint(source.name, kind, placement, along if slides else about, *limits))
-    masses = tuple(LinkMass(float(body.mass), np.array(body.lever)) for body in model.inertias[1:])
+    masses = tuple(map(LinkMass, read["masses"].tolist(), read["levers"]))
     return Chain(
-        tree.name, tuple(joints), _link_placement(model, flange).homogeneous,
+        tree.name, tuple(joints), read["flange"],
         masses if any(body.mass > 0 for body in masses) else (),
     )  # fmt: skip
+
+
+SUFFIX = ".chain.npz"
+
+
+def _read_by_pinocchio(tree: Tree, moving: list[str], base: str, flange: str) -> dict[str, Array]:
+    """`placements` (n, 4, 4) and `subspaces` (n, 2, 3), linear and angular, of the `moving` joints,
+    `masses` (n,) and `levers` (n, 3) of what each carries, and `flange` (4, 4).
+
+    Kept in the cache: loading pinocchio takes longer than reading cell and measurements.
+    """
+    skeleton = _skeleton(tree, moving)
+    key = content_key("chain", Path(__file__).read_bytes(), skeleton, base, flange, *moving)
+    if found := fetch_arrays(key, SUFFIX):
+        return found
+    model = _pinocchio_model(tree, skeleton, moving)
+    placements = [placement.homogeneous for placement in model.jointPlacements[1:]]
+    placements[0] = _link_placement(model, base).inverse().homogeneous @ placements[0]
+    # The motion subspace is (linear, angular) for every pinocchio joint, aligned or not, also
+    # for unbounded ones that store (cos q, sin q).
+    motions = list(model.createData().joints)[1:]
+    bodies = list(model.inertias)[1:]
+    read = {
+        "placements": np.array(placements),
+        "subspaces": np.array([np.asarray(joint.S).reshape(2, 3) for joint in motions]),
+        "masses": np.array([body.mass for body in bodies]),
+        "levers": np.array([body.lever for body in bodies]),
+        "flange": _link_placement(model, flange).homogeneous,
+    }
+    store_arrays(key, SUFFIX, read)
+    return read
 
 
 def _link_placement(model: Any, link: str) -> Any:
@@ -84,12 +111,11 @@ def _link_placement(model: Any, link: str) -> Any:
     return model.frames[model.getFrameId(link, pin.FrameType.BODY)].placement
 
 
-def _pinocchio_model(tree: Tree, moving: Sequence[UrdfJoint]) -> Any:
+def _pinocchio_model(tree: Tree, skeleton: str, expected: list[str]) -> Any:
     import pinocchio as pin
 
-    expected = [joint.name for joint in moving]
     try:
-        model = pin.buildModelFromXML(_skeleton(tree, expected))
+        model = pin.buildModelFromXML(skeleton)
     except Exception as error:  # pinocchio raises ValueError, RuntimeError and its own
         raise InputError(f"{tree.path}: pinocchio cannot read it: {error}") from error
     found = list(model.names)[1:]
