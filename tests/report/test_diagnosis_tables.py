@@ -8,7 +8,7 @@ import pytest
 from rich.console import Console
 from support.diagnoses import EXPLAINED, EXTRA, VERDICTS
 
-from elastocal.report.terminal import MOST_CANDIDATES_PRINTED, print_diagnosis
+from elastocal.report.diagnosis_terminal import MOST_CANDIDATES_PRINTED, print_diagnosis
 
 KINDS = ("revolute",) * 6
 

@@ -12,8 +12,9 @@ import pytest
 from support.diagnoses import VERDICTS
 
 from elastocal.identification import judged
+from elastocal.report.diagnosis_terminal import print_diagnosis
 from elastocal.report.judgement_view import judgement
-from elastocal.report.terminal import PRINTED_WIDTH, print_diagnosis, print_result, printed_text
+from elastocal.report.terminal import PRINTED_WIDTH, print_result, printed_text
 
 
 def test_an_identification_prints_its_parameters_and_what_they_are_worth(case: Any) -> None:

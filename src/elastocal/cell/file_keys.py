@@ -188,9 +188,15 @@ def _wrong_argument(cls: Any, error: ValidationError) -> str:
     return f"{own}: {name} takes {told}; found {shown(first['input'])}{hint}"
 
 
+@cache
+def _hints_of(cls: Any) -> dict[str, Any]:
+    """The types of a record's fields, with what is annotated."""
+    return get_type_hints(cls, include_extras=True)
+
+
 def _fields_of(cls: Any) -> dict[str, tuple[Key, ...]]:
     """The fields of a record by name, each with the keys that state it in a cell file."""
-    hints = get_type_hints(cls, include_extras=True)
+    hints = _hints_of(cls)
     found = {}
     for name, one in cls.__dataclass_fields__.items():
         how = next((note for note in _notes(hints[name]) if isinstance(note, FromFile)), None)
@@ -229,7 +235,7 @@ def _notes(hint: Any) -> Iterator[Any]:
 # --- From the file -------------------------------------------------------------------------------
 
 
-class RecordTable(Table):
+class RecordTable(Table, defer_build=True):
     """A table of the cell file from which a record is built."""
 
     record: ClassVar[Any]
@@ -238,7 +244,7 @@ class RecordTable(Table):
 def keys_of(*records: Any, without: Sequence[str] = ()) -> list[Key]:
     """The keys that state records in a cell file, each with its type there."""
     return [
-        replace(known, form=known.form or _form(get_type_hints(one, include_extras=True)[name]))
+        replace(known, form=known.form or _form(_hints_of(one)[name]))
         for one in records
         for name, keys in fields_of(one).items()
         for known in keys

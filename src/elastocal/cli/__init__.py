@@ -7,6 +7,8 @@ import os
 # Many small matrices: a second thread of the linear algebra library only waits for the first.
 # It must be said before numpy is loaded, and the user's own setting wins.
 os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
+# No plug-in of pydantic has to do with a cell file; looking for them reads what is installed.
+os.environ.setdefault("PYDANTIC_DISABLE_PLUGINS", "__all__")
 
 # Importing a command registers it.
 from elastocal.cli import (  # noqa: F401
@@ -27,7 +29,7 @@ from elastocal.screen import close_streams, prepare_streams
 
 # New containers between two searches for garbage in cycles.  Python's own 700 has every import and
 # every fit walked through all that is loaded, 0.07 s each time, and finds nothing.
-COLLECT_AFTER = 100_000
+COLLECT_AFTER = 200_000
 
 
 def main() -> None:

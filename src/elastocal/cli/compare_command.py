@@ -55,7 +55,7 @@ def compare(
     from elastocal.diagnosis.changes import compare as run
     from elastocal.files import together
     from elastocal.model.calibrated import read_calibrated
-    from elastocal.report.terminal import print_comparison
+    from elastocal.report.diagnosis_terminal import print_comparison
     from elastocal.saving import write_json
 
     written = check_outputs(output, report)

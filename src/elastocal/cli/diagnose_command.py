@@ -111,7 +111,7 @@ def diagnose(
     if as_json:
         say(json_text(publish(found, found.model, found.data)))
         return
-    from elastocal.report.terminal import print_diagnosis
+    from elastocal.report.diagnosis_terminal import print_diagnosis
 
     print_diagnosis(console(), found, kinds)
     for line in told:

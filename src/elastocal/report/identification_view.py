@@ -50,6 +50,7 @@ from elastocal.report.method_and_noise import (
     MOST_TOLD,
     candidate_rows,
     constraints_line,
+    counted_functions,
     does_noise_explain_it,
     false_alarm_line,
     fault_lines,
@@ -63,8 +64,9 @@ from elastocal.report.method_and_noise import (
     repeats_line,
     shape_line,
     size_rows,
+    smooth_lines,
+    smooth_table,
 )
-from elastocal.report.smooth_view import counted_functions, smooth_lines, smooth_table
 from elastocal.text import listed, printable
 from elastocal.units import Array
 

@@ -15,7 +15,14 @@ from elastocal.identification.noise_summary import SLIDES, Noise, NoiseSize
 from elastocal.identification.residuals import GroupSummary, ResidualSummary
 from elastocal.identification.result import Calibration
 from elastocal.model.observations import available_noise
-from elastocal.report.formatting import display, length, plain, significant
+from elastocal.report.formatting import (
+    ShownTable,
+    counted,
+    display,
+    length,
+    plain,
+    significant,
+)
 from elastocal.text import printable
 
 MOST_NAMED = 6
@@ -514,3 +521,43 @@ def _bends(result: Calibration, finding: FaultyGroup) -> bool:
     """Whether the readings have their full weight in the fit."""
     apart = {o.line for o in result.excluded} & set(finding.lines)
     return method_of(result) in FULL_WEIGHT and not apart
+
+
+# The smooth functions that were fitted.
+
+SMOOTH_HEADS = ("smooth function", "rms", "95 %", "known to ±", "unit", "coefficients' worth")
+
+
+def smooth_table(result: Calibration) -> ShownTable:
+    """A row for each function and unit; what was left out has none."""
+    rows = []
+    for part in result.smooth:
+        if not part.scale:
+            continue
+        for unit, (rms, (low, high), half) in part.sizes.items():
+            numbers = [significant(display(v, unit)[0]) for v in (rms, low, high, half)]
+            worth = f"{significant(part.effective, 2)} of {part.coefficients}"
+            rows.append(
+                (
+                    printable(part.group.name), numbers[0], f"{numbers[1]} to {numbers[2]}",
+                    numbers[3], display(0.0, unit)[1], worth,
+                )
+            )  # fmt: skip
+    return ShownTable(SMOOTH_HEADS, rows, (0, 4))
+
+
+def smooth_lines(result: Calibration) -> list[str]:
+    """The same as sentences, one for each function."""
+    return [
+        f"{name}: {rms} {unit} rms ({ends}), known to ± {half} {unit}, {worth} coefficients' worth"
+        for name, rms, ends, half, unit, worth in smooth_table(result).rows
+    ]
+
+
+def counted_functions(result: Calibration) -> str:
+    """ "; and 6 smooth functions of 648 coefficients", "" where there are none."""
+    found = [part for part in result.smooth if part.scale]
+    if not found:
+        return ""
+    n = sum(part.coefficients for part in found)
+    return f"; and {counted(len(found), 'smooth function')} of {n} coefficients"

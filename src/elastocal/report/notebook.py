@@ -30,6 +30,7 @@ from elastocal.planning.plan import Plan
 from elastocal.report.arm_view import plan_figure, plan_space
 from elastocal.report.causes_view import causes
 from elastocal.report.changes_view import changes_frame, draw_map
+from elastocal.report.diagnosis_terminal import print_comparison, print_diagnosis
 from elastocal.report.diagnosis_view import error_steps
 from elastocal.report.effect_names import effect_at, name_of
 from elastocal.report.figures import SERIES, as_figures, drawn
@@ -40,9 +41,7 @@ from elastocal.report.plan_view import first_stops
 from elastocal.report.residual_figures import by_configuration
 from elastocal.report.residual_view import residuals_of
 from elastocal.report.terminal import (
-    print_comparison,
     print_compensation,
-    print_diagnosis,
     print_result,
     printed_text,
     table_of,

@@ -15,6 +15,7 @@ from elastocal.identification.prediction import over_the_workspace
 from elastocal.identification.residuals import GroupSummary, ResidualSummary
 from elastocal.identification.result import Calibration
 from elastocal.identification.scrutiny import Autocorrelation
+from elastocal.identification.smooth_part import SmoothPart
 from elastocal.model.manipulator import Model
 from elastocal.model.observations import Observations
 from elastocal.model.rigid import nominal_flanges
@@ -29,10 +30,10 @@ from elastocal.report.figures import (
     panels_of,
     waterfall_of_steps,
 )
-from elastocal.report.formatting import length, short_name, significant
+from elastocal.report.formatting import display, length, short_name, significant
 from elastocal.report.identification_view import before_and_after, budget_steps, rms_by_kind
 from elastocal.report.residual_view import Residuals, reach, rms_by_pose, running_mean
-from elastocal.report.smooth_view import smooth_figure
+from elastocal.text import printable
 from elastocal.units import Array, IntArray
 
 if TYPE_CHECKING:
@@ -42,6 +43,7 @@ if TYPE_CHECKING:
 
 WIDTH = 9.9
 MOST_LABELS = 30
+MOST_SMOOTH = 24  # smooth functions
 MOST_JOINT_DOTS = 2000  # per joint; the running mean uses every reading
 
 
@@ -492,6 +494,46 @@ def correlations(result: Calibration) -> tuple[list[str], Array]:
         kept = np.sort(np.argsort(-strongest, kind="stable")[:MOST_IN_MATRIX])
         names, r = [names[k] for k in kept], r[np.ix_(kept, kept)]
     return names, np.clip(r, -1.0, 1.0)
+
+
+def smooth_figure(result: Calibration) -> str:
+    """Every function with its 95 % band, without what offsets and lengths can stand for."""
+    found = [
+        (part, unit)
+        for part in result.smooth
+        if part.scale and part.group.basis is not None
+        for unit in part.sizes
+    ][:MOST_SMOOTH]
+    if not found:
+        return ""
+    rows = -(-len(found) // 3)
+
+    def draw(figure: Figure) -> None:
+        panels = panels_of(figure, len(found), min(3, len(found)))
+        for axes, (part, unit) in zip(panels, found, strict=True):
+            _panel(axes, part, unit)
+
+    return drawn(draw, WIDTH, 0.3 + 2.2 * rows, "Smooth functions with their 95 % bands")
+
+
+def _panel(axes: Axes, part: SmoothPart, unit: str) -> None:
+    x, value, half = part.shape()
+    shown = _places(x, part)
+    axes.axhline(0, color=FAINT, linewidth=0.8)
+    own = [c for c, u in enumerate(part.group.units) if u == unit]
+    factor, text = display(1.0, unit)
+    for k, c in enumerate(own):
+        colour = SERIES[k % len(SERIES)]
+        low, high = ((value[c] + sign * half[c]) * factor for sign in (-1, 1))
+        axes.fill_between(shown, low, high, color=colour, alpha=0.25, linewidth=0)
+        axes.plot(shown, value[c] * factor, color=colour, linewidth=1.2)
+    axes.set_title(printable(part.group.name))
+    axes.set_ylabel(text)
+    axes.set_xlabel(f"{part.group.follows} in {'°' if part.group.lasting else 'h'}")
+
+
+def _places(x: Array, part: SmoothPart) -> Array:
+    return np.degrees(x) if part.group.lasting else x / 3600
 
 
 def residual_figures(
