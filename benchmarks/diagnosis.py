@@ -85,17 +85,16 @@ def measure(size: str) -> Part:
         for what, data, limit in cases:
             cache = folder / f"cache{len(table.rows)}"
             cache.mkdir(mode=0o700)
+            answer, rows = folder / "diagnosis.json", len(data.read_text().splitlines()) - 1
+            given = ("diagnose", cell, data, "-o", answer, "--quiet")
             for state in ("empty", "filled"):
                 print(f"{what}, cache {state}", file=sys.stderr, flush=True)
-                answer = folder / "diagnosis.json"
-                given = ("diagnose", cell, data, "-o", answer, "--quiet")
                 done = ran(*given, ELASTOCAL_CACHE=str(cache))
                 content = json.loads(answer.read_text())
                 effects = ", ".join(f"{e['effect']}:{e['where']}" for e in content["effects"])
                 verdict = f"{content['verdict']} {effects}".strip()
                 if data.parent == folder and ":".join(FOUND) not in verdict:
                     part.remarks.append(f"{what}: {':'.join(FOUND)} was not named")
-                rows = len(data.read_text().splitlines()) - 1
                 table.rows.append([what, state, rows, done.wall, done.cpu, done.peak_mb, verdict])
                 if limit:
                     named = f"{what}, cache {state}: wall, at most {limit} s"

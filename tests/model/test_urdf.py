@@ -111,7 +111,7 @@ def test_off_path_joints_may_mimic_float_or_lack_limits(tmp_path: Path) -> None:
 def test_what_pinocchio_read_is_kept_to_the_bit(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    """A file is read by pinocchio once; another flange or a number changed is another arm."""
+    """A file is read by pinocchio once; with a number changed it is another arm."""
     import pinocchio as pin
 
     monkeypatch.setenv("ELASTOCAL_CACHE", str(tmp_path / "cache"))

@@ -235,7 +235,7 @@ def _notes(hint: Any) -> Iterator[Any]:
 # --- From the file -------------------------------------------------------------------------------
 
 
-class RecordTable(Table, defer_build=True):
+class RecordTable(Table):
     """A table of the cell file from which a record is built."""
 
     record: ClassVar[Any]

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import ctypes
-import hashlib
 import os
 import platform
 import secrets
@@ -15,7 +14,7 @@ import tempfile
 from collections.abc import Sequence
 from contextlib import suppress
 from dataclasses import dataclass
-from functools import cache, lru_cache
+from functools import lru_cache
 from pathlib import Path
 
 import casadi as ca
@@ -23,7 +22,15 @@ import numpy as np
 from numpy.typing import NDArray
 
 from elastocal.errors import ElastocalError
-from elastocal.model.function_cache import HashedFunction, content_key, entry_bytes, fetch, store
+from elastocal.model import function_cache
+from elastocal.model.function_cache import (
+    HashedFunction,
+    content_key,
+    entry_bytes,
+    fetch,
+    store,
+    written_by,
+)
 
 # The C text of a function: CasADi's generated code for one row, and a loop over rows.
 
@@ -271,11 +278,6 @@ def _key(function: HashedFunction, compiler: Compiler) -> str:
     """
     flags = (*compiler.command, compiler.version, *FLAGS, *LIBRARIES)
     system = (sys.platform, platform.machine(), *platform.libc_ver())
-    return content_key("library", function.digest, _written_by(), *flags, *system)
-
-
-@cache
-def _written_by() -> str:
-    """Digest of the code that writes the C text."""
-    sources = [Path(__file__), Path(__file__).with_name("function_cache.py")]
-    return hashlib.sha256(b"".join(source.read_bytes() for source in sources)).hexdigest()
+    return content_key(
+        "library", function.digest, written_by(__file__, function_cache.__file__), *flags, *system
+    )

@@ -10,7 +10,7 @@ from collections.abc import Callable, Iterable, Iterator, Sequence
 from concurrent.futures import Future, ThreadPoolExecutor
 from dataclasses import dataclass, replace
 from functools import cached_property
-from itertools import pairwise
+from itertools import accumulate, pairwise
 from typing import Any, TypeVar
 
 import casadi as ca
@@ -217,6 +217,7 @@ class RowByRow:
         self._function = function.function
         outputs = range(self._function.n_out())
         self._places = [row_by_row(self._function.sparsity_out(k)) for k in outputs]
+        self._spans = _side_by_side(map(len, self._places))
 
     def threads(self, rows: int) -> int:
         """One: CasADi evaluates few rows, and holds the interpreter's lock."""
@@ -231,24 +232,29 @@ class RowByRow:
         # All that varies by row side by side, and all that is found: one copy each for a row.
         varying = [a for a in inputs if a.ndim == 2]
         rows = np.concatenate(varying, axis=1) if varying else np.zeros((1, 0))
-        edges = np.cumsum([0, *(len(places) for places in self._places)]).tolist()
-        given, found = np.zeros(rows.shape[1]), np.zeros(edges[-1])
-        held, at = [], 0
-        for k, a in enumerate(inputs):
-            held.append(given[at : at + a.shape[1]] if a.ndim == 2 else a.copy())
-            at += a.shape[1] if a.ndim == 2 else 0
-            call.set_arg(k, held[k].data)
-        for k, (first, last) in enumerate(pairwise(edges)):
-            call.set_res(k, found[first:last].data)
+        given, found = np.zeros(rows.shape[1]), np.zeros(sum(map(len, self._places)))
+        spans = _side_by_side(a.shape[1] if a.ndim == 2 else 0 for a in inputs)
+        held = [
+            given[span] if a.ndim == 2 else a.copy() for a, span in zip(inputs, spans, strict=True)
+        ]
+        for k, array in enumerate(held):
+            call.set_arg(k, array.data)
+        for k, span in enumerate(self._spans):
+            call.set_res(k, found[span].data)
         numbers = [i for block in blocks for i in range(block.start, block.stop)]
         all_found = np.empty((len(numbers), len(found)))
         for i, out in zip(numbers, all_found, strict=True):
             given[:] = rows[i]
             run()
             out[:] = found
-        for result, places, first in zip(results, self._places, edges, strict=False):
+        for result, places, span in zip(results, self._places, self._spans, strict=True):
             flat = result.reshape(len(result), result.shape[1] * result.shape[2])
-            flat[np.ix_(numbers, places)] = all_found[:, first : first + len(places)]
+            flat[np.ix_(numbers, places)] = all_found[:, span]
+
+
+def _side_by_side(widths: Iterable[int]) -> list[slice]:
+    """Where each of several pieces stands in a row of all."""
+    return [slice(a, b) for a, b in pairwise(accumulate(widths, initial=0))]
 
 
 Engine = RowByRow | NumpyFunction | Compiled

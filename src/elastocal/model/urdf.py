@@ -20,7 +20,7 @@ import numpy as np
 from elastocal.errors import InputError, require
 from elastocal.files import DEEPEST, read_bytes
 from elastocal.model.chain import MAX_JOINTS, MIN_JOINTS, Chain, Joint, JointKind, LinkMass
-from elastocal.model.function_cache import content_key, fetch_arrays, store_arrays
+from elastocal.model.function_cache import content_key, fetch_arrays, store_arrays, written_by
 from elastocal.text import did_you_mean, listed, printable
 from elastocal.units import Array
 
@@ -84,7 +84,7 @@ def _read_by_pinocchio(tree: Tree, moving: list[str], base: str, flange: str) ->
     Kept in the cache: loading pinocchio takes longer than reading cell and measurements.
     """
     skeleton = _skeleton(tree, moving)
-    key = content_key("chain", Path(__file__).read_bytes(), skeleton, base, flange, *moving)
+    key = content_key("chain", written_by(__file__), skeleton, base, flange, *moving)
     if found := fetch_arrays(key, SUFFIX):
         return found
     model = _pinocchio_model(tree, skeleton, moving)

@@ -1,4 +1,4 @@
-"""How the numbers came about, in words: method, intervals, noise, faulty readings."""
+"""How the numbers came about, in words: method, intervals, noise, faulty readings, functions."""
 
 from __future__ import annotations
 
