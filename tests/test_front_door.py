@@ -329,6 +329,7 @@ def test_arrays_become_tables(model):
 # What the command line writes, and how it says in text what Python says otherwise.
 # In Python `fit.unmet(...)` asks what `--require` does.
 OF_FILES = {
+    "plugins",  # of Model, and of read_calibrated
     "require",
     "output",
     "certificate",

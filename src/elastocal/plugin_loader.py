@@ -1,12 +1,14 @@
 """Where code of the user's own comes from: installed packages, and files that a cell names.
 
 A plug-in is any Python code that calls `elastocal.plugins.register_effect` and its like.  It is run
-once: for an entry point of the group `elastocal.plugins` when the first cell is read, for
-`[plugins] modules` of a cell when that cell is.
+once.  An entry point of the group `elastocal.plugins`, which somebody installed, runs when the
+first model is made.  What `[plugins] modules` of a cell names came with the cell, perhaps from a
+stranger, and runs only when the user says so.
 """
 
 from __future__ import annotations
 
+import os
 import re
 import sys
 from collections.abc import Callable, Sequence
@@ -15,7 +17,7 @@ from pathlib import Path
 from types import CodeType, ModuleType
 from typing import TYPE_CHECKING
 
-from elastocal.errors import InputError
+from elastocal.errors import InputError, option, require
 from elastocal.files import check_exists, read_text
 from elastocal.text import quoted
 
@@ -25,6 +27,7 @@ if TYPE_CHECKING:
 GROUP = "elastocal.plugins"
 MAX_BYTES = 1_000_000
 OURS = str(Path(__file__).parent)
+TRUSTED = "ELASTOCAL_PLUGINS"  # 1, or folders whose cells may have their plug-ins run
 
 _installed: list[str] = []  # entry points that were run
 _files: dict[Path, tuple[int, int]] = {}  # files that were run, as they were then
@@ -38,7 +41,7 @@ def load_plugins(cell: Path | None = None, modules: Sequence[str] = ()) -> None:
 
     Raises InputError that names the plug-in, its file and the line, where one cannot be run.
     """
-    _load_installed()
+    load_installed()
     for k, name in enumerate(modules):
         key = f"plugins.modules[{k}]"
         owner = cell or Path("plug-ins")
@@ -49,12 +52,47 @@ def load_plugins(cell: Path | None = None, modules: Sequence[str] = ()) -> None:
             _run(where, None, partial(_import, name))
 
 
+def load_named(cell: Path, modules: Sequence[str], asked: bool, fresh: bool) -> None:
+    """`load_plugins` of a cell, whose `modules` run where the user says so: by what was `asked`, or
+    the environment variable TRUSTED.
+
+    `fresh`: the cell has just been read, and a file that has changed is run again.
+
+    Raises InputError that names the first of them that would run unasked.
+    """
+    pending = [name for name in modules if not _has_run(name, fresh)]
+    for name in pending:
+        what = f"the Python file {Path(name)}" if is_plugin_file(name) else f"the module {name!r}"
+        require(
+            asked or _trusted(cell),
+            f"{cell}: key plugins.modules[{modules.index(name)}] names {what}, which runs with "
+            f"your rights and so not unasked; read it, then say {option('plugins', True)}, or set "
+            f"{TRUSTED}={cell.absolute().parent} for all cells of this folder",
+        )
+    load_plugins(cell, modules if pending else ())
+
+
+def _has_run(name: str, fresh: bool) -> bool:
+    if not is_plugin_file(name):
+        return name in sys.modules
+    path = Path(name).resolve()
+    return path in _files and not (fresh and path.exists() and _files[path] != _version(path))
+
+
+def _trusted(cell: Path) -> bool:
+    """Whether TRUSTED allows all, or lists a folder that holds the cell, wherever links lead."""
+    stated = os.environ.get(TRUSTED, "")
+    folders = (Path(each).resolve() for each in stated.split(os.pathsep) if os.path.isabs(each))
+    return stated == "1" or any(cell.resolve().is_relative_to(folder) for folder in folders)
+
+
 def is_plugin_file(module: str) -> bool:
     """Whether an entry of `[plugins] modules` names a file, not a module to import."""
     return module.endswith(".py")
 
 
-def _load_installed() -> None:
+def load_installed() -> None:
+    """Run the entry points of installed packages."""
     from importlib.metadata import entry_points
 
     for point in entry_points(group=GROUP):
@@ -94,8 +132,7 @@ def _run_file(path: Path, where: str) -> None:
     import zlib
 
     path = path.resolve()
-    state = path.stat()
-    version = state.st_mtime_ns, state.st_size
+    version = _version(path)
     if _files.get(path) == version:
         return
     source = read_text(path, "plug-in", MAX_BYTES)
@@ -115,6 +152,11 @@ def _run_file(path: Path, where: str) -> None:
         raise
     _send_by_value(module)
     _files[path] = version
+
+
+def _version(path: Path) -> tuple[int, int]:
+    state = path.stat()
+    return state.st_mtime_ns, state.st_size
 
 
 def _run(where: str, path: Path | None, run: Callable[[], None]) -> None:

@@ -11,8 +11,8 @@ needs stands here, wherever it lives inside.
     register_effect(MyEffect())
 
 From then on `identify`, `design` and `diagnose` know the effect.  On the command line the code is
-run by `[plugins] modules = ["my_effects.py"]` in the cell, or by an entry point of the group
-`elastocal.plugins` of an installed package.
+run by `[plugins] modules = ["my_effects.py"]` in the cell and the option --plugins, or by an entry
+point of the group `elastocal.plugins` of an installed package.
 """
 
 from __future__ import annotations

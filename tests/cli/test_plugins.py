@@ -68,7 +68,7 @@ def folder(tmp_path: Path) -> Path:
     write_example(tmp_path, "three_lobes.py")
     path = tmp_path / "cell.toml"
     path.write_text(CELL, encoding="utf-8")
-    plain = read_cell(path)
+    plain = Model(path, plugins=True).cell
     chain = kr270_chain()
     table = measured(chain, plain, [LOBES], unloaded(chain, 25), 1)
     table.save(tmp_path / "data.csv")
@@ -80,8 +80,9 @@ def unloaded(chain: Chain, n: int) -> Measurements:
     return table.take(np.all(table.force == 0, axis=1))
 
 
-def run(*arguments: object) -> Result:
-    return CliRunner().invoke(app, [str(a) for a in arguments], catch_exceptions=False)
+def run(*arguments: object, plugins: bool = True) -> Result:
+    words = [str(a) for a in arguments] + ["--plugins"] * plugins
+    return CliRunner().invoke(app, words, catch_exceptions=False)
 
 
 def with_effect(folder: Path, entry: str) -> Path:
@@ -158,7 +159,7 @@ def noisy_days(folder: Path) -> Path:
     text = CELL.replace("three_lobes.py", "noise_by_day.py").replace("sigma_um = 10\n", "")
     cell.write_text(text, encoding="utf-8")
     write_example(folder, "noise_by_day.py")
-    model = Model(read_cell(cell))
+    model = Model(cell, plugins=True)
     table = unloaded(model.chain, 60)
     day = table.configuration % 3
     exact = model.predict(table).reshape(-1, 3)
@@ -188,7 +189,8 @@ def test_the_noise_model_is_chosen_and_named(tmp_path: Path) -> None:
 def test_the_noise_model_can_be_asked_for_before_the_cell_was_read(tmp_path: Path) -> None:
     """In a process of its own, in which nothing is registered yet."""
     cell = noisy_days(tmp_path)
-    arguments = ["identify", cell, tmp_path / "days.csv", "--noise", "day", "--json", "-q"]
+    arguments = ["identify", cell, tmp_path / "days.csv", "--noise", "day", "--json", "-q",
+                 "--plugins"]  # fmt: skip
     done = subprocess.run(
         [sys.executable, "-m", "elastocal", *map(str, arguments)], capture_output=True, text=True
     )
@@ -229,7 +231,7 @@ def test_a_bad_plug_in_is_one_sentence_with_file_and_line(code: str, tmp_path: P
     cell = tmp_path / "cell.toml"
     cell.write_text(CELL.replace("three_lobes.py", "bad.py"), encoding="utf-8")
     with pytest.raises(InputError, match=r"cell\.toml: key plugins\.modules\[0\]: .*" + BAD[code]):
-        read_cell(cell)
+        Model(cell, plugins=True)
     result = run("identify", cell, tmp_path / "data.csv")
     assert result.exit_code == 2 and "Traceback" not in result.stderr
 
@@ -246,7 +248,109 @@ def test_what_cannot_be_found_is_named(entry: str, told: str, tmp_path: Path) ->
     cell = tmp_path / "cell.toml"
     cell.write_text(CELL.replace("three_lobes.py", entry), encoding="utf-8")
     with pytest.raises(InputError, match=rf"plugins\.modules\[0\].*{told}"):
-        read_cell(cell)
+        Model(cell, plugins=True)
+
+
+STRANGE = """\
+from pathlib import Path
+Path(__file__).with_name("ran").touch()
+"""
+
+
+@pytest.fixture
+def strange(tmp_path: Path) -> Path:
+    """A cell whose plug-in leaves a file, `ran`, where it runs; data of it, and two results."""
+    cell = tmp_path / "cell.toml"
+    cell.write_text(CELL.replace("three_lobes.py", "absent.py"), encoding="utf-8")
+    (tmp_path / "absent.py").touch()
+    model = Model(cell, plugins=True)
+    table = unloaded(model.chain, 25)
+    replace(table, position=model.predict(table).reshape(-1, 3)).save(tmp_path / "data.csv")
+    for name in ("a.json", "b.json"):
+        done = run("identify", cell, tmp_path / "data.csv", "-o", tmp_path / name, "-q")
+        assert done.exit_code == 0, done.stderr
+    cell.write_text(CELL.replace("three_lobes.py", "helper.py"), encoding="utf-8")
+    (tmp_path / "helper.py").write_text(STRANGE, encoding="utf-8")
+    (tmp_path / "targets.csv").write_text("x_mm,y_mm,z_mm\n2000,0,1500\n")
+    return tmp_path
+
+
+FITTING: dict[str, list[str]] = {
+    "effects": [],
+    "identify": ["data.csv"],
+    "diagnose": ["data.csv"],
+    "next": ["data.csv", "-o", "out.csv"],
+    "design": ["-o", "out.csv", "--effort", "quick"],
+    "simulate": ["data.csv", "-o", "out.csv"],
+}
+READING = {
+    "compare": ["a.json", "b.json"],
+    "compare of a named cell": ["a.json", "b.json", "--cell", "cell.toml"],
+    "compensate": ["cell.toml", "a.json", "targets.csv", "--point", "M1"],
+    "export": ["cell.toml", "a.json", "-o", "out.urdf"],
+    "import": ["data.csv", "--preset", "kuka", "--cell", "cell.toml", "--preview"],
+}
+
+
+@pytest.mark.parametrize("verb", FITTING)
+def test_a_cells_code_does_not_run_unasked(
+    verb: str, strange: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.chdir(strange)
+    done = run(verb, "cell.toml", *FITTING[verb], plugins=False)
+    assert done.exit_code == 2 and done.stderr.count("elastocal:") == 1
+    assert all(word in done.stderr for word in ("helper.py", "--plugins", "cell.toml"))
+    assert not (strange / "ran").exists() and not (strange / "out.csv").exists()
+
+
+@pytest.mark.parametrize("verb", READING)
+def test_what_reads_results_runs_no_code(
+    verb: str, strange: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.chdir(strange)
+    done = run(verb.split()[0], *READING[verb], plugins=False)
+    assert done.exit_code == 0 or verb == "import", done.stderr
+    assert not (strange / "ran").exists()
+
+
+def test_results_of_an_effect_of_a_plug_in_need_it(folder: Path) -> None:
+    cell = with_effect(folder, "three_lobes:joint3")
+    out = folder / "result.json"
+    assert run("identify", cell, folder / "data.csv", "-o", out, "-q").exit_code == 0
+    CATALOGUE.pop("three_lobes")
+    plugin_loader._files.clear()
+    done = run("compare", out, out, "--cell", cell, plugins=False)
+    assert done.exit_code == 2 and "three_lobes.py" in done.stderr
+    assert run("compare", out, out, "--cell", cell).exit_code == 0
+
+
+@pytest.mark.parametrize("module", ["helper.py", "strange_helper"])
+def test_who_allows_it(module: str, strange: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    cell, ran = strange / "cell.toml", strange / "ran"
+    cell.write_text(CELL.replace("three_lobes.py", module), encoding="utf-8")
+    (strange / "helper.py").rename(strange / f"{module.removesuffix('.py')}.py")
+    monkeypatch.syspath_prepend(str(strange))
+    for trusted in ("", "0", "no", str(strange / "within"), "."):
+        monkeypatch.setenv(plugin_loader.TRUSTED, trusted)
+        with pytest.raises(InputError, match=rf"{module.removesuffix('.py')}.*plugins=True"):
+            Model(cell)
+    assert not ran.exists()
+    for trusted in ("1", str(strange), f"/nowhere:{strange.parent}"):
+        monkeypatch.setenv(plugin_loader.TRUSTED, trusted)
+        Model(cell)
+        assert ran.exists()
+        ran.unlink()
+        plugin_loader._files.clear()
+        sys.modules.pop("strange_helper", None)
+    monkeypatch.delenv(plugin_loader.TRUSTED)
+    read_cell(cell)
+    with pytest.raises(InputError, match="plugins=True"):
+        Model(read_cell(cell))
+    assert not ran.exists()
+    Model(cell, plugins=True)
+    assert ran.exists()
+    Model(cell)  # what has run is not asked for again
+    sys.modules.pop("strange_helper", None)
 
 
 def test_a_file_that_was_changed_is_run_again(tmp_path: Path) -> None:

@@ -23,7 +23,7 @@ from elastocal.cell.workspace_rules import Workspace
 from elastocal.config import Positive, Table, Text, Vector2, checked, header, key, read_toml
 from elastocal.errors import require
 from elastocal.files import check_exists
-from elastocal.plugin_loader import is_plugin_file, load_plugins
+from elastocal.plugin_loader import is_plugin_file
 from elastocal.text import did_you_mean, listed, quoted
 
 KnownEffects = Collection[str]
@@ -65,7 +65,8 @@ class Cell:
     """Everything known about arm, tool, tracker and model before measuring.
 
     `limits` joint → (lower, upper) in rad or m, which narrow those of the robot.  `plugins`:
-    Python files, as absolute paths or relative to the working folder, and importable modules.
+    Python files, as absolute paths or relative to the working folder, and importable modules;
+    `Model` runs them where it is told to.
     `path`: the file that it was read from.
 
     Examples:
@@ -139,14 +140,12 @@ class Cell:
         """Checks that the parts of the cell fit together, which `replace` may leave otherwise.
 
         Args:
-            known_effects: the names that `model.effects` may use once the cell's plug-ins are run
-                (the catalogue itself, which they may add to); None leaves them unchecked.
+            known_effects: the names that `model.effects` may use; None leaves them unchecked.
 
         Raises:
             InputError: an effect or a marker is unknown, or shapes of a URDF are asked for that
                 there is none of.
         """
-        load_plugins(self.path or Path(self.name), self.plugins)
         where, sight = self.path or self.name, self.workspace.visibility
         self._check_markers(("workspace", "visibility", "normals"), sight.normals if sight else ())
         least = None if sight is None else sight.min_markers

@@ -120,6 +120,9 @@ DataFile = Annotated[Path, typer.Argument(help="Measurements (CSV or Parquet).")
 ReportFile = Annotated[Path | None, typer.Option(help="Write a report (one HTML page).")]
 Json = Annotated[bool, typer.Option("--json", help="Print the result as JSON to stdout.")]
 Quiet = Annotated[bool, typer.Option("--quiet", "-q", help="No progress.")]
+Plugins = Annotated[
+    bool, typer.Option("--plugins", help="Run the Python code that the cell names in [plugins].")
+]
 Seed = Annotated[int, typer.Option(min=0, help="Seed of all random draws.")]
 
 

@@ -9,6 +9,7 @@ import typer
 
 from elastocal.cli.app import (
     Json,
+    Plugins,
     Quiet,
     ReportFile,
     Seed,
@@ -44,6 +45,7 @@ def compare(
         float, typer.Option(help="Chance that anything is called changed where nothing is.")
     ] = 0.05,
     poses: Annotated[int, typer.Option(min=2, max=100_000, help="Random poses.")] = 300,
+    plugins: Plugins = False,
     seed: Seed = 0,
     as_json: Json = False,
     quiet: Quiet = False,
@@ -65,7 +67,7 @@ def compare(
     check_apart(written, [old, new, known])
     with progress_line(quiet) as progress:
         progress("reading")
-        arms = [read_calibrated(known, path) for path in (old, new)]
+        arms = [read_calibrated(known, path, plugins) for path in (old, new)]
         check_apart(written, [], arms[0].model.cell)
         progress("comparing")
         found = run(*arms, load=load, level=level, poses=poses, seed=seed)

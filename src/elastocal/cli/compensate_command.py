@@ -10,6 +10,7 @@ import typer
 from elastocal.cli.app import (
     CellFile,
     Json,
+    Plugins,
     Quiet,
     Seed,
     check_apart,
@@ -87,6 +88,7 @@ def compensate(
         str | None,
         typer.Option(metavar="RX,RY,RZ", help="Rotation vector of the tool in --box, in degrees."),
     ] = None,
+    plugins: Plugins = False,
     seed: Seed = 0,
     as_json: Json = False,
     quiet: Quiet = False,
@@ -129,7 +131,7 @@ def compensate(
     content, texts = {}, {}
     with progress_line(quiet) as progress:
         progress("reading")
-        arm = read_calibrated(cell, result)
+        arm = read_calibrated(cell, result, plugins)
         check_apart(written, [cell, result, targets], arm.model.cell)
         start = _posture(arm, near)
         lines = None if table is None else _grid(arm, grid, box, rotation)

@@ -12,6 +12,7 @@ from elastocal.cli.app import (
     CellFile,
     Interrupts,
     Json,
+    Plugins,
     Quiet,
     ReportFile,
     Seed,
@@ -136,6 +137,7 @@ def design(
     ] = None,
     report: ReportFile = None,
     jobs: Annotated[int, typer.Option(help="Processes; -1 for all cores.")] = 1,
+    plugins: Plugins = False,
     seed: Seed = 0,
     as_json: Json = False,
     quiet: Quiet = False,
@@ -152,6 +154,7 @@ def design(
     from inspect import signature
 
     from elastocal.files import together
+    from elastocal.model.choice import cell_of
     from elastocal.planning.checkpoint import Checkpoint, key_of
     from elastocal.planning.design import design as run
     from elastocal.planning.pins import plan_and_names
@@ -173,7 +176,7 @@ def design(
             tell(message)
 
         progress("reading")
-        wanted, options = design_request(cell, **asked)
+        wanted, options = design_request(cell_of(cell, plugins), **asked)
         _check_programs(wanted, programs)
         require(
             cell_out is None or wanted.design.choose is not None,

@@ -13,6 +13,7 @@ from elastocal.cli.app import (
     CellFile,
     DataFile,
     Json,
+    Plugins,
     Quiet,
     ReportFile,
     Seed,
@@ -55,6 +56,7 @@ def diagnose(
         list[str] | None,
         typer.Option(metavar="EFFECT", help="Take an effect out of the catalogue; repeatable."),
     ] = None,
+    plugins: Plugins = False,
     seed: Seed = 0,
     as_json: Json = False,
     quiet: Quiet = False,
@@ -79,7 +81,7 @@ def diagnose(
         f"--poses {poses} has no meaning without --plan; name the file for the extra poses",
     )
     written = check_outputs(output, report, plan, cell_out)
-    known = cell_of(cell)  # its plug-ins may have the effect
+    known = cell_of(cell, plugins)  # its plug-ins may have the effect
     check_apart(written, [cell, data], known)
     with progress_line(quiet) as progress:
         found = verbs.diagnose(
@@ -106,7 +108,10 @@ def diagnose(
                 added = added_text(extra)
                 told.append(f"wrote {cell_out} with {added or 'no further effect'}")
                 if added:
-                    again = shlex.join(["elastocal", "identify", str(cell_out), str(data)])
+                    again = shlex.join(
+                        ["elastocal", "identify", str(cell_out), str(data)]
+                        + ["--plugins"] * plugins
+                    )
                     told.append(f"to go on: {again} -o result.json")
     if as_json:
         say(json_text(publish(found, found.model, found.data)))

@@ -10,6 +10,7 @@ import typer
 from elastocal.cli.app import (
     CellFile,
     Json,
+    Plugins,
     Quiet,
     Seed,
     check_apart,
@@ -71,6 +72,7 @@ def export(
     poses: Annotated[
         int, typer.Option(min=2, max=1_000_000, help="Random poses to find costs at.")
     ] = 500,
+    plugins: Plugins = False,
     seed: Seed = 0,
     as_json: Json = False,
     quiet: Quiet = False,
@@ -88,7 +90,7 @@ def export(
     wish = wish_of(output, format, load, frames, base_frame, temperature_c, time_s, poses, seed)
     with progress_line(quiet) as progress:
         progress("reading")
-        calibrated = read_calibrated(cell, result)
+        calibrated = read_calibrated(cell, result, plugins)
         check_apart(written, [cell, result], calibrated.model.cell)
         done = run(calibrated, wish, progress)
     atomic_write_text(output, done.text)

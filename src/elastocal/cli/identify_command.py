@@ -12,6 +12,7 @@ from elastocal.cli.app import (
     CellFile,
     DataFile,
     Json,
+    Plugins,
     Quiet,
     ReportFile,
     Seed,
@@ -110,6 +111,7 @@ def identify(
         ),
     ] = None,
     jobs: Annotated[int, typer.Option(help="Processes of a bootstrap; -1 for all cores.")] = 1,
+    plugins: Plugins = False,
     seed: Seed = 0,
     as_json: Json = False,
     details: Annotated[
@@ -130,7 +132,7 @@ def identify(
     written = check_outputs(output, report, residuals, certificate)
     limits = limits_of(require or [])
     inputs = [p for p in (cell, data, test, covariance, knowledge) if p is not None]
-    known = cell_of(cell)  # its plug-ins may have the noise model
+    known = cell_of(cell, plugins)  # its plug-ins may have the noise model
     check_apart(written, inputs, known)
     with progress_line(quiet) as progress:
         result = verbs.identify(

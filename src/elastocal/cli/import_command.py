@@ -65,7 +65,6 @@ def import_(
     from elastocal.cli.import_preview import left_out, print_preview, summary
     from elastocal.importing.assemble import import_files
     from elastocal.importing.mapping_file import preset_text, read_mapping, with_units
-    from elastocal.model.effects import CATALOGUE
 
     if show_preset is not None:
         say(preset_text(show_preset), end="")
@@ -88,7 +87,7 @@ def import_(
     read = with_units(read_mapping(mapping, preset or ()), length_unit, angle_unit)
     known = None
     if cell is not None:
-        known = read_cell(cell, known_effects=CATALOGUE)
+        known = read_cell(cell)
         check_apart(written, [], known)
     found = import_files(paths, read, known, str(output or "the table"))
     if as_json:

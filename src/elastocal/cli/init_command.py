@@ -7,7 +7,7 @@ from typing import Annotated
 
 import typer
 
-from elastocal.cli.app import Json, check_apart, check_outputs, command, console
+from elastocal.cli.app import Json, Plugins, check_apart, check_outputs, command, console
 from elastocal.screen import say
 from elastocal.text import json_text
 
@@ -56,6 +56,7 @@ def effects(
     cell: Annotated[
         Path | None, typer.Argument(help="Cell file (TOML); default: the KR 270 of the demo.")
     ] = None,
+    plugins: Plugins = False,
     as_json: Json = False,
 ) -> None:
     """Every effect of the catalogue: its parameters' unit and typical size, what it is, and where.
@@ -65,9 +66,10 @@ def effects(
     from rich.padding import Padding
 
     from elastocal import demo
+    from elastocal.model.choice import cell_of
     from elastocal.report.effect_names import effect_entries, effect_lines
 
-    entries = effect_entries(cell or Path(demo.__file__).parent / "cell.toml")
+    entries = effect_entries(cell_of(cell or Path(demo.__file__).parent / "cell.toml", plugins))
     if as_json:
         say(json_text({"schema": "elastocal/effects/1", "effects": entries}))
         return

@@ -11,6 +11,7 @@ from elastocal.cli.app import (
     CellFile,
     DataFile,
     Json,
+    Plugins,
     Quiet,
     Seed,
     check_apart,
@@ -48,6 +49,7 @@ def next_command(
         int, typer.Option(min=1, help="Feasible candidates to choose from.")
     ] = 400,
     jobs: Annotated[int, typer.Option(help="Processes; -1 for all cores.")] = 1,
+    plugins: Plugins = False,
     seed: Seed = 0,
     as_json: Json = False,
     quiet: Quiet = False,
@@ -69,7 +71,7 @@ def next_command(
     require(output.suffix.lower() != ".json", f"{output}: name the plan .csv; .json goes beside it")
     written = check_outputs(output, beside)
     limits = limits_of([] if required is None else [required], ("new_poses",))
-    known = cell_of(cell)
+    known = cell_of(cell, plugins)
     check_apart(written, [cell, data], known)
     with progress_line(quiet) as progress:
         found = next_poses(

@@ -10,6 +10,7 @@ import typer
 from elastocal.cli.app import (
     CellFile,
     Json,
+    Plugins,
     Quiet,
     Seed,
     check_apart,
@@ -48,6 +49,7 @@ def simulate(
     ] = None,
     repeats: Annotated[int, typer.Option(min=1, help="Readings per pose and load state.")] = 1,
     no_noise: Annotated[bool, typer.Option("--no-noise", help="Exact readings.")] = False,
+    plugins: Plugins = False,
     seed: Seed = 0,
     as_json: Json = False,
 ) -> None:
@@ -62,7 +64,7 @@ def simulate(
     from elastocal.verbs import simulated
 
     written = check_outputs(output, truth)
-    model = Model(cell)
+    model = Model(cell, plugins=plugins)
     check_apart(written, [cell, plan], model.cell)
     poses = model.read_plan(plan)
     table, x = simulated(

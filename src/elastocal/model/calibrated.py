@@ -184,12 +184,15 @@ def lasting(arm: CalibratedArm) -> tuple[CalibratedArm, tuple[str, ...]]:
     ), tuple(gone)  # fmt: skip
 
 
-def read_calibrated(cell_path: str | Path, result_path: str | Path) -> CalibratedArm:
+def read_calibrated(
+    cell_path: str | Path, result_path: str | Path, plugins: bool = False
+) -> CalibratedArm:
     """The arm that an earlier identification wrote.
 
     Args:
         cell_path: The cell file that it was run with.
         result_path: Its result (`Calibration.save`, or the command identify).
+        plugins: Run the plug-ins that the cell names, where its model has an effect of theirs.
 
     Returns:
         The `CalibratedArm`, as `fit.arm` is.
@@ -203,7 +206,7 @@ def read_calibrated(cell_path: str | Path, result_path: str | Path) -> Calibrate
         >>> ec.read_calibrated("cell.toml", "result.json")
         <CalibratedArm kuka_kr270_2: 9 of 10 parameters determined, from result.json>
     """
-    cell = cell_of(cell_path)
+    cell = cell_of(cell_path, plugins or None)
     result = _read_result(Path(result_path))
     held = _held(result, result_path)
     # A cell that lists no markers took them from the table; their names stand in the parameters.
@@ -214,7 +217,7 @@ def read_calibrated(cell_path: str | Path, result_path: str | Path) -> Calibrate
             if where.startswith("marker:")
         )
     )
-    model = Model(cell, markers)
+    model = Model(cell, markers, plugins=plugins or None)
     _check_same(model, held, cell_path, result_path)
     _check_robot(model, result.get("nominal_flange"), cell_path, result_path)
     determined, covariance = _covariance(result, held, result_path)

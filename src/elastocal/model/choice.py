@@ -14,14 +14,25 @@ from elastocal.model.arm import ParameterSpec
 from elastocal.model.chain import Chain, plausible
 from elastocal.model.effects import CATALOGUE
 from elastocal.model.effects.base import Effect
+from elastocal.plugin_loader import load_installed, load_named
 from elastocal.text import did_you_mean, listed
 
 
-def cell_of(cell: Cell | str | Path) -> Cell:
-    """The cell itself, or that of a cell file; InputError where the file is wrong."""
-    if isinstance(cell, Cell):
-        return cell
-    return read_cell(cell, known_effects=tuple(CATALOGUE))
+def cell_of(cell: Cell | str | Path, plugins: bool | None = False) -> Cell:
+    """The cell itself, or that of a cell file; its plug-ins run where `plugins` or the environment
+    allows it.
+
+    `plugins` None: they are done without where the catalogue has all effects of its model.  Raises
+    InputError where the file is wrong, or names plug-ins that may not run.
+    """
+    fresh = not isinstance(cell, Cell)
+    read = cell if isinstance(cell, Cell) else read_cell(cell)
+    load_installed()
+    if plugins is not None or any(each.name not in CATALOGUE for each in read.model.effects):
+        load_named(read.path or Path(read.name), read.plugins, bool(plugins), fresh)
+    if fresh:
+        read.check(known_effects=tuple(CATALOGUE))
+    return read
 
 
 def load_chain(cell: Cell) -> Chain:

@@ -63,6 +63,8 @@ class Model:
             takes them from the table where neither says them.
         backend: What evaluates it: "auto", "numpy" or "compiled"; None follows the
             environment variable ELASTOCAL_BACKEND.
+        plugins: Run the Python files and modules that the cell names under [plugins]; None does
+            without them where no effect of the model is theirs.
 
     Raises:
         InputError: The cell, or a file that it names, is wrong; the message says where.
@@ -81,9 +83,13 @@ class Model:
     """
 
     def __init__(
-        self, cell: Cell | str | Path, markers: Sequence[str] = (), backend: str | None = None
+        self,
+        cell: Cell | str | Path,
+        markers: Sequence[str] = (),
+        backend: str | None = None,
+        plugins: bool | None = False,
     ) -> None:
-        cell = cell_of(cell)
+        cell = cell_of(cell, plugins)
         self._markers_stated = bool(cell.tool.markers)
         if not self._markers_stated:
             cell = _with_markers(cell, tuple(markers) or (DEFAULT_MARKER,))
