@@ -14,7 +14,6 @@ from elastocal.errors import UnknownNameError
 from elastocal.identification import judged, rms_3d
 from elastocal.identification.findings import ENOUGH, spare_equations
 from elastocal.identification.identify import identify
-from elastocal.identification.mistakes import UNHEARD, unheard_of
 from elastocal.identification.prediction import NewPoses
 from elastocal.identification.residuals import told_by_one
 from elastocal.model import Model, observe
@@ -128,18 +127,6 @@ def test_limits_that_are_not_kept_are_named(fits):
     assert fit.unmet(test=1.0) == ("test: not known where at most 1e+06 µm is required",)
     with pytest.raises(UnknownNameError, match="held_out"):
         fit.unmet(held_out=1.0)
-
-
-def test_values_that_no_arm_has_are_said_first(fits):
-    fit = fits[0][0]
-    name = next(p.name for p in fit.model.parameters if p.effect == "link_geometry")
-    k = fit.model.names.index(name)
-    x = fit.x.copy()
-    assert unheard_of(fit.model, x) == {}
-    x[k] = fit.model.nominal[k] + 1.5 * UNHEARD * fit.model.parameters[k].typical
-    far = judged(replace(fit, x=x, estimates=fit.estimates))
-    assert far.verdict.missing[0].kind == "unheard_of" and not far.verdict.trusted
-    assert far.finding("unheard_of").numbers["parameters"] == (name,)
 
 
 def test_what_no_pose_shows_is_not_asked_for(fits):

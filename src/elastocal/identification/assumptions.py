@@ -17,13 +17,14 @@ from elastocal.identification.result import Calibration, Finding
 LEVEL = 0.01  # p-value below which scatter and drift are there
 
 
-def assumption_findings(result: Calibration) -> Iterator[Finding]:
-    """All of these findings, those on the readings first."""
+def assumption_findings(result: Calibration, explained: bool) -> Iterator[Finding]:
+    """All of these findings, those on the readings first; `explained`: the noise explains what the
+    fit leaves."""
     yield from _copies(result)
     yield from _load_unit(result)
     yield from _hardly_shown(result)
     yield from _left_out(result)
-    yield from _alike_in_time(result)
+    yield from _alike_in_time(result, explained)
 
 
 def _copies(result: Calibration) -> Iterator[Finding]:
@@ -84,14 +85,18 @@ def _left_out(result: Calibration) -> Iterator[Finding]:
             )  # fmt: skip
 
 
-def _alike_in_time(result: Calibration) -> Iterator[Finding]:
-    """Residuals of visits that follow each other, by a permutation test."""
+def _alike_in_time(result: Calibration, explained: bool) -> Iterator[Finding]:
+    """Residuals of visits that follow each other, by a permutation test.
+
+    Where the noise explains the residual, what they share is a small part of it, for which the
+    error at new poses has room.
+    """
     found = result.autocorrelation
     if found is None or found.p >= LEVEL:
         return
     counted = result.noise.drift is not None
     yield Finding(
-        "autocorrelated", "note" if counted else "care",
+        "autocorrelated", "note" if counted or explained else "care",
         {
             "lag1": found.correlations[0], "p": found.p, "visits": found.visits, "by": found.by,
             "counted": "yes" if counted else "no",

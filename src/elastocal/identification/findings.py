@@ -13,7 +13,7 @@ from scipy import linalg, special
 
 from elastocal.errors import option
 from elastocal.identification.assumptions import assumption_findings
-from elastocal.identification.mistakes import unheard_of
+from elastocal.identification.far_values import far_values, only_placed
 from elastocal.identification.noise_structure import JOINTS, TIME
 from elastocal.identification.outliers import Outlier, blocks
 from elastocal.identification.residuals import ResidualSummary
@@ -83,17 +83,18 @@ def judged(result: Calibration, of_solution: tuple[Finding, ...] | None = None) 
     """
     if of_solution is None:
         of_solution = tuple(f for f in result.findings if f.kind in OF_SOLUTION)
+    noise = (*_against_stated_noise(result), *_repeats(result))
+    explained = _explained(result, {f.kind for f in noise})
     found = [
         *_spoilt(result),
-        *_unheard_of(result),
-        *assumption_findings(result),
+        *far_values(result, explained, LACKING),
+        *assumption_findings(result, explained),
         *_few_poses(result),
         *(f for f in of_solution if f.kind == "ill_conditioned"),
-        *_against_stated_noise(result),
-        *_repeats(result),
+        *noise,
         *_visits(result),
-        *_prediction(result),
-        *_new_poses(result),
+        *_prediction(result, explained),
+        *_new_poses(result, explained),
         *(f for f in of_solution if f.kind != "ill_conditioned"),
         *_faulty(result),
         *_undetermined(result),
@@ -127,25 +128,21 @@ def _spoilt(result: Calibration) -> Iterator[Finding]:
             "Give start hints in [model.nominal], fit fewer effects, or measure more poses.",
         )  # fmt: skip
     held, nominal = result.heldout_rms, result.nominal_rms
-    if math.isfinite(held) and math.isfinite(nominal) and held >= nominal:
+    if held < math.inf and nominal < math.inf and held >= nominal and not only_placed(result):
         numbers: dict[str, Number] = {"heldout_rms_um": _um(held), "nominal_rms_um": _um(nominal)}
         yield Finding("no_better_than_nominal", "poor", numbers)
 
 
-def _unheard_of(result: Calibration) -> Iterator[Finding]:
-    """Values that no arm has: an effect is missing, or hardly anything holds them."""
-    far = unheard_of(result.model, result.x)
-    if far:
-        values = [result[name] for name in far]
-        yield Finding(
-            "unheard_of", "care",
-            {
-                "parameters": tuple(far), "typical_sizes": tuple(far.values()),
-                "values": tuple(e.held for e in values),
-                "units": tuple(e.unit for e in values), "readings_set_apart": len(result.excluded),
-            },
-            LACKING,
-        )  # fmt: skip
+def _explained(result: Calibration, told: set[str]) -> bool:
+    """Whether the noise explains what is left, by what is `told` of it, and held-out poses agree.
+
+    Of n equations for p parameters the held-out error is that of the fit times n / (n - p) or more.
+    """
+    stated = told & {"residual_agrees_with_stated_noise", "residual_below_stated_noise"}
+    agrees = bool(stated) or ("noise_not_compared" in told and "repeats_agree" in told)
+    n, held = len(result.observations.value), result.heldout_rms
+    expected = result.residual_rms * n / max(result.dof, 1)
+    return agrees and "lack_of_fit" not in told and held <= FLATTERS * expected
 
 
 def _few_poses(result: Calibration) -> Iterator[Finding]:
@@ -273,21 +270,27 @@ def _visits(result: Calibration) -> Iterator[Finding]:
         )  # fmt: skip
 
 
-def _prediction(result: Calibration) -> Iterator[Finding]:
+def _prediction(result: Calibration, explained: bool) -> Iterator[Finding]:
     held, fitted, nominal = result.heldout_kept_rms, result.residual_rms, result.nominal_rms
+    placed = only_placed(result)
     # Under a drift the held-out error is that of another day, which more poses make no better.
-    if math.isfinite(held) and held > FLATTERS * fitted and result.noise.drift is None:
+    # Of base and tool alone, what each point takes of the fit is all that it can flatter by.
+    flatters = math.isfinite(held) and held > FLATTERS * fitted and not (placed and explained)
+    if flatters and result.noise.drift is None:
         numbers: dict[str, Number] = {"heldout_rms_um": _um(held), "residual_rms_um": _um(fitted)}
         yield Finding("fit_flatters", "care", numbers, _more_poses())
-    if held < nominal < LITTLE * held < math.inf:
+    if held < nominal < LITTLE * held < math.inf and not placed:
         numbers = {"heldout_rms_um": _um(held), "nominal_rms_um": _um(nominal)}
         yield Finding("little_gain", "care", numbers)
 
 
-def _new_poses(result: Calibration) -> Iterator[Finding]:
+def _new_poses(result: Calibration, explained: bool) -> Iterator[Finding]:
     """Is what is said of poses that nobody measured founded: on enough configurations, on a noise
     that is known, on parameters that the readings show?"""
-    left, wanted = spare_equations(result), ENOUGH
+    # Where base and tool alone are sought, as by a dozen touches of a tip, the stated noise judges
+    # the fit, and no scatter has to be learnt from it: a coarser look is enough.
+    placed = explained and only_placed(result)
+    left, wanted = spare_equations(result), COARSE if placed else ENOUGH
     if left < wanted:
         numbers: dict[str, Number] = {
             "configurations": result.observations.n_configurations,
@@ -314,15 +317,18 @@ def _new_poses(result: Calibration) -> Iterator[Finding]:
             },
             f"{_more_poses()} For a part of the joint ranges alone, state test poses in the cell.",
         )  # fmt: skip
-    if found.rms > result.nominal_rms / LITTLE:
+    if found.rms > result.nominal_rms / LITTLE and not only_placed(result):
         numbers = {"rms_um": _um(found.rms), "nominal_rms_um": _um(result.nominal_rms)}
         yield Finding("new_poses_no_gain", "care", numbers, _more_poses())
 
 
 # Equations left between configurations from which their scatter says to a factor of 1.25, with
-# 95 % probability, what errors there are beyond the parameters: √(ν/χ²_ν(5 %)) ≤ 1.25.
-FACTOR = 1.25
-ENOUGH = next(n for n in range(1, 1000) if n <= FACTOR**2 * special.chdtri(n, 0.95))
+# 95 % probability, what errors there are beyond the parameters: √(ν/χ²_ν(5 %)) ≤ 1.25; and from
+# which it says it to a factor of 1.5.
+ENOUGH, COARSE = (
+    next(n for n in range(1, 1000) if n <= factor**2 * special.chdtri(n, 0.95))
+    for factor in (1.25, 1.5)
+)
 
 
 def spare_equations(result: Calibration) -> int:

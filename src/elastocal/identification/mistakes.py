@@ -20,7 +20,6 @@ from elastocal.errors import InsufficientDataError
 from elastocal.identification.start import RegistrationProblem, any_matrix, register
 from elastocal.measurements import Measurements
 from elastocal.model.chain import Chain
-from elastocal.model.effects import effect_of
 from elastocal.model.effects.base import index
 from elastocal.model.effects.compliances import (
     RATED_WIND_UP,
@@ -28,7 +27,6 @@ from elastocal.model.effects.compliances import (
     rated_torque,
     weight_torque,
 )
-from elastocal.model.effects.placements import MarkerPosition
 from elastocal.model.manipulator import Model
 from elastocal.model.observations import Observations
 from elastocal.units import Array, BoolArray
@@ -313,22 +311,3 @@ def refuse_nonsense(
     raise InsufficientDataError(
         f"{table.source}: {what}, which no arm of {length:.3g} m could be; {cause}"
     )
-
-
-UNHEARD = 10.0  # typical deviations from nominal, beyond which no arm that works has a parameter
-
-
-def unheard_of(model: Model, x: Array) -> dict[str, float]:
-    """Parameters whose values (parameters,) no arm has, and how many typical deviations they are
-    from nominal, the farthest first.
-
-    Not counted are those without a typical deviation or a stated nominal value, as where the base
-    stands, and markers that the cell does not place.
-    """
-    stated = any(place.any() for place in model.cell.tool.markers.values())
-    far = {}
-    for p, value in zip(model.parameters, x, strict=True):
-        placed = effect_of(p.effect).registered and not (p.effect == MarkerPosition.name and stated)
-        if p.typical and not placed and not p.shrunk:
-            far[p.name] = abs(float(value) - p.nominal) / p.typical
-    return {k: v for k, v in sorted(far.items(), key=lambda kv: -kv[1]) if v > UNHEARD}

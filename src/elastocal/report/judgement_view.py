@@ -6,9 +6,10 @@ import math
 from collections.abc import Callable
 from dataclasses import dataclass
 
+from elastocal.identification.far_values import only_placed
 from elastocal.identification.findings import next_steps
 from elastocal.identification.result import Calibration, Finding
-from elastocal.report.formatting import Tone, counted, display, length, significant
+from elastocal.report.formatting import Tone, counted, display, estimate, length, significant
 from elastocal.text import listed, printable
 
 # Sections of the page, by the finding they tell of, and the words that they are named after.
@@ -193,6 +194,21 @@ def _accuracy(result: Calibration) -> str:
         "rms"
     )
     gain = result.nominal_rms / result.heldout_rms if result.heldout_rms > 0 else math.inf
-    if math.isfinite(gain):
+    if only_placed(result):
+        text += _placed_markers(result)
+    elif math.isfinite(gain):
         text += f", {significant(gain, 2)} times better than by the nominal arm"
     return text
+
+
+def _placed_markers(result: Calibration) -> str:
+    """ "; TCP lies at x = 30.24 ± 0.13, … mm of the flange (95 %)": what such a fit is made for."""
+    found: dict[str, list[str]] = {}
+    for e in result.ordinary:
+        name, _, axis = e.name.rpartition(".")
+        if axis in ("x", "y", "z") and e.value is not None and e.ci95 is not None:
+            value, half, unit = estimate(e.value, (e.ci95[1] - e.ci95[0]) / 2, e.unit)
+            found.setdefault(name, []).append(f"{axis} = {value} ± {half} {unit}")
+    told = [f"{printable(name.removeprefix('marker:'))} lies at {', '.join(axes)}"
+            for name, axes in found.items() if len(axes) == 3]  # fmt: skip
+    return f"; {listed(told, 3)} (95 %)" if told else ""
