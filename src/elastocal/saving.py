@@ -14,7 +14,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from elastocal.errors import InputError, option, require
-from elastocal.files import atomic_write_text
+from elastocal.files import atomic_write_text, read_json
 from elastocal.measurements import Measurements, write_measurements
 from elastocal.model.arm import given_force
 from elastocal.tables import csv_text
@@ -31,6 +31,8 @@ if TYPE_CHECKING:
     from elastocal.identification.result import Calibration
     from elastocal.model.calibrated import CalibratedArm
     from elastocal.planning.plan import Plan
+
+LARGEST_SUMMARY = 200_000_000  # bytes
 
 # One verb's result should not load another verb: each function imports what it needs.
 
@@ -58,18 +60,38 @@ def save_residuals(fit: Calibration, path: Path) -> None:
     atomic_write_text(path, csv_text(list(rows[0]), [list(row.values()) for row in rows]))
 
 
+def beside(path: Path) -> Path:
+    """Where the summary (JSON) of the plan `path` is written, which nobody names.
+
+    Raises InputError where `path` ends in .json itself, or another file is there that no design
+    wrote.
+    """
+    require(path.suffix.lower() != ".json", f"{path}: name the plan .csv; .json goes beside it")
+    summary = path.with_suffix(".json")
+    if summary.exists():
+        try:
+            found = read_json(summary, "summary", LARGEST_SUMMARY, "")
+        except InputError:
+            found = None
+        require(
+            isinstance(found, dict) and found.get("schema") == "elastocal/plan/1",
+            f"{summary}: goes beside {path} and would be written over, but is no summary of a "
+            "plan; move it, or name the plan otherwise",
+        )
+    return summary
+
+
 def save_plan(plan: Plan, path: Path, command: str | None = None) -> None:
     """plan.csv, which people measure by, and plan.json (schema elastocal/plan/1) beside it.
 
-    `command` is the command line that repeats the design.  Raises InputError for a path that ends
-    in .json, since that of the summary is made of it.
+    `command` is the command line that repeats the design.  Raises InputError as `beside` does.
     """
     from elastocal.planning.plan import write_plan, write_plan_json
 
-    require(path.suffix.lower() != ".json", f"{path}: name the plan .csv; .json goes beside it")
+    summary = beside(path)
     write_plan(path, plan.rows, plan.model.chain.kinds)
     repeat = {"command": command, "backend": plan.model.backend_report()}
-    write_plan_json(path.with_suffix(".json"), plan.to_json() | repeat)
+    write_plan_json(summary, plan.to_json() | repeat)
 
 
 def save_diagnosis(diagnosis: Diagnosis, path: Path) -> None:

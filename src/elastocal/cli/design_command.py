@@ -48,7 +48,14 @@ def _criteria() -> list[str]:
 @command()
 def design(
     cell: CellFile,
-    output: Annotated[Path, typer.Option("-o", "--output", help="The plan to write (CSV).")],
+    output: Annotated[
+        Path,
+        typer.Option(
+            "-o",
+            "--output",
+            help="The plan to write (CSV), .json beside it; OUTPUT.resume while it works.",
+        ),
+    ],
     poses: Annotated[int | None, typer.Option(min=1, help="Number of poses.")] = None,
     criterion: Annotated[
         str | None,
@@ -158,11 +165,11 @@ def design(
     from elastocal.planning.checkpoint import Checkpoint, key_of
     from elastocal.planning.design import design as run
     from elastocal.planning.pins import plan_and_names
+    from elastocal.saving import beside
     from elastocal.verbs import design as verb
     from elastocal.verbs import design_request
 
-    summary = output.with_suffix(".json")
-    require(output.suffix.lower() != ".json", f"{output}: name the plan .csv; .json goes beside it")
+    summary = beside(output)
     programs = program or []
     _check_suffixes(programs, picture)
     written = check_outputs(output, summary, *programs, picture, report, cell_out)

@@ -21,7 +21,6 @@ from elastocal.cli.app import (
     repeated,
 )
 from elastocal.cli.identify_command import limits_of
-from elastocal.errors import require
 from elastocal.screen import progress_line, say
 from elastocal.text import json_text
 
@@ -30,7 +29,9 @@ from elastocal.text import json_text
 def next_command(
     cell: CellFile,
     data: DataFile,
-    output: Annotated[Path, typer.Option("-o", "--output", help="The poses to write (CSV).")],
+    output: Annotated[
+        Path, typer.Option("-o", "--output", help="The poses to write (CSV); .json beside it.")
+    ],
     batch: Annotated[int, typer.Option(min=1, help="Number of poses.")] = 5,
     required: Annotated[
         str | None,
@@ -65,11 +66,10 @@ def next_command(
     from elastocal.diagnosis.next_poses import next_poses
     from elastocal.files import together
     from elastocal.model.choice import cell_of
-    from elastocal.saving import save_plan
+    from elastocal.saving import beside, save_plan
 
-    beside = output.with_suffix(".json")
-    require(output.suffix.lower() != ".json", f"{output}: name the plan .csv; .json goes beside it")
-    written = check_outputs(output, beside)
+    summary = beside(output)
+    written = check_outputs(output, summary)
     limits = limits_of([] if required is None else [required], ("new_poses",))
     known = cell_of(cell, plugins)
     check_apart(written, [cell, data], known)
@@ -88,4 +88,4 @@ def next_command(
     from elastocal.report.plan_terminal import print_next
 
     print_next(console(), found)
-    say(f"{output} not written" if found.plan is None else f"wrote {output}\nwrote {beside}")
+    say(f"{output} not written" if found.plan is None else f"wrote {output}\nwrote {summary}")

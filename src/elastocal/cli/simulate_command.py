@@ -96,7 +96,10 @@ def _assignment(text: str) -> tuple[str, float]:
 @command(short_help="See a KR 270 simulated and calibrated (Klimchik et al. 2013).")
 def demo(
     folder: Annotated[
-        Path, typer.Option("-o", "--output", help="Folder for the example's files.")
+        Path,
+        typer.Option(
+            "-o", "--output", help="Folder for the example's files, data, result and report."
+        ),
     ] = Path("demo_out"),
     seed: Seed = 2013,
     as_json: Json = False,

@@ -55,7 +55,12 @@ def study(
     ] = None,
     output: Annotated[
         Path | None,
-        typer.Option("-o", "--output", help="Folder of the results; default: FOLDER/results."),
+        typer.Option(
+            "-o",
+            "--output",
+            help="Folder of the results, with the summary in OUTPUT.md; default: FOLDER/results "
+            "and FOLDER/result.md.",
+        ),
     ] = None,
     progress: Annotated[
         bool,
@@ -81,7 +86,7 @@ def study(
     """
     require(cluster is None or jobs is None, "--jobs is for this machine; leave it with --cluster")
     from elastocal.studies.study_folder import read_study
-    from elastocal.studies.study_results import arrow
+    from elastocal.studies.study_results import StudyResults, arrow
     from elastocal.studies.study_run import StudyStop, Way, run_study, summarise
 
     arrow()
@@ -90,6 +95,7 @@ def study(
     page = folder / "result.md"
     if output is not None:
         page = Path(f"{output if output.name else output.resolve()}.md")
+        StudyResults(results).check_page(page)
     prepared = read_study(folder, seed, set_ or ())
     with StudyStop() as stop, StudyProgress(progress and not quiet) as shown:
         ending = run_study(

@@ -5,7 +5,7 @@ from __future__ import annotations
 import hashlib
 import io
 import json
-import shutil
+import re
 import zipfile
 import zlib
 from collections.abc import Callable, Iterable, Mapping
@@ -17,10 +17,12 @@ import numpy as np
 from numpy.typing import NDArray
 
 from elastocal import __version__
-from elastocal.errors import InputError
-from elastocal.files import atomic_write_bytes, open_input
+from elastocal.errors import InputError, require
+from elastocal.files import atomic_write_bytes, open_input, remove_abandoned
 
 State = Mapping[str, NDArray]
+MARK = "elastocal"  # an array of every file that a stage writes: what has none is not removed
+KEY = "[0-9a-f]{32}"
 
 
 def key_of(files: Iterable[Path], **options: object) -> str:
@@ -50,7 +52,7 @@ class Stage:
             return None
         try:
             with open(self.path, "rb") as file, np.load(file, allow_pickle=False) as saved:
-                return {name: saved[name] for name in saved.files}
+                return {name: saved[name] for name in saved.files if name != MARK}
         except (OSError, ValueError, EOFError, zipfile.BadZipFile, zlib.error):
             return None
 
@@ -68,7 +70,8 @@ class Stage:
         if self.path is None:
             return
         text = io.BytesIO()
-        np.savez(text, allow_pickle=False, **{k: np.asarray(v) for k, v in state.items()})
+        arrays = {MARK: np.array(__version__)} | {k: np.asarray(v) for k, v in state.items()}
+        np.savez(text, allow_pickle=False, **arrays)
         self.path.parent.mkdir(parents=True, exist_ok=True)
         try:
             atomic_write_bytes(self.path, text.getvalue())
@@ -91,8 +94,17 @@ class Checkpoint:
         """In the folder `OUTPUT.resume`, apart from what other input or options left there.
 
         Nothing is written, nor anything of another design thrown away, before a stage is saved.
+        Raises InputError where something else has that name, or is in the folder.
         """
-        return cls(output.with_name(output.name + ".resume") / key[:32], check)
+        folder = output.with_name(output.name + ".resume")
+        entries = sorted(folder.iterdir()) if folder.is_dir() else [folder][: folder.exists()]
+        for entry in entries:
+            require(
+                entry.is_dir() and bool(re.fullmatch(KEY, entry.name)),
+                f"{entry} is not elastocal's, which keeps in {folder} where a design stands; move "
+                "it elsewhere, or name another -o",
+            )
+        return cls(folder / key[:32], check)
 
     @property
     def begun(self) -> bool:
@@ -106,11 +118,26 @@ class Checkpoint:
     def drop(self) -> None:
         """This design ends without a plan: nothing to resume, but perhaps of another one."""
         if self.folder is not None:
-            shutil.rmtree(self.folder, ignore_errors=True)
-            with suppress(OSError):
-                self.folder.parent.rmdir()
+            _remove(self.folder)
 
     def clear(self) -> None:
         """The output is written: nothing to resume, whatever else was begun for it."""
         if self.folder is not None:
-            shutil.rmtree(self.folder.parent, ignore_errors=True)
+            for folder in self.folder.parent.glob("*"):
+                if re.fullmatch(KEY, folder.name):
+                    _remove(folder)
+
+
+def _remove(folder: Path) -> None:
+    """The files that stages wrote into `folder`, and the folders that are empty then."""
+    with suppress(OSError):
+        remove_abandoned(folder, r".*\.npz")
+    for path in folder.glob("*.npz"):
+        with suppress(OSError, zipfile.BadZipFile):
+            with zipfile.ZipFile(path) as archive:
+                ours = f"{MARK}.npy" in archive.namelist()
+            if ours:
+                path.unlink()
+    for empty in (folder, folder.parent):
+        with suppress(OSError):
+            empty.rmdir()

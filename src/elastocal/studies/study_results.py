@@ -6,6 +6,7 @@ is checked, so that no task counts twice.
 
 from __future__ import annotations
 
+import hashlib
 import json
 import threading
 import time
@@ -16,7 +17,14 @@ from types import ModuleType
 from typing import TYPE_CHECKING, Any, Self
 
 from elastocal.errors import InputError, option, require
-from elastocal.files import atomic_binary_writer, atomic_write_text, read_json, remove_abandoned
+from elastocal.files import (
+    atomic_binary_writer,
+    atomic_write_text,
+    read_bytes,
+    read_json,
+    read_text,
+    remove_abandoned,
+)
 from elastocal.screen import shown
 from elastocal.studies.study_folder import Outcome, Study
 
@@ -26,7 +34,9 @@ if TYPE_CHECKING:
 
 # Names with a leading underscore or dot are no parts to those who read the folder as a dataset.
 MAX_BYTES = 100_000_000  # of the record
+SCHEMA = "elastocal/study/1"
 STATEMENT, FAILURES, LOCK = "_study.json", "_failures.log", ".lock"
+WRITTEN = "_written.txt"  # names of the parts and digests of the page that the study wrote
 SOONEST, LATEST = 5.0, 60.0  # s between parts; a long run writes fewer, or there are thousands
 
 
@@ -101,8 +111,22 @@ class StudyResults:
         number = max((int(number) for number in numbers if number.isdigit()), default=0) + 1
         return self.folder / f"part-{number:06d}.parquet"
 
+    def note(self, written: str) -> None:
+        """Remember what is about to be written: nothing else is removed or replaced."""
+        if written not in self.noted():
+            with open(self.folder / WRITTEN, "a", encoding="utf-8") as ledger:
+                ledger.write(f"{written}\n")
+
+    def noted(self) -> list[str]:
+        """Returns what `note` was told."""
+        try:
+            return read_text(self.folder / WRITTEN, "record", MAX_BYTES).split()
+        except InputError:
+            return []
+
     def write(self, path: Path, lines: pyarrow.Table) -> None:
         """Write the part `path` (again), whole or not at all."""
+        self.note(path.name)
         with atomic_binary_writer(path) as handle:
             arrow().parquet.write_table(lines, handle, compression="zstd")
 
@@ -155,14 +179,36 @@ class StudyResults:
                 self.write(path, good)
 
     def clear(self) -> None:
-        """Remove all results."""
+        """Remove all results; InputError where there are parts that the study did not write."""
+        noted = self.noted()
+        foreign = [path.name for path in self.parts() if path.name not in noted]
+        require(
+            not foreign,
+            f"{self.folder}: holds {', '.join(foreign[:3])}, which the study did not write; move "
+            f"it elsewhere, or name another folder with {option('output', 'NEW')}",
+        )
         for path in [*self.parts(), self.folder / STATEMENT, self.folder / FAILURES]:
             path.unlink(missing_ok=True)
+
+    def check_page(self, page: Path) -> None:
+        """Raise InputError where `page` is there and not as a summary of the study wrote it."""
+        if page.exists():
+            digest = hashlib.sha256(read_bytes(page, "page", MAX_BYTES)).hexdigest()
+            require(
+                digest in self.noted(),
+                f"{page}: would be written over, and is not as the study left it; move it "
+                f"elsewhere, or name another folder with {option('output', 'NEW')}",
+            )
+
+    def write_page(self, page: Path, text: str) -> None:
+        """Write the summary."""
+        self.note(hashlib.sha256(text.encode()).hexdigest())
+        atomic_write_text(page, text)
 
     def state(self, study: Study, version: str) -> None:
         """Write down what the results are of: seed, options, hashes of the sources."""
         statement = {
-            "schema": "elastocal/study/1",
+            "schema": SCHEMA,
             "title": study.title,
             "seed": study.seed,
             "options": dict(study.options),
@@ -272,13 +318,22 @@ def opened(folder: Path) -> Iterator[StudyResults]:
         folder.mkdir(parents=True, exist_ok=True)
     except OSError as error:
         raise InputError(f"{folder}: cannot be made ({error.strerror}); name another") from None
-    visible = [p.name for p in sorted(folder.iterdir()) if not p.name.startswith((".", "_"))]
-    foreign = [n for n in visible if not (n.startswith("part-") and n.endswith(".parquet"))]
+    results = StudyResults(folder)
+    ours = results.stated().get("schema") == SCHEMA
+    visible = [p.name for p in sorted(folder.iterdir()) if not p.name.startswith(".")]
+    foreign = [
+        name
+        for name in visible
+        if not (
+            ours
+            and (name.startswith("_") or (name.startswith("part-") and name.endswith(".parquet")))
+        )
+    ]
     require(
         not foreign,
         f"{folder}: holds {', '.join(foreign[:3])}, which no study wrote; name a folder of its own",
     )
-    with open(folder / LOCK, "w", encoding="utf-8") as lock:
+    with open(folder / LOCK, "a", encoding="utf-8") as lock:
         try:
             fcntl.flock(lock, fcntl.LOCK_EX | fcntl.LOCK_NB)
         except OSError:
@@ -287,7 +342,7 @@ def opened(folder: Path) -> Iterator[StudyResults]:
                 f"another folder with {option('output', 'NEW')}"
             ) from None
         remove_abandoned(folder, r"part-.*")
-        yield StudyResults(folder)
+        yield results
 
 
 def read_results(folder: str | Path, failed: bool = False) -> pandas.DataFrame:

@@ -27,7 +27,7 @@ from typing import Any, Self
 
 from elastocal import __version__
 from elastocal.errors import ElastocalError, InputError, option, require
-from elastocal.files import atomic_write_text, read_bytes
+from elastocal.files import read_bytes
 from elastocal.studies.study_folder import Outcome, Sources, Study, StudyTask, calling, execute
 from elastocal.studies.study_results import SOONEST, Recorder, StudyResults, opened, read_results
 from elastocal.text import printable, quoted
@@ -508,7 +508,7 @@ def summarise(study: Study, output: str | Path, page: str | Path) -> str | None:
         kind = type(text).__name__
         raise InputError(f"{study.folder / 'study.py'}: summary() returned {kind}; it returns text")
     lines = (printable(line).replace("\\t", "\t") for line in text.rstrip("\n").split("\n"))
-    atomic_write_text(page, "\n".join(lines) + "\n")
+    StudyResults(Path(output)).write_page(Path(page), "\n".join(lines) + "\n")
     return text
 
 
