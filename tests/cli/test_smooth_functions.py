@@ -11,6 +11,7 @@ import pytest
 from support.robots import KR270
 from typer.testing import CliRunner, Result
 
+import elastocal as ec
 from elastocal.cli.app import app
 from elastocal.model import Model
 from elastocal.model.smooth_groups import smooth_groups
@@ -139,6 +140,21 @@ def test_compensate_says_where_no_reading_shows_them(folder: Path) -> None:
     assert "joint1 stands outside -85.9° to 85.9°" in done.output
     near, far = (float(row["std_um"]) for row in csv.DictReader(out.open()))
     assert far > 2 * near
+
+
+def test_beyond_its_range_the_arm_is_that_of_the_model_without_it(folder: Path) -> None:
+    """Faded without a step, so that commands near the end of the range have one solution."""
+    arm = ec.read_calibrated(folder / "cell.toml", folder / "result.json")
+    plain = CELL.replace(', "joint_curve:joint1", "joint_curve:joint2"', "")
+    (folder / "bare.toml").write_text(plain)
+    bare = ec.Model(folder / "bare.toml")
+    x = [arm.values[name] for name in bare.names]
+    angle = np.array([-1.5, 1.4, 1.5, 1.5001, 1.6, 2.2, 2.9])
+    q = np.array([[a, -1.0, 1.0, 0.1, 0.5, 0.1] for a in angle])
+    q[:, 1] = 1.0  # joint 2 was measured up to -0.4 rad
+    apart = np.linalg.norm(arm.pose(q)[:, :3, 3] - bare.pose(q, x)[:, :3, 3], axis=1)
+    assert apart[:4].min() > 1e-5 and abs(apart[3] - apart[2]) < 1e-6
+    assert 0 < apart[4] < 2 * apart[2] and apart[5:].max() < 1e-12
 
 
 def test_export_writes_them_as_corrections(folder: Path) -> None:

@@ -42,7 +42,7 @@ def component(data: NoisyData, seed: int, k: int, smooth: bool = False) -> Compo
     columns = 1e-5 * rng.normal(size=(*data.r.shape, k))
     if not smooth:
         return Component("angle", EncoderScale(), f"joint{seed}", columns, fellows=8)
-    waves = Waves(0.0, np.arange(1.0, k // 2 + 1), 6.0, 1.0)
+    waves = Waves(0.0, np.arange(1.0, k // 2 + 1))
     return Component(
         "angle", JointCurve(), f"joint{seed}", columns, waves=waves, lengths=(-2.0, 1.0)
     )

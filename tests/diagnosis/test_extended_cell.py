@@ -160,3 +160,14 @@ def test_sizes_of_parameters_travel_with_the_effects(tmp_path):
     assert cell.model.nominal.sizes == {"joint2": {"encoder_scale": 0.01, **sizes}}
     typical = {p.name: p.typical for p in Model(tmp_path / "new.toml").parameters}
     assert typical["joint2.move_lag"] == 2.5e-3 and typical["joint2.move_lag_sign"] == 1e-3
+
+
+def test_the_cell_says_where_its_smooth_functions_end(tmp_path):
+    (tmp_path / "arm.urdf").write_bytes(KR270.read_bytes())
+    source = tmp_path / "cell.toml"
+    source.write_text('[robot]\nurdf = "arm.urdf"\n[model]\neffects = ["base_frame"]\n')
+    settings = {"curve_low_rad": -1.5, "curve_high_rad": 1.5}
+    curve = replace(ECCENTRICITY, effect="joint_curve", parameters=(), settings=settings)
+    cell = write_extended_cell(source, tmp_path / "new.toml", (curve,))
+    assert f"{curve.where} from -85.9° to 85.9°;" in (tmp_path / "new.toml").read_text()
+    assert cell.model == read_cell(tmp_path / "new.toml").model

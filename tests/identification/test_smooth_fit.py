@@ -59,7 +59,7 @@ def readings(
 
 
 @lru_cache
-def campaign(seed: int = 0, n: int = 80, curves: float = 1.0):
+def campaign(seed: int = 1, n: int = 80, curves: float = 1.0):
     """Model, truth, readings, others for a test, and the calibration."""
     model, rng = arm(), np.random.default_rng(seed)
     x = true(model, rng, curves)
@@ -263,7 +263,7 @@ def test_the_result_says_where_it_was_not_measured():
     assert far.test.std > 2 * inside.test.std > 0
     assert far.to_json()["test"]["far"] == far.test.far
     assert far.to_json()["measured_poses"]["configurations"] == 100
-    assert far.arm.shown == inside.arm.shown is not None
+    assert far.arm.shown.most == pytest.approx(inside.arm.shown.most, rel=1e-9)
 
 
 def test_intervals_without_a_prior_are_refused():

@@ -73,6 +73,7 @@ def diagnose(
     from elastocal.diagnosis.diagnosis import publish
     from elastocal.files import together
     from elastocal.model.choice import cell_of
+    from elastocal.model.smooth_groups import where_smooth_functions_end
     from elastocal.report.causes_view import added_text
     from elastocal.saving import save_diagnosis
 
@@ -104,9 +105,14 @@ def diagnose(
                 told.append(_write_extra_poses(plan, found.extra, kinds, bool(found.groups)))
             if cell_out is not None:
                 extra = (*found.effects, *found.slight, *found.fields)
-                write_extended_cell(cell, cell_out, extra, found.model_keys)
+                extended = write_extended_cell(cell, cell_out, extra, found.model_keys)
                 added = added_text(extra)
                 told.append(f"wrote {cell_out} with {added or 'no further effect'}")
+                if ends := where_smooth_functions_end(extended):
+                    told.append(
+                        f"its smooth functions end where nothing was measured: {ends}; beyond, "
+                        "the model without them holds"
+                    )
                 if added:
                     again = shlex.join(
                         ["elastocal", "identify", str(cell_out), str(data)]

@@ -335,8 +335,8 @@ def _beyond_functions(arm: CalibratedArm, result: Compensation) -> tuple[str, ..
             low, high = np.degrees([group.low, group.high])
             told.append(
                 f"{_rows(result.targets, out)}: {group.follows} stands outside {low:.1f}° to "
-                f"{high:.1f}°, where the {group.name} was measured; there it goes to zero, and "
-                "the uncertainty grows to its whole size"
+                f"{high:.1f}°, where the {group.name} was measured; there it ends, the arm is "
+                "that of the model without it, and the uncertainty grows to its whole size"
             )
     return tuple(told)
 

@@ -111,9 +111,7 @@ class Component:
         if self.waves is None:
             return np.ones(self.width), np.zeros(self.width)
         length = float(np.exp(log_length))
-        spectrum = self.waves.variances(1.0, length)
-        slope = 30 / length**2 / (5 / length**2 + np.tile(self.waves.frequency, 2) ** 2)
-        slope = slope - (spectrum @ slope) / spectrum.sum()
+        spectrum, slope = self.waves.variances(1.0, length), self.waves.slopes(length)
         return np.tile(spectrum, self.repeat), np.tile(slope, self.repeat)
 
     @property

@@ -60,6 +60,7 @@ from elastocal.identification.start import check_table
 from elastocal.measurements import Measurements
 from elastocal.model.effects import CATALOGUE, effect_of
 from elastocal.model.manipulator import Model
+from elastocal.model.smooth_groups import where_smooth_functions_end
 from elastocal.plugin_loader import is_plugin_file
 from elastocal.text import did_you_mean, listed
 from elastocal.units import BoolArray, Progress
@@ -108,7 +109,12 @@ def write_extended_cell(
         handle.write(tomli_w.dumps(data))
         handle.flush()
         # Read before it appears: a cell that cannot be read is not left behind.
-        return replace(read_cell(handle.name), path=target)
+        written = replace(read_cell(handle.name), path=target)
+        if ends := where_smooth_functions_end(written):
+            handle.seek(0)
+            handle.write(f"# Smooth functions correct the arm where it was measured, {ends};\n")
+            handle.write("# beyond, the model without them holds.\n" + tomli_w.dumps(data))
+        return written
 
 
 def _join(data: dict[str, Any], keys: Mapping[str, Any]) -> None:

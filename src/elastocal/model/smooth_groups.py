@@ -7,8 +7,10 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from elastocal.cell.work_cell import Cell
+from elastocal.model.choice import load_chain
 from elastocal.model.effects import effect_of
-from elastocal.model.effects.base import index
+from elastocal.model.effects.base import Effect, SmoothFunction, index
 from elastocal.model.effects.smooth import FULL_TURN
 from elastocal.model.manipulator import Model
 from elastocal.units import Array, IntArray
@@ -54,11 +56,37 @@ class SmoothGroup:
     @property
     def whole_turn(self) -> bool:
         """Whether it was measured all the way round, so that no angle lies outside."""
-        return self.lasting and self.high - self.low >= FULL_TURN * 2 * np.pi
+        return self.lasting and turns_all_round(self)
 
     def grid(self, n: int) -> Array:
         """n values (n,) of what it follows, over its range."""
         return np.linspace(self.low, self.high, n)
+
+
+def turns_all_round(f: SmoothGroup | SmoothFunction) -> bool:
+    """Whether its range is a whole turn of a joint."""
+    return f.high - f.low >= FULL_TURN * 2 * np.pi
+
+
+def where_smooth_functions_end(cell: Cell) -> str:
+    """Up to where the cell's smooth functions correct the arm, "joint1 from -85.9° to 85.9°, …";
+    empty where none ends."""
+    chosen = [(effect_of(choice.name), choice.where) for choice in cell.model.effects]
+    chosen = [each for each in chosen if type(each[0]).functions is not Effect.functions]
+    chain = load_chain(cell) if chosen else None
+    ends: dict[str, tuple[float, float]] = {}
+    for effect, place in chosen:
+        assert chain is not None
+        for where in [place] if place else effect.places(chain, cell):
+            for f in effect.functions(where, chain, cell):
+                if f.follows == "time" or not turns_all_round(f):
+                    low, high = ends.get(f.follows, (f.low, f.high))
+                    ends[f.follows] = min(low, f.low), max(high, f.high)
+    return ", ".join(
+        f"{name} from {low:.0f} s to {high:.0f} s" if name == "time"
+        else f"{name} from {np.degrees(low):.1f}° to {np.degrees(high):.1f}°"
+        for name, (low, high) in sorted(ends.items())
+    )  # fmt: skip
 
 
 def smooth_groups(model: Model) -> tuple[SmoothGroup, ...]:

@@ -11,8 +11,13 @@ A joint that turns all the way is periodic, P = 2π; else P is longer than the r
 its ends do not know of each other.  Such parameters are `shrunk`: what the readings do not show
 stays at zero, so that the function takes as many parameters as the data pay for.
 
-Beyond its range a function that is not periodic goes to zero as the process does that knows nothing
-there, and stays so: half-way between the ends of the period x stands still.
+Beyond its range a function that is not periodic ends, and the arm is that of the model without it:
+
+    w f(x) + (1 − w) g,   w = (1 − t)² (1 + 2t),
+
+t the distance from the range over that in which f fades, 1 at most, so that value and slope have no
+step.  g ~ N(0, s²) is what the function may be there: no reading within the range tells of it, so
+that it stays at zero and the uncertainty is the function's whole size.
 
 A smooth function corrects the arm and explains nothing.
 """
@@ -52,20 +57,23 @@ FULL_TURN = 0.98  # of 2π: a range from which on a joint's curve is periodic
 HIGHEST = 6.0
 MOST_WAVES = 160
 MARGIN, LENGTHS = 0.25, 3.0  # of the range, or in lengths, that the ends are apart
+# Of the range, and at most one length: within it the function fades.  Beyond a length the readings
+# at the end say next to nothing, and a long one would reach as far again as was measured.
+FADE = 0.125
 
 
 @dataclass(frozen=True)
 class Waves:
     """The waves of a smooth function: `frequency` ω (K,) in 1/x, of x − `low`.
 
-    x goes no further than `reach` to either side of the range, `span` long; infinite where the
+    They fade to zero within `fade` of either end of the range, `span` long; infinite where the
     function is periodic.
     """
 
     low: float
     frequency: Array
     span: float = math.inf
-    reach: float = math.inf
+    fade: float = math.inf
 
     @classmethod
     def over(cls, low: float, high: float, length: float, turns: bool) -> Waves:
@@ -73,32 +81,53 @@ class Waves:
         an angle, and the function periodic where it goes all the way round."""
         span = max(high - low, 1e-9)
         period = span + max(MARGIN * span, LENGTHS * length)
-        reach = (period - span) / 2
+        fade = min(length, FADE * span)
         if turns and span >= FULL_TURN * 2 * math.pi:
-            period, reach = 2 * math.pi, math.inf
+            period, fade = 2 * math.pi, math.inf
         count = math.ceil(HIGHEST / length * period / (2 * math.pi))
         order = np.arange(1, min(max(count, 1), MOST_WAVES) + 1)
         frequency = np.asarray(2 * np.pi * order / period, dtype=np.float64)
-        return cls(low, frequency, span, reach)
+        return cls(low, frequency, span, fade)
+
+    @property
+    def count(self) -> int:
+        """How many coefficients a function has."""
+        return 2 * len(self.frequency) + math.isfinite(self.fade)
 
     def variances(self, size: float, length: float) -> Array:
-        """Prior variances (2K,) of the coefficients, cosines first."""
+        """Prior variances (count,) of the coefficients: cosines, sines, what is beyond."""
         spectrum = (5 / length**2 + self.frequency**2) ** -3.0
-        return np.asarray(np.tile(size**2 * spectrum / spectrum.sum(), 2))
+        shares = [*np.tile(spectrum / spectrum.sum(), 2), 1.0]
+        return np.asarray(size**2 * np.array(shares[: self.count]))
+
+    def slopes(self, length: float) -> Array:
+        """(count,): those of the variances' logarithms in log ℓ."""
+        spectrum, bend = self.variances(1.0, length), 5 / length**2 + self.frequency**2
+        slope = np.tile(30 / length**2 / bend, 2)
+        own = spectrum[: len(slope)]
+        return np.append(slope - (own @ slope) / own.sum(), np.zeros(self.count - len(slope)))
 
     def values(self, x: ca.SX) -> list[ca.SX]:
-        """cos ω_k(x − low), then sin ω_k(x − low): 2K expressions."""
+        """cos ω_k(x − low), then sin ω_k(x − low), then what is beyond: `count` expressions."""
         x = x - self.low
-        if math.isfinite(self.reach):
-            x = ca.fmin(ca.fmax(x, -self.reach), self.span + self.reach)
         phases = [float(w) * x for w in self.frequency]
-        return [*(ca.cos(phase) for phase in phases), *(ca.sin(phase) for phase in phases)]
+        waves = [*(ca.cos(phase) for phase in phases), *(ca.sin(phase) for phase in phases)]
+        if math.isinf(self.fade):
+            return waves
+        t = ca.fmin(ca.fmax(ca.fmax(-x, x - self.span), 0) / self.fade, 1)
+        w = (1 - t) ** 2 * (1 + 2 * t)
+        return [*(w * wave for wave in waves), 1 - w]
 
     def at(self, x: Array) -> Array:
-        """The same numbers (n, 2K) at x (n,)."""
-        x = np.clip(x - self.low, -self.reach, self.span + self.reach)
+        """The same numbers (n, count) at x (n,)."""
+        x = x - self.low
         phases = x[:, None] * self.frequency
-        return np.hstack([np.cos(phases), np.sin(phases)])
+        waves = np.hstack([np.cos(phases), np.sin(phases)])
+        if math.isinf(self.fade):
+            return waves
+        t = np.clip(np.maximum(-x, x - self.span) / self.fade, 0.0, 1.0)[:, None]
+        w = (1 - t) ** 2 * (1 + 2 * t)
+        return np.hstack([w * waves, 1 - w])
 
 
 @dataclass(frozen=True)
@@ -167,7 +196,7 @@ class JointCurve(DrivenEffect):
 
     def functions(self, place: str, chain: Chain, cell: Cell) -> tuple[SmoothFunction, ...]:
         course = self.course(place, chain, cell)
-        keys = tuple(f"curve_{k + 1}" for k in range(2 * len(course.waves.frequency)))
+        keys = tuple(f"curve_{k + 1}" for k in range(course.waves.count))
         return (course.function((keys,), ("rad",)),)
 
     def drive(self, arm: Arm, place: str, p: Symbols) -> ca.SX:
@@ -249,10 +278,7 @@ class ResidualField(DrivenEffect):
         return tuple(
             course.function(
                 tuple(
-                    tuple(
-                        f"field_{course.name}_{c + 1}_{k + 1}"
-                        for k in range(2 * len(course.waves.frequency))
-                    )
+                    tuple(f"field_{course.name}_{c + 1}_{k + 1}" for k in range(course.waves.count))
                     for c in range(len(units))
                 ),
                 units,
