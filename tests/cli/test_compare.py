@@ -85,6 +85,18 @@ def test_where_nothing_happened_nothing_is_named_though_base_and_markers_moved()
     assert found["tool"]["rms_um"] < 2 * found["tool"]["by_chance_rms_um"]
 
 
+def test_the_page_is_green_only_where_two_campaigns_show_no_change(folder):
+    shutil.copyfile(folder / "old.json", folder / "copy.json")
+    for new, tone in (("bent", "care"), ("same", "good"), ("copy", "care")):
+        _, out, err = run("old.json", f"{new}.json", "--report", "tone.html")
+        page = Path("tone.html").read_text()
+        assert f'<section class="judgement {tone}"' in page, (new, err)
+        told = "old.json and copy.json are the same result, equal to the last digit"
+        assert (told in " ".join(out.split())) == (told in page) == (new == "copy")
+    assert json.loads(run("old.json", "copy.json", "--json")[1])["one_result"] is True
+    assert json.loads(run("old.json", "same.json", "--json")[1])["one_result"] is False
+
+
 def test_in_python_it_is_a_result_like_the_others():
     arms = [ec.read_calibrated("cell.toml", f"{name}.json") for name in ("old", "bent")]
     found = ec.compare(*arms)

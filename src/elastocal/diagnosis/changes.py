@@ -110,6 +110,12 @@ class Comparison(Result):
         return "changed_somewhere" if self.p < self.level else "no_change_shown"
 
     @property
+    def one_result(self) -> bool:
+        """Whether both are the same result: no two campaigns agree to the last digit."""
+        same = self.old.determined == self.new.determined and np.array_equal(self.old.x, self.new.x)
+        return same and np.array_equal(self.old.covariance, self.new.covariance)
+
+    @property
     def distance(self) -> NDArray:
         """How far the point moves (poses,) in m."""
         return np.asarray(np.linalg.norm(self.moved, axis=1))
@@ -129,6 +135,7 @@ class Comparison(Result):
             "old": self.old.source,
             "new": self.new.source,
             "verdict": self.verdict,
+            "one_result": self.one_result,
             "p": self.p,
             "level": self.level,
             "family": "Holm over the parameters",

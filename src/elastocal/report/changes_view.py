@@ -9,7 +9,7 @@ import numpy as np
 from elastocal.diagnosis.changes import Comparison
 from elastocal.report.effect_names import p_value, size_of
 from elastocal.report.figures import INK, SERIES
-from elastocal.report.formatting import ShownTable, estimate, length
+from elastocal.report.formatting import ShownTable, Tone, estimate, length
 from elastocal.text import listed, printable
 
 if TYPE_CHECKING:
@@ -21,6 +21,11 @@ NAMED = 3  # parameters in a headline
 
 def headline(c: Comparison) -> str:
     """The verdict in a sentence."""
+    if c.one_result:
+        return (
+            f"Nothing is compared: {printable(c.old.source)} and {printable(c.new.source)} are the "
+            "same result, equal to the last digit."
+        )
     if c.changed:
         names = ", ".join(printable(change.name) for change in c.changed[:NAMED])
         more = f" and {len(c.changed) - NAMED} more" if len(c.changed) > NAMED else ""
@@ -28,6 +33,11 @@ def headline(c: Comparison) -> str:
     if c.verdict == "no_change_shown":
         return "No change is shown: the differences are as large as the noise makes them."
     return "The arm has changed, but no single parameter can be named."
+
+
+def tone(c: Comparison) -> Tone:
+    """Care where the arm has changed, or nothing was compared."""
+    return "good" if c.verdict == "no_change_shown" and not c.one_result else "care"
 
 
 def changes_lines(c: Comparison) -> list[tuple[str, str]]:
@@ -86,6 +96,8 @@ OF_LOADS = {
 
 def steps(c: Comparison) -> list[str]:
     """What to do."""
+    if c.one_result:
+        return ["Give the results of two campaigns: this is one of them and its copy."]
     if c.verdict == "no_change_shown":
         return ["Nothing: the old calibration still holds to within the noise of these campaigns."]
     return [
@@ -137,7 +149,7 @@ def changes_contents(c: Comparison) -> dict[str, Any]:
     lines = changes_lines(c)
     return {
         "headline": headline(c),
-        "tone": "good" if c.verdict == "no_change_shown" else "warn",
+        "tone": tone(c),
         "verdict": [line for line in lines if line[0] not in ("Verdict", "Next")],
         "steps": steps(c),
         "warnings": [],

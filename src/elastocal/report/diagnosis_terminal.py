@@ -11,7 +11,7 @@ from rich.text import Text
 from elastocal.diagnosis.changes import Comparison
 from elastocal.diagnosis.diagnosis import Diagnosis
 from elastocal.report.causes_view import cause_rows, field_rows, place_rows, slight_text
-from elastocal.report.changes_view import change_rows, changes_lines
+from elastocal.report.changes_view import change_rows, changes_lines, tone
 from elastocal.report.diagnosis_view import (
     added_parameter_rows,
     alike,
@@ -89,7 +89,7 @@ def _tables_of_causes(console: Console, d: Diagnosis) -> Iterable[Table | Text]:
 
 def print_comparison(console: Console, c: Comparison) -> None:
     """The verdict, and every parameter; in a narrow terminal its change without both values."""
-    print_told(console, changes_lines(c))
+    print_told(console, changes_lines(c), "Warning" if tone(c) == "good" else "Verdict")
     console.print()
     shown = change_rows(c)
     if console.width < NARROW_FOR_BOTH:

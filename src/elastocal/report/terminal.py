@@ -80,9 +80,11 @@ def longest_word(texts: Iterable[str]) -> int | None:
     return longest if longest <= LONGEST_WHOLE else None
 
 
-def print_lines(console: Console, lines: Iterable[tuple[str, str]]) -> None:
+def print_lines(
+    console: Console, lines: Iterable[tuple[str, str]], yellow: str = "Warning"
+) -> None:
     for label, text in lines:
-        style = "bold yellow" if label == "Warning" else "bold"
+        style = "bold yellow" if label == yellow else "bold"
         console.print(Text.assemble((f"{label}: ", style), text))
 
 
@@ -205,8 +207,8 @@ def print_result(
         console.print(Text(f"{more} and every combination; so does the report.", style="dim"))
 
 
-def print_told(console: Console, lines: Iterable[tuple[str, str]]) -> None:
-    print_lines(console, ((label, capital(text)) for label, text in lines))
+def print_told(console: Console, lines: Iterable[tuple[str, str]], yellow: str = "Warning") -> None:
+    print_lines(console, ((label, capital(text)) for label, text in lines), yellow)
 
 
 def print_compensation(console: Console, content: dict[str, Any]) -> None:
