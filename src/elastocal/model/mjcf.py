@@ -25,6 +25,7 @@ from elastocal.errors import InputError, require
 from elastocal.files import read_bytes
 from elastocal.model import rigid
 from elastocal.model.chain import MAX_JOINTS, MIN_JOINTS, Chain, Joint, JointKind, LinkMass
+from elastocal.model.mjcf_bounds import check_bounds
 from elastocal.model.urdf import MAX_BYTES, xml_tree
 from elastocal.text import did_you_mean, listed, printable
 from elastocal.units import Array
@@ -89,6 +90,7 @@ class MjcfArm:
             root.tag == "mujoco",
             f"{path}: the root element is <{printable(root.tag)}>, an MJCF file has <mujoco>{hint}",
         )
+        check_bounds(path, data)
         spec = parsed(path, text)
         coupled, tied = _couplings(spec)
         model, weighed = _compiled(path, spec)

@@ -1,0 +1,223 @@
+"""What an MJCF file asks of MuJoCo, counted before MuJoCo sees it.
+
+MuJoCo makes elements of a line (<replicate>, <composite>, <flexcomp>), reads whatever files a model
+names, of any kind and size, and takes as much memory as a number in the text says.  So the text and
+all that it includes is read here first.  With n children and m what its own counts multiply,
+
+    weight(element) = m (1 + Σ weight(child)),
+
+and the weight of a model is the number of elements that MuJoCo would have to make.
+"""
+
+from __future__ import annotations
+
+import math
+import os
+import re
+import struct
+from collections.abc import Callable, Iterator, Mapping
+from pathlib import Path
+from xml.etree import ElementTree as ET
+
+from elastocal.errors import InputError, require
+from elastocal.files import check_regular, check_size, open_input, read_bytes
+from elastocal.model.urdf import MAX_BYTES, xml_tree
+from elastocal.text import printable, quoted
+
+# A humanoid with hands and keyframes has 1500.  MuJoCo's compiler takes 1 s for so many bodies with
+# free joints; its time grows with their square, and that of 20 000 is beyond a minute.
+MOST_ELEMENTS = 5000
+MOST_MESH_BYTES = 100_000_000  # of a file
+MOST_FILES_BYTES = 300_000_000  # of all, each as often as it is named
+MOST_CELLS = 1_000_000  # of all height fields
+VERTEX_BYTES = 50  # of a mesh file, at least
+# The largest numbers of attributes that MuJoCo sets memory aside by.
+LARGEST: dict[str, dict[str, float]] = {
+    "size": {"nuserdata": 1e6, "nkey": 1e3, "njmax": 1e6, "nconmax": 1e6, "nstack": 1e8,
+             "memory": 4e9} | {f"nuser_{kind}": 1e3 for kind in
+             ("body", "jnt", "geom", "site", "cam", "tendon", "actuator", "sensor")},
+    "numeric": {"size": 1e5},
+    "mesh": {"params": 200, "octree_maxdepth": 8},
+    "composite": {"subgrid": 10},
+}  # fmt: skip
+_NUMBER = re.compile(r"[-+]?(?:\d+\.?\d*|\.\d+)(?:[eE][-+]?\d{1,3})?")
+_UNITS = {unit: 1024.0**k for k, unit in enumerate("KMGTPE", start=1)}
+
+
+def check_bounds(path: Path, data: bytes) -> None:
+    """Raise InputError where the MJCF `data` of the file `path` asks for more than an arm needs.
+
+    Counted are elements as often as they are replicated, sizes, and what files it names: included
+    models stand in its folder, and all are regular files.  The message names file and element.
+    """
+    model = _Model(path)
+    weight = model.weight_of(path, data)
+    require(
+        weight <= MOST_ELEMENTS,
+        f"{path}: makes {weight:.3g} elements of all it replicates and includes; more than "
+        f"{MOST_ELEMENTS} are no arm, so keep the arm alone",
+    )
+
+
+class _Model:
+    """A model of several files; adds up what they ask for."""
+
+    def __init__(self, path: Path) -> None:
+        self._folder = path.parent
+        # The folder as it is named, and that of the file where the name is a link.
+        self._roots = {os.path.realpath(path.parent), os.path.dirname(os.path.realpath(path))}
+        self._weights: dict[str, float] = {}
+        self._open: list[str] = []
+        self._text = self._bytes = self._cells = 0
+
+    def weight_of(self, path: Path, data: bytes | None = None) -> float:
+        """The weight of an XML file, which is read once."""
+        real = os.path.realpath(path)
+        require(real not in self._open, f"{path}: includes itself; take out the <include>")
+        if real not in self._weights:
+            self._open.append(real)
+            if data is None:
+                data = read_bytes(path, "included model", MAX_BYTES)
+            self._text += len(data)
+            check_size(path, "MuJoCo model with all it includes", self._text, MAX_BYTES)
+            root = xml_tree(path, data, "an MJCF file")
+            self._weights[real] = _File(self, path, root).weight(root)
+            self._open.pop()
+        return self._weights[real]
+
+    def included(self, path: Path, name: str) -> Iterator[Path]:
+        """The files that an element of the file `path` includes by `name`: beside the model or
+        beside the file itself, as versions of MuJoCo differ."""
+        for found in {self._folder / name, path.parent / name}:
+            if os.path.lexists(found):
+                inside = any(
+                    os.path.commonpath([root, os.path.realpath(found)]) == root
+                    for root in self._roots
+                )
+                require(
+                    inside,
+                    f"{path}: includes {printable(name)}, which is outside its folder; put a copy "
+                    "there",
+                )
+                yield found
+
+    def count_file(self, path: Path, what: str) -> int:
+        """Size of a file that is named once more, in bytes."""
+        size = check_regular(path, what)
+        check_size(path, what, size, MOST_MESH_BYTES)
+        self._bytes += size
+        require(
+            self._bytes <= MOST_FILES_BYTES,
+            f"{path}: with it the files that the model names have more than "
+            f"{MOST_FILES_BYTES / 1e6:g} MB; keep the arm alone",
+        )
+        return size
+
+    def count_cells(self, path: Path, cells: float) -> None:
+        self._cells += int(min(cells, 1e18))
+        require(
+            self._cells <= MOST_CELLS,
+            f"{path}: <hfield> has more than {MOST_CELLS} points, which no arm needs; take it out",
+        )
+
+
+class _File:
+    """One file of a model: its elements and where the files that they name may stand."""
+
+    def __init__(self, model: _Model, path: Path, root: ET.Element) -> None:
+        self._model, self._path = model, path
+        named = {
+            compiler.get(key, "")
+            for compiler in root.iter("compiler")
+            for key in ("assetdir", "meshdir", "texturedir")
+        }
+        folders = {path.parent, model._folder}
+        self._places = [folder / name for folder in folders for name in sorted({"", *named})]
+        self._models = {
+            one.get("name") or Path(one.get("file", "")).stem: one.get("file", "")
+            for one in root.iter("model")
+        }
+
+    def weight(self, element: ET.Element) -> float:
+        """How many elements MuJoCo makes of it and all within it."""
+        self._check_sizes(element)
+        inside = 1 + sum(self.weight(child) for child in element)
+        inside += sum(self._named(element))
+        return inside * _COUNTS.get(element.tag, _once)(element.attrib)
+
+    def _named(self, element: ET.Element) -> Iterator[float]:
+        """Weights of the files that it names: of a model its elements, of a grid its vertices."""
+        if element.tag in ("include", "model"):
+            for found in self._model.included(self._path, element.get("file", "")):
+                yield self._model.weight_of(found)
+            return
+        if element.tag == "attach":
+            name = self._models.get(element.get("model", ""), "")
+            for found in self._model.included(self._path, name) if name else ():
+                yield self._model.weight_of(found)
+        for key, name in element.attrib.items():
+            if key.startswith("file") and name:
+                for found in self._candidates(name):
+                    size = self._model.count_file(found, f"file of <{printable(element.tag)}>")
+                    if element.tag == "flexcomp":
+                        yield size / VERTEX_BYTES
+                    elif element.tag == "hfield":
+                        self._model.count_cells(self._path, _pixels(found))
+
+    def _candidates(self, name: str) -> set[Path]:
+        """Where a file may stand; the last part of its name alone counts under `strippath`."""
+        names = {name, re.split(r"[\\/]", name)[-1]}
+        places = {place / each for place in self._places for each in names if each}
+        return {place for place in places if os.path.lexists(place) and not place.is_dir()}
+
+    def _check_sizes(self, element: ET.Element) -> None:
+        tag = element.tag
+        for key, largest in LARGEST.get(tag, {}).items():
+            if max(_numbers(element.get(key, "")), default=0.0) > largest:
+                raise InputError(
+                    f"{self._path}: <{tag} {key}={quoted(element.get(key, ''))}> asks for more "
+                    f"than {largest:g}, which no arm needs; take it out"
+                )
+        if tag == "hfield":
+            rows, columns = (math.prod(_numbers(element.get(k, ""))) for k in ("nrow", "ncol"))
+            self._model.count_cells(self._path, rows * columns)
+
+
+def _numbers(text: str) -> list[float]:
+    """Sizes of the numbers in a text, of one with a unit ("2G") too."""
+    found = _NUMBER.finditer(text)
+    return [abs(float(m[0])) * _UNITS.get(text[m.end() : m.end() + 1].upper(), 1.0) for m in found]
+
+
+def _once(given: Mapping[str, str]) -> float:
+    return 1.0
+
+
+def _product(given: Mapping[str, str]) -> float:
+    """Of all numbers of `count`; a dimension that is 0 or not there counts as one."""
+    return math.prod(max(n, 1.0) for n in _numbers(given.get("count", "")))
+
+
+def _vertices(given: Mapping[str, str]) -> float:
+    """Each vertex of a flex is a body with three slides."""
+    return 5 * max(_product(given), len(given.get("point", "").split()) / 3, 1.0)
+
+
+def _segments(given: Mapping[str, str]) -> float:
+    """Each segment of a composite is a body with joints and a geom."""
+    return 5 * max(_product(given), len(given.get("vertex", "").split()) / 3, 1.0)
+
+
+_COUNTS: dict[str, Callable[[Mapping[str, str]], float]] = {
+    "replicate": _product, "composite": _segments, "flexcomp": _vertices,
+}  # fmt: skip
+
+
+def _pixels(path: Path) -> float:
+    """Points of a height field's file: a PNG says them where it begins, however small it is."""
+    with open_input(path, "file of <hfield>") as handle:
+        head = handle.read(24)
+    if head.startswith(b"\x89PNG") and len(head) == 24:
+        width, height = struct.unpack(">II", head[16:24])
+        return float(width) * float(height)
+    return 0.0

@@ -1,0 +1,165 @@
+"""No MJCF file makes MuJoCo take more memory or time than an arm needs, or wait for ever."""
+
+from __future__ import annotations
+
+import os
+import struct
+import time
+import zlib
+from pathlib import Path
+
+import pytest
+
+from elastocal.errors import InputError
+from elastocal.model import read_mjcf
+
+pytest.importorskip("mujoco", reason="needs the extra 'mujoco'")
+
+ARM = (
+    '<body name="b0"><joint axis="0 0 1"/><geom size=".1"/><body pos="0 0 .3">'
+    '<joint axis="0 1 0"/><geom size=".1"/><body pos="0 0 .3"><joint axis="0 1 0"/>'
+    '<geom size=".1"/><body name="end" pos="0 0 .3"><joint axis="1 0 0"/><geom size=".1"/>'
+    "</body></body></body></body>"
+)
+BODY = '<body><freejoint/><geom size=".1"/></body>'
+
+
+def model(folder: Path, world: str = "", top: str = "", name: str = "arm.xml") -> Path:
+    path = folder / name
+    path.write_text(f"<mujoco>{top}<worldbody>{ARM}{world}</worldbody></mujoco>")
+    return path
+
+
+def nested(depth: int, count: int, inside: str = BODY) -> str:
+    for _ in range(depth):
+        inside = f'<replicate count="{count}" offset="1 0 0">{inside}</replicate>'
+    return inside
+
+
+WORLDS = {
+    "replicate": nested(1, 100_000_000),
+    "nested replicates": nested(9, 10),
+    "a count as a float": nested(1, 0).replace('"0"', '"1e8"'),
+    "composite": '<body><freejoint/><composite type="cable" count="1000000 1 1" size="1"/></body>',
+    "replicated composite": nested(
+        1, 100, '<body><composite type="cable" count="100 1 1" size="1"/></body>'
+    ),
+    "flexcomp": '<flexcomp name="f" type="grid" count="300 300 300" spacing=".1 .1 .1"/>',
+    "many elements": '<site size=".1"/>' * 6000,
+}
+TOPS = {
+    "hfield": '<asset><hfield name="h" nrow="40000" ncol="40000" size="1 1 1 1"/></asset>',
+    "hfields": "<asset>"
+    + "".join(f'<hfield name="h{k}" nrow="900" ncol="900" size="1 1 1 1"/>' for k in range(2))
+    + "</asset>",
+    "userdata": '<size nuserdata="2000000000"/>',
+    "keys": '<size nkey="100000000"/>',
+    "user": '<size nuser_body="100000000"/>',
+    "memory": '<size memory="900G"/>',
+    "numeric": '<custom><numeric name="n" size="10000000"/></custom>',
+    "mesh": '<asset><mesh name="m" builtin="supersphere" params="90000 1 1"/></asset>',
+}
+
+
+def refused(path: Path, told: str) -> None:
+    begun = time.process_time()
+    with pytest.raises(InputError, match=told):
+        read_mjcf(path, flange="end")
+    assert time.process_time() - begun < 5
+
+
+@pytest.mark.parametrize("world", WORLDS)
+def test_what_is_replicated_is_counted(tmp_path: Path, world: str) -> None:
+    refused(model(tmp_path, WORLDS[world]), "more than 5000 are no arm")
+
+
+@pytest.mark.parametrize("top", TOPS)
+def test_sizes_are_bounded(tmp_path: Path, top: str) -> None:
+    refused(model(tmp_path, top=TOPS[top]), "no arm needs; take it out")
+
+
+def test_what_an_arm_needs_is_read(tmp_path: Path) -> None:
+    (tmp_path / "more.xml").write_text(f"<mujoco><worldbody>{BODY}</worldbody></mujoco>")
+    top = '<size memory="1G" nuser_body="3" nkey="2"/><include file="more.xml"/>'
+    top += '<asset><hfield name="h" nrow="100" ncol="100" size="1 1 1 1"/></asset>'
+    path = model(tmp_path, nested(2, 10), top)
+    assert read_mjcf(path, flange="end").n_joints == 4
+
+
+def test_attached_models_count_as_often_as_they_are_attached(tmp_path: Path) -> None:
+    """Each of four files attaches the next ten times."""
+    for k in range(5):
+        asset = f'<asset><model name="m" file="m{k + 1}.xml"/></asset>' if k < 4 else ""
+        uses = "".join(f'<attach model="m" prefix="p{i}"/>' for i in range(10)) if k < 4 else ""
+        (tmp_path / f"m{k}.xml").write_text(
+            f'<mujoco>{asset}<worldbody><body name="b{k}">{uses}</body></worldbody></mujoco>'
+        )
+    top = '<asset><model name="m" file="m0.xml"/></asset>'
+    refused(model(tmp_path, '<attach model="m" prefix="x"/>', top), "more than 5000")
+
+
+@pytest.mark.parametrize("how", ["parent", "absolute", "link", "model", "nested"])
+def test_includes_stay_in_the_folder(tmp_path: Path, how: str) -> None:
+    outside, folder = tmp_path / "secret.xml", tmp_path / "arm"
+    folder.mkdir()
+    outside.write_text("<mujoco/>")
+    name = {"parent": "../secret.xml", "absolute": str(outside), "link": "link.xml"}
+    if how == "link":
+        (folder / "link.xml").symlink_to(outside)
+    include = f'<include file="{name.get(how, "../secret.xml")}"/>'
+    if how == "model":
+        include = '<asset><model name="m" file="../secret.xml"/></asset>'
+    if how == "nested":
+        (folder / "inner.xml").write_text(f"<mujoco>{include}</mujoco>")
+        include = '<include file="inner.xml"/>'
+    refused(model(folder, top=include), "outside its folder")
+
+
+@pytest.mark.parametrize(
+    "top",
+    [
+        '<include file="x"/>',
+        '<asset><mesh name="m" file="x"/></asset>',
+        '<compiler meshdir="sub" strippath="true"/><asset><mesh name="m" file="C:\\a\\x"/></asset>',
+        '<asset><hfield name="h" file="x" size="1 1 1 1"/></asset>',
+        '<asset><texture type="2d" name="t" file="x"/></asset>',
+    ],
+)
+@pytest.mark.parametrize("kind", ["pipe", "device"])
+def test_only_regular_files_are_named(tmp_path: Path, top: str, kind: str) -> None:
+    place = tmp_path / ("sub/x" if "sub" in top else "x")
+    place.parent.mkdir(exist_ok=True)
+    if kind == "pipe":
+        os.mkfifo(place)
+    elif "include" in top:
+        pytest.skip("a device is outside the folder")
+    else:
+        place.symlink_to("/dev/zero")
+    refused(model(tmp_path, top=top), "not a regular file")
+
+
+def test_files_are_sized(tmp_path: Path) -> None:
+    for name, size in (("big.xml", 11_000_000), ("big.obj", 101_000_000), ("half.obj", 90_000_000)):
+        with open(tmp_path / name, "wb") as file:
+            file.truncate(size)
+    refused(model(tmp_path, top='<include file="big.xml"/>'), "larger than 10 MB")
+    mesh = '<asset><mesh name="m" file="big.obj"/></asset>'
+    refused(model(tmp_path, top=mesh), "larger than 100 MB")
+    meshes = "".join(f'<mesh name="m{k}" file="half.obj"/>' for k in range(4))
+    refused(model(tmp_path, top=f"<asset>{meshes}</asset>"), "more than 300 MB")
+
+
+def test_a_picture_is_sized_by_what_it_unpacks_to(tmp_path: Path) -> None:
+    def chunk(kind: bytes, data: bytes) -> bytes:
+        check = struct.pack(">I", zlib.crc32(kind + data))
+        return struct.pack(">I", len(data)) + kind + data + check
+
+    head = chunk(b"IHDR", struct.pack(">IIBBBBB", 30000, 30000, 8, 0, 0, 0, 0))
+    body = chunk(b"IDAT", zlib.compress(bytes(30001) * 300)) + chunk(b"IEND", b"")
+    (tmp_path / "h.png").write_bytes(b"\x89PNG\r\n\x1a\n" + head + body)
+    top = '<asset><hfield name="h" file="h.png" size="1 1 1 1"/></asset>'
+    refused(model(tmp_path, top=top), "more than 1000000 points")
+
+
+def test_a_file_that_includes_itself_is_named(tmp_path: Path) -> None:
+    refused(model(tmp_path, top='<include file="arm.xml"/>'), "includes itself")
