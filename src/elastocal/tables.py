@@ -1,11 +1,9 @@
-"""Delimited tables: one reader and one writer for readings, plans, targets, DH tables and masses.
+"""Delimited tables: one reader and one writer for all of them.
 
 A table is CSV (UTF-8; comma, semicolon or tab between columns; decimal commas where columns are not
 separated by them) or Parquet.  Its first line names the columns, and units stand in the names.
-What a table may hold is stated as families of columns; the reader returns numbers in the file's own
-units beside the line of each row, and refuses everything else by file, line and column, with what
-was found and what to do.  A file is read in chunks, so a large one that is no table is refused
-early and in little memory.
+What a table may hold is stated as families of columns; numbers are returned in the file's own units
+beside the line of each row, all else is refused.  A file is read in chunks and little memory.
 """
 
 from __future__ import annotations
@@ -33,6 +31,7 @@ from elastocal.text import (
     did_you_mean,
     is_label,
     listed,
+    plain_minus,
     printable,
     quoted,
 )
@@ -117,6 +116,7 @@ class CsvLines:
                         f"this is no {self.what}"
                     )
                 continue
+            line = plain_minus(line)
             if line.count(delimiter) != delimiters or b'"' in line or not line.isascii():
                 self._check_fields(line, number)
             lines.append(line)

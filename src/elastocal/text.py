@@ -97,6 +97,15 @@ def cell_meaning(cell: str) -> str:
     return cell[1:] if cell.startswith("'") and _FORMULA.match(cell) else cell
 
 
+# The minus signs of text programs at the beginning of a number, in UTF-8: −, –, －.
+_MINUS = re.compile(rb'(^|[,;\t"][ \t"]*)(?:\xe2\x88\x92|\xe2\x80\x93|\xef\xbc\x8d)(?=[\d.,])')
+
+
+def plain_minus(line: bytes) -> bytes:
+    """A line of a table with minus signs of text programs as -."""
+    return line if line.isascii() else _MINUS.sub(rb"\1-", line)
+
+
 def plain(value: Any) -> Any:
     """`value` with dataclasses as their fields, numpy numbers and arrays as plain ones, and None
     for numbers not finite."""

@@ -103,10 +103,13 @@ CASES: dict[str, tuple[str, str]] = {
     ),
     "few joints": (arm(3), r"3 moving joints between 'l0' and 'l3' \(q1, q2, q3\); 4 to 9 are"),
     "many joints": (arm(10), r"10 moving joints between 'l0' and 'l10' \(q1, .*q10\); 4 to 9"),
-    "two leaves": (
-        arm(extra=link("camera") + joint("c", "l4", "camera", "fixed", "")
-            + link("tool0") + joint("t", "l4", "tool0", "fixed", "")),
-        "several links could be the flange: camera, tool0; name the right one as `flange`",
+    "two arms": (
+        arm(extra="".join(
+            link(f"{side}{i}") + joint(f"{side}{i}", before, f"{side}{i}")
+            for side in ("left", "right")
+            for i, before in enumerate(["l0", *(f"{side}{k}" for k in range(1, 5))], start=1)
+        )),
+        "several links could be the flange, one of each arm: l4, left5, right5; name",
     ),
 }  # fmt: skip
 

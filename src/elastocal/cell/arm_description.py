@@ -44,7 +44,6 @@ Convention = Literal["standard", "modified"]
 Sigma = Annotated[Array, numbers(3, above=0, one_for_all=True)]
 Scatter = Annotated[Array, numbers(least=0, one_for_all=True)]
 Compliances = Annotated[Many[NonNegative], Field(min_length=1)]
-JointName = Annotated[str, Field(pattern=r"^joint[1-9][0-9]{0,2}$")]
 ZEROS = partial(np.zeros, 3)
 SOURCES = ("urdf", "mjcf", "dh")  # keys of [robot] that state the nominal arm
 POLAR_KEYS = ("range_um", "range_ppm", "transverse_um", "transverse_ppm")
@@ -54,7 +53,10 @@ POLAR_KEYS = ("range_um", "range_ppm", "transverse_um", "transverse_ppm")
 class Robot:
     """A URDF or a MuJoCo model with the names of its first and last link, or a DH table.
 
-    `masses`: the table of link masses of a DH robot.  Files as absolute or relative paths.
+    `masses`: the table of link masses of a DH robot.  `dh` takes a UR's factory calibration too:
+    a YAML of ur_calibration, or a calibration.conf with `ur_model`.  `joint_names` says what
+    jointN means where the file has such a name at another place.  Files as absolute or relative
+    paths.
 
     Examples:
         >>> robot = ec.Robot.from_urdf("kr270_2.urdf", flange="flange")
@@ -75,6 +77,10 @@ class Robot:
     masses: File | None = keyed(
         'the path of a table of link masses, e.g. "links.csv"', default=None
     )
+    ur_model: Text | None = keyed('the name of a Universal Robot, e.g. "UR10e"', default=None)
+    joint_names: Literal["order", "file"] | None = keyed(
+        '"order" (jointN is the Nth joint) or "file" (names of the robot\'s file)', default=None
+    )
 
     def __post_init__(self) -> None:
         given = [name for name in SOURCES if getattr(self, name) is not None]
@@ -87,7 +93,7 @@ class Robot:
         given = [name for name in SOURCES if getattr(table, name) is not None]
         told = f"[robot] takes exactly one of {listed(SOURCES)}; none is given"
         spot.require(bool(given), told)
-        of_a_table = ("dh_convention", "masses")
+        of_a_table = ("dh_convention", "masses", "ur_model")
         other = {"urdf": of_a_table, "mjcf": of_a_table, "dh": ("base", "flange")}
         for name in other[given[0]] if len(given) == 1 else ():
             spot.require(
@@ -330,7 +336,7 @@ def _choices(entries: object) -> object:
 class CompensatorTable(Table):
     """A spring between two anchor points that takes a part of a joint's load."""
 
-    joint: JointName = required('the joint the spring spans, e.g. "joint2"')
+    joint: Text = required('the joint the spring spans, e.g. "joint2"')
     stiffness_N_per_m: NonNegative | None = key("a number >= 0 in N/m")
     anchor_m: Annotated[list[float], Field(min_length=2, max_length=2)] | None = key(
         "two numbers in m"

@@ -8,6 +8,7 @@ table (`from_table`), and what is said of a wrong argument in Python.
 
 from __future__ import annotations
 
+import math
 import re
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import suppress
@@ -61,7 +62,7 @@ Record = TypeVar("Record")
 Member = TypeVar("Member")
 FARTHEST = 1e4  # m; no cell is as large, and a move of a tool that long is checked for minutes
 JOINT_UNITS = ("deg", "rad", "m", "mm")
-JOINT_KEY = re.compile(r"(joint[1-9][0-9]{0,2})(?:_(deg|rad|mm|m))?", re.ASCII)
+JOINT_KEY = re.compile(r"(.+)_(deg|rad|mm|m)", re.ASCII)
 # Units that key names end with, in words, and the SI unit in its place in Python.
 UNITS = {
     "m": ("m", "m"),
@@ -352,6 +353,19 @@ def rotation_from_rpy(rpy_deg: Sequence[float] | Array, *_: object) -> Array:
     return about_z @ about_y @ about_x
 
 
+def rpy(R: Array) -> tuple[float, float, float]:
+    """Roll, pitch, yaw in rad with R = Rz(yaw) Ry(pitch) Rx(roll), the URDF's convention.
+
+    Yaw is taken first and undone in the other two, so that all three are exact to rounding at
+    pitch = ±π/2 as well, where the textbook formula divides 0 by 0.
+    """
+    yaw = math.atan2(R[1, 0], R[0, 0])
+    c, s = math.cos(yaw), math.sin(yaw)
+    pitch = math.atan2(-R[2, 0], c * R[0, 0] + s * R[1, 0])
+    roll = math.atan2(s * R[0, 2] - c * R[1, 2], c * R[1, 1] - s * R[0, 1])
+    return roll, pitch, yaw
+
+
 def direction(vector: Array, spot: Spot, name: str) -> Array:
     """A vector (3,) at unit length; raises InputError that names the key where it is zero."""
     unit = _unit_vector(np.asarray(vector, dtype=float))
@@ -366,23 +380,24 @@ def joint_values(
 ) -> dict[str, tuple[float, ...]]:
     """Values in SI units per joint name, from keys such as joint2_deg of the table `name`.
 
-    `others`: further keys of that table, which a misspelt one may have been meant for.
+    `others`: further keys of that table, which a misspelt one may have been meant for.  A joint may
+    be named as in the robot's file, which `model.joint_names` looks into.
 
-    Raises InputError for other keys, missing units, and a joint given in two units.
+    Raises InputError for keys without a unit, and a joint given in two units.
     """
     values: dict[str, tuple[float, ...]] = {}
     above = spot.key(name)
     for key, stated_values in table.items():
         match = JOINT_KEY.fullmatch(key)
-        joint, unit = match.groups() if match else (None, None)
-        if joint is None or unit is None:
-            valid = [f"joint{i}_{u}" for i in range(1, 10) for u in JOINT_UNITS] + [*others]
-            names = " or ".join(f"{joint}_{u}" for u in JOINT_UNITS)
-            hint = did_you_mean(key, valid) if joint is None else f"; missing unit: {names}"
+        if match is None:
+            hint = did_you_mean(key, others) or (
+                f"; missing unit: {' or '.join(f'{key}_{u}' for u in JOINT_UNITS)}"
+            )
             raise InputError(
                 f"{spot.path}: unknown key {above}.{dotted((key,))}{hint}; [{above}] takes "
                 "keys such as joint1_deg or joint1_rad, for a prismatic joint joint3_m or joint3_mm"
             )
+        joint, unit = match.groups()
         spot.require(joint not in values, f"[{above}] gives {joint} in two units; keep one of them")
         values[joint] = tuple(to_si(float(v), unit) for v in stated_values)
     return values

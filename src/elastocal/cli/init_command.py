@@ -15,7 +15,11 @@ from elastocal.text import json_text
 @command(short_help="How does a first cell for my arm look?")
 def init(
     robot: Annotated[
-        Path, typer.Argument(help="URDF (.urdf), MuJoCo model (.xml, .mjcf) or DH table (.csv).")
+        Path,
+        typer.Argument(
+            help="URDF (.urdf), MuJoCo model (.xml, .mjcf), DH table (.csv) or factory calibration "
+            "of a UR (.conf, .yaml)."
+        ),
     ],
     output: Annotated[
         Path, typer.Option("-o", "--output", help="Cell file to write (TOML).")
@@ -27,6 +31,9 @@ def init(
     convention: Annotated[
         str, typer.Option(help="Of a DH table: standard or modified.")
     ] = "standard",
+    ur_model: Annotated[
+        str | None, typer.Option(help="Of a calibration.conf: the robot, as UR10e.")
+    ] = None,
     force: Annotated[bool, typer.Option("--force", help="Write over a file.")] = False,
 ) -> None:
     """Write a commented cell that runs: joints and limits of the robot's file, guesses elsewhere.
@@ -35,13 +42,19 @@ def init(
     """
     from elastocal.cell.work_cell import read_cell
     from elastocal.importing.first_cell import init as write
+    from elastocal.importing.first_cell import notes_of, reach_of
     from elastocal.model.choice import load_chain
 
     check_apart(check_outputs(output), [robot])
-    write(robot, output, base=base, flange=flange, convention=convention, force=force)  # type: ignore[arg-type]
+    write(robot, output, base=base, flange=flange, convention=convention,  # type: ignore[arg-type]
+          ur_model=ur_model, force=force)  # fmt: skip
     cell = read_cell(output)
-    names = [joint.name for joint in load_chain(cell).joints]
-    say(f"wrote {output}: {len(names)} joints ({', '.join(names)})")
+    chain = load_chain(cell)
+    names = [joint.name for joint in chain.joints]
+    reach = f"reach {reach_of(chain):.2f} m"
+    say(f"wrote {output}: {len(names)} joints ({', '.join(names)}), {reach}")
+    for note in notes_of(cell.robot, chain):
+        say(f"Note: {note}.")
     if cell.robot.flange is not None:
         say(f"The flange is '{cell.robot.flange}'; --flange names another.")
     say("Replace what is marked as a guess. It runs as it is:")

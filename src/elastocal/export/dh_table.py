@@ -14,6 +14,7 @@ from elastocal.export.exportable import ExportNumbers
 from elastocal.model import dh
 from elastocal.model.chain import Chain, Joint
 from elastocal.model.effects.compliances import transverse_axes
+from elastocal.model.ur_table import ENDINGS
 from elastocal.tables import csv_text
 from elastocal.units import Array
 
@@ -255,11 +256,12 @@ def _z_to(axis: Array) -> Array:
 def _nominal_rows(robot: Robot, chain: Chain, convention: Convention) -> list[DhRow | None]:
     """What the user's own table says of links 0 … n; None where it is in another convention."""
     nothing: list[DhRow | None] = [None] * (chain.n_joints + 1)
-    if robot.dh is None or robot.dh_convention != convention:
+    if robot.dh is None or robot.dh_convention != convention or robot.dh.suffix in ENDINGS:
         return nothing
     table = dh.read_dh_table(robot.dh)
     n = len(table.row)
-    if any(table.text(i, "type") == dh.FIXED for i in range(n)):
+    # Rows without a joint, joints against z and frames slid along their axes are not rows of ours.
+    if n != chain.n_joints or chain.notes or any(joint.axis[2] < 0 for joint in chain.joints):
         return nothing
     stems = ("theta0", "d", "a", "alpha", "beta")
     keys = [("length" if len(stem) == 1 else "angle", stem) for stem in stems]

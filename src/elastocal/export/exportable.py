@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import math
 from collections import defaultdict
 from dataclasses import dataclass, replace
 from pathlib import Path
@@ -12,6 +11,7 @@ import numpy as np
 from numpy.typing import ArrayLike
 from scipy.spatial.transform import Rotation
 
+from elastocal.cell.file_keys import rpy
 from elastocal.errors import InsufficientDataError, option
 from elastocal.measurements import Measurements
 from elastocal.model import rigid
@@ -44,19 +44,6 @@ def placed_body(name: str, T: Array) -> dict[str, str]:
     """Attributes of an MJCF's body or site called `name` at T (4, 4) in its parent's frame."""
     x, y, z, w = Rotation.from_matrix(T[:3, :3]).as_quat()
     return {"name": name, "pos": numbers(T[:3, 3]), "quat": numbers((w, x, y, z))}
-
-
-def rpy(R: Array) -> tuple[float, float, float]:
-    """Roll, pitch, yaw in rad with R = Rz(yaw) Ry(pitch) Rx(roll), the URDF's convention.
-
-    Yaw is taken first and undone in the other two, so that all three are exact to rounding at
-    pitch = ±π/2 as well, where the textbook formula divides 0 by 0.
-    """
-    yaw = math.atan2(R[1, 0], R[0, 0])
-    c, s = math.cos(yaw), math.sin(yaw)
-    pitch = math.atan2(-R[2, 0], c * R[0, 0] + s * R[1, 0])
-    roll = math.atan2(s * R[0, 2] - c * R[1, 2], c * R[1, 1] - s * R[0, 1])
-    return roll, pitch, yaw
 
 
 def origin_attributes(T: Array) -> dict[str, str]:

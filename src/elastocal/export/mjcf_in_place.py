@@ -28,7 +28,6 @@ from elastocal.export.mjcf_file import RIGID, spring_joint, springs_at
 from elastocal.export.urdf_file import (
     PREFIX,
     XmlText,
-    as_utf8,
     comment,
     correction_of_joint,
     element,
@@ -39,6 +38,7 @@ from elastocal.export.urdf_file import (
 )
 from elastocal.model.effects.loads import STANDARD_GRAVITY
 from elastocal.model.mjcf import SPRING, MjcfArm, mjcf_bytes, parsed, strip, transform
+from elastocal.model.urdf import as_utf8
 from elastocal.units import Array
 
 ORIENTATIONS = ("quat", "axisangle", "xyaxes", "zaxis", "euler")

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import codecs
 import math
 import re
 from collections.abc import Collection, Mapping
@@ -12,14 +11,13 @@ from xml.parsers import expat
 from xml.sax.saxutils import quoteattr
 
 import numpy as np
-from scipy.spatial.transform import Rotation
 
 from elastocal.cell.arm_description import Robot
 from elastocal.errors import InputError, option
 from elastocal.export.exportable import ExportNumbers, numbers, origin_attributes
 from elastocal.model.chain import Joint, LinkMass
 from elastocal.model.effects.placements import link_ends
-from elastocal.model.urdf import Tree, UrdfJoint, check_urdf, urdf_bytes
+from elastocal.model.urdf import Tree, UrdfJoint, as_utf8, check_urdf, urdf_bytes
 from elastocal.units import Array
 
 # Edits of a URDF's text that leave everything else as it was, to the byte.
@@ -28,7 +26,6 @@ from elastocal.units import Array
 # white space.  Here a parser only says where the start tags stand; the text between is not touched.
 
 TAG = re.compile(rb"""(?:[^"'>]|"[^"]*"|'[^']*')*>""")
-DECLARATION = re.compile(r"""(<\?xml[^>]*?\bencoding\s*=\s*)("[^"]*"|'[^']*')""")
 
 
 @dataclass
@@ -133,25 +130,6 @@ def read_urdf_text(path: Path) -> UrdfText:
     return found
 
 
-def as_utf8(path: Path, data: bytes) -> bytes:
-    """An XML file's content as UTF-8, its declaration with it.
-
-    Raises InputError where it cannot be decoded.
-    """
-    if data.startswith((codecs.BOM_UTF16_LE, codecs.BOM_UTF16_BE)):
-        name = "utf-16"
-    else:
-        declared = DECLARATION.search(data[:200].decode("ascii", "replace"))
-        name = declared.group(2).strip("\"'") if declared else "utf-8"
-    if name.lower() in ("utf-8", "utf8"):
-        return data
-    try:
-        text = data.decode(name)
-    except (LookupError, UnicodeDecodeError) as error:
-        raise InputError(f"{path}: cannot be read as {name} ({error}); save it as UTF-8") from None
-    return DECLARATION.sub(r'\g<1>"UTF-8"', text, count=1).encode("utf-8")
-
-
 def tag_end(data: bytes, start: int) -> int:
     """Offset just after the `>` that closes the tag at `start`; one in quotes does not."""
     tag = TAG.match(data, start)
@@ -211,11 +189,11 @@ def _tracker_frame(tree: Tree, text: UrdfText, pieces: ExportNumbers, base: str)
             f"{tree.path}: the cell's base is {TRACKER}, the tracker's frame of an earlier export; "
             "name the robot's own base link as [robot] base"
         )
-    T = pieces.T_tracker_base @ np.linalg.inv(_placed(tree, tree.root, base))
+    T = pieces.T_tracker_base @ np.linalg.inv(tree.placed(tree.root, base))
     if tree.root != TRACKER:
         return _fixed(tree, text, TRACKER, TRACKER, tree.root, T)
     below = next(joint for joint in tree.joints.values() if joint.parent == TRACKER)
-    text.set_origin(below.name, origin_attributes(T @ _origin(below)))
+    text.set_origin(below.name, origin_attributes(T @ below.origin))
     return []
 
 
@@ -253,7 +231,7 @@ def _correct_joints(
 ) -> None:
     for i, joint in enumerate(moving):
         if not nothing(correction := correction_of_joint(pieces, i)):
-            text.set_origin(joint.name, origin_attributes(_origin(joint) @ correction))
+            text.set_origin(joint.name, origin_attributes(joint.origin @ correction))
 
 
 def _correct_flange(
@@ -264,7 +242,7 @@ def _correct_flange(
         return []
     last = tree.parent_joint[flange]
     if last.kind == "fixed":
-        text.set_origin(last.name, origin_attributes(_origin(last) @ error))
+        text.set_origin(last.name, origin_attributes(last.origin @ error))
         return []
     # The flange is the link that the last joint moves: a link in between takes the correction.
     text.set_child(last.name, MOUNT)
@@ -306,21 +284,6 @@ def _fixed(tree: Tree, text: UrdfText, new: str, parent: str, child: str, T: Arr
             f"or leave the frame out ({option('frames', False)}, or no {option('base_frame')})"
         )
     return fixed_link(new, parent, child, T)
-
-
-def _origin(joint: UrdfJoint) -> Array:
-    T = np.eye(4)
-    T[:3, :3] = Rotation.from_euler("xyz", joint.rpy).as_matrix()
-    T[:3, 3] = joint.xyz
-    return T
-
-
-def _placed(tree: Tree, root: str, link: str) -> Array:
-    """T_root_link (4, 4) with every joint between them at zero."""
-    T = np.eye(4)
-    for joint in tree.joints_between(root, link) or ():
-        T = T @ _origin(joint)
-    return T
 
 
 # A URDF for an arm that has none: a robot described by a DH table.

@@ -114,7 +114,8 @@ def summarise(
     )  # fmt: skip
     result = replace(result, predicted=predicted)
     result = judged(result, of_solution(result, solution))
-    return replace(result, warnings=found.warnings + warning_sentences(result))
+    told = tuple(f"The robot's file: {note}." for note in model.chain.notes)
+    return replace(result, warnings=(*found.warnings, *warning_sentences(result), *told))
 
 
 def _tails(every: Solution, found: MethodResult, set_apart: bool) -> Tails | None:

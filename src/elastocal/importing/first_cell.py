@@ -9,32 +9,38 @@ from __future__ import annotations
 import math
 import os
 from collections.abc import Iterator
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 
 from elastocal.cell.arm_description import SOURCES, Convention, Robot
+from elastocal.cell.file_keys import rpy
 from elastocal.cell.work_cell import Cell
 from elastocal.errors import InputError, option, require
 from elastocal.files import atomic_write_text
+from elastocal.model import ur_table
 from elastocal.model.chain import Chain, Joint, finite_ranges
 from elastocal.model.choice import load_chain
 from elastocal.model.effects.compliances import JointCompliance
 from elastocal.model.effects.gears import JointOffset
 from elastocal.model.effects.placements import BaseFrame, LinkGeometry, MarkerPosition
+from elastocal.model.joint_names import clashing, names_told
 from elastocal.model.mjcf import MjcfArm
+from elastocal.model.plausible import jaw_told
 from elastocal.model.rigid import nominal_flanges
-from elastocal.model.urdf import check_urdf
-from elastocal.text import printable
+from elastocal.model.urdf import MOVING, check_urdf, xacro_left
+from elastocal.text import listed, printable
 from elastocal.units import Array
 
 ENDINGS = {".urdf": "urdf", ".xml": "mjcf", ".mjcf": "mjcf", ".csv": "dh"}
+ENDINGS |= dict.fromkeys(ur_table.ENDINGS, "dh")
 # Sites that are flanges by what MuJoCo users call them.
 FLANGE_SITES = ("attachment_site", "flange", "tool0", "ee_site")
 MOST_SITES = 8  # listed as markers; of more most are something else
 # Of the KR 270 of the demo, in m and N, from which loads are guessed by the fourth power of the
-# reach: small arms carry less for their size.
+# reach: small arms carry less for their size, and longer ones are no stronger.
 REACH, LOAD = 2.9, 2600.0
 THICKNESS = 15.0  # reach over a link's radius
 POSES, CANDIDATES = 20, 2000  # three markers read nine numbers in each pose and load state
@@ -47,6 +53,7 @@ def init(
     base: str | None = None,
     flange: str | None = None,
     convention: Convention = "standard",
+    ur_model: str | None = None,
     force: bool = False,
 ) -> str:
     """How does a first cell for my arm look?
@@ -55,11 +62,13 @@ def init(
     of what it does not, marked as such: a cell file that `design` and `simulate` run with.
 
     Args:
-        robot: A URDF, MuJoCo model (MJCF) or DH table, or a `Robot`.
+        robot: A URDF, MuJoCo model (MJCF), DH table or UR's factory calibration (calibration.conf,
+            YAML), or a `Robot`.
         output: The cell file to write; None writes none.
         base: First link or body, None for the root.
         flange: Last link, body or site; None for the one that is found.
         convention: Of a DH table: "standard" or "modified".
+        ur_model: Of a calibration.conf: the robot, as "UR10e".
         force: Write over a file that is there.
 
     Returns:
@@ -78,7 +87,9 @@ def init(
         target is None or force or not target.exists(),
         f"{target} is there already; name another file, or give {option('force', True)}",
     )
-    found = robot if isinstance(robot, Robot) else robot_of(robot, base, flange, convention)
+    found = (
+        robot if isinstance(robot, Robot) else robot_of(robot, base, flange, convention, ur_model)
+    )
     text = first_cell(found, "." if target is None else target.parent)
     if target is not None:
         atomic_write_text(target, text)
@@ -90,6 +101,7 @@ def robot_of(
     base: str | None = None,
     flange: str | None = None,
     convention: Convention = "standard",
+    ur_model: str | None = None,
 ) -> Robot:
     """The robot that a file describes: URDF, MuJoCo model or DH table, by its ending.
 
@@ -98,15 +110,21 @@ def robot_of(
     """
     path = Path(path)
     kind = ENDINGS.get(path.suffix.lower())
+    require(path.suffix.lower() != ".xacro", xacro_left(path, f"the ending '{path.suffix}'"))
     if kind is None:
         raise InputError(
             f"{path}: the ending '{printable(path.suffix)}' tells no robot; give a URDF (.urdf), a "
-            "MuJoCo model (.xml, .mjcf) or a DH table (.csv)"
+            "MuJoCo model (.xml, .mjcf), a DH table (.csv) or the factory calibration of a UR "
+            "(.conf, .yaml)"
         )
+    require(
+        ur_model is None or path.suffix.lower() == ".conf",
+        f"{option('ur_model')} is for a calibration.conf; leave it out for {path}",
+    )
     if kind == "dh":
         for name, given in (("base", base), ("flange", flange)):
             require(given is None, f"{option(name)} has no meaning for a DH table; leave it out")
-        return Robot.from_dh(path, convention)
+        return replace(Robot.from_dh(path, convention), ur_model=ur_model)
     require(
         convention == "standard",
         f"{option('convention')} is for DH tables; leave it out for {path}",
@@ -127,27 +145,64 @@ def first_cell(robot: Robot, folder: str | Path = ".") -> str:
     """
     kind, path = next((k, p) for k in SOURCES if (p := getattr(robot, k)) is not None)
     chain = load_chain(Cell(name=path.stem, robot=robot))
-    sites = MjcfArm.read(path, robot.base, robot.flange).sites() if kind == "mjcf" else {}
-    reach = max(reach_of(chain), 0.05)
+    arm = MjcfArm.read(path, robot.base, robot.flange) if kind == "mjcf" else None
+    if clashing(chain) and robot.joint_names is None:
+        robot = replace(robot, joint_names="order")
     lines = [
         f"# {printable(chain.name)}: a first cell, made of {printable(path.name)} by elastocal"
         " init. It runs as it is.",
         "# What the robot's file does not say is a guess, and marked so: replace it by your own.",
+        *(f"# Note: {printable(note)}." for note in notes_of(robot, chain)),
         f"name = {_text(chain.name)}",
         "",
         *_robot(robot, kind, path, Path(folder)),
         *_joints(chain),
-        _rest(chain, reach, sites),
+        _rest(chain, _mount(robot, arm), {} if arm is None else arm.sites()),
     ]
     return "\n".join(lines) + "\n"
 
 
+def notes_of(robot: Robot, chain: Chain) -> list[str]:
+    """What to know of how the robot's file was read, in sentences."""
+    found = list(chain.notes)
+    if clash := clashing(chain):
+        found.append(
+            f"the file calls other joints {listed(clash, 3)} than their number in the arm: here "
+            f'jointN is the Nth joint ({names_told(chain)}); [robot] joint_names = "file" takes '
+            "the file's names instead"
+        )
+    moved = ""
+    if robot.urdf is not None and robot.flange is not None:
+        last = check_urdf(robot.urdf).parent_joint[robot.flange]
+        moved = robot.flange if last.kind in MOVING else ""
+    return found + jaw_told(chain, moved)
+
+
+def _mount(robot: Robot, arm: MjcfArm | None) -> tuple[Array, str]:
+    """Rotation (3, 3) of the base in a frame whose z is up, as the file has it, and who says so."""
+    if arm is not None:
+        up, told = arm.upright()
+        return up @ arm.placed(arm.base)[:3, :3], told
+    if robot.urdf is None:
+        return np.eye(3), "guess: the base stands upright"
+    tree = check_urdf(robot.urdf)
+    base = tree.root if robot.base is None else robot.base
+    return tree.placed(tree.root, base)[:3, :3], f"of '{base}' in the file's '{tree.root}', z up"
+
+
 def reach_of(chain: Chain) -> float:
-    """How far the flange gets from the first joint, in m: the largest of 500 drawn poses."""
+    """How far the flange gets from the first joint that turns, in m: the largest of 500 drawn
+    poses.  Slides before it, as a rail, stand still."""
     limits = [np.array([getattr(j, end) for j in chain.joints]) for end in ("lower", "upper")]
-    q = np.random.default_rng(0).uniform(*finite_ranges(chain, *limits), (500, chain.n_joints))
-    away = nominal_flanges(chain, q)[:, :3, 3] - chain.joints[0].placement[:3, 3]
-    return float(np.linalg.norm(away, axis=1).max())
+    low, high = finite_ranges(chain, *limits)
+    q = np.random.default_rng(0).uniform(low, high, (500, chain.n_joints))
+    turning = [i for i, kind in enumerate(chain.kinds) if kind == "revolute"]
+    first = turning[0] if turning else 0
+    q[:, :first] = (low + high)[:first] / 2
+    until = replace(chain, joints=chain.joints[:first], flange_placement=np.eye(4), masses=())
+    centre = nominal_flanges(until, q[:1, :first])[0] if first else np.eye(4)
+    centre = (centre @ chain.joints[first].placement)[:3, 3]
+    return float(np.linalg.norm(nominal_flanges(chain, q)[:, :3, 3] - centre, axis=1).max())
 
 
 def _text(value: str) -> str:
@@ -169,10 +224,10 @@ def _one(value: float) -> float:
 def _robot(robot: Robot, kind: str, path: Path, folder: Path) -> Iterator[str]:
     yield "[robot]"
     yield f"{kind} = {_text(Path(os.path.relpath(path, folder)).as_posix())}"
-    if kind == "dh":
+    if kind == "dh" and path.suffix.lower() == ".csv":
         yield f'dh_convention = "{robot.dh_convention}"' + " " * 7 + '# or "modified" (Craig)'
         yield '# masses = "links.csv"               # link masses, for weights: docs, File formats'
-    for name in ("base", "flange"):
+    for name in ("base", "flange", "ur_model", "joint_names"):
         if (value := getattr(robot, name)) is not None:
             yield f"{name} = {_text(value)}"
     yield ""
@@ -219,9 +274,12 @@ def _key(name: str) -> str:
     return name if bare else _text(name)
 
 
-def _rest(chain: Chain, reach: float, sites: dict[str, Array]) -> str:
+def _rest(chain: Chain, mount: tuple[Array, str], sites: dict[str, Array]) -> str:
     """Tool, tracker, model, workspace and wishes for a plan."""
+    reach = max(reach_of(chain), 0.05)
     side, n = reach / 12, chain.n_joints
+    turned, whose = mount
+    rpy_deg = f"base_rpy_deg = {_vector(np.degrees(rpy(turned)))}"
     # Off the last joint's axis, which a load on it would not turn.
     hangs = f"load_point_m = {_vector([side, 0, side])}"
     station = f"position_m = {_vector([round(2 * reach, 1), 0.0, round(0.5 * reach, 1)])}"
@@ -234,6 +292,8 @@ def _rest(chain: Chain, reach: float, sites: dict[str, Array]) -> str:
     springs = "\n    ".join(" ".join(sprung[k : k + 2]) for k in range(0, len(sprung), 2))
     weighed = bool(chain.masses)
     told = "masses of the robot's file bend the joints" if weighed else "the file has no masses"
+    if any("gravity" in note or "mass of" in note for note in chain.notes):
+        told = "a choice: see the notes above"
     # In mm, fives; the links get thinner towards the wrist.
     thick = max(5 * round(reach * 1e3 / THICKNESS / 5), 5)
     thin = max(5 * round(thick * 0.6 / 5), 5)
@@ -241,7 +301,7 @@ def _rest(chain: Chain, reach: float, sites: dict[str, Array]) -> str:
     # What stands on the mounting plane is no body that could strike it.
     if chain.joints[0].placement[2, 3] * 1e3 <= radii[0]:
         radii[0] = 0
-    load = max(_one(LOAD * (reach / REACH) ** 4), 5.0)
+    load = max(_one(LOAD * min(reach / REACH, 1.0) ** 4), 5.0)
     return f"""\
 [tool]                                 # all in m, in the flange frame
 {hangs:<38} # guess: where a load hangs
@@ -263,17 +323,17 @@ effects = [
 {f"link_gravity = {str(weighed).lower()}":<38} # {told}
 
 [model.nominal]                        # the robot's base in the data's frame
-base_position_m = [0, 0, 0]            # guess: the data are in the base's frame
-base_rpy_deg = [0, 0, 0]
+base_position_m = [0, 0, 0]            # guess: the base is the origin of the data
+{rpy_deg:<38} # {whose}
 
 [workspace]                            # where the arm may be; design keeps to it
 {f"link_radius_mm = [{', '.join(map(str, radii))}]":<38} # guess
 clearance_mm = {thin}
 
 [[workspace.keep_out]]
-name = "mounting plane"                # the arm stays above it; for a ceiling or
-point_m = [0, 0, 0]                    # a wall turn the normal, and the base above
-normal = [0, 0, 1]
+name = "mounting plane"                # the arm stays above it, z of the base
+point_m = [0, 0, 0]
+normal = {_vector(turned[:, 2])}
 
 # [[workspace.obstacle]]
 # name = "table"
@@ -284,4 +344,4 @@ normal = [0, 0, 1]
 [design]                               # elastocal design
 poses = {POSES}
 {f"candidates = {CANDIDATES}":<38} # to choose from; more take longer
-{f"loads_N = [[0, 0, 0], [0, 0, -{load:g}]]":<38} # guess: without and with it"""
+{f"loads_N = [[0, 0, 0], [0, 0, -{load:g}]]":<38} # guess for a reach of {reach:.2f} m"""

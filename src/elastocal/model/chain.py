@@ -49,13 +49,15 @@ class Chain:
 
     `flange_placement` (4, 4) places the flange in the last joint's frame.
     `masses` holds one entry per joint, all bodies rigidly carried by that joint
-    lumped, or is empty where the source has no inertias.
+    lumped, or is empty where the source has no inertias.  `notes`: what to know of how the source
+    was read, in sentences.
     """
 
     name: str
     joints: tuple[Joint, ...]
     flange_placement: Array
     masses: tuple[LinkMass, ...] = field(default=())
+    notes: tuple[str, ...] = field(default=(), compare=False)
 
     @property
     def n_joints(self) -> int:
@@ -64,25 +66,6 @@ class Chain:
     @property
     def kinds(self) -> tuple[JointKind, ...]:
         return tuple(joint.kind for joint in self.joints)
-
-
-def plausible(chain: Chain, source: object) -> Chain:
-    """The chain of the file `source`; raises InputError where it is longer or heavier than any."""
-
-    def check(found: float, most: float, what: str) -> None:
-        if not found <= most:
-            raise InputError(f"{source}: {found:g} {what}; correct it")
-
-    for i, joint in enumerate(chain.joints, start=1):
-        length = float(np.linalg.norm(joint.placement[:3, 3]))
-        check(length, MAX_LENGTH, f"m before joint {i} is too long for a link")
-    length = float(np.linalg.norm(chain.flange_placement[:3, 3]))
-    check(length, MAX_LENGTH, "m before the flange is too long for a link")
-    for i, body in enumerate(chain.masses, start=1):
-        check(body.mass, MAX_MASS, f"kg is too heavy for link {i}")
-        offset = float(np.linalg.norm(body.com))
-        check(offset, MAX_LENGTH, f"m to the centre of mass is too far for link {i}")
-    return chain
 
 
 # Joint limits: the robot's own, narrowed by the cell's.

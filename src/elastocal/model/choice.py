@@ -11,9 +11,10 @@ import casadi as ca
 from elastocal.cell.work_cell import Cell, read_cell
 from elastocal.errors import InputError
 from elastocal.model.arm import ParameterSpec
-from elastocal.model.chain import Chain, plausible
+from elastocal.model.chain import Chain
 from elastocal.model.effects import CATALOGUE
 from elastocal.model.effects.base import Effect
+from elastocal.model.plausible import plausible
 from elastocal.plugin_loader import load_installed, load_named
 from elastocal.text import did_you_mean, listed
 
@@ -36,7 +37,9 @@ def cell_of(cell: Cell | str | Path, plugins: bool | None = False) -> Cell:
 
 
 def load_chain(cell: Cell) -> Chain:
-    """The nominal chain of the cell's robot, from its URDF, MuJoCo model or DH table."""
+    """The nominal chain of the cell's robot, from its URDF, MuJoCo model, DH table or factory
+    calibration."""
+    from elastocal.model import ur_table
     from elastocal.model.dh import read_dh
     from elastocal.model.mjcf import read_mjcf
     from elastocal.model.urdf import read_urdf
@@ -46,6 +49,8 @@ def load_chain(cell: Cell) -> Chain:
         return plausible(read_mjcf(robot.mjcf, robot.base, robot.flange), robot.mjcf)
     if robot.urdf is not None:
         return plausible(read_urdf(robot.urdf, robot.base, robot.flange), robot.urdf)
+    if robot.dh is not None and robot.dh.suffix.lower() in ur_table.ENDINGS:
+        return plausible(ur_table.read_ur_table(robot.dh, robot.ur_model), robot.dh)
     if robot.dh is not None:
         chain = read_dh(robot.dh, convention=robot.dh_convention, masses_path=robot.masses)
         return plausible(chain, robot.masses or robot.dh)

@@ -4,7 +4,8 @@ from __future__ import annotations
 
 import math
 from collections.abc import Sequence
-from functools import reduce
+from dataclasses import replace
+from functools import partial, reduce
 from operator import matmul
 from pathlib import Path
 from typing import Literal
@@ -23,8 +24,10 @@ from elastocal.model.chain import (
     JointKind,
     LinkMass,
 )
+from elastocal.model.plausible import MAX_ANGLE, extent, near_the_arm
 from elastocal.tables import (
     NO_UNIT,
+    Column,
     Family,
     Layout,
     RawTable,
@@ -32,24 +35,27 @@ from elastocal.tables import (
     match_columns,
     read_table,
 )
-from elastocal.text import did_you_mean, listed
+from elastocal.text import did_you_mean, listed, nearest, quoted
 from elastocal.units import Array
 
 Convention = Literal["standard", "modified"]
 ANGLE, LENGTH = ("rad", "deg"), ("m", "mm")
 X, Y, Z = (1.0, 0.0, 0.0), (0.0, 1.0, 0.0), (0.0, 0.0, 1.0)
 FIXED = "fixed"
-# Two turns: beyond them the unit in the header is wrong.
-MAX_ANGLE = 4 * math.pi
+# Rows that no joint moves: as types, and as names that need one.
+STILL = (FIXED, "base", "tool", "flange")
+NO_JOINTS = ("world", "tcp", "end_effector", "ee", *STILL)
 MOST_BYTES = 1_000_000
+FARTHEST_D = 1e5  # m; axes that meet farther away are parallel to 1e-5 rad
 
 # Multiplied, as these tables always were: 115.7 mm / 1000 is not the same float.
-SI = {"rad": 1.0, "deg": math.pi / 180.0, "m": 1.0, "mm": 1e-3, "kg": 1.0}
+SI = {"": 1.0, "rad": 1.0, "deg": math.pi / 180.0, "m": 1.0, "mm": 1e-3, "kg": 1.0}
 ENDS = ("lower", "upper")
 
 DH_FAMILIES = (
     Family("joint", "joint names", {"joint": NO_UNIT}, is_label=True, optional=("joint",)),
     Family("type", "joint types", {"type": NO_UNIT}, is_label=True, optional=("type",)),
+    Family("sign", "directions of the joints", {"sign": NO_UNIT}, optional=("sign",)),
     Family(
         "angle", "angles", dict.fromkeys(("theta0", "alpha", "beta"), ANGLE), optional=("beta",)
     ),
@@ -73,10 +79,14 @@ def read_dh(
     """The chain of a DH table in CSV, one row per joint.
 
     Columns theta0_rad|deg, d_m|mm, a_m|mm, alpha_rad|deg; optional: beta_rad|deg, joint (name),
-    type (revolute|prismatic|fixed), limits lower_/upper_rad|deg for revolute and
-    lower_/upper_m|mm for prismatic joints (blank: none).  masses_path: CSV with link (1…n, linkN or
-    the joint's name), mass_kg, com_x_m, com_y_m, com_z_m, the centre of mass in DH frame i; every
-    link once.
+    type (revolute|prismatic, or fixed|base|tool|flange for a row that no joint moves), sign (1, or
+    -1 where the joint's value counts against the axis), limits lower_/upper_rad|deg for revolute
+    and lower_/upper_m|mm for prismatic joints (blank: none).  masses_path: CSV with link (1…n,
+    linkN or the joint's name), mass_kg, com_x_m, com_y_m, com_z_m, the centre of mass in DH frame
+    i; every link once.
+
+    Where axes are nearly parallel their common normal lies far away, and d of hundreds of metres
+    cancel (factory calibrations): such frames are taken near the arm, see `near_the_arm`.
 
     Raises InputError, naming file, row and column.
     """
@@ -87,7 +97,7 @@ def read_dh(
             " is unknown; valid: standard, modified"
         )
     table = read_dh_table(path)
-    moving = [i for i in range(len(table.row)) if table.text(i, "type") != FIXED]
+    moving = [i for i in range(len(table.row)) if not _still(table, i)]
     if not MIN_JOINTS <= len(moving) <= MAX_JOINTS:
         raise InputError(
             f"{path}: {len(moving)} rows below the header, one per joint; "
@@ -102,12 +112,14 @@ def read_dh(
             continue
         kind = _kind(table, i)
         lower, upper = _limits(table, i, kind)
-        joints.append(Joint(next(waiting), kind, passed @ T_before, np.array(Z), lower, upper))
+        axis = _sign(table, i) * np.array(Z)
+        joints.append(Joint(next(waiting), kind, passed @ T_before, axis, lower, upper))
         passed = T_after
         after.append(T_after)
     names = [joint.name for joint in joints]
     masses = () if masses_path is None else _masses(Path(masses_path), names, after)
-    return Chain(name or path.stem, tuple(joints), passed, masses)
+    chain = Chain(name or path.stem, tuple(joints), passed, masses)
+    return _closer(table, chain) if extent(chain) > MAX_LENGTH else chain
 
 
 def read_dh_table(path: Path) -> RawTable:
@@ -125,7 +137,7 @@ def _read(path: Path, known: Sequence[Family], needed: Sequence[str], what: str)
     named = {family.name: family for family in known}
 
     def choose(header: Sequence[str]) -> Layout:
-        present = match_columns(str(path), header, named)
+        present = match_columns(str(path), header, named, explain=partial(_meant, known, what))
         return layout_of_columns(
             str(path), present, named, [(n,) for n in needed], f"a {what} needs"
         )
@@ -134,12 +146,17 @@ def _read(path: Path, known: Sequence[Family], needed: Sequence[str], what: str)
 
 
 def _link(table: RawTable, i: int, convention: str) -> tuple[Array, Array]:
-    """T_{i-1,i}(q_i) = before · motion(q_i) · after: the two constant factors."""
     theta0, alpha, beta = (_plausible(table, i, "angle", k) for k in ("theta0", "alpha", "beta"))
     d, a = (_plausible(table, i, "length", k) for k in ("d", "a"))
+    return link(theta0, d, a, alpha, 0.0 if math.isnan(beta) else beta, convention)
+
+
+def link(
+    theta0: float, d: float, a: float, alpha: float, beta: float = 0.0, convention: str = "standard"
+) -> tuple[Array, Array]:
+    """T_{i-1,i}(q_i) = before · motion(q_i) · after: the two constant factors (4, 4)."""
     Rz_theta, Tz_d = rotation(Z, theta0), translation(Z, d)
-    Tx_a, Rx_alpha = translation(X, a), rotation(X, alpha)
-    Ry_beta = rotation(Y, 0.0 if math.isnan(beta) else beta)
+    Tx_a, Rx_alpha, Ry_beta = translation(X, a), rotation(X, alpha), rotation(Y, beta)
     if convention == "standard":
         return product(Rz_theta), product(Tz_d, Tx_a, Rx_alpha, Ry_beta)
     return product(Rx_alpha, Tx_a, Ry_beta, Rz_theta, Tz_d), np.eye(4)
@@ -160,17 +177,99 @@ def product(*factors: ca.SX) -> Array:
 
 def _plausible(table: RawTable, i: int, family: str, stem: str) -> float:
     value, column = dh_number(table, i, family, stem), table.column(family, stem)
-    if column is None:
-        return value
-    lengths = column.unit in LENGTH
-    if not abs(value) > (MAX_LENGTH if lengths else MAX_ANGLE):
-        return value
-    wrong = "m is too long for a link" if lengths else "rad is more than two turns"
-    meant = {"rad": ("degrees", "deg"), "m": ("millimetres", "mm")}.get(str(column.unit))
+    if column is not None:
+        # Whether a long d is one is seen in the chain.
+        most = FARTHEST_D if stem == "d" else MAX_LENGTH
+        if column.unit in LENGTH and abs(value) > most:
+            raise _too_much(table, i, column, value, "m is too long for a link")
+        if column.unit in ANGLE and abs(value) > MAX_ANGLE:
+            raise _too_much(table, i, column, value, "rad is more than two turns")
+    return value
+
+
+def _too_much(
+    table: RawTable, i: int, column: Column, value: float, wrong: str
+) -> InputError:  # fmt: skip
+    meant = {"rad": ("degrees", "deg"), "m": ("millimetres", "mm")}.get(column.unit)
     remedy = (
-        f"if these are {meant[0]}, call the column {stem}_{meant[1]}" if meant else "correct it"
+        f"if these are {meant[0]}, call the column {column.stem}_{meant[1]}"
+        if meant
+        else "correct it"
     )
-    raise InputError(f"{table.where(i, column.header)}: {value:g} {wrong}; {remedy}")
+    return InputError(f"{table.where(i, column.header)}: {value:g} {wrong}; {remedy}")
+
+
+def _closer(table: RawTable, chain: Chain) -> Chain:
+    """The chain with its frames near the arm; InputError where it is as long all the same."""
+    closer = near_the_arm(chain)
+    d = np.array([dh_number(table, i, "length", "d") for i in range(len(table.row))])
+    i, column = int(np.argmax(np.abs(d))), table.column("length", "d")
+    if extent(closer) > MAX_LENGTH and column is not None:
+        raise _too_much(table, i, column, d[i], "m is too long for a link, and the d do not cancel")
+    told = (
+        f"the d of nearly parallel axes, up to {abs(d[i]):.4g} m, cancel: joint frames are taken "
+        f"where the axes pass the arm, whose links are {extent(closer):.2f} m long together; it "
+        "moves as the table says"
+    )
+    return replace(closer, notes=(*closer.notes, told))
+
+
+# Other people's names of columns, by the ones here; units stay.
+ALIASES = {
+    "lower": ("qmin", "min", "low", "qlow", "lb", "qlimmin", "limitmin", "lowerlimit", "jmin"),
+    "upper": ("qmax", "max", "high", "qhigh", "ub", "qlimmax", "limitmax", "upperlimit", "jmax"),
+    "theta0": ("theta", "θ", "θ0", "offset", "q0", "thetaoffset"),
+    "alpha": ("α",), "beta": ("β",), "a": ("r",), "joint": ("name",), "type": ("sigma", "kind"),
+    "sign": ("direction", "flip", "dir"),
+}  # fmt: skip
+
+
+def _meant(known: Sequence[Family], what: str, header: str) -> str | None:
+    """What to say of an unknown column: its name here, or the columns that there are.  Names are
+    compared without their unit, so that min_deg is not taken for beta_deg."""
+    ways: dict[str, tuple[str, ...]] = {}
+    for family in known:
+        for stem in family.units:
+            ways[stem] = ways.get(stem, ()) + family.columns(stem)
+    stem, _, unit = header.rpartition("_")
+    if not stem or unit not in SI:
+        stem, unit = header, ""
+    if stem in ways:
+        return None
+    plain = stem.lower().replace("_", "")
+    near = next((k for k, names in ALIASES.items() if plain in names and k in ways), None)
+    near = near or nearest(stem, ways, 0.7)
+    if near is None:
+        told = f"; a {what} takes {listed(way for family in ways.values() for way in family)}"
+    else:
+        same = [way for way in ways[near] if way == f"{near}_{unit}"]
+        told = f" (did you mean {' or '.join(map(repr, same or ways[near]))}?)"
+        told += ": 1, or -1 where a joint turns against its axis" if near == "sign" else ""
+    return (
+        f"unknown column {quoted(header)}{told}; correct the name, or start it with '#', '_' or "
+        "'note' to have it ignored"
+    )
+
+
+def _still(table: RawTable, i: int) -> bool:
+    """Whether a row has no joint; InputError where its name says so and its type does not."""
+    kind, name = table.text(i, "type"), table.text(i, "joint").lower()
+    if not kind and name in NO_JOINTS:
+        raise InputError(
+            f"{table.where(i, 'joint')}: '{table.text(i, 'joint')}' names no joint; give the row "
+            f"type {FIXED} in the column type (or revolute, prismatic, if a joint moves it)"
+        )
+    return kind.lower() in STILL
+
+
+def _sign(table: RawTable, i: int) -> float:
+    """1, or -1 where the joint's value counts against its axis."""
+    value = dh_number(table, i, "sign", "sign")
+    if value not in (1.0, -1.0) and not math.isnan(value):
+        raise InputError(
+            f"{table.where(i, 'sign')}: {value:g}; write 1, or -1 where the joint turns against z"
+        )
+    return -1.0 if value == -1.0 else 1.0
 
 
 def _kind(table: RawTable, i: int) -> JointKind:
@@ -179,7 +278,8 @@ def _kind(table: RawTable, i: int) -> JointKind:
         return "prismatic" if text == "prismatic" else "revolute"
     raise InputError(
         f"{table.where(i, 'type')}: unknown joint type '{text}'"
-        f"{did_you_mean(text, ('revolute', 'prismatic', FIXED))}; valid: revolute, prismatic, fixed"
+        f"{did_you_mean(text, ('revolute', 'prismatic', *STILL))}; valid: revolute, prismatic, "
+        "fixed"
     )
 
 

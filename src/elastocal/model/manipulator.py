@@ -21,6 +21,7 @@ from elastocal.model.effects import effect_of
 from elastocal.model.effects.base import Effect
 from elastocal.model.effects.driven import JointMotion
 from elastocal.model.evaluate import CHUNK, row_blocks, summary
+from elastocal.model.joint_names import numbered
 from elastocal.model.observations import Observations, observe
 from elastocal.model.symbolic import SymbolicArm
 from elastocal.text import listed
@@ -93,7 +94,8 @@ class Model:
         self._markers_stated = bool(cell.tool.markers)
         if not self._markers_stated:
             cell = _with_markers(cell, tuple(markers) or (DEFAULT_MARKER,))
-        self._assemble(load_chain(cell), cell, (), backend)
+        chain = load_chain(cell)
+        self._assemble(chain, numbered(cell, chain), (), backend)
 
     @classmethod
     def assembled(

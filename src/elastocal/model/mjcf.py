@@ -11,8 +11,11 @@ which is a chain whose joint frames are T_b … Trans(p_j) J(a_j, −r_j).
 
 from __future__ import annotations
 
+import math
 import re
-from collections.abc import Iterable, Sequence
+import warnings
+from collections.abc import Iterable, Iterator, Sequence
+from contextlib import contextmanager
 from dataclasses import dataclass
 from functools import cached_property
 from pathlib import Path
@@ -25,8 +28,11 @@ from elastocal.errors import InputError, require
 from elastocal.files import read_bytes
 from elastocal.model import rigid
 from elastocal.model.chain import MAX_JOINTS, MIN_JOINTS, Chain, Joint, JointKind, LinkMass
+from elastocal.model.effects.loads import STANDARD_GRAVITY
 from elastocal.model.mjcf_bounds import check_bounds
-from elastocal.model.urdf import MAX_BYTES, xml_tree
+from elastocal.model.mjcf_loops import check_open, ties_of
+from elastocal.model.plausible import check_angles
+from elastocal.model.urdf import MAX_BYTES, as_utf8, xml_tree
 from elastocal.text import did_you_mean, listed, printable
 from elastocal.units import Array
 
@@ -35,6 +41,7 @@ WORLD = 0  # MuJoCo's number of the world body
 SPRING = "elastocal_spring_"
 # MuJoCo wants masses of moving bodies; where a file's meshes are missing, these stand for them.
 STAND_IN = 1e-6
+SMALLEST_GRAVITY = 1e-3  # m/s²; below it there is none
 
 
 def read_mjcf(path: str | Path, base: str | None = None, flange: str | None = None) -> Chain:
@@ -56,7 +63,8 @@ class MjcfArm:
     """A compiled MuJoCo model and the way through it from `base` to `flange`.
 
     `base`: number of a body.  `flange`: number of the body that is the flange, or has the site
-    `site` that is (None: the body).  `weighed`: the masses of the bodies are those of the file.
+    `site` that is (None: the body).  `unweighed`: bodies whose masses meshes that are not there
+    would state.  `notes`: what MuJoCo and the reader say of the file.
     """
 
     path: Path
@@ -65,7 +73,8 @@ class MjcfArm:
     base: int
     flange: int
     site: int | None
-    weighed: bool
+    unweighed: frozenset[int] = frozenset()
+    notes: tuple[str, ...] = ()
 
     @classmethod
     def read(
@@ -85,6 +94,9 @@ class MjcfArm:
         path = Path(path)
         data = mjcf_bytes(path) if text is None else text.encode("utf-8")
         root = xml_tree(path, data, "an MJCF file")
+        if text is None and (path.suffix.lower() != ".xml" or as_utf8(path, data) != data):
+            # MuJoCo's reader takes .xml in UTF-8 alone.
+            text = as_utf8(path, data).decode("utf-8-sig")
         hint = '; this is a URDF, give it as urdf = "…"' if root.tag == "robot" else ""
         require(
             root.tag == "mujoco",
@@ -92,20 +104,24 @@ class MjcfArm:
         )
         check_bounds(path, data)
         spec = parsed(path, text)
-        coupled, tied = _couplings(spec)
-        model, weighed = _compiled(path, spec)
+        _check_units(path, spec)
+        ties = ties_of(spec)
+        model, unweighed, notes = _compiled(path, spec)
         names = {model.body(i).name: i for i in range(model.nbody) if model.body(i).name}
         start = WORLD if base is None else _find(path, "base body", base, names)
         if flange is None:
-            arm = cls(path, spec.modelname or path.stem, model, start, start, None, weighed)
+            arm = cls(path, spec.modelname or path.stem, model, start, start, None)
             end, site = arm._last_body(), None
         else:
             sites = {model.site(i).name: i for i in range(model.nsite) if model.site(i).name}
             found = _find(path, "flange", flange, names | {n: -1 for n in sites if n not in names})
             site = sites[flange] if found < 0 else None
             end = found if site is None else int(model.site_bodyid[site])
-        arm = cls(path, spec.modelname or path.stem, model, start, end, site, weighed)
-        arm._check(coupled, tied)
+        arm = cls(
+            path, spec.modelname or path.stem, model, start, end, site, unweighed, tuple(notes)
+        )
+        arm._check()
+        check_open(arm, ties)
         return arm
 
     def way(self, body: int) -> list[int]:
@@ -170,7 +186,9 @@ class MjcfArm:
                     Joint(self.joint_name(j), self._kind(j), placement, axis, lower, upper)
                 )
                 T = shift(-self.model.jnt_pos[j])
-        return Chain(self.name, tuple(joints), T @ self.flange_in_body, self.masses())
+        masses = self.masses()
+        notes = (*self.notes, *(self._weights_told() if masses else ()))
+        return Chain(self.name, tuple(joints), T @ self.flange_in_body, masses, notes)
 
     @property
     def flange_in_body(self) -> Array:
@@ -186,7 +204,7 @@ class MjcfArm:
         found = {}
         for i in range(self.model.nsite):
             body, name = int(self.model.site_bodyid[i]), self.model.site(i).name
-            if i != self.site and name and self._carrier(body) == self.joints[-1]:
+            if i != self.site and name and self.carrier(body) == self.joints[-1]:
                 place = world[body] @ [*self.model.site_pos[i], 1.0]
                 found[name] = np.linalg.solve(T, place)[:3]
         return found
@@ -210,7 +228,7 @@ class MjcfArm:
             found.append(found[int(self.model.body_parentid[body])] @ self.local(body))
         return found
 
-    def _carrier(self, body: int) -> int | None:
+    def carrier(self, body: int) -> int | None:
         """The last joint of the chain that moves a body, None where none does."""
         while body != WORLD:
             own = [j for j in self.joints_of(body) if j in self.joints]
@@ -220,13 +238,14 @@ class MjcfArm:
         return None
 
     def masses(self) -> tuple[LinkMass, ...]:
-        """What each joint carries, in its frame; none where the file's meshes would state it."""
-        if not self.weighed:
+        """What each joint carries, in its frame; none where meshes that are not there would state
+        the mass of a body between base and flange."""
+        if self.unweighed.intersection(self.way(self.flange)):
             return ()
         world = self._world()
         mass, moment = dict.fromkeys(self.joints, 0.0), dict.fromkeys(self.joints, np.zeros(3))
         for body in range(1, self.model.nbody):
-            if (j := self._carrier(body)) is not None:
+            if body not in self.unweighed and (j := self.carrier(body)) is not None:
                 m = float(self.model.body_mass[body])
                 place = world[body] @ [*self.model.body_ipos[body], 1.0]
                 frame = world[int(self.model.jnt_bodyid[j])] @ shift(self.model.jnt_pos[j])
@@ -236,6 +255,41 @@ class MjcfArm:
             return ()
         both = [(mass[j], moment[j]) for j in self.joints]
         return tuple(LinkMass(m, s / m if m > 0 else np.zeros(3)) for m, s in both)
+
+    def upright(self) -> tuple[Array, str]:
+        """Rotation (3, 3) of the file's world that turns its gravity down, and who says so."""
+        gravity = np.array(self.model.opt.gravity)
+        size = float(np.linalg.norm(gravity))
+        base = f"body '{self.model.body(self.base).name}'"
+        if size < SMALLEST_GRAVITY:
+            return np.eye(3), "guess: the file has no gravity; its z is taken as up"
+        up = -gravity / size
+        if np.abs(up - [0.0, 0.0, 1.0]).max() < 1e-9:
+            return np.eye(3), f"of {base} in the file, z up"
+        return _turn(up), f"of {base}, up against the file's gravity"
+
+    def _weights_told(self) -> list[str]:
+        """Sentences on weights that the file does not state, or does not let act."""
+        import mujoco
+
+        model, found = self.model, []
+        size = float(np.linalg.norm(model.opt.gravity))
+        if size < SMALLEST_GRAVITY or model.opt.disableflags & mujoco.mjtDisableBit.mjDSBL_GRAVITY:
+            found.append("the file switches gravity off, while link_gravity = true lets it act")
+        elif abs(size - STANDARD_GRAVITY) > 0.05:
+            found.append(
+                f"the file's gravity is {size:.4g} m/s², while weights act here with "
+                f"{STANDARD_GRAVITY:.4g} m/s²"
+            )
+        moved = [b for b in range(1, model.nbody) if self.carrier(b) is not None]
+        held = [b for b in moved if model.body_gravcomp[b]]
+        if held:
+            names = listed((model.body(b).name or f"body {b}" for b in held), 4)
+            found.append(
+                f"gravcomp of the file carries the weight of {names}: in MuJoCo nothing sags "
+                "there, while link_gravity = true bends the joints"
+            )
+        return found
 
     def _last_body(self) -> int:
         """The last body that all bodies with the most joints on their way have in common."""
@@ -258,7 +312,7 @@ class MjcfArm:
             )
         return common[-1]
 
-    def _check(self, coupled: set[str], tied: set[str]) -> None:
+    def _check(self) -> None:
         """Raise InputError unless the way is one of 4 to 9 hinges and slides of their own."""
         import mujoco
 
@@ -279,22 +333,10 @@ class MjcfArm:
                 f"{where} is {word} joint between base and flange; only hinges and slides can be, "
                 "name a base below it",
             )
-            require(
-                self.model.joint(j).name not in coupled,
-                f"{where} is coupled by <equality>; coupled joints are not supported between base "
-                "and flange, remove the constraint or choose another flange",
-            )
             lower, upper = self._limits(j)
             require(
                 lower < upper,
                 f"{where}: range {lower:g} {upper:g} leaves no room to move; correct it",
-            )
-        for body in way[:-1]:
-            name = self.model.body(body).name
-            require(
-                not name or name not in tied,
-                f"{self.path}: body '{name}' is part of a closed loop (<equality><connect>); loops "
-                "are not supported between base and flange",
             )
         names = [self.joint_name(j) for j in self.joints]
         require(
@@ -339,7 +381,7 @@ def mjcf_bytes(path: Path) -> bytes:
 def parsed(path: Path, text: str | None = None) -> Any:
     """MuJoCo's MjSpec of a file, or of a `text` that is to stand in its place."""
     mujoco = import_mujoco()
-    try:
+    with _quiet(), _refusals(path):
         if text is None:
             return mujoco.MjSpec.from_file(str(path))
         names = re.findall(r"""<include\s[^>]*?file\s*=\s*["']([^"']+)["']""", text)
@@ -347,47 +389,102 @@ def parsed(path: Path, text: str | None = None) -> Any:
         spec = mujoco.MjSpec.from_string(text, include=inside)
         spec.modelfiledir = f"{path.parent}/"
         return spec
+
+
+@contextmanager
+def _refusals(path: Path) -> Iterator[None]:
+    try:
+        yield
     except ValueError as error:
         raise InputError(f"{path}: MuJoCo cannot read it: {_sentence(error)}") from None
+
+
+@contextmanager
+def _quiet() -> Iterator[list[warnings.WarningMessage]]:
+    """In the `with` block warnings are collected, not shown."""
+    with warnings.catch_warnings(record=True) as found:
+        warnings.simplefilter("always")
+        yield found
+
+
+def compiled(spec: Any) -> tuple[Any, list[str]]:
+    """MuJoCo's model of a spec, and its warnings.  Raises ValueError as it does."""
+    with _quiet() as found:
+        model = spec.compile()
+    return model, [f"MuJoCo warns: {str(one.message).splitlines()[0]}" for one in found]
 
 
 def _sentence(error: Exception) -> str:
     return "; ".join(line.strip() for line in str(error).splitlines() if line.strip())
 
 
-def _couplings(spec: Any) -> tuple[set[str], set[str]]:
-    """Joints that others drive, and bodies of closed loops, as <equality> states them."""
+def _turn(up: Array) -> Array:
+    """The least rotation (3, 3) that takes the unit vector `up` to z."""
+    from scipy.spatial.transform import Rotation
+
+    axis = np.cross(up, [0.0, 0.0, 1.0])
+    size = float(np.linalg.norm(axis))
+    axis = axis / size if size > 1e-9 else np.array([1.0, 0.0, 0.0])
+    return Rotation.from_rotvec(math.atan2(size, up[2]) * axis).as_matrix()
+
+
+def _check_units(path: Path, spec: Any) -> None:
+    """Raise InputError where the file's angles are in rad and no rad can be so large."""
     import mujoco
 
-    coupled, tied = set(), set()
-    for one in spec.equalities:
-        if one.active and one.type == mujoco.mjtEq.mjEQ_JOINT:
-            coupled.add(one.name1)
-        elif one.active and one.type == mujoco.mjtEq.mjEQ_CONNECT:
-            tied |= {one.name1, one.name2}
-    return coupled, tied
+    kinds = mujoco.mjtOrientation
+    for kind in ("body", "frame", "site") if not spec.compiler.degree else ():
+        for one in getattr(spec, {"body": "bodies"}.get(kind, f"{kind}s")):
+            stated = {kinds.mjORIENTATION_EULER: one.alt.euler}
+            stated[kinds.mjORIENTATION_AXISANGLE] = one.alt.axisangle[3:]
+            check_angles(
+                f"{path}: {kind} '{one.name}'", tuple(map(float, stated.get(one.alt.type, ()))),
+                'its compiler states angle="radian"',
+            )  # fmt: skip
 
 
-def _compiled(path: Path, spec: Any) -> tuple[Any, bool]:
-    """The model without what is to be seen or to move it, and whether its masses are the file's."""
+def _compiled(path: Path, spec: Any) -> tuple[Any, frozenset[int], list[str]]:
+    """The model without what is to be seen or to move it, the bodies whose masses are not known as
+    meshes are not there, and what to know of it."""
     import mujoco
 
     for kept in ("fusestatic", "discardvisual"):
         setattr(spec.compiler, kept, 0)
     from_geoms = spec.compiler.inertiafromgeom == mujoco.mjtInertiaFromGeom.mjINERTIAFROMGEOM_TRUE
     # The geoms of a body that states its inertia say nothing more.
-    idle = [] if from_geoms else [g for b in spec.bodies if b.explicitinertial for g in b.geoms]
-    strip(spec, idle)
-    try:
-        return spec.compile(), True
-    except ValueError as error:
-        first = error
-    strip(spec, list(spec.geoms))
-    spec.compiler.boundmass = spec.compiler.boundinertia = STAND_IN
-    try:
-        return spec.compile(), False
-    except ValueError:
-        raise InputError(f"{path}: MuJoCo cannot read it: {_sentence(first)}") from None
+    stated = [] if from_geoms else [b for b in spec.bodies if b.explicitinertial]
+    strip(spec, [g for b in stated for g in b.geoms])
+    first: ValueError | None = None
+    missing = _missing_meshes(path, spec)
+    for lost in (missing, None):  # those, then all
+        geoms = [g for g in spec.geoms if lost is None or g.meshname in lost]
+        open_ = [b for b in spec.bodies if b not in stated and any(g in geoms for g in b.geoms)]
+        strip(spec, geoms)
+        if geoms:
+            spec.compiler.boundmass = spec.compiler.boundinertia = STAND_IN
+        try:
+            model, notes = compiled(spec)
+        except ValueError as error:
+            first = first or error
+            continue
+        unweighed = frozenset(b.id for b in open_)
+        if unweighed:
+            names = listed((b.name or f"body {b.id}" for b in open_), 4)
+            files = listed(missing.values(), 3) or "meshes that MuJoCo cannot read"
+            notes.append(f"{files} is not there, which would state the mass of {names}: taken as 0")
+        return model, unweighed, notes
+    raise InputError(f"{path}: MuJoCo cannot read it: {_sentence(first or ValueError())}")
+
+
+def _missing_meshes(path: Path, spec: Any) -> dict[str, str]:
+    """Meshes that geoms use and whose files are not there: name → file."""
+    used = {geom.meshname for geom in spec.geoms}
+    folder = path.parent / (spec.compiler.meshdir or "")
+    return {
+        mesh.name: mesh.file
+        for mesh in spec.meshes
+        if mesh.name in used and mesh.file and not (folder / mesh.file).is_file()
+    }
 
 
 def strip(spec: Any, geoms: Iterable[Any]) -> None:

@@ -6,6 +6,7 @@ parent, child, origin, axis and limits.  Meshes, materials, plugins and transmis
 
 from __future__ import annotations
 
+import codecs
 import math
 import re
 import xml.etree.ElementTree as ET
@@ -21,17 +22,25 @@ from elastocal.errors import InputError, require
 from elastocal.files import DEEPEST, read_bytes
 from elastocal.model.chain import MAX_JOINTS, MIN_JOINTS, Chain, Joint, JointKind, LinkMass
 from elastocal.model.function_cache import content_key, fetch_arrays, store_arrays, written_by
-from elastocal.text import did_you_mean, listed, printable
+from elastocal.model.plausible import FINGERS, check_angles
+from elastocal.text import SHOWN, did_you_mean, listed, printable
 from elastocal.units import Array
 
 Vector = tuple[float, float, float]
 ZERO: Vector = (0.0, 0.0, 0.0)
 MOVING = ("revolute", "continuous", "prismatic")
 JOINT_TYPES = (*MOVING, "fixed", "floating", "planar")
+# Names of flanges, the usual first.
+FLANGES = ("tool0", "flange", "ee_link", "tcp")
+MOST_IN_A_FINGER = 4  # joints
 # Links that `elastocal export` hangs on a flange; none of them is a flange itself.
 TOOL_FRAMES = ("elastocal_marker_", "elastocal_load_point")
+ENDLESS = 1e9  # rad or m, in what pinocchio reads
 MAX_BYTES = 10_000_000
 MOST_LINKS = 2000
+ENDLESS_TEXT = re.compile(r"([+-]?)\.?inf(?:inity)?", re.IGNORECASE)
+# What xacro, roslaunch and launch files would put in.
+LEFT = re.compile(r"\$\{|\$\((?:arg|find|env|optenv|eval|dirname|anon)\b")
 NUMBER = re.compile(r"[+-]?(\d+\.?\d*|\.\d+)([eE][+-]?\d+)?")
 
 
@@ -39,7 +48,7 @@ def read_urdf(path: str | Path, base: str | None = None, flange: str | None = No
     """The serial chain between two links of a URDF.
 
     base: link name, default the root link; the chain starts in its frame.
-    flange: link name, default the only leaf that at least four moving joints carry.
+    flange: link name, default as `Tree.last_link` finds it.
     Chain: placements in m, unit axes, limits in rad or m (continuous: infinite), and one mass
     per joint in kg with its centre of mass in m in the joint's frame (none if all are zero).
     Bodies beyond the flange and on side branches count, those carried by the base do not.
@@ -148,7 +157,7 @@ def _skeleton(tree: Tree, moving: Collection[str]) -> str:
         ET.SubElement(element, "origin", xyz=text(joint.xyz), rpy=text(joint.rpy))
         ET.SubElement(element, "axis", xyz=text(joint.axis))
         if kind != "fixed" and joint.limit is not None:
-            lower, upper = map(repr, joint.limit)
+            lower, upper = (repr(min(max(end, -ENDLESS), ENDLESS)) for end in joint.limit)
             ET.SubElement(element, "limit", lower=lower, upper=upper, effort="0", velocity="0")
     return ET.tostring(robot, encoding="unicode")
 
@@ -169,6 +178,15 @@ class UrdfJoint:
     axis: Vector
     limit: tuple[float, float] | None = None
     mimic: str | None = None
+
+    @property
+    def origin(self) -> Array:
+        """T (4, 4) from the joint's frame at zero to its parent link's."""
+        from scipy.spatial.transform import Rotation
+
+        T = np.eye(4)
+        T[:3, :3], T[:3, 3] = Rotation.from_euler("xyz", self.rpy).as_matrix(), self.xyz
+        return T
 
 
 @dataclass(frozen=True)
@@ -253,21 +271,71 @@ class Tree:
         return name
 
     def last_link(self, base: str) -> str:
-        """The only leaf below `base` that enough moving joints carry to be a flange."""
-        # Nothing hangs on a leaf but tool frames that `export` has added.
-        leaves = [
+        """The link below `base` from which on fingers, or frames that none moves, branch off.
+
+        Of the links that no other hangs on, those with the most moving joints on their way have it
+        in common; among frames at its end one with a usual name is taken.  Raises InputError, with
+        what each arm would end in, where there are several arms.
+        """
+        arms: dict[tuple[str, ...], list[str]] = {}
+        for leaf in self._leaves(base):
+            way = [joint.name for joint in self._moving(base, leaf)]
+            if len(way) >= MIN_JOINTS:
+                arms.setdefault(tuple(way[:MIN_JOINTS]), []).append(leaf)
+        ends = [self._end_of_arm(base, leaves) for leaves in arms.values()]
+        require(
+            len(ends) < 2,
+            f"{self.path}: several links could be the flange, one of each arm: "
+            f"{listed(sorted(ends))}; name the right one as `flange`, and its base",
+        )
+        leaves = self._leaves(base)
+        return ends[0] if ends else max(leaves, key=lambda leaf: len(self._moving(base, leaf)))
+
+    def _leaves(self, base: str) -> list[str]:
+        """Links on which nothing hangs but tool frames that `export` has added."""
+        return [
             link for link in self._below(base)
             if not link.startswith(TOOL_FRAMES)
             and all(child.startswith(TOOL_FRAMES) for child in self._children[link])
         ]  # fmt: skip
-        able = [leaf for leaf in leaves if len(self._moving(base, leaf)) >= MIN_JOINTS]
-        choice = able or leaves
-        require(
-            len(choice) < 2,
-            f"{self.path}: several links could be the flange: {listed(sorted(choice))}; "
-            "name the right one as `flange`",
-        )
-        return choice[0]
+
+    def _end_of_arm(self, base: str, leaves: Sequence[str]) -> str:
+        most = max(len(self._moving(base, leaf)) for leaf in leaves)
+        ways = [
+            [joint.child for joint in self.joints_between(base, leaf) or ()]
+            for leaf in leaves
+            if len(self._moving(base, leaf)) == most
+        ]
+        common = [link for link in ways[0] if all(link in way for way in ways)]
+        if len(self._moving(base, common[-1])) == most and len(ways) > 1:
+            named = [way[-1] for name in FLANGES for way in ways if way[-1] == name]
+            return named[0] if named else common[-1]
+        # Fingers of unequal length, as a thumb has: no link is common to those with most joints.
+        for k, link in enumerate(common):
+            before, after = (
+                len(self._moving(*pair)) for pair in ((base, link), (link, common[-1]))
+            )
+            if before < MIN_JOINTS or not 0 < after <= MOST_IN_A_FINGER:
+                continue
+            beside = [c for c in self._children[link] if c not in common and self._moves(c)]
+            if len(beside) > 1 or any(self._is_finger(c) for c in beside):
+                return common[k]
+        return common[-1]
+
+    def _moves(self, link: str) -> bool:
+        """Whether the joint before a link, or one below it, moves."""
+        return any(self.parent_joint[below].kind in MOVING for below in self._below(link))
+
+    def _is_finger(self, link: str) -> bool:
+        joints = [self.parent_joint[below] for below in self._below(link)]
+        return any(j.mimic is not None or FINGERS.search(j.name + j.child) for j in joints)
+
+    def placed(self, root: str, link: str) -> Array:
+        """T_root_link (4, 4) with every joint between them at zero."""
+        T = np.eye(4)
+        for joint in self.joints_between(root, link) or ():
+            T = T @ joint.origin
+        return T
 
     def _moving(self, base: str, flange: str) -> list[UrdfJoint]:
         return [j for j in self.joints_between(base, flange) or () if j.kind in MOVING]
@@ -361,18 +429,87 @@ def xml_tree(path: Path, data: bytes, what: str) -> ET.Element:
 
     Raises InputError for what is not XML, nests too deep, declares entities or has xacro macros.
     """
+    start = data[:300].lstrip(b"\xef\xbb\xbf \t\r\n").lower()
+    require(
+        not start.startswith(b"version https://git-lfs"),
+        f"{path}: is a pointer of Git LFS, not {what}; run git lfs pull, or download the file",
+    )
+    require(
+        not start.startswith((b"<!doctype html", b"<html")),
+        f"{path}: is a web page, not {what}; download the file itself (on GitHub: Raw)",
+    )
     try:
         return ET.fromstring(data, ET.XMLParser(target=_Bounded(path, what)))
     except ET.ParseError as error:
         if "unbound prefix" in str(error) and b"<xacro:" in data:
-            raise InputError(_xacro(path, "<xacro:…> elements")) from None
+            raise InputError(xacro_left(path, "<xacro:…> elements")) from None
         line, column = error.position
-        reason = str(error).split(": line")[0]
-        raise InputError(
-            f"{path}: not XML: {reason} in line {line}, column {column + 1}; {what} is an XML file"
-        ) from None
+        reason = (
+            _around(data)
+            or _undeclared(data)
+            or (
+                f"{str(error).split(': line')[0]} in line {line}, column {column + 1}; {what} is "
+                "an XML file"
+            )
+        )
+        raise InputError(f"{path}: not XML: {reason}") from None
     except (LookupError, ValueError) as error:
         raise InputError(f"{path}: not XML: {error}; save it as UTF-8") from None
+
+
+def _around(data: bytes) -> str:
+    """What to say of text before or after the elements, "" where there is none."""
+    head = re.search(rb"<\?xml\b|<(?:robot|mujoco)\b", data)
+    before = data[: head.start()].removeprefix(b"\xef\xbb\xbf") if head else b""
+    if before.strip() or (before and head is not None and head[0] == b"<?xml"):
+        first = printable(before.strip().decode("utf-8", "replace").partition("\n")[0][:SHOWN])
+        told = f"'{first}' stands" if first else "blanks stand"
+        return f"{told} before {'<?xml …?>' if head and head[0] == b'<?xml' else 'it'}; remove that"
+    tail = re.search(rb"</(?:robot|mujoco)\s*>", data)
+    after = data[tail.end() :] if tail else b""
+    if re.sub(rb"<!--.*?-->", b"", after, flags=re.DOTALL).strip():
+        first = printable(after.strip().decode("utf-8", "replace").partition("\n")[0][:SHOWN])
+        return f"'{first}' stands after the end of the robot; remove that"
+    return ""
+
+
+def _undeclared(data: bytes) -> str:
+    """What to say of bytes that are no UTF-8 in a file that declares no encoding, else ""."""
+    if data.startswith(UTF16) or DECLARATION.search(data[:200].decode("ascii", "replace")):
+        return ""
+    try:
+        data.decode("utf-8")
+    except UnicodeDecodeError as error:
+        line = data.count(b"\n", 0, error.start) + 1
+        return (
+            f"line {line} has the byte 0x{data[error.start]:02x}, which is not UTF-8, and no "
+            'encoding is declared; save it as UTF-8, or declare it: <?xml version="1.0" '
+            'encoding="latin-1"?>'
+        )
+    return ""
+
+
+UTF16 = (codecs.BOM_UTF16_LE, codecs.BOM_UTF16_BE)
+DECLARATION = re.compile(r"""(<\?xml[^>]*?\bencoding\s*=\s*)("[^"]*"|'[^']*')""")
+
+
+def as_utf8(path: Path, data: bytes) -> bytes:
+    """An XML file's content as UTF-8, its declaration with it.
+
+    Raises InputError where it cannot be decoded.
+    """
+    if data.startswith(UTF16):
+        name = "utf-16"
+    else:
+        declared = DECLARATION.search(data[:200].decode("ascii", "replace"))
+        name = declared.group(2).strip("\"'") if declared else "utf-8"
+    if name.lower() in ("utf-8", "utf8"):
+        return data
+    try:
+        text = data.decode(name)
+    except (LookupError, UnicodeDecodeError) as error:
+        raise InputError(f"{path}: cannot be read as {name} ({error}); save it as UTF-8") from None
+    return DECLARATION.sub(r'\g<1>"UTF-8"', text, count=1).encode("utf-8")
 
 
 def urdf_bytes(path: Path) -> bytes:
@@ -413,9 +550,11 @@ class _Bounded(ET.TreeBuilder):
 def _without_namespace(path: Path, root: ET.Element) -> ET.Element:
     for element in root.iter():
         namespace, _, local = element.tag.rpartition("}")
-        require("xacro" not in namespace, _xacro(path, f"<xacro:{local}>"))
-        macro = next((v for v in element.attrib.values() if "${" in v), None)
-        require(macro is None, _xacro(path, f"'{macro}' in <{local}>"))
+        require("xacro" not in namespace, xacro_left(path, f"<xacro:{local}>"))
+        # Files of meshes and plug-ins are not read.
+        values = [v for k, v in element.attrib.items() if k not in ("filename", "file")]
+        macro = next((v for v in values if LEFT.search(v)), None)
+        require(macro is None, xacro_left(path, f"'{macro}' in <{local}>"))
         element.tag = local
     other = {"mujoco": "MJCF", "sdf": "SDF"}.get(root.tag)
     way = 'give it as mjcf = "…"' if other == "MJCF" else "export it as URDF"
@@ -427,10 +566,12 @@ def _without_namespace(path: Path, root: ET.Element) -> ET.Element:
     return root
 
 
-def _xacro(path: Path, what: str) -> str:
+def xacro_left(path: Path, what: str) -> str:
+    """The message that `what` of the file shows that it is still to be expanded."""
+    plain = path.name.removesuffix(".xacro")
+    plain = plain if plain.endswith(".urdf") and plain != path.name else "expanded.urdf"
     return (
-        f"{path}: xacro macros are left in ({what}); "
-        f"run xacro first: xacro {path.name} > expanded.urdf"
+        f"{path}: xacro macros are left in ({what}); run xacro first: xacro {path.name} > {plain}"
     )
 
 
@@ -478,17 +619,19 @@ def _joint(where: str, name: str, element: ET.Element, links: Mapping[str, LinkM
     limit = None
     if (stated := element.find("limit")) is not None:
         lower, upper = (
-            _number(f"{where}, limit {side}", stated.get(side, "0")) for side in ("lower", "upper")
+            _limit(f"{where}, limit {side}", stated.get(side, "0")) for side in ("lower", "upper")
         )
         limit = None if kind == "continuous" else (lower, upper)
     mimic = element.find("mimic")
+    rpy = _vector(where, element, "origin", "rpy")
+    check_angles(f"{where}, origin rpy", rpy, "a URDF takes rad")
     return UrdfJoint(
         name,
         kind,
         parent=_end(where, element, "parent", links),
         child=_end(where, element, "child", links),
         xyz=_vector(where, element, "origin", "xyz"),
-        rpy=_vector(where, element, "origin", "rpy"),
+        rpy=rpy,
         axis=(x / length, y / length, z / length) if length else (x, y, z),
         limit=limit,
         mimic=None if mimic is None else mimic.get("joint", ""),
@@ -520,6 +663,14 @@ def _vector(
     )
     x, y, z = (_number(what, word) for word in words)
     return x, y, z
+
+
+def _limit(what: str, text: str) -> float:
+    """A number, or infinite: no limit."""
+    endless = ENDLESS_TEXT.fullmatch(text.strip())
+    if endless is None:
+        return _number(what, text)
+    return -math.inf if endless[1] == "-" else math.inf
 
 
 def _number(what: str, text: str) -> float:

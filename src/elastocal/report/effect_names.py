@@ -17,6 +17,7 @@ from elastocal.model.chain import Chain
 from elastocal.model.choice import cell_of, load_chain
 from elastocal.model.effects import CATALOGUE
 from elastocal.model.effects.base import Effect
+from elastocal.model.joint_names import numbered
 from elastocal.report.formatting import display, significant, together, with_uncertainty
 from elastocal.text import printable
 
@@ -225,6 +226,7 @@ def effect_entries(cell: Cell | str | Path) -> list[dict[str, Any]]:
     """
     given = cell_of(cell)
     chain = load_chain(given)
+    given = numbered(given, chain)
     on = {choice.name for choice in given.model.effects}
     return [_entry(effect, chain, given, effect.name in on) for effect in CATALOGUE.values()]
 
