@@ -401,7 +401,9 @@ def simulated(
             f"{option('values')} takes {len(made.parameters)} finite numbers, one per parameter, "
             f"or some of them by name; found an array of shape {x.shape}",
         )
-    return run(made, rows, x, rng, noise=noise), x
+    read = run(made, rows, x, rng, noise=noise)
+    # Up to here rows are lines of the plan, which messages name.
+    return replace(read, row=np.arange(len(read)) + 2), x
 
 
 def _poses(model: Model, plan: Plan | Table | ArrayLike) -> Measurements:

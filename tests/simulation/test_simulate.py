@@ -211,7 +211,7 @@ def test_expand_plan_orders_rows_as_one_would_measure():
     expected = [(c, r, f, m) for c in (0, 1) for r in (0, 1) for f in (0.0, -100.0) for m in (0, 1)]
     assert labels == expected
     assert rows.marker_names == ("A", "B")
-    assert np.array_equal(rows.row, np.arange(16) + 2)
+    assert np.array_equal(rows.row, np.repeat(plan.row, 8))
     assert np.array_equal(rows.q, plan.q[rows.configuration])
     assert np.array_equal(plan.force, np.zeros((2, 3)))  # the plan itself is left alone
 

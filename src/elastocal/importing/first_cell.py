@@ -205,6 +205,26 @@ def reach_of(chain: Chain) -> float:
     return float(np.linalg.norm(nominal_flanges(chain, q)[:, :3, 3] - centre, axis=1).max())
 
 
+def loaded_joints(chain: Chain, turned: Array) -> list[int]:
+    """Numbers of the joints that a weight strains: those that turn about no axis that is upright
+    in all poses, as the first of most arms and those of a SCARA do, and slides that are not level.
+
+    `turned` (3, 3): the base in a frame whose z is up.
+    """
+    limits = [np.array([getattr(j, end) for j in chain.joints]) for end in ("lower", "upper")]
+    low, high = finite_ranges(chain, *limits)
+    q = np.random.default_rng(0).uniform(low, high, (50, chain.n_joints))
+    found = []
+    for i, joint in enumerate(chain.joints):
+        before = replace(chain, joints=chain.joints[:i], flange_placement=joint.placement)
+        frames = nominal_flanges(before, q[:, :i]) if i else joint.placement[None]
+        upright = np.abs((turned @ frames[:, :3, :3] @ joint.axis)[:, 2])
+        strained = 1 - upright if joint.kind == "revolute" else upright
+        if strained.max() > 1e-6:
+            found.append(i + 1)
+    return found
+
+
 def _text(value: str) -> str:
     """A TOML string."""
     import tomli_w
@@ -287,8 +307,7 @@ def _rest(chain: Chain, mount: tuple[Array, str], sites: dict[str, Array]) -> st
         " ".join(f'"{effect.name}",' for effect in pair)
         for pair in ((BaseFrame, MarkerPosition), (JointOffset, LinkGeometry))
     )
-    # What hangs does not turn an upright first joint.
-    sprung = [f'"{JointCompliance.name}:joint{i}",' for i in range(2, n + 1)]
+    sprung = [f'"{JointCompliance.name}:joint{i}",' for i in loaded_joints(chain, turned)]
     springs = "\n    ".join(" ".join(sprung[k : k + 2]) for k in range(0, len(sprung), 2))
     weighed = bool(chain.masses)
     told = "masses of the robot's file bend the joints" if weighed else "the file has no masses"

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, replace
 from itertools import islice
@@ -9,7 +10,7 @@ from itertools import islice
 import numpy as np
 
 from elastocal.cell.work_cell import Cell
-from elastocal.errors import InsufficientDataError, require
+from elastocal.errors import InputError, InsufficientDataError, require
 from elastocal.model.chain import Chain, finite_ranges, joint_index, joint_limits
 from elastocal.planning.feasibility import Feasibility, PoseFeasibility
 from elastocal.planning.information import ALL_LOADS, LoadStates
@@ -54,10 +55,20 @@ def joint_space(cell: Cell, chain: Chain) -> JointSpace:
     """The robot's limits, narrowed by [limits], with the levels of [design.levels].
 
     A joint without a limit turns once, from −π to π, or slides 2 m (`finite_ranges`).  Raises
-    InputError as `joint_limits` does.
+    InputError as `joint_limits` does, and where the compliance of a joint is known at levels that
+    the plan does not keep to.
     """
     lower, upper = finite_ranges(chain, *joint_limits(cell, chain))
     wanted = cell.design.levels
+    for joint, levels in cell.model.compliance_levels.items() if not wanted else ():
+        i = joint_index(cell, chain, joint, "[model.compliance_levels]")
+        turns = chain.kinds[i] == "revolute"
+        stated = ", ".join(f"{math.degrees(v) if turns else v:.6g}" for v in levels)
+        raise InputError(
+            f"{cell.path or cell.name}: [model.compliance_levels] has {joint} at levels, and the "
+            f"plan must keep to them; add [design.levels] {joint}_{'deg' if turns else 'm'} = "
+            f"[{stated}]"
+        )
     if not wanted:
         return JointSpace(lower, upper)
     ((name, levels),) = wanted.items()

@@ -10,13 +10,15 @@ from scipy.spatial.transform import Rotation
 from elastocal.errors import InputError, option
 from elastocal.measurements import Measurements, visits, with_moves
 from elastocal.model.effects.compliances import JointCompliance
+from elastocal.model.effects.loads import STANDARD_GRAVITY
 from elastocal.model.manipulator import Model, check_equilibrium
 from elastocal.model.observations import available_noise, position_covariance
+from elastocal.model.plausible import extent
 from elastocal.text import did_you_mean, listed
 from elastocal.units import Array
 
 MOST_ROWS = 200  # of a plan, from which sizes are taken
-SHOWS = 1e-6  # of the largest slope of a parameter of the same unit
+SHOWS = 1e-6  # of the largest slope that a force can have, of a parameter of such a unit
 
 
 def values_from(model: Model, chosen: dict[str, float]) -> Array:
@@ -70,11 +72,22 @@ def _sizes_shown(model: Model, rows: Measurements) -> Array:
     B = seen.regressor(replace(some, position=np.zeros((len(some), 3))), None, columns).B
     moved = np.abs(B).max(axis=0)
     # A load on a joint's own axis leaves rounding, from which no size follows.
-    units = np.array([seen.parameters[c].unit for c in columns])
-    most = np.array([moved[units == unit].max() for unit in units])
-    size = np.divide(1e-3, moved, out=np.zeros(len(moved)), where=moved > SHOWS * most)
+    most = _largest_slopes(model, some)
+    least = SHOWS * np.array([most.get(seen.parameters[c].unit, 0.0) for c in columns])
+    size = np.divide(1e-3, moved, out=np.zeros(len(moved)), where=moved > least)
     found = dict(zip(names, size, strict=True))
     return np.array([found.get(name, 0.0) for name in model.names])
+
+
+def _largest_slopes(model: Model, rows: Measurements) -> dict[str, float]:
+    """Unit → by how many m a unit of a compliance moves a reading at most: a force F, weights with
+    it, on levers of the arm's length L, turns by F L and moves by F L²."""
+    masses = model.chain.masses if model.cell.model.link_gravity else ()
+    weight = STANDARD_GRAVITY * sum(body.mass for body in masses)
+    F = float(np.linalg.norm(rows.force, axis=1).max(initial=0.0)) + weight
+    tool = [*model.cell.tool.markers.values(), model.cell.tool.load_point]
+    L = extent(model.chain) + max(float(np.linalg.norm(point)) for point in tool)
+    return {"rad/(N*m)": F * L**2, "m/N": F, "rad/(N*m)^3": F**3 * L**4}
 
 
 def expand_plan(
@@ -108,7 +121,6 @@ def expand_plan(
     index, repeat, state, marker = (np.array(v) for v in zip(*parts, strict=True))
     rows = replace(
         plan.take(index),
-        row=np.arange(len(index)) + 2,
         repeat=plan.repeat[index] * repeats + repeat,
         marker=marker,
         marker_names=marker_names,

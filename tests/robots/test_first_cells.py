@@ -1,0 +1,83 @@
+"""First cells run as `init` says: arms whose joints a weight does not turn, rails, the demo."""
+
+import re
+import shutil
+
+import pytest
+from support.robot_files import told_by_init, urdf
+from typer.testing import CliRunner
+
+import elastocal as ec
+from elastocal.cli.app import app
+
+SCARA = (
+    "type,theta0_deg,d_mm,a_mm,alpha_deg,lower_mm,upper_mm\nrevolute,0,210,260,0,,\n"
+    "revolute,0,0,240,180,,\nprismatic,0,0,0,0,0,160\nrevolute,0,40,0,0,,\n"
+)
+PLAN = "configuration,q1_deg,q2_deg,q3_mm,q4_deg\n1,10,20,50,0\n2,-40,60,120,30\n3,80,-50,20,-60\n"
+
+
+def run(*words):
+    done = CliRunner().invoke(app, list(map(str, words)))
+    return done.exit_code, " ".join(done.stdout.split()), " ".join(done.stderr.split())
+
+
+def test_a_scara_simulates_at_any_seed_though_weights_turn_no_upright_joint(tmp_path):
+    (tmp_path / "dh.csv").write_text(SCARA)
+    (tmp_path / "plan.csv").write_text(PLAN)
+    assert told_by_init(tmp_path / "dh.csv")[0] == 0
+    cell = tmp_path / "cell.toml"
+    assert [str(e) for e in ec.read_cell(cell).model.effects][4:] == ["joint_compliance:joint3"]
+    every = cell.read_text().replace("joint_compliance:joint3", "joint_compliance")
+    (tmp_path / "every.toml").write_text(every)
+    for name in ("cell.toml", "every.toml"):
+        for seed in range(3):
+            code, _, err = run("simulate", tmp_path / name, tmp_path / "plan.csv", "-o",
+                               tmp_path / "data.csv", "--draw", 1 + seed, "--load", 0, 0, -5,
+                               "--seed", seed)  # fmt: skip
+            assert code == 0, err
+
+
+def test_a_pose_without_equilibrium_is_named_by_its_line_in_the_plan(tmp_path):
+    (tmp_path / "arm.urdf").write_text(urdf())
+    assert told_by_init(tmp_path / "arm.urdf")[0] == 0
+    header = "configuration," + ",".join(f"q{i}_deg" for i in range(1, 7))
+    (tmp_path / "plan.csv").write_text(f"{header}\n1,0,0,0,0,0,0\n2,0,30,0,0,0,0\n")
+    code, _, err = run("simulate", tmp_path / "cell.toml", tmp_path / "plan.csv", "-o",
+                       tmp_path / "data.csv", "--set", "joint2.compliance=0.1", "--load", 0, 0,
+                       -2000)  # fmt: skip
+    assert code == 2 and re.search(r"plan\.csv, line [23]:", err), err
+
+
+def test_the_load_is_guessed_from_the_arm_and_not_from_its_rail(tmp_path):
+    (tmp_path / "arm.urdf").write_text(urdf())
+    assert told_by_init(tmp_path / "arm.urdf")[0] == 0
+    alone = ec.read_cell(tmp_path / "cell.toml").design.loads
+    rail = (
+        '<link name="ground"/><joint name="rail" type="prismatic"><parent link="ground"/>'
+        '<child link="base_link"/><axis xyz="1 0 0"/>'
+        '<limit lower="-20" upper="20" effort="1" velocity="1"/></joint>'
+    )
+    (tmp_path / "rail.urdf").write_text(urdf(rail))
+    code, out, _ = told_by_init(tmp_path / "rail.urdf")
+    assert code == 0 and "reach 1." in out
+    assert ec.read_cell(tmp_path / "cell.toml").design.loads == pytest.approx(alone)
+    # The largest of this build: 2.6 kN at 2.9 m.
+    (tmp_path / "long.urdf").write_text(urdf(scale=6))
+    assert told_by_init(tmp_path / "long.urdf")[0] == 0
+    assert abs(ec.read_cell(tmp_path / "cell.toml").design.loads).max() <= 3000
+
+
+def test_levels_of_the_compliance_are_asked_for_in_words_that_can_be_pasted(tmp_path):
+    from elastocal import demo
+
+    folder = tmp_path / "demo"
+    shutil.copytree(demo.__path__[0], folder)
+    cell = folder / "cell.toml"
+    done = run("design", cell, "-o", tmp_path / "plan.csv", "--effort", "quick")
+    assert done[0] == 0, done[2]
+    text = cell.read_text()
+    head, levels = text.split("[design.levels]\n")
+    cell.write_text(head)
+    code, _, err = run("design", cell, "-o", tmp_path / "other.csv", "--effort", "quick")
+    assert code == 2 and f"add [design.levels] {levels.strip()[:-3]}]" in err
