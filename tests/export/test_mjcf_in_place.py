@@ -83,20 +83,56 @@ def test_meshes_need_not_be_there(tmp_path):
 
 
 NEW = {
-    "base spring": ("", "base_compliance", "spring of the base"),
-    "two joints on a body": ('<joint name="b4" axis="0 0 1"/>', "", "shares its body"),
-    "include": ('<include file="more.xml"/>', "", "do not all stand in the file"),
+    "two joints on a body": ('<joint name="b4" axis="0 0 1"/>', "shares its body"),
+    "include": ('<include file="more.xml"/>', "do not all stand in the file"),
 }
 
 
 @pytest.mark.parametrize("name", NEW)
 def test_what_the_file_cannot_take_goes_into_a_new_one(name, tmp_path):
-    more, effect, reason = NEW[name]
+    more, reason = NEW[name]
     (tmp_path / "more.xml").write_text(
         '<mujocoinclude><body name="more"><geom size="0.1"/></body></mujocoinclude>'
     )
     text = LOADABLE.replace('<joint name="a4"/>', f'<joint name="a4"/>{more}')
     text = text.split("<keyframe>")[0] + "</mujoco>"
-    _, done = corrected(tmp_path, "", [*SPRINGS, *([effect] if effect else [])], text=text)
+    _, done = corrected(tmp_path, "", SPRINGS, text=text)
     assert any("cannot take" in w and reason in w for w in done.warnings), done.warnings
     assert done.checked is not None and done.checked < MICROMETRE
+
+
+@pytest.mark.parametrize("base", ["", 'base = "foot"', 'base = "l1"'])
+def test_a_tilting_pedestal_stands_before_the_first_joint(base, tmp_path):
+    effects = [*SPRINGS, "base_compliance"]
+    _, done = corrected(tmp_path, base, effects, "link_gravity = true")
+    assert not [w for w in done.warnings if "cannot take" in w]
+    assert done.checked is not None and done.checked < MICROMETRE
+    names = [name for name in done.text.split('"') if name.startswith("elastocal_spring_base")]
+    assert names and 'name="drive2"' in done.text
+
+
+HINDERED = {
+    "position": ("</default>", '<position kp="500" ctrlrange="-6 6"/></default>'),
+    "general": ("</default>", '<general biastype="affine" biasprm="1 -5 -1" forcerange="-1 1"/>'
+                "</default>"),
+    "site": ("</default>", '<site type="box" size="1 1 1" euler="1 2 3"/></default>'),
+    "gravcomp": ('<body name="l2"', '<body gravcomp="1" name="l2"'),
+    "no gravity": ("<option ", '<option><flag gravity="disable"/></option><option '),
+    "no springs": ("<option ", '<option><flag passive="disable"/></option><option '),
+    "no actuation": ("<option ", '<option><flag actuation="disable"/></option><option '),
+    "gravity to the side": ("<option ", '<option gravity="0 -9.81 0" '),
+}  # fmt: skip
+
+
+@pytest.mark.parametrize("kind", HINDERED)
+def test_what_the_file_sets_otherwise_does_not_hinder_the_arm(kind, tmp_path):
+    old, new = HINDERED[kind]
+    if "<flag passive" in new and not hasattr(mujoco.mjtDisableBit, "mjDSBL_PASSIVE"):
+        new = new.replace("passive", "spring")
+    last = LOADABLE.rpartition(old) if old == "</default>" else LOADABLE.partition(old)
+    text = last[0] + new + last[2]
+    _, done = corrected(tmp_path, 'base = "foot"', SPRINGS, "link_gravity = true", text)
+    assert not [w for w in done.warnings if "cannot take" in w]
+    assert done.checked is not None and done.checked < MICROMETRE
+    told = {"gravcomp": "gravcomp of l2 is 0", "no gravity": "gravity is switched on"}
+    assert any(told.get(kind, "") in w for w in done.warnings)

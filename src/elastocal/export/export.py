@@ -29,7 +29,14 @@ from elastocal.export.exportable import (
 )
 from elastocal.export.mjcf_file import RIGID, MujocoRest, calibrated_mjcf
 from elastocal.export.mjcf_in_place import NotInPlace, corrected_mjcf, held_arm
-from elastocal.export.urdf_file import BASE, FLANGE, Frames, calibrated_urdf, new_urdf
+from elastocal.export.urdf_file import (
+    BASE,
+    FLANGE,
+    Frames,
+    calibrated_urdf,
+    new_urdf,
+    urdf_flanges,
+)
 from elastocal.files import atomic_write_text
 from elastocal.identification.covariance import t_quantile
 from elastocal.model.calibrated import CalibratedArm
@@ -258,7 +265,12 @@ def check_chain(
         atomic_write_text(path, text)
         back = read(path)
     q = random_table(kept.full.model, kept.conditions, 100, seed).q
-    apart = (nominal_flanges(back, q) - nominal_flanges(chain, q))[:, :3] @ CORNERS
+    return _apart(nominal_flanges(back, q), nominal_flanges(chain, q), largest)
+
+
+def _apart(found: Array, expected: Array, largest: float | None = LARGEST) -> float:
+    """Largest distance in m between flanges (n, 4, 4), of origin and points on the axes."""
+    apart = (found - expected)[:, :3] @ CORNERS
     worst = float(np.linalg.norm(apart, axis=1).max())
     return worst if largest is None else _accepted(worst, largest)
 
@@ -406,15 +418,26 @@ def _urdf(calibrated: CalibratedArm, wish: Wish, kept: Kept, pieces: ExportNumbe
     note = _note(calibrated, wish)
     if robot.urdf is not None:
         text = calibrated_urdf(robot, pieces, wish.frames, note)
-        base, flange = robot.base, robot.flange
-        if wish.frames.base and base is None:
-            base = check_urdf(robot.urdf).root
+        tree = check_urdf(robot.urdf)
+        base = tree.root if robot.base is None else robot.base
+        flange = tree.last_link(base) if robot.flange is None else robot.flange
     else:
         text = new_urdf(pieces, wish.frames, note)
         base, flange = BASE, FLANGE
     read = partial(read_urdf, base=base, flange=flange)
     chain = pieces.calibrated_chain()
-    return text, check_chain(text, ".urdf", read, chain, kept, wish.seed), "pinocchio", [], None
+    apart = check_chain(text, ".urdf", read, chain, kept, wish.seed)
+    q = random_table(kept.full.model, kept.conditions, 100, wish.seed).q
+    names = [joint.name for joint in chain.joints]
+    try:
+        found = urdf_flanges(text, names, base, flange, q)
+    except (ValueError, RuntimeError) as error:  # pinocchio's own
+        told = [
+            "pinocchio's own reader refuses this file, as it does without the corrections "
+            f"({str(error).strip().splitlines()[0]}); only elastocal's has read it back"
+        ]
+        return text, apart, "elastocal's reader of URDF", told, None
+    return text, max(apart, _apart(found, nominal_flanges(chain, q))), "pinocchio", [], None
 
 
 def _mjcf(calibrated: CalibratedArm, wish: Wish, kept: Kept, pieces: ExportNumbers) -> Written:

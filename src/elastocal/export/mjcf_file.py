@@ -11,7 +11,7 @@ import numpy as np
 
 from elastocal.errors import ElastocalError, InputError
 from elastocal.export.exportable import ExportNumbers, SpringValue, numbers, placed_body
-from elastocal.model.chain import LinkMass
+from elastocal.model.chain import Chain, Joint, LinkMass
 from elastocal.model.effects.compliances import transverse_axes
 from elastocal.model.effects.loads import STANDARD_GRAVITY
 from elastocal.model.mjcf import import_mujoco
@@ -46,11 +46,11 @@ def calibrated_mjcf(
 ) -> str:
     """MJCF text of the exported pieces.
 
-    Actuators joint1 … jointN (control: commanded rad or m) and load_x, load_y, load_z (control:
-    N at the load point, axes of the tracker).  Sites: flange, load_point, marker_NAME.  The world
-    is the robot's base, or with `base_frame` the tracker's frame.  `inertias`: (3, 3) kg m² per
-    link about its centre of mass in its joint's axes; `compensator`: values of
-    `gravity_compensator` by key, with `joint` its 0-based index.
+    Joints and their actuators (control: commanded rad or m) are called as in the robot's file;
+    actuators load_x, load_y, load_z (control: N at the load point, axes of the tracker).  Sites:
+    flange, load_point, marker_NAME.  The world is the robot's base, or with `base_frame` the
+    tracker's frame.  `inertias`: (3, 3) kg m² per link about its centre of mass in its joint's
+    axes; `compensator`: values of `gravity_compensator` by key, with `joint` its 0-based index.
     """
     chain = pieces.chain
     root = ET.Element("mujoco", model=chain.name)
@@ -71,6 +71,7 @@ def calibrated_mjcf(
     for spring in springs_at(pieces, "base"):
         _passive(body, spring, np.eye(4))
     before: list[SpringValue] = []
+    motors = motor_names(chain)
     for i, joint in enumerate(chain.joints):
         own, in_series = _drive(pieces, i)
         offset = pieces.offset_motion(i)
@@ -86,7 +87,7 @@ def calibrated_mjcf(
         body = _body(body, f"link{i + 1}", T @ offset, mass, inertias[i] if inertias else None)
         for spring in in_series:
             _passive(body, spring, offset)
-        _motor(body, actuators, pieces, i, own)
+        _motor(body, actuators, joint, motors[i], own)
         if compensator is not None and compensator["joint"] == i:
             _arm_end(body, joint.axis, offset, compensator)
         before = springs_at(pieces, f"link{i + 1}")
@@ -159,11 +160,20 @@ def armature(stiffness: float) -> str:
     return repr(max(ARMATURE, ARMATURE_PER_STIFFNESS * stiffness))
 
 
+def motor_names(chain: Chain) -> list[str]:
+    """The names of joints and their actuators: the file's, but for those that stand for others."""
+    taken = {f"load_{axis}" for axis in "xyz"}
+    numbers = [f"joint{i}" for i in range(1, chain.n_joints + 1)]
+    names = [joint.name for joint in chain.joints]
+    good = len(set(names)) == len(names) and not any(
+        name in taken or name.startswith("spring_") for name in names
+    )
+    return names if good else numbers
+
+
 def _motor(
-    body: ET.Element, actuators: ET.Element, pieces: ExportNumbers, i: int, compliance: float
+    body: ET.Element, actuators: ET.Element, joint: Joint, name: str, compliance: float
 ) -> None:
-    joint = pieces.chain.joints[i]
-    name = f"joint{i + 1}"
     kp = 1.0 / compliance if compliance > 0 else RIGID
     ET.SubElement(
         body, "joint", name=name, type=MOTIONS[joint.kind], axis=numbers(joint.axis),

@@ -13,6 +13,7 @@ actuators, sensors and ranges stay as they are; keyframes get a zero for it.
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
@@ -23,7 +24,7 @@ import numpy as np
 
 from elastocal.cell.arm_description import Robot
 from elastocal.errors import ElastocalError
-from elastocal.export.exportable import ExportNumbers, numbers, placed_body
+from elastocal.export.exportable import ExportNumbers, SpringValue, numbers, placed_body
 from elastocal.export.mjcf_file import RIGID, spring_joint, springs_at
 from elastocal.export.urdf_file import (
     PREFIX,
@@ -37,8 +38,17 @@ from elastocal.export.urdf_file import (
     tool_frames,
 )
 from elastocal.model.effects.loads import STANDARD_GRAVITY
-from elastocal.model.mjcf import SPRING, MjcfArm, mjcf_bytes, parsed, strip, transform
+from elastocal.model.mjcf import (
+    SPRING,
+    MjcfArm,
+    compiled,
+    mjcf_bytes,
+    parsed,
+    strip,
+    transform,
+)
 from elastocal.model.urdf import as_utf8
+from elastocal.text import listed
 from elastocal.units import Array
 
 ORIENTATIONS = ("quat", "axisangle", "xyaxes", "zaxis", "euler")
@@ -50,6 +60,10 @@ WITHOUT_DEFAULTS = {
     "limited": "false", "frictionloss": "0", "ref": "0", "springref": "0",
     "actuatorfrclimited": "false",
 }  # fmt: skip
+
+
+# Of an element of a spec, what makes it the one it is.
+KEPT = ("id", "name", "signature", "classname", "info")
 
 
 class NotInPlace(ElastocalError):
@@ -76,6 +90,7 @@ class MjcfText(XmlText):
     keys: list[tuple[int, dict[str, str]]] = field(default_factory=list)
     compiler: dict[str, str] = field(default_factory=dict)
     option: int | None = None
+    flags: int | None = None
     root: int = 0
 
 
@@ -109,6 +124,8 @@ def read_mjcf_text(path: Path) -> MjcfText:
             found.keys.append((at, attributes))
         elif tag == "option" and found.option is None:
             found.option = at
+        elif tag == "flag" and above == "option":
+            found.flags = at
 
     def end(tag: str) -> None:
         stack.pop()
@@ -135,9 +152,6 @@ def corrected_mjcf(
     _check_located(arm, text)
     told: list[str] = []
     sprung: dict[int, int] = {}  # joint → springs put before it
-    springs = list(pieces.springs)
-    if any(s.compliance > 0 and not s.site.startswith(("joint", "link")) for s in springs):
-        raise NotInPlace("a spring of the base has no joint of the file to stand before")
     if springs_at(pieces, f"link{pieces.chain.n_joints}"):
         raise NotInPlace("a spring behind the last joint has no joint to stand before")
     for i, j in enumerate(arm.joints):
@@ -145,8 +159,8 @@ def corrected_mjcf(
         sprung[j] = _add_springs(arm, text, pieces, i, j)
     if any(sprung.values()):
         _lengthen_keys(arm, text, sprung)
-        if pieces.masses:
-            _turn_gravity(arm, text, pieces)
+    if springs_of(pieces):
+        told += _let_act(arm, text, pieces)
     told += _flange_and_sites(arm, text, pieces, frames)
     _correct_masses(arm, text, pieces)
     text.insert(tag_end(text.data, text.root), f"\n  <!-- {comment(note)} -->")
@@ -212,10 +226,8 @@ def _placed(T: Array) -> dict[str, str]:
 
 def _add_springs(arm: MjcfArm, text: MjcfText, pieces: ExportNumbers, i: int, j: int) -> int:
     """Put the springs between link i and joint i before the joint; returns how many."""
-    springs = [
-        *(springs_at(pieces, f"link{i}") if i > 0 else ()),
-        *springs_at(pieces, f"joint{i + 1}"),
-    ]
+    before = springs_at(pieces, f"link{i}" if i else "base")
+    springs = [*before, *springs_at(pieces, f"joint{i + 1}")]
     body = int(arm.model.jnt_bodyid[j])
     first = int(arm.model.body_jntadr[body])
     tags = text.bodies[body].joints
@@ -233,7 +245,9 @@ def _add_springs(arm: MjcfArm, text: MjcfText, pieces: ExportNumbers, i: int, j:
         raise NotInPlace(f"{count} joints would stand on one body, and MuJoCo takes {MOST_JOINTS}")
     # The springs' frame in that of the moved body: before the joint turns by its offset.
     F = arm.before(j) @ np.linalg.inv(pieces.offset_motion(i))
-    joints = (element("joint", spring_joint(SPRING, s, F) | WITHOUT_DEFAULTS) for s in springs)
+    base = F if i else F @ np.linalg.inv(pieces.placement(0))  # the base's frame in that body's
+    placed = [(s, base if s.site == "base" else F) for s in springs]
+    joints = (element("joint", spring_joint(SPRING, *one) | WITHOUT_DEFAULTS) for one in placed)
     text.insert(tags[j - first], "".join(f"{joint} " for joint in joints))
     return len(springs) - len(old)
 
@@ -276,6 +290,43 @@ def _lengthen_keys(arm: MjcfArm, text: MjcfText, sprung: dict[int, int]) -> None
                 changed[name] = " ".join(values)
         if changed:
             text.set_attributes(start, changed)
+
+
+def springs_of(pieces: ExportNumbers) -> list[SpringValue]:
+    """The springs that yield."""
+    return [s for s in pieces.springs if s.compliance > 0]
+
+
+def _let_act(arm: MjcfArm, text: MjcfText, pieces: ExportNumbers) -> list[str]:
+    """Let springs yield and weights act in the file, as they do in the model; what that changes."""
+    told = _enabled(arm, text, ("passive", "spring"))
+    if not pieces.masses:
+        return told
+    _turn_gravity(arm, text, pieces)
+    told += _enabled(arm, text, ("gravity",))
+    moved = [b for b in range(1, arm.model.nbody) if arm.carrier(b) is not None]
+    held = [b for b in moved if arm.model.body_gravcomp[b]]
+    for b in held:
+        text.set_attributes(text.bodies[b].start, {"gravcomp": "0"})
+    if held:
+        names = listed((arm.model.body(b).name or f"body {b}" for b in held), 4)
+        told.append(f"gravcomp of {names} is 0 in this file, so that weights bend the springs")
+    return told
+
+
+def _enabled(arm: MjcfArm, text: MjcfText, names: Sequence[str]) -> list[str]:
+    """Switch on what <flag> of the file switches off, of these."""
+    import mujoco
+
+    told = []
+    for name in names:
+        bit = getattr(mujoco.mjtDisableBit, f"mjDSBL_{name.upper()}", 0)  # as versions differ
+        if arm.model.opt.disableflags & int(bit):
+            if text.flags is None:
+                raise NotInPlace(f'its <flag {name}="disable"/> stands in another file')
+            text.set_attributes(text.flags, {name: "enable"})
+            told.append(f"{name} is switched on in this file, so that the springs yield to weights")
+    return told
 
 
 def _turn_gravity(arm: MjcfArm, text: MjcfText, pieces: ExportNumbers) -> None:
@@ -344,7 +395,7 @@ def held_arm(text: str, robot: Robot, pieces: ExportNumbers) -> tuple[Any, Array
     spec, model = parsed(robot.mjcf, text), arm.model
     strip(spec, list(spec.geoms))
     spec.compiler.boundmass = spec.compiler.boundinertia = SMALLEST
-    spec.compile()  # gives numbers to bodies and joints
+    compiled(spec)  # gives numbers to bodies and joints
     for body in spec.bodies:
         body.explicitinertial = 1
         body.mass, body.inertia = model.body_mass[body.id], model.body_inertia[body.id]
@@ -364,27 +415,42 @@ def held_arm(text: str, robot: Robot, pieces: ExportNumbers) -> tuple[Any, Array
     for name, point in zip(
         [*names, f"{HELD}load"], [*pieces.points, pieces.load_point], strict=True
     ):
-        site = last.add_site(name=name, pos=(arm.flange_in_body @ [*point, 1.0])[:3])
-        site.material = ""  # which the file's defaults may give it
+        site = plain(last.add_site(name=name), "site")
+        site.pos = (arm.flange_in_body @ [*point, 1.0])[:3]
     spec.option.gravity = model.opt.gravity if pieces.masses else np.zeros(3)
     spec.compiler.inertiafromgeom = mujoco.mjtInertiaFromGeom.mjINERTIAFROMGEOM_FALSE
     T_base = arm.placed(arm.base)
     tracker = placed_body("tracker_axes", T_base @ np.linalg.inv(pieces.T_tracker_base))
     place, turn = (np.array(tracker[k].split(), dtype=float) for k in ("pos", "quat"))
-    site = spec.worldbody.add_site(name="tracker_axes", pos=place, quat=turn)
-    site.material = ""
+    site = plain(spec.worldbody.add_site(name="tracker_axes"), "site")
+    site.pos, site.quat = place, turn
     for name in driven.values():
-        spec.add_actuator(
-            name=name, target=f"{HELD}{name}", trntype=mujoco.mjtTrn.mjTRN_JOINT,
-            gainprm=_first(RIGID), biastype=mujoco.mjtBias.mjBIAS_AFFINE, biasprm=_first(0, -RIGID),
-        )  # fmt: skip
+        drive = plain(spec.add_actuator(name=name), "actuator")
+        drive.target, drive.trntype = f"{HELD}{name}", mujoco.mjtTrn.mjTRN_JOINT
+        drive.gainprm, drive.biasprm = _first(RIGID), _first(0, -RIGID)
+        drive.biastype = mujoco.mjtBias.mjBIAS_AFFINE
     for k, axis in enumerate("xyz"):
         gear = np.eye(6)[k] * pieces.load_scale
-        spec.add_actuator(
-            name=f"load_{axis}", target=f"{HELD}load", refsite="tracker_axes", gear=gear,
-            trntype=mujoco.mjtTrn.mjTRN_SITE, gainprm=_first(1.0),
-        )  # fmt: skip
-    return spec.compile(), T_base, names
+        load = plain(spec.add_actuator(name=f"load_{axis}"), "actuator")
+        load.target, load.refsite, load.gear = f"{HELD}load", "tracker_axes", gear
+        load.trntype, load.gainprm = mujoco.mjtTrn.mjTRN_SITE, _first(1.0)
+    spec.option.disableflags &= ~int(mujoco.mjtDisableBit.mjDSBL_ACTUATION)
+    return compiled(spec)[0], T_base, names
+
+
+def plain(made: Any, kind: str) -> Any:
+    """An element just added to a spec without what the defaults of the file give it."""
+    import mujoco
+
+    empty = mujoco.MjSpec()
+    bare = empty.worldbody.add_site() if kind == "site" else empty.add_actuator()
+    for name in dir(bare):
+        value = None if name.startswith("_") or name in KEPT else getattr(bare, name)
+        if isinstance(value, float | int | str | np.ndarray) or type(value).__name__[:3] == "mjt":
+            setattr(made, name, value)
+    if kind == "site":
+        made.alt.type = bare.alt.type
+    return made
 
 
 def _first(*values: float) -> Array:

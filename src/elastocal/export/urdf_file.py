@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 import re
-from collections.abc import Collection, Mapping
+from collections.abc import Collection, Mapping, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
 from xml.parsers import expat
@@ -34,6 +34,7 @@ class XmlText:
 
     data: bytes
     edits: list[tuple[int, int, bytes]] = field(default_factory=list, kw_only=True)
+    tags: dict[int, dict[str, str | None]] = field(default_factory=dict, kw_only=True)
 
     def insert(self, at: int, text: str) -> None:
         """Put text at an offset, behind what was put there before."""
@@ -42,7 +43,8 @@ class XmlText:
     def result(self) -> str:
         """The text with all edits made."""
         parts, last = [], 0
-        for start, end, new in sorted(self.edits, key=lambda edit: edit[:2]):
+        changed = [self._changed(start, given) for start, given in self.tags.items()]
+        for start, end, new in sorted([*self.edits, *changed], key=lambda edit: edit[:2]):
             parts += [self.data[last:start], new]
             last = end
         return b"".join([*parts, self.data[last:]]).decode("utf-8")
@@ -51,20 +53,23 @@ class XmlText:
         self, start: int, attributes: Mapping[str, str], without: Collection[str] = ()
     ) -> None:
         """Set attributes of the start tag at an offset, and take out those named `without`."""
+        self.tags.setdefault(start, {}).update(dict.fromkeys(without) | dict(attributes))
+
+    def _changed(self, start: int, given: Mapping[str, str | None]) -> tuple[int, int, bytes]:
         end = tag_end(self.data, start)
         tag = self.data[start:end].decode("utf-8")
-        for name in without:
-            tag = re.sub(rf"""\s{name}\s*=\s*("[^"]*"|'[^']*')""", "", tag)
-        for name, value in attributes.items():
-            given = re.compile(rf"""(\s{name}\s*=\s*)("[^"]*"|'[^']*')""")
-            new = quoteattr(value)
-            if (found := given.search(tag)) is not None:
-                tag = tag[: found.start(2)] + new + tag[found.end(2) :]
+        for name, value in given.items():
+            pattern = re.compile(rf"""(\s{name}\s*=\s*)("[^"]*"|'[^']*')""")
+            found = pattern.search(tag)
+            if value is None:
+                tag = pattern.sub("", tag)
+            elif found is not None:
+                tag = tag[: found.start(2)] + quoteattr(value) + tag[found.end(2) :]
             else:
                 body = tag[:-1].rstrip().removesuffix("/").rstrip()
                 closing = "/>" if tag.endswith("/>") else ">"
-                tag = f"{body} {name}={new}{closing}"
-        self.edits.append((start, end, tag.encode("utf-8")))
+                tag = f"{body} {name}={quoteattr(value)}{closing}"
+        return start, end, tag.encode("utf-8")
 
 
 @dataclass
@@ -347,3 +352,29 @@ def _joint(joint: Joint, parent: str, child: str) -> list[str]:
         limit = {name: repr(float(end)) for name, end in ends.items()}
         lines += [f"  {element('limit', limit | {'effort': '0', 'velocity': '0'})}"]
     return [*lines, "</joint>"]
+
+
+# The written file as others read it: pinocchio's own reader on all of the text, not elastocal's.
+
+
+def urdf_flanges(text: str, joints: Sequence[str], base: str, flange: str, q: Array) -> Array:
+    """T_base_flange (n, 4, 4) at q (n, joints) of a URDF in pinocchio; other joints are neutral.
+
+    Raises ValueError or RuntimeError where pinocchio refuses it.
+    """
+    import pinocchio as pin
+
+    model = pin.buildModelFromXML(text.encode("utf-8").decode("utf-8-sig"))
+    data, found = model.createData(), []
+    ends = [model.getFrameId(name, pin.FrameType.BODY) for name in (base, flange)]
+    numbers = [model.getJointId(name) for name in joints]
+    for row in q:
+        position = pin.neutral(model)
+        for number, value in zip(numbers, row, strict=True):
+            at = model.joints[number].idx_q
+            turns = model.joints[number].nq == 2  # without limits: (cos q, sin q)
+            position[at : at + 1 + turns] = [np.cos(value), np.sin(value)] if turns else [value]
+        pin.framesForwardKinematics(model, data, position)
+        start, end = (data.oMf[frame].homogeneous for frame in ends)
+        found.append(np.linalg.solve(start, end))
+    return np.array(found)
