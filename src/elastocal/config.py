@@ -123,7 +123,7 @@ def parsed_toml(path: str | Path, text: str) -> dict[str, Any]:
             lines = text.split("\n")
             end = f"(at line {len(lines)}, column {len(lines[-1]) + 1}, the end of the file)"
             reason = reason.replace("(at end of document)", end)
-        if long := re.search(r"\d{4300}", text):  # what Python refuses to read
+        if long := re.search(r"(?<!\d)\d{4300}", text):  # what Python refuses to read
             line = text.count("\n", 0, long.start()) + 1
             reason = f"a number of thousands of digits (at line {line})"
         raise InputError(f"{path}: not valid TOML: {reason}") from None

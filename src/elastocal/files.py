@@ -28,11 +28,12 @@ _TAKEN_AT_RANDOM = r"\.[0-9a-f]{8}"
 # Lists and tables within each other, and parts of a dotted key: a file that people write has six.
 # tomllib takes time and memory that grow with the square of them.
 DEEPEST = 32
+# A string without an end takes all that is left of its line or text: none is looked through twice.
 _TOKEN = re.compile(
-    r'"""(?:[^\\]|\\.)*?"""|'
-    r"'''.*?'''|"
-    r'"(?:[^"\\\n]|\\.)*"|'
-    r"'[^'\n]*'"
+    r'"""(?:[^"\\]|\\.|"(?!""))*+(?:"{3,5}+)?|'
+    r"'''(?:[^']|'(?!''))*+(?:'{3,5}+)?|"
+    r'"(?:[^"\\\n]|\\.)*+"?|'
+    r"'[^'\n]*+'?"
     r"|#[^\n]*|[\[{]|[\]}]|\.|[\w-]+|[ \t]+|[^\w\s]|\n+|\s",
     re.DOTALL,
 )

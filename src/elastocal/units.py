@@ -46,8 +46,8 @@ _ALIASES = {
     "degrees": "deg", "radian": "rad", "radians": "rad", "sec": "s", "seconds": "s", "n": "N",
     "nm": "Nm", "n·m": "Nm", "n m": "Nm", "°c": "C", "kn": "kN", "msec": "ms", "µs": "us",
 }  # fmt: skip
-_BRACKETED = re.compile(r"\s*[\[(]\s*([^\[\]()]+?)\s*[\])]\s*$")
-_TAILED = re.compile(r"[_ /,.]\s*([A-Za-zµμ°]+)\s*$")
+_BRACKETED = re.compile(r"[\[(]([^\[\]()]++)[\])]$")
+_TAILED = re.compile(r"(?:[_/,.]|(?<!\s) )\s*+([A-Za-zµμ°]+)$")
 
 
 def to_si(value: Value, unit: str) -> Value:
@@ -88,6 +88,7 @@ def known_unit(text: str) -> str | None:
 
 def split_unit(header: str) -> tuple[str, str | None]:
     """("X", "mm") for "X [mm]", "X (mm)", "X_mm" and "X, mm"; (header, None) without a unit."""
+    header = header.strip()
     for pattern in (_BRACKETED, _TAILED):
         found = pattern.search(header)
         unit = known_unit(found[1]) if found else None

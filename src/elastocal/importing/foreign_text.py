@@ -6,9 +6,12 @@ import codecs
 import csv
 import math
 import re
+import signal
+import threading
+import time
 from bisect import bisect_left
 from collections.abc import Callable, Iterable, Iterator, Sequence
-from contextlib import suppress
+from contextlib import contextmanager, suppress
 from dataclasses import dataclass, replace
 from datetime import UTC, datetime
 from pathlib import Path
@@ -121,10 +124,11 @@ def unit_in_comments(where: str, pattern: str | None, comments: Sequence[str]) -
             f"{where}: unit_comment = {quoted(pattern)} has no group (?P<unit>…); name the part "
             "that is the unit so"
         )
-    for comment in comments:
-        found = expression.search(comment)
-        if found and found["unit"] and known_unit(found["unit"]):
-            return found["unit"]
+    with bounded_search(where) as search:
+        for comment in comments:
+            found = search(expression, comment)
+            if found and found["unit"] and known_unit(found["unit"]):
+                return found["unit"]
     return None
 
 
@@ -136,6 +140,52 @@ def compiled(where: str, key: str, pattern: str) -> re.Pattern[str]:
         raise InputError(
             f"{where}: {key} = {quoted(pattern)} is no regular expression: {error}"
         ) from None
+
+
+PATIENCE = 2.0  # s of processor time; a letter and a text have theirs beside it
+PER_LETTER, PER_TEXT = 2e-6, 2e-5  # s, twenty times what such expressions take
+
+Search = Callable[[re.Pattern[str], str], re.Match[str] | None]
+
+
+@contextmanager
+def bounded_search(where: str) -> Iterator[Search]:
+    """In a `with` block, Pattern.search for expressions of a mapping, which may be exponential.
+
+    Raises InputError where it takes longer than PATIENCE and what any number of texts may take:
+    in the main thread, and where the system has a timer.
+    """
+    now: tuple[str, str] | None = None
+    letters = texts = 0
+    begun = time.thread_time()
+
+    def search(expression: re.Pattern[str], text: str) -> re.Match[str] | None:
+        nonlocal now, letters, texts
+        letters, texts = letters + len(text), texts + 1
+        now = expression.pattern, text
+        found = expression.search(text)
+        now = None
+        return found
+
+    def look(number: int, frame: object) -> None:
+        allowed = PATIENCE + PER_LETTER * letters + PER_TEXT * texts
+        if now is not None and time.thread_time() - begun > allowed:
+            raise InputError(
+                f"{where}: the expression {quoted(now[0])} takes too long to tell whether it is "
+                f"in {quoted(now[1])}; write it without repeats of repeats, as (a+)+"
+            )
+
+    main = threading.current_thread() is threading.main_thread()
+    if not (main and hasattr(signal, "SIGVTALRM")):
+        yield search
+        return
+    before = signal.signal(signal.SIGVTALRM, look)
+    signal.setitimer(signal.ITIMER_VIRTUAL, PATIENCE / 4, PATIENCE / 4)
+    try:
+        yield search
+    finally:
+        signal.setitimer(signal.ITIMER_VIRTUAL, 0.0)
+        signal.signal(signal.SIGVTALRM, before)
 
 
 @dataclass(frozen=True)
@@ -167,16 +217,17 @@ def table_rows(
     marks = tuple(settings.comments or ())
     skip = None if settings.ignore is None else compiled(text.source, "ignore", settings.ignore)
     content, comments, ignored = [], [], []
-    for number, line in enumerate(text.lines, start=1):
-        bare = line.strip()
-        if not bare:
-            continue
-        if marks and bare.startswith(marks):
-            comments.append((number, bare))
-        elif skip is not None and skip.search(line):
-            ignored.append((number, f"matches ignore: {bare[:SHOWN]}"))
-        else:
-            content.append((number, line))
+    with bounded_search(text.source) as search:
+        for number, line in enumerate(text.lines, start=1):
+            bare = line.strip()
+            if not bare:
+                continue
+            if marks and bare.startswith(marks):
+                comments.append((number, bare))
+            elif skip is not None and search(skip, line):
+                ignored.append((number, f"matches ignore: {bare[:SHOWN]}"))
+            else:
+                content.append((number, line))
     if not content:
         raise InputError(f"{text.source}: only comments and blank lines; export the points again")
     delimiter: str = settings.delimiter or "auto"
@@ -405,10 +456,12 @@ KRL_AXES = tuple(f"{letter}{i}" for letter in "AE" for i in range(1, 7))
 RAPID_AXES = (*(f"rax_{i}" for i in range(1, 7)), *(f"eax_{letter}" for letter in "abcdef"))
 NOT_CONNECTED = 9e9  # what RAPID writes for an external axis that does not exist
 _NUMBER = re.compile(r"[+-]?(?:\d+\.?\d*|\.\d+)(?:[eE][+-]?\d+)?")
-_KRL = re.compile(r"(?:([$A-Za-z_][\w$]*(?:\[\s*\d+\s*\])?)\s*=\s*)?\{([^{}]*)\}")
-_KRL_PART = re.compile(r"([A-Za-z_]\w*(?:\[\s*\])?)\s+(\S.*)")
-_RAPID_NAME = re.compile(r"(?:\b(\w+)\s+)?\b([A-Za-z]\w*)\s*(\{[\d,\s]*\})?\s*:=")
-_RAPID_PAIR = re.compile(r"\[\s*\[([^\[\]]*)\]\s*,\s*\[([^\[\]]*)\]\s*\]")
+# Names begin where a word does, and no part gives back what it took: a line that is no statement
+# is looked through once, not from each of its letters.
+_KRL = re.compile(r"(?:(?<![\w$])([$A-Za-z_][\w$]*+(?:\[\s*+\d++\s*+\])?)\s*+=\s*+)?\{([^{}]*+)\}")
+_KRL_PART = re.compile(r"([A-Za-z_]\w*+(?:\[\s*+\])?)\s++(\S.*)")
+_RAPID_NAME = re.compile(r"(?:\b(\w++)\s++)?\b([A-Za-z]\w*+)\s*+(\{[\d,\s]*+\})?\s*+:=")
+_RAPID_PAIR = re.compile(r"\[\s*+\[([^\[\]]*+)\]\s*+,\s*+\[([^\[\]]*+)\]\s*+\]")
 
 
 def krl_rows(text: Text) -> Rows:

@@ -438,7 +438,7 @@ def _key(name: str) -> str:
 
 def _number(name: str) -> str:
     """The number at the end of a name: 7 for P07, pose_7 and 7."""
-    found = re.search(r"\d+$", _key(name))
+    found = re.search(r"(?<!\d)\d+$", _key(name))
     return found[0] if found else _key(name)
 
 

@@ -15,6 +15,7 @@ from elastocal.importing.foreign_text import (
     NumberCells,
     Rows,
     Text,
+    bounded_search,
     compiled,
     krl_rows,
     rapid_rows,
@@ -390,22 +391,24 @@ def _labels_of_names(
             )
     found: dict[str, list[str]] = {stem: [] for stem in GROUPS}
     bad: list[int] = []
-    for i, name in enumerate(named):
-        match = next((m for e in expressions if (m := e.search(name))), None)
-        if match is None:
-            bad.append(i)
-        groups = match.groupdict() if match else {}
-        for stem in GROUPS:
-            found[stem].append((groups.get(stem) or "").strip())
+    with bounded_search(where) as search:
+        for i, name in enumerate(named):
+            match = next((m for e in expressions if (m := search(e, name))), None)
+            if match is None:
+                bad.append(i)
+            groups = match.groupdict() if match else {}
+            for stem in GROUPS:
+                found[stem].append((groups.get(stem) or "").strip())
     if bad and (names.unmatched != "ignore" or len(bad) == len(named)):
         raise InputError(
             f"{records.where(bad[0])}: the name {quoted(named[bad[0]])} matches no pattern "
             f"({listed(map(quoted, patterns), 3)}), as do not {len(bad) - 1} others; {ADVICE}, or "
             'unmatched = "ignore" to leave such points out'
         )
+    unnamed = set(bad)
     present = {stem: texts for stem, texts in found.items() if any(texts)}
     for stem, texts in present.items():
-        empty = [i for i, text in enumerate(texts) if not text and i not in set(bad)]
+        empty = [i for i, text in enumerate(texts) if not text and i not in unnamed]
         if empty and stem in ("configuration", "marker"):
             raise InputError(
                 f"{records.where(empty[0])}: the name {quoted(named[empty[0]])} says no {stem}, "

@@ -143,6 +143,28 @@ def test_the_certificate_of_l1_survives_an_observation_met_exactly():
     assert found.converged
 
 
+@pytest.mark.parametrize("kind", ["exact", "some wrong", "many wrong"])
+def test_l1_ends_at_the_minimum_of_noise_free_data(kind):
+    """100 problems of each kind: where most readings agree exactly, Σ |e_i| has a kink and no
+    second derivative, and a step of Newton's may lead away from it."""
+    for seed in range(100):
+        rng = np.random.default_rng([seed, len(kind)])
+        size, p = int(rng.choice([1, 2, 3, 6])), int(rng.integers(2, 10))
+        n = int(rng.integers(2 * p // size + p + 3, 60))
+        B = rng.normal(size=(n * size, p)) * 10.0 ** rng.uniform(-3, 3, p)
+        x = rng.normal(size=p) / np.linalg.norm(B, axis=0)
+        y = (B @ x).reshape(n, size)
+        share = {"exact": 0.0, "some wrong": 0.1, "many wrong": 0.25}[kind]
+        wrong = rng.choice(n, int(share * n), replace=False)
+        y[wrong] += rng.normal(size=(len(wrong), size)) * 10.0 ** rng.uniform(-3, 4)
+        found = m_estimate(B, y.ravel(), Absolute(size), size=size)
+        least = np.linalg.norm((y - (B @ x).reshape(n, size)), axis=1).sum()
+        total = np.linalg.norm(found.residual.reshape(n, size), axis=1).sum()
+        rounding = 30 * n * size * found.design.floor
+        assert total <= (least + rounding) * (1 + 1e-9), seed
+        assert found.converged, seed
+
+
 def test_noiseless_data_are_fitted_exactly():
     B, _ = regression(5)
     x = 1 / np.linalg.norm(B, axis=0)
