@@ -79,10 +79,12 @@ def effects(
     from rich.padding import Padding
 
     from elastocal import demo
-    from elastocal.model.choice import cell_of
+    from elastocal.model.choice import cell_of, load_chain
+    from elastocal.model.joint_names import names_told
     from elastocal.report.effect_names import effect_entries, effect_lines
 
-    entries = effect_entries(cell_of(cell or Path(demo.__file__).parent / "cell.toml", plugins))
+    known = cell_of(cell or Path(demo.__file__).parent / "cell.toml", plugins)
+    entries = effect_entries(known)
     if as_json:
         say(json_text({"schema": "elastocal/effects/1", "effects": entries}))
         return
@@ -94,6 +96,8 @@ def effects(
         screen.print(Padding(head, (0, 0, 0, 2)))
         screen.print(Padding(what, (0, 0, 0, 6)), style="dim")
     screen.print()
+    if told := names_told(load_chain(known)):
+        screen.print(f"Joints: {told}")
     for line in (
         "Each line: effect (* fitted or acting), places, typical size of its parameters.",
         'In the cell: [model] effects = ["joint_offset", "backlash:joint2"].',

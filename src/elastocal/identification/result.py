@@ -612,6 +612,7 @@ class Calibration(Result):
         return {
             "schema": SCHEMA,
             "robot": self.model.chain.name,
+            "joints": [joint.name for joint in self.model.chain.joints],
             "nominal_flange": nominal_flange_rows(self.model.chain),
             "cell": self.model.cell.name,
             "data": self.observations.table.source,

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import re
 from collections.abc import Callable, Mapping
 from dataclasses import replace
 from typing import TypeVar
@@ -9,7 +10,7 @@ from typing import TypeVar
 from elastocal.cell.work_cell import Cell
 from elastocal.errors import InputError
 from elastocal.model.chain import Chain
-from elastocal.text import did_you_mean, listed
+from elastocal.text import did_you_mean, listed, printable
 
 Value = TypeVar("Value")
 
@@ -27,8 +28,14 @@ def clashing(chain: Chain) -> list[str]:
 
 
 def names_told(chain: Chain) -> str:
-    """ "joint1 = shoulder_pan, joint2 = …" of the joints that the file calls otherwise, or ""."""
-    return listed(f"{number} = {name}" for number, name in file_names(chain).items())
+    """ "joint1 = shoulder_pan, joint2 = …", or "" where the file's names end with these numbers."""
+    names = file_names(chain)
+    ends = [re.search(r"[0-9]+$", name) for name in names.values()]
+    if all(
+        end and number == f"joint{int(end[0])}" for number, end in zip(names, ends, strict=True)
+    ):
+        return ""
+    return listed(f"{number} = {printable(name)}" for number, name in names.items())
 
 
 def numbered(cell: Cell, chain: Chain) -> Cell:

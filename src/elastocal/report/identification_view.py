@@ -30,6 +30,7 @@ from elastocal.identification.result import (
     deviation,
 )
 from elastocal.identification.scrutiny import stage_of
+from elastocal.model.joint_names import names_told
 from elastocal.report.formatting import (
     ShownTable,
     capital,
@@ -316,6 +317,12 @@ def error_line(result: Calibration) -> str:
     return text
 
 
+def joint_lines(result: Calibration) -> list[tuple[str, str]]:
+    """The names that the robot's file has for joint1 … jointN, where they say something else."""
+    told = names_told(result.model.chain)
+    return [("Joints", told)] if told else []
+
+
 def readings(result: Calibration) -> str:
     observed = result.observations
     poses = observed.n_configurations
@@ -371,6 +378,7 @@ def summary_lines(
 ) -> list[tuple[str, str]]:
     """Label and sentence of what else there is to say; `details`: of method, noise, intervals."""
     lines = [("Readings", readings(result)), ("Identified", what_was_identified(result))]
+    lines += joint_lines(result)
     if details:
         lines += [
             ("Method", method_and_weights(result)),
@@ -533,6 +541,7 @@ def certificate_contents(result: Calibration, budget: ErrorBudget | None) -> dic
         )
     facts = [
         ("Robot", printable(result.model.chain.name)),
+        *joint_lines(result),
         ("Instrument, standard deviations", noise),
         ("Readings", readings(result)),
         ("Loads", "; ".join(_newtons(f) for f in measured_loads(result.observations))),
@@ -724,6 +733,7 @@ def identification_contents(
     sentences = [text for label, text in noise_lines(result) if label != "Residuals"]
     verdict = [
         ("Identified", what_was_identified(result)),
+        *joint_lines(result),
         *prediction_lines(result),
         ("Noise", does_noise_explain_it(result)),
         *held_lines(result),
