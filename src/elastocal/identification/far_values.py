@@ -10,14 +10,23 @@ from __future__ import annotations
 import math
 from collections.abc import Iterator
 
+import numpy as np
+
 from elastocal.identification.result import Calibration, Finding
+from elastocal.identification.start import nominal_problem, register
 from elastocal.model.arm import Parameter
 from elastocal.model.effects import effect_of
 from elastocal.model.effects.compliances import JointCompliance
 from elastocal.model.effects.gears import JointOffset
 from elastocal.model.effects.placements import LinkGeometry
+from elastocal.model.effects.tracker_distortion import TrackerDistortion
 from elastocal.text import listed
 
+SCALED = 0.005  # no arm's lengths are this far off together, relatively: the readings' are
+LARGEST = 0.5  # beyond it the points hardly move, as of a tip that touches one, or do so otherwise
+NEARLY = 0.1  # share of the square that a scale leaves of what it explains
+SOME = 400  # readings that are enough for it
+FEWEST_POSES = 8
 FAR = 10.0  # typical deviations from nominal, beyond which an arm that works has no parameter
 # What the nominal arm states and a first cell fits.  Base and markers are guesses, and any other
 # effect is in the cell because someone named it: their sizes are findings, no evidence.
@@ -53,6 +62,14 @@ def far_values(result: Calibration, explained: bool, lacking: str) -> Iterator[F
             },
             f"The zero of {listed(told)}: remaster it, or command the arm by this calibration.",
         )  # fmt: skip
+    scale = scale_of(result)
+    if scale is not None:
+        yield Finding(
+            "scale", "care", {"readings_over_file": scale},
+            f"Look for what scales the readings: the size stated of a tag or scale bar, or a unit. "
+            f"Multiplied by {1 / scale:.4g} they have the lengths of the robot's file.",
+        )  # fmt: skip
+        return
     others.sort(key=lambda found: -sizes[found[0].name])
     if others:
         told = [f"{p.name} by {_size(off, p.unit)} ({_size(half[p.name], p.unit)})"
@@ -73,11 +90,55 @@ def far_values(result: Calibration, explained: bool, lacking: str) -> Iterator[F
         )  # fmt: skip
 
 
+def scale_of(result: Calibration) -> float | None:
+    """By what factor all lengths that were read exceed those of the nominal arm; None where no such
+    scale shows.
+
+    With base and markers placed, x_i = R (G_i m + t_i) + s of the nominal arm leaves r_i, and
+
+        r_i = σ (p_i − s) + ω × (p_i − s) + δs + R G_i δm
+
+    is linear.  A scale that takes nine tenths of the square away, and is larger than any arm's
+    lengths err together, is one of the readings.
+    """
+    table = result.observations.table
+    own = any(p.effect == TrackerDistortion.name for p in result.model.parameters)
+    if table.position is None or own or len(np.unique(table.q, axis=0)) < FEWEST_POSES:
+        return None
+    extent = float(np.linalg.norm(np.ptp(table.position, axis=0)))
+    if not SCALED * extent / 10 < result.nominal_rms < math.inf:
+        return None
+    table = table.take(result.observations.lead[:: max(len(result.observations.lead) // SOME, 1)])
+    problem = nominal_problem(result.model, table)
+    found = register(problem)
+    n, turn = len(table), problem.flange_rotation
+    G = np.zeros((n, 3, len(found.markers), 3))
+    G[np.arange(n), :, table.marker] = found.rotation @ turn
+    body = np.einsum("nij,nj->ni", turn, found.markers[table.marker]) + problem.flange_position
+    arm = body @ found.rotation.T
+    left = np.asarray(table.position) - found.translation - arm
+    about = np.cross(np.eye(3), arm[:, None, :])
+    columns = np.concatenate(
+        [arm[:, :, None], about.transpose(0, 2, 1), np.tile(np.eye(3), (n, 1, 1)),
+         G.reshape(n, 3, -1)], axis=2,
+    ).reshape(3 * n, -1)  # fmt: skip
+    target = left.ravel()
+    squares, coefficients = [], np.zeros(1)
+    for B in (columns[:, 1:], columns):
+        coefficients = np.linalg.lstsq(B, target, rcond=1e-9)[0]
+        squares.append(float(((target - B @ coefficients) ** 2).sum()))
+    scale = 1 + float(coefficients[0])
+    shown = squares[1] < NEARLY * squares[0] and SCALED < abs(scale - 1) < LARGEST
+    return scale if shown else None
+
+
 def only_placed(result: Calibration) -> bool:
     """Whether nothing but base, markers and their like was fitted, as in a calibration of a tool
     or of hand and eye: then the nominal arm is placed by the same fit and no rival to it."""
-    effects = {p.name: p.effect for p in result.model.parameters}
-    return all(effect_of(effects[name]).registered for name in result.determined)
+    return all(
+        effect_of(p.effect).registered or e.note.startswith("fixed")
+        for p, e in zip(result.model.parameters, result.estimates, strict=True)
+    )
 
 
 def _half_widths(result: Calibration) -> dict[str, float]:

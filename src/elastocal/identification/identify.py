@@ -108,7 +108,10 @@ def _fitted(
         faulty, sound = find_faulty(every, refit)
     if 0 < faulty.mean() < 1:
         sound = refit(~faulty, final=True)
-    refuse_nonsense(model, sound.problem.observations, sound.fit.x, sound.fit.residual, table)
+    refuse_nonsense(
+        model, sound.problem.observations, sound.fit.x, sound.fit.residual, table,
+        subset(observed, faulty) if faulty.any() and sound is not every else None,
+    )  # fmt: skip
     if smooth:
         return every, sound, with_smooth(every, sound, faulty, free, options, progress)
     found = run_method(every, sound, faulty, refit, options, progress)

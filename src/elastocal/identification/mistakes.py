@@ -9,7 +9,6 @@ from __future__ import annotations
 
 from collections.abc import Iterator
 from dataclasses import dataclass, replace
-from functools import partial
 
 import numpy as np
 from scipy import special
@@ -17,7 +16,10 @@ from scipy import special
 from elastocal.cell.arm_description import ModelSpec, Tool
 from elastocal.cell.work_cell import Cell
 from elastocal.errors import InsufficientDataError
-from elastocal.identification.start import RegistrationProblem, any_matrix, register
+from elastocal.identification.far_values import SCALED
+from elastocal.identification.joint_maps import LinearFits, joint_maps, linear_fits
+from elastocal.identification.shifted_rows import Slipped, slipped
+from elastocal.identification.start import nominal_problem, register
 from elastocal.measurements import Measurements
 from elastocal.model.chain import Chain
 from elastocal.model.effects.base import index
@@ -29,14 +31,20 @@ from elastocal.model.effects.compliances import (
 )
 from elastocal.model.manipulator import Model
 from elastocal.model.observations import Observations
+from elastocal.model.rigid import nominal_flanges
+from elastocal.text import listed
 from elastocal.units import Array, BoolArray
 
 FEWEST_POSES = 8  # base (6) and a marker (3) from fewer fit anything
 POOR = 0.03  # m: no nominal arm is this wrong, wrong signs and units are far more
+MOST = 80  # % of the readings, which what they fit to is told of
 BETTER = 5.0  # a correction must reduce the error by this factor to be named
 FARTHEST = 1e5  # m; beyond it no fit is worth its overflows, and plausibility speaks
 SAMPLE = 80
-CONFIRMED = 2  # corrections that are tried in earnest
+CONFIRMED = 6  # corrections that are tried in earnest
+UNITS = ((1e-3, "mm read as m"), (1e3, "m read as mm"), (25.4, "inches read as mm"),
+         (1 / 25.4, "mm read as inches"))  # fmt: skip
+OF_A_UNIT = 0.25  # a unit in the place of another is told from the arm's length to a quarter
 
 
 @dataclass(frozen=True)
@@ -69,107 +77,141 @@ def nominal_fit(
     if len(rows) > SAMPLE:
         rows = np.sort(np.random.default_rng(0).choice(rows, SAMPLE, replace=False))
     used = table.take(rows)
-    error = _error(rigid, used)
-    if error <= POOR:
+    error, far = _errors(rigid, used)
+    if far <= POOR:
         return NominalFit(error, "")
-    # A registration takes time; the linear one, exact where the base is a rotation, chooses.
-    guesses = sorted(
-        _corrections(used, spherical), key=lambda guess: _linear_error(rigid, guess[1])
-    )
-    tried = [(_error(rigid, changed), words) for words, changed in guesses[:CONFIRMED]]
-    best, words = min(tried, key=lambda t: t[0])
-    said = f"the readings fit the nominal arm only to {error * 1e3:.3g} mm"
-    if best < error / BETTER:
-        told = f"{said}; {words} they would fit to {best * 1e3:.3g} mm"
-        return NominalFit(error, told, best <= POOR)
+    said = f"the readings fit the nominal arm only to {far * 1e3:.3g} mm"
+    tried = [(_errors(rigid, changed)[1], words)
+             for words, changed in _corrections(chain, used, spherical)]  # fmt: skip
+    # The simplest that mends it, else what does most.
+    best, words = next((t for t in tried if t[0] <= POOR), min(tried, default=(far, "")))
+    if best < far / BETTER:
+        return NominalFit(error, f"{said}; {words} they would fit to {best * 1e3:.3g} mm",
+                          best <= POOR)  # fmt: skip
+    found = slipped(chain, table, lambda some: register(nominal_problem(rigid, some)))
+    if found is not None:
+        return NominalFit(error, f"{said}; {_slipped_words(table, found)}", True)
     return NominalFit(
         error,
-        f"{said}, and neither another unit, sign or coupling of a joint nor a shift by one pose "
-        "mends that: check the robot of the cell, offsets of joints, and which joint values belong "
-        "to which point",
+        f"{said}, and neither another unit or scale, signs, couplings, offsets or an exchange of "
+        "columns, one or two of them, nor rows that have shifted mend that: check the robot of the "
+        "cell, offsets of joints, and which joint values belong to which point",
     )
 
 
-def _problem_of(model: Model, table: Measurements) -> RegistrationProblem:
-    T = model.rigid.flange_poses(table)
-    return RegistrationProblem(
-        T[:, :3, :3], T[:, :3, 3], np.asarray(table.position), table.marker,
-        np.zeros((len(table.marker_names), 3)), np.ones(len(table.marker_names), dtype=bool),
-        True, np.eye(3), np.zeros(3),
-    )  # fmt: skip
-
-
-def _error(model: Model, table: Measurements) -> float:
-    return register(_problem_of(model, table)).error
-
-
-def _linear_error(model: Model, table: Measurements) -> float:
-    """Rms of the registration by any matrix in the place of a rotation.
-
-    Infinite where that is none at all: it mirrors, or its scale is off by a quarter.
-    """
-    matrix, left = any_matrix(_problem_of(model, table))
-    return left if 0.75**3 < np.linalg.det(matrix) < 1.25**3 else np.inf
+def _errors(model: Model, table: Measurements) -> tuple[float, float]:
+    """Distance (m) from the nominal arm that half of the readings keep to, and that MOST do."""
+    problem = nominal_problem(model, table)
+    found = register(problem)
+    body = np.einsum("nij,nj->ni", problem.flange_rotation, found.markers[table.marker])
+    place = (body + problem.flange_position) @ found.rotation.T + found.translation
+    distance = np.linalg.norm(problem.points - place, axis=1)
+    return found.error, float(np.percentile(distance, MOST))
 
 
 def _placed(model: Model, table: Measurements) -> bool:
     """Whether positions, if there are any, agree with the nominal arm at first sight."""
     if table.position is None or np.abs(table.position).max() > FARTHEST:
         return True
-    return _linear_error(model, table.take(np.arange(min(len(table), SAMPLE)))) <= POOR
+    some = table.take(np.arange(min(len(table), SAMPLE)))
+    flange = model.rigid.flange_poses(some)
+    found = linear_fits(flange[None], np.asarray(some.position), some.marker)
+    rigid = found.determinant[0] > 0 and abs(found.scale[0] - 1) < OF_A_UNIT
+    return bool(rigid and found.left[0] <= POOR)
 
 
-def _corrections(table: Measurements, spherical: bool) -> Iterator[tuple[str, Measurements]]:
-    """Mistakes that are often made, each undone."""
-    other = partial(replace, table)
+def _corrections(
+    chain: Chain, table: Measurements, spherical: bool
+) -> Iterator[tuple[str, Measurements]]:
+    """Mistakes that are often made, each undone; first those of which few have to be undone."""
     position = np.asarray(table.position)
-    for factor, words in (
-        (1e-3, "mm read as m"), (1e3, "m read as mm"), (25.4, "inches read as mm"),
-        (1 / 25.4, "mm read as inches"),
-    ):  # fmt: skip
-        yield f"if positions were {words}", other(position=position * factor)
-    # The base is fitted: every swap of two axes and every turned sign is the same mirror image.
-    mirrored = position[:, [1, 0, 2]]
+    maps = joint_maps(chain)
+    q = np.stack([joint_map.of(table.q) for joint_map in maps])
+    flange = nominal_flanges(chain, q.reshape(-1, q.shape[2])).reshape(*q.shape[:2], 4, 4)
+    found: list[tuple[float, float, str, Measurements]] = []
+    points = [(position, "")]
     if spherical:
-        yield (
-            "with azimuths counted the other way (azimuth = … in [[source]])",
-            other(position=mirrored),
-        )
         level = np.hypot(*position[:, :2].T)
         turned = np.where(level > 0, position[:, 2] / np.where(level > 0, level, 1.0), 0.0)
-        yield (
-            "with zenith angles read as elevations or the other way round",
-            other(position=np.column_stack([position[:, :2] * turned[:, None], level])),
+        swapped = np.column_stack([position[:, :2] * turned[:, None], level])
+        points += [(swapped, "with zenith angles read as elevations or the other way round")]
+    for place, of_angles in points:
+        fits = linear_fits(flange, place, table.marker)
+        for k in np.flatnonzero(np.isfinite(fits.left)):
+            words = [*maps[k].words, *([of_angles] if of_angles else [])]
+            undone, more = _of_positions(place, fits, int(k), spherical)
+            # To mirror the frame beside turned signs is no simpler than to turn others.
+            count = maps[k].mistakes + (len(words) > 0 and len(more) > 0) + len(more)
+            words += more
+            if words:
+                changed = replace(table, q=q[k], position=undone)
+                found.append((float(fits.left[k]), count, " and ".join(words), changed))
+    found.sort(key=lambda one: one[0])
+    likely = [one for one in found if one[0] <= POOR] or found[:2]
+    likely.sort(key=lambda one: one[1])  # of equally many mistakes the better fit stays first
+    yield from ((words, changed) for _, _, words, changed in likely[:CONFIRMED])
+
+
+def _of_positions(
+    position: Array, fits: LinearFits, k: int, spherical: bool
+) -> tuple[Array, list[str]]:
+    """The positions as the k-th fit asks for: in which unit, in a right-handed frame."""
+    words, scale = [], float(fits.scale[k])
+    # The base is fitted: every swap of two axes and every turned sign is the same mirror image.
+    if fits.determinant[k] < 0:
+        position = position[:, [1, 0, 2]]
+        words.append(
+            "with azimuths counted the other way (azimuth = … in [[source]])"
+            if spherical
+            else "with two columns of the positions swapped, or the sign of one turned round (now "
+            "they make a left-handed frame),"
         )
-    yield (
-        "with two columns of the positions swapped, or the sign of one turned round (now they "
-        "make a left-handed frame),",
-        other(position=mirrored),
-    )
-    yield "if joints were degrees read as radians", other(q=np.radians(table.q))
-    yield "if joints were radians read as degrees", other(q=np.degrees(table.q))
-    n = table.q.shape[1]
-    for j in range(n):
-        q = table.q.copy()
-        q[:, j] *= -1
-        yield f"with the sign of joint {j + 1} turned round", other(q=q)
-    for factor in (1.0, -1.0):
-        if n >= 3:
-            q = table.q.copy()
-            q[:, 2] += factor * q[:, 1]
-            yield f"with coupling {{ joint = 3, of = 2, factor = {factor:g} }}", other(q=q)
-    for j in range(n):
-        for degrees in (90, -90, 180):
-            q = table.q.copy()
-            q[:, j] += np.radians(degrees)
-            yield f"with offset_deg {degrees} at joint {j + 1}", other(q=q)
-    visit = np.cumsum(np.r_[0, np.any(np.diff(table.q, axis=0) != 0, axis=1)])
-    poses = np.array([table.q[visit == v][0] for v in range(visit.max() + 1)])
-    for shift, words in ((1, "earlier"), (-1, "later")):
-        yield (
-            f"with the joint values of one pose {words}",
-            other(q=np.roll(poses, shift, axis=0)[visit]),
-        )
+    unit = next((u for u in UNITS if abs(scale / u[0] - 1) < OF_A_UNIT), None)
+    if unit is not None:
+        return position * unit[0], [f"if positions were {unit[1]}", *words]
+    if abs(scale - 1) > SCALED:
+        words.append(f"with all positions {scale:.4g} times as far apart ({SCALE})")
+        return position * scale, words
+    return position, words
+
+
+SCALE = "one scale of all lengths, as of a tag, a scale bar or a unit of another size"
+
+
+def _slipped_words(table: Measurements, found: Slipped) -> str:
+    """ "configurations 1 to 20 fit the nominal arm to 1 mm; from 21 on the points belong to joint
+    values one later, from 27 two later" """
+    by_rows = None in found.visits
+    labels = [
+        f"line {table.row[i]}" if by_rows else table.configuration_labels[table.configuration[i]]
+        for i in found.starts
+    ]
+    fits: list[str] = []
+    moved: list[str] = []
+    for k, (label, rows, visits) in enumerate(zip(labels, found.rows, found.visits, strict=True)):
+        shift = rows if by_rows or visits is None else visits
+        size = {1: "one", 2: "two"}.get(abs(shift), str(abs(shift)))
+        size += "" if not by_rows else " row" if abs(shift) == 1 else " rows"
+        side = "later" if shift > 0 else "earlier"
+        if shift:
+            on = "" if moved else " on the points belong to joint values"
+            moved.append(f"from {label}{on} {size} {side}")
+        elif k + 1 < len(labels):
+            last = found.starts[k + 1] - 1
+            end = table.configuration_labels[table.configuration[last]]
+            fits.append(f"{label} to {table.row[last] if by_rows else end}")
+        else:
+            fits.append(f"{label} and later")
+    if len(labels) == 1:
+        poses = "" if by_rows else " poses" if abs(shift) > 1 else " pose"
+        return f"with the joint values of {size}{poses} {side} they would fit to {_mm(found)}"
+    what = "" if by_rows else "configurations "
+    own = f"{what}{listed(fits)} fit the nominal arm to {_mm(found)}; " if fits else ""
+    return f"{own}{listed(moved)}"
+
+
+def _mm(found: Slipped) -> str:
+    return f"{found.error * 1e3:.3g} mm"
 
 
 # Readings that are copies of others.
@@ -264,33 +306,37 @@ CELL, WEIGHTS = "the cell's nominal compliances", "the weights of the links"
 
 # What no arm can be.
 
-# Median of what a fitted model leaves, over the length of the arm.  Arms as they come from a
-# factory err by a thousandth of it, those of hobbyists by a hundredth; wrong columns by a third.
-POOREST = 0.05
+# What a fitted model may leave, over the length of the arm: the median and rms of the readings,
+# and all but one in five, those set apart among them.  Arms as they come from a factory err by a
+# thousandth of it, those of hobbyists by a hundredth; wrong columns by a third.
+POOREST, FEW = 0.05, 0.2
 LARGEST = 10.0  # a fitted length, over that of the arm and the distance of the readings
 
 
 def refuse_nonsense(
-    model: Model, observed: Observations, x: Array, residual: Array, every: Measurements
-) -> None:
+    model: Model, observed: Observations, x: Array, residual: Array, every: Measurements,
+    apart: Observations | None = None,
+) -> None:  # fmt: skip
     """Raise InsufficientDataError, with the likely cause, where a fit is none of this robot.
 
-    `x` (parameters,) and `residual` (N·size,) of the fit in SI units; `every` reading is looked at
-    for the cause, since few may be left in `observed`.  Deflections are small whatever the mistake:
-    there positions that a mistake undone makes fit are enough.
+    `x` (parameters,) and `residual` (N·size,) of the fit in SI units, `apart` what it left out;
+    `every` reading is looked at for the cause, since few may be left in `observed`.  Deflections
+    are small whatever the mistake: there positions that a mistake undone makes fit are enough.
     """
-    parts = residual.reshape(-1, observed.size)[:, :3]
-    error = float(np.median(np.linalg.norm(parts, axis=1))) if len(parts) else 0.0
-    frames = [*(joint.placement for joint in model.chain.joints), model.chain.flange_placement]
+    off = np.linalg.norm(residual.reshape(-1, observed.size)[:, :3], axis=1)
+    if apart is not None:
+        left = apart.value - model.predict(apart.table, x, apart)
+        apart_off = np.linalg.norm(left.reshape(-1, apart.size)[:, :3], axis=1)
+    with np.errstate(over="ignore"):
+        error, rms = (float(np.median(off)), float(np.sqrt((off**2).mean()))) if len(off) else NONE
     table = observed.table
-    sliding = np.array([joint.kind == "prismatic" for joint in model.chain.joints], dtype=bool)
-    tool = max((np.linalg.norm(m) for m in model.cell.tool.markers.values()), default=0.0)
-    length = float(sum(np.linalg.norm(frame[:3, 3]) for frame in frames) + tool)
-    length += float(np.ptp(table.q[:, sliding], axis=0).sum()) if len(table) else 0.0
-    far = 0.0 if table.position is None else float(np.abs(table.position).max())
+    length = _length(model, table)
+    reach = 0.0 if table.position is None else float(np.abs(table.position).max())
     lengths = np.array([p.unit == "m" for p in model.parameters], dtype=bool)
-    beyond = np.flatnonzero(lengths & ~(np.abs(x) <= LARGEST * (length + far)))
-    sane = np.isfinite(error) and error <= POOREST * length and not len(beyond)
+    beyond = np.flatnonzero(lengths & ~(np.abs(x) <= LARGEST * (length + reach)))
+    every_off = off if apart is None else np.append(off, apart_off)
+    share = float((every_off > POOREST * length).mean()) if len(every_off) else 0.0
+    sane = max(error, rms) <= POOREST * length and share <= FEW and not len(beyond)
     if sane and (observed.kind != "deflection" or _placed(model, every)):
         return
     fit = nominal_fit(model.chain, model.cell, every)
@@ -300,14 +346,47 @@ def refuse_nonsense(
                 f"{table.source}: no deflections of this arm: {fit.warning}"
             )
         return
-    what = f"after the fit the readings are {error:.3g} m (median) from the model"
+    what = f"after the fit the readings are {error:.3g} m (median) and {rms:.3g} m (rms)"
+    if share > FEW:
+        what += f", {share:.0%} of them more than {POOREST * length:.2g} m,"
+    what += " from the model"
     if len(beyond):
         k = int(beyond[0])
         what += f", whose {model.parameters[k].name} is {x[k]:.3g} m"
-    cause = fit.warning if fit is not None and fit.warning else (
+    raise InsufficientDataError(
+        f"{table.source}: {what}, which no arm of {length:.3g} m could be; {_cause(every, fit)}"
+    )
+
+
+NONE = (0.0, 0.0)
+
+
+def _length(model: Model, table: Measurements) -> float:
+    """Of the arm stretched out, with its tool and the ways of its slides, in m."""
+    frames = [*(joint.placement for joint in model.chain.joints), model.chain.flange_placement]
+    sliding = np.array([joint.kind == "prismatic" for joint in model.chain.joints], dtype=bool)
+    tool = max((np.linalg.norm(m) for m in model.cell.tool.markers.values()), default=0.0)
+    length = float(sum(np.linalg.norm(frame[:3, 3]) for frame in frames) + tool)
+    return length + (float(np.ptp(table.q[:, sliding], axis=0).sum()) if len(table) else 0.0)
+
+
+def _cause(every: Measurements, fit: NominalFit | None) -> str:
+    if (same := _constant(every)) and (fit is None or not fit.mended):
+        return f"{same} in all {len(every)} rows: was it recorded?"
+    if fit is not None and fit.warning:
+        return fit.warning
+    return (
         "check the units and the order of the columns, which joint values belong to which point, "
         "and whether the cell describes this robot"
-    )  # fmt: skip
-    raise InsufficientDataError(
-        f"{table.source}: {what}, which no arm of {length:.3g} m could be; {cause}"
     )
+
+
+def _constant(table: Measurements) -> str:
+    """The columns of a position that hold one value while the arm moved, and those of joints."""
+    columns = [] if table.position is None else list(zip("xyz", table.position.T, strict=True))
+    columns += [(f"q{j + 1}", values) for j, values in enumerate(table.q.T)]
+    same = [name for name, values in columns if (values == values[0]).all()]
+    if not same:
+        return ""
+    one = len(same) == 1
+    return f"{'column' if one else 'columns'} {listed(same)} {'holds' if one else 'hold'} one value"

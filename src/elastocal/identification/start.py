@@ -227,6 +227,16 @@ class RegistrationProblem:
     base_translation: Array
 
 
+def nominal_problem(model: Model, table: Measurements) -> RegistrationProblem:
+    """Base and all markers free, of the nominal arm and positions."""
+    T = model.rigid.flange_poses(table)
+    return RegistrationProblem(
+        T[:, :3, :3], T[:, :3, 3], np.asarray(table.position), table.marker,
+        np.zeros((len(table.marker_names), 3)), np.ones(len(table.marker_names), dtype=bool),
+        True, np.eye(3), np.zeros(3),
+    )  # fmt: skip
+
+
 def register(problem: RegistrationProblem, seed: int = 0) -> Registration:
     """Robust alternating registration from several starts; the best by median distance wins.
 

@@ -119,6 +119,10 @@ DOUBTS: dict[str, Callable[[Finding], str]] = {
     "fit_flatters": lambda f: (
         f"unseen poses are worse than fitted ones ({_length(f, 'residual_rms_um')})"
     ),
+    "scale": lambda f: (
+        f"all lengths read are {significant(f.number('readings_over_file'), 4)} times those of the "
+        "robot's file: one scale, as of a tag or a unit of another size"
+    ),
     "unheard_of": lambda f: _unheard_of(f),
     "little_gain": lambda f: "that is hardly better than the nominal arm",
     "few_configurations": lambda f: (

@@ -1,0 +1,167 @@
+"""A table that fits no arm ends with exit code 1 and the mistakes that undone mend it."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+from identification.test_far_values import CASES, cell, poses
+from typer.testing import CliRunner
+
+import elastocal as ec
+from elastocal.cli.app import app
+
+COUPLED = "coupling { joint = 3, of = 2, factor = -1 }"
+
+
+@pytest.mark.parametrize(
+    ("case", "told"),
+    [
+        ("fanuc_convention", f"with the sign of joint 3 turned round and with {COUPLED}"),
+        ("sweeps_raw", f"with the sign of joints 3, 4, 5, 6 turned round and with {COUPLED}"),
+        (
+            "rows_closed_up",
+            "configurations 1 to 20 fit the nominal arm to 1.44 mm; from 21 on the points belong "
+            "to joint values one later, from 27 two later",
+        ),
+    ],
+)
+def test_the_mistake_is_named_and_the_exit_code_is_1(case, told):
+    folder = CASES / case
+    ran = CliRunner().invoke(
+        app, ["identify", *(str(folder / f) for f in ("cell.toml", "train.csv"))]
+    )
+    assert ran.exit_code == 1 and told in ran.stderr
+
+
+def test_the_same_sweeps_in_the_models_own_angles_are_no_nonsense():
+    folder = CASES / "sweeps_raw"
+    fit = ec.identify(folder / "cell.toml", folder / "right.csv")
+    assert fit.residual_rms < 1e-4
+
+
+@pytest.fixture(scope="module")
+def made(tmp_path_factory) -> tuple[Path, ec.Measurements]:
+    path = cell(tmp_path_factory.mktemp("made"))
+    return path, ec.simulate(path, poses(40, 3), draw=0.3, seed=4)
+
+
+def refusal(path: Path, table: ec.Measurements) -> str:
+    with pytest.raises(ec.InsufficientDataError) as refused:
+        ec.identify(path, table)
+    return str(refused.value)
+
+
+def joints(change: Callable[[np.ndarray], None]) -> Callable[[ec.Measurements], ec.Measurements]:
+    def changed(table: ec.Measurements) -> ec.Measurements:
+        q = table.q.copy()
+        change(q.T)
+        return replace(table, q=q)
+
+    return changed
+
+
+def two_signs(q: np.ndarray) -> None:
+    q[[1, 4]] *= -1
+
+
+def exchanged(q: np.ndarray) -> None:
+    q[[1, 2]] = q[[2, 1]]
+
+
+def exchanged_and_turned(q: np.ndarray) -> None:
+    q[[3, 4]] = q[[4, 3]]
+    q[1] *= -1
+
+
+def offset_and_turned(q: np.ndarray) -> None:
+    q[1] -= np.pi / 2
+    q[2] *= -1
+
+
+def wrist(q: np.ndarray) -> None:
+    q[4] = q[3] - q[4]
+
+
+@pytest.mark.parametrize(
+    ("change", "told"),
+    [
+        (two_signs, "with the sign of joints 2, 5 turned round they"),
+        (exchanged, "with the columns of joints 2 and 3 exchanged they"),
+        (exchanged_and_turned, "joints 4 and 5 exchanged and with the sign of joint 2 turned"),
+        (offset_and_turned, "with offset_deg 90 at joint 2 and with the sign of joint 3 turned"),
+        (wrist, "sign of joint 5 turned round and with coupling { joint = 5, of = 4, factor = 1 }"),
+    ],
+)
+def test_pairs_of_mistakes(made, change, told):
+    path, table = made
+    assert told in refusal(path, joints(change)(table))
+
+
+def test_a_left_handed_frame_beside_a_sign(made):
+    path, table = made
+    wrong = joints(lambda q: q[2].__imul__(-1))(table)
+    told = refusal(path, replace(wrong, position=table.position[:, [1, 0, 2]]))
+    assert "sign of joint 3" in told and "left-handed" in told
+
+
+@pytest.mark.parametrize(
+    ("missing", "told"),
+    [
+        ([10], "configurations 1 to 10 fit the nominal arm to {} mm; from 11 on the points belong "
+               "to joint values one later"),
+        ([6, 20, 21], "from 7 on the points belong to joint values one later, from 20 3 later"),
+    ],
+)  # fmt: skip
+def test_readings_that_closed_up(made, missing, told):
+    path, table = made
+    left = np.delete(table.position.reshape(40, 3, 3), missing, axis=0).reshape(-1, 3)
+    found = refusal(path, replace(table.take(np.arange(len(left))), position=left))
+    for part in told.split("{}"):
+        assert part in found
+
+
+def test_one_row_that_closed_up_lets_markers_change_places(made):
+    path, table = made
+    left = np.delete(table.position, 31, axis=0)
+    found = refusal(path, replace(table.take(np.arange(len(left))), position=left))
+    assert "line 33" in found and "one row later" in found
+
+
+def test_rows_in_no_order_have_no_explanation(made):
+    path, table = made
+    order = np.random.default_rng(0).permutation(40)
+    mixed = table.position.reshape(40, 3, 3)[order].reshape(-1, 3)
+    assert "nor rows that have shifted mend that" in refusal(path, replace(table, position=mixed))
+
+
+@pytest.mark.parametrize("axis", [0, 1, 2])
+def test_a_column_that_holds_one_value_is_named(made, axis):
+    path, table = made
+    stuck = table.position.copy()
+    stuck[:, axis] = stuck[0, axis]
+    found = refusal(path, replace(table, position=stuck))
+    assert f"column {'xyz'[axis]} holds one value in all 120 rows" in found
+
+
+@pytest.mark.parametrize("effects", [("base_frame", "marker_position"), None])
+@pytest.mark.parametrize("factor", [0.97, 1.03])
+def test_one_scale_of_all_lengths_is_named_and_not_trusted(tmp_path, effects, factor):
+    """Whether the model's lengths follow it, or leave it in the residual."""
+    path = cell(tmp_path, **({} if effects is None else {"effects": effects}))
+    table = ec.simulate(path, poses(40, 3), draw=0.1, seed=4)
+    assert ec.identify(path, table).finding("scale") is None
+    fit = ec.identify(path, replace(table, position=factor * table.position))
+    assert fit.finding("scale").numbers["readings_over_file"] == pytest.approx(factor, abs=2e-3)
+    assert (
+        not fit.verdict.trusted and "one scale, as of a tag" in fit.to_json()["verdict"]["sentence"]
+    )
+
+
+def test_a_longer_link_is_no_scale(tmp_path):
+    path = cell(tmp_path)
+    fit = ec.identify(path, ec.simulate(path, poses(40, 3), values={"link2.dx": 0.02}, seed=4))
+    assert fit.finding("scale") is None and fit.finding("far_from_nominal") is not None
