@@ -119,7 +119,7 @@ def test_no_unit_is_guessed(tmp_path, readings):
 def test_presets_are_mappings_with_a_comment_on_what_they_read(name):
     assert preset_text(name).startswith("# ")
     (source,) = read_mapping(None, (name,)).sources
-    assert source.columns and source.role in ("points", "joints")
+    assert source.columns and source.role in ("points", "joints", "both")
 
 
 def test_unknown_preset_names_the_nearest():

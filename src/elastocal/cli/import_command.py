@@ -18,7 +18,7 @@ from elastocal.errors import InputError, require
 from elastocal.screen import say
 from elastocal.text import json_text
 
-PRESET_NAMES = "spatialanalyzer, polyworks, leica, faro, spherical, kuka, abb, ros"
+PRESET_NAMES = "spatialanalyzer, polyworks, leica, faro, spherical, wide, kuka, abb, ros"
 
 
 @command("import", short_help="How do tracker exports and joint logs become the table?")

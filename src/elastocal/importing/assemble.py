@@ -8,9 +8,10 @@ from __future__ import annotations
 
 import re
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from fnmatch import fnmatchcase
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -93,6 +94,70 @@ def forces_of(
     return np.array([known[name] for name in named])
 
 
+# A load in a file's name: log_2600N, payload_2p5kg, load2.6kN.  A number that follows a letter is a
+# load only after a word for one; a small n counts something.
+_SIZE = re.compile(
+    r"(?:(?<![A-Za-z0-9.,])|(?<=load)|(?<=mass)|(?<=weight))(\d+(?:[.,p]\d+)?)[ _-]?"
+    r"([kK][gG]|kN|N)(?![A-Za-z0-9])"
+)
+_WORD = re.compile(r"(?<!un)(?<!no)(?<!without)[ _-]?(?:pay)?load(?:ed)?(?![a-z])|weight", re.I)
+_NEWTONS = {"kg": GRAVITY, "kn": 1e3, "n": 1.0}
+
+
+def load_of_name(path: str) -> tuple[str, float] | None:
+    """The load that a file's name states, as it is written and in N; None where none is."""
+    found = _SIZE.search(Path(path).stem)
+    if found is None:
+        return None
+    size = float(re.sub("[,p]", ".", found[1]))
+    return f"{size:g} {found[2]}", size * _NEWTONS[found[2].lower()]
+
+
+def with_loads_of_names(
+    records: Mapping[str, list[Records]], loads: Mapping[str, Any] | None
+) -> tuple[dict[str, list[Records]], dict[str, Any] | None, list[str]]:
+    """The records with the loads that their files are named for, where nothing else states any,
+    those loads by name, and what to tell.  They hang straight down.
+
+    Raises InputError where joint logs are named for several loads and the points for none.
+    """
+    every = [r for role in records.values() for r in role]
+    stated = any(r.load is not None or "load" in r.labels for r in every)
+    if loads or stated or any("force_x" in r.numbers for r in every):
+        return dict(records), dict(loads or {}) or None, []
+    named = {id(r): load_of_name(r.source) for r in every}
+    known = {found[0]: found[1] for found in named.values() if found}
+    if not known:
+        told = [r.source for r in every if _WORD.search(Path(r.source).stem)]
+        return dict(records), None, [
+            f"{listed(told)}: named for a load of no stated size, and its rows are written "
+            "unloaded; state it by load in [[source]] and [loads]"
+        ] if told else []  # fmt: skip
+    made = {}
+    for role, files in records.items():
+        texts = [(named[id(r)] or ("unloaded", 0.0))[0] for r in files]
+        made[role] = [replace(r, load=t) for r, t in zip(files, texts, strict=True)]
+    if all(named[id(r)] is None for r in records["points"]):
+        # The points are those of the joint logs.
+        only = {r.load for r in made["joints"]}
+        if len(only) > 1:
+            raise InputError(
+                f"{records['joints'][0].source}: joint logs are named for the loads "
+                f"{listed(sorted(map(str, only)))} and the points for none; give load in the "
+                "[[source]] of each file of points"
+            )
+        made["points"] = [replace(r, load=next(iter(only))) for r in records["points"]]
+    elif all(named[id(r)] is None for r in records["joints"]):
+        made["joints"] = list(records["joints"])  # one log for every load
+    told = [
+        f"{r.source}: taken as measured under {found[0]} by its name, hanging straight down "
+        f"(0, 0, {0.0 - found[1]:.6g}) N; load in [[source]] states another"
+        for r in every
+        if (found := named[id(r)])
+    ]
+    return made, {name: np.array([0.0, 0.0, -size]) for name, size in known.items()}, told
+
+
 OWN_DEFAULT = {"sigma_cartesian": "um", "sigma_polar": "um"}
 WHOLE = re.compile(r"-?[0-9]{1,15}")
 LABELS = ("configuration", "repeat", "marker")
@@ -115,13 +180,14 @@ class Assembled:
 
 
 def assemble(where: str, points: PooledRecords, log: PooledRecords | None, joined: Joined | None,
-             mapping: MappingTable) -> Assembled:  # fmt: skip
+             mapping: MappingTable, loads: Mapping[str, Any] | None) -> Assembled:  # fmt: skip
     """One row per point that has joint values, in the points' order.
 
     Configurations are those of the names, else of the joint log, else joint values that agree
     within same_pose_deg.  Repeats are numbered in order where the file does not number them.
-    Times are counted from the first reading.  Raises InputError where there are no joint values
-    or positions, for repeats that are no whole numbers or occur twice, and for unknown loads.
+    Times are counted from the first reading; `loads` are forces by name.  Raises InputError where
+    there are no joint values or positions, for repeats that are no whole numbers or occur twice,
+    and for unknown loads.
     """
     settings = mapping.join or JoinTable()
     rows = np.arange(len(points)) if joined is None else np.flatnonzero(joined.row >= 0)
@@ -135,7 +201,7 @@ def assemble(where: str, points: PooledRecords, log: PooledRecords | None, joine
     kinds = tuple(
         "revolute" if "angle" in quantities(units[stem]) else "prismatic" for stem in stems
     )
-    forces = forces_of(where, points, mapping.loads)
+    forces = forces_of(where, points, loads)
     if forces is not None:
         for k, axis in enumerate("xyz"):
             numbers[f"force_{axis}"], units[f"force_{axis}"] = forces[rows, k], "N"
@@ -476,6 +542,7 @@ def import_files(
             f"{where}: no file with points among {listed(map(str, files), 5)}; add the tracker's "
             'export, or set role = "points" in its [[source]]'
         )
+    records, loads, told = with_loads_of_names(records, table.loads)
     points = pooled(records["points"])
     log = pooled(records["joints"]) if records["joints"] else None
     if log is not None and not log.q.shape[1]:
@@ -483,12 +550,12 @@ def import_files(
             f"{log.files[0]}: no joint values; map q1_deg … (or q#_deg) in its [source.columns]"
         )
     joined = None if log is None else join(where, points, log, table.join)
-    made = assemble(where, points, log, joined, table)
+    made = assemble(where, points, log, joined, table, loads)
     text = table_text(made)
     measured = validated(text, name, made, cell)
     fit, refused = against_cell(cell, measured, made, spherical) if cell is not None else (None, "")
     remarks = [] if joined is None else [r for r in joined.remarks if r.startswith("WARNING: ")]
-    warnings = [*(r.removeprefix("WARNING: ") for r in remarks), *made.warnings]
+    warnings = [*told, *(r.removeprefix("WARNING: ") for r in remarks), *made.warnings]
     warnings += plausibility(made, measured, None if cell is None else cell.model.observe)
     if fit is not None and fit.warning:
         warnings.append(fit.warning)

@@ -36,7 +36,17 @@ from elastocal.units import FACTORS, known_unit, quantities, split_unit
 Place = Annotated[int, Field(ge=1)] | Text
 Where = Place | Annotated[list[Place], Field(min_length=1)]
 Texts = Annotated[list[Text], Field(min_length=1)]
-PRESETS = ("spatialanalyzer", "polyworks", "leica", "faro", "spherical", "kuka", "abb", "ros")
+PRESETS = (
+    "spatialanalyzer",
+    "polyworks",
+    "leica",
+    "faro",
+    "spherical",
+    "wide",
+    "kuka",
+    "abb",
+    "ros",
+)
 COLUMNS = (
     'places in the file by column of the measurement table, as in x_mm = "X [mm]", q1_deg = 5, '
     'q#_deg = "A#" or name = "Point"'
@@ -294,6 +304,15 @@ class ColumnKey:
         return list(self.at) if isinstance(self.at, list) else [self.at]
 
     @property
+    def of_each_marker(self) -> bool:
+        """Whether one row has such a column for each marker."""
+        return isinstance(self.at, str) and EACH in self.at
+
+    def of_marker(self, name: str) -> ColumnKey:
+        """The column of the marker that the file calls `name`."""
+        return replace(self, at=str(self.at).replace(EACH, name)) if self.of_each_marker else self
+
+    @property
     def quantities(self) -> tuple[str, ...]:
         """What its numbers measure."""
         return _QUANTITIES[re.sub(r"^(q|torque_|approach_)\d+$", r"\1#", self.stem)]
@@ -345,6 +364,7 @@ def column_key(where: str, key: str) -> ColumnKey:
 
 
 MOST_JOINTS = 64
+EACH = "*"  # in a place of [source.columns]: the name of a marker
 
 
 @dataclass(frozen=True)
@@ -389,6 +409,11 @@ def wanted(
                     f"{where}: {target.key} takes one column; only texts such as name are joined "
                     "from several"
                 )
+            if EACH in str(target.at) and (target.is_text or not target.of_each_marker):
+                raise InputError(
+                    f"{where}: {target.key} = {quoted(str(target.at))}: {EACH} stands for the "
+                    'markers of a row in places of numbers, as in x_mm = "*_x"'
+                )
             result.append(target)
     return tuple(result)
 
@@ -402,11 +427,51 @@ def lacking(asked: Sequence[ColumnKey], cells: Sequence[str]) -> list[str]:
     """The required columns asked for by name that a line does not name, as the mapping has them."""
     absent = []
     for target in (c for c in asked if c.required):
+        if target.of_each_marker:
+            if not _marker_names(target, cells):
+                absent.append(f"{target.key} = {quoted(str(target.at))}")
+            continue
         first = target.numbered(1) if target.is_template else target
         for part in target.parts:
             if isinstance(part, str) and not _find(_named(part, first), cells):
                 absent.append(f"{target.key} = {quoted(part)}")
     return absent
+
+
+def markers_of_row(source: str, asked: Sequence[ColumnKey], header: Sequence[str]) -> list[str]:
+    """The markers that have a column each in one row, as the file calls them; none where the
+    mapping has no * in a place.
+
+    Raises InputError where a marker lacks one of its columns.
+    """
+    each = [target for target in asked if target.of_each_marker and target.required]
+    found = {target.key: _marker_names(target, header) for target in each}
+    names = list(dict.fromkeys(name for names in found.values() for name in names))
+    for name in names:
+        absent = [t for t in each if name not in found[t.key]]
+        if absent:
+            raise InputError(
+                f"{source}: {quoted(name)} has no column for {listed(t.key for t in absent)}, as "
+                f"{quoted(str(absent[0].of_marker(name).at))}; write the places so that {EACH} "
+                "stands for the markers' names alone"
+            )
+    return names
+
+
+def _marker_names(target: ColumnKey, header: Sequence[str]) -> list[str]:
+    """What * stands for in the columns of a header; columns in a unit of something else are not
+    meant."""
+    found = []
+    for cell in header:
+        unit = split_unit(cell)[1]
+        if unit is not None and not set(quantities(unit)) & set(target.quantities):
+            continue
+        for part in str(target.at).split("|"):
+            before, _, after = (re.escape(piece) for piece in part.strip().partition(EACH))
+            for text in (" ".join(cell.split()), " ".join(split_unit(cell)[0].split())):
+                if match := re.fullmatch(f"{before}(.+?){after}", text, re.IGNORECASE):
+                    found.append(match[1])
+    return list(dict.fromkeys(found))
 
 
 def no_header(

@@ -33,6 +33,7 @@ from elastocal.importing.mapping_file import (
     UnitsTable,
     by_name,
     lacking,
+    markers_of_row,
     no_header,
     read_mapping,
     resolve,
@@ -102,6 +103,20 @@ def read_records(where: str, path: Path, source: SourceTable, units: UnitsTable)
     if len(table.rows) > MAX_ROWS:
         raise InputError(f"{text.source}: more than {MAX_ROWS:,} rows; thin the export out")
     hint = unit_in_comments(where, settings.unit_comment, table.comments)
+    markers = markers_of_row(text.source, asked, table.header)
+    parts = [
+        _read(text, table, [c.of_marker(name) for c in asked], source, units, hint)
+        for name in markers or [""]
+    ]
+    return _side_by_side(parts, markers) if markers else parts[0]
+
+
+def _read(
+    text: Text, table: Rows, asked: Sequence[ColumnKey], source: SourceTable, units: UnitsTable,
+    hint: str | None,
+) -> Records:  # fmt: skip
+    """The rows of a table with these columns."""
+    settings = source.text or TextSourceKeys()
     width = len(table.rows[0][1])
     columns = resolve(text.source, asked, table.header, width, units, hint)
     numeric = [c for c in columns if not c.target.is_text]
@@ -139,6 +154,38 @@ def read_records(where: str, path: Path, source: SourceTable, units: UnitsTable)
         ignored=tuple(sorted([*table.ignored, *reader.ignored])),
     )
     return reader.records(understood, source)
+
+
+def _side_by_side(parts: Sequence[Records], markers: Sequence[str]) -> Records:
+    """One row for each marker of a row; of a marker without a value that one alone is left out."""
+    first = parts[0]
+    line = np.concatenate([part.line for part in parts])
+    order = np.argsort(line, kind="stable")
+
+    def in_order(texts: Sequence[Sequence[str]]) -> list[str]:
+        every = [text for part in texts for text in part]
+        return [every[k] for k in order]
+
+    texts = {stem: in_order([part.texts[stem] for part in parts]) for stem in first.texts}
+    texts["marker"] = in_order([[m] * len(p) for m, p in zip(markers, parts, strict=True)])
+    seen = [part.understood for part in parts]
+    unused = set.intersection(*(set(understood.unused) for understood in seen))
+    understood = replace(
+        seen[0],
+        columns=tuple(dict.fromkeys(column for u in seen for column in u.columns)),
+        unused=tuple(name for name in seen[0].unused if name in unused),
+        rows=len(line),
+        ignored=tuple(sorted({each for u in seen for each in u.ignored})),
+    )
+    times = [part.time for part in parts if part.time is not None]
+    return replace(
+        first,
+        line=line[order],
+        numbers={s: np.concatenate([p.numbers[s] for p in parts])[order] for s in first.numbers},
+        texts=texts,
+        time=np.concatenate(times)[order] if times else None,
+        understood=understood,
+    )
 
 
 def likely_presets(path: Path) -> list[str]:

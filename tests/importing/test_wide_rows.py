@@ -1,0 +1,128 @@
+"""Several markers in one row, and loads that only the files' names state."""
+
+from __future__ import annotations
+
+import csv
+from pathlib import Path
+
+import numpy as np
+import pytest
+from support.tracker_exports import MARKERS, kr270_readings
+from typer.testing import CliRunner, Result
+
+from elastocal.cli.app import app
+
+
+def run(*words: object) -> Result:
+    return CliRunner().invoke(app, ["import", *map(str, words)], env={"COLUMNS": "300"})
+
+
+def wide(path: Path, degrees: np.ndarray, points: np.ndarray, head: str, unit: str = "_mm") -> Path:
+    """One row per pose; `head` has {marker} and {axis} of a column's name."""
+    joints = [f"q{j + 1}_deg" for j in range(degrees.shape[1])]
+    names = [head.format(marker=m, axis=a) + unit for m in MARKERS for a in "xyz"]
+    rows = [
+        [*map(repr, q), *map(repr, p.ravel().tolist())]
+        for q, p in zip(degrees.tolist(), points, strict=True)
+    ]
+    path.write_text("\n".join(",".join(row) for row in [[*joints, *names], *rows]) + "\n")
+    return path
+
+
+def table(path: Path) -> list[dict[str, str]]:
+    with path.open() as file:
+        return list(csv.DictReader(file))
+
+
+@pytest.mark.parametrize("head", ["{marker}_{axis}", "{marker}.{axis}", "{marker} {axis}"])
+def test_every_marker_of_a_row_becomes_a_reading(tmp_path, head):
+    _, degrees, points = kr270_readings(tmp_path)
+    file = wide(tmp_path / "log.csv", degrees, points, head)
+    out = tmp_path / "data.csv"
+    done = run(file, "--preset", "wide", "--cell", tmp_path / "cell.toml", "-o", out)
+    assert done.exit_code == 0 and "Warning" not in done.output, done.output
+    rows = table(out)
+    assert [row["marker"] for row in rows[:4]] == ["M1", "M2", "M1", "M2"]
+    assert len(rows) == points[..., 0].size
+    found = np.array([[float(row[f"{a}_mm"]) for a in "xyz"] for row in rows])
+    assert np.array_equal(found, points.reshape(-1, 3))
+    assert len({row["configuration"] for row in rows}) == len(degrees)
+
+
+def test_a_marker_that_was_hidden_is_left_out_alone_and_listed(tmp_path):
+    _, degrees, points = kr270_readings(tmp_path)
+    file = wide(tmp_path / "log.csv", degrees, points, "{marker}_{axis}")
+    lines = file.read_text().splitlines()
+    cells = lines[3].split(",")
+    lines[3] = ",".join([*cells[:-2], "", cells[-1]])
+    file.write_text("\n".join(lines) + "\n")
+    done = run(file, "--preset", "wide", "-o", tmp_path / "data.csv")
+    assert done.exit_code == 0 and "line 4 (no value in column M2_y_mm)" in done.output
+    assert len(table(tmp_path / "data.csv")) == 2 * len(degrees) - 1
+
+
+def test_a_mapping_names_the_columns_and_renames_the_markers(tmp_path):
+    _, degrees, points = kr270_readings(tmp_path)
+    file = wide(tmp_path / "log.csv", degrees, points, "pos{axis}({marker})", "")
+    (tmp_path / "map.toml").write_text(
+        '[[source]]\n[source.columns]\n"q#_deg" = "q#"\nx_mm = "posx(*)"\ny_mm = "posy(*)"\n'
+        'z_mm = "posz(*)"\n[source.names]\nmarkers = { M2 = "ball" }\n'
+    )
+    done = run(file, "--map", tmp_path / "map.toml", "-o", tmp_path / "data.csv")
+    assert done.exit_code == 0, done.output
+    assert {row["marker"] for row in table(tmp_path / "data.csv")} == {"M1", "ball"}
+
+
+def test_a_marker_that_lacks_a_column_is_named(tmp_path):
+    (tmp_path / "log.csv").write_text("q1_deg,M1_x_mm,M1_y_mm,M1_z_mm,M2_x_mm\n1,2,3,4,5\n")
+    done = run(tmp_path / "log.csv", "--preset", "wide", "-o", tmp_path / "data.csv")
+    assert done.exit_code == 2 and "'M2' has no column for y_auto, z_auto" in done.output
+    assert not (tmp_path / "data.csv").exists()
+
+
+def test_a_star_where_no_marker_stands_is_refused(tmp_path):
+    (tmp_path / "log.csv").write_text("q1_deg,M1_x\n1,2\n")
+    (tmp_path / "map.toml").write_text('[[source]]\n[source.columns]\nname = "*_name"\n')
+    done = run(tmp_path / "log.csv", "--map", tmp_path / "map.toml", "--preview")
+    assert done.exit_code == 2 and "* stands for the markers of a row" in done.output
+
+
+@pytest.mark.parametrize(
+    ("name", "force"),
+    [("log_2600N", 2600.0), ("payload_2p5kg", 2.5 * 9.80665), ("load2.6kN", 2600.0),
+     ("run3_12 kg", 12 * 9.80665), ("arm7_unloaded", 0.0), ("P12N3", 0.0), ("n100", 0.0)],
+)  # fmt: skip
+def test_a_load_in_a_files_name_is_taken_and_told(tmp_path, name, force):
+    _, degrees, points = kr270_readings(tmp_path)
+    file = wide(tmp_path / f"{name}.csv", degrees, points, "{marker}_{axis}")
+    done = run(file, "--preset", "wide", "-o", tmp_path / "data.csv")
+    assert done.exit_code == 0, done.output
+    forces = {float(row.get("force_z_N", 0.0)) for row in table(tmp_path / "data.csv")}
+    assert len(forces) == 1 and forces.pop() == pytest.approx(-force)
+    assert ("by its name, hanging straight down" in done.output) == (force > 0)
+
+
+def test_files_beside_it_are_unloaded_and_what_states_no_size_is_told(tmp_path):
+    _, degrees, points = kr270_readings(tmp_path)
+    for name in ("unloaded", "full_2600N", "loaded"):
+        wide(tmp_path / f"{name}.csv", degrees, points, "{marker}_{axis}")
+    files = tmp_path / "unloaded.csv", tmp_path / "full_2600N.csv"
+    done = run(*files, "--preset", "wide", "-o", tmp_path / "data.csv")
+    assert done.exit_code == 0, done.output
+    rows = table(tmp_path / "data.csv")
+    assert {float(row["force_z_N"]) for row in rows} == {0.0, -2600.0}
+    done = run(tmp_path / "loaded.csv", "--preset", "wide", "-o", tmp_path / "data.csv")
+    assert "named for a load of no stated size" in done.output
+    done = run(tmp_path / "unloaded.csv", "--preset", "wide", "-o", tmp_path / "data.csv")
+    assert "named for a load" not in done.output
+
+
+def test_what_the_mapping_says_of_loads_counts_before_a_name(tmp_path):
+    _, degrees, points = kr270_readings(tmp_path)
+    file = wide(tmp_path / "log_2600N.csv", degrees, points, "{marker}_{axis}")
+    (tmp_path / "map.toml").write_text(
+        '[[source]]\npreset = "wide"\nload = "slant"\n[loads]\nslant = [100, 0, -2000]\n'
+    )
+    done = run(file, "--map", tmp_path / "map.toml", "-o", tmp_path / "data.csv")
+    assert done.exit_code == 0 and "by its name" not in done.output
+    assert {float(row["force_z_N"]) for row in table(tmp_path / "data.csv")} == {-2000.0}
