@@ -50,7 +50,10 @@ def test_the_plan_has_the_columns_of_its_format_and_the_poses_asked_for(levels):
     folder, _ = levels
     rows = rows_of(folder / "plan.csv")
     joints = [f"q{i}_deg" for i in range(1, 7)]
-    assert list(rows[0]) == ["configuration", *joints, "level", *ORDERS]
+    carried = ["note_load", "note_load_2", "note_load_3"]
+    assert list(rows[0]) == ["configuration", *joints, "level", *ORDERS, *carried]
+    loads = {tuple(row[key] for key in carried) for row in rows}
+    assert loads == {("unloaded", "0 0 -2600 N", "unloaded")}
     assert [row["configuration"] for row in rows] == ["1", "2", "3", "4", "5", "6"]
     assert [row["level"] for row in rows] == ["1"] * 3 + ["2"] * 3
     assert [float(row["q2_deg"]) for row in rows] == [-25.24] * 3 + [-56.9] * 3
@@ -98,6 +101,20 @@ def test_every_file_asked_for_is_written_and_told(levels):
         written[2],
     ]
     assert (folder / "picture.png").read_bytes().startswith(b"\x89PNG")
+
+
+def test_to_try_the_plan_its_load_is_part_of_the_command(levels):
+    """As printed it simulates what `identify` can use; without the load nothing is to be seen."""
+    folder, told = levels
+    (line,) = re.findall(r"To try it without an arm: elastocal (.*)", told)
+    words = line.replace("data.csv", str(folder / "tried.csv")).split()
+    assert words[-4:] == ["--load", "0", "0", "-2600"]
+    done = elastocal(*words)
+    assert done.exit_code == 0 and "Warning" not in done.stderr, done.output
+    assert {float(row["force_z_N"]) for row in rows_of(folder / "tried.csv")} == {0.0, -2600.0}
+    done = elastocal(*words[:-4])
+    assert "every reading is unloaded" in done.stderr
+    (folder / "tried.csv").unlink()
 
 
 def test_the_programs_move_to_the_plan_in_its_order(levels):

@@ -25,6 +25,7 @@ from elastocal.cli.app import (
 )
 from elastocal.errors import InputError, require
 from elastocal.screen import progress_line, say
+from elastocal.text import listed
 
 if TYPE_CHECKING:
     from elastocal.cell.work_cell import Cell
@@ -229,17 +230,28 @@ def design(
     print_plan(console(), plan)
     for path in written:
         say(f"wrote {path}")
-    say(_what_next(cell, output, augment))
+    say(_what_next(cell, output, augment, plan))
 
 
-def _what_next(cell: Path, plan: Path, augment: Path | None) -> str:
+def _what_next(cell: Path, output: Path, augment: Path | None, plan: Plan) -> str:
     """What to do with the plan."""
+    from elastocal.planning.plan import load_name
+
+    loads = plan.forces[(plan.forces != 0).any(axis=1)]
+    carried, hung = "", ""
+    if len(loads) and plan.stated_forces is None:  # else the plan's rows state their forces
+        names = listed(load_name(force) for force in plan.forces)
+        hung = f"with the loads of its note_load ({names}), "
+        carried = f" --load {' '.join(f'{value:g}' for value in loads[0])}"
+    elif len(loads):
+        hung = "each row under its force, "
     added = "" if augment is None else f" (add them to {augment})"
     return (
-        f"Next: measure {plan} in its order, a row with x_mm, y_mm, z_mm for each marker{added}; "
-        "then\n"
+        f"Next: measure {output} in its order, {hung}a row with x_mm, y_mm, z_mm for each "
+        f"marker{added}; then\n"
         f"  elastocal identify {cell} {augment or 'data.csv'} --report report.html\n"
-        f"To try it without an arm: elastocal simulate {cell} {plan} -o data.csv --draw 1"
+        f"To try it without an arm: elastocal simulate {cell} {output} -o data.csv --draw 1"
+        f"{carried}"
     )
 
 

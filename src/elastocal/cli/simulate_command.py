@@ -71,6 +71,13 @@ def simulate(
         model, poses, values=dict(_assignment(text) for text in set_ or ()), draw=draw, load=load,
         repeats=repeats, noise=not no_noise, seed=seed,
     )  # fmt: skip
+    planned = model.cell.design.loads
+    if load is None and not table.force.any() and planned is not None and planned.any():
+        say(
+            f"Warning: {plan} states no load and none is given, so every reading is unloaded; the "
+            "cell plans some ([design] loads_N): simulate one by --load",
+            error=True,
+        )
     named = dict(zip(model.names, x.tolist(), strict=True))
     with together(written):
         table.save(output)

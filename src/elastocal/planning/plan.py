@@ -166,13 +166,15 @@ def plan_rows(
     level: IntArray,
     forces: Array | None = None,
     seen: Mapping[str, BoolArray] | None = None,
+    carried: Array | None = None,
 ) -> PlanRows:
     """The rows of an execution, sorted by pose, then side of approach, then load state.
 
     With `forces` (L, 3) N of the load states one row per reading, under its force; without, one
     row per pose and side, to be measured in every load state, `order` being its place in the
     order in the first state, note_order_2 that in the second, and so on; what is read in two parts
-    has the place of the second behind these.  `configurations` and
+    has the place of the second behind these.  note_load, note_load_2, … then say what hangs at each
+    of these places, where any of the load states `carried` (L, 3) N is one.  `configurations` and
     `level`: one per pose.  Where a pose is approached from both sides, they are two
     configurations, 7+ (joints moving up to it) and 7-: the difference between them is what such a
     plan is for, not noise of repeats.  With `seen`, which markers are read of each pose in each
@@ -196,6 +198,14 @@ def plan_rows(
         f"note_order_{i + 1}": [str(row[i][0]) if i < len(row) else "" for row in rows]
         for i in range(1, most)
     }
+    if forces is None and carried is not None and carried.any():
+        names = [load_name(force) for force in carried]
+        notes |= {
+            "note_load" + (f"_{i + 1}" if i else ""): [
+                names[row[i][1].load] if i < len(row) else "" for row in rows
+            ]
+            for i in range(most)
+        }
     approach = [stop.approach for stop in first if stop.approach is not None]
     marker = None
     if seen is not None:
@@ -217,6 +227,13 @@ def plan_rows(
         marker_names=(DEFAULT_MARKER,) if seen is None else tuple(seen),
         time=np.array(time) if time else None,
     )
+
+
+def load_name(force: Array) -> str:
+    """A load state for people: "unloaded", or its force."""
+    if not np.any(force):
+        return "unloaded"
+    return " ".join(f"{value + 0.0:g}" for value in force) + " N"
 
 
 def write_plan(path: str | Path, rows: PlanRows, joint_kinds: Sequence[str]) -> None:
@@ -583,8 +600,9 @@ class Plan(Result):
     def rows(self) -> PlanRows:
         """What its file has."""
         return plan_rows(
-            self.execution, self.configurations, self.group + 1, self.stated_forces, self._read
-        )
+            self.execution, self.configurations, self.group + 1, self.stated_forces, self._read,
+            self.forces,
+        )  # fmt: skip
 
     @property
     def _read(self) -> dict[str, BoolArray] | None:
