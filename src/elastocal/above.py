@@ -34,7 +34,8 @@ class Saved:
                 `NextPoses` their plan, if any; a `CalibratedArm` what the ending says: .urdf, .xml
                 or .mjcf (MuJoCo), .csv (DH table), .yaml, .json.
             **how: For an arm: `format` (as "mdh"), `load` (3,) N, `time_s`, `temperature_c`,
-                `frames`, `base_frame`, `poses` and `seed`, as `elastocal export` has them.
+                `frames`, `base_frame`, `joint_correction` (a path), `poses` and `seed`, as
+                `elastocal export` has them.
 
         Raises:
             InputError: The file cannot be written, or not in this format.

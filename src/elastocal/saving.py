@@ -122,9 +122,11 @@ def save_arm(arm: CalibratedArm, path: Path, **how: Any) -> None:
     where no random pose has a static equilibrium under the load, and ElastocalError where the
     text, read back, is another arm than the model.
     """
-    from elastocal.export.export import export
+    from elastocal.export.export import export, write
 
-    atomic_write_text(path, export(arm, wish_of(path, **how)).text)
+    correction = how.pop("joint_correction", None)
+    wish = wish_of(path, **how, correct_joints=correction is not None)
+    write(export(arm, wish), path, correction)
 
 
 def wish_of(
@@ -137,6 +139,7 @@ def wish_of(
     time_s: float | None = None,
     poses: int = 500,
     seed: int = 0,
+    correct_joints: bool = False,
 ) -> Wish:
     """How to export an arm to `path`, checked; the others are the options of `elastocal export`:
     no format goes by the file's ending, costs are stated under `load` (3,) N at random `poses`.
@@ -162,6 +165,8 @@ def wish_of(
         conditions=Conditions(np.zeros(3) if force is None else force, time_s, temperature_c),
         poses=poses,
         seed=seed,
+        load_stated=force is not None,
+        correct_joints=correct_joints,
     )
 
 

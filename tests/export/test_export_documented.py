@@ -22,7 +22,7 @@ def test_the_example_moves_the_arm(
     calibrated, done = exported(*write_result(tmp_path, f'urdf = "{KR270}"'), "mjcf")
     (tmp_path / "calibrated.xml").write_text(done.text)
     monkeypatch.chdir(tmp_path)
-    (example,) = re.findall(r"```python\n(.*?)```", PAGE, re.S)
+    example = re.findall(r"```python\n(.*?)```", PAGE, re.S)[0]
     exec(example, {})
     shown = np.array([float(v) for v in re.findall(r"-?\d+\.\d+", capsys.readouterr().out)])
     q, force = np.array([[0.4, -1.0, 0, 0, 0, 0]]), np.array([0, 0, -2600.0])

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
 
@@ -26,6 +27,7 @@ if TYPE_CHECKING:
 
     from elastocal.export.export import Exported
     from elastocal.export.exportable import Cost
+    from elastocal.export.refit import Refit
 
 
 WORTH_TELLING = 10e-6  # m, as for what compensate leaves open
@@ -63,6 +65,13 @@ def export(
         bool,
         typer.Option("--base-frame", help="Put the tracker's frame above the robot's base."),
     ] = False,
+    joint_correction: Annotated[
+        Path | None,
+        typer.Option(
+            help="Write what joints are to be commanded besides, for simulators (CSV); the file is "
+            "fitted with it."
+        ),
+    ] = None,
     temperature_c: Annotated[
         float | None, typer.Option("--temperature-c", help="Temperature in °C to export at.")
     ] = None,
@@ -82,23 +91,27 @@ def export(
     Example: elastocal export cell.toml result.json -o calibrated.urdf --load 0 0 -2600
     """
     from elastocal.export.export import export as run
-    from elastocal.files import atomic_write_text
+    from elastocal.export.export import write
     from elastocal.model.calibrated import read_calibrated
     from elastocal.saving import wish_of
 
-    written = check_outputs(output)
-    wish = wish_of(output, format, load, frames, base_frame, temperature_c, time_s, poses, seed)
+    written = check_outputs(output, joint_correction)
+    wish = wish_of(
+        output, format, load, frames, base_frame, temperature_c, time_s, poses, seed,
+        joint_correction is not None,
+    )  # fmt: skip
     with progress_line(quiet) as progress:
         progress("reading")
         calibrated = read_calibrated(cell, result, plugins)
         check_apart(written, [cell, result], calibrated.model.cell)
         done = run(calibrated, wish, progress)
-    atomic_write_text(output, done.text)
+    write(done, output, joint_correction)
     if as_json:
         say(json_text({"output": str(output)} | done.to_json()))
         return
     _tell(done)
-    say(f"wrote {output}")
+    for path in written:
+        say(f"wrote {path}")
 
 
 def _tell(done: Exported) -> None:
@@ -109,7 +122,6 @@ def _tell(done: Exported) -> None:
     cost, (name, in_title) = done.cost, NAMES[done.format]
     if cost.effects:
         screen.print(_cost_table(f"What {in_title} cannot hold", cost))
-    force = ", ".join(f"{v:g}" for v in cost.force)
     held = list(done.held)
     more = f" and {len(held) - 8} more" if len(held) > 8 else ""
     for wanted, sentence in (
@@ -117,7 +129,12 @@ def _tell(done: Exported) -> None:
         (
             cost.effects,
             f"Costs: differences from the calibrated model at {cost.poses} random poses within the "
-            f"joint limits under a load of ({force}) N, each effect left out alone.",
+            f"joint {'ranges measured' if cost.measured else 'limits'} under "
+            f"{_loads(cost)}, each effect left out alone.",
+        ),
+        (
+            done.refit is not None,
+            _fit(done.refit),
         ),
         (
             done.checked is not None,
@@ -146,6 +163,33 @@ def _tell(done: Exported) -> None:
     ):
         if wanted:
             screen.print(printable(sentence), markup=False)
+
+
+def _loads(cost: Cost) -> str:
+    if len(cost.forces) == 1:
+        return f"a load of ({', '.join(f'{v:g}' for v in cost.forces[0])}) N"
+    sizes = [math.hypot(*force) for force in cost.forces]
+    return f"the {len(sizes)} loads measured, {min(sizes):.4g} to {max(sizes):.4g} N"
+
+
+def _fit(refit: Refit | None) -> str:
+    """How far the file is from the arm."""
+    from elastocal.report.formatting import length
+
+    if refit is None:
+        return ""
+    told = f"the markers are {length(refit.after)} rms off"
+    if refit.correction is not None:
+        told = f"with its joint correction {length(refit.correction)}, without it {told}"
+    if refit.taken or refit.correction is not None:
+        told = (
+            f"What it holds is fitted to the calibrated arm at {refit.visits} measured visits: "
+            f"{told}, with the values identified {length(refit.before)}"
+        )
+    else:
+        told = f"What it holds is as identified, which no fit to the arm betters: {told}"
+    worse = "" if refit.after < refit.nominal else "; it is worse than the nominal file"
+    return f"{told}, the nominal file with base and tool placed {length(refit.nominal)}{worse}."
 
 
 def _rounding(metres: float | None) -> str:

@@ -6,6 +6,7 @@ ROOMS = {
     "dh_table": "split",
     "export": "Exported Wish to_yaml",
     "exportable": "Conditions cost_of evaluate_pieces keep random_table rpy",
+    "joint_correction": "JointCorrection read_joint_correction",
     "mjcf_file": "MujocoRest",
     "urdf_file": "Frames read_urdf_text",
 }

@@ -8,7 +8,7 @@ from __future__ import annotations
 
 import tempfile
 from collections.abc import Callable, Iterator
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from functools import partial
 from pathlib import Path
 from typing import Any
@@ -27,8 +27,10 @@ from elastocal.export.exportable import (
     link_inertias,
     rpy,
 )
+from elastocal.export.joint_correction import JointCorrection
 from elastocal.export.mjcf_file import RIGID, MujocoRest, calibrated_mjcf
 from elastocal.export.mjcf_in_place import NotInPlace, corrected_mjcf, held_arm
+from elastocal.export.refit import Refit, refitted
 from elastocal.export.urdf_file import (
     BASE,
     FLANGE,
@@ -37,7 +39,7 @@ from elastocal.export.urdf_file import (
     new_urdf,
     urdf_flanges,
 )
-from elastocal.files import atomic_write_text
+from elastocal.files import atomic_write_text, together
 from elastocal.identification.covariance import t_quantile
 from elastocal.model.calibrated import CalibratedArm
 from elastocal.model.chain import Chain
@@ -46,7 +48,7 @@ from elastocal.model.rigid import nominal_flanges
 from elastocal.model.smooth_groups import SmoothGroup, smooth_groups
 from elastocal.model.valued import Conditions, Valued, random_table
 from elastocal.tables import csv_text
-from elastocal.text import did_you_mean, json_text, plain
+from elastocal.text import did_you_mean, json_text, listed, plain
 from elastocal.units import Array
 
 # The parameters as YAML or JSON, to be read by people and by programs of their own.
@@ -120,7 +122,8 @@ def cost_json(cost: Cost) -> dict[str, Any]:
     return {
         "poses": cost.poses,
         "poses_without_equilibrium": cost.unsettled,
-        "force_N": [float(v) for v in cost.force],
+        "force_N": cost.forces[0].tolist() if len(cost.forces) == 1 else None,
+        "forces_N": cost.forces.tolist(),
         "total": cost.total.to_json(),
         "effects": [
             {"effect": e.effect, "note": e.note,
@@ -291,12 +294,12 @@ def check_rest(
     Raises InputError where MuJoCo is not installed, ElastocalError where they differ.
     """
     arm = MujocoRest(mjcf)
-    part, force = kept.exported, kept.conditions.force
+    part = kept.exported
     table = random_table(kept.full.model, kept.conditions, poses, seed)
     placed = T_world_base @ np.linalg.inv(pieces.T_tracker_base)
     expected = placed @ part.model.flange_poses(table, part.x)
     worst = 0.0
-    for q, T in zip(table.q, expected, strict=True):
+    for q, force, T in zip(table.q, table.force, expected, strict=True):
         if np.isfinite(T).all():
             found = arm.sites(q, force, names)
             away = found - (pieces.points @ T[:3, :3].T + T[:3, 3])
@@ -319,11 +322,14 @@ POSES_AT_REST = 20
 
 @dataclass(frozen=True)
 class Wish:
-    """How to export: `poses` random poses for the cost, drawn with `seed`."""
+    """How to export: `poses` random poses for the cost, drawn with `seed`; `load_stated`: under the
+    force of `conditions` though it is zero; `correct_joints`: with a joint correction."""
 
     format: str
     frames: Frames = field(default_factory=Frames)
     conditions: Conditions = field(default_factory=Conditions)
+    load_stated: bool = False
+    correct_joints: bool = False
     poses: int = 500
     seed: int = 0
 
@@ -333,7 +339,9 @@ class Exported:
     """`text` to write; `checked`: largest distance in m when read back, None where it was not.
 
     `held`: parameters that the data did not determine, with the values used; `without_beta`: of a
-    DH table with a column beta_rad, the largest distance in m for who reads four columns only.
+    DH table with a column beta_rad, the largest distance in m for who reads four columns only;
+    `refit`: how far the file is from the arm before and after what it holds was fitted to it;
+    `correction`: where its joints are to be commanded besides, empty where nothing was asked for.
     """
 
     text: str
@@ -345,6 +353,8 @@ class Exported:
     of_the_measurement: tuple[str, ...]
     warnings: tuple[str, ...]
     without_beta: float | None = None
+    refit: Refit | None = None
+    correction: JointCorrection = field(default_factory=lambda: JointCorrection(()))
 
     def to_json(self) -> dict[str, Any]:
         """The answer as a JSON-ready dictionary, lengths in µm."""
@@ -352,6 +362,7 @@ class Exported:
             "schema": SCHEMA,
             "format": self.format,
             "cannot_hold": cost_json(self.cost),
+            "refit": None if self.refit is None else self.refit.to_json(),
             "read_back": {"with": self.checked_with, "max_um": _um(self.checked)},
             "without_beta_max_um": _um(self.without_beta),
             "held": self.held,
@@ -369,9 +380,16 @@ def export(
     where no random pose has an equilibrium under the load, and ElastocalError where the text,
     read back, is another arm than the model.
     """
+    if wish.correct_joints:
+        _check_correctable(calibrated, wish)
     estimates = estimates_of(calibrated)
-    kept = keep(calibrated, elastic=wish.format == "mjcf", conditions=wish.conditions)
-    pieces = evaluate_pieces(kept.exported, wish.conditions)
+    conditions = _conditions(calibrated, wish)
+    kept = keep(calibrated, elastic=wish.format == "mjcf", conditions=conditions)
+    refit, correction = None, JointCorrection(())
+    if wish.format in FITTED:
+        progress("fitting what the format holds")
+        kept, refit, correction = refitted(kept, wish.poses, wish.seed, wish.correct_joints)
+    pieces = evaluate_pieces(kept.exported, conditions)
     progress("what the format cannot hold")
     cost = cost_of(kept, wish.poses, wish.seed)
     progress("writing and reading back")
@@ -390,24 +408,61 @@ def export(
         checked_with=tool,
         held=held_values(calibrated, estimates),
         of_the_measurement=kept.of_the_measurement,
-        warnings=(*_warnings(calibrated, cost), *warnings),
+        warnings=(*_warnings(calibrated, kept, cost), *warnings),
         without_beta=beta,
+        refit=refit,
+        correction=correction,
     )
+
+
+def _conditions(calibrated: CalibratedArm, wish: Wish) -> Conditions:
+    """With the visits measured, where they are known, under the load that was asked for."""
+    visits, given = calibrated.visits, wish.conditions
+    if visits is not None and (wish.load_stated or given.force.any()):
+        visits = replace(visits, force=np.broadcast_to(given.force, visits.force.shape))
+    return replace(given, visits=visits)
+
+
+def _check_correctable(calibrated: CalibratedArm, wish: Wish) -> None:
+    asked = option("joint_correction")
+    if wish.format not in FITTED:
+        raise InputError(f"{asked} goes with {listed(FITTED)}; found format {wish.format}")
+    if calibrated.visits is None:
+        raise InputError(
+            f"{calibrated.source} does not say where the arm was measured, which {asked} needs; "
+            "identify anew"
+        )
+
+
+FITTED = ("urdf", "mjcf", "dh", "mdh")
+
+
+def write(done: Exported, path: Path, correction: str | Path | None) -> None:
+    """The file, and where it is asked for its joint correction: both or none."""
+    with together([path] if correction is None else [path, correction]):
+        atomic_write_text(path, done.text)
+        if correction is not None:
+            told = f"q_effective = q + the deltas of its joint, for {path.name}; SI: rad or m"
+            atomic_write_text(correction, done.correction.csv([told]))
 
 
 # Text, distance when read back, by what, warnings, distance without beta.
 Written = tuple[str, float | None, str, list[str], float | None]
 
 
-def _note(calibrated: CalibratedArm, wish: Wish) -> str:
+def _note(calibrated: CalibratedArm, kept: Kept) -> str:
     """One line for a comment in the file: where its numbers come from, what they hold for."""
+    conditions = kept.conditions
     cell = calibrated.model.cell
     source = Path(calibrated.source).name
     told = f"calibrated by elastocal: {source} of {Path(cell.path).name if cell.path else 'cell'}"
-    if wish.conditions.temperature is not None:
-        told += f", at {wish.conditions.temperature:g} °C"
-    if wish.conditions.time is not None:
-        told += f", at {wish.conditions.time:g} s"
+    if conditions.temperature is not None:
+        told += f", at {conditions.temperature:g} °C"
+    if conditions.time is not None:
+        told += f", at {conditions.time:g} s"
+    if kept.fitted and conditions.visits is not None:
+        sizes = np.linalg.norm(conditions.visits.force, axis=1)
+        told += f", fitted where it was measured, under {sizes.min():.4g} to {sizes.max():.4g} N"
     return told
 
 
@@ -415,7 +470,7 @@ def _urdf(calibrated: CalibratedArm, wish: Wish, kept: Kept, pieces: ExportNumbe
     from elastocal.model.urdf import check_urdf, read_urdf
 
     robot = calibrated.model.cell.robot
-    note = _note(calibrated, wish)
+    note = _note(calibrated, kept)
     if robot.urdf is not None:
         text = calibrated_urdf(robot, pieces, wish.frames, note)
         tree = check_urdf(robot.urdf)
@@ -454,7 +509,7 @@ def _mjcf(calibrated: CalibratedArm, wish: Wish, kept: Kept, pieces: ExportNumbe
     if pieces.masses and robot.urdf is not None:
         inertias = link_inertias(robot.urdf, pieces.chain)
     text = calibrated_mjcf(
-        pieces, _note(calibrated, wish), inertias, _compensator(kept.exported), wish.frames.base
+        pieces, _note(calibrated, kept), inertias, _compensator(kept.exported), wish.frames.base
     )
     if not pieces.masses:
         warnings.append(
@@ -483,7 +538,7 @@ def _corrected(calibrated: CalibratedArm, wish: Wish, kept: Kept, pieces: Export
         raise NotInPlace("it has no gravity compensator")
     if pieces.masses and not cell.model.link_gravity:
         raise NotInPlace("weights were identified without those of the file (link_gravity = false)")
-    text, warnings = corrected_mjcf(cell.robot, pieces, wish.frames.tool, _note(calibrated, wish))
+    text, warnings = corrected_mjcf(cell.robot, pieces, wish.frames.tool, _note(calibrated, kept))
     arm, placed, names = held_arm(text, cell.robot, pieces)
     distance = check_rest(arm, pieces, kept, placed, names, POSES_AT_REST, wish.seed)
     springs = [s for s in pieces.springs if s.compliance > 0]
@@ -532,7 +587,7 @@ def _dh(calibrated: CalibratedArm, wish: Wish, kept: Kept, pieces: ExportNumbers
     chain = pieces.calibrated_chain()
     checked = check_chain(dh_csv(lines), ".csv", read, chain, kept, wish.seed)
     comments = [
-        f"{_note(calibrated, wish)}; {convention} convention: {FORMULA[convention]}",
+        f"{_note(calibrated, kept)}; {convention} convention: {FORMULA[convention]}",
         f"largest flange error of this table: {checked * 1e6:.2g} um",
     ]
     beta = None
@@ -548,7 +603,7 @@ def _dh(calibrated: CalibratedArm, wish: Wish, kept: Kept, pieces: ExportNumbers
 def _corrections(
     calibrated: CalibratedArm, wish: Wish, kept: Kept, pieces: ExportNumbers
 ) -> Written:
-    text = corrections_csv(calibrated, _note(calibrated, wish))
+    text = corrections_csv(calibrated, _note(calibrated, kept))
     return text, None, "", [], None
 
 
@@ -557,11 +612,16 @@ WRITERS = {
 }  # fmt: skip
 
 
-def _warnings(calibrated: CalibratedArm, cost: Cost) -> list[str]:
+def _warnings(calibrated: CalibratedArm, kept: Kept, cost: Cost) -> list[str]:
     found = []
+    if kept.fitted and len(cost.forces) > 1 and not kept.exported.elastic:
+        found.append(
+            f"the arm sags under its load and this file cannot: it is fitted to all "
+            f"{len(cost.forces)} loads measured; state {option('load')} for the one that it is for"
+        )
     spec = calibrated.model.cell.model
     elastic = any(effect_of(choice.name).elastic for choice in spec.effects)
-    if elastic and not cost.force.any() and not spec.link_gravity:
+    if elastic and not cost.forces.any() and not spec.link_gravity:
         found.append(
             f"no load is given, so compliances cost nothing here: state one with {option('load')} "
             "(N, in the tracker's axes)"

@@ -95,13 +95,14 @@ class Kept:
     """`full`: the calibrated arm; `exported`: what the file holds of it; `omissions` between.
 
     `of_the_measurement`: effects of the instrument, which are no part of the arm; neither model
-    has them."""
+    has them.  `fitted`: whether the file's values are no longer those identified."""
 
     full: Valued
     exported: Valued
     conditions: Conditions
     omissions: tuple[Omission, ...]
     of_the_measurement: tuple[str, ...]
+    fitted: bool = False
 
 
 def keep(calibrated: CalibratedArm, elastic: bool, conditions: Conditions) -> Kept:
@@ -321,14 +322,16 @@ class Cost:
     """`total` between the full model and the file's, `effects` one by one, over `poses`.
 
     Effects interact, so the total need not be their sum.  `unsettled`: poses without a static
-    equilibrium under the load, left out.
+    equilibrium under the load, left out.  `forces` (L, 3) N act in turn; poses are
+    within the joints' `measured` ranges, else within their limits.
     """
 
     total: Difference
     effects: tuple[Omission, ...]
     poses: int
     unsettled: int
-    force: Array
+    forces: Array
+    measured: bool
 
 
 def cost_of(kept: Kept, poses: int, seed: int) -> Cost:
@@ -340,19 +343,19 @@ def cost_of(kept: Kept, poses: int, seed: int) -> Cost:
     table = random_table(kept.full.model, kept.conditions, poses, seed)
     # No omission touches the tool, so one set of markers serves every model.
     markers = evaluate_pieces(kept.exported, kept.conditions).points
-    full = _positions(kept.full, table, markers)
-    exported = _positions(kept.exported, table, markers)
+    full = points_of(kept.full, table, markers)
+    exported = points_of(kept.exported, table, markers)
     settled = np.isfinite(full).all(axis=(1, 2)) & np.isfinite(exported).all(axis=(1, 2))
     if not settled.any():
         raise InsufficientDataError(
             f"none of {poses} random poses has a static equilibrium under the load "
-            f"{kept.conditions.force.tolist()} N; check {option('load')} and the "
+            f"{table.force[0].tolist()} N; check {option('load')} and the "
             "compliances of the result"
         )
     effects = []
     for omission in kept.omissions:
         if omission.without is not None:
-            without = _positions(omission.without, table, markers)
+            without = points_of(omission.without, table, markers)
             difference = _difference(full[settled], without[settled])
             omission = replace(omission, difference=difference)
         effects.append(omission)
@@ -362,11 +365,12 @@ def cost_of(kept: Kept, poses: int, seed: int) -> Cost:
         effects=tuple(effects),
         poses=poses,
         unsettled=int((~settled).sum()),
-        force=kept.conditions.force,
+        forces=np.unique(table.force, axis=0),
+        measured=kept.conditions.visits is not None,
     )
 
 
-def _positions(part: Valued, table: Measurements, points: Array) -> Array:
+def points_of(part: Valued, table: Measurements, points: Array) -> Array:
     """Points (k, 3) of the flange frame in the tracker frame (poses, k, 3); NaN: no equilibrium."""
     T = part.model.flange_poses(table, part.x)
     return np.asarray(T[:, None, :3, :3] @ points[..., None])[..., 0] + T[:, None, :3, 3]

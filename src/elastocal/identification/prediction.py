@@ -33,7 +33,7 @@ from elastocal.identification.residuals import rms_3d
 from elastocal.identification.solve import STRUCTURAL, Solution, free_r_factor
 from elastocal.measurements import Measurements
 from elastocal.model.arm import Parameter
-from elastocal.model.calibrated import CalibratedArm, OpenParameters
+from elastocal.model.calibrated import CalibratedArm, MeasuredVisits, OpenParameters
 from elastocal.model.calibrated_tool import CalibratedTool
 from elastocal.model.chain import finite_ranges, joint_index, joint_limits
 from elastocal.model.manipulator import Model
@@ -364,6 +364,18 @@ def measured_loads(observed: Observations) -> Array:
     forces = _loads(observed.table.force, observed.kind)
     chosen = np.linspace(0, len(forces) - 1, min(len(forces), MOST_LOADS)).round().astype(int)
     return np.asarray(forces[chosen])
+
+
+MOST_VISITS = 400  # kept with a result
+
+
+def measured_visits(observed: Observations) -> MeasuredVisits:
+    """Joints and force of the readings, each pair once, at most MOST_VISITS, evenly chosen."""
+    rows = np.hstack([observed.table.q, observed.table.force])[observed.lead]
+    first = np.sort(np.unique(rows.round(9), axis=0, return_index=True)[1])
+    chosen = np.linspace(0, len(first) - 1, min(len(first), MOST_VISITS)).round().astype(int)
+    rows = rows[first[chosen]]
+    return MeasuredVisits(rows[:, :-3], rows[:, -3:])
 
 
 @dataclass(frozen=True)

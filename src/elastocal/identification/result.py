@@ -27,6 +27,7 @@ from elastocal.identification.prediction import (
     PredictedError,
     excess_of,
     measured_loads,
+    measured_visits,
     position_at,
     scatter_of,
 )
@@ -534,6 +535,7 @@ class Calibration(Result):
             0.0 if self.excess is None else float(np.sqrt(self.excess.squared.mean())),
             measured_loads(self.observations),
             self.shown,
+            measured_visits(self.observations),
         )
 
     @cached_property
@@ -643,6 +645,7 @@ class Calibration(Result):
             "verdict": self.verdict.to_json()
             | {"sentence": headline(self) if self.findings else None},
             "predicted_new_poses_um": None if self.predicted is None else self.predicted.to_json(),
+            "measured_visits": measured_visits(self.observations).to_json(),
             "measured_poses": None if self.shown is None else self.shown.to_json(),
             "open": None if self.left is None else self.left.to_json(),
             "noise": self.noise.to_json(),

@@ -73,6 +73,22 @@ class ShownPoses:
         return {"largest_std_um": self.most * 1e6, "configurations": self.configurations}
 
 
+@dataclass(frozen=True)
+class MeasuredVisits:
+    """Where an arm was measured: commanded joints `q` (k, joints) in rad or m, and the `force`
+    (k, 3) N at each."""
+
+    q: Array
+    force: Array
+
+    def to_json(self) -> dict[str, Any]:
+        """JSON-ready; joints to a µrad or µm, forces to a mN."""
+        return {
+            "q": [[round(float(v), 6) + 0.0 for v in row] for row in self.q],
+            "force_N": [[round(float(v), 3) + 0.0 for v in row] for row in self.force],
+        }
+
+
 @dataclass(frozen=True, repr=False)
 class CalibratedArm(Saved):
     """A calibrated arm: a model and the parameter values that it predicts with.
@@ -92,6 +108,7 @@ class CalibratedArm(Saved):
         lacking: 3-D rms in m of what the model may lack, as far as the readings told.
         loads: (L, 3) N, the forces under which it was measured; none in results that do not say.
         shown: How sure the fit is where it was measured; None in results that do not say.
+        visits: The joints and forces measured; None in results that do not say.
 
     Examples:
         >>> arm = ec.identify("cell.toml", "data.csv").arm
@@ -111,6 +128,7 @@ class CalibratedArm(Saved):
     lacking: float = 0.0
     loads: Array = field(default_factory=lambda: np.zeros((0, 3)))
     shown: ShownPoses | None = None
+    visits: MeasuredVisits | None = None
 
     def __repr__(self) -> str:
         return (
@@ -181,6 +199,7 @@ def lasting(arm: CalibratedArm) -> tuple[CalibratedArm, tuple[str, ...]]:
         arm.lacking,
         arm.loads,
         arm.shown,
+        arm.visits,
     ), tuple(gone)  # fmt: skip
 
 
@@ -233,6 +252,7 @@ def read_calibrated(
         _lacking(result.get("predicted_new_poses_um")),
         _loads(result.get("loads_N", []), result_path),
         _shown(result.get("measured_poses")),
+        _visits(result.get("measured_visits"), model.chain.n_joints),
     )
 
 
@@ -368,6 +388,16 @@ def _shown(stated: Any) -> ShownPoses | None:
     except (TypeError, KeyError, ValueError, OverflowError):
         return None
     return found if math.isfinite(found.most) and found.configurations > 0 else None
+
+
+def _visits(stated: Any, n_joints: int) -> MeasuredVisits | None:
+    try:
+        found = MeasuredVisits(*(np.array(stated[key], dtype=float) for key in ("q", "force_N")))
+    except (TypeError, KeyError, ValueError, OverflowError):
+        return None
+    shapes = (found.q.shape, found.force.shape)
+    fit = shapes == ((len(found.q), n_joints), (len(found.q), 3)) and len(found.q) > 0
+    return found if fit and np.isfinite(np.hstack([found.q, found.force])).all() else None
 
 
 def _check_same(model: Model, held: dict[str, float], cell: str | Path, result: str | Path) -> None:

@@ -9,7 +9,7 @@ from typing import Any
 import numpy as np
 
 from elastocal.measurements import Measurements
-from elastocal.model.calibrated import CalibratedArm
+from elastocal.model.calibrated import CalibratedArm, MeasuredVisits
 from elastocal.model.chain import finite_ranges, joint_limits
 from elastocal.model.effects import CATALOGUE
 from elastocal.model.effects.loads import LinkGravity
@@ -22,11 +22,13 @@ RECORDED = {"torque": "recorded torques"}  # what an effect needs and only a tab
 @dataclass(frozen=True)
 class Conditions:
     """What the arm is compared under: force (3,) N in the tracker frame at the load point, time
-    in s and temperature in °C of the table's columns (None: not stated)."""
+    in s and temperature in °C of the table's columns (None: not stated).  With `visits` poses are
+    those within their joints' ranges, and forces theirs."""
 
     force: Array = field(default_factory=lambda: np.zeros(3))
     time: float | None = None
     temperature: float | None = None
+    visits: MeasuredVisits | None = None
 
     def state(self, need: str) -> bool:
         """Is what an effect needs ("time", "temperature", …) stated here?"""
@@ -53,6 +55,11 @@ class Valued:
         if spec.link_gravity:
             active.add(LinkGravity.name)
         return [name for name in CATALOGUE if name in active]
+
+    @property
+    def elastic(self) -> bool:
+        """Whether loads deflect it."""
+        return any(CATALOGUE[name].elastic for name in self.effects)
 
 
 def unstated_needs(calibrated: CalibratedArm, conditions: Conditions) -> dict[str, list[str]]:
@@ -85,15 +92,28 @@ def arm_with(calibrated: CalibratedArm, names: Collection[str]) -> Valued:
 
 def random_table(model: Model, conditions: Conditions, poses: int, seed: int) -> Measurements:
     """`poses` random poses, a row each, with every column that the arm's effects may ask for."""
-    cell, chain = model.cell, model.chain
+    cell, chain, visits = model.cell, model.chain, conditions.visits
     rng = np.random.default_rng(seed)
     low, high = finite_ranges(chain, *joint_limits(cell, chain))
+    force = conditions.force
+    if visits is not None:
+        low, high = visits.q.min(axis=0), visits.q.max(axis=0)
+        force = visits.force[np.arange(poses) % len(visits.force)]
     q = rng.uniform(low, high, (poses, chain.n_joints))
     for joint, levels in cell.model.compliance_levels.items():
         q[:, int(joint.removeprefix("joint")) - 1] = rng.choice(levels, poses)
+    return table_at(model, conditions, q, force, rng)
+
+
+def table_at(
+    model: Model, conditions: Conditions, q: Array, force: Array, rng: np.random.Generator
+) -> Measurements:
+    """The poses q (poses, joints) under `force` (3,) or (poses, 3) N; the last motions are drawn,
+    each pose's of its own, in whatever order they stand."""
+    cell, poses, side = model.cell, len(q), rng.choice([-1.0, 1.0], q.shape)
     stated = {"time": conditions.time, "temperature": conditions.temperature}
     more: dict[str, Any] = {k: np.full(poses, v) for k, v in stated.items() if v is not None}
     return Measurements.of_poses(
-        "random poses", q, conditions.force, marker_names=tuple(cell.tool.markers)[:1],
-        approach=rng.choice([-1.0, 1.0], (poses, chain.n_joints)), **more,
+        "random poses", q, force, marker_names=tuple(cell.tool.markers)[:1],
+        approach=side, direction=side, move=side * rng.uniform(0.1, 1.0, q.shape), **more,
     )  # fmt: skip
