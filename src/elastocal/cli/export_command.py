@@ -180,7 +180,7 @@ def _fit(refit: Refit | None) -> str:
         return ""
     told = f"the markers are {length(refit.after)} rms off"
     if refit.correction is not None:
-        told = f"with its joint correction {length(refit.correction)}, without it {told}"
+        told = f"{told}, with its joint correction {length(refit.correction)}"
     if refit.taken or refit.correction is not None:
         told = (
             f"What it holds is fitted to the calibrated arm at {refit.visits} measured visits: "

@@ -97,7 +97,7 @@ def random_table(model: Model, conditions: Conditions, poses: int, seed: int) ->
     low, high = finite_ranges(chain, *joint_limits(cell, chain))
     force = conditions.force
     if visits is not None:
-        low, high = visits.q.min(axis=0), visits.q.max(axis=0)
+        low, high = np.clip([visits.q.min(axis=0), visits.q.max(axis=0)], low, high)
         force = visits.force[np.arange(poses) % len(visits.force)]
     q = rng.uniform(low, high, (poses, chain.n_joints))
     for joint, levels in cell.model.compliance_levels.items():
