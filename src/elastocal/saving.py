@@ -13,6 +13,7 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
+from elastocal.arguments import checked_arguments
 from elastocal.errors import InputError, option, require
 from elastocal.files import atomic_write_text, read_json
 from elastocal.measurements import Measurements, write_measurements
@@ -33,6 +34,7 @@ if TYPE_CHECKING:
     from elastocal.planning.plan import Plan
 
 LARGEST_SUMMARY = 200_000_000  # bytes
+MOST_POSES = 1_000_000
 
 # One verb's result should not load another verb: each function imports what it needs.
 
@@ -74,9 +76,9 @@ def beside(path: Path) -> Path:
         except InputError:
             found = None
         require(
-            isinstance(found, dict) and found.get("schema") == "elastocal/plan/1",
-            f"{summary}: goes beside {path} and would be written over, but is no summary of a "
-            "plan; move it, or name the plan otherwise",
+            isinstance(found, dict) and str(found.get("schema")).startswith("elastocal/"),
+            f"{summary}: goes beside {path} and would be written over, but elastocal did not "
+            "write it; move it, or name the plan otherwise",
         )
     return summary
 
@@ -129,6 +131,7 @@ def save_arm(arm: CalibratedArm, path: Path, **how: Any) -> None:
     write(export(arm, wish), path, correction)
 
 
+@checked_arguments
 def wish_of(
     path: Path,
     format: str | None = None,
@@ -159,6 +162,10 @@ def wish_of(
                 f"{option(name)} takes a number of {low:g} to {high:g}; found {value:g}"
             )
     force = given_force(load)
+    require(
+        2 <= poses <= MOST_POSES,
+        f"{option('poses')} takes a whole number from 2 to {MOST_POSES:,}; found {poses}",
+    )
     return Wish(
         format=chosen,
         frames=Frames(tool=frames, base=base_frame),

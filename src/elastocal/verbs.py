@@ -15,6 +15,7 @@ from typing import TYPE_CHECKING, Any, Literal, TypeAlias, TypeVar
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
+from elastocal.arguments import checked_arguments, length, one_of, vectors, whole
 from elastocal.cell.plan_wishes import Freedom, Motion, TargetBox, TargetPath, TargetPose
 from elastocal.cell.work_cell import Cell
 from elastocal.errors import InputError, option, require
@@ -23,7 +24,7 @@ from elastocal.model.arm import given_force
 from elastocal.model.calibrated import CalibratedArm, given_arm
 from elastocal.model.choice import cell_of
 from elastocal.model.manipulator import Model
-from elastocal.text import did_you_mean, listed, quoted
+from elastocal.text import quoted
 
 if TYPE_CHECKING:
     from elastocal.compensation.compensate import Compensation
@@ -43,11 +44,11 @@ if TYPE_CHECKING:
 AnyModel: TypeAlias = Model | Cell | str | Path
 Table: TypeAlias = Measurements | str | Path
 Prior: TypeAlias = "Mapping[str, Mapping[str, float]] | GaussianPrior"
-MOST = 10_000_000  # of poses, candidates, processes: more is a slip of the key
 Progress: TypeAlias = Callable[[str], None]
 T = TypeVar("T")
 
 
+@checked_arguments
 def design(
     model: AnyModel,
     *,
@@ -214,12 +215,12 @@ def design_request(
         cell, pins = read_pins(cell, known, keep, strike, asked.get("poses") is not None)
     options = DesignOptions(
         effort=effort,  # type: ignore[arg-type]
-        seed=_whole("seed", seed, 0),
+        seed=int(seed),
         jobs=jobs,
         fixed=_names("fixed", fixed),
         prior=_gaussian(prior) if stated is None else stated,
         done=done,
-        curve=tuple(sorted({_whole("curve", n) for n in curve})),
+        curve=tuple(sorted({whole("curve", n) for n in curve})),
         notes=notes,
         pins=pins,
         doubts=doubts,
@@ -234,17 +235,17 @@ def _design_of(cell: Cell, asked: Mapping[str, Any]) -> Any:
     chosen = {key: value for key, value in asked.items() if value is not None}
     for key, least in (("poses", 1), ("candidates", 1), ("repeats", 1), ("robust_samples", 1)):
         if key in chosen:
-            chosen[key] = _whole(key, chosen[key], least)
+            chosen[key] = whole(key, chosen[key], least)
     for key, names in (
         ("criterion", tuple(CRITERIA)),
         ("prior", ("none", "typical")),
         ("robust", ("none", "average", "worst")),
     ):
         if key in chosen:
-            _one_of(key, chosen[key], names)
+            one_of(key, chosen[key], names)
     for key, zero in (("target", False), ("repeatability", True)):
         if key in chosen:
-            chosen[key] = _length(key, chosen[key], zero)
+            chosen[key] = length(key, chosen[key], zero)
     if "minutes" in chosen:
         require(
             np.isfinite(float(chosen["minutes"])) and float(chosen["minutes"]) > 0,
@@ -258,17 +259,17 @@ def _design_of(cell: Cell, asked: Mapping[str, Any]) -> Any:
             "for the number of poses; drop one"
         )
     if "loads" in chosen:
-        chosen["loads"] = _vectors("loads", chosen["loads"])
+        chosen["loads"] = vectors("loads", chosen["loads"])
     if "marker_sigma" in chosen:
         for name, value in chosen["marker_sigma"].items():
-            _one_of("marker_sigma", name, tuple(cell.tool.markers))
-            _length("marker_sigma", value)
+            one_of("marker_sigma", name, tuple(cell.tool.markers))
+            length("marker_sigma", value)
     if "levels" in chosen:
         require(len(chosen["levels"]) == 1, f"{option('levels')} takes the values of one joint")
         chosen["levels"] = {k: tuple(map(float, v)) for k, v in chosen["levels"].items()}
         chosen.setdefault("per_level", ())
     for key, other in (("elsewhere", "elsewhere_cap"), ("elsewhere_cap", "elsewhere")):
-        if key in chosen:
+        if chosen.get(key) is not None:
             share = chosen[key] = float(chosen[key])
             require(0 <= share < 1, f"{option(key)} takes a share from 0 to below 1")
             require(
@@ -277,7 +278,7 @@ def _design_of(cell: Cell, asked: Mapping[str, Any]) -> Any:
             )
             chosen.setdefault(other, None)
     motion = {
-        key: _whole(key, chosen.pop(key), 1)
+        key: whole(key, chosen.pop(key), 1)
         for key in ("load_changes", "reference_every")
         if key in chosen
     }
@@ -287,17 +288,18 @@ def _design_of(cell: Cell, asked: Mapping[str, Any]) -> Any:
         chosen["interest"] = _names("interest", chosen["interest"])
     if "test_poses" in chosen:
         poses = chosen["test_poses"]
+        require(np.ndim(poses) > 0, f"{option('test_poses')} takes joints by pose; found {poses}")
         if not all(isinstance(pose, TargetPose) for pose in poses):
             poses = [TargetPose(q) for q in np.atleast_2d(np.asarray(poses, dtype=float))]
         chosen["test_poses"] = tuple(poses)
     if isinstance(chosen.get("test_path"), str | Path):
         chosen["test_path"] = TargetPath(Path(chosen["test_path"]))
     if "test_box" in chosen and not isinstance(chosen["test_box"], TargetBox):
-        lower, upper = _vectors("test_box", chosen["test_box"])
+        lower, upper = vectors("test_box", chosen["test_box"])
         require(bool((lower < upper).all()), f"{option('test_box')} takes lower < upper corners")
         chosen["test_box"] = TargetBox(lower, upper)
     if "per_level" in chosen:
-        chosen["per_level"] = tuple(_whole("per_level", n, 1) for n in chosen["per_level"])
+        chosen["per_level"] = tuple(whole("per_level", n, 1) for n in chosen["per_level"])
     # What the cell says of the number of poses gives way to what is asked for here.
     number: dict[str, Any] = {"minutes": None} if wishes else {}
     if "poses" in chosen or "minutes" in chosen:
@@ -329,6 +331,7 @@ def _prior_of(
     return prior, (note,) if left_out else ()
 
 
+@checked_arguments
 def simulate(
     model: AnyModel,
     plan: Plan | Table | ArrayLike,
@@ -386,10 +389,10 @@ def simulated(
         f"{option('draw')} takes a factor of the typical sizes, 0 or more; found "
         + (f"{factor[()]:g}" if factor.shape == () else str(draw)),
     )
-    repeats = _whole("repeats", repeats, 1)
+    repeats = whole("repeats", repeats, 1)
     poses = _poses(made, plan)
     check_limits(made, poses)
-    rng = np.random.default_rng(_whole("seed", seed, 0))
+    rng = np.random.default_rng(seed)
     rows = expand_plan(poses, tuple(made.cell.tool.markers), repeats, force)
     drawn = draw_errors(made, float(draw), rng, rows) if draw else {}
     if values is None or isinstance(values, Mapping):
@@ -416,6 +419,7 @@ def _poses(model: Model, plan: Plan | Table | ArrayLike) -> Measurements:
     return model.read_plan(plan) if isinstance(plan, str | Path) else model.table(plan)
 
 
+@checked_arguments
 def identify(
     model: AnyModel,
     data: Table,
@@ -488,6 +492,10 @@ def identify(
     from elastocal.identification.options import Options
     from elastocal.planning.test_poses import where_used
 
+    require(
+        covariance is None or (np.ndim(covariance) == 2 and np.size(covariance) > 0),
+        f"{option('covariance')} takes a square matrix in m²; found {quoted(covariance)}",
+    )
     options = Options(
         method=method,
         noise=noise,
@@ -497,7 +505,7 @@ def identify(
         fixed=_names("fixed", fixed),
         bounded=bounded,
         faulty=outliers,
-        seed=_whole("seed", seed, 0),
+        seed=int(seed),
         jobs=jobs,
     )
     known = knowledge_of(knowledge, physical)
@@ -521,6 +529,7 @@ def identify(
     return run(made, table, options, kept_back, tell, where_used(made))
 
 
+@checked_arguments
 def diagnose(
     model: AnyModel,
     data: Table,
@@ -564,9 +573,9 @@ def diagnose(
     from elastocal.diagnosis.diagnose import DiagnosisOptions
     from elastocal.diagnosis.diagnose import diagnose as run
 
-    options = DiagnosisOptions(_whole("seed", seed, 0), _names("without", without), false_alarm)
+    options = DiagnosisOptions(seed, _names("without", without), false_alarm)
     if extra_poses is not None:
-        _whole("extra_poses", extra_poses, 1)
+        whole("extra_poses", extra_poses, 1)
     tell = progress or _silent
     tell("reading")
     made = _model(model)
@@ -578,10 +587,11 @@ def diagnose(
     from elastocal.diagnosis.extra_poses import plan_extra
 
     tell("looking for poses that tell the rivals apart")
-    extra = plan_extra(made, table, found, most=extra_poses, seed=seed, progress=tell)
+    extra = plan_extra(made, table, found, most=extra_poses, seed=int(seed), progress=tell)
     return replace(found, extra=extra)
 
 
+@checked_arguments
 def compensate(
     arm: CalibratedArm | Calibration,
     targets: Targets | str | Path | ArrayLike,
@@ -640,7 +650,7 @@ def compensate(
     )
     where = _tool_point(arm.model.cell, point)
     wanted = _targets(targets, chain.kinds, frame, force)
-    return run(arm, wanted, where, start, _whole("seed", seed, 0), progress or _silent)
+    return run(arm, wanted, where, start, seed, progress or _silent)
 
 
 def check_frame(frame: str) -> None:
@@ -680,7 +690,8 @@ def _targets(
     if found.shape in ((3,), (4, 4)):
         found = found[None]
     oriented = found.ndim == 3 and found.shape[1:] == (4, 4)
-    if not (oriented or (found.ndim == 2 and found.shape[1] == 3)) or not np.isfinite(found).all():
+    placed = oriented or (found.ndim == 2 and found.shape[1] == 3)
+    if not (placed and len(found) and np.isfinite(found).all()):
         raise InputError(
             f"{option('targets')} takes positions (n, 3) in m, poses (n, 4, 4) or a file; found an "
             f"array of shape {np.shape(targets)}"
@@ -746,46 +757,3 @@ def _names(name: str, given: str | Sequence[str]) -> tuple[str, ...]:
     for each in names:
         require(isinstance(each, str), f"{option(name)} takes names; found {quoted(each)}")
     return names
-
-
-def _whole(name: str, given: Any, least: int | None = None) -> int:
-    whole = isinstance(given, int | np.integer) and not isinstance(given, bool)
-    more = "" if least is None else f", {least} or more"
-    if whole and abs(given) > MOST:
-        more += f" and at most {MOST:,}"
-    require(
-        whole and (least is None or given >= least) and abs(given) <= MOST,
-        f"{option(name)} takes a whole number{more}; found {quoted(given)}",
-    )
-    return int(given)
-
-
-def _length(name: str, given: Any, zero: bool = False) -> float:
-    number = isinstance(given, int | float | np.number) and not isinstance(given, bool)
-    require(
-        number and np.isfinite(given) and (given > 0 or (zero and given == 0)),
-        f"{option(name)} takes a {'number, 0 or more,' if zero else 'positive number'} in m; "
-        f"found {quoted(given)}",
-    )
-    return float(given)
-
-
-def _vectors(name: str, given: Any) -> NDArray[np.float64]:
-    """(k, 3) finite numbers."""
-    try:
-        found = np.atleast_2d(np.asarray(given, dtype=float))
-    except (TypeError, ValueError):
-        found = np.zeros((1, 0))
-    require(
-        found.ndim == 2 and found.shape[1] == 3 and bool(np.isfinite(found).all()),
-        f"{option(name)} takes rows of three finite numbers; found {quoted(given)}",
-    )
-    return found
-
-
-def _one_of(name: str, given: Any, valid: Sequence[str]) -> None:
-    require(
-        given in valid,
-        f"{option(name)} {quoted(given)} is unknown{did_you_mean(str(given), valid)}; there are "
-        f"{listed(valid)}",
-    )

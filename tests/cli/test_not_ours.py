@@ -42,7 +42,7 @@ def test_what_was_put_among_a_designs_own_stays(cell: Path) -> None:
     assert [path.name for path in folder.parent.iterdir()] == ["0" * 32]
 
 
-@pytest.mark.parametrize("text", [MINE, "[]", '{"schema": "elastocal/identification/1"}'])
+@pytest.mark.parametrize("text", [MINE, "[]", '{"schema": "mine/1"}'])
 def test_a_file_where_the_summary_of_a_plan_goes(cell: Path, text: str) -> None:
     own = cell.parent / "plan.json"
     own.write_text(text)

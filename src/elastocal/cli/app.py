@@ -123,7 +123,7 @@ Quiet = Annotated[bool, typer.Option("--quiet", "-q", help="No progress.")]
 Plugins = Annotated[
     bool, typer.Option("--plugins", help="Run the Python code that the cell names in [plugins].")
 ]
-Seed = Annotated[int, typer.Option(min=0, help="Seed of all random draws.")]
+Seed = Annotated[int, typer.Option(min=0, max=2**63 - 1, help="Seed of all random draws.")]
 
 
 def command(*name: str, **how: Any) -> Callable[[Callable[..., None]], Callable[..., None]]:

@@ -24,6 +24,7 @@ from numpy.typing import ArrayLike, NDArray
 from scipy import special
 
 from elastocal.above import Result
+from elastocal.arguments import checked_arguments
 from elastocal.cell.arm_description import Tool
 from elastocal.errors import InputError, InsufficientDataError, option, require
 from elastocal.identification.result import Calibration
@@ -41,6 +42,7 @@ SAME_SPACE = 1e-6  # of a column of B that others should hold
 RANK = 1e-9
 CENTRAL = 0.95
 POINT = "tool"
+MOST_POSES = 100_000
 
 
 @dataclass(frozen=True)
@@ -154,6 +156,7 @@ class Comparison(Result):
         }
 
 
+@checked_arguments
 def compare(
     old: CalibratedArm | Calibration,
     new: CalibratedArm | Calibration,
@@ -190,9 +193,10 @@ def compare(
         'no_change_shown'
     """
     before, after = given_arm("old", old), given_arm("new", new)
-    for name, count, least in (("poses", poses, 2), ("seed", seed, 0)):
-        whole = isinstance(count, int | np.integer) and not isinstance(count, bool)
-        require(whole and count >= least, f"{option(name)} takes a whole number, {least} or more")
+    require(
+        2 <= poses <= MOST_POSES,
+        f"{option('poses')} takes a whole number from 2 to {MOST_POSES}; found {poses}",
+    )
     require(0 < level < 1, f"{option('level')} takes a number between 0 and 1; found {level}")
     loads = _loads(before, after, given_force(load))
     return _compared(before, after, *loads, float(level), int(poses), int(seed))

@@ -17,6 +17,7 @@ from typing import Any, Literal
 import numpy as np
 
 from elastocal.above import Result
+from elastocal.arguments import checked_arguments
 from elastocal.cell.work_cell import Cell
 from elastocal.diagnosis.diagnose import FEWEST, DiagnosisOptions, diagnose
 from elastocal.diagnosis.diagnosis import Diagnosis, FoundEffect
@@ -94,6 +95,7 @@ class NextPoses(Result):
         }  # fmt: skip
 
 
+@checked_arguments
 def next_poses(
     model: Model | Cell | str | Path,
     data: Measurements | str | Path,

@@ -14,6 +14,7 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from elastocal.above import Saved
+from elastocal.arguments import checked_arguments
 from elastocal.errors import InputError, option
 from elastocal.files import read_json
 from elastocal.model.chain import Chain
@@ -141,6 +142,7 @@ class CalibratedArm(Saved):
         """Name → value in SI units."""
         return dict(zip(self.model.names, map(float, self.x), strict=True))
 
+    @checked_arguments
     def pose(self, q: ArrayLike, force: ArrayLike | None = None) -> NDArray:
         """The flange's pose in the data's frame, deflections included.
 
@@ -203,6 +205,7 @@ def lasting(arm: CalibratedArm) -> tuple[CalibratedArm, tuple[str, ...]]:
     ), tuple(gone)  # fmt: skip
 
 
+@checked_arguments
 def read_calibrated(
     cell_path: str | Path, result_path: str | Path, plugins: bool = False
 ) -> CalibratedArm:

@@ -10,9 +10,10 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
+from elastocal.arguments import checked_arguments
 from elastocal.cell.arm_description import EffectChoice, ModelSpec
 from elastocal.cell.work_cell import Cell
-from elastocal.errors import InputError, require
+from elastocal.errors import InputError, option, require
 from elastocal.measurements import DEFAULT_MARKER, Measurements, read_measurements, read_plan
 from elastocal.model.arm import Parameter, row_inputs
 from elastocal.model.chain import Chain
@@ -83,6 +84,7 @@ class Model:
         (810, 10)
     """
 
+    @checked_arguments
     def __init__(
         self,
         cell: Cell | str | Path,
@@ -129,6 +131,7 @@ class Model:
             f"{len(self.parameters)} parameters of {effects}; observes {self.observe}>"
         )
 
+    @checked_arguments
     def read(self, path: str | Path) -> Measurements:
         """The measurements of a CSV or Parquet file, in SI units.
 
@@ -149,6 +152,7 @@ class Model:
             path, joint_kinds=self.chain.kinds, marker_names=markers, observe=self.observe
         )
 
+    @checked_arguments
     def read_plan(self, path: str | Path) -> Measurements:
         """The poses of a plan, a row each; forces (N) where it states them.
 
@@ -165,6 +169,7 @@ class Model:
         markers = tuple(self.cell.tool.markers) if self._markers_stated else ()
         return read_plan(path, joint_kinds=self.chain.kinds, marker_names=markers)
 
+    @checked_arguments
     def table(
         self, q: ArrayLike, force: ArrayLike | None = None, position: ArrayLike | None = None
     ) -> Measurements:
@@ -184,10 +189,12 @@ class Model:
             >>> model.deflection(table).shape
             (1, 6)
         """
-        joints = np.atleast_2d(np.asarray(q, dtype=float))
+        joints = np.atleast_2d(
+            np.array(q, dtype=float)
+        )  # what the caller does to q later is not ours
         n = len(joints)
         require(
-            joints.shape == (n, self.chain.n_joints),
+            n > 0 and joints.shape == (n, self.chain.n_joints),
             f"q takes {self.chain.n_joints} joints per row; found an array of shape {np.shape(q)}",
         )
         pull = np.zeros(3) if force is None else _rows_of_three("force", force, n)
@@ -197,6 +204,7 @@ class Model:
             "table", joints, pull, marker, position=place, joint_kinds=self.chain.kinds
         )
 
+    @checked_arguments
     def pose(
         self, q: ArrayLike, x: ArrayLike | None = None, force: ArrayLike | None = None
     ) -> NDArray:
@@ -218,7 +226,7 @@ class Model:
             >>> ec.Model("cell.toml").pose([0.0, -1.0, 1.0, 0.0, 0.5, 0.0]).shape
             (4, 4)
         """
-        poses = self.flange_poses(self.table(q, force), None if x is None else np.asarray(x))
+        poses = self.flange_poses(self.table(q, force), self._at(x))
         return poses[0] if np.ndim(q) == 1 else poses
 
     def with_markers_of(self, *tables: Measurements) -> Model:
@@ -303,6 +311,7 @@ class Model:
         motion = JointMotion()
         return self._with(spec, [(motion, w) for w in motion.places(self.chain, self.cell)])
 
+    @checked_arguments
     def deflection(self, table: Measurements, x: Array | None = None) -> NDArray:
         """Elastic deflections θ at static equilibrium.
 
@@ -320,14 +329,32 @@ class Model:
             >>> bool(abs(model.deflection(loaded)).max() < 0.01)
             True
         """
-        x = self.nominal if x is None else np.asarray(x)
+        x = self._at(x)
         return self._settle(row_inputs(self._symbolic.arm, table), x)
+
+    def _at(self, x: ArrayLike | None, several: bool = False) -> NDArray:
+        """Parameter values (parameters,), the nominal ones by default; or `several` (k, …)."""
+        if x is None:
+            return self.nominal
+        values = np.asarray(x)
+        require(
+            (
+                values.shape[-1:] == (len(self.parameters),)
+                and 0 < values.ndim <= 1 + several
+                and values.size > 0
+            )
+            or not self.parameters,
+            f"{option('x')} takes {len(self.parameters)} numbers, one for each parameter; found "
+            f"an array of shape {values.shape}",
+        )
+        return values
 
     def _settle(self, inputs: list[NDArray], x: NDArray) -> NDArray:
         if not self._symbolic.implicit:
             return np.zeros((len(inputs[0]), len(self._symbolic.arm.springs)), dtype=x.dtype)
         return self._symbolic.equilibrium.solve(inputs, x)[0]
 
+    @checked_arguments
     def predict(
         self, table: Measurements, x: Array | None = None, observations: Observations | None = None
     ) -> NDArray:
@@ -348,7 +375,7 @@ class Model:
             >>> model.predict(model.read("data.csv")).shape
             (810,)
         """
-        x = self.nominal if x is None else np.asarray(x)
+        x = self._at(x, several=True)
         inputs = row_inputs(self._symbolic.arm, table)
         observed = observations or observe(table, self.observe)
         if x.ndim == 2:
@@ -369,6 +396,7 @@ class Model:
         (h,) = symbolic.function("reading")(*rows, np.repeat(several, n, axis=0), theta)
         return h.reshape(k, n, -1)
 
+    @checked_arguments
     def B(self, table: Measurements, x: Array | None = None) -> NDArray:
         """The regressor B = ∂prediction/∂X (eq. 4 of Klimchik et al. 2013) of a whole table.
 
@@ -402,7 +430,7 @@ class Model:
         `columns` selects parameters by index (default all).  Raises InputError where the table
         lacks a column the model needs, ElastocalError where a pose has no static equilibrium.
         """
-        x = self.nominal if x is None else np.asarray(x)
+        x = self._at(x)
         chosen = tuple(range(len(x))) if columns is None else tuple(int(c) for c in columns)
         observed = observations or observe(table, self.observe)
         h, B = self._symbolic.regressor(row_inputs(self._symbolic.arm, table), x, columns=chosen)
@@ -421,7 +449,7 @@ class Model:
         return rotation, position[..., 0]
 
     def _frames(self, table: Measurements, x: Array | None) -> list[NDArray]:
-        x = self.nominal if x is None else np.asarray(x)
+        x = self._at(x)
         inputs = row_inputs(self._symbolic.arm, table)
         return self._symbolic.function("frames")(*inputs, x, self._settle(inputs, x))
 

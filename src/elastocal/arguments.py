@@ -1,0 +1,258 @@
+"""What the functions of the front door take: their arguments checked by their annotations.
+
+    @checked_arguments
+    def compare(old: CalibratedArm, *, level: float = 0.05, poses: int = 300, seed: int = 0): ...
+
+An annotation names kinds, `A | B`: of each that is known here it is checked whether a value is one,
+and a value that is none is an InputError that names the argument.  What a value means (a marker
+that is there, a share below 1) is for the function itself.
+"""
+
+from __future__ import annotations
+
+import functools
+import inspect
+import re
+from collections.abc import Callable, Collection, Mapping, Sequence
+from pathlib import Path
+from typing import Any, TypeVar
+
+import numpy as np
+from numpy.typing import NDArray
+
+from elastocal.above import Saved
+from elastocal.errors import InputError, option, require
+from elastocal.text import did_you_mean, listed, quoted
+
+MOST = 10_000_000  # of anything that is counted: more is a slip of the key
+# No length, angle, force, stiffness or compliance in SI units is as large; squares and products of
+# several such numbers are still numbers.
+LARGEST = 1e30
+LARGEST_SEED = 2**63 - 1  # as far as whole numbers of files go
+F = TypeVar("F", bound=Callable[..., Any])
+
+Check = Callable[[Any], bool]
+
+
+def _array(value: Any) -> bool:
+    """Numbers, or what numpy makes numbers of, of any shape; not what it reads of a text."""
+    try:
+        numbers = np.asarray(value)
+        if numbers.dtype == object:
+            numbers = np.asarray(value, dtype=float)
+    except (TypeError, ValueError):
+        return False
+    return numbers.dtype.kind in "iuf" and bool((np.abs(numbers) <= LARGEST).all())
+
+
+def _values(value: Any) -> bool:
+    """Numbers; whether they can be computed with is for what computes with them."""
+    return np.asarray(value).dtype.kind in "iufc"
+
+
+def _whole(value: Any) -> bool:
+    return isinstance(value, int | np.integer) and not isinstance(value, bool)
+
+
+def _number(value: Any) -> bool:
+    kind = isinstance(value, int | float | np.integer | np.floating)
+    return kind and not isinstance(value, bool) and bool(abs(value) <= LARGEST)
+
+
+def _path(value: Any) -> bool:
+    return isinstance(value, Path) or (isinstance(value, str) and bool(value))
+
+
+def _list_of(check: Check) -> Check:
+    def checked(value: Any) -> bool:
+        listed = isinstance(value, Collection | np.ndarray) and not isinstance(value, str | bytes)
+        return listed and np.ndim(value) <= 1 and all(map(check, value))
+
+    return checked
+
+
+def _table_of(key: Check, check: Check) -> Check:
+    def checked(value: Any) -> bool:
+        return isinstance(value, Mapping) and all(key(k) and check(v) for k, v in value.items())
+
+    return checked
+
+
+def _text(value: Any) -> bool:
+    return isinstance(value, str)
+
+
+def _texts(value: Any) -> bool:
+    return isinstance(value, tuple) and all(map(_text, value))
+
+
+def _two(value: Any) -> bool:
+    return isinstance(value, Sequence | np.ndarray) and len(value) == 2 and all(map(_array, value))
+
+
+def _filled(value: Any) -> bool:
+    return _array(value) and np.ndim(value) == 1 and np.size(value) > 0
+
+
+# Kind as it is annotated → how a message names it, and whether a value is one.  Names that are not
+# here are classes; a value is one by the name of its own.
+KINDS: dict[str, tuple[str, Check]] = {
+    "int": (f"a whole number of at most {MOST:,}", lambda v: _whole(v) and abs(v) <= MOST),
+    "float": ("a finite number", _number),
+    "bool": ("True or False", lambda v: isinstance(v, bool | np.bool_)),
+    "str": ("a text", _text),
+    "Path": ("a path", _path),
+    "ArrayLike": ("finite numbers", _array),
+    "Array": ("numbers", _values),
+    "Sequence[int]": ("a list of whole numbers", _list_of(lambda v: _whole(v) and abs(v) <= MOST)),
+    "Sequence[str]": ("a list of names", _list_of(_text)),
+    "Sequence[TargetPose]": (
+        "a list of TargetPose",
+        _list_of(lambda v: type(v).__name__ == "TargetPose"),
+    ),
+    "Mapping[str, float]": ("numbers by name", _table_of(_text, _number)),
+    "Mapping[str, Sequence[float]]": ("a list of numbers by name", _table_of(_text, _filled)),
+    "Mapping[tuple[str, str], float]": (
+        "numbers by effect and place",
+        _table_of(_texts, _number),
+    ),
+    "tuple[ArrayLike, ArrayLike]": ("two corners", _two),
+    "Progress": ("a function", callable),
+    "None": ("None", lambda v: v is None),
+}  # fmt: skip
+CLASSES = {"a path"}  # words for what a function tells apart itself
+ALIASES = {
+    "AnyModel": "Model | Cell | str | Path",
+    "Table": "Measurements | str | Path",
+    "Prior": "Mapping | GaussianPrior",
+    **dict.fromkeys(
+        ("Effort", "Method", "WeightKind", "IntervalKind", "FaultyReadings", "Convention"), "str"
+    ),
+}
+SEED = (f"a whole number from 0 to {LARGEST_SEED}", lambda v: _whole(v) and 0 <= v <= LARGEST_SEED)
+
+
+def checked_arguments(function: F) -> F:
+    """The function, whose arguments are checked by its annotations before it runs.
+
+    Raises InputError that names the argument, what it takes and what was found.
+    """
+    signature = inspect.signature(function)
+    kinds = {
+        name: [SEED] if name == "seed" else [_kind(text) for text in _parts(parameter.annotation)]
+        for name, parameter in signature.parameters.items()
+        if isinstance(parameter.annotation, str) and name != "self"
+    }
+
+    def check(given: Mapping[str, Any], names: Collection[str]) -> None:
+        for name in names:
+            if name in given and not any(fits(given[name]) for _, fits in kinds[name]):
+                takes = " or ".join(dict.fromkeys(words for words, _ in kinds[name]))
+                raise InputError(f"{option(name)} takes {takes}; found {_shown(given[name])}")
+
+    # What may be one of several classes the function tells apart itself, and says it better.
+    simple = [
+        name
+        for name, known in kinds.items()
+        if name != "load" and sum(words in CLASSES for words, _ in known) < 2
+    ]
+
+    @functools.wraps(function)
+    def run(*args: Any, **kwargs: Any) -> Any:
+        given = signature.bind(*args, **kwargs).arguments
+        check(given, simple)
+        try:
+            return sealed(function(*args, **kwargs))
+        except (TypeError, ValueError, AttributeError, LookupError, ArithmeticError):
+            check(given, kinds)
+            raise
+
+    return run  # type: ignore[return-value]
+
+
+def sealed(result: Any) -> Any:
+    """A result whose arrays, and those of the calibrated arm in it, nobody can write into: what it
+    says of itself, and what follows from it, would no longer be what was found."""
+    if isinstance(result, Saved) and type(result).__name__ != "Measurements":
+        for name, value in vars(result).items():
+            if isinstance(value, np.ndarray):
+                view = value.view()
+                view.flags.writeable = False
+                object.__setattr__(result, name, view)
+            else:
+                sealed(value)
+    return result
+
+
+def _parts(annotation: str) -> list[str]:
+    """The members of a union, aliases resolved; a Literal is a text, which the function checks."""
+    found: list[str] = []
+    for part in re.split(r" \| (?![^\[]*\])", annotation.strip("\"'")):
+        part = "str" if part.startswith("Literal[") else part
+        found += _parts(ALIASES[part]) if part in ALIASES else [part]
+    return found
+
+
+def _kind(name: str) -> tuple[str, Check]:
+    def of_class(value: Any) -> bool:
+        return any(each.__name__ == name for each in type(value).__mro__) or (
+            name == "Mapping" and isinstance(value, Mapping)
+        )
+
+    if name not in KINDS:
+        CLASSES.add(f"a {name}")
+    return KINDS.get(name, (f"a {name}", of_class))
+
+
+def _shown(value: Any) -> str:
+    """A value as a message shows it: numbers and texts themselves, all else by its type."""
+    if value is None or isinstance(value, str | int | float | np.number | list | tuple | Mapping):
+        return quoted(value)
+    shape = np.shape(value) if isinstance(value, np.ndarray) else ()
+    return f"{type(value).__name__}{f' of shape {shape}' if shape else ''}"
+
+
+def whole(name: str, given: Any, least: int | None = None) -> int:
+    """A whole number, `least` or more.  Raises InputError that names the argument."""
+    whole = isinstance(given, int | np.integer) and not isinstance(given, bool)
+    more = "" if least is None else f", {least} or more"
+    if whole and abs(given) > MOST:
+        more += f" and at most {MOST:,}"
+    require(
+        whole and (least is None or given >= least) and abs(given) <= MOST,
+        f"{option(name)} takes a whole number{more}; found {quoted(given)}",
+    )
+    return int(given)
+
+
+def length(name: str, given: Any, zero: bool = False) -> float:
+    """A positive number in m, 0 too where `zero`.  Raises InputError that names the argument."""
+    number = isinstance(given, int | float | np.number) and not isinstance(given, bool)
+    require(
+        number and np.isfinite(given) and (given > 0 or (zero and given == 0)),
+        f"{option(name)} takes a {'number, 0 or more,' if zero else 'positive number'} in m; "
+        f"found {quoted(given)}",
+    )
+    return float(given)
+
+
+def vectors(name: str, given: Any) -> NDArray[np.float64]:
+    """(k, 3) finite numbers.  Raises InputError that names the argument."""
+    try:
+        found = np.atleast_2d(np.asarray(given, dtype=float))
+    except (TypeError, ValueError):
+        found = np.zeros((1, 0))
+    require(
+        found.ndim == 2 and found.shape[1] == 3 and bool(np.isfinite(found).all()),
+        f"{option(name)} takes rows of three finite numbers; found {quoted(given)}",
+    )
+    return found
+
+
+def one_of(name: str, given: Any, valid: Sequence[str]) -> None:
+    """Raise InputError where a text is none of the `valid` ones."""
+    require(
+        given in valid,
+        f"{option(name)} {quoted(given)} is unknown{did_you_mean(str(given), valid)}; there are "
+        f"{listed(valid)}",
+    )
