@@ -112,7 +112,7 @@ def test_files_beside_it_are_unloaded_and_what_states_no_size_is_told(tmp_path):
     rows = table(tmp_path / "data.csv")
     assert {float(row["force_z_N"]) for row in rows} == {0.0, -2600.0}
     done = run(tmp_path / "loaded.csv", "--preset", "wide", "-o", tmp_path / "data.csv")
-    assert "named for a load of no stated size" in done.output
+    assert "named for a load that is not taken" in done.output
     done = run(tmp_path / "unloaded.csv", "--preset", "wide", "-o", tmp_path / "data.csv")
     assert "named for a load" not in done.output
 
@@ -126,3 +126,17 @@ def test_what_the_mapping_says_of_loads_counts_before_a_name(tmp_path):
     done = run(file, "--map", tmp_path / "map.toml", "-o", tmp_path / "data.csv")
     assert done.exit_code == 0 and "by its name" not in done.output
     assert {float(row["force_z_N"]) for row in table(tmp_path / "data.csv")} == {-2000.0}
+
+
+def test_a_column_of_payloads_is_a_load_and_one_that_is_not_read_is_told(tmp_path):
+    rows = ["q1_deg,q2_deg,payload_kg,M1_x_mm,M1_y_mm,M1_z_mm", "1,2,0,3,4,5", "6,7,2.5,8,9,10"]
+    (tmp_path / "log.csv").write_text("\n".join(rows) + "\n")
+    done = run(tmp_path / "log.csv", "--preset", "wide", "-o", tmp_path / "data.csv")
+    assert done.exit_code == 0, done.output
+    forces = [float(row["force_z_N"]) for row in table(tmp_path / "data.csv")]
+    assert forces == pytest.approx([0.0, -2.5 * 9.80665])
+    (tmp_path / "map.toml").write_text(
+        '[[source]]\n[source.columns]\n"q#_deg" = "q#"\nx_mm = "*_x"\ny_mm = "*_y"\nz_mm = "*_z"\n'
+    )
+    done = run(tmp_path / "log.csv", "--map", tmp_path / "map.toml", "-o", tmp_path / "data.csv")
+    assert done.exit_code == 0 and "column payload_kg of" in done.output

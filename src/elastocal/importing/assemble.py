@@ -63,7 +63,8 @@ def forces_of(
 ) -> NDArray[np.float64] | None:
     """(n, 3) N in the tracker's frame (z up) for each point; None where no load is told.
 
-    A mass m hangs straight down: force (0, 0, -9.80665 m).  The names none, unloaded and 0 mean no
+    A mass m hangs straight down: force (0, 0, -9.80665 m); so does a load whose name is a size, as
+    "2600 N" or "2.5 kg", unless [loads] has it.  The names none, unloaded and 0 mean no
     force unless [loads] says otherwise.  Raises InputError for a load that [loads] does not have,
     and where loads are told both by name and in columns.
     """
@@ -85,6 +86,8 @@ def forces_of(
             stated = np.array([0.0, 0.0, -stated.mass_kg * GRAVITY])
         known[name] = stated + 0.0  # no -0.0
     for i, name in enumerate(named):
+        if name not in known and (size := load_in(name)):
+            known[name] = np.array([0.0, 0.0, 0.0 - size[1]])
         if name not in known:
             raise InputError(
                 f"{points.where(i)}: load {quoted(name)} is not in [loads] of {where}"
@@ -104,9 +107,9 @@ _WORD = re.compile(r"(?<!un)(?<!no)(?<!without)[ _-]?(?:pay)?load(?:ed)?(?![a-z]
 _NEWTONS = {"kg": GRAVITY, "kn": 1e3, "n": 1.0}
 
 
-def load_of_name(path: str) -> tuple[str, float] | None:
-    """The load that a file's name states, as it is written and in N; None where none is."""
-    found = _SIZE.search(Path(path).stem)
+def load_in(text: str) -> tuple[str, float] | None:
+    """The load that a text states, as it is written and in N; None where none is."""
+    found = _SIZE.search(text)
     if found is None:
         return None
     size = float(re.sub("[,p]", ".", found[1]))
@@ -125,13 +128,20 @@ def with_loads_of_names(
     stated = any(r.load is not None or "load" in r.labels for r in every)
     if loads or stated or any("force_x" in r.numbers for r in every):
         return dict(records), dict(loads or {}) or None, []
-    named = {id(r): load_of_name(r.source) for r in every}
+    named = {id(r): load_in(Path(r.source).stem) for r in every}
     known = {found[0]: found[1] for found in named.values() if found}
     if not known:
         told = [r.source for r in every if _WORD.search(Path(r.source).stem)]
+        told += [
+            f"column {name} of {r.source}"
+            for r in every
+            for name in r.understood.unused
+            if _WORD.search(name)
+        ]
         return dict(records), None, [
-            f"{listed(told)}: named for a load of no stated size, and its rows are written "
-            "unloaded; state it by load in [[source]] and [loads]"
+            f"{listed(told)}: named for a load that is not taken, and the rows are written "
+            "unloaded; state it by load in [[source]] and [loads], or by load = \"…\" in "
+            "[source.columns]"
         ] if told else []  # fmt: skip
     made = {}
     for role, files in records.items():

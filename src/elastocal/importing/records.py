@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import re
 from collections.abc import Sequence
 from dataclasses import dataclass, field, replace
 from pathlib import Path
@@ -45,6 +46,7 @@ from elastocal.units import Array, IntArray, convert
 
 MAX_ROWS = 2_000_000
 DECIMAL_SAMPLE = 2000
+UNIT_OF_LOAD = r"[ _([](kg|kN|N)[])]?$"  # payload_kg, Load [N]: its cells are sizes
 
 
 @dataclass(frozen=True)
@@ -243,6 +245,8 @@ class _Reader:
         self.textual = [c for c in columns if c.target.is_text]
         self.values: list[list[float]] = [[] for _ in self.numeric]
         self.texts: list[list[str]] = [[] for _ in self.textual]
+        loads = (re.search(UNIT_OF_LOAD, c.header) for c in columns if c.target.stem == "load")
+        self.load_unit = next((found[1] for found in loads if found), "")
         self.widest = max(columns, key=lambda c: max(c.index))
 
     def add(self, number: int, row: list[str]) -> None:
@@ -267,7 +271,10 @@ class _Reader:
             values.append(value)
         for texts, place in zip(self.texts, self.textual, strict=True):
             glue = " " if place.target.stem == "time_text" else "::"
-            texts.append(glue.join(row[i].strip() for i in place.index))
+            text = glue.join(row[i].strip() for i in place.index)
+            if place.target.stem == "load" and re.fullmatch(r"[\d.,]+", text):
+                text = f"{text} {self.load_unit}".strip()
+            texts.append(text)
         self.line.append(number)
 
     def records(self, understood: Understood, source: SourceTable) -> Records:
