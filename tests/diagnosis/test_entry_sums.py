@@ -7,7 +7,7 @@ import pytest
 from scipy.special import logsumexp
 from support.diagnosis_data import random_blocks, random_data
 
-from elastocal.diagnosis import EntrySums, NoiseValues, VisitPlaces, direct, project
+from elastocal.diagnosis import EntrySums, Flips, NoiseValues, VisitPlaces, direct, project
 
 NOISE = NoiseValues(1.1, np.array([4e-6, 9e-6, 1e-5]), np.full(3, 0.5))
 SEEDS = range(4)
@@ -49,8 +49,8 @@ def test_driven_groups_are_groups_of_the_columns_they_stand_for(seed: int, d: in
     D = rng.normal(size=(C, v, d, 5, k))
     D[:, :, :, 3] = 0.0
     D[:, :, :, 4] = D[:, :1, :, 4]
-    signs = rng.choice([-1.0, 1.0], (4, C))
-    entry = EntrySums.of(E, places, at, signs)
+    turned = Flips(rng.choice([-1.0, 1.0], (4, C)), at.scattered)
+    entry = EntrySums.of(E, places, at, turned)
     found = entry.driven(D)
     flips = found.flipped(np.zeros((5, 1)))
     weights = rng.normal(size=5)
@@ -58,7 +58,7 @@ def test_driven_groups_are_groups_of_the_columns_they_stand_for(seed: int, d: in
     np.testing.assert_allclose(found.flipped(weights[None])[0], together, atol=1e-9)
     for g in range(5):
         columns = np.einsum("cmd,cmv,cvdk->cmk", E, places.one_hot, D[:, :, :, g])
-        expected = direct(columns, at, signs)
+        expected = direct(columns, at, turned)
         np.testing.assert_allclose(
             found.lam[g], expected.lam[0], rtol=1e-8, atol=1e-9 * found.lam[g].max()
         )

@@ -10,7 +10,15 @@ from scipy import stats
 from scipy.special import logsumexp
 from support.diagnosis_data import dense_noise, random_data, used_rows
 
-from elastocal.diagnosis import NoiseValues, NoisyData, direct, evidence_of, exceedance, project
+from elastocal.diagnosis import (
+    Flips,
+    NoiseValues,
+    NoisyData,
+    direct,
+    evidence_of,
+    exceedance,
+    project,
+)
 from elastocal.diagnosis.diagnosis import SMALLEST_P
 from elastocal.diagnosis.evidence import SCALES, _principal
 
@@ -77,13 +85,13 @@ def test_flipped_configurations_are_flipped_residuals_projected_anew(seed: int) 
     data = random_data(seed)
     C, at = group(data, seed), project(data, NOISE)
     signs = np.random.default_rng(seed).choice([-1.0, 1.0], (6, len(data.r)))
-    found = direct(C, at, signs).flipped(np.zeros((1, 1)))[0]
+    found = direct(C, at, Flips(signs, at.scattered)).flipped(np.zeros((1, 1)))[0]
     rows = used_rows(data)
     X, c = (a.reshape(-1, a.shape[2])[rows] for a in (data.X, C))
     inverse = np.linalg.inv(dense_noise(data, NOISE))
     M = X.T @ inverse @ X + np.diag(data.precision)
     P = inverse - inverse @ X @ np.linalg.solve(M, X.T @ inverse)
-    e = (np.linalg.inv(at.inverse) @ at.spread[0][..., None]).ravel()[rows]
+    e = at.scattered.ravel()[rows]
     lam, U = np.linalg.eigh(c.T @ P @ c)
     each = np.repeat(signs, data.r.shape[1], axis=1)[:, rows]
     beta = np.array([U.T @ c.T @ P @ (d * e) for d in each])

@@ -10,6 +10,7 @@ from support.diagnosis_data import campaign
 
 from elastocal.diagnosis import (
     DiagnosisData,
+    Flips,
     Grams,
     Hypothesis,
     NoiseValues,
@@ -56,12 +57,13 @@ def test_every_setting_scores_as_the_columns_it_stands_for(
     at = project(made().data, NOISE)
     signs = np.random.default_rng(1).choice([-1.0, 1.0], (5, len(made().blocks.member)))
     h = hypothesis(name)
-    found = Grams(unused(), made().data, at, signs).of(h)
+    turned = Flips(signs, at.scattered)
+    found = Grams(unused(), made().data, at, turned).of(h)
     values = made().grids[h.name, h.where].values
     assert len(found.lam) == len(values)
     flips = found.flipped(np.zeros((len(values), 1)))
     for k in range(0, len(values), max(len(values) // 7, 1)):
-        expected = direct(made().data.masked(made().packed(h, values[k])), at, signs)
+        expected = direct(made().data.masked(made().packed(h, values[k])), at, turned)
         np.testing.assert_allclose(found.evidence()[k], expected.evidence()[0], atol=1e-6)
         np.testing.assert_allclose(flips[k], expected.flipped(np.zeros((1, 1)))[0], atol=1e-6)
 

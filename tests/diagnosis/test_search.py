@@ -12,6 +12,7 @@ from support.diagnosis_data import campaign
 
 from elastocal.diagnosis import (
     DiagnosisData,
+    Flips,
     ForwardSelection,
     Hypothesis,
     Item,
@@ -125,24 +126,23 @@ def test_scores_of_a_scan_count_from_the_set_under_its_noise() -> None:
     dataset = noisy(5)
     nothing = fit_set(dataset, ())
     prior = log_prior_odds(dataset.hypotheses, [])
-    observed = scan(dataset, [], prior, nothing.data, nothing.noise, np.zeros((0, 24)))
+    observed = scan(dataset, [], prior, nothing.data, nothing.noise)
     assert base_score(dataset, nothing, observed) == pytest.approx(nothing.score, abs=1e-6)
-    worse = scan(dataset, [], prior, nothing.data, NOISE, np.zeros((0, 24)))
+    worse = scan(dataset, [], prior, nothing.data, NOISE)
     assert base_score(dataset, nothing, worse) < nothing.score + 0.5
 
 
 def test_a_set_is_scanned_once_under_one_noise() -> None:
-    """With flips holds what is asked for without them, and not the other way round."""
     dataset = noisy(5)
     search, nothing = ForwardSelection(dataset, [], NOISE, 0.05, 0), fit_set(dataset, ())
     plain = search._scan(nothing, NOISE)
     assert search._scan(nothing, NOISE) is plain and len(plain.flipped) == 0
-    flipped = search._scan(nothing, NOISE, flips=True)
-    assert len(flipped.flipped) == FLIPS and search._scan(nothing, NOISE) is flipped
+    flipped = search._scan(nothing, NOISE, nothing)
+    assert len(flipped.flipped) == FLIPS
     assert [s.evidence for s in plain.scored] == [s.evidence for s in flipped.scored]
-    assert search._scan(nothing) is not flipped
+    assert search._scan(nothing) is not plain
     other = fit_set(dataset, (item(*BEND),), NOISE)
-    assert search._scan(other, NOISE).odds != flipped.odds
+    assert search._scan(other, NOISE).odds != plain.odds
 
 
 def test_the_odds_of_all_are_the_prior_mean_of_each() -> None:
@@ -150,7 +150,8 @@ def test_the_odds_of_all_are_the_prior_mean_of_each() -> None:
     blocks = generic_blocks(dataset)
     prior = log_prior_odds(dataset.hypotheses, blocks)
     signs = np.ones((1, 24))
-    observed = scan(dataset, blocks, prior, dataset.data, NOISE, signs)
+    flips = Flips(signs, project(dataset.data, NOISE).scattered)
+    observed = scan(dataset, blocks, prior, dataset.data, NOISE, flips)
     weights = np.exp(prior)
     each = np.exp([s.evidence for s in observed.scored])
     assert observed.odds == pytest.approx(np.log(weights @ each / weights.sum()))

@@ -22,7 +22,7 @@ ROOMS = {
         "Discrimination VisitPool campaign_of joined load_forces rows_of visit_pool_of"
     ),
     "effect_search": "ForwardSelection SelectedEffects Slot base_score is_far relinearised",
-    "evidence": "EntrySums Grams Scan direct evidence_of exceedance log_prior_odds scan",
+    "evidence": "EntrySums Flips Grams Scan direct evidence_of exceedance log_prior_odds scan",
     "extra_poses": "expected expected_of_random fewest measuring_order plan_extra",
     "hypotheses": (
         "Hypothesis SettingsGrid change_times compute_columns grid_of judged_together model_keys "

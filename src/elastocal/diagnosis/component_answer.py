@@ -23,6 +23,7 @@ from elastocal.diagnosis.components import (
     side_by_side,
 )
 from elastocal.diagnosis.diagnosis import (
+    LARGE,
     ComponentShare,
     Curve,
     EffectAt,
@@ -54,7 +55,6 @@ NAMED = 0.9  # probability from which a named effect needs no rivals beside it
 CHANCE = 0.05  # probability from which a rival is told
 TOLD = 0.02  # share of the gap from which it matters which of several effects it is
 SLIGHT = 0.01  # of the gap's rms: what moves the markers by less is next to nothing
-LARGE = 0.1  # share of the gap from which what has no name leaves the verdict open
 
 
 @dataclass(frozen=True)

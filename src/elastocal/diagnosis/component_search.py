@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections import Counter, defaultdict
-from collections.abc import Mapping, Sequence
+from collections.abc import Container, Mapping, Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property
 
@@ -51,9 +51,9 @@ from elastocal.diagnosis.noise_floor import (
     project,
 )
 from elastocal.model.effects.base import index
-from elastocal.model.effects.gears import GearSpectrum
+from elastocal.model.effects.gears import GearRipple, GearSpectrum
 from elastocal.model.effects.gravity_sag import GravitySag, LinkWeights
-from elastocal.model.effects.smooth import JointCurve
+from elastocal.model.effects.smooth import JointCurve, ResidualField
 from elastocal.units import Array, IntArray, Progress
 
 # Nats by which a sum must be more probable than what the forward search found; and those that its
@@ -80,23 +80,27 @@ class TriedComponents:
 
 
 def search_components(
-    dataset: DiagnosisData, chosen: ModelSet, progress: Progress = lambda message: None
-) -> tuple[DiagnosisData, FittedSum, tuple[Component, ...]] | None:
+    dataset: DiagnosisData, chosen: ModelSet, without: Container[str] = (),
+    progress: Progress = lambda message: None,
+) -> tuple[DiagnosisData, FittedSum, tuple[Component, ...]] | None:  # fmt: skip
     """The most probable sum beside the fitted parameters, the data with all its columns, and what
     may be there as well though these data do not show it.
 
     `chosen` is what the forward search found: its searched constants are tried as they are.  None
-    where it has names and all else beside it does not promise that a sum is CLEARLY better.
+    where it has names and all else beside it does not promise that a sum is CLEARLY better.  None
+    of the effects `without` is in it.
     """
-    full = _with_together(dataset)
+    full = _with_together(dataset, without)
     for weighed in (False, True):
         data = with_equal_noise(full)
         begun = replace(NoiseValues.usual(data.G.shape[2]), factor=0.3)
         instrument = (chosen.noise if data.stated else begun).of_instrument()
         known = (replace(c, given=weighed and isinstance(c.effect, LinkWeights))
                  for c in catalogue_components(full))  # fmt: skip
-        every = [*drifts(full), *known, *_searched(full, chosen)]
-        tried = TriedComponents(list(joint_curves(full)), _first(every))
+        moving = () if ResidualField.name in without else drifts(full)
+        every = [*moving, *known, *_searched(full, chosen)]
+        curves = () if JointCurve.name in without else joint_curves(full)
+        tried = TriedComponents(list(curves), _first(every))
         if not (weighed or chosen.unknown or promised(chosen, tried.both) > PROMISING):
             return None
         progress(f"sizes of {len(tried.both)} components at once")
@@ -118,7 +122,7 @@ def search_components(
     if again is not found and len(full.blocks.member) <= FEW_POSES:
         again = with_returned(_with_lines(full, again), every)
     found = again
-    for _ in range(FIELD_SEARCHES):
+    for _ in range(0 if ResidualField.name in without else FIELD_SEARCHES):
         progress("fields beside the components")
         wider = _wider(found, fields(full, found, MOST_FIELDS))
         if wider is found:
@@ -680,11 +684,13 @@ def _kinds_that_show(
     return shown
 
 
-def _with_together(dataset: DiagnosisData) -> DiagnosisData:
+def _with_together(dataset: DiagnosisData, without: Container[str]) -> DiagnosisData:
     """The data with the effects that are judged in the sum alone, whose columns they have."""
-    base = dataset.base
-    more = judged_together(base.model, base.observed.table)
-    return dataset.changed(hypotheses=(*dataset.hypotheses, *more)) if more else dataset
+    base, kept = dataset.base, list(dataset.hypotheses)
+    if GearSpectrum.name in without:  # lines are sought as ripples are
+        kept = [h for h in kept if not isinstance(h.effect, GearRipple)]
+    more = judged_together(base.model, base.observed.table, without)
+    return dataset.changed(hypotheses=(*kept, *more))
 
 
 def _searched(dataset: DiagnosisData, chosen: ModelSet) -> list[Component]:

@@ -40,7 +40,7 @@ from elastocal.diagnosis.shrinkage import (
     refit,
     shrinkage,
 )
-from elastocal.diagnosis.stated_floor import noise_floor, supported_floor
+from elastocal.diagnosis.stated_floor import FALSE_SMOOTH, noise_floor, supported_floor
 from elastocal.diagnosis.unknown import generic_blocks
 from elastocal.diagnosis.verdict import (
     Answer,
@@ -232,19 +232,25 @@ def diagnose(
     base = dataset.base
     dataset, search, found, screened = _searched(dataset, options, progress)
     rng = np.random.default_rng(options.seed)
-    whole, nats, fields = _sum_of_all(dataset, found, rng, progress)
+    whole, nats, fields = _sum_of_all(dataset, found, options, rng, progress)
     progress("confirming")
     found = search.settled(found) if whole is None else found
-    tests, judged = structure_tests(found.first), judge(found)
+    tests = structure_tests(found.first)
     if whole is None:
-        answers = _of_few(dataset, found, judged, tests, rng)
+        gap, steps = budget(dataset, found, rng)
+        judged = judge(found, gap.open)
+        answers = _of_few(dataset, found, judged, tests, gap, rng) | {"budget": steps}
         answers["fields"] = fields if judged.verdict == "unknown_effect" else ()
     else:
+        judged = judge(found)
         answers = _of_sum(whole, dataset, found, tests)
     added = (*answers["effects"], *answers.get("slight", ()))
     there = () if whole is None else {(f.effect, f.where) for f in added}
     small = [u for u in too_small(dataset, found) if (u.effect, u.where) not in there]
     p, nothing = chance_of_noise(found, nats)
+    if answers["gap"].open:
+        # What is left is no noise, whatever it is.
+        nothing = min(nothing, FALSE_SMOOTH)
     beside = found.chosen if whole is None else whole.found
     return Diagnosis(
         **answers,
@@ -281,12 +287,13 @@ MANY = 3
 
 
 def _sum_of_all(
-    dataset: DiagnosisData, found: SelectedEffects, rng: np.random.Generator, progress: Progress
-) -> tuple[SumAnswer | None, float, tuple[FoundEffect, ...]]:
+    dataset: DiagnosisData, found: SelectedEffects, options: DiagnosisOptions,
+    rng: np.random.Generator, progress: Progress,
+) -> tuple[SumAnswer | None, float, tuple[FoundEffect, ...]]:  # fmt: skip
     """The sum of all that may act at once, None where a few causes are the better answer, by how
     many nats it is more probable than nothing, and what has no name in it."""
     progress("judging all that may act at once")
-    if (searched := search_components(dataset, found.chosen, progress)) is None:
+    if (searched := search_components(dataset, found.chosen, options.without, progress)) is None:
         return None, 0.0, ()
     full, total, hidden = searched
     answer, nothing = SumAnswer(dataset, full, total, hidden, rng).decided, found.nothing.score
@@ -298,19 +305,17 @@ def _sum_of_all(
 
 def _of_few(
     dataset: DiagnosisData, found: SelectedEffects, answer: Answer,
-    tests: tuple[StructureTest, ...], rng: np.random.Generator,
+    tests: tuple[StructureTest, ...], gap: Gap, rng: np.random.Generator,
 ) -> dict[str, Any]:  # fmt: skip
     """What a diagnosis says of what the forward search found."""
-    gap, steps = budget(dataset, found, rng)
     return {
         "verdict": answer.verdict,
         "gap": gap,
-        "budget": steps,
         "effects": _findings(found, answer, dataset.base, gap, rng),
         "indistinguishable": answer.indistinguishable,
         "location": location(found, tests),
         "noise": noise_floor(found.dataset, found.chosen.data, found.chosen.noise),
-        "probability_unknown": _unknown(found),
+        "probability_unknown": max(_unknown(found), gap.open * (1 - FALSE_SMOOTH)),
         "curves": curves_of(found.dataset, found.chosen),
     }
 
@@ -332,14 +337,14 @@ def _of_sum(
         supported.unexplained,
     )  # fmt: skip
     return {
-        "verdict": answer.verdict,
+        "verdict": "unknown_effect" if gap.open else answer.verdict,
         "gap": gap,
         "budget": (*steps, BudgetStep("noise_floor", floor, (floor, floor))),
         "effects": answer.effects,
         "indistinguishable": answer.indistinguishable,
         "location": answer.location(tests),
         "noise": noise_floor(answer.dataset, data, answer.found.noise),
-        "probability_unknown": min(1.0, answer.unnamed_probability),
+        "probability_unknown": max(answer.unnamed_probability, gap.open * (1 - FALSE_SMOOTH)),
         "curves": answer.curves(),
         "components": answer.components,
         "groups": answer.groups,

@@ -63,6 +63,7 @@ MICRO = 1e6
 # Φ(5/2); at less than FAINTEST it is missed more often than not once the search is paid for.
 VISIBLE, FAINTEST = 5.0, 3.0
 SMALLEST_P = 1e-4  # a p-value that stands for itself and all that are smaller
+LARGE = 0.1  # share of the gap, in squares, from which what has no name leaves the verdict open
 STRUCTURE = 0.05  # family-wise p-value up to which the dependence on a covariate is told
 
 
@@ -193,7 +194,7 @@ class Gap:
     """3-D rms marker errors in m on held-out poses; the noise floor is what noise alone gives.
 
     `unexplained` is scatter that fits as if it were noise, and is none: repeats do not show it,
-    or neighbours in pose or time share it.
+    neighbours in pose or time share it, or joints would have to be worse than joints are.
     """
 
     nominal: float
@@ -201,6 +202,13 @@ class Gap:
     explained: float
     noise_floor: float
     unexplained: float = 0.0
+
+    @property
+    def open(self) -> bool:
+        """Whether no verdict may call the gap explained, or nothing: what is unexplained is more
+        than the noise, and more than LARGE of the calibrated arm's excess over it."""
+        excess = self.calibrated**2 - self.noise_floor**2
+        return self.unexplained**2 > max(self.noise_floor**2, LARGE * excess)
 
 
 @dataclass(frozen=True)

@@ -12,7 +12,14 @@ from scipy.special import logsumexp
 
 from elastocal.diagnosis.baseline import Baseline
 from elastocal.diagnosis.diagnosis_data import DiagnosisData, diagnosis_data_of
-from elastocal.diagnosis.evidence import ANOTHER, Scan, exceedance, log_prior_odds, scan
+from elastocal.diagnosis.evidence import (
+    ANOTHER,
+    Flips,
+    Scan,
+    exceedance,
+    log_prior_odds,
+    scan,
+)
 from elastocal.diagnosis.hypotheses import Hypothesis
 from elastocal.diagnosis.model_set import (
     Item,
@@ -55,6 +62,15 @@ class Slot:
         """Of each option (K,), and of nothing."""
         total = float(logsumexp(np.append(self.scores, 0.0)))
         return np.exp(self.scores - total), float(np.exp(-total))
+
+    @property
+    def claimable(self) -> bool:
+        """Whether what can be claimed, one of the LARGEST_SET likeliest effects or something
+        without a name, is more probable than nothing."""
+        each, nothing = self.probabilities()
+        known = np.array([item.known for item in self.items], dtype=bool)
+        named = np.sort(each[known])[-LARGEST_SET:].sum()
+        return bool(max(named, each[~known].sum()) > nothing)
 
 
 @dataclass(frozen=True)
@@ -147,10 +163,11 @@ HOPELESS = -6.0  # score below which none is
 # How far behind the best one is not worth a noise of its own: under noise that an effect still
 # missing has swollen, and under the noise of a set that is complete but for the item in question.
 FAR_BEHIND, BEHIND_COMPLETE = 60.0, 20.0
-# Probability that nothing (more) is there above which nothing is claimed.  A first effect has to be
-# the more probable, and the flips keep the false alarms at their level; many weak candidates
-# together may make it probable that there is something, though none of them is so by itself.
-DOUBT, DOUBT_MORE = 0.5, 0.05
+# A first effect has to be more probable than nothing, it and not all weak candidates together; the
+# flips keep the false alarms at their level.  Beside it the probability that nothing more is there
+# has to be less than this.
+DOUBT_MORE = 0.05
+LARGEST_SET = 3  # effects that one claim names: more are no answer
 CLOSE_BLOCKS = 3
 CLEARLY = 10.0  # nats by which several named effects must beat fewer without a name
 PART = 0.3
@@ -187,7 +204,7 @@ class ForwardSelection:
     def run(self) -> SelectedEffects:
         self._start = dataset = self.dataset
         nothing = current = fit_set(dataset, (), self.noise)
-        scanned = first = alone = self._scan(current, flips=True)
+        scanned = first = alone = self._scan(current, beside=current)
         slots: list[Slot] = []
         p_values: list[float] = []
         while True:
@@ -197,22 +214,22 @@ class ForwardSelection:
                 break
             # Score all again under the noise beside the winner: an effect that is still missing
             # looks like noise, and hides others with it.
-            observed = self._scan(current, best.noise)
+            observed = self._scan(current, best.noise, best)
             if not current.items:
                 alone = observed
             better, again = self._best_addition(current, observed)
             best, slot = better, slot.best_of(again)
-            doubt = DOUBT_MORE if current.items else DOUBT
-            if best is None or slot.probabilities()[1] > doubt:
+            if best is None or not slot.claimable:
                 break
-            after = self._scan(best, flips=True)
-            p = exceedance(after.flipped, observed.odds)
+            if current.items and slot.probabilities()[1] > DOUBT_MORE:
+                break
+            p = exceedance(observed.flipped, observed.odds)
             # The search may have come round to a set that it had.
             key = frozenset(id(item.what) for item in best.items)
             if p > self.level or key in self._visited:
                 break
             self._visited.add(key)
-            current, scanned = best, after
+            current, scanned = best, self._scan(best)
             slots.append(slot)
             p_values.append(p)
             if is_far(self.dataset, current):
@@ -257,22 +274,23 @@ class ForwardSelection:
         self._scanned.clear()
 
     def _scan(
-        self, current: ModelSet, noise: NoiseValues | None = None, flips: bool = False
+        self, current: ModelSet, noise: NoiseValues | None = None, beside: ModelSet | None = None
     ) -> Scan:
+        """All candidates beside the set; with flips of what is left `beside` another, where one is
+        given: they hold nothing of what this one explains."""
         noise = noise or current.noise
         items = tuple((id(item.what), item.settings.tobytes()) for item in current.items)
-        # Sets that a step has judged come again when its items are re-examined; a scan with flips
-        # holds what one without them does.
-        key = items, current.scales, noise.logs().tobytes()
-        for known in (True, flips):
-            if (*key, known) in self._scanned:
-                return self._scanned[*key, known]
-        prior, signs = self._prior(current), self.signs if flips else self.signs[:0]
-        scanned = scan(self.dataset, self.generic, prior, current.data, noise, signs)
-        self._scanned[*key, flips] = scanned
-        while len(self._scanned) > KEPT:
-            self._scanned.pop(next(iter(self._scanned)))
-        return scanned
+        # Sets that a step has judged come again when its items are re-examined; the noise beside
+        # which a residual is flipped is that of the set that leaves it.
+        key = items, current.scales, noise.logs().tobytes(), beside is not None
+        if key not in self._scanned:
+            flips = None if beside is None else Flips(self.signs, beside.at.scattered)
+            self._scanned[key] = scan(
+                self.dataset, self.generic, self._prior(current), current.data, noise, flips
+            )
+            while len(self._scanned) > KEPT:
+                self._scanned.pop(next(iter(self._scanned)))
+        return self._scanned[key]
 
     def _prior(self, current: ModelSet) -> Array:
         """Log odds of one item more."""

@@ -195,10 +195,22 @@ def log_prior_odds(
 
 
 @dataclass(frozen=True)
+class Flips:
+    """A residual (C, m) whose configurations have their signs flipped by `signs` (F, C) of ±1.
+
+    It scatters as the noise does and holds no effect that has been found; everything that is tried
+    is scored against it beside the same columns as against the readings.
+    """
+
+    signs: Array
+    residual: Array
+
+
+@dataclass(frozen=True)
 class EntrySums:
     """Of one entry under one noise: `local` (C, v, d, v, d), `H` (p, C, v, d), `b` (C, v, d).
 
-    `flip` (C, v, d) and `h` (F, p) are of residuals that are flipped by `signs` (F, C).
+    `flip` (C, v, d) and `h` (F, p) are of the residual that is flipped by `signs` (F, C).
     """
 
     local: Array
@@ -210,7 +222,7 @@ class EntrySums:
 
     @classmethod
     def of(
-        cls, E: Array, places: VisitPlaces, at: Projection, signs: Array | None = None
+        cls, E: Array, places: VisitPlaces, at: Projection, flips: Flips | None = None
     ) -> EntrySums:
         """E (C, m, d): the entry's packed columns, zero in rows that do not count."""
         C, m, d = E.shape
@@ -219,7 +231,7 @@ class EntrySums:
         local = wide.transpose(0, 2, 1) @ (at.inverse @ wide)
         H = np.ascontiguousarray((at.H.transpose(0, 2, 1) @ wide).transpose(1, 0, 2))  # (p, C, v·d)
         b = np.einsum("cmk,cm->ck", wide, at.u)
-        signs, u, h = _flipped(at, signs)
+        signs, u, h = _flipped(at, flips)
         flip = np.einsum("cmk,cm->ck", wide, u)
         return cls(
             local.reshape(C, v, d, v, d), H.reshape(-1, C, v, d),
@@ -295,28 +307,24 @@ def _each_with_each(a: Array, b: Array) -> Array:
     return np.asarray(a.transpose(1, 2, 0) @ b.transpose(1, 0, 2))
 
 
-def _flipped(at: Projection, signs: Array | None) -> tuple[Array, Array, Array]:
-    """The signs (F, C), what they flip in a projected residual, Σ_c signs (Hᵀe)_c (F, p)."""
-    if signs is None or not len(signs):
+def _flipped(at: Projection, flips: Flips | None) -> tuple[Array, Array, Array]:
+    """The signs (F, C), V⁻¹e (C, m), which they flip, and Σ_c signs (Hᵀe)_c (F, p)."""
+    if flips is None:
         return np.zeros((0, len(at.u))), np.zeros_like(at.u), np.zeros((0, at.H.shape[2]))
-    u, h = at.spread
-    return signs, u, signs @ h
+    e = flips.residual[..., None]
+    h = (at.H.transpose(0, 2, 1) @ e)[..., 0]
+    return flips.signs, (at.inverse @ e)[..., 0], flips.signs @ h
 
 
-def direct(C: Array, at: Projection, signs: Array | None = None) -> Spectrum:
-    """Spectrum of one group of packed columns C (blocks, m, k), zero in rows that do not count.
-
-    `signs` (F, blocks) are the flips that it holds.
-    """
+def direct(C: Array, at: Projection, flips: Flips | None = None) -> Spectrum:
+    """Spectrum of one group of packed columns C (blocks, m, k), zero in rows that do not count."""
     k = C.shape[2]
     A = C.reshape(-1, k).T @ (at.inverse @ C).reshape(-1, k)
     Z = at.H.reshape(-1, at.H.shape[2]).T @ C.reshape(-1, k)
     b = np.einsum("cmk,cm->k", C, at.u)
-    signs, u, h = _flipped(at, signs)
-    flips = np.zeros((0, k))
-    if len(signs):
-        flips = signs @ np.einsum("cmk,cm->ck", C, u) - h @ Z
-    return spectrum((A - Z.T @ Z)[None], b[None], flips[:, None, :])
+    signs, u, h = _flipped(at, flips)
+    flipped = signs @ np.einsum("cmk,cm->ck", C, u) - h @ Z
+    return spectrum((A - Z.T @ Z)[None], b[None], flipped[:, None, :])
 
 
 # Numbers of regressor directions that are held at a time: with more of them the sums over thousands
@@ -326,19 +334,19 @@ HELD = 300_000
 
 @dataclass
 class Grams:
-    """Spectra against `data` under the noise of its projection `at`, and against its residual
-    with flipped `signs` (F, C), where these are given."""
+    """Spectra against `data` under the noise of its projection `at`, and against `flips`, where
+    these are given."""
 
     dataset: DiagnosisData
     data: NoisyData
     at: Projection
-    signs: Array | None = None
+    flips: Flips | None = None
     _entries: dict[EntryKey, EntrySums] = field(init=False, default_factory=dict)
 
     def entry(self, key: EntryKey) -> EntrySums:
         if key not in self._entries:
             E = self.data.masked(self.dataset.entry(key))
-            self._entries[key] = EntrySums.of(E, self.dataset.places, self.at, self.signs)
+            self._entries[key] = EntrySums.of(E, self.dataset.places, self.at, self.flips)
         return self._entries[key]
 
     def of(self, h: Hypothesis | Generic, settings: Array | None = None) -> Spectrum:
@@ -383,7 +391,7 @@ class Grams:
         return Spectrum.joined(list(ahead(sums.driven, directions, self.data.threads)))
 
     def _direct(self, columns: Array) -> Spectrum:
-        return direct(self.data.masked(columns), self.at, self.signs)
+        return direct(self.data.masked(columns), self.at, self.flips)
 
 
 @dataclass(frozen=True)
@@ -421,22 +429,20 @@ class Scan:
 
 def scan(
     dataset: DiagnosisData, generic: list[Generic], prior: Array, data: NoisyData,
-    noise: NoiseValues, signs: Array,
+    noise: NoiseValues, flips: Flips | None = None,
 ) -> Scan:  # fmt: skip
-    """Score all hypotheses and blocks, of log odds `prior`, beside the columns already in `data`.
-
-    `signs` (F, C) of ±1 are the flips.
-    """
-    grams = Grams(dataset, data, project(data, noise), signs)
+    """Score all hypotheses and blocks, of log odds `prior`, beside the columns in `data`."""
+    grams = Grams(dataset, data, project(data, noise), flips)
     whats: tuple[Hypothesis | Generic, ...] = (*dataset.hypotheses, *generic)
     found: dict[int, Scored] = {}
-    flips = np.empty((len(whats), len(signs)))
+    F = 0 if flips is None else len(flips.signs)
+    flipped = np.empty((len(whats), F))
     for members, spectra in grams.of_each(whats):
         scales = whats[members[0]].scales
         # A hypothesis has all of its settings, of several blocks each has one.
         grids = [dataset.grids.get(whats[n].key, NO_SETTINGS) for n in members]
         each, spans = spectra.evidence(scales), np.arange(len(spectra.lam)).reshape(len(grids), -1)
-        flips[list(members)] = spectra.flipped(np.stack([g.log_prior for g in grids]), scales)
+        flipped[list(members)] = spectra.flipped(np.stack([g.log_prior for g in grids]), scales)
         for n, own, grid in zip(members, spans, grids, strict=True):
             weighed = each[own] + grid.log_prior
             k = int(np.argmax(weighed))
@@ -449,8 +455,8 @@ def scan(
     total, by_covariate = float(logsumexp(prior)), of_covariate.items()
     return Scan(
         scored, float(log_sum(prior + [s.evidence for s in scored])) - total,
-        log_sum(prior[:, None] + flips, axis=0) - total,
+        log_sum(prior[:, None] + flipped, axis=0) - total,
         {c: max(scored[n].evidence for n in own) for c, own in by_covariate},
-        {c: flips[own].max(axis=0) for c, own in by_covariate if len(signs)},
+        {c: flipped[own].max(axis=0) for c, own in by_covariate if F},
         grams.at.marginal, noise,
     )  # fmt: skip

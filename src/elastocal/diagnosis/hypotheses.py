@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Container, Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property
 from typing import ClassVar
@@ -133,7 +133,7 @@ class Hypothesis:
 
 
 def possible(
-    model: Model, table: Measurements, without: tuple[str, ...] = ()
+    model: Model, table: Measurements, without: Container[str] = ()
 ) -> tuple[list[Hypothesis], list[Untested]]:
     """Hypotheses that the table's columns can test, and the effects it cannot, with advice."""
     chain, cell = model.chain, model.cell
@@ -168,15 +168,18 @@ def possible(
     return hypotheses, untested
 
 
-def judged_together(model: Model, table: Measurements) -> list[Hypothesis]:
+def judged_together(
+    model: Model, table: Measurements, without: Container[str] = ()
+) -> list[Hypothesis]:
     """Effects that are judged in a sum alone, but for the smooth ones, which have their own
-    searches, at every place where the table can test them."""
+    searches, at every place where the table can test them; none `without` which to judge."""
     chain, cell = model.chain, model.cell
     active = {(p.effect, p.where) for p in model.parameters}
     return [
         Hypothesis(effect, where, parameters, ())
         for effect in CATALOGUE.values()
         if effect.together
+        and effect.name not in without
         and not isinstance(effect, JointCurve | ResidualField | GearSpectrum)
         and all(recorded(table, need) for need in effect.needed(cell))
         and not (effect.unless and recorded(table, effect.unless))

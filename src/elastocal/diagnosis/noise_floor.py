@@ -231,14 +231,14 @@ class Projection:
         return self.inverse - self.H @ self.H.transpose(0, 2, 1)
 
     @cached_property
-    def spread(self) -> tuple[Array, Array]:
-        """V⁻¹e and Hᵀe, (C, m) and (C, p), of residuals e that scatter as the noise does.
+    def scattered(self) -> Array:
+        """Residuals e (C, m) that scatter as the noise does.
 
         The fit's own residuals are too small, its leverage less than V: u_c has the covariance
         P_cc, so e_c = V_c^½ P_cc^−½ u_c has V_c (Bell and McCaffrey 2002).
         """
         e = _power(self.inverse, -0.5) @ (_power(self.P, -0.5) @ self.u[..., None])
-        return (self.inverse @ e)[..., 0], (self.H.transpose(0, 2, 1) @ e)[..., 0]
+        return np.asarray(e[..., 0])
 
     @property
     def beta_deviation(self) -> Array:

@@ -11,7 +11,17 @@ from scipy.spatial import cKDTree
 
 from elastocal.diagnosis.diagnosis import FaultyReading, NearRepeats, NoiseFloor
 from elastocal.diagnosis.diagnosis_data import DiagnosisData
-from elastocal.diagnosis.noise_floor import NoiseValues, NoisyData, Projection, covariance, project
+from elastocal.diagnosis.noise_floor import (
+    JOINT_SPREAD,
+    REPEATABILITY,
+    REPEATABILITY_SPREAD,
+    STATED_SPREAD,
+    NoiseValues,
+    NoisyData,
+    Projection,
+    covariance,
+    project,
+)
 from elastocal.model.observations import pure_error as pure_error_of
 from elastocal.units import Array, BoolArray, IntArray
 
@@ -220,9 +230,15 @@ def _correlation(z: Array, one: IntArray, other: IntArray, limit: float) -> floa
 
 
 # The floor that is supported: by repeats where there are some, else by what neighbours do not
-# share.  The rest of what the fit takes for noise is unexplained.
+# share and joints and instruments may have.  The rest of what the fit takes for noise is
+# unexplained.
 
 CONTRADICTED = 0.05  # chance of repeats that scatter so little if the fitted noise were noise
+# What the prior of the noise exceeds in 2.5 % of cases: the scatter of a joint (rad, or m), and
+# the instrument's over the stated one.  Beyond them only repeats show that scatter is noise.
+UPPER = 1.96
+MOST_SCATTER = REPEATABILITY * float(np.exp(UPPER * np.hypot(REPEATABILITY_SPREAD, JOINT_SPREAD)))
+MOST_STATED = float(np.exp(UPPER * STATED_SPREAD))
 
 
 @dataclass(frozen=True)
@@ -260,9 +276,13 @@ def supported_floor(
     at = project(data, noise)
     fitted = min(noise_rms(data, noise), best)
     size = min(data.blocks.size, 3)
-    smooth = np.minimum(smooth_scatter(dataset, data, at), noise.joint**2 * (1 + noise.shared**2))
-    shared = _per_reading(data, (data.G**2) @ smooth)
-    variance = max(fitted**2 - shared, 0.0)
+    scatter = noise.joint**2 * (1 + noise.shared**2)
+    smooth = np.minimum(smooth_scatter(dataset, data, at), scatter)
+    beyond = _per_reading(data, (data.G**2) @ np.maximum(smooth, scatter - MOST_SCATTER**2))
+    if data.stated and noise.factor > MOST_STATED:
+        stated = np.diagonal(data.covariance, axis1=1, axis2=2)
+        beyond += (noise.factor**2 - MOST_STATED**2) * _per_reading(data, stated)
+    variance = max(fitted**2 - beyond, 0.0)
     mean, dof = returned(dataset)
     total = mean * dof
     near = near_repeats(dataset, data, at)

@@ -18,7 +18,7 @@ from elastocal.diagnosis.diagnosis import (
     Verdict,
 )
 from elastocal.diagnosis.diagnosis_data import DiagnosisData
-from elastocal.diagnosis.effect_search import SelectedEffects
+from elastocal.diagnosis.effect_search import LARGEST_SET, SelectedEffects
 from elastocal.diagnosis.evidence import Scan, exceedance
 from elastocal.diagnosis.hypotheses import Hypothesis
 from elastocal.diagnosis.model_set import Item, ModelSet, distances, settings_of
@@ -28,7 +28,7 @@ from elastocal.diagnosis.reading_faults import OutlierScreening
 # From scores to an answer: explained, ambiguous, unknown, or nothing significant.
 
 NAMED = 0.9  # probability from which an effect is named
-SET, LARGEST_SET = 0.95, 3  # probability that the named set holds, as far as so many can
+SET = 0.95  # probability that the named set holds, as far as so many can
 # Two known alternatives at distance d are told apart with probability Φ(d/2) at best: closer than
 # this, no evidence can be trusted to name one of them.
 TOO_NEAR = 2.0
@@ -53,16 +53,16 @@ class Answer:
         )
 
 
-def judge(found: SelectedEffects) -> Answer:
-    """The verdict on what the search found."""
+def judge(found: SelectedEffects, unexplained: bool = False) -> Answer:
+    """The verdict on what the search found; `unexplained` where most of the gap is left."""
     if not found.chosen.items:
-        return Answer("nothing_significant", (), ())
+        return Answer("unknown_effect" if unexplained else "nothing_significant", (), ())
     probability, rivals = [], []
     for k, item in enumerate(found.chosen.items):
         p, others = _of_item(found, k, item)
         probability.append(p)
         rivals.append(others)
-    if found.chosen.unknown:
+    if found.chosen.unknown or unexplained:
         verdict: Verdict = "unknown_effect"
         # What is named beside something without a name may be part of its imitation.
         probability = [min(p, TOO_NEAR_PROBABILITY) for p in probability]

@@ -9,6 +9,7 @@ from typing import Any
 
 from elastocal.diagnosis.diagnosis import (
     NORMAL_95,
+    STRUCTURE,
     Candidate,
     Curve,
     Diagnosis,
@@ -226,9 +227,9 @@ def _unexplained_lines(d: Diagnosis) -> list[str]:
     if d.gap.unexplained <= MATERIAL * d.gap.noise_floor:
         return []
     return [
-        f"{length(d.gap.unexplained)} rms look like scatter of the arm and are no noise: readings "
-        "at the same or nearly the same pose do not show them, or neighbours in pose or time share "
-        "them. They are unexplained."
+        f"{length(d.gap.unexplained)} rms look like scatter of the arm and are no noise: repeats "
+        "do not show them, neighbours in pose or time share them, or they are more than joints "
+        "scatter. They are unexplained."
     ]
 
 
@@ -257,7 +258,7 @@ def _shape(curve: Curve) -> str:
 
 
 def _chance(d: Diagnosis) -> str:
-    if d.verdict == "nothing_significant":
+    if not d.effects and d.p_value > STRUCTURE:
         return f"the strongest candidate is one that noise alone yields with {size_of(d.p_value)}."
     return f"noise alone yields such a finding with {size_of(d.p_value)}, all candidates counted."
 

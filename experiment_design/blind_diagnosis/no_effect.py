@@ -1,0 +1,230 @@
+"""How often `diagnose` claims something of arms that lack nothing, by what is observed.
+
+    python no_effect.py [--seed S] [--worlds N] [--kinds position,pose,…]
+
+Arms of a DH table with errors of geometry (and springs, for deflections), measured as positions,
+poses, deflections or distances, with 18 to 60 poses, noise from 10 µm to 3 mm that half of the
+cells state, and joints that repeat to 6 µrad.  The readings come from the few lines of numpy here
+and not from elastocal's model.  At most 5 % of the worlds of each kind may be claimed.
+"""
+
+from __future__ import annotations
+
+import argparse
+import tempfile
+from collections.abc import Iterator
+from concurrent.futures import ProcessPoolExecutor
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy.spatial.transform import Rotation
+from scipy.stats import beta
+
+Array = NDArray[np.float64]
+KINDS = ("position", "pose", "deflection", "distance")
+# theta0, d, a, alpha
+DH = np.array([
+    [0.0, 0.4, 0.15, -np.pi / 2], [-np.pi / 2, 0.0, 0.6, 0.0], [0.0, 0.0, 0.12, -np.pi / 2],
+    [0.0, 0.64, 0.0, np.pi / 2], [0.0, 0.0, 0.0, -np.pi / 2], [np.pi, 0.1, 0.0, 0.0],
+])  # fmt: skip
+LIMITS = np.radians([90, 55, 60, 160, 100, 180])
+MARKERS = np.array([[0.12, 0.02, 0.05], [-0.06, 0.1, 0.08], [-0.05, -0.09, 0.03]])
+LOAD, COMPLIANCE = -1000.0, 1e-6  # N, rad/(N·m)
+REPEATABILITY = 6e-6
+POSES = (18, 30, 60)
+EFFECTS = {
+    "position": ["base_frame", "joint_offset", "link_geometry", "marker_position"],
+    "pose": [
+        "base_frame", "joint_offset", "link_geometry", "marker_position", "marker_orientation",
+    ],
+    "deflection": ["joint_compliance"],
+    "distance": ["joint_offset", "link_geometry", "base_frame", "marker_position"],
+}  # fmt: skip
+
+
+@dataclass(frozen=True)
+class Arm:
+    """A specimen: DH table (6, 4), small turns and shifts of every link, base, springs."""
+
+    dh: Array
+    tilt: Array
+    shift: Array
+    base: Rotation
+    origin: Array
+    springs: Array
+
+    @classmethod
+    def drawn(cls, kind: str, rng: np.random.Generator) -> Arm:
+        dh = DH + rng.normal(size=DH.shape) * [5e-4, 3e-4, 3e-4, 3e-4]
+        if kind == "deflection":  # a base that is as stated: deflections are to tell springs
+            return cls(DH, np.zeros((6, 3)), np.zeros((6, 3)), Rotation.identity(), np.zeros(3),
+                       COMPLIANCE * np.exp(0.5 * rng.normal(size=6)))  # fmt: skip
+        turned = Rotation.from_rotvec([0, 0, rng.uniform(-np.pi, np.pi)])
+        return cls(
+            dh, rng.normal(size=(6, 3)) * 3e-4, rng.normal(size=(6, 3)) * 3e-4,
+            turned * Rotation.from_rotvec(rng.normal(size=3) * 0.01),
+            np.array([2.0, 1.5, 0.4]) + rng.normal(size=3) * 0.2,
+            COMPLIANCE * np.exp(0.5 * rng.normal(size=6)),
+        )  # fmt: skip
+
+    def flange(self, q: Array) -> tuple[Rotation, Array]:
+        """In the tracker's frame, of joint angles (n, 6)."""
+        turn = Rotation.concatenate([self.base] * len(q))
+        at = np.tile(self.origin, (len(q), 1))
+        for k in range(6):
+            theta0, d, a, alpha = self.dh[k]
+            about = Rotation.from_rotvec(np.outer(q[:, k] + theta0, [0, 0, 1]))
+            turn = turn * about
+            at = at + turn.apply([a, 0, d])
+            turn = turn * Rotation.from_rotvec([alpha, 0, 0])
+            at = at + turn.apply(self.shift[k])
+            turn = turn * Rotation.from_rotvec(self.tilt[k])
+        return turn, at
+
+    def markers(self, q: Array) -> Array:
+        """(n, markers, 3)."""
+        turn, at = self.flange(q)
+        return np.stack([at + turn.apply(m) for m in MARKERS], axis=1)
+
+    def loaded(self, q: Array) -> Array:
+        """Joint angles at rest under the load, which hangs at the flange."""
+        at = q
+        for _ in range(4):
+            torque = np.empty_like(q)
+            for j in range(6):
+                step = np.zeros(6)
+                step[j] = 1e-6
+                up, down = (self.flange(at + s * step)[1] for s in (1, -1))
+                torque[:, j] = (up - down)[:, 2] / 2e-6 * LOAD
+            at = q + self.springs * torque
+        return at
+
+
+@dataclass(frozen=True)
+class World:
+    kind: str
+    poses: int
+    sigma: float
+    stated: bool
+    seed: tuple[int, int]
+
+    def write(self, folder: Path) -> None:
+        rng = np.random.default_rng(self.seed)
+        arm = Arm.drawn(self.kind, rng)
+        header = "theta0_rad,d_m,a_m,alpha_rad"
+        np.savetxt(folder / "dh.csv", DH, delimiter=",", header=header, comments="", fmt="%.16g")
+        q = rng.uniform(-LIMITS, LIMITS, (self.poses, 6))
+        rows = list(self._rows(arm, q, rng))
+        (folder / "data.csv").write_text("\n".join([self._header, *rows]) + "\n")
+        (folder / "cell.toml").write_text(self._cell)
+
+    @property
+    def _markers(self) -> int:
+        return 1 if self.kind in ("pose", "distance") else len(MARKERS)
+
+    @property
+    def _turns(self) -> float:
+        return self.sigma / 0.3
+
+    @property
+    def _header(self) -> str:
+        joints = ",".join(f"q{j}_rad" for j in range(1, 7))
+        force = ",force_x_N,force_y_N,force_z_N" if self.kind == "deflection" else ""
+        read = "distance_mm" if self.kind == "distance" else "x_mm,y_mm,z_mm"
+        turned = ",qw,qx,qy,qz" if self.kind == "pose" else ""
+        return f"configuration,marker,{joints}{force},{read}{turned}"
+
+    @property
+    def _cell(self) -> str:
+        markers = "\n".join(f"M{m + 1} = {MARKERS[m].tolist()}" for m in range(self._markers))
+        stated = ""
+        if self.kind == "distance":
+            stated = "anchor_m = [0, 0, 0]\n"
+            stated += f"distance_um = {self.sigma * 1e6}\n" if self.stated else ""
+        elif self.stated:
+            stated = f"sigma_um = {self.sigma * 1e6}\n"
+            stated += f"rotation_urad = {self._turns * 1e6}\n" if self.kind == "pose" else ""
+        base = "base_position_m = [2, 1.5, 0.4]" if self.kind == "distance" else ""
+        compliance = f"joint_compliance = {[COMPLIANCE] * 6}" if self.kind == "deflection" else base
+        return (
+            f'[robot]\ndh = "dh.csv"\n[tool]\nload_point_m = [0, 0, 0]\n[tool.markers_m]\n'
+            f"{markers}\n[tracker]\n{stated}"
+            f'[model]\nobserve = "{self.kind}"\neffects = {EFFECTS[self.kind]}\n'
+            f"[model.nominal]\n{compliance}\n"
+        )
+
+    def _rows(self, arm: Arm, q: Array, rng: np.random.Generator) -> Iterator[str]:
+        def settled() -> Array:
+            return q + REPEATABILITY * rng.normal(size=q.shape)
+
+        states = ((0.0, settled()),)
+        if self.kind == "deflection":
+            states = ((0.0, settled()), (LOAD, arm.loaded(settled())))
+        for force, at in states:
+            turn, _ = arm.flange(at)
+            turned = turn * Rotation.from_rotvec(self._turns * rng.normal(size=(len(q), 3)))
+            points = arm.markers(at)
+            points = points + self.sigma * rng.normal(size=points.shape)
+            lengths = np.linalg.norm(arm.markers(at), axis=2)
+            lengths = lengths + self.sigma * rng.normal(size=lengths.shape)
+            for c in range(len(q)):
+                for m in range(self._markers):
+                    cells = [f"{c + 1}", f"M{m + 1}", *(f"{v:.9f}" for v in q[c])]
+                    if self.kind == "deflection":
+                        cells += ["0", "0", f"{force}"]
+                    read = [lengths[c, m]] if self.kind == "distance" else points[c, m]
+                    cells += [f"{1e3 * v:.7f}" for v in read]
+                    if self.kind == "pose":
+                        x, y, z, w = turned[c].as_quat()
+                        cells += [f"{v:.12f}" for v in (w, x, y, z)]
+                    yield ",".join(cells)
+
+
+def worlds(kind: str, seed: int, n: int) -> Iterator[World]:
+    for k in range(n):
+        rng = np.random.default_rng((seed, KINDS.index(kind), k))
+        poses = int(rng.choice(POSES)) * (4 if kind == "distance" else 1)
+        sigma = float(np.exp(rng.uniform(np.log(1e-5), np.log(3e-3))))
+        yield World(kind, poses, sigma, bool(k % 2), (seed, k))
+
+
+def verdict(world: World) -> tuple[str, float, float, str]:
+    """What `diagnose` says of it, P(nothing), p, and the effects claimed."""
+    import elastocal as ec
+
+    with tempfile.TemporaryDirectory() as name:
+        folder = Path(name)
+        world.write(folder)
+        why = ec.diagnose(folder / "cell.toml", folder / "data.csv")
+        claimed = [f"{e.effect}:{e.where}" for e in why.effects]
+        return why.verdict, why.probability_nothing, why.p_value, " ".join(claimed)
+
+
+def main() -> None:
+    parser = argparse.ArgumentParser()
+    parser.add_argument("--seed", type=int, default=20261126)
+    parser.add_argument("--worlds", type=int, default=400)
+    parser.add_argument("--kinds", default=",".join(KINDS))
+    parser.add_argument("--jobs", type=int, default=2)
+    parser.add_argument("--show", action="store_true", help="print each world that is claimed")
+    asked = parser.parse_args()
+    print("| observed | worlds | claimed | 95 % |\n|---|---|---|---|", flush=True)
+    with ProcessPoolExecutor(asked.jobs) as pool:
+        for kind in asked.kinds.split(","):
+            tried = list(worlds(kind, asked.seed, asked.worlds))
+            found = list(pool.map(verdict, tried))
+            claimed = [
+                (w, f) for w, f in zip(tried, found, strict=True) if f[0] != "nothing_significant"
+            ]
+            k, n = len(claimed), len(tried)
+            low, high = beta.ppf([0.025, 0.975], [k, k + 1], [n - k + 1, n - k])
+            print(f"| {kind} | {n} | {k} | {np.nan_to_num(low):.3f} to {high:.3f} |", flush=True)
+            if asked.show:
+                for w, f in claimed:
+                    print(w, f, flush=True)
+
+
+if __name__ == "__main__":
+    main()
