@@ -56,6 +56,7 @@ from elastocal.errors import InputError, InsufficientDataError, option, require
 from elastocal.files import atomic_writer
 from elastocal.identification.error_budget import BudgetStep
 from elastocal.identification.mistakes import refuse_nonsense
+from elastocal.identification.rigid_markers import solved_body, without_copies
 from elastocal.identification.start import check_table
 from elastocal.measurements import Measurements
 from elastocal.model.effects import CATALOGUE, effect_of
@@ -221,6 +222,7 @@ def diagnose(
     given, source = model, table.source
     check_table(model, table)
     _check_enough(table)
+    table, copies = without_copies(table)
     table, left_out = thinned(table)
     model = with_recorded_drivers(model, table)
     progress("fitting the model as it is")
@@ -259,7 +261,11 @@ def diagnose(
         probability_nothing=nothing,
         p_value=p,
         untested=(*untested, *small),
-        warnings=(*filter(None, [left_out]), *warnings(dataset, found, screened, beside.noise)),
+        warnings=(
+            *copies,
+            *filter(None, [left_out, solved_body(table, float(base.residual.std()))]),
+            *warnings(dataset, found, screened, beside.noise),
+        ),
         n_readings=dataset.blocks.n,
         n_configurations=len(dataset.blocks.member),
         model_keys=model_keys(base.model, added),

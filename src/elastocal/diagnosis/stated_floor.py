@@ -278,10 +278,12 @@ def supported_floor(
     size = min(data.blocks.size, 3)
     scatter = noise.joint**2 * (1 + noise.shared**2)
     smooth = np.minimum(smooth_scatter(dataset, data, at), scatter)
-    beyond = _per_reading(data, (data.G**2) @ np.maximum(smooth, scatter - MOST_SCATTER**2))
-    if data.stated and noise.factor > MOST_STATED:
-        stated = np.diagonal(data.covariance, axis1=1, axis2=2)
-        beyond += (noise.factor**2 - MOST_STATED**2) * _per_reading(data, stated)
+    above = 0.0
+    if data.stated:  # else what joints do and what the instrument does are not to be told apart
+        smooth = np.maximum(smooth, scatter - MOST_SCATTER**2)
+        above = max(noise.factor**2 - MOST_STATED**2, 0.0)
+    stated = np.diagonal(data.covariance, axis1=1, axis2=2)
+    beyond = _per_reading(data, (data.G**2) @ smooth + above * stated)
     variance = max(fitted**2 - beyond, 0.0)
     mean, dof = returned(dataset)
     total = mean * dof

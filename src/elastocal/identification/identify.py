@@ -24,6 +24,7 @@ from elastocal.identification.outliers import FALSE_ALARM, describe, find_faulty
 from elastocal.identification.prediction import NewPoses
 from elastocal.identification.residuals import f_test, rms_3d
 from elastocal.identification.result import Calibration, TestErrors
+from elastocal.identification.rigid_markers import solved_body, without_copies
 from elastocal.identification.solve import Problem, Solution, solve
 from elastocal.identification.start import (
     check_rows,
@@ -70,6 +71,7 @@ def identify(
     check_table(model, table)
     if test is not None:
         check_rows(model, test)
+    table, told = without_copies(table)
     observed = observe(table, model.observe)
     again = copied(observed)
     copies = tuple(table.row[observed.lead[again]].tolist())
@@ -80,6 +82,8 @@ def identify(
     progress("intervals and held-out residuals")
     outliers = describe(every, found.solution, ~found.good)
     result = summarise(model, every, sound, found, outliers, new_poses, copies)
+    body = solved_body(table, float(found.solution.fit.residual.std()))
+    result = replace(result, warnings=(*told, *result.warnings, *filter(None, [body])))
     if test is None:
         return result
     return judged(replace(result, test=_test_errors(model, result, test)))
