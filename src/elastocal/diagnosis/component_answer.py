@@ -36,10 +36,11 @@ from elastocal.diagnosis.diagnosis import (
     Verdict,
 )
 from elastocal.diagnosis.diagnosis_data import DiagnosisData
+from elastocal.diagnosis.left_out import left_out_residual, left_out_square
 from elastocal.diagnosis.line_orders import families_of, ripples
 from elastocal.diagnosis.model_set import spans_of
 from elastocal.diagnosis.noise_floor import NoisyData, Projection, Weighted, covariance, project
-from elastocal.diagnosis.shrinkage import NEW_POSES, Shrinkage, left_out_residual, rms_with_interval
+from elastocal.diagnosis.shrinkage import NEW_POSES, Shrinkage, rms_with_interval
 from elastocal.identification.error_budget import BudgetStep
 from elastocal.model.effects.base import Stage, index, turning_joints
 from elastocal.model.effects.gears import GearSpectrum
@@ -53,6 +54,8 @@ MOST_POSES = 1500  # that a set of new poses is drawn from
 PROBABLE = 0.5
 NAMED = 0.9  # probability from which a named effect needs no rivals beside it
 CHANCE = 0.05  # probability from which a rival is told
+PAYS = 0.01  # of the error of left-out configurations, by which a name has to lower it
+MOST_LEFT_OUT = 1000  # configurations that show whether it does
 TOLD = 0.02  # share of the gap from which it matters which of several effects it is
 SLIGHT = 0.01  # of the gap's rms: what moves the markers by less is next to nothing
 
@@ -284,10 +287,51 @@ class SumAnswer:
             k for k in self._rivals
             if self._probability(k) < PROBABLE and abs(float(np.median(self.shares([k])))) < TOLD
         ]  # fmt: skip
-        if not gone:
-            return self
+        answer = self._without(gone) if gone else self
+        harmful = [
+            k for key, ratio in answer._not_paying.items() if ratio < 1
+            for k in answer._at_place[key]
+        ]  # fmt: skip
+        return answer._without(harmful) if harmful else answer
+
+    def _without(self, gone: Sequence[int]) -> SumAnswer:
         removed = [self.found.components[k] for k in gone]
         return replace(self, found=exchanged(self.found, removed), hidden=(*self.hidden, *removed))
+
+    @cached_property
+    def _not_paying(self) -> dict[tuple[str, str], float]:
+        """Named effects at their places without which configurations that are left out of the fit
+        are predicted better, or worse by less than PAYS: the error without over that with them.
+
+        The one that matters least is judged first, and stays out then: of two that say the same,
+        one remains.
+        """
+        gone: list[int] = []
+        out: dict[tuple[str, str], float] = {}
+        named = {
+            key: own for key, own in self._at_place.items()
+            if all(self.found.components[k].named for k in own)
+            and not any(self.found.components[k].given for k in own)
+        }  # fmt: skip
+        now = self._left_out_without(gone)
+        while named:
+            without = {key: self._left_out_without([*gone, *own]) for key, own in named.items()}
+            key = min(without, key=lambda key: without[key])
+            if without[key] > (1 + PAYS) * now:
+                break
+            out[key], now = without[key] / now, without[key]
+            gone += named.pop(key)
+        return out
+
+    def _left_out_without(self, gone: Sequence[int]) -> float:
+        """Rms error in m of left-out configurations, these components not in the fit."""
+        keep = np.ones(self.found.data.X.shape[2], dtype=bool)
+        for k in gone:
+            keep[self.found.spans[k]] = False
+        data = self.found.data
+        data = replace(data, X=data.X[:, :, keep], precision=data.precision[keep])
+        some = data.every(-(-len(data.r) // MOST_LEFT_OUT))
+        return math.sqrt(left_out_square(some, self.found.noise))
 
     # Shares.
 
@@ -495,7 +539,7 @@ class SumAnswer:
 
     @cached_property
     def _slight(self) -> set[int]:
-        """Named components, by effect and place, that probably do not matter.
+        """Named components, by effect and place, that probably do not matter, or do not pay.
 
         Where a kind does, and at which of its places these data do not tell, one of them stands for
         all: the most probable.
@@ -508,6 +552,7 @@ class SumAnswer:
             spared = own[likeliest] < PROBABLE <= self._matters(members, self._of_kind(name))
             doubtful = {k for k, p in own.items() if p < PROBABLE}
             slight |= doubtful - {likeliest} if spared else doubtful
+        slight |= {self._at_place[key][0] for key in self._not_paying}
         return {k for own in self._at_place.values() if own[0] in slight for k in own}
 
     def _matters(self, members: Sequence[int], together: Sequence[int] = ()) -> float:

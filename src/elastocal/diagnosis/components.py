@@ -414,7 +414,8 @@ class SumOfComponents:
         if not factor_alone:
             lengths = np.array([c.lengths for c in self.components]).reshape(K, 2)
             lower[1:] = np.concatenate([np.full(K, GONE - 1), lengths[:, 0]])
-            upper[1:] = np.concatenate([np.full(K, LARGEST), lengths[:, 1]])
+            most = [min(LARGEST, float(np.log(c.effect.most))) for c in self.components]
+            upper[1:] = np.concatenate([most, lengths[:, 1]])
         x = scored_climb(self.objective, theta, lower, upper, enough, STEPS)[0]
         return Sizes(float(x[0]), x[1 : K + 1], x[K + 1 :])
 

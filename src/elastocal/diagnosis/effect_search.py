@@ -21,6 +21,7 @@ from elastocal.diagnosis.evidence import (
     scan,
 )
 from elastocal.diagnosis.hypotheses import Hypothesis
+from elastocal.diagnosis.left_out import left_out_square, left_out_together
 from elastocal.diagnosis.model_set import (
     Item,
     ModelSet,
@@ -226,7 +227,7 @@ class ForwardSelection:
             p = exceedance(observed.flipped, observed.odds)
             # The search may have come round to a set that it had.
             key = frozenset(id(item.what) for item in best.items)
-            if p > self.level or key in self._visited:
+            if p > self.level or key in self._visited or not self._lowers(current, best):
                 break
             self._visited.add(key)
             current, scanned = best, self._scan(best)
@@ -266,6 +267,14 @@ class ForwardSelection:
         return replace(
             found, dataset=self.dataset, chosen=chosen, slots=tuple(slots), p_values=named.p_values
         )
+
+    def _lowers(self, current: ModelSet, best: ModelSet) -> bool:
+        """Whether the error of configurations left out of the fit falls by the last item: a name
+        that does not pay there is none."""
+        noise = best.noise.of_instrument()
+        together = left_out_together(self.dataset, best)
+        after, before = (left_out_square(s.data, noise, together) for s in (best, current))
+        return after < before
 
     def _forget(self) -> None:
         """What was fitted and scanned about another fit is void, and after a search only fills the
@@ -312,6 +321,9 @@ class ForwardSelection:
         added = [k for k in close if k not in there]
         fits = self._with_each(current, [slot.items[k] for k in added])
         for k, fitted in zip(added, fits, strict=True):
+            if fitted.excessive:
+                scores[k] = -np.inf
+                continue
             scores[k] = fitted.score - base
             if best is None or fitted.score > best.score:
                 best = fitted

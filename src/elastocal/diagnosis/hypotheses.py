@@ -185,6 +185,7 @@ def judged_together(
         and not (effect.unless and recorded(table, effect.unless))
         for where in effect.places(chain, cell)
         if (effect.name, where) not in active
+        and effect.acts(where, chain, cell)
         and (parameters := effect.parameters(where, chain, cell))
     ]
 

@@ -89,6 +89,15 @@ class ModelSet:
         return any(not item.known for item in self.items)
 
     @property
+    def excessive(self) -> bool:
+        """Whether an effect would have to be larger than any of its kind is."""
+        return any(
+            isinstance(item.what, Hypothesis)
+            and np.abs(self.at.beta[span]).max(initial=0.0) > item.what.effect.most
+            for item, span in zip(self.items, self.spans, strict=True)
+        )
+
+    @property
     def spans(self) -> tuple[slice, ...]:
         """Where each item's coefficients stand among those of the data, last of all."""
         return spans_of([item.width for item in self.items], self.data.X.shape[2])

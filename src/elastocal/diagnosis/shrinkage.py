@@ -13,12 +13,13 @@ from scipy import linalg
 from scipy.spatial import cKDTree
 
 from elastocal.diagnosis.backlash_model import EFFECT, under_other_backlash_model
-from elastocal.diagnosis.baseline import Baseline, Blocks, from_centre, prior_deviations
+from elastocal.diagnosis.baseline import Baseline, from_centre, prior_deviations
 from elastocal.diagnosis.diagnosis import FittedParameter, Gap
 from elastocal.diagnosis.diagnosis_data import DiagnosisData
 from elastocal.diagnosis.effect_search import SelectedEffects
 from elastocal.diagnosis.evidence import Grams
 from elastocal.diagnosis.hypotheses import Hypothesis
+from elastocal.diagnosis.left_out import left_out_residual, left_out_together, squared_lengths
 from elastocal.diagnosis.model_set import (
     Item,
     ModelSet,
@@ -29,7 +30,7 @@ from elastocal.diagnosis.model_set import (
     signal_of,
     with_items,
 )
-from elastocal.diagnosis.noise_floor import NoiseValues, NoisyData, Projection, noise_draws, project
+from elastocal.diagnosis.noise_floor import NoiseValues, NoisyData, noise_draws, project
 from elastocal.diagnosis.stated_floor import supported_floor
 from elastocal.identification.error_budget import BudgetStep, resampled_rms
 from elastocal.identification.scrutiny import stage_of
@@ -38,51 +39,6 @@ from elastocal.model.effects.placements import BaseFrame
 from elastocal.model.manipulator import Model, Regression
 from elastocal.model.observations import Observations, observe
 from elastocal.units import Array, IntArray
-
-# Errors on configurations, or blocks of time, left out of the fit, in closed form.
-
-TENTHS = 10  # blocks of time that are left out in turn
-
-
-def left_out_residual(at: Projection, together: IntArray | None = None) -> Array:
-    """r_c − X_c β̂₋c = P_cc⁻¹ u_c (C, m): each configuration under the fit to the others.
-
-    `together` (C,) numbers the group that each is left out with; by itself where None.  For a
-    group, with V and H of its configurations,
-
-        P⁻¹u = V u + V H (I − HᵀVH)⁻¹ HᵀV u.
-    """
-    if together is None:
-        return np.asarray(np.linalg.solve(at.P, at.u[..., None])[..., 0])
-    Vu, VH = (np.linalg.solve(at.inverse, b) for b in (at.u[..., None], at.H))
-    out = Vu[..., 0]
-    for g in np.unique(together):
-        own = together == g
-        H = at.H[own]
-        inner = np.eye(H.shape[2]) - np.einsum("cmp,cmq->pq", H, VH[own])
-        z = np.linalg.solve(inner, np.einsum("cmp,cm->p", H, Vu[own, :, 0]))
-        out[own] += VH[own] @ z
-    return np.asarray(out)
-
-
-def blocks_of_time(blocks: Blocks, time: Array) -> IntArray:
-    """Which tenth of the campaign (C,) each configuration was first measured in; `time` (N,)."""
-    padded = np.append(time, np.inf)
-    first = padded[blocks.member].min(axis=1)
-    order = np.argsort(np.argsort(first, kind="stable"), kind="stable")
-    return np.asarray(order * TENTHS // len(first))
-
-
-def squared_lengths(data: NoisyData, packed: Array) -> tuple[Array, Array]:
-    """Per configuration: Σ of squared 3-D lengths of `packed` (C, m), and the number of readings.
-
-    Of a pose the position counts, of a distance its one component.
-    """
-    C, M = data.blocks.member.shape
-    size = data.blocks.size
-    used = ~data.left_out.reshape(C, M, size)[:, :, 0]
-    part = packed.reshape(C, M, size)[:, :, : min(size, 3)]
-    return ((part**2).sum(axis=2) * used).sum(axis=1), used.sum(axis=1)
 
 
 def rms_with_interval(
@@ -104,7 +60,7 @@ def budget(
     left out are tenths of the time: between neighbours a drift needs no model.
     """
     chosen = found.chosen
-    together = _left_out_together(dataset, chosen)
+    together = left_out_together(dataset, chosen)
     steps = first_steps(dataset, found.nothing, together, rng)
     known = [k for k, item in enumerate(chosen.items) if item.known]
     for n, last in enumerate(known, 1):
@@ -136,14 +92,6 @@ def first_steps(
     steps = [BudgetStep(BaseFrame.name, *rms_with_interval(dataset.data, placed, rng))]
     fitted = _fitted_steps(dataset)
     return steps + [_step(name, data, nothing, together, rng) for name, data in fitted]
-
-
-def _left_out_together(dataset: DiagnosisData, chosen: ModelSet) -> IntArray | None:
-    time, cell = dataset.table.time, dataset.base.model.cell
-    known = [item.what for item in chosen.items if isinstance(item.what, Hypothesis)]
-    if time is None or not any("time" in what.effect.needed(cell) for what in known):
-        return None
-    return blocks_of_time(dataset.blocks, time[dataset.lead])
 
 
 def _step(

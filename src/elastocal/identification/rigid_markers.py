@@ -58,9 +58,10 @@ def solved_body(table: Measurements, error: float) -> str | None:
     if scatter > SOLVED or error < CLEARLY_LESS * scatter:
         return None
     names = [table.marker_names[m] for m in np.unique(pairs[used])]
+    within = max(scatter * 1e6, 0.01)
     return (
-        f"markers {listed(names)} keep their distances to within {max(scatter * 1e6, 0.01):.2g} µm: "
-        "they are points of one solved rigid body. A visit carries its pose, six independent "
+        f"markers {listed(names)} keep their distances to within {within:.2g} µm: they are "
+        "points of one solved rigid body. A visit carries its pose, six independent "
         f"numbers and not {3 * len(names)}: import the body's pose and set [model] observe = "
         '"pose", or keep one marker'
     )

@@ -122,6 +122,8 @@ class Effect:
     sized_by: ClassVar[str] = ""
     # What it depends on in the first place, where its stage and needs do not say so.
     family: ClassVar[str] = ""
+    # How many times its typical size it may be at most: beyond, it is something else.
+    most: ClassVar[float] = 1000.0
     # What to measure besides more poses where those do not tell it from other effects.
     remedy: ClassVar[str] = ""
 
@@ -187,6 +189,10 @@ class Effect:
     def may_be_missing(self, cell: Cell) -> bool:
         """Whether a diagnosis of this cell's data may suspect it by itself."""
         return not self.together
+
+    def acts(self, place: str, chain: Chain, cell: Cell) -> bool:
+        """Whether it moves anything at this place of an arm that is mounted as the cell says."""
+        return True
 
     def unphysical(self, values: Mapping[str, float], chain: Chain, cell: Cell) -> str:
         """Why no spring or body has these `values` (by parameter name); "" where one may."""
