@@ -1,7 +1,7 @@
 """What counts as right of a whole arm: shares of the gap, and names.
 
 The diagnosis lists `components`, each a family of errors at a place with its share of the gap
-(what it adds to the mean square of all, so that shares sum to one) and 90 % interval.  Families
+(of the squared gap: what goes when it is added last) and 90 % interval.  Families
 that act by the same load, and the error against a joint's angle under any name, are one *kind*
 here; a place without a number stands for all places of its kind.
 """
@@ -86,7 +86,7 @@ def score_parts(gap: Gap, answer: Json) -> Scored:
     for (kind, where), found in stated.items():
         own = [c for c in found if "share_ci90" in c and c.get("share") is not None]
         if own:
-            shares.append(_share(kind, where, own, true_share(gap, (kind, where))))
+            shares.append(_share(kind, where, own, strength(gap, (kind, where))))
     names = [
         Name(name, strength(gap, part), name.partition(":")[0] not in ABSENT)
         for name, part in named_parts(answer, stated)
@@ -151,12 +151,8 @@ def imitated(where: str) -> tuple[str, ...]:
     return ("", "all", "arm", "joints") + (("joint1",) if where == "base" else ())
 
 
-def true_share(gap: Gap, part: Part) -> float:
-    true = matching(gap, part)
-    return gap.share(true) if true else 0.0
-
-
 def strength(gap: Gap, part: Part) -> float:
+    """Of the squared gap, what goes with this part when it is the last to be added."""
     true = matching(gap, part)
     return gap.strength(true) if true else 0.0
 

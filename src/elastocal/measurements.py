@@ -48,7 +48,7 @@ REQUIRED: dict[str, tuple[tuple[str, ...], ...]] = {
     "targets": (),
 }
 EXCLUSIVE = (("sigma_cartesian", "sigma_polar"), ("rotation", "quaternion"))
-NUMBERED = re.compile(r"(q|torque_|approach_)([1-9][0-9]{0,3})(_[a-zA-Z]+)?", re.ASCII)
+NUMBERED = re.compile(r"(q|torque_|approach_|before_)([1-9][0-9]{0,3})(_[a-zA-Z]+)?", re.ASCII)
 PLANS = ("plan", "targets")
 PLAN_ONLY = ("level", "order")
 # What `compensate` writes beside its commands, which are a plan too.
@@ -56,7 +56,7 @@ BESIDE_COMMANDS = ("correction_", "error_", "std_", "within95_", "status")
 # In the order in which they are written.
 NUMBERS = (
     "repeat", "q", "force", "position", "rotation", "distance", "torque", "sigma", "time",
-    "approach", "temperature",
+    "approach", "before", "temperature",
 )  # fmt: skip
 DEFAULT_MARKER = "M1"
 LEAST_FORCE, LARGEST_FORCE = 1e-6, 1e7  # N
@@ -73,11 +73,12 @@ class Measurements(Result):
     `force` (n, 3) N in the tracker frame at the load point; `rotation` (n, 3) rotation
     vector in rad; `distance` (n,) m; `torque` (n, joints) N m; `sigma` (n, 3) m along
     x, y, z ("cartesian") or range, azimuth, elevation ("polar", transverse lengths);
-    `time` (n,) s; `approach` (n, joints) in {-1, 0, +1}; `temperature` (n,) °C.
+    `time` (n,) s; `approach` (n, joints) in {-1, 0, +1}; `before` (n, joints) the commanded joints
+    of the pose before; `temperature` (n,) °C.
     `configuration` and `marker` are integer codes into their label tuples; `row` is the
     line number in the source file, for messages.  `move` and `direction` (n, joints) are no
-    columns: they follow from the order of the visits (`with_moves`), are found when a table is
-    read, and stay with the rows that are taken from it.  `joint_kinds` has "revolute" or
+    columns: they follow from `before`, or the order of the visits (`with_moves`), are found when a
+    table is read, and stay with the rows that are taken from it.  `joint_kinds` has "revolute" or
     "prismatic" for each joint; none are all revolute.
 
     Examples:
@@ -105,6 +106,7 @@ class Measurements(Result):
     sigma_frame: str = "cartesian"
     time: Array | None = None
     approach: Array | None = None
+    before: Array | None = None
     temperature: Array | None = None
     move: Array | None = None
     direction: Array | None = None
@@ -240,7 +242,8 @@ def with_moves(table: Measurements) -> Measurements:
     """The table with the way the arm came to each visit, by the order of its visits.
 
     `move` (n, joints) is the commanded q of the visit minus that of the visit before, in rad or m:
-    the visits in order of time where it is recorded, else of the rows, which is an assumption.  A
+    by the columns `before_1 …` where they are recorded, else with the visits in order of time, or
+    of the rows where there is none, which is an assumption (`order_contradicted`).  A
     visit that moved no joint keeps the move before it, and the first has none.  `direction`
     (n, joints) is the sign of each joint's own last motion, 0 where it has not moved yet.  All
     rows of a visit have those of its first row.
@@ -253,15 +256,51 @@ def with_moves(table: Measurements) -> Measurements:
     known, begun = np.unique(number[order], return_index=True)
     sequence = np.argsort(begun)
     q = table.q[order[begun[sequence]]]
-    step = np.diff(q, axis=0, prepend=q[:1])
+    if table.before is not None:
+        step = q - table.before[order[begun[sequence]]]
+    else:
+        step = np.diff(q, axis=0, prepend=q[:1])
     step[np.abs(step) <= STILL] = 0.0
     visit = np.arange(len(step))
-    last = np.maximum.accumulate(np.where(step.any(axis=1), visit, 0))
-    own = np.maximum.accumulate(np.where(step != 0, visit[:, None], 0), axis=0)
+    last, own = visit, np.tile(visit[:, None], q.shape[1])
+    if table.before is None:
+        last = np.maximum.accumulate(np.where(step.any(axis=1), visit, 0))
+        own = np.maximum.accumulate(np.where(step != 0, visit[:, None], 0), axis=0)
     place = np.empty(len(known), dtype=np.int64)
     place[sequence] = visit
     direction = np.sign(np.take_along_axis(step, own, axis=0))
     return replace(table, move=step[last][place[number]], direction=direction[place[number]])
+
+
+# Share of the visits at which a joint that came from one side, by the order of the visits, was
+# recorded as come from there: fewer, beyond chance, and the order is not that of the campaign.
+AGREEING, BEYOND_CHANCE = 0.9, 1e-3
+
+
+def order_contradicted(table: Measurements) -> str | None:
+    """That the recorded sides (`approach_1 …`) are not those of the order of the visits, where it
+    is so: a table that was split, sorted or thinned, or poses that were overshot."""
+    if table.approach is None or table.before is not None:
+        return None
+    found = with_moves(table).direction if table.direction is None else table.direction
+    if found is None:
+        return None
+    first = np.unique(visits(table), return_index=True)[1]
+    recorded, ordered = np.sign(table.approach[first]), np.sign(found[first])
+    told = (recorded != 0) & (ordered != 0)
+    if not told.any():
+        return None
+    share = float((recorded[told] == ordered[told]).mean())
+    # The joints of a visit agree or not together.
+    n = int(told.any(axis=1).sum())
+    from scipy.special import bdtr  # slow to import, seldom asked for
+
+    if bdtr(round(share * n), n, AGREEING) > BEYOND_CHANCE:
+        return None
+    return (
+        f"{table.source}: from which side the joints came, by approach_1 …, is in {share:.0%} of "
+        "the visits what the order of the rows says: the order is not that of the campaign"
+    )
 
 
 # Its columns
@@ -302,6 +341,7 @@ def families(joint_kinds: Sequence[str]) -> dict[str, Family]:
         ),
         Family("time", "time", same(TIME, "time")),
         Family("approach", "approach directions", per_joint("approach_{}", NO_UNIT, NO_UNIT)),
+        Family("before", "joints of the pose before", per_joint("before_{}", ANGLE, LENGTH[:2])),
         Family("temperature", "temperature", same(("C",), "temperature")),
     )
     return {family.name: family for family in known}
@@ -431,6 +471,7 @@ def read_measurements(
         sigma_frame="polar" if "sigma_polar" in raw.layout.columns else "cartesian",
         time=None if time is None else time[:, 0],
         approach=approach,
+        before=raw.si("before"),
         temperature=None if temperature is None else temperature[:, 0],
         joint_kinds=() if q is None else joint_kinds,
     )

@@ -41,6 +41,7 @@ from elastocal.diagnosis.line_orders import families_of, ripples
 from elastocal.diagnosis.model_set import spans_of
 from elastocal.diagnosis.noise_floor import NoisyData, Projection, Weighted, covariance, project
 from elastocal.diagnosis.shrinkage import NEW_POSES, Shrinkage, rms_with_interval
+from elastocal.diagnosis.stated_floor import SupportedFloor, supported_floor
 from elastocal.identification.error_budget import BudgetStep
 from elastocal.model.effects.base import Stage, index, turning_joints
 from elastocal.model.effects.gears import GearSpectrum
@@ -235,30 +236,32 @@ class SumAnswer:
         return np.r_[(slice(0, 0), *(self._spans[k] for k in members))]
 
     def shares(self, members: Sequence[int], lines: Sequence[str] = ()) -> Array:
-        """What these components, and the lines that are not seen of these joints, add to the mean
-        square of the whole, over that (draws,): shares sum to one, and one that cancels a part of
-        others is negative.
+        """The share (draws,) of the squared gap that goes when these components, and the lines that
+        are not seen of these joints, are added last: the mean square of what they do over that of
+        the whole and of what is unexplained.
 
         The draws are as wide as a jackknife over PARTS of the configurations says, where that is
         wider than the posterior, which takes model and sizes for true.
         """
-        index = self._index(members)
-        drawn, apart = (of.share(index, lines) for of in self._added)
+        index, open_ = self._index(members), self.supported.unexplained**2
+        drawn = self.squares(members, lines) / np.maximum(self.total + open_, 1e-300)
+        own, whole = (
+            np.einsum("kd,kd->d", w, G @ w)
+            for w, G in (
+                (self.deleted[index], self.gram[np.ix_(index, index)]), (self.deleted, self.gram)
+            )
+        )  # fmt: skip
+        apart = own / np.maximum(whole + open_, 1e-300)
         spread = np.sqrt((PARTS - 1) * np.mean((apart - apart.mean()) ** 2))
         middle = np.median(drawn)
-        return np.asarray(middle + max(1.0, spread / max(drawn.std(), 1e-300)) * (drawn - middle))
+        wider = middle + max(1.0, spread / max(drawn.std(), 1e-300)) * (drawn - middle)
+        return np.asarray(np.clip(wider, 0.0, None))
 
     @cached_property
-    def _added(self) -> tuple[_Added, _Added]:
-        """By the draws, and by the fits without one part."""
-        w = self.draws
-        pull, unseen = self.gram @ w, {}
-        if self._unseen:
-            left = self.moved @ w + sum(self._unseen.values())
-            pull = self.moved.T @ left / self._readings
-            unseen = {where: np.einsum("nd,nd->d", u, left) / self._readings
-                      for where, u in self._unseen.items()}  # fmt: skip
-        return _Added.of(w, pull, unseen), _Added.of(self.deleted, self.gram @ self.deleted, {})
+    def supported(self) -> SupportedFloor:
+        """What of the noise beside the sum is noise, and what is unexplained."""
+        best = self._left_out_without([])
+        return supported_floor(self.dataset, self.found.data, self.found.noise, best)
 
     @cached_property
     def deleted(self) -> Array:
@@ -273,10 +276,10 @@ class SumAnswer:
             out.append(linalg.cho_solve(factor, all_.z - X.T @ r.ravel())[self._own :])
         return np.array(out).T
 
-    @property
+    @cached_property
     def total(self) -> Array:
         """Mean squares (draws,) in m² of the whole."""
-        return self._added[0].whole
+        return self.squares(range(len(self._spans)), tuple(self._unseen))
 
     @property
     def decided(self) -> SumAnswer:
@@ -516,6 +519,8 @@ class SumAnswer:
     def verdict(self) -> Verdict:
         if self._unnamed and float(np.median(self.shares(self._unnamed))) > LARGE:
             return "unknown_effect"
+        if not self.groups:  # something is there, and no name pays
+            return "unknown_effect"
         return "ambiguous" if self.indistinguishable else "explained"
 
     @cached_property
@@ -692,27 +697,6 @@ class SumAnswer:
             values = (tuple(v.tolist()) for v in (x, y - y.mean(), sd))
             out.append(Curve(f"{c.where} angle", "rad", c.where, "rad", *values))
         return tuple(out)
-
-
-@dataclass(frozen=True)
-class _Added:
-    """What each coefficient adds to the mean square of the whole (Σ k, n), each joint's lines that
-    are not seen (n,), and the `whole` (n,), in m²."""
-
-    each: Array
-    unseen: Mapping[str, Array]
-    whole: Array
-
-    @classmethod
-    def of(cls, w: Array, pull: Array, unseen: Mapping[str, Array]) -> _Added:
-        """Of coefficients w (Σ k, n), `pull` (Σ k, n) the products of their columns with the whole
-        motion."""
-        each = w * pull
-        return cls(each, unseen, each.sum(axis=0) + sum(unseen.values()))
-
-    def share(self, index: IntArray, lines: Sequence[str]) -> Array:
-        part = self.each[index].sum(axis=0) + sum(self.unseen.get(where, 0.0) for where in lines)
-        return np.asarray(part / np.maximum(self.whole, 1e-300))
 
 
 GEARS = "gear_errors"

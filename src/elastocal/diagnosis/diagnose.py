@@ -29,7 +29,13 @@ from elastocal.diagnosis.diagnosis import (
 from elastocal.diagnosis.diagnosis_data import DiagnosisData, diagnosis_data_of
 from elastocal.diagnosis.effect_search import ForwardSelection, SelectedEffects
 from elastocal.diagnosis.evidence import exceedance
-from elastocal.diagnosis.hypotheses import model_keys, possible, with_recorded_drivers
+from elastocal.diagnosis.hypotheses import (
+    BY_LAST_MOVE,
+    OUT_OF_ORDER,
+    model_keys,
+    possible,
+    with_recorded_drivers,
+)
 from elastocal.diagnosis.model_set import settings_of
 from elastocal.diagnosis.reading_faults import OutlierScreening, screen_outliers
 from elastocal.diagnosis.shrinkage import (
@@ -40,7 +46,7 @@ from elastocal.diagnosis.shrinkage import (
     refit,
     shrinkage,
 )
-from elastocal.diagnosis.stated_floor import FALSE_SMOOTH, noise_floor, supported_floor
+from elastocal.diagnosis.stated_floor import FALSE_SMOOTH, noise_floor
 from elastocal.diagnosis.unknown import generic_blocks
 from elastocal.diagnosis.verdict import (
     Answer,
@@ -58,7 +64,7 @@ from elastocal.identification.error_budget import BudgetStep
 from elastocal.identification.mistakes import refuse_nonsense
 from elastocal.identification.rigid_markers import solved_body, without_copies
 from elastocal.identification.start import check_table
-from elastocal.measurements import Measurements
+from elastocal.measurements import Measurements, order_contradicted
 from elastocal.model.effects import CATALOGUE, effect_of
 from elastocal.model.manipulator import Model
 from elastocal.model.smooth_groups import where_smooth_functions_end
@@ -228,6 +234,10 @@ def diagnose(
     progress("fitting the model as it is")
     base = fit_baseline(model, table, options.seed)
     refuse_nonsense(model, base.observed, base.x, base.residual, table)
+    disordered = order_contradicted(table)
+    if disordered:
+        copies = (*copies, disordered + OUT_OF_ORDER)
+        options = replace(options, without=(*options.without, *BY_LAST_MOVE))
     hypotheses, untested = possible(model, table, options.without)
     progress("columns of what could be missing")
     dataset = with_likelier_backlash_model(diagnosis_data_of(base, hypotheses))
@@ -335,12 +345,10 @@ def _of_sum(
     first = first_steps(dataset, found.nothing, None, answer.rng)
     steps = answer.budget(first)
     named = [step for step in steps if not step.step.startswith("unknown")]
-    best = min(step.heldout_rms for step in steps)
-    supported = supported_floor(answer.dataset, data, answer.found.noise, best)
-    floor = supported.noise
+    floor = answer.supported.noise
     gap = Gap(
         steps[0].heldout_rms, first[-1].heldout_rms, named[-1].heldout_rms, floor,
-        supported.unexplained,
+        answer.supported.unexplained,
     )  # fmt: skip
     return {
         "verdict": "unknown_effect" if gap.open else answer.verdict,

@@ -111,11 +111,10 @@ class ComponentShare:
     """What errors of one kind at one place contribute to the gap, all components judged together.
 
     `family` says what the error depends on: "angle" (the joint's own), "gravity", "torque",
-    "load", "move" (the last one), "time", "temperature", "pose", "tool".  `share` is what it
-    adds to the mean square gap after geometry, over that, with its 90 % interval: shares sum to
-    one, and that of a component which cancels a part of others may be negative.  `rms` in m, with
-    its 95 % interval.  `probability` that it is there and moves the markers by a hundredth of the
-    gap's rms or more; `named` where some effect of the catalogue is in it.
+    "load", "move" (the last one), "time", "temperature", "pose", "tool".  `share` is that of the
+    squared gap after geometry which goes when it is added last, with its 90 % interval.  `rms` in
+    m, with its 95 % interval.  `probability` that it is there and moves the markers by a hundredth
+    of the gap's rms or more; `named` where some effect of the catalogue is in it.
     """
 
     family: str
@@ -204,11 +203,16 @@ class Gap:
     unexplained: float = 0.0
 
     @property
+    def unexplained_share(self) -> float:
+        """Of the calibrated arm's excess over the noise, in squares."""
+        excess = max(self.calibrated**2 - self.noise_floor**2, self.unexplained**2)
+        return self.unexplained**2 / excess if excess > 0 else 0.0
+
+    @property
     def open(self) -> bool:
         """Whether no verdict may call the gap explained, or nothing: what is unexplained is more
-        than the noise, and more than LARGE of the calibrated arm's excess over it."""
-        excess = self.calibrated**2 - self.noise_floor**2
-        return self.unexplained**2 > max(self.noise_floor**2, LARGE * excess)
+        than the noise, and more than LARGE of the gap."""
+        return self.unexplained > self.noise_floor and self.unexplained_share > LARGE
 
 
 @dataclass(frozen=True)

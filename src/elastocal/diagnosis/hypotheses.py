@@ -143,6 +143,8 @@ def possible(
     for name, effect in CATALOGUE.items():
         if name in without or not effect.may_be_missing(cell):
             continue
+        if effect.unless and recorded(table, effect.unless):
+            continue
         places = [w for w in effect.places(chain, cell) if (name, w) not in active]
         settings = {w: effect.settings(w, chain, cell) for w in places}
         # Only a driven effect can be evaluated at many settings; others' stay as the model has
@@ -210,6 +212,13 @@ def among(points: Array) -> bool:
 
 
 # What the table records decides how some effects are driven.
+
+# Effects of the last move that take it from the order of the visits.
+BY_LAST_MOVE = tuple(name for name, effect in CATALOGUE.items() if effect.family == "move")
+OUT_OF_ORDER = (
+    ". What goes with the last move was left out; give the joints of the pose before each as "
+    "before_1_deg …, or the table as it was measured"
+)
 
 # Key of [model], its value, the column that allows it, and the effect that it is about.
 CHOICES = (

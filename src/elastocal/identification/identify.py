@@ -40,8 +40,9 @@ from elastocal.identification.weighted_problem import (
     scaled_by_component,
     weights_for,
 )
-from elastocal.measurements import Measurements
-from elastocal.model.effects import CATALOGUE
+from elastocal.measurements import Measurements, order_contradicted
+from elastocal.model.effects import CATALOGUE, effect_of
+from elastocal.model.effects.play import BY_ORDER
 from elastocal.model.manipulator import Model
 from elastocal.model.observations import Observations, observe, subset
 from elastocal.units import Array, Progress
@@ -83,10 +84,20 @@ def identify(
     outliers = describe(every, found.solution, ~found.good)
     result = summarise(model, every, sound, found, outliers, new_poses, copies)
     body = solved_body(table, float(found.solution.fit.residual.std()))
-    result = replace(result, warnings=(*told, *result.warnings, *filter(None, [body])))
+    disordered = _disordered(model, table, test)
+    result = replace(result, warnings=(*told, *disordered, *result.warnings, *filter(None, [body])))
     if test is None:
         return result
     return judged(replace(result, test=_test_errors(model, result, test)))
+
+
+def _disordered(model: Model, *tables: Measurements | None) -> tuple[str, ...]:
+    """That effects of the last move rest on an order which is not that of the campaign."""
+    by_order = model.cell.model.approach == BY_ORDER
+    if not by_order and not any(effect_of(p.effect).family == "move" for p in model.parameters):
+        return ()
+    found = (order_contradicted(table) for table in tables if table is not None)
+    return tuple(f"{text}; effects of the last move are wrong there" for text in found if text)
 
 
 def _fitted(

@@ -138,6 +138,8 @@ def cause_rows(d: Diagnosis) -> ShownTable:
         )
         for c in causes(d)
     ]  # fmt: skip
+    if d.gap.unexplained_share >= FINE**2:
+        rows.append(("unexplained", share_text(d.gap.unexplained_share), "–", "–", "–"))
     return ShownTable(("made of", "share", "90 %", "error falls by", "90 %"), rows)
 
 

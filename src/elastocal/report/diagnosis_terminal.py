@@ -75,9 +75,8 @@ def _tables_of_causes(console: Console, d: Diagnosis) -> Iterable[Table | Text]:
     if found.rows:
         yield table_of("What the gap is made of", found, whole=True)
         yield Text(
-            "share: what it adds to the mean square error of the calibrated arm, over that; below "
-            "zero where it cancels a part of others. error falls by: of new poses, once this and "
-            "nothing else joins the model.\n",
+            "share: of the squared gap, the part that goes when this is added last. error falls "
+            "by: of new poses, once this and nothing else joins the model.\n",
             style="dim",
         )
     if at.rows:

@@ -125,7 +125,6 @@ class MoveLag(DrivenEffect):
     name = "move_lag"
     stage = "transmission"
     at = "turning joints"
-    together = True
     family = "move"
     entry = JointMotion()
     unknowns = (
@@ -153,7 +152,6 @@ class MoveHysteresis(DrivenEffect):
     name = "move_hysteresis"
     stage = "transmission"
     at = "turning joints"
-    together = True
     unless = "approach"
     family = "move"
     entry = JointMotion()
