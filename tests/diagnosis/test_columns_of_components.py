@@ -10,7 +10,8 @@ from support.cells import COMPLIANCE, kr270_cell, kr270_chain, random_table
 
 from elastocal.cell.arm_description import EffectChoice, Nominal
 from elastocal.diagnosis import Hypothesis, compute_columns, fit_baseline
-from elastocal.diagnosis.hypotheses import RegressorDirection, as_placed
+from elastocal.diagnosis.hypotheses import RegressorDirection
+from elastocal.identification.upright import as_placed
 from elastocal.measurements import with_moves
 from elastocal.model import Model
 from elastocal.model.effects import CATALOGUE

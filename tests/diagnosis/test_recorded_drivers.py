@@ -10,7 +10,8 @@ from support.cells import kr270_cell, kr270_chain, random_table
 from support.diagnoses import ECCENTRICITY
 
 from elastocal.diagnosis import Hypothesis, model_keys, with_recorded_drivers
-from elastocal.diagnosis.hypotheses import RegressorDirection, as_placed
+from elastocal.diagnosis.hypotheses import RegressorDirection
+from elastocal.identification.upright import as_placed
 from elastocal.model import Model
 from elastocal.model.effects import CATALOGUE
 

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
 from functools import cache
 from pathlib import Path
 from typing import Any
@@ -48,3 +49,16 @@ def test_what_is_left_is_unexplained_or_noise(case: str) -> None:
     gap = diagnosed(case, without=("gravity_sag",) if case == "without_ignored" else ()).gap
     left = (gap.explained**2 - gap.noise_floor**2) ** 0.5
     assert 0.5 * left < gap.unexplained < 1.05 * left
+
+
+def test_sag_seen_by_a_camera_whose_y_points_down() -> None:
+    """Weights act along −z of the readings' frame; the base says that −y is up."""
+    case = CASES / "without_ignored"
+    table = ec.Model(case / "cell.toml").read(case / "train.csv")
+    camera = replace(table, position=table.position[:, [0, 2, 1]] * [1, -1, 1])
+    why = ec.diagnose(case / "cell.toml", camera)
+    assert why.verdict == "unknown_effect"
+    (text,) = (w for w in why.warnings if "−y" in w)
+    assert "−y points up" in text and "gravity_sag:joint2" in text
+    fit = ec.identify(case / "cell.toml", replace(camera, force=camera.force + [0, 0, -50.0]))
+    assert any("−y" in text for text in fit.warnings)

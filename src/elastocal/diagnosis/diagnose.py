@@ -17,7 +17,7 @@ from elastocal.cell.work_cell import Cell, read_cell
 from elastocal.config import read_toml
 from elastocal.diagnosis.backlash_model import with_likelier_backlash_model
 from elastocal.diagnosis.baseline import Baseline, fit_baseline, thinned
-from elastocal.diagnosis.component_answer import SumAnswer
+from elastocal.diagnosis.component_answer import PAYS, SumAnswer
 from elastocal.diagnosis.component_search import CLEARLY, compared_score, search_components
 from elastocal.diagnosis.diagnosis import (
     SMALLEST_P,
@@ -64,6 +64,7 @@ from elastocal.identification.error_budget import BudgetStep
 from elastocal.identification.mistakes import refuse_nonsense
 from elastocal.identification.rigid_markers import solved_body, without_copies
 from elastocal.identification.start import check_table
+from elastocal.identification.upright import Fallen, fallen
 from elastocal.measurements import Measurements, order_contradicted
 from elastocal.model.effects import CATALOGUE, effect_of
 from elastocal.model.manipulator import Model
@@ -225,6 +226,33 @@ def diagnose(
     are too few configurations to tell an effect from noise.
     """
     options = options or DiagnosisOptions()
+    found = _diagnosed(model, table, options, progress)
+    assert found.calibrated is not None
+    lies = fallen(found.calibrated.model, found.calibrated.x)
+    if lies is None or model.observe == "distance":
+        return found
+    if lies.axis is None:
+        return replace(found, warnings=(str(lies), *found.warnings))
+    progress(f"once more with {lies.axis} up")
+    upright = _diagnosed(model, lies.turned(table), options, progress)
+    return replace(found, warnings=(_if_upright(lies, found, upright), *found.warnings))
+
+
+def _if_upright(lies: Fallen, found: Diagnosis, upright: Diagnosis) -> str:
+    """What is different where the readings' frame is turned so that the arm stands."""
+    before, after = (1e6 * d.budget[-2].heldout_rms for d in (found, upright))
+    if after > (1 - PAYS) * before:
+        return f"{lies}. Here it makes no difference"
+    names = listed(f"{f.effect}:{f.where}" for f in upright.effects) or "no name"
+    return (
+        f"{lies}. With {lies.axis} up {names} explains the gap, and the held-out error falls to "
+        f"{after:.3g} µm instead of {before:.3g} µm"
+    )
+
+
+def _diagnosed(
+    model: Model, table: Measurements, options: DiagnosisOptions, progress: Progress
+) -> Diagnosis:
     given, source = model, table.source
     check_table(model, table)
     _check_enough(table)

@@ -11,7 +11,6 @@ from typing import ClassVar
 import casadi as ca
 import numpy as np
 from scipy.optimize import least_squares
-from scipy.spatial.transform import Rotation
 
 from elastocal.cell.arm_description import EffectChoice
 from elastocal.cell.work_cell import Cell
@@ -35,7 +34,6 @@ from elastocal.model.effects.driven import (
     MarkerMotion,
 )
 from elastocal.model.effects.gears import GearSpectrum
-from elastocal.model.effects.placements import BaseFrame
 from elastocal.model.effects.play import BY_ORDER, Backlash, Hysteresis
 from elastocal.model.effects.smooth import JointCurve, ResidualField
 from elastocal.model.evaluate import BatchFunction
@@ -727,17 +725,6 @@ def _with_all(
     full = made_once(model, key, lambda: Model.assembled(chain, replace(cell, model=spec), extra))
     at = dict(zip(model.names, base.x, strict=True)) | found
     return full, np.array([at.get(p.name, p.nominal) for p in full.parameters])
-
-
-def as_placed(model: Model, x: Array) -> Cell:
-    """The model's cell with the base turned as it is at x (parameters,)."""
-    vector = [v for p, v in zip(model.parameters, x, strict=True)
-              if p.effect == BaseFrame.name and p.unit == "rad"]  # fmt: skip
-    if len(vector) != 3:
-        return model.cell
-    turned = Rotation.from_rotvec(vector).as_matrix()
-    nominal = replace(model.cell.model.nominal, base_rotation=turned)
-    return replace(model.cell, model=replace(model.cell.model, nominal=nominal))
 
 
 def cell_with(cell: Cell, where: str, settings: Mapping[str, float]) -> Cell:

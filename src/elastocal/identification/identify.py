@@ -33,6 +33,7 @@ from elastocal.identification.start import (
     ordinary,
     start_values,
 )
+from elastocal.identification.upright import fallen
 from elastocal.identification.weighted_problem import (
     Weights,
     partition,
@@ -84,11 +85,18 @@ def identify(
     outliers = describe(every, found.solution, ~found.good)
     result = summarise(model, every, sound, found, outliers, new_poses, copies)
     body = solved_body(table, float(found.solution.fit.residual.std()))
-    disordered = _disordered(model, table, test)
-    result = replace(result, warnings=(*told, *disordered, *result.warnings, *filter(None, [body])))
+    told = (*told, *_disordered(model, table, test), *_fallen(model, table, result.x))
+    result = replace(result, warnings=(*told, *result.warnings, *filter(None, [body])))
     if test is None:
         return result
     return judged(replace(result, test=_test_errors(model, result, test)))
+
+
+def _fallen(model: Model, table: Measurements, x: Array) -> tuple[str, ...]:
+    """That the base lies far from upright, where weights or loads act."""
+    weighs = model.cell.model.link_gravity or bool(table.force.any())
+    lies = fallen(model, x) if weighs and model.observe != "distance" else None
+    return () if lies is None else (str(lies),)
 
 
 def _disordered(model: Model, *tables: Measurements | None) -> tuple[str, ...]:
