@@ -272,6 +272,37 @@ def with_moves(table: Measurements) -> Measurements:
     return replace(table, move=step[last][place[number]], direction=direction[place[number]])
 
 
+NEVER_YET = 1e15  # as the line of a table: after all that were measured
+
+
+def by_rows(table: Measurements) -> Array:
+    """The line (n,) at which each row's visit begins, for want of a time; after all lines of a
+    campaign where the table has no readings, as poses have that the arm is still to visit."""
+    if table.position is None and table.distance is None:
+        return np.full(len(table), NEVER_YET)
+    visit = visits(table)
+    first = np.full(int(visit.max(initial=-1)) + 1, np.inf)
+    np.minimum.at(first, visit, table.row.astype(np.float64))
+    return first[visit]
+
+
+FOLLOWING = 3.3  # standard deviations of chance: one joint in a thousand
+
+
+def in_any_order(table: Measurements) -> bool:
+    """Whether no joint's value goes with the row: where it does (a grid, a sorted table), what
+    changes between rows is not to be told from what depends on the pose.
+
+    The correlation of successive visits' values; √n ρ is N(0, 1) in random order.
+    """
+    q = table.q[np.unique(by_rows(table), return_index=True)[1]]  # in their order
+    q = q - q.mean(axis=0)
+    square = (q**2).sum(axis=0)
+    moved = square > 0
+    along = (q[1:] * q[:-1]).sum(axis=0)[moved] / square[moved]
+    return bool((np.abs(along) * np.sqrt(len(q)) < FOLLOWING).all())
+
+
 # Share of the visits at which a joint that came from one side, by the order of the visits, was
 # recorded as come from there: fewer, beyond chance, and the order is not that of the campaign.
 AGREEING, BEYOND_CHANCE = 0.9, 1e-3

@@ -15,13 +15,13 @@ from elastocal.diagnosis import (
     fit_baseline,
     fit_set,
     left_out_residual,
+    left_out_together,
     noise_rms,
     possible,
     project,
     rms_with_interval,
     squared_lengths,
 )
-from elastocal.diagnosis.shrinkage import _left_out_together
 
 NOISE = NoiseValues(1.2, np.array([4e-6, 9e-6, 1e-5]), np.full(3, 0.4))
 SEEDS = range(4)
@@ -42,7 +42,7 @@ def test_left_out_residuals_are_those_of_fits_without_the_configuration(seed: in
 
 
 @pytest.mark.parametrize("seed", SEEDS)
-def test_groups_are_left_out_together(seed: int) -> None:
+def test_groups_areleft_out_together(seed: int) -> None:
     data = random_data(seed)
     together = np.array([0, 1, 0, 2, 1])
     found = left_out_residual(project(data, NOISE), together)
@@ -75,10 +75,10 @@ def test_a_drift_is_judged_on_hours_that_were_left_out() -> None:
     dataset = diagnosis_data_of(base, possible(model, table)[0])
     (h,) = (h for h in dataset.hypotheses if (h.name, h.where) == ("thermal_expansion", "link2"))
     chosen = fit_set(dataset, (Item(h, np.array([1200.0]), 0.0),))
-    drift = _left_out_together(dataset, chosen)
+    drift = left_out_together(dataset, chosen)
     assert drift is not None and len(np.unique(drift)) == 10
     (still,) = (h for h in dataset.hypotheses if h.label == "encoder_scale at joint3")
-    assert _left_out_together(dataset, fit_set(dataset, (Item(still, np.zeros(0), 0.0),))) is None
+    assert left_out_together(dataset, fit_set(dataset, (Item(still, np.zeros(0), 0.0),))) is None
 
 
 @pytest.mark.parametrize("seed", SEEDS)

@@ -60,7 +60,9 @@ def test_what_the_table_does_not_say_is_untested_with_advice(column: str, how: s
     assert all(column in u.reason or "side" in u.reason for u in untested)
     assert all("record" in u.advice and column in u.advice for u in untested)
     complete = {(h.name, h.where) for h in possible(MODEL, TABLE)[0]}
-    parts = {(h.name, h.where) for h in tried} | {(u.effect, u.where) for u in untested}
+    # Without sides the order of the visits has to say them.
+    parts = {(h.name, h.where) for h in tried if h.name != "move_hysteresis"}
+    parts |= {(u.effect, u.where) for u in untested}
     assert parts == complete
 
 

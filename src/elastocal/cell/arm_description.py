@@ -421,6 +421,7 @@ class ModelSpec:
     thermal_driver: Literal["time", "temperature"] = keyed(default="time")
     play_side: Literal["load", "load_and_approach"] = keyed(default="load")
     approach: Literal["column", "order"] = keyed(default="column")
+    clock: Literal["column", "rows"] = keyed(default="column")
     nominal: Nominal = keyed("a table", default_factory=Nominal)
 
     def with_effect(

@@ -28,6 +28,7 @@ ROOMS = {
         "Hypothesis SettingsGrid change_times compute_columns grid_of judged_together model_keys "
         "possible with_recorded_drivers"
     ),
+    "left_out": "blocks_of_time left_out_residual left_out_together squared_lengths",
     "model_set": (
         "Item ModelSet distances extended fit_extended fit_set packed_columns refine "
         "settings_to_try signal_of"
@@ -39,10 +40,7 @@ ROOMS = {
     ),
     "reading_faults": "OutlierScreening left_out_errors screen_outliers",
     "rivals": "RivalSet Suspects alternatives with_neighbours",
-    "shrinkage": (
-        "Change Confirmation PosteriorDraw blocks_of_time left_out_residual new_pose_table "
-        "rms_with_interval squared_lengths"
-    ),
+    "shrinkage": ("Change Confirmation PosteriorDraw new_pose_table rms_with_interval"),
     "stated_floor": (
         "SupportedFloor describe_faulty near_pairs near_repeats noise_rms pure_error returned "
         "smooth_scatter supported_floor"

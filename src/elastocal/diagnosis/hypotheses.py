@@ -16,7 +16,7 @@ from elastocal.cell.arm_description import EffectChoice
 from elastocal.cell.work_cell import Cell
 from elastocal.diagnosis.baseline import Baseline, from_centre, made_once, prior_deviations
 from elastocal.diagnosis.diagnosis import Diagnosis, FoundEffect, Untested
-from elastocal.measurements import Measurements
+from elastocal.measurements import Measurements, by_rows, in_any_order
 from elastocal.model.arm import Arm, ParameterSpec, Setting, row_inputs
 from elastocal.model.chain import Chain
 from elastocal.model.choice import set_constants
@@ -51,8 +51,9 @@ RECORD = {
     "temperature": ("the table has no temperature column", "record temperature_C"),
     "load": (
         "no reading is loaded, and the model has no weights",
-        "measure some poses with and without a load, or give the links' masses and set "
-        "[model] link_gravity = true",
+        # Not "give the links' masses": those of public files are wrong by half, and what they leave
+        # looks like another spring.
+        "measure some poses with and without a load",
     ),
     "station": (
         "the readings do not tell where the instrument stands: they are deflections, or lie around "
@@ -150,6 +151,8 @@ def possible(
         searched = isinstance(effect, DrivenEffect)
         kinds = {s.kind for each in settings.values() for s in each} if searched else set()
         needed = [*effect.needed(cell), *["time"] * bool(kinds & {"change_time", "time_constant"})]
+        if kinds == {"change_time"} and table.time is None and cell.model.clock == "rows":
+            needed = [need for need in needed if need != "time"]
         if lacking := [need for need in needed if not recorded(table, need)]:
             reason, advice = RECORD[lacking[0]]
             untested += [Untested(name, w, reason, advice) for w in places]
@@ -232,7 +235,8 @@ def with_recorded_drivers(
 
     Growth follows a measured temperature rather than a warm-up curve, and play rests where the
     last motion left it where that is known.  Effects that the cell has active stay as they are;
-    those of a diagnosis are driven as `found`.
+    those of a diagnosis are driven as `found`.  Where there are no times, what changes once does so
+    between rows, if the poses are in any order.
     """
     active = {p.effect for p in model.parameters}
     if found is not None:
@@ -243,6 +247,8 @@ def with_recorded_drivers(
         for key, value, column, effect in CHOICES
         if recorded(table, column) and effect not in active
     }
+    if table.time is None and in_any_order(table):
+        keys["clock"] = "rows"
     return with_keys(model, **keys) if keys else model
 
 
@@ -257,8 +263,10 @@ def model_keys(model: Model, found: tuple[FoundEffect, ...]) -> dict[str, str]:
     names, spec = {f.effect for f in found}, model.cell.model
     used = [(key, value) for key, value, _, effect in CHOICES if effect in names]
     keys = {key: value for key, value in used if getattr(spec, key) == value}
-    ordered = spec.approach == BY_ORDER and names & {Backlash.name, Hysteresis.name}
-    return keys | {"approach": BY_ORDER} if ordered else keys
+    if spec.approach == BY_ORDER and names & {Backlash.name, Hysteresis.name}:
+        keys |= {"approach": BY_ORDER}
+    changes = any(s.kind == "change_time" for n in names for s in CATALOGUE[n].constants)
+    return keys | {"clock": spec.clock} if changes and spec.clock != "column" else keys
 
 
 # Where an effect's constants are searched: change times, time constants, orders, ranges.
@@ -326,8 +334,7 @@ def _axis(setting: Setting, where: str, visits: Measurements) -> SettingsGrid:
 
 
 def _time(visits: Measurements) -> Array:
-    assert visits.time is not None  # else the hypothesis is not tested
-    return visits.time
+    return by_rows(visits) if visits.time is None else visits.time
 
 
 def _thinned(axis: SettingsGrid, share: float) -> SettingsGrid:

@@ -268,7 +268,10 @@ def warnings(
     if text := _undecided_backlash(found):
         out.append(text)
     if dataset.table.time is None:
-        out.append("without times neither drifts nor jumps can be seen: record time_s")
+        out.append(
+            "without times no drift can be seen, and a jump only by the order of the rows: "
+            "record time_s"
+        )
     return tuple(out)
 
 

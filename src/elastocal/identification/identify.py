@@ -41,7 +41,7 @@ from elastocal.identification.weighted_problem import (
     scaled_by_component,
     weights_for,
 )
-from elastocal.measurements import Measurements, order_contradicted
+from elastocal.measurements import NEVER_YET, Measurements, order_contradicted
 from elastocal.model.effects import CATALOGUE, effect_of
 from elastocal.model.effects.play import BY_ORDER
 from elastocal.model.manipulator import Model
@@ -262,6 +262,8 @@ def _solution(
 def _test_errors(model: Model, result: Calibration, table: Measurements) -> TestErrors:
     # What came before its first visit is not what came before that of the campaign.
     table = replace(table, move=None, direction=None)
+    if table.time is None and model.cell.model.clock == "rows":  # after the campaign
+        table = replace(table, time=np.full(len(table), NEVER_YET))
     observed = observe(table, model.observe)
     parts = partition(observed, Weights("none", None, False, ""), len(model.parameters))
     error = residual_at(model, parts, result.x)

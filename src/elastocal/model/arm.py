@@ -12,7 +12,7 @@ from numpy.typing import ArrayLike, NDArray
 
 from elastocal.cell.work_cell import Cell
 from elastocal.errors import InputError, option
-from elastocal.measurements import LARGEST_FORCE, Measurements, with_moves
+from elastocal.measurements import LARGEST_FORCE, Measurements, by_rows, with_moves
 from elastocal.model import rigid
 from elastocal.model.chain import Chain
 from elastocal.units import Array
@@ -269,6 +269,8 @@ def _one(arm: Arm, table: Measurements, name: str, marker: NDArray) -> NDArray:
     if name in ("move", "direction") and getattr(table, name) is None:
         table = with_moves(table)
     value = getattr(table, name)
+    if name == "time" and value is None and arm.cell.model.clock == "rows":
+        value = by_rows(table)
     if value is None:
         raise InputError(
             f"{table.source}: the model needs the column {COLUMNS[name]}, which the table lacks"

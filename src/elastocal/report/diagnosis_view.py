@@ -3,9 +3,11 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Iterable
+from collections.abc import Iterable, Mapping
 from dataclasses import dataclass
 from typing import Any
+
+import numpy as np
 
 from elastocal.diagnosis.diagnosis import (
     NORMAL_95,
@@ -21,6 +23,7 @@ from elastocal.diagnosis.diagnosis import (
     NoiseFloor,
 )
 from elastocal.identification.error_budget import BudgetStep
+from elastocal.measurements import by_rows
 from elastocal.report.causes_view import (
     assumed_order,
     cause_rows,
@@ -121,6 +124,7 @@ def _near_repeats_line(near: NearRepeats) -> str:
 
 ABSURD = 100.0  # typical sizes: no arm has an effect that large, whatever the readings could show
 MOST_NAMED = 6
+MOMENTS = ("jump_time_s", "slip_time_s")
 
 
 def diagnosis_headline(d: Diagnosis) -> str:
@@ -141,7 +145,14 @@ def diagnosis_headline(d: Diagnosis) -> str:
 
 
 def _likely(d: Diagnosis) -> list[str]:
-    return [f"{effect_at(f)} (probability {probability(f.probability)})" for f in d.effects]
+    return [f"{effect_at(f)} (probability {probability(f.probability)}{_when(d, f)})"
+            for f in d.effects]  # fmt: skip
+
+
+def _when(d: Diagnosis, f: FoundEffect) -> str:
+    """When it happened, where it happened once."""
+    moments = {k: v for k, v in f.settings.items() if k in MOMENTS}
+    return f"; {settings_of(d, moments)}" if moments else ""
 
 
 def _ambiguous(d: Diagnosis) -> str:
@@ -238,7 +249,17 @@ def _finding_line(d: Diagnosis, f: FoundEffect) -> tuple[str, str]:
     open_sets = {(e.effect, e.where) for rivals in d.indistinguishable for e in rivals}
     label = "Likeliest" if (f.effect, f.where) in open_sets else "Besides"
     text = f"{effect_at(f)} (probability {probability(f.probability)}"
-    return label, f"{text}; {settings_text(f.settings)})." if f.settings else f"{text})."
+    return (
+        label,
+        f"{text}; {settings_of(d, f.settings)})." if f.settings else f"{text}).",
+    )
+
+
+def settings_of(d: Diagnosis, settings: Mapping[str, float]) -> str:
+    """Constants of an effect in words."""
+    table = None if d.calibrated is None else d.calibrated.observed.table
+    lines = () if table is None or table.time is not None else np.unique(by_rows(table)).tolist()
+    return settings_text(settings, lines)
 
 
 def _dependence(d: Diagnosis) -> list[str]:
@@ -343,7 +364,7 @@ def hypothesis_rows(d: Diagnosis, most: int) -> ShownTable:
             f"{c.score:+.1f}",
             significant(c.detectable, 2),
             seen_from(c),
-            settings_text(c.settings),
+            settings_of(d, c.settings),
         )
         for c in d.candidates[:most]
     ]
@@ -363,7 +384,7 @@ def added_parameter_rows(d: Diagnosis) -> ShownTable:
         for p in f.parameters:
             rows.append((printable(p.name), *estimate(p.value, NORMAL_95 * p.std, p.unit)))
         if f.settings:
-            rows.append((effect_at(f), settings_text(f.settings), "", ""))
+            rows.append((effect_at(f), settings_of(d, f.settings), "", ""))
     return ShownTable(("parameter", "value", "± 95 %", "unit"), rows, (0, 3))
 
 

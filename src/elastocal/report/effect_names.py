@@ -158,8 +158,9 @@ def reduction(f: FoundEffect) -> str:
 SMALL = 0.01  # rad, below which angles are told in mrad
 
 
-def settings_text(settings: Mapping[str, float]) -> str:
-    """Searched constants with their units: "jump time 12.0 min, ripple order 101"."""
+def settings_text(settings: Mapping[str, float], lines: Sequence[float] = ()) -> str:
+    """Searched constants with their units: "jump time 12.0 min, ripple order 101"; for want of
+    times a moment is one between the `lines` of the table at which visits begin."""
     ends = {key: key.replace("_low_", "_high_") for key in settings if "_low_" in key}
     pairs = {low: high for low, high in ends.items() if high in settings}
     # What all names begin with says nothing.
@@ -169,7 +170,10 @@ def settings_text(settings: Mapping[str, float]) -> str:
     for key, value in settings.items():
         if LINE.fullmatch(key) or key.endswith(REFERENCE):
             continue
-        if key in pairs:
+        if lines and key.endswith("_time_s"):
+            later = min((line for line in lines if line > value), default=value)
+            texts.append(f"before line {later:.0f} of the table, by the order of its rows")
+        elif key in pairs:
             high = setting_value(pairs[key], settings[pairs[key]])
             texts.append(f"from {setting_value(key, value)} to {high}")
         elif key not in pairs.values():
