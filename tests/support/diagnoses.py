@@ -84,6 +84,7 @@ LOCATION = Location(
 NOISE = NoiseFloor(
     stated=True,
     stated_factor=1.12,
+    ratio_to_stated=1.2,
     reading_sigma=18.4e-6,
     repeatability=(6.1e-6, 5.2e-6, 7.0e-6, 0.0, 9.4e-6, 4.4e-6),
     shared=0.5,

@@ -297,15 +297,17 @@ class NoiseFloor:
     """The noise that the data themselves show.
 
     `stated_factor`: tracker noise in units of what is stated (`stated` says whether anything
-    was).  `reading_sigma` (m): rms per axis of a single reading.  `repeatability` (joints,) in rad
-    or m: scatter of each joint from visit to visit.  `shared`: scatter common to all visits of
-    a configuration, as a multiple of it, `shared_by_joint` (joints,) that of each joint.
-    `pure_error` (m): rms per axis within repeats, `near_repeats`: what readings at nearly the same
-    pose differ by, None without.  `drift` (m): what the cell states of it and nobody has to find.
+    was), `ratio_to_stated`: with the scatter of the joints.  `reading_sigma` (m): rms per axis of a
+    single reading.  `repeatability` (joints,) in rad or m: scatter of each joint from visit to
+    visit.  `shared`: scatter common to all visits of a configuration, as a multiple of it,
+    `shared_by_joint` (joints,) that of each joint.  `pure_error` (m): rms per axis within repeats,
+    `near_repeats`: what readings at nearly the same pose differ by, None without.  `drift` (m):
+    what the cell states of it and nobody has to find.
     """
 
     stated: bool
     stated_factor: float
+    ratio_to_stated: float
     reading_sigma: float
     repeatability: tuple[float, ...]
     shared: float
@@ -532,6 +534,7 @@ def publish(diagnosis: Diagnosis, model: Model, data: str) -> dict[str, Any]:
         "noise": {
             "stated": noise.stated,
             "stated_factor": noise.stated_factor,
+            "ratio_to_stated": noise.ratio_to_stated if noise.stated else None,
             "reading_sigma_um": _um(noise.reading_sigma),
             "repeatability": [
                 {"where": f"joint{i}", "value": value, "unit": unit}

@@ -30,8 +30,11 @@ def noise_floor(dataset: DiagnosisData, data: NoisyData, noise: NoiseValues) -> 
     """Tracker noise, repeatability, shared scatter, (near-)repeats and faulty readings."""
     used = ~data.left_out
     variance = np.diagonal(data.covariance, axis1=1, axis2=2)[used]
+    ratio = noise_rms(data, noise) / np.sqrt(
+        _per_reading(data, np.diagonal(data.covariance, axis1=1, axis2=2))
+    )
     return NoiseFloor(
-        data.stated, noise.factor, float(noise.factor * np.sqrt(variance.mean())),
+        data.stated, noise.factor, float(ratio), float(noise.factor * np.sqrt(variance.mean())),
         tuple(noise.joint.tolist()), noise.shared_by_all, pure_error(dataset),
         tuple(noise.shared.tolist()), describe_faulty(dataset, data, noise),
         near_repeats(dataset, data, project(data, noise)), dataset.drift,

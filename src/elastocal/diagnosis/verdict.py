@@ -6,6 +6,7 @@ from collections import defaultdict
 from dataclasses import dataclass
 
 import numpy as np
+from scipy import special
 
 from elastocal.diagnosis.backlash_model import EFFECT
 from elastocal.diagnosis.diagnosis import (
@@ -22,8 +23,10 @@ from elastocal.diagnosis.effect_search import LARGEST_SET, SelectedEffects
 from elastocal.diagnosis.evidence import Scan, exceedance
 from elastocal.diagnosis.hypotheses import Hypothesis
 from elastocal.diagnosis.model_set import Item, ModelSet, distances, settings_of
-from elastocal.diagnosis.noise_floor import NoiseValues
+from elastocal.diagnosis.noise_floor import NoiseValues, NoisyData
 from elastocal.diagnosis.reading_faults import OutlierScreening
+from elastocal.identification.single_readings import BEYOND, single_readings
+from elastocal.model.observations import subset
 
 # From scores to an answer: explained, ambiguous, unknown, or nothing significant.
 
@@ -246,10 +249,10 @@ def warnings(
 ) -> tuple[str, ...]:
     """What a reader should know before trusting the verdict, by the `noise` that the answer has."""
     out, data = [], found.chosen.data
-    if data.stated and not STATED_LOW < noise.factor < STATED_HIGH:
+    if data.stated and _stated_wrong(dataset, data, noise.factor):
         out.append(
             f"the readings scatter {noise.factor:.2g} times as much as cell or table state; "
-            "correct the stated noise"
+            "correct [tracker], the stated noise"
         )
     faulty = (data.left_out & ~dataset.blocks.absent).sum() / max((~dataset.blocks.absent).sum(), 1)
     if faulty > FAULTY_SHARE:
@@ -273,6 +276,23 @@ def warnings(
             "record time_s"
         )
     return tuple(out)
+
+
+def _stated_wrong(dataset: DiagnosisData, data: NoisyData, factor: float) -> bool:
+    """Whether the tracker's noise is beyond what chance makes of the stated one, and repeats or
+    markers of one pose, where they tell, say so too; or stated far too large."""
+    if factor < STATED_LOW:
+        return True
+    base, good, dof = dataset.base, ~data.faulty, max(data.n_rows - data.X.shape[2], 1)
+    if factor**2 * dof < special.chdtri(dof, BEYOND) or base.stated is None:
+        return False
+    if base.observed.kind != "position":
+        return factor > STATED_HIGH
+    residual = base.residual.reshape(len(good), -1)[good].ravel()
+    single = single_readings(
+        subset(base.observed, good), residual, base.stated[good], len(base.x)
+    )  # fmt: skip
+    return single is None or single.above
 
 
 def _undecided_backlash(found: SelectedEffects) -> str:

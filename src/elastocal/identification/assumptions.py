@@ -41,9 +41,12 @@ def _copies(result: Calibration) -> Iterator[Finding]:
 def _load_unit(result: Calibration) -> Iterator[Finding]:
     """Are all compliances about as much too large as kilograms for newtons make them, or too small?
 
-    On the scale of the logarithm the ratio has to lie nearer to that factor than to one.  By the
-    links' weights alone, a rule of thumb, it is worth a look, and no more.
+    Without a load there is no unit of one.  On the scale of the logarithm the ratio has to lie
+    nearer to that factor than to one.  By the links' weights alone, a rule of thumb, it is worth a
+    look, and no more.
     """
+    if not result.observations.table.force.any():
+        return
     known = {e.name: e.value for e in result.ordinary if e.value is not None}
     found = load_ratio(result.model, known)
     if found is None:

@@ -13,7 +13,7 @@ from scipy import linalg, special
 
 from elastocal.errors import option
 from elastocal.identification.assumptions import assumption_findings
-from elastocal.identification.far_values import far_values, only_placed
+from elastocal.identification.far_values import STATED_BY_FILE, far_values, only_placed
 from elastocal.identification.noise_structure import JOINTS, TIME
 from elastocal.identification.outliers import Outlier, blocks
 from elastocal.identification.residuals import ResidualSummary
@@ -21,6 +21,7 @@ from elastocal.identification.result import Calibration, Estimate, Finding, Numb
 from elastocal.identification.solve import Solution
 from elastocal.identification.tails import kept_of
 from elastocal.measurements import firsts, numbered
+from elastocal.model.effects import effect_of
 from elastocal.text import gathered, listed
 
 # What a result is worth, judged once: each finding with its numbers, its threshold and a remedy.
@@ -54,7 +55,11 @@ WEAK = "weak"
 
 LACKING = (
     "Ask what the model lacks: elastocal diagnose with the same cell and data. Where it finds "
-    "nothing, the excess is the robot's repeatability, or noise larger than stated."
+    "nothing, the excess is the robot's repeatability, or noise larger than stated ([tracker])."
+)
+NAMED = (
+    "The cell has {} already. If diagnose named that, it has no name for what is left: repeat some "
+    "poses, which tell noise and repeatability from what the model lacks."
 )
 STATE_NOISE = (
     "State the tracker's noise ([tracker] sigma_um, or range_um and transverse_um): only beside "
@@ -87,7 +92,7 @@ def judged(result: Calibration, of_solution: tuple[Finding, ...] | None = None) 
     explained = _explained(result, {f.kind for f in noise})
     found = [
         *_spoilt(result),
-        *far_values(result, explained, LACKING),
+        *far_values(result, explained, _lacking(result)),
         *assumption_findings(result, explained),
         *_few_poses(result),
         *(f for f in of_solution if f.kind == "ill_conditioned"),
@@ -138,7 +143,10 @@ def _explained(result: Calibration, told: set[str]) -> bool:
 
     Of n equations for p parameters the held-out error is that of the fit times n / (n - p) or more.
     """
-    stated = told & {"residual_agrees_with_stated_noise", "residual_below_stated_noise"}
+    stated = told & {
+        "residual_agrees_with_stated_noise", "residual_below_stated_noise",
+        "residual_agrees_with_readings",
+    }  # fmt: skip
     agrees = bool(stated) or ("noise_not_compared" in told and "repeats_agree" in told)
     n, held = len(result.observations.value), result.heldout_rms
     expected = result.residual_rms * n / max(result.dof, 1)
@@ -184,8 +192,19 @@ def _against_stated_noise(result: Calibration) -> Iterator[Finding]:
         "ratio": float(ratio), "by_chance_from": float(low), "by_chance_to": float(high),
         "dof": result.dof,
     }  # fmt: skip
-    if ratio > high:
-        yield Finding("residual_above_stated_noise", "care", numbers, LACKING)
+    single = result.noise.single
+    if single is not None and single.above:
+        times = ratio if single.explains else single.ratio
+        yield Finding(
+            "stated_noise_too_small", "note",
+            {"ratio": single.ratio, "dof": single.dof, "by": single.by, "p_rest": single.rest},
+            f"Correct [tracker]: by {single.by} single readings scatter {times:.2g} times as much "
+            "as cell or table state.",
+        )  # fmt: skip
+    if ratio > high and not (single is not None and single.explains):
+        yield Finding("residual_above_stated_noise", "care", numbers, _lacking(result))
+    elif ratio > high:
+        yield Finding("residual_agrees_with_readings", "good", numbers)
     elif ratio < low:
         severity: Severity = "care" if ratio < FAR_TOO_LARGE else "note"
         yield Finding(
@@ -206,6 +225,17 @@ def _stated_kurtosis(result: Calibration) -> float:
     return kept_of(tails, values, size).excess_kurtosis
 
 
+def _lacking(result: Calibration) -> str:
+    """What to do where much is left: ask diagnose, unless the cell has what it names."""
+    usual = set(STATED_BY_FILE)
+    named = {
+        p.effect.replace("_", " "): None
+        for p in result.model.parameters
+        if p.effect not in usual and not effect_of(p.effect).registered
+    }
+    return NAMED.format(listed(named, 3)) if named else LACKING
+
+
 def _lacks_fit(result: Calibration) -> bool:
     found = result.noise.lack_of_fit
     return found is not None and found.p < LACK_OF_FIT
@@ -221,7 +251,7 @@ def _repeats(result: Calibration) -> Iterator[Finding]:
             "counted_by": "the noise model" if noise.shared else counted,
         }  # fmt: skip
         if _lacks_fit(result):
-            yield Finding("lack_of_fit", "care", numbers, LACKING)
+            yield Finding("lack_of_fit", "care", numbers, _lacking(result))
         else:
             yield Finding("repeats_agree", "good", numbers)
     shared = [s for s in noise.sizes or () if s.shared and s.sigma is not None]

@@ -19,8 +19,15 @@ from elastocal.identification.noise_choice import (
     own_noise,
 )
 from elastocal.identification.noise_structure import DRIFT, SHARED
+from elastocal.identification.single_readings import SingleReadings, single_readings
 from elastocal.identification.tails import kept_of
-from elastocal.identification.weighted_problem import Weights, block_diagonal, weights_for, whitener
+from elastocal.identification.weighted_problem import (
+    Weights,
+    block_diagonal,
+    stated_by_observation,
+    weights_for,
+    whitener,
+)
 from elastocal.measurements import Measurements
 from elastocal.model.observations import Observations, pure_error
 from elastocal.units import Array
@@ -121,8 +128,9 @@ class Noise:
 
     `kind` and `description` name the weights.  `sigma` (m) is the noise of a reading's component
     where one number says it, `ratio_to_stated` the residual over the stated noise where any was
-    stated.  `interval_kind` and `interval_description` say how intervals follow from it.  Where the
-    noise was estimated there are its `sizes` and the models `tried`; `reason` says why this one.
+    stated, and `single` that of repeats or of markers of one pose alone.  `interval_kind` and
+    `interval_description` say how intervals follow from it.  Where the noise was estimated there
+    are its `sizes` and the models `tried`; `reason` says why this one.
     `tests` are those for joints that settle anew at each visit and for a drift, `drift` says of a
     course in time how long it lasts.
     """
@@ -139,6 +147,7 @@ class Noise:
     tried: tuple[Trial, ...] | None = None
     tests: tuple[NoiseTest, ...] = ()
     drift: Drift | None = None
+    single: SingleReadings | None = None
 
     @property
     def estimated(self) -> bool:
@@ -173,6 +182,8 @@ class Noise:
             "held_out_by": self.held_out_by,
             "intervals": {"kind": self.interval_kind, "description": self.interval_description},
         }
+        if self.single is not None:
+            content["single_readings"] = asdict(self.single)
         if self.reason is not None:
             content["reason"] = self.reason
         if self.sizes is not None:
@@ -202,6 +213,7 @@ def noise_of(found: MethodResult, sigma: float) -> Noise:
         sigma=None if weights.absolute else sigma,
         ratio_to_stated=_ratio_to_stated(found, sigma),
         lack_of_fit=_lack_of_fit(found),
+        single=_single(found),
         interval_kind=covariance.kind,
         interval_description=covariance.description,
     )
@@ -297,6 +309,15 @@ def _ratio_to_stated(found: MethodResult, sigma: float) -> float | None:
         return None
     e = stated.apply(solution.fit.residual)
     return float(np.sqrt(e @ e / max(len(e) - _spent(found), 1))) / unit
+
+
+def _single(found: MethodResult) -> SingleReadings | None:
+    solution = found.solution
+    observed, tracker = solution.problem.observations, solution.problem.model.cell.tracker
+    stated = stated_by_observation(observed, tracker)
+    if stated is None or solution.problem.model.cell.noise.tails is not None:
+        return None
+    return single_readings(observed, solution.fit.residual, stated, _spent(found))
 
 
 def _spent(found: MethodResult) -> int:

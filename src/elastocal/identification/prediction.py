@@ -448,6 +448,12 @@ def excess_of(
         beyond = np.maximum(between - within, 0.0)
         visits = any(s.shared or s.of_joints or s.drift for s in noise.sizes or ())
         return Excess(beyond / n * pure, one if visits else 1 + beyond / within)
+    single = noise.single
+    if noise.ratio_to_stated and single is not None and single.above:
+        # The noise is what single readings say, and the rest of the residual beyond it.
+        pure, own = scatter * (single.ratio / noise.ratio_to_stated) ** 2, max(dof - single.dof, 1)
+        between = max(dof * scatter - single.dof * pure, 0.0) / own * _chi2(own, rng)
+        return Excess(np.maximum(between - pure * _chi2(single.dof, rng), 0.0), one)
     if noise.ratio_to_stated:
         floor = scatter / noise.ratio_to_stated**2
         return Excess(floor * np.maximum(noise.ratio_to_stated**2 * _chi2(dof, rng) - 1, 0.0), one)

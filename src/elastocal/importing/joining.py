@@ -578,8 +578,11 @@ def _by_time(where: str, points: PooledRecords, log: PooledRecords, settings: Jo
         )
         still = log.spread(settings.still_deg, settings.still_mm)
         q = log.q[order]
-        around = np.abs(q[np.minimum(nearest + 1, len(q) - 1)] - q[np.maximum(nearest - 1, 0)])
-        moving = np.flatnonzero(good & (around > still).any(axis=1))
+        # Rows of other stops say nothing of this one.
+        ends = [np.clip(nearest + step, 0, len(q) - 1) for step in (-1, 1)]
+        soon = [np.where(np.abs(clock[k] - at) <= 2 * settings.tolerance_s, k, nearest)
+                for k in ends]  # fmt: skip
+        moving = np.flatnonzero(good & (np.abs(q[soon[1]] - q[soon[0]]) > still).any(axis=1))
         if len(moving):
             remarks.append(
                 f"WARNING: the arm moved while {len(moving)} points were measured: "

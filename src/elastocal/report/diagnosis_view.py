@@ -80,7 +80,10 @@ def noise_floor_lines(noise: NoiseFloor, kinds: Iterable[str]) -> list[str]:
     sigma = length(noise.reading_sigma)
     if noise.stated:
         text = f"A reading scatters by {sigma} rms per axis, {significant(noise.stated_factor, 2)}"
-        lines = [f"{text} times what is stated."]
+        lines = [
+            f"{text} times what is stated, and {significant(noise.ratio_to_stated)} times with the "
+            "scatter of the joints."
+        ]
     else:
         lines = [f"A reading scatters by {sigma} rms per axis; nothing was stated."]
     lines.append(f"Repeatability from visit to visit: {repeatabilities(noise, kinds)}.")

@@ -50,7 +50,10 @@ def judgement(result: Calibration, sections: bool = False) -> Judgement:
     if trust.severity == "care":
         named = "; and ".join(DOUBTS[f.kind](f) for f in verdict.missing)
         return Judgement("care", f"Use this calibration with care: {told}. But {named}.", steps)
-    compared = result.finding("residual_agrees_with_stated_noise", "residual_below_stated_noise")
+    compared = result.finding(
+        "residual_agrees_with_stated_noise", "residual_below_stated_noise",
+        "residual_agrees_with_readings",
+    )  # fmt: skip
     noise = "" if compared is None else ", and the residual is noise"
     at = "" if verdict.at is None else f" at {length(verdict.at)}"
     return Judgement("good", f"This calibration can be trusted{at}: {told}{noise}.", steps)

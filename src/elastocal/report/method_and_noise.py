@@ -229,6 +229,7 @@ COMPARED = (
     "residual_above_stated_noise",
     "residual_agrees_with_stated_noise",
     "residual_below_stated_noise",
+    "residual_agrees_with_readings",
 )
 SHAPES = {
     "residuals_skew": "errors lean to one side, as an effect that the model lacks would make them.",
@@ -257,7 +258,13 @@ def does_noise_explain_it(result: Calibration) -> str:
     )
     if f.kind == "residual_agrees_with_stated_noise":
         return f"The residual agrees with the stated noise ({size})."
-    if f.kind == "residual_above_stated_noise":
+    single = result.finding("stated_noise_too_small")
+    if f.kind == "residual_agrees_with_readings" and single is not None:
+        text = (
+            f"The noise is stated too small: the residual is {size}, and {single.numbers['by']} "
+            f"scatter by {significant(single.number('ratio'))} times the stated noise themselves."
+        )
+    elif f.kind == "residual_above_stated_noise":
         text = (
             f"The residual is larger than the stated noise explains ({size}): something is "
             "unmodelled, or the noise is larger than stated."
