@@ -5,6 +5,7 @@ from __future__ import annotations
 from collections import defaultdict
 from dataclasses import dataclass, replace
 from pathlib import Path
+from xml.etree import ElementTree as ET
 
 import casadi as ca
 import numpy as np
@@ -303,13 +304,14 @@ def link_inertias(path: Path, chain: Chain) -> tuple[Array, ...]:
     """
     import pinocchio as pin
 
+    root, moving = ET.fromstring(urdf_bytes(path)), {joint.name for joint in chain.joints}
+    for joint in root.iter("joint"):
+        if joint.get("name", "").strip() not in moving:
+            joint.set("type", "fixed")
     try:
-        robot = pin.buildModelFromXML(urdf_bytes(path).decode("utf-8-sig"))
+        model = pin.buildModelFromXML(ET.tostring(root, encoding="unicode"))
     except (ValueError, RuntimeError):
         return ()
-    moving = {joint.name for joint in chain.joints}
-    held = [i for i in range(1, robot.njoints) if robot.names[i] not in moving]
-    model = pin.buildReducedModel(robot, held, pin.neutral(robot)) if held else robot
     tensors = [np.array(inertia.inertia) for inertia in model.inertias[1:]]
     return tuple(tensors) if len(tensors) == chain.n_joints else ()
 

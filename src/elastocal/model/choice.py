@@ -50,6 +50,8 @@ def load_chain(cell: Cell) -> Chain:
     if robot.urdf is not None:
         return plausible(read_urdf(robot.urdf, robot.base, robot.flange), robot.urdf)
     if robot.dh is not None and robot.dh.suffix.lower() in ur_table.ENDINGS:
+        if robot.masses is not None:
+            raise InputError(f"{robot.dh}: takes no [robot] masses; state the arm as a DH table")
         return plausible(ur_table.read_ur_table(robot.dh, robot.ur_model), robot.dh)
     if robot.dh is not None:
         chain = read_dh(robot.dh, convention=robot.dh_convention, masses_path=robot.masses)

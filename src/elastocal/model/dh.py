@@ -227,6 +227,9 @@ ALIASES = {
 def _meant(known: Sequence[Family], what: str, header: str) -> str | None:
     """What to say of an unknown column: its name here, or the columns that there are.  Names are
     compared without their unit, so that min_deg is not taken for beta_deg."""
+    if header.startswith(("<", "version https://git-lfs")):
+        kind = "a web page or XML" if header.startswith("<") else "a pointer of Git LFS"
+        return f"is {kind}, not a {what}; download the file itself"
     ways: dict[str, tuple[str, ...]] = {}
     for family in known:
         for stem in family.units:
