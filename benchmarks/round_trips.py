@@ -20,6 +20,7 @@ from pathlib import Path
 
 import numpy as np
 import yaml
+from scipy.spatial.transform import Rotation
 
 import elastocal as ec
 from elastocal.cell.file_keys import rotation_from_rpy
@@ -98,7 +99,7 @@ def trip(name: str, path: Path, folder: Path, seed: int = 0) -> Trip:
                        None, None, 500, seed)  # fmt: skip
         done = export(fit.arm, wish)
         rows = left if form == "mjcf" else left.take(np.flatnonzero(~left.force.any(axis=1)))
-        found = READERS[form](done.text, fit, cell, rows, folder)
+        found = READERS[form](done.text, fit, fitted, rows, folder)
         assert rows.position is not None
         errors[form] = _rms(found - rows.position)
         losses[form] = done.cost.total.marker_max
@@ -113,7 +114,9 @@ def _rms(apart: Array) -> float:
     return float(np.sqrt((apart**2).sum(axis=1).mean()))
 
 
-def _urdf(text: str, fit: ec.Calibration, cell: Path, rows: Measurements, folder: Path) -> Array:
+def _urdf(
+    text: str, fit: ec.Calibration, known: Measurements, rows: Measurements, folder: Path
+) -> Array:  # fmt: skip
     """Markers of the rows in the tracker's frame: frames of the file, in pinocchio."""
     names = [joint.name for joint in fit.model.chain.joints]
     found = np.empty((len(rows), 3))
@@ -126,7 +129,9 @@ def _urdf(text: str, fit: ec.Calibration, cell: Path, rows: Measurements, folder
     return found
 
 
-def _mjcf(text: str, fit: ec.Calibration, cell: Path, rows: Measurements, folder: Path) -> Array:
+def _mjcf(
+    text: str, fit: ec.Calibration, known: Measurements, rows: Measurements, folder: Path
+) -> Array:  # fmt: skip
     """The same in MuJoCo, at rest under each row's force; the world is the robot's base."""
     arm = MujocoRest(text)
     _, T = _parameters(fit, folder)
@@ -137,15 +142,25 @@ def _mjcf(text: str, fit: ec.Calibration, cell: Path, rows: Measurements, folder
     return np.array(found)
 
 
-def _dh(text: str, fit: ec.Calibration, cell: Path, rows: Measurements, folder: Path) -> Array:
-    """The same by elastocal's reader; base and markers are those of the parameters' file."""
+def _dh(
+    text: str, fit: ec.Calibration, known: Measurements, rows: Measurements, folder: Path
+) -> Array:  # fmt: skip
+    """The same by elastocal's reader.  The table has no base: it is placed by the rows fitted."""
     path = folder / "read.csv"
     path.write_text(text, encoding="utf-8")
-    convention = "standard" if "standard convention" in text else "modified"
-    markers, T = _parameters(fit, folder)
-    flanges = T @ nominal_flanges(read_dh(path, convention), rows.q)  # type: ignore[arg-type]
-    points = np.array([markers[rows.marker_names[k]] for k in rows.marker])
-    return np.asarray((flanges[:, :3, :3] @ points[..., None])[..., 0] + flanges[:, :3, 3])
+    chain = read_dh(path, "standard" if "standard convention" in text else "modified")
+    markers, _ = _parameters(fit, folder)
+
+    def points(table: Measurements) -> Array:
+        T = nominal_flanges(chain, table.q)
+        own = np.array([markers[table.marker_names[k]] for k in table.marker])
+        return np.asarray((T[:, :3, :3] @ own[..., None])[..., 0] + T[:, :3, 3])
+
+    unloaded = known.take(np.flatnonzero(~known.force.any(axis=1)))
+    assert unloaded.position is not None
+    found, seen = points(unloaded), unloaded.position
+    R, _ = Rotation.align_vectors(seen - seen.mean(axis=0), found - found.mean(axis=0))
+    return np.asarray(R.apply(points(rows) - found.mean(axis=0)) + seen.mean(axis=0))
 
 
 def _parameters(fit: ec.Calibration, folder: Path) -> tuple[dict[str, Array], Array]:
@@ -174,8 +189,8 @@ HEAD = """\
 Arms of the packages example-robot-data and rtb-data: a first cell by `init`, 40 random poses
 measured (simulated with errors of typical size), `identify` on 32 of them, `export` to each format.
 Another program reads each file and predicts the markers in the 8 poses left: pinocchio the URDF,
-MuJoCo at rest under the load the MJCF, elastocal's reader the DH tables. Made by
-`python benchmarks/round_trips.py -o docs/round-trips.md`.
+MuJoCo at rest under the load the MJCF, elastocal's reader the DH tables, whose base the fitted
+poses place. Made by `python benchmarks/round_trips.py -o docs/round-trips.md`.
 
 Errors are 3-D rms in µm, noise of a reading included, which alone gives {noise:.0f} µm; of the
 nominal arm base and markers are placed. In brackets stands what `export` says that the format loses
