@@ -166,3 +166,35 @@ def test_a_yaml_of_ur_calibration_is_a_robot(tmp_path):
     np.testing.assert_allclose(T[:3, 3], [-0.8172, -0.2329, 0.0628], atol=1e-6)
     path.write_text(text.replace("    yaw: 0\n", "", 1))
     assert "kinematics.shoulder needs" in told_by_init(path)[2]
+
+
+RADIANS = KR6.replace("-90", "-1.5708").replace(",90", ",1.5708")
+LIMITS = "lower_rad,upper_rad"
+
+
+@pytest.mark.parametrize(
+    ("header", "rows", "code", "told"),
+    [
+        (HEADER, RADIANS, 0, "neighbouring axes are at most 1.5708 degrees apart"),
+        (HEADER.replace("deg", "rad"), KR6, 2, "more than two turns; if these are degrees"),
+        (HEADER, KR6.replace("410", "0.41").replace("450", "0.45").replace("415", "0.415")
+         .replace(",20,", ",0.02,").replace(",30,", ",0.03,").replace("75", "0.075"), 2,
+         "if its lengths are metres"),
+        (f"{HEADER.replace('deg', 'rad')},{LIMITS}",
+         "".join(f"{row},-170,170\n" for row in RADIANS.split()), 2, "more than 27 turns"),
+        (f"{HEADER},lower_deg,upper_deg", with_cells(*["-2.9,2.9"] * 6), 0,
+         "as where limits in rad are read as degrees"),
+        ("version https://git-lfs.github.com/spec/v1", "oid sha256:1\n", 2, "pointer of Git LFS"),
+        ("<!DOCTYPE html>", "<html>\n", 2, "is a web page"),
+    ],
+)  # fmt: skip
+def test_units_that_cannot_be_meant_are_told(header, rows, code, told, tmp_path):
+    found, out, err = told_by_init(write(tmp_path, header, rows))
+    assert found == code and told in out + err, out + err
+
+
+def test_what_is_doubtful_is_a_warning_of_identify_too(tmp_path):
+    assert told_by_init(write(tmp_path, HEADER, RADIANS))[0] == 0
+    model = ec.Model(str(tmp_path / "cell.toml"))
+    data = ec.simulate(model, np.random.default_rng(0).uniform(-1, 1, (20, 6)))
+    assert any("degrees apart" in warning for warning in ec.identify(model, data).warnings)

@@ -156,3 +156,19 @@ def test_a_jaw_alone_is_told(tmp_path):
     )
     code, out, err = told_by_init(arm(tmp_path, at_end=jaw))
     assert code == 0 and "'grip' looks like a jaw" in out, err
+
+
+def test_the_palm_is_the_flange_where_the_thumb_has_more_joints(tmp_path):
+    def finger(name, joints):
+        if not joints:
+            return ""
+        return (
+            f'<body name="{name}{joints}"><inertial pos="0 0 0" mass="0.1" diaginertia="1 1 1"/>'
+            f'<joint name="{name}{joints}" axis="0 1 0" range="0 1"/>{finger(name, joints - 1)}'
+            "</body>"
+        )
+
+    fingers = finger("thumb", 3) + finger("index", 2) + finger("ring", 2)
+    hand = f'<body name="palm" pos="0.1 0 0">{fingers}</body>'
+    code, out, err = told_by_init(arm(tmp_path, at_end=hand))
+    assert code == 0 and "6 joints (j1, " in out and "looks like a jaw" not in out, err

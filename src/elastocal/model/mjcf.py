@@ -32,7 +32,7 @@ from elastocal.model.effects.loads import STANDARD_GRAVITY
 from elastocal.model.mjcf_bounds import check_bounds
 from elastocal.model.mjcf_loops import check_open, ties_of
 from elastocal.model.plausible import check_angles
-from elastocal.model.urdf import MAX_BYTES, as_utf8, xml_tree
+from elastocal.model.urdf import MAX_BYTES, MOST_IN_A_FINGER, as_utf8, xml_tree
 from elastocal.text import did_you_mean, listed, printable
 from elastocal.units import Array
 
@@ -310,6 +310,14 @@ class MjcfArm:
                 f"'{model.body(self.base).name}'; the bodies with the most joints are {told}. Name "
                 "base and flange, a body or a site"
             )
+        # Fingers of unequal length, as a thumb has: no body is common to those with most joints.
+        for body in common[:-1]:
+            after = sum(len(self.joints_of(b)) for b in common[common.index(body) + 1 :])
+            beside = {way[way.index(body) + 1] for way in ways if body in way[:-1]} - {*common}
+            fingers = [b for b in beside if any(b in w and n > moved - after
+                       for w, n in zip(ways, counts, strict=True))]  # fmt: skip
+            if moved - after >= MIN_JOINTS and 0 < after <= MOST_IN_A_FINGER and len(fingers) > 1:
+                return body
         return common[-1]
 
     def _check(self) -> None:

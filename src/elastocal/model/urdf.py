@@ -32,7 +32,7 @@ MOVING = ("revolute", "continuous", "prismatic")
 JOINT_TYPES = (*MOVING, "fixed", "floating", "planar")
 # Names of flanges, the usual first.
 FLANGES = ("tool0", "flange", "ee_link", "tcp")
-MOST_IN_A_FINGER = 4  # joints
+MOST_IN_A_FINGER = 5  # joints
 # Links that `elastocal export` hangs on a flange; none of them is a flange itself.
 TOOL_FRAMES = ("elastocal_marker_", "elastocal_load_point")
 ENDLESS = 1e9  # rad or m, in what pinocchio reads
