@@ -72,7 +72,8 @@ def joint_curves(dataset: DiagnosisData) -> Iterator[Component]:
             continue
         q = dataset.table.q[:, index(where)]
         span = float(np.ptp(q))
-        shortest = max(SHORTEST, RESOLVED * _distance(q, n))
+        distinct = min(n, len(np.unique(q.round(3))))
+        shortest = max(SHORTEST, RESOLVED * span / max(distinct, 1))
         if span < MOVED or shortest > span / 2:
             continue
         longest = max(min(LONGEST, 2 * span), 2 * shortest)
@@ -85,19 +86,6 @@ def joint_curves(dataset: DiagnosisData) -> Iterator[Component]:
             lengths=(math.log(shortest), math.log(longest)), settings=tuple(measured.items()),
             fellows=len(joints),
         )  # fmt: skip
-
-
-def _distance(q: Array, n: int) -> float:
-    """How far a joint's angles are apart in n configurations: their mean distance, or where they
-    stand in groups, the one that half of the range lies in such gaps or larger ones of.
-
-    Of angles at random the gap about a random angle is 1.68 times the mean one in the median.
-    """
-    gaps = np.sort(np.diff(np.unique(q.round(3))))
-    if not len(gaps):
-        return 0.0
-    half = gaps[np.searchsorted(gaps.cumsum(), gaps.sum() / 2)]
-    return max(float(gaps.sum()) / min(n, len(gaps) + 1), float(half) / 1.68)
 
 
 def catalogue_components(dataset: DiagnosisData) -> Iterator[Component]:
