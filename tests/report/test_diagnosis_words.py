@@ -63,7 +63,7 @@ def test_an_explained_gap_names_effect_probability_and_both_errors():
 
 def test_of_two_effects_each_has_its_share():
     text = spoken(TWO)
-    assert "and encoder jump at joint 1 (probability 0.91) explain the gap" in text
+    assert "and encoder jump at joint 1 (probability 0.91; jump time" in text
     assert "gear eccentricity at joint 2 takes away 75 %" in text
     assert "encoder jump at joint 1 takes away 12 % (5 to 19 %)" in text
 
