@@ -31,7 +31,8 @@ help:
 	@echo "make demo       set up .venv if needed, then calibrate a simulated arm"
 	@echo "make test       the test suite              (PYTEST_ARGS=\"tests/model -x\", WORKERS=2)"
 	@echo "make test-long  the long studies among the tests"
-	@echo "make test-versions  the wheel with every other supported Python that is found (VERSIONS_ARGS=--one)"
+	@echo "make test-versions  the wheel with every other supported Python that is found (VERSIONS_ARGS=--one), then a"
+	@echo "                    slice of the tests with the oldest and the newest of what it needs"
 	@echo "make bench      the benchmarks, to benchmarks/result.md      (BENCH_ARGS=--full: all sizes)"
 	@echo "make lint       ruff check, ruff format --check, mypy"
 	@echo "make docs       the documentation as pages in site/ (strict: a broken link is an error)"
@@ -61,6 +62,7 @@ test-long: $(TEST_TOOLS)
 
 test-versions: $(RUN_TIME)
 	$(BIN)/python tests/versions.py $(VERSIONS_ARGS)
+	$(BIN)/python tests/versions.py --floors --newest
 
 bench: $(RUN_TIME)
 	$(BIN)/python benchmarks/run.py $(BENCH_ARGS)

@@ -1,5 +1,8 @@
 """The wheel on every supported Python of this machine: python tests/versions.py.
 
+With --floors and --newest: a slice of the tests in an environment with the oldest versions that
+pyproject.toml allows, all together, and in one with the newest that there are.
+
 Each of VERSIONS that is found by name, or among pyenv's, gets an empty environment outside the
 checkout, the wheel with the tested versions of what it needs, and then runs as a user would: demo,
 identify, a report.  The one that runs this is left to `make test`.  What is missing is said and
@@ -15,10 +18,18 @@ import subprocess
 import sys
 import tempfile
 import time
+import tomllib
 from pathlib import Path
 
 ROOT = Path(__file__).parents[1]
 VERSIONS = ("3.11", "3.12", "3.13")
+# Model, identification, planning, one of each verb, and what is written and read.
+SLICE = (
+    "tests/cli/test_verbs.py", "tests/identification/test_fit.py",
+    "tests/model/test_agreement_with_pinocchio.py", "tests/planning/test_design_flow.py",
+    "tests/studies/test_study_dataset.py", "tests/model/test_mjcf.py",
+)  # fmt: skip
+TOOLS = ("pytest", "hypothesis", "statsmodels", "rtb-data", "example-robot-data", "setuptools")
 AGAIN = ("demo_out/cell.toml", "demo_out/data.csv", "-o", "result.json", "-q")
 
 
@@ -62,13 +73,48 @@ def tried(python: str, source: Path, folder: Path) -> str:
     return f"{run(folder, own / 'python', '--version').strip()}: demo, identify, report"
 
 
+def floors() -> list[str]:
+    """The oldest version of each requirement, extras included, as pip takes it."""
+    project = tomllib.loads((ROOT / "pyproject.toml").read_text(encoding="utf-8"))["project"]
+    extras = project["optional-dependencies"]
+    stated = [*project["dependencies"], *(r for x in ("mujoco", "parquet", "cluster")
+                                          for r in extras[x])]  # fmt: skip
+    return [requirement.replace(">=", "==") for requirement in stated]
+
+
+def sliced(which: str, folder: Path) -> str:
+    """The slice of the tests with `which` versions: "floors" or "newest"."""
+    run(folder, sys.executable, "-m", "venv", "venv")
+    own = folder / "venv" / "bin" / "python"
+    stated = floors()
+    wanted = stated if which == "floors" else [each.partition("==")[0] for each in stated]
+    run(folder, own, "-m", "pip", "install", "-q", "--disable-pip-version-check", "--no-compile",
+        "--only-binary", ":all:", *wanted, *TOOLS)  # fmt: skip
+    told = run(folder, "env", f"PYTHONPATH={ROOT / 'src'}", f"ELASTOCAL_CACHE={folder / 'cache'}",
+               own, "-m", "pytest", "--rootdir", ROOT, "-c", ROOT / "pyproject.toml", "-q", "-p",
+               "no:cacheprovider", "--tb=short", *(ROOT / each for each in SLICE))  # fmt: skip
+    return f"{which}: {told.strip().splitlines()[-1]}"
+
+
 def main() -> int:
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
     own = "{}.{}".format(*sys.version_info)
     others = [version for version in VERSIONS if version != own]
     parser.add_argument("versions", nargs="*", default=others, help="default: all but this one")
     parser.add_argument("--one", action="store_true", help="only the newest that is found")
+    for which in ("floors", "newest"):
+        parser.add_argument(f"--{which}", action="store_true", help=f"the tests with the {which}")
     asked, failed = parser.parse_args(), 0
+    slices = [which for which in ("floors", "newest") if getattr(asked, which)]
+    for which in slices:
+        with tempfile.TemporaryDirectory(prefix=f"elastocal-{which}-") as place:
+            try:
+                print(sliced(which, Path(place)), flush=True)
+            except subprocess.CalledProcessError as error:
+                failed += 1
+                print(f"{which}: {error}", flush=True)
+    if slices:
+        return int(bool(failed))
     with tempfile.TemporaryDirectory(prefix="elastocal-versions-") as place:
         source = Path(place, "source")  # pip builds where the sources are
         shutil.copytree(ROOT / "src", source / "src", ignore=shutil.ignore_patterns("*.egg-info"))

@@ -10,11 +10,12 @@ argument, on the command line the flag.
 
 from __future__ import annotations
 
+import re
 from collections.abc import Collection, Iterable, Iterator
 from contextlib import contextmanager
 from pathlib import Path
 
-from elastocal.text import did_you_mean, listed, quoted
+from elastocal.text import SHOWN, did_you_mean, listed, quoted
 
 # Keyword arguments whose flag is another word; everywhere else joint1_x is --joint1-x.
 FLAGS = {"fixed": "--fix", "options": "--set", "presets": "--preset", "extra_poses": "--poses"}
@@ -23,11 +24,25 @@ LISTS = ("fixed", "without", "options", "presets")
 
 _flags = False
 
+# No name of a file is as long, and nobody reads more.
+LONGEST_WORD, LONGEST_MESSAGE = 400, 8000
+_LONG_WORD = re.compile(rf"\S{{{LONGEST_WORD},}}")
+
+
+def bounded(message: str) -> str:
+    """A message whose words, keys and names of files among them, have an end."""
+    short = _LONG_WORD.sub(lambda word: f"{word[0][:SHOWN]}…{word[0][-SHOWN:]}", message)
+    half = LONGEST_MESSAGE // 2
+    return short if len(short) <= LONGEST_MESSAGE else f"{short[:half]} … {short[-half:]}"
+
 
 class ElastocalError(Exception):
     """Root of all errors that elastocal raises on purpose."""
 
     exit_code = 2
+
+    def __init__(self, message: object = "") -> None:
+        super().__init__(bounded(str(message)))
 
 
 class InputError(ElastocalError):
@@ -101,6 +116,8 @@ def explained(error: Exception, read: Iterable[object]) -> tuple[str, int]:
     """
     import traceback
 
+    if plugin := _of_plugin(error):
+        return plugin, 2
     named = [str(p) for p in read if p is not None for p in (p if isinstance(p, list) else [p])]
     files = listed(map(str, named)) or "the options"
     what = f"{type(error).__name__}: {error}".rstrip(": ")
@@ -124,6 +141,20 @@ def explained(error: Exception, read: Iterable[object]) -> tuple[str, int]:
         f"command and its files ({TRACEBACK}=1 shows where)",
         INTERNAL,
     )
+
+
+def _of_plugin(error: Exception) -> str:
+    """What a plug-in raised while the model was made or evaluated; empty where none did."""
+    import sys
+    import traceback
+
+    loader = sys.modules.get("elastocal.plugin_loader")
+    files = {str(path) for path in getattr(loader, "_files", ())}
+    for frame in reversed(traceback.extract_tb(error.__traceback__)):
+        if frame.filename in files:
+            what = f"{type(error).__name__}: {error}".rstrip(": ")
+            return f"{frame.filename}, line {frame.lineno}: {what}; correct the plug-in"
+    return ""
 
 
 def require(condition: bool, message: str) -> None:

@@ -10,6 +10,9 @@ os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
 # No plug-in of pydantic has to do with a cell file; looking for them reads what is installed.
 os.environ.setdefault("PYDANTIC_DISABLE_PLUGINS", "__all__")
 
+# Figures are drawn into files; what a window would take does not concern them.
+os.environ["MPLBACKEND"] = "agg"
+
 # Importing a command registers it.
 from elastocal.cli import (  # noqa: F401
     compare_command,

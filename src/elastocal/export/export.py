@@ -15,7 +15,7 @@ from typing import Any
 
 import numpy as np
 
-from elastocal.errors import ElastocalError, InputError, option
+from elastocal.errors import ElastocalError, InputError, InsufficientDataError, option
 from elastocal.export.dh_table import CONVENTIONS, FORMULA, dh_csv, dh_lines, without_beta
 from elastocal.export.exportable import (
     Cost,
@@ -397,6 +397,11 @@ def export(
     if wish.format in WRITERS:
         written = WRITERS[wish.format](calibrated, wish, kept, pieces)
     text, checked, tool, warnings, beta = written
+    if checked is not None and not np.isfinite(checked):
+        raise InsufficientDataError(
+            f"{calibrated.source}: its corrections are larger than a file of a robot can hold; "
+            "look at its values"
+        )
     if not text:
         document = parameter_document(calibrated, estimates, pieces, cost)
         text = to_yaml(document) if wish.format == "yaml" else json_text(document) + "\n"

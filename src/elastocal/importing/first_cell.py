@@ -17,9 +17,9 @@ import numpy as np
 
 from elastocal.cell.arm_description import SOURCES, Convention, Robot
 from elastocal.cell.file_keys import rpy
-from elastocal.cell.work_cell import Cell
+from elastocal.cell.work_cell import Cell, read_cell
 from elastocal.errors import InputError, option, require
-from elastocal.files import atomic_write_text
+from elastocal.files import atomic_writer
 from elastocal.model import ur_table
 from elastocal.model.chain import Chain, Joint, finite_ranges
 from elastocal.model.choice import load_chain
@@ -92,7 +92,15 @@ def init(
     )
     text = first_cell(found, "." if target is None else target.parent)
     if target is not None:
-        atomic_write_text(target, text)
+        with atomic_writer(target) as handle:
+            handle.write(text)
+            handle.flush()
+            try:  # before it appears: a cell that cannot be read is not left behind
+                load_chain(read_cell(handle.name))
+            except InputError as error:
+                told = str(error).replace(handle.name, "the cell made of it")
+                file = found.urdf or found.mjcf or found.dh
+                raise InputError(f"{file}: is no robot to begin with: {told}") from None
     return text
 
 

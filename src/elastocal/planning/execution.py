@@ -295,7 +295,7 @@ def shortest_tour(cost: Array, start: list[int], seed: int, iterations: int) -> 
     result = pyvrp.solve(
         data,
         stop,
-        seed=seed,
+        seed=seed % 2**32,  # it takes no larger one
         collect_stats=False,
         display=False,
         params=params,

@@ -141,9 +141,11 @@ def check_driven(steps: Sequence[Step], chain: Chain, limits: Limits | None) -> 
 def limits_text(chain: Chain, limits: Limits | None) -> str:
     """The limits that every joint value was checked against, in degrees."""
     ends = zip(*limits, strict=True) if limits else ((j.lower, j.upper) for j in chain.joints)
-    shown = (
-        f"J{i} {math.degrees(a):.4g} to {math.degrees(b):.4g}" for i, (a, b) in enumerate(ends, 1)
-    )
+    shown = []
+    for i, (low, high) in enumerate(ends, 1):
+        told = [f"from {math.degrees(low):.4g}"] if math.isfinite(low) else []
+        told += [f"to {math.degrees(high):.4g}"] if math.isfinite(high) else []
+        shown.append(f"J{i} {' '.join(told).removeprefix('from ' * (len(told) == 2)) or 'any'}")
     return ", ".join(shown)
 
 

@@ -1,0 +1,86 @@
+"""What commands say: of any length of name in a file, of what has no end, of whose fault it is."""
+
+from __future__ import annotations
+
+import math
+import os
+import subprocess
+import sys
+from pathlib import Path
+
+import numpy as np
+import pytest
+from support.files import write_campaign
+from support.registered import forgotten
+from typer.testing import CliRunner, Result
+
+from elastocal.cli.app import app
+from elastocal.errors import InputError
+from elastocal.model.chain import Chain
+from elastocal.model.urdf import read_urdf
+from elastocal.planning.programs import limits_text
+
+
+def run(*words: object) -> Result:
+    return CliRunner().invoke(app, [str(word) for word in words])
+
+
+@pytest.mark.parametrize("key", ["a" * 20_000, "a b " * 5_000, "'" + "é" * 20_000 + "'"])
+def test_a_message_has_an_end(key: str, tmp_path: Path) -> None:
+    cell = tmp_path / "cell.toml"
+    name = key if key.isalnum() else f'"{key}"'
+    cell.write_text(f"[robot]\n{name} = 1\n", encoding="utf-8")
+    done = run("effects", cell)
+    assert done.exit_code == 2 and len(done.stderr) < 4000 and "cell.toml" in done.stderr
+    assert len(str(InputError(key))) < 9000
+
+
+def test_a_first_cell_that_cannot_be_read_is_not_left_behind(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    from elastocal.importing import first_cell
+
+    write_campaign(tmp_path)
+    monkeypatch.setattr(first_cell, "first_cell", lambda *given: "[robot]\nnothing = 1\n")
+    done = run("init", tmp_path / "arm.urdf", "-o", tmp_path / "first.toml")
+    assert done.exit_code == 2 and "arm.urdf" in done.stderr
+    assert not (tmp_path / "first.toml").exists()
+
+
+def test_limits_without_an_end_are_no_numbers(tmp_path: Path) -> None:
+    write_campaign(tmp_path)
+    chain: Chain = read_urdf(tmp_path / "arm.urdf")
+    lower = np.array([-math.inf, -1.0, -math.inf, -1.0, -1.0, -1.0])
+    upper = np.array([math.inf, math.inf, 1.0, 1.0, 1.0, 1.0])
+    told = limits_text(chain, (lower, upper))
+    assert told.startswith("J1 any, J2 from -57.3, J3 to 57.3, J4 -57.3 to 57.3,")
+    assert "inf" not in told
+
+
+def test_a_plug_in_that_fails_at_work_is_to_blame_itself(tmp_path: Path) -> None:
+    write_campaign(tmp_path)
+    (tmp_path / "mine.py").write_text(
+        "from elastocal.plugins import *\n"
+        "class Mine(DrivenEffect):\n"
+        "  name, stage, entry = 'mine', 'transmission', JointMotion()\n"
+        "  def places(self, chain, cell): return turning_joints(chain)\n"
+        "  def parameters(self, place, chain, cell): return [ParameterSpec('a', 'rad', 0, 1e-5)]\n"
+        "  def drive(self, arm, place, p): return p['b']\n"
+        "register_effect(Mine())\n"
+    )
+    cell = tmp_path / "cell.toml"
+    text = cell.read_text().replace('"joint_offset"', '"joint_offset", "mine"')
+    cell.write_text(f'{text}\n[plugins]\nmodules = ["mine.py"]\n')
+    with forgotten():
+        done = run("identify", cell, tmp_path / "data.csv", "--plugins", "-q")
+    assert done.exit_code == 2 and "mine.py, line 6: KeyError" in done.stderr
+    assert "data.csv" not in done.stderr
+
+
+def test_a_window_that_there_is_not_concerns_no_report(tmp_path: Path) -> None:
+    write_campaign(tmp_path)
+    words = [sys.executable, "-m", "elastocal", "identify", "cell.toml", "data.csv", "-q",
+             "--report", "page.html"]  # fmt: skip
+    environment = os.environ | {"MPLBACKEND": "none_such"}
+    done = subprocess.run(words, cwd=tmp_path, env=environment, capture_output=True, text=True)
+    assert done.returncode == 0, done.stderr
