@@ -214,7 +214,7 @@ def test_settings_have_units():
 
 
 def test_near_repeats_are_told_with_their_number():
-    bare = NoiseFloor(False, 1.0, 2e-5, (0.0,) * 6, 0.0, None)
+    bare = NoiseFloor(False, 1.0, 1.0, 2e-5, (0.0,) * 6, 0.0, None)
 
     def told(near):
         return " ".join(noise_floor_lines(replace(bare, near_repeats=near), KINDS))
@@ -263,7 +263,7 @@ def test_candidates_seen_from_five_standard_deviations():
 
 
 def test_noise_without_repeats_statement_or_faults():
-    bare = NoiseFloor(False, 1.0, 2e-5, (0.0,) * 6, 0.0, None)
+    bare = NoiseFloor(False, 1.0, 1.0, 2e-5, (0.0,) * 6, 0.0, None)
     text = " ".join(noise_floor_lines(bare, KINDS))
     assert "nothing was stated" in text and "none that shows" in text
     assert "No reading is repeated" in text
