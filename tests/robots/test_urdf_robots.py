@@ -194,3 +194,10 @@ def test_the_names_of_the_file_are_shown_and_a_new_mjcf_keeps_them(tmp_path):
     assert [n for n in re.findall(r'<position name="(.*?)"', text)] == names
     done = CliRunner().invoke(app, ["effects", cell])
     assert "Joints: joint1 = linear_axis" in done.stdout
+
+
+def test_a_cell_that_leaves_the_flange_open_is_told_what_init_takes(tmp_path):
+    write(tmp_path, urdf(frame("camera", "link_6")))
+    (tmp_path / "cell.toml").write_text('[robot]\nurdf = "arm.urdf"\n')
+    with pytest.raises(ec.ElastocalError, match=r"camera, tool0; .* \(init takes 'tool0'\)"):
+        ec.Model(str(tmp_path / "cell.toml"))

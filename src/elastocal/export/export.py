@@ -480,7 +480,7 @@ def _urdf(calibrated: CalibratedArm, wish: Wish, kept: Kept, pieces: ExportNumbe
         text = calibrated_urdf(robot, pieces, wish.frames, note)
         tree = check_urdf(robot.urdf)
         base = tree.root if robot.base is None else robot.base
-        flange = tree.last_link(base) if robot.flange is None else robot.flange
+        flange = tree.only_flange(base) if robot.flange is None else robot.flange
     else:
         text = new_urdf(pieces, wish.frames, note)
         base, flange = BASE, FLANGE

@@ -174,7 +174,7 @@ def calibrated_urdf(robot: Robot, pieces: ExportNumbers, frames: Frames, note: s
     assert robot.urdf is not None
     tree = check_urdf(robot.urdf)
     base = tree.root if robot.base is None else robot.base
-    flange = tree.last_link(base) if robot.flange is None else robot.flange
+    flange = tree.only_flange(base) if robot.flange is None else robot.flange
     text = read_urdf_text(robot.urdf)
     added = [f"<!-- {comment(note)} -->"]
     _correct_joints(tree, text, pieces, tree.serial_chain(base, flange))

@@ -48,7 +48,7 @@ def read_urdf(path: str | Path, base: str | None = None, flange: str | None = No
     """The serial chain between two links of a URDF.
 
     base: link name, default the root link; the chain starts in its frame.
-    flange: link name, default as `Tree.last_link` finds it.
+    flange: link name, default the only leaf that at least four moving joints carry.
     Chain: placements in m, unit axes, limits in rad or m (continuous: infinite), and one mass
     per joint in kg with its centre of mass in m in the joint's frame (none if all are zero).
     Bodies beyond the flange and on side branches count, those carried by the base do not.
@@ -65,7 +65,7 @@ def read_urdf(path: str | Path, base: str | None = None, flange: str | None = No
     """
     tree = check_urdf(path)
     base = tree.root if base is None else tree.find_link("base", base)
-    flange = tree.last_link(base) if flange is None else tree.find_link("flange", flange)
+    flange = tree.only_flange(base) if flange is None else tree.find_link("flange", flange)
     moving = tree.serial_chain(base, flange)
     read = _read_by_pinocchio(tree, [joint.name for joint in moving], base, flange)
     joints = []
@@ -290,6 +290,18 @@ class Tree:
         )
         leaves = self._leaves(base)
         return ends[0] if ends else max(leaves, key=lambda leaf: len(self._moving(base, leaf)))
+
+    def only_flange(self, base: str) -> str:
+        """`last_link` where there is nothing to choose: a cell that leaves the choice open may have
+        meant another frame.  Raises InputError with the links that there are."""
+        able = [k for k in self._leaves(base) if len(self._moving(base, k)) >= MIN_JOINTS]
+        found = self.last_link(base)
+        require(
+            len(able) < 2,
+            f"{self.path}: several links could be the flange: {listed(sorted({*able, found}))}; "
+            f"name the right one as `flange` (init takes '{found}')",
+        )
+        return found
 
     def _leaves(self, base: str) -> list[str]:
         """Links on which nothing hangs but tool frames that `export` has added."""
