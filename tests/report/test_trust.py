@@ -14,7 +14,7 @@ from elastocal.report import judgement_view
 from elastocal.report.formatting import length
 from elastocal.report.page import page_of
 
-MISFIT = LackOfFit(9.0, 1e-5, 30, 200)
+MISFIT = LackOfFit(9.0, 1e-5, 30, 20)
 
 
 def judgement(result: Any) -> judgement_view.Judgement:

@@ -14,7 +14,7 @@ from numpy.typing import ArrayLike
 
 from elastocal.above import Result, headline, write_page
 from elastocal.cell.arm_description import Unsteadiness
-from elastocal.errors import UnknownNameError
+from elastocal.errors import ElastocalError, UnknownNameError
 from elastocal.identification import scrutiny
 from elastocal.identification.constrained import ActiveConstraint
 from elastocal.identification.covariance import Covariance
@@ -28,6 +28,7 @@ from elastocal.identification.prediction import (
     excess_of,
     measured_loads,
     measured_visits,
+    over_the_workspace,
     position_at,
     scatter_of,
 )
@@ -49,6 +50,7 @@ from elastocal.model.observations import COMPONENTS, Observations
 from elastocal.units import Array
 
 SCHEMA = "elastocal/identification/1"
+FEW_POSES = 64  # of those over the workspace, for an rms
 LOPSIDED = 0.1  # difference of the halves of an interval that one half width cannot tell
 
 
@@ -539,6 +541,24 @@ class Calibration(Result):
         )
 
     @cached_property
+    def load_point_error(self) -> float | None:
+        """Rms in m to which the load point is known at new poses, where that is more than the
+        verdict says of the markers: nothing measured tells where it lies among them.
+
+        It is the default point of `compensate`.  None where it is known as well, or not stated.
+        """
+        tool, at = self.model.cell.tool, self.verdict.at
+        if not tool.load_point.any() or at is None:
+            return None
+        poses = over_the_workspace(self.model.cell, self.model, self.observations.table)
+        try:
+            found = self.position(poses.q[:FEW_POSES], poses.force[:FEW_POSES])
+        except ElastocalError:
+            return None
+        rms = float(np.sqrt(np.nanmean(np.trace(found.covariance, axis1=1, axis2=2))))
+        return rms if rms > at else None
+
+    @cached_property
     def excess(self) -> Excess | None:
         """By how much configurations scatter beyond their noise; None where nothing tells it."""
         rng = np.random.default_rng(0)
@@ -646,6 +666,9 @@ class Calibration(Result):
             | {"sentence": headline(self) if self.findings else None},
             "predicted_new_poses_um": None if self.predicted is None else self.predicted.to_json(),
             "measured_visits": measured_visits(self.observations).to_json(),
+            "load_point_um": None
+            if self.load_point_error is None
+            else _um(self.load_point_error),
             "measured_poses": None if self.shown is None else self.shown.to_json(),
             "open": None if self.left is None else self.left.to_json(),
             "noise": self.noise.to_json(),

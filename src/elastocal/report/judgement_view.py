@@ -6,6 +6,7 @@ import math
 from collections.abc import Callable
 from dataclasses import dataclass
 
+from elastocal.errors import option
 from elastocal.identification.far_values import only_placed
 from elastocal.identification.findings import next_steps
 from elastocal.identification.result import Calibration, Finding
@@ -45,18 +46,21 @@ def judgement(result: Calibration, sections: bool = False) -> Judgement:
     if trust.severity == "poor":
         why = next(f for f in result.findings if f.severity == "poor" and f is not trust)
         return Judgement("poor", f"Do not use this calibration: {DOUBTS[why.kind](why)}.", steps)
-    told = _accuracy(result)
+    told, elsewhere = _accuracy(result), _load_point(result)
     verdict = result.verdict
     if trust.severity == "care":
         named = "; and ".join(DOUBTS[f.kind](f) for f in verdict.missing)
-        return Judgement("care", f"Use this calibration with care: {told}. But {named}.", steps)
+        return Judgement(
+            "care", f"Use this calibration with care: {told}{elsewhere}. But {named}.", steps
+        )
     compared = result.finding(
         "residual_agrees_with_stated_noise", "residual_below_stated_noise",
         "residual_agrees_with_readings",
     )  # fmt: skip
     noise = "" if compared is None else ", and the residual is noise"
     at = "" if verdict.at is None else f" at {length(verdict.at)}"
-    return Judgement("good", f"This calibration can be trusted{at}: {told}{noise}.", steps)
+    text = f"This calibration can be trusted{at}: {told}{noise}{elsewhere}."
+    return Judgement("good", text, steps)
 
 
 # What verdict, next step and the line on noise say already.
@@ -206,6 +210,18 @@ def _accuracy(result: Calibration) -> str:
     elif math.isfinite(gain):
         text += f", {significant(gain, 2)} times better than by the nominal arm"
     return text
+
+
+def _load_point(result: Calibration) -> str:
+    """That all this is about the markers, where the load point is known worse."""
+    if result.load_point_error is None:
+        return ""
+    marker = printable(next(iter(result.model.cell.tool.markers)))
+    return (
+        f". That is so of the markers; the load point, where compensate goes by default, is known "
+        f"to {length(result.load_point_error)} rms only, as nothing measured says where it lies "
+        f"among them: measure a marker there, or state {option('point')} {marker}"
+    )
 
 
 def _placed_markers(result: Calibration) -> str:

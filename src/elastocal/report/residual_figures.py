@@ -392,7 +392,8 @@ def uncertainty_map(result: Calibration) -> str:
     each part of the workspace; empty where the model asks for more than joints and load."""
     model, point = result.model, None
     markers, load_point = model.cell.tool.markers, model.cell.tool.load_point
-    if not load_point.any() and len(markers) != 1:
+    # The point that the verdict speaks of.
+    if (not load_point.any() and len(markers) != 1) or result.load_point_error is not None:
         point = next(iter(markers), "0,0,0")
     poses = over_the_workspace(model.cell, model, result.observations.table)
     try:
@@ -406,8 +407,11 @@ def uncertainty_map(result: Calibration) -> str:
         return ""
     at = np.column_stack([np.hypot(nominal[:, 0], nominal[:, 1]), nominal[:, 2]])[good]
 
+    what = printable(f"marker {point}" if point in markers else "tool")
+
     def draw(figure: Figure) -> None:
         axes = figure.subplots()
+        axes.set_title(what)
         _map(axes, at, 1e12 * variance[good], float(np.ptp(at, axis=0).max()) / CELLS)
         axes.set_xlabel("distance from the base's z axis in m")
         axes.set_ylabel("height over the base in m")
