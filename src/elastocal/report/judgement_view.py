@@ -146,8 +146,13 @@ DOUBTS: dict[str, Callable[[Finding], str]] = {
         f"not show ({listed([printable(str(n)) for n in f.listed('parameters')], 3)})"
     ),
     "new_poses_no_gain": lambda f: (
-        f"at new poses {_length(f, 'rms_um')} are to be expected, hardly better than the nominal "
-        "arm"
+        f"at new poses {_length(f, 'rms_um')} are to be expected, "
+        + (
+            "hardly better than"
+            if f.number("rms_um") <= f.number("nominal_rms_um")
+            else "worse than"
+        )
+        + f" by the nominal arm where it was measured ({_length(f, 'nominal_rms_um')})"
     ),
     "many_faulty_readings": lambda f: (
         f"{f.numbers['faulty']} of the {f.numbers['fitted']} readings fitted lie beyond what the "
