@@ -71,7 +71,9 @@ def test_every_column_of_the_measurement_table_is_on_the_page():
     text = section("Measurement table")
     for family in families(("revolute",) * 6).values():
         for stem in family.units:
-            of_a_joint = re.fullmatch(r"(q|torque_|approach_|before_)[2-6]", stem)  # "…" on the page
+            of_a_joint = re.fullmatch(
+                r"(q|torque_|approach_|before_)[2-6]", stem
+            )  # "…" on the page
             assert of_a_joint or re.search(rf"(?<!\w){stem}", text), stem
 
 

@@ -30,10 +30,12 @@ from pathlib import Path
 from random import Random
 
 from fuzz.campaign import COMMANDS, Command
+from fuzz.grammar import grown
 from fuzz.mutations import spoil, spoil_arguments
 
 SECONDS = 30  # of processor time
 WALL = 120.0  # s; beyond it a case hangs, also where other programs have the processor
+GROWN = 0.4  # share of cases that are made by the grammar, not spoilt
 MEMORY = 1_000_000_000  # bytes resident, what is loaded included
 OLD = b"what was there before\n"
 DIRECTIONS = "\u200e\u200f\u202a\u202b\u202c\u202d\u202e\u2066\u2067\u2068\u2069\u2028\u2029"
@@ -61,6 +63,7 @@ class Case:
     took: float = 0.0  # s by the clock
     resident: int = 0
     complaints: list[str] = field(default_factory=list)
+    then: list[tuple[Command, list[str]]] = field(default_factory=list)  # verbs that follow
 
     @property
     def line(self) -> str:
@@ -95,6 +98,10 @@ def load_everything() -> None:
 def make(seed: int, base: Path, folder: Path, verbs: tuple[str, ...] = ()) -> Case:
     """The spoilt case of a seed in `folder`, which must not exist; `base` is the campaign."""
     rng = Random(seed)
+    if not verbs and rng.random() < GROWN:
+        work = folder / "a" / "b" / "c"
+        (command, words), *then = grown(work, rng)
+        return Case(seed, command, words, f"grown: {chained(then)}", work, then=then)
     command = rng.choice([c for c in COMMANDS if not verbs or c.verb in verbs])
     # What `..` names stays within the case.
     work = folder / "a" / "b" / "c"
@@ -109,6 +116,9 @@ def make(seed: int, base: Path, folder: Path, verbs: tuple[str, ...] = ()) -> Ca
         done.append(how)
     if rng.random() < 0.5:
         for name in command.outputs:
+            # What goes beside an output replaces only what elastocal wrote.
+            if name.endswith(".json") and f"{name[:-5]}.csv" in command.outputs:
+                continue
             (work / name).write_bytes(OLD)
     return Case(seed, command, words, "; ".join(done), work)
 
@@ -118,7 +128,14 @@ def run(case: Case) -> Case:
     before = seen(case.folder)
     execute(case)
     case.complaints = list(_complaints(case, before))
+    if case.then and case.code == 0 and not case.complaints:
+        (command, words), *then = case.then
+        return run(Case(case.seed, command, words, case.done, case.folder, then=then))
     return case
+
+
+def chained(verbs: list[tuple[Command, list[str]]]) -> str:
+    return " > ".join(command.verb for command, _ in verbs)
 
 
 def execute(

@@ -158,7 +158,11 @@ class _File:
         for key, name in element.attrib.items():
             if key.startswith("file") and name:
                 for found in self._candidates(name):
-                    size = self._model.count_file(found, f"file of <{printable(element.tag)}>")
+                    try:
+                        size = self._model.count_file(found, "file")
+                    except InputError as error:
+                        tag = printable(element.tag)
+                        raise InputError(f"{self._path}: <{tag}> names {error}") from None
                     if element.tag == "flexcomp":
                         yield size / VERTEX_BYTES
                     elif element.tag == "hfield":
