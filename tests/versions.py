@@ -28,6 +28,7 @@ SLICE = (
     "tests/cli/test_verbs.py", "tests/identification/test_fit.py",
     "tests/model/test_agreement_with_pinocchio.py", "tests/planning/test_design_flow.py",
     "tests/studies/test_study_dataset.py", "tests/model/test_mjcf.py",
+    "tests/export/test_mjcf_in_place.py",
 )  # fmt: skip
 TOOLS = ("pytest", "hypothesis", "statsmodels", "rtb-data", "example-robot-data", "setuptools")
 AGAIN = ("demo_out/cell.toml", "demo_out/data.csv", "-o", "result.json", "-q")
