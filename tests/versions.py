@@ -93,7 +93,8 @@ def sliced(which: str, folder: Path) -> str:
         "--only-binary", ":all:", *wanted, *TOOLS)  # fmt: skip
     told = run(folder, "env", f"PYTHONPATH={ROOT / 'src'}", f"ELASTOCAL_CACHE={folder / 'cache'}",
                own, "-m", "pytest", "--rootdir", ROOT, "-c", ROOT / "pyproject.toml", "-q", "-p",
-               "no:cacheprovider", "--tb=short", *(ROOT / each for each in SLICE))  # fmt: skip
+               "no:cacheprovider", "--tb=short", "--disable-warnings",
+               *(ROOT / each for each in SLICE))  # fmt: skip
     return f"{which}: {told.strip().splitlines()[-1]}"
 
 

@@ -293,6 +293,7 @@ def _message_complaints(case: Case) -> Iterator[str]:
     message = case.stderr[case.stderr.index(messages[0]) + len(messages[0]) :]
     words = (*case.words, *case.command.line.split(), *case.command.named)
     names = {Path(word).name or "." for word in words}
+    names |= {name[:60] for name in names}  # as much of it as a message shows
     shown = {name for name in names if name.isprintable()} | {repr(name)[1:-1] for name in names}
     if not (any(name in message for name in shown) or NAMED.search(message)):
         yield "names no culprit"

@@ -161,5 +161,10 @@ def test_a_picture_is_sized_by_what_it_unpacks_to(tmp_path: Path) -> None:
     refused(model(tmp_path, top=top), "more than 1000000 points")
 
 
+def test_what_is_no_number_is_told_before_mujoco_logs_it(tmp_path: Path) -> None:
+    refused(model(tmp_path, '<site name="nan" pos="0 NaN 0"/>'), "pos='0 NaN 0'> is no number")
+    assert read_mjcf(model(tmp_path, '<site name="nan"/>'), flange="end").n_joints == 4
+
+
 def test_a_file_that_includes_itself_is_named(tmp_path: Path) -> None:
     refused(model(tmp_path, top='<include file="arm.xml"/>'), "includes itself")

@@ -40,6 +40,7 @@ LARGEST: dict[str, dict[str, float]] = {
     "mesh": {"params": 200, "octree_maxdepth": 8},
     "composite": {"subgrid": 10},
 }  # fmt: skip
+NAMES = ("name", "class", "childclass", "model", "prefix", "file")
 _NUMBER = re.compile(r"[-+]?(?:\d+\.?\d*|\.\d+)(?:[eE][-+]?\d{1,3})?")
 _UNITS = {unit: 1024.0**k for k, unit in enumerate("KMGTPE", start=1)}
 
@@ -176,6 +177,12 @@ class _File:
 
     def _check_sizes(self, element: ET.Element) -> None:
         tag = element.tag
+        for key, text in element.attrib.items():
+            require(
+                key in NAMES or not re.search(r"(?i)(?<!\S)[-+]?nan(?!\S)", text),
+                f"{self._path}: <{printable(tag)} {printable(key)}={quoted(text)}> is no number; "
+                "correct it",
+            )
         for key, largest in LARGEST.get(tag, {}).items():
             if max(_numbers(element.get(key, "")), default=0.0) > largest:
                 raise InputError(
