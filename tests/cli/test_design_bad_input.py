@@ -249,7 +249,7 @@ def test_measurements_that_do_not_fit(tmp_path, text, fragments):
         ("none/plan.csv", "the folder .*none does not exist"),
         ("plan.json", r"name the plan \.csv"),
         ("cell.toml", "cell.toml is read and would"),
-        ("arm.csv", "arm.json is read and would"),
+        ("arm.csv", "arm.json: goes beside"),
     ],
 )
 def test_an_output_that_cannot_be(tmp_path, output, fragment):

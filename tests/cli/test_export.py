@@ -90,7 +90,7 @@ BAD = [
     (("-o", "cell.toml", "--format", "dh"), "is read and would be written over"),
     (("-o", "result.json"), "is read and would be written over"),
     (("-o", "a.urdf", "--load", "nan", "0", "0"), "--load takes three finite numbers"),
-    (("-o", "a.urdf", "--temperature-c", "inf"), "--temperature-c takes a number of"),
+    (("-o", "a.urdf", "--temperature-c", "inf"), "--temperature-c takes a finite number"),
 ]
 
 

@@ -121,9 +121,9 @@ def test_the_scatter_that_is_told_is_that_of_the_answer() -> None:
     plain, nothing = fit_set(one, ()), None
     found = SelectedEffects(one, plain, (), (), plain, nothing, nothing)  # type: ignore[arg-type]
     screened = OutlierScreening(one.data.faulty, one.data.faulty)
-    for factor in (1.0, 3.0):
+    for factor in (1.0, 0.5):
         told = warnings(one, found, screened, replace(plain.noise, factor=factor))
-        assert any("scatter 3 times" in t for t in told) == (factor == 3.0)
+        assert any("scatter 0.5 times" in t for t in told) == (factor == 0.5)
 
 
 def test_play_by_either_law_may_be_true_at_fresh_poses() -> None:

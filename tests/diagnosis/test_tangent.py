@@ -65,7 +65,7 @@ def test_poses_not_measured_yet_do_not_change_what_the_data_say() -> None:
     late = np.linspace(1e5, 2e5, 100)
     q = random_poses(model.chain, 100, 5)
     pool = visit_pool_of(model, base.x, table, q, np.ones((100, 6)), late, force)
-    noise = NoiseFloor(True, 1.0, 2e-5, (5e-6,) * 6, 0.0, None)
+    noise = NoiseFloor(True, 1.0, 1.0, 2e-5, (5e-6,) * 6, 0.0, None)
     diagnosis = type("Found", (), {"noise": noise})
     whole = campaign_of(base, pool, spring, diagnosis).dataset  # type: ignore
     alone = diagnosis_data_of(base, spring)
@@ -86,7 +86,7 @@ def against_a_spring() -> Discrimination:
     force = np.unique(table.force, axis=0)
     late, q = np.linspace(1e5, 2e5, 30), random_poses(model.chain, 30, 5)
     pool = visit_pool_of(model, base.x, table, q, np.ones((30, 6)), late, force)
-    noise = NoiseFloor(True, 1.0, 2e-5, (5e-6,) * 6, 0.0, None)
+    noise = NoiseFloor(True, 1.0, 1.0, 2e-5, (5e-6,) * 6, 0.0, None)
     diagnosis = type("Found", (), {"noise": noise})
     whole = campaign_of(base, pool, [known[k] for k in keys], diagnosis)  # type: ignore
     rivals = RivalSet.of([Item(known[k], np.zeros(0), 0.0) for k in keys], [0.5, 0.5], [])

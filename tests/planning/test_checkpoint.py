@@ -12,10 +12,10 @@ from elastocal.planning import Checkpoint, Stage, key_of
 
 def test_a_stage_gives_back_what_it_was_given(tmp_path: Path) -> None:
     state = {"q": np.arange(6.0).reshape(2, 3), "done": np.array([True, False]), "n": np.int64(4)}
-    checkpoint = Checkpoint.beside(tmp_path / "plan.csv", "key")
+    checkpoint = Checkpoint.beside(tmp_path / "plan.csv", "ab" * 32)
     assert not checkpoint.begun
     checkpoint.stage("pool").save(state)
-    again = Checkpoint.beside(tmp_path / "plan.csv", "key")
+    again = Checkpoint.beside(tmp_path / "plan.csv", "ab" * 32)
     assert again.begun
     loaded = again.stage("pool").load()
     assert loaded is not None and loaded.keys() == state.keys()
@@ -26,8 +26,8 @@ def test_a_stage_gives_back_what_it_was_given(tmp_path: Path) -> None:
 
 
 def test_another_input_starts_anew(tmp_path: Path) -> None:
-    Checkpoint.beside(tmp_path / "plan.csv", "one").stage("pool").save({"q": np.zeros(3)})
-    assert not Checkpoint.beside(tmp_path / "plan.csv", "two").begun
+    Checkpoint.beside(tmp_path / "plan.csv", "1" * 64).stage("pool").save({"q": np.zeros(3)})
+    assert not Checkpoint.beside(tmp_path / "plan.csv", "2" * 64).begun
 
 
 @pytest.mark.parametrize("content", [b"", b"PK\x03\x04 cut short", b"something else"])

@@ -49,7 +49,7 @@ def diagnosis_of(
         indistinguishable=(tuple(EffectAt(*key) for key in rivals),),
         location=None,
         model_keys={"play_side": "load_and_approach"},
-        noise=NoiseFloor(True, 1.0, SIGMA, (REPEATABILITY,) * 6, 0.2, None),
+        noise=NoiseFloor(True, 1.0, 1.0, SIGMA, (REPEATABILITY,) * 6, 0.2, None),
         probability_unknown=0.0,
         probability_nothing=0.0,
     )

@@ -84,7 +84,7 @@ def discrimination(base: Baseline, pool: VisitPool) -> Discrimination:
     settings = [[], [], [TIME_CONSTANT]]
     items = [Item(known[k], np.array(s), 0.0) for k, s in zip(RIVALS, settings, strict=True)]
     joints = tuple(NOISE.joint), 0.5, None, tuple(NOISE.shared)
-    found = NoiseFloor(True, NOISE.factor, SIGMA, *joints)
+    found = NoiseFloor(True, NOISE.factor, NOISE.factor, SIGMA, *joints)
     diagnosis = type("Found", (), {"noise": found})
     whole = campaign_of(base, pool, [known[k] for k in RIVALS], diagnosis)  # type: ignore
     rivals = RivalSet.of(items, list(PROBABILITY), [])
@@ -232,7 +232,7 @@ def test_a_rival_with_settings_imitates_by_its_best_ones(base, pool, discriminat
     drift = discrimination.rivals.rivals[2]
     quick = replace(drift, settings=np.array([700.0]))
     joints = tuple(NOISE.joint), 0.5, None, tuple(NOISE.shared)
-    found = NoiseFloor(True, NOISE.factor, SIGMA, *joints)
+    found = NoiseFloor(True, NOISE.factor, NOISE.factor, SIGMA, *joints)
     whole = campaign_of(base, pool, [drift.what], type("Found", (), {"noise": found}))
     rivals = RivalSet.of([drift, quick], [0.5, 0.5], [])
     drifts = alternatives(whole.so_far, NOISE, rivals)[1]
