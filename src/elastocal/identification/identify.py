@@ -93,8 +93,9 @@ def identify(
 
 
 def _fallen(model: Model, table: Measurements, x: Array) -> tuple[str, ...]:
-    """That the base lies far from upright, where weights or loads act."""
-    weighs = model.cell.model.link_gravity or bool(table.force.any())
+    """That the base lies far from upright, where weights act, or loads that hang."""
+    hangs = table.force.any() and not table.force[:, :2].any() and (table.force[:, 2] <= 0).all()
+    weighs = model.cell.model.link_gravity or bool(hangs)
     lies = fallen(model, x) if weighs and model.observe != "distance" else None
     return () if lies is None else (str(lies),)
 

@@ -54,8 +54,8 @@ def test_what_a_diagnosis_may_suspect_and_what_acts_unasked(observe: str) -> Non
     never = {n for n, e in CATALOGUE.items() if not e.may_be_missing(cell)}
     only = {"marker_orientation": "pose", "distance_sensor": "distance"}
     together = {  # judged with all other components of the gap
-        "joint_curve", "residual_field", "gear_spectrum", "gravity_sag", "link_weights", "move_lag",
-        "torque_coupling", "torque_tilt", "move_hysteresis",
+        "joint_curve", "residual_field", "gear_spectrum", "gravity_sag", "link_weights",
+        "torque_coupling", "torque_tilt",
     }  # fmt: skip
     loads = {"payload", "link_gravity"}
     assert never == loads | together | {n for n, o in only.items() if o != observe}
