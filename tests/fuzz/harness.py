@@ -38,6 +38,8 @@ WALL = 120.0  # s; beyond it a case hangs, also where other programs have the pr
 GROWN = 0.4  # share of cases that are made by the grammar, not spoilt
 MEMORY = 1_000_000_000  # bytes resident, what is loaded included
 OLD = b"what was there before\n"
+# What goes beside an output replaces only what elastocal wrote.
+OLD_BESIDE = b'{"schema": "elastocal/plan/1"}\n'
 DIRECTIONS = "\u200e\u200f\u202a\u202b\u202c\u202d\u202e\u2066\u2067\u2068\u2069\u2028\u2029"
 # Folders that a run which fails may leave: tasks that were done, an example half copied.
 KEPT = {"study": ("results", "results.md"), "demo": ("demo_out",)}
@@ -116,10 +118,7 @@ def make(seed: int, base: Path, folder: Path, verbs: tuple[str, ...] = ()) -> Ca
         done.append(how)
     if rng.random() < 0.5:
         for name in command.outputs:
-            # What goes beside an output replaces only what elastocal wrote.
-            if name.endswith(".json") and f"{name[:-5]}.csv" in command.outputs:
-                continue
-            (work / name).write_bytes(OLD)
+            (work / name).write_bytes(old(command, name))
     return Case(seed, command, words, "; ".join(done), work)
 
 
@@ -229,6 +228,12 @@ def waited(
     with suppress(ProcessLookupError, PermissionError):
         os.killpg(child, signal.SIGKILL)  # processes that it started
     return status, usage
+
+
+def old(command: Command, name: str) -> bytes:
+    """What stands under the name of an output before the command runs."""
+    beside = name.endswith(".json") and f"{name[:-5]}.csv" in command.outputs
+    return OLD_BESIDE if beside else OLD
 
 
 def seen(folder: Path) -> dict[str, bytes | None]:

@@ -24,7 +24,7 @@ from pathlib import Path
 from random import Random
 
 from fuzz.campaign import COMMANDS, Command
-from fuzz.harness import OLD, WALL, Case, apart, be_child, execute, malformed, seen, waited
+from fuzz.harness import WALL, Case, apart, be_child, execute, malformed, old, seen, waited
 
 OPERATIONS = ("open", "os.rename", "os.remove", "os.mkdir", "os.rmdir", "shutil.rmtree")
 # What a killed run may leave for the next one to go on from, or to sweep up.
@@ -172,7 +172,7 @@ class Victim:
             if name not in self.inputs and not any(i.startswith(f"{name}/") for i in self.inputs):
                 shutil.rmtree(path) if path.is_dir() else path.unlink()
         for name in self.command.outputs:
-            (self.folder / name).write_bytes(OLD)
+            (self.folder / name).write_bytes(old(self.command, name))
 
     def wrong(self) -> Iterator[str]:
         """What stands in the folder now that must not."""
@@ -184,7 +184,9 @@ class Victim:
             content = there.get(name)
             if content is None:
                 yield f"{name} is gone"
-            elif content != OLD and (problem := _broken(name, content, self.sizes[name])):
+            elif content != old(self.command, name) and (
+                problem := _broken(name, content, self.sizes[name])
+            ):
                 yield f"{name}: {problem}"
         for name in there.keys() - self.inputs.keys() - set(self.command.outputs):
             if not BEGUN.search(name):
@@ -226,7 +228,7 @@ class Victim:
             where = f"Ctrl-C at operation {number} of {self.operations} on files"
             case = self.go_on("operation", number, signal.SIGINT)
         found, there = list(self.wrong()), seen(self.folder)
-        new = [n for n in self.command.outputs if there.get(n) != OLD]
+        new = [n for n in self.command.outputs if there.get(n) != old(self.command, n)]
         messages = [line for line in case.stderr.splitlines() if line.startswith("elastocal: ")]
         study = self.command.verb == "study"
         if case.code not in (0, INTERRUPTED):
@@ -252,7 +254,7 @@ class Victim:
         case = self.go_on("byte", number, 0)
         found = list(self.wrong())
         there = seen(self.folder)
-        new = [n for n in self.command.outputs if there.get(n) != OLD]
+        new = [n for n in self.command.outputs if there.get(n) != old(self.command, n)]
         if case.code == 0 and len(new) < len(self.command.outputs):
             found.append("exit code 0 without all outputs")
         if case.code != 0 and new:
