@@ -19,14 +19,6 @@ def with_limits(**limits: tuple[float, float]):
     return joint_limits(replace(kr270_cell(), limits=limits), kr270_chain())
 
 
-def test_a_cell_narrows_and_never_widens() -> None:
-    own = with_limits()
-    lower, upper = with_limits(joint1=(-0.5, 0.5), joint2=(-100.0, 100.0))
-    assert (lower[0], upper[0]) == (-0.5, 0.5)
-    np.testing.assert_array_equal(lower[1:], own[0][1:])
-    np.testing.assert_array_equal(upper[1:], own[1][1:])
-
-
 def test_a_joint_that_the_robot_lacks_is_named() -> None:
     with pytest.raises(InputError, match=r"\[limits\] names joint7.* has 6 joints"):
         with_limits(joint7=(0.0, 1.0))
@@ -78,11 +70,3 @@ def test_ranges_are_finite_and_keep_every_limit(low, high, kinds) -> None:
     near = np.full(4, 0.7)
     middle = np.mean(finite_ranges(chain, lower, upper, near), axis=0)
     np.testing.assert_allclose(middle[free], 0.7)
-
-
-def test_a_limit_that_only_stands_for_none_gives_a_turn():
-    chain = limited([None] * 4, [None] * 4, ["revolute", "prismatic"] * 2)
-    lower, upper = np.array([-7e18, -4.0, -1.0, -3e9]), np.array([7.0, 1e16, 1.0, 4e9])
-    a, b = finite_ranges(chain, lower, upper)
-    np.testing.assert_allclose(a, [7.0 - 2 * np.pi, -4.0, -1.0, -1.0])
-    np.testing.assert_allclose(b, [7.0, -2.0, 1.0, 1.0])

@@ -48,40 +48,6 @@ def subtracted(table: Measurements) -> dict[int, dict[int, float]]:
 # --- pairing -------------------------------------------------------------------------------
 
 
-def test_the_same_repeat_is_preferred() -> None:
-    table = readings((0, 0, "M1", 0), (0, 1, "M1", 0), (0, 1, "M1", DOWN), (0, 0, "M1", DOWN))
-    assert subtracted(table) == {2: {2: 1, 1: -1}, 3: {3: 1, 0: -1}}
-
-
-def test_the_mean_of_all_unloaded_serves_where_the_repeat_is_missing() -> None:
-    table = readings(
-        (0, 0, "M1", 0), (0, 1, "M1", 0), (0, 2, "M1", 0), (0, 2, "M1", DOWN), (0, 7, "M1", DOWN)
-    )
-    third = -1 / 3
-    assert subtracted(table) == {3: {3: 1, 2: -1}, 4: {4: 1, 0: third, 1: third, 2: third}}
-
-
-def test_two_unloaded_readings_of_one_repeat_are_averaged() -> None:
-    table = readings((0, 0, "M1", 0), (0, 0, "M1", DOWN), (0, 0, "M1", 0))
-    assert subtracted(table) == {1: {1: 1, 0: -0.5, 2: -0.5}}
-
-
-def test_every_load_level_subtracts_the_same_reading() -> None:
-    table = readings(
-        (0, 0, "M1", 0), (0, 0, "M1", DOWN / 2), (0, 0, "M1", DOWN), (0, 0, "M1", -DOWN)
-    )
-    assert subtracted(table) == {k: {k: 1, 0: -1} for k in (1, 2, 3)}
-
-
-def test_configurations_and_markers_are_not_mixed() -> None:
-    table = readings(
-        (0, 0, "M1", 0), (0, 0, "M2", 0), (1, 0, "M1", 0), (1, 0, "M2", 0),
-        (1, 0, "M2", DOWN), (0, 0, "M1", DOWN), (1, 0, "M1", DOWN), (0, 0, "M2", DOWN),
-    )  # fmt: skip
-    partner = {i: next(j for j, w in row.items() if w < 0) for i, row in subtracted(table).items()}
-    assert partner == {4: 3, 5: 0, 6: 2, 7: 1}
-
-
 def test_a_sideways_force_is_a_load_too() -> None:
     table = readings((0, 0, "M1", 0), (0, 0, "M1", 0))
     force = np.zeros((2, 3))
@@ -99,42 +65,7 @@ def test_a_missing_partner_is_named(unloaded: tuple) -> None:
         pair_loaded_with_unloaded(table)
 
 
-def test_a_missing_partner_stays_missing_after_another_marker_was_measured() -> None:
-    table = readings((0, 0, "M1", 0), (0, 0, "M1", DOWN), (0, 0, "M2", DOWN))
-    with pytest.raises(InputError, match=r"line 4.*marker M2.*observe = 'position'"):
-        observe(table, "deflection")
-
-
-def test_without_loaded_rows_there_is_no_deflection() -> None:
-    table = readings((0, 0, "M1", 0), (0, 1, "M1", 0))
-    with pytest.raises(InputError, match=r"data\.csv: .*needs loaded rows.*force_x_N"):
-        observe(table, "deflection")
-
-
 # --- observed values -----------------------------------------------------------------------
-
-
-def test_observed_deflections_are_differences_of_positions() -> None:
-    table = readings((0, 0, "M1", 0), (0, 1, "M1", 0), (0, 1, "M1", DOWN), (0, 5, "M1", DOWN))
-    observed = observe(table, "deflection")
-    np.testing.assert_allclose(observed.value, [1, 10, 100, 2.5, 25, 250], rtol=1e-15)
-    np.testing.assert_array_equal(observed.lead, [2, 3])
-
-
-def test_every_row_is_a_position() -> None:
-    table = readings((0, 0, "M1", 0), (1, 0, "M1", DOWN))
-    observed = observe(table, "position")
-    np.testing.assert_array_equal(observed.value, table.position.ravel())
-    np.testing.assert_array_equal(observed.combine.toarray(), np.eye(2))
-    np.testing.assert_array_equal(observed.configuration, [0, 1])
-
-
-def test_poses_are_observed_as_turned_by_nothing() -> None:
-    """The rotation is relative to the measured one, hence zero."""
-    table = random_table(kr270_chain(), 2, seed=0)
-    value = observe(table, "pose").value.reshape(-1, 6)
-    np.testing.assert_array_equal(value[:, :3], table.position)
-    assert not value[:, 3:].any()
 
 
 def test_a_measured_pose_that_is_the_models_has_no_residual() -> None:
@@ -233,28 +164,3 @@ def test_a_subset_keeps_the_rows_it_needs(kind: str) -> None:
     found = model.regressor(part.table, observations=part)
     np.testing.assert_allclose(found.prediction, whole.prediction[rows], rtol=0, atol=1e-15)
     np.testing.assert_allclose(found.B, whole.B[rows], rtol=1e-9, atol=1e-15)
-
-
-def test_a_subset_keeps_all_unloaded_readings_of_a_mean() -> None:
-    table = readings(
-        (1, 0, "M1", 0), (0, 0, "M1", 0), (0, 1, "M1", 0), (1, 0, "M1", DOWN), (0, 9, "M1", DOWN)
-    )
-    part = subset(observe(table, "deflection"), np.array([False, True]))
-    np.testing.assert_array_equal(part.table.row, [3, 4, 6])
-    np.testing.assert_array_equal(part.combine.toarray(), [[-0.5, -0.5, 1]])
-    np.testing.assert_array_equal(part.lead, [2])
-    again = observe(part.table, "deflection")
-    np.testing.assert_array_equal(again.value, part.value)
-
-
-def test_a_subset_of_a_subset() -> None:
-    observed = observe(shuffled(6), "deflection")
-    rng = np.random.default_rng(6)
-    outer = rng.random(len(observed.lead)) < 0.6
-    inner = rng.random(outer.sum()) < 0.5
-    both = outer.copy()
-    both[outer] = inner
-    twice, once = subset(subset(observed, outer), inner), subset(observed, both)
-    np.testing.assert_array_equal(twice.table.row, once.table.row)
-    np.testing.assert_array_equal(twice.lead, once.lead)
-    np.testing.assert_array_equal(twice.combine.toarray(), once.combine.toarray())

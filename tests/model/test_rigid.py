@@ -49,21 +49,6 @@ def test_log_is_scipys(axis: np.ndarray, angle: float) -> None:
     np.testing.assert_allclose(log(R), angle * axis, rtol=0, atol=1e-12)
 
 
-@given(axis=axes, angle=angles)
-@settings(deadline=None)
-def test_round_trip(axis: np.ndarray, angle: float) -> None:
-    """To 1e-12 rad up to π − 0.01."""
-    np.testing.assert_allclose(log(exp(angle * axis)), angle * axis, rtol=0, atol=1e-12)
-
-
-@given(axis=axes, angle=st.floats(0, np.pi))
-@settings(deadline=None)
-def test_exp_is_a_rotation(axis: np.ndarray, angle: float) -> None:
-    R = exp(angle * axis)
-    np.testing.assert_allclose(R.T @ R, np.eye(3), rtol=0, atol=2e-15)
-    assert np.linalg.det(R) > 0
-
-
 @pytest.mark.parametrize("angle", NEAR_ZERO)
 @given(axis=axes)
 @settings(deadline=None)
@@ -96,21 +81,6 @@ def test_near_pi_digits_go_as_the_inverse_distance(short_of_pi: float, axis: np.
     r = (np.pi - short_of_pi) * axis
     tolerance = 10 * np.finfo(float).eps / short_of_pi
     np.testing.assert_allclose(log(exp(r)), r, rtol=0, atol=tolerance)
-
-
-@given(axis=axes, angle=st.floats(-10, 10))
-@settings(deadline=None)
-def test_rotation_about_an_axis_is_scipys(axis: np.ndarray, angle: float) -> None:
-    R = np.array(ca.evalf(rigid.rotation_about(axis, ca.SX(angle))))
-    expected = Rotation.from_rotvec(angle * axis).as_matrix()
-    np.testing.assert_allclose(R, expected, rtol=0, atol=2e-15)
-
-
-@given(v=st.tuples(*[st.floats(-5, 5)] * 3), w=st.tuples(*[st.floats(-5, 5)] * 3))
-@settings(deadline=None)
-def test_skew_is_the_cross_product(v: tuple, w: tuple) -> None:
-    product = np.array(ca.evalf(rigid.skew(np.array(v)))) @ np.array(w)
-    np.testing.assert_allclose(product, np.cross(v, w), rtol=0, atol=1e-14)
 
 
 def test_motions_and_points() -> None:

@@ -3,17 +3,14 @@
 from __future__ import annotations
 
 from dataclasses import replace
-from itertools import pairwise
 from typing import Any
 
 import numpy as np
 import pytest
-from scipy.spatial.transform import Rotation
 from support.cells import (
     COMPLIANCE,
     DOWN,
     SLANTED,
-    TABLE_2,
     kr270_cell,
     kr270_chain,
     random_poses,
@@ -65,50 +62,6 @@ def test_explicit_models_agree_to_rounding(
     table = replace(table_of(q, SLANTED, both=True), distance=np.ones(6))
     symbolic, reference = both(model, table, somewhere(model, seed))
     assert np.abs(symbolic - reference).max() <= 1e-12 * np.abs(reference).max()
-
-
-@pytest.mark.parametrize("pose", [0, 6, 14])
-def test_equilibrium_is_approached_geometrically(pose: int) -> None:
-    model = model_of(("joint_compliance",), "deflection")
-    table = table_of(TABLE_2[[pose]], DOWN, both=True)
-    errors = []
-    for steps in (1, 2, 3, 4):
-        symbolic, reference = both(model, table, model.nominal, steps)
-        errors.append(np.abs(symbolic - reference).max() / np.abs(reference).max())
-    assert errors[1] < 1e-3
-    assert all(later < 0.05 * earlier for earlier, later in pairwise(errors))
-
-
-def test_measured_rotation_is_the_predicted_one() -> None:
-    model = model_of(("base_frame", "joint_offset", "marker_orientation"), "pose", nominal=BASE)
-    x = somewhere(model, 4)
-    table = table_of(random_poses(model.chain, 1, 4), DOWN)
-    table = replace(table, rotation=np.zeros_like(table.position))
-    rotation = model.target_poses(table, x)[0]
-    table = replace(table, rotation=Rotation.from_matrix(rotation).as_rotvec())
-    symbolic, reference = both(model, table, x)
-    np.testing.assert_allclose(symbolic, reference, atol=1e-11)
-    # A template that says otherwise changes nothing: q decides.
-    other, _ = both(model, replace(table, rotation=np.ones_like(table.position)), x)
-    np.testing.assert_array_equal(other, symbolic)
-
-
-def test_levels_and_columns_come_from_the_caller() -> None:
-    levels = {"joint2": (-0.4, -1.6)}
-    model = model_of(
-        ("joint_compliance",), "deflection", compliance_levels=levels, deflection_model="linear"
-    )
-    q = random_poses(model.chain, 1, 5)
-    q[0, 1] = -1.6
-    table = table_of(q, DOWN, both=True)
-    columns = np.array([2, 4])
-    rows = configuration_rows(SymbolicArm(model.chain, model.cell), table, columns)
-    B = rows.function(q[0], model.nominal).full()
-    np.testing.assert_allclose(B, model.regressor(table).B[:, columns], atol=1e-14)
-    first = list(model.names).index("joint2.compliance_level1")
-    second = list(model.names).index("joint2.compliance_level2")
-    B = both(model, table, model.nominal)[0]
-    assert not B[:, first].any() and B[:, second].any()
 
 
 def test_adjoint_is_the_slope_of_the_weighted_sum() -> None:

@@ -58,52 +58,6 @@ def test_polar_covariance_against_draws_in_polar_coordinates(sight, rows):
     assert (np.abs(difference) < 5 * np.sqrt(2 / n) * np.outer(sigma, sigma)).all()
 
 
-def test_axes_are_orthonormal_right_handed_and_azimuth_is_horizontal():
-    sight = np.random.default_rng(2).normal(size=(50, 3))
-    axes = polar_axes(sight)
-    np.testing.assert_allclose(axes @ axes.transpose(0, 2, 1), np.tile(np.eye(3), (50, 1, 1)),
-                               atol=1e-12)  # fmt: skip
-    np.testing.assert_allclose(np.linalg.det(axes), 1.0)
-    np.testing.assert_allclose(axes[:, 1, 2], 0.0)
-    assert (axes[:, 2, 2] > 0).all()  # elevation grows upwards
-    np.testing.assert_allclose(np.cross(axes[:, 0], sight), 0.0, atol=1e-12)
-
-
-@pytest.mark.parametrize("up", [1.0, -1.0])
-def test_straight_above_or_below_the_tracker(up):
-    covariance, _ = position_covariance(table([0, 0, 2 * up]), Tracker(noise=NOISE), "polar")
-    across, along = 3e-4 + 2e-4, 1e-4 + 1e-4
-    np.testing.assert_allclose(covariance[0], np.diag([across, across, along]) ** 2, atol=1e-20)
-
-
-def test_isotropic_polar_noise_is_cartesian():
-    same = PolarNoise(2e-5, 0.0, 2e-5, 0.0)
-    points = np.random.default_rng(3).normal(size=(20, 3))
-    covariance, _ = position_covariance(table(points), Tracker(STATION, same), "polar")
-    np.testing.assert_allclose(covariance, np.tile(4e-10 * np.eye(3), (20, 1, 1)), atol=1e-22)
-
-
-def test_cartesian_noise_of_cell_and_rows():
-    points = np.random.default_rng(4).normal(size=(5, 3))
-    covariance, text = position_covariance(table(points), AXIS, "axis")
-    np.testing.assert_allclose(covariance, np.tile(np.diag([1e-10, 4e-10, 9e-10]), (5, 1, 1)))
-    assert "[10.0, 20.0, 30.0] µm" in text
-    sigma = np.random.default_rng(5).uniform(1e-6, 1e-4, (5, 3))
-    covariance, text = position_covariance(replace(table(points), sigma=sigma), AXIS, "rows")
-    np.testing.assert_allclose(covariance, [np.diag(s**2) for s in sigma])
-    assert "per-row cartesian" in text
-
-
-def test_turning_station_and_points_together_turns_the_covariance():
-    """About the vertical, which the tracker's angles refer to."""
-    points = np.random.default_rng(6).normal(size=(8, 3)) + np.array([3, 0, 0])
-    c, s = np.cos(0.7), np.sin(0.7)
-    R = np.array([[c, -s, 0], [s, c, 0], [0, 0, 1]])
-    a, _ = position_covariance(table(points), Tracker(STATION, NOISE), "polar")
-    b, _ = position_covariance(table(points @ R.T), Tracker(R @ STATION, NOISE), "polar")
-    np.testing.assert_allclose(b, R @ a @ R.T, atol=1e-20)
-
-
 def test_the_tables_sigmas_come_first():
     bare = table([[1.0, 2.0, 3.0]])
     rows = replace(bare, sigma=np.full((1, 3), 1e-5))

@@ -12,9 +12,6 @@ from elastocal.cell.arm_description import Nominal
 from elastocal.errors import InputError
 from elastocal.model import Model
 
-SINCE = 100.0
-TIME = np.array([0.0, 99.0, 100.0, 101.0])
-CHANGED = TIME >= SINCE
 WARM = 1 - np.exp(-1)
 
 
@@ -22,12 +19,6 @@ def test_a_drift_has_gone_63_percent_of_its_way_at_its_time_constant() -> None:
     m = model(stick("z"), "joint_drift", settings={"joint1": {"time_constant_s": 600.0}})
     y = positions(m, rows(np.zeros(3), time=[0.0, 600.0, 1e9]), drift=1e-3)[:, 1]
     np.testing.assert_allclose(y, np.sin(1e-3 * np.array([0.0, WARM, 1.0])), atol=1e-17)
-
-
-def test_a_time_constant_is_half_an_hour_unless_given() -> None:
-    m = model(stick("z"), "joint_drift")
-    y = positions(m, rows([0.0], time=[1800.0]), drift=1e-3)[0, 1]
-    np.testing.assert_allclose(y, np.sin(1e-3 * WARM), atol=1e-17)
 
 
 def test_a_drifting_base_moves_and_turns_about_its_origin() -> None:
@@ -43,12 +34,6 @@ def test_a_drifting_base_moves_and_turns_about_its_origin() -> None:
     still, moved = positions(m, table, **values)
     R = Rotation.from_rotvec(WARM * np.array([4e-3, 0.0, 5e-3])).as_matrix()
     np.testing.assert_allclose(moved, R @ still + WARM * np.array([1e-3, 2e-3, -3e-3]), atol=1e-15)
-
-
-def test_an_encoder_that_jumped_is_an_offset_from_then_on() -> None:
-    m = model(stick("z"), "encoder_jump", settings={"joint1": {"jump_time_s": SINCE}})
-    y = positions(m, rows(np.zeros(4), time=TIME), jump=1e-3)[:, 1]
-    np.testing.assert_allclose(y, np.where(CHANGED, np.sin(1e-3), 0.0), atol=1e-17)
 
 
 def test_a_bumped_tracker_shifts_all_later_readings_rigidly() -> None:
@@ -93,25 +78,6 @@ def test_a_link_grows_by_its_strain_once_warm() -> None:
     m = model(stick("zz", (2.0, 1.0)), "thermal_expansion:link1", tip=(0.5, 0, 0))
     reach = positions(m, rows(np.zeros((3, 2)), time=[0.0, 1800.0, 1e9]), expansion=1e-4)[:, 0]
     np.testing.assert_allclose(reach, 3.5 + 2e-4 * np.array([0.0, WARM, 1.0]), rtol=1e-15)
-
-
-def test_all_links_grow_alike() -> None:
-    chain = kr270_chain()
-    table = random_table(chain, 4, seed=3)
-    together = Model.assembled(chain, kr270_cell(["thermal_expansion:all"]))
-    each = Model.assembled(chain, kr270_cell([f"thermal_expansion:link{i}" for i in (1, 2, 3, 6)]))
-    assert len(each.parameters) == 4
-    grown = together.predict(table, np.array([1e-3]))
-    np.testing.assert_allclose(grown, each.predict(table, np.full(4, 1e-3)), atol=1e-14)
-    assert np.abs(grown - together.predict(table)).max() > 1e-4
-
-
-def test_growth_may_follow_the_temperature() -> None:
-    m = model(stick("z"), "thermal_expansion:link1", thermal_driver="temperature")
-    (parameter,) = m.parameters
-    assert parameter.unit == "1/K"
-    reach = positions(m, rows(np.zeros(3), temperature=[20.0, 28.0, 15.0]), expansion=12e-6)[:, 0]
-    np.testing.assert_allclose(reach, [1.0, 1.0 + 96e-6, 1.0 - 60e-6], rtol=1e-15)
 
 
 @pytest.mark.parametrize(

@@ -8,12 +8,9 @@ import numpy as np
 import pytest
 from model.effects.stick import model, positions, rows, stick
 from support.cells import kr270_cell, kr270_chain, random_table
-from support.robots import random_chain_urdf
 
-from elastocal.cell.arm_description import Nominal
 from elastocal.errors import InputError
-from elastocal.model import Model, read_urdf
-from elastocal.model.effects import CATALOGUE
+from elastocal.model import Model
 
 Q = np.radians([-170.0, -90.0, -20.0, 0.0, 35.0, 90.0, 160.0])
 
@@ -47,10 +44,6 @@ def test_a_harmonic_repeats_its_order_times_per_turn(
     np.testing.assert_allclose(behind, -found, atol=1e-15)
 
 
-def test_a_scale_error_grows_with_the_command() -> None:
-    np.testing.assert_allclose(turned("encoder_scale", Q, encoder_scale=1e-3), 1e-3 * Q, atol=1e-15)
-
-
 @pytest.mark.parametrize("orders, second", [((40.0,), 40.0), ((10.0, 20.0), 20.0)])
 def test_ripple_orders_are_one_for_all_or_one_each(
     orders: tuple[float, ...], second: float
@@ -67,17 +60,6 @@ def test_another_number_of_ripple_orders_is_refused() -> None:
         model(stick("zz", (1.0, 1.0)), "gear_ripple", gear_ripple_orders=(1.0, 2.0, 3.0))
 
 
-def test_an_order_of_a_place_wins_over_the_list() -> None:
-    m = model(
-        stick("z"),
-        "gear_ripple",
-        gear_ripple_orders=(40.0,),
-        nominal=Nominal(settings={"joint1": {"ripple_order": 3.0}}),
-    )
-    y = positions(m, rows([np.pi / 6]), ripple_sin=1e-3)[0, 1]
-    np.testing.assert_allclose(y, np.sin(np.pi / 6 + 1e-3), atol=1e-15)
-
-
 def test_a_coupled_wrist_moves_as_if_commanded_so() -> None:
     chain = kr270_chain()
     m = Model.assembled(chain, kr270_cell(["wrist_coupling"]))
@@ -88,27 +70,6 @@ def test_a_coupled_wrist_moves_as_if_commanded_so() -> None:
     q[:, 5] += b * table.q[:, 3] + c * table.q[:, 4]
     expected = Model.assembled(chain, kr270_cell()).predict(replace(table, q=q))
     np.testing.assert_allclose(m.predict(table, np.array([a, b, c])), expected, atol=1e-14)
-
-
-def test_only_arms_with_a_turning_wrist_have_one() -> None:
-    cell, coupling = kr270_cell(), CATALOGUE["wrist_coupling"]
-    assert coupling.places(kr270_chain(), cell) == ("wrist",)
-    assert coupling.places(stick("zyyzy", (1.0,) * 5), cell) == ()
-    last = kr270_chain().joints[-1]
-    sliding = replace(
-        kr270_chain(), joints=(*kr270_chain().joints[:-1], replace(last, kind="prismatic"))
-    )
-    assert coupling.places(sliding, cell) == ()
-
-
-def test_gears_are_at_turning_joints_only(tmp_path) -> None:
-    path = tmp_path / "chain.urdf"
-    path.write_text(random_chain_urdf(4, n_joints=5))
-    chain = read_urdf(path, base="base", flange="flange")
-    turning = tuple(f"joint{i + 1}" for i, kind in enumerate(chain.kinds) if kind == "revolute")
-    assert 0 < len(turning) < 5
-    for name in ("gear_eccentricity", "gear_ripple", "backlash", "hysteresis", "joint_hardening"):
-        assert CATALOGUE[name].places(chain, kr270_cell()) == turning
 
 
 LINES = {"order_1": 12.5, "order_3": 80.25, "order_sd_3": 0.2, "spectrum_centre_rad": 0.4}
@@ -128,12 +89,6 @@ def test_a_spectrum_has_the_lines_that_the_cell_names() -> None:
     )
 
 
-def test_a_multiple_of_a_line_is_smaller_beforehand() -> None:
-    lines = {f"order_{k}": order for k, order in enumerate((17.4, 22.0, 2 * 17.4, 3 * 17.4), 1)}
-    m = model(stick("z"), "gear_spectrum", settings={"joint1": lines | {"spectrum_size_rad": 6e-5}})
-    assert [p.typical for p in m.parameters][::2] == pytest.approx([6e-5, 6e-5, 3e-5, 2e-5])
-
-
 def test_beside_a_line_stands_its_derivative_by_the_order() -> None:
     """A line of an order a little off, turned about the middle of the angles, is their sum."""
     m = model(stick("z"), "gear_spectrum", settings={"joint1": LINES})
@@ -144,9 +99,3 @@ def test_beside_a_line_stands_its_derivative_by_the_order() -> None:
     x, y, _ = positions(m, rows(Q), line_3_sin=a, line_3_cos=b, **shifts).T
     found = np.arctan2(np.sin(np.arctan2(y, x) - Q), np.cos(np.arctan2(y, x) - Q))
     np.testing.assert_allclose(found, expected, atol=1e-3 * a * off + 1e-11)
-
-
-def test_a_spectrum_of_no_lines_has_no_parameters() -> None:
-    assert not model(stick("z"), "gear_spectrum").parameters
-    with pytest.raises(InputError, match="unknown setting of joint1 'order_41'"):
-        model(stick("z"), "gear_spectrum", settings={"joint1": {"order_41": 3.0}})

@@ -42,12 +42,6 @@ def test_the_torques_of_any_weights_are_sums_of_them(tmp_path: Path, seed: int) 
         np.testing.assert_allclose(D[80:] @ found, tau[80:], atol=1e-6 * np.abs(tau).max() + 1e-9)
 
 
-def test_a_serial_arm_has_two_for_each_link_that_the_joint_carries() -> None:
-    chain, cell = kr270_chain(), kr270_cell()
-    count = [len(SAG.parameters(place, chain, cell)) for place in SAG.places(chain, cell)]
-    assert count == [12, 10, 8, 6, 4, 2]
-
-
 def test_they_are_independent_and_one_in_size() -> None:
     chain = kr270_chain()
     q = random_configurations(chain, 300, 3)
@@ -80,11 +74,3 @@ def test_the_vertical_is_that_of_the_fitted_base() -> None:
     x[3:6] = vector
     x[6:] = 1e-3 * np.arange(1, len(x) - 5)
     np.testing.assert_allclose(free.predict(table, x), fixed.predict(table, x[6:]), atol=1e-12)
-
-
-def test_the_size_is_a_setting_and_the_prior_of_each() -> None:
-    cell = kr270_cell(["gravity_sag"], nominal=Nominal(settings={"joint2": {"sag_size_rad": 5e-4}}))
-    found = Model.assembled(kr270_chain(), cell).parameters
-    assert {p.typical for p in found if p.where == "joint2"} == {5e-4}
-    assert {p.typical for p in found if p.where == "joint3"} == {2e-4}
-    assert all(p.shrunk for p in found)

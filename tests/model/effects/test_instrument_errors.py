@@ -3,13 +3,7 @@
 from __future__ import annotations
 
 import numpy as np
-import pytest
 from model.effects.stick import model, positions, rows, stick
-from support.cells import kr270_cell
-
-from elastocal.errors import InputError
-from elastocal.model import Model
-from elastocal.model.effects import CATALOGUE
 
 STATION = np.array([0.5, -0.4, 0.3])
 TURN = np.array([[q, p] for q in np.radians([-150, -60, 0, 90, 170]) for p in (-0.8, 0.1, 0.9)])
@@ -27,11 +21,6 @@ def azimuth(p: np.ndarray) -> np.ndarray:
 
 def elevation(p: np.ndarray) -> np.ndarray:
     return np.arctan2(p[:, 2], np.hypot(p[:, 0], p[:, 1]))
-
-
-def test_an_instrument_without_errors_reports_what_is_there() -> None:
-    plain = positions(model(stick("zy", (1.0, 1.5))), rows(TURN)) - STATION
-    np.testing.assert_allclose(readings()[0], plain, atol=1e-15)
 
 
 def test_a_scale_error_multiplies_ranges_from_the_instrument() -> None:
@@ -63,16 +52,3 @@ def test_an_eccentric_elevation_circle_tilts_by_the_elevation() -> None:
     )
     np.testing.assert_allclose(azimuth(observed), azimuth(true), atol=1e-14)
     np.testing.assert_allclose(np.linalg.norm(observed, axis=1), np.linalg.norm(true, axis=1))
-
-
-def test_a_marker_at_the_instrument_or_above_it_has_a_derivative() -> None:
-    for station in ([1.0, 0.0, 0.0], [1.0, 0.0, -2.0]):
-        m = model(stick("z"), "tracker_distortion", tracker=station)
-        assert np.isfinite(m.regressor(rows([0.0])).B).all()
-
-
-def test_distances_know_no_tracker() -> None:
-    cell = kr270_cell(["tracker_distortion"], "distance")
-    with pytest.raises(InputError, match=r'no place on robot .* observe = "distance"'):
-        Model.assembled(stick("zyyz", (1.0,) * 4), cell)
-    assert CATALOGUE["tracker_distortion"].places(stick("z"), kr270_cell()) == ("tracker",)

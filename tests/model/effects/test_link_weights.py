@@ -58,17 +58,6 @@ def test_they_are_independent_but_for_what_an_upright_base_carries_anyway() -> N
     assert np.linalg.cond(shown / np.linalg.norm(shown, axis=0)) < 20
 
 
-def test_they_are_as_large_as_the_density_that_the_cell_states_makes_them() -> None:
-    """Along a link half of it and what follows, a housing of 0.1 m at least; across it 0.1 m."""
-    settings = {"arm": {"weights_kg_per_m": 8.0}}
-    cell = kr270_cell(["link_weights"], nominal=Nominal(settings=settings))
-    found = Model.assembled(stick("yy", (1.0, 0.5)), cell).parameters
-    assert [(p.name, p.unit, p.shrunk) for p in found[:1]] == [("arm.link1_moment_x", "kg*m", True)]
-    assert [p.typical for p in found] == pytest.approx(
-        [8 * (1.1 + 0.11), 8 * 0.11, 8 * (0.5 * 0.35 + 0.06), 8 * 0.06]
-    )
-
-
 def test_each_joint_yields_by_its_compliance_times_the_torque() -> None:
     """Two sticks: the outer one's weight bends both joints, the inner one's only the first."""
     k, S1, S2 = 1e-6, 6.0, 2.0

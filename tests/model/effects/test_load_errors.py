@@ -9,7 +9,6 @@ import pytest
 from support.cells import LOAD_POINT, kr270_cell, kr270_chain, random_table
 
 from elastocal.cell.arm_description import Tool
-from elastocal.errors import InputError
 from elastocal.model import LinkMass, Model
 from elastocal.model.effects import CATALOGUE
 
@@ -62,16 +61,6 @@ def test_a_mass_error_is_another_mass_and_centre_of_mass() -> None:
     assert np.abs(found - m.predict(TABLE)).max() > 1e-5
 
 
-def test_the_whole_weight_is_missing_where_weights_are_off() -> None:
-    m = Model.assembled(CHAIN, kr270_cell([*ELASTIC, "link_mass_error"]))
-    values = {f"link{i + 1}.mass_error": body.mass for i, body in enumerate(CHAIN.masses)}
-    for i, body in enumerate(CHAIN.masses):
-        for k, component in zip("xyz", body.mass * body.com, strict=True):
-            values[f"link{i + 1}.moment_{k}"] = component
-    expected = Model.assembled(CHAIN, kr270_cell(ELASTIC, link_gravity=True)).predict(TABLE)
-    np.testing.assert_allclose(disturbed(m, values), expected, atol=1e-14)
-
-
 @pytest.mark.parametrize("weighed, share", [(True, 0.1), (False, 1.0)])
 def test_a_typical_mass_error_is_a_tenth_of_the_mass_or_all_of_it(
     weighed: bool, share: float
@@ -82,12 +71,3 @@ def test_a_typical_mass_error_is_a_tenth_of_the_mass_or_all_of_it(
         assert mass.typical == pytest.approx(share * body.mass)
         offset = share * np.linalg.norm(body.com) + 0.02
         assert [m.typical for m in moments] == pytest.approx([body.mass * offset] * 3)
-
-
-def test_links_without_mass_have_no_mass_error() -> None:
-    effect, cell = CATALOGUE["link_mass_error"], kr270_cell(["link_mass_error"])
-    assert effect.places(replace(CHAIN, masses=()), cell) == ()
-    light = replace(CHAIN, masses=(LinkMass(0.0, np.zeros(3)), *CHAIN.masses[1:]))
-    assert effect.places(light, cell) == tuple(f"link{i}" for i in range(2, 7))
-    with pytest.raises(InputError, match="link_mass_error has no place on robot"):
-        Model.assembled(replace(CHAIN, masses=()), cell)

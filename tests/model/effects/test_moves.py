@@ -11,7 +11,7 @@ from model.effects.stick import model, positions, rows, stick
 from support.cells import kr270_cell, kr270_chain, random_table
 
 from elastocal.errors import InputError
-from elastocal.measurements import read_measurements, visits, with_moves
+from elastocal.measurements import read_measurements, with_moves
 from elastocal.model import Model
 from elastocal.model.effects import CATALOGUE
 
@@ -24,34 +24,6 @@ def test_a_move_is_from_one_visit_to_the_next_and_a_joint_keeps_its_last_directi
     table = with_moves(rows(Q))
     np.testing.assert_allclose(table.move, MOVE, atol=1e-15)
     np.testing.assert_array_equal(table.direction, DIRECTION)
-
-
-def test_times_decide_where_there_are_any() -> None:
-    shuffled = np.array([2, 0, 3, 1])
-    table = with_moves(rows(Q[shuffled], time=np.arange(4.0)[shuffled]))
-    np.testing.assert_allclose(table.move, MOVE[shuffled], atol=1e-15)
-    np.testing.assert_array_equal(table.direction, DIRECTION[shuffled])
-
-
-def test_a_visit_that_moves_nothing_keeps_the_move_before_it() -> None:
-    """A load is hung on, or a second marker is read; what an encoder reads may tremble."""
-    twice = np.repeat(np.arange(4), 2)
-    table = rows(Q[twice] + 1e-6 * np.arange(8)[:, None])
-    table = replace(table, configuration=twice, force=np.tile([[0, 0, 0], [0, 0, -9.0]], (4, 1)))
-    assert len(np.unique(visits(table))) == 8
-    np.testing.assert_allclose(with_moves(table).move, MOVE[twice], atol=1e-5)
-    np.testing.assert_array_equal(with_moves(table).direction, DIRECTION[twice])
-    np.testing.assert_allclose(
-        with_moves(replace(table, force=np.zeros((8, 3)))).move, MOVE[twice], atol=1e-5
-    )
-
-
-def test_visits_are_numbered_by_configuration_repeat_and_force() -> None:
-    table = random_table(kr270_chain(), 9, seed=4)
-    force = np.round(table.force, 6)
-    key = np.column_stack([table.configuration, table.repeat, force])
-    expected = np.unique(key, axis=0, return_inverse=True)[1].ravel()
-    np.testing.assert_array_equal(visits(table), expected)
 
 
 def test_rows_that_are_taken_from_a_table_that_was_read_keep_their_moves(tmp_path: Path) -> None:

@@ -5,7 +5,6 @@ from __future__ import annotations
 import casadi as ca
 import numpy as np
 import pytest
-from model.effects.stick import model, rows, stick
 from scipy.spatial.transform import Rotation
 from support.cells import COMPLIANCE, MARKERS, kr270_cell, kr270_chain, random_table
 
@@ -51,14 +50,6 @@ def test_values_outside_their_range_are_refused(effect, place, key, value) -> No
         model_with({place: {key: value}}, effect)
 
 
-@pytest.mark.parametrize("moment", [-np.inf, np.inf, -3600.0])
-def test_a_change_may_be_at_any_time(moment: float) -> None:
-    """Also before the first and after the last row: everything or nothing has changed."""
-    m = model(stick("z"), "encoder_jump", settings={"joint1": {"jump_time_s": moment}})
-    moved = np.abs(m.regressor(rows([0.0], time=[0.0])).B).max()
-    assert moved == pytest.approx(1.0 if moment < 0 else 0.0)
-
-
 @pytest.mark.parametrize(
     "settings, parts",
     [
@@ -75,18 +66,6 @@ def test_a_setting_that_no_effect_has_meets_its_nearest(settings, parts) -> None
     text = str(caught.value)
     assert "[model] nominal.settings" in text
     assert all(part in text for part in parts)
-
-
-def test_settings_of_effects_that_are_off_are_kept_for_later() -> None:
-    settings = {"joint2": {"jump_time_s": 3.0, "ripple_order": 121.0, "time_constant_s": 600.0}}
-    assert model_with(settings, "joint_offset").parameters
-
-
-def test_a_temperature_has_no_time_constant() -> None:
-    settings = {"link1": {"time_constant_s": 600.0}}
-    model_with(settings, "thermal_expansion:link1")
-    with pytest.raises(InputError, match="unknown setting of link1 'time_constant_s'"):
-        model_with(settings, "thermal_expansion:link1", thermal_driver="temperature")
 
 
 @pytest.mark.parametrize("name", [n for n, e in CATALOGUE.items() if isinstance(e, DrivenEffect)])
@@ -138,14 +117,6 @@ def sized(sizes: dict[str, dict[str, float]], *effects: str) -> Model:
     return Model.assembled(kr270_chain(), kr270_cell(effects, nominal=Nominal(sizes=sizes)))
 
 
-def test_a_cell_states_how_large_a_parameter_of_this_arm_is():
-    stated = sized({"joint2": {"encoder_scale": 0.02}}, "encoder_scale", "joint_offset")
-    plain = sized({}, "encoder_scale", "joint_offset")
-    typical = {p.name: p.typical for p in stated.parameters}
-    assert typical.pop("joint2.encoder_scale") == 0.02
-    assert typical == {p.name: p.typical for p in plain.parameters if p.name in typical}
-
-
 @pytest.mark.parametrize(
     "sizes, message",
     [
@@ -157,9 +128,3 @@ def test_a_cell_states_how_large_a_parameter_of_this_arm_is():
 def test_sizes_of_what_no_effect_has_are_refused(sizes, message) -> None:
     with pytest.raises(InputError, match=message):
         sized(sizes, "joint_offset")
-
-
-@pytest.mark.parametrize("size", [0.0, -1.0, np.nan, np.inf])
-def test_sizes_are_positive_numbers(size: float) -> None:
-    with pytest.raises(InputError, match="sizes"):
-        Nominal(sizes={"joint2": {"offset": size}})

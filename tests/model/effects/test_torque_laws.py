@@ -34,20 +34,6 @@ def test_play_turns_over_with_the_weights_side_of_the_joint() -> None:
     np.testing.assert_allclose(z, -np.sin(BETA / 2), atol=1e-12)
 
 
-def test_a_balanced_joint_floats_in_its_play() -> None:
-    m = model(stick("y"), "backlash")
-    hanging = np.pi / 2  # straight down, no torque
-    tip = positions(m, rows([hanging], DOWN), backlash=BETA)
-    np.testing.assert_allclose(tip, [[0.0, 0.0, -1.0]], atol=1e-15)
-
-
-def test_an_unloaded_joint_shows_no_play() -> None:
-    m = model(stick("y"), "backlash")
-    np.testing.assert_array_equal(
-        positions(m, rows([0.3]), backlash=BETA), positions(m, rows([0.3]))
-    )
-
-
 def test_a_joint_stops_short_of_or_beyond_its_target_by_its_approach() -> None:
     m = model(stick("y"), "hysteresis")
     table = rows([0.0, 0.0], approach=[[1.0], [-1.0]])
@@ -97,15 +83,6 @@ def test_measured_torques_drive_the_same_laws(effect, key, value, law) -> None:
     np.testing.assert_allclose(y, np.sin(law(torque)), atol=1e-16)
 
 
-def test_the_weights_torque_is_a_bound_that_a_horizontal_stick_attains() -> None:
-    chain = stick("yy", (2.0, 1.0), mass=10.0)
-    g = 9.80665
-    assert weight_torque(chain, 0) == pytest.approx(10 * g * (1.0 + 2.5))
-    assert weight_torque(chain, 1) == pytest.approx(10 * g * 0.5)
-    assert weight_torque(stick("x", mass=10.0), 0) == 0  # all of the mass on the axis
-    assert weight_torque(stick("y"), 0) == 0
-
-
 @pytest.mark.parametrize("seed", [1, 2, 3])
 def test_no_pose_and_no_mounting_exceeds_the_weights_torque(seed: int) -> None:
     chain = kr270_chain()
@@ -129,17 +106,6 @@ def test_a_rated_torque_comes_from_compliance_weights_or_the_strongest_joint() -
     bare = stick("y")
     assert rated_torque(bare, unknown, 0) is None
     assert torque_scale(bare, unknown, 0) == 1.0
-
-
-def test_typical_hardening_is_a_fifth_of_the_linear_deflection_at_the_rated_torque() -> None:
-    chain, cell = kr270_chain(), kr270_cell()
-    (spec,) = CATALOGUE["joint_hardening"].parameters("joint2", chain, cell)
-    torque = rated_torque(chain, cell, 1)
-    assert spec.typical * torque**3 == pytest.approx(0.2 * COMPLIANCE[1] * torque)
-    (unknown,) = CATALOGUE["joint_hardening"].parameters(
-        "joint2", chain, kr270_cell(nominal=Nominal())
-    )
-    assert unknown.typical is None
 
 
 @pytest.mark.parametrize(

@@ -3,11 +3,11 @@
 from __future__ import annotations
 
 import pytest
-from support.cells import kr270_cell, kr270_chain
+from support.cells import kr270_cell
 from support.registered import forgotten
 
 from elastocal.errors import InputError
-from elastocal.model import effect_of, register
+from elastocal.model import register
 from elastocal.model.effects import CATALOGUE
 from elastocal.model.effects.base import Effect, Symbols
 from elastocal.model.effects.driven import JointMotion
@@ -62,24 +62,6 @@ def test_what_a_diagnosis_may_suspect_and_what_acts_unasked(observe: str) -> Non
     assert {n for n, e in CATALOGUE.items() if e.acts_unasked(cell)} == {"payload", "link_gravity"}
     light = kr270_cell((), observe)
     assert {n for n, e in CATALOGUE.items() if e.acts_unasked(light)} == {"payload"}
-
-
-def test_a_stranger_is_an_ordinary_error_of_the_arm_that_no_file_holds() -> None:
-    for effect in (Stranger(), effect_of("not in the catalogue")):
-        assert not (effect.registered or effect.elastic or effect.sized_by_value or effect.remedy)
-        assert effect.formats == () and effect.rank == CATALOGUE["link_bending"].rank
-        assert effect.may_be_missing(kr270_cell(())) and not effect.acts_unasked(kr270_cell(()))
-    assert not Stranger().of_the_measurement
-    assert Stranger().unphysical({}, kr270_chain(), kr270_cell(())) == ""
-
-
-def test_registering_keeps_the_order_of_the_others_and_the_dictionary_itself() -> None:
-    before, catalogue = list(CATALOGUE), CATALOGUE
-    with forgotten():
-        register(Stranger())
-        assert [name for name in CATALOGUE if name != "stranger"] == before
-        assert CATALOGUE is catalogue
-    assert list(CATALOGUE) == before
 
 
 def test_a_name_is_taken_once_but_by_the_same_class() -> None:
