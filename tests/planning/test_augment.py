@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 from support.cells import DOWN, TABLE_2, kr270_chain, random_poses
-from support.design_cells import FULL, all_loads, as_table, plan_cell, setup_of
+from support.design_cells import all_loads, as_table, plan_cell, setup_of
 
 from elastocal.cell.arm_description import PolarNoise
 from elastocal.cell.work_cell import Cell
@@ -72,17 +72,6 @@ def test_a_campaign_tells_what_its_poses_would(
     assert done.numbers == len(table) * {"deflection": 1.5, "position": 3, "pose": 6}[observed]
 
 
-def test_markers_noise_of_their_own_counts_for_what_is_done_too() -> None:
-    """The cell may state a σ per marker instead of the tracker's."""
-    sigmas = {"M1": 10e-6, "M2": 20e-6, "M3": 40e-6}
-    cell = plan_cell(noise=None, loads=DOWN[None], marker_sigma=sigmas)
-    done = measured(Model.assembled(CHAIN, cell), campaign(cell, TABLE_2), ())
-    assert relative(done.information, gathered(cell, TABLE_2, done.x)) < 1e-6
-    stated = replace(campaign(cell, TABLE_2), sigma=np.full((90, 3), 1e-5))
-    own = measured(Model.assembled(CHAIN, cell), stated, ())
-    assert own.information[1, 1] > 1.5 * done.information[1, 1]
-
-
 def test_the_same_campaign_again_halves_the_variances() -> None:
     cell = plan_cell(loads=DOWN[None], repeats=2)
     once = setup_of(cell, POSES)
@@ -98,16 +87,6 @@ def test_the_same_campaign_again_halves_the_variances() -> None:
     assert np.allclose(variances(twice), variances(once) / 2, rtol=1e-6)
 
 
-def test_what_is_done_is_linearised_where_it_says_the_arm_is() -> None:
-    cell = plan_cell(loads=DOWN[None])
-    model = Model.assembled(CHAIN, cell)
-    truth = model.nominal * np.array([1, 1.3, 0.8, 1.2, 0.9, 1.1])
-    done = measured(model, campaign(cell, TABLE_2, noise=True, x=truth), ())
-    assert done.x == pytest.approx(truth, rel=0.02)
-    setup = setup_of(cell, POSES, known=Known(done=done))
-    assert np.array_equal(setup.information.scenarios, done.x[None])
-
-
 def test_a_campaign_shows_what_no_pose_to_come_would() -> None:
     """The load once pulled from the side; a plan with a vertical load needs joint 1 no more."""
     cell = plan_cell(loads=DOWN[None])
@@ -118,25 +97,6 @@ def test_a_campaign_shows_what_no_pose_to_come_would() -> None:
     setup = setup_of(cell, POSES, known=Known(done=done))
     assert setup.information.names == model.names
     assert setup.warnings == ()
-
-
-def test_too_few_measurements_count_at_the_nominal_arm() -> None:
-    cell = plan_cell(FULL, "position", loads=BOTH)
-    model = Model.assembled(CHAIN, cell)
-    table = campaign(cell, TABLE_2[:1])
-    done = measured(model, table, ())
-    assert np.array_equal(done.x, model.nominal)
-    assert "nominal arm" in done.note
-    assert "do not suffice" in done.note
-    assert relative(done.information, gathered(cell, TABLE_2[:1], done.x)) < 1e-6
-
-
-def test_held_parameters_stay_where_they_are() -> None:
-    cell = plan_cell(loads=DOWN[None])
-    model = Model.assembled(CHAIN, cell)
-    done = measured(model, campaign(cell, TABLE_2, x=model.nominal * 1.2), ("joint4",))
-    assert done.x[3] == model.nominal[3]
-    assert done.x[5] != pytest.approx(model.nominal[5], rel=0.05)
 
 
 @pytest.mark.parametrize(

@@ -86,12 +86,6 @@ def test_what_does_not_fit_is_told_with_key_found_and_remedy(bad: Cell, told: li
     assert not [part for part in told if part not in str(caught.value)], str(caught.value)
 
 
-def test_the_cells_own_limits_count() -> None:
-    narrow = replace(cell(motion=Motion(home=HOME)), limits={"joint2": (-1.0, -0.5)})
-    with pytest.raises(InputError, match=r"joint2 .* at -90° is beyond its limits"):
-        check_cell(narrow, kr270_chain())
-
-
 @pytest.mark.parametrize(
     ("bad", "told"),
     [
@@ -122,11 +116,3 @@ def test_the_cell_shown_in_the_documentation_fits_its_robot(tmp_path: Path) -> N
     check_cell(shown, kr270_chain())
     targets = target_poses.test_poses(shown, kr270_chain())
     assert len(targets.q) == 1 + 1 + 20
-
-
-def test_a_prismatic_joint_beyond_its_limits_is_told_in_metres() -> None:
-    chain = random_chain(seed=1)
-    slide = replace(chain.joints[2], kind="prismatic", lower=0.0, upper=0.5)
-    chain = replace(chain, joints=(*chain.joints[:2], slide, *chain.joints[3:]))
-    with pytest.raises(InputError, match=r"joint3 .* at 0\.8 m is beyond its limits, 0 m to"):
-        check_cell(cell(test_poses=(TargetPose(np.array([0, 0, 0.8, 0, 0, 0])),)), chain)

@@ -38,12 +38,6 @@ def test_a_spoilt_file_counts_as_nothing_done(tmp_path: Path, content: bytes) ->
     assert stage.load() is None
 
 
-def test_without_a_folder_nothing_is_kept() -> None:
-    stage = Checkpoint().stage("pool")
-    stage.save({"q": np.zeros(3)})
-    assert stage.load() is None
-
-
 def test_the_key_changes_with_every_input(tmp_path: Path) -> None:
     cell, urdf = tmp_path / "cell.toml", tmp_path / "arm.urdf"
     cell.write_text("a")

@@ -8,8 +8,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from planning.test_information import information_of
-from support.cells import DOWN, TABLE_2, kr270_chain
+from support.cells import DOWN, kr270_chain
 from support.design_cells import plan_cell
 from support.design_commands import DEFLECTION, design, write_cell
 
@@ -20,7 +19,6 @@ from elastocal.errors import InputError
 from elastocal.model import Model
 from elastocal.planning import Choice, Chosen, Known, choices
 from elastocal.planning import test_poses as target_poses
-from elastocal.planning.information import ALL_LOADS
 
 CHAIN = kr270_chain()
 ONE = (TargetPose(np.radians([0.0, -90, 90, 0, 30, 0])),)
@@ -62,35 +60,6 @@ def test_places_stay_in_their_boxes_and_lower_the_relaxed_optimum() -> None:
     # The same cell again, as it would be measured with.
     placed = found.applied(cell_with(Freedom()))
     assert placed.tool.load_point == pytest.approx(found.places["load point"][1])
-
-
-def test_moved_places_give_the_information_of_the_cell_that_has_them() -> None:
-    tool = plan_cell().tool
-    freedom = Freedom({"M2": around(tool.markers["M2"])}, around(tool.load_point))
-    cell = cell_with(freedom, repeatability=20e-6)
-    boxes, q = choices.Boxes.of(cell), TABLE_2[:4]
-    places = boxes.lower + 0.03
-    here, there = (
-        information_of(replace(c, design=replace(c.design, choose=None)))
-        for c in (cell, boxes.placed(cell, places))
-    )
-    found = choices._mobile(boxes, cell, here)(places)
-    load = np.full(4, ALL_LOADS)
-    assert np.allclose(found.blocks(q, load), there.blocks(q, load), rtol=1e-9, atol=1e-6)
-
-
-def test_what_is_asked_for_at_the_test_poses_does_not_move_with_the_markers() -> None:
-    """Without a load point in the cell the test point is the mean of the markers: of those that
-    the cell states, wherever others stand."""
-    cell = cell_with(Freedom())
-    cell = replace(cell, tool=replace(cell.tool, load_point=np.zeros(3)))
-    made = search(cell)
-    moved = {name: at + 0.2 for name, at in cell.tool.markers.items()}
-    there = made.relaxed(replace(cell, tool=replace(cell.tool, markers=moved)))
-    here = made.relaxed(cell)
-    assert here is not None and there is not None
-    assert np.allclose(here.setup.target_rows.T @ here.setup.target_rows,
-                       there.setup.target_rows.T @ there.setup.target_rows)  # fmt: skip
 
 
 def test_the_tracker_goes_where_its_noise_is_least() -> None:
@@ -141,9 +110,3 @@ def test_the_command_plans_for_what_it_chose_and_writes_the_cell(tmp_path: Path)
     assert found["relaxed"]["after"] < found["relaxed"]["before"]
     # Nothing is chosen any more.
     assert design(again, "--cell-out", tmp_path / "no.toml").exit_code == 2
-
-
-def test_a_box_is_stated_from_its_lower_corner(tmp_path: Path) -> None:
-    wrong = CHOOSE.replace("[[-0.2, 0.1", "[[-0.05, 0.1")
-    result = design(write_cell(tmp_path, DEFLECTION + wrong))
-    assert result.exit_code == 2 and "markers_m.M2 takes the lower corner" in result.stderr

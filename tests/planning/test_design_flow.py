@@ -238,26 +238,6 @@ def test_the_same_seed_gives_the_same_plan_and_another_another() -> None:
     assert not np.array_equal(first.q, other.q)
 
 
-@pytest.mark.parametrize(
-    "cell",
-    [
-        lambda: plan_cell(loads=DOWN[None], poses=6, candidates=80, levels=LEVELS),
-        lambda: plan_cell(("joint_offset", "joint_compliance"), "position", loads=BOTH, poses=6,
-                          candidates=60, criterion="D"),
-    ],
-)  # fmt: skip
-@pytest.mark.long
-def test_more_effort_is_never_worse(cell: Callable[[], Cell]) -> None:
-    quick, normal, thorough = (
-        design(cell(), DesignOptions(effort)) for effort in ("quick", "normal", "thorough")
-    )
-    assert thorough.value <= normal.value * (1 + 1e-9) <= quick.value * (1 + 2e-9)
-    assert thorough.value < quick.value
-    assert thorough.polished > 0
-    for plan in (quick, normal, thorough):
-        assert plan.certificate.bound_pool <= plan.value * (1 + 1e-9)
-
-
 @pytest.mark.long
 def test_quick_plans_of_a_whole_geometry_are_certified_on_the_continuum() -> None:
     effects = ("base_frame", "joint_offset", "link_geometry", "joint_compliance", "marker_position")

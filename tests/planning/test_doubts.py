@@ -8,13 +8,9 @@ from planning.relaxation.test_two_methods import assert_agreement
 from support.cells import DOWN, kr270_chain, random_poses
 from support.design_cells import all_loads, plan_cell, set_up, target_poses
 
-from elastocal.identification.knowledge import GaussianPrior
 from elastocal.model import Model
-from elastocal.model.effects import SOMETHING
-from elastocal.planning import Gain, Known, Setup, in_doubt, load_states, missing, relax
-from elastocal.planning.doubts import WORTH, leading_directions
+from elastocal.planning import Gain, Known, Setup, in_doubt, load_states
 from elastocal.planning.plan import Doubt
-from elastocal.planning.selection import in_terms, random_plan
 
 CHAIN = kr270_chain()
 POSES = random_poses(CHAIN, 60, seed=1)
@@ -34,57 +30,6 @@ def setup_with(doubts: dict | None, known: Known | None = None, n_poses: int = 5
 @pytest.fixture(scope="module")
 def setup() -> Setup:
     return setup_with(FEW)
-
-
-def test_what_may_be_missing_is_what_poses_and_loads_can_show() -> None:
-    model = Model.assembled(CHAIN, plan_cell(loads=DOWN[None]))
-    found = missing(model)
-    assert ("gear_eccentricity", "joint2") in found and len(found) == len(set(found))
-    names = {name for name, _ in found}
-    # In the model; asks for times, for sides of approach; an order is searched; the instrument's.
-    absent = {"joint_compliance", "joint_drift", "hysteresis", "gear_ripple", "tracker_distortion"}
-    assert not names & absent
-
-
-def test_equal_shares_of_doubt_add_up() -> None:
-    cell = plan_cell(("base_frame",), "position", loads=DOWN[None])
-    model = Model.assembled(CHAIN, cell)
-    whole, known, _ = in_doubt(model, Known(), load_states(cell), POSES, all_loads(POSES))
-    prior = known.prior
-    assert prior is not None
-    at = {p.name: p for p in whole.parameters}
-    std = dict(zip(prior.names, np.sqrt(np.diag(prior.covariance)), strict=True))
-    share = {
-        (at[n].effect, at[n].where): (s / at[n].typical) ** 2
-        for n, s in std.items()
-        if at[n].typical
-    }
-    kinds = {name for name, _ in missing(model)}
-    joints = [p for (name, _), p in share.items() if name == "gear_eccentricity"]
-    assert len(joints) == 6 and sum(joints) == pytest.approx(SOMETHING / len(kinds))
-    assert max(share.values()) < SOMETHING / len(kinds) * (1 + 1e-9)
-
-
-def test_a_stated_prior_stays() -> None:
-    stated = GaussianPrior.independent(["joint2.compliance"], [3e-7], [1e-8])
-    cell = plan_cell(loads=DOWN[None])
-    known = in_doubt(
-        Model.assembled(CHAIN, cell), Known(("joint1",), stated), load_states(cell), POSES,
-        all_loads(POSES), FEW,
-    )[1]  # fmt: skip
-    assert known.prior is not None and known.prior.names[0] == "joint2.compliance"
-    assert known.prior.covariance[0, 0] == pytest.approx(1e-16) and "joint1" in known.fixed
-
-
-def test_without_doubts_it_is_the_error_at_the_test_poses() -> None:
-    robust = setup_with({})
-    cell = plan_cell(loads=DOWN[None], criterion="test_pose")
-    model = Model.assembled(CHAIN, cell)
-    targets = target_poses.test_poses(cell, CHAIN, None, 0)
-    other = set_up(model, load_states(cell), POSES, all_loads(POSES), 5, targets, Known(), 0)
-    q, load = POSES[:8], all_loads(POSES[:8])
-    assert robust.value(q, load) == pytest.approx(other.value(q, load), rel=1e-9)
-    assert robust.information.names == other.information.names
 
 
 def test_it_is_the_error_of_the_best_linear_estimate(setup: Setup) -> None:
@@ -108,57 +53,6 @@ def test_it_is_the_error_of_the_best_linear_estimate(setup: Setup) -> None:
 def test_the_bound_is_that_of_another_solver(setup: Setup) -> None:
     pool = setup.pool(POSES, all_loads(POSES), np.zeros(len(POSES), dtype=np.int64))
     assert_agreement(setup.problem(pool, np.array([8])))
-
-
-def test_the_search_is_one_in_directions_that_count() -> None:
-    """What they leave out counts as known: no plan errs more, and the best hardly less."""
-    setup = setup_with(None)
-    pool = setup.pool(POSES, all_loads(POSES), np.zeros(len(POSES), dtype=np.int64))
-    problem, R = setup.problem(pool, np.array([8])), setup.target_rows
-    own = np.isin(setup.information.names, Model.assembled(CHAIN, plan_cell()).names)
-    assert R is not None
-    T = leading_directions(problem, R, ~own)
-    assert T is not None and own.sum() < T.shape[2] <= WORTH * len(own)
-    fewer = in_terms(problem, T)
-    assert fewer is not None
-    rng = np.random.default_rng(0)
-    for chosen in (random_plan(problem, rng) for _ in range(10)):
-        whole, some = (p.criterion.value(p.prior + p.sum_of(chosen)) for p in (problem, fewer))
-        assert some <= whole * (1 + 1e-9)
-    bound = relax(problem).bound
-    assert 0.99 * bound < relax(fewer).bound <= bound * (1 + 1e-6)
-    assert leading_directions(problem, R, np.zeros(len(own), dtype=bool)) is None
-
-
-def test_doubt_costs_and_poses_pay_it_back() -> None:
-    """More doubt, more error; and more poses lower it."""
-    q, load = POSES[:10], all_loads(POSES[:10])
-    sure, doubtful = (setup_with({key: p for key in FEW}) for p in (1e-4, 0.5))
-    assert doubtful.value(q, load) > sure.value(q, load)
-    more, all_of_them = POSES[:30], all_loads(POSES[:30])
-    assert doubtful.value(more, all_of_them) < doubtful.value(q, load)
-
-
-def test_gain_counts_what_the_readings_show_and_leave_open() -> None:
-    """One parameter, and one that may be missing, which the model has at zero: by hand."""
-    R, before, pull = np.eye(2), np.diag([4.0, 1.0]), np.array([0.0, 100.0])
-    one = np.array([1])
-
-    def gain(p: float, spare: float = 0.0) -> Gain:
-        return Gain.of(R, before, 4 * before, [Doubt(p, one, np.array([spare]))], pull, 0)
-
-    there = gain(1.0)
-    assert there.before == pytest.approx(np.sqrt(0.25 + 1 + 100**2))
-    assert there.after == pytest.approx(np.sqrt(1 / 16 + 1 / (3 + 1 / (1 + 100**2))))
-    assert there.model_before == pytest.approx(0.5) and there.model_after == pytest.approx(0.25)
-    assert there.sure == pytest.approx(100 + 1.645, abs=0.1)
-    # Known less well if it is there than with its chance alone: 1/(1 - spare) times the variance.
-    assert gain(1.0, 0.5).sure == pytest.approx(200 + 1.645 * np.sqrt(2), abs=0.2)
-    # What is missing with a few per cent alone leaves the error that of the model: N(0, 1/4).
-    assert gain(1e-9).sure == pytest.approx(1.96 / 2, abs=0.05)
-    assert 1.96 / 2 < gain(0.03).sure < 1.5 and gain(0.1).sure > 98
-    assert gain(1e-9).before == pytest.approx(there.model_before, rel=1e-4)
-    assert Gain.of(R, np.diag([0.0, 1.0]), before, [], np.zeros(2), 0).sure == np.inf
 
 
 def test_the_stated_error_holds_in_as_many_campaigns_as_it_says() -> None:

@@ -7,8 +7,7 @@ import pytest
 from support.cells import DOWN, kr270_chain, random_poses
 from support.design_cells import all_loads, plan_cell
 
-from elastocal.cell.plan_wishes import ELSEWHERE_CAP, TargetPose
-from elastocal.errors import InputError
+from elastocal.cell.plan_wishes import TargetPose
 from elastocal.model import Model
 from elastocal.planning import Known, Setup, load_states, relax, set_up
 from elastocal.planning import test_poses as target_poses
@@ -39,17 +38,6 @@ def errors(setup: Setup, chosen: np.ndarray) -> Everywhere:
     return Everywhere.of(setup.target_rows, setup.elsewhere_rows, M, M[None], M)
 
 
-def best(setup: Setup) -> np.ndarray:
-    """The best plan found of six poses, checked against its bound."""
-    problem = setup.problem(
-        setup.pool(Q, all_loads(Q), np.zeros(60, dtype=np.int64)), np.array([6])
-    )
-    found = exact_plan(problem, starts=4)
-    bound = relax(problem).bound
-    assert 0.8 * found.value <= bound <= found.value
-    return found.chosen
-
-
 def test_the_criterion_is_the_weighted_mean_of_both_errors() -> None:
     setup, chosen = made(0.25), np.arange(8)
     e = errors(setup, chosen)
@@ -57,13 +45,6 @@ def test_the_criterion_is_the_weighted_mean_of_both_errors() -> None:
     mean = 0.75 * e.test_poses**2 + 0.25 * e.elsewhere**2
     assert float(setup.criterion.value(M)) == pytest.approx(mean, rel=1e-9)
     assert (e.random_test_poses, e.random_elsewhere) == (e.test_poses, e.elsewhere)
-
-
-def test_a_share_elsewhere_costs_little_at_the_test_poses_and_buys_the_rest() -> None:
-    alone, shared = made(0.0), made(0.3)
-    narrow, wide = errors(alone, best(alone)), errors(shared, best(shared))
-    assert wide.elsewhere < narrow.elsewhere
-    assert narrow.test_poses <= wide.test_poses < 1.5 * narrow.test_poses
 
 
 def test_the_share_is_the_largest_that_the_cap_allows_and_the_bound_is_another_solvers() -> None:
@@ -84,12 +65,3 @@ def test_the_share_is_the_largest_that_the_cap_allows_and_the_bound_is_another_s
 
     assert 0.045 < price(share) < 0.0505
     assert price(1.3 * share) > 0.05
-
-
-def test_a_cap_stands_where_no_test_poses_are_stated_and_nothing_else_is_said() -> None:
-    assert plan_cell().design.cap == ELSEWHERE_CAP
-    assert plan_cell(elsewhere=0.0).design.cap == plan_cell(elsewhere=0.3).design.cap == 0
-    assert plan_cell(test_poses=ONE).design.cap == plan_cell(criterion="D").design.cap == 0
-    assert plan_cell(test_poses=ONE, elsewhere_cap=0.1).design.cap == 0.1
-    with pytest.raises(InputError, match="drop one"):
-        plan_cell(elsewhere=0.1, elsewhere_cap=0.1)

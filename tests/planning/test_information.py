@@ -70,59 +70,12 @@ def _plan(information: PoseInformation):
     return replace(rows.take(first), force=np.zeros((len(first), 3)), sigma=None)
 
 
-def test_loads_chosen_per_pose_share_the_information_of_all() -> None:
-    both = np.array([[0.0, 0, 0], DOWN])
-    every = information_of(cell_for("position", AXIS, loads=both))
-    one = information_of(cell_for("position", AXIS, loads=both, load_choice=True))
-    single = [one.blocks(TABLE_2, np.full(len(TABLE_2), k))[0] for k in range(2)]
-    summed = sum(np.einsum("nri,nrj->ij", B, B) for B in single)
-    assert relative(summed, gathered(every, TABLE_2)) < 1e-10
-
-
-def test_a_configuration_effect_bounds_what_repeats_can_tell() -> None:
-    """With τ ≫ σ a pose of M markers tells at most what one exact reading with τ would."""
-    tau = 1e-3
-    cell = cell_for("deflection", AXIS, loads=DOWN[None], repeats=1000, repeatability=tau)
-    model = Model.assembled(
-        kr270_chain(), replace(cell, tool=replace(cell.tool, markers={"M": np.zeros(3)}))
-    )
-    n = len(model.parameters)
-    x = model.nominal
-    found = PoseInformation(model, load_states(model.cell), x[None], np.arange(n), np.ones(n))
-    table = found.rows(TABLE_2, np.full(15, ALL_LOADS), x)
-    B = model.regressor(table, x).B
-    assert relative(gathered(found, TABLE_2), B.T @ B / tau**2) < 1e-4
-
-
 def test_both_directions_are_two_visits() -> None:
     once = cell_for("deflection", AXIS, loads=DOWN[None], repeatability=40e-6)
     motion = replace(once.design.motion, both_directions=True)
     twice = replace(once, design=replace(once.design, motion=motion))
     found = gathered(information_of(twice), TABLE_2)
     assert relative(found, 2 * gathered(information_of(once), TABLE_2)) < 1e-12
-
-
-def test_markers_have_their_own_noise_where_stated() -> None:
-    sigmas = {"M1": 10e-6, "M2": 20e-6, "M3": 40e-6}
-    cell = cell_for("position", None, marker_sigma=sigmas)
-    own = information_of(cell).blocks(TABLE_2, np.full(15, ALL_LOADS))[0]
-    plain = information_of(cell_for("position", CartesianNoise(np.full(3, 10e-6))))
-    same = plain.blocks(TABLE_2, np.full(15, ALL_LOADS))[0]
-    assert np.allclose(
-        own.reshape(15, 3, 3, -1), same.reshape(15, 3, 3, -1) / [[[1]], [[2]], [[4]]]
-    )
-
-
-def test_scenarios_are_linearised_at_their_own_values() -> None:
-    cell = cell_for("deflection", AXIS, loads=DOWN[None])
-    base = information_of(cell)
-    soft = base.model.nominal * 2
-    two = replace(base, scenarios=np.stack([base.model.nominal, soft]))
-    load = np.full(15, ALL_LOADS)
-    blocks = two.blocks(TABLE_2, load)
-    assert np.allclose(blocks[0], base.blocks(TABLE_2, load)[0])
-    assert np.allclose(blocks[1], information_of(cell, soft).blocks(TABLE_2, load)[0])
-    assert not np.allclose(blocks[0], blocks[1], rtol=1e-4)
 
 
 @pytest.mark.parametrize(

@@ -47,13 +47,6 @@ def walled(wall: float) -> Walled:
     return feasibility
 
 
-def test_a_plan_whose_moves_are_free_is_left_alone() -> None:
-    setup, found = selection()
-    after, execution, told = ordered(setup, found, SHARES, walled(np.inf), 0, lambda text: None)
-    assert set(after.chosen) == set(found.chosen) and told == []
-    assert {stop.pose for stop in execution.stops} == set(range(6))
-
-
 def test_unreachable_poses_are_replaced_and_the_bound_still_holds() -> None:
     setup, found = selection()
     wall = np.sort(found.pool.q[:, 0])[45]

@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-import re
-from dataclasses import replace
 from typing import Any
 
 import numpy as np
@@ -12,13 +10,12 @@ from numpy.typing import NDArray
 from support.cells import DOWN, TABLE_2, kr270_chain, random_poses
 from support.design_cells import FULL, all_loads, any_cell, plan_cell, scara, setup_of, spread
 
-from elastocal.cell.plan_wishes import TargetPose
 from elastocal.cell.work_cell import Cell
 from elastocal.errors import InputError, InsufficientDataError
-from elastocal.identification import GaussianPrior, Options
+from elastocal.identification import Options
 from elastocal.identification.identify import identify
 from elastocal.model import Model
-from elastocal.planning import Known, PoseInformation, Setup, load_states
+from elastocal.planning import Known, PoseInformation, load_states
 from elastocal.planning import information as parameters
 from elastocal.simulation.simulate import simulate
 
@@ -83,50 +80,8 @@ def test_what_is_dropped_moves_the_readings_as_its_mixing_says() -> None:
     assert np.abs(off).max() < 1e-6 * np.abs(B * setup.found.sizes).max()
 
 
-def test_a_prior_keeps_every_parameter_that_it_knows() -> None:
-    typical = setup_of(plan_cell(FULL, "position", loads=BOTH, prior="typical"), POSES)
-    assert len(typical.information.names) == len(typical.information.model.names)
-    assert typical.warnings == ()
-    prior = GaussianPrior.independent(("joint1.compliance",), [3.5e-7], [1e-7])
-    told = setup_of(plan_cell(loads=DOWN[None]), POSES, known=Known(prior=prior))
-    assert len(told.information.names) == 6
-    std = np.sqrt(np.linalg.inv(told.gathered(told.information.blocks(*plan()))[0])[0, 0])
-    assert std * told.information.sizes[0] == pytest.approx(1e-7)
-
-
 def plan() -> tuple[NDArray, NDArray]:
     return TABLE_2, all_loads(TABLE_2)
-
-
-def test_a_held_parameter_is_not_among_them() -> None:
-    cell = plan_cell(FULL, "position", loads=BOTH)
-    fixed = setup_of(cell, POSES, known=Known(fixed=("joint2", "joint5.offset")))
-    assert not [n for n in fixed.information.names if n.startswith(("joint2", "joint5.offset"))]
-    assert "joint3.compliance" in fixed.information.names
-
-
-def test_loads_that_are_chosen_per_pose_are_all_looked_at(monkeypatch: pytest.MonkeyPatch) -> None:
-    """Candidates alternate between the load states, as a step through them might."""
-    monkeypatch.setattr(parameters, "SAMPLE", 100)
-    cell = plan_cell(("joint_compliance",), "position", loads=BOTH, load_choice=True)
-    q = np.repeat(POSES, 2, axis=0)
-    setup = setup_of(cell, q, load=np.tile([0, 1], len(POSES)))
-    assert setup.information.names == tuple(f"joint{i}.compliance" for i in range(2, 7))
-
-
-@pytest.mark.parametrize("scarce", [0, 1, 4])
-def test_a_level_with_few_poses_is_looked_at(scarce: int, monkeypatch: pytest.MonkeyPatch) -> None:
-    """Each level has a compliance of its own, which its poses alone show."""
-    monkeypatch.setattr(parameters, "SAMPLE", 50)
-    levels = tuple(np.unique(TABLE_2[:, 1]).tolist())
-    cell = plan_cell(
-        loads=DOWN[None], levels={"joint2": levels}, model={"compliance_levels": {"joint2": levels}}
-    )
-    level = np.repeat(np.arange(5), np.where(np.arange(5) == scarce, 3, 100))
-    q = random_poses(CHAIN, len(level), seed=3)
-    q[:, 1] = np.array(levels)[level]
-    names = setup_of(cell, q).information.names
-    assert {f"joint2.compliance_level{k}" for k in range(1, 6)} <= set(names)
 
 
 # --- what counts --------------------------------------------------------------------------
@@ -150,12 +105,6 @@ def test_interest_names_parameters_places_or_effects(interest: Any, counted: Any
     assert chosen.tolist() == expected
     V = np.linalg.inv(setup.gathered(setup.information.blocks(*plan()))[0])
     assert setup.value(*plan()) == pytest.approx(np.trace(V[np.ix_(chosen, chosen)]), rel=1e-8)
-
-
-def test_base_and_markers_count_where_there_is_nothing_else() -> None:
-    cell = plan_cell(("base_frame", "marker_position"), "position", criterion="D")
-    setup = setup_of(cell, POSES)
-    assert len(parameters.interest_of(setup.information.model, setup.found)) == 15
 
 
 @pytest.mark.parametrize(
@@ -198,18 +147,6 @@ def test_a_combination_has_the_variance_of_its_terms() -> None:
     )
 
 
-def test_a_combination_of_what_the_readings_add_up_is_known_and_its_parts_are_not() -> None:
-    """base.rz and joint1.offset turn the arm alike: their difference is known, neither alone."""
-    effects = ("base_frame", "joint_offset")
-    cell = plan_cell(effects, "position", criterion="c")
-    both = {"base.rz": 1.0, "joint1.offset": -1.0}  # axis 1 points down
-    sum_of = replace(cell, design=replace(cell.design, combination=both))
-    assert np.isfinite(setup_of(sum_of, POSES).value(*plan()))
-    alone = replace(cell, design=replace(cell.design, combination={"joint1.offset": 1.0}))
-    with pytest.raises(InsufficientDataError, match=r"combination depends on joint1.offset.*base"):
-        setup_of(alone, POSES)
-
-
 def test_a_plan_estimates_what_identification_will() -> None:
     """Of fifteen poses both keep the same parameters; joint 6's offset, which only the load point
     tells from the markers, is below the noise and held by both."""
@@ -225,21 +162,3 @@ def test_a_plan_estimates_what_identification_will() -> None:
     result = identify(model, data, Options(method="wls", faulty="keep"))
     assert set(setup.information.names) == set(result.determined)
     assert "joint6.offset" not in setup.information.names
-
-
-def test_what_is_held_and_moves_a_stated_point_is_told() -> None:
-    effects = ("base_frame", "joint_offset", "joint_compliance", "marker_position")
-    told = TargetPose(TABLE_2[0], force=DOWN, point=np.array([0.2, 0.0, 0.25]))
-    cell = plan_cell(effects, "position", loads=BOTH, test_poses=(told,))
-    of_point = remaining(setup_of(cell, TABLE_2, n_poses=15))
-    cell = plan_cell(effects, "position", loads=BOTH, test_poses=(replace(told, point=None),))
-    of_markers = remaining(setup_of(cell, TABLE_2, n_poses=15))
-    # A milliradian about the flange, 0.2 m away; markers move as the readings told.
-    assert 100 < of_point < 400
-    assert of_markers < 5
-
-
-def remaining(setup: Setup) -> float:
-    """µm that held parameters move the test points by, as the warning tells; 0 without one."""
-    told = [text for text in setup.warnings if "joint6.offset" in text]
-    return float(re.findall(r"by ([0-9.]+) µm", told[0])[0]) if told else 0.0

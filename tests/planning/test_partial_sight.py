@@ -17,7 +17,6 @@ import elastocal as ec
 from elastocal.cell.arm_description import Tool, Tracker
 from elastocal.cell.plan_wishes import Motion
 from elastocal.cell.workspace_rules import Visibility, Workspace
-from elastocal.errors import InputError
 from elastocal.model import observe
 from elastocal.planning import Plan
 from elastocal.planning.information import ALL_LOADS, observed_weights
@@ -88,9 +87,3 @@ def test_a_plan_names_the_markers_and_its_readings_are_identified(tmp_path: Path
     # The stated noise, where identification takes what the residuals say of it.
     ratio = [found[p.name].std / p.std for p in plan.predicted]
     assert np.ptp(ratio) < 0.01 and 0.5 < np.mean(ratio) < 1.5
-
-
-def test_more_markers_than_there_are_cannot_be_asked_for() -> None:
-    space = Workspace(visibility=Visibility(min_markers=4))
-    with pytest.raises(InputError, match="min_markers is 4, but"):
-        replace(plan_cell(), workspace=space).check()

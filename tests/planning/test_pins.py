@@ -19,7 +19,6 @@ from elastocal.planning import design as design_module
 from elastocal.planning.feasibility import NEARBY
 
 CELL = plan_cell(loads=DOWN[None], poses=6, candidates=60)
-LEVELS = {"joint2": (-0.5, -1.2, -2.0)}
 
 
 @lru_cache
@@ -60,25 +59,6 @@ def test_one_pose_struck_is_replaced_by_the_best_other(file, monkeypatch) -> Non
     assert plan.candidates.removed_by["struck"] >= 0
     loads = {stop.load for stop in plan.execution.stops if stop.pose == 5}
     assert loads == {0, 1}  # without and with load
-
-
-def test_poses_kept_are_part_of_a_larger_plan(file, monkeypatch) -> None:
-    plan, problems = searched(monkeypatch, keep=f"{file}:1,5", poses=7)
-    assert plan.configurations == ("1", "5", "7", "8", "9", "10", "11")
-    assert np.allclose(plan.q[:2], first().q[[0, 4]], atol=1e-9)
-    assert problems[0].shares.tolist() == [5]
-    assert plan.certificate.bound_pool <= plan.value
-    all_ = ec.design(CELL, effort="quick", keep=file, poses=8)
-    assert all_.value < first().value
-
-
-def test_what_stays_counts_for_its_level(tmp_path) -> None:
-    cell = plan_cell(loads=DOWN[None], candidates=90, levels=LEVELS, per_level=(2, 2, 2))
-    plan = ec.design(cell, effort="quick")
-    plan.save(tmp_path / "levels.csv")
-    again = ec.design(cell, effort="quick", strike=f"{tmp_path / 'levels.csv'}:1,4")
-    assert np.bincount(again.group).tolist() == [2, 2, 2]
-    assert sorted(again.configurations, key=int) == ["2", "3", "5", "6", "7", "8"]
 
 
 @pytest.mark.parametrize(

@@ -73,48 +73,6 @@ def test_what_is_written_is_read_back(tmp_path_factory, data):
     )
 
 
-def test_angles_in_degrees_read_as_they_were_stated(tmp_path):
-    path = tmp_path / "plan.csv"
-    write_plan(path, plan_rows(execution_of(), NAMES, LEVEL), KINDS)
-    rows = [line.split(",") for line in path.read_text().splitlines()]
-    assert rows[0][:3] == ["configuration", "q1_deg", "q2_deg"]
-    assert rows[0][-3:] == ["level", "order", "note_order_2"]
-    assert [float(row[2]) for row in rows[1:]] == [round(v, 2) for v in np.degrees(TABLE_2[:, 1])]
-    assert rows[1][:4] == ["1", "79.2", "-0.01", "-5.57"]
-    orders = [int(row[k]) for row in rows[1:] for k in (-2, -1)]
-    assert sorted(orders) == list(range(1, 31))
-
-
-def test_orders_follow_the_execution(tmp_path):
-    execution = execution_of()
-    rows = plan_rows(execution, NAMES, LEVEL, FORCES)
-    assert len(rows.order) == 30 and np.array_equal(np.unique(rows.level), np.arange(1, 6))
-    for k, stop in enumerate(execution.stops, start=1):
-        row = int(np.flatnonzero(rows.order == k)[0])
-        assert rows.configuration[row] == NAMES[stop.pose]
-        assert np.array_equal(rows.q[row], stop.q)
-        assert np.array_equal(rows.force[row], FORCES[stop.load])
-        assert rows.level[row] == LEVEL[stop.pose]
-
-
-def test_a_load_chosen_per_pose_stands_in_its_row(tmp_path):
-    path, load = tmp_path / "plan.csv", np.arange(15) % 2
-    write_plan(path, plan_rows(execution_of(load=load), NAMES, LEVEL, FORCES), KINDS)
-    plan = read_plan(path, joint_kinds=KINDS)
-    assert np.array_equal(plan.force, FORCES[load])
-    assert np.allclose(plan.q, TABLE_2, rtol=0, atol=1e-9)
-
-
-def test_both_directions_are_two_configurations_with_their_signs(tmp_path):
-    path = tmp_path / "plan.csv"
-    execution = execution_of(forces=FORCES[:1], both_directions=True)
-    write_plan(path, plan_rows(execution, NAMES, LEVEL), KINDS)
-    plan = read_plan(path, joint_kinds=KINDS)
-    assert len(plan) == 30
-    assert plan.configuration_labels[:4] == ("1+", "1-", "2+", "2-")
-    assert (plan.approach[::2] == 1).all() and (plan.approach[1::2] == -1).all()
-
-
 @pytest.mark.parametrize(
     "change, message",
     [

@@ -33,13 +33,6 @@ def test_predicted_intervals_are_those_of_the_inverse() -> None:
     assert [p.unit for p in told] == ["rad/(N*m)"] * 6
 
 
-def test_combined_parameters_are_named() -> None:
-    mixing = np.array([[0.5], [0.0], [0.0], [0.0], [1e-4]])
-    told = predicted(MODEL, found([0, 2, 3, 4, 5], [1], mixing), np.eye(5), 30)
-    assert told[0].combined_with == ("joint2.compliance",)
-    assert all(p.combined_with == () for p in told[1:])
-
-
 def test_a_pose_is_worth_what_is_lost_without_it() -> None:
     rng = np.random.default_rng(1)
     blocks, prior = rng.normal(size=(7, 3, 6)), 0.1 * np.eye(6)
@@ -52,14 +45,3 @@ def test_a_pose_is_worth_what_is_lost_without_it() -> None:
         assert reason.loss == without / 2.0
         assert [name for name, _ in reason.serves] == [MODEL.names[k] for k in order]
         assert np.allclose([g for _, g in reason.serves], growth[order], rtol=1e-9)
-
-
-def test_a_pose_that_alone_shows_a_parameter_is_worth_everything() -> None:
-    blocks = np.zeros((3, 6, 6))
-    blocks[0, :5, :5] = np.eye(5)
-    blocks[1, :5, :5] = np.eye(5)
-    blocks[2, 5, 5] = 1.0
-    told = reasons(MODEL, ALL, blocks, np.zeros((6, 6)), np.array([2.0, 2.0, np.inf]), 1.0)
-    assert told[2].serves == (("joint6.compliance", np.inf),)
-    assert told[2].loss == np.inf
-    assert np.allclose([g for _, g in told[0].serves], np.sqrt(2))

@@ -10,7 +10,6 @@ import pytest
 from numpy.typing import NDArray
 from support.cells import COMPENSATOR, COMPLIANCE, DOWN, TABLE_2, kr270_chain, random_poses
 from support.design_cells import (
-    FULL,
     all_loads,
     any_cell,
     as_table,
@@ -139,15 +138,6 @@ def test_the_value_is_what_identification_would_leave_at_the_test_poses(
     assert setup.criterion.reported(value) == (pytest.approx(1e6 * np.sqrt(expected)), "µm")
 
 
-def test_no_pose_makes_a_plan_worse_and_repeats_divide_the_variance() -> None:
-    setup = setup_of(plan_cell(loads=DOWN[None]), POSES)
-    values = [setup.value(POSES[:n], all_loads(POSES[:n])) for n in (5, 6, 10, 20)]
-    assert (np.diff(values) < 0).all()
-    thrice = setup_of(plan_cell(loads=DOWN[None], repeats=3), POSES)
-    five = POSES[:5]
-    assert thrice.value(five, all_loads(five)) == pytest.approx(values[0] / 3)
-
-
 @pytest.mark.parametrize("repeatability", [0.0, 5e-5])
 def test_what_the_arm_scatters_is_not_removed_by_repeats(repeatability: float) -> None:
     def value(repeats: int) -> float:
@@ -178,17 +168,6 @@ def test_a_prior_adds_its_information() -> None:
     assert setup.value(*plan) < without.value(*plan)
 
 
-def test_a_typical_prior_is_worth_one_typical_size_of_each_parameter() -> None:
-    cell = plan_cell(FULL, "position", loads=BOTH, prior="typical", criterion="A",
-                     interest=("joint_offset",))  # fmt: skip
-    setup = setup_of(cell, POSES)
-    typical = [setup.information.model.parameters[c].typical for c in setup.found.columns]
-    assert np.allclose(setup.information.sizes, typical)
-    assert np.allclose(setup.prior[0], np.eye(len(typical)))
-    # Before any pose every offset is as uncertain as is typical.
-    assert setup.criterion.value(setup.prior) == pytest.approx(6.0)
-
-
 def test_a_prior_of_an_unknown_parameter_is_refused() -> None:
     prior = GaussianPrior.independent(("joint9.compliance",), [0.0], [1.0])
     with pytest.raises(InputError, match=r"joint9\.compliance.*did you mean"):
@@ -211,28 +190,3 @@ def test_scenarios_come_from_the_seed_and_move_the_arm_alone() -> None:
     assert (a[1:, placed] == model.nominal[placed]).all()
     assert (a[1:, ~placed] != model.nominal[~placed]).all()
     assert not np.isclose(a[1:, ~placed], c[1:, ~placed]).any()
-
-
-@pytest.mark.parametrize("robust", ["average", "worst"])
-def test_over_scenarios_the_average_or_the_worst_of_each_arm_counts(robust: Any) -> None:
-    cell = plan_cell(loads=DOWN[None], robust=robust, robust_samples=4)
-    setup = setup_of(cell, POSES, seed=2)
-    targets = target_poses.test_poses(cell, CHAIN, None, 2)
-    each = []
-    for x in setup.information.scenarios:
-        nominal = replace(cell.model.nominal, joint_compliance=tuple(x))
-        arm = replace(cell, model=replace(cell.model, nominal=nominal))
-        arm = replace(arm, design=replace(arm.design, robust="none"))
-        each.append(setup_of(arm, POSES, targets=targets).value(TABLE_2, all_loads(TABLE_2)))
-    assert len(set(each)) == 5
-    expected = np.mean(each) if robust == "average" else max(each)
-    assert setup.value(TABLE_2, all_loads(TABLE_2)) == pytest.approx(expected, rel=1e-9)
-
-
-def test_scenarios_with_parameters_that_cannot_be_told_apart_are_weighed() -> None:
-    """What combines with what differs from arm to arm; that is no reason to refuse any of them."""
-    cell = plan_cell(FULL, "position", loads=BOTH, robust="worst", robust_samples=1)
-    value = setup_of(cell, POSES).value(POSES[:30], all_loads(POSES[:30]))
-    nominal = replace(cell, design=replace(cell.design, robust="none"))
-    least = setup_of(nominal, POSES).value(POSES[:30], all_loads(POSES[:30]))
-    assert least * (1 - 1e-9) <= value < 2 * least

@@ -14,9 +14,9 @@ from support.calibration import placement
 from support.cells import kr270_cell, kr270_chain, nominal_flanges, random_poses
 
 from elastocal.cell.arm_description import Nominal, Tool
-from elastocal.cell.plan_wishes import DesignSpec, Motion, TargetBox, TargetPath, TargetPose
+from elastocal.cell.plan_wishes import DesignSpec, TargetBox, TargetPath, TargetPose
 from elastocal.cell.work_cell import Cell
-from elastocal.errors import InputError, InsufficientDataError
+from elastocal.errors import InputError
 from elastocal.planning import TargetPoses
 from elastocal.planning import test_poses as target_poses
 from elastocal.planning.test_poses import DEFAULT_COUNT
@@ -63,35 +63,6 @@ def test_stated_poses_come_with_their_force_point_and_share() -> None:
     assert "2 of [[design.test_pose]]" in found.source
 
 
-def test_a_pose_without_force_is_taken_under_each_load_that_is_not_zero() -> None:
-    q = random_poses(CHAIN, 2, seed=1)
-    stated = TargetPose(q[0], np.zeros(3), 1.0)
-    found = poses_of(cell_of(loads=LOADS, test_poses=(stated, TargetPose(q[1], weight=3.0))))
-    np.testing.assert_array_equal(found.q, q[[0, 1, 1]])
-    np.testing.assert_array_equal(found.force, LOADS)
-    np.testing.assert_allclose(found.weight, [0.25, 0.375, 0.375])
-
-
-def test_without_loads_there_is_no_force() -> None:
-    pose = TargetPose(random_poses(CHAIN, 1, seed=1)[0])
-    for loads in (None, np.zeros((1, 3))):
-        found = poses_of(cell_of(loads=loads, test_poses=(pose,)))
-        np.testing.assert_array_equal(found.force, np.zeros((1, 3)))
-
-
-@pytest.mark.parametrize(
-    ("tool", "point"),
-    [
-        (Tool(POINT, {"M1": np.ones(3)}), POINT),
-        (Tool(markers={"M1": np.ones(3), "M2": np.zeros(3)}), np.full(3, 0.5)),
-        (Tool(), np.zeros(3)),
-    ],
-)
-def test_the_point_is_the_load_point_or_the_middle_of_the_markers(tool: Tool, point: Any) -> None:
-    pose = TargetPose(random_poses(CHAIN, 1, seed=1)[0])
-    np.testing.assert_array_equal(poses_of(cell_of(tool, test_poses=(pose,))).point, [point])
-
-
 def test_a_pose_beyond_the_limits_is_refused() -> None:
     q = random_poses(CHAIN, 1, seed=1)[0]
     q[1] = 0.5
@@ -115,25 +86,6 @@ def csv(header: str, rows: NDArray) -> str:
 JOINTS = ",".join(f"q{i}_deg" for i in range(1, 7))
 
 
-def test_a_path_in_joints(tmp_path: Path) -> None:
-    q = random_poses(CHAIN, 3, seed=2)
-    rows = np.hstack([np.degrees(q), LOADS, [[1], [2], [5]]])
-    text = csv(JOINTS + ",force_x_N,force_y_N,force_z_N,weight", rows)
-    found = poses_of(path_cell(tmp_path, text))
-    np.testing.assert_allclose(found.q, q, rtol=1e-14)
-    np.testing.assert_array_equal(found.force, LOADS)
-    np.testing.assert_allclose(found.weight, [1 / 8, 2 / 8, 5 / 8])
-    assert "3 of path.csv" in found.source
-
-
-def test_the_path_may_say_its_force_once(tmp_path: Path) -> None:
-    q = random_poses(CHAIN, 2, seed=2)
-    cell = path_cell(tmp_path, csv(JOINTS, np.degrees(q)), force=LOADS[2], point=np.ones(3))
-    found = poses_of(cell)
-    np.testing.assert_array_equal(found.force, LOADS[[2, 2]])
-    np.testing.assert_array_equal(found.point, np.ones((2, 3)))
-
-
 @pytest.mark.parametrize("turned", ["free", "vector", "quaternion"])
 def test_a_path_of_places_is_reached_where_the_arm_stands(tmp_path: Path, turned: str) -> None:
     T = placement([0.5, -2.0, 0.3], Rotation.from_euler("z", 2.0))
@@ -152,23 +104,6 @@ def test_a_path_of_places_is_reached_where_the_arm_stands(tmp_path: Path, turned
     if turned != "free":
         reached = Rotation.from_matrix(T[:3, :3] @ nominal_flanges(CHAIN, found.q)[:, :3, :3])
         assert (reached.inv() * rotation).magnitude().max() < 2e-6
-
-
-def test_a_path_is_followed_in_one_posture(tmp_path: Path) -> None:
-    """Along a short straight line no joint jumps to another branch."""
-    line = np.linspace([1500, -200, 1000], [1500, 200, 1000], 30)
-    found = poses_of(path_cell(tmp_path, csv("x_mm,y_mm,z_mm", line)))
-    assert np.abs(np.diff(found.q, axis=0)).max() < 0.1
-
-
-def test_parquet_says_the_same(tmp_path: Path) -> None:
-    pd = pytest.importorskip("pandas")
-    pytest.importorskip("pyarrow")
-    q = random_poses(CHAIN, 3, seed=2)
-    frame = pd.DataFrame(np.degrees(q), columns=JOINTS.split(","))
-    frame.to_parquet(tmp_path / "path.parquet")
-    found = poses_of(cell_of(test_path=TargetPath(tmp_path / "path.parquet")))
-    np.testing.assert_allclose(found.q, q, rtol=1e-14)
 
 
 GOOD = "0,-90,90,0,30,0"
@@ -212,11 +147,6 @@ def test_what_is_wrong_with_a_path_is_told_with_its_place(
     assert not [part for part in told if part not in message], message
 
 
-def test_a_path_too_long_is_refused(tmp_path: Path) -> None:
-    with pytest.raises(InputError, match="10001 poses; a path takes at most 10000"):
-        poses_of(path_cell(tmp_path, JOINTS + "\n" + f"{GOOD}\n" * 10_001))
-
-
 # --- a box ---------------------------------------------------------------------------------
 
 
@@ -228,26 +158,6 @@ def test_a_box_is_filled_with_reached_places() -> None:
     assert (at <= UPPER + 2e-6).all()
     # Sobol points: every half of every edge holds half of them.
     assert ((at > (LOWER + UPPER) / 2).sum(axis=0) == 16).all()
-
-
-def test_a_box_may_prescribe_rotation_force_and_point() -> None:
-    down, point = Rotation.from_euler("y", np.pi).as_matrix(), np.array([0.0, 0.1, 0.1])
-    box = TargetBox(LOWER, UPPER, 5, down, LOADS[2], point)
-    found = poses_of(cell_of(test_box=box, loads=LOADS))
-    turned = nominal_flanges(CHAIN, found.q)[:, :3, :3]
-    np.testing.assert_allclose(turned, np.broadcast_to(down, (5, 3, 3)), atol=2e-6)
-    np.testing.assert_array_equal(found.force, np.tile(LOADS[2], (5, 1)))
-    np.testing.assert_array_equal(found.point, np.tile(point, (5, 1)))
-
-
-def test_the_posture_is_the_one_near_home() -> None:
-    box = TargetBox(LOWER, UPPER, 4)
-    home = np.radians([0.0, -60.0, 100.0, 180.0, -40.0, 180.0])
-    mid = poses_of(cell_of(test_box=box))
-    near = poses_of(cell_of(test_box=box, motion=Motion(home=home)))
-    np.testing.assert_allclose(places(near), places(mid), atol=4e-6)
-    closer = np.linalg.norm(near.q - home, axis=1) - np.linalg.norm(mid.q - home, axis=1)
-    assert (closer < 0).all()
 
 
 def test_a_box_out_of_reach_is_told_with_a_place_and_a_remedy() -> None:
@@ -289,19 +199,6 @@ class Elbow:
         )
 
 
-def test_a_posture_that_the_cell_allows_is_preferred() -> None:
-    cell = cell_of(loads=LOADS, test_box=TargetBox(LOWER, UPPER, 8))
-    free = poses_of(cell)
-    rules = Elbow(float(np.median(free.q[:, 2])))
-    chosen = poses_of(cell, rules)
-    np.testing.assert_allclose(places(chosen), places(free), atol=4e-6)
-    assert (free.q[:, 2] <= rules.least).any()
-    assert (chosen.q[:, 2] > rules.least).all()
-    kept = free.q[:, 2] > rules.least
-    np.testing.assert_allclose(chosen.q[kept], free.q[kept])
-    assert "no posture" not in chosen.source
-
-
 class Wrist:
     """Allows joint 6 in a narrow range: one posture in forty."""
 
@@ -339,14 +236,6 @@ def test_without_any_source_poses_are_drawn_over_the_limits_and_it_is_said() -> 
     assert f"{DEFAULT_COUNT} drawn over the joint limits (the cell states none)" in found.source
     np.testing.assert_array_equal(poses_of(cell).q, found.q)
     assert (poses_of(cell, seed=1).q != found.q).any()
-
-
-def test_drawn_poses_keep_to_the_rules() -> None:
-    found = poses_of(cell_of(loads=LOADS[:2]), Elbow(2.0))
-    assert (found.q[:, 2] > 2.0).all()
-    assert len(found.q) == DEFAULT_COUNT
-    with pytest.raises(InsufficientDataError, match=r"allow none of .* postures"):
-        poses_of(cell_of(), Elbow(100.0))
 
 
 def test_several_sources_add_up(tmp_path: Path) -> None:

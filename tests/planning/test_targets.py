@@ -17,7 +17,6 @@ from elastocal.cell.plan_wishes import TargetPose
 from elastocal.cell.work_cell import Cell
 from elastocal.errors import InsufficientDataError
 from elastocal.model import Chain, Model, Parameter
-from elastocal.model.effects import CATALOGUE
 from elastocal.planning import PoseInformation, TargetPoses, load_states, prediction_rows
 from elastocal.planning import test_poses as target_poses
 
@@ -131,23 +130,6 @@ def remaining(cell: Cell, q: NDArray, **known: Any) -> tuple[float, tuple[str, .
     return setup.value(plan, np.full(len(plan), -1)), setup.information.names
 
 
-@pytest.mark.parametrize("robust", ["none", "average"])
-def test_the_remaining_error_does_not_hang_on_which_parameters_are_kept(
-    robust: Any, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    """Whichever minimal complete set stands for the arm, the same poses leave the same error."""
-    cell = plan_cell(FULL, "position", loads=BOTH, robust=robust, robust_samples=2)
-    q = random_poses(CHAIN, 150, seed=1)
-    usual, names = remaining(cell, q)
-    for effect in CATALOGUE.values():
-        monkeypatch.setattr(type(effect), "rank", -effect.rank)
-    other, others = remaining(cell, q)
-    assert set(names) != set(others)
-    assert len(names) == len(others)
-    # Scenarios bend axes that are parallel in the nominal arm, which no set takes up exactly.
-    assert other == pytest.approx(usual, rel=1e-6 if robust == "none" else 1e-2)
-
-
 def test_the_remaining_error_does_not_hang_on_the_base_frame_chosen() -> None:
     """Where the base is put beforehand changes no certainty: the tracker stays where it is."""
     q = random_poses(CHAIN, 100, seed=2)
@@ -157,24 +139,6 @@ def test_the_remaining_error_does_not_hang_on_the_base_frame_chosen() -> None:
         nominal = replace(cell.model.nominal, base_position=np.array([0.0, 0.0, height]))
         found.append(remaining(replace(cell, model=replace(cell.model, nominal=nominal)), q)[0])
     assert found[1] == pytest.approx(found[0], rel=1e-6)
-
-
-def test_several_markers_count_as_their_mean_square() -> None:
-    """One test pose: ρ₀² is the mean over the markers of each one's own."""
-    q = random_poses(CHAIN, 60, seed=3)
-    pose = TargetPose(TABLE_2[3], DOWN)
-    cell = plan_cell(("joint_offset", "marker_position"), "position", test_poses=(pose,))
-    together = remaining(cell, q)[0]
-    setup = setup_of(cell, q)
-    plan = q[:20]
-    M = setup.gathered(setup.information.blocks(plan, np.full(20, -1)))[0]
-    sizes, kept = setup.information.sizes, setup.found.columns
-    each = []
-    for name in cell.tool.markers:
-        table = rows_with_markers(TABLE_2[[3]], DOWN, (name,))
-        A = setup.information.model.regressor(table).B[:, kept] * sizes
-        each.append(np.trace(A @ np.linalg.inv(M) @ A.T))
-    assert together == pytest.approx(np.mean(each), rel=1e-9)
 
 
 @pytest.mark.parametrize("criterion", ["test_pose", "I", "G"])
@@ -196,14 +160,3 @@ def test_a_test_load_that_no_reading_shows_is_refused_with_its_parameter(criteri
         assert part in message
     sideways = replace(cell.design, loads=np.array([DOWN, SIDEWAYS]))
     assert np.isfinite(remaining(replace(cell, design=sideways), q)[0])
-
-
-def test_a_test_pose_that_parameters_move_together_is_fine_and_apart_is_refused() -> None:
-    """Deflections show no base: where position in the data's frame is wanted, that is told."""
-    cell = plan_cell(("base_frame", "joint_compliance"), "deflection", loads=DOWN[None])
-    with pytest.raises(InsufficientDataError, match=r"depends on base\.[xyz]"):
-        setup_of(cell, random_poses(CHAIN, 60, seed=5))
-    # joint1.offset and base.rz turn the arm alike: neither is known alone, every position is.
-    cell = plan_cell(("base_frame", "joint_offset"), "position")
-    setup = setup_of(cell, random_poses(CHAIN, 60, seed=5))
-    assert len(setup.information.names) < len(setup.information.model.names)

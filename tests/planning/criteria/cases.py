@@ -15,6 +15,10 @@ INTEREST = np.array([4, 1, 2, 5])
 CERTIFIABLE = tuple(name for name in CRITERIA if name not in ("O2", "O4"))
 # (scenarios, robust) under which each criterion is checked.
 ROBUST = ((1, "none"), (3, "average"), (3, "worst"))
+# Every criterion under one of them, in turn; two that are put together differently under all.
+MIXED = [(name, *ROBUST[k % 3]) for k, name in enumerate(CRITERIA)]
+MIXED += [(name, *robust) for name in ("D", "G") for robust in ROBUST]
+MIXED = sorted({*MIXED})
 
 
 def criterion(name: str, scenarios: int = 1, robust: str = "none", seed: int = 7) -> Criterion:

@@ -2,12 +2,11 @@
 
 import numpy as np
 import pytest
-from planning.criteria.cases import ROBUST, P, blocks, criterion, information, random_information
+from planning.criteria.cases import MIXED, blocks, criterion, information, random_information
 
 from elastocal.planning import candidate_sums, make_criterion
-from elastocal.planning.criteria import CRITERIA
 
-every_criterion = pytest.mark.parametrize("name", CRITERIA)
+mixed = pytest.mark.parametrize(("name", "scenarios", "robust"), MIXED)
 LOW_RANK = ("test_pose", "A", "I", "c", "G", "D", "O1")
 
 
@@ -15,9 +14,8 @@ def anew(phi, M, B):
     return np.concatenate([np.atleast_1d(phi.value(sums)) for _, sums in candidate_sums(M, B)])
 
 
-@every_criterion
-@pytest.mark.parametrize(("scenarios", "robust"), ROBUST)
-@pytest.mark.parametrize("r", [1, 3, 9])
+@mixed
+@pytest.mark.parametrize("r", [1, 9])
 def test_agrees_with_the_sum(name, scenarios, robust, r):
     rng = np.random.default_rng(1)
     phi = criterion(name, scenarios, robust)
@@ -28,10 +26,10 @@ def test_agrees_with_the_sum(name, scenarios, robust, r):
 
 
 @pytest.mark.parametrize("name", LOW_RANK)
-@pytest.mark.parametrize("p", [9, 30])
-@pytest.mark.parametrize("share", [1e-1, 1e-3, 1e-5, 1e-7])
-def test_agrees_where_little_is_known_of_one_direction(name, p, share):
+@pytest.mark.parametrize("share", [1e-1, 1e-7])
+def test_agrees_where_little_is_known_of_one_direction(name, share):
     """The pose to be replaced carried nearly all that is known of a direction."""
+    p = 30
     rng = np.random.default_rng(2)
     u = rng.normal(size=p) / np.sqrt(p)
     weak = np.eye(p) - (1 - share) * np.outer(u, u) / (u @ u)
@@ -49,8 +47,7 @@ def test_agrees_where_little_is_known_of_one_direction(name, p, share):
     assert phi.after_adding(M, B) == pytest.approx(anew(phi, M, B), rel=1e-9 / share**0.25)
 
 
-@every_criterion
-@pytest.mark.parametrize(("scenarios", "robust"), ROBUST)
+@mixed
 def test_a_pose_that_restores_the_rank_is_found(name, scenarios, robust):
     rng = np.random.default_rng(3)
     phi = criterion(name, scenarios, robust)
@@ -64,25 +61,3 @@ def test_a_pose_that_restores_the_rank_is_found(name, scenarios, robust):
     assert np.isfinite(values[:3]).all()
     assert values[:3] == pytest.approx(np.array(expected), rel=1e-9)
     assert (values[3:] == np.inf).all()
-
-
-@pytest.mark.parametrize("name", LOW_RANK)
-def test_a_pose_that_shows_nothing_changes_nothing(name):
-    rng = np.random.default_rng(4)
-    phi = criterion(name)
-    M = random_information(rng, 1)
-    nothing = np.zeros((1, 3, 3, P))
-    assert phi.after_adding(M, nothing) == pytest.approx(np.full(3, phi.value(M)), rel=1e-13)
-    assert phi.after_adding(M, nothing[:, :0]).shape == (0,)
-
-
-@pytest.mark.parametrize("name", LOW_RANK)
-def test_many_candidates_are_evaluated_in_parts(name, monkeypatch):
-    rng = np.random.default_rng(5)
-    phi = criterion(name)
-    M, B = random_information(rng, 1), blocks(rng, 1, 31)
-    whole = phi.after_adding(M, B)
-    monkeypatch.setattr("elastocal.planning.criterion.CHUNK_NUMBERS", 7 * 3 * P)
-    monkeypatch.setattr("elastocal.planning.criterion.BATCH_NUMBERS", 4 * P * P)
-    assert phi.after_adding(M, B) == pytest.approx(whole, rel=1e-12)
-    assert anew(phi, M, B) == pytest.approx(whole, rel=1e-12)

@@ -6,7 +6,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from planning.criteria.cases import (
     CERTIFIABLE,
-    ROBUST,
+    MIXED,
     P,
     blocks,
     criterion,
@@ -19,12 +19,13 @@ from elastocal.errors import InsufficientDataError
 from elastocal.planning.criteria import CRITERIA
 
 every_criterion = pytest.mark.parametrize("name", CRITERIA)
-certifiable = pytest.mark.parametrize("name", CERTIFIABLE)
-every_robust = pytest.mark.parametrize(("scenarios", "robust"), ROBUST)
+mixed = pytest.mark.parametrize(("name", "scenarios", "robust"), MIXED)
+mixed_certifiable = pytest.mark.parametrize(
+    ("name", "scenarios", "robust"), [case for case in MIXED if case[0] in CERTIFIABLE]
+)
 
 
-@every_criterion
-@every_robust
+@mixed
 @pytest.mark.parametrize("order", [np.inf, 4.0])
 def test_gradient_agrees_with_central_differences(name, scenarios, robust, order):
     rng = np.random.default_rng(1)
@@ -44,8 +45,7 @@ def test_gradient_agrees_with_central_differences(name, scenarios, robust, order
         assert -np.sum(found.G * step) == pytest.approx(float(slope), abs=1e-6 * scale)
 
 
-@every_criterion
-@every_robust
+@mixed
 def test_degree_in_information(name, scenarios, robust):
     phi = criterion(name, scenarios, robust)
     M = random_information(np.random.default_rng(2), scenarios)
@@ -57,8 +57,7 @@ def test_degree_in_information(name, scenarios, robust):
     assert np.sum(found.G * M) == pytest.approx(degree * found.value, abs=1e-10 * found.value)
 
 
-@certifiable
-@every_robust
+@mixed_certifiable
 def test_more_information_never_hurts(name, scenarios, robust):
     rng = np.random.default_rng(3)
     phi = criterion(name, scenarios, robust)
@@ -68,8 +67,7 @@ def test_more_information_never_hurts(name, scenarios, robust):
     assert (np.linalg.eigvalsh(phi.gradient(M).G) >= -1e-12 * before).all()
 
 
-@certifiable
-@every_robust
+@mixed_certifiable
 @pytest.mark.parametrize("order", [np.inf, 3.0])
 @settings(max_examples=25, deadline=None)
 @given(seed=st.integers(0, 2**32 - 1), t=st.floats(0.0, 1.0))
@@ -97,8 +95,7 @@ def test_no_bound_is_claimed_for_indices_that_have_none(name):
     assert (phi.after_adding(M, 30 * blocks(rng, 1, 50, r=1)) > phi.value(M)).any()
 
 
-@certifiable
-@every_robust
+@mixed_certifiable
 def test_tangent_bound_holds_on_every_plan(name, scenarios, robust):
     """Φ(w)/(1 + gap/Φ(w)) against all plans of 3 in 9 candidates, with and without a prior."""
     for seed, size in ((5, 0.0), (6, 0.3)):
@@ -115,32 +112,7 @@ def test_tangent_bound_holds_on_every_plan(name, scenarios, robust):
             assert min(plans) >= found.value / (1 + gap / found.value) * (1 - 1e-12)
 
 
-@certifiable
-@every_robust
-def test_softened_lies_below_and_tends_to_the_criterion(name, scenarios, robust):
-    phi = criterion(name, scenarios, robust)
-    M = random_information(np.random.default_rng(7), scenarios)
-    exact = phi.value(M)
-    values = [float(phi.softened(order).value(M)) for order in (1.0, 4.0, 30.0, 3000.0)]
-    assert values == sorted(values)
-    assert values[-1] == pytest.approx(float(exact), rel=3e-3)
-    assert values[-1] <= exact * (1 + 1e-12)
-
-
-@every_criterion
-@every_robust
-def test_value_of_a_stack_is_that_of_its_members(name, scenarios, robust):
-    rng = np.random.default_rng(8)
-    phi = criterion(name, scenarios, robust)
-    stack = np.array([[random_information(rng, scenarios) for _ in range(3)] for _ in range(2)])
-    values = phi.value(stack)
-    assert values.shape == (2, 3)
-    for index in np.ndindex(2, 3):
-        assert values[index] == pytest.approx(float(phi.value(stack[index])), rel=1e-13)
-
-
-@every_criterion
-@every_robust
+@mixed
 def test_singular_information_is_infinitely_bad(name, scenarios, robust):
     rng = np.random.default_rng(9)
     phi = criterion(name, scenarios, robust)

@@ -5,8 +5,6 @@ import pytest
 
 from elastocal.errors import InputError
 from elastocal.planning import (
-    CriterionInputs,
-    ScenarioCriterion,
     SpectralCriterion,
     TraceCriterion,
     criterion_named,
@@ -41,12 +39,6 @@ def test_a_registered_criterion_is_made_like_those_that_there_are():
     # var(b) = 0.5² V_22 and 3² of it.
     assert float(phi.value(np.diag([7.0, 4.0])[None])) == pytest.approx(9 * 0.25 / 4)
     assert phi.certifiable
-
-
-def test_every_criterion_stands_under_its_name_and_is_complete():
-    for name, criterion in CRITERIA.items():
-        assert criterion.name == name and criterion.title
-        assert register(criterion) is criterion
 
 
 class Named(TraceCriterion):
@@ -87,8 +79,3 @@ def test_what_is_no_whole_criterion_is_refused(parents, content, message):
 def test_an_unknown_name_is_told_with_the_nearest_and_all_that_there_are():
     with pytest.raises(InputError, match=r"'e' is unknown \(did you mean 'E'\?\); there are test_"):
         criterion_named("e")
-
-
-def test_a_criterion_that_does_not_say_how_it_is_made_is_none():
-    with pytest.raises(NotImplementedError, match="ScenarioCriterion"):
-        ScenarioCriterion.of(CriterionInputs("any", 2, np.arange(2)))

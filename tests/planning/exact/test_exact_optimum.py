@@ -8,7 +8,6 @@ from small_pools import CRITERIA, all_plans, all_values, random_problem
 
 from elastocal.planning import DesignProblem, make_criterion, relax
 from elastocal.planning.exact_plan import exact_plan
-from elastocal.planning.selection import exchange
 
 
 def is_optimal(problem: DesignProblem, seed: int, **options) -> bool:
@@ -35,16 +34,6 @@ def test_the_optimum_is_found_with_repeats_and_with_measurements_done(name, most
     for seed in range(100, 103):
         problem = random_problem(name, seed, most=most, prior=prior)
         assert is_optimal(problem, seed, starts=3)
-
-
-@pytest.mark.parametrize("name", ["O2", "O4"])
-def test_criteria_without_a_bound_reach_the_optimum_too(name):
-    for seed in range(3):
-        problem = random_problem("E", seed)
-        p = problem.blocks.shape[-1]
-        criterion = make_criterion(name, parameters=p, interest=np.arange(p))
-        assert not criterion.certifiable
-        assert is_optimal(replace(problem, criterion=criterion), seed, starts=3)
 
 
 @pytest.mark.parametrize("robust", ["average", "worst"])
@@ -112,21 +101,6 @@ def test_no_single_exchange_on_the_whole_pool_betters_the_plan(name, most, weigh
     assert found.values[0] == pytest.approx(found.value, rel=1e-9), "a start ends at an optimum"
 
 
-@pytest.mark.parametrize("prior", [0.0, 300.0])
-@pytest.mark.parametrize("name", CRITERIA)
-def test_the_smallest_gains_are_made(name, prior):
-    """From plans just above an optimum; with much known before, Φ is nearly linear, its bounds
-    leave no slack, and gains are of 1e-4."""
-    problem = medium(name, 5, prior=prior)
-    best = exact_plan(problem, starts=1).chosen
-    near = neighbours(problem, best)
-    for begun in near[np.argsort(all_values(problem, near))[:5]]:
-        found = exchange(problem, begun)
-        assert found.value < all_values(problem, begun[None])[0]
-        values = all_values(problem, neighbours(problem, found.chosen))
-        assert values.min() >= found.value * (1 - 2e-9)
-
-
 @pytest.mark.parametrize("name", CRITERIA)
 def test_the_value_lies_above_the_certified_bound(name):
     problem = medium(name, 2)
@@ -135,23 +109,3 @@ def test_the_value_lies_above_the_certified_bound(name):
         problem, relaxed_weights=relaxed.weights, tangent=relaxed.tangent, starts=2, seed=0
     )
     assert relaxed.bound <= found.value <= 1.3 * relaxed.bound
-
-
-def test_measurements_done_change_the_plan_and_are_worth_their_information():
-    """With what a plan would measure already known, augmenting gives the best of both together."""
-    problem = medium("test_pose", 3)
-    done = exact_plan(problem, starts=2)
-    augmented = replace(problem, prior=problem.prior + problem.sum_of(done.chosen))
-    more = exact_plan(augmented, starts=2)
-    assert more.value < done.value
-    together = np.concatenate([done.chosen, more.chosen])
-    assert all_values(problem, together[None])[0] == pytest.approx(more.value, rel=1e-10)
-    afresh = all_values(augmented, done.chosen[None])[0]
-    assert more.value <= afresh * (1 + 1e-9)
-
-
-def test_a_warm_plan_is_never_made_worse():
-    problem = medium("D", 4)
-    best = exact_plan(problem, starts=3, seed=1)
-    again = exact_plan(problem, warm=best.chosen[::-1], starts=1, seed=2)
-    assert again.value <= best.value * (1 + 1e-9)

@@ -4,17 +4,15 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-from small_pools import all_plans, all_values, random_problem
+from small_pools import all_plans, all_values
 
-from elastocal.errors import InputError, InsufficientDataError
+from elastocal.errors import InputError
 from elastocal.planning import (
     DesignProblem,
     DeterminantCriterion,
-    Exchanged,
     make_criterion,
     size_curve,
 )
-from elastocal.planning import exact_plan as module
 
 
 def problem_of(name="test_pose", levels=2, p=5, N=14, seed=0):
@@ -42,25 +40,6 @@ def test_the_curve_falls_and_stays_above_its_bound():
     assert (np.diff(values) < 0).all()
     assert all(p.bound is not None and p.bound <= p.value * (1 + 1e-9) for p in points)
     assert all(len(p.plan.chosen) == p.n_poses for p in points)
-
-
-def test_the_curve_falls_even_where_the_search_for_the_larger_plan_finds_nothing(monkeypatch):
-    """With random plans and no exchange, only the extension of the smaller plan keeps order."""
-
-    def lame(pool, k, seed, begun=None):
-        rng = np.random.default_rng(pool.problem.n_poses)
-        chosen = module.random_plan(pool.problem, rng) if begun is None else begun
-        M = pool.problem.prior + pool.problem.sum_of(chosen)
-        return k, module.Exchanged(pool.kept[chosen], float(pool.problem.criterion.value(M)), 0)
-
-    def unmoved(problem, chosen):
-        M = problem.prior + problem.sum_of(chosen)
-        return Exchanged(chosen, float(problem.criterion.value(M)), 0)
-
-    monkeypatch.setattr(module, "_start", lame)
-    monkeypatch.setattr(module, "exchange", unmoved)
-    points = size_curve(problem_of(seed=4), range(4, 12), starts=1).points
-    assert (np.diff([p.value for p in points]) < 0).all()
 
 
 class Unbounded(DeterminantCriterion):
@@ -94,24 +73,6 @@ def test_a_target_out_of_reach_leaves_the_best_there_is():
     assert found.points[-1].n_poses == 8
 
 
-def test_numbers_and_target_may_come_together():
-    of = problem_of()
-    curve = size_curve(of, [4, 12], starts=2)
-    target = float(np.sqrt(curve.points[0].value * curve.points[1].value))
-    found = size_curve(of, [4, 12], target, between=(2, 14), starts=2)
-    assert {4, 12} <= {p.n_poses for p in found.points}
-    values = {p.n_poses: p.value for p in found.points}
-    assert values[found.smallest] <= target
-    fewer = [n for n in values if n < found.smallest]
-    assert all(values[n] > target for n in fewer)
-    assert found.smallest - 1 in (*fewer, found.excluded)
-
-
-def test_too_few_equations_for_the_range_say_so():
-    with pytest.raises(InsufficientDataError, match="fewer equations than parameters"):
-        size_curve(problem_of(p=9), (), 1.0, between=(1, 4))
-
-
 @pytest.mark.parametrize(
     ("numbers", "options", "named"),
     [
@@ -123,12 +84,3 @@ def test_too_few_equations_for_the_range_say_so():
 def test_wrong_input_is_named(numbers, options, named):
     with pytest.raises(InputError, match=named):
         size_curve(problem_of(), numbers, **options)
-
-
-def test_random_problems_are_what_they_say():
-    """The pools that this folder's tests rest on: all plans, each once, and none else."""
-    problem = replace(random_problem("D", 2), shares=np.array([2]), group=np.zeros(10, dtype=int),
-                      blocks=random_problem("D", 2).blocks[:, :10], most=2)  # fmt: skip
-    plans = all_plans(problem)
-    assert len(plans) == 10 * 11 // 2
-    assert len({tuple(p) for p in plans.tolist()}) == len(plans)

@@ -80,27 +80,6 @@ def test_a_checkpoint_of_other_work_is_not_used(change):
     assert same(expected, exact_plan(problem, starts=2, seed=seed, checkpoint=memory))
 
 
-def test_more_starts_contain_the_fewer():
-    problem = rough(2)
-    few, many = exact_plan(problem, starts=2, seed=5), exact_plan(problem, starts=4, seed=5)
-    np.testing.assert_array_equal(many.values[:2], few.values)
-    assert many.value <= few.value
-
-
-def test_equal_candidates_are_taken_in_the_order_of_the_pool():
-    """Every candidate twice over: of each pair the plan has the first."""
-    one = random_problem("test_pose", 5)
-    N = one.n_candidates
-    both = replace(
-        one,
-        blocks=np.concatenate([one.blocks, one.blocks], axis=1),
-        group=np.concatenate([one.group, one.group]),
-    )
-    chosen = exact_plan(both, starts=3).chosen
-    second = chosen[chosen >= N]
-    assert np.isin(second - N, chosen).all()
-
-
 def test_fewer_equations_than_parameters_says_how_many():
     problem = random_problem("D", 0)
     p = 20
@@ -116,19 +95,6 @@ def test_fewer_equations_than_parameters_says_how_many():
     rest = rng.normal(size=(5, p))
     known = replace(problem, prior=(rest.T @ rest)[None])
     assert np.isfinite(exact_plan(known, starts=2).value)
-
-
-def test_a_group_without_share_cannot_help():
-    """Parameter 3 shows in group 1 alone, of which no pose is asked."""
-    rng = np.random.default_rng(0)
-    blocks = rng.normal(size=(1, 20, 3, 4))
-    group = np.arange(20) % 2
-    blocks[:, group == 0, :, 3] = 0.0
-    criterion = make_criterion("D", parameters=4, interest=np.arange(4))
-    problem = DesignProblem(blocks, np.zeros((1, 4, 4)), group, np.array([5, 0]), criterion)
-    with pytest.raises(InsufficientDataError, match="10 candidates of the groups with a share"):
-        exact_plan(problem)
-    assert np.isfinite(exact_plan(replace(problem, shares=np.array([4, 1])), starts=1).value)
 
 
 @pytest.mark.parametrize("name", ["D", "E"])
@@ -168,24 +134,6 @@ def test_a_regular_plan_is_found_where_no_exchange_leads_to_it(large):
         rng = np.random.default_rng(seed)
         np.testing.assert_array_equal(regular_plan(problem, np.array([2, 7]), rng), [10, 11])
         np.testing.assert_array_equal(exact_plan(problem, starts=2, seed=seed).chosen, [10, 11])
-
-
-@pytest.mark.parametrize("given", [False, True])
-def test_a_nuisance_parameter_that_no_near_candidate_shows_is_determined(given, monkeypatch):
-    """Candidates 0 and 1 show the last parameter and nothing else: worthless but indispensable."""
-    monkeypatch.setattr("elastocal.planning.exact_plan.NEAR_PER_POSE", 2)
-    blocks = np.random.default_rng(0).normal(size=(1, 40, 2, 5))
-    blocks[..., 4] = 0.0
-    blocks[:, :2] = 0.0
-    blocks[:, :2, 0, 4] = 1.0
-    criterion = make_criterion("D", parameters=5, interest=np.arange(4))
-    problem = DesignProblem(
-        blocks, np.zeros((1, 5, 5)), np.zeros(40, dtype=int), np.array([4]), criterion
-    )
-    weights = np.full(40, 0.1) if given else None
-    found = exact_plan(problem, relaxed_weights=weights, starts=4)
-    assert (found.chosen < 2).sum() == 1
-    assert np.isfinite(found.values).all()
 
 
 def test_too_few_poses_for_any_regular_plan_say_so():

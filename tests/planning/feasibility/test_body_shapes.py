@@ -10,11 +10,7 @@ from scipy.spatial.transform import Rotation
 from elastocal.cell.workspace_rules import Solid
 from elastocal.errors import InputError
 from elastocal.planning import (
-    capsule_between,
-    few_points,
-    hull,
     mesh_hull,
-    rotation_to,
     support,
     touches,
 )
@@ -81,19 +77,6 @@ def test_support_is_the_farthest_point_of_the_surface(shape, direction):
     assert farthest - 1e-12 <= support(solid, direction) <= farthest + 0.03
 
 
-@pytest.mark.parametrize("shape", SIZES)
-def test_hull_encloses_the_surface_and_is_tight_along_its_axis(shape):
-    solid = Solid(shape, shape, np.array(SIZES[shape]), placement(2))
-    points, radius = hull(solid)
-    rng = np.random.default_rng(3)
-    for direction in rng.normal(size=(50, 3)):
-        direction /= np.linalg.norm(direction)
-        reach = (points @ direction).max() + radius
-        assert (surface(solid) @ direction).max() <= reach + 1e-12
-        if shape != "cylinder":
-            assert reach == pytest.approx(support(solid, direction))
-
-
 def test_a_mesh_is_its_convex_hull(tmp_path):
     (tmp_path / "cube.obj").write_text(CUBE)
     mesh = Solid("cube", "mesh", np.array([1.0, 2.0, 0.5]), placement(4), tmp_path / "cube.obj")
@@ -111,19 +94,6 @@ def test_a_mesh_is_its_convex_hull(tmp_path):
     assert touches(mesh, centred[:3, 3], 1e-3)
 
 
-def test_few_points_box_a_mesh_that_has_many(tmp_path):
-    rng = np.random.default_rng(6)
-    cloud = rng.normal(size=(60, 3))
-    lines = [f"v {x} {y} {z}" for x, y, z in cloud]
-    lines += [f"f {i + 1} {i + 2} {i + 3}" for i in range(58)]
-    (tmp_path / "cloud.obj").write_text("\n".join(lines))
-    solid = Solid("cloud", "mesh", np.ones(3), placement(7), tmp_path / "cloud.obj")
-    points, radius = few_points(solid)
-    assert len(points) == 8 and radius == 0
-    for direction in rng.normal(size=(20, 3)):
-        assert (hull(solid)[0] @ direction).max() <= (points @ direction).max() + 1e-12
-
-
 @pytest.mark.parametrize(
     ("text", "message"),
     [
@@ -138,21 +108,3 @@ def test_a_bad_mesh_is_named(tmp_path, text, message):
         path.write_text(text)
     with pytest.raises(InputError, match=f"(?=.*part.obj).*fixture.*{message}"):
         mesh_hull(Solid("fixture", "mesh", np.ones(3), mesh=path))
-
-
-@given(directions)
-def test_rotation_to_is_a_rotation_with_this_z(v):
-    z = v / np.linalg.norm(v)
-    R = rotation_to(z)
-    assert np.allclose(R @ R.T, np.eye(3), atol=1e-12) and np.linalg.det(R) > 0
-    assert np.allclose(R[:, 2], z, atol=1e-12)
-
-
-@given(directions, st.floats(0, 2))
-def test_a_capsule_spans_its_two_points(v, length):
-    a = np.array([0.1, 0.2, 0.3])
-    b = a + length * v / np.linalg.norm(v)
-    points, radius = hull(capsule_between("c", a, b, 0.07))
-    assert radius == 0.07
-    expected = {tuple(np.round(p, 8)) for p in (a, b)}
-    assert {tuple(np.round(p, 8)) for p in points} == expected

@@ -4,63 +4,21 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-from planning.feasibility.small_cells import KR270_CHAIN, at, box, cell, gantry, sphere
-from support.robots import packaged_urdf
+from planning.feasibility.small_cells import KR270_CHAIN, at, cell, sphere
 
-from elastocal.cell.arm_description import Nominal, Robot
+from elastocal.cell.arm_description import Robot
 from elastocal.cell.workspace_rules import CarriedBody, HangingLoad, Solid, Workspace
 from elastocal.errors import InputError
 from elastocal.model import read_urdf
 from elastocal.planning import cell_bodies, hull, support
 from elastocal.planning.bodies import HANGING, WORLD
 
-RADII = (0.3, 0.2, 0.2, 0.15, 0.14, 0.12)
 DOWN = np.array([0.0, 0.0, -1.0])
 
 
 def named(workspace, chain=KR270_CHAIN, **changes):
     given = replace(cell(workspace), **changes)
     return {body.name: body for body in cell_bodies(given, chain)}
-
-
-def test_the_skeleton_joins_the_joints_origins():
-    """KR 270-2: d1 = 0.75, a1 = 0.35, a2 = 1.25, d4 = 1.1, a3 = −0.055, d6 = 0.23 m."""
-    found = named(Workspace(link_radius=RADII))
-    spans = {name: np.ptp(hull(body.solid)[0], axis=0) for name, body in found.items()}
-    assert np.allclose(spans["base"], [0, 0, 0.75])
-    assert np.allclose(spans["link1"], [0.35, 0, 0])
-    assert np.allclose(spans["link2"], [1.25, 0, 0])
-    assert np.allclose(spans["link3"], [1.1, 0, 0.055])
-    assert np.allclose(spans["link6"], [0.23, 0, 0])
-    assert found["link4"].solid.shape == found["link5"].solid.shape == "sphere"
-    assert [found[f"link{i + 1}"].carrier for i in range(6)] == list(range(6))
-    assert [hull(found[f"link{i + 1}"].solid)[1] for i in range(6)] == list(RADII)
-    assert found["base"].carrier == WORLD
-
-
-def test_one_radius_is_for_all_links_and_none_is_no_body():
-    assert len(named(Workspace(link_radius=(0.1,)))) == 7
-    assert "link4" not in named(Workspace(link_radius=(0.1, 0.1, 0.1, 0.0, 0.1, 0.1)))
-    assert named(Workspace()) == {}
-
-
-def test_the_base_stands_where_the_cell_puts_it():
-    model = cell(Workspace()).model
-    turned = np.array([[0.0, -1, 0], [1, 0, 0], [0, 0, 1]])
-    nominal = Nominal(base_position=np.array([1.0, 2.0, 0.5]), base_rotation=turned)
-    workspace = Workspace(
-        bodies=(CarriedBody(sphere("foot", 0.1, (0.3, 0, 0)), "base"),), link_radius=RADII
-    )
-    found = named(workspace, model=replace(model, nominal=nominal))
-    assert np.allclose(found["foot"].solid.placement[:3, 3], [1.0, 2.3, 0.5])
-    assert np.allclose(hull(found["base"].solid)[0].mean(axis=0), [1.0, 2.0, 0.875])
-
-
-def test_what_sits_on_the_flange_is_carried_by_the_last_joint():
-    found = named(Workspace(bodies=(CarriedBody(box("tool", (0.1, 0.1, 0.4), (0, 0, 0.2))),)))
-    centre = KR270_CHAIN.flange_placement @ at(0, 0, 0.2)
-    assert found["tool"].carrier == 5
-    assert np.allclose(found["tool"].solid.placement, centre)
 
 
 @pytest.mark.parametrize("shape", ["box", "sphere", "cylinder", "capsule"])
@@ -171,19 +129,3 @@ def test_a_urdf_without_collision_elements_says_so():
 
     with pytest.raises(InputError, match="no <collision> elements"):
         named(Workspace(urdf_geometry=True), robot=Robot(urdf=KR270))
-
-
-@pytest.mark.parametrize("name", ["UR5", "Panda"])
-def test_packaged_robots_bring_their_geometry(name):
-    path, flange = packaged_urdf(name)
-    chain = read_urdf(path, flange=flange)
-    found = named(Workspace(urdf_geometry=True), chain, robot=Robot(urdf=path, flange=flange))
-    assert {body.carrier for body in found.values()} >= set(range(chain.n_joints - 1))
-    assert all(np.isfinite(hull(body.solid)[0]).all() for body in found.values())
-
-
-def test_a_gantry_has_sliding_links_of_its_own():
-    """All its joints coincide at zero: spheres at the joints, none for the base."""
-    found = named(Workspace(link_radius=(0.1,)), gantry())
-    assert [found[f"link{i + 1}"].carrier for i in range(4)] == [0, 1, 2, 3]
-    assert "base" not in found

@@ -1,7 +1,6 @@
 """Moves: what is called free is free at every point, and little that is free is refused."""
 
 from dataclasses import replace
-from itertools import pairwise
 
 import coal
 import numpy as np
@@ -25,8 +24,6 @@ from planning.feasibility.test_margins_of_pairs import kr270_cell, kr270_poses
 from elastocal.cell.arm_description import Tool
 from elastocal.cell.workspace_rules import CarriedBody, HalfSpace, HangingLoad, Solid, Workspace
 from elastocal.planning import Body, Collisions, Feasibility, MotionBound, coal_shape
-from elastocal.planning.collision import RESOLUTION
-from elastocal.planning.feasibility import POSE_SLACK
 
 BALL = Workspace(bodies=(CarriedBody(sphere("tool", 0.1, (0, 0, 0))),), clearance=0.05)
 
@@ -65,32 +62,6 @@ def test_no_pair_changes_its_distance_by_more_than_the_bound(seed, tmp_path):
             known = largest > 1e-3
             tightest = max(tightest, (change[known] / largest[known]).max(initial=0.0))
     assert tightest > 0.5  # a bound, and not a far one
-
-
-def test_arm_and_load_may_part_by_the_motion_of_both():
-    """A counterweight behind joint 2 goes up while a load on a long rope goes down."""
-    workspace = Workspace(
-        bodies=(CarriedBody(sphere("counterweight", 0.1, (-1.5, 0, 0)), "link2"),),
-        load=HangingLoad(sphere("load", 0.1, (0, 0, 0)), rope=30.0),
-    )
-    rules = Feasibility(cell(workspace), KR270_CHAIN)
-    bound = MotionBound(rules.kinematics, rules.bodies, rules.pairs)
-    pair = [p.names for p in rules.pairs].index(("load", "counterweight"))
-    middle, half = np.zeros(6), np.array([0, 0.05, 0, 0, 0, 0])
-    largest = bound(rules.kinematics.poses(middle, DOWN), half[None])[0, pair]
-    change = abs(distances(rules, middle + half) - distances(rules, middle))[pair]
-    assert 0.9 * largest < change <= largest
-
-
-def test_a_disc_that_tilts_about_its_middle_moves_at_its_rim():
-    disc = CarriedBody(Solid("disc", "cylinder", np.array([0.5, 0.01]), at(0, 0, 0)), "link5")
-    table = box("table", (5, 5, 0.1), (1.6, 0, -0.2))
-    rules = Feasibility(cell(Workspace(bodies=(disc,), obstacles=(table,))), KR270_CHAIN)
-    bound = MotionBound(rules.kinematics, rules.bodies, rules.pairs)
-    middle, half = np.zeros(6), np.array([0, 0, 0, 0, 0.3, 0])
-    largest = bound(rules.kinematics.poses(middle, NOTHING), half[None])[0]
-    change = abs(distances(rules, middle + half) - distances(rules, middle))
-    assert 0.9 * largest[0] < change[0] <= largest[0]
 
 
 def distances(rules, q):
@@ -132,16 +103,6 @@ def test_free_moves_are_free_wherever_one_looks(loaded):
     assert 10 < free.sum() < len(free) - 10
 
 
-def test_both_directions_are_the_same_move():
-    rules = Feasibility(kr270_cell(), KR270_CHAIN)
-    q = kr270_poses(300, seed=2)
-    q = q[rules.feasible(q, NOTHING)]
-    there, back = (rules.paths_free(a, b, False) for a, b in ((q[:-1], q[1:]), (q[1:], q[:-1])))
-    assert (there == back).all()
-    single = [rules.paths_free(a, b, False) for a, b in pairwise(q[:10])]
-    assert single == there[:9].tolist()
-
-
 @settings(deadline=None, max_examples=30)
 @given(st.floats(-2.5, 2.5), st.floats(1e-4, 0.1))
 def test_nothing_is_too_thin_to_be_met(x, thickness):
@@ -152,50 +113,6 @@ def test_nothing_is_too_thin_to_be_met(x, thickness):
     assert not rules.paths_free(start, end, False)
     above = gantry_at((-2.9, 0, 1.2), (2.9, 0, 1.2))
     assert rules.paths_free(*above, False)
-
-
-@settings(deadline=None, max_examples=30)
-@given(st.floats(-2.5, 2.5))
-def test_moves_are_judged_each_by_its_own_motion(x):
-    """The one move of a batch that meets the sheet is among shorter ones that do not."""
-    sheet, tip = box("sheet", (1e-4, 1, 1), (x, 0, 0)), CarriedBody(sphere("tip", 1e-3, (0, 0, 0)))
-    rules = gantry_rules(Workspace(bodies=(tip,), obstacles=(sheet,)))
-    ends = np.linspace(0.5, 2.8, 24)
-    start = gantry_at(*[(-2.9, 2, 0)] * 24, (-2.9, 0, 0))
-    end = gantry_at(*[(end, 2, 0) for end in ends], (2.9, 0, 0))
-    assert rules.paths_free(start, end, False).tolist() == [True] * 24 + [False]
-
-
-def test_a_move_past_an_obstacle_is_free_up_to_the_resolution():
-    rules = gantry_rules(replace(BALL, obstacles=(box("table", (1, 1, 1), (0, 0, -0.5)),)))
-    ways = [(0.15 - 1e-6, False), (0.15 + 3 * RESOLUTION, True)]
-    for height, expected in ways:
-        q = gantry_at((-2, 0.3, height), (2, -0.2, height))
-        assert rules.paths_free(*q, False) == expected
-
-
-def test_every_feasible_pose_can_be_left():
-    """A pose that just keeps all margins: a short move away from it is certified."""
-    rules = gantry_rules(replace(BALL, obstacles=(box("table", (1, 1, 1), (0, 0, -0.5)),)))
-    touching = gantry_at((0, 0, 0.15 + POSE_SLACK + 1e-8))
-    assert rules.feasible(touching, NOTHING).all()
-    for aside in gantry_at((0.2, 0, 0.3), (0.3, 0, 0.15 + POSE_SLACK), (0, 0, 0.15 + POSE_SLACK)):
-        assert rules.paths_free(touching[0], aside, False)
-
-
-def test_the_load_is_in_the_way_only_where_it_hangs():
-    load = HangingLoad(sphere("load", 0.2, (0, 0, 0)), rope=0.6, min_height=-0.9)
-    wall = box("wall", (0.1, 2, 1), (0, 0, -0.8))
-    rules = gantry_rules(replace(BALL, obstacles=(wall,), load=load))
-    q = np.array([gantry_at((-1, 0, 0.2), (1, 0, 0.2)), gantry_at((-1, 0, 0.9), (1, 0, 0.9))])
-    assert rules.paths_free(q[:, 0], q[:, 1], False).tolist() == [True, True]
-    assert rules.paths_free(q[:, 0], q[:, 1], True).tolist() == [False, True]
-    mixed = rules.paths_free(q[[0, 0], 0], q[[0, 0], 1], np.array([True, False]))
-    assert mixed.tolist() == [False, True]
-    # Down to 0.9 m under the data's origin and no lower: the load ends 1 m under the load point.
-    down = gantry_at((-1, 0, 0.5), (-1, 0, 0.1 + 1e-4), (-1, 0, 0.1 - 1e-4))
-    assert rules.paths_free(down[0], down[1], True)
-    assert not rules.paths_free(down[0], down[2], True)
 
 
 def test_the_rope_keeps_its_angle_on_the_way():

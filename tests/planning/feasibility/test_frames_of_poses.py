@@ -7,14 +7,13 @@ import pinocchio as pin
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
-from planning.feasibility.small_cells import DOWN, KR270_CHAIN, cell, gantry
+from planning.feasibility.small_cells import DOWN, KR270_CHAIN, cell
 from scipy.spatial.transform import Rotation
 from support.robots import random_chain_urdf
 
 from elastocal.cell.arm_description import Nominal, Tool
 from elastocal.cell.workspace_rules import Workspace
-from elastocal.measurements import Measurements
-from elastocal.model import Model, read_urdf
+from elastocal.model import read_urdf
 from elastocal.planning import Kinematics, arm_configuration, arm_model
 from elastocal.planning.bodies import HANGING, WORLD
 
@@ -34,23 +33,6 @@ def random_chain(seed: int, folder):
     path = folder / f"{seed}.urdf"
     path.write_text(random_chain_urdf(seed))
     return read_urdf(path, base="base", flange="flange")
-
-
-def table(q: np.ndarray) -> Measurements:
-    n, zero = len(q), np.zeros(len(q), dtype=np.int64)
-    return Measurements(
-        "test", np.arange(n), q, np.arange(n), tuple(map(str, range(n))), zero, zero, ("M1",),
-        np.zeros((n, 3)),
-    )  # fmt: skip
-
-
-@pytest.mark.parametrize("seed", range(4))
-def test_the_flange_is_where_the_model_puts_it(seed, tmp_path):
-    chain, given_cell = random_chain(seed, tmp_path), placed_cell(seed)
-    q = np.random.default_rng(seed).uniform(-2, 2, (20, chain.n_joints))
-    found = Kinematics(given_cell, chain).poses(q, DOWN).flange
-    expected = Model.assembled(chain, given_cell).flange_poses(table(q))
-    assert np.allclose(found, expected, atol=1e-12)
 
 
 @pytest.mark.parametrize("seed", range(4))
@@ -76,11 +58,3 @@ def test_what_hangs_is_upright_at_the_load_point(q):
     assert np.allclose(hanging[:3, :3], np.eye(3))
     assert np.allclose(hanging[:3, 3], (poses.flange[0] @ [*LOAD_POINT, 1.0])[:3])
     assert np.allclose(poses.frames[0, WORLD], np.eye(4))
-
-
-def test_the_load_hangs_where_there_is_a_force():
-    kinematics = Kinematics(cell(Workspace()), gantry())
-    forces = np.array([[0, 0, 0], [0, 0, -1.0], [0, 1e-3, 0]])
-    poses = kinematics.poses(np.zeros((3, 4)), forces)
-    assert poses.loaded.tolist() == [False, True, True]
-    assert poses.take(np.array([2, 0])).loaded.tolist() == [True, False]

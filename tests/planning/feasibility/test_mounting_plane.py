@@ -6,16 +6,11 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-from scipy.spatial.transform import Rotation
-from support.calibration import placement, random_chain
 from support.cells import kr270_chain
-from support.design_cells import any_cell, plan_cell
+from support.design_cells import plan_cell
 
 from elastocal.cell.workspace_rules import HalfSpace, Workspace
-from elastocal.errors import InputError
-from elastocal.model import Chain
 from elastocal.planning import Feasibility
-from elastocal.planning.bodies import mounting_plane
 
 CHAIN, CELL = kr270_chain(), plan_cell()
 ZERO = np.zeros(3)
@@ -69,20 +64,3 @@ def test_moves_are_checked_against_it() -> None:
 def test_it_stands_where_nothing_else_is_stated(space: Workspace, stands: bool) -> None:
     rules = Feasibility(replace(CELL, workspace=space), CHAIN)
     assert ("mounting_plane" in [rule.name for rule in rules.rules]) == stands
-
-
-def test_a_base_whose_frame_is_elsewhere_has_none() -> None:
-    chain = random_chain(3)
-    cell = any_cell(chain, ("joint_offset",))
-    assert mounting_plane(cell, chain) is None
-    asked = replace(cell, workspace=Workspace(mounting_plane=True))
-    with pytest.raises(InputError, match="keep_out"):
-        mounting_plane(asked, chain)
-
-
-def test_a_frame_that_points_down_has_the_arm_on_its_other_side() -> None:
-    first = CHAIN.joints[0]
-    over = placement([0, 0, 0], Rotation.from_euler("x", np.pi))
-    turned = replace(first, placement=over @ first.placement)
-    plane = mounting_plane(CELL, Chain("over", (turned, *CHAIN.joints[1:]), CHAIN.flange_placement))
-    assert plane is not None and plane.normal[2] == -1

@@ -1,6 +1,5 @@
 """Each rule by cases whose answer is known; together they do not depend on their order."""
 
-import pickle
 from dataclasses import replace
 
 import numpy as np
@@ -14,7 +13,6 @@ from planning.feasibility.small_cells import (
     breaking,
     broken,
     cell,
-    freed_by,
     gantry_at,
     gantry_rules,
     sphere,
@@ -31,26 +29,10 @@ from elastocal.cell.workspace_rules import (
     Workspace,
 )
 from elastocal.errors import InputError
-from elastocal.planning import Feasibility, Kinematics, PoseFeasibility, StaticTorque
+from elastocal.planning import Feasibility, Kinematics, StaticTorque
 
 EYE = Tracker(position=np.array([3.0, 0.0, 0.0]))
 MARKER = Tool(markers={"M1": np.zeros(3)})
-
-
-def test_joint_limits_are_the_robots_narrowed_by_the_cells():
-    narrowed = replace(cell(Workspace()), limits={"joint2": (-2.0, -1.0), "joint1": (-9.0, 9.0)})
-    rules = Feasibility(narrowed, KR270_CHAIN)
-    base = np.array([0, -1.5, 0, 0, 0, 0])
-    q = np.tile(base, (5, 1))
-    q[1, 1], q[2, 1], q[3, 1], q[4, 0] = -1.0, -0.999, -2.001, np.radians(185.01)
-    assert [bool(b) for b in broken(rules, q, NOTHING)] == [False, False, True, True, True]
-
-
-def test_range():
-    sight = Visibility(range=(1.0, 2.0), line_of_sight=False)
-    rules = gantry_rules(Workspace(visibility=sight), MARKER, EYE)
-    q = gantry_at((0.99, 0, 0), (1.01, 0, 0), (1.99, 0, 0), (2.01, 0, 0), (3, 1.5, 0))
-    assert broken(rules, q, NOTHING) == [{"range"}, set(), set(), {"range"}, set()]
 
 
 def test_incidence_is_the_angle_between_the_reflectors_axis_and_the_beam():
@@ -105,18 +87,6 @@ def test_the_instrument_itself_hides_nothing_and_the_load_hides_where_it_hangs()
     )
     assert broken(rules, gantry_at((0, 0, 0)), NOTHING) == [set()]
     assert broken(rules, gantry_at((0, 0, 0)), DOWN) == [{"line_of_sight"}]
-
-
-def test_one_hidden_marker_of_several_is_enough():
-    """Beams end at (0, 0, 0) and (0, 0.5, 0); the screen stands half way to the second."""
-    tool = Tool(markers={"M1": np.zeros(3), "M2": np.array([0, 0.5, 0])})
-    screen = box("screen", (0.1, 0.1, 0.1), (1.5, 0.25, 0))
-    rules = gantry_rules(Workspace(obstacles=(screen,), visibility=Visibility()), tool, EYE)
-    q = gantry_at((0, 0, 0), (0, 0.5, 0), (0, 1.0, 0))
-    assert broken(rules, q, NOTHING) == [{"line_of_sight"}, {"line_of_sight"}, set()]
-    causes = rules.rules[-1].causes(rules.kinematics.poses(q, NOTHING))
-    assert causes["M1 behind screen"].tolist() == [False, True, False]
-    assert causes["M2 behind screen"].tolist() == [True, False, False]
 
 
 def test_the_rope_may_deviate_from_the_vertical_by_its_angle():
@@ -228,45 +198,6 @@ def test_the_order_of_rules_changes_who_removes_but_not_what_remains():
         assert (shuffled.feasible(q, DOWN) == verdict.ok).all()
 
 
-def test_a_pose_that_the_hanging_load_allows_needs_no_second_look_without_it():
-    given = full_cell()
-    light = replace(given, workspace=replace(given.workspace, torque_limits=()))
-    rules, q = Feasibility(light, KR270_CHAIN), kr270_poses(2000)
-    assert not rules.of_force and Feasibility(given, KR270_CHAIN).of_force
-    loaded = rules.check(q, DOWN)
-    assert rules.check(q[loaded.ok], NOTHING).ok.all()
-    first = rules.check(q, DOWN, every=False)
-    assert first.removed_by == loaded.removed_by and (first.ok == loaded.ok).all()
-
-
-def test_counts_add_up():
-    rules = Feasibility(full_cell(), KR270_CHAIN)
-    q, force = kr270_poses(3000), np.where(np.arange(3000)[:, None] % 2 == 0, DOWN, NOTHING)
-    verdict = rules.check(q, force)
-    assert sum(verdict.removed_by.values()) + verdict.ok.sum() == len(q)
-    parts = [rules.check(q[a : a + 1000], force[a : a + 1000]) for a in (0, 1000, 2000)]
-    joined = PoseFeasibility.join(parts)
-    assert (joined.ok == verdict.ok).all() and joined.removed_by == verdict.removed_by
-    for rule in verdict.rules:
-        assert freed_by(verdict)[rule] <= verdict.removed_by[rule] <= breaking(verdict)[rule]
-    # Rows are judged each by its own force.
-    assert (rules.check(q[::2], DOWN).ok == verdict.ok[::2]).all()
-    assert (rules.check(q[1::2], NOTHING).ok == verdict.ok[1::2]).all()
-
-
-def test_a_copy_in_another_process_judges_alike():
-    rules = Feasibility(full_cell(), KR270_CHAIN)
-    q = kr270_poses(500)
-    again = pickle.loads(pickle.dumps(rules))
-    assert (again.check(q, DOWN).broken == rules.check(q, DOWN).broken).all()
-
-
-def test_a_cell_without_rules_lets_all_pass_within_the_limits():
-    rules = Feasibility(cell(Workspace(mounting_plane=False)), KR270_CHAIN)
-    assert rules.check(kr270_poses(50), DOWN).ok.all()
-    assert rules.paths_free(kr270_poses(5), kr270_poses(5, 1), True).all()
-
-
 @pytest.mark.parametrize(
     ("workspace", "message"),
     [
@@ -277,11 +208,3 @@ def test_a_cell_without_rules_lets_all_pass_within_the_limits():
 def test_workspaces_that_do_not_fit_are_refused(workspace, message):
     with pytest.raises(InputError, match=message):
         Feasibility(cell(workspace), KR270_CHAIN)
-
-
-def test_poses_that_are_none_are_refused():
-    rules = Feasibility(cell(Workspace()), KR270_CHAIN)
-    with pytest.raises(InputError, match=r"5 joint values.*6 joints"):
-        rules.check(np.zeros((2, 5)), NOTHING)
-    with pytest.raises(InputError, match="pose 1 is not finite"):
-        rules.check(np.array([[0.0] * 6, [np.nan] * 6]), NOTHING)

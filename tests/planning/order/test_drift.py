@@ -1,6 +1,5 @@
 """The order keeps a drift apart from what the plan is for, within time and changes of load."""
 
-from dataclasses import replace
 from itertools import groupby
 
 import numpy as np
@@ -96,21 +95,6 @@ def test_where_there_is_time_poses_are_read_before_and_after_their_load():
     assert sorted(places[:, 1]) == loaded
     # With forces stated, the second part stands in the row of the first.
     assert len(plan_rows(twice, names, level, BOTH).configuration) == 24
-
-
-@pytest.mark.parametrize(("noise", "read"), [(1e-6, 36), (100e-6, 24)])
-def test_poses_are_read_twice_where_that_pays_more_than_further_readings(noise, read):
-    execution = ordered(replace(PAIRS, noise=noise))
-    assert len(execution.stops) == read
-    once = ordered(replace(PAIRS, noise=noise), extra_time=0.05)
-    assert len(once.stops) == 24
-    squared = [(noise**2 + e.drift.bias**2) * e.total for e in (execution, once)]
-    assert (squared[0] < squared[1]) is (read == 36)
-
-
-def test_without_extra_time_the_order_is_the_shortest():
-    there, shortest = ordered(extra_time=0.0), ordered(alias=None)
-    assert [(s.pose, s.load) for s in there.stops] == [(s.pose, s.load) for s in shortest.stops]
 
 
 def test_a_reference_pose_comes_again_first_last_and_in_between():

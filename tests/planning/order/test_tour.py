@@ -5,7 +5,7 @@ from itertools import permutations
 import numpy as np
 import pytest
 
-from elastocal.planning import greedy_tour, held_karp_bound, shortest_tour, tour_bound, tour_cost
+from elastocal.planning import greedy_tour, shortest_tour, tour_bound, tour_cost
 
 
 def costs(seed, n, symmetric):
@@ -34,26 +34,8 @@ def test_the_tour_is_the_best_of_all_permutations_and_the_bound_is_below_it(n, s
         assert 0 < bound <= best(cost) * (1 + 1e-9)
 
 
-def test_a_poor_tour_to_start_from_and_a_loose_upper_value_do_not_spoil_the_bound():
-    cost = costs(3, 8, True)
-    assert held_karp_bound(cost, 3 * best(cost)) <= best(cost) * (1 + 1e-9)
-
-
 def test_the_bound_is_within_two_per_cent_of_the_tour_through_forty_points():
     cost = costs(11, 40, True)
     tour = shortest_tour(cost, greedy_tour(cost), seed=0, iterations=2000)
     bound = tour_bound(cost, tour_cost(cost, tour))
     assert 0.98 < bound / tour_cost(cost, tour) <= 1.0
-
-
-def test_the_tour_is_never_worse_than_the_one_to_start_from():
-    cost = costs(5, 30, True)
-    start = shortest_tour(cost, greedy_tour(cost), seed=1, iterations=2000)
-    again = shortest_tour(cost, start, seed=2, iterations=1)
-    assert tour_cost(cost, again) <= tour_cost(cost, start)
-
-
-def test_the_same_seed_gives_the_same_tour():
-    cost = costs(6, 25, False)
-    tours = [shortest_tour(cost, greedy_tour(cost), seed=9, iterations=200) for _ in range(2)]
-    assert tours[0] == tours[1]

@@ -13,7 +13,7 @@ from support.discs import Discs
 from elastocal.cell.plan_wishes import Motion
 from elastocal.errors import ElastocalError, InputError
 from elastocal.model import Chain
-from elastocal.planning import krl_program, load_name, number, plain, schedule, urscript_program
+from elastocal.planning import krl_program, schedule, urscript_program
 from elastocal.planning.programs import (
     RESERVED,
     check_program,
@@ -35,18 +35,6 @@ UR_LINE = re.compile(
     rf'v={NUMBER}\)|  popup\("[^"]*", title="Load", blocking=True\)|  textmsg\("[^"]*"\)'
     rf"|  sleep\({NUMBER}\)|end||\w+\(\)"
 )
-
-
-class Fence:
-    """Straight moves between the poses 0 and 1 are blocked, everything else is free."""
-
-    def __init__(self, q):
-        self.q = q
-
-    def paths_free(self, q_from, q_to, loaded):
-        fenced = {tuple(self.q[0]), tuple(self.q[1])}
-        ends = [{tuple(a), tuple(b)} for a, b in zip(q_from, q_to, strict=True)]
-        return np.array([end != fenced for end in ends])
 
 
 @pytest.fixture(scope="module")
@@ -110,17 +98,6 @@ def test_the_load_is_hung_before_the_first_loaded_reading_and_taken_off_after_th
     assert max(k for k in range(first) if "; measure" in lines[k]) < hang < first < last < off
 
 
-def test_via_points_are_moved_through_and_not_measured(chain):
-    q = random_poses(chain, 2, seed=5)
-    execution = schedule(q, Motion(home=HOME), Fence(q), iterations=50)
-    via = schedule(q, Motion(), Fence(q), via=HOME[None], iterations=50)
-    assert sum(len(s.via) for s in via.stops) == 1
-    text = krl_program(via, chain, NAMES)
-    assert text.count("PTP") == 3 and text.count("WAIT SEC") == 2
-    assert text.count("via point, not measured") == 1
-    assert krl_program(execution, chain, NAMES).count("PTP") == 5
-
-
 @pytest.mark.parametrize("write", [krl_program, urscript_program])
 def test_the_text_is_the_same_every_time_and_names_cannot_break_it(chain, write):
     execution = execution_of(chain)
@@ -154,14 +131,6 @@ def test_any_name_is_reduced_to_one_that_both_languages_allow(name):
     assert re.fullmatch(r"[A-Za-z][A-Za-z0-9_]{0,23}", reduced, re.ASCII)
     assert reduced.lower() not in RESERVED
     assert program_name(reduced) == reduced
-
-
-@pytest.mark.parametrize("write", [krl_program, urscript_program])
-def test_the_header_states_module_units_frames_and_limits(chain, write):
-    text = write(execution_of(chain), chain, NAMES, FORCES, name="my plan\n;HALT")
-    head = text[: text.index("configuration")]
-    for told in ("my_plan_HALT()", "Units: ", "frame", "J1 -185 to 185", "s; loads in N", "limits"):
-        assert told in head.replace("stops in s, loads", "s; loads"), told
 
 
 @pytest.mark.parametrize("write", [krl_program, urscript_program])
@@ -211,12 +180,3 @@ def test_speeds_out_of_range(chain):
     for wrong in ({"speed": 4.0}, {"acceleration": 11.0}, {"speed": np.nan}):
         with pytest.raises(InputError, match="at most"):
             urscript_program(execution_of(chain), chain, NAMES, **wrong)
-
-
-def test_numbers_and_text_for_controllers():
-    assert [number(v, 6) for v in (-0.0, 1e-9, -1e-9, 1.5, -2600, 1e-6)] == [
-        "0", "0", "0", "1.5", "-2600", "0.000001",
-    ]  # fmt: skip
-    assert plain(' a "b"\t\n ü ') == "a 'b' ?"
-    assert load_name(np.array([-0.0, 0, 0])) == "no load"
-    assert load_name(np.array([-0.0, 1.5, -2600])) == "load of (0, 1.5, -2600) N"

@@ -7,16 +7,11 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 from planning.relaxation.pools import (
-    DISTINCT,
-    ROBUST,
     diagonal_problem,
-    even_weights,
     random_problem,
-    repeated,
 )
 
 from elastocal.planning import DesignProblem, make_criterion, relax
-from elastocal.planning import selection as selection_module
 
 
 def sums_of(problem, weights):
@@ -68,20 +63,6 @@ def test_a_optimal_weights_of_separate_parameters(sizes, share):
     assert relaxed.bound <= expected * (1 + 1e-12)
 
 
-@pytest.mark.parametrize("name", ["E", "G"])
-def test_the_largest_variance_is_least_where_all_are_equal(name):
-    sizes = np.array([1.0, 2.0, 4.0, 0.5])
-    relaxed = relax(diagonal_problem(name, sizes, 5, most=5))
-    assert relaxed.value == pytest.approx((1 / sizes).sum() / 5, rel=1e-6)
-    np.testing.assert_allclose(relaxed.weights, 5 / sizes / (1 / sizes).sum(), rtol=1e-4)
-
-
-def test_the_box_binds_where_it_must():
-    """w = most for the weakest parameter, the rest as without it: shares as a^{−1/2}."""
-    relaxed = relax(diagonal_problem("A", np.array([0.01, 1.0, 4.0]), 4, most=2), tolerance=1e-9)
-    np.testing.assert_allclose(relaxed.weights, [2.0, 4 / 3, 2 / 3], rtol=1e-3)
-
-
 @settings(deadline=None, max_examples=30)
 @given(
     seed=st.integers(0, 10_000),
@@ -103,29 +84,6 @@ def test_any_shares_and_priors_end_within_the_gap(seed, name, shares, most, prio
     assert relaxed.value == pytest.approx(float(value), rel=1e-9)
 
 
-@pytest.mark.parametrize("name", DISTINCT)
-def test_candidates_listed_twice_change_nothing(name):
-    problem = random_problem(name, most=5)
-    assert relax(repeated(problem)).value == pytest.approx(relax(problem).value, rel=2e-6)
-
-
-@pytest.mark.parametrize("robust", ROBUST)
-def test_starts_do_not_matter(robust):
-    problem = random_problem("D", scenarios=3, robust=robust, seed=5)
-    expected = relax(problem)
-    single = np.zeros(problem.n_candidates)
-    single[0] = 1.0
-    for start in (single, expected.weights, even_weights(problem)):
-        assert relax(problem, start=start).value == pytest.approx(expected.value, rel=2e-6)
-
-
-def test_the_worst_case_is_never_better_than_the_average():
-    average, worst = (
-        relax(random_problem("test_pose", scenarios=4, robust=robust)) for robust in ROBUST
-    )
-    assert worst.bound >= average.value * (1 - 2e-6)
-
-
 @pytest.mark.parametrize("method", ["first-order", "conic"])
 @pytest.mark.parametrize("name", ["c", "A"])
 def test_a_nuisance_parameter_that_few_candidates_see(name, method):
@@ -143,23 +101,3 @@ def test_a_nuisance_parameter_that_few_candidates_see(name, method):
     relaxed = relax(replace(problem, blocks=blocks, criterion=criterion), method=method)
     assert relaxed.gap <= 1e-5
     assert relaxed.weights[500] > 0.0
-
-
-def test_pools_too_large_to_pack_give_the_same(monkeypatch):
-    problem = random_problem("test_pose", scenarios=2, robust="average")
-    packed = relax(problem)
-    monkeypatch.setattr(selection_module, "PACKED_BYTES", 0)
-    plain = relax(replace(problem))
-    assert plain.value == pytest.approx(packed.value, rel=1e-9)
-    assert plain.bound == pytest.approx(packed.bound, rel=1e-9)
-
-
-@pytest.mark.long
-@pytest.mark.parametrize("name", DISTINCT)
-def test_twenty_thousand_candidates(name):
-    problem = random_problem(
-        name, n=20_000, r=9, p=20, shares=(3,) * 5, scenarios=2, robust="worst"
-    )
-    relaxed = relax(problem)
-    assert relaxed.gap <= 1e-6
-    np.testing.assert_allclose(sums_of(problem, relaxed.weights), 3, atol=1e-9)

@@ -27,23 +27,6 @@ def test_prior_knowledge_makes_up_for_it():
     assert relax(replace(problem, blocks=blocks)).gap <= 1e-6
 
 
-def test_prior_alone():
-    """Candidates that measure nothing leave Φ and its bound at the prior's."""
-    problem = random_problem("test_pose", prior=2.0)
-    problem = replace(problem, blocks=np.zeros_like(problem.blocks))
-    relaxed = relax(problem)
-    expected = float(problem.criterion.value(problem.prior))
-    assert relaxed.value == pytest.approx(expected, rel=1e-12)
-    assert relaxed.bound == pytest.approx(expected, rel=1e-6)
-
-
-def test_shares_that_take_everything():
-    problem = random_problem("test_pose", n=6, shares=(6, 6), most=2)
-    relaxed = relax(problem)
-    np.testing.assert_array_equal(relaxed.weights, 2.0)
-    assert relaxed.bound == pytest.approx(relaxed.value, rel=1e-12)
-
-
 @pytest.mark.parametrize(
     ("options", "message"),
     [
@@ -56,10 +39,3 @@ def test_shares_that_take_everything():
 def test_wrong_options(options, message):
     with pytest.raises(InputError, match=message):
         relax(random_problem(), **options)
-
-
-def test_progress_tells_the_gap():
-    lines: list[str] = []
-    relaxed = relax(random_problem(), progress=lines.append)
-    assert len(lines) == relaxed.iterations
-    assert f"{relaxed.history[-1].gap:.1e}" in lines[-1]

@@ -92,11 +92,6 @@ def test_bounds_on_the_pose_are_the_rules_themselves(case: Build) -> None:
     assert all((broken[:, k] & (broken.sum(axis=1) == 1)).any() for k in (0, 1, 2, 3))
 
 
-def test_a_cell_without_rules_has_no_margins(case: Build) -> None:
-    model = case().model
-    assert margins(model.cell, model.chain, (), DOWN[None]) is None
-
-
 def test_margins_have_slopes(case: Build) -> None:
     arm = case(
         Workspace(

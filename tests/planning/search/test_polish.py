@@ -9,9 +9,7 @@ from typing import Any
 import numpy as np
 import pytest
 
-from elastocal.cell.arm_description import PolarNoise, Tracker
 from elastocal.cell.workspace_rules import HalfSpace, Solid, Workspace
-from elastocal.errors import InputError
 from elastocal.planning import sobol
 from elastocal.planning.polish import polish
 from elastocal.units import Array
@@ -26,7 +24,6 @@ CLUTTER = Workspace(
     clearance=0.01,
 )
 LEVELS = (-1.2, -0.4)
-POLAR = Tracker(position=np.array([3.0, -1.0, 0.5]), noise=PolarNoise(1e-5, 3e-7, 1.5e-5, 6e-6))
 
 
 def grid(arm: Any, count: int) -> Array:
@@ -87,48 +84,3 @@ def test_floor_and_ceiling_at_the_best_poses_cost_something(case: Build) -> None
     blocks = blocked.information.blocks(q, np.full(len(q), -1))
     values = problem.criterion.after_adding(problem.prior, blocks)
     assert tight.after <= values.min()
-
-
-def test_each_pose_keeps_its_load_and_its_noise(case: Build) -> None:
-    loads = np.array([[0.0, 0.0, -20.0], [0.0, 0.0, -200.0]])
-    arm = case(
-        design={"loads": loads, "load_choice": True}, tracker=POLAR, observe="position",
-        deflection_model="equilibrium", effects=("joint_compliance:joint2", "marker_position"),
-    )  # fmt: skip
-    pool = arm.draw(100)
-    problem = arm.problem(pool, [3], arm.criterion("D"))
-    chosen = np.array([0, 1, 2])
-    assert set(pool.load[chosen]) == {0, 1}
-    found = polish(problem, arm.searches, pool.q, pool.load, chosen, starts=1, sweeps=2)
-    assert found.after < found.before
-    assert found.after == pytest.approx(arm.value(problem, found.q, pool.load[chosen]), rel=1e-9)
-
-
-def test_the_same_plan_on_one_and_two_processes(case: Build) -> None:
-    arm = case()
-    pool = arm.draw(64)
-    problem = arm.problem(pool, [2], arm.criterion("test_pose"))
-    plans = [
-        polish(
-            problem,
-            arm.searches,
-            pool.q,
-            pool.load,
-            np.array([1, 2]),
-            sweeps=1,
-            starts=2,
-            jobs=jobs,
-        )
-        for jobs in (1, 2)
-    ]
-    np.testing.assert_array_equal(plans[0].q, plans[1].q)
-    assert plans[0].after == plans[1].after
-
-
-def test_numbers_that_make_no_sense_are_refused(case: Build) -> None:
-    arm = case()
-    pool = arm.draw(64)
-    problem = arm.problem(pool, [1], arm.criterion("D"))
-    for bad in ({"starts": -1}, {"sweeps": 0}):
-        with pytest.raises(InputError, match="polish needs"):
-            polish(problem, arm.searches, pool.q, pool.load, np.array([0]), **bad)
