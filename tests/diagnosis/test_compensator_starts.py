@@ -6,8 +6,7 @@ from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
-import pytest
-from support.cells import kr270_cell, kr270_chain
+from support.cells import kr270_chain
 from support.diagnoses import ECCENTRICITY
 from support.diagnosis_data import FAULTS, campaign
 from support.robots import KR270
@@ -16,7 +15,6 @@ from elastocal.cell.work_cell import read_cell
 from elastocal.diagnosis import (
     Hypothesis,
     Item,
-    compute_columns,
     diagnosis_data_of,
     fit_baseline,
     fit_extended,
@@ -25,72 +23,12 @@ from elastocal.diagnosis import (
     write_extended_cell,
 )
 from elastocal.diagnosis.diagnosis import FittedParameter
-from elastocal.diagnosis.hypotheses import StartSearch
 from elastocal.model import Model
-from elastocal.model.effects import CATALOGUE
 
-SPRING = CATALOGUE["gravity_compensator"]
 VALUES = {
     "compensator_stiffness": 2.5e4, "compensator_anchor_x": 0.2, "compensator_anchor_y": -0.5,
     "compensator_arm": -0.3, "compensator_free_length": -0.4,
 }  # fmt: skip
-
-
-def test_starts_turn_the_anchor_and_pull_push_and_keep_the_force() -> None:
-    starts = SPRING.starts("joint2", kr270_chain(), kr270_cell())
-    anchor = np.array([[s["compensator_anchor_x"], s["compensator_anchor_y"]] for s in starts])
-    a, arm, free = (
-        np.linalg.norm(anchor, axis=1),
-        *(np.array([s[f"compensator_{key}"] for s in starts]) for key in ("arm", "free_length")),
-    )
-    assert len({round(t, 6) for t in np.arctan2(*anchor.T)}) == 24
-    assert ((free < a - arm) & (free > 0)).any() and (free > a + arm).any()
-    assert (np.abs(free) > 3 * (a + arm)).any() and (free < 0).any()
-    assert ((a >= 0.1) & (a <= 0.5)).all() and (arm < a).all()
-
-
-def test_a_stated_geometry_is_the_only_start() -> None:
-    stated = kr270_cell()
-    nominal = replace(stated.model.nominal, gravity_compensator={"joint": "joint2"})
-    cell = replace(stated, model=replace(stated.model, nominal=nominal))
-    assert SPRING.starts("joint2", kr270_chain(), cell) == ()
-
-
-@pytest.fixture(scope="module")
-def search() -> StartSearch:
-    model, table = campaign("gear_eccentricity:joint2")
-    base = fit_baseline(model, table)
-    hypotheses = [h for h in possible(model, table)[0] if h.name == "gravity_compensator"]
-    columns = compute_columns(base, hypotheses)
-    return StartSearch.of(columns.full, hypotheses[0], base, columns.x, columns.rows)
-
-
-def test_a_profile_times_the_factor_of_its_row_is_the_column_of_the_whole_model(
-    search: StartSearch,
-) -> None:
-    for start in (search.starts[77], search.starts[400]):
-        _, whole = search._amplitude(start, search.part.table)
-        profile = SPRING.profiles("joint2", [start], search.part.table.q)
-        fast = search._factor * profile
-        assert np.abs(fast - whole).max() < 2e-3 * np.abs(whole).max()
-
-
-def test_what_many_starts_explain_by_chance_is_paid_for(search: StartSearch) -> None:
-    assert search.screened is not None
-    best, share = search.screened
-    assert -np.log(len(search.starts)) <= share < 0
-    assert len(best) == 12
-    left = [t.left for t in search.tangents()]
-    assert left[0] <= min(left) + 1e-6
-
-
-def test_a_model_without_parameters_has_starts_too() -> None:
-    model, table = campaign("gear_eccentricity:joint2")
-    bare = Model(replace(model.cell, model=replace(model.cell.model, effects=())))
-    base = fit_baseline(bare, table)
-    h = next(h for h in possible(bare, table)[0] if h.name == "gravity_compensator")
-    columns = compute_columns(base, [h])
-    assert StartSearch.of(columns.full, h, base, columns.x, columns.rows).X.shape[1] == 0
 
 
 def test_from_the_start_that_was_found_the_exact_fit_ends_at_the_noise() -> None:

@@ -15,20 +15,13 @@ from elastocal.diagnosis import (
     NoiseValues,
     NoisyData,
     Sizes,
-    component_search,
     fit_sum,
     posed,
-    with_returned,
 )
-from elastocal.diagnosis.baseline import Blocks, fit_baseline
+from elastocal.diagnosis.baseline import fit_baseline
 from elastocal.diagnosis.component_answer import PROBABLE, TOLD, SumAnswer
-from elastocal.diagnosis.component_search import WIDE, Beside, evidence_beside, promised
-from elastocal.diagnosis.diagnose import diagnose
 from elastocal.diagnosis.diagnosis_data import diagnosis_data_of
-from elastocal.diagnosis.evidence import direct
 from elastocal.diagnosis.hypotheses import possible
-from elastocal.diagnosis.model_set import ModelSet
-from elastocal.diagnosis.noise_floor import project
 from elastocal.model.effects.gears import EncoderScale
 from elastocal.model.effects.smooth import JointCurve, Waves
 
@@ -97,31 +90,6 @@ def test_the_information_is_the_average_of_the_dense_gaussian() -> None:
     np.testing.assert_allclose(problem.objective(theta)[2], expected, rtol=1e-5, atol=1e-5)
 
 
-def test_the_slope_is_that_of_the_value() -> None:
-    data, components, at = some()
-    problem = posed(data, components, NOISE)
-    theta = np.concatenate([[at.factor], at.size, at.length])
-    slope = problem.objective(theta)[1]
-    for k in range(len(theta)):
-        if slope[k] == 0.0:  # the length of what has none
-            continue
-        step = 1e-5 * np.eye(len(theta))[k]
-        ends = [problem.objective(theta + sign * step)[0] for sign in (1, -1)]
-        assert slope[k] == pytest.approx((ends[0] - ends[1]) / 2e-5, rel=1e-4, abs=1e-5)
-
-
-def test_what_a_component_earns_is_what_the_likelihood_loses_without_it() -> None:
-    data, components, at = some()
-    problem = posed(data, components, NOISE)
-    whole, (earned, within) = problem.factored(at)[2], problem.earned(at)
-    assert not within.any()
-    for k in range(len(components)):
-        kept = [i for i in range(len(components)) if i != k]
-        fewer = posed(data, [components[i] for i in kept], NOISE)
-        lost = (fewer.factored(at.chosen(kept))[2] - whole) / 2
-        assert earned[k] == pytest.approx(lost, abs=1e-6)
-
-
 def test_a_compliance_below_zero_is_no_cause() -> None:
     """Evidence of a half Gaussian: of what is positive twice as much, of what is not next to none,
     and so it is not in the sum."""
@@ -144,85 +112,6 @@ def test_a_compliance_below_zero_is_no_cause() -> None:
     assert negative.components and not none.components
 
 
-def test_sums_that_are_known_serve_another_fit() -> None:
-    """A component more and one less, and the noise larger by a factor, as if summed anew."""
-    data, components, at = some()
-    known = posed(data, components, NOISE)
-    other = [components[2], component(data, 4, 3), components[0]]
-    twice, anew = posed(data, other, NOISE, known), posed(data, other, NOISE)
-    np.testing.assert_allclose(twice.weighted.M, anew.weighted.M, rtol=1e-9, atol=1e-12)
-    np.testing.assert_allclose(twice.weighted.z, anew.weighted.z, rtol=1e-9, atol=1e-12)
-    larger = known.scaled(0.3)
-    expected = posed(data, components, larger.noise)
-    np.testing.assert_allclose(larger.weighted.M, expected.weighted.M, rtol=1e-9)
-    assert larger.factored(at)[2] == pytest.approx(expected.factored(at)[2], abs=1e-6)
-
-
-def test_evidence_beside_a_sum_is_that_of_the_rows() -> None:
-    data, components, _ = some()
-    r = data.r + sum(c.columns @ np.full(c.width, 20.0) for c in components)
-    found = fit_sum(replace(data, r=r), components, NOISE, refit_noise=False)
-    assert len(found.components) == 3
-    more = [component(data, 4, 2).columns, component(data, 5, 3).columns]
-    beside = Beside(found, more)
-    for k, gone in enumerate(found.spans):
-        kept = np.r_[0 : gone.start, gone.stop : found.data.X.shape[2]]
-        rest = replace(found.data, X=found.data.X[:, :, kept], precision=found.data.precision[kept])
-        at = project(rest, found.noise)
-        tried = [found.components[k].columns, *more]
-        expected = [float(direct(data.masked(C), at).evidence(WIDE)[0]) for C in tried]
-        assert beside.evidence(gone, [gone, *beside.spans]) == pytest.approx(expected, rel=1e-6)
-    # Without directions that hardly show the rest of the readings is as probable.
-    shown = project(found.without_these(), found.noise).marginal
-    assert shown == pytest.approx(project(found.data, found.noise).marginal, abs=1e-3)
-
-
-def test_what_components_promise_counts_once_what_two_of_them_say() -> None:
-    """Of one it is its evidence, of another besides what that has beside the first; a copy, or one
-    of which the readings say nothing, promises nothing more."""
-    data = random_data(5, p=2)
-    data = replace(data, left_out=data.left_out & False, r=0 * data.r)
-    each = 1e-14 * np.eye(data.r.shape[1])
-    data = replace(data, covariance=np.tile(each, (len(data.r), 1, 1)))
-    first, second, idle = (component(data, k, 1) for k in (1, 2, 3))
-    quiet = NoiseValues.usual(3).of_instrument()
-    r = 1e-7 * np.random.default_rng(3).normal(size=data.r.shape)
-    r = r + first.columns @ np.array([0.01]) + second.columns @ np.array([0.01])
-    data = replace(data, r=r)
-    chosen = ModelSet((), quiet, data, 0.0, ())
-    at = project(data, quiet)
-    own = [float(direct(c.columns, at).evidence(WIDE)[0]) for c in (first, second, idle)]
-    assert promised(chosen, [first]) == pytest.approx(own[0])
-    both = promised(chosen, [first, second, idle])
-    assert both == pytest.approx(own[0] + own[1], rel=0.2) and both > own[0] > 20 > 5 * own[2]
-    assert promised(chosen, [first, replace(first), second]) == pytest.approx(both, rel=0.05)
-
-
-def test_where_no_sum_is_promised_none_is_looked_for(monkeypatch: pytest.MonkeyPatch) -> None:
-    """One effect: the answer is that of a diagnosis which looks for a sum all the same."""
-    model, table = campaign("gear_eccentricity:joint4")
-    said: list[str] = []
-    short = diagnose(model, table, progress=said.append)
-    assert not any("components at once" in line for line in said)
-    monkeypatch.setattr(component_search, "PROMISING", -1.0)
-    longer = diagnose(model, table, progress=said.append)
-    assert any("components at once" in line for line in said)
-    assert short.verdict == longer.verdict == "explained" and short.effects == longer.effects
-
-
-def test_scatter_of_joints_that_the_instrument_has_taken_is_found() -> None:
-    """Nothing is stated: beside so much noise of the instrument the likelihood is flat where joints
-    repeat well."""
-    blocks = Blocks.of(np.repeat(np.arange(80), 2), np.arange(160), 3)
-    data = random_data(6, blocks, p=2, stated=False)
-    rng = np.random.default_rng(2)
-    scatter = data.same_visit @ (2e-4 * rng.normal(size=(*data.r.shape, 3)))
-    r = 2e-5 * rng.normal(size=data.r.shape) + (data.G * scatter).sum(axis=2)
-    start = NoiseValues(30.0, np.full(3, 1e-9), np.full(3, 0.2))
-    found = fit_sum(replace(data, r=r), [component(data, 1, 2)], start)
-    assert (found.noise.joint > 1e-4).all()
-
-
 def test_of_causes_only_those_at_work_are_left() -> None:
     """Readings that two of ten components make: these are found, at their sizes."""
     data = random_data(5, p=2)
@@ -242,29 +131,6 @@ def test_of_causes_only_those_at_work_are_left() -> None:
                     refit_noise=False)  # fmt: skip
     assert {id(c) for c in found.components} == {id(components[k]) for k in true}
     assert np.exp(found.sizes.size) == pytest.approx([1.1, 1.4], rel=0.5)
-
-
-def test_what_the_columns_of_others_are_about_stays() -> None:
-    data, components, _ = some()
-    quiet = NoiseValues.usual(3).of_instrument()
-    free = fit_sum(replace(data, r=0 * data.r), components[:1], quiet, refit_noise=False)
-    given = replace(components[0], given=True)
-    held = fit_sum(replace(data, r=0 * data.r), [given], quiet, refit_noise=False)
-    assert not free.components and held.components == (given,)
-
-
-def test_a_smooth_function_is_tried_at_several_lengths() -> None:
-    """Beside a sum its evidence is that of the length that suits it best."""
-    data, components, _ = some()
-    smooth = next(c for c in components if c.waves is not None)
-    low, high = smooth.lengths
-    assert low < high and len(smooth.scalings) == 3
-    for scaling, length in zip(smooth.scalings, (low, (low + high) / 2, high), strict=True):
-        np.testing.assert_allclose(scaling, np.sqrt(smooth.shares(length)[0]))
-    found = fit_sum(data, [c for c in components if c is not smooth], NOISE, refit_noise=False)
-    beside = Beside(found, [smooth.columns * scaling for scaling in smooth.scalings])
-    best = max(beside.evidence(slice(0, 0), beside.spans))
-    assert evidence_beside(found, [smooth]) == pytest.approx([best])
 
 
 def test_nothing_is_found_in_noise() -> None:
@@ -305,26 +171,6 @@ def test_many_effects_at_once_are_one_sum() -> None:
         assert e.probability >= PROBABLE or abs(shares[e.effect, e.where]) >= TOLD
 
 
-def test_the_campaign_of_many_has_their_model() -> None:
-    model, table = campaign(*MANY, n=20)
-    assert len(table) == 20 * 2 * 3 and not any(p.shrunk for p in model.parameters)
-
-
-def test_what_went_under_a_larger_noise_comes_back() -> None:
-    """A small cause beside a large one that was not known yet."""
-    data = random_data(5, p=2)
-    data = replace(data, left_out=data.left_out & False, r=0 * data.r)
-    each = 1e-14 * np.eye(data.r.shape[1])
-    data = replace(data, covariance=np.tile(each, (len(data.r), 1, 1)))
-    large, small = component(data, 1, 3), component(data, 2, 1)
-    r = 1e-7 * np.random.default_rng(8).normal(size=data.r.shape)
-    r = r + large.columns @ np.array([30.0, -20.0, 25.0]) + small.columns @ np.array([0.1])
-    data, quiet = replace(data, r=r), NoiseValues.usual(3).of_instrument()
-    found = fit_sum(data, [large], quiet, refit_noise=False)
-    again = with_returned(found, [large, small])
-    assert {id(c) for c in again.components} == {id(large), id(small)}
-
-
 def answer_without_components(every: bool) -> SumAnswer:
     """Of a campaign whose joint 5 has another error in every configuration, of `every` visit or of
     the unloaded ones alone."""
@@ -349,8 +195,3 @@ def test_what_a_joint_errs_by_at_every_configuration_is_its_angle_s() -> None:
     true = float(np.sqrt((left**2).sum() / answer._readings))
     assert row.rms_ci95[0] < true < row.rms_ci95[1] < 1.3 * row.rms_ci95[0]
     assert row.share > 0.9 and row.probability > 0.99
-
-
-def test_without_visits_again_nothing_is_called_an_error_of_the_angle() -> None:
-    """What repeats is not told from what does not."""
-    assert not answer_without_components(every=False).components

@@ -66,13 +66,6 @@ def test_what_the_table_does_not_say_is_untested_with_advice(column: str, how: s
     assert parts == complete
 
 
-def test_without_a_load_the_loads_error_is_untested() -> None:
-    unloaded = replace(TABLE, force=np.zeros_like(TABLE.force))
-    tried, untested = possible(MODEL, unloaded)
-    assert "payload_error" in {u.effect for u in untested} - {h.name for h in tried}
-    assert any("load" in u.advice for u in untested)
-
-
 @pytest.mark.parametrize("name", sorted(ISSUE))
 def test_an_effect_can_be_taken_out_of_the_catalogue(name: str) -> None:
     whole = {(h.name, h.where) for h in possible(MODEL, TABLE)[0]}

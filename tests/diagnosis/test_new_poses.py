@@ -10,7 +10,7 @@ import pytest
 from support.diagnosis_data import campaign
 
 from elastocal.diagnosis import new_pose_table
-from elastocal.diagnosis.shrinkage import _box, _joints, _raked, _recombined, _unlike
+from elastocal.diagnosis.shrinkage import _joints, _recombined, _unlike
 from elastocal.measurements import Measurements
 from elastocal.model import Model, observe
 
@@ -44,70 +44,11 @@ def test_every_joint_has_been_at_its_angle_and_no_arm_in_its_pose() -> None:
     assert not {tuple(q) for q in new.q} & {tuple(q) for q in table.q}
 
 
-def test_markers_stay_about_where_they_were_measured() -> None:
-    """Beyond the outermost configuration by no more than it is from the one before it."""
-    model, table, new = drawn()
-    was, now = (model.target_poses(t)[1] for t in (table, new))
-    codes = np.unique(table.configuration)
-    second, last = np.sort([was[table.configuration == c].max(axis=0) for c in codes], axis=0)[-2:]
-    assert (now <= last + (last - second)).all()
-    last, second = np.sort([was[table.configuration == c].min(axis=0) for c in codes], axis=0)[:2]
-    assert (now >= last - (second - last)).all()
-
-
-def test_as_much_of_the_room_is_beyond_the_ends_as_draws_leave_on_average() -> None:
-    rng = np.random.default_rng(4)
-    ends = np.array([_box(rng.random((60, 3)), np.arange(60)) for _ in range(2000)])
-    np.testing.assert_allclose(ends.mean(axis=0), [[0.0] * 3, [1.0] * 3], atol=2e-3)
-
-
-def test_no_joint_is_drawn_to_its_middle_by_the_ends_of_the_room() -> None:
-    """Poses with an outstretched arm leave the box most often, and would be missing."""
-    model, table, _ = drawn()
-    new = new_pose_table(model, table, 400, np.random.default_rng(6))
-    was, now = (t.q[np.unique(t.configuration, return_index=True)[1]] for t in (table, new))
-    np.testing.assert_allclose(now.std(axis=0), was.std(axis=0), rtol=0.08)
-
-
-def test_raked_poses_have_every_donor_as_often() -> None:
-    """Where half of those with a joint at one of its angles are missing."""
-    rng = np.random.default_rng(2)
-    donors = rng.integers(5, size=(4000, 3))
-    donors = donors[(donors[:, 1] != 2) | (rng.random(4000) < 0.5)]
-    weight = _raked(donors)
-    for of_joint in donors.T:
-        np.testing.assert_allclose(np.bincount(of_joint, weight), 0.2, rtol=1e-6)
-
-
-def test_times_are_the_campaigns_and_one_per_visit() -> None:
-    _, table, new = drawn()
-    assert new.time.min() >= table.time.min() and new.time.max() <= table.time.max()
-    assert np.ptp(new.time) > 0.9 * np.ptp(table.time)
-    visits = np.column_stack([new.configuration, new.force[:, 2]])
-    assert len(np.unique(np.column_stack([visits, new.time]), axis=0)) == 2 * N
-    np.testing.assert_allclose(new.temperature, 20 + 1e-3 * new.time)
-
-
 def test_loaded_and_unloaded_readings_still_pair() -> None:
     model, _, new = drawn("deflection")
     observed = observe(new, "deflection")
     assert len(observed.lead) == len(new) // 2
     assert np.isfinite(model.predict(new, None, observed)).all()
-
-
-def test_the_same_seed_draws_the_same_poses() -> None:
-    model, table, new = drawn()
-    again = new_pose_table(model, table, N, np.random.default_rng(5))
-    other = new_pose_table(model, table, N, np.random.default_rng(6))
-    np.testing.assert_array_equal(again.q, new.q)
-    assert not np.array_equal(other.q, new.q)
-
-
-def test_where_nothing_recorded_is_there_nothing_is_invented() -> None:
-    model, table, _ = drawn()
-    bare = replace(table, time=None, approach=None, temperature=None)
-    new = new_pose_table(model, bare, N, np.random.default_rng(5))
-    assert new.time is None and new.approach is None and new.temperature is None
 
 
 @pytest.mark.parametrize("n", [8, 9])
@@ -146,11 +87,3 @@ def test_poses_of_a_campaign_whose_joints_depend_on_each_other_do_so_too() -> No
     was, now = _joints(table), _joints(new)
     np.testing.assert_allclose(now.std(axis=0), was.std(axis=0), rtol=0.25)
     assert np.ptp(new.time) > 0.8 * np.ptp(table.time)
-
-
-def test_joints_that_are_independent_are_not_called_dependent() -> None:
-    found = 0
-    for seed in range(40):
-        rng = np.random.default_rng(seed)
-        found += _unlike(rng.uniform(-1, 1, (60, 6)), rng.uniform(-1, 1, (N, 6)), rng)
-    assert found <= 3

@@ -14,7 +14,6 @@ from elastocal.diagnosis import (
     fit_noise,
     likelihood,
     noise_draws,
-    noise_floor,
 )
 
 N = 300
@@ -54,34 +53,3 @@ def test_draws_are_spread_as_the_likelihood_is() -> None:
     mean, deviation = on_a_grid(made, best)
     assert logs.mean() == pytest.approx(mean, abs=0.35 * deviation)
     assert logs.std() == pytest.approx(deviation, rel=0.35)
-
-
-def test_no_draw_is_far_less_likely_than_the_best() -> None:
-    """Beyond what shows the likelihood falls steeply, and no Gaussian about its top is kept."""
-    made = data()
-    best = fit_noise(made)
-    top = likelihood(made, best)[0]
-    worst = max(
-        likelihood(made, n)[0] for n in noise_draws(made, best, 40, np.random.default_rng(1))
-    )
-    assert worst - top < 25
-
-
-def test_the_same_seed_draws_the_same_noise() -> None:
-    made = data()
-    best = fit_noise(made)
-    one, two = (noise_draws(made, best, 5, np.random.default_rng(2)) for _ in range(2))
-    for a, b in zip(one, two, strict=True):
-        np.testing.assert_array_equal(a.logs(), b.logs())
-
-
-def test_no_result_depends_on_the_number_of_threads(monkeypatch: pytest.MonkeyPatch) -> None:
-    """Of large data, on which several work."""
-    made = data()
-    best = fit_noise(made)
-    alone = noise_draws(made, best, 20, np.random.default_rng(0))
-    monkeypatch.setattr(noise_floor, "LARGE", 0)
-    monkeypatch.setenv("OMP_NUM_THREADS", "3")
-    several = noise_draws(made, best, 20, np.random.default_rng(0))
-    for one, other in zip(alone, several, strict=True):
-        np.testing.assert_array_equal(one.logs(), other.logs())

@@ -13,7 +13,6 @@ from elastocal.diagnosis import (
     Hypothesis,
     Item,
     SettingsGrid,
-    change_times,
     diagnosis_data_of,
     fit_baseline,
     fit_set,
@@ -23,7 +22,6 @@ from elastocal.diagnosis import (
 )
 from elastocal.measurements import Measurements
 from elastocal.model import Model
-from elastocal.model.effects import CATALOGUE
 
 
 @pytest.fixture(scope="module")
@@ -56,54 +54,6 @@ def test_the_prior_of_every_search_sums_to_one(visits) -> None:
     assert searched == {"order", "change_time", "time_constant"}
 
 
-@pytest.mark.parametrize("seed", range(5))
-def test_a_change_lies_between_two_visits_with_two_at_least_on_either_side(seed: int) -> None:
-    rng = np.random.default_rng(seed)
-    time = rng.uniform(0, 1e4, rng.integers(4, 60))
-    found = change_times(rng.permutation(time))
-    sides = (time[:, None] < found).sum(axis=0)
-    assert not np.isin(found, time).any()
-    assert sorted(sides) == list(range(2, len(time) - 1))
-
-
-def test_of_many_moments_some_are_tried_from_first_to_last() -> None:
-    time = np.arange(2000.0)
-    found = change_times(time)
-    assert len(found) == 120 and np.diff(found).max() < 20
-    assert found[0] == 1.5 and found[-1] == 1997.5
-
-
-def test_time_constants_span_the_campaign(visits) -> None:
-    grid = grid_of(hypothesis("joint_drift", "joint2"), visits)
-    span = np.ptp(visits.time)
-    assert grid.values.min() < span / 10 and grid.values.max() > 2 * span
-    # A drift between two grid points keeps nearly all of its shape.
-    t = (visits.time - visits.time.min())[:, None]
-    between = np.sqrt(grid.values[:-1, 0] * grid.values[1:, 0])
-    for tau, near in zip(between, grid.values[:-1, 0], strict=True):
-        shape, other = (1 - np.exp(-t[:, 0] / c) for c in (tau, near))
-        shape, other = (s - s.mean() for s in (shape, other))
-        kept = abs(shape @ other) / np.linalg.norm(shape) / np.linalg.norm(other)
-        assert kept > 0.97
-
-
-def test_orders_that_the_cell_names_get_half_of_the_prior(visits) -> None:
-    grid = ripple((121.0,), visits.q[:, 3], visits)
-    known = grid.values[:, 0] == 121.0
-    assert known.any()
-    assert np.exp(grid.log_prior[known]).sum() == pytest.approx(0.5, abs=1e-3)
-    free = ripple((), visits.q[:, 3], visits)
-    assert np.ptp(free.log_prior) == 0 and len(free.values) == len(grid.values) - 1
-
-
-@pytest.mark.parametrize("spread", [0.0, 1e-4, 0.005])
-def test_a_joint_that_hardly_moved_is_asked_for_few_orders(spread: float, visits) -> None:
-    """Over so small a range all orders look like a line or less."""
-    grid = ripple((121.0,), np.linspace(0, spread, len(visits)), visits)
-    assert 1 <= len(grid.values) < 5 and 121.0 in grid.values
-    assert np.exp(grid.log_prior).sum() == pytest.approx(1.0)
-
-
 @pytest.mark.parametrize("spread", [0.5, 2.0, 6.0])
 @pytest.mark.parametrize("seed", range(3))
 def test_a_ripple_of_any_order_keeps_nine_tenths_of_its_size_on_the_grid(
@@ -120,14 +70,6 @@ def test_a_ripple_of_any_order_keeps_nine_tenths_of_its_size_on_the_grid(
             A = np.column_stack([np.sin(n * q), np.cos(n * q)])
             kept.append(np.linalg.norm(A @ np.linalg.lstsq(A, wave)[0]) / np.linalg.norm(wave))
         assert max(kept) > 0.9
-
-
-def test_what_has_no_constant_to_search_has_one_point(visits) -> None:
-    grid = grid_of(hypothesis("gear_eccentricity", "joint1"), visits)
-    assert grid.values.shape == (1, 0) and grid.log_prior[0] == 0
-    assert (
-        CATALOGUE["gear_eccentricity"].settings("joint1", kr270_chain(), campaign()[0].cell) == ()
-    )
 
 
 def test_a_change_is_found_to_the_visit_however_many_there_are() -> None:

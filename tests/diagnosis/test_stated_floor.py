@@ -14,12 +14,8 @@ from elastocal.diagnosis import (
     DiagnosisData,
     diagnosis_data_of,
     fit_baseline,
-    near_pairs,
-    near_repeats,
     noise_rms,
     project,
-    pure_error,
-    returned,
     smooth_scatter,
     supported_floor,
 )
@@ -72,47 +68,8 @@ def true_rms(dataset: DiagnosisData) -> float:
     return float(np.sqrt(3 * SIGMA**2 + 3 * REPEATABILITY**2 * (G**2).sum(axis=1).mean()))
 
 
-def test_near_repeats_are_found_among_readings_of_one_marker_and_load() -> None:
-    dataset = data_with(False, near=2e-3)
-    pairs = near_pairs(dataset, np.ones(dataset.blocks.n, dtype=bool))
-    table, lead = dataset.table, dataset.lead
-    one, other = lead[pairs[:, 0]], lead[pairs[:, 1]]
-    assert len(pairs) == 40 * 2 * 3
-    assert (table.marker[one] == table.marker[other]).all()
-    np.testing.assert_array_equal(table.force[one], table.force[other])
-    assert (table.configuration[other] - table.configuration[one] == 120).all()
-    assert np.abs(table.q[one] - table.q[other]).max() <= 2e-3
-    assert near_repeats(data_with(False), data_with(False).data, at_(data_with(False))) is None
-
-
 def at_(dataset: DiagnosisData):
     return project(dataset.data, dataset.noise)
-
-
-@pytest.mark.parametrize("curves", [False, True])
-def test_near_repeats_scatter_by_the_noise_whatever_the_arm_does(curves: bool) -> None:
-    dataset = data_with(curves, near=2e-3)
-    found = near_repeats(dataset, dataset.data, at_(dataset))
-    assert found is not None
-    assert (found.pairs, found.independent) == (240, 240)
-    assert np.sqrt(3) * found.scatter == pytest.approx(true_rms(dataset), rel=0.12)
-    # All pairs are two thirds of the campaign apart.
-    assert found.soon is None and found.later is None
-
-
-def test_near_repeats_soon_and_later_are_told_apart() -> None:
-    model, table = campaign_with(False, near=2e-3)
-    # Every other pair is measured one after the other; the readings drift.
-    code = table.configuration
-    first = np.where(code >= 120, code - 120, code)
-    moment = np.where((code >= 120) & (first % 2 == 0), first + 0.5, code).astype(float)
-    drift = 3e-4 * (moment / moment.max()) ** 2
-    position = table.position + drift[:, None] * np.array([1.0, 0, 0])
-    dataset = data_of(model, replace(table, time=60 * moment, position=position))
-    found = near_repeats(dataset, dataset.data, at_(dataset))
-    assert found is not None and found.soon is not None and found.later is not None
-    assert found.later > 2 * found.soon
-    assert np.sqrt(3) * found.soon == pytest.approx(true_rms(dataset), rel=0.2)
 
 
 def test_an_error_curve_is_no_scatter() -> None:
@@ -150,32 +107,3 @@ def test_on_an_arm_that_only_scatters_nothing_is_unexplained(near: float, shake:
     found = supported_floor(dataset, dataset.data, dataset.noise, 1.0)
     assert found.unexplained == 0.0
     assert found.noise == noise_rms(dataset.data, dataset.noise)
-
-
-def test_only_repeats_that_the_arm_came_back_for_say_what_it_repeats() -> None:
-    """Standing still between two readings shows the tracker alone."""
-    model, table = campaign_with(True)
-    rng = np.random.default_rng(2)
-    again = replace(table, repeat=table.repeat + 1)
-    again = replace(again, position=table.position + np.sqrt(2) * SIGMA * rng.normal(
-        size=table.position.shape))  # fmt: skip
-    parts = {}
-    for name, shift in (("at once", 1.0), ("later", 1e5)):
-        both = joined_tables(table, replace(again, time=table.time + shift))
-        dataset = data_of(model, both)
-        assert pure_error(dataset) == pytest.approx(SIGMA, rel=0.1)
-        parts[name] = returned(dataset)
-    assert parts["at once"] == (0.0, 0)
-    square, dof = parts["later"]
-    assert np.sqrt(square) == pytest.approx(SIGMA, rel=0.1) and dof == 3 * len(table)
-
-
-def joined_tables(one: Measurements, other: Measurements) -> Measurements:
-    rows = np.concatenate([np.arange(len(one)), np.arange(len(one))])
-    both = one.take(rows)
-    n = len(one)
-    for name in ("time", "position", "repeat"):
-        values = getattr(both, name).copy()
-        values[n:] = getattr(other, name)
-        both = replace(both, **{name: values})
-    return both

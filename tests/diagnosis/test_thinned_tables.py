@@ -8,9 +8,8 @@ import numpy as np
 from support.diagnosis_data import campaign
 
 from elastocal.diagnosis import thinned
-from elastocal.diagnosis.baseline import MOST_CONFIGURATIONS, MOST_IN_ONE, MOST_ROWS
+from elastocal.diagnosis.baseline import MOST_CONFIGURATIONS, MOST_ROWS
 from elastocal.measurements import Measurements, with_moves
-from elastocal.model import observe
 
 
 def repeated(times: int, poses: int = 40) -> Measurements:
@@ -24,11 +23,6 @@ def repeated(times: int, poses: int = 40) -> Measurements:
         every, configuration=every.configuration + poses * lap, configuration_labels=labels,
         row=np.arange(len(every)) + 2, time=every.time + (table.time.max() + 30.0) * lap,
     )  # fmt: skip
-
-
-def test_a_small_table_is_looked_at_whole() -> None:
-    table = campaign("encoder_scale:joint3")[1]
-    assert thinned(table) == (table, None)
 
 
 def test_configurations_stay_whole_and_evenly_spaced() -> None:
@@ -51,18 +45,3 @@ def test_of_many_poses_a_part_is_enough_and_keeps_its_moves() -> None:
     assert kept.move is not None and single.move is not None
     moves = dict(zip(single.row, single.move, strict=True))
     assert all((moves[row] == own).all() for row, own in zip(kept.row, kept.move, strict=True))
-
-
-def test_many_readings_of_one_configuration_are_thinned_alike() -> None:
-    """As many of each marker, loaded and unloaded, so that deflections still pair."""
-    table = campaign("encoder_scale:joint3")[1]
-    times = 50
-    every = table.take(np.tile(np.arange(len(table)), times))
-    every = replace(every, repeat=np.repeat(np.arange(times), len(table)))
-    kept, said = thinned(every)
-    assert said is not None
-    one = kept.take(kept.configuration == 7)
-    assert len(one) == MOST_IN_ONE
-    counts = np.unique(np.column_stack([one.marker, one.force[:, 2]]), axis=0, return_counts=True)
-    assert (counts[1] == MOST_IN_ONE // 6).all()
-    assert len(observe(kept, "deflection").lead) == len(kept) // 2

@@ -36,8 +36,7 @@ from elastocal.diagnosis import (
 )
 from elastocal.diagnosis.discrimination import DRAWS, _hidden
 from elastocal.diagnosis.rivals import SETTINGS
-from elastocal.diagnosis.verdict import TOO_NEAR, TOO_NEAR_PROBABILITY
-from elastocal.measurements import Measurements, with_moves
+from elastocal.measurements import Measurements
 from elastocal.model import Model
 from elastocal.simulation import values_from
 from elastocal.simulation.simulate import simulate
@@ -138,38 +137,6 @@ def test_distance_is_that_of_dense_least_squares(base, pool, discrimination, cho
         assert squared[k] == pytest.approx(expected_square, rel=1e-3)
 
 
-def test_adding_each_candidate_is_as_adding_it_by_hand(discrimination) -> None:
-    each = discrimination.squared_with_each(discrimination.gram(CHOSEN))
-    for k in range(10):
-        direct = discrimination.squared(discrimination.gram((*CHOSEN, k)))
-        np.testing.assert_allclose(each[k], direct, rtol=1e-6, atol=1e-6)
-
-
-def test_more_visits_never_bring_rivals_nearer(discrimination) -> None:
-    before = discrimination.before
-    for n in range(1, 11):
-        after = discrimination.squared(discrimination.gram(range(n)))
-        assert (after >= before - 1e-6 * (1 + before)).all()
-        before = after
-
-
-def test_draws_have_the_mean_of_the_ridge_estimate(base, discrimination) -> None:
-    """Antithetic draws average to the estimate, which is nearer what is true than nothing is."""
-    posterior_draw = np.array([2e-4, -1e-4]) / 1e-4
-    estimate = discrimination.draws[0].mean(axis=0)
-    spread = discrimination.draws[0].std(axis=0)
-    assert (np.abs(estimate - posterior_draw) < 4 * spread).all()
-    opposite = discrimination.draws[0][:DRAWS] + discrimination.draws[0][DRAWS:]
-    np.testing.assert_allclose(opposite, np.tile(2 * estimate, (DRAWS, 1)))
-
-
-def test_without_visits_the_likeliest_is_named(discrimination) -> None:
-    assert expected([discrimination], ()) == pytest.approx(0.5, abs=1e-4)
-    merged = discrimination.in_classes(np.array([0, 1, 0]))
-    assert expected([merged], ()) == pytest.approx(0.7, abs=1e-4)
-    assert not discrimination.in_classes(np.zeros(3, dtype=np.int64)).open and merged.open
-
-
 def test_two_rivals_are_named_as_often_as_their_log_odds_are_right(discrimination) -> None:
     """P = Σ p_a P(log odds > 0) with log odds ~ N(±(L + δ²/2), δ²), by drawing them."""
     p = np.array([0.7, 0.3])
@@ -190,33 +157,6 @@ def test_two_rivals_are_named_as_often_as_their_log_odds_are_right(discriminatio
     assert two.probability(squared) == pytest.approx(p @ drawn, abs=2e-3)
     even = replace(two, rivals=replace(two.rivals, probability=np.array([0.5, 0.5])))
     assert even.probability(squared) == pytest.approx(stats.norm.cdf(delta / 2))
-
-
-def test_what_the_verdict_calls_alike_is_named_with_no_more_than_it_allows(discrimination) -> None:
-    """However the odds stand: a promise that the verdict cannot keep is none."""
-    p = np.array([0.5, 0.5])
-    two = replace(
-        discrimination,
-        rivals=replace(
-            discrimination.rivals, rivals=discrimination.rivals.rivals[:2], probability=p
-        ),
-        draws=discrimination.draws[:2], before=np.full((2, 2, 1), -40.0), classes=np.arange(2),
-    )  # fmt: skip
-    apart = 1 - np.eye(2)[:, :, None]
-    assert two.probability(0.99 * TOO_NEAR**2 * apart) == pytest.approx(TOO_NEAR_PROBABILITY)
-    assert two.probability(1.01 * TOO_NEAR**2 * apart) > 0.99
-
-
-def test_the_search_finds_the_best_pair_of_visits(discrimination) -> None:
-    """Addition and exchange against all pairs."""
-    pairs = [(i, j) for i in range(10) for j in range(i)]
-    errors = {
-        pair: float(discrimination.error_bound(discrimination.squared(discrimination.gram(pair))))
-        for pair in pairs
-    }
-    chosen = fewest([discrimination], 2)
-    assert len(chosen) == 2
-    assert errors[max(chosen), min(chosen)] <= min(errors.values()) * (1 + 1e-3)
 
 
 def test_the_plan_beats_random_visits(discrimination) -> None:
@@ -251,17 +191,3 @@ def test_markers_that_the_tracker_does_not_see_are_not_read(observe: str) -> Non
     arm: Any = SimpleNamespace(cell=rules.cell, chain=rules.chain, observe=observe)
     hidden = _hidden(arm, gantry_at((0.2, 0, 0), (0, 0.1, 0)), np.zeros((2, 3)), ("R", "L"))
     assert hidden.tolist() == [False, True] * 4
-
-
-def test_what_one_of_two_tables_lacks_both_lack(base: Baseline) -> None:
-    """Rows of a simulation know how the arm came to them; joined to others that do not, all take
-    it from their order or none."""
-    whole = base.observed.table
-    half = np.arange(len(whole)) < len(whole) // 2
-    first, second = whole.take(half), whole.take(~half)
-    bare = replace(first, move=None, direction=None)
-    assert joined(bare, with_moves(second)).move is None
-    both, known = joined(with_moves(first), replace(second, move=None)), with_moves(whole)
-    np.testing.assert_array_equal(both.move, known.move)
-    np.testing.assert_array_equal(both.direction, known.direction)
-    assert len(both) == len(whole) and both.q.shape == whole.q.shape
