@@ -128,55 +128,6 @@ def test_others_on_the_same_worker_are_not_blamed(tmp_path):
     assert list(numbers(tmp_path / "r")["task"]) == [0, 2, 3, 4, 5]
 
 
-def test_a_cluster_that_gets_its_workers_later(tmp_path):
-    folder, _ = marked(tmp_path, count=4)
-    told = []
-    with distributed.LocalCluster(
-        n_workers=0, threads_per_worker=1, processes=False, dashboard_address=":0"
-    ) as empty:
-        threading.Timer(1.5, empty.scale, (1,)).start()
-        ending = run_study(folder, tmp_path / "r", at(empty.scheduler_address, told=told))
-    assert ending.done == 4
-    assert told == ["the cluster has no worker; waiting for one"]
-
-
-def test_a_task_that_raises_fails_alone(cluster, tmp_path):
-    folder, _ = marked(tmp_path)
-    script = (
-        (folder / "study.py")
-        .read_text()
-        .replace("    time.sleep", "    k == 2 and 1 / 0\n    time.sleep")
-    )
-    write_study(folder, script)
-    ending = run_study(folder, tmp_path / "r", at(cluster.scheduler_address))
-    assert (ending.done, ending.failed) == (11, 1)
-    assert "line" in (tmp_path / "r" / "_failures.log").read_text("utf-8")
-
-
-def test_a_stop_waits_for_what_is_out_and_the_rest_runs_later(cluster, tmp_path):
-    folder, marks = marked(tmp_path, count=30)
-    stop = StudyStop()
-
-    def ask():
-        while len(list(marks.iterdir())) < 6:
-            time.sleep(0.01)
-        stop.asked = True
-
-    threading.Thread(target=ask, daemon=True).start()
-    first = run_study(folder, tmp_path / "r", at(cluster.scheduler_address, stop), stop=stop)
-    assert first.stopped and 6 <= first.done < 30
-    assert first.done == len(begun(marks))
-    second = run_study(folder, tmp_path / "r", at(cluster.scheduler_address))
-    assert (second.before, second.done) == (first.done, 30)
-    assert sorted(begun(marks)) == list(range(30))
-
-
-def test_a_cluster_in_the_configuration_of_dask(cluster, tmp_path):
-    folder, _ = marked(tmp_path, count=3)
-    with dask.config.set({"scheduler-address": cluster.scheduler_address}):
-        assert run_study(folder, tmp_path / "r", at("config")).done == 3
-
-
 def test_no_scheduler_is_told(monkeypatch):
     monkeypatch.setattr("elastocal.studies.study_run.ANSWER", 0.5)
     nothing = dask.config.set({"scheduler-address": None})
@@ -204,15 +155,6 @@ def test_no_scheduler_beyond_this_host_is_reached_in_the_clear(address, allowed)
         with pytest.raises(InputError, match="not encrypted, so whoever stands between"):
             Way().security(distributed, address)
         Way(unencrypted=True).security(distributed, address)
-
-
-def test_tls_files_reach_dask(tmp_path):
-    files = [tmp_path / name for name in ("ca.pem", "cert.pem", "key.pem")]
-    for path in files:
-        path.write_text("-----BEGIN")
-    found = Way(*files).security(distributed, "tls://far.away:9")
-    held = (found.tls_ca_file, found.tls_client_cert, found.tls_client_key)
-    assert held == tuple(map(str, files))
 
 
 def test_a_scheduler_that_goes_away_ends_the_run_and_keeps_what_is_done(tmp_path, monkeypatch):

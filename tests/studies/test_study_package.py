@@ -38,33 +38,6 @@ def result_of(study, sources=None):
     return execute(sources or study.sources, study.tasks[0])
 
 
-def test_a_part_that_changed_is_imported_anew(folder):
-    assert result_of(read_study(folder)).rows[0]["mean"] == 42
-    (folder / "study_part_of_test.py").write_text("FACTOR = 30  # another length\n")
-    assert result_of(read_study(folder)).rows[0]["mean"] == 630
-
-
-def test_two_studies_may_have_parts_of_one_name(folder, tmp_path):
-    other = write_study(tmp_path / "other", WITH_PARTS, TOML)
-    (other / "study_part_of_test.py").write_text("FACTOR = 3\n")
-    (other / "data").mkdir()
-    (other / "data" / "number.txt").write_text("1")
-    first, second = read_study(folder), read_study(other)
-    assert result_of(first).rows[0]["mean"] == 42
-    assert result_of(second).rows[0]["mean"] == 3
-
-
-def test_every_file_that_is_part_of_the_study_counts(folder):
-    digests = {read_study(folder).sources.digest}
-    for name in ("study.py", "study_part_of_test.py", "data/number.txt"):
-        with open(folder / name, "a") as handle:
-            handle.write(" ")
-        digests.add(read_study(folder).sources.digest)
-    assert len(digests) == 4
-    (folder / "notes.md").write_text("no part of it")
-    assert read_study(folder).sources.digest in digests
-
-
 def test_a_worker_without_the_folder_unpacks_it(folder, tmp_path, monkeypatch):
     study = read_study(folder)
     monkeypatch.setattr("elastocal.studies.study_folder._LOADED", {})

@@ -23,11 +23,8 @@ import worker
 from arm_data import ARMS
 from whole_columns import components, moments, scene_of
 from whole_draw import RANGES, draw_whole
-from whole_laws import CREEP, LAST_MOVE, LINES, WEIGHTS, creep, gear_error
-from whole_losses import losses, units
-from whole_oracle import Gap, Sights, gap_of, geometry_error, oracle_error, oracle_errors
-from whole_score import Name, score_parts
-from whole_search import Search, true_orders
+from whole_laws import CREEP, LAST_MOVE, LINES, WEIGHTS, gear_error
+from whole_oracle import Sights, oracle_errors
 from world_files import write_world
 
 
@@ -103,12 +100,6 @@ def test_columns_of_geometry_are_the_arms_own_derivatives():
         assert moved == pytest.approx(1e-6 * getattr(scene, name)[:, :, k], abs=1e-8)
 
 
-def test_the_oracle_knows_what_geometry_does_not(sights):
-    oracle = oracle_error(sights)
-    assert 1e-6 < oracle < 0.15 * geometry_error(sights)
-    assert oracle < 2.5 * sights.world.noise.level
-
-
 def test_the_oracle_errs_as_its_covariance_says():
     """Mean square of 12 arms, each with some hundred degrees of freedom of its own."""
     every = [oracle_errors(Sights.of(draw_whole((8, 7, k), "w", 40))) for k in range(12)]
@@ -116,63 +107,7 @@ def test_the_oracle_errs_as_its_covariance_says():
     assert np.mean(ratios**2) == pytest.approx(1.0, abs=0.2)
 
 
-def test_more_poses_tell_the_oracle_more():
-    few, many = (oracle_error(Sights.of(draw_whole((8, 4), "w", n))) for n in (60, 200))
-    assert many < 0.8 * few
-
-
-def test_an_oracle_who_searches_for_the_orders_stands_between_knowing_and_leaving_them_out():
-    search = Search(Sights.of(draw_whole((8, 6), "w", 60, arm="medium")))
-    true = true_orders(search.sights)
-    oracle, known, none = oracle_error(search.sights), search.error(true), search.error({})
-    assert 0.9 * oracle < known < 1.2 * oracle < none
-    for j in (0, 1):
-        others = {i: p for i, p in true.items() if i != j}
-        gains = search.gains(others, j, np.array([true[j], true[j] + 3.0]))
-        assert gains[0] > 10.0 > gains[1]
-
-
-def test_what_is_left_out_costs_what_it_would_have_brought():
-    """With all that there is named, an oracle with sags of each joint's own is left; without the
-    lines of joint 1, they are the worst loss."""
-    sights = Sights.of(draw_whole((8, 9), "w", 60, arm="medium"))
-    names = {"lines": "gear_spectrum", "eccentricity": "gear_eccentricity", "sag": "gravity_sag",
-             "move": "move_lag", "creep": "base_drift"}  # fmt: skip
-    every = [{"effect": names[kind], "where": where} for kind, where in units(sights)]
-    all_named, nothing = losses(sights, {"effects": every})
-    assert not nothing and all_named < 1.5 * oracle_error(sights)
-    first = {"effect": "gear_spectrum", "where": "joint1"}
-    error, left = losses(sights, {"effects": [e for e in every if e != first]})
-    ((fall, unit),) = left
-    assert unit == ("lines", "joint1") and error > all_named
-    assert fall == pytest.approx(np.sqrt(error**2 - all_named**2))
-
-
-def test_shares_of_the_gap_sum_to_one_and_its_strengths_nearly(sights):
-    gap = gap_of(sights)
-    assert gap.share(gap.parts) == pytest.approx(1.0)
-    assert sum(gap.share([part]) for part in gap.parts) == pytest.approx(1.0)
-    assert sum(gap.strength([part]) for part in gap.parts) == pytest.approx(1.0, abs=0.5)
-    J = sights.world.spec.skeleton.n_joints
-    assert len(gap.parts) == 3 * J + 1
-    assert gap.strength([("gravity", "joint1")]) < 1e-3  # its axis is vertical
-
-
-def test_the_creep_is_correlated_over_its_length_and_as_large_as_drawn():
-    sizes, apart = [], []
-    for k in range(60):
-        (e,) = (e for e in draw_whole((8, 5, k), "w", 2).effects if e.name == CREEP)
-        moved = creep(e, np.array([0.0, e.settings["length_s"]]))
-        sizes.append(moved[:, 0] ** 2)
-        apart.append(moved[0, 0] * moved[1, 0])
-    assert RANGES.shift[0] < np.sqrt(np.mean(sizes)) < RANGES.shift[1]
-    assert np.mean(apart) / np.mean(sizes) == pytest.approx(np.exp(-0.5), abs=0.25)
-
-
 # --- scores -----------------------------------------------------------------------------------
-
-PARTS = (("angle", "joint1"), ("angle", "joint2"), ("gravity", "joint2"), ("time", "base"))
-GAP = Gap(PARTS, np.diag([0.3, 0.1, 0.6 - 1e-5, 1e-5]) * 1e-8, 1e-4)
 
 
 def component(family, where, share, half=0.05, **more):
@@ -180,52 +115,6 @@ def component(family, where, share, half=0.05, **more):
         "family": family, "where": where, "share": share, "probability": 0.9,
         "share_ci90": [share - half, share + half], "effect": None,
     } | more  # fmt: skip
-
-
-def scored(*parts, effects=()):
-    return score_parts(GAP, {"components": list(parts), "effects": list(effects)})
-
-
-def test_a_share_holds_where_its_interval_holds_the_truth():
-    found = scored(component("angle", "joint1", 0.33), component("angle", "joint2", 0.2))
-    assert [s.held for s in found.shares] == [True, False]
-    assert found.missed == ("gravity:joint2",)
-
-
-def test_what_acts_by_load_is_one_kind_and_adds_up():
-    parts = (component("torque", "joint2", 0.25), component("gravity", "link2", 0.3))
-    (share,) = scored(*parts).shares
-    assert share.stated == pytest.approx(0.55) and share.true == pytest.approx(0.6, abs=1e-4)
-    assert share.high - share.stated == pytest.approx(0.05 * np.sqrt(2))
-
-
-def test_one_finding_may_stand_for_all_joints():
-    found = scored(component("angle", "", 0.4), component("gravity", "all", 0.6))
-    assert all(s.held for s in found.shares) and not found.missed
-
-
-def test_names_that_an_arm_does_not_have_are_wrong_and_curves_are_none():
-    found = scored(
-        component("angle", "joint1", 0.3, effect="gear_ripple"),
-        component("angle", "joint2", 0.1, effect="joint_curve"),
-        component("load", "joint2", 0.6, effect="gravity_compensator"),
-        component("time", "base", 0.01),
-        component("move", "joint1", 0.01),
-        component("angle", "joint2", 0.1, probability=0.2),
-        effects=[{"effect": "gear_ripple", "where": "joint1"},
-                 {"effect": "payload_error", "where": "load"}],
-    )  # fmt: skip
-    assert [(n.name, n.right) for n in found.names] == [
-        ("gear_ripple:joint1", True), ("gravity_compensator:joint2", False),
-        ("time:base", False), ("move:joint1", False), ("payload_error:load", False),
-    ]  # fmt: skip
-    assert not Name("gravity:joint3", 0.0, True).right
-
-
-def test_an_answer_without_components_has_no_shares():
-    found = score_parts(GAP, {"effects": [{"effect": "gear_eccentricity", "where": "joint2"}]})
-    assert not found.shares and [n.right for n in found.names] == [True]
-    assert found.missed == ("angle:joint1", "angle:joint2", "gravity:joint2")
 
 
 # --- the study --------------------------------------------------------------------------------
