@@ -65,60 +65,6 @@ def test_a_fit_beside_its_peers_ends_at_the_arm(
     assert found["parameters"] >= 25
 
 
-def test_an_exponent_is_the_slope_of_the_logarithms(bench) -> None:
-    x = np.array([1e3, 1e4, 1e6])
-    assert bench["bench_clock"].exponent(x, 3e-7 * x**1.3) == pytest.approx(1.3)
-
-
-@pytest.mark.parametrize(
-    ("value", "text"),
-    [(0.000123, "1.23e-04"), (0.0123, "0.0123"), (1.234, "1.23"), (12.34, "12.3"), (1234.5, "1234"),
-     (0.0, "0"), (None, "–"), (300, "300"), ("numpy", "numpy"), (9.999, "10.00")],
-)  # fmt: skip
-def test_numbers_have_three_digits(bench, value, text: str) -> None:
-    assert bench["bench_part"].number(value) == text
-
-
-def test_what_is_kept_reads_back_and_goals_have_their_direction(bench, tmp_path: Path) -> None:
-    import json
-    from dataclasses import asdict
-
-    module = bench["bench_part"]
-    part = module.Part("a", "A", [module.Table("t", ["x", "y"], [[1, 0.5], ["b", None]])])
-    part.goal("at most 2", 2.5, 2.0, "s")
-    part.goal("at least 10", 15.0, 10.0, "times", least=True)
-    assert [g.met for g in part.goals] == [False, True]
-    path = tmp_path / "a.json"
-    path.write_text(json.dumps(asdict(part)))
-    assert module.read_part(path) == part
-
-
-def test_only_what_stands_between_the_marks_of_the_page_is_written(
-    bench, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    run = bench["run"]
-    page = tmp_path / "performance.md"
-    page.write_text(f"before\n{run.BEGIN}\nold\n{run.END}\nafter\n")
-    monkeypatch.setattr(run, "PAGE", page)
-    monkeypatch.setattr(run, "KEPT", tmp_path)
-    monkeypatch.setattr(run, "FIGURE", tmp_path / "none.png")
-    run.page()
-    text = page.read_text()
-    assert text.startswith(f"before\n{run.BEGIN}\n") and text.endswith(f"{run.END}\nafter\n")
-    assert "old" not in text and "| goal |" in text
-    kept = Path(__file__).parents[1] / "docs" / "performance.md"
-    assert run.BEGIN in kept.read_text("utf-8") and run.END in kept.read_text("utf-8")
-
-
-def test_memory_is_the_commands_own(bench) -> None:
-    """A parent's memory is not counted: a child of this process starts with its peak."""
-    held = np.ones(40_000_000)  # 320 MB
-    ran = bench["bench_clock"].process([sys.executable, "-c", "print('done')"])
-    assert held.sum() == len(held)
-    assert (ran.code, ran.out.strip()) == (0, "done")
-    assert ran.peak_mb < 100
-
-
 @pytest.mark.long
 @pytest.mark.parametrize("part", ["evaluation", "scaling", "startup", "diagnosis"])
 def test_every_part_runs_in_tiny(part: str, tmp_path: Path) -> None:

@@ -15,10 +15,8 @@ from elastocal.config import (
     Vector3,
     checked,
     key,
-    numbers,
     read_toml,
     required,
-    tables_in,
 )
 from elastocal.errors import InputError
 
@@ -88,20 +86,3 @@ def test_a_file_beyond_its_bound_is_refused(tmp_path):
 def test_a_vector_is_three_finite_numbers(value):
     with pytest.raises(InputError, match="place_m takes three numbers in m"):
         checked(Cart, {"place_m": value}, "cart")
-
-
-def test_one_number_may_stand_for_all():
-    class Sizes(Table):
-        size: Annotated[object, numbers(3, above=0, one_for_all=True)] = required("a size")
-
-    assert checked(Sizes, {"size": 2}, "sizes").size.tolist() == [2.0, 2.0, 2.0]
-    with pytest.raises(InputError):
-        checked(Sizes, {"size": 0}, "sizes")
-
-
-def test_tables_are_found_in_lists_and_unions():
-    fields = Cart.model_fields
-    assert tables_in(fields["wheel"].annotation) == [(Wheel, True)]
-    assert tables_in(fields["part"].annotation) == [(Wheel, False)]
-    assert tables_in(fields["spare"].annotation) == [(Wheel, True)]
-    assert tables_in(fields["place_m"].annotation) == []

@@ -11,9 +11,6 @@ import pytest
 from elastocal import tables
 from elastocal.errors import InputError
 from elastocal.measurements import (
-    firsts,
-    numbered,
-    ranked,
     read_measurements,
     write_measurements,
 )
@@ -108,14 +105,6 @@ def test_every_column_arrives_in_si_units(read):
     assert got.repeat.tolist() == [3]
 
 
-@pytest.mark.parametrize("unit", ["um", "mm", "m"])
-def test_cartesian_sigmas_in_any_length_unit(read, unit):
-    names = ",".join(f"sigma_{axis}_{unit}" for axis in "xyz")
-    got = read(extended(names, "1,2,3"))
-    assert got.sigma_frame == "cartesian"
-    assert np.allclose(got.sigma, np.array([[1, 2, 3]]) * {"um": 1e-6, "mm": 1e-3, "m": 1}[unit])
-
-
 def test_labels_are_text_coded_in_order_of_first_appearance(read):
     rows = ["b,1," + ROW, "a,01," + ROW, "b,01," + ROW]
     got = read(table(*rows, header="configuration,marker," + HEADER))
@@ -125,22 +114,12 @@ def test_labels_are_text_coded_in_order_of_first_appearance(read):
     assert got.marker_names == ("1", "01")
 
 
-def test_labels_that_look_like_numbers_stay_as_written(read):
-    labels = ("00", "0", "01", "1.0", "1e3")
-    got = read(table(*(f"{label},{ROW}" for label in labels), header="configuration," + HEADER))
-    assert got.configuration_labels == labels
-
-
 def test_markers_are_coded_in_the_cells_order_and_all_named(read):
     got = read(
         table("C," + ROW, "A," + ROW, header="marker," + HEADER), marker_names=("A", "B", "C")
     )
     assert got.marker_names == ("A", "B", "C")
     assert got.marker.tolist() == [2, 0]
-
-
-def test_the_only_marker_of_the_cell_is_the_default(read):
-    assert read(table(ROW), marker_names=("ball",)).marker_names == ("ball",)
 
 
 def test_several_markers_need_a_marker_column(refusal):
@@ -171,13 +150,6 @@ def test_quaternions_become_rotation_vectors(read, quaternion, vector):
 def test_semicolon_and_tab_tables_may_use_decimal_commas(read, delimiter, mark):
     text = table("1,2,3.25,4,5").replace(",", delimiter).replace(".", mark)
     assert read(text).position.tolist() == [[0.00325, 0.004, 0.005]]
-
-
-def test_byte_order_mark_windows_line_ends_blank_lines_and_blanks_are_understood(read):
-    text = "\ufeff" + table("a , 1 , 2, 3 ,4,5", "", "  ", "b,1,2,3,4,5", header="marker," + HEADER)
-    got = read(text.replace("\n", "\r\n").encode() + b"\r\n\r\n")
-    assert got.marker_names == ("a", "b")
-    assert got.row.tolist() == [2, 5]
 
 
 def test_quoted_labels_may_hold_the_delimiter(read):
@@ -291,15 +263,6 @@ def test_bad_cell_is_told_with_line_column_and_text(refusal, cell, told):
     assert told in message
 
 
-def test_a_column_of_truth_values_is_not_read_as_ones(refusal):
-    assert "'True' is not a number" in refusal(table("1,2,3,4,True"))
-    assert "line 3, column x_mm: 'FALSE'" in refusal(table(ROW, "1,2,FALSE,4,5"))
-
-
-def test_the_line_told_counts_blank_lines(refusal):
-    assert "line 5, column z_mm" in refusal(table(ROW, "", "", "1,2,3,4,x"))
-
-
 @pytest.mark.parametrize("row", ["1,5;2;3;4;1.5", "1.234,5;2;3;4;5", "1,234.5;2;3;4;5"])
 def test_mixed_decimal_marks_and_thousands_separators_are_never_guessed(refusal, row):
     assert "line 2" in refusal(table(row, header=HEADER.replace(",", ";")))
@@ -310,14 +273,6 @@ def test_decimal_marks_must_agree_throughout_the_file(refusal):
     message = refusal(table("1;2;3;4;5,5", "1;2;3;4;6.5", header=header))
     assert "line 2, column z_mm: '5,5'" in message
     assert "line 3, column z_mm: '6.5'" in message
-
-
-def test_wrong_number_of_fields_is_told_for_decimal_commas_too(refusal):
-    message = refusal(table(ROW, "1,2,3,4,5,6,7"))
-    assert "line 3 has 7 fields, header has 5" in message
-    assert "';'" in message
-    assert "line 2 has 4 fields, header has 5" in refusal(table("1,2,3,4"))
-    assert "line 2 has 4 fields" in refusal(table('1,2,3,"4,5"'))
 
 
 @pytest.mark.parametrize(
@@ -457,14 +412,6 @@ def test_a_table_read_in_pieces_is_the_same_table(read, small_chunks):
     assert got.position[:, 0].tolist() == [0, 0, 0.0005, 0.0005]
 
 
-@pytest.mark.parametrize(("first", "second"), [("1.5", "2,5"), ("1,5", "2.5")])
-def test_mixed_decimal_marks_are_found_across_pieces(refusal, small_chunks, first, second):
-    header = HEADER.replace(",", ";")
-    message = refusal(table(f"1;2;3;4;{first}", "1;2;3;4;7", f"1;2;3;4;{second}", header=header))
-    assert f"line 2, column z_mm: '{first}'" in message
-    assert f"line 4, column z_mm: '{second}'" in message
-
-
 def test_more_rows_than_any_campaign_has_are_refused(refusal, small_chunks, monkeypatch):
     monkeypatch.setattr(tables, "MAX_ROWS", 3)
     assert "more than 3 rows" in refusal(table(*(f"{i},2,3,4,5" for i in range(9))))
@@ -537,23 +484,3 @@ def test_what_cannot_be_read_back_is_not_written(read, tmp_path):
     with pytest.raises(InputError, match="does not exist"):
         write_measurements(got, tmp_path / "absent" / "out.csv")
     assert os.listdir(tmp_path) == ["data.csv"]
-
-
-@pytest.mark.parametrize("low, high", [(-5, 6), (10**9, 10**9 + 40), (-(10**12), 10**12)])
-def test_codes_are_ranked_as_sorting_ranks_them(low, high):
-    """Close ones by a mask, others and numbers that are not whole by sorting."""
-    codes = np.random.default_rng(3).integers(low, high, 50)
-    different, first, number = np.unique(codes, return_index=True, return_inverse=True)
-    assert np.array_equal(ranked(codes), number)
-    assert np.array_equal(ranked(codes / 7), number)
-    assert np.array_equal(firsts(number, len(different)), first)
-    assert firsts(number, len(different) + 1)[-1] == len(codes)
-
-
-def test_rows_are_numbered_by_their_combination_of_values():
-    """As numpy numbers whole rows, −0 being 0, at any size of the values."""
-    rng = np.random.default_rng(0)
-    table = rng.integers(-2, 3, (400, 4)) * np.array([1.0, -0.0, 1e9, 1e-6])
-    expected = np.unique(table, axis=0, return_inverse=True)[1].ravel()
-    assert np.array_equal(numbered(*table.T), expected)
-    assert len(numbered(np.zeros(0))) == 0

@@ -2,14 +2,11 @@
 
 import json
 import math
-import subprocess
-import sys
 
-import numpy as np
 from hypothesis import given
 from hypothesis import strategies as st
 
-from elastocal.tables import NUMBER, csv_text
+from elastocal.tables import NUMBER
 from elastocal.text import cell_meaning, cell_text, gathered, is_label, json_text, printable
 
 ANYTHING = st.recursive(
@@ -36,19 +33,6 @@ def test_strict_json_that_reads_back_with_null_where_there_is_no_number(value):
     assert read == without_numbers_that_are_none(value)
 
 
-def test_numpy_numbers_and_arrays_are_plain_ones():
-    value = {"a": np.array([[1.0, np.nan], [np.inf, 2.5]]), "n": np.int64(3), "t": np.bool_(True),
-             "x": np.float64("-inf"), "both": (np.float32(0.5), 1)}  # fmt: skip
-    assert json.loads(json_text(value)) == {
-        "a": [[1.0, None], [None, 2.5]], "n": 3, "t": True, "x": None, "both": [0.5, 1],
-    }  # fmt: skip
-
-
-def test_it_loads_no_numpy_as_the_help_texts_come_by_it():
-    program = "import sys, elastocal.text; sys.exit('numpy' in sys.modules)"
-    assert subprocess.run([sys.executable, "-c", program]).returncode == 0
-
-
 CELLS = st.text(st.sampled_from("=+-@'1.5e,ab \u202e\x1bµ"))
 
 
@@ -58,14 +42,6 @@ def test_no_cell_of_text_is_a_formula_and_each_is_read_back(text):
     assert NUMBER.fullmatch(written) or not written.startswith(("=", "+", "-", "@"))
     assert cell_meaning(written) == printable(text)
     assert not is_label(text) or printable(text) == text
-
-
-def test_a_table_of_names_and_numbers_keeps_the_numbers():
-    rows = [["=1+1", "-2.5", -2.5], ["@x", "+1e3", 1e3], ["'=y", "-x", 0]]
-    text = csv_text(["=name", "a", "b"], rows, ["made of \x1b]0;x"])
-    assert text.splitlines() == [
-        "# made of \\x1b]0;x", "'=name,a,b", "'=1+1,-2.5,-2.5", "'@x,+1e3,1000.0", "''=y,'-x,0",
-    ]  # fmt: skip
 
 
 def test_parameters_alike_are_told_together():

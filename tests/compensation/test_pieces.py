@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import csv
 import io
-from dataclasses import replace
 
 import numpy as np
 import pytest
@@ -20,7 +19,6 @@ from elastocal.measurements import read_plan
 from elastocal.model import share_of_levels, tool_point
 
 KINDS = ("revolute",) * 6
-JOINTS = "q1_deg,q2_deg,q3_deg,q4_deg,q5_deg,q6_deg"
 POSE = np.radians([[10, -80, 90, 30, 50, -20]])
 
 
@@ -35,19 +33,6 @@ def test_shares_interpolate_between_levels(levels, angle) -> None:
     # Shares of a linear function of the level give that function, clamped at the ends.
     assert np.isclose(share @ values, np.clip(angle, values.min(), values.max()))
     assert np.count_nonzero(share) <= 2
-
-
-def test_points_are_named_or_given() -> None:
-    cell = kr270_cell()
-    assert tool_point(cell, None).marker is None
-    assert tool_point(cell, "M2").marker == "M2"
-    assert np.array_equal(tool_point(cell, "0.1,-0.2,0.3").place, [0.1, -0.2, 0.3])
-    for text, told in (("M9", "did you mean"), ("1,2", "x,y,z in m"), ("200,0,0", "10 m")):
-        with pytest.raises(InputError, match=told):
-            tool_point(cell, text)
-    bare = replace(cell, tool=replace(cell.tool, load_point=np.zeros(3)))
-    with pytest.raises(InputError, match="`point`"):
-        tool_point(bare, None)
 
 
 @pytest.mark.parametrize(
@@ -69,16 +54,6 @@ def test_tables_that_say_no_target_are_refused(tmp_path, text, told) -> None:
     path.write_text(text)
     with pytest.raises(InputError, match=told):
         read_targets(path, KINDS, "base")
-
-
-def test_joints_alone_are_targets_of_the_base_frame(tmp_path) -> None:
-    path = tmp_path / "targets.csv"
-    path.write_text(f"{JOINTS}\n1,2,3,4,5,6\n1,2,3,4,5,6\n")
-    targets = read_targets(path, KINDS, "base", np.array([0.0, 0.0, -5.0]))
-    assert targets.position is None and len(targets) == 2  # a path may pass a place twice
-    assert np.array_equal(targets.table.force[1], [0, 0, -5])
-    with pytest.raises(InputError, match="base frame"):
-        read_targets(path, KINDS, "tracker")
 
 
 @settings(max_examples=60, deadline=None)

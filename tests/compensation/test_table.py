@@ -10,7 +10,7 @@ from scipy.spatial.transform import Rotation
 from support.cells import DOWN, kr270_cell, kr270_chain
 from support.commands import calibrated, erring, tool_errors
 
-from elastocal.compensation import CorrectionGrid, box_grid, joint_grid, targets_at
+from elastocal.compensation import CorrectionGrid, joint_grid, targets_at
 from elastocal.compensation.compensate import compensate
 from elastocal.compensation.correction_table import EXACT, correction_table
 from elastocal.errors import InputError
@@ -53,28 +53,6 @@ def test_corrected_targets_are_reached_by_the_nominal_arm() -> None:
     real = compensate(arm, targets_at("t", None, None, "base", DOWN, q=found.points), point)
     miss, turn = tool_errors(arm, replace(real, q=controller.q))
     assert miss.max() < 1e-7 and turn.max() < 1e-7
-
-
-def test_a_finer_grid_leaves_less_between_its_points() -> None:
-    arm, point = arm_and_point()
-    errors = []
-    for counts in ((2, 2, 2, 1, 1, 1), (4, 4, 4, 1, 1, 1)):
-        found = correction_table(arm, joint_box(counts), point, DOWN)
-        assert len(found.between) == 512
-        errors.append(np.sqrt(np.mean(found.between[:, 0] ** 2)))
-    before = np.sqrt(np.mean(found.before[:, 0] ** 2))
-    # A third of the step, a ninth of what linear interpolation leaves.
-    assert errors[1] < errors[0] / 5 and errors[0] < before / 5
-
-
-def test_a_box_with_one_rotation() -> None:
-    arm, point = arm_and_point()
-    T = nominal_flanges(arm.model.chain, np.radians([[0, -90, 80, 0, 60, 0]]))[0]
-    centre = T[:3, 3] + T[:3, :3] @ arm.model.cell.tool.markers["M1"]
-    grid = box_grid(centre - 0.1, centre + 0.1, (3,), T[:3, :3])
-    found = correction_table(arm, grid, point, DOWN, near=np.radians([0, -90, 80, 0, 60, 0]))
-    assert len(found.points) == 27 and set(found.status) == {EXACT}
-    assert found.between[:, 0].max() < found.before[:, 0].max() / 20
 
 
 @pytest.mark.parametrize(

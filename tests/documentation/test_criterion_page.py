@@ -11,7 +11,7 @@ import pytest
 from support.design_cells import plan_cell
 
 from elastocal.errors import InputError
-from elastocal.planning import DesignOptions, make_criterion, register
+from elastocal.planning import DesignOptions, register
 from elastocal.planning.criteria import CRITERIA
 from elastocal.planning.design import design
 from elastocal.report.plan_view import plan_lines
@@ -66,22 +66,6 @@ def test_the_example_without_a_bound_plans_by_exchange_alone(own, cell):
     assert plan.certificate.efficiency_pool is plan.bound_reported is None
     (line,) = re.findall(r"^    Certificate: (none: .*)$", PAGE.read_text("utf-8"), re.M)
     assert dict(plan_lines(plan))["Certificate"] == line
-
-
-def test_the_example_without_a_bound_is_the_geometric_mean_of_two(own):
-    own("own_shape", UNBOUNDED)
-    M = np.diag([1.0, 4.0, 9.0])[None] + 0.5
-    made = {
-        name: make_criterion(name, parameters=3, interest=np.arange(3))
-        for name in ("volume_and_axis", "D", "E")
-    }
-    phi = {name: float(criterion.value(M)) for name, criterion in made.items()}
-    assert phi["volume_and_axis"] == pytest.approx(np.sqrt(phi["D"] * phi["E"]), rel=1e-12)
-    G = made["volume_and_axis"].gradient(M).G
-    step = np.diag([0.3, -0.2, 0.1])[None] + 0.1
-    value = made["volume_and_axis"].value
-    slope = (float(value(M + 1e-5 * step)) - float(value(M - 1e-5 * step))) / 2e-5
-    assert -np.sum(G * step) == pytest.approx(slope, rel=1e-7)
 
 
 def test_a_parameter_that_the_poses_do_not_show_is_named(own, cell):

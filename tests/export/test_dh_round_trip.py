@@ -85,19 +85,6 @@ def test_numbers_that_calibration_leaves_alone_are_the_users(format: str, tmp_pa
         assert all(float(rows[i][k]) == float(nominal[i][k]) for k in ("theta0_rad", "d_m", "a_m"))
 
 
-def test_nearly_parallel_axes_keep_their_lengths_by_beta(tmp_path: Path) -> None:
-    (tmp_path / "dh.csv").write_text(DH)
-    written = write_result(tmp_path, 'dh = "dh.csv"', GEOMETRY)
-    rows = check(*written, "dh")
-    second = next(row for row in rows if row["joint"] == "a2")
-    assert float(second["beta_rad"]) != 0.0 and float(second["d_m"]) == 0.0
-    assert abs(float(second["a_m"]) - 0.6) < 5e-3
-    _, done = exported(*written, "dh")
-    # Dropping an angle of a milliradian at arms of a metre costs tenths of a millimetre and more.
-    assert done.without_beta is not None and 1e-5 < done.without_beta < 1e-2
-    assert f"{done.without_beta * 1e6:.3g} um" in done.text
-
-
 @given(
     st.tuples(*[st.floats(-1, 1)] * 3),
     st.tuples(*[st.floats(-3, 3)] * 3),

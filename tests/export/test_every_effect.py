@@ -99,26 +99,6 @@ def test_it_is_accounted_for(name: str, elastic: bool) -> None:
     assert evaluate_pieces(kept.exported, CONDITIONS).chain.n_joints == 6
 
 
-def test_values_that_no_spring_has_leave_the_effect_out_with_its_cost() -> None:
-    arm = calibrated("gravity_compensator")
-    x = arm.x.copy()
-    x[list(arm.model.names).index("joint2.compensator_stiffness")] = -1e5
-    kept = keep(replace(arm, x=x), True, CONDITIONS)
-    (omission,) = kept.omissions
-    assert omission.effect == "gravity_compensator"
-    assert "negative" in omission.note
-    assert cost_of(kept, 8, seed=0).total.flange_max > 1e-6
-
-
-def test_measured_torques_give_way_to_those_of_the_load() -> None:
-    arm = calibrated("joint_offset")
-    spec = replace(arm.model.cell.model, torque="measured", link_gravity=False)
-    measured = Model.assembled(arm.model.chain, replace(arm.model.cell, model=spec))
-    kept = keep(replace(arm, model=measured), True, CONDITIONS)
-    assert kept.full.model.cell.model.torque == "computed"
-    assert cost_of(kept, 4, seed=0).total.flange_max == 0.0
-
-
 def test_linear_deflections_are_held_at_the_deflected_pose_and_that_costs() -> None:
     arm = calibrated("joint_offset")
     spec = replace(arm.model.cell.model, deflection_model="linear")

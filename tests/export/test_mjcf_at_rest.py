@@ -7,7 +7,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from support.exports import DH, LOAD, SPRINGS, exported, flanges_in_base, poses_of, write_result
+from support.exports import LOAD, SPRINGS, exported, flanges_in_base, poses_of, write_result
 from support.robots import KR270, packaged_urdf, random_chain_urdf
 
 from elastocal.export import Frames, MujocoRest
@@ -38,14 +38,6 @@ def check_rest(cell: Path, result: Path, force=LOAD, poses: int = 5) -> str:
 
 @pytest.mark.parametrize("name", ["UR5", "iiwa14", "KR210"])
 def test_packaged_robots(name: str, tmp_path: Path) -> None:
-    path, flange = packaged_urdf(name)
-    robot = f'urdf = "{path}"' + (f'\nflange = "{flange}"' if flange else "")
-    check_rest(*write_result(tmp_path, robot))
-
-
-@pytest.mark.long
-@pytest.mark.parametrize("name", ["UR10", "Panda", "IRB140"])
-def test_more_packaged_robots(name: str, tmp_path: Path) -> None:
     path, flange = packaged_urdf(name)
     robot = f'urdf = "{path}"' + (f'\nflange = "{flange}"' if flange else "")
     check_rest(*write_result(tmp_path, robot))
@@ -94,14 +86,6 @@ def test_slides_and_branches(seed: int, tmp_path: Path) -> None:
     (tmp_path / "arm.urdf").write_text(random_chain_urdf(seed))
     robot = 'urdf = "arm.urdf"\nbase = "base"\nflange = "flange"'
     check_rest(*write_result(tmp_path, robot, model="link_gravity = true", seed=seed))
-
-
-def test_an_arm_of_a_dh_table_with_masses(tmp_path: Path) -> None:
-    (tmp_path / "dh.csv").write_text(DH)
-    rows = [f"{i},{30 - 4 * i},0.01,{0.02 * i},-0.03" for i in range(1, 7)]
-    (tmp_path / "m.csv").write_text("\n".join(["link,mass_kg,com_x_m,com_y_m,com_z_m", *rows]))
-    robot = 'dh = "dh.csv"\nmasses = "m.csv"'
-    check_rest(*write_result(tmp_path, robot, model="link_gravity = true"))
 
 
 def test_in_the_trackers_frame_the_arm_stands_where_it_was_identified(tmp_path: Path) -> None:
@@ -166,27 +150,6 @@ def test_the_nominal_arm_has_the_inertia_of_its_urdf(tmp_path: Path) -> None:
         mujoco.mj_fullM(model, data, found)
         expected = pin.crba(own, own.createData(), q) + np.diag(model.dof_armature)
         assert np.abs(found - expected).max() < 1e-6 * np.abs(expected).max()
-
-
-def test_limits_bound_what_is_commanded(tmp_path: Path) -> None:
-    written = write_result(tmp_path, f'urdf = "{KR270}"')
-    calibrated, done = exported(*written, "mjcf")
-    model = mujoco.MjModel.from_xml_string(done.text)
-    joints = calibrated.model.chain.joints
-    wanted = [(joint.lower, joint.upper) for joint in joints]
-    assert np.array_equal(model.actuator_ctrlrange[:6], wanted)
-    assert not model.jnt_limited.any()
-
-
-def test_a_joint_without_compliance_is_rigid_and_said_so(tmp_path: Path) -> None:
-    written = write_result(
-        tmp_path,
-        f'urdf = "{KR270}"',
-        value=lambda p: 0.0 if p.name == "joint1.compliance" else None,
-    )
-    _, done = exported(*written, "mjcf", LOAD)
-    assert any("joint1: rigid" in warning for warning in done.warnings)
-    assert any("weigh nothing" in warning for warning in done.warnings)
 
 
 def test_what_no_spring_does_is_left_out_with_its_cost(tmp_path: Path) -> None:

@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 from hypothesis import given
 from hypothesis import strategies as st
-from support.exports import GEOMETRY, LOAD, SPRINGS, exported, write_result
+from support.exports import LOAD, exported, write_result
 from support.robots import KR270
 
 from elastocal.export import Conditions, Wish, to_yaml
@@ -85,30 +85,6 @@ def test_a_gear_error_costs_what_it_moves(tmp_path: Path) -> None:
     assert done.cost.total.flange_rms == pytest.approx(np.sqrt(np.mean(off**2)), rel=2e-3)
 
 
-def test_a_rigid_file_costs_the_deflection_and_none_without_load(tmp_path: Path) -> None:
-    written = write_result(tmp_path, ROBOT)
-    _, loaded = exported(*written, "urdf", LOAD)
-    _, unloaded = exported(*written, "urdf")
-    (entry,) = loaded.cost.effects
-    assert entry.effect == "joint_compliance" and entry.difference == loaded.cost.total
-    assert loaded.cost.total.flange_rms > 1e-5
-    assert unloaded.cost.total.flange_max == 0.0
-    assert any("`load`" in warning for warning in unloaded.warnings)
-
-
-def test_levels_of_a_joint_are_held_by_their_mean(tmp_path: Path) -> None:
-    def value(p):
-        return float(p.name[-1]) * 1e-7 if "level" in p.name else None
-
-    model = "[model.compliance_levels]\njoint2_deg = [-10, -60, -120]"
-    written = write_result(tmp_path, ROBOT, ["joint_compliance"], model, value=value)
-    _, done = exported(*written, "mjcf", LOAD)
-    (entry,) = done.cost.effects
-    assert entry.effect == "levels of a joint" and entry.difference == done.cost.total
-    assert done.cost.total.flange_max > 1e-6
-    assert f'kp="{1 / 2e-7!r}"' in done.text or 'kp="5000000' in done.text
-
-
 def test_temperature_is_frozen_into_the_lengths_where_it_is_stated(tmp_path: Path) -> None:
     written = write_result(
         tmp_path,
@@ -127,18 +103,3 @@ def test_temperature_is_frozen_into_the_lengths_where_it_is_stated(tmp_path: Pat
     forearm = read_urdf(tmp_path / "warm.urdf").joints[2].placement
     assert forearm[0, 3] == pytest.approx(1.25 * (1 + 12e-6 * 10), rel=1e-15)
     assert "at 30 °C" in warm.text
-
-
-def test_what_belongs_to_the_instrument_is_no_cost_of_the_arm(tmp_path: Path) -> None:
-    written = write_result(tmp_path, ROBOT, [*SPRINGS, "tracker_distortion"])
-    _, done = exported(*written, "mjcf", LOAD)
-    assert done.of_the_measurement == ("tracker_distortion",)
-    assert done.cost.total.flange_max == 0.0
-
-
-def test_the_same_seed_gives_the_same_answer(tmp_path: Path) -> None:
-    written = write_result(tmp_path, ROBOT, [*GEOMETRY, "backlash", "hysteresis"])
-    once, again = (exported(*written, "urdf", LOAD)[1].to_json() for _ in range(2))
-    assert once == again
-    effects = {e["effect"] for e in once["cannot_hold"]["effects"]}
-    assert effects == {"backlash", "hysteresis"}

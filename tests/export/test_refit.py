@@ -5,8 +5,6 @@ from __future__ import annotations
 
 import csv
 import json
-import re
-from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -26,8 +24,6 @@ from elastocal.export import (
     read_joint_correction,
 )
 from elastocal.export.export import export as to_text
-
-mujoco = pytest.importorskip("mujoco")
 
 HELD = ("base_frame", "joint_offset", "link_geometry", "marker_position", "joint_compliance")
 LACKED = (
@@ -161,29 +157,6 @@ def test_rigid_files_are_fitted_to_the_loads_measured_or_the_one_asked_for(folde
     assert "fitted where it was measured, under 1500 to 1500 N" in (
         folder / f"loaded.{ending}"
     ).read_text(encoding="utf-8")
-
-
-def test_the_function_shown_is_that_of_the_library(folder, monkeypatch, capsys):
-    page = (Path(__file__).parents[2] / "docs" / "exporting.md").read_text(encoding="utf-8")
-    example = re.findall(r"```python\n(.*?)```", page, re.S)[1]
-    export(folder, "full", "calibrated.xml", "--joint-correction", folder / "joints.csv")
-    monkeypatch.chdir(folder)
-    names: dict = {}
-    exec(example, names)
-    q, side = [0.4, -1.0, 1.0, 0.2, 0.5, 0.1], [1, 1, -1, 1, 1, -1]
-    assert np.allclose(names["command"], read_joint_correction("joints.csv")(q, side), atol=1e-12)
-    shown = [float(v) for v in re.findall(r"-?\d+\.\d+", capsys.readouterr().out)]
-    arm = ec.read_calibrated("full.toml", "full.json")
-    table = arm.model.table(q)
-    table = replace(table, approach=np.array([side], dtype=float))
-    T = arm.model.flange_poses(table, arm.x)[0]
-    own = [arm.values[f"marker:M1.{k}"] for k in "xyz"]
-    assert np.abs(shown - (T[:3, :3] @ own + T[:3, 3])).max() < 40e-6
-
-
-def test_a_file_that_holds_the_whole_arm_has_what_was_identified(folder):
-    told = export(folder, "plain", "whole.xml", "--joint-correction", folder / "none.csv")
-    assert told["refit"] is None and read_joint_correction(folder / "none.csv").curves == ()
 
 
 def test_a_joint_correction_needs_a_file_of_an_arm_and_says_so(folder):

@@ -61,17 +61,6 @@ def test_by_name_in_any_order_with_leading_zeros_and_capitals(tmp_path):
     assert q1(found) == [20, 10, 20, 10]
 
 
-def test_by_the_numbers_of_names_only_where_they_tell_names_apart(tmp_path):
-    files = {
-        "points.csv": points("A7_M1", "A8_M1"),
-        "joints.csv": joints(("XP8", 80, 1), ("XP7", 70, 2)),
-    }
-    assert q1(imported(tmp_path, files, mapping())) == [70, 80]
-    files["points.csv"] = points("A7_M1", "B7_M1")
-    with pytest.raises(InputError, match="no joint values"):
-        imported(tmp_path, files, mapping('[join]\nby = "name"\n'))
-
-
 def test_points_without_a_pose_are_named_and_refused(tmp_path):
     files = {
         "points.csv": points("1_M1", "2_M1", "9_M1"),
@@ -83,12 +72,6 @@ def test_points_without_a_pose_are_named_and_refused(tmp_path):
     assert q1(found) == [10, 20]
     assert found.joined.left_out == ("9_M1 (line 4)",)
     assert found.joined.unused == ("3 (line 4)",)
-
-
-def test_one_name_for_two_poses_is_refused(tmp_path):
-    files = {"points.csv": points("1_M1"), "joints.csv": joints((1, 10, 1), (1, 20, 2))}
-    with pytest.raises(InputError, match=r"joints.csv, line 3: pose 1 has other joint values.*2"):
-        imported(tmp_path, files, mapping())
 
 
 ORDER = '[join]\nby = "order"\n'
@@ -103,16 +86,6 @@ def test_by_order_a_marker_seen_again_begins_a_pose(tmp_path):
     found = imported(tmp_path, files, mapping(ORDER, PLAIN))
     assert q1(found) == [10, 10, 20, 20, 20]
     assert found.table.repeat.tolist() == [0, 0, 0, 1, 0]
-
-
-def test_by_order_with_so_many_points_per_pose(tmp_path):
-    files = {
-        "points.csv": points(*["M1"] * 6),
-        "joints.csv": joints(("", 10, 1), ("", 20, 2)),
-    }
-    found = imported(tmp_path, files, mapping(ORDER + "points_per_pose = 3\n", PLAIN))
-    assert q1(found) == [10] * 3 + [20] * 3
-    assert found.table.repeat.tolist() == [0, 1, 2] * 2
 
 
 def test_by_order_counts_must_agree_and_the_odd_visit_is_named(tmp_path):
@@ -148,17 +121,6 @@ def test_by_time_takes_the_nearest_with_the_offset(tmp_path):
     np.testing.assert_allclose(found.table.time, [0, 9.7])
     with pytest.raises(InputError, match=r"1 of 2.*line 2, 0\.2 s from the nearest.*offset_s"):
         imported(tmp_path, files, TIMED + "[join]\noffset_s = 100.0\ntolerance_s = 0.15\n")
-
-
-def test_by_time_says_where_the_arm_moved(tmp_path):
-    files = {
-        "points.csv": table("t,x,y,z", (1, 1, 2, 3), (5, 4, 5, 6)),
-        "joints.csv": table(
-            "t,a,b", (0, 0, 0), (1, 0, 0), (2, 0, 0), (4, 8, 0), (5, 9, 0), (6, 10, 0)
-        ),
-    }
-    found = imported(tmp_path, files, TIMED)
-    assert any("moved while 1 points were measured: line 3" in w for w in found.warnings)
 
 
 def test_by_standstill_takes_the_median_and_numbers_poses_by_joints(tmp_path):

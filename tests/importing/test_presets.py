@@ -79,27 +79,6 @@ by = "order"
     holds(imported(tmp_path, files, mapping, cell=cell), degrees, points)
 
 
-def test_the_robot_names_the_joints_where_the_mapping_does_not(tmp_path, readings):
-    from elastocal.model import load_chain
-
-    cell, degrees, points = readings
-    own = [joint.name for joint in load_chain(cell).joints][::-1]
-    head = [*(f"name_{i}" for i in range(6)), *(f"position_{i}" for i in range(6))]
-    rows = [",".join([*own, *(f"{v:.12f}" for v in np.radians(q[::-1]))]) for q in degrees]
-    files = {"p.txt": spatialanalyzer(points), "j.csv": "\n".join([",".join(head), *rows])}
-    mapping = '[join]\nby = "order"\n'
-    found = imported(tmp_path, files, mapping, ("spatialanalyzer", "ros"), cell)
-    holds(found, degrees, points)
-
-
-def test_repeated_shots_are_repeats(tmp_path, readings):
-    _, degrees, points = readings
-    files = {"p.txt": spatialanalyzer(points, shots=3), "j.dat": krl(degrees)}
-    found = imported(tmp_path, files, presets=("spatialanalyzer", "kuka"))
-    holds(found, degrees, points, shots=3)
-    assert set(found.table.repeat) == {0, 1, 2}
-
-
 def test_units_of_the_axes_comment_decide(tmp_path, readings):
     _, degrees, points = readings
     files = {"p.txt": spatialanalyzer(points / 25.4, unit="in"), "j.dat": krl(degrees)}
@@ -125,10 +104,3 @@ def test_presets_are_mappings_with_a_comment_on_what_they_read(name):
 def test_unknown_preset_names_the_nearest():
     with pytest.raises(InputError, match=r"'kuca'.*'kuka'"):
         preset_text("kuca")
-
-
-def test_the_users_column_replaces_the_presets(tmp_path):
-    path = tmp_path / "m.toml"
-    path.write_text('[[source]]\npreset = "faro"\n[source.columns]\nx_m = "Ost"\n')
-    columns = read_mapping(path).sources[0].columns
-    assert columns["x_m"] == "Ost" and "x_auto" not in columns and "y_auto" in columns

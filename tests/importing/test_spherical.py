@@ -74,13 +74,6 @@ def test_every_unit_and_sense_gives_the_positions_back(
     assert found.warnings == ()
 
 
-def test_readings_in_the_second_face_come_out_right(tmp_path, readings):
-    points = readings[2].reshape(-1, 3)
-    polar = read_by_a_tracker(points, "gon", second_face=True)
-    found = brought_in(tmp_path, readings, polar, angle="gon")
-    np.testing.assert_allclose(found.table.position * 1e3, points, rtol=0, atol=1e-6)
-
-
 @given(
     st.floats(1e-3, 1e5), st.floats(0, 400), st.floats(0, 400), st.booleans(),
     st.sampled_from(["deg", "gon", "rad"]),
@@ -102,24 +95,6 @@ def test_the_length_is_the_range_whatever_the_angles(d, az, zen, clockwise, unit
     )
 
 
-def test_the_preset_reads_a_total_stations_table(tmp_path, readings):
-    points = readings[2].reshape(-1, 3)
-    polar = read_by_a_tracker(points, "gon", clockwise=True)
-    head = "Point ID;Slope Distance [mm];Hz [gon];Zenith Angle [gon]"
-    mapping = """
-[[source]]
-preset = "spherical"
-files = ["points*"]
-azimuth = "clockwise"
-[[source]]
-preset = "kuka"
-"""
-    files = {"points.csv": written(polar, head), "poses.dat": krl(readings[1])}
-    found = imported(tmp_path, files, mapping, cell=readings[0])
-    np.testing.assert_allclose(found.table.position * 1e3, points, rtol=0, atol=1e-6)
-    assert found.warnings == () and found.fit.error < 1e-5
-
-
 def test_no_unit_of_an_angle_is_guessed(tmp_path, readings):
     polar = read_by_a_tracker(readings[2].reshape(-1, 3))
     files = {"points.csv": written(polar, "Point;Range mm;Azimuth;Zenith"),
@@ -132,14 +107,6 @@ def test_azimuths_counted_the_other_way_are_told_with_a_cell(tmp_path, readings)
     polar = read_by_a_tracker(readings[2].reshape(-1, 3), clockwise=True)
     found = brought_in(tmp_path, readings, polar)
     assert any("azimuths counted the other way" in w for w in found.warnings)
-
-
-def test_zenith_angles_read_as_elevations_are_told_with_a_cell(tmp_path, readings):
-    points = readings[2].reshape(-1, 3) + np.array([0, 0, 2000.0])  # the tracker stands lower
-    polar = read_by_a_tracker(points)
-    assert polar[:, 2].max() < 90
-    found = brought_in(tmp_path, readings, polar, height="elevation")
-    assert any("zenith angles read as elevations" in w for w in found.warnings)
 
 
 @pytest.mark.parametrize(

@@ -4,7 +4,7 @@ import numpy as np
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from elastocal.importing import dwells, groups_alike
+from elastocal.importing import dwells
 
 STEPS = st.lists(st.tuples(st.sampled_from([0.1, 0.5, 2.0]), st.integers(-2, 2),
                            st.integers(-1, 1)), min_size=1, max_size=40)  # fmt: skip
@@ -34,14 +34,3 @@ def test_as_the_definition_says(steps, shortest):
     assert [(s.first, s.last) for s in found] == plainly(time, q, still, shortest)
     for s in found:
         np.testing.assert_array_equal(s.q, np.median(q[s.first : s.last + 1], axis=0))
-
-
-def test_runs_longer_than_a_chunk():
-    q = np.r_[np.zeros(5000), np.ones(3000)][:, None]
-    found = dwells(np.arange(8000.0), q, np.array([0.5]), 10.0)
-    assert [(s.first, s.last) for s in found] == [(0, 4999), (5000, 7999)]
-
-
-def test_groups_by_their_first_row():
-    q = np.array([[0.0, 0], [0.9, 0], [1.8, 0], [0.0, 5], [0.1, 0.5]])
-    assert groups_alike(q, np.array([1.0, 1.0])).tolist() == [0, 0, 1, 2, 0]

@@ -73,20 +73,6 @@ def test_a_mapping_names_the_columns_and_renames_the_markers(tmp_path):
     assert {row["marker"] for row in table(tmp_path / "data.csv")} == {"M1", "ball"}
 
 
-def test_a_marker_that_lacks_a_column_is_named(tmp_path):
-    (tmp_path / "log.csv").write_text("q1_deg,M1_x_mm,M1_y_mm,M1_z_mm,M2_x_mm\n1,2,3,4,5\n")
-    done = run(tmp_path / "log.csv", "--preset", "wide", "-o", tmp_path / "data.csv")
-    assert done.exit_code == 2 and "'M2' has no column for y_auto, z_auto" in done.output
-    assert not (tmp_path / "data.csv").exists()
-
-
-def test_a_star_where_no_marker_stands_is_refused(tmp_path):
-    (tmp_path / "log.csv").write_text("q1_deg,M1_x\n1,2\n")
-    (tmp_path / "map.toml").write_text('[[source]]\n[source.columns]\nname = "*_name"\n')
-    done = run(tmp_path / "log.csv", "--map", tmp_path / "map.toml", "--preview")
-    assert done.exit_code == 2 and "* stands for the markers of a row" in done.output
-
-
 @pytest.mark.parametrize(
     ("name", "force"),
     [("log_2600N", 2600.0), ("payload_2p5kg", 2.5 * 9.80665), ("load2.6kN", 2600.0),
@@ -115,17 +101,6 @@ def test_files_beside_it_are_unloaded_and_what_states_no_size_is_told(tmp_path):
     assert "named for a load that is not taken" in done.output
     done = run(tmp_path / "unloaded.csv", "--preset", "wide", "-o", tmp_path / "data.csv")
     assert "named for a load" not in done.output
-
-
-def test_what_the_mapping_says_of_loads_counts_before_a_name(tmp_path):
-    _, degrees, points = kr270_readings(tmp_path)
-    file = wide(tmp_path / "log_2600N.csv", degrees, points, "{marker}_{axis}")
-    (tmp_path / "map.toml").write_text(
-        '[[source]]\npreset = "wide"\nload = "slant"\n[loads]\nslant = [100, 0, -2000]\n'
-    )
-    done = run(file, "--map", tmp_path / "map.toml", "-o", tmp_path / "data.csv")
-    assert done.exit_code == 0 and "by its name" not in done.output
-    assert {float(row["force_z_N"]) for row in table(tmp_path / "data.csv")} == {-2000.0}
 
 
 def test_a_column_of_payloads_is_a_load_and_one_that_is_not_read_is_told(tmp_path):

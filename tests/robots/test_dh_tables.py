@@ -52,14 +52,6 @@ def test_a_sign_turns_a_joint_against_its_axis(tmp_path):
     assert code == 2 and "write 1, or -1" in err
 
 
-def test_minus_signs_of_text_programs_are_minus_signs(tmp_path):
-    for sign in "−–":
-        found = read_dh(write(tmp_path, HEADER, KR6.replace("-", sign)))
-        plain = read_dh(write(tmp_path, HEADER, KR6, "plain.csv"))
-        q = np.ones((1, 6))
-        np.testing.assert_array_equal(nominal_flanges(found, q), nominal_flanges(plain, q))
-
-
 def test_rows_of_base_and_tool_move_nothing(tmp_path):
     joints = "".join(f"A{i},{row},\n" for i, row in enumerate(KR6.split(), start=1))
     rows = f"base,0,100,0,0,base\n{joints}tool,0,50,0,0,tool\n"
@@ -191,10 +183,3 @@ LIMITS = "lower_rad,upper_rad"
 def test_units_that_cannot_be_meant_are_told(header, rows, code, told, tmp_path):
     found, out, err = told_by_init(write(tmp_path, header, rows))
     assert found == code and told in out + err, out + err
-
-
-def test_what_is_doubtful_is_a_warning_of_identify_too(tmp_path):
-    assert told_by_init(write(tmp_path, HEADER, RADIANS))[0] == 0
-    model = ec.Model(str(tmp_path / "cell.toml"))
-    data = ec.simulate(model, np.random.default_rng(0).uniform(-1, 1, (20, 6)))
-    assert any("degrees apart" in warning for warning in ec.identify(model, data).warnings)

@@ -84,14 +84,6 @@ def test_weights_act_along_the_gravity_of_the_file(gravity, up, tmp_path):
     np.testing.assert_allclose(plane.normal, R[:, 2], atol=1e-4)
 
 
-def test_a_base_that_the_file_turns_is_taken_as_turned(tmp_path):
-    text = mjcf().replace('<body name="base">', '<body name="base" euler="0 1.5707963 0">')
-    (tmp_path / "arm.xml").write_text(text)
-    assert told_by_init(tmp_path / "arm.xml", "--base", "base")[0] == 0
-    R = ec.read_cell(tmp_path / "cell.toml").model.nominal.base_rotation
-    np.testing.assert_allclose(R[:, 2], [1, 0, 0], atol=1e-6)
-
-
 @pytest.mark.parametrize(
     ("parts", "told"),
     [
@@ -106,14 +98,6 @@ def test_weights_that_the_file_lets_not_act_are_told(parts, told, tmp_path):
     assert code == 0 and told in out, err
     text = (tmp_path / "cell.toml").read_text()
     assert told in text and "a choice: see the notes above" in text
-
-
-def test_endings_and_encodings_are_read_alike(tmp_path):
-    plain = told_by_init(arm(tmp_path))
-    for name, encoding in (("arm.mjcf", "utf-8"), ("arm16.xml", "utf-16")):
-        text = f'<?xml version="1.0" encoding="{encoding}"?>\n{arm(tmp_path).read_text()}'
-        (tmp_path / name).write_text(text, encoding=encoding)
-        assert told_by_init(tmp_path / name) == plain
 
 
 def test_a_missing_mesh_is_named_and_only_its_bodies_lose_their_mass(tmp_path):
@@ -147,15 +131,6 @@ def test_mujoco_warns_in_the_words_of_the_tool(tmp_path, recwarn):
 def test_units_that_cannot_be_meant_are_told(parts, told, tmp_path):
     code, out, err = told_by_init(arm(tmp_path, **parts))
     assert told in out + err and (code == 2) == (told not in out)
-
-
-def test_a_jaw_alone_is_told(tmp_path):
-    jaw = (
-        '<body name="f"><inertial pos="0 0 0" mass="1" diaginertia="1 1 1"/>'
-        '<joint name="grip" type="slide" axis="0 1 0" range="0 0.04"/></body>'
-    )
-    code, out, err = told_by_init(arm(tmp_path, at_end=jaw))
-    assert code == 0 and "'grip' looks like a jaw" in out, err
 
 
 def test_the_palm_is_the_flange_where_the_thumb_has_more_joints(tmp_path):

@@ -47,13 +47,6 @@ def test_the_flange_is_the_link_before_fingers_branch_off(extra, flange, tmp_pat
     assert flange_of(tmp_path, text)[0] == flange
 
 
-def test_a_last_joint_that_looks_like_a_jaw_is_told(tmp_path):
-    text = urdf(slide("grip", "link_6", "tool0"))
-    flange, out = flange_of(tmp_path, text)
-    assert flange == "tool0"
-    assert "last joint 'grip' looks like a jaw of a gripper" in out
-
-
 @pytest.mark.parametrize("rpy", ["0 0 0", "-1.5707963267948966 0 0", "3.141592653589793 0 0.5"])
 def test_the_mount_stands_as_in_the_root_of_the_file(rpy, tmp_path):
     text = urdf(frame("mount", "torso", "0 0.3 1.1", rpy), base="mount")
@@ -74,11 +67,6 @@ def test_limits_that_stand_for_none_are_none(limits, tmp_path):
     assert code == 0, err
     text = (tmp_path / "cell.toml").read_text()
     assert text.count("the file has no limit: guess") == 6 and "joint1_deg = [-180, 180]" in text
-
-
-def test_turns_without_a_cable_are_kept(tmp_path):
-    code, _, err = told_by_init(write(tmp_path, urdf(limits=("-31.4159", "31.4159"))))
-    assert code == 0 and "[-1800, 1800]" in (tmp_path / "cell.toml").read_text(), err
 
 
 @pytest.mark.parametrize(
@@ -157,25 +145,6 @@ def test_names_of_the_file_may_be_used_and_a_clash_is_no_shift(tmp_path):
     assert set(model("linear_axis_mm = [0, 100]").cell.limits) == {"joint1"}
     with pytest.raises(ec.ElastocalError, match="names joint7, but robot"):
         model("joint7_deg = [-10, 20]", 'joint_names = "file"')
-
-
-def test_names_without_a_clash_need_nothing(tmp_path):
-    write(tmp_path, urdf(name="shoulder.{}"))
-    (tmp_path / "cell.toml").write_text(
-        '[robot]\nurdf = "arm.urdf"\n[limits]\n"shoulder.2_deg" = [-10, 20]\n'
-        '[model]\neffects = ["joint_compliance:shoulder.3", "joint_offset:joint2"]\n'
-        '[model.compliance_levels]\n"shoulder.3_deg" = [0, 10]\n'
-    )
-    model = ec.Model(str(tmp_path / "cell.toml"))
-    assert set(model.cell.limits) == {"joint2"}
-    assert model.names == (
-        "joint2.offset", "joint3.compliance_level1", "joint3.compliance_level2"
-    )  # fmt: skip
-    (tmp_path / "cell.toml").write_text(
-        '[robot]\nurdf = "arm.urdf"\n[limits]\n"sholder.2_deg" = [-10, 20]\n'
-    )
-    with pytest.raises(ec.ElastocalError, match=r"did you mean 'shoulder\.2'"):
-        ec.Model(str(tmp_path / "cell.toml"))
 
 
 def test_the_names_of_the_file_are_shown_and_a_new_mjcf_keeps_them(tmp_path):

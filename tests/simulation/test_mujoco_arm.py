@@ -21,7 +21,6 @@ pytest.importorskip("mujoco")
 COMPLIANCE = np.array([0.35, 0.29, 0.416, 2.786, 3.483, 2.074]) * 1e-6
 LOAD_POINT = np.array([0.20, 0.0, 0.25])
 DOWN = np.array([0.0, 0.0, -2600.0])
-GRAVITY = np.array([0.0, 0.0, -9.80665])
 
 
 @pytest.fixture(scope="module")
@@ -79,45 +78,6 @@ def test_torques_balance_under_the_load_by_pinocchio(kr270: Chain) -> None:
             np.testing.assert_allclose(rest - q, expected, rtol=0, atol=1e-12)
             largest = max(largest, float(np.abs(expected).max()))
     assert largest > 1e-3  # the load does bend the arm, by milliradians
-
-
-def test_weights_add_to_the_load(kr270: Chain) -> None:
-    model, data, frame = loaded_pinocchio()
-    model.gravity.linear = GRAVITY
-    arm = MujocoArm(kr270, COMPLIANCE, LOAD_POINT, gravity=GRAVITY)
-    for q in configurations(kr270, 20):
-        rest = arm.equilibrium(q, DOWN)
-        load = load_torques(model, data, frame, rest, DOWN)
-        weights = -pin.computeGeneralizedGravity(model, data, rest)
-        np.testing.assert_allclose(rest - q, COMPLIANCE * (load + weights), rtol=0, atol=1e-12)
-
-
-def test_slides_give_way_by_compliance_times_force(tmp_path: Path) -> None:
-    path = tmp_path / "chain.urdf"
-    path.write_text(random_chain_urdf(4))
-    text = path.read_text()
-    chain = read_urdf(path, base="root", flange="flange")
-    assert set(chain.kinds) == {"revolute", "prismatic"}
-    model = pin.buildModelFromXML(text)
-    arm = MujocoArm(chain, np.full(chain.n_joints, 1e-6))
-    symbol = ca.SX.sym("q", chain.n_joints)
-    position = nominal_flange(chain, symbol)[:3, 3]
-    force = np.array([300.0, -200.0, 500.0])
-    tau = ca.Function("tau", [symbol], [ca.jacobian(position, symbol).T @ ca.DM(force)])
-    assert model.njoints > chain.n_joints
-    for q in configurations(chain, 10):
-        rest = arm.equilibrium(q, force)
-        np.testing.assert_allclose(rest - q, 1e-6 * tau(rest).full().ravel(), rtol=0, atol=1e-12)
-
-
-def test_without_load_or_with_rigid_joints_nothing_moves(kr270: Chain) -> None:
-    q = configurations(kr270, 1)[0]
-    np.testing.assert_array_equal(MujocoArm(kr270, COMPLIANCE).equilibrium(q), q)
-    np.testing.assert_array_equal(MujocoArm(kr270, np.zeros(6)).equilibrium(q, DOWN), q)
-    stiff_wrist = COMPLIANCE * [1, 1, 1, 0, 0, 0]
-    rest = MujocoArm(kr270, stiff_wrist).equilibrium(q, DOWN)
-    assert np.all(rest[3:] == q[3:])
-    assert np.all(rest[1:3] != q[1:3])
 
 
 def test_a_buckling_load_is_refused(kr270: Chain) -> None:

@@ -52,17 +52,6 @@ def test_without_noise_the_readings_are_the_models_prediction():
     assert np.array_equal(exact.position, table.position)
 
 
-def test_the_plan_is_kept_and_not_changed():
-    model = model_with(AXIS)
-    plan = plan_of(model)
-    before = plan.position.copy()
-    table = simulate(model, plan, model.nominal, 1)
-    assert np.array_equal(plan.position, before)
-    for name in ("q", "row", "configuration", "force", "marker", "repeat"):
-        assert np.array_equal(getattr(table, name), getattr(plan, name))
-    assert table.configuration_labels == plan.configuration_labels
-
-
 def test_the_same_seed_gives_the_same_readings():
     model = model_with(AXIS)
     plan = plan_of(model)
@@ -139,12 +128,6 @@ def test_poses():
     assert low < (((noisy.position - exact.position) / AXIS.noise.sigma) ** 2).sum() < high
 
 
-def test_poses_from_a_plan_without_rotations():
-    model, truth = pose_case()
-    plan = replace(plan_of(model), position=None)
-    assert simulate(model, plan, truth, 0).rotation.shape == (20, 3)
-
-
 def test_deflections_are_loaded_minus_unloaded_readings():
     nominal = Nominal(joint_compliance=COMPLIANCE)
     cell = cell_of(("joint_compliance",), observe="deflection", nominal=nominal)
@@ -216,22 +199,6 @@ def test_expand_plan_orders_rows_as_one_would_measure():
     assert np.array_equal(plan.force, np.zeros((2, 3)))  # the plan itself is left alone
 
 
-def test_expand_plan_without_load_keeps_the_plans_forces_and_repeats():
-    plan = table_at(np.zeros((2, 3)), [[0, 0, 0], [0, 0, -50.0]])
-    rows = expand_plan(plan, ("M1",))
-    assert np.array_equal(rows.force, plan.force)
-    repeated = replace(plan, repeat=np.array([0, 0, 1, 1]))
-    rows = expand_plan(repeated, ("M1",), repeats=3)
-    # every repeat of the plan becomes three of its own
-    assert rows.repeat.tolist() == [0, 1, 2, 0, 1, 2, 3, 4, 5, 3, 4, 5]
-
-
-def test_a_load_on_top_of_the_plans_own_forces_is_refused():
-    plan = table_at(np.zeros((2, 3)), [[0, 0, -50.0]])
-    with pytest.raises(InputError, match=r"table\.csv: the plan has forces of its own"):
-        expand_plan(plan, ("M1",), load=np.array([0.0, 0.0, -100.0]))
-
-
 def test_an_arm_that_buckles_is_refused_with_its_line():
     nominal = Nominal(joint_compliance=(1e-3,) * 6)
     model = Model.assembled(kr270_chain(), cell_of(("joint_compliance",), nominal=nominal))
@@ -248,12 +215,6 @@ def test_distances_without_equilibrium_are_refused_with_their_line():
     with pytest.raises(Exception, match=r"table\.csv, line \d+: no static equilibrium") as caught:
         simulate(model, plan, model.nominal, 0)
     assert caught.value.exit_code == 2
-
-
-def test_an_unknown_marker_is_refused():
-    model = model_with(effects=("marker_position",), markers={"A": np.zeros(3), "B": np.ones(3)})
-    with pytest.raises(InputError, match=r"marker 'C' is not one of the cell's markers: A, B"):
-        simulate(model, plan_of(model, 3, markers=("A", "C")), model.nominal, 0)
 
 
 def test_a_drift_is_correlated_in_time_and_the_table_says_when():
@@ -286,9 +247,3 @@ def test_tails_have_the_stated_standard_deviation_and_many_far_readings():
     assert found[1] > 10 * max(found[0], 1e-4)
     with pytest.raises(InputError, match=r"noise\.tails is 2\.0: .* take a number > 2"):
         Unsteadiness(tails=2.0)
-
-
-def test_as_many_numbers_as_joints_are_needed():
-    model = model_with(noise=Unsteadiness(np.full(7, 1e-5)))
-    with pytest.raises(InputError, match=r"noise\.joints_urad has 7 numbers"):
-        simulate(model, plan_of(model), model.nominal, 0)
