@@ -53,8 +53,6 @@ test test-long: export OMP_NUM_THREADS = 1
 test test-long: export MKL_NUM_THREADS = 1
 # What is compiled to bytecode is kept: the tests start some hundred processes.
 test test-long: export PYTHONDONTWRITEBYTECODE =
-# What the tests compile stays with them.
-test test-long: export ELASTOCAL_CACHE = $(CURDIR)/$(VENV)/cache
 
 test: $(TEST_TOOLS)
 	$(PYTEST) $(PYTEST_ARGS)

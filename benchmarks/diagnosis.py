@@ -3,8 +3,7 @@
     python benchmarks/diagnosis.py [--size tiny|short|full] [--json FILE]
 
 The blind check's example (60 poses, 2 loads, 3 markers, simulated in MuJoCo), and tables of the
-same arm that `elastocal simulate` makes, with a gear that runs out of round at joint 4; each with
-an empty cache, as at the first diagnosis of an arm, and with what that has left in it.
+same arm that `elastocal simulate` makes, with a gear that runs out of round at joint 4.
 """
 
 from __future__ import annotations
@@ -73,7 +72,7 @@ def measure(size: str) -> Part:
     part = Part("diagnosis", "Diagnosis, whole catalogue")
     table = Table(
         "`elastocal diagnose`, from start to JSON",
-        ["data", "cache", "rows", "wall, s", "CPU, s", "peak, MB", "verdict"],
+        ["data", "rows", "wall, s", "CPU, s", "peak, MB", "verdict"],
     )
     with tempfile.TemporaryDirectory() as name:
         folder = Path(name)
@@ -83,22 +82,18 @@ def measure(size: str) -> Part:
             data = simulated(folder, rows)
             cases.append((f"simulated, {rows} rows", data, {10_000: 15}.get(rows, 0)))
         for what, data, limit in cases:
-            cache = folder / f"cache{len(table.rows)}"
-            cache.mkdir(mode=0o700)
             answer, rows = folder / "diagnosis.json", len(data.read_text().splitlines()) - 1
             given = ("diagnose", cell, data, "-o", answer, "--quiet")
-            for state in ("empty", "filled"):
-                print(f"{what}, cache {state}", file=sys.stderr, flush=True)
-                done = ran(*given, ELASTOCAL_CACHE=str(cache))
-                content = json.loads(answer.read_text())
-                effects = ", ".join(f"{e['effect']}:{e['where']}" for e in content["effects"])
-                verdict = f"{content['verdict']} {effects}".strip()
-                if data.parent == folder and ":".join(FOUND) not in verdict:
-                    part.remarks.append(f"{what}: {':'.join(FOUND)} was not named")
-                table.rows.append([what, state, rows, done.wall, done.cpu, done.peak_mb, verdict])
-                if limit:
-                    named = f"{what}, cache {state}: wall, at most {limit} s"
-                    part.goal(named, done.wall, limit, "s")
+            print(what, file=sys.stderr, flush=True)
+            done = ran(*given)
+            content = json.loads(answer.read_text())
+            effects = ", ".join(f"{e['effect']}:{e['where']}" for e in content["effects"])
+            verdict = f"{content['verdict']} {effects}".strip()
+            if data.parent == folder and ":".join(FOUND) not in verdict:
+                part.remarks.append(f"{what}: {':'.join(FOUND)} was not named")
+            table.rows.append([what, rows, done.wall, done.cpu, done.peak_mb, verdict])
+            if limit:
+                part.goal(f"{what}: wall, at most {limit} s", done.wall, limit, "s")
     part.tables.append(table)
     return part
 

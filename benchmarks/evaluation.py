@@ -1,5 +1,5 @@
-"""B of a whole table, seven ways: CasADi's, numpy by hand, a bare C loop, and elastocal's two; and
-of few rows by elastocal's third, which is CasADi again.
+"""B of a whole table, six ways: CasADi's three, numpy by hand, a bare C loop, and elastocal's; and
+of few rows by elastocal's second, which is CasADi again.
 
     python benchmarks/evaluation.py [--size tiny|short|full] [--json FILE]
 
@@ -35,9 +35,9 @@ FEW = (1, 4, 16, 64)
 AT_A_TIME = 100_000  # rows whose B is held at once: 122 MB
 LOOP, BUFFER, MAP = "CasADi, Python loop", "CasADi, FunctionBuffer in a loop", "CasADi, map"
 HAND, BARE = "numpy, by hand", "C by CasADi, -O3, bare loop"
-REPLAY, COMPILED = "elastocal, replay (numpy)", "elastocal, compiled"
+REPLAY = "elastocal, replay (numpy)"
 SLOW = (LOOP, BUFFER, MAP)
-EQUAL = {HAND: 1e-9, LOOP: 1e-12, BUFFER: 1e-12, MAP: 1e-12, BARE: 1e-12, COMPILED: 1e-12}
+EQUAL = {HAND: 1e-9, LOOP: 1e-12, BUFFER: 1e-12, MAP: 1e-12, BARE: 1e-12}
 
 
 class Ways:
@@ -50,10 +50,7 @@ class Ways:
         outputs = [s.reading, ca.jacobian(s.reading, s.p)]
         self.f = function_of(inputs, outputs)
         by_hand = NumpyRegressor(model)
-        tapes = {
-            REPLAY: BatchFunction(inputs, outputs, "numpy"),
-            COMPILED: BatchFunction(inputs, outputs, "compiled"),
-        }
+        replay = BatchFunction(inputs, outputs, "numpy")
         loops = {LOOP: python_loop, BUFFER: buffered_loop}
         self.run: dict[str, Callable] = {
             name: lambda a, n, loop=loop: loop(self.f, a, n)[1] for name, loop in loops.items()
@@ -63,8 +60,8 @@ class Ways:
             MAP: lambda a, n: mapped(a, n)[1],
             HAND: lambda a, n: by_hand(a[0], self.x),
             BARE: lambda a, n: bare(a, n)[1],
+            REPLAY: lambda a, n: replay(*a)[1],
         }
-        self.run |= {name: lambda a, n, t=t: t(*a)[1] for name, t in tapes.items()}
 
     def arrays(self, model: Model, n: int) -> list[np.ndarray]:
         return [*row_inputs(self.symbolic.arm, poses(model, n)), self.x]
@@ -113,7 +110,7 @@ def whole_calls(folder: Path, part: Part, sizes: tuple[int, ...]) -> None:
     """`Model.regressor` itself, from table to B: what a user's call costs."""
     table = Table(
         "`Model.regressor`, table checks and derivatives through the equilibrium included",
-        ["model", "rows", "backend", "wall, ms", "CPU, ms", "CPU, µs per row"],
+        ["model", "rows", "wall, ms", "CPU, ms", "CPU, µs per row"],
     )
     loaded = (*GEOMETRY, "joint_compliance")
     for what, effects, load in (("rigid", GEOMETRY, False), ("under load", loaded, True)):
@@ -121,14 +118,10 @@ def whole_calls(folder: Path, part: Part, sizes: tuple[int, ...]) -> None:
         x = truth(model)
         for n in sizes:
             readings = poses(model, n, load)
-            engines = {}
-            for backend in ("numpy", "compiled"):
-                own_engine = Model.assembled(model.chain, model.cell, backend=backend)
-                engines[backend] = partial(own_engine.regressor, readings, x)
-            for backend, t in race(engines, 5, 1.0).items():
-                what_now = f"{what}, {len(model.parameters)} parameters"
-                micro = t.cpu / n * 1e6
-                table.rows.append([what_now, n, backend, t.wall * 1e3, t.cpu * 1e3, micro])
+            own_engine = Model.assembled(model.chain, model.cell, backend="numpy")
+            t = race({"numpy": partial(own_engine.regressor, readings, x)}, 5, 1.0)["numpy"]
+            what_now = f"{what}, {len(model.parameters)} parameters"
+            table.rows.append([what_now, n, t.wall * 1e3, t.cpu * 1e3, t.cpu / n * 1e6])
     part.tables.append(table)
 
 
@@ -155,12 +148,10 @@ def threads(model: Model, part: Part, n: int) -> None:
     arrays = ways.arrays(model, n)
     table = Table(f"Threads, {n} rows", ["", "threads", "wall, µs per row", "CPU"])
     before = os.environ.get("OMP_NUM_THREADS")
-    for name in (REPLAY, COMPILED):
-        for count in (1, cores):
-            os.environ["OMP_NUM_THREADS"] = str(count)
-            took = race({name: lambda w=name: ways.run[w](arrays, n)}, 3, 1.0)[name]
-            micro = 1e6 / n
-            table.rows.append([name, count, took.wall * micro, took.cpu * micro])
+    for count in (1, cores):
+        os.environ["OMP_NUM_THREADS"] = str(count)
+        took = race({REPLAY: lambda: ways.run[REPLAY](arrays, n)}, 3, 1.0)[REPLAY]
+        table.rows.append([REPLAY, count, took.wall / n * 1e6, took.cpu / n * 1e6])
     os.environ.pop("OMP_NUM_THREADS")
     if before is not None:
         os.environ["OMP_NUM_THREADS"] = before
@@ -173,7 +164,7 @@ def memory(part: Part, size: str, n: int) -> None:
         f"Peak memory, {n} rows, B itself {n * 3 * 51 * 8 / 1e6:.0f} MB",
         ["way", "peak of the process, MB", "above what it held before, MB"],
     )
-    for name in (LOOP, BUFFER, MAP, HAND, BARE, REPLAY, COMPILED):
+    for name in (LOOP, BUFFER, MAP, HAND, BARE, REPLAY):
         if name == LOOP and size != "full":
             continue
         found = own(__file__, name, n, OMP_NUM_THREADS="1")
@@ -210,7 +201,7 @@ def measure(size: str) -> Part:
                 f"{clock} time in µs per row, one thread",
                 ["way", *[f"{rows} rows" for rows in rows_of], "difference of B"],
             )
-            for way in (*SLOW, HAND, BARE, REPLAY, COMPILED):
+            for way in (*SLOW, HAND, BARE, REPLAY):
                 times = [micro[rows][way][k] if way in micro[rows] else None for rows in rows_of]
                 table.rows.append([way, *times, differences.get(way)])
             part.tables.append(table)
@@ -223,14 +214,11 @@ def measure(size: str) -> Part:
         hundred, few = ({w: t[k] for w, t in micro[rows].items()} for rows in (largest, 300))
         part.goal(f"replay over the bare C loop, {largest} rows, {clock}, at most 2.0",
                   hundred[REPLAY] / hundred[BARE], 2.0, "times")  # fmt: skip
-        part.goal(f"compiled over the bare C loop, {largest} rows, {clock}, at most 1.15",
-                  hundred[COMPILED] / hundred[BARE], 1.15, "times")  # fmt: skip
-        for way in (REPLAY, COMPILED):
-            part.goal(f"Python loop over {way}, 300 rows, {clock}, at least 10",
-                      few[LOOP] / few[way], 10.0, "times", least=True)  # fmt: skip
+        part.goal(f"Python loop over {REPLAY}, 300 rows, {clock}, at least 10",
+                  few[LOOP] / few[REPLAY], 10.0, "times", least=True)  # fmt: skip
     part.curves = {"rows": list(rows_of), "cpu": {
         way: [micro[rows][way][1] if way in micro[rows] else None for rows in rows_of]
-        for way in (*SLOW, HAND, BARE, REPLAY, COMPILED)
+        for way in (*SLOW, HAND, BARE, REPLAY)
     }}  # fmt: skip
     return part
 

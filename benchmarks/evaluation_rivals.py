@@ -13,8 +13,6 @@ import casadi as ca
 import numpy as np
 from numpy.typing import NDArray
 
-from elastocal.model import find_compiler
-
 Array = NDArray[np.float64]
 MAPPED = 10_000  # rows of one call of a mapped function
 FLAGS = ("-O3", "-shared", "-fPIC", "-w")
@@ -105,7 +103,7 @@ class BareC:
             source = Path(folder, "tape.c")
             source.write_text(source.read_text() + LOOP.format(**sizes))
             library = Path(folder, "bare.so")
-            command = [*find_compiler().command, *FLAGS, str(source), "-o", str(library), "-lm"]
+            command = [os.environ.get("CC") or "cc", *FLAGS, str(source), "-o", str(library), "-lm"]
             subprocess.run(command, check=True, capture_output=True)
             self.loop = ctypes.CDLL(str(library)).loop
         pointer = ctypes.c_void_p

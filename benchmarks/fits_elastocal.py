@@ -1,16 +1,14 @@
 """elastocal's side of fits_peers.py: one fit, timed.
 
-    python benchmarks/fits_elastocal.py auto|ols|plain[+compiled] FOLDER OUT.npz
+    python benchmarks/fits_elastocal.py auto|ols|plain FOLDER OUT.npz
 
 `auto`: what `elastocal identify` does without options.  `ols`: the same with `--method ols`.
 `plain`: only placing, choosing parameters, fitting and covariance, by the API; no held-out
-residuals, faulty readings, noise models or diagnostics.  `+compiled`: with the backend "compiled",
-which ELASTOCAL_BACKEND chooses and which finds in its cache what it has compiled before.
+residuals, faulty readings, noise models or diagnostics.
 """
 
 from __future__ import annotations
 
-import os
 import sys
 from pathlib import Path
 
@@ -43,17 +41,15 @@ def plain(model: Model, table: Measurements) -> tuple[np.ndarray, int]:
 
 def main(how: str, folder: Path, out: Path) -> None:
     given = np.load(folder / "given.npz")
-    method, _, backend = how.partition("+")
-    os.environ["ELASTOCAL_BACKEND"] = backend
     with clock.step("read"):
         model = Model(folder / "cell.toml")
         table = model.read(folder / "data.csv")
         model = model.with_markers_of(table)
     with clock.step("fit"):
-        if method == "plain":
+        if how == "plain":
             x, p = plain(model, table)
         else:
-            result = identify(model, table, Options(method=method))
+            result = identify(model, table, Options(method=how))
             x, p = result.x, len(result.determined)
     n = len(given["fresh_q"])
     fresh = replace(table.take(np.zeros(n, dtype=np.int64)), q=given["fresh_q"])

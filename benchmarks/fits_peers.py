@@ -48,8 +48,6 @@ CONTENDERS = (
     Contender("elastocal: identify", "fits_elastocal.py", "auto"),
     Contender("elastocal: identify --method ols", "fits_elastocal.py", "ols"),
     Contender("elastocal: fit alone (API)", "fits_elastocal.py", "plain"),
-    Contender("elastocal: identify, compiled", "fits_elastocal.py", "auto+compiled"),
-    Contender("elastocal: fit alone, compiled", "fits_elastocal.py", "plain+compiled"),
     Contender("FIGAROH: structural (default)", "fits_figaroh.py", "structural"),
     Contender("FIGAROH: excitation", "fits_figaroh.py", "excitation"),
     Contender("FIGAROH: map", "fits_figaroh.py", "map"),
@@ -96,15 +94,6 @@ def compared(
             ran = peer(own, contender.script, contender.how, folder, folder / "found.npz")
             found[contender].add(ran, given)
     return found
-
-
-def warmed(given: Campaign, folder: Path, contenders: list[Contender]) -> None:
-    """Run each of ours once, caches empty at first, and say what that takes."""
-    for contender in contenders:
-        if contender.own:
-            ran = peer(Path(sys.executable), contender.script, contender.how, folder,
-                       folder / "found.npz")  # fmt: skip
-            print(f"- caches filled by {contender.name}: fit {float(ran['cpu_fit']):.3f} CPU s")
 
 
 def show(truth: str, poses: int, found: dict[Contender, Found]) -> None:
@@ -171,17 +160,11 @@ def main() -> None:
     ]
     print(f"{os.cpu_count()} cores, load {os.getloadavg()[0]:.1f}, one BLAS thread each")
     with tempfile.TemporaryDirectory() as name:
-        # An empty cache: only what these fits leave there is found there.
-        os.environ["ELASTOCAL_CACHE"] = str(Path(name) / "cache")
-        warm = False
         for truth in truths:
             for poses in sizes:
                 folder = Path(name) / f"{truth}{poses}"
                 given = campaign(truth, poses, SEED)
                 write(given, folder)
-                if not warm:
-                    warmed(given, folder, contenders)
-                    warm = True
                 found = compared(given, folder, contenders, python, rounds)
                 show(truth, poses, found)
                 if poses == max(sizes):

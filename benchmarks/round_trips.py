@@ -23,7 +23,6 @@ import yaml
 from scipy.spatial.transform import Rotation
 
 import elastocal as ec
-from elastocal.cell.file_keys import rotation_from_rpy
 from elastocal.errors import ElastocalError
 from elastocal.export.export import export
 from elastocal.export.mjcf_file import MujocoRest
@@ -34,7 +33,7 @@ from elastocal.model.dh import read_dh
 from elastocal.model.plausible import extent
 from elastocal.model.rigid import nominal_flanges
 from elastocal.saving import wish_of
-from elastocal.units import Array
+from elastocal.units import Array, rotation_from_rpy
 
 PACKAGES = ("example-robot-data", "rtb-data")
 # Of robots with several arms: URDF → flange.
@@ -168,7 +167,7 @@ def _parameters(fit: ec.Calibration, folder: Path) -> tuple[dict[str, Array], Ar
     wish = wish_of(folder / "out.yaml", "yaml", np.zeros(3), True, False, None, None, 2, 0)
     geometry = yaml.safe_load(export(fit.arm, wish).text)["geometry"]
     base, T = geometry["tracker_to_base"], np.eye(4)
-    T[:3, :3], T[:3, 3] = rotation_from_rpy(np.degrees(base["rpy_rad"])), base["xyz_m"]
+    T[:3, :3], T[:3, 3] = rotation_from_rpy(base["rpy_rad"]), base["xyz_m"]
     return {name: np.array(at["xyz_m"]) for name, at in geometry["markers"].items()}, T
 
 

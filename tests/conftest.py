@@ -59,13 +59,14 @@ def known_instructions() -> Iterator[None]:
     CasADi for the instructions, which are the same wherever the expressions are."""
     from elastocal.model import numpy_engine
 
-    ask, known = numpy_engine._extracted, {}
+    ask, known = numpy_engine.instructions, {}
 
-    def extracted(function: Any) -> Any:
-        if function.digest not in known:
-            known[function.digest] = ask(function)
-        return known[function.digest]
+    def remembered(function: Any) -> Any:
+        key = function.serialize()
+        if key not in known:
+            known[key] = ask(function)
+        return known[key]
 
     with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(numpy_engine, "_extracted", extracted)
+        patch.setattr(numpy_engine, "instructions", remembered)
         yield

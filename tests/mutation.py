@@ -239,7 +239,7 @@ def pytest(root: Path, *words: str, seconds: float | None = None, **environment:
     """What pytest prints on the copy; it and all that it started end after `seconds`."""
     clean = os.environ | {
         "PYTHONPATH": f"{root / 'src'}", "OPENBLAS_NUM_THREADS": "1", "OMP_NUM_THREADS": "1",
-        "ELASTOCAL_CACHE": str(root / ".cache"), "PYTHONDONTWRITEBYTECODE": "",
+        "PYTHONDONTWRITEBYTECODE": "",
     } | environment  # fmt: skip
     command = [sys.executable, "-m", "pytest", "-p", "elastocal_mutants", "--tb=no",
                "--hypothesis-seed=0", "-p", "no:cacheprovider", *words]  # fmt: skip

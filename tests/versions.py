@@ -91,10 +91,9 @@ def sliced(which: str, folder: Path) -> str:
     wanted = stated if which == "floors" else [each.partition("==")[0] for each in stated]
     run(folder, own, "-m", "pip", "install", "-q", "--disable-pip-version-check", "--no-compile",
         "--only-binary", ":all:", *wanted, *TOOLS)  # fmt: skip
-    told = run(folder, "env", f"PYTHONPATH={ROOT / 'src'}", f"ELASTOCAL_CACHE={folder / 'cache'}",
-               own, "-m", "pytest", "--rootdir", ROOT, "-c", ROOT / "pyproject.toml", "-q", "-p",
-               "no:cacheprovider", "--tb=short", "--disable-warnings",
-               *(ROOT / each for each in SLICE))  # fmt: skip
+    told = run(folder, "env", f"PYTHONPATH={ROOT / 'src'}", own, "-m", "pytest", "--rootdir",
+               ROOT, "-c", ROOT / "pyproject.toml", "-q", "-p", "no:cacheprovider", "--tb=short",
+               "--disable-warnings", *(ROOT / each for each in SLICE))  # fmt: skip
     return f"{which}: {told.strip().splitlines()[-1]}"
 
 

@@ -1,10 +1,10 @@
-"""Types of arrays, and units of file columns and keys on their way to SI."""
+"""Types of arrays, units of file columns and keys on their way to SI, angles of rotations."""
 
 from __future__ import annotations
 
 import math
 import re
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from typing import TypeVar
 
 import numpy as np
@@ -48,6 +48,28 @@ _ALIASES = {
 }  # fmt: skip
 _BRACKETED = re.compile(r"[\[(]([^\[\]()]++)[\])]$")
 _TAILED = re.compile(r"(?:[_/,.]|(?<!\s) )\s*+([A-Za-zµμ°]+)$")
+
+
+def rotation_from_rpy(rpy: Sequence[float] | Array) -> Array:
+    """Rz(yaw) Ry(pitch) Rx(roll), (3, 3), of angles in rad: the URDF's convention."""
+    (cr, cp, cy), (sr, sp, sy) = np.cos(rpy), np.sin(rpy)
+    about_z = np.array([[cy, -sy, 0.0], [sy, cy, 0.0], [0.0, 0.0, 1.0]])
+    about_y = np.array([[cp, 0.0, sp], [0.0, 1.0, 0.0], [-sp, 0.0, cp]])
+    about_x = np.array([[1.0, 0.0, 0.0], [0.0, cr, -sr], [0.0, sr, cr]])
+    return np.asarray(about_z @ about_y @ about_x)
+
+
+def rpy_from_rotation(R: Array) -> tuple[float, float, float]:
+    """Roll, pitch, yaw in rad with R = Rz(yaw) Ry(pitch) Rx(roll).
+
+    Yaw is taken first and undone in the other two, so that all three are exact to rounding at
+    pitch = ±π/2 as well, where the textbook formula divides 0 by 0.
+    """
+    yaw = math.atan2(R[1, 0], R[0, 0])
+    c, s = math.cos(yaw), math.sin(yaw)
+    pitch = math.atan2(-R[2, 0], c * R[0, 0] + s * R[1, 0])
+    roll = math.atan2(s * R[0, 2] - c * R[1, 2], c * R[1, 1] - s * R[0, 1])
+    return roll, pitch, yaw
 
 
 def to_si(value: Value, unit: str) -> Value:

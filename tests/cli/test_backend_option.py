@@ -21,8 +21,8 @@ def unset(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setenv(VARIABLE, "")
 
 
-@pytest.mark.parametrize("name", ["numpy", "compiled", "auto"])
-def test_the_option_is_what_tapes_will_use(name: str) -> None:
+@pytest.mark.parametrize("name", ["numpy", "auto"])
+def test_the_option_is_what_models_will_use(name: str) -> None:
     CliRunner().invoke(app, ["--backend", name, *ABSENT])
     assert os.environ[VARIABLE] == name
     assert chosen_backend() == name
@@ -39,9 +39,9 @@ def test_results_and_report_say_what_evaluated_the_model(tmp_path: Path) -> None
 
 
 def test_an_unknown_backend_is_told_with_the_known_ones() -> None:
-    found = CliRunner().invoke(app, ["--backend", "compild", *ABSENT])
+    found = CliRunner().invoke(app, ["--backend", "nunpy", *ABSENT])
     assert found.exit_code == 2
-    assert "--backend: unknown backend 'compild' (did you mean 'compiled'" in found.output
+    assert "--backend: unknown backend 'nunpy' (did you mean 'numpy'" in found.output
     assert "no-cell.toml" not in found.output
 
 
@@ -50,3 +50,13 @@ def test_the_environment_is_checked_as_well(monkeypatch: pytest.MonkeyPatch) -> 
     found = CliRunner().invoke(app, ABSENT)
     assert found.exit_code == 2
     assert VARIABLE in found.output and "gpu" in found.output
+
+
+def test_what_is_gone_names_its_successor(monkeypatch: pytest.MonkeyPatch) -> None:
+    """The compiled backend is refused; a folder for a cache asks for nothing and is only told."""
+    found = CliRunner().invoke(app, ["--backend", "compiled", *ABSENT])
+    assert found.exit_code == 2
+    assert "--backend: the backend 'compiled' is gone" in found.output and "auto" in found.output
+    monkeypatch.setenv("ELASTOCAL_CACHE", "anywhere")
+    found = CliRunner().invoke(app, ABSENT)
+    assert "ELASTOCAL_CACHE is no longer read" in found.output

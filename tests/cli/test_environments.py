@@ -1,4 +1,4 @@
-"""Wherever it runs: streams without some letters, no home, no terminal, no compiler, no reader."""
+"""Wherever it runs: streams without some letters, no home, no terminal, no reader."""
 
 from __future__ import annotations
 
@@ -14,7 +14,7 @@ from support.files import write_campaign
 pytestmark = pytest.mark.skipif(sys.platform == "win32", reason="folders and pipes of POSIX")
 
 SOURCE = Path(__file__).parents[2] / "src"
-UNSET = ("HOME", "TERM", "LANG", "LC_CTYPE", "XDG_CACHE_HOME", "ELASTOCAL_CACHE", "PYTHONUTF8",
+UNSET = ("HOME", "TERM", "LANG", "LC_CTYPE", "XDG_CACHE_HOME", "PYTHONUTF8",
          "MPLCONFIGDIR", "NO_COLOR", "FORCE_COLOR")  # fmt: skip
 
 
@@ -44,8 +44,7 @@ def identified(folder: Path, *words: str, **how) -> subprocess.CompletedProcess[
 
 
 def test_everything_missing_at_once(campaign, tmp_path):
-    """No terminal, locale or compiler, 20 columns, a home without a place for caches; and any
-    warning would be an error."""
+    """No terminal, locale, program or home, 20 columns; and any warning would be an error."""
     page, result = tmp_path / "page.html", tmp_path / "result.json"
     (tmp_path / "file").write_text("")
     done = identified(
@@ -73,13 +72,6 @@ def test_streams_that_lack_letters(campaign, encoding, words, name):
     done = elastocal(campaign, *words, PYTHONIOENCODING=encoding)
     assert done.returncode == 0, done.stderr.decode()
     assert name in done.stdout.decode(encoding) and b"Traceback" not in done.stderr
-
-
-def test_a_compiler_that_is_asked_for_and_absent(campaign):
-    done = elastocal(
-        campaign, "--backend", "compiled", "identify", "cell.toml", "data.csv", PATH="/nowhere"
-    )
-    assert done.returncode == 2 and b"no C compiler" in done.stderr
 
 
 @pytest.mark.parametrize(

@@ -95,17 +95,11 @@ def test_a_folder_that_cannot_be_written_is_refused_before_the_work(inputs, tmp_
     assert (tmp_path / "closed" / "result.json").read_text() == "old"
 
 
-def test_two_runs_at_once_leave_one_whole_result_and_one_whole_cache(inputs, tmp_path):
-    cache = tmp_path / "cache"
-    environment = os.environ | {"ELASTOCAL_CACHE": str(cache)}
-    words = ("--backend", "compiled", "identify", "deflecting.toml", "data.csv", "-q", "-o")
-    both = [elastocal(*words, str(tmp_path / "result.json"), cwd=inputs, env=environment)
-            for _ in range(2)]  # fmt: skip
+def test_two_runs_at_once_leave_one_whole_result(inputs, tmp_path):
+    words = ("identify", "deflecting.toml", "data.csv", "-q", "-o")
+    both = [elastocal(*words, str(tmp_path / "result.json"), cwd=inputs) for _ in range(2)]
     for process in both:
         _, told = process.communicate()
-        if "no C compiler" in told:
-            pytest.skip("no C compiler here")
         assert (process.returncode, told) == (0, "")
     assert json.loads((tmp_path / "result.json").read_text())["converged"]
-    assert sorted(os.listdir(tmp_path)) == ["cache", "result.json"]
-    assert not [name for name in os.listdir(cache) if name.endswith(".tmp")]
+    assert sorted(os.listdir(tmp_path)) == ["result.json"]

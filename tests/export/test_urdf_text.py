@@ -15,7 +15,8 @@ from support.exports import GEOMETRY, exported, write_result
 from support.robots import KR270, packaged_urdf
 
 from elastocal.errors import InputError
-from elastocal.export import Frames, read_urdf_text, rpy
+from elastocal.export import Frames, read_urdf_text
+from elastocal.units import rpy_from_rotation
 
 ODD = """<?xml version='1.0'?>
 <!-- <joint name="q1"> in a comment is no joint -->\r
@@ -99,7 +100,7 @@ def test_roll_pitch_yaw_are_exact_also_where_they_are_not_unique(
     roll: float, pitch: float, near: float, yaw: float
 ) -> None:
     R = Rotation.from_euler("xyz", [roll, pitch + near, yaw]).as_matrix()
-    back = Rotation.from_euler("xyz", rpy(R)).as_matrix()
+    back = Rotation.from_euler("xyz", rpy_from_rotation(R)).as_matrix()
     assert np.abs(back - R).max() < 4e-16 * 10
 
 

@@ -45,7 +45,6 @@ def main() -> int:
     parser.add_argument("--case", type=int, help="run one case, show it, and keep its folder")
     asked = parser.parse_args()
     folder = Path(tempfile.mkdtemp(prefix="elastocal-fuzz-"))
-    os.environ.setdefault("ELASTOCAL_CACHE", str(folder / "cache"))
     base = folder / "campaign"
     base.mkdir()
     anything = asked.cases or asked.kills or asked.full or asked.interrupts

@@ -7,15 +7,9 @@ import threading
 import casadi as ca
 import numpy as np
 import pytest
-from support.backends import system_compiler
 
-from elastocal.model import BatchFunction, c_engine, thread_count
+from elastocal.model import BatchFunction, thread_count
 from elastocal.model.evaluate import CHUNK
-
-
-@pytest.fixture(autouse=True)
-def own_cache(tmp_path_factory: pytest.TempPathFactory, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setenv("ELASTOCAL_CACHE", str(tmp_path_factory.mktemp("cache")))
 
 
 @pytest.mark.parametrize("value, expected", [("3", 3), ("5,2", 5)])
@@ -33,18 +27,12 @@ def mixed() -> tuple[list[ca.SX], list[ca.SX]]:
     return [x, p], [y, ca.jacobian(y, x)]
 
 
-@pytest.mark.parametrize("backend", ["numpy", "compiled"])
-def test_results_do_not_depend_on_the_number_of_threads(
-    backend: str, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    if backend == "compiled":
-        system_compiler()
-    monkeypatch.setattr(c_engine, "WORK_OF_A_THREAD", 1)
+def test_results_do_not_depend_on_the_number_of_threads(monkeypatch: pytest.MonkeyPatch) -> None:
     x = np.abs(np.random.default_rng(0).normal(size=(3 * CHUNK + 17, 3)))
     found = {}
     for threads in (1, 3):
         monkeypatch.setenv("OMP_NUM_THREADS", str(threads))
-        function = BatchFunction(*mixed(), backend)
+        function = BatchFunction(*mixed(), "numpy")
         found[threads] = function(x, np.array([1.7]))
         assert function.report.threads == threads
     for one, three in zip(found[1], found[3], strict=True):

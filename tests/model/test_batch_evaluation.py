@@ -46,7 +46,7 @@ def casadi_values(inputs: list[ca.SX], output: ca.SX, *values: np.ndarray) -> np
 
 def assert_evaluates(inputs: list[ca.SX], output: ca.SX, *values: np.ndarray) -> None:
     with np.errstate(all="ignore"):
-        found = BatchFunction(inputs, [output])(*values)[0]
+        found = BatchFunction(inputs, [output], "numpy")(*values)[0]
     np.testing.assert_allclose(
         found, casadi_values(inputs, output, *values), rtol=4e-15, atol=1e-300
     )
@@ -137,17 +137,33 @@ def test_chunk_boundaries(chunk: int, beyond: int | None) -> None:
     rng = np.random.default_rng(n)
     q, p = rng.normal(size=(n, 3)), rng.normal(size=2)
     inputs, outputs = three_outputs()
-    for found, expected in zip(BatchFunction(inputs, outputs)(q, p, chunk=chunk), evaluated(q, p),
+    function = BatchFunction(inputs, outputs, "numpy")
+    for found, expected in zip(function(q, p, chunk=chunk), evaluated(q, p),
                                strict=True):  # fmt: skip
         assert found.shape == expected.shape
         np.testing.assert_allclose(found, expected, rtol=1e-15, atol=1e-15)
+
+
+@pytest.mark.parametrize("backend", ["auto", "numpy"])
+@pytest.mark.parametrize("given_as", [
+    lambda q: np.asfortranarray(q), lambda q: np.hstack([q, q])[:, :3],
+    lambda q: np.repeat(q, 2, axis=0)[::2], lambda q: q[::-1][::-1], lambda q: q.astype(">f8"),
+    lambda q: np.frombuffer(b"x" + q.tobytes(), dtype=np.uint8)[1:].view(float).reshape(-1, 3),
+    lambda q: np.round(10 * q).astype(np.int32),
+])  # fmt: skip
+def test_arrays_of_any_layout(given_as, backend: str) -> None:
+    q = given_as(np.random.default_rng(1).normal(size=(9, 3)))
+    function = BatchFunction(*three_outputs(), backend)
+    plain = np.array(q.tolist(), dtype=float)
+    for found, exact in zip(function(q, np.ones(2)), function(plain, np.ones(2)), strict=True):
+        np.testing.assert_array_equal(found, exact)
 
 
 def test_a_tape_has_no_memory() -> None:
     """Called again, also with fewer rows, it starts afresh; results are the caller's own."""
     rng = np.random.default_rng(2)
     q, p = rng.normal(size=(9, 3)), rng.normal(size=2)
-    function = BatchFunction(*three_outputs())
+    function = BatchFunction(*three_outputs(), "numpy")
     first = function(q, p)
     kept = [found.copy() for found in first]
     function(rng.normal(size=(4, 3)), p)
@@ -170,7 +186,7 @@ PIECEWISE = {"fmax": ca.fmax(X, 1.0), "fmin": ca.fmin(X, 1.0), "lt": (X < 1) * X
 
 def assert_complex_step(expression: ca.SX, at: np.ndarray) -> None:
     step = 1e-30
-    found = BatchFunction([X], [expression])(at + 1j * step)[0]
+    found = BatchFunction([X], [expression], "numpy")(at + 1j * step)[0]
     np.testing.assert_allclose(found.real, casadi_values([X], expression, at), rtol=4e-15)
     slope = casadi_values([X], ca.jacobian(expression, X), at)
     np.testing.assert_allclose(found.imag / step, slope, rtol=4e-14)  # 1 − tanh² cancels

@@ -86,28 +86,3 @@ def test_off_path_joints_may_mimic_float_or_lack_limits(tmp_path: Path) -> None:
         )
     )
     assert read(tmp_path, arm(extra=branch), flange="l4").n_joints == 4
-
-
-def test_what_pinocchio_read_is_kept_to_the_bit(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    """A file is read by pinocchio once; with a number changed it is another arm."""
-    import pinocchio as pin
-
-    monkeypatch.setenv("ELASTOCAL_CACHE", str(tmp_path / "cache"))
-    build, asked = pin.buildModelFromXML, []
-    monkeypatch.setattr(pin, "buildModelFromXML", lambda text: asked.append(text) or build(text))
-    first, again = read_urdf(KR270), read_urdf(KR270)
-    assert len(asked) == 1
-    for one, other in zip(first.joints, again.joints, strict=True):
-        assert (one.name, one.kind, one.lower, one.upper) == (
-            other.name, other.kind, other.lower, other.upper
-        )  # fmt: skip
-        assert one.placement.tobytes() == other.placement.tobytes()
-        assert one.axis.tobytes() == other.axis.tobytes()
-    assert first.flange_placement.tobytes() == again.flange_placement.tobytes()
-    for a, b in zip(first.masses, again.masses, strict=True):
-        assert a.mass == b.mass and a.com.tobytes() == b.com.tobytes()
-    read(tmp_path, arm())
-    read(tmp_path, arm(replace={'lower="-1"': 'lower="-0.5"'}))
-    assert len(asked) == 3

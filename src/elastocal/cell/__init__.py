@@ -11,7 +11,7 @@ ROOMS = {
         "CartesianNoise CompensatorTable EffectChoice ModelSpec Nominal Observe PolarNoise "
         "Robot Tool Tracker Unsteadiness"
     ),
-    "file_keys": "rotation_from_rpy table_of",
+    "file_keys": "table_of",
     "plan_wishes": "DesignSpec Freedom Motion TargetBox TargetPath TargetPose",
     "work_cell": "Cell read_cell",
     "workspace_rules": "CarriedBody HalfSpace HangingLoad Shape Solid Visibility Workspace",

@@ -8,7 +8,6 @@ table (`from_table`), and what is said of a wrong argument in Python.
 
 from __future__ import annotations
 
-import math
 import re
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import suppress
@@ -56,7 +55,7 @@ from elastocal.config import (
 from elastocal.errors import InputError, require
 from elastocal.files import check_exists
 from elastocal.text import did_you_mean, listed
-from elastocal.units import Array, to_si
+from elastocal.units import Array, rotation_from_rpy, to_si
 
 Record = TypeVar("Record")
 Member = TypeVar("Member")
@@ -344,28 +343,6 @@ def existing_file(found: str, spot: Spot, name: str) -> Path:
     return check_exists(spot.path.parent / found, spot.key(name), spot.path)
 
 
-def rotation_from_rpy(rpy_deg: Sequence[float] | Array, *_: object) -> Array:
-    """Rz(yaw) Ry(pitch) Rx(roll), (3, 3)."""
-    (cr, cp, cy), (sr, sp, sy) = np.cos(np.radians(rpy_deg)), np.sin(np.radians(rpy_deg))
-    about_z = np.array([[cy, -sy, 0.0], [sy, cy, 0.0], [0.0, 0.0, 1.0]])
-    about_y = np.array([[cp, 0.0, sp], [0.0, 1.0, 0.0], [-sp, 0.0, cp]])
-    about_x = np.array([[1.0, 0.0, 0.0], [0.0, cr, -sr], [0.0, sr, cr]])
-    return about_z @ about_y @ about_x
-
-
-def rpy(R: Array) -> tuple[float, float, float]:
-    """Roll, pitch, yaw in rad with R = Rz(yaw) Ry(pitch) Rx(roll), the URDF's convention.
-
-    Yaw is taken first and undone in the other two, so that all three are exact to rounding at
-    pitch = ±π/2 as well, where the textbook formula divides 0 by 0.
-    """
-    yaw = math.atan2(R[1, 0], R[0, 0])
-    c, s = math.cos(yaw), math.sin(yaw)
-    pitch = math.atan2(-R[2, 0], c * R[0, 0] + s * R[1, 0])
-    roll = math.atan2(s * R[0, 2] - c * R[1, 2], c * R[1, 1] - s * R[0, 1])
-    return roll, pitch, yaw
-
-
 def direction(vector: Array, spot: Spot, name: str) -> Array:
     """A vector (3,) at unit length; raises InputError that names the key where it is zero."""
     unit = _unit_vector(np.asarray(vector, dtype=float))
@@ -452,6 +429,8 @@ AnyFloat = Annotated[float, AllowInfNan(True)]
 Many = Annotated[tuple[Member, ...], TUPLE]
 AS_PATH = BeforeValidator(lambda value: Path(value) if isinstance(value, str) else value)
 File = Annotated[Path, AS_PATH, FromFile(Text, existing_file)]
-Rotation = Annotated[Array, matrix(3, 3), FromFile(Vector3, rotation_from_rpy)]
+Rotation = Annotated[
+    Array, matrix(3, 3), FromFile(Vector3, lambda rpy, *_: rotation_from_rpy(np.radians(rpy)))
+]
 Transform = Annotated[Array, matrix(4, 4)]
 Direction = Annotated[Array, PlainValidator(_direction), FromFile(Vector3, direction)]

@@ -27,7 +27,6 @@ from elastocal.cell.file_keys import (
     keyed,
     keys_of,
     record,
-    rotation_from_rpy,
     stated,
 )
 from elastocal.config import (
@@ -42,7 +41,7 @@ from elastocal.config import (
 )
 from elastocal.errors import require
 from elastocal.text import is_label, quoted
-from elastocal.units import Array
+from elastocal.units import Array, rotation_from_rpy
 
 Shape = Literal["box", "sphere", "cylinder", "capsule", "mesh"]
 Part = Annotated[str, Field(pattern=r"^(base|flange|link[1-9][0-9]{0,2})$")]
@@ -118,7 +117,7 @@ class Solid:
             size = np.hstack([getattr(table, name) for name in needed])
         T = np.eye(4)
         if getattr(table, "rpy_deg", None) is not None:
-            T[:3, :3] = rotation_from_rpy(table.rpy_deg)
+            T[:3, :3] = rotation_from_rpy(np.radians(table.rpy_deg))
         if getattr(table, "position_m", None) is not None:
             T[:3, 3] = table.position_m
         return {"size": size, "placement": T}

@@ -141,10 +141,6 @@ def reporting_errors(command: Callable[..., None]) -> Callable[..., None]:
                 # numpy's, of overflows: what comes of them is judged where a number must be one.
                 warnings.simplefilter("ignore", RuntimeWarning)
                 command(*args, **kwargs)
-                # Nothing else of the model is loaded for this.
-                cache = sys.modules.get("elastocal.model.function_cache")
-                for told in getattr(cache, "refused", ()):
-                    complain(told)
         except ElastocalError as error:
             complain(str(error))
             raise typer.Exit(error.exit_code) from None
@@ -197,7 +193,7 @@ def options(
     ] = False,
     backend: Annotated[
         str | None,
-        typer.Option(help="What evaluates the model: auto, numpy or compiled; default: auto."),
+        typer.Option(help="What evaluates the model: auto or numpy; default: auto."),
     ] = None,
 ) -> None:
     """Calibrate industrial robot arms and explain what is left over."""
@@ -207,6 +203,8 @@ def options(
     if backend is not None:
         os.environ[VARIABLE] = checked(backend.strip() or "auto", "--backend")
     chosen_backend()
+    if os.environ.get("ELASTOCAL_CACHE"):
+        complain("ELASTOCAL_CACHE is no longer read, as nothing is kept between runs; unset it")
 
 
 # The files that a command reads and writes: checked before the work, written after it.

@@ -5,7 +5,7 @@ from elastocal import loaded_on_demand
 ROOMS = {
     "dh_table": "split",
     "export": "Exported Wish to_yaml",
-    "exportable": "Conditions cost_of evaluate_pieces keep random_table rpy",
+    "exportable": "Conditions cost_of evaluate_pieces keep random_table",
     "joint_correction": "JointCorrection read_joint_correction",
     "mjcf_file": "MujocoRest",
     "urdf_file": "Frames read_urdf_text",

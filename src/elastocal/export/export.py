@@ -25,7 +25,6 @@ from elastocal.export.exportable import (
     evaluate_pieces,
     keep,
     link_inertias,
-    rpy,
 )
 from elastocal.export.joint_correction import JointCorrection
 from elastocal.export.mjcf_file import RIGID, MujocoRest, calibrated_mjcf
@@ -49,7 +48,7 @@ from elastocal.model.smooth_groups import SmoothGroup, smooth_groups
 from elastocal.model.valued import Conditions, Valued, random_table
 from elastocal.tables import csv_text
 from elastocal.text import did_you_mean, json_text, listed, plain
-from elastocal.units import Array
+from elastocal.units import Array, rpy_from_rotation
 
 # The parameters as YAML or JSON, to be read by people and by programs of their own.
 
@@ -136,7 +135,7 @@ def cost_json(cost: Cost) -> dict[str, Any]:
 def _placed(T: Array) -> dict[str, list[float]]:
     return {
         "xyz_m": [float(v) + 0.0 for v in T[:3, 3]],
-        "rpy_rad": [v + 0.0 for v in rpy(T[:3, :3])],
+        "rpy_rad": [v + 0.0 for v in rpy_from_rotation(T[:3, :3])],
     }
 
 

@@ -12,7 +12,6 @@ import numpy as np
 from numpy.typing import ArrayLike
 from scipy.spatial.transform import Rotation
 
-from elastocal.cell.file_keys import rpy
 from elastocal.errors import InsufficientDataError, option
 from elastocal.measurements import Measurements
 from elastocal.model import rigid
@@ -33,7 +32,7 @@ from elastocal.model.valued import (
     random_table,
     unstated_needs,
 )
-from elastocal.units import Array
+from elastocal.units import Array, rpy_from_rotation
 
 
 def numbers(values: ArrayLike) -> str:
@@ -49,7 +48,7 @@ def placed_body(name: str, T: Array) -> dict[str, str]:
 
 def origin_attributes(T: Array) -> dict[str, str]:
     """xyz and rpy of an <origin> for a transform (4, 4)."""
-    return {"xyz": numbers(T[:3, 3]), "rpy": numbers(rpy(T[:3, :3]))}
+    return {"xyz": numbers(T[:3, 3]), "rpy": numbers(rpy_from_rotation(T[:3, :3]))}
 
 
 # What of the calibrated model a file can hold, as a model of its own beside the full one.

@@ -16,7 +16,6 @@ from typing import Any
 import numpy as np
 
 from elastocal.cell.arm_description import SOURCES, Convention, Robot
-from elastocal.cell.file_keys import rpy
 from elastocal.cell.work_cell import Cell, read_cell
 from elastocal.errors import InputError, option, require
 from elastocal.files import atomic_writer
@@ -32,7 +31,7 @@ from elastocal.model.plausible import jaw_told
 from elastocal.model.rigid import nominal_flanges
 from elastocal.model.urdf import MOVING, check_urdf, xacro_left
 from elastocal.text import listed, printable
-from elastocal.units import Array
+from elastocal.units import Array, rpy_from_rotation
 
 ENDINGS = {".urdf": "urdf", ".xml": "mjcf", ".mjcf": "mjcf", ".csv": "dh"}
 ENDINGS |= dict.fromkeys(ur_table.ENDINGS, "dh")
@@ -307,7 +306,7 @@ def _rest(chain: Chain, mount: tuple[Array, str], sites: dict[str, Array]) -> st
     reach = max(reach_of(chain), 0.05)
     side, n = reach / 12, chain.n_joints
     turned, whose = mount
-    rpy_deg = f"base_rpy_deg = {_vector(np.degrees(rpy(turned)))}"
+    rpy_deg = f"base_rpy_deg = {_vector(np.degrees(rpy_from_rotation(turned)))}"
     # Off the last joint's axis, which a load on it would not turn.
     hangs = f"load_point_m = {_vector([side, 0, side])}"
     station = f"position_m = {_vector([round(2 * reach, 1), 0.0, round(0.5 * reach, 1)])}"

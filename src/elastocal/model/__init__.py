@@ -4,7 +4,6 @@ from elastocal import loaded_on_demand
 
 ROOMS = {
     "arm": "Arm Parameter ParameterSpec Setting row_inputs usual_sizes",
-    "c_engine": "find_compiler",
     "calibrated": "CalibratedArm nominal_flange_rows read_calibrated",
     "calibrated_tool": "CalibratedTool ToolPoint share_of_levels tool_point",
     "chain": "Chain Joint LinkMass finite_ranges joint_index joint_limits",
@@ -12,9 +11,8 @@ ROOMS = {
     "dh": "read_dh",
     "effects": "effect_of register",
     "evaluate": (
-        "BackendReport BatchFunction Work chosen_backend row_blocks run_blocks summary thread_count"
+        "BackendReport BatchFunction chosen_backend row_blocks run_blocks summary thread_count"
     ),
-    "function_cache": "HashedFunction cache_folder content_key fetch store",
     "inverse_kinematics": "Postures",
     "manipulator": "Model",
     "mjcf": "MjcfArm read_mjcf",

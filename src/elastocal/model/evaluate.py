@@ -8,7 +8,7 @@ import threading
 from collections import deque
 from collections.abc import Callable, Iterable, Iterator, Sequence
 from concurrent.futures import Future, ThreadPoolExecutor
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from functools import cached_property
 from itertools import accumulate, pairwise
 from typing import Any, TypeVar
@@ -18,15 +18,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from elastocal.errors import InputError
-from elastocal.model.c_engine import (
-    HOW_TO_GET_ONE,
-    Compiled,
-    NoCompiler,
-    compile_function,
-    find_compiled,
-)
-from elastocal.model.function_cache import HashedFunction, row_by_row
-from elastocal.model.numpy_engine import NumpyFunction
+from elastocal.model.numpy_engine import NumpyFunction, row_by_row
 from elastocal.text import did_you_mean
 
 Item = TypeVar("Item")
@@ -92,32 +84,27 @@ def ahead(work: Callable[[Item], Result], items: Iterable[Item], threads: int) -
             yield waiting.popleft().result()
 
 
-# Which engine evaluates a function: CasADi row by row, numpy or compiled C; asked for and reported.
-#
-# "auto" rents before it buys: few rows are evaluated by CasADi itself, where numpy's calls would
-# cost more, many by numpy, until that has cost about as much more than compiled code as compiling
-# costs, and compiled then.  What has been compiled before is used as soon as the others have cost
-# more than looking for it.  All is counted in calls and rows and never timed, so that the same
-# work with the same cache is evaluated by the same engine.
+# Which engine evaluates a function: numpy, or under "auto" CasADi itself where rows are so few that
+# numpy's calls would cost more.  That is counted and never timed, so that the same work is
+# evaluated by the same engine.
 
-BACKENDS = ("auto", "numpy", "compiled")
+BACKENDS = ("auto", "numpy")
 VARIABLE = "ELASTOCAL_BACKEND"
-
-# Seconds, on one core of a 2023 server.  Numpy costs a call per instruction and block and
-# is then bound by the second-level cache; compiled code keeps most operands in registers.
-NUMPY_CALL = 0.3e-6  # per instruction and block
-NUMPY_ROW = 0.15e-9  # per instruction and row, above compiled code
-CASADI_ROW = 4e-9  # the same of CasADi's own evaluation, which has no cost beside
-COMPILE_START, COMPILE_INSTRUCTION = 0.2, 1.0e-4  # one run of the compiler, and for each
-COMPILE_LENGTH = 4.4e-9  # instruction and each of the others in the same function
-LOOKUP_START, LOOKUP_INSTRUCTION = 0.02, 1e-6  # hash, verify and load a library
+# A row takes CasADi 4 ns per instruction and numpy 0.15, which pays 0.3 µs per instruction and
+# block beside (one core of a 2023 server).
+FEW = 77  # rows of a block
 
 
 def checked(name: str, source: str) -> str:
     """`name` where it is a backend; InputError that says where it comes from otherwise."""
+    if name == "compiled":
+        raise InputError(
+            f"{source}: the backend 'compiled' is gone, as numpy evaluates tables nearly as fast; "
+            "take auto, or leave it out"
+        )
     if name not in BACKENDS:
         raise InputError(
-            f"{source}: unknown backend '{name}'{did_you_mean(name, list(BACKENDS))}; "
+            f"{source}: unknown backend '{name}'{did_you_mean(name, BACKENDS)}; "
             f"valid: {', '.join(BACKENDS)}"
         )
     return name
@@ -133,72 +120,32 @@ def chosen_backend(name: str | None = None) -> str:
     return checked(os.environ.get(VARIABLE, "").strip() or "auto", f"{VARIABLE} in the environment")
 
 
-@dataclass
-class Work:
-    """Seconds that numpy or CasADi has cost above compiled code of `instructions`, estimated."""
-
-    instructions: int
-    wasted: float = 0.0
-
-    def add(self, rows: int, blocks: int) -> None:
-        """One more call of `rows` rows in `blocks` blocks."""
-        by_numpy = NUMPY_CALL * blocks + NUMPY_ROW * rows
-        self.wasted += self.instructions * min(by_numpy, CASADI_ROW * rows)
-
-    @staticmethod
-    def few(rows: int, blocks: int) -> bool:
-        """CasADi evaluates so few rows (up to 77 of one block) sooner than numpy."""
-        return CASADI_ROW * rows <= NUMPY_CALL * blocks + NUMPY_ROW * rows
-
-    @property
-    def pays_to_look(self) -> bool:
-        """A library that exists already pays by now."""
-        return self.wasted >= LOOKUP_START + LOOKUP_INSTRUCTION * self.instructions
-
-    @property
-    def pays_to_compile(self) -> bool:
-        """Compiling would have paid by now."""
-        each = COMPILE_INSTRUCTION + COMPILE_LENGTH * self.instructions
-        return self.wasted >= COMPILE_START + each * self.instructions
-
-
 @dataclass(frozen=True)
 class BackendReport:
-    """What evaluated a function last.
-
-    `backend` "casadi", "numpy" or "compiled" ("none" before the first call), `compiler` its path
-    and version where compiled, `threads` used, `cached` True where the library was found and not
-    compiled by this process, `reason` why it is not compiled.
-    """
+    """What evaluated a function last: `backend` "casadi", "numpy" or, before any call, "none"."""
 
     backend: str
-    compiler: str | None = None
     threads: int = 1
-    cached: bool = False
-    reason: str = ""
 
     def __str__(self) -> str:
-        cores = f"{self.threads} thread{'s' if self.threads > 1 else ''}"
-        if self.backend == "compiled":
-            return f"compiled ({self.compiler}; {cores})"
-        why = f"; {self.reason}" if self.reason else ""
-        return f"{self.backend} ({cores}{why})"
+        return f"{self.backend} ({self.threads} thread{'s' if self.threads > 1 else ''})"
 
 
 def summary(reports: Iterable[BackendReport]) -> str:
     """One line for a report: every engine that was used, and by how many of the functions."""
-    groups: dict[tuple[str, str | None, str], list[BackendReport]] = {}
+    threads: dict[str, list[int]] = {}
     for report in reports:
         if report.backend != "none":
-            key = (report.backend, report.compiler, report.reason)
-            groups.setdefault(key, []).append(report)
-    total = sum(len(group) for group in groups.values())
-    lines = []
-    for group in groups.values():
-        threads = max(r.threads for r in group)
-        share = f"{len(group)} of {total} expressions: " if len(groups) > 1 else ""
-        lines.append(f"{share}{replace(group[0], threads=threads)}")
-    return "; ".join(lines) or "nothing evaluated yet"
+            threads.setdefault(report.backend, []).append(report.threads)
+    total = sum(map(len, threads.values()))
+    return (
+        "; ".join(
+            (f"{len(used)} of {total} expressions: " if len(threads) > 1 else "")
+            + str(BackendReport(engine, max(used)))
+            for engine, used in threads.items()
+        )
+        or "nothing evaluated yet"
+    )
 
 
 CHUNK = 8192  # rows at a time: registers stay in cache, numpy's call overhead is spread
@@ -213,15 +160,11 @@ class RowByRow:
 
     name, largest_block = "casadi", CHUNK
 
-    def __init__(self, function: HashedFunction) -> None:
-        self._function = function.function
+    def __init__(self, function: ca.Function) -> None:
+        self._function = function
         outputs = range(self._function.n_out())
         self._places = [row_by_row(self._function.sparsity_out(k)) for k in outputs]
         self._spans = _side_by_side(map(len, self._places))
-
-    def threads(self, rows: int) -> int:
-        """One: CasADi evaluates few rows, and holds the interpreter's lock."""
-        return 1
 
     def evaluate(
         self, inputs: Sequence[NDArray], results: Sequence[NDArray], blocks: Sequence[slice]
@@ -257,48 +200,33 @@ def _side_by_side(widths: Iterable[int]) -> list[slice]:
     return [slice(a, b) for a, b in pairwise(accumulate(widths, initial=0))]
 
 
-Engine = RowByRow | NumpyFunction | Compiled
-
-
 class BatchFunction:
     """An `SX` expression list, evaluated row by row on arrays.
 
     `inputs` and `outputs` are lists of SX vectors / matrices.  Calling it takes one array
     per input: (n, size) for a quantity that varies by row, (size,) for one that is the same in
     every row; it returns one array (n, rows, columns) per output, float64, or complex where an
-    input is.  `backend` is "auto", "numpy" or "compiled"; None follows ELASTOCAL_BACKEND.
-    Complex numbers are always evaluated by numpy; under "auto" few rows by CasADi.
+    input is.  `backend` is "auto" or "numpy"; None follows ELASTOCAL_BACKEND.  Complex numbers are
+    always evaluated by numpy; under "auto" few rows by CasADi.
 
-    By numpy a call raises NotImplementedError for an operation that it lacks, by all ValueError
-    for arrays of other shapes, InputError where `backend` is "compiled" and nothing can compile.
+    By numpy a call raises NotImplementedError for an operation that it lacks, by both ValueError
+    for arrays of other shapes.
     """
 
     def __init__(
         self, inputs: Sequence[ca.SX], outputs: Sequence[ca.SX], backend: str | None = None
     ) -> None:
         self._asked = None if backend is None else checked(backend, "backend")
-        self._function = HashedFunction(inputs, outputs)
-        self.shapes = self._function.shapes
-        self._sizes = self._function.sizes
-        self.n_instructions = self._function.n_instructions
-        self._forget()
-
-    def _forget(self) -> None:
-        self._lock = threading.Lock()
-        self._work = Work(self.n_instructions)
-        self._compiled: Compiled | None = None
-        self._looked = False
-        self._refused = ""
+        self._function = f = ca.Function("rows", list(inputs), list(outputs))
+        self.shapes = [f.size_out(k) for k in range(f.n_out())]
+        self._sizes = [f.nnz_in(k) for k in range(f.n_in())]
+        self.n_instructions = int(f.n_instructions())
         self._report = BackendReport("none")
 
     def __getstate__(self) -> dict[str, Any]:
-        """Expressions only: libraries, locks and instructions are found again where it goes."""
-        kept = ("_asked", "_function", "shapes", "_sizes", "n_instructions")
-        return {key: self.__dict__[key] for key in kept}
-
-    def __setstate__(self, state: dict[str, Any]) -> None:
-        self.__dict__.update(state)
-        self._forget()
+        """Without engines, which are made again where it goes."""
+        engines = ("_by_numpy", "_by_casadi")
+        return {key: value for key, value in self.__dict__.items() if key not in engines}
 
     @cached_property
     def _by_numpy(self) -> NumpyFunction:
@@ -317,10 +245,13 @@ class BatchFunction:
         arrays, n = self._rows(inputs)
         dtype = np.result_type(np.float64, *arrays)
         results = [np.zeros((n, r, c), dtype=dtype) for r, c in self.shapes]
-        engine = self._engine(dtype, n, -(-n // max(chunk, 1)))
+        few = n <= FEW * -(-n // max(chunk, 1)) and dtype == np.float64
+        by_casadi = chosen_backend(self._asked) == "auto" and few
+        engine = self._by_casadi if by_casadi else self._by_numpy
         blocks = row_blocks(n, min(chunk, engine.largest_block))
-        threads = max(1, min(engine.threads(n), len(blocks), _threads_here()))
-        self._note(engine, threads)
+        # CasADi holds the interpreter's lock; numpy lets others run while it computes.
+        threads = 1 if by_casadi else max(1, min(len(blocks), _threads_here()))
+        self._report = BackendReport(engine.name, threads)
         run_blocks(lambda share: engine.evaluate(arrays, results, share), blocks, threads)
         return results
 
@@ -335,42 +266,6 @@ class BatchFunction:
         if len(shapes) != len(self._sizes) or not all(fit):
             raise ValueError(f"inputs of shapes {shapes}; it takes {self._sizes} per row")
         return arrays, n
-
-    def _engine(self, dtype: np.dtype, rows: int, blocks: int) -> Engine:
-        backend = chosen_backend(self._asked)
-        if backend == "numpy" or dtype != np.float64:
-            return self._by_numpy
-        with self._lock:
-            if self._compiled is None and backend == "compiled":
-                try:
-                    self._compiled = compile_function(self._function)
-                except NoCompiler as error:
-                    raise InputError(f"backend compiled: {error}; {HOW_TO_GET_ONE}") from None
-            if self._compiled is None and not self._refused:
-                self._compiled = self._where_it_pays(rows, blocks)
-            if self._compiled is not None:
-                return self._compiled
-        return self._by_casadi if self._work.few(rows, blocks) else self._by_numpy
-
-    def _where_it_pays(self, rows: int, blocks: int) -> Compiled | None:
-        """Compiled code under "auto", this call counted; None where numpy is still cheaper."""
-        self._work.add(rows, blocks)
-        try:
-            if self._work.pays_to_compile:
-                return compile_function(self._function)
-            if self._work.pays_to_look and not self._looked:
-                self._looked = True
-                return find_compiled(self._function)
-        except NoCompiler as error:
-            self._refused = str(error)
-        return None
-
-    def _note(self, engine: Engine, threads: int) -> None:
-        if isinstance(engine, Compiled):
-            compiler = str(engine.compiler)
-            self._report = BackendReport(engine.name, compiler, threads, engine.cached)
-        else:
-            self._report = BackendReport(engine.name, threads=threads, reason=self._refused)
 
 
 def _threads_here() -> int:

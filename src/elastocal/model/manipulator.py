@@ -63,8 +63,8 @@ class Model:
         cell: A cell file (TOML), or a `Cell` built in Python.
         markers: The markers' names where the cell lists none; default one, "M1".  Every verb
             takes them from the table where neither says them.
-        backend: What evaluates it: "auto", "numpy" or "compiled"; None follows the
-            environment variable ELASTOCAL_BACKEND.
+        backend: What evaluates it: "auto" or "numpy"; None follows the environment
+            variable ELASTOCAL_BACKEND.
         plugins: Run the Python files and modules that the cell names under [plugins]; None does
             without them where no effect of the model is theirs.
 
@@ -276,7 +276,7 @@ class Model:
         return sorted({v for p in self.parameters for v in (p.name, p.where, p.effect)})
 
     def backend_report(self) -> str:
-        """What evaluates this model, for reports: engine, compiler, cached or not, threads."""
+        """What evaluates this model, for reports: engine and threads."""
         return summary(self._symbolic.backend_reports)
 
     @property

@@ -4,20 +4,11 @@ from __future__ import annotations
 
 import operator
 from collections.abc import Callable, Iterator, Sequence
-from contextlib import suppress
 from typing import Any
 
 import casadi as ca
 import numpy as np
 from numpy.typing import NDArray
-
-from elastocal.model.function_cache import (
-    HashedFunction,
-    content_key,
-    fetch_arrays,
-    row_by_row,
-    store_arrays,
-)
 
 # CasADi's scalar operations as numpy functions of arrays, real or complex.
 
@@ -83,39 +74,34 @@ ON_NUMBERS: dict[Any, Any] = {
 }  # fmt: skip
 
 
-# CasADi's instructions of a function as arrays, kept in the cache where asking for them takes long.
+# CasADi's instructions of a function as arrays.
 
 CONSTANT, READ, WRITE, UNARY_OP, BINARY_OP = range(5)
-SUFFIX = ".tape.npz"
-# Asking CasADi for its instructions takes 15 µs for each, with their common subexpressions; what
-# is made in less than 15 ms is not worth a file.
-SMALLEST_CACHED = 1000
+# Finding common subexpressions takes 7 µs per instruction.  It saves 2 to 14 % of the instructions
+# of B and 1 % of a Jacobian of 170 000, where it would take longer than all the rest.
+LARGEST_REDUCED = 60_000
 
 
-def instructions(function: HashedFunction) -> tuple[NDArray[np.int32], NDArray, int]:
-    """Instructions (m, 5), constants (c,) and number of registers of a function; cached when long.
+def instructions(function: ca.Function) -> tuple[NDArray[np.int32], NDArray, int]:
+    """Instructions (m, 5), constants (c,) and number of registers of a function.
 
     An instruction is kind, operation or constant's index, register, first and second operand;
     of READ the operands are input and component, of WRITE output and place row by row.
     """
-    if function.n_instructions < SMALLEST_CACHED:
-        return _extracted(function)
-    key = content_key("instructions", function.digest)
-    if found := fetch_arrays(key, SUFFIX):
-        with suppress(KeyError, TypeError):  # of another version
-            return found["table"], found["constants"], int(found["registers"])
-    table, constants, registers = _extracted(function)
-    kept = {"table": table, "constants": constants, "registers": np.array(registers)}
-    store_arrays(key, SUFFIX, kept)
-    return table, constants, registers
-
-
-def _extracted(function: HashedFunction) -> tuple[NDArray[np.int32], NDArray, int]:
-    reduced = function.reduced
+    if function.n_instructions() <= LARGEST_REDUCED:
+        # The derivative code repeats the chain's products many times over.
+        symbols = function.sx_in()
+        function = ca.Function("rows", symbols, function.call(symbols), {"cse": True})
     constants: list[float] = []
-    steps = list(_steps(reduced, constants))
+    steps = list(_steps(function, constants))
     table = np.array(steps, dtype=np.int32).reshape(-1, 5)
-    return table, np.array(constants), int(reduced.sz_w())
+    return table, np.array(constants), int(function.sz_w())
+
+
+def row_by_row(sparsity: ca.Sparsity) -> list[int]:
+    """Where each nonzero, in CasADi's order, stands in its matrix written row by row."""
+    columns = sparsity.size2()
+    return [r * columns + c for r, c in zip(sparsity.row(), sparsity.get_col(), strict=True)]
 
 
 def _steps(f: ca.Function, constants: list[float]) -> Iterator[tuple[int, int, int, int, int]]:
@@ -160,15 +146,11 @@ class NumpyFunction:
 
     name = "numpy"
 
-    def __init__(self, function: HashedFunction) -> None:
+    def __init__(self, function: ca.Function) -> None:
         self._table, self._constants, self.n_registers = instructions(function)
-        width = self.n_registers + sum(r * c for r, c in function.shapes)
+        width = self.n_registers + sum(function.numel_out(k) for k in range(function.n_out()))
         self.largest_block = max(LARGEST_BUFFER // max(width, 1), 1)
         self._steps: dict[tuple[bool, ...], Steps] = {}
-
-    def threads(self, rows: int) -> int:
-        """As many as there are blocks: numpy lets others run while it computes a long array."""
-        return rows
 
     def evaluate(
         self, inputs: Sequence[NDArray], results: Sequence[NDArray], blocks: Sequence[slice]

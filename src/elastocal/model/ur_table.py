@@ -20,7 +20,6 @@ from typing import Any
 
 import numpy as np
 
-from elastocal.cell.file_keys import rotation_from_rpy
 from elastocal.errors import InputError, option, require
 from elastocal.files import read_text
 from elastocal.model.chain import Chain, Joint
@@ -28,7 +27,7 @@ from elastocal.model.dh import link
 from elastocal.model.plausible import check_angles, near_the_arm
 from elastocal.model.rigid import nominal_flanges
 from elastocal.text import did_you_mean, listed, quoted
-from elastocal.units import Array
+from elastocal.units import Array, rotation_from_rpy
 
 ENDINGS = (".conf", ".yaml", ".yml")
 MOST_BYTES = 100_000
@@ -207,6 +206,6 @@ def _of_origins(path: Path, text: str) -> Chain:
         numbers = [_number(f"{path}: kinematics.{of_link}.{key}", origin[key]) for key in ORIGIN]
         check_angles(f"{path}: kinematics.{of_link}", tuple(numbers[3:]), "the file is in rad")
         T = np.eye(4)
-        T[:3, :3], T[:3, 3] = rotation_from_rpy(np.degrees(numbers[3:])), numbers[:3]
+        T[:3, :3], T[:3, 3] = rotation_from_rpy(numbers[3:]), numbers[:3]
         joints.append(Joint(name, "revolute", T, np.array([0.0, 0.0, 1.0])))
     return Chain(path.stem, tuple(joints), np.eye(4))
