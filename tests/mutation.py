@@ -7,9 +7,9 @@ stands: the same set is drawn from another state of the tree, and with --again F
 earlier run is kept; a mutant whose line is gone gives way to the next of its package.
 
 All are written into one copy of the tree, each asleep until the environment names it.  One run of
-the tests records which test comes to which mutant; then each is woken, and the tests that come to
-it run, the files with the shortest first, until one fails or the time is over.  What a fixture of
-several tests comes to counts for all tests of its file.
+the tests, of a parametrised one its first case, records which test comes to which mutant; then
+each is woken, and the tests that come to it run, the files with the shortest first, until one
+fails or the time is over.  What a fixture of several tests comes to counts for all of its file.
 """
 
 from __future__ import annotations
@@ -62,6 +62,10 @@ def late(*_):
 def timed(when):
     signal.signal(signal.SIGVTALRM, late)
     signal.setitimer(signal.ITIMER_VIRTUAL, SECONDS[when] if NOTES else 0.0)
+def pytest_collection_modifyitems(config, items):
+    if NOTES:
+        first = {item.nodeid.split("[")[0]: item for item in reversed(items)}
+        items[:] = [item for item in items if first[item.nodeid.split("[")[0]] is item]
 def pytest_runtest_setup(item):
     timed("setup")
 def pytest_runtest_call(item):
@@ -257,19 +261,20 @@ def pytest(root: Path, *words: str, seconds: float | None = None, **environment:
 def recorded(notes: Path) -> tuple[dict[int, dict[str, list[str]]], dict[str, float]]:
     """Tests that come to each mutant, by file, and how long each test that passes takes."""
     hits, times, bad = defaultdict(set), defaultdict(float), set()
-    for line in notes.read_text().splitlines():
-        what, *rest = line.split("\t")
+    for what, *rest in (line.split("\t") for line in notes.read_text().splitlines()):
         if what == "test":
-            times[rest[0]] += float(rest[3])
+            test = rest[0].split("[")[0]
+            times[test] += float(rest[3])
             if rest[2] != "passed":
-                bad.add(rest[0])
+                bad.add(test)
         elif rest[1]:
-            hits[int(rest[0])].add(rest[1])
+            test, stage = rest[1].rsplit(" ", 1)
+            hits[int(rest[0])].add((test.split("[")[0], stage))
     good = {t: s for t, s in times.items() if t not in bad}
     chosen: dict[int, dict[str, list[str]]] = {}
     for k, tests in hits.items():
         files: dict[str, list[str]] = defaultdict(list)
-        for test, stage in (t.rsplit(" ", 1) for t in sorted(tests)):
+        for test, stage in sorted(tests):
             file = test.split("::")[0]
             more = [t for t in good if t.split("::")[0] == file] if stage == "(setup)" else [test]
             files[file] += [t for t in more if t in good and t not in files[file]]

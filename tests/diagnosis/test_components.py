@@ -18,9 +18,7 @@ from elastocal.diagnosis import (
     fit_sum,
     posed,
 )
-from elastocal.diagnosis.baseline import fit_baseline
-from elastocal.diagnosis.component_answer import PROBABLE, TOLD, SumAnswer
-from elastocal.diagnosis.diagnosis_data import diagnosis_data_of
+from elastocal.diagnosis.component_answer import PROBABLE, TOLD
 from elastocal.diagnosis.hypotheses import possible
 from elastocal.model.effects.gears import EncoderScale
 from elastocal.model.effects.smooth import JointCurve, Waves
@@ -112,27 +110,6 @@ def test_a_compliance_below_zero_is_no_cause() -> None:
     assert negative.components and not none.components
 
 
-def test_of_causes_only_those_at_work_are_left() -> None:
-    """Readings that two of ten components make: these are found, at their sizes."""
-    data = random_data(5, p=2)
-    rng = np.random.default_rng(8)
-    data = replace(data, left_out=data.left_out & False, r=0 * data.r)
-    components = [component(data, k, 3) for k in range(1, 11)]
-    # Readings without padding: noise of the usual size.
-    noise = 1e-7
-    data = replace(
-        data, covariance=np.tile(np.eye(data.r.shape[1]), (len(data.r), 1, 1)) * noise**2
-    )
-    true = {1: np.array([1.5, -1.0, 0.8]), 4: np.array([-0.7, 1.2, 2.0])}
-    r = noise * rng.normal(size=data.r.shape)
-    for k, w in true.items():
-        r = r + components[k].columns @ w
-    found = fit_sum(replace(data, r=r), components, NoiseValues.usual(3).of_instrument(),
-                    refit_noise=False)  # fmt: skip
-    assert {id(c) for c in found.components} == {id(components[k]) for k in true}
-    assert np.exp(found.sizes.size) == pytest.approx([1.1, 1.4], rel=0.5)
-
-
 def test_nothing_is_found_in_noise() -> None:
     count = 0
     for seed in range(6):
@@ -169,29 +146,3 @@ def test_many_effects_at_once_are_one_sum() -> None:
     assert not {(e.effect, e.where) for e in d.effects} & {(e.effect, e.where) for e in d.slight}
     for e in d.effects:
         assert e.probability >= PROBABLE or abs(shares[e.effect, e.where]) >= TOLD
-
-
-def answer_without_components(every: bool) -> SumAnswer:
-    """Of a campaign whose joint 5 has another error in every configuration, of `every` visit or of
-    the unloaded ones alone."""
-    model, table = campaign(n=40)
-    table = table if every else table.take((table.force == 0).all(axis=1))
-    dataset = diagnosis_data_of(fit_baseline(model, table), possible(model, table)[0])
-    errors = 2e-4 * np.random.default_rng(0).normal(size=len(dataset.data.r))
-    data = replace(dataset.data, r=dataset.data.r + dataset.data.G[:, :, 4] * errors[:, None])
-    dataset = dataset.changed(data=data)
-    found = fit_sum(data, [], NoiseValues.usual(6))
-    return SumAnswer(dataset, dataset, found, (), np.random.default_rng(1))
-
-
-def test_what_a_joint_errs_by_at_every_configuration_is_its_angle_s() -> None:
-    """It has a row without a name, of the size that it has."""
-    answer = answer_without_components(every=True)
-    (row,) = answer.components
-    assert (row.family, row.where, row.named) == ("angle", "joint5", False)
-    errors = 2e-4 * np.random.default_rng(0).normal(size=40)
-    moved = answer.dataset.data.G[:, :, [4]] * errors[:, None, None]
-    left = answer._followed(moved[answer._rows])
-    true = float(np.sqrt((left**2).sum() / answer._readings))
-    assert row.rms_ci95[0] < true < row.rms_ci95[1] < 1.3 * row.rms_ci95[0]
-    assert row.share > 0.9 and row.probability > 0.99

@@ -50,15 +50,6 @@ def test_the_evidence_is_the_ratio_of_dense_densities(seed: int) -> None:
     assert found.evidence()[0] == pytest.approx(mixed, rel=1e-7, abs=1e-7)
 
 
-FLIPS = np.sort(np.random.default_rng(3).chisquare(3, 199) / 2)
-
-
-def test_where_flips_reach_it_a_p_value_is_their_share() -> None:
-    assert exceedance(FLIPS, FLIPS[100]) == pytest.approx(100 / 200)
-    assert exceedance(FLIPS, FLIPS[-1]) == pytest.approx(2 / 200)
-    assert exceedance(FLIPS[:0], 5.0) == 1.0
-
-
 @pytest.mark.parametrize("kind", ["one", "many", "sum", "largest", "rare"])
 @pytest.mark.parametrize("true", [2e-3, 5e-4])
 def test_p_values_from_the_tail_are_not_below_what_they_are(kind: str, true: float) -> None:

@@ -4,7 +4,6 @@ fast the base drifts."""
 from __future__ import annotations
 
 from dataclasses import replace
-from math import comb, exp
 
 import numpy as np
 import pytest
@@ -24,9 +23,7 @@ from elastocal.diagnosis.component_search import (
     with_shorter_drifts,
 )
 from elastocal.diagnosis.components import (
-    PRESENT,
     fit_sum,
-    presence_cost,
 )
 from elastocal.diagnosis.diagnosis_data import DiagnosisData, diagnosis_data_of
 from elastocal.diagnosis.hypotheses import possible
@@ -44,12 +41,6 @@ def plain_data() -> NoisyData:
 
 def fellow(k: int, columns: np.ndarray, effect: type = EncoderScale) -> Component:
     return Component("angle", effect(), f"joint{k + 1}", columns, fellows=6)
-
-
-@pytest.mark.parametrize("n", [1, 2, 6, 9])
-def test_a_kind_is_there_with_its_prior_probability_at_whatever_places(n: int) -> None:
-    there = sum(comb(n, k) * exp(-presence_cost(n, k)) for k in range(1, n + 1))
-    assert there == pytest.approx(PRESENT / (1 - PRESENT))
 
 
 @pytest.mark.parametrize("few_poses", [300, 0])

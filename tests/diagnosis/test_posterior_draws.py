@@ -79,15 +79,6 @@ def test_the_errors_expected_are_those_of_fresh_readings(
     assert after < 0.5 * before
 
 
-def test_a_constant_that_is_not_known_well_widens_what_is_possible() -> None:
-    found, item = confirmation("gear_ripple:joint5")
-    posterior_draw = of_one(found, item)
-    known = len(found.fitted.x)
-    assert posterior_draw.spread.shape[2] == known + 1
-    column = found._by_constant(found.fitted, [item], item)[1]
-    assert rms(column.reshape(-1, 3)) > 0
-
-
 def test_a_rival_is_held_for_true_as_often_as_it_is_probable() -> None:
     """Unlikely ones and blocks without a name never are; the settings share the item's."""
     found, item = confirmation("encoder_scale:joint3")

@@ -7,18 +7,13 @@ from dataclasses import replace
 import numpy as np
 import pytest
 from support.cells import kr270_chain
-from support.diagnosis_data import JUMP_TIME, VISIT_TIME, campaign
+from support.diagnosis_data import campaign
 
 from elastocal.diagnosis import (
     Hypothesis,
-    Item,
     SettingsGrid,
-    diagnosis_data_of,
-    fit_baseline,
-    fit_set,
     grid_of,
     possible,
-    refine,
 )
 from elastocal.measurements import Measurements
 from elastocal.model import Model
@@ -70,16 +65,3 @@ def test_a_ripple_of_any_order_keeps_nine_tenths_of_its_size_on_the_grid(
             A = np.column_stack([np.sin(n * q), np.cos(n * q)])
             kept.append(np.linalg.norm(A @ np.linalg.lstsq(A, wave)[0]) / np.linalg.norm(wave))
         assert max(kept) > 0.9
-
-
-def test_a_change_is_found_to_the_visit_however_many_there_are() -> None:
-    """200 visits, of which 120 moments are tried: the right one is sought about the best."""
-    model, table = campaign("encoder_jump:joint4", n=100)
-    dataset = diagnosis_data_of(fit_baseline(model, table), [hypothesis("encoder_jump", "joint4")])
-    (h,) = dataset.hypotheses
-    grid = dataset.grids[h.name, h.where].values[:, 0]
-    assert len(grid) < len(dataset.moments)
-    far = grid[np.abs(grid - JUMP_TIME).argsort()[1]]
-    chosen = fit_set(dataset, (Item(h, np.array([far]), 0.0),))
-    found = float(refine(dataset, chosen, 0).items[0].settings[0])
-    assert abs(found - JUMP_TIME) <= VISIT_TIME

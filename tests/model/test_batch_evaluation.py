@@ -27,8 +27,6 @@ BINARY = {
     "ne": X != Y, "and": ca.logic_and(X, Y), "or": ca.logic_or(X, Y),
     "copysign": ca.copysign(X, Y), "if_else_zero": ca.if_else(X > Y, X, 0),
 }  # fmt: skip
-# Both branches of CasADi's if_else are multiplied by their condition, the second by its negation.
-BRANCHES = ca.if_else(X > Y, ca.sin(X), ca.cos(Y))
 
 # Equal operands, zeros, half-integers and both signs: where comparisons and rounding decide.
 POINTS = np.array(
@@ -64,15 +62,6 @@ def test_unary_operations(name: str) -> None:
 @pytest.mark.parametrize("name", BINARY)
 def test_binary_operations(name: str) -> None:
     assert_evaluates([X, Y], BINARY[name], POINTS[:, :1], POINTS[:, 1:])
-
-
-def test_if_else_with_two_branches() -> None:
-    assert_evaluates([X, Y], BRANCHES, POINTS[:, :1], POINTS[:, 1:])
-
-
-def test_unknown_operations_are_refused() -> None:
-    with pytest.raises(NotImplementedError, match=f"operation {ca.OP_ERF}"):
-        BatchFunction([X], [ca.erf(X)], "numpy")(np.zeros((1, 1)))
 
 
 # --- whole expressions ---------------------------------------------------------------------

@@ -10,9 +10,6 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from scipy.spatial.transform import Rotation
 from support.cells import (
-    COMPENSATOR,
-    COMPLIANCE,
-    MARKERS,
     kr270_cell,
     kr270_chain,
     random_table,
@@ -76,21 +73,6 @@ def test_an_unknown_place_meets_its_nearest(wrong: str, right: str) -> None:
     assert f"did you mean '{right}" in text
 
 
-# --- places --------------------------------------------------------------------------------
-
-
-@pytest.mark.parametrize("name", NAMES)
-def test_an_effect_without_a_place_acts_at_all_of_them(name: str) -> None:
-    places = CATALOGUE[name].places(kr270_chain(), kr270_cell())
-    assert [place for effect, place in chosen(name) if effect == name] == list(places)
-
-
-def test_the_compensator_stands_where_its_nominal_says() -> None:
-    nominal = Nominal(COMPLIANCE, gravity_compensator=COMPENSATOR | {"joint": "joint3"})
-    assert ("gravity_compensator", "joint2") in chosen("gravity_compensator")
-    assert ("gravity_compensator", "joint3") in chosen("gravity_compensator", nominal=nominal)
-
-
 # --- order and what is always there --------------------------------------------------------
 
 
@@ -136,12 +118,6 @@ def test_markers_are_the_tables_where_the_cell_lists_none() -> None:
     np.testing.assert_allclose(moved, table.marker == 1, atol=1e-12)  # of "front", by its name
 
 
-def test_the_cells_markers_win_over_the_tables() -> None:
-    model = Model(kr270_cell(("marker_position",)), ("front",))
-    assert model.names[::3] == ("marker:M1.x", "marker:M2.x", "marker:M3.x")
-    np.testing.assert_array_equal(model.nominal, np.concatenate(list(MARKERS.values())))
-
-
 def test_an_unknown_marker_in_the_table_is_refused() -> None:
     model = model_of("joint_offset")
     table = random_table(model.chain, 1, seed=0, markers=("M1", "M2", "M9"))
@@ -177,6 +153,3 @@ def test_the_base_may_be_half_turned(R: np.ndarray) -> None:
     nominal = model_of("base_frame", nominal=Nominal(base_rotation=R)).nominal
     found = Rotation.from_rotvec(nominal[3:]).as_matrix()
     np.testing.assert_allclose(found, R, rtol=0, atol=1e-7)
-
-
-# --- robot ---------------------------------------------------------------------------------

@@ -63,18 +63,6 @@ def test_whatever_the_arm_reaches_is_reached(name: str, oriented: bool) -> None:
     check(chain, found, position, wanted)
 
 
-def test_different_starts_give_different_postures() -> None:
-    """A spherical wrist flips: with the rotation prescribed there are at least two postures."""
-    chain = kr270_chain()
-    q = random_poses(chain, 10, seed=4)
-    position, rotation = places(chain, q)
-    found = inverse_kinematics(chain, position, limits(chain), rotation=rotation, point=POINT)
-    for t in range(10):
-        postures = found.q[t][found.reached[t]]
-        apart = np.linalg.norm(postures[:, None] - postures[None], axis=2)
-        assert (apart > 0.1).any()
-
-
 @pytest.mark.parametrize("name", ["KR270", "Panda"])
 def test_the_first_posture_is_the_nearest(name: str) -> None:
     """Against constrained minimisation (SLSQP) of the distance from many starts."""

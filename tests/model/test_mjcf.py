@@ -62,15 +62,6 @@ def test_masses_are_those_that_a_joint_carries(tmp_path):
     np.testing.assert_allclose(masses[0].com, [-0.01, -0.01, 0.1], atol=1e-12)
 
 
-def test_masses_that_a_missing_mesh_would_state_are_not_known(tmp_path):
-    inertial = '<inertial pos="0.2 0 0" mass="6" diaginertia="0.1 0.2 0.2"/>'
-    text = ARM.replace(inertial, '<geom type="mesh" mesh="hull"/>')
-    chain = read_mjcf(write_arm(tmp_path, text))
-    assert chain.masses == () and chain.n_joints == 5
-    from_geom = ARM.replace(inertial, '<geom size="0.05" pos="0.2 0 0" mass="6"/>')
-    assert read_mjcf(write_arm(tmp_path, from_geom)).masses[1].mass == pytest.approx(6)
-
-
 def test_a_cell_names_it(tmp_path):
     write_arm(tmp_path)
     (tmp_path / "cell.toml").write_text('[robot]\nmjcf = "arm.xml"\nflange = "attachment_site"\n')

@@ -6,7 +6,6 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-from scipy.spatial.transform import Rotation
 from support.cells import kr270_cell, kr270_chain, random_table
 
 from elastocal.errors import InputError
@@ -48,13 +47,6 @@ def subtracted(table: Measurements) -> dict[int, dict[int, float]]:
 # --- pairing -------------------------------------------------------------------------------
 
 
-def test_a_sideways_force_is_a_load_too() -> None:
-    table = readings((0, 0, "M1", 0), (0, 0, "M1", 0))
-    force = np.zeros((2, 3))
-    force[1, 0] = 1e-3
-    assert subtracted(replace(table, force=force)) == {1: {1: 1, 0: -1}}
-
-
 @pytest.mark.parametrize(
     "unloaded", [(1, 0, "M1", 0), (0, 0, "M2", 0)], ids=["other pose", "other marker"]
 )
@@ -66,17 +58,6 @@ def test_a_missing_partner_is_named(unloaded: tuple) -> None:
 
 
 # --- observed values -----------------------------------------------------------------------
-
-
-def test_a_measured_pose_that_is_the_models_has_no_residual() -> None:
-    model = Model.assembled(kr270_chain(), kr270_cell(("joint_compliance",), "pose"))
-    table = random_table(model.chain, 3, seed=1)
-    predicted = model.predict(table).reshape(-1, 6)
-    assert np.linalg.norm(predicted[:, 3:], axis=1).min() > 1e-3
-    turned = model.target_poses(table)[0]
-    table = replace(table, position=predicted[:, :3],
-                    rotation=Rotation.from_matrix(turned).as_rotvec())  # fmt: skip
-    np.testing.assert_allclose(model.regressor(table).residual, 0, rtol=0, atol=1e-14)
 
 
 @pytest.mark.parametrize(
@@ -125,23 +106,6 @@ def test_predicted_deflections_are_differences_of_predicted_positions() -> None:
         block = slice(3 * k, 3 * k + 3)
         np.testing.assert_allclose(found.prediction[block], h[loaded] - h[partner], atol=1e-15)
         np.testing.assert_allclose(found.B[block], B[loaded] - B[partner], rtol=1e-9, atol=1e-15)
-
-
-@pytest.mark.parametrize("kind", SIZE)
-def test_rows_of_b_follow_the_table(kind: str) -> None:
-    """All components of an observation together, observations in the table's order."""
-    model = Model.assembled(kr270_chain(), kr270_cell(("joint_offset", "joint_compliance"), kind))
-    table = shuffled()
-    whole = model.regressor(table)
-    observed, size = whole.observations, SIZE[kind]
-    assert whole.B.shape == (len(observed.lead) * size, 12)
-    assert whole.residual.shape == whole.prediction.shape == (len(whole.B),)
-    assert list(observed.lead) == sorted(observed.lead)
-    for k in range(len(observed.lead)):
-        block = slice(size * k, size * (k + 1))
-        alone = model.regressor(table.take(np.unique(observed.combine[[k]].indices)))
-        np.testing.assert_allclose(whole.B[block], alone.B, rtol=1e-9, atol=1e-15)
-        np.testing.assert_allclose(whole.residual[block], alone.residual, rtol=1e-9, atol=1e-14)
 
 
 # --- subset --------------------------------------------------------------------------------

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 from functools import lru_cache
 from itertools import pairwise
-from pathlib import Path
 
 import numpy as np
 import pytest
@@ -46,18 +45,6 @@ def test_the_clock_runs_as_the_order_takes() -> None:
             if len(moved):
                 assert stop.approach[joint] == np.sign(moved[-1])
         last = stop.q
-
-
-def test_the_promise_is_that_of_the_readings_as_the_file_states_them(tmp_path: Path) -> None:
-    plan = planned()
-    names = [p.name for p in plan.predicted]
-    assert "joint2.drift" in names and "joint3.hysteresis" in names
-    plan.save(tmp_path / "plan.csv")
-    data = ec.simulate(plan.model, tmp_path / "plan.csv", repeats=2, seed=3)
-    assert data.time is not None and data.approach is not None
-    found = ec.identify(plan.model, data, method="wls", weights="axis")
-    ratio = [found[p.name].std / p.std for p in plan.predicted]
-    assert np.ptp(ratio) < 0.02 and 0.7 < np.mean(ratio) < 1.3
 
 
 def test_to_find_them_too_costs_something_and_the_certificate_stays() -> None:

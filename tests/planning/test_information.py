@@ -70,14 +70,6 @@ def _plan(information: PoseInformation):
     return replace(rows.take(first), force=np.zeros((len(first), 3)), sigma=None)
 
 
-def test_both_directions_are_two_visits() -> None:
-    once = cell_for("deflection", AXIS, loads=DOWN[None], repeatability=40e-6)
-    motion = replace(once.design.motion, both_directions=True)
-    twice = replace(once, design=replace(once.design, motion=motion))
-    found = gathered(information_of(twice), TABLE_2)
-    assert relative(found, 2 * gathered(information_of(once), TABLE_2)) < 1e-12
-
-
 @pytest.mark.parametrize(
     ("cell", "said"),
     [

@@ -15,7 +15,7 @@ from elastocal.cell.plan_wishes import Motion
 from elastocal.cli.app import app
 from elastocal.errors import InputError
 from elastocal.measurements import read_plan
-from elastocal.planning import PlanRows, plan_rows, schedule, write_plan, write_plan_json
+from elastocal.planning import PlanRows, plan_rows, schedule, write_plan
 from elastocal.text import is_label
 
 FORCES = np.array([[0.0, 0, 0], [0, 0, -2600.0]])
@@ -29,10 +29,6 @@ def execution_of(q=TABLE_2, forces=FORCES, load=None, **motion):
     return schedule(
         q, Motion(**motion), Discs(), loads=forces, load=load, limits=LIMITS, iterations=100
     )
-
-
-def header(path):
-    return path.read_text(encoding="utf-8").splitlines()[0].split(",")
 
 
 joint_values = st.floats(-6.3, 6.3) | st.sampled_from([0.0, -0.0, np.pi, 1e-12, -1e-300])
@@ -92,31 +88,6 @@ def test_what_no_table_can_hold_is_refused_and_nothing_is_written(tmp_path, chan
     assert not list(tmp_path.iterdir())
 
 
-def test_json_has_the_schema_first_and_no_numbers_that_json_cannot_hold(tmp_path):
-    path = tmp_path / "plan.json"
-    summary = {
-        "criterion": "D",
-        "value": np.float64(2.5),
-        "n_poses": np.int64(15),
-        "candidates": {"removed_by": {"limits": np.int64(3)}},
-        "certificate": {"bound_pool": np.inf, "efficiency_continuum": None},
-        "predicted": ({"name": "joint2.compliance", "std": np.nan, "ok": np.True_},),
-        "q": np.eye(2),
-    }
-    write_plan_json(path, summary)
-    found = json.loads(path.read_text())
-    assert next(iter(found)) == "schema" and found.pop("schema") == "elastocal/plan/1"
-    assert found == {
-        "criterion": "D",
-        "value": 2.5,
-        "n_poses": 15,
-        "candidates": {"removed_by": {"limits": 3}},
-        "certificate": {"bound_pool": None, "efficiency_continuum": None},
-        "predicted": [{"name": "joint2.compliance", "std": None, "ok": True}],
-        "q": [[1.0, 0.0], [0.0, 1.0]],
-    }
-
-
 def run(*arguments):
     result = CliRunner().invoke(app, [str(a) for a in arguments], catch_exceptions=False)
     assert result.exit_code == 0, result.stderr
@@ -165,13 +136,3 @@ def test_simulate_and_identify_take_a_plan_of_deflections(tmp_path, stated):
     result = json.loads((tmp_path / "result.json").read_text())
     found = {p["name"]: p["value"] for p in result["parameters"]}
     assert found["joint3.compliance"] == pytest.approx(5e-7, rel=0.02)
-
-
-def test_simulate_and_identify_take_a_plan_from_both_sides(tmp_path):
-    cell, _ = write_campaign(tmp_path)
-    plan, data = tmp_path / "plan.csv", tmp_path / "data.csv"
-    execution = execution_of(forces=FORCES[:1], both_directions=True)
-    write_plan(plan, plan_rows(execution, NAMES, LEVEL), KINDS)
-    run("simulate", cell, plan, "-o", data)
-    assert {f"approach_{i}" for i in range(1, 7)} <= set(header(data))
-    run("identify", cell, data, "-o", tmp_path / "result.json", "-q")

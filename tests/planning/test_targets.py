@@ -130,17 +130,6 @@ def remaining(cell: Cell, q: NDArray, **known: Any) -> tuple[float, tuple[str, .
     return setup.value(plan, np.full(len(plan), -1)), setup.information.names
 
 
-def test_the_remaining_error_does_not_hang_on_the_base_frame_chosen() -> None:
-    """Where the base is put beforehand changes no certainty: the tracker stays where it is."""
-    q = random_poses(CHAIN, 100, seed=2)
-    found = []
-    for height in (0.0, 0.7):
-        cell = plan_cell(FULL, "position", loads=BOTH)
-        nominal = replace(cell.model.nominal, base_position=np.array([0.0, 0.0, height]))
-        found.append(remaining(replace(cell, model=replace(cell.model, nominal=nominal)), q)[0])
-    assert found[1] == pytest.approx(found[0], rel=1e-6)
-
-
 @pytest.mark.parametrize("criterion", ["test_pose", "I", "G"])
 def test_a_test_load_that_no_reading_shows_is_refused_with_its_parameter(criterion: Any) -> None:
     """Loads straight down never turn joint 1; a force from the side does."""

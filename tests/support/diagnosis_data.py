@@ -243,23 +243,3 @@ def dense_noise(data: NoisyData, noise: NoiseValues) -> Array:
             if one == other:
                 V[a, b] += noise.factor**2 * data.covariance[i // m, i % m, j % m]
     return V
-
-
-def kept_only(data: NoisyData) -> NoisyData:
-    """The data rebuilt from the observations that count alone."""
-    old = data.blocks
-    out = old.unpack(data.left_out[..., None].astype(float))[:, 0, 0] > 0
-    configuration = np.empty(old.n + 1, dtype=int)
-    configuration[old.member] = np.arange(len(old.member))[:, None]
-    blocks = Blocks.of(configuration[:-1][~out], old.visit[~out], old.size)
-    return NoisyData(
-        blocks=blocks,
-        r=blocks.pack(old.unpack(data.r[..., None])[~out])[:, :, 0],
-        X=blocks.pack(old.unpack(data.X)[~out]),
-        precision=data.precision,
-        covariance=blocks.pack_square(old.unpack_square(data.covariance)[~out]),
-        G=blocks.pack(old.unpack(data.G)[~out]),
-        same_visit=blocks.same_visit,
-        left_out=blocks.absent,
-        stated=data.stated,
-    )

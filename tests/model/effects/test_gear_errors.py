@@ -2,46 +2,13 @@
 
 from __future__ import annotations
 
-from dataclasses import replace
-
 import numpy as np
 import pytest
 from model.effects.stick import model, positions, rows, stick
-from support.cells import kr270_cell, kr270_chain, random_table
 
 from elastocal.errors import InputError
-from elastocal.model import Model
 
 Q = np.radians([-170.0, -90.0, -20.0, 0.0, 35.0, 90.0, 160.0])
-
-
-def turned(effect: str, q: np.ndarray, **values: float) -> np.ndarray:
-    """How far a joint about z has run ahead of its command, by the direction of its link."""
-    settings = {"joint1": {"ripple_order": 88.5}} if "ripple" in effect else None
-    x, y, _ = positions(model(stick("z"), effect, settings=settings), rows(q), **values).T
-    return np.arctan2(np.sin(np.arctan2(y, x) - q), np.cos(np.arctan2(y, x) - q))
-
-
-@pytest.mark.parametrize(
-    "effect, prefix, order",
-    [
-        ("gear_eccentricity", "eccentricity", 1.0),
-        ("gear_second_harmonic", "harmonic2", 2.0),
-        ("gear_ripple", "ripple", 88.5),
-    ],
-)
-def test_a_harmonic_repeats_its_order_times_per_turn(
-    effect: str, prefix: str, order: float
-) -> None:
-    found = turned(effect, Q, **{f"{prefix}_sin": 3e-4, f"{prefix}_cos": -4e-4})
-    np.testing.assert_allclose(
-        found, 3e-4 * np.sin(order * Q) - 4e-4 * np.cos(order * Q), atol=1e-15
-    )
-    ahead = turned(effect, Q + 2 * np.pi / order, **{f"{prefix}_sin": 3e-4, f"{prefix}_cos": -4e-4})
-    np.testing.assert_allclose(ahead, found, atol=1e-15)
-    # Half a period on it lags by what it led.
-    behind = turned(effect, Q + np.pi / order, **{f"{prefix}_sin": 3e-4, f"{prefix}_cos": -4e-4})
-    np.testing.assert_allclose(behind, -found, atol=1e-15)
 
 
 @pytest.mark.parametrize("orders, second", [((40.0,), 40.0), ((10.0, 20.0), 20.0)])
@@ -58,18 +25,6 @@ def test_ripple_orders_are_one_for_all_or_one_each(
 def test_another_number_of_ripple_orders_is_refused() -> None:
     with pytest.raises(InputError, match=r"gear_ripple_orders has 3 values.*has 2 joints"):
         model(stick("zz", (1.0, 1.0)), "gear_ripple", gear_ripple_orders=(1.0, 2.0, 3.0))
-
-
-def test_a_coupled_wrist_moves_as_if_commanded_so() -> None:
-    chain = kr270_chain()
-    m = Model.assembled(chain, kr270_cell(["wrist_coupling"]))
-    table = random_table(chain, 6, seed=1)
-    a, b, c = 3e-3, -2e-3, 5e-3
-    q = table.q.copy()
-    q[:, 4] += a * table.q[:, 3]
-    q[:, 5] += b * table.q[:, 3] + c * table.q[:, 4]
-    expected = Model.assembled(chain, kr270_cell()).predict(replace(table, q=q))
-    np.testing.assert_allclose(m.predict(table, np.array([a, b, c])), expected, atol=1e-14)
 
 
 LINES = {"order_1": 12.5, "order_3": 80.25, "order_sd_3": 0.2, "spectrum_centre_rad": 0.4}

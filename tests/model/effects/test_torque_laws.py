@@ -5,7 +5,6 @@ from __future__ import annotations
 import numpy as np
 import pytest
 from model.effects.stick import model, positions, rows, stick
-from scipy.optimize import brentq
 from scipy.spatial.transform import Rotation
 from support.cells import COMPLIANCE, kr270_cell, kr270_chain, random_table
 
@@ -15,54 +14,7 @@ from elastocal.model import Model
 from elastocal.model.effects import CATALOGUE
 from elastocal.model.effects.compliances import rated_torque, torque_scale, weight_torque
 
-FORCE = 500.0  # N, downwards at the end of 1 m: far above the 1 N m of a massless stick's scale
-DOWN = (0.0, 0.0, -FORCE)
 BETA = 1e-3
-
-
-def test_play_lets_the_arm_sink_on_either_side() -> None:
-    """Reaching forward the torque is positive, backward it is negative: the tip sinks both ways."""
-    m = model(stick("y"), "backlash")
-    tip = positions(m, rows([0.0, np.pi], DOWN), backlash=BETA)
-    np.testing.assert_allclose(tip[:, 0], [np.cos(BETA / 2), -np.cos(BETA / 2)], atol=1e-15)
-    np.testing.assert_allclose(tip[:, 2], -np.sin(BETA / 2), atol=1e-15)
-
-
-def test_play_turns_over_with_the_weights_side_of_the_joint() -> None:
-    m = model(stick("y", mass=100.0), "backlash", link_gravity=True)
-    z = positions(m, rows([0.0, np.pi]), backlash=BETA)[:, 2]
-    np.testing.assert_allclose(z, -np.sin(BETA / 2), atol=1e-12)
-
-
-def test_a_joint_stops_short_of_or_beyond_its_target_by_its_approach() -> None:
-    m = model(stick("y"), "hysteresis")
-    table = rows([0.0, 0.0], approach=[[1.0], [-1.0]])
-    z = positions(m, table, hysteresis=2e-4)[:, 2]
-    np.testing.assert_allclose(z, [-np.sin(2e-4), np.sin(2e-4)], atol=1e-17)
-
-
-def test_hysteresis_grows_with_the_load_whatever_its_sign() -> None:
-    """By g |τ| far above the torque scale, and not at all without load."""
-    m = model(stick("y"), "hysteresis")
-    up = (0.0, 0.0, FORCE)
-    for approach in (1.0, -1.0):
-        angle = [
-            -np.arcsin(positions(m, rows([0.0], f, approach=[[approach]]),
-                                 hysteresis=2e-4, hysteresis_per_torque=1e-6)[0, 2])
-            for f in ((0.0, 0.0, 0.0), DOWN, up)
-        ]  # fmt: skip
-        expected = approach * (2e-4 + 1e-6 * np.array([0.0, FORCE, FORCE]))
-        np.testing.assert_allclose(angle, expected, rtol=0, atol=1.01e-6)
-        assert angle[1] == pytest.approx(angle[2], rel=1e-9)
-
-
-def test_hardening_solves_the_cubic_law_at_the_deflected_lever() -> None:
-    m = model(stick("y"), "joint_hardening")
-    k3 = 1e-10
-    theta = brentq(lambda t: t - k3 * (FORCE * np.cos(t)) ** 3, 0.0, 0.1, xtol=1e-15)
-    z = positions(m, rows([0.0], DOWN), hardening=k3)[0, 2]
-    assert theta > 0.01
-    np.testing.assert_allclose(z, -np.sin(theta), rtol=1e-12)
 
 
 @pytest.mark.parametrize(

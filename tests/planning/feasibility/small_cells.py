@@ -8,7 +8,7 @@ from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
-from support.robots import KR270
+from support.robots import KR270, random_chain_urdf
 
 from elastocal.cell.arm_description import Robot, Tool, Tracker
 from elastocal.cell.work_cell import Cell
@@ -83,3 +83,15 @@ def study_module(name: str):
     if str(CHECK) not in sys.path:
         sys.path.append(str(CHECK))
     return importlib.import_module(name)
+
+
+def random_chain(seed: int, folder: Path) -> Chain:
+    path = folder / f"{seed}.urdf"
+    path.write_text(random_chain_urdf(seed))
+    return read_urdf(path, base="base", flange="flange")
+
+
+def kr270_poses(n: int, seed: int = 0) -> np.ndarray:
+    rng = np.random.default_rng(seed)
+    lower, upper = ([getattr(j, end) for j in KR270_CHAIN.joints] for end in ("lower", "upper"))
+    return rng.uniform(lower, upper, (n, 6))

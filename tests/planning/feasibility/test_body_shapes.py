@@ -2,8 +2,6 @@
 
 import numpy as np
 import pytest
-from hypothesis import given
-from hypothesis import strategies as st
 from planning.feasibility.small_cells import at
 from scipy.spatial.transform import Rotation
 
@@ -38,43 +36,12 @@ f 4 1 5
 f 4 5 8
 f 9 1 2
 """
-SIZES = {"box": [0.4, 0.2, 0.6], "sphere": [0.3], "cylinder": [0.2, 0.7], "capsule": [0.1, 0.5]}
-directions = (
-    st.tuples(*[st.floats(-1, 1)] * 3).map(np.array).filter(lambda v: np.linalg.norm(v) > 1e-3)
-)
 
 
 def placement(seed: int) -> np.ndarray:
     T = at(0.3, -0.2, 0.5)
     T[:3, :3] = Rotation.random(rng=np.random.default_rng(seed)).as_matrix()
     return T
-
-
-def surface(solid: Solid, n: int = 40_000) -> np.ndarray:
-    """Random points of the solid's surface, written down for each shape by itself."""
-    rng, s = np.random.default_rng(0), solid.size
-    unit = rng.normal(size=(n, 3))
-    unit /= np.linalg.norm(unit, axis=1, keepdims=True)
-    if solid.shape == "box":
-        p = s / 2 * unit / np.abs(unit).max(axis=1, keepdims=True)
-    elif solid.shape == "sphere":
-        p = s[0] * unit
-    elif solid.shape == "capsule":
-        p = s[0] * unit + np.outer(np.sign(unit[:, 2]), [0, 0, s[1] / 2])
-    else:
-        turn, z = rng.uniform(0, 2 * np.pi, n), s[1] * (rng.integers(0, 2, n) - 0.5)
-        p = np.stack([s[0] * np.cos(turn), s[0] * np.sin(turn), z], axis=1)
-    return p @ solid.placement[:3, :3].T + solid.placement[:3, 3]
-
-
-@pytest.mark.parametrize("shape", SIZES)
-@given(direction=directions)
-def test_support_is_the_farthest_point_of_the_surface(shape, direction):
-    solid = Solid(shape, shape, np.array(SIZES[shape]), placement(1))
-    direction = direction / np.linalg.norm(direction)
-    farthest = (surface(solid, 4000) @ direction).max()
-    # Random points fall a little short of the extreme one, and never beyond it.
-    assert farthest - 1e-12 <= support(solid, direction) <= farthest + 0.03
 
 
 def test_a_mesh_is_its_convex_hull(tmp_path):

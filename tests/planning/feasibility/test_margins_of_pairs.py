@@ -3,11 +3,9 @@
 from dataclasses import replace
 from itertools import combinations, pairwise
 
-import coal
 import numpy as np
 import pytest
 from planning.feasibility.small_cells import (
-    DOWN,
     KR270_CHAIN,
     NOTHING,
     at,
@@ -22,7 +20,7 @@ from planning.feasibility.small_cells import (
 from elastocal.cell.arm_description import Tool
 from elastocal.cell.workspace_rules import CarriedBody, HalfSpace, HangingLoad, Solid, Workspace
 from elastocal.errors import InputError
-from elastocal.planning import Feasibility, coal_shape
+from elastocal.planning import Feasibility
 from elastocal.planning.feasibility import POSE_SLACK
 
 RADII = (0.28, 0.2, 0.18, 0.15, 0.15, 0.11)
@@ -87,24 +85,6 @@ def test_the_arm_keeps_the_self_clearance_and_no_more():
     assert broken(rules, q * 0, NOTHING) == [set(), set()]
 
 
-def test_the_load_is_a_body_where_it_hangs_and_only_there():
-    """A weight of 0.4 m below a rope of 0.5 m: its bottom is 0.9 m under the load point."""
-    weight = HangingLoad(
-        Solid("load", "cylinder", np.array([0.2, 0.4])), 0.5, 0.01, min_height=-1.5
-    )
-    table = box("table", (1, 1, 1), (2, 0, -1.5))
-    rules = gantry_rules(Workspace(load=weight, obstacles=(table,)), Tool(np.array([0, 0, -0.1])))
-    above, touching = 0.1 - 1 + 0.9 + 2e-4, 0.1 - 1 + 0.9 - 1e-5
-    q = gantry_at((2, 0, above), (2, 0, touching), (0, 0, -0.5 + 2e-4), (0, 0, -0.5 - 1e-5))
-    assert broken(rules, q, DOWN) == [set(), {"obstacle"}, set(), {"load_height"}]
-    assert broken(rules, q, NOTHING) == [set()] * 4
-    # The rope alone passes the edge of the table.
-    wire = gantry_at((1.495, 0, -0.4), (1.485, 0, -0.4))
-    thin = replace(weight, solid=Solid("load", "sphere", np.array([0.001])))
-    rules = gantry_rules(Workspace(load=thin, obstacles=(box("t", (1, 1, 0.1), (2, 0, -0.8)),)))
-    assert broken(rules, wire, DOWN) == [{"obstacle"}, set()]
-
-
 def kr270_cell(**changes):
     workspace = Workspace(
         link_radius=RADII,
@@ -115,25 +95,6 @@ def kr270_cell(**changes):
         self_clearance=0.02,
     )
     return cell(replace(workspace, **changes), Tool(np.array([0.2, 0, 0.25])))
-
-
-def kr270_poses(n: int, seed: int = 0) -> np.ndarray:
-    rng = np.random.default_rng(seed)
-    lower = np.array([joint.lower for joint in KR270_CHAIN.joints])
-    upper = np.array([joint.upper for joint in KR270_CHAIN.joints])
-    return rng.uniform(lower, upper, (n, 6))
-
-
-def _distance(a, b, frames):
-    placed = [
-        (coal_shape(body.solid), frames[body.carrier] @ body.solid.placement) for body in (a, b)
-    ]
-    (one, T), (two, U) = placed
-    return coal.distance(
-        one, coal.Transform3s(T[:3, :3].copy(), T[:3, 3].copy()),
-        two, coal.Transform3s(U[:3, :3].copy(), U[:3, 3].copy()),
-        coal.DistanceRequest(), coal.DistanceResult(),
-    )  # fmt: skip
 
 
 def pair_names(given_cell, chain=KR270_CHAIN):
@@ -154,16 +115,6 @@ def test_neighbours_and_a_spherical_wrist_are_not_paired():
         assert {frozenset((link, "table")), frozenset((link, "lamp"))} <= found
     assert frozenset(("base", "table")) not in found
     assert frozenset(("tool", "link6")) not in found and frozenset(("tool", "link5")) in found
-
-
-def test_pairs_that_are_left_out_touch_in_every_pose():
-    """All but neighbours: leaving them out hides nothing."""
-    rules = Feasibility(kr270_cell(), KR270_CHAIN)
-    bodies = {body.name: body for body in rules.bodies}
-    poses = rules.kinematics.poses(kr270_poses(200), DOWN)
-    for names in [("base", "link2"), ("link3", "link5"), ("link3", "link6"), ("link4", "link6")]:
-        for frames in poses.frames:
-            assert _distance(bodies[names[0]], bodies[names[1]], frames) <= 0.02
 
 
 def test_ignored_pairs_may_touch_and_unknown_ones_are_named():

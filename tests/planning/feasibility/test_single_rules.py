@@ -15,10 +15,11 @@ from planning.feasibility.small_cells import (
     cell,
     gantry_at,
     gantry_rules,
+    kr270_poses,
+    random_chain,
     sphere,
 )
-from planning.feasibility.test_frames_of_poses import random_chain
-from planning.feasibility.test_margins_of_pairs import kr270_cell, kr270_poses
+from planning.feasibility.test_margins_of_pairs import kr270_cell
 
 from elastocal.cell.arm_description import EffectChoice, Tool, Tracker
 from elastocal.cell.workspace_rules import (

@@ -97,17 +97,6 @@ def test_where_there_is_time_poses_are_read_before_and_after_their_load():
     assert len(plan_rows(twice, names, level, BOTH).configuration) == 24
 
 
-def test_a_reference_pose_comes_again_first_last_and_in_between():
-    execution = ordered(reference_every=10)
-    again = [k for k, stop in enumerate(execution.stops) if stop.again]
-    assert again == [0, 11, 22, 27] and len({execution.stops[k].pose for k in again}) == 1
-    names = tuple(map(str, range(1, 13)))
-    rows = plan_rows(execution, names, np.zeros(12, dtype=int), BOTH)
-    assert len(rows.configuration) == 28
-    assert sum("r" in name for name in rows.configuration) == 4
-    assert sorted(rows.order) == list(range(1, 29))
-
-
 def test_the_alias_is_what_least_squares_make_of_shifted_readings():
     chain, cell = kr270_chain(), plan_cell(loads=DOWN[None])
     q = random_poses(chain, 8, seed=4)

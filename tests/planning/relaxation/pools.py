@@ -59,21 +59,6 @@ def random_problem(
     )
 
 
-def diagonal_problem(name: str, sizes: np.ndarray, share: int, most: int) -> DesignProblem:
-    """Candidate i measures parameter i alone, M = diag(w_i · sizes_i)."""
-    p = len(sizes)
-    return DesignProblem(
-        blocks=(np.sqrt(sizes)[:, None] * np.eye(p))[None, :, None, :],
-        prior=np.zeros((1, p, p)),
-        group=np.zeros(p, dtype=np.int64),
-        shares=np.array([share]),
-        criterion=make_criterion(
-            name, parameters=p, interest=np.arange(p), A=np.eye(p)[None, :, None]
-        ),
-        most=most,
-    )
-
-
 def repeated(problem: DesignProblem) -> DesignProblem:
     """The same problem with every candidate listed twice."""
     return replace(

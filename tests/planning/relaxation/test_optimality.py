@@ -4,18 +4,11 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-from hypothesis import given, settings
-from hypothesis import strategies as st
 from planning.relaxation.pools import (
-    diagonal_problem,
     random_problem,
 )
 
 from elastocal.planning import DesignProblem, make_criterion, relax
-
-
-def sums_of(problem, weights):
-    return np.bincount(problem.group, weights, minlength=len(problem.shares))
 
 
 @pytest.mark.parametrize("prior", [0.0, 1.0])
@@ -50,38 +43,6 @@ def test_d_optimal_quadratic_regression():
     relaxed = relax(problem, tolerance=1e-9)
     np.testing.assert_allclose(relaxed.weights[[0, 100, 200]], 1.0, atol=1e-3)
     assert relaxed.value == pytest.approx(4 ** (-1 / 3), rel=1e-8)
-
-
-@settings(deadline=None, max_examples=30)
-@given(sizes=st.lists(st.floats(0.1, 10.0), min_size=2, max_size=6), share=st.integers(1, 20))
-def test_a_optimal_weights_of_separate_parameters(sizes, share):
-    """Σ 1/(w_i a_i) is least for w_i ∝ a_i^{−1/2}."""
-    sizes = np.array(sizes)
-    relaxed = relax(diagonal_problem("A", sizes, share, most=share), tolerance=1e-8)
-    expected = (sizes**-0.5).sum() ** 2 / share
-    assert relaxed.value == pytest.approx(expected, rel=1e-7)
-    assert relaxed.bound <= expected * (1 + 1e-12)
-
-
-@settings(deadline=None, max_examples=30)
-@given(
-    seed=st.integers(0, 10_000),
-    name=st.sampled_from(["test_pose", "D", "A", "G", "c", "O5"]),
-    shares=st.lists(st.integers(0, 9), min_size=1, max_size=4).filter(lambda s: sum(s) > 3),
-    most=st.integers(1, 4),
-    prior=st.sampled_from([1e-6, 1e-2, 1.0, 1e3]),
-)
-def test_any_shares_and_priors_end_within_the_gap(seed, name, shares, most, prior):
-    problem = random_problem(
-        name, n=40, shares=tuple(shares), most=most, prior=prior, seed=seed, r=1 + seed % 3
-    )
-    relaxed = relax(problem)
-    assert relaxed.gap <= 1e-5
-    np.testing.assert_allclose(sums_of(problem, relaxed.weights), shares, atol=1e-9)
-    assert (relaxed.weights >= 0).all()
-    assert (relaxed.weights <= most * (1 + 1e-12)).all()
-    value = problem.criterion.value(problem.information(relaxed.weights))
-    assert relaxed.value == pytest.approx(float(value), rel=1e-9)
 
 
 @pytest.mark.parametrize("method", ["first-order", "conic"])

@@ -32,11 +32,6 @@ def test_scenarios(name, robust):
     assert_agreement(random_problem(name, n=60, scenarios=3, robust=robust, seed=2))
 
 
-def test_repetitions_and_whole_levels():
-    """One level is taken whole, another may repeat."""
-    assert_agreement(random_problem("test_pose", n=12, shares=(12, 3), most=2))
-
-
 def test_the_conic_solver_generates_columns_for_large_pools(monkeypatch):
     problem = random_problem("E", n=600, r=3, p=5)
     whole = relax(problem, method="conic")
@@ -45,10 +40,3 @@ def test_the_conic_solver_generates_columns_for_large_pools(monkeypatch):
     assert part.history[0].support < 100 < whole.history[0].support
     assert part.value == pytest.approx(whole.value, rel=2e-6)
     assert part.gap <= 1e-6
-
-
-def test_the_mean_of_maxima_has_conic_masters():
-    problem = random_problem("G", scenarios=2, robust="average")
-    relaxed = relax(problem)
-    assert relaxed.method == "conic"
-    assert relaxed.gap <= 1e-5
