@@ -5,22 +5,15 @@ from __future__ import annotations
 from dataclasses import replace
 from functools import lru_cache
 
-import numpy as np
 import pytest
 from support.cells import kr270_chain
 from support.diagnosis_data import FITTED, Fault, cell, measured, plan
 
 from elastocal.diagnosis import (
     DiagnosisData,
-    Item,
-    OutlierScreening,
-    Scan,
-    SelectedEffects,
     diagnosis_data_of,
     fit_baseline,
-    fit_set,
     possible,
-    warnings,
     with_likelier_backlash_model,
     with_recorded_drivers,
 )
@@ -48,16 +41,3 @@ def test_the_readings_tell_the_backlash_model(side: str) -> None:
     told = with_likelier_backlash_model(first)
     assert told.base.model.cell.model.play_side == side
     assert [h.label for h in told.hypotheses] == [h.label for h in first.hypotheses]
-
-
-@pytest.mark.parametrize(("doubt_of_it", "told"), [(0.05, False), (0.5, True)])
-def test_the_reader_is_told_that_the_law_is_open(doubt_of_it: float, told: bool) -> None:
-    one = replace(with_likelier_backlash_model(dataset("load")), other_backlash=doubt_of_it)
-    (play,) = [h for h in one.hypotheses if (h.name, h.where) == PLAY.key]
-    plain = fit_set(one, ())
-    nothing: Scan = None  # type: ignore[assignment]
-    screened = OutlierScreening(one.data.faulty, one.data.faulty)
-    for items, expected in (((Item(play, np.zeros(0), 0.0),), told), ((), False)):
-        found = SelectedEffects(one, fit_set(one, items), (), (), plain, nothing, nothing)
-        texts = [t for t in warnings(one, found, screened, plain.noise) if "play of joint3" in t]
-        assert bool(texts) == expected

@@ -6,7 +6,6 @@ from dataclasses import replace
 from functools import lru_cache
 
 import numpy as np
-import pytest
 from support.diagnosis_data import campaign
 
 from elastocal.diagnosis import new_pose_table
@@ -24,16 +23,6 @@ def drawn(observe: str = "position") -> tuple[Model, Measurements, Measurements]
     return model, table, new_pose_table(model, table, N, np.random.default_rng(5))
 
 
-def test_there_are_as_many_as_asked_each_like_a_measured_one() -> None:
-    _, table, new = drawn()
-    assert len(np.unique(new.configuration)) == N
-    for c in np.unique(new.configuration):
-        own = new.take(new.configuration == c)
-        assert sorted(own.marker) == sorted(table.marker[table.configuration == 0])
-        assert len(np.unique(own.force, axis=0)) == 2
-        assert len(np.unique(own.q, axis=0)) == 1
-
-
 def test_every_joint_has_been_at_its_angle_and_no_arm_in_its_pose() -> None:
     """The side of approach comes with the angle of its joint."""
     _, table, new = drawn()
@@ -42,21 +31,6 @@ def test_every_joint_has_been_at_its_angle_and_no_arm_in_its_pose() -> None:
         found = {(a, s) for a, s in zip(new.q[:, j], new.approach[:, j], strict=True)}
         assert found <= pairs and len(found) > 10
     assert not {tuple(q) for q in new.q} & {tuple(q) for q in table.q}
-
-
-@pytest.mark.parametrize("n", [8, 9])
-def test_repeats_keep_their_own_side_of_approach(n: int) -> None:
-    """A configuration that was measured from both sides is met from both sides."""
-    model, table, _ = drawn()
-    few = table.take(table.configuration < n)
-    both = np.concatenate([np.arange(len(few)), np.arange(len(few))])
-    repeated = few.take(both)
-    repeat = (np.arange(len(both)) >= len(few)).astype(np.int64)
-    sides = np.where(repeat[:, None] == 1, -1.0, 1.0) * np.ones_like(repeated.q)
-    repeated = replace(repeated, repeat=repeat, approach=sides)
-    new = new_pose_table(model, repeated, N, np.random.default_rng(1))
-    np.testing.assert_array_equal(new.approach[new.repeat == 0], 1.0)
-    np.testing.assert_array_equal(new.approach[new.repeat == 1], -1.0)
 
 
 def upright() -> tuple[Model, Measurements]:

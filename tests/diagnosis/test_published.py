@@ -8,7 +8,7 @@ from dataclasses import fields, replace
 
 import pytest
 from support.cells import kr270_cell, kr270_chain
-from support.diagnoses import EXPLAINED, EXTRA, MANY_UNKNOWN, UNKNOWN, VERDICTS
+from support.diagnoses import EXPLAINED, MANY_UNKNOWN, VERDICTS
 
 from elastocal.diagnosis import Diagnosis, Gap, NearRepeats, publish
 from elastocal.identification import BudgetStep
@@ -32,11 +32,6 @@ def test_every_part_of_the_result_is_published(model):
     renamed = {"extra": "extra_plan"}
     names = {renamed.get(f.name, f.name) for f in fields(Diagnosis)} - {"calibrated", "model"}
     assert names <= set(publish(EXPLAINED, model, "data.csv"))
-
-
-def test_what_evaluated_the_model_is_told(model):
-    content = publish(EXPLAINED, model, "data.csv")
-    assert content["backend"] == model.backend_report()
 
 
 def test_keys_and_units_of_the_design(model):
@@ -98,14 +93,6 @@ def test_near_repeats_and_what_is_unexplained_are_told(model):
     assert content["noise"]["near_repeat_um"] == pytest.approx(26.0)
     told = {"pairs": 12, "independent": 10, "soon_um": pytest.approx(20.0), "later_um": None}
     assert content["noise"]["near_repeats"] == told
-
-
-def test_curves_and_extra_poses(model):
-    content = publish(replace(UNKNOWN, extra=EXTRA), model, "data.csv")
-    curve = content["curves"][0]
-    assert len(curve["x"]) == len(curve["y"]) == len(curve["sd"]) == 40
-    assert content["extra_plan"]["pairs"][0]["distance_after"] == 5.6
-    assert content["extra_plan"]["n_poses"] == 2
 
 
 def test_components_groups_and_fields(model):

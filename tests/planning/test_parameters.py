@@ -127,13 +127,6 @@ def test_interest_in_what_cannot_be_known_is_answered(
     assert not [part for part in told if part not in str(caught.value)], str(caught.value)
 
 
-def test_readings_that_show_nothing_are_refused() -> None:
-    """Compliances alone, and no load hangs."""
-    cell = plan_cell(("joint_compliance",), "position", criterion="D")
-    with pytest.raises(InsufficientDataError, match=r"no feasible pose shows any .* loads_N"):
-        setup_of(cell, POSES)
-
-
 def test_a_combination_has_the_variance_of_its_terms() -> None:
     terms = {"joint2.compliance": 1.0, "joint3.compliance": -2.0}
     cell = plan_cell(loads=DOWN[None], criterion="c", combination=terms)

@@ -138,17 +138,6 @@ def test_the_value_is_what_identification_would_leave_at_the_test_poses(
     assert setup.criterion.reported(value) == (pytest.approx(1e6 * np.sqrt(expected)), "µm")
 
 
-@pytest.mark.parametrize("repeatability", [0.0, 5e-5])
-def test_what_the_arm_scatters_is_not_removed_by_repeats(repeatability: float) -> None:
-    def value(repeats: int) -> float:
-        cell = plan_cell(loads=DOWN[None], repeats=repeats, repeatability=repeatability)
-        cell = replace(cell, tool=replace(cell.tool, markers={"M": np.array([0.2, 0.0, 0.1])}))
-        return setup_of(cell, POSES).value(TABLE_2, all_loads(TABLE_2))
-
-    gain = value(1) / value(100)
-    assert gain == pytest.approx(100) if repeatability == 0 else gain < 2
-
-
 # --- what is known before --------------------------------------------------------------------
 
 

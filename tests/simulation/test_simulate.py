@@ -5,7 +5,6 @@ from dataclasses import replace
 import numpy as np
 import pytest
 from scipy import stats
-from scipy.spatial.transform import Rotation
 from support.calibration import GEOMETRY, cell_of, planar_chain, table_at, true_values, with_values
 from support.cells import COMPLIANCE, kr270_chain, random_poses
 
@@ -104,30 +103,6 @@ def test_distances():
     assert low < ((error / 3e-4) ** 2).sum() < high
 
 
-def pose_case():
-    tracker = replace(AXIS, rotation_sigma=2e-4)
-    effects = ("base_frame", "marker_position", "marker_orientation")
-    model = model_with(tracker, effects, observe="pose")
-    truth = true_values(model, np.random.default_rng(4))
-    truth[model.names.index("marker:M1.rx")] = 0.7
-    return model, truth
-
-
-def test_poses():
-    model, truth = pose_case()
-    plan = plan_of(model, 100)
-    plan = replace(plan, rotation=np.zeros((100, 3)))
-    exact, noisy = (simulate(model, plan, truth, 2, noise=n) for n in (False, True))
-    # observed relative to its own rotation, the model's prediction is the position and no turn
-    at = model.predict(exact, truth).reshape(-1, 6)
-    np.testing.assert_allclose(at[:, :3], exact.position, atol=1e-12)
-    np.testing.assert_allclose(at[:, 3:], 0.0, atol=1e-9)
-    turn = Rotation.from_rotvec(exact.rotation).inv() * Rotation.from_rotvec(noisy.rotation)
-    low, high = chi2_band(300)
-    assert low < (turn.as_rotvec() ** 2).sum() / 2e-4**2 < high
-    assert low < (((noisy.position - exact.position) / AXIS.noise.sigma) ** 2).sum() < high
-
-
 def test_deflections_are_loaded_minus_unloaded_readings():
     nominal = Nominal(joint_compliance=COMPLIANCE)
     cell = cell_of(("joint_compliance",), observe="deflection", nominal=nominal)
@@ -142,14 +117,6 @@ def test_deflections_are_loaded_minus_unloaded_readings():
 
 
 # --- values ---------------------------------------------------------------------------------
-
-
-def test_chosen_values_replace_nominal_ones():
-    model = model_with()
-    x = values_from(model, {"link2.dx": 1e-3, "base.x": 2.0})
-    changed = dict(zip(model.names, x - model.nominal, strict=True))
-    assert {k: v for k, v in changed.items() if v} == {"link2.dx": 1e-3, "base.x": 2.0}
-    assert np.array_equal(values_from(model, {}), model.nominal)
 
 
 @pytest.mark.parametrize(

@@ -1,6 +1,5 @@
 """Real measurements, where ELASTOCAL_DATASETS names their folder: the bars that must hold."""
 
-import csv
 import importlib.util
 import json
 import os
@@ -30,39 +29,6 @@ def folder(tmp_path_factory):
     for cell in FOLDER.glob("*.toml"):
         (work / cell.name).write_text(cell.read_text(encoding="utf-8"), encoding="utf-8")
     return work
-
-
-def poses_of(folder, table):
-    with open(folder / "data" / table, newline="", encoding="utf-8") as handle:
-        return [tuple(row.values()) for row in csv.DictReader(handle)]
-
-
-def test_ur10_is_split_into_poses_for_training_and_others_for_test(folder):
-    test = set(poses_of(folder, "ur10_test.csv"))
-    assert len(test) == 2000
-    smaller = set()
-    for count in (100, 600, 3000):
-        train = set(poses_of(folder, f"ur10_{count}.csv"))
-        assert len(train) == count and smaller < train and not train & test
-        smaller = train
-    for split in ("blocks", "first"):
-        train, test = (poses_of(folder, f"ur10_{split}_{part}.csv") for part in ("600", "test"))
-        assert (len(train), len(test)) == (600, 2000) and not set(train) & set(test)
-
-
-def test_ur10_keeps_times_in_order_and_temperatures(folder):
-    rows = poses_of(folder, "ur10_600.csv")
-    times = [float(row[9]) for row in rows]
-    assert times == sorted(times) and times[0] >= 0 and times[-1] / 3600 < 100
-    assert all(15 < float(row[10]) < 35 for row in rows)
-
-
-def test_iiwa_is_split_by_whole_configurations(folder):
-    train, test = (
-        {row[0] for row in poses_of(folder, f"iiwa7_{part}.csv")} for part in ("train", "test")
-    )
-    whole = {row[0] for row in poses_of(folder, "iiwa7.csv")}
-    assert train | test == whole and not train & test and len(test) == len(whole) // 5
 
 
 def identified(folder, cell, data, *options):

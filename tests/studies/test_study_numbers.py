@@ -49,14 +49,6 @@ def test_they_depend_neither_on_order_nor_on_interruptions(
     pd.testing.assert_frame_equal(numbers(results), whole)
 
 
-@pytest.mark.parametrize("first", [1, 5])
-def test_they_do_not_depend_on_how_many_were_asked_for_first(folder, whole, tmp_path, first):
-    assert run_study(folder, tmp_path, only=first).done == first
-    ending = run_study(folder, tmp_path)
-    assert (ending.before, ending.done) == (first, 12)
-    pd.testing.assert_frame_equal(numbers(tmp_path), whole)
-
-
 def test_another_seed_gives_other_numbers_and_is_refused_among_the_first(folder, whole, tmp_path):
     run_study(folder, tmp_path, seed=12)
     assert not np.isclose(numbers(tmp_path)["mean"], whole["mean"]).any()

@@ -119,17 +119,3 @@ def test_wrong_tasks_are_told(tmp_path, old, new, told):
 )
 def test_a_wrong_option_is_told(tmp_path, assignment, told):
     assert told in refused(write_study(tmp_path / "study"), assignment)
-
-
-def test_options_reach_tasks(tmp_path):
-    study = read_study(write_study(tmp_path / "study"), None, ["replicates = 2", "scale=3"])
-    assert len(study.tasks) == 4
-    assert study.options["scale"] == 3.0
-
-
-def test_a_study_leaves_no_bytecode_in_its_folder(tmp_path, monkeypatch):
-    monkeypatch.setattr(sys, "dont_write_bytecode", False)
-    folder = write_study(tmp_path / "study", "import more\n" + SCRIPT)
-    (folder / "more.py").write_text("HELPS = 1\n")
-    read_study(folder, None, [])
-    assert not list(folder.rglob("*.pyc")) and sys.dont_write_bytecode is False

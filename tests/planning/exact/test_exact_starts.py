@@ -65,21 +65,6 @@ def test_an_interrupted_search_resumes_to_the_same_plan(after):
     assert same(whole, exact_plan(problem, starts=5, seed=7, checkpoint=memory))
 
 
-@pytest.mark.parametrize("change", ["seed", "problem", "size"])
-def test_a_checkpoint_of_other_work_is_not_used(change):
-    problem, seed = rough(1), 7
-    memory = Memory()
-    exact_plan(problem, starts=2, seed=seed, checkpoint=memory)
-    if change == "seed":
-        seed = 8
-    elif change == "problem":
-        problem = replace(problem, blocks=1.5 * problem.blocks)
-    else:
-        problem = replace(problem, shares=np.array([4, 3, 3]))
-    expected = exact_plan(problem, starts=2, seed=seed)
-    assert same(expected, exact_plan(problem, starts=2, seed=seed, checkpoint=memory))
-
-
 def test_fewer_equations_than_parameters_says_how_many():
     problem = random_problem("D", 0)
     p = 20

@@ -114,17 +114,3 @@ def test_nothing_is_too_thin_to_be_met(x, thickness):
     assert not rules.paths_free(start, end, False)
     above = gantry_at((-2.9, 0, 1.2), (2.9, 0, 1.2))
     assert rules.paths_free(*above, False)
-
-
-def test_the_rope_keeps_its_angle_on_the_way():
-    """Joint 5 from 60° through the vertical to 120°, and the long way by two turns of joint 4."""
-    axis, limit = np.array([0, 0, 1.0]), np.radians(31)
-    load = HangingLoad(sphere("load", 0.1, (0, 0, 0)), 0.5, rope_axis=axis, max_angle=limit)
-    rules = Feasibility(cell(Workspace(load=load)), KR270_CHAIN)
-    start, end = np.zeros(6), np.zeros(6)
-    start[4], end[4] = np.radians([60, 120])
-    round_about = end.copy()
-    round_about[3] = 4 * np.pi
-    assert rules.paths_free(start, end, True)
-    assert not rules.paths_free(start, round_about, True)
-    assert rules.paths_free(start, round_about, False)
