@@ -8,6 +8,7 @@ PYTEST_ARGS ?=
 VERSIONS_ARGS ?=
 BENCH_ARGS ?=
 MUTANTS_ARGS ?=
+GOLDEN ?=
 
 VENV := .venv
 BIN := $(VENV)/bin
@@ -25,13 +26,15 @@ NOT_AT_HOME := not-at-home
 endif
 
 .DEFAULT_GOAL := help
-.PHONY: help demo test test-long test-versions mutants bench lint docs docs-figures clean not-at-home
+.PHONY: help demo test test-long golden golden-accept test-versions mutants bench lint docs docs-figures clean not-at-home
 .DELETE_ON_ERROR:
 
 help:
 	@echo "make demo       set up .venv if needed, then calibrate a simulated arm"
 	@echo "make test       the test suite              (PYTEST_ARGS=\"tests/model -x\", WORKERS=2)"
 	@echo "make test-long  the long studies among the tests"
+	@echo "make golden     what commands and the front door give, beside tests/golden/expected  (GOLDEN=\"demo next\")"
+	@echo "make golden-accept  takes what differs as meant                          (GOLDEN=\"demo\", GOLDEN=all)"
 	@echo "make test-versions  the wheel with every other supported Python that is found (VERSIONS_ARGS=--one), then a"
 	@echo "                    slice of the tests with the oldest and the newest of what it needs"
 	@echo "make mutants    do the tests notice wrong lines?  60 drawn; about an hour (MUTANTS_ARGS=\"--count 20\")"
@@ -48,9 +51,9 @@ demo: $(RUN_TIME)
 	$(BIN)/elastocal demo
 
 # One thread for each worker: linear algebra would otherwise start as many as there are cores.
-test test-long: export OPENBLAS_NUM_THREADS = 1
-test test-long: export OMP_NUM_THREADS = 1
-test test-long: export MKL_NUM_THREADS = 1
+test test-long golden golden-accept: export OPENBLAS_NUM_THREADS = 1
+test test-long golden golden-accept: export OMP_NUM_THREADS = 1
+test test-long golden golden-accept: export MKL_NUM_THREADS = 1
 # What is compiled to bytecode is kept: the tests start some hundred processes.
 test test-long: export PYTHONDONTWRITEBYTECODE =
 
@@ -59,6 +62,14 @@ test: $(TEST_TOOLS)
 
 test-long: $(TEST_TOOLS)
 	$(PYTEST) -m long $(PYTEST_ARGS)
+
+golden golden-accept: export PYTHONPATH = tests
+
+golden: $(TEST_TOOLS)
+	@$(BIN)/python -m golden show $(GOLDEN)
+
+golden-accept: $(TEST_TOOLS)
+	@$(BIN)/python -m golden accept $(GOLDEN)
 
 test-versions: $(RUN_TIME)
 	$(BIN)/python tests/versions.py $(VERSIONS_ARGS)

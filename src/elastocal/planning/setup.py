@@ -325,7 +325,7 @@ def known_before(model: Model, known: Known, sizes: Array) -> tuple[Array, NDArr
     n = len(sizes)
     information = np.zeros((n, n))
     if model.cell.design.prior == "typical":
-        has = np.array([p.typical is not None for p in model.parameters])
+        has = np.array([p.typical is not None for p in model.parameters], dtype=bool)
         information[has, has] += 1.0
     if known.prior is not None:
         P = known.prior.rows(model.names)[0] * sizes
@@ -335,7 +335,7 @@ def known_before(model: Model, known: Known, sizes: Array) -> tuple[Array, NDArr
     names = () if known.prior is None else known.prior.names
     typical = model.cell.design.prior == "typical"
     counted = [p.name in names or (typical and p.typical is not None) for p in model.parameters]
-    return information, np.array(counted)
+    return information, np.array(counted, dtype=bool)
 
 
 def _combination(model: Model, found: Estimable) -> Array | None:

@@ -1,0 +1,150 @@
+"""A table of bad inputs: what is spoilt, the command, and (in expected/) its whole message.
+
+Every one has to end with exit code 1 or 2, one message that names file, row, key or option, and
+nothing written.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+CAMPAIGN = ("tests/golden/inputs/campaign",)
+FIT = "identify placed.toml placed.csv -q -o out.json"
+DEFLECT = "identify deflecting.toml data.csv -q -o out.json"
+DESIGN = "design wished.toml -o plan.csv --candidates 20 --effort quick -q"
+
+
+@dataclass(frozen=True)
+class Mistake:
+    """`command` where in `file` the first `old` is `new` (old empty: the whole text)."""
+
+    name: str
+    command: str
+    file: str = ""
+    old: str = ""
+    new: str = ""
+
+    @property
+    def __name__(self) -> str:
+        return self.name
+
+    def __call__(self, folder: Path) -> dict[str, Any]:
+        from golden.runner import run_command
+
+        path = folder / self.file
+        original = path.read_text(encoding="utf-8") if self.file else ""
+        if self.file:
+            spoilt = original.replace(self.old, self.new, 1) if self.old else self.new
+            assert spoilt != original, f"{self.name}: {self.file} has no {self.old!r}"
+            path.write_text(spoilt, encoding="utf-8")
+        before = {path.name for path in folder.iterdir()}
+        found = run_command(self.command)
+        if self.file:
+            path.write_text(original, encoding="utf-8")
+        assert found["exit"] in (1, 2), f"{self.name}: exit code {found['exit']}"
+        assert "Traceback" not in "".join(found["text stderr"]), self.name
+        assert before == {path.name for path in folder.iterdir()}, f"{self.name}: something written"
+        return found
+
+
+TABLE = (
+    Mistake("no such table", "identify placed.toml nowhere.csv -q"),
+    Mistake("an empty table", FIT, "placed.csv", "", ""),
+    Mistake("a header alone", FIT, "placed.csv", "", "configuration,q1_rad,x_m\n"),
+    Mistake("a column without a unit", FIT, "placed.csv", "x_m,", "x,"),
+    Mistake("mixed units", FIT, "placed.csv", "y_m,", "y_mm,"),
+    Mistake("a joint column that is missing", FIT, "placed.csv", "q6_rad", "note_6"),
+    Mistake("an unknown column", FIT, "placed.csv", "force_x_N", "forse_x_N"),
+    Mistake("no number", FIT, "placed.csv", "-2.78122528", "abc"),
+    Mistake("NaN", FIT, "placed.csv", "-2.78122528", "nan"),
+    Mistake("an empty field", FIT, "placed.csv", "-2.78122528", ""),
+    Mistake("an unknown marker", FIT, "placed.csv", "1,M2,", "1,M7,"),
+    Mistake("a reading twice", FIT, "placed.csv", "1,M2,0", "1,M1,0"),
+    Mistake("joints beyond limits", FIT, "placed.csv", "2.78380016", "12.78380016"),
+    Mistake("a force beyond all measure", FIT, "placed.csv", "-1000.0", "-1e300"),
+    Mistake("radians named degrees", FIT, "placed.csv", "q1_rad,q2_rad,q3_rad,q4_rad,q5_rad,q6_rad",
+            "q1_deg,q2_deg,q3_deg,q4_deg,q5_deg,q6_deg"),
+    Mistake("metres named millimetres", FIT, "placed.csv", "x_m,y_m,z_m", "x_mm,y_mm,z_mm"),
+    Mistake("columns swapped", FIT, "placed.csv", "x_m,y_m,z_m", "z_m,y_m,x_m"),
+    Mistake("deflections without a load", DEFLECT, "data.csv", "force_z_N", "note_z"),
+)  # fmt: skip
+CELL = (
+    Mistake("no such cell", "identify nowhere.toml placed.csv -q"),
+    Mistake("TOML that does not parse", FIT, "placed.toml", "[model]", "[model"),
+    Mistake("an unknown key", FIT, "placed.toml", "effects =", "efects ="),
+    Mistake("an unknown table", FIT, "placed.toml", "[tracker]", "[traker]"),
+    Mistake("an unknown effect", FIT, "placed.toml", "joint_offset", "joint_ofset"),
+    Mistake("an effect at no joint", FIT, "placed.toml", "compliance:joint2", "compliance:joint9"),
+    Mistake("a wrong type", FIT, "placed.toml", "range_um = 10", 'range_um = "ten"'),
+    Mistake("a wrong length", FIT, "placed.toml", "[0.2, 0.05, 0.1]", "[0.2, 0.05]"),
+    Mistake("an unknown way to observe", FIT, "placed.toml", '"position"', '"postion"'),
+    Mistake("no robot's file", FIT, "placed.toml", '"arm.urdf"', '"leg.urdf"'),
+    Mistake("a flange that is no link", FIT, "placed.toml", 'base = "base_link"',
+            'flange = "flnge"'),
+    Mistake("a URDF that does not parse", FIT, "arm.urdf", "</robot>", ""),
+    Mistake("a URDF with a loop", FIT, "arm.urdf", "</robot>",
+            '<joint name="again" type="fixed"><parent link="link_5"/><child link="link_2"/></joint>'
+            "</robot>"),
+    Mistake("a DH table without a column", DEFLECT, "arm.csv", "alpha_deg", "alpha"),
+    Mistake("a negative mass", DEFLECT, "links.csv", "1,11,", "1,-11,"),
+    Mistake("a knowledge of nobody", f"{DEFLECT} --knowledge knowledge.toml", "knowledge.toml",
+            'parameter = "joint3.compliance"', 'parameter = "joint3.complaince"'),
+    Mistake("knowledge with a negative deviation", f"{DEFLECT} --knowledge knowledge.toml",
+            "knowledge.toml", "std = 3e-8", "std = -3e-8"),
+    Mistake("an obstacle without a size", "design planned.toml -o plan.csv -q", "planned.toml",
+            "size_m = [1.2, 0.8, 0.2]", ""),
+    Mistake("levels of two joints", "design planned.toml -o plan.csv -q", "planned.toml",
+            "joint2_deg = [-30, 20, 60]", "joint2_deg = [-30]\njoint3_deg = [10]"),
+)  # fmt: skip
+OPTIONS = (
+    Mistake("no such verb", "identfy placed.toml placed.csv"),
+    Mistake("no such option", f"{FIT} --methd ols"),
+    Mistake("a missing argument", "identify placed.toml"),
+    Mistake("an unknown method", f"{FIT} --method sideways"),
+    Mistake("an unknown noise", f"{FIT} --noise loud"),
+    Mistake("unknown weights", f"{FIT} --weights heavy"),
+    Mistake("unknown intervals", f"{FIT} --intervals wide"),
+    Mistake("weights that nothing states", f"{FIT} --weights axis"),
+    Mistake("a parameter that is not there", f"{FIT} --fix joint2.ofset"),
+    Mistake("everything held", f"{FIT} --fix base_frame --fix joint_offset --fix marker_position "
+            "--fix joint2.compliance"),
+    Mistake("a limit of nothing", f"{FIT} --require held=1"),
+    Mistake("a negative limit", f"{FIT} --require heldout=-1"),
+    Mistake("a negative seed", f"{FIT} --seed -1"),
+    Mistake("no folder to write to", f"{FIT} --report no/page.html"),
+    Mistake("an output over an input", "identify placed.toml placed.csv -q -o placed.csv"),
+    Mistake("no covariance", f"{DEFLECT} --weights covariance"),
+    Mistake("a covariance of another size", f"{DEFLECT} --weights covariance --covariance "
+            "links.csv"),
+    Mistake("an unknown effect left out", "diagnose placed.toml placed.csv -q --without baklash"),
+    Mistake("a plan of no poses", f"{DESIGN} --poses 0"),
+    Mistake("a target and a number", f"{DESIGN} --poses 4 --target 10"),
+    Mistake("an unknown criterion", f"{DESIGN} --criterion Z"),
+    Mistake("an unknown effort", "design wished.toml -o plan.csv --effort little -q"),
+    Mistake("a kept pose that is not there", f"{DESIGN} --poses 9 --keep poses.csv:1,99"),
+    Mistake("a level of gain that is none", "next wished.toml data.csv -o next.csv --least-gain "
+            "100 -q"),
+    Mistake("a target of two numbers", "compensate placed.toml placed.json --target 1,2 -q"),
+    Mistake("an unknown frame", "compensate placed.toml placed.json --target 1500,200,1200 "
+            "--frame tool -q"),
+    Mistake("a target out of reach", "compensate placed.toml placed.json --target 9000,0,0 "
+            "--point M1 -q -o out.csv"),
+    Mistake("a box without extent", "compensate placed.toml placed.json --table t.csv --box "
+            "500,0,500,500,100,600 -q"),
+    Mistake("a result of another robot", "compensate placed.toml result.json --target 1,2,3 -q"),
+    Mistake("no result at all", "export placed.toml placed.csv -o out.urdf -q"),
+    Mistake("an unknown format", "export placed.toml placed.json -o out.step -q"),
+    Mistake("an unknown preset", "import points.txt poses.dat --preset spatialanlyzer -o out.csv"),
+    Mistake("an unknown unit", "import points.txt poses.dat --preset spatialanalyzer --preset kuka "
+            "--length-unit yards -o out.csv"),
+    Mistake("an effect without a true value", "simulate placed.toml plan270.csv -o out.csv --set "
+            "joint2.complaince=1e-6"),
+    Mistake("a cell that is there", "init arm.urdf -o placed.toml"),
+    Mistake("an unknown convention", "init arm.csv -o out.toml --convention other"),
+    Mistake("a study without its file", "study nowhere -q"),
+    Mistake("a study's unknown option", "study study --set replcates=2 -q"),
+    Mistake("results to compare that are none", "compare placed.csv june.json --cell placed.toml "
+            "-q"),
+)  # fmt: skip
