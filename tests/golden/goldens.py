@@ -206,5 +206,6 @@ GOLDENS: dict[str, Golden] = {
     "mistakes_table": Golden(CAMPAIGN, mistakes.TABLE),
     "mistakes_cell": Golden(CAMPAIGN, mistakes.CELL),
     "mistakes_options": Golden(CAMPAIGN, mistakes.OPTIONS),
+    "mistakes_gone": Golden(CAMPAIGN, mistakes.GONE),
     "mistakes_design": Golden(CAMPAIGN, mistakes_design.TABLE),
 }  # fmt: skip

@@ -148,3 +148,5 @@ OPTIONS = (
     Mistake("results to compare that are none", "compare placed.csv june.json --cell placed.toml "
             "-q"),
 )  # fmt: skip
+# What went, with its successor.
+GONE = (Mistake("the compiled backend", "--backend compiled effects placed.toml"),)
