@@ -118,7 +118,7 @@ def _without(found: Any, folder: Path) -> Any:
         for here in (str(folder.resolve()), str(folder)):
             found = found.replace(here + os.sep, "").replace(here, "FOLDER")
         found = re.sub(r"\b\d{4}-\d\d-\d\d(?:[ T]\d\d:\d\d(?::\d\d)?(?: ?UTC|Z)?)?", "DATE", found)
-        found = re.sub(r"\b\d+\.\d+\.\d+\+g\w+(-dirty)?", "VERSION", found)
+        found = re.sub(r"(?<=elastocal )\d+\.\d+\.\d+\S*|\b0\.\d+\.\d+\+g\S+", "VERSION", found)
         return re.sub(r"\(\d+ threads?\)", "(N threads)", found)
     return found
 
