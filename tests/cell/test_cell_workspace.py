@@ -8,9 +8,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from elastocal.cell.file_keys import Spot, direction
-from elastocal.cell.work_cell import read_cell
 from elastocal.cell.workspace_rules import Workspace
-from elastocal.errors import InputError
 
 CELL = """
 [robot]
@@ -24,33 +22,10 @@ LOAD = "[workspace.load]\nshape = 'sphere'\nradius_m = 0.2\n"
 HALF = "[[workspace.keep_out]]\nname = 'walkway'\npoint_m = [0, 0, 0]\n"
 
 
-@pytest.fixture
-def read(tmp_path):
-    for name in ("arm.urdf", "dh.csv", "part.stl"):
-        (tmp_path / name).write_text("content is read by others")
-
-    def read(text, robot=CELL):
-        (tmp_path / "cell.toml").write_text(robot + text, encoding="utf-8")
-        return read_cell(tmp_path / "cell.toml").workspace
-
-    return read
-
-
-@pytest.fixture
-def refusal(read):
-    def refusal(text, **options):
-        with pytest.raises(InputError) as caught:
-            read(text, **options)
-        message = str(caught.value)
-        assert "cell.toml: " in message
-        assert "\n" not in message
-        return message
-
-    return refusal
-
-
 def test_every_key_arrives_in_si_units(read, tmp_path):
-    space = read("""
+    space = read(
+        CELL
+        + """
 [workspace]
 clearance_mm = 50
 self_clearance_m = 0.01
@@ -100,7 +75,8 @@ line_of_sight = false
 [workspace.visibility.normals]
 M1 = [0, 0, 3]
 "ball, left" = [1, 0, 0]
-""")
+"""
+    ).workspace
     assert (space.clearance, space.self_clearance) == (0.05, 0.01)
     assert space.link_radius == (0.2, 0.15, 0.0)
     assert not space.urdf_geometry
@@ -133,22 +109,22 @@ M1 = [0, 0, 3]
 
 
 def test_an_empty_table_is_a_cell_without_rules(read):
-    assert read("[workspace]\n") == Workspace()
+    assert read(CELL + "[workspace]\n").workspace == Workspace()
 
 
 def test_visibility_without_keys_asks_for_line_of_sight(read):
-    sight = read("[workspace.visibility]\n").visibility
+    sight = read(CELL + "[workspace.visibility]\n").workspace.visibility
     assert sight.line_of_sight
     assert (sight.range, sight.max_incidence) == ((0.0, np.inf), None)
 
 
 def test_one_radius_stands_for_all_links(read):
-    assert read("[workspace]\nlink_radius_m = 0.2").link_radius == (0.2,)
+    assert read(CELL + "[workspace]\nlink_radius_m = 0.2").workspace.link_radius == (0.2,)
 
 
 def test_geometry_of_the_urdf_or_none(read):
-    assert read("[workspace]\ngeometry = 'urdf'").urdf_geometry
-    assert read("[workspace]\ngeometry = 'none'") == Workspace()
+    assert read(CELL + "[workspace]\ngeometry = 'urdf'").workspace.urdf_geometry
+    assert read(CELL + "[workspace]\ngeometry = 'none'").workspace == Workspace()
 
 
 @given(
@@ -236,12 +212,12 @@ def test_a_direction_has_length_one_whatever_its_size(vector):
     ],
 )
 def test_what_is_wrong_is_told_with_key_and_remedy(refusal, text, told):
-    message = refusal(text)
+    message = refusal(CELL + text)
     assert not [part for part in told if part not in message], message
 
 
 def test_collision_shapes_of_a_urdf_need_a_urdf(refusal):
-    message = refusal("[workspace]\ngeometry = 'urdf'", robot="[robot]\ndh = 'dh.csv'\n")
+    message = refusal("[robot]\ndh = 'dh.csv'\n[workspace]\ngeometry = 'urdf'")
     assert "needs [robot] urdf" in message
     assert "link_radius_mm" in message
 
@@ -250,4 +226,4 @@ def test_names_of_markers_need_markers(refusal):
     text = (
         "[workspace.visibility]\nmax_incidence_deg = 9\n[workspace.visibility.normals]\nA=[0,0,1]"
     )
-    assert "[tool.markers_m] has none" in refusal(text, robot="[robot]\nurdf = 'arm.urdf'\n")
+    assert "[tool.markers_m] has none" in refusal("[robot]\nurdf = 'arm.urdf'\n" + text)
