@@ -65,7 +65,7 @@ def run(golden: Golden) -> list[dict[str, Any]]:
 
 
 def _step(step: Step, folder: Path) -> dict[str, Any]:
-    before = _states(folder)
+    before = states(folder)
     if callable(step):
         returned = step(folder)
         if returned is None:  # it prepares what the next step reads
@@ -73,13 +73,14 @@ def _step(step: Step, folder: Path) -> dict[str, Any]:
         found: dict[str, Any] = {"door": step.__name__, "returned": kept(plain(returned))}
     else:
         found = run_command(step)
-    after = _states(folder)
+    after = states(folder)
     written = [name for name in after if before.get(name) != after[name]]
     found["files"] = {name: _file(folder / name) for name in sorted(written)}
     return {key: value for key, value in _without(found, folder).items() if value != {}}
 
 
-def _states(folder: Path) -> dict[str, bytes]:
+def states(folder: Path) -> dict[str, bytes]:
+    """What each file of a folder holds, by its digest."""
     files = (path for path in folder.rglob("*") if path.is_file())
     return {
         path.relative_to(folder).as_posix(): hashlib.sha1(path.read_bytes()).digest()
@@ -119,6 +120,7 @@ def _without(found: Any, folder: Path) -> Any:
             found = found.replace(here + os.sep, "").replace(here, "FOLDER")
         found = re.sub(r"\b\d{4}-\d\d-\d\d(?:[ T]\d\d:\d\d(?::\d\d)?(?: ?UTC|Z)?)?", "DATE", found)
         found = re.sub(r"(?<=elastocal )\d+\.\d+\.\d+\S*|\b0\.\d+\.\d+\+g\S+", "VERSION", found)
+        found = re.sub(r"\b[0-9a-f]{40,}\b", "DIGEST", found)
         return re.sub(r"\(\d+ threads?\)", "(N threads)", found)
     return found
 

@@ -20,6 +20,7 @@ SHARE = 0.01  # of a standard deviation
 EXACT = 1e-6  # relative, where no engine is between the input and the number
 ENGINE = 1e-3  # relative, where one is
 NOTHING = 1e-13  # of SI units: below it a number is rounding of zero, on any machine
+NOTHING_SMALL = 1e-6  # the same of µm and µrad
 WIDTH_95 = 3.92  # standard deviations in a 95 % interval
 WIDTH_90 = 3.29
 
@@ -153,13 +154,14 @@ def _numbers(
     path: str, key: str, expected: float, found: float, measure: Measure
 ) -> Iterator[Difference]:
     off, sd = abs(found - expected), measure.sd
-    allowed = NOTHING + (ENGINE if measure.engine else EXACT) * max(abs(expected), measure.size)
+    nothing = NOTHING_SMALL if key.endswith(("_um", "_urad")) else NOTHING
+    allowed = nothing + (ENGINE if measure.engine else EXACT) * max(abs(expected), measure.size)
     if measure.engine:
         rule = next((r for r in RULES if r[0].match(key)), None)
         if key == "std":
             allowed = SHARE * abs(expected)
         elif rule is not None:
-            allowed = max(NOTHING, rule[1]) + rule[2] * max(abs(expected), measure.size)
+            allowed = max(nothing, rule[1]) + rule[2] * max(abs(expected), measure.size)
         elif sd:
             allowed = SHARE * sd
     if not off <= allowed:
