@@ -21,9 +21,9 @@ from elastocal.identification import (
     asymptotic_covariance,
     cluster_robust,
     eq14,
-    mm_estimate,
     ols,
     outlier_screening,
+    tukey,
 )
 from elastocal.identification.noise_choice import settle
 
@@ -64,7 +64,7 @@ def estimates(s: Setting, replicate: int) -> np.ndarray:
     def put(method: str, x: np.ndarray, std: np.ndarray, dof: np.ndarray | float) -> None:
         found[METHODS.index(method)] = np.column_stack([x, std, np.broadcast_to(dof, p)])
 
-    robust = mm_estimate(B, e, size=3)
+    robust = tukey(B, e, size=3)
     own = asymptotic_covariance(robust)
     put("Tukey MM", robust.x, own.std, own.dof)
     readings = s.readings(e)

@@ -22,7 +22,7 @@ from elastocal.cell.arm_description import EffectChoice
 from elastocal.identification import Options, blocks, least_trimmed_squares, majority
 from elastocal.identification.identify import identify
 from elastocal.identification.outliers import FALSE_ALARM
-from elastocal.identification.robust_core import median_scale
+from elastocal.identification.trimmed import median_scale
 from elastocal.model import Model
 
 SIGMA = 5e-5

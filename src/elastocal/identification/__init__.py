@@ -21,6 +21,7 @@ ROOMS = {
     ),
     "least_squares": "FitProblem SumOfSquares descend fit",
     "linear_solver": "solve_weighted",
+    "trimmed": "least_trimmed_squares majority",
     "noise_choice": "Trial estimate_noise outlier_screening own_noise unexplained_readings",
     "noise_structure": (
         "NoiseModel Readings by_axis by_group independent noise_models shared_effects"
@@ -36,13 +37,9 @@ ROOMS = {
         "simultaneous_level summarise_residuals"
     ),
     "result": "Calibration Combination Finding TestErrors Verdict",
-    "robust": "asymptotic_covariance clustered_covariance robust_fit",
-    "robust_core": (
-        "Absolute Bisquare Huber StudentT bisquare breakdown_bisquare design efficiency huber "
-        "m_scale normal_mean normal_moments"
-    ),
-    "robust_fits": (
-        "least_trimmed_squares log_likelihood m_estimate majority mm_estimate student_t"
+    "robust": (
+        "Absolute Bisquare Huber StudentT asymptotic_covariance bisquare clustered_covariance "
+        "design huber log_likelihood m_estimate robust_fit student_t tukey"
     ),
     "solve": "Problem Reduction Solution reduce residual_sigma sizes_and_check",
     "start": "RegistrationProblem check_limits check_table fixed_and_free register start_values",

@@ -14,7 +14,7 @@ from scipy import linalg, sparse
 from elastocal.errors import ElastocalError, require
 from elastocal.identification.knowledge import Matrix, System
 from elastocal.identification.linear_solver import least_norm
-from elastocal.identification.robust_core import huber
+from elastocal.identification.robust import huber
 from elastocal.units import Array, BoolArray
 
 # Linear equalities, by the space that they leave.

@@ -20,7 +20,7 @@ from elastocal.identification.noise_choice import (
 )
 from elastocal.identification.outliers import FALSE_ALARM, blocks, studentised
 from elastocal.identification.residuals import f_test
-from elastocal.identification.robust_core import Design, design
+from elastocal.identification.robust import Design, design
 from elastocal.identification.solve import Solution
 from elastocal.identification.weighted_problem import block_diagonal, inverse_factor
 from elastocal.model.effects.placements import MarkerPosition

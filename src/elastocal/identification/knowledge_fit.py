@@ -49,8 +49,8 @@ from elastocal.identification.least_squares import Fit, FitProblem
 from elastocal.identification.linear_solver import least_norm
 from elastocal.identification.options import Options
 from elastocal.identification.residuals import held_out_residual
-from elastocal.identification.robust_core import median_scale
 from elastocal.identification.solve import Reduction, Solution, residual_sigma
+from elastocal.identification.trimmed import median_scale
 from elastocal.identification.weighted_problem import RFactor
 from elastocal.text import listed
 from elastocal.units import Array, Progress

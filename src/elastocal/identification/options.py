@@ -23,6 +23,13 @@ FaultyReadings = Literal["auto", "drop", "keep"]
 METHODS = get_args(Method)
 ROBUST = ("huber", "tukey", "l1", "student-t")
 WITH_KNOWLEDGE = ("auto", "bootstrap", "profile")
+# What there was once, or is looked for by this name: what does the same.
+SUCCESSORS = {
+    "method": dict.fromkeys(
+        ("lts", "s", "mm"),
+        "tukey, which starts from the fit of the majority and rejects what lies far from it",
+    ),
+}
 
 
 @dataclass(frozen=True)
@@ -62,6 +69,8 @@ class Options:
             ("intervals", self.intervals, INTERVALS),
             ("outliers", self.faulty, get_args(FaultyReadings)),
         ):
+            if successor := SUCCESSORS.get(name, {}).get(str(value)):
+                raise InputError(f"there is no {option(name, value)}: use {successor}")
             if value not in valid:
                 raise InputError(
                     f"{option(name)} takes one of {', '.join(valid)}; found {quoted(value)}"

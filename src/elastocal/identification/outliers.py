@@ -9,8 +9,6 @@ import numpy as np
 from scipy import linalg, special
 
 from elastocal.errors import ElastocalError, InsufficientDataError
-from elastocal.identification.robust_core import median_scale
-from elastocal.identification.robust_fits import majority
 from elastocal.identification.solve import (
     SAMPLE,
     WORTH_A_COLUMN,
@@ -19,6 +17,7 @@ from elastocal.identification.solve import (
     is_placed,
     settle,
 )
+from elastocal.identification.trimmed import majority, median_scale
 from elastocal.identification.weighted_problem import (
     Part,
     RFactor,

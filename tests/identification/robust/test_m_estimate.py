@@ -9,7 +9,7 @@ from hypothesis import strategies as st
 from scipy import optimize
 from scipy.spatial.transform import Rotation
 
-from elastocal.errors import InputError
+from elastocal.errors import InputError, InsufficientDataError
 from elastocal.identification import (
     Absolute,
     Bisquare,
@@ -17,8 +17,8 @@ from elastocal.identification import (
     asymptotic_covariance,
     huber,
     m_estimate,
-    mm_estimate,
     student_t,
+    tukey,
 )
 
 
@@ -49,27 +49,26 @@ def test_estimate_scale_and_covariance_are_those_of_statsmodels(ours, theirs):
     np.testing.assert_allclose(scaled, reference.bcov_scaled, rtol=1e-8, atol=1e-14)
 
 
-@pytest.mark.parametrize("loss", [huber(3), Bisquare(3, 5.5), Absolute(3)], ids=lambda f: f.name)
-def test_regression_affine_and_scale_equivariance(arm, loss):
+FITS = {
+    "huber": lambda B, y: m_estimate(B, y, huber(3), size=3),
+    "l1": lambda B, y: m_estimate(B, y, Absolute(3), size=3),
+    "tukey": lambda B, y: tukey(B, y, size=3),
+    "student-t": lambda B, y: student_t(B, y, size=3, nu=4.0),
+}
+
+
+@pytest.mark.parametrize("fit", FITS.values(), ids=FITS)
+def test_regression_affine_and_scale_equivariance(arm, fit):
     rng = np.random.default_rng(3)
     y = arm.observed(arm.errors(rng, 0.1)[0])
     A, v = rng.normal(size=(9, 9)), rng.normal(size=9)
-    plain = m_estimate(arm.B, y, loss, size=3)
-    moved = m_estimate(arm.B @ A, 6.0 * (y + arm.B @ v), loss, size=3)
+    plain = fit(arm.B, y)
+    moved = fit(arm.B @ A, 6.0 * (y + arm.B @ v))
     np.testing.assert_allclose(A @ moved.x, 6.0 * (plain.x + v), rtol=1e-7, atol=1e-7)
     assert moved.scale == pytest.approx(6.0 * plain.scale, rel=1e-7)
 
 
-@pytest.mark.parametrize(
-    "fit",
-    [
-        lambda B, y: m_estimate(B, y, huber(3), size=3),
-        lambda B, y: m_estimate(B, y, Absolute(3), size=3),
-        lambda B, y: mm_estimate(B, y, size=3),
-        lambda B, y: student_t(B, y, size=3, nu=4.0),
-    ],
-    ids=["huber", "l1", "mm", "student-t"],
-)
+@pytest.mark.parametrize("fit", FITS.values(), ids=FITS)
 def test_the_axes_of_a_reading_do_not_matter(arm, fit):
     """Each reading turned by its own rotation, as another tracker frame would: same x, weights."""
     rng = np.random.default_rng(9)
@@ -132,17 +131,6 @@ def test_the_sum_of_lengths_is_the_cone_programs_optimum(size):
     assert found.converged and found.optimality < 1e-8
 
 
-def test_the_certificate_of_l1_survives_an_observation_met_exactly():
-    """More than half of the readings agree on one x: the sum of lengths has its kink there."""
-    rng = np.random.default_rng(8)
-    B = rng.normal(size=(60, 2))
-    y = B @ np.array([1.0, -2.0])
-    y[:12] += rng.normal(size=12)
-    found = m_estimate(B, y, Absolute(2), size=2)
-    np.testing.assert_allclose(found.x, [1.0, -2.0], atol=1e-8)
-    assert found.converged
-
-
 @pytest.mark.parametrize("kind", ["exact", "some wrong", "many wrong"])
 def test_l1_ends_at_the_minimum_of_noise_free_data(kind):
     """100 problems of each kind: where most readings agree exactly, Σ |e_i| has a kink and no
@@ -165,13 +153,6 @@ def test_l1_ends_at_the_minimum_of_noise_free_data(kind):
         assert found.converged, seed
 
 
-def test_noiseless_data_are_fitted_exactly():
-    B, _ = regression(5)
-    x = 1 / np.linalg.norm(B, axis=0)
-    for loss in (huber(1), Bisquare(1, 4.685), Absolute(1)):
-        np.testing.assert_allclose(m_estimate(B, B @ x, loss).x, x, rtol=1e-10)
-
-
 @settings(deadline=None)
 @given(
     rows=st.integers(0, 12),
@@ -186,15 +167,7 @@ def test_input_is_either_fitted_or_refused_with_a_reason(rows, columns, size, ba
     fits = rows > columns > 0 and size > 0 and rows % size == 0 and np.isfinite(bad)
     try:
         found = m_estimate(B, y, Huber(max(size, 1), 1.5), size=size)
-    except InputError as error:
+    except (InputError, InsufficientDataError) as error:
         assert not fits and len(str(error)) > 20
     else:
         assert fits and np.isfinite(found.x).all()
-
-
-def test_what_is_wrong_is_named():
-    B, y = regression(6)
-    with pytest.raises(InputError, match=r"columns \[3\]"):
-        m_estimate(np.column_stack([B[:, :3], B[:, 0] + B[:, 1]]), y, huber(1))
-    with pytest.raises(InputError, match="loss is for 3 rows"):
-        m_estimate(B, y, huber(3))

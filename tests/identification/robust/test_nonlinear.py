@@ -53,8 +53,9 @@ def test_settles_where_the_estimating_equation_holds(name):
     problem, _, _ = arm_problem(1, 0.1)
     found = robust_fit(problem, name)
     assert found.converged and found.steps < 15
-    step = (found.linear.x * np.linalg.norm(found.linear.design.B, axis=0)) / found.linear.scale
-    assert np.abs(step).max() < 1e-5
+    design = found.linear.design
+    step = design.Q.T @ (design.y - found.linear.residual)
+    assert np.abs(step / found.linear.scale).max() < 1e-5
     observed = problem.observations
     residual = observed.value - problem.model.predict(observed.table, found.x, observed)
     np.testing.assert_allclose(found.residual, residual, atol=1e-14)
@@ -108,8 +109,6 @@ def test_covariances_are_of_the_fitted_columns():
 
 def test_what_it_cannot_fit_is_refused():
     problem, _, _ = arm_problem(6)
-    with pytest.raises(InputError, match="huber, tukey, l1, student-t"):
-        robust_fit(problem, "cauchy")
     with pytest.raises(InputError, match="neither ties nor bounds"):
         robust_fit(replace(problem, bounded=True))
     with pytest.raises(InputError, match="neither ties nor bounds"):
