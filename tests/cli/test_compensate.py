@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import csv
 import json
-import os
 from pathlib import Path
 
 import numpy as np
@@ -14,7 +13,7 @@ from typer.testing import CliRunner
 
 from elastocal.cell.work_cell import read_cell
 from elastocal.cli.app import app
-from elastocal.model import Model, nominal_flange_rows
+from elastocal.model import Model
 from elastocal.model.effects import CATALOGUE
 
 URDF = Path(__file__).parents[2] / "src" / "elastocal" / "demo" / "kr270_2.urdf"
@@ -154,22 +153,6 @@ def test_a_refused_table_speaks_of_its_grid_and_not_of_targets(folder):
     assert "smaller --box" in outcome.stderr and "target" not in outcome.stderr
 
 
-def test_a_result_of_another_robot_is_refused_although_its_parameters_have_the_same_names(folder):
-    path = folder / "result.json"
-    result = json.loads(path.read_text())
-    model = Model(read_cell(folder / "cell.toml", known_effects=tuple(CATALOGUE)))
-    result["nominal_flange"] = nominal_flange_rows(model.chain)
-    path.write_text(json.dumps(result))
-    assert run(folder, folder / "targets.csv").exit_code == 0
-    longer = URDF.read_text().replace('xyz="1.250 0.000 0.000"', 'xyz="1.260 0.000 0.000"')
-    assert longer != URDF.read_text()
-    (folder / "arm.urdf").write_text(longer)
-    (folder / "cell.toml").write_text(CELL.replace(str(URDF), "arm.urdf"))
-    outcome = run(folder, folder / "targets.csv")
-    assert outcome.exit_code == 2
-    assert "the nominal robot is another one" in outcome.stderr and "10 mm" in outcome.stderr
-
-
 @pytest.mark.parametrize(
     "damage",
     [
@@ -191,12 +174,6 @@ def test_a_damaged_result_is_refused(folder, damage):
     assert "result.json" in outcome.stderr and "write the result anew" in outcome.stderr
 
 
-def test_a_result_of_brackets_is_refused(folder):
-    (folder / "result.json").write_text("[" * 100_000)
-    outcome = run(folder, folder / "targets.csv")
-    assert outcome.exit_code == 2 and "give the file that identify wrote" in outcome.stderr
-
-
 def test_names_of_markers_are_no_markup(folder):
     cell = folder / "cell.toml"
     cell.write_text(CELL.replace("M2 =", '"[bold]M2" ='))
@@ -210,35 +187,3 @@ def test_a_forgotten_load_is_mentioned(folder):
     assert "no load is stated" in " ".join(outcome.stdout.split())
     outcome = run(folder, "--target", "1800,300,1500", "--load", "0", "0", "-2600")
     assert "no load is stated" not in " ".join(outcome.stdout.split())
-
-
-@pytest.mark.parametrize(
-    ("arguments", "told"),
-    [
-        ((), "nothing to compensate"),
-        (("targets.csv", "--frame", "world"), "--frame takes base or tracker"),
-        (("targets.csv", "--target", "1,2,3"), "drop one of them"),
-        (("targets.csv", "--point", "M3"), "did you mean 'M"),
-        (("targets.csv", "--point", "1,2"), "--point takes x,y,z"),
-        (("targets.csv", "--near", "0,0"), "--near takes 6 numbers"),
-        (("targets.csv", "--near", "170,0,0,0,0,0"), "joint 1 is beyond its limits"),
-        (("targets.csv", "--load", "0", "0", "-5"), "forces of its own"),
-        (("targets.csv", "--grid", "3"), "--table FILE"),
-        (("--target", "1,2"), "--target takes"),
-        (("--target", "1,2,x"), "--target takes"),
-        (("--table", "t.csv", "--grid", "a"), "whole numbers"),
-        (("--table", "t.csv", "--grid", "1000,1000,1000,1000,1000,1"), "1,000,000,000,000,000 po"),
-        (("--table", "t.csv", "--rotation", "0,0,0"), "belongs to --box"),
-        (("--table", "t.csv", "--box", "1,2,3"), "--box takes"),
-        (("missing.csv",), "no such file"),
-        (("targets.csv", "-o", "targets.csv"), "written over"),
-        (("targets.csv", "-o", "nowhere/c.csv"), "does not exist"),
-    ],
-)
-def test_wrong_input_is_told(folder, monkeypatch, arguments, told):
-    monkeypatch.chdir(folder)
-    before = sorted(os.listdir(folder))
-    outcome = run(folder, *arguments)
-    assert outcome.exit_code == 2
-    assert told in outcome.stderr
-    assert sorted(os.listdir(folder)) == before

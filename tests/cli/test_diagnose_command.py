@@ -179,53 +179,12 @@ def test_a_pose_visited_again_under_the_same_force_has_its_own_name(tmp_path):
 # --- wrong input: one message, the right code, nothing written, no time lost ----------------
 
 
-def test_unknown_effect_to_leave_out(campaign, engine):
-    options = ("--without", "gear_eccentrcity")
-    refused(campaign, engine, 2, "gear_eccentrcity", "gear_eccentricity", options=options)
-
-
-def test_poses_without_a_plan(campaign, engine):
-    refused(campaign, engine, 2, "--poses 4", "--plan", options=("--poses", 4))
-
-
-@pytest.mark.parametrize("option", ["-o", "--report", "--plan", "--cell-out"])
-def test_output_folder_that_does_not_exist(option, campaign, engine):
-    path = campaign[0].parent / "no" / "file"
-    refused(campaign, engine, 2, "does not exist", options=(option, path))
-
-
-@pytest.mark.parametrize("option", ["-o", "--report", "--plan", "--cell-out"])
-@pytest.mark.parametrize("name", ["cell.toml", "data.csv", "arm.urdf"])
-def test_no_input_is_written_over(option, name, campaign, engine):
-    path = campaign[0].parent / name
-    refused(campaign, engine, 2, re.escape(name), "written over", options=(option, path))
-
-
-def test_two_outputs_in_one_file(campaign, engine):
-    path = campaign[0].parent / "out"
-    refused(campaign, engine, 2, "two outputs", options=("-o", path, "--report", path))
-
-
-def test_missing_column(campaign, engine):
-    data = campaign[1]
-    lines = data.read_text(encoding="utf-8").splitlines()
-    data.write_text("\n".join(line.rpartition(",")[0] for line in lines) + "\n", encoding="utf-8")
-    refused(campaign, engine, 2, "data.csv", "z_mm", options=("-o", data.parent / "d.json"))
-
-
 def test_data_that_support_no_answer(campaign, engine):
     engine.answer = InsufficientDataError("data.csv: 2 configurations; measure at least 9")
     outputs = ("-o", "d.json", "--report", "r.html", "--plan", "e.csv", "--cell-out", "c.toml")
     folder = campaign[0].parent
     options = [folder / o if not o.startswith("-") else o for o in outputs]
     refused(campaign, engine, 1, "measure at least 9", options=options, asked=True)
-
-
-@pytest.mark.parametrize("which", [0, 1])
-def test_a_file_that_is_not_there(which, campaign, engine):
-    name = campaign[which].name
-    campaign[which].unlink()
-    refused(campaign, engine, 2, re.escape(name), "no such file")
 
 
 @pytest.mark.skipif(os.geteuid() == 0, reason="root may write anywhere")

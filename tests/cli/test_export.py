@@ -81,46 +81,6 @@ def test_held_values_are_named(campaign, tmp_path: Path) -> None:
     assert content["parameters"][9]["name"] in result.output
 
 
-BAD = [
-    (("-o", "a.txt"), "the ending '.txt' tells no format"),
-    (("-o", "a"), "tells no format"),
-    (("-o", "a.urdf", "--format", "urd"), "did you mean"),
-    (("-o", "no/folder/a.urdf"), "does not exist; create it first"),
-    (("-o", "arm.urdf"), "is read and would be written over"),
-    (("-o", "cell.toml", "--format", "dh"), "is read and would be written over"),
-    (("-o", "result.json"), "is read and would be written over"),
-    (("-o", "a.urdf", "--load", "nan", "0", "0"), "--load takes three finite numbers"),
-    (("-o", "a.urdf", "--temperature-c", "inf"), "--temperature-c takes a finite number"),
-]
-
-
-@pytest.mark.parametrize(("options", "told"), BAD)
-def test_what_is_wrong_is_told_and_nothing_written(
-    campaign, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, options: tuple, told: str
-) -> None:
-    monkeypatch.chdir(tmp_path)
-    before = {path.name: path.read_bytes() for path in tmp_path.iterdir()}
-    result = run(*campaign, *options, "-q")
-    assert result.exit_code == 2
-    assert told in result.output and "Traceback" not in result.output
-    assert {path.name: path.read_bytes() for path in tmp_path.iterdir()} == before
-
-
-def test_a_result_of_another_cell_is_refused(campaign, tmp_path: Path) -> None:
-    cell, result = campaign
-    cell.write_text(cell.read_text().replace('"joint_offset", ', ""))
-    told = run(cell, result, "-o", tmp_path / "a.urdf", "-q")
-    assert told.exit_code == 2 and "was not identified with" in told.output
-    assert not (tmp_path / "a.urdf").exists()
-
-
-def test_a_load_that_no_pose_carries_ends_with_1(campaign, tmp_path: Path) -> None:
-    output = tmp_path / "a.urdf"
-    result = run(*campaign, "-o", output, "-q", "--poses", "5", "--load", 0, 0, -1e7)
-    assert result.exit_code == 1
-    assert "has a static equilibrium" in result.output and not output.exists()
-
-
 def test_a_mimic_beside_the_chain_stays_and_one_on_it_is_refused(tmp_path: Path) -> None:
     finger = (
         '<link name="f"/><joint name="grip" type="prismatic"><parent link="l5"/><child link="f"/>'

@@ -1,8 +1,6 @@
 """`identify --knowledge` and `--physical` from the command line."""
 
 import json
-import os
-import re
 
 import numpy as np
 import pytest
@@ -111,48 +109,3 @@ def test_bounded_is_still_there(campaign):
     told = json.loads(found)
     assert told["method"] == "reml" and told["active"] == []
     assert values(found)[BEARING]["held"] == 0 and values(found)[BEARING]["value"] is None
-
-
-@pytest.mark.parametrize(
-    "code, text, fragments",
-    [
-        (2, "bound = 1", ["known.toml", "unknown key bound;", "did you mean bounds"]),
-        (2, '[[bounds]]\nparameter = "joint2.complience"\nlower = 0',
-         ["known.toml", "did you mean 'joint2.compliance'"]),
-        (2, '[[bounds]]\nparameter = "joint2.compliance"\nlower = 1e-6\n[[equality]]\n'
-         'terms = { "joint2.compliance" = 1.0 }\nvalue = 1e-7\nlabel = "data sheet"',
-         ["contradict each other", "'data sheet'", "lower bound of joint2.compliance"]),
-    ],
-)  # fmt: skip
-def test_wrong_knowledge_ends_with_a_message_and_writes_nothing(
-    campaign, tmp_path, code, text, fragments
-):
-    path = tmp_path / "known.toml"
-    path.write_text(text + "\n", encoding="utf-8")
-    found, _, message = run(campaign, "--knowledge", path, "-o", tmp_path / "result.json")
-    assert found == code and "Traceback" not in message
-    for fragment in fragments:
-        assert re.search(re.escape(fragment), message), message
-    assert os.listdir(tmp_path) == ["known.toml"]
-
-
-def test_a_missing_file_is_told(campaign, tmp_path):
-    code, _, message = run(campaign, "--knowledge", tmp_path / "none.toml")
-    assert code == 2 and "none.toml: no such file" in message
-
-
-def test_a_method_without_constraints_is_refused(campaign):
-    code, _, message = run(campaign, "--physical", "--method", "tukey")
-    assert code == 2 and "use huber" in message
-
-
-def test_equalities_of_what_no_reading_shows_end_with_exit_code_1(campaign, tmp_path):
-    cell, data = campaign
-    blind = tmp_path / "cell.toml"
-    text = cell.read_text(encoding="utf-8").replace("effects = [", 'effects = ["base_frame", ')
-    blind.write_text(text, encoding="utf-8")
-    path = tmp_path / "known.toml"
-    path.write_text('[[equality]]\nterms = { "base.x" = 1.0, "base.y" = -1.0 }\n', encoding="utf-8")
-    code, _, message = run((blind, data), "--knowledge", path)
-    assert code == 1, message
-    assert "do not determine" in message

@@ -85,33 +85,6 @@ def test_what_is_left_out_is_said(campaign, tmp_path):
     assert "left out, without joint values: 2 points: P10::M1 (line 21), P10::M2 (line 22)" in err
 
 
-@pytest.mark.parametrize(
-    ("arguments", "match"),
-    [
-        ([], "the argument FILES is missing"),
-        (["points.txt", *PRESETS[:2]], "needs -o data.csv"),
-        (["points.txt", "-o", "d.csv"], "needs --map mapping.toml, or --preset"),
-        (["points.txt", "-o", "points.txt", *PRESETS[:2]], "read and would be written over"),
-        (["none.txt", "-o", "d.csv", *PRESETS[:2]], "none.txt: no such file"),
-        (["points.txt", "-o", "d.csv", "--preset", "kukka"], "'kukka'.*'kuka'"),
-        (["points.txt", "-o", "d.csv", *PRESETS], "one preset per file"),
-        (["points.txt", "points.txt", "-o", "d.csv", *PRESETS], "named twice"),
-        (["points.txt", "poses.dat", "-o", "no/d.csv", *PRESETS], "does not exist"),
-        (["points.txt", "-o", "d.csv", *PRESETS[:2], "--length-unit", "ell"], "length.*'ell'"),
-        (["poses.dat", "-o", "d.csv", *PRESETS[2:]], "no file with points"),
-        (["points.txt", "-o", "d.csv", *PRESETS[:2]], "no joint values"),
-        (["cell.toml", "-o", "d.csv", *PRESETS[:2]], "cell.toml, line 1: no numbers"),
-    ],
-)
-def test_wrong_use_ends_with_one_message(campaign, tmp_path, arguments, match):
-    before = {path: path.read_bytes() for path in tmp_path.iterdir()}
-    code, out, err = run(*arguments)
-    assert code == 2 and out == ""
-    assert re.search(match, err), err
-    assert err.startswith("elastocal: ") and "Traceback" not in err
-    assert {path: path.read_bytes() for path in tmp_path.iterdir()} == before
-
-
 def test_what_the_robot_cannot_have_measured_is_shown_and_not_written(campaign, tmp_path):
     (tmp_path / "map.toml").write_text("[joints]\noffset_deg = [0, 300, 0, 0, 0, 0]\n")
     code, out, err = run("points.txt", "poses.dat", *PRESETS, "--map", "map.toml", "--preview",
@@ -131,12 +104,3 @@ def test_presets_are_printed_to_be_copied(tmp_path):
     from elastocal.importing import read_mapping
 
     assert read_mapping(path).sources[0].role == "joints"
-
-
-def test_without_a_preset_those_that_read_the_files_are_suggested(campaign):
-    code, _, err = run("points.txt", "poses.dat", "-o", "data.csv")
-    assert code == 2
-    hint = err.partition("what reads your files: ")[2]
-    points, poses = hint.split(", ")
-    assert points.startswith("points.txt as --preset") and "spatialanalyzer" in points
-    assert poses.strip() == "poses.dat as --preset kuka"

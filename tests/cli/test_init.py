@@ -76,22 +76,6 @@ def test_a_file_that_is_there_is_kept_unless_forced(arms):
     assert run("init", "arms/arm.csv", "--force")[0] == 0
 
 
-@pytest.mark.parametrize(
-    ("words", "told"),
-    [
-        (("arms/arm.obj",), "tells no robot; give a URDF"),
-        (("arms/none.urdf",), "none.urdf"),
-        (("arms/arm.csv", "--flange", "a"), "--flange has no meaning for a DH table"),
-        (("arms/arm.urdf", "--flange", "flunge"), "did you mean 'flange'"),
-        (("arms/arm.urdf", "--convention", "modified"), "--convention is for DH tables"),
-    ],
-)
-def test_what_is_wrong_is_said_and_nothing_is_written(words, told, arms):
-    code, _, err = run("init", *words)
-    assert code == 2 and told in err, err
-    assert not Path("cell.toml").exists()
-
-
 def test_effects_lists_every_effect_with_unit_size_and_words(arms):
     code, out, err = run("effects")
     assert code == 0, err

@@ -23,24 +23,6 @@ def command(tmp_path_factory) -> tuple[Path, list[str]]:
     return folder, ["identify", *words]
 
 
-@pytest.mark.parametrize(
-    ("limits", "code", "told"),
-    [
-        (["heldout=1e6"], 0, ""),
-        (["heldout=1e6", "new_poses=1e-3"], 3, "not accepted: new_poses: "),
-        (["test=1"], 3, "not accepted: test: not known where at most 1 µm is required"),
-        (["held=1"], 2, "--require takes NAME=UM"),
-        (["heldout=-1"], 2, "found 'heldout=-1'"),
-    ],
-)
-def test_limits(command, monkeypatch, limits, code, told) -> None:
-    folder, words = command
-    monkeypatch.chdir(folder)
-    done = CliRunner().invoke(app, [*words, *(f"--require={text}" for text in limits)])
-    assert done.exit_code == code
-    assert told in " ".join(done.output.split())
-
-
 def test_limits_of_the_cell(command, monkeypatch) -> None:
     folder, words = command
     monkeypatch.chdir(folder)

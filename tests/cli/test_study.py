@@ -132,12 +132,6 @@ def test_wrong_arguments_are_told(folder, arguments, told, monkeypatch):
     assert told in result.stderr and "Traceback" not in result.stderr
 
 
-def test_a_folder_without_a_study_is_told(tmp_path):
-    assert "no such folder" in study(tmp_path / "none").stderr
-    result = study(tmp_path)
-    assert result.exit_code == 2 and "holds no study.py" in result.stderr
-
-
 @pytest.mark.parametrize(
     ("missing", "arguments", "told"),
     [

@@ -53,12 +53,6 @@ def test_no_help_text_shows_what_only_a_programmer_knows(verb: str) -> None:
                if " / " in line.partition("  ")[2])  # fmt: skip
 
 
-@pytest.mark.parametrize("verb", [SIMULATE, IDENTIFY, COMPENSATE, EXPORT, DESIGN, DIAGNOSE])
-def test_a_negative_seed_is_a_usage_error(folder: Path, verb: tuple[str, ...]) -> None:
-    outcome = run(*verb, "--seed", "-1")
-    assert outcome.exit_code == 2 and "--seed" in outcome.stderr
-
-
 @pytest.mark.parametrize(
     "verb",
     [
@@ -85,16 +79,3 @@ def test_no_verb_writes_over_its_inputs_or_two_outputs_into_one(
     assert outcome.exit_code == 2
     assert "written over" in outcome.stderr or "two outputs" in outcome.stderr
     assert {path.name: path.read_bytes() for path in folder.iterdir()} == before
-
-
-@pytest.mark.parametrize("verb", [SIMULATE, COMPENSATE, EXPORT], ids=lambda verb: verb[0])
-def test_a_load_that_is_no_number_is_told_as_such(folder: Path, verb: tuple[str, ...]) -> None:
-    outcome = run(*verb, "--load", "0", "0", "nan")
-    assert outcome.exit_code == 2
-    assert "--load takes three finite numbers in N; found 0 0 nan" in outcome.stderr
-
-
-@pytest.mark.parametrize("draw", ["-1", "nan", "inf"])
-def test_simulate_draws_a_finite_share_of_the_typical_sizes(folder: Path, draw: str) -> None:
-    outcome = run(*SIMULATE, "--draw", draw)
-    assert outcome.exit_code == 2 and "--draw takes a factor" in outcome.stderr

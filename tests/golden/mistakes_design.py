@@ -93,4 +93,12 @@ TABLE = (
             f"marker,{JOINTS},x_mm,y_mm,z_mm\nM1,0,-9,9,0,9,0,1,1,1\n"),
     Mistake("knowledge without a prior", QUICK + " --knowledge knowledge.toml", "knowledge.toml",
             "", "physical = true\n"),
+    Mistake("measurements of another marker", QUICK + " --augment data.csv", "data.csv", "",
+            f"marker,{JOINTS},x_mm,y_mm,z_mm\nM7,0,-9,9,0,9,0,1,1,1\n"),
+    Mistake("measurements of two joints", QUICK + " --augment data.csv", "data.csv", "",
+            "q1_deg,q2_deg\n1,2\n"),
+    Mistake("knowledge of no parameter", QUICK + " --knowledge knowledge.toml", "knowledge.toml",
+            "", '[prior."joint2.complance"]\nmean = 0\nstd = 1\n'),
+    Mistake("knowledge without a spread", QUICK + " --knowledge knowledge.toml", "knowledge.toml",
+            "", '[prior."joint2.compliance"]\nmean = 0\nstd = 0\n'),
 )  # fmt: skip
