@@ -18,15 +18,17 @@ import argparse
 import ast
 import copy
 import hashlib
+import importlib
 import json
+import math
 import os
 import shutil
 import signal
-import subprocess
 import sys
 import time
 from collections import defaultdict
 from collections.abc import Iterator
+from contextlib import suppress
 from pathlib import Path
 from typing import Any
 
@@ -40,6 +42,10 @@ TURNED: dict[type, type] = {
 SILENT = (ast.Raise, ast.JoinedStr, ast.AnnAssign, ast.arg, ast.Assert, ast.MatchValue)
 # Of the whole tree: they fail on a copy, or say nothing of a line of src.
 LEFT_OUT = ("tests/test_repository.py", "tests/documentation", "tests/fuzz")
+# What takes long to load, once for all runs.
+LOADED = ("scipy.stats", "scipy.optimize", "casadi", "pinocchio", "coal", "cvxpy", "pandas",
+          "matplotlib.pyplot", "plotly.graph_objects", "pydantic", "typer", "rich.table", "mujoco",
+          "joblib", "hypothesis.strategies", "typer.testing")  # fmt: skip
 # Imported by the copy: wakes a mutant, and as a plug-in of pytest notes what comes to which.
 SWITCH = """
 import os, signal, sys
@@ -76,7 +82,13 @@ def pytest_runtest_logreport(report):
     if NOTES:
         note("test", report.nodeid, report.when, report.outcome, round(report.duration, 4))
     elif report.failed:
-        print("CAUGHT", report.nodeid, flush=True)
+        caught(report.nodeid)
+def pytest_collectreport(report):
+    if report.failed and not NOTES:
+        caught(report.nodeid + " (not even collected)")
+def caught(test):
+    with open(os.environ["MUTANT_CAUGHT"], "a") as file:
+        file.write(test + "\\n")
 """
 
 
@@ -240,22 +252,47 @@ def _read_at_import(tree: ast.Module, node: ast.AST) -> str | None:
 
 
 def pytest(root: Path, *words: str, seconds: float | None = None, **environment: str) -> str:
-    """What pytest prints on the copy; it and all that it started end after `seconds`."""
-    clean = os.environ | {
-        "PYTHONPATH": f"{root / 'src'}", "OPENBLAS_NUM_THREADS": "1", "OMP_NUM_THREADS": "1",
-        "PYTHONDONTWRITEBYTECODE": "",
-    } | environment  # fmt: skip
-    command = [sys.executable, "-m", "pytest", "-p", "elastocal_mutants", "--tb=no",
-               "--hypothesis-seed=0", "-p", "no:cacheprovider", *words]  # fmt: skip
-    with subprocess.Popen(
-        command, cwd=root, env=clean, text=True, start_new_session=True,
-        stdout=subprocess.PIPE, stderr=subprocess.STDOUT,
-    ) as run:  # fmt: skip
-        try:
-            return run.communicate(timeout=seconds)[0]
-        except subprocess.TimeoutExpired:
-            os.killpg(run.pid, signal.SIGKILL)
-            return run.communicate()[0] + "\nTIME"
+    """What pytest prints on the copy, in a fork of this process, which has loaded all but the
+    copy; it and all that it started end after `seconds`."""
+    for name in LOADED:
+        with suppress(ImportError):
+            importlib.import_module(name)
+    told = root / "told"
+    sys.stdout.flush()
+    child = os.fork()
+    if child == 0:
+        _be_pytest(root, told, words, environment)
+    end, late = time.monotonic() + (seconds or math.inf), False
+    while not os.waitpid(child, os.WNOHANG)[0]:
+        late = time.monotonic() > end
+        if late:
+            os.killpg(child, signal.SIGKILL)
+            os.waitpid(child, 0)
+            break
+        time.sleep(0.05)
+    return told.read_text(errors="replace") + "\nTIME" * late
+
+
+def _be_pytest(root: Path, told: Path, words: tuple[str, ...], environment: dict[str, str]) -> None:
+    """In the fork: one run of pytest; never returns."""
+    code = 1
+    try:
+        os.setsid()
+        handle = os.open(told, os.O_WRONLY | os.O_CREAT | os.O_TRUNC)
+        for number in (1, 2):
+            os.dup2(handle, number)
+        os.environ.update(
+            PYTHONPATH=str(root / "src"), OPENBLAS_NUM_THREADS="1", OMP_NUM_THREADS="1",
+            **environment,
+        )  # fmt: skip
+        os.chdir(root)
+        sys.path[:0] = [str(root / "src")]
+        plain = ("--tb=no", "--hypothesis-seed=0", "-p", "no:cacheprovider")
+        code = int(importlib.import_module("pytest").main(
+            ["-p", "elastocal_mutants", *plain, *words]))  # fmt: skip
+        sys.stdout.flush()
+    finally:
+        os._exit(code)
 
 
 def recorded(notes: Path) -> tuple[dict[int, dict[str, list[str]]], dict[str, float]]:
@@ -297,13 +334,14 @@ def tried(
             total += times.get(test, 1.0)
             if total < 1.5 * cap and test not in words:
                 words.append(test)
-    said = pytest(root, "-x", *words[:400], seconds=cap, MUTANT=str(k))
-    caught = [s.split(" ", 1)[1] for s in said.splitlines() if s.lstrip(".sx").startswith("CAUGHT")]
-    if caught:
-        return caught[0]
-    if "error" in said.lower() and " passed" not in said:
-        return "caught at import"
-    return "survived (time over)" if said.endswith("TIME") else "survived"
+    failed = root / "failed"
+    failed.unlink(missing_ok=True)
+    end = pytest(root, "-x", *words[:400], seconds=cap, MUTANT=str(k), MUTANT_CAUGHT=str(failed))
+    if failed.exists():
+        return failed.read_text().splitlines()[0]
+    if not any(word in end for word in (" passed", "TIME")):
+        return "caught: nothing runs"
+    return "survived (time over)" if end.endswith("TIME") else "survived"
 
 
 def _stands(root: Path, test: str) -> bool:
