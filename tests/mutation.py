@@ -6,10 +6,11 @@ of code ask for.  Which are drawn depends on the seed and on what the line says,
 stands: the same set is drawn from another state of the tree, and with --again FILE the set of an
 earlier run is kept; a mutant whose line is gone gives way to the next of its package.
 
-All are written into one copy of the tree, each asleep until the environment names it.  One run of
-the tests, of a parametrised one its first case, records which test comes to which mutant; then
-each is woken, and the tests that come to it run, the files with the shortest first, until one
-fails or the time is over.  What a fixture of several tests comes to counts for all of its file.
+All are written into one copy of the tree, each asleep until it is woken.  One run of the tests, of
+a parametrised one its first case, notes which test comes to which mutant.  A second run collects
+those tests and forks for each mutant: it is woken in the fork, and the tests that come to it run,
+the files with the shortest first, until one fails or the processor time is over.  What acts when
+a module is read has a run of its own.  What a fixture comes to counts for all tests of its file.
 """
 
 from __future__ import annotations
@@ -18,17 +19,14 @@ import argparse
 import ast
 import copy
 import hashlib
-import importlib
 import json
-import math
 import os
 import shutil
-import signal
+import subprocess
 import sys
 import time
 from collections import defaultdict
 from collections.abc import Iterator
-from contextlib import suppress
 from pathlib import Path
 from typing import Any
 
@@ -42,32 +40,26 @@ TURNED: dict[type, type] = {
 SILENT = (ast.Raise, ast.JoinedStr, ast.AnnAssign, ast.arg, ast.Assert, ast.MatchValue)
 # Of the whole tree: they fail on a copy, or say nothing of a line of src.
 LEFT_OUT = ("tests/test_repository.py", "tests/documentation", "tests/fuzz")
-# What takes long to load, once for all runs.
-LOADED = ("scipy.stats", "scipy.optimize", "casadi", "pinocchio", "coal", "cvxpy", "pandas",
-          "matplotlib.pyplot", "plotly.graph_objects", "pydantic", "typer", "rich.table", "mujoco",
-          "joblib", "hypothesis.strategies", "typer.testing")  # fmt: skip
-# Imported by the copy: wakes a mutant, and as a plug-in of pytest notes what comes to which.
+# Imported by the copy: wakes a mutant; as a plug-in of pytest notes what comes to which, or forks.
 SWITCH = """
-import os, signal, sys
-AWAKE, NOTES = os.environ.get("MUTANT"), os.environ.get("MUTANT_NOTES")
-SECONDS = {"setup": 20.0, "call": 6.0}
+import json, os, signal, time
+AWAKE, NOTES, PLAN = map(os.environ.get, ("MUTANT", "MUTANT_NOTES", "MUTANT_PLAN"))
+SECONDS, CAP = {"setup": 20.0, "call": 6.0}, float(os.environ.get("MUTANT_CAP", 0))
 seen = set()
 def note(*words):
-    with open(NOTES, "a") as file:
+    with open(os.environ["MUTANT_FILE"], "a") as file:
         file.write("\\t".join(map(str, words)) + "\\n")
 def on(k):
-    if NOTES:
-        test = os.environ.get("PYTEST_CURRENT_TEST", "")
-        if (k, test) not in seen:
-            seen.add((k, test))
-            note("hit", k, test)
-        return False
+    test = NOTES and os.environ.get("PYTEST_CURRENT_TEST")
+    if test and (k, test) not in seen:
+        seen.add((k, test))
+        note("hit", k, test)
     return AWAKE == str(k)
 def late(*_):
     raise TimeoutError("longer than a test of mutants may take")
 def timed(when):
     signal.signal(signal.SIGVTALRM, late)
-    signal.setitimer(signal.ITIMER_VIRTUAL, SECONDS[when] if NOTES else 0.0)
+    signal.setitimer(signal.ITIMER_VIRTUAL, SECONDS.get(when, 0.0) if NOTES else 0.0)
 def pytest_collection_modifyitems(config, items):
     if NOTES:
         first = {item.nodeid.split("[")[0]: item for item in reversed(items)}
@@ -77,18 +69,43 @@ def pytest_runtest_setup(item):
 def pytest_runtest_call(item):
     timed("call")
 def pytest_runtest_teardown(item):
-    signal.setitimer(signal.ITIMER_VIRTUAL, 0.0)
+    timed("teardown")
 def pytest_runtest_logreport(report):
     if NOTES:
         note("test", report.nodeid, report.when, report.outcome, round(report.duration, 4))
     elif report.failed:
-        caught(report.nodeid)
+        ended(AWAKE, report.nodeid)
 def pytest_collectreport(report):
-    if report.failed and not NOTES:
-        caught(report.nodeid + " (not even collected)")
-def caught(test):
-    with open(os.environ["MUTANT_CAUGHT"], "a") as file:
-        file.write(test + "\\n")
+    if report.failed and AWAKE:
+        ended(AWAKE, report.nodeid + " (not even collected)")
+def ended(k, how):
+    note("end", k, how)
+    os._exit(0)
+def pytest_runtestloop(session):
+    if not PLAN:
+        return None
+    items = {}
+    for item in session.items:
+        items.setdefault(item.nodeid.split("[")[0], []).append(item)
+    for k, tests in json.loads(PLAN and open(PLAN).read()):
+        child = os.fork()
+        if child == 0:
+            attempt(k, [item for test in tests for item in items.get(test, [])])
+        end = time.monotonic() + 30 * CAP
+        while not (done := os.waitpid(child, os.WNOHANG))[0]:
+            if time.monotonic() > end:
+                os.kill(child, signal.SIGKILL)
+            time.sleep(0.02)
+        if done[1]:
+            note("end", k, "survived (time over)")
+    return True
+def attempt(k, items):
+    global AWAKE
+    AWAKE = os.environ["MUTANT"] = str(k)
+    signal.setitimer(signal.ITIMER_PROF, CAP)
+    for item, after in zip(items, [*items[1:], None]):
+        item.config.hook.pytest_runtest_protocol(item=item, nextitem=after)
+    ended(k, "survived")
 """
 
 
@@ -107,6 +124,8 @@ def mutated(node: ast.AST) -> tuple[str, ast.AST] | None:
     if isinstance(node, ast.UnaryOp) and isinstance(node.op, ast.USub):
         return "sign", new.operand
     if isinstance(node, ast.Constant) and type(node.value) in (int, float):
+        if repr(node.value) == "0.0":
+            return None
         new.value = node.value + 1 if type(node.value) is int else 1.1 * node.value
         return ("whole number" if type(node.value) is int else "decimal number"), new
     return None
@@ -216,8 +235,9 @@ def set_in(root: Path, mutants: list[dict[str, Any]]) -> None:
         path = root / "src" / file
         nodes = {places[i]: n for i, n in enumerate(sites(trees[path])) if i in places}
         for k, node in nodes.items():
-            name = _read_at_import(trees[path], node)
-            if name:
+            names = _read_at_import(trees[path], node)
+            mutants[k]["at_import"] = bool(names)
+            for name in names:
                 used[name].append(k)
         trees[path] = Asleep({id(n): k for k, n in nodes.items()}).visit(trees[path])
         changed.add(path)
@@ -235,64 +255,28 @@ def set_in(root: Path, mutants: list[dict[str, Any]]) -> None:
         path.write_text(ast.unparse(ast.fix_missing_locations(trees[path])))
 
 
-def _read_at_import(tree: ast.Module, node: ast.AST) -> str | None:
-    """The name under which functions use what a module, class or default holds; else None."""
-    for outer in tree.body:
-        if node not in ast.walk(outer):
-            continue
-        if isinstance(outer, ast.FunctionDef):
-            return outer.name if node not in [n for s in outer.body for n in ast.walk(s)] else None
-        if isinstance(outer, ast.ClassDef):
-            inner = [f for f in ast.walk(outer) if isinstance(f, ast.FunctionDef)]
-            within = any(node in ast.walk(s) for f in inner for s in f.body)
-            return None if within else outer.name
-        target = getattr(outer, "targets", [getattr(outer, "target", None)])[0]
-        return target.id if isinstance(target, ast.Name) else None
-    return None
+def _read_at_import(tree: ast.Module, node: ast.AST) -> set[str]:
+    """The names under which functions use what a module, class or default holds."""
+    outer = next(o for o in tree.body if node in ast.walk(o))
+    inner = [f for f in ast.walk(outer) if isinstance(f, ast.FunctionDef)]
+    if any(node in ast.walk(s) for f in inner for s in f.body):
+        return set()
+    if isinstance(outer, ast.FunctionDef | ast.ClassDef):
+        return {outer.name}
+    return {
+        n.id for n in ast.walk(outer) if isinstance(n, ast.Name) and isinstance(n.ctx, ast.Store)
+    }
 
 
-def pytest(root: Path, *words: str, seconds: float | None = None, **environment: str) -> str:
-    """What pytest prints on the copy, in a fork of this process, which has loaded all but the
-    copy; it and all that it started end after `seconds`."""
-    for name in LOADED:
-        with suppress(ImportError):
-            importlib.import_module(name)
-    told = root / "told"
-    sys.stdout.flush()
-    child = os.fork()
-    if child == 0:
-        _be_pytest(root, told, words, environment)
-    end, late = time.monotonic() + (seconds or math.inf), False
-    while not os.waitpid(child, os.WNOHANG)[0]:
-        late = time.monotonic() > end
-        if late:
-            os.killpg(child, signal.SIGKILL)
-            os.waitpid(child, 0)
-            break
-        time.sleep(0.05)
-    return told.read_text(errors="replace") + "\nTIME" * late
-
-
-def _be_pytest(root: Path, told: Path, words: tuple[str, ...], environment: dict[str, str]) -> None:
-    """In the fork: one run of pytest; never returns."""
-    code = 1
-    try:
-        os.setsid()
-        handle = os.open(told, os.O_WRONLY | os.O_CREAT | os.O_TRUNC)
-        for number in (1, 2):
-            os.dup2(handle, number)
-        os.environ.update(
-            PYTHONPATH=str(root / "src"), OPENBLAS_NUM_THREADS="1", OMP_NUM_THREADS="1",
-            **environment,
-        )  # fmt: skip
-        os.chdir(root)
-        sys.path[:0] = [str(root / "src")]
-        plain = ("--tb=no", "--hypothesis-seed=0", "-p", "no:cacheprovider")
-        code = int(importlib.import_module("pytest").main(
-            ["-p", "elastocal_mutants", *plain, *words]))  # fmt: skip
-        sys.stdout.flush()
-    finally:
-        os._exit(code)
+def pytest(root: Path, *words: str, **environment: str) -> str:
+    """What pytest prints on the copy."""
+    clean = os.environ | {
+        "PYTHONPATH": str(root / "src"), "OPENBLAS_NUM_THREADS": "1", "OMP_NUM_THREADS": "1",
+    } | environment  # fmt: skip
+    plain = ("-p", "elastocal_mutants", "--tb=no", "--hypothesis-seed=0", "-p", "no:cacheprovider")
+    command = [sys.executable, "-m", "pytest", *plain, *words]
+    done = subprocess.run(command, cwd=root, env=clean, text=True, capture_output=True)
+    return done.stdout + done.stderr
 
 
 def recorded(notes: Path) -> tuple[dict[int, dict[str, list[str]]], dict[str, float]]:
@@ -319,29 +303,42 @@ def recorded(notes: Path) -> tuple[dict[int, dict[str, list[str]]], dict[str, fl
     return chosen, good
 
 
-def tried(
-    root: Path, k: int, files: dict[str, list[str]], times: dict[str, float], first: str, cap: float
-) -> str:
-    """The test that catches mutant k, or "survived", or why nothing was tried."""
-    stands = {f: [t for t in ts if _stands(root, t)] for f, ts in files.items()}
-    took = {f: sum(times.get(t, 1.0) for t in ts) for f, ts in stands.items() if ts}
-    if not took:
-        return "no test comes to it"
-    words = [first] if first and _stands(root, first) else []
+def ordered(root: Path, mutant: dict[str, Any], times: dict[str, float], cap: float) -> list[str]:
+    """The tests that stand and come to a mutant: that of an earlier run first, then the files with
+    the shortest, as many as the time is for."""
+    stands = {f: [t for t in ts if _stands(root, t)] for f, ts in mutant["tests"].items()}
+    took = {f: sum(times.get(t, 1.0) for t in ts) for f, ts in stands.items()}
+    words = [t for t in [mutant.get("first", "").split("[")[0]] if t and _stands(root, t)]
     total = 0.0
     for file in sorted(took, key=lambda f: took[f]):
         for test in sorted(stands[file], key=lambda t: times.get(t, 1.0)):
             total += times.get(test, 1.0)
-            if total < 1.5 * cap and test not in words:
+            if total < 3 * cap and test not in words:
                 words.append(test)
-    failed = root / "failed"
-    failed.unlink(missing_ok=True)
-    end = pytest(root, "-x", *words[:400], seconds=cap, MUTANT=str(k), MUTANT_CAUGHT=str(failed))
-    if failed.exists():
-        return failed.read_text().splitlines()[0]
-    if not any(word in end for word in (" passed", "TIME")):
-        return "caught: nothing runs"
-    return "survived (time over)" if end.endswith("TIME") else "survived"
+    return words
+
+
+def tried(
+    root: Path, mutants: list[dict[str, Any]], times: dict[str, float], cap: float
+) -> dict[int, str]:
+    """How each mutant ended: the test that catches it, "survived", or that none comes to it."""
+    plans = {k: ordered(root, mutant, times, cap) for k, mutant in enumerate(mutants)}
+    alone = [[k] for k, m in enumerate(mutants) if m.get("at_import") and plans[k]]
+    together = [k for k, m in enumerate(mutants) if not m.get("at_import") and plans[k]]
+    ends, file = dict.fromkeys(plans, "no test comes to it"), root / "ends"
+    file.write_text("")
+    for ks in [together, *alone]:
+        plan = root / "plan"
+        plan.write_text(json.dumps([(k, plans[k]) for k in ks]))
+        given = {"MUTANT": str(ks[0])} if ks in alone else {}
+        files = sorted({t.split("::")[0] for k in ks for t in plans[k]})
+        if files:
+            pytest(root, *files, MUTANT_PLAN=str(plan), MUTANT_FILE=str(file), MUTANT_CAP=str(cap),
+                   **given)  # fmt: skip
+    for line in file.read_text().splitlines():
+        _, k, how = line.split("\t")
+        ends[int(k)] = how
+    return ends
 
 
 def _stands(root: Path, test: str) -> bool:
@@ -376,7 +373,7 @@ def main() -> None:
     parser.add_argument("--copy", type=Path, default=Path("/tmp/elastocal-mutants"))
     parser.add_argument("--seed", type=int, default=47)
     parser.add_argument("--count", type=int, default=60)
-    parser.add_argument("--cap", type=float, default=60.0, help="seconds for each mutant")
+    parser.add_argument("--cap", type=float, default=20.0, help="processor time for each mutant, s")
     parser.add_argument("--again", type=Path, help="the .json of an earlier run: its set and map")
     parser.add_argument("--fresh", action="store_true", help="with --again: a map of its own")
     parser.add_argument("--tests", nargs="*", default=["tests"])
@@ -391,7 +388,7 @@ def main() -> None:
     start = time.monotonic()
     if not told.again or told.fresh:
         out = [f"--ignore={p}" for p in LEFT_OUT]
-        print(pytest(told.copy, *told.tests, *out, MUTANT_NOTES=str(notes))[-300:], flush=True)
+        print(pytest(told.copy, *told.tests, *out, MUTANT_NOTES="1", MUTANT_FILE=str(notes))[-300:])
         maps, times = recorded(notes)
     else:
         times = earlier["times"]
@@ -401,12 +398,11 @@ def main() -> None:
     print(f"which tests come to which: {time.monotonic() - start:.0f} s", flush=True)
     for k, mutant in enumerate(mutants):
         mutant["tests"] = maps.get(k, {})
-        first = known.get(tuple(mutant["name"]), {}).get("end", "")
-        first = first if "::" in first else ""
-        mutant["end"] = tried(told.copy, k, mutant["tests"], times, first, told.cap)
-        print(k, mutant["name"][:2], mutant["becomes"], mutant["end"], flush=True)
-        done = {"mutants": mutants[: k + 1], "times": times}
-        told.output.with_suffix(".json").write_text(json.dumps(done))
+        mutant["first"] = known.get(tuple(mutant["name"]), {}).get("end", "")
+    for k, end in tried(told.copy, mutants, times, told.cap).items():
+        mutants[k]["end"] = end
+    done = {"mutants": mutants, "times": times}
+    told.output.with_suffix(".json").write_text(json.dumps(done))
     told.output.with_suffix(".md").write_text(table(mutants) + "\n")
     print(table(mutants))
 

@@ -184,14 +184,6 @@ def test_identify_is_that_of_the_command_line(fit):
     assert mine == other
 
 
-def test_residuals_are_those_of_the_command_line(fit):
-    done = command("identify", "cell.toml", "data.csv", "--fix", "joint1.compliance",
-                   "--residuals", "line.csv", "--quiet")  # fmt: skip
-    assert done.exit_code == 0, done.output
-    fit.save("front.csv")
-    assert Path("front.csv").read_text() == Path("line.csv").read_text()
-
-
 def test_a_plan_saves_itself_and_is_simulated_as_its_file_is(plan, model):
     plan.save("plan4.csv")
     written = json.loads(Path("plan4.json").read_text())
@@ -256,14 +248,6 @@ def test_compensate_is_that_of_the_command_line(fit):
     assert len(in_memory) == 3 and in_memory.reached.all()
 
 
-def test_targets_may_be_poses(fit):
-    poses = np.tile(np.eye(4), (2, 1, 1))
-    poses[:, :3, :3] = np.diag([1.0, -1.0, -1.0])
-    poses[:, :3, 3] = [[1.7, 0.0, 1.0], [1.7, 0.1, 1.0]]
-    commands = ec.compensate(fit.arm, poses, load=LOAD)
-    assert commands.reached.all() and (commands.after < 1e-8).all() and (commands.turn < 0.1).all()
-
-
 def test_every_result_reports_plots_and_tabulates_itself(fit, plan):
     commands = ec.compensate(fit.arm, TARGETS, load=LOAD)
     readings = ec.simulate("cell.toml", "plan.csv", load=LOAD)
@@ -287,12 +271,6 @@ def test_whatever_a_verb_returns_is_a_result():
                 for name in ("design", "simulate", "identify", "diagnose", "compensate", "compare",
                              "next_poses")}  # fmt: skip
     assert returned == set(VIEWS) == set(PAGES) == set(WRITERS) - {"CalibratedArm"}
-
-
-def test_a_report_names_the_files_it_came_from(fit):
-    fit.report("report.html")
-    page = Path("report.html").read_text()
-    assert "data.csv" in page and "cell.toml" in page and page.count("SHA-256") == 2
 
 
 def test_reprs_are_one_line(model, fit):

@@ -2,24 +2,16 @@
 
 from __future__ import annotations
 
-import csv
-import io
-
 import numpy as np
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
-from support.cells import DOWN, kr270_cell, kr270_chain
-from support.commands import calibrated
 
-from elastocal.compensation import commands_csv, one_target, read_targets, summary, targets_at
-from elastocal.compensation.compensate import compensate
+from elastocal.compensation import one_target, read_targets
 from elastocal.errors import ElastocalError, InputError
-from elastocal.measurements import read_plan
-from elastocal.model import share_of_levels, tool_point
+from elastocal.model import share_of_levels
 
 KINDS = ("revolute",) * 6
-POSE = np.radians([[10, -80, 90, 30, 50, -20]])
 
 
 @given(
@@ -65,28 +57,3 @@ def test_any_target_text_is_a_target_or_told(text) -> None:
         assert "`target` takes" in str(error)
     else:
         assert np.isfinite(targets.position).all()
-
-
-def test_commands_are_a_plan_and_rows_not_reached_are_empty(tmp_path) -> None:
-    chain = kr270_chain()
-    cell = kr270_cell(("joint_compliance",))
-    arm = calibrated(chain, cell, std=0.01)
-    joints = np.repeat(POSE, 2, axis=0)
-    position = np.array([[1.8, 0.3, 1.5], [9.0, 0.0, 0.0]])
-    found = compensate(
-        arm, targets_at("t", position, None, "base", DOWN, q=joints), tool_point(cell, "M1")
-    )
-    assert found.status == ("reached", "not reached")
-    rows = list(csv.DictReader(io.StringIO(commands_csv(found, chain.kinds))))
-    assert rows[1]["q1_deg"] == "" and rows[1]["correction_q1_deg"] == ""
-    assert rows[1]["status"] == "not reached" and float(rows[1]["error_after_um"]) > 1e6
-    assert float(rows[0]["force_z_N"]) == DOWN[2]
-    told = summary(found, chain.kinds, commands=True)
-    assert told["reached"] == 1 and told["not_reached"][0]["line"] == 2
-    assert "q1_deg" in told["commands"][0] and "q1_deg" not in told["commands"][1]
-    path = tmp_path / "commands.csv"
-    path.write_text("\n".join(commands_csv(found, chain.kinds).splitlines()[:2]) + "\n")
-    plan = read_plan(path, joint_kinds=chain.kinds)
-    assert np.allclose(plan.q, found.q[:1], atol=1e-10)
-    change = [float(rows[0][f"correction_q{k}_deg"]) for k in range(1, 7)]
-    assert np.allclose(found.q[0] - found.nominal[0], np.radians(change))

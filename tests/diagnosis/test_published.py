@@ -8,9 +8,9 @@ from dataclasses import fields, replace
 
 import pytest
 from support.cells import kr270_cell, kr270_chain
-from support.diagnoses import EXPLAINED, MANY_UNKNOWN, VERDICTS
+from support.diagnoses import EXPLAINED, VERDICTS
 
-from elastocal.diagnosis import Diagnosis, Gap, NearRepeats, publish
+from elastocal.diagnosis import Diagnosis, Gap, publish
 from elastocal.identification import BudgetStep
 from elastocal.model import Model
 
@@ -34,37 +34,6 @@ def test_every_part_of_the_result_is_published(model):
     assert names <= set(publish(EXPLAINED, model, "data.csv"))
 
 
-def test_keys_and_units_of_the_design(model):
-    content = publish(EXPLAINED, model, "data.csv")
-    assert content["schema"] == "elastocal/diagnosis/1"
-    assert content["verdict"] == "explained"
-    assert content["gap"] == pytest.approx(
-        {
-            "nominal_um": 3200,
-            "calibrated_um": 84,
-            "explained_um": 21,
-            "noise_floor_um": 19,
-            "unexplained_um": 0,
-        }
-    )
-    last = content["budget"][-2]
-    assert last["step"] == "gear_eccentricity:joint2"
-    assert [last["heldout_rms_um"], *last["ci95"]] == pytest.approx([21, 19, 23])
-    (effect,) = content["effects"]
-    assert (effect["effect"], effect["where"]) == ("gear_eccentricity", "joint2")
-    assert effect["gap_reduction_ci95"] == [0.63, 0.84]
-    first = effect["parameters"][0]
-    low, high = first["ci95"]
-    assert (first["unit"], (low + high) / 2) == ("rad", pytest.approx(1.12e-4))
-    # 97.5 % of a normal distribution lie below 1.96 standard deviations.
-    upper = (high - first["value"]) / first["std"]
-    assert (1 + math.erf(upper / math.sqrt(2))) / 2 == pytest.approx(0.975, abs=1e-6)
-    assert {"effect", "where", "probability", "score"} <= set(content["candidates"][0])
-    assert content["location"]["evidence"]["stages"]["transmission"] == 0.984
-    assert content["noise"]["faulty"][1]["error_um"] == pytest.approx(1300)
-    assert [r["unit"] for r in content["noise"]["repeatability"]] == ["rad"] * 6
-
-
 def test_what_is_not_known_is_null(model):
     unknown = replace(
         EXPLAINED,
@@ -80,43 +49,3 @@ def test_what_is_not_known_is_null(model):
     assert content["noise"]["pure_error_um"] is None
     assert content["noise"]["near_repeat_um"] is None and content["noise"]["near_repeats"] is None
     assert content["extra_plan"] is None
-
-
-def test_near_repeats_and_what_is_unexplained_are_told(model):
-    near = NearRepeats(26e-6, 12, 10, 20e-6)
-    d = replace(
-        EXPLAINED, noise=replace(EXPLAINED.noise, near_repeats=near),
-        gap=replace(EXPLAINED.gap, unexplained=5e-5),
-    )  # fmt: skip
-    content = publish(d, model, "data.csv")
-    assert content["gap"]["unexplained_um"] == pytest.approx(50.0)
-    assert content["noise"]["near_repeat_um"] == pytest.approx(26.0)
-    told = {"pairs": 12, "independent": 10, "soon_um": pytest.approx(20.0), "later_um": None}
-    assert content["noise"]["near_repeats"] == told
-
-
-def test_components_groups_and_fields(model):
-    content = publish(MANY_UNKNOWN, model, "data.csv")
-    first = content["components"][0]
-    assert (first["family"], first["where"], first["effects"]) == (
-        "angle", "joint2", ["joint_curve"],
-    )  # fmt: skip
-    assert first["effect"] == "joint_curve" and first["named"] is True
-    assert first["share"] == 0.55 and first["share_ci90"] == pytest.approx([0.495, 0.605])
-    rms = 426 * math.sqrt(0.55)
-    assert first["rms_um"] == pytest.approx(rms)
-    assert first["rms_ci95_um"] == pytest.approx([0.94 * rms, 1.06 * rms])
-    assert content["components"][-1]["named"] is False
-    gears = content["groups"][0]
-    assert (gears["name"], gears["places"]) == ("gear_errors", ["joint1", "joint2", "joint5"])
-    assert gears["effects"] == ["joint_curve", "gear_eccentricity"]
-    assert (gears["share"], gears["share_ci90"]) == (0.82, [0.79, 0.85])
-    assert (gears["gap_reduction"], gears["gap_reduction_ci90"]) == (0.54, [0.52, 0.56])
-    (field,) = content["fields"]
-    assert (field["effect"], field["where"]) == ("residual_field", "base")
-    assert field["settings"]["field_time_length"] == 5400.0
-    assert content["location"]["evidence"]["shares"] == {"transmission": 0.97, "tracker": 0.05}
-    kinds = [f["kind"] for f in content["findings"]]
-    assert kinds[:4] == [
-        "unknown_effect", "many_causes", "named_beside_unknown", "corrected_without_a_name",
-    ]  # fmt: skip

@@ -5,11 +5,10 @@ from __future__ import annotations
 import json
 from pathlib import Path
 
-import numpy as np
 import pytest
 from hypothesis import given
 from hypothesis import strategies as st
-from support.exports import LOAD, exported, write_result
+from support.exports import exported, write_result
 from support.robots import KR270
 
 from elastocal.export import Conditions, Wish, to_yaml
@@ -38,22 +37,6 @@ def test_a_yaml_reader_finds_what_was_written(data: object) -> None:
     assert yaml.safe_load(to_yaml(data)) == data
 
 
-def test_yaml_and_json_say_the_same(tmp_path: Path) -> None:
-    yaml = pytest.importorskip("yaml")
-    written = write_result(tmp_path, ROBOT)
-    from_yaml = yaml.safe_load(exported(*written, "yaml", LOAD)[1].text)
-    calibrated, done = exported(*written, "json", LOAD)
-    document = json.loads(done.text)
-    assert from_yaml == document
-    assert [p["name"] for p in document["parameters"]] == list(calibrated.model.names)
-    first = document["parameters"][0]
-    assert first["value"] == calibrated.x[0] and first["std"] == 1e-5
-    assert first["ci95"] == [first["value"] - 2e-5, first["value"] + 2e-5]
-    assert first["identifiable"] is True and first["unit"] == "m"
-    total = document["geometry_alone"]["total"]
-    assert total["marker_rms_um"] == done.cost.total.marker_rms * 1e6 > 1.0
-
-
 def test_what_the_data_did_not_determine_is_listed_with_its_value(tmp_path: Path) -> None:
     cell, result = write_result(tmp_path, ROBOT)
     content = json.loads(result.read_text())
@@ -62,27 +45,6 @@ def test_what_the_data_did_not_determine_is_listed_with_its_value(tmp_path: Path
     result.write_text(json.dumps(content))
     _, done = exported(cell, result, "urdf")
     assert done.held == {entry["name"]: entry["held"]}
-
-
-def test_a_gear_error_costs_what_it_moves(tmp_path: Path) -> None:
-    """Joint 1 errs by a sin q₁: a point is off by a |sin q₁| times its distance from axis 1."""
-    written = write_result(
-        tmp_path,
-        ROBOT,
-        ["gear_eccentricity:joint1"],
-        value=lambda p: 1e-3 if p.name == "joint1.eccentricity_sin" else 0.0,
-    )
-    calibrated, done = exported(*written, "urdf", poses=400)
-    (entry,) = done.cost.effects
-    assert entry.effect == "gear_eccentricity" and entry.difference == done.cost.total
-    from elastocal.export import random_table
-    from elastocal.model import nominal_flanges
-
-    q = random_table(calibrated.model, Conditions(), 400, 0).q
-    place = nominal_flanges(calibrated.model.chain, q)[:, :2, 3]
-    off = 1e-3 * np.abs(np.sin(q[:, 0])) * np.linalg.norm(place, axis=1)
-    assert done.cost.total.flange_max == pytest.approx(off.max(), rel=2e-3)
-    assert done.cost.total.flange_rms == pytest.approx(np.sqrt(np.mean(off**2)), rel=2e-3)
 
 
 def test_temperature_is_frozen_into_the_lengths_where_it_is_stated(tmp_path: Path) -> None:

@@ -51,15 +51,6 @@ def test_an_origin_is_changed_where_it_stands(tmp_path: Path) -> None:
     assert text.result() == expected
 
 
-def test_missing_attributes_are_added(tmp_path: Path) -> None:
-    robot = (
-        '<robot name="r"><link name="a"/><joint name="j"><origin/><child link="a"/></joint></robot>'
-    )
-    text = text_of(tmp_path, robot)
-    text.set_origin("j", {"xyz": "1 2 3", "rpy": "0 0 1"})
-    assert '<origin xyz="1 2 3" rpy="0 0 1"/>' in text.result()
-
-
 def changed_lines(old: str, new: str) -> list[str]:
     lines = difflib.ndiff(old.splitlines(), new.splitlines())
     return [line for line in lines if line[:1] in "+-"]

@@ -4,7 +4,6 @@ from itertools import combinations
 
 import numpy as np
 import pytest
-from support.design_commands import DEFLECTION, planned, write_cell
 
 from elastocal.planning import DesignProblem, make_criterion
 from elastocal.planning.exact_plan import random_information
@@ -46,12 +45,3 @@ def test_each_is_a_plan_of_these_shares_drawn_without_preference(name: str) -> N
     # The share of draws below the true median is binomial: 400 draws, 5 standard deviations.
     below = int((found <= np.median(every)).sum())
     assert abs(below - 200) < 50
-
-
-def test_a_plan_says_what_chance_gives_and_beats_it(tmp_path) -> None:
-    plan = planned(write_cell(tmp_path, DEFLECTION))
-    chance = plan["random_plans"]
-    assert chance["n"] == chance["determined"] == 20
-    assert plan["value"] < chance["best"] <= chance["median"] <= chance["worst"]
-    # ρ₀ is the root of Φ.
-    assert chance["efficiency"] == pytest.approx((plan["value"] / chance["median"]) ** 2)

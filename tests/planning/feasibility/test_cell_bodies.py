@@ -4,36 +4,19 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-from planning.feasibility.small_cells import KR270_CHAIN, at, cell, sphere
+from planning.feasibility.small_cells import KR270_CHAIN, cell, sphere
 
 from elastocal.cell.arm_description import Robot
-from elastocal.cell.workspace_rules import CarriedBody, HangingLoad, Solid, Workspace
+from elastocal.cell.workspace_rules import CarriedBody, Workspace
 from elastocal.errors import InputError
 from elastocal.model import read_urdf
-from elastocal.planning import cell_bodies, hull, support
-from elastocal.planning.bodies import HANGING, WORLD
-
-DOWN = np.array([0.0, 0.0, -1.0])
+from elastocal.planning import cell_bodies, hull
+from elastocal.planning.bodies import WORLD
 
 
 def named(workspace, chain=KR270_CHAIN, **changes):
     given = replace(cell(workspace), **changes)
     return {body.name: body for body in cell_bodies(given, chain)}
-
-
-@pytest.mark.parametrize("shape", ["box", "sphere", "cylinder", "capsule"])
-def test_the_load_hangs_by_its_top_at_the_end_of_the_rope(shape):
-    size = {"box": [0.3, 0.2, 0.5], "sphere": [0.2], "cylinder": [0.2, 0.6], "capsule": [0.1, 0.4]}
-    tilted = at(0, 0, 7.0)
-    tilted[:3, :3] = [[1, 0, 0], [0, 0.8, -0.6], [0, 0.6, 0.8]]
-    solid = Solid("load", shape, np.array(size[shape]), tilted)
-    found = named(Workspace(load=HangingLoad(solid, rope=0.7, rope_radius=0.02)))
-    assert support(found["load"].solid, -DOWN) == pytest.approx(-0.7)
-    points, radius = hull(found["rope"].solid)
-    assert radius == 0.02
-    assert np.allclose(sorted(points.tolist()), [[0, 0, -0.7], [0, 0, 0]])
-    assert found["load"].carrier == found["rope"].carrier == HANGING
-    assert "rope" not in named(Workspace(load=HangingLoad(solid)))
 
 
 @pytest.mark.parametrize(
