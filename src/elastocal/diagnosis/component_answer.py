@@ -36,7 +36,7 @@ from elastocal.diagnosis.diagnosis import (
     Verdict,
 )
 from elastocal.diagnosis.diagnosis_data import DiagnosisData
-from elastocal.diagnosis.left_out import left_out_residual, left_out_square
+from elastocal.diagnosis.left_out import left_out_residual, left_out_square, squared_lengths
 from elastocal.diagnosis.line_orders import families_of, ripples
 from elastocal.diagnosis.model_set import spans_of
 from elastocal.diagnosis.noise_floor import NoisyData, Projection, Weighted, covariance, project
@@ -56,6 +56,7 @@ PROBABLE = 0.5
 NAMED = 0.9  # probability from which a named effect needs no rivals beside it
 CHANCE = 0.05  # probability from which a rival is told
 PAYS = 0.01  # of the error of left-out configurations, by which a name has to lower it
+HARM = 2.0  # standard errors by which they are predicted worse with what is taken out of the sum
 MOST_LEFT_OUT = 1000  # configurations that show whether it does
 TOLD = 0.02  # share of the gap from which it matters which of several effects it is
 SLIGHT = 0.01  # of the gap's rms: what moves the markers by less is next to nothing
@@ -260,7 +261,7 @@ class SumAnswer:
     @cached_property
     def supported(self) -> SupportedFloor:
         """What of the noise beside the sum is noise, and what is unexplained."""
-        best = self._left_out_without([])
+        best = math.sqrt(left_out_square(_thinned(self.found.data), self.found.noise))
         return supported_floor(self.dataset, self.found.data, self.found.noise, best)
 
     @cached_property
@@ -292,7 +293,7 @@ class SumAnswer:
         ]  # fmt: skip
         answer = self._without(gone) if gone else self
         harmful = [
-            k for key, ratio in answer._not_paying.items() if ratio < 1
+            k for key, gain in answer._not_paying.items() if gain < -HARM
             for k in answer._at_place[key]
         ]  # fmt: skip
         return answer._without(harmful) if harmful else answer
@@ -304,7 +305,7 @@ class SumAnswer:
     @cached_property
     def _not_paying(self) -> dict[tuple[str, str], float]:
         """Named effects at their places without which configurations that are left out of the fit
-        are predicted better, or worse by less than PAYS: the error without over that with them.
+        are predicted better, or worse by less than PAYS: by how many standard errors worse.
 
         The one that matters least is judged first, and stays out then: of two that say the same,
         one remains.
@@ -319,22 +320,29 @@ class SumAnswer:
         now = self._left_out_without(gone)
         while named:
             without = {key: self._left_out_without([*gone, *own]) for key, own in named.items()}
-            key = min(without, key=lambda key: without[key])
-            if without[key] > (1 + PAYS) * now:
+            key = min(without, key=lambda key: without[key].sum())
+            if without[key].sum() > (1 + PAYS) ** 2 * now.sum():
                 break
-            out[key], now = without[key] / now, without[key]
+            change = without[key] - now
+            out[key] = float(change.sum() / max(change.std() * math.sqrt(len(change)), 1e-300))
+            now = without[key]
             gone += named.pop(key)
         return out
 
-    def _left_out_without(self, gone: Sequence[int]) -> float:
-        """Rms error in m of left-out configurations, these components not in the fit."""
-        keep = np.ones(self.found.data.X.shape[2], dtype=bool)
-        for k in gone:
-            keep[self.found.spans[k]] = False
+    def _left_out_without(self, gone: Sequence[int]) -> Array:
+        """Σ of squared errors (C,) in m² of left-out configurations, these components not in the
+        fit."""
+        kept = [k for k in range(len(self.found.components)) if k not in gone]
+        data = _thinned(self._of_components(kept))
+        return squared_lengths(data, left_out_residual(project(data, self.found.noise)))[0]
+
+    def _of_components(self, kept: Sequence[int]) -> NoisyData:
+        """The data with the columns of the arm's own parameters and of these components."""
         data = self.found.data
-        data = replace(data, X=data.X[:, :, keep], precision=data.precision[keep])
-        some = data.every(-(-len(data.r) // MOST_LEFT_OUT))
-        return math.sqrt(left_out_square(some, self.found.noise))
+        keep = np.arange(data.X.shape[2]) < self._own
+        for k in kept:
+            keep[self.found.spans[k]] = True
+        return replace(data, X=data.X[:, :, keep], precision=data.precision[keep])
 
     # Shares.
 
@@ -517,9 +525,8 @@ class SumAnswer:
 
     @property
     def verdict(self) -> Verdict:
-        if self._unnamed and float(np.median(self.shares(self._unnamed))) > LARGE:
-            return "unknown_effect"
-        if not self.groups:  # something is there, and no name pays
+        nameless = bool(self._unnamed) and float(np.median(self.shares(self._unnamed))) > LARGE
+        if nameless or not self.groups:  # something is there, and no name pays
             return "unknown_effect"
         return "ambiguous" if self.indistinguishable else "explained"
 
@@ -673,12 +680,7 @@ class SumAnswer:
         return tuple(steps)
 
     def _step(self, name: str, members: list[int]) -> BudgetStep:
-        keep = np.zeros(self.found.data.X.shape[2], dtype=bool)
-        keep[: self._own] = True
-        for k in members:
-            keep[self.found.spans[k]] = True
-        data = self.found.data
-        part = replace(data, X=data.X[:, :, keep], precision=data.precision[keep])
+        part = self._of_components(members)
         left = left_out_residual(project(part, self.found.noise))
         return BudgetStep(name, *rms_with_interval(part, left, self.rng))
 
@@ -722,3 +724,8 @@ def _kind(c: Component) -> str:
 
 def _of_gear(c: Component) -> bool:
     return c.family == "angle" and c.where.startswith("joint")
+
+
+def _thinned(data: NoisyData) -> NoisyData:
+    """Of many configurations only so many as show whether a name pays."""
+    return data.every(-(-len(data.r) // MOST_LEFT_OUT))

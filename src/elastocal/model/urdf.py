@@ -1,4 +1,4 @@
-"""URDF → nominal chain; what is wrong with the file is said by name.
+"""URDF → nominal chain: what is wrong with the file is said by name; Pinocchio reads the rest.
 
 Only what kinematics and weights need is read: links with mass and centre of mass, joints with
 parent, child, origin, axis and limits.  Meshes, materials, plugins and transmissions are ignored.
@@ -10,7 +10,7 @@ import codecs
 import math
 import re
 import xml.etree.ElementTree as ET
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Collection, Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from functools import cached_property
 from pathlib import Path
@@ -23,7 +23,7 @@ from elastocal.files import DEEPEST, read_bytes
 from elastocal.model.chain import MAX_JOINTS, MIN_JOINTS, Chain, Joint, JointKind, LinkMass
 from elastocal.model.plausible import FINGERS, check_angles
 from elastocal.text import SHOWN, did_you_mean, listed, printable
-from elastocal.units import Array, rotation_from_rpy
+from elastocal.units import Array
 
 Vector = tuple[float, float, float]
 ZERO: Vector = (0.0, 0.0, 0.0)
@@ -34,6 +34,7 @@ FLANGES = ("tool0", "flange", "ee_link", "tcp")
 MOST_IN_A_FINGER = 5  # joints
 # Links that `elastocal export` hangs on a flange; none of them is a flange itself.
 TOOL_FRAMES = ("elastocal_marker_", "elastocal_load_point")
+ENDLESS = 1e9  # rad or m, in what pinocchio reads
 MAX_BYTES = 10_000_000
 MOST_LINKS = 2000
 ENDLESS_TEXT = re.compile(r"([+-]?)\.?inf(?:inity)?", re.IGNORECASE)
@@ -51,11 +52,13 @@ def read_urdf(path: str | Path, base: str | None = None, flange: str | None = No
     per joint in kg with its centre of mass in m in the joint's frame (none if all are zero).
     Bodies beyond the flange and on side branches count, those carried by the base do not.
 
-    Everything off the path from base to flange is held still: those joints stay at zero, and the
-    joint on the path that carries them carries their bodies.  With X_i the placement of joint i in
-    the frame of the joint before (of the base, where it is the first), the chain is
+    Everything off the path from base to flange is held still: those joints become fixed at their
+    neutral position, so that pinocchio merges their bodies into the joint on the path that carries
+    them.  With X_i pinocchio's placement of joint i in its parent joint, the chain is
 
-        T_base_flange(q) = X_1 J_1(q_1) X_2 J_2(q_2) … X_n J_n(q_n) T_n_flange
+        T_base_flange(q) = (T_p0_base)⁻¹ X_1 J_1(q_1) X_2 J_2(q_2) … X_n J_n(q_n) T_n_flange
+
+    where p0 is the (immobile) joint frame that carries the base link.
 
     Raises InputError, naming file, element and remedy, for anything `check_urdf` or `Tree` refuses.
     """
@@ -63,47 +66,87 @@ def read_urdf(path: str | Path, base: str | None = None, flange: str | None = No
     base = tree.root if base is None else tree.find_link("base", base)
     flange = tree.only_flange(base) if flange is None else tree.find_link("flange", flange)
     moving = tree.serial_chain(base, flange)
-    placements, carried = _carried(tree, base, [joint.name for joint in moving])
+    read = _read_by_pinocchio(tree, [joint.name for joint in moving], base, flange)
     joints = []
-    for source, placement in zip(moving, placements, strict=True):
+    for source, placement, (along, about) in zip(
+        moving, read["placements"], read["subspaces"], strict=True
+    ):
         limits = source.limit or (-np.inf, np.inf)
-        kind: JointKind = "prismatic" if source.kind == "prismatic" else "revolute"
-        joints.append(Joint(source.name, kind, placement, np.array(source.axis), *limits))
-    masses = tuple(_together(tree, carried, k + 1) for k in range(len(joints)))
+        slides = source.kind == "prismatic"
+        kind: JointKind = "prismatic" if slides else "revolute"
+        joints.append(Joint(source.name, kind, placement, along if slides else about, *limits))
+    masses = tuple(map(LinkMass, read["masses"].tolist(), read["levers"]))
     return Chain(
-        tree.name, tuple(joints), carried[flange][1],
+        tree.name, tuple(joints), read["flange"],
         masses if any(body.mass > 0 for body in masses) else (),
     )  # fmt: skip
 
 
-Carried = dict[str, tuple[int, Array]]
+def _read_by_pinocchio(tree: Tree, moving: list[str], base: str, flange: str) -> dict[str, Array]:
+    """`placements` (n, 4, 4) and `subspaces` (n, 2, 3), linear and angular, of the `moving` joints,
+    `masses` (n,) and `levers` (n, 3) of what each carries, and `flange` (4, 4)."""
+    model = _pinocchio_model(tree, moving)
+    placements = [placement.homogeneous for placement in model.jointPlacements[1:]]
+    placements[0] = _link_placement(model, base).inverse().homogeneous @ placements[0]
+    # The motion subspace is (linear, angular) for every pinocchio joint, aligned or not, also
+    # for unbounded ones that store (cos q, sin q).
+    motions = list(model.createData().joints)[1:]
+    bodies = list(model.inertias)[1:]
+    return {
+        "placements": np.array(placements),
+        "subspaces": np.array([np.asarray(joint.S).reshape(2, 3) for joint in motions]),
+        "masses": np.array([body.mass for body in bodies]),
+        "levers": np.array([body.lever for body in bodies]),
+        "flange": _link_placement(model, flange).homogeneous,
+    }
 
 
-def _carried(tree: Tree, base: str, moving: Sequence[str]) -> tuple[list[Array], Carried]:
-    """Placements (4, 4) of the `moving` joints, each in the frame of the one before, the first in
-    that of the base; and of every link which of them carries it, from 1 on (0: the base), and its
-    T (4, 4) in that joint's frame (0: the root's)."""
-    placements: list[Array] = []
-    carried: Carried = {tree.root: (0, np.eye(4))}
-    for link in tree.below(tree.root):
-        if link == tree.root:
-            continue
-        joint = tree.parent_joint[link]
-        k, T = carried[joint.parent]
-        carried[link] = (k, T @ joint.origin)
-        if joint.name in moving:
-            placements.append(carried[link][1])
-            carried[link] = (k + 1, np.eye(4))
-    placements[0] = np.linalg.inv(carried[base][1]) @ placements[0]
-    return placements, carried
+def _link_placement(model: Any, link: str) -> Any:
+    import pinocchio as pin
+
+    return model.frames[model.getFrameId(link, pin.FrameType.BODY)].placement
 
 
-def _together(tree: Tree, carried: Carried, number: int) -> LinkMass:
-    """The mass of all that a joint carries, and its centre in the joint's frame."""
-    bodies = [(tree.links[link], T) for link, (k, T) in carried.items() if k == number]
-    mass = sum(body.mass for body, _ in bodies)
-    moment = sum((body.mass * (T[:3, :3] @ body.com + T[:3, 3]) for body, T in bodies), np.zeros(3))
-    return LinkMass(mass, moment / mass if mass else np.zeros(3))
+def _pinocchio_model(tree: Tree, expected: list[str]) -> Any:
+    import pinocchio as pin
+
+    try:
+        model = pin.buildModelFromXML(_skeleton(tree, expected))
+    except Exception as error:  # pinocchio raises ValueError, RuntimeError and its own
+        raise InputError(f"{tree.path}: pinocchio cannot read it: {error}") from error
+    found = list(model.names)[1:]
+    require(
+        found == expected and list(model.parents)[1:] == list(range(len(found))),
+        f"{tree.path}: pinocchio reads the joints {found} as something else than the serial "
+        f"chain {expected}; simplify the URDF",
+    )
+    return model
+
+
+def _skeleton(tree: Tree, moving: Collection[str]) -> str:
+    """URDF text with links, masses and joints only; joints not in `moving` are fixed."""
+    robot = ET.Element("robot", name=tree.name)
+
+    def text(vector: Sequence[float] | Array) -> str:
+        return " ".join(repr(float(value)) for value in vector)
+
+    for name, body in tree.links.items():
+        inertial = ET.SubElement(ET.SubElement(robot, "link", name=name), "inertial")
+        ET.SubElement(inertial, "mass", value=repr(body.mass))
+        ET.SubElement(inertial, "origin", xyz=text(body.com))
+        zero = dict.fromkeys(("ixx", "ixy", "ixz", "iyy", "iyz", "izz"), "0")
+        ET.SubElement(inertial, "inertia", zero)
+    for joint in tree.joints.values():
+        kind = joint.kind if joint.name in moving else "fixed"
+        element = ET.SubElement(robot, "joint", name=joint.name, type=kind)
+        ET.SubElement(element, "parent", link=joint.parent)
+        ET.SubElement(element, "child", link=joint.child)
+        ET.SubElement(element, "origin", xyz=text(joint.xyz), rpy=text(joint.rpy))
+        ET.SubElement(element, "axis", xyz=text(joint.axis))
+        if kind != "fixed" and joint.limit is not None:
+            lower, upper = (repr(min(max(end, -ENDLESS), ENDLESS)) for end in joint.limit)
+            ET.SubElement(element, "limit", lower=lower, upper=upper, effort="0", velocity="0")
+    return ET.tostring(robot, encoding="unicode")
 
 
 # The tree of links and joints in a URDF, and the one path through it from base to flange.
@@ -126,8 +169,10 @@ class UrdfJoint:
     @property
     def origin(self) -> Array:
         """T (4, 4) from the joint's frame at zero to its parent link's."""
+        from scipy.spatial.transform import Rotation
+
         T = np.eye(4)
-        T[:3, :3], T[:3, 3] = rotation_from_rpy(self.rpy), self.xyz
+        T[:3, :3], T[:3, 3] = Rotation.from_euler("xyz", self.rpy).as_matrix(), self.xyz
         return T
 
 
@@ -154,7 +199,7 @@ class Tree:
                 f"'{joint.name}'; kinematic loops are not supported, remove one of them",
             )
         roots = [name for name in self.links if name not in parents]
-        reached = {link for root in roots for link in self.below(root)}
+        reached = {link for root in roots for link in self._below(root)}
         if lost := [name for name in self.links if name not in reached]:
             way = [lost[0]]
             while way.count(way[-1]) < 2:
@@ -185,8 +230,7 @@ class Tree:
     def root(self) -> str:
         return next(name for name in self.links if name not in self.parent_joint)
 
-    def below(self, link: str) -> Iterator[str]:
-        """A link and all that hang on it, each after what it hangs on."""
+    def _below(self, link: str) -> Iterator[str]:
         waiting = [link]
         while waiting:
             link = waiting.pop()
@@ -249,7 +293,7 @@ class Tree:
     def _leaves(self, base: str) -> list[str]:
         """Links on which nothing hangs but tool frames that `export` has added."""
         return [
-            link for link in self.below(base)
+            link for link in self._below(base)
             if not link.startswith(TOOL_FRAMES)
             and all(child.startswith(TOOL_FRAMES) for child in self._children[link])
         ]  # fmt: skip
@@ -279,10 +323,10 @@ class Tree:
 
     def _moves(self, link: str) -> bool:
         """Whether the joint before a link, or one below it, moves."""
-        return any(self.parent_joint[below].kind in MOVING for below in self.below(link))
+        return any(self.parent_joint[below].kind in MOVING for below in self._below(link))
 
     def _is_finger(self, link: str) -> bool:
-        joints = [self.parent_joint[below] for below in self.below(link)]
+        joints = [self.parent_joint[below] for below in self._below(link)]
         return any(j.mimic is not None or FINGERS.search(j.name + j.child) for j in joints)
 
     def placed(self, root: str, link: str) -> Array:
@@ -305,7 +349,7 @@ class Tree:
         if joints is None:
             raise InputError(
                 f"{self.path}: flange '{flange}' is not below base '{base}'; links below "
-                f"'{base}': {listed(link for link in self.below(base) if link != base)}"
+                f"'{base}': {listed(link for link in self._below(base) if link != base)}"
             )
         for joint in joints:
             _check_on_path(joint, f"{self.path}: joint '{joint.name}'")
