@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import causes
 import certificate
 import chain
 import coverage
@@ -11,5 +12,5 @@ import tutorial_valley
 from style import draw
 
 if __name__ == "__main__":
-    for module in (chain, house, tutorial_valley, coverage, certificate, diagnosis_distance):
+    for module in (chain, house, tutorial_valley, coverage, certificate, diagnosis_distance, causes):
         draw(module.__name__, module.figure)

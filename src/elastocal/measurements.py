@@ -238,6 +238,12 @@ def visits(table: Measurements) -> IntArray:
     return numbered(table.configuration, table.repeat, load_states(table.force))
 
 
+def first_of_visit(table: Measurements) -> IntArray:
+    """Where in the table (n,) each row's visit begins."""
+    visit = visits(table)
+    return firsts(visit, int(visit.max(initial=-1)) + 1)[visit]
+
+
 def with_moves(table: Measurements) -> Measurements:
     """The table with the way the arm came to each visit, by the order of its visits.
 
@@ -280,10 +286,7 @@ def by_rows(table: Measurements) -> Array:
     campaign where the table has no readings, as poses have that the arm is still to visit."""
     if table.position is None and table.distance is None:
         return np.full(len(table), NEVER_YET)
-    visit = visits(table)
-    first = np.full(int(visit.max(initial=-1)) + 1, np.inf)
-    np.minimum.at(first, visit, table.row.astype(np.float64))
-    return first[visit]
+    return table.row[first_of_visit(table)].astype(np.float64)
 
 
 FOLLOWING = 3.3  # standard deviations of chance: one joint in a thousand
@@ -295,7 +298,7 @@ def in_any_order(table: Measurements) -> bool:
 
     The correlation of successive visits' values; √n ρ is N(0, 1) in random order.
     """
-    q = table.q[np.unique(by_rows(table), return_index=True)[1]]  # in their order
+    q = table.q[np.unique(first_of_visit(table))]
     q = q - q.mean(axis=0)
     square = (q**2).sum(axis=0)
     moved = square > 0
@@ -316,7 +319,7 @@ def order_contradicted(table: Measurements) -> str | None:
     found = with_moves(table).direction if table.direction is None else table.direction
     if found is None:
         return None
-    first = np.unique(visits(table), return_index=True)[1]
+    first = np.unique(first_of_visit(table))
     recorded, ordered = np.sign(table.approach[first]), np.sign(found[first])
     told = (recorded != 0) & (ordered != 0)
     if not told.any():

@@ -243,10 +243,10 @@ def _if_upright(lies: Fallen, found: Diagnosis, upright: Diagnosis) -> str:
     before, after = (1e6 * d.budget[-2].heldout_rms for d in (found, upright))
     if after > (1 - PAYS) * before:
         return f"{lies}. Here it makes no difference"
-    names = listed(f"{f.effect}:{f.where}" for f in upright.effects) or "no name"
+    names = listed(f"{f.effect}:{f.where}" for f in upright.effects) or "none"
     return (
-        f"{lies}. With {lies.axis} up {names} explains the gap, and the held-out error falls to "
-        f"{after:.3g} µm instead of {before:.3g} µm"
+        f"{lies}. With {lies.axis} up the verdict is {upright.verdict} (effects: {names}), and the "
+        f"held-out error falls to {after:.3g} µm instead of {before:.3g} µm"
     )
 
 
@@ -256,7 +256,7 @@ def _diagnosed(
     given, source = model, table.source
     check_table(model, table)
     _check_enough(table)
-    table, copies = without_copies(table)
+    table, told = without_copies(table)
     table, left_out = thinned(table)
     model = with_recorded_drivers(model, table)
     progress("fitting the model as it is")
@@ -264,7 +264,7 @@ def _diagnosed(
     refuse_nonsense(model, base.observed, base.x, base.residual, table)
     disordered = order_contradicted(table)
     if disordered:
-        copies = (*copies, disordered + OUT_OF_ORDER)
+        told = (*told, disordered + OUT_OF_ORDER)
         options = replace(options, without=(*options.without, *BY_LAST_MOVE))
     hypotheses, untested = possible(model, table, options.without)
     progress("columns of what could be missing")
@@ -300,7 +300,7 @@ def _diagnosed(
         p_value=p,
         untested=(*untested, *small),
         warnings=(
-            *copies,
+            *told,
             *filter(None, [left_out, solved_body(table, float(base.residual.std()))]),
             *warnings(dataset, found, screened, beside.noise),
         ),
