@@ -207,3 +207,14 @@ def published(folder: Path) -> dict[str, Any]:
                "weights": fit.weights, "residual": fit.residual}
         for name, fit in fits.items()
     } | {"weights": paper.eq14_weights(sigma)}  # fmt: skip
+
+
+def told(folder: Path) -> dict[str, Any]:
+    """What every kind of verdict prints."""
+    from support.diagnoses import VERDICTS
+
+    return {f"text {name}": _printed(found) for name, found in VERDICTS.items()}
+
+
+def _printed(result: Any) -> list[str]:
+    return [line for line in str(result).splitlines() if line.strip()]

@@ -191,7 +191,8 @@ GOLDENS: dict[str, Golden] = {
         "compensate", "export", "compare", "study", "demo"
     )))),
     # The front door
-    "door": Golden(CAMPAIGN, (door.names, door.published)),
+    "door": Golden((), (door.names, door.published)),
+    "told": Golden((), (door.told,)),
     "door_model": Golden(CAMPAIGN, (door.model, door.compensated)),
     "door_fit": Golden(CAMPAIGN, (
         door.identified, door.built_in_python, door.compared, door.planned, door.diagnosed,

@@ -151,7 +151,7 @@ def kept(value: Any, key: str = "", some: int = SOME) -> Any:
         return {"keys": len(entries), "some": {k: entries[k] for k in _some(sorted(entries), some)}}
     if isinstance(value, float):
         return float(f"{value:.8g}") if math.isfinite(value) else str(value)
-    if not isinstance(value, list):
+    if not isinstance(value, list) or key.startswith("text "):
         return value
     most = math.inf if key in WHOLE else MOST_ENTRIES if some > 1 else 1
     if len(value) <= most and not (_nested(value) and len(value) > some):

@@ -38,19 +38,6 @@ from elastocal.report.effect_names import name_of, places, settings_text
 from elastocal.report.figures import share_bars
 
 
-def test_the_headline_names_findings_with_their_shares():
-    gears = "Gear errors at joints 1, 2 and 5 (82 % of the gap)"
-    sag = "gravity sag at joints 2 and 3 (12 %)"
-    assert diagnosis_headline(MANY) == f"{gears} and {sag} explain the gap."
-    assert diagnosis_headline(MANY_AMBIGUOUS) == (
-        f"{gears} and {sag} make the gap; of one effect in it these data leave the name open."
-    )
-    assert diagnosis_headline(MANY_UNKNOWN) == (
-        f"{gears} and {sag} make part of the gap; beside them, something not in the catalogue acts "
-        "at base."
-    )
-
-
 def test_small_causes_are_counted_and_not_named():
     small = replace(MANY.groups[1], name="base_drift", places=("base",), share=0.004)
     text = diagnosis_headline(replace(MANY, groups=(*MANY.groups, small, small)))
@@ -81,16 +68,6 @@ def test_a_finding_has_its_places_below_it_and_every_part_once():
     assert len(place_rows(both).rows) == len(kept)
 
 
-def test_what_has_no_name_is_told_last_and_takes_nothing_away():
-    *_, last = cause_rows(MANY_UNKNOWN).rows
-    assert last == ("without a name, with time at base", "11 %", "10 to 12 %", "–", "–")
-
-
-def test_a_single_cause_has_no_table_of_causes():
-    for d in (EXPLAINED, UNKNOWN):
-        assert not cause_rows(d).rows and not place_rows(d).rows and not field_rows(d).rows
-
-
 def test_a_share_that_cancels_others_is_negative_and_drawn():
     parts = (*MANY.components, replace(part("load", "base", ("base_drift",), 0.03), share=-0.03,
                                        share_ci90=(-0.05, -0.01)))  # fmt: skip
@@ -110,13 +87,6 @@ def test_sentences_do_not_repeat_the_tables():
     assert alike(MANY_AMBIGUOUS) == [
         "gear eccentricity at joint 5 (probability 0.58) and gear second harmonic at joint 5"
     ]
-
-
-def test_what_corrections_without_a_name_take_away_is_told_apart():
-    error = dict(diagnosis_lines(MANY_UNKNOWN))["Error"]
-    assert "from 426 µm to 137 µm rms (noise alone: 61.0 µm)" in error
-    assert error.endswith("Smooth corrections without a name take it to 90.0 µm.")
-    assert "without a name" not in dict(diagnosis_lines(MANY))["Error"]
 
 
 def test_every_family_is_a_phrase():

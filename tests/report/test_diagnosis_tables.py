@@ -40,22 +40,6 @@ def test_every_step_and_the_best_candidates_are_listed():
     assert "no further effect" in text and "an effect outside the catalogue" in text
 
 
-def test_of_many_causes_the_findings_come_first_and_their_places_below():
-    text = printed("many ambiguous", 140)
-    heads = ["What the gap is made of", "Place by place", "Gap budget", "Candidates one at a time"]
-    assert sorted(heads, key=text.index) == heads
-    lines = [
-        line.split() for line in text[text.index(heads[0]) : text.index(heads[1])].splitlines()
-    ]
-    (gears,) = [line for line in lines if line[:2] == ["gear", "errors"]]
-    assert " ".join(gears).endswith("joints 1, 2 and 5 82 % 79 to 85 % 54 % 52 to 56 %")
-    below = text[text.index(heads[1]) : text.index(heads[2])]
-    for told in ("against its own angle", "by gravity", "316 µm (297 to 335 µm)", "> 0.99"):
-        assert told in below
-    # Each thing once: what a joint's curve is made of is no sentence of its own.
-    assert "Besides" not in text and text.count("gear errors at joints 1, 2 and 5") == 2
-
-
 def test_searched_constants_stand_where_there_is_room():
     assert "ripple order 100.7" in printed("explained", 140)
     assert "ripple order 100.7" not in printed("explained", 80)
