@@ -35,10 +35,11 @@ RULES = [
                 r"correlations?|\w*ratio\w*|\w*reduction\w*|covariance|mixing|low|high|observed|"
                 r"expected|prior_share)$"), 0.002, 0.01),
     (re.compile(r"^(counts|beyond)$"), 2, 0),  # readings at the edge of a bin
+    (re.compile(r"^multiplier$"), 1e-6, 0.01),  # of a constraint that costs nothing: zero
     (re.compile(r"^read_back$"), 0.01, 0),  # µm that rounding leaves in a file that is exact
 ]  # fmt: skip
-# What says how the machine did it, not what came out.
-MASKED = {"backend", "seconds", "version", "iterations", "elapsed_s"}
+# What says how the machine did it, or which of several alike rounding picked, not what came out.
+MASKED = {"redundant", "backend", "seconds", "version", "iterations", "elapsed_s"}
 
 NAMED_BY = ("name", "effect", "driver", "set", "step", "kind", "where")
 
