@@ -76,7 +76,7 @@ def test_a_page_that_no_study_wrote(folder: Path, tmp_path: Path) -> None:
     assert own.read_text() == MINE
 
 
-@pytest.mark.parametrize("name", ["part-1.parquet", "_failures.log", "_study.json", "table.csv"])
+@pytest.mark.parametrize("name", ["results.jsonl", "_failures.log", "_study.json", "table.csv"])
 @pytest.mark.parametrize("more", [(), ("--restart",)])
 def test_a_folder_that_no_study_made(folder: Path, name: str, more: tuple[str, ...]) -> None:
     own = mine(folder / "results" / name)
@@ -85,7 +85,7 @@ def test_a_folder_that_no_study_made(folder: Path, name: str, more: tuple[str, .
     assert own.read_text() == MINE
 
 
-@pytest.mark.parametrize("name", ["part-mine.parquet", "part-000009.parquet"])
+@pytest.mark.parametrize("name", ["mine.jsonl", "part-000009.parquet"])
 def test_restart_removes_what_the_study_wrote_alone(folder: Path, name: str) -> None:
     assert elastocal("study", folder, "--jobs", 1).exit_code == 0
     lock = mine(folder / "results" / ".lock")

@@ -1,6 +1,6 @@
-"""The results on disk: one writer, whole parts, nothing twice, readable by others."""
+"""The results on disk: one writer, whole lines, nothing twice, readable by others."""
 
-import shutil
+import json
 
 import pandas as pd
 import pytest
@@ -24,14 +24,16 @@ def results(folder):
 
 
 def test_a_result_that_is_there_twice_is_refused_on_reading(results):
-    shutil.copy(results / "part-000001.parquet", results / "part-000002.parquet")
+    lines = (results / "results.jsonl").read_text("utf-8")
+    (results / "results.jsonl").write_text(lines + lines.partition("\n")[0] + "\n", "utf-8")
     with pytest.raises(InputError, match="task 0 has more than one result"):
         read_results(results)
 
 
-def test_a_damaged_part_is_named(results):
-    (results / "part-000001.parquet").write_bytes(b"PAR1 cut")
-    with pytest.raises(InputError, match=r"part-000001.parquet: damaged"):
+def test_a_damaged_line_is_named(results):
+    first, rest = (results / "results.jsonl").read_text("utf-8").split("\n", 1)
+    (results / "results.jsonl").write_text(f"{first}\n{{cut\n{rest}", "utf-8")
+    with pytest.raises(InputError, match=r"results.jsonl, line 2: is damaged"):
         read_results(results)
 
 
@@ -49,11 +51,26 @@ def test_a_folder_with_other_things_is_refused(tmp_path):
         pass
 
 
-def test_what_a_killed_run_left_half_written_is_removed(folder, results):
-    left = results / ".part-000002.parquet.0123abcd.tmp"
-    left.write_bytes(b"PAR1")
-    assert run_study(folder, results).complete
-    assert not left.exists()
+def test_what_a_killed_run_left_half_written_is_computed_again(folder, results):
+    before, path = numbers(results), results / "results.jsonl"
+    path.write_bytes(path.read_bytes()[:-40])
+    ending = run_study(folder, results)
+    assert (ending.before, ending.done) == (11, 12)
+    pd.testing.assert_frame_equal(numbers(results), before)
+
+
+def test_each_line_is_strict_json_whatever_a_task_returns(tmp_path):
+    script = SCRIPT[: SCRIPT.index('    return [{"mean"')]
+    script += "    return [{'mean': float(v)} for v in ('nan', '-inf', 2)]\n"
+    folder = write_study(tmp_path / "study", script)
+    run_study(folder, tmp_path / "r", only=1)
+
+    def refuse(name):
+        raise AssertionError(name)
+
+    json.loads((tmp_path / "r" / "results.jsonl").read_text("utf-8"), parse_constant=refuse)
+    mean = read_results(tmp_path / "r")["mean"]
+    assert pd.isna(mean[0]) and mean[1] == float("-inf") and mean[2] == 2
 
 
 @pytest.mark.parametrize(

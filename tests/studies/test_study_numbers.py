@@ -58,7 +58,7 @@ def test_another_seed_gives_other_numbers_and_is_refused_among_the_first(folder,
 
 def test_a_second_run_does_nothing(folder, tmp_path):
     run_study(folder, tmp_path)
-    before = {p: p.read_bytes() for p in tmp_path.glob("part-*")}
+    before = {p: p.read_bytes() for p in tmp_path.glob("*.jsonl")}
 
     def refuse(study):
         def runner(jobs):
@@ -69,4 +69,4 @@ def test_a_second_run_does_nothing(folder, tmp_path):
 
     ending = run_study(folder, tmp_path, refuse)
     assert (ending.total, ending.before, ending.done) == (12, 12, 12)
-    assert {p: p.read_bytes() for p in tmp_path.glob("part-*")} == before
+    assert {p: p.read_bytes() for p in tmp_path.glob("*.jsonl")} == before

@@ -41,7 +41,7 @@ def stopped(tmp_path, grace=60.0, script=SIGNALLED, times=1, name="SIGINT", wait
     told = []
     with StudyStop(grace, told.append) as stop:
         runner = lambda study: on_processes(study, 1, stop)  # noqa: E731
-        ending = run_study(folder, tmp_path / "r", runner, stop=stop, soonest=0.01)
+        ending = run_study(folder, tmp_path / "r", runner, stop=stop)
     assert len(told) == 1 and told[0].startswith("stopping: the running tasks have")
     assert ending.stopped and not ending.complete
     return list(read_results(tmp_path / "r")["task"])

@@ -86,12 +86,10 @@ def study(
     """
     require(cluster is None or jobs is None, "--jobs is for this machine; leave it with --cluster")
     from elastocal.studies.study_folder import read_study
-    from elastocal.studies.study_results import StudyResults, arrow
+    from elastocal.studies.study_results import StudyResults
     from elastocal.studies.study_run import StudyStop, Way, run_study, summarise
 
-    arrow()
     results = folder / "results" if output is None else output
-    # Beside the results, not among them: their folder is a dataset that others read whole.
     page = folder / "result.md"
     if output is not None:
         page = Path(f"{output if output.name else output.resolve()}.md")

@@ -29,7 +29,7 @@ from elastocal import __version__
 from elastocal.errors import ElastocalError, InputError, option, require
 from elastocal.files import read_bytes
 from elastocal.studies.study_folder import Outcome, Sources, Study, StudyTask, calling, execute
-from elastocal.studies.study_results import SOONEST, Recorder, StudyResults, opened, read_results
+from elastocal.studies.study_results import StudyResults, opened, read_results
 from elastocal.text import printable, quoted
 
 GRACE = 30.0  # s that running tasks are waited for
@@ -403,7 +403,6 @@ def run_study(
     progress: Callable[[int, int, int], None] = lambda total, ended, failed: None,
     tell: Callable[[str], None] = print,
     runner: Callable[[Sequence[StudyTask]], Outcomes] | None = None,
-    soonest: float = SOONEST,
 ) -> Ending:
     """Run the tasks that have no result yet (of the first `only`) and record what comes.
 
@@ -425,13 +424,12 @@ def run_study(
     with opened(Path(output)) as results:
         if restart:
             if cluster is not None:
-                connect(
-                    cluster, way
-                ).close()  # one that cannot be reached must not cost the results
+                # One that cannot be reached must not cost the results.
+                connect(cluster, way).close()
             results.clear()
         failures = _known(study, results)
         if retry_failed and any(failures.values()):
-            results.drop_failed()
+            results.drop(failed=True)
             failures = {index: False for index, failed in failures.items() if not failed}
         results.state(study, version)
         wanted = study.tasks[:only]
@@ -439,12 +437,11 @@ def run_study(
         total, before = len(wanted), len(wanted) - len(left)
         ended, failed = before, sum(failures.get(task.index, False) for task in wanted)
         progress(total, ended, failed)
-        recording = Recorder(results, study, version, soonest)
         try:
-            with recording, closing(runner(left)) as outcomes:
+            with closing(runner(left)) as outcomes:
                 for outcome in outcomes:
                     stop.check()
-                    recording.add(outcome)
+                    results.add(study.tasks[outcome.index], outcome, version)
                     failed += outcome.error is not None
                     ended += 1
                     progress(total, ended, failed)
@@ -459,21 +456,21 @@ def _known(study: Study, results: StudyResults) -> dict[int, bool]:
 
     Raises InputError where a task there is not the study's task of that index now.
     """
-    found = results.read(study)
-    if found is None:
-        return {}
-    names = ("task", "task_hash", "task_error")
-    lines = sorted(zip(*(found[name].to_pylist() for name in names), strict=True))
-    lines = [line for line in lines if line[0] < len(study.tasks)]
-    for index, hashed, _ in lines:
-        if study.tasks[index].hash != hashed:
-            told = "; ".join(_changes(study, results.stated())) or f"task {index} was another one"
+    here = f"Run with {option('restart', True)} to discard them, or with {option('output', 'NEW')}"
+    before, columns = results.stated(), dict(study.sources.columns)
+    require(
+        before.get("columns", columns) == columns,
+        f"{results.folder}: has other columns, types or units than the study now. {here}",
+    )
+    lines = [line for line in results.lines() if line["task"] < len(study.tasks)]
+    for line in lines:
+        if study.tasks[line["task"]].hash != line["task_hash"]:
+            changes = _changes(study, before) or [f"task {line['task']} was another one"]
             raise InputError(
-                f"{results.folder}: holds results of another study: {told}. "
-                f"Run with {option('restart', True)} to discard them, or with "
-                f"{option('output', 'NEW')} to keep them"
+                f"{results.folder}: holds results of another study: {'; '.join(changes)}. {here} "
+                "to keep them"
             )
-    return {index: error is not None for index, _, error in lines}
+    return {line["task"]: line["task_error"] is not None for line in lines}
 
 
 def _changes(now: Study, before: dict[str, Any]) -> list[str]:
