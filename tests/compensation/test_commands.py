@@ -184,32 +184,6 @@ def test_frames_say_the_same_place_in_two_ways():
     assert tool_errors(arm, in_base)[0].max() < FARTHEST
 
 
-def test_levels_between_which_a_joint_stands():
-    """The demo's kind of model: one compliance per level of joint 2; commands leave the levels."""
-    levels = {"joint2": tuple(np.radians([-140.0, -60.0, -100.0]))}
-    cell = kr270_cell(("joint_compliance",), compliance_levels=levels)
-    chain = kr270_chain()
-    arm = calibrated(chain, cell)
-    x = arm.x.copy()
-    for k, value in enumerate((2e-7, 4e-7, 3e-7)):
-        x[arm.model.names.index(f"joint2.compliance_level{k + 1}")] = value
-    plain = kr270_cell(("joint_compliance",))
-    same = calibrated(chain, plain)
-    x_same = same.x.copy()
-    q = POSTURES[:1].copy()
-    q[0, 1] = np.radians(-80.0)  # between the levels of 4e-7 and 3e-7
-    x_same[same.model.names.index("joint2.compliance")] = 3.5e-7
-    targets = targets_at("t", None, None, "base", DOWN, q=q)
-    of_levels = compensate(replace(arm, x=x), targets, tool_point(cell, "M1"))
-    of_one = compensate(replace(same, x=x_same), targets, tool_point(plain, "M1"))
-    assert of_levels.status == ("reached",)
-    # The correction moves joint 2 by less than 0.1°, a hundredth of the way between levels.
-    assert np.allclose(of_levels.q, of_one.q, atol=1e-5)
-    q[0, 1] = np.radians(-20.0)
-    beyond = compensate(replace(arm, x=x), replace(targets, q=q), tool_point(cell, "M1"))
-    assert any("beyond its levels" in told for told in beyond.warnings)
-
-
 def test_a_column_that_the_model_needs_is_asked_for():
     cell = kr270_cell(("joint_offset", "hysteresis"))
     arm = calibrated(kr270_chain(), cell)

@@ -6,8 +6,7 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-from support.cells import kr270_chain
-from support.diagnosis_data import campaign, cell
+from support.diagnosis_data import campaign
 
 from elastocal.diagnosis import DiagnosisOptions, possible
 from elastocal.errors import InputError
@@ -31,16 +30,6 @@ def test_the_whole_catalogue_is_tried_where_everything_is_recorded() -> None:
     assert len({(h.name, h.where) for h in tried}) == len(tried)
     for joint in range(1, 7):
         assert ("gear_eccentricity", f"joint{joint}") in {(h.name, h.where) for h in tried}
-
-
-def test_what_the_model_has_is_not_a_hypothesis_and_what_it_lacks_is() -> None:
-    tried = {h.name for h in possible(MODEL, TABLE)[0]}
-    assert not tried & {c.name for c in MODEL.cell.model.effects}
-    assert "link_geometry" in tried
-    spare = Model.assembled(kr270_chain(), cell(("base_frame", "joint_compliance:joint2")))
-    places = {(h.name, h.where) for h in possible(spare, TABLE)[0]}
-    assert ("joint_compliance", "joint3") in places and ("joint_offset", "joint1") in places
-    assert ("joint_compliance", "joint2") not in places
 
 
 LACKING = {
@@ -71,14 +60,6 @@ def test_an_effect_can_be_taken_out_of_the_catalogue(name: str) -> None:
     whole = {(h.name, h.where) for h in possible(MODEL, TABLE)[0]}
     rest = {(h.name, h.where) for h in possible(MODEL, TABLE, (name,))[0]}
     assert rest == {key for key in whole if key[0] != name} < whole
-
-
-def test_instruments_that_were_not_used_are_not_suspected() -> None:
-    names = {h.name for h in possible(MODEL, TABLE)[0]}
-    assert not names & {"marker_orientation", "distance_sensor"}
-    for observe, name in (("pose", "marker_orientation"), ("distance", "distance_sensor")):
-        other = Model.assembled(kr270_chain(), cell(observe=observe))
-        assert name in {h.name for h in possible(other, TABLE)[0]}
 
 
 def test_a_misspelt_effect_is_refused_with_the_nearest_name() -> None:

@@ -148,19 +148,6 @@ def test_arrays_of_any_layout(given_as, backend: str) -> None:
         np.testing.assert_array_equal(found, exact)
 
 
-def test_a_tape_has_no_memory() -> None:
-    """Called again, also with fewer rows, it starts afresh; results are the caller's own."""
-    rng = np.random.default_rng(2)
-    q, p = rng.normal(size=(9, 3)), rng.normal(size=2)
-    function = BatchFunction(*three_outputs(), "numpy")
-    first = function(q, p)
-    kept = [found.copy() for found in first]
-    function(rng.normal(size=(4, 3)), p)
-    for found, before, again in zip(first, kept, function(q, p), strict=True):
-        np.testing.assert_array_equal(found, before)
-        np.testing.assert_array_equal(found, again)
-
-
 # --- complex steps -------------------------------------------------------------------------
 
 ANALYTIC = ("neg", "exp", "log", "sqrt", "sq", "sin", "cos", "tan", "asin", "acos", "atan",

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from dataclasses import replace
 from typing import Any
 
 import casadi as ca
@@ -110,18 +109,3 @@ def test_what_is_out_of_reach_is_told_with_its_distance(far: float) -> None:
     assert found.miss[1, 0] <= np.linalg.norm(drawn - goal, axis=1).min() * (1 + 1e-5)
     at, _ = places(chain, found.q[1, :1])
     assert found.miss[1, 0] == pytest.approx(np.linalg.norm(at[0] - goal))
-
-
-def test_a_rotation_out_of_reach_is_told_with_its_angle() -> None:
-    """With its wrist held, the arm reaches the place but not the rotation."""
-    chain = kr270_chain()
-    held = tuple(replace(j, lower=-0.01, upper=0.01) for j in chain.joints[3:])
-    chain = replace(chain, joints=(*chain.joints[:3], *held))
-    position, rotation = places(chain, random_poses(chain, 4, seed=1))
-    tilted = rotation @ Rotation.from_euler("x", 0.5).as_matrix()
-    found = inverse_kinematics(chain, position, limits(chain), rotation=tilted, point=POINT)
-    assert found.out_of_reach.tolist() == [0, 1, 2, 3]
-    at, turned = places(chain, found.q[:, 0])
-    np.testing.assert_allclose(found.miss[:, 0], np.linalg.norm(at - position, axis=1), atol=1e-12)
-    angle = Rotation.from_matrix(turned.transpose(0, 2, 1) @ tilted).magnitude()
-    np.testing.assert_allclose(found.turn[:, 0], angle, atol=1e-9)

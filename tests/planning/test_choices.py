@@ -15,7 +15,6 @@ from support.design_commands import DEFLECTION, design, write_cell
 from elastocal.cell.arm_description import PolarNoise
 from elastocal.cell.plan_wishes import Freedom, TargetPose
 from elastocal.cell.work_cell import Cell
-from elastocal.errors import InputError
 from elastocal.model import Model
 from elastocal.planning import Choice, Chosen, Known, choices
 from elastocal.planning import test_poses as target_poses
@@ -73,15 +72,6 @@ def test_the_tracker_goes_where_its_noise_is_least() -> None:
     found = best(far)
     assert found.places["tracker"][1, 0] == pytest.approx(3.0, abs=0.05)
     assert found.before is not None and found.after < 0.6 * found.before
-
-
-def test_of_given_loads_the_best_hang() -> None:
-    loads = np.array([[0.0, 0, 0], DOWN / 10, DOWN, DOWN / 2])
-    found = best(cell_with(Freedom(loads=1), loads))
-    assert found.loads is not None and found.loads.tolist() == [[0, 0, 0], DOWN.tolist()]
-    assert found.before is not None and found.after > found.before  # fewer readings at each pose
-    with pytest.raises(InputError, match="252 choices of 5 of 10 loads"):
-        best(cell_with(Freedom(loads=5), DOWN * np.arange(1, 11)[:, None] / 10))
 
 
 CHOOSE = """

@@ -77,30 +77,6 @@ def test_the_stated_error_holds_in_as_many_campaigns_as_it_says() -> None:
     assert 0.92 < np.mean(held) < 0.98
 
 
-def test_before_and_after_are_errors_of_drawn_arms() -> None:
-    """Arms as likely as believed, measured once more: the best linear estimate, fitted to them."""
-    rng = np.random.default_rng(3)
-    B, A, R = (rng.standard_normal((n, 4)) for n in (12, 5, 3))
-    own, pull, spare = np.arange(2), rng.standard_normal(4), np.full(1, 0.2)
-    before = B.T @ B + np.diag([0.0, 0.0, 1.0, 1.0])
-    places = {2: 0.3, 3: 0.2}
-    doubts = [Doubt(p, np.array([k]), spare) for k, p in places.items()]
-    gain = Gain.of(R, before, before + A.T @ A, doubts, pull, 0)
-    n, arms = 60_000, []
-    for k, p in {None: 0.5, **places}.items():
-        there = own if k is None else np.append(own, k)
-        M = before[np.ix_(there, there)] - np.diag([0.0, 0.0, 0.2][: len(there)])
-        V = np.linalg.inv(M)
-        x = np.zeros((round(p * n), 4))
-        x[:, there] = rng.multivariate_normal(V @ pull[there], V, len(x))
-        arms.append(x)
-    x = np.concatenate(arms)
-    y = x @ A.T + rng.standard_normal((n, 5))
-    off = (x - y @ np.linalg.lstsq(y, x, rcond=None)[0]) @ R.T
-    rms = [np.sqrt((e**2).sum(axis=1).mean()) for e in (x @ R.T, off)]
-    assert rms == pytest.approx([gain.before, gain.after], rel=0.015)
-
-
 def _posterior(
     B: np.ndarray, y: np.ndarray, own: np.ndarray, places: tuple, s: float, p: float
 ) -> np.ndarray:

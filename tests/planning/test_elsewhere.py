@@ -13,7 +13,6 @@ from elastocal.planning import Known, Setup, load_states, relax, set_up
 from elastocal.planning import test_poses as target_poses
 from elastocal.planning.elsewhere import share_within
 from elastocal.planning.exact_plan import exact_plan
-from elastocal.planning.plan import Everywhere
 from elastocal.planning.test_poses import ELSEWHERE, everywhere
 
 CHAIN = kr270_chain()
@@ -30,21 +29,6 @@ def made(share: float | None) -> Setup:
     return set_up(
         model, load_states(cell), Q, all_loads(Q), 10**9, targets, Known(), 0, region
     )  # fmt: skip
-
-
-def errors(setup: Setup, chosen: np.ndarray) -> Everywhere:
-    assert setup.target_rows is not None and setup.elsewhere_rows is not None
-    M = setup.gathered(setup.information.blocks(Q, all_loads(Q))[:, chosen])[0]
-    return Everywhere.of(setup.target_rows, setup.elsewhere_rows, M, M[None], M)
-
-
-def test_the_criterion_is_the_weighted_mean_of_both_errors() -> None:
-    setup, chosen = made(0.25), np.arange(8)
-    e = errors(setup, chosen)
-    M = setup.gathered(setup.information.blocks(Q, all_loads(Q))[:, chosen])
-    mean = 0.75 * e.test_poses**2 + 0.25 * e.elsewhere**2
-    assert float(setup.criterion.value(M)) == pytest.approx(mean, rel=1e-9)
-    assert (e.random_test_poses, e.random_elsewhere) == (e.test_poses, e.elsewhere)
 
 
 def test_the_share_is_the_largest_that_the_cap_allows_and_the_bound_is_another_solvers() -> None:

@@ -3,26 +3,23 @@
 from __future__ import annotations
 
 from dataclasses import replace
-from typing import Any
 
 import numpy as np
 import pytest
 from numpy.typing import NDArray
-from support.cells import COMPENSATOR, COMPLIANCE, DOWN, TABLE_2, kr270_chain, random_poses
+from support.cells import COMPENSATOR, COMPLIANCE, DOWN, TABLE_2, kr270_chain
 from support.cells import table_of as rows_with_markers
-from support.design_cells import FULL, any_cell, plan_cell, setup_of, sliding_chain, spread
+from support.design_cells import FULL, any_cell, plan_cell, sliding_chain, spread
 
 from elastocal.cell.arm_description import Nominal
 from elastocal.cell.plan_wishes import TargetPose
 from elastocal.cell.work_cell import Cell
-from elastocal.errors import InsufficientDataError
 from elastocal.model import Chain, Model, Parameter
 from elastocal.planning import PoseInformation, TargetPoses, load_states, prediction_rows
 from elastocal.planning import test_poses as target_poses
 
 CHAIN = kr270_chain()
 BOTH = np.array([[0.0, 0, 0], DOWN])
-SIDEWAYS = np.array([0.0, 1500.0, 0.0])
 POINT = np.array([0.1, -0.2, 0.4])
 LEVELS = tuple(np.unique(TABLE_2[:, 1]).tolist())
 
@@ -122,30 +119,3 @@ def test_the_rows_are_how_position_changes_with_the_parameters(case: str) -> Non
     assert np.abs(A - expected).max(axis=(0, 1)) == pytest.approx(0 * scale, abs=2e-6 * scale.max())
     observed = scale > 0
     assert (np.abs(A - expected).max(axis=(0, 1))[observed] < 1e-5 * scale[observed] + 1e-11).all()
-
-
-def remaining(cell: Cell, q: NDArray, **known: Any) -> tuple[float, tuple[str, ...]]:
-    setup = setup_of(cell, q, **known)
-    plan = q[:20]
-    return setup.value(plan, np.full(len(plan), -1)), setup.information.names
-
-
-@pytest.mark.parametrize("criterion", ["test_pose", "I", "G"])
-def test_a_test_load_that_no_reading_shows_is_refused_with_its_parameter(criterion: Any) -> None:
-    """Loads straight down never turn joint 1; a force from the side does."""
-    pose = TargetPose(TABLE_2[0], SIDEWAYS)
-    cell = plan_cell(loads=DOWN[None], criterion=criterion, test_poses=(pose,))
-    q = random_poses(CHAIN, 60, seed=4)
-    with pytest.raises(InsufficientDataError) as caught:
-        setup_of(cell, q)
-    message = str(caught.value)
-    for part in (
-        "test pose 1",
-        "joint1.compliance",
-        "load's direction",
-        "fixed=[",
-        'criterion = "D"',
-    ):
-        assert part in message
-    sideways = replace(cell.design, loads=np.array([DOWN, SIDEWAYS]))
-    assert np.isfinite(remaining(replace(cell, design=sideways), q)[0])

@@ -52,19 +52,6 @@ def test_a_sign_turns_a_joint_against_its_axis(tmp_path):
     assert code == 2 and "write 1, or -1" in err
 
 
-def test_rows_of_base_and_tool_move_nothing(tmp_path):
-    joints = "".join(f"A{i},{row},\n" for i, row in enumerate(KR6.split(), start=1))
-    rows = f"base,0,100,0,0,base\n{joints}tool,0,50,0,0,tool\n"
-    path = write(tmp_path, f"joint,{HEADER},type", rows)
-    chain = read_dh(path)
-    assert chain.n_joints == 6 and chain.joints[0].name == "A1"
-    plain = read_dh(write(tmp_path, HEADER, KR6, "plain.csv"))
-    far = nominal_flanges(chain, np.zeros((1, 6)))[0] - nominal_flanges(plain, np.zeros((1, 6)))[0]
-    assert np.linalg.norm(far[:3, 3]) > 0.1
-    code, _, err = told_by_init(write(tmp_path, f"joint,{HEADER}", "tool,0,50,0,0\n" * 4))
-    assert code == 2 and "'tool' names no joint" in err
-
-
 def factory_table(tilts=(5e-4, 3.7e-4)):
     """Rows of a UR whose axes 2 to 4 are nearly parallel, with d of hundreds of metres."""
     d2, d3 = 300.0, -700.0

@@ -5,7 +5,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 from scipy import stats
-from support.calibration import GEOMETRY, cell_of, planar_chain, table_at, true_values, with_values
+from support.calibration import GEOMETRY, cell_of, planar_chain, table_at, true_values
 from support.cells import COMPLIANCE, kr270_chain, random_poses
 
 from elastocal.cell.arm_description import (
@@ -85,22 +85,6 @@ def test_noise_has_the_stated_covariance(tracker, rows):
     low, high = chi2_band(300, 1e-3 / 3)
     assert ((z**2).sum(axis=0) > low).all() and ((z**2).sum(axis=0) < high).all()
     assert abs(z.mean()) < 4 / np.sqrt(900)
-
-
-def test_distances():
-    tracker = Tracker(anchor=np.array([1.0, -1.0, 0.2]), distance_sigma=3e-4)
-    effects = ("distance_sensor", "marker_position")
-    model = model_with(tracker, effects, observe="distance")
-    truth = with_values(model, {"tracker.length_offset": 0.1, "marker:M1.x": 0.05})
-    plan = replace(plan_of(model, 200), position=None)
-    exact = simulate(model, plan, truth, 0, noise=False)
-    marker = model_with(None, ("marker_position",))
-    at = marker.predict(plan_of(marker, 200), with_values(marker, {"marker:M1.x": 0.05}))
-    length = np.linalg.norm(at.reshape(-1, 3) - tracker.anchor, axis=1) + 0.1
-    np.testing.assert_allclose(exact.distance, length, atol=1e-12)
-    low, high = chi2_band(200)
-    error = simulate(model, plan, truth, 1).distance - exact.distance
-    assert low < ((error / 3e-4) ** 2).sum() < high
 
 
 def test_deflections_are_loaded_minus_unloaded_readings():

@@ -32,9 +32,6 @@ ECCENTRIC, MASS, SCALE = (
 )
 
 
-BACKLASHES = [("backlash", "joint2"), ("backlash", "joint3")]
-
-
 def truth(*places, location=None, joints=6):
     effects = [{"effect": e, "where": w, "values": {"size": 1.0}} for e, w in places]
     if location:
@@ -84,29 +81,6 @@ NOTHING = answer("nothing_significant")
 def test_one_effect(given, outcome, outright):
     assert score.one_effect(truth(ECCENTRIC), given) == outcome
     assert score.outright(truth(ECCENTRIC), given) is outright
-
-
-@pytest.mark.parametrize(
-    ("given", "found", "invented"),
-    [
-        (answer("explained", ECCENTRIC, SCALE), 2, 0),
-        (answer("explained", SCALE, ECCENTRIC), 2, 0),
-        (answer("explained", SCALE), 1, 0),
-        (answer("explained", MASS, SCALE), 1, 1),
-        (answer("explained", SCALE, ECCENTRIC, MASS), 2, 1),
-        # A set of four finds nothing, and invents nothing where it holds a true effect.
-        (answer("ambiguous", MASS, sets=[[MASS, SCALE, *BACKLASHES]]), 0, 0),
-        (answer("ambiguous", MASS, sets=[[MASS, *BACKLASHES, *BACKLASHES]]), 0, 1),
-        # One claim cannot stand for both.
-        (answer("ambiguous", SCALE, sets=[[SCALE, ECCENTRIC]]), 1, 0),
-        # The first claim holds both, the second only one of them: both are found.
-        (answer("ambiguous", SCALE, ECCENTRIC, sets=[[SCALE, ECCENTRIC]]), 2, 0),
-        (NOTHING, 0, 0),
-        (None, 0, 0),
-    ],
-)
-def test_two_effects(given, found, invented):
-    assert score.pair(truth(ECCENTRIC, SCALE), given) == score.Pair(found, invented)
 
 
 # --- nothing leaks, nothing is lost -----------------------------------------------------------

@@ -22,8 +22,8 @@ import suites
 import worker
 from arm_data import ARMS
 from whole_columns import components, moments, scene_of
-from whole_draw import RANGES, draw_whole
-from whole_laws import CREEP, LAST_MOVE, LINES, WEIGHTS, gear_error
+from whole_draw import draw_whole
+from whole_laws import WEIGHTS
 from whole_oracle import Sights, oracle_errors
 from world_files import write_world
 
@@ -35,24 +35,6 @@ def sights(request):
 
 def rms(x):
     return float(np.sqrt(np.mean(x**2)))
-
-
-def test_every_joint_has_everything(sights):
-    world = sights.world
-    joints = [f"joint{j + 1}" for j in range(world.spec.skeleton.n_joints)]
-    for name in (LINES, LAST_MOVE):
-        assert [e.where for e in world.effects if e.name == name] == joints
-    assert {e.name for e in world.effects} == {LINES, LAST_MOVE, WEIGHTS, CREEP}
-    assert (world.noise.repeatability >= RANGES.scatter[0]).all()
-    gear = world.spec.gear
-    for e in world.effects:
-        if e.name == LINES:
-            orders = [order for line, order in e.settings.items() if line != "eccentricity"]
-            assert RANGES.order[0] <= orders[0] and max(orders) <= RANGES.highest_order
-            assert orders == pytest.approx(orders[0] * np.arange(1, len(orders) + 1))
-            turn = np.linspace(0.0, 2 * np.pi, 1000)
-            peak = np.abs(gear_error(e, turn)).max()
-            assert 30e-6 * gear < peak < 300e-6 * gear
 
 
 def test_the_tool_is_told_neither_weights_nor_orders(tmp_path):

@@ -9,7 +9,6 @@ from typing import Any
 import numpy as np
 import pytest
 from planning.feasibility.small_cells import gantry_at, gantry_rules
-from scipy import stats
 from support.cells import choices, kr270_cell, kr270_chain, random_poses, table_of
 
 from elastocal.cell.arm_description import CartesianNoise, Tool, Tracker
@@ -135,28 +134,6 @@ def test_distance_is_that_of_dense_least_squares(base, pool, discrimination, cho
     for k in (0, DRAWS, 2 * DRAWS - 1):
         expected_square = dense_distance(base, table, a, b, discrimination.draws[a][k])
         assert squared[k] == pytest.approx(expected_square, rel=1e-3)
-
-
-def test_two_rivals_are_named_as_often_as_their_log_odds_are_right(discrimination) -> None:
-    """P = Σ p_a P(log odds > 0) with log odds ~ N(±(L + δ²/2), δ²), by drawing them."""
-    p = np.array([0.7, 0.3])
-    two = replace(
-        discrimination,
-        rivals=replace(
-            discrimination.rivals, rivals=discrimination.rivals.rivals[:2], probability=p
-        ),
-        draws=discrimination.draws[:2], before=np.zeros((2, 2, 1)), classes=np.arange(2),
-    )  # fmt: skip
-    delta = 2.3
-    squared = delta**2 * (1 - np.eye(2))[:, :, None]
-    rng = np.random.default_rng(0)
-    L = np.log(p[0] / p[1])
-    drawn = [
-        (sign * L + delta**2 / 2 + delta * rng.normal(size=400_000) > 0).mean() for sign in (1, -1)
-    ]
-    assert two.probability(squared) == pytest.approx(p @ drawn, abs=2e-3)
-    even = replace(two, rivals=replace(two.rivals, probability=np.array([0.5, 0.5])))
-    assert even.probability(squared) == pytest.approx(stats.norm.cdf(delta / 2))
 
 
 def test_the_plan_beats_random_visits(discrimination) -> None:

@@ -61,13 +61,6 @@ def test_what_came_before_the_first_visit_has_an_error_of_its_own(effect: str) -
     np.testing.assert_array_equal(positions(m, rows(Q), **first), positions(m, rows(Q)))
 
 
-def test_a_joint_stays_behind_its_own_last_motion() -> None:
-    m = model(stick("zz", (1.0, 1.0)), "move_hysteresis:joint2")
-    moved = positions(m, rows(Q), move_hysteresis=1e-3) - positions(m, rows(Q))
-    turned = positions(m, rows(Q + np.array([0.0, 1e-3]))) - positions(m, rows(Q))
-    np.testing.assert_allclose(moved, turned * DIRECTION[:, 1:], atol=1e-6)
-
-
 @pytest.mark.parametrize("effect", ["hysteresis", "backlash"])
 def test_the_order_of_visits_says_what_a_missing_column_would(effect: str) -> None:
     chain, side = kr270_chain(), "load_and_approach"
@@ -81,12 +74,3 @@ def test_the_order_of_visits_says_what_a_missing_column_would(effect: str) -> No
         by_column.predict(table, x)
     assert "approach" not in CATALOGUE[effect].needed(by_order.cell)
     assert "approach" in CATALOGUE[effect].needed(by_column.cell)
-
-
-def test_a_recorded_column_counts_unless_the_cell_says_otherwise() -> None:
-    chain = kr270_chain()
-    table = random_table(chain, 6, seed=1)
-    m = Model.assembled(chain, kr270_cell(["hysteresis"]))
-    other = replace(table, approach=-table.approach)
-    x = np.array([p.typical or 1e-8 for p in m.parameters])
-    assert np.abs(m.predict(table, x) - m.predict(other, x)).max() > 1e-6

@@ -8,7 +8,6 @@ from elastocal.planning import (
     SpectralCriterion,
     TraceCriterion,
     criterion_named,
-    make_criterion,
     register,
 )
 from elastocal.planning.criteria import CRITERIA
@@ -20,25 +19,6 @@ def forgotten():
     yield
     CRITERIA.clear()
     CRITERIA.update(before)
-
-
-def test_a_registered_criterion_is_made_like_those_that_there_are():
-    @register
-    class Second(TraceCriterion):
-        name = "second"
-
-        @classmethod
-        def of(cls, inputs):
-            F = inputs.row({"b": 3.0})[None]
-            return cls(np.stack([F.T @ F] * inputs.scenarios))
-
-    assert criterion_named("second") is Second
-    phi = make_criterion(
-        "second", parameters=2, interest=np.arange(2), names=("a", "b"), sizes=np.array([1.0, 0.5])
-    )
-    # var(b) = 0.5² V_22 and 3² of it.
-    assert float(phi.value(np.diag([7.0, 4.0])[None])) == pytest.approx(9 * 0.25 / 4)
-    assert phi.certifiable
 
 
 class Named(TraceCriterion):

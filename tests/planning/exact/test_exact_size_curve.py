@@ -66,13 +66,6 @@ def test_the_fewest_poses_are_those_of_brute_force(name, wanted):
     assert all(best[n] > target for n in range(3, found.excluded + 1))
 
 
-def test_a_target_out_of_reach_leaves_the_best_there_is():
-    of = problem_of()
-    found = size_curve(of, (), 1e-9, between=(2, 8), starts=2)
-    assert found.smallest is None and found.excluded == 8
-    assert found.points[-1].n_poses == 8
-
-
 @pytest.mark.parametrize(
     ("numbers", "options", "named"),
     [

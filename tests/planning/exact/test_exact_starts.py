@@ -11,21 +11,6 @@ from elastocal.planning import DesignProblem, make_criterion, regular_plan
 from elastocal.planning.exact_plan import exact_plan
 
 
-class Memory:
-    """A checkpoint that may be told to interrupt the work after so many savings."""
-
-    def __init__(self, interrupt_after=None):
-        self.state, self.saved, self.interrupt_after = None, 0, interrupt_after
-
-    def load(self):
-        return self.state
-
-    def save(self, state):
-        self.state, self.saved = dict(state), self.saved + 1
-        if self.saved == self.interrupt_after:
-            raise KeyboardInterrupt
-
-
 def rough(seed: int = 0) -> DesignProblem:
     """A pool in whose local optima starts end that differ."""
     rng = np.random.default_rng(seed)
@@ -33,36 +18,6 @@ def rough(seed: int = 0) -> DesignProblem:
     blocks = rng.normal(size=(1, 30, 2, 7))
     group = np.arange(30) % 3
     return DesignProblem(blocks, np.zeros((1, 7, 7)), group, np.array([3, 3, 3]), criterion)
-
-
-def same(a, b) -> bool:
-    return (
-        np.array_equal(a.chosen, b.chosen)
-        and a.value == b.value
-        and a.passes == b.passes
-        and np.array_equal(a.values, b.values)
-    )
-
-
-def test_the_plan_does_not_depend_on_the_number_of_processes():
-    problem = rough()
-    alone = exact_plan(problem, starts=4, seed=3)
-    assert len(set(alone.values.round(12))) > 1, "starts that all end alike would prove nothing"
-    assert same(alone, exact_plan(problem, starts=4, seed=3, jobs=2))
-
-
-@pytest.mark.parametrize("after", [1, 3])
-def test_an_interrupted_search_resumes_to_the_same_plan(after):
-    problem = rough(1)
-    whole = exact_plan(problem, starts=5, seed=7)
-    memory = Memory(after)
-    with pytest.raises(KeyboardInterrupt):
-        exact_plan(problem, starts=5, seed=7, checkpoint=memory)
-    said = []
-    resumed = exact_plan(problem, starts=5, seed=7, checkpoint=memory, progress=said.append)
-    assert same(whole, resumed)
-    assert len(said) == 5 - after, "finished starts are not made again"
-    assert same(whole, exact_plan(problem, starts=5, seed=7, checkpoint=memory))
 
 
 def test_fewer_equations_than_parameters_says_how_many():

@@ -23,7 +23,6 @@ from planning.feasibility.test_margins_of_pairs import kr270_cell
 
 from elastocal.cell.arm_description import EffectChoice, Tool, Tracker
 from elastocal.cell.workspace_rules import (
-    CarriedBody,
     HalfSpace,
     HangingLoad,
     Visibility,
@@ -69,25 +68,6 @@ def test_the_beam_reaches_from_the_tracker_to_the_marker_and_no_further(x):
         assert broken(rules, gantry_at((x, 0, 0)), NOTHING) == [
             {"line_of_sight"} if hides else set()
         ]
-
-
-def test_the_body_under_a_marker_hides_it_from_behind_only():
-    plate = CarriedBody(box("plate", (0.1, 0.5, 0.5), (-0.05, 0, 0)))
-    rules = gantry_rules(Workspace(bodies=(plate,), visibility=Visibility()), MARKER, EYE)
-    q = gantry_at(*[(0, 0, 0)] * 4)
-    q[:, 3] = np.radians([0, 70, -70, 180])
-    assert [bool(b) for b in broken(rules, q, NOTHING)] == [False, False, False, True]
-
-
-def test_the_instrument_itself_hides_nothing_and_the_load_hides_where_it_hangs():
-    stand = box("stand", (0.3, 0.3, 2), (3, 0, -0.9))
-    load = HangingLoad(sphere("load", 0.3, (0, 0, 0)), rope=0.5)
-    tool = Tool(np.array([0.6, 0, 0.8]), {"M1": np.zeros(3)})
-    rules = gantry_rules(
-        Workspace(obstacles=(stand,), load=load, visibility=Visibility()), tool, EYE
-    )
-    assert broken(rules, gantry_at((0, 0, 0)), NOTHING) == [set()]
-    assert broken(rules, gantry_at((0, 0, 0)), DOWN) == [{"line_of_sight"}]
 
 
 def test_the_rope_may_deviate_from_the_vertical_by_its_angle():
