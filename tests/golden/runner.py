@@ -187,6 +187,8 @@ def _file(path: Path) -> Any:
     """A written file: JSON and tables by value, pages and other text by word."""
     if path.suffix == ".json":
         return kept(json.loads(path.read_text(encoding="utf-8")))
+    if path.suffix == ".jsonl":
+        return [kept(json.loads(line)) for line in path.read_text(encoding="utf-8").splitlines()]
     if path.suffix == ".csv":
         return _table(path)
     if path.suffix in (".png", ".svg", ".parquet"):
