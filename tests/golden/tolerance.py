@@ -39,7 +39,7 @@ RULES = [
     (re.compile(r"^read_back$"), 0.01, 0),  # µm that rounding leaves in a file that is exact
 ]  # fmt: skip
 # What says how the machine did it, or which of several alike rounding picked, not what came out.
-MASKED = {"redundant", "backend", "seconds", "version", "iterations", "elapsed_s"}
+MASKED = {"redundant", "backend", "seconds", "task_seconds", "version", "iterations", "elapsed_s"}
 
 NAMED_BY = ("name", "effect", "driver", "set", "step", "kind", "where")
 
