@@ -459,8 +459,8 @@ def identify(
             "polar" or "stated"; with "+configuration" what a configuration's readings share.
         weights: Stated noise to take as it is: "none", "rows", "axis", "polar", "covariance".
         covariance: Noise covariance (rows, rows) in m², for the weights "covariance".
-        intervals: "auto" goes with the method; "classical", "hc0" to "hc4", "cr0" to "cr3" (by
-            configuration), "wild", "bootstrap", "profile".
+        intervals: "auto" goes with the method; "classical", "hc0" to "hc3", "cr0" to "cr3" (by
+            configuration), "profile".
         outliers: Readings beyond the noise: "auto" leaves them out unless they are a tenth or
             more, "drop" always, "keep" never.  They are listed in any case.
         bounded: Keep parameters inside their physical bounds.
@@ -468,8 +468,8 @@ def identify(
         knowledge: What is known besides: `Knowledge`, or a knowledge file (TOML).
         prior: What is known by name, {"joint2.compliance": {"mean": 2.9e-7, "std": 3e-8}}.
         constraints: Bounds, equalities and matrices, besides those of `knowledge`.
-        seed: Of multi-start, searches and bootstraps.
-        jobs: Processes of a bootstrap; −1 for all cores.
+        seed: Of multi-start and searches.
+        jobs: Has no effect any more: nothing is drawn in processes.
         progress: Is told what is done.
 
     Returns:

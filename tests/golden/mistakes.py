@@ -238,4 +238,12 @@ OPTIONS = (
             "-q"),
 )  # fmt: skip
 # What went, with its successor.
-GONE = (Mistake("the compiled backend", "--backend compiled effects placed.toml"),)
+GONE = (
+    Mistake("the compiled backend", "--backend compiled effects placed.toml"),
+    Mistake("an estimator that goes by another name", "identify placed.toml placed.csv "
+            "-q -o out.json --method mm"),
+    Mistake("wild intervals", "identify placed.toml placed.csv -q -o out.json --intervals wild"),
+    Mistake("hc4 intervals", "identify placed.toml placed.csv -q -o out.json --intervals hc4"),
+    Mistake("bootstrap intervals", "identify placed.toml placed.csv -q -o out.json "
+            "--intervals bootstrap"),
+)  # fmt: skip

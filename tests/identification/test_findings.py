@@ -89,7 +89,7 @@ def test_lack_of_fit_has_one_threshold(result, above):
 
 
 @pytest.mark.parametrize(
-    ("kind", "intervals"), [("axis+configuration", "classical"), ("axis", "CR2"), ("axis", "wild")]
+    ("kind", "intervals"), [("axis+configuration", "classical"), ("axis", "CR2")]
 )
 def test_scatter_that_is_counted_with_warns_of_no_narrow_interval(result, kind, intervals):
     misfit = LackOfFit(9.0, 1e-6, 30, 200)

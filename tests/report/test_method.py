@@ -26,8 +26,7 @@ def test_only_intervals_that_do_take_active_constraints_for_exact(case: Any) -> 
 
     assert "take these for exact" in line("t under constraints")
     assert "stop at bounds" in line("constrained profile")
-    assert "take these for exact" not in line("constrained profile") + line("constrained bootstrap")
-    assert "fits that keep" in line("constrained bootstrap")
+    assert "take these for exact" not in line("constrained profile")
 
 
 @pytest.mark.parametrize(

@@ -8,11 +8,9 @@ from elastocal.identification import (
     ConstrainedObjective,
     Constraints,
     GaussianPrior,
-    constrained_bootstrap,
     minimise,
     profile_linear_interval,
 )
-from elastocal.identification.bootstrap import ParametricBootstrap
 from elastocal.identification.constrained import Minimum
 from elastocal.identification.constrained_solver import loss_of
 from elastocal.identification.intervals import ProfileInterval
@@ -65,21 +63,3 @@ def profile(
     """The interval of one parameter for rows of unit noise."""
     objective = objective_of(B, y, names, None, "squares", 1, 1.0)
     return profile_linear_interval(objective, stated.resolve(names), name, 1.0)
-
-
-def bootstrap(
-    B: np.ndarray,
-    y: np.ndarray,
-    names: Sequence[str],
-    stated: Constraints,
-    *,
-    prior: GaussianPrior | None = None,
-    draws: int,
-    seed: int,
-    jobs: int = 1,
-) -> ParametricBootstrap:
-    """Draws for rows of unit noise."""
-    objective = objective_of(B, y, names, prior, "squares", 1, 1.0)
-    return constrained_bootstrap(
-        objective, stated.resolve(names), 1.0, draws=draws, seed=seed, jobs=jobs
-    )

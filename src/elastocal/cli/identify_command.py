@@ -67,10 +67,7 @@ def identify(
     ] = "auto",
     intervals: Annotated[
         str,
-        typer.Option(
-            help="auto, classical, hc0 to hc4, cr0 to cr3 (by configuration), wild, bootstrap, "
-            "profile."
-        ),
+        typer.Option(help="auto, classical, hc0 to hc3, cr0 to cr3 (by configuration), profile."),
     ] = "auto",
     covariance: Annotated[
         Path | None, typer.Option(help="Noise covariance in m² (CSV without header, or .npy).")
@@ -110,7 +107,7 @@ def identify(
             "else as [require] of the cell says. Exit code 3 where one is exceeded.",
         ),
     ] = None,
-    jobs: Annotated[int, typer.Option(help="Processes of a bootstrap; -1 for all cores.")] = 1,
+    jobs: Annotated[int, typer.Option(help="Has no effect: nothing is drawn in processes.")] = 1,
     plugins: Plugins = False,
     seed: Seed = 0,
     as_json: Json = False,

@@ -3,7 +3,6 @@
 from elastocal import loaded_on_demand
 
 ROOMS = {
-    "bootstrap": "ParametricBootstrap parametric_bootstrap wild_cluster_bootstrap",
     "constrained": "ActiveConstraint constrained_fit minimise",
     "constrained_solver": "ConstrainedObjective ResidualLoss",
     "covariance": "Covariance cluster_robust hc t_quantile",
@@ -16,9 +15,7 @@ ROOMS = {
         "SemidefiniteMatrix equal non_negative physical_constraints read_knowledge "
         "share_of_prior"
     ),
-    "knowledge_fit": (
-        "constrained_bootstrap degrees_of_freedom profile_fit_interval profile_linear_interval"
-    ),
+    "knowledge_fit": ("degrees_of_freedom profile_fit_interval profile_linear_interval"),
     "least_squares": "FitProblem SumOfSquares descend fit",
     "linear_solver": "solve_weighted",
     "trimmed": "least_trimmed_squares majority",

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Iterator
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Literal, get_args
 
 import numpy as np
@@ -179,77 +179,6 @@ class SatterthwaiteSums:
         return np.where(told, self._trace**2 / np.where(told, square, 1.0), 0.0)
 
 
-# Covariance from independent rows, each of its own variance (HC0 to HC4).
-
-HCKind = Literal["HC0", "HC1", "HC2", "HC3", "HC4"]
-
-ALONE = 1e-9  # 1 − leverage below which a row is fitted exactly, whatever was read there
-ENTRIES = 2**22  # of a temporary array, 32 MB
-
-ROW_DESCRIPTION = {
-    "HC0": "each row its own variance, e² as it is (biased low in small samples)",
-    "HC1": "each row its own variance, e² · n/(n − p)",
-    "HC2": "each row its own variance, e²/(1 − h), unbiased under equal variances",
-    "HC3": "each row its own variance, e²/(1 − h)², nearly the jackknife",
-    "HC4": "each row its own variance, e²/(1 − h)^min(4, nh/p)",
-}
-
-
-def hc(B: ArrayLike, e: ArrayLike, kind: HCKind = "HC3") -> Covariance:
-    """Heteroscedasticity-consistent (BᵀB)⁻¹ Bᵀ diag(f_i² e_i²) B (BᵀB)⁻¹, rows independent.
-
-    With the leverage h_i = |Q_i|², B = QR, and f_i² = 1 (HC0; White 1980), n/(n − p) (HC1),
-    1/(1 − h_i) (HC2), 1/(1 − h_i)² (HC3; MacKinnon & White 1985) or (1 − h_i)^−min(4, n h_i/p)
-    (HC4; Cribari-Neto 2004).  Degrees of freedom: n − p for HC0 and HC1; for the others those of
-    Satterthwaite (Bell & McCaffrey 2002), as `cluster_robust` with every row a cluster.
-
-    B (n, p) and e (n,) whitened, e = y − B x̂.  Raises InsufficientDataError where HC2 to HC4
-    meet a row of leverage one: its residual is zero whatever was read, so its variance is
-    unknown.  InputError as `orthogonal`, and for an unknown kind.
-    """
-    require(kind in get_args(HCKind), f"kind must be one of {get_args(HCKind)}; got {kind!r}")
-    factors, e = orthogonal(B, e)
-    Q, V = factors.Q, factors.V
-    n, p = Q.shape
-    h = np.einsum("ij,ij->i", Q, Q)
-    adjusted = kind not in ("HC0", "HC1")
-    exact = np.flatnonzero(1 - h < ALONE)
-    if adjusted and exact.size:
-        raise InsufficientDataError(
-            f"row {exact[0]} of B alone determines a combination of the parameters (leverage"
-            f" one; {exact.size} such rows), so {kind} has no residual to judge it by; measure"
-            " there again, fit fewer parameters, or use HC1"
-        )
-    f = _factor(kind, h, p)
-    scores = Q * (f * e)[:, None]
-    matrix = factors.sandwich(scores.T @ scores)
-    dof = _dof(Q, V, f) if adjusted else np.full(p, float(n - p))
-    return Covariance(kind, matrix, dof, ROW_DESCRIPTION[kind])
-
-
-def _factor(kind: HCKind, h: Array, p: int) -> Array:
-    """f (n,), by which the residual is multiplied."""
-    n = h.size
-    if kind == "HC0":
-        return np.ones(n)
-    if kind == "HC1":
-        return np.full(n, np.sqrt(n / (n - p)))
-    power = np.minimum(4.0, n * h / p) if kind == "HC4" else 1.0 if kind == "HC2" else 2.0
-    return np.asarray((1 - h) ** (-power / 2))
-
-
-def _dof(Q: Array, V: Array, f: Array) -> Array:
-    """Satterthwaite dof (p,): every row a cluster, a_i = f_i Q_iᵀv_j, b_i = a_i Q_i."""
-    n, p = Q.shape
-    sums = SatterthwaiteSums(p)
-    block = max(1, ENTRIES // p**2)
-    for start in range(0, n, block):
-        part = slice(start, start + block)
-        a = f[part, None] * (Q[part] @ V.T)
-        sums.add(a**2, Q[part, :, None] * a[:, None, :])
-    return sums.dof()
-
-
 # Cluster-robust covariance: rows of a cluster may be correlated in any way (CR0 to CR3).
 #
 # A cluster is what shares an error: the readings of one configuration share the arm's
@@ -265,8 +194,14 @@ def _dof(Q: Array, V: Array, f: Array) -> Array:
 #     CR3  A_c = (I − Q_cQ_cᵀ)^(−1)              nearly the jackknife over clusters, errs wide
 #
 # The working model of CR2 and of the degrees of freedom is the identity: B and e are whitened.
+#
+# Where every row is a cluster, rows are independent, each of its own variance: with the leverage
+# h_i = |Q_i|², CR0 to CR3 are then HC0 (White 1980), HC1, HC2, HC3 (MacKinnon and White 1985).
 
+ALONE = 1e-9  # 1 − leverage below which a cluster is fitted exactly, whatever was read there
+ENTRIES = 2**22  # of a temporary array, 32 MB
 CRKind = Literal["CR0", "CR1", "CR2", "CR3"]
+HCKind = Literal["HC0", "HC1", "HC2", "HC3"]
 DEPENDS = 1e-6  # share of a parameter in such a direction above which it depends on it
 
 CLUSTER_DESCRIPTION = {
@@ -351,6 +286,7 @@ def cluster_robust(
     Q, V = factors.Q, factors.V
     n, p = Q.shape
     groups = clusters_of(cluster, n)
+    what, left = ("row", "HC") if len(groups) == n else ("cluster", "CR")
     meat, sums, alone = np.zeros((p, p)), SatterthwaiteSums(p), np.zeros(p, dtype=bool)
     for some, rows in groups.blocks(p):
         Qc = Q[rows]
@@ -359,8 +295,8 @@ def cluster_robust(
             if kind == "CR3":
                 label = groups.label[some[np.argmax(determined)]]
                 raise InsufficientDataError(
-                    f"cluster {label} alone determines a combination of the parameters: leaving"
-                    " it out, as CR3 does, leaves no answer; fit fewer parameters or use CR2"
+                    f"{what} {label} alone determines a combination of the parameters: leaving it"
+                    f" out, as {left}3 does, leaves no answer; fit fewer parameters or use {left}2"
                 )
             alone |= _depends(Qc[determined], V)
         scores = (e[rows][:, None, :] @ adjusted)[:, 0]
@@ -373,6 +309,28 @@ def cluster_robust(
     if alone.any():
         text += f"; parameters {np.flatnonzero(alone).tolist()} hang on a single cluster"
     return Covariance(kind, factors.sandwich(meat), np.where(alone, 0.0, sums.dof()), text)
+
+
+ROW_DESCRIPTION = {
+    "HC0": "each row its own variance, e² as it is (biased low in small samples)",
+    "HC1": "each row its own variance, e² · n/(n − p)",
+    "HC2": "each row its own variance, e²/(1 − h), unbiased under equal variances",
+    "HC3": "each row its own variance, e²/(1 − h)², nearly the jackknife",
+}
+
+
+def hc(B: ArrayLike, e: ArrayLike, kind: HCKind = "HC3") -> Covariance:
+    """Covariance of x̂ with independent rows, each of its own variance: every row a cluster.
+
+    B (n, p) and e (n,) whitened.  Degrees of freedom are n − p for HC0 and HC1.  Raises InputError
+    and InsufficientDataError as `cluster_robust`.
+    """
+    require(kind in get_args(HCKind), f"kind must be one of {get_args(HCKind)}; got {kind!r}")
+    n = len(np.atleast_1d(e))
+    found = cluster_robust(B, e, np.arange(n), f"CR{kind[2]}")  # type: ignore[arg-type]
+    plain = kind in ("HC0", "HC1")
+    dof = np.full(len(found.dof), float(n - len(found.dof))) if plain else found.dof
+    return replace(found, kind=kind, dof=dof, description=ROW_DESCRIPTION[kind])
 
 
 def _adjusted(Qc: Array, kind: CRKind) -> tuple[Array, NDArray[np.bool_]]:

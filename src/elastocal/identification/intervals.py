@@ -8,14 +8,12 @@ from dataclasses import dataclass, replace
 from typing import Literal, get_args
 
 import numpy as np
-from scipy import optimize, sparse
+from scipy import optimize
 
 from elastocal.errors import ElastocalError, InputError, option, require
-from elastocal.identification.bootstrap import parametric_bootstrap, wild_cluster_bootstrap
 from elastocal.identification.covariance import Covariance, cluster_robust, hc, t_quantile
 from elastocal.identification.least_squares import Fit, FitProblem, fit
-from elastocal.identification.linear_solver import least_norm
-from elastocal.identification.noise_choice import NoiseFit, estimate_noise, linearised
+from elastocal.identification.noise_choice import NoiseFit
 from elastocal.identification.solve import Solution, residual_sigma
 from elastocal.identification.weighted_problem import Partition, Span, in_order, regressor
 from elastocal.units import Array
@@ -209,8 +207,8 @@ def profile_of(problem: FitProblem, found: Fit, index: int) -> Objective:
 # Standard deviations and 95 % intervals of the fitted parameters, by the method asked for.
 
 IntervalKind = Literal[
-    "auto", "classical", "hc0", "hc1", "hc2", "hc3", "hc4", "cr0", "cr1", "cr2", "cr3",
-    "wild", "bootstrap", "profile",
+    "auto", "classical", "hc0", "hc1", "hc2", "hc3", "cr0", "cr1", "cr2", "cr3",
+    "profile",
 ]  # fmt: skip
 KINDS = get_args(IntervalKind)
 LEVEL = 0.95
@@ -229,15 +227,12 @@ class Intervals:
         return self.covariance.kind
 
 
-def intervals_of(
-    solution: Solution, kind: IntervalKind, noise: NoiseFit | None, seed: int = 0, jobs: int = 1
-) -> Intervals:
+def intervals_of(solution: Solution, kind: IntervalKind, noise: NoiseFit | None) -> Intervals:
     """Intervals of the solution's fitted parameters.
 
     auto: those of the estimated noise (Kenward–Roger), where there is one, else classical, or in
     a large table with several readings per configuration cr1;
     classical: s²(BᵀW²B)⁻¹ with t (eq. 7, 13); hc…, cr…: sandwich, clusters being configurations;
-    wild: bootstrap of those; bootstrap: parametric, with the noise estimated in each draw;
     profile: of the nonlinear sum of squares.
 
     Raises InputError for a kind that the problem does not allow, InsufficientDataError where
@@ -270,13 +265,6 @@ def intervals_of(
         return by_t(_scaled(hc(B, e, kind.upper()), size))  # type: ignore[arg-type]
     if kind.startswith("cr"):
         return by_t(_scaled(cluster_robust(B, e, cluster, kind.upper()), size))  # type: ignore[arg-type]
-    if kind == "wild":
-        wild = wild_cluster_bootstrap(B, e, cluster, draws=DRAWS, seed=seed)
-        spread = _scaled(cluster_robust(B, e, cluster, "CR2"), size)
-        ci95 = x[:, None] + size[:, None] * wild.interval(LEVEL)
-        return Intervals(replace(spread, kind="wild", description=wild.description), ci95)
-    if kind == "bootstrap":
-        return _bootstrapped(solution, noise, classical, seed, jobs)
     return _profiled(solution, classical)
 
 
@@ -293,36 +281,6 @@ def _classical(solution: Solution) -> Covariance:
 def _scaled(found: Covariance, size: Array) -> Covariance:
     """From parameters in typical sizes to their own units."""
     return replace(found, matrix=found.matrix * np.outer(size, size))
-
-
-def _bootstrapped(
-    solution: Solution, noise: NoiseFit | None, classical: Covariance, seed: int, jobs: int
-) -> Intervals:
-    """Residuals drawn from the noise model, everything estimated anew on the linearised model."""
-    fit, problem = solution.fit, solution.problem
-    observed, weights = problem.observations, problem.weights
-    sigma = residual_sigma(fit, len(fit.columns))
-    readings = linearised(problem.model, observed, fit.x, fit.columns)
-    whiten = None if weights.whole is None else weights.whole.tocsc()
-
-    def draw(rng: np.random.Generator) -> Array:
-        z = sigma * rng.normal(size=len(observed.value))
-        return z if whiten is None else sparse.linalg.spsolve(whiten, z)
-
-    size = solution.sizes[fit.columns]
-    B = weights.apply(fit.B * size)
-
-    def estimate(e: Array) -> Array:
-        if noise is None:
-            return least_norm(B, weights.apply(e)) * size
-        return estimate_noise(readings.moved(e.reshape(readings.e.shape)), noise.kind).x
-
-    found = parametric_bootstrap(draw, estimate, draws=DRAWS, seed=seed, jobs=jobs)
-    x = fit.x[fit.columns]
-    around = x[:, None] + found.interval(np.zeros(len(x)), LEVEL)
-    return Intervals(
-        Covariance("bootstrap", found.covariance().matrix, classical.dof, found.description), around
-    )
 
 
 def _profiled(solution: Solution, classical: Covariance) -> Intervals:

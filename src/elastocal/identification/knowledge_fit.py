@@ -4,14 +4,13 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import dataclass, replace
-from functools import cached_property, partial
+from functools import cached_property
 
 import numpy as np
 from numpy.typing import NDArray
 from scipy import linalg, sparse, special
 
 from elastocal.errors import ElastocalError, InputError, option, require
-from elastocal.identification.bootstrap import ParametricBootstrap, parametric_bootstrap
 from elastocal.identification.constrained import (
     ActiveConstraint,
     ConstrainedFit,
@@ -32,7 +31,6 @@ from elastocal.identification.constrained_solver import (
 )
 from elastocal.identification.covariance import Covariance, t_quantile
 from elastocal.identification.intervals import (
-    DRAWS,
     LEVEL,
     Intervals,
     ProfileInterval,
@@ -170,43 +168,6 @@ def _extent(
 def _only_equalities(system: System) -> System:
     free = np.full(len(system.names), np.inf)
     return replace(system, lower=-free, upper=free, matrices=())
-
-
-# Parametric bootstrap of constrained estimates.
-
-
-def constrained_bootstrap(
-    objective: ConstrainedObjective,
-    system: System,
-    sigma: float,
-    *,
-    draws: int = 999,
-    seed: int = 0,
-    jobs: int = 1,
-) -> ParametricBootstrap:
-    """Fit B x̂ + σ·N(0, 1) again `draws` times under the same constraints (see its `interval`).
-
-    `sigma` is the standard deviation of a row.  The prior's mean is drawn anew as well, about x̂
-    with its own covariance: like the data it is an observation of the parameters, so the spread of
-    the draws is the posterior's.
-
-    Draws pile up on an active bound, whose percentile interval is then one-sided.  With the truth
-    on a bound the bootstrap is not consistent (Andrews 2000): there, prefer profile intervals.
-    """
-    best = minimise(objective, system)
-    exact = np.concatenate([objective.B @ best.x, objective.P @ best.x])
-    return parametric_bootstrap(
-        partial(_draw, exact, sigma), partial(_refit, objective, system), draws, seed, jobs
-    )
-
-
-def _draw(exact: Array, spread: float, rng: np.random.Generator) -> Array:
-    return exact + spread * rng.normal(size=len(exact))
-
-
-def _refit(objective: ConstrainedObjective, system: System, drawn: Array) -> Array:
-    rows = len(objective.y)
-    return minimise(replace(objective, y=drawn[:rows], target=drawn[rows:]), system).x
 
 
 # A constrained fit linearised at its minimum: covariance, shares of the prior, leverage.
@@ -379,7 +340,7 @@ def intervals_with_knowledge(
 
     auto: t intervals of the posterior covariance, cut off at bounds, where no inequality is
     active; else the profile of the linearised model under the constraints.  profile: that of the
-    nonlinear one.  bootstrap: parametric, on the linearised model under the constraints.
+    nonlinear one.
 
     The covariance takes equalities for exact and leaves inequalities out: knowing more than it
     says, no estimate is farther off.  `of_readings` (columns,) are the method's degrees of freedom.
@@ -393,15 +354,6 @@ def intervals_with_knowledge(
         ci95 = covariance.interval(local.x, LEVEL)
         lower, upper = local.system.lower[:, None], local.system.upper[:, None]
         return Intervals(covariance, np.clip(ci95, lower, upper))
-    if kind == "bootstrap":
-        objective = local.objective(local.B, local.e + local.B @ local.x, local.loss)
-        drawn = constrained_bootstrap(
-            objective, local.system, local.sigma, draws=DRAWS, seed=options.seed, jobs=options.jobs
-        )
-        text = f"{drawn.description}, on the linearised model under the constraints, its noise kept"
-        return Intervals(
-            Covariance("constrained bootstrap", matrix, dof, text), drawn.interval(local.x, LEVEL)
-        )
     ends = []
     plain = Covariance("t", matrix, dof, "").interval(local.x, LEVEL)
     # The prior is as wide as the noise is taken for, so that their ratio stays.

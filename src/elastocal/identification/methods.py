@@ -206,7 +206,7 @@ def run_method(
     if method in ("eq14", "eq14-residual"):
         return _published(method, every, solution, good, options, progress)
     kind = "ols" if solution.problem.weights.kind == "none" else "wls"
-    intervals = intervals_of(solution, options.intervals, None, options.seed, options.jobs)
+    intervals = intervals_of(solution, options.intervals, None)
     warnings = (COMPUTED,) if exact else ()
     return MethodResult(kind, solution, intervals, None, good, warnings=warnings)
 
@@ -339,7 +339,7 @@ def _holding(
             readings = readings.take(found.good)
         again = over_times(estimate_noise(readings, noise.kind, noise), readings)
         noise = replace(again, trials=noise.trials, reason=noise.reason, tests=noise.tests)
-    intervals = intervals_of(solution, options.intervals, noise, options.seed, options.jobs)
+    intervals = intervals_of(solution, options.intervals, noise)
     return replace(found, solution=solution, intervals=intervals, noise=noise)
 
 
@@ -380,7 +380,7 @@ def _reml(
             tests = noise.tests
             solution, noise, good = plain
             noise = replace(noise, tests=tests)  # which say what is not counted
-    intervals = intervals_of(solution, options.intervals, noise, options.seed, options.jobs)
+    intervals = intervals_of(solution, options.intervals, noise)
     return MethodResult("reml", solution, intervals, noise, good)
 
 
@@ -426,7 +426,7 @@ def _published(
     fitted = good if len(observed.lead) < len(good) else np.ones_like(good)
     solution = refined(every, start, start.fit.x, fitted, weights)
     if options.intervals != "auto":
-        own = intervals_of(solution, options.intervals, None, options.seed, options.jobs)
+        own = intervals_of(solution, options.intervals, None)
         return MethodResult(method, solution, own, None, good)
     covariance = Covariance(
         "eq13", last.covariance * np.outer(size, size), np.full(len(size), np.inf),

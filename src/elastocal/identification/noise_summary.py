@@ -169,7 +169,7 @@ class Noise:
     def intervals_by_configuration(self) -> bool:
         """Whether the intervals hold where the readings of a configuration are correlated."""
         kind = self.interval_kind.lower()
-        return kind in ("wild", "clustered") or kind.startswith("cr")
+        return kind == "clustered" or kind.startswith("cr")
 
     def to_json(self) -> dict[str, Any]:
         """JSON-ready: lengths in µm, and only what is known of a noise that was not estimated."""

@@ -22,13 +22,18 @@ Method = Literal[
 FaultyReadings = Literal["auto", "drop", "keep"]
 METHODS = get_args(Method)
 ROBUST = ("huber", "tukey", "l1", "student-t")
-WITH_KNOWLEDGE = ("auto", "bootstrap", "profile")
+WITH_KNOWLEDGE = ("auto", "profile")
 # What there was once, or is looked for by this name: what does the same.
 SUCCESSORS = {
     "method": dict.fromkeys(
         ("lts", "s", "mm"),
         "tukey, which starts from the fit of the majority and rejects what lies far from it",
     ),
+    "intervals": {
+        "wild": "cr2, which allows any correlation within a configuration as well",
+        "hc4": "hc3, which is nearly the jackknife over rows",
+        "bootstrap": "profile, which is lopsided where the model bends as well",
+    },
 }
 
 
@@ -45,8 +50,8 @@ class Options:
     `bounded`: keep parameters inside their physical bounds.  `constraints` and `prior`: a
     constrained or regularised fit on top of the method's weights (knowledge_fit).  `faulty`:
     readings beyond the noise are set apart (auto: unless they are too many to be reading errors),
-    always, or never; they are listed in the result in any case.  `seed`: of multi-start, searches
-    and bootstraps; `jobs`: processes of a bootstrap.
+    always, or never; they are listed in the result in any case.  `seed`: of multi-start and
+    searches; `jobs` has no effect, as nothing is drawn in processes.
     """
 
     method: Method = "auto"
@@ -98,7 +103,7 @@ class Options:
                 f"the method {self.resolved} takes neither constraints nor a prior; use huber, or "
                 "the default method, which sets faulty readings apart"
             )
-        valid = ("auto", "bootstrap") if self.resolved == "huber" else WITH_KNOWLEDGE
+        valid = ("auto",) if self.resolved == "huber" else WITH_KNOWLEDGE
         if self.intervals not in valid:
             raise InputError(
                 f"{option('intervals', self.intervals)} knows of neither constraints nor a prior; "

@@ -54,14 +54,6 @@ INTERVALS = {
     "clustered": (
         "robust to correlation within a configuration; they assume independent configurations"
     ),
-    "wild": (
-        "wild cluster bootstrap over configurations; assumes only that these are independent, "
-        "not equal or normal noise"
-    ),
-    "bootstrap": (
-        "parametric bootstrap: noise drawn from the model and everything estimated anew; assumes "
-        "the noise model, not that estimates are normal"
-    ),
     "profile": (
         "profile of the sum of squares, which follows the curvature of the model and may be "
         "lopsided; assumes independent normal noise"
@@ -77,10 +69,6 @@ INTERVALS = {
     "constrained profile": (
         "profile of the fit under the constraints: one-sided at a bound, and too wide rather than "
         "too narrow near one; assumes normal noise"
-    ),
-    "constrained bootstrap": (
-        "parametric bootstrap of the fit under the constraints: noise drawn from the model, its "
-        "size taken for known, and fitted anew; assumes the noise model"
     ),
     "eq7": "as published, eq. (7): equal, independent noise of the residual's size",
     "eq8": "as published, eq. (8): independent noise whose σ are taken for known",
@@ -110,7 +98,6 @@ HELD = {
     "constrained profile": (
         "Intervals keep the constraints: they stop at bounds and take equalities for exact"
     ),
-    "constrained bootstrap": "Intervals come from fits that keep the constraints too",
 }
 ROBUST = "asymptotic covariance of the robust estimate ({}); assumes independent readings"
 

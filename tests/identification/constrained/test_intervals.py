@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 from scipy import stats
 from support.calibration import binomial_band
-from support.constrained import bootstrap, profile, profiles, solve
+from support.constrained import profile, profiles, solve
 
 from elastocal.errors import InputError
 from elastocal.identification import (
@@ -126,42 +126,6 @@ def test_coverage_with_the_truth_on_two_bounds(degrees):
     held = sum(profile(columns, y, ("a", "b"), stated, "a").lower == 0.0 for y in draws)
     low, high = binomial_band(n, 0.975 - stats.chi2.sf(3.8415, 2) * (degrees - 90) / 360)
     assert low <= held <= high
-
-
-def test_bootstrap_of_an_inactive_fit_has_its_covariance():
-    y = readings(20.0, 20.0, 20.0)
-    found = bootstrap(B, y, NAMES, non_negative(*NAMES), draws=400, seed=2)
-    assert found.failures == 0
-    ratio = found.draws.var(axis=0, ddof=1) / np.diag(COFACTOR)
-    # A sample variance of 400 normal draws has a relative standard deviation of √(2/399) = 7 %.
-    np.testing.assert_allclose(ratio, 1.0, atol=4 * np.sqrt(2 / 399))
-
-
-def test_bootstrap_with_a_prior_has_the_posterior_covariance():
-    prior = GaussianPrior.independent(("a", "c"), [0.0, 0.0], STD[[0, 2]])
-    y = readings(1.0, 1.0, 1.0)
-    fit = solve(B, y, NAMES, prior=prior)
-    found = bootstrap(B, y, NAMES, Constraints(), prior=prior, draws=400, seed=4)
-    ratio = found.draws.var(axis=0, ddof=1) / np.diag(fit.cofactor)
-    np.testing.assert_allclose(ratio, 1.0, atol=4 * np.sqrt(2 / 399))
-
-
-def test_bootstrap_of_an_active_parameter_is_one_sided():
-    y = readings(-3.0, 5.0, 5.0)
-    found = bootstrap(B, y, NAMES, non_negative("a"), draws=150, seed=1)
-    fit = solve(B, y, NAMES, non_negative("a"))
-    low, high = found.interval(fit.x)[0]
-    assert low == 0.0 < high
-    assert 0.3 < np.mean(found.draws[:, 0] == 0) < 0.7  # half of the draws want it beyond
-
-
-def test_bootstrap_does_not_depend_on_the_number_of_processes():
-    y = readings(0.0, 1.0, 1.0)
-    one, two = (
-        bootstrap(B, y, NAMES, non_negative("a"), draws=20, seed=1, jobs=jobs).draws
-        for jobs in (1, 2)
-    )
-    np.testing.assert_array_equal(one, two)
 
 
 def test_a_name_that_is_no_parameter_is_refused():

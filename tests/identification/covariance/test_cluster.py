@@ -52,7 +52,7 @@ def dense_weights(B, cluster, kind):
 
 
 @pytest.mark.parametrize("kind", KINDS)
-@pytest.mark.parametrize("seed", range(4))
+@pytest.mark.parametrize("seed", range(2))
 def test_equals_dense_algebra(kind, seed):
     """Variance and dof from n × n matrices, clusters smaller and larger than p."""
     B, e, cluster = problem(seed, n=24 if seed % 2 else 60, p=4, clusters=8)
@@ -68,7 +68,7 @@ def test_equals_dense_algebra(kind, seed):
         np.testing.assert_allclose(found.matrix[j, j], variance, rtol=1e-9)
 
 
-@pytest.mark.parametrize("seed", range(3))
+@pytest.mark.parametrize("seed", range(1))
 def test_cr2_is_unbiased_under_the_working_model(seed):
     """E v_j = σ² tr(G_jᵀG_j) = σ² (BᵀB)⁻¹_jj exactly, v_j = Σ_c (G_jcᵀu)² and cov(u) = σ²I; by
     polarisation from the estimator itself: the sum of v over e = (I − H) u_i, u_i unit vectors."""
@@ -92,14 +92,43 @@ def test_equals_statsmodels(corrected):
     np.testing.assert_allclose(found.matrix, expected, rtol=1e-8)
 
 
-@pytest.mark.parametrize("kind", ["CR2", "CR3"])
+@pytest.mark.parametrize("kind", ["HC0", "HC1", "HC2", "HC3"])
 def test_singleton_clusters_are_rows(kind):
-    """CR2 and CR3 of clusters of one row are HC2 and HC3, dof included."""
+    """HC of statsmodels, with n − p degrees of freedom where leverage is not corrected."""
     B, e, _ = problem(5)
-    rows = cluster_robust(B, e, np.random.default_rng(0).permutation(len(B)), kind)
-    single = hc(B, e, {"CR2": "HC2", "CR3": "HC3"}[kind])
-    np.testing.assert_allclose(rows.matrix, single.matrix, rtol=1e-10)
-    np.testing.assert_allclose(rows.dof, single.dof, rtol=1e-10)
+    found = hc(B, e, kind)
+    fitted = sm.OLS(B @ np.arange(4.0) + e, B).fit()
+    np.testing.assert_allclose(found.matrix, getattr(fitted, f"cov_{kind}"), rtol=1e-8)
+    assert (found.dof == 36.0).all() == (kind in ("HC0", "HC1"))
+
+
+def test_dof_of_the_difference_of_two_means():
+    """HC2 of two groups is the Welch statistic; with equal variances its dof is the closed form
+    (1/m + 1/n)² / (1/(m²(m − 1)) + 1/(n²(n − 1))) (Imbens & Kolesár 2016)."""
+    m, n = 4, 19
+    B = np.column_stack([np.ones(m + n), np.arange(m + n) < m]).astype(float)
+    found = hc(B, residual(B, np.random.default_rng(3).normal(size=m + n)), "HC2")
+    welch = (1 / m + 1 / n) ** 2 / (1 / (m**2 * (m - 1)) + 1 / (n**2 * (n - 1)))
+    np.testing.assert_allclose(found.dof[1], welch, rtol=1e-10)
+
+
+def test_a_row_of_leverage_one_leaves_its_parameter_unbounded():
+    B, e, _ = problem(8)
+    B = np.column_stack([B, np.eye(len(B))[17]])
+    assert hc(B, residual(B, e), "HC2").dof[4] == 0
+    with pytest.raises(InsufficientDataError, match=r"row 17 alone .* use HC2"):
+        hc(B, residual(B, e), "HC3")
+
+
+def test_an_ill_conditioned_fit_keeps_its_digits():
+    """Columns that agree to 1e-6: BᵀB has condition 1e12.  B = A T exactly rounded, so the
+    covariance is that of A carried by T⁻¹; QR keeps 1e-9 where the normal equations keep 1e-4."""
+    A, e, _ = problem(7)
+    T = np.eye(4)
+    T[0, 1] = 2.0**20
+    inverse = 2 * np.eye(4) - T
+    expected = inverse @ hc(A, e, "HC2").matrix @ inverse.T
+    np.testing.assert_allclose(hc(A @ T, e, "HC2").std, np.sqrt(np.diag(expected)), rtol=1e-9)
 
 
 @pytest.mark.parametrize("kind", KINDS)
@@ -115,15 +144,6 @@ def test_follows_a_reparametrisation(kind):
     scaled = cluster_robust(B * units, e, cluster, kind)
     np.testing.assert_allclose(scaled.matrix * np.outer(units, units), found.matrix, rtol=1e-10)
     np.testing.assert_allclose(scaled.dof, found.dof, rtol=1e-10)
-
-
-def test_ignores_the_order_of_rows_and_the_names_of_clusters():
-    B, e, cluster = problem(8)
-    order = np.random.default_rng(9).permutation(len(B))
-    found = cluster_robust(B, e, cluster)
-    moved = cluster_robust(B[order], e[order], 1000 - 7 * cluster[order])
-    np.testing.assert_allclose(moved.matrix, found.matrix, rtol=1e-10)
-    np.testing.assert_allclose(moved.dof, found.dof, rtol=1e-10)
 
 
 def fixed_effects(seed):
@@ -192,7 +212,7 @@ def test_any_clustering_gives_a_covariance_or_says_why_not(seed, n, p, groups, k
     assert (found.dof >= 0).all() and (found.dof <= most + 1e-6).all()
 
 
-@pytest.mark.parametrize("clusters", [10, 15])
+@pytest.mark.parametrize("clusters", [10])
 def test_intervals_cover_with_correlated_clusters_of_unequal_spread(clusters):
     """2000 data sets, clusters of 6 rows with a common error and a spread that grows threefold
     with the regressor.  A right interval misses 5 %; three binomial standard deviations of 2000
