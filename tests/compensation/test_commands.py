@@ -162,28 +162,6 @@ def test_a_limit_is_kept_and_named():
     assert any("joint 3 stands at its limit" in told for told in free.warnings)
 
 
-def test_frames_say_the_same_place_in_two_ways():
-    chain, rng = kr270_chain(), np.random.default_rng(2)
-    cell = kr270_cell(EVERYWHERE)
-    arm = calibrated(chain, cell)
-    x = erring(arm.model, rng)
-    base = [arm.model.names.index(f"base.{k}") for k in ("x", "y", "z", "rx", "ry", "rz")]
-    x[base] = [1.0, -2.0, 0.5, 0.02, -0.3, 2.0]
-    arm = replace(arm, x=x)
-    R, p = Rotation.from_rotvec(x[base[3:]]).as_matrix(), x[base[:3]]
-    position, rotation = near(chain, POSTURES, rng)
-    point = tool_point(cell, "M1")
-    in_base = compensate(arm, targets_at("t", position, rotation, "base", DOWN, q=POSTURES), point)
-    in_tracker = compensate(
-        arm,
-        targets_at("t", p + position @ R.T, R @ rotation, "tracker", R @ DOWN, q=POSTURES),
-        point,
-    )
-    assert np.allclose(in_base.q, in_tracker.q, atol=1e-10)
-    assert np.allclose(in_base.uncertainty.std, in_tracker.uncertainty.std)
-    assert tool_errors(arm, in_base)[0].max() < FARTHEST
-
-
 def test_a_column_that_the_model_needs_is_asked_for():
     cell = kr270_cell(("joint_offset", "hysteresis"))
     arm = calibrated(kr270_chain(), cell)
@@ -242,17 +220,6 @@ def _places(model: Model, found, x):
         force=found.force,
     )  # fmt: skip
     return model.target_poses(rows, x)[1]
-
-
-@pytest.mark.parametrize("observe", ["deflection", "pose", "distance"])
-def test_what_was_observed_does_not_matter(observe):
-    cell = kr270_cell(("joint_compliance",), observe=observe)
-    arm = calibrated(kr270_chain(), cell)
-    targets = targets_at("t", None, None, "base", DOWN, q=POSTURES)
-    found = compensate(arm, targets, tool_point(cell, "M1"))
-    same = kr270_cell(("joint_compliance",))
-    expected = compensate(calibrated(kr270_chain(), same), targets, tool_point(same, "M1"))
-    assert found.reached.all() and np.allclose(found.q, expected.q, atol=1e-10)
 
 
 def test_what_no_marker_showed_is_told():

@@ -1,7 +1,6 @@
 """Pages that are made from the code have all of it."""
 
 import re
-from pathlib import Path
 
 import cell_keys_page
 import commands_page
@@ -15,8 +14,6 @@ from elastocal.cli.app import app
 from elastocal.model.effects import CATALOGUE
 from elastocal.model.effects.base import Effect
 from elastocal.planning.criteria import CRITERIA
-
-DOCS = Path(__file__).parents[2] / "docs"
 
 
 @pytest.fixture(scope="module")
@@ -69,28 +66,6 @@ def test_every_table_of_the_cell_file_is_on_the_page():
     for head in ("[robot]", "[model.nominal.gravity_compensator]", "[[design.test_pose]]"):
         assert f"## `{head}`" in page
     assert "| `urdf` |" in page and "| `workspace` |" in page
-
-
-def test_fences_with_a_word_of_ours_become_plain_ones():
-    import generated_pages as hook
-
-    text = (DOCS / "file-formats.md").read_text(encoding="utf-8")
-    assert "```toml workspace\n" in text
-    after = re.findall(r"^```(.*)$", hook.plain_fences(text), re.M)
-    assert len(after) == text.count("```") and set(after) <= {"", "toml", "text", "console"}
-
-
-def test_links_out_of_the_documentation_become_paths():
-    import generated_pages as hook
-
-    text = (
-        "[the study](../experiment_design/a/README.md#x), [files](file-formats.md#y), ![](../x.png)"
-    )
-    after = hook.links_inside(text, "exporting.md")
-    assert "the study (`experiment_design/a/README.md`)" in after
-    assert "[files](file-formats.md#y)" in after and "![](../x.png)" in after
-    inside = "[formats](../file-formats.md)"
-    assert hook.links_inside(inside, "explanation/chain.md") == inside
 
 
 def test_the_measured_page_is_what_the_studies_wrote():

@@ -144,21 +144,6 @@ def test_with_its_joint_correction_mujoco_does_as_well_as_elastocal(folder):
     assert error_in_mujoco(folder, "corrected.xml") > 3 * found
 
 
-@pytest.mark.parametrize("ending", ["urdf", "csv"])
-def test_rigid_files_are_fitted_to_the_loads_measured_or_the_one_asked_for(folder, ending):
-    every = export(folder, "full", f"every.{ending}")
-    one = export(folder, "full", f"loaded.{ending}", "--load", 0, 0, -1500)
-    for told in (every, one):
-        assert told["refit"]["marker_rms_after_um"] < told["refit"]["marker_rms_before_um"]
-    assert every["cannot_hold"]["forces_N"] == [[0, 0, -1500], [0, 0, 0]]
-    assert one["cannot_hold"]["force_N"] == [0, 0, -1500]
-    assert any("state --load" in warning for warning in every["warnings"])
-    assert one["refit"]["marker_rms_after_um"] < 0.7 * every["refit"]["marker_rms_after_um"]
-    assert "fitted where it was measured, under 1500 to 1500 N" in (
-        folder / f"loaded.{ending}"
-    ).read_text(encoding="utf-8")
-
-
 def test_a_joint_correction_needs_a_file_of_an_arm_and_says_so(folder):
     cell, result = folder / "full.toml", folder / "full.json"
     for out, more in (("a.yaml", "goes with urdf, mjcf, dh"), ("b.xml", "identify anew")):

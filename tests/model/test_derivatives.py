@@ -21,7 +21,7 @@ from support.robots import random_chain_urdf
 
 from elastocal.cell.arm_description import Nominal
 from elastocal.measurements import Measurements, with_moves
-from elastocal.model import Model, manipulator, observe, read_urdf
+from elastocal.model import Model, observe, read_urdf
 from elastocal.model.effects import CATALOGUE
 from elastocal.model.observations import COMPONENTS
 
@@ -273,18 +273,3 @@ def test_of_chains_with_sliding_joints(
         Model.assembled(chain, cell), random_table(chain, 3, seed, force=np.array([300, -200, 500]))
     )
     assert largest_excess(c, range(len(c.x))) <= 1
-
-
-@pytest.mark.parametrize(
-    "observed, deflection_model", [("position", "equilibrium"), ("distance", "linear")]
-)
-def test_predictions_at_several_values_are_those_at_each(
-    observed: str, deflection_model: str, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    """Together, in blocks of two, with rows that share a state of the arm."""
-    c = everything(observed, deflection_model)
-    monkeypatch.setattr(manipulator, "CHUNK", 2 * len(c.table))
-    several = c.x + 0.1 * c.sizes * np.random.default_rng(2).uniform(-1, 1, (3, len(c.x)))
-    found = c.model.predict(c.table, several)
-    expected = [c.model.predict(c.table, x) for x in several]
-    np.testing.assert_allclose(found, expected, rtol=1e-12, atol=1e-14)

@@ -182,24 +182,6 @@ def test_every_reading_has_a_stop_and_every_move_is_free(name: str) -> None:
 
 
 @pytest.mark.parametrize("name", ALL)
-def test_the_levels_have_their_shares(name: str) -> None:
-    plan, _, _ = planned(name)
-    spec = plan.model.cell.design
-    counts = np.bincount(plan.group)
-    if not spec.levels:
-        assert counts.tolist() == [spec.poses]
-        return
-    ((joint, levels),) = spec.levels.items()
-    assert plan.level_joint == joint
-    assert (plan.q[:, int(joint[-1]) - 1] == np.array(levels)[plan.group]).all()
-    if spec.per_level:
-        assert counts.tolist() == list(spec.per_level)
-    else:
-        assert counts.sum() == spec.poses
-        assert np.ptp(counts) <= 1
-
-
-@pytest.mark.parametrize("name", ALL)
 def test_the_value_is_that_of_the_poses_and_no_less_than_its_bound(name: str) -> None:
     plan, setup, _ = planned(name)
     value = setup.value(plan.q, plan.load)
@@ -226,16 +208,6 @@ def test_what_is_predicted_is_the_inverse_of_the_information(name: str) -> None:
     assert np.allclose([p.std for p in plan.predicted], std, rtol=1e-5)
     assert all(r.loss >= 1 - 1e-9 for r in plan.reasons)
     assert len(plan.reasons) == len(plan.q)
-
-
-def test_the_same_seed_gives_the_same_plan_and_another_another() -> None:
-    first, again, other = (
-        design(plan_cell(loads=DOWN[None], poses=5, candidates=60), DesignOptions("quick", seed))
-        for seed in (3, 3, 4)
-    )
-    assert np.array_equal(first.q, again.q)
-    assert first.to_json() == again.to_json()
-    assert not np.array_equal(first.q, other.q)
 
 
 @pytest.mark.long
@@ -270,15 +242,6 @@ def test_normal_effort_polishes_off_the_pool_and_stays_inside_the_rules(
 
 
 # --- what the cell says and the plan heeds -----------------------------------------------------
-
-
-def test_measured_torques_are_computed_for_poses_to_come_and_it_is_said() -> None:
-    cell = plan_cell(loads=DOWN[None], poses=5, candidates=60)
-    own = replace(cell, model=replace(cell.model, torque="measured"))
-    plan, usual = design(own, DesignOptions("quick")), design(cell, DesignOptions("quick"))
-    assert [w for w in plan.warnings if "torques" in w]
-    assert plan.value == usual.value
-    assert np.array_equal(plan.q, usual.q)
 
 
 def test_test_poses_are_where_the_plan_makes_position_certain(

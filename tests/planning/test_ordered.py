@@ -12,7 +12,6 @@ from support.cells import DOWN, kr270_chain, random_poses
 from support.design_cells import all_loads, plan_cell, setup_of
 
 from elastocal.planning import Certificate, Feasibility, Selection, Unreachable, ordered
-from elastocal.planning.arrangement import MOST_REPLACED
 
 CHAIN = kr270_chain()
 CELL = plan_cell(("joint_compliance",), loads=DOWN[None])
@@ -63,14 +62,6 @@ def test_unreachable_poses_are_replaced_and_the_bound_still_holds() -> None:
     assert c.efficiency_pool == pytest.approx(c.bound_pool / after.value)
     assert c.efficiency_continuum == pytest.approx(found.certificate.bound_continuum / after.value)
     assert len(told) == 1 and "left out" in told[0]
-
-
-def test_a_cell_without_any_free_move_is_said_to_be_one() -> None:
-    setup, found = selection()
-    pool = found.pool.take(np.arange(len(found.pool)))
-    assert len(pool) > MOST_REPLACED
-    with pytest.raises(Unreachable, match="cannot be reached"):
-        ordered(setup, replace(found, pool=pool), SHARES, walled(-np.inf), 0, lambda text: None)
 
 
 def test_where_no_other_candidates_are_left_the_poses_are_named() -> None:

@@ -3,22 +3,17 @@
 from __future__ import annotations
 
 from dataclasses import replace
-from functools import lru_cache
-from pathlib import Path
 
 import numpy as np
 import pytest
 from planning.feasibility.small_cells import NOTHING, gantry_at, gantry_rules, sphere
 from planning.test_information import AXIS, cell_for, gathered, information_of, relative
 from support.cells import DOWN, TABLE_2
-from support.design_cells import plan_cell
 
 import elastocal as ec
 from elastocal.cell.arm_description import Tool, Tracker
-from elastocal.cell.plan_wishes import Motion
 from elastocal.cell.workspace_rules import Visibility, Workspace
 from elastocal.model import observe
-from elastocal.planning import Plan
 from elastocal.planning.information import ALL_LOADS, observed_weights
 
 STATES = np.array([[0.0, 0, 0], DOWN])
@@ -61,29 +56,3 @@ def test_information_is_that_of_the_readings_that_are_made(observed: str, tau: f
     read = observe(part.rows(Q, load, x).take(seen.reshape(-1)), observed)
     B = observed_weights(model, read, x).apply(model.regressor(read.table, x, None, read).B)
     assert relative(gathered(part, Q), B.T @ B) < 1e-9
-
-
-@lru_cache
-def planned() -> Plan:
-    """Reflectors on three sides of the tool, of which at most two are seen at a time."""
-    still = Motion(extra_time=0.0)
-    cell = plan_cell(loads=DOWN[None], poses=6, candidates=60, criterion="D", motion=still)
-    axes = {"M1": [1.0, 0, 0], "M2": [0, 1.0, 0], "M3": [-0.5, -0.5, 0.7]}
-    normals = {name: np.array(axis) for name, axis in axes.items()}
-    sight = Visibility(normals, np.radians(60), line_of_sight=False, min_markers=1)
-    return ec.design(replace(cell, workspace=Workspace(visibility=sight)), effort="quick")
-
-
-def test_a_plan_names_the_markers_and_its_readings_are_identified(tmp_path: Path) -> None:
-    plan = planned()
-    assert plan.seen is not None and plan.seen.any(axis=2).all() and not plan.seen.all()
-    plan.save(tmp_path / "plan.csv")
-    rows = plan.model.read_plan(tmp_path / "plan.csv")
-    assert len(rows) == plan.seen.all(axis=1).sum()
-    assert np.array_equal(rows.marker, plan.table().marker)
-    data = ec.simulate(plan.model, tmp_path / "plan.csv", load=DOWN, seed=1)
-    assert len(data) == 2 * len(rows)
-    found = ec.identify(plan.model, data, method="wls", weights="axis")
-    # The stated noise, where identification takes what the residuals say of it.
-    ratio = [found[p.name].std / p.std for p in plan.predicted]
-    assert np.ptp(ratio) < 0.01 and 0.5 < np.mean(ratio) < 1.5

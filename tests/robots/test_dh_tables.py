@@ -52,40 +52,6 @@ def test_a_sign_turns_a_joint_against_its_axis(tmp_path):
     assert code == 2 and "write 1, or -1" in err
 
 
-def factory_table(tilts=(5e-4, 3.7e-4)):
-    """Rows of a UR whose axes 2 to 4 are nearly parallel, with d of hundreds of metres."""
-    d2, d3 = 300.0, -700.0
-    rows = [
-        (0.0, 0.15, 0.0, np.pi / 2), (0.3, d2, -0.4, tilts[0]), (-0.5, d3, -0.35, tilts[1]),
-        (0.2, 0.1 - d2 - d3, 0.0, np.pi / 2), (0.0, 0.09, 0.0, -np.pi / 2), (0.0, 0.08, 0.0, 0.0),
-    ]  # fmt: skip
-    return "".join(",".join(map(repr, map(float, row))) + "\n" for row in rows)
-
-
-def test_d_of_hundreds_of_metres_that_cancel_are_an_arm(tmp_path):
-    header = "theta0_rad,d_m,a_m,alpha_rad"
-    rows = factory_table()
-    path = write(tmp_path, header, rows)
-    code, out, err = told_by_init(path)
-    assert code == 0, err
-    assert "nearly parallel axes, up to 700 m, cancel" in out
-    chain = ec.Model(str(tmp_path / "cell.toml")).chain
-    assert max(np.linalg.norm(j.placement[:3, 3]) for j in chain.joints) < 1.0
-    for q in np.random.default_rng(1).uniform(-3, 3, (5, 6)):
-        T = np.eye(4)
-        for row, angle in zip(rows.split(), q, strict=True):
-            theta, d, a, alpha = map(float, row.split(","))
-            c, s = np.cos(theta + angle), np.sin(theta + angle)
-            ca, sa = np.cos(alpha), np.sin(alpha)
-            T = T @ [[c, -s * ca, s * sa, a * c], [s, c * ca, -c * sa, a * s], [0, sa, ca, d],
-                     [0, 0, 0, 1]]  # fmt: skip
-        assert np.abs(nominal_flanges(chain, q[None])[0] - T).max() < 1e-11
-    as_radians = KR6.replace("-90", "-1.57").replace("90", "1.57")
-    for rows in (as_radians, as_radians.replace("450", "45").replace("41", "4.1")):
-        code, _, err = told_by_init(write(tmp_path, header, rows, "m.csv"))
-        assert code == 2 and "_mm" in err and "millimetres" in err
-
-
 CALIBRATION = """\
 [mounting]
 delta_theta = [ -8.2e-05, -0.10361, 0.67363, -0.57017, -4.6e-05, 9.7e-07]

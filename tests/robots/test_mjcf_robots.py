@@ -113,13 +113,6 @@ def test_a_missing_mesh_is_named_and_only_its_bodies_lose_their_mass(tmp_path):
     assert [body.mass for body in chain.masses][-1] == 4.0
 
 
-def test_mujoco_warns_in_the_words_of_the_tool(tmp_path, recwarn):
-    path = arm(tmp_path, compiler='angle="radian" settotalmass="30"')
-    code, out, err = told_by_init(path)
-    assert code == 0 and "Note: MuJoCo warns: " in out and "UserWarning" not in out + err
-    assert not [one for one in recwarn if "settotalmass" in str(one.message)]
-
-
 @pytest.mark.parametrize(
     ("parts", "told"),
     [
@@ -131,19 +124,3 @@ def test_mujoco_warns_in_the_words_of_the_tool(tmp_path, recwarn):
 def test_units_that_cannot_be_meant_are_told(parts, told, tmp_path):
     code, out, err = told_by_init(arm(tmp_path, **parts))
     assert told in out + err and (code == 2) == (told not in out)
-
-
-def test_the_palm_is_the_flange_where_the_thumb_has_more_joints(tmp_path):
-    def finger(name, joints):
-        if not joints:
-            return ""
-        return (
-            f'<body name="{name}{joints}"><inertial pos="0 0 0" mass="0.1" diaginertia="1 1 1"/>'
-            f'<joint name="{name}{joints}" axis="0 1 0" range="0 1"/>{finger(name, joints - 1)}'
-            "</body>"
-        )
-
-    fingers = finger("thumb", 3) + finger("index", 2) + finger("ring", 2)
-    hand = f'<body name="palm" pos="0.1 0 0">{fingers}</body>'
-    code, out, err = told_by_init(arm(tmp_path, at_end=hand))
-    assert code == 0 and "6 joints (j1, " in out and "looks like a jaw" not in out, err

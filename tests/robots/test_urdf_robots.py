@@ -1,14 +1,10 @@
 """URDFs as they are found: grippers, mounts, limits, names, and what is no URDF at all."""
 
-import re
-
 import numpy as np
 import pytest
 from support.robot_files import frame, slide, told_by_init, urdf
-from typer.testing import CliRunner
 
 import elastocal as ec
-from elastocal.cli.app import app
 
 
 def write(tmp_path, text, name="arm.urdf", encoding="utf-8"):
@@ -145,24 +141,6 @@ def test_names_of_the_file_may_be_used_and_a_clash_is_no_shift(tmp_path):
     assert set(model("linear_axis_mm = [0, 100]").cell.limits) == {"joint1"}
     with pytest.raises(ec.ElastocalError, match="names joint7, but robot"):
         model("joint7_deg = [-10, 20]", 'joint_names = "file"')
-
-
-def test_the_names_of_the_file_are_shown_and_a_new_mjcf_keeps_them(tmp_path):
-    write(tmp_path, urdf(RAIL, name="joint{}"))
-    assert told_by_init(tmp_path / "arm.urdf")[0] == 0
-    cell = str(tmp_path / "cell.toml")
-    model = ec.Model(cell)
-    data = ec.simulate(model, np.random.default_rng(0).uniform(-1, 1, (25, 7)), draw=1.0)
-    fit = ec.identify(model, data)
-    names = ["linear_axis", *(f"joint{i}" for i in range(1, 7))]
-    assert fit.to_json()["joints"] == names
-    assert "joint1 = linear_axis, joint2 = joint1" in str(fit)
-    fit.save(tmp_path / "result.json")
-    fit.arm.save(tmp_path / "out.xml")
-    text = (tmp_path / "out.xml").read_text()
-    assert [n for n in re.findall(r'<position name="(.*?)"', text)] == names
-    done = CliRunner().invoke(app, ["effects", cell])
-    assert "Joints: joint1 = linear_axis" in done.stdout
 
 
 def test_a_cell_that_leaves_the_flange_open_is_told_what_init_takes(tmp_path):

@@ -2,13 +2,11 @@
 
 import re
 
-import numpy as np
 from planning.feasibility.small_cells import (
     DOWN,
     KR270_CHAIN,
     NOTHING,
     box,
-    cell,
     freed_by,
     kr270_poses,
     sphere,
@@ -16,7 +14,6 @@ from planning.feasibility.small_cells import (
 from planning.feasibility.test_margins_of_pairs import kr270_cell
 from planning.feasibility.test_single_rules import full_cell
 
-from elastocal.cell.workspace_rules import CarriedBody, HalfSpace, Workspace
 from elastocal.planning import Feasibility
 
 
@@ -45,15 +42,3 @@ def test_an_obstacle_that_swallows_the_robot_is_named():
     assert "'obstacle'" in text and "link1 and pallet" in text
     assert '["link1", "pallet"]' in text and "[workspace] ignored_pairs" in text
     assert ("link1", "pallet") in rules.always_in_contact
-
-
-def test_two_rules_that_both_stop_everything_are_named_together():
-    both = Workspace(
-        bodies=(CarriedBody(sphere("tool", 0.1, (0, 0, 0))),),
-        keep_out=(HalfSpace("people", np.array([9.0, 0, 0]), np.array([1.0, 0, 0])),),
-        obstacles=(sphere("cave", 9.0, (0, 0, 0)),),
-    )
-    _, verdict, text = advised(cell(both), kr270_poses(50))
-    assert freed_by(verdict) == {"joint_limits": 0, "keep_out": 0, "obstacle": 0}
-    assert "relax 'keep_out' and 'obstacle', which stop 50 of them" in text
-    assert "tool and people (50)" in text and "tool and cave (50)" in text

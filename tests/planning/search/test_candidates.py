@@ -23,15 +23,6 @@ CLUTTER = Workspace(
 )
 
 
-def test_same_seed_same_candidates_whatever_the_jobs(case: Build) -> None:
-    arm = case(CLUTTER)
-    one, again, two = arm.draw(1500, 3), arm.draw(1500, 3), arm.draw(1500, 3, jobs=2)
-    for name in ("q", "load", "group", "tried", "feasible", "removed_by"):
-        np.testing.assert_array_equal(getattr(one, name), getattr(again, name))
-        np.testing.assert_array_equal(getattr(one, name), getattr(two, name))
-    assert not np.array_equal(one.q, arm.draw(1500, 4).q)
-
-
 def test_levels_are_held_and_equally_many(case: Build) -> None:
     levels = (-1.5, 0.1, -0.7)
     found = case(CLUTTER, {"levels": {"joint2": levels}}).draw(900)
