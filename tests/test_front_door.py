@@ -439,3 +439,27 @@ def test_progress_is_told(model):
 def test_unknown_keywords_are_an_error_of_python(model):
     with pytest.raises(TypeError, match="methd"):
         ec.identify(model, "data.csv", methd="ols")
+
+
+def test_what_a_user_guesses(tmp_path):
+    """A data frame for a table, pickles, and the words that other libraries have for a fit."""
+    import pickle
+
+    import pandas as pd
+
+    run_demo(tmp_path)
+    model = ec.Model(tmp_path / "cell.toml")
+    frame = pd.read_csv(tmp_path / "data.csv", comment="#")
+    fit = ec.identify(model, frame)
+    again = pickle.loads(pickle.dumps(fit))
+    assert again.params == fit.params == dict(zip(model.names, fit.x, strict=True))
+    assert np.array_equal(again.model.B(model.read(frame), fit.x), fit.B)
+    assert fit == fit and fit != again and len({fit, again}) == 2
+    assert (
+        fit.residuals.shape == (270, 3) and fit.to_dict()["schema"] == "elastocal/identification/1"
+    )
+    assert fit.summary() == str(fit)
+    q = model.read_plan(tmp_path / "plan.csv").q
+    assert fit.predict(q, [0, 0, -2600]).shape == (len(q), 3)
+    with pytest.raises(ec.InputError, match="DataFrame"):
+        model.read(frame.drop(columns="q1_deg"))

@@ -55,6 +55,10 @@ class Result(Saved):
         """The result as the command line prints it: tables and sentences."""
         return str(_view(self).text(self))
 
+    def summary(self) -> str:
+        """The same text."""
+        return str(self)
+
     def _repr_html_(self) -> str:
         """The result as HTML, which notebooks show of themselves; text of the user is escaped."""
         return str(_view(self).html(self))

@@ -123,7 +123,7 @@ KINDS: dict[str, tuple[str, Check]] = {
 CLASSES = {"a path"}  # words for what a function tells apart itself
 ALIASES = {
     "AnyModel": "Model | Cell | str | Path",
-    "Table": "Measurements | str | Path",
+    "Table": "Measurements | str | Path | DataFrame",
     "Prior": "Mapping | GaussianPrior",
     **dict.fromkeys(
         ("Effort", "Method", "WeightKind", "IntervalKind", "FaultyReadings", "Convention"), "str"

@@ -65,7 +65,7 @@ LARGEST_EXACT_INTEGER = 2.0**53
 AT_A_TIME = 50_000  # rows
 
 
-@dataclass(frozen=True, repr=False)
+@dataclass(frozen=True, repr=False, eq=False)
 class Measurements(Result):
     """n rows: one per pose, load state, repeat and marker.
 

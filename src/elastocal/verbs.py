@@ -27,6 +27,8 @@ from elastocal.model.manipulator import Model
 from elastocal.text import quoted
 
 if TYPE_CHECKING:
+    from pandas import DataFrame
+
     from elastocal.compensation.compensate import Compensation
     from elastocal.compensation.targets import Targets
     from elastocal.diagnosis.diagnosis import Diagnosis
@@ -42,7 +44,7 @@ if TYPE_CHECKING:
 # One verb should not load another: each imports the package that it calls.
 
 AnyModel: TypeAlias = Model | Cell | str | Path
-Table: TypeAlias = Measurements | str | Path
+Table: TypeAlias = "Measurements | str | Path | DataFrame"
 Prior: TypeAlias = "Mapping[str, Mapping[str, float]] | GaussianPrior"
 Progress: TypeAlias = Callable[[str], None]
 T = TypeVar("T")
@@ -724,7 +726,7 @@ def _checked_cell(given: Any) -> Cell | str | Path:
 def _table(name: str, model: Model, given: Table) -> Measurements:
     if isinstance(given, Measurements):
         return given
-    if isinstance(given, str | Path):
+    if isinstance(given, str | Path) or hasattr(given, "to_csv"):
         return model.read(given)
     raise InputError(
         f"{option(name)} takes measurements (Model.read, Model.table) or the path of their table; "

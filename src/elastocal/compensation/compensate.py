@@ -31,7 +31,7 @@ from elastocal.units import Array, IntArray
 REACHED, LIMIT, NO_EQUILIBRIUM, NOT_REACHED = "reached", "limit", "no equilibrium", "not reached"
 
 
-@dataclass(frozen=True, repr=False)
+@dataclass(frozen=True, repr=False, eq=False)
 class Compensation(Result):
     """Commands that put the tool at n targets.
 

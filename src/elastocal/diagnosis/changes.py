@@ -64,7 +64,7 @@ class ParameterChange:
     combined_with: tuple[str, ...] = ()
 
 
-@dataclass(frozen=True, repr=False)
+@dataclass(frozen=True, repr=False, eq=False)
 class Comparison(Result):
     """What has changed between two calibrations of one arm.
 

@@ -318,7 +318,7 @@ class NoiseFloor:
     drift: float = 0.0
 
 
-@dataclass(frozen=True, repr=False)
+@dataclass(frozen=True, repr=False, eq=False)
 class Diagnosis(Result):
     """Why the real arm still differs from the model.
 

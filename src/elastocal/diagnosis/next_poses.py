@@ -43,7 +43,7 @@ CRITERION = RobustError.name
 NextVerdict = Literal["measure", "enough", "no_gain"]
 
 
-@dataclass(frozen=True, repr=False)
+@dataclass(frozen=True, repr=False, eq=False)
 class NextPoses(Result):
     """The next poses to measure, or why none are needed.
 

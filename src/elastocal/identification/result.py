@@ -226,7 +226,7 @@ class Verdict:
         }  # fmt: skip
 
 
-@dataclass(frozen=True, repr=False)
+@dataclass(frozen=True, repr=False, eq=False)
 class Calibration(Result):
     """What `identify` found: a mapping from parameter names to `Estimate`s, and all around it.
 
@@ -594,6 +594,24 @@ class Calibration(Result):
         table = model.table(q, load)
         scatter = scatter_of(self.noise, model.chain.n_joints)
         return position_at(tool, table, table.q, scatter, self.spread)
+
+    def predict(self, q: ArrayLike, load: ArrayLike | None = None) -> Array:
+        """Where the tool is at any pose, (n, 3) in m: `position` without its uncertainty."""
+        return self.position(q, load).position
+
+    @property
+    def params(self) -> dict[str, float]:
+        """The values that the model uses, by parameter, in SI units."""
+        return dict(zip(self.model.names, self.x.tolist(), strict=True))
+
+    @property
+    def residuals(self) -> Array:
+        """Observed minus predicted (observations, components), in m (rad)."""
+        return self.residual.reshape(-1, self.observations.size)
+
+    def to_dict(self) -> dict[str, Any]:
+        """The result as the dictionary that `save` writes as JSON."""
+        return self.to_json()
 
     def combination(self, first: str) -> Combination:
         """The combination whose first member is `first`; UnknownNameError where there is none."""

@@ -90,7 +90,7 @@ class MeasuredVisits:
         }
 
 
-@dataclass(frozen=True, repr=False)
+@dataclass(frozen=True, repr=False, eq=False)
 class CalibratedArm(Saved):
     """A calibrated arm: a model and the parameter values that it predicts with.
 

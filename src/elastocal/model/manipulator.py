@@ -6,6 +6,7 @@ from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property
 from pathlib import Path
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
@@ -27,6 +28,9 @@ from elastocal.model.observations import Observations, observe
 from elastocal.model.symbolic import SymbolicArm
 from elastocal.text import listed
 from elastocal.units import Array
+
+if TYPE_CHECKING:
+    from pandas import DataFrame
 
 
 @dataclass(frozen=True)
@@ -119,10 +123,15 @@ class Model:
     def _assemble(
         self, chain: Chain, cell: Cell, extra: Sequence[tuple[Effect, str]], backend: str | None
     ) -> None:
-        self.chain, self.cell = chain, cell
+        self.chain, self.cell, self._extra = chain, cell, tuple(extra)
         self.observe = cell.model.observe
         self._symbolic = SymbolicArm(chain, cell, extra, backend)
         self.parameters: tuple[Parameter, ...] = self._symbolic.parameters
+
+    def __reduce__(self) -> tuple[Any, ...]:
+        """Pickled by what it is made of; another process derives the functions again."""
+        made_of = self.chain, self.cell, self._extra, self._symbolic.backend
+        return _again, (*made_of, self._markers_stated)
 
     def __repr__(self) -> str:
         effects = listed(dict.fromkeys(p.effect for p in self.parameters), 6) or "no effect"
@@ -132,8 +141,8 @@ class Model:
         )
 
     @checked_arguments
-    def read(self, path: str | Path) -> Measurements:
-        """The measurements of a CSV or Parquet file, in SI units.
+    def read(self, path: str | Path | DataFrame) -> Measurements:
+        """The measurements of a CSV or Parquet file or a pandas data frame, in SI units.
 
         Args:
             path: The table; its columns are those that the model observes, units stand in the
@@ -148,9 +157,13 @@ class Model:
             (540, (540, 6), ('M1', 'M2', 'M3'))
         """
         markers = tuple(self.cell.tool.markers) if self._markers_stated else ()
+        source, text = path, None
+        if not isinstance(path, str | Path):
+            source, text = "DataFrame", path.to_csv(index=False)
         return read_measurements(
-            path, joint_kinds=self.chain.kinds, marker_names=markers, observe=self.observe
-        )
+            source, joint_kinds=self.chain.kinds, marker_names=markers, observe=self.observe,
+            text=text,
+        )  # fmt: skip
 
     @checked_arguments
     def read_plan(self, path: str | Path) -> Measurements:
@@ -452,6 +465,15 @@ class Model:
         x = self._at(x)
         inputs = row_inputs(self._symbolic.arm, table)
         return self._symbolic.function("frames")(*inputs, x, self._settle(inputs, x))
+
+
+def _again(
+    chain: Chain, cell: Cell, extra: Sequence[tuple[Effect, str]], backend: str | None,
+    markers_stated: bool,
+) -> Model:  # fmt: skip
+    model = Model.assembled(chain, cell, extra, backend)
+    model._markers_stated = markers_stated
+    return model
 
 
 def check_equilibrium(table: Measurements, predicted: Array) -> None:

@@ -497,7 +497,7 @@ class TimedSize:
     value: float
 
 
-@dataclass(frozen=True, repr=False)
+@dataclass(frozen=True, repr=False, eq=False)
 class Plan(Result):
     """A measurement plan: poses in their order, what they promise, how far from the best they are.
 
