@@ -11,8 +11,9 @@ import numpy as np
 
 from elastocal.cell.work_cell import read_cell
 from elastocal.measurements import Measurements
-from elastocal.model import Model, finite_ranges, joint_limits
-from elastocal.model.effects import CATALOGUE
+from elastocal.model.chain import finite_ranges, joint_limits
+from elastocal.model.effects.catalogue import CATALOGUE
+from elastocal.model.manipulator import Model
 
 GEOMETRY = ("base_frame", "joint_offset", "link_geometry", "marker_position")
 LOAD_N = (0.0, 0.0, -2600.0)

@@ -24,10 +24,11 @@ import numpy as np
 from peer_kr270 import Arm, evolved, prepared
 from peer_tools import ONE_THREAD, Row, Seconds, peer, required, seconds_of, starts, table, timed
 
-from elastocal.planning import DesignProblem, DeterminantCriterion, relax, round_weights
-from elastocal.planning.exact_plan import exact_plan
+from elastocal.planning.criteria import DeterminantCriterion
+from elastocal.planning.exact_plan import exact_plan, round_weights
 from elastocal.planning.polish import polish
-from elastocal.planning.selection import exchange
+from elastocal.planning.relaxation import relax
+from elastocal.planning.selection import DesignProblem, exchange
 
 SEED = 1
 POOL, POSES = 1000, 30  # of the UR10

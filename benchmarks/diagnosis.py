@@ -18,7 +18,8 @@ from bench_clock import Ran, elastocal
 from bench_part import HERE, Part, Table, run_alone
 
 from elastocal.cell.work_cell import read_cell
-from elastocal.model import Model, joint_limits
+from elastocal.model.chain import joint_limits
+from elastocal.model.manipulator import Model
 
 EXAMPLE = HERE.parent / "experiment_design" / "blind_diagnosis" / "example"
 ROWS = {"tiny": (), "short": (10_000,), "full": (3000, 10_000, 100_000)}

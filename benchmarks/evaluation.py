@@ -27,7 +27,9 @@ from bench_part import Part, Table, run_alone
 from evaluation_numpy import NumpyRegressor
 from evaluation_rivals import BareC, Mapped, buffered_loop, function_of, python_loop
 
-from elastocal.model import BatchFunction, Model, row_inputs
+from elastocal.model.arm import row_inputs
+from elastocal.model.evaluate import BatchFunction
+from elastocal.model.manipulator import Model
 
 ROWS = {"tiny": (300, 2000), "short": (300, 10_000, 100_000, 1_000_000)}
 ROWS["full"] = ROWS["short"]

@@ -10,7 +10,7 @@ from __future__ import annotations
 import numpy as np
 from numpy.typing import NDArray
 
-from elastocal.model import Model
+from elastocal.model.manipulator import Model
 
 Array = NDArray[np.float64]
 CHUNK = 4096  # rows at a time: the quickest of 1024 to 65 536

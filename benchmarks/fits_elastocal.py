@@ -20,12 +20,16 @@ with clock.step("import"):
 
     import numpy as np
 
-    # What reading would import when first called.
-    from elastocal.identification import Options, Problem, Weights, sizes_and_check, start_values
     from elastocal.identification.identify import identify
-    from elastocal.identification.solve import settle
+
+    # What reading would import when first called.
+    from elastocal.identification.options import Options
+    from elastocal.identification.solve import Problem, settle, sizes_and_check
+    from elastocal.identification.start import start_values
+    from elastocal.identification.weighted_problem import Weights
     from elastocal.measurements import Measurements
-    from elastocal.model import Model, observe
+    from elastocal.model.manipulator import Model
+    from elastocal.model.observations import observe
 
 
 def plain(model: Model, table: Measurements) -> tuple[np.ndarray, int]:

@@ -23,12 +23,13 @@ from typing import Any
 import numpy as np
 
 from elastocal.cell.work_cell import read_cell
-from elastocal.identification import Calibration
 from elastocal.identification import weighted_problem as partition
 from elastocal.identification.identify import identify
+from elastocal.identification.result import Calibration
 from elastocal.measurements import Measurements, read_measurements, write_measurements
-from elastocal.model import Model, joint_limits
-from elastocal.model.effects import CATALOGUE
+from elastocal.model.chain import joint_limits
+from elastocal.model.effects.catalogue import CATALOGUE
+from elastocal.model.manipulator import Model
 from elastocal.simulation.simulate import simulate
 
 GEOMETRY = ("base_frame", "joint_offset", "link_geometry", "marker_position")

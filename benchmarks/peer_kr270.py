@@ -12,21 +12,15 @@ from numpy.typing import NDArray
 from scipy.optimize import differential_evolution
 
 from elastocal.cell.work_cell import read_cell
-from elastocal.model import Model
-from elastocal.model.effects import CATALOGUE
-from elastocal.planning import (
-    DesignProblem,
-    Feasibility,
-    FeasiblePool,
-    Known,
-    Searches,
-    Setup,
-    TraceCriterion,
-    draw,
-    joint_space,
-    load_states,
-    set_up,
-)
+from elastocal.model.effects.catalogue import CATALOGUE
+from elastocal.model.manipulator import Model
+from elastocal.planning.candidates import draw, joint_space
+from elastocal.planning.criteria import TraceCriterion
+from elastocal.planning.feasibility import Feasibility
+from elastocal.planning.information import load_states
+from elastocal.planning.polish import Searches
+from elastocal.planning.selection import DesignProblem
+from elastocal.planning.setup import FeasiblePool, Known, Setup, set_up
 from elastocal.planning.test_poses import test_poses
 
 Array = NDArray[np.float64]

@@ -23,10 +23,10 @@ from bench_clock import exponent, own
 from bench_part import Part, Table, run_alone
 
 from elastocal.errors import ElastocalError
-from elastocal.identification import Options
 from elastocal.identification.identify import identify
+from elastocal.identification.options import Options
 from elastocal.measurements import Measurements
-from elastocal.model import Model
+from elastocal.model.manipulator import Model
 from elastocal.simulation.simulate import simulate
 
 ROWS = {

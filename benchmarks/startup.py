@@ -63,7 +63,7 @@ def child() -> None:
     """Seconds of building the arm, imports apart, and of the first and second B of 60 poses."""
     from bench_arms import GEOMETRY, kr270, poses
 
-    from elastocal.model.effects import CATALOGUE
+    from elastocal.model.effects.catalogue import CATALOGUE
 
     clock = time.process_time
     with tempfile.TemporaryDirectory() as folder:

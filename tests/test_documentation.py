@@ -10,9 +10,9 @@ import typer
 from support.robots import KR270
 
 from elastocal.cell.work_cell import read_cell
-from elastocal.cli.app import app
-from elastocal.model import Model
-from elastocal.model.effects import CATALOGUE
+from elastocal.cli.main import app
+from elastocal.model.effects.catalogue import CATALOGUE
+from elastocal.model.manipulator import Model
 
 ROOT = Path(__file__).parents[1]
 DOCS = ROOT / "docs"

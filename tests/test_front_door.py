@@ -15,12 +15,12 @@ from typer.testing import CliRunner
 
 import elastocal as ec
 from elastocal.cell.plan_wishes import DesignSpec
-from elastocal.cli.app import app
-from elastocal.demo import LOAD_N, run_demo
-from elastocal.diagnosis import DiagnosisOptions
+from elastocal.cli.main import app
+from elastocal.demo.example import LOAD_N, run_demo
+from elastocal.diagnosis.diagnose import DiagnosisOptions
 from elastocal.errors import option, options_as_flags
-from elastocal.identification import Options
-from elastocal.planning import DesignOptions
+from elastocal.identification.options import Options
+from elastocal.planning.design import DesignOptions
 from elastocal.report.notebook import VIEWS
 from elastocal.report.page import PAGES
 from elastocal.saving import WRITERS

@@ -11,7 +11,7 @@ import pytest
 from typer.testing import CliRunner
 
 from elastocal.cell.work_cell import read_cell
-from elastocal.cli.app import app
+from elastocal.cli.main import app
 from elastocal.compensation.targets import read_targets
 from elastocal.errors import ElastocalError
 from elastocal.files import read_json

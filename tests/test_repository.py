@@ -290,9 +290,22 @@ def test_nobody_within_goes_by_the_front_door() -> None:
         for node in nodes(path)
         if isinstance(node, ast.ImportFrom) and node.module == "elastocal"
         for alias in node.names
-        if alias.name not in ("__version__", "loaded_on_demand", *map(unit, MODULES))
+        if alias.name not in ("__version__", *map(unit, MODULES))
     }
     assert not taken
+
+
+def test_only_the_door_exports() -> None:
+    """Every other package holds its docstring alone: a name is had from its module."""
+    doors = {SOURCE / "__init__.py"}
+    told = {
+        str(path.relative_to(SOURCE))
+        for path in sorted(SOURCE.rglob("__init__.py"))
+        if path not in doors
+        for node in ast.parse(path.read_text()).body
+        if not (isinstance(node, ast.Expr) and isinstance(node.value, ast.Constant))
+    }
+    assert not told
 
 
 def test_modules_are_found_by_name_at_three_places_only() -> None:
@@ -346,7 +359,7 @@ def test_no_module_but_the_catalogue_names_an_effect() -> None:
 
     An option of a verb may be called as an effect is, as `base_frame` of export.
     """
-    from elastocal.model.effects import CATALOGUE
+    from elastocal.model.effects.catalogue import CATALOGUE
 
     named = [
         f"{module}, line {node.lineno}: {node.value}"

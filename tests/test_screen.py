@@ -17,7 +17,8 @@ from rich.table import Table
 from rich.text import Text
 from typer.testing import CliRunner
 
-from elastocal.cli.app import app, reporting_errors
+from elastocal.cli.app import reporting_errors
+from elastocal.cli.main import app
 from elastocal.screen import SHARE, complain, progress_line, safe_console, say
 from elastocal.text import printable
 
@@ -129,7 +130,8 @@ def test_an_interrupt_that_a_library_swallows_still_ends_with_one_line():
     program = """
 import signal, sys
 from elastocal.screen import noting_interrupts
-from elastocal.cli.app import app, command
+from elastocal.cli.app import command
+from elastocal.cli.main import app
 signal.signal(signal.SIGINT, signal.default_int_handler)
 def library():
     try:

@@ -12,5 +12,13 @@ import tutorial_valley
 from style import draw
 
 if __name__ == "__main__":
-    for module in (chain, house, tutorial_valley, coverage, certificate, diagnosis_distance, causes):
+    for module in (
+        chain,
+        house,
+        tutorial_valley,
+        coverage,
+        certificate,
+        diagnosis_distance,
+        causes,
+    ):
         draw(module.__name__, module.figure)

@@ -22,7 +22,7 @@ def page() -> str:
     """The page, a section for each verb."""
     import typer
 
-    from elastocal.cli.app import app
+    from elastocal.cli.main import app
 
     group = typer.main.get_command(app)
     parts = [HEAD, "## Options of every verb\n", _options(group), ""]

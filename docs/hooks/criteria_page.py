@@ -4,8 +4,8 @@ from __future__ import annotations
 
 import inspect
 
-from elastocal.planning import ScenarioCriterion
 from elastocal.planning.criteria import CRITERIA
+from elastocal.planning.criterion import ScenarioCriterion
 
 HEAD = """# Criteria
 

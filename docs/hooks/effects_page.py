@@ -7,11 +7,13 @@ import re
 from dataclasses import replace
 from pathlib import Path
 
-from elastocal import demo
 from elastocal.cell.work_cell import Cell, read_cell
-from elastocal.model import Chain, ParameterSpec, Setting, load_chain
-from elastocal.model.effects import CATALOGUE
+from elastocal.demo import example
+from elastocal.model.arm import ParameterSpec, Setting
+from elastocal.model.chain import Chain
+from elastocal.model.choice import load_chain
 from elastocal.model.effects.base import Effect
+from elastocal.model.effects.catalogue import CATALOGUE
 from elastocal.report.formatting import display
 
 STAGES = {
@@ -54,7 +56,7 @@ correct the arm; they are shown here with two lines, or a field over one joint's
 
 def page() -> str:
     """The page, a section for each stage of the chain and in it each effect of the catalogue."""
-    base = read_cell(Path(demo.__file__).parent / "cell.toml")
+    base = read_cell(Path(example.__file__).parent / "cell.toml")
     chain = load_chain(base)
     parts = [HEAD, _overview()]
     for stage, title in STAGES.items():

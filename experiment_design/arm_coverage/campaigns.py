@@ -20,10 +20,11 @@ from elastocal.cell.arm_description import (
     Tracker,
 )
 from elastocal.cell.work_cell import Cell
-from elastocal.identification import reduce
+from elastocal.identification.solve import reduce
 from elastocal.measurements import Measurements, with_moves
-from elastocal.model import Model, read_urdf
+from elastocal.model.manipulator import Model
 from elastocal.model.observations import polar_axes
+from elastocal.model.urdf import read_urdf
 from elastocal.simulation.simulate import simulate
 
 EFFECTS = ("base_frame", "joint_offset", "link_geometry", "marker_position", "joint_compliance")

@@ -17,9 +17,9 @@ import numpy as np
 from campaigns import BY_KEY, GEOMETRY, SIGMA, SPRINGS, Campaign, arm
 from scipy import optimize, sparse, stats
 
-from elastocal.identification import Weights, held_out_residual, reduce
-from elastocal.identification.residuals import predicts_better, rms_3d
-from elastocal.identification.solve import PLACED, WIDER, Reduction, is_placed
+from elastocal.identification.residuals import held_out_residual, predicts_better, rms_3d
+from elastocal.identification.solve import PLACED, WIDER, Reduction, is_placed, reduce
+from elastocal.identification.weighted_problem import Weights
 
 MODEL = arm()
 SPRING = np.array([p.effect == "joint_compliance" for p in MODEL.parameters])

@@ -17,7 +17,7 @@ import numpy as np
 
 from elastocal.cell.arm_description import Unsteadiness
 from elastocal.diagnosis.diagnose import diagnose
-from elastocal.model import Model
+from elastocal.model.manipulator import Model
 
 
 def main(first: int, number: int) -> None:

@@ -21,7 +21,6 @@ import campaigns
 import numpy as np
 from scipy import stats
 
-from elastocal.identification import held_out_residual, reduce
 from elastocal.identification.noise_choice import (
     NoiseFit,
     estimate_noise,
@@ -30,8 +29,9 @@ from elastocal.identification.noise_choice import (
     weights_of,
 )
 from elastocal.identification.noise_structure import Readings
-from elastocal.identification.residuals import as_of_another_campaign
-from elastocal.model import observe
+from elastocal.identification.residuals import as_of_another_campaign, held_out_residual
+from elastocal.identification.solve import reduce
+from elastocal.model.observations import observe
 
 MODEL = campaigns.arm()
 COORDINATES = 100  # at new poses

@@ -26,10 +26,10 @@ from elastocal.cell.work_cell import Cell
 from elastocal.cell.workspace_rules import Workspace
 from elastocal.identification.noise_choice import linearised, outlier_screening, settle
 from elastocal.measurements import Measurements, with_moves
-from elastocal.model import observe
-from elastocal.planning import DesignOptions, Plan
+from elastocal.model.observations import observe
 from elastocal.planning import test_poses as target_poses
-from elastocal.planning.design import design
+from elastocal.planning.design import DesignOptions, design
+from elastocal.planning.plan import Plan
 from elastocal.simulation.simulate import simulate
 
 MARKS = len(campaigns.MARKERS)

@@ -18,8 +18,8 @@ import pandas as pd
 from campaigns import BY_KEY, SCENARIOS, Campaign, arm
 from scipy import optimize, stats
 
-from elastocal.identification import Calibration
 from elastocal.identification.identify import identify
+from elastocal.identification.result import Calibration
 
 LEVELS = {"held_95": 0.95, "held_9973": 0.9973}
 

@@ -18,10 +18,9 @@ import campaigns
 import numpy as np
 from scipy import stats
 
-from elastocal.identification import reduce
 from elastocal.identification.noise_choice import estimate_noise, linearised
-from elastocal.identification.solve import PLACED, is_placed
-from elastocal.model import observe
+from elastocal.identification.solve import PLACED, is_placed, reduce
+from elastocal.model.observations import observe
 
 MODEL = campaigns.arm()
 SPRING = np.array([p.effect == "joint_compliance" for p in MODEL.parameters])

@@ -14,20 +14,13 @@ from draw import World
 from numpy.typing import NDArray
 
 from elastocal.cell.work_cell import read_cell
-from elastocal.diagnosis import (
-    Baseline,
-    DiagnosisData,
-    Grams,
-    Hypothesis,
-    NoiseValues,
-    NoisyData,
-    diagnosis_data_of,
-    fit_baseline,
-    possible,
-    project,
-)
+from elastocal.diagnosis.baseline import Baseline, fit_baseline
+from elastocal.diagnosis.diagnosis_data import DiagnosisData, diagnosis_data_of
+from elastocal.diagnosis.evidence import Grams
+from elastocal.diagnosis.hypotheses import Hypothesis, possible
+from elastocal.diagnosis.noise_floor import NoiseValues, NoisyData, project
 from elastocal.measurements import Measurements, read_measurements
-from elastocal.model import Model
+from elastocal.model.manipulator import Model
 
 Array = NDArray[np.float64]
 

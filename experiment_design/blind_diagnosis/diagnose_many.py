@@ -15,7 +15,7 @@ import sys
 import time
 import traceback
 
-from elastocal.cli.app import app
+from elastocal.cli.main import app
 
 MESSAGE = 2000  # characters
 

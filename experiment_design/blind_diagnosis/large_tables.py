@@ -22,7 +22,7 @@ from score import one_effect
 from world_files import write_world
 
 import elastocal
-from elastocal.diagnosis import thinned
+from elastocal.diagnosis.baseline import thinned
 
 POSES = 1667
 

@@ -25,10 +25,14 @@ from scipy.spatial.transform import Rotation
 from scipy.stats import chi2
 
 from elastocal.cell.work_cell import read_cell
-from elastocal.compensation import nominal_flanges, read_targets, tool_point
 from elastocal.compensation.compensate import compensate
+from elastocal.compensation.targets import read_targets
 from elastocal.measurements import Measurements, write_measurements
-from elastocal.model import Chain, joint_limits, load_chain, read_calibrated
+from elastocal.model.calibrated import read_calibrated
+from elastocal.model.calibrated_tool import tool_point
+from elastocal.model.chain import Chain, joint_limits
+from elastocal.model.choice import load_chain
+from elastocal.model.rigid import nominal_flanges
 
 HERE = Path(__file__).resolve().parent
 NOISE = 20e-6  # m per axis

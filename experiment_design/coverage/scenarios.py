@@ -14,12 +14,12 @@ sys.path.insert(0, str(Path(__file__).resolve().parent.parent / "kr270_reproduct
 from campaign import DEMO, campaign
 
 from elastocal.cell.work_cell import read_cell
-from elastocal.demo import LOAD_N, published_compliances
-from elastocal.identification import Readings
+from elastocal.demo.example import LOAD_N, published_compliances
+from elastocal.identification.noise_structure import Readings
 from elastocal.measurements import read_plan
-from elastocal.model import Model
+from elastocal.model.manipulator import Model
 from elastocal.model.observations import polar_axes
-from elastocal.simulation import expand_plan, values_from
+from elastocal.simulation.simulate import expand_plan, values_from
 
 EFFECT = 80e-6  # m, configuration effect in each direction
 OUTLIERS = 0.05, 1e-3, 1e-2  # share of readings, least and largest error in m

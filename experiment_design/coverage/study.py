@@ -17,15 +17,10 @@ import pandas as pd
 from scenarios import SCENARIOS, Setting, setting
 from tables import report, totals
 
-from elastocal.identification import (
-    asymptotic_covariance,
-    cluster_robust,
-    eq14,
-    ols,
-    outlier_screening,
-    tukey,
-)
-from elastocal.identification.noise_choice import settle
+from elastocal.identification.covariance import cluster_robust
+from elastocal.identification.noise_choice import outlier_screening, settle
+from elastocal.identification.published import eq14, ols
+from elastocal.identification.robust import asymptotic_covariance, tukey
 
 CHUNK = 50
 PUBLISHED_EVERY = 10  # thirty iterations of a weighted fit each: a tenth of the replicates do

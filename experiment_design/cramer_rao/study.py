@@ -24,10 +24,12 @@ from scipy.spatial.transform import Rotation
 
 from elastocal.cell.arm_description import EffectChoice, ModelSpec, Robot, Tool
 from elastocal.cell.work_cell import Cell
-from elastocal.identification import reduce
 from elastocal.identification.identify import identify
+from elastocal.identification.solve import reduce
 from elastocal.measurements import Measurements
-from elastocal.model import Chain, Model, read_urdf
+from elastocal.model.chain import Chain
+from elastocal.model.manipulator import Model
+from elastocal.model.urdf import read_urdf
 
 ARMS = ("UR10", "KR 270-2")
 EFFECTS = ("base_frame", "joint_offset", "link_geometry", "marker_position")

@@ -14,22 +14,18 @@ from pathlib import Path
 
 import numpy as np
 
-from elastocal.cell import (
-    CartesianNoise,
-    Cell,
-    DesignSpec,
-    ModelSpec,
-    Nominal,
-    Robot,
-    TargetPose,
-    Tool,
-    Tracker,
-)
-from elastocal.model import Model
-from elastocal.planning import Feasibility, Known, draw, load_states, relax, set_up
+from elastocal.cell.arm_description import CartesianNoise, ModelSpec, Nominal, Robot, Tool, Tracker
+from elastocal.cell.plan_wishes import DesignSpec, TargetPose
+from elastocal.cell.work_cell import Cell
+from elastocal.model.manipulator import Model
+from elastocal.planning.candidates import draw
 from elastocal.planning.elsewhere import share_within
 from elastocal.planning.exact_plan import exact_plan, random_information
+from elastocal.planning.feasibility import Feasibility
+from elastocal.planning.information import load_states
 from elastocal.planning.plan import Everywhere
+from elastocal.planning.relaxation import relax
+from elastocal.planning.setup import Known, set_up
 from elastocal.planning.test_poses import everywhere, test_poses
 
 HERE = Path(__file__).parent

@@ -15,9 +15,9 @@ import numpy as np
 import pandas as pd
 from small_pools import CRITERIA, all_plans, all_values, random_problem
 
-from elastocal.planning import DesignProblem, random_plan, regular_plan, relax
 from elastocal.planning.exact_plan import exact_plan
-from elastocal.planning.selection import exchange
+from elastocal.planning.relaxation import relax
+from elastocal.planning.selection import DesignProblem, exchange, random_plan, regular_plan
 
 EQUAL = 1e-9
 

@@ -19,9 +19,10 @@ from mujoco_cell import MujocoCell
 from scipy.stats import qmc
 
 from elastocal.cell.work_cell import read_cell
-from elastocal.model import joint_limits, load_chain
-from elastocal.planning import Feasibility
+from elastocal.model.chain import joint_limits
+from elastocal.model.choice import load_chain
 from elastocal.planning.collision import END
+from elastocal.planning.feasibility import Feasibility
 
 HERE = Path(__file__).resolve().parent
 FORCE = np.array([0.0, 0.0, -2600.0])

@@ -15,9 +15,8 @@ from scipy.spatial.transform import Rotation
 
 from elastocal.cell.work_cell import Cell
 from elastocal.cell.workspace_rules import Solid
-from elastocal.model import Chain
-from elastocal.planning import Body, Pair, data_base
-from elastocal.planning.bodies import HANGING, WORLD
+from elastocal.model.chain import Chain
+from elastocal.planning.bodies import HANGING, WORLD, Body, Pair, data_base
 
 AWAY = (0.0, 0.0, 1e4)
 SEEN, UNSEEN = 0, 1  # geom groups: what hides a marker, and what does not

@@ -15,19 +15,13 @@ from compared import HERE, table_2
 
 from elastocal.cell.arm_description import Tool
 from elastocal.cell.work_cell import Cell, read_cell
-from elastocal.model import Model
-from elastocal.planning import (
-    Feasibility,
-    Known,
-    TargetPoses,
-    draw,
-    joint_space,
-    load_states,
-    relax,
-    set_up,
-    shares_of,
-)
-from elastocal.planning.information import ALL_LOADS
+from elastocal.model.manipulator import Model
+from elastocal.planning.candidates import draw, joint_space
+from elastocal.planning.feasibility import Feasibility
+from elastocal.planning.information import ALL_LOADS, load_states
+from elastocal.planning.relaxation import relax
+from elastocal.planning.setup import Known, set_up, shares_of
+from elastocal.planning.test_poses import TargetPoses
 
 CANDIDATES = 20_000
 SETS = 5  # sets of twenty test poses, drawn over the joint limits

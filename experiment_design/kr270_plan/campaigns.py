@@ -9,15 +9,13 @@ import numpy as np
 from compared import DEMO, Study
 from joblib import Parallel, delayed
 
-from elastocal.demo import published_compliances
-from elastocal.identification import Options
+from elastocal.demo.example import published_compliances
 from elastocal.identification.identify import identify
+from elastocal.identification.options import Options
 from elastocal.measurements import Measurements
-from elastocal.model import Model
-from elastocal.planning import rows_of
-from elastocal.planning.information import ALL_LOADS
-from elastocal.simulation import values_from
-from elastocal.simulation.simulate import simulate
+from elastocal.model.manipulator import Model
+from elastocal.planning.information import ALL_LOADS, rows_of
+from elastocal.simulation.simulate import simulate, values_from
 
 STEP = 1e-6  # rad, differences of the tool's position
 ROUNDS = 6

@@ -10,25 +10,15 @@ import numpy as np
 
 from elastocal.cell.work_cell import Cell, read_cell
 from elastocal.measurements import read_plan
-from elastocal.model import Model
-from elastocal.planning import (
-    Checkpoint,
-    DesignOptions,
-    Feasibility,
-    FeasiblePool,
-    Known,
-    LoadStates,
-    Plan,
-    Setup,
-    TargetPoses,
-    draw,
-    load_states,
-    set_up,
-    shares_of,
-)
-from elastocal.planning.design import design
-from elastocal.planning.information import ALL_LOADS
-from elastocal.planning.test_poses import test_poses
+from elastocal.model.manipulator import Model
+from elastocal.planning.candidates import draw
+from elastocal.planning.checkpoint import Checkpoint
+from elastocal.planning.design import DesignOptions, design
+from elastocal.planning.feasibility import Feasibility
+from elastocal.planning.information import ALL_LOADS, LoadStates, load_states
+from elastocal.planning.plan import Plan
+from elastocal.planning.setup import FeasiblePool, Known, Setup, set_up, shares_of
+from elastocal.planning.test_poses import TargetPoses, test_poses
 
 HERE = Path(__file__).parent
 DEMO = Path(str(files("elastocal.demo")))

@@ -16,10 +16,10 @@ import numpy as np
 from compared import HERE, Study, table_2
 
 from elastocal.measurements import read_plan
-from elastocal.planning import Alias, schedule
 from elastocal.planning.arrangement import VIA
 from elastocal.planning.conditions import clocked
-from elastocal.planning.drift import DRIFT
+from elastocal.planning.drift import DRIFT, Alias
+from elastocal.planning.execution import schedule
 from elastocal.planning.information import ALL_LOADS
 from elastocal.planning.time_budget import at_stops
 

@@ -11,8 +11,9 @@ from pathlib import Path
 import numpy as np
 
 from elastocal.cell.work_cell import read_cell
-from elastocal.model import load_chain
-from elastocal.planning import Feasibility, joint_space, sobol
+from elastocal.model.choice import load_chain
+from elastocal.planning.candidates import joint_space, sobol
+from elastocal.planning.feasibility import Feasibility
 
 HERE = Path(__file__).parent
 PER_LEVEL = 4

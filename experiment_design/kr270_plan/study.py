@@ -15,7 +15,7 @@ import numpy as np
 from campaigns import realised
 from compared import Study, table_2
 
-from elastocal.planning import Plan, plan_rows, write_plan
+from elastocal.planning.plan import Plan, plan_rows, write_plan
 from elastocal.report.arm_view import write_plan_picture
 
 HERE = Path(__file__).parent

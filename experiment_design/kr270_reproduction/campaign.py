@@ -9,11 +9,11 @@ from pathlib import Path
 import numpy as np
 
 from elastocal.cell.work_cell import read_cell
-from elastocal.demo import LOAD_N, REPEATS, published_compliances, reading_sigma
+from elastocal.demo.example import LOAD_N, REPEATS, published_compliances, reading_sigma
 from elastocal.measurements import read_plan
-from elastocal.model import Model, observe
-from elastocal.simulation import expand_plan, values_from
-from elastocal.simulation.simulate import simulate
+from elastocal.model.manipulator import Model
+from elastocal.model.observations import observe
+from elastocal.simulation.simulate import expand_plan, simulate, values_from
 
 DEMO = Path(str(files("elastocal.demo")))
 

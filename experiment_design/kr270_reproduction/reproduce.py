@@ -16,7 +16,7 @@ import numpy as np
 from campaign import DEMO, Campaign, campaign
 from joblib import Parallel, delayed
 
-from elastocal.identification import eq14, ols, wls
+from elastocal.identification.published import eq14, ols, wls
 
 HERE = Path(__file__).parent
 EFFECT = 80e-6  # m, configuration effect of the second scenario

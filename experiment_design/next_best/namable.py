@@ -24,9 +24,11 @@ from itertools import pairwise
 import numpy as np
 from study import LOADS, NAMED_FROM, SIGMA, TrueArm, feasible, model, planned, poses
 
-from elastocal.model import Model, observe
-from elastocal.planning import Known, in_doubt, load_states, rows_of
-from elastocal.planning.information import ALL_LOADS
+from elastocal.model.manipulator import Model
+from elastocal.model.observations import observe
+from elastocal.planning.doubts import in_doubt
+from elastocal.planning.information import ALL_LOADS, load_states, rows_of
+from elastocal.planning.setup import Known
 
 POOL, STEPS, LOOSE = 1500, 60, 10.0  # poses; of the weights; own parameters, in typical sizes
 LARGER = 3.0  # times its typical size that a rival may have

@@ -33,12 +33,13 @@ from elastocal.errors import ElastocalError
 from elastocal.identification.identify import identify
 from elastocal.identification.result import Calibration
 from elastocal.measurements import Measurements
-from elastocal.model import Model
-from elastocal.planning import Known, in_doubt, load_states, missing, rows_of
+from elastocal.model.manipulator import Model
 from elastocal.planning.candidates import draw
 from elastocal.planning.design import DesignOptions, design
+from elastocal.planning.doubts import in_doubt, missing
 from elastocal.planning.feasibility import Feasibility
-from elastocal.planning.information import ALL_LOADS
+from elastocal.planning.information import ALL_LOADS, load_states, rows_of
+from elastocal.planning.setup import Known
 from elastocal.simulation.simulate import simulate
 
 EFFECTS = ("base_frame", "joint_offset", "joint_compliance", "marker_position")

@@ -9,10 +9,13 @@ import numpy as np
 from prepare import HERE, prepare
 
 from elastocal.cell.work_cell import read_cell
-from elastocal.identification import Calibration, Options, blocks
 from elastocal.identification.identify import identify
+from elastocal.identification.options import Options
+from elastocal.identification.outliers import blocks
+from elastocal.identification.result import Calibration
 from elastocal.measurements import Measurements, read_measurements
-from elastocal.model import Model, observe
+from elastocal.model.manipulator import Model
+from elastocal.model.observations import observe
 
 SPLITS, TEST_SHARE = 5, 0.2
 

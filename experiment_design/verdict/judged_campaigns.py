@@ -20,7 +20,9 @@ from elastocal.cell.arm_description import (
 )
 from elastocal.cell.work_cell import Cell
 from elastocal.measurements import Measurements
-from elastocal.model import Chain, Model, finite_ranges, read_urdf
+from elastocal.model.chain import Chain, finite_ranges
+from elastocal.model.manipulator import Model
+from elastocal.model.urdf import read_urdf
 from elastocal.simulation.simulate import simulate
 
 HERE = Path(__file__).parent

@@ -13,9 +13,9 @@ import pandas as pd
 from judged_campaigns import campaign
 
 from elastocal.errors import ElastocalError
-from elastocal.identification import rms_3d
 from elastocal.identification.identify import identify
-from elastocal.model import observe
+from elastocal.identification.residuals import rms_3d
+from elastocal.model.observations import observe
 
 NUMBERS = (
     "at_um", "true_um", "heldout_um", "predicted_um", "from_um", "own_um", "open_um", "lacking_um",

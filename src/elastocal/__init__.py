@@ -12,8 +12,6 @@
 Every name is loaded when it is first used, so that `import elastocal` costs nothing.
 """
 
-import sys
-from collections.abc import Callable, Mapping
 from importlib import import_module
 from typing import TYPE_CHECKING, Any
 
@@ -39,26 +37,6 @@ if TYPE_CHECKING:
     from elastocal.verbs import compensate, design, diagnose, identify, simulate
 
 __version__ = "0.1.0"
-
-
-def loaded_on_demand(
-    package: str, rooms: Mapping[str, str]
-) -> tuple[Callable[[str], Any], Callable[[], list[str]]]:
-    """Returns `__getattr__` and `__dir__` of a package whose names are loaded when they are used.
-
-    `rooms` gives the names that each module of the package has, with spaces between (PEP 562).
-    """
-    home_of = {name: room for room, names in rooms.items() for name in names.split()}
-
-    def load(name: str) -> Any:
-        if name not in home_of:
-            raise AttributeError(f"module '{package}' has no attribute '{name}'")
-        value = getattr(import_module(f"{package}.{home_of[name]}"), name)
-        setattr(sys.modules[package], name, value)
-        return value
-
-    return load, lambda: sorted({*home_of, "__doc__", "__name__"})
-
 
 # Where each name lives; a test holds this against the imports above.
 ROOMS = {
@@ -92,4 +70,17 @@ __all__ = [
     "register_noise_model", "simulate",
 ]  # fmt: skip
 
-__getattr__, __dir__ = loaded_on_demand(__name__, ROOMS)
+_HOME = {name: room for room, names in ROOMS.items() for name in names.split()}
+
+
+def __getattr__(name: str) -> Any:
+    """The public name, loaded when it is first used (PEP 562)."""
+    if name not in _HOME:
+        raise AttributeError(f"module '{__name__}' has no attribute '{name}'")
+    value = getattr(import_module(f"{__name__}.{_HOME[name]}"), name)
+    globals()[name] = value
+    return value
+
+
+def __dir__() -> list[str]:
+    return sorted({*_HOME, "__doc__", "__name__"})

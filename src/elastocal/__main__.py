@@ -12,7 +12,7 @@ def main() -> None:
 
         with noting_interrupts() as noted:
             try:
-                from elastocal.cli import main as run
+                from elastocal.cli.main import main as run
 
                 run()
             except Exception:

@@ -26,9 +26,10 @@ from elastocal.cell.work_cell import Cell
 from elastocal.errors import InputError
 from elastocal.identification import noise_structure
 from elastocal.identification.noise_structure import NoiseModel, Readings
-from elastocal.model import effects, rigid
+from elastocal.model import rigid
 from elastocal.model.arm import Arm, ParameterSpec, Setting, Spring
 from elastocal.model.chain import Chain
+from elastocal.model.effects import catalogue
 from elastocal.model.effects.base import (
     Effect,
     Symbols,
@@ -109,7 +110,7 @@ def register_effect(effect: E) -> E:
         >>> ec.register_effect(SquareGear()).name
         'square_gear'
     """
-    return _registered(effects.register, effect)
+    return _registered(catalogue.register, effect)
 
 
 def register_noise_model(model: N) -> N:

@@ -9,9 +9,8 @@ from pathlib import Path
 import pytest
 from typer.testing import CliRunner
 
-from elastocal.cli.app import app
-from elastocal.model import chosen_backend
-from elastocal.model.evaluate import VARIABLE
+from elastocal.cli.main import app
+from elastocal.model.evaluate import VARIABLE, chosen_backend
 
 ABSENT = ["identify", "no-cell.toml", "no-data.csv"]
 

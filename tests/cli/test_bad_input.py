@@ -8,7 +8,7 @@ import pytest
 from support.files import write_campaign
 from typer.testing import CliRunner
 
-from elastocal.cli.app import app
+from elastocal.cli.main import app
 
 
 @pytest.fixture

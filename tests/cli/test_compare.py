@@ -9,7 +9,7 @@ import pytest
 from typer.testing import CliRunner
 
 import elastocal as ec
-from elastocal.cli.app import app
+from elastocal.cli.main import app
 
 TUTORIAL = Path(__file__).parents[2] / "docs" / "tutorial"
 CELL = """\

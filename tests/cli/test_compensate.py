@@ -12,9 +12,9 @@ from support.calibration import with_values
 from typer.testing import CliRunner
 
 from elastocal.cell.work_cell import read_cell
-from elastocal.cli.app import app
-from elastocal.model import Model
-from elastocal.model.effects import CATALOGUE
+from elastocal.cli.main import app
+from elastocal.model.effects.catalogue import CATALOGUE
+from elastocal.model.manipulator import Model
 
 URDF = Path(__file__).parents[2] / "src" / "elastocal" / "demo" / "kr270_2.urdf"
 CELL = f"""

@@ -6,7 +6,7 @@ from pathlib import Path
 import pytest
 from typer.testing import CliRunner
 
-from elastocal.cli.app import app
+from elastocal.cli.main import app
 
 
 def demo(folder: Path):

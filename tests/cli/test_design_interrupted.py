@@ -16,14 +16,14 @@ from support.design_commands import (
     write_cell,
 )
 
-from elastocal.planning import Stage
 from elastocal.planning import design as select
+from elastocal.planning.checkpoint import Stage
 
 GOING_ON = "going on with the design that was interrupted"
 # A child may inherit that SIGINT is ignored; here it must not.
 PROGRAM = (
     "import signal; signal.signal(signal.SIGINT, signal.default_int_handler); "
-    "from elastocal.cli import main; main()"
+    "from elastocal.cli.main import main; main()"
 )
 STAGES = ("candidates", "exchange0", "polish1", "continuum1", "exchange1")
 
@@ -190,7 +190,8 @@ def test_the_command_line_does_not_wait_for_what_help_does_not_need():
     heavy = ("casadi", "pinocchio", "cvxpy", "scipy.stats", "pandas", "matplotlib", "numpy",
              "pydantic")  # fmt: skip
     code = (
-        "import sys, elastocal.cli as c; c.app(['identify', '--help'], standalone_mode=False); "
+        "import sys, elastocal.cli.main as c; "
+        "c.app(['identify', '--help'], standalone_mode=False); "
         f"print([m for m in {heavy} if m in sys.modules])"
     )
     told = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)

@@ -15,7 +15,7 @@ from support.files import write_campaign
 from typer.testing import CliRunner
 
 from elastocal.cell.work_cell import read_cell
-from elastocal.cli.app import app
+from elastocal.cli.main import app
 from elastocal.errors import InsufficientDataError
 from elastocal.measurements import read_plan
 from elastocal.saving import save_extra_poses

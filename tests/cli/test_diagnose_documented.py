@@ -10,9 +10,9 @@ from support.cells import kr270_cell, kr270_chain
 from support.diagnoses import ECCENTRICITY, EXTRA, UNKNOWN
 from typer.testing import CliRunner
 
-from elastocal.cli.app import app
-from elastocal.diagnosis import publish
-from elastocal.model import Model
+from elastocal.cli.main import app
+from elastocal.diagnosis.diagnosis import publish
+from elastocal.model.manipulator import Model
 
 DOCS = Path(__file__).parents[2] / "docs"
 

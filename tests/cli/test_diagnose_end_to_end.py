@@ -9,7 +9,7 @@ import pytest
 from support.cells import KR270, TABLE_2
 from typer.testing import CliRunner
 
-from elastocal.cli.app import app
+from elastocal.cli.main import app
 
 CELL = """\
 [robot]

@@ -11,7 +11,7 @@ from support.robots import KR270
 from support.urdf_text import arm
 from typer.testing import CliRunner, Result
 
-from elastocal.cli.app import app
+from elastocal.cli.main import app
 
 
 @pytest.fixture
@@ -103,7 +103,7 @@ def test_a_mimic_beside_the_chain_stays_and_one_on_it_is_refused(tmp_path: Path)
 
 def test_it_is_the_result_of_identify_that_is_exported(tmp_path: Path) -> None:
     """From the demo's readings to a file, by the commands alone."""
-    from elastocal.demo import run_demo
+    from elastocal.demo.example import run_demo
 
     demo = run_demo(tmp_path)
     path = tmp_path / "result.json"

@@ -10,8 +10,8 @@ from support.robots import KR270
 from typer.testing import CliRunner
 
 from elastocal.cell.work_cell import read_cell
-from elastocal.cli.app import app
-from elastocal.model import Model
+from elastocal.cli.main import app
+from elastocal.model.manipulator import Model
 
 CELL = f"""\
 [robot]

@@ -8,7 +8,7 @@ import pytest
 from support.tracker_exports import kr270_readings, krl, spatialanalyzer
 from typer.testing import CliRunner
 
-from elastocal.cli.app import app
+from elastocal.cli.main import app
 from elastocal.measurements import read_measurements
 
 
@@ -101,6 +101,6 @@ def test_presets_are_printed_to_be_copied(tmp_path):
     # As it stands it is the body of a [[source]].
     text = re.sub(r"^\[(\w+)\]", r"[source.\1]", out, flags=re.MULTILINE)
     path.write_text("[[source]]\n" + text, encoding="utf-8")
-    from elastocal.importing import read_mapping
+    from elastocal.importing.mapping_file import read_mapping
 
     assert read_mapping(path).sources[0].role == "joints"

@@ -11,9 +11,9 @@ from support.robots import KR270
 from typer.testing import CliRunner
 
 import elastocal as ec
-from elastocal.cli.app import app
-from elastocal.model import Model
-from elastocal.model.effects import CATALOGUE
+from elastocal.cli.main import app
+from elastocal.model.effects.catalogue import CATALOGUE
+from elastocal.model.manipulator import Model
 
 TUTORIAL = Path(__file__).parents[2] / "docs" / "tutorial"
 

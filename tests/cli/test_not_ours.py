@@ -98,7 +98,7 @@ def test_restart_removes_what_the_study_wrote_alone(folder: Path, name: str) -> 
 
 
 def test_an_example_that_was_changed_is_not_made_anew(tmp_path: Path) -> None:
-    from elastocal.demo import _copy_example
+    from elastocal.demo.example import _copy_example
 
     cell, _ = _copy_example(tmp_path)
     mine(cell)

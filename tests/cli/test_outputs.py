@@ -15,7 +15,7 @@ from fuzz import campaign
 from fuzz.campaign import COMMANDS
 from typer.testing import CliRunner
 
-from elastocal.cli.app import app
+from elastocal.cli.main import app
 
 WRITING = [c for c in COMMANDS if c.outputs and not any(
     other.verb == c.verb for other in COMMANDS[: COMMANDS.index(c)]

@@ -19,12 +19,13 @@ from typer.testing import CliRunner, Result
 
 from elastocal import plugin_loader
 from elastocal.cell.work_cell import read_cell
-from elastocal.cli.app import app
-from elastocal.diagnosis import write_extended_cell
+from elastocal.cli.main import app
+from elastocal.diagnosis.diagnose import write_extended_cell
 from elastocal.errors import InputError
 from elastocal.measurements import Measurements
-from elastocal.model import Chain, Model
-from elastocal.model.effects import CATALOGUE
+from elastocal.model.chain import Chain
+from elastocal.model.effects.catalogue import CATALOGUE
+from elastocal.model.manipulator import Model
 from elastocal.plugins import load_plugins
 
 CELL = f"""\

@@ -10,7 +10,7 @@ from fuzz import campaign
 from fuzz.campaign import COMMANDS
 from typer.testing import CliRunner
 
-from elastocal.cli.app import app
+from elastocal.cli.main import app
 
 
 @pytest.fixture(scope="module")

@@ -12,8 +12,8 @@ from support.robots import KR270
 from typer.testing import CliRunner, Result
 
 import elastocal as ec
-from elastocal.cli.app import app
-from elastocal.model import Model
+from elastocal.cli.main import app
+from elastocal.model.manipulator import Model
 from elastocal.model.smooth_groups import smooth_groups
 
 CELL = """

@@ -14,14 +14,14 @@ from rich.console import Console
 from support.study_folders import SCRIPT, numbers, run_study, write_study
 from typer.testing import CliRunner
 
-from elastocal.cli.app import app
+from elastocal.cli.main import app
 from elastocal.cli.study_command import StudyProgress
 from elastocal.studies.study_results import read_results
 
 # A child may inherit that SIGINT is ignored; here it must not.
 PROGRAM = (
     "import signal; signal.signal(signal.SIGINT, signal.default_int_handler); "
-    "from elastocal.cli import main; main()"
+    "from elastocal.cli.main import main; main()"
 )
 SUMMARY = """
 

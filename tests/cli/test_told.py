@@ -14,7 +14,7 @@ from support.files import write_campaign
 from support.registered import forgotten
 from typer.testing import CliRunner, Result
 
-from elastocal.cli.app import app
+from elastocal.cli.main import app
 from elastocal.errors import InputError
 from elastocal.model.chain import Chain
 from elastocal.model.urdf import read_urdf

@@ -9,7 +9,8 @@ from support.exports import write_result
 from support.files import write_campaign
 from typer.testing import CliRunner
 
-from elastocal.cli.app import VERBS, app
+from elastocal.cli.app import VERBS
+from elastocal.cli.main import app
 
 SIMULATE = ("simulate", "cell.toml", "plan.csv", "-o", "out.csv")
 IDENTIFY = ("identify", "cell.toml", "data.csv", "-q")

@@ -22,11 +22,12 @@ from support.cells import (
 from support.commands import calibrated, circumstances, erring, tool_errors
 
 from elastocal.cell.arm_description import Nominal
-from elastocal.compensation import targets_at
 from elastocal.compensation.compensate import compensate
+from elastocal.compensation.targets import targets_at
 from elastocal.errors import InputError
-from elastocal.model import Model, tool_point
 from elastocal.model.calibrated import ShownPoses
+from elastocal.model.calibrated_tool import tool_point
+from elastocal.model.manipulator import Model
 from elastocal.model.rigid import nominal_flanges
 
 EVERYWHERE = ("base_frame", "joint_offset", "link_geometry", "marker_position", "joint_compliance")

@@ -7,9 +7,9 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from elastocal.compensation import one_target, read_targets
+from elastocal.compensation.targets import one_target, read_targets
 from elastocal.errors import ElastocalError, InputError
-from elastocal.model import share_of_levels
+from elastocal.model.calibrated_tool import share_of_levels
 
 KINDS = ("revolute",) * 6
 

@@ -10,11 +10,16 @@ from scipy.spatial.transform import Rotation
 from support.cells import DOWN, kr270_cell, kr270_chain
 from support.commands import calibrated, erring, tool_errors
 
-from elastocal.compensation import CorrectionGrid, joint_grid, targets_at
 from elastocal.compensation.compensate import compensate
-from elastocal.compensation.correction_table import EXACT, correction_table
+from elastocal.compensation.correction_table import (
+    EXACT,
+    CorrectionGrid,
+    correction_table,
+    joint_grid,
+)
+from elastocal.compensation.targets import targets_at
 from elastocal.errors import InputError
-from elastocal.model import tool_point
+from elastocal.model.calibrated_tool import tool_point
 from elastocal.model.rigid import nominal_flanges
 
 EFFECTS = ("joint_offset", "link_geometry", "joint_compliance")

@@ -9,15 +9,11 @@ import pytest
 from support.cells import kr270_chain
 from support.diagnosis_data import FITTED, Fault, cell, measured, plan
 
-from elastocal.diagnosis import (
-    DiagnosisData,
-    diagnosis_data_of,
-    fit_baseline,
-    possible,
-    with_likelier_backlash_model,
-    with_recorded_drivers,
-)
-from elastocal.model import Model
+from elastocal.diagnosis.backlash_model import with_likelier_backlash_model
+from elastocal.diagnosis.baseline import fit_baseline
+from elastocal.diagnosis.diagnosis_data import DiagnosisData, diagnosis_data_of
+from elastocal.diagnosis.hypotheses import possible, with_recorded_drivers
+from elastocal.model.manipulator import Model
 
 PLAY = Fault("backlash", "joint3", {"backlash": 3e-4})
 

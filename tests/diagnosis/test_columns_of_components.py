@@ -9,12 +9,12 @@ import pytest
 from support.cells import COMPLIANCE, kr270_cell, kr270_chain, random_table
 
 from elastocal.cell.arm_description import EffectChoice, Nominal
-from elastocal.diagnosis import Hypothesis, compute_columns, fit_baseline
-from elastocal.diagnosis.hypotheses import RegressorDirection
+from elastocal.diagnosis.baseline import fit_baseline
+from elastocal.diagnosis.hypotheses import Hypothesis, RegressorDirection, compute_columns
 from elastocal.identification.upright import as_placed
 from elastocal.measurements import with_moves
-from elastocal.model import Model
-from elastocal.model.effects import CATALOGUE
+from elastocal.model.effects.catalogue import CATALOGUE
+from elastocal.model.manipulator import Model
 
 FIELD = {"field_joint2_size": 1e-4, "field_time_size": 2e-4, "field_time_length": 1500.0}
 SETTINGS = {

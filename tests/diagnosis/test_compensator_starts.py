@@ -12,18 +12,13 @@ from support.diagnosis_data import FAULTS, campaign
 from support.robots import KR270
 
 from elastocal.cell.work_cell import read_cell
-from elastocal.diagnosis import (
-    Hypothesis,
-    Item,
-    diagnosis_data_of,
-    fit_baseline,
-    fit_extended,
-    fit_set,
-    possible,
-    write_extended_cell,
-)
+from elastocal.diagnosis.baseline import fit_baseline
+from elastocal.diagnosis.diagnose import write_extended_cell
 from elastocal.diagnosis.diagnosis import FittedParameter
-from elastocal.model import Model
+from elastocal.diagnosis.diagnosis_data import diagnosis_data_of
+from elastocal.diagnosis.hypotheses import Hypothesis, possible
+from elastocal.diagnosis.model_set import Item, fit_extended, fit_set
+from elastocal.model.manipulator import Model
 
 VALUES = {
     "compensator_stiffness": 2.5e4, "compensator_anchor_x": 0.2, "compensator_anchor_y": -0.5,

@@ -9,17 +9,10 @@ import pytest
 from scipy.stats import multivariate_normal
 from support.diagnosis_data import campaign, dense_noise, diagnosed, random_data, used_rows
 
-from elastocal.diagnosis import (
-    Component,
-    FittedSum,
-    NoiseValues,
-    NoisyData,
-    Sizes,
-    fit_sum,
-    posed,
-)
 from elastocal.diagnosis.component_answer import PROBABLE, TOLD
+from elastocal.diagnosis.components import Component, FittedSum, Sizes, fit_sum, posed
 from elastocal.diagnosis.hypotheses import possible
+from elastocal.diagnosis.noise_floor import NoiseValues, NoisyData
 from elastocal.model.effects.gears import EncoderScale
 from elastocal.model.effects.smooth import JointCurve, Waves
 

@@ -8,8 +8,7 @@ from functools import lru_cache
 import numpy as np
 import pytest
 
-from elastocal.diagnosis import Change, PosteriorDraw
-from elastocal.diagnosis.shrinkage import NEW_POSES, shrinkage
+from elastocal.diagnosis.shrinkage import NEW_POSES, Change, PosteriorDraw, shrinkage
 
 SIGMA, P, K = 1e-5, 8, 2
 N = 10_000  # measured poses: as many kinds of pose as there are

@@ -9,19 +9,14 @@ import numpy as np
 import pytest
 
 from elastocal.cell.work_cell import read_cell
-from elastocal.demo import (
-    LOAD_N,
-    REPEATS,
-    published_compliances,
-    reading_sigma,
-    run_demo,
-)
-from elastocal.diagnosis import Diagnosis, diagnosis_data_of, fit_baseline, prior_deviations
+from elastocal.demo.example import LOAD_N, REPEATS, published_compliances, reading_sigma, run_demo
+from elastocal.diagnosis.baseline import fit_baseline, prior_deviations
 from elastocal.diagnosis.diagnose import diagnose
+from elastocal.diagnosis.diagnosis import Diagnosis
+from elastocal.diagnosis.diagnosis_data import diagnosis_data_of
 from elastocal.measurements import Measurements, read_plan
-from elastocal.model import Model
-from elastocal.simulation import values_from
-from elastocal.simulation.simulate import expand_plan, simulate
+from elastocal.model.manipulator import Model
+from elastocal.simulation.simulate import expand_plan, simulate, values_from
 
 
 @pytest.fixture(scope="module")

@@ -9,9 +9,9 @@ import pytest
 from support.diagnosis_data import FAULTS, SIGMA, campaign, diagnosed
 
 from elastocal.cell.arm_description import CartesianNoise
-from elastocal.diagnosis import Diagnosis, DiagnosisOptions
-from elastocal.diagnosis.diagnose import diagnose
-from elastocal.model import Model
+from elastocal.diagnosis.diagnose import DiagnosisOptions, diagnose
+from elastocal.diagnosis.diagnosis import Diagnosis
+from elastocal.model.manipulator import Model
 
 # Effects that others imitate in any poses, and those others.
 IMITATED = {

@@ -20,11 +20,10 @@ from support.robots import KR270
 from elastocal.cell.arm_description import EffectChoice
 from elastocal.cell.file_keys import table_of
 from elastocal.cell.work_cell import Cell, read_cell
-from elastocal.diagnosis import write_extended_cell
-from elastocal.diagnosis.diagnose import PATHS
+from elastocal.diagnosis.diagnose import PATHS, write_extended_cell
 from elastocal.errors import InputError
-from elastocal.model import Model
-from elastocal.model.effects import CATALOGUE
+from elastocal.model.effects.catalogue import CATALOGUE
+from elastocal.model.manipulator import Model
 
 ROOT = Path(__file__).parents[2]
 SLIP = replace(JUMP, effect="marker_slip", where="marker:M1", settings={"slip_time_s": 61.5})

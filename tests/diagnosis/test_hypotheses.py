@@ -8,10 +8,11 @@ import numpy as np
 import pytest
 from support.diagnosis_data import campaign
 
-from elastocal.diagnosis import DiagnosisOptions, possible
+from elastocal.diagnosis.diagnose import DiagnosisOptions
+from elastocal.diagnosis.hypotheses import possible
 from elastocal.errors import InputError
-from elastocal.model import Model
-from elastocal.model.effects import CATALOGUE
+from elastocal.model.effects.catalogue import CATALOGUE
+from elastocal.model.manipulator import Model
 
 MODEL, TABLE = campaign()
 ISSUE = {

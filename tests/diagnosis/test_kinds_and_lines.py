@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 from support.diagnosis_data import campaign, random_data
 
-from elastocal.diagnosis import Component, NoiseValues, NoisyData, fit_baseline
+from elastocal.diagnosis.baseline import fit_baseline
 from elastocal.diagnosis.component_families import (
     drifts,
     line_families,
@@ -23,10 +23,12 @@ from elastocal.diagnosis.component_search import (
     with_shorter_drifts,
 )
 from elastocal.diagnosis.components import (
+    Component,
     fit_sum,
 )
 from elastocal.diagnosis.diagnosis_data import DiagnosisData, diagnosis_data_of
 from elastocal.diagnosis.hypotheses import possible
+from elastocal.diagnosis.noise_floor import NoiseValues, NoisyData
 from elastocal.model.effects.gears import EncoderScale, GearEccentricity
 
 QUIET = NoiseValues.usual(3).of_instrument()

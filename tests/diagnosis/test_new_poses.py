@@ -8,10 +8,9 @@ from functools import lru_cache
 import numpy as np
 from support.diagnosis_data import campaign
 
-from elastocal.diagnosis import new_pose_table
-from elastocal.diagnosis.shrinkage import _joints, _recombined, _unlike
+from elastocal.diagnosis.shrinkage import _joints, _recombined, _unlike, new_pose_table
 from elastocal.measurements import Measurements
-from elastocal.model import Model
+from elastocal.model.manipulator import Model
 
 N = 50
 

@@ -10,18 +10,13 @@ import pytest
 from typer.testing import CliRunner
 
 import elastocal as ec
-from elastocal.cli.app import app
-from elastocal.demo import run_demo
-from elastocal.diagnosis import (
-    Candidate,
-    Diagnosis,
-    FoundEffect,
-    doubts_after,
-    verdict_of,
-    with_effects_of,
-)
-from elastocal.model.effects import SOMETHING
-from elastocal.planning import Gain, missing
+from elastocal.cli.main import app
+from elastocal.demo.example import run_demo
+from elastocal.diagnosis.diagnosis import Candidate, Diagnosis, FoundEffect
+from elastocal.diagnosis.next_poses import doubts_after, verdict_of, with_effects_of
+from elastocal.model.effects.catalogue import SOMETHING
+from elastocal.planning.doubts import missing
+from elastocal.planning.plan import Gain
 
 FEW = ["--candidates", "60", "-q"]
 

@@ -10,24 +10,21 @@ from scipy import optimize, stats
 from support.diagnosis_data import campaign, dense_noise, random_data, used_rows
 
 from elastocal.cell.arm_description import Unsteadiness
-from elastocal.diagnosis import (
-    Blocks,
+from elastocal.diagnosis.baseline import Blocks, fit_baseline
+from elastocal.diagnosis.diagnosis_data import diagnosis_data_of
+from elastocal.diagnosis.noise_floor import (
     NoiseValues,
     NoisyData,
     covariance,
-    diagnosis_data_of,
-    fit_baseline,
+    curved_likelihood,
     fit_noise,
     likelihood,
     log_prior,
+    prior_curvature,
     project,
 )
-from elastocal.diagnosis.noise_floor import (
-    curved_likelihood,
-    prior_curvature,
-)
 from elastocal.measurements import visits
-from elastocal.model import Model
+from elastocal.model.manipulator import Model
 
 NOISE = NoiseValues(1.3, np.array([4e-6, 9e-6, 2e-5]), np.array([0.4, 0.1, 0.9]))
 SEEDS = range(4)

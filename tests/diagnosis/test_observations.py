@@ -10,10 +10,10 @@ from support.cells import kr270_chain
 from support.diagnosis_data import Fault, campaign, cell, measured, plan, zigzag
 
 from elastocal.cell.arm_description import Nominal
-from elastocal.diagnosis import Diagnosis
 from elastocal.diagnosis.diagnose import diagnose
+from elastocal.diagnosis.diagnosis import Diagnosis
 from elastocal.errors import InsufficientDataError
-from elastocal.model import Model
+from elastocal.model.manipulator import Model
 
 ECCENTRIC, TILTED = "gear_eccentricity:joint4", "off_axis_compliance:joint3"
 PULL = np.array([0.0, 0.0, -300.0])

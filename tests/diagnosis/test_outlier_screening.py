@@ -11,17 +11,13 @@ from support.cells import kr270_chain, random_poses, table_of
 from support.diagnosis_data import SIGMA, campaign, cell, diagnosed, measured
 
 from elastocal.cell.arm_description import Nominal
-from elastocal.diagnosis import (
-    DiagnosisData,
-    NoiseValues,
-    describe_faulty,
-    diagnosis_data_of,
-    fit_baseline,
-    fit_noise,
-    screen_outliers,
-)
+from elastocal.diagnosis.baseline import fit_baseline
+from elastocal.diagnosis.diagnosis_data import DiagnosisData, diagnosis_data_of
+from elastocal.diagnosis.noise_floor import NoiseValues, fit_noise
+from elastocal.diagnosis.reading_faults import screen_outliers
+from elastocal.diagnosis.stated_floor import describe_faulty
 from elastocal.measurements import Measurements
-from elastocal.model import Model
+from elastocal.model.manipulator import Model
 
 POSES = 60  # × 2 loads × 3 markers
 

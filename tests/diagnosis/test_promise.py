@@ -10,10 +10,12 @@ from support.cells import kr270_chain, random_poses, table_of
 from support.diagnosis_data import FAULTS, SIGMA, cell, measured, zigzag
 
 from elastocal.cell.arm_description import Nominal
-from elastocal.diagnosis import Item, extended, fit_baseline, possible
+from elastocal.diagnosis.baseline import fit_baseline
 from elastocal.diagnosis.diagnose import diagnose
+from elastocal.diagnosis.hypotheses import possible
+from elastocal.diagnosis.model_set import Item, extended
 from elastocal.measurements import Measurements
-from elastocal.model import Model
+from elastocal.model.manipulator import Model
 
 RIGID = ("base_frame", "joint_offset", "marker_position")
 

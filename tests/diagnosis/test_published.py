@@ -10,9 +10,9 @@ import pytest
 from support.cells import kr270_cell, kr270_chain
 from support.diagnoses import EXPLAINED, VERDICTS
 
-from elastocal.diagnosis import Diagnosis, Gap, publish
-from elastocal.identification import BudgetStep
-from elastocal.model import Model
+from elastocal.diagnosis.diagnosis import Diagnosis, Gap, publish
+from elastocal.identification.error_budget import BudgetStep
+from elastocal.model.manipulator import Model
 
 
 @pytest.fixture(scope="module")

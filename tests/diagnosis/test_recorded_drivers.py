@@ -9,8 +9,8 @@ import numpy as np
 from support.cells import kr270_cell, kr270_chain, random_table
 from support.diagnoses import ECCENTRICITY
 
-from elastocal.diagnosis import model_keys, with_recorded_drivers
-from elastocal.model import Model
+from elastocal.diagnosis.hypotheses import model_keys, with_recorded_drivers
+from elastocal.model.manipulator import Model
 
 
 def bare(**model) -> Model:

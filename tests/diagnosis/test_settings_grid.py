@@ -9,14 +9,9 @@ import pytest
 from support.cells import kr270_chain
 from support.diagnosis_data import campaign
 
-from elastocal.diagnosis import (
-    Hypothesis,
-    SettingsGrid,
-    grid_of,
-    possible,
-)
+from elastocal.diagnosis.hypotheses import Hypothesis, SettingsGrid, grid_of, possible
 from elastocal.measurements import Measurements
-from elastocal.model import Model
+from elastocal.model.manipulator import Model
 
 
 @pytest.fixture(scope="module")

@@ -10,17 +10,12 @@ import pytest
 from support.cells import kr270_chain, random_poses, table_of
 from support.diagnosis_data import DOWN, FITTED, REPEATABILITY, SIGMA, cell, measured
 
-from elastocal.diagnosis import (
-    DiagnosisData,
-    diagnosis_data_of,
-    fit_baseline,
-    noise_rms,
-    project,
-    smooth_scatter,
-    supported_floor,
-)
+from elastocal.diagnosis.baseline import fit_baseline
+from elastocal.diagnosis.diagnosis_data import DiagnosisData, diagnosis_data_of
+from elastocal.diagnosis.noise_floor import project
+from elastocal.diagnosis.stated_floor import noise_rms, smooth_scatter, supported_floor
 from elastocal.measurements import Measurements
-from elastocal.model import Model
+from elastocal.model.manipulator import Model
 
 AMPLITUDE, LENGTH = 1e-4, 0.07  # rad: an error curve of joints 2 and 3
 

@@ -6,11 +6,8 @@ import numpy as np
 import pytest
 from support.diagnosis_data import FAULTS, campaign, diagnosed
 
-from elastocal.diagnosis import (
-    compute_columns,
-    fit_baseline,
-    possible,
-)
+from elastocal.diagnosis.baseline import fit_baseline
+from elastocal.diagnosis.hypotheses import compute_columns, possible
 
 COMPENSATOR = "gravity_compensator:joint2"
 

@@ -7,8 +7,7 @@ from dataclasses import replace
 import numpy as np
 from support.diagnosis_data import campaign
 
-from elastocal.diagnosis import thinned
-from elastocal.diagnosis.baseline import MOST_CONFIGURATIONS, MOST_ROWS
+from elastocal.diagnosis.baseline import MOST_CONFIGURATIONS, MOST_ROWS, thinned
 from elastocal.measurements import Measurements, with_moves
 
 

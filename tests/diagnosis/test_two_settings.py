@@ -11,7 +11,7 @@ from support.registered import forgotten, write_example
 
 from elastocal.diagnosis.diagnose import diagnose
 from elastocal.measurements import Measurements
-from elastocal.model import Model
+from elastocal.model.manipulator import Model
 from elastocal.plugin_loader import load_plugins
 
 FROM, TIME = 900.0, 400.0

@@ -9,17 +9,11 @@ import numpy as np
 import pytest
 from support.diagnosis_data import campaign
 
-from elastocal.diagnosis import (
-    DiagnosisData,
-    Generic,
-    Grams,
-    NoiseValues,
-    diagnosis_data_of,
-    fit_baseline,
-    generic_blocks,
-    project,
-    wrenches,
-)
+from elastocal.diagnosis.baseline import fit_baseline
+from elastocal.diagnosis.diagnosis_data import DiagnosisData, diagnosis_data_of
+from elastocal.diagnosis.evidence import Grams
+from elastocal.diagnosis.noise_floor import NoiseValues, project
+from elastocal.diagnosis.unknown import Generic, generic_blocks, wrenches
 
 N = 24
 NOISE = NoiseValues(1.0, np.full(6, 3e-6), np.full(6, 0.2))

@@ -11,7 +11,7 @@ import numpy as np
 
 import elastocal as ec
 from elastocal import Diagnosis
-from elastocal.model.effects import effect_of
+from elastocal.model.effects.catalogue import effect_of
 
 CASES = Path(__file__).parents[1] / "cases"
 

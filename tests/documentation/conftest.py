@@ -32,7 +32,7 @@ def ran(command: str, folder: Path) -> str:
     """What a shell prints of a command; ours runs in this process, where it stands alone."""
     import console_blocks
 
-    from elastocal.cli.app import app
+    from elastocal.cli.main import app
 
     words = shlex.split(command.replace("\\\n", " "))
     if words[0] != "elastocal" or {"|", ">", ">>", "&&", ";"} & {*words}:

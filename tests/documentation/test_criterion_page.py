@@ -11,9 +11,8 @@ import pytest
 from support.design_cells import plan_cell
 
 from elastocal.errors import InputError
-from elastocal.planning import DesignOptions, register
-from elastocal.planning.criteria import CRITERIA
-from elastocal.planning.design import design
+from elastocal.planning.criteria import CRITERIA, register
+from elastocal.planning.design import DesignOptions, design
 from elastocal.report.plan_view import plan_lines
 
 PAGE = Path(__file__).parents[2] / "docs" / "adding-a-criterion.md"

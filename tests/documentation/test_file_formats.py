@@ -10,15 +10,17 @@ import pytest
 from typer.testing import CliRunner
 
 from elastocal.cell.work_cell import read_cell
-from elastocal.cli.app import app
+from elastocal.cli.main import app
 from elastocal.config import tables_in
-from elastocal.diagnosis import Curve, DiagnosisOptions, RivalPair, Untested, publish
-from elastocal.diagnosis.diagnose import diagnose
-from elastocal.identification import FaultyGroup, KnowledgeTable, Outlier
+from elastocal.diagnosis.diagnose import DiagnosisOptions, diagnose
+from elastocal.diagnosis.diagnosis import Curve, RivalPair, Untested, publish
+from elastocal.identification.faulty_readings import FaultyGroup
+from elastocal.identification.knowledge import KnowledgeTable
+from elastocal.identification.outliers import Outlier
 from elastocal.measurements import families, read_measurements
-from elastocal.model import Model
 from elastocal.model.dh import DH_FAMILIES
-from elastocal.model.effects import CATALOGUE
+from elastocal.model.effects.catalogue import CATALOGUE
+from elastocal.model.manipulator import Model
 
 ROOT = Path(__file__).parents[2]
 PAGE = (ROOT / "docs" / "file-formats.md").read_text(encoding="utf-8")

@@ -10,9 +10,9 @@ import measured_page
 import pytest
 import typer
 
-from elastocal.cli.app import app
-from elastocal.model.effects import CATALOGUE
+from elastocal.cli.main import app
 from elastocal.model.effects.base import Effect
+from elastocal.model.effects.catalogue import CATALOGUE
 from elastocal.planning.criteria import CRITERIA
 
 

@@ -9,9 +9,10 @@ import pytest
 from support.cells import COMPENSATOR, SLANTED, kr270_cell
 
 from elastocal.cell.arm_description import Nominal
-from elastocal.export import Conditions, cost_of, evaluate_pieces, keep
-from elastocal.model import CalibratedArm, Model
-from elastocal.model.effects import CATALOGUE
+from elastocal.export.exportable import Conditions, cost_of, evaluate_pieces, keep
+from elastocal.model.calibrated import CalibratedArm
+from elastocal.model.effects.catalogue import CATALOGUE
+from elastocal.model.manipulator import Model
 
 CONDITIONS = Conditions(SLANTED, time=1800.0, temperature=30.0)
 # Without parameters of their own they act through the others.

@@ -39,7 +39,7 @@ def test_every_format_and_ending_is_told() -> None:
 def test_every_option_is_told() -> None:
     from typer.main import get_command
 
-    from elastocal.cli.app import app
+    from elastocal.cli.main import app
 
     command = get_command(app).commands["export"]  # type: ignore[attr-defined]
     options = [o for p in command.params for o in p.opts if o.startswith("--")]

@@ -10,8 +10,8 @@ import pytest
 from support.exports import LOAD, SPRINGS, exported, flanges_in_base, poses_of, write_result
 from support.robots import KR270, packaged_urdf, random_chain_urdf
 
-from elastocal.export import MujocoRest
-from elastocal.model import Parameter
+from elastocal.export.mjcf_file import MujocoRest
+from elastocal.model.arm import Parameter
 
 mujoco = pytest.importorskip("mujoco")
 

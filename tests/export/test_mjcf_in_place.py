@@ -7,7 +7,7 @@ from support.exports import GEOMETRY, LOAD, SPRINGS, exported, poses_of, write_r
 from support.mjcf_text import ARM, LOADABLE, write_arm
 
 from elastocal.export.exportable import evaluate_pieces, keep
-from elastocal.model import MjcfArm
+from elastocal.model.mjcf import MjcfArm
 from elastocal.model.rigid import nominal_flanges
 from elastocal.model.valued import Conditions
 

@@ -11,9 +11,10 @@ from hypothesis import strategies as st
 from support.exports import exported, write_result
 from support.robots import KR270
 
-from elastocal.export import Conditions, Wish, to_yaml
-from elastocal.export.export import export
-from elastocal.model import read_calibrated, read_urdf
+from elastocal.export.export import Wish, export, to_yaml
+from elastocal.export.exportable import Conditions
+from elastocal.model.calibrated import read_calibrated
+from elastocal.model.urdf import read_urdf
 
 ROBOT = f'urdf = "{KR270}"'
 

@@ -15,15 +15,12 @@ from support.robots import KR270
 from typer.testing import CliRunner
 
 import elastocal as ec
-from elastocal.cli.app import app
-from elastocal.export import (
-    Conditions,
-    MujocoRest,
-    Wish,
-    random_table,
-    read_joint_correction,
-)
+from elastocal.cli.main import app
+from elastocal.export.export import Wish
 from elastocal.export.export import export as to_text
+from elastocal.export.exportable import Conditions, random_table
+from elastocal.export.joint_correction import read_joint_correction
+from elastocal.export.mjcf_file import MujocoRest
 
 HELD = ("base_frame", "joint_offset", "link_geometry", "marker_position", "joint_compliance")
 LACKED = (

@@ -11,8 +11,9 @@ from support.exports import DH, GEOMETRY, exported, flanges_in_base, poses_of, w
 from support.robots import KR270, PACKAGED, packaged_urdf, random_chain_urdf
 from support.urdf_text import arm
 
-from elastocal.export import Frames
-from elastocal.model import CalibratedArm, check_urdf, read_urdf
+from elastocal.export.urdf_file import Frames
+from elastocal.model.calibrated import CalibratedArm
+from elastocal.model.urdf import check_urdf, read_urdf
 
 NANOMETRE = 1e-9
 

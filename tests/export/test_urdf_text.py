@@ -15,7 +15,7 @@ from support.exports import GEOMETRY, exported, write_result
 from support.robots import KR270, packaged_urdf
 
 from elastocal.errors import InputError
-from elastocal.export import Frames, read_urdf_text
+from elastocal.export.urdf_file import Frames, read_urdf_text
 from elastocal.units import rpy_from_rotation
 
 ODD = """<?xml version='1.0'?>

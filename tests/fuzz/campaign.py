@@ -332,7 +332,7 @@ def write(folder: Path) -> None:
 
     from elastocal import verbs
     from elastocal.cell.work_cell import read_cell
-    from elastocal.model import Model
+    from elastocal.model.manipulator import Model
     from elastocal.simulation.simulate import expand_plan, simulate
 
     (folder / "study").mkdir(parents=True)

@@ -90,7 +90,7 @@ def states(folder: Path) -> dict[str, bytes]:
 
 
 def run_command(line: str) -> dict[str, Any]:
-    from elastocal.cli.app import app
+    from elastocal.cli.main import app
 
     words = shlex.split(line)
     environment = {"COLUMNS": "100", "NO_COLOR": "1"}

@@ -7,9 +7,11 @@ import pytest
 from support.calibration import GEOMETRY, measured
 from support.parts import SIGMA, arm, faulty_of, solved
 
-from elastocal.identification import find_faulty, outliers, verdict, weights_for
+from elastocal.identification import outliers
+from elastocal.identification.outliers import find_faulty, verdict
 from elastocal.identification.solve import solve
-from elastocal.model import subset
+from elastocal.identification.weighted_problem import weights_for
+from elastocal.model.observations import subset
 
 
 def solved_with(faults, size, seed, poses=60):

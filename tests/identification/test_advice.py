@@ -17,10 +17,10 @@ from support.calibration import (
 from support.cells import random_poses
 
 from elastocal.cell.arm_description import CartesianNoise, Nominal, Tracker
-from elastocal.identification import Options
 from elastocal.identification import least_squares as fit_module
 from elastocal.identification.identify import identify
-from elastocal.model import Model
+from elastocal.identification.options import Options
+from elastocal.model.manipulator import Model
 
 SIGMA = 5e-5
 SENTENCES = {

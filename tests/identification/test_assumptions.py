@@ -10,11 +10,11 @@ from support.calibration import SPRINGS, cell_of, measured, random_chain, table_
 from support.cells import random_poses
 
 from elastocal.cell.arm_description import CartesianNoise, Nominal, Tracker
-from elastocal.identification import judged, warning_sentences
+from elastocal.identification.findings import judged, warning_sentences
 from elastocal.identification.identify import identify
 from elastocal.identification.mistakes import copied
 from elastocal.identification.noise_choice import NoiseTest
-from elastocal.model import Model
+from elastocal.model.manipulator import Model
 from elastocal.model.observations import observe
 from elastocal.report.identification_view import (
     judgement,

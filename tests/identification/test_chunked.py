@@ -18,19 +18,16 @@ from support.parts import (
 
 from elastocal.cell.arm_description import Nominal
 from elastocal.errors import ElastocalError
-from elastocal.identification import (
-    Weights,
-    describe,
-    held_out_by_parts,
-    held_out_residual,
-    outliers,
-    residual_sigma,
-    solve,
-    solve_weighted,
-)
+from elastocal.identification import outliers, solve
 from elastocal.identification import weighted_problem as chunked
 from elastocal.identification import weighted_problem as partition
-from elastocal.model import Model, observe
+from elastocal.identification.linear_solver import solve_weighted
+from elastocal.identification.outliers import describe
+from elastocal.identification.residuals import held_out_by_parts, held_out_residual
+from elastocal.identification.solve import residual_sigma
+from elastocal.identification.weighted_problem import Weights
+from elastocal.model.manipulator import Model
+from elastocal.model.observations import observe
 
 UNIT = Weights("none", None, False, "")
 

@@ -4,16 +4,12 @@ import numpy as np
 from support.calibration import PLACED, cell_of, measured, planar_chain, table_at, true_values
 from support.cells import random_poses
 
-from elastocal.identification import (
-    FitProblem,
-    Partition,
-    Weights,
-    cluster_by_parts,
-    cluster_robust,
-    fit,
-    worth_clustering,
-)
-from elastocal.model import Model, observe
+from elastocal.identification.covariance import cluster_robust
+from elastocal.identification.intervals import cluster_by_parts, worth_clustering
+from elastocal.identification.least_squares import FitProblem, fit
+from elastocal.identification.weighted_problem import Partition, Weights
+from elastocal.model.manipulator import Model
+from elastocal.model.observations import observe
 
 MARKERS = {"M1": np.array([0.1, 0, 0]), "M2": np.array([0, 0.1, 0.1])}
 

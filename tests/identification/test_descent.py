@@ -7,7 +7,8 @@ import pytest
 from scipy.optimize import lsq_linear
 
 from elastocal.errors import ElastocalError
-from elastocal.identification import Evaluation, RFactor, SumOfSquares, descend
+from elastocal.identification.least_squares import SumOfSquares, descend
+from elastocal.identification.weighted_problem import Evaluation, RFactor
 
 
 def objective_of(residual, jacobian, p, lower=-np.inf, upper=np.inf, tie=np.inf):

@@ -11,7 +11,7 @@ import pytest
 from typer.testing import CliRunner
 
 import elastocal as ec
-from elastocal.cli.app import app
+from elastocal.cli.main import app
 
 CASES = Path(__file__).parents[1] / "cases"
 CELL = """\

@@ -7,8 +7,8 @@ import numpy as np
 import pytest
 from identification.test_methods import campaign
 
-from elastocal.identification import Options
 from elastocal.identification.identify import identify
+from elastocal.identification.options import Options
 
 
 def shifted(table, rows, by):

@@ -16,17 +16,12 @@ from support.cells import random_poses
 from elastocal.cell.arm_description import CartesianNoise, Tracker
 from elastocal.diagnosis import diagnosis as diagnosis_result
 from elastocal.errors import options_as_flags
-from elastocal.identification import (
-    Finding,
-    LackOfFit,
-    TestErrors,
-    judged,
-    next_steps,
-    warning_sentences,
-)
 from elastocal.identification import findings as module
+from elastocal.identification.findings import judged, next_steps, warning_sentences
 from elastocal.identification.identify import identify
-from elastocal.model import Model
+from elastocal.identification.noise_summary import LackOfFit
+from elastocal.identification.result import Finding, TestErrors
+from elastocal.model.manipulator import Model
 from elastocal.report.judgement_view import warnings_beside
 
 SIGMA = 5e-5

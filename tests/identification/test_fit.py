@@ -8,7 +8,8 @@ import pytest
 from support.parts import positions, solved
 
 from elastocal.errors import ElastocalError
-from elastocal.identification import fit, part_of
+from elastocal.identification.least_squares import fit
+from elastocal.identification.weighted_problem import part_of
 
 
 def test_residual_and_B_of_a_point_come_from_one_evaluation(monkeypatch):

@@ -19,19 +19,14 @@ from support.calibration import (
 from support.cells import random_poses
 
 from elastocal.cell.arm_description import CartesianNoise, Nominal, Tracker
-from elastocal.identification import (
-    FitProblem,
-    Options,
-    Weights,
-    fit,
-    held_out_residual,
-    rms_3d,
-    weights_for,
-)
 from elastocal.identification.identify import identify
-from elastocal.identification.residuals import f_test, predicts_better
+from elastocal.identification.least_squares import FitProblem, fit
+from elastocal.identification.options import Options
+from elastocal.identification.residuals import f_test, held_out_residual, predicts_better, rms_3d
 from elastocal.identification.solve import fits_better
-from elastocal.model import Model, subset
+from elastocal.identification.weighted_problem import Weights, weights_for
+from elastocal.model.manipulator import Model
+from elastocal.model.observations import subset
 
 UNIT = Weights("none", None, False, "")
 

@@ -28,9 +28,11 @@ from support.cells import COMPLIANCE, kr270_chain, random_poses
 from support.robots import packaged_urdf
 
 from elastocal.cell.arm_description import CartesianNoise, Nominal, Tracker
-from elastocal.identification import Options, reduce
 from elastocal.identification.identify import identify
-from elastocal.model import Model, read_urdf
+from elastocal.identification.options import Options
+from elastocal.identification.solve import reduce
+from elastocal.model.manipulator import Model
+from elastocal.model.urdf import read_urdf
 from elastocal.simulation.simulate import simulate
 
 SIGMA = 5e-5

@@ -15,24 +15,24 @@ from support.calibration import binomial_band, measured, with_values
 from support.cells import DOWN, SLANTED, TABLE_2, kr270_cell, table_of
 
 from elastocal.errors import ElastocalError, InputError, InsufficientDataError
-from elastocal.identification import (
+from elastocal.identification import weighted_problem as partition
+from elastocal.identification.identify import identify
+from elastocal.identification.knowledge import (
     Bounds,
     Constraints,
     GaussianPrior,
     Knowledge,
     LinearEquality,
-    Options,
     SemidefiniteMatrix,
-    degrees_of_freedom,
     equal,
     non_negative,
     physical_constraints,
     read_knowledge,
 )
-from elastocal.identification import weighted_problem as partition
-from elastocal.identification.identify import identify
+from elastocal.identification.knowledge_fit import degrees_of_freedom
+from elastocal.identification.options import Options
 from elastocal.measurements import Measurements
-from elastocal.model import Model
+from elastocal.model.manipulator import Model
 
 SIGMA = 2e-4  # m, of a deflection: coarse, so that a stiff bearing is lost in the noise
 BEARING_X, BEARING_Y = "joint2.off_axis_compliance_x", "joint2.off_axis_compliance_y"

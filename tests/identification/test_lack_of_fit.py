@@ -9,10 +9,11 @@ from scipy import stats
 from support.calibration import cell_of, planar_chain, table_at
 from support.cells import random_poses
 
-from elastocal.identification import Options, lack_of_fit
 from elastocal.identification.identify import identify
-from elastocal.model import Model, observe
-from elastocal.model.observations import pure_error
+from elastocal.identification.noise_summary import lack_of_fit
+from elastocal.identification.options import Options
+from elastocal.model.manipulator import Model
+from elastocal.model.observations import observe, pure_error
 
 PLACED = ("base_frame", "marker_position")
 SIGMA, POSES, REPEATS = 5e-5, 14, 4

@@ -6,8 +6,8 @@ import numpy as np
 import pytest
 
 from elastocal.errors import InputError
-from elastocal.identification import linear_solver, solve_weighted
-from elastocal.identification.linear_solver import least_norm
+from elastocal.identification import linear_solver
+from elastocal.identification.linear_solver import least_norm, solve_weighted
 
 
 def rational_solution(B, y, w):

@@ -18,12 +18,13 @@ from support.cells import random_poses
 
 from elastocal.cell.arm_description import CartesianNoise, Tracker
 from elastocal.errors import InputError
-from elastocal.identification import Options, published
+from elastocal.identification import published
 from elastocal.identification.identify import identify
 from elastocal.identification.intervals import KINDS as INTERVALS
 from elastocal.identification.noise_structure import noise_models
-from elastocal.identification.options import METHODS, ROBUST
-from elastocal.model import Model, observe
+from elastocal.identification.options import METHODS, ROBUST, Options
+from elastocal.model.manipulator import Model
+from elastocal.model.observations import observe
 from elastocal.simulation.simulate import simulate
 
 SIGMA = 5e-5

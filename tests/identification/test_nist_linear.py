@@ -12,7 +12,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from elastocal.identification import solve_weighted
+from elastocal.identification.linear_solver import solve_weighted
 
 FOLDER = Path(__file__).parent / "nist"
 CERTIFIED = json.loads((FOLDER / "certified.json").read_text(encoding="utf-8"))

@@ -10,9 +10,11 @@ from support.cells import random_poses
 
 from elastocal.cell.arm_description import CartesianNoise, PolarNoise, Tracker
 from elastocal.errors import InputError
-from elastocal.identification import Options, scaled_by_component, weights_for
 from elastocal.identification.identify import identify
-from elastocal.model import Model, observe, subset
+from elastocal.identification.options import Options
+from elastocal.identification.weighted_problem import scaled_by_component, weights_for
+from elastocal.model.manipulator import Model
+from elastocal.model.observations import observe, subset
 from elastocal.simulation.simulate import simulate
 
 POLAR = Tracker(np.array([0.3, -0.2, 0.1]), PolarNoise(2e-6, 3e-6, 5e-6, 2e-5))

@@ -19,11 +19,11 @@ from support.calibration import (
 from support.cells import random_poses
 
 from elastocal.cell.arm_description import EffectChoice
-from elastocal.identification import Options, blocks, least_trimmed_squares, majority
 from elastocal.identification.identify import identify
-from elastocal.identification.outliers import FALSE_ALARM
-from elastocal.identification.trimmed import median_scale
-from elastocal.model import Model
+from elastocal.identification.options import Options
+from elastocal.identification.outliers import FALSE_ALARM, blocks
+from elastocal.identification.trimmed import least_trimmed_squares, majority, median_scale
+from elastocal.model.manipulator import Model
 
 SIGMA = 5e-5
 

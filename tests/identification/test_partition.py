@@ -9,9 +9,9 @@ from hypothesis import strategies as st
 from scipy import sparse
 from support.parts import deflections, positions
 
-from elastocal.identification import Weights, weights_for
 from elastocal.identification import weighted_problem as partition
-from elastocal.model import observe
+from elastocal.identification.weighted_problem import Weights, weights_for
+from elastocal.model.observations import observe
 
 UNIT = Weights("none", None, False, "")
 UNIT_TABLE = positions()

@@ -11,13 +11,13 @@ from support.cells import random_poses
 
 from elastocal.cell.arm_description import CartesianNoise, Tracker
 from elastocal.errors import UnknownNameError
-from elastocal.identification import judged, rms_3d
-from elastocal.identification.findings import ENOUGH, spare_equations
+from elastocal.identification.findings import ENOUGH, judged, spare_equations
 from elastocal.identification.identify import identify
 from elastocal.identification.prediction import NewPoses
-from elastocal.identification.residuals import told_by_one
-from elastocal.model import Model, observe
+from elastocal.identification.residuals import rms_3d, told_by_one
 from elastocal.model.calibrated_tool import CalibratedTool, tool_point
+from elastocal.model.manipulator import Model
+from elastocal.model.observations import observe
 
 SIGMA, POSES = 5e-5, 40
 

@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 
 from elastocal.errors import InputError
-from elastocal.identification import eq14, eq14_weights, group_sigma, ols, wls
+from elastocal.identification.published import eq14, eq14_weights, group_sigma, ols, wls
 
 RNG = np.random.default_rng(14)
 B = RNG.normal(size=(90, 4))

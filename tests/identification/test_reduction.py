@@ -25,11 +25,13 @@ from support.cells import choices, kr270_chain, random_poses
 from support.parts import SIGMA, arm, solved
 
 from elastocal.cell.arm_description import Nominal
-from elastocal.identification import Options, reduce
 from elastocal.identification import solve as solving
 from elastocal.identification.identify import identify
-from elastocal.identification.solve import STRUCTURAL, solve
-from elastocal.model import Chain, Joint, Model, Parameter
+from elastocal.identification.options import Options
+from elastocal.identification.solve import STRUCTURAL, reduce, solve
+from elastocal.model.arm import Parameter
+from elastocal.model.chain import Chain, Joint
+from elastocal.model.manipulator import Model
 
 DOWN = ((0.0, 0.0, -300.0),)
 SIDEWAYS = ((300.0, 0.0, 0.0),)

@@ -7,9 +7,10 @@ from support.calibration import cell_of, random_chain, table_at
 from support.cells import kr270_chain, random_poses
 from support.robots import packaged_urdf
 
-from elastocal.identification import RegistrationProblem, register
 from elastocal.identification import start as registration
-from elastocal.model import Model, read_urdf
+from elastocal.identification.start import RegistrationProblem, register
+from elastocal.model.manipulator import Model
+from elastocal.model.urdf import read_urdf
 
 SIGMA = 5e-5
 POSES = 60

@@ -13,14 +13,15 @@ from scipy import sparse, stats
 from support.calibration import binomial_band, table_at
 
 from elastocal.errors import InputError
-from elastocal.identification import (
+from elastocal.identification.residuals import (
+    MOST_BINS,
+    MOST_LISTED,
     ResidualSummary,
     normal_scores,
     simultaneous_level,
     summarise_residuals,
 )
-from elastocal.identification.residuals import MOST_BINS, MOST_LISTED
-from elastocal.model import Observations
+from elastocal.model.observations import Observations
 
 LOADS = ((0, 0, 0), (0, 0, -2600.0))
 

@@ -11,7 +11,7 @@ from elastocal.identification import visit_record
 from elastocal.identification.findings import judged
 from elastocal.identification.identify import identify
 from elastocal.identification.visit_record import in_random_order
-from elastocal.model import Model
+from elastocal.model.manipulator import Model
 from elastocal.report.method_and_noise import noise_model_line
 from elastocal.simulation.simulate import simulate
 

@@ -12,12 +12,13 @@ from support.calibration import SPRINGS, cell_of, measured, random_chain, table_
 from support.cells import random_poses
 
 from elastocal.cell.arm_description import CartesianNoise, Nominal, Tracker
-from elastocal.identification import judged, scrutiny
+from elastocal.identification import scrutiny
+from elastocal.identification.findings import judged
 from elastocal.identification.identify import identify
 from elastocal.identification.options import Options
 from elastocal.identification.residuals import rms_3d
 from elastocal.identification.scrutiny import autocorrelation
-from elastocal.model import Model
+from elastocal.model.manipulator import Model
 from elastocal.report.identification_view import influence_table, sets_table, uncertainty_table
 
 SIGMA = 1e-5

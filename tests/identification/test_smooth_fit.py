@@ -10,11 +10,12 @@ from support.calibration import PLACED, cell_of, covered, measured, planar_chain
 
 from elastocal.cell.arm_description import CartesianNoise, Nominal, Tracker
 from elastocal.errors import InputError
-from elastocal.identification import GaussianPrior, Options, non_negative
 from elastocal.identification.identify import identify
+from elastocal.identification.knowledge import GaussianPrior, non_negative
+from elastocal.identification.options import Options
 from elastocal.identification.smooth_part import SmoothPart
 from elastocal.measurements import Measurements
-from elastocal.model import Model
+from elastocal.model.manipulator import Model
 from elastocal.model.observations import observe, subset
 from elastocal.model.smooth_groups import SmoothGroup, smooth_groups
 from elastocal.units import Array

@@ -18,8 +18,8 @@ from support.calibration import (
 from support.cells import COMPLIANCE, kr270_chain, random_poses
 
 from elastocal.cell.arm_description import Nominal, Tracker
-from elastocal.identification import start_values
-from elastocal.model import Model
+from elastocal.identification.start import start_values
+from elastocal.model.manipulator import Model
 from elastocal.simulation.simulate import simulate
 
 SIGMA = 5e-5

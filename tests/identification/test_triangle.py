@@ -9,8 +9,7 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from elastocal.identification import RFactor, merge
-from elastocal.identification.weighted_problem import BLOCK
+from elastocal.identification.weighted_problem import BLOCK, RFactor, merge
 
 NIST = Path(__file__).parent / "nist"
 CERTIFIED = json.loads((NIST / "certified.json").read_text(encoding="utf-8"))

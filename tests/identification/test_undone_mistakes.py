@@ -12,7 +12,7 @@ from identification.test_far_values import CASES, cell, poses
 from typer.testing import CliRunner
 
 import elastocal as ec
-from elastocal.cli.app import app
+from elastocal.cli.main import app
 
 COUPLED = "coupling { joint = 3, of = 2, factor = -1 }"
 

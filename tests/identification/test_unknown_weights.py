@@ -12,7 +12,7 @@ from support.cells import kr270_cell, kr270_chain, random_table
 from elastocal.cell.arm_description import Nominal
 from elastocal.identification.identify import identify
 from elastocal.measurements import Measurements
-from elastocal.model import Model
+from elastocal.model.manipulator import Model
 from elastocal.units import Array
 
 SIGMA = 1e-5  # m

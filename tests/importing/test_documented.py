@@ -7,10 +7,9 @@ import pytest
 from support.tracker_exports import kr270_readings, krl, spatialanalyzer
 from typer.testing import CliRunner
 
-from elastocal.cli.app import app
 from elastocal.cli.import_command import PRESET_NAMES
-from elastocal.importing import read_mapping, wanted
-from elastocal.importing.mapping_file import PRESETS
+from elastocal.cli.main import app
+from elastocal.importing.mapping_file import PRESETS, read_mapping, wanted
 
 PAGE = (Path(__file__).parents[2] / "docs" / "importing.md").read_text(encoding="utf-8")
 

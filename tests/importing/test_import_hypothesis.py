@@ -10,7 +10,8 @@ from hypothesis import strategies as st
 from support.tracker_exports import imported, krl, rapid
 
 from elastocal.errors import InputError
-from elastocal.importing import Clock, Text, krl_rows, rapid_rows, read_mapping
+from elastocal.importing.foreign_text import Clock, Text, krl_rows, rapid_rows
+from elastocal.importing.mapping_file import read_mapping
 
 QUIET = settings(max_examples=40, deadline=None, suppress_health_check=list(HealthCheck))
 MAPPING = """

@@ -13,8 +13,7 @@ from support.tracker_exports import (
 )
 
 from elastocal.errors import InputError
-from elastocal.importing import preset_text, read_mapping
-from elastocal.importing.mapping_file import PRESETS
+from elastocal.importing.mapping_file import PRESETS, preset_text, read_mapping
 
 
 @pytest.fixture(scope="module")

@@ -79,7 +79,7 @@ def test_every_unit_and_sense_gives_the_positions_back(
     st.sampled_from(["deg", "gon", "rad"]),
 )  # fmt: skip
 def test_the_length_is_the_range_whatever_the_angles(d, az, zen, clockwise, unit):
-    from elastocal.importing import Records, Understood, with_positions
+    from elastocal.importing.records import Records, Understood, with_positions
 
     scale = TURN[unit] / 400
     observed = Understood("p", None, "points", "utf-8", "", ".", (), (), 1, ())

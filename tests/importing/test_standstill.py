@@ -4,7 +4,7 @@ import numpy as np
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from elastocal.importing import dwells
+from elastocal.importing.joining import dwells
 
 STEPS = st.lists(st.tuples(st.sampled_from([0.1, 0.5, 2.0]), st.integers(-2, 2),
                            st.integers(-1, 1)), min_size=1, max_size=40)  # fmt: skip

@@ -5,7 +5,7 @@ import pytest
 from support.tracker_exports import imported
 
 from elastocal.errors import InputError
-from elastocal.importing import Text, krl_rows, rapid_rows, read_lines
+from elastocal.importing.foreign_text import Text, krl_rows, rapid_rows, read_lines
 from elastocal.units import split_unit
 
 ROWS = [(10.0, 20.5, -30.25, 1234.5, 0.125, -7.0), (11.0, 21.5, -31.25, -2234.5, 1.125, -8.0)]

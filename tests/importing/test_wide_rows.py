@@ -10,7 +10,7 @@ import pytest
 from support.tracker_exports import MARKERS, kr270_readings
 from typer.testing import CliRunner, Result
 
-from elastocal.cli.app import app
+from elastocal.cli.main import app
 
 
 def run(*words: object) -> Result:

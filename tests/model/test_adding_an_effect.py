@@ -13,8 +13,8 @@ from elastocal.cell.arm_description import EffectChoice, ModelSpec, Robot, Tool
 from elastocal.cell.work_cell import Cell
 from elastocal.errors import InputError
 from elastocal.identification.identify import identify
-from elastocal.model import Model, register
-from elastocal.model.effects import CATALOGUE
+from elastocal.model.effects.catalogue import CATALOGUE, register
+from elastocal.model.manipulator import Model
 from elastocal.plugin_loader import load_plugins
 
 

@@ -15,7 +15,9 @@ from support.robots import KR270, PACKAGED, packaged_urdf, random_chain_urdf
 
 from elastocal.cell.arm_description import Nominal
 from elastocal.cell.work_cell import Cell
-from elastocal.model import Chain, nominal_flange, read_urdf
+from elastocal.model.chain import Chain
+from elastocal.model.rigid import nominal_flange
+from elastocal.model.urdf import read_urdf
 
 
 class Reference:

@@ -10,8 +10,8 @@ import pytest
 from support.cells import kr270_cell, kr270_chain, random_table
 
 from elastocal.errors import InputError
-from elastocal.model import BackendReport, BatchFunction, Model, chosen_backend, summary
-from elastocal.model.evaluate import FEW
+from elastocal.model.evaluate import FEW, BackendReport, BatchFunction, chosen_backend, summary
+from elastocal.model.manipulator import Model
 
 X = ca.SX.sym("x", 2)
 ROWS = np.linspace(0.1, 2.0, 20).reshape(10, 2)

@@ -8,8 +8,7 @@ import casadi as ca
 import numpy as np
 import pytest
 
-from elastocal.model import BatchFunction, thread_count
-from elastocal.model.evaluate import CHUNK
+from elastocal.model.evaluate import CHUNK, BatchFunction, thread_count
 
 
 @pytest.mark.parametrize("value, expected", [("3", 3), ("5,2", 5)])

@@ -9,8 +9,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from support.expressions import X, Y, built
 
-from elastocal.model import BatchFunction
-from elastocal.model.evaluate import CHUNK
+from elastocal.model.evaluate import CHUNK, BatchFunction
 
 UNARY = {
     "neg": -X, "exp": ca.exp(X), "log": ca.log(X), "sqrt": ca.sqrt(X), "sq": X * X,

@@ -9,9 +9,9 @@ from typing import Any
 import numpy as np
 import pytest
 
-from elastocal.demo import Demo, run_demo
+from elastocal.demo.example import Demo, run_demo
 from elastocal.errors import InputError
-from elastocal.model import read_calibrated
+from elastocal.model.calibrated import read_calibrated
 
 
 @pytest.fixture(scope="module")

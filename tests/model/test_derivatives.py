@@ -21,9 +21,10 @@ from support.robots import random_chain_urdf
 
 from elastocal.cell.arm_description import Nominal
 from elastocal.measurements import Measurements, with_moves
-from elastocal.model import Model, observe, read_urdf
-from elastocal.model.effects import CATALOGUE
-from elastocal.model.observations import COMPONENTS
+from elastocal.model.effects.catalogue import CATALOGUE
+from elastocal.model.manipulator import Model
+from elastocal.model.observations import COMPONENTS, observe
+from elastocal.model.urdf import read_urdf
 
 TOLERANCE = 1e-7  # relative to the largest entry of the column
 EPS = float(np.finfo(float).eps)

@@ -9,7 +9,9 @@ import numpy as np
 import pytest
 
 from elastocal.errors import InputError
-from elastocal.model import Chain, nominal_flange, read_dh
+from elastocal.model.chain import Chain
+from elastocal.model.dh import read_dh
+from elastocal.model.rigid import nominal_flange
 
 HEADER = "theta0_rad,d_m,a_m,alpha_rad"
 # UR5, https://www.universal-robots.com: d, a in m and α in rad, standard convention.

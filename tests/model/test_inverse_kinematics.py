@@ -13,8 +13,10 @@ from scipy.spatial.transform import Rotation
 from support.cells import kr270_chain, nominal_flanges, random_poses
 from support.robots import PACKAGED, packaged_urdf
 
-from elastocal.model import Chain, Postures, nominal_flange, read_urdf
-from elastocal.model.inverse_kinematics import inverse_kinematics
+from elastocal.model.chain import Chain
+from elastocal.model.inverse_kinematics import Postures, inverse_kinematics
+from elastocal.model.rigid import nominal_flange
+from elastocal.model.urdf import read_urdf
 
 POINT = np.array([0.1, -0.05, 0.2])
 ROBOTS = ["KR270", *PACKAGED]

@@ -12,7 +12,7 @@ from support.calibration import planar_chain
 from support.cells import kr270_cell, kr270_chain
 
 from elastocal.errors import InputError
-from elastocal.model import Chain, finite_ranges, joint_index, joint_limits
+from elastocal.model.chain import Chain, finite_ranges, joint_index, joint_limits
 
 
 def with_limits(**limits: tuple[float, float]):

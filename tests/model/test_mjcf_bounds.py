@@ -11,7 +11,7 @@ from pathlib import Path
 import pytest
 
 from elastocal.errors import InputError
-from elastocal.model import read_mjcf
+from elastocal.model.mjcf import read_mjcf
 
 pytest.importorskip("mujoco", reason="needs the extra 'mujoco'")
 

@@ -10,8 +10,8 @@ from support.cells import kr270_cell, kr270_chain, random_table
 
 from elastocal.errors import InputError
 from elastocal.measurements import Measurements
-from elastocal.model import Model, observe, pair_loaded_with_unloaded, subset
-from elastocal.model.observations import SIZE
+from elastocal.model.manipulator import Model
+from elastocal.model.observations import SIZE, observe, pair_loaded_with_unloaded, subset
 
 DOWN = -2600.0
 

@@ -19,7 +19,8 @@ from support.cells import (
 
 from elastocal.cell.arm_description import Nominal
 from elastocal.measurements import Measurements
-from elastocal.model import Model, SymbolicArm, configuration_rows
+from elastocal.model.manipulator import Model
+from elastocal.model.symbolic import SymbolicArm, configuration_rows
 from elastocal.units import Array
 
 GEOMETRY = ("base_frame", "joint_offset", "link_geometry", "marker_position")

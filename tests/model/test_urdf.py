@@ -10,7 +10,8 @@ import pytest
 from support.robots import KR270
 from support.urdf_text import LIMIT, arm, joint, link
 
-from elastocal.model import nominal_flange, read_urdf
+from elastocal.model.rigid import nominal_flange
+from elastocal.model.urdf import read_urdf
 
 
 def read(tmp_path: Path, text: str, base: str | None = None, flange: str | None = None):

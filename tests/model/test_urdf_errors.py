@@ -9,7 +9,7 @@ import pytest
 from support.urdf_text import LIMIT, arm, joint, link
 
 from elastocal.errors import InputError
-from elastocal.model import read_urdf
+from elastocal.model.urdf import read_urdf
 
 
 def read(tmp_path: Path, text: str, base: str | None = None, flange: str | None = None):

@@ -14,10 +14,11 @@ from support.design_cells import all_loads, as_table, plan_cell, setup_of
 from elastocal.cell.arm_description import PolarNoise
 from elastocal.cell.work_cell import Cell
 from elastocal.measurements import Measurements
-from elastocal.model import Model
-from elastocal.planning import Known, PoseInformation, load_states, measured, next_number, predicted
-from elastocal.simulation import expand_plan
-from elastocal.simulation.simulate import simulate
+from elastocal.model.manipulator import Model
+from elastocal.planning.information import PoseInformation, load_states, measured, next_number
+from elastocal.planning.plan import predicted
+from elastocal.planning.setup import Known
+from elastocal.simulation.simulate import expand_plan, simulate
 
 CHAIN = kr270_chain()
 BOTH = np.array([[0.0, 0, 0], DOWN])

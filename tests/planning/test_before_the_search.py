@@ -13,8 +13,8 @@ from support.design_cells import plan_cell, setup_of
 from elastocal.cell.plan_wishes import Motion
 from elastocal.cell.workspace_rules import Solid, Workspace
 from elastocal.errors import InputError
-from elastocal.planning import Checkpoint, DesignOptions
-from elastocal.planning.design import _Design
+from elastocal.planning.checkpoint import Checkpoint
+from elastocal.planning.design import DesignOptions, _Design
 
 HOME = np.radians([0.0, -90, 90, 0, 0, 0])
 

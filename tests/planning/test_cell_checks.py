@@ -17,8 +17,8 @@ from elastocal.cell.plan_wishes import DesignSpec, Motion, TargetPose
 from elastocal.cell.work_cell import Cell, read_cell
 from elastocal.cell.workspace_rules import CarriedBody, Solid, Workspace
 from elastocal.errors import InputError
-from elastocal.planning import check_cell
 from elastocal.planning import test_poses as target_poses
+from elastocal.planning.test_poses import check_cell
 
 HOME = np.radians([0.0, -90.0, 90.0, 0.0, 0.0, 0.0])
 HIGH = np.radians([0.0, 10.0, 90.0, 0.0, 0.0, 0.0])  # joint 2 ends at 0°

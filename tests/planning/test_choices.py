@@ -15,9 +15,11 @@ from support.design_commands import DEFLECTION, design, write_cell
 from elastocal.cell.arm_description import PolarNoise
 from elastocal.cell.plan_wishes import Freedom, TargetPose
 from elastocal.cell.work_cell import Cell
-from elastocal.model import Model
-from elastocal.planning import Choice, Chosen, Known, choices
+from elastocal.model.manipulator import Model
+from elastocal.planning import choices
 from elastocal.planning import test_poses as target_poses
+from elastocal.planning.choices import Choice, Chosen
+from elastocal.planning.setup import Known
 
 CHAIN = kr270_chain()
 ONE = (TargetPose(np.radians([0.0, -90, 90, 0, 30, 0])),)

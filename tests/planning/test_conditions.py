@@ -12,7 +12,7 @@ from support.design_cells import plan_cell
 
 import elastocal as ec
 from elastocal.cell.plan_wishes import Motion, TargetPose
-from elastocal.planning import Plan
+from elastocal.planning.plan import Plan
 
 HOME = np.radians([0.0, -90, 90, 0, 45, 0])
 MOTION = Motion(home=HOME, speed=np.full(6, 0.2), dwell=20.0, load_change=300.0, extra_time=0.0)

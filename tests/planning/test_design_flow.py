@@ -21,11 +21,14 @@ from elastocal.cell.plan_wishes import Motion, TargetPose
 from elastocal.cell.work_cell import Cell
 from elastocal.cell.workspace_rules import CarriedBody, HalfSpace, HangingLoad, Solid, Workspace
 from elastocal.errors import InputError, InsufficientDataError
-from elastocal.model import Chain, joint_limits, read_urdf
-from elastocal.planning import DesignOptions, DesignSearch, Effort, Feasibility, Plan, Setup, set_up
+from elastocal.model.chain import Chain, joint_limits
+from elastocal.model.urdf import read_urdf
 from elastocal.planning import design as design_module
-from elastocal.planning.design import EFFORTS, design
+from elastocal.planning.design import EFFORTS, DesignOptions, DesignSearch, Effort, design
+from elastocal.planning.feasibility import Feasibility
 from elastocal.planning.information import ALL_LOADS
+from elastocal.planning.plan import Plan
+from elastocal.planning.setup import Setup, set_up
 
 BOTH = np.array([[0.0, 0, 0], DOWN])
 LIGHT = np.array([[0.0, 0, 0], [0.0, 0, -60.0]])

@@ -8,9 +8,11 @@ from planning.relaxation.test_two_methods import assert_agreement
 from support.cells import DOWN, kr270_chain, random_poses
 from support.design_cells import all_loads, plan_cell, set_up, target_poses
 
-from elastocal.model import Model
-from elastocal.planning import Gain, Known, Setup, in_doubt, load_states
-from elastocal.planning.plan import Doubt
+from elastocal.model.manipulator import Model
+from elastocal.planning.doubts import in_doubt
+from elastocal.planning.information import load_states
+from elastocal.planning.plan import Doubt, Gain
+from elastocal.planning.setup import Known, Setup
 
 CHAIN = kr270_chain()
 POSES = random_poses(CHAIN, 60, seed=1)

@@ -8,11 +8,13 @@ from support.cells import DOWN, kr270_chain, random_poses
 from support.design_cells import all_loads, plan_cell
 
 from elastocal.cell.plan_wishes import TargetPose
-from elastocal.model import Model
-from elastocal.planning import Known, Setup, load_states, relax, set_up
+from elastocal.model.manipulator import Model
 from elastocal.planning import test_poses as target_poses
 from elastocal.planning.elsewhere import share_within
 from elastocal.planning.exact_plan import exact_plan
+from elastocal.planning.information import load_states
+from elastocal.planning.relaxation import relax
+from elastocal.planning.setup import Known, Setup, set_up
 from elastocal.planning.test_poses import ELSEWHERE, everywhere
 
 CHAIN = kr270_chain()

@@ -12,13 +12,12 @@ from elastocal.cell.arm_description import CartesianNoise, PolarNoise, Tracker, 
 from elastocal.cell.plan_wishes import DesignSpec
 from elastocal.cell.work_cell import Cell
 from elastocal.errors import InputError
-from elastocal.identification import weights_for
+from elastocal.identification.weighted_problem import weights_for
 from elastocal.measurements import Measurements
-from elastocal.model import Model, observe
-from elastocal.planning import PoseInformation, load_states
-from elastocal.planning.information import ALL_LOADS, pose_covariance
-from elastocal.simulation import expand_plan
-from elastocal.simulation.simulate import simulate
+from elastocal.model.manipulator import Model
+from elastocal.model.observations import observe
+from elastocal.planning.information import ALL_LOADS, PoseInformation, load_states, pose_covariance
+from elastocal.simulation.simulate import expand_plan, simulate
 
 POLAR = PolarNoise(10e-6, 0.3e-6, 15e-6, 6e-6)
 AXIS = CartesianNoise(np.array([10e-6, 15e-6, 20e-6]))

@@ -11,7 +11,10 @@ import pytest
 from support.cells import DOWN, kr270_chain, random_poses
 from support.design_cells import all_loads, plan_cell, setup_of
 
-from elastocal.planning import Certificate, Feasibility, Selection, Unreachable, ordered
+from elastocal.planning.arrangement import Selection, ordered
+from elastocal.planning.feasibility import Feasibility
+from elastocal.planning.moves import Unreachable
+from elastocal.planning.plan import Certificate
 
 CHAIN = kr270_chain()
 CELL = plan_cell(("joint_compliance",), loads=DOWN[None])

@@ -12,11 +12,12 @@ from support.design_cells import FULL, all_loads, any_cell, plan_cell, scara, se
 
 from elastocal.cell.work_cell import Cell
 from elastocal.errors import InputError, InsufficientDataError
-from elastocal.identification import Options
 from elastocal.identification.identify import identify
-from elastocal.model import Model
-from elastocal.planning import Known, PoseInformation, load_states
+from elastocal.identification.options import Options
+from elastocal.model.manipulator import Model
 from elastocal.planning import information as parameters
+from elastocal.planning.information import PoseInformation, load_states
+from elastocal.planning.setup import Known
 from elastocal.simulation.simulate import simulate
 
 CHAIN = kr270_chain()

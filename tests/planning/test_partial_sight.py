@@ -13,7 +13,7 @@ from support.cells import DOWN, TABLE_2
 import elastocal as ec
 from elastocal.cell.arm_description import Tool, Tracker
 from elastocal.cell.workspace_rules import Visibility, Workspace
-from elastocal.model import observe
+from elastocal.model.observations import observe
 from elastocal.planning.information import ALL_LOADS, observed_weights
 
 STATES = np.array([[0.0, 0, 0], DOWN])

@@ -14,9 +14,10 @@ from support.design_cells import plan_cell
 import elastocal as ec
 from elastocal.cell.workspace_rules import HalfSpace, Workspace
 from elastocal.errors import InputError
-from elastocal.planning import Plan, relax
 from elastocal.planning import design as design_module
 from elastocal.planning.feasibility import NEARBY
+from elastocal.planning.plan import Plan
+from elastocal.planning.relaxation import relax
 
 CELL = plan_cell(loads=DOWN[None], poses=6, candidates=60)
 

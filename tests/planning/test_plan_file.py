@@ -12,10 +12,11 @@ from support.files import write_campaign
 from typer.testing import CliRunner
 
 from elastocal.cell.plan_wishes import Motion
-from elastocal.cli.app import app
+from elastocal.cli.main import app
 from elastocal.errors import InputError
 from elastocal.measurements import read_plan
-from elastocal.planning import PlanRows, plan_rows, schedule, write_plan
+from elastocal.planning.execution import schedule
+from elastocal.planning.plan import PlanRows, plan_rows, write_plan
 from elastocal.text import is_label
 
 FORCES = np.array([[0.0, 0, 0], [0, 0, -2600.0]])

@@ -16,14 +16,13 @@ from support.design_cells import as_table, plan_cell
 from elastocal.cell.arm_description import PolarNoise
 from elastocal.cell.work_cell import Cell
 from elastocal.cell.workspace_rules import Workspace
-from elastocal.identification import Options
 from elastocal.identification.identify import identify
+from elastocal.identification.options import Options
 from elastocal.measurements import Measurements
-from elastocal.planning import DesignOptions, Plan
 from elastocal.planning import test_poses as target_poses
-from elastocal.planning.design import design
-from elastocal.simulation import expand_plan
-from elastocal.simulation.simulate import simulate
+from elastocal.planning.design import DesignOptions, design
+from elastocal.planning.plan import Plan
+from elastocal.simulation.simulate import expand_plan, simulate
 
 CHAIN = kr270_chain()
 BOTH = np.array([[0.0, 0, 0], DOWN])

@@ -6,9 +6,10 @@ import numpy as np
 from scipy import stats
 from support.cells import kr270_cell, kr270_chain
 
-from elastocal.identification import Reduction
-from elastocal.model import Model
-from elastocal.planning import Estimable, predicted, reasons
+from elastocal.identification.solve import Reduction
+from elastocal.model.manipulator import Model
+from elastocal.planning.information import Estimable
+from elastocal.planning.plan import predicted, reasons
 
 MODEL = Model.assembled(kr270_chain(), kr270_cell(("joint_compliance",), "deflection"))
 SIZES = np.full(6, 1e-7)

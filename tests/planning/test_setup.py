@@ -25,12 +25,17 @@ from elastocal.cell.arm_description import Nominal, PolarNoise
 from elastocal.cell.plan_wishes import TargetPose
 from elastocal.cell.work_cell import Cell
 from elastocal.errors import InputError
-from elastocal.identification import GaussianPrior, weights_for
-from elastocal.model import Chain, Model, observe, read_dh, read_urdf
-from elastocal.planning import Known, TargetPoses
+from elastocal.identification.knowledge import GaussianPrior
+from elastocal.identification.weighted_problem import weights_for
+from elastocal.model.chain import Chain
+from elastocal.model.dh import read_dh
+from elastocal.model.manipulator import Model
+from elastocal.model.observations import observe
+from elastocal.model.urdf import read_urdf
 from elastocal.planning import test_poses as target_poses
-from elastocal.simulation import expand_plan
-from elastocal.simulation.simulate import simulate
+from elastocal.planning.setup import Known
+from elastocal.planning.test_poses import TargetPoses
+from elastocal.simulation.simulate import expand_plan, simulate
 
 CHAIN = kr270_chain()
 BOTH = np.array([[0.0, 0, 0], DOWN])

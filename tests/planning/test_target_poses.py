@@ -17,9 +17,8 @@ from elastocal.cell.arm_description import Nominal, Tool
 from elastocal.cell.plan_wishes import DesignSpec, TargetBox, TargetPath, TargetPose
 from elastocal.cell.work_cell import Cell
 from elastocal.errors import InputError
-from elastocal.planning import TargetPoses
 from elastocal.planning import test_poses as target_poses
-from elastocal.planning.test_poses import DEFAULT_COUNT
+from elastocal.planning.test_poses import DEFAULT_COUNT, TargetPoses
 
 CHAIN = kr270_chain()
 LOADS = np.array([[0.0, 0, 0], [0, 0, -2600], [0, 900, -2600]])

@@ -14,9 +14,12 @@ from support.design_cells import FULL, any_cell, plan_cell, sliding_chain, sprea
 from elastocal.cell.arm_description import Nominal
 from elastocal.cell.plan_wishes import TargetPose
 from elastocal.cell.work_cell import Cell
-from elastocal.model import Chain, Model, Parameter
-from elastocal.planning import PoseInformation, TargetPoses, load_states, prediction_rows
+from elastocal.model.arm import Parameter
+from elastocal.model.chain import Chain
+from elastocal.model.manipulator import Model
 from elastocal.planning import test_poses as target_poses
+from elastocal.planning.information import PoseInformation, load_states
+from elastocal.planning.test_poses import TargetPoses, prediction_rows
 
 CHAIN = kr270_chain()
 BOTH = np.array([[0.0, 0, 0], DOWN])

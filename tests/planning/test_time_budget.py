@@ -13,10 +13,12 @@ import elastocal as ec
 from elastocal.cell.plan_wishes import Motion, TargetPose
 from elastocal.cell.work_cell import Cell
 from elastocal.errors import InputError, InsufficientDataError
-from elastocal.model import Model
-from elastocal.planning import Choice, Known, choices, time_budget
+from elastocal.model.manipulator import Model
+from elastocal.planning import choices, time_budget
 from elastocal.planning import test_poses as target_poses
+from elastocal.planning.choices import Choice
 from elastocal.planning.plan import TimedSize
+from elastocal.planning.setup import Known
 from elastocal.planning.time_budget import _Budget, _minutes, at_stops
 
 ONE = (TargetPose(np.radians([0.0, -90, 90, 0, 30, 0])),)

@@ -9,12 +9,12 @@ import pytest
 from support.cells import MARKERS, kr270_cell, kr270_chain, random_poses, table_of
 
 from elastocal.cell.arm_description import CartesianNoise, Tracker
-from elastocal.identification import Calibration, Method, Options
 from elastocal.identification.identify import identify
-from elastocal.model import Model
+from elastocal.identification.options import Method, Options
+from elastocal.identification.result import Calibration
+from elastocal.model.manipulator import Model
 from elastocal.report import page as report_pages
-from elastocal.simulation import values_from
-from elastocal.simulation.simulate import simulate
+from elastocal.simulation.simulate import simulate, values_from
 
 EFFECTS = ("base_frame", "joint_offset", "joint_compliance", "marker_position")
 SCRIPT = "<script>alert(1)</script>"

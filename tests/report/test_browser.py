@@ -20,10 +20,9 @@ from support.diagnoses import EXPLAINED, HOSTILE
 
 from elastocal.cell.arm_description import CartesianNoise, Tracker
 from elastocal.cell.plan_wishes import DesignSpec
-from elastocal.diagnosis import Baseline
-from elastocal.model import Model
-from elastocal.planning import DesignOptions
-from elastocal.planning.design import design
+from elastocal.diagnosis.baseline import Baseline
+from elastocal.model.manipulator import Model
+from elastocal.planning.design import DesignOptions, design
 from elastocal.report.page import page_of
 
 playwright = pytest.importorskip("playwright.sync_api")

@@ -13,10 +13,13 @@ from support.diagnoses import EXPLAINED, EXTRA, HOSTILE, TWO, VERDICTS
 from support.pages import Page
 
 from elastocal.cell.arm_description import EffectChoice
-from elastocal.diagnosis import Baseline, FaultyReading
+from elastocal.diagnosis.baseline import Baseline
+from elastocal.diagnosis.diagnosis import FaultyReading
 from elastocal.errors import InputError
-from elastocal.identification import BudgetStep
-from elastocal.model import Model, joint_limits, observe
+from elastocal.identification.error_budget import BudgetStep
+from elastocal.model.chain import joint_limits
+from elastocal.model.manipulator import Model
+from elastocal.model.observations import observe
 from elastocal.report.figures import effect_shapes
 from elastocal.report.page import page_of, write_page
 from elastocal.simulation.simulate import simulate

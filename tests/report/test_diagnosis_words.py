@@ -24,7 +24,7 @@ from support.diagnoses import (
     VERDICTS,
 )
 
-from elastocal.diagnosis import EffectAt, NearRepeats, NoiseFloor
+from elastocal.diagnosis.diagnosis import EffectAt, NearRepeats, NoiseFloor
 from elastocal.report.diagnosis_view import (
     diagnosis_headline,
     diagnosis_lines,

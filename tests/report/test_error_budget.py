@@ -10,7 +10,7 @@ import pytest
 from support.pages import Page
 
 from elastocal.identification import error_budget as module
-from elastocal.identification import gap_budget
+from elastocal.identification.error_budget import gap_budget
 from elastocal.report.figures import waterfall_of_steps
 from elastocal.report.identification_view import budget_steps, budget_table, rms_by_kind
 

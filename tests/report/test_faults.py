@@ -8,7 +8,8 @@ from typing import Any
 import numpy as np
 import pytest
 
-from elastocal.identification import FaultyGroup, Outlier, OutlierReport
+from elastocal.identification.faulty_readings import FaultyGroup, OutlierReport
+from elastocal.identification.outliers import Outlier
 from elastocal.report.identification_view import summary_lines
 from elastocal.report.method_and_noise import MOST_TOLD, fault_lines
 from elastocal.report.page import page_of

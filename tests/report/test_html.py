@@ -16,9 +16,8 @@ import numpy as np
 import pytest
 from support.pages import Page
 
-from elastocal.identification import gap_budget
-from elastocal.identification.error_budget import pose_accuracy
-from elastocal.model import observe
+from elastocal.identification.error_budget import gap_budget, pose_accuracy
+from elastocal.model.observations import observe
 from elastocal.report import figures, residual_view
 from elastocal.report.formatting import length
 from elastocal.report.judgement_view import judgement

@@ -7,7 +7,7 @@ from typing import Any
 
 import pytest
 
-from elastocal.identification import ActiveConstraint
+from elastocal.identification.constrained import ActiveConstraint
 from elastocal.report.method_and_noise import constraints_line, method_and_weights
 
 AT_BOUND = (ActiveConstraint("joint2.compliance >= 0", "lower", ("joint2.compliance",), 0.0, 1.0),)

@@ -12,18 +12,14 @@ import pytest
 from rich.console import Console
 from support.pages import Page
 
-from elastocal.identification import (
-    ActiveConstraint,
-    LackOfFit,
-    Noise,
-    NoiseSize,
-    Trial,
-    judged,
-    noise_models,
-    summarise_residuals,
-)
+from elastocal.identification.constrained import ActiveConstraint
+from elastocal.identification.findings import judged
 from elastocal.identification.intervals import KINDS as INTERVALS
+from elastocal.identification.noise_choice import Trial
+from elastocal.identification.noise_structure import noise_models
+from elastocal.identification.noise_summary import LackOfFit, Noise, NoiseSize
 from elastocal.identification.options import METHODS
+from elastocal.identification.residuals import summarise_residuals
 from elastocal.report.identification_view import summary_lines
 from elastocal.report.method_and_noise import (
     candidate_rows,

@@ -56,8 +56,7 @@ def plan():
 
     from elastocal.cell.arm_description import CartesianNoise, Tracker
     from elastocal.cell.plan_wishes import DesignSpec
-    from elastocal.planning import DesignOptions
-    from elastocal.planning.design import design
+    from elastocal.planning.design import DesignOptions, design
 
     loads = np.array([[0, 0, 0], [0, 0, -2600.0]])
     spec = DesignSpec(poses=4, loads=loads, candidates=30, levels={"joint2": (-0.5, -1.0)})
@@ -209,9 +208,10 @@ def commands():
     from support.cells import kr270_cell
     from support.commands import calibrated, erring
 
-    from elastocal.compensation import targets_at
     from elastocal.compensation.compensate import compensate
-    from elastocal.model import Model, tool_point
+    from elastocal.compensation.targets import targets_at
+    from elastocal.model.calibrated_tool import tool_point
+    from elastocal.model.manipulator import Model
 
     cell = kr270_cell(("joint_offset", "joint_compliance"))
     x = erring(Model.assembled(kr270_chain(), cell), np.random.default_rng(1), 0.5)

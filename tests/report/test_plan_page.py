@@ -16,8 +16,8 @@ from support.pages import Page
 from elastocal.cell.arm_description import CartesianNoise, Tracker
 from elastocal.cell.plan_wishes import DesignSpec
 from elastocal.errors import InputError
-from elastocal.planning import Certificate, DesignOptions, PlanSize
-from elastocal.planning.design import design
+from elastocal.planning.design import DesignOptions, design
+from elastocal.planning.plan import Certificate, PlanSize
 from elastocal.report.arm_view import plan_space
 from elastocal.report.page import page_of, write_page
 from elastocal.report.plan_view import plan_headline, plan_steps, plan_tone

@@ -11,8 +11,8 @@ from support.cells import kr270_cell
 
 from elastocal.cell.arm_description import CartesianNoise, Tracker
 from elastocal.cell.plan_wishes import DesignSpec
-from elastocal.planning import Certificate, DesignOptions, PlanSize
-from elastocal.planning.design import design
+from elastocal.planning.design import DesignOptions, design
+from elastocal.planning.plan import Certificate, PlanSize
 from elastocal.report.plan_terminal import print_plan
 from elastocal.report.plan_view import plan_lines, served
 from elastocal.report.terminal import PRINTED_WIDTH, printed_text

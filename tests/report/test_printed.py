@@ -11,7 +11,7 @@ import numpy as np
 import pytest
 from support.diagnoses import VERDICTS
 
-from elastocal.identification import judged
+from elastocal.identification.findings import judged
 from elastocal.report.diagnosis_terminal import print_diagnosis
 from elastocal.report.judgement_view import judgement
 from elastocal.report.terminal import PRINTED_WIDTH, print_result, printed_text

@@ -15,7 +15,7 @@ from support.robots import packaged_urdf
 
 from elastocal.cell.arm_description import Robot, Tracker
 from elastocal.cell.workspace_rules import Solid, Workspace
-from elastocal.model import load_chain
+from elastocal.model.choice import load_chain
 from elastocal.planning.bodies import WORLD
 from elastocal.report import arm_view as residual_module
 from elastocal.report.arm_view import (

@@ -10,7 +10,8 @@ import pytest
 from rich.console import Console
 from rich.table import Table
 
-from elastocal.identification import Combination, standings
+from elastocal.identification.findings import standings
+from elastocal.identification.result import Combination
 from elastocal.report.identification_view import (
     HALF_LENGTH,
     MIDDLE,

@@ -9,7 +9,9 @@ from typing import Any
 
 import pytest
 
-from elastocal.identification import LackOfFit, TestErrors, judged
+from elastocal.identification.findings import judged
+from elastocal.identification.noise_summary import LackOfFit
+from elastocal.identification.result import TestErrors
 from elastocal.report import judgement_view
 from elastocal.report.formatting import length
 from elastocal.report.page import page_of

@@ -5,7 +5,8 @@ import pytest
 from support.robot_files import told_by_init
 
 import elastocal as ec
-from elastocal.model import nominal_flanges, read_dh
+from elastocal.model.dh import read_dh
+from elastocal.model.rigid import nominal_flanges
 
 KR6 = """\
 0,410,20,-90

@@ -2,13 +2,14 @@
 
 import re
 import shutil
+from pathlib import Path
 
 import pytest
 from support.robot_files import told_by_init, urdf
 from typer.testing import CliRunner
 
 import elastocal as ec
-from elastocal.cli.app import app
+from elastocal.cli.main import app
 
 SCARA = (
     "type,theta0_deg,d_mm,a_mm,alpha_deg,lower_mm,upper_mm\nrevolute,0,210,260,0,,\n"
@@ -69,10 +70,10 @@ def test_the_load_is_guessed_from_the_arm_and_not_from_its_rail(tmp_path):
 
 
 def test_levels_of_the_compliance_are_asked_for_in_words_that_can_be_pasted(tmp_path):
-    from elastocal import demo
+    from elastocal.demo import example
 
     folder = tmp_path / "demo"
-    shutil.copytree(demo.__path__[0], folder)
+    shutil.copytree(Path(example.__file__).parent, folder)
     cell = folder / "cell.toml"
     done = run("design", cell, "-o", tmp_path / "plan.csv", "--effort", "quick")
     assert done[0] == 0, done[2]

@@ -12,7 +12,9 @@ from support.elastic_arms import MujocoArm, elastic_arm
 from support.robots import KR270, random_chain_urdf
 
 from elastocal.errors import ElastocalError, InputError
-from elastocal.model import Chain, nominal_flange, read_urdf
+from elastocal.model.chain import Chain
+from elastocal.model.rigid import nominal_flange
+from elastocal.model.urdf import read_urdf
 
 pytest.importorskip("mujoco")
 

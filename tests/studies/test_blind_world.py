@@ -25,7 +25,7 @@ from world_files import write_table, write_world
 from elastocal.cell.arm_description import EffectChoice
 from elastocal.cell.work_cell import read_cell
 from elastocal.measurements import Measurements, read_measurements
-from elastocal.model import Model
+from elastocal.model.manipulator import Model
 
 WORLD_MODULES = {
     "arm_data", "chance", "draw", "inside", "instrument", "mechanics", "mjcf", "outside", "places",

@@ -17,13 +17,12 @@ import scenarios
 from support.study_scripts import study_of
 
 from elastocal.cell.work_cell import read_cell
-from elastocal.demo import LOAD_N, published_compliances
-from elastocal.identification import Options
+from elastocal.demo.example import LOAD_N, published_compliances
 from elastocal.identification.identify import identify
+from elastocal.identification.options import Options
 from elastocal.measurements import read_plan
-from elastocal.model import Model
-from elastocal.simulation import expand_plan, values_from
-from elastocal.simulation.simulate import simulate
+from elastocal.model.manipulator import Model
+from elastocal.simulation.simulate import expand_plan, simulate, values_from
 
 study = study_of(FOLDER)
 NAMES = {s.key: s for s in scenarios.SCENARIOS}

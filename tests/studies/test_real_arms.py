@@ -8,7 +8,7 @@ from pathlib import Path
 import pytest
 from typer.testing import CliRunner
 
-from elastocal.cli.app import app
+from elastocal.cli.main import app
 
 FOLDER = Path(__file__).parents[2] / "experiment_design" / "real_arms"
 

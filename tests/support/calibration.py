@@ -13,9 +13,10 @@ from support.cells import choices
 
 from elastocal.cell.arm_description import ModelSpec, Robot, Tool, Tracker, Unsteadiness
 from elastocal.cell.work_cell import Cell
-from elastocal.identification import Calibration
+from elastocal.identification.result import Calibration
 from elastocal.measurements import Measurements
-from elastocal.model import Chain, Joint, LinkMass, Model
+from elastocal.model.chain import Chain, Joint, LinkMass
+from elastocal.model.manipulator import Model
 from elastocal.simulation.simulate import simulate
 from elastocal.units import Array
 

@@ -15,7 +15,9 @@ from support.robots import KR270
 from elastocal.cell.arm_description import EffectChoice, ModelSpec, Nominal, Robot, Tool, Tracker
 from elastocal.cell.work_cell import Cell
 from elastocal.measurements import Measurements
-from elastocal.model import Chain, nominal_flange, read_urdf
+from elastocal.model.chain import Chain
+from elastocal.model.rigid import nominal_flange
+from elastocal.model.urdf import read_urdf
 from elastocal.units import Array
 
 # Table 3 of Klimchik et al. (2013) in rad/(N m), k2 at its first level; k1 is not in it.

@@ -8,9 +8,11 @@ import numpy as np
 from scipy.spatial.transform import Rotation
 
 from elastocal.cell.work_cell import Cell
-from elastocal.compensation import Compensation
+from elastocal.compensation.compensate import Compensation
 from elastocal.measurements import Measurements
-from elastocal.model import CalibratedArm, Chain, Model
+from elastocal.model.calibrated import CalibratedArm
+from elastocal.model.chain import Chain
+from elastocal.model.manipulator import Model
 from elastocal.units import Array
 
 

@@ -4,16 +4,11 @@ from collections.abc import Sequence
 
 import numpy as np
 
-from elastocal.identification import (
-    ConstrainedObjective,
-    Constraints,
-    GaussianPrior,
-    minimise,
-    profile_linear_interval,
-)
-from elastocal.identification.constrained import Minimum
-from elastocal.identification.constrained_solver import loss_of
+from elastocal.identification.constrained import Minimum, minimise
+from elastocal.identification.constrained_solver import ConstrainedObjective, loss_of
 from elastocal.identification.intervals import ProfileInterval
+from elastocal.identification.knowledge import Constraints, GaussianPrior
+from elastocal.identification.knowledge_fit import profile_linear_interval
 
 NONE = Constraints()
 

@@ -16,10 +16,12 @@ from elastocal.cell.arm_description import CartesianNoise, Tool, Tracker
 from elastocal.cell.plan_wishes import DesignSpec
 from elastocal.cell.work_cell import Cell
 from elastocal.measurements import Measurements
-from elastocal.model import Chain, Joint, LinkMass, Model
-from elastocal.planning import Known, Setup, TargetPoses, load_states, set_up
+from elastocal.model.chain import Chain, Joint, LinkMass
+from elastocal.model.manipulator import Model
 from elastocal.planning import test_poses as target_poses
-from elastocal.planning.information import ALL_LOADS
+from elastocal.planning.information import ALL_LOADS, load_states
+from elastocal.planning.setup import Known, Setup, set_up
+from elastocal.planning.test_poses import TargetPoses
 from elastocal.units import Array
 
 AXIS = CartesianNoise(np.array([10e-6, 15e-6, 20e-6]))

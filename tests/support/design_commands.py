@@ -10,7 +10,7 @@ from typing import Any
 from support.robots import KR270
 from typer.testing import CliRunner, Result
 
-from elastocal.cli.app import app
+from elastocal.cli.main import app
 
 TEST_POSES = """
 [[design.test_pose]]

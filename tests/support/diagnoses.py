@@ -6,7 +6,7 @@ from dataclasses import replace
 
 import numpy as np
 
-from elastocal.diagnosis import (
+from elastocal.diagnosis.diagnosis import (
     Candidate,
     ComponentShare,
     Curve,
@@ -24,7 +24,7 @@ from elastocal.diagnosis import (
     StructureTest,
     Untested,
 )
-from elastocal.identification import BudgetStep
+from elastocal.identification.error_budget import BudgetStep
 from elastocal.measurements import Measurements
 
 HOSTILE = "<script>alert(1)</script>\x1b[31m"

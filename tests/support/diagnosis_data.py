@@ -23,12 +23,14 @@ from support.robots import KR270
 
 from elastocal.cell.arm_description import CartesianNoise, ModelSpec, Nominal, Robot, Tool, Tracker
 from elastocal.cell.work_cell import Cell
-from elastocal.diagnosis import Blocks, Diagnosis, DiagnosisOptions, NoiseValues, NoisyData
-from elastocal.diagnosis.diagnose import diagnose
+from elastocal.diagnosis.baseline import Blocks
+from elastocal.diagnosis.diagnose import DiagnosisOptions, diagnose
+from elastocal.diagnosis.diagnosis import Diagnosis
+from elastocal.diagnosis.noise_floor import NoiseValues, NoisyData
 from elastocal.measurements import Measurements
-from elastocal.model import Chain, Joint, Model
-from elastocal.simulation import draw_errors, values_from
-from elastocal.simulation.simulate import simulate
+from elastocal.model.chain import Chain, Joint
+from elastocal.model.manipulator import Model
+from elastocal.simulation.simulate import draw_errors, simulate, values_from
 
 Array = np.ndarray
 FITTED = ("base_frame", "joint_offset", "joint_compliance", "marker_position")

@@ -9,10 +9,13 @@ from pathlib import Path
 import numpy as np
 
 from elastocal.cell.work_cell import read_cell
-from elastocal.export import Conditions, Exported, Frames, Wish, random_table
-from elastocal.export.export import export
-from elastocal.model import CalibratedArm, Model, Parameter, read_calibrated
-from elastocal.model.effects import CATALOGUE
+from elastocal.export.export import Exported, Wish, export
+from elastocal.export.exportable import Conditions, random_table
+from elastocal.export.urdf_file import Frames
+from elastocal.model.arm import Parameter
+from elastocal.model.calibrated import CalibratedArm, read_calibrated
+from elastocal.model.effects.catalogue import CATALOGUE
+from elastocal.model.manipulator import Model
 from elastocal.units import Array
 
 GEOMETRY = ("base_frame", "joint_offset", "link_geometry", "marker_position")

@@ -25,7 +25,7 @@ def write_campaign(folder: Path, poses: int = 12) -> tuple[Path, Path]:
     from support.cells import random_poses, table_of
 
     from elastocal.cell.work_cell import read_cell
-    from elastocal.model import Model
+    from elastocal.model.manipulator import Model
 
     shutil.copyfile(KR270, folder / "arm.urdf")
     cell = folder / "cell.toml"

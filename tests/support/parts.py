@@ -12,17 +12,13 @@ from support.calibration import GEOMETRY, cell_of, measured, planar_chain, table
 from support.cells import random_poses
 
 from elastocal.cell.arm_description import CartesianNoise, Nominal, PolarNoise, Tracker
-from elastocal.identification import (
-    Problem,
-    Solution,
-    find_faulty,
-    fixed_and_free,
-    start_values,
-    weights_for,
-)
-from elastocal.identification.solve import solve
+from elastocal.identification.outliers import find_faulty
+from elastocal.identification.solve import Problem, Solution, solve
+from elastocal.identification.start import fixed_and_free, start_values
+from elastocal.identification.weighted_problem import weights_for
 from elastocal.measurements import Measurements
-from elastocal.model import Model, observe, subset
+from elastocal.model.manipulator import Model
+from elastocal.model.observations import observe, subset
 from elastocal.simulation.simulate import simulate
 from elastocal.units import Array
 

@@ -9,7 +9,7 @@ from pathlib import Path
 
 from elastocal import plugin_loader
 from elastocal.identification import noise_structure as structure
-from elastocal.model.effects import CATALOGUE
+from elastocal.model.effects.catalogue import CATALOGUE
 from elastocal.planning.criteria import CRITERIA
 
 DOCS = Path(__file__).parents[2] / "docs"

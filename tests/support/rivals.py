@@ -12,11 +12,11 @@ from support.cells import COMPLIANCE, DOWN, kr270_cell, kr270_chain, table_of
 
 from elastocal.cell.arm_description import CartesianNoise, Nominal
 from elastocal.cell.work_cell import Cell
-from elastocal.diagnosis import Candidate, EffectAt, NoiseFloor
+from elastocal.diagnosis.diagnosis import Candidate, EffectAt, NoiseFloor
 from elastocal.measurements import Measurements
-from elastocal.model import Model, finite_ranges, joint_limits
-from elastocal.simulation import values_from
-from elastocal.simulation.simulate import simulate
+from elastocal.model.chain import finite_ranges, joint_limits
+from elastocal.model.manipulator import Model
+from elastocal.simulation.simulate import simulate, values_from
 
 Key = tuple[str, str]
 

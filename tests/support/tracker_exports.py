@@ -10,9 +10,9 @@ from support.cells import random_poses, table_of
 from support.robots import KR270
 
 from elastocal.cell.work_cell import Cell, read_cell
-from elastocal.importing import Imported, read_mapping
-from elastocal.importing.assemble import import_files
-from elastocal.model import Model
+from elastocal.importing.assemble import Imported, import_files
+from elastocal.importing.mapping_file import read_mapping
+from elastocal.model.manipulator import Model
 
 MARKERS = ("M1", "M2")
 CELL = """\

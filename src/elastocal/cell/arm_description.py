@@ -223,7 +223,7 @@ class Tracker:
     `rotation_sigma` rad and `distance_sigma` m: noise of pose and distance readings, if known.
 
     Examples:
-        >>> from elastocal.cell import CartesianNoise
+        >>> from elastocal.cell.arm_description import CartesianNoise
         >>> ec.Tracker(position=[3.0, 0.0, 1.5], noise=CartesianNoise(sigma=[1e-5] * 3)).noise.sigma
         array([1.e-05, 1.e-05, 1.e-05])
     """

@@ -70,7 +70,7 @@ class Cell:
     `path`: the file that it was read from.
 
     Examples:
-        >>> from elastocal.cell import ModelSpec
+        >>> from elastocal.cell.arm_description import ModelSpec
         >>> cell = ec.Cell(
         ...     name="our arm",
         ...     robot=ec.Robot.from_urdf("kr270_2.urdf", flange="flange"),

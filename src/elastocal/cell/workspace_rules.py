@@ -238,7 +238,7 @@ class Workspace:
     side of z = 0 of the base; None: where neither obstacles nor half-spaces are stated.
 
     Examples:
-        >>> from elastocal.cell import HalfSpace
+        >>> from elastocal.cell.workspace_rules import HalfSpace
         >>> floor = HalfSpace(name="floor", point=[0, 0, 0], normal=[0, 0, 1])
         >>> ec.Workspace(keep_out=[floor], clearance=0.05).clearance
         0.05

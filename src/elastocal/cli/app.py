@@ -21,7 +21,6 @@ from typing import TYPE_CHECKING, Annotated, Any, Self
 import typer
 from typer.core import TyperGroup
 
-from elastocal import __version__
 from elastocal.errors import TRACEBACK, ElastocalError, InputError, explained, options_as_flags
 from elastocal.screen import complain, interrupts, safe_console, say
 
@@ -177,34 +176,6 @@ def _unwritten(error: OSError) -> int:
 def console(stderr: bool = False) -> Console:
     """A console; colours respect NO_COLOR and are off where the output is no terminal."""
     return safe_console(stderr=stderr)
-
-
-def _show_version(wanted: bool) -> None:
-    if wanted:
-        say(f"elastocal {__version__}")
-        raise typer.Exit
-
-
-@app.callback()
-@reporting_errors
-def options(
-    version: Annotated[
-        bool, typer.Option("--version", callback=_show_version, is_eager=True, help="Version.")
-    ] = False,
-    backend: Annotated[
-        str | None,
-        typer.Option(help="What evaluates the model: auto or numpy; default: auto."),
-    ] = None,
-) -> None:
-    """Calibrate industrial robot arms and explain what is left over."""
-    from elastocal.model.evaluate import VARIABLE, checked, chosen_backend
-
-    # By the environment, so that processes which a command starts choose the same.
-    if backend is not None:
-        os.environ[VARIABLE] = checked(backend.strip() or "auto", "--backend")
-    chosen_backend()
-    if os.environ.get("ELASTOCAL_CACHE"):
-        complain("ELASTOCAL_CACHE is no longer read, as nothing is kept between runs; unset it")
 
 
 # The files that a command reads and writes: checked before the work, written after it.

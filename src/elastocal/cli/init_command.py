@@ -78,12 +78,12 @@ def effects(
     """
     from rich.padding import Padding
 
-    from elastocal import demo
+    from elastocal.demo import example
     from elastocal.model.choice import cell_of, load_chain
     from elastocal.model.joint_names import names_told
     from elastocal.report.effect_names import effect_entries, effect_lines
 
-    known = cell_of(cell or Path(demo.__file__).parent / "cell.toml", plugins)
+    known = cell_of(cell or Path(example.__file__).parent / "cell.toml", plugins)
     entries = effect_entries(known)
     if as_json:
         say(json_text({"schema": "elastocal/effects/1", "effects": entries}))

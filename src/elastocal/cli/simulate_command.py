@@ -117,7 +117,7 @@ def demo(
     Example: elastocal demo -o demo_out
     """
     from elastocal.cli.identify_command import write_results
-    from elastocal.demo import run_demo
+    from elastocal.demo.example import run_demo
 
     with progress_line(quiet) as progress:
         done = run_demo(folder, seed, progress)

@@ -20,7 +20,7 @@ from elastocal.measurements import families
 from elastocal.model.calibrated import CalibratedArm, lasting
 from elastocal.model.calibrated_tool import CalibratedTool, ToolPoint
 from elastocal.model.chain import Chain, joint_limits
-from elastocal.model.effects import effect_of
+from elastocal.model.effects.catalogue import effect_of
 from elastocal.model.inverse_kinematics import Reaching, inverse_kinematics
 from elastocal.model.rigid import nominal_flanges
 from elastocal.model.smooth_groups import smooth_groups

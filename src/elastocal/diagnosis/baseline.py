@@ -19,7 +19,7 @@ from elastocal.identification.weighted_problem import (
     weights_for,
 )
 from elastocal.measurements import Measurements, load_states, numbered, visits
-from elastocal.model.effects import effect_of
+from elastocal.model.effects.catalogue import effect_of
 from elastocal.model.manipulator import Model
 from elastocal.model.observations import Observations, observe
 from elastocal.units import Array, IntArray

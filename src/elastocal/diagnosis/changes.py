@@ -31,7 +31,7 @@ from elastocal.identification.result import Calibration
 from elastocal.measurements import Measurements
 from elastocal.model.arm import given_force
 from elastocal.model.calibrated import CalibratedArm, given_arm
-from elastocal.model.effects import CATALOGUE
+from elastocal.model.effects.catalogue import CATALOGUE
 from elastocal.model.manipulator import Model
 from elastocal.model.valued import Conditions, Valued, arm_with, random_table, unstated_needs
 from elastocal.units import Array

@@ -66,7 +66,7 @@ from elastocal.identification.rigid_markers import solved_body, without_copies
 from elastocal.identification.start import check_table
 from elastocal.identification.upright import Fallen, fallen
 from elastocal.measurements import Measurements, order_contradicted
-from elastocal.model.effects import CATALOGUE, effect_of
+from elastocal.model.effects.catalogue import CATALOGUE, effect_of
 from elastocal.model.manipulator import Model
 from elastocal.model.smooth_groups import where_smooth_functions_end
 from elastocal.plugin_loader import is_plugin_file

@@ -35,7 +35,7 @@ from elastocal.identification.upright import as_placed
 from elastocal.identification.visit_record import visit_record
 from elastocal.measurements import Measurements, numbered
 from elastocal.model.arm import usual_sizes
-from elastocal.model.effects import CATALOGUE
+from elastocal.model.effects.catalogue import CATALOGUE
 from elastocal.model.effects.loads import PayloadError
 from elastocal.model.effects.placements import BaseFrame
 from elastocal.model.manipulator import Model

@@ -33,7 +33,7 @@ from elastocal.diagnosis.model_set import (
 )
 from elastocal.diagnosis.noise_floor import NoiseValues, log_prior
 from elastocal.diagnosis.unknown import Generic
-from elastocal.model.effects import SOMETHING
+from elastocal.model.effects.catalogue import SOMETHING
 from elastocal.units import Array
 
 # What a search found: the set, what else could stand in each of its places, and the odds.

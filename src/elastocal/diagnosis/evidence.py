@@ -22,7 +22,7 @@ from elastocal.diagnosis.noise_floor import (
     project,
 )
 from elastocal.diagnosis.unknown import Generic
-from elastocal.model.effects import SOMETHING
+from elastocal.model.effects.catalogue import SOMETHING
 from elastocal.model.evaluate import ahead
 from elastocal.units import Array
 

@@ -25,7 +25,7 @@ from elastocal.diagnosis.hypotheses import with_keys, with_recorded_drivers
 from elastocal.diagnosis.rivals import RivalSet, Suspects, check_open, with_neighbours
 from elastocal.errors import InsufficientDataError, option, require
 from elastocal.measurements import Measurements
-from elastocal.model.effects import effect_of
+from elastocal.model.effects.catalogue import effect_of
 from elastocal.model.manipulator import Model
 from elastocal.units import Array, Progress
 

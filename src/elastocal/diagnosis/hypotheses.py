@@ -20,8 +20,8 @@ from elastocal.measurements import Measurements, by_rows, in_any_order
 from elastocal.model.arm import Arm, ParameterSpec, Setting, row_inputs
 from elastocal.model.chain import Chain
 from elastocal.model.choice import set_constants
-from elastocal.model.effects import CATALOGUE
 from elastocal.model.effects.base import Effect, Stage, index
+from elastocal.model.effects.catalogue import CATALOGUE
 from elastocal.model.effects.changes_in_time import ThermalExpansion
 from elastocal.model.effects.compliances import JointCompliance
 from elastocal.model.effects.driven import (

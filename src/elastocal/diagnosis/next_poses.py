@@ -29,7 +29,7 @@ from elastocal.identification.identify import identify
 from elastocal.identification.prediction import over_the_workspace, predicted_error
 from elastocal.identification.result import Calibration
 from elastocal.measurements import Measurements
-from elastocal.model.effects import SOMETHING
+from elastocal.model.effects.catalogue import SOMETHING
 from elastocal.model.manipulator import Model
 from elastocal.planning.criteria import RobustError
 from elastocal.planning.design import DesignOptions, design

@@ -42,7 +42,7 @@ from elastocal.files import atomic_write_text, together
 from elastocal.identification.covariance import t_quantile
 from elastocal.model.calibrated import CalibratedArm
 from elastocal.model.chain import Chain
-from elastocal.model.effects import effect_of
+from elastocal.model.effects.catalogue import effect_of
 from elastocal.model.rigid import nominal_flanges
 from elastocal.model.smooth_groups import SmoothGroup, smooth_groups
 from elastocal.model.valued import Conditions, Valued, random_table

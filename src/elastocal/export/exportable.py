@@ -18,8 +18,8 @@ from elastocal.model import rigid
 from elastocal.model.arm import Arm
 from elastocal.model.calibrated import CalibratedArm
 from elastocal.model.chain import Chain, LinkMass
-from elastocal.model.effects import CATALOGUE
 from elastocal.model.effects.base import Format
+from elastocal.model.effects.catalogue import CATALOGUE
 from elastocal.model.effects.compliances import JointCompliance
 from elastocal.model.manipulator import Model
 from elastocal.model.symbolic import SymbolicArm

@@ -38,7 +38,7 @@ class JointCorrection:
     commanded to q.  Curves are linear between their rows and constant beyond.
 
     Examples:
-        >>> from elastocal.export import read_joint_correction
+        >>> from elastocal.export.joint_correction import read_joint_correction
         >>> effective = read_joint_correction("joints.csv")
         >>> effective([0.4, -1.0, 1.0, 0.0, 0.5, 0.0]).round(3)
         array([ 0.4, -1. ,  1. ,  0. ,  0.5,  0. ])

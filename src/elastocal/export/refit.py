@@ -25,7 +25,7 @@ from elastocal.export.joint_correction import CorrectionCurve, JointCorrection
 from elastocal.measurements import Measurements
 from elastocal.model.arm import row_inputs
 from elastocal.model.chain import finite_ranges, joint_limits
-from elastocal.model.effects import effect_of
+from elastocal.model.effects.catalogue import effect_of
 from elastocal.model.effects.gears import JointOffset
 from elastocal.model.effects.placements import LinkGeometry
 from elastocal.model.evaluate import BatchFunction

@@ -15,7 +15,7 @@ import numpy as np
 from elastocal.identification.result import Calibration, Finding
 from elastocal.identification.start import nominal_problem, register
 from elastocal.model.arm import Parameter
-from elastocal.model.effects import effect_of
+from elastocal.model.effects.catalogue import effect_of
 from elastocal.model.effects.compliances import JointCompliance
 from elastocal.model.effects.gears import JointOffset
 from elastocal.model.effects.placements import LinkGeometry

@@ -21,7 +21,7 @@ from elastocal.identification.result import Calibration, Estimate, Finding, Numb
 from elastocal.identification.solve import Solution
 from elastocal.identification.tails import kept_of
 from elastocal.measurements import firsts, numbered
-from elastocal.model.effects import effect_of
+from elastocal.model.effects.catalogue import effect_of
 from elastocal.text import gathered, listed
 
 # What a result is worth, judged once: each finding with its numbers, its threshold and a remedy.

@@ -20,7 +20,7 @@ from elastocal.identification.smooth_prior import Standardised
 from elastocal.identification.weighted_problem import Weights
 from elastocal.measurements import Measurements
 from elastocal.model.calibrated import CalibratedArm
-from elastocal.model.effects import CATALOGUE
+from elastocal.model.effects.catalogue import CATALOGUE
 from elastocal.model.manipulator import Model
 from elastocal.model.observations import Observations
 from elastocal.units import Array, BoolArray, IntArray

@@ -39,7 +39,7 @@ from elastocal.identification.weighted_problem import (
     sample,
 )
 from elastocal.model.arm import Parameter
-from elastocal.model.effects import effect_of
+from elastocal.model.effects.catalogue import effect_of
 from elastocal.model.manipulator import Model
 from elastocal.model.observations import Observations
 from elastocal.units import Array, IntArray, Progress

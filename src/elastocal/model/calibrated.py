@@ -19,7 +19,7 @@ from elastocal.errors import InputError, option
 from elastocal.files import read_json
 from elastocal.model.chain import Chain
 from elastocal.model.choice import cell_of
-from elastocal.model.effects import effect_of
+from elastocal.model.effects.catalogue import effect_of
 from elastocal.model.manipulator import Model
 from elastocal.model.rigid import nominal_flange
 from elastocal.model.smooth_groups import smooth_groups

@@ -12,8 +12,8 @@ from elastocal.cell.work_cell import Cell, read_cell
 from elastocal.errors import InputError
 from elastocal.model.arm import ParameterSpec
 from elastocal.model.chain import Chain
-from elastocal.model.effects import CATALOGUE
 from elastocal.model.effects.base import Effect
+from elastocal.model.effects.catalogue import CATALOGUE
 from elastocal.model.plausible import plausible
 from elastocal.plugin_loader import load_installed, load_named
 from elastocal.text import did_you_mean, listed

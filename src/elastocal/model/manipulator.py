@@ -19,8 +19,8 @@ from elastocal.measurements import DEFAULT_MARKER, Measurements, read_measuremen
 from elastocal.model.arm import Parameter, row_inputs
 from elastocal.model.chain import Chain
 from elastocal.model.choice import cell_of, load_chain
-from elastocal.model.effects import effect_of
 from elastocal.model.effects.base import Effect
+from elastocal.model.effects.catalogue import effect_of
 from elastocal.model.effects.driven import JointMotion
 from elastocal.model.evaluate import CHUNK, row_blocks, summary
 from elastocal.model.joint_names import numbered

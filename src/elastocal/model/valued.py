@@ -11,7 +11,7 @@ import numpy as np
 from elastocal.measurements import Measurements
 from elastocal.model.calibrated import CalibratedArm, MeasuredVisits
 from elastocal.model.chain import finite_ranges, joint_limits
-from elastocal.model.effects import CATALOGUE
+from elastocal.model.effects.catalogue import CATALOGUE
 from elastocal.model.effects.loads import LinkGravity
 from elastocal.model.manipulator import Model
 from elastocal.units import Array

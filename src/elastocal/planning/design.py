@@ -15,7 +15,7 @@ from elastocal.cell.work_cell import Cell
 from elastocal.errors import InsufficientDataError, option, require
 from elastocal.identification.knowledge import GaussianPrior
 from elastocal.measurements import Measurements
-from elastocal.model.effects import effect_of
+from elastocal.model.effects.catalogue import effect_of
 from elastocal.model.manipulator import Model
 from elastocal.planning.arrangement import Selection, ordered
 from elastocal.planning.candidates import draw, joint_space

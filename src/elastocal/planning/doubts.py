@@ -26,7 +26,7 @@ from scipy import linalg
 from elastocal.cell.arm_description import EffectChoice
 from elastocal.identification.knowledge import GaussianPrior
 from elastocal.model.arm import usual_sizes
-from elastocal.model.effects import CATALOGUE, SOMETHING
+from elastocal.model.effects.catalogue import CATALOGUE, SOMETHING
 from elastocal.model.manipulator import Model
 from elastocal.model.observations import observe
 from elastocal.planning.information import (

@@ -26,7 +26,7 @@ from elastocal.identification.weighted_problem import (
 )
 from elastocal.measurements import Measurements
 from elastocal.model.chain import joint_index
-from elastocal.model.effects import effect_of
+from elastocal.model.effects.catalogue import effect_of
 from elastocal.model.manipulator import Model
 from elastocal.model.observations import Observations, available_noise, observe
 from elastocal.simulation.simulate import simulate

@@ -13,7 +13,7 @@ from elastocal.cell.work_cell import Cell
 from elastocal.errors import InsufficientDataError, option, require
 from elastocal.identification.knowledge import GaussianPrior
 from elastocal.identification.start import fixed_and_free
-from elastocal.model.effects import effect_of
+from elastocal.model.effects.catalogue import effect_of
 from elastocal.model.manipulator import Model
 from elastocal.planning.criteria import criterion_named, make_criterion
 from elastocal.planning.criterion import Criterion

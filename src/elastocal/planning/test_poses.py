@@ -20,7 +20,7 @@ from elastocal.identification.solve import Reduction
 from elastocal.measurements import NUMBERED, Measurements, families, layout_of, rotation_column
 from elastocal.model.arm import LEVEL_TOLERANCE
 from elastocal.model.chain import Chain, finite_ranges, joint_index, joint_limits
-from elastocal.model.effects import CATALOGUE
+from elastocal.model.effects.catalogue import CATALOGUE
 from elastocal.model.effects.placements import MarkerPosition
 from elastocal.model.inverse_kinematics import Postures, inverse_kinematics
 from elastocal.model.manipulator import Model

@@ -25,7 +25,7 @@ from elastocal.diagnosis.changes import Comparison
 from elastocal.diagnosis.diagnosis import Diagnosis
 from elastocal.errors import InputError
 from elastocal.identification.result import Calibration, Estimate
-from elastocal.model.effects import effect_of
+from elastocal.model.effects.catalogue import effect_of
 from elastocal.planning.plan import Plan
 from elastocal.report.arm_view import plan_figure, plan_space
 from elastocal.report.causes_view import causes

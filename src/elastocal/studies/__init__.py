@@ -8,13 +8,3 @@ out one task, `study_run` hands the tasks to workers, `study_results` is the dat
     run_study(study, "look", jobs=4)
     frame = read_results("look")
 """
-
-from elastocal import loaded_on_demand
-
-ROOMS = {
-    "study_folder": "Study read_study",
-    "study_results": "read_results",
-    "study_run": "ClusterLostError StudyStop Way run_cluster run_local run_study summarise",
-}
-__all__ = [name for names in ROOMS.values() for name in names.split()]
-__getattr__, __dir__ = loaded_on_demand(__name__, ROOMS)

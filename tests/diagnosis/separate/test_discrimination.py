@@ -13,32 +13,26 @@ from support.cells import choices, kr270_cell, kr270_chain, random_poses, table_
 
 from elastocal.cell.arm_description import CartesianNoise, Tool, Tracker
 from elastocal.cell.workspace_rules import Visibility, Workspace
-from elastocal.diagnosis import (
-    Baseline,
+from elastocal.diagnosis.baseline import Baseline, fit_baseline, prior_deviations
+from elastocal.diagnosis.diagnosis import NoiseFloor
+from elastocal.diagnosis.discrimination import (
+    DRAWS,
     Discrimination,
-    Item,
-    NoiseFloor,
-    NoiseValues,
-    RivalSet,
     VisitPool,
-    alternatives,
+    _hidden,
     campaign_of,
-    expected,
-    expected_of_random,
-    fewest,
-    fit_baseline,
     joined,
-    possible,
-    prior_deviations,
     rows_of,
     visit_pool_of,
 )
-from elastocal.diagnosis.discrimination import DRAWS, _hidden
-from elastocal.diagnosis.rivals import SETTINGS
+from elastocal.diagnosis.extra_poses import expected, expected_of_random, fewest
+from elastocal.diagnosis.hypotheses import possible
+from elastocal.diagnosis.model_set import Item
+from elastocal.diagnosis.noise_floor import NoiseValues
+from elastocal.diagnosis.rivals import SETTINGS, RivalSet, alternatives
 from elastocal.measurements import Measurements
-from elastocal.model import Model
-from elastocal.simulation import values_from
-from elastocal.simulation.simulate import simulate
+from elastocal.model.manipulator import Model
+from elastocal.simulation.simulate import simulate, values_from
 from elastocal.units import Array
 
 FITTED = ("base_frame", "joint_offset", "marker_position")

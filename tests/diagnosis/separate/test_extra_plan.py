@@ -10,14 +10,12 @@ import pytest
 from support.rivals import ECCENTRIC, SCALE, campaign, diagnosis_of, measured
 
 from elastocal.cell.workspace_rules import Workspace
-from elastocal.diagnosis import (
-    plan_extra,
-)
+from elastocal.diagnosis.extra_poses import plan_extra
 from elastocal.errors import InputError
 from elastocal.measurements import Measurements, read_plan
-from elastocal.model import Model, finite_ranges, joint_limits
-from elastocal.simulation import expand_plan
-from elastocal.simulation.simulate import simulate
+from elastocal.model.chain import finite_ranges, joint_limits
+from elastocal.model.manipulator import Model
+from elastocal.simulation.simulate import expand_plan, simulate
 
 NARROW = {"joint3.eccentricity_sin": 1.5e-4, "joint3.eccentricity_cos": -1e-4}
 

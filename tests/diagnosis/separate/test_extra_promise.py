@@ -9,19 +9,16 @@ import pytest
 from scipy.special import softmax
 from support.rivals import ECCENTRIC, REPEATABILITY, SCALE, Key, campaign, diagnosis_of, measured
 
-from elastocal.diagnosis import (
-    NoiseValues,
-    diagnosis_data_of,
-    direct,
-    fit_baseline,
-    joined,
-    plan_extra,
-    possible,
-    project,
-)
+from elastocal.diagnosis.baseline import fit_baseline
+from elastocal.diagnosis.diagnosis_data import diagnosis_data_of
+from elastocal.diagnosis.discrimination import joined
+from elastocal.diagnosis.evidence import direct
+from elastocal.diagnosis.extra_poses import plan_extra
+from elastocal.diagnosis.hypotheses import possible
+from elastocal.diagnosis.noise_floor import NoiseValues, project
 from elastocal.measurements import Measurements
-from elastocal.model import Model
-from elastocal.simulation import expand_plan
+from elastocal.model.manipulator import Model
+from elastocal.simulation.simulate import expand_plan
 from elastocal.units import Array
 
 RIVALS: tuple[Key, ...] = (ECCENTRIC, SCALE)

@@ -9,16 +9,15 @@ from scipy import optimize
 from support.constrained import solve
 
 from elastocal.errors import InputError
-from elastocal.identification import (
+from elastocal.identification.constrained_solver import ConstrainedObjective, ResidualLoss
+from elastocal.identification.knowledge import (
     Bounds,
-    ConstrainedObjective,
     Constraints,
     LinearEquality,
-    ResidualLoss,
     SemidefiniteMatrix,
-    huber,
     non_negative,
 )
+from elastocal.identification.robust import huber
 
 NAMES = tuple("abcdef")
 UNIT = np.array([1e-7, 1e-7, 1e-7, 1e-3, 1e-3, 1e-3])

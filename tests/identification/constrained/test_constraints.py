@@ -9,7 +9,7 @@ from hypothesis import strategies as st
 from support.cells import kr270_cell
 
 from elastocal.errors import InputError
-from elastocal.identification import (
+from elastocal.identification.knowledge import (
     Bounds,
     Constraints,
     LinearEquality,
@@ -18,7 +18,8 @@ from elastocal.identification import (
     non_negative,
     physical_constraints,
 )
-from elastocal.model import Model, Parameter
+from elastocal.model.arm import Parameter
+from elastocal.model.manipulator import Model
 
 NAMES = ("joint1.compliance", "joint2.compliance", "joint3.offset")
 

@@ -7,15 +7,15 @@ from support.calibration import binomial_band
 from support.constrained import profile, profiles, solve
 
 from elastocal.errors import InputError
-from elastocal.identification import (
+from elastocal.identification.knowledge import (
     Bounds,
     Constraints,
     GaussianPrior,
     LinearEquality,
     SemidefiniteMatrix,
     non_negative,
-    solve_weighted,
 )
+from elastocal.identification.linear_solver import solve_weighted
 
 NAMES = ("a", "b", "c")
 SIZES = np.array([1e-7, 1e-6, 1e-3])

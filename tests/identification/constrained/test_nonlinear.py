@@ -10,21 +10,21 @@ from support.calibration import measured, with_values
 from support.cells import SLANTED, TABLE_2, kr270_cell, table_of
 
 from elastocal.errors import ElastocalError, InputError
-from elastocal.identification import (
+from elastocal.identification.constrained import constrained_fit
+from elastocal.identification.knowledge import (
     Bounds,
     Constraints,
-    FitProblem,
     GaussianPrior,
     SemidefiniteMatrix,
-    Weights,
-    constrained_fit,
     equal,
-    fit,
     non_negative,
     physical_constraints,
-    profile_fit_interval,
 )
-from elastocal.model import Model, observe
+from elastocal.identification.knowledge_fit import profile_fit_interval
+from elastocal.identification.least_squares import FitProblem, fit
+from elastocal.identification.weighted_problem import Weights
+from elastocal.model.manipulator import Model
+from elastocal.model.observations import observe
 
 SIGMA = 2e-4  # m, of a deflection: coarse, so that a stiff bearing is lost in the noise
 BEARING_X, BEARING_Y = "joint2.off_axis_compliance_x", "joint2.off_axis_compliance_y"

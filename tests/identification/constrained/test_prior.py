@@ -9,7 +9,7 @@ from hypothesis import strategies as st
 from support.constrained import solve
 
 from elastocal.errors import ElastocalError, InputError
-from elastocal.identification import GaussianPrior, non_negative, share_of_prior
+from elastocal.identification.knowledge import GaussianPrior, non_negative, share_of_prior
 
 NAMES = ("joint1.compliance", "joint2.compliance", "link1.x")
 SIZES = np.array([1e-7, 1e-6, 1e-3])

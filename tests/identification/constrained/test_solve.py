@@ -8,14 +8,14 @@ from scipy import optimize
 from support.constrained import solve
 
 from elastocal.errors import ElastocalError, InputError, InsufficientDataError
-from elastocal.identification import (
+from elastocal.identification.knowledge import (
     Bounds,
     Constraints,
     LinearEquality,
     equal,
     non_negative,
-    solve_weighted,
 )
+from elastocal.identification.linear_solver import solve_weighted
 
 NAMES = tuple("abcdef")
 # Parameters of the sizes that an arm has: compliances of 1e-7 beside lengths of 1e-3.

@@ -8,7 +8,7 @@ from hypothesis import strategies as st
 from statsmodels.stats.sandwich_covariance import cov_cluster
 
 from elastocal.errors import InputError, InsufficientDataError
-from elastocal.identification import cluster_robust, hc
+from elastocal.identification.covariance import cluster_robust, hc
 
 KINDS = ("CR0", "CR1", "CR2", "CR3")
 

@@ -10,7 +10,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from elastocal.identification import cluster_robust
+from elastocal.identification.covariance import cluster_robust
 
 KINDS = ("CR0", "CR1", "CR2", "CR3")
 

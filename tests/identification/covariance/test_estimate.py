@@ -5,7 +5,7 @@ import pytest
 from scipy import stats
 
 from elastocal.errors import InputError
-from elastocal.identification import Covariance, t_quantile
+from elastocal.identification.covariance import Covariance, t_quantile
 
 
 def test_each_parameter_has_its_own_t():

@@ -10,14 +10,11 @@ from support.cells import random_poses
 
 from elastocal.cell.arm_description import Nominal
 from elastocal.errors import ElastocalError, InputError
-from elastocal.identification import (
-    FitProblem,
-    fit,
-    profile_interval,
-    profile_of,
-    weights_for,
-)
-from elastocal.model import Model, observe
+from elastocal.identification.intervals import profile_interval, profile_of
+from elastocal.identification.least_squares import FitProblem, fit
+from elastocal.identification.weighted_problem import weights_for
+from elastocal.model.manipulator import Model
+from elastocal.model.observations import observe
 
 
 def least(B, y):

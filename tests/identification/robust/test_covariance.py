@@ -5,17 +5,17 @@ import pytest
 from support.calibration import binomial_band
 
 from elastocal.errors import InputError, InsufficientDataError
-from elastocal.identification import (
+from elastocal.identification.robust import (
     Absolute,
     Huber,
     asymptotic_covariance,
     clustered_covariance,
     huber,
-    least_trimmed_squares,
     m_estimate,
     student_t,
     tukey,
 )
+from elastocal.identification.trimmed import least_trimmed_squares
 
 FITS = {
     "huber": lambda B, y: m_estimate(B, y, huber(3), size=3),

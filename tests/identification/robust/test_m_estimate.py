@@ -10,7 +10,7 @@ from scipy import optimize
 from scipy.spatial.transform import Rotation
 
 from elastocal.errors import InputError, InsufficientDataError
-from elastocal.identification import (
+from elastocal.identification.robust import (
     Absolute,
     Bisquare,
     Huber,

@@ -8,15 +8,11 @@ from support.calibration import PLACED, cell_of, measured, planar_chain, table_a
 from support.cells import random_poses
 
 from elastocal.errors import InputError
-from elastocal.identification import (
-    FitProblem,
-    asymptotic_covariance,
-    clustered_covariance,
-    fit,
-    robust_fit,
-    weights_for,
-)
-from elastocal.model import Model, observe
+from elastocal.identification.least_squares import FitProblem, fit
+from elastocal.identification.robust import asymptotic_covariance, clustered_covariance, robust_fit
+from elastocal.identification.weighted_problem import weights_for
+from elastocal.model.manipulator import Model
+from elastocal.model.observations import observe
 
 SIGMA = 5e-5
 NAMES = ("huber", "tukey", "l1", "student-t")

@@ -7,9 +7,9 @@ import pytest
 from scipy import stats
 from scipy.spatial.transform import Rotation
 
-from elastocal.identification import outlier_report, tukey
-from elastocal.identification.faulty_readings import CleanFit
+from elastocal.identification.faulty_readings import CleanFit, outlier_report
 from elastocal.identification.outliers import FALSE_ALARM
+from elastocal.identification.robust import tukey
 
 
 def agreeing(B, y, tests, seed=0):

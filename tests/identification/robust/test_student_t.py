@@ -5,7 +5,7 @@ import pytest
 from scipy import optimize, stats
 
 from elastocal.errors import InputError
-from elastocal.identification import log_likelihood, student_t
+from elastocal.identification.robust import log_likelihood, student_t
 
 
 def sample(seed, size, nu=4.0, n=200, p=3):

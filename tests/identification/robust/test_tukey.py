@@ -4,10 +4,8 @@ import numpy as np
 import pytest
 
 from elastocal.errors import InsufficientDataError
-from elastocal.identification import (
-    least_trimmed_squares,
-    tukey,
-)
+from elastocal.identification.robust import tukey
+from elastocal.identification.trimmed import least_trimmed_squares
 
 
 def least_squares(B, y):

@@ -6,7 +6,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from elastocal.identification import Readings
+from elastocal.identification.noise_structure import Readings
 
 BY = {
     "configuration": ("configuration",),

@@ -15,8 +15,8 @@ import numpy as np
 import pytest
 from scipy import stats
 
-from elastocal.identification import Readings
 from elastocal.identification.noise_choice import settle
+from elastocal.identification.noise_structure import Readings
 
 
 @dataclass(frozen=True)

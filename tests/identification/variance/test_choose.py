@@ -8,7 +8,8 @@ import pytest
 from identification.variance.dense import Table, readings
 
 from elastocal.errors import InputError, InsufficientDataError
-from elastocal.identification import estimate_noise, noise_models
+from elastocal.identification.noise_choice import estimate_noise
+from elastocal.identification.noise_structure import noise_models
 
 BASE = Table(configurations=12, markers=3, repeats=4, unbalanced=False)
 

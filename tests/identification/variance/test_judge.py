@@ -7,14 +7,16 @@ import pytest
 from identification.variance.dense import Table, own_parts, readings, shared_part
 from scipy import stats
 
-from elastocal.identification import (
-    Readings,
+from elastocal.identification.noise_choice import (
+    _deletion_fit,
+    _not_fitted,
     estimate_noise,
     outlier_screening,
     own_noise,
+    settle,
     unexplained_readings,
 )
-from elastocal.identification.noise_choice import _deletion_fit, _not_fitted, settle
+from elastocal.identification.noise_structure import Readings
 from elastocal.identification.outliers import FALSE_ALARM
 
 KINDS = [

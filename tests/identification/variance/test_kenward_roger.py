@@ -4,16 +4,15 @@ import numpy as np
 import pytest
 from identification.variance.dense import Table, dense, readings
 
-from elastocal.identification import (
-    Covariance,
+from elastocal.identification.covariance import Covariance
+from elastocal.identification.noise_choice import estimate_noise
+from elastocal.identification.noise_structure import (
+    STRUCTURES,
     Readings,
-    estimate_noise,
     independent,
-    kenward_roger,
     shared_effects,
 )
-from elastocal.identification.noise_structure import STRUCTURES
-from elastocal.identification.reml import reml
+from elastocal.identification.reml import kenward_roger, reml
 
 # Yates 1935, as nlme::Oats of R orders it: blocks I to VI; Victory, Golden Rain, Marvellous;
 # nitrogen 0, 0.2, 0.4, 0.6.

@@ -4,8 +4,8 @@ import numpy as np
 import pytest
 from identification.variance.dense import Table, dense, readings
 
-from elastocal.identification import evaluate, shared_effects, slope, stacks
-from elastocal.identification.noise_structure import STRUCTURES
+from elastocal.identification.noise_structure import STRUCTURES, shared_effects
+from elastocal.identification.reml import evaluate, slope, stacks
 
 TABLES = {
     "size 1": Table(size=1, configurations=5, markers=3, repeats=3, p=3),

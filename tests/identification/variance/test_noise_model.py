@@ -11,7 +11,8 @@ from identification.variance.dense import Table, readings
 from support.registered import forgotten
 
 from elastocal.errors import InputError
-from elastocal.identification import NoiseModel, Readings, estimate_noise, noise_models, own_noise
+from elastocal.identification.noise_choice import estimate_noise, own_noise
+from elastocal.identification.noise_structure import NoiseModel, Readings, noise_models
 from elastocal.plugins import register_noise_model
 
 UNBALANCED = readings(Table(configurations=10, markers=3, repeats=3), 4)

@@ -3,7 +3,8 @@
 import numpy as np
 import pytest
 
-from elastocal.identification import Readings, outlier_screening
+from elastocal.identification.noise_choice import outlier_screening
+from elastocal.identification.noise_structure import Readings
 
 
 def table(configurations=10, each=12):

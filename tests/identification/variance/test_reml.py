@@ -10,10 +10,14 @@ from identification.variance.dense import Table, readings
 from scipy import optimize
 from statsmodels.regression.mixed_linear_model import MixedLMParams
 
-from elastocal.identification import by_axis, evaluate, independent, shared_effects, stacks
 from elastocal.identification import reml as module
-from elastocal.identification.noise_structure import STRUCTURES
-from elastocal.identification.reml import reml
+from elastocal.identification.noise_structure import (
+    STRUCTURES,
+    by_axis,
+    independent,
+    shared_effects,
+)
+from elastocal.identification.reml import evaluate, reml, stacks
 
 
 def mixed_lm(r, **effects):

@@ -8,8 +8,8 @@ import pytest
 from identification.variance.dense import Table, readings
 
 from elastocal.errors import InputError
-from elastocal.identification import Readings, estimate_noise, noise_models
-from elastocal.identification.noise_choice import settle
+from elastocal.identification.noise_choice import estimate_noise, settle
+from elastocal.identification.noise_structure import Readings, noise_models
 
 BASE = Table(configurations=9, markers=3, repeats=4, unbalanced=False)
 

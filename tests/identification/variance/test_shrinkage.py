@@ -6,16 +6,15 @@ from identification.variance.dense import Table, readings
 from scipy import stats
 
 from elastocal.errors import InsufficientDataError
-from elastocal.identification import (
+from elastocal.identification.noise_structure import Readings, by_group, shared_effects
+from elastocal.identification.reml import (
+    NARROWEST,
     LogPrior,
-    Readings,
-    by_group,
     evaluate,
     prior_of_groups,
-    shared_effects,
+    reml,
     stacks,
 )
-from elastocal.identification.reml import NARROWEST, reml
 
 MEAN = 2 * np.log([1e-5, 2e-5, 6e-5])
 

@@ -7,8 +7,9 @@ import pytest
 from scipy import linalg, stats
 
 from elastocal.errors import InputError
-from elastocal.identification import Readings, estimate_noise, kenward_roger
-from elastocal.identification.noise_choice import NoiseFit, weights_of
+from elastocal.identification.noise_choice import NoiseFit, estimate_noise, weights_of
+from elastocal.identification.noise_structure import Readings
+from elastocal.identification.reml import kenward_roger
 from elastocal.identification.residuals import as_of_another_campaign, held_out_residual
 from elastocal.identification.visit_record import VisitRecord, course_waves
 

@@ -12,7 +12,8 @@ from support.cells import choices, table_of
 from elastocal.cell.arm_description import ModelSpec, Nominal, Robot, Tool, Tracker
 from elastocal.cell.work_cell import Cell
 from elastocal.measurements import Measurements
-from elastocal.model import Chain, Joint, LinkMass, Model
+from elastocal.model.chain import Chain, Joint, LinkMass
+from elastocal.model.manipulator import Model
 from elastocal.units import Array
 
 AXES = {"x": (1.0, 0.0, 0.0), "y": (0.0, 1.0, 0.0), "z": (0.0, 0.0, 1.0)}

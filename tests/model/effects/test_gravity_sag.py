@@ -13,8 +13,10 @@ from support.cells import kr270_cell, kr270_chain, random_table
 
 from elastocal.cell.arm_description import Nominal
 from elastocal.cell.work_cell import Cell
-from elastocal.model import Arm, Chain, Model
+from elastocal.model.arm import Arm
+from elastocal.model.chain import Chain
 from elastocal.model.effects.gravity_sag import GravitySag
+from elastocal.model.manipulator import Model
 from elastocal.units import Array
 
 SAG = GravitySag()

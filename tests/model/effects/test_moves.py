@@ -12,8 +12,8 @@ from support.cells import kr270_cell, kr270_chain, random_table
 
 from elastocal.errors import InputError
 from elastocal.measurements import read_measurements, with_moves
-from elastocal.model import Model
-from elastocal.model.effects import CATALOGUE
+from elastocal.model.effects.catalogue import CATALOGUE
+from elastocal.model.manipulator import Model
 
 Q = np.array([[0.0, 0.0], [0.5, 0.0], [0.2, -0.4], [0.2, 0.1]])
 MOVE = np.array([[0.0, 0.0], [0.5, 0.0], [-0.3, -0.4], [0.0, 0.5]])

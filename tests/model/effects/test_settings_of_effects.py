@@ -10,9 +10,10 @@ from support.cells import COMPLIANCE, MARKERS, kr270_cell, kr270_chain, random_t
 
 from elastocal.cell.arm_description import Nominal
 from elastocal.errors import InputError
-from elastocal.model import Arm, Model
-from elastocal.model.effects import CATALOGUE
+from elastocal.model.arm import Arm
+from elastocal.model.effects.catalogue import CATALOGUE
 from elastocal.model.effects.driven import DrivenEffect
+from elastocal.model.manipulator import Model
 
 
 def model_with(settings: dict[str, dict[str, float]], *effects: str, **spec) -> Model:

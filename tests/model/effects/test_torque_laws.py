@@ -9,7 +9,7 @@ from support.cells import COMPLIANCE, kr270_cell, kr270_chain
 
 from elastocal.cell.arm_description import Nominal
 from elastocal.errors import InputError
-from elastocal.model.effects import CATALOGUE
+from elastocal.model.effects.catalogue import CATALOGUE
 from elastocal.model.effects.compliances import rated_torque, torque_scale, weight_torque
 
 BETA = 1e-3

@@ -7,9 +7,8 @@ from support.cells import kr270_cell
 from support.registered import forgotten
 
 from elastocal.errors import InputError
-from elastocal.model import register
-from elastocal.model.effects import CATALOGUE
 from elastocal.model.effects.base import Effect, Symbols
+from elastocal.model.effects.catalogue import CATALOGUE, register
 from elastocal.model.effects.driven import JointMotion
 
 COMPLIANCES = {"joint_compliance", "off_axis_compliance", "link_bending", "base_compliance"}

@@ -7,8 +7,8 @@ from collections.abc import Iterator
 
 import numpy as np
 
-from elastocal.planning import Criterion, make_criterion
-from elastocal.planning.criteria import CRITERIA
+from elastocal.planning.criteria import CRITERIA, make_criterion
+from elastocal.planning.criterion import Criterion
 
 P = 6
 INTEREST = np.array([4, 1, 2, 5])

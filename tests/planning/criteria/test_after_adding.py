@@ -4,7 +4,8 @@ import numpy as np
 import pytest
 from planning.criteria.cases import MIXED, blocks, criterion, information, random_information
 
-from elastocal.planning import candidate_sums, make_criterion
+from elastocal.planning.criteria import make_criterion
+from elastocal.planning.criterion import candidate_sums
 
 mixed = pytest.mark.parametrize(("name", "scenarios", "robust"), MIXED)
 LOW_RANK = ("test_pose", "A", "I", "c", "G", "D", "O1")

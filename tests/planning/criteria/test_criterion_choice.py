@@ -5,8 +5,7 @@ import pytest
 from planning.criteria.cases import INTEREST, P
 
 from elastocal.errors import InputError
-from elastocal.planning import make_criterion
-from elastocal.planning.criteria import CRITERIA
+from elastocal.planning.criteria import CRITERIA, make_criterion
 
 A = np.ones((1, 2, 3, P))
 GIVEN = {

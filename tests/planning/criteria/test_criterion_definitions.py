@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 from planning.criteria.cases import INTEREST, P, blocks, criterion, information
 
-from elastocal.planning import make_criterion
+from elastocal.planning.criteria import make_criterion
 
 
 @pytest.fixture

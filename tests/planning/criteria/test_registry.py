@@ -4,13 +4,13 @@ import numpy as np
 import pytest
 
 from elastocal.errors import InputError
-from elastocal.planning import (
+from elastocal.planning.criteria import (
+    CRITERIA,
     SpectralCriterion,
     TraceCriterion,
     criterion_named,
     register,
 )
-from elastocal.planning.criteria import CRITERIA
 
 
 @pytest.fixture(autouse=True)

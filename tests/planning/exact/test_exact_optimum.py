@@ -6,8 +6,10 @@ import numpy as np
 import pytest
 from small_pools import CRITERIA, all_plans, all_values, random_problem
 
-from elastocal.planning import DesignProblem, make_criterion, relax
+from elastocal.planning.criteria import make_criterion
 from elastocal.planning.exact_plan import exact_plan
+from elastocal.planning.relaxation import relax
+from elastocal.planning.selection import DesignProblem
 
 
 def is_optimal(problem: DesignProblem, seed: int, **options) -> bool:

@@ -5,10 +5,8 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from small_pools import CRITERIA, all_plans, all_values, random_problem
 
-from elastocal.planning import (
-    Prices,
-    relax,
-)
+from elastocal.planning.exact_plan import Prices
+from elastocal.planning.relaxation import relax
 
 
 @settings(max_examples=25, deadline=None)

@@ -7,12 +7,9 @@ import pytest
 from small_pools import all_plans, all_values
 
 from elastocal.errors import InputError
-from elastocal.planning import (
-    DesignProblem,
-    DeterminantCriterion,
-    make_criterion,
-    size_curve,
-)
+from elastocal.planning.criteria import DeterminantCriterion, make_criterion
+from elastocal.planning.exact_plan import size_curve
+from elastocal.planning.selection import DesignProblem
 
 
 def problem_of(name="test_pose", levels=2, p=5, N=14, seed=0):

@@ -7,8 +7,9 @@ import pytest
 from small_pools import random_problem
 
 from elastocal.errors import InputError, InsufficientDataError
-from elastocal.planning import DesignProblem, make_criterion, regular_plan
+from elastocal.planning.criteria import make_criterion
 from elastocal.planning.exact_plan import exact_plan
+from elastocal.planning.selection import DesignProblem, regular_plan
 
 
 def rough(seed: int = 0) -> DesignProblem:

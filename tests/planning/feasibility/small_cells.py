@@ -13,8 +13,9 @@ from support.robots import KR270, random_chain_urdf
 from elastocal.cell.arm_description import Robot, Tool, Tracker
 from elastocal.cell.work_cell import Cell
 from elastocal.cell.workspace_rules import Solid, Workspace
-from elastocal.model import Chain, Joint, read_urdf
-from elastocal.planning import Feasibility, PoseFeasibility
+from elastocal.model.chain import Chain, Joint
+from elastocal.model.urdf import read_urdf
+from elastocal.planning.feasibility import Feasibility, PoseFeasibility
 
 CHECK = Path(__file__).resolve().parents[3] / "experiment_design" / "feasibility_check"
 DOWN = np.array([0.0, 0.0, -2600.0])

@@ -7,11 +7,7 @@ from scipy.spatial.transform import Rotation
 
 from elastocal.cell.workspace_rules import Solid
 from elastocal.errors import InputError
-from elastocal.planning import (
-    mesh_hull,
-    support,
-    touches,
-)
+from elastocal.planning.bodies import mesh_hull, support, touches
 
 CUBE = """v 0 0 0
 v 1 0 0

@@ -9,9 +9,8 @@ from planning.feasibility.small_cells import KR270_CHAIN, cell, sphere
 from elastocal.cell.arm_description import Robot
 from elastocal.cell.workspace_rules import CarriedBody, Workspace
 from elastocal.errors import InputError
-from elastocal.model import read_urdf
-from elastocal.planning import cell_bodies, hull
-from elastocal.planning.bodies import WORLD
+from elastocal.model.urdf import read_urdf
+from elastocal.planning.bodies import WORLD, cell_bodies, hull
 
 
 def named(workspace, chain=KR270_CHAIN, **changes):

@@ -24,7 +24,9 @@ from planning.feasibility.test_margins_of_pairs import kr270_cell
 
 from elastocal.cell.arm_description import Tool
 from elastocal.cell.workspace_rules import CarriedBody, HalfSpace, HangingLoad, Solid, Workspace
-from elastocal.planning import Body, Collisions, Feasibility, MotionBound, coal_shape
+from elastocal.planning.bodies import Body, coal_shape
+from elastocal.planning.collision import Collisions, MotionBound
+from elastocal.planning.feasibility import Feasibility
 
 BALL = Workspace(bodies=(CarriedBody(sphere("tool", 0.1, (0, 0, 0))),), clearance=0.05)
 

@@ -14,7 +14,7 @@ from planning.feasibility.small_cells import (
 from planning.feasibility.test_margins_of_pairs import kr270_cell
 from planning.feasibility.test_single_rules import full_cell
 
-from elastocal.planning import Feasibility
+from elastocal.planning.feasibility import Feasibility
 
 
 def advised(given, q, force=NOTHING):

@@ -20,8 +20,7 @@ from planning.feasibility.small_cells import (
 from elastocal.cell.arm_description import Tool
 from elastocal.cell.workspace_rules import CarriedBody, HalfSpace, HangingLoad, Solid, Workspace
 from elastocal.errors import InputError
-from elastocal.planning import Feasibility
-from elastocal.planning.feasibility import POSE_SLACK
+from elastocal.planning.feasibility import POSE_SLACK, Feasibility
 
 RADII = (0.28, 0.2, 0.18, 0.15, 0.15, 0.11)
 SIZES = {"box": [0.4, 0.2, 0.6], "sphere": [0.3], "cylinder": [0.2, 0.6], "capsule": [0.2, 0.2]}

@@ -10,7 +10,7 @@ from support.cells import kr270_chain
 from support.design_cells import plan_cell
 
 from elastocal.cell.workspace_rules import HalfSpace, Workspace
-from elastocal.planning import Feasibility
+from elastocal.planning.feasibility import Feasibility
 
 CHAIN, CELL = kr270_chain(), plan_cell()
 ZERO = np.zeros(3)

@@ -5,9 +5,10 @@ import pytest
 from planning.feasibility.small_cells import CHECK, DOWN, NOTHING, study_module
 
 from elastocal.cell.work_cell import read_cell
-from elastocal.model import joint_limits, load_chain
-from elastocal.planning import Collisions, Feasibility
-from elastocal.planning.collision import END
+from elastocal.model.chain import joint_limits
+from elastocal.model.choice import load_chain
+from elastocal.planning.collision import END, Collisions
+from elastocal.planning.feasibility import Feasibility
 
 pytest.importorskip("mujoco")
 TOLERANCE = 1e-5  # m between two implementations of GJK

@@ -29,7 +29,8 @@ from elastocal.cell.workspace_rules import (
     Workspace,
 )
 from elastocal.errors import InputError
-from elastocal.planning import Feasibility, Kinematics, StaticTorque
+from elastocal.planning.collision import Kinematics, StaticTorque
+from elastocal.planning.feasibility import Feasibility
 
 EYE = Tracker(position=np.array([3.0, 0.0, 0.0]))
 MARKER = Tool(markers={"M1": np.zeros(3)})

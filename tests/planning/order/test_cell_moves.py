@@ -10,7 +10,9 @@ from support.cells import kr270_cell, kr270_chain, random_poses
 from elastocal.cell.plan_wishes import Motion
 from elastocal.cell.workspace_rules import CarriedBody, HalfSpace, HangingLoad, Solid, Workspace
 from elastocal.errors import InsufficientDataError
-from elastocal.planning import Blockers, Feasibility, schedule
+from elastocal.planning.execution import schedule
+from elastocal.planning.feasibility import Feasibility
+from elastocal.planning.moves import Blockers
 
 LOADS = np.array([[0.0, 0, 0], [0, 0, -2600.0]])
 HOME = np.radians([0.0, -90, 90, 0, 45, 0])

@@ -12,11 +12,12 @@ from elastocal.cell.arm_description import Unsteadiness
 from elastocal.cell.plan_wishes import Motion
 from elastocal.errors import InputError
 from elastocal.identification.visit_record import course_waves
-from elastocal.planning import Alias, plan_rows, schedule
 from elastocal.planning import execution as execution_module
 from elastocal.planning import test_poses as target_poses
-from elastocal.planning.drift import DRIFT, turns
+from elastocal.planning.drift import DRIFT, Alias, turns
+from elastocal.planning.execution import schedule
 from elastocal.planning.information import pose_covariance
+from elastocal.planning.plan import plan_rows
 from elastocal.planning.test_poses import prediction_rows
 
 BOTH = np.array([[0.0, 0, 0], [0, 0, -100.0]])

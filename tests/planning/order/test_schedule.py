@@ -10,7 +10,7 @@ from support.discs import Discs, best_time
 
 from elastocal.cell.plan_wishes import Motion
 from elastocal.errors import InputError, InsufficientDataError
-from elastocal.planning import schedule
+from elastocal.planning.execution import schedule
 from elastocal.planning.moves import Unreachable
 
 BOTH = np.array([[0.0, 0, 0], [0, 0, -100.0]])

@@ -5,7 +5,7 @@ from itertools import permutations
 import numpy as np
 import pytest
 
-from elastocal.planning import greedy_tour, shortest_tour, tour_bound, tour_cost
+from elastocal.planning.execution import greedy_tour, shortest_tour, tour_bound, tour_cost
 
 
 def costs(seed, n, symmetric):

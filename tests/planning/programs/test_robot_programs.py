@@ -12,14 +12,16 @@ from support.discs import Discs
 
 from elastocal.cell.plan_wishes import Motion
 from elastocal.errors import ElastocalError, InputError
-from elastocal.model import Chain
-from elastocal.planning import krl_program, schedule, urscript_program
+from elastocal.model.chain import Chain
+from elastocal.planning.execution import schedule
 from elastocal.planning.programs import (
     RESERVED,
     check_program,
+    krl_program,
     program_name,
     program_steps,
     steps_of,
+    urscript_program,
 )
 
 FORCES = np.array([[0.0, 0, 0], [0, 0, -2600.0]])

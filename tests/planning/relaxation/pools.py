@@ -7,7 +7,9 @@ from itertools import combinations_with_replacement, product
 
 import numpy as np
 
-from elastocal.planning import Criterion, DesignProblem, make_criterion
+from elastocal.planning.criteria import make_criterion
+from elastocal.planning.criterion import Criterion
+from elastocal.planning.selection import DesignProblem
 
 NAMES = ("test_pose", "D", "A", "E", "G", "I", "c", "O1", "O3", "O5")
 # O1 and O3 are D and E, I is test_pose with equal weights.

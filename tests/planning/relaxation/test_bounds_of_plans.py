@@ -17,7 +17,8 @@ from planning.relaxation.pools import (
 )
 
 from elastocal.errors import InputError
-from elastocal.planning import lower_bound, relax
+from elastocal.planning.relaxation import relax
+from elastocal.planning.selection import lower_bound
 
 
 def tiny(name, **changes):

@@ -8,7 +8,9 @@ from planning.relaxation.pools import (
     random_problem,
 )
 
-from elastocal.planning import DesignProblem, make_criterion, relax
+from elastocal.planning.criteria import make_criterion
+from elastocal.planning.relaxation import relax
+from elastocal.planning.selection import DesignProblem
 
 
 @pytest.mark.parametrize("prior", [0.0, 1.0])

@@ -7,7 +7,7 @@ import pytest
 from planning.relaxation.pools import random_problem
 
 from elastocal.errors import InputError, InsufficientDataError
-from elastocal.planning import relax
+from elastocal.planning.relaxation import relax
 
 
 @pytest.mark.parametrize("name", ["test_pose", "D", "E"])

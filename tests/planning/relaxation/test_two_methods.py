@@ -3,8 +3,8 @@
 import pytest
 from planning.relaxation.pools import NAMES, ROBUST, random_problem
 
-from elastocal.planning import relax
 from elastocal.planning import relaxation as relaxation_module
+from elastocal.planning.relaxation import relax
 
 
 def assert_agreement(problem):

@@ -15,21 +15,14 @@ from support.calibration import cell_of, planar_chain
 from elastocal.cell.arm_description import CartesianNoise, Nominal, Tracker
 from elastocal.cell.plan_wishes import DesignSpec
 from elastocal.cell.workspace_rules import Workspace
-from elastocal.model import Model
-from elastocal.planning import (
-    Candidates,
-    Criterion,
-    DesignProblem,
-    Feasibility,
-    JointSpace,
-    LoadStates,
-    PoseInformation,
-    Searches,
-    draw,
-    joint_space,
-    load_states,
-    make_criterion,
-)
+from elastocal.model.manipulator import Model
+from elastocal.planning.candidates import Candidates, JointSpace, draw, joint_space
+from elastocal.planning.criteria import make_criterion
+from elastocal.planning.criterion import Criterion
+from elastocal.planning.feasibility import Feasibility
+from elastocal.planning.information import LoadStates, PoseInformation, load_states
+from elastocal.planning.polish import Searches
+from elastocal.planning.selection import DesignProblem
 from elastocal.units import Array
 
 EFFECTS = tuple(f"joint_compliance:joint{i}" for i in (2, 3, 4))

@@ -10,8 +10,9 @@ import numpy as np
 import pytest
 
 from elastocal.cell.workspace_rules import HalfSpace, Workspace
-from elastocal.planning import DesignProblem, estimate, tangent_bound
 from elastocal.planning.candidates import CHUNK
+from elastocal.planning.polish import estimate
+from elastocal.planning.selection import DesignProblem, tangent_bound
 from elastocal.units import Array
 
 Build = Callable[..., Any]

@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 
 from elastocal.cell.workspace_rules import HalfSpace, Solid, Workspace
-from elastocal.planning import sobol
+from elastocal.planning.candidates import sobol
 from elastocal.planning.polish import polish
 from elastocal.units import Array
 

@@ -84,7 +84,7 @@ class Effect:
     effects by name.  Their defaults suit an effect of which nothing more is known.
 
     Examples:
-        >>> from elastocal.model.effects import CATALOGUE
+        >>> from elastocal.model.effects.catalogue import CATALOGUE
         >>> backlash = CATALOGUE["backlash"]
         >>> isinstance(backlash, ec.Effect), backlash.stage
         (True, 'transmission')
