@@ -36,7 +36,6 @@ SENTENCES = {
     "share": "too large a share for reading errors",
     "lack": "Configurations scatter more than their repeats",
     "computed": "they are computed, not measured",
-    "explained": "they are no faulty readings and are kept",
 }
 
 

@@ -18,7 +18,6 @@ from elastocal.model.manipulator import Model
 from elastocal.model.observations import observe
 from elastocal.report.identification_view import (
     judgement,
-    prediction_lines,
     undetermined_lines,
 )
 
@@ -221,26 +220,6 @@ def test_heavy_tails_call_for_care_where_least_squares_wastes_readings(clean, ku
     calm = replace(whole, normality_p=0.011)
     calm = judged(replace(clean[3], residual_summary=replace(summary, whole=calm)))
     assert calm.finding("residuals_heavy_tailed") is None
-
-
-def test_readings_set_apart_count(clean):
-    model, table, x, _ = clean
-    rng = np.random.default_rng(9)
-    exact = measured(model, table, x, 0.0, rng)
-    tails = SIGMA * rng.standard_t(3, size=exact.position.shape)
-    mistakes = np.array([7, 40])
-    tails[mistakes] += 0.01
-    result = identify(model, replace(exact, position=exact.position + tails))
-    n, kept, own = len(result.observations.lead), result.heldout_kept_rms, result.tails.counted
-    apart = np.array([o.residual**2 for o in result.excluded])
-    lines = np.array([o.line for o in result.excluded])
-    assert own.any() and set(lines[~own]) == set(exact.row[mistakes])
-    for rms, counts in ((result.heldout_rms, own), (result.heldout_all_rms, own | True)):
-        assert (n + counts.sum()) * rms**2 == pytest.approx(n * kept**2 + apart[counts].sum())
-    assert 1.02 * kept < result.heldout_rms < result.heldout_all_rms / 2
-    told = prediction_lines(result)[0][1]
-    assert "Errors have far tails" in told and "set apart as faulty" in told
-    assert result.to_json()["heldout_all_rms_um"] == pytest.approx(result.heldout_all_rms * 1e6)
 
 
 def test_scatter_that_a_test_finds_and_the_noise_lacks_is_told(clean):

@@ -18,7 +18,6 @@ from support.calibration import (
 )
 from support.cells import random_poses
 
-from elastocal.cell.arm_description import EffectChoice
 from elastocal.identification.identify import identify
 from elastocal.identification.options import Options
 from elastocal.identification.outliers import FALSE_ALARM, blocks
@@ -267,22 +266,3 @@ def test_blocks_of_lines():
     assert blocks([9, 2, 3, 4, 20, 23]) == [(2, 4), (9, 9), (20, 23)]
     assert blocks([2, 6], gap=3) == [(2, 2), (6, 6)]
     assert blocks([2, 5, 8], gap=3) == [(2, 8)]
-
-
-@pytest.mark.parametrize("missing", [True, False])
-def test_readings_that_a_missing_effect_explains_are_not_set_apart(missing):
-    chain = random_chain(6)
-    model = Model.assembled(chain, cell_of(GEOMETRY))
-    real = model.with_effects((*model.cell.model.effects, EffectChoice("hysteresis", "joint2")))
-    rng = np.random.default_rng(5)
-    approach = np.where(rng.random((60, chain.n_joints)) < 0.5, -1.0, 1.0)
-    approach[:, 1] = np.where(np.arange(60) < 4, -1.0, 1.0)  # four poses come from the other side
-    plan = replace(table_at(random_poses(chain, 60, 5)), approach=approach)
-    x = true_values(real, rng)
-    x[real.names.index("joint2.hysteresis")] = 2e-3 if missing else 0.0
-    table = measured(real, plan, x, SIGMA, rng)
-    if not missing:  # as many readings are off by as much, but by nothing that an arm does
-        table.position[:4] += rng.normal(size=(4, 3)) * 1e-3
-    fit = identify(model, table)
-    assert bool(fit.faulty) == (not missing)
-    assert any("hysteresis of joint2" in text for text in fit.warnings) == missing

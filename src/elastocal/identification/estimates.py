@@ -9,7 +9,7 @@ import numpy as np
 from scipy import linalg
 
 from elastocal.identification.covariance import variance_of
-from elastocal.identification.faulty_readings import report_faulty, standardised
+from elastocal.identification.faulty_readings import report_faulty
 from elastocal.identification.findings import judged, of_solution, warning_sentences
 from elastocal.identification.methods import MethodResult, is_exact
 from elastocal.identification.noise_summary import noise_of, noise_parts
@@ -29,8 +29,6 @@ from elastocal.identification.residuals import (
 from elastocal.identification.result import Calibration, Combination, Estimate
 from elastocal.identification.scrutiny import MOST_NUMBERS
 from elastocal.identification.solve import Solution, bent, residual_sigma
-from elastocal.identification.tails import Tails, tails_of
-from elastocal.identification.weighted_problem import residual_at
 from elastocal.measurements import ranked
 from elastocal.model.arm import Parameter
 from elastocal.model.calibrated import ShownPoses
@@ -63,7 +61,7 @@ def summarise(
     observed = solution.problem.observations
     set_apart = len(observed.lead) < len(every.problem.observations.lead)
     covariance = found.intervals.covariance.matrix
-    tails, apart = _tails(every, found, set_apart), faulty if set_apart else ()
+    apart = faulty if set_apart else ()
     result = Calibration(
         model=model,
         method=found.method,
@@ -80,7 +78,7 @@ def summarise(
         sigma=sigma,
         dof=len(final.whitened) - spent,
         residual_rms=rms_3d(final.residual, observed.size),
-        heldout_rms=_honest(rms_3d(solution.heldout, observed.size), observed, apart, tails),
+        heldout_rms=rms_3d(solution.heldout, observed.size),
         nominal_rms=solution.nominal_rms,
         converged=final.converged,
         reason=final.reason,
@@ -104,7 +102,6 @@ def summarise(
         copies=copies,
         weights=solution.problem.weights,
         noise_parts=noise_parts(found),
-        tails=tails,
     )
     result = replace(result, shown=_shown(solution, covariance, found.leverage))
     predicted = predicted_error(
@@ -116,34 +113,6 @@ def summarise(
     result = judged(result, of_solution(result, solution))
     told = tuple(f"The robot's file: {note}." for note in model.chain.notes)
     return replace(result, warnings=(*found.warnings, *warning_sentences(result), *told))
-
-
-def _tails(every: Solution, found: MethodResult, set_apart: bool) -> Tails | None:
-    """Whether the errors have tails that are not those of normal noise; None where they have not,
-    and where nothing says so in passing: a large table, an exact fit, noise that was not estimated
-    and explains all readings."""
-    if every.problem.large or is_exact(every) or (found.noise is None and not set_apart):
-        return None
-    fitted = found.good if set_apart else np.ones_like(found.good)
-    residual = found.standard
-    if found.method == "constrained" and residual is None:  # the noise is that of another fit
-        problem = every.problem
-        residual = residual_at(problem.model, problem.parts, found.solution.fit.x)
-        residual = residual.reshape(len(fitted), -1)
-    z = standardised(every, found.solution, found.noise, fitted, residual)
-    return tails_of(z[fitted], z[~fitted])
-
-
-def _honest(
-    kept: float, observed: Observations, apart: tuple[Outlier, ...], tails: Tails | None
-) -> float:
-    """The held-out rms with those readings set apart that are the noise's own tail: a new reading
-    may be one of them.  Mistakes are not counted, and said to be there."""
-    if tails is None:
-        return kept
-    own = [o for o, own in zip(apart, tails.counted, strict=True) if own]
-    n = len(observed.lead)
-    return float(np.sqrt((n * kept**2 + sum(o.residual**2 for o in own)) / (n + len(own))))
 
 
 def _unchecked(result: Calibration, solution: Solution) -> Array | None:

@@ -105,7 +105,6 @@ def judged(result: Calibration, of_solution: tuple[Finding, ...] | None = None) 
         *_undetermined(result),
         *_prior(result),
         *_shape(result),
-        *_tails(result),
         *_test(result),
     ]
     return replace(result, findings=(_trust(found), *found))
@@ -301,7 +300,7 @@ def _visits(result: Calibration) -> Iterator[Finding]:
 
 
 def _prediction(result: Calibration, explained: bool) -> Iterator[Finding]:
-    held, fitted, nominal = result.heldout_kept_rms, result.residual_rms, result.nominal_rms
+    held, fitted, nominal = result.heldout_rms, result.residual_rms, result.nominal_rms
     placed = only_placed(result)
     # Under a drift the held-out error is that of another day, which more poses make no better.
     # Of base and tool alone, what each point takes of the fit is all that it can flatter by.
@@ -479,21 +478,6 @@ def shape_of(summary: ResidualSummary) -> Finding:
         "differ by more than their intervals, far readings decide them; look for what makes single "
         "readings err (line of sight, vibration, a tracker that has not settled).",
     )  # fmt: skip
-
-
-def _tails(result: Calibration) -> Iterator[Finding]:
-    """Far errors that are the noise's own, whether they were set apart or not."""
-    tails = result.tails
-    if tails is not None:
-        yield Finding(
-            "far_tails", "note",
-            {
-                "dof": tails.dof, "p": tails.p, "set_apart": len(tails.counted),
-                "counted": int(tails.counted.sum()),
-                "heldout_rms_um": _um(result.heldout_rms),
-                "heldout_kept_rms_um": _um(result.heldout_kept_rms),
-            },
-        )  # fmt: skip
 
 
 def _test(result: Calibration) -> Iterator[Finding]:
@@ -698,7 +682,8 @@ def _faulty_readings(result: Calibration) -> list[str]:
     if result.excluded:
         found.append(
             f"{_count(result.excluded, 'was', 'were')} left out as faulty "
-            f"({_lines(result.excluded)}): the noise does not explain them. All are listed in the "
+            f"({_lines(result.excluded)}): the noise does not explain them. They are mistakes, or "
+            f"show what the model lacks. All are listed in the "
             f"result under 'excluded'; {option('outliers', 'keep')} fits them too."
         )
     return found

@@ -7,8 +7,6 @@ from dataclasses import replace
 import numpy as np
 from numpy.typing import NDArray
 
-from elastocal.cell.arm_description import EffectChoice
-from elastocal.errors import ElastocalError
 from elastocal.identification.estimates import summarise, uncertainty_of
 from elastocal.identification.findings import judged
 from elastocal.identification.methods import (
@@ -20,9 +18,9 @@ from elastocal.identification.methods import (
 )
 from elastocal.identification.mistakes import copied, refuse_nonsense
 from elastocal.identification.options import Options
-from elastocal.identification.outliers import FALSE_ALARM, describe, find_faulty
+from elastocal.identification.outliers import describe, find_faulty
 from elastocal.identification.prediction import NewPoses
-from elastocal.identification.residuals import f_test, rms_3d
+from elastocal.identification.residuals import rms_3d
 from elastocal.identification.result import Calibration, TestErrors
 from elastocal.identification.rigid_markers import solved_body, without_copies
 from elastocal.identification.solve import Problem, Solution, solve
@@ -42,7 +40,7 @@ from elastocal.identification.weighted_problem import (
     weights_for,
 )
 from elastocal.measurements import NEVER_YET, Measurements, order_contradicted
-from elastocal.model.effects.catalogue import CATALOGUE, effect_of
+from elastocal.model.effects.catalogue import effect_of
 from elastocal.model.effects.play import BY_ORDER
 from elastocal.model.manipulator import Model
 from elastocal.model.observations import Observations, observe, subset
@@ -139,91 +137,7 @@ def _fitted(
     if smooth:
         return every, sound, with_smooth(every, sound, faulty, free, options, progress)
     found = run_method(every, sound, faulty, refit, options, progress)
-    if options.faulty == "auto" and not found.good.all():
-        missing = _shown_to_be_missing(every, sound, found, table, options, progress)
-        if missing:
-            progress(f"fitting all readings: {missing} explains those set apart")
-            told = EXPLAINED.format((~found.good).sum(), missing)
-            try:
-                kept = replace(options, faulty="keep")
-                found = run_method(every, sound, faulty, refit, kept, progress)
-                warnings = (told, *found.warnings)
-                found = replace(found, good=np.ones_like(found.good), warnings=warnings)
-            except (ElastocalError, np.linalg.LinAlgError):
-                pass  # they bend the fit so far that no arm is left: better without
     return every, sound, with_limits(every, found, options)
-
-
-# Readings that the noise does not explain may show an effect that the model lacks.
-
-EXPLAINED = (
-    "Some readings ({}) lie beyond the noise, but not with {} in the model: they are no faulty "
-    "readings and are kept. diagnose tells what is missing."
-)
-
-
-def _shown_to_be_missing(
-    every: Solution, sound: Solution, found: MethodResult, table: Measurements, options: Options,
-    progress: Progress,
-) -> str:  # fmt: skip
-    """The effect that explains the readings set apart: with it in the model none is, and it has
-    fewer parameters than they have coordinates; "" where there is none."""
-    if every.problem.large:
-        return ""
-    observed = every.problem.observations
-    choice = _most_telling(every, sound, int((~found.good).sum()) * observed.size)
-    if choice is None:
-        return ""
-    words = choice.name if choice.where is None else f"{choice.name} of {choice.where}"
-    progress(f"judging the readings set apart by a model with {words}")
-    model, options = every.problem.model, replace(options, faulty="drop")
-    try:
-        wider = model.with_effects((*model.cell.model.effects, choice))
-        good = _fitted(wider, table, observed, options, _silent)[2].good
-    except (ElastocalError, np.linalg.LinAlgError):
-        return ""
-    return words if good.all() else ""
-
-
-def _most_telling(every: Solution, sound: Solution, most: int) -> EffectChoice | None:
-    """That effect of one joint, or of all, which all readings show most clearly to be missing from
-    the fit to the good ones: by an F-test of its columns, fewer than `most`; None where none is."""
-    problem, x = every.problem, sound.fit.x
-    model, rows, whiten = problem.model, problem.observations, problem.weights.apply
-    at = model.regressor(rows.table, x, sound.reduction.kept, rows)
-    Q, e = np.linalg.qr(whiten(at.B))[0], whiten(at.residual)
-    e = e - Q @ (Q.T @ e)
-    value = dict(zip(model.names, x, strict=True))
-    own = {choice.name for choice in model.cell.model.effects}
-    tried: list[tuple[float, float, EffectChoice]] = []
-    for effect in CATALOGUE.values():
-        if not effect.at.endswith("joints") or effect.together or effect.constants:
-            continue
-        if effect.name in own:
-            continue
-        chosen = EffectChoice(effect.name, None)
-        try:
-            wider = model.with_effects((*model.cell.model.effects, chosen))
-            check_table(wider, rows.table)
-            start = [
-                value.get(p.name, v) for p, v in zip(wider.parameters, wider.nominal, strict=True)
-            ]
-            new = np.flatnonzero([name not in value for name in wider.names])
-            B = whiten(wider.regressor(rows.table, np.array(start), new, rows).B)
-        except ElastocalError:
-            continue  # the table or the arm has nothing for it
-        A = B - Q @ (Q.T @ B)
-        A[:, np.linalg.norm(A, axis=0) < 1e-6 * np.linalg.norm(B)] = 0.0
-        where = [wider.parameters[k].where for k in new]
-        for place in (None, *dict.fromkeys(where)):
-            U, s, _ = np.linalg.svd(A[:, [place in (None, w) for w in where]], full_matrices=False)
-            U = U[:, s > 1e-6 * s[0]] if s[0] else U[:, :0]
-            dof, gain = len(e) - Q.shape[1] - U.shape[1], float(((U.T @ e) ** 2).sum())
-            if 0 < U.shape[1] < most and dof > 0:
-                F, p = f_test(gain, U.shape[1], float(e @ e) - gain, dof)
-                tried.append((float(p), -float(F), replace(chosen, where=place)))
-    p, _, best = min(tried, key=lambda one: one[:2], default=(1.0, 0.0, None))
-    return best if p * len(tried) < FALSE_ALARM else None
 
 
 def _without(options: Options, left_out: NDArray[np.bool_], size: int) -> Options:

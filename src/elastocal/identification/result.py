@@ -32,10 +32,9 @@ from elastocal.identification.prediction import (
     position_at,
     scatter_of,
 )
-from elastocal.identification.residuals import ResidualSummary, rms_3d
+from elastocal.identification.residuals import ResidualSummary
 from elastocal.identification.scrutiny import MOST_NUMBERS
 from elastocal.identification.smooth_part import SmoothPart
-from elastocal.identification.tails import Tails
 from elastocal.identification.weighted_problem import Weights
 from elastocal.measurements import Measurements
 from elastocal.model.calibrated import (
@@ -247,9 +246,8 @@ class Calibration(Result):
         sigma: Standard deviation of the residual per whitened row (in m with unit weights).
         dof: Its degrees of freedom.
         residual_rms: 3-D rms of `residual`, in m.
-        heldout_rms: What a reading of a new pose is off by: that of `held_out`, and of those
-            readings set apart that are the noise's own far end (`tails`); mistakes are not
-            counted.  Infinite where none could be held out.
+        heldout_rms: That of `held_out`, without readings that were set apart.  Infinite where none
+            could be held out.
         nominal_rms: That of the nominal arm, placed but not calibrated.
         converged: Whether the fit converged; `reason` says how it ended.
         outliers: Readings beyond the noise that had a part in the fit.
@@ -270,7 +268,6 @@ class Calibration(Result):
         noise_parts: Mean square 3-D noise (m²) of single "readings", and what readings of
             "visits" have in common.
         shown: How sure the fit is where it was measured; None of a large table.
-        tails: Student's t that the errors follow; None where they are as normal noise makes them.
 
     Examples:
         >>> fit = ec.identify("cell.toml", "data.csv")
@@ -320,7 +317,6 @@ class Calibration(Result):
     weights: Weights | None = field(default=None, compare=False)
     noise_parts: dict[str, float] = field(default_factory=dict)
     shown: ShownPoses | None = None
-    tails: Tails | None = None
 
     @property
     def covariance(self) -> Array:
@@ -338,8 +334,7 @@ class Calibration(Result):
             joints = np.zeros(1)
         own = next((s.sigma for s in self.noise.sizes or () if s.of_configuration), None) or 0.0
         lasting, drift = (lasting, drift) if lasting else (Unsteadiness.lasting, 0.0)
-        tails = self.tails.dof if self.tails is not None and self.tails.dof > 2 else None
-        return Unsteadiness(joints, drift, lasting, own, tails)
+        return Unsteadiness(joints, drift, lasting, own)
 
     @cached_property
     def ordinary(self) -> tuple[Estimate, ...]:
@@ -423,14 +418,7 @@ class Calibration(Result):
         the fit to the others; infinite where none could be held out."""
         apart = sum(o.residual**2 for o in self.excluded)
         n, k = len(self.observations.lead), len(self.excluded)
-        return math.sqrt((n * self.heldout_kept_rms**2 + apart) / (n + k))
-
-    @cached_property
-    def heldout_kept_rms(self) -> float:
-        """The 3-D rms in m of `held_out` alone, without any reading that was set apart."""
-        if self.tails is None or not self.tails.counted.any():
-            return self.heldout_rms
-        return rms_3d(self.held_out, self.observations.size)
+        return math.sqrt((n * self.heldout_rms**2 + apart) / (n + k))
 
     def __getitem__(self, name: str) -> Estimate:
         """The estimate of the parameter `name`; UnknownNameError with the nearest name."""
@@ -673,7 +661,7 @@ class Calibration(Result):
             "dof": self.dof,
             "residual_rms_um": _um(self.residual_rms),
             "heldout_rms_um": _um(self.heldout_rms),
-            "heldout_kept_rms_um": _um(self.heldout_kept_rms),
+            "heldout_kept_rms_um": _um(self.heldout_rms),
             "heldout_all_rms_um": _um(self.heldout_all_rms),
             "nominal_rms_um": _um(self.nominal_rms),
             "test": None if self.test is None else self.test.to_json(),
@@ -690,12 +678,12 @@ class Calibration(Result):
             "measured_poses": None if self.shown is None else self.shown.to_json(),
             "open": None if self.left is None else self.left.to_json(),
             "noise": self.noise.to_json(),
-            "tails": None if self.tails is None else self.tails.to_json(),
+            "tails": None,
             "cell_noise": {
                 "joints_urad": (1e6 * self.unsteadiness.joints).tolist(),
                 "drift_um": _um(self.unsteadiness.drift), "lasting_s": self.unsteadiness.lasting,
                 "configuration_um": _um(self.unsteadiness.configuration),
-                "tails": self.unsteadiness.tails,
+                "tails": None,
             },
             "residual_summary": (
                 None if self.residual_summary is None else self.residual_summary.to_json()

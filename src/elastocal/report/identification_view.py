@@ -234,17 +234,7 @@ def prediction_lines(result: Calibration) -> list[tuple[str, str]]:
         )
     elif result.noise.drift is not None:
         told.append("Held out were whole blocks in time, with another day's drift.")
-    tails = result.tails
-    if held and tails is not None and tails.counted.any():
-        far = int(tails.counted.sum())
-        told.append(
-            f"Errors have far tails, as of Student's t with {significant(tails.dof, 2)} degrees of "
-            f"freedom: {far} of the {counted(len(result.excluded), 'reading')} set apart "
-            f"{'is' if far == 1 else 'are'} of the noise and no mistake{'' if far == 1 else 's'}, "
-            "and count in the held-out error, which is "
-            f"{length(result.heldout_kept_rms)} rms without them."
-        )
-    if held and len(result.excluded) > (0 if tails is None else tails.counted.sum()):
+    if held and result.excluded:
         told.append(
             f"With the {counted(len(result.excluded), 'reading')} set apart as faulty, poses that "
             f"were not fitted are predicted to {length(result.heldout_all_rms)} rms."
