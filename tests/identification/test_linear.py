@@ -61,20 +61,23 @@ def nearly_dependent_problem(seed, gap=1e-11):
 @pytest.mark.parametrize("seed", range(3))
 @pytest.mark.parametrize("problem", [random_problem, polynomial_problem, nearly_dependent_problem])
 def test_equals_rational_arithmetic(problem, seed):
+    """But for the digits that the condition number κ of the scaled columns costs, in units of the
+    standard deviation where the residual is far above the signal."""
     B, y, w = problem(seed)
     x, cofactor, rss = rational_solution(B, y, w)
     solution = solve_weighted(B, y, w)
-    assert solution.kept.size == B.shape[1]
-    np.testing.assert_allclose(solution.x, x, rtol=1e-13)
+    A = B * w[:, None]
+    lost = 100 * np.finfo(float).eps * np.linalg.cond(A / np.linalg.norm(A, axis=0))
     sizes = np.sqrt(np.diag(cofactor))
-    np.testing.assert_allclose(np.sqrt(np.diag(solution.cofactor)), sizes, rtol=1e-13)
+    of_noise = sizes * np.sqrt(rss / solution.dof)
+    assert solution.kept.size == B.shape[1]
+    assert (np.abs(solution.x - x) <= lost * (np.abs(x) + of_noise)).all()
+    np.testing.assert_allclose(np.sqrt(np.diag(solution.cofactor)), sizes, rtol=lost)
     np.testing.assert_allclose(
-        solution.cofactor / np.outer(sizes, sizes),
-        cofactor / np.outer(sizes, sizes),
-        rtol=0,
-        atol=1e-13,
-    )
-    assert solution.rss == pytest.approx(rss, rel=1e-13)
+        solution.cofactor / np.outer(sizes, sizes), cofactor / np.outer(sizes, sizes), rtol=0,
+        atol=2 * lost,
+    )  # fmt: skip
+    assert solution.rss == pytest.approx(rss, rel=lost)
 
 
 def test_weighted_problem_equals_scaled_rows():
