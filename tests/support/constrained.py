@@ -3,58 +3,52 @@
 from collections.abc import Sequence
 
 import numpy as np
+from scipy import stats
 
-from elastocal.identification.constrained import Minimum, minimise
-from elastocal.identification.constrained_solver import ConstrainedObjective, loss_of
-from elastocal.identification.intervals import ProfileInterval
-from elastocal.identification.knowledge import Constraints, GaussianPrior
-from elastocal.identification.knowledge_fit import profile_linear_interval
+from elastocal.identification.constrained import Minimum, Reduced, minimise
+from elastocal.identification.knowledge import Constraints, System
 
 NONE = Constraints()
-
-
-def objective_of(B, y, names, prior, loss, size, sigma) -> ConstrainedObjective:
-    """Σ ρ(y − B x) + σ² (x − m)ᵀ C⁻¹ (x − m) with rows of standard deviation `sigma`."""
-    p = len(names)
-    P, target = (np.zeros((0, p)), np.zeros(0)) if prior is None else prior.rows(names)
-    return ConstrainedObjective(
-        np.asarray(B, dtype=float), np.asarray(y, dtype=float), sigma * P, sigma * target,
-        loss_of(loss, size, sigma),
-    )  # fmt: skip
+CHI2 = float(stats.chi2.ppf(0.95, 1))
 
 
 def solve(
-    B: np.ndarray,
-    y: np.ndarray,
-    names: Sequence[str],
-    stated: Constraints = NONE,
-    *,
-    prior: GaussianPrior | None = None,
-    loss: str = "squares",
-    size: int = 1,
-    sigma: float = 1.0,
+    B: np.ndarray, y: np.ndarray, names: Sequence[str], stated: Constraints = NONE
 ) -> Minimum:
-    objective = objective_of(B, y, names, prior, loss, size, sigma)
-    return minimise(objective, stated.resolve(names))
+    """The least |y − B x|² under the constraints."""
+    return minimise(B, y, stated.resolve(names))
 
 
-def profiles(
-    B: np.ndarray,
-    y: np.ndarray,
-    names: Sequence[str],
-    stated: Constraints,
-    *,
-    prior: GaussianPrior | None = None,
-    level: float = 0.95,
-) -> list[ProfileInterval]:
-    """The interval of every parameter for rows of unit noise."""
-    objective, system = objective_of(B, y, names, prior, "squares", 1, 1.0), stated.resolve(names)
-    return [profile_linear_interval(objective, system, n, 1.0, level) for n in names]
+def ends(
+    B: np.ndarray, y: np.ndarray, names: Sequence[str], stated: Constraints, name: str,
+    rise: float = CHI2,
+) -> tuple[float, float]:  # fmt: skip
+    """The profile interval of one parameter for rows of unit noise, by default of 95 %."""
+    reduced, index = Reduced.of(B, y, stated.resolve(names)), names.index(name)
+    best = reduced.minimum()
+    low, high = (float(reduced.farthest(index, best, rise, side)[index]) for side in (-1, 1))
+    return low, high
 
 
-def profile(
-    B: np.ndarray, y: np.ndarray, names: Sequence[str], stated: Constraints, name: str
-) -> ProfileInterval:
-    """The interval of one parameter for rows of unit noise."""
-    objective = objective_of(B, y, names, None, "squares", 1, 1.0)
-    return profile_linear_interval(objective, stated.resolve(names), name, 1.0)
+def breach(B: np.ndarray, y: np.ndarray, system: System, found: Minimum) -> float:
+    """What of the conditions of Karush, Kuhn and Tucker a fit of bounds and equalities breaks.
+
+    The largest of: a violated constraint, a price of the wrong sign, and a slope of the sum of
+    squares that no price explains, each in units of the parameters' own standard deviations.
+    """
+    unit = 1 / np.linalg.norm(B, axis=0)
+    x = found.x / unit
+    missed = np.abs(system.A @ found.x - system.b) / np.maximum(
+        np.linalg.norm(system.A * unit, axis=1), 1e-300
+    )
+    parts = [system.lower / unit - x, x - system.upper / unit, missed]
+    slope = 2 * unit * (B.T @ (B @ found.x - y))
+    for a in found.active:
+        if a.kind == "equality":
+            row = system.A[system.equality_labels.index(a.label)]
+        else:
+            row = np.eye(len(x))[system.names.index(a.names[0])]
+            parts.append(np.array([-a.multiplier if a.kind == "lower" else a.multiplier]) * unit)
+        slope = slope - a.multiplier * row * unit
+    parts.append(np.abs(slope))
+    return float(max(np.max(part, initial=0.0) for part in parts))

@@ -1,76 +1,60 @@
-"""Fits under constraints and with a prior, linear and nonlinear: minimum, conflicts, columns."""
+"""Linear least squares under constraints: the minimum, its prices, and how far a value can go.
+
+After the equalities and the free minimum are taken out, x = centre + T u with the sum of squares
+rest + |u|², so that the constrained minimum is the point of a convex set nearest to u = 0.  A cone
+program (cvxpy with Clarabel) finds which constraints are active there; the point itself then comes
+from the equations of these, good to rounding and not to a solver's tolerance.
+"""
 
 from __future__ import annotations
 
+import warnings
 from dataclasses import dataclass, replace
-from typing import Literal, NoReturn
+from types import ModuleType
+from typing import Any, Literal, NoReturn
 
 import numpy as np
-from numpy.typing import NDArray
-from scipy import linalg
+from scipy import linalg, optimize
 
-from elastocal.errors import ElastocalError, InputError, InsufficientDataError, option, require
-from elastocal.identification.constrained_solver import (
-    Active,
-    Affine,
-    ConstrainedObjective,
-    Kkt,
-    LossName,
-    ResidualLoss,
-    active_at,
-    active_from_duals,
-    equality_space,
-    kkt,
-    least_excess,
-    loss_of,
-    polished,
-    solve_conic,
-    tangent_rows,
-)
-from elastocal.identification.knowledge import (
-    ROUND_OFF,
-    Bounds,
-    Constraints,
-    GaussianPrior,
-    Matrix,
-    System,
-    share_of_prior,
-)
-from elastocal.identification.least_squares import FitProblem
+from elastocal.errors import ElastocalError, InputError, InsufficientDataError
+from elastocal.identification.knowledge import ROUND_OFF, Matrix, System
 from elastocal.identification.linear_solver import least_norm
-from elastocal.identification.solve import WORTH_A_COLUMN, Solution
-from elastocal.model.manipulator import Regression
-from elastocal.text import listed, quoted
-from elastocal.units import Array, IntArray
+from elastocal.text import listed
+from elastocal.units import Array, BoolArray, IntArray
 
-# Which constraints contradict each other.
+# Linear equalities, by the space that they leave.
 
-MATTERS = 1e-6  # of the largest multiplier
+RANK = 1e-10  # of unit rows or columns: what is smaller is taken for round-off
 
 
-def raise_conflict(system: System) -> NoReturn:
-    """Raise InputError that names the constraints which no x satisfies together.
+@dataclass(frozen=True)
+class Affine:
+    """{origin + basis w}: all x with A x = b; `gap` is the largest |A x − b| left, unit rows."""
 
-    Every constraint is relaxed by one t, in the units of `system`, and t made as small as can be.
-    The constraints with a multiplier are a proof of the contradiction (Farkas); the others could
-    be dropped and it would remain.
-    """
-    found = least_excess(system)
-    largest = max(found.values(), default=0.0)
-    guilty = [f"'{k}'" for k, v in found.items() if v > MATTERS * largest] or [
-        f"'{label}'" for label in found
-    ]
-    raise InputError(
-        f"the constraints contradict each other: no values satisfy {listed(guilty)} together; "
-        "relax or drop one of them"
-    )
+    origin: Array  # (p,) the shortest such x
+    basis: Array  # (p, q) orthonormal
+    gap: float
 
 
-# The minimum of an objective under constraints: scaled, solved, polished, named.
+def equality_space(A: Array, b: Array) -> Affine:
+    """All solutions of A x = b (k, p); least-squares ones where the rows contradict each other."""
+    p = A.shape[1]
+    norms = np.linalg.norm(A, axis=1)
+    rows = A[norms > 0] / norms[norms > 0, None]
+    values = b[norms > 0] / norms[norms > 0]
+    if not len(rows):
+        return Affine(np.zeros(p), np.eye(p), float(np.max(np.abs(b), initial=0.0)))
+    Q, R, _ = linalg.qr(rows.T, pivoting=True)
+    sizes = np.abs(np.diag(R))
+    rank = int(np.count_nonzero(sizes > RANK * sizes[0]))
+    origin = Q[:, :rank] @ least_norm(rows @ Q[:, :rank], values)
+    gap = float(np.max(np.abs(rows @ origin - values)))
+    return Affine(origin, Q[:, rank:], max(gap, float(np.max(np.abs(b[norms == 0]), initial=0.0))))
 
-CONTRADICTION = 1e-9  # what equalities may miss each other by, of the size of x
-CERTIFIED = 1e-6  # KKT residual above which the point is no minimum
-UNDETERMINED = 1e-11  # singular value of unit columns, of the largest
+
+# The answer.
+
+ON_BOUND = 1e-7  # in units of x: what is closer to a bound lies on it
 
 
 @dataclass(frozen=True)
@@ -91,75 +75,336 @@ class ActiveConstraint:
 
 @dataclass(frozen=True)
 class Minimum:
-    """Minimiser x (p,), residual y − B x (rows,) and objective there, and their optimality.
+    """Minimiser x (p,) of |t − J x|² under constraints, the objective there, what is active.
 
-    `cofactor` (p, p) is the inverse of half the objective's Hessian within the face of the active
-    constraints, zero across it: (BᵀB + PᵀP)⁻¹ for squares and no active constraint.  Times the
-    variance of a whitened row it is the (posterior) covariance with the active constraints taken
-    as equalities; for Huber's loss it is no covariance.  `prior_share` (p,) says what share of each
-    estimate's information is the prior's (0 without prior, NaN where constraints fix the value).
-    `kkt` is the relative KKT residual, about 1e-12 at a minimum.
+    `u` (q,) is the same point in the coordinates of `Reduced`.
     """
 
     x: Array
-    residual: Array
     objective: float
     active: tuple[ActiveConstraint, ...]
-    cofactor: Array
-    prior_share: Array
-    kkt: float
+    u: Array
 
 
-def minimise(
-    objective: ConstrainedObjective, system: System, stated: System | None = None
-) -> Minimum:
-    """Minimise the objective over the system's x; `active` in the terms of `stated`, if given,
-    where x is a step and `stated` the constraints on the parameters themselves.
+@dataclass(frozen=True)
+class Active:
+    """Which rows of a region hold u back (k,), and a null-space basis (n, ·) of each matrix."""
 
-    Inequalities and Huber's loss are solved by an interior-point method (Clarabel), and Newton
-    steps on the active face end it, so that the result is good to rounding and not to a solver's
-    tolerance.
+    rows: BoolArray
+    nulls: tuple[Array, ...]
 
-    Raises InputError where constraints contradict each other, which it names, and
-    InsufficientDataError where data, prior and equalities leave a direction undetermined.
+
+@dataclass(frozen=True)
+class Region:
+    """{u: rows u ≥ least, every matrix ⪰ 0} in the coordinates u (q,) of a `Reduced`.
+
+    The rows (k, q) are the finite bounds, lower ones first, of unit length: `sides` (k,) is 1 for
+    a lower bound and −1 for an upper one of parameter `of` (k,), `lengths` (k,) what a row was
+    divided by.
     """
-    # Columns of unit length: x is then in units of the standard deviation a parameter would have
-    # alone, whatever its physical unit, and so are slacks and tolerances.
-    unit = 1 / objective.norms
-    zero = np.zeros(len(unit))
-    scaled, limits = objective.moved(zero, unit), system.moved(zero, unit)
-    space = equality_space(limits.A, limits.b)
-    if space.gap > CONTRADICTION * max(1.0, float(np.max(np.abs(space.origin)))):
-        raise_conflict(limits)
-    centre, R = _least_squares(scaled, space, system.names)
-    data = float(np.linalg.norm(scaled.y) + np.linalg.norm(scaled.target))
-    # About the unconstrained minimum numbers are as small as the constraints allow.
-    scaled, limits = scaled.moved(centre, zero + 1), limits.moved(centre, zero + 1)
-    start, active = _constrained_start(scaled, limits, space.basis, R)
-    z, active, at = polished(scaled, limits, active, start, data)
-    if not at.residual <= CERTIFIED:
-        raise ElastocalError(
-            f"no certified minimum: the KKT residual is {at.residual:.1e}; state values that the "
-            "constraints pin from two sides as equalities, and check the units of the bounds"
+
+    rows: Array
+    least: Array
+    of: IntArray
+    sides: Array
+    lengths: Array
+    matrices: tuple[Matrix, ...]
+
+    @classmethod
+    def of_system(cls, system: System, T: Array) -> Region:
+        """Bounds and matrices of a system on x = T u."""
+        below, above = (np.flatnonzero(np.isfinite(b)) for b in (system.lower, system.upper))
+        of, sides = np.append(below, above), np.repeat([1.0, -1.0], [len(below), len(above)])
+        rows = sides[:, None] * T[of]
+        least = np.append(system.lower[below], -system.upper[above])
+        lengths = np.linalg.norm(rows, axis=1)
+        # What the equalities pin does not move; a bound on it holds, or nothing can meet it.
+        lengths[lengths <= RANK * np.max(np.linalg.norm(T, axis=1), initial=0.0)] = 0.0
+        if np.max(least[lengths == 0], initial=0.0) > RANK:
+            raise_conflict(system)
+        moves = lengths > 0
+        matrices = tuple(
+            replace(m, slopes=np.tensordot(T.T, m.slopes, axes=1)).balanced()
+            for m in system.matrices
         )
-    x = unit * (centre + z)
-    x[active.lower], x[active.upper] = system.lower[active.lower], system.upper[active.upper]
-    cofactor = _cofactor(scaled, limits, active, z) * np.outer(unit, unit)
-    return Minimum(
-        x, objective.y - objective.B @ x, objective.value(x),
-        _named(stated or system, limits, active, at, z, unit), cofactor,
-        share_of_prior(cofactor, objective.P), at.residual,
-    )  # fmt: skip
+        return cls(
+            rows[moves] / lengths[moves, None], least[moves] / lengths[moves], of[moves],
+            sides[moves], lengths[moves], matrices,
+        )  # fmt: skip
+
+    def holds(self, u: Array) -> bool:
+        """Whether u lies in the region, matrices to round-off."""
+        for matrix in self.matrices:
+            values = _eigenvalues(matrix, u)
+            if values[0] < -ROUND_OFF * max(np.abs(values).max(), 0.0):
+                return False
+        return bool((self.rows @ u >= self.least).all())
+
+    def about(self, u: Array, size: float, whole: bool = False) -> Region:
+        """The same region for v, where the point is u + size · v; `whole` as in `balanced`."""
+        matrices = tuple(
+            replace(m, constant=m.at(u), slopes=m.slopes * size).balanced(whole)
+            for m in self.matrices
+        )
+        return replace(self, least=(self.least - self.rows @ u) / size, matrices=matrices)
+
+    def distance(self) -> float:
+        """A lower bound of the way |u| from 0 into the region."""
+        # An eigenvalue of M changes by at most |u| √(Σ ‖slopes_i‖²).
+        parts = [m.shortfall(np.zeros(len(m.slopes))) / np.linalg.norm(m.slopes)
+                 for m in self.matrices if m.slopes.any()]  # fmt: skip
+        return max(0.0, float(np.max(self.least, initial=0.0)), *map(float, parts))
+
+    def tangent(self, active: Active, u: Array) -> tuple[Array, Array]:
+        """Rows and values of the equations on u that keep the active constraints active.
+
+        Of a matrix N_lᵀ dM N_l = −N_lᵀ M(u) N_l, the upper triangle, off-diagonal entries times
+        √2, so that ⟨Λ, N_lᵀ dM N_l⟩ is a scalar product.
+        """
+        rows, values = [self.rows[active.rows]], [self.least[active.rows]]
+        for matrix, N in zip(self.matrices, active.nulls, strict=True):
+            i, j, factor = _triangle(N.shape[1])
+            own = ((N.T @ matrix.slopes @ N)[:, i, j] * factor).T
+            rows.append(own)
+            values.append(own @ u - (N.T @ matrix.at(u) @ N)[i, j] * factor)
+        return np.vstack(rows), np.concatenate(values)
+
+    def curvature(self, active: Active, multipliers: tuple[Array, ...], u: Array) -> Array:
+        """Rows K with |K du|² = 2 Σ_l ⟨Z_l, dM M⁺ dM⟩, Z_l the multipliers.
+
+        The face of a matrix of fixed rank is curved, and this is what moving along it adds to the
+        Hessian of half the objective (the sigma term of Shapiro 1997).
+        """
+        found = [np.zeros((0, len(u)))]
+        for matrix, N, Z in zip(self.matrices, active.nulls, multipliers, strict=True):
+            k = N.shape[1]
+            if k:
+                values, vectors = np.linalg.eigh(matrix.at(u))
+                inverse = vectors[:, k:] / np.sqrt(np.maximum(values[k:], np.finfo(float).tiny))
+                sizes, axes = np.linalg.eigh(Z)
+                root = (axes * np.sqrt(2 * np.maximum(sizes, 0.0))).T
+                found.append((root @ matrix.slopes @ inverse).reshape(len(u), -1).T)
+        return np.vstack(found)
 
 
-def _least_squares(
-    objective: ConstrainedObjective, space: Affine, names: tuple[str, ...]
-) -> tuple[Array, Array]:
-    """Least-squares x (p,) in the space, and R (q, q) with RᵀR = basisᵀ(BᵀB + PᵀP) basis."""
-    J = np.vstack([objective.B, objective.P])
-    t = np.concatenate([objective.y, objective.target]) - J @ space.origin
+# The minimum.
+
+CONTRADICTION = 1e-9  # what equalities may miss each other by, of the size of x
+CERTIFIED = 1e-6  # of |u|: KKT residual above which the point is no minimum
+UNDETERMINED = 1e-11  # singular value of unit columns, of the largest
+FAR = 10.0  # times the expected way: what is farther is out of reach
+STEEPEST = 1e7  # of an interval's 1/s: what it leaves across it is below 1e-7
+STEPS = 30  # of Newton's method, which needs three, on a curved face
+
+
+@dataclass(frozen=True)
+class Reduced:
+    """|t − J x|² = constant + |u|² on x = unit · (centre + T u), all x that the equalities allow.
+
+    `unit` (p,) makes the columns of J unit length, so that slacks and tolerances do not depend on
+    a parameter's physical unit; `limits` are the constraints on x/unit − centre.
+    """
+
+    J: Array
+    t: Array
+    system: System
+    unit: Array
+    centre: Array
+    T: Array
+    limits: System
+    region: Region
+
+    @classmethod
+    def of(cls, J: Array, t: Array, system: System) -> Reduced:
+        """Raises InputError where equalities contradict each other, which it names, and
+        InsufficientDataError where they and J (rows, p) leave a direction undetermined."""
+        norms = np.linalg.norm(J, axis=0)
+        unit = 1 / np.where(norms > 0, norms, 1.0)
+        zero = np.zeros(len(unit))
+        limits = system.moved(zero, unit)
+        space = equality_space(limits.A, limits.b)
+        if space.gap > CONTRADICTION * max(1.0, float(np.max(np.abs(space.origin), initial=0.0))):
+            raise_conflict(limits)
+        centre, T = _free_minimum(J * unit, t, space, system.names)
+        # About the free minimum numbers are as small as the constraints allow.
+        limits = limits.moved(centre, zero + 1)
+        region = Region.of_system(limits, T)
+        return cls(J, t, system, unit, centre, T, limits, region)
+
+    def minimum(self, stated: System | None = None) -> Minimum:
+        """The minimum under all constraints; `active` in the terms of `stated`, if given, where x
+        is a step and `stated` the constraints on the parameters themselves.
+
+        Raises InputError where constraints contradict each other, which it names.
+        """
+        u = np.zeros(self.T.shape[1])
+        active = Active(
+            np.zeros(len(self.region.least), bool),
+            tuple(np.zeros((len(m.balance), 0)) for m in self.region.matrices),
+        )
+        if not self.region.holds(u):
+            u, active = self._nearest()
+        x = self.unit * (self.centre + self.T @ u)
+        for kind, side in (("lower", 1), ("upper", -1)):
+            held = self.region.of[active.rows & (self.region.sides == side)]
+            x[held] = getattr(self.system, kind)[held]
+        left = self.t - self.J @ x
+        named = self._named(stated or self.system, active, u)
+        return Minimum(x, float(left @ left), named, u)
+
+    def _nearest(self) -> tuple[Array, Active]:
+        """The point of the region nearest to 0, and what is active there."""
+        origin, size = np.zeros(self.T.shape[1]), self.region.distance() or 1.0
+        for _ in range(5):
+            region = self.region.about(origin, size)
+            v, active, multipliers = self._cone_program(region)
+            length = float(np.linalg.norm(v))
+            if length <= FAR:
+                break
+            size *= length
+        moves = np.inf
+        for k in range(STEPS):
+            before, v = v, _newton(region, active, multipliers, v)
+            active, last = _refreshed(region, active, v), moves
+            rows, multipliers = _multipliers(region, active, v)
+            moves = float(np.linalg.norm(v - before))
+            # The first step may only move the multipliers to their new null space.
+            if not any(N.shape[1] for N in active.nulls) or (k > 1 and not moves < last / 2):
+                break
+        _certify(region, v, rows, multipliers)
+        return size * v, _refreshed(self.region, active, size * v)
+
+    def _cone_program(self, region: Region) -> tuple[Array, Active, tuple[Array, ...]]:
+        """The nearest point to a solver's accuracy, what is active, and the matrices' multipliers.
+
+        Active are those with slack < multiplier (strict complementarity).  M and its multiplier Z
+        share eigenvectors and M Z = 0, so the negative eigenvalues of M − Z are those of −Z, and
+        belong to the null space.
+        """
+        import cvxpy as cp
+
+        v = cp.Variable(self.T.shape[1])
+        # No v of the length expected reaches a farther bound, whose size would cost digits.
+        near = region.least >= -FAR
+        bounds = [region.rows[near] @ v >= region.least[near]] if near.any() else []
+        matrices = [_value(cp, m, v) >> 0 for m in region.matrices]
+        status = _solve(cp.Problem(cp.Minimize(cp.sum_squares(v)), [*bounds, *matrices]))
+        if "infeasible" in status:
+            raise_conflict(self.limits)
+        if v.value is None:
+            raise _stopped(status)
+        at, rows = np.asarray(v.value), np.zeros(len(near), bool)
+        if bounds:
+            rows[near] = region.rows[near] @ at - region.least[near] < bounds[0].dual_value / 2
+        duals = tuple((c.dual_value + c.dual_value.T) / 4 for c in matrices)
+        nulls = []
+        for matrix, Z in zip(region.matrices, duals, strict=True):
+            values, vectors = np.linalg.eigh(matrix.at(at) - Z)
+            nulls.append(vectors[:, values < 0])
+        return at, Active(rows, tuple(nulls)), duals
+
+    def _named(self, stated: System, active: Active, u: Array) -> tuple[ActiveConstraint, ...]:
+        """Equalities, then bounds, then matrices on which u lies, prices in the units of x."""
+        region, limits, z = self.region, self.limits, self.T @ u
+        rows, matrices = _multipliers(region, active, u)
+        prices = np.zeros(len(z))
+        np.add.at(prices, region.of, region.sides * rows / region.lengths)
+        # What they leave of the gradient of half the objective is the equalities'.
+        J = self.J * self.unit
+        pull = J.T @ (self.J @ (self.unit * (self.centre + z)) - self.t) - prices
+        for own, in_u, Z in zip(limits.matrices, region.matrices, matrices, strict=True):
+            both = in_u.balance / own.balance
+            pull -= np.tensordot(own.slopes, np.outer(both, both) * Z, axes=2)
+        shares = least_norm(limits.A.T, pull) if len(limits.b) else np.zeros(0)
+        noise = ROUND_OFF * float(np.linalg.norm(self.t))  # J has columns of unit length
+        shares[np.abs(shares) * np.linalg.norm(limits.A, axis=1) <= noise] = 0.0
+        found = [
+            ActiveConstraint(label, "equality", _names(stated, row), float(b), 2 * float(price))
+            for row, label, b, price in zip(
+                stated.A, stated.equality_labels, stated.b, shares, strict=True
+            )
+        ]
+        sides: tuple[tuple[Literal["lower", "upper"], str, Array, int], ...] = (
+            ("lower", ">=", z - limits.lower, 1), ("upper", "<=", limits.upper - z, -1),
+        )  # fmt: skip
+        for kind, sign, slack, side in sides:
+            held = region.of[active.rows & (region.sides == side)]
+            for i in np.union1d(held, np.flatnonzero(slack <= ON_BOUND)):
+                name, value = stated.names[i], float(getattr(stated, kind)[i])
+                price = 2 * float(prices[i] / self.unit[i]) if i in held else 0.0
+                label = f"{name} {sign} {value:.6g}"
+                found.append(ActiveConstraint(label, kind, (name,), value, price))
+        for own, in_u, Z in zip(limits.matrices, region.matrices, matrices, strict=True):
+            if _eigenvalues(own, z)[0] <= ON_BOUND:
+                names = _names(stated, np.abs(own.slopes).sum(axis=(1, 2)))
+                price = 2 * float(in_u.balance**2 @ np.diag(Z))
+                found.append(ActiveConstraint(own.label, "semidefinite", names, 0.0, price))
+        return tuple(found)
+
+    def face(self, found: Minimum) -> Array:
+        """Orthonormal directions (q, ·) in which the constraints on which `found` lies let u go."""
+        region, z = self.region, self.T @ found.u
+        touched = (region.rows @ found.u - region.least) * region.lengths <= ON_BOUND
+        nulls = [
+            np.linalg.eigh(own.at(found.u))[1][:, : int((_eigenvalues(m, z) <= ON_BOUND).sum())]
+            for own, m in zip(region.matrices, self.limits.matrices, strict=True)
+        ]
+        rows, _ = region.tangent(Active(touched, tuple(nulls)), found.u)
+        return equality_space(rows, np.zeros(len(rows))).basis
+
+    def farthest(self, index: int, found: Minimum, rise: float, side: int) -> Array:
+        """x (p,) with the least (side −1) or largest (1) x[index] where the objective is at most
+        `rise` above its minimum `found`.
+
+        These are the ends of the profile interval {v: S(v) − Ŝ ≤ rise}, S(v) the least objective
+        with the parameter at v.
+        """
+        c, s = side * self.T[index], float(np.sqrt(rise))
+        length = float(np.linalg.norm(c))
+        if s == 0 or length <= RANK * float(np.max(np.linalg.norm(self.T, axis=1), initial=0.0)):
+            return found.x  # equalities leave a single value
+        v = c / length
+        if found.u.any() or not self.region.holds(s * v):
+            v = self._cone_end(v, found.u, s)
+        x = self.unit * (self.centre + self.T @ (found.u + s * v))
+        bound = (self.system.lower if side < 0 else self.system.upper)[index]
+        near = ON_BOUND * self.unit[index] * length * s
+        if side * (bound - x[index]) <= near:
+            x[index] = bound
+        return x if side * (x[index] - found.x[index]) > 0 else found.x
+
+    def _cone_end(self, direction: Array, u: Array, s: float) -> Array:
+        """v farthest in the direction, where u + s v is allowed and |u + s v|² ≤ |u|² + s²."""
+        import cvxpy as cp
+
+        region, v = self.region.about(u, s, whole=True), cp.Variable(len(u))
+        wanted = [_value(cp, m, v) >> 0 for m in region.matrices]
+        # What is allowed lies where u·v ≥ 0.  A minimum far from the free one leaves next to
+        # nothing of that side.
+        steep = 2 * np.linalg.norm(u) / s
+        if steep < STEEPEST:
+            wanted.append(cp.sum_squares(v) + (2 / s) * u @ v <= 1)
+        else:
+            wanted += [cp.sum_squares(v) <= 1, u / np.linalg.norm(u) @ v <= 0]
+        near = region.least >= -FAR
+        if near.any():  # u itself is allowed, whatever its rounding says
+            wanted.append(region.rows[near] @ v >= np.minimum(region.least[near], 0.0))
+        status = _solve(cp.Problem(cp.Maximize(direction @ v), wanted))
+        if v.value is None:
+            raise _stopped(status)
+        return np.asarray(v.value)
+
+
+def minimise(J: Array, t: Array, system: System, stated: System | None = None) -> Minimum:
+    """Minimise |t − J x|² over the system's x; errors and `stated` as in `Reduced`."""
+    return Reduced.of(J, t, system).minimum(stated)
+
+
+def _free_minimum(J: Array, t: Array, space: Affine, names: tuple[str, ...]) -> tuple[Array, Array]:
+    """Least-squares x (p,) in the space, and T (p, q) with |J T u| = |u|."""
+    t = t - J @ space.origin
     if not space.basis.shape[1]:
-        return space.origin, np.zeros((0, 0))
+        return space.origin, space.basis
     Q, R = linalg.qr(J @ space.basis, mode="economic")
     singular, right = linalg.svd(R)[1:]
     tiny = UNDETERMINED * float(np.max(singular, initial=0.0))
@@ -171,332 +416,161 @@ def _least_squares(
             f"data, prior and equalities do not determine {listed(free)}: values can change "
             "together without moving a reading; hold some of them, or state a prior"
         )
-    return space.origin + space.basis @ linalg.solve_triangular(R, Q.T @ t), R
+    T = linalg.solve_triangular(R, space.basis.T, trans="T").T
+    return space.origin + T @ (Q.T @ t), T
 
 
-def _constrained_start(
-    objective: ConstrainedObjective, system: System, basis: Array, R: Array
-) -> tuple[Array, Active]:
-    """A minimum to a solver's accuracy, and what is active; 0 is the free one of squares."""
-    x, threshold = np.zeros(len(system.names)), objective.loss.threshold
-    outside, size = (system.lower > 0) | (system.upper < 0), system.distance(x)
-    active = Active(outside, outside, tuple(np.zeros((len(m.balance), 0)) for m in system.matrices))
-    T = linalg.solve_triangular(R, basis.T, trans="T").T
-
-    def solved(size: float, loss: ResidualLoss) -> tuple[Array, Active]:
-        point = solve_conic(replace(objective, loss=loss), system, T, size)
-        if point is None:
-            raise_conflict(system)
-        return point.x, active_from_duals(system, point)
-
-    if outside.any() or not all(_semidefinite(m, x) for m in system.matrices):
-        x, active = solved(size, ResidualLoss())
-    # Where no reading is beyond Huber's threshold, his loss is squares.
-    if np.max(objective.loss.lengths(objective.y - objective.B @ x), initial=0.0) <= threshold:
-        return x, active
-    return solved(max(size, threshold), objective.loss)
+def _newton(region: Region, active: Active, multipliers: tuple[Array, ...], u: Array) -> Array:
+    """The nearest point to 0 on the active constraints linearised at u; for bounds exact."""
+    space = equality_space(*region.tangent(active, u))
+    K = region.curvature(active, multipliers, u)
+    if not len(K) or not space.basis.shape[1]:
+        return space.origin
+    bent = K @ space.basis
+    slope = bent.T @ (K @ (u - space.origin))
+    w = linalg.solve(np.eye(bent.shape[1]) + bent.T @ bent, slope, assume_a="pos")
+    return space.origin + space.basis @ w
 
 
-def _semidefinite(matrix: Matrix, x: Array) -> bool:
-    values = np.linalg.eigvalsh(matrix.at(x))
-    return bool(values[0] >= -ROUND_OFF * max(np.abs(values).max(), 0.0))
-
-
-def _cofactor(objective: ConstrainedObjective, system: System, active: Active, x: Array) -> Array:
-    basis = equality_space(*tangent_rows(system, active, x)).basis
-    R = linalg.qr(objective.root(x) @ basis, mode="r")[0][: basis.shape[1]]
-    try:
-        half = linalg.solve_triangular(R, basis.T, trans="T") if R.size else np.zeros((0, len(x)))
-    except (linalg.LinAlgError, ValueError):
-        raise InputError(
-            "Huber's loss sees too few readings within its threshold to curve in every "
-            "direction: check sigma, which should be the noise of a whitened row"
-        ) from None
-    return half.T @ half
-
-
-def _named(
-    system: System, scaled: System, active: Active, at: Kkt, z: Array, unit: Array
-) -> tuple[ActiveConstraint, ...]:
-    """Equalities, then bounds, then matrices on which z lies, prices in the units of x."""
-    touched = active_at(scaled, z)
-    found = []
-    for row, label, b, price in zip(
-        system.A, system.equality_labels, system.b, at.equalities, strict=True
-    ):
-        names = tuple(system.names[i] for i in np.flatnonzero(row))
-        found.append(ActiveConstraint(label, "equality", names, float(b), 2 * float(price)))
-    sides = (
-        ("lower", ">=", active.lower | touched.lower, system.lower),
-        ("upper", "<=", active.upper | touched.upper, system.upper),
-    )
-    for kind, sign, chosen, bound in sides:
-        for i in np.flatnonzero(chosen):
-            name, value = system.names[i], float(bound[i])
-            price = 2 * float(at.bounds[i] / unit[i]) if getattr(active, kind)[i] else 0.0
-            label = f"{name} {sign} {value:.6g}"
-            found.append(ActiveConstraint(label, kind, (name,), value, price))  # type: ignore[arg-type]
-    for matrix, N, Z in zip(scaled.matrices, touched.nulls, at.matrices, strict=True):
-        if N.shape[1]:
-            names = tuple(n for n, s in zip(system.names, matrix.slopes, strict=True) if s.any())
-            price = 2 * float(matrix.balance**2 @ np.diag(Z))
-            found.append(ActiveConstraint(matrix.label, "semidefinite", names, 0.0, price))
-    return tuple(found)
-
-
-# Constrained fit of the nonlinear model: sequential convex programming on the exact B.
-
-# Predicted fall of the objective, relative to it, below which the step is the last one.
-TOLERANCE = 1e-12
-FIRST_RADIUS, LEAST_RADIUS = 10.0, 1e-12  # in typical sizes of the parameters
-POOR, GOOD = 0.25, 0.75  # actual over predicted fall (Conn, Gould and Toint 2000, section 6.1)
-
-
-@dataclass(frozen=True)
-class ConstrainedFit:
-    """Values x (parameters,), raw and whitened residual (rows,), B (rows, columns), raw.
-
-    `columns` are the fitted parameters; `cofactor` (columns, columns) and `prior_share`
-    (columns,) as in `Minimum`, on the model linearised at x; multipliers of `active`
-    are in units of the objective per unit of the constraint.  `kkt` is the relative KKT residual
-    of the nonlinear problem at x.
-    """
-
-    x: Array
-    residual: Array
-    whitened: Array
-    B: Array
-    columns: NDArray[np.int64]
-    names: tuple[str, ...]
-    objective: float
-    active: tuple[ActiveConstraint, ...]
-    cofactor: Array
-    prior_share: Array
-    kkt: float
-    converged: bool
-    reason: str
-    steps: int
-
-
-def constrained_fit(
-    problem: FitProblem,
-    constraints: Constraints | None = None,
-    *,
-    prior: GaussianPrior | None = None,
-    loss: LossName = "squares",
-    sigma: float = 1.0,
-    max_steps: int = 60,
-) -> ConstrainedFit:
-    """Minimise Σ ρ(W (y − h(X))) + σ² (X − m)ᵀ C⁻¹ (X − m) over X[columns] under constraints.
-
-    Each step minimises the objective of the linearised model under the constraints, which are
-    convex and kept as they are, inside a box around X (trust region); it is taken where the true
-    objective falls too.  Every iterate satisfies the constraints; at the limit no step improves
-    the linearised model, which is the KKT condition of the nonlinear problem.  `sigma` is the
-    standard deviation of a whitened row; Huber's loss is of each reading's length.  The problem's
-    `bounded` and `tie` hold as in `fit`.
-
-    Raises InputError as `minimise` does, and where a held parameter alone breaks a
-    constraint; ElastocalError where the start has poses without equilibrium.
-    """
-    columns = problem.columns
-    names = tuple(problem.model.names[c] for c in columns)
-    system = fit_system(problem, constraints or Constraints())
-    P, target = _prior_rows(problem, columns, prior, sigma)
-    nonlinear = _Nonlinear(problem, P, target, loss_of(loss, problem.observations.size, sigma))
-    size, zero = problem.sizes[columns], np.zeros(len(columns))
-    x = nonlinear.moved(problem.x, _nearest(size, system.moved(problem.x[columns], zero + 1)))
-    at, objective = nonlinear.linearised(x)
-    value, radius = objective.value(zero), FIRST_RADIUS
-    reason, converged, steps = "the step limit was reached; the start may be far off", False, 0
-    while steps < max_steps and not converged:
-        steps += 1
-        found = minimise(objective, system.moved(x[columns], zero + 1).boxed(radius * size))
-        length = float(np.max(np.abs(found.x) / size))
-        trial = nonlinear.moved(x, found.x)
-        reached, fall = nonlinear.value(trial), value - found.objective
-        converged = fall <= TOLERANCE * value or length <= LEAST_RADIUS
-        if converged:
-            reason = "no step within the constraints improves the fit"
-        gained = value - reached if np.isfinite(reached) else -np.inf
-        if gained < POOR * fall:
-            radius = POOR * length
-        elif gained > GOOD * fall:
-            radius = max(radius, 3 * length)
-        # The last step cannot be judged by a fall that drowns in round-off.
-        if gained > 0 or (converged and gained >= -TOLERANCE * value):
-            x = trial
-            at, objective = nonlinear.linearised(x)
-            value = objective.value(zero)
-    limits = system.moved(x[columns], zero + 1)
-    final = minimise(objective, limits, system)
-    return ConstrainedFit(
-        x, at.residual, objective.y, at.B, columns, names, value, final.active,
-        final.cofactor, final.prior_share, _kkt(objective, limits), converged,
-        reason, steps,
-    )  # fmt: skip
-
-
-def fit_system(problem: FitProblem, constraints: Constraints) -> System:
-    """The constraints on the problem's columns, with the effects' own bounds where `bounded`."""
-    columns = problem.columns
-    own = [problem.model.parameters[c] for c in columns] if problem.bounded else []
-    stated = constraints + Constraints(tuple(Bounds(p.name, p.lower, p.upper) for p in own))
-    return stated.resolve(problem.model.names).restricted(columns, problem.x)
-
-
-@dataclass(frozen=True)
-class _Nonlinear:
-    """The objective as a function of all parameters, and its linearisation in a step."""
-
-    problem: FitProblem
-    P: Array
-    target: Array
-    loss: ResidualLoss
-
-    def moved(self, x: Array, step: Array) -> Array:
-        """x (parameters,) with `step` (columns,) added."""
-        trial = x.astype(float)
-        trial[self.problem.columns] += step
-        return trial
-
-    def linearised(self, x: Array) -> tuple[Regression, ConstrainedObjective]:
-        problem, apply = self.problem, self.problem.weights.apply
-        observed, columns = problem.observations, problem.columns
-        at = problem.model.regressor(observed.table, x, columns, observed)
-        lack = self.target - self.P @ x[columns]
-        return at, ConstrainedObjective(apply(at.B), apply(at.residual), self.P, lack, self.loss)
-
-    def value(self, x: Array) -> float:
-        """The objective at x; NaN where a pose has no equilibrium."""
-        observed = self.problem.observations
-        misfit = observed.value - self.problem.model.predict(observed.table, x, observed)
-        lack = self.target - self.P @ x[self.problem.columns]
-        return self.loss.value(self.problem.weights.apply(misfit)) + float(lack @ lack)
-
-
-def _prior_rows(
-    problem: FitProblem, columns: NDArray[np.int64], prior: GaussianPrior | None, sigma: float
-) -> tuple[Array, Array]:
-    """P (k, columns) and target (k,) of the prior, given the held parameters, and of the tie."""
-    P, target = np.zeros((0, len(columns))), np.zeros(0)
-    if prior is not None:
-        P, target = prior.rows(problem.model.names)
-        held = np.setdiff1d(np.arange(len(problem.x)), columns)
-        target = sigma * (target - P[:, held] @ problem.x[held])
-        P = sigma * P[:, columns]
-    if problem.tie is not None:
-        P = np.vstack([P, np.diag(1 / problem.tie)])
-        target = np.concatenate([target, problem.tied_to / problem.tie])
-    return P, target
-
-
-def _nearest(size: Array, system: System) -> Array:
-    """The shortest step, in typical sizes, to where the constraints hold."""
-    P, target = np.zeros((0, len(size))), np.zeros(0)
-    distance = ConstrainedObjective(np.diag(1 / size), 0 * size, P, target, ResidualLoss())
-    return minimise(distance, system).x
-
-
-def _kkt(objective: ConstrainedObjective, limits: System) -> float:
-    """KKT residual at the linearisation point itself."""
-    zero, unit = np.zeros(len(limits.names)), 1 / objective.norms
-    scaled, inside = objective.moved(zero, unit), limits.moved(zero, unit)
-    return kkt(scaled, inside, active_at(inside, zero), zero).residual
-
-
-# Which parameters a fit with constraints and a prior has, and its constraints on these alone.
-
-# Share of a column that others must leave over: B is exact to 1e-15, but a base that is tilted by
-# some µrad already tells its turn from that of joint 1.
-TOLD_APART = 1e-6
-
-
-def fitted_columns(
-    solution: Solution, std: Array, constraints: Constraints, prior: GaussianPrior | None
-) -> IntArray:
-    """Indices of the parameters to fit under the constraints and the prior, ascending.
-
-    These are the kept parameters of the solution (and those that bounds held); the free ones that
-    the prior or an equality names, for that is knowledge of themselves; and, of the parameters
-    that are known only together with one of these, as many as can now be told apart from it: with
-    a prior on k, readings of k + d are knowledge of d.  Told apart is what readings, prior and
-    equalities determine better than its typical size, as in the choice of the kept parameters.
-    Bounds and matrices make nothing known: they act on the fitted parameters, with all others
-    held where the fit held them.
-
-    `std` (kept,) is that of the solution's estimates.  Raises InputError for a name that is no
-    parameter, or a prior on a parameter that is held fixed; InsufficientDataError where an
-    equality names a parameter that stays undetermined.
-    """
-    problem, reduction = solution.problem, solution.reduction
-    names, free = problem.model.names, set(problem.free.tolist())
-    constraints.resolve(names)
-    tied = {name for e in constraints.equalities for name, factor in e.terms.items() if factor}
-    priors = set() if prior is None else set(prior.names)
-    if prior is not None:
-        prior.rows(names)
-    fixed = [quoted(n) for n in sorted(priors) if names.index(n) not in free]
-    require(
-        not fixed,
-        f"a prior is stated for {listed(fixed)}, which is held fixed; drop the prior or the fixing",
-    )
-    named = {names.index(n) for n in tied | priors} & free
-    columns = {*reduction.kept.tolist(), *reduction.at_bound.tolist(), *named}
-
-    def told_apart(c: int) -> bool:
-        return _told_apart(solution, [*sorted(columns - {c}), c], constraints, prior)
-
-    new = {names.index(n) for n in tied - priors} & free - set(reduction.kept.tolist())
-    unknown = [quoted(names[c]) for c in sorted(new) if not told_apart(c)]
-    if unknown:
-        raise InsufficientDataError(
-            f"readings, prior and equalities do not determine {listed(unknown)}, which an equality "
-            f"names; hold it ({option('fixed')}) or state a prior for it, or drop the equality"
+def _certify(region: Region, u: Array, rows: Array, matrices: tuple[Array, ...]) -> None:
+    """Raise ElastocalError where u breaks a condition of Karush, Kuhn and Tucker."""
+    pull = region.rows.T @ rows
+    for matrix, Z in zip(region.matrices, matrices, strict=True):
+        pull = pull + np.tensordot(matrix.slopes, Z, axes=2)
+    wrong = [float(np.linalg.norm(u - pull)), np.max(-rows, initial=0.0)]
+    wrong += [np.max(region.least - region.rows @ u, initial=0.0)]
+    wrong += [m.shortfall(u) for m in region.matrices]
+    wrong += [-np.linalg.eigvalsh(Z)[0] for Z in matrices]
+    residual = float(np.max(wrong)) / max(float(np.linalg.norm(u)), 1.0)
+    if not residual <= CERTIFIED:
+        raise ElastocalError(
+            f"no certified minimum: the KKT residual is {residual:.1e}; state values that the "
+            "constraints pin from two sides as equalities, and check the units of the bounds"
         )
-    partners: dict[int, None] = {}
-    for k, c in enumerate(reduction.kept.tolist()):
-        if c in named:
-            partners |= dict.fromkeys(reduction.terms(k, solution.sizes, std[k]))
-    for d in partners:
-        if d not in columns and told_apart(d):
-            columns.add(d)
-    return np.array(sorted(columns), dtype=np.int64)
 
 
-def _told_apart(
-    solution: Solution, columns: list[int], constraints: Constraints, prior: GaussianPrior | None
-) -> bool:
-    """Whether readings, prior and equalities tell the last of the columns from the others."""
-    problem, observed, e = solution.problem, solution.problem.observations, solution.fit.whitened
-    chosen = np.array(columns)
-    size, names = solution.sizes[chosen], problem.model.names
-    at = problem.model.regressor(observed.table, solution.fit.x, chosen, observed)
-    sigma = max(float(np.sqrt(e @ e / len(e))), 1e-12)
-    J = problem.weights.apply(at.B) * size / sigma
-    if prior is not None:
-        J = np.vstack([J, prior.rows(names)[0][:, chosen] * size])
-    A = constraints.resolve(names).A[:, chosen] * size
-    A = A[A.any(axis=1)]
-    # An equality is exact: it counts as much as the most that anything else tells.
-    A *= np.linalg.norm(J, axis=0).max() / np.linalg.norm(A, axis=1)[:, None]
-    J = np.vstack([J, A])
-    lengths = np.linalg.norm(J, axis=0)
-    J = J / np.where(lengths > 0, lengths, 1.0)
-    left = J[:, -1] - J[:, :-1] @ least_norm(J[:, :-1], J[:, -1])
-    off = float(np.linalg.norm(left))
-    return off > TOLD_APART and off * lengths[-1] > WORTH_A_COLUMN
+def _refreshed(region: Region, active: Active, u: Array) -> Active:
+    """The same bounds and ranks, with the null spaces of the matrices at u."""
+    nulls = [
+        np.linalg.eigh(matrix.at(u))[1][:, : N.shape[1]]
+        for matrix, N in zip(region.matrices, active.nulls, strict=True)
+    ]
+    return Active(active.rows, tuple(nulls))
 
 
-def own_bounds(solution: Solution) -> Constraints:
-    """The bounds that the effects of a bounded problem state themselves."""
-    if not solution.problem.bounded:
-        return Constraints()
-    parameters = solution.problem.model.parameters
-    return Constraints(
-        tuple(
-            Bounds(p.name, p.lower, p.upper)
-            for p in parameters
-            if np.isfinite(p.lower) or np.isfinite(p.upper)
-        )
+def _multipliers(region: Region, active: Active, u: Array) -> tuple[Array, tuple[Array, ...]]:
+    """Of the rows (k,) and of each matrix (n, n): what comes closest to u = Σ multiplier · row."""
+    G, _ = region.tangent(active, u)
+    found = least_norm(G.T, u) if len(G) else np.zeros(0)
+    rows = np.zeros(len(region.least))
+    held = int(active.rows.sum())
+    if held == len(found) and np.min(found, initial=0.0) < 0:  # several bounds pin one value
+        found = optimize.nnls(G.T, u)[0]
+    rows[active.rows], found = found[:held], found[held:]
+    matrices = []
+    for N in active.nulls:
+        i, j, factor = _triangle(N.shape[1])
+        inner = np.zeros((N.shape[1], N.shape[1]))
+        inner[i, j] = inner[j, i] = found[: len(i)] / factor
+        found = found[len(i) :]
+        matrices.append(N @ inner @ N.T)
+    return rows, tuple(matrices)
+
+
+def _names(system: System, chosen: Array) -> tuple[str, ...]:
+    return tuple(system.names[i] for i in np.flatnonzero(chosen))
+
+
+def _eigenvalues(matrix: Matrix, x: Array) -> Array:
+    return np.asarray(np.linalg.eigvalsh(matrix.at(x)))
+
+
+def _triangle(k: int) -> tuple[IntArray, IntArray, Array]:
+    """The upper triangle (i, j) column by column, and √2 off the diagonal."""
+    j, i = np.tril_indices(k)
+    return i, j, np.where(i == j, 1.0, np.sqrt(2.0))
+
+
+# Which constraints contradict each other.
+
+MATTERS = 1e-6  # of the largest multiplier
+
+
+def raise_conflict(system: System) -> NoReturn:
+    """Raise InputError that names the constraints which no x satisfies together.
+
+    Every constraint is relaxed by one t, in the units of `system`, and t made as small as can be.
+    The constraints with a multiplier are a proof of the contradiction (Farkas); the others could
+    be dropped and it would remain.
+    """
+    found = _least_excess(system)
+    largest = max(found.values(), default=0.0)
+    guilty = [f"'{k}'" for k, v in found.items() if v > MATTERS * largest] or [
+        f"'{label}'" for label in found
+    ]
+    raise InputError(
+        f"the constraints contradict each other: no values satisfy {listed(guilty)} together; "
+        "relax or drop one of them"
+    )
+
+
+def _least_excess(system: System) -> dict[str, float]:
+    """Multipliers by label of min t subject to every constraint relaxed by t ≥ 0."""
+    import cvxpy as cp
+
+    z, t = cp.Variable(len(system.names)), cp.Variable(nonneg=True)
+    norms = np.linalg.norm(system.A, axis=1)
+    norms = np.where(norms > 0, norms, 1.0)
+    named: list[tuple[str, Any]] = []
+    for k, label in enumerate(system.equality_labels):
+        named.append((label, cp.abs(system.A[k] / norms[k] @ z - system.b[k] / norms[k]) <= t))
+    for i, name in enumerate(system.names):
+        if np.isfinite(system.lower[i]):
+            named.append((f"the lower bound of {name}", z[i] >= system.lower[i] - t))
+        if np.isfinite(system.upper[i]):
+            named.append((f"the upper bound of {name}", z[i] <= system.upper[i] + t))
+    for m in system.matrices:
+        named.append((m.label, _value(cp, m, z) + t * np.eye(len(m.balance)) >> 0))
+    _solve(cp.Problem(cp.Minimize(t), [constraint for _, constraint in named]))
+    return {
+        label: 0.0 if c.dual_value is None else float(np.abs(c.dual_value).max())
+        for label, c in named
+    }
+
+
+# Cone programs.
+
+TOLERANCES = (1e-10, 1e-8, 1e-6)  # the next where the solver gives up
+
+
+def _value(cp: ModuleType, matrix: Matrix, x: Any) -> Any:
+    n = len(matrix.balance)
+    slopes = matrix.slopes.reshape(len(matrix.slopes), n * n).T
+    return matrix.constant + cp.reshape(slopes @ x, (n, n), order="C")
+
+
+def _solve(problem: Any) -> str:
+    """Solve the problem in place; its status."""
+    import cvxpy as cp
+
+    with warnings.catch_warnings():
+        # Inaccurate solutions only say what is active; the point is judged by its KKT residual.
+        warnings.simplefilter("ignore")
+        if problem.is_lp():  # by the simplex method: at a vertex as few multipliers as can be
+            problem.solve(solver="SCIPY", scipy_options={"method": "highs"})
+            return str(problem.status)
+        for tolerance in TOLERANCES:
+            options = {f"tol_{name}": tolerance for name in ("gap_abs", "gap_rel", "feas")}
+            try:
+                problem.solve(solver="CLARABEL", **options)
+            except cp.SolverError:
+                continue
+            return str(problem.status)
+    return "solver_error"
+
+
+def _stopped(status: str) -> ElastocalError:
+    return ElastocalError(
+        f"the cone solver stopped with '{status}'; the problem may be badly scaled: check the "
+        "units of the bounds and of the prior"
     )

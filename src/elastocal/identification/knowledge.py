@@ -44,9 +44,12 @@ class Matrix:
         """M(x) (n, n)."""
         return self.constant + np.tensordot(x, self.slopes, axes=1)
 
-    def balanced(self) -> Matrix:
-        """The same inequality with diagonal entries that change by about 1 per unit of x."""
+    def balanced(self, whole: bool = False) -> Matrix:
+        """The same inequality with diagonal entries that change by about 1 per unit of x; `whole`:
+        and are themselves at most about 1 at x = 0."""
         largest = np.abs(np.diagonal(self.slopes, axis1=1, axis2=2)).max(axis=0, initial=0.0)
+        if whole:
+            largest = np.maximum(largest, np.abs(np.diag(self.constant)))
         d = 1 / np.sqrt(np.where(largest > 0, largest, 1.0))
         both = np.outer(d, d)
         return Matrix(self.label, self.constant * both, self.slopes * both, self.balance * d)
@@ -82,40 +85,6 @@ class System:
             b=self.b - self.A @ centre,
             matrices=matrices,
         )
-
-    def boxed(self, half_width: Array) -> System:
-        """With |x| ≤ half_width (p,) as well; what a step may do inside a trust region."""
-        lower, upper = np.maximum(self.lower, -half_width), np.minimum(self.upper, half_width)
-        return replace(self, lower=lower, upper=upper)
-
-    def with_value(self, index: int, value: float) -> System:
-        """With x[index] = value as a further equality, in place of its bounds."""
-        row = np.zeros(len(self.names))
-        row[index] = 1.0
-        lower, upper = self.lower.copy(), self.upper.copy()
-        lower[index], upper[index] = -np.inf, np.inf
-        return replace(
-            self,
-            lower=lower,
-            upper=upper,
-            A=np.vstack([self.A, row]),
-            b=np.append(self.b, value),
-            equality_labels=(*self.equality_labels, f"{self.names[index]} = {value:.6g}"),
-        )
-
-    def violation(self, x: Array) -> float:
-        """The largest amount by which x breaks a bound, an equality (unit rows) or a matrix."""
-        norms = np.linalg.norm(self.A, axis=1)
-        missed = np.abs(self.A @ x - self.b) / np.where(norms > 0, norms, 1.0)
-        parts = (self.lower - x, x - self.upper, missed, [m.shortfall(x) for m in self.matrices])
-        return float(max(0.0, *(np.max(part, initial=0.0) for part in parts)))
-
-    def distance(self, x: Array) -> float:
-        """A lower bound of the way |Δx| from x to where bounds and matrices hold."""
-        parts = [self.lower - x, x - self.upper]
-        # An eigenvalue of M changes by at most |Δx| √(Σ ‖slopes_i‖²).
-        parts += [np.array([m.shortfall(x) / np.linalg.norm(m.slopes)]) for m in self.matrices]
-        return float(max(0.0, *(np.max(part, initial=0.0) for part in parts)))
 
     def restricted(self, columns: NDArray[np.int64], x: Array) -> System:
         """The constraints on x[columns], all other parameters held at x (p,).

@@ -2,40 +2,22 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
 from dataclasses import dataclass, replace
 from functools import cached_property
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy import linalg, sparse, special
+from scipy import sparse, special
 
-from elastocal.errors import ElastocalError, InputError, option, require
+from elastocal.errors import ElastocalError, InputError, InsufficientDataError, option, require
 from elastocal.identification.constrained import (
     ActiveConstraint,
-    ConstrainedFit,
-    constrained_fit,
-    fit_system,
-    fitted_columns,
+    Minimum,
+    Reduced,
     minimise,
-    own_bounds,
-)
-from elastocal.identification.constrained_solver import (
-    ConstrainedObjective,
-    ResidualLoss,
-    active_at,
-    equality_space,
-    extent,
-    loss_of,
-    tangent_rows,
 )
 from elastocal.identification.covariance import Covariance, t_quantile
-from elastocal.identification.intervals import (
-    LEVEL,
-    Intervals,
-    ProfileInterval,
-    profile_interval,
-)
+from elastocal.identification.intervals import LEVEL, Intervals
 from elastocal.identification.knowledge import (
     Bounds,
     Constraints,
@@ -47,13 +29,301 @@ from elastocal.identification.least_squares import Fit, FitProblem
 from elastocal.identification.linear_solver import least_norm
 from elastocal.identification.options import Options
 from elastocal.identification.residuals import held_out_residual
-from elastocal.identification.solve import Reduction, Solution, residual_sigma
-from elastocal.identification.trimmed import median_scale
+from elastocal.identification.solve import WORTH_A_COLUMN, Reduction, Solution, residual_sigma
 from elastocal.identification.weighted_problem import RFactor
-from elastocal.text import listed
-from elastocal.units import Array, Progress
+from elastocal.model.manipulator import Regression
+from elastocal.text import listed, quoted
+from elastocal.units import Array, IntArray, Progress
 
-# Profile intervals under constraints.
+# Constrained fit of the nonlinear model: Gauss–Newton on the exact B, steps halved.
+
+# Predicted fall of the objective, relative to it, below which the step is the last one.
+TOLERANCE = 1e-12
+LEAST = 1e-12  # in typical sizes of the parameters: a step that moves nothing
+HALVINGS = 40
+
+
+@dataclass(frozen=True)
+class KnowledgeProblem:
+    """|W (y − h(X))|² + |target − P X|² over X[columns] under `system`, the others held.
+
+    P (k, columns) and target (k,) are the prior's rows in units of the noise `sigma` of a whitened
+    row; `system` holds the constraints on the columns.
+    """
+
+    problem: FitProblem
+    P: Array
+    target: Array
+    system: System
+    sigma: float
+
+    @classmethod
+    def of(
+        cls, problem: FitProblem, constraints: Constraints, prior: GaussianPrior | None,
+        sigma: float,
+    ) -> KnowledgeProblem:  # fmt: skip
+        """Raises InputError where a held parameter alone breaks a constraint."""
+        columns, names = problem.columns, problem.model.names
+        P, target = np.zeros((0, len(columns))), np.zeros(0)
+        if prior is not None:
+            P, target = prior.rows(names)
+            held = np.setdiff1d(np.arange(len(problem.x)), columns)
+            target = sigma * (target - P[:, held] @ problem.x[held])
+            P = sigma * P[:, columns]
+        system = constraints.resolve(names).restricted(columns, problem.x)
+        return cls(problem, P, target, system, sigma)
+
+    def moved(self, x: Array, step: Array) -> Array:
+        """x (parameters,) with `step` (columns,) added."""
+        trial = x.astype(float)
+        trial[self.problem.columns] += step
+        return trial
+
+    def limits(self, x: Array) -> System:
+        """The constraints on a step from x."""
+        return self.system.moved(x[self.problem.columns], np.ones(len(self.problem.columns)))
+
+    def linearised(self, x: Array) -> tuple[Regression, Array, Array]:
+        """Regression at x, and J and t with the objective |t − J step|²."""
+        problem, apply = self.problem, self.problem.weights.apply
+        observed, columns = problem.observations, problem.columns
+        at = problem.model.regressor(observed.table, x, columns, observed)
+        lack = self.target - self.P @ x[columns]
+        J = np.vstack([apply(at.B), self.P])
+        return at, J, np.concatenate([apply(at.residual), lack])
+
+    def value(self, x: Array) -> float:
+        """The objective at x; infinite where a pose has no equilibrium."""
+        observed = self.problem.observations
+        misfit = observed.value - self.problem.model.predict(observed.table, x, observed)
+        e, lack = self.problem.weights.apply(misfit), self.target - self.P @ x[self.problem.columns]
+        value = float(e @ e + lack @ lack)
+        return value if np.isfinite(value) else np.inf
+
+
+# What equalities leave of a parameter that they fix, of unit columns.
+PINNED = 1e-12
+
+
+@dataclass(frozen=True)
+class ConstrainedFit:
+    """The minimum x (parameters,), the regression `at` it, and the model linearised there.
+
+    `reduced` is the linear problem of the step δ (columns,) from x, |e − B δ|² + |lack − P δ|² with
+    the whitened B and residual e, and `best` its minimum, δ = 0 to rounding.
+    """
+
+    posed: KnowledgeProblem
+    x: Array
+    at: Regression
+    reduced: Reduced
+    best: Minimum
+    converged: bool
+    reason: str
+    steps: int
+
+    @property
+    def columns(self) -> IntArray:
+        return self.posed.problem.columns
+
+    @property
+    def names(self) -> tuple[str, ...]:
+        return self.posed.system.names
+
+    @property
+    def objective(self) -> float:
+        return float(self.reduced.t @ self.reduced.t)
+
+    @property
+    def e(self) -> Array:
+        """Whitened residual (rows,)."""
+        return self.reduced.t[: len(self.at.residual)]
+
+    @property
+    def lack(self) -> Array:
+        """What the prior's rows (k,) miss."""
+        return self.reduced.t[len(self.at.residual) :]
+
+    @property
+    def B(self) -> Array:
+        """Whitened regressor (rows, columns)."""
+        return self.reduced.J[: len(self.at.residual)]
+
+    @cached_property
+    def face(self) -> Array:
+        """Directions (columns, q), orthonormal by J, in which active constraints let x move."""
+        return self.reduced.unit[:, None] * self.reduced.T @ self.reduced.face(self.best)
+
+    @cached_property
+    def cofactor(self) -> Array:
+        """(NᵀBᵀB N + NᵀPᵀP N)⁻¹ in the directions N that the equalities leave."""
+        return self._pinned(self.reduced.unit[:, None] * self.reduced.T)
+
+    @cached_property
+    def on_face(self) -> Array:
+        """The same with every active constraint taken for an equality."""
+        return self._pinned(self.face)
+
+    @property
+    def covariance(self) -> Array:
+        """Posterior covariance (columns, columns), equalities exact, inequalities left out."""
+        return self.posed.sigma**2 * self.cofactor
+
+    @property
+    def prior_share(self) -> Array:
+        """Share (columns,) of each estimate's information that is the prior's; NaN where fixed."""
+        return share_of_prior(self.cofactor, self.posed.P)
+
+    @property
+    def effective(self) -> float:
+        """How many parameters' worth the readings determine: tr(cofactor BᵀB) on the face."""
+        return self.face.shape[1] - float(((self.posed.P @ self.face) ** 2).sum())
+
+    @property
+    def leverage(self) -> Array:
+        """Diagonal (rows,) of B cofactor Bᵀ on the face, at most 1."""
+        return np.minimum(((self.B @ self.face) ** 2).sum(axis=1), 1.0)
+
+    def _pinned(self, half: Array) -> Array:
+        fixed = np.linalg.norm(half, axis=1) <= PINNED * self.reduced.unit
+        half = np.where(fixed[:, None], 0.0, half)
+        return np.asarray(half @ half.T)
+
+
+def constrained_fit(posed: KnowledgeProblem, max_steps: int = 60) -> ConstrainedFit:
+    """Minimise the objective under its constraints.
+
+    Each step goes to the minimum of the linearised model under the constraints, which are convex
+    and kept as they are; it is halved until the true objective falls too.  Every iterate satisfies
+    the constraints; at the limit no step improves the linearised model, which is the condition of
+    Karush, Kuhn and Tucker of the nonlinear problem.
+
+    Raises InputError as `minimise` does; ElastocalError where the start has poses without
+    equilibrium.
+    """
+    problem = posed.problem
+    size = problem.sizes[problem.columns]
+    nearest = minimise(np.diag(1 / size), np.zeros(len(size)), posed.limits(problem.x)).x
+    x = posed.moved(problem.x, nearest)
+    at, J, t = posed.linearised(x)
+    value, steps, converged = float(t @ t), 0, False
+    while steps < max_steps and not converged:
+        steps += 1
+        found = minimise(J, t, posed.limits(x))
+        length = float(np.max(np.abs(found.x) / size, initial=0.0))
+        converged = value - found.objective <= TOLERANCE * value or length <= LEAST
+        # The last step cannot be judged by a fall that drowns in round-off.
+        enough = value * (1 + TOLERANCE) if converged else value
+        for k in range(1 if converged else HALVINGS):
+            trial = posed.moved(x, found.x / 2**k)
+            if posed.value(trial) <= enough:
+                x = trial
+                at, J, t = posed.linearised(x)
+                value = float(t @ t)
+                break
+        else:
+            converged = True
+    reason = (
+        "no step within the constraints improves the fit" if converged
+        else "the step limit was reached; the start may be far off"
+    )  # fmt: skip
+    reduced = Reduced.of(J, t, posed.limits(x))
+    best = reduced.minimum(posed.system)
+    return ConstrainedFit(posed, x, at, reduced, best, converged, reason, steps)
+
+
+# Which parameters a fit with constraints and a prior has, and its constraints on these alone.
+
+# Share of a column that others must leave over: B is exact to 1e-15, but a base that is tilted by
+# some µrad already tells its turn from that of joint 1.
+TOLD_APART = 1e-6
+
+
+def fitted_columns(
+    solution: Solution, std: Array, constraints: Constraints, prior: GaussianPrior | None
+) -> IntArray:
+    """Indices of the parameters to fit under the constraints and the prior, ascending.
+
+    These are the kept parameters of the solution (and those that bounds held); the free ones that
+    the prior or an equality names, for that is knowledge of themselves; and, of the parameters
+    that are known only together with one of these, as many as can now be told apart from it: with
+    a prior on k, readings of k + d are knowledge of d.  Told apart is what readings, prior and
+    equalities determine better than its typical size, as in the choice of the kept parameters.
+    Bounds and matrices make nothing known: they act on the fitted parameters, with all others
+    held where the fit held them.
+
+    `std` (kept,) is that of the solution's estimates.  Raises InputError for a name that is no
+    parameter, or a prior on a parameter that is held fixed; InsufficientDataError where an
+    equality names a parameter that stays undetermined.
+    """
+    problem, reduction = solution.problem, solution.reduction
+    names, free = problem.model.names, set(problem.free.tolist())
+    constraints.resolve(names)
+    tied = {name for e in constraints.equalities for name, factor in e.terms.items() if factor}
+    priors = set() if prior is None else set(prior.names)
+    if prior is not None:
+        prior.rows(names)
+    fixed = [quoted(n) for n in sorted(priors) if names.index(n) not in free]
+    require(
+        not fixed,
+        f"a prior is stated for {listed(fixed)}, which is held fixed; drop the prior or the fixing",
+    )
+    named = {names.index(n) for n in tied | priors} & free
+    columns = {*reduction.kept.tolist(), *reduction.at_bound.tolist(), *named}
+
+    def told_apart(c: int) -> bool:
+        return _told_apart(solution, [*sorted(columns - {c}), c], constraints, prior)
+
+    new = {names.index(n) for n in tied - priors} & free - set(reduction.kept.tolist())
+    unknown = [quoted(names[c]) for c in sorted(new) if not told_apart(c)]
+    if unknown:
+        raise InsufficientDataError(
+            f"readings, prior and equalities do not determine {listed(unknown)}, which an equality "
+            f"names; hold it ({option('fixed')}) or state a prior for it, or drop the equality"
+        )
+    partners: dict[int, None] = {}
+    for k, c in enumerate(reduction.kept.tolist()):
+        if c in named:
+            partners |= dict.fromkeys(reduction.terms(k, solution.sizes, std[k]))
+    for d in partners:
+        if d not in columns and told_apart(d):
+            columns.add(d)
+    return np.array(sorted(columns), dtype=np.int64)
+
+
+def _told_apart(
+    solution: Solution, columns: list[int], constraints: Constraints, prior: GaussianPrior | None
+) -> bool:
+    """Whether readings, prior and equalities tell the last of the columns from the others."""
+    problem, observed, e = solution.problem, solution.problem.observations, solution.fit.whitened
+    chosen = np.array(columns)
+    size, names = solution.sizes[chosen], problem.model.names
+    at = problem.model.regressor(observed.table, solution.fit.x, chosen, observed)
+    sigma = max(float(np.sqrt(e @ e / len(e))), 1e-12)
+    J = problem.weights.apply(at.B) * size / sigma
+    if prior is not None:
+        J = np.vstack([J, prior.rows(names)[0][:, chosen] * size])
+    A = constraints.resolve(names).A[:, chosen] * size
+    A = A[A.any(axis=1)]
+    # An equality is exact: it counts as much as the most that anything else tells.
+    A *= np.linalg.norm(J, axis=0).max() / np.linalg.norm(A, axis=1)[:, None]
+    J = np.vstack([J, A])
+    lengths = np.linalg.norm(J, axis=0)
+    J = J / np.where(lengths > 0, lengths, 1.0)
+    left = J[:, -1] - J[:, :-1] @ least_norm(J[:, :-1], J[:, -1])
+    off = float(np.linalg.norm(left))
+    return off > TOLD_APART and off * lengths[-1] > WORTH_A_COLUMN
+
+
+def own_bounds(solution: Solution) -> Constraints:
+    """The bounds that the effects of a bounded problem state themselves."""
+    if not solution.problem.bounded:
+        return Constraints()
+    parameters = solution.problem.model.parameters
+    return Constraints(tuple(Bounds(p.name, p.lower, p.upper) for p in parameters))
+
+
+# Intervals of a fit under constraints or with a prior.
 #
 # At a bound the estimate is not normal and the likelihood ratio not χ²: where the truth lies on one
 # bound, it is the mixture ½χ²₀ + ½χ²₁ (Chernoff 1954; Self and Liang 1987), whose 95 % point is
@@ -63,255 +333,10 @@ from elastocal.units import Array, Progress
 # angle α > 90° between the two whitened columns of B: they then hold 97.5 % − 14.65 % (α −
 # 90°)/360°, which is 95 % at 150° and 93.8 % in the limit of 180°, two columns that nearly cancel.
 
-INWARD = 1e-6  # of a standard deviation, from an end that only a linear program knows
-
-
-def profile_linear_interval(
-    objective: ConstrainedObjective, system: System, name: str, sigma: float, level: float = 0.95
-) -> ProfileInterval:
-    """{v: (S(v) − Ŝ)/σ² ≤ χ²₁(level)} for the parameter `name`.
-
-    S(v) is the least objective (squares and prior, whose rows have the standard deviation `sigma`)
-    with the parameter at v and all constraints kept.  The interval ends ("bound") where no x
-    satisfies the constraints any more, so an active parameter has a one-sided interval that starts
-    at its bound.
-
-    Raises InputError as `minimise` does, and for a name that is no parameter.
-    """
-    require(name in system.names, f"{name!r} is not a parameter; choose from {list(system.names)}")
-    i = system.names.index(name)
-    best = minimise(objective, system)
-    free = minimise(objective, _only_equalities(system))
-
-    def least(value: float) -> float:
-        if value == best.x[i]:
-            return best.objective
-        return minimise(objective, system.with_value(i, value)).objective
-
-    std, ends = float(np.sqrt(free.cofactor[i, i])), _extent(objective, system, best.x, i)
-    return _interval(least, float(best.x[i]), std, ends, sigma, level)
-
-
-def profile_fit_interval(
-    problem: FitProblem,
-    found: ConstrainedFit,
-    name: str,
-    constraints: Constraints,
-    sigma: float,
-    *,
-    prior: GaussianPrior | None = None,
-    level: float = 0.95,
-) -> ProfileInterval:
-    """The profile interval of one fitted parameter of the nonlinear model.
-
-    As `profile_linear_interval`, with S(v) the objective of `constrained_fit` (squares), which gave
-    `found` for the same problem, constraints, prior and sigma.
-    """
-    require(name in found.names, f"{name!r} was not fitted; choose from {list(found.names)}")
-    k = found.names.index(name)
-    c = int(found.columns[k])
-    system = fit_system(problem, constraints)
-    weighted = problem.weights.apply(found.B)
-    rows, p = weighted.shape
-    linear = ConstrainedObjective(
-        weighted, np.zeros(rows), np.zeros((0, p)), np.zeros(0), ResidualLoss()
-    )
-    free = minimise(linear, _only_equalities(system.moved(found.x[found.columns], np.ones(p))))
-    known = [found.x]
-
-    def least(value: float) -> float:
-        if value == found.x[c]:
-            return found.objective
-        start = min(known, key=lambda x: abs(x[c] - value)).copy()
-        start[c] = value
-        stated = constraints + Constraints(bounds=(Bounds(name, value, value),))
-        again = constrained_fit(replace(problem, x=start), stated, prior=prior, sigma=sigma)
-        if not again.converged:
-            raise ElastocalError(f"no fit with {name} at {value:g}: {again.reason}")
-        known.append(again.x)
-        return again.objective
-
-    ends = _extent(linear, system, found.x[found.columns], k)
-    return _interval(
-        least, float(found.x[c]), float(np.sqrt(free.cofactor[k, k])), ends, sigma, level
-    )
-
-
-def _interval(
-    least: Callable[[float], float],
-    estimate: float,
-    std: float,
-    ends: tuple[float, float],
-    sigma: float,
-    level: float,
-) -> ProfileInterval:
-    if std == 0 or ends[0] == ends[1]:  # equalities leave a single value
-        return ProfileInterval(estimate, estimate, ("bound", "bound"))
-    return profile_interval(
-        lambda v: least(v) / sigma**2, estimate, std * sigma, np.inf, level, ends[0], ends[1]
-    )
-
-
-def _extent(
-    objective: ConstrainedObjective, system: System, x: Array, index: int
-) -> tuple[float, float]:
-    """How far the constraints let x[index] go from the solution x, kept inside by a hair."""
-    if not (len(system.b) or system.matrices):
-        return float(system.lower[index]), float(system.upper[index])
-    # In standard deviations from the solution; a linear program's tolerances are absolute.
-    unit = 1 / objective.norms
-    low, high = extent(system.moved(x, unit), index)
-    low, high = min(low + INWARD, 0.0), max(high - INWARD, 0.0)
-    return float(x[index] + unit[index] * low), float(x[index] + unit[index] * high)
-
-
-def _only_equalities(system: System) -> System:
-    free = np.full(len(system.names), np.inf)
-    return replace(system, lower=-free, upper=free, matrices=())
-
-
-# A constrained fit linearised at its minimum: covariance, shares of the prior, leverage.
-
-PINNED = 1e-12  # of unit columns: what equalities leave of a parameter that they fix
-
-
-@dataclass(frozen=True)
-class LinearisedFit:
-    """The constrained fit about its minimum x̂ (columns,): Σ ρ + |lack − P δ|² in δ = x − x̂.
-
-    `B` (rows, columns) and `e` (rows,) are the whitened regressor and residual there, `P` (k,
-    columns) and `lack` (k,) the prior in units of the noise `sigma` of a whitened row.
-    """
-
-    names: tuple[str, ...]
-    x: Array
-    B: Array
-    e: Array
-    P: Array
-    lack: Array
-    loss: ResidualLoss
-    sigma: float
-    system: System
-
-    @classmethod
-    def at(
-        cls,
-        problem: FitProblem,
-        found: ConstrainedFit,
-        constraints: Constraints,
-        prior: GaussianPrior | None,
-        loss: ResidualLoss,
-        sigma: float,
-    ) -> LinearisedFit:
-        """About the minimum that `constrained_fit` found."""
-        x, p = found.x[found.columns], len(found.columns)
-        P, target = (np.zeros((0, p)), np.zeros(0)) if prior is None else prior.rows(found.names)
-        return cls(
-            found.names, x, problem.weights.apply(found.B), found.whitened, sigma * P,
-            sigma * (target - P @ x), loss, sigma, fit_system(problem, constraints),
-        )  # fmt: skip
-
-    @cached_property
-    def K(self) -> Array:
-        """(rows, columns) with KᵀK = half the Hessian of the readings' loss."""
-        return self.loss.root(self.B, self.e)
-
-    @cached_property
-    def unit(self) -> Array:
-        """What makes the columns of K and P together unit length."""
-        norms = np.linalg.norm(np.vstack([self.K, self.P]), axis=0)
-        return 1 / np.where(norms > 0, norms, 1.0)
-
-    @cached_property
-    def variance(self) -> float:
-        """κ with cov x̂ = κ (KᵀK)⁻¹ for readings alone.
-
-        σ² for squares; for Huber's loss [Σ|ψ|²/(rows − p)] / mean ψ' (Huber and Ronchetti 2009,
-        section 7.6, H2), which the root of the Hessian turns into a covariance.
-        """
-        if self.loss.quadratic:
-            return self.sigma**2
-        w = self.loss.weights(self.e)
-        psi, near = w * self.e, self.loss.lengths(self.e) <= self.loss.threshold
-        slope = np.where(near, 1.0, w[:: self.loss.size] * (1 - 1 / self.loss.size)).mean()
-        return float(psi @ psi / max(len(psi) - len(self.x), 1) / slope)
-
-    @cached_property
-    def equalities(self) -> Array:
-        """Directions (columns, q) in which the equalities let x move."""
-        space = equality_space(self.system.A * self.unit, np.zeros(len(self.system.b)))
-        return self.unit[:, None] * space.basis
-
-    @cached_property
-    def face(self) -> Array:
-        """Directions (columns, q) in which all active constraints let x move."""
-        inside = self.system.moved(self.x, self.unit)
-        zero = np.zeros(len(self.x))
-        rows, values = tangent_rows(inside, active_at(inside, zero), zero)
-        return self.unit[:, None] * equality_space(rows, values).basis
-
-    @cached_property
-    def cofactor(self) -> Array:
-        """(NᵀKᵀK N + NᵀPᵀP N)⁻¹ in the directions N that the equalities leave."""
-        half = self._half(self.equalities)
-        return half.T @ half
-
-    @cached_property
-    def on_face(self) -> Array:
-        """The same with every active constraint taken for an equality."""
-        return self._half_on_face.T @ self._half_on_face
-
-    def objective(self, B: Array, y: Array, loss: ResidualLoss) -> ConstrainedObjective:
-        """Of x with these rows for the readings, and the prior."""
-        return ConstrainedObjective(B, y, self.P, self.lack + self.P @ self.x, loss)
-
-    @property
-    def covariance(self) -> Array:
-        """Posterior covariance (columns, columns), equalities exact, inequalities left out."""
-        by_prior = (self.P @ self.cofactor).T @ (self.P @ self.cofactor)
-        return self.variance * (self.cofactor - by_prior) + self.sigma**2 * by_prior
-
-    @property
-    def prior_share(self) -> Array:
-        """Share (columns,) of each estimate's information that is the prior's; NaN where fixed."""
-        return share_of_prior(self.cofactor, self.P)
-
-    @property
-    def effective(self) -> float:
-        """How many parameters' worth the readings determine: tr(cofactor KᵀK) on the face."""
-        return self.face.shape[1] - float(((self._half_on_face @ self.P.T) ** 2).sum())
-
-    @property
-    def leverage(self) -> Array:
-        """Diagonal (rows,) of K cofactor Kᵀ on the face, at most 1."""
-        return np.minimum(((self.K @ self._half_on_face.T) ** 2).sum(axis=1), 1.0)
-
-    @cached_property
-    def r_factor(self) -> tuple[Array, Array]:
-        """R (columns, columns), z (columns,): |z − R x|² is the readings' part, but a constant."""
-        p = len(self.x)
-        R = linalg.qr(self.K * self.unit, mode="r")[0][:p]
-        R = np.vstack([R, np.zeros((p - len(R), p))])
-        gradient = self.unit * (self.B.T @ (self.loss.weights(self.e) * self.e))
-        z = least_norm(R.T, gradient)
-        return R / self.unit, z + R @ (self.x / self.unit)
-
-    @cached_property
-    def _half_on_face(self) -> Array:
-        return self._half(self.face)
-
-    def _half(self, basis: Array) -> Array:
-        """H (q, columns) with HᵀH the cofactor within the basis (columns, q)."""
-        rows = np.vstack([self.K, self.P]) @ basis
-        R = linalg.qr(rows, mode="r")[0][: basis.shape[1]]
-        half = linalg.solve_triangular(R, basis.T, trans="T") if R.size else basis.T
-        half[:, np.linalg.norm(half / self.unit, axis=0) <= PINNED] = 0.0
-        return np.asarray(half)
-
-
-# Intervals of a fit under constraints or with a prior.
-
 ONE_SIDED = "one-sided at a bound, and wide rather than narrow near one"
+PRECISION = 1e-7  # of an interval: a step that short is the last
+MOST_STEPS = 40
+ASTRAY = 0.5  # of the rise: how far the nonlinear objective may lie beyond it on the way
 
 
 def degrees_of_freedom(of_readings: Array, share: Array) -> Array:
@@ -327,64 +352,67 @@ def degrees_of_freedom(of_readings: Array, share: Array) -> Array:
 
 
 def intervals_with_knowledge(
-    problem: FitProblem,
-    found: ConstrainedFit,
-    local: LinearisedFit,
-    constraints: Constraints,
-    prior: GaussianPrior | None,
-    of_readings: Array,
-    options: Options,
-    many: set[str] | None = None,
+    found: ConstrainedFit, of_readings: Array, kind: str, many: set[str]
 ) -> Intervals:
     """95 % intervals of the constrained fit's columns, and their covariance.
 
     auto: t intervals of the posterior covariance, cut off at bounds, where no inequality is
-    active; else the profile of the linearised model under the constraints.  profile: that of the
-    nonlinear one.
+    active; else the profile {v: S(v) − Ŝ ≤ t² σ²} of the linearised model under the constraints,
+    S(v) the least objective with the parameter at v.  profile: that of the nonlinear one.
 
     The covariance takes equalities for exact and leaves inequalities out: knowing more than it
     says, no estimate is farther off.  `of_readings` (columns,) are the method's degrees of freedom.
     Parameters that are `many`, those of smooth functions, have t intervals in any case.
     """
-    kind, dof = options.intervals, degrees_of_freedom(of_readings, local.prior_share)
-    matrix, inside = local.covariance, not any(a.kind != "equality" for a in found.active)
+    posed, matrix = found.posed, found.covariance
+    dof = degrees_of_freedom(of_readings, found.prior_share)
+    inside = not any(a.kind != "equality" for a in found.best.active)
+    plain = Covariance("t", matrix, dof, "").interval(found.x[found.columns], LEVEL)
     if kind == "auto" and inside:
-        name, text = _posterior(prior, local)
-        covariance = Covariance(name, matrix, dof, text)
-        ci95 = covariance.interval(local.x, LEVEL)
-        lower, upper = local.system.lower[:, None], local.system.upper[:, None]
-        return Intervals(covariance, np.clip(ci95, lower, upper))
-    ends = []
-    plain = Covariance("t", matrix, dof, "").interval(local.x, LEVEL)
-    # The prior is as wide as the noise is taken for, so that their ratio stays.
-    linear = local.objective(*local.r_factor, ResidualLoss())
-    for k, (name, wide) in enumerate(zip(local.names, _inflation(local, dof), strict=True)):
-        if name in (many or ()):
-            ends.append((float(plain[k, 0]), float(plain[k, 1])))
-            continue
-        sigma = local.sigma * wide
-        if kind == "profile":
-            wider = None if prior is None else replace(prior, covariance=prior.covariance * wide**2)
-            one = profile_fit_interval(problem, found, name, constraints, sigma, prior=wider)
-        else:
-            one = profile_linear_interval(linear, local.system, name, sigma)
-        ends.append((one.lower, one.upper))
+        name, text = ("t under constraints", "equalities taken for exact, bounds cut off")
+        if len(posed.P):
+            name, text = ("posterior", "readings and prior together, the prior taken at its word")
+        lower, upper = posed.system.lower[:, None], posed.system.upper[:, None]
+        covariance = Covariance(name, matrix, dof, f"{text}; assumes normal noise")
+        return Intervals(covariance, np.clip(plain, lower, upper))
+    ends = plain
+    # Prior and noise are widened alike, by t for the normal quantile, so that their ratio stays.
+    rises = (posed.sigma * t_quantile(LEVEL, np.maximum(dof, 1.0))) ** 2
+    for k, name in enumerate(found.names):
+        for end, side in enumerate((-1, 1)) if name not in many else ():
+            step = found.reduced.farthest(k, found.best, float(rises[k]), side)
+            x = posed.moved(found.x, step)
+            if kind == "profile":
+                x = profile_end(found, k, float(rises[k]), side)
+            ends[k, end] = x[found.columns[k]]
     model = "nonlinear" if kind == "profile" else "linearised"
     text = f"profile of the {model} fit under the constraints, {ONE_SIDED}; assumes normal noise"
-    return Intervals(Covariance("constrained profile", matrix, dof, text), np.array(ends))
+    return Intervals(Covariance("constrained profile", matrix, dof, text), ends)
 
 
-def _posterior(prior: GaussianPrior | None, local: LinearisedFit) -> tuple[str, str]:
-    noise = "normal noise" if local.loss.quadratic else "independent readings, as Huber's estimate"
-    if prior is None:
-        return "t under constraints", f"equalities taken for exact, bounds cut off; assumes {noise}"
-    return "posterior", f"readings and prior together, the prior taken at its word; assumes {noise}"
+def profile_end(found: ConstrainedFit, index: int, rise: float, side: int) -> Array:
+    """Parameters where the fitted one no. `index` is least (side −1) or largest (1) of all with
+    the nonlinear objective at most `rise` above its minimum: an end of the profile interval.
 
+    Each step goes to that end of the model linearised where the last one ended, and is halved
+    until the objective there is near what is allowed.  An end may also be where poses have no
+    equilibrium any more.
 
-def _inflation(local: LinearisedFit, dof: Array) -> Array:
-    """Factors (p,) on σ that turn the normal quantile of a known noise into t of `dof`."""
-    t = t_quantile(LEVEL, np.maximum(dof, 1.0))
-    return t / special.ndtri((1 + LEVEL) / 2) * np.sqrt(local.variance) / local.sigma
+    Raises ElastocalError where the steps do not settle.
+    """
+    posed, limit, x = found.posed, found.objective + rise, found.x
+    for _ in range(MOST_STEPS):
+        _, J, t = posed.linearised(x)
+        reduced = Reduced.of(J, t, posed.limits(x))
+        best = reduced.minimum()
+        step = reduced.farthest(index, best, max(limit - best.objective, 0.0), side)
+        while not posed.value(posed.moved(x, step)) <= limit + ASTRAY * rise:
+            step = step / 2
+        x = posed.moved(x, step)
+        if np.linalg.norm(J @ step) <= PRECISION * np.sqrt(rise):
+            return x
+    name = found.names[index]
+    raise ElastocalError(f"the profile interval of {name} has no end: its steps did not settle")
 
 
 # The fit of a method, its knowledge added: one more step on the weights that the method ends with.
@@ -443,12 +471,12 @@ def fit_with_knowledge(
     solution: Solution, before: Intervals, options: Options, progress: Progress,
     own: FunctionPrior | None = None,
 ) -> KnowledgeFit:  # fmt: skip
-    """Minimise Σ ρ(W (y − h(X))) + σ² (X − m)ᵀ C⁻¹ (X − m) under `options.constraints`.
+    """Minimise |W (y − h(X))|² + σ² (X − m)ᵀ C⁻¹ (X − m) under `options.constraints`.
 
     W and the readings are those of the method's `solution`, σ the noise of a whitened row under
-    it, ρ squares or, for the method huber, Huber's loss.  `fitted_columns` says what is fitted,
-    `intervals_with_knowledge` what the intervals are; t intervals have the degrees of freedom of
-    `before`, the method's own.  `own` is the prior of smooth functions, which joins the stated one.
+    it.  `fitted_columns` says what is fitted, `intervals_with_knowledge` what the intervals are; t
+    intervals have the degrees of freedom of `before`, the method's own.  `own` is the prior of
+    smooth functions, which joins the stated one.
 
     Raises InputError for constraints that contradict each other or held values, names that are no
     parameters, and tables too large to hold B; InsufficientDataError where an equality names a
@@ -462,72 +490,59 @@ def fit_with_knowledge(
         )
     constraints = (options.constraints or Constraints()) + own_bounds(solution)
     prior = joined(options.prior, None if own is None else own.prior)
-    name = "huber" if options.resolved == "huber" else "squares"
-    size = problem.observations.size if name == "huber" else 1
-    sigma = _noise(solution, name, size) if own is None else own.sigma
+    fit = solution.fit
+    sigma = residual_sigma(fit, len(fit.columns)) if own is None else own.sigma
     columns = fitted_columns(solution, before.covariance.std, constraints, prior)
-    posed = replace(problem, bounded=False).fit_of(columns, solution.fit.x, solution.sizes)
+    # Of the effects' own bounds, where asked for, the constraints speak.
+    stated = replace(problem, bounded=False).fit_of(columns, fit.x, solution.sizes)
+    posed = KnowledgeProblem.of(stated, constraints, prior, sigma)
     progress("fitting under constraints" if prior is None else "fitting with the prior")
-    found = constrained_fit(posed, constraints, prior=prior, loss=name, sigma=sigma)  # type: ignore[arg-type]
-    loss: ResidualLoss = loss_of(name, size, sigma)  # type: ignore[arg-type]
-    local = LinearisedFit.at(posed, found, constraints, prior, loss, sigma)
+    found = constrained_fit(posed)
     progress("intervals under constraints" if prior is None else "intervals with the prior")
     dof = _dof(solution, before, columns) if own is None else np.full(len(columns), own.dof)
-    intervals = intervals_with_knowledge(
-        posed, found, local, constraints, prior, dof, options,
-        set() if own is None else set(own.prior.names),
-    )  # fmt: skip
+    many = set() if own is None else set(own.prior.names)
+    intervals = intervals_with_knowledge(found, dof, options.intervals, many)
     # Of smooth functions' parameters, which are many, nobody asks.
     shares = {} if prior is None else {
-        name: share for c, name, share in zip(columns, found.names, local.prior_share, strict=True)
+        name: share for c, name, share in zip(columns, found.names, found.prior_share, strict=True)
         if not problem.model.shrunk[c]
     }  # fmt: skip
     known = replace(
         solution,
-        fit=_as_fit(posed, found, local),
-        reduction=_reduction(solution, found, local),
-        heldout=_held_out(solution, found, local),
+        fit=_as_fit(found),
+        reduction=_reduction(solution, found),
+        heldout=_held_out(solution, found),
     )
     return KnowledgeFit(
-        known, intervals, found.active,
+        known, intervals, found.best.active,
         {n: float(s) for n, s in shares.items() if np.isfinite(s)},
-        round(local.effective), local.leverage,
-        _contradiction(solution, before, found, local, own),
+        round(found.effective), found.leverage,
+        _contradiction(solution, before, found, own),
     )  # fmt: skip
 
 
-def _noise(solution: Solution, loss: str, size: int) -> float:
-    """σ of a whitened row: of the residual, or for Huber's loss of its median length."""
-    fit = solution.fit
-    if loss == "squares":
-        return residual_sigma(fit, len(fit.columns))
-    lengths = np.linalg.norm(fit.whitened.reshape(-1, size), axis=1)
-    return max(median_scale(lengths, size), 1e-12)
-
-
 def _contradiction(
-    solution: Solution, before: Intervals, found: ConstrainedFit, local: LinearisedFit,
-    own: FunctionPrior | None,
-) -> tuple[str, ...]:  # fmt: skip
-    """A sentence where the objective grew by more than noise explains (F-test), for squares.
+    solution: Solution, before: Intervals, found: ConstrainedFit, own: FunctionPrior | None
+) -> tuple[str, ...]:
+    """A sentence where the objective grew by more than noise explains (F-test).
 
     Rows of the prior and active constraints count as degrees of freedom, less the parameters they
     made estimable.  At active bounds the true distribution is smaller (χ̄²): the test is cautious.
     """
-    rows = len(local.P) - (0 if own is None else len(own.prior.names))
-    stated = rows + len(found.active) - (len(found.columns) - len(solution.fit.columns))
-    if stated < 1 or not local.loss.quadratic:
+    rows = len(found.posed.P) - (0 if own is None else len(own.prior.names))
+    stated = rows + len(found.best.active) - (len(found.columns) - len(solution.fit.columns))
+    if stated < 1:
         return ()
     grown = found.objective - float(solution.fit.whitened @ solution.fit.whitened)
     dof = max(float(before.covariance.dof.min()), 1.0)
     if own is not None:
         grown, dof = grown - own.stands, own.dof
-    F = max(grown, 0.0) / (stated * local.sigma**2)
+    F = max(grown, 0.0) / (stated * found.posed.sigma**2)
     known = np.isinf(dof)
     p = float(special.chdtrc(stated, F * stated) if known else special.fdtrc(stated, dof, F))
     if p > CONTRADICTED:
         return ()
-    what = [f"'{a.label}'" for a in found.active]
+    what = [f"'{a.label}'" for a in found.best.active]
     what += ["the prior"] if rows else []
     return (
         f"The readings contradict {listed(what, 6)}: without, they are fitted better than noise "
@@ -543,22 +558,23 @@ def _dof(solution: Solution, before: Intervals, columns: NDArray[np.int64]) -> A
     return np.array([known.get(c, fewest) for c in columns.tolist()])
 
 
-def _as_fit(problem: FitProblem, found: ConstrainedFit, local: LinearisedFit) -> Fit:
+def _as_fit(found: ConstrainedFit) -> Fit:
     """As the fit of a method; its R factor has prior and equalities as further rows.
 
     Without them a parameter that no reading shows would leave it singular; equalities weigh as
     much as the readings of a parameter do.
     """
-    A = local.system.A * local.unit
-    rows = np.vstack([local.B, local.P, A / np.linalg.norm(A, axis=1)[:, None] / local.unit])
-    rest = np.concatenate([local.e, local.lack, np.zeros(len(A))])
+    unit = found.reduced.unit
+    A = found.reduced.system.A * unit
+    rows = np.vstack([found.B, found.posed.P, A / np.linalg.norm(A, axis=1)[:, None] / unit])
+    rest = np.concatenate([found.e, found.lack, np.zeros(len(A))])
     return Fit(
-        found.x, found.residual, found.whitened, RFactor.of(rows, rest), found.converged,
-        found.reason, found.steps, replace(problem, x=found.x),
+        found.x, found.at.residual, found.e, RFactor.of(rows, rest), found.converged,
+        found.reason, found.steps, replace(found.posed.problem, x=found.x),
     )  # fmt: skip
 
 
-def _reduction(solution: Solution, found: ConstrainedFit, local: LinearisedFit) -> Reduction:
+def _reduction(solution: Solution, found: ConstrainedFit) -> Reduction:
     """What is fitted, what is held, and how a held parameter's error would move the estimates.
 
     A parameter that an active constraint holds back does not move: it stands for itself.
@@ -567,35 +583,34 @@ def _reduction(solution: Solution, found: ConstrainedFit, local: LinearisedFit) 
     observed, columns = problem.observations, found.columns
     dropped = np.setdiff1d(before.dropped, columns)
     at = problem.model.regressor(observed.table, found.x, dropped, observed)
-    K = local.loss.root(problem.weights.apply(at.B), local.e)
-    mixing = local.on_face @ (local.K.T @ K)
+    mixing = found.on_face @ (found.B.T @ problem.weights.apply(at.B))
     share = np.abs(mixing) * solution.sizes[dropped] / solution.sizes[columns][:, None]
     mixing[share < ROUNDING] = 0.0
     return Reduction(columns, dropped, mixing, np.setdiff1d(before.invisible, columns))
 
 
-def _held_out(solution: Solution, found: ConstrainedFit, local: LinearisedFit) -> Array:
+def _held_out(solution: Solution, found: ConstrainedFit) -> Array:
     """Residual (rows,) of each configuration under a fit to the others and the prior.
 
-    Linearised, with the active constraints kept active and Huber's weights as they are.
+    Linearised, with the active constraints kept active.
     """
-    if not local.face.shape[1]:
-        return found.residual
+    if not found.face.shape[1]:
+        return found.at.residual
     observed, weights = solution.problem.observations, solution.problem.weights
     # The prior's rows go with no configuration, so that they are never left out.
-    more = -len(local.P) % observed.size
-    P = np.vstack([local.P, np.zeros((more, len(local.x)))])
+    more = -len(found.posed.P) % observed.size
+    P = np.vstack([found.posed.P, np.zeros((more, len(found.columns)))])
     left_out = observed.configuration if weights.together is None else weights.together
     own = left_out.max() + 1 + np.arange(len(P) // observed.size)
-    whiten = sparse.diags_array(np.sqrt(local.loss.weights(local.e)))
-    if weights.whole is not None:
-        whiten = whiten @ weights.whole
+    whiten = weights.whole
+    if whiten is None:
+        whiten = sparse.eye_array(len(found.at.residual))
     both = sparse.block_diag([whiten, sparse.eye_array(len(P))], format="csr")
     held = held_out_residual(
-        np.vstack([found.B, P]) @ local.face,
-        np.concatenate([found.residual, local.lack, np.zeros(more)]),
+        np.vstack([found.at.B, P]) @ found.face,
+        np.concatenate([found.at.residual, found.lack, np.zeros(more)]),
         replace(weights, whiten=sparse.csr_array(both), low=None, common=None, together=None),
         np.concatenate([left_out, own]),
         observed.size,
     )
-    return held[: len(found.residual)]
+    return held[: len(found.at.residual)]

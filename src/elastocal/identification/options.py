@@ -98,16 +98,15 @@ class Options:
             self._check_knowledge()
 
     def _check_knowledge(self) -> None:
-        if self.resolved in ROBUST and self.resolved != "huber":
+        if self.resolved in ROBUST:
             raise InputError(
-                f"the method {self.resolved} takes neither constraints nor a prior; use huber, or "
-                "the default method, which sets faulty readings apart"
+                f"the method {self.resolved} takes neither constraints nor a prior; use the "
+                "default method, which sets faulty readings apart"
             )
-        valid = ("auto",) if self.resolved == "huber" else WITH_KNOWLEDGE
-        if self.intervals not in valid:
+        if self.intervals not in WITH_KNOWLEDGE:
             raise InputError(
                 f"{option('intervals', self.intervals)} knows of neither constraints nor a prior; "
-                f"with these and this method there are {', '.join(valid)}"
+                f"with these there are {', '.join(WITH_KNOWLEDGE)}"
             )
 
     @property
