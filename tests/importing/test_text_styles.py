@@ -6,7 +6,7 @@ from support.tracker_exports import imported
 
 from elastocal.errors import InputError
 from elastocal.importing.foreign_text import Text, krl_rows, rapid_rows, read_lines
-from elastocal.units import split_unit
+from elastocal.units import convert, split_unit
 
 ROWS = [(10.0, 20.5, -30.25, 1234.5, 0.125, -7.0), (11.0, 21.5, -31.25, -2234.5, 1.125, -8.0)]
 NAMED = """
@@ -143,3 +143,20 @@ def test_files_that_are_no_text(tmp_path, data, message):
 )
 def test_units_in_headers(header, expected):
     assert split_unit(header) == expected
+
+
+@pytest.mark.parametrize(
+    ("values", "units"),
+    [
+        ([1.0, 360.0, 400.0, 2 * np.pi, 2000 * np.pi], ["rev", "deg", "gon", "rad", "mrad"]),
+        ([1.0, 2.54, 25.4, 0.0254, 25400.0], ["in", "cm", "mm", "m", "um"]),
+        ([1.0, 60.0, 3.6e3, 3.6e6, 3.6e9, 3.6e12], ["h", "min", "s", "ms", "us", "ns"]),
+        ([20.0, 293.15, 68.0], ["C", "K", "F"]),
+        ([2.5, 2500.0], ["kN", "N"]),
+        ([2.0, 2000.0, 2e6], ["kNm", "Nm", "Nmm"]),
+    ],
+)
+def test_the_same_in_every_unit(values, units):
+    for value, unit in zip(values, units, strict=True):
+        found = convert(np.array([value]), unit, units[0])
+        np.testing.assert_allclose(found, values[0], rtol=1e-14)

@@ -40,6 +40,19 @@ def placement(seed: int) -> np.ndarray:
     return T
 
 
+@pytest.mark.parametrize("tilt", [0.0, 0.4, 1.2, np.pi / 2, 2.5])
+def test_tilted_solids_reach_as_far_as_rim_cap_and_corner(tilt):
+    c, s = abs(np.cos(tilt)), abs(np.sin(tilt))
+    tilted = np.eye(4)
+    tilted[:3, :3] = Rotation.from_euler("x", tilt).as_matrix()
+    for shape, size, reach in (
+        ("sphere", [0.3], 0.3), ("capsule", [0.1, 0.8], 0.4 * c + 0.1),
+        ("cylinder", [0.1, 0.8], 0.4 * c + 0.1 * s), ("box", [0.4, 0.2, 0.6], 0.3 * c + 0.1 * s),
+    ):  # fmt: skip
+        solid = Solid(shape, shape, np.array(size), tilted)
+        assert support(solid, np.array([0.0, 0.0, 1.0])) == pytest.approx(reach)
+
+
 def test_a_mesh_is_its_convex_hull(tmp_path):
     (tmp_path / "cube.obj").write_text(CUBE)
     mesh = Solid("cube", "mesh", np.array([1.0, 2.0, 0.5]), placement(4), tmp_path / "cube.obj")
