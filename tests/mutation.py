@@ -109,26 +109,34 @@ def attempt(k, items):
 """
 
 
-def mutated(node: ast.AST) -> tuple[str, ast.AST] | None:
-    """The kind of mutant that an expression makes, and what it becomes; None without one."""
-    new: Any = copy.deepcopy(node)
+def kind_of(node: ast.AST) -> str | None:
+    """The kind of mutant that an expression makes; None without one."""
     if isinstance(node, ast.Compare) and len(node.ops) == 1 and type(node.ops[0]) in TURNED:
-        new.ops = [TURNED[type(node.ops[0])]()]
-        return "comparison", new
+        return "comparison"
     if isinstance(node, ast.BinOp) and type(node.op) in TURNED:
         joined = ast.List | ast.Tuple | ast.JoinedStr
-        if isinstance(node.left, joined) or isinstance(node.right, joined):
-            return None
-        new.op = TURNED[type(node.op)]()
-        return "sign", new
+        return None if isinstance(node.left, joined) or isinstance(node.right, joined) else "sign"
     if isinstance(node, ast.UnaryOp) and isinstance(node.op, ast.USub):
-        return "sign", new.operand
-    if isinstance(node, ast.Constant) and type(node.value) in (int, float):
-        if repr(node.value) == "0.0":
-            return None
-        new.value = node.value + 1 if type(node.value) is int else 1.1 * node.value
-        return ("whole number" if type(node.value) is int else "decimal number"), new
+        return "sign"
+    if isinstance(node, ast.Constant) and type(node.value) is int:
+        return "whole number"
+    if isinstance(node, ast.Constant) and type(node.value) is float and node.value:
+        return "decimal number"
     return None
+
+
+def mutated(node: ast.AST) -> ast.AST:
+    """What an expression becomes."""
+    new: Any = copy.deepcopy(node)
+    if isinstance(node, ast.Compare):
+        new.ops = [TURNED[type(node.ops[0])]()]
+    elif isinstance(node, ast.BinOp):
+        new.op = TURNED[type(node.op)]()
+    elif isinstance(node, ast.UnaryOp):
+        new = new.operand
+    elif isinstance(node, ast.Constant):
+        new.value = new.value + 1 if type(new.value) is int else 1.1 * new.value
+    return new
 
 
 def sites(tree: ast.AST) -> Iterator[ast.expr]:
@@ -143,7 +151,7 @@ def sites(tree: ast.AST) -> Iterator[ast.expr]:
         for node in inner:
             if isinstance(node, ast.Subscript) and ast.unparse(node.value) == "Literal":
                 continue
-            if isinstance(node, ast.expr) and mutated(node):
+            if isinstance(node, ast.expr) and kind_of(node):
                 yield node
             if not (isinstance(node, ast.UnaryOp) and isinstance(node.operand, ast.Constant)):
                 yield from sites(node)
@@ -156,7 +164,7 @@ def candidates(root: Path, seed: int) -> dict[str, list[dict[str, Any]]]:
         text = path.read_text(encoding="utf-8")
         lines, many = text.splitlines(), defaultdict(int)
         for place, node in enumerate(sites(ast.parse(text))):
-            kind, new = mutated(node)  # type: ignore[misc]
+            kind = str(kind_of(node))
             file = str(path.relative_to(root / "src"))
             line = lines[node.lineno - 1].strip()
             name = [file, line, kind, ast.unparse(node)]
@@ -166,7 +174,7 @@ def candidates(root: Path, seed: int) -> dict[str, list[dict[str, Any]]]:
             package = "/".join(Path(file).parts[:2]) if len(Path(file).parts) > 2 else "elastocal"
             found[package].append(
                 {"name": name, "rank": rank, "number": node.lineno, "place": place,
-                 "becomes": ast.unparse(new)}
+                 "node": node}
             )  # fmt: skip
     return {p: sorted(all_, key=lambda m: m["rank"]) for p, all_ in found.items()}
 
@@ -201,6 +209,8 @@ def drawn(root: Path, seed: int, count: int, again: list[dict[str, Any]]) -> lis
                 break
             left.remove(pick)
             kept.append(pick | {"instead": gone[turn]["name"][:2] if turn < len(gone) else None})
+        for m in kept:
+            m["becomes"] = ast.unparse(mutated(m.pop("node")))
         chosen += [m | {"package": package} for m in kept]
     return sorted(chosen, key=lambda m: (m["name"][0], m["number"], m["place"]))
 
@@ -212,14 +222,13 @@ class Asleep(ast.NodeTransformer):
         self.numbers = numbers
 
     def visit(self, node: ast.AST) -> Any:
-        k, found = self.numbers.get(id(node)), None
-        if k is not None:
-            found = mutated(node)
+        k = self.numbers.get(id(node))
+        wrong = None if k is None else mutated(node)
         plain = self.generic_visit(node)
-        if found is None:
+        if wrong is None:
             return plain
         switch = ast.parse(f"__import__('elastocal_mutants').on({k})", mode="eval").body
-        return ast.IfExp(switch, found[1], plain)
+        return ast.IfExp(switch, wrong, plain)
 
 
 def set_in(root: Path, mutants: list[dict[str, Any]]) -> None:
@@ -242,6 +251,8 @@ def set_in(root: Path, mutants: list[dict[str, Any]]) -> None:
         trees[path] = Asleep({id(n): k for k, n in nodes.items()}).visit(trees[path])
         changed.add(path)
     for path, tree in trees.items():
+        if not any(name in path.read_text() for name in used):
+            continue
         for function in [n for n in ast.walk(tree) if isinstance(n, ast.FunctionDef)]:
             names = {n.id for s in function.body for n in ast.walk(s) if isinstance(n, ast.Name)}
             names |= {n.attr for s in function.body for n in ast.walk(s)
