@@ -1,4 +1,4 @@
-"""What the diagnosis says of a real arm: how the error falls, and which joint contributes how much."""
+"""What the diagnosis says of a real arm: how the error falls, and the share of each joint."""
 
 from __future__ import annotations
 
@@ -37,10 +37,11 @@ def figure(colours: Colours) -> Figure:
     ends = np.array([[float(v) for v in row[head.index("90 %")].split(" to ")] for row in named])
     right.barh(at, shares, 0.6, color=colours.three)
     right.hlines(at, ends[:, 0], ends[:, 1], color=colours.text, linewidth=1.6)
+    effect, place = head.index("effects"), head.index("place")
     where = [
-        f"{NAMES[row[head.index('effects')].split(',')[0]]}, {row[head.index('place')].replace('joint', 'joint ')}"
+        f"{NAMES[row[effect].split(',')[0]]}, {row[place].replace('joint', 'joint ')}"
         for row in named
-    ]  # fmt: skip
+    ]
     right.set_yticks(at, where)
     right.set_ylim(len(named) - 0.5, -0.5)
     right.set_xlim(left=0)

@@ -1,10 +1,10 @@
-"""What each name is worth on whole arms, and what `diagnose` says where an effect is withheld from it.
+"""What each name is worth on whole arms, and what `diagnose` says where an effect is withheld.
 
     python experiment_design/blind_diagnosis/whole_without.py --seed S --worlds N
 
-For each arm: the error at new poses of the diagnosed cell; how much it grows when one name of those
-stated above 0.9 is taken out of that cell and the rest is fitted again (a name *pays* where the error
-grows by 1 %); and the diagnosis with `--without` the kind that does most on that arm: its verdict,
+For each arm: the error at new poses of the diagnosed cell; how much it grows when one name of
+those stated above 0.9 is taken out of that cell and the rest is fitted again (a name *pays* where
+the error grows by 1 %); and the diagnosis with `--without` the kind that does most on that arm: its verdict,
 names that are wrong, what it says is left, its error over that with the kind in.
 """
 
@@ -39,8 +39,9 @@ def main() -> None:
     parser.add_argument("--worlds", type=int, default=10)
     parser.add_argument("--poses", type=int, default=60)
     asked = parser.parse_args()
-    print("| arm | error, mm | names pay | do not | withheld | verdict | left, µm | error over that "
-          "with it in | wrong names |\n" + "|---" * 9 + "|", flush=True)  # fmt: skip
+    head = ("arm", "error, mm", "names pay", "do not", "withheld", "verdict", "left, µm",
+            "error over that with it in", "wrong names")  # fmt: skip
+    print(f"| {' | '.join(head)} |\n{'|---' * len(head)}|", flush=True)
     paid, stated, growth = 0, 0, []
     for k in range(asked.worlds):
         recipe = WholeRecipe(f"whole-{asked.poses}-{k:03d}", (asked.seed, 9, k), asked.poses)
@@ -54,9 +55,12 @@ def main() -> None:
             growth.append(over)
             wrong = [n["name"] for n in found["names"] if not n["right"]]
             left = answer["gap"]["unexplained_um"]
-            print(f"| {k} | {error:.4f} | {len(gains) - len(idle)} of {len(gains)} | {', '.join(idle)} "
-                  f"| {family} | {answer['verdict']} | {left or 0:.0f} | {over:.2f} "
-                  f"| {', '.join(wrong)} of {len(found['names'])} |", flush=True)  # fmt: skip
+            cells = (
+                k, f"{error:.4f}", f"{len(gains) - len(idle)} of {len(gains)}", ", ".join(idle),
+                family, answer["verdict"], f"{left or 0:.0f}", f"{over:.2f}",
+                f"{', '.join(wrong)} of {len(found['names'])}",
+            )  # fmt: skip
+            print(f"| {' | '.join(map(str, cells))} |", flush=True)
     print(f"\nNames above {SURE} that pay: {paid} of {stated}; withheld, error over that with it in: "
           f"median {np.nanmedian(growth):.2f}, largest {np.nanmax(growth):.2f}.")  # fmt: skip
 
