@@ -4,8 +4,8 @@
 
 For each arm: the error at new poses of the diagnosed cell; how much it grows when one name of
 those stated above 0.9 is taken out of that cell and the rest is fitted again (a name *pays* where
-the error grows by 1 %); and the diagnosis with `--without` the kind that does most on that arm: its verdict,
-names that are wrong, what it says is left, its error over that with the kind in.
+the error grows by 1 %); and the diagnosis with `--without` the kind that does most on that arm:
+its verdict, names that are wrong, what it says is left, its error over that with the kind in.
 """
 
 from __future__ import annotations
@@ -61,7 +61,7 @@ def main() -> None:
                 f"{', '.join(wrong)} of {len(found['names'])}",
             )  # fmt: skip
             print(f"| {' | '.join(map(str, cells))} |", flush=True)
-    print(f"\nNames above {SURE} that pay: {paid} of {stated}; withheld, error over that with it in: "
+    print(f"\nNames above {SURE} that pay: {paid} of {stated}; withheld, error over that with it: "
           f"median {np.nanmedian(growth):.2f}, largest {np.nanmax(growth):.2f}.")  # fmt: skip
 
 
