@@ -159,10 +159,12 @@ def _side(excess: Objective, estimate: float, step: float, bound: float) -> tupl
         if outside == estimate:
             return estimate, "bound"
         value = excess(outside)
+        if abs(value) <= PRECISION:  # rounding alone decides its sign
+            return outside, "crossing"
         if value > 0:
             break
-        if at_bound or value == 0:
-            return outside, "bound" if value < 0 else "crossing"
+        if at_bound:
+            return outside, "bound"
         inside = outside
     else:
         return float(np.copysign(np.inf, step)), "unbounded"

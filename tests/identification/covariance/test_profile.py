@@ -209,3 +209,19 @@ def test_a_profile_needs_a_fitted_parameter_without_ties():
     tied = replace(problem, tie=np.ones(4))
     with pytest.raises(InputError, match="ties"):
         profile_of(tied, found, problem.columns[0])
+
+
+
+def test_rounding_at_the_end_of_the_t_interval_is_no_crossing_of_its_own():
+    """The refits of a linear problem end at t exactly, on this side of it or on that."""
+    sign = 1.0
+
+    def objective(value):
+        nonlocal sign
+        sign = -sign
+        return parabola(value) + 1e-10 * sign
+
+    found = profile_interval(objective, 1.0, 1.0, 10)
+    t = stats.t.ppf(0.975, 10)
+    assert [found.lower, found.upper] == pytest.approx([1 - t, 1 + t], abs=1e-5)
+    assert found.ends == ("crossing", "crossing")
