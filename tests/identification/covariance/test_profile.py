@@ -217,9 +217,9 @@ def test_rounding_at_the_end_of_the_t_interval_is_no_crossing_of_its_own():
     seen = set()
 
     def objective(value):
-        again = value in seen
+        rounding = 1e-9 if value in seen else -1e-9
         seen.add(value)
-        return parabola(value) + (1e-10 if again else -1e-10)
+        return parabola(value) + (rounding if value != 1.0 else 0.0)
 
     found = profile_interval(objective, 1.0, 1.0, 10)
     t = stats.t.ppf(0.975, 10)
