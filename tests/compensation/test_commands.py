@@ -254,3 +254,14 @@ def test_random_poses_of_the_demo_arm_are_reached_without_joints_given():
     assert found.reached.sum() >= len(q) - 1
     miss, turn = tool_errors(arm, found)
     assert miss[found.reached].max() < FARTHEST and turn[found.reached].max() < FARTHEST
+
+
+def test_too_soft_an_arm_has_no_equilibrium():
+    nominal = Nominal(joint_compliance=(1e-3,) * 6)
+    cell = kr270_cell(("joint_compliance",), nominal=nominal)
+    arm = calibrated(kr270_chain(), cell)
+    found = compensate(
+        arm, targets_at("t", None, None, "base", DOWN, q=POSTURES[:2]), tool_point(cell, "M1")
+    )
+    assert set(found.status) == {"no equilibrium"}
+    assert np.isnan(found.after).all()

@@ -186,3 +186,20 @@ def test_the_offset_at_which_most_points_meet_a_standing_arm_is_told(by, tmp_pat
     join = f'[join]\nby = "{by}"\noffset_s = {told[1]}\n'
     found = imported(tmp_path, files, TIMED + join)
     assert q1(found) == [10.0 * k for k in range(8)]
+
+
+def test_one_name_for_two_poses_is_refused(tmp_path):
+    files = {"points.csv": points("1_M1"), "joints.csv": joints((1, 10, 1), (1, 20, 2))}
+    with pytest.raises(InputError, match=r"joints.csv, line 3: pose 1 has other joint values.*2"):
+        imported(tmp_path, files, mapping())
+
+
+def test_by_time_says_where_the_arm_moved(tmp_path):
+    files = {
+        "points.csv": table("t,x,y,z", (1, 1, 2, 3), (5, 4, 5, 6)),
+        "joints.csv": table(
+            "t,a,b", (0, 0, 0), (1, 0, 0), (2, 0, 0), (4, 8, 0), (5, 9, 0), (6, 10, 0)
+        ),
+    }
+    found = imported(tmp_path, files, TIMED)
+    assert any("moved while 1 points were measured: line 3" in w for w in found.warnings)

@@ -160,3 +160,13 @@ def test_the_same_in_every_unit(values, units):
     for value, unit in zip(values, units, strict=True):
         found = convert(np.array([value]), unit, units[0])
         np.testing.assert_allclose(found, values[0], rtol=1e-14)
+
+
+def test_thousands_separators_that_nobody_told_of_are_refused(tmp_path):
+    with pytest.raises(InputError, match=r"a.csv, line 2, column X \[mm\].*'1.234,5'"):
+        imported(tmp_path, {"a.csv": text_of(";", ",", thousands=".")}, NAMED)
+
+
+def test_krl_expressions_are_no_values():
+    with pytest.raises(InputError, match=r"f, line 1: A2 is 'B-1', not a number"):
+        krl_rows(lines("XP1={A1 1,A2 B-1,A3 2}"))

@@ -115,3 +115,17 @@ def test_a_column_of_payloads_is_a_load_and_one_that_is_not_read_is_told(tmp_pat
     )
     done = run(tmp_path / "log.csv", "--map", tmp_path / "map.toml", "-o", tmp_path / "data.csv")
     assert done.exit_code == 0 and "column payload_kg of" in done.output
+
+
+def test_a_marker_that_lacks_a_column_is_named(tmp_path):
+    (tmp_path / "log.csv").write_text("q1_deg,M1_x_mm,M1_y_mm,M1_z_mm,M2_x_mm\n1,2,3,4,5\n")
+    done = run(tmp_path / "log.csv", "--preset", "wide", "-o", tmp_path / "data.csv")
+    assert done.exit_code == 2 and "'M2' has no column for y_auto, z_auto" in done.output
+    assert not (tmp_path / "data.csv").exists()
+
+
+def test_a_star_where_no_marker_stands_is_refused(tmp_path):
+    (tmp_path / "log.csv").write_text("q1_deg,M1_x\n1,2\n")
+    (tmp_path / "map.toml").write_text('[[source]]\n[source.columns]\nname = "*_name"\n')
+    done = run(tmp_path / "log.csv", "--map", tmp_path / "map.toml", "--preview")
+    assert done.exit_code == 2 and "* stands for the markers of a row" in done.output

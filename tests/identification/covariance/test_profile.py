@@ -211,7 +211,6 @@ def test_a_profile_needs_a_fitted_parameter_without_ties():
         profile_of(tied, found, problem.columns[0])
 
 
-
 def test_rounding_at_the_end_of_the_t_interval_is_no_crossing_of_its_own():
     """The refits of a linear problem end at t exactly, on this side of it or on that."""
     seen = set()
