@@ -248,3 +248,8 @@ def test_several_sources_add_up(tmp_path: Path) -> None:
     np.testing.assert_allclose(found.weight, [0.5, *[0.1] * 5])
     for part in ("1 of [[design.test_pose]]", "3 of path.csv", "2 in [design.test_box]"):
         assert part in found.source
+
+
+def test_a_path_too_long_is_refused(tmp_path: Path) -> None:
+    with pytest.raises(InputError, match="10001 poses; a path takes at most 10000"):
+        poses_of(path_cell(tmp_path, JOINTS + "\n" + f"{GOOD}\n" * 10_001))

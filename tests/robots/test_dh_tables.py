@@ -137,3 +137,10 @@ LIMITS = "lower_rad,upper_rad"
 def test_units_that_cannot_be_meant_are_told(header, rows, code, told, tmp_path):
     found, out, err = told_by_init(write(tmp_path, header, rows))
     assert found == code and told in out + err, out + err
+
+
+def test_what_is_doubtful_is_a_warning_of_identify_too(tmp_path):
+    assert told_by_init(write(tmp_path, HEADER, RADIANS))[0] == 0
+    model = ec.Model(str(tmp_path / "cell.toml"))
+    data = ec.simulate(model, np.random.default_rng(0).uniform(-1, 1, (20, 6)))
+    assert any("degrees apart" in warning for warning in ec.identify(model, data).warnings)

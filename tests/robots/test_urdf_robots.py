@@ -148,3 +148,10 @@ def test_a_cell_that_leaves_the_flange_open_is_told_what_init_takes(tmp_path):
     (tmp_path / "cell.toml").write_text('[robot]\nurdf = "arm.urdf"\n')
     with pytest.raises(ec.ElastocalError, match=r"camera, tool0; .* \(init takes 'tool0'\)"):
         ec.Model(str(tmp_path / "cell.toml"))
+
+
+def test_a_last_joint_that_looks_like_a_jaw_is_told(tmp_path):
+    text = urdf(slide("grip", "link_6", "tool0"))
+    flange, out = flange_of(tmp_path, text)
+    assert flange == "tool0"
+    assert "last joint 'grip' looks like a jaw of a gripper" in out

@@ -197,3 +197,21 @@ def test_tails_have_the_stated_standard_deviation_and_many_far_readings():
     assert found[1] > 10 * max(found[0], 1e-4)
     with pytest.raises(InputError, match=r"noise\.tails is 2\.0: .* take a number > 2"):
         Unsteadiness(tails=2.0)
+
+
+def test_a_load_on_top_of_the_plans_own_forces_is_refused():
+    plan = table_at(np.zeros((2, 3)), [[0, 0, -50.0]])
+    with pytest.raises(InputError, match=r"table\.csv: the plan has forces of its own"):
+        expand_plan(plan, ("M1",), load=np.array([0.0, 0.0, -100.0]))
+
+
+def test_an_unknown_marker_is_refused():
+    model = model_with(effects=("marker_position",), markers={"A": np.zeros(3), "B": np.ones(3)})
+    with pytest.raises(InputError, match=r"marker 'C' is not one of the cell's markers: A, B"):
+        simulate(model, plan_of(model, 3, markers=("A", "C")), model.nominal, 0)
+
+
+def test_as_many_numbers_as_joints_are_needed():
+    model = model_with(noise=Unsteadiness(np.full(7, 1e-5)))
+    with pytest.raises(InputError, match=r"noise\.joints_urad has 7 numbers"):
+        simulate(model, plan_of(model), model.nominal, 0)

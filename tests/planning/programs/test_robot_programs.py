@@ -137,3 +137,13 @@ def test_a_program_read_back_is_the_plan_to_a_millionth_of_a_radian(chain, write
         assert wrong != text
         with pytest.raises(ElastocalError, match="do not run it"):
             check_program(wrong, steps)
+
+
+def test_speeds_out_of_range(chain):
+    with pytest.raises(InputError, match="1 to 100 %"):
+        krl_program(execution_of(chain), chain, NAMES, percent=0)
+    with pytest.raises(InputError, match="at least"):
+        urscript_program(execution_of(chain), chain, NAMES, speed=0.0)
+    for wrong in ({"speed": 4.0}, {"acceleration": 11.0}, {"speed": np.nan}):
+        with pytest.raises(InputError, match="at most"):
+            urscript_program(execution_of(chain), chain, NAMES, **wrong)
