@@ -111,7 +111,6 @@ def bare() -> Case:
 def no_figures(monkeypatch: pytest.MonkeyPatch) -> None:
     """Pages without figures, for what does not depend on them: drawing takes its time."""
     names = ("errors", "held_out", "by_configuration", "against_joints", "histogram", "scores",
-             "groups", "histograms", "waterfall", "matrix", "space", "over_time",
-             "by_region", "spread", "sureness")  # fmt: skip
+             "waterfall", "space", "over_time", "spread", "sureness")  # fmt: skip
     drawn = dict.fromkeys(names, "<svg></svg>")
     monkeypatch.setattr(report_pages, "drawn_for", lambda *_: drawn)

@@ -145,7 +145,7 @@ def test_kinds_of_figures(case, plan):
 
 def test_every_figure_of_the_page_is_there_in_its_own_colours(case):
     found = figures_of(case.result)
-    assert {"waterfall", "spread", "sureness", "by_region", "matrix", "histogram"} <= set(found)
+    assert {"waterfall", "spread", "sureness", "histogram"} <= set(found)
     figure = case.result.plot("spread")
     assert figure._repr_png_().startswith(b"\x89PNG")
     assert figure.axes[0].xaxis.label.get_color() == INK != "black"

@@ -62,7 +62,6 @@ from elastocal.report.identification_view import (
 from elastocal.report.notebook import view_of
 from elastocal.report.plan_view import plan_contents
 from elastocal.report.residual_figures import (
-    MOST_IN_MATRIX,
     MOST_JOINT_DOTS,
     drawn_for,
     residual_figures,
@@ -250,7 +249,7 @@ def _calibration(
         **identification_contents(result, summary, budget, truth, published),
         **_residuals(result.observations, residuals, space),
         "n_markers": len(residuals.markers),
-        **_thinning(result, residuals),
+        **_thinning(residuals),
     }
 
 
@@ -327,15 +326,13 @@ def _residuals(observed: Observations, residuals: Residuals, space: Space) -> di
     }
 
 
-def _thinning(result: Calibration, residuals: Residuals) -> dict[str, str]:
+def _thinning(residuals: Residuals) -> dict[str, str]:
     """Sentences on how many readings the scatter plots show, empty where it is all."""
-    total, shown, n = len(residuals.value), len(residuals.shown), len(result.determined)
+    total, shown = len(residuals.value), len(residuals.shown)
     in_joints = min(shown, MOST_JOINT_DOTS // residuals.positions)
     text = " Dots are a random choice of {} of {} readings; everything else uses all of them."
-    most = f" The {MOST_IN_MATRIX} of {n} that correlate most."
     return {
         "thinned": text.format(shown, total) if shown < total else "",
-        "thinned_matrix": most if n > MOST_IN_MATRIX else "",
         "thinned_joints": text.format(in_joints, total) if in_joints < total else "",
     }
 

@@ -3,23 +3,20 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING
 
 import numpy as np
-from scipy import special
 
 from elastocal.errors import ElastocalError
 from elastocal.identification.error_budget import ErrorBudget
-from elastocal.identification.estimates import CORRELATED
 from elastocal.identification.prediction import over_the_workspace
 from elastocal.identification.residuals import GroupSummary, ResidualSummary
 from elastocal.identification.result import Calibration
-from elastocal.identification.scrutiny import Autocorrelation
 from elastocal.identification.smooth_part import SmoothPart
 from elastocal.model.manipulator import Model
 from elastocal.model.observations import Observations
 from elastocal.model.rigid import nominal_flanges
-from elastocal.report.arm_view import Space, marker_positions, space_picture
+from elastocal.report.arm_view import Space, space_picture
 from elastocal.report.figures import (
     FAINT,
     INK,
@@ -37,7 +34,6 @@ from elastocal.text import printable
 from elastocal.units import Array, IntArray
 
 if TYPE_CHECKING:
-    from matplotlib.artist import Artist
     from matplotlib.axes import Axes
     from matplotlib.figure import Figure
 
@@ -205,10 +201,6 @@ def _remark(axes: Axes, text: str) -> None:
     axes.text(0.01, 0.97, text, transform=axes.transAxes, va="top", fontsize=8)
 
 
-ACROSS = 6  # small histograms beside each other
-MOST_PANELS = 18  # small histograms, of the most conspicuous groups
-
-
 def histogram(summary: ResidualSummary) -> str:
     """Standardised residuals beside what the noise model expects in each bin."""
 
@@ -219,6 +211,13 @@ def histogram(summary: ResidualSummary) -> str:
         axes.legend(loc="upper right", fontsize=8)
 
     return drawn(draw, WIDTH / 2, 2.9, "Histogram of standardised residuals beside the expected")
+
+
+def _histogram_bars(axes: Axes, group: GroupSummary, edges: np.ndarray, label: str) -> None:
+    axes.stairs(group.counts, edges, fill=True, color=SERIES[0], alpha=0.5, label="observed")
+    axes.stairs(group.expected, edges, color=INK, linewidth=1.1, baseline=None, label="expected")
+    beyond = f"{group.beyond} beyond this axis" if group.beyond else ""
+    axes.set_xlabel("; ".join(text for text in (label, beyond) if text))
 
 
 def scores(summary: ResidualSummary) -> str:
@@ -244,88 +243,9 @@ def scores(summary: ResidualSummary) -> str:
     return drawn(draw, WIDTH / 2, 2.9, "Normal scores of the residuals with a 95 % band")
 
 
-def scatter_by_group(summary: ResidualSummary) -> str:
-    """Observed over expected standard deviation of every listed group, with its chance band."""
-    shown = [g for g in summary.groupings if g.groups]
-
-    def draw(figure: Figure) -> None:
-        if not shown:
-            figure.text(0.5, 0.5, "no groups of at least 8 values", ha="center")
-            return
-        widths = [max(len(g.groups), 2) for g in shown]
-        panels = figure.subplots(1, len(shown), sharey=True, squeeze=False, width_ratios=widths)[0]
-        for axes, grouping in zip(panels, shown, strict=True):
-            _scatter_panel(axes, grouping.groups)
-            left_out = grouping.n_groups - len(grouping.groups)
-            title = grouping.by + (f" ({left_out} more)" if left_out else "")
-            axes.set_title(title)
-        panels[0].set_ylabel("observed / expected scatter")
-        largest = max(group.mean_square for g in shown for group in g.groups)
-        panels[0].set_ylim(0, 1.12 * max(np.sqrt(largest), 1.6))
-        handles: dict[str, Artist] = {}
-        for axes in panels:
-            for handle, label in zip(*axes.get_legend_handles_labels(), strict=True):
-                handles.setdefault(label, handle)
-        figure.legend(list(handles.values()), list(handles), loc="outside lower right", ncols=3)
-
-    return drawn(draw, WIDTH, 3.4, "Scatter of each group of readings over the expected one")
-
-
-def _scatter_panel(axes: Axes, groups: tuple[GroupSummary, ...]) -> None:
-    x = np.arange(len(groups))
-    f = np.array([g.dof for g in groups])
-    low, high = (np.sqrt(special.chdtri(f, 1 - q) / f) for q in (0.025, 0.975))
-    axes.axhline(1, color=INK, linewidth=0.8)
-    axes.bar(x, high - low, 0.7, low, color=FAINT, alpha=0.3, label="chance alone, 95 % of each")
-    value = np.sqrt([g.mean_square for g in groups])
-    deviates = np.array([g.deviates for g in groups])
-    for chosen, mark, colour, size, name in (
-        (~deviates, "o", SERIES[0], 4.5, "as the noise model says"),
-        (deviates, "D", SERIES[1], 5.5, "unlike the noise model"),
-    ):
-        if chosen.any():
-            axes.plot(x[chosen], value[chosen], mark, color=colour, markersize=size, label=name)
-    axes.set_xlim(-0.6, max(len(groups), 2) - 0.4)
-    names = [short_name(g.name, 16) for g in groups]
-    turn = 90 if max(map(len, names)) > 2 else 0
-    axes.set_xticks(x.tolist(), names, rotation=turn)
-    axes.grid(axis="x", visible=False)
-
-
-def histograms_by_group(summary: ResidualSummary) -> str:
-    """A small histogram of each of the most conspicuous groups, beside the expected one."""
-    every = [(g, group) for g in summary.groupings for group in g.groups]
-    least = sorted(group.p for _, group in every)[:MOST_PANELS]
-    panels = [
-        (f"{g.by} {short_name(group.name)}", group, g.edges)
-        for g, group in every
-        if group.p <= least[-1]
-    ][:MOST_PANELS]
-    rows = max(-(-len(panels) // ACROSS), 1)
-
-    def draw(figure: Figure) -> None:
-        grid = panels_of(figure, len(panels), ACROSS)
-        for axes, (title, group, edges) in zip(grid, panels, strict=True):
-            _histogram_bars(axes, group, edges, "")
-            axes.set_title(title, fontsize=7.5)
-            axes.xaxis.label.set_fontsize(7)
-            axes.tick_params(labelsize=7)
-
-    return drawn(draw, WIDTH, 0.2 + 1.45 * rows, "Histograms of standardised residuals by group")
-
-
-def _histogram_bars(axes: Axes, group: GroupSummary, edges: np.ndarray, label: str) -> None:
-    axes.stairs(group.counts, edges, fill=True, color=SERIES[0], alpha=0.5, label="observed")
-    axes.stairs(group.expected, edges, color=INK, linewidth=1.1, baseline=None, label="expected")
-    beyond = f"{group.beyond} beyond this axis" if group.beyond else ""
-    axes.set_xlabel("; ".join(text for text in (label, beyond) if text))
-
-
 CELLS = 6  # of the work space's longest side
 FEWEST = 3  # readings from which on a cell is told
 FEWEST_ON_MAP = 30  # poses
-MOST_IN_MATRIX = 48  # of the correlation matrix
-MOST_WRITTEN = 16  # parameters up to which the numbers are written into it
 
 
 def over_time(observed: Observations, residuals: Residuals) -> str:
@@ -346,45 +266,6 @@ def over_time(observed: Observations, residuals: Residuals) -> str:
         figure.legend(loc="outside upper right", ncols=residuals.positions)
 
     return drawn(draw, WIDTH, 2.6, "Residuals over time")
-
-
-def in_time(course: Autocorrelation) -> str:
-    """Correlation of the residuals of visits, over how far they are apart."""
-
-    def draw(figure: Figure) -> None:
-        axes = figure.subplots()
-        lags = np.arange(1, len(course.correlations) + 1)
-        axes.axhline(0, color=FAINT, linewidth=0.8)
-        for side in (-1, 1):
-            axes.axhline(side * course.band, color=FAINT, linewidth=0.8, linestyle="--")
-        axes.vlines(lags, 0, course.correlations, color=SERIES[0], linewidth=2)
-        axes.plot(lags, course.correlations, "o", color=SERIES[0], markersize=4)
-        axes.set_xticks(lags)
-        axes.set_xlabel("visits apart")
-        axes.set_ylabel("correlation")
-
-    return drawn(draw, WIDTH, 2.2, "Correlation of residuals from visit to visit")
-
-
-def by_region(position: Array, residual: Array) -> str:
-    """3-D rms residual (µm) of the readings in each part of the work space, from two sides.
-
-    `position` (N, 3) m where the markers were, `residual` (N, 3) or (N, 1) in µm.
-    """
-    squared = (residual**2).sum(axis=1)
-    views = ((0, 1, "from above"), (0, 2, "from the side"))
-    # Of readings far from zero a side has to be more than rounding.
-    side = max(float(np.ptp(position, axis=0).max()) / CELLS, 1e-3, 1e-9 * np.abs(position).max())
-
-    def draw(figure: Figure) -> None:
-        panels = figure.subplots(1, 2)
-        for axes, (a, b, title) in zip(panels, views, strict=True):
-            _map(axes, position[:, [a, b]], squared, side)
-            axes.set_title(title)
-            axes.set_xlabel(f"{'xyz'[a]} in m")
-            axes.set_ylabel(f"{'xyz'[b]} in m")
-
-    return drawn(draw, WIDTH, 3.9, "Rms residual by region of the work space")
 
 
 def uncertainty_map(result: Calibration) -> str:
@@ -445,61 +326,6 @@ def _map(axes: Axes, at: Array, squared: Array, side: float) -> None:
     axes.set_aspect("equal")
 
 
-def correlation_matrix(result: Calibration) -> str:
-    """Correlations of the parameters that the data determine; empty where there are fewer than two.
-
-    Size by the shade, sign by hatching or number, so that no colour has to be told apart.
-    """
-    names, r = correlations(result)
-    n = len(names)
-    if n < 2:
-        return ""
-    size = min(WIDTH, 2.2 + 0.32 * n)
-
-    def draw(figure: Figure) -> None:
-        from matplotlib.patches import Rectangle
-
-        axes = figure.subplots()
-        for i in range(n):
-            for j in range(i):
-                value = float(r[i, j])
-                look: dict[str, Any] = {"hatch": "//////", "edgecolor": FAINT} if value < 0 else {}
-                axes.add_patch(Rectangle((j - 0.5, i - 0.5), 1, 1, linewidth=0,
-                                         facecolor=SERIES[0] if value > 0 else SERIES[1],
-                                         alpha=0.8 * abs(value), **look))  # fmt: skip
-                if n <= MOST_WRITTEN:
-                    text = f"{value:+.2f}".replace("-", "−")
-                    axes.text(j, i, text, ha="center", va="center", fontsize=7)
-                elif abs(value) > CORRELATED:
-                    axes.text(j, i, "+" if value > 0 else "−", ha="center", va="center", fontsize=8)
-        shown = [short_name(name, MOST_LABELS) for name in names]
-        axes.set_yticks(range(1, n), shown[1:], fontsize=8 if n < 30 else 6.5)
-        axes.set_xticks(range(n - 1), shown[:-1], rotation=90, fontsize=8 if n < 30 else 6.5)
-        axes.set_xlim(-0.5, n - 1.5)
-        axes.set_ylim(n - 0.5, 0.5)
-        axes.grid(False)
-        axes.set_aspect("equal")
-
-    return drawn(draw, size, 0.92 * size, "Correlations between the parameters")
-
-
-def correlations(result: Calibration) -> tuple[list[str], Array]:
-    """Names and correlations (n, n) of the determined parameters with a finite variance; of many,
-    those that correlate most."""
-    variance = np.diag(result.covariance)
-    shrunk = {n for n, s in zip(result.model.names, result.model.shrunk, strict=True) if s}
-    told = np.array([name not in shrunk for name in result.determined], dtype=bool)
-    good = np.flatnonzero(np.isfinite(variance) & (variance > 0) & told)
-    sd = np.sqrt(variance[good])
-    r = result.covariance[np.ix_(good, good)] / np.outer(sd, sd)
-    names = [result.determined[k] for k in good]
-    if len(names) > MOST_IN_MATRIX:
-        strongest = np.abs(r - np.eye(len(r))).max(axis=1)
-        kept = np.sort(np.argsort(-strongest, kind="stable")[:MOST_IN_MATRIX])
-        names, r = [names[k] for k in kept], r[np.ix_(kept, kept)]
-    return names, np.clip(r, -1.0, 1.0)
-
-
 def smooth_figure(result: Calibration) -> str:
     """Every function with its 95 % band, without what offsets and lengths can stand for."""
     found = [
@@ -544,11 +370,9 @@ def residual_figures(
     model: Model, observed: Observations, x: Array, residuals: Residuals, space: Space, title: str
 ) -> dict[str, str]:
     """Where, when and in which poses an arm at parameter values x (parameters,) errs, as SVG."""
-    positions = marker_positions(model, observed, x)
     return {
         "against_joints": against_joints(model.chain.kinds, residuals),
         "over_time": over_time(observed, residuals),
-        "by_region": by_region(positions, residuals.value[:, : residuals.positions]),
         "space": space_picture(space, title),
     }
 
@@ -569,12 +393,10 @@ def drawn_for(
         "errors": errors(result),
         "held_out": held_out(result, residuals),
         "by_configuration": by_configuration(residuals),
-        "matrix": correlation_matrix(result),
         "waterfall": "",
         "smooth": smooth_figure(result),
         "sureness": uncertainty_map(result),
         "spread": before_after(spread) if spread else "",
-        "in_time": "" if result.autocorrelation is None else in_time(result.autocorrelation),
     }  # fmt: skip
     if budget is not None:
         steps = budget_steps(result, budget)
@@ -582,6 +404,4 @@ def drawn_for(
     if summary is not None:
         found["histogram"] = histogram(summary)
         found["scores"] = scores(summary)
-        found["groups"] = scatter_by_group(summary)
-        found["histograms"] = histograms_by_group(summary)
     return found
