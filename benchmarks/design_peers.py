@@ -25,10 +25,10 @@ from peer_kr270 import Arm, evolved, prepared
 from peer_tools import ONE_THREAD, Row, Seconds, peer, required, seconds_of, starts, table, timed
 
 from elastocal.planning.criteria import DeterminantCriterion
-from elastocal.planning.exact_plan import exact_plan, round_weights
+from elastocal.planning.criterion import Objective
+from elastocal.planning.exchange import exact_plan, exchange, rounded
 from elastocal.planning.polish import polish
-from elastocal.planning.relaxation import relax
-from elastocal.planning.selection import DesignProblem, exchange
+from elastocal.planning.relaxation import DesignProblem, balanced, relax
 
 SEED = 1
 POOL, POSES = 1000, 30  # of the UR10
@@ -37,7 +37,6 @@ FASTER = 20
 STARTS = (1, 10)
 GENERATIONS = 60  # of differential evolution: more than 10 times the time of our first start
 POLISHED = 3  # plans, from different seeds
-SWEEPS = 50  # at most; a sweep that gains less than 1e-4 is the last
 RANDOM = 200
 
 
@@ -67,23 +66,22 @@ def beside_figaroh(python: Path, folder: Path) -> None:
 
     def problem(most: int) -> DesignProblem:
         blocks, prior = (R / columns)[None], np.zeros((1, p, p))
-        criterion = DeterminantCriterion(np.arange(p))
+        criterion = Objective((DeterminantCriterion(np.eye(p)),))
         group = np.zeros(POOL, dtype=np.int64)
-        return DesignProblem(blocks, prior, group, np.array([POSES]), criterion, most)
+        whole = DesignProblem(blocks, prior, group, np.array([POSES]), criterion, most)
+        return balanced(whole)[0]
 
     print(f"\n## UR10: {POOL} poses, {p} parameters, regressor of FIGAROH")
     # FIGAROH's weights of sum 1 have no upper limit; nor has a pose measured up to POSES times.
-    ours, took = timed(partial(relax, problem(POSES), method="first-order"))
-    conic, conic_took = timed(partial(relax, problem(POSES), method="conic"))
+    ours, took = timed(partial(relax, problem(POSES), 1e-6))
     socp = seconds_of(theirs, "socp")
-    top = log_det_of(max(ours.bound, conic.bound)) - p * np.log(POSES)
+    top = log_det_of(ours.bound) - p * np.log(POSES)
     found = log_det(ours.weights / POSES)
     table(
         "relaxed weights of sum 1", "log det M", 6, "below the certified bound",
         [
             Row(f"FIGAROH: SOCP by cvxopt, {theirs['status']}", log_det(theirs["weights"]), socp),
-            Row("elastocal: conic (clarabel)", log_det(conic.weights / POSES), conic_took),
-            Row("elastocal: first-order", found, took),
+            Row("elastocal: Newton with columns", found, took),
         ],
         lambda value: f"{top - value:.1e}",
     )  # fmt: skip
@@ -104,9 +102,9 @@ def beside_figaroh(python: Path, folder: Path) -> None:
         Row("FIGAROH: DetMax", float(theirs["detmax"]), seconds_of(theirs, "detmax")),
     ]
     for number in STARTS:
-        work = partial(exact_plan, once, relaxed_weights=relaxed.weights, starts=number, seed=SEED)
-        plan, took = timed(work)
-        value = log_det(np.bincount(plan.chosen, minlength=POOL))
+        work = partial(exact_plan, once, relaxed, starts=number, seed=SEED)
+        (plan, _), took = timed(work)
+        value = log_det(np.bincount(plan, minlength=POOL))
         rows.append(Row(f"elastocal, {starts(number)}", value, relaxing + took))
     table(
         f"{POSES} poses", "log det M", 3, "D-efficiency at least", rows,
@@ -148,21 +146,21 @@ def beside_exchange(python: Path | None, folder: Path) -> None:
 def _ours(arm: Arm, pooling: Seconds) -> tuple[list[Row], float]:
     """Plans of increasing effort, each with all the time that it took, and the bound in µm."""
     problem, q = arm.problem, arm.pool.q
+    problem, T = balanced(problem)
     relaxed, relaxing = timed(partial(relax, problem))
-    w, before = relaxed.weights, pooling + relaxing
-    once, took = timed(lambda: exchange(problem, round_weights(problem, w)))
-    rows = [Row("elastocal, one exchange", arm.rho(q[once.chosen]), before + took)]
+    before = pooling + relaxing
+    (once, _), took = timed(lambda: exchange(problem, rounded(problem, relaxed.weights)))
+    rows = [Row("elastocal, one exchange", arm.rho(q[once]), before + took)]
     for number in STARTS:
-        work = partial(exact_plan, problem, relaxed_weights=w, starts=number, seed=SEED)
-        plan, took = timed(work)
-        rows.append(Row(f"elastocal, {starts(number)}", arm.rho(q[plan.chosen]), before + took))
+        (plan, _), took = timed(partial(exact_plan, problem, relaxed, starts=number, seed=SEED))
+        rows.append(Row(f"elastocal, {starts(number)}", arm.rho(q[plan]), before + took))
     value, total = np.inf, before
     for k in range(POLISHED):
-        work = partial(exact_plan, problem, relaxed_weights=w, starts=k + 1, seed=SEED + k)
-        plan, took = timed(work)
-        load, chosen = arm.pool.load, plan.chosen
-        off, last = timed(partial(polish, problem, arm.searches, q, load, chosen, sweeps=SWEEPS))
-        value, total = min(value, arm.rho(off.q)), total + took + last
+        rng = np.random.default_rng(SEED + k) if k else None
+        plan, took = timed(partial(rounded, problem, relaxed.weights, rng))
+        poses = q[plan], arm.pool.load[plan], arm.pool.group[plan]
+        (off, _), last = timed(partial(polish, problem, arm.searches, T, *poses))
+        value, total = min(value, arm.rho(off)), total + took + last
         name = "elastocal, 1 start, polished" if k == 0 else f"elastocal, best of {k + 1} polished"
         rows.append(Row(name, value, total))
     return rows, float(1e6 * np.sqrt(relaxed.bound))

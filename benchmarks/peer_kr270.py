@@ -8,6 +8,7 @@ from importlib.resources import files
 from pathlib import Path
 
 import numpy as np
+from elastocal.planning.relaxation import DesignProblem
 from numpy.typing import NDArray
 from scipy.optimize import differential_evolution
 
@@ -15,11 +16,10 @@ from elastocal.cell.work_cell import read_cell
 from elastocal.model.effects.catalogue import CATALOGUE
 from elastocal.model.manipulator import Model
 from elastocal.planning.candidates import draw, joint_space
-from elastocal.planning.criteria import TraceCriterion
+from elastocal.planning.criterion import TraceCriterion
 from elastocal.planning.feasibility import Feasibility
 from elastocal.planning.information import load_states
 from elastocal.planning.polish import Searches
-from elastocal.planning.selection import DesignProblem
 from elastocal.planning.setup import FeasiblePool, Known, Setup, set_up
 from elastocal.planning.test_poses import test_poses
 
@@ -71,8 +71,9 @@ class Arm:
     @property
     def C(self) -> Array:
         """C (p, p) of ρ₀² = tr(C M⁻¹)."""
-        assert isinstance(self.setup.criterion, TraceCriterion)
-        return self.setup.criterion.C[0]
+        (criterion,) = self.setup.criterion.each
+        assert isinstance(criterion, TraceCriterion)
+        return criterion.C
 
     def rho(self, q: Array) -> float:
         """ρ₀ in µm of the plan q (n_poses, 6)."""

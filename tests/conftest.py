@@ -5,6 +5,7 @@ from __future__ import annotations
 import gc
 from collections.abc import Iterator
 from dataclasses import replace
+from importlib import import_module
 from typing import Any
 
 import pytest
@@ -24,17 +25,19 @@ def short_search(request: pytest.FixtureRequest) -> Iterator[None]:
     """One lot of new points and no second for the bound on the continuum, which in pools as small
     as those of tests is searched again and again; few steps in search of an order.
 
-    The plan of `--effort quick` is not touched by either, its order may be.
+    One start of the search instead of several.
     """
     if WHOLE & {*request.path.parts} or getattr(request.module, "WHOLE_SEARCH", False):
         yield
         return
-    from elastocal.planning import design, execution
-
+    names = ("execution", "polish", "search")
+    execution, polish, search = (import_module(f"elastocal.planning.{name}") for name in names)
     with pytest.MonkeyPatch.context() as patch:
-        quick = replace(design.EFFORTS["quick"], points=1, ascents=1)
-        patch.setitem(design.EFFORTS, "quick", quick)
-        patch.setattr(design, "REFINED", 0)
+        quick = replace(search.EFFORTS["quick"], starts=1)
+        patch.setitem(search.EFFORTS, "quick", quick)
+        patch.setattr(search, "REFINED", 0)
+        patch.setattr(polish, "POINTS", 1)
+        patch.setattr(polish, "STARTS", 1)
         patch.setattr(execution, "STEPS", 1000)
         patch.setattr(execution, "FEW", 1000)
         yield

@@ -347,7 +347,7 @@ def test_every_flag_of_a_verb_is_a_keyword_of_it(verb):
     [
         ("identify", Options, {"faulty": "outliers"}),
         ("design", DesignOptions, {"done": "augment", "notes": "knowledge", "pins": "keep"}),
-        ("design", DesignSpec, {}),
+        ("design", DesignSpec, {"taught": "candidates"}),
         ("diagnose", DiagnosisOptions, {}),
     ],
 )

@@ -19,13 +19,12 @@ from elastocal.cell.plan_wishes import DesignSpec, TargetPose
 from elastocal.cell.work_cell import Cell
 from elastocal.model.manipulator import Model
 from elastocal.planning.candidates import draw
-from elastocal.planning.elsewhere import share_within
-from elastocal.planning.exact_plan import exact_plan, random_information
+from elastocal.planning.exchange import exact_plan, random_information
 from elastocal.planning.feasibility import Feasibility
 from elastocal.planning.information import load_states
 from elastocal.planning.plan import Everywhere
-from elastocal.planning.relaxation import relax
-from elastocal.planning.setup import Known, set_up
+from elastocal.planning.relaxation import balanced, relax
+from elastocal.planning.setup import Known, set_up, share_within
 from elastocal.planning.test_poses import everywhere, test_poses
 
 HERE = Path(__file__).parent
@@ -90,17 +89,10 @@ def rows_of(arm: str, stated: bool, candidates: int, campaigns: int) -> list[str
         if not file.exists():
             print(file.stem, flush=True)
             share = share_within(setup, pool, shares, cap, lambda message: None)
-            problem = setup.sharing(share).problem(pool, shares)
-            relaxed = relax(problem, tolerance=1e-4)
-            found = exact_plan(
-                problem,
-                relaxed_weights=relaxed.weights,
-                tangent=relaxed.tangent,
-                starts=2,
-                looks=64,
-            )
+            problem, _ = balanced(setup.sharing(share).problem(pool, shares))
+            chosen, _ = exact_plan(problem, relax(problem), starts=2)
             file.parent.mkdir(exist_ok=True)
-            np.save(file, found.chosen)
+            np.save(file, chosen)
         blocks = pool.blocks[:, np.load(file)]
         M, B = setup.gathered(blocks)[0], blocks[0].reshape(-1, blocks.shape[-1])
         noise = np.random.default_rng(1).standard_normal((len(B), campaigns))

@@ -7,7 +7,7 @@ from itertools import combinations_with_replacement, product
 import numpy as np
 
 from elastocal.planning.criteria import make_criterion
-from elastocal.planning.selection import DesignProblem
+from elastocal.planning.relaxation import DesignProblem
 from elastocal.units import Array, IntArray
 
 CRITERIA = ("test_pose", "D", "E")

@@ -49,13 +49,11 @@ from elastocal.model.effects.driven import (
     MarkerMotion,
 )
 from elastocal.planning import criteria
-from elastocal.planning.criteria import SpectralCriterion, TraceCriterion
 from elastocal.planning.criterion import (
     CriterionInputs,
     ScenarioCriterion,
-    SpectralTerm,
-    Term,
-    TraceTerm,
+    SpectralCriterion,
+    TraceCriterion,
 )
 
 __all__ = [
@@ -66,6 +64,9 @@ __all__ = [
     "add_deflection", "index", "joints", "links", "load_plugins", "motion_unit",
     "register_criterion", "register_effect", "register_noise_model", "rigid", "turning_joints",
 ]  # fmt: skip
+
+# What the relaxation needs of a criterion, it states itself, as a function of the covariance.
+Term, TraceTerm, SpectralTerm = ScenarioCriterion, TraceCriterion, SpectralCriterion
 
 load_plugins = plugin_loader.load_plugins
 

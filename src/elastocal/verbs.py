@@ -16,7 +16,15 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from elastocal.arguments import checked_arguments, length, one_of, vectors, whole
-from elastocal.cell.plan_wishes import Freedom, Motion, TargetBox, TargetPath, TargetPose
+from elastocal.cell.plan_wishes import (
+    CANDIDATES,
+    Freedom,
+    Motion,
+    TargetBox,
+    TargetPath,
+    TargetPose,
+    of_candidates,
+)
 from elastocal.cell.work_cell import Cell
 from elastocal.errors import InputError, option, require
 from elastocal.measurements import Measurements
@@ -66,7 +74,7 @@ def design(
     knowledge: Knowledge | str | Path | None = None,
     prior: Literal["none", "typical"] | Prior | None = None,
     effort: Effort = "normal",
-    candidates: int | None = None,
+    candidates: int | str | Path | Sequence[int | str | Path] | None = None,
     repeats: int | None = None,
     loads: ArrayLike | None = None,
     load_choice: bool | None = None,
@@ -116,7 +124,8 @@ def design(
         prior: "typical" takes every parameter's typical size as its prior, "none" none; or what
             is known by name, {"joint2.compliance": {"mean": 2.9e-7, "std": 3e-8}}.
         effort: How hard to search: "quick", "normal" or "thorough".
-        candidates: Feasible candidates to choose from, over all levels.
+        candidates: Feasible candidates to draw, over all levels; or a table (CSV) of poses to
+            choose from, as they were taught or measured before; or both, ["taught.csv", 500].
         repeats: Readings per pose and load state.
         loads: Forces (L, 3) in N at the load point, in the data's frame.
         load_choice: Choose one load for each pose, instead of measuring all of them there.
@@ -235,8 +244,17 @@ def _design_of(cell: Cell, asked: Mapping[str, Any]) -> Any:
     from elastocal.planning.criteria import CRITERIA
 
     chosen = {key: value for key, value in asked.items() if value is not None}
+    if "candidates" in chosen and not isinstance(chosen["candidates"], int | np.integer):
+        found = of_candidates(chosen["candidates"])
+        if found is None:
+            given = quoted(chosen["candidates"])
+            raise InputError(f"{option('candidates')} takes {CANDIDATES}; found {given}")
+        chosen["candidates"], taught = found
+        chosen["taught"] = None if taught is None else Path(taught)
+    elif "candidates" in chosen:
+        chosen["taught"] = None
     for key, least in (("poses", 1), ("candidates", 1), ("repeats", 1), ("robust_samples", 1)):
-        if key in chosen:
+        if chosen.get(key) is not None:
             chosen[key] = whole(key, chosen[key], least)
     for key, names in (
         ("criterion", tuple(CRITERIA)),

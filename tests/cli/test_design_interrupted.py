@@ -1,5 +1,6 @@
 """An interrupted design goes on where it was, and ends as if nothing had happened."""
 
+import contextlib
 import json
 import signal
 import subprocess
@@ -16,7 +17,7 @@ from support.design_commands import (
     write_cell,
 )
 
-from elastocal.planning import design as select
+from elastocal.planning import search
 from elastocal.planning.checkpoint import Stage
 
 GOING_ON = "going on with the design that was interrupted"
@@ -25,7 +26,7 @@ PROGRAM = (
     "import signal; signal.signal(signal.SIGINT, signal.default_int_handler); "
     "from elastocal.cli.main import main; main()"
 )
-STAGES = ("candidates", "exchange0", "polish1", "continuum1", "exchange1")
+STAGES = ("candidates", "exchange", "start0", "continuum1", "warm0")
 
 
 @pytest.fixture(scope="module")
@@ -120,23 +121,21 @@ def without_backend(path):
 
 def test_an_interrupt_that_a_solver_catches_is_not_lost(tmp_path, monkeypatch):
     """CasADi catches it inside IPOPT and returns a search cut short, which must not be kept."""
-    polish = select.polish
+    polish = search.polish
 
     def interrupted_polish(*arguments, **options):
-        try:
+        with contextlib.suppress(KeyboardInterrupt):
             signal.raise_signal(signal.SIGINT)
-        except KeyboardInterrupt:
-            options["progress"] = lambda message: None
         return polish(*arguments, **options)
 
     cell = write_cell(tmp_path, altered(DEFLECTION, poses="2", candidates="20"))
     arguments = ("design", cell, "-o", tmp_path / "plan.csv", "-q")
     with monkeypatch.context() as patch:
-        patch.setattr(select, "polish", interrupted_polish)
+        patch.setattr(search, "polish", interrupted_polish)
         result = elastocal(*arguments)
     assert result.exit_code == 130
     (state,) = (tmp_path / "plan.csv.resume").iterdir()
-    assert everything_in(state) == ["candidates.npz", "exchange0.npz"]
+    assert everything_in(state) == ["candidates.npz", "exchange.npz"]
 
 
 def stopped(cell, output, stage, number):

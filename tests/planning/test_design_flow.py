@@ -24,7 +24,7 @@ from elastocal.errors import InputError, InsufficientDataError
 from elastocal.model.chain import Chain, joint_limits
 from elastocal.model.urdf import read_urdf
 from elastocal.planning import design as design_module
-from elastocal.planning.design import EFFORTS, DesignOptions, DesignSearch, Effort, design
+from elastocal.planning.design import DesignOptions, Effort, design
 from elastocal.planning.feasibility import Feasibility
 from elastocal.planning.information import ALL_LOADS
 from elastocal.planning.plan import Plan
@@ -197,7 +197,7 @@ def test_the_value_is_that_of_the_poses_and_no_less_than_its_bound(name: str) ->
     assert c.efficiency_pool == pytest.approx(min(c.bound_pool / value, 1.0), rel=1e-9)
     assert 0 < c.efficiency_continuum <= c.efficiency_pool * (1 + 1e-9)
     assert plan.bound_reported == setup.criterion.reported(c.bound_pool)[0]
-    assert c.pool == plan.model.cell.design.candidates
+    assert c.pool >= plan.model.cell.design.candidates  # with what polish found
 
 
 @pytest.mark.parametrize("name", ALL)
@@ -225,12 +225,8 @@ def test_quick_plans_of_a_whole_geometry_are_certified_on_the_continuum() -> Non
 @pytest.mark.long
 @pytest.mark.parametrize("make", [plan_cell, work_cell])
 def test_normal_effort_polishes_off_the_pool_and_stays_inside_the_rules(
-    make: Callable[..., Cell], monkeypatch: pytest.MonkeyPatch
+    make: Callable[..., Cell],
 ) -> None:
-    if make is plan_cell:
-        monkeypatch.setitem(
-            EFFORTS, "normal", DesignSearch(rounds=1, starts=4, points=256, ascents=1)
-        )
     n = 40 if make is plan_cell else 150
     plans = {
         effort: design(make(loads=DOWN[None], poses=4, candidates=n), DesignOptions(effort))

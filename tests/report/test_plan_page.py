@@ -20,7 +20,7 @@ from elastocal.planning.design import DesignOptions, design
 from elastocal.planning.plan import Certificate, PlanSize
 from elastocal.report.arm_view import plan_space
 from elastocal.report.page import page_of, write_page
-from elastocal.report.plan_view import plan_headline, plan_steps, plan_tone
+from elastocal.report.plan_view import plan_headline, plan_lines, plan_steps, plan_tone
 
 SCRIPT = "<script>alert(1)</script>"
 
@@ -83,26 +83,27 @@ def test_view_has_the_poses_of_the_plan(page: Page, plan: Any) -> None:
 
 
 @pytest.mark.parametrize(
-    ("pool", "continuum", "warned", "text", "tone"),
+    ("pool", "starts", "warned", "text", "tone"),
     [
-        (0.98, 0.97, False, "more than 2.0 % better (certified)", "good"),
-        (0.9999, 0.97, False, "no plan from these candidates is better (certified)", "good"),
-        (0.98, 0.97, True, "more than 2.0 % better (certified)", "care"),
-        (0.98, 0.7, False, "poses between them may be, by up to 30 %", "care"),
-        (0.7, None, False, "more than 30.0 % better (certified)", "care"),
-        (None, None, False, "no bound says", "care"),
+        (0.98, (5.0, 5.01), False, "more than 2.0 % better (certified)", "good"),
+        (0.9999, (5.0,), False, "no plan from these candidates is better (certified)", "good"),
+        (0.98, (), True, "more than 2.0 % better (certified)", "care"),
+        (0.7, (5.0, 5.5), False, "more than 30.0 % better (certified)", "good"),
+        (None, (), False, "no bound says", "good"),
     ],
 )
 def test_the_verdict_says_how_far_from_the_best(
-    plan: Any, pool: Any, continuum: Any, warned: bool, text: str, tone: str
+    plan: Any, pool: Any, starts: Any, warned: bool, text: str, tone: str
 ) -> None:
-    certificate = Certificate(30, 1.0, pool, None, continuum)
+    certificate = Certificate(30, 1.0, pool, None, 0.9, starts=starts)
     warnings = ("something",) if warned else ()
     told = replace(plan, certificate=certificate, warnings=warnings)
     assert text in plan_headline(told)
     assert plan_tone(told) == tone
     advised = any("effort='thorough'" in step for step in plan_steps(told))
-    assert advised == (continuum == 0.7)
+    assert advised == (starts == (5.0, 5.5))
+    lines = [line for label, line in plan_lines(told) if "start" in line and label == "Certificate"]
+    assert [f"{len(starts)} start" in line for line in lines] == [True] * bool(starts)
 
 
 def test_writing_is_whole_or_not_at_all(plan: Any, tmp_path: Any) -> None:

@@ -2,17 +2,20 @@
 
 from __future__ import annotations
 
+from pathlib import Path
 from typing import Annotated, Any, Literal
 
 import numpy as np
 from pydantic import ConfigDict, Field
 
 from elastocal.cell.file_keys import (
+    AS_PATH,
     File,
     Key,
     Many,
     Rotation,
     Spot,
+    existing_file,
     fields_of,
     joint_values,
     keyed,
@@ -195,6 +198,22 @@ class Freedom:
             )
 
 
+CANDIDATES = (
+    'a whole number >= 1, a file of poses, as in "taught.csv", or both, as in ["taught.csv", 2000]'
+)
+
+
+def of_candidates(given: Any) -> tuple[int | None, str | Path | None] | None:
+    """The number of poses to draw and the file of poses that are brought; None where it is neither,
+    nor one of each."""
+    parts = list(given) if isinstance(given, list | tuple) else [given]
+    numbers = [p for p in parts if isinstance(p, int) and not isinstance(p, bool) and p > 0]
+    files = [p for p in parts if isinstance(p, str | Path)]
+    if len(numbers) > 1 or len(files) > 1 or len(numbers) + len(files) < len(parts) or not parts:
+        return None
+    return next(iter(numbers), None), next(iter(files), None)
+
+
 class LevelsTable(Table):
     """One joint's levels under a key such as joint2_deg, and how many poses each gets."""
 
@@ -217,7 +236,8 @@ class DesignSpec:
     D, A, E and O count (default all but base and markers); `elsewhere`: the share of the weight
     that poses all over the joint ranges have beside the test poses; `elsewhere_cap`: by how much
     the test poses may be worse for as little error there as can be had (see `cap`);
-    `combination` name → factor for c."""
+    `combination` name → factor for c; `candidates` to draw, and `taught`: a table of poses that are
+    brought, instead of these or beside them."""
 
     poses: Count | None = keyed("a whole number >= 1", default=None)
     criterion: Text = keyed(
@@ -252,7 +272,12 @@ class DesignSpec:
     elsewhere_cap: NonNegative | None = keyed("a number >= 0, as in 0.05", default=None)
     robust: Literal["none", "average", "worst"] = keyed(default="none")
     robust_samples: Count = keyed("a whole number >= 1", default=8)
-    candidates: Count | None = keyed("a whole number >= 1", default=None)
+    candidates: Count | None = keyed(
+        CANDIDATES,
+        form=Count | Text | Annotated[list[Count | Text], Field(min_length=1, max_length=2)],
+        default=None,
+    )
+    taught: Annotated[Path, AS_PATH] | None = None
     target: Positive | None = keyed("a positive number in µm", "target_um", default=None)
     minutes: Positive | None = keyed("a positive number", default=None)
     test_poses: Many[TargetPose] = keyed(
@@ -328,7 +353,16 @@ class DesignSpec:
                 "[design.levels], and each needs at least one pose; ask for more poses or fewer "
                 "levels",
             )
-        return {"levels": levels, "per_level": per_level, "poses": poses}
+        known = {"levels": levels, "per_level": per_level, "poses": poses}
+        if table.candidates is not None:
+            found = of_candidates(table.candidates)
+            where = spot.key("candidates")
+            spot.require(found, f"key {where} takes {CANDIDATES}; found {table.candidates}")
+            assert found is not None
+            known["candidates"] = found[0]
+            if found[1] is not None:
+                known["taught"] = existing_file(str(found[1]), spot, "candidates")
+        return known
 
 
 def _per_level(

@@ -227,6 +227,7 @@ def files_of(cell: Cell) -> list[Path]:
         robot.dh,
         robot.masses,
         None if targets is None else targets.file,
+        cell.design.taught,
     ]
     named += [solid.mesh for solid in solids]
     named += [Path(name) for name in cell.plugins if is_plugin_file(name)]

@@ -102,7 +102,11 @@ def design(
         ),
     ] = None,
     candidates: Annotated[
-        int | None, typer.Option(min=1, help="Feasible candidates to choose from, over all levels.")
+        str | None,
+        typer.Option(
+            metavar="N|FILE[,N]",
+            help="Feasible candidates to draw, over all levels; or a table of poses instead.",
+        ),
     ] = None,
     effort: Annotated[str, typer.Option(help="quick, normal or thorough.")] = "normal",
     elsewhere: Annotated[
@@ -177,6 +181,7 @@ def design(
     # What this command and `ec.design` call the same goes from one to the other.
     asked = {name: given[name] for name in signature(verb).parameters if name in given}
     asked |= {"target": _target(target, poses), "curve": _numbers(curve), "fixed": fix or ()}
+    asked["candidates"] = _candidates(candidates)
     with progress_line(quiet) as tell, Interrupts() as interrupts:
 
         def progress(message: str) -> None:
@@ -279,6 +284,16 @@ def _numbers(text: str | None) -> list[int]:
         ) from None
 
 
+def _candidates(text: str | None) -> int | str | list[int | str] | None:
+    """--candidates 500, taught.csv or taught.csv,500."""
+    if text is None:
+        return None
+    if text.isdecimal():
+        return int(text)
+    path, comma, number = text.rpartition(",")
+    return [path, int(number)] if comma and number.isdecimal() else text
+
+
 def _check_suffixes(programs: list[Path], picture: Path | None) -> None:
     """Refuse names that do not say which kind of file is wanted."""
     for path in programs:
@@ -303,7 +318,7 @@ def _check_programs(cell: Cell, programs: list[Path]) -> None:
 
     if programs:
         chain = load_chain(cell)
-        nothing = Execution((), np.zeros((0, chain.n_joints)), 0.0, False, Motion(), 0.0, 0, 0)
+        nothing = Execution((), np.zeros((0, chain.n_joints)), 0.0, False, Motion(), 0, 0)
         for path in programs:
             _program(path, nothing, chain)
 

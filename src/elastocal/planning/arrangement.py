@@ -1,80 +1,23 @@
-"""A plan as it was selected, in an order that moves can follow; poses that no move reaches."""
+"""The order of a plan that moves can follow; poses that none reaches are replaced, and polished."""
 
 from __future__ import annotations
 
-from dataclasses import dataclass, replace
-from functools import partial
+from dataclasses import replace
 
 import numpy as np
 
 from elastocal.model.chain import finite_ranges, joint_limits
-from elastocal.planning.checkpoint import Checkpoint, State
+from elastocal.planning.checkpoint import State
+from elastocal.planning.criterion import inverse
 from elastocal.planning.drift import Alias
-from elastocal.planning.exact_plan import repaired, restrict
+from elastocal.planning.exchange import exchange, fitted
 from elastocal.planning.execution import Execution, schedule
 from elastocal.planning.feasibility import Feasibility
 from elastocal.planning.moves import Blockers, Unreachable
-from elastocal.planning.plan import Certificate
-from elastocal.planning.selection import DesignProblem
+from elastocal.planning.search import Search, Selection
 from elastocal.planning.setup import FeasiblePool, Setup
 from elastocal.planning.time_budget import at_stops
 from elastocal.units import Array, BoolArray, IntArray, Progress
-
-
-@dataclass(frozen=True)
-class Selection:
-    """The plan as indices `chosen` (k,) into the `pool`, which has grown; Φ `value`.
-
-    From index `first` on the pool holds what came from local searches and the continuum, at its
-    end, once the plan is `whole`, the `pinned` poses that stay.  `alias`: what a shift of its
-    readings does, once it is in order.
-    """
-
-    pool: FeasiblePool
-    chosen: IntArray
-    value: float
-    certificate: Certificate
-    first: int
-    pinned: int = 0
-    alias: Alias | None = None
-
-    @property
-    def polished(self) -> int:
-        """Poses of the plan that are not candidates of the first pool."""
-        own = self.chosen < len(self.pool) - self.pinned
-        return int((own & (self.chosen >= self.first)).sum())
-
-    def whole(self, pinned: FeasiblePool | None) -> Selection:
-        """With the poses that stay, in the order of the levels, so that the table reads like
-        Table 2; of a level those that stay come first."""
-        pool, chosen, n = self.pool, np.sort(self.chosen), 0
-        if pinned is not None:
-            pool, n = pool.joined(pinned), len(pinned)
-            chosen = np.append(np.arange(len(self.pool), len(pool)), chosen)
-        chosen = chosen[np.argsort(pool.group[chosen], kind="stable")]
-        return replace(self, pool=pool, chosen=chosen, pinned=n)
-
-    def without(self, gone: IntArray, chosen: IntArray, setup: Setup) -> Selection:
-        """The plan `chosen` (k,) without the candidates `gone`, which leave the pool.
-
-        The bounds hold: those of a pool are those of every part of it.
-        """
-        kept = np.setdiff1d(np.arange(len(self.pool)), gone)
-        value = float(setup.criterion.value(setup.gathered(self.pool.blocks[:, chosen])))
-        c = self.certificate
-        of_pool, of_continuum = (
-            None if share is None else share * (self.value / value)
-            for share in (c.efficiency_pool, c.efficiency_continuum)
-        )
-        certificate = replace(
-            c, pool=len(kept), efficiency_pool=of_pool, efficiency_continuum=of_continuum
-        )
-        first = self.first - int((gone < self.first).sum())
-        own = np.searchsorted(kept, chosen)
-        return Selection(self.pool.take(kept), own, value, certificate, first)
-
-
-# The order of execution of a selection, and what becomes of poses that no move reaches.
 
 SAME = 1e-9  # of the largest number of the blocks: rounding
 MOST_REPLACED = 50  # poses that cannot be reached, before that is said instead
@@ -84,51 +27,109 @@ VIA = 200  # candidates through which a blocked move may go
 
 
 def ordered(
-    setup: Setup,
-    found: Selection,
-    shares: IntArray,
-    feasibility: Feasibility,
-    seed: int,
-    progress: Progress,
-    checkpoint: Checkpoint | None = None,
-    pinned: FeasiblePool | None = None,
+    search: Search, found: Selection, pinned: FeasiblePool | None = None
 ) -> tuple[Selection, Execution, list[str]]:
     """The selection in the order of its levels, its execution, and warnings.
 
     Poses that no chain of free moves reaches are replaced by the best others, unless they are
-    `pinned`.  Raises InsufficientDataError where that does not end.
+    `pinned`, and all poses then polished again, as far as moves reach them there.  Raises
+    InsufficientDataError where that does not end.
     """
-    lost, unwound, paths = 0, False, _Paths(feasibility)
-    while True:
-        plan = found.whole(pinned)
-        if unwound:
-            plan = _unwound(setup, plan, feasibility)
-        chosen = plan.chosen
-        try:
-            plan = replace(plan, alias=Alias.of(setup, plan.pool, chosen))
-            execution = _execution(setup, plan, paths, seed, progress)
-        except Unreachable as error:
-            if not unwound:
-                unwound = True
-                continue
-            gone = np.unique(chosen[error.poses])
-            others = np.delete(found.pool.group, gone[gone < len(found.pool)])
-            few = np.bincount(others, minlength=len(shares)) < shares
-            if lost >= MOST_REPLACED or (gone >= len(found.pool)).any() or few.any():
-                raise
-            lost += len(error.poses)
-            progress(f"{lost} poses that no free move reaches are replaced by the best others")
-            stage = (checkpoint or Checkpoint()).stage(f"replaced{lost}")
-            state = stage.finished(
-                partial(
-                    _replaced, setup.having(pinned).problem(found.pool, shares), found.chosen, gone,
-                    _nearer(feasibility, found.pool.q), plan.pool.q[np.setdiff1d(chosen, gone)],
-                    paths,
+    order = _Ordering(search, _Paths(search.searches.checker), pinned)
+    plan, execution = order.reachable(found)
+    if order.gone:
+        plan, execution = order.polished(plan, execution)
+    return plan, execution, _warnings(order.gone, execution)
+
+
+class _Ordering:
+    """Plans put in order; `gone` poses of them were unreachable so far."""
+
+    def __init__(self, search: Search, paths: _Paths, pinned: FeasiblePool | None) -> None:
+        self.search, self.paths, self.pinned, self.gone = search, paths, pinned, 0
+        self.unwound = False
+        self.found: Selection | None = None
+
+    def reachable(self, found: Selection) -> tuple[Selection, Execution]:
+        """The plan, or that with others in the place of unreachable poses, in an order."""
+        shares = self.search.shares
+        while True:
+            try:
+                plan, execution = self.put(found)
+            except Unreachable as error:
+                if not self.unwound:
+                    self.unwound = True
+                    continue
+                pool, whole = found.pool, found.whole(self.pinned)
+                gone = np.unique(whole.chosen[error.poses])
+                others = np.delete(pool.group, gone[gone < len(pool)])
+                few = np.bincount(others, minlength=len(shares)) < shares
+                if self.gone >= MOST_REPLACED or (gone >= len(pool)).any() or few.any():
+                    raise
+                self.gone += len(error.poses)
+                self.search.progress(
+                    f"{self.gone} poses that no free move reaches are replaced by the best others"
                 )
-            )  # fmt: skip
-            found = found.without(gone, state["chosen"], setup.having(pinned))
-            continue
-        return plan, execution, _warnings(lost, execution)
+                stage = self.search.checkpoint.stage(f"replaced{self.gone}")
+                there = whole.pool.q[np.setdiff1d(whole.chosen, gone)]
+                chosen = stage.finished(lambda: self._replaced(found, gone, there))["chosen"]  # noqa: B023
+                kept = np.setdiff1d(np.arange(len(pool)), gone)
+                value = self.search.value(pool, chosen)
+                first = found.first - int((gone < found.first).sum())
+                found = found.exchanged(pool.take(kept), np.searchsorted(kept, chosen), value)
+                certificate = replace(found.certificate, pool=len(kept))
+                found = replace(found, first=first, certificate=certificate)
+                continue
+            self.found = found
+            return plan, execution
+
+    def put(self, found: Selection) -> tuple[Selection, Execution]:
+        """The whole plan and its execution; Unreachable where there is none."""
+        search, plan = self.search, found.whole(self.pinned)
+        setup = search.setup
+        if self.unwound:
+            plan = _unwound(setup, plan, self.paths.feasibility)
+        plan = replace(plan, alias=Alias.of(search.plain, plan.pool, plan.chosen))
+        return plan, _execution(setup, plan, self.paths, search.seed, search.progress)
+
+    def polished(self, plan: Selection, execution: Execution) -> tuple[Selection, Execution]:
+        """With all poses polished again, where moves reach them and that is better."""
+        found, search = self.found, self.search
+        if found is None or not search.effort.starts:
+            return plan, execution
+        pool, chosen = search.polished(found.pool, found.chosen, "replaced")
+        value = search.value(pool, chosen)
+        if value >= found.value:
+            return plan, execution
+        try:
+            return self.put(found.exchanged(pool, chosen, value))
+        except Unreachable:
+            return plan, execution
+
+    def _replaced(self, found: Selection, gone: IntArray, there: Array) -> State:
+        """What is `chosen` instead of the plan `found` without the candidates `gone`.
+
+        In their place, and by exchange in that of others, come those of the LIKELY candidates of a
+        level that a free move joins, as postures, to poses of the plan that are `there`.
+        """
+        problem, were = self.search.problem(found.pool), found.chosen
+        q = _nearer(self.paths.feasibility, found.pool.q)
+        kept, pool = np.setdiff1d(were, gone), [were]
+        V = inverse(problem.information(were))
+        worth = problem.prices(V @ problem.criterion.slope(V)[1] @ V)
+        for level, share in enumerate(problem.shares):
+            own = np.setdiff1d(np.flatnonzero(problem.group == level), were)
+            ranked, n = own[np.argsort(-worth[own], kind="stable")], 0
+            while len(ranked) and n < share:
+                tried, ranked = ranked[:LIKELY], ranked[LIKELY:]
+                pool.append(tried[~_apart(self.paths, q[tried], there)])
+                n += len(pool[-1])
+        some = np.setdiff1d(np.concatenate(pool), gone)
+        if (np.bincount(problem.group[some], minlength=len(problem.shares)) < problem.shares).any():
+            # It is said once all have gone.
+            some = np.setdiff1d(np.arange(problem.n_candidates), gone)
+        part = problem.restricted(some)
+        return {"chosen": some[exchange(part, fitted(part, np.searchsorted(some, kept)))[0]]}
 
 
 class _Paths:
@@ -165,29 +166,6 @@ def _execution(
         paired=not states.observed.all(),
         seed=seed, progress=progress,
     )  # fmt: skip
-
-
-def _replaced(
-    problem: DesignProblem, were: IntArray, gone: IntArray, q: Array, there: Array, paths: _Paths
-) -> State:
-    """What is `chosen` instead of the plan `were` without the candidates `gone`.
-
-    In their place, and by exchange in that of others, come those of the LIKELY candidates of a
-    level that a free move joins, as postures q (N, n), to poses of the plan that are `there`.
-    """
-    kept, pool = np.setdiff1d(were, gone), [were]
-    worth = problem.sensitivity(problem.criterion.gradient(problem.prior + problem.sum_of(were)).G)
-    for level, share in enumerate(problem.shares):
-        own = np.setdiff1d(np.flatnonzero(problem.group == level), were)
-        ranked, found = own[np.argsort(-worth[own], kind="stable")], 0
-        while len(ranked) and found < share:
-            tried, ranked = ranked[:LIKELY], ranked[LIKELY:]
-            pool.append(tried[~_apart(paths, q[tried], there)])
-            found += len(pool[-1])
-    some = np.setdiff1d(np.concatenate(pool), gone)
-    if (np.bincount(problem.group[some], minlength=len(problem.shares)) < problem.shares).any():
-        some = np.setdiff1d(np.arange(problem.n_candidates), gone)  # it is said once all have gone
-    return {"chosen": some[repaired(restrict(problem, some), np.searchsorted(some, kept))]}
 
 
 def _apart(paths: _Paths, q: Array, there: Array) -> BoolArray:

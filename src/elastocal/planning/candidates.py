@@ -11,6 +11,7 @@ import numpy as np
 
 from elastocal.cell.work_cell import Cell
 from elastocal.errors import InputError, InsufficientDataError, require
+from elastocal.measurements import Measurements
 from elastocal.model.chain import Chain, finite_ranges, joint_index, joint_limits
 from elastocal.planning.feasibility import Feasibility, PoseFeasibility
 from elastocal.planning.information import ALL_LOADS, LoadStates
@@ -148,6 +149,58 @@ def draw(
             )
         drawn.append(lot)
     return Candidates.join(drawn)
+
+
+LEVEL_SLACK = 1e-6  # rad or m by which a file's digits may miss a level
+NO_LEVEL = "level"  # the rule that a pose brought along breaks where it stands at none
+
+
+def brought(
+    cell: Cell, chain: Chain, states: LoadStates, checker: Feasibility, table: Measurements
+) -> tuple[Candidates, list[str], dict[str, str]]:
+    """The poses of a table that the cell allows, the name of each, and of those refused the rule
+    that each breaks first.  A pose that stands in several rows is one.
+
+    Raises InsufficientDataError where none is allowed, with the rule to relax.
+    """
+    space = joint_space(cell, chain)
+    q, first = np.unique(np.round(table.q, 9), axis=0, return_index=True)
+    order = np.argsort(first, kind="stable")
+    q = table.q[first[order]].copy()
+    names = [table.configuration_labels[k] for k in table.configuration[first[order]]]
+    group = np.zeros(len(q), dtype=np.int64)
+    refused: dict[str, str] = {}
+    if space.held is not None:
+        away = np.abs(q[:, [space.held]] - np.array(space.levels))
+        group = away.argmin(axis=1)
+        q[:, space.held] = np.array(space.levels)[group]
+        refused = {names[k]: NO_LEVEL for k in np.flatnonzero(away.min(axis=1) > LEVEL_SLACK)}
+    at_level = np.array([name not in refused for name in names], dtype=bool)
+    lots, verdicts, told = [], [], []
+    for level in range(space.n_groups):
+        own = np.flatnonzero(at_level & (group == level))
+        lot, verdict = _check(checker, states, level, q[own])
+        lots.append(lot)
+        verdicts.append(verdict)
+        broken = verdict.broken.reshape(-1, len(own), len(verdict.rules))
+        for k, i in enumerate(own):
+            if broken[:, k].any(axis=1).all():  # where the load is chosen, under every load
+                refused[names[i]] = verdict.rules[int(broken[0, k].argmax())]
+        place = {pose.tobytes(): names[i] for pose, i in zip(q[own], own, strict=True)}
+        told += [place[pose.tobytes()] for pose in lot.q]
+    found = Candidates.join(lots)
+    found.removed_by[NO_LEVEL] = int((~at_level).sum())
+    found = replace(found, tried=found.tried + int((~at_level).sum()))
+    if not len(found.q):
+        where = f"{table.source}: the cell allows none of its {len(q)} poses"
+        if not at_level.any():
+            joint = f"joint{(space.held or 0) + 1}"
+            raise InsufficientDataError(
+                f"{where}, as none stands at a level of {joint}; bring poses at the levels of "
+                "[design.levels], or drop these"
+            )
+        raise InsufficientDataError(f"{where}; {checker.advice(PoseFeasibility.join(verdicts))}")
+    return found, told, refused
 
 
 def sobol(space: JointSpace, group: int, stream: np.random.SeedSequence) -> Iterator[Array]:

@@ -26,7 +26,7 @@ from elastocal.planning.candidates import Candidates, draw
 from elastocal.planning.criteria import CRITERIA
 from elastocal.planning.feasibility import Feasibility
 from elastocal.planning.information import PoseInformation, load_states
-from elastocal.planning.relaxation import Relaxed, relax
+from elastocal.planning.relaxation import Relaxed, balanced, relax
 from elastocal.planning.setup import FeasiblePool, Known, Setup, set_up, shares_of
 from elastocal.planning.test_poses import TargetPoses
 from elastocal.units import Array, IntArray, Progress
@@ -283,7 +283,7 @@ class Choice:
                 rules.seen if rules.partial else None, self.work,
             )  # fmt: skip
             pool = setup.pool(drawn.q, drawn.load, drawn.group)
-            relaxed = relax(setup.problem(pool, shares), tolerance=GAIN / 10)
+            relaxed = relax(balanced(setup.problem(pool, shares))[0], GAIN / 10)
         except ElastocalError:
             return None
         return RelaxedPoint(cell, setup, pool, relaxed, drawn.feasible / drawn.tried)

@@ -5,10 +5,12 @@ from __future__ import annotations
 from collections.abc import Mapping
 from dataclasses import dataclass, field, replace
 from itertools import count
+from pathlib import Path
 from typing import Literal, get_args
 
 import numpy as np
 from numpy.typing import NDArray
+from threadpoolctl import threadpool_limits
 
 from elastocal.cell.plan_wishes import TEST_POSE
 from elastocal.cell.work_cell import Cell
@@ -17,29 +19,27 @@ from elastocal.identification.knowledge import GaussianPrior
 from elastocal.measurements import Measurements
 from elastocal.model.effects.catalogue import effect_of
 from elastocal.model.manipulator import Model
-from elastocal.planning.arrangement import Selection, ordered
-from elastocal.planning.candidates import draw, joint_space
+from elastocal.planning.arrangement import ordered
+from elastocal.planning.candidates import (
+    LEVEL_SLACK,
+    NO_LEVEL,
+    Candidates,
+    brought,
+    draw,
+    joint_space,
+)
 from elastocal.planning.checkpoint import Checkpoint, State
 from elastocal.planning.choices import Choice
 from elastocal.planning.conditions import ScheduledEffects
 from elastocal.planning.criteria import CRITERIA
-from elastocal.planning.criterion import Gradient
 from elastocal.planning.doubts import OPEN, Place, gain_of, in_doubt, leading_directions
-from elastocal.planning.elsewhere import share_within
-from elastocal.planning.exact_plan import (
-    SizedPlan,
-    exact_plan,
-    random_information,
-    repaired,
-    size_curve,
-)
+from elastocal.planning.exchange import random_information, size_curve, values_without
 from elastocal.planning.feasibility import Feasibility
 from elastocal.planning.information import Done, load_states, measured, next_number, readings_each
 from elastocal.planning.moves import Blockers
 from elastocal.planning.pins import Pins
 from elastocal.planning.plan import (
     CandidateCounts,
-    Certificate,
     Chance,
     Everywhere,
     Plan,
@@ -47,9 +47,9 @@ from elastocal.planning.plan import (
     predicted,
     reasons,
 )
-from elastocal.planning.polish import Continuum, Searches, estimate, polish
-from elastocal.planning.relaxation import Relaxed, relax
-from elastocal.planning.selection import DesignProblem, efficiency, in_terms, values_without
+from elastocal.planning.polish import Searches
+from elastocal.planning.search import EFFORTS, POOL, Search, Selection
+from elastocal.planning.search import Effort as SearchEffort
 from elastocal.planning.setup import (
     FeasiblePool,
     Known,
@@ -57,38 +57,17 @@ from elastocal.planning.setup import (
     check_available,
     most_poses,
     set_up,
+    share_within,
     shares_of,
 )
 from elastocal.planning.test_poses import TargetPoses, check_cell, everywhere, test_poses
 from elastocal.planning.time_budget import within
 from elastocal.text import did_you_mean, listed, quoted
-from elastocal.units import Array, BoolArray, IntArray, Progress
+from elastocal.units import Array, IntArray, Progress
 
 # How a plan is searched for; what it is to be stands in the cell's [design].
 
 Effort = Literal["quick", "normal", "thorough", "batch"]
-
-
-@dataclass(frozen=True)
-class DesignSearch:
-    """`rounds` of polishing and of poses from the continuum added to the pool; `starts` of the
-    exchange; new `points` per level and `ascents` when the continuum is searched, if it is;
-    `candidates` where the cell asks for no number, and how many of them an exchange `looks` at."""
-
-    rounds: int
-    starts: int
-    points: int
-    ascents: int
-    candidates: int = 20_000
-    looks: int | None = None
-
-
-EFFORTS: dict[str, DesignSearch] = {
-    "batch": DesignSearch(rounds=0, starts=2, points=0, ascents=0),
-    "quick": DesignSearch(rounds=0, starts=2, points=4096, ascents=2, candidates=5000, looks=64),
-    "normal": DesignSearch(rounds=1, starts=10, points=16_384, ascents=4),
-    "thorough": DesignSearch(rounds=3, starts=30, points=65_536, ascents=10),
-}
 
 
 @dataclass(frozen=True)
@@ -127,180 +106,9 @@ class DesignOptions:
         )
 
 
-# Choosing the poses: relaxation, exchange, polish, and new candidates from the continuum.
-
-NEAR = 0.97  # of the bound on the pool: a continuum as near as that is not searched again
-REFINED = 4  # times at most
-ROUND = 1000  # added to the seed of each of them, beyond the rounds of polishing
-
-
-def select(
-    setup: Setup,
-    pool: FeasiblePool,
-    shares: IntArray,
-    searches: Searches,
-    options: DesignOptions,
-    checkpoint: Checkpoint,
-    progress: Progress,
-    begun: SizedPlan | None = None,
-    doubtful: BoolArray | None = None,
-) -> Selection:
-    """The best plan found and its certificates; `begun` is what was found on this pool already,
-    `doubtful` (p,) are parameters of which the search may leave out what hardly counts.
-
-    In each round the exact plan is polished off the pool and the continuum is searched for poses
-    of larger sensitivity; both join the pool, on which relaxation and exchange run again.  So the
-    plan is never worse than that of the first pool, and the bound on the pool is that of the
-    grown one.
-    """
-    first = len(pool)
-    R, terms = setup.target_rows, None
-    if begun is None and doubtful is not None and R is not None:
-        terms = leading_directions(setup.problem(pool, shares), R, doubtful)
-    search = _Rounds(setup, searches, shares, options, checkpoint, progress, terms)
-    relaxed = search.relax(pool) if begun is None else begun.relaxed
-    found = None if begun is None else begun.plan.chosen
-    chosen = search.exchange(pool, relaxed, None, 0, found)
-    effort = EFFORTS[options.effort]
-    for k in range(1, effort.rounds + 1):
-        grown, chosen = search.polish(pool, chosen, k)
-        pool = search.widen(grown, relaxed, k)
-        relaxed = search.relax(pool)
-        chosen = search.exchange(pool, relaxed, chosen, k)
-    value = float(setup.criterion.value(setup.gathered(pool.blocks[:, chosen])))
-    certificate = search.certificate(pool, relaxed, value)
-    return Selection(pool, chosen, value, certificate, first)
-
-
-@dataclass(frozen=True)
-class _Rounds:
-    """One step of a round each; what is finished is taken from the checkpoint.
-
-    The search is one in `terms` (S, p, k) of the parameters, where there are such; its bounds hold
-    for all of them, as what is left out counts as known there.
-    """
-
-    setup: Setup
-    searches: Searches
-    shares: IntArray
-    options: DesignOptions
-    checkpoint: Checkpoint
-    progress: Progress
-    terms: Array | None = None
-    last: list[tuple[FeasiblePool, DesignProblem]] = field(default_factory=list)
-
-    def relax(self, pool: FeasiblePool) -> Relaxed | None:
-        """The relaxed optimum on the pool; None for a criterion without a bound."""
-        if not self.setup.criterion.certifiable:
-            return None
-        self.progress(f"relaxation over {len(pool)} candidates")
-        return relax(self.problem(pool), progress=self.progress)
-
-    def problem(self, pool: FeasiblePool) -> DesignProblem:
-        """That of a pool, kept with what it has formed as long as the pool is the same."""
-        if not self.last or self.last[0][0] is not pool:
-            whole = self.setup.problem(pool, self.shares)
-            some = None if self.terms is None else in_terms(whole, self.terms)
-            self.last[:] = [(pool, some or whole)]
-        return self.last[0][1]
-
-    def exchange(
-        self, pool: FeasiblePool, relaxed: Relaxed | None, warm: IntArray | None, k: int,
-        found: IntArray | None = None,
-    ) -> IntArray:  # fmt: skip
-        effort = EFFORTS[self.options.effort]
-        best = exact_plan(
-            self.problem(pool),
-            relaxed_weights=None if relaxed is None else relaxed.weights,
-            tangent=None if relaxed is None else relaxed.tangent,
-            starts=effort.starts, looks=effort.looks, found=found, warm=warm,
-            seed=self.options.seed, jobs=self.options.jobs,
-            checkpoint=self.checkpoint.stage(f"exchange{k}"), progress=self.progress,
-        )  # fmt: skip
-        if self.terms is None:
-            return best.chosen
-        # No pose of the plan has a better one in its place, with all parameters.
-        return repaired(self.setup.problem(pool, self.shares), best.chosen)
-
-    def polish(self, pool: FeasiblePool, chosen: IntArray, k: int) -> tuple[FeasiblePool, IntArray]:
-        """The pool with the polished poses, and the polished plan in it."""
-
-        def make() -> State:
-            done = polish(
-                self.setup.problem(pool, self.shares), self.searches, pool.q, pool.load, chosen,
-                jobs=self.options.jobs, progress=self.progress,
-            )  # fmt: skip
-            return {"q": done.q, "moved": done.moved}
-
-        state = self.checkpoint.stage(f"polish{k}").finished(make)
-        q, moved = state["q"], state["moved"]
-        if not moved.any():
-            return pool, chosen
-        were = chosen[moved]
-        grown = pool.joined(self.setup.pool(q[moved], pool.load[were], pool.group[were]))
-        now = chosen.copy()
-        now[moved] = np.arange(len(pool), len(grown))
-        return grown, now
-
-    def widen(self, pool: FeasiblePool, relaxed: Relaxed | None, k: int) -> FeasiblePool:
-        """The pool with the poses of the continuum that the relaxed optimum lacks."""
-        if relaxed is None:
-            return pool
-
-        def make() -> State:
-            found = self._continuum(pool, relaxed, k)
-            return {"q": found.q, "load": found.load, "group": found.group}
-
-        state = self.checkpoint.stage(f"continuum{k}").finished(make)
-        if not len(state["q"]):
-            return pool
-        return pool.joined(self.setup.pool(state["q"], state["load"], state["group"]))
-
-    def _continuum(self, pool: FeasiblePool, relaxed: Relaxed, k: int) -> Continuum:
-        effort = EFFORTS[self.options.effort]
-        problem, tangent, T = self.problem(pool), relaxed.tangent, self.terms
-        if T is not None:
-            problem = self.setup.problem(pool, self.shares)
-            tangent = Gradient(tangent.value, T @ tangent.G @ T.swapaxes(-1, -2))
-        # The pool may have grown since: candidates added later have weight 0.
-        return estimate(
-            problem, tangent, self.searches, pool.q, pool.load,
-            points=effort.points, starts=effort.ascents, seed=self.options.seed + k,
-            jobs=self.options.jobs, progress=self.progress,
-        )  # fmt: skip
-
-    def certificate(self, pool: FeasiblePool, relaxed: Relaxed | None, value: float) -> Certificate:
-        if relaxed is None:
-            return Certificate(len(pool), None, None)
-        if not EFFORTS[self.options.effort].points:
-            return Certificate(len(pool), relaxed.bound, efficiency(value, relaxed.bound))
-        found = [self._continuum(pool, relaxed, 0)]
-        # The tangent of the pool's optimum says little of poses far better than the pool's: they
-        # join it, and that of the new optimum says more.
-        grown, optimum = pool, relaxed
-        while found[-1].bound < NEAR * optimum.bound and len(found[-1].q) and len(found) <= REFINED:
-            new = found[-1]
-            grown = grown.joined(self.setup.pool(new.q, new.load, new.group))
-            start = np.concatenate([optimum.weights, np.zeros(len(new.q))])
-            problem = replace(self.problem(grown), most=int(self.shares.sum()))
-            optimum = relax(problem, tolerance=1e-3, start=start)
-            found.append(self._continuum(grown, optimum, len(found) * ROUND))
-        bound = found[-1].bound
-        return Certificate(
-            pool=len(pool),
-            bound_pool=relaxed.bound,
-            efficiency_pool=efficiency(value, relaxed.bound),
-            bound_continuum=bound,
-            efficiency_continuum=efficiency(value, min(bound, relaxed.bound)),
-            searched=sum(c.searched for c in found),
-            ascents=sum(c.ascents for c in found),
-        )
-
-
 # The course of a design.
 
 MOST_POSES = 100  # that a target is sought with
-FEWER = 4  # times: starts of a size that is compared only
 
 
 def design(
@@ -320,20 +128,26 @@ def design(
     InsufficientDataError where no pose is feasible, or a parameter that the criterion needs cannot
     be seen.
     """
-    rest = options or DesignOptions(), checkpoint or Checkpoint(), progress
-    whole = _Design(cell, *rest)
-    spec = cell.design
+    # Products of matrices of a few dozen rows: more threads of BLAS wait for each other.
+    with threadpool_limits(limits=1, user_api="blas"):
+        return _planned(cell, options or DesignOptions(), checkpoint or Checkpoint(), progress)
+
+
+def _planned(
+    cell: Cell, options: DesignOptions, checkpoint: Checkpoint, progress: Progress
+) -> Plan:
+    whole, spec = _Design(cell, options, checkpoint, progress), cell.design
     if spec.choose is None and spec.minutes is None:
         return whole.run()
-    choice = Choice(whole.model, *whole.targets(), whole.known(), rest[0].seed, progress)
+    choice = Choice(whole.model, *whole.targets(), whole.known(), options.seed, progress)
     chosen = None if spec.choose is None else choice.best()
     placed = cell if chosen is None else chosen.applied(cell)
 
     def plan_of(cell: Cell) -> Plan:
-        folder, own = rest[1].folder, rest[1]
+        folder, own = checkpoint.folder, checkpoint
         if folder is not None and spec.minutes:  # poses come in several numbers
             own = replace(own, folder=folder / f"{cell.design.poses}x{cell.design.repeats}")
-        made = _Design(cell, rest[0], own, progress, whole)
+        made = _Design(cell, options, own, progress, whole)
         return replace(made.run(), chosen=chosen)
 
     return plan_of(placed) if not spec.minutes else within(choice, placed, plan_of, spec.minutes)
@@ -352,9 +166,8 @@ class _Design:
             self.warnings.append(
                 "torques of poses that are not measured yet are computed from load and weights"
             )
-        if cell.design.candidates is None:
-            drawn = EFFORTS[options.effort].candidates
-            cell = replace(cell, design=replace(cell.design, candidates=drawn))
+        if cell.design.candidates is None and cell.design.taught is None:
+            cell = replace(cell, design=replace(cell.design, candidates=POOL))
         self.checkpoint, self.progress = checkpoint, progress
         self.doubts: dict[Place, float] = {}
         self.model = Model(cell, options.done.marker_names if options.done else ())
@@ -460,12 +273,21 @@ class _Design:
         curve, shares, begun = self._sizes(search, pool, shares)
         searches = Searches(setup.information, self.space, self.feasibility, self.feasibility.pairs)
         own = np.isin(setup.information.names, self.model.names)
-        found = select(
-            search, pool, shares, searches, options, self.checkpoint, progress, begun, ~own
-        )
+        terms = None
+        if begun is None and not own.all() and search.target_rows is not None:
+            terms = leading_directions(search.problem(pool, shares), search.target_rows, ~own)
+        seek = Search.of(
+            search, pool, searches, shares, self._effort(), options.seed,
+            self.checkpoint, progress, terms, setup,
+        )  # fmt: skip
+        found = seek.select(pool, begun)
         progress("random plans beside it")
         drawn = random_information(search.problem(pool, shares), options.seed)
-        return self._plan(setup, found, shares, counts, targets.source, curve, known, drawn, pinned)
+        return self._plan(setup, seek, found, counts, targets.source, curve, known, drawn, pinned)
+
+    def _effort(self) -> SearchEffort:
+        effort = EFFORTS[self.options.effort]
+        return effort.in_pool if self.cell.design.candidates is None else effort
 
     def _shares(self, n_poses: int | None = None) -> IntArray:
         """Poses (L,) to choose per level, beside those that stay."""
@@ -510,16 +332,30 @@ class _Design:
         tried, feasible = (int(v) for v in state["tried"])
         removed = dict(zip(state["rules"].tolist(), state["removed"].tolist(), strict=True))
         counts = CandidateCounts(tried, feasible, removed)
+        self.taught = {
+            q.tobytes(): str(n) for q, n in zip(state["q"], state["names"], strict=False)
+        }
         return state["q"], state["load"], state["group"], counts
 
     def _drawn(self) -> State:
         """The candidates and how many poses each rule removed, as arrays."""
-        self.progress("drawing candidates")
-        drawn = draw(
-            self.cell, self.chain, self.states, self.feasibility,
-            self.cell.design.candidates or 1, self.options.seed, self.options.jobs, self.progress,
-        )  # fmt: skip
+        spec, asked = self.cell.design, (self.cell, self.chain, self.states, self.feasibility)
+        lots: list[Candidates] = []
+        names: list[str] = []
+        told = ""
+        if spec.taught is not None:
+            own, names, told = self._brought(spec.taught)
+            lots.append(own)
+        if spec.taught is None or spec.candidates is not None:
+            self.progress("drawing candidates")
+            options, n = self.options, spec.candidates or 1
+            lots.append(draw(*asked, n, options.seed, options.jobs, self.progress))
+        if len(lots) > 1:
+            lots[1].removed_by[NO_LEVEL] = 0
+        drawn = Candidates.join(lots)
         return {
+            "names": np.array(names, dtype=np.str_),
+            "told": np.array(told),
             "q": drawn.q,
             "load": drawn.load,
             "group": drawn.group,
@@ -528,9 +364,32 @@ class _Design:
             "removed": np.array(list(drawn.removed_by.values()), dtype=np.int64),
         }
 
+    def _brought(self, path: Path) -> tuple[Candidates, list[str], str]:
+        """The poses of a file that the cell allows, but for those that stay anyhow; their names;
+        which were refused."""
+        self.progress(f"checking the poses of {path}")
+        table = self.model.read_plan(path)
+        found, names, refused = brought(self.cell, self.chain, self.states, self.feasibility, table)
+        by_rule: dict[str, list[str]] = {}
+        for name, rule in refused.items():
+            by_rule.setdefault(rule.replace("_", " "), []).append(name)
+        told = "; ".join(f"{rule} ({listed(own)})" for rule, own in by_rule.items())
+        if told:
+            told = (
+                f"{path}: {len(refused)} of {len(refused) + len(set(names))} poses are refused, by "
+                f"the rule that each breaks first: {told}"
+            )
+        pins = self.options.pins
+        if pins is not None and len(pins.q):
+            near = np.abs(found.q[:, None] - pins.q[None]).max(axis=2).min(axis=1) < LEVEL_SLACK
+            kept = np.flatnonzero(~near)
+            found = replace(found, q=found.q[kept], load=found.load[kept], group=found.group[kept])
+            names = [names[k] for k in kept]
+        return found, names, told
+
     def _sizes(
         self, setup: Setup, pool: FeasiblePool, shares: IntArray
-    ) -> tuple[tuple[PlanSize, ...], IntArray, SizedPlan | None]:
+    ) -> tuple[tuple[PlanSize, ...], IntArray, IntArray | None]:
         """The curve of criterion against number of poses, where there is a target the shares that
         meet it, and what was found for these shares."""
         target, numbers = self.cell.design.target, self.options.curve
@@ -544,7 +403,7 @@ class _Design:
             PlanSize(int(n), reported(value)[0], None if np.isnan(b) else reported(b)[0])
             for n, value, b in zip(state["n"], state["value"], state["bound"], strict=True)
         )
-        begun = SizedPlan.kept(state)
+        begun = state["chosen"] if len(state["chosen"]) else None
         if target is None:
             return points, shares, begun
         smallest = int(state["smallest"])
@@ -563,7 +422,6 @@ class _Design:
     ) -> dict[str, NDArray]:  # fmt: skip
         """As `size_curve`: bounds NaN where there are none, `smallest` 0 where none meets; what
         was found of `smallest`, without a target of `shares` where these were among them."""
-        effort = EFFORTS[self.options.effort]
         found = size_curve(
             lambda n: setup.problem(pool, self._shares(n)),
             numbers,
@@ -572,11 +430,9 @@ class _Design:
                 max(pool.n_groups, int(self.pinned.sum()) + 1),
                 most_poses(self.cell, np.bincount(pool.group), MOST_POSES),
             ),
-            # That of the size that is planned gets its other starts then.
-            starts=max(effort.starts // FEWER, 1),
-            seed=self.options.seed, jobs=self.options.jobs, looks=effort.looks,
+            seed=self.options.seed,
             progress=self.progress,
-        )  # fmt: skip
+        )
         n = found.smallest or 0
         total = int((shares + self.pinned).sum())
         if target is None and np.array_equal(self._shares(total), shares):
@@ -587,7 +443,9 @@ class _Design:
             "value": np.array([p.value for p in found.points]),
             "bound": np.array(bounds),
             "smallest": np.array(found.smallest or 0),
-            **next((p.arrays() for p in found.points if p.n_poses == n), {}),
+            "chosen": next(
+                (p.chosen for p in found.points if p.n_poses == n), np.zeros(0, dtype=np.int64)
+            ),
         }
 
     def _target(self, setup: Setup, target: float) -> float:
@@ -603,20 +461,16 @@ class _Design:
         return (target * 1e6 / unit_value) ** 2
 
     def _plan(
-        self, setup: Setup, found: Selection, shares: IntArray, counts: CandidateCounts,
-        targets: str,
+        self, setup: Setup, seek: Search, found: Selection, counts: CandidateCounts, targets: str,
         curve: tuple[PlanSize, ...], known: Known, drawn: Array, pinned: FeasiblePool | None,
     ) -> Plan:  # fmt: skip
         self.progress("order of execution")
-        found, execution, told = ordered(
-            setup, found, shares, self.feasibility, self.options.seed, self.progress,
-            self.checkpoint, pinned,
-        )  # fmt: skip
+        found, execution, told = ordered(seek, found, pinned)
         self.warnings += told
         pool, chosen = found.pool, found.chosen
         q, load, blocks = pool.q[chosen], pool.load[chosen], pool.blocks[:, chosen]
         spec, model = self.cell.design, setup.information.model
-        problem = setup.problem(pool, shares)
+        problem = setup.problem(pool, seek.shares)
         M = setup.gathered(blocks)[0]
         when = execution.times(len(q), len(self.states.forces))
         noise, alias = model.cell.noise, found.alias
@@ -641,7 +495,10 @@ class _Design:
             level_joint=None if self.space.held is None else f"joint{self.space.held + 1}",
             execution=execution,
             candidates=counts,
-            certificate=found.certificate,
+            certificate=replace(
+                found.certificate,
+                starts=tuple(setup.criterion.figure(v) for v in found.certificate.starts),
+            ),
             predicted=tuple(
                 p
                 for p in predicted(model, setup.found, left, numbers)
@@ -668,13 +525,17 @@ class _Design:
 
     def _names(self, found: Selection) -> tuple[str, ...]:
         """Those that stay keep theirs, and the others are numbered after all there have been."""
-        pins = self.options.pins
-        if pins is None:
+        pins, q = self.options.pins, found.pool.q
+        if pins is None and not self.taught:
             return ()
         labels = self.options.done.configuration_labels if self.options.done else ()
-        new = count(next_number((*labels, *pins.taken)))
-        own = len(found.pool) - found.pinned
-        return tuple(pins.names[i - own] if i >= own else str(next(new)) for i in found.chosen)
+        kept, taken = ((), ()) if pins is None else (pins.names, pins.taken)
+        new = count(next_number((*labels, *taken, *self.taught.values())))
+        own, names = len(found.pool) - found.pinned, list[str]()
+        for i in found.chosen:
+            name = kept[i - own] if i >= own else self.taught.get(q[i].tobytes())
+            names.append(str(next(new)) if name is None or name in names else name)
+        return tuple(names)
 
     def _everywhere(self, setup: Setup, M: Array, random: Array, left: Array) -> Everywhere | None:
         """The error at the test poses and elsewhere of the plan of information M (p, p), of random

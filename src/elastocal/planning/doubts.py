@@ -29,13 +29,15 @@ from elastocal.model.arm import usual_sizes
 from elastocal.model.effects.catalogue import CATALOGUE, SOMETHING
 from elastocal.model.manipulator import Model
 from elastocal.model.observations import observe
+from elastocal.planning.criterion import covariance
+from elastocal.planning.exchange import random_plan
 from elastocal.planning.information import (
     LoadStates,
     PoseInformation,
     observed_weights,
 )
 from elastocal.planning.plan import Doubt, Gain
-from elastocal.planning.selection import DesignProblem, is_regular, random_plan
+from elastocal.planning.relaxation import DesignProblem
 from elastocal.planning.setup import Known, Setup
 from elastocal.units import Array, BoolArray, IntArray
 
@@ -124,15 +126,14 @@ def leading_directions(problem: DesignProblem, R: Array, doubtful: BoolArray) ->
     """
     if len(problem.prior) > 1 or not doubtful.any():
         return None
-    size = np.bincount(problem.group, minlength=len(problem.shares))
-    even = problem.information((problem.shares / np.maximum(size, 1))[problem.group])
+    even = problem.at(problem.even())
     rng = np.random.default_rng(0)
-    drawn = [problem.prior + problem.sum_of(random_plan(problem, rng)) for _ in range(PLANS)]
+    drawn = [problem.information(random_plan(problem, rng)) for _ in range(PLANS)]
     x, u = np.flatnonzero(~doubtful), np.flatnonzero(doubtful)
     unit = np.eye(len(doubtful))
     unit[np.ix_(u, u)] = np.linalg.inv(np.linalg.cholesky(problem.prior[0][np.ix_(u, u)])).T
     kept, target = np.eye(len(doubtful))[:, x], R @ unit  # in units of the prior
-    plans = [M for M in (even, *drawn) if is_regular(M[:, x[:, None], x])]
+    plans = [M for M in (even, *drawn) if covariance(M[:, x[:, None], x])[1].all()]
     while plans and kept.shape[1] <= WORTH * len(doubtful):
         errors = []
         for M in plans:

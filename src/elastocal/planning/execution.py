@@ -6,10 +6,8 @@ from collections import Counter
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 from itertools import pairwise
-from typing import Any
 
 import numpy as np
-from scipy.optimize import linear_sum_assignment
 
 from elastocal.cell.plan_wishes import Motion
 from elastocal.errors import require
@@ -76,9 +74,8 @@ class Stop:
 class Execution:
     """The stops in order, and the way home, through `home_via` (k, n), where there is a home.
 
-    `travel` s in all; no order of these visits, whose moves go straight or through the given
-    points, travels less than `bound` s.  `checked` moves were tried, `blocked` of them in the
-    way of something.  `take_off`: the load hangs on the arm after the last stop.  `drift`: what a
+    `travel` s in all.  `checked` moves were tried, `blocked` of them in the way of something.
+     `take_off`: the load hangs on the arm after the last stop.  `drift`: what a
     steady drift would do to the plan's result in this order; None where that was not asked.
     """
 
@@ -87,7 +84,6 @@ class Execution:
     home_travel: float
     take_off: bool
     motion: Motion
-    bound: float
     checked: int
     blocked: int
     drift: Drifting | None = None
@@ -95,13 +91,6 @@ class Execution:
     @property
     def travel(self) -> float:
         return sum(stop.travel for stop in self.stops) + self.home_travel
-
-    @property
-    def gap(self) -> float:
-        """How much longer than the best order this one can be: travel / bound − 1."""
-        if self.travel <= self.bound:
-            return 0.0
-        return self.travel / self.bound - 1 if self.bound > 0 else np.inf
 
     @property
     def one_sided(self) -> tuple[int, ...]:
@@ -168,74 +157,11 @@ def _time(moves: Moves, way: list[int]) -> float:
     return float(sum(moves.times[i, j] for i, j in pairwise(way)))
 
 
-# A lower bound on the cost of every tour, to say how far a found one can be from the best.
+# The shortest tour through given costs, by iterated local search.
 
-SUBGRADIENTS = 400
-
-
-def tour_bound(cost: Array, upper: float) -> float:
-    """The larger of the assignment bound and the Held–Karp bound, ≤ every tour's cost.
-
-    `cost` (V, V) of directed moves, V ≥ 2, finite; `upper`: cost of a known tour.  Held–Karp is
-    taken on min(c_ij, c_ji), which no tour's cost falls below.
-    """
-    closed = cost + np.diag(np.full(len(cost), 2.0 * upper + 1.0))
-    rows, columns = linear_sum_assignment(closed)
-    assignment = float(closed[rows, columns].sum())
-    return max(assignment, held_karp_bound(np.minimum(cost, cost.T), upper))
-
-
-def held_karp_bound(cost: Array, upper: float) -> float:
-    """max_π min over 1-trees of Σ (c_ij + π_i + π_j) − 2 Σ π_i (Held and Karp 1971).
-
-    A 1-tree is a spanning tree of all nodes but node 0 and two edges at node 0; every tour is
-    one, with degree 2 everywhere.  π by subgradient steps in the direction degree − 2, their
-    length from `upper` (Polyak), halved when the bound stalls; every step's value is a bound.
-    """
-    n = len(cost)
-    if n == 2:
-        return float(2 * cost[0, 1])
-    price, best, best_price = np.zeros(n), -np.inf, np.zeros(n)
-    scale, stalled = 1.0, 0
-    for _ in range(SUBGRADIENTS):
-        value, degree = _one_tree(cost + price[:, None] + price[None, :])
-        value -= 2 * float(price.sum())
-        if value > best:
-            best, best_price, stalled = value, price, 0
-        else:
-            stalled += 1
-        slope = degree - 2.0
-        if not slope.any():
-            break
-        if stalled == 10:
-            scale, stalled, price = scale / 2, 0, best_price
-            continue
-        price = price + scale * max(upper - value, 1e-9 * abs(upper)) / float(slope @ slope) * slope
-    return best
-
-
-def _one_tree(cost: Array) -> tuple[float, Array]:
-    """Cost and node degrees (V,) of the minimum 1-tree: Prim's tree of all nodes but node 0."""
-    n = len(cost)
-    ends = np.argsort(cost[0, 1:], kind="stable")[:2] + 1
-    total, degree = float(cost[0, ends].sum()), np.zeros(n)
-    rest = cost[1:, 1:].copy()
-    near, via, last = np.full(n - 1, np.inf), np.zeros(n - 1, dtype=np.int64), 0
-    for _ in range(n - 2):
-        rest[:, last] = near[last] = np.inf  # it is in the tree
-        closer = rest[last] < near
-        near[closer], via[closer] = rest[last, closer], last
-        last = int(near.argmin())
-        total += float(near[last])
-        degree[[last + 1, via[last] + 1]] += 1
-    degree[ends] += 1
-    degree[0] = 2
-    return total, degree
-
-
-# The shortest tour through given costs, by PyVRP's iterated local search.
-
-LARGEST = 2**40  # of a cost as an integer: PyVRP warns beyond 2⁴⁴
+PART = 3  # visits that are put elsewhere together, at most
+WINDOW = 30  # visits among which a kick mixes segments
+GAINED = 1e-9  # of the tour, that a step must gain
 
 
 def tour_cost(cost: Array, tour: list[int]) -> float:
@@ -257,59 +183,81 @@ def greedy_tour(cost: Array) -> list[int]:
     return tour
 
 
-def shortest_tour(cost: Array, start: list[int], seed: int, iterations: int) -> list[int]:
-    """A short tour 0 → every node → 0, never worse than `start` (Wouda, Lan and Kool 2024).
+def shortest_tour(cost: Array, start: list[int], seed: int, kicks: int) -> list[int]:
+    """A short tour 0 → every node → 0, never worse than `start`.
 
-    `cost` (V + 1, V + 1), finite and not negative, need not be symmetric.  The search ends after
-    `iterations`, or a third of them without gain, not after a time, so the same seed gives the
-    same tour on any machine.
+    `cost` (V + 1, V + 1), finite and not negative, need not be symmetric.  Segments are turned
+    round (2-opt) or put elsewhere (Or-opt) until that gains nothing; then segments are exchanged
+    at random (double bridge), and again, `kicks` times from the best tour (Martin, Otto & Felten
+    1991).  The same seed gives the same tour on any machine.
     """
-    if len(cost) <= 2:
-        return start
-    import pyvrp
-    from pyvrp import search
+    rng = np.random.default_rng(seed)
+    best = _locally_best(cost, np.array(start, dtype=np.int64))
+    least = tour_cost(cost, best.tolist())
+    for _ in range(kicks if len(best) > PART else 0):
+        width = min(WINDOW, len(best))
+        first = int(rng.integers(len(best) - width + 1))
+        a, b, c = (first + np.sort(rng.choice(width + 1, 3, replace=False))).tolist()
+        new = np.concatenate([best[:a], best[b:c], best[a:b], best[c:]])
+        new = _locally_best(cost, new)
+        found = tour_cost(cost, new.tolist())
+        if found < least * (1 - GAINED):
+            best, least = new, found
+    tour = [int(node) for node in best]
+    return tour if least < tour_cost(cost, start) else start
 
-    integers: Any = np.round(cost * (LARGEST / max(float(cost.max()), 1e-300))).astype(np.int64)
-    np.fill_diagonal(integers, 0)
-    n = len(integers)
-    data = pyvrp.ProblemData(
-        locations=[pyvrp.Location(0, 0) for _ in range(n)],
-        clients=[pyvrp.Client(location=i) for i in range(1, n)],
-        depots=[pyvrp.Depot(location=0)],
-        vehicle_types=[pyvrp.VehicleType(num_available=1)],
-        distance_matrices=[integers],
-        duration_matrices=[0 * integers],
-    )
-    # One vehicle: the moves that exchange between routes are left out, longer segments added.
-    # Lower history than the default, which is made for thousands of nodes.
-    params = pyvrp.SolveParams(
-        operators=[
-            search.Relocate1, search.Relocate2, search.Relocate3, search.Swap11, search.Swap21,
-            search.Swap22, search.Swap31, search.Swap32, search.Swap33,
-        ],
-        ils=pyvrp.IteratedLocalSearchParams(history_length=100),
-    )  # fmt: skip
-    stop = pyvrp.stop.MultipleCriteria(
-        [pyvrp.stop.MaxIterations(iterations), pyvrp.stop.NoImprovement(iterations // 3)]
-    )
-    result = pyvrp.solve(
-        data,
-        stop,
-        seed=seed % 2**32,  # it takes no larger one
-        collect_stats=False,
-        display=False,
-        params=params,
-        initial_solution=pyvrp.Solution(data, [[node - 1 for node in start]]),
-    )
-    (route,) = result.best.routes()
-    tour = [stop.idx + 1 for stop in route if stop.is_client()]
-    return tour if tour_cost(cost, tour) < tour_cost(cost, start) else start
+
+def _locally_best(cost: Array, tour: IntArray) -> IntArray:
+    """The tour once neither turning a segment round nor putting one elsewhere shortens it."""
+    enough = GAINED * tour_cost(cost, tour.tolist())
+    while True:
+        gain, move = _best_turn(cost, tour)
+        for size in range(1, min(PART, len(tour) - 1) + 1):
+            other = _best_shift(cost, tour, size)
+            if other[0] > gain:
+                gain, move = other
+        if gain <= enough:
+            return tour
+        tour = move
+
+
+def _best_turn(cost: Array, tour: IntArray) -> tuple[float, IntArray]:
+    """What turning the best segment i … j round gains, and the tour then."""
+    ring = np.concatenate([[0], tour, [0]])
+    here, before, after = ring[1:-1], ring[:-2], ring[2:]
+    forth = np.concatenate([[0.0], cost[here[:-1], here[1:]].cumsum()])
+    back = np.concatenate([[0.0], cost[here[1:], here[:-1]].cumsum()])
+    inside = (forth - back)[None, :] - (forth - back)[:, None]
+    gain = cost[before, here][:, None] + cost[here, after][None, :] + inside
+    gain = gain - cost[before[:, None], here[None, :]] - cost[here[:, None], after[None, :]]
+    gain = np.triu(gain, 1)
+    i, j = np.unravel_index(int(gain.argmax()), gain.shape)
+    return float(gain[i, j]), np.concatenate([tour[:i], tour[i : j + 1][::-1], tour[j + 1 :]])
+
+
+def _best_shift(cost: Array, tour: IntArray, size: int) -> tuple[float, IntArray]:
+    """What putting the best segment of `size` visits elsewhere gains, and the tour then."""
+    ring, n = np.concatenate([[0], tour, [0]]), len(tour)
+    first = np.arange(1, n - size + 2)  # its place in the ring
+    a, b = ring[first], ring[first + size - 1]
+    p, q = ring[first - 1], ring[first + size]
+    left = cost[p, a] + cost[b, q] - cost[p, q]
+    u, v = ring[:-1], ring[1:]  # between which it goes
+    added = cost[u[None, :], a[:, None]] + cost[b[:, None], v[None, :]] - cost[u, v][None, :]
+    gain = left[:, None] - added
+    place = np.arange(n + 1)[None, :]
+    gain[(place >= first[:, None] - 1) & (place <= first[:, None] + size - 1)] = -np.inf
+    i, k = np.unravel_index(int(gain.argmax()), gain.shape)
+    start, rest = int(first[i]) - 1, np.delete(tour, np.arange(first[i] - 1, first[i] - 1 + size))
+    at = int(k) if k < start else int(k) - size
+    part = tour[start : start + size]
+    return float(gain[i, k]), np.concatenate([rest[:at], part, rest[at:]])
 
 
 # The shortest execution of a plan: every pose in its load states, by collision-free moves.
 
-ITERATIONS = 5000
-FEW_ITERATIONS = 300  # while moves of the tour still turn out to be blocked
+KICKS = 400
+FEW_KICKS = 30  # while moves of the tour still turn out to be blocked
 PATIENT = 5  # times, before all ways are checked
 
 
@@ -326,7 +274,7 @@ def schedule(
     alias: Alias | None = None,
     paired: bool = False,
     seed: int = 0,
-    iterations: int = ITERATIONS,
+    kicks: int = KICKS,
     progress: Callable[[str], None] = lambda message: None,
 ) -> Execution:
     """The order of `q` (N, n) with the least travel time found, from and to `motion.home`.
@@ -340,7 +288,7 @@ def schedule(
     side is blocked (`Execution.one_sided`).
 
     Solve, check the moves of the solution, forbid the blocked ones, and again: at the end all
-    moves are checked, and the tour is one that the routing solver holds best at costs that are
+    moves are checked, and the tour is one that the search holds best at costs that are
     nowhere above the true ones.  The same seed gives the same order.
 
     With an `alias` the order found is one in which a drift does little to what the plan is for,
@@ -362,7 +310,7 @@ def schedule(
     tour = greedy_tour(costs.cost)
     thorough, done, rounds = False, False, 0
     while not done:
-        effort = iterations if thorough else min(iterations, FEW_ITERATIONS)
+        effort = kicks if thorough else min(kicks, FEW_KICKS)
         tour = shortest_tour(costs.cost, tour, seed, effort)
         tour = _unloaded_first(tour, costs.cost, moves)
         blocked = moves.check(tour, costs)
@@ -373,18 +321,12 @@ def schedule(
             costs = moves.costs()
         done, thorough = thorough and not blocked, not blocked
     refuse_impossible(moves, tour, costs, blockers)
-    # The bound leaves open in which order the load states come: their number alone is fixed.
-    way, fixed = costs.cost - costs.changed, tour_cost(costs.apart, tour)
-    drift, shortest = None, tour
+    drift = None
     if (alias is not None or motion.load_changes) and motion.longer > 0:
         tour, moves, later, drift = _against_drift(
             moves, motion, tour, costs, alias, seed, progress
         )
-        if len(set(moves.visits.load.tolist())) > 1:
-            # Load states may come more than once: nothing but the way itself bounds that.
-            way, fixed, shortest = later.cost - later.apart - later.changed, 0.0, tour
         costs = later
-    bound = tour_bound(way, tour_cost(way, shortest)) - fixed
     order = [(node, 0) for node in tour]
     if motion.reference_every:
         order = with_references(tour, moves, costs, motion.reference_every, paired)
@@ -404,14 +346,12 @@ def schedule(
         visited[key] += 1
     _, home = moves.way(nodes[-1], 0, costs)  # empty without a home
     home_travel = _time(moves, home)
-    travel = sum(stop.travel for stop in stops) + home_travel
     return Execution(
         stops=tuple(stops),
         home_via=moves.points[home[1:-1]],
         home_travel=home_travel,
         take_off=bool(moves.loaded[stops[-1].load]),
         motion=motion,
-        bound=float(np.clip(bound, 0.0, travel)),
         checked=moves.checked,
         blocked=moves.blocked,
         drift=drift,

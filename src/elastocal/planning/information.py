@@ -262,10 +262,9 @@ class PoseInformation:
         B = at.B.reshape(len(q), -1, len(self.columns)) * self.sizes
         return np.asarray(np.linalg.solve(factor, B), dtype=np.float64)
 
-    def whitener(self, q: Array, load: int) -> Array:
-        """W (S, r, r) of one pose q (n,): W B is its block before scaling."""
-        one = q[None], np.array([load])
-        return np.stack([np.linalg.inv(self.noise(*one, x)[1][0]) for x in self.scenarios])
+    def whiteners(self, q: Array, load: IntArray) -> Array:
+        """W (S, N, r, r) of poses q (N, n): W B is a block before scaling."""
+        return np.stack([np.linalg.inv(self.noise(q, load, x)[1]) for x in self.scenarios])
 
     def seen(self, q: Array, load: IntArray) -> BoolArray:
         """(N, L, markers): which markers are seen of poses q (N, n) in each load state; True in

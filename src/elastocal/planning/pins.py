@@ -13,13 +13,13 @@ from elastocal.errors import InputError, option, require
 from elastocal.measurements import Measurements
 from elastocal.model.chain import Chain, joint_index
 from elastocal.model.manipulator import Model
+from elastocal.planning.candidates import LEVEL_SLACK
 from elastocal.planning.feasibility import Feasibility, Struck
 from elastocal.planning.information import ALL_LOADS, LoadStates
 from elastocal.planning.setup import shares_of
 from elastocal.text import did_you_mean, listed, quoted
 from elastocal.units import Array, IntArray
 
-LEVEL_SLACK = 1e-6  # rad or m by which a file's digits may miss a level
 SAME_FORCE = 1e-3  # N
 
 

@@ -17,7 +17,7 @@ from elastocal.files import atomic_write_text
 from elastocal.measurements import DEFAULT_MARKER, Measurements, families
 from elastocal.model.manipulator import Model
 from elastocal.planning.choices import Chosen
-from elastocal.planning.criterion import Criterion
+from elastocal.planning.criterion import Objective
 from elastocal.planning.execution import Execution, Stop
 from elastocal.planning.information import Estimable
 from elastocal.tables import column, csv_text
@@ -315,7 +315,7 @@ class Certificate:
     `efficiency_pool` is certified: no plan with the same shares from the `pool` candidates has a
     value below `bound_pool`.  `efficiency_continuum` is an estimate: the search tried `searched`
     poses and `ascents` local searches, and a better pose may still exist.  Values Φ; None where
-    the criterion has no bound.
+    the criterion has no bound.  `starts`: Φ at which each start of the search ended.
     """
 
     pool: int
@@ -325,6 +325,7 @@ class Certificate:
     efficiency_continuum: float | None = None
     searched: int = 0
     ascents: int = 0
+    starts: tuple[float, ...] = ()
 
 
 @dataclass(frozen=True)
@@ -345,7 +346,7 @@ class Chance:
     efficiency: float | None
 
     @classmethod
-    def of(cls, values: Array, value: float, criterion: Criterion) -> Chance:
+    def of(cls, values: Array, value: float, criterion: Objective) -> Chance:
         """What random plans of Φ = `values` (n,), ascending, are beside a plan of Φ = `value`."""
         phi = (float(np.median(values)), float(values[0]), float(values[-1]))
         median, best, worst = (criterion.reported(v)[0] if np.isfinite(v) else None for v in phi)
@@ -669,6 +670,7 @@ class Plan(Result):
                 "continuum_is": "estimated on the continuum",
                 "searched": c.searched,
                 "ascents": c.ascents,
+                "starts": list(c.starts),
             },
             "random_plans": None if self.chance is None else asdict(self.chance),
             "everywhere": None if self.everywhere is None else asdict(self.everywhere),

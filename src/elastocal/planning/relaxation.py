@@ -1,403 +1,266 @@
-"""The relaxation: weights instead of whole poses, solved to a certified gap.
+"""The choice of poses as a problem, and its relaxation: weights instead of whole poses.
 
-A small support of candidates is solved exactly by one of two masters, and all other candidates are
-priced against it by their first derivatives until none of them gains (column generation).  The
-masters, Newton's method of `interior_point` and a conic program for clarabel, are written
-independently of each other, so that each checks the other.
+A few candidates are solved for by Newton's method, all others priced against them by their
+first derivatives until none of them gains (column generation).  With the tangent (Φ, G) anywhere
+
+    Φ(w') ≥ Φ² / (⟨G, prior⟩ + max_w' Σ w'_i d_i),        d_i = ⟨G, B_iᵀB_i⟩
+
+for all weights 0 ≤ w'_i ≤ most with Σ_{i∈l} w'_i = n_l, exact plans among them; the maximum is
+taken greedily.  Sources: Pukelsheim, Optimal Design of Experiments (2006), ch. 5 and 7; Harman,
+Filová & Richtárik, J. Am. Stat. Assoc. 115 (2020) 348.
 """
 
 from __future__ import annotations
 
-import warnings
-from collections.abc import Callable
-from dataclasses import dataclass
-from functools import cached_property, partial
-from typing import Any, Literal, get_args
+from dataclasses import dataclass, replace
+from functools import cached_property, lru_cache
 
 import numpy as np
-from scipy.linalg import cho_factor, cho_solve
 
 from elastocal.errors import InsufficientDataError, require
-from elastocal.planning.criterion import (
-    Cone,
-    Criterion,
-    Gradient,
-    ScenarioCriterion,
-    Term,
-    Worst,
-)
-from elastocal.planning.selection import DesignProblem, largest_sum, tangent_bound, triangle
-from elastocal.units import Array, IntArray, Progress
+from elastocal.planning.criterion import Objective, Tangent, covariance, inverse
+from elastocal.units import Array, BoolArray, IntArray, Progress
 
-# Newton's method for a few hundred candidates: a primal–dual interior point with exact Hessian.
-#
-#     minimise max_j f_j(w),  f_j = log Φ_j(M(w)),   subject to  E w = n,  0 ≤ w ≤ u.
-#
-# f_j is convex since 1/Φ_j is concave; E (L, k) sums the weights of each level.  For σ → 0 the
-# barrier function
-#
-#     F_σ(w) = min_τ [τ − σ Σ_j log(τ − f_j)] − σ Σ_i log w_i − σ Σ_i log(u − w_i)
-#
-# is minimised by Newton steps in which the barrier's own curvatures σ/s_j², σ/w_i², σ/(u − w_i)²
-# are replaced by μ_j/s_j, z_i/w_i, y_i/(u − w_i) with multipliers that follow their own Newton
-# steps; s_j = τ − f_j.  F_σ decreases in every step, so that no start can fail, and the multipliers
-# give the fast last steps and the bound.  Boyd & Vandenberghe, Convex Optimization (2004), ch. 11;
-# Wächter & Biegler, Math. Program. 106 (2006) 25, for keeping the multipliers near σ/w.
-
-MOST_STEPS = 100
-TO_BOUNDARY = 0.99
-# Reduction of σ, once the decrement λ² of Newton's step is below CENTRED · σ · (constraints).
-REDUCTION = 0.1
-CENTRED = 0.3
-# and no multiplier further than this |log| from σ/slack.
-SPREAD = 2.0
-ARMIJO = 1e-4
-# A gap that should be below the accuracy is, for σ below this part of it, hidden by rounding.
-FINEST = 1e-2
-# Multipliers stay within this factor of σ/slack.
-NEAR = 1e4
-# Relative to the mean diagonal of the Hessian: keeps it definite to rounding.
-RIDGE = 1e-14
+# Packed information larger than this (bytes) is not stored; pricing then goes through the blocks.
+PACKED_BYTES = 1_500_000_000
+BATCH = 512  # candidates whose products are formed at once
+# Of the information of even weights, added to every plan's: none is singular, and the bound holds
+# all the same, since more information lowers Φ.
+RIDGE = 1e-9
 
 
 @dataclass(frozen=True)
-class Restricted:
-    """Candidates A (S, k, p, p) in levels (k,) 0 … L−1 with shares (L,), each at most `most`.
+class DesignProblem:
+    """Choose shares[l] of the candidates of each group l so that Φ(M) is smallest.
 
-    `base` (S, p, p): information that does not depend on their weights.
+    `blocks` (S, N, r, p): whitened, scaled B of candidate i under scenario s of the arm;
+    M_s(w) = prior_s + Σ_i w_i B_siᵀ B_si with `prior` (S, p, p) from prior knowledge and from
+    measurements already done.  `group` (N,) in 0 … L−1 and `shares` (L,) the numbers of poses.
+    `most`: how often one candidate may be measured in a plan.
     """
 
-    A: Array
-    base: Array
-    level: IntArray
+    blocks: Array
+    prior: Array
+    group: IntArray
     shares: IntArray
-    most: int
+    criterion: Objective
+    most: int = 1
 
-    def information(self, w: Array) -> Array:
-        return self.base + np.tensordot(self.A, w, (1, 0))
+    def __post_init__(self) -> None:
+        S, N, _, p = self.blocks.shape
+        require(self.prior.shape == (S, p, p), f"prior is {self.prior.shape}, not {(S, p, p)}")
+        require(self.group.shape == (N,), f"group is {self.group.shape}, not {(N,)}")
+        available = np.bincount(self.group, minlength=len(self.shares)) * self.most
+        short = np.flatnonzero(available < self.shares)
+        require(
+            len(short) == 0,
+            f"group {short[0] if len(short) else 0} has fewer candidates than its share",
+        )
 
-    def relative(self, w: Array) -> Array:
-        """w_i as a part of the largest weight of its level."""
-        largest = np.zeros(len(self.shares))
-        np.maximum.at(largest, self.level, w)
-        return np.asarray(w / largest[self.level])
+    @property
+    def n_candidates(self) -> int:
+        return int(self.blocks.shape[1])
 
-    def inside(self, w: Array, depth: float) -> Array:
-        """w ≥ 0 scaled to the shares and moved off its bounds, `depth` of the way to even ones."""
-        size = np.bincount(self.level)
-        total = np.bincount(self.level, w)
-        scale = self.shares / np.where(total > 0.0, total, np.inf)
-        clipped = np.minimum(w * scale[self.level], self.most)
-        filled = np.bincount(self.level, clipped)
-        missing = np.maximum(self.shares - filled, 0.0)
-        part = missing / np.maximum(self.most * size - filled, np.finfo(float).tiny)
-        full = clipped + part[self.level] * (self.most - clipped)
-        return np.asarray((1.0 - depth) * full + depth * (self.shares / size)[self.level])
+    @property
+    def n_poses(self) -> int:
+        return int(self.shares.sum())
 
-
-@dataclass(frozen=True)
-class SmoothPieces:
-    """Φ(M) = max_j Φ_j, Φ_j = Σ_t mix_jt φ_t(M_s(t)⁻¹).
-
-    `terms`: one Term per scenario s; the columns of `mix` (J, T) ≥ 0 are their functions in order.
-    One row is a smooth criterion (a mean over scenarios), the identity the worst case.
-    """
-
-    terms: tuple[Term, ...]
-    mix: Array
-
-    def at(self, M: Array) -> LocalPieces | None:
-        """Φ_j and derivatives at M (S, p, p); None where M is not positive definite."""
-        try:
-            root = np.linalg.inv(np.linalg.cholesky(M))
-        except np.linalg.LinAlgError:
+    @cached_property
+    def packed(self) -> Array | None:
+        """A_si = B_siᵀB_si as its upper triangle, √2 off the diagonal (S, N, p(p+1)/2), so that
+        ⟨G, A_si⟩ is a product of rows; None where that takes too much memory."""
+        S, N, _, p = self.blocks.shape
+        rows, columns, factor = triangle(p)
+        if 8 * S * N * len(rows) > PACKED_BYTES:
             return None
-        V = root.transpose(0, 2, 1) @ root
-        slopes = [term.slope(V_s) for term, V_s in zip(self.terms, V, strict=True)]
-        values = self.mix @ np.concatenate([value for value, _ in slopes])
-        if not np.all(np.isfinite(values)):
-            return None
-        return LocalPieces(self, V, values, [C for _, C in slopes])
+        found = np.empty((S, N, len(rows)))
+        for k in range(0, N, BATCH):
+            A = self.matrices(np.arange(k, min(k + BATCH, N)))
+            found[:, k : k + BATCH] = A[..., rows, columns] * factor
+        return found
+
+    def matrices(self, chosen: IntArray) -> Array:
+        """A (S, k, p, p), B_siᵀB_si of the candidates `chosen` (k,)."""
+        B = self.blocks[:, chosen]
+        return np.asarray(B.swapaxes(-1, -2) @ B)
+
+    def prices(self, G: Array) -> Array:
+        """d (N,): d_i = Σ_s tr(B_si G_s B_siᵀ) = −∂Φ/∂w_i for G (S, p, p)."""
+        if self.packed is None:
+            return block_prices(self.blocks, G)
+        rows, columns, factor = triangle(G.shape[-1])
+        flat = G[:, rows, columns] * factor
+        return np.asarray((self.packed @ flat[:, :, None])[..., 0].sum(axis=0))
+
+    def information(self, chosen: IntArray, weights: Array | None = None) -> Array:
+        """M (S, p, p) of the candidates `chosen` (k,), each once or with `weights` (k,)."""
+        B = self.blocks[:, chosen]
+        if weights is not None:
+            B = B * np.sqrt(weights)[:, None, None]
+        B = B.reshape(len(B), -1, B.shape[-1])
+        return np.asarray(self.prior + B.swapaxes(1, 2) @ B)
+
+    def at(self, weights: Array) -> Array:
+        """M (S, p, p) at weights w (N,)."""
+        used = np.flatnonzero(weights)
+        if self.packed is None or 4 * len(used) < len(weights):
+            return self.information(used, weights[used])
+        p = self.blocks.shape[-1]
+        rows, columns, factor = triangle(p)
+        M = np.empty((len(self.packed), p, p))
+        M[:, rows, columns] = M[:, columns, rows] = weights @ self.packed / factor
+        return self.prior + M
+
+    def even(self) -> Array:
+        """w (N,): each group's share spread evenly."""
+        size = np.bincount(self.group, minlength=len(self.shares))
+        return np.asarray((self.shares / np.maximum(size, 1))[self.group])
+
+    def value(self, chosen: IntArray) -> float:
+        """Φ of a plan; inf where it leaves parameters open."""
+        return float(self.criterion.value(self.information(chosen)))
+
+    def restricted(self, kept: IntArray) -> DesignProblem:
+        """With the candidates `kept` (k,) alone."""
+        part = replace(self, blocks=self.blocks[:, kept], group=self.group[kept])
+        if "packed" in self.__dict__ and self.packed is not None:
+            part.__dict__["packed"] = self.packed[:, kept]
+        return part
 
 
-@dataclass(frozen=True)
-class LocalPieces:
-    """The pieces at one M: V (S, p, p), `values` Φ_j (J,), C = ∂φ/∂V of each scenario's terms."""
-
-    pieces: SmoothPieces
-    V: Array
-    values: Array
-    C: list[Array]
-
-    def shares(self, mu: Array) -> list[Array]:
-        """Σ_j μ_j mix_jt/Φ_j (T_s,) per scenario: how much each term counts in Σ μ_j log Φ_j."""
-        counts = np.cumsum([term.count for term in self.pieces.terms])[:-1]
-        return list(np.split((mu / self.values) @ self.pieces.mix, counts))
-
-    def slopes(self, A: Array) -> Array:
-        """−∂ log Φ_j/∂w_i (J, k) for A (S, k, p, p)."""
-        of_terms = []
-        for V, C, A_s in zip(self.V, self.C, A, strict=True):
-            G = V @ C @ V
-            of_terms.append(G.reshape(len(G), -1) @ A_s.reshape(len(A_s), -1).T)
-        return np.asarray(self.pieces.mix @ np.concatenate(of_terms)) / self.values[:, None]
-
-    def tangent(self, mu: Array) -> Gradient:
-        """Φ_μ = Σ c_j Φ_j ≤ Φ with c_j ∝ μ_j/Φ_j, Σ c_j = 1, and its G.
-
-        1/Φ_μ is concave as 1/Φ is, so the tangent bounds Φ too; at the optimum, where μ are the
-        multipliers, it is tight, while a single piece would not be.
-        """
-        scale = 1.0 / np.sum(mu / self.values)
-        shares = self.shares(mu)
-        C = np.stack([np.tensordot(c, C, 1) for c, C in zip(shares, self.C, strict=True)])
-        return Gradient(float(scale * mu.sum()), scale * (self.V @ C @ self.V))
-
-    def hessian(self, A: Array, mu: Array, slopes: Array) -> Array:
-        """Σ_j μ_j ∂² log Φ_j/∂w_i∂w_j (k, k); `slopes` (J, k) as from `slopes`."""
-        k = A.shape[1]
-        H = -(slopes.T * mu) @ slopes
-        for term, share, V, C, A_s in zip(
-            self.pieces.terms, self.shares(mu), self.V, self.C, A, strict=True
-        ):
-            AV = A_s @ V
-            G = V @ np.tensordot(share, C, 1) @ V
-            # tr(A_i V A_j G): A_i V beside the transpose of A_j G.
-            H += 2.0 * AV.reshape(k, -1) @ (A_s @ G).transpose(0, 2, 1).reshape(k, -1).T
-            curvature = term.curvature(V, V @ AV)
-            if curvature is not None:
-                H += share[0] * curvature
-        return 0.5 * (H + H.T)
+def block_prices(blocks: Array, G: Array) -> Array:
+    """⟨G, B_iᵀB_i⟩ (N,), summed over scenarios, of blocks (S, N, r, p) and G (S, p, p)."""
+    return np.asarray(((blocks @ G[:, None]) * blocks).sum(axis=(0, 2, 3)))
 
 
-def pieces_of(criterion: Criterion, scenarios: int) -> SmoothPieces | None:
-    """The criterion as a maximum of smooth pieces, from its terms; None where it is none.
+@lru_cache
+def triangle(p: int) -> tuple[IntArray, IntArray, Array]:
+    """Rows, columns (k,) of the upper triangle of (p, p), and √2 off its diagonal, else 1."""
+    rows, columns = np.triu_indices(p)
+    return rows, columns, np.where(rows == columns, 1.0, np.sqrt(2.0))
 
-    These are E and its O3, whose pieces would be all directions, and the mean over several
-    scenarios of a maximum.
+
+def balancing(problem: DesignProblem) -> Array:
+    """T (S, p, p): parameters z, y = T z, whose information at even weights is 1.
+
+    Where base, markers and geometry are identified together, information is conditioned so badly
+    that an update of Φ by one pose would keep no digits otherwise.  Raises InsufficientDataError
+    where all candidates together leave something open, as then every plan does.
     """
-    worst = isinstance(criterion, Worst) or scenarios == 1
-    if isinstance(criterion, Worst) and criterion.order != np.inf:
-        return None
-    base = criterion.base if isinstance(criterion, Worst) else criterion
-    assert isinstance(base, ScenarioCriterion)
-    terms = []
-    for s in range(scenarios):
-        term = base.term(s)
-        if term is None or not (worst or term.count == 1):
-            return None
-        terms.append(term)
-    count = sum(term.count for term in terms)
-    return SmoothPieces(tuple(terms), np.eye(count) if worst else np.full((1, count), 1.0 / count))
+    M = problem.at(problem.even())
+    size = np.sqrt(np.maximum(np.diagonal(M, axis1=1, axis2=2), 0.0))
+    scale = 1 / np.where(size > 0, size, 1.0)
+    ok = covariance(M)[1]
+    if not ok.all():
+        n = int(np.count_nonzero(problem.shares[problem.group]))
+        raise InsufficientDataError(
+            f"all {n} candidates of the groups with a share together do not determine the "
+            f"{M.shape[-1]} parameters; allow other joint levels or more load, switch effects off, "
+            "or add prior knowledge"
+        )
+    L: Array = np.asarray(np.linalg.cholesky(M * scale[:, :, None] * scale[:, None, :]))
+    root = inverse(L)
+    return np.asarray(scale[:, :, None] * root.swapaxes(1, 2))
 
 
-@dataclass(frozen=True)
-class BarrierPoint:
-    """w (k,) inside its bounds, the pieces there, their slacks s (J,) and F_σ as `merit`."""
+def in_terms(problem: DesignProblem, T: Array, ridge: float = 0.0) -> DesignProblem:
+    """The problem of the parameters z, y = T_s z, T (S, p, k), `ridge` · 1 known before.
 
-    w: Array
-    local: LocalPieces
-    s: Array
-    merit: float
-
-
-def _central(task: Restricted, point: BarrierPoint, sigma: float) -> Array:
-    """Multipliers (J + 2k,) on the central path: of the pieces, of w ≥ 0 and of w ≤ u."""
-    return sigma / np.concatenate([point.s, point.w, task.most - point.w])
-
-
-def _solve(
-    pieces: SmoothPieces, task: Restricted, start: Array, accuracy: float
-) -> tuple[Array, Array]:
-    """Weights w (k,) whose log Φ is within `accuracy` of the least, and multipliers μ (J,).
-
-    `start` (k,) strictly inside its bounds with the right sums per level.
+    Where k < p, what T leaves out is taken for known: no plan has a larger Φ than before.
     """
-    local = pieces.at(task.information(start))
-    assert local is not None  # every support sees what the pool sees
-    J, count = len(local.values), 2 * len(start) + len(local.values)
-    mu = np.full(J, 1.0 / J)
-    gap = _gap(task, start, local, mu, local.slopes(task.A))
-    if gap <= accuracy:
-        return start, mu
-    sigma = gap / count
-    point = _barrier(local, task, start, sigma)
-    at = _central(task, point, sigma)
-    best = (gap, start, mu)
-    for _ in range(MOST_STEPS):
-        slopes = point.local.slopes(task.A)
-        gap = _gap(task, point.w, point.local, at[:J], slopes)
-        if gap < best[0]:
-            best = (gap, point.w, at[:J])
-        if gap <= accuracy or sigma * count < FINEST * accuracy:
-            break
-        change, direction, decrement = _newton(task, point, at, slopes, sigma)
-        # Where rounding hides any decrease of F the multipliers still have to settle.
-        point = _search(pieces, task, point, direction, decrement, sigma) or point
-        # All stay positive, and within NEAR of the central values.
-        central = _central(task, point, sigma)
-        at = np.clip(at + _step_to_boundary(at, change) * change, central / NEAR, central * NEAR)
-        spread = float(np.abs(np.log(at / central)).max())
-        if decrement <= CENTRED * count * sigma and spread <= SPREAD:
-            sigma *= REDUCTION
-            point = _barrier(point.local, task, point.w, sigma)
-    return best[1], best[2] / best[2].sum()
+    prior = T.swapaxes(-1, -2) @ problem.prior @ T
+    return replace(
+        problem,
+        blocks=problem.blocks @ T[:, None],
+        prior=(prior + prior.swapaxes(-1, -2)) / 2 + ridge * np.eye(T.shape[-1]),
+        criterion=problem.criterion.turned(T),
+    )
 
 
-def _newton(
-    task: Restricted, point: BarrierPoint, at: Array, slopes: Array, sigma: float
-) -> tuple[Array, Array, float]:
-    """Steps of the multipliers `at` (J + 2k,) and of w (k,), and the decrement −∇F·Δw."""
-    w, room, s = point.w, task.most - point.w, point.s
-    mu, z, y = np.split(at, np.cumsum([len(s), len(w)]))
-    K = point.local.hessian(task.A, mu, slopes)
-    stiff = mu / s
-    centred = slopes - stiff @ slopes / stiff.sum()
-    K += (centred.T * stiff) @ centred
-    K[np.diag_indices_from(K)] += z / w + y / room + RIDGE * np.trace(K) / len(K)
-    gradient = -(sigma / s) @ slopes - sigma / w + sigma / room
-
-    factor = cho_factor(K, lower=True, overwrite_a=True, check_finite=False)
-    E = (task.level == np.arange(len(task.shares))[:, None]).astype(float)
-    solved = cho_solve(factor, np.column_stack([gradient, E.T]), check_finite=False)
-    lam = np.linalg.solve(E @ solved[:, 1:], E @ solved[:, 0])
-    dw = solved[:, 1:] @ lam - solved[:, 0]
-    change = [
-        sigma / s - mu - stiff * (centred @ dw),
-        sigma / w - z * (1.0 + dw / w),
-        sigma / room - y * (1.0 - dw / room),
-    ]
-    return np.concatenate(change), dw, float(-gradient @ dw)
+def balanced(problem: DesignProblem) -> tuple[DesignProblem, Array]:
+    """The problem of balanced parameters, in which all searches work, and T (S, p, p)."""
+    T = balancing(problem)
+    return in_terms(problem, T, RIDGE), T
 
 
-def _search(
-    pieces: SmoothPieces,
-    task: Restricted,
-    point: BarrierPoint,
-    dw: Array,
-    decrement: float,
-    sigma: float,
-) -> BarrierPoint | None:
-    """The longest of halved steps that decreases F_σ enough; None where rounding allows none."""
-    length = min(_step_to_boundary(point.w, dw), _step_to_boundary(task.most - point.w, -dw))
-    while length > 1e-10:
-        w = point.w + length * dw
-        local = pieces.at(task.information(w))
-        if local is not None:
-            moved = _barrier(local, task, w, sigma)
-            if moved.merit <= point.merit - ARMIJO * length * decrement:
-                return moved
-        length *= 0.5
-    return None
+def check_enough(problem: DesignProblem) -> None:
+    """Raise InsufficientDataError where no plan of these shares can determine all parameters."""
+    _, _, r, p = problem.blocks.shape
+    n = problem.n_poses
+    # How many combinations of parameters the prior determines.
+    known = min(int(np.linalg.matrix_rank(prior, hermitian=True)) for prior in problem.prior)
+    needed = -(-(p - known) // r)
+    if n < needed:
+        prior = f" and the prior {known}" if known else ""
+        raise InsufficientDataError(
+            f"fewer equations than parameters: {n} poses of {r} readings give {n * r}{prior}, for "
+            f"{p} parameters; plan at least {needed} poses, switch effects off or state a prior"
+        )
 
 
-def _barrier(local: LocalPieces, task: Restricted, w: Array, sigma: float) -> BarrierPoint:
-    """F_σ at w; τ solves Σ_j σ/(τ − f_j) = 1 by Newton's method from the left."""
-    f = np.log(local.values)
-    below = f.max() - f
-    excess = sigma
-    for _ in range(50):
-        s = below + excess
-        missing = np.sum(sigma / s) - 1.0
-        if missing <= 1e-14:
-            break
-        excess += missing / np.sum(sigma / s**2)
-    logs = np.log(s).sum() + np.log(w).sum() + np.log(task.most - w).sum()
-    return BarrierPoint(w, local, s, float(f.max() + excess - sigma * logs))
+def largest_sum(d: Array, group: IntArray, shares: IntArray, most: int) -> float:
+    """max Σ w_i d_i over 0 ≤ w_i ≤ most with Σ_{i∈l} w_i = shares[l]; d (N,), group (N,)."""
+    total = 0.0
+    for level in np.flatnonzero(shares):
+        full, rest = divmod(int(shares[level]), most)
+        best = np.sort(d[group == level])[::-1]
+        total += most * float(best[:full].sum()) + rest * float(best[full] if rest else 0.0)
+    return total
 
 
-def _gap(task: Restricted, w: Array, local: LocalPieces, mu: Array, slopes: Array) -> float:
-    """log Φ(w) minus the bound (see `tangent_bound`) of the restricted problem."""
-    d = mu @ slopes / mu.sum()
-    gain = largest_sum(d, task.level, task.shares, task.most) - d @ w
-    below = mu.sum() / np.sum(mu / local.values)
-    return float(np.log(local.values.max() / below) + np.log1p(gain))
+def tangent_bound(problem: DesignProblem, tangent: Tangent, d: Array) -> float:
+    """No plan has a smaller Φ: by the tangent at any point and its prices `d` (N,)."""
+    reach = largest_sum(d, problem.group, problem.shares, problem.most)
+    return tangent.value**2 / (float((tangent.G * problem.prior).sum()) + reach)
 
 
-def _step_to_boundary(value: Array, step: Array) -> float:
-    """The longest step in (0, 1] that leaves 1 % of every positive value."""
-    shrink = np.min(step / value)
-    return 1.0 if shrink >= -TO_BOUNDARY else float(-TO_BOUNDARY / shrink)
+def efficiency(value: float, bound: float) -> float:
+    """bound/Φ in (0, 1]: a plan of efficiency 0.99 is at most 1 % above the best possible Φ."""
+    return min(bound / value, 1.0)
 
 
-def newton(
-    pieces: SmoothPieces, task: Restricted, start: Array, accuracy: float
-) -> tuple[Array, Gradient]:
-    """The master problem by this interior point."""
-    w, mu = _solve(pieces, task, start, accuracy)
-    local = pieces.at(task.information(w))
-    assert local is not None  # `_solve` returns only points where it is
-    return w, local.tangent(mu)
+# Column generation.
 
-
-# The candidates of the pool, and the rounds in which they are priced against a master.
-
-Method = Literal["auto", "first-order", "conic"]
-
-# Pools up to this size go to the conic solver whole.
-DIRECT = 2000
-# Candidates of the first master per parameter, shared among the levels.
-PER_PARAMETER = 4
-# Multiplicative steps before that.
-PASSES = 10
-# Part of even weights in the first ones, so that none is singular.
-EVEN = 0.05
-# Parts of the largest weight below which weights are tried to be left out.
-LEFT_OUT = (1e-2, 1e-3, 1e-4, 1e-5, 1e-6)
-MOST_ROUNDS = 200
-# The master's gap as a part of the pool's: more would be lost on candidates that will change.
-MASTER_PART = 0.1
-# Of each level up to 1/ENTERING of its first candidates join per round.
-ENTERING = 4
-# How far each master starts from its bounds, as a part of the way to even weights.
-LEAST_DEPTH, MOST_DEPTH = 1e-3, 0.1
-# Weights below this part of the largest leave the support, unless their d is near the margin.
-NEGLIGIBLE = 1e-4
-# Information in a direction, as a part of that of the whole pool, which counts as none.
-UNSEEN = 1e-6
-# Smallest eigenvalue of the pool's information, scaled to unit diagonal, that counts as regular.
-LEAST_EIGENVALUE = 1e-13
-# Of clarabel on the scaled program, whose optimum is near 1; the second where the first fails.
-TOLERANCES = (1e-10, 1e-8)
+GAP = 1e-4  # 1 − bound/Φ at which the relaxation ends
+PASSES = 8  # multiplicative steps that show where the support lies
+EVEN = 0.05  # part of even weights in them
+PER_PARAMETER = 4  # candidates of the first support per parameter, shared among the groups
+MOST_ROUNDS = 60
+# Of a round's gap that the master may leave: more would be lost on candidates that will change.
+MASTER = 0.1
+NEGLIGIBLE = 1e-3  # of the largest weight, below which a candidate leaves the support
 
 
 @dataclass(frozen=True)
 class Relaxed:
     """Optimal weights (N,) of the relaxation, Φ = `value` there, and what is proved.
 
-    `bound`: no plan with these candidates, shares and repetitions has a smaller Φ.  `gap` is
-    1 − bound/Φ.  `tangent`: the (Φ, G) behind the bound, for sensitivities off the pool; its
-    value is below Φ where the criterion has a kink.  `method`: what solved the masters.
+    `bound`: no plan with these candidates, shares and repetitions has a smaller Φ.  `tangent`: the
+    (Φ, G) behind the bound, for prices off the pool.
     """
 
     weights: Array
     value: float
     bound: float
-    gap: float
-    iterations: int
-    method: Literal["first-order", "conic"]
-    history: tuple[RelaxationStep, ...]
-    tangent: Gradient
+    tangent: Tangent
+
+    @property
+    def gap(self) -> float:
+        """1 − bound/Φ."""
+        return max(1 - self.bound / self.value, 0.0)
 
 
 def relax(
     problem: DesignProblem,
-    *,
-    method: Method = "auto",
-    tolerance: float = 1e-6,
+    gap: float = GAP,
     start: Array | None = None,
     progress: Progress = lambda message: None,
 ) -> Relaxed:
     """Minimise Φ(prior + Σ w_i A_i) over 0 ≤ w_i ≤ most with Σ_{i∈l} w_i = shares[l].
 
-    "first-order": a few candidates by Newton's method, all others priced by the first derivatives
-    d_i, those that gain most added, until the gap is below `tolerance` (relative).  "conic": the
-    same program by clarabel, at once for small pools.  "auto" is the first, with conic masters
-    where the criterion has no smooth pieces: E, O3 and the mean over scenarios of a maximum.
-    `start` (N,) ≥ 0: weights near the optimum, as those of a smaller pool.  The result's gap may
-    exceed `tolerance` where rounding forbids more; its bound holds all the same.
-    Raises InputError for a criterion without a bound (as O2 and O4, whose 1/Φ is not concave) and
-    InsufficientDataError where all candidates together leave M singular.
+    The problem should be a `balanced` one.  `start` (N,) ≥ 0: weights near the optimum, as those of
+    a smaller pool.  The result's gap may exceed `gap` where rounding forbids more; its bound holds
+    all the same.  Raises InputError for a criterion without a bound.
     """
     criterion = problem.criterion
     require(
@@ -405,338 +268,197 @@ def relax(
         f"criterion {criterion.name} has no relaxation, since it {criterion.without_bound}; design "
         "with it by exchange alone, or take D, E or test_pose",
     )
-    require(
-        method in get_args(Method),
-        f"method of the relaxation is {method!r}; there are {', '.join(get_args(Method))}",
+    size = np.bincount(problem.group, minlength=len(problem.shares))
+    full = (size * problem.most == problem.shares)[problem.group]
+    if full.any():
+        return _around(problem, full, gap, start)
+    weights, best = _first_weights(problem, start), None
+    least = problem.shares // problem.most + 2  # of a group: as its share takes, and a choice
+    sizes = np.where(
+        problem.shares > 0,
+        -(-PER_PARAMETER * problem.prior.shape[-1] // np.count_nonzero(problem.shares)) + 2 * least,
+        0,
     )
-    require(0.0 < tolerance < 1.0, f"tolerance is {tolerance}; it must lie between 0 and 1")
-    pool = CandidatePool(problem)
-    _ = pool.root  # a pool that cannot see all parameters is refused here
-    if len(pool.levels) == 0:
-        return _only_plan(pool)
-    first = _first_weights(pool, start)
-    pieces = None if method == "conic" else pieces_of(criterion, len(problem.prior))
-    master: Master = ConicMaster(criterion) if pieces is None else partial(newton, pieces)
-    at_once = method == "conic" and problem.n_candidates <= DIRECT
+    support = best_of(weights, problem.group, sizes)
+    w, accuracy = weights[support], 0.05
+    for _ in range(MOST_ROUNDS):
+        w, tangent, value = newton(problem, support, w, accuracy)
+        d = problem.prices(tangent.G)
+        bound = tangent_bound(problem, tangent, d)
+        if best is None or bound > best.bound or value < best.value:
+            steepest = tangent if best is None or bound > best.bound else best.tangent
+            weights = np.zeros(len(d))
+            weights[support] = w
+            if best is not None and value > best.value:
+                weights, value = best.weights, best.value
+            best = Relaxed(weights, value, max(bound, best.bound if best else 0.0), steepest)
+        progress(f"relaxation: within {best.gap:.1e} of the bound, {len(support)} candidates")
+        if best.gap <= gap:
+            break
+        accuracy = min(accuracy, max(MASTER * best.gap, 0.3 * gap))
+        keep = w > NEGLIGIBLE * w.max()
+        keep |= np.isin(np.arange(len(w)), best_of(d[support], problem.group[support], least))
+        support, w = support[keep], w[keep]
+        d[support] = -np.inf
+        new = best_of(d, problem.group, np.maximum(sizes // 4, np.minimum(sizes, 1)))
+        new = new[np.isfinite(d[new])]
+        support, w = np.append(support, new), np.append(w, np.full(len(new), NEGLIGIBLE))
+    assert best is not None
+    return best
 
-    def report(step: RelaxationStep) -> None:
-        progress(f"relaxation: within {step.gap:.1e} of the bound, {step.support} candidates")
 
-    sizes = _sizes(pool, at_once)
-    weights, tangent, history = optimise(pool, master, first, sizes, tolerance, report)
-    last = history[-1]
-    weights, value = _thinned(pool, weights, last, tolerance)
-    return Relaxed(
-        weights=weights,
-        value=value,
-        bound=last.bound,
-        gap=RelaxationStep(value, last.bound, last.support).gap,
-        iterations=len(history),
-        method="conic" if pieces is None else "first-order",
-        history=history,
-        tangent=tangent,
-    )
+def _around(problem: DesignProblem, full: BoolArray, gap: float, start: Array | None) -> Relaxed:
+    """Where shares take every candidate of a group, these count as known."""
+    fixed, free = np.flatnonzero(full), np.flatnonzero(~full)
+    weights = np.where(full, float(problem.most), 0.0)
+    prior = problem.information(fixed, weights[fixed])
+    shares = problem.shares.copy()
+    shares[np.unique(problem.group[fixed])] = 0
+    if not shares.any():
+        tangent = problem.criterion.tangent(inverse(prior))
+        value = float(problem.criterion.of(inverse(prior)))
+        return Relaxed(weights, value, tangent_bound(problem, tangent, problem.prices(tangent.G)),
+                       tangent)  # fmt: skip
+    rest = replace(problem.restricted(free), prior=prior, shares=shares)
+    found = relax(rest, gap, None if start is None else start[free])
+    weights[free] = found.weights
+    return replace(found, weights=weights)
 
 
-def _first_weights(pool: CandidatePool, start: Array | None) -> Array:
+def _first_weights(problem: DesignProblem, start: Array | None) -> Array:
     """Multiplicative steps w_i ∝ w_i √d_i from even weights or `start`: where the support lies.
 
     Silvey, Titterington & Torsney, Commun. Stat. Theory Methods 7 (1978) 1379.
     """
-    problem, even = pool.problem, pool.even()
-    weights = even
-    if start is not None:
-        require(
-            start.shape == even.shape and bool(np.all(start >= 0.0)),
-            f"start of the relaxation has shape {start.shape} or negative weights; give "
-            f"{even.shape} weights of 0 or more",
-        )
-        weights = EVEN * even + (1.0 - EVEN) * pool.scaled(start)
-    # Of a maximum its mean: on a kink these steps would swing from one side to the other.
-    criterion = problem.criterion.softened(1.0)
+    even, L = problem.even(), len(problem.shares)
+
+    def mixed(w: Array) -> Array:
+        total = np.bincount(problem.group, w, minlength=L)
+        w = w * (problem.shares / np.where(total > 0, total, np.inf))[problem.group]
+        return EVEN * even + (1 - EVEN) * np.minimum(w, problem.most)
+
+    w = even if start is None else mixed(start)
+    criterion = problem.criterion.softened(1.0)  # on a kink these steps would swing
     for _ in range(PASSES):
-        d = pool.sensitivity(criterion.gradient(pool.information(weights)).G)
-        step = np.minimum(pool.scaled(weights * np.sqrt(d)), problem.most)
-        weights = EVEN * even + (1.0 - EVEN) * step
-    return weights
+        V = inverse(problem.at(w))
+        _, C = criterion.slope(V)
+        w = mixed(w * np.sqrt(np.maximum(problem.prices(V @ C @ V), 0.0)))
+    return w
 
 
-def _sizes(pool: CandidatePool, at_once: bool) -> IntArray:
-    """Candidates of each level in the first master; more than its share takes at once."""
-    if at_once:
-        return np.full(len(pool.levels), pool.problem.n_candidates)
-    p = pool.problem.prior.shape[-1]
-    for_share = 2 * pool.problem.shares[pool.levels] // pool.problem.most
-    return np.asarray(-(-PER_PARAMETER * p // len(pool.levels)) + for_share)
+def best_of(score: Array, group: IntArray, counts: IntArray) -> IntArray:
+    """Of each group as many candidates as `counts` (L,) says, those of largest score (N,)."""
+    found = [np.zeros(0, dtype=np.int64)]
+    for g in np.flatnonzero(counts):
+        own = np.flatnonzero(group == g)
+        found.append(own[np.argsort(-score[own], kind="stable")[: counts[g]]])
+    return np.concatenate(found)
 
 
-def _only_plan(pool: CandidatePool) -> Relaxed:
-    """Where the shares take every candidate, that plan is the optimum and the bound."""
-    problem = pool.problem
-    tangent = problem.criterion.gradient(pool.information(pool.fixed))
-    bound = tangent_bound(problem, tangent)
-    step = RelaxationStep(tangent.value, bound, 0)
-    return Relaxed(pool.fixed, tangent.value, bound, step.gap, 0, "first-order", (), tangent)
+# Newton's method for a few hundred candidates, by a primal barrier:
+#
+#     minimise log Φ(M(w)) − s Σ_i [log w_i + log(u − w_i)],   E w = n,   s → 0
+#
+# log Φ is convex since 1/Φ is concave; E (L, k) sums the weights of each group.  Kinks are softened
+# by a power mean whose order grows as s falls, so that what it hides is as small as the barrier's.
+# Boyd & Vandenberghe, Convex Optimization (2004), ch. 11.
+
+MOST_STEPS = 80
+TO_BOUNDARY = 0.99
+REDUCTION = 0.1  # of s, once the decrement of Newton's step is below CENTRED · s · (constraints)
+# A power mean's slopes, which weigh the pieces of a kink, settle later than its value.
+CENTRED, SETTLED = 0.3, 3e-4
+SHARPEST = 1e6  # order of a power mean beyond which rounding takes it for the maximum
 
 
-def _thinned(
-    pool: CandidatePool, weights: Array, last: RelaxationStep, tolerance: float
-) -> tuple[Array, float]:
-    """Without the smallest weights of each level, as many as the gap allows."""
-    support = np.flatnonzero(weights * ~(pool.fixed > 0.0))
-    task = pool.restricted(support)
-    for part in LEFT_OUT:
-        found = weights[support]
-        found = np.where(task.relative(found) > part, found, 0.0)
-        fewer = pool.fixed.copy()
-        fewer[support] = task.inside(found, 0.0)
-        value = float(pool.problem.criterion.value(pool.information(fewer)))
-        if 1.0 - last.bound / value <= max(tolerance, last.gap):
-            return fewer, value
-    return weights, last.value
+def newton(
+    problem: DesignProblem, support: IntArray, w: Array, accuracy: float
+) -> tuple[Array, Tangent, float]:
+    """Weights (k,) of the `support` whose log Φ is within `accuracy` of the least, the tangent that
+    shows it, and Φ."""
+    u, k = float(problem.most), len(support)
+    A, group = problem.matrices(support), problem.group[support]
+    flat = A.reshape(len(A), k, -1)
+    E = (group == np.flatnonzero(problem.shares)[:, None]).astype(float)
+    share = problem.shares[problem.shares > 0].astype(float)
+    w, s, best = _inside(w, E, share, u), None, None
+    criterion = problem.criterion.softened(4.0)
+    centred = SETTLED if problem.criterion.kinked else CENTRED
 
+    def at(w: Array) -> tuple[Array, float, Array] | None:
+        M = problem.prior + np.einsum("k,skx->sx", w, flat).reshape(problem.prior.shape)
+        V = inverse(M)
+        phi, C = criterion.slope(V)
+        return (V, phi, C) if np.isfinite(phi) and phi > 0 else None
 
-class CandidatePool:
-    """The candidates of a problem.
+    def merit(phi: float, w: Array, s: float) -> float:
+        return float(np.log(phi) - s * (np.log(w).sum() + np.log(u - w).sum()))
 
-    `fixed` (N,): the weights of groups whose share takes every candidate, 0 for others; `levels`:
-    the groups that leave a choice.
-    """
-
-    def __init__(self, problem: DesignProblem) -> None:
-        self.problem = problem
-        self.sensitivity, self.matrices = problem.sensitivity, problem.matrices
-        size = np.bincount(problem.group, minlength=len(problem.shares))
-        full = size * problem.most == problem.shares
-        self.fixed = np.where(full[problem.group], float(problem.most), 0.0)
-        self.levels = np.flatnonzero(~full & (problem.shares > 0))
-
-    def even(self) -> Array:
-        """w (N,): each group's share spread evenly."""
-        size = np.bincount(self.problem.group, minlength=len(self.problem.shares))
-        return np.asarray((self.problem.shares / np.maximum(size, 1))[self.problem.group])
-
-    @cached_property
-    def root(self) -> Array:
-        """R (S, p, p) with R M Rᵀ = 1 for the information M of even weights.
-
-        Raises InsufficientDataError where that is singular, as then it is for any weights.
-        """
-        M = self.information(self.even())
-        for s, M_s in enumerate(M):
-            diagonal = np.diag(M_s)
-            scale = np.sqrt(np.where(diagonal > 0.0, diagonal, 1.0))
-            smallest = float(np.linalg.eigvalsh(M_s / np.outer(scale, scale))[0])
-            if not smallest > LEAST_EIGENVALUE * len(M_s):
-                raise InsufficientDataError(
-                    f"all {self.problem.n_candidates} candidate poses together leave some "
-                    f"parameters undetermined (scenario {s + 1} of {len(M)}: smallest eigenvalue "
-                    f"of the scaled information {smallest:.1e}): add prior knowledge, other poses "
-                    "or loads, or fix parameters"
-                )
-        return np.asarray(np.linalg.inv(np.linalg.cholesky(M)))
-
-    def scaled(self, weights: Array) -> Array:
-        """w ≥ 0 (N,) with each group's sum brought to its share, 0 where a group has none."""
-        problem = self.problem
-        total = np.bincount(problem.group, weights, minlength=len(problem.shares))
-        return weights * (problem.shares / np.where(total > 0.0, total, np.inf))[problem.group]
-
-    def information(self, weights: Array) -> Array:
-        """M (S, p, p) at weights (N,)."""
-        packed = self.problem.packed
-        if packed is None or np.count_nonzero(weights) * 4 < len(weights):
-            return self.problem.information(weights)
-        p = self.problem.blocks.shape[-1]
-        rows, columns, factor = triangle(p)
-        M = np.empty((len(packed), p, p))
-        M[:, rows, columns] = M[:, columns, rows] = weights @ packed / factor
-        return self.problem.prior + M
-
-    def restricted(self, chosen: IntArray) -> Restricted:
-        """The problem with no other candidates than `chosen`, all of them free."""
-        problem = self.problem
-        level = np.searchsorted(self.levels, problem.group[chosen])
-        base = problem.information(self.fixed)
-        shares = problem.shares[self.levels]
-        return Restricted(self.matrices(chosen), base, level, shares, problem.most)
-
-    def margins(self, chosen: IntArray, d: Array) -> tuple[Array, Array]:
-        """(N,) each: the least d that a level's share takes of `chosen`, largest first, and the
-        next d, which must stay for a choice to be left; inf where weights are fixed."""
-        problem = self.problem
-        taken, following = np.full((2, len(problem.shares)), np.inf)
-        for level in self.levels:
-            of_level = np.sort(d[chosen[problem.group[chosen] == level]])[::-1]
-            count = -(-int(problem.shares[level]) // problem.most)
-            taken[level] = of_level[count - 1]
-            following[level] = of_level[min(count, len(of_level) - 1)]
-        return taken[problem.group], following[problem.group]
-
-    def best(self, score: Array, counts: IntArray) -> IntArray:
-        """Of each free level as many candidates as `counts` says, those of largest score (N,);
-        none of score −inf."""
-        found = []
-        for level, count in zip(self.levels, counts, strict=True):
-            of_level = np.flatnonzero(self.problem.group == level)
-            rest = max(len(of_level) - count, 0)
-            found.append(of_level[np.argpartition(score[of_level], rest)[rest:]])
-        best = np.concatenate(found)
-        return best[score[best] > -np.inf]
-
-
-@dataclass(frozen=True)
-class RelaxationStep:
-    """One round: Φ of the weights at hand, the best bound so far, candidates in the master."""
-
-    value: float
-    bound: float
-    support: int
-
-    @property
-    def gap(self) -> float:
-        """1 − bound/Φ."""
-        return max(1.0 - self.bound / self.value, 0.0)
-
-
-# Solves the problem on a few candidates: from a start (k,) strictly inside the bounds to w (k,)
-# with a relative gap of the accuracy asked for, and a tangent that shows it.
-Master = Callable[[Restricted, Array, float], tuple[Array, Gradient]]
-
-
-def optimise(
-    pool: CandidatePool,
-    master: Master,
-    start: Array,
-    sizes: IntArray,
-    tolerance: float,
-    progress: Callable[[RelaxationStep], None],
-) -> tuple[Array, Gradient, tuple[RelaxationStep, ...]]:
-    """Weights (N,) with 1 − bound/Φ ≤ tolerance, the tangent of the bound, and all rounds.
-
-    `start` (N,) names the first candidates, by weight, `sizes` of each free level.  Ends with a
-    wider gap where rounding hides which candidate could still improve the plan.
-    """
-    problem = pool.problem
-    support = pool.best(start, sizes)
-    weights = best = start
-    value, bound, gap, accuracy = np.inf, 0.0, 1.0, MASTER_PART
-    history: list[RelaxationStep] = []
-    for _ in range(MOST_ROUNDS):
-        support, task = _regular(pool, support)
-        inside = task.inside(weights[support], min(max(gap, LEAST_DEPTH), MOST_DEPTH))
-        found, tangent = master(task, inside, accuracy)
-        weights = pool.fixed.copy()
-        weights[support] = found
-        reached = float(problem.criterion.value(pool.information(weights)))
-        if reached < value:
-            best, value = weights, reached
-        d = pool.sensitivity(tangent.G)
-        certified = tangent_bound(problem, tangent, d)
-        if not history or certified > bound:
-            bound, steepest = certified, tangent
-        history.append(RelaxationStep(value, bound, len(support)))
-        progress(history[-1])
-        gap = history[-1].gap
-        margin, least = pool.margins(support, d)
-        outside = np.where(d > (1.0 + 0.1 * tolerance) * margin, d, -np.inf)
-        outside[support] = -np.inf
-        entering = pool.best(outside, np.maximum(sizes // ENTERING, 1))
-        finest = accuracy <= 0.1 * tolerance
-        if gap <= tolerance or (len(entering) == 0 and finest):
+    here = at(w)
+    assert here is not None  # the ridge keeps every plan regular
+    for _ in range(MOST_STEPS):
+        V, phi, _ = here
+        tangent, value = criterion.tangent(V), float(problem.criterion.of(V))
+        d = np.einsum("skx,sx->k", flat, tangent.G.reshape(len(A), -1))
+        reach = largest_sum(d, group, problem.shares, problem.most)
+        bound = tangent.value**2 / (float((tangent.G * problem.prior).sum()) + reach)
+        gap = float(np.log(value / bound))
+        if best is None or gap < best[0]:
+            best = gap, w, tangent, value
+        if gap <= accuracy or (s is not None and s * 2 * k < 1e-2 * accuracy):
             break
-        accuracy = MASTER_PART * (gap if len(entering) else min(gap, accuracy))
-        accuracy = max(accuracy, (0.5 if len(entering) else 0.1) * tolerance)
-        kept = (task.relative(found) > NEGLIGIBLE) | (d[support] >= (1.0 - gap) * least[support])
-        support = np.concatenate([support[kept], entering])
-    return best, steepest, tuple(history)
+        if s is None:
+            s = min(gap / (2 * k), 1.0)
+            criterion = problem.criterion.softened(min(2 / gap + 4, SHARPEST))
+            here = V, *criterion.slope(V)
+            V = here[0]
+        step, slope = _step(criterion, A, here, w, u, s, E)
+        low, high = float(np.min(step / w)), float(np.max(step / (u - w)))
+        t = min(1.0, TO_BOUNDARY / max(-low, 1e-9), TO_BOUNDARY / max(high, 1e-9))
+        now, moved = merit(phi, w, s), None
+        while t > 1e-8:
+            moved = at(w + t * step)
+            if moved and merit(moved[1], w + t * step, s) <= now + 1e-4 * t * slope:
+                break
+            t, moved = t / 2, None
+        if moved is not None:
+            w, here = w + t * step, moved
+        if moved is None or -slope < centred * s * 2 * k:
+            s *= REDUCTION
+            criterion = problem.criterion.softened(min(1 / (k * s) + 4, SHARPEST))
+            here = here[0], *criterion.slope(here[0])
+    assert best is not None
+    return best[1], best[2], best[3]
 
 
-def _regular(pool: CandidatePool, support: IntArray) -> tuple[IntArray, Restricted]:
-    """The support with candidates added until it sees every direction that the pool sees.
+def _step(
+    criterion: Objective, A: Array, here: tuple[Array, float, Array], w: Array, u: float, s: float,
+    E: Array,
+) -> tuple[Array, float]:  # fmt: skip
+    """Newton's step (k,) of the barrier function and its slope along it."""
+    (V, phi, C), k = here, A.shape[1]
+    G = V @ C @ V
+    AV = A @ V[:, None]
+    d = np.einsum("skij,sij->k", A, G) / phi
+    H = -np.outer(d, d)
+    for s_, AV_s in enumerate(AV):
+        AG = (A[s_] @ G[s_]).swapaxes(1, 2).reshape(k, -1)
+        H += 2 / phi * AV_s.reshape(k, -1) @ AG.T
+    bent = criterion.curvature(V, V[:, None] @ AV)
+    H = H + bent / phi if np.ndim(bent) else H
+    H[np.diag_indices(k)] += s / w**2 + s / (u - w) ** 2 + 1e-12 * np.trace(H) / k
+    g = -d - s / w + s / (u - w)
+    solved = np.linalg.solve((H + H.T) / 2, np.column_stack([g, E.T]))
+    step = solved[:, 1:] @ np.linalg.solve(E @ solved[:, 1:], E @ solved[:, 0]) - solved[:, 0]
+    return step, float(g @ step)
 
-    Directions that Φ does not count, such as nuisance parameters beside c, draw no weight.
-    """
-    while True:
-        task = pool.restricted(support)
-        even = task.inside(np.zeros(len(support)), 1.0)
-        M = pool.root @ task.information(even) @ pool.root.transpose(0, 2, 1)
-        eigenvalues, U = np.linalg.eigh(M)
-        unseen = eigenvalues < UNSEEN
-        if not unseen.any():
-            return support, task
-        rows = (U * unseen[:, None, :]).transpose(0, 2, 1) @ pool.root
-        d = pool.sensitivity(rows.transpose(0, 2, 1) @ rows)
-        d[support] = -np.inf
-        support = np.concatenate([support, pool.best(d, np.ones_like(pool.levels))])
 
-
-class ConicMaster:
-    """Σ_s Φ_s/S or max_s Φ_s over the weights, solved by clarabel to its own accuracy."""
-
-    def __init__(self, criterion: Criterion) -> None:
-        self._worst = isinstance(criterion, Worst)
-        base = criterion.base if isinstance(criterion, Worst) else criterion
-        assert isinstance(base, ScenarioCriterion)
-        self._base = base
-        import cvxpy as cp
-
-        self._cp = cp
-
-    def __call__(self, task: Restricted, start: Array, accuracy: float) -> tuple[Array, Gradient]:
-        """w (k,) and a tangent; `start` sets the units of the program and nothing else.
-
-        Raises InsufficientDataError where clarabel finds no solution.
-        """
-        cp = self._cp
-        M = task.information(start)
-        values = self._base.each(M)
-        w = cp.Variable(len(start), nonneg=True)
-        members = (task.level == np.arange(len(task.shares))[:, None]).astype(float)
-        constraints = [members @ w == task.shares, w <= task.most]
-        cones: list[Cone] = []
-        for s, root in enumerate(np.linalg.inv(np.linalg.cholesky(M))):
-            A = root @ task.A[s] @ root.T
-            information = cp.reshape(A.reshape(len(A), -1).T @ w, root.shape, order="C")
-            information = information + root @ task.base[s] @ root.T
-            cones.append(self._base.cone(cp, s, information, root, float(values[s])))
-            constraints += cones[-1].constraints
-        relative = [
-            float(v / values.max()) * cone.value for v, cone in zip(values, cones, strict=True)
-        ]
-        total = cp.Variable()
-        mean = sum(relative) / len(relative)
-        limit = [value <= total for value in (relative if self._worst else [mean])]
-        self._solve(cp.Problem(cp.Minimize(total), [*constraints, *limit]))
-        if self._worst:
-            share = np.maximum([float(c.dual_value) for c in limit], 0.0)
-        else:
-            share = np.ones(len(cones))
-        found = task.inside(np.maximum(w.value, 0.0), 0.0)
-        return found, self._tangent(task.information(found), cones, share / share.sum())
-
-    def _tangent(self, M: Array, cones: list[Cone], share: Array) -> Gradient:
-        """v = Σ c_s v_s and G = (c_s G_s), c = `share` (S,): Φ ≥ Σ c_s v_s²/⟨G_s, M'_s⟩ is at least
-        v²/⟨G, M'⟩ by Cauchy and Schwarz."""
-        values, G = self._base.each_gradient(M)
-        for s, cone in enumerate(cones):
-            if cone.tangent is not None:
-                values[s], G[s] = cone.tangent(M[s])
-        return Gradient(float(share @ values), share[:, None, None] * G)
-
-    def _solve(self, program: Any) -> None:
-        """Solved in place; an inexact answer is used, since its bound shows what it is worth."""
-        with warnings.catch_warnings():
-            warnings.simplefilter("ignore")
-            for tolerance in TOLERANCES:
-                options = dict.fromkeys(("tol_gap_abs", "tol_gap_rel", "tol_feas"), tolerance)
-                try:
-                    program.solve(solver=self._cp.CLARABEL, **options)
-                except self._cp.SolverError:
-                    continue
-                if program.status in ("optimal", "optimal_inaccurate"):
-                    return
-        raise InsufficientDataError(
-            f"the conic solver stopped with status {program.status!r} on the relaxation; the "
-            "information may be nearly singular: add prior knowledge or poses"
-        )
+def _inside(w: Array, E: Array, share: Array, u: float) -> Array:
+    """w (k,) moved strictly inside its bounds, with the right sums per group."""
+    room = (share / E.sum(axis=1)) @ E  # even weights, which are inside
+    w = np.clip(w, 0.0, u)
+    for _ in range(20):
+        w = np.minimum(w * ((share / np.maximum(E @ w, 1e-300)) @ E), u)
+    w = 0.98 * w + 0.02 * room
+    missing = share - E @ w
+    return np.asarray(w + ((missing / (E @ (w * (u - w)))) @ E) * w * (u - w))

@@ -16,7 +16,7 @@ from elastocal.identification.start import fixed_and_free
 from elastocal.model.effects.catalogue import effect_of
 from elastocal.model.manipulator import Model
 from elastocal.planning.criteria import criterion_named, make_criterion
-from elastocal.planning.criterion import Criterion
+from elastocal.planning.criterion import Objective
 from elastocal.planning.information import (
     Done,
     Estimable,
@@ -28,7 +28,7 @@ from elastocal.planning.information import (
     typical_sizes,
     why,
 )
-from elastocal.planning.selection import DesignProblem
+from elastocal.planning.relaxation import DesignProblem, balancing, in_terms, relax
 from elastocal.planning.test_poses import (
     TargetPoses,
     joined,
@@ -39,7 +39,7 @@ from elastocal.planning.test_poses import (
 )
 from elastocal.simulation.simulate import draw_errors, values_from
 from elastocal.text import listed
-from elastocal.units import Array, IntArray
+from elastocal.units import Array, IntArray, Progress
 
 # How many poses a plan has at each level.
 
@@ -158,13 +158,13 @@ class Setup:
 
     information: PoseInformation
     found: Estimable
-    criterion: Criterion
+    criterion: Objective
     prior: Array
     warnings: tuple[str, ...]
     target_rows: Array | None = None
     elsewhere_rows: Array | None = None
     share: float = 0.0
-    weighed: Callable[[float], Criterion] | None = None
+    weighed: Callable[[float], Objective] | None = None
 
     def sharing(self, share: float) -> Setup:
         """With this share of the weight on what lies beside the test poses."""
@@ -252,7 +252,7 @@ def set_up(
     combination = _combination(model, found)
     unit = units.pop() if len(units) == 1 else ""
 
-    def weighed(share: float) -> Criterion:
+    def weighed(share: float) -> Objective:
         rows, weights = A, targets.weight
         if share and A is not None and beyond is not None and region is not None:
             rows = np.concatenate([A, beyond], axis=1)
@@ -366,3 +366,54 @@ def _held(model: Model, found: Estimable, bias: float) -> tuple[str, ...]:
         f"cannot see, and typical deviations of that move the test points by {bias * 1e6:.3g} µm "
         "rms, which the criterion does not count",
     )
+
+
+# The weight of what lies elsewhere, from the price that the test poses may pay for it.
+#
+# The relaxed optimum w(s) of Φ = (1 − s) Φ_test + s Φ_elsewhere has Φ_test(w(s)) rising and
+# Φ_elsewhere(w(s)) falling with s; all that can be had lies on this curve (both are convex).  Near
+# s = 0, where Φ_test is least, it rises with the square of u = s/(1 − s).
+
+FIRST, MOST = 0.3, 0.9  # shares tried first, and at most
+TRIES = 8
+CLOSE = 0.05  # of the price under the limit: a better share would not be noticed
+LOOSE = 1e-3  # gap of the relaxations
+SOME = 4000  # candidates that tell the share: it hangs on where poses are, not on each of them
+
+
+def share_within(
+    setup: Setup, pool: FeasiblePool, shares: IntArray, cap: float, progress: Progress
+) -> float:
+    """The largest share s of the postures elsewhere for which the relaxed optimum is at most
+    `cap` worse at the test poses (rms) than it could be; 0 where there are none."""
+    if setup.elsewhere_rows is None or not cap:
+        return 0.0
+    progress(f"weight of the joint ranges, at most {100 * cap:g} % worse at the test poses")
+    problem = _some(setup.sharing(0.0).problem(pool, shares))
+    own, T = problem.criterion, balancing(problem)
+    alone = relax(in_terms(problem, T), LOOSE)
+    least, limit = alone.value, (1 + cap) ** 2 * alone.value
+    low, high, share, weights = 0.0, MOST, FIRST, alone.weights
+    for _ in range(TRIES):
+        other = replace(problem, criterion=setup.sharing(share).criterion)
+        weights = relax(in_terms(other, T), LOOSE, weights).weights
+        value = float(own.value(problem.at(weights)))
+        if value <= limit:
+            low = share
+            if share == MOST or limit - value < CLOSE * (limit - least):
+                break
+        else:
+            high = share
+        aim = (1 - CLOSE / 2) * (limit - least)
+        u = share / (1 - share) * np.sqrt(aim / max(value - least, 1e-3 * least))
+        share = u / (1 + u)
+        if not low < share < high:
+            share = high if high == MOST and low else (low + high) / 2
+    return low
+
+
+def _some(problem: DesignProblem) -> DesignProblem:
+    """The problem with about SOME of its candidates, equally many of each group."""
+    each = max(SOME // len(problem.shares), 20 * int(problem.shares.max()))
+    members = [np.flatnonzero(problem.group == g) for g in range(len(problem.shares))]
+    return problem.restricted(np.sort(np.concatenate([m[:: -(-len(m) // each)] for m in members])))

@@ -18,11 +18,12 @@ from elastocal.cell.work_cell import Cell
 from elastocal.errors import ElastocalError, InsufficientDataError
 from elastocal.planning.candidates import Candidates
 from elastocal.planning.choices import Choice
-from elastocal.planning.exact_plan import exact_plan
+from elastocal.planning.exchange import exact_plan
 from elastocal.planning.execution import greedy_tour, tour_cost
 from elastocal.planning.information import load_states
 from elastocal.planning.moves import travel_times
 from elastocal.planning.plan import Plan, TimedSize
+from elastocal.planning.relaxation import balanced, check_enough
 from elastocal.planning.setup import shares_of
 from elastocal.units import Array
 
@@ -99,17 +100,15 @@ class _Budget:
                 if point is None:
                     return None
                 problem = point.setup.problem(point.pool, shares_of(cell))
-                relaxed = point.relaxed
-                plan = exact_plan(
-                    problem, relaxed_weights=relaxed.weights, tangent=relaxed.tangent, starts=1
-                )
+                check_enough(problem)
+                chosen, phi = exact_plan(balanced(problem)[0], point.relaxed)
             except ElastocalError:
                 return None
-            took = _minutes(cell, point.pool.q[plan.chosen])
+            took = _minutes(cell, point.pool.q[chosen])
             if took <= self.minutes:
-                value = point.setup.criterion.figure(plan.value)
+                value = point.setup.criterion.figure(phi)
                 kept = problem.blocks.shape[-1]
-                return kept, plan.value, TimedSize(poses, repeats, took, value)
+                return kept, phi, TimedSize(poses, repeats, took, value)
             poses = min(int(poses * self.minutes / took), poses - 1)
         return None
 

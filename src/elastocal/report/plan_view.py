@@ -144,7 +144,7 @@ def stop_rows(plan: Plan) -> ShownTable:
     return ShownTable((*heads, *joint_heads(kinds)), rows, (2, 3))
 
 
-CLOSE = 0.95  # efficiency from which a plan is called near the best
+APART = 0.02  # of the criterion, between starts of the search: more of them may find better
 VAIN = 0.1  # below which the bound says nothing: so few poses cannot be spread as its weights are
 
 
@@ -170,8 +170,6 @@ def plan_headline(plan: Plan) -> str:
     away = 100 * (1 - found)
     text += "; no plan from these candidates is "
     text += "better" if away < 0.05 else f"more than {away:.1f} % better"
-    if (beyond := _beyond(plan)) is not None:
-        return f"{text} (certified), but poses between them may be, by up to {beyond:.0f} %."
     return f"{text} (certified)."
 
 
@@ -181,16 +179,15 @@ def _rho(plan: Plan) -> float:
     return plan.reported if e is None or not e.share else e.test_poses * 1e6
 
 
-def _beyond(plan: Plan) -> float | None:
-    """How much better (%) a plan from all of the joint space may be, where that is much."""
-    found = plan.certificate.efficiency_continuum
-    return None if found is None or found >= CLOSE else 100 * (1 - found)
+def _apart(plan: Plan) -> bool:
+    """Did the starts of the search end so far apart that more of them may find a better plan?"""
+    ends = plan.certificate.starts
+    return len(ends) > 1 and max(ends) - min(ends) > APART * max(abs(end) for end in ends)
 
 
 def plan_tone(plan: Plan) -> Tone:
-    found = plan.certificate.efficiency_pool
-    close = found is not None and found >= CLOSE and _beyond(plan) is None
-    return "good" if close and not plan.warnings else "care"
+    """A gap to the bound is no fault of the plan's: with few poses much of it is the bound's."""
+    return "care" if plan.warnings else "good"
 
 
 def plan_steps(plan: Plan) -> list[str]:
@@ -203,11 +200,8 @@ def plan_steps(plan: Plan) -> list[str]:
             f"If ρ₀ is not small enough: {option('target')} finds the fewest poses that reach a "
             f"value, {option('curve')} compares numbers of poses."
         )
-    if _beyond(plan) is not None:
-        steps.append(
-            f"For a better plan: more {option('candidates')}, or {option('effort', 'thorough')}, "
-            "which polishes poses between them."
-        )
+    if _apart(plan):
+        steps.append(f"For a better plan: {option('effort', 'thorough')}, which begins more often.")
     together = sum(bool(p.combined_with) for p in plan.predicted)
     if together:
         steps.append(
@@ -368,7 +362,25 @@ def _certificate_lines(plan: Plan) -> list[tuple[str, str]]:
                 "have been missed.",
             )
         )
-    return lines
+    return lines + _starts_lines(plan)
+
+
+def _starts_lines(plan: Plan) -> list[tuple[str, str]]:
+    """Where the starts of the search ended, and what lies between the best plan and the bound."""
+    ends, bound = plan.certificate.starts, plan.bound_reported
+    if not ends or bound is None:
+        return []
+    unit = f" {plan.unit}" if plan.unit else ""
+    low, high = f"{min(ends):.4g}", f"{max(ends):.4g}"
+    told = f"at {low}{unit}" if low == high else f"between {low} and {high}{unit}"
+    return [
+        (
+            "Certificate",
+            f"{counted(len(ends), 'start')} of the search ended {told}, the bound is "
+            f"{bound:.4g}{unit}. Between plan and bound lies what no start found, and what only "
+            "weights reach, whole poses not: the fewer poses, the more of that.",
+        )
+    ]
 
 
 def _share(value: float) -> str:
@@ -385,8 +397,6 @@ def _execution_line(plan: Plan) -> tuple[str, str]:
     parts = sum(stop.part > 0 for stop in e.stops)
     if parts:
         text += f"; {parts} poses are read twice without load, half of the readings each time"
-    if e.gap > 5e-4 and (e.drift is None or e.drift.bias == e.drift.shortest) and not again:
-        text += f" (at most {100 * e.gap:.1f} % above the shortest order)"
     if changes:
         text += f", {changes} load change{'s' if changes > 1 else ''} by hand"
     via = sum(len(stop.via) for stop in e.stops) + len(e.home_via)

@@ -74,19 +74,18 @@ def test_every_visit_once_in_turns_and_the_drift_does_little(changes, sequence):
     assert blocks(execution) == sequence and execution.load_changes == len(sequence) - 1
     assert execution.drift.bias < 0.25 * execution.drift.shortest
     shortest = ordered(alias=None)
-    assert execution.bound <= execution.travel
     assert execution.travel <= shortest.travel + 0.05 * shortest.total
 
 
 def test_where_there_is_time_poses_are_read_before_and_after_their_load():
-    once, twice = ordered(), ordered(extra_time=0.5)
+    once, twice = ordered(extra_time=0.05), ordered(extra_time=0.5)
     assert blocks(twice) == "ULU" and len(twice.stops) == 36
     assert sorted((s.pose, s.load, s.part) for s in twice.stops) == [
         (pose, load, part) for pose in range(12) for load, part in ((0, 0), (0, 1), (1, 0))
     ]
     assert twice.drift.bias < 0.2 * once.drift.bias
     shortest = ordered(alias=None)
-    assert once.total < twice.total < 1.5 * shortest.total and twice.bound <= twice.travel
+    assert once.total < twice.total < 1.5 * shortest.total
     names, level = tuple(map(str, range(1, 13))), np.zeros(12, dtype=int)
     rows = plan_rows(twice, names, level)
     assert rows.configuration == names and set(rows.notes) == {"note_order_2", "note_order_3"}

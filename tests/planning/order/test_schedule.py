@@ -65,7 +65,6 @@ def test_small_plans_take_the_time_of_the_best_order(seed, home):
     execution = schedule(q, Motion(home=home), checker, via=CORNERS)
     best = best_time(q, checker, home, via=CORNERS)
     assert execution.travel == pytest.approx(best, abs=1e-9)
-    assert execution.bound <= execution.travel
     assert sorted(stop.pose for stop in execution.stops) == list(range(6))
 
 
@@ -82,9 +81,7 @@ def test_every_move_driven_is_free_and_every_reading_is_made_once(seed, at_home,
     home = np.array([-2.0, -2.0]) if at_home else None
     motion = Motion(home=home, both_directions=both, overshoot=0.03, speed=np.array([0.5, 2.0]))
     try:
-        execution = schedule(
-            q, motion, checker, loads=forces, limits=LIMITS, via=CORNERS, iterations=300
-        )
+        execution = schedule(q, motion, checker, loads=forces, limits=LIMITS, via=CORNERS, kicks=30)
     except Unreachable:
         assume(False)  # discs all around a pose: rare, or hypothesis complains
     moves = driven(execution, q, forces)
@@ -96,7 +93,6 @@ def test_every_move_driven_is_free_and_every_reading_is_made_once(seed, at_home,
     assert {key for key in read if key[2] == 1} or not both
     changes = sum(a.load != b.load for a, b in pairwise(execution.stops))
     assert changes == len(forces) - 1
-    assert 0 <= execution.bound <= execution.travel
 
 
 def test_a_wall_is_passed_through_the_points_offered_and_nothing_is_measured_there():

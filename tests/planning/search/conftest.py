@@ -9,7 +9,6 @@ from typing import Any
 
 import numpy as np
 import pytest
-from numpy.typing import NDArray
 from support.calibration import cell_of, planar_chain
 
 from elastocal.cell.arm_description import CartesianNoise, Nominal, Tracker
@@ -18,12 +17,11 @@ from elastocal.cell.workspace_rules import Workspace
 from elastocal.model.manipulator import Model
 from elastocal.planning.candidates import Candidates, JointSpace, draw, joint_space
 from elastocal.planning.criteria import make_criterion
-from elastocal.planning.criterion import Criterion
+from elastocal.planning.criterion import Objective
 from elastocal.planning.feasibility import Feasibility
 from elastocal.planning.information import LoadStates, PoseInformation, load_states
 from elastocal.planning.polish import Searches
-from elastocal.planning.selection import DesignProblem
-from elastocal.units import Array
+from elastocal.planning.relaxation import DesignProblem
 
 EFFECTS = tuple(f"joint_compliance:joint{i}" for i in (2, 3, 4))
 LOAD = np.array([[0.0, 0.0, -200.0]])
@@ -63,7 +61,7 @@ class Case:
         model = self.model
         return draw(model.cell, model.chain, self.states, self.rules, n, seed, jobs)
 
-    def criterion(self, name: str) -> Criterion:
+    def criterion(self, name: str) -> Objective:
         """`name` on three test poses."""
         p = len(self.information.columns)
         q = np.array([[0.0, 0.3, -0.5, 0.4], [0.5, -0.4, 1.0, 0.2], [0.0, -1.2, 1.5, -1.0]])
@@ -73,17 +71,12 @@ class Case:
         )
 
     def problem(
-        self, pool: Candidates, shares: Sequence[int], criterion: Criterion, prior: float = 1e-2
+        self, pool: Candidates, shares: Sequence[int], criterion: Objective, prior: float = 1e-2
     ) -> DesignProblem:
         p = len(self.information.columns)
         blocks = self.information.blocks(pool.q, pool.load)
         known = prior * np.eye(p)[None]
         return DesignProblem(blocks, known, pool.group, np.array(shares), criterion)
-
-    def value(self, problem: DesignProblem, q: Array, load: NDArray[np.int64]) -> float:
-        """Φ of any plan, from the exact B."""
-        B = self.information.blocks(q, load)
-        return float(problem.criterion.value(problem.prior + np.einsum("snri,snrj->sij", B, B)))
 
 
 @pytest.fixture(scope="session")

@@ -1,0 +1,305 @@
+"""The search for a plan: relaxation, few starts, all poses polished at once, the bound.
+
+What a polish or an ascent finds joins the pool, on which the relaxation runs again: so the bound
+on the pool is one on what was found between its candidates too.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field, replace
+
+import numpy as np
+
+from elastocal.planning.checkpoint import Checkpoint, State
+from elastocal.planning.drift import Alias
+from elastocal.planning.exchange import (
+    PATIENCE,
+    check_determined,
+    exact_plan,
+    prospects,
+    random_plan,
+    rounded,
+)
+from elastocal.planning.plan import Certificate
+from elastocal.planning.polish import Continuum, Searches, estimate, polish
+from elastocal.planning.relaxation import (
+    RIDGE,
+    DesignProblem,
+    Relaxed,
+    balancing,
+    check_enough,
+    efficiency,
+    in_terms,
+)
+from elastocal.planning.setup import FeasiblePool, Setup
+from elastocal.units import Array, IntArray, Progress
+
+POOL = 2000  # candidates where nobody asks for a number
+CLOSE, FINE = 1e-3, 1e-4  # gap of the relaxations that lead to the next one, and of the last
+NEAR = 0.97  # of the bound on the pool: a continuum as near as that is not searched again
+REFINED = 3  # times at most
+ROUND = 1000  # added to the seed of each of them, beyond the rounds that belong to the effort
+
+
+@dataclass(frozen=True)
+class Effort:
+    """`starts` of the search, each polished, and `rounds` in which the continuum is searched for
+    poses that the pool lacks.  Without starts the plan is one of the pool's candidates, the best of
+    so many `exchanges`."""
+
+    starts: int
+    rounds: int
+    exchanges: int = 1
+
+    @property
+    def in_pool(self) -> Effort:
+        """For poses that are brought: none is moved."""
+        return Effort(0, 0, max(self.starts, 1))
+
+
+EFFORTS = {
+    "batch": Effort(starts=0, rounds=0, exchanges=2),
+    "quick": Effort(starts=5, rounds=0),
+    "normal": Effort(starts=8, rounds=2),
+    "thorough": Effort(starts=40, rounds=4),
+}
+
+
+@dataclass(frozen=True)
+class Selection:
+    """The plan as indices `chosen` (k,) into the `pool`, which has grown; Φ `value`.
+
+    From index `first` on the pool holds what came from polish and the continuum, at its end, once
+    the plan is `whole`, the `pinned` poses that stay.  `alias`: what a shift of its readings does,
+    once it is in order.
+    """
+
+    pool: FeasiblePool
+    chosen: IntArray
+    value: float
+    certificate: Certificate
+    first: int
+    pinned: int = 0
+    alias: Alias | None = None
+
+    @property
+    def polished(self) -> int:
+        """Poses of the plan that are not candidates of the first pool."""
+        own = self.chosen < len(self.pool) - self.pinned
+        return int((own & (self.chosen >= self.first)).sum())
+
+    def whole(self, pinned: FeasiblePool | None) -> Selection:
+        """With the poses that stay, in the order of the levels, so that the table reads like
+        Table 2; of a level those that stay come first."""
+        pool, chosen, n = self.pool, np.sort(self.chosen), 0
+        if pinned is not None:
+            pool, n = pool.joined(pinned), len(pinned)
+            chosen = np.append(np.arange(len(self.pool), len(pool)), chosen)
+        chosen = chosen[np.argsort(pool.group[chosen], kind="stable")]
+        return replace(self, pool=pool, chosen=chosen, pinned=n)
+
+    def exchanged(self, pool: FeasiblePool, chosen: IntArray, value: float) -> Selection:
+        """Another plan (k,) of Φ = `value`, from another pool that may hold more poses.
+
+        The bounds hold: those of a pool are those of every part of it, and a plan's own poses,
+        where they are new, are among those that the continuum's bound is about.
+        """
+        c = self.certificate
+        shares = (c.efficiency_pool, c.efficiency_continuum)
+        of_pool, of_continuum = (
+            None if share is None else min(share * (self.value / value), 1.0) for share in shares
+        )
+        certificate = replace(c, efficiency_pool=of_pool, efficiency_continuum=of_continuum)
+        return replace(self, pool=pool, chosen=chosen, value=value, certificate=certificate)
+
+
+@dataclass
+class Search:
+    """What a plan is sought with: the setup, whose parameters y = T z are balanced.
+
+    The search may be one in few `terms` z of the parameters; its bounds hold for all of them, as
+    what is left out counts as known there.
+    """
+
+    setup: Setup
+    searches: Searches
+    shares: IntArray
+    effort: Effort
+    seed: int
+    checkpoint: Checkpoint
+    progress: Progress
+    T: Array
+    plain: Setup
+    _last: list[tuple[FeasiblePool, DesignProblem]] = field(default_factory=list)
+
+    @classmethod
+    def of(
+        cls, setup: Setup, pool: FeasiblePool, searches: Searches, shares: IntArray,
+        effort: Effort, seed: int, checkpoint: Checkpoint, progress: Progress,
+        terms: Array | None = None, plain: Setup | None = None,
+    ) -> Search:  # fmt: skip
+        """`plain`: the setup without the poses that stay, where there are some.
+
+        Raises InsufficientDataError where no plan can determine all parameters.
+        """
+        whole = setup.problem(pool, shares)
+        check_enough(whole)
+        some = whole if terms is None else in_terms(whole, terms)
+        T = balancing(some)
+        T = T if terms is None else terms @ T
+        return cls(setup, searches, shares, effort, seed, checkpoint, progress, T, plain or setup)
+
+    def problem(self, pool: FeasiblePool) -> DesignProblem:
+        """That of a pool, kept with what it has formed as long as the pool is the same."""
+        if not self._last or self._last[0][0] is not pool:
+            whole = self.setup.problem(pool, self.shares)
+            self._last[:] = [(pool, in_terms(whole, self.T, RIDGE))]
+        return self._last[0][1]
+
+    def value(self, pool: FeasiblePool, chosen: IntArray) -> float:
+        """Φ of a plan, of all parameters."""
+        return float(self.setup.criterion.value(self.setup.gathered(pool.blocks[:, chosen])))
+
+    def select(self, pool: FeasiblePool, begun: IntArray | None = None) -> Selection:
+        """The best plan found and its certificate; `begun` is a plan found on this pool already."""
+        first, efforts = len(pool), self.effort
+        self.progress(f"relaxation over {len(pool)} candidates")
+        relaxed = prospects(self.problem(pool), CLOSE if efforts.starts else FINE)
+        begins = self._begins(pool, relaxed, begun)
+        best, ends = begins[0], []
+        for k, chosen in enumerate(begins[: efforts.starts]):
+            pool, end = self.polished(pool, chosen, f"start{k}")
+            ends.append(self.value(pool, end))
+            self.progress(f"start {k + 1} of {efforts.starts}: {min(ends):.6g}")
+            best = end if ends[-1] <= min(ends) else best
+        continuum: list[Continuum] = []
+        for k in range(efforts.rounds):
+            relaxed = self._again(pool, relaxed)
+            if self.problem(pool).criterion.certifiable:
+                pool = self._widened(pool, relaxed, k + 1, continuum)
+            pool, best = self._bettered(pool, best, relaxed, k)
+        if efforts.starts:
+            relaxed = self._again(pool, relaxed, CLOSE if efforts.rounds else FINE)
+            best, _ = exact_plan(self.problem(pool), relaxed, warm=best, patience=0)
+        if efforts.rounds:
+            pool, best = self.polished(pool, best, "last", fine=True)
+        value = self.value(pool, best)
+        check_determined(self.setup.problem(pool, self.shares), value)
+        certificate = self._certificate(pool, relaxed, value, continuum)
+        certificate = replace(certificate, starts=tuple(ends))
+        return Selection(pool, best, value, certificate, first)
+
+    def _begins(
+        self, pool: FeasiblePool, relaxed: Relaxed, begun: IntArray | None
+    ) -> list[IntArray]:
+        """Plans to polish: that of exchange, then roundings and random plans in turn."""
+        problem, rng = self.problem(pool), np.random.default_rng(self.seed)
+
+        def make() -> State:
+            # Where plans are polished, other starts better them more than a longer search here.
+            patience = 0 if self.effort.starts else PATIENCE
+            found = exact_plan(
+                problem, relaxed, warm=begun, starts=self.effort.exchanges, seed=self.seed,
+                patience=patience,
+            )  # fmt: skip
+            return {"chosen": found[0]}
+
+        found = [self.checkpoint.stage("exchange").finished(make)["chosen"]]
+        for k in range(1, self.effort.starts):
+            new = rounded(problem, relaxed.weights, rng) if k % 2 == 0 else None
+            found.append(random_plan(problem, rng) if new is None else new)
+        return found
+
+    def polished(
+        self, pool: FeasiblePool, chosen: IntArray, name: str, fine: bool = False
+    ) -> tuple[FeasiblePool, IntArray]:
+        """The pool with the plan's polished poses, and the polished plan in it."""
+
+        def make() -> State:
+            q, _ = polish(
+                self.problem(pool), self.searches, self.T, pool.q[chosen], pool.load[chosen],
+                pool.group[chosen], fine,
+            )  # fmt: skip
+            return {"q": q}
+
+        q = self.checkpoint.stage(name).finished(make)["q"]
+        moved = (q != pool.q[chosen]).any(axis=1)
+        if not moved.any():
+            return pool, chosen
+        were, now = chosen[moved], chosen.copy()
+        now[moved] = np.arange(len(pool), len(pool) + len(were))
+        return pool.joined(self.setup.pool(q[moved], pool.load[were], pool.group[were])), now
+
+    def _again(self, pool: FeasiblePool, relaxed: Relaxed, gap: float = CLOSE) -> Relaxed:
+        """The relaxation on a pool that has grown since."""
+        start = np.concatenate([relaxed.weights, np.zeros(len(pool) - len(relaxed.weights))])
+        return prospects(self.problem(pool), gap, start)
+
+    def _continuum(self, pool: FeasiblePool, relaxed: Relaxed, seed: int) -> Continuum:
+        return estimate(
+            self.problem(pool), relaxed.tangent, self.searches, self.T, pool.q, pool.load,
+            seed=self.seed + seed, progress=self.progress,
+        )  # fmt: skip
+
+    def _widened(
+        self, pool: FeasiblePool, relaxed: Relaxed, k: int, found: list[Continuum]
+    ) -> FeasiblePool:
+        """The pool with the poses of the continuum that the relaxed optimum lacks."""
+
+        def make() -> State:
+            c = self._continuum(pool, relaxed, k)
+            counts = np.array([c.searched, c.ascents])
+            return {"q": c.q, "load": c.load, "group": c.group, "bound": np.array(c.bound),
+                    "counts": counts}  # fmt: skip
+
+        s = self.checkpoint.stage(f"continuum{k}").finished(make)
+        counts = [int(n) for n in s["counts"]]
+        found.append(Continuum(float(s["bound"]), s["q"], s["load"], s["group"], *counts))
+        if not len(s["q"]):
+            return pool
+        return pool.joined(self.setup.pool(s["q"], s["load"], s["group"]))
+
+    def _bettered(
+        self, pool: FeasiblePool, best: IntArray, relaxed: Relaxed, k: int
+    ) -> tuple[FeasiblePool, IntArray]:
+        """The pool and the better of the plan and those exchanged on the grown pool and polished:
+        one begun from the plan, one from the relaxation."""
+        problem, relaxed = self.problem(pool), self._again(pool, relaxed)
+        plans = [exact_plan(problem, relaxed, warm=w, patience=0)[0] for w in (best, None)]
+        for name, chosen in zip((f"warm{k}", f"anew{k}"), plans, strict=True):
+            pool, chosen = self.polished(pool, chosen, name)
+            if self.value(pool, chosen) < self.value(pool, best):
+                best = chosen
+        return pool, best
+
+    def _certificate(
+        self, pool: FeasiblePool, relaxed: Relaxed, value: float, found: list[Continuum]
+    ) -> Certificate:
+        problem = self.problem(pool)
+        if not problem.criterion.certifiable:
+            return Certificate(len(pool), None, None)
+        if len(relaxed.weights) < len(pool):
+            relaxed = self._again(pool, relaxed, FINE)
+        bound, size = relaxed.bound, len(pool)
+        if not self.effort.starts:
+            return Certificate(size, bound, efficiency(value, bound))
+        # The tangent of the pool's optimum says little of poses far better than the pool's: they
+        # join it, and that of the new optimum says more.
+        found = [*found, self._continuum(pool, relaxed, ROUND)]
+        for k in range(REFINED):
+            new = found[-1]
+            if new.bound >= NEAR * relaxed.bound or not len(new.q):
+                break
+            pool = pool.joined(self.setup.pool(new.q, new.load, new.group))
+            relaxed = self._again(pool, relaxed)
+            found.append(self._continuum(pool, relaxed, (k + 2) * ROUND))
+        beyond = min(found[-1].bound, bound)
+        return Certificate(
+            pool=size,
+            bound_pool=bound,
+            efficiency_pool=efficiency(value, bound),
+            bound_continuum=beyond,
+            efficiency_continuum=efficiency(value, beyond),
+            searched=sum(c.searched for c in found),
+            ascents=sum(c.ascents for c in found),
+        )
