@@ -8,7 +8,6 @@ from importlib.resources import files
 from pathlib import Path
 
 import numpy as np
-from elastocal.planning.relaxation import DesignProblem
 from numpy.typing import NDArray
 from scipy.optimize import differential_evolution
 
@@ -20,6 +19,7 @@ from elastocal.planning.criterion import TraceCriterion
 from elastocal.planning.feasibility import Feasibility
 from elastocal.planning.information import load_states
 from elastocal.planning.polish import Searches
+from elastocal.planning.relaxation import DesignProblem
 from elastocal.planning.setup import FeasiblePool, Known, Setup, set_up
 from elastocal.planning.test_poses import test_poses
 

@@ -412,7 +412,7 @@ class MeanCriterion(SpectralCriterion):
 
 
 @dataclass(frozen=True)
-class Tangent:
+class TangentBound:
     """Φ(M') ≥ `value`²/⟨G, M'⟩ for every M' (S, p, p), of a certifiable criterion; G (S, p, p)."""
 
     value: float
@@ -475,13 +475,13 @@ class Objective:
         weights = mean_slope(values, self.order)
         return float(power_mean(values, self.order)), weights[:, None, None] * C
 
-    def tangent(self, V: Array) -> Tangent:
+    def tangent(self, V: Array) -> TangentBound:
         """The tangent at V (S, p, p): G = V C V of weights that sum to 1."""
         values, C = self._slopes(V, True)
         weights = mean_slope(values, self.order)
         if self.order != 1:
             weights = weights / weights.sum()
-        return Tangent(float(weights @ values), V @ (weights[:, None, None] * C) @ V)
+        return TangentBound(float(weights @ values), V @ (weights[:, None, None] * C) @ V)
 
     def curvature(self, V: Array, X: Array) -> Array | float:
         """D²Φ (k, k) for directions X (S, k, p, p) of V (S, p, p)."""

@@ -48,8 +48,7 @@ from elastocal.planning.plan import (
     reasons,
 )
 from elastocal.planning.polish import Searches
-from elastocal.planning.search import EFFORTS, POOL, Search, Selection
-from elastocal.planning.search import Effort as SearchEffort
+from elastocal.planning.search import EFFORTS, POOL, Search, SearchEffort, Selection
 from elastocal.planning.setup import (
     FeasiblePool,
     Known,

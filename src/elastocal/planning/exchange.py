@@ -13,7 +13,7 @@ import numpy as np
 
 from elastocal.errors import InsufficientDataError, require
 from elastocal.planning.criteria import DeterminantCriterion
-from elastocal.planning.criterion import Objective, Tangent, inverse
+from elastocal.planning.criterion import Objective, TangentBound, inverse
 from elastocal.planning.relaxation import (
     DesignProblem,
     Relaxed,
@@ -187,7 +187,7 @@ def prospects(problem: DesignProblem, gap: float = 1e-4, start: Array | None = N
     return replace(found, bound=0.0)
 
 
-def excluded(problem: DesignProblem, tangent: Tangent, d: Array, value: float) -> BoolArray:
+def excluded(problem: DesignProblem, tangent: TangentBound, d: Array, value: float) -> BoolArray:
     """(N,): no plan with Φ < `value` contains the candidate: the tangent with each group's least
     price displaced by its own.
 

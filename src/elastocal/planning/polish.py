@@ -21,7 +21,7 @@ import numpy as np
 from elastocal.model.symbolic import SymbolicArm, configuration_rows
 from elastocal.planning.bodies import Pair
 from elastocal.planning.candidates import CHUNK, JointSpace, feasible, sobol
-from elastocal.planning.criterion import Tangent, inverse
+from elastocal.planning.criterion import TangentBound, inverse
 from elastocal.planning.feasibility import Feasibility
 from elastocal.planning.information import PoseInformation
 from elastocal.planning.margins import margins
@@ -360,7 +360,7 @@ class Continuum:
 
 def estimate(
     problem: DesignProblem,
-    tangent: Tangent,
+    tangent: TangentBound,
     searches: Searches,
     T: Array,
     q: Array,

@@ -18,7 +18,7 @@ from functools import cached_property, lru_cache
 import numpy as np
 
 from elastocal.errors import InsufficientDataError, require
-from elastocal.planning.criterion import Objective, Tangent, covariance, inverse
+from elastocal.planning.criterion import Objective, TangentBound, covariance, inverse
 from elastocal.units import Array, BoolArray, IntArray, Progress
 
 # Packed information larger than this (bytes) is not stored; pricing then goes through the blocks.
@@ -208,7 +208,7 @@ def largest_sum(d: Array, group: IntArray, shares: IntArray, most: int) -> float
     return total
 
 
-def tangent_bound(problem: DesignProblem, tangent: Tangent, d: Array) -> float:
+def tangent_bound(problem: DesignProblem, tangent: TangentBound, d: Array) -> float:
     """No plan has a smaller Φ: by the tangent at any point and its prices `d` (N,)."""
     reach = largest_sum(d, problem.group, problem.shares, problem.most)
     return tangent.value**2 / (float((tangent.G * problem.prior).sum()) + reach)
@@ -242,7 +242,7 @@ class Relaxed:
     weights: Array
     value: float
     bound: float
-    tangent: Tangent
+    tangent: TangentBound
 
     @property
     def gap(self) -> float:
@@ -373,7 +373,7 @@ SHARPEST = 1e6  # order of a power mean beyond which rounding takes it for the m
 
 def newton(
     problem: DesignProblem, support: IntArray, w: Array, accuracy: float
-) -> tuple[Array, Tangent, float]:
+) -> tuple[Array, TangentBound, float]:
     """Weights (k,) of the `support` whose log Φ is within `accuracy` of the least, the tangent that
     shows it, and Φ."""
     u, k = float(problem.most), len(support)

@@ -42,7 +42,7 @@ ROUND = 1000  # added to the seed of each of them, beyond the rounds that belong
 
 
 @dataclass(frozen=True)
-class Effort:
+class SearchEffort:
     """`starts` of the search, each polished, and `rounds` in which the continuum is searched for
     poses that the pool lacks.  Without starts the plan is one of the pool's candidates, the best of
     so many `exchanges`."""
@@ -52,16 +52,16 @@ class Effort:
     exchanges: int = 1
 
     @property
-    def in_pool(self) -> Effort:
+    def in_pool(self) -> SearchEffort:
         """For poses that are brought: none is moved."""
-        return Effort(0, 0, max(self.starts, 1))
+        return SearchEffort(0, 0, max(self.starts, 1))
 
 
 EFFORTS = {
-    "batch": Effort(starts=0, rounds=0, exchanges=2),
-    "quick": Effort(starts=5, rounds=0),
-    "normal": Effort(starts=8, rounds=2),
-    "thorough": Effort(starts=40, rounds=4),
+    "batch": SearchEffort(starts=0, rounds=0, exchanges=2),
+    "quick": SearchEffort(starts=5, rounds=0),
+    "normal": SearchEffort(starts=8, rounds=2),
+    "thorough": SearchEffort(starts=40, rounds=4),
 }
 
 
@@ -124,7 +124,7 @@ class Search:
     setup: Setup
     searches: Searches
     shares: IntArray
-    effort: Effort
+    effort: SearchEffort
     seed: int
     checkpoint: Checkpoint
     progress: Progress
@@ -135,7 +135,7 @@ class Search:
     @classmethod
     def of(
         cls, setup: Setup, pool: FeasiblePool, searches: Searches, shares: IntArray,
-        effort: Effort, seed: int, checkpoint: Checkpoint, progress: Progress,
+        effort: SearchEffort, seed: int, checkpoint: Checkpoint, progress: Progress,
         terms: Array | None = None, plain: Setup | None = None,
     ) -> Search:  # fmt: skip
         """`plain`: the setup without the poses that stay, where there are some.
