@@ -31,6 +31,16 @@ def test_an_effect_that_is_taken_out_is_named_by_no_engine() -> None:
     assert diagnosed("without_ignored").effects[0].effect == "gravity_sag"
 
 
+def test_what_imitates_a_withheld_effect_of_many_is_not_sure() -> None:
+    """An arm with errors at every joint, its weights taken out of the catalogue: what stands in
+    for them leaves more than the noise, and is no name above 0.9."""
+    whole = Path(__file__).parents[1] / "golden" / "inputs" / "whole"
+    weights = ("link_mass_error", "gravity_sag", "link_weights")
+    why = ec.diagnose(whole / "cell.toml", whole / "data.csv", without=weights)
+    assert why.verdict == "unknown_effect" and why.gap.unexplained > why.gap.noise_floor
+    assert max(e.probability for e in why.effects) < 0.9
+
+
 def test_noise_of_poses_is_nothing() -> None:
     why = diagnosed("pose_noise_claimed")
     assert why.verdict == "nothing_significant" and not why.effects

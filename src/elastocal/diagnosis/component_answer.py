@@ -265,6 +265,28 @@ class SumAnswer:
         return supported_floor(self.dataset, self.found.data, self.found.noise, best)
 
     @cached_property
+    def unexplained(self) -> float:
+        """Rms length in m that is neither noise nor explained by a name: what is beyond the noise,
+        and where that is more than the noise and a large part of the gap what only corrections
+        without a name take away."""
+        open_, floor = self.supported.unexplained, self.supported.noise
+        left = self._left_by_names if self._unnamed else 0.0
+        large = LARGE * (float(np.median(self.total)) + open_**2)
+        return max(open_, math.sqrt(left)) if left > max(floor**2, large) else open_
+
+    @cached_property
+    def _left_by_names(self) -> float:
+        """Mean square (m²) by which the names alone err at left-out configurations, beyond what
+        noise and the uncertainty of their fit make of it: r_c − X_c β̂₋c has covariance P_cc⁻¹."""
+        named = [k for k, c in enumerate(self.found.components) if c.named]
+        data = _thinned(self._of_components(named))
+        at = project(data, self.found.noise)
+        squares, count = squared_lengths(data, left_out_residual(at))
+        variance = np.diagonal(np.linalg.inv(at.P), axis1=1, axis2=2)
+        expected, _ = squared_lengths(data, np.sqrt(variance))
+        return float(max((squares - expected).sum() / count.sum(), 0.0))
+
+    @cached_property
     def deleted(self) -> Array:
         """The coefficients (Σ k, PARTS) without one part of the configurations after the other."""
         all_ = self._weighted

@@ -49,6 +49,7 @@ from elastocal.diagnosis.shrinkage import (
 from elastocal.diagnosis.stated_floor import FALSE_SMOOTH, noise_floor
 from elastocal.diagnosis.unknown import generic_blocks
 from elastocal.diagnosis.verdict import (
+    TOO_NEAR_PROBABILITY,
     Answer,
     candidates,
     curves_of,
@@ -376,13 +377,13 @@ def _of_sum(
     floor = answer.supported.noise
     gap = Gap(
         steps[0].heldout_rms, first[-1].heldout_rms, named[-1].heldout_rms, floor,
-        answer.supported.unexplained,
+        answer.unexplained,
     )  # fmt: skip
     return {
         "verdict": "unknown_effect" if gap.open else answer.verdict,
         "gap": gap,
         "budget": (*steps, BudgetStep("noise_floor", floor, (floor, floor))),
-        "effects": answer.effects,
+        "effects": beside_unknown(answer.effects) if gap.open else answer.effects,
         "indistinguishable": answer.indistinguishable,
         "location": answer.location(tests),
         "noise": noise_floor(answer.dataset, data, answer.found.noise),
@@ -393,6 +394,11 @@ def _of_sum(
         "fields": answer.fields,
         "slight": answer.slight,
     }
+
+
+def beside_unknown(effects: Sequence[FoundEffect]) -> tuple[FoundEffect, ...]:
+    """Names beside something without a name, which may be part of its imitation."""
+    return tuple(replace(f, probability=min(f.probability, TOO_NEAR_PROBABILITY)) for f in effects)
 
 
 def _unknown(found: SelectedEffects) -> float:
