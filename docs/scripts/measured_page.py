@@ -1,4 +1,4 @@
-"""docs/measured.md, made from what the studies wrote into their own folders.
+"""docs/measured.md and docs/measured/*.md, made from what the studies wrote into their own folders.
 
     python docs/scripts/measured_page.py
 
@@ -15,19 +15,21 @@ from pathlib import Path
 
 ROOT = Path(__file__).resolve().parents[2]
 PAGE = ROOT / "docs" / "measured.md"
+FOLDER = ROOT / "docs" / "measured"
 STUDIES = "experiment_design"
 
 HEAD = """\
 # What was measured
 
-Made by `docs/scripts/measured_page.py` from what the studies wrote; each table stands under the command that prints it,
-from a checkout. Real arms are public data; where to get them: `experiment_design/real_arms/README.md`.
+Made by `docs/scripts/measured_page.py` from the result files of the studies. Each table stands under the command that
+prints it, run from a checkout. The real arms are public data; `experiment_design/real_arms/README.md` says where to
+get them.
 """
 
 TESTED = """\
-## What the tests hold
+## Bounds that the tests check
 
-These are no single figures but bounds that `make test` checks anew each time.
+`make test` checks these bounds each time.
 
 | what | bound | test |
 |---|---|---|
@@ -52,25 +54,24 @@ class Part:
     tables: int = 0
 
 
-ROOMS: dict[str, tuple[Part, ...]] = {
+PAGES: dict[str, tuple[Part, ...]] = {
     "Real arms": (
         Part(
             "Identified",
-            "Poses that no fit has seen, mm (UR5 published: 0.155 for a hybrid method, 2.57 "
-            "uncalibrated; WAM 2.92).",
+            "Error at test poses, mm. Published: UR5 0.155 (hybrid method), 2.57 uncalibrated; WAM 2.92.",
             "python experiment_design/real_arms/run.py",
             f"{STUDIES}/real_arms/result.md",
         ),
         Part(
             "Diagnosed",
-            "Before `diagnose`, what one diagnosis named before it judged all causes together, "
-            "and now, mm; identified with `--test` where there is a second run.",
+            "Error in mm, with `--test` where a second run exists. \"Earlier version\": causes judged one by one; "
+            "\"as diagnosed\": all causes judged together.",
             "python experiment_design/real_arms/diagnose.py",
             f"{STUDIES}/real_arms/diagnosis.md",
             tables=1,
         ),
         Part(
-            "Rows that the tool names as faulty, IRB 120 by cable",
+            "Outliers found, IRB 120 by cable",
             "",
             "python experiment_design/real_arms/faulty_rows.py",
             f"{STUDIES}/real_arms/faulty_rows.md",
@@ -78,19 +79,19 @@ ROOMS: dict[str, tuple[Part, ...]] = {
     ),
     "Intervals and noise": (
         Part(
-            "Linear campaigns on the KR 270, noise of the paper's Table 1 or a polar tracker",
+            "Linear simulations on the KR 270, noise of the paper's Table 1 or a polar tracker",
             "",
             "elastocal study experiment_design/coverage",
             f"{STUDIES}/coverage/result.md",
         ),
         Part(
-            "Whole arms, parameters and noise chosen anew in each campaign",
+            "Whole arms: parameters and noise model selected anew in each measurement session",
             "",
             "elastocal study experiment_design/arm_coverage",
             f"{STUDIES}/arm_coverage/result.md",
         ),
         Part(
-            "How long a drift lasts",
+            "Correlation time of a drift",
             "",
             "python experiment_design/arm_coverage/lasting.py 8 8",
             f"{STUDIES}/arm_coverage/README.md",
@@ -98,8 +99,8 @@ ROOMS: dict[str, tuple[Part, ...]] = {
             tables=1,
         ),
         Part(
-            "What plans promise under nine kinds of noise",
-            "Rms error at the test poses over the one promised; plans of quick effort.",
+            "Predicted error of plans under nine kinds of noise",
+            "Realised over predicted rms error at the test poses; plans with `--effort quick`.",
             "python experiment_design/arm_coverage/planned.py 200",
             f"{STUDIES}/arm_coverage/README.md",
             "What plans promise",
@@ -112,7 +113,7 @@ ROOMS: dict[str, tuple[Part, ...]] = {
             f"{STUDIES}/cramer_rao/result.md",
         ),
         Part(
-            "What the paper's iterated weights are worth: noise of Table 1",
+            "The paper's iterated weights: noise of Table 1",
             "",
             "python experiment_design/kr270_reproduction/reproduce.py",
             f"{STUDIES}/kr270_reproduction/result.md",
@@ -120,15 +121,15 @@ ROOMS: dict[str, tuple[Part, ...]] = {
         ),
         Part(
             'A verdict that says "trusted at X"',
-            "Arms, sizes, plans and hidden effects drawn at random; "
-            "[how](../experiment_design/verdict/README.md).",
+            "Arms, sizes, plans and hidden effects are random "
+            "([how](../../experiment_design/verdict/README.md)).",
             "elastocal study experiment_design/verdict",
             f"{STUDIES}/verdict/result.md",
         ),
     ),
     "Plans": (
         Part(
-            "As the paper's Table 2, joint limits alone",
+            "As the paper's Table 2, joint limits only",
             "",
             "python experiment_design/kr270_plan/study.py",
             f"{STUDIES}/kr270_plan/result.md",
@@ -148,13 +149,13 @@ ROOMS: dict[str, tuple[Part, ...]] = {
             f"{STUDIES}/kr270_plan/assumptions.md",
         ),
         Part(
-            "What a steady drift of 50 µm does, by the order of the poses",
+            "Effect of a steady drift of 50 µm, by order of the poses",
             "",
             "python experiment_design/kr270_plan/drift_order.py",
             f"{STUDIES}/kr270_plan/drift.md",
         ),
         Part(
-            "CPU of a quick plan where nine moves of ten are blocked",
+            "CPU time of a quick plan when nine of ten moves are blocked",
             "",
             "time elastocal design experiment_design/kr270_plan/crowded.toml --effort quick -o plan.csv",
             f"{STUDIES}/kr270_plan/README.md",
@@ -162,7 +163,7 @@ ROOMS: dict[str, tuple[Part, ...]] = {
             tables=1,
         ),
         Part(
-            "Effects named from 30 poses, 100 arms that lack one",
+            "Effects named from 30 poses, 100 arms with one missing effect",
             "",
             "elastocal study experiment_design/next_best --set arms=0 --set named=100",
             f"{STUDIES}/next_best/README.md",
@@ -170,7 +171,7 @@ ROOMS: dict[str, tuple[Part, ...]] = {
             tables=1,
         ),
         Part(
-            "The error elsewhere",
+            "Error outside the test poses",
             "",
             "python experiment_design/everywhere/study.py",
             f"{STUDIES}/everywhere/result.md",
@@ -182,13 +183,13 @@ ROOMS: dict[str, tuple[Part, ...]] = {
             f"{STUDIES}/exact_quality/result.md",
         ),
         Part(
-            "Feasible poses and free moves, looked at by MuJoCo",
+            "Feasible poses and free moves, checked in MuJoCo",
             "",
             "python experiment_design/feasibility_check/check.py",
             f"{STUDIES}/feasibility_check/result.md",
         ),
         Part(
-            "Beside FIGAROH: UR10, its own pool and regressor",
+            "Compared with FIGAROH: UR10, its own pool and regressor",
             "",
             "python benchmarks/design_peers.py",
             "benchmarks/README.md",
@@ -196,7 +197,7 @@ ROOMS: dict[str, tuple[Part, ...]] = {
             tables=2,
         ),
         Part(
-            "Beside pyDOE3 and scipy: KR 270",
+            "Compared with pyDOE3 and scipy: KR 270",
             "",
             "python benchmarks/design_peers.py",
             "benchmarks/README.md",
@@ -207,24 +208,25 @@ ROOMS: dict[str, tuple[Part, ...]] = {
     "Diagnosis of simulated arms": (
         Part(
             "One withheld effect",
-            "Arms simulated in MuJoCo; [how](../experiment_design/blind_diagnosis/README.md).",
+            "Arms simulated in MuJoCo ([how](../../experiment_design/blind_diagnosis/README.md)).",
             "elastocal study experiment_design/blind_diagnosis",
             f"{STUDIES}/blind_diagnosis/result.md",
             "Bars",
         ),
         Part(
             "Whole arms",
-            "Lines, eccentricity, sag, compliance, the last move, scatter and drift act at every "
-            "joint at once; the oracle knows structure and orders. Seed 11 was looked at while shares were "
-            "mended, seed 12 was not.",
-            "python experiment_design/blind_diagnosis/whole_arms.py --seed 11 --worlds 6 --poses 60",
+            "Gear lines, eccentricity, sag, compliance, the last move, scatter and drift act at every joint "
+            "at once. The oracle knows structure and orders. All tables: "
+            "`experiment_design/blind_diagnosis/result_whole.md`.",
+            "python experiment_design/blind_diagnosis/whole_arms.py --seed 27 --worlds 6 --poses 60",
             f"{STUDIES}/blind_diagnosis/result_whole.md",
+            "Thirty arms",
         ),
     ),
     "Speed": (
         Part("Goals", "", "make bench", "benchmarks/result.md", "Benchmarks: result", 1),
         Part(
-            "Whole fits beside their peers, UR10, 300 poses",
+            "Whole fits compared with other packages, UR10, 300 poses",
             "",
             "make bench",
             "benchmarks/result.md",
@@ -232,7 +234,7 @@ ROOMS: dict[str, tuple[Part, ...]] = {
             tables=1,
         ),
         Part(
-            "The verbs on the demo",
+            "The commands on the demo",
             "",
             "make bench",
             "benchmarks/result.md",
@@ -248,8 +250,8 @@ ROOMS: dict[str, tuple[Part, ...]] = {
             f"{STUDIES}/compensation/result.md",
         ),
         Part(
-            "MuJoCo models as their users have them",
-            "From `init` to `export` in place; [each arm](../experiment_design/mujoco_arms/README.md).",
+            "Public MuJoCo models",
+            "From `init` to `export` ([each arm](../../experiment_design/mujoco_arms/README.md)).",
             "python experiment_design/mujoco_arms/walk.py",
             f"{STUDIES}/mujoco_arms/README.md",
             "From a MuJoCo model",
@@ -277,16 +279,29 @@ def shown(part: Part) -> str:
     return "\n\n".join(tables[: part.tables])
 
 
-def page() -> str:
-    """The whole page."""
-    parts = [HEAD]
-    for room, inside in ROOMS.items():
-        parts.append(f"## {room}\n")
+def name_of(title: str) -> str:
+    """File name of a page."""
+    return title.lower().replace(" ", "-") + ".md"
+
+
+def pages() -> dict[Path, str]:
+    """Every page: where it stands and what it says."""
+    made = {}
+    for title, inside in PAGES.items():
+        parts = [f"# Measured: {title[0].lower()}{title[1:]}\n"]
         for part in inside:
             says = f"{part.says}\n\n" if part.says else ""
-            parts.append(f"### {part.title}\n\n{says}    {part.command}\n\n{shown(part)}\n")
-    return "\n".join([*parts, TESTED])
+            parts.append(f"## {part.title}\n\n{says}    {part.command}\n\n{shown(part)}\n")
+        made[FOLDER / name_of(title)] = "\n".join(parts)
+    contents = [
+        f"- [{title}](measured/{name_of(title)}): {'; '.join(p.title for p in inside)}"
+        for title, inside in PAGES.items()
+    ]
+    made[PAGE] = "\n".join([HEAD, *contents, "", TESTED])
+    return made
 
 
 if __name__ == "__main__":
-    PAGE.write_text(page(), encoding="utf-8")
+    FOLDER.mkdir(exist_ok=True)
+    for path, text in pages().items():
+        path.write_text(text, encoding="utf-8")
