@@ -185,14 +185,16 @@ def row(t: Trip) -> str:
 HEAD = """\
 # Round trips
 
-Arms of the packages example-robot-data and rtb-data. For each: a cell by `init`, 40 random poses simulated with errors
-of typical size, `identify` on 32 of them, `export` to each format. Another program reads each file and predicts the
-markers at the other 8 poses: pinocchio the URDF, MuJoCo at rest under load the MJCF, elastocal's reader the DH tables
-(base placed by the fitted poses). Made by `python benchmarks/round_trips.py -o docs/round-trips.md`.
+Arms of the packages example-robot-data and rtb-data. For each: a cell by `init`, 40 random poses
+simulated with errors of typical size, `identify` on 32 of them, `export` to each format. Another
+program reads each file and predicts the markers at the other 8 poses: pinocchio the URDF, MuJoCo
+at rest under load the MJCF, elastocal's reader the DH tables (base placed by the fitted poses).
+Made by `python benchmarks/round_trips.py -o docs/round-trips.md`.
 
-Errors are 3-D rms in µm with measurement noise, which alone gives {noise:.0f} µm. The nominal arm has base and markers
-placed. In brackets: the largest loss of the format as `export` states it, mostly gravity sag; rigid formats are judged
-without load. Bold: above 1.3 times noise and loss together.
+Errors are 3-D rms in µm with measurement noise, which alone gives {noise:.0f} µm. The nominal arm
+has base and markers placed. In brackets: the largest loss of the format as `export` states it,
+mostly gravity sag; rigid formats are judged without load. Bold: above 1.3 times noise and loss
+together.
 
 | arm | joints | links, m | nominal | model | URDF | MJCF | DH | modified DH |
 |---|---|---|---|---|---|---|---|---|
@@ -204,9 +206,7 @@ def page(trips: list[Trip], refused: dict[str, str]) -> str:
     good = sum(t.passes(form) for t in trips for form in FORMATS)
     told = f"\n{good} of {len(trips) * len(FORMATS)} files of {len(trips)} arms pass."
     if refused:
-        told += (
-            f" Rejected, not arms of 4 to 9 joints: {len(refused)} other robots (legs, drones, hands)."
-        )
+        told += f" Not arms of 4 to 9 joints: {len(refused)} other robots (legs, drones, hands)."
     noise = trips[0].noise * 1e6 if trips else 0.0
     return HEAD.format(noise=noise) + "\n".join(map(row, trips)) + "\n" + told + "\n"
 

@@ -64,8 +64,8 @@ PAGES: dict[str, tuple[Part, ...]] = {
         ),
         Part(
             "Diagnosed",
-            "Error in mm, with `--test` where a second run exists. \"Earlier version\": causes judged one by one; "
-            "\"as diagnosed\": all causes judged together.",
+            'Error in mm, with `--test` where a second run exists. "Earlier version": causes judged one by one; '
+            '"as diagnosed": all causes judged together.',
             "python experiment_design/real_arms/diagnose.py",
             f"{STUDIES}/real_arms/diagnosis.md",
             tables=1,
