@@ -331,9 +331,10 @@ class _Design:
         tried, feasible = (int(v) for v in state["tried"])
         removed = dict(zip(state["rules"].tolist(), state["removed"].tolist(), strict=True))
         counts = CandidateCounts(tried, feasible, removed)
-        self.taught = {
-            q.tobytes(): str(n) for q, n in zip(state["q"], state["names"], strict=False)
-        }
+        names = zip(state["q"], state["names"], strict=False)  # of those brought, which come first
+        self.taught = {q.tobytes(): str(name) for q, name in names}
+        if told := str(state["told"]):
+            self.warnings.append(told)
         return state["q"], state["load"], state["group"], counts
 
     def _drawn(self) -> State:

@@ -36,6 +36,8 @@ from elastocal.units import Array, IntArray, Progress
 
 POOL = 2000  # candidates where nobody asks for a number
 CLOSE, FINE = 1e-3, 1e-4  # gap of the relaxations that lead to the next one, and of the last
+# Of Φ: what starts differ by less is where IPOPT stops, and mirrored poses tell apart by rounding.
+SAME = 1e-4
 NEAR = 0.97  # of the bound on the pool: a continuum as near as that is not searched again
 REFINED = 3  # times at most
 ROUND = 1000  # added to the seed of each of them, beyond the rounds that belong to the effort
@@ -166,12 +168,13 @@ class Search:
         self.progress(f"relaxation over {len(pool)} candidates")
         relaxed = prospects(self.problem(pool), CLOSE if efforts.starts else FINE)
         begins = self._begins(pool, relaxed, begun)
-        best, ends = begins[0], []
+        best, least, ends = begins[0], np.inf, list[float]()
         for k, chosen in enumerate(begins[: efforts.starts]):
             pool, end = self.polished(pool, chosen, f"start{k}")
             ends.append(self.value(pool, end))
             self.progress(f"start {k + 1} of {efforts.starts}: {min(ends):.6g}")
-            best = end if ends[-1] <= min(ends) else best
+            if ends[-1] < least * (1 - SAME):
+                best, least = end, ends[-1]
         continuum: list[Continuum] = []
         for k in range(efforts.rounds):
             relaxed = self._again(pool, relaxed)
@@ -268,7 +271,7 @@ class Search:
         plans = [exact_plan(problem, relaxed, warm=w, patience=0)[0] for w in (best, None)]
         for name, chosen in zip((f"warm{k}", f"anew{k}"), plans, strict=True):
             pool, chosen = self.polished(pool, chosen, name)
-            if self.value(pool, chosen) < self.value(pool, best):
+            if self.value(pool, chosen) < self.value(pool, best) * (1 - SAME):
                 best = chosen
         return pool, best
 

@@ -84,6 +84,11 @@ def check_available(cell: Cell, available: IntArray, shares: IntArray) -> None:
     level = f" takes {shares[k]} at level {k + 1} of {next(iter(cell.design.levels), '')}"
     where = f"{cell.path or cell.name}: a plan of {int(shares.sum())} poses"
     where += level if len(shares) > 1 else ""
+    if (taught := cell.design.taught) is not None:
+        raise InsufficientDataError(
+            f"{where}, but of the poses of {taught} the cell allows {available[k]} there; bring "
+            f'more, draw others beside them (candidates = ["{taught.name}", 500]), or plan fewer'
+        )
     asked = drawn // len(shares) + (k < drawn % len(shares))
     require(
         asked >= shares[k],
