@@ -42,20 +42,3 @@ def test_an_unknown_backend_is_told_with_the_known_ones() -> None:
     assert found.exit_code == 2
     assert "--backend: unknown backend 'nunpy' (did you mean 'numpy'" in found.output
     assert "no-cell.toml" not in found.output
-
-
-def test_the_environment_is_checked_as_well(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setenv(VARIABLE, "gpu")
-    found = CliRunner().invoke(app, ABSENT)
-    assert found.exit_code == 2
-    assert VARIABLE in found.output and "gpu" in found.output
-
-
-def test_what_is_gone_names_its_successor(monkeypatch: pytest.MonkeyPatch) -> None:
-    """The compiled backend is refused; a folder for a cache asks for nothing and is only told."""
-    found = CliRunner().invoke(app, ["--backend", "compiled", *ABSENT])
-    assert found.exit_code == 2
-    assert "--backend: the backend 'compiled' is gone" in found.output and "auto" in found.output
-    monkeypatch.setenv("ELASTOCAL_CACHE", "anywhere")
-    found = CliRunner().invoke(app, ABSENT)
-    assert "ELASTOCAL_CACHE is no longer read" in found.output

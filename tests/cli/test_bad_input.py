@@ -34,13 +34,6 @@ def refused(code, *fragments, campaign, extra=()):
     assert sorted(os.listdir(cell.parent)) == before
 
 
-def edit(path: Path, pattern: str, replacement: str, count: int = 1) -> None:
-    text = path.read_text(encoding="utf-8")
-    changed = re.sub(pattern, replacement, text, count=count, flags=re.M)
-    assert changed != text
-    path.write_text(changed, encoding="utf-8")
-
-
 def cells_of(path: Path) -> list[list[str]]:
     return [line.split(",") for line in path.read_text(encoding="utf-8").splitlines()]
 
@@ -49,35 +42,7 @@ def write_cells(path: Path, rows: list[list[str]]) -> None:
     path.write_text("\n".join(",".join(row) for row in rows) + "\n", encoding="utf-8")
 
 
-def set_cell(path: Path, line: int, column: str, text: str) -> None:
-    rows = cells_of(path)
-    rows[line - 1][rows[0].index(column)] = text
-    write_cells(path, rows)
-
-
-def test_the_campaign_itself_is_accepted(campaign):
-    cell, data = campaign
-    code, message = run("identify", cell, data, "-o", cell.parent / "result.json", "-q")
-    assert code == 0, message
-    assert (cell.parent / "result.json").exists()
-
-
 # --- the table -----------------------------------------------------------------------------
-
-
-def test_degrees_given_as_radians(campaign):
-    edit(campaign[1], r"q\d_deg", lambda m: m[0].replace("deg", "rad"), count=6)
-    refused(2, "degrees", "rename it to …_deg", campaign=campaign)
-
-
-def test_metres_given_as_millimetres(campaign):
-    edit(campaign[1], r"(\w)_mm", r"\1_m", count=3)
-    refused(2, "millimetres in columns named …_m", campaign=campaign)
-
-
-def test_fewer_equations_than_parameters(campaign):
-    write_cells(campaign[1], cells_of(campaign[1])[:5])
-    refused(1, "12 equations", "15 parameters", "measure more", campaign=campaign)
 
 
 def test_crlf_bom_and_semicolons_with_decimal_commas_are_understood(campaign):
@@ -145,51 +110,7 @@ def test_output_folder_where_not_even_root_may_write(campaign):
     assert code == 2 and "/sys/kernel" in message and "write" in message
 
 
-@pytest.mark.parametrize("name", ["noise.csv", "noise.npy"])
-def test_covariance_that_is_no_file_of_numbers(campaign, name):
-    path = campaign[0].parent / name
-    extra = ("--covariance", path)
-    refused(2, name, "no such file; check the path of the noise", campaign=campaign, extra=extra)
-    path.mkdir()
-    refused(2, name, "is a directory; give the noise covariance", campaign=campaign, extra=extra)
-    path.rmdir()
-    path.write_bytes("1,2\n3,ä\n".encode("latin-1"))
-    told = "line 2: not UTF-8 text" if name.endswith("csv") else "not a matrix of numbers"
-    refused(2, name, told, campaign=campaign, extra=extra)
-
-
-def test_a_covariance_that_is_none(campaign):
-    path = campaign[0].parent / "noise.csv"
-    path.write_text(
-        "\n".join(",".join("1" if j <= i else "0" for j in range(36)) for i in range(36))
-    )
-    refused(2, "--covariance is not.* symmetric", campaign=campaign, extra=("--covariance", path))
-
-
 # --- nonsense, and numbers beyond all measure ---------------------------------------------------
-
-
-def change_columns(path: Path, changed) -> None:
-    """Apply `changed` to the table of cells below the header, a list of rows."""
-    rows = cells_of(path)
-    write_cells(path, [rows[0], *changed(rows[1:])])
-
-
-def test_readings_of_other_poses_are_no_calibration(campaign):
-    order = [5, 9, 2, 11, 0, 7, 3, 10, 1, 8, 6, 4]
-    change_columns(
-        campaign[1],
-        lambda rows: [[*rows[k][:6], *r[6:]] for k, r in zip(order, rows, strict=True)],
-    )
-    refused(1, "data.csv: after the fit", "which joint values belong", campaign=campaign)
-
-
-@pytest.mark.parametrize("force", ["1e300", "-1e9"])
-def test_a_force_beyond_all_measure_is_refused(campaign, force):
-    rows = cells_of(campaign[1])
-    names = ["force_x_N", "force_y_N", "force_z_N"]
-    write_cells(campaign[1], [[*rows[0], *names], *([*r, "0", "0", force] for r in rows[1:])])
-    refused(2, "line 2, column force_z_N: no arm carries", campaign=campaign)
 
 
 def test_a_force_that_rounding_left_is_none(campaign):

@@ -85,30 +85,6 @@ def test_where_nothing_happened_nothing_is_named_though_base_and_markers_moved()
     assert found["tool"]["rms_um"] < 2 * found["tool"]["by_chance_rms_um"]
 
 
-def test_the_page_is_green_only_where_two_campaigns_show_no_change(folder):
-    shutil.copyfile(folder / "old.json", folder / "copy.json")
-    for new, tone in (("bent", "care"), ("same", "good"), ("copy", "care")):
-        _, out, err = run("old.json", f"{new}.json", "--report", "tone.html")
-        page = Path("tone.html").read_text()
-        assert f'<section class="judgement {tone}"' in page, (new, err)
-        told = "old.json and copy.json are the same result, equal to the last digit"
-        assert (told in " ".join(out.split())) == (told in page) == (new == "copy")
-    assert json.loads(run("old.json", "copy.json", "--json")[1])["one_result"] is True
-    assert json.loads(run("old.json", "same.json", "--json")[1])["one_result"] is False
-
-
-def test_in_python_it_is_a_result_like_the_others():
-    arms = [ec.read_calibrated("cell.toml", f"{name}.json") for name in ("old", "bent")]
-    found = ec.compare(*arms)
-    assert [c.name for c in found.changed] == [BENT] and "link2.dx" in str(found)
-    assert len(found.to_dataframe()) == len(found.changes) and found.plot().axes
-    assert ec.compare(arms[0], arms[0]).p == 1.0
-    with pytest.raises(ec.InputError, match="`level` takes a number between 0 and 1"):
-        ec.compare(*arms, level=2)
-    with pytest.raises(ec.InputError, match="`old` takes a calibrated arm"):
-        ec.compare("old.json", arms[1])
-
-
 def test_what_another_choice_of_parameters_determined_is_told_in_that_of_the_old(folder):
     """The same arm identified with another complete set: nothing but the names differs."""
     model = ec.Model("cell.toml")
@@ -143,10 +119,3 @@ def test_a_softer_joint_is_seen_under_the_loads_of_the_campaigns(folder):
     assert found["tool"]["rms_um"] > 10 * found["tool"]["by_chance_rms_um"] > 0
     arms = [ec.read_calibrated("soft.toml", f"soft{k}.json") for k in (0, 1)]
     assert ec.compare(*arms, load=[0, 0, 0]).distance.max() < 1e-6
-
-
-def test_the_cell_is_that_of_both():
-    code, _, err = run("old.json", "bent.json", "--cell", "none.toml")
-    assert code == 2 and "none.toml" in err
-    code, _, err = run("old.json", "bent.json", "-o", "old.json")
-    assert code == 2 and "would be written over" in err

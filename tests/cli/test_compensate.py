@@ -106,22 +106,6 @@ def test_the_marker_named_is_where_simulate_sees_it(folder):
     assert np.allclose(x, [1.8, 1.81, 1.82], atol=1e-7)
 
 
-def test_one_target_on_the_terminal(folder):
-    outcome = run(folder, "--target", "1800,300,1500", "--load", "0", "0", "-2600")
-    assert outcome.exit_code == 0, outcome.stderr
-    assert "target 1: q1_deg" in outcome.stdout
-
-
-def test_a_table_of_corrections(folder):
-    out = folder / "table.csv"
-    outcome = run(folder, "--table", out, "--grid", "2,2,1,1,1,1", "--json")
-    assert outcome.exit_code == 0, outcome.stderr
-    told = json.loads(outcome.stdout)["table"]
-    assert told["points"] == 4 and told["checked_between"] > 0
-    rows = list(csv.DictReader(out.open()))
-    assert len(rows) == 4 and "dx_mm" in rows[0] and "drz_deg" in rows[0]
-
-
 def test_a_target_out_of_reach_ends_with_1_and_writes_nothing_unless_partial(folder):
     (folder / "targets.csv").write_text(TARGETS + "9000,0,0,0,0,0,0,0,-2600\n")
     out = folder / "commands.csv"
@@ -136,54 +120,9 @@ def test_a_target_out_of_reach_ends_with_1_and_writes_nothing_unless_partial(fol
     assert rows[0]["status"] == "reached"
 
 
-def test_a_refused_table_leaves_no_commands_behind(folder):
-    commands, table = folder / "commands.csv", folder / "table.csv"
-    outcome = run(folder, folder / "targets.csv", "-o", commands, "--table", table,
-                  "--box", "9000,0,0,9100,100,100", "--grid", "1")  # fmt: skip
-    assert outcome.exit_code == 1 and "Nothing was written" in outcome.stderr
-    assert not commands.exists() and not table.exists()
-
-
-def test_a_refused_table_speaks_of_its_grid_and_not_of_targets(folder):
-    outcome = run(folder, "--table", folder / "table.csv",
-                  "--box", "9000,0,0,9100,100,100", "--grid", "1")  # fmt: skip
-    assert outcome.exit_code == 1
-    told = "1 of 1 grid points (x_mm, y_mm, z_mm) are not reached: (9050, 50, 50) (not reached)"
-    assert told in outcome.stderr
-    assert "smaller --box" in outcome.stderr and "target" not in outcome.stderr
-
-
-@pytest.mark.parametrize(
-    "damage",
-    [
-        {"covariance": [[1, 2], [3]]},
-        {"covariance": [["a"]]},
-        {"covariance": None},
-        {"covariance_of": None},
-        {"covariance_of": 5},
-        {"nominal_flange": "abc"},
-        {"nominal_flange": [[1, 2]]},
-    ],
-    ids=str,
-)
-def test_a_damaged_result_is_refused(folder, damage):
-    path = folder / "result.json"
-    path.write_text(json.dumps(json.loads(path.read_text()) | damage))
-    outcome = run(folder, folder / "targets.csv")
-    assert outcome.exit_code == 2
-    assert "result.json" in outcome.stderr and "write the result anew" in outcome.stderr
-
-
 def test_names_of_markers_are_no_markup(folder):
     cell = folder / "cell.toml"
     cell.write_text(CELL.replace("M2 =", '"[bold]M2" ='))
     outcome = run(folder, folder / "targets.csv", "--point", "[bold]M2")
     assert outcome.exit_code == 0, outcome.stderr
     assert "[bold]M2" in " ".join(outcome.stdout.split())
-
-
-def test_a_forgotten_load_is_mentioned(folder):
-    outcome = run(folder, "--target", "1800,300,1500")
-    assert "no load is stated" in " ".join(outcome.stdout.split())
-    outcome = run(folder, "--target", "1800,300,1500", "--load", "0", "0", "-2600")
-    assert "no load is stated" not in " ".join(outcome.stdout.split())

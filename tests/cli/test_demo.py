@@ -32,10 +32,3 @@ def test_somebodys_own_files_stay(tmp_path: Path, name: str) -> None:
     assert f"{tmp_path / name} is not the demo's" in outcome.stderr
     assert [path.name for path in tmp_path.iterdir()] == [name]
     assert (tmp_path / name).read_text() == "mine"
-
-
-@pytest.mark.parametrize("inside", ["file", "file/demo"])
-def test_a_file_is_no_folder(tmp_path: Path, inside: str) -> None:
-    (tmp_path / "file").write_text("mine")
-    outcome = demo(tmp_path / inside)
-    assert outcome.exit_code == 2 and "name a folder for the demo" in outcome.stderr

@@ -5,15 +5,11 @@ import re
 import pytest
 from support.design_commands import (
     BARE,
-    POSITION,
     design,
-    elastocal,
     everything_in,
     planned,
     write_cell,
 )
-
-from elastocal.planning.criteria import CRITERIA
 
 PATH = '\n[design.test_path]\nfile = "path.csv"\n'
 JOINTS = ",".join(f"q{i}_deg" for i in range(1, 7))
@@ -32,14 +28,6 @@ def refused(cell, code, *fragments, extra=(), output="plan.csv"):
     assert all(path.read_bytes() == content for path, content in before.items())
 
 
-# id: (cell, exit code, fragments of the message)
-# id: (options, exit code, fragments of the message)
-@pytest.mark.parametrize("options", [("--poses", "1"), ("--curve", "1,6")])
-def test_fewer_equations_than_parameters(tmp_path, options):
-    told = "1 poses of 18 readings give 18, for \\d+ parameters; plan at least 2"
-    refused(write_cell(tmp_path, POSITION), 1, "fewer equations", told, extra=options)
-
-
 @pytest.mark.parametrize(
     ("output", "fragment"),
     [
@@ -56,15 +44,6 @@ def test_an_output_that_cannot_be(tmp_path, output, fragment):
     refused(cell, 2, fragment, output=output)
 
 
-def test_a_program_for_six_axes_is_refused_for_another_arm_before_the_work(tmp_path):
-    rows = [f"{0.1 * i},{0.2 + 0.1 * i},0.3,{1.57 * (i % 2)}" for i in range(7)]
-    (tmp_path / "arm.csv").write_text("\n".join(["theta0_rad,d_m,a_m,alpha_rad", *rows, ""]))
-    text = re.sub(r"urdf = .*", 'dh = "arm.csv"\ndh_convention = "standard"', BARE)
-    text = re.sub(r"joint_compliance = \[.*", "", text)
-    cell = write_cell(tmp_path, text)
-    refused(cell, 2, "--program .*moves.src", "six", extra=("--program", tmp_path / "moves.src"))
-
-
 def test_a_refused_plan_leaves_the_one_of_before(tmp_path):
     cell = write_cell(tmp_path)
     planned(cell)
@@ -75,11 +54,3 @@ def test_a_picture_that_cannot_be_written_leaves_no_half_file(tmp_path):
     cell = write_cell(tmp_path)
     (tmp_path / "poses.png").mkdir()
     refused(cell, 2, "poses.png is a directory", extra=("--picture", tmp_path / "poses.png"))
-
-
-def test_help_says_what_the_verb_is_for():
-    result = elastocal("design", "--help")
-    assert result.exit_code == 0
-    assert "Which poses should I measure?" in result.stdout
-    named = result.stdout.partition("--criterion <str>")[2].partition(";")[0]
-    assert re.findall(r"\w+", named) == [*CRITERIA]

@@ -1,7 +1,6 @@
 """An interrupted design goes on where it was, and ends as if nothing had happened."""
 
 import contextlib
-import json
 import signal
 import subprocess
 import sys
@@ -75,15 +74,6 @@ def test_it_goes_on_and_ends_with_the_same_plan(tmp_path, monkeypatch, whole, sa
     assert everything_in(tmp_path) == ["cell.toml", "plan.csv", "plan.json"]
 
 
-def test_another_seed_starts_anew(tmp_path, monkeypatch, whole):
-    cell = write_cell(tmp_path)
-    interrupted(cell, monkeypatch, 2)
-    result = design(cell, "--seed", "1", quiet=False)
-    assert result.exit_code == 0 and GOING_ON not in result.stderr
-    assert (tmp_path / "plan.csv").read_bytes() == whole[1]
-    assert everything_in(tmp_path) == ["cell.toml", "plan.csv", "plan.json"]
-
-
 def test_an_edited_cell_starts_anew(tmp_path, monkeypatch):
     cell = write_cell(tmp_path)
     interrupted(cell, monkeypatch, 2)
@@ -91,32 +81,6 @@ def test_an_edited_cell_starts_anew(tmp_path, monkeypatch):
     result = design(cell, quiet=False)
     assert result.exit_code == 0 and GOING_ON not in result.stderr
     assert len((tmp_path / "plan.csv").read_text().splitlines()) == 5
-
-
-def test_a_refused_run_in_between_throws_nothing_away(tmp_path, monkeypatch, whole):
-    cell = write_cell(tmp_path)
-    interrupted(cell, monkeypatch, 2)
-    assert design(cell, "--target", "0.01").exit_code == 1
-    assert design(cell, "--fix", "nothing").exit_code == 2
-    result = design(cell, quiet=False)
-    assert result.exit_code == 0 and GOING_ON in result.stderr
-    assert (tmp_path / "plan.csv").read_bytes() == whole[0]
-
-
-def test_a_curve_is_kept_too(tmp_path, monkeypatch):
-    cell = write_cell(tmp_path)
-    options = ("--curve", "3,4", "--poses", "4")
-    interrupted(cell, monkeypatch, 2, *options)
-    result = design(cell, *options, quiet=False)
-    assert result.exit_code == 0 and "4 poses: " not in result.stderr
-    resumed = without_backend(tmp_path / "plan.json")
-    assert design(cell, *options).exit_code == 0
-    assert without_backend(tmp_path / "plan.json") == resumed
-
-
-def without_backend(path):
-    """Which engine evaluated the model depends on how much there was to evaluate."""
-    return {k: v for k, v in json.loads(path.read_text("utf-8")).items() if k != "backend"}
 
 
 def test_an_interrupt_that_a_solver_catches_is_not_lost(tmp_path, monkeypatch):
@@ -183,16 +147,3 @@ def test_a_process_that_is_stopped_in_any_stage(tmp_path, stage, number):
         assert elastocal("design", cell, "-o", tmp_path / output, "-q").exit_code == 0
         plans.append((tmp_path / output).read_bytes())
     assert plans[0] == plans[1]
-
-
-def test_the_command_line_does_not_wait_for_what_help_does_not_need():
-    heavy = ("casadi", "pinocchio", "cvxpy", "scipy.stats", "pandas", "matplotlib", "numpy",
-             "pydantic")  # fmt: skip
-    code = (
-        "import sys, elastocal.cli.main as c; "
-        "c.app(['identify', '--help'], standalone_mode=False); "
-        f"print([m for m in {heavy} if m in sys.modules])"
-    )
-    told = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)
-    assert told.stdout.startswith("Usage: elastocal identify [OPTIONS] {cell} {data}\n")
-    assert told.stdout.endswith("\n[]\n")

@@ -5,80 +5,15 @@ from __future__ import annotations
 import json
 from pathlib import Path
 
-import pytest
-from support.exports import GEOMETRY, SPRINGS, write_result
-from support.robots import KR270
+from support.exports import GEOMETRY, write_result
 from support.urdf_text import arm
 from typer.testing import CliRunner, Result
 
 from elastocal.cli.main import app
 
 
-@pytest.fixture
-def campaign(tmp_path: Path) -> tuple[Path, Path]:
-    (tmp_path / "arm.urdf").write_bytes(KR270.read_bytes())
-    return write_result(tmp_path, 'urdf = "arm.urdf"', SPRINGS)
-
-
 def run(*arguments: object) -> Result:
     return CliRunner().invoke(app, ["export", *map(str, arguments)], env={"COLUMNS": "200"})
-
-
-@pytest.mark.parametrize(
-    ("name", "starts"),
-    [
-        ("a.urdf", "<?xml"),
-        ("a.xml", "<mujoco"),
-        ("a.mjcf", "<mujoco"),
-        ("a.csv", "# calibrated by elastocal"),
-        ("a.yaml", "schema: "),
-        ("a.JSON", "{"),
-    ],
-)
-def test_the_ending_tells_the_format(campaign, tmp_path: Path, name: str, starts: str) -> None:
-    output = tmp_path / name
-    result = run(*campaign, "-o", output, "-q", "--poses", "10", "--load", 0, 0, -200)
-    assert result.exit_code == 0, result.output
-    assert output.read_text(encoding="utf-8").startswith(starts)
-    assert f"wrote {output}" in result.output
-    if name not in ("a.xml", "a.mjcf"):
-        assert "joint compliance" in result.output and "(0, 0, -200) N" in result.output
-        assert "Next: where that much matters, elastocal compensate" in result.output
-    else:
-        assert "The MJCF holds all of the calibrated model." in result.output
-        assert "Next:" not in result.output
-        assert "[model] link_gravity" in result.output  # no markup swallows it
-
-
-def test_the_format_may_be_named(campaign, tmp_path: Path) -> None:
-    output = tmp_path / "table.txt"
-    result = run(*campaign, "-o", output, "--format", "MDH", "-q", "--poses", "10")
-    assert result.exit_code == 0 and "modified convention" in output.read_text()
-
-
-def test_json_says_what_the_terminal_says(campaign, tmp_path: Path) -> None:
-    output = tmp_path / "a.urdf"
-    options = ("--json", "-q", "--poses", "10", "--load", 0, 0, -200)
-    result = run(*campaign, "-o", output, *options)
-    assert result.exit_code == 0
-    told = json.loads(result.stdout)
-    assert told["schema"] == "elastocal/export/1" and told["format"] == "urdf"
-    assert told["output"] == str(output) and output.exists()
-    assert told["read_back"]["with"] == "pinocchio" and told["read_back"]["max_um"] < 1e-3
-    (entry,) = told["cannot_hold"]["effects"]
-    assert entry["effect"] == "joint_compliance"
-    assert entry["difference"]["marker_max_um"] >= entry["difference"]["marker_rms_um"] > 1
-    assert told["cannot_hold"]["force_N"] == [0, 0, -200]
-
-
-def test_held_values_are_named(campaign, tmp_path: Path) -> None:
-    cell, path = campaign
-    content = json.loads(path.read_text())
-    content["parameters"][9]["identifiable"] = False
-    path.write_text(json.dumps(content))
-    result = run(cell, path, "-o", tmp_path / "a.urdf", "-q", "--poses", "10")
-    assert "Held, as the data do not determine them" in result.output
-    assert content["parameters"][9]["name"] in result.output
 
 
 def test_a_mimic_beside_the_chain_stays_and_one_on_it_is_refused(tmp_path: Path) -> None:

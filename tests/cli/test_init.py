@@ -4,7 +4,6 @@ import json
 import shutil
 from pathlib import Path
 
-import numpy as np
 import pytest
 from support.mjcf_text import write_arm
 from support.robots import KR270
@@ -12,7 +11,6 @@ from typer.testing import CliRunner
 
 import elastocal as ec
 from elastocal.cli.main import app
-from elastocal.model.effects.catalogue import CATALOGUE
 from elastocal.model.manipulator import Model
 
 TUTORIAL = Path(__file__).parents[2] / "docs" / "tutorial"
@@ -54,40 +52,8 @@ def test_the_cell_it_writes_plans_and_simulates_as_it_is(name, arms):
     assert len(model.read("data.csv")) >= 12
 
 
-def test_joints_and_limits_are_those_of_the_file(arms):
-    text = ec.init("arms/arm.urdf")
-    assert "joint2_deg = [-146, 0]                 # joint_a2, revolute" in text
-    assert 'base = "base_link"\nflange = "flange"' in text
-    text = ec.init("arms/arm.xml", "sites.toml", base="foot")
-    assert 'flange = "attachment_site"' in text and "joint3_mm = [0, 300]" in text
-    cell = ec.read_cell("sites.toml")
-    # The site's place in the flange's frame: 60 mm below it, 50 mm aside.
-    assert np.linalg.norm(cell.tool.markers["reflector"]) == pytest.approx(np.hypot(0.05, 0.06))
-    (Path("arms") / "free.csv").write_text(
-        "theta0_deg,d_mm,a_mm,alpha_deg\n0,400,0,90\n0,0,500,0\n0,0,0,90\n0,400,0,0\n"
-    )
-    assert "the file has no limit: guess" in ec.init("arms/free.csv", convention="modified")
-
-
 def test_a_file_that_is_there_is_kept_unless_forced(arms):
     Path("cell.toml").write_text("mine")
     code, _, err = run("init", "arms/arm.csv")
     assert code == 2 and "give --force" in err and Path("cell.toml").read_text() == "mine"
     assert run("init", "arms/arm.csv", "--force")[0] == 0
-
-
-def test_effects_lists_every_effect_with_unit_size_and_words(arms):
-    code, out, err = run("effects")
-    assert code == 0, err
-    flat = " ".join(out.split())
-    for name in CATALOGUE:
-        assert name in out
-    assert "joint_offset: joints 1 to 6; 1 mrad δq = a: the joint's zero differs" in flat
-    ec.init("arms/arm.xml", "cell.toml")
-    code, out, err = run("effects", "cell.toml", "--json")
-    assert code == 0, err
-    found = {entry["name"]: entry for entry in json.loads(out)["effects"]}
-    assert found["joint_offset"]["on"] and not found["backlash"]["on"]
-    assert found["joint_offset"]["places"] == [f"joint{i}" for i in range(1, 6)]
-    (offset,) = found["joint_offset"]["parameters"]
-    assert (offset["unit"], offset["typical"]) == ("rad", 1e-3)

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import json
-import subprocess
 import sys
 from collections.abc import Iterator
 from dataclasses import replace
@@ -20,7 +19,6 @@ from typer.testing import CliRunner, Result
 from elastocal import plugin_loader
 from elastocal.cell.work_cell import read_cell
 from elastocal.cli.main import app
-from elastocal.diagnosis.diagnose import write_extended_cell
 from elastocal.errors import InputError
 from elastocal.measurements import Measurements
 from elastocal.model.chain import Chain
@@ -119,30 +117,6 @@ def test_diagnose_suspects_it_at_all_its_places_and_finds_it(folder: Path) -> No
     assert "three_lobes" in [choice.name for choice in read_cell(extended).model.effects]
 
 
-def test_diagnose_does_without_it_where_asked(folder: Path) -> None:
-    """Though nothing is registered when the options are looked at."""
-    CATALOGUE.pop("three_lobes")
-    plugin_loader._files.clear()
-    out = folder / "diagnosis.json"
-    result = run(
-        "diagnose", folder / "cell.toml", folder / "data.csv", "-o", out, "-q",
-        "--without", "three_lobes",
-    )  # fmt: skip
-    assert result.exit_code == 0, result.stderr
-    why = json.loads(out.read_text())
-    assert "three_lobes" in CATALOGUE
-    assert "three_lobes" not in {c["effect"] for c in why["candidates"]}
-
-
-def test_design_plans_for_it(folder: Path) -> None:
-    cell = with_effect(folder, "three_lobes:joint3")
-    cell.write_text(cell.read_text().replace('interest = ["joint_offset"]', ""))
-    result = run("design", cell, "-o", folder / "plan.csv", "--effort", "quick", "-q")
-    assert result.exit_code == 0, result.stderr
-    predicted = {p["name"] for p in json.loads((folder / "plan.json").read_text())["predicted"]}
-    assert {"joint3.lobes_sin", "joint3.lobes_cos"} <= predicted
-
-
 def test_export_and_compensate_know_it(folder: Path) -> None:
     """A file cannot hold it, and says what that costs."""
     out = folder / "result.json"
@@ -185,18 +159,6 @@ def test_the_noise_model_is_chosen_and_named(tmp_path: Path) -> None:
     assert sizes["day 2"] == pytest.approx(80, rel=0.2)
     assert sizes["day 1"] == pytest.approx(10, rel=0.2)
     assert "one variance per day" in page.read_text(encoding="utf-8")
-
-
-def test_the_noise_model_can_be_asked_for_before_the_cell_was_read(tmp_path: Path) -> None:
-    """In a process of its own, in which nothing is registered yet."""
-    cell = noisy_days(tmp_path)
-    arguments = ["identify", cell, tmp_path / "days.csv", "--noise", "day", "--json", "-q",
-                 "--plugins"]  # fmt: skip
-    done = subprocess.run(
-        [sys.executable, "-m", "elastocal", *map(str, arguments)], capture_output=True, text=True
-    )
-    assert done.returncode == 0, done.stderr
-    assert json.loads(done.stdout)["noise"]["kind"] == "day"
 
 
 BAD = {
@@ -314,17 +276,6 @@ def test_what_reads_results_runs_no_code(
     assert not (strange / "ran").exists()
 
 
-def test_results_of_an_effect_of_a_plug_in_need_it(folder: Path) -> None:
-    cell = with_effect(folder, "three_lobes:joint3")
-    out = folder / "result.json"
-    assert run("identify", cell, folder / "data.csv", "-o", out, "-q").exit_code == 0
-    CATALOGUE.pop("three_lobes")
-    plugin_loader._files.clear()
-    done = run("compare", out, out, "--cell", cell, plugins=False)
-    assert done.exit_code == 2 and "three_lobes.py" in done.stderr
-    assert run("compare", out, out, "--cell", cell).exit_code == 0
-
-
 @pytest.mark.parametrize("module", ["helper.py", "strange_helper"])
 def test_who_allows_it(module: str, strange: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     cell, ran = strange / "cell.toml", strange / "ran"
@@ -387,13 +338,3 @@ def test_an_installed_package_registers_by_its_entry_point(
         InputError, match=r"plug-in 'bad' of the package lobed: .*lobed_broken\.py, line 1"
     ):
         load_plugins()
-
-
-def test_the_extended_cell_leads_to_the_same_plug_in(tmp_path: Path) -> None:
-    write_example(tmp_path, "three_lobes.py")
-    cell = tmp_path / "cell.toml"
-    cell.write_text(CELL, encoding="utf-8")
-    (tmp_path / "other").mkdir()
-    moved = write_extended_cell(cell, tmp_path / "other" / "cell.toml", ())
-    (plugin,) = moved.plugins
-    assert Path(plugin).resolve() == (tmp_path / "three_lobes.py").resolve()

@@ -11,7 +11,6 @@ import pytest
 from support.robots import KR270
 from typer.testing import CliRunner, Result
 
-import elastocal as ec
 from elastocal.cli.main import app
 from elastocal.model.manipulator import Model
 from elastocal.model.smooth_groups import smooth_groups
@@ -83,24 +82,6 @@ def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
     return here
 
 
-def test_identify_tells_functions_by_the_line(folder: Path) -> None:
-    told = (folder / "told.txt").read_text()
-    assert "Smooth function: joint curve of joint1:" in told and "coefficients' worth" in told
-    assert "curve_1" not in told
-    assert "2 smooth functions of" in told
-    result = json.loads((folder / "result.json").read_text())
-    assert result["test_rms_um"] < 60
-    assert [entry["where"] for entry in result["smooth"]] == ["joint1", "joint2"]
-    names = [p["name"] for p in result["parameters"]]
-    assert "joint2.curve_3" in names and len(names) > 40
-
-
-def test_the_report_draws_them(folder: Path) -> None:
-    page = (folder / "report.html").read_text()
-    assert "Smooth functions" in page and "smooth-functions" in page
-    assert "curve_1" not in page
-
-
 def test_compensate_undoes_them(folder: Path) -> None:
     """The commands put the true marker, curves and all, where it should be."""
     cell, out = folder / "cell.toml", folder / "commands.csv"
@@ -142,21 +123,6 @@ def test_compensate_says_where_no_reading_shows_them(folder: Path) -> None:
     assert far > 2 * near
 
 
-def test_beyond_its_range_the_arm_is_that_of_the_model_without_it(folder: Path) -> None:
-    """Faded without a step, so that commands near the end of the range have one solution."""
-    arm = ec.read_calibrated(folder / "cell.toml", folder / "result.json")
-    plain = CELL.replace(', "joint_curve:joint1", "joint_curve:joint2"', "")
-    (folder / "bare.toml").write_text(plain)
-    bare = ec.Model(folder / "bare.toml")
-    x = [arm.values[name] for name in bare.names]
-    angle = np.array([-1.5, 1.4, 1.5, 1.5001, 1.6, 2.2, 2.9])
-    q = np.array([[a, -1.0, 1.0, 0.1, 0.5, 0.1] for a in angle])
-    q[:, 1] = 1.0  # joint 2 was measured up to -0.4 rad
-    apart = np.linalg.norm(arm.pose(q)[:, :3, 3] - bare.pose(q, x)[:, :3, 3], axis=1)
-    assert apart[:4].min() > 1e-5 and abs(apart[3] - apart[2]) < 1e-6
-    assert 0 < apart[4] < 2 * apart[2] and apart[5:].max() < 1e-12
-
-
 def test_export_writes_them_as_corrections(folder: Path) -> None:
     out = folder / "corrections.csv"
     done = run(
@@ -183,30 +149,3 @@ def test_export_writes_them_as_corrections(folder: Path) -> None:
     half = np.array([float(row["half95"]) for row in own])
     assert (np.abs(found - true) < 1.5 * half).mean() > 0.9
     assert all(row["unit"] == "urad" for row in rows)
-
-
-def test_export_holds_the_rest_and_says_what_that_costs(folder: Path) -> None:
-    out = folder / "arm_out.urdf"
-    done = run("export", folder / "cell.toml", folder / "result.json", "-o", out, "--poses", 20)
-    assert done.exit_code == 0, done.output
-    assert "joint curve" in done.output and "cannot hold" in done.output
-
-
-def test_no_corrections_of_an_arm_without_functions(folder: Path) -> None:
-    plain = CELL.replace(', "joint_curve:joint1", "joint_curve:joint2"', "")
-    (folder / "plain.toml").write_text(plain)
-    run("identify", folder / "plain.toml", folder / "data.csv", "-o", folder / "plain.json")
-    done = run(
-        "export", folder / "plain.toml", folder / "plain.json", "-o", folder / "none.csv",
-        "--format", "corrections", "--poses", 10,
-    )  # fmt: skip
-    assert done.exit_code == 2 and "no smooth function" in done.output
-
-
-def test_design_holds_them_and_says_so(folder: Path) -> None:
-    done = run(
-        "design", folder / "cell.toml", "--poses", 8, "--candidates", 60, "--effort", "quick",
-        "--criterion", "D", "-o", folder / "plan.csv",
-    )  # fmt: skip
-    assert done.exit_code == 0, done.output
-    assert "holds the smooth functions (joint_curve) at zero" in done.output

@@ -54,14 +54,6 @@ def test_it_runs_once_and_then_finds_nothing_to_do(folder):
     assert second.stderr == "" == study(folder, "--jobs", 1, "--progress", "--quiet").stderr
 
 
-def test_options_seed_output_and_only(folder, tmp_path):
-    out = tmp_path / "elsewhere"
-    arguments = (folder, "--jobs", 1, "--seed", 3, "--set", "replicates=2", "-o", out)
-    assert "1 of 1 tasks done;" in study(*arguments, "--only", 1, "--jobs", "9" * 20).stdout
-    assert "4 of 4 tasks done (1 were there);" in study(*arguments).stdout
-    assert set(numbers(out)["replicate"]) == {0, 1} and not (folder / "results").exists()
-
-
 def test_a_summary_is_written_once_all_is_there(tmp_path):
     script = SCRIPT + SUMMARY.replace("sorted(frame.task)", "sorted(set(frame.task))")
     folder = write_study(tmp_path / "study", script)
@@ -73,63 +65,6 @@ def test_a_summary_is_written_once_all_is_there(tmp_path):
     assert told.stdout.endswith(page)
     study(folder, "--jobs", 1, "-o", tmp_path / "other")
     assert (tmp_path / "other.md").read_text() == page
-
-
-def test_a_wrong_summary_keeps_the_results(tmp_path):
-    script = SCRIPT + "\n\ndef summary(frame):\n    return frame.of_no_such_column\n"
-    folder = write_study(tmp_path / "study", script)
-    told = study(folder, "--jobs", 1)
-    assert told.exit_code == 2
-    assert "study.py, line 13: summary() raised AttributeError" in told.stderr
-    assert len(numbers(folder / "results")) == 24
-
-
-def test_failures_end_with_exit_1_and_their_number(tmp_path):
-    script = SCRIPT.replace("    x = rng", '    1 / (task["replicate"] - 2)\n    x = rng')
-    folder = write_study(tmp_path / "study", script + SUMMARY)
-    told = study(folder, "--jobs", 1)
-    assert told.exit_code == 1
-    assert "10 of 12 tasks done, 2 failed; results in" in told.stdout
-    assert "first failure: task 2: ZeroDivisionError: division by zero" in told.stdout
-    assert "_failures.log; --retry-failed" in told.stdout
-    assert "2 failed" in told.stderr and "Traceback" not in told.stdout + told.stderr
-    assert not (folder / "result.md").exists()
-
-
-def test_an_option_that_no_record_holds_is_refused_with_its_key(folder):
-    path = folder / "study.toml"
-    path.write_text(path.read_text().replace("[options]", "[options]\nfarthest = inf"))
-    told = study(folder, "--jobs", 1)
-    assert told.exit_code == 2 and "study.toml: key options.'farthest'" in told.stderr
-    assert not (folder / "results").exists()
-
-
-def test_a_changed_study_is_refused_and_started_anew_on_demand(folder):
-    study(folder, "--jobs", 1)
-    told = study(folder, "--jobs", 1, "--seed", 4)
-    assert told.exit_code == 2 and "the seed was 11, now it is 4" in told.stderr
-    assert "Run with --restart to discard them, or with --output NEW to keep them" in told.stderr
-    assert study(folder, "--jobs", 1, "--seed", 4, "--restart").exit_code == 0
-    assert study(folder, "--jobs", 1, "--seed", 4).exit_code == 0
-
-
-@pytest.mark.parametrize(
-    ("arguments", "told"),
-    [
-        (("--set", "replicats=3"), "did you mean 'replicates'?"),
-        (("--set", "scale=big"), "--set scale=big: takes a number, as in study.toml"),
-        (("--cluster", "tcp://nowhere"), "--cluster tcp://nowhere: leads beyond this host"),
-        (("--cluster", "tcp://nowhere at all", "--unencrypted"), "tcp://nowhere at all: no sched"),
-        (("--cluster", "tls://a:1", "--tls-ca", "absent.pem"), "absent.pem: no such file"),
-        (("--jobs", "2", "--cluster", "config"), "--jobs is for this machine"),
-        (("-o", "."), ".: holds study.py, study.toml, which no study wrote"),
-    ],
-)
-def test_wrong_arguments_are_told(folder, arguments, told, monkeypatch):
-    monkeypatch.chdir(folder)
-    result = study(folder, *(a.format(folder=folder) for a in arguments))
-    assert result.exit_code == 2
-    assert told in result.stderr and "Traceback" not in result.stderr
 
 
 def test_a_missing_extra_is_named(folder, monkeypatch):

@@ -2,13 +2,8 @@
 
 from __future__ import annotations
 
-import math
-import os
-import subprocess
-import sys
 from pathlib import Path
 
-import numpy as np
 import pytest
 from support.files import write_campaign
 from support.registered import forgotten
@@ -16,9 +11,6 @@ from typer.testing import CliRunner, Result
 
 from elastocal.cli.main import app
 from elastocal.errors import InputError
-from elastocal.model.chain import Chain
-from elastocal.model.urdf import read_urdf
-from elastocal.planning.programs import limits_text
 
 
 def run(*words: object) -> Result:
@@ -47,16 +39,6 @@ def test_a_first_cell_that_cannot_be_read_is_not_left_behind(
     assert not (tmp_path / "first.toml").exists()
 
 
-def test_limits_without_an_end_are_no_numbers(tmp_path: Path) -> None:
-    write_campaign(tmp_path)
-    chain: Chain = read_urdf(tmp_path / "arm.urdf")
-    lower = np.array([-math.inf, -1.0, -math.inf, -1.0, -1.0, -1.0])
-    upper = np.array([math.inf, math.inf, 1.0, 1.0, 1.0, 1.0])
-    told = limits_text(chain, (lower, upper))
-    assert told.startswith("J1 any, J2 from -57.3, J3 to 57.3, J4 -57.3 to 57.3,")
-    assert "inf" not in told
-
-
 def test_a_plug_in_that_fails_at_work_is_to_blame_itself(tmp_path: Path) -> None:
     write_campaign(tmp_path)
     (tmp_path / "mine.py").write_text(
@@ -75,12 +57,3 @@ def test_a_plug_in_that_fails_at_work_is_to_blame_itself(tmp_path: Path) -> None
         done = run("identify", cell, tmp_path / "data.csv", "--plugins", "-q")
     assert done.exit_code == 2 and "mine.py, line 6: KeyError" in done.stderr
     assert "data.csv" not in done.stderr
-
-
-def test_a_window_that_there_is_not_concerns_no_report(tmp_path: Path) -> None:
-    write_campaign(tmp_path)
-    words = [sys.executable, "-m", "elastocal", "identify", "cell.toml", "data.csv", "-q",
-             "--report", "page.html"]  # fmt: skip
-    environment = os.environ | {"MPLBACKEND": "none_such"}
-    done = subprocess.run(words, cwd=tmp_path, env=environment, capture_output=True, text=True)
-    assert done.returncode == 0, done.stderr

@@ -10,10 +10,9 @@ from support.calibration import SPRINGS, cell_of, measured, random_chain, table_
 from support.cells import random_poses
 
 from elastocal.cell.arm_description import CartesianNoise, Nominal, Tracker
-from elastocal.identification.findings import judged, warning_sentences
+from elastocal.identification.findings import judged
 from elastocal.identification.identify import identify
 from elastocal.identification.mistakes import copied
-from elastocal.identification.noise_choice import NoiseTest
 from elastocal.model.manipulator import Model
 from elastocal.model.observations import observe
 from elastocal.report.identification_view import (
@@ -129,16 +128,6 @@ def test_kilograms_given_as_newtons_are_told(clean):
     assert "another unit" in judgement(kilograms).headline
 
 
-def test_without_nominal_compliances_the_weights_of_the_links_tell():
-    """A rule of thumb is worth a note, whatever the loads."""
-    rated = (5e-6, 5e-6, 6e-6, 1.2e-5, 1.2e-5, 1.2e-5)
-    model, plan = arm(nominal=None)
-    table, _ = campaign(model, plan, stiffness=rated)
-    assert identify(model, table).finding("load_unit") is None
-    found = identify(model, replace(table, force=table.force / 9.80665)).finding("load_unit")
-    assert found is not None and found.severity == "note"
-
-
 # Numbers that the data cannot support.
 
 
@@ -206,28 +195,6 @@ def test_noise_stated_far_too_large_is_no_noise_that_explains_the_residual(clean
     assert "stated too large" in judgement(result).headline
     slightly = judged(replace(result, noise=replace(result.noise, ratio_to_stated=0.8)))
     assert slightly.finding("residual_below_stated_noise").severity == "note"
-
-
-@pytest.mark.parametrize(("kurtosis", "severity"), [(0.5, "note"), (1.5, "care")])
-def test_heavy_tails_call_for_care_where_least_squares_wastes_readings(clean, kurtosis, severity):
-    summary = clean[3].residual_summary
-    whole = replace(summary.whole, normality_p=0.009, excess_kurtosis=kurtosis, skewness=0.0)
-    found = judged(replace(clean[3], residual_summary=replace(summary, whole=whole)))
-    f = found.finding("residuals_heavy_tailed")
-    assert f.severity == severity and "robust fit" in f.remedy
-    assert ("residuals_heavy_tailed" in found.findings[0].listed("because")) == (severity == "care")
-    assert ("far errors" in judgement(found).headline) == (severity == "care")
-    calm = replace(whole, normality_p=0.011)
-    calm = judged(replace(clean[3], residual_summary=replace(summary, whole=calm)))
-    assert calm.finding("residuals_heavy_tailed") is None
-
-
-def test_scatter_that_a_test_finds_and_the_noise_lacks_is_told(clean):
-    result = clean[3]
-    for part, p, told in (("+joints", 1e-4, True), ("+time", 1e-4, True), ("+time", 0.02, False)):
-        found = judged(replace(result, noise=replace(result.noise, tests=(NoiseTest(part, p),))))
-        assert (found.finding("scatter_not_counted") is not None) == told
-        assert any("visit" in w for w in warning_sentences(found)) == told
 
 
 def test_few_clean_configurations_accuse_nobody():

@@ -17,13 +17,11 @@ from support.parts import (
 )
 
 from elastocal.cell.arm_description import Nominal
-from elastocal.errors import ElastocalError
 from elastocal.identification import outliers, solve
 from elastocal.identification import weighted_problem as chunked
 from elastocal.identification import weighted_problem as partition
-from elastocal.identification.linear_solver import solve_weighted
 from elastocal.identification.outliers import describe
-from elastocal.identification.residuals import held_out_by_parts, held_out_residual
+from elastocal.identification.residuals import held_out_by_parts
 from elastocal.identification.solve import residual_sigma
 from elastocal.identification.weighted_problem import Weights
 from elastocal.model.manipulator import Model
@@ -82,60 +80,6 @@ def test_in_parts_equals_whole(case, in_parts):
     assert np.array_equal(faulty_of(parts)[0], accused)
 
 
-@pytest.mark.parametrize("case", CASES, ids=lambda case: case.__name__)
-def test_many_readings_on_their_triangle_equal_the_exact_solver(case, monkeypatch):
-    whole = solved(*case())
-    monkeypatch.setattr(partition, "MANY", 0)
-    reduced = solved(*case())
-    assert not reduced.problem.large and len(reduced.problem.parts.spans) == 1
-    assert_same_estimates(reduced, whole)
-    np.testing.assert_allclose(
-        reduced.heldout, whole.heldout, atol=1e-5 * np.abs(whole.heldout).max()
-    )
-
-
-def test_the_last_evaluation_leaves_the_triangle_of_all_columns_to_choose_from(in_parts):
-    """It is that of another pass at the fitted values, and the fit's own is a part of it.
-
-    Where rounding lets the last step be taken back it is not there, and another pass is made."""
-    in_parts()
-    left = []
-    for case in CASES[:3]:
-        solution = solved(*case())
-        problem, fitted = solution.problem, solution.fit
-        assert len(fitted.columns) < len(problem.free)
-        again, own = (
-            chunked.evaluate(problem.model, problem.parts, fitted.x, columns).r_factor
-            for columns in (problem.free, fitted.columns)
-        )
-        left.append(fitted.wide is not None)
-        for one, other in ((fitted.wide or again, again), (fitted.r_factor, own)):
-            scale = np.linalg.norm(other.augmented, axis=0)
-            scale[scale == 0] = 1.0
-            found, expected = (
-                t.augmented.T @ t.augmented / np.outer(scale, scale) for t in (one, other)
-            )
-            np.testing.assert_allclose(found, expected, atol=1e-12)
-    assert any(left)
-
-
-def test_what_is_dropped_of_base_or_marker_is_placed_to_the_last_digit(in_parts):
-    """Where joint 1 stands still the marker's way out of the plane is the base's as well.  It is
-    held for good where placing ends, on an arm whose joints are off by 30 mrad; a placing that
-    ends where the choice of parameters may begin leaves 7e-11 m."""
-    model, plan, truth, rng = arm(("base_frame", "marker_position", "joint_offset"), 12, 120)
-    truth[[p.effect == "joint_offset" for p in model.parameters]] *= 30
-    plan.q[:, 0] = 0.3
-    table = measured(model, plan, truth, SIGMA, rng)
-    whole = solved(model, table)
-    held = whole.reduction.dropped[solve.is_placed(model)[whole.reduction.dropped]]
-    assert len(held)
-    in_parts()
-    parts = solved(model, table)
-    assert_same_estimates(parts, whole)
-    np.testing.assert_allclose(parts.fit.x[held], whole.fit.x[held], rtol=0, atol=3e-11)
-
-
 def test_a_covariance_that_links_configurations_keeps_them_together(in_parts):
     """Neighbouring observations are correlated in runs of five, across configurations."""
     model, plan, truth, rng = arm(GEOMETRY, 7)
@@ -165,38 +109,6 @@ def test_faulty_readings_are_found_in_parts_too(in_parts):
     np.testing.assert_allclose([o.residual for o in one], [o.residual for o in other], rtol=0.01)
 
 
-@pytest.mark.parametrize("configurations", [120, 40])
-def test_bounds_spare_b_and_change_no_verdict(configurations, in_parts, monkeypatch):
-    """Readings by themselves and three to a configuration: some are looked at, all judged alike."""
-    model, plan, truth, rng = arm(GEOMETRY, 8, 120)
-    table = measured(model, plan, truth, SIGMA, rng)
-    table = replace(table, configuration=np.arange(120) * configurations // 120)
-    table.position[::20] += rng.uniform(-5e-4, 5e-4, (6, 3))
-    in_parts(3000, 70)
-    solution = solved(model, table)
-    looked = []
-
-    def counted(parts, chosen, work):
-        looked.append(int(chosen.sum()))
-        return partition.of_some(parts, chosen, work)
-
-    monkeypatch.setattr(outliers, "of_some", counted)
-    every = np.ones(120, dtype=bool)
-    few = every.copy()
-    few[60:] = False
-    few[::20] = False
-    for good in (every, few):
-        least = outliers.judge(solution, solution, good)
-        spared, looked[:] = looked[-1], []
-        with monkeypatch.context() as all_of_them:
-            unknown = np.full(120, np.inf), np.empty(120)
-            all_of_them.setattr(outliers, "_at_most", lambda *_, told=unknown: told)
-            expected = outliers.judge(solution, solution, good)
-        assert spared < looked[-1] == 120
-        assert 0 < expected[0].sum() < 60 and np.array_equal(least[0], expected[0])
-        assert least[1] == pytest.approx(expected[1], rel=1e-9)
-
-
 def test_a_bounded_fit_in_parts_is_the_constrained_minimum(in_parts):
     """Two true compliances are zero.  Nowhere outside the bounds, never above the sum of squares
     that the interior-point fit of the whole table reaches (it stops 1e-10 rad/(N m) short of a
@@ -220,38 +132,7 @@ def test_a_bounded_fit_in_parts_is_the_constrained_minimum(in_parts):
             np.testing.assert_allclose(p.x, f.x, rtol=1e-6)
 
 
-@pytest.mark.parametrize("configurations", [1, 2, 7])
-def test_held_out_where_a_configuration_is_larger_than_a_part(configurations, in_parts):
-    """60 readings in a few configurations, parts of five; one alone has no held-out residual."""
-    model, table = positions()
-    code = np.random.default_rng(0).integers(0, configurations, len(table))
-    observed = observe(replace(table, configuration=code), "position")
-    x, columns = model.nominal, np.array([0, 1, 2, 6, 7])
-    at = model.regressor(observed.table, x, columns, observed)
-    step = solve_weighted(at.B, at.residual).x
-    whole = held_out_residual(at.B, at.residual - at.B @ step, UNIT, code, 3)
-    in_parts(15 * len(model.parameters))
-    parts = partition.partition(observed, UNIT, len(model.parameters))
-    assert max(len(group) for group in parts.groups) > 1
-    r_factor = chunked.evaluate(model, parts, x, columns).r_factor
-    held = held_out_by_parts(model, parts, x, columns, r_factor, step)
-    assert np.isinf(whole).all() == (configurations == 1)
-    np.testing.assert_allclose(held, whole, rtol=1e-9, atol=1e-12)
-
-
 # --- passes ---------------------------------------------------------------------------------
-
-
-def test_results_come_in_order_and_failures_come_out():
-    assert list(chunked.in_order(range(50), lambda k: k * k)) == [k * k for k in range(50)]
-
-    def refuse(k):
-        if k == 7:
-            raise ElastocalError("seven")
-        return k
-
-    with pytest.raises(ElastocalError, match="seven"):
-        list(chunked.in_order(range(50), refuse))
 
 
 @pytest.mark.parametrize("workers", [1, 3])

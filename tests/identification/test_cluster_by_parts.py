@@ -5,7 +5,7 @@ from support.calibration import PLACED, cell_of, measured, planar_chain, table_a
 from support.cells import random_poses
 
 from elastocal.identification.covariance import cluster_robust
-from elastocal.identification.intervals import cluster_by_parts, worth_clustering
+from elastocal.identification.intervals import cluster_by_parts
 from elastocal.identification.least_squares import FitProblem, fit
 from elastocal.identification.weighted_problem import Partition, Weights
 from elastocal.model.manipulator import Model
@@ -41,9 +41,3 @@ def test_equals_the_whole_table_however_it_is_cut():
         parts = Partition(observed, weights, order, groups)
         np.testing.assert_allclose(cluster_by_parts(found, parts).matrix, whole, rtol=1e-7,
                                    atol=1e-9 * np.abs(whole).max())  # fmt: skip
-
-
-def test_needs_several_readings_and_many_configurations():
-    _, observed, weights = fitted()
-    parts = Partition(observed, weights, None, (((0, 80),),))
-    assert worth_clustering(parts, 4) and not worth_clustering(parts, 5)

@@ -9,7 +9,7 @@ from support.calibration import GEOMETRY, cell_of, combination_truth, measured, 
 from support.cells import kr270_chain, random_poses
 
 from elastocal.cell.arm_description import CartesianNoise, Nominal, Tracker
-from elastocal.identification import estimates, solve
+from elastocal.identification import estimates
 from elastocal.identification.identify import identify
 from elastocal.model.manipulator import Model
 from elastocal.text import json_text
@@ -59,25 +59,6 @@ def test_an_interval_without_an_end_is_null_with_the_reason():
     told = next(e for e in published["parameters"] if e["name"] == known.name)
     assert told["ci95"] == [None, known.ci95[1]]
     assert told["note"] == "the data set no lower limit to it"
-
-
-def test_what_is_not_linear_is_told_by_some_of_many_readings(monkeypatch):
-    """Widths of combinations from half of the readings are within a quarter of those from all."""
-    chain, sigma = kr270_chain(), 2e-6
-    marker = {"M1": np.array([0.25, 0.0, 0.05])}
-    tracker = Tracker(noise=CartesianNoise(np.full(3, sigma)))
-    model = Model.assembled(chain, cell_of(GEOMETRY, marker, tracker))
-    rng = np.random.default_rng(2)
-    truth = model.nominal + 1e-3 * rng.standard_normal(len(model.nominal))
-    table = measured(model, table_at(random_poses(chain, 300, 2)), truth, sigma, rng)
-    whole = identify(model, table)
-    monkeypatch.setattr(solve, "BENT_SAMPLE", 150)
-    some = identify(model, table)
-    widths = [[c.ci95[1] - c.ci95[0] for c in fit.combinations] for fit in (whole, some)]
-    monkeypatch.setattr(estimates, "bent", lambda s, _: np.zeros(len(s.reduction.kept)))
-    without = [c.ci95[1] - c.ci95[0] for c in identify(model, table).combinations]
-    assert max(widths[0] / np.array(without)) > 1.3  # there is something to tell
-    np.testing.assert_allclose(widths[1], widths[0], rtol=0.25)
 
 
 def test_intervals_of_combinations_have_room_for_what_is_not_linear(monkeypatch):

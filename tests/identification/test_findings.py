@@ -3,8 +3,6 @@
 from __future__ import annotations
 
 import ast
-import json
-import pickle
 from dataclasses import replace
 from pathlib import Path
 
@@ -15,14 +13,11 @@ from support.cells import random_poses
 
 from elastocal.cell.arm_description import CartesianNoise, Tracker
 from elastocal.diagnosis import diagnosis as diagnosis_result
-from elastocal.errors import options_as_flags
 from elastocal.identification import findings as module
-from elastocal.identification.findings import judged, next_steps, warning_sentences
+from elastocal.identification.findings import judged, warning_sentences
 from elastocal.identification.identify import identify
 from elastocal.identification.noise_summary import LackOfFit
-from elastocal.identification.result import Finding, TestErrors
 from elastocal.model.manipulator import Model
-from elastocal.report.judgement_view import warnings_beside
 
 SIGMA = 5e-5
 PAGE = Path(__file__).parents[2] / "docs" / "file-formats.md"
@@ -62,18 +57,6 @@ def test_residual_and_stated_noise_have_one_threshold(result, above):
     assert any("times the stated noise" in w for w in warning_sentences(found)) == above
 
 
-def test_a_warning_that_the_verdict_tells_is_not_told_beside_it(result):
-    """By the kind of finding that it knows; in a file it is a text."""
-    found = with_noise(result, ratio_to_stated=3.0)
-    found = replace(found, warnings=("from before", *warning_sentences(found)))
-    (kind,) = (w.kind for w in found.warnings[1:] if "times the stated noise" in w)
-    assert kind == "residual_above_stated_noise" in {f.kind for f in found.verdict.missing}
-    assert warnings_beside(found) == [w for w in found.warnings if "times the stated" not in w]
-    again = pickle.loads(pickle.dumps(found.warnings))
-    assert [w.kind for w in again[1:]] == [w.kind for w in found.warnings[1:]]
-    assert json.loads(json.dumps(found.warnings)) == list(found.warnings)
-
-
 @pytest.mark.parametrize("above", [False, True])
 def test_lack_of_fit_has_one_threshold(result, above):
     p = module.LACK_OF_FIT * (1 - 1e-6 if above else 1 + 1e-6)
@@ -81,38 +64,6 @@ def test_lack_of_fit_has_one_threshold(result, above):
     assert (found.finding("lack_of_fit") is not None) == above
     assert (found.finding("repeats_agree") is None) == above
     assert any("scatter more than their repeats" in w for w in warning_sentences(found)) == above
-
-
-@pytest.mark.parametrize(
-    ("kind", "intervals"), [("axis+configuration", "classical"), ("axis", "CR2")]
-)
-def test_scatter_that_is_counted_with_warns_of_no_narrow_interval(result, kind, intervals):
-    misfit = LackOfFit(9.0, 1e-6, 30, 200)
-    found = with_noise(result, kind=kind, interval_kind=intervals, lack_of_fit=misfit)
-    assert found.finding("lack_of_fit").numbers["counted_by"] != "nothing"
-    assert not any("too narrow" in w for w in warning_sentences(found))
-
-
-def test_findings_of_the_solver_stay_when_test_data_are_added(result):
-    own = Finding("ill_conditioned", "note", {"condition_number": 1e5, "parameters": ("a",)})
-    whole = replace(result, findings=(*result.findings, own))
-    tested = judged(replace(whole, test=TestErrors(result.heldout_rms, 0.0, 0.0, 9)))
-    assert tested.finding("ill_conditioned") == own
-    assert tested.finding("untested") is None and result.finding("untested") is not None
-
-
-def test_remedies_are_told_once_and_name_flags_on_the_command_line_only(result):
-    steps = [f.remedy for f in next_steps(result)]
-    assert len(set(steps)) == len(steps) and all(steps)
-    assert "--" not in " ".join(steps) and "`test`" in " ".join(steps)
-    with options_as_flags():
-        assert "--test" in " ".join(f.remedy for f in next_steps(judged(result)))
-
-
-def test_numbers_that_are_not_finite_are_null():
-    found = Finding("untested", "note", {"a": float("inf"), "b": (1.0, 2.0), "c": None}, "Do.")
-    text = json.dumps(found.to_json(), allow_nan=False)
-    assert json.loads(text)["numbers"] == {"a": None, "b": [1.0, 2.0], "c": None}
 
 
 def test_every_kind_is_on_the_page():

@@ -1,11 +1,8 @@
 """Held-out residuals in closed form against explicit fits that leave configurations out."""
 
-from dataclasses import replace
-from types import SimpleNamespace
-
 import numpy as np
 import pytest
-from scipy import sparse, stats
+from scipy import sparse
 from support.calibration import (
     GEOMETRY,
     SPRINGS,
@@ -22,8 +19,7 @@ from elastocal.cell.arm_description import CartesianNoise, Nominal, Tracker
 from elastocal.identification.identify import identify
 from elastocal.identification.least_squares import FitProblem, fit
 from elastocal.identification.options import Options
-from elastocal.identification.residuals import f_test, held_out_residual, predicts_better, rms_3d
-from elastocal.identification.solve import fits_better
+from elastocal.identification.residuals import held_out_residual, predicts_better
 from elastocal.identification.weighted_problem import Weights, weights_for
 from elastocal.model.manipulator import Model
 from elastocal.model.observations import subset
@@ -87,13 +83,6 @@ def test_equals_refits_of_an_arm(effects, stated):
         np.testing.assert_allclose(result.held_out[mine], left_out, atol=0.01 * sigma)
 
 
-def test_rms_is_of_three_dimensional_lengths():
-    assert rms_3d(np.array([3.0, 4.0, 0.0, 0.0, 0.0, 5.0]), 3) == pytest.approx(5.0)
-    pose = np.array([3.0, 4.0, 0.0, 99.0, 99.0, 99.0])
-    assert rms_3d(pose, 6) == pytest.approx(5.0)  # rotations do not count
-    assert rms_3d(np.array([3.0, -3.0]), 1) == pytest.approx(3.0)
-
-
 def test_a_wider_set_is_needed_where_the_parameters_it_adds_are_something():
     """None is found in at most 1 % of tables, one of six standard deviations in most."""
     rng = np.random.default_rng(5)
@@ -112,25 +101,6 @@ def test_a_wider_set_is_needed_where_the_parameters_it_adds_are_something():
 
     assert sum(needed(0.0) for _ in range(500)) <= 11  # 5 expected at most; p < 0.01 of more
     assert sum(needed(6.0) for _ in range(50)) > 35
-
-
-def test_a_wider_set_fits_better_than_by_chance():
-    """An F-test at 1 %: of 500 tables without anything 5 are expected, p < 0.01 of more than 11."""
-    rng = np.random.default_rng(6)
-    B = rng.normal(size=(60, 9))
-    unit = B[:, 8] - B[:, :4] @ np.linalg.lstsq(B[:, :4], B[:, 8], rcond=None)[0]
-
-    def better(size):
-        y = rng.normal(size=60) + size * unit / np.linalg.norm(unit)
-        found = [
-            SimpleNamespace(whitened=y - Q @ (Q.T @ y), columns=np.arange(p))
-            for p in (4, 9)
-            for Q in [np.linalg.qr(B[:, :p])[0]]
-        ]
-        return fits_better(*found)
-
-    assert sum(better(0.0) for _ in range(500)) <= 11
-    assert sum(better(7.0) for _ in range(50)) > 40
 
 
 def test_infinite_where_one_configuration_alone_determines_a_parameter():
@@ -170,27 +140,3 @@ def test_a_level_measured_once_has_no_held_out_residual():
     assert np.isinf(result.heldout_rms)
     assert any("Some configuration alone determines" in w for w in result.warnings)
     assert result.to_json()["heldout_rms_um"] is None
-
-
-def test_held_out_covers_all_rows_of_a_configuration_together():
-    """Repeats of one configuration share its model error, so they are left out together."""
-    chain = planar_chain()
-    model = Model.assembled(chain, cell_of(("base_frame", "marker_position")))
-    rng = np.random.default_rng(2)
-    truth = true_values(model, rng)
-    plan = table_at(random_poses(chain, 10, 2))
-    rows = np.repeat(np.arange(10), 3)
-    plan = replace(plan.take(rows), row=np.arange(30) + 2, repeat=np.tile(np.arange(3), 10))
-    result = identify(model, measured(model, plan, truth, 5e-5, rng), Options())
-    B = model.regressor(result.observations.table, result.x,
-                        np.array([model.names.index(n) for n in result.determined])).B  # fmt: skip
-    one_by_one = held_out_residual(B, result.residual, UNIT, np.arange(30), 3)
-    assert np.abs(result.held_out).mean() > np.abs(one_by_one).mean()
-
-
-def test_the_p_value_of_an_F_test_is_uniform_where_the_columns_are_none():
-    """Of normal noise, 3 columns take a χ² of 3 and leave one of 20."""
-    rng = np.random.default_rng(8)
-    _, p = f_test(rng.chisquare(3, 4000), 3, rng.chisquare(20, 4000), 20)
-    assert stats.kstest(p, "uniform").pvalue > 1e-3
-    assert f_test(1.0, 2, 0.0, 5)[1] == 0.0

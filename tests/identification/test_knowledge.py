@@ -1,20 +1,16 @@
 """Constraints and priors in the whole identification, and the file that states them."""
 
-import json
 import re
 from functools import lru_cache
 from pathlib import Path
 
 import numpy as np
 import pytest
-from hypothesis import given
-from hypothesis import strategies as st
 from scipy import stats
 from support.calibration import binomial_band, measured, with_values
 from support.cells import DOWN, SLANTED, TABLE_2, kr270_cell, table_of
 
-from elastocal.errors import InputError, InsufficientDataError
-from elastocal.identification import weighted_problem as partition
+from elastocal.errors import InputError
 from elastocal.identification.identify import identify
 from elastocal.identification.knowledge import (
     Bounds,
@@ -23,11 +19,9 @@ from elastocal.identification.knowledge import (
     LinearEquality,
     SemidefiniteMatrix,
     equal,
-    non_negative,
     physical_constraints,
     read_knowledge,
 )
-from elastocal.identification.knowledge_fit import degrees_of_freedom
 from elastocal.identification.options import Options
 from elastocal.measurements import Measurements
 from elastocal.model.manipulator import Model
@@ -112,31 +106,6 @@ def test_the_profile_of_the_nonlinear_fit_agrees_where_the_model_is_nearly_linea
     assert "nonlinear" in exact.noise.interval_description
     for one, other in zip(linear.estimates, exact.estimates, strict=True):
         np.testing.assert_allclose(one.ci95, other.ci95, atol=0.01 * one.std)
-
-
-def test_bounds_that_nothing_presses_on_change_nothing_but_what_lies_beyond_them():
-    table = readings(bearings(), 1, SLANTED, **{BEARING_X: 8e-8, BEARING_Y: 3e-8})
-    alone = identify(bearings(), table, Options(method="ols"))
-    found = identify(
-        bearings(), table, Options(method="ols", constraints=physical_constraints(bearings()))
-    )
-    assert found.active == ()
-    np.testing.assert_allclose(found.x, alone.x, rtol=1e-7, atol=1e-14)
-    np.testing.assert_allclose(found.covariance, alone.covariance, rtol=1e-5, atol=1e-24)
-    np.testing.assert_allclose(found.held_out, alone.held_out, atol=1e-9)
-    assert (found.dof, found.sigma) == (alone.dof, pytest.approx(alone.sigma))
-    for one, other in zip(found.estimates, alone.estimates, strict=True):
-        cut = np.maximum(other.limits or other.ci95, 0.0)
-        np.testing.assert_allclose(one.ci95, cut, rtol=1e-6, atol=1e-13)
-    assert any(e.limits[0] < 0 for e in alone.estimates if e.limits)
-
-
-def test_bounded_adds_the_physical_bounds_to_what_is_stated():
-    loose = Constraints((Bounds("joint2.compliance", upper=1.0),))
-    found = identify(bearings(), negative(), Options(bounded=True, constraints=loose))
-    np.testing.assert_allclose(found.x, by_physics().x, rtol=1e-6, atol=1e-13)
-    assert [a.label for a in found.active] == [f"{BEARING_X} >= 0"]
-    assert found[BEARING_X].value == 0
 
 
 # --- priors -----------------------------------------------------------------------------------
@@ -225,13 +194,6 @@ def test_a_prior_on_one_of_a_pair_tells_the_other(known, other):
     assert not {known, other} & {n for c in found.combinations for n in c.terms}
 
 
-def test_a_prior_on_a_fixed_parameter_is_refused():
-    prior = prior_of(joint2__compliance=(3e-7, 1e-8))
-    options = Options(prior=prior, fixed=("joint2.compliance",))
-    with pytest.raises(InputError, match=r"'joint2\.compliance', which is held fixed"):
-        identify(drives(), readings(drives(), 0), options)
-
-
 def test_intervals_of_truths_drawn_from_the_prior_hold_them():
     """Bayesian calibration: truth ~ prior, readings ~ truth, 95 % of intervals hold it."""
     model, hits = drives("linear"), []
@@ -248,15 +210,6 @@ def test_intervals_of_truths_drawn_from_the_prior_hold_them():
         hits += [low <= v <= high for (low, high), v in zip(ends, drawn, strict=True)]
     low, high = binomial_band(len(hits), 0.95)
     assert low <= sum(hits) <= high
-
-
-@given(st.floats(1.0, 1e4), st.floats(0.0, 1.0))
-def test_degrees_of_freedom_grow_with_the_share_of_the_prior(dof, share):
-    (found,) = degrees_of_freedom(np.array([dof]), np.array([share]))
-    assert found >= dof
-    # Satterthwaite of a sum: readings' part with dof, prior's part known.
-    if share < 0.99:
-        assert found == pytest.approx(1 / ((1 - share) ** 2 / dof), rel=1e-9)
 
 
 # --- equalities -------------------------------------------------------------------------------
@@ -296,71 +249,7 @@ def test_an_equality_with_a_known_parameter_determines_an_unseen_one():
     assert one.std == pytest.approx(other.std) and one.note == ""
 
 
-def test_a_known_value_splits_a_combination():
-    table = readings(placed(), 10)
-    known = Constraints(equalities=(LinearEquality({"joint1.offset": 1.0}, 1e-3),))
-    found, alone = (identify(placed(), table, Options(constraints=c)) for c in (known, None))
-    assert found["joint1.offset"].ci95 == (1e-3, 1e-3)
-    combined, e = alone.combination("base.rz"), found["base.rz"]
-    expected = combined.value - combined.terms["joint1.offset"] * 1e-3
-    assert e.value == pytest.approx(expected, abs=2e-6)
-    assert np.isfinite(found.covariance).all()
-    assert all(np.isfinite(r) for *_, r in found.correlations)
-
-
-def test_an_equality_of_what_stays_undetermined_is_refused():
-    # It repeats the combination that the readings tell; what the two share stays unknown.
-    same = Constraints(equalities=(LinearEquality({"base.rz": 1.0, "joint1.offset": -1.0}),))
-    table = readings(placed(), 11)
-    terms = identify(placed(), table, Options()).combination("base.rz").terms
-    assert terms == pytest.approx({"base.rz": 1.0, "joint1.offset": -1.0})
-    with pytest.raises(
-        InsufficientDataError, match=r"not determine 'joint1\.offset', which an equality"
-    ):
-        identify(placed(), table, Options(constraints=same))
-
-
-def test_a_held_value_outside_its_bounds_is_named():
-    outside = Constraints((Bounds("joint1.compliance", lower=1e-6),))
-    with pytest.raises(InputError, match=r"joint1\.compliance is held at 3\.5e-07, outside"):
-        identify(drives(), readings(drives(), 0), Options(constraints=outside))
-
-
-def test_a_table_too_large_to_hold_b_is_refused(monkeypatch):
-    monkeypatch.setattr(partition, "LARGE", 0)
-    with pytest.raises(InputError, match="which a table of this size does not allow"):
-        identify(
-            drives(),
-            readings(drives(), 0),
-            Options(prior=prior_of(joint2__compliance=(3e-7, 1e-8))),
-        )
-
-
 # --- options ----------------------------------------------------------------------------------
-
-
-@pytest.mark.parametrize("method", ["huber", "tukey", "l1", "student-t"])
-def test_methods_without_a_constrained_fit_say_what_to_use(method):
-    with pytest.raises(InputError, match="use the default method"):
-        Options(method=method, constraints=non_negative("joint2.compliance"))
-
-
-@pytest.mark.parametrize("method, kind", [("auto", "cr2"), ("ols", "hc3")])
-def test_intervals_that_ignore_the_knowledge_are_refused(method, kind):
-    with pytest.raises(InputError, match="there are auto, profile"):
-        Options(method=method, intervals=kind, constraints=non_negative("joint2.compliance"))
-
-
-def test_the_result_says_what_was_active_and_shared_in_json():
-    prior = prior_of(joint3__compliance=(4.2e-7, 1e-8))
-    options = Options(prior=prior, constraints=physical_constraints(bearings()))
-    text = json.dumps(identify(bearings(), negative(), options).to_json(), allow_nan=False)
-    told = json.loads(text)
-    (active,) = told["active"]
-    assert active["parameters"] == [BEARING_X] and active["kind"] == "lower"
-    assert active["value"] == 0 and active["multiplier"] > 0
-    assert 0.5 < told["prior_share"]["joint3.compliance"] < 1
-    assert told["method"] == "constrained" and told["noise"]["kind"]
 
 
 # --- the file ---------------------------------------------------------------------------------
@@ -442,36 +331,3 @@ def test_a_wrong_file_is_told_by_file_and_key(tmp_path, text, message):
     with pytest.raises(InputError, match=message) as error:
         read_knowledge(written(tmp_path, text))
     assert str(error.value).startswith(str(tmp_path / "knowledge.toml"))
-
-
-@pytest.mark.parametrize(
-    "text",
-    [
-        '[prior."joint2.complience"]\nmean = 1\nstd = 1',
-        '[[bounds]]\nparameter = "joint2.complience"\nlower = 0',
-        '[[equality]]\nterms = { "joint2.complience" = 1 }',
-        '[[semidefinite]]\nentries = [["joint2.complience"]]',
-    ],
-)
-def test_a_name_that_is_no_parameter_is_told_with_the_nearest(tmp_path, text):
-    known = read_knowledge(written(tmp_path, text))
-    with pytest.raises(InputError, match=r"knowledge\.toml: .*did you mean 'joint2\.compliance'"):
-        known.of(drives())
-
-
-VALUES = st.recursive(
-    st.none() | st.booleans() | st.integers(-3, 3) | st.floats() | st.text(max_size=5),
-    lambda x: st.lists(x, max_size=3) | st.dictionaries(st.text(max_size=8), x, max_size=3),
-    max_leaves=6,
-)  # fmt: skip
-KEYS = st.sampled_from(["physical", "prior", "bounds", "equality", "semidefinite", "other"])
-
-
-def as_toml(value) -> str:
-    if isinstance(value, dict):
-        return "{" + ", ".join(f"{json.dumps(k)} = {as_toml(v)}" for k, v in value.items()) + "}"
-    if isinstance(value, list):
-        return "[" + ", ".join(map(as_toml, value)) + "]"
-    if isinstance(value, float):
-        return repr(value)
-    return '""' if value is None else json.dumps(value)

@@ -13,7 +13,7 @@ from elastocal.identification.identify import identify
 from elastocal.identification.noise_summary import lack_of_fit
 from elastocal.identification.options import Options
 from elastocal.model.manipulator import Model
-from elastocal.model.observations import observe, pure_error
+from elastocal.model.observations import observe
 
 PLACED = ("base_frame", "marker_position")
 SIGMA, POSES, REPEATS = 5e-5, 14, 4
@@ -82,24 +82,3 @@ def test_the_default_counts_with_a_configuration_effect():
     assert np.trace(result.covariance) > 2 * np.trace(plain.covariance)
     (common,) = (s for s in result.noise.sizes if s.name == "common to each configuration")
     assert 50e-6 < common.sigma < 200e-6  # 100 µm, from a handful of configurations
-
-
-def test_a_clean_campaign_is_left_in_peace():
-    model, table = campaign(4)
-    assert not any(w.startswith(SENTENCE) for w in identify(model, table).warnings)
-
-
-def test_without_repeats_there_is_no_test():
-    model, table = campaign(5, repeats=1)
-    result = identify(model, table)
-    assert result.noise.lack_of_fit is None
-    assert not any(w.startswith(SENTENCE) for w in result.warnings)
-
-
-def test_pure_error_is_that_about_the_means_of_groups():
-    rng = np.random.default_rng(1)
-    group, values = rng.integers(0, 5, 40) * 3, rng.normal(size=(40, 3))
-    square, dof = pure_error(group, values)
-    own = [values[group == g] for g in np.unique(group)]
-    assert dof == 3 * (40 - len(own))
-    assert abs(square / sum(((v - v.mean(axis=0)) ** 2).sum() for v in own) - 1) < 1e-12

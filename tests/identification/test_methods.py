@@ -17,11 +17,8 @@ from support.calibration import (
 from support.cells import random_poses
 
 from elastocal.cell.arm_description import CartesianNoise, Tracker
-from elastocal.errors import InputError
 from elastocal.identification import published
 from elastocal.identification.identify import identify
-from elastocal.identification.intervals import KINDS as INTERVALS
-from elastocal.identification.noise_structure import noise_models
 from elastocal.identification.options import METHODS, ROBUST, Options
 from elastocal.model.manipulator import Model
 from elastocal.model.observations import observe
@@ -103,16 +100,6 @@ def test_the_published_methods_are_those_of_the_paper():
         np.testing.assert_allclose(np.sqrt(np.diag(stated)), std, rtol=1e-3)
 
 
-def test_published_methods_fit_every_reading_unless_told_otherwise():
-    model, table, _ = campaign()
-    wrong = with_errors(table, 0.05)
-    for method in ("ols", "eq14", "eq14-residual"):
-        kept = identify(model, wrong, Options(method=method))
-        assert len(kept.residual) == 3 * len(table) and len(kept.outliers) >= 5
-    dropped = identify(model, wrong, Options(method="ols", faulty="drop"))
-    assert len(dropped.excluded) >= 5 and len(dropped.residual) < 3 * len(table)
-
-
 @pytest.mark.parametrize("method", [*ROBUST, "reml"])
 @pytest.mark.parametrize("share", [0.05, 0.3])
 def test_gross_errors_do_not_bend_a_robust_fit(method, share):
@@ -148,41 +135,6 @@ def test_robust_intervals_hold_with_outliers():
 # --- noise ----------------------------------------------------------------------------------
 
 
-@pytest.mark.parametrize("noise", [k for k in noise_models() if k != "auto"])
-def test_every_noise_model_by_name(noise):
-    model, table, truth = campaign(2, effect=1e-4)
-    result = identify(model, table, Options(noise=noise))
-    assert result.noise.kind == noise and result.noise.reason == "as asked for"
-    assert np.isfinite(result.covariance).all()
-    if noise.endswith("+configuration"):
-        assert np.abs(z(result, truth)).max() < 4.5
-        sizes = {s.name: s.sigma for s in result.noise.sizes}
-        assert 50e-6 < sizes["common to each configuration"] < 200e-6
-
-
-@pytest.mark.parametrize("noise", ["marker", "groups"])
-def test_variances_bear_the_names_that_the_table_gives(noise):
-    model, table, _ = campaign(2)
-    poses = tuple(f"pose {c}" for c in table.configuration_labels)
-    result = identify(model, replace(table, configuration_labels=poses), Options(noise=noise))
-    found = {s.name.split(",")[0] for s in result.noise.sizes}
-    used = (table.marker_names, table.marker) if noise == "marker" else (poses, table.configuration)
-    kind = "marker" if noise == "marker" else "configuration"
-    assert found == {f"{kind} {used[0][k]}" for k in np.unique(used[1])}
-
-
-def test_auto_says_what_it_chose_and_from_what():
-    model, table, _ = campaign(3, effect=1e-4, stated=False)
-    noise = identify(model, table).noise
-    assert noise.kind.endswith("+configuration")
-    assert {t.kind.removesuffix("+configuration") for t in noise.tried} >= {
-        "independent", "axis", "marker", "groups", "polar",
-    }  # fmt: skip
-    assert "smallest information criterion" in noise.reason
-    best = min(noise.tried, key=lambda t: t.criterion)
-    assert best.kind == noise.kind
-
-
 def test_intervals_hold_where_the_arm_does_not_come_back_to_the_same_place():
     """8 tables of 7 parameters with 100 µm common to a configuration, twice the noise."""
     hits = plain_hits = total = 0
@@ -202,21 +154,6 @@ def test_intervals_hold_where_the_arm_does_not_come_back_to_the_same_place():
 # --- intervals ------------------------------------------------------------------------------
 
 
-@pytest.mark.parametrize("kind", INTERVALS)
-def test_every_kind_of_intervals(kind):
-    """Independent readings: all estimate the same widths, the clustered from 14 clusters."""
-    model, table, truth = campaign(4)
-    options = Options(method="ols", intervals=kind)
-    result, plain = identify(model, table, options), identify(model, table, Options(method="ols"))
-    assert result.noise.interval_kind.lower() == ("classical" if kind == "auto" else kind)
-    for name, true in zip(model.names, truth, strict=True):
-        mine, other = result[name], plain[name]
-        width = (mine.ci95[1] - mine.ci95[0]) / (other.ci95[1] - other.ci95[0])
-        assert 0.4 < width < 2.5
-        assert mine.ci95[0] < mine.value < mine.ci95[1]
-        assert abs(mine.value - true) < 5 * other.std
-
-
 def test_clustered_intervals_hold_under_a_configuration_effect():
     hits = total = 0
     for seed in range(8):
@@ -229,48 +166,6 @@ def test_clustered_intervals_hold_under_a_configuration_effect():
 
 
 # --- what does not go together --------------------------------------------------------------
-
-
-@pytest.mark.parametrize(
-    ("options", "message"),
-    [
-        ({"method": "olss"}, "student-t; found 'olss' (did you mean 'ols'?)"),
-        ({"method": "mm"}, "there is no method='mm': use tukey"),
-        ({"intervals": "wild"}, "there is no intervals='wild': use cr2"),
-        ({"intervals": "hc4"}, "use hc3"),
-        ({"intervals": "bootstrap"}, "use profile"),
-        ({"noise": "group"}, "(did you mean 'groups'?)"),
-        ({"intervals": "hc5"}, "`intervals` takes one of auto, classical, hc0"),
-        ({"faulty": "ignore"}, "`outliers` takes one of auto, drop, keep; found 'ignore'"),
-        ({"method": "ols", "noise": "groups"}, "is estimated by the method reml"),
-        ({"method": "wls", "weights": "none"}, "choose the method ols"),
-        ({"method": "eq14", "weights": "rows"}, "choose the method wls"),
-    ],
-)
-def test_options_that_make_no_sense_are_refused(options, message):
-    with pytest.raises(InputError) as error:
-        Options(**options)
-    assert message in str(error.value)
-
-
-@pytest.mark.parametrize(
-    ("options", "message"),
-    [
-        (Options(method="huber", bounded=True), "takes no bounds"),
-        (Options(method="tukey", intervals="hc3"), "has intervals of its own"),
-    ],
-)
-def test_a_robust_method_says_what_it_cannot_do(options, message):
-    model, table, _ = campaign()
-    with pytest.raises(InputError, match=message):
-        identify(model, table, options)
-
-
-def test_shared_effects_need_readings_that_share_something():
-    model, table, _ = campaign()
-    alone = table.take((table.repeat == 0) & (table.marker == 0))
-    with pytest.raises(InputError, match="needs repeats or several markers"):
-        identify(model, alone, Options(noise="axis+configuration"))
 
 
 @pytest.mark.parametrize("stated", [True, False])

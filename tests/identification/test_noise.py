@@ -12,9 +12,9 @@ from elastocal.cell.arm_description import CartesianNoise, PolarNoise, Tracker
 from elastocal.errors import InputError
 from elastocal.identification.identify import identify
 from elastocal.identification.options import Options
-from elastocal.identification.weighted_problem import scaled_by_component, weights_for
+from elastocal.identification.weighted_problem import weights_for
 from elastocal.model.manipulator import Model
-from elastocal.model.observations import observe, subset
+from elastocal.model.observations import observe
 from elastocal.simulation.simulate import simulate
 
 POLAR = Tracker(np.array([0.3, -0.2, 0.1]), PolarNoise(2e-6, 3e-6, 5e-6, 2e-5))
@@ -91,18 +91,6 @@ def test_deflections_that_share_an_unloaded_reading_are_correlated():
         assert not W[c][:, np.arange(4) != c].any()
 
 
-def test_deflections_against_the_mean_of_unloaded_repeats():
-    """Loaded once, unloaded twice: the difference has variance σ² (1 + 1/2)."""
-    table = some_table(n=3, states=3)
-    force = table.force.copy()
-    force[:, 2] = np.tile([0.0, 0.0, -100.0], 3)
-    table = replace(table, force=force, repeat=np.tile([0, 1, 5], 3))
-    observed = observe(table, "deflection")
-    assert_whitens(
-        weights_for(observed, AXIS), np.kron(np.eye(3), 1.5 * np.diag(AXIS.noise.sigma**2))
-    )
-
-
 def test_whitens_poses_and_distances():
     rng = np.random.default_rng(2)
     table = some_table(n=5)
@@ -111,23 +99,6 @@ def test_whitens_poses_and_distances():
     block = np.diag([1e-5, 2e-5, 3e-5, 2e-5, 2e-5, 2e-5]) ** 2
     assert_whitens(weights_for(observe(table, "pose"), tracker), np.kron(np.eye(5), block))
     assert_whitens(weights_for(observe(table, "distance"), tracker), 16e-10 * np.eye(5))
-
-
-def test_a_given_covariance_is_whitened_and_wins():
-    observed = observe(some_table(n=4), "position")
-    A = np.random.default_rng(3).normal(size=(12, 12))
-    covariance = A @ A.T + 0.1 * np.eye(12)
-    covariance[:3, 3:] = covariance[3:, :3] = 0.0  # a group of its own
-    weights = weights_for(observed, AXIS, "auto", covariance)
-    assert weights.kind == "covariance" and weights.absolute
-    assert_whitens(weights, covariance)
-
-
-def test_component_weights():
-    table = replace(some_table(n=2), rotation=np.zeros((2, 3)))
-    weights = scaled_by_component(observe(table, "pose"), np.arange(1.0, 7.0))
-    assert not weights.absolute
-    np.testing.assert_allclose(weights.apply(np.tile(np.arange(1.0, 7.0), 2)), np.ones(12))
 
 
 @pytest.mark.parametrize(
@@ -151,58 +122,12 @@ def test_auto_takes_the_tables_sigmas_then_the_cells_then_none(sigma, tracker, k
         assert weights.whiten is None and weights.apply(rows) is rows
 
 
-def test_auto_for_distances_and_poses():
-    table = replace(some_table(), distance=np.ones(12), rotation=np.zeros((12, 3)))
-    distance, pose = observe(table, "distance"), observe(table, "pose")
-    assert weights_for(distance, AXIS).kind == "none"
-    assert weights_for(distance, replace(AXIS, distance_sigma=1e-4)).kind == "axis"
-    assert weights_for(pose, AXIS).kind == "none"
-    assert weights_for(pose, replace(AXIS, rotation_sigma=1e-4)).kind == "axis"
-
-
-@pytest.mark.parametrize(
-    ("kind", "tracker", "message"),
-    [
-        ("rows", AXIS, r"cannot be formed: table\.csv has no sigma_… columns"),
-        ("axis", POLAR, r"the cell has no \[tracker\] sigma_um"),
-        ("axis", Tracker(), r"the cell has no \[tracker\] sigma_um"),
-        ("polar", AXIS, r"no \[tracker\] range_um, range_ppm, transverse_um, transverse_ppm"),
-        ("covariance", AXIS, r"'covariance' need a matrix \(`covariance`\)"),
-    ],
-)
-def test_noise_that_is_not_stated_is_refused(kind, tracker, message):
-    with pytest.raises(InputError, match=message):
-        weights_for(observe(some_table(), "position"), tracker, kind)
-
-
 def test_distances_and_poses_need_their_own_sigma():
     table = replace(some_table(), distance=np.ones(12), rotation=np.zeros((12, 3)))
     with pytest.raises(InputError, match=r"distances need \[tracker\] distance_um"):
         weights_for(observe(table, "distance"), AXIS, "axis")
     with pytest.raises(InputError, match=r"poses need \[tracker\] rotation_urad"):
         weights_for(observe(table, "pose"), AXIS, "axis")
-
-
-@pytest.mark.parametrize(
-    ("matrix", "message"),
-    [
-        (np.eye(35), r"the covariance is \(35, 35\), but there are 36 rows"),
-        (np.eye(36) + np.eye(36, k=1), "is not finite and symmetric"),
-        (np.diag([np.nan, *np.ones(35)]), "is not finite and symmetric"),
-        (np.diag([-1.0, *np.ones(35)]), "not positive definite; check what states it"),
-        (np.ones((36, 36)), "not positive definite"),
-    ],
-)
-def test_a_wrong_covariance_is_refused(matrix, message):
-    with pytest.raises(InputError, match=message):
-        weights_for(observe(some_table(), "position"), AXIS, "covariance", matrix)
-
-
-def test_a_zero_sigma_is_refused():
-    table = with_sigma(some_table(), "cartesian")
-    table.sigma[3, 1] = 0.0
-    with pytest.raises(InputError, match="not positive definite; check what states it"):
-        weights_for(observe(table, "position"), AXIS)
 
 
 # --- what weighting gains -------------------------------------------------------------------
@@ -273,25 +198,6 @@ def test_identify_states_the_covariance_that_its_estimates_have():
         squared.append(d @ np.linalg.solve(result.covariance, d))
     p, dof = len(truth), result.dof
     assert abs(np.mean(squared) - p * dof / (dof - 2)) < 4 * 1.3 * np.sqrt(2 * p / 25)
-
-
-def test_unit_weights_are_ols_and_worse():
-    model = Model.assembled(planar_chain(), cell_of(("base_frame", "marker_position")))
-    plan = heterogeneous(model.chain)
-    rng = np.random.default_rng(6)
-    truth = true_values(model, rng)
-    table = simulate(model, plan, truth, rng)
-    weighted, unit = identify(model, table), identify(model, table, Options(weights="none"))
-    assert unit.method == "ols" and unit.noise.kind == "none"
-    assert np.trace(unit.covariance) > 4 * np.trace(weighted.covariance)
-
-
-def test_weights_follow_a_subset_of_the_observations():
-    table = with_sigma(some_table(n=10, states=2), "cartesian")
-    observed = observe(table, "deflection")
-    part = subset(observed, np.arange(10) % 3 > 0)
-    mix = np.kron(part.combine.toarray(), np.eye(3))
-    assert_whitens(weights_for(part, AXIS), mix @ reading_covariance(part.table, AXIS) @ mix.T)
 
 
 def test_ratio_to_stated_noise():

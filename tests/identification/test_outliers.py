@@ -21,7 +21,6 @@ from support.cells import random_poses
 from elastocal.identification.identify import identify
 from elastocal.identification.options import Options
 from elastocal.identification.outliers import FALSE_ALARM, blocks
-from elastocal.identification.trimmed import least_trimmed_squares, majority, median_scale
 from elastocal.model.manipulator import Model
 
 SIGMA = 5e-5
@@ -84,33 +83,6 @@ def test_a_tenth_of_gross_errors_is_found_and_little_else(seed):
     found = rows_of(identify(model, wrong).faulty)
     assert set(bad) <= set(found)
     assert len(found) <= len(bad) + 1
-
-
-def test_errors_among_several_load_states_and_markers():
-    markers = {"M1": np.array([0.1, 0, 0]), "M2": np.array([0, 0.1, 0.1])}
-    model = Model.assembled(planar_chain(), cell_of(PLACED, markers))
-    rng = np.random.default_rng(3)
-    truth = true_values(model, rng)
-    plan = table_at(random_poses(model.chain, 15, 3), markers=("M1", "M2"))
-    table, bad = with_gross_errors(measured(model, plan, truth, SIGMA, rng), rng, 0.1)
-    result = identify(model, table)
-    assert np.array_equal(rows_of(result.faulty), bad)
-    for o in result.faulty:
-        i = o.line - 2
-        assert o.marker == ("M1", "M2")[table.marker[i]]
-        assert o.configuration == str(table.configuration[i] + 1)
-
-
-def test_error_and_ratio_of_a_faulty_reading():
-    """8 mm on one reading: so it is reported, in m and in multiples of the noise (√3 per σ)."""
-    model = Model.assembled(planar_chain(), cell_of(PLACED))
-    table, _, _ = clean_table(model, 5, 30)
-    table.position[11] += [0.0, 8e-3, 0.0]
-    (outlier,) = identify(model, table).faulty
-    assert outlier.line == 13
-    assert outlier.residual == pytest.approx(8e-3, abs=5 * SIGMA)
-    # scale from a median over 29 readings of 3 components: within a third
-    assert outlier.ratio == pytest.approx(8e-3 / SIGMA, rel=0.34)
 
 
 def distance_block(seed, share, shift):
@@ -195,15 +167,6 @@ def test_nothing_is_left_out_in_silence():
     assert all(o["residual"] > 1e-3 and o["ratio"] > 10 for o in listed)
 
 
-def test_a_clean_table_is_used_whole_with_and_without_dropping():
-    model = Model.assembled(planar_chain(), cell_of(PLACED))
-    table, _, _ = clean_table(model, 8, 30)
-    a, b = identify(model, table), identify(model, table, Options(faulty="drop"))
-    assert a.excluded == b.excluded == a.outliers == b.outliers == ()
-    assert a.dof == b.dof
-    np.testing.assert_allclose(a.x, b.x, rtol=1e-9, atol=1e-12)
-
-
 def test_stated_sigmas_count():
     """A reading of sigma 2 mm that is off by 3 mm is no outlier; one of sigma 20 µm off by 1 mm
     is."""
@@ -221,48 +184,4 @@ def test_stated_sigmas_count():
     assert rows_of(result.faulty).tolist() == [20]
 
 
-def test_outliers_are_found_under_a_given_covariance_too():
-    model = Model.assembled(planar_chain(), cell_of(PLACED))
-    table, _, _ = clean_table(model, 10, 30)
-    table.position[4] += 0.02
-    options = Options(weights="covariance", covariance=SIGMA**2 * np.eye(90))
-    assert rows_of(identify(model, table, options).faulty).tolist() == [4]
-
-
 # --- the trimmed fit ------------------------------------------------------------------------
-
-
-@pytest.mark.parametrize("size", [1, 3])
-@pytest.mark.parametrize("seed", range(3))
-def test_least_trimmed_squares_ignores_almost_half(seed, size):
-    """45 % of the observations agree on another answer; the majority's is exact and found."""
-    rng = np.random.default_rng(seed)
-    n, p = 60, 4
-    B = rng.normal(size=(n * size, p))
-    truth, other = rng.normal(size=p), rng.normal(size=p) + 5
-    e = B @ truth
-    bad = np.repeat(np.arange(n) < 0.45 * n, size)
-    e[bad] = (B @ other)[bad]
-    np.testing.assert_allclose(least_trimmed_squares(B, e, size, seed), truth, atol=1e-9)
-
-
-def test_majority_leaves_one_in_a_hundred_clean_observations_out():
-    """Reweighted at the 99 % limit over 2000 observations: 1 % ± 4 standard deviations."""
-    rng = np.random.default_rng(0)
-    good = majority(rng.normal(size=(6000, 3)), rng.normal(size=6000), 3)
-    assert abs((~good).mean() - 0.01) < 4 * np.sqrt(0.01 * 0.99 / 2000)
-
-
-@pytest.mark.parametrize("size", [1, 3, 6])
-def test_median_scale_is_consistent(size):
-    """20 000 observations; the median's relative standard error is below 2/√n."""
-    squared = 4.0 * np.random.default_rng(size).chisquare(size, 20_000)
-    assert median_scale(np.sqrt(squared), size) == pytest.approx(2.0, rel=4 * 2 / np.sqrt(20_000))
-
-
-def test_blocks_of_lines():
-    assert blocks([]) == []
-    assert blocks([7]) == [(7, 7)]
-    assert blocks([9, 2, 3, 4, 20, 23]) == [(2, 4), (9, 9), (20, 23)]
-    assert blocks([2, 6], gap=3) == [(2, 2), (6, 6)]
-    assert blocks([2, 5, 8], gap=3) == [(2, 8)]

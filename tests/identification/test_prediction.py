@@ -10,7 +10,6 @@ from support.calibration import GEOMETRY, cell_of, measured, planar_chain, table
 from support.cells import random_poses
 
 from elastocal.cell.arm_description import CartesianNoise, Tracker
-from elastocal.errors import UnknownNameError
 from elastocal.identification.findings import ENOUGH, judged, spare_equations
 from elastocal.identification.identify import identify
 from elastocal.identification.prediction import NewPoses
@@ -71,13 +70,6 @@ def test_predicted_error_is_that_at_new_poses(fits):
     assert sum(inside) >= 7
 
 
-def test_trusted_at_is_the_upper_end_of_what_is_predicted(fits):
-    fit = fits[0][0]
-    assert fit.verdict.trusted and fit.verdict.at == fit.predicted.ci95[1]
-    assert fit.to_json()["verdict"]["at_um"] == pytest.approx(fit.verdict.at * 1e6)
-    assert fit.to_json()["predicted_new_poses_um"]["ci95"][1] == pytest.approx(fit.verdict.at * 1e6)
-
-
 def test_few_configurations_and_unknown_noise_are_no_ground_for_trust(fits):
     few = campaign(0, 12)[0]
     assert spare_equations(few) < ENOUGH
@@ -117,23 +109,3 @@ def test_a_pose_that_alone_shows_a_parameter_counts_by_its_share_of_the_error(si
     told = fit.finding("not_held_out")
     assert (told.severity == "note") == fit.verdict.trusted == (not sideways)
     assert (fit.predicted.unchecked**2 > fit.predicted.rms**2 / 2) == bool(sideways)
-
-
-def test_limits_that_are_not_kept_are_named(fits):
-    fit = fits[0][0]
-    assert fit.unmet(heldout=1.0, new_poses=1.0) == ()
-    (told,) = fit.unmet(heldout=1e-6)
-    assert told.startswith("heldout: ") and told.endswith("at most 1 µm is required")
-    assert fit.unmet(test=1.0) == ("test: not known where at most 1e+06 µm is required",)
-    with pytest.raises(UnknownNameError, match="held_out"):
-        fit.unmet(held_out=1.0)
-
-
-def test_what_no_pose_shows_is_not_asked_for(fits):
-    fit = fits[0][0]
-    left = fit.left
-    assert set(left.redundant) <= set(left.names)
-    undetermined = fit.finding("undetermined")
-    asked = () if undetermined is None else undetermined.numbers["names"]
-    assert not set(asked) & set(left.redundant)
-    assert len(asked) + len(left.redundant) == len(left.names)

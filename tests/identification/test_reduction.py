@@ -1,6 +1,5 @@
 """Which parameters the data determine, on arms whose redundancies are known by name."""
 
-from dataclasses import replace
 from functools import lru_cache
 
 import numpy as np
@@ -22,14 +21,10 @@ from support.calibration import (
     z_scores,
 )
 from support.cells import choices, kr270_chain, random_poses
-from support.parts import SIGMA, arm, solved
 
 from elastocal.cell.arm_description import Nominal
-from elastocal.identification import solve as solving
 from elastocal.identification.identify import identify
-from elastocal.identification.options import Options
-from elastocal.identification.solve import STRUCTURAL, reduce, solve
-from elastocal.model.arm import Parameter
+from elastocal.identification.solve import reduce
 from elastocal.model.chain import Chain, Joint
 from elastocal.model.manipulator import Model
 
@@ -87,17 +82,6 @@ def test_parallel_axes_leave_only_the_sum_of_shifts_along_them():
     assert set(share) <= {"link2.dz", "link3.dz", "link2.rz"}
 
 
-def test_parallel_axes_of_the_kr_270():
-    """Axes 2 and 3 are parallel to y, and so is axis 5's at joint 4 = 0 but not elsewhere."""
-    effects = ("link_geometry:link1", "link_geometry:link2", "joint_offset")
-    _, share, _ = reduced(kr270_chain(), effects)
-    pair = {"link1.dy", "link2.dy"}
-    (dropped,) = pair & set(share)
-    assert share[dropped] == {(pair - {dropped}).pop(): 1.0}
-    assert share["link1.ry"] == {"joint2.offset": 1.0}
-    assert share["link2.ry"] == {"joint3.offset": 1.0}
-
-
 def test_a_vertical_joint_1_leaves_base_z_and_link1_dz_as_a_sum():
     kept, share, _ = reduced(planar_chain(), GEOMETRY)
     assert share["link1.dz"] == {"base.z": 1.0}
@@ -105,22 +89,6 @@ def test_a_vertical_joint_1_leaves_base_z_and_link1_dz_as_a_sum():
     assert share["link3.dx"] == {"marker:M1.x": 1.0}
     assert {f"base.{k}" for k in ("x", "y", "z", "rx", "ry", "rz")} <= set(kept)
     assert {f"marker:M1.{k}" for k in "xyz"} <= set(kept)
-
-
-def test_with_the_base_turned_the_shares_turn_with_it():
-    """The base frame is in the tracker's axes: link1.dz is then base·(R e_z)."""
-    R = Rotation.from_euler("xyz", [40, -25, 70], degrees=True).as_matrix()
-    _, share, _ = reduced(planar_chain(), GEOMETRY, nominal=Nominal(base_rotation=R))
-    expected = dict(zip(("base.x", "base.y", "base.z"), R[:, 2], strict=True))
-    assert share["link1.dz"] == pytest.approx(expected, abs=1e-8)
-
-
-def test_the_last_link_is_seen_only_through_the_marker():
-    _, share, invisible = reduced(planar_chain(), GEOMETRY)
-    for k in "xyz":
-        assert share[f"link3.d{k}"] == {f"marker:M1.{k}": 1.0}
-    # tilts of the flange with the marker at its origin move nothing
-    assert invisible == ["link3.rx", "link3.ry", "link3.rz"]
 
 
 @pytest.mark.parametrize("nominal", [None, Nominal(joint_compliance=(1e-5, 2e-5, 3e-5))])
@@ -131,25 +99,6 @@ def test_a_vertical_load_does_not_show_a_vertical_joint(nominal):
     assert share == {"joint1.compliance": {}} and invisible == ["joint1.compliance"]
     kept, share, invisible = reduced(planar_chain(), ("joint_compliance",), SIDEWAYS, **model)
     assert len(kept) == 3 and not share and not invisible
-
-
-def test_without_load_no_compliance_is_known():
-    kept, _, invisible = reduced(
-        kr270_chain(), ("base_frame", "joint_compliance"),
-        nominal=Nominal(joint_compliance=(1e-6,) * 6),
-    )  # fmt: skip
-    assert not any("compliance" in name for name in kept)
-    assert invisible == [f"joint{i}.compliance" for i in range(1, 7)]
-
-
-def test_compliance_and_base_are_kept_before_link_geometry():
-    kept, share, _ = reduced(
-        kr270_chain(), (*GEOMETRY, "joint_compliance"), ((0, 0, 0), (300, 0, -2600)),
-        nominal=Nominal(joint_compliance=(1e-6,) * 6), load_point=(0.2, 0.1, 0.2),
-    )  # fmt: skip
-    assert {f"joint{i}.compliance" for i in range(1, 7)} <= set(kept)
-    assert {f"base.{k}" for k in ("x", "y", "z", "rx", "ry", "rz")} <= set(kept)
-    assert all(name.startswith(("link", "joint")) for name in share)
 
 
 # --- properties -----------------------------------------------------------------------------
@@ -176,42 +125,6 @@ def regression(chain_name, effects, seed=0):
     return model, B, model.sizes(B)
 
 
-@pytest.mark.parametrize("effects", CHOICES, ids="+".join)
-@pytest.mark.parametrize("chain", ["planar", "kr270", "random"])
-def test_a_dropped_column_is_its_mix_of_kept_ones(chain, effects):
-    model, B, sizes = regression(chain, effects)
-    found = reduce(B, sizes, model.parameters, 1.0, 0.0)
-    assert sorted([*found.kept, *found.dropped]) == list(range(len(model.names)))
-    assert not set(found.kept) & set(found.dropped)
-    assert set(found.invisible) <= set(found.dropped)
-    assert found.mixing.shape == (len(found.kept), len(found.dropped))
-    scaled = B * sizes
-    off = B[:, found.dropped] - B[:, found.kept] @ found.mixing
-    length = np.linalg.norm(scaled, axis=0)
-    # A column is dropped when less than STRUCTURAL of its own length lies off the kept ones
-    # (or of the longest column where it is shorter than that altogether).
-    assert (
-        np.linalg.norm(off * sizes[found.dropped], axis=0) <= 1.01 * STRUCTURAL * length.max()
-    ).all()
-    # ... and the kept ones are as many as the numerical rank says.
-    singular = linalg.svdvals(scaled / np.where(length > 0, length, 1.0))
-    assert len(found.kept) == (singular > 1e-9 * singular[0]).sum()
-
-
-@pytest.mark.parametrize("threshold", [10.0, 1.0, 0.1, 0.01])
-@pytest.mark.parametrize("seed", range(5))
-def test_no_dropped_column_is_worth_keeping(threshold, seed):
-    """Off the span of the kept columns, a dropped one is shorter than the threshold."""
-    rng = np.random.default_rng(seed)
-    spread = np.diag(10.0 ** rng.uniform(-5, 1, 12))
-    B = rng.normal(size=(40, 12)) @ spread @ rng.normal(size=(12, 12))
-    sizes, sigma = 10.0 ** rng.uniform(-3, 0, 12), 0.01
-    parameters = tuple(Parameter(f"p{i}", "link_geometry", "x", "m", 0.0, 1e-3) for i in range(12))
-    found = reduce(B, sizes, parameters, sigma, threshold)
-    off = B[:, found.dropped] - B[:, found.kept] @ found.mixing
-    assert (np.linalg.norm(off * sizes[found.dropped] / sigma, axis=0) <= threshold * 1.001).all()
-
-
 @pytest.mark.parametrize("effects", CHOICES[1:4], ids="+".join)
 @pytest.mark.parametrize("chain", ["planar", "kr270", "random"])
 def test_units_do_not_matter(chain, effects):
@@ -225,24 +138,6 @@ def test_units_do_not_matter(chain, effects):
     assert np.array_equal(a.invisible, b.invisible)
     expected = a.mixing * unit[a.kept][:, None] / unit[a.dropped][None, :]
     np.testing.assert_allclose(b.mixing, expected, rtol=1e-12)
-
-
-@pytest.mark.parametrize("effects", CHOICES[1:4], ids="+".join)
-@pytest.mark.parametrize("chain", ["planar", "kr270", "random"])
-@pytest.mark.parametrize("seed", range(3))
-def test_typical_sizes_do_not_change_which_directions_are_known(chain, effects, seed):
-    """Another choice of members is fine; the known subspace, the row space of B, is the same."""
-    model, B, sizes = regression(chain, effects)
-    other = sizes * 10.0 ** np.random.default_rng(seed).uniform(-1, 1, len(sizes))
-    rows = []
-    for s in (sizes, other):
-        found = reduce(B, s, model.parameters, 1.0, 0.0)
-        known = np.zeros((len(found.kept), len(sizes)))
-        known[:, found.kept] = np.eye(len(found.kept))
-        known[:, found.dropped] = found.mixing
-        rows.append(linalg.orth((known * sizes).T))
-    assert rows[0].shape == rows[1].shape
-    assert linalg.subspace_angles(*rows).max() < 1e-5
 
 
 # --- what a user gets -----------------------------------------------------------------------
@@ -296,21 +191,6 @@ def test_no_interval_for_what_the_data_cannot_determine(chain, seed, effects):
             assert e.name in result.determined
 
 
-def test_every_member_of_a_combination_names_the_others():
-    result, _ = simulated(planar_chain(), GEOMETRY, 0)
-    assert result.combinations
-    for c in result.combinations:
-        first, *others = c.terms
-        assert first in result.determined and c.terms[first] == 1.0
-        assert result[first].combined_with == tuple(others)
-        assert result[first].note == f"only as {c.expression}"
-        for name in others:
-            assert first in result[name].combined_with
-            assert result[name].note.startswith("held: known only together with")
-    with_height = [next(iter(c.terms)) for c in result.combinations if "link1.dz" in c.terms]
-    assert with_height and set(with_height) <= {"base.x", "base.y", "base.z"}
-
-
 SEEDS = 20
 
 
@@ -352,39 +232,6 @@ def test_what_another_effect_explains_completely_is_reported_with_it():
     assert result.combination("base.rz").terms == pytest.approx(
         {"base.rz": 1.0, "joint1.offset": 1.0}, abs=1e-2
     )
-
-
-def test_a_wider_set_that_is_singular_where_it_comes_to_rest_is_not_preferred(monkeypatch):
-    model, plan, truth, rng = arm(GEOMETRY, 1, 20)
-    problem = solved(model, measured(model, plan, truth, 1000 * SIGMA, rng)).problem
-    before, asked = solve(problem, try_wider=False), []
-
-    def promising(problem, sizes, x, wider, r_factor):
-        return x, np.zeros_like(before.heldout)
-
-    def once(problem, found):
-        asked.append(found)
-        if len(asked) > 1:
-            raise np.linalg.LinAlgError("singular matrix")
-        return before.heldout
-
-    monkeypatch.setattr(solving, "_linear_step", promising)
-    monkeypatch.setattr(solving, "heldout_of", once)
-    after = solve(problem)
-    assert len(asked) > 1
-    np.testing.assert_array_equal(after.reduction.kept, before.reduction.kept)
-
-
-def test_readings_of_one_precise_axis_show_more_than_equal_weights_do():
-    """What two noisy axes hide is chosen by the weights that are found, and held no longer."""
-    model, rng = Model.assembled(random_chain(3), cell_of(GEOMETRY)), np.random.default_rng(1)
-    truth = true_values(model, rng, anywhere=False)
-    plan = table_at(random_poses(model.chain, 30, 0))
-    exact = measured(model, plan, truth, 0.0, rng)
-    noise = np.array([2e-5, 1e-3, 1e-3]) * rng.normal(size=exact.position.shape)
-    read = replace(exact, position=exact.position + noise)
-    equal, own = (identify(model, read, Options(noise=kind)) for kind in ("independent", "axis"))
-    assert len(own.determined) > len(equal.determined)
 
 
 def test_combinations_hold_where_the_readings_are_too_good_for_a_linear_sum():

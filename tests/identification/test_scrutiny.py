@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-import itertools
-import json
 from dataclasses import replace
 
 import numpy as np
@@ -12,14 +10,13 @@ from support.calibration import SPRINGS, cell_of, measured, random_chain, table_
 from support.cells import random_poses
 
 from elastocal.cell.arm_description import CartesianNoise, Nominal, Tracker
-from elastocal.identification import scrutiny
 from elastocal.identification.findings import judged
 from elastocal.identification.identify import identify
 from elastocal.identification.options import Options
 from elastocal.identification.residuals import rms_3d
 from elastocal.identification.scrutiny import autocorrelation
 from elastocal.model.manipulator import Model
-from elastocal.report.identification_view import influence_table, sets_table, uncertainty_table
+from elastocal.report.identification_view import sets_table, uncertainty_table
 
 SIGMA = 1e-5
 STIFF = tuple(np.array([1.0, 0.9, 1.2, 8.0, 10.0, 6.0]) * 1e-7)
@@ -67,17 +64,6 @@ def test_influence_is_what_leaving_a_configuration_out_does(fitted):
         assert c.by == pytest.approx(abs(move[k]) / std[k], rel=1e-5)
 
 
-def test_a_configuration_that_alone_determines_something_is_said_so():
-    """The only one that is loaded."""
-    model, table = campaign()
-    first = table.configuration == 0
-    result = identify(model, table.take(first | (table.force == 0).all(axis=1)))
-    alone = [c for c in result.influence() if not np.isfinite(c.cook)]
-    assert [c.configuration for c in alone] == [table.configuration_labels[0]]
-    assert alone[0].moved.endswith(".compliance") and alone[0].to_json()["cook"] is None
-    assert "undetermined" in {row[5] for row in influence_table(result).rows}
-
-
 def test_residuals_alike_in_time_are_found_and_clean_ones_seldom(fitted):
     """False-alarm rate of 1 % by permutation; a drift as large as the noise is found."""
     _, _, result = fitted
@@ -94,42 +80,6 @@ def test_residuals_alike_in_time_are_found_and_clean_ones_seldom(fitted):
         noise = replace(result.noise, ratio_to_stated=ratio)
         f = judged(replace(result, residual=drift.ravel(), noise=noise)).finding("autocorrelated")
         assert f.severity == severity and "random order" in f.remedy
-
-
-@pytest.mark.parametrize("size", [1, 3])
-def test_moments_over_permutations_are_those_of_all_orders(size):
-    mean = np.random.default_rng(size).standard_t(3, (6, size))
-    mean -= mean.mean(axis=0)
-    all_orders = (mean[list(order)] for order in itertools.permutations(range(6)))
-    sums = [float((m[:-1] * m[1:]).sum()) for m in all_orders]
-    assert scrutiny.over_permutations(mean) == pytest.approx((np.mean(sums), np.std(sums)))
-
-
-def test_many_visits_are_judged_by_the_moments(fitted, monkeypatch):
-    """25 visits already: the p-values are those of permutations to a few hundredths."""
-    observed = fitted[2].observations
-    rng = np.random.default_rng(2)
-    residuals = rng.normal(size=(20, 3 * len(observed.lead)))
-    drawn = [autocorrelation(e, observed) for e in residuals]
-    monkeypatch.setattr(scrutiny, "MOST_PERMUTED", 12)
-    found = [autocorrelation(e, observed) for e in residuals]
-    for one, other in zip(found, drawn, strict=True):
-        assert one.correlations == other.correlations
-        assert one.p == pytest.approx(other.p, abs=0.06)
-        assert one.band == pytest.approx(other.band, rel=0.15)
-
-
-def test_order_is_that_of_times_where_there_are_any(fitted):
-    _, _, result = fitted
-    observed = result.observations
-    n = len(observed.lead)
-    rows = np.argsort(np.random.default_rng(3).permutation(25)[observed.configuration])
-    time = np.empty(n)
-    time[rows] = np.arange(n)
-    timed = replace(observed, table=replace(observed.table, time=time))
-    drift = np.repeat(np.sin(3 * time / n), 3) + 0.01 * np.random.default_rng(0).normal(size=3 * n)
-    assert autocorrelation(drift, timed).by == "times"
-    assert autocorrelation(drift, timed).p < 0.01 < autocorrelation(drift, observed).p
 
 
 def test_sets_of_parameters_side_by_side(fitted):
@@ -170,20 +120,3 @@ def test_what_the_stated_noise_does_not_explain_is_lack_of_fit(fitted):
     budget = replace(result, noise=replace(result.noise, ratio_to_stated=3.0)).uncertainty()
     assert budget.lack_of_fit == pytest.approx(SIGMA * np.sqrt(3 * 8 / 9), rel=0.1)
     assert budget.instrument == pytest.approx(SIGMA * np.sqrt(3 / 9), rel=0.3)
-
-
-def test_scatter_of_a_configuration_counts_as_repeatability():
-    model, table = campaign(seed=2)
-    common = 4e-5 * np.random.default_rng(0).normal(size=(25, 3))
-    result = identify(model, replace(table, position=table.position + common[table.configuration]))
-    budget = result.uncertainty()
-    assert budget.repeatability == pytest.approx(4e-5 * np.sqrt(3), rel=0.3)
-    assert budget.instrument == pytest.approx(SIGMA * np.sqrt(3), rel=0.2)
-
-
-def test_all_of_it_is_in_the_json(fitted):
-    content = json.loads(json.dumps(fitted[2].to_json(), allow_nan=False))
-    assert len(content["influence"]) == 25 and content["influence"][0]["leverage"] > 0
-    assert {s["set"] for s in content["parameter_sets"]} >= {"chosen", "with geometry"}
-    assert content["autocorrelation"]["visits"] == 25
-    assert content["uncertainty"]["total_um"] > 0

@@ -36,19 +36,6 @@ def marginal(B, e, scales: Scales, kept: np.ndarray) -> tuple[np.ndarray, float]
     return V, np.linalg.slogdet(V)[1] + np.linalg.slogdet(N)[1] + e @ P @ e
 
 
-def test_sums_over_rows_say_the_same_as_their_factor():
-    B, e, *_ = drawn(0)
-    B[:, 3] = B[:, 0] - B[:, 1]  # columns that depend on each other
-    away = np.random.default_rng(5).normal(size=SHRUNK)
-    halves = [Sums.of(B[rows], e[rows], FREE) for rows in (slice(0, 30), slice(30, None))]
-    summed = LinearRows.summed(halves[0].merged(halves[1]), away, STD, GROUP)
-    whole, kept = linear(B, e, away), np.array([0, 1, 2])
-    scales = Scales(np.array([1.0, 0.3, 0.0]), 0.2, np.zeros(3))
-    one, other = (rows.only(kept).posterior(scales) for rows in (summed, whole))
-    assert np.allclose(one.step, other.step) and np.allclose(one.cofactor, other.cofactor)
-    assert np.isclose(summed.only(kept).total, whole.only(kept).total)
-
-
 @pytest.mark.parametrize("seed", range(3))
 @pytest.mark.parametrize("kept", [np.arange(FREE), np.array([0, 2])])
 def test_the_posterior_is_that_of_ridge_regression(seed, kept):
@@ -68,25 +55,6 @@ def test_the_posterior_is_that_of_ridge_regression(seed, kept):
     assert np.allclose(np.diag(C @ found.cofactor @ C.T), np.diag(hat))
     share = np.diag(found.cofactor * prior @ found.cofactor) / np.diag(found.cofactor)
     assert np.allclose(found.prior_share, share)
-
-
-def test_the_marginal_factor_takes_the_functions_for_noise():
-    B, e, *_ = drawn(0)
-    scales = Scales(np.array([1.0, 0.3, 2.0]), 0.2, np.zeros(3))
-    V, _ = marginal(B, e, scales, np.arange(FREE))
-    R = linear(B, e).only(np.arange(FREE)).posterior(scales).marginal.R
-    information = B[:, :FREE].T @ np.linalg.inv(V) @ B[:, :FREE]
-    assert np.allclose(R.T @ R / scales.variance, information, rtol=1e-9)
-
-
-def test_functions_away_from_nominal_make_no_difference():
-    B, e, *_ = drawn(1)
-    away = np.random.default_rng(5).normal(size=SHRUNK)
-    there = linear(B, e - B[:, FREE:] @ away, away).only(np.arange(FREE))
-    here = linear(B, e).only(np.arange(FREE))
-    assert np.allclose(there.right, here.right) and np.isclose(there.total, here.total)
-    scales = Scales(np.ones(3), 0.1, np.zeros(3))
-    assert np.allclose(there.posterior(scales).step, here.posterior(scales).step)
 
 
 @pytest.mark.parametrize("seed", range(3))
@@ -116,20 +84,6 @@ def test_what_is_not_there_is_shrunk_to_nothing():
     assert (found.gain[1:] < 2).all()
     posterior = linear(B, e).only(np.arange(FREE)).posterior(found)
     assert np.abs(posterior.step[FREE + 5 :]).max(initial=0) < 0.5 * np.abs(b[:5]).max()
-
-
-def test_a_group_at_zero_stays_there():
-    B, e, *_ = drawn(3)
-    start = Scales(np.array([1.0, 0.0, 1.0]), 0.1, np.zeros(3))
-    assert linear(B, e).only(np.arange(FREE)).scales(start).scale[1] == 0.0
-
-
-def test_ten_times_the_size_has_its_price():
-    """Data that hardly show a function would else take it for anything."""
-    B, e, *_ = drawn(4, (1.0, 1.0, 0.0))
-    B[:, FREE + 10 :] *= 1e-4
-    found = linear(B, e).only(np.arange(FREE)).scales()
-    assert found.scale[2] < 10
 
 
 def test_posterior_intervals_hold_the_truth():

@@ -7,7 +7,6 @@ import pytest
 from scipy.spatial.transform import Rotation
 from support.calibration import (
     BASE,
-    SPRINGS,
     cell_of,
     measured,
     random_chain,
@@ -15,9 +14,9 @@ from support.calibration import (
     true_values,
     with_values,
 )
-from support.cells import COMPLIANCE, kr270_chain, random_poses
+from support.cells import random_poses
 
-from elastocal.cell.arm_description import Nominal, Tracker
+from elastocal.cell.arm_description import Tracker
 from elastocal.identification.start import start_values
 from elastocal.model.manipulator import Model
 from elastocal.simulation.simulate import simulate
@@ -48,54 +47,6 @@ def test_position_start_is_as_near_as_the_nominal_geometry_allows(seed):
             assert x[i] == 0.0
     miss = rms(table.position.ravel() - model.predict(table, x))
     assert miss < 1.5 * rms(table.position.ravel() - model.predict(table, without_errors))
-
-
-def test_only_active_parameters_move():
-    chain, rng = kr270_chain(), np.random.default_rng(0)
-    nominal = Nominal(joint_compliance=COMPLIANCE)
-    full = Model.assembled(chain, cell_of(SPRINGS, nominal=nominal))
-    truth = true_values(full, rng)
-    table = measured(full, table_at(random_poses(chain, 20, 0)), truth, SIGMA, rng)
-    x = start_values(full, table)
-    moved = {p.effect for p, a, b in zip(full.parameters, x, full.nominal, strict=True) if a != b}
-    assert moved == {"base_frame", "marker_position"}
-    for effects, expected in (
-        (("marker_position", "joint_offset"), {"marker_position"}),
-        (("base_frame", "joint_offset"), {"base_frame"}),
-        (("joint_offset", "link_geometry"), set()),
-    ):
-        model = Model.assembled(chain, cell_of(effects, nominal=nominal))
-        x = start_values(model, table)
-        assert x.shape == model.nominal.shape
-        found = {p.effect for p, a, b in zip(model.parameters, x, model.nominal, strict=True)
-                 if a != b}  # fmt: skip
-        assert found == expected
-
-
-def test_one_marker_may_be_free_while_another_is_given():
-    chain, rng = kr270_chain(), np.random.default_rng(1)
-    markers = {"M1": np.array([0.1, 0.0, 0.1]), "M2": np.zeros(3)}
-    effects = ("base_frame", "marker_position:marker:M2")
-    model = Model.assembled(chain, cell_of(effects, markers))
-    assert not any(name.startswith("marker:M1") for name in model.names)
-    truth = with_values(model, {"marker:M2.x": 0.2, "marker:M2.z": -0.1, "base.x": 2.0})
-    table = table_at(random_poses(chain, 20, 1), markers=("M1", "M2"))
-    x = start_values(model, measured(model, table, truth, SIGMA, rng))
-    # 20 readings of each marker, a rigid arm: a few standard errors of the mean
-    np.testing.assert_allclose(x, truth, atol=2e-4)
-
-
-def test_unloaded_readings_serve_alone_where_they_suffice():
-    """0.1 rad of deflection under load would pull the start; unloaded rows must keep it exact."""
-    chain = kr270_chain()
-    stiff = Model.assembled(chain, cell_of(("base_frame", "marker_position", "joint_compliance"),
-                                 nominal=Nominal(joint_compliance=(2e-5,) * 6)))  # fmt: skip
-    truth = with_values(stiff, {"base.x": 1.0, "base.rz": 2.0, "marker:M1.x": 0.1})
-    forces = [[0, 0, 0], [0, 0, -1500.0]]
-    exact = simulate(stiff, table_at(random_poses(chain, 15, 2), forces), truth, 0, noise=False)
-    np.testing.assert_allclose(start_values(stiff, exact), truth, atol=1e-6)
-    loaded = exact.take(exact.force[:, 2] != 0)
-    assert np.abs(start_values(stiff, loaded) - truth).max() > 1e-3
 
 
 @pytest.mark.parametrize("seed", range(5))
@@ -174,17 +125,3 @@ def test_a_given_anchor_is_tried_first_and_kept_where_it_is_not_fitted():
     truth = with_values(model, {"marker:M1.x": 0.1, "marker:M1.y": -0.05})
     table = simulate(model, table_at(random_poses(chain, 40, 3)), truth, 0, noise=False)
     np.testing.assert_allclose(start_values(model, table), truth, atol=1e-6)
-
-
-def test_nothing_to_place_leaves_the_nominal_values():
-    chain = random_chain(4)
-    model = Model.assembled(chain, cell_of(("joint_offset",), observe="distance"))
-    table = table_at(random_poses(chain, 10, 4))
-    table = simulate(model, table, model.nominal, 0)
-    assert np.array_equal(start_values(model, table), model.nominal)
-
-
-def test_the_same_seed_gives_the_same_start(monkeypatch):
-    monkeypatch.setattr("elastocal.identification.start.DISTANCE_STARTS", 8)
-    model, table, _ = distance_case(2, DIRECTIONS[7], 0.1, rows=310)
-    assert np.array_equal(start_values(model, table, 4), start_values(model, table, 4))

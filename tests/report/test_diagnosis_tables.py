@@ -6,9 +6,9 @@ import io
 
 import pytest
 from rich.console import Console
-from support.diagnoses import EXPLAINED, EXTRA, VERDICTS
+from support.diagnoses import VERDICTS
 
-from elastocal.report.diagnosis_terminal import MOST_CANDIDATES_PRINTED, print_diagnosis
+from elastocal.report.diagnosis_terminal import print_diagnosis
 
 KINDS = ("revolute",) * 6
 
@@ -28,26 +28,3 @@ def test_it_fits_and_obeys_no_control_character(name, width):
     words = " ".join(text.split())
     for part in ("Verdict:", "Gap budget", "the best 8 of 10", "Noise:", "Next:"):
         assert part in words
-
-
-def test_every_step_and_the_best_candidates_are_listed():
-    text = printed("explained", 140)
-    for step in ("nominal", "base frame", "joint offset", "gear eccentricity at joint 2"):
-        assert step in text
-    listed = [c.effect.replace("_", " ") in text for c in EXPLAINED.candidates]
-    assert listed == [True] * MOST_CANDIDATES_PRINTED + [False] * 2
-    assert "joint2.eccentricity_sin" in text and "mrad" in text
-    assert "no further effect" in text and "an effect outside the catalogue" in text
-
-
-def test_searched_constants_stand_where_there_is_room():
-    assert "ripple order 100.7" in printed("explained", 140)
-    assert "ripple order 100.7" not in printed("explained", 80)
-
-
-def test_alike_untested_and_rivals():
-    text = " ".join(printed("planned", 140).split())
-    assert "link mass error of link 2: these data cannot tell them apart" in text
-    assert "the table has no approach direction" in text
-    before, after = EXTRA.pairs[0].distance_before, EXTRA.pairs[0].distance_after
-    assert f"gear eccentricity at joint 2 or link mass error of link 2 {before} {after}" in text

@@ -17,10 +17,9 @@ from elastocal.cell.arm_description import CartesianNoise, Tracker
 from elastocal.cell.plan_wishes import DesignSpec
 from elastocal.errors import InputError
 from elastocal.planning.design import DesignOptions, design
-from elastocal.planning.plan import Certificate, PlanSize
+from elastocal.planning.plan import PlanSize
 from elastocal.report.arm_view import plan_space
 from elastocal.report.page import page_of, write_page
-from elastocal.report.plan_view import plan_headline, plan_lines, plan_steps, plan_tone
 
 SCRIPT = "<script>alert(1)</script>"
 
@@ -50,23 +49,6 @@ def page(plan: Any) -> Page:
     return found
 
 
-def test_every_key_figure_is_on_the_page(page: Page, plan: Any) -> None:
-    assert f"efficiency {plan.certificate.efficiency_pool:.4f}" in page.text
-    assert f"{plan.candidates.feasible} feasible of {plan.candidates.tried} tried" in page.text
-    rows = page.named_rows()
-    for p in plan.predicted:
-        assert p.name in rows
-    for k, q in enumerate(np.degrees(plan.q)):
-        (row,) = [r for r in page.rows if r[0] == str(k + 1) and len(r) == 8]
-        assert [float(v) for v in row[1:7]] == pytest.approx(q, abs=0.005)
-    stops = [r for r in page.rows if len(r) == 12][1:]
-    assert [int(r[1]) - 1 for r in stops] == [stop.pose for stop in plan.execution.stops]
-    assert [r[0] for r in page.rows if r[0] in ("4", "8") and r[-1] in ("6.1", "–")] == ["4", "8"]
-    assert "no feasible pose shows joint1.compliance" in page.text
-    assert rows["seed"] == ["seed", str(plan.seed)]
-    assert SCRIPT in page.text  # the command, as text
-
-
 def test_view_has_the_poses_of_the_plan(page: Page, plan: Any) -> None:
     (view,) = (json.loads(text) for text in page.data)
     space = plan_space(plan)
@@ -80,30 +62,6 @@ def test_view_has_the_poses_of_the_plan(page: Page, plan: Any) -> None:
         away = np.linalg.norm(pose.markers - pose.flange[:3, 3], axis=1)
         local = np.array(list(plan.model.cell.tool.markers.values()))
         assert away == pytest.approx(np.linalg.norm(local, axis=1))
-
-
-@pytest.mark.parametrize(
-    ("pool", "starts", "warned", "text", "tone"),
-    [
-        (0.98, (5.0, 5.01), False, "more than 2.0 % better (certified)", "good"),
-        (0.9999, (5.0,), False, "no plan from these candidates is better (certified)", "good"),
-        (0.98, (), True, "more than 2.0 % better (certified)", "care"),
-        (0.7, (5.0, 5.5), False, "more than 30.0 % better (certified)", "good"),
-        (None, (), False, "no bound says", "good"),
-    ],
-)
-def test_the_verdict_says_how_far_from_the_best(
-    plan: Any, pool: Any, starts: Any, warned: bool, text: str, tone: str
-) -> None:
-    certificate = Certificate(30, 1.0, pool, None, 0.9, starts=starts)
-    warnings = ("something",) if warned else ()
-    told = replace(plan, certificate=certificate, warnings=warnings)
-    assert text in plan_headline(told)
-    assert plan_tone(told) == tone
-    advised = any("effort='thorough'" in step for step in plan_steps(told))
-    assert advised == (starts == (5.0, 5.5))
-    lines = [line for label, line in plan_lines(told) if "start" in line and label == "Certificate"]
-    assert [f"{len(starts)} start" in line for line in lines] == [True] * bool(starts)
 
 
 def test_writing_is_whole_or_not_at_all(plan: Any, tmp_path: Any) -> None:

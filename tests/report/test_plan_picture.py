@@ -12,7 +12,6 @@ from support.cells import TABLE_2, kr270_cell, kr270_chain, nominal_flanges, ran
 
 from elastocal.cell.arm_description import Nominal, Tracker
 from elastocal.cell.workspace_rules import HalfSpace, Solid, Workspace
-from elastocal.errors import InputError
 from elastocal.report.arm_view import plan_figure, write_plan_picture
 
 PLACED = np.eye(4)
@@ -73,19 +72,6 @@ def test_flanges_are_drawn_where_the_model_puts_them_in_every_view(cell):
     assert [t.get_text() for t in legend.get_texts()] == [line.get_label() for line in tips(top)]
 
 
-def test_a_floor_is_a_line_in_the_view_in_which_it_stands_upright(cell):
-    _, top, side = plan_figure(of_table_2(cell)).axes
-    dashed = [[line for line in axes.lines if line.get_linestyle() == "--"] for axes in (top, side)]
-    assert list(map(len, dashed)) == [0, 1]
-
-
-def test_groups_differ_in_colour_and_sign_even_when_there_are_many(cell):
-    q = random_poses(kr270_chain(), 20, 0)
-    figure = plan_figure(plan_at(cell, q, np.arange(20), [f"g{k}" for k in range(20)]))
-    marks = {(line.get_color(), line.get_marker()) for line in tips(figure.axes[1])}
-    assert len(marks) == 20
-
-
 def test_names_from_files_are_not_formulas_and_sixty_poses_are_drawn(cell, tmp_path):
     q = random_poses(kr270_chain(), 60, 0)
     names = [f'${i}_<&"' for i in range(60)]
@@ -94,19 +80,3 @@ def test_names_from_files_are_not_formulas_and_sixty_poses_are_drawn(cell, tmp_p
         plan = plan_at(cell, q, np.zeros(60, int), ["no load $x^$"], names)
         write_plan_picture(tmp_path / "plan.svg", plan)
     ET.parse(tmp_path / "plan.svg")
-
-
-@pytest.mark.parametrize("suffix", [".png", ".svg"])
-def test_the_same_plan_gives_the_same_file(cell, tmp_path, suffix):
-    files = [tmp_path / f"{k}{suffix}" for k in range(2)]
-    for file in files:
-        write_plan_picture(file, of_table_2(cell))
-    content = [file.read_bytes() for file in files]
-    assert content[0] == content[1]
-    assert content[0].startswith({".png": b"\x89PNG", ".svg": b"<?xml"}[suffix])
-
-
-def test_other_formats_are_refused(cell, tmp_path):
-    with pytest.raises(InputError, match=r"\.png or \.svg"):
-        write_plan_picture(tmp_path / "plan.pdf", of_table_2(cell))
-    assert not list(tmp_path.iterdir())

@@ -13,21 +13,16 @@ from hypothesis import strategies as st
 from support.cells import TABLE_2, kr270_cell, kr270_chain, nominal_flanges
 from support.robots import packaged_urdf
 
-from elastocal.cell.arm_description import Robot, Tracker
+from elastocal.cell.arm_description import Robot
 from elastocal.cell.workspace_rules import Solid, Workspace
 from elastocal.model.choice import load_chain
-from elastocal.planning.bodies import WORLD
-from elastocal.report import arm_view as residual_module
 from elastocal.report.arm_view import (
-    ARROW,
-    Posed,
     base_or_joint,
     frames_at,
     in_script,
     residual_space,
     shells_of,
     space_json,
-    space_of,
     triangles_of,
 )
 
@@ -71,39 +66,6 @@ def test_arm_stands_where_the_kinematics_puts_it() -> None:
     assert frames_at(cell, chain, TABLE_2, moved)[1][3] == pytest.approx(flange[3])
 
 
-def test_bodies_reach_along_the_arm_and_obstacles_stay_outside_it() -> None:
-    cell = kr270_cell()
-    obstacle = Solid("crate", "box", np.array([0.5, 0.8, 1.2]), TURNED)
-    shells = shells_of(replace(cell, workspace=Workspace((obstacle,))), kr270_chain())
-    carriers = {base_or_joint(shell) for shell in shells.arm}
-    assert carriers >= {1, 2, 3}
-    (crate,) = shells.around
-    assert crate.carrier == WORLD
-    assert crate.points.mean(axis=0) == pytest.approx(TURNED[:3, 3])
-
-
-def posed(arrows: Any = None, at: Any = (0.5, 0.0, 1.0)) -> Posed:
-    chain = kr270_chain()
-    frames, flange = frames_at(kr270_cell(), chain, TABLE_2[:1])
-    return Posed("1", "", frames[0], flange[0], np.array([at]), ("M1",), arrows)
-
-
-@given(st.floats(1e-9, 1e-1))
-@settings(max_examples=25, deadline=None)
-def test_arrows_are_scaled_by_a_round_number_and_fit(size: float) -> None:
-    space = space_of(kr270_cell(), kr270_chain(), [posed(np.array([[size, 0.0, 0.0]]))])
-    digit = space.scale / 10.0 ** np.floor(np.log10(space.scale) + 1e-9)
-    assert round(digit, 6) in (1, 2, 5)
-    longest = ARROW * float(np.ptp(space.extent, axis=0).max())
-    assert 0.39 * longest <= size * space.scale <= 1.0001 * longest
-
-
-def test_tracker_is_shown_where_it_stands_near() -> None:
-    near, far = (replace(kr270_cell(), tracker=Tracker(np.array([x, 0.0, 1.0]))) for x in (3, 90))
-    assert space_of(near, kr270_chain(), [posed()]).tracker is not None
-    assert space_of(far, kr270_chain(), [posed()]).tracker is None
-
-
 @given(st.lists(st.text() | st.integers(), max_size=4))
 @settings(max_examples=60, deadline=None)
 def test_no_name_ends_the_script_that_holds_it(content: Any) -> None:
@@ -136,20 +98,6 @@ def test_arrows_are_mean_residuals_by_configuration_load_and_marker(case: Any) -
     content = json.loads(space_json(space))
     assert len(content["poses"]) == len(space.poses)
     assert content["scale"] == space.scale
-
-
-def test_of_many_poses_the_worst_are_kept(case: Any, monkeypatch: pytest.MonkeyPatch) -> None:
-    result = case.result
-    told = (result.model, result.observations, result.x, result.residual)
-    every = residual_space(*told)
-    monkeypatch.setattr(residual_module, "MOST_POSES", 6)
-    monkeypatch.setattr(residual_module, "WORST", 2)
-    few = residual_space(*told)
-    assert len(few.poses) == 6
-    assert few.poses[few.first].name == every.poses[every.first].name
-    assert [p.name for p in few.poses] == [
-        p.name for p in every.poses if p.name in {f.name for f in few.poses}
-    ]
 
 
 def test_a_urdf_with_collision_meshes_at_hand_is_drawn_from_them() -> None:

@@ -109,30 +109,3 @@ def test_what_is_no_better_than_nominal_must_not_be_used(fine: Any) -> None:
     assert useless.tone == lost.tone == "poor"
     assert "the nominal arm does as well" in useless.headline
     assert "did not converge (100 steps)" in lost.headline
-
-
-def test_faulty_readings_are_pointed_at(fine: Any, hostile: Any) -> None:
-    steps = judgement(replace(fine, excluded=hostile.result.excluded)).steps
-    assert any("beyond the noise" in step for step in steps)
-    assert not any("beyond the noise" in step for step in judgement(fine).steps)
-
-
-def test_without_stated_noise_it_asks_for_it(fine: Any) -> None:
-    unstated = replace(fine, noise=replace(fine.noise, ratio_to_stated=None))
-    steps = " ".join(judgement(unstated).steps)
-    assert "State the tracker's noise ([tracker] sigma_um" in steps and "diagnose" in steps
-    assert "State the tracker's noise" not in " ".join(judgement(fine).steps)
-
-
-def test_many_faulty_readings_in_the_fit_and_little_gain_are_doubts(
-    fine: Any, hostile: Any
-) -> None:
-    reading = hostile.result.faulty[0]
-    n = len(fine.observations.lead)
-    few, many = (replace(fine, outliers=(reading,) * k) for k in (1, n // 10 + 1))
-    assert judgement(few).tone == "good"
-    found = judgement(many)
-    assert found.tone == "care"
-    assert f"{n // 10 + 1} of the {n} readings fitted lie beyond" in found.headline
-    little = judgement(replace(fine, nominal_rms=1.1 * fine.heldout_rms))
-    assert little.tone == "care" and "hardly better than the nominal arm" in little.headline

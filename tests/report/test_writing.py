@@ -9,7 +9,6 @@ from typing import Any
 import pytest
 
 from elastocal.errors import InputError
-from elastocal.report import page as report_pages
 from elastocal.report.page import write_page
 
 # Writing does not depend on what the figures show, and drawing takes its time.
@@ -37,22 +36,3 @@ def test_failure_while_writing_leaves_nothing(
     with pytest.raises(InputError, match="cannot be written"):
         write_page(case.result, tmp_path / "r.html")
     assert list(tmp_path.iterdir()) == []
-
-
-def test_failure_while_drawing_keeps_the_old_page(
-    case: Any, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    (tmp_path / "r.html").write_text("old", encoding="utf-8")
-
-    def broken(*_: object) -> dict[str, str]:
-        raise RuntimeError("no figures today")
-
-    monkeypatch.setattr(report_pages, "drawn_for", broken)
-    with pytest.raises(RuntimeError):
-        write_page(case.result, tmp_path / "r.html")
-    assert [(p.name, p.read_text()) for p in tmp_path.iterdir()] == [("r.html", "old")]
-
-
-def test_missing_folder(case: Any, tmp_path: Path) -> None:
-    with pytest.raises(InputError, match="does not exist"):
-        write_page(case.result, tmp_path / "none" / "r.html")

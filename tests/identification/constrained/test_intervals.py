@@ -28,14 +28,6 @@ def readings(*truth_in_std: float) -> np.ndarray:
     return B @ (STD * truth_in_std) + NOISE
 
 
-def test_without_active_constraints_it_is_the_normal_interval():
-    y = readings(10.0, 10.0, 10.0)
-    linear, half = solve_weighted(B, y), np.sqrt(CHI2) * STD
-    for i, name in enumerate(NAMES):
-        found = ends(B, y, NAMES, non_negative("a", "b"), name)
-        np.testing.assert_allclose(found, linear.x[i] + half[i] * np.array([-1, 1]), rtol=1e-11)
-
-
 def test_one_bound_in_closed_form():
     # With one bound S(v) = rss + (v − x̂)²/V still, and Ŝ is its value at the bound.
     y = readings(-2.0, 5.0, 5.0)
@@ -61,33 +53,6 @@ def test_ends_are_where_the_least_objective_has_risen_as_far_as_allowed():
             # Or there is no further to go: beyond, the constraints contradict each other.
             at_end = end in (2.2 * STD[2],) or abs(end) < 1e-6 * STD[i]
             assert rise == pytest.approx(CHI2, abs=1e-5) or (at_end and rise < CHI2)
-
-
-def test_intervals_end_where_other_constraints_end():
-    # a + b = 3 of their sizes and b ≥ 0 leave a at most there, though a itself has no bound.
-    total = 3.0 * STD[0]
-    stated = non_negative("b") + Constraints(
-        equalities=(LinearEquality({"a": 1.0, "b": STD[0] / STD[1]}, total),)
-    )
-    low, high = ends(B, readings(2.5, 0.5, 1.0), NAMES, stated, "a")
-    assert high == pytest.approx(total, abs=1e-7 * STD[0])
-    assert low < total - 0.5 * STD[0]
-
-
-def test_a_value_that_equalities_fix_is_its_interval():
-    stated = Constraints((Bounds("b", STD[1], STD[1]),))
-    found = ends(B, readings(1, 1, 1), NAMES, stated, "b")
-    np.testing.assert_allclose(found, STD[1], rtol=1e-12)
-
-
-def test_a_bound_that_the_readings_contradict_leaves_the_interval_of_its_face():
-    # Ten million standard deviations beyond the bound: what remains is the fit with a held there.
-    y = readings(-1e7, 1.0, 1.0)
-    rest = solve_weighted(B[:, 1:], y)
-    assert ends(B, y, NAMES, non_negative("a"), "a")[0] == 0.0
-    half = np.sqrt(CHI2 * rest.cofactor[0, 0])
-    found = ends(B, y, NAMES, non_negative("a"), "b")
-    np.testing.assert_allclose(found, rest.x[0] + half * np.array([-1, 1]), atol=1e-5 * half)
 
 
 @pytest.mark.parametrize(("truth", "exact"), [(0.0, 0.975), (1.0, None)])

@@ -9,7 +9,6 @@ from scipy import sparse
 from support.calibration import measured, with_values
 from support.cells import SLANTED, TABLE_2, kr270_cell, table_of
 
-from elastocal.errors import ElastocalError, InputError
 from elastocal.identification.knowledge import (
     Bounds,
     Constraints,
@@ -67,28 +66,6 @@ def negative_bearing() -> FitProblem:
     return found
 
 
-def test_a_negative_compliance_becomes_zero_and_the_others_follow():
-    stated = negative_bearing()
-    found = fitted(stated, physical_constraints(arm()))
-    i = arm().names.index(BEARING_X)
-    assert found.converged
-    assert found.x[i] == 0
-    (active,) = found.best.active
-    assert (active.label, active.kind) == (f"{BEARING_X} >= 0", "lower")
-    assert active.multiplier > 0
-    held = fit(replace(stated, columns=np.delete(stated.columns, i)))
-    np.testing.assert_allclose(found.x, held.x, atol=1e-7 * stated.sizes.min(), rtol=1e-7)
-    assert found.objective == pytest.approx(held.whitened @ held.whitened, rel=1e-10)
-    assert found.on_face[i, i] == 0 and found.face.shape[1] == len(held.columns)
-
-
-def test_without_active_constraints_it_is_the_fit():
-    stated = problem(1, **{BEARING_X: 8e-8, BEARING_Y: 8e-8})
-    found, free = fitted(stated, physical_constraints(arm())), fit(stated)
-    assert found.best.active == ()
-    np.testing.assert_allclose(found.x, free.x, rtol=1e-8, atol=1e-14)
-
-
 def test_a_multiplier_is_the_price_of_its_bound_in_the_nonlinear_problem():
     stated = negative_bearing()
     (active,) = fitted(stated, non_negative(BEARING_X)).best.active
@@ -120,25 +97,6 @@ def test_an_infeasible_start_is_moved_inside():
     found = fitted(replace(stated, x=start), physical_constraints(arm()))
     expected = fitted(stated, physical_constraints(arm()))
     np.testing.assert_allclose(found.x, expected.x, rtol=1e-8, atol=1e-16)
-
-
-def test_held_parameters_stay_and_may_not_break_a_constraint():
-    stated = negative_bearing()
-    i = arm().names.index(BEARING_X)
-    held = replace(stated, columns=np.delete(stated.columns, i))
-    assert fitted(held, physical_constraints(arm())).x[i] == stated.x[i]
-    outside = stated.x.copy()
-    outside[i] = -1e-8
-    with pytest.raises(InputError, match="is held at -1e-08, outside its bounds"):
-        fitted(replace(held, x=outside), physical_constraints(arm()))
-
-
-def test_a_start_without_equilibrium_is_said():
-    stated = negative_bearing()
-    soft = stated.x.copy()
-    soft[1] = 1e-2
-    with pytest.raises(ElastocalError, match="no static equilibrium"):
-        fitted(replace(stated, x=soft))
 
 
 @pytest.mark.parametrize("name", [BEARING_X, "joint3.compliance"])

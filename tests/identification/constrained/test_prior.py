@@ -4,10 +4,8 @@ import tomllib
 
 import numpy as np
 import pytest
-from hypothesis import given
-from hypothesis import strategies as st
 
-from elastocal.errors import ElastocalError, InputError
+from elastocal.errors import InputError
 from elastocal.identification.knowledge import GaussianPrior
 
 NAMES = ("joint1.compliance", "joint2.compliance", "link1.x")
@@ -57,22 +55,3 @@ def test_a_wrong_prior_says_where_and_what(text, says):
 def test_an_impossible_covariance_is_refused(covariance, says):
     with pytest.raises(InputError, match=says):
         GaussianPrior(("a", "b"), np.zeros(2), covariance)
-
-
-JSON = st.recursive(
-    st.none() | st.booleans() | st.floats() | st.integers() | st.text(max_size=5),
-    lambda inner: (
-        st.lists(inner, max_size=2)
-        | st.dictionaries(st.sampled_from(["mean", "std", "x"]), inner, max_size=3)
-    ),
-    max_leaves=5,
-)
-
-
-@given(st.dictionaries(st.text(max_size=8), JSON, max_size=3))
-def test_any_table_is_a_prior_or_an_input_error(table):
-    try:
-        prior = GaussianPrior.from_dict(table)
-    except ElastocalError:
-        return
-    assert prior.names == tuple(table) and np.isfinite(prior.rows(prior.names)[0]).all()

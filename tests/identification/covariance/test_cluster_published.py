@@ -12,8 +12,6 @@ import pytest
 
 from elastocal.identification.covariance import cluster_robust
 
-KINDS = ("CR0", "CR1", "CR2", "CR3")
-
 
 def chicks():
     """weight (578,), time (578,), chick (578,), diet (578,)."""
@@ -66,49 +64,3 @@ def test_clubsandwich_coef_test_of_chick_weights():
     found = cluster_robust(B, residual(B, weight), chick, "CR2")
     np.testing.assert_allclose(found.std[5:], [1.49, 1.35, 1.01], atol=5.1e-3)
     np.testing.assert_allclose(found.dof[5:], [18.8, 18.8, 18.3], atol=0.051)
-
-
-@pytest.mark.parametrize("sizes", [(1, 4, 9, 2, 2, 7), (3, 3, 3, 3), (20, 1, 1)])
-def test_a_mean_has_its_closed_form(sizes):
-    """One column of ones: the sums over cluster sizes that clubSandwich's tests state for the
-    variances and Satterthwaite dof of CR0, CR1 (there without (n − 1)/(n − p) = 1) and CR2."""
-    nj = np.array(sizes, dtype=float)
-    N, m = nj.sum(), len(nj)
-    cluster = np.repeat(np.arange(m), sizes)
-    y = np.random.default_rng(2).normal(size=int(N))
-    e = y - y.mean()
-    square = np.bincount(cluster, e) ** 2 / N**2
-    found = {k: cluster_robust(np.ones((len(y), 1)), e, cluster, k) for k in KINDS}
-    variances = {
-        "CR0": square.sum(),
-        "CR1": square.sum() * m / (m - 1),
-        "CR2": (square / (1 - nj / N)).sum(),
-        "CR3": (square / (1 - nj / N) ** 2).sum(),
-    }
-    dof_0 = (N**2 - (nj**2).sum()) ** 2 / (
-        N**2 * (nj**2).sum() - 2 * N * (nj**3).sum() + (nj**2).sum() ** 2
-    )
-    dof_2 = N**2 / (
-        N**2 * (nj**2 / (N - nj) ** 2).sum()
-        - 2 * N * (nj**3 / (N - nj) ** 2).sum()
-        + (nj**2 / (N - nj)).sum() ** 2
-    )
-    for kind, dof in {"CR0": dof_0, "CR1": dof_0, "CR2": dof_2}.items():
-        np.testing.assert_allclose(found[kind].dof, dof, rtol=1e-10)
-    for kind in KINDS:
-        np.testing.assert_allclose(found[kind].matrix, variances[kind], rtol=1e-10)
-
-
-def test_balanced_contrasts_have_the_dof_of_a_two_sample_t_test():
-    """Equal clusters, a column that varies within them: G − 1.  Cluster-level groups of m₁ and
-    m₂ clusters: the dof of the two-sample t with unequal variances (clubSandwich tests it as a
-    special case)."""
-    m1, m2, size = 5, 9, 4
-    G = m1 + m2
-    cluster = np.repeat(np.arange(G), size)
-    group = (cluster >= m1) * 1.0
-    within = np.tile([0.0, 1.0], G * size // 2)
-    B = np.column_stack([np.ones(len(cluster)), group, within])
-    e = residual(B, np.random.default_rng(3).normal(size=len(B)))
-    welch = G**2 * (m1 - 1) * (m2 - 1) / (m1**2 * (m1 - 1) + m2**2 * (m2 - 1))
-    np.testing.assert_allclose(cluster_robust(B, e, cluster).dof[1:], [welch, G - 1], rtol=1e-10)

@@ -4,7 +4,6 @@ import numpy as np
 import pytest
 from support.calibration import binomial_band
 
-from elastocal.errors import InputError, InsufficientDataError
 from elastocal.identification.robust import (
     Absolute,
     Huber,
@@ -73,27 +72,6 @@ def test_intervals_hold_where_blunders_are_leverage_points(arm):
     assert low <= np.sum(held) / 3 <= high
 
 
-@pytest.mark.parametrize("name", ["huber"])
-def test_clustered_intervals_hold_under_an_error_common_to_each_configuration(arm, name):
-    """A shift of one standard deviation per configuration and component, on average columns that
-    all configurations see (the levels' own columns rest on three configurations each)."""
-    rng = np.random.default_rng(2)
-    B = np.random.default_rng(3).normal(size=(15, 1, 3, 3)) + 0.3 * np.random.default_rng(4).normal(
-        size=(15, 18, 3, 3)
-    )
-    B = B.reshape(-1, 3)
-    clustered, independent = [], []
-    for _ in range(80):
-        noise = arm.errors(rng)[0] + rng.normal(size=(15, 3))[arm.configuration]
-        found = FITS[name](B, B @ np.ones(3) + noise.ravel())
-        clustered.append(holds(found.x, clustered_covariance(found, arm.configuration), 1.0))
-        independent.append(holds(found.x, asymptotic_covariance(found), 1.0))
-    assert np.mean(independent) < 0.75
-    low, _ = binomial_band(np.size(clustered) // 3, 0.95)
-    assert np.sum(clustered) / 3 >= low
-    assert np.mean(clustered) < 0.985
-
-
 def test_with_every_observation_its_own_cluster_it_is_the_jackknife(arm):
     """For a loss that is quadratic throughout: refits of least squares without each reading."""
     y = arm.observed(arm.errors(np.random.default_rng(5))[0])
@@ -127,13 +105,3 @@ def test_dof_are_satterthwaites_of_the_quadratic_form(arm):
         assert covariance.matrix[j, j] == pytest.approx(
             14 / 15 * ((A[:, j] @ found.residual) ** 2).sum(), rel=1e-8
         )
-
-
-def test_what_cannot_be_told_is_refused(arm):
-    found = FITS["huber"](arm.B, arm.observed(arm.errors(np.random.default_rng(7))[0]))
-    with pytest.raises(InputError, match="at least two clusters"):
-        clustered_covariance(found, np.zeros(270, dtype=int))
-    with pytest.raises(InputError, match="one label per observation"):
-        clustered_covariance(found, np.zeros(810, dtype=int))
-    with pytest.raises(InsufficientDataError, match="without cluster 0"):
-        clustered_covariance(found, arm.configuration // 3)

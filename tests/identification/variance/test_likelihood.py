@@ -42,25 +42,6 @@ def at_random(table, name, share, seed=0):
     return structure, stacked, theta, whole
 
 
-@pytest.mark.parametrize("share", [False, True], ids=["alone", "shared"])
-def test_clusters_of_equal_covariance_enter_by_their_moments(share):
-    for table, name, whether in (
-        ("many", "axis", True), ("many", "marker", True), ("many repeated", "axis", True),
-        ("many", "polar", False), ("balanced", "axis", False),
-    ):  # fmt: skip
-        found = at_random(table, name, share)[1]
-        assert all((stack.moments is not None) == whether for stack in found)
-
-
-@pytest.mark.parametrize(("table", "name", "share"), CASES)
-def test_state_is_that_of_all_rows(table, name, share):
-    structure, stacked, theta, whole = at_random(table, name, share)
-    state = evaluate(structure, stacked, theta)
-    assert state.log_likelihood == pytest.approx(whole.log_likelihood, rel=1e-10)
-    np.testing.assert_allclose(state.x, whole.x, rtol=1e-8, atol=1e-8 * np.abs(whole.x).max())
-    np.testing.assert_allclose(state.Phi, whole.Phi, rtol=1e-8, atol=1e-9 * whole.Phi.max())
-
-
 @pytest.mark.parametrize(("table", "name", "share"), CASES)
 def test_score_and_information_are_those_of_all_rows(table, name, share):
     structure, stacked, theta, whole = at_random(table, name, share, seed=10)
@@ -88,31 +69,3 @@ def test_score_is_the_slope_of_the_likelihood_and_observed_information_its_own(t
         np.testing.assert_allclose(
             row / size / size[k], at.observed[k] / size / size[k], atol=1e-5 * max(1, size[k])
         )
-
-
-def test_information_is_the_mean_outer_product_of_scores():
-    """E[s sᵀ] over data drawn from the model, within five standard errors of 2000 draws."""
-    structure, stacked, theta, whole = at_random("balanced", "axis", True)
-    rng = np.random.default_rng(5)
-    L = np.linalg.cholesky(whole.V)
-    P, draws = whole.P, L @ rng.normal(size=(len(L), 2000))
-    Pe = P @ draws
-    scores = np.array(
-        [0.5 * ((Pe * (V @ Pe)).sum(axis=0) - np.trace(P @ V)) for V in whole.parts]
-    )  # at each draw; test_score… ties the package's score to this formula
-    information = slope(structure, evaluate(structure, stacked, theta)).information
-    products = scores[:, None] * scores[None]
-    error = products.std(axis=2) / np.sqrt(2000)
-    assert (np.abs(products.mean(axis=2) - information) < 5 * error).all()
-
-
-def test_the_stacks_are_cut_small_enough_without_changing_anything(monkeypatch):
-    structure, stacked, theta, _ = at_random("loads", "groups", True)
-    whole = slope(structure, evaluate(structure, stacked, theta))
-    monkeypatch.setattr("elastocal.identification.correlated_stacks.MOST_NUMBERS", 1)
-    effects = shared_effects(structure.sets, 3)
-    cut = stacks(structure, effects)
-    assert len(cut) > len(stacked)
-    found = slope(structure, evaluate(structure, cut, theta))
-    np.testing.assert_allclose(found.score, whole.score, rtol=1e-9)
-    np.testing.assert_allclose(found.information, whole.information, rtol=1e-9)

@@ -12,7 +12,7 @@ from support.registered import forgotten
 
 from elastocal.errors import InputError
 from elastocal.identification.noise_choice import estimate_noise, own_noise
-from elastocal.identification.noise_structure import NoiseModel, Readings, noise_models
+from elastocal.identification.noise_structure import NoiseModel, Readings
 from elastocal.plugins import register_noise_model
 
 UNBALANCED = readings(Table(configurations=10, markers=3, repeats=3), 4)
@@ -65,29 +65,6 @@ def test_it_has_the_likelihood_of_a_built_in_model_that_says_the_same(
         np.testing.assert_allclose(mine, its, rtol=1e-3)
 
 
-def test_auto_tries_it_last_and_all_others_as_without_it() -> None:
-    before = estimate_noise(UNBALANCED)
-    register_noise_model(Twin())
-    after = estimate_noise(UNBALANCED)
-    # What follows the structures is the best of them without shared deviations.
-    n = len([t for t in before.trials if t.kind.partition("+")[0] != before.kind.partition("+")[0]])
-    assert before.trials[:n] == after.trials[:n]
-    assert "twin" in {t.kind.partition("+")[0] for t in after.trials}
-    assert {"twin", "twin+configuration"} <= set(noise_models())
-    assert not {"twin"} & {t.kind.partition("+")[0] for t in before.trials}
-
-
-def test_it_is_not_tried_where_the_readings_lack_what_it_needs() -> None:
-    class Never(Twin):
-        name = "never"
-
-        def supports(self, readings: Readings) -> bool:
-            return False
-
-    register_noise_model(Never())
-    assert "never" not in {t.kind.partition("+")[0] for t in estimate_noise(UNBALANCED).trials}
-
-
 def test_repeats_share_the_mean_of_what_each_says() -> None:
     class Growing(NoiseModel):
         name = "growing"
@@ -129,12 +106,3 @@ def test_components_that_are_no_covariances_are_refused(case: str) -> None:
     register_noise_model(Wrong())
     with pytest.raises(InputError, match=told):
         estimate_noise(UNBALANCED, "wrong")
-
-
-def test_the_same_class_takes_the_place_of_its_former_self() -> None:
-    register_noise_model(Twin())
-    register_noise_model(Twin())
-    with pytest.raises(InputError, match=r"test_noise_model\.py, line \d+: register a noise model"):
-        register_noise_model(Twin)  # type: ignore[type-var]
-    with pytest.raises(InputError, match="found int"):
-        register_noise_model(3)  # type: ignore[type-var]

@@ -10,10 +10,8 @@ from identification.variance.dense import Table, readings
 from scipy import optimize
 from statsmodels.regression.mixed_linear_model import MixedLMParams
 
-from elastocal.identification import reml as module
 from elastocal.identification.noise_structure import (
     STRUCTURES,
-    by_axis,
     independent,
     shared_effects,
 )
@@ -112,54 +110,3 @@ def test_no_optimiser_finds_a_higher_likelihood(name, table):
     )
     assert -better.fun <= found.log_likelihood + 1e-8
     np.testing.assert_allclose(better.x, log, atol=1e-4)
-
-
-def test_score_vanishes_at_the_optimum_or_points_out_of_the_bound():
-    rng = np.random.default_rng(1)
-    r = readings(Table(configurations=10), 1, noise=1.0)
-    at_bound = 0
-    for _ in range(20):
-        r = r.moved(rng.normal(size=r.e.shape))
-        structure = by_axis(r)
-        found = reml(structure, shared_effects(structure.sets, 3))
-        free = found.state.theta > 0
-        size = np.sqrt(np.diag(found.slope.information))
-        assert np.abs(found.slope.score / size)[free].max() < 1e-4
-        assert (found.slope.score[~free] <= 0).all()
-        at_bound += (~free).sum()
-    assert at_bound > 5  # noise without effects puts them there about half of the time
-
-
-@pytest.mark.parametrize("start", [1e-3, 1e3])
-def test_the_start_does_not_matter(start):
-    r = readings(Table(configurations=10), 3, noise=1.0, shared=1.0)
-    structure = by_axis(r)
-    effects = shared_effects(structure.sets, 3)
-    usual = reml(structure, effects)
-    other = reml(structure, effects, start=np.full(3 + len(effects), start))
-    np.testing.assert_allclose(other.state.theta, usual.state.theta, rtol=1e-4)
-
-
-def test_a_variance_that_vanishes_goes_there_at_once_and_to_the_same_end(monkeypatch):
-    """White noise has no share that grows with the reach or goes by the angle: one ends at its
-    bound in most tables, after as many steps as it takes to fall there by e each without."""
-    steps, vanished = [], 0
-    slope = module.slope
-    monkeypatch.setattr(module, "slope", lambda *a: steps.append(1) or slope(*a))
-    for seed in range(6):
-        structure = STRUCTURES["polar"](readings(Table(configurations=40), seed))
-        counts = []
-        for little in (0.0, module.LITTLE):
-            monkeypatch.setattr(module, "LITTLE", little)
-            steps.clear()
-            counts.append((reml(structure, ()), len(steps)))
-        (slow, many), (found, few) = counts
-        assert found.converged and few <= many
-        own = slow.own > 1e-9 * slow.own.max()
-        np.testing.assert_array_equal(found.own > 1e-9 * found.own.max(), own)
-        np.testing.assert_allclose(found.own[own], slow.own[own], rtol=1e-8)
-        assert found.log_likelihood == pytest.approx(slow.log_likelihood, rel=1e-12)
-        scale = np.sqrt(np.diag(slow.state.Phi))
-        assert np.abs((found.state.x - slow.state.x) / scale).max() < 1e-8
-        vanished += few < many - 3
-    assert vanished >= 2

@@ -34,54 +34,6 @@ def test_perfect_data(kind):
     assert found.noise.covariance.std.max() < 1e-30
 
 
-@pytest.mark.parametrize("kind", noise_models())
-def test_residuals_of_rounding_only(kind):
-    """e = B x₀ to the last bit: x₀ is found to the digits there are."""
-    r = readings(BASE, 0)
-    x0 = np.array([1.0, -2.0, 3.0, 0.5])
-    found = settle(r.moved(r.B @ x0), kind)
-    finite(found.noise)
-    np.testing.assert_allclose(found.noise.x, x0, rtol=1e-12)
-
-
-@pytest.mark.parametrize("kind", noise_models())
-def test_one_group_is_constant(kind):
-    r = readings(BASE, 0)
-    e = r.e.copy()
-    e[r.configuration == 4] = 0.0
-    finite(settle(r.moved(e), kind).noise)
-
-
-@pytest.mark.parametrize("kind", noise_models())
-def test_one_component_is_perfect(kind):
-    r = readings(BASE, 0)
-    e, B = r.e.copy(), r.B.copy()
-    e[:, 2], B[:, 2] = 0.0, 0.0
-    finite(settle(replace(r, e=e, B=B), kind).noise)
-
-
-@pytest.mark.parametrize("kind", noise_models())
-def test_a_configuration_with_a_single_reading(kind):
-    r = readings(BASE, 0)
-    keep = (r.configuration != 4) | (np.cumsum(r.configuration == 4) == 1)
-    found = settle(r.take(keep), kind)
-    finite(found.noise)
-
-
-@pytest.mark.parametrize("configurations", [1, 2, 3])
-def test_few_configurations(configurations):
-    r = readings(replace(BASE, configurations=configurations), 0, shared=2e-5)
-    finite(settle(r).noise)
-
-
-def test_one_marker_and_no_repeats():
-    r = readings(Table(configurations=40, markers=1, repeats=1, unbalanced=False), 0)
-    found = settle(r)
-    finite(found.noise)
-    assert {"marker", "groups"}.isdisjoint(t.kind for t in found.noise.trials)
-    assert not any("+" in t.kind for t in found.noise.trials)
-
-
 @pytest.mark.parametrize("spare", [1, 2, 5, 8])
 def test_parameters_nearly_as_many_as_rows(spare):
     r = readings(Table(configurations=10, markers=1, repeats=1, p=30 - spare, unbalanced=False), 1)
@@ -107,19 +59,6 @@ def test_numbers_must_be_finite(name):
         estimate_noise(replace(r, **{name: values}))
 
 
-@pytest.mark.parametrize("name", ["configuration", "load", "marker"])
-def test_labels_must_match(name):
-    r = readings(BASE, 0)
-    with pytest.raises(InputError, match=f"{name} is .* one label per reading"):
-        replace(r, **{name: getattr(r, name)[:-1]})
-
-
-def test_B_must_match():
-    r = readings(BASE, 0)
-    with pytest.raises(InputError, match=r"B is .* where 108 readings of 3 components need"):
-        replace(r, B=r.B[1:])
-
-
 @pytest.mark.parametrize("seed", range(4))
 def test_an_effect_that_the_parameters_explain_is_left_out(seed):
     """A free offset per configuration: what a configuration shares cannot be told from it, and
@@ -137,18 +76,6 @@ def test_an_effect_that_the_parameters_explain_is_left_out(seed):
     np.testing.assert_allclose(found.covariance.std, plain.covariance.std, rtol=1e-8)
 
 
-def test_a_variance_pushed_to_nothing_is_taken_for_zero():
-    """Noise across the line of sight only: ranges then give the parameters without error."""
-    r = readings(BASE, 0)
-    noise = np.random.default_rng(0).normal(size=(len(r), 3)) * [0.0, 1e-5, 1e-5]
-    found = estimate_noise(r.moved(np.einsum("nij,ni->nj", r.sight, noise)), "polar")
-    finite(found)
-    assert found.fit.converged
-    assert found.fit.own[0] < 1e-6 * found.fit.own.max()
-    assert np.abs(found.x).max() < 1e-8
-    assert found.fit.covariance[0, 0] == 0
-
-
 def large(configurations, markers, repeats, p, seed=0):
     rng = np.random.default_rng(seed)
     c, m, _ = np.indices((configurations, markers, repeats)).reshape(3, -1)
@@ -156,22 +83,6 @@ def large(configurations, markers, repeats, p, seed=0):
     common = rng.normal(size=(configurations, 3))[c]
     e = 1e-5 * rng.normal(size=(len(c), 3)) * [1, 2, 3] + 2e-5 * (markers > 1) * common
     return Readings(B, e, c, 0 * c, m)
-
-
-@pytest.mark.parametrize(
-    ("table", "kind"),
-    [((2000, 1, 1, 46), "axis"), ((300, 3, 2, 46), "axis+configuration")],
-)
-def test_many_configurations_in_little_memory(table, kind):
-    """Whatever is formed per configuration is cut into stacks: under 800 MB at the peak."""
-    r = large(*table)
-    tracemalloc.start()
-    found = settle(r)
-    peak = tracemalloc.get_traced_memory()[1]
-    tracemalloc.stop()
-    assert peak < 800e6
-    finite(found.noise)
-    assert found.noise.kind == kind
 
 
 @pytest.mark.long

@@ -3,10 +3,9 @@
 import numpy as np
 import pytest
 from identification.variance.dense import Table, readings
-from scipy import stats
 
 from elastocal.errors import InsufficientDataError
-from elastocal.identification.noise_structure import Readings, by_group, shared_effects
+from elastocal.identification.noise_structure import Readings, by_group
 from elastocal.identification.reml import (
     NARROWEST,
     LogPrior,
@@ -58,27 +57,6 @@ def test_shrunk_variances_are_nearer_the_truth():
     assert shrunk < 0.5 * plain
 
 
-def test_equal_variances_are_shrunk_onto_each_other():
-    r, _ = groups(40, 10, 0.0, 0.0, 3)
-    structure = by_group(r)
-    prior = prior_of_groups(structure, structure.sets.e)
-    fit = reml(structure, (), prior, np.exp(prior.mean))
-    free = reml(structure, (), None, np.exp(prior.mean))
-    spread = np.log(fit.own).reshape(-1, 3).std(axis=0)
-    assert (spread < 0.25 * np.log(free.own).reshape(-1, 3).std(axis=0)).all()
-    np.testing.assert_allclose(np.log(fit.own).reshape(-1, 3).mean(axis=0), MEAN, atol=0.2)
-
-
-def test_prior_density_is_the_multivariate_normal():
-    rng = np.random.default_rng(0)
-    root = rng.normal(size=(4, 4))
-    covariance = root @ root.T + np.eye(4)
-    mean, theta = rng.normal(size=4), np.exp(rng.normal(size=4))
-    expected = stats.multivariate_normal(mean, covariance).logpdf(np.log(theta))
-    found = LogPrior(mean, np.linalg.inv(covariance)).value(theta)
-    assert found == pytest.approx(expected, rel=1e-12)
-
-
 def test_marginal_likelihood_is_the_integral_over_the_prior():
     """Laplace's value against quadrature where one log variance is unknown.
 
@@ -103,40 +81,6 @@ def test_marginal_likelihood_is_the_integral_over_the_prior():
     integral = top + np.log(weights @ np.exp(np.array(values) - top) / np.sqrt(2 * np.pi))
     # Laplace with the expected curvature of 11 degrees of freedom is off by a few hundredths.
     assert found.log_likelihood == pytest.approx(integral, abs=0.1)
-
-
-def test_a_group_of_equal_readings_does_not_pull_the_others():
-    r, log = groups(20, 8, 0.2, 0.1, 5)
-    e = r.e.copy()
-    e[r.configuration == 4, 1] = 0.0
-    structure = by_group(r.moved(e))
-    prior = prior_of_groups(structure, structure.sets.e)
-    fit = reml(structure, (), prior, np.exp(prior.mean))
-    others = np.delete(np.arange(60), 13)
-    assert np.abs(np.log(fit.own)[others] - log.ravel()[others]).max() < 2.5
-    # Its logarithm counts as −14 beside the others, a twentieth of which moves their mean.
-    np.testing.assert_allclose(prior.mean[:3], MEAN, atol=1.5)
-    assert np.isfinite(fit.covariance).all()
-
-
-def test_what_a_configuration_shares_is_not_taken_for_noise():
-    r, _ = groups(200, 9, 0.0, 0.0, 6)
-    shift = 1e-3 * np.random.default_rng(0).normal(size=(200, 3))
-    structure = by_group(r.moved(r.e + shift[r.configuration]))
-    prior = prior_of_groups(structure, structure.sets.e)
-    np.testing.assert_allclose(prior.mean[:3], MEAN, atol=0.1)
-    assert shared_effects(structure.sets, 3)
-
-
-def test_repeats_and_means_give_the_same_prior_as_their_readings():
-    """A group's variance is that of its single readings, however they are spread over sets."""
-    r, _ = groups(30, 12, 0.3, 0.2, 7)
-    alone = by_group(r)
-    sets = by_group(Readings(r.B, r.e, r.configuration, r.load, r.marker // 4))
-    first = prior_of_groups(alone, alone.sets.e)
-    second = prior_of_groups(sets, sets.sets.e)
-    np.testing.assert_allclose(second.mean, first.mean, rtol=1e-12)
-    np.testing.assert_allclose(second.precision, first.precision, rtol=1e-9)
 
 
 def test_too_few_readings_to_shrink_are_refused():

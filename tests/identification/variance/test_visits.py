@@ -1,17 +1,13 @@
 """Joints that settle anew at each visit and drift in time: formulas, choice, false alarms."""
 
-from dataclasses import replace
-
 import numpy as np
 import pytest
 from scipy import linalg, stats
 
-from elastocal.errors import InputError
-from elastocal.identification.noise_choice import NoiseFit, estimate_noise, weights_of
+from elastocal.identification.noise_choice import NoiseFit, estimate_noise
 from elastocal.identification.noise_structure import Readings
 from elastocal.identification.reml import kenward_roger
-from elastocal.identification.residuals import as_of_another_campaign, held_out_residual
-from elastocal.identification.visit_record import VisitRecord, course_waves
+from elastocal.identification.visit_record import VisitRecord
 
 SIGMA, SCATTER, DRIFT, LASTING = 2e-5, 2e-5, 4e-5, 0.2
 
@@ -97,42 +93,6 @@ def test_likelihood_and_estimate_are_those_of_dense_matrices(kind):
         assert abs(found.fit.slope.score[k] * found.fit.state.theta[k]) < 1e-4
 
 
-def test_weights_whiten_what_drifts_and_blocks_are_left_out_as_by_fits_to_the_others():
-    r = drawn(readings(), np.random.default_rng(2), SCATTER, DRIFT)
-    found = estimate_noise(r, "independent+joints+time")
-    weights = weights_of(found, r)
-    G = covariance(r, 1.0) - covariance(r)
-    V = (
-        found.fit.own[0] * np.eye(3 * len(r)) + found.fit.common[0] * G
-        + found.fit.own[1] * np.kron(course(r, found.lasting), np.eye(3))
-    )  # fmt: skip
-    W = weights.whole.toarray()
-    assert np.allclose(W @ V @ W.T, np.eye(len(V)), atol=1e-8)
-    B, e = r.B.reshape(len(V), -1), r.e.ravel()
-    residual = e - B @ found.x
-    held = held_out_residual(B, residual, weights, r.configuration, 3)
-    block = np.repeat(r.visits.blocks(r.configuration, found.lasting), 3)
-    assert len(np.unique(block)) == 5
-    for b in range(5):
-        others = block != b
-        x = restricted(V[np.ix_(others, others)], B[others], e[others])[1]
-        assert np.allclose(held[~others], e[~others] - B[~others] @ x, atol=1e-9)
-    # What the blocks are off by, made as large as with a drift of another day: a base that is
-    # fitted follows that of the campaign.
-    B = np.hstack([np.tile(np.eye(3), (len(r), 1)), B])
-    factor = as_of_another_campaign(B, weights, 3)
-    assert factor.mean() > 1.05
-    for b in range(5):
-        own, others = block == b, block != b
-        inverse = np.linalg.inv(V[np.ix_(others, others)])
-        G = np.linalg.solve(B[others].T @ inverse @ B[others], B[others].T @ inverse)
-        M = B[own] @ G
-        new = V[np.ix_(own, own)] + M @ V[np.ix_(others, others)] @ M.T
-        shared = M @ V[np.ix_(others, own)]
-        ratio = np.diag(new) / np.diag(new - shared - shared.T)
-        assert np.allclose(factor[own] ** 2, ratio, rtol=1e-6)
-
-
 @pytest.mark.parametrize(
     ("joints", "drift", "part"), [(SCATTER, 0.0, "+joints"), (0.0, DRIFT, "+time")]
 )
@@ -147,14 +107,6 @@ def test_what_is_there_is_chosen_and_its_size_found(joints, drift, part):
         assert not any("each-joint" in k.kind for k in kinds)
 
 
-def test_joints_that_scatter_unlike_each_other_are_told_apart():
-    r = readings()
-    motion = r.visits.motion * np.array([4.0, 1.0, 0.2])
-    uneven = replace(r, visits=replace(r.visits, motion=motion))
-    e = drawn(uneven, np.random.default_rng(6), SCATTER).e
-    assert "each-joint" in estimate_noise(r.moved(e)).kind
-
-
 def test_tests_of_either_alarm_falsely_once_in_a_hundred_times():
     """p-values of independent noise are uniform: 1 % and 20 % below these, within chance."""
     r, rng = readings(configurations=12), np.random.default_rng(4)
@@ -165,50 +117,8 @@ def test_tests_of_either_alarm_falsely_once_in_a_hundred_times():
     assert ((p > 0.5).mean(axis=0) > 0.3).all()
 
 
-def test_repeats_of_other_visits_are_apart_where_it_matters():
-    r = readings(repeats=3)
-    rng = np.random.default_rng(5)
-    found = estimate_noise(drawn(r, rng, SCATTER), "independent+joints")
-    assert len(found.fit.structure.sets) == len(r)
-    assert np.sqrt(found.fit.common[0]) == pytest.approx(SCATTER, rel=0.3)
-    plain = estimate_noise(drawn(r, rng, SCATTER), "independent+configuration")
-    assert len(plain.fit.structure.sets) == len(r) // 3
-
-
 def test_kenward_roger_widens_for_a_drift_and_knows_few_degrees_of_freedom():
     found = estimate_noise(drawn(readings(), np.random.default_rng(6), 0.0, DRIFT), "axis+time")
     plain = (found.basis @ found.fit.state.Phi @ found.basis.T).diagonal()[:5]
     assert (found.covariance.matrix.diagonal() >= plain).all()
     assert np.allclose(kenward_roger(found.fit, found.basis)[0], found.spread)
-
-
-def test_readings_without_visits_have_neither():
-    r = replace(drawn(readings(), np.random.default_rng(7), SCATTER), visits=None)
-    assert estimate_noise(r).tests == ()
-    with pytest.raises(InputError, match="visits"):
-        estimate_noise(r, "independent+joints")
-    with pytest.raises(InputError, match="takes one of"):
-        estimate_noise(r, "axis+sometimes")
-
-
-def test_of_a_course_longer_than_the_campaign_the_waves_make_what_varies_about_its_mean():
-    """Nearly all of a walk is a level that the base takes over."""
-    t = np.linspace(0, 1, 200)
-    about = np.eye(len(t)) - 1 / len(t)
-    for lasting in (1.0, 20.0, 1000.0):
-        waves = about @ course_waves(t, lasting)
-        true = about @ np.exp(-np.abs(t[:, None] - t) / lasting) @ about
-        assert np.linalg.norm(waves @ waves.T - true) < 0.1 * np.linalg.norm(true)
-
-
-def test_what_the_waves_leave_of_a_drift_is_not_taken_for_noise_of_readings():
-    """These find their own size in the mean over campaigns; without the rest, nearly half more."""
-    r, rng, found = readings(configurations=30), np.random.default_rng(8), []
-    when = r.visits.place[:, 0]
-    assert np.allclose(np.diag(course(r, 0.1)), 1)
-    whole = np.kron(np.exp(-np.abs(when[:, None] - when) / 0.1), np.eye(3))
-    root = np.linalg.cholesky(SIGMA**2 * np.eye(3 * len(r)) + DRIFT**2 * whole)
-    for _ in range(6):
-        one = r.moved((root @ rng.normal(size=len(root))).reshape(-1, 3))
-        found.append(estimate_noise(one, "independent+time").fit.own[0])
-    assert np.mean(found) == pytest.approx(SIGMA**2, rel=0.08)
