@@ -98,15 +98,21 @@ def _kind(mode: int) -> str:
     return "a socket" if stat.S_ISSOCK(mode) else "a device"
 
 
+PIECE = 1 << 20  # bytes read at once
+
+
 def read_bytes(path: str | Path, what: str, max_bytes: int) -> bytes:
     """The content of a regular file of at most `max_bytes`, sized before it is read.
 
     Raises InputError as `open_input` does.
     """
+    data = bytearray()
     with open_input(path, what, max_bytes) as handle:
-        data = handle.read(max_bytes + 1)  # a file may grow, and those of /proc tell no size
+        # A file may grow, those of /proc tell no size, and read() takes memory for what it may get.
+        while len(data) <= max_bytes and (piece := handle.read(PIECE)):
+            data += piece
     check_size(path, what, len(data), max_bytes)
-    return data
+    return bytes(data)
 
 
 def read_text(path: str | Path, what: str, max_bytes: int) -> str:
