@@ -183,7 +183,9 @@ class Search:
             pool, best = self._bettered(pool, best, relaxed, k)
         if efforts.starts:
             relaxed = self._again(pool, relaxed, CLOSE if efforts.rounds else FINE)
-            best, _ = exact_plan(self.problem(pool), relaxed, warm=best, patience=0)
+            mixed, _ = exact_plan(self.problem(pool), relaxed, warm=best, starts=2, seed=self.seed)
+            if self.value(pool, mixed) < self.value(pool, best) * (1 - SAME):
+                best = mixed
         if efforts.rounds:
             pool, best = self.polished(pool, best, "last", fine=True)
         value = self.value(pool, best)
