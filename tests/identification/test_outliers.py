@@ -161,7 +161,7 @@ def test_nothing_is_left_out_in_silence():
     assert np.array_equal(rows_of(dropped.excluded), bad) and dropped.outliers == ()
     assert len(dropped.residual) == 114
     assert not {row["line"] - 2 for row in dropped.residual_table()} & set(bad)
-    assert any(w.startswith("2 readings were left out as faulty") for w in dropped.warnings)
+    assert any(w.startswith("2 readings were excluded as outliers") for w in dropped.warnings)
     listed = dropped.to_json()["excluded"]
     assert [o["line"] - 2 for o in listed] == list(bad)
     assert all(o["residual"] > 1e-3 and o["ratio"] > 10 for o in listed)

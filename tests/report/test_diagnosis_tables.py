@@ -26,5 +26,5 @@ def test_it_fits_and_obeys_no_control_character(name, width):
     assert max(map(len, text.splitlines())) <= width
     assert "\x1b" not in text
     words = " ".join(text.split())
-    for part in ("Verdict:", "Gap budget", "the best 8 of 10", "Noise:", "Next:"):
+    for part in ("Verdict:", "Error budget", "the best 8 of 10", "Noise:", "Next:"):
         assert part in words

@@ -89,7 +89,7 @@ def test_diagnosis_as_html_and_frame(name):
     only = [f.effect for f in d.effects if (f.effect, f.where) not in tried]
     assert list(frame.effect) == [*only, *(c.effect for c in d.candidates)]
     assert set(zip(frame.effect[frame.found], frame["where"][frame.found], strict=True)) == found
-    assert ("What the gap is made of" in text) == bool(d.groups)
+    assert ("Causes of the remaining error" in text) == bool(d.groups)
 
 
 def test_figures_are_matplotlibs_and_hold_every_reading(case):

@@ -38,11 +38,11 @@ def compare(
         tuple[float, float, float] | None,
         typer.Option(
             metavar="X Y Z",
-            help="Force in N at the load point (tracker's axes); default: the campaigns' loads.",
+            help="Force in N at the load point (tracker's axes); default: the measured loads.",
         ),
     ] = None,
     level: Annotated[
-        float, typer.Option(help="Chance that anything is called changed where nothing is.")
+        float, typer.Option(help="Probability of any finding if nothing has changed.")
     ] = 0.05,
     poses: Annotated[int, typer.Option(min=2, max=100_000, help="Random poses.")] = 300,
     plugins: Plugins = False,

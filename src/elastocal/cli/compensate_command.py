@@ -57,18 +57,18 @@ def compensate(
     load: Annotated[
         tuple[float, float, float] | None,
         typer.Option(
-            metavar="X Y Z", help="Force in N at the load point where the table states none."
+            metavar="X Y Z", help="Force in N at the load point if the table states none."
         ),
     ] = None,
     near: Annotated[
         str | None,
         typer.Option(
             metavar="Q1,Q2,…",
-            help="Joints in degrees (mm where prismatic) whose posture to begin near.",
+            help="Joints in degrees (mm where prismatic) of a posture to start near.",
         ),
     ] = None,
     partial: Annotated[
-        bool, typer.Option("--partial", help="Write what is reached; leave other rows empty.")
+        bool, typer.Option("--partial", help="Write the rows reached; leave others empty.")
     ] = False,
     table: Annotated[
         Path | None, typer.Option(help="Correction table to write (CSV), over --grid.")
@@ -93,10 +93,10 @@ def compensate(
     as_json: Json = False,
     quiet: Quiet = False,
 ) -> None:
-    """Which commands put the tool where it should be?
+    """Compute corrected joint commands for targets.
 
-    Solves the calibrated arm, under its load, for every target.  With --table it writes the
-    corrections that a controller adds to its nominal targets.
+    Solves the calibrated arm under load for every target.  --table writes corrections that a
+    controller adds to nominal targets.
 
     Example: elastocal compensate cell.toml result.json targets.csv -o commands.csv
     """

@@ -66,19 +66,19 @@ def design(
         float | None,
         typer.Option(
             metavar="µm",
-            help="Find the smallest number of poses that reaches this, for a criterion in µm.",
+            help="Find the fewest poses that reach this, for a criterion in µm.",
         ),
     ] = None,
     minutes: Annotated[
         float | None,
-        typer.Option(help="Find the poses and readings each that leave the least error within."),
+        typer.Option(help="Find the best numbers of poses and readings within this time."),
     ] = None,
     curve: Annotated[
         str | None,
         typer.Option(metavar="N,N,…", help="Compare numbers of poses, as in 10,15,20,30."),
     ] = None,
     augment: Annotated[
-        Path | None, typer.Option(help="Measurements already done (CSV), which the plan adds to.")
+        Path | None, typer.Option(help="Existing measurements (CSV) to extend.")
     ] = None,
     keep: Annotated[
         str | None,
@@ -112,7 +112,7 @@ def design(
     elsewhere: Annotated[
         float | None,
         typer.Option(
-            min=0, max=0.99, help="Share of the weight for poses beside the test poses, as in 0.2."
+            min=0, max=0.99, help="Weight share of poses over the joint ranges, as in 0.2."
         ),
     ] = None,
     elsewhere_cap: Annotated[
@@ -120,13 +120,14 @@ def design(
         typer.Option(
             min=0,
             max=0.99,
-            help="How much worse the test poses may be for the least error elsewhere, as in 0.05.",
+            help="Loss allowed at the test poses to minimise the error elsewhere, as in 0.05.",
         ),
     ] = None,
     load_changes: Annotated[
         int | None,
         typer.Option(
-            min=1, help="Changes of load allowed; more keep a drift apart; default: the fewest."
+            min=1,
+            help="Load changes allowed; more reduce the effect of drift; default: the fewest.",
         ),
     ] = None,
     reference_every: Annotated[
@@ -157,8 +158,7 @@ def design(
     """Which poses should I measure?
 
     Writes the plan (CSV) and plan.json beside it.  An interrupted run, started again with
-    the same input, goes on behind the last step it had ended: the candidates, an exchange, a round
-    of polishing.
+    the same input, resumes.
 
     Example: elastocal design cell.toml -o plan.csv --poses 15 --picture poses.png
     """
@@ -203,7 +203,7 @@ def design(
         told = {name: value for name, value in asked.items() if name not in apart}
         checkpoint = Checkpoint.beside(output, key_of(files, **told), interrupts.check)
         if checkpoint.begun:
-            progress("going on with the design that was interrupted")
+            progress("resuming the interrupted design")
         try:
             plan = run(wanted, options, checkpoint, progress)
         except Exception as error:

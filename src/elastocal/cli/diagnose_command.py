@@ -43,7 +43,7 @@ def diagnose(
     report: ReportFile = None,
     plan: Annotated[
         Path | None,
-        typer.Option(help="Write extra poses (CSV) that tell the rivals apart, where there are."),
+        typer.Option(help="Write extra poses (CSV) that separate the remaining hypotheses."),
     ] = None,
     poses: Annotated[
         int | None,
@@ -54,7 +54,7 @@ def diagnose(
     ] = None,
     without: Annotated[
         list[str] | None,
-        typer.Option(metavar="EFFECT", help="Take an effect out of the catalogue; repeatable."),
+        typer.Option(metavar="EFFECT", help="Exclude an effect; repeatable."),
     ] = None,
     plugins: Plugins = False,
     seed: Seed = 0,
@@ -63,8 +63,8 @@ def diagnose(
 ) -> None:
     """Why does the real arm still differ from the model?
 
-    Says where the gap lies, which effect of the catalogue causes it, or that none does, and how
-    far the error of new poses falls once it is added.
+    Finds the unmodelled effect that explains the remaining error, its place, and how far the
+    error at new poses falls once it is added.
 
     Example: elastocal diagnose cell.toml data.csv -o diagnosis.json --report diagnosis.html
     """
@@ -110,8 +110,8 @@ def diagnose(
                 told.append(f"wrote {cell_out} with {added or 'no further effect'}")
                 if ends := where_smooth_functions_end(extended):
                     told.append(
-                        f"its smooth functions end where nothing was measured: {ends}; beyond, "
-                        "the model without them holds"
+                        f"its smooth functions end outside the measured range: {ends}; there the "
+                        "model without them holds"
                     )
                 if added:
                     again = shlex.join(
@@ -137,10 +137,10 @@ def _write_extra_poses(
     from elastocal.saving import save_extra_poses
 
     if extra is None and many:
-        return f"{path} not written: many causes act at once, and no few poses tell them apart"
+        return f"{path} not written: few extra poses do not separate many causes"
     if extra is None:
-        return f"{path} not written: there are no rivals to tell apart"
+        return f"{path} not written: there are no rivals to separate"
     if extra.plan is None:
-        return f"{path} not written: no pose tells the rivals apart"
+        return f"{path} not written: no pose separates the rivals"
     save_extra_poses(path, extra.plan, kinds)
     return f"wrote {path}: {extra.n_poses} poses, {len(extra.plan)} visits"

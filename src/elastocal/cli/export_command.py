@@ -33,7 +33,7 @@ if TYPE_CHECKING:
 WORTH_TELLING = 10e-6  # m, as for what compensate leaves open
 
 
-@command(short_help="How do others get the calibrated arm: URDF, MuJoCo, DH table?")
+@command(short_help="Write the calibrated model: URDF, MuJoCo, DH table")
 def export(
     cell: CellFile,
     result: Annotated[Path, typer.Argument(help="Result of identify (JSON).")],
@@ -54,7 +54,7 @@ def export(
         tuple[float, float, float] | None,
         typer.Option(
             metavar="X Y Z",
-            help="Force in N at the load point (tracker's axes) to state costs under.",
+            help="Force in N at the load point (tracker's axes) for costs and fit.",
         ),
     ] = None,
     frames: Annotated[
@@ -68,8 +68,7 @@ def export(
     joint_correction: Annotated[
         Path | None,
         typer.Option(
-            help="Write what joints are to be commanded besides, for simulators (CSV); the file is "
-            "fitted with it."
+            help="Write the joint correction for simulators (CSV); the file is fitted with it."
         ),
     ] = None,
     temperature_c: Annotated[
@@ -86,7 +85,7 @@ def export(
     as_json: Json = False,
     quiet: Quiet = False,
 ) -> None:
-    """Write the calibrated arm as URDF, MJCF, DH table or parameters, and say what that loses.
+    """Write the calibrated arm as URDF, MJCF, DH table or parameters, and state the loss.
 
     Example: elastocal export cell.toml result.json -o calibrated.urdf --load 0 0 -2600
     """
@@ -146,18 +145,17 @@ def _tell(done: Exported) -> None:
         ),
         (
             held,
-            "Held, as the data do not determine them on their own, at the values that the "
-            f"identification predicts with: {', '.join(held[:8])}{more}.",
+            "Not determined by the data, at the values that the identification predicts with: "
+            f"{', '.join(held[:8])}{more}.",
         ),
         (
             done.of_the_measurement,
-            f"Of the measurement, not of the arm, and left out: "
-            f"{', '.join(done.of_the_measurement)}.",
+            f"Left out, effects of the measurement: {', '.join(done.of_the_measurement)}.",
         ),
         *((True, f"Note: {warning}.") for warning in done.warnings),
         (
             cost.total is not None and cost.total.marker_rms > WORTH_TELLING,
-            "Next: where that much matters, elastocal compensate corrects it with the same cell "
+            "Next: if that matters, elastocal compensate corrects it with the same cell "
             "and result.",
         ),
     ):
@@ -183,11 +181,11 @@ def _fit(refit: Refit | None) -> str:
         told = f"{told}, with its joint correction {length(refit.correction)}"
     if refit.taken or refit.correction is not None:
         told = (
-            f"What it holds is fitted to the calibrated arm at {refit.visits} measured visits: "
+            f"Refitted to the calibrated arm at {refit.visits} measured visits: "
             f"{told}, with the values identified {length(refit.before)}"
         )
     else:
-        told = f"What it holds is as identified, which no fit to the arm betters: {told}"
+        told = f"Values as identified; no refit is better: {told}"
     worse = "" if refit.after < refit.nominal else "; it is worse than the nominal file"
     return f"{told}, the nominal file with base and tool placed {length(refit.nominal)}{worse}."
 

@@ -39,7 +39,7 @@ def identify(
         Path | None, typer.Option("-o", "--output", help="Write the result as JSON.")
     ] = None,
     test: Annotated[
-        Path | None, typer.Option(help="Measurements never fitted, to test the result on.")
+        Path | None, typer.Option(help="Independent measurements to test the result on.")
     ] = None,
     report: ReportFile = None,
     certificate: Annotated[
@@ -58,7 +58,7 @@ def identify(
         str,
         typer.Option(
             help="Noise that reml estimates: auto, independent, axis, marker, groups, polar, "
-            "stated; with +configuration for what a configuration's readings share."
+            "stated; with +configuration for deviations common to a configuration."
         ),
     ] = "auto",
     weights: Annotated[
@@ -83,19 +83,19 @@ def identify(
     ] = False,
     knowledge: Annotated[
         Path | None,
-        typer.Option(help="What is known besides: priors, bounds, equalities (TOML)."),
+        typer.Option(help="Prior knowledge: priors, bounds, equalities (TOML)."),
     ] = None,
     physical: Annotated[
         bool,
         typer.Option(
             "--physical",
-            help="No negative compliance, no compliance matrix that yields energy.",
+            help="No negative compliance, compliance matrices semidefinite.",
         ),
     ] = False,
     outliers: Annotated[
         str,
         typer.Option(
-            help="Readings beyond the noise: auto (leave out, unless they are a tenth or more), "
+            help="Outliers: auto (exclude, unless they are a tenth or more), "
             "drop, keep. They are listed in any case."
         ),
     ] = "auto",
@@ -117,7 +117,7 @@ def identify(
     ] = False,
     quiet: Quiet = False,
 ) -> None:
-    """What are the parameters of my arm, and how sure are we?
+    """What are the parameters of my arm, and how certain are they?
 
     Example: elastocal identify cell.toml data.csv -o result.json --test other.csv
     """

@@ -21,7 +21,7 @@ from elastocal.text import json_text
 PRESET_NAMES = "spatialanalyzer, polyworks, leica, faro, spherical, wide, kuka, abb, ros"
 
 
-@command("import", short_help="How do tracker exports and joint logs become the table?")
+@command("import", short_help="Convert tracker exports and joint logs to the measurement table")
 def import_(
     files: Annotated[
         list[Path] | None,
@@ -56,7 +56,7 @@ def import_(
     ] = None,
     as_json: Json = False,
 ) -> None:
-    """The measurement table from exports of a laser tracker and logs of the joint values.
+    """Convert exports of a laser tracker and joint logs to the measurement table.
 
     Example: elastocal import points.txt poses.dat --preset spatialanalyzer --preset kuka
     --cell cell.toml --preview -o data.csv

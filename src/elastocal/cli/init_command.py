@@ -12,7 +12,7 @@ from elastocal.screen import say
 from elastocal.text import json_text
 
 
-@command(short_help="How does a first cell for my arm look?")
+@command(short_help="Write a working cell file for my arm")
 def init(
     robot: Annotated[
         Path,
@@ -36,7 +36,7 @@ def init(
     ] = None,
     force: Annotated[bool, typer.Option("--force", help="Write over a file.")] = False,
 ) -> None:
-    """Write a commented cell that runs: joints and limits of the robot's file, guesses elsewhere.
+    """Write a working cell: joints and limits from the robot's file, commented guesses elsewhere.
 
     Example: elastocal init arm.urdf -o cell.toml
     """
@@ -64,7 +64,7 @@ def init(
     say(f"  elastocal simulate {output} plan.csv -o data.csv --draw 1 --load {load}")
 
 
-@command(short_help="What can be fitted?")
+@command(short_help="List the effects that can be fitted")
 def effects(
     cell: Annotated[
         Path | None, typer.Argument(help="Cell file (TOML); default: the KR 270 of the demo.")

@@ -57,9 +57,9 @@ def next_command(
 ) -> None:
     """Which poses should I measure next, or are these enough?
 
-    Diagnoses and identifies what was measured so far, and writes the poses (CSV, and plan.json
-    beside) that serve the parameters and show what the model may lack; none where the required
-    error is kept, or no batch pays.
+    Diagnoses and identifies the measurements so far, and writes the next poses (CSV and
+    plan.json) for the parameters and for effects that may be missing; none if the required
+    error is kept, or no batch gains enough.
 
     Example: elastocal next cell.toml data.csv -o next.csv --batch 5 --require new_poses=50
     """

@@ -23,7 +23,7 @@ from elastocal.screen import progress_line, say
 from elastocal.text import json_text
 
 
-@command(short_help="What would I measure, if …?")
+@command(short_help="Simulate measurements")
 def simulate(
     cell: CellFile,
     plan: Annotated[Path, typer.Argument(help="Poses (CSV): configuration, q1_deg, …")],
@@ -53,7 +53,7 @@ def simulate(
     seed: Seed = 0,
     as_json: Json = False,
 ) -> None:
-    """Synthetic measurements from the cell's model, with chosen errors and noise.
+    """Simulate measurements from the cell's model, with chosen errors and noise.
 
     Example: elastocal simulate cell.toml plan.csv -o data.csv --set joint2.compliance=3e-7
     --load 0 0 -2600 --repeats 6
@@ -100,7 +100,7 @@ def _assignment(text: str) -> tuple[str, float]:
         ) from None
 
 
-@command(short_help="See a KR 270 simulated and calibrated (Klimchik et al. 2013).")
+@command(short_help="Simulate and calibrate a KR 270 (Klimchik et al. 2013)")
 def demo(
     folder: Annotated[
         Path,

@@ -22,7 +22,7 @@ if TYPE_CHECKING:
 EVERY = 10.0  # s between plain lines of progress
 
 
-@command(short_help="What happens in a thousand simulated campaigns?")
+@command(short_help="Run many simulations on all cores or a cluster")
 def study(
     folder: Annotated[Path, typer.Argument(help="Folder with study.py and study.toml.")],
     jobs: Annotated[
@@ -77,7 +77,7 @@ def study(
         bool, typer.Option("--retry-failed", help="Run tasks that failed again.")
     ] = False,
 ) -> None:
-    """Run a study's tasks that have no result yet; Ctrl-C stops, the same command goes on.
+    """Run a study's tasks that have no result yet; after Ctrl-C the same command resumes.
 
     study.py in the folder is Python code and runs with your rights, here and on a cluster: run
     only folders that you trust.

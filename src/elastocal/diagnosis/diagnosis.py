@@ -440,24 +440,25 @@ def _findings(d: Diagnosis) -> Iterator[Finding]:
         names = tuple(f"{g.name}:{'+'.join(g.places)}" for g in d.groups)
         numbers = {"groups": names, "shares": shares, "shares_low": low, "shares_high": high}
         remedy = "" if settled else (
-            "More poses, spread over the whole range of every joint, tell many causes apart that "
-            "act at once."
+            "More poses over the whole range of every joint separate many simultaneous causes."
         )  # fmt: skip
         yield Finding("many_causes", "note", numbers, remedy)
     if d.verdict == "unknown_effect" and d.effects:
         numbers = {"effects": tuple(f"{f.effect}:{f.where}" for f in d.effects)}
-        alone = _kept_back("the effects named added, and nothing for what has no name: keep it")
+        alone = _kept_back("the named effects added, and nothing for unknown ones: keep it")
         yield Finding("named_beside_unknown", "care", numbers, "" if d.fields else alone)
     if d.fields:
         numbers = {"fields": tuple(f"{f.effect}:{f.where}" for f in d.fields)}
         beside = "the effects named and " if d.effects else ""
-        smooth = "smooth corrections for what has no name, which explain nothing: keep it"
+        smooth = "unnamed smooth corrections: keep it"
         yield Finding("corrected_without_a_name", "care", numbers, _kept_back(beside + smooth))
     if d.slight:
         numbers = {"effects": tuple(f"{f.effect}:{f.where}" for f in d.slight)}
         yield Finding("slight_causes", "note", numbers)
     if d.open and d.extra is None:
-        remedy = f"{option('plan', 'extra.csv')} designs the poses that tell the rivals apart."
+        remedy = (
+            f"{option('plan', 'extra.csv')} designs poses that separate the remaining hypotheses."
+        )
         yield Finding("rivals_open", "note", {}, remedy)
     if d.dependences:
         drivers, p_family = zip(*((t.driver, t.p_family) for t in d.dependences), strict=True)
@@ -483,12 +484,12 @@ def _remedy(verdict: Verdict) -> str:
     """What to do after a verdict."""
     return {
         "explained": f"Identify with the cell that {option('cell_out')} writes, and check the "
-        f"promise on poses that were never fitted (identify with {option('test')}).",
-        "ambiguous": "Compensating with the likeliest of the set serves poses and loads like those "
-        "measured; beyond them the rivals may predict differently.",
-        "unknown_effect": "Look for a physical cause where the evidence points, and measure more "
-        "where the curve is steep; compensate nothing by a name that the data do not support.",
-        "nothing_significant": "Nothing calls for another effect in the model.",
+        f"error on poses kept back (identify with {option('test')}).",
+        "ambiguous": "The likeliest of the set compensates poses and loads like those measured; "
+        "elsewhere the rivals may predict differently.",
+        "unknown_effect": "Look for a physical cause at the place shown. Measure more where the "
+        "curve is steep. Do not compensate by an effect that the data do not support.",
+        "nothing_significant": "The model needs no further effect.",
     }[verdict]
 
 

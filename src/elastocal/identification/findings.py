@@ -208,8 +208,8 @@ def _against_stated_noise(result: Calibration) -> Iterator[Finding]:
         severity: Severity = "care" if ratio < FAR_TOO_LARGE else "note"
         yield Finding(
             "residual_below_stated_noise", severity, numbers,
-            "State the noise that the tracker has: beside noise stated too large, nothing shows "
-            "whether the model lacks something.",
+            "State the tracker's true noise: with noise stated too large, a missing effect does "
+            "not show.",
         )  # fmt: skip
     else:
         yield Finding("residual_agrees_with_stated_noise", "good", numbers)
@@ -277,9 +277,9 @@ def _visits(result: Calibration) -> Iterator[Finding]:
                 "of": tuple(s.name for s in joints), "p": p[JOINTS],
                 "sigma_urad": tuple(_um(s.sigma) for s in joints if s.sigma is not None),
             },
-            "Measure more poses rather than one pose longer, and approach each from the same side: "
-            "the joints settle anew at every visit. The cell's [noise] joints_urad lets design and "
-            "simulate count with it.",
+            "Measure more poses, not more repeats, and approach each from the same side: the "
+            "joints settle anew at every visit. State it as [noise] joints_urad in the cell for "
+            "design and simulate.",
         )  # fmt: skip
     drifts = [s for s in sizes if s.drift and s.sigma]
     if noise.drift is not None and drifts and p.get(TIME, 1.0) < SCATTERS:
@@ -293,8 +293,8 @@ def _visits(result: Calibration) -> Iterator[Finding]:
             },
             "Measure poses and loads in random order, return to a reference pose every ten poses, "
             + ("" if seconds is not None else "record times, ")
-            + "and let arm and tracker warm up. The cell's [noise] drift_um lets design and "
-            "simulate count with it."
+            + "and let arm and tracker warm up. State it as [noise] drift_um in the cell for "
+            "design and simulate."
             + ("" if noise.drift.ends else WANDERS),
         )  # fmt: skip
 
@@ -383,19 +383,19 @@ def _columns(result: Calibration) -> NDArray[np.bool_]:
 def _faulty(result: Calibration) -> Iterator[Finding]:
     n, fitted = len(result.faulty), len(result.observations.lead)
     if n:
-        verb = "1 reading that lies" if n == 1 else f"{n} readings that lie"
+        named = "1 reading" if n == 1 else f"{n} readings"
         yield Finding(
             "faulty_readings", "note",
             {
                 "fitted": len(result.outliers), "left_out": len(result.excluded),
                 "heldout_all_rms_um": _um(result.heldout_all_rms),
             },
-            f"Look at the {verb} beyond the noise.",
+            f"Check the {named} beyond the noise.",
         )  # fmt: skip
     if len(result.outliers) > MANY * fitted:
         yield Finding(
             "many_faulty_readings", "care", {"faulty": len(result.outliers), "fitted": fitted},
-            "Look at where they lie before leaving any out.",
+            "Check where they lie before excluding any.",
         )  # fmt: skip
 
 
@@ -410,9 +410,9 @@ def _undetermined(result: Calibration) -> Iterator[Finding]:
     if n := len(shown):
         yield Finding(
             "undetermined", "note", {"parameters": n, "names": tuple(shown)},
-            f"{n} parameter{'' if n == 1 else 's'} cannot be had from these data "
-            f"({listed(shown, 4)}). Poses and loads like those measured are predicted all the "
-            "same; for others, measure what shows them.",
+            f"{n} parameter{'' if n == 1 else 's'} cannot be determined from these data "
+            f"({listed(shown, 4)}). Predictions hold for poses and loads like those measured; for "
+            "others, measure what shows them.",
         )  # fmt: skip
 
 
@@ -487,7 +487,7 @@ def _test(result: Calibration) -> Iterator[Finding]:
     if test is None:
         yield Finding(
             "untested", "note", {},
-            "Prove it: measure some poses that take no part in the fit, and give them with "
+            "Validate on independent poses: measure some that are not fitted, and give them with "
             f"{option('test')}.",
         )  # fmt: skip
     elif math.isfinite(held):
@@ -502,7 +502,7 @@ def _test(result: Calibration) -> Iterator[Finding]:
                 "far": test.far, "configurations": test.configurations, "p": test.p_far,
                 "predicted_std_um": _um(test.std), "fitted_std_um": _um(test.most_fitted),
             },
-            "Measure poses there: what is fitted tells little about them.",
+            "Measure poses there: the fit extrapolates.",
         )  # fmt: skip
 
 
@@ -560,15 +560,15 @@ def _bounds(result: Calibration, solution: Solution) -> Iterator[Finding]:
 # What a warning says of a finding: its numbers and its remedy by name.
 SENTENCES = {
     "copied_readings": (
-        "{copies} readings repeat others to the last digit (lines {lines}) and were left out: a "
-        "copy tells nothing new, and intervals that count it are too narrow. {remedy}"
+        "{copies} readings repeat others to the last digit (lines {lines}) and were excluded: "
+        "copies add no information and make intervals too narrow. {remedy}"
     ),
     "load_unit": "{remedy}",
     "scatter_not_counted": "{remedy}",
     "not_converged": "The fit did not converge: {reason}. {remedy}",
     "few_degrees_of_freedom": (
         "Only {dof} degrees of freedom for {parameters} determined parameters: intervals are wide "
-        "and the residual flatters the model. {remedy}"
+        "and the residual is too small. {remedy}"
     ),
     "not_held_out": (
         "Some configuration alone determines a parameter, so there is no held-out error for "
@@ -579,25 +579,25 @@ SENTENCES = {
         "separate {parameters}. {remedy}"
     ),
     "residual_above_stated_noise": (
-        "The residual is {ratio:.1f} times the stated noise: something is unmodelled or the stated "
-        "noise is too small. The intervals use the residual, not the stated noise; look for "
-        "effects that the model lacks."
+        "The residual is {ratio:.1f} times the stated noise: an effect is missing or the stated "
+        "noise is too small. Intervals use the residual, not the stated noise. Look for missing "
+        "effects (diagnose)."
     ),
     "lack_of_fit": (
         "Configurations scatter more than their repeats (lack of fit: F = {F:.2f} on {dof_between} "
-        "and {dof_pure} degrees of freedom, p = {p:.1g}): the arm does not come back to the same "
-        "place, or an effect is missing. The intervals take all readings for independent and are "
-        "too narrow: use the default method, whose noise model has this scatter, or intervals by "
-        "cr2; measure more configurations rather than more repeats."
+        "and {dof_pure} degrees of freedom, p = {p:.1g}): the arm does not return to the same "
+        "place, or an effect is missing. The intervals assume independent readings and are too "
+        "narrow: use the default method, whose noise model has this scatter, or intervals by cr2; "
+        "measure more configurations rather than more repeats."
     ),
     "drift": (
-        "Base or tracker drift in the course of the campaign ({sigma_um:.3g} µm in each direction, "
-        "judged by the {by}; p = {p:.1g}). Weights and intervals count with it, and the held-out "
-        "error leaves out whole blocks in time. {remedy}"
+        "Base or tracker drift during the session ({sigma_um:.3g} µm in each direction, by the "
+        "{by}; p = {p:.1g}). Weights and intervals account for it, and whole blocks in time are "
+        "held out. {remedy}"
     ),
     "joint_scatter": (
         "The joints settle anew at every visit of the arm (standard deviation {sigma_urad} µrad; "
-        "p = {p:.1g}). Weights and intervals count with it. {remedy}"
+        "p = {p:.1g}). Weights and intervals account for it. {remedy}"
     ),
     "at_bound": (
         "{parameter} stands at its bound {bound:g} {unit}; it is held there and has no interval. "
@@ -608,8 +608,8 @@ SENTENCES = {
         "{remedy}"
     ),
     "many_faulty_readings": (
-        "That is too large a share for reading errors: a shifted block of readings, or an effect "
-        "that the model lacks in some load state, marker or region. {remedy}"
+        "Too many for reading errors: a shifted block of readings, or a missing effect in some "
+        "load state, marker or region. {remedy}"
     ),
 }
 # The same of several parameters, whose names are told together.
@@ -676,15 +676,14 @@ def _faulty_readings(result: Calibration) -> list[str]:
     if result.outliers:
         found.append(
             f"{_count(result.outliers, 'lies', 'lie')} beyond what the noise explains "
-            f"({_lines(result.outliers)}) and had a part in the fit. Check them; "
-            f"{option('outliers', 'drop')} leaves them out."
+            f"({_lines(result.outliers)}); they are in the fit. Check them; "
+            f"{option('outliers', 'drop')} excludes them."
         )
     if result.excluded:
         found.append(
-            f"{_count(result.excluded, 'was', 'were')} left out as faulty "
-            f"({_lines(result.excluded)}): the noise does not explain them. They are mistakes, or "
-            f"show what the model lacks. All are listed in the "
-            f"result under 'excluded'; {option('outliers', 'keep')} fits them too."
+            f"{_count(result.excluded, 'was', 'were')} excluded as outliers "
+            f"({_lines(result.excluded)}). They are mistakes, or signs of a missing effect. All "
+            f"are listed in the result under 'excluded'; {option('outliers', 'keep')} keeps them."
         )
     return found
 

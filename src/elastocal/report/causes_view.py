@@ -105,7 +105,8 @@ def headline_of_causes(d: Diagnosis) -> str:
     found = [c for c in causes(d) if c.named]
     large = [c for k, c in enumerate(found[:MOST_IN_HEADLINE]) if k == 0 or c.share >= FINE]
     told = [
-        f"{c.name} ({share_text(c.share)}{' of the gap' * (k == 0)})" for k, c in enumerate(large)
+        f"{c.name} ({share_text(c.share)}{' of the remaining error' * (k == 0)})"
+        for k, c in enumerate(large)
     ]
     if more := len(found) - len(told):
         told.append(counted(more, "smaller cause"))
@@ -113,17 +114,16 @@ def headline_of_causes(d: Diagnosis) -> str:
     plural = len(first.places) > 1 or first.name.endswith("errors")
     text, several = together(told), len(found) > 1 or plural
     if d.verdict == "explained":
-        return f"{text} explain{'s' * (not several)} the gap."
+        return f"{text} explain{'s' * (not several)} the remaining error."
     if d.verdict == "ambiguous":
         n = len(d.indistinguishable)
         names = "one effect" if n == 1 else f"{n} effects"
-        verb = "make" if several else "makes"
-        return f"{text} {verb} the gap; of {names} in it these data leave the name open."
-    beside = "them" if several else "it"
+        verb = "cause" if several else "causes"
+        return f"{text} {verb} the remaining error; these data leave {names} of it open."
     at = places(dict.fromkeys(c.where for c in d.components if not c.named))
     where = f" at {at}" if at else ""
     return (
-        f"{text} make{'s' * (not several)} part of the gap; beside {beside}, something not in the "
+        f"{text} cause{'s' * (not several)} part of the remaining error; an effect outside the "
         f"catalogue acts{where}."
     )
 
@@ -140,7 +140,7 @@ def cause_rows(d: Diagnosis) -> ShownTable:
     ]  # fmt: skip
     if d.gap.unexplained_share >= FINE**2:
         rows.append(("unexplained", share_text(d.gap.unexplained_share), "–", "–", "–"))
-    return ShownTable(("made of", "share", "90 %", "error falls by", "90 %"), rows)
+    return ShownTable(("cause", "share", "90 %", "error falls by", "90 %"), rows)
 
 
 def place_rows(d: Diagnosis) -> ShownTable:
@@ -192,8 +192,8 @@ def assumed_order(d: Diagnosis) -> str:
     if not matters or d.calibrated is None or d.calibrated.observed.table.time is not None:
         return ""
     return (
-        "the last move is that from the visit before, visits taken in the order of the rows; "
-        "where they were not measured so, what goes with it is not to be relied on."
+        "the last move is that from the visit before, in the order of the rows; if they were not "
+        "measured so, do not rely on effects of the last move."
     )
 
 
@@ -203,7 +203,7 @@ def slight_text(d: Diagnosis) -> str:
         return ""
     return (
         f"{added_text(d.slight)}: each probably moves the markers by less than a hundredth of the "
-        "gap, if it is there at all. They correct the arm, and are no findings."
+        "remaining error. They correct the arm and are not findings."
     )
 
 

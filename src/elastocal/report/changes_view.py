@@ -31,8 +31,8 @@ def headline(c: Comparison) -> str:
         more = f" and {len(c.changed) - NAMED} more" if len(c.changed) > NAMED else ""
         return f"The arm has changed: {names}{more}."
     if c.verdict == "no_change_shown":
-        return "No change is shown: the differences are as large as the noise makes them."
-    return "The arm has changed, but no single parameter can be named."
+        return "No significant change: the differences are within the noise."
+    return "The arm has changed, but no single parameter is significant."
 
 
 def tone(c: Comparison) -> Tone:
@@ -47,20 +47,20 @@ def changes_lines(c: Comparison) -> list[tuple[str, str]]:
         ("Verdict", headline(c)),
         (
             "Tool",
-            f"Commanded alike it stands {length(float(np.sqrt(np.mean(far**2))))} rms away from "
-            f"where it stood, {length(float(far.max()))} at most, at {len(far)} random poses "
+            f"Moved by {length(float(np.sqrt(np.mean(far**2))))} rms for the same commands, "
+            f"{length(float(far.max()))} at most, at {len(far)} random poses "
             f"within the joint limits {under(c)}; noise alone gives {length(float(chance))} rms.",
         ),
         (
             "Chance",
             f"All {len(c.changes)} parameters together: {size_of(c.p)}. Each alone by Holm's rule: "
-            f"where nothing has changed, any is called changed with probability {c.level:g} at "
+            f"if nothing has changed, the probability of any finding is {c.level:g} at "
             "most.",
         ),
         (
             "Compared",
-            "The arm itself. Base and markers are set up anew in each campaign: a change that a "
-            "motion of the base or of the markers would also make is not seen.",
+            "The arm itself. Base and markers are set up anew each time: a change that a motion of "
+            "the base or the markers also explains is not seen.",
         ),
     ]
     if c.first_order:
@@ -99,11 +99,11 @@ def steps(c: Comparison) -> list[str]:
     if c.one_result:
         return ["Give the results of two campaigns: this is one of them and its copy."]
     if c.verdict == "no_change_shown":
-        return ["Nothing: the old calibration still holds to within the noise of these campaigns."]
+        return ["Nothing: the old calibration still holds within the noise of both sessions."]
     return [
         "Use the new calibration (elastocal compensate, elastocal export).",
-        "Look for the cause at the joints and links named; what the model lacks can look like a "
-        "change where poses or loads differ (elastocal diagnose with the new data).",
+        "Look for the cause at the joints and links named. A missing effect can look like a "
+        "change if poses or loads differ (elastocal diagnose with the new data).",
     ]
 
 

@@ -41,7 +41,7 @@ def print_diagnosis(console: Console, d: Diagnosis, kinds: Sequence[str] = ()) -
     console.print()
     for told in _tables_of_causes(console, d):
         console.print(told)
-    console.print(table_of("Gap budget (3-D rms error on held-out poses)", gap_rows(d)))
+    console.print(table_of("Error budget (3-D rms error at held-out poses)", gap_rows(d)))
     if (parameters := added_parameter_rows(d)).rows:
         console.print(table_of("Parameters of the effects found", parameters))
     best = hypothesis_rows(d, MOST_CANDIDATES_PRINTED)
@@ -53,8 +53,8 @@ def print_diagnosis(console: Console, d: Diagnosis, kinds: Sequence[str] = ()) -
     console.print(
         Text(
             "evidence: log marginal likelihood over that of no further effect. d: standard "
-            "deviations that the typical size moves the data; below 3 it hides in the noise. "
-            "seen from: the size, in typical sizes, from which it would have been seen.",
+            "deviations by which the typical size moves the data; below 3 it is below the noise. "
+            "seen from: smallest detectable size, in typical sizes.",
             style="dim",
         )
     )
@@ -62,7 +62,7 @@ def print_diagnosis(console: Console, d: Diagnosis, kinds: Sequence[str] = ()) -
         if table.rows:
             console.print(table_of(title, table))
     console.print()
-    lines = [("Alike here", f"{text}: these data cannot tell them apart.") for text in alike(d)]
+    lines = [("Alike here", f"{text}: not separable by these data.") for text in alike(d)]
     lines += [("Slight", text)] if (text := slight_text(d)) else []
     lines += [("Noise", text) for text in noise_floor_lines(d.noise, kinds)]
     lines += [("Next", text) for text in diagnosis_steps(d)]
@@ -73,17 +73,17 @@ def _tables_of_causes(console: Console, d: Diagnosis) -> Iterable[Table | Text]:
     """What the gap is made of, place by place, and the corrections without a name."""
     found, at, fields = cause_rows(d), place_rows(d), field_rows(d)
     if found.rows:
-        yield table_of("What the gap is made of", found, whole=True)
+        yield table_of("Causes of the remaining error", found, whole=True)
         yield Text(
-            "share: of the squared gap, the part that goes when this is added last. error falls "
-            "by: of new poses, once this and nothing else joins the model.\n",
+            "share: part of the squared remaining error that goes when this is added last. error "
+            "falls by: at new poses, if only this is added to the model.\n",
             style="dim",
         )
     if at.rows:
         # What it is as effects stands in the table of parameters too.
         yield table_of("Place by place", without_columns(at, 2) if console.width < WIDE else at)
     if fields.rows:
-        yield table_of("Corrections without a name", fields)
+        yield table_of("Smooth corrections", fields)
 
 
 def print_comparison(console: Console, c: Comparison) -> None:

@@ -72,7 +72,7 @@ def repeatabilities(noise: NoiseFloor, kinds: Iterable[str]) -> str:
         for i, (value, kind) in enumerate(zip(noise.repeatability, kinds, strict=True))
         if value > 0
     ]
-    return ", ".join(texts) or "none that shows"
+    return ", ".join(texts) or "none found"
 
 
 def noise_floor_lines(noise: NoiseFloor, kinds: Iterable[str]) -> list[str]:
@@ -89,16 +89,15 @@ def noise_floor_lines(noise: NoiseFloor, kinds: Iterable[str]) -> list[str]:
     lines.append(f"Repeatability from visit to visit: {repeatabilities(noise, kinds)}.")
     if noise.shared > 0:
         lines.append(
-            "All visits of a configuration share a further scatter of "
+            "Visits of a configuration have a common scatter of "
             f"{significant(noise.shared, 2)} times that."
         )
     if noise.drift > 0:
         lines.append(
-            f"The drift of {length(noise.drift)} that [noise] of the cell states counts as noise: "
-            "no cause is sought for it."
+            f"The drift of {length(noise.drift)} that [noise] of the cell states counts as noise."
         )
     if noise.pure_error is None:
-        lines.append("No reading is repeated, so the noise is known from the residuals only.")
+        lines.append("No repeats: the noise is estimated from residuals only.")
     else:
         lines.append(f"Repeats scatter by {length(noise.pure_error)} rms per axis.")
     if noise.near_repeats is not None:
@@ -106,8 +105,8 @@ def noise_floor_lines(noise: NoiseFloor, kinds: Iterable[str]) -> list[str]:
     if noise.faulty:
         n = len(noise.faulty)
         lines.append(
-            f"{n} faulty reading{'s were' if n > 1 else ' was'} left out, "
-            f"the worst {length(max(f.error for f in noise.faulty))} off."
+            f"{n} outlier{'s were' if n > 1 else ' was'} excluded, the worst "
+            f"{length(max(f.error for f in noise.faulty))} off."
         )
     return lines
 
@@ -119,7 +118,7 @@ def _near_repeats_line(near: NearRepeats) -> str:
     )
     if near.soon is not None and near.later is not None:
         text += (
-            f" (measured soon after each other {length(near.soon)}, in other parts of the campaign "
+            f" (measured soon after each other {length(near.soon)}, in other parts of the session "
             f"{length(near.later)})"
         )
     return f"{text}."
@@ -136,13 +135,13 @@ def diagnosis_headline(d: Diagnosis) -> str:
         return capital(headline_of_causes(d))
     if d.verdict == "explained":
         named = together(_likely(d))
-        return f"{capital(named)} explain{'s' * (len(d.effects) == 1)} the gap."
+        return f"{capital(named)} explain{'s' * (len(d.effects) == 1)} the remaining error."
     if d.verdict == "ambiguous":
         return _ambiguous(d)
     if d.verdict == "unknown_effect":
         return _unknown(d)
     return (
-        "No further effect shows above the noise: the probability that there is none is "
+        "No further effect exceeds the noise; probability of none: "
         f"{probability(d.probability_nothing)}."
     )
 
@@ -161,21 +160,20 @@ def _when(d: Diagnosis, f: FoundEffect) -> str:
 def _ambiguous(d: Diagnosis) -> str:
     sets = [together([effect_at(e) for e in rivals], "or") for rivals in d.indistinguishable]
     text = together([f"either {rivals}" for rivals in sets])
-    return f"{capital(text)} make{'s' * (len(sets) == 1)} the gap; these data cannot tell which."
+    verb = "causes" if len(sets) == 1 else "cause"
+    return f"{capital(text)} {verb} the remaining error; these data cannot decide."
 
 
 def _unknown(d: Diagnosis) -> str:
-    text = "Something that is not in the catalogue makes the gap"
+    text = "An effect outside the catalogue causes the remaining error"
     if d.effects:
-        verb = "make" if len(d.effects) > 1 else "makes"
-        text = (
-            f"{capital(together(_likely(d)))} {verb} part of the gap; beside it, something not in "
-        )
-        text += "the catalogue"
+        verb = "cause" if len(d.effects) > 1 else "causes"
+        text = f"{capital(together(_likely(d)))} {verb} part of the remaining error; an effect "
+        text += "outside the catalogue"
         return f"{text} acts {location_text(d.location)}." if d.location else f"{text} acts."
     if d.location is None:
-        return f"{text}; the data do not show where it sits."
-    return f"{text}: it sits {location_text(d.location)}."
+        return f"{text}; the data do not show where."
+    return f"{text}, {location_text(d.location)}."
 
 
 def location_text(location: Location) -> str:
@@ -212,24 +210,23 @@ def _error_lines(d: Diagnosis) -> list[str]:
     rest = _unexplained_lines(d)
     if not d.effects:
         return [
-            f"On held-out poses the calibrated arm is off by {calibrated} rms; noise alone "
-            f"gives {floor}.", *rest,
+            f"Held-out error: {calibrated} rms (noise alone: {floor}).", *rest,
         ]  # fmt: skip
     text = (
-        f"On held-out poses the error falls from {calibrated} to {length(d.gap.explained)} rms "
+        f"Held-out error: {calibrated} rms, with the effects found {length(d.gap.explained)} rms "
         f"(noise alone: {floor})."
     )
     nameless = [s for s in d.budget if s.step.startswith("unknown:")]
     if d.groups and nameless:
         left = length(nameless[-1].heldout_rms)
-        text += f" Smooth corrections without a name take it to {left}."
+        text += f" With unnamed smooth corrections: {left}."
     if d.groups:  # the table of causes says what each takes away
         return [text, *rest]
     if len(d.effects) == 1:
-        shrinks = f"The noise-free error of new poses shrinks by {reduction(d.effects[0])}."
+        shrinks = f"The noise-free error at new poses falls by {reduction(d.effects[0])}."
         return [f"{text} {shrinks}", *rest]
-    each = [f"{effect_at(f)} takes away {reduction(f)}" for f in d.effects]
-    last = f"As the last to join the model, {together(each)} of the noise-free error of new poses."
+    each = [f"{effect_at(f)} removes {reduction(f)}" for f in d.effects]
+    last = f"Added last, {together(each)} of the noise-free error at new poses."
     return [f"{text} {last}", *rest]
 
 
@@ -241,9 +238,9 @@ def _unexplained_lines(d: Diagnosis) -> list[str]:
     if d.gap.unexplained <= MATERIAL * d.gap.noise_floor:
         return []
     return [
-        f"{length(d.gap.unexplained)} rms look like scatter of the arm and are no noise: repeats "
-        "do not show them, neighbours in pose or time share them, or they are more than joints "
-        "scatter. They are unexplained."
+        f"{length(d.gap.unexplained)} rms are unexplained: they look like scatter of the arm, but "
+        "repeats do not show them, neighbours in pose or time share them, or joints do not scatter "
+        "that much."
     ]
 
 
@@ -283,8 +280,8 @@ def _shape(curve: Curve) -> str:
 
 def _chance(d: Diagnosis) -> str:
     if not d.effects and d.p_value > STRUCTURE:
-        return f"the strongest candidate is one that noise alone yields with {size_of(d.p_value)}."
-    return f"noise alone yields such a finding with {size_of(d.p_value)}, all candidates counted."
+        return f"{size_of(d.p_value)} for the strongest candidate, corrected for all candidates."
+    return f"{size_of(d.p_value)} after correction for all candidates."
 
 
 def sensitivity(d: Diagnosis) -> list[str]:
@@ -294,18 +291,17 @@ def sensitivity(d: Diagnosis) -> list[str]:
     lines = []
     if math.isfinite(d.smallest_seen):
         lines.append(
-            f"effects that move the markers by more than about "
-            f"{significant(d.smallest_seen * 1e6, 2)} µm rms, in a way that the fitted parameters "
-            "cannot follow, would have been seen."
+            f"effects above about {significant(d.smallest_seen * 1e6, 2)} µm rms at the markers, "
+            "not absorbed by fitted parameters, would have been found."
         )
     visible = [c for c in d.candidates if c.visible]
     faint = [c for c in d.candidates if c.hidden]
-    text = f"of {len(d.candidates)} candidates {len(visible)} would have shown at typical size"
+    text = f"of {len(d.candidates)} candidates {len(visible)} would have been found at typical size"
     if faint:
         by_effect = dict.fromkeys(plain_name(c.effect) for c in faint)
         names = list(by_effect)[:MOST_NAMED]
         more = len(by_effect) - len(names)
-        text += f"; hidden in the noise even then: {len(faint)} ({', '.join(names)}"
+        text += f"; below the noise even then: {len(faint)} ({', '.join(names)}"
         text += f" and {more} more kinds)" if more else ")"
     return [*lines, f"{text}."]
 
@@ -330,12 +326,12 @@ def extra_lines(extra: ExtraPlan) -> list[str]:
     """What the extra poses promise, or that none would help."""
     rivals = together([name_of(name) for name in extra.rivals], "or")
     if not extra.separable:
-        lines = [f"No pose that this cell allows tells apart {rivals}."]
+        lines = [f"No pose that this cell allows separates {rivals}."]
     else:
         n = extra.n_poses
         lines = [
-            f"{n} more pose{'s' if n != 1 else ''} to tell apart {rivals}: the probability of "
-            f"naming the right one rises from {probability(extra.probability_before)} to "
+            f"{n} more pose{'s' if n != 1 else ''} to separate {rivals}: the probability of "
+            f"the right answer rises from {probability(extra.probability_before)} to "
             f"{probability(extra.probability_after)} (as many random poses: "
             f"{probability(extra.probability_random)})."
         ]

@@ -227,7 +227,7 @@ def waterfall_of_steps(
         micrometre_axis(axes, "3-D rms error on held-out poses")
         figure.legend(loc="outside upper right", ncols=4, fontsize=8)
 
-    return drawn(draw, WIDTH, 1.1 + STEP_HEIGHT * len(rms), "Gap budget, step by step")
+    return drawn(draw, WIDTH, 1.1 + STEP_HEIGHT * len(rms), "Error budget, step by step")
 
 
 def micrometre_axis(axes: Axes, label: str) -> None:
@@ -315,7 +315,7 @@ def share_bars(d: Diagnosis) -> str:
         axes.set_xlim(100 * least, 112 * most)
         axes.set_xlabel("share of the gap in %, with 90 % interval")
 
-    return drawn(draw, WIDTH, 0.7 + 0.8 * BAR_HEIGHT * len(rows), "What the gap is made of")
+    return drawn(draw, WIDTH, 0.7 + 0.8 * BAR_HEIGHT * len(rows), "Causes of the remaining error")
 
 
 def unknown_curves(d: Diagnosis) -> str:

@@ -185,10 +185,7 @@ def undetermined_lines(result: Calibration, most: int | None = None) -> list[str
         lines.append(f"{where}, absorbed in a combination: {told(names)}")
     if names := [n for s in (INVISIBLE, ABSORBED) for n in names_of(result, s) if n in extra]:
         where = held_where(result, names)
-        lines.append(
-            f"{where}, redundant by construction (no pose under such loads shows them; nothing to "
-            f"do): {told(names)}"
-        )
+        lines.append(f"{where}, not identifiable with these loads (expected): {told(names)}")
     if names := names_of(result, FIXED):
         lines.append(f"fixed by the user: {told(names)}")
     return lines
@@ -205,11 +202,11 @@ READINGS = {
 
 def what_was_identified(result: Calibration) -> str:
     alone, n = len(names_of(result, ALONE)), len(result.combinations)
-    text = f"{alone} of {counted(len(result.ordinary), 'parameter')} known on their own"
+    text = f"{alone} of {counted(len(result.ordinary), 'parameter')}"
     if n:
         absorbed = len(names_of(result, ABSORBED))
         text += (
-            f", and {counted(n, 'combination')} of parameters that no reading tells apart "
+            f", and {counted(n, 'combination')} of parameters that these readings cannot separate "
             f"({absorbed} held in exchange)"
         )
     if weak := len(names_of(result, WEAK)):
@@ -219,7 +216,7 @@ def what_was_identified(result: Calibration) -> str:
     if fixed := len(names_of(result, FIXED)):
         text += f"; {fixed} fixed by the user"
     if (far := result.finding("unheard_of")) is not None:
-        text += f"; {len(far.listed('parameters'))} at values that no arm has"
+        text += f"; {len(far.listed('parameters'))} with implausible values"
     return text + counted_functions(result) + "."
 
 
@@ -228,38 +225,35 @@ def prediction_lines(result: Calibration) -> list[tuple[str, str]]:
     told: list[str] = []
     held = math.isfinite(result.heldout_rms)
     if not held:
-        told.append(
-            "How well unseen poses are predicted is not known: some configuration alone "
-            "determines a parameter, so none can be held out."
-        )
+        told.append("No held-out error: some configuration alone determines a parameter.")
     elif result.noise.drift is not None:
-        told.append("Held out were whole blocks in time, with another day's drift.")
+        told.append("Whole blocks in time were held out, with another day's drift.")
     if held and result.excluded:
         told.append(
-            f"With the {counted(len(result.excluded), 'reading')} set apart as faulty, poses that "
-            f"were not fitted are predicted to {length(result.heldout_all_rms)} rms."
+            f"With the {counted(len(result.excluded), 'reading')} excluded as outliers, the "
+            f"held-out error is {length(result.heldout_all_rms)} rms."
         )
     if result.predicted is not None:
         told.append(at_new_poses(result.predicted))
     if (t := result.test) is not None:
         told.append(
-            f"On {counted(t.n, 'test reading')} never fitted: {length(t.rms)} rms, "
-            f"{length(t.mean)} mean, {length(t.maximum)} at most."
+            f"Test error ({counted(t.n, 'reading')}, not fitted): {length(t.rms)} rms, "
+            f"{length(t.mean)} mean, {length(t.maximum)} maximum."
         )
     return [("Prediction", " ".join(told))] if told else []
 
 
 def at_new_poses(found: PredictedError) -> str:
-    """What is to be expected where nobody measured, and of what it consists."""
+    """Expected error at new poses and its parts."""
     low, high = found.ci95
-    parts = [f"{length(found.parameters)} of the estimates"]
+    parts = [f"parameters {length(found.parameters)}"]
     if found.open > 0:
-        parts.append(f"{length(found.open)} of parameters that these poses do not show")
+        parts.append(f"undetermined parameters {length(found.open)}")
     if found.lacking:
-        parts.append(f"{length(found.lacking)} that the model may lack")
+        parts.append(f"possible model error {length(found.lacking)}")
     return (
-        f"At new poses ({found.source}) the arm itself, without the noise of a reading, is off by "
-        f"{length(found.rms)} rms, 95 %: {length(low)} to {length(high)} ({', '.join(parts)})."
+        f"{length(found.rms)} rms at new poses, 95 %: {length(low)} to {length(high)}, measurement "
+        f"noise excluded ({', '.join(parts)}). New poses: {found.source}."
     )
 
 
@@ -539,7 +533,7 @@ def certificate_contents(result: Calibration, budget: ErrorBudget | None) -> dic
         ("Method", _sentence(method_and_weights(result))),
     ]
     if result.predicted is not None:
-        facts.append(("Expected where nobody measured", at_new_poses(result.predicted)))
+        facts.append(("Expected error", at_new_poses(result.predicted)))
     if result.test is not None:
         t = result.test
         told = f"{length(t.mean)} mean, {length(t.maximum)} at most of {counted(t.n, 'reading')}"
@@ -653,7 +647,7 @@ def influence_table(result: Calibration) -> ShownTable:
         for c in found
     ]  # fmt: skip
     heads = (
-        "configuration", "readings", "parameters it pays for", "Cook's distance", "moves most",
+        "configuration", "readings", "leverage (parameters)", "Cook's distance", "moves most",
         "by (std)",
     )  # fmt: skip
     return ShownTable(heads, rows, (0, 4))
@@ -684,12 +678,12 @@ def _signed(metres: float) -> str:
 
 
 SOURCES = {
-    "parameters": "parameters: what the estimates leave uncertain",
-    "open_parameters": "parameters left open, by their typical deviations",
-    "repeatability": "repeatability: what readings of a visit have in common",
+    "parameters": "parameters: uncertainty of the estimates",
+    "open_parameters": "undetermined parameters: typical deviations",
+    "repeatability": "repeatability: common to the readings of a visit",
     "instrument": "instrument: single readings",
-    "lack_of_fit": "lack of fit: what configurations scatter by beyond these",
-    "total": "together",
+    "lack_of_fit": "lack of fit: further scatter of configurations",
+    "total": "total",
 }
 
 
@@ -759,9 +753,9 @@ def identification_contents(
         "warnings": warnings_beside(result),
         "budget": None if budget is None else budget_table(result, budget),
         "spread": spread_table(before_and_after(result, budget)),
-        "floor": "Nothing says how large the noise alone is."
+        "floor": "The noise level is unknown."
         if budget is None or budget.floor is None
-        else f"The dashed line is what noise alone gives ({budget.floor_name}).",
+        else f"The dashed line is the noise level ({budget.floor_name}).",
         "parameters": parameter_rows(result, truth, published),
         "combinations": combination_rows(result, truth),
         "endless": " An interval without an end runs to the edge." if endless else "",

@@ -15,8 +15,8 @@ from elastocal.text import listed, printable
 
 # Sections of the page, by the finding they tell of, and the words that they are named after.
 SECTIONS = {
-    "faulty_readings": ("beyond the noise", "Faulty readings"),
-    "undetermined": ("from these data", "What is not determined"),
+    "faulty_readings": ("beyond the noise", "Outliers"),
+    "undetermined": ("from these data", "Not determined"),
 }
 
 
@@ -46,21 +46,17 @@ def judgement(result: Calibration, sections: bool = False) -> Judgement:
     if trust.severity == "poor":
         why = next(f for f in result.findings if f.severity == "poor" and f is not trust)
         return Judgement("poor", f"Do not use this calibration: {DOUBTS[why.kind](why)}.", steps)
-    told, elsewhere = _accuracy(result), _load_point(result)
+    told = f"{_accuracy(result)}{_load_point(result)}"
     verdict = result.verdict
     if trust.severity == "care":
         named = "; and ".join(DOUBTS[f.kind](f) for f in verdict.missing)
-        return Judgement(
-            "care", f"Use this calibration with care: {told}{elsewhere}. But {named}.", steps
-        )
+        return Judgement("care", f"Use this calibration with care: {named}. {told}", steps)
     compared = result.finding(
         "residual_agrees_with_stated_noise", "residual_below_stated_noise",
         "residual_agrees_with_readings",
     )  # fmt: skip
-    noise = "" if compared is None else ", and the residual is noise"
-    at = "" if verdict.at is None else f" at {length(verdict.at)}"
-    text = f"This calibration can be trusted{at}: {told}{noise}{elsewhere}."
-    return Judgement("good", text, steps)
+    noise = "" if compared is None else " The residual is consistent with noise."
+    return Judgement("good", f"This calibration can be used. {told}{noise}", steps)
 
 
 # What verdict, next step and the line on noise say already.
@@ -88,15 +84,13 @@ def _length(f: Finding, name: str) -> str:
 DOUBTS: dict[str, Callable[[Finding], str]] = {
     "not_converged": lambda f: f"the fit did not converge ({f.numbers['reason']})",
     "no_better_than_nominal": lambda f: (
-        f"unseen poses are predicted to {_length(f, 'heldout_rms_um')} rms, and the nominal arm "
-        f"does as well ({_length(f, 'nominal_rms_um')})"
+        f"the held-out error ({_length(f, 'heldout_rms_um')} rms) is not below that of the nominal "
+        f"arm ({_length(f, 'nominal_rms_um')})"
     ),
     "not_held_out": lambda f: (
-        "how well it predicts poses left out is not known: some pose alone determines a parameter, "
-        "and nothing checks it"
+        "there is no held-out error: some pose alone determines a parameter, and nothing checks it"
         + (
-            f" ({_length(f, 'unchecked_um')} of the {_length(f, 'rms_um')} to be expected at new "
-            "poses)"
+            f" ({_length(f, 'unchecked_um')} of the {_length(f, 'rms_um')} expected at new poses)"
             if f.numbers
             else ""
         )
@@ -105,75 +99,68 @@ DOUBTS: dict[str, Callable[[Finding], str]] = {
         f"the residual is {significant(f.number('ratio'))} times the stated noise"
     ),
     "residual_below_stated_noise": lambda f: (
-        f"the noise is stated too large (the residual is {significant(f.number('ratio'))} times "
-        "it), so nothing shows whether the model lacks something"
+        f"the stated noise is too large (the residual is {significant(f.number('ratio'))} times "
+        "it), so a missing effect would not show"
     ),
     "residuals_heavy_tailed": lambda f: (
-        "far errors are more frequent than normal noise makes them (excess kurtosis "
+        "large errors are more frequent than in normal noise (excess kurtosis "
         f"{f.number('excess_kurtosis'):+.2g})"
     ),
-    "autocorrelated": lambda f: (
-        "residuals of visits that follow each other are alike, as under a drift"
-    ),
+    "autocorrelated": lambda f: "residuals of successive visits are correlated, as under a drift",
     "load_unit": lambda f: (
-        f"the compliances are {significant(f.number('ratio'), 2)} times what {f.numbers['by']} let "
-        "expect: the loads may be in another unit"
+        f"the compliances are {significant(f.number('ratio'), 2)} times those expected from "
+        f"{f.numbers['by']}: the loads may be in another unit"
     ),
     "scatter_not_counted": lambda f: (
-        "residuals scatter from visit to visit, or drift, as the noise model does not have it"
+        "residuals scatter between visits, or drift, beyond the noise model"
     ),
-    "lack_of_fit": lambda f: "configurations scatter more than repeats of one explain",
+    "lack_of_fit": lambda f: "configurations scatter more than their repeats",
     "fit_flatters": lambda f: (
-        f"unseen poses are worse than fitted ones ({_length(f, 'residual_rms_um')})"
+        f"the held-out error is larger than the fitted one ({_length(f, 'residual_rms_um')})"
     ),
     "scale": lambda f: (
-        f"all lengths read are {significant(f.number('readings_over_file'), 4)} times those of the "
-        "robot's file: one scale, as of a tag or a unit of another size"
+        f"all measured lengths are {significant(f.number('readings_over_file'), 4)} times those of "
+        "the robot's file: a scale error, as of a target or unit of another size"
     ),
     "unheard_of": lambda f: _unheard_of(f),
-    "little_gain": lambda f: "that is hardly better than the nominal arm",
+    "little_gain": lambda f: "the error is hardly smaller than that of the nominal arm",
     "few_configurations": lambda f: (
-        f"in {counted(int(str(f.numbers['configurations'])), 'configuration')} there are only "
-        f"{f.numbers['equations_left']} equations beyond {f.numbers['parameters']} parameters, too "
-        f"few to judge by (needed: {f.numbers['needed']})"
+        f"{counted(int(str(f.numbers['configurations'])), 'configuration')} give only "
+        f"{f.numbers['equations_left']} equations beyond {f.numbers['parameters']} parameters "
+        f"(needed: {f.numbers['needed']})"
     ),
     "noise_unknown": lambda f: (
-        "nothing says how large the noise is (no stated noise, no repeats), so the residual may "
-        "hide what the model lacks"
+        "the noise level is unknown (neither stated nor repeated), so the residual may hide a "
+        "missing effect"
     ),
     "new_poses_not_shown": lambda f: (
-        f"at new poses {_length(f, 'open_um')} are to be expected of what the measured poses do "
-        f"not show ({listed([printable(str(n)) for n in f.listed('parameters')], 3)})"
+        f"{_length(f, 'open_um')} of the error at new poses come from parameters that the measured "
+        f"poses do not show ({listed([printable(str(n)) for n in f.listed('parameters')], 3)})"
     ),
     "new_poses_no_gain": lambda f: (
-        f"at new poses {_length(f, 'rms_um')} are to be expected, "
-        + (
-            "hardly better than"
-            if f.number("rms_um") <= f.number("nominal_rms_um")
-            else "worse than"
-        )
-        + f" by the nominal arm where it was measured ({_length(f, 'nominal_rms_um')})"
+        f"the error expected at new poses ({_length(f, 'rms_um')}) is "
+        + ("hardly smaller" if f.number("rms_um") <= f.number("nominal_rms_um") else "larger")
+        + f" than that of the nominal arm at measured poses ({_length(f, 'nominal_rms_um')})"
     ),
     "many_faulty_readings": lambda f: (
-        f"{f.numbers['faulty']} of the {f.numbers['fitted']} readings fitted lie beyond what the "
-        "noise explains"
+        f"{f.numbers['faulty']} of the {f.numbers['fitted']} fitted readings are outliers"
     ),
     "drift": lambda f: (
-        f"base or tracker drift by {_length(f, 'sigma_um')} in the course of the campaign"
+        f"base or tracker drift by {_length(f, 'sigma_um')} during the measurement session"
     ),
     "test_data_worse": lambda f: (
-        f"test data are off by {_length(f, 'test_rms_um')} rms, more than chance explains"
+        f"the test error ({_length(f, 'test_rms_um')} rms) is larger than chance explains"
     ),
     "test_data_far": lambda f: (
-        f"{f.numbers['far']} of {f.numbers['configurations']} test poses lie where the fit knows "
-        f"less than at every pose measured (to {_length(f, 'predicted_std_um')} rms in all, there "
-        f"to {_length(f, 'fitted_std_um')} at most)"
+        f"{f.numbers['far']} of {f.numbers['configurations']} test poses are more uncertain than "
+        f"every measured pose ({_length(f, 'predicted_std_um')} rms over all test poses, at most "
+        f"{_length(f, 'fitted_std_um')} at measured ones)"
     ),
 }
 
 
 def _unheard_of(f: Finding) -> str:
-    """ "no arm has such values (link6.dx 32.1 mm, 32 typical sizes): …" """
+    """ "implausible values (link6.dx 32.1 mm, 32 typical sizes): …" """
     each = zip(
         f.listed("parameters"), f.listed("values"), f.listed("units"), f.listed("typical_sizes"),
         strict=True,
@@ -186,46 +173,36 @@ def _unheard_of(f: Finding) -> str:
             f"{significant(float(sizes), 2)} typical deviations from nominal"
         )
     return (
-        f"no arm has such values ({listed(shown, 3)}): most likely an effect is missing that they "
-        "stand in for, or these poses hardly tell them from others"
+        f"implausible values ({listed(shown, 3)}): most likely an effect is missing, or these "
+        "poses hardly determine them"
     )
 
 
 def _accuracy(result: Calibration) -> str:
     """The arm's own error where nobody measured, and that of readings, which has their noise."""
-    what = {"deflection": "deflections", "distance": "distances"}.get(
-        result.observations.kind, "positions"
+    of = {"deflection": " of deflections", "distance": " of distances"}.get(
+        result.observations.kind, ""
     )
-    own = "the error at new poses is not known. With the noise of a reading, "
+    own = "Expected error at new poses: not known."
     if (at := result.verdict.at) is not None:
-        most = "no more, rms," if result.verdict.trusted else f"{length(at)} rms at most"
-        own = (
-            f"the arm itself, without the noise of a reading, is off by {most} at new poses "
-            "(95 %). With that noise, "
-        )
+        own = f"Expected error at new poses: ≤ {length(at)} rms (95 %), measurement noise excluded."
     if not math.isfinite(result.heldout_rms):
-        return f"{own}{what} that were fitted are reproduced to {length(result.residual_rms)} rms"
-    text = (
-        f"{own}{what} in poses that were not fitted are predicted to {length(result.heldout_rms)} "
-        "rms"
-    )
-    gain = result.nominal_rms / result.heldout_rms if result.heldout_rms > 0 else math.inf
+        return f"{own} Residual{of}: {length(result.residual_rms)} rms; no held-out error."
+    text = f"{own} Held-out error{of}: {length(result.heldout_rms)} rms"
     if only_placed(result):
-        text += _placed_markers(result)
-    elif math.isfinite(gain):
-        text += f", {significant(gain, 2)} times better than by the nominal arm"
-    return text
+        return f"{text}{_placed_markers(result)}."
+    return f"{text} (nominal arm {length(result.nominal_rms)})."
 
 
 def _load_point(result: Calibration) -> str:
-    """That all this is about the markers, where the load point is known worse."""
+    """That the load point is known worse than the markers."""
     if result.load_point_error is None:
         return ""
     marker = printable(next(iter(result.model.cell.tool.markers)))
     return (
-        f". That is so of the markers; the load point, where compensate goes by default, is known "
-        f"to {length(result.load_point_error)} rms only, as nothing measured says where it lies "
-        f"among them: measure a marker there, or state {option('point')} {marker}"
+        " The load point, default of compensate, is known only to "
+        f"{length(result.load_point_error)} rms: measure a marker there, or state "
+        f"{option('point')} {marker}."
     )
 
 

@@ -35,21 +35,21 @@ METHODS = {
         "weighted least squares as published, weights of eq. (14) from each residual, iterated; "
         "it acts like a robust fit, and its stated intervals are far too narrow"
     ),
-    "huber": "robust M-estimate with Huber's loss, which limits the pull of far readings",
-    "tukey": "robust MM-estimate with Tukey's biweight, which gives far readings no weight at all",
-    "l1": "least sum of residual lengths (L1), the robust relative of the median",
-    "student-t": "maximum likelihood under Student-t noise, which expects some far readings",
+    "huber": "robust M-estimate with Huber's loss, which limits the weight of outliers",
+    "tukey": "robust MM-estimate with Tukey's biweight, which gives outliers no weight",
+    "l1": "least sum of residual lengths (L1), robust like the median",
+    "student-t": "maximum likelihood under Student-t noise, which allows for outliers",
 }
 # What the weights are is said by the method itself, or by the line on the noise model.
 SAID = {"reml", "ols", "eq14", "eq14-residual"}
 INTERVALS = {
     "kenward-roger": (
-        "t intervals of Kenward and Roger, which count with the weights being estimated; they "
+        "t intervals of Kenward and Roger, which account for estimated weights; they "
         "assume the noise model and normal noise"
     ),
     "classical": (
-        "t intervals that take the readings for independent (after weighting) and the size of the "
-        "noise from the residual, also where it was stated"
+        "t intervals that assume independent readings (after weighting), with the noise level "
+        "from the residual, even if stated"
     ),
     "clustered": (
         "robust to correlation within a configuration; they assume independent configurations"
@@ -63,19 +63,19 @@ INTERVALS = {
         "they assume the noise of the method"
     ),
     "posterior": (
-        "t intervals of readings and prior together, ending at bounds; they take the prior at its "
-        "word and assume the noise of the method"
+        "t intervals of readings and prior together, ending at bounds; they trust the "
+        "prior and assume the noise of the method"
     ),
     "constrained profile": (
         "profile of the fit under the constraints: one-sided at a bound, and too wide rather than "
         "too narrow near one; assumes normal noise"
     ),
     "eq7": "as published, eq. (7): equal, independent noise of the residual's size",
-    "eq8": "as published, eq. (8): independent noise whose σ are taken for known",
-    "eq11": "as published, eq. (11): independent noise whose σ are taken for known",
+    "eq8": "as published, eq. (8): independent noise with σ taken as known",
+    "eq11": "as published, eq. (11): independent noise with σ taken as known",
     "eq13": (
-        "as published, eq. (13): weights taken for known although they come from the same "
-        "residuals, which makes the intervals too narrow"
+        "as published, eq. (13): weights taken as known although they come from the same "
+        "residuals, so the intervals are too narrow"
     ),
 }
 HC = (
@@ -189,7 +189,7 @@ def prior_line(result: Calibration) -> str | None:
     text = f"Mostly prior, share of the information: {named}" + (
         f", and {more} more" if more > 0 else ""
     )
-    return f"{text}. These data say little about them; poses that load them more would."
+    return f"{text}. Measure poses that load them more."
 
 
 def _percent(share: float) -> str:
@@ -219,12 +219,12 @@ COMPARED = (
     "residual_agrees_with_readings",
 )
 SHAPES = {
-    "residuals_skew": "errors lean to one side, as an effect that the model lacks would make them.",
+    "residuals_skew": "errors are skewed, as with a missing effect.",
     "residuals_heavy_tailed": (
-        "far readings are more frequent. A robust method (huber, tukey, student-t) shows "
+        "large errors are more frequent. A robust method (huber, tukey, student-t) shows "
         "whether the estimates depend on them."
     ),
-    "residuals_light_tailed": "far readings are rarer, as with rounded or selected readings.",
+    "residuals_light_tailed": "large errors are rarer, as with rounded or selected readings.",
 }
 
 
@@ -237,7 +237,7 @@ def does_noise_explain_it(result: Calibration) -> str:
         if sigma is not None and method == "ols":
             size = f"; the residual amounts to {length(sigma)} per coordinate"
         elif _is_estimated(result):
-            size = "; the size of the noise was estimated from the readings"
+            size = "; the noise level was estimated from the readings"
         return f"{_why_not_judged(result)}{size}."
     size = (
         f"{significant(f.number('ratio'))} times the stated noise; chance alone gives "
@@ -248,18 +248,18 @@ def does_noise_explain_it(result: Calibration) -> str:
     single = result.finding("stated_noise_too_small")
     if f.kind == "residual_agrees_with_readings" and single is not None:
         text = (
-            f"The noise is stated too small: the residual is {size}, and {single.numbers['by']} "
-            f"scatter by {significant(single.number('ratio'))} times the stated noise themselves."
+            f"The stated noise is too small: the residual is {size}, and {single.numbers['by']} "
+            f"scatter by {significant(single.number('ratio'))} times the stated noise."
         )
     elif f.kind == "residual_above_stated_noise":
         text = (
-            f"The residual is larger than the stated noise explains ({size}): something is "
-            "unmodelled, or the noise is larger than stated."
+            f"The residual is larger than the stated noise explains ({size}): an effect is "
+            "missing, or the noise is larger than stated."
         )
     else:
-        text = f"The residual is smaller than the stated noise ({size}): it was stated too large."
+        text = f"The residual is smaller than the stated noise ({size}), which is too large."
     if _is_estimated(result):
-        text += " Weights and intervals follow the noise that the readings show."
+        text += " Weights and intervals use the estimated noise."
     return text
 
 
@@ -274,7 +274,7 @@ def _why_not_judged(result: Calibration) -> str:
     stated = available_noise(observed.table, tracker) != "none"
     if observed.kind == "distance":
         stated = tracker.distance_sigma is not None
-    nothing_says = "so nothing says how small the residual should be"
+    nothing_says = "so the residual cannot be judged"
     if observed.kind == "pose" and stated != (tracker.rotation_sigma is not None):
         which = "positions" if stated else "rotations"
         return f"Noise was stated for {which} only, {nothing_says}"
@@ -358,10 +358,10 @@ def repeats_line(result: Calibration) -> str | None:
                 f"{text}: the test shows no common deviation. The noise model, chosen by its "
                 "criterion, has one; the intervals include it."
             )
-        return f"{text}: readings of one configuration bear no common deviation worth counting."
+        return f"{text}: readings of one configuration have no common deviation."
     text = (
-        f"Configurations scatter more than repeats of one explain ({numbers}): the arm does not "
-        "come back to the same place, or an effect is missing."
+        f"Configurations scatter more than their repeats ({numbers}): the arm does not "
+        "return to the same place, or an effect is missing."
     )
     if counted == "the noise model":
         return f"{text} The noise model has this common deviation; the intervals include it."
@@ -389,7 +389,7 @@ def shape_line(summary: ResidualSummary) -> str:
         text = f"Standardised residuals are not normal ({numbers}): {SHAPES[f.kind]}"
     found = sum(g.n_deviating for g in summary.groupings)
     if not found:
-        return f"{text} No group of readings scatters more or less than the noise model says."
+        return f"{text} No group of readings deviates from the noise model."
     named = [f"{group_name(by, g)} {ratio(g)} times" for by, g in summary.deviating[:MOST_GROUPS]]
     more = found - len(named)
     tail = f", and {more} more" if more else ""
@@ -406,14 +406,14 @@ def in_time_line(result: Calibration) -> str | None:
         f"{'their times' if found.by == 'times' else 'the rows'}, {_p(found.p)}"
     )
     told = result.finding("autocorrelated")
-    which = "Residuals of visits that follow each other are"
+    which = "Residuals of successive visits are"
     if told is None:
         return f"{which} no more alike than others ({numbers})."
     if told.numbers["counted"] == "yes":
         return f"{which} alike ({numbers}); the noise model has this as a drift."
     return (
-        f"{which} alike ({numbers}): something drifts, or the model lacks what neighbouring poses "
-        "have in common. Intervals are too narrow by that."
+        f"{which} alike ({numbers}): drift, or an effect missing at neighbouring poses. Intervals "
+        "are too narrow."
     )
 
 
@@ -468,7 +468,7 @@ def false_alarm_line(result: Calibration) -> str | None:
     if report is None or not fault_lines(result):
         return None
     share = 100 * report.false_alarm
-    return f"Of tables in which nothing is wrong, at most {share:g} % would yield any finding."
+    return f"False-alarm rate: at most {share:g} % of tables without outliers."
 
 
 def _sentence(result: Calibration, finding: FaultyGroup) -> str:
@@ -478,7 +478,7 @@ def _sentence(result: Calibration, finding: FaultyGroup) -> str:
     text = f"{PLACE[finding.level].format(printable(finding.name))}: {n} readings {how} "
     text += noise if size is None else f"{length(size)} ({noise})"
     if beyond < n:
-        text += f", {beyond or 'none'} of them beyond the noise alone"
+        text += f", {beyond or 'none'} of them beyond the noise"
     return f"{text}{_influence(result, finding)}."
 
 

@@ -26,7 +26,7 @@ if TYPE_CHECKING:
     from elastocal.diagnosis.next_poses import NextPoses
 
 TOLD = 2  # parameters that a pose serves, in the table
-SERVES = "serves (standard deviation without it)"
+SERVES = "most affected if dropped (standard deviation)"
 
 
 def pose_rows(plan: Plan, reasons: bool = True, decimals: int = 2) -> ShownTable:
@@ -70,7 +70,7 @@ def served(reason: Reason) -> str:
         f"{printable(name)} {'lost' if math.isinf(growth) else f'+{100 * (growth - 1):.0f} %'}"
         for name, growth in reason.serves[:TOLD]
     ]
-    return ", ".join(parts) or "all a little"
+    return ", ".join(parts) or "all slightly"
 
 
 def interval_rows(plan: Plan) -> ShownTable:
@@ -159,16 +159,15 @@ def plan_headline(plan: Plan) -> str:
     n = counted(len(plan.q), "pose")
     if plan.of_test_poses:
         text = (
-            f"{n} leave a position error of ρ₀ = {_rho(plan):.3g} µm rms at the test poses "
-            "after compensation"
+            f"{n}: position error ρ₀ = {_rho(plan):.3g} µm rms at the test poses after compensation"
         )
     else:
-        text = f"{n} reach {plan.criterion} = {plan.reported:.4g} {plan.unit}".rstrip()
+        text = f"{n}: {plan.criterion} = {plan.reported:.4g} {plan.unit}".rstrip()
     found = plan.certificate.efficiency_pool
     if found is None or found < VAIN:
-        return f"{text}; how far that is from the best, no bound says."
+        return f"{text}; no bound on the best plan is known."
     away = 100 * (1 - found)
-    text += "; no plan from these candidates is "
+    text += "; no other plan from these candidates is "
     text += "better" if away < 0.05 else f"more than {away:.1f} % better"
     return f"{text} (certified)."
 
@@ -192,20 +191,20 @@ def plan_tone(plan: Plan) -> Tone:
 
 def plan_steps(plan: Plan) -> list[str]:
     steps = [
-        "Measure the poses in the order given, which keeps a drift apart from what is sought, and "
-        "record the time of each reading."
+        "Measure the poses in the given order, which limits the effect of drift, and record the "
+        "time of each reading."
     ]
     if plan.of_test_poses:
         steps.append(
-            f"If ρ₀ is not small enough: {option('target')} finds the fewest poses that reach a "
-            f"value, {option('curve')} compares numbers of poses."
+            f"If ρ₀ is not small enough: {option('target')} finds the fewest poses for a value, "
+            f"{option('curve')} compares numbers of poses."
         )
     if _apart(plan):
-        steps.append(f"For a better plan: {option('effort', 'thorough')}, which begins more often.")
+        steps.append(f"For a better plan: {option('effort', 'thorough')}, which has more starts.")
     together = sum(bool(p.combined_with) for p in plan.predicted)
     if together:
         steps.append(
-            f"{counted(together, 'parameter')} will be known only together with others: more "
+            f"{counted(together, 'parameter')} will be determined only in sums: more "
             "markers or load states separate them, more poses like these do not."
         )
     steps.append("Then: elastocal identify with the same cell and the measurements.")
@@ -222,8 +221,8 @@ def plan_lines(plan: Plan) -> list[tuple[str, str]]:
     s = plan.scheduled
     if s is not None and s.test_poses is not None and s.without is not None:
         text = (
-            f"{s.test_poses * 1e6:.4g} µm at the test poses with {listed(s.effects)} found too, "
-            f"{s.without * 1e6:.4g} µm were they known"
+            f"{s.test_poses * 1e6:.4g} µm at the test poses with {listed(s.effects)} identified "
+            f"too, {s.without * 1e6:.4g} µm if they were known"
         )
         lines.append(("In time", f"{text}."))
     if plan.timed:
@@ -254,7 +253,7 @@ def _chosen_lines(plan: Plan) -> list[tuple[str, str]]:
     stood = "no plan" if c.before is None else f"{c.before:.4g}"
     seen = "none" if c.share[0] is None else f"{100 * c.share[0]:.1f} %"
     worth = (
-        f"the best that any plan can reach goes from {stood} to {c.after:.4g} {c.unit}".rstrip()
+        f"best possible value of any plan from {stood} to {c.after:.4g} {c.unit}".rstrip()
         + f" (relaxed, {c.candidates} candidates each), feasible poses from {seen} to "
         f"{100 * c.share[1]:.1f} %"
     )
@@ -265,8 +264,8 @@ def _criterion_line(plan: Plan) -> tuple[str, str]:
     if not plan.of_test_poses:
         return "Criterion", f"{plan.criterion} = {plan.reported:.6g} {plan.unit}".rstrip() + "."
     return "Criterion", (
-        f"ρ₀ = {_rho(plan):.4g} µm, the rms position error that remains at the test poses after "
-        f"compensation ({printable(plan.targets)})."
+        f"ρ₀ = {_rho(plan):.4g} µm rms position error at the test poses after compensation "
+        f"({printable(plan.targets)})."
     )
 
 
@@ -281,7 +280,7 @@ def _everywhere_lines(plan: Plan) -> list[tuple[str, str]]:
 
     own = "" if plan.of_test_poses else f"; at the test poses {e.test_poses * 1e6:.4g}"
     text = (
-        f"{e.elsewhere * 1e6:.4g} µm rms all over the joint ranges{own}; a random plan leaves "
+        f"{e.elsewhere * 1e6:.4g} µm rms over the joint ranges{own}; a random plan gives "
         f"{micrometres(e.random_elsewhere)} there and {micrometres(e.random_test_poses)} at the "
         "test poses"
     )
@@ -293,11 +292,10 @@ def _everywhere_lines(plan: Plan) -> list[tuple[str, str]]:
         )
     if e.share:
         text += f"; the joint ranges have {100 * e.share:.0f} % of the criterion's weight"
-        text += f", for which ρ₀ may be {100 * e.cap:g} % above the least" if e.cap else ""
+        text += f", with ρ₀ at most {100 * e.cap:g} % above its minimum" if e.cap else ""
     elif plan.of_test_poses:
         text += (
-            f"; {option('elsewhere_cap', 0.05)} finds the least there for 5 % more at the test "
-            "poses"
+            f"; {option('elsewhere_cap', 0.05)} minimises it, allowing 5 % more at the test poses"
         )
     return [("Elsewhere", f"{text}.")]
 
@@ -309,7 +307,7 @@ def _chance_lines(plan: Plan) -> list[tuple[str, str]]:
         return []
     whole = f"{c.n} random plans of as many feasible poses"
     open_ = c.n - c.determined
-    lost = f"{open_} of {whole} leave parameters open that this plan determines"
+    lost = f"{open_} of {whole} do not determine all parameters of this plan"
     if c.median is None or c.best is None:
         return [("Chance", f"{lost}.")]
     name = "ρ₀" if plan.of_test_poses else plan.criterion
@@ -342,15 +340,15 @@ def _certificate_lines(plan: Plan) -> list[tuple[str, str]]:
     lines = [
         (
             "Certificate",
-            f"certified on the pool: efficiency {_share(c.efficiency_pool)} against the best plan "
-            f"of these shares from {c.pool} candidates, each in it once"
+            f"certified on the pool: efficiency {_share(c.efficiency_pool)} against the best "
+            f"subset of the {c.pool} candidates with the same number per level"
             f"{told.replace(' )', ')')}.",
         )
     ]
     if c.efficiency_pool < VAIN:
         text = (
-            "the bound spreads weights over many candidates, which so few poses cannot follow: "
-            "they leave parameters to what was known before; it says nothing here"
+            "with so few poses the bound says nothing: the relaxation spreads weights over many "
+            "candidates"
         )
         return [*lines, ("Certificate", f"{text}.")]
     if c.efficiency_continuum is not None:
@@ -377,8 +375,8 @@ def _starts_lines(plan: Plan) -> list[tuple[str, str]]:
         (
             "Certificate",
             f"{counted(len(ends), 'start')} of the search ended {told}, the bound is "
-            f"{bound:.4g}{unit}. Between plan and bound lies what no start found, and what only "
-            "weights reach, whole poses not: the fewer poses, the more of that.",
+            f"{bound:.4g}{unit}. The difference is what no start found, or what only weights can "
+            "reach: the fewer poses, the more of the latter.",
         )
     ]
 
@@ -396,19 +394,19 @@ def _execution_line(plan: Plan) -> tuple[str, str]:
         text = f"{stops} stops, {again} of them at reference poses, {e.travel:.0f} s of travel"
     parts = sum(stop.part > 0 for stop in e.stops)
     if parts:
-        text += f"; {parts} poses are read twice without load, half of the readings each time"
+        text += f"; {parts} poses are measured unloaded at start and end (half the readings each)"
     if changes:
         text += f", {changes} load change{'s' if changes > 1 else ''} by hand"
     via = sum(len(stop.via) for stop in e.stops) + len(e.home_via)
     if via:
-        text += f", {via} points in between to get around obstacles"
+        text += f", {via} via points around obstacles"
     space = plan.model.cell.workspace
     if len(space.link_radius) > 0 or space.urdf_geometry or len(space.bodies) > 0:
         checked = "every move checked"
     elif mounting_plane(plan.model.cell, plan.model.chain) is not None:
         checked = (
             "every move checked against the mounting plane (z = 0 of the base; [workspace] "
-            "mounting_plane = false lifts it) and nothing else, as [workspace] states no bodies"
+            "mounting_plane = false disables it) only, as [workspace] states no bodies"
         )
     else:
         checked = (
@@ -423,12 +421,12 @@ def _drift_lines(plan: Plan) -> list[tuple[str, str]]:
     d = plan.execution.drift
     if d is None:
         return []
-    size = f"a steady drift of {DRIFT * 1e6:g} µm while measuring"
+    size = f"a steady drift of {DRIFT * 1e6:g} µm"
     if d.at_test_poses:
-        text = f"{size} puts {d.bias * 1e6:.2g} µm on the test poses at worst"
+        text = f"{size} changes the result by at most {d.bias * 1e6:.2g} µm at the test poses"
         other = f"{d.shortest * 1e6:.2g} µm"
     else:
-        text = f"{size} moves the parameters by {d.bias:.2g} of their standard deviations at worst"
+        text = f"{size} changes parameters by at most {d.bias:.2g} standard deviations"
         other = f"{d.shortest:.2g}"
     if d.bias < d.shortest:
         text += f" (in the shortest order {other})"
@@ -440,15 +438,15 @@ def next_lines(found: NextPoses) -> list[tuple[str, str]]:
     g, n = found.gain, counted(found.batch, "pose")
     limit = "" if found.required is None else f" (required: {found.required * 1e6:.3g} µm)"
     verdicts = {
-        "measure": f"measure {n} more; then ask again with all readings in one table",
+        "measure": f"measure {n} more; then run it again with all readings in one table",
         "enough": "no further pose is needed: the required error is kept with 95 %",
         "no_gain": f"no {n} lower the error by {100 * found.least_gain:g} % "
-        f"({option('least_gain')}): more of them do not pay; what does is "
-        "more repeats, a better instrument, or another kind of measurement",
+        f"({option('least_gain')}): use more repeats, a better instrument "
+        "or another kind of measurement",
     }
-    now = "not known yet, as the measurements leave parameters open"
+    now = "not known yet, as some parameters are undetermined"
     if math.isfinite(found.reached):
-        now = f"with 95 % at most {found.reached * 1e6:.3g} µm at new poses{limit}"
+        now = f"≤ {found.reached * 1e6:.3g} µm rms at new poses (95 %){limit}"
 
     def both(before: float, after: float) -> str:
         begun = f"{before * 1e6:.3g} µm" if math.isfinite(before) else "an unknown error"
@@ -458,14 +456,14 @@ def next_lines(found: NextPoses) -> list[tuple[str, str]]:
     lines.append(
         (
             "Gain",
-            f"{n} lower the rms error at the test poses, averaged over what is in doubt, "
-            f"from {both(g.before, g.after)}; were the "
-            f"model right, from {both(g.model_before, g.model_after)}.",
+            f"{n} lower the rms error at the test poses from {both(g.before, g.after)}, averaged "
+            "over possible missing effects; from "
+            f"{both(g.model_before, g.model_after)} if the model is right.",
         )
     )
     named = [f"{f.effect} at {f.where} ({f.probability:.2f})" for f in found.found]
     if named:
-        text = f"{', '.join(named)}, which the model is given here; write the cell with it"
+        text = f"{', '.join(named)}, added to the model here; write the cell with it"
         lines.append(("Found", printable(f"{text} (diagnose, {option('cell_out')}).")))
     doubts = [f"{e} at {w} ({p:.2g})" for e, w, p in found.doubts[:3]]
     if doubts:
