@@ -19,7 +19,7 @@ from support.design_commands import (
 from elastocal.planning import search
 from elastocal.planning.checkpoint import Stage
 
-GOING_ON = "going on with the design that was interrupted"
+GOING_ON = "resuming the interrupted design"
 # A child may inherit that SIGINT is ignored; here it must not.
 PROGRAM = (
     "import signal; signal.signal(signal.SIGINT, signal.default_int_handler); "
