@@ -31,8 +31,8 @@ SENTENCES = {
     "at bound": "stands at its bound",
     "beyond bound": "lies beyond its physical bound",
     "outliers": "beyond what the noise explains",
-    "excluded": "left out as faulty",
-    "share": "too large a share for reading errors",
+    "excluded": "excluded as outliers",
+    "share": "Too many for reading errors",
     "lack": "Configurations scatter more than their repeats",
     "computed": "they are computed, not measured",
 }

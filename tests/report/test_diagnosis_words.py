@@ -37,7 +37,7 @@ def spoken(d):
 def test_the_smallest_effect_that_shows_has_distance_five():
     """d of a displacement field of the told size, computed from readings, is 5."""
     (line, _) = sensitivity(NOTHING)
-    (told,) = re.findall(r"more than about ([\d.]+) µm", line)
+    (told,) = re.findall(r"above about ([\d.]+) µm", line)
     field = np.random.default_rng(1).normal(size=(NOTHING.n_configurations, 3))
     field *= float(told) * 1e-6 / math.sqrt((field**2).sum(axis=1).mean())
     sigma = NOTHING.gap.noise_floor / math.sqrt(3)

@@ -41,7 +41,9 @@ def test_what_nothing_speaks_against_can_be_trusted(fine: Any) -> None:
     found = judgement(fine)
     assert found.tone == "good"
     at = length(fine.predicted.ci95[1])
-    assert found.headline.startswith(f"This calibration can be trusted at {at}: ")
+    assert found.headline.startswith(
+        f"This calibration can be used. Expected error at new poses: ≤ {at} "
+    )
     assert any("give them with `test`" in step for step in found.steps)
     assert not any("diagnose" in step for step in found.steps)
     tested = replace(fine, test=TestErrors(fine.heldout_rms, 0.0, 0.0, 9))
@@ -54,8 +56,8 @@ def test_one_sentence_says_which_error_has_the_noise_of_a_reading(
     """In terminal, page, notebook, certificate and JSON."""
     fit = case.result
     sentence = judgement_view.judgement(fit).headline
-    own, _, read = sentence.partition(". With that noise, ")
-    assert "without the noise of a reading, is off by" in own and length(fit.verdict.at) in own
+    own, _, read = sentence.partition(" Held-out error: ")
+    assert "measurement noise excluded" in own and length(fit.verdict.at) in own
     assert length(fit.heldout_rms) in read
     json = fit.to_json()
     assert json["verdict"]["sentence"] == sentence
@@ -70,17 +72,17 @@ def test_each_doubt_is_named_with_its_remedy(fine: Any) -> None:
         "times the stated noise": (
             replace(fine, noise=replace(fine.noise, ratio_to_stated=2.0)), "diagnose"
         ),
-        "scatter more than repeats": (
+        "scatter more than their repeats": (
             replace(fine, noise=replace(fine.noise, lack_of_fit=MISFIT)), "diagnose"
         ),
-        "unseen poses are worse": (
+        "held-out error is larger": (
             replace(fine, heldout_rms=3 * fine.residual_rms), "augment"
         ),
-        "is not known": (
+        "there is no held-out error": (
             replace(fine, heldout_rms=float("inf"),
                     predicted=replace(fine.predicted, unchecked=float("inf"))), "augment"
         ),
-        "test data are off": (
+        "the test error (": (
             replace(fine, test=TestErrors(2 * fine.heldout_rms, 0.0, 0.0, 9)), ""
         ),
     }  # fmt: skip
@@ -99,7 +101,7 @@ def test_test_data_count_where_chance_does_not_explain_them(fine, ratio, n, doub
     """Twenty readings may be 1.38 times worse by chance (1 %), five 1.74 times."""
     known = replace(fine, dof=600, test=TestErrors(ratio * fine.heldout_rms, 0.0, 0.0, n))
     found = judgement(known)
-    assert ("more than chance explains" in found.headline) == doubted
+    assert ("larger than chance explains" in found.headline) == doubted
     assert any("Compare the test poses" in step for step in found.steps) == doubted
 
 
@@ -107,5 +109,5 @@ def test_what_is_no_better_than_nominal_must_not_be_used(fine: Any) -> None:
     useless = judgement(replace(fine, heldout_rms=2 * fine.nominal_rms))
     lost = judgement(replace(fine, converged=False, reason="100 steps"))
     assert useless.tone == lost.tone == "poor"
-    assert "the nominal arm does as well" in useless.headline
+    assert "is not below that of the nominal arm" in useless.headline
     assert "did not converge (100 steps)" in lost.headline
