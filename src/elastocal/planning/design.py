@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field, replace
 from itertools import count
 from pathlib import Path
@@ -14,7 +14,7 @@ from threadpoolctl import threadpool_limits
 
 from elastocal.cell.plan_wishes import TEST_POSE
 from elastocal.cell.work_cell import Cell
-from elastocal.errors import InsufficientDataError, option, require
+from elastocal.errors import InputError, InsufficientDataError, option, require
 from elastocal.identification.knowledge import GaussianPrior
 from elastocal.measurements import Measurements
 from elastocal.model.effects.catalogue import effect_of
@@ -275,11 +275,22 @@ class _Design:
         terms = None
         if begun is None and not own.all() and search.target_rows is not None:
             terms = leading_directions(search.problem(pool, shares), search.target_rows, ~own)
-        seek = Search.of(
-            search, pool, searches, shares, self._effort(), options.seed,
-            self.checkpoint, progress, terms, setup,
-        )  # fmt: skip
-        found = seek.select(pool, begun)
+
+        def sought(
+            shares: IntArray, pool: FeasiblePool, begun: IntArray | None, checkpoint: Checkpoint
+        ) -> tuple[Search, Selection]:
+            seek = Search.of(
+                search, pool, searches, shares, self._effort(), options.seed, checkpoint, progress,
+                terms, setup,
+            )  # fmt: skip
+            return seek, seek.select(pool, begun)
+
+        seek, found = sought(shares, pool, begun, self.checkpoint)
+        if self.cell.design.target is not None:
+            seek, found, sizes = self._fewer(
+                seek, found, self._target(search, self.cell.design.target), sought
+            )
+            curve = tuple(sorted((*curve, *sizes), key=lambda size: size.poses))
         progress("random plans beside it")
         drawn = random_information(search.problem(pool, shares), options.seed)
         return self._plan(setup, seek, found, counts, targets.source, curve, known, drawn, pinned)
@@ -447,6 +458,34 @@ class _Design:
                 (p.chosen for p in found.points if p.n_poses == n), np.zeros(0, dtype=np.int64)
             ),
         }
+
+    def _fewer(
+        self, seek: Search, found: Selection, target: float,
+        sought: Callable[..., tuple[Search, Selection]],
+    ) -> tuple[Search, Selection, tuple[PlanSize, ...]]:  # fmt: skip
+        """The plan of the fewest poses that meets Φ ≤ `target` once its poses are polished, and
+        the sizes that were tried: n was found on the drawn poses, where plans are worse.
+
+        Φ goes about as 1/n: that tells which number to try next.
+        """
+        reported, tried = seek.setup.criterion.reported, list[PlanSize]()
+        n, least = int(seek.shares.sum()), max(len(seek.shares), 1)
+        while found.value <= target and least < n:
+            m = max(min(int(np.ceil(n * found.value / target)), n - 1), least)
+            try:
+                less, plan = sought(self._shares(m + int(self.pinned.sum())), found.pool, None,
+                                    Checkpoint())  # fmt: skip
+            except (InputError, InsufficientDataError):
+                least = m + 1
+                continue
+            share = plan.certificate.efficiency_pool
+            bound = None if share is None else reported(plan.value * share)[0]
+            tried.append(PlanSize(m, reported(plan.value)[0], bound))
+            if plan.value <= target:
+                seek, found, n = less, plan, m
+            else:
+                least = m + 1
+        return seek, found, tuple(tried)
 
     def _target(self, setup: Setup, target: float) -> float:
         """Φ of a target in m."""
