@@ -63,7 +63,7 @@ def test_after_a_collision_the_bent_link_is_named(folder):
     assert code == 0, err
     flat = " ".join(out.split())
     assert f"Verdict: The arm has changed: {BENT}." in flat
-    assert "any is called changed with probability 0.05 at most" in flat
+    assert "the probability of any finding is 0.05 at most" in flat
     found = json.loads(Path("c.json").read_text())
     assert (found["verdict"], found["changed"]) == ("changed", [BENT])
     (one,) = (p for p in found["parameters"] if p["changed"])

@@ -34,6 +34,8 @@ RULES = [
     (re.compile(r"^(dof|std|cook|leverage|by|skewness|excess_kurtosis|mean_square|\w*share\w*|"
                 r"correlations?|\w*ratio\w*|\w*reduction\w*|covariance|mixing|low|high|observed|"
                 r"expected|prior_share)$"), 0.002, 0.01),
+    # Of plans of nearly one worth rounding decides.
+    (re.compile(r"^efficiency\w*$"), 0.003, 0),
     (re.compile(r"^(counts|beyond)$"), 2, 0),  # readings at the edge of a bin
     (re.compile(r"^multiplier$"), 1e-6, 0.01),  # of a constraint that costs nothing: zero
     (re.compile(r"^read_back$"), 0.01, 0),  # µm that rounding leaves in a file that is exact

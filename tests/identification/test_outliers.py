@@ -156,7 +156,7 @@ def test_nothing_is_left_out_in_silence():
     assert np.array_equal(rows_of(kept.outliers), bad) and kept.excluded == ()
     assert len(kept.residual) == 120 and len(kept.residual_table()) == 40
     assert any(w.startswith("2 readings lie beyond what the noise explains") for w in kept.warnings)
-    assert any("outliers='drop' leaves them out" in w for w in kept.warnings)
+    assert any("outliers='drop' excludes them" in w for w in kept.warnings)
     dropped = identify(model, wrong, Options(faulty="drop"))
     assert np.array_equal(rows_of(dropped.excluded), bad) and dropped.outliers == ()
     assert len(dropped.residual) == 114

@@ -143,9 +143,7 @@ def test_one_scale_of_all_lengths_is_named_and_not_trusted(tmp_path, effects, fa
     assert ec.identify(path, table).finding("scale") is None
     fit = ec.identify(path, replace(table, position=factor * table.position))
     assert fit.finding("scale").numbers["readings_over_file"] == pytest.approx(factor, abs=2e-3)
-    assert (
-        not fit.verdict.trusted and "one scale, as of a tag" in fit.to_json()["verdict"]["sentence"]
-    )
+    assert not fit.verdict.trusted and "a scale error" in fit.to_json()["verdict"]["sentence"]
 
 
 def test_a_longer_link_is_no_scale(tmp_path):

@@ -90,7 +90,7 @@ def test_the_command_plans_for_what_it_chose_and_writes_the_cell(tmp_path: Path)
     again = tmp_path / "chosen.toml"
     result = design(cell, "--cell-out", again)
     assert result.exit_code == 0, result.stderr
-    assert "M2 at [" in result.stdout and "the best that any plan can reach goes from" in (
+    assert "M2 at [" in result.stdout and "best possible value of any plan from" in (
         " ".join(result.stdout.split())
     )
     found = json.loads((tmp_path / "plan.json").read_text())["chosen"]

@@ -21,7 +21,7 @@ def fit() -> ec.Calibration:
 
 def test_the_headline_says_that_it_is_of_the_markers_and_what_to_state(fit):
     sentence = fit.to_json()["verdict"]["sentence"]
-    assert "the load point, where compensate goes by default, is known to 2" in sentence
+    assert "is known only to 2" in sentence
     assert "measure a marker there, or state `point` M1" in sentence
     own = ec.compensate(fit.arm, [1.0, 0.0, 0.6]).uncertainty
     assert fit.to_json()["load_point_um"] > 10 * fit.verdict.at * 1e6

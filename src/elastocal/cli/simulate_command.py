@@ -23,7 +23,7 @@ from elastocal.screen import progress_line, say
 from elastocal.text import json_text
 
 
-@command(short_help="Simulate measurements")
+@command(short_help="Simulate the measurements of a plan")
 def simulate(
     cell: CellFile,
     plan: Annotated[Path, typer.Argument(help="Poses (CSV): configuration, q1_deg, …")],
