@@ -11,6 +11,7 @@ import numpy as np
 
 ROOT = Path(__file__).parents[2]
 TUTORIAL = ROOT / "docs" / "tutorial"
+STUDY = ROOT / "tests" / "golden" / "inputs" / "campaign" / "study"
 URDF = ROOT / "src" / "elastocal" / "demo" / "kr270_2.urdf"
 
 
@@ -224,34 +225,6 @@ files = ["poses.dat"]
 role = "joints"
 preset = "kuka"
 """
-STUDY = """\
-def tasks(options):
-    for n in (4, 16):
-        for k in range(options["replicates"]):
-            yield {"n": n, "label": "few" if n < 9 else "many", "replicate": k}
-
-
-def run(task, rng):
-    x = rng.normal(size=task["n"])
-    return {"mean": float(x.mean()), "inside": bool(abs(x.mean()) < 1), "above": int((x > 0).sum())}
-
-
-def summary(results):
-    return f"mean {results['mean'].mean():.3f}\\n"
-"""
-STUDY_TOML = """\
-title = "means"
-seed = 11
-
-[options]
-replicates = 2
-scale = 1.0
-
-[columns]
-mean = "mm"
-inside = "yes/no"
-above = "count"
-"""
 
 COMMANDS = (
     Command("design", "wished.toml -o plan.csv --effort quick --candidates 30 --curve 3,4 "
@@ -335,7 +308,7 @@ def write(folder: Path) -> None:
     from elastocal.model.manipulator import Model
     from elastocal.simulation.simulate import expand_plan, simulate
 
-    (folder / "study").mkdir(parents=True)
+    shutil.copytree(STUDY, folder / "study", ignore=shutil.ignore_patterns("__pycache__"))
     _, degrees, points = kr270_readings(folder)
     for name, text in (
         ("deflecting.toml", DEFLECTING), ("placed.toml", PLACED), ("planned.toml", PLANNED),
@@ -343,7 +316,6 @@ def write(folder: Path) -> None:
         ("links.csv", LINKS), ("path.csv", PATH), ("fixture.stl", STL),
         ("knowledge.toml", KNOWLEDGE), ("mapping.toml", MAPPING),
         ("points.txt", spatialanalyzer(points)), ("poses.dat", krl(degrees)),
-        ("study/study.py", STUDY), ("study/study.toml", STUDY_TOML),
     ):  # fmt: skip
         (folder / name).write_text(text, encoding="utf-8")
     for name in ("arm.csv", "poses.csv", "targets.csv"):
