@@ -11,7 +11,7 @@ from support.study_folders import numbers, run_study, write_study
 
 from elastocal.errors import InputError
 from elastocal.studies.study_results import read_results
-from elastocal.studies.study_run import ClusterLostError, StudyStop, Way, connect, run_cluster
+from elastocal.studies.study_run import ClusterLostError, StudyStop, _security, connect, run_cluster
 
 dask = pytest.importorskip("dask", reason="needs the extra 'cluster'")
 distributed = pytest.importorskip("distributed", reason="needs the extra 'cluster'")
@@ -136,7 +136,7 @@ def test_no_scheduler_is_told(monkeypatch):
     with pytest.raises(InputError, match="no scheduler answers"):
         connect("tcp://127.0.0.1:9")
     with pytest.raises(InputError, match="cluster='nowhere at all'"):
-        connect("nowhere at all", Way(unencrypted=True))
+        connect("nowhere at all", unencrypted=True)
 
 
 @pytest.mark.parametrize(
@@ -150,11 +150,11 @@ def test_no_scheduler_is_told(monkeypatch):
 )  # fmt: skip
 def test_no_scheduler_beyond_this_host_is_reached_in_the_clear(address, allowed):
     if allowed:
-        Way().security(distributed, address)
+        _security(distributed, address)
     else:
         with pytest.raises(InputError, match="not encrypted, so whoever stands between"):
-            Way().security(distributed, address)
-        Way(unencrypted=True).security(distributed, address)
+            _security(distributed, address)
+        _security(distributed, address, unencrypted=True)
 
 
 def test_a_scheduler_that_goes_away_ends_the_run_and_keeps_what_is_done(tmp_path, monkeypatch):

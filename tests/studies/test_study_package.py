@@ -40,9 +40,9 @@ def result_of(study, sources=None):
 
 def test_a_worker_without_the_folder_unpacks_it(folder, tmp_path, monkeypatch):
     study = read_study(folder)
-    monkeypatch.setattr("elastocal.studies.study_folder._LOADED", {})
+    monkeypatch.setattr("elastocal.studies.study_folder._here", ("", folder.resolve(), None))
     elsewhere = Sources(tmp_path / "not here", study.sources.contents, study.sources.columns)
-    assert result_of(study, elsewhere).rows[0]["mean"] == 42
+    assert result_of(study, elsewhere)["rows"][0]["mean"] == 42
     module = sys.modules["study_part_of_test"]
     assert not module.__file__.startswith(str(folder))
 
@@ -50,7 +50,7 @@ def test_a_worker_without_the_folder_unpacks_it(folder, tmp_path, monkeypatch):
 def test_a_worker_of_another_version_refuses(folder):
     study = read_study(folder)
     sources = Sources(folder, study.sources.contents, study.sources.columns, version="0.0.1")
-    assert "this worker has elastocal" in result_of(study, sources).error
+    assert "this worker has elastocal" in result_of(study, sources)["task_error"]
 
 
 def refused(folder, *options):

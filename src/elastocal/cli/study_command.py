@@ -87,7 +87,7 @@ def study(
     require(cluster is None or jobs is None, "--jobs is for this machine; leave it with --cluster")
     from elastocal.studies.study_folder import read_study
     from elastocal.studies.study_results import StudyResults
-    from elastocal.studies.study_run import StudyStop, Way, run_study, summarise
+    from elastocal.studies.study_run import StudyStop, run_study, summarise
 
     results = folder / "results" if output is None else output
     page = folder / "result.md"
@@ -98,8 +98,8 @@ def study(
     with StudyStop() as stop, StudyProgress(progress and not quiet) as shown:
         ending = run_study(
             prepared, results, jobs=jobs, cluster=cluster, only=only, restart=restart,
-            way=Way(tls_ca, tls_cert, tls_key, unencrypted), retry_failed=retry_failed,
-            stop=stop, progress=shown.show, tell=shown.tell,
+            retry_failed=retry_failed, stop=stop, progress=shown.show, tell=shown.tell,
+            tls_ca=tls_ca, tls_cert=tls_cert, tls_key=tls_key, unencrypted=unencrypted,
         )  # fmt: skip
     say(_told(ending, results))
     if ending.stopped and not ending.complete:

@@ -11,6 +11,7 @@ import atexit
 import hashlib
 import importlib
 import json
+import math
 import shutil
 import sys
 import tempfile
@@ -51,9 +52,8 @@ KINDS: dict[str, tuple[str, type, tuple[type, ...]]] = {
 }
 NUMBER = ("a number", float, (int, float, np.integer, np.floating))
 
-_LOADED: dict[str, ModuleType] = {}
-_FOLDERS: set[Path] = set()
 _LOCK = threading.Lock()
+_here: tuple[str, Path, ModuleType] | None = None  # digest, folder and study.py of what is loaded
 
 
 @dataclass(frozen=True)
@@ -97,6 +97,13 @@ class StudyTask:
         values: dict[str, Any] = json.loads(self.text)
         return values
 
+    def line(self) -> Row:
+        """The line of results of a task that gave none yet."""
+        return {
+            "task": self.index, "task_hash": self.hash, "values": self.values, "rows": [],
+            "task_seconds": 0.0, "elastocal": __version__, "task_error": None,
+        }  # fmt: skip
+
     def rng(self) -> np.random.Generator:
         """Child `index` of SeedSequence(seed): the same as .spawn(n)[index], for every n.
 
@@ -117,17 +124,6 @@ class Study:
     sources: Sources
     module: ModuleType
     tasks: tuple[StudyTask, ...]
-
-
-@dataclass(frozen=True)
-class Outcome:
-    """What became of a task: its rows, or `error` (one line) and `trace` (the traceback)."""
-
-    index: int
-    rows: tuple[Row, ...] = ()
-    seconds: float = 0.0
-    error: str | None = None
-    trace: str = ""
 
 
 class StudyFile(Table):
@@ -180,11 +176,20 @@ def read_study(folder: str | Path, seed: int | None = None, options: Iterable[st
                 f"{path}: key options.{quoted(key)} cannot be recorded ({error}); use finite "
                 "numbers, text, true/false, lists and tables of them"
             ) from None
-    sources = read_sources(folder, stated.files, stated.columns)
+    sources = _sources(folder.resolve(), stated)
     module = load(sources)
-    tasks = tuple(_tasks(folder, module, chosen, sources, seed))
     title = stated.title or folder.resolve().name
+    tasks = tuple(_tasks(folder, module, chosen, sources, seed))
     return Study(folder, title, seed, chosen, sources, module, tasks)
+
+
+def _sources(folder: Path, stated: StudyFile) -> Sources:
+    """Sources of the study as its folder stands now, without hidden folders and caches."""
+    names = {path.relative_to(folder) for path in folder.rglob("*.py")}
+    hidden = {n for n in names if any(p.startswith(".") or p == "__pycache__" for p in n.parts)}
+    parts = sorted({n.as_posix() for n in names - hidden} | set(stated.files))
+    contents = {name: read_bytes(folder / name, "file of a study", MAX_BYTES) for name in parts}
+    return Sources(folder, contents, stated.columns)
 
 
 def _with_options(path: Path, defaults: Mapping[str, Any], given: Iterable[str]) -> dict[str, Any]:
@@ -211,16 +216,6 @@ def _with_options(path: Path, defaults: Mapping[str, Any], given: Iterable[str])
         require(type(value) is type(default), f"{here}: takes {kind}, as in study.toml")
         options[key] = value
     return options
-
-
-def read_sources(folder: Path, files: Iterable[str], columns: Mapping[str, str]) -> Sources:
-    """Returns the sources of a study as its folder stands now."""
-    folder = folder.resolve()
-    names = {path.relative_to(folder) for path in folder.rglob("*.py")}
-    hidden = {n for n in names if any(p.startswith(".") or p == "__pycache__" for p in n.parts)}
-    parts = sorted({n.as_posix() for n in names - hidden} | set(files))
-    contents = {name: read_bytes(folder / name, "file of a study", MAX_BYTES) for name in parts}
-    return Sources(folder, contents, columns)
 
 
 def _tasks(
@@ -266,28 +261,29 @@ def _tasks(
 
 
 def load(sources: Sources) -> ModuleType:
-    """Returns the module study.py, imported once per process and digest.
+    """Returns the module study.py, imported once per process as long as no other study comes.
 
     Raises InputError with file and line where importing it fails.
     """
+    global _here
     with _LOCK:
-        if sources.digest not in _LOADED:
+        if _here is None or _here[0] != sources.digest:
+            if _here is not None:
+                _forget(_here[1])
             folder = _standing(sources)
-            _forget_earlier()
-            _FOLDERS.add(folder)
             sys.path.insert(0, str(folder))
             name = f"elastocal_study_{sources.digest[:16]}"
             loader = SourceFileLoader(name, str(folder / "study.py"))
             module = module_from_spec(cast(ModuleSpec, spec_from_loader(name, loader)))
             sys.modules[name] = module  # dataclasses and pickle look a class's module up there
+            _here = sources.digest, folder, module
             # No bytecode in the user's folder: it would be left, half written, by a kill.
             before, sys.dont_write_bytecode = sys.dont_write_bytecode, True
             try:
                 calling(folder, "importing study.py", lambda: loader.exec_module(module))
             finally:
                 sys.dont_write_bytecode = before
-            _LOADED[sources.digest] = module
-        return _LOADED[sources.digest]
+        return _here[2]
 
 
 def _standing(sources: Sources) -> Path:
@@ -303,18 +299,15 @@ def _standing(sources: Sources) -> Path:
     return folder
 
 
-def _forget_earlier() -> None:
-    """Drop what earlier studies, or an earlier state of this one, imported from their folders.
+def _forget(folder: Path) -> None:
+    """Drop what an earlier study, or an earlier state of this one, imported from its folder.
 
     A worker outlives a study, and two studies may both have a scenarios.py.
     """
     for name, module in list(sys.modules.items()):
-        file = getattr(module, "__file__", None)
-        own = name.startswith("elastocal_study_")
-        if file and not own and any(Path(file).is_relative_to(folder) for folder in _FOLDERS):
+        if Path(getattr(module, "__file__", None) or "/").is_relative_to(folder):
             del sys.modules[name]
-    sys.path[:] = [place for place in sys.path if place not in map(str, _FOLDERS)]
-    _FOLDERS.clear()
+    sys.path[:] = [place for place in sys.path if place != str(folder)]
     importlib.invalidate_caches()
 
 
@@ -340,11 +333,13 @@ def calling(folder: Path, what: str, call: Callable[[], Any]) -> Any:
         ) from error
 
 
-def execute(sources: Sources, task: StudyTask) -> Outcome:
-    """Returns what came of the task: whatever its code raises becomes an outcome."""
+def execute(sources: Sources, task: StudyTask) -> Row:
+    """Returns the line of results that came of the task, whatever its code raises.
+
+    Of a task that failed it has the `trace` (the traceback) beside `task_error`.
+    """
+    line = task.line()
     begun = time.perf_counter()
-    rows: tuple[Row, ...] = ()
-    error, trace = None, ""
     try:
         if sources.version != __version__:
             raise RuntimeError(
@@ -352,13 +347,16 @@ def execute(sources: Sources, task: StudyTask) -> Outcome:
                 f"{sources.version}; install the same there"
             )
         found = load(sources).run(task.values, task.rng())
-        rows = _checked_rows(found, sources.columns, task.values)
+        line["rows"] = _checked_rows(found, sources.columns, task.values)
     except (Exception, SystemExit) as caught:
-        error, trace = f"{type(caught).__name__}: {caught}", traceback.format_exc()
-    return Outcome(task.index, rows, time.perf_counter() - begun, error, trace)
+        line |= {
+            "task_error": f"{type(caught).__name__}: {caught}", "trace": traceback.format_exc()
+        }  # fmt: skip
+    line["task_seconds"] = time.perf_counter() - begun
+    return line
 
 
-def _checked_rows(found: Any, columns: Mapping[str, str], task: Row) -> tuple[Row, ...]:
+def _checked_rows(found: Any, columns: Mapping[str, str], task: Row) -> list[Row]:
     """What run() returned, as rows of plain values of the types that `columns` states."""
     rows = [found] if isinstance(found, Mapping) else found
     if not isinstance(rows, list | tuple) or not all(isinstance(row, Mapping) for row in rows):
@@ -373,15 +371,21 @@ def _checked_rows(found: Any, columns: Mapping[str, str], task: Row) -> tuple[Ro
                 f"run() returned {name!r}{did_you_mean(str(name), columns)}, which [columns] "
                 f"of study.toml does not list (there are {listed(columns)})"
             )
-    return tuple({n: _plain(n, row.get(n), unit) for n, unit in columns.items()} for row in rows)
+    return [{n: _plain(n, row.get(n), unit) for n, unit in columns.items()} for row in rows]
 
 
 def _plain(name: str, value: Any, unit: str) -> Any:
-    """`value` as bool, int, float or str after the column's unit; None stays None."""
+    """`value` as bool, int, float or str after the column's unit, as JSON can hold it.
+
+    None stays None, and NaN becomes it; an infinite number becomes its name as text.
+    """
     if isinstance(value, np.ndarray) and value.ndim == 0:
         value = value.item()
     takes, made, accepted = KINDS.get(unit, NUMBER)
     is_bool = isinstance(value, bool | np.bool_)
     if value is not None and not (isinstance(value, accepted) and is_bool == (made is bool)):
         raise TypeError(f"column {name!r} takes {takes}; found {type(value).__name__}")
-    return None if value is None else made(value)
+    if value is None or made is not float:
+        return None if value is None else made(value)
+    number = float(value)
+    return None if math.isnan(number) else number if math.isfinite(number) else str(number)

@@ -8,8 +8,7 @@ from __future__ import annotations
 
 import hashlib
 import json
-import math
-from collections.abc import Iterable, Iterator, Mapping
+from collections.abc import Iterable, Iterator
 from contextlib import contextmanager
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -17,7 +16,7 @@ from typing import TYPE_CHECKING, Any
 from elastocal.errors import InputError, option, require
 from elastocal.files import atomic_write_text, read_bytes, read_json, read_text
 from elastocal.screen import shown
-from elastocal.studies.study_folder import KINDS, Outcome, Row, Study, StudyTask
+from elastocal.studies.study_folder import KINDS, Row, Study
 
 if TYPE_CHECKING:
     import pandas
@@ -37,18 +36,14 @@ class StudyResults:
         self.folder = folder
         self.path = folder / RESULTS
 
-    def add(self, task: StudyTask, outcome: Outcome, version: str) -> None:
-        """Write the line of a task that ended; of one that failed its traceback too."""
-        if outcome.error is not None:
+    def add(self, line: Row, version: str) -> None:
+        """Write the line of a task that ended, made by `version`; its traceback goes to the log."""
+        if trace := line.pop("trace", None):
             with open(self.folder / FAILURES, "a", encoding="utf-8") as log:
-                log.write(shown(f"task {task.index} {task.text}\n{outcome.trace}\n"))
-        line = {
-            "task": task.index, "task_hash": task.hash, "values": task.values,
-            "rows": [_strict(row) for row in outcome.rows], "task_seconds": outcome.seconds,
-            "elastocal": version, "task_error": outcome.error,
-        }  # fmt: skip
+                log.write(shown(f"task {line['task']} {json.dumps(line['values'])}\n{trace}\n"))
+        text = json.dumps(line | {"elastocal": version}, ensure_ascii=False, allow_nan=False)
         with open(self.path, "a", encoding="utf-8") as handle:
-            handle.write(json.dumps(line, ensure_ascii=False, allow_nan=False) + "\n")
+            handle.write(text + "\n")
 
     def lines(self) -> list[Row]:
         """Returns all lines in the order of their tasks.
@@ -132,15 +127,6 @@ class StudyResults:
         except InputError:
             return {}
         return found if isinstance(found, dict) else {}
-
-
-def _strict(row: Mapping[str, Any]) -> Row:
-    """A row as JSON can hold it: NaN is null, an infinite number its name as text."""
-    return {
-        name: value if not isinstance(value, float) or math.isfinite(value)
-        else None if math.isnan(value) else str(value)
-        for name, value in row.items()
-    }  # fmt: skip
 
 
 @contextmanager

@@ -28,7 +28,7 @@ from typing import Any, Self
 from elastocal import __version__
 from elastocal.errors import ElastocalError, InputError, option, require
 from elastocal.files import read_bytes
-from elastocal.studies.study_folder import Outcome, Sources, Study, StudyTask, calling, execute
+from elastocal.studies.study_folder import Row, Sources, Study, StudyTask, calling, execute
 from elastocal.studies.study_results import StudyResults, opened, read_results
 from elastocal.text import printable, quoted
 
@@ -42,7 +42,7 @@ THREADS = (
     "VECLIB_MAXIMUM_THREADS", "NUMBA_NUM_THREADS", "NUMEXPR_NUM_THREADS",
 )  # fmt: skip
 
-Outcomes = Generator[Outcome, None, None]
+Lines = Generator[Row, None, None]
 
 
 class StudyStop:
@@ -96,13 +96,13 @@ def _write(message: str) -> None:
 
 
 def hand_out(
-    crew: Processes | DaskWorkers, sources: Sources, tasks: Sequence[StudyTask], stop: StudyStop
-) -> Outcomes:
-    """Outcomes as they come, none twice; no new task goes out once `stop` is asked for.
+    crew: Processes, sources: Sources, tasks: Sequence[StudyTask], stop: StudyStop
+) -> Lines:
+    """Lines of results as they come, none twice; none new begins once `stop` is asked for.
 
     No task waits at a worker: what is out is what is waited for on Ctrl-C.  A process that dies
     may have died of another task that was out, so those that were have further tries at the end,
-    each alone; one whose processes still die is an outcome with an error.
+    each alone; one whose processes still die has failed.
     """
     waiting, suspects = deque(tasks), deque[StudyTask]()
     out: dict[Any, StudyTask] = {}
@@ -124,33 +124,31 @@ def hand_out(
                 continue
             task = out.pop(future)
             try:
-                outcome = future.result()
+                line = future.result()
             except Exception as error:  # execute() returns what a task raises
                 deaths = died[task.index]
                 deaths.append(crew.deaths(error))
                 if deaths[-1] and len(deaths) < crew.tries:
                     suspects.append(task)
                     continue
-                line = f"the worker could not run it: {type(error).__name__}: {error}"
+                told = f"the worker could not run it: {type(error).__name__}: {error}"
                 if deaths[-1]:
-                    line = (
+                    told = (
                         f"its worker process died {sum(deaths)} times (out of memory, killed, "
                         "or crashed in a library)"
                     )
-                outcome = Outcome(task.index, error=line, trace=f"{line}\n{error}\n")
-            yield outcome
+                line = task.line() | {"task_error": told, "trace": f"{told}\n{error}\n"}
+            yield line
     finally:
         crew.close(list(out))
 
 
-def run_local(
-    study: Study, tasks: Sequence[StudyTask], jobs: int | None, stop: StudyStop
-) -> Outcomes:
-    """Outcomes of tasks on the cores of this machine; with `jobs` of 1 in this process."""
+def run_local(study: Study, tasks: Sequence[StudyTask], jobs: int | None, stop: StudyStop) -> Lines:
+    """Runs tasks on the cores of this machine; with `jobs` of 1 in this process."""
     import joblib
 
     jobs = min(jobs or joblib.cpu_count(), len(tasks))
-    if jobs > 1 and tasks:
+    if jobs > 1:
         yield from hand_out(Processes(jobs), study.sources, tasks, stop)
         return
     for task in tasks:
@@ -177,12 +175,11 @@ class Processes:
 
         threads = str(max(cpu_count() // self._number, 1))
         while True:
-            if self._pool is None:
-                self._pool = ProcessPoolExecutor(
-                    self._number,
-                    initializer=_ignore_interrupts,
-                    env={name: os.environ.get(name, threads) for name in THREADS},
-                )
+            self._pool = self._pool or ProcessPoolExecutor(
+                self._number,
+                initializer=partial(signal.signal, signal.SIGINT, signal.SIG_IGN),  # Ctrl-C
+                env={name: os.environ.get(name, threads) for name in THREADS},
+            )
             try:
                 return self._pool.submit(*call)
             except BrokenProcessPool:
@@ -194,11 +191,6 @@ class Processes:
     def close(self, out: list[Any]) -> None:
         if self._pool is not None:
             self._pool.shutdown(kill_workers=bool(out))
-
-
-def _ignore_interrupts() -> None:
-    """In a worker process: Ctrl-C reaches the whole terminal, and its task is to end."""
-    signal.signal(signal.SIGINT, signal.SIG_IGN)
 
 
 class ClusterLostError(ElastocalError):
@@ -213,17 +205,17 @@ def run_cluster(
     address: str,
     stop: StudyStop,
     tell: Callable[[str], None],
-    way: Way | None = None,
-) -> Outcomes:
-    """Outcomes of tasks on the Dask cluster at `address`, or that of Dask's configuration.
+    **way: Any,
+) -> Lines:
+    """Runs tasks on the Dask cluster at `address`, or that of Dask's configuration.
 
     Raises InputError where `connect` does, ClusterLostError where the scheduler goes away.
     """
     if tasks:
-        yield from hand_out(DaskWorkers(connect(address, way), tell), study.sources, tasks, stop)
+        yield from hand_out(DaskWorkers(connect(address, **way), tell), study.sources, tasks, stop)
 
 
-class DaskWorkers:
+class DaskWorkers(Processes):
     """The workers of a Dask cluster, which gives the tasks of a dead one to another.
 
     `distributed` itself rather than joblib's backend for it: each task has its own future, so
@@ -277,47 +269,42 @@ class DaskWorkers:
         )
 
 
-@dataclass(frozen=True)
-class Way:
-    """How a scheduler is reached: with the TLS files `ca`, `cert` and `key` (PEM), or those of
-    Dask's configuration; beyond this host only encrypted, unless `unencrypted` allows it.
+def _security(
+    distributed: ModuleType,
+    address: str,
+    tls_ca: Path | None = None,
+    tls_cert: Path | None = None,
+    tls_key: Path | None = None,
+    unencrypted: bool = False,
+) -> Any:
+    """Dask's Security for a client of `address`, with these TLS files (PEM) or those of Dask's
+    configuration.
 
     Whoever stands between could run code of their own here and there: tasks and results are
-    pickles.
+    pickles.  So another host is reached by TLS only, unless `unencrypted` allows it.
     """
-
-    ca: Path | None = None
-    cert: Path | None = None
-    key: Path | None = None
-    unencrypted: bool = False
-
-    def security(self, distributed: ModuleType, address: str) -> Any:
-        """Dask's Security for a client of `address`.
-
-        Raises InputError where a file is missing, or the address is another host's without TLS.
-        """
-        for name, path in (("tls_ca", self.ca), ("tls_cert", self.cert), ("tls_key", self.key)):
-            if path is not None:
-                read_bytes(path, f"file of {option(name)}", MOST_PEM_BYTES)
-        scheme, _, rest = address.rpartition("://")
-        host = rest.rsplit(":", 1)[0].strip("[]")
-        here = scheme == "inproc" or host == "localhost"
-        with suppress(ValueError):  # a name, which may lead anywhere
-            here = here or ip_address(host).is_loopback
-        require(
-            here or self.unencrypted or scheme in ("tls", "wss"),
-            f"{option('cluster', address)}: leads beyond this host and is not encrypted, so "
-            "whoever stands between could run code on both; use tls:// with "
-            f"{option('tls_ca')}, {option('tls_cert')} and {option('tls_key')}, a tunnel to this "
-            f"host, or allow it with {option('unencrypted', True)}",
-        )
-        files = {
-            "tls_ca_file": self.ca, "tls_client_cert": self.cert, "tls_client_key": self.key,
-        }  # fmt: skip
-        return distributed.Security(**{k: str(p) for k, p in files.items() if p is not None})
+    files = {"tls_ca": tls_ca, "tls_cert": tls_cert, "tls_key": tls_key}
+    for name, path in files.items():
+        if path is not None:
+            read_bytes(path, f"file of {option(name)}", MOST_PEM_BYTES)
+    scheme, _, rest = address.rpartition("://")
+    host = rest.rsplit(":", 1)[0].strip("[]")
+    here = scheme == "inproc" or host == "localhost"
+    with suppress(ValueError):  # a name, which may lead anywhere
+        here = here or ip_address(host).is_loopback
+    require(
+        here or unencrypted or scheme in ("tls", "wss"),
+        f"{option('cluster', address)}: leads beyond this host and is not encrypted, so "
+        "whoever stands between could run code on both; use tls:// with "
+        f"{option('tls_ca')}, {option('tls_cert')} and {option('tls_key')}, a tunnel to this "
+        f"host, or allow it with {option('unencrypted', True)}",
+    )
+    keys = ("tls_ca_file", "tls_client_cert", "tls_client_key")
+    stated = {k: str(p) for k, p in zip(keys, files.values(), strict=True) if p is not None}
+    return distributed.Security(**stated)
 
 
-def connect(address: str, way: Way | None = None) -> Any:
+def connect(address: str, **way: Any) -> Any:
     """Returns a client of the scheduler at `address`, or in Dask's configuration ("config").
 
     Raises InputError where distributed is not installed, the way there is not allowed, there is
@@ -333,7 +320,7 @@ def connect(address: str, way: Way | None = None) -> Any:
         "DASK_SCHEDULER_ADDRESS or scheduler-address, or give "
         f"{option('cluster', 'tcp://HOST:8786')}",
     )
-    security = (way or Way()).security(distributed, str(where))
+    security = _security(distributed, str(where), **way)
     # Its log lines tell of dead workers with tracebacks; what matters is told by the study.
     for name in [n for n in logging.root.manager.loggerDict if n.startswith("distributed")]:
         logging.getLogger(name).setLevel(logging.CRITICAL)
@@ -345,15 +332,15 @@ def connect(address: str, way: Way | None = None) -> Any:
             "start one for this host alone: dask scheduler"
         ) from None
     try:
-        found = client.run(_version)
-        wrong = [(worker, version) for worker, version in found.items() if version != __version__]
-        told = "".join(f"worker {worker} has elastocal {version}" for worker, version in wrong[:1])
+        versions = client.run(_version).items()
+        wrong = [f"worker {name} has elastocal {found}" for name, found in versions
+                 if found != __version__]  # fmt: skip
     except Exception as error:  # of the worker: whatever its Python lacks
-        told = f"a worker cannot import elastocal ({error})"
-    if told:
+        wrong = [f"a worker cannot import elastocal ({error})"]
+    if wrong:
         client.close()
         here = option("cluster", where)
-        raise InputError(f"{here}: {told}; install elastocal {__version__} there, as here")
+        raise InputError(f"{here}: {wrong[0]}; install elastocal {__version__} there, as here")
     return client
 
 
@@ -395,21 +382,22 @@ def run_study(
     *,
     jobs: int | None = None,
     cluster: str | None = None,
-    way: Way | None = None,
     only: int | None = None,
     restart: bool = False,
     retry_failed: bool = False,
     stop: StudyStop | None = None,
     progress: Callable[[int, int, int], None] = lambda total, ended, failed: None,
     tell: Callable[[str], None] = print,
-    runner: Callable[[Sequence[StudyTask]], Outcomes] | None = None,
+    runner: Callable[[Sequence[StudyTask]], Lines] | None = None,
+    **way: Any,
 ) -> Ending:
     """Run the tasks that have no result yet (of the first `only`) and record what comes.
 
     They run in `jobs` processes (by default one per core), on the Dask scheduler at `cluster`,
-    reached in this `way`, or as `runner` has it.  `restart` discards the results that are in the
-    folder `output`, `retry_failed` those that are errors; `progress` takes the number of tasks, of
-    those that ended and of those that failed.  However the run ends, what was done is written.
+    reached this `way` (tls_ca, tls_cert, tls_key, unencrypted), or as `runner` has it.  `restart`
+    discards the results in the folder `output`, `retry_failed` those that are errors; `progress`
+    takes the number of tasks, of those that ended and of those that failed.  However the run ends,
+    what was done is written.
 
     Raises InputError where the results in `output` are of another seed, source or task, or the
     cluster cannot be reached; ClusterLostError where the scheduler goes away.
@@ -417,7 +405,7 @@ def run_study(
     stop = stop or StudyStop()
     if runner is None and cluster is not None:
         dask_distributed()
-        runner = partial(run_cluster, study, address=cluster, stop=stop, tell=tell, way=way)
+        runner = partial(run_cluster, study, address=cluster, stop=stop, tell=tell, **way)
     elif runner is None:
         runner = partial(run_local, study, jobs=jobs, stop=stop)
     version = source_version()
@@ -425,7 +413,7 @@ def run_study(
         if restart:
             if cluster is not None:
                 # One that cannot be reached must not cost the results.
-                connect(cluster, way).close()
+                connect(cluster, **way).close()
             results.clear()
         failures = _known(study, results)
         if retry_failed and any(failures.values()):
@@ -438,11 +426,11 @@ def run_study(
         ended, failed = before, sum(failures.get(task.index, False) for task in wanted)
         progress(total, ended, failed)
         try:
-            with closing(runner(left)) as outcomes:
-                for outcome in outcomes:
+            with closing(runner(left)) as lines:
+                for line in lines:
                     stop.check()
-                    results.add(study.tasks[outcome.index], outcome, version)
-                    failed += outcome.error is not None
+                    results.add(line, version)
+                    failed += line["task_error"] is not None
                     ended += 1
                     progress(total, ended, failed)
         except KeyboardInterrupt:
