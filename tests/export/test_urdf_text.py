@@ -15,7 +15,8 @@ from support.exports import GEOMETRY, exported, write_result
 from support.robots import KR270, packaged_urdf
 
 from elastocal.errors import InputError
-from elastocal.export.urdf_file import Frames, read_urdf_text
+from elastocal.export.urdf_file import Frames
+from elastocal.model.xml_file import XmlText
 from elastocal.units import rpy_from_rotation
 
 ODD = """<?xml version='1.0'?>
@@ -32,17 +33,17 @@ ODD = """<?xml version='1.0'?>
 
 
 def text_of(tmp_path: Path, content: str | bytes):
-    path = tmp_path / "arm.urdf"
-    path.write_bytes(content if isinstance(content, bytes) else content.encode())
-    return read_urdf_text(path)
+    data = content if isinstance(content, bytes) else content.encode()
+    return XmlText(tmp_path / "arm.urdf", data)
 
 
 def test_an_origin_is_changed_where_it_stands(tmp_path: Path) -> None:
     text = text_of(tmp_path, ODD)
-    text.set_origin("q>1", {"xyz": "4 5 6", "rpy": "7 8 9"})
-    text.set_origin("q2", {"xyz": "1 1 1", "rpy": "2 2 2"})
-    text.set_child("q>1", "d")
-    text.append('<link name="d"/>')
+    joints = {tag.stated["name"]: tag for tag in text.tags[0].all("joint")}
+    text.set_in(joints["q>1"], "origin", {"xyz": "4 5 6", "rpy": "7 8 9"})
+    text.set_in(joints["q2"], "origin", {"xyz": "1 1 1", "rpy": "2 2 2"})
+    text.set_in(joints["q>1"], "child", {"link": "d"})
+    text.insert(text.end, '<link name="d"/>')
     expected = ODD.replace("rpy='0 0 0'\n       xyz=\"1 2 3\"", 'rpy="7 8 9"\n       xyz="4 5 6"')
     expected = expected.replace('<child\n     link="b"/>', '<child\n     link="d"/>')
     expected = expected.replace(

@@ -163,14 +163,3 @@ def test_unreadable_files_are_explained(tmp_path: Path) -> None:
     encoded.write_bytes(b'<?xml version="1.0" encoding="shift_jis"?><robot/>')
     with pytest.raises(InputError, match=r"not XML|has no <link>"):
         read_urdf(encoded)
-
-
-def test_pinocchio_failure_becomes_an_input_error(tmp_path: Path, monkeypatch) -> None:
-    import pinocchio as pin
-
-    def fail(text: str) -> None:
-        raise ValueError("bad tree")
-
-    monkeypatch.setattr(pin, "buildModelFromXML", fail)
-    with pytest.raises(InputError, match="pinocchio cannot read it: bad tree"):
-        read(tmp_path, arm())

@@ -28,7 +28,7 @@ from elastocal.export.exportable import (
 )
 from elastocal.export.joint_correction import JointCorrection
 from elastocal.export.mjcf_file import RIGID, MujocoRest, calibrated_mjcf
-from elastocal.export.mjcf_in_place import NotInPlace, corrected_mjcf, held_arm
+from elastocal.export.mjcf_in_place import HeldArm, NotInPlace, corrected_mjcf
 from elastocal.export.refit import Refit, refitted
 from elastocal.export.urdf_file import (
     BASE,
@@ -278,30 +278,25 @@ def _apart(found: Array, expected: Array, largest: float | None = LARGEST) -> fl
 
 
 def check_rest(
-    mjcf: Any,
+    at_rest: Callable[[Array, Array], Array],
     pieces: ExportNumbers,
     kept: Kept,
     T_world_base: Array,
-    names: list[str],
-    poses: int,
     seed: int,
 ) -> float:
     """Largest distance in m of flange and markers between MuJoCo at rest and the exported model.
 
-    `T_world_base` (4, 4) in the MJCF; `names` of the sites of `pieces.points`.
-
-    Raises InputError where MuJoCo is not installed, ElastocalError where they differ.
+    `at_rest`: `pieces.points` (k, 3) in the MJCF's world by commanded joints and force;
+    `T_world_base` (4, 4) there.  Raises ElastocalError where they differ.
     """
-    arm = MujocoRest(mjcf)
     part = kept.exported
-    table = random_table(kept.full.model, kept.conditions, poses, seed)
+    table = random_table(kept.full.model, kept.conditions, POSES_AT_REST, seed)
     placed = T_world_base @ np.linalg.inv(pieces.T_tracker_base)
     expected = placed @ part.model.flange_poses(table, part.x)
     worst = 0.0
     for q, force, T in zip(table.q, table.force, expected, strict=True):
         if np.isfinite(T).all():
-            found = arm.sites(q, force, names)
-            away = found - (pieces.points @ T[:3, :3].T + T[:3, 3])
+            away = at_rest(q, force) - (pieces.points @ T[:3, :3].T + T[:3, 3])
             worst = max(worst, float(np.linalg.norm(away, axis=1).max()))
     return _accepted(worst, LARGEST_AT_REST)
 
@@ -529,7 +524,8 @@ def _mjcf(calibrated: CalibratedArm, wish: Wish, kept: Kept, pieces: ExportNumbe
         return text, None, "", warnings, None
     names = ["flange", *(f"marker_{name}" for name in pieces.markers)]
     placed = pieces.T_tracker_base if wish.frames.base else np.eye(4)
-    distance = check_rest(text, pieces, kept, placed, names, POSES_AT_REST, wish.seed)
+    at_rest = partial(MujocoRest(text).sites, names=names)
+    distance = check_rest(at_rest, pieces, kept, placed, wish.seed)
     return text, distance, "MuJoCo, at rest under the load", warnings, None
 
 
@@ -543,8 +539,8 @@ def _corrected(calibrated: CalibratedArm, wish: Wish, kept: Kept, pieces: Export
     if pieces.masses and not cell.model.link_gravity:
         raise NotInPlace("weights were identified without those of the file (link_gravity = false)")
     text, warnings = corrected_mjcf(cell.robot, pieces, wish.frames.tool, _note(calibrated, kept))
-    arm, placed, names = held_arm(text, cell.robot, pieces)
-    distance = check_rest(arm, pieces, kept, placed, names, POSES_AT_REST, wish.seed)
+    arm = HeldArm(text, cell.robot, pieces)
+    distance = check_rest(arm, pieces, kept, arm.T_world_base, wish.seed)
     springs = [s for s in pieces.springs if s.compliance > 0]
     if springs and not pieces.masses:
         warnings.append(

@@ -21,6 +21,7 @@ from elastocal.model.chain import Chain, LinkMass
 from elastocal.model.effects.base import Format
 from elastocal.model.effects.catalogue import CATALOGUE
 from elastocal.model.effects.compliances import JointCompliance
+from elastocal.model.effects.placements import link_ends
 from elastocal.model.manipulator import Model
 from elastocal.model.symbolic import SymbolicArm
 from elastocal.model.urdf import urdf_bytes
@@ -49,6 +50,11 @@ def placed_body(name: str, T: Array) -> dict[str, str]:
 def origin_attributes(T: Array) -> dict[str, str]:
     """xyz and rpy of an <origin> for a transform (4, 4)."""
     return {"xyz": numbers(T[:3, 3]), "rpy": numbers(rpy_from_rotation(T[:3, :3]))}
+
+
+def nothing(T: Array) -> bool:
+    """Whether T (4, 4) differs from the identity by rounding alone."""
+    return bool(np.max(np.abs(T - np.eye(4))) < 4 * np.finfo(float).eps)
 
 
 # What of the calibrated model a file can hold, as a model of its own beside the full one.
@@ -219,6 +225,18 @@ class ExportNumbers:
     def points(self) -> Array:
         """(1 + markers, 3) m in the flange frame: its origin and the markers."""
         return np.array([np.zeros(3), *(T[:3, 3] for T in self.markers.values())])
+
+    def error(self, i: int) -> Array:
+        """E (4, 4) of link i (0-based): calibrated = nominal distal frame · E."""
+        nominal = link_ends(self.chain)[i]
+        if np.array_equal(nominal, self.links[i]):
+            return np.eye(4)
+        return np.asarray(np.linalg.solve(nominal, self.links[i]))
+
+    def correction(self, i: int) -> Array:
+        """E_{i−1} J_i(a_i) (4, 4) of joint i (0-based)."""
+        offset = self.offset_motion(i)
+        return offset if i == 0 else self.error(i - 1) @ offset
 
     def placement(self, i: int) -> Array:
         """Joint i's frame (0-based) in the frame before it, without its offset."""

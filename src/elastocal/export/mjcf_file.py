@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from typing import Any
 from xml.etree import ElementTree as ET
 
@@ -254,16 +254,12 @@ DIFFERENCE_STEP = 1e-6  # rad or m
 
 
 class MujocoRest:
-    """An exported MJCF in MuJoCo, as text or as MuJoCo's model of it.
+    """An exported MJCF in MuJoCo.  Raises InputError where MuJoCo is missing or refuses it."""
 
-    Raises InputError where MuJoCo is missing or refuses it.
-    """
-
-    def __init__(self, mjcf: Any) -> None:
+    def __init__(self, text: str) -> None:
         self._mujoco = mujoco = import_mujoco("the check")
         try:
-            text = isinstance(mjcf, str)
-            self.model = mujoco.MjModel.from_xml_string(mjcf) if text else mjcf
+            self.model = mujoco.MjModel.from_xml_string(text)
         except ValueError as error:
             raise InputError(f"MuJoCo refuses the exported MJCF: {error}") from None
         self._data = mujoco.MjData(self.model)
@@ -272,7 +268,7 @@ class MujocoRest:
         self._driven = [
             int(self.model.jnt_dofadr[self.model.actuator_trnid[k, 0]]) for k in self._drives
         ]
-        stiffness = np.array(self.model.jnt_stiffness, dtype=float).reshape(self.model.nv, -1)[:, 0]
+        stiffness = joint_stiffness(self.model)
         stiffness[self._driven] = self.model.actuator_gainprm[self._drives, 0]
         self._compliance = 1.0 / stiffness
 
@@ -289,19 +285,8 @@ class MujocoRest:
         self._data.ctrl[:] = control
         x = np.zeros(self.model.nv)
         x[self._driven] = q
-        for _ in range(MAX_STEPS):
-            r = self._residual(x)
-            h = DIFFERENCE_STEP * np.eye(len(x))
-            apart = [self._residual(x + dx) - self._residual(x - dx) for dx in h]
-            slope = np.column_stack(apart) / (2 * DIFFERENCE_STEP)
-            step = np.linalg.solve(slope, r)
-            x = x - step
-            if not np.isfinite(x).all():
-                break
-            if np.max(np.abs(step)) < TOLERANCE:
-                self._residual(x)
-                return np.array([self._data.site(name).xpos.copy() for name in names])
-        raise ElastocalError(f"MuJoCo finds no rest of the exported arm near q = {q.tolist()}")
+        settle(self._residual, x, q)
+        return np.array([self._data.site(name).xpos.copy() for name in names])
 
     def _residual(self, x: Array) -> Array:
         data = self._data
@@ -312,3 +297,27 @@ class MujocoRest:
         self._mujoco.mj_fwdActuation(self.model, data)
         force = data.qfrc_passive + data.qfrc_actuator - data.qfrc_bias
         return np.asarray(self._compliance * force)
+
+
+def joint_stiffness(model: Any) -> Array:
+    """(joints,) N m/rad or N/m; newer MuJoCo states more than the linear term."""
+    return np.array(model.jnt_stiffness, dtype=float).reshape(model.njnt, -1)[:, 0]
+
+
+def settle(residual: Callable[[Array], Array], x: Array, q: Array) -> None:
+    """Find where `residual` of joints (n,) is zero, from x on, and evaluate it there last.
+
+    Raises ElastocalError, which names the commanded q, where there is no such place.
+    """
+    for _ in range(MAX_STEPS):
+        r = residual(x)
+        h = DIFFERENCE_STEP * np.eye(len(x))
+        slope = np.array([residual(x + dx) - residual(x - dx) for dx in h]).reshape(h.shape).T
+        step = np.linalg.solve(slope / (2 * DIFFERENCE_STEP), r)
+        x = x - step
+        if not np.isfinite(x).all():
+            break
+        if np.max(np.abs(step), initial=0.0) < TOLERANCE:
+            residual(x)
+            return
+    raise ElastocalError(f"MuJoCo finds no rest of the exported arm near q = {q.tolist()}")

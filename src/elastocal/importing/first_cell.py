@@ -29,7 +29,8 @@ from elastocal.model.joint_names import clashing, names_told
 from elastocal.model.mjcf import MjcfArm
 from elastocal.model.plausible import jaw_told
 from elastocal.model.rigid import nominal_flanges
-from elastocal.model.urdf import MOVING, check_urdf, xacro_left
+from elastocal.model.urdf import MOVING, check_urdf
+from elastocal.model.xml_file import xacro_left
 from elastocal.text import listed, printable
 from elastocal.units import Array, rpy_from_rotation
 

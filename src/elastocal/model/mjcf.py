@@ -32,7 +32,8 @@ from elastocal.model.effects.loads import STANDARD_GRAVITY
 from elastocal.model.mjcf_bounds import check_bounds
 from elastocal.model.mjcf_loops import check_open, ties_of
 from elastocal.model.plausible import check_angles
-from elastocal.model.urdf import MAX_BYTES, MOST_IN_A_FINGER, as_utf8, xml_tree
+from elastocal.model.urdf import MAX_BYTES, MOST_IN_A_FINGER
+from elastocal.model.xml_file import as_utf8, xml_tree
 from elastocal.text import did_you_mean, listed, printable
 from elastocal.units import Array
 

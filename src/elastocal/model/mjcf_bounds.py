@@ -21,7 +21,8 @@ from xml.etree import ElementTree as ET
 
 from elastocal.errors import InputError, require
 from elastocal.files import check_regular, check_size, open_input, read_bytes
-from elastocal.model.urdf import MAX_BYTES, xml_tree
+from elastocal.model.urdf import MAX_BYTES
+from elastocal.model.xml_file import xml_tree
 from elastocal.text import printable, quoted
 
 # A humanoid with hands and keyframes has 1500.  MuJoCo's compiler takes 1 s for so many bodies with

@@ -1,4 +1,4 @@
-"""URDF → nominal chain: what is wrong with the file is said by name; Pinocchio reads the rest.
+"""URDF → nominal chain: what is wrong with the file is said by name.
 
 Only what kinematics and weights need is read: links with mass and centre of mass, joints with
 parent, child, origin, axis and limits.  Meshes, materials, plugins and transmissions are ignored.
@@ -6,11 +6,10 @@ parent, child, origin, axis and limits.  Meshes, materials, plugins and transmis
 
 from __future__ import annotations
 
-import codecs
 import math
 import re
 import xml.etree.ElementTree as ET
-from collections.abc import Collection, Iterator, Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from functools import cached_property
 from pathlib import Path
@@ -19,10 +18,11 @@ from typing import Any
 import numpy as np
 
 from elastocal.errors import InputError, require
-from elastocal.files import DEEPEST, read_bytes
+from elastocal.files import read_bytes
 from elastocal.model.chain import MAX_JOINTS, MIN_JOINTS, Chain, Joint, JointKind, LinkMass
 from elastocal.model.plausible import FINGERS, check_angles
-from elastocal.text import SHOWN, did_you_mean, listed, printable
+from elastocal.model.xml_file import xacro_left, xml_tree
+from elastocal.text import did_you_mean, listed
 from elastocal.units import Array
 
 Vector = tuple[float, float, float]
@@ -34,7 +34,6 @@ FLANGES = ("tool0", "flange", "ee_link", "tcp")
 MOST_IN_A_FINGER = 5  # joints
 # Links that `elastocal export` hangs on a flange; none of them is a flange itself.
 TOOL_FRAMES = ("elastocal_marker_", "elastocal_load_point")
-ENDLESS = 1e9  # rad or m, in what pinocchio reads
 MAX_BYTES = 10_000_000
 MOST_LINKS = 2000
 ENDLESS_TEXT = re.compile(r"([+-]?)\.?inf(?:inity)?", re.IGNORECASE)
@@ -52,13 +51,7 @@ def read_urdf(path: str | Path, base: str | None = None, flange: str | None = No
     per joint in kg with its centre of mass in m in the joint's frame (none if all are zero).
     Bodies beyond the flange and on side branches count, those carried by the base do not.
 
-    Everything off the path from base to flange is held still: those joints become fixed at their
-    neutral position, so that pinocchio merges their bodies into the joint on the path that carries
-    them.  With X_i pinocchio's placement of joint i in its parent joint, the chain is
-
-        T_base_flange(q) = (T_p0_base)⁻¹ X_1 J_1(q_1) X_2 J_2(q_2) … X_n J_n(q_n) T_n_flange
-
-    where p0 is the (immobile) joint frame that carries the base link.
+    Everything off the path from base to flange is held at zero.
 
     Raises InputError, naming file, element and remedy, for anything `check_urdf` or `Tree` refuses.
     """
@@ -66,87 +59,16 @@ def read_urdf(path: str | Path, base: str | None = None, flange: str | None = No
     base = tree.root if base is None else tree.find_link("base", base)
     flange = tree.only_flange(base) if flange is None else tree.find_link("flange", flange)
     moving = tree.serial_chain(base, flange)
-    read = _read_by_pinocchio(tree, [joint.name for joint in moving], base, flange)
+    placements, end = tree.frames(base, flange)
     joints = []
-    for source, placement, (along, about) in zip(
-        moving, read["placements"], read["subspaces"], strict=True
-    ):
+    for source, placement in zip(moving, placements, strict=True):
+        kind: JointKind = "prismatic" if source.kind == "prismatic" else "revolute"
         limits = source.limit or (-np.inf, np.inf)
-        slides = source.kind == "prismatic"
-        kind: JointKind = "prismatic" if slides else "revolute"
-        joints.append(Joint(source.name, kind, placement, along if slides else about, *limits))
-    masses = tuple(map(LinkMass, read["masses"].tolist(), read["levers"]))
+        joints.append(Joint(source.name, kind, placement, np.array(source.axis), *limits))
+    masses = tree.carried(moving)
     return Chain(
-        tree.name, tuple(joints), read["flange"],
-        masses if any(body.mass > 0 for body in masses) else (),
-    )  # fmt: skip
-
-
-def _read_by_pinocchio(tree: Tree, moving: list[str], base: str, flange: str) -> dict[str, Array]:
-    """`placements` (n, 4, 4) and `subspaces` (n, 2, 3), linear and angular, of the `moving` joints,
-    `masses` (n,) and `levers` (n, 3) of what each carries, and `flange` (4, 4)."""
-    model = _pinocchio_model(tree, moving)
-    placements = [placement.homogeneous for placement in model.jointPlacements[1:]]
-    placements[0] = _link_placement(model, base).inverse().homogeneous @ placements[0]
-    # The motion subspace is (linear, angular) for every pinocchio joint, aligned or not, also
-    # for unbounded ones that store (cos q, sin q).
-    motions = list(model.createData().joints)[1:]
-    bodies = list(model.inertias)[1:]
-    return {
-        "placements": np.array(placements),
-        "subspaces": np.array([np.asarray(joint.S).reshape(2, 3) for joint in motions]),
-        "masses": np.array([body.mass for body in bodies]),
-        "levers": np.array([body.lever for body in bodies]),
-        "flange": _link_placement(model, flange).homogeneous,
-    }
-
-
-def _link_placement(model: Any, link: str) -> Any:
-    import pinocchio as pin
-
-    return model.frames[model.getFrameId(link, pin.FrameType.BODY)].placement
-
-
-def _pinocchio_model(tree: Tree, expected: list[str]) -> Any:
-    import pinocchio as pin
-
-    try:
-        model = pin.buildModelFromXML(_skeleton(tree, expected))
-    except Exception as error:  # pinocchio raises ValueError, RuntimeError and its own
-        raise InputError(f"{tree.path}: pinocchio cannot read it: {error}") from error
-    found = list(model.names)[1:]
-    require(
-        found == expected and list(model.parents)[1:] == list(range(len(found))),
-        f"{tree.path}: pinocchio reads the joints {found} as something else than the serial "
-        f"chain {expected}; simplify the URDF",
+        tree.name, tuple(joints), end, masses if any(body.mass > 0 for body in masses) else ()
     )
-    return model
-
-
-def _skeleton(tree: Tree, moving: Collection[str]) -> str:
-    """URDF text with links, masses and joints only; joints not in `moving` are fixed."""
-    robot = ET.Element("robot", name=tree.name)
-
-    def text(vector: Sequence[float] | Array) -> str:
-        return " ".join(repr(float(value)) for value in vector)
-
-    for name, body in tree.links.items():
-        inertial = ET.SubElement(ET.SubElement(robot, "link", name=name), "inertial")
-        ET.SubElement(inertial, "mass", value=repr(body.mass))
-        ET.SubElement(inertial, "origin", xyz=text(body.com))
-        zero = dict.fromkeys(("ixx", "ixy", "ixz", "iyy", "iyz", "izz"), "0")
-        ET.SubElement(inertial, "inertia", zero)
-    for joint in tree.joints.values():
-        kind = joint.kind if joint.name in moving else "fixed"
-        element = ET.SubElement(robot, "joint", name=joint.name, type=kind)
-        ET.SubElement(element, "parent", link=joint.parent)
-        ET.SubElement(element, "child", link=joint.child)
-        ET.SubElement(element, "origin", xyz=text(joint.xyz), rpy=text(joint.rpy))
-        ET.SubElement(element, "axis", xyz=text(joint.axis))
-        if kind != "fixed" and joint.limit is not None:
-            lower, upper = (repr(min(max(end, -ENDLESS), ENDLESS)) for end in joint.limit)
-            ET.SubElement(element, "limit", lower=lower, upper=upper, effort="0", velocity="0")
-    return ET.tostring(robot, encoding="unicode")
 
 
 # The tree of links and joints in a URDF, and the one path through it from base to flange.
@@ -336,6 +258,34 @@ class Tree:
             T = T @ joint.origin
         return T
 
+    def frames(self, base: str, flange: str) -> tuple[list[Array], Array]:
+        """Of each moving joint its frame in the one before it, the first in the base's, and the
+        flange's in the last (4, 4)."""
+        placements, T = [], np.eye(4)
+        for joint in self.joints_between(base, flange) or ():
+            T = T @ joint.origin
+            if joint.kind in MOVING:
+                placements.append(T)
+                T = np.eye(4)
+        return placements, T
+
+    def carried(self, moving: Sequence[UrdfJoint]) -> tuple[LinkMass, ...]:
+        """What each of the joints carries up to the next of them, in its frame."""
+        own = {joint.child: k for k, joint in enumerate(moving)}
+        mass, moment = np.zeros(len(moving)), np.zeros((len(moving), 3))
+        for name, body in self.links.items():
+            T, link = np.eye(4), name
+            while link not in own and link != self.root:
+                joint = self.parent_joint[link]
+                T, link = joint.origin @ T, joint.parent
+            if link in own:
+                mass[own[link]] += body.mass
+                moment[own[link]] += body.mass * (T @ [*body.com, 1.0])[:3]
+        return tuple(
+            LinkMass(float(m), s / m if m > 0 else np.zeros(3))
+            for m, s in zip(mass, moment, strict=True)
+        )
+
     def _moving(self, base: str, flange: str) -> list[UrdfJoint]:
         return [j for j in self.joints_between(base, flange) or () if j.kind in MOVING]
 
@@ -423,127 +373,9 @@ def check_urdf(path: str | Path) -> Tree:
     return Tree(path, root.get("name") or path.stem, links, joints)
 
 
-def xml_tree(path: Path, data: bytes, what: str) -> ET.Element:
-    """The elements of an XML file; `what` it should be ("a URDF") stands in messages.
-
-    Raises InputError for what is not XML, nests too deep, declares entities or has xacro macros.
-    """
-    start = data[:300].lstrip(b"\xef\xbb\xbf \t\r\n").lower()
-    require(
-        not start.startswith(b"version https://git-lfs"),
-        f"{path}: is a pointer of Git LFS, not {what}; run git lfs pull, or download the file",
-    )
-    require(
-        not start.startswith((b"<!doctype html", b"<html")),
-        f"{path}: is a web page, not {what}; download the file itself (on GitHub: Raw)",
-    )
-    try:
-        return ET.fromstring(data, ET.XMLParser(target=_Bounded(path, what)))
-    except ET.ParseError as error:
-        if "unbound prefix" in str(error) and b"<xacro:" in data:
-            raise InputError(xacro_left(path, "<xacro:…> elements")) from None
-        line, column = error.position
-        reason = (
-            _around(data)
-            or _undeclared(data)
-            or (
-                f"{str(error).split(': line')[0]} in line {line}, column {column + 1}; {what} is "
-                "an XML file"
-            )
-        )
-        raise InputError(f"{path}: not XML: {reason}") from None
-    except (LookupError, ValueError) as error:
-        raise InputError(f"{path}: not XML: {error}; save it as UTF-8") from None
-
-
-def _around(data: bytes) -> str:
-    """What to say of text before or after the elements, "" where there is none."""
-    head = re.search(rb"<\?xml\b|<(?:robot|mujoco)\b", data)
-    before = data[: head.start()].removeprefix(b"\xef\xbb\xbf") if head else b""
-    if before.strip() or (before and head is not None and head[0] == b"<?xml"):
-        first = printable(before.strip().decode("utf-8", "replace").partition("\n")[0][:SHOWN])
-        told = f"'{first}' stands" if first else "blanks stand"
-        return f"{told} before {'<?xml …?>' if head and head[0] == b'<?xml' else 'it'}; remove that"
-    tail = re.search(rb"</(?:robot|mujoco)\s*>", data)
-    after = data[tail.end() :] if tail else b""
-    if re.sub(rb"<!--.*?-->", b"", after, flags=re.DOTALL).strip():
-        first = printable(after.strip().decode("utf-8", "replace").partition("\n")[0][:SHOWN])
-        return f"'{first}' stands after the end of the robot; remove that"
-    return ""
-
-
-def _undeclared(data: bytes) -> str:
-    """What to say of bytes that are no UTF-8 in a file that declares no encoding, else ""."""
-    if data.startswith(UTF16) or DECLARATION.search(data[:200].decode("ascii", "replace")):
-        return ""
-    try:
-        data.decode("utf-8")
-    except UnicodeDecodeError as error:
-        line = data.count(b"\n", 0, error.start) + 1
-        return (
-            f"line {line} has the byte 0x{data[error.start]:02x}, which is not UTF-8, and no "
-            'encoding is declared; save it as UTF-8, or declare it: <?xml version="1.0" '
-            'encoding="latin-1"?>'
-        )
-    return ""
-
-
-UTF16 = (codecs.BOM_UTF16_LE, codecs.BOM_UTF16_BE)
-DECLARATION = re.compile(r"""(<\?xml[^>]*?\bencoding\s*=\s*)("[^"]*"|'[^']*')""")
-
-
-def as_utf8(path: Path, data: bytes) -> bytes:
-    """An XML file's content as UTF-8, its declaration with it.
-
-    Raises InputError where it cannot be decoded.
-    """
-    if data.startswith(UTF16):
-        name = "utf-16"
-    else:
-        declared = DECLARATION.search(data[:200].decode("ascii", "replace"))
-        name = declared.group(2).strip("\"'") if declared else "utf-8"
-    if name.lower() in ("utf-8", "utf8"):
-        return data
-    try:
-        text = data.decode(name)
-    except (LookupError, UnicodeDecodeError) as error:
-        raise InputError(f"{path}: cannot be read as {name} ({error}); save it as UTF-8") from None
-    return DECLARATION.sub(r'\g<1>"UTF-8"', text, count=1).encode("utf-8")
-
-
 def urdf_bytes(path: Path) -> bytes:
     """The content of a URDF file.  Raises InputError where it cannot be read or is too large."""
     return read_bytes(path, "URDF file", MAX_BYTES)
-
-
-class _Bounded(ET.TreeBuilder):
-    """The tree of a file that nests no deeper than a robot does and declares no entities.
-
-    A parser that calls itself, as those of other libraries do, would end with the stack.
-    """
-
-    def __init__(self, path: Path, what: str) -> None:
-        super().__init__()
-        self._path, self._what, self._depth = path, what, 0
-
-    def start(self, tag: Any, attributes: Any) -> Any:
-        """As inherited; raises InputError beyond DEEPEST."""
-        self._depth += 1
-        require(
-            self._depth <= DEEPEST,
-            f"{self._path}: <{printable(tag)}> is nested more than {DEEPEST} deep, which no robot "
-            "needs",
-        )
-        return super().start(tag, attributes)
-
-    def end(self, tag: str) -> Any:
-        """As inherited."""
-        self._depth -= 1
-        return super().end(tag)
-
-    def doctype(self, name: str, public: str | None, system: str | None) -> None:
-        """Raise InputError: entities may stand for more text than memory holds."""
-        raise InputError(f"{self._path}: has a <!DOCTYPE>, which {self._what} does not; remove it")
 
 
 def _without_namespace(path: Path, root: ET.Element) -> ET.Element:
@@ -563,15 +395,6 @@ def _without_namespace(path: Path, root: ET.Element) -> ET.Element:
         f'{path}: the root element is <{root.tag}>, a URDF has <robot name="…">{hint}',
     )
     return root
-
-
-def xacro_left(path: Path, what: str) -> str:
-    """The message that `what` of the file shows that it is still to be expanded."""
-    plain = path.name.removesuffix(".xacro")
-    plain = plain if plain.endswith(".urdf") and plain != path.name else "expanded.urdf"
-    return (
-        f"{path}: xacro macros are left in ({what}); run xacro first: xacro {path.name} > {plain}"
-    )
 
 
 def _name(path: Path, element: ET.Element, known: Mapping[str, Any]) -> str:

@@ -387,5 +387,5 @@ def _plain(name: str, value: Any, unit: str) -> Any:
         raise TypeError(f"column {name!r} takes {takes}; found {type(value).__name__}")
     if value is None or made is not float:
         return None if value is None else made(value)
-    number = float(value)
+    number = made(value)
     return None if math.isnan(number) else number if math.isfinite(number) else str(number)

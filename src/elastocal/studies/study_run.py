@@ -405,7 +405,8 @@ def run_study(
     stop = stop or StudyStop()
     if runner is None and cluster is not None:
         dask_distributed()
-        runner = partial(run_cluster, study, address=cluster, stop=stop, tell=tell, **way)
+        address = cluster
+        runner = lambda left: run_cluster(study, left, address, stop, tell, **way)  # noqa: E731
     elif runner is None:
         runner = partial(run_local, study, jobs=jobs, stop=stop)
     version = source_version()

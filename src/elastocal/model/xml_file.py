@@ -1,0 +1,268 @@
+"""An XML file: read with what is wrong said plainly, and edited so that all else stays to the byte.
+
+An XML library would write the whole file anew: other quotes, no comments before the root, other
+white space.  Here a parser only says where the start tags stand; the text between is not touched.
+"""
+
+from __future__ import annotations
+
+import codecs
+import re
+import xml.etree.ElementTree as ET
+from collections.abc import Collection, Mapping
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Any
+from xml.parsers import expat
+from xml.sax.saxutils import quoteattr
+
+from elastocal.errors import InputError, require
+from elastocal.files import DEEPEST
+from elastocal.text import SHOWN, printable
+
+UTF16 = (codecs.BOM_UTF16_LE, codecs.BOM_UTF16_BE)
+DECLARATION = re.compile(r"""(<\?xml[^>]*?\bencoding\s*=\s*)("[^"]*"|'[^']*')""")
+END_OF_TAG = re.compile(rb"""(?:[^"'>]|"[^"]*"|'[^']*')*>""")  # a > in quotes is none
+
+
+def xml_tree(path: Path, data: bytes, what: str) -> ET.Element:
+    """The elements of an XML file; `what` it should be ("a URDF") stands in messages.
+
+    Raises InputError for what is not XML, nests too deep, declares entities or has xacro macros.
+    """
+    start = data[:300].lstrip(b"\xef\xbb\xbf \t\r\n").lower()
+    require(
+        not start.startswith(b"version https://git-lfs"),
+        f"{path}: is a pointer of Git LFS, not {what}; run git lfs pull, or download the file",
+    )
+    require(
+        not start.startswith((b"<!doctype html", b"<html")),
+        f"{path}: is a web page, not {what}; download the file itself (on GitHub: Raw)",
+    )
+    try:
+        return ET.fromstring(data, ET.XMLParser(target=_Bounded(path, what)))
+    except ET.ParseError as error:
+        if "unbound prefix" in str(error) and b"<xacro:" in data:
+            raise InputError(xacro_left(path, "<xacro:…> elements")) from None
+        line, column = error.position
+        reason = (
+            _around(data)
+            or _undeclared(data)
+            or (
+                f"{str(error).split(': line')[0]} in line {line}, column {column + 1}; {what} is "
+                "an XML file"
+            )
+        )
+        raise InputError(f"{path}: not XML: {reason}") from None
+    except (LookupError, ValueError) as error:
+        raise InputError(f"{path}: not XML: {error}; save it as UTF-8") from None
+
+
+def _around(data: bytes) -> str:
+    """What to say of text before or after the elements, "" where there is none."""
+    head = re.search(rb"<\?xml\b|<(?:robot|mujoco)\b", data)
+    before = data[: head.start()].removeprefix(b"\xef\xbb\xbf") if head else b""
+    if before.strip() or (before and head is not None and head[0] == b"<?xml"):
+        first = printable(before.strip().decode("utf-8", "replace").partition("\n")[0][:SHOWN])
+        told = f"'{first}' stands" if first else "blanks stand"
+        return f"{told} before {'<?xml …?>' if head and head[0] == b'<?xml' else 'it'}; remove that"
+    tail = re.search(rb"</(?:robot|mujoco)\s*>", data)
+    after = data[tail.end() :] if tail else b""
+    if re.sub(rb"<!--.*?-->", b"", after, flags=re.DOTALL).strip():
+        first = printable(after.strip().decode("utf-8", "replace").partition("\n")[0][:SHOWN])
+        return f"'{first}' stands after the end of the robot; remove that"
+    return ""
+
+
+def _undeclared(data: bytes) -> str:
+    """What to say of bytes that are no UTF-8 in a file that declares no encoding, else ""."""
+    if data.startswith(UTF16) or DECLARATION.search(data[:200].decode("ascii", "replace")):
+        return ""
+    try:
+        data.decode("utf-8")
+    except UnicodeDecodeError as error:
+        line = data.count(b"\n", 0, error.start) + 1
+        return (
+            f"line {line} has the byte 0x{data[error.start]:02x}, which is not UTF-8, and no "
+            'encoding is declared; save it as UTF-8, or declare it: <?xml version="1.0" '
+            'encoding="latin-1"?>'
+        )
+    return ""
+
+
+def as_utf8(path: Path, data: bytes) -> bytes:
+    """An XML file's content as UTF-8, its declaration with it.
+
+    Raises InputError where it cannot be decoded.
+    """
+    if data.startswith(UTF16):
+        name = "utf-16"
+    else:
+        declared = DECLARATION.search(data[:200].decode("ascii", "replace"))
+        name = declared.group(2).strip("\"'") if declared else "utf-8"
+    if name.lower() in ("utf-8", "utf8"):
+        return data
+    try:
+        text = data.decode(name)
+    except (LookupError, UnicodeDecodeError) as error:
+        raise InputError(f"{path}: cannot be read as {name} ({error}); save it as UTF-8") from None
+    return DECLARATION.sub(r'\g<1>"UTF-8"', text, count=1).encode("utf-8")
+
+
+class _Bounded(ET.TreeBuilder):
+    """The tree of a file that nests no deeper than a robot does and declares no entities.
+
+    A parser that calls itself, as those of other libraries do, would end with the stack.
+    """
+
+    def __init__(self, path: Path, what: str) -> None:
+        super().__init__()
+        self._path, self._what, self._depth = path, what, 0
+
+    def start(self, tag: Any, attributes: Any) -> Any:
+        """As inherited; raises InputError beyond DEEPEST."""
+        self._depth += 1
+        require(
+            self._depth <= DEEPEST,
+            f"{self._path}: <{printable(tag)}> is nested more than {DEEPEST} deep, which no robot "
+            "needs",
+        )
+        return super().start(tag, attributes)
+
+    def end(self, tag: str) -> Any:
+        """As inherited."""
+        self._depth -= 1
+        return super().end(tag)
+
+    def doctype(self, name: str, public: str | None, system: str | None) -> None:
+        """Raise InputError: entities may stand for more text than memory holds."""
+        raise InputError(f"{self._path}: has a <!DOCTYPE>, which {self._what} does not; remove it")
+
+
+def xacro_left(path: Path, what: str) -> str:
+    """The message that `what` of the file shows that it is still to be expanded."""
+    plain = path.name.removesuffix(".xacro")
+    plain = plain if plain.endswith(".urdf") and plain != path.name else "expanded.urdf"
+    return (
+        f"{path}: xacro macros are left in ({what}); run xacro first: xacro {path.name} > {plain}"
+    )
+
+
+@dataclass(eq=False)
+class Tag:
+    """A start tag: its name without prefix, its offset in bytes, what it states, the tags that
+    stand in it and the one that it stands in."""
+
+    name: str
+    start: int
+    stated: dict[str, str]
+    above: Tag | None
+    inside: list[Tag] = field(default_factory=list)
+
+    def all(self, *names: str) -> list[Tag]:
+        """Tags of these names that stand directly in this one."""
+        return [tag for tag in self.inside if tag.name in names]
+
+    def first(self, name: str) -> Tag | None:
+        return next(iter(self.all(name)), None)
+
+    def within(self, name: str) -> bool:
+        """Whether it stands in a tag of this name, however deep."""
+        return self.above is not None and (self.above.name == name or self.above.within(name))
+
+
+class XmlText:
+    """The text of an XML file that is known to be right, and the edits to make in it.
+
+    `tags` in the order of the file, the root first; `end`: where the root's end tag starts.
+    """
+
+    def __init__(self, path: Path, data: bytes) -> None:
+        self.data = as_utf8(path, data)
+        self.tags: list[Tag] = []
+        self.end = len(self.data)
+        self._inserted: list[tuple[int, int, bytes]] = []
+        self._changed: dict[int, dict[str, str | None]] = {}
+        parser = expat.ParserCreate()
+        open_: list[Tag] = []
+
+        def start(name: str, stated: dict[str, str]) -> None:
+            above = open_[-1] if open_ else None
+            tag = Tag(name.rpartition(":")[2], parser.CurrentByteIndex, stated, above)
+            self.tags.append(tag)
+            open_.append(tag)
+            if above is not None:
+                above.inside.append(tag)
+
+        def end(name: str) -> None:
+            open_.pop()
+            if not open_:
+                self.end = parser.CurrentByteIndex
+
+        parser.StartElementHandler, parser.EndElementHandler = start, end
+        parser.Parse(self.data, True)
+
+    def insert(self, at: int, text: str) -> None:
+        """Put text at an offset, behind what was put there before."""
+        self._inserted.append((at, at, text.encode("utf-8")))
+
+    def insert_in(self, tag: Tag, text: str) -> None:
+        """Put text where the content of an element begins."""
+        self.insert(self._end(tag.start), text)
+
+    def remove(self, tag: Tag) -> None:
+        """Take out an empty element."""
+        self._inserted.append((tag.start, self._end(tag.start), b""))
+
+    def set(self, tag: Tag, stated: Mapping[str, str], without: Collection[str] = ()) -> None:
+        """Let the tag state this, and no longer what `without` names."""
+        self._changed.setdefault(tag.start, {}).update(dict.fromkeys(without) | dict(stated))
+
+    def set_in(self, tag: Tag, name: str, stated: Mapping[str, str]) -> None:
+        """Let the first `name` in an element state this, where there is none a new one."""
+        inside = tag.first(name)
+        if inside is None:
+            self.insert_in(tag, element(name, stated))
+        else:
+            self.set(inside, stated)
+
+    def result(self) -> str:
+        """The text with all edits made."""
+        parts, last = [], 0
+        changed = [self._edit(start, stated) for start, stated in self._changed.items()]
+        for start, end, new in sorted([*self._inserted, *changed], key=lambda edit: edit[:2]):
+            parts += [self.data[last:start], new]
+            last = end
+        return b"".join([*parts, self.data[last:]]).decode("utf-8")
+
+    def _end(self, start: int) -> int:
+        found = END_OF_TAG.match(self.data, start)
+        assert found, "a parsed tag ends"
+        return found.end()
+
+    def _edit(self, start: int, stated: Mapping[str, str | None]) -> tuple[int, int, bytes]:
+        end = self._end(start)
+        tag = self.data[start:end].decode("utf-8")
+        for name, value in stated.items():
+            pattern = re.compile(rf"""(\s{name}\s*=\s*)("[^"]*"|'[^']*')""")
+            found = pattern.search(tag)
+            if value is None:
+                tag = pattern.sub("", tag)
+            elif found is not None:
+                tag = tag[: found.start(2)] + quoteattr(value) + tag[found.end(2) :]
+            else:
+                body = tag[:-1].rstrip().removesuffix("/").rstrip()
+                closing = "/>" if tag.endswith("/>") else ">"
+                tag = f"{body} {name}={quoteattr(value)}{closing}"
+        return start, end, tag.encode("utf-8")
+
+
+def element(tag: str, stated: Mapping[str, str], *inside: str) -> str:
+    """An element as text."""
+    head = f"<{tag}{''.join(f' {k}={quoteattr(v)}' for k, v in stated.items())}"
+    return f"{head}>{''.join(inside)}</{tag}>" if inside else f"{head}/>"
+
+
+def comment(text: str) -> str:
+    """A comment of this text, in which two hyphens would end it."""
+    return f"<!-- {text.replace('--', '- -').rstrip('-')} -->"
