@@ -385,7 +385,7 @@ def _plain(name: str, value: Any, unit: str) -> Any:
     is_bool = isinstance(value, bool | np.bool_)
     if value is not None and not (isinstance(value, accepted) and is_bool == (made is bool)):
         raise TypeError(f"column {name!r} takes {takes}; found {type(value).__name__}")
-    if value is None or made is not float:
-        return None if value is None else made(value)
-    number = made(value)
-    return None if math.isnan(number) else number if math.isfinite(number) else str(number)
+    kept: Any = None if value is None else made(value)
+    if made is not float or kept is None or math.isfinite(kept):
+        return kept
+    return None if math.isnan(kept) else str(kept)
