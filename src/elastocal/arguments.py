@@ -12,17 +12,18 @@ from __future__ import annotations
 
 import functools
 import inspect
+import math
 import re
 from collections.abc import Callable, Collection, Mapping, Sequence
+from numbers import Integral, Real
 from pathlib import Path
 from typing import Any, TypeVar
-
-import numpy as np
-from numpy.typing import NDArray
 
 from elastocal.above import Saved
 from elastocal.errors import InputError, option, require
 from elastocal.text import did_you_mean, listed, quoted
+
+# numpy is loaded where a value is looked at: the command line reads the kinds alone, for --help.
 
 MOST = 10_000_000  # of anything that is counted: more is a slip of the key
 # No length, angle, force, stiffness or compliance in SI units is as large; squares and products of
@@ -36,6 +37,8 @@ Check = Callable[[Any], bool]
 
 def _array(value: Any) -> bool:
     """Numbers, or what numpy makes numbers of, of any shape; not what it reads of a text."""
+    import numpy as np
+
     try:
         numbers = np.asarray(value)
         if numbers.dtype == object:
@@ -47,16 +50,26 @@ def _array(value: Any) -> bool:
 
 def _values(value: Any) -> bool:
     """Numbers; whether they can be computed with is for what computes with them."""
+    import numpy as np
+
     return np.asarray(value).dtype.kind in "iufc"
 
 
+def _truth(value: Any) -> bool:
+    return type(value).__name__ in ("bool", "bool_")
+
+
 def _whole(value: Any) -> bool:
-    return isinstance(value, int | np.integer) and not isinstance(value, bool)
+    return isinstance(value, Integral) and not _truth(value)
+
+
+def _counted(value: Any) -> bool:
+    return _whole(value) and abs(value) <= MOST
 
 
 def _number(value: Any) -> bool:
-    kind = isinstance(value, int | float | np.integer | np.floating)
-    return kind and not isinstance(value, bool) and bool(abs(value) <= LARGEST)
+    size: Any = abs(value) if isinstance(value, Real) and not _truth(value) else math.inf
+    return bool(size <= LARGEST)
 
 
 def _path(value: Any) -> bool:
@@ -65,8 +78,8 @@ def _path(value: Any) -> bool:
 
 def _list_of(check: Check) -> Check:
     def checked(value: Any) -> bool:
-        listed = isinstance(value, Collection | np.ndarray) and not isinstance(value, str | bytes)
-        return listed and np.ndim(value) <= 1 and all(map(check, value))
+        several = isinstance(value, Collection) and not isinstance(value, str | bytes)
+        return several and getattr(value, "ndim", 1) == 1 and all(map(check, value))
 
     return checked
 
@@ -87,34 +100,37 @@ def _texts(value: Any) -> bool:
 
 
 def _two(value: Any) -> bool:
-    return isinstance(value, Sequence | np.ndarray) and len(value) == 2 and all(map(_array, value))
+    return isinstance(value, Collection) and len(value) == 2 and all(map(_array, value))
 
 
 def _filled(value: Any) -> bool:
-    return _array(value) and np.ndim(value) == 1 and np.size(value) > 0
+    return _list_of(_number)(value) and len(value) > 0
+
+
+def _seed(value: Any) -> bool:
+    whole = _whole(value) and 0 <= value <= LARGEST_SEED
+    return whole or type(value).__name__ == "Generator"
 
 
 # Kind as it is annotated → how a message names it, and whether a value is one.  Names that are not
 # here are classes; a value is one by the name of its own.
 KINDS: dict[str, tuple[str, Check]] = {
-    "int": (f"a whole number of at most {MOST:,}", lambda v: _whole(v) and abs(v) <= MOST),
+    "int": (f"a whole number of at most {MOST:,}", _counted),
     "float": ("a finite number", _number),
-    "bool": ("True or False", lambda v: isinstance(v, bool | np.bool_)),
+    "bool": ("True or False", _truth),
     "str": ("a text", _text),
     "Path": ("a path", _path),
     "ArrayLike": ("finite numbers", _array),
     "Array": ("numbers", _values),
-    "Sequence[int]": ("a list of whole numbers", _list_of(lambda v: _whole(v) and abs(v) <= MOST)),
+    "Sequence[int]": ("a list of whole numbers", _list_of(_counted)),
     "Sequence[str]": ("a list of names", _list_of(_text)),
     "Sequence[TargetPose]": (
-        "a list of TargetPose",
-        _list_of(lambda v: type(v).__name__ == "TargetPose"),
+        "a list of TargetPose", _list_of(lambda v: type(v).__name__ == "TargetPose"),
     ),
     "Mapping[str, float]": ("numbers by name", _table_of(_text, _number)),
     "Mapping[str, Sequence[float]]": ("a list of numbers by name", _table_of(_text, _filled)),
     "Mapping[tuple[str, str], float]": (
-        "numbers by effect and place",
-        _table_of(_texts, _number),
+        "numbers by effect and place", _table_of(_texts, _number),
     ),
     "tuple[ArrayLike, ArrayLike]": ("two corners", _two),
     "Progress": ("a function", callable),
@@ -129,19 +145,20 @@ ALIASES = {
         ("Effort", "Method", "WeightKind", "IntervalKind", "FaultyReadings", "Convention"), "str"
     ),
 }
-SEED = (f"a whole number from 0 to {LARGEST_SEED}", lambda v: _whole(v) and 0 <= v <= LARGEST_SEED)
+SEED = (f"a whole number from 0 to {LARGEST_SEED}, or a numpy Generator", _seed)
 
 
 def checked_arguments(function: F) -> F:
     """The function, whose arguments are checked by its annotations before it runs.
 
+    In place of a `seed` it takes a numpy Generator, of which one is drawn.
     Raises InputError that names the argument, what it takes and what was found.
     """
     signature = inspect.signature(function)
     kinds = {
-        name: [SEED] if name == "seed" else [_kind(text) for text in _parts(parameter.annotation)]
-        for name, parameter in signature.parameters.items()
-        if isinstance(parameter.annotation, str) and name != "self"
+        name: [SEED] if name == "seed" else [_kind(text) for text in kinds_of(given.annotation)]
+        for name, given in signature.parameters.items()
+        if isinstance(given.annotation, str) and name != "self"
     }
 
     def check(given: Mapping[str, Any], names: Collection[str]) -> None:
@@ -159,10 +176,13 @@ def checked_arguments(function: F) -> F:
 
     @functools.wraps(function)
     def run(*args: Any, **kwargs: Any) -> Any:
-        given = signature.bind(*args, **kwargs).arguments
+        bound = signature.bind(*args, **kwargs)
+        given = bound.arguments
         check(given, simple)
+        if hasattr(given.get("seed"), "integers"):
+            given["seed"] = int(given["seed"].integers(LARGEST_SEED))
         try:
-            return sealed(function(*args, **kwargs))
+            return sealed(function(*bound.args, **bound.kwargs))
         except (TypeError, ValueError, AttributeError, LookupError, ArithmeticError):
             check(given, kinds)
             raise
@@ -174,6 +194,8 @@ def sealed(result: Any) -> Any:
     """A result whose arrays, and those of the calibrated arm in it, nobody can write into: what it
     says of itself, and what follows from it, would no longer be what was found."""
     if isinstance(result, Saved) and type(result).__name__ != "Measurements":
+        import numpy as np
+
         for name, value in vars(result).items():
             if isinstance(value, np.ndarray):
                 view = value.view()
@@ -184,12 +206,12 @@ def sealed(result: Any) -> Any:
     return result
 
 
-def _parts(annotation: str) -> list[str]:
+def kinds_of(annotation: str) -> list[str]:
     """The members of a union, aliases resolved; a Literal is a text, which the function checks."""
     found: list[str] = []
     for part in re.split(r" \| (?![^\[]*\])", annotation.strip("\"'")):
         part = "str" if part.startswith("Literal[") else part
-        found += _parts(ALIASES[part]) if part in ALIASES else [part]
+        found += kinds_of(ALIASES[part]) if part in ALIASES else [part]
     return found
 
 
@@ -206,47 +228,22 @@ def _kind(name: str) -> tuple[str, Check]:
 
 def _shown(value: Any) -> str:
     """A value as a message shows it: numbers and texts themselves, all else by its type."""
-    if value is None or isinstance(value, str | int | float | np.number | list | tuple | Mapping):
+    if value is None or isinstance(value, str | Real | list | tuple | Mapping):
         return quoted(value)
-    shape = np.shape(value) if isinstance(value, np.ndarray) else ()
+    shape = getattr(value, "shape", ())
     return f"{type(value).__name__}{f' of shape {shape}' if shape else ''}"
 
 
 def whole(name: str, given: Any, least: int | None = None) -> int:
     """A whole number, `least` or more.  Raises InputError that names the argument."""
-    whole = isinstance(given, int | np.integer) and not isinstance(given, bool)
     more = "" if least is None else f", {least} or more"
-    if whole and abs(given) > MOST:
+    if _whole(given) and abs(given) > MOST:
         more += f" and at most {MOST:,}"
     require(
-        whole and (least is None or given >= least) and abs(given) <= MOST,
+        _counted(given) and (least is None or given >= least),
         f"{option(name)} takes a whole number{more}; found {quoted(given)}",
     )
     return int(given)
-
-
-def length(name: str, given: Any, zero: bool = False) -> float:
-    """A positive number in m, 0 too where `zero`.  Raises InputError that names the argument."""
-    number = isinstance(given, int | float | np.number) and not isinstance(given, bool)
-    require(
-        number and np.isfinite(given) and (given > 0 or (zero and given == 0)),
-        f"{option(name)} takes a {'number, 0 or more,' if zero else 'positive number'} in m; "
-        f"found {quoted(given)}",
-    )
-    return float(given)
-
-
-def vectors(name: str, given: Any) -> NDArray[np.float64]:
-    """(k, 3) finite numbers.  Raises InputError that names the argument."""
-    try:
-        found = np.atleast_2d(np.asarray(given, dtype=float))
-    except (TypeError, ValueError):
-        found = np.zeros((1, 0))
-    require(
-        found.ndim == 2 and found.shape[1] == 3 and bool(np.isfinite(found).all()),
-        f"{option(name)} takes rows of three finite numbers; found {quoted(given)}",
-    )
-    return found
 
 
 def one_of(name: str, given: Any, valid: Sequence[str]) -> None:

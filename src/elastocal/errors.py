@@ -18,7 +18,10 @@ from pathlib import Path
 from elastocal.text import SHOWN, did_you_mean, listed, quoted
 
 # Keyword arguments whose flag is another word; everywhere else joint1_x is --joint1-x.
-FLAGS = {"fixed": "--fix", "options": "--set", "presets": "--preset", "extra_poses": "--poses"}
+FLAGS = {
+    "fixed": "--fix", "options": "--set", "values": "--set", "presets": "--preset",
+    "extra_poses": "--poses",
+}  # fmt: skip
 # Keyword arguments that take a list, and flags that are repeated.
 LISTS = ("fixed", "without", "options", "presets")
 
@@ -75,6 +78,11 @@ class UnknownNameError(InputError, KeyError):
         return cls(f"no {what} {quoted(name)}{hint}; there are {listed(there)}")
 
 
+def flag_of(keyword: str) -> str:
+    """The flag of a keyword argument."""
+    return FLAGS.get(keyword, "--" + keyword.replace("_", "-"))
+
+
 def option(keyword: str, value: object = None) -> str:
     """An option of a verb as a message names it.
 
@@ -83,7 +91,7 @@ def option(keyword: str, value: object = None) -> str:
     since messages end in results, their files and reports as well as in exceptions.
     """
     if _flags:
-        flag = FLAGS.get(keyword, "--" + keyword.replace("_", "-"))
+        flag = flag_of(keyword)
         if value is False:
             return f"--no-{flag[2:]}"
         return flag if value is None or value is True else f"{flag} {value}"

@@ -1,8 +1,10 @@
 """The verbs of the front door: design, simulate, identify, diagnose, compensate.
 
 Each takes the model first (or a cell, or the path of one) and its options as keyword arguments;
-it checks them, makes the option objects that the packages below work with, and calls them.  What
-the command line shares with Python in making sense of options stands here too.
+it checks them, makes the option objects that the packages below work with, and calls them.
+
+Signature and docstring are the one place where an option is declared: the command line takes name,
+kind and default from here, and as help the first sentence on it (`elastocal.cli.signatures`).
 """
 
 from __future__ import annotations
@@ -10,33 +12,18 @@ from __future__ import annotations
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import replace
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, Literal, TypeAlias, TypeVar
+from typing import TYPE_CHECKING, Any, Literal, TypeAlias
 
-import numpy as np
-from numpy.typing import ArrayLike, NDArray
-
-from elastocal.arguments import checked_arguments, length, one_of, vectors, whole
-from elastocal.cell.plan_wishes import (
-    CANDIDATES,
-    Freedom,
-    Motion,
-    TargetBox,
-    TargetPath,
-    TargetPose,
-    of_candidates,
-)
-from elastocal.cell.work_cell import Cell
+from elastocal.arguments import checked_arguments, one_of, whole
 from elastocal.errors import InputError, option, require
-from elastocal.measurements import Measurements
-from elastocal.model.arm import given_force
-from elastocal.model.calibrated import CalibratedArm, given_arm
-from elastocal.model.choice import cell_of
-from elastocal.model.manipulator import Model
 from elastocal.text import quoted
 
 if TYPE_CHECKING:
+    from numpy.typing import ArrayLike
     from pandas import DataFrame
 
+    from elastocal.cell.plan_wishes import Freedom, Motion, TargetBox, TargetPath, TargetPose
+    from elastocal.cell.work_cell import Cell
     from elastocal.compensation.compensate import Compensation
     from elastocal.compensation.targets import Targets
     from elastocal.diagnosis.diagnosis import Diagnosis
@@ -45,17 +32,20 @@ if TYPE_CHECKING:
     from elastocal.identification.options import FaultyReadings, Method
     from elastocal.identification.result import Calibration
     from elastocal.identification.weighted_problem import WeightKind
+    from elastocal.measurements import Measurements
+    from elastocal.model.calibrated import CalibratedArm
     from elastocal.model.calibrated_tool import ToolPoint
+    from elastocal.model.manipulator import Model
     from elastocal.planning.design import DesignOptions, Effort
     from elastocal.planning.plan import Plan
+    from elastocal.units import Array
 
-# One verb should not load another: each imports the package that it calls.
+# Each verb imports what it calls: one should not load another, and --help none of them.
 
-AnyModel: TypeAlias = Model | Cell | str | Path
+AnyModel: TypeAlias = "Model | Cell | str | Path"
 Table: TypeAlias = "Measurements | str | Path | DataFrame"
 Prior: TypeAlias = "Mapping[str, Mapping[str, float]] | GaussianPrior"
 Progress: TypeAlias = Callable[[str], None]
-T = TypeVar("T")
 
 
 @checked_arguments
@@ -110,22 +100,23 @@ def design(
         model: The model, or a cell, or the path of a cell file.
         poses: Number of poses.
         criterion: What is to become small: "test_pose" (error at the test poses), "robust" (the
-            same with what the model may lack), "D", "A", "E", "G", "I", "c", "O1" to "O5".
-        target: Find the smallest number of poses that reaches this error, in m; goes with the
-            criteria test_pose, I and G, and instead of `poses`.
-        minutes: Find the numbers of poses and of readings at each that leave the least error
-            within this time; instead of `poses` and `target`.
-        curve: Numbers of poses to compare.
-        fixed: Parameters, places or effects held as known.
-        augment: Measurements already done, or their file, which the plan adds to.
-        keep: An earlier plan's file, whose poses stay in this one: all, or "plan.csv:1,4".
-        strike: "plan.csv:3,7": of that plan these poses are replaced, and all others stay.
-        knowledge: `Knowledge`, or a knowledge file (TOML); its priors count for a plan.
+            same with what the model may lack), "D", "A", "E", "G", "I", "c", "O1", "O2", "O3",
+            "O4" or "O5"; default as the cell says.
+        target: Find the fewest poses that reach this error, for the criteria test_pose, robust, G
+            and I.  In m.
+        minutes: Find the best numbers of poses and readings within this time.  It stands instead
+            of `poses` and `target`.
+        curve: Compare numbers of poses, as in 10,15,20,30.
+        fixed: Parameter, place or effect to hold as known.
+        augment: Existing measurements to extend.
+        keep: Poses of an earlier plan that stay: all, or some, as in "plan.csv:1,4".
+        strike: Poses of a plan to replace, as in "plan.csv:3,7"; all its others stay.
+        knowledge: Knowledge file (TOML) as for identify, whose priors count.  Or a `Knowledge`.
         prior: "typical" takes every parameter's typical size as its prior, "none" none; or what
             is known by name, {"joint2.compliance": {"mean": 2.9e-7, "std": 3e-8}}.
         effort: How hard to search: "quick", "normal" or "thorough".
-        candidates: Feasible candidates to draw, over all levels; or a table (CSV) of poses to
-            choose from, as they were taught or measured before; or both, ["taught.csv", 500].
+        candidates: Feasible candidates to draw, over all levels; or a table of poses to choose
+            from, or both, as in "taught.csv",500.  In Python ["taught.csv", 500].
         repeats: Readings per pose and load state.
         loads: Forces (L, 3) in N at the load point, in the data's frame.
         load_choice: Choose one load for each pose, instead of measuring all of them there.
@@ -141,20 +132,17 @@ def design(
         test_poses: Joints (k, joints) in rad or m where the position must be right.
         test_path: A table (CSV) of such places.
         test_box: Lower and upper corner (3,) in m of a box of such places, in the data's frame.
-        elsewhere: Share of the criterion's weight, 0 to below 1, that poses all over the joint
-            ranges have beside the test poses.
-        elsewhere_cap: By how much the error at the test poses may exceed the least, as in 0.05,
-            for as little error all over the joint ranges as can be had; default 0.05 where no
-            test poses are stated, else 0.
+        elsewhere: Weight of poses all over the joint ranges, a share as 0.2, beside the test poses.
+        elsewhere_cap: Loss allowed at the test poses to reduce the error elsewhere, a share as
+            0.05, which is the default where no test poses are stated.
         choose: Boxes in which markers, load point and tracker may still be placed before.
         motion: How the arm moves between poses, which decides their order.
-        load_changes: How often the load may be hung, exchanged or taken off; default as rarely as
-            can be. More of them keep a drift further apart from what the loads show.
+        load_changes: Load changes allowed; more reduce the effect of drift; default: the fewest.
         reference_every: Visit a reference pose again after so many stops.
         doubts: Probability that the model lacks an effect at a place, {("backlash", "joint2"):
             0.1}, for the criterion robust; default equal shares of the catalogue.
-        seed: Of all random draws.
-        jobs: Processes; −1 for all cores.
+        seed: Seed of all random draws, or a numpy Generator.
+        jobs: Processes; -1 for all cores.
         progress: Is told what is done.
 
     Returns:
@@ -182,32 +170,25 @@ def design(
 
 
 def design_request(
-    model: AnyModel,
-    *,
-    curve: Sequence[int] = (),
-    fixed: str | Sequence[str] = (),
-    augment: Table | None = None,
-    keep: str | Path | None = None,
-    strike: str | Path | None = None,
-    knowledge: Knowledge | str | Path | None = None,
-    prior: Literal["none", "typical"] | Prior | None = None,
-    effort: str = "normal",
-    doubts: Mapping[tuple[str, str], float] | None = None,
-    seed: int = 0,
-    jobs: int = 1,
-    **asked: Any,
-) -> tuple[Cell, DesignOptions]:
+    model: AnyModel, *, curve: Any = (), fixed: Any = (), augment: Any = None, keep: Any = None,
+    strike: Any = None, knowledge: Any = None, prior: Any = None, **asked: Any,
+) -> tuple[Cell, DesignOptions]:  # fmt: skip
     """The cell with [design] as `asked`, and how to search; options as for `design`.
 
     Raises InputError that names the keyword.
     """
+    from elastocal.model.choice import cell_of
+    from elastocal.model.manipulator import Model
     from elastocal.planning.design import DesignOptions
     from elastocal.planning.pins import read_pins
 
     cell = model.cell if isinstance(model, Model) else cell_of(_checked_cell(model))
+    of_the_search = ("effort", "seed", "jobs", "doubts")
+    search = {name: asked.pop(name) for name in of_the_search if name in asked}
     if isinstance(prior, str):
         asked["prior"], prior = prior, None
     cell = replace(cell, design=_design_of(cell, asked))
+    cell.check()
     files = (augment, knowledge, keep, strike)
     known = None if all(file is None for file in files) else Model(cell)
     done = None
@@ -225,80 +206,61 @@ def design_request(
     if known is not None and (keep or strike):
         cell, pins = read_pins(cell, known, keep, strike, asked.get("poses") is not None)
     options = DesignOptions(
-        effort=effort,  # type: ignore[arg-type]
-        seed=int(seed),
-        jobs=jobs,
+        **search,
         fixed=_names("fixed", fixed),
         prior=_gaussian(prior) if stated is None else stated,
         done=done,
         curve=tuple(sorted({whole("curve", n) for n in curve})),
         notes=notes,
         pins=pins,
-        doubts=doubts,
     )
     return cell, options
 
 
 def _design_of(cell: Cell, asked: Mapping[str, Any]) -> Any:
-    """[design] of the cell with what is asked for, checked, in its place."""
+    """[design] of the cell with what is asked for, checked by it, in its place."""
+    import numpy as np
+
+    from elastocal.cell.plan_wishes import (
+        CANDIDATES,
+        DesignSpec,
+        Motion,
+        TargetBox,
+        TargetPath,
+        TargetPose,
+        of_candidates,
+    )
     from elastocal.planning.criteria import CRITERIA
 
-    chosen = {key: value for key, value in asked.items() if value is not None}
-    if "candidates" in chosen and not isinstance(chosen["candidates"], int | np.integer):
-        found = of_candidates(chosen["candidates"])
-        if found is None:
-            given = quoted(chosen["candidates"])
-            raise InputError(f"{option('candidates')} takes {CANDIDATES}; found {given}")
-        chosen["candidates"], taught = found
-        chosen["taught"] = None if taught is None else Path(taught)
-    elif "candidates" in chosen:
-        chosen["taught"] = None
-    for key, least in (("poses", 1), ("candidates", 1), ("repeats", 1), ("robust_samples", 1)):
-        if chosen.get(key) is not None:
-            chosen[key] = whole(key, chosen[key], least)
-    for key, names in (
-        ("criterion", tuple(CRITERIA)),
-        ("prior", ("none", "typical")),
-        ("robust", ("none", "average", "worst")),
-    ):
-        if key in chosen:
-            one_of(key, chosen[key], names)
-    for key, zero in (("target", False), ("repeatability", True)):
-        if key in chosen:
-            chosen[key] = length(key, chosen[key], zero)
-    if "minutes" in chosen:
-        require(
-            np.isfinite(float(chosen["minutes"])) and float(chosen["minutes"]) > 0,
-            f"{option('minutes')} takes a positive number; found {chosen['minutes']}",
-        )
-        chosen["minutes"] = float(chosen["minutes"])
+    chosen = {key: _plain(value) for key, value in asked.items() if value is not None}
+    if "candidates" in chosen:
+        given, taught = of_candidates(chosen["candidates"]) or (None, None)
+        if given is None and taught is None:
+            raise InputError(
+                f"{option('candidates')} takes {CANDIDATES}; found {quoted(chosen['candidates'])}"
+            )
+        given = None if given is None else whole("candidates", given, 1)
+        chosen |= {"candidates": given, "taught": None if taught is None else Path(taught)}
+    if "criterion" in chosen:
+        one_of("criterion", chosen["criterion"], tuple(CRITERIA))
     wishes = [key for key in ("poses", "target", "minutes") if key in chosen]
-    if len(wishes) > 1:
-        raise InputError(
-            f"{' and '.join(option(key, chosen[key]) for key in wishes)}: a target or a time asks "
-            "for the number of poses; drop one"
-        )
-    if "loads" in chosen:
-        chosen["loads"] = vectors("loads", chosen["loads"])
-    if "marker_sigma" in chosen:
-        for name, value in chosen["marker_sigma"].items():
-            one_of("marker_sigma", name, tuple(cell.tool.markers))
-            length("marker_sigma", value)
+    require(
+        len(wishes) < 2,
+        f"{' and '.join(map(option, wishes))}: a target or a time asks for the number of poses; "
+        "drop one",
+    )
     if "levels" in chosen:
         require(len(chosen["levels"]) == 1, f"{option('levels')} takes the values of one joint")
-        chosen["levels"] = {k: tuple(map(float, v)) for k, v in chosen["levels"].items()}
         chosen.setdefault("per_level", ())
     for key, other in (("elsewhere", "elsewhere_cap"), ("elsewhere_cap", "elsewhere")):
-        if chosen.get(key) is not None:
-            share = chosen[key] = float(chosen[key])
-            require(0 <= share < 1, f"{option(key)} takes a share from 0 to below 1")
+        if key in chosen:
             require(
-                not (share and chosen.get(other)),
+                not (chosen[key] and chosen.get(other)),
                 f"{option(key)} and {option(other)} both say what the rest is worth; drop one",
             )
             chosen.setdefault(other, None)
     motion = {
-        key: whole(key, chosen.pop(key), 1)
+        key: _wish(Motion, key, chosen.pop(key))
         for key in ("load_changes", "reference_every")
         if key in chosen
     }
@@ -306,6 +268,8 @@ def _design_of(cell: Cell, asked: Mapping[str, Any]) -> Any:
         chosen["motion"] = replace(chosen.get("motion", cell.design.motion), **motion)
     if "interest" in chosen:
         chosen["interest"] = _names("interest", chosen["interest"])
+    if "loads" in chosen:
+        chosen["loads"] = np.atleast_2d(np.asarray(chosen["loads"], dtype=float))
     if "test_poses" in chosen:
         poses = chosen["test_poses"]
         require(np.ndim(poses) > 0, f"{option('test_poses')} takes joints by pose; found {poses}")
@@ -315,11 +279,8 @@ def _design_of(cell: Cell, asked: Mapping[str, Any]) -> Any:
     if isinstance(chosen.get("test_path"), str | Path):
         chosen["test_path"] = TargetPath(Path(chosen["test_path"]))
     if "test_box" in chosen and not isinstance(chosen["test_box"], TargetBox):
-        lower, upper = vectors("test_box", chosen["test_box"])
-        require(bool((lower < upper).all()), f"{option('test_box')} takes lower < upper corners")
-        chosen["test_box"] = TargetBox(lower, upper)
-    if "per_level" in chosen:
-        chosen["per_level"] = tuple(whole("per_level", n, 1) for n in chosen["per_level"])
+        chosen["test_box"] = TargetBox(*chosen["test_box"])
+    chosen = {key: _wish(DesignSpec, key, value) for key, value in chosen.items()}
     # What the cell says of the number of poses gives way to what is asked for here.
     number: dict[str, Any] = {"minutes": None} if wishes else {}
     if "poses" in chosen or "minutes" in chosen:
@@ -327,6 +288,24 @@ def _design_of(cell: Cell, asked: Mapping[str, Any]) -> Any:
     if chosen.get("per_level"):
         number = {"poses": sum(chosen["per_level"]), "target": None, "minutes": None}
     return replace(cell.design, **(number | chosen))
+
+
+def _wish(record: Any, key: str, value: Any) -> Any:
+    """A value as a record of the cell takes it.  Raises InputError that names the option."""
+    try:
+        return getattr(record(**{key: value}), key)
+    except InputError as error:
+        told = str(error).replace(f"{record.__name__}: {key}", option(key), 1)
+        raise InputError(told) from None
+
+
+def _plain(value: Any) -> Any:
+    """Numbers and arrays of numpy as those of Python, which a cell is made of."""
+    if isinstance(value, Mapping):
+        return {key: _plain(each) for key, each in value.items()}
+    if isinstance(value, list | tuple):
+        return type(value)(map(_plain, value))
+    return value.tolist() if hasattr(value, "tolist") else value
 
 
 def _prior_of(
@@ -371,10 +350,10 @@ def simulate(
         values: True parameter values in SI units, by name (the others are nominal) or all of them
             (parameters,).
         draw: Draw true values: typical sizes times this, at random; `values` win over them.
-        load: Force (3,) in N at the load point: every pose is measured without and with it.
+        load: Measure every pose without and with this force (3,) in N at the load point.
         repeats: Readings per pose and load state.
         noise: Whether the readings have the noise that plan or cell state; else they are exact.
-        seed: Of all random draws.
+        seed: Seed of all random draws, or a numpy Generator.
 
     Returns:
         The `Measurements`, one row per pose, repeat, load state and marker.
@@ -395,20 +374,20 @@ def simulate(
 
 def simulated(
     made: Model, plan: Plan | Table | ArrayLike, values: Mapping[str, float] | ArrayLike | None,
-    draw: float, load: ArrayLike | None, repeats: int, noise: bool, seed: int,
-) -> tuple[Measurements, NDArray[np.float64]]:  # fmt: skip
+    draw: float = 0.0, load: ArrayLike | None = None, repeats: int = 1, noise: bool = True,
+    seed: int = 0,
+) -> tuple[Measurements, Array]:  # fmt: skip
     """What `simulate` gives, and the true values (parameters,) behind it."""
+    import numpy as np
+
     from elastocal.identification.start import check_limits
+    from elastocal.model.arm import given_force
     from elastocal.simulation.simulate import draw_errors, expand_plan, values_from
     from elastocal.simulation.simulate import simulate as run
 
     force = given_force(load)
-    factor = np.asarray(draw, dtype=float)
-    require(
-        factor.shape == () and bool(0 <= factor < np.inf),
-        f"{option('draw')} takes a factor of the typical sizes, 0 or more; found "
-        + (f"{factor[()]:g}" if factor.shape == () else str(draw)),
-    )
+    told = f"{option('draw')} takes a factor of the typical sizes, 0 or more; found {draw:g}"
+    require(0 <= draw < float("inf"), told)
     repeats = whole("repeats", repeats, 1)
     poses = _poses(made, plan)
     check_limits(made, poses)
@@ -430,6 +409,7 @@ def simulated(
 
 
 def _poses(model: Model, plan: Plan | Table | ArrayLike) -> Measurements:
+    from elastocal.measurements import Measurements
     from elastocal.planning.plan import Plan
 
     if isinstance(plan, Plan):
@@ -449,7 +429,7 @@ def identify(
     method: Method = "auto",
     noise: str = "auto",
     weights: WeightKind = "auto",
-    covariance: ArrayLike | None = None,
+    covariance: ArrayLike | str | Path | None = None,
     intervals: IntervalKind = "auto",
     outliers: FaultyReadings = "auto",
     bounded: bool = False,
@@ -470,26 +450,27 @@ def identify(
     Args:
         model: The model, or a cell, or the path of a cell file.
         data: The readings, or their file.
-        test: Readings that are never fitted, on which the result is tested.
-        fixed: Parameters, places or effects held at their start.
-        method: "auto" is "reml" unless `weights` are stated; "ols" is eq. (6) of Klimchik et al.
-            2013, "wls" eq. (10) with stated noise, "eq14" and "eq14-residual" its weights; "huber",
-            "tukey" (MM), "l1" and "student-t" are robust.
+        test: Independent measurements to test the result on; they are never fitted.
+        fixed: Parameter, place or effect to hold at its start.
+        method: "auto" ("reml" unless `weights` are stated), "reml", "ols" (eq. 6 of Klimchik et
+            al. 2013), "wls" (eq. 10), "eq14", "eq14-residual"; robust: "huber", "tukey", "l1",
+            "student-t".
         noise: Noise that reml estimates: "auto", "independent", "axis", "marker", "groups",
-            "polar" or "stated"; with "+configuration" what a configuration's readings share.
+            "polar", "stated"; with "+configuration" for deviations common to a configuration.
         weights: Stated noise to take as it is: "none", "rows", "axis", "polar", "covariance".
-        covariance: Noise covariance (rows, rows) in m², for the weights "covariance".
-        intervals: "auto" goes with the method; "classical", "hc0" to "hc3", "cr0" to "cr3" (by
+        covariance: Noise covariance in m² for the weights "covariance": CSV without header, or
+            .npy.  Or an array (rows, rows).
+        intervals: "auto" (by the method), "classical", "hc0" to "hc3", "cr0" to "cr3" (by
             configuration), "profile".
-        outliers: Readings beyond the noise: "auto" leaves them out unless they are a tenth or
-            more, "drop" always, "keep" never.  They are listed in any case.
+        outliers: "auto" (exclude, unless they are a tenth or more), "drop", "keep"; they are
+            listed in any case.
         bounded: Keep parameters inside their physical bounds.
-        physical: No negative compliance, no compliance matrix that yields energy.
-        knowledge: What is known besides: `Knowledge`, or a knowledge file (TOML).
+        physical: No negative compliance, compliance matrices semidefinite.
+        knowledge: Prior knowledge: priors, bounds, equalities (TOML).  Or a `Knowledge`.
         prior: What is known by name, {"joint2.compliance": {"mean": 2.9e-7, "std": 3e-8}}.
         constraints: Bounds, equalities and matrices, besides those of `knowledge`.
-        seed: Of multi-start and searches.
-        jobs: Has no effect any more: nothing is drawn in processes.
+        seed: Seed of all random draws, or a numpy Generator.
+        jobs: Has no effect: nothing is drawn in processes.
         progress: Is told what is done.
 
     Returns:
@@ -508,10 +489,15 @@ def identify(
         True
         >>> fit.save("result.json")
     """
+    import numpy as np
+
     from elastocal.identification.identify import identify as run
     from elastocal.identification.options import Options
+    from elastocal.measurements import read_matrix
     from elastocal.planning.test_poses import where_used
 
+    if isinstance(covariance, str | Path):
+        covariance = read_matrix(covariance, "noise covariance")
     require(
         covariance is None or (np.ndim(covariance) == 2 and np.size(covariance) > 0),
         f"{option('covariance')} takes a square matrix in m²; found {quoted(covariance)}",
@@ -569,11 +555,11 @@ def diagnose(
     Args:
         model: The model, or a cell, or the path of a cell file.
         data: The readings, or their file.
-        without: Effects taken out of the catalogue.
+        without: Effect to exclude.
         false_alarm: Probability that something is claimed where nothing is.
         extra_poses: Where rivals are left, seek the fewest poses, at most this many, that tell
             them apart (`Diagnosis.extra`); None seeks none.
-        seed: Of the sign flips and the draws behind intervals.
+        seed: Seed of all random draws, or a numpy Generator.
         progress: Is told what is done.
 
     Returns:
@@ -634,10 +620,10 @@ def compensate(
             the tool, or a table of targets (CSV or Parquet).
         load: Force (3,) in N at the load point, in `frame`, where the table states none.
         frame: Frame of targets and forces: "base" (as identified) or "tracker".
-        point: Point of the tool: a marker, or (3,) in m in the flange frame; default the load
+        point: Point of the tool: a marker, or x,y,z in m in the flange frame; default: the load
             point, or the only marker.
         near: Joints (joints,) in rad or m whose posture to begin near.
-        seed: Of the postures that are tried.
+        seed: Seed of all random draws, or a numpy Generator.
         progress: Is told what is done.
 
     Returns:
@@ -657,7 +643,11 @@ def compensate(
         >>> bool(commands.before.max() > 1e-3), bool(commands.after.max() < 1e-9)
         (True, True)
     """
+    import numpy as np
+
     from elastocal.compensation.compensate import compensate as run
+    from elastocal.model.arm import given_force
+    from elastocal.model.calibrated import given_arm
 
     arm = given_arm("arm", arm)
     force = given_force(load)
@@ -682,6 +672,8 @@ def check_frame(frame: str) -> None:
 
 
 def _tool_point(cell: Cell, point: str | ArrayLike | None) -> ToolPoint:
+    import numpy as np
+
     from elastocal.model.calibrated_tool import tool_point
 
     if point is None or isinstance(point, str):
@@ -695,8 +687,10 @@ def _targets(
     targets: Targets | str | Path | ArrayLike,
     kinds: tuple[str, ...],
     frame: Literal["base", "tracker"],
-    force: NDArray[np.float64] | None,
+    force: Array | None,
 ) -> Targets:
+    import numpy as np
+
     from elastocal.compensation.targets import Targets, read_targets, targets_at
 
     if isinstance(targets, Targets):
@@ -729,11 +723,13 @@ def _silent(message: str) -> None:
 
 
 def _model(given: AnyModel) -> Model:
+    from elastocal.model.manipulator import Model
+
     return given if isinstance(given, Model) else Model(_checked_cell(given))
 
 
 def _checked_cell(given: Any) -> Cell | str | Path:
-    if isinstance(given, Cell | str | Path):
+    if isinstance(given, str | Path) or type(given).__name__ == "Cell":
         return given
     raise InputError(
         f"{option('model')} takes a Model, a Cell or the path of a cell file; found "
@@ -742,6 +738,8 @@ def _checked_cell(given: Any) -> Cell | str | Path:
 
 
 def _table(name: str, model: Model, given: Table) -> Measurements:
+    from elastocal.measurements import Measurements
+
     if isinstance(given, Measurements):
         return given
     if isinstance(given, str | Path) or hasattr(given, "to_csv"):

@@ -160,7 +160,7 @@ GOLDENS: dict[str, Golden] = {
         "export urdf.toml urdf.json -o urdf.csv -q --poses 20",
     ), engine=True),
     "compare": Golden(CAMPAIGN, (
-        "compare placed.json june.json --cell placed.toml -o changes.json --poses 20 -q "
+        "compare placed.toml placed.json june.json -o changes.json --poses 20 -q "
         "--load 0 0 -1000",
         "compare placed.json placed.json --cell placed.toml --poses 20 -q --json",
     )),

@@ -16,7 +16,7 @@ from io import StringIO
 from itertools import pairwise
 from pathlib import Path
 from types import FrameType
-from typing import TYPE_CHECKING, Annotated, Any, Self
+from typing import TYPE_CHECKING, Any, Self
 
 import typer
 from typer.core import TyperGroup
@@ -113,22 +113,6 @@ app = typer.Typer(
     context_settings={"help_option_names": HELP, "max_content_width": 100},
 )
 
-# What several commands take.
-CellFile = Annotated[Path, typer.Argument(help="Cell file (TOML): robot, tool, tracker, model.")]
-DataFile = Annotated[Path, typer.Argument(help="Measurements (CSV or Parquet).")]
-ReportFile = Annotated[Path | None, typer.Option(help="Write a report (one HTML page).")]
-Json = Annotated[bool, typer.Option("--json", help="Print the result as JSON to stdout.")]
-Quiet = Annotated[bool, typer.Option("--quiet", "-q", help="No progress.")]
-Plugins = Annotated[
-    bool, typer.Option("--plugins", help="Run the Python code that the cell names in [plugins].")
-]
-Seed = Annotated[int, typer.Option(min=0, max=2**63 - 1, help="Seed of all random draws.")]
-
-
-def command(*name: str, **how: Any) -> Callable[[Callable[..., None]], Callable[..., None]]:
-    """Register a command of the app, which ends with a message where the user can act on it."""
-    return lambda function: app.command(*name, **how)(reporting_errors(function))
-
 
 def reporting_errors(command: Callable[..., None]) -> Callable[..., None]:
     """Turn what the user can act on into a message and an exit code, never a traceback."""
@@ -221,14 +205,8 @@ def files_of(cell: Cell) -> list[Path]:
 
     robot, targets = cell.robot, cell.design.test_path
     solids = [*cell.workspace.obstacles, *(body.solid for body in cell.workspace.bodies)]
-    named = [
-        robot.urdf,
-        robot.mjcf,
-        robot.dh,
-        robot.masses,
-        None if targets is None else targets.file,
-        cell.design.taught,
-    ]
+    path = None if targets is None else targets.file
+    named = [robot.urdf, robot.mjcf, robot.dh, robot.masses, cell.design.taught, path]
     named += [solid.mesh for solid in solids]
     named += [Path(name) for name in cell.plugins if is_plugin_file(name)]
     return [path for path in named if path is not None]

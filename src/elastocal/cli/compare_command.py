@@ -7,35 +7,24 @@ from typing import Annotated
 
 import typer
 
-from elastocal.cli.app import (
-    Json,
-    Plugins,
-    Quiet,
-    ReportFile,
-    Seed,
-    check_apart,
-    check_outputs,
-    command,
-    console,
-    repeated,
-)
+from elastocal.cli.app import repeated
+from elastocal.cli.signatures import FORCE, JsonFile, ReportFile, Run, Seed, command
 from elastocal.errors import InputError
-from elastocal.screen import progress_line, say
-from elastocal.text import json_text
+from elastocal.screen import complain
 
 
 @command(short_help="What has changed since the last calibration?")
 def compare(
+    cell: Annotated[Path, typer.Argument(help="Cell file (TOML) of both.")],
     old: Annotated[Path, typer.Argument(help="Result of identify (JSON), the earlier one.")],
-    new: Annotated[Path, typer.Argument(help="Result of identify (JSON), the later one.")],
-    cell: Annotated[
-        Path | None,
-        typer.Option(help="Cell file of both; default: cell.toml beside the earlier one."),
+    new: Annotated[
+        Path | None, typer.Argument(help="Result of identify (JSON), the later one.")
     ] = None,
-    output: Annotated[Path | None, typer.Option("-o", "--output", help="Write JSON.")] = None,
+    cell_of_old: Annotated[Path | None, typer.Option("--cell", hidden=True)] = None,
+    output: JsonFile = None,
     report: ReportFile = None,
     load: Annotated[
-        tuple[float, float, float] | None,
+        FORCE | None,
         typer.Option(
             metavar="X Y Z",
             help="Force in N at the load point (tracker's axes); default: the measured loads.",
@@ -45,40 +34,45 @@ def compare(
         float, typer.Option(help="Probability of any finding if nothing has changed.")
     ] = 0.05,
     poses: Annotated[int, typer.Option(min=2, max=100_000, help="Random poses.")] = 300,
-    plugins: Plugins = False,
     seed: Seed = 0,
-    as_json: Json = False,
-    quiet: Quiet = False,
+    *,
+    run: Run,
 ) -> None:
     """What has changed between two calibrations: by parameter, and how far the tool moved.
 
-    Example: elastocal compare january.json june.json --cell cell.toml --report changes.html
+    Example: elastocal compare cell.toml january.json june.json --report changes.html
     """
-    from elastocal.diagnosis.changes import compare as run
+    from elastocal.diagnosis.changes import compare as compared
     from elastocal.files import together
     from elastocal.model.calibrated import read_calibrated
     from elastocal.report.diagnosis_terminal import print_comparison
     from elastocal.saving import write_json
 
-    written = check_outputs(output, report)
-    known = old.parent / "cell.toml" if cell is None else cell
-    if cell is None and not known.is_file():
-        raise InputError(f"there is no cell.toml beside {old}; name the cell of both by --cell")
-    check_apart(written, [old, new, known])
-    with progress_line(quiet) as progress:
+    if new is None:
+        cell, old, new = _in_old_order(cell, old, cell_of_old)
+    run.writes(output, report)
+    inputs = run.reads(cell, old, new)
+    with run.progress() as progress:
         progress("reading")
-        arms = [read_calibrated(known, path, plugins) for path in (old, new)]
-        check_apart(written, [], arms[0].model.cell)
+        arms = [read_calibrated(cell, path, run.plugins) for path in (old, new)]
+        run.reads(cell=arms[0].model.cell)
         progress("comparing")
-        found = run(*arms, load=load, level=level, poses=poses, seed=seed)
-    with together(written):
+        found = compared(*arms, load=load, level=level, poses=poses, seed=seed)
+    with together(run.written):
         if output is not None:
             write_json(output, found.to_json())
         if report is not None:
-            found.report(report, inputs=[known, old, new], command=repeated(), seed=seed)
-    if as_json:
-        say(json_text(found.to_json()))
-        return
-    print_comparison(console(), found)
-    for path in written:
-        say(f"wrote {path}")
+            found.report(report, inputs=inputs, command=repeated(), seed=seed)
+    run.answer(found.to_json, lambda screen: print_comparison(screen, found))
+
+
+def _in_old_order(old: Path, new: Path, cell: Path | None) -> tuple[Path, Path, Path]:
+    """Cell and both results where the cell does not come first, as it once did not."""
+    known = old.parent / "cell.toml" if cell is None else cell
+    if cell is None and not known.is_file():
+        raise InputError(
+            f"there is no cell.toml beside {old}; name the cell first: elastocal compare CELL "
+            f"{old} {new}"
+        )
+    complain(f"the cell comes first now: elastocal compare {known} {old} {new}")
+    return known, old, new

@@ -7,20 +7,10 @@ from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
-from elastocal.cli.app import (
-    CellFile,
-    Json,
-    Plugins,
-    Quiet,
-    Seed,
-    check_apart,
-    check_outputs,
-    command,
-    console,
-)
+from elastocal import verbs
+from elastocal.cli.signatures import Asked, CellFile, ResultFile, Run, command
 from elastocal.errors import InputError, require
-from elastocal.screen import progress_line, say
-from elastocal.text import json_text
+from elastocal.screen import say
 
 if TYPE_CHECKING:
     from elastocal.compensation.compensate import Compensation
@@ -29,10 +19,10 @@ if TYPE_CHECKING:
     from elastocal.units import Array
 
 
-@command()
+@command(verb=verbs.compensate, offers="frame point load seed", texts={"point": ("POINT", str)})
 def compensate(
     cell: CellFile,
-    result: Annotated[Path, typer.Argument(help="Result of identify -o (JSON).")],
+    result: ResultFile,
     targets: Annotated[
         Path | None,
         typer.Argument(help="Targets (CSV): x_mm, y_mm, z_mm, rx_deg, …, or q1_deg, …"),
@@ -43,22 +33,6 @@ def compensate(
     target: Annotated[
         str | None,
         typer.Option(metavar="X,Y,Z[,RX,RY,RZ]", help="One target instead, in mm and degrees."),
-    ] = None,
-    frame: Annotated[
-        str, typer.Option(help="Frame of targets and forces: base (as identified) or tracker.")
-    ] = "base",
-    point: Annotated[
-        str | None,
-        typer.Option(
-            metavar="POINT",
-            help="Point of the tool: a marker, or x,y,z in m in the flange frame.",
-        ),
-    ] = None,
-    load: Annotated[
-        tuple[float, float, float] | None,
-        typer.Option(
-            metavar="X Y Z", help="Force in N at the load point if the table states none."
-        ),
     ] = None,
     near: Annotated[
         str | None,
@@ -88,10 +62,9 @@ def compensate(
         str | None,
         typer.Option(metavar="RX,RY,RZ", help="Rotation vector of the tool in --box, in degrees."),
     ] = None,
-    plugins: Plugins = False,
-    seed: Seed = 0,
-    as_json: Json = False,
-    quiet: Quiet = False,
+    *,
+    asked: Asked,
+    run: Run,
 ) -> None:
     """Compute corrected joint commands for targets.
 
@@ -100,15 +73,58 @@ def compensate(
 
     Example: elastocal compensate cell.toml result.json targets.csv -o commands.csv
     """
-    from elastocal import verbs
     from elastocal.compensation.targets import one_target
     from elastocal.files import atomic_write_text, together
     from elastocal.model.arm import given_force
     from elastocal.model.calibrated import read_calibrated
-    from elastocal.model.calibrated_tool import tool_point
+    from elastocal.report.terminal import print_compensation
 
     # What can be wrong with the options is told before any file is read.
-    verbs.check_frame(frame)
+    verbs.check_frame(asked["frame"])
+    force = given_force(asked.get("load"))
+    _check(targets, target, output, table, (grid, box, rotation))
+    run.writes(output, table)
+    content, texts = {}, {}
+    with run.progress() as progress:
+        progress("reading")
+        arm = read_calibrated(cell, result, run.plugins)
+        run.reads(cell, result, targets, cell=arm.model.cell)
+        start = _posture(arm, near)
+        lines = None if table is None else _grid(arm, grid, box, rotation)
+        wanted = targets if target is None else one_target(target, asked["frame"], force)
+        if wanted is not None:
+            found = verbs.compensate(arm, wanted, **asked, near=start, progress=progress)
+            content["commands"], text = _commands(found, output is None, partial)
+            if output is not None:
+                texts[output] = text
+        if table is not None and lines is not None:
+            from elastocal.compensation.correction_table import correction_table
+            from elastocal.model.calibrated_tool import tool_point
+
+            where = tool_point(arm.model.cell, asked.get("point"))
+            corrections = correction_table(arm, lines, where, force, start, asked["seed"], progress)
+            content["table"], texts[table] = _table(corrections, arm, partial)
+        # Nothing is written before every answer is there: a refused table leaves no commands.
+        with together(run.written):
+            for path, text in texts.items():
+                atomic_write_text(path, text)
+    shown = run.answer(
+        lambda: content.get("commands", {}) | {k: v for k, v in content.items() if k == "table"},
+        lambda screen: print_compensation(screen, content),
+    )
+    if shown and output is not None:
+        say(
+            f"Next: run the commands of {output.name} (its q columns) and measure some: the tool "
+            "should lie within two or three std_um, and the tracker's noise, of its targets."
+        )
+
+
+def _check(
+    targets: Path | None, target: str | None, output: Path | None, table: Path | None,
+    of_a_table: tuple[str, str | None, str | None],
+) -> None:  # fmt: skip
+    """Raises InputError for options that do not go together."""
+    _, box, rotation = of_a_table
     require(
         targets is not None or target is not None or table is not None,
         "nothing to compensate: name a table of targets, or give --target x,y,z or --table FILE",
@@ -122,52 +138,10 @@ def compensate(
         "-o writes the commands of targets; name a table of them, or give --target",
     )
     require(
-        table is not None or (box is None and rotation is None and grid == "5"),
+        table is not None or of_a_table == ("5", None, None),
         "--grid, --box and --rotation belong to a correction table; give --table FILE",
     )
     require(rotation is None or box is not None, "--rotation belongs to --box")
-    force = given_force(load)
-    written = check_outputs(output, table)
-    content, texts = {}, {}
-    with progress_line(quiet) as progress:
-        progress("reading")
-        arm = read_calibrated(cell, result, plugins)
-        check_apart(written, [cell, result, targets], arm.model.cell)
-        start = _posture(arm, near)
-        lines = None if table is None else _grid(arm, grid, box, rotation)
-        wanted = targets if target is None else one_target(target, frame, force)  # type: ignore[arg-type]
-        if wanted is not None:
-            found = verbs.compensate(
-                arm, wanted, load=load, frame=frame, point=point, near=start,  # type: ignore[arg-type]
-                seed=seed, progress=progress,
-            )  # fmt: skip
-            content["commands"], text = _commands(found, output is None, partial)
-            if output is not None:
-                texts[output] = text
-        if table is not None and lines is not None:
-            from elastocal.compensation.correction_table import correction_table
-
-            where = tool_point(arm.model.cell, point)
-            corrections = correction_table(arm, lines, where, force, start, seed, progress)
-            content["table"], texts[table] = _table(corrections, arm, partial)
-        # Nothing is written before every answer is there: a refused table leaves no commands.
-        with together(written):
-            for path, text in texts.items():
-                atomic_write_text(path, text)
-    if as_json:
-        both = content.get("commands", {}) | {k: v for k, v in content.items() if k == "table"}
-        say(json_text(both))
-        return
-    from elastocal.report.terminal import print_compensation
-
-    print_compensation(console(), content)
-    for path in written:
-        say(f"wrote {path}")
-    if output is not None:
-        say(
-            f"Next: run the commands of {output.name} (its q columns) and measure some: the tool "
-            "should lie within two or three std_um, and the tracker's noise, of its targets."
-        )
 
 
 GRID_REMEDIES = {

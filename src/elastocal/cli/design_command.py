@@ -8,45 +8,68 @@ from typing import TYPE_CHECKING, Annotated
 
 import typer
 
-from elastocal.cli.app import (
-    CellFile,
-    Interrupts,
-    Json,
-    Plugins,
-    Quiet,
-    ReportFile,
-    Seed,
-    check_apart,
-    check_outputs,
-    command,
-    console,
-    files_of,
-    repeated,
-)
+from elastocal import verbs
+from elastocal.cli.app import Interrupts, files_of, repeated
+from elastocal.cli.signatures import Asked, CellFile, ReportFile, Run, command
 from elastocal.errors import InputError, require
-from elastocal.screen import progress_line, say
+from elastocal.screen import say
 from elastocal.text import listed
 
 if TYPE_CHECKING:
     from elastocal.cell.work_cell import Cell
     from elastocal.model.chain import Chain
+    from elastocal.planning.checkpoint import Checkpoint
+    from elastocal.planning.design import DesignOptions
     from elastocal.planning.execution import Execution
     from elastocal.planning.plan import Plan
-    from elastocal.units import Array
+    from elastocal.units import Array, Progress
 
 PROGRAMS = {".src": "KUKA KRL", ".script": "URScript"}
 PICTURES = (".png", ".svg")
-# Their classes load numpy and pydantic, for which help need not wait; a test compares the two.
-CRITERIA = "test_pose, robust, D, A, E, G, I, c, O1, O2, O3, O4, O5"
 
 
-def _criteria() -> list[str]:
-    from elastocal.planning.criteria import CRITERIA as known
+def _target(text: str) -> float:
+    """--target in m."""
+    try:
+        target = float(text)
+    except ValueError:
+        target = math.nan
+    require(
+        math.isfinite(target) and target > 0,
+        f"--target takes a positive number of µm; found {text}",
+    )
+    return target * 1e-6
 
-    return list(known)
+
+def _numbers(text: str) -> list[int]:
+    try:
+        return [int(part) for part in text.split(",")]
+    except ValueError:
+        raise InputError(
+            f"--curve takes numbers of poses, as in 10,15,20; found '{text}'"
+        ) from None
 
 
-@command()
+def _candidates(text: str) -> int | str | list[int | str]:
+    """--candidates 500, taught.csv or taught.csv,500."""
+    if text.isdecimal():
+        return int(text)
+    path, comma, number = text.rpartition(",")
+    return [path, int(number)] if comma and number.isdecimal() else text
+
+
+@command(
+    verb=verbs.design,
+    offers="poses criterion target minutes curve augment keep strike knowledge fixed candidates "
+    "effort elsewhere elsewhere_cap load_changes reference_every jobs seed",
+    texts={
+        "target": ("µm", _target),
+        "curve": ("N,N,…", _numbers),
+        "keep": ("PLAN[:3,7]", str),
+        "strike": ("PLAN:3,7", str),
+        "candidates": ("N|FILE[,N]", _candidates),
+    },
+)
 def design(
     cell: CellFile,
     output: Annotated[
@@ -57,83 +80,8 @@ def design(
             help="The plan to write (CSV), .json beside it; OUTPUT.resume while it works.",
         ),
     ],
-    poses: Annotated[int | None, typer.Option(min=1, help="Number of poses.")] = None,
-    criterion: Annotated[
-        str | None,
-        typer.Option(help=f"{CRITERIA}; default as the cell says.", autocompletion=_criteria),
-    ] = None,
-    target: Annotated[
-        float | None,
-        typer.Option(
-            metavar="µm",
-            help="Find the fewest poses that reach this, for a criterion in µm.",
-        ),
-    ] = None,
-    minutes: Annotated[
-        float | None,
-        typer.Option(help="Find the best numbers of poses and readings within this time."),
-    ] = None,
-    curve: Annotated[
-        str | None,
-        typer.Option(metavar="N,N,…", help="Compare numbers of poses, as in 10,15,20,30."),
-    ] = None,
-    augment: Annotated[
-        Path | None, typer.Option(help="Existing measurements (CSV) to extend.")
-    ] = None,
-    keep: Annotated[
-        str | None,
-        typer.Option(
-            metavar="PLAN[:3,7]", help="Poses of an earlier plan that stay: all or these."
-        ),
-    ] = None,
-    strike: Annotated[
-        str | None,
-        typer.Option(
-            metavar="PLAN:3,7", help="Replace these poses of a plan; all its others stay."
-        ),
-    ] = None,
-    knowledge: Annotated[
-        Path | None, typer.Option(help="Priors on parameters (TOML), as for identify.")
-    ] = None,
-    fix: Annotated[
-        list[str] | None,
-        typer.Option(
-            metavar="NAME", help="Hold a parameter, place or effect as known; repeatable."
-        ),
-    ] = None,
-    candidates: Annotated[
-        str | None,
-        typer.Option(
-            metavar="N|FILE[,N]",
-            help="Feasible candidates to draw, over all levels; or a table of poses instead.",
-        ),
-    ] = None,
-    effort: Annotated[str, typer.Option(help="quick, normal or thorough.")] = "normal",
-    elsewhere: Annotated[
-        float | None,
-        typer.Option(
-            min=0, max=0.99, help="Weight share of poses over the joint ranges, as in 0.2."
-        ),
-    ] = None,
-    elsewhere_cap: Annotated[
-        float | None,
-        typer.Option(
-            min=0,
-            max=0.99,
-            help="Loss allowed at the test poses to minimise the error elsewhere, as in 0.05.",
-        ),
-    ] = None,
-    load_changes: Annotated[
-        int | None,
-        typer.Option(
-            min=1,
-            help="Load changes allowed; more reduce the effect of drift; default: the fewest.",
-        ),
-    ] = None,
-    reference_every: Annotated[
-        int | None,
-        typer.Option(min=1, metavar="N", help="Visit a reference pose again after every N stops."),
-    ] = None,
+    *,
+    asked: Asked,
     program: Annotated[
         list[Path] | None,
         typer.Option(
@@ -149,11 +97,7 @@ def design(
         typer.Option(help="Cell file to write, with what [design.choose] has chosen."),
     ] = None,
     report: ReportFile = None,
-    jobs: Annotated[int, typer.Option(help="Processes; -1 for all cores.")] = 1,
-    plugins: Plugins = False,
-    seed: Seed = 0,
-    as_json: Json = False,
-    quiet: Quiet = False,
+    run: Run,
 ) -> None:
     """Which poses should I measure?
 
@@ -162,80 +106,74 @@ def design(
 
     Example: elastocal design cell.toml -o plan.csv --poses 15 --picture poses.png
     """
-    given = locals()
-    from inspect import signature
-
     from elastocal.files import together
     from elastocal.model.choice import cell_of
-    from elastocal.planning.checkpoint import Checkpoint, key_of
-    from elastocal.planning.design import design as run
     from elastocal.planning.pins import plan_and_names
+    from elastocal.report.plan_terminal import print_plan
     from elastocal.saving import beside
-    from elastocal.verbs import design as verb
-    from elastocal.verbs import design_request
 
     summary = beside(output)
     programs = program or []
     _check_suffixes(programs, picture)
-    written = check_outputs(output, summary, *programs, picture, report, cell_out)
-    # What this command and `ec.design` call the same goes from one to the other.
-    asked = {name: given[name] for name in signature(verb).parameters if name in given}
-    asked |= {"target": _target(target, poses), "curve": _numbers(curve), "fixed": fix or ()}
-    asked["candidates"] = _candidates(candidates)
-    with progress_line(quiet) as tell, Interrupts() as interrupts:
+    run.writes(output, summary, *programs, picture, report, cell_out)
+    with run.progress() as tell, Interrupts() as interrupts:
 
         def progress(message: str) -> None:
             interrupts.check()
             tell(message)
 
         progress("reading")
-        wanted, options = design_request(cell_of(cell, plugins), **asked)
+        wanted, options = verbs.design_request(cell_of(cell, run.plugins), **asked)
         _check_programs(wanted, programs)
         require(
             cell_out is None or wanted.design.choose is not None,
             f"--cell-out {cell_out}: nothing is chosen; state [design.choose] in {cell}",
         )
-        pinned = [plan_and_names(text)[0] for text in (keep, strike) if text]
-        read = (cell, augment, knowledge, *pinned, *files_of(wanted))
-        files = [p for p in read if p is not None]
-        check_apart(written, files)
-        apart = ("jobs", "augment", "knowledge")  # these are among the files
-        told = {name: value for name, value in asked.items() if name not in apart}
-        checkpoint = Checkpoint.beside(output, key_of(files, **told), interrupts.check)
-        if checkpoint.begun:
-            progress("resuming the interrupted design")
-        try:
-            plan = run(wanted, options, checkpoint, progress)
-        except Exception as error:
-            interrupts.check()
-            if not isinstance(error, OSError):
-                # The same input ends here again: there is nothing to go on with.
-                checkpoint.drop()
-            raise
-        interrupts.check()
-        with together(written):
+        pinned = [plan_and_names(asked[name])[0] for name in ("keep", "strike") if name in asked]
+        stated = [asked.get(name) for name in ("augment", "knowledge")]
+        files = run.reads(cell, *stated, *pinned, *files_of(wanted))
+        plan, checkpoint = _resumed(wanted, options, output, files, asked, interrupts, progress)
+        with together(run.written):
             _write_all(plan, output, programs, picture)
             if cell_out is not None:
                 from elastocal.diagnosis.diagnose import write_extended_cell
 
-                write_extended_cell(
-                    cell, cell_out, (), keys=plan.chosen.keys if plan.chosen else {}
-                )
+                keys = plan.chosen.keys if plan.chosen else {}
+                write_extended_cell(cell, cell_out, (), keys=keys)
             if report is not None:
-                from elastocal.report.page import write_page
-
                 progress("writing the report")
-                write_page(plan, report, list(dict.fromkeys(files)), repeated())
+                plan.report(report, inputs=list(dict.fromkeys(files)), command=repeated())
         checkpoint.clear()
-    if as_json:
+    if run.json:
         say(summary.read_text(encoding="utf-8"), end="")
-        return
-    from elastocal.report.plan_terminal import print_plan
+    else:
+        run.answer(plan.to_json, lambda screen: print_plan(screen, plan))
+        say(_what_next(cell, output, asked.get("augment"), plan))
 
-    print_plan(console(), plan)
-    for path in written:
-        say(f"wrote {path}")
-    say(_what_next(cell, output, augment, plan))
+
+def _resumed(
+    cell: Cell, options: DesignOptions, output: Path, files: list[Path], asked: Asked,
+    interrupts: Interrupts, progress: Progress,
+) -> tuple[Plan, Checkpoint]:  # fmt: skip
+    """The plan, where an interrupted run of the same input left off, and what that left."""
+    from elastocal.planning.checkpoint import Checkpoint, key_of
+    from elastocal.planning.design import design as run
+
+    apart = ("jobs", "augment", "knowledge")  # these are among the files
+    told = {name: value for name, value in asked.items() if name not in apart}
+    checkpoint = Checkpoint.beside(output, key_of(files, **told), interrupts.check)
+    if checkpoint.begun:
+        progress("resuming the interrupted design")
+    try:
+        plan = run(cell, options, checkpoint, progress)
+    except Exception as error:
+        interrupts.check()
+        if not isinstance(error, OSError):
+            # The same input ends here again: there is nothing to go on with.
+            checkpoint.drop()
+        raise
+    interrupts.check()
+    return plan, checkpoint
 
 
 def _what_next(cell: Path, output: Path, augment: Path | None, plan: Plan) -> str:
@@ -258,40 +196,6 @@ def _what_next(cell: Path, output: Path, augment: Path | None, plan: Plan) -> st
         f"To try it without an arm: elastocal simulate {cell} {output} -o data.csv --draw 1"
         f"{carried}"
     )
-
-
-def _target(target: float | None, poses: int | None) -> float | None:
-    """--target in m."""
-    if target is None:
-        return None
-    require(
-        math.isfinite(target) and target > 0,
-        f"--target takes a positive number of µm; found {target:g}",
-    )
-    require(
-        poses is None,
-        f"--poses {poses} and --target {target:g}: a target asks for the number of poses; drop one",
-    )
-    return target * 1e-6
-
-
-def _numbers(text: str | None) -> list[int]:
-    try:
-        return [] if text is None else [int(part) for part in text.split(",")]
-    except ValueError:
-        raise InputError(
-            f"--curve takes numbers of poses, as in 10,15,20; found '{text}'"
-        ) from None
-
-
-def _candidates(text: str | None) -> int | str | list[int | str] | None:
-    """--candidates 500, taught.csv or taught.csv,500."""
-    if text is None:
-        return None
-    if text.isdecimal():
-        return int(text)
-    path, comma, number = text.rpartition(",")
-    return [path, int(number)] if comma and number.isdecimal() else text
 
 
 def _check_suffixes(programs: list[Path], picture: Path | None) -> None:

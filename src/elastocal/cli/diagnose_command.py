@@ -3,43 +3,29 @@
 from __future__ import annotations
 
 import shlex
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
 
 import typer
 
-from elastocal.cli.app import (
-    CellFile,
-    DataFile,
-    Json,
-    Plugins,
-    Quiet,
-    ReportFile,
-    Seed,
-    check_apart,
-    check_outputs,
-    command,
-    console,
-    repeated,
-)
+from elastocal import verbs
+from elastocal.cli.app import repeated
+from elastocal.cli.signatures import Asked, CellFile, DataFile, JsonFile, ReportFile, Run, command
 from elastocal.errors import require
-from elastocal.screen import progress_line, say
-from elastocal.text import json_text
+from elastocal.screen import say
 
 if TYPE_CHECKING:
-    from elastocal.diagnosis.diagnosis import ExtraPlan
+    from elastocal.diagnosis.diagnosis import Diagnosis
 
 MOST_POSES = 10
 
 
-@command()
+@command(verb=verbs.diagnose, offers="without seed")
 def diagnose(
     cell: CellFile,
     data: DataFile,
-    output: Annotated[
-        Path | None, typer.Option("-o", "--output", help="Write the diagnosis as JSON.")
-    ] = None,
+    output: JsonFile = None,
     report: ReportFile = None,
     plan: Annotated[
         Path | None,
@@ -52,14 +38,9 @@ def diagnose(
     cell_out: Annotated[
         Path | None, typer.Option(help="Write the cell (TOML) with the effects found added.")
     ] = None,
-    without: Annotated[
-        list[str] | None,
-        typer.Option(metavar="EFFECT", help="Exclude an effect; repeatable."),
-    ] = None,
-    plugins: Plugins = False,
-    seed: Seed = 0,
-    as_json: Json = False,
-    quiet: Quiet = False,
+    *,
+    asked: Asked,
+    run: Run,
 ) -> None:
     """Why does the real arm still differ from the model?
 
@@ -68,75 +49,74 @@ def diagnose(
 
     Example: elastocal diagnose cell.toml data.csv -o diagnosis.json --report diagnosis.html
     """
-    from elastocal import verbs
-    from elastocal.diagnosis.diagnose import write_extended_cell
     from elastocal.diagnosis.diagnosis import publish
     from elastocal.files import together
     from elastocal.model.choice import cell_of
-    from elastocal.model.smooth_groups import where_smooth_functions_end
-    from elastocal.report.causes_view import added_text
+    from elastocal.report.diagnosis_terminal import print_diagnosis
+    from elastocal.report.page import write_page
     from elastocal.saving import save_diagnosis
 
     require(
         poses is None or plan is not None,
         f"--poses {poses} has no meaning without --plan; name the file for the extra poses",
     )
-    written = check_outputs(output, report, plan, cell_out)
-    known = cell_of(cell, plugins)  # its plug-ins may have the effect
-    check_apart(written, [cell, data], known)
-    with progress_line(quiet) as progress:
-        found = verbs.diagnose(
-            known, data, without=without or (), seed=seed, progress=progress,
-            extra_poses=None if plan is None else poses or MOST_POSES,
-        )  # fmt: skip
-        assert found.model is not None  # `diagnose` states it
-        kinds = found.model.chain.kinds
+    run.writes(output, report, plan, cell_out)
+    known = cell_of(cell, run.plugins)  # its plug-ins may have the effect
+    run.reads(cell, data, cell=known)
+    most = None if plan is None else poses or MOST_POSES
+    with run.progress() as progress:
+        found = verbs.diagnose(known, data, **asked, extra_poses=most, progress=progress)
+        model = found.model
+        assert model is not None  # `diagnose` states it
         told = []
-        with together(written):
+        with together(run.written):
             if output is not None:
                 save_diagnosis(found, output)
                 told.append(f"wrote {output}")
             if report is not None:
-                from elastocal.report.page import write_page
-
-                write_page(found, report, [cell, data], repeated(), seed)
+                write_page(found, report, [cell, data], repeated(), asked["seed"])
                 told.append(f"wrote {report}")
             if plan is not None:
-                told.append(_write_extra_poses(plan, found.extra, kinds, bool(found.groups)))
+                told.append(_write_extra_poses(plan, found, model.chain.kinds))
             if cell_out is not None:
-                extra = (*found.effects, *found.slight, *found.fields)
-                extended = write_extended_cell(cell, cell_out, extra, found.model_keys)
-                added = added_text(extra)
-                told.append(f"wrote {cell_out} with {added or 'no further effect'}")
-                if ends := where_smooth_functions_end(extended):
-                    told.append(
-                        f"its smooth functions end outside the measured range: {ends}; there the "
-                        "model without them holds"
-                    )
-                if added:
-                    again = shlex.join(
-                        ["elastocal", "identify", str(cell_out), str(data)]
-                        + ["--plugins"] * plugins
-                    )
-                    told.append(f"to go on: {again} -o result.json")
-    if as_json:
-        say(json_text(publish(found, found.model, found.data)))
-        return
-    from elastocal.report.diagnosis_terminal import print_diagnosis
-
-    print_diagnosis(console(), found, kinds)
-    for line in told:
-        say(line)
+                told += _write_extended(cell_out, found, cell, data, run.plugins)
+    if run.answer(
+        lambda: publish(found, model, found.data),
+        lambda screen: print_diagnosis(screen, found, model.chain.kinds),
+        files=False,
+    ):
+        for line in told:
+            say(line)
 
 
-def _write_extra_poses(
-    path: Path, extra: ExtraPlan | None, kinds: Sequence[str], many: bool
-) -> str:
-    """Write the extra poses, and say so; or why there are none to write: `many` causes act at
-    once, or none is left open."""
+def _write_extended(
+    path: Path, found: Diagnosis, cell: Path, data: Path, plugins: bool
+) -> Iterator[str]:
+    """Write the cell with the effects found, and say so and what to do with it."""
+    from elastocal.diagnosis.diagnose import write_extended_cell
+    from elastocal.model.smooth_groups import where_smooth_functions_end
+    from elastocal.report.causes_view import added_text
+
+    extra = (*found.effects, *found.slight, *found.fields)
+    extended = write_extended_cell(cell, path, extra, found.model_keys)
+    added = added_text(extra)
+    yield f"wrote {path} with {added or 'no further effect'}"
+    if ends := where_smooth_functions_end(extended):
+        yield (
+            f"its smooth functions end outside the measured range: {ends}; there the model "
+            "without them holds"
+        )
+    if added:
+        words = ["elastocal", "identify", str(path), str(data)] + ["--plugins"] * plugins
+        yield f"to go on: {shlex.join(words)} -o result.json"
+
+
+def _write_extra_poses(path: Path, found: Diagnosis, kinds: Sequence[str]) -> str:
+    """Write the extra poses, and say so; or why there are none to write."""
     from elastocal.saving import save_extra_poses
 
-    if extra is None and many:
+    extra = found.extra
+    if extra is None and found.groups:
         return f"{path} not written: few extra poses do not separate many causes"
     if extra is None:
         return f"{path} not written: there are no rivals to separate"

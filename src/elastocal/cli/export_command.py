@@ -8,21 +8,10 @@ from typing import TYPE_CHECKING, Annotated
 
 import typer
 
-from elastocal.cli.app import (
-    CellFile,
-    Json,
-    Plugins,
-    Quiet,
-    Seed,
-    check_apart,
-    check_outputs,
-    command,
-    console,
-)
-from elastocal.screen import progress_line, say
-from elastocal.text import json_text
+from elastocal.cli.signatures import FORCE, CellFile, ResultFile, Run, Seed, command
 
 if TYPE_CHECKING:
+    from rich.console import Console
     from rich.table import Table
 
     from elastocal.export.export import Exported
@@ -36,7 +25,7 @@ WORTH_TELLING = 10e-6  # m, as for what compensate leaves open
 @command(short_help="Write the calibrated model: URDF, MuJoCo, DH table")
 def export(
     cell: CellFile,
-    result: Annotated[Path, typer.Argument(help="Result of identify (JSON).")],
+    result: ResultFile,
     output: Annotated[
         Path,
         typer.Option(
@@ -51,7 +40,7 @@ def export(
         ),
     ] = None,
     load: Annotated[
-        tuple[float, float, float] | None,
+        FORCE | None,
         typer.Option(
             metavar="X Y Z",
             help="Force in N at the load point (tracker's axes) for costs and fit.",
@@ -80,44 +69,37 @@ def export(
     poses: Annotated[
         int, typer.Option(min=2, max=1_000_000, help="Random poses to find costs at.")
     ] = 500,
-    plugins: Plugins = False,
     seed: Seed = 0,
-    as_json: Json = False,
-    quiet: Quiet = False,
+    *,
+    run: Run,
 ) -> None:
     """Write the calibrated arm as URDF, MJCF, DH table or parameters, and state the loss.
 
     Example: elastocal export cell.toml result.json -o calibrated.urdf --load 0 0 -2600
     """
-    from elastocal.export.export import export as run
+    from elastocal.export.export import export as exported
     from elastocal.export.export import write
     from elastocal.model.calibrated import read_calibrated
     from elastocal.saving import wish_of
 
-    written = check_outputs(output, joint_correction)
+    run.writes(output, joint_correction)
     wish = wish_of(
         output, format, load, frames, base_frame, temperature_c, time_s, poses, seed,
         joint_correction is not None,
     )  # fmt: skip
-    with progress_line(quiet) as progress:
+    with run.progress() as progress:
         progress("reading")
-        calibrated = read_calibrated(cell, result, plugins)
-        check_apart(written, [cell, result], calibrated.model.cell)
-        done = run(calibrated, wish, progress)
+        calibrated = read_calibrated(cell, result, run.plugins)
+        run.reads(cell, result, cell=calibrated.model.cell)
+        done = exported(calibrated, wish, progress)
     write(done, output, joint_correction)
-    if as_json:
-        say(json_text({"output": str(output)} | done.to_json()))
-        return
-    _tell(done)
-    for path in written:
-        say(f"wrote {path}")
+    run.answer(lambda: {"output": str(output)} | done.to_json(), lambda screen: _tell(screen, done))
 
 
-def _tell(done: Exported) -> None:
+def _tell(screen: Console, done: Exported) -> None:
     """What the file holds and what not, for people."""
     from elastocal.text import printable
 
-    screen = console()
     cost, (name, in_title) = done.cost, NAMES[done.format]
     if cost.effects:
         screen.print(_cost_table(f"What {in_title} cannot hold", cost))

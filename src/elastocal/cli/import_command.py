@@ -7,13 +7,8 @@ from typing import Annotated
 
 import typer
 
-from elastocal.cli.app import (
-    Json,
-    check_apart,
-    check_outputs,
-    command,
-    console,
-)
+from elastocal.cli.app import console
+from elastocal.cli.signatures import Run, command
 from elastocal.errors import InputError, require
 from elastocal.screen import say
 from elastocal.text import json_text
@@ -21,7 +16,11 @@ from elastocal.text import json_text
 PRESET_NAMES = "spatialanalyzer, polyworks, leica, faro, spherical, wide, kuka, abb, ros"
 
 
-@command("import", short_help="Convert tracker exports and joint logs to the measurement table")
+@command(
+    "import",
+    short_help="Convert tracker exports and joint logs to the measurement table",
+    flags="json",
+)
 def import_(
     files: Annotated[
         list[Path] | None,
@@ -54,7 +53,8 @@ def import_(
     angle_unit: Annotated[
         str | None, typer.Option(help="Unit of angles where a file does not say: deg, rad, gon.")
     ] = None,
-    as_json: Json = False,
+    *,
+    run: Run,
 ) -> None:
     """Convert exports of a laser tracker and joint logs to the measurement table.
 
@@ -75,22 +75,20 @@ def import_(
         "the argument FILES is missing: the tracker's export, and the log of the joints",
     )
     require(
-        output is not None or preview or as_json,
+        output is not None or preview or run.json,
         "import needs -o data.csv to write to, or --preview to only look",
     )
     if mapping is None and not preset:
         raise InputError(
             f"import needs --map mapping.toml, or --preset: {PRESET_NAMES}{_suggestion(paths)}"
         )
-    written = check_outputs(output)
-    check_apart(written, [*paths, mapping, cell])
+    run.writes(output)
+    run.reads(*paths, mapping, cell)
     read = with_units(read_mapping(mapping, preset or ()), length_unit, angle_unit)
-    known = None
-    if cell is not None:
-        known = read_cell(cell)
-        check_apart(written, [], known)
+    known = None if cell is None else read_cell(cell)
+    run.reads(cell=known)
     found = import_files(paths, read, known, str(output or "the table"))
-    if as_json:
+    if run.json:
         say(json_text(summary(found, output)))
     elif preview:
         print_preview(console(), found)
@@ -106,7 +104,7 @@ def import_(
     from elastocal.files import atomic_write_text
 
     atomic_write_text(output, found.text)
-    if not as_json:
+    if not run.json:
         table = found.table
         say(
             f"wrote {len(table)} readings of {len(table.configuration_labels)} configurations to "

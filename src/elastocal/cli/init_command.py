@@ -3,16 +3,18 @@
 from __future__ import annotations
 
 from pathlib import Path
-from typing import Annotated
+from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
-from elastocal.cli.app import Json, Plugins, check_apart, check_outputs, command, console
+from elastocal.cli.signatures import Run, command
 from elastocal.screen import say
-from elastocal.text import json_text
+
+if TYPE_CHECKING:
+    from rich.console import Console
 
 
-@command(short_help="Write a working cell file for my arm")
+@command(short_help="Write a working cell file for my arm", flags="")
 def init(
     robot: Annotated[
         Path,
@@ -35,6 +37,8 @@ def init(
         str | None, typer.Option(help="Of a calibration.conf: the robot, as UR10e.")
     ] = None,
     force: Annotated[bool, typer.Option("--force", help="Write over a file.")] = False,
+    *,
+    run: Run,
 ) -> None:
     """Write a working cell: joints and limits from the robot's file, commented guesses elsewhere.
 
@@ -45,7 +49,8 @@ def init(
     from elastocal.importing.first_cell import notes_of, reach_of
     from elastocal.model.choice import load_chain
 
-    check_apart(check_outputs(output), [robot])
+    run.writes(output)
+    run.reads(robot)
     write(robot, output, base=base, flange=flange, convention=convention,  # type: ignore[arg-type]
           ur_model=ur_model, force=force)  # fmt: skip
     cell = read_cell(output)
@@ -64,31 +69,38 @@ def init(
     say(f"  elastocal simulate {output} plan.csv -o data.csv --draw 1 --load {load}")
 
 
-@command(short_help="List the effects that can be fitted")
+@command(short_help="List the effects that can be fitted", flags="plugins json")
 def effects(
     cell: Annotated[
         Path | None, typer.Argument(help="Cell file (TOML); default: the KR 270 of the demo.")
     ] = None,
-    plugins: Plugins = False,
-    as_json: Json = False,
+    *,
+    run: Run,
 ) -> None:
     """Every effect of the catalogue: its parameters' unit and typical size, what it is, and where.
 
     Example: elastocal effects cell.toml
     """
+    from elastocal.demo import example
+    from elastocal.model.choice import cell_of
+    from elastocal.report.effect_names import effect_entries
+
+    known = cell_of(cell or Path(example.__file__).parent / "cell.toml", run.plugins)
+    entries = effect_entries(known)
+    run.answer(
+        lambda: {"schema": "elastocal/effects/1", "effects": entries},
+        lambda screen: _print_effects(screen, known, entries),
+    )
+
+
+def _print_effects(screen: Console, cell: Any, entries: Any) -> None:
     from rich.padding import Padding
 
-    from elastocal.demo import example
-    from elastocal.model.choice import cell_of, load_chain
+    from elastocal.model.choice import load_chain
     from elastocal.model.joint_names import names_told
-    from elastocal.report.effect_names import effect_entries, effect_lines
+    from elastocal.report.effect_names import effect_lines
 
-    known = cell_of(cell or Path(example.__file__).parent / "cell.toml", plugins)
-    entries = effect_entries(known)
-    if as_json:
-        say(json_text({"schema": "elastocal/effects/1", "effects": entries}))
-        return
-    screen, stage = console(), ""
+    stage = ""
     for its_stage, head, what in effect_lines(entries):
         if its_stage != stage:
             stage = its_stage
@@ -96,10 +108,7 @@ def effects(
         screen.print(Padding(head, (0, 0, 0, 2)))
         screen.print(Padding(what, (0, 0, 0, 6)), style="dim")
     screen.print()
-    if told := names_told(load_chain(known)):
+    if told := names_told(load_chain(cell)):
         screen.print(f"Joints: {told}")
-    for line in (
-        "Each line: effect (* fitted or acting), places, typical size of its parameters.",
-        'In the cell: [model] effects = ["joint_offset", "backlash:joint2"].',
-    ):
-        screen.print(line)
+    screen.print("Each line: effect (* fitted or acting), places, typical size of its parameters.")
+    screen.print('In the cell: [model] effects = ["joint_offset", "backlash:joint2"].')

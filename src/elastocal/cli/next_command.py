@@ -2,27 +2,16 @@
 
 from __future__ import annotations
 
+from functools import partial
 from pathlib import Path
 from typing import Annotated
 
 import typer
 
-from elastocal.cli.app import (
-    CellFile,
-    DataFile,
-    Json,
-    Plugins,
-    Quiet,
-    Seed,
-    check_apart,
-    check_outputs,
-    command,
-    console,
-    repeated,
-)
+from elastocal.cli.app import repeated
 from elastocal.cli.identify_command import limits_of
-from elastocal.screen import progress_line, say
-from elastocal.text import json_text
+from elastocal.cli.signatures import CellFile, DataFile, Run, Seed, command
+from elastocal.screen import say
 
 
 @command("next")
@@ -50,10 +39,9 @@ def next_command(
         int, typer.Option(min=1, help="Feasible candidates to choose from.")
     ] = 400,
     jobs: Annotated[int, typer.Option(help="Processes; -1 for all cores.")] = 1,
-    plugins: Plugins = False,
     seed: Seed = 0,
-    as_json: Json = False,
-    quiet: Quiet = False,
+    *,
+    run: Run,
 ) -> None:
     """Which poses should I measure next, or are these enough?
 
@@ -66,26 +54,23 @@ def next_command(
     from elastocal.diagnosis.next_poses import next_poses
     from elastocal.files import together
     from elastocal.model.choice import cell_of
+    from elastocal.report.plan_terminal import print_next
     from elastocal.saving import beside, save_plan
 
     summary = beside(output)
-    written = check_outputs(output, summary)
+    run.writes(output, summary)
     limits = limits_of([] if required is None else [required], ("new_poses",))
-    known = cell_of(cell, plugins)
-    check_apart(written, [cell, data], known)
-    with progress_line(quiet) as progress:
+    known = cell_of(cell, run.plugins)
+    run.reads(cell, data, cell=known)
+    with run.progress() as progress:
         found = next_poses(
             known, data, batch=batch, require=limits.get("new_poses"),
             least_gain=least_gain / 100, candidates=candidates, seed=seed, jobs=jobs,
             progress=progress,
         )  # fmt: skip
         if found.plan is not None:
-            with together(written):
+            with together(run.written):
                 save_plan(found.plan, output, repeated())
-    if as_json:
-        say(json_text(found.to_json()))
-        return
-    from elastocal.report.plan_terminal import print_next
-
-    print_next(console(), found)
-    say(f"{output} not written" if found.plan is None else f"wrote {output}\nwrote {summary}")
+    show = partial(print_next, found=found)
+    if run.answer(found.to_json, show, files=found.plan is not None) and found.plan is None:
+        say(f"{output} not written")

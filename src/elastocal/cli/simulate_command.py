@@ -7,23 +7,18 @@ from typing import Annotated
 
 import typer
 
-from elastocal.cli.app import (
-    CellFile,
-    Json,
-    Plugins,
-    Quiet,
-    Seed,
-    check_apart,
-    check_outputs,
-    command,
-    console,
-)
+from elastocal import verbs
+from elastocal.cli.signatures import Asked, CellFile, Run, Seed, command
 from elastocal.errors import InputError
-from elastocal.screen import progress_line, say
-from elastocal.text import json_text
+from elastocal.screen import say
 
 
-@command(short_help="Simulate the measurements of a plan")
+@command(
+    short_help="Simulate the measurements of a plan",
+    verb=verbs.simulate,
+    offers="draw load repeats seed",
+    flags="plugins json",
+)
 def simulate(
     cell: CellFile,
     plan: Annotated[Path, typer.Argument(help="Poses (CSV): configuration, q1_deg, …")],
@@ -35,23 +30,10 @@ def simulate(
     truth: Annotated[
         Path | None, typer.Option(help="Write the true values used, as JSON {name: value}.")
     ] = None,
-    draw: Annotated[
-        float,
-        typer.Option(
-            metavar="FACTOR", help="Draw true values: typical size times this, at random."
-        ),
-    ] = 0.0,
-    load: Annotated[
-        tuple[float, float, float] | None,
-        typer.Option(
-            metavar="X Y Z", help="Measure every pose unloaded and under this force in N."
-        ),
-    ] = None,
-    repeats: Annotated[int, typer.Option(min=1, help="Readings per pose and load state.")] = 1,
     no_noise: Annotated[bool, typer.Option("--no-noise", help="Exact readings.")] = False,
-    plugins: Plugins = False,
-    seed: Seed = 0,
-    as_json: Json = False,
+    *,
+    asked: Asked,
+    run: Run,
 ) -> None:
     """Simulate measurements from the cell's model, with chosen errors and noise.
 
@@ -61,33 +43,30 @@ def simulate(
     from elastocal.files import together
     from elastocal.model.manipulator import Model
     from elastocal.saving import write_json
-    from elastocal.verbs import simulated
 
-    written = check_outputs(output, truth)
-    model = Model(cell, plugins=plugins)
-    check_apart(written, [cell, plan], model.cell)
+    run.writes(output, truth)
+    model = Model(cell, plugins=run.plugins)
+    run.reads(cell, plan, cell=model.cell)
     poses = model.read_plan(plan)
-    table, x = simulated(
-        model, poses, values=dict(_assignment(text) for text in set_ or ()), draw=draw, load=load,
-        repeats=repeats, noise=not no_noise, seed=seed,
-    )  # fmt: skip
+    values = dict(_assignment(text) for text in set_ or ())
+    table, x = verbs.simulated(model, poses, **asked, values=values, noise=not no_noise)
     planned = model.cell.design.loads
-    if load is None and not table.force.any() and planned is not None and planned.any():
+    if "load" not in asked and not table.force.any() and planned is not None and planned.any():
         say(
             f"Warning: {plan} states no load and none is given, so every reading is unloaded; the "
             "cell plans some ([design] loads_N): simulate one by --load",
             error=True,
         )
     named = dict(zip(model.names, x.tolist(), strict=True))
-    with together(written):
+    with together(run.written):
         table.save(output)
         if truth is not None:
             write_json(truth, named)
-    if as_json:
-        summary = {"output": str(output), "readings": len(table), "poses": len(poses)}
-        say(json_text(summary | {"seed": seed, "truth": named}))
-        return
-    say(f"wrote {len(table)} readings of {len(poses)} poses to {output}")
+    summary = {"output": str(output), "readings": len(table), "poses": len(poses)}
+    told = f"wrote {len(table)} readings of {len(poses)} poses to {output}"
+    run.answer(
+        lambda: summary | {"seed": asked["seed"], "truth": named}, lambda _: say(told), files=False
+    )
 
 
 def _assignment(text: str) -> tuple[str, float]:
@@ -100,7 +79,7 @@ def _assignment(text: str) -> tuple[str, float]:
         ) from None
 
 
-@command(short_help="Simulate and calibrate a KR 270 (Klimchik et al. 2013)")
+@command(short_help="Simulate and calibrate a KR 270 (Klimchik et al. 2013)", flags="json quiet")
 def demo(
     folder: Annotated[
         Path,
@@ -109,8 +88,8 @@ def demo(
         ),
     ] = Path("demo_out"),
     seed: Seed = 2013,
-    as_json: Json = False,
-    quiet: Quiet = False,
+    *,
+    run: Run,
 ) -> None:
     """The KR 270 example of Klimchik et al. 2013, measured (simulated) and identified.
 
@@ -118,8 +97,9 @@ def demo(
     """
     from elastocal.cli.identify_command import write_results
     from elastocal.demo.example import run_demo
+    from elastocal.report.terminal import print_result
 
-    with progress_line(quiet) as progress:
+    with run.progress() as progress:
         done = run_demo(folder, seed, progress)
         report = folder / "report.html"
         inputs = [done.cell, done.plan, done.data]
@@ -127,13 +107,11 @@ def demo(
             done.result, folder / "result.json", report, None, inputs, seed, done.truth,
             done.published,
         )  # fmt: skip
-    if as_json:
-        say(json_text(done.result.to_json() | {"truth": done.truth}))
-        return
-    from elastocal.report.terminal import print_result
-
-    print_result(console(), done.result, truth=done.truth)
-    say(
-        f"\nTo repeat it by hand: elastocal identify {done.cell} {done.data} -o result.json\n"
-        f"Report to open: {report.absolute()}"
-    )
+    if run.answer(
+        lambda: done.result.to_json() | {"truth": done.truth},
+        lambda screen: print_result(screen, done.result, truth=done.truth),
+    ):
+        say(
+            f"\nTo repeat it by hand: elastocal identify {done.cell} {done.data} -o result.json\n"
+            f"Report to open: {report.absolute()}"
+        )

@@ -9,10 +9,8 @@ from typing import TYPE_CHECKING, Annotated, Any, Self
 
 import typer
 
-from elastocal.cli.app import (
-    command,
-    console,
-)
+from elastocal.cli.app import console
+from elastocal.cli.signatures import command
 from elastocal.errors import InsufficientDataError, require
 from elastocal.screen import say
 
