@@ -25,11 +25,12 @@ ROOMS = {
     "planning": (6.4, 4, 1.3, "poses, with a certificate"),
     "simulation": (1.5, 3, 0.85, "what one would\nmeasure"),
     "identification": (4.1, 3, 0.95, "weighted fit on B,\nnoise, intervals"),
+    "engine": (7.4, 2, 1.1, "the linear mixed model"),
     "model": (4.1, 2, 1.75, "effects on the chain → prediction and $B_i$"),
     "cell": (2.95, 1, 1.0, "robot, tool, tracker,\nwork space"),
     "measurements": (5.25, 1, 1.0, "the table of\nreadings"),
 }
-MISSION = ("model", "identification", "planning", "diagnosis")
+MISSION = ("model", "engine", "identification", "planning", "diagnosis")
 COMMON = "units · errors · text · files · config · tables"
 HEIGHT, STEP = 0.72, 1.14
 

@@ -24,7 +24,8 @@ from elastocal.cell.arm_description import CartesianNoise, PolarNoise, Robot, Un
 from elastocal.cell.plan_wishes import DesignSpec, Motion
 from elastocal.cell.work_cell import Cell
 from elastocal.cell.workspace_rules import Workspace
-from elastocal.identification.noise_choice import linearised, outlier_screening, settle
+from elastocal.identification.noise_choice import linearised
+from elastocal.identification.noise_judge import outlier_screening, settle
 from elastocal.measurements import Measurements, with_moves
 from elastocal.model.observations import observe
 from elastocal.planning import test_poses as target_poses

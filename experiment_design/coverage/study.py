@@ -18,7 +18,7 @@ from scenarios import SCENARIOS, Setting, setting
 from tables import report, totals
 
 from elastocal.identification.covariance import cluster_robust
-from elastocal.identification.noise_choice import outlier_screening, settle
+from elastocal.identification.noise_judge import outlier_screening, settle
 from elastocal.identification.published import eq14, ols
 from elastocal.identification.robust import asymptotic_covariance, tukey
 

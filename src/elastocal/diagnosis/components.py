@@ -39,8 +39,8 @@ from elastocal.diagnosis.noise_floor import (
     inverse_triangle,
     log_prior,
     posterior,
-    scored_climb,
 )
+from elastocal.engine.climb import climb
 from elastocal.identification.smooth_prior import Standardised
 from elastocal.model.effects.base import Effect
 from elastocal.model.effects.smooth import ResidualField, Waves
@@ -416,7 +416,7 @@ class SumOfComponents:
             lower[1:] = np.concatenate([np.full(K, GONE - 1), lengths[:, 0]])
             most = [min(LARGEST, float(np.log(c.effect.most))) for c in self.components]
             upper[1:] = np.concatenate([most, lengths[:, 1]])
-        x = scored_climb(self.objective, theta, lower, upper, enough, STEPS)[0]
+        x = climb(self.objective, theta, lower, upper, enough, STEPS)[0]
         return Sizes(float(x[0]), x[1 : K + 1], x[K + 1 :])
 
     def earned(self, at: Sizes) -> tuple[Array, Array]:

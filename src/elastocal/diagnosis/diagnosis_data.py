@@ -323,9 +323,9 @@ def _stated_drift(base: Baseline) -> tuple[Array, Array | float]:
     along = np.where(np.arange(size) < 3, noise.drift, 0.0)
     waves = along_axes(record.waves(lasting), along)
     drift = np.concatenate([waves, np.zeros((n - base.n_measured, *waves.shape[1:]))])
-    left = faster_course("drift", record, lasting, along).padded(n + 1 - base.n_measured)
-    m = blocks.member.shape[1] * size
-    return drift, left.product(blocks.member, left, blocks.member).reshape(-1, m, m)
+    members = np.where(blocks.member < base.n_measured, blocks.member, -1)
+    loading = faster_course(record, lasting, along).packed(members)
+    return drift, loading @ loading.transpose(0, 2, 1)
 
 
 def _load_hypotheses(base: Baseline) -> list[Hypothesis]:

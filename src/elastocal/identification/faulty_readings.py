@@ -11,13 +11,9 @@ from numpy.typing import ArrayLike, NDArray
 from scipy import special
 
 from elastocal.errors import ElastocalError, require
-from elastocal.identification.noise_choice import (
-    NoiseFit,
-    linearised,
-    own_noise,
-    standard_errors,
-    weights_of,
-)
+from elastocal.identification.noise_choice import NoiseFit, linearised, weights_of
+from elastocal.identification.noise_judge import standard_errors
+from elastocal.identification.noisy_readings import own_noise
 from elastocal.identification.outliers import FALSE_ALARM, blocks, studentised
 from elastocal.identification.residuals import f_test
 from elastocal.identification.robust import Design, design

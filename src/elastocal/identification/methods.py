@@ -18,11 +18,10 @@ from elastocal.identification.noise_choice import (
     NoiseFit,
     estimate_noise,
     linearised,
-    outlier_screening,
     over_times,
-    settle,
     weights_of,
 )
+from elastocal.identification.noise_judge import outlier_screening, settle
 from elastocal.identification.noise_structure import Kind, Readings
 from elastocal.identification.options import ROBUST, Options
 from elastocal.identification.residuals import held_out_residual, rms_3d

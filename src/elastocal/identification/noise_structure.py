@@ -5,11 +5,12 @@ from __future__ import annotations
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property
-from typing import Any, ClassVar, NamedTuple
+from typing import ClassVar, NamedTuple
 
 import numpy as np
 from scipy import sparse
 
+from elastocal.engine.mixed import Common, Diagonal, Full, NoisePart, Pack
 from elastocal.errors import InputError, option, require
 from elastocal.identification.visit_record import VisitRecord
 from elastocal.measurements import Measurements, firsts, numbered
@@ -29,7 +30,7 @@ class Readings:
     position is known, holds the unit vectors along and across the line of sight as rows and
     `reach` (N,) its length in m; `stated` (N, size, size), where noise is stated, its covariance.
     `lead` (N,) are the readings' rows in the `table`.  `visits` says at which visits of the arm
-    they were made; `apart`, that repeats of different visits are no repeats of one reading.
+    they were made.
     """
 
     B: Array
@@ -43,7 +44,6 @@ class Readings:
     table: Measurements | None = None
     lead: IntArray | None = None
     visits: VisitRecord | None = None
-    apart: bool = False
 
     def __post_init__(self) -> None:
         n, size = self.e.shape
@@ -73,19 +73,6 @@ class Readings:
         assert self.table is not None and self.lead is not None
         return self.table.take(self.lead)
 
-    @cached_property
-    def set_of(self) -> IntArray:
-        """Number (N,) of the set of repeats that a reading belongs to."""
-        labels = [self.configuration, self.load, self.marker]
-        if self.apart and self.visits is not None:
-            labels.append(self.visits.visit[:, 0])
-        return numbered(*labels)
-
-    @cached_property
-    def sets(self) -> RepeatSets:
-        """Sets of repeats with plain means; every noise model but the stated one uses them."""
-        return reduce_repeats(self)
-
     def take(self, chosen: BoolArray) -> Readings:
         """Only the readings where `chosen` (N,) holds."""
         names = ("B", "e", "configuration", "load", "marker", "sight", "reach", "stated", "lead")
@@ -102,10 +89,6 @@ class Readings:
         order = np.random.default_rng(0).permutation(len(count))
         return self.take(np.isin(code, order[: np.searchsorted(np.cumsum(count[order]), n) + 1]))
 
-    def by_visit(self, apart: bool = True) -> Readings:
-        """The same with repeats of different visits `apart`, or all together."""
-        return self if apart == self.apart else replace(self, apart=apart)
-
     def of_columns(self, chosen: BoolArray) -> Readings:
         """Only the columns of B where `chosen` (p,) holds."""
         return replace(self, B=self.B[:, :, chosen])
@@ -115,80 +98,6 @@ class Readings:
         return replace(self, e=e)
 
 
-@dataclass(frozen=True)
-class RepeatSets:
-    """Sets of repeats, reduced without loss: a mean and what scatters about it.
-
-    With the covariance θ S_i of reading i in a set, the weighted mean ȳ = U Σ S_i⁻¹ y_i with
-    U = (Σ S_i⁻¹)⁻¹ and the scatter about it are sufficient: ȳ varies by θ U plus whatever all
-    repeats share, the scatter by θ alone with (repeats − 1) · size degrees of freedom.  Repeats
-    are taken to have one B; where theirs differ a little, the mean stands for all.
-    `B` (C, size, p), `e` (C, size), `unit` U (C, size, size), `dof` (C,) repeats − 1, `scatter`
-    (C, size, size), `log_offset`: Σ log|S_i| − log|U| over all sets, which the likelihood needs.
-    """
-
-    B: Array
-    e: Array
-    unit: Array
-    repeats: IntArray
-    dof: Array
-    scatter: Array
-    log_offset: float
-    configuration: IntArray
-    load: IntArray
-    marker: IntArray
-    sight: Array | None
-    reach: Array | None
-    visits: VisitRecord | None = None
-
-    def __len__(self) -> int:
-        return len(self.e)
-
-
-def reduce_repeats(readings: Readings, stated: bool = False) -> RepeatSets:
-    """The sets of repeats; weighted by the stated covariances if `stated`, else plainly."""
-    set_of = readings.set_of
-    n_sets = int(set_of.max()) + 1
-    first = firsts(set_of, n_sets)
-    repeats = np.bincount(set_of, minlength=n_sets)
-    size = readings.size
-    if stated:
-        require(readings.stated is not None, "no noise is stated that could be used")
-        S = np.asarray(readings.stated)
-        P = np.linalg.inv(S)
-        unit = np.linalg.inv(_sum(P, set_of, n_sets)).astype(np.float64)
-        offset = np.linalg.slogdet(S)[1].sum() - np.linalg.slogdet(unit)[1].sum()
-        share = unit[set_of] @ P
-        e = _sum((share @ readings.e[:, :, None])[..., 0], set_of, n_sets)
-        B = _sum(share @ readings.B, set_of, n_sets)
-        deviation = readings.e - e[set_of]
-        squares = np.einsum("ni,nij,nj->n", deviation, P, deviation)
-        scatter = np.bincount(set_of, squares, n_sets)[:, None, None] * np.eye(size) / size
-    else:
-        unit = np.eye(size) / repeats[:, None, None]
-        offset = size * np.log(repeats).sum()
-        e = _sum(readings.e, set_of, n_sets) / repeats[:, None]
-        B = _sum(readings.B, set_of, n_sets) / repeats[:, None, None]
-        deviation = readings.e - e[set_of]
-        scatter = _sum(deviation[:, :, None] * deviation[:, None, :], set_of, n_sets)
-    return RepeatSets(
-        B, e, unit, repeats, (repeats - 1).astype(float), scatter, float(offset),
-        readings.configuration[first], readings.load[first], readings.marker[first],
-        None if readings.sight is None else readings.sight[first],
-        None if readings.reach is None else readings.reach[first],
-        None if readings.visits is None else readings.visits.take(first),
-    )  # fmt: skip
-
-
-def _sum(values: Array, set_of: IntArray, n_sets: int) -> Array:
-    total = np.zeros((n_sets, *values.shape[1:]))
-    if n_sets == len(set_of):  # no repeats
-        total[set_of] += values
-    else:
-        np.add.at(total, set_of, values)
-    return total
-
-
 # How the noise of a single reading may be built: one variance, or several.
 #
 # Besides the built-in structures there are those that a `NoiseModel` of the user's own describes.
@@ -196,51 +105,46 @@ def _sum(values: Array, set_of: IntArray, n_sets: int) -> Array:
 
 @dataclass(frozen=True)
 class Structure:
-    """Covariance of one reading in set c: Σ_l θ[index[c, l]] · matrix[c, l].
+    """Covariance of reading i alone: Σ_l θ[index[i, l]] · matrix[i, l].
 
-    `index` (C, L) into the `names` of the variances θ, in m² (rad²); `matrix` (C, L, size, size)
-    for a single reading.  The set's mean has that covariance with `mean_matrix` in its place.
-    `shrunk` says that the variances are many and share a prior (see shrinkage).  Where there is a
-    course in time, it is `lasting` so long (`with_drift`), its coefficients' sets come last, and
-    what changes `faster`, common to a visit, has the variances of the course.
+    `index` (N, L) into the `names` of the variances θ, in m² (rad²); `matrix` (N, L, size, size).
+    `shrunk` says that the variances are many and share a prior.
     """
 
     name: str
     description: str
     names: tuple[str, ...]
-    sets: RepeatSets
     index: IntArray
     matrix: Array
-    mean_matrix: Array
     shrunk: bool = False
-    lasting: float | None = None
-    faster: tuple[SharedEffect, ...] = ()
 
-    @property
-    def n_own(self) -> int:
-        """How many of the variances are those of single readings."""
-        return sum(not name.startswith(DRIFT) for name in self.names)
+    def covariance(self, theta: Array) -> Array:
+        """Of each reading (N, size, size)."""
+        return np.einsum("nl,nlij->nij", theta[self.index], self.matrix)
 
 
-def _plain(
-    name: str, text: str, names: Sequence[str], sets: RepeatSets, index: IntArray, matrix: Array
-) -> Structure:
-    """Where the mean of a set is the plain one; `index` (C, L), or (L,) the same in all sets."""
-    index = np.broadcast_to(index, (len(sets), index.shape[-1])).copy()
-    matrix = np.broadcast_to(matrix, (len(sets), *matrix.shape[-3:])).copy()
-    mean = matrix / sets.repeats[:, None, None, None]
-    return Structure(name, text, tuple(names), sets, index, matrix, mean)
+def _alike(
+    name: str, text: str, names: Sequence[str], n: int, index: IntArray, matrix: Array,
+    shrunk: bool = False,
+) -> Structure:  # fmt: skip
+    """`index` (N, L), or (L,) the same for all readings; `matrix` likewise."""
+    index = np.broadcast_to(index, (n, index.shape[-1]))
+    matrix = np.broadcast_to(matrix, (n, *matrix.shape[-3:]))
+    return Structure(name, text, tuple(names), index, matrix, shrunk)
+
+
+def _axes(size: int) -> Array:
+    return np.eye(size)[:, :, None] * np.eye(size)[:, None, :]
 
 
 def independent(readings: Readings) -> Structure:
     """One variance for all readings (positions, and one for rotations)."""
     size = readings.size
-    kinds = [range(3), range(3, 6)] if size == 6 else [range(size)]
-    names = ("position", "rotation")[: len(kinds)] if size > 1 else ("distance",)
-    parts = np.array([np.diag(np.isin(np.arange(size), kind).astype(float)) for kind in kinds])
-    return _plain(
-        "independent", "one variance for all readings", names, readings.sets,
-        np.arange(len(kinds)), parts,
+    names = ("position", "rotation")[: max(size // 3, 1)] if size > 1 else ("distance",)
+    parts = np.array([_axes(size)[3 * k : 3 * k + 3].sum(axis=0) for k in range(len(names))])
+    return _alike(
+        "independent", "one variance for all readings", names, len(readings),
+        np.arange(len(names)), parts,
     )  # fmt: skip
 
 
@@ -248,19 +152,20 @@ def by_axis(readings: Readings) -> Structure:
     """One variance for each component of a reading."""
     size = readings.size
     names = ("x", "y", "z", "rx", "ry", "rz")[:size] if size > 1 else ("distance",)
-    parts = np.eye(size)[:, :, None] * np.eye(size)[:, None, :]
-    return _plain("axis", "one variance per axis", names, readings.sets, np.arange(size), parts)
+    return _alike(
+        "axis", "one variance per axis", names, len(readings), np.arange(size), _axes(size)
+    )
 
 
 def by_marker(readings: Readings) -> Structure:
     """One variance for each marker."""
     require(readings.size == 3, "variances per marker are for positions and deflections")
-    sets = readings.sets
-    labels, index = np.unique(sets.marker, return_inverse=True)
+    labels, index = np.unique(readings.marker, return_inverse=True)
     names = [f"marker {m}" for m in labels]
-    return _plain(
-        "marker", "one variance per marker", names, sets, index.reshape(-1, 1), np.eye(3)[None]
-    )
+    return _alike(
+        "marker", "one variance per marker", names, len(readings), index.reshape(-1, 1),
+        np.eye(3)[None],
+    )  # fmt: skip
 
 
 def by_group(readings: Readings) -> Structure:
@@ -268,17 +173,15 @@ def by_group(readings: Readings) -> Structure:
 
     The group of Klimchik et al. 2013, section 4: its markers and repeats share one σ.
     """
-    sets = readings.sets
     size = readings.size
-    key = np.column_stack([sets.configuration, sets.load])
+    key = np.column_stack([readings.configuration, readings.load])
     groups, number = np.unique(key, axis=0, return_inverse=True)
-    index = number.ravel()[:, None] * size + np.arange(size)
-    parts = np.eye(size)[:, :, None] * np.eye(size)[:, None, :]
     names = [
         f"configuration {c}, load {load}, component {a}" for c, load in groups for a in range(size)
     ]
     text = "a variance per configuration and direction, shrunk towards the others"
-    return replace(_plain("groups", text, names, sets, index, parts), shrunk=True)
+    index = number.ravel()[:, None] * size + np.arange(size)
+    return _alike("groups", text, names, len(readings), index, _axes(size), shrunk=True)
 
 
 def polar(readings: Readings, angular: bool | None = None) -> Structure:
@@ -292,29 +195,24 @@ def polar(readings: Readings, angular: bool | None = None) -> Structure:
         readings.sight is not None and readings.size == 3,
         "polar noise needs positions and the tracker's position",
     )
-    sets = readings.sets
-    u, d = np.asarray(sets.sight)[:, 0, :], np.asarray(sets.reach)
+    u, d = np.asarray(readings.sight)[:, 0, :], np.asarray(readings.reach)
     along = u[:, :, None] * u[:, None, :]
-    across = np.eye(3) - along
-    matrix = np.stack([along, across], axis=1)
-    names: tuple[str, ...] = ("range", "transverse")
-    if angular is None:
-        angular = bool(np.ptp(d) > 0.2 * d.mean())
-    if angular:
-        matrix = np.concatenate([matrix, (across * d[:, None, None] ** 2)[:, None]], axis=1)
-        names = (*names, "angular")
+    parts, names = [along, np.eye(3) - along], ["range", "transverse"]
+    if angular if angular is not None else np.ptp(d) > 0.2 * d.mean():
+        parts.append(parts[1] * d[:, None, None] ** 2)
+        names.append("angular")
     text = "range and transverse variances of the tracker"
-    return _plain("polar", text, names, sets, np.arange(len(names)), matrix)
+    return _alike(
+        "polar", text, names, len(readings), np.arange(len(names)), np.stack(parts, axis=1)
+    )
 
 
 def as_stated(readings: Readings) -> Structure:
     """The stated noise times one factor, which the residuals tell."""
-    sets = reduce_repeats(readings, stated=True)
-    matrix = np.tile(np.eye(readings.size), (len(sets), 1, 1, 1))
-    return Structure(
-        "stated", "the stated noise times one factor", ("factor",), sets,
-        np.zeros((len(sets), 1), dtype=np.int64), matrix, sets.unit[:, None],
-    )  # fmt: skip
+    require(readings.stated is not None, "no noise is stated that could be used")
+    matrix = np.asarray(readings.stated)[:, None]
+    text = "the stated noise times one factor"
+    return _alike("stated", text, ("factor",), len(readings), np.zeros(1, np.int64), matrix)
 
 
 STRUCTURES: dict[str, Callable[[Readings], Structure]] = {
@@ -327,20 +225,12 @@ STRUCTURES: dict[str, Callable[[Readings], Structure]] = {
 }
 
 
-def of_readings(
-    structure: Structure, readings: Readings
-) -> tuple[tuple[str, ...], IntArray, Array]:
-    """Names, `index` (N, L) and `matrix` (N, L, size, size) of such a structure for each of the
-    `readings`, be they those that it is of or others."""
-    if structure.name == "stated":  # whatever their sets
-        matrix = np.asarray(readings.stated)[:, None]
-        return structure.names[:1], np.zeros((len(readings), 1), dtype=np.int64), matrix
-    whole = (
-        polar(readings, "angular" in structure.names)
-        if structure.name == "polar"
-        else STRUCTURES[structure.name](readings)
-    )
-    return whole.names, whole.index[readings.set_of], whole.matrix[readings.set_of]
+def like(structure: Structure, readings: Readings) -> Structure:
+    """The same noise of these `readings`, be they those that it is of or others; their variances
+    are numbered as they come."""
+    if structure.name == "polar":
+        return polar(readings, "angular" in structure.names)
+    return STRUCTURES[structure.name](readings)
 
 
 SHARED = "+configuration"
@@ -376,18 +266,15 @@ class NoiseModel:
         """The model for the likelihood; InputError where `components` are not as they should be."""
         found = self.components(readings)
         require(bool(found), f"the noise model '{self.name}' has no components")
-        whole = np.stack([self._matrices(name, S, readings) for name, S in found.items()], axis=1)
-        sets, set_of = readings.sets, readings.set_of
-        matrix = np.zeros((len(sets), *whole.shape[1:]))
-        np.add.at(matrix, set_of, whole)
-        matrix /= sets.repeats[:, None, None, None]
+        matrix = np.stack([self._matrices(name, S, readings) for name, S in found.items()], axis=1)
         smallest = np.linalg.eigvalsh(matrix.sum(axis=1))[:, 0]
         require(
             bool((smallest > 0).all()),
             f"the noise model '{self.name}' leaves a reading without noise in some direction: its "
             "components add up to a singular matrix",
         )
-        return _plain(self.name, self.description, list(found), sets, np.arange(len(found)), matrix)
+        n, names = len(readings), tuple(found)
+        return _alike(self.name, self.description, names, n, np.arange(len(names)), matrix)
 
     def _matrices(self, name: str, S: Array, readings: Readings) -> Array:
         """S (N, size, size) of one component, checked."""
@@ -480,7 +367,7 @@ class Kind(NamedTuple):
         return bool(self.joints) or self.time
 
 
-# Random effects: what readings of a configuration have in common besides the model.
+# What readings have in common besides the model.
 
 PARTITIONS = (
     ("configuration",),
@@ -492,32 +379,22 @@ PARTITIONS = (
 
 @dataclass(frozen=True)
 class SharedEffect:
-    """A deviation common to all sets of one `unit` (C, m): covariance τ² Σ ℓ ℓᵀ of those that share
-    it, with the loadings ℓ of each set on its units, `loading` (C, m, size, r).
+    """A deviation common to all readings of one `unit` (N, m): covariance τ² Σ ℓ ℓᵀ of those that
+    share it, with the loadings ℓ of each reading on its units, `loading` (N, m, size, r).
 
-    Sets are of one unit where they agree in the labels `by`; at an unit of −1 there is nothing.  A
-    joint that settles elsewhere at each visit is the deviation of a visit with ℓ = ∂(reading)/∂q of
-    the `joints`; what is left of a course so long `lasting`, one along the axes.
+    Readings are of one unit where they agree in the labels `by`; at an unit of −1 there is nothing.
+    A joint that settles elsewhere at each visit is the deviation of a visit with ℓ = ∂(reading)/∂q
+    of the `joints`; what is left of a course in time, one along the axes.
     """
 
     name: str
     by: tuple[str, ...]
     unit: IntArray
     loading: Array
-    axes: Array
     joints: tuple[int, ...] = ()
-    lasting: float = 0.0
-
-    def of(self, readings: Readings) -> SharedEffect:
-        """The same deviation for single readings (N in the place of C)."""
-        if self.joints:
-            return _of_joints(self.name, readings, self.joints)
-        if self.lasting:
-            return faster_course(self.name, readings.visits, self.lasting, self.axes)
-        return _common(self.name, self.by, readings, self.axes)
 
     def columns(self) -> sparse.csr_array:
-        """Z (C·size, units·r) of the loadings: the covariance of all is τ² Z Zᵀ."""
+        """Z (N·size, units·r) of the loadings: the covariance of all is τ² Z Zᵀ."""
         n, m, size, r = self.loading.shape
         units, unit = np.unique(self.unit, return_inverse=True)
         column = unit.reshape(n, m, 1, 1) * r + np.arange(r)
@@ -529,66 +406,54 @@ class SharedEffect:
         Z.eliminate_zeros()
         return Z
 
-    def padded(self, k: int) -> SharedEffect:
-        """The same with k more sets that have no part in it."""
-        unit = np.concatenate([self.unit, np.full((k, self.unit.shape[1]), -1)])
-        loading = np.concatenate([self.loading, np.zeros((k, *self.loading.shape[1:]))])
-        return replace(self, unit=unit, loading=loading)
-
-    def product(self, members: IntArray, other: SharedEffect, others: IntArray) -> Array:
-        """Σ ℓ ℓᵀ (G, n, size, k, size) of the sets `members` (G, n) and `others` (G, k)."""
-        mine, theirs = self.unit[members], other.unit[others]
-        a, b = self.loading[members], other.loading[others]
-        (G, n, own, size, r), (k, units) = a.shape, theirs.shape[1:]
-        out = np.zeros((G, n, size, k, size))
-        # Products of matrices for the one or two units of a set: einsum took twenty times as long.
-        for i, j in np.ndindex(own, units):
-            unit = mine[:, :, None, i]
-            same = (unit == theirs[:, None, :, j]) & (unit >= 0)
-            rows = a[:, :, i].reshape(G, n * size, r)
-            columns = b[:, :, j].reshape(G, k * size, r)
-            each = (rows @ columns.transpose(0, 2, 1)).reshape(out.shape)
-            out += np.multiply(each, same[:, :, None, :, None], out=each)
-        return out
+    def packed(self, members: IntArray) -> Array:
+        """Loadings (C, M·size, units·r) of the readings `members` (C, M), −1 for none, on the units
+        of each cluster."""
+        here = members >= 0
+        unit = np.where(here[..., None], self.unit[members], -1)
+        loading = np.where((unit >= 0)[..., None, None], self.loading[members], 0.0)
+        C, M, m, size, _ = loading.shape
+        local = ranked_within(unit.reshape(C, -1)).reshape(C, M, m)
+        mine = local[..., None] == np.arange(max(int(local.max(initial=0)) + 1, 1))
+        return np.einsum("cmku,cmksr->cmsur", mine, loading).reshape(C, M * size, -1)
 
 
-def _common(
-    name: str, by: tuple[str, ...], labelled: RepeatSets | Readings, axes: Array
-) -> SharedEffect:
-    """Sets or readings that agree in the labels `by` share a deviation of covariance diag(axes)."""
-    unit = np.zeros(len(labelled), dtype=np.int64)
-    for label in PARTITIONS[-1]:
-        unit = unit * LABELS + (getattr(labelled, label) + 1 if label in by else 0)
-    loading = np.diag(np.sqrt(axes))[:, axes > 0]
-    return SharedEffect(name, by, unit[:, None], np.tile(loading, (len(labelled), 1, 1, 1)), axes)
+def ranked_within(codes: IntArray) -> IntArray:
+    """The place of each code among the different ones of its row (C, n); −1 where it is below 0."""
+    order = np.argsort(codes, axis=1, kind="stable")
+    ordered = np.take_along_axis(codes, order, axis=1)
+    new = np.concatenate([ordered[:, :1] >= 0, np.diff(ordered, axis=1) > 0], axis=1)
+    out = np.empty_like(codes)
+    np.put_along_axis(out, order, np.cumsum(new, axis=1) - 1, axis=1)
+    return np.where(codes < 0, -1, out)
 
 
-LABELS = 2**20  # that a table may have of each kind, so that three of them make one number
-
-
-def shared_effects(sets: RepeatSets, size: int, wanted: bool = True) -> tuple[SharedEffect, ...]:
-    """The shared effects that these readings can tell apart.
+def shared_effects(readings: Readings, every: bool = False) -> tuple[SharedEffect, ...]:
+    """The shared effects that these readings can tell apart; or `every` one that there may be.
 
     An arm does not come back to quite the same place: a deviation per configuration; per
     configuration and load; per configuration and marker; and per set, common to its repeats.
     One is left out where it would coincide with another or with the noise of single readings.
     Rotations, in rad, have variances of their own.
     """
-    if not wanted:
-        return ()
     kept: dict[tuple[str, ...], IntArray] = {}
+    by: tuple[str, ...]
     for by in PARTITIONS:
-        unit = numbered(*(getattr(sets, label) for label in by))
-        # Alone in its unit and not repeated, a reading's own noise covers it.
-        observed = np.bincount(unit, sets.repeats)
-        if (observed < 2).all() or any(np.array_equal(unit, other) for other in kept.values()):
+        unit = numbered(*(getattr(readings, label) for label in by))
+        # Alone in its unit, a reading's own noise covers it.
+        told = (np.bincount(unit) > 1).any() and not any(
+            np.array_equal(unit, other) for other in kept.values()
+        )
+        if not (told or every):
             continue
         kept[by] = unit
-    position = np.where(np.arange(size) < 3, 1.0, 0.0)
-    names = {by: " and ".join([", ".join(by[:-1]), by[-1]] if by[1:] else by) for by in kept}
-    found = [_common(names[by], by, sets, position) for by in kept]
-    if size == 6:
-        found += [_common(f"{names[by]} (rotation)", by, sets, 1.0 - position) for by in kept]
+    size, found = readings.size, []
+    for k, kind in enumerate(("", " (rotation)")[: max(size // 3, 1)]):
+        axes = np.eye(size)[:, 3 * k : 3 * k + 3]
+        for by, unit in kept.items():
+            name = (" and ".join([", ".join(by[:-1]), by[-1]]) if by[1:] else by[0]) + kind
+            loading = np.broadcast_to(axes, (len(readings), 1, *axes.shape))
+            found.append(SharedEffect(name, by, unit[:, None], loading))
     return tuple(found)
 
 
@@ -598,12 +463,9 @@ VISIT = "visit"
 ALIKE = 1e-9  # m per rad: joints that move no reading more than this have no scatter to be seen
 
 
-def joint_effects(sets: RepeatSets, each: bool) -> tuple[SharedEffect, ...]:
+def joint_effects(record: VisitRecord, each: bool) -> tuple[SharedEffect, ...]:
     """The scatter of the joints from visit to visit, as a diagnosis has it too: a standard
     deviation for each joint, or one for all that turn and one for all that slide."""
-    record = sets.visits
-    if record is None:
-        return ()
     seen = np.abs(record.motion).max(axis=(0, 1, 2), initial=0.0) > ALIKE
     groups: list[tuple[str, tuple[int, ...]]]
     if each:
@@ -611,83 +473,26 @@ def joint_effects(sets: RepeatSets, each: bool) -> tuple[SharedEffect, ...]:
     else:
         both = ("each joint", record.turning), ("each slide", ~record.turning)
         groups = [(name, tuple(np.flatnonzero(seen & kind).tolist())) for name, kind in both]
-    return tuple(_of_joints(name, sets, joints) for name, joints in groups if joints)
-
-
-def _of_joints(name: str, labelled: RepeatSets | Readings, joints: tuple[int, ...]) -> SharedEffect:
-    record = labelled.visits
-    assert record is not None
-    loading = record.motion[..., list(joints)]
-    return SharedEffect(name, (VISIT,), record.visit, loading, np.zeros(0), joints)
+    return tuple(
+        SharedEffect(name, (VISIT,), record.visit, record.motion[..., list(joints)], joints)
+        for name, joints in groups
+        if joints
+    )
 
 
 DRIFT = "drift in time"
 
 
-def faster_course(
-    name: str, record: VisitRecord | None, lasting: float, axes: Array
-) -> SharedEffect:
+def drifts_of(size: int) -> tuple[tuple[str, Array], ...]:
+    """Names and axes (size,) of what drifts apart: positions, and rotations."""
+    both = ((DRIFT, np.arange(size) < 3), (f"{DRIFT} (rotation)", np.arange(size) >= 3))
+    return tuple((name, axes.astype(float)) for name, axes in both if axes.any())
+
+
+def faster_course(record: VisitRecord, lasting: float, axes: Array) -> SharedEffect:
     """What of a course in time changes faster than its waves, of deviations `axes` (size,)."""
-    assert record is not None
     loading = record.faster(lasting)[:, :, None, None] * np.diag(axes)[:, axes > 0]
-    return SharedEffect(name, (VISIT,), record.visit, loading, axes, lasting=lasting)
-
-
-def with_drift(structure: Structure, lasting: float) -> Structure:
-    """The structure with a course in time common to all readings, of unknown variance.
-
-    The course's coefficients (`VisitRecord.waves`) are columns of
-    B, along x, y and z (and of rotations), which readings of zero with the unknown variance hold:
-    restricted likelihood is then the same as that of the course taken for noise (Henderson 1975),
-    and nothing that is as large as the table squared is formed.  What changes faster than these
-    waves is a deviation of each visit.
-    """
-    sets = structure.sets
-    assert sets.visits is not None
-    waves = sets.visits.waves(lasting)
-    (C, size, p), k = sets.B.shape, waves.shape[1]
-    kinds = [np.arange(3), np.arange(3, 6)] if size == 6 else [np.arange(size)]
-    names = (DRIFT, f"{DRIFT} (rotation)")[: len(kinds)]
-    more = along_axes(waves, np.ones(size))
-    held = np.concatenate([np.zeros((k, size, p)), np.eye(k * size).reshape(k, size, -1)], axis=2)
-    none = np.zeros((k, size, size))
-
-    def tailed(values: Any, tail: Any) -> Any:
-        return np.concatenate([values, tail])
-
-    # A new configuration for each, so that it is correlated with nothing.
-    fresh = int(sets.configuration.max()) + 1 + np.arange(k)
-    zero = np.zeros(k, dtype=np.int64)
-    grown = replace(
-        sets, B=tailed(np.concatenate([sets.B, more], axis=2), held),
-        e=tailed(sets.e, np.zeros((k, size))), unit=tailed(sets.unit, none + np.eye(size)),
-        repeats=tailed(sets.repeats, zero + 1), dof=tailed(sets.dof, np.zeros(k)),
-        scatter=tailed(sets.scatter, none), configuration=tailed(sets.configuration, fresh),
-        load=tailed(sets.load, zero), marker=tailed(sets.marker, zero), sight=None, reach=None,
-        visits=None,
-    )  # fmt: skip
-    L, K = max(structure.index.shape[1], len(kinds)), len(structure.names)
-    index = np.zeros((C + k, L), dtype=np.int64)
-    index[:C, : structure.index.shape[1]] = structure.index
-    index[C:, : len(kinds)] = K + np.arange(len(kinds))
-    along = [np.isin(np.arange(size), kind).astype(float) for kind in kinds]
-    parts = np.array([np.diag(axes) for axes in along])
-    faster = [
-        faster_course(name, sets.visits, lasting, axes).padded(k)
-        for name, axes in zip(names, along, strict=True)
-    ]
-
-    def padded(matrix: Array) -> Array:
-        out = np.zeros((C + k, L, size, size))
-        out[:C, : matrix.shape[1]] = matrix
-        out[C:, : len(kinds)] = parts
-        return out
-
-    return replace(
-        structure, names=(*structure.names, *names), sets=grown, index=index,
-        matrix=padded(structure.matrix), mean_matrix=padded(structure.mean_matrix),
-        lasting=lasting, faster=tuple(faster),
-    )  # fmt: skip
+    return SharedEffect(DRIFT, (VISIT,), record.visit, loading)
 
 
 def along_axes(waves: Array, axes: Array) -> Array:
@@ -695,3 +500,117 @@ def along_axes(waves: Array, axes: Array) -> Array:
     `axes` (size,), r of which are not zero."""
     each = waves[:, None, :, None] * np.diag(axes)[:, None, axes > 0]
     return np.asarray(each.reshape(len(waves), len(axes), -1))
+
+
+# The same as packs of rows.  Of R repeats the mean, times √R, holds all of Δx and of what they
+# share; R − 1 contrasts between them hold their own noise alone.  Rows so turned are as good as
+# those read: the turn is orthogonal.
+
+
+class Sets:
+    """Readings as sets of repeats: `of` (N,) the set of a reading, `root` (S,) √R, and the rows
+    B (S, size, p), e (S, size) of their means times that; `contrasts` (N − S, size) of `sets`."""
+
+    def __init__(self, readings: Readings, B: Array, apart: Sequence[IntArray]) -> None:
+        labels = (readings.configuration, readings.load, readings.marker, *apart)
+        self.of = numbered(*labels)
+        self.n = int(self.of.max(initial=-1)) + 1
+        self.first = firsts(self.of, self.n)
+        repeats = np.bincount(self.of, minlength=self.n)
+        self.root = np.sqrt(repeats)
+        self.B = self.mean(B) * self.root[:, None, None]
+        self.e = self.mean(readings.e) * self.root[:, None]
+        order = np.argsort(self.of, kind="stable")
+        starts = np.concatenate([[0], np.cumsum(repeats)])[:-1]
+        e, set_of = readings.e[order], self.of[order]
+        before = np.cumsum(e, axis=0) - e
+        before -= before[starts][set_of]
+        j = (np.arange(len(e)) - starts[set_of])[:, None]
+        self.contrasts = ((before - j * e) / np.sqrt(np.maximum(j * (j + 1), 1)))[j[:, 0] > 0]
+        self.sets = set_of[j[:, 0] > 0]
+
+    def mean(self, values: Array) -> Array:
+        """Of each set (S, …) of values (N, …)."""
+        if self.n == len(self.of):
+            out = np.empty_like(values)
+            out[self.of] = values
+            return out
+        total = np.zeros((self.n, *values.shape[1:]))
+        np.add.at(total, self.of, values)
+        return total / (self.root**2).reshape(-1, *[1] * (values.ndim - 1))
+
+
+def packs_of(
+    sets: Sets, structure: Structure, shared: Sequence[SharedEffect], numbers: Sequence[int],
+    together: IntArray | None, silent: BoolArray | None = None,
+) -> list[tuple[IntArray, Pack]]:  # fmt: skip
+    """Packs of the sets, and the sets (C, M) that their clusters are of, −1 for none.
+
+    Sets of one label `together` (S,) are a cluster, without labels each by itself; deviations
+    `shared` by the readings have the variances of these `numbers`.  Those `silent` (S,) are absent.
+    """
+    matrix, index = sets.mean(structure.matrix), structure.index[sets.first]
+    label = np.arange(sets.n) if together is None else numbered(together)
+    count = np.bincount(label)
+    order, starts = np.argsort(label, kind="stable"), np.concatenate([[0], np.cumsum(count)])
+    scale = sets.root[:, None, None, None]
+    turned = [
+        replace(e, unit=e.unit[sets.first], loading=e.loading[sets.first] * scale) for e in shared
+    ]
+    found = []
+    # Clusters that differ by less than two in size share a pack.
+    for size in np.unique(rank := np.ceil(np.log2(count)).astype(int)):
+        of = np.flatnonzero(rank == size)
+        place = np.arange(count[of].max())
+        members = np.where(
+            place < count[of][:, None],
+            order[np.minimum(starts[of][:, None] + place, sets.n - 1)], -1,
+        )  # fmt: skip
+        out = members < 0 if silent is None else (members < 0) | silent[members]
+        parts = _own_parts(index, matrix, members)
+        for k, effect in zip(numbers, turned, strict=True):
+            number = np.full(len(members), k)
+            parts.append(Common(number, effect.packed(members)))
+        found.append((members, _pack(sets.B, sets.e, members, parts, out)))
+    return found
+
+
+def contrasts_of(sets: Sets, structure: Structure) -> Pack:
+    """The contrasts between repeats, which hold their own noise alone."""
+    matrix = sets.mean(structure.matrix)
+    parts = _own_parts(structure.index[sets.first], matrix, sets.sets[:, None])
+    e = sets.contrasts
+    return Pack(np.zeros((*e.shape, 0)), e, tuple(parts), np.zeros(e.shape, dtype=bool))
+
+
+def _pack(B: Array, e: Array, members: IntArray, parts: list[NoisePart], out: BoolArray) -> Pack:
+    (C, M), (size, p) = members.shape, B.shape[1:]
+    here = ~out[..., None]
+    return Pack(
+        np.where(here[..., None], B[members], 0.0).reshape(C, M * size, p),
+        np.where(here, e[members], 0.0).reshape(C, M * size),
+        tuple(parts), np.repeat(out, size, axis=1),
+    )  # fmt: skip
+
+
+def _own_parts(index: IntArray, matrix: Array, members: IntArray) -> list[NoisePart]:
+    """The parts of single readings: those of the k-th of a cluster's different variances, each."""
+    (C, M), (L, size) = members.shape, matrix.shape[1:3]
+    here = members >= 0
+    own = np.where(here[..., None], index[members], -1)  # (C, M, L)
+    blocks = np.where(here[..., None, None, None], matrix[members], 0.0)
+    place = ranked_within(own.reshape(C, -1)).reshape(C, M, L)
+    diagonal = bool((blocks * (1 - np.eye(size)) == 0).all())
+    parts: list[NoisePart] = []
+    for k in range(int(place.max()) + 1):
+        mine = place == k
+        of = np.where(mine, own, 0).max(axis=(1, 2))
+        block = np.einsum("cml,cmlij->cmij", mine, blocks)
+        if diagonal:
+            parts.append(Diagonal(of, np.einsum("cmii->cmi", block).reshape(C, -1)))
+            continue
+        K = np.zeros((C, M, size, M, size))
+        at = np.arange(M)
+        K[:, at, :, at, :] = block.transpose(1, 0, 2, 3)
+        parts.append(Full(of, K.reshape(C, M * size, M * size)))
+    return parts

@@ -11,14 +11,9 @@ from scipy import special
 
 from elastocal.errors import InputError
 from elastocal.identification.methods import MethodResult
-from elastocal.identification.noise_choice import (
-    NoiseFit,
-    NoiseTest,
-    Trial,
-    linearised,
-    own_noise,
-)
+from elastocal.identification.noise_choice import NoiseFit, NoiseTest, Trial, linearised
 from elastocal.identification.noise_structure import DRIFT, SHARED
+from elastocal.identification.noisy_readings import deviations_of, own_noise
 from elastocal.identification.single_readings import SingleReadings, single_readings
 from elastocal.identification.tails import kept_of
 from elastocal.identification.weighted_problem import (
@@ -233,9 +228,13 @@ def _estimated(noise: Noise, found: NoiseFit, table: Measurements) -> Noise:
     names = [NUMBERED.sub(label, name) for name in fit.structure.names]
     own = [
         NoiseSize(name, None, float(np.sqrt(v)))
-        if fit.structure.name == "stated" and not name.startswith(DRIFT)
+        if fit.structure.name == "stated"
         else NoiseSize(name, float(np.sqrt(v)))
         for name, v in zip(names, fit.own, strict=True)
+    ]
+    own += [
+        NoiseSize(name, float(np.sqrt(v)))
+        for (name, _), v in zip(fit.noisy.drifts, fit.drift, strict=True)
     ]
     shared = [
         NoiseSize(SCATTER.format(e.name), float(np.sqrt(v)), None, True, e.joints)
@@ -250,7 +249,7 @@ def _estimated(noise: Noise, found: NoiseFit, table: Measurements) -> Noise:
             found.lasting * found.course.span if found.course.timed else None,
             found.to_longest > LIKELY,
         )
-    alone = fit.structure.name == "independent" and len(fit.own) == 1
+    alone = fit.structure.name == "independent" and len(own) == 1
     return replace(
         noise,
         kind=found.kind,
@@ -280,14 +279,12 @@ def noise_parts(found: MethodResult) -> dict[str, float]:
     readings = linearised(solution.problem.model, observed, fit.x, few)
     own = np.diagonal(own_noise(noise, readings)[0], axis1=1, axis2=2)[:, :3].sum(axis=1).mean()
     visits = 0.0
-    for effect, variance in zip(noise.shared, noise.common, strict=True):
-        if variance > 0:
-            mine = effect.of(readings)
-            loading = np.where(mine.unit[:, :, None, None] >= 0, mine.loading, 0.0)
-            visits += float(variance) * float((loading[:, :, :3] ** 2).sum(axis=(1, 2, 3)).mean())
-    drifting = noise.own[noise.structure.n_own :]
-    if len(drifting):
-        visits += float(drifting[0]) * min(size, 3)
+    drift = float(noise.drift[0]) if len(noise.drift) else 0.0
+    for effect, variance in deviations_of(noise, readings):
+        loading = np.where(effect.unit[:, :, None, None] >= 0, effect.loading, 0.0)
+        if effect.name != DRIFT:
+            visits += variance * float((loading[:, :, :3] ** 2).sum(axis=(1, 2, 3)).mean())
+    visits += drift * min(size, 3)
     return {"readings": float(own), "visits": visits}
 
 

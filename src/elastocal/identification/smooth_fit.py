@@ -26,14 +26,8 @@ from elastocal.identification.intervals import LEVEL, Intervals
 from elastocal.identification.knowledge import GaussianPrior
 from elastocal.identification.knowledge_fit import FunctionPrior
 from elastocal.identification.least_squares import Fit
-from elastocal.identification.noise_choice import (
-    NoiseFit,
-    estimate_noise,
-    linearised,
-    outlier_screening,
-    settle,
-    weights_of,
-)
+from elastocal.identification.noise_choice import NoiseFit, estimate_noise, linearised, weights_of
+from elastocal.identification.noise_judge import outlier_screening, settle
 from elastocal.identification.noise_structure import Readings
 from elastocal.identification.options import Options, check_for_functions
 from elastocal.identification.outliers import FALSE_ALARM

@@ -14,6 +14,7 @@ from numpy.typing import NDArray
 from scipy import linalg, sparse
 
 from elastocal.cell.arm_description import Tracker
+from elastocal.engine.mixed import lower_inverse
 from elastocal.errors import InputError, option
 from elastocal.identification.linear_solver import least_norm
 from elastocal.model.manipulator import Model, Regression
@@ -217,21 +218,6 @@ def inverse_factor(blocks: Array) -> Array:
             f"{option('covariance')}, the sigma columns of the table, or [tracker] of the cell"
         ) from None
     return lower_inverse(factor)
-
-
-def lower_inverse(K: Array, out: Array | None = None) -> Array:
-    """K⁻¹ of lower triangular K (C, m, m), by halves: a general inverse takes four times as long.
-
-    `out` is where it is put, zeros above the diagonal.
-    """
-    out, m, h = np.zeros_like(K) if out is None else out, K.shape[1], K.shape[1] // 2
-    if m == 1:
-        return np.divide(1.0, K, out=out)
-    upper, lower = (lower_inverse(K[:, s, s], out[:, s, s]) for s in (slice(h), slice(h, m)))
-    # Of single numbers, products of matrices would be a call for each block.
-    cross = K[:, h:, :h] * upper if h == 1 else K[:, h:, :h] @ upper
-    out[:, h:, :h] = -lower * cross if m == 2 else -lower @ cross
-    return out
 
 
 class WhitenedBlocks(NamedTuple):

@@ -185,7 +185,8 @@ def pose_covariance(
     if model.cell.noise.joints.any():
         settling = settling_joints(model, observed, model.nominal if x is None else x)
         members = np.arange(len(observed.lead)).reshape(n_poses, -1)
-        covariance = covariance + settling.product(members, settling, members).reshape(-1, r, r)
+        loading = settling.packed(members)
+        covariance = covariance + loading @ loading.transpose(0, 2, 1)
     covariance = covariance / visits
     if model.cell.noise.configuration and observed.kind != "deflection":
         moved = np.diag(np.arange(size) < 3).astype(float)
@@ -199,7 +200,7 @@ def settling_joints(model: Model, observed: Observations, x: Array) -> SharedEff
     record = visit_record(model, observed, x)
     assert record is not None
     loading = record.motion * model.cell.noise.of_joints(model.chain.n_joints)
-    return SharedEffect("joints", (VISIT,), record.visit, loading, np.zeros(0))
+    return SharedEffect("joints", (VISIT,), record.visit, loading)
 
 
 def readings_each(cell: Cell) -> int:

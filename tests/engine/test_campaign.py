@@ -15,7 +15,7 @@ import numpy as np
 import pytest
 from scipy import stats
 
-from elastocal.identification.noise_choice import settle
+from elastocal.identification.noise_judge import settle
 from elastocal.identification.noise_structure import Readings
 
 
@@ -46,7 +46,7 @@ class Campaign:
 @pytest.fixture(scope="module")
 def kr270():
     """B (15, 3, 3, 9) of configuration and marker, unit columns, and σ (15, 3)."""
-    folder = Path(__file__).parents[3] / "experiment_design" / "kr270_reproduction"
+    folder = Path(__file__).parents[2] / "experiment_design" / "kr270_reproduction"
     spec = importlib.util.spec_from_file_location("kr270_campaign", folder / "campaign.py")
     module = importlib.util.module_from_spec(spec)
     sys.modules[spec.name] = module  # where dataclasses look their module up

@@ -7,12 +7,13 @@ from typing import Any
 
 import numpy as np
 import pytest
-from identification.variance.dense import Table, readings
+from engine.dense import Table, readings
 from support.registered import forgotten
 
 from elastocal.errors import InputError
-from elastocal.identification.noise_choice import estimate_noise, own_noise
-from elastocal.identification.noise_structure import NoiseModel, Readings
+from elastocal.identification.noise_choice import estimate_noise
+from elastocal.identification.noise_structure import Kind, NoiseModel, Readings
+from elastocal.identification.noisy_readings import NoisyReadings, own_noise
 from elastocal.plugins import register_noise_model
 
 UNBALANCED = readings(Table(configurations=10, markers=3, repeats=3), 4)
@@ -73,13 +74,10 @@ def test_repeats_share_the_mean_of_what_each_says() -> None:
         def components(self, readings: Readings) -> Mapping[str, np.ndarray]:
             return {"growing": 1.0 + np.arange(len(readings))}
 
-    structure = Growing().structure(UNBALANCED)
-    set_of, number = UNBALANCED.set_of, 1.0 + np.arange(len(UNBALANCED))
-    for c in range(len(structure.sets)):
-        mean = number[set_of == c].mean()
-        np.testing.assert_allclose(structure.matrix[c, 0], mean * np.eye(3))
-        repeats = (set_of == c).sum()
-        np.testing.assert_allclose(structure.mean_matrix[c, 0], mean / repeats * np.eye(3))
+    noisy = NoisyReadings(UNBALANCED, Kind("growing"), structure=Growing().structure(UNBALANCED))
+    sets, number = noisy.sets, 1.0 + np.arange(len(UNBALANCED))
+    for c, S in enumerate(sets.mean(noisy.structure.matrix)):
+        np.testing.assert_allclose(S[0], number[sets.of == c].mean() * np.eye(3))
 
 
 WRONG: dict[str, tuple[Callable[[int], Any], str]] = {

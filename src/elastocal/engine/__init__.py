@@ -1,0 +1,1 @@
+"""The linear mixed model that identification and diagnosis share."""

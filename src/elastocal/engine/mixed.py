@@ -1,0 +1,523 @@
+"""Rows whose noise is a sum of parts of unknown size, and columns with a prior or without one.
+
+    e = B x + ε,   ε ~ N(0, V),   V = Σ_k θ_k K_k,   x_j flat (λ_j = 0) or N(0, 1/λ_j)
+
+With x integrated out (Patterson and Thompson 1971; Harville 1977),
+
+    −2 ℓ = log|V| + log|BᵀV⁻¹B + Λ| − log|Λ| + eᵀPe + n log 2π,   P = V⁻¹ − V⁻¹BΦBᵀV⁻¹,
+    ∂(−2ℓ)/∂θ_k = tr P K_k − eᵀP K_k P e,   Φ = (BᵀV⁻¹B + Λ)⁻¹
+
+(n less the number of flat columns).  V is block-diagonal: clusters of rows come in packs of one
+padded size, so that all linear algebra runs on stacks.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Sequence
+from dataclasses import dataclass
+from functools import cached_property
+from typing import Protocol
+
+import numpy as np
+from scipy import linalg, optimize, special
+
+from elastocal.engine.climb import climb
+from elastocal.errors import InsufficientDataError
+from elastocal.units import Array, BoolArray, IntArray
+
+LOG_2PI = float(np.log(2 * np.pi))
+
+
+# What V is made of: K of every cluster, and the number of its variance there.
+
+
+class NoisePart(Protocol):
+    """K of C clusters; `of` (C,) are the numbers of its variance, which need not be one."""
+
+    @property
+    def of(self) -> IntArray: ...
+
+    def add(self, V: Array, theta: Array) -> None:
+        """θ K (C, m, m) onto V, θ (C,)."""
+
+    def times(self, u: Array) -> Array:
+        """K u (C, m)."""
+
+    def trace(self, P: Array) -> Array:
+        """tr P K (C,)."""
+
+    def turned(self, root: Array) -> Array:
+        """root K rootᵀ (C, m, m)."""
+
+
+@dataclass(frozen=True)
+class Diagonal:
+    """K diagonal, (C, m)."""
+
+    of: IntArray
+    K: Array
+
+    def add(self, V: Array, theta: Array) -> None:
+        np.einsum("cii->ci", V)[:] += theta[:, None] * self.K
+
+    def times(self, u: Array) -> Array:
+        return self.K * u
+
+    def trace(self, P: Array) -> Array:
+        return np.asarray((np.einsum("cii->ci", P) * self.K).sum(axis=1))
+
+    def turned(self, root: Array) -> Array:
+        return np.asarray((root * self.K[:, None, :]) @ root.transpose(0, 2, 1))
+
+
+@dataclass(frozen=True)
+class Full:
+    """Any K, (C, m, m)."""
+
+    of: IntArray
+    K: Array
+
+    def add(self, V: Array, theta: Array) -> None:
+        V += theta[:, None, None] * self.K
+
+    def times(self, u: Array) -> Array:
+        return np.asarray((self.K @ u[..., None])[..., 0])
+
+    def trace(self, P: Array) -> Array:
+        return np.einsum("cij,cij->c", P, self.K)
+
+    def turned(self, root: Array) -> Array:
+        return np.asarray(root @ self.K @ root.transpose(0, 2, 1))
+
+
+@dataclass(frozen=True)
+class Common:
+    """K = ℓℓᵀ of deviations that rows have in common, with their loadings ℓ (C, m, r)."""
+
+    of: IntArray
+    loading: Array
+
+    def add(self, V: Array, theta: Array) -> None:
+        V += (theta[:, None, None] * self.loading) @ self.loading.transpose(0, 2, 1)
+
+    def times(self, u: Array) -> Array:
+        return np.asarray((self.loading @ (u[:, None] @ self.loading).transpose(0, 2, 1))[..., 0])
+
+    def trace(self, P: Array) -> Array:
+        return np.einsum("cmr,cmr->c", P @ self.loading, self.loading)
+
+    def turned(self, root: Array) -> Array:
+        own = root @ self.loading
+        return np.asarray(own @ own.transpose(0, 2, 1))
+
+
+@dataclass(frozen=True)
+class Pack:
+    """C clusters of m rows: B (C, m, p), p = 0 where they hold nothing of x; e (C, m); parts of V.
+
+    Rows that are `absent` (C, m) do not count: padding, or readings that only are to be judged.
+    """
+
+    B: Array
+    e: Array
+    parts: tuple[NoisePart, ...]
+    absent: BoolArray
+
+    def V(self, theta: Array) -> Array:
+        """V (C, m, m) at θ (K,), absent rows as any others."""
+        V = np.zeros((*self.e.shape, self.e.shape[1]))
+        for part in self.parts:
+            part.add(V, theta[part.of])
+        return V
+
+
+class Whitened:
+    """A pack under V = RRᵀ: `root` R⁻¹ (C, m, m), R⁻¹B and R⁻¹e, zeros in absent rows, log|V|."""
+
+    def __init__(self, pack: Pack, theta: Array) -> None:
+        V, out = pack.V(theta), pack.absent
+        self.pack = pack
+        if out.any():
+            here = ~out
+            V *= here[:, :, None] & here[:, None, :]
+            np.einsum("cii->ci", V)[:] += out
+        R = np.asarray(np.linalg.cholesky(V), dtype=np.float64)
+        self.log_det = 2 * float(np.log(np.einsum("cii->ci", R)).sum())
+        self.root = lower_inverse(R)
+        if out.any():
+            self.root *= here[:, None, :]
+        self.B = self.root @ pack.B
+        self.e = (self.root @ pack.e[..., None])[..., 0]
+
+    def back(self, rows: Array) -> Array:
+        """R⁻ᵀ times rows (C, m, …)."""
+        return np.asarray(self.root.transpose(0, 2, 1) @ rows)
+
+
+@dataclass(frozen=True)
+class State:
+    """Everything at one θ (K,): x (p,), L of LLᵀ = BᵀV⁻¹B + Λ, and −2ℓ."""
+
+    theta: Array
+    packs: tuple[Whitened, ...]
+    x: Array
+    L: Array
+    value: float
+
+    @cached_property
+    def inverse(self) -> Array:
+        """L⁻¹ (p, p)."""
+        return np.asarray(linalg.lapack.dtrtri(self.L, lower=1)[0])
+
+    @property
+    def Phi(self) -> Array:
+        return self.inverse.T @ self.inverse
+
+    @property
+    def log_likelihood(self) -> float:
+        return -0.5 * self.value
+
+    def each(self) -> Iterator[tuple[Whitened, Array, Array]]:
+        """The packs with H = R⁻¹BL⁻ᵀ (C, m, p), so that P = R⁻ᵀ(1 − HHᵀ)R⁻¹, and R⁻¹(e − Bx)."""
+        for w in self.packs:
+            if w.B.shape[2]:
+                yield w, w.B @ self.inverse.T, w.e - w.B @ self.x
+            else:
+                yield w, w.B, w.e
+
+    def projected(self) -> Iterator[tuple[Pack, Array, Array]]:
+        """The packs with P (C, m, m) of each cluster by itself and Pe (C, m)."""
+        for w, H, z in self.each():
+            P = w.back((np.eye(H.shape[1]) - H @ H.transpose(0, 2, 1)) @ w.root)
+            yield w.pack, P, w.back(z[..., None])[..., 0]
+
+
+@dataclass(frozen=True)
+class LogPrior:
+    """Gaussian prior of the logarithms of the first k variances: `mean` (k,), its `precision`."""
+
+    mean: Array
+    precision: Array
+
+    def penalty(self, t: Array) -> tuple[float, Array]:
+        """−2 log density at logarithms (K,) but for its constant, and the slope of that (k,)."""
+        off = t[: len(self.mean)] - self.mean
+        slope = self.precision @ off
+        return float(off @ slope), 2 * slope
+
+    def curved(self, information: Array) -> Array:
+        """Information (K, K) with that of the prior."""
+        out, k = information.copy(), len(self.mean)
+        out[:k, :k] += self.precision
+        return out
+
+
+@dataclass(frozen=True)
+class Mixed:
+    """The model: packs of rows, `K` variances, and the columns' prior precisions (p,)."""
+
+    packs: tuple[Pack, ...]
+    K: int
+    precision: Array
+    prior: LogPrior | None = None
+
+    @property
+    def rows(self) -> int:
+        return int(sum((~pack.absent).sum() for pack in self.packs))
+
+    def state(self, theta: Array) -> State:
+        """Raises LinAlgError where V is not positive definite, InsufficientDataError where columns
+        without a prior depend on each other."""
+        packs = tuple(Whitened(pack, theta) for pack in self.packs)
+        p = len(self.precision)
+        M, z, value = np.diag(self.precision), np.zeros(p), 0.0
+        for w in packs:
+            value += w.log_det + float(np.vdot(w.e, w.e))
+            if w.B.shape[2]:
+                flat = w.B.reshape(-1, p)
+                M, z = M + flat.T @ flat, z + flat.T @ w.e.ravel()
+        try:
+            L = np.asarray(linalg.cholesky(M, lower=True))
+        except linalg.LinAlgError:
+            raise InsufficientDataError(
+                "the columns of B depend on each other under this noise model; measure more poses"
+            ) from None
+        x = linalg.cho_solve((L, True), z)
+        known = self.precision > 0
+        value += 2 * float(np.log(np.diag(L)).sum()) - float(x @ z)
+        value += (self.rows - int((~known).sum())) * LOG_2PI
+        value -= float(np.log(self.precision[known]).sum())
+        return State(theta, packs, x, L, value)
+
+    def objective(self, t: Array) -> tuple[float, Array, Array]:
+        """−2 log posterior at logarithms t (K,), slope, and the average of observed and expected
+        curvature (Gilmour, Thompson and Cullis 1995, Biometrics 51, 1440): eᵀP K_k P K_l P e."""
+        state = self.state(np.exp(t))
+        K, p = self.K, len(self.precision)
+        slope, both, through = np.zeros(K), np.zeros(K * K), np.zeros((K, p))
+        for w, H, z in state.each():
+            u = w.back(z[..., None])[..., 0]
+            P = w.back((np.eye(H.shape[1]) - H @ H.transpose(0, 2, 1)) @ w.root)
+            own = []
+            for part in w.pack.parts:
+                theta = state.theta[part.of]
+                moved = theta[:, None] * part.times(u)
+                slope += np.bincount(part.of, theta * part.trace(P) - (u * moved).sum(axis=1), K)
+                own.append((w.root @ moved[..., None])[..., 0])
+            for k, (part, f) in enumerate(zip(w.pack.parts, own, strict=True)):
+                if H.shape[2]:
+                    _add(through, part.of, (f[:, None] @ H)[:, 0])
+                for other, g in zip(w.pack.parts[: k + 1], own, strict=False):
+                    product, pair = (f * g).sum(axis=1), part.of * K + other.of
+                    both += np.bincount(pair, product, K * K)
+                    if other is not part:
+                        both += np.bincount(other.of * K + part.of, product, K * K)
+        information = both.reshape(K, K) - through @ through.T
+        value = state.value
+        if self.prior is not None:
+            penalty, more = self.prior.penalty(t)
+            value += penalty
+            slope[: len(more)] += more
+            information = 2 * self.prior.curved(information / 2)
+        return value, slope, information
+
+    def none(self, theta: Array, k: int) -> float:
+        """p-value of the hypothesis θ_k = 0, `theta` (K,) being the fit under it.
+
+        U = ½ eᵀP K_k P e has the mean ½ tr P K_k and, the other variances being estimated, the
+        variance I_kk − I_ko I_oo⁻¹ I_ok; a scaled χ² with the same two moments gives its p-value
+        (Zhang and Lin 2003, Biostatistics 4, 57).
+        """
+        state = self.state(theta)
+        at, mean, U = self.expected(state), 0.0, 0.0
+        for pack, P, u in state.projected():
+            for part in pack.parts:
+                mine = part.of == k
+                mean += 0.5 * float(part.trace(P)[mine].sum())
+                U += 0.5 * float((u * part.times(u))[mine].sum())
+        free, known = (theta > 0) & at.told, at.information
+        across, own = known[free, k], known[np.ix_(free, free)]
+        left = known[k, k] - float(across @ np.linalg.pinv(own, hermitian=True) @ across)
+        if not at.told[k] or mean <= 0 or left <= LEAST_TOLD * known[k, k]:
+            return 1.0
+        return float(special.chdtrc(2 * mean**2 / left, 2 * mean * U / left))
+
+    def expected(self, state: State) -> Expected:
+        """The expected information on θ at a state, and what Kenward and Roger need."""
+        K, p = self.K, len(self.precision)
+        Phi, half = state.Phi, state.inverse.T
+        C, pairs, known = np.zeros((K, p, p)), np.zeros(K * K), np.zeros(K)
+        turned = []
+        for w in state.packs:
+            parts = w.pack.parts
+            A = np.stack([part.turned(w.root) for part in parts], axis=1)  # (C, L, m, m)
+            of = np.stack([part.of for part in parts], axis=1)
+            flat = A.reshape(*of.shape, -1)
+            left = A
+            if w.B.shape[2]:
+                AB = A @ w.B[:, None]
+                for k, part in enumerate(parts):
+                    _add(C, part.of, w.B.transpose(0, 2, 1) @ AB[:, k])
+                H = w.B @ half
+                left = A - 2 * A @ (H @ H.transpose(0, 2, 1))[:, None]
+                turned.append((of, AB))
+            local = flat @ left.transpose(0, 1, 3, 2).reshape(*of.shape, -1).transpose(0, 2, 1)
+            pairs += np.bincount(
+                (of[:, :, None] * K + of[:, None, :]).ravel(), local.ravel(), K * K
+            )
+            known += np.bincount(of.ravel(), (flat**2).sum(axis=2).ravel(), K)
+        rotated = (half.T @ C @ half).reshape(K, -1)
+        information = 0.5 * (pairs.reshape(K, K) + rotated @ rotated.T)
+        information = (information + information.T) / 2
+        return Expected(information, known, C, Phi, tuple(turned))
+
+
+def _add(out: Array, of: IntArray, values: Array) -> None:
+    """Each of the values (C, …) onto its place in `out` (K, …)."""
+    if (of == of[0]).all():
+        out[of[0]] += values.sum(axis=0)
+    else:
+        np.add.at(out, of, values)
+
+
+LEAST_TOLD = 1e-9  # of the information on θ_k that there would be if x were known
+
+
+@dataclass(frozen=True)
+class Expected:
+    """½ tr P K_k P K_l (K, K), the same diagonal were x known, twice (K,), BᵀV⁻¹K_kV⁻¹B (K, p, p),
+    Φ, and of each pack R⁻¹K_lR⁻ᵀR⁻¹B (C, L, m, p) with the numbers (C, L) of these parts."""
+
+    information: Array
+    known: Array
+    C: Array
+    Phi: Array
+    turned: tuple[tuple[IntArray, Array], ...]
+
+    @property
+    def told(self) -> BoolArray:
+        """Which θ_k the readings say anything of: not those that x could explain all of."""
+        return np.diag(self.information) > LEAST_TOLD * 0.5 * self.known
+
+    def kenward_roger(self, W: Array, rows: Array) -> tuple[Array, Array]:
+        """Covariance (k, k) of combinations `rows` (k, p) of x, and degrees of freedom (k,).
+
+        With W = cov(θ̂) (K, K), P_k = −BᵀV⁻¹K_kV⁻¹B and Q_kl = BᵀV⁻¹K_kV⁻¹K_lV⁻¹B,
+
+            Φ_A = Φ + 2 Φ [Σ_kl W_kl (Q_kl − P_k Φ P_l)] Φ
+
+        (Kenward and Roger 1997, Biometrics 53, 983; V is linear in θ).  Φ alone is too small twice
+        over: estimated weights cost accuracy, and Φ̂ does not see it.  A combination c has
+        Satterthwaite's degrees of freedom 2 (cᵀΦc)² / gᵀWg, g_k = cᵀΦBᵀV⁻¹K_kV⁻¹BΦc; infinite
+        where no estimated variance matters.
+        """
+        Phi, C = self.Phi, self.C
+        middle = np.zeros_like(Phi)
+        for of, AB in self.turned:
+            weight = W[of[:, :, None], of[:, None, :]]
+            mixed = (weight @ AB.reshape(*of.shape, -1)).reshape(AB.shape)
+            middle += np.tensordot(AB, mixed, ((0, 1, 2), (0, 1, 2)))
+        mixed = (W @ C.reshape(len(W), -1)).reshape(C.shape)
+        middle -= (C @ Phi @ mixed).sum(axis=0)
+        # No less than zero but for rounding, where variances differ by many powers of ten.
+        values, vectors = np.linalg.eigh((middle + middle.T) / 2)
+        more = rows @ Phi @ (vectors * np.sqrt(2 * np.maximum(values, 0.0)))
+        plain = rows @ Phi
+        covariance = plain @ rows.T + more @ more.T
+        variance = (plain * rows).sum(axis=1)
+        g = ((plain @ C) * plain).sum(axis=2)  # (K, k)
+        spread = (g * (W @ g)).sum(axis=0)
+        dof = np.divide(2 * variance**2, spread, out=np.full(len(rows), np.inf), where=spread > 0)
+        return (covariance + covariance.T) / 2, dof
+
+
+# The variances of the largest restricted likelihood.
+
+# Steps before it is asked which variances are none, and how often; of −2ℓ: what a last step may
+# promise, and what none may cost.
+STEPS, ROUNDS, ENOUGH, FINE = 6, 15, 1e-7, 1e-3
+SMALLEST, LARGEST = 1e-10, 1e6  # of the start
+UNSEEN = 1e-5  # curvature of ℓ in its logarithm below which a variance is as good as none
+FLAT, NEAR = 1.0, 0.1  # curvature and slope in it below which it may be none
+
+
+@dataclass(frozen=True)
+class MixedFit:
+    """θ (K,) at the maximum, the state there, and whether the search ended.
+
+    `log_likelihood` is the restricted one, with a prior the marginal one by Laplace's method.
+    """
+
+    model: Mixed
+    state: State
+    converged: bool
+
+    @property
+    def theta(self) -> Array:
+        return self.state.theta
+
+    @cached_property
+    def expected(self) -> Expected:
+        return self.model.expected(self.state)
+
+    @cached_property
+    def covariance(self) -> Array:
+        """W (K, K) of θ̂.  A variance that is none is taken for zero, not for uncertain (the
+        convention of mixed-model software): counting it widens what is wide enough already."""
+        at, theta = self.expected, self.theta
+        out = np.zeros_like(at.information)
+        H = theta[:, None] * at.information * theta
+        if self.model.prior is not None:
+            H = self.model.prior.curved(H)
+        free = np.flatnonzero((np.diag(H) > UNSEEN) & at.told)
+        if len(free):
+            scale = 1 / np.sqrt(np.diag(H)[free])
+            own = H[np.ix_(free, free)] * np.outer(scale, scale)
+            scale *= theta[free]
+            # The pseudo-inverse where variances cannot be told apart.
+            out[np.ix_(free, free)] = np.linalg.pinv(own, 1e-12, hermitian=True) * np.outer(
+                scale, scale
+            )
+        return out
+
+    @cached_property
+    def log_likelihood(self) -> float:
+        found, prior = self.state.log_likelihood, self.model.prior
+        if prior is None:
+            return found
+        k, theta = len(prior.mean), self.theta[: len(prior.mean)]
+        H = theta[:, None] * self.expected.information[:k, :k] * theta + prior.precision
+        log_dets = [float(np.linalg.slogdet(part)[1]) for part in (prior.precision, H)]
+        return found - 0.5 * prior.penalty(np.log(theta))[0] + 0.5 * (log_dets[0] - log_dets[1])
+
+
+def fit(model: Mixed, start: Array, may_vanish: Sequence[int] = ()) -> MixedFit:
+    """Maximise the restricted likelihood (times the prior of log θ) from θ = `start` (K,).
+
+    Variances that `may_vanish` are zero where the likelihood does not miss them.
+    """
+    t = np.log(start)
+    lower, upper = t + np.log(SMALLEST), t + np.log(LARGEST)
+    ended = False
+    # Those that the columns could explain all of say nothing, and stand where they are: at none.
+    told = model.expected(model.state(start)).told
+    held = np.array([k for k in may_vanish if not told[k]], dtype=np.int64)
+    for _ in range(ROUNDS):
+        t[held], lower[held], upper[held] = -np.inf, -np.inf, -np.inf
+        t, ended = _climbed(model, t, lower, upper)
+        value, slope, information = model.objective(t)
+        falling = (slope > 0) & (slope < NEAR) & (np.diag(information) < FLAT) & np.isfinite(t)
+        gone: list[int] = []
+        for k in may_vanish:
+            without = t.copy()
+            without[[*gone, k]] = -np.inf
+            if falling[k] and model.objective(without)[0] <= value + FINE:
+                gone.append(k)
+        if ended and not gone:
+            break
+        held = np.append(held, gone).astype(np.int64)
+    return MixedFit(model, model.state(np.exp(t)), ended)
+
+
+def _climbed(model: Mixed, t: Array, lower: Array, upper: Array) -> tuple[Array, bool]:
+    free = np.flatnonzero(np.isfinite(t))
+    if not len(free):
+        return t, True
+
+    def full(own: Array) -> Array:
+        out = t.copy()
+        out[free] = own
+        return out
+
+    def objective(own: Array) -> tuple[float, Array, Array]:
+        try:
+            value, slope, information = model.objective(full(own))
+        except np.linalg.LinAlgError:
+            return np.inf, np.zeros(len(free)), np.eye(len(free))
+        ridge = 1e-9 * max(float(np.diag(information).max()), 1e-3) * np.eye(len(free))
+        return value, slope[free], information[np.ix_(free, free)] + ridge
+
+    found, ended = climb(objective, t[free], lower[free], upper[free], ENOUGH, STEPS)
+    if not ended and np.array_equal(found, t[free]):  # where the information does not lead
+        by = optimize.minimize(
+            lambda own: objective(own)[:2], found, jac=True, method="L-BFGS-B",
+            bounds=list(zip(lower[free], upper[free], strict=True)),
+            options={"maxiter": 10 * STEPS, "ftol": 1e-13},
+        )  # fmt: skip
+        found, ended = by.x, bool(by.success)
+    return full(found), ended
+
+
+def lower_inverse(R: Array, out: Array | None = None) -> Array:
+    """R⁻¹ of lower triangular R (C, m, m), by halves: a general inverse takes four times as long.
+
+    `out` is where it is put, zeros above the diagonal.
+    """
+    out, m, h = np.zeros_like(R) if out is None else out, R.shape[1], R.shape[1] // 2
+    if m == 1:
+        return np.divide(1.0, R, out=out)
+    upper, lower = (lower_inverse(R[:, s, s], out[:, s, s]) for s in (slice(h), slice(h, m)))
+    # Of single numbers, products of matrices would be a call for each block.
+    cross = R[:, h:, :h] * upper if h == 1 else R[:, h:, :h] @ upper
+    out[:, h:, :h] = -lower * cross if m == 2 else -lower @ cross
+    return out
