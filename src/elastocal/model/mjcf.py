@@ -466,12 +466,12 @@ def _compiled(path: Path, spec: Any) -> tuple[Any, frozenset[int], list[str]]:
     first: ValueError | None = None
     missing = _missing_meshes(path, spec)
     for lost in (missing, None):  # those, then all
-        geoms = [g for g in spec.geoms if lost is None or g.meshname in lost]
-        open_ = [b for b in spec.bodies if b not in stated and any(g in geoms for g in b.geoms)]
-        strip(spec, geoms)
-        if geoms:
-            spec.compiler.boundmass = spec.compiler.boundinertia = STAND_IN
-        try:
+        try:  # a spec that could not be compiled says so again at whatever is asked of it
+            geoms = [g for g in spec.geoms if lost is None or g.meshname in lost]
+            open_ = [b for b in spec.bodies if b not in stated and any(g in geoms for g in b.geoms)]
+            strip(spec, geoms)
+            if geoms:
+                spec.compiler.boundmass = spec.compiler.boundinertia = STAND_IN
             model, notes = compiled(spec)
         except ValueError as error:
             first = first or error
