@@ -14,10 +14,7 @@ from __future__ import annotations
 import random
 import sys
 import tempfile
-import time
 import xml.etree.ElementTree as ElementTree
-from collections.abc import Iterator
-from contextlib import contextmanager
 from pathlib import Path
 from typing import Any
 
@@ -31,6 +28,7 @@ from figaroh.calibration.calibration_tools import (
 from figaroh.calibration.parameter import add_base_name, add_pee_name
 from figaroh.optimal.base_optimal_calibration import BaseOptimalCalibration, Detmax, SOCPOptimizer
 from figaroh.tools.load_robot import load_robot
+from fits_clock import Clock
 
 MARKER_M = "0.1 0.05 0.1"  # off the last axis, so that the marker sees all that a position can
 
@@ -99,20 +97,6 @@ def prepared(urdf: Path, q: np.ndarray, folder: Path) -> UnknownFrames:
     }
     (folder / "config.yaml").write_text(yaml.safe_dump(config))
     return UnknownFrames(loaded, str(folder / "config.yaml"))
-
-
-class Clock:
-    """Wall and CPU seconds of named steps."""
-
-    def __init__(self) -> None:
-        self.seconds: dict[str, Any] = {}
-
-    @contextmanager
-    def step(self, name: str) -> Iterator[None]:
-        wall, cpu = time.perf_counter(), time.process_time()
-        yield
-        self.seconds[f"wall_{name}"] = time.perf_counter() - wall
-        self.seconds[f"cpu_{name}"] = time.process_time() - cpu
 
 
 def main(urdf: Path, pool: Path, out: Path) -> None:

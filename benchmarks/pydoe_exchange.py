@@ -18,11 +18,11 @@ and its `wall` and `cpu` seconds.
 from __future__ import annotations
 
 import sys
-import time
 from pathlib import Path
 from typing import Any
 
 import numpy as np
+from fits_clock import Clock
 from pyDOE3.doe_optimal import algorithms, utils
 
 ALPHA = 1e-3
@@ -51,13 +51,12 @@ def main(pool: Path, out: Path) -> None:
         module.build_uniform_moment_matrix = moments
     numbers = np.arange(len(blocks), dtype=float)[:, None]
     results: dict[str, Any] = {}
+    clock = Clock()
     for name, method in METHODS.items():
-        wall, cpu = time.perf_counter(), time.process_time()
-        design = method(numbers, int(given["n_poses"]), 1, "I")
-        results[f"wall_{name}"] = time.perf_counter() - wall
-        results[f"cpu_{name}"] = time.process_time() - cpu
+        with clock.step(name):
+            design = method(numbers, int(given["n_poses"]), 1, "I")
         results[f"chosen_{name}"] = design[:, 0].astype(int)
-    np.savez(out, **results)
+    np.savez(out, **results, **clock.seconds)
 
 
 if __name__ == "__main__":

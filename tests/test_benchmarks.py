@@ -14,7 +14,7 @@ import pytest
 
 BENCHMARKS = Path(__file__).parents[1] / "benchmarks"
 MODULES = ("bench_part", "bench_clock", "bench_arms", "evaluation_numpy", "evaluation_rivals",
-           "evaluation", "scaling", "startup", "diagnosis", "million_rows", "run", "fits_clock",
+           "evaluation", "scaling", "startup", "diagnosis", "run", "fits_clock",
            "fits_arm", "fits_elastocal")  # fmt: skip
 
 

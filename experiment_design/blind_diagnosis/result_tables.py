@@ -20,7 +20,6 @@ import numpy as np
 import pandas as pd
 from bars import Row, bar_rows, wilson
 from calibration import answerable, draw_reliability, reliability
-from power import observed
 from records import Record
 from scipy.stats import norm
 from score import claims, is_unknown, location_right, one_effect, outright, sure
@@ -60,7 +59,6 @@ def report(done: Sequence[Record]) -> str:
         sections.append("## One effect, 60 poses: true × answered\n\n" + confusion(alone))
     if apart := [r for name in ("catalogue", "sizes") for r in every[name] if "distances" in r]:
         sections.append("## Distance d to the nearest rival\n\n" + by_distance(apart))
-        sections.append(observed(apart))
     if every["sizes"]:
         sections.append("## Size over the realistic size\n\n" + by_size(every["sizes"]))
     if every["catalogue300"]:

@@ -5,7 +5,7 @@
 Rms errors at 200 new poses and loads, in mm: of the cell's own model, of what `diagnose --cell-out`
 added, both by `identify --test`; of the oracle; their ratio, what is claimed and how long it took.
 With `--keep FOLDER` cell, readings and answers stay there, with the truth; `--first K` begins with
-world K; `--search` also shows an oracle who has to search for the orders (`whole_search.py`).
+world K.
 Blindness is the study's matter: here all runs in one process.
 """
 
@@ -24,14 +24,12 @@ from typing import Any
 import numpy as np
 from diagnose_many import run
 from whole_draw import WholeRecipe
-from whole_oracle import Sights, oracle_error
-from whole_search import searched, true_orders
 from whole_world import judged, over_oracle
 from world_files import write_world
 
 HEAD = (
     "| world | arm | noise, µm | approach told | geometry, mm | as diagnosed | oracle | ratio "
-    "| searching | s | verdict | shares held | wrong names | missed | named |\n" + "|" + "---|" * 15
+    "| s | verdict | shares held | wrong names | missed | named |\n" + "|" + "---|" * 14
 )
 
 
@@ -42,7 +40,6 @@ def main() -> None:
     parser.add_argument("--first", type=int, default=0)
     parser.add_argument("--poses", type=int, default=60)
     parser.add_argument("--keep", type=Path)
-    parser.add_argument("--search", action="store_true")
     asked = parser.parse_args()
     print(HEAD, flush=True)
     ratios = []
@@ -50,7 +47,7 @@ def main() -> None:
         recipe = WholeRecipe(f"whole-{asked.poses}-{k:03d}", (asked.seed, 9, k), asked.poses)
         folder = Path(tempfile.mkdtemp()) if asked.keep is None else asked.keep / recipe.name
         try:
-            line, ratio = one_world(recipe, folder, search_ratio(recipe) if asked.search else "–")
+            line, ratio = one_world(recipe, folder)
         finally:
             if asked.keep is None:
                 shutil.rmtree(folder)
@@ -61,7 +58,7 @@ def main() -> None:
         print(f"\nRatio: median {np.median(known):.2f}, 90 % {np.quantile(known, 0.9):.2f}.")
 
 
-def one_world(recipe: WholeRecipe, folder: Path, searching: str) -> tuple[str, float]:
+def one_world(recipe: WholeRecipe, folder: Path) -> tuple[str, float]:
     """Its row, and the tool's error over the oracle's."""
     world = recipe.draw()
     observed, sealed = folder / "seen", folder / "sealed"
@@ -88,18 +85,8 @@ def one_world(recipe: WholeRecipe, folder: Path, searching: str) -> tuple[str, f
         f"{1e6 * world.noise.level:.0f}",
         "yes" if world.told.approach else "no",
     ]
-    parts += [*(f"{e:.4f}" for e in errors), f"{ratio:.2f}", searching, f"{seconds:.0f}"]
+    parts += [*(f"{e:.4f}" for e in errors), f"{ratio:.2f}", f"{seconds:.0f}"]
     return " | ".join(parts + said(answer, whole)), ratio
-
-
-def search_ratio(recipe: WholeRecipe) -> str:
-    """Error of an oracle who has to search for the orders over that of one who knows them."""
-    sights = Sights.of(recipe.draw())
-    error, found = searched(sights)
-    true = true_orders(sights)
-    orders = ", ".join(f"{j + 1}: {found.get(j, 0):.2f} ({true[j]:.2f})" for j in sorted(true))
-    print(f"orders found (true): {orders}", file=sys.stderr, flush=True)
-    return f"{error / oracle_error(sights):.2f}"
 
 
 def said(answer: Mapping[str, Any] | None, whole: Mapping[str, Any]) -> list[str]:
