@@ -12,7 +12,7 @@ joints' true scatter.  With r the noise of the readings, X the columns, D the pr
 from __future__ import annotations
 
 from collections.abc import Iterator, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 
 import numpy as np
 from arm_data import ANGLE, BASE_ANGLE, BASE_POSITION, COMPLIANCE_SPREAD, LENGTH, MARKER, OFFSET
@@ -73,11 +73,6 @@ def oracle_errors(sights: Sights) -> tuple[float, float]:
     error, factor, other = _fit(sights, [*geometry(sights), *effects(sights)], ())
     variance = (other.T * cho_solve(factor, other.T)).sum() / len(other)
     return rms_length(error), float(np.sqrt(3 * variance))
-
-
-def error_of(sights: Sights, blocks: Sequence[Block], hidden: Sequence[Block]) -> float:
-    """Rms length (m) at the other poses where `blocks` are fitted and `hidden` are not known."""
-    return rms_length(_fit(sights, blocks, hidden)[0])
 
 
 def _fit(
@@ -254,18 +249,6 @@ def gap_of(sights: Sights) -> Gap:
     products = left.T @ left / len(left)
     names = tuple((p.family, p.where) for p in parts)
     return Gap(names, products, float(np.sqrt(products.sum())))
-
-
-def geometry_error(sights: Sights) -> float:
-    """Rms length (m) of the errors at the other poses where geometry alone is fitted, by plain
-    least squares, to what the effects do and to the noise."""
-    world = sights.world
-    bare = replace(world, effects=())
-    moved = world.readings() - bare.noise_free(sights.here)
-    there = world.noise_free(sights.there) - bare.noise_free(sights.there)
-    X, other = _fitted(sights)
-    beta = np.linalg.lstsq(X, moved.ravel(), rcond=1e-10)[0]
-    return rms_length(there.ravel() - other @ beta)
 
 
 def _fitted(sights: Sights) -> tuple[Array, Array]:
