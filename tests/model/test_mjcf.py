@@ -82,8 +82,9 @@ REFUSED = {
     "entities": ("<!DOCTYPE a><mujoco/>", {}, "DOCTYPE"),
     "deep": ("<a>" * 40 + "</a>" * 40, {}, "nested more than"),
     "MuJoCo's own": (ARM.replace('pos="0 0 0.35"', 'pos="0 0"'), {}, "MuJoCo cannot read it"),
-    "a geom of no size": (
-        ARM.replace('<body name="foot"', '<geom size="0"/><body name="foot"'), {}, "size 0 must be",
+    "no mass": (
+        ARM.replace('<body name="foot"', '<body name="b5"><joint/></body><body name="foot"'),
+        {}, "mass and inertia of moving bodies.*'b5'",
     ),
     "no arm": ("<mujoco><worldbody/></mujoco>", {}, "no single arm of 4 joints"),
     "unknown": (ARM, {"flange": "hend"}, "flange 'hend' is not there.*did you mean 'hand'"),
