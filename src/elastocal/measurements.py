@@ -6,7 +6,7 @@ Beside it, what the noise that is stated for the table or its tracker means for 
 from __future__ import annotations
 
 import re
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, fields, replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -469,49 +469,42 @@ def read_measurements(
 
     raw = read_table(path, choose, text=text)
     n = len(raw.row)
+    found = {name: _values(raw, name) for name in raw.layout.columns}
     # A plan without the column is of all markers.
     marker = _marker(raw, marker_names if observe not in PLANS or "marker" in raw.labels else ())
     configuration = raw.labels.get("configuration")
     if configuration is None:
         configuration = Labels(np.arange(n), tuple(str(i) for i in range(1, n + 1)))
-    force, torque, sigma = raw.si("force"), raw.si("torque"), _sigma(raw)
+    q, force, repeat = (found.pop(name, None) for name in ("q", "force", "repeat"))
     if force is not None:
-        raw.check("force", np.abs(force) <= LARGEST_FORCE, "no arm carries a force this large")
         # What a subtraction or rotation leaves of no load; scaled by it, numbers overflow.
         force = np.where(np.linalg.norm(force, axis=1, keepdims=True) < LEAST_FORCE, 0.0, force)
-    q, time, temperature = raw.si("q"), raw.si("time"), raw.si("temperature")
-    distance = raw.si("distance")
-    if distance is not None:
-        raw.check("distance", distance > 0, "a distance must be positive")
-    approach = raw.si("approach")
-    if approach is not None:
-        good = np.isin(approach, (-1.0, 0.0, 1.0))
-        raw.check("approach", good, "an approach direction is -1, 0 or 1")
+    polar = found.get("sigma_polar")
+    columns = ("position", "torque", "approach", "before")
     table = Measurements(
         source=str(path),
         row=raw.row,
         q=np.zeros((n, 0)) if q is None else q,
         configuration=configuration.codes,
         configuration_labels=configuration.names,
-        repeat=_repeat(raw),
+        repeat=np.zeros(n, dtype=np.int64) if repeat is None else repeat[:, 0].astype(np.int64),
         marker=marker.codes,
         marker_names=marker.names,
         force=np.zeros((n, 3)) if force is None else force,
-        position=raw.si("position"),
         rotation=rotation_column(raw),
-        distance=None if distance is None else distance[:, 0],
-        torque=torque,
-        sigma=sigma,
-        sigma_frame="polar" if "sigma_polar" in raw.layout.columns else "cartesian",
-        time=None if time is None else time[:, 0],
-        approach=approach,
-        before=raw.si("before"),
-        temperature=None if temperature is None else temperature[:, 0],
+        sigma=found.get("sigma_cartesian") if polar is None else polar,
+        sigma_frame="cartesian" if polar is None else "polar",
         joint_kinds=() if q is None else joint_kinds,
+        **{name: found.get(name) for name in columns},
+        **{name: _first(found.get(name)) for name in ("distance", "time", "temperature")},
     )
     if observe != "targets":  # a path may pass a place twice
         _check_duplicates(raw, table)
     return with_moves(table)
+
+
+def _first(values: Array | None) -> Array | None:
+    return None if values is None else values[:, 0]
 
 
 def read_plan(
@@ -527,22 +520,31 @@ def read_plan(
     )
 
 
-def _sigma(raw: RawTable) -> Array | None:
-    for family in ("sigma_cartesian", "sigma_polar"):
-        sigma = raw.si(family)
-        if sigma is not None:
-            raw.check(family, sigma > 0, "a standard deviation must be positive")
-            return sigma
-    return None
+# Family → which of its values are right, and what a message says of others.
+RULES: dict[str, tuple[Callable[[Array], np.ndarray], str]] = {
+    "force": (lambda v: np.abs(v) <= LARGEST_FORCE, "no arm carries a force this large"),
+    "distance": (lambda v: v > 0, "a distance must be positive"),
+    "approach": (lambda v: np.isin(v, (-1.0, 0.0, 1.0)), "an approach direction is -1, 0 or 1"),
+    "repeat": (
+        lambda v: (v == np.round(v)) & (np.abs(v) <= LARGEST_EXACT_INTEGER),
+        "a repeat is a whole number",
+    ),
+    **dict.fromkeys(
+        ("sigma_cartesian", "sigma_polar"),
+        (lambda v: v > 0, "a standard deviation must be positive"),
+    ),
+}
 
 
-def _repeat(raw: RawTable) -> IntArray:
-    repeat = raw.si("repeat")
-    if repeat is None:
-        return np.zeros(len(raw.row), dtype=np.int64)
-    whole = (repeat == np.round(repeat)) & (np.abs(repeat) <= LARGEST_EXACT_INTEGER)
-    raw.check("repeat", whole, "a repeat is a whole number")
-    return repeat[:, 0].astype(np.int64)
+def _values(raw: RawTable, family: str) -> Array | None:
+    """The numbers of a family (n, k) in SI units, where they keep its rule; None for labels."""
+    if raw.layout.columns[family][0].header in raw.labels:
+        return None
+    values = raw.si(family)
+    if values is not None and family in RULES:
+        good, rule = RULES[family]
+        raw.check(family, good(values), rule)
+    return values
 
 
 def rotation_column(raw: RawTable) -> Array | None:
@@ -559,23 +561,10 @@ def rotation_column(raw: RawTable) -> Array | None:
             f"{raw.where(i, 'qw')}: the quaternion's norm is {norm[i]:.6g}, not 1; check the "
             "order qw, qx, qy, qz and the digits"
         )
-    return rotation_vector(quaternion)
+    from scipy.spatial.transform import Rotation  # slow to import, seldom asked for
 
-
-def rotation_vector(quaternion: Array) -> Array:
-    """Axis times angle in [0, π], (n, 3) rad, of quaternions (n, 4) as w, x, y, z, not zero.
-
-    Scale and sign of a quaternion do not matter.
-    """
-    # q and -q are the same rotation; w >= 0 is the one of at most half a turn.
-    q = np.where(quaternion[:, :1] < 0, -quaternion, quaternion)
-    sine = np.linalg.norm(q[:, 1:], axis=1)
-    angle = 2.0 * np.arctan2(sine, q[:, 0])
-    # angle / sine tends to 2 / w as the angle vanishes.
-    small = sine < 1e-150
-    factor = np.where(small, 2.0 / np.where(small, q[:, 0], 1.0), 0.0)
-    np.divide(angle, sine, out=factor, where=~small)
-    return q[:, 1:] * factor[:, None]
+    vectors: Array = Rotation.from_quat(quaternion[:, [1, 2, 3, 0]]).as_rotvec()
+    return vectors
 
 
 def _marker(raw: RawTable, known: tuple[str, ...]) -> Labels:
@@ -665,24 +654,21 @@ def read_matrix(path: str | Path, what: str) -> Array:
     """
     if Path(path).suffix.lower() == ".npy":
         return _read_npy(path, what)
-    rows: list[list[float]] = []
-    text = read_text(path, what, MOST_BYTES)
-    for number, line in enumerate(text.splitlines(), start=1):
-        if not line.strip():
-            continue
-        cells = list(enumerate(cell.strip() for cell in line.split(",")))
-        columns = {i: f"no. {i + 1}" for i, _ in cells}
-        if problem := first_bad_cell(str(path), [(number, [c for _, c in cells])], columns, False):
-            raise problem
-        rows.append([float(cell) for _, cell in cells])
-        if len(rows[-1]) != len(rows[0]):
-            raise InputError(
-                f"{path}, line {number}: {len(rows[-1])} numbers, the first line has "
-                f"{len(rows[0])}; a {what} is a square table without a header"
-            )
+    lines = enumerate(read_text(path, what, MOST_BYTES).splitlines(), start=1)
+    rows = [(n, [cell.strip() for cell in line.split(",")]) for n, line in lines if line.strip()]
     if not rows:
         raise InputError(f"{path}: empty file; a {what} is a square table of numbers")
-    return np.array(rows)
+    width = len(rows[0][1])
+    for number, cells in rows:
+        if len(cells) != width:
+            raise InputError(
+                f"{path}, line {number}: {len(cells)} numbers, the first line has {width}; a "
+                f"{what} is a square table without a header"
+            )
+    columns = {i: f"no. {i + 1}" for i in range(width)}
+    if problem := first_bad_cell(str(path), rows, columns, False):
+        raise problem
+    return np.array([cells for _, cells in rows], dtype=np.float64)
 
 
 def _read_npy(path: str | Path, what: str) -> Array:
