@@ -26,7 +26,7 @@ from functools import cache, cached_property
 from typing import Literal, NamedTuple
 
 import numpy as np
-from scipy import linalg, special
+from scipy import special
 
 from elastocal.diagnosis.hypotheses import Hypothesis
 from elastocal.diagnosis.model_set import spans_of, within_bounds
@@ -36,12 +36,11 @@ from elastocal.diagnosis.noise_floor import (
     Weighted,
     balanced,
     fit_noise,
-    inverse_triangle,
     log_prior,
     posterior,
 )
 from elastocal.engine.climb import climb
-from elastocal.identification.smooth_prior import Standardised
+from elastocal.engine.sizes import Products, Standardised
 from elastocal.model.effects.base import Effect
 from elastocal.model.effects.smooth import ResidualField, Waves
 from elastocal.units import Array, IntArray
@@ -242,7 +241,7 @@ def log_odds(components: Sequence[Component], another: Component) -> float:
     return presence_cost(n, k - 1) - presence_cost(n, k) - another.sought
 
 
-class Products(NamedTuple):
+class Across(NamedTuple):
     """Of columns C (C, m, k) under a noise: XᵀV⁻¹C (p, k) of those that they stand beside, CᵀV⁻¹C
     (k, k) and CᵀV⁻¹r (k,).  `columns` are the given ones."""
 
@@ -289,12 +288,22 @@ class SumOfComponents:
 
     @cached_property
     def sized(self) -> Array:
-        """By how much (p + Σ k, 1 + K + W) the logarithms of prior variances grow with those of
-        sizes; zero where a noise's factor and lengths stand."""
-        out = np.zeros((len(self.weighted.z), 1 + len(self.components) + len(self.waved)))
+        """By how much (p + Σ k, K + W) the logarithms of prior variances grow with those of sizes;
+        zero where lengths stand."""
+        out = np.zeros((len(self.weighted.z), len(self.components) + len(self.waved)))
         for k, span in enumerate(self.spans):
-            out[span, 1 + k] = 2.0
+            out[span, k] = 2.0
         return out
+
+    @cached_property
+    def products_of_all(self) -> Products:
+        """Of all columns."""
+        return Products(self.weighted.M, self.weighted.z, self.squares, self.rows)
+
+    @property
+    def constant(self) -> float:
+        """What of −2ℓ does not change with sizes: log|V| + n log 2π."""
+        return self.weighted.alone - self.squares
 
     def scaled(self, factor: float) -> SumOfComponents:
         """The same under e^factor times the noise."""
@@ -326,10 +335,10 @@ class SumOfComponents:
         return root.transpose(0, 2, 1) @ root
 
     @cached_property
-    def _known(self) -> dict[int, Products]:
+    def _known(self) -> dict[int, Across]:
         return {}
 
-    def products(self, columns: Sequence[Array]) -> list[Products]:
+    def products(self, columns: Sequence[Array]) -> list[Across]:
         """Of each of these columns beside the data's own and the components'; kept, since a search
         comes back to the same ones."""
         new = {id(c): c for c in columns if id(c) not in self._known}
@@ -342,7 +351,7 @@ class SumOfComponents:
                 across, z = beside.T @ white, white.T @ r
                 for c, span in zip(some, spans_of([c.shape[2] for c in some], len(z)), strict=True):
                     own = _rows(joined[:, :, span]).T @ white[:, span]
-                    self._known[id(c)] = Products(c, across[:, span], own, z[span])
+                    self._known[id(c)] = Across(c, across[:, span], own, z[span])
         return [self._known[id(c)] for c in columns]
 
     def variances(self, at: Sizes) -> Array:
@@ -351,16 +360,10 @@ class SumOfComponents:
         sized = [np.exp(2 * s) * share for s, share in zip(at.size, shares, strict=True)]
         return np.concatenate([1 / self.data.precision, *sized])
 
-    def factored(self, at: Sizes) -> tuple[Array, Standardised, float]:
-        """√v, the coefficients in units of it under e^factor times the noise, and −2ℓ."""
-        a = float(np.exp(at.factor))
-        root = np.sqrt(self.variances(at))
-        found = Standardised.of(self.weighted.M, self.weighted.z / a, root / a)
-        value = (
-            self.weighted.alone - self.squares + self.squares / a**2 + 2 * self.rows * at.factor
-            + found.log_det - found.explained
-        )  # fmt: skip
-        return root, found, value
+    def factored(self, at: Sizes) -> tuple[Standardised, float]:
+        """The coefficients under e^factor times the noise, and −2ℓ."""
+        found = self.products_of_all.at(self.variances(at), at.factor)
+        return found, self.constant + self.products_of_all.value(found)
 
     def objective(self, theta: Array) -> tuple[float, Array, Array]:
         """−2 log posterior of the logarithms, its slope and its average information (1 + 2 K,
@@ -372,30 +375,15 @@ class SumOfComponents:
         """
         K, waved = len(self.components), self.waved
         at = Sizes(float(theta[0]), theta[1 : K + 1], theta[K + 1 :])
-        root, found, value = self.factored(at)
-        b, a2 = found.b, np.exp(2 * at.factor)
-        beta = root * b
-        rss = self.squares - 2 * float(beta @ self.weighted.z)
-        rss += float(beta @ (self.weighted.M @ beta))
-        inverse = inverse_triangle(found.L)
-        # A coefficient's posterior over its prior variance.
-        left = np.einsum("ij,ij->j", inverse, inverse)
-        each, changed = (1 - left) - b**2, self.sized.copy()  # ∂(−2ℓ)/∂ log v
-        for n, k in enumerate(waved, 1 + K):
-            changed[self.spans[k], n] = self.components[k].shares(at.length[k])[1]
+        grown = self.sized.copy()  # of the logarithms of prior variances
+        for n, k in enumerate(waved, K):
+            grown[self.spans[k], n] = self.components[k].shares(at.length[k])[1]
+        value, own, between = self.products_of_all.objective(self.variances(at), grown, at.factor)
         index = np.concatenate([np.arange(1 + K), 1 + K + waved])
         slope, information = np.zeros_like(theta), np.zeros((len(theta), len(theta)))
-        slope[index] = each @ changed
-        slope[0] = 2 * (self.rows - (len(left) - left.sum()) - rss / a2)
-        changed *= b[:, None]
-        half, own = linalg.blas.dtrmm(1.0, inverse, changed, lower=1), changed.T @ changed
-        own[0] = own[:, 0] = 0.0
-        information[np.ix_(index, index)] = own - half.T @ half
-        of_noise = 2 * (inverse @ b)
-        information[0, index] = information[index, 0] = of_noise @ half
-        information[0, 0] = 4 * rss / a2 - float(of_noise @ of_noise)
+        slope[index], information[np.ix_(index, index)] = own, between
         prior, of_sizes = self.pool.penalty(at.size)
-        value += prior
+        value += self.constant + prior
         slope[1 : K + 1] += of_sizes
         information[1 : K + 1, 1 : K + 1] += 2 * self.pool.precision
         if self.data.stated:
@@ -423,21 +411,14 @@ class SumOfComponents:
         """By how much ℓ falls (K,) where a component is left out, all else as it is; and what of it
         (K,) is due to coefficients that cannot be negative.
 
-        Of the posterior: with S its covariance block of a component's standardised coefficients
-        and b their mean, leaving it out changes −2ℓ by log|S| + bᵀS⁻¹b.
+        Of coefficients that cannot be negative, by the posterior's share of that half.
         """
-        _, found, _ = self.factored(at)
-        b, inverse = found.b, found.covariance
-        out, within = np.zeros((2, len(self.components)))
+        at_sizes, _ = self.factored(at)
+        inverse, within = at_sizes.covariance, np.zeros(len(self.components))
         for k, span in enumerate(self.spans):
-            S = inverse[span, span]
-            S = np.tril(S) + np.tril(S, -1).T
-            C = linalg.cholesky(S, lower=True)
-            y = linalg.solve_triangular(C, b[span], lower=True)
-            out[k] = 0.5 * float(y @ y + 2 * np.log(np.diag(C)).sum())
-            i = self.components[k].bounded
-            within[k] = within_bounds(b[span][i] / np.sqrt(np.diag(S)[i]))
-        return out + within, within
+            i = np.arange(span.start, span.stop)[self.components[k].bounded]
+            within[k] = within_bounds(at_sizes.b[i] / np.sqrt(inverse[i, i]))
+        return at_sizes.left_out(list(self.spans)) + within, within
 
 
 def side_by_side(data: NoisyData, columns: Sequence[Array]) -> Array:
@@ -626,7 +607,7 @@ def _under_own_noise(problem: SumOfComponents, at: Sizes) -> SumOfComponents:
 def _at_maximum(problem: SumOfComponents, at: Sizes) -> FittedSum:
     """The sum of all its components at these sizes."""
     variances = problem.variances(at)
-    value = problem.factored(at)[2]
+    value = problem.factored(at)[1]
     score = -value / 2 - problem.pool.penalty(at.size)[0] / 2 - problem.pool.cost
     score -= 0.5 * log_prior(problem.data.stated, problem.noise)[0]
     (earned, within), own = problem.earned(at), variances[len(problem.data.precision) :]

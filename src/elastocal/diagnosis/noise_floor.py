@@ -10,6 +10,7 @@ from scipy import linalg, optimize
 
 from elastocal.diagnosis.baseline import Blocks
 from elastocal.engine.climb import STRIDE, climb
+from elastocal.engine.sizes import inverse_triangle
 from elastocal.identification.weighted_problem import WhitenedBlocks
 from elastocal.model.evaluate import ahead, thread_count
 from elastocal.units import Array, BoolArray
@@ -309,21 +310,6 @@ class Weighted:
         u = (back @ self.r[..., None])[..., 0] - _times(H, z)
         beta = linalg.solve_triangular(L, z, lower=True, trans="T", check_finite=False)
         return Projection(back @ self.root, H, u, beta, marginal, L)
-
-
-SMALL = 64  # triangles that LAPACK inverts
-
-
-def inverse_triangle(L: Array) -> Array:
-    """L⁻¹ of a lower triangular L (p, p), by halves: BLAS's products of triangles are two to three
-    times as fast as LAPACK's inverse."""
-    if len(L) <= SMALL:
-        return np.asarray(linalg.lapack.dtrtri(L, lower=1)[0])
-    h, out, multiply = len(L) // 2, np.zeros(L.shape, order="F"), linalg.blas.dtrmm
-    out[:h, :h] = upper = inverse_triangle(L[:h, :h])
-    out[h:, h:] = lower = inverse_triangle(L[h:, h:])
-    out[h:, :h] = multiply(-1.0, upper, multiply(1.0, lower, L[h:, :h], lower=1), side=1, lower=1)
-    return out
 
 
 def _times_transposed(rows: Array, lower: Array, overwrite: bool = False) -> Array:

@@ -13,10 +13,10 @@ from typing import Any
 import numpy as np
 from scipy import linalg, special
 
+from elastocal.engine.sizes import Standardised
 from elastocal.identification.linear_solver import least_norm
 from elastocal.identification.prediction import mean_squares
 from elastocal.identification.residuals import ALONE, held_out_residual, rms_3d
-from elastocal.identification.smooth_prior import Standardised
 from elastocal.identification.weighted_problem import Weights
 from elastocal.measurements import Measurements
 from elastocal.model.calibrated import CalibratedArm

@@ -13,16 +13,17 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 from functools import cached_property
-from typing import NamedTuple
 
 import numpy as np
-from scipy import linalg, optimize
+from scipy import linalg
 
+from elastocal.engine.climb import climb
+from elastocal.engine.sizes import Products, Standardised
 from elastocal.identification.weighted_problem import RFactor
-from elastocal.units import Array, BoolArray, IntArray
+from elastocal.units import Array, IntArray
 
 # Scales λ beyond these are no longer told apart: nothing is left of the group, or of its prior.
-LEAST, MOST = 1e-6, 1e6
+LEAST, MOST = 1e-3, 1e6
 SMALL = 0.05
 DEPENDENT = 1e-11  # singular value of unit columns, of the largest
 # Of log λ above 0: a function may be smaller than stated at no price, but ten times the size costs
@@ -30,8 +31,7 @@ DEPENDENT = 1e-11  # singular value of unit columns, of the largest
 PRICE = 0.75
 # Noise as shares of the variance that ordinary parameters leave, from which the search starts.
 SHARES = (1.0, 0.1, 0.01, 0.001)
-STEPS = 60
-TOLERANCE = 2e-4  # of the log-likelihood per row, relative
+STEPS, ENOUGH, LEVEL = 30, 0.02, 0.3  # of −2ℓ: what the last step may promise; its curvature
 
 
 @dataclass(frozen=True)
@@ -66,48 +66,6 @@ class Sums:
             self.own.merged(other.own), self.cross + other.cross, self.gram + other.gram,
             self.right + other.right,
         )  # fmt: skip
-
-
-class Standardised(NamedTuple):
-    """Coefficients with a prior, in units of their prior deviations √v: L of A = LLᵀ = 1 + √v M √v
-    and A b = √v z, of the sums M = CᵀC and z = Cᵀe over whitened columns and rows.
-
-    Their likelihood, integrated out, is that of e without them but for −2ℓ = log|A| − `explained`.
-    """
-
-    L: Array
-    b: Array
-    explained: float
-
-    @classmethod
-    def of(cls, M: Array, z: Array, root: Array) -> Standardised:
-        """Of prior deviations `root` (k,)."""
-        A = M * root
-        A *= root[:, None]
-        A[np.diag_indices_from(A)] += 1.0
-        # Symmetric, and LAPACK's own way round: nothing is copied.
-        L = linalg.cholesky(A.T, lower=True, overwrite_a=True, check_finite=False)
-        right = root * z
-        b = linalg.cho_solve((L, True), right, check_finite=False)
-        return cls(L, b, float(b @ right))
-
-    @property
-    def log_det(self) -> float:
-        return 2 * float(np.log(np.diag(self.L)).sum())
-
-    @property
-    def covariance(self) -> Array:
-        """A⁻¹ (k, k), its lower triangle."""
-        return np.asarray(linalg.lapack.dpotri(self.L, lower=1)[0])
-
-
-class _Terms(NamedTuple):
-    """−2ℓ, its slope in log T (groups,), q, and |b|²/T (groups,) in it."""
-
-    value: float
-    slope: Array
-    q: float
-    squares: Array
 
 
 @dataclass(frozen=True)
@@ -180,76 +138,50 @@ class ShrunkProblem(LinearRows):
 
     def scales(self, start: Scales | None = None) -> Scales:
         """λ and σ² of the largest restricted likelihood, where λ above 1 has its PRICE; what is 0
-        at the `start` stays so.
+        at the `start` stays so."""
+        alive = np.ones(self.n_groups, dtype=bool) if start is None else start.scale > 0
+        own = np.flatnonzero(alive[self.group])
+        group = np.unique(self.group[own], return_inverse=True)[1].ravel()
+        products = Products(self.gram[np.ix_(own, own)], self.right[own], self.total, self.spare)
+        grown = 2.0 * (group[:, None] == np.arange(int(alive.sum())))
 
-        −2ℓ = (rows − p_f) log q + log|A| + const with A = 1 + T½MT½, T = λ/σ², M = sB_sᵀB_s s and
-        q the least |e|² + |b|²/T, of which σ² is the mean.
-        """
-        G = self.n_groups
-        alive: BoolArray = np.ones(G, dtype=bool) if start is None else start.scale > 0
-        whole = max(self.total / self.spare, 1e-300)
-        limits = np.log(LEAST / whole), np.log(MOST / whole) - np.log(SHARES[-1])
+        def objective(theta: Array) -> tuple[float, Array, Array]:
+            """In log σ and the ½ log λ of the groups."""
+            variances = np.exp(2 * theta[1:])[group] * self.std[own] ** 2
+            value, slope, information = products.objective(variances, grown, float(theta[0]))
+            over = np.maximum(2 * theta[1:], 0.0) / PRICE
+            slope[1:] += 4 * over / PRICE
+            # What is next to nothing has next to no curvature: no step may be taken for it.
+            information[np.diag_indices_from(information)] += LEVEL
+            at = 1 + np.flatnonzero(over > 0)
+            information[at, at] += 8 / PRICE**2
+            return value + float(over @ over), slope, information
 
-        def criterion(free: Array) -> tuple[float, Array]:
-            at = self._terms(np.exp(self._spread(free, alive)), slopes=True)
-            # λ = T q/(rows − p_f), and q falls by |b|² as T grows: the price moves with both.
-            over = np.maximum(free + np.log(at.q / self.spare), 0.0) / PRICE**2
-            slope = at.slope[alive] + 2 * (over - over.sum() * at.squares[alive] / at.q)
-            return at.value + PRICE**2 * float(over @ over), slope
+        whole, n = max(self.total / self.spare, 1e-300), grown.shape[1]
+        size = 0.5 * np.log([LEAST, MOST])
+        noise = 0.5 * np.log(whole) + np.array([-20.0, 1.0])
+        lower, upper = (np.concatenate([[noise[k]], np.full(n, size[k])]) for k in (0, 1))
 
-        def least(free: Array) -> tuple[float, Array]:
-            found = optimize.minimize(
-                criterion, free, jac=True, method="L-BFGS-B", bounds=[limits] * len(free),
-                options={"maxiter": STEPS, "ftol": TOLERANCE / self.rows, "maxls": 30},
-            )  # fmt: skip
-            return float(found.fun), np.asarray(found.x)
+        def found(theta: Array) -> Array:
+            return climb(objective, np.clip(theta, lower, upper), lower, upper, ENOUGH, STEPS)[0]
 
-        ratio = np.zeros(G)
-        if alive.any():
-            none = np.zeros(int(alive.sum()))
-            if start is None:
-                guesses = [np.clip(none - np.log(whole * share), *limits) for share in SHARES]
-                begin = min(guesses, key=lambda guess: criterion(guess)[0])
-            else:
-                # From nothing the likelihood shows no way back: what is small begins anew.
-                known = np.where(start.scale[alive] < SMALL, 1.0, start.scale[alive])
-                begin = np.clip(np.log(known / start.variance), *limits)
-            value, free = least(begin)
-            variance = self._terms(np.exp(self._spread(free, alive))).q / self.spare
-            small = free < np.log(SMALL / variance)
-            if start is None and small.any():
-                again, other = least(np.where(small, -np.log(variance), free))
-                if again < value:
-                    free = other
-            ratio[alive] = np.exp(free)
-        at = self._terms(ratio)
-        variance = at.q / self.spare
-        gain = np.array([self._left_out(ratio, g) - at.value for g in range(G)]) / 2
-        return Scales(ratio * variance, variance, gain)
-
-    @staticmethod
-    def _spread(free: Array, alive: BoolArray) -> Array:
-        every = np.full(len(alive), -np.inf)
-        every[alive] = free
-        return every
-
-    def _left_out(self, ratio: Array, g: int) -> float:
-        return self._terms(np.where(np.arange(len(ratio)) == g, 0.0, ratio)).value
-
-    def _terms(self, ratio: Array, slopes: bool = False) -> _Terms:
-        """−2ℓ at T (groups,), with its slope in log T where that is asked for."""
-        root = np.sqrt(ratio)[self.group] * self.std
-        own, zero = np.flatnonzero(root > 0), np.zeros(self.n_groups)
-        at = Standardised.of(self.gram[np.ix_(own, own)], self.right[own], root[own])
-        q = max(self.total - at.explained, 1e-300)
-        value = self.spare * float(np.log(q)) + at.log_det
-        if not slopes or not len(own):
-            return _Terms(value, zero, q, zero)
-        squares, known = (
-            np.asarray(np.bincount(self.group[own], each, self.n_groups), dtype=np.float64)
-            for each in (at.b**2, 1 - np.diag(at.covariance))
-        )
-        return _Terms(value, known - self.spare / q * squares, q, squares)
+        if start is None:
+            levels = 0.5 * np.log(whole * np.array(SHARES))
+            begun = [np.concatenate([[level], np.zeros(n)]) for level in levels]
+            theta = found(min(begun, key=lambda one: objective(one)[0]))
+            small = theta[1:] < 0.5 * np.log(SMALL)
+            if small.any():
+                again = found(np.where(np.concatenate([[False], small]), 0.0, theta))
+                theta = min(theta, again, key=lambda one: objective(one)[0])
+        else:
+            # From nothing the likelihood shows no way back: what is small begins anew.
+            known = np.where(start.scale[alive] < SMALL, 1.0, start.scale[alive])
+            theta = found(0.5 * np.log(np.concatenate([[start.variance], known])))
+        scale, gain = np.zeros(len(alive)), np.zeros(len(alive))
+        scale[alive] = np.exp(2 * theta[1:])
+        at = products.at(scale[self.group[own]] * self.std[own] ** 2, float(theta[0]))
+        gain[alive] = at.left_out([np.flatnonzero(group == g) for g in range(n)])
+        return Scales(scale, float(np.exp(2 * theta[0])), gain)
 
     def posterior(self, scales: Scales) -> ShrunkPosterior:
         """The estimate and its covariance under these scales."""
