@@ -51,6 +51,7 @@ from elastocal.units import Array, IntArray, Progress
 # Below this share of its own length a column lies in the span of the kept ones: B is exact
 # to 1e-15, so this is a structural dependence and not rounding.
 STRUCTURAL = 1e-7
+ROUNDING = 1e-9
 
 
 @dataclass(frozen=True)
@@ -137,7 +138,9 @@ def reduce(
             continue
         off = R[:, candidates] - basis @ (basis.T @ R[:, candidates])
         off -= basis @ (basis.T @ off)  # twice is enough (Parlett)
-        _, T, order = linalg.qr(off, mode="economic", pivoting=True)
+        # Of columns that are alike but for rounding the first is kept, on any machine.
+        alike = 1 - ROUNDING * np.arange(len(candidates))
+        _, T, order = linalg.qr(off * alike, mode="economic", pivoting=True)
         diagonal = np.abs(np.diag(T))
         for k, d in enumerate(diagonal):
             c = candidates[order[k]]
