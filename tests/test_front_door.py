@@ -5,7 +5,7 @@ import inspect
 import json
 import subprocess
 import sys
-from dataclasses import fields
+from dataclasses import fields, replace
 from pathlib import Path
 
 import numpy as np
@@ -77,8 +77,8 @@ def command(*words):
 # Names
 
 
-def test_about_twenty_names_are_listed_and_all_are_there():
-    assert 20 <= len(ec.__all__) <= 34
+def test_about_thirty_names_are_listed_and_all_are_there():
+    assert 20 <= len(ec.__all__) <= 37
     assert set(ec.__all__) <= set(dir(ec))
     assert all(getattr(ec, name) is not None for name in ec.__all__)
     with pytest.raises(AttributeError, match="no attribute 'identity'"):
@@ -463,3 +463,53 @@ def test_what_a_user_guesses(tmp_path):
     assert fit.predict(q, [0, 0, -2600]).shape == (len(q), 3)
     with pytest.raises(ec.InputError, match="DataFrame"):
         model.read(frame.drop(columns=[c for c in frame if c.startswith("q1_")]))
+
+
+def test_a_file_is_loaded_by_what_it_is(fit, tmp_path):
+    fit.save("result.json")
+    model, arm, data = (ec.load(name) for name in ("cell.toml", "result.json", "data.csv"))
+    assert model.names == fit.model.names and np.array_equal(arm.x, fit.x)
+    assert np.array_equal(data.position, model.read("data.csv").position)
+    (tmp_path / "copy.json").write_text(Path("result.json").read_text())
+    assert np.array_equal(ec.load(tmp_path / "copy.json", cell="cell.toml").x, fit.x)
+    with pytest.raises(ec.InputError, match=r"no cell\.toml beside .*copy\.json"):
+        ec.load(tmp_path / "copy.json")
+    with pytest.raises(ec.InputError, match=r"kr270_2\.urdf: give a cell file"):
+        ec.load("kr270_2.urdf")
+
+
+def test_effects_are_a_data_frame():
+    frame = ec.effects("cell.toml").set_index("name")
+    assert frame.loc["joint_compliance", "on"] and "joint2" in frame.loc["backlash", "places"]
+
+
+def test_arrays_of_many_markers_are_what_their_file_is(model):
+    data = replace(model.read("data.csv"), sigma=None)
+    names = [data.marker_names[k] for k in data.marker]
+    table = ec.table(data.q, data.position, data.force, marker=names)
+    again, fit = (ec.identify(model, each) for each in (table, data))
+    assert np.array_equal(table.repeat, data.repeat) and np.array_equal(again.x, fit.x)
+    assert [again[n].ci95 for n in again] == [fit[n].ci95 for n in fit]
+    with pytest.raises(ec.InputError, match="`marker` takes a value for each row"):
+        ec.table(data.q, data.position, marker=["M1"])
+
+
+def test_a_generator_is_a_seed(model):
+    q = np.array([[0.1, -0.4405, 0.5, 0.0, 0.5, 0.0]])
+    one, two, other = (
+        ec.simulate(model, q, seed=np.random.default_rng(seed)).position for seed in (1, 1, 2)
+    )
+    assert np.array_equal(one, two) and not np.array_equal(one, other)
+
+
+def test_a_figure_is_drawn_in_axes_of_the_users_own(fit):
+    from matplotlib.figure import Figure
+
+    figure = Figure(figsize=(12, 5), layout="constrained")
+    left, right = figure.subplots(1, 2)
+    left.plot([1, 2])
+    part = fit.plot("parameters", ax=right)
+    assert part in figure.subfigs and part.axes[0].get_xlabel() and len(figure.axes) == 2
+    figure.savefig("both.png")
+    with pytest.raises(ec.InputError, match="`ax` takes axes"):
+        fit.plot(ax=Figure())

@@ -42,9 +42,11 @@ def uses() -> dict[str, set[str]]:
         room = _room(path.relative_to(SOURCE).with_suffix("").parts[0])
         for node in ast.walk(ast.parse(path.read_text(encoding="utf-8"))):
             name = node.module or "" if isinstance(node, ast.ImportFrom) else ""
-            target = _room(name.removeprefix("elastocal.").partition(".")[0])
-            if room in ROOMS and target in ROOMS and name.startswith("elastocal."):
-                found[room].add(target)
+            names = [name] if name != "elastocal" else [f"{name}.{a.name}" for a in node.names]
+            for name in names:
+                target = _room(name.removeprefix("elastocal.").partition(".")[0])
+                if room in ROOMS and target in ROOMS and name.startswith("elastocal."):
+                    found[room].add(target)
         found.get(room, set()).discard(room)
     return {
         room: {one for one in direct if not any(one in _below(o, found) for o in direct)}

@@ -16,6 +16,7 @@ from importlib import import_module
 from typing import TYPE_CHECKING, Any
 
 if TYPE_CHECKING:
+    from elastocal.above import effects
     from elastocal.cell.arm_description import Robot, Tool, Tracker
     from elastocal.cell.work_cell import Cell, read_cell
     from elastocal.cell.workspace_rules import Workspace
@@ -27,19 +28,21 @@ if TYPE_CHECKING:
     from elastocal.identification.knowledge import Knowledge
     from elastocal.identification.result import Calibration
     from elastocal.importing.first_cell import init
-    from elastocal.measurements import Measurements
+    from elastocal.measurements import Measurements, table
     from elastocal.model.arm import Parameter
     from elastocal.model.calibrated import CalibratedArm, read_calibrated
     from elastocal.model.effects.base import Effect
     from elastocal.model.manipulator import Model
     from elastocal.planning.plan import Plan
     from elastocal.plugins import register_criterion, register_effect, register_noise_model
+    from elastocal.saving import load
     from elastocal.verbs import compensate, design, diagnose, identify, simulate
 
 __version__ = "0.1.0"
 
 # Where each name lives; a test holds this against the imports above.
 ROOMS = {
+    "above": "effects",
     "cell.arm_description": "Robot Tool Tracker",
     "cell.work_cell": "Cell read_cell",
     "cell.workspace_rules": "Workspace",
@@ -51,13 +54,14 @@ ROOMS = {
     "identification.knowledge": "Knowledge",
     "identification.result": "Calibration",
     "importing.first_cell": "init",
-    "measurements": "Measurements",
+    "measurements": "Measurements table",
     "model.arm": "Parameter",
     "model.calibrated": "CalibratedArm read_calibrated",
     "model.effects.base": "Effect",
     "model.manipulator": "Model",
     "planning.plan": "Plan",
     "plugins": "register_criterion register_effect register_noise_model",
+    "saving": "load",
     "verbs": "compensate design diagnose identify simulate",
 }
 
@@ -65,9 +69,9 @@ __all__ = [
     "CalibratedArm", "Calibration", "Cell", "Comparison", "Compensation", "Diagnosis", "Effect",
     "ElastocalError", "InputError", "InsufficientDataError", "Knowledge", "Measurements",
     "Model", "Parameter", "Plan", "Robot", "Tool", "Tracker", "UnknownNameError", "Workspace",
-    "compare", "compensate", "design", "diagnose", "identify", "init", "next_poses",
-    "read_calibrated", "read_cell", "register_criterion", "register_effect",
-    "register_noise_model", "simulate",
+    "compare", "compensate", "design", "diagnose", "effects", "identify", "init", "load",
+    "next_poses", "read_calibrated", "read_cell", "register_criterion", "register_effect",
+    "register_noise_model", "simulate", "table",
 ]  # fmt: skip
 
 _HOME = {name: room for room, names in ROOMS.items() for name in names.split()}

@@ -19,6 +19,7 @@ VIEWS = "elastocal.report.notebook"
 PAGES = "elastocal.report.page"
 WORDS = "elastocal.report.judgement_view"
 WRITERS = "elastocal.saving"
+NAMES = "elastocal.report.effect_names"
 
 
 class Saved:
@@ -86,7 +87,7 @@ class Result(Saved):
         """
         write_page(self, path, inputs, command, seed)
 
-    def plot(self, kind: str | None = None, interactive: bool = False) -> Any:
+    def plot(self, kind: str | None = None, interactive: bool = False, ax: Any = None) -> Any:
         """A figure of the result.
 
         Args:
@@ -96,9 +97,12 @@ class Result(Saved):
                 `Measurements` "joints", `NextPoses` "gain" and "doubts"; and each has those of its
                 page, such as "waterfall" or "spread" (they stand still).
             interactive: A figure to zoom and hover.
+            ax: Axes of matplotlib's subplots, in whose place the figure is drawn; not for the
+                figures of the page.
 
         Returns:
-            matplotlib's Figure, or plotly's where `interactive`.
+            matplotlib's Figure, the part of it in the place of `ax`, or plotly's where
+            `interactive`.
 
         Raises:
             InputError: There is no such figure; the message names those that there are.
@@ -108,7 +112,7 @@ class Result(Saved):
             >>> figure.savefig("parameters.png")
         """
         pages = import_module(PAGES)
-        return _view(self).plot(self, kind, interactive, lambda: pages.figures_of(self))
+        return _view(self).plot(self, kind, interactive, lambda: pages.figures_of(self), ax)
 
     def to_dataframe(self) -> pd.DataFrame:
         """The result's main table as a pandas data frame; units stand in the column names.
@@ -132,6 +136,31 @@ def write_page(
 def headline(result: object) -> str:
     """The verdict on a calibration, in the words of terminal, page and notebook."""
     return str(import_module(WORDS).judgement(result).headline)
+
+
+def effects(cell: Any = None) -> pd.DataFrame:
+    """The physical effects that can be fitted.
+
+    Args:
+        cell: The cell, or its file, whose arm decides on places and sizes; None takes the KR 270
+            of the demo.
+
+    Returns:
+        A row per effect: name, stage, whether the cell has it `on`, what it is, its places, the
+        columns that it needs, and its parameters with unit, nominal value and typical size.
+
+    Raises:
+        InputError: The cell is wrong.
+
+    Examples:
+        >>> found = ec.effects("cell.toml")
+        >>> "joint_compliance" in set(found["name"])
+        True
+    """
+    import pandas as pd
+
+    given = Path(__file__).parent / "demo" / "cell.toml" if cell is None else cell
+    return pd.DataFrame(import_module(NAMES).effect_entries(given))
 
 
 def _view(result: object) -> Any:

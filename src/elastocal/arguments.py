@@ -141,6 +141,7 @@ ALIASES = {
     "AnyModel": "Model | Cell | str | Path",
     "Table": "Measurements | str | Path | DataFrame",
     "Prior": "Mapping | GaussianPrior",
+    "Seed": "int",
     **dict.fromkeys(
         ("Effort", "Method", "WeightKind", "IntervalKind", "FaultyReadings", "Convention"), "str"
     ),

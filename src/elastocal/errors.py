@@ -14,6 +14,7 @@ import re
 from collections.abc import Collection, Iterable, Iterator
 from contextlib import contextmanager
 from pathlib import Path
+from typing import Any
 
 from elastocal.text import SHOWN, did_you_mean, listed, quoted
 
@@ -152,16 +153,26 @@ def explained(error: Exception, read: Iterable[object]) -> tuple[str, int]:
 
 
 def _of_plugin(error: Exception) -> str:
-    """What a plug-in raised while the model was made or evaluated; empty where none did."""
+    """Whose fault it is where a plug-in raised `error`, or what it gave did; else empty."""
     import sys
     import traceback
 
-    loader = sys.modules.get("elastocal.plugin_loader")
-    files = {str(path) for path in getattr(loader, "_files", ())}
-    for frame in reversed(traceback.extract_tb(error.__traceback__)):
-        if frame.filename in files:
-            what = f"{type(error).__name__}: {error}".rstrip(": ")
-            return f"{frame.filename}, line {frame.lineno}: {what}; correct the plug-in"
+    loader: Any = sys.modules.get("elastocal.plugin_loader")
+    if loader is None:
+        return ""
+    what = f"{type(error).__name__}: {error}".rstrip(": ")
+    ran = {str(path) for path in loader._files}
+    for frame, line in reversed(list(traceback.walk_tb(error.__traceback__))):
+        file, mine = frame.f_code.co_filename, frame.f_locals.values()
+        kinds = [v if isinstance(v, type) else type(v) for v in mine]
+        plugin = next((kind for kind in kinds if kind in loader.REGISTERED), None)
+        if plugin is None and file not in ran:
+            continue
+        if plugin is None:
+            return f"{file}, line {line}: {what}; correct the plug-in"
+        home = getattr(sys.modules.get(plugin.__module__), "__file__", file)
+        at = f"{home}, line {line}" if file == home else home
+        return f"{at}: '{getattr(plugin, 'name', plugin.__name__)}': {what}; correct the plug-in"
     return ""
 
 

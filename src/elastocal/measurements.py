@@ -15,6 +15,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from elastocal.above import Result
+from elastocal.arguments import checked_arguments
 from elastocal.errors import InputError, option
 from elastocal.files import atomic_writer, open_input, read_text
 from elastocal.tables import (
@@ -36,6 +37,7 @@ from elastocal.units import ANGLE, LENGTH, TIME, Array, IntArray
 
 if TYPE_CHECKING:
     import pandas as pd
+    from numpy.typing import ArrayLike
 
 
 SI_UNITS = ("m", "rad", "s", "N", "Nm", "C", "")
@@ -185,6 +187,69 @@ class Measurements(Result):
             if isinstance(getattr(self, f.name), np.ndarray)
         }
         return replace(self, **changes)
+
+
+@checked_arguments
+def table(
+    q: ArrayLike,
+    position: ArrayLike | None = None,
+    force: ArrayLike | None = None,
+    marker: str | Sequence[str] = DEFAULT_MARKER,
+    joint_kinds: Sequence[str] = (),
+) -> Measurements:
+    """Readings that no file states, as a table for the verbs.
+
+    Rows with the same joints are of one configuration; those of the same marker and force there
+    are its repeats.
+
+    Args:
+        q: Commanded joints (n, joints), in rad or m.
+        position: Measured positions (n, 3) in m in the tracker's frame (z vertical).
+        force: Forces (n, 3), or (3,) for all rows, in N at the load point; default none.
+        marker: The marker of each row, or the one of all.
+        joint_kinds: "revolute" or "prismatic" for each joint; none are all revolute.
+
+    Returns:
+        The `Measurements`.
+
+    Raises:
+        InputError: A shape does not fit; the message names the argument.
+
+    Examples:
+        >>> exact = ec.simulate("cell.toml", "plan.csv", noise=False)
+        >>> names = [exact.marker_names[k] for k in exact.marker]
+        >>> ec.table(exact.q, exact.position, exact.force, marker=names)
+        <Measurements table: 45 rows, 15 configurations, markers M1, M2, M3>
+    """
+    joints = np.array(np.atleast_2d(q), dtype=float)  # what the caller does to q is not ours
+    n = len(joints)
+    names = [marker] * n if isinstance(marker, str) else list(marker)
+    kinds = tuple(joint_kinds)
+    pulls = np.zeros((n, 3)) if force is None else np.array(force, dtype=float)
+    places = None if position is None else np.array(np.atleast_2d(position), dtype=float)
+    for name, given, shapes in (
+        ("q", joints, [(n, joints.shape[1])] if joints.size else []),
+        ("position", places, [(n, 3)]),
+        ("force", pulls, [(n, 3), (3,)]),
+        ("marker", np.array(names), [(n,)]),
+        ("joint_kinds", np.array(kinds), [(0,), (joints.shape[1],)]),
+    ):
+        told = f"{option(name)} takes a value for each row of q ({n} joints)"
+        if given is not None and given.shape not in shapes:
+            raise InputError(f"{told}; found an array of shape {given.shape}")
+    pulls = np.broadcast_to(pulls, (n, 3)).copy()
+    configuration, markers = Labels.of(map(tuple, joints.tolist())), Labels.of(names)
+    alike = numbered(configuration.codes, markers.codes, load_states(pulls))
+    order = np.argsort(alike, kind="stable")
+    repeat = np.empty(n, dtype=np.int64)
+    repeat[order] = np.arange(n) - np.searchsorted(alike[order], alike[order])
+    found = Measurements.of_poses("table", joints, pulls, position=places, joint_kinds=kinds)
+    found = replace(
+        found, repeat=repeat, configuration=configuration.codes, marker=markers.codes,
+        configuration_labels=tuple(map(str, range(1, len(configuration.names) + 1))),
+        marker_names=markers.names,
+    )  # fmt: skip
+    return with_moves(found)
 
 
 # Visits, and the moves between them

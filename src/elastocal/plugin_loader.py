@@ -31,6 +31,7 @@ TRUSTED = "ELASTOCAL_PLUGINS"  # 1, or folders whose cells may have their plug-i
 
 _installed: list[str] = []  # entry points that were run
 _files: dict[Path, tuple[int, int]] = {}  # files that were run, as they were then
+REGISTERED: set[type] = set()  # the classes of effects, noise models and criteria that they gave
 
 
 def load_plugins(cell: Path | None = None, modules: Sequence[str] = ()) -> None:

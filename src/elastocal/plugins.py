@@ -177,6 +177,7 @@ def _registered(register: Callable[[T], Any], what: T) -> T:
     """What was registered, so that a criterion's class can be decorated."""
     try:
         register(what)
+        plugin_loader.REGISTERED.add(what if isinstance(what, type) else type(what))
         return what
     except InputError as error:
         caller = sys._getframe(2)

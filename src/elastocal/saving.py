@@ -1,4 +1,4 @@
-"""Every result as a file, in the form that its verb of the command line writes.
+"""Every result as a file, in the form that its verb of the command line writes, and back.
 
 `Result.save` and `CalibratedArm.save` find `save` by name (elastocal.above); the command line
 calls the function of the kind.
@@ -31,6 +31,7 @@ if TYPE_CHECKING:
     from elastocal.export.export import Wish
     from elastocal.identification.result import Calibration
     from elastocal.model.calibrated import CalibratedArm
+    from elastocal.model.manipulator import Model
     from elastocal.planning.plan import Plan
 
 LARGEST_SUMMARY = 200_000_000  # bytes
@@ -228,3 +229,43 @@ WRITERS: dict[str, Callable[..., Any]] = {
     "Measurements": write_measurements,
     "NextPoses": save_next,
 }
+
+
+@checked_arguments
+def load(path: str | Path, cell: str | Path | None = None) -> Model | CalibratedArm | Measurements:
+    """Read a file by what it is.
+
+    Args:
+        path: A cell file (.toml), which becomes a `Model`; a result of identify (.json), which
+            becomes the `CalibratedArm`; or a table (.csv, .parquet), which becomes `Measurements`.
+        cell: The cell file of a result or a table; None takes cell.toml beside it.
+
+    Returns:
+        The `Model`, `CalibratedArm` or `Measurements`.
+
+    Raises:
+        InputError: The file is none of these or is wrong, or there is no cell file.
+
+    Examples:
+        >>> model = ec.load("cell.toml")
+        >>> ec.identify(model, ec.load("data.csv")).save("result.json")
+        >>> ec.load("result.json")
+        <CalibratedArm kuka_kr270_2: 9 of 10 parameters determined, from result.json>
+    """
+    from elastocal.model.calibrated import read_calibrated
+    from elastocal.model.manipulator import Model
+
+    path, kind = Path(path), Path(path).suffix.lower()
+    if kind == ".toml":
+        return Model(path)
+    require(
+        kind in (".json", ".csv", ".parquet", ".pq"),
+        f"{path}: give a cell file (.toml), a result of identify (.json) or a table (.csv, "
+        ".parquet)",
+    )
+    of = path.parent / "cell.toml" if cell is None else Path(cell)
+    require(
+        cell is not None or of.is_file(),
+        f"there is no cell.toml beside {path}; name the cell file by {option('cell')}",
+    )
+    return read_calibrated(of, path) if kind == ".json" else Model(of).read(path)

@@ -12,13 +12,14 @@ from __future__ import annotations
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import replace
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, Literal, TypeAlias
+from typing import TYPE_CHECKING, Any, Literal, TypeAlias, cast
 
 from elastocal.arguments import checked_arguments, one_of, whole
 from elastocal.errors import InputError, option, require
 from elastocal.text import quoted
 
 if TYPE_CHECKING:
+    import numpy as np
     from numpy.typing import ArrayLike
     from pandas import DataFrame
 
@@ -46,6 +47,7 @@ AnyModel: TypeAlias = "Model | Cell | str | Path"
 Table: TypeAlias = "Measurements | str | Path | DataFrame"
 Prior: TypeAlias = "Mapping[str, Mapping[str, float]] | GaussianPrior"
 Progress: TypeAlias = Callable[[str], None]
+Seed: TypeAlias = "int | np.random.Generator"  # a number has been drawn before a verb runs
 
 
 @checked_arguments
@@ -86,7 +88,7 @@ def design(
     load_changes: int | None = None,
     reference_every: int | None = None,
     doubts: Mapping[tuple[str, str], float] | None = None,
-    seed: int = 0,
+    seed: Seed = 0,
     jobs: int = 1,
     progress: Progress | None = None,
 ) -> Plan:
@@ -340,7 +342,7 @@ def simulate(
     load: ArrayLike | None = None,
     repeats: int = 1,
     noise: bool = True,
-    seed: int = 0,
+    seed: Seed = 0,
 ) -> Measurements:
     """What would I measure, if …?
 
@@ -369,7 +371,7 @@ def simulate(
         >>> ec.identify("cell.toml", data)["joint3.compliance"].ci95
         (3.3...e-07, 3.4...e-07)
     """
-    return simulated(_model(model), plan, values, draw, load, repeats, noise, seed)[0]
+    return simulated(_model(model), plan, values, draw, load, repeats, noise, cast(int, seed))[0]
 
 
 def simulated(
@@ -437,7 +439,7 @@ def identify(
     knowledge: Knowledge | str | Path | None = None,
     prior: Prior | None = None,
     constraints: Constraints | None = None,
-    seed: int = 0,
+    seed: Seed = 0,
     jobs: int = 1,
     progress: Progress | None = None,
 ) -> Calibration:
@@ -511,7 +513,7 @@ def identify(
         fixed=_names("fixed", fixed),
         bounded=bounded,
         faulty=outliers,
-        seed=int(seed),
+        seed=cast(int, seed),
         jobs=jobs,
     )
     known = knowledge_of(knowledge, physical)
@@ -543,7 +545,7 @@ def diagnose(
     without: str | Sequence[str] = (),
     false_alarm: float = 0.05,
     extra_poses: int | None = None,
-    seed: int = 0,
+    seed: Seed = 0,
     progress: Progress | None = None,
 ) -> Diagnosis:
     """Why does the real arm still differ from the model?
@@ -579,7 +581,7 @@ def diagnose(
     from elastocal.diagnosis.diagnose import DiagnosisOptions
     from elastocal.diagnosis.diagnose import diagnose as run
 
-    options = DiagnosisOptions(seed, _names("without", without), false_alarm)
+    options = DiagnosisOptions(cast(int, seed), _names("without", without), false_alarm)
     if extra_poses is not None:
         whole("extra_poses", extra_poses, 1)
     tell = progress or _silent
@@ -593,7 +595,7 @@ def diagnose(
     from elastocal.diagnosis.extra_poses import plan_extra
 
     tell("looking for poses that tell the rivals apart")
-    extra = plan_extra(made, table, found, most=extra_poses, seed=int(seed), progress=tell)
+    extra = plan_extra(made, table, found, most=extra_poses, seed=cast(int, seed), progress=tell)
     return replace(found, extra=extra)
 
 
@@ -606,7 +608,7 @@ def compensate(
     frame: Literal["base", "tracker"] = "base",
     point: str | ArrayLike | None = None,
     near: ArrayLike | None = None,
-    seed: int = 0,
+    seed: Seed = 0,
     progress: Progress | None = None,
 ) -> Compensation:
     """Which commands put the tool where it has to be?
@@ -660,7 +662,7 @@ def compensate(
     )
     where = _tool_point(arm.model.cell, point)
     wanted = _targets(targets, chain.kinds, frame, force)
-    return run(arm, wanted, where, start, seed, progress or _silent)
+    return run(arm, wanted, where, start, cast(int, seed), progress or _silent)
 
 
 def check_frame(frame: str) -> None:

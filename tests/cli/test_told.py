@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import re
 from pathlib import Path
 
 import pytest
@@ -39,21 +40,47 @@ def test_a_first_cell_that_cannot_be_read_is_not_left_behind(
     assert not (tmp_path / "first.toml").exists()
 
 
-def test_a_plug_in_that_fails_at_work_is_to_blame_itself(tmp_path: Path) -> None:
+MINE = """\
+from elastocal.plugins import *
+class Mine(DrivenEffect):
+  name, stage, entry = 'mine', 'transmission', JointMotion()
+  def places(self, chain, cell): return turning_joints(chain)
+  def parameters(self, place, chain, cell): return [ParameterSpec('a', 'rad', 0, 1e-5)]
+  def drive(self, arm, place, p): return p['b']
+register_effect(Mine())
+"""
+NOISE = """\
+from elastocal.plugins import *
+class Mine(NoiseModel):
+  name, description = 'mine', 'one variance'
+  def supports(self, readings): return readings.nothing
+  def components(self, readings): return {'all': 1.0}
+register_noise_model(Mine())
+"""
+
+
+@pytest.mark.parametrize(
+    ("module", "code", "told"),
+    [
+        ("mine.py", MINE, r"mine\.py, line 6: 'mine': KeyError: 'b'; correct the plug-in"),
+        ("mine_by_name", MINE, r"mine_by_name\.py, line 6: 'mine': KeyError"),
+        ("mine.py", MINE.replace("p['b']", "'b'"), r"mine\.py.*'mine': \w+Error"),
+        ("mine.py", MINE.replace("[ParameterSpec('a', 'rad', 0, 1e-5)]", "1"),
+         r"mine\.py.*'mine': TypeError"),
+        ("mine.py", NOISE, r"mine\.py, line 4: 'mine': AttributeError"),
+    ],
+)  # fmt: skip
+def test_a_plug_in_that_fails_at_work_is_to_blame_itself(
+    module: str, code: str, told: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
     write_campaign(tmp_path)
-    (tmp_path / "mine.py").write_text(
-        "from elastocal.plugins import *\n"
-        "class Mine(DrivenEffect):\n"
-        "  name, stage, entry = 'mine', 'transmission', JointMotion()\n"
-        "  def places(self, chain, cell): return turning_joints(chain)\n"
-        "  def parameters(self, place, chain, cell): return [ParameterSpec('a', 'rad', 0, 1e-5)]\n"
-        "  def drive(self, arm, place, p): return p['b']\n"
-        "register_effect(Mine())\n"
-    )
+    monkeypatch.syspath_prepend(str(tmp_path))
+    (tmp_path / f"{module.removesuffix('.py')}.py").write_text(code)
     cell = tmp_path / "cell.toml"
-    text = cell.read_text().replace('"joint_offset"', '"joint_offset", "mine"')
-    cell.write_text(f'{text}\n[plugins]\nmodules = ["mine.py"]\n')
+    effects = '"joint_offset", "mine"' if "DrivenEffect" in code else '"joint_offset"'
+    text = cell.read_text().replace('"joint_offset"', effects)
+    cell.write_text(f'{text}\n[plugins]\nmodules = ["{module}"]\n')
     with forgotten():
         done = run("identify", cell, tmp_path / "data.csv", "--plugins", "-q")
-    assert done.exit_code == 2 and "mine.py, line 6: KeyError" in done.stderr
+    assert done.exit_code == 2 and re.search(told, done.stderr), done.stderr
     assert "data.csv" not in done.stderr

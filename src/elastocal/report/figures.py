@@ -27,7 +27,7 @@ from elastocal.report.residual_view import reach
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
-    from matplotlib.figure import Figure
+    from matplotlib.figure import Figure, SubFigure
 
     from elastocal.planning.plan import Plan
 
@@ -84,13 +84,13 @@ def style() -> AbstractContextManager[None]:
     return matplotlib.style.context(["default", {**_STYLE, "axes.prop_cycle": cycle}])
 
 
-_as_figures = ContextVar("_as_figures", default=False)
+_as_figures: ContextVar[Any] = ContextVar("_as_figures", default=None)
 
 
 @contextmanager
-def as_figures() -> Iterator[None]:
-    """Within it `drawn` gives matplotlib's Figures."""
-    token = _as_figures.set(True)
+def as_figures(place: SubFigure | None = None) -> Iterator[None]:
+    """Within it `drawn` gives matplotlib's Figures, or draws in a `place` of the user's own."""
+    token = _as_figures.set(place or _as_figures.get() or "new ones")
     try:
         yield
     finally:
@@ -102,13 +102,16 @@ def drawn(draw: Draw, width: float, height: float, title: str) -> Any:
 
     `title` says what the figure shows to those who cannot see it; it is not user text.
     """
-    from matplotlib.figure import Figure
+    from matplotlib.figure import Figure, SubFigure
 
+    place = _as_figures.get()
     with style():
-        figure = Figure(figsize=(width, height), layout=LAYOUT)
+        own = isinstance(place, SubFigure)
+        figure: Any = place if own else Figure(figsize=(width, height), layout=LAYOUT)
         draw(figure)
-        if _as_figures.get():
-            figure.draw_without_rendering()  # what is made when drawing is made in this style
+        if place:
+            whole = figure.get_figure(root=True)
+            whole.draw_without_rendering()  # what is made when drawing is made in this style
             return figure
         return svg_of(figure, title)
 

@@ -277,6 +277,15 @@ def _showing(figure: Any) -> Any:
     return figure
 
 
+def _instead(ax: Any) -> Any:
+    """A part of the figure in the place of these axes."""
+    spot = getattr(ax, "get_subplotspec", lambda: None)()
+    if spot is None:
+        raise InputError("`ax` takes axes that plt.subplots or Figure.subplots made")
+    ax.remove()
+    return spot.get_gridspec().figure.add_subfigure(spot)
+
+
 def _png(figure: Any) -> bytes:
     picture = BytesIO()
     figure.savefig(picture, format="png", dpi=100, facecolor="white")
@@ -313,16 +322,20 @@ class View:
 
     def plot(
         self, result: Any, kind: str | None, interactive: bool,
-        of_page: Callable[[], Mapping[str, Any]] = dict,
+        of_page: Callable[[], Mapping[str, Any]] = dict, ax: Any = None,
     ) -> Any:  # fmt: skip
-        """The figure `kind`: one of these, or one `of_page`, by name, which stand still.
+        """The figure `kind`: one of these, in the place of `ax` where that is given, or one
+        `of_page`, by name, which stand still.
 
         Raises InputError for a kind that the result does not have.
         """
         chosen = next(iter(self.figures)) if kind is None else kind
-        if chosen in self.figures:
+        if chosen in self.figures and ax is None:
             return self.figures[chosen](result, interactive)
-        found = of_page()
+        if chosen in self.figures:
+            with as_figures(_instead(ax)):
+                return self.figures[chosen](result, False)
+        found = of_page() if ax is None else {}
         if chosen not in found:
             every = [*self.figures, *(name for name in found if name not in self.figures)]
             hint = did_you_mean(chosen, every)
