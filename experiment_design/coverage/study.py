@@ -20,7 +20,7 @@ from tables import report, totals
 from elastocal.identification.covariance import cluster_robust
 from elastocal.identification.noise_judge import outlier_screening, settle
 from elastocal.identification.published import eq14, ols
-from elastocal.identification.robust import asymptotic_covariance, tukey
+from elastocal.identification.robust import asymptotic_covariance, design, tukey
 
 CHUNK = 50
 PUBLISHED_EVERY = 10  # thirty iterations of a weighted fit each: a tenth of the replicates do
@@ -59,7 +59,7 @@ def estimates(s: Setting, replicate: int) -> np.ndarray:
     def put(method: str, x: np.ndarray, std: np.ndarray, dof: np.ndarray | float) -> None:
         found[METHODS.index(method)] = np.column_stack([x, std, np.broadcast_to(dof, p)])
 
-    robust = tukey(B, e, size=3)
+    robust = tukey(design(B, e, 3))
     own = asymptotic_covariance(robust)
     put("Tukey MM", robust.x, own.std, own.dof)
     readings = s.readings(e)

@@ -7,12 +7,11 @@ from dataclasses import asdict, dataclass, replace
 from typing import Any, Literal
 
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import NDArray
 from scipy import special
 
-from elastocal.errors import ElastocalError, require
+from elastocal.errors import ElastocalError
 from elastocal.identification.noise_choice import NoiseFit, linearised, weights_of
-from elastocal.identification.noise_judge import standard_errors
 from elastocal.identification.noisy_readings import own_noise
 from elastocal.identification.outliers import FALSE_ALARM, blocks, studentised
 from elastocal.identification.residuals import f_test
@@ -21,7 +20,7 @@ from elastocal.identification.solve import Solution
 from elastocal.identification.weighted_problem import block_diagonal, inverse_factor
 from elastocal.model.effects.placements import MarkerPosition
 from elastocal.model.manipulator import Model
-from elastocal.units import Array, BoolArray
+from elastocal.units import Array, BoolArray, IntArray
 
 # Tests of single readings and of groups against the fit to the readings held to be good.
 
@@ -154,13 +153,14 @@ class CleanFit:
         Tx = self.T[extra]
         G = np.eye(self.T.shape[2]) + np.einsum("nij,nik->jk", Tx, Tx)
         moved = np.linalg.solve(G, np.einsum("nij,ni->j", Tx, self.e[extra]))
-        P = self.problem.parameters(self.to_z)
+        P = self.problem.V @ self.to_z
         return P @ moved / (self.sigma * np.linalg.norm(P, axis=1))
 
 
 # Groups of readings that may share an error: which of them to blame, and in what order.
 
 Level = Literal["reading", "marker", "configuration", "block"]
+Pattern = Literal["single", "common", "scatter"]
 
 SMALLEST_BLOCK = 3
 WORTH_A_BLOCK = 1.1  # a run of lines must explain that much more than the best named group
@@ -181,11 +181,15 @@ class Group:
     may_shift: bool = True
 
 
-def groups_of(level: Level, labels: NDArray[Any]) -> list[Group]:
+def groups_of(
+    level: Level, labels: NDArray[Any] | None, without_shift: Collection[str] = ()
+) -> list[Group]:
     """Every group with more than one reading and less than half of them."""
+    if labels is None:
+        return []
     names, code, count = np.unique(labels, return_inverse=True, return_counts=True)
     testable = np.flatnonzero((count > 1) & (2 * count < len(labels)))
-    return [Group(level, str(names[k]), code == k) for k in testable]
+    return [Group(level, str(names[k]), code == k, names[k] not in without_shift) for k in testable]
 
 
 def accepted_groups(
@@ -200,13 +204,13 @@ def accepted_groups(
 
     One at a time, the one that explains most first, as long as a majority is left.  `adjust`
     holds the number of tests that a p-value of each level is multiplied by; runs of `lines` (n,)
-    are tried where it has "block".
+    are tried as well.
     """
     n, active = problem.n, np.ones(problem.n, dtype=bool)
     accepted: list[tuple[Group, GroupTest, int]] = []
     while True:
         fit = CleanFit(problem, good & active)
-        runs = _runs(fit, active, lines) if "block" in adjust else []
+        runs = _runs(fit, active, lines)
         tested = _tested(fit, active, groups + runs, adjust)
         significant = [t for t in tested if t[1].p_value * adjust[t[0].level] < FALSE_ALARM]
         if not significant:
@@ -284,7 +288,7 @@ class FaultyGroup:
 
     level: Level
     name: str
-    pattern: Literal["single", "common", "scatter"]
+    pattern: Pattern
     readings: tuple[int, ...]
     lines: tuple[int, ...]
     beyond: int
@@ -309,7 +313,7 @@ class OutlierReport:
     sigma: float
     dof: int
     good: BoolArray
-    tests: dict[str, int]
+    tests: dict[Level, int]
     false_alarm: float = FALSE_ALARM
     names: tuple[str, ...] = ()
 
@@ -317,114 +321,78 @@ class OutlierReport:
         """Plain numbers, strings and lists; an unbounded influence is None."""
         listed = [asdict(f) for f in self.findings]
         for entry in listed:
-            entry["readings"], entry["lines"] = list(entry["readings"]), list(entry["lines"])
+            entry |= {"readings": list(entry["readings"]), "lines": list(entry["lines"])}
             if not np.isfinite(entry["influence"]):
                 entry["influence"] = None
             if self.names:
                 entry["moves_most"] = self.names[entry.pop("column")]
         return {
-            "findings": listed,
-            "sigma": self.sigma,
-            "dof": self.dof,
-            "readings_used": int(self.good.sum()),
-            "tests": dict(self.tests),
+            "findings": listed, "sigma": self.sigma, "dof": self.dof,
+            "readings_used": int(self.good.sum()), "tests": dict(self.tests),
             "false_alarm": self.false_alarm,
-        }
+        }  # fmt: skip
 
 
 def outlier_report(
-    B: ArrayLike,
-    y: ArrayLike,
+    problem: Design,
     good: BoolArray,
-    *,
-    size: int = 1,
-    marker: ArrayLike | None = None,
-    configuration: ArrayLike | None = None,
-    line: ArrayLike | None = None,
+    lines: NDArray[np.int64],
+    marker: NDArray[Any] | None = None,
+    configuration: NDArray[Any] | None = None,
     fitted_markers: Collection[str] = (),
 ) -> OutlierReport:
-    """What is wrong with the readings of y (n·size,) ≈ B (n·size, p) x, whitened.
+    """What is wrong with the readings of y ≈ B x, whitened.
 
     `good` (n,) says which observations to rely on; reported are the others, alone or as groups,
     and groups of good ones that err together.
 
     Markers whose positions are among the parameters, `fitted_markers`, have no common shift.
-    `marker` and `configuration` (n,) labels, `line` (n,) integer line of each observation (by
-    default its number); a level without labels is not tested, and neither are groups of a single
-    reading or of half the table.
-
-    Raises InputError for wrong shapes or dependent columns.
+    `marker` and `configuration` (n,) are labels, `lines` (n,) the line of each observation; a
+    level without labels is not tested, nor are groups of a single reading or of half the table.
     """
-    problem = design(B, y, size)
     n = problem.n
-    lines = np.arange(n) if line is None else _labels("line", line, n)
-    require(np.issubdtype(lines.dtype, np.integer), "line must hold integers")
-    groups: list[Group] = []
-    if marker is not None:
-        found = groups_of("marker", _labels("marker", marker, n))
-        groups += [replace(g, may_shift=g.name not in fitted_markers) for g in found]
-    if configuration is not None:
-        groups += groups_of("configuration", _labels("configuration", configuration, n))
+    groups = groups_of("marker", marker, fitted_markers)
+    groups += groups_of("configuration", configuration)
     tests: dict[Level, int] = {"reading": n}
     for group in groups:
         tests[group.level] = tests.get(group.level, 0) + 1
-    if line is not None:
-        tests["block"] = n * (n + 1) // 2
+    tests["block"] = n * (n + 1) // 2
     adjust = {level: count * len(tests) for level, count in tests.items()}
 
     fit, accepted = accepted_groups(problem, good, groups, lines, adjust)
-    findings = []
-    active = np.ones(n, dtype=bool)
+    p_reading, left, findings = fit.reading_p(), np.ones(n, dtype=bool), []
     for group, test, beyond in accepted:
-        active &= ~group.members
-        final = (
-            fit.group_test(group.members, group.may_shift) or test
-        )  # against the fit without any of the others
+        left &= ~group.members
+        # Against the fit without any of the others.
+        final = fit.group_test(group.members, group.may_shift) or test
+        shift = final.shift if final.common else None
         p = min(1.0, test.p_value * adjust[group.level])
-        findings.append(
-            _finding(fit, group, lines, beyond, p, final.shift if final.common else None)
-        )
-    p_reading = fit.reading_p()
-    for i in np.flatnonzero(active & ~fit.good):
+        findings.append(_finding(fit, group, lines, beyond, p, shift))
+    for i in np.flatnonzero(left & ~fit.good):
         alone = Group("reading", str(lines[i]), np.arange(n) == i)
         p = min(1.0, float(p_reading[i]) * adjust["reading"])
         findings.append(_finding(fit, alone, lines, 1, p, None))
     findings.sort(key=lambda f: (f.level == "reading", -f.sigmas))
     return OutlierReport(
-        tuple(findings), problem.parameters(fit.z), fit.sigma, fit.dof, fit.good,
-        {str(level): count for level, count in tests.items()},
-    )  # fmt: skip
+        tuple(findings), problem.V @ fit.z, fit.sigma, fit.dof, fit.good, dict(tests)
+    )
 
 
 def _finding(
-    fit: CleanFit,
-    group: Group,
-    lines: NDArray[np.int64],
-    beyond: int,
-    p: float,
+    fit: CleanFit, group: Group, lines: NDArray[np.int64], beyond: int, p: float,
     shift: Array | None,
-) -> FaultyGroup:
+) -> FaultyGroup:  # fmt: skip
     move = np.abs(fit.move(group.members))
     column = int(np.argmax(move))
     chosen = np.flatnonzero(group.members)
     error = float(np.sqrt((fit.e[chosen] ** 2).sum(axis=1).mean()))
-    pattern: Literal["single", "common", "scatter"] = "scatter"
+    pattern: Pattern = "single" if group.level == "reading" else "scatter"
     if shift is not None:
         pattern, error = "common", float(np.linalg.norm(shift))
-    elif group.level == "reading":
-        pattern = "single"
     return FaultyGroup(
         group.level, group.name, pattern, tuple(chosen.tolist()), tuple(lines[chosen].tolist()),
         beyond, error, error / fit.sigma, p, float(move[column]), column,
     )  # fmt: skip
-
-
-def _labels(name: str, given: ArrayLike, n: int) -> NDArray[Any]:
-    labels = np.asarray(given)
-    require(
-        labels.shape == (n,), f"{name} needs one label per observation, ({n},); got {labels.shape}"
-    )
-    return labels
 
 
 # The readings of an identification, under the noise that its method found.
@@ -460,56 +428,26 @@ def report_faulty(
         readings = readings.moved(residual)
     size = clean.sizes[columns]
     B, e = readings.B.reshape(len(observed.value), -1) * size, readings.e.ravel()
-    shared = False
+    shared = noise is not None and (bool((noise.fit.common > 0).any()) or noise.lasting is not None)
     if noise is None:
-        weights = problem.weights
-        B, e = weights.apply(B), weights.apply(e)
+        B, e = problem.weights.apply(B), problem.weights.apply(e)
     else:
-        own = own_noise(noise.fit, readings)[0]
-        root = block_diagonal(inverse_factor(own))
-        whiten = weights_of(noise, readings).whole
-        shared = bool((noise.fit.common > 0).any()) or noise.lasting is not None
+        own, whiten = own_noise(noise.fit, readings)[0], weights_of(noise, readings).whole
         if shared and whiten is not None:
             e = block_diagonal(own) @ (whiten.T @ (whiten @ e))
+        root = block_diagonal(inverse_factor(own))
         B, e = root @ B, root @ e
+    lead = observed.lead
+    marker = _labels(table.marker_names, table.marker[lead])
+    visited = _labels(table.configuration_labels, table.configuration[lead])
     try:
         report = outlier_report(
-            B, e, good, size=observed.size, line=table.row[observed.lead],
-            marker=_reading_labels(table.marker_names, table.marker[observed.lead]),
-            configuration=None if shared else _reading_labels(
-                table.configuration_labels, table.configuration[observed.lead]
-            ),
-            fitted_markers=_fitted_markers(problem.model, columns),
+            design(B, e, observed.size), good, table.row[lead], marker,
+            None if shared else visited, _fitted_markers(problem.model, columns),
         )  # fmt: skip
     except (ElastocalError, np.linalg.LinAlgError):
         return None
     return replace(report, names=tuple(problem.model.names[c] for c in columns))
-
-
-def standardised(
-    whole: Solution,
-    clean: Solution,
-    noise: NoiseFit | None,
-    fitted: BoolArray,
-    residual: Array | None = None,
-) -> Array:
-    """Errors (N, size) of all readings under the fit to the `fitted` ones (N,), in units of the
-    noise of a single reading.
-
-    `residual` (N, size): errors to take in place of those that the noise was found with."""
-    problem, columns = whole.problem, clean.fit.columns
-    if residual is not None:
-        columns = columns[~np.isin(columns, clean.reduction.with_prior)]
-    readings = linearised(problem.model, problem.observations, clean.fit.x, columns)
-    if residual is None and noise is not None:
-        return standard_errors(noise, readings, fitted)[0]
-    e = readings.e if residual is None else residual
-    if noise is None:
-        z = problem.weights.apply(e.ravel())
-    else:
-        z = block_diagonal(inverse_factor(own_noise(noise.fit, readings)[0])) @ e.ravel()
-    z = z.reshape(e.shape)
-    return np.asarray(z / np.sqrt(np.mean(z[fitted] ** 2)))
 
 
 def _fitted_markers(model: Model, columns: NDArray[np.int64]) -> set[str]:
@@ -518,6 +456,6 @@ def _fitted_markers(model: Model, columns: NDArray[np.int64]) -> set[str]:
     return {p.where.partition(":")[2] for p in fitted if p.effect == MarkerPosition.name}
 
 
-def _reading_labels(names: tuple[str, ...], codes: np.ndarray) -> np.ndarray | None:
+def _labels(names: tuple[str, ...], codes: IntArray) -> NDArray[Any] | None:
     """Labels (N,), None where all are the same."""
     return np.array(names)[codes] if len(np.unique(codes)) > 1 else None

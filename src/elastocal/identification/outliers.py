@@ -11,9 +11,7 @@ from scipy import linalg, special
 from elastocal.errors import ElastocalError, InsufficientDataError
 from elastocal.identification.solve import (
     SAMPLE,
-    WORTH_A_COLUMN,
     Solution,
-    choose,
     is_placed,
     settle,
 )
@@ -73,16 +71,14 @@ def verdict(
     solution: Solution,
     refit: Callable[[BoolArray], Solution],
     good: BoolArray,
-    before: tuple[Judged, ...] = (),
 ) -> tuple[BoolArray, Solution]:
     """Which observations (N,) are faulty, and the fit to the others, beginning with the `good`.
 
     Every observation is judged against the fit to the good ones at a Bonferroni limit for the
     whole table, which makes new good ones, and so on until the verdict stands.  Where taking
     readings back in has bent the fit away from the majority, the earlier verdict stands.
-    `before` are fits to others that have been judged already.
     """
-    tried = list(before)
+    tried: list[Judged] = []
     for _ in range(ROUNDS):
         try:
             current = solution if good.all() else refit(good)
@@ -224,59 +220,17 @@ def find_faulty(
 ) -> tuple[BoolArray, Solution]:
     """Which observations (N,) are faulty, and the solution without them.
 
-    A trimmed fit of base, markers and cable to the nominal arm shows the suspects; then the whole
-    model is fitted to the others and every observation judged, in turns (`verdict`).  Where one
-    step from the fit of all to that of the others accuses nobody, the first turn ends with that:
-    of a clean table, one in a hundred readings is a suspect, and a fit without it is a small step.
-
-    In a large table the majority of a sample judges all observations first.
+    The majority's fit of base, markers and cable to the nominal arm shows the suspects; then the
+    whole model is fitted to the others and every observation judged, in turns (`verdict`).  In a
+    large table the majority of a sample judges all observations first.
     """
     if not solution.problem.large:
-        good = ~_suspects(solution)
-        judged = _acquitted(solution, good)
-        if judged is not None:
-            found = verdict(solution, refit, np.ones(len(good), dtype=bool), (judged,))
-            if found[1] is not judged[2]:
-                return found
-        return verdict(solution, refit, good)
+        return verdict(solution, refit, ~_suspects(solution))
 
     def fit_others(good: BoolArray) -> Solution:
         return _fit_to(solution, good)
 
     return verdict(solution, fit_others, _agreeing_with_a_sample(solution))
-
-
-def _acquitted(solution: Solution, good: BoolArray) -> Judged | None:
-    """The judgement by one Gauss–Newton step from the fit of all to the `good` observations.
-
-    None where it accuses anybody, or where the good ones ask for other parameters: then the fit
-    has to be made.  Of the fit judged, values and parameters alone are those of the good ones.
-    """
-    problem, kept = solution.problem, solution.reduction.kept
-    independent = problem.parts.blocks is None and problem.weights.kind != "component"
-    if good.all() or problem.bounded or not independent:
-        return None  # what is correlated, or weighted by its residuals, is whitened anew
-    observed, free, sizes = problem.observations, problem.free, solution.sizes
-    try:
-        at = problem.model.regressor(observed.table, solution.fit.x, free, observed)
-        rows = np.repeat(good, observed.size)
-        r_factor = RFactor.of(
-            problem.weights.apply(at.B)[rows], problem.weights.apply(at.residual)[rows]
-        )
-        own = r_factor.of_columns(np.searchsorted(free, kept))
-        if own.rows <= len(kept):
-            return None
-        sigma = max(own.rest / float(np.sqrt(own.rows - len(kept))), 1e-12)
-        chosen = choose(problem, sizes, r_factor, sigma, WORTH_A_COLUMN)
-        if not np.array_equal(chosen.kept, kept):
-            return None
-        x = solution.fit.x.copy()
-        x[kept] += own.step(sizes[kept])
-        stepped = replace(solution, fit=replace(solution.fit, x=x))
-        beyond, cost = judge(solution, stepped, good)
-    except (ElastocalError, np.linalg.LinAlgError):
-        return None
-    return None if beyond.any() else (cost, good, stepped)
 
 
 def _suspects(solution: Solution) -> BoolArray:

@@ -8,15 +8,13 @@ from scipy import integrate, stats
 
 from elastocal.identification.robust import (
     HALF,
-    Absolute,
-    Bisquare,
-    Huber,
-    StudentT,
+    absolute,
     bisquare,
     huber,
+    t_loss,
 )
 
-LOSSES = [Huber(3, 1.5), Bisquare(3, 4.0), Absolute(3), StudentT(3, 4.0)]
+LOSSES = [huber(3, 1.5), bisquare(3, 4.0), absolute(3), t_loss(3, 4.0)]
 
 
 @pytest.mark.parametrize("loss", LOSSES, ids=lambda loss: loss.name)
@@ -25,7 +23,7 @@ LOSSES = [Huber(3, 1.5), Bisquare(3, 4.0), Absolute(3), StudentT(3, 4.0)]
 def test_psi_and_slope_are_the_derivatives_of_rho(loss, d):
     """Central differences, away from the kink at the tuning constant."""
     h = 1e-5
-    if abs(d - getattr(loss, "c", -1.0)) < 2 * h:
+    if abs(d - loss.constant) < 2 * h:
         return
     low, at, high = (np.array(v) for v in (d - h, d, d + h))
     assert loss.psi(at) == pytest.approx((loss.rho(high) - loss.rho(low)) / (2 * h), abs=1e-8)
@@ -45,8 +43,8 @@ def test_constants_give_the_efficiency_and_breakdown_they_are_for(size):
         return sum(value for value, _ in values)
 
     for loss in (huber(size), bisquare(size)):
-        a = mean(lambda d, f=loss: f.psi(d) * d, loss.c) / size
-        b = mean(lambda d, f=loss: f.psi(d) ** 2, loss.c) / size
+        a = mean(lambda d, f=loss: f.psi(d) * d, loss.constant) / size
+        b = mean(lambda d, f=loss: f.psi(d) ** 2, loss.constant) / size
         assert a**2 / b == pytest.approx(0.95, abs=1e-8)
-    half = Bisquare(size, HALF[size - 1])
-    assert mean(half.rho, half.c) == pytest.approx(half.c**2 / 12, rel=1e-8)
+    half = bisquare(size, HALF[size - 1])
+    assert mean(half.rho, half.constant) == pytest.approx(half.constant**2 / 12, rel=1e-8)

@@ -8,11 +8,11 @@ from scipy import optimize
 from scipy.spatial.transform import Rotation
 
 from elastocal.identification.robust import (
-    Absolute,
-    Bisquare,
-    Huber,
     asymptotic_covariance,
+    bisquare,
+    design,
     huber,
+    least_absolute,
     m_estimate,
     student_t,
     tukey,
@@ -29,8 +29,8 @@ def regression(seed, n=120, p=4):
 @pytest.mark.parametrize(
     ("ours", "theirs"),
     [
-        (Huber(1, 1.345), sm.robust.norms.HuberT(1.345)),
-        (Bisquare(1, 4.685), sm.robust.norms.TukeyBiweight(4.685)),
+        (huber(1, 1.345), sm.robust.norms.HuberT(1.345)),
+        (bisquare(1, 4.685), sm.robust.norms.TukeyBiweight(4.685)),
     ],
     ids=["huber", "tukey"],
 )
@@ -39,7 +39,7 @@ def test_estimate_scale_and_covariance_are_those_of_statsmodels(ours, theirs):
     B, y = regression(1)
     unit = np.linalg.norm(B, axis=0)
     reference = sm.RLM(y, B / unit, M=theirs).fit(cov="H2", tol=1e-13, maxiter=2000)
-    found = m_estimate(B, y, ours)
+    found = m_estimate(design(B, y, 1), ours)
     np.testing.assert_allclose(found.x * unit, reference.params, rtol=1e-8)
     assert found.scale == pytest.approx(reference.scale, rel=1e-8)
     scaled = asymptotic_covariance(found).matrix * np.outer(unit, unit)
@@ -47,10 +47,10 @@ def test_estimate_scale_and_covariance_are_those_of_statsmodels(ours, theirs):
 
 
 FITS = {
-    "huber": lambda B, y: m_estimate(B, y, huber(3), size=3),
-    "l1": lambda B, y: m_estimate(B, y, Absolute(3), size=3),
-    "tukey": lambda B, y: tukey(B, y, size=3),
-    "student-t": lambda B, y: student_t(B, y, size=3, nu=4.0),
+    "huber": lambda B, y: m_estimate(design(B, y, 3), huber(3)),
+    "l1": lambda B, y: least_absolute(design(B, y, 3)),
+    "tukey": lambda B, y: tukey(design(B, y, 3)),
+    "student-t": lambda B, y: student_t(design(B, y, 3), nu=4.0),
 }
 
 
@@ -77,10 +77,10 @@ def test_l1_is_the_linear_programs_optimum(seed):
     equations = np.hstack([B / unit, np.eye(n), -np.eye(n)])
     bounds = [(None, None)] * p + [(0, None)] * (2 * n)
     lp = optimize.linprog(cost, A_eq=equations, b_eq=y, bounds=bounds)
-    found = m_estimate(B, y, Absolute(1))
+    found = least_absolute(design(B, y, 1))
     assert np.abs(found.residual).sum() == pytest.approx(lp.fun, rel=1e-9)
     np.testing.assert_allclose(found.x * unit, lp.x[:p], atol=1e-7 * np.abs(lp.x[:p]).max())
-    assert found.converged and found.optimality < 1e-10
+    assert found.converged
     assert (np.abs(found.residual) < 1e-12).sum() == p  # a vertex
 
 
@@ -93,8 +93,8 @@ def test_the_sum_of_lengths_is_the_cone_programs_optimum(size):
     lengths = [cp.norm(y[k : k + size] - B[k : k + size] @ x) for k in range(0, len(y), size)]
     problem = cp.Problem(cp.Minimize(cp.sum(cp.hstack(lengths))))
     problem.solve(solver=cp.CLARABEL)
-    found = m_estimate(B, y, Absolute(size), size=size)
+    found = least_absolute(design(B, y, size))
     total = np.linalg.norm(found.residual.reshape(-1, size), axis=1).sum()
     assert total <= problem.value * (1 + 1e-8)
     np.testing.assert_allclose(found.x, x.value, atol=1e-4)
-    assert found.converged and found.optimality < 1e-8
+    assert found.converged
