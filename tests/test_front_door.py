@@ -10,7 +10,6 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-import typer
 from typer.testing import CliRunner
 
 import elastocal as ec
@@ -302,44 +301,6 @@ def test_arrays_become_tables(model):
 
 
 # Wrong options
-
-
-# What the command line writes, and how it says in text what Python says otherwise.
-# In Python `fit.unmet(...)` asks what `--require` does.
-OF_FILES = {
-    "plugins",  # of Model, and of read_calibrated
-    "require",
-    "output",
-    "certificate",
-    "report",
-    "residuals",
-    "program",
-    "picture",
-    "plan",
-    "cell_out",
-    "truth",
-}
-OF_TEXT = {
-    "json",
-    "quiet",
-    "help",
-    "set",
-    "no_noise",
-    "target",
-    "partial",
-    "poses",
-    "fix",
-    "details",
-}
-OF_A_TABLE = {"table", "grid", "box", "rotation"}
-
-
-@pytest.mark.parametrize("verb", ["design", "simulate", "identify", "diagnose", "compensate"])
-def test_every_flag_of_a_verb_is_a_keyword_of_it(verb):
-    parameters = typer.main.get_command(app).commands[verb].params
-    flags = {p.opts[-1][2:].replace("-", "_") for p in parameters if p.opts[-1].startswith("--")}
-    keywords = set(inspect.signature(getattr(ec, verb)).parameters)
-    assert flags - OF_FILES - OF_TEXT - OF_A_TABLE <= keywords
 
 
 @pytest.mark.parametrize(

@@ -151,6 +151,11 @@ def test_semicolon_and_tab_tables_may_use_decimal_commas(read, delimiter, mark):
     assert read(text).position.tolist() == [[0.00325, 0.004, 0.005]]
 
 
+def test_a_byte_order_mark_and_windows_line_ends_are_understood(read):
+    plain, other = table(ROW), "\ufeff" + table(ROW).replace("\n", "\r\n")
+    assert np.array_equal(read(plain).position, read(other).position)
+
+
 def test_quoted_labels_may_hold_the_delimiter(read):
     assert read(table('"a, ""b""",' + ROW, header="marker," + HEADER)).marker_names == ('a, "b"',)
 

@@ -65,31 +65,6 @@ def run(folder, *arguments):
     return outcome
 
 
-def test_targets_become_commands(folder):
-    out = folder / "commands.csv"
-    outcome = run(folder, folder / "targets.csv", "-o", out, "--json")
-    assert outcome.exit_code == 0, outcome.stderr
-    told = json.loads(outcome.stdout)
-    spoken = run(folder, folder / "targets.csv", "-o", out)
-    assert "Next: run the commands of commands.csv" in spoken.stdout
-    assert told["schema"] == "elastocal/compensation/1"
-    assert told["n"] == told["reached"] == 3
-    assert told["error_before_um"]["rms"] > 1000 > 0.1 > told["error_after_um"]["max"]
-    rows = list(csv.DictReader(out.open()))
-    assert [row["status"] for row in rows] == ["reached"] * 3
-    assert all(float(row["std_um"]) > 0 for row in rows)
-    q = [[float(row[f"q{k}_deg"]) for k in range(1, 7)] for row in rows]
-    # simulate reads the commands, and agrees on where the load point's tool goes.
-    sets = [v for name, value in TRUTH.items() for v in ("--set", f"{name}={value}")]
-    again = CliRunner().invoke(
-        app,
-        ["simulate", str(folder / "cell.toml"), str(out), "-o", str(folder / "s.csv"),
-         "--no-noise", *sets],
-    )  # fmt: skip
-    assert again.exit_code == 0, again.stderr
-    assert np.abs(np.diff(q, axis=0)).max() < 2
-
-
 def test_the_marker_named_is_where_simulate_sees_it(folder):
     out = folder / "commands.csv"
     outcome = run(folder, folder / "targets.csv", "-o", out, "--point", "M2")
@@ -104,20 +79,6 @@ def test_the_marker_named_is_where_simulate_sees_it(folder):
     observed = [row for row in csv.DictReader((folder / "s.csv").open()) if row["marker"] == "M2"]
     x = [float(row["x_m"]) for row in observed]
     assert np.allclose(x, [1.8, 1.81, 1.82], atol=1e-7)
-
-
-def test_a_target_out_of_reach_ends_with_1_and_writes_nothing_unless_partial(folder):
-    (folder / "targets.csv").write_text(TARGETS + "9000,0,0,0,0,0,0,0,-2600\n")
-    out = folder / "commands.csv"
-    outcome = run(folder, folder / "targets.csv", "-o", out)
-    assert outcome.exit_code == 1
-    assert "line 5 (not reached)" in outcome.stderr and "--partial" in outcome.stderr
-    assert not out.exists()
-    outcome = run(folder, folder / "targets.csv", "-o", out, "--partial")
-    assert outcome.exit_code == 0, outcome.stderr
-    rows = list(csv.DictReader(out.open()))
-    assert rows[3]["q1_deg"] == "" and rows[3]["status"] == "not reached"
-    assert rows[0]["status"] == "reached"
 
 
 def test_names_of_markers_are_no_markup(folder):

@@ -4,9 +4,8 @@ import csv
 import json
 import re
 
-import numpy as np
 import pytest
-from support.cells import COMPLIANCE, kr270_chain
+from support.cells import COMPLIANCE
 from support.design_commands import (
     DEFLECTION,
     POSITION,
@@ -17,8 +16,6 @@ from support.design_commands import (
     planned,
     write_cell,
 )
-
-from elastocal.measurements import read_plan
 
 TWO_LEVELS = "\n[design.levels]\njoint2_deg = [-25.24, -56.9]\n"
 LEVELS = altered(DEFLECTION, poses="6") + TWO_LEVELS
@@ -42,24 +39,6 @@ def levels(tmp_path_factory):
 def rows_of(path):
     with open(path, encoding="utf-8", newline="") as handle:
         return list(csv.DictReader(handle))
-
-
-def test_the_plan_has_the_columns_of_its_format_and_the_poses_asked_for(levels):
-    folder, _ = levels
-    rows = rows_of(folder / "plan.csv")
-    joints = [f"q{i}_deg" for i in range(1, 7)]
-    carried = ["note_load", "note_load_2", "note_load_3"]
-    assert list(rows[0]) == ["configuration", *joints, "level", *ORDERS, *carried]
-    loads = {tuple(row[key] for key in carried) for row in rows}
-    assert loads == {("unloaded", "0 0 -2600 N", "unloaded")}
-    assert [row["configuration"] for row in rows] == ["1", "2", "3", "4", "5", "6"]
-    assert [row["level"] for row in rows] == ["1"] * 3 + ["2"] * 3
-    assert [float(row["q2_deg"]) for row in rows] == [-25.24] * 3 + [-56.9] * 3
-    orders = [int(row[key]) for row in rows for key in ORDERS]
-    assert sorted(orders) == list(range(1, 19))
-    poses = read_plan(folder / "plan.csv", joint_kinds=kr270_chain().kinds)
-    stated = [[float(row[j]) for j in joints] for row in rows]
-    np.testing.assert_allclose(poses.q, np.radians(stated), atol=1e-11)
 
 
 def test_to_try_the_plan_its_load_is_part_of_the_command(levels):

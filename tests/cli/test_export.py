@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import json
 from pathlib import Path
 
 from support.exports import GEOMETRY, write_result
@@ -34,21 +33,3 @@ def test_a_mimic_beside_the_chain_stays_and_one_on_it_is_refused(tmp_path: Path)
     result = run(*written, "-o", tmp_path / "again.urdf", "-q")
     assert result.exit_code == 2 and "mimics 'q4'" in result.output
     assert not (tmp_path / "again.urdf").exists()
-
-
-def test_it_is_the_result_of_identify_that_is_exported(tmp_path: Path) -> None:
-    """From the demo's readings to a file, by the commands alone."""
-    from elastocal.demo.example import run_demo
-
-    demo = run_demo(tmp_path)
-    path = tmp_path / "result.json"
-    path.write_text(json.dumps(demo.result.to_json()))
-    output = tmp_path / "calibrated.xml"
-    options = ("--json", "-q", "--poses", "20", "--load", 0, 0, -2600)
-    result = run(demo.cell, path, "-o", output, *options)
-    assert result.exit_code == 0, result.output
-    told = json.loads(result.stdout)
-    assert told["held"] == {"joint1.compliance": 0.0}
-    k = next(e.held for e in demo.result.estimates if e.name == "joint4.compliance")
-    assert f'kp="{1 / k!r}"' in output.read_text()
-    assert told["read_back"]["max_um"] < 1

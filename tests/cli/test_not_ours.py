@@ -104,16 +104,3 @@ def test_an_example_that_was_changed_is_not_made_anew(tmp_path: Path) -> None:
     mine(cell)
     done = elastocal("demo", "-o", tmp_path, "-q")
     assert done.exit_code == 2 and str(cell) in done.stderr and cell.read_text() == MINE
-
-
-@pytest.mark.parametrize(
-    ("verb", "told"),
-    [
-        ("design", ".json beside it"),
-        ("design", "OUTPUT.resume"),
-        ("next", ".json beside it"),
-        ("study", "OUTPUT.md"),
-    ],
-)
-def test_help_lists_what_goes_beside(verb: str, told: str) -> None:
-    assert told in " ".join(elastocal(verb, "--help").stdout.split())

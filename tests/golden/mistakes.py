@@ -104,6 +104,9 @@ CELL = (
             '<link name="camera"/><joint name="c" type="fixed"><parent link="link_6"/>'
             '<child link="camera"/></joint></robot>'),
     Mistake("a link beyond all measure", FIT, "arm.urdf", "0.000 0.750", "0.000 750"),
+    Mistake("a mass beyond all measure", FIT, "arm.urdf", 'mass value="330"', 'mass value="1e19"'),
+    Mistake("a centre of mass beyond all measure", FIT, "arm.urdf", '<origin xyz="0.1 0 -0.1"',
+            '<origin xyz="0 0 1e19"'),
     Mistake("a marker beyond all measure", FIT, "placed.toml", "[0.2, 0.05", "[1e19, 0.05"),
     Mistake("a DH table without a column", DEFLECT, "arm.csv", "alpha_deg", "alpha"),
     Mistake("a negative mass", DEFLECT, "links.csv", "1,11,", "1,-11,"),
