@@ -16,6 +16,7 @@ if TYPE_CHECKING:
     import pandas as pd
 
 VIEWS = "elastocal.report.notebook"
+TEXTS = "elastocal.report.terminal"
 PAGES = "elastocal.report.page"
 WORDS = "elastocal.report.judgement_view"
 WRITERS = "elastocal.saving"
@@ -54,7 +55,7 @@ class Result(Saved):
 
     def __str__(self) -> str:
         """The result as the command line prints it: tables and sentences."""
-        return str(_view(self).text(self))
+        return str(import_module(TEXTS).printed_text(self))
 
     def summary(self) -> str:
         """The same text."""
@@ -62,7 +63,7 @@ class Result(Saved):
 
     def _repr_html_(self) -> str:
         """The result as HTML, which notebooks show of themselves; text of the user is escaped."""
-        return str(_view(self).html(self))
+        return str(import_module(VIEWS).html(self))
 
     def report(
         self, path: str | Path, *, inputs: Any = None, command: str | None = None,
@@ -91,28 +92,28 @@ class Result(Saved):
         """A figure of the result.
 
         Args:
-            kind: Which of the result's figures; default the first.  A `Calibration` has
-                "residuals" and "parameters", a `Plan` "poses" and "intervals", a `Diagnosis`
-                "budget" and "candidates", a `Compensation` "errors" and "uncertainty",
-                `Measurements` "joints", `NextPoses` "gain" and "doubts"; and each has those of its
-                page, such as "waterfall" or "spread" (they stand still).
-            interactive: A figure to zoom and hover.
-            ax: Axes of matplotlib's subplots, in whose place the figure is drawn; not for the
-                figures of the page.
+            kind: Which of the result's figures.  A `Calibration` has "residuals" (the default),
+                "parameters", "waterfall", "sureness", "against_joints", "over_time", "scores",
+                "smooth" and "space"; a `Plan` "poses", "intervals" and "curve"; a `Diagnosis`
+                "budget", "candidates", "shares", "curves", "effects" and those of residuals; a
+                `Compensation` "errors" and "uncertainty"; a `Comparison` "moved"; `Measurements`
+                "joints"; `NextPoses` "gain" and "doubts".
+            interactive: The arm in space ("space", "poses") to be turned.
+            ax: Axes of matplotlib's subplots, in whose place the figure is drawn.
 
         Returns:
             matplotlib's Figure, the part of it in the place of `ax`, or plotly's where
             `interactive`.
 
         Raises:
-            InputError: There is no such figure; the message names those that there are.
+            InputError: There is no such figure, or it cannot be turned; the message names those
+                that there are.
 
         Examples:
             >>> figure = ec.identify("cell.toml", "data.csv").plot("parameters")
             >>> figure.savefig("parameters.png")
         """
-        pages = import_module(PAGES)
-        return _view(self).plot(self, kind, interactive, lambda: pages.figures_of(self), ax)
+        return import_module(VIEWS).plot(self, kind, interactive, ax)
 
     def to_dataframe(self) -> pd.DataFrame:
         """The result's main table as a pandas data frame; units stand in the column names.
@@ -122,7 +123,7 @@ class Result(Saved):
             >>> list(frame.columns[:4])
             ['parameter', 'unit', 'value', 'std']
         """
-        return _view(self).frame(self)
+        return import_module(VIEWS).frame(self)
 
 
 def write_page(
@@ -161,7 +162,3 @@ def effects(cell: Any = None) -> pd.DataFrame:
 
     given = Path(__file__).parent / "demo" / "cell.toml" if cell is None else cell
     return pd.DataFrame(import_module(NAMES).effect_entries(given))
-
-
-def _view(result: object) -> Any:
-    return import_module(VIEWS).view_of(result)

@@ -11,7 +11,7 @@ from support.diagnoses import (
 
 from elastocal.report.causes_view import (
     causes,
-    place_rows,
+    place_table,
 )
 
 
@@ -20,10 +20,10 @@ def test_a_finding_has_its_places_below_it_and_every_part_once():
     assert [[c.where for c in cause.parts] for cause in found] == [
         ["joint2", "joint1", "joint5"], ["joint3", "joint2"], ["base"],
     ]  # fmt: skip
-    rows = place_rows(MANY_UNKNOWN)
+    rows = place_table(MANY_UNKNOWN)
     assert len(rows.rows) == len(MANY_UNKNOWN.components)
     assert list(rows.groups) == [0, 3, 5]
     # An effect that two findings share a place with stands below one of them only.
     both = replace(MANY, groups=(MANY.groups[0], replace(MANY.groups[0], name="other")))
     kept = [c for c in MANY.components if c.family == "angle"]
-    assert len(place_rows(both).rows) == len(kept)
+    assert len(place_table(both).rows) == len(kept)

@@ -48,7 +48,7 @@ def test_names_from_files_are_text_and_nothing_comes_from_elsewhere(name, pages)
 def test_figures_are_well_formed_and_follow_the_page_colours(name, pages):
     figures = re.findall(r"<svg.*?</svg>", pages[name], re.DOTALL)
     shown = VERDICTS[name]
-    assert len(figures) == 3 + bool(shown.curves) + bool(shown.components)
+    assert len(figures) == 2 + bool(shown.curves) + bool(shown.components)
     for figure in figures:
         ElementTree.fromstring(figure)
         assert "aria-label" in figure

@@ -8,14 +8,12 @@ import pytest
 from rich.console import Console
 from support.diagnoses import VERDICTS
 
-from elastocal.report.diagnosis_terminal import print_diagnosis
-
-KINDS = ("revolute",) * 6
+from elastocal.report.terminal import print_report
 
 
 def printed(name: str, width: int) -> str:
     out = io.StringIO()
-    print_diagnosis(Console(file=out, width=width), VERDICTS[name], KINDS)
+    print_report(Console(file=out, width=width), VERDICTS[name])
     return out.getvalue()
 
 
@@ -26,5 +24,5 @@ def test_it_fits_and_obeys_no_control_character(name, width):
     assert max(map(len, text.splitlines())) <= width
     assert "\x1b" not in text
     words = " ".join(text.split())
-    for part in ("Verdict:", "Error budget", "the best 8 of 10", "Noise:", "Next:"):
+    for part in ("Verdict:", "Error budget", "rank 1 to 8 of 10", "Noise:", "Next:"):
         assert part in words

@@ -19,7 +19,7 @@ from support.diagnoses import (
 from elastocal.report.diagnosis_view import (
     diagnosis_lines,
     diagnosis_steps,
-    gap_rows,
+    gap_table,
     noise_floor_lines,
     sensitivity,
 )
@@ -63,12 +63,12 @@ def test_a_probability_is_never_told_as_certain(p):
 
 def test_budget_changes_add_up():
     """Change of every step, read back from its text, is the difference of the errors."""
-    table = gap_rows(EXPLAINED).rows
+    table = gap_table(EXPLAINED).rows
     assert table[-1][:2] == ("noise alone", "19.0 µm")
     scale = {"mm": 1e-3, "µm": 1e-6}
 
     def read(text):
-        number, unit = text.replace("−", "-").split()
+        number, unit = text.split()
         return float(number) * scale[unit]
 
     for before, after in pairwise(table[:-1]):

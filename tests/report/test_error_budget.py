@@ -21,7 +21,7 @@ def test_budget_goes_from_the_nominal_arm_to_the_held_out_error(case: Any) -> No
     # The nominal arm of the result has base and markers placed by all readings; here the
     # configuration in question is left out, and the name says so.
     named = [name for name, *_ in budget_steps(case.result, budget)]
-    assert named == ["nominal arm (base and markers by other poses)", "geometry", "compliance"]
+    assert named == ["nominal arm, held out", "geometry", "compliance"]
     assert named[0] not in dict(rms_by_kind(case.result))
     assert first == pytest.approx(case.result.nominal_rms, rel=0.5)
     assert first > 3 * middle

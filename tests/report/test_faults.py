@@ -33,7 +33,7 @@ def with_findings(result: Any, *findings: FaultyGroup, named: bool = True, **to:
 def test_page_lists_every_group_beside_the_single_readings(case: Any, no_figures: None) -> None:
     groups = [replace(BLOCK, level="configuration", name=f"<b>{k}\x1b") for k in range(9)]
     page = page_of(with_findings(case.result, *groups, excluded=outliers(range(142, 508))))
-    section = page[page.index("<h2>Outliers") : page.index("<h2>To repeat")]
+    section = page[page.index("<summary>Outliers (366)") : page.index("<summary>Which conf")]
     assert section.count("<li>") == 9
     assert "at most 1 %" in section
     assert "and 266 more" in section

@@ -47,7 +47,7 @@ def test_the_certificate_is_one_page_of_accuracy_data_and_verdict(
     n = len(np.unique(case.result.observations.place))
     accuracy = pose_accuracy(case.result.observations, gap_budget(case.result).steps[-1].errors)
     assert rows["calibrated"][1:3] == [str(n), length(float(accuracy.mean()))]
-    assert rows["d.csv"][1] == "SHA-256abc123" and rows["made on"][1]
+    assert rows["d.csv"][1] == "SHA-256 abc123" and rows["made on"][1]
     assert "10.0 µm" in rows["Instrument, standard deviations"][1] or "µm" in text
     assert judgement(case.result).headline in page.text and "ISO 9283" in page.text
     assert "<nav" not in text and not page.tags["svg"]
@@ -55,7 +55,7 @@ def test_the_certificate_is_one_page_of_accuracy_data_and_verdict(
 
 def test_figures_are_well_formed_and_follow_the_page_colours(page: str) -> None:
     figures = re.findall(r"<svg xmlns=.*?</svg>", page, re.DOTALL)
-    assert len(figures) == 11
+    assert len(figures) == 8
     for figure in figures:
         ElementTree.fromstring(figure)
         assert "var(--ink)" in figure
@@ -73,7 +73,6 @@ def test_names_from_files_are_text(hostile: Any) -> None:
     (view,) = structure.data
     assert not set("<>&") & set(view)
     assert json.loads(view)["poses"][0]["names"][0] == "<script>alert(1)</script>"
-    assert "left out" in structure.text.lower()
 
 
 def test_size_of_a_long_table(case: Any, tmp_path: Path) -> None:

@@ -88,7 +88,7 @@ def test_each_doubt_is_named_with_its_remedy(fine: Any) -> None:
     }  # fmt: skip
     for text, (result, remedy) in doubts.items():
         found = judgement(result)
-        assert found.tone == "care", text
+        assert found.tone == "warn", text
         assert text in found.headline
         assert any(remedy in step for step in found.steps), text
 

@@ -45,7 +45,7 @@ def compare(
     from elastocal.diagnosis.changes import compare as compared
     from elastocal.files import together
     from elastocal.model.calibrated import read_calibrated
-    from elastocal.report.diagnosis_terminal import print_comparison
+    from elastocal.report.terminal import print_report
     from elastocal.saving import write_json
 
     if new is None:
@@ -63,7 +63,7 @@ def compare(
             write_json(output, found.to_json())
         if report is not None:
             found.report(report, inputs=inputs, command=repeated(), seed=seed)
-    run.answer(found.to_json, lambda screen: print_comparison(screen, found))
+    run.answer(found.to_json, lambda screen: print_report(screen, found))
 
 
 def _in_old_order(old: Path, new: Path, cell: Path | None) -> tuple[Path, Path, Path]:

@@ -77,7 +77,8 @@ def compensate(
     from elastocal.files import atomic_write_text, together
     from elastocal.model.arm import given_force
     from elastocal.model.calibrated import read_calibrated
-    from elastocal.report.terminal import print_compensation
+    from elastocal.report.compensation_view import compensation_blocks
+    from elastocal.report.terminal import print_blocks
 
     # What can be wrong with the options is told before any file is read.
     verbs.check_frame(asked["frame"])
@@ -110,7 +111,7 @@ def compensate(
                 atomic_write_text(path, text)
     shown = run.answer(
         lambda: content.get("commands", {}) | {k: v for k, v in content.items() if k == "table"},
-        lambda screen: print_compensation(screen, content),
+        lambda screen: print_blocks(screen, compensation_blocks(content)),
     )
     if shown and output is not None:
         say(

@@ -109,7 +109,7 @@ def design(
     from elastocal.files import together
     from elastocal.model.choice import cell_of
     from elastocal.planning.pins import plan_and_names
-    from elastocal.report.plan_terminal import print_plan
+    from elastocal.report.terminal import print_report
     from elastocal.saving import beside
 
     summary = beside(output)
@@ -147,7 +147,7 @@ def design(
     if run.json:
         say(summary.read_text(encoding="utf-8"), end="")
     else:
-        run.answer(plan.to_json, lambda screen: print_plan(screen, plan))
+        run.answer(plan.to_json, lambda screen: print_report(screen, plan))
         say(_what_next(cell, output, asked.get("augment"), plan))
 
 

@@ -52,8 +52,8 @@ def diagnose(
     from elastocal.diagnosis.diagnosis import publish
     from elastocal.files import together
     from elastocal.model.choice import cell_of
-    from elastocal.report.diagnosis_terminal import print_diagnosis
     from elastocal.report.page import write_page
+    from elastocal.report.terminal import print_report
     from elastocal.saving import save_diagnosis
 
     require(
@@ -82,7 +82,7 @@ def diagnose(
                 told += _write_extended(cell_out, found, cell, data, run.plugins)
     if run.answer(
         lambda: publish(found, model, found.data),
-        lambda screen: print_diagnosis(screen, found, model.chain.kinds),
+        lambda screen: print_report(screen, found),
         files=False,
     ):
         for line in told:

@@ -180,7 +180,8 @@ def _rounding(metres: float | None) -> str:
 
 
 def _cost_table(title: str, cost: Cost) -> Table:
-    from elastocal.report.formatting import ShownTable, length
+    from elastocal.report import blocks
+    from elastocal.report.formatting import length
     from elastocal.report.terminal import table_of
     from elastocal.text import printable
 
@@ -191,7 +192,7 @@ def _cost_table(title: str, cost: Cost) -> Table:
         cells = [length(size) for size in sizes] or [""] * 4
         rows.append((printable(name), *cells, printable(note)))
     heads = ("effect", "markers rms", "max", "flange rms", "max", "")
-    return table_of(title, ShownTable(heads, rows, (0, 5)))
+    return table_of(blocks.Table(heads, rows, (0, 5), title=title))
 
 
 # At the start of a sentence and in a title.

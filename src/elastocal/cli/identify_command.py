@@ -16,8 +16,7 @@ from elastocal.text import listed
 
 if TYPE_CHECKING:
     from elastocal.identification.result import Calibration
-    from elastocal.report.identification_view import Truth
-    from elastocal.report.page import Published
+    from elastocal.report.parameter_tables import Published, Truth
 
 
 @command(
@@ -57,7 +56,7 @@ def identify(
     Example: elastocal identify cell.toml data.csv -o result.json --test other.csv
     """
     from elastocal.model.choice import cell_of
-    from elastocal.report.terminal import print_result
+    from elastocal.report.terminal import print_report
 
     run.writes(output, report, residuals, certificate)
     limits = limits_of(require or [])
@@ -69,7 +68,7 @@ def identify(
         write_results(
             result, output, report, residuals, inputs, asked["seed"], certificate=certificate
         )
-    run.answer(result.to_json, lambda screen: print_result(screen, result, details=details))
+    run.answer(result.to_json, lambda screen: print_report(screen, result, details))
     if unmet := result.unmet(**limits):
         raise NotAcceptedError(f"not accepted: {'; '.join(unmet)}")
 

@@ -54,7 +54,7 @@ def next_command(
     from elastocal.diagnosis.next_poses import next_poses
     from elastocal.files import together
     from elastocal.model.choice import cell_of
-    from elastocal.report.plan_terminal import print_next
+    from elastocal.report.terminal import print_report
     from elastocal.saving import beside, save_plan
 
     summary = beside(output)
@@ -71,6 +71,6 @@ def next_command(
         if found.plan is not None:
             with together(run.written):
                 save_plan(found.plan, output, repeated())
-    show = partial(print_next, found=found)
+    show = partial(print_report, result=found)
     if run.answer(found.to_json, show, files=found.plan is not None) and found.plan is None:
         say(f"{output} not written")

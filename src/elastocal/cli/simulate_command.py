@@ -97,7 +97,7 @@ def demo(
     """
     from elastocal.cli.identify_command import write_results
     from elastocal.demo.example import run_demo
-    from elastocal.report.terminal import print_result
+    from elastocal.report.terminal import print_report
 
     with run.progress() as progress:
         done = run_demo(folder, seed, progress)
@@ -109,7 +109,7 @@ def demo(
         )  # fmt: skip
     if run.answer(
         lambda: done.result.to_json() | {"truth": done.truth},
-        lambda screen: print_result(screen, done.result, truth=done.truth),
+        lambda screen: print_report(screen, done.result, details=False, truth=done.truth),
     ):
         say(
             f"\nTo repeat it by hand: elastocal identify {done.cell} {done.data} -o result.json\n"

@@ -5,6 +5,7 @@ from __future__ import annotations
 import json
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
+from html import escape
 from io import BytesIO
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -30,14 +31,14 @@ from elastocal.planning.bodies import (
 )
 from elastocal.planning.collision import Kinematics
 from elastocal.planning.plan import Plan
-from elastocal.report.figures import ARM, FAINT, INK, SERIES, as_figures, drawn, style
+from elastocal.report import blocks
+from elastocal.report.figures import ARM, FAINT, INK, SERIES, figure_of, style
 from elastocal.report.formatting import joint_heads, joint_texts, length, short_name
 from elastocal.report.plan_view import first_stops
 from elastocal.text import printable
 from elastocal.units import Array, IntArray
 
 if TYPE_CHECKING:
-    from markupsafe import Markup
     from matplotlib.axes import Axes
     from matplotlib.figure import Figure
 
@@ -270,7 +271,7 @@ def space_of(
     return replace(space, tracker=at if near else None)
 
 
-def space_json(space: Space) -> Markup:
+def space_json(space: Space) -> str:
     """The space for the page's script: lengths in m, arrows in µm; safe within a script element."""
     low, high = space.extent
     content = {
@@ -287,14 +288,12 @@ def space_json(space: Space) -> Markup:
     return in_script(content)
 
 
-def in_script(content: object) -> Markup:
+def in_script(content: object) -> str:
     """JSON in which nothing can end the element that holds it, whatever names hold."""
-    from markupsafe import Markup
-
     text = json.dumps(content, ensure_ascii=False, separators=(",", ":"), allow_nan=False)
     for character in "<>&":
         text = text.replace(character, f"\\u{ord(character):04x}")
-    return Markup(text)
+    return text
 
 
 def _shell(shell: Shell, carrier: int) -> dict[str, object]:
@@ -316,6 +315,23 @@ def _posed(p: Posed) -> dict[str, object]:
 
 MOST_POSES = 80  # in the page; of more, those with the largest residuals and a random choice
 WORST = 30
+
+
+def residual_arm(model: Model, observed: Observations, x: Array, residual: Array) -> blocks.Arm:
+    """The arm with its residuals as arrows, and what they are."""
+    space = residual_space(model, observed, x, residual)
+    shown, several = len(space.poses), observed.n_configurations
+    text = (
+        f"Mean residual of each marker as an arrow, {space.scale:g} times as long as it is, in "
+        f"configuration {printable(space.poses[space.first].name)}, which has the largest, and in "
+        f"all of them. The arm is drawn as {space.shells.drawn_from}."
+    )
+    if shown < several:
+        text += (
+            f" {shown} poses of {several} configurations: those with the largest residuals, and a "
+            "random choice."
+        )
+    return blocks.Arm("space", space, "Residuals as arrows on the posed arm", text)
 
 
 def residual_space(model: Model, observed: Observations, x: Array, residual: Array) -> Space:
@@ -358,32 +374,6 @@ def residual_space(model: Model, observed: Observations, x: Array, residual: Arr
     return space_of(model.cell, model.chain, poses, int(np.argmax(rms[chosen])), "configuration")
 
 
-def view_caption(space: Space, configurations: int) -> str:
-    """What the arrows are, and how much they are enlarged in the still picture."""
-    text = (
-        f"Mean residual of each marker as an arrow, {space.scale:g} times as long as it is, in "
-        f"configuration {printable(space.poses[space.first].name)}, which has the largest, and in "
-        f"all of them. The arm is drawn as {space.shells.drawn_from}."
-    )
-    if len(space.poses) < configurations:
-        text += (
-            f" {len(space.poses)} poses of {configurations} configurations: those with the "
-            "largest residuals, and a random choice."
-        )
-    return text
-
-
-def time_caption(observed: Observations) -> str:
-    """What the figure over time shows, and what it would mean."""
-    text = (
-        "{}; lines are means with twice their standard error. A slope is a drift, a step something "
-        "that moved."
-    )
-    if observed.table.time is None:
-        return text.format("In the order of the table, which has no column time_s or time_min")
-    return text.format("Over time")
-
-
 def _chosen(rms: Array, order: IntArray) -> IntArray:
     """The entries to show, in the table's order."""
     if len(rms) <= MOST_POSES:
@@ -418,7 +408,6 @@ def _load(force: Array) -> str:
     return "(" + ", ".join(f"{f + 0.0:.6g}" for f in force) + ") N"
 
 
-WIDTH = 9.9
 MOST_NUMBERED = 80  # beyond that numbers hide each other
 SIGNS = ("o", "s", "^", "D", "v", "P")  # of groups, which differ in more than colour
 # Rows: to the right and upwards on paper, and towards the reader.
@@ -434,28 +423,26 @@ TOP = np.eye(3)
 SIDE = np.array([[1.0, 0, 0], [0, 0, 1.0], [0, -1.0, 0]])
 
 
-def space_picture(space: Space, title: str) -> str:
-    """SVG: the first pose seen obliquely, and all poses from above and from the side.
-
-    `title` says what it shows to those who cannot see it; it is not user text.
-    """
+def space_figure(arm: blocks.Arm) -> blocks.Figure:
+    """The first pose seen obliquely, and all poses from above and from the side."""
+    space = arm.space
 
     def draw(figure: Figure) -> None:
-        grid = figure.add_gridspec(2, 2, width_ratios=(1.25, 1.0))
-        large = figure.add_subplot(grid[:, 0])
+        grid = figure.add_gridspec(2, 2, height_ratios=(1.5, 1.0))
+        large = figure.add_subplot(grid[0, :])
         _draw(large, space, OBLIQUE, whole=False)
         large.set_axis_off()
         for k, (view, name, up) in enumerate(((TOP, "from above", "y"), (SIDE, "side", "z"))):
-            axes = figure.add_subplot(grid[k, 1])
+            axes = figure.add_subplot(grid[1, k])
             _draw(axes, space, view, whole=True)
             axes.set_title(name)
             axes.set_xlabel("x in m")
             axes.set_ylabel(f"{up} in m")
         if space.groups:
             handles = axes.get_legend_handles_labels()
-            figure.legend(*handles, loc="outside lower center", ncols=7, fontsize=8)
+            figure.legend(*handles, loc="outside lower center", ncols=4)
 
-    return drawn(draw, WIDTH, 5.6, title)
+    return blocks.Figure(arm.name, arm.title, draw, 7.0, arm.caption)
 
 
 SUFFIXES = (".png", ".svg")
@@ -477,8 +464,17 @@ def write_plan_picture(path: str | Path, plan: Plan) -> None:
 
 def plan_figure(plan: Plan) -> Any:
     """The poses of a plan as matplotlib's Figure."""
-    with as_figures():
-        return space_picture(plan_space(plan), "The arm in the poses of the plan")
+    return figure_of(space_figure(plan_arm(plan)))
+
+
+def plan_arm(plan: Plan) -> blocks.Arm:
+    """The arm in every pose of a plan."""
+    space = plan_space(plan)
+    caption = (
+        "The arm in the poses of the plan, numbered at the flange. The arm is drawn as "
+        f"{space.shells.drawn_from}."
+    )
+    return blocks.Arm("poses", space, "The arm in the poses of the plan", caption)
 
 
 def _draw(axes: Axes, space: Space, view: Array, whole: bool) -> None:
@@ -615,3 +611,38 @@ def plan_space(plan: Plan) -> Space:
             )
         )
     return space_of(cell, chain, poses, groups=plan.group_names)
+
+
+def turned(space: Space) -> Any:
+    """The poses as plotly's figure, to be turned."""
+    import plotly.graph_objects as go
+
+    def name(text: str) -> str:  # plotly reads some HTML in its texts
+        return escape(short_name(text, LONGEST_NAME), quote=False)
+
+    figure = go.Figure()
+    for pose in space.poses:
+        colour, line = SERIES[pose.group % len(SERIES)], pose.line.T
+        figure.add_scatter3d(
+            x=line[0], y=line[1], z=line[2], mode="lines+markers", name=name(f"pose {pose.name}"),
+            line={"color": colour, "width": 4}, marker={"size": 2, "color": colour},
+        )  # fmt: skip
+        at = pose.markers.T
+        figure.add_scatter3d(
+            x=at[0], y=at[1], z=at[2], mode="markers", text=[*map(name, pose.names)],
+            marker={"size": 3, "color": colour, "symbol": "diamond"}, hoverinfo="text",
+            showlegend=False,
+        )  # fmt: skip
+        arrows = np.zeros((0, 3)) if pose.arrows is None else space.scale * pose.arrows
+        for start, arrow in zip(pose.markers, arrows, strict=False):
+            ends = np.stack([start, start + arrow], axis=1)
+            figure.add_scatter3d(
+                x=ends[0], y=ends[1], z=ends[2], mode="lines", showlegend=False, hoverinfo="skip",
+                line={"color": SERIES[1], "width": 4},
+            )  # fmt: skip
+    if space.tracker is not None:
+        x, y, z = ([v] for v in space.tracker)
+        figure.add_scatter3d(x=x, y=y, z=z, mode="markers", name="tracker",
+                             marker={"size": 5, "color": INK})  # fmt: skip
+    axes = {f"{a}axis": {"title": {"text": f"{a} in m"}} for a in "xyz"}
+    return figure.update_layout(scene={"aspectmode": "data", **axes}, height=640)

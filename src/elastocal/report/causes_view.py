@@ -7,6 +7,7 @@ from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
 
 from elastocal.diagnosis.diagnosis import ComponentShare, Curve, Diagnosis, FoundEffect, Interval
+from elastocal.report.blocks import Figure, Table
 from elastocal.report.effect_names import (
     effect_at_places,
     place,
@@ -16,7 +17,6 @@ from elastocal.report.effect_names import (
     setting_value,
 )
 from elastocal.report.formatting import (
-    ShownTable,
     counted,
     display,
     length,
@@ -88,7 +88,7 @@ def share_text(fraction: float, fine: bool | None = None) -> str:
     if fine and 0 < fraction < 0.0005:
         return "< 0.1 %"
     digits = 1 if fine else 0
-    return f"{round(100 * fraction, digits) + 0.0:.{digits}f} %".replace("-", "−")
+    return f"{round(100 * fraction, digits) + 0.0:.{digits}f} %"
 
 
 def span_text(ends: Interval, middle: float) -> str:
@@ -128,7 +128,7 @@ def headline_of_causes(d: Diagnosis) -> str:
     )
 
 
-def cause_rows(d: Diagnosis) -> ShownTable:
+def cause_table(d: Diagnosis) -> Table:
     """One row per finding: its share of the gap, and what it takes off the error of new poses."""
     rows = [
         (
@@ -140,10 +140,14 @@ def cause_rows(d: Diagnosis) -> ShownTable:
     ]  # fmt: skip
     if d.gap.unexplained_share >= FINE**2:
         rows.append(("unexplained", share_text(d.gap.unexplained_share), "–", "–", "–"))
-    return ShownTable(("cause", "share", "90 %", "error falls by", "90 %"), rows)
+    heads = ("cause", "share", "90 %", "error falls by", "90 %")
+    return Table(heads, rows, title="Causes of the remaining error", note=(
+        "share: part of the squared remaining error that goes when this is added last. error falls "
+        "by: at new poses, if only this is added to the model."
+    ))  # fmt: skip
 
 
-def place_rows(d: Diagnosis) -> ShownTable:
+def place_table(d: Diagnosis) -> Table:
     """What acts at each place, below the finding that it belongs to."""
     rows: list[tuple[str, ...]] = []
     groups: dict[int, str] = {}
@@ -161,7 +165,8 @@ def place_rows(d: Diagnosis) -> ShownTable:
             ))  # fmt: skip
         told += parts
     heads = ("place", "error", "as", "rms (95 %)", "share (90 %)", "probability")
-    return ShownTable(heads, rows, (0, 1, 2), groups)
+    table = Table(heads, rows, (0, 1, 2), groups, title="Place by place")
+    return table.when_narrow(2)  # what it is as effects stands in the table of parameters too
 
 
 def lengths(ends: Interval) -> str:
@@ -169,6 +174,29 @@ def lengths(ends: Interval) -> str:
     low, high = map(length, ends)
     unit = high[high.rfind(" ") :]
     return f"{low.removesuffix(unit)} to {high}" if low.endswith(unit) else f"{low} to {high}"
+
+
+def share_figure(d: Diagnosis) -> Figure:
+    """The share of every finding with its 90 % interval, and below it each of its places."""
+    from elastocal.report.figures import SERIES, Row, rows_of_dots
+
+    rows: list[Row] = []
+
+    def add(name: str, share: float, ci90: Interval, colour: str, small: bool = False) -> None:
+        ends = (100 * ci90[0], 100 * ci90[1])
+        rows.append(Row(name, 100 * share, ends, share_text(share), colour, small))
+
+    for cause in causes(d):
+        colour = SERIES[0] if cause.named else SERIES[1]
+        add(cause.name, cause.share, cause.share_ci90, colour)
+        for c in cause.parts if len(cause.parts) > 1 else ():
+            add(f"{place(c.where)}, {family(c)}", c.share, c.share_ci90, colour, True)
+    axis = "share of the remaining error in %, with 90 % interval"
+    caption = (
+        "Part of the squared remaining error that goes when each cause is added last. Small dots: "
+        "at each place."
+    )
+    return rows_of_dots("shares", "Causes of the remaining error", rows, axis, caption)
 
 
 def curve_span(curve: Curve) -> str:
@@ -210,11 +238,15 @@ def slight_text(d: Diagnosis) -> str:
 # Corrections that have no name.
 
 
-def field_rows(d: Diagnosis) -> ShownTable:
+def field_table(d: Diagnosis) -> Table:
     """The smooth corrections without a name: where, what they follow, how large and how smooth."""
     rows = [row for f in d.fields for row in _followed(f)]
     heads = ("correction at", "follows", "size", "over", "error falls by", "95 %")
-    return ShownTable(heads, rows, (0, 1))
+    note = (
+        "Smooth functions without a physical name; they hold where the arm was measured: size "
+        "(standard deviation) and the length over which they change."
+    )
+    return Table(heads, rows, (0, 1), title="Smooth corrections", note=note)
 
 
 def _followed(f: FoundEffect) -> Iterable[tuple[str, ...]]:

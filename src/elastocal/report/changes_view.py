@@ -1,22 +1,59 @@
-"""What a comparison of two calibrations says: words, rows, and a map over the workspace."""
+"""What a comparison of two calibrations says, as blocks."""
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING, Any
+from collections.abc import Iterator
+from typing import TYPE_CHECKING
 
 import numpy as np
 
 from elastocal.diagnosis.changes import Comparison
+from elastocal.report.blocks import Block, Figure, Fold, Key, Lines, Report, Table, Verdict
 from elastocal.report.effect_names import p_value, size_of
-from elastocal.report.figures import INK, SERIES
-from elastocal.report.formatting import ShownTable, Tone, estimate, length
+from elastocal.report.formatting import estimate, length, title_of
 from elastocal.text import listed, printable
 
 if TYPE_CHECKING:
-    import pandas as pd
-    from matplotlib.figure import Figure
+    from matplotlib.figure import Figure as Drawing
 
 NAMED = 3  # parameters in a headline
+
+
+def report(c: Comparison) -> Report:
+    """Two calibrations of one arm: has it changed, how far does the tool move, and by what."""
+    model = c.old.model
+    title = title_of(model.chain.name, model.cell.name)
+    return Report("Comparison", title, _blocks(c), model.backend_report())
+
+
+def _blocks(c: Comparison) -> Iterator[Block]:
+    yield Fold("", lambda: [_key(c)])
+    same = c.verdict == "no_change_shown" and not c.one_result
+    yield Verdict("good" if same else "warn", headline(c))
+    yield Lines(changes_lines(c))
+    yield Fold("", lambda: [_map(c)], figures=("moved",))
+    yield change_table(c)
+
+
+def _key(c: Comparison) -> Key:
+    rms, noise = (length(float(np.sqrt(np.mean(v**2)))) for v in (c.distance, c.chance))
+    figures = [
+        ("the tool has moved, rms", rms), ("at most", length(float(c.distance.max()))),
+        ("noise alone", noise), ("all parameters together", size_of(c.p)),
+    ]  # fmt: skip
+    return Key(f"moved by {rms} (noise {noise})", figures)
+
+
+def _map(c: Comparison) -> Figure:
+    caption = (
+        "Random poses within the joint limits, in the data's frame of the old session. A disc's "
+        "area shows how far the tool has moved for the same command."
+    )
+
+    def draw(figure: Drawing) -> None:
+        draw_map(figure, c)
+
+    return Figure("moved", "How far the tool has moved", draw, 6.4, caption)
 
 
 def headline(c: Comparison) -> str:
@@ -35,16 +72,10 @@ def headline(c: Comparison) -> str:
     return "The arm has changed, but no single parameter is significant."
 
 
-def tone(c: Comparison) -> Tone:
-    """Care where the arm has changed, or nothing was compared."""
-    return "good" if c.verdict == "no_change_shown" and not c.one_result else "care"
-
-
 def changes_lines(c: Comparison) -> list[tuple[str, str]]:
-    """Verdict, displacement, chance, what was compared, what to do."""
+    """Displacement, chance, what was compared, what to do."""
     far, chance = c.distance, np.sqrt(np.mean(c.chance**2))
     lines = [
-        ("Verdict", headline(c)),
         (
             "Tool",
             f"Moved by {length(float(np.sqrt(np.mean(far**2))))} rms for the same commands, "
@@ -67,7 +98,7 @@ def changes_lines(c: Comparison) -> list[tuple[str, str]]:
         lines.append(
             (
                 "Compared",
-                "The campaigns determined other parameters; the new ones are told in those of the "
+                "The sessions determined other parameters; the new ones are given in those of the "
                 "old, to first order.",
             )
         )
@@ -88,8 +119,8 @@ def under(c: Comparison) -> str:
 OF_LOADS = {
     "": "as no load is stated",
     "the option": "as asked for",
-    "the earlier campaign": "those of the earlier campaign",
-    "the later campaign": "those of the later campaign",
+    "the earlier campaign": "those of the earlier session",
+    "the later campaign": "those of the later session",
     "the cell's plan": "those of the cell's plan",
 }
 
@@ -97,7 +128,7 @@ OF_LOADS = {
 def steps(c: Comparison) -> list[str]:
     """What to do."""
     if c.one_result:
-        return ["Give the results of two campaigns: this is one of them and its copy."]
+        return ["Give the results of two sessions: this is one of them and its copy."]
     if c.verdict == "no_change_shown":
         return ["Nothing: the old calibration still holds within the noise of both sessions."]
     return [
@@ -107,7 +138,7 @@ def steps(c: Comparison) -> list[str]:
     ]
 
 
-def change_rows(c: Comparison) -> ShownTable:
+def change_table(c: Comparison) -> Table:
     """A row for each parameter, the changed first, then by their effect at the tool."""
     heads = ("parameter", "old", "new", "change", "± std", "unit", "p (Holm)", "moves the tool", "")
     rows = []
@@ -120,39 +151,26 @@ def change_rows(c: Comparison) -> ShownTable:
             (printable(one.name + with_others), old, new, value, half, unit, p_value(one.p_family),
              length(one.moves), told)
         )  # fmt: skip
-    return ShownTable(heads, rows, (0, 5, 8))
+    note = (
+        "± std: standard deviation of the difference, of both sessions together. p (Holm): chance "
+        "of such a difference where nothing has changed, corrected for all parameters. Moves the "
+        "tool: rms over the poses, by this change alone."
+    )
+    table = Table(heads, rows, (0, 5, 8), title="Parameter by parameter", note=note)
+    return table.when_narrow(1, 2)
 
 
-def changes_frame(c: Comparison) -> pd.DataFrame:
-    """One row per parameter, SI units."""
-    import pandas as pd
-
-    return pd.DataFrame([vars(change) for change in c.changes])
-
-
-def draw_map(figure: Figure, c: Comparison) -> None:
+def draw_map(figure: Drawing, c: Comparison) -> None:
     """The poses from above and from the side, each a disc as large as the tool moves there."""
+    from elastocal.report.figures import INK, SERIES
+
     far = c.distance
     area = 120.0 * far / max(float(far.max()), 1e-12)
     for k, (i, j, title) in enumerate(((0, 1, "from above"), (0, 2, "from the side"))):
-        axes = figure.add_subplot(1, 2, k + 1)
+        axes = figure.add_subplot(2, 1, k + 1)
         axes.scatter(c.place[:, i], c.place[:, j], s=area, color=SERIES[0], alpha=0.6, linewidths=0)
         axes.scatter(c.place[:, i], c.place[:, j], s=2, color=INK)
         axes.set_aspect("equal", adjustable="datalim")
         axes.set_title(f"{title}; the largest disc is {length(float(far.max()))}")
         axes.set_xlabel(f"{'xyz'[i]} in m")
         axes.set_ylabel(f"{'xyz'[j]} in m")
-
-
-def changes_contents(c: Comparison) -> dict[str, Any]:
-    """Words and tables of the page, by the names that its template has for them."""
-    lines = changes_lines(c)
-    return {
-        "headline": headline(c),
-        "tone": tone(c),
-        "verdict": [line for line in lines if line[0] not in ("Verdict", "Next")],
-        "steps": steps(c),
-        "warnings": [],
-        "lead": f"{printable(c.old.source)} → {printable(c.new.source)}",
-        "changes": change_rows(c),
-    }

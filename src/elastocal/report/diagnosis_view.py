@@ -1,11 +1,9 @@
-"""What a diagnosis says: its sentences and its rows."""
+"""What a diagnosis says, as blocks: verdict, causes, error; behind them evidence and noise."""
 
 from __future__ import annotations
 
 import math
-from collections.abc import Iterable, Mapping
-from dataclasses import dataclass
-from typing import Any
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 
 import numpy as np
 
@@ -24,14 +22,29 @@ from elastocal.diagnosis.diagnosis import (
 )
 from elastocal.identification.error_budget import BudgetStep
 from elastocal.measurements import by_rows
+from elastocal.report.blocks import (
+    TONES,
+    WARNING,
+    Arm,
+    Block,
+    Figure,
+    Fold,
+    Key,
+    Lines,
+    Report,
+    Table,
+    Text,
+    Verdict,
+)
 from elastocal.report.causes_view import (
     assumed_order,
-    cause_rows,
+    cause_table,
     curve_line,
     curve_span,
-    field_rows,
+    field_table,
     headline_of_causes,
-    place_rows,
+    place_table,
+    share_figure,
     share_text,
     slight_text,
 )
@@ -50,19 +63,137 @@ from elastocal.report.effect_names import (
     size_of,
 )
 from elastocal.report.formatting import (
-    ShownTable,
+    budget_table,
     capital,
-    counted,
     estimate,
-    faulty_rows,
-    gap_table,
     joint_heads,
     joint_texts,
     length,
+    outlier_blocks,
     significant,
+    title_of,
     together,
 )
 from elastocal.text import printable
+
+MOST_CANDIDATES, MOST_PRINTED = 40, 8
+MOST_TESTS = 12
+MOST_PLACES = 8
+MOST_VISITS = 200
+
+
+def report(d: Diagnosis) -> Report:
+    """Why the arm still differs from the model, and what follows."""
+    title, backend = printable(d.data), ""
+    if d.model is not None:
+        title = title_of(d.model.chain.name, d.model.cell.name)
+        backend = d.model.backend_report()
+    return Report("Diagnosis", title, _blocks(d, _kinds(d)), backend)
+
+
+def _kinds(d: Diagnosis) -> Sequence[str]:
+    return ("revolute",) * len(d.noise.repeatability) if d.model is None else d.model.chain.kinds
+
+
+def _blocks(d: Diagnosis, kinds: Sequence[str]) -> Iterator[Block]:
+    yield Fold("", lambda: [_key(d)])
+    yield Verdict(TONES[d.findings[0].severity] if d.findings else "good", diagnosis_headline(d))
+    lines = [(label, capital(text)) for label, text in diagnosis_lines(d)]
+    lines += [("Not separable", capital(f"{text}.")) for text in alike(d)]
+    lines += [("Next", text) for text in diagnosis_steps(d)]
+    yield Lines([*lines, *((WARNING, capital(printable(text))) for text in d.warnings)])
+    yield Fold("", lambda: _figures(d), figures=("budget", "shares", "effects", "curves"))
+    yield cause_table(d)
+    yield added_parameter_table(d)
+    places = place_table(d)
+    yield Fold("Place by place", lambda: [places], printed=True)
+    yield Fold("Smooth corrections", lambda: _nameless(d), printed=True)
+    yield Fold("Error budget", lambda: [gap_table(d)], printed=True)
+    best = candidate_table(d, 0, MOST_PRINTED)
+    yield Fold("Candidates", lambda: [best], printed=True)
+    yield Fold("Probability of every candidate", lambda: [candidate_figure(d)],
+               figures=("candidates",))  # fmt: skip
+    if len(d.candidates) > MOST_PRINTED:
+        more = candidate_table(d, MOST_PRINTED, MOST_CANDIDATES)
+        yield Fold("Further candidates", lambda: [more])
+    yield Fold("Rivals", lambda: [pair_table(d)], printed=True)
+    yield Fold("Extra poses", lambda: [extra_visits(d, kinds)])
+    yield Fold("Where the error comes from", lambda: _where(d))
+    yield Fold("Not tested", lambda: [untested_table(d)], printed=True)
+    noise = [("Noise", text) for text in noise_floor_lines(d.noise, kinds)]
+    yield Fold("Noise", lambda: [Lines(noise)], printed=True)
+    if d.noise.faulty:
+        yield Fold("Outliers excluded", lambda: _outliers(d))
+    if d.calibrated is not None:
+        yield Fold("Residuals of the calibrated arm", lambda: _residuals(d),
+                   figures=("space", "residuals", "against_joints", "over_time"))  # fmt: skip
+
+
+def _key(d: Diagnosis) -> Key:
+    """The error before and after the effects found, and the noise in both."""
+    gap = d.gap
+    calibrated, floor = length(gap.calibrated), length(gap.noise_floor)
+    figures = [("calibrated arm, held out", calibrated)]
+    headline = calibrated
+    if d.effects:
+        headline += f" → {length(gap.explained)}"
+        figures.append(("with the effects found", length(gap.explained)))
+    figures += [("noise alone", floor), ("readings", str(d.n_readings))]
+    return Key(f"{headline} (noise {floor})", figures)
+
+
+def _figures(d: Diagnosis) -> Iterator[Figure]:
+    from elastocal.report.figures import effects_over_joints, unknown_curves, waterfall
+
+    if d.components:
+        yield share_figure(d)
+    if d.budget:
+        yield waterfall("budget", _named_steps(d), ("noise alone", d.gap.noise_floor))
+    if (found := effects_over_joints(d)) is not None:
+        yield found
+    if d.curves:
+        yield unknown_curves(d)
+
+
+def candidate_figure(d: Diagnosis) -> Figure:
+    """Probability of the best candidates, of an effect outside the catalogue, and of none."""
+    from elastocal.report.figures import FAINT, SERIES, Row, rows_of_dots
+
+    every = [(effect_at(c), c.probability, SERIES[0]) for c in d.candidates[:MOST_PRINTED]]
+    every.append(("an effect outside the catalogue", d.probability_unknown, SERIES[1]))
+    every.append(("no further effect", d.probability_nothing, FAINT))
+    rows = [Row(name, p, text=probability(p), colour=colour) for name, p, colour in every]
+    caption = "Probability of each, given these data and typical sizes."
+    title = "Probability of every candidate"
+    return rows_of_dots("candidates", title, rows, "probability", caption)
+
+
+def _nameless(d: Diagnosis) -> Iterator[Block]:
+    if text := slight_text(d):
+        yield Text(text)
+    yield field_table(d)
+
+
+def _where(d: Diagnosis) -> Iterator[Block]:
+    yield stage_table(d)
+    yield place_probabilities(d)
+    yield structure_table(d, MOST_TESTS)
+
+
+def _outliers(d: Diagnosis) -> Iterable[Block]:
+    faulty = sorted(d.noise.faulty, key=lambda f: -f.sigmas)
+    return outlier_blocks("", [(f, f.error, f.sigmas) for f in faulty])
+
+
+def _residuals(d: Diagnosis) -> Iterator[Arm | Block]:
+    from elastocal.report.residual_figures import residual_figures
+    from elastocal.report.residual_view import residual_table, residuals_by
+
+    base = d.calibrated
+    assert base is not None
+    yield Text("What the model leaves before the effects found are added.")
+    yield from residual_figures(base.model, base.observed, base.x, base.residual)
+    yield residual_table(base.observed, residuals_by(base.observed, base.residual))
 
 
 def repeatabilities(noise: NoiseFloor, kinds: Iterable[str]) -> str:
@@ -184,9 +315,8 @@ def location_text(location: Location) -> str:
 
 
 def diagnosis_lines(d: Diagnosis) -> list[tuple[str, str]]:
-    """(label, sentence) on what was found, for the terminal and the head of the page."""
-    lines = [("Verdict", diagnosis_headline(d))]
-    lines += [("Error", text) for text in _error_lines(d)]
+    """(label, sentence) on what was found."""
+    lines = [("Error", text) for text in _error_lines(d)]
     if d.verdict == "unknown_effect":
         lines += [("Depends on", text) for text in _dependence(d)]
     if d.groups:
@@ -348,35 +478,42 @@ def error_steps(d: Diagnosis) -> tuple[BudgetStep, ...]:
     return tuple(step for step in d.budget if step.step != "noise_floor")
 
 
-def gap_rows(d: Diagnosis) -> ShownTable:
-    """The gap budget step by step, the noise floor last."""
-    steps = [(name_of(step.step), step.heldout_rms, step.ci95) for step in error_steps(d)]
-    return gap_table(steps, ("noise alone", d.gap.noise_floor))
+def gap_table(d: Diagnosis) -> Table:
+    """The budget step by step, the noise last."""
+    return budget_table(_named_steps(d), ("noise alone", d.gap.noise_floor))
 
 
-def hypothesis_rows(d: Diagnosis, most: int) -> ShownTable:
-    """The best `most` candidates; nothing and an unknown effect are candidates as well."""
+def _named_steps(d: Diagnosis) -> list[tuple[str, float, tuple[float, float]]]:
+    return [(name_of(step.step), step.heldout_rms, step.ci95) for step in error_steps(d)]
+
+
+OF_CANDIDATES = (
+    "evidence: log marginal likelihood over that of no further effect. d: standard deviations by "
+    "which the typical size moves the data; below 3 it is below the noise. seen from: smallest "
+    "detectable size, in typical sizes."
+)
+
+
+def candidate_table(d: Diagnosis, first: int, last: int) -> Table:
+    """The candidates of these ranks, the best first; with rank 0 an unknown effect and none, which
+    are candidates as well."""
     rows = [
-        (
-            effect_at(c),
-            probability(c.probability),
-            f"{c.score:+.1f}",
-            significant(c.detectable, 2),
-            seen_from(c),
-            settings_of(d, c.settings),
-        )
-        for c in d.candidates[:most]
-    ]
-    for name, p in (
-        ("an effect outside the catalogue", d.probability_unknown),
-        ("no further effect", d.probability_nothing),
-    ):
-        rows.append((name, probability(p), "", "", "", ""))
+        (effect_at(c), probability(c.probability), f"{c.score:+.1f}",
+         significant(c.detectable, 2), seen_from(c), settings_of(d, c.settings))
+        for c in d.candidates[first:last]
+    ]  # fmt: skip
+    title = f"{'Further c' if first else 'C'}andidates{' one at a time' if d.groups else ''}"
+    title += f", rank {first + 1} to {first + len(rows)} of {len(d.candidates)}"
+    if not first:
+        none = ("", "", "", "")
+        rows.append(("an effect outside the catalogue", probability(d.probability_unknown), *none))
+        rows.append(("no further effect", probability(d.probability_nothing), *none))
     heads = ("candidate", "probability", "evidence", "d", "seen from", "settings")
-    return ShownTable(heads, rows, (0, 5))
+    table = Table(heads, rows, (0, 5), title=title, note=OF_CANDIDATES)
+    return table.when_narrow(5) if any(row[5] for row in rows) else table.without(5)
 
 
-def added_parameter_rows(d: Diagnosis) -> ShownTable:
+def added_parameter_table(d: Diagnosis) -> Table:
     """Fitted parameters of the effects found, with 95 % half widths, and their settings."""
     rows: Rows = []
     for f in d.effects:
@@ -384,17 +521,22 @@ def added_parameter_rows(d: Diagnosis) -> ShownTable:
             rows.append((printable(p.name), *estimate(p.value, NORMAL_95 * p.std, p.unit)))
         if f.settings:
             rows.append((effect_at(f), settings_of(d, f.settings), "", ""))
-    return ShownTable(("parameter", "value", "± 95 %", "unit"), rows, (0, 3))
+    title = "Parameters of the effects found"
+    return Table(("parameter", "value", "± 95 %", "unit"), rows, (0, 3), title=title)
 
 
-def structure_rows(d: Diagnosis, most: int) -> ShownTable:
+def structure_table(d: Diagnosis, most: int) -> Table:
     """Tests that name no effect, the most conspicuous first."""
     tests = sorted(d.structure, key=lambda t: (t.p_family, t.p_value))[:most]
     rows: Rows = [(driver_name(t.driver), p_value(t.p_value), p_value(t.p_family)) for t in tests]
-    return ShownTable(("depends on", "p", "p, all tests"), rows)
+    note = (
+        "Does the residual depend on it at all? These tests name no effect: whole configurations "
+        f"change sign, and the last column counts all {len(d.structure)}."
+    )
+    return Table(("depends on", "p", "p, all tests"), rows, note=note)
 
 
-def pair_rows(d: Diagnosis) -> ShownTable:
+def pair_table(d: Diagnosis) -> Table:
     """How far apart each pair of rivals is before and after the extra poses."""
     rows = [
         (
@@ -404,10 +546,15 @@ def pair_rows(d: Diagnosis) -> ShownTable:
         )
         for pair in (() if d.extra is None else d.extra.pairs)
     ]
-    return ShownTable(("rivals", "d so far", "d with the extra poses"), rows)
+    note = (
+        "d is the distance of the two in standard deviations of the data; the best test between "
+        "them is right with probability Φ(d/2)."
+    )
+    heads = ("rivals", "d so far", "d with the extra poses")
+    return Table(heads, rows, title="Rivals", note=note)
 
 
-def untested_rows(d: Diagnosis) -> ShownTable:
+def untested_table(d: Diagnosis) -> Table:
     """Effects that could not be tested, those with the same reason and remedy in one row."""
     groups: dict[tuple[str, str], dict[str, list[str]]] = {}
     for u in d.untested:
@@ -417,7 +564,7 @@ def untested_rows(d: Diagnosis) -> ShownTable:
         (", ".join(f"{name} ({places(at, True)})" for name, at in effects.items()), *reason)
         for reason, effects in groups.items()
     ]
-    return ShownTable(("effect", "why", "record or measure"), rows, (0, 1, 2))
+    return Table(("effect", "why", "record or measure"), rows, (0, 1, 2), title="Not tested")
 
 
 def alike(d: Diagnosis) -> list[str]:
@@ -432,58 +579,33 @@ def alike(d: Diagnosis) -> list[str]:
     return [together([told(e) for e in rivals]) for rivals in d.indistinguishable]
 
 
-# What only the page shows.
-
-MOST_CANDIDATES = 40
-MOST_TESTS = 12
-MOST_PLACES = 8
-MOST_VISITS = 200
-BOX_WIDTH, GAP = 118, 18  # width of a box of the chain and the room between two, in SVG units
-
-
-@dataclass(frozen=True)
-class ChainBox:
-    """A link of the chain as the page draws it: `shade` 0 to 1, None where it cannot err."""
-
-    name: str
-    x: int
-    shade: float | None
-    evidence: str
-
-
-def chain_boxes(d: Diagnosis) -> list[ChainBox]:
-    """The chain from commanded joints to tracker, shaded by the evidence for each link."""
-    stages = {} if d.location is None else d.location.shares or d.location.stages
-    named: list[tuple[str, float | None]] = [("commanded joints", None)]
-    named += [(name, stages.get(stage, 0.0) if stages else None) for stage, name in STAGES.items()]
-    return [
-        ChainBox(
-            name,
-            k * (BOX_WIDTH + GAP),
-            None if shade is None else min(shade, 1.0),
-            "" if shade is None else _evidence(d, shade),
-        )
-        for k, (name, shade) in enumerate(named)
+def stage_table(d: Diagnosis) -> Table:
+    """The stages of the chain from commanded joints to tracker, with the evidence for each."""
+    location = d.location
+    if location is None:
+        return Table((), [])
+    shared = bool(location.shares)
+    found = location.shares or location.stages
+    rows = [
+        (name, share_text(min(value, 1.0)) if shared else probability(value))
+        for stage, name in STAGES.items()
+        for value in (found.get(stage, 0.0),)
     ]
+    return Table(("stage", "share of the error" if shared else "probability"), rows)
 
 
-def _evidence(d: Diagnosis, value: float) -> str:
-    shared = d.location is not None and d.location.shares
-    return share_text(min(value, 1.0)) if shared else probability(value)
-
-
-def likeliest_places(d: Diagnosis) -> list[tuple[str, str]]:
+def place_probabilities(d: Diagnosis) -> Table:
     """The likeliest places, the likeliest first."""
-    if d.location is None:
-        return []
-    order = sorted(d.location.places.items(), key=lambda item: -item[1])
-    return [(place(where), probability(p)) for where, p in order[:MOST_PLACES]]
+    found = [] if d.location is None or d.location.shares else d.location.places.items()
+    order = sorted(found, key=lambda item: -item[1])
+    rows = [(place(where), probability(p)) for where, p in order[:MOST_PLACES]]
+    return Table(("place", "probability"), rows)
 
 
-def extra_visits(d: Diagnosis, kinds: tuple[str, ...]) -> dict[str, Any] | None:
-    """The extra poses as a table, in the order of measuring; None where there are none."""
+def extra_visits(d: Diagnosis, kinds: Sequence[str]) -> Table:
+    """The extra poses in the order of measuring."""
     if d.extra is None or d.extra.plan is None:
-        return None
+        return Table((), [])
     plan = d.extra.plan
     heads = ["order", "pose", *joint_heads(kinds), "force N"]
     heads += ["approach"] if plan.approach is not None else []
@@ -494,44 +616,9 @@ def extra_visits(d: Diagnosis, kinds: tuple[str, ...]) -> dict[str, Any] | None:
         row += joint_texts(plan.q[i] + 0.0, kinds)
         row.append(" ".join(significant(f) for f in plan.force[i]))
         if plan.approach is not None:
-            row.append(" ".join("+" if a > 0 else "−" if a < 0 else "0" for a in plan.approach[i]))
+            row.append(" ".join("+" if a > 0 else "-" if a < 0 else "0" for a in plan.approach[i]))
         if plan.time is not None:
             row.append(f"{plan.time[i] / 60:.1f}")
         table.append(tuple(row))
-    return {"table": ShownTable(tuple(heads), table, ()), "more": len(plan) - len(table)}
-
-
-def diagnosis_contents(d: Diagnosis, kinds: tuple[str, ...]) -> dict[str, Any]:
-    """Words and tables of the page, by the names that its template has for them."""
-    faulty = sorted(d.noise.faulty, key=lambda f: -f.sigmas)
-    return {
-        "headline": diagnosis_headline(d),
-        "tone": d.findings[0].severity,
-        "verdict": [(label, capital(text)) for label, text in diagnosis_lines(d)[1:]],
-        "steps": diagnosis_steps(d),
-        "warnings": [capital(printable(w)) for w in d.warnings],
-        "readings": f"{counted(d.n_readings, 'reading')} in "
-        f"{counted(d.n_configurations, 'configuration')}",
-        "data": printable(d.data),
-        "boxes": chain_boxes(d),
-        "box": BOX_WIDTH,
-        "places": likeliest_places(d),
-        "budget": gap_rows(d),
-        "causes": cause_rows(d),
-        "causes_by_place": place_rows(d),
-        "fields": field_rows(d),
-        "shared": bool(d.location and d.location.shares),
-        "parameters": added_parameter_rows(d),
-        "candidates": hypothesis_rows(d, MOST_CANDIDATES),
-        "n_candidates": len(d.candidates),
-        "slight": slight_text(d),
-        "alike": [capital(text) for text in alike(d)],
-        "structure": structure_rows(d, MOST_TESTS),
-        "n_structure": len(d.structure),
-        "noise": noise_floor_lines(d.noise, kinds),
-        "faulty": faulty_rows([(f, f.error, f.sigmas) for f in faulty]),
-        "untested": untested_rows(d),
-        "extra": [] if d.extra is None else extra_lines(d.extra),
-        "pairs": pair_rows(d),
-        "visits": extra_visits(d, kinds),
-    }
+    more = len(plan) - len(table)
+    return Table(tuple(heads), table, (), title="Poses", note=f"and {more} more" if more else "")

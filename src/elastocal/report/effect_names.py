@@ -211,7 +211,7 @@ def setting_value(key: str, value: float) -> str:
     if unit == "rad":
         if "size" in key or 0 < abs(value) < SMALL:
             return f"{significant(value * 1e3)} mrad"
-        return f"{significant(math.degrees(value))}°".replace("-", "−")
+        return f"{significant(math.degrees(value))}°"
     if unit != "s":
         return significant(value, 4)
     if abs(value) < LONG_TIME:

@@ -1,4 +1,4 @@
-"""Figures as SVG that stands in a page and follows its colours; those of plan and diagnosis."""
+"""Figures by matplotlib: SVG that stands in a page and follows its colours, or Figures to plot."""
 
 from __future__ import annotations
 
@@ -6,10 +6,11 @@ import hashlib
 import io
 import math
 import re
-from collections.abc import Callable, Iterator, Sequence
-from contextlib import AbstractContextManager, contextmanager
-from contextvars import ContextVar
+import textwrap
+from collections.abc import Sequence
+from contextlib import AbstractContextManager
 from dataclasses import dataclass, replace
+from itertools import pairwise
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
@@ -19,10 +20,9 @@ from elastocal.diagnosis.diagnosis import Curve, Diagnosis
 from elastocal.errors import ElastocalError
 from elastocal.identification.linear_solver import least_norm
 from elastocal.model.manipulator import Model
-from elastocal.report.causes_view import causes, family, share_text
-from elastocal.report.diagnosis_view import error_steps
-from elastocal.report.effect_names import driver_name, effect_at, name_of, place, probability
-from elastocal.report.formatting import display, length, short_name, significant
+from elastocal.report import blocks
+from elastocal.report.effect_names import driver_name, effect_at
+from elastocal.report.formatting import length, short_name
 from elastocal.report.residual_view import reach
 
 if TYPE_CHECKING:
@@ -47,12 +47,12 @@ _STYLE: dict[str, Any] = {
     "svg.fonttype": "none",
     "svg.hashsalt": "elastocal",
     "font.family": "sans-serif",
-    "font.size": 9.0,
+    "font.size": 10.5,
     "text.parse_math": False,  # names from files are not formulas
     "text.color": INK,
     "axes.labelcolor": INK,
     "axes.edgecolor": FAINT,
-    "axes.titlesize": 9.0,
+    "axes.titlesize": 10.0,
     "axes.titlelocation": "left",
     "axes.spines.top": False,
     "axes.spines.right": False,
@@ -69,10 +69,12 @@ _STYLE: dict[str, Any] = {
     "ytick.labelcolor": INK,
     "figure.facecolor": "none",
     "legend.frameon": False,
+    "legend.fontsize": 9.0,
+    "xtick.labelsize": 9.0,
+    "ytick.labelsize": 9.0,
     "path.simplify": False,
 }
 LAYOUT: Any = "constrained"  # half of what drawing takes
-Draw = Callable[["Figure"], None]
 
 
 def style() -> AbstractContextManager[None]:
@@ -84,49 +86,33 @@ def style() -> AbstractContextManager[None]:
     return matplotlib.style.context(["default", {**_STYLE, "axes.prop_cycle": cycle}])
 
 
-_as_figures: ContextVar[Any] = ContextVar("_as_figures", default=None)
+def figure_of(block: blocks.Figure, place: SubFigure | None = None) -> Figure | SubFigure:
+    """matplotlib's Figure of a block, or what is drawn of it in a `place` of another figure."""
+    from matplotlib.figure import Figure
 
-
-@contextmanager
-def as_figures(place: SubFigure | None = None) -> Iterator[None]:
-    """Within it `drawn` gives matplotlib's Figures, or draws in a `place` of the user's own."""
-    token = _as_figures.set(place or _as_figures.get() or "new ones")
-    try:
-        yield
-    finally:
-        _as_figures.reset(token)
-
-
-def drawn(draw: Draw, width: float, height: float, title: str) -> Any:
-    """The SVG element of what `draw` puts on a figure of the given size in inches.
-
-    `title` says what the figure shows to those who cannot see it; it is not user text.
-    """
-    from matplotlib.figure import Figure, SubFigure
-
-    place = _as_figures.get()
     with style():
-        own = isinstance(place, SubFigure)
-        figure: Any = place if own else Figure(figsize=(width, height), layout=LAYOUT)
-        draw(figure)
-        if place:
-            whole = figure.get_figure(root=True)
-            whole.draw_without_rendering()  # what is made when drawing is made in this style
-            return figure
-        return svg_of(figure, title)
+        figure: Any = place or Figure(figsize=(block.width, block.height), layout=LAYOUT)
+        block.draw(figure)
+        # What is made when drawing is made in this style.
+        figure.get_figure(root=True).draw_without_rendering()
+    return figure
 
 
-def svg_of(figure: Figure, title: str) -> str:
-    """The SVG element of a figure, in the colours of the page."""
+def svg(block: blocks.Figure) -> str:
+    """The SVG element of a block, in the colours of the page."""
+    from matplotlib.figure import Figure
+
     with style():
+        figure = Figure(figsize=(block.width, block.height), layout=LAYOUT)
+        block.draw(figure)
         text = rendered(figure)
     text = text[text.index("<svg") :]
     text = re.sub(r'<g id="[^"]*"', "<g", text)  # several figures share a page
-    head = _head(title, figure.get_figwidth())
+    head = _head(block.title, block.width)
     text = re.sub(r"<svg [^>]*viewBox=\"([^\"]*)\"[^>]*>", head, text, count=1)
     for colour, variable in _VARIABLES.items():
         text = text.replace(colour, variable)
-    return _numbered(text, title)
+    return _numbered(text, block.title)
 
 
 def rendered(figure: Figure) -> str:
@@ -183,73 +169,101 @@ def panels_of(figure: Figure, n: int, across: int, **how: Any) -> list[Axes]:
     return list(grid[:n])
 
 
-WIDTH = 9.9
-STEP_HEIGHT = 0.42  # inches per step
-LONGEST_NAME = 46
-# A budget that spans more than this is drawn on a logarithmic axis.
+ROW = 0.27  # inches per line of a name
+LONGEST_LINE = 25  # letters of a name, which has two lines at most
+# Lengths that span more than this are drawn on a logarithmic axis.
 WIDE_RANGE = 8.0
 
 
-def waterfall_of_steps(
-    steps: Sequence[tuple[str, float, tuple[float, float]]],
-    floor: float | None,
-    floor_name: str,
-) -> str:
-    """SVG of the steps (name, rms in m, 95 % interval) and the `floor` (m) that noise leaves."""
-    rms = np.array([value for _, value, _ in steps])
-    ends = np.array([ci95 for *_, ci95 in steps]).reshape(-1, 2)
-    floor = math.nan if floor is None else floor
-    known = [v for v in (*rms, floor) if math.isfinite(v) and v > 0]
+@dataclass(frozen=True)
+class Row:
+    """A dot at `value` with an interval to both `ends`, where these are finite, and a `text`."""
+
+    name: str
+    value: float
+    ends: tuple[float, float] = (math.nan, math.nan)
+    text: str = ""
+    colour: str = SERIES[0]
+    small: bool = False
+
+
+def rows_of_dots(
+    name: str, title: str, rows: Sequence[Row], axis: str, caption: str = "",
+    line: tuple[str, float] | None = None, logarithmic: bool = False, lengths: bool = False,
+) -> blocks.Figure:  # fmt: skip
+    """Values with their intervals, a row each, and a dashed line at one that has a name.
+
+    `lengths`: values in µm, which may span decades.
+    """
+    names = [_two_lines(row.name) for row in rows]
+    lines = [name.count("\n") for name in names]
+    at = np.cumsum([0.0, *(1 + 0.4 * (a + b) for a, b in pairwise(lines))])
+    dashed = line if line is not None and math.isfinite(line[1]) else None
+    known = [row.value for row in rows] + ([dashed[1]] if dashed else [])
+    known = [v for v in known if math.isfinite(v)]
+    wide = lengths and min(known, default=0) > 0 and max(known) > WIDE_RANGE * min(known)
 
     def draw(figure: Figure) -> None:
-        from matplotlib.ticker import LogLocator
-
         axes = figure.subplots()
-        for k, (value, (low, high)) in enumerate(zip(rms * 1e6, ends * 1e6, strict=True)):
-            if k:
-                label = "taken away" if k == 1 else None
-                axes.plot([rms[k - 1] * 1e6, value], [k, k], color=SERIES[5], linewidth=7,
-                          solid_capstyle="butt", label=label)  # fmt: skip
-            axes.plot([low, high], [k, k], color=SERIES[0], linewidth=1.6,
-                      label="95 % interval" if k == 0 else None)  # fmt: skip
-            axes.plot([value], [k], "o", color=SERIES[0], markersize=7,
-                      label="remaining error" if k == 0 else None)  # fmt: skip
-            axes.annotate(length(rms[k]), (value, k), (0, 7), textcoords="offset points",
-                          ha="center", fontsize=8)  # fmt: skip
-        if math.isfinite(floor):
-            axes.axvline(floor * 1e6, color=SERIES[1], linestyle="--", linewidth=1.2,
-                         label=f"{floor_name} ({length(floor)})")  # fmt: skip
-        axes.set_yticks(range(len(rms)), [short_name(name, LONGEST_NAME) for name, *_ in steps])
-        axes.set_ylim(len(rms) - 0.4, -0.75)
-        if known and max(known) > WIDE_RANGE * min(known):
-            axes.set_xscale("log")
-            axes.xaxis.set_major_locator(LogLocator(subs=(1.0, 2.0, 5.0)))
-            axes.margins(x=0.1)
-        else:
-            axes.set_xlim(0, 1.15e6 * max(known, default=1.0))
-        micrometre_axis(axes, "3-D rms error on held-out poses")
-        figure.legend(loc="outside upper right", ncols=4, fontsize=8)
+        for y, row in zip(at, rows, strict=True):
+            axes.plot(row.ends, [y, y], color=row.colour, linewidth=1.1 if row.small else 2.0)
+            axes.plot([row.value], [y], "o", color=row.colour, markersize=4 if row.small else 7)
+            axes.annotate(row.text, (row.value, y), (0, 6), textcoords="offset points",
+                          ha="center", fontsize=9)  # fmt: skip
+        axes.set_yticks(at, names)
+        for tick, row in zip(axes.get_yticklabels(), rows, strict=True):
+            tick.set_fontsize(8.5 if row.small else 9.5)
+        axes.set_ylim(at[-1] + 0.6, -0.9)
+        if dashed:
+            told = f"{dashed[0]} ({length(dashed[1] * 1e-6)})"
+            axes.axvline(dashed[1], color=SERIES[1], linestyle="--", linewidth=1.2, label=told)
+            figure.legend(loc="outside upper right")
+        _scaled(axes, known, wide or logarithmic, lengths)
+        axes.set_xlabel(axis)
+        axes.grid(axis="y", visible=False)
 
-    return drawn(draw, WIDTH, 1.1 + STEP_HEIGHT * len(rms), "Error budget, step by step")
+    return blocks.Figure(name, title, draw, 0.95 + ROW * (float(at[-1]) + 1.5), caption)
 
 
-def micrometre_axis(axes: Axes, label: str) -> None:
-    """Lengths in µm across, ticked as "50 µm" or "2 mm"."""
-    axes.xaxis.set_major_formatter(lambda x, _: f"{x:g} µm" if x < 1e3 else f"{x / 1e3:g} mm")
-    axes.xaxis.set_minor_formatter(lambda x, _: "")
-    axes.set_xlabel(label)
-    axes.grid(axis="y", visible=False)
+def _scaled(axes: Axes, known: Sequence[float], logarithmic: bool, lengths: bool) -> None:
+    from matplotlib.ticker import LogLocator
+
+    axes.margins(x=0.1)
+    if logarithmic:
+        axes.set_xscale("log")
+        axes.xaxis.set_major_locator(LogLocator(subs=(1.0, 2.0, 5.0), numticks=7))
+    elif min(known, default=0) >= 0 and axes.get_xlim()[1] > 0:
+        low = axes.dataLim.x0
+        axes.set_xlim(left=min(0.0, low) if math.isfinite(low) else 0.0)
+    if lengths:
+        axes.xaxis.set_major_formatter(lambda x, _: f"{x:g} µm" if x < 1e3 else f"{x / 1e3:g} mm")
+        axes.xaxis.set_minor_formatter(lambda x, _: "")
 
 
-def _name_rows(axes: Axes, names: Sequence[str]) -> None:
-    """A row for each name, the first on top."""
-    axes.set_yticks(range(len(names)), names)
-    axes.set_ylim(len(names) - 0.4, -0.6)
-    axes.grid(axis="y", visible=False)
+def _two_lines(name: str) -> str:
+    """A printable name on two lines, cut where it is longer."""
+    lines = textwrap.wrap(short_name(name, 2 * LONGEST_LINE), LONGEST_LINE)
+    return "\n".join(lines[:2]) + ("…" if len(lines) > 2 else "")
 
 
-BAR_HEIGHT = 0.34  # inches per bar
-MOST_BARS = 10
+def waterfall(
+    name: str, steps: Sequence[tuple[str, float, tuple[float, float]]],
+    floor: tuple[str, float] | None,
+) -> blocks.Figure:  # fmt: skip
+    """Steps (name, held-out rms in m, 95 % interval), and the `floor` (m) that noise leaves."""
+    rows = [Row(n, v * 1e6, (low * 1e6, high * 1e6), length(v)) for n, v, (low, high) in steps]
+    caption = (
+        "Held-out 3-D rms error with its 95 % interval, as the model gains one part after the "
+        "other. "
+    )
+    caption += "The noise level is unknown." if floor is None else "Dashed: the noise level."
+    line = None if floor is None else (floor[0], floor[1] * 1e6)
+    title = "Error budget, step by step"
+    return rows_of_dots(name, title, rows, "held-out rms error", caption, line, lengths=True)
+
+
+# Of a diagnosis
+
 LONGEST_ENTRY = 24  # what moves, written along the height of a small panel
 # Unit of a curve's axis → (factor, unit shown).
 ABSCISSA = {
@@ -261,78 +275,24 @@ ABSCISSA = {
 ORDINATE = {"m": (1e6, "µm"), "rad": (1e6, "µrad"), "1": (1e6, "ppm")}
 
 
-def diagnosis_waterfall(d: Diagnosis) -> str:
-    """The gap budget of a diagnosis as a waterfall."""
-    steps = [(name_of(s.step), s.heldout_rms, s.ci95) for s in error_steps(d)]
-    return waterfall_of_steps(steps, d.gap.noise_floor, "noise alone")
-
-
-def candidate_bars(d: Diagnosis) -> str:
-    """Probability of the best candidates, of nothing, and of an effect outside the catalogue."""
-    rows = [(effect_at(c), c.probability, SERIES[0], "") for c in d.candidates[:MOST_BARS]]
-    rows.append(("an effect outside the catalogue", d.probability_unknown, SERIES[1], "////"))
-    rows.append(("no further effect", d.probability_nothing, FAINT, "...."))
-
-    def draw(figure: Figure) -> None:
-        axes = figure.subplots()
-        for k, (_, p, colour, hatch) in enumerate(rows):
-            axes.barh(k, p, height=0.62, facecolor=colour if not hatch else "none",
-                      edgecolor=colour, hatch=hatch)  # fmt: skip
-            axes.text(p + 0.012, k, probability(p), va="center", fontsize=8)
-        _name_rows(axes, [_axis_name(name) for name, *_ in rows])
-        axes.set_xlim(0, 1.1)
-        axes.set_xticks(np.linspace(0, 1, 6))
-        axes.set_xlabel("probability")
-
-    return drawn(draw, WIDTH, 0.7 + BAR_HEIGHT * len(rows), "Probability of every candidate")
-
-
-def share_bars(d: Diagnosis) -> str:
-    """What the gap is made of: the share of every finding with its 90 % interval, and below it
-    what it does at each of its places."""
-    rows: list[tuple[str, float, tuple[float, float], bool, str]] = []
-    for cause in causes(d):
-        colour = SERIES[0] if cause.named else SERIES[1]
-        rows.append((cause.name, cause.share, cause.share_ci90, True, colour))
-        if len(cause.parts) > 1:
-            rows += [
-                (f"{place(c.where)}, {family(c)}", c.share, c.share_ci90, False, colour)
-                for c in cause.parts
-            ]
-    ends = [end for row in rows for end in row[2] if math.isfinite(end)]
-    least, most = min(0.0, *ends, 0.0), max(0.01, *ends, 0.01)
-
-    def draw(figure: Figure) -> None:
-        axes = figure.subplots()
-        for k, (_, share, ci90, whole, colour) in enumerate(rows):
-            axes.barh(k, 100 * share, height=0.62 if whole else 0.34, facecolor=colour,
-                      edgecolor="none", alpha=1.0 if whole else 0.45)  # fmt: skip
-            both = [100 * end for end in ci90]
-            axes.plot(both, [k, k], color=INK, linewidth=1.4, solid_capstyle="butt")
-            axes.plot(both, [k, k], "|", color=INK, markersize=7 if whole else 5)
-            axes.annotate(share_text(share), (max(100 * share, both[1]), k), (6, 0),
-                          textcoords="offset points", va="center", fontsize=8)  # fmt: skip
-        _name_rows(axes, [_axis_name(name) for name, *_ in rows])
-        for tick, row in zip(axes.get_yticklabels(), rows, strict=True):
-            tick.set_fontsize(9 if row[3] else 8)
-        axes.set_xlim(100 * least, 112 * most)
-        axes.set_xlabel("share of the gap in %, with 90 % interval")
-
-    return drawn(draw, WIDTH, 0.7 + 0.8 * BAR_HEIGHT * len(rows), "Causes of the remaining error")
-
-
-def unknown_curves(d: Diagnosis) -> str:
+def unknown_curves(d: Diagnosis) -> blocks.Figure:
     """How the unknown effect depends on what drives it: smooth curves with bands of 2 sd."""
+    across = min(2, len(d.curves))
 
     def draw(figure: Figure) -> None:
-        panels = panels_of(figure, len(d.curves), min(2, len(d.curves)))
+        panels = panels_of(figure, len(d.curves), across)
         for axes, curve in zip(panels, d.curves, strict=True):
             _curve(axes, curve)
         handles = panels[0].get_legend_handles_labels()
-        figure.legend(*handles, loc="outside upper right", ncols=2, fontsize=8)
+        figure.legend(*handles, loc="outside upper right", ncols=2)
 
     title = "Error curves of the joints" if d.groups else "Shape of the unknown dependence"
-    return drawn(draw, WIDTH, 0.4 + 2.6 * -(-len(d.curves) // 2), title)
+    caption = (
+        "Motion of the arm beyond the model, as a smooth function of its driver. If the band "
+        "includes zero, the data show nothing."
+    )
+    height = 0.5 + 2.1 * -(-len(d.curves) // across)
+    return blocks.Figure("curves", title, draw, height, caption)
 
 
 def _curve(axes: Axes, curve: Curve) -> None:
@@ -343,7 +303,7 @@ def _curve(axes: Axes, curve: Curve) -> None:
     axes.fill_between(x * wide, (y - 2 * sd) * high, (y + 2 * sd) * high, color=SERIES[0],
                       alpha=0.25, linewidth=0, label="± 2 standard deviations")  # fmt: skip
     axes.plot(x * wide, y * high, color=INK, linewidth=1.4, label="estimated shape")
-    axes.set_xlabel(f"{_axis_name(driver_name(curve.driver))} in {x_unit}")
+    axes.set_xlabel(f"{short_name(driver_name(curve.driver), LONGEST_ENTRY)} in {x_unit}")
     axes.set_ylabel(f"{short_name(driver_name(curve.entry), LONGEST_ENTRY)} in {y_unit}")
 
 
@@ -406,95 +366,44 @@ def effect_shapes(d: Diagnosis) -> list[EffectShape]:
     return found
 
 
-def effects_over_joints(d: Diagnosis) -> str:
+def effects_over_joints(d: Diagnosis) -> blocks.Figure | None:
     """Every found effect of a joint over that joint's position, with the residuals behind it."""
     shapes = effect_shapes(d)
     if not shapes:
-        return ""
+        return None
 
     def draw(figure: Figure) -> None:
-        panels = panels_of(figure, len(shapes), min(2, len(shapes)))
-        for axes, shape in zip(panels, shapes, strict=True):
-            revolute = shape.kind == "revolute"
-            q = np.degrees(shape.q) if revolute else shape.q * 1e3
-            sides = np.unique(np.sign(shape.side))
-            for k, side in enumerate(sides):
-                own = np.sign(shape.side) == side
-                told = "" if len(sides) == 1 else f" ({'from below' if side > 0 else 'from above'})"
-                dots(axes, q[own], 1e6 * shape.seen[own], SERIES[k], 1.8, f"readings{told}")
-                axes.plot(q[own], 1e6 * shape.explained[own], "_", color=SERIES[k], markersize=9,
-                          markeredgewidth=1.8, label=f"effect{told}")  # fmt: skip
-            axes.set_title(shape.name, loc="left")
-            axes.set_xlabel(f"joint in {'°' if revolute else 'mm'}")
-            axes.set_ylabel(f"motion of the joint in {'µrad' if revolute else 'µm'}")
-            height = reach(1e6 * np.concatenate([shape.seen, shape.explained]))
-            axes.set_ylim(-height, height)
-            # Above the axes: inside, it would hide readings.
-            axes.legend(fontsize=7, loc="lower right", bbox_to_anchor=(1, 1), ncols=2)
+        for axes, shape in zip(panels_of(figure, len(shapes), 1), shapes, strict=True):
+            _effect(axes, shape)
 
-    return drawn(
-        draw, WIDTH, 0.3 + 2.7 * -(-len(shapes) // 2), "Found effects over the joints they act at"
+    caption = (
+        "Dashes: the effect found, as a motion of its joint. Dots: the same with what is left of "
+        "each reading when all is fitted."
     )
+    title = "Found effects over the joints they act at"
+    return blocks.Figure("effects", title, draw, 0.3 + 2.5 * len(shapes), caption)
 
 
-def _axis_name(text: str) -> str:
-    return short_name(text, LONGEST_NAME)
+def _effect(axes: Axes, shape: EffectShape) -> None:
+    revolute = shape.kind == "revolute"
+    q = np.degrees(shape.q) if revolute else shape.q * 1e3
+    sides = np.unique(np.sign(shape.side))
+    for k, side in enumerate(sides):
+        own = np.sign(shape.side) == side
+        told = "" if len(sides) == 1 else f" ({'from below' if side > 0 else 'from above'})"
+        dots(axes, q[own], 1e6 * shape.seen[own], SERIES[k], 1.8, f"readings{told}")
+        axes.plot(q[own], 1e6 * shape.explained[own], "_", color=SERIES[k], markersize=9,
+                  markeredgewidth=1.8, label=f"effect{told}")  # fmt: skip
+    axes.set_title(shape.name, loc="left")
+    axes.set_xlabel(f"joint in {'°' if revolute else 'mm'}")
+    axes.set_ylabel(f"motion in {'µrad' if revolute else 'µm'}")
+    height = reach(1e6 * np.concatenate([shape.seen, shape.explained]))
+    axes.set_ylim(-height, height)
+    # Above the axes: inside, it would hide readings.
+    axes.legend(fontsize=8, loc="lower right", bbox_to_anchor=(1, 1), ncols=2)
 
 
-PLAN_ROW = 0.26  # inches per bar or dot
-MOST_PARAMETERS = 60
-LONGEST_PARAMETER = 40
-
-
-def plan_intervals(plan: Plan) -> str:
-    """Predicted half widths of the 95 % intervals, a panel per unit."""
-    units: dict[str, list[tuple[str, float]]] = {}
-    for p in plan.predicted[:MOST_PARAMETERS]:
-        shown, unit = display(p.half_width, p.unit)
-        units.setdefault(unit, []).append((short_name(p.name, LONGEST_PARAMETER), shown))
-    heights = [len(rows) + 1.5 for rows in units.values()]
-
-    def draw(figure: Figure) -> None:
-        panels = figure.subplots(len(units), 1, squeeze=False, height_ratios=heights)[:, 0]
-        for axes, (unit, rows) in zip(panels, units.items(), strict=True):
-            for k, (_, half) in enumerate(rows):
-                axes.plot([0, half], [k, k], color=SERIES[0], linewidth=5, solid_capstyle="butt")
-                axes.annotate(significant(half, 2), (half, k), (5, 0), va="center", fontsize=8,
-                              textcoords="offset points")  # fmt: skip
-            _name_rows(axes, [name for name, _ in rows])
-            axes.set_xlim(0, 1.12 * max(half for _, half in rows))
-            axes.set_xlabel(f"half width of the 95 % interval in {unit}")
-
-    return drawn(
-        draw, WIDTH, 0.5 + PLAN_ROW * sum(heights) + 0.3 * len(units), "Predicted intervals"
-    )
-
-
-def plan_removed(plan: Plan) -> str:
-    """How many candidates each rule of the cell removed, and how many are feasible."""
-    # What designs plans is slow to import, and other figures do not need it.
-    from elastocal.report.plan_view import removed
-
-    c = plan.candidates
-    rows = [*removed(plan), ("feasible", c.feasible)]
-
-    def draw(figure: Figure) -> None:
-        axes = figure.subplots()
-        for k, (name, n) in enumerate(rows):
-            look: dict[str, Any] = {"facecolor": "none", "edgecolor": FAINT, "hatch": "////"}
-            if name == "feasible":
-                look = {"facecolor": SERIES[2]}
-            axes.barh(k, n, height=0.62, **look)
-            axes.annotate(f"{n}", (n, k), (5, 0), textcoords="offset points", va="center",
-                          fontsize=8)  # fmt: skip
-        _name_rows(axes, [name for name, _ in rows])
-        axes.set_xlim(0, 1.15 * max(n for _, n in rows) + 1)
-        axes.set_xlabel(f"of {c.tried} poses tried")
-
-    return drawn(draw, WIDTH, 0.7 + 1.2 * PLAN_ROW * len(rows), "What removed candidates")
-
-
-def plan_curve(plan: Plan) -> str:
+def plan_curve(plan: Plan) -> blocks.Figure:
     """The criterion of the best plan found against its number of poses, with its bound."""
     points = plan.curve
     bounded = [(s.poses, s.bound) for s in points if s.bound is not None]
@@ -512,6 +421,6 @@ def plan_curve(plan: Plan) -> str:
         name = "ρ₀" if plan.of_test_poses else plan.criterion
         axes.set_ylabel(f"{name} in {plan.unit}" if plan.unit else name)
         axes.set_ylim(bottom=0)
-        axes.legend(fontsize=8)
+        axes.legend()
 
-    return drawn(draw, WIDTH, 3.0, "Criterion against the number of poses")
+    return blocks.Figure("curve", "Criterion against the number of poses", draw, 3.0)

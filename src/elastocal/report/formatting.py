@@ -4,9 +4,9 @@ from __future__ import annotations
 
 import math
 from collections.abc import Iterable, Sequence
-from dataclasses import dataclass, field
-from typing import Any, Literal
+from typing import Any
 
+from elastocal.report.blocks import Table, Text
 from elastocal.text import printable
 
 # SI unit → (factor, unit shown).
@@ -134,17 +134,7 @@ def counted(n: int, one: str, many: str | None = None) -> str:
 
 
 def signed_change(change: float) -> str:
-    return f"{'−' if change < 0 else '+'}{length(abs(change))}"
-
-
-def minus(text: str) -> str:
-    """Proper minus signs in front of numbers, ends and between terms, not in names."""
-    if text.startswith("-"):
-        text = "−" + text[1:]
-    return text.replace(" - ", " − ").replace("[-", "[−").replace(", -", ", −")
-
-
-Tone = Literal["good", "care", "poor"]
+    return f"{'-' if change < 0 else '+'}{length(abs(change))}"
 
 
 def together(parts: Sequence[str], last: str = "and") -> str:
@@ -153,50 +143,40 @@ def together(parts: Sequence[str], last: str = "and") -> str:
 
 
 def capital(text: str) -> str:
-    """As a sentence begins; a symbol such as ρ₀ stays as it is."""
-    return text if text.startswith("ρ") else f"{text[:1].upper()}{text[1:]}"
+    """As a sentence begins; a symbol such as p or ρ₀ stays as it is."""
+    return text if text[1:2] in (" ", "₀") else f"{text[:1].upper()}{text[1:]}"
 
 
-@dataclass(frozen=True)
-class ShownTable:
-    """A table of texts.  `words` are the columns that hold words; the others hold numbers.
-
-    `groups` names the rows that follow, by the index of the first: {0: "base frame", 6: …}.
-    """
-
-    heads: tuple[str, ...]
-    rows: Sequence[tuple[str, ...]]
-    words: tuple[int, ...] = (0,)
-    groups: dict[int, str] = field(default_factory=dict)
+def sentence(text: str) -> str:
+    """With a capital and a full stop."""
+    return f"{capital(text.rstrip('.'))}."
 
 
-def without_columns(shown: ShownTable, *columns: int) -> ShownTable:
-    """The table without some columns."""
-    kept = [k for k in range(len(shown.heads)) if k not in columns]
-    heads, *rows = (tuple(row[k] for k in kept) for row in (shown.heads, *shown.rows))
-    return ShownTable(heads, rows, tuple(n for n, k in enumerate(kept) if k in shown.words))
+def title_of(*names: str) -> str:
+    """Robot and cell, once where they have the same name."""
+    return printable(" – ".join(name for name in dict.fromkeys(names) if name))
 
 
-MOST_FAULTY = 100  # rows of the table of faulty readings
+MOST_FAULTY = 100  # rows of the table of outliers
 
 
-def faulty_rows(found: Sequence[tuple[Any, float, float]]) -> dict[str, Any]:
-    """Readings beyond the noise as a table, and how many `more` there are than it holds.
-
-    `found`: each reading with its line and names, its error in m, and that over the noise.
-    """
+def outlier_blocks(title: str, found: Sequence[tuple[Any, float, float]]) -> list[Table | Text]:
+    """Readings beyond the noise: each with its line and names, its error in m, and that over the
+    noise."""
     rows = [
         (str(o.line), printable(o.configuration), printable(o.marker), length(error),
          significant(ratio))
         for o, error, ratio in found[:MOST_FAULTY]
     ]  # fmt: skip
     heads = ("line", "configuration", "marker", "error", "error / noise")
-    return {"table": ShownTable(heads, rows, (1, 2)), "more": len(found) - len(rows)}
+    more = len(found) - len(rows)
+    blocks: list[Table | Text] = [Table(heads, rows, (1, 2), title=title)]
+    return [*blocks, Text(f"and {more} more", soft=True)] if more else blocks
 
 
-def gap_table(
+def budget_table(
     steps: Sequence[tuple[str, float, tuple[float, float]]], floor: tuple[str, float] | None
-) -> ShownTable:
+) -> Table:
     """Steps (name, held-out rms in m, its 95 % interval) and what each changes; `floor` last."""
     rows: list[tuple[str, ...]] = []
     for k, (name, rms, ci95) in enumerate(steps):
@@ -204,7 +184,8 @@ def gap_table(
         rows.append((name, length(rms), " to ".join(map(length, ci95)), change))
     if floor is not None:
         rows.append((floor[0], length(floor[1]), "", ""))
-    return ShownTable(("model", "held-out rms", "95 %", "change"), rows)
+    heads = ("model", "held-out rms", "95 %", "change")
+    return Table(heads, rows, title="Error budget (3-D rms error at held-out poses)")
 
 
 def joint_heads(kinds: Sequence[str]) -> list[str]:

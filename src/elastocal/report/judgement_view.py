@@ -10,37 +10,21 @@ from elastocal.errors import option
 from elastocal.identification.far_values import only_placed
 from elastocal.identification.findings import next_steps
 from elastocal.identification.result import Calibration, Finding
-from elastocal.report.formatting import Tone, counted, display, estimate, length, significant
+from elastocal.report.blocks import Tone
+from elastocal.report.formatting import counted, display, estimate, length, significant
 from elastocal.text import listed, printable
-
-# Sections of the page, by the finding they tell of, and the words that they are named after.
-SECTIONS = {
-    "faulty_readings": ("beyond the noise", "Outliers"),
-    "undetermined": ("from these data", "Not determined"),
-}
 
 
 @dataclass(frozen=True)
 class Judgement:
-    """`tone`: good (use it), care (use it knowing what is wrong), poor (do not use it)."""
-
     tone: Tone
     headline: str
     steps: tuple[str, ...]
 
-    @property
-    def lines(self) -> list[tuple[str, str]]:
-        """Label and sentence of the verdict and of each step."""
-        steps = [("Next", printable(step)) for step in self.steps]
-        return [("Verdict", printable(self.headline)), *steps]
 
-
-def judgement(result: Calibration, sections: bool = False) -> Judgement:
-    """How good the calibration is and what follows from it, as the result's findings say.
-
-    `sections`: the steps name the sections of the page.
-    """
-    steps = tuple(_step(f, sections) for f in next_steps(result))
+def judgement(result: Calibration) -> Judgement:
+    """How good the calibration is and what follows from it, as the result's findings say."""
+    steps = tuple(f.remedy for f in next_steps(result))
     trust = result.finding("trust")
     assert trust is not None, "every identification is judged"
     if trust.severity == "poor":
@@ -50,7 +34,7 @@ def judgement(result: Calibration, sections: bool = False) -> Judgement:
     verdict = result.verdict
     if trust.severity == "care":
         named = "; and ".join(DOUBTS[f.kind](f) for f in verdict.missing)
-        return Judgement("care", f"Use this calibration with care: {named}. {told}", steps)
+        return Judgement("warn", f"Use this calibration with care: {named}. {told}", steps)
     compared = result.finding(
         "residual_agrees_with_stated_noise", "residual_below_stated_noise",
         "residual_agrees_with_readings",
@@ -67,13 +51,6 @@ def warnings_beside(result: Calibration) -> list[str]:
     """The warnings that say more than the verdict and what to do next."""
     said = {f.kind for f in result.verdict.missing} & set(SAID)
     return [printable(str(w)) for w in result.warnings if getattr(w, "kind", "") not in said]
-
-
-def _step(f: Finding, sections: bool) -> str:
-    if not sections or f.kind not in SECTIONS:
-        return f.remedy
-    phrase, section = SECTIONS[f.kind]
-    return f.remedy.replace(phrase, f"{phrase} ({section})", 1)
 
 
 def _length(f: Finding, name: str) -> str:

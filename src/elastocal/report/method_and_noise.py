@@ -15,8 +15,8 @@ from elastocal.identification.noise_summary import SLIDES, Noise, NoiseSize
 from elastocal.identification.residuals import GroupSummary, ResidualSummary
 from elastocal.identification.result import Calibration
 from elastocal.model.observations import available_noise
+from elastocal.report.blocks import Table
 from elastocal.report.formatting import (
-    ShownTable,
     counted,
     display,
     length,
@@ -293,7 +293,7 @@ def noise_model_line(result: Calibration) -> str | None:
     text = text[:1].upper() + text[1:]
     if sizes:
         text += ": " + "; ".join(f"{name} {size}" for name, size in sizes)
-    candidates = candidate_rows(noise)
+    candidates = candidate_table(noise).rows
     if len(candidates) > 1:
         second, _, gap = candidates[1]
         n = len(candidates)
@@ -318,17 +318,23 @@ def size_rows(noise: Noise) -> list[tuple[str, str]]:
     ]
 
 
-def candidate_rows(noise: Noise) -> list[tuple[str, str, str]]:
+def size_table(noise: Noise) -> Table:
+    return Table(("part", "size"), size_rows(noise), title="Noise, standard deviations")
+
+
+def candidate_table(noise: Noise) -> Table:
     """Noise models that were tried, best first: words, variances, criterion above the best."""
     tried = sorted(noise.tried or (), key=lambda t: t.criterion)
-    return [
-        (
-            kind_in_words(t.kind),
-            str(t.n_variances),
-            f"{t.criterion - tried[0].criterion:.1f}",
-        )
+    rows = [
+        (kind_in_words(t.kind), str(t.n_variances), f"{t.criterion - tried[0].criterion:.1f}")
         for t in tried
     ]
+    heads = ("noise model", "variances", "criterion over best")
+    note = (
+        "The information criterion: twice the loss in log-likelihood and a price per variance; 10 "
+        "above the best is practically no support."
+    )
+    return Table(heads, rows, title="Noise models tried", note=note)
 
 
 def kind_in_words(kind: str) -> str:
@@ -417,6 +423,15 @@ def in_time_line(result: Calibration) -> str | None:
     )
 
 
+def deviating_table(summary: ResidualSummary) -> Table:
+    """Groups of readings that scatter unlike the noise model."""
+    rows = [
+        (group_name(by, g), str(g.n), ratio(g), f"{g.p_holm:.1g}") for by, g in summary.deviating
+    ]
+    heads = ("scatters unlike the noise model", "values", "observed / expected", "p (Holm)")
+    return Table(heads, rows)
+
+
 def group_name(by: str, group: GroupSummary) -> str:
     return f"{by} {printable(group.name)}"
 
@@ -444,7 +459,6 @@ def _p(p: float) -> str:
     return "p < 1e-6" if p < 1e-6 else f"p = {significant(p, 2)}"
 
 
-MOST_TOLD = 3  # in the terminal's summary
 FULL_WEIGHT = ("reml", "ols", "wls", "eq14")  # methods that let far readings bend the fit
 PLACE = {
     "block": "Block of lines {}",
@@ -522,7 +536,7 @@ def _bends(result: Calibration, finding: FaultyGroup) -> bool:
 SMOOTH_HEADS = ("smooth function", "rms", "95 %", "known to ±", "unit", "coefficients' worth")
 
 
-def smooth_table(result: Calibration) -> ShownTable:
+def smooth_table(result: Calibration) -> Table:
     """A row for each function and unit; what was left out has none."""
     rows = []
     for part in result.smooth:
@@ -537,15 +551,12 @@ def smooth_table(result: Calibration) -> ShownTable:
                     numbers[3], display(0.0, unit)[1], worth,
                 )
             )  # fmt: skip
-    return ShownTable(SMOOTH_HEADS, rows, (0, 4))
-
-
-def smooth_lines(result: Calibration) -> list[str]:
-    """The same as sentences, one for each function."""
-    return [
-        f"{name}: {rms} {unit} rms ({ends}), known to ± {half} {unit}, {worth} coefficients' worth"
-        for name, rms, ends, half, unit, worth in smooth_table(result).rows
-    ]
+    note = (
+        "What the arm does besides, as smooth functions of joint angles or time: they correct it "
+        "where it was measured, and explain nothing. Each takes as many of its coefficients as "
+        "the readings pay for."
+    )
+    return Table(SMOOTH_HEADS, rows, (0, 4), title="Smooth functions", note=note)
 
 
 def counted_functions(result: Calibration) -> str:

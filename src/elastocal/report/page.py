@@ -1,7 +1,7 @@
-"""Results as HTML pages: identification, plan, diagnosis, compensation and what else there is.
+"""The blocks of a result as HTML: pages that need no network and no other file.
 
-Each page needs no network and no other file.  Its words and tables come from the result's view,
-its figures are drawn here; the templates lie beside this module.
+Every text is escaped by `_text`; what is not text was made here.  The style sheet and the script
+lie beside this module.
 """
 
 from __future__ import annotations
@@ -13,71 +13,31 @@ import platform
 import re
 from collections.abc import Callable, Iterable, Mapping
 from datetime import date
-from functools import cache, partial
+from functools import cache
+from html import escape
 from importlib import metadata, resources
+from itertools import groupby
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 from elastocal import __version__
-from elastocal.compensation.compensate import Compensation
-from elastocal.diagnosis.changes import Comparison
-from elastocal.diagnosis.diagnosis import Diagnosis
 from elastocal.files import atomic_write_text, open_input
-from elastocal.identification.error_budget import gap_budget
-from elastocal.identification.result import Calibration
-from elastocal.model.manipulator import Model
-from elastocal.model.observations import Observations
-from elastocal.planning.plan import Plan
-from elastocal.report.arm_view import (
-    Space,
-    plan_space,
-    residual_space,
-    space_json,
-    space_picture,
-    time_caption,
-    view_caption,
+from elastocal.report.blocks import (
+    WARNING,
+    Arm,
+    Bar,
+    Block,
+    Figure,
+    Fold,
+    Heading,
+    Key,
+    Lines,
+    Table,
+    Text,
+    Verdict,
 )
-from elastocal.report.changes_view import changes_contents, draw_map
-from elastocal.report.diagnosis_view import diagnosis_contents
-from elastocal.report.figures import (
-    as_figures,
-    candidate_bars,
-    diagnosis_waterfall,
-    drawn,
-    effects_over_joints,
-    plan_curve,
-    plan_intervals,
-    plan_removed,
-    share_bars,
-    svg_of,
-    unknown_curves,
-)
-from elastocal.report.formatting import minus
-from elastocal.report.identification_view import (
-    Published,
-    Truth,
-    certificate_contents,
-    identification_contents,
-)
-from elastocal.report.notebook import view_of
-from elastocal.report.plan_view import plan_contents
-from elastocal.report.residual_figures import (
-    MOST_JOINT_DOTS,
-    drawn_for,
-    residual_figures,
-)
-from elastocal.report.residual_view import (
-    Residuals,
-    residual_table,
-    residuals_by,
-    residuals_of,
-    summary_of,
-)
+from elastocal.report.terminal import report_of
 from elastocal.screen import shown
-from elastocal.text import printable
-
-if TYPE_CHECKING:
-    from jinja2 import Environment
 
 FEWEST_SECTIONS = 4  # that are worth a list
 LIBRARIES = ("numpy", "scipy", "casadi")
@@ -107,70 +67,221 @@ def page_of(
     tell how to repeat the run.  To a calibration `truth` (SI) adds true values, and `published`
     values (SI) and half widths that others found; `certificate` makes a certificate of it.  Raises
     InputError where an input cannot be read.
-
-    Where the page has a 3-D view, plotly.js comes along.  It runs these two scripts, named by
-    their hashes, and no other: not even one that slipped into a name.
     """
-    from markupsafe import Markup
+    named = digests(inputs)
+    report = report_of(result, **told)
+    body = html_of(report.blocks)
+    space = VIEW in body
+    found = (
+        ("command", command), ("elastocal", __version__), ("made on", date.today().isoformat()),
+        ("with", software(space)), ("model evaluated by", report.backend),
+        ("seed", seed if report.seed is None else report.seed),
+        *((name, f"SHA-256 {digest}") for name, digest in named.items()),
+    )  # fmt: skip
+    rows = "".join(
+        f'<tr><td class="name">{text_of(name, False)}</td>'
+        f"<td><code>{text_of(str(value), False)}</code></td></tr>\n"
+        for name, value in found if value not in (None, "")
+    )  # fmt: skip
+    last = f'<table class="repeat"><tbody>{rows}</tbody></table>'
+    if not report.filed:
+        last = f"<details><summary>To repeat this</summary>{last}</details>"
+    return _framed(f"{report.kind} of {text_of(report.title, False)}", body + last, space,
+                   "filed" if report.filed else "")  # fmt: skip
 
-    template, contents = PAGES[type(result).__name__]
-    if told.pop("certificate", False):
-        template, contents = "certificate.html.j2", _certificate
-    content: dict[str, Any] = {"seed": seed, "backend": ""} | contents(result, **told)
-    drawn = bool(content.get("view"))
-    source, packed = plotly() if drawn else ("", "")
+
+def _framed(head: str, body: str, space: bool, kind: str) -> str:
+    """The whole page.  Where it has a 3-D view, plotly.js comes along.  It runs these two scripts,
+    named by their hashes, and no other: not even one that slipped into a name."""
+    source, packed = plotly() if space else ("", "")
     script = resource("report.js")
-    return with_contents(
-        environment()
-        .get_template(template)
-        .render(
-            content
-            | {
-                "title": printable(content["title"]),
-                "css": Markup(resource("style.css")),
-                "script": Markup(script),
-                "script_hashes": " ".join(
-                    f"'sha256-{_digest(text)}'" for text in (script, source) if text
-                ),
-                "plotly": Markup(packed),
-                "version": __version__,
-                "date": date.today().isoformat(),
-                "environment": software(drawn),
-                "command": None if command is None else printable(command),
-                "inputs": {printable(k): printable(v) for k, v in digests(inputs).items()},
-                "backend": printable(content["backend"]),
-            }
-        )
-    )
+    hashes = " ".join(f"'sha256-{_digest(text)}'" for text in (script, source) if text)
+    carried = f'<script type="application/octet-stream" id="plotly">{packed}</script>'
+    contents, body = _with_contents(body)
+    return f"""<!doctype html>
+<html lang="en">
+<head>
+<meta charset="utf-8">
+<meta http-equiv="Content-Security-Policy" content="default-src 'none'; \
+style-src 'unsafe-inline'; img-src data: blob:; script-src {hashes}">
+<meta name="viewport" content="width=device-width, initial-scale=1">
+<meta name="generator" content="elastocal {__version__}">
+<title>{head}</title>
+<style>{resource("style.css")}</style>
+</head>
+<body class="{kind}">
+<h1>{head}</h1>
+{contents}
+{body}
+{carried if space else ""}
+<script>{script}</script>
+</body>
+</html>
+"""
 
 
-def with_contents(page: str) -> str:
-    """The page with a list of its sections where `<nav></nav>` stands."""
-    heads = re.findall(r"<h2>(.*?)</h2>", page)
-    links = "".join(f'<a href="#part{k}">{head}</a>' for k, head in enumerate(heads))
+def _with_contents(body: str) -> tuple[str, str]:
+    """A list of the sections, where there are some, and the body with the places that it names."""
+    heads = re.findall(r"<h2>(.*?)</h2>", body)
     if len(heads) < FEWEST_SECTIONS:
-        return page.replace("<nav></nav>\n", "", 1)
+        return "", body
     number = iter(range(len(heads)))
-    page = re.sub("<h2>", lambda _: f'<a id="part{next(number)}"></a><h2>', page)
-    return page.replace("<nav></nav>", f'<nav aria-label="Contents">{links}</nav>', 1)
+    body = re.sub("<h2>", lambda _: f'<h2 id="part{next(number)}">', body)
+    links = "".join(f'<a href="#part{k}">{head}</a>' for k, head in enumerate(heads))
+    return f'<nav aria-label="Contents">{links}</nav>', body
 
 
-@cache
-def environment() -> Environment:
-    """Templates of this package: what is not marked as markup is escaped, what is missing fails."""
-    from jinja2 import Environment, FunctionLoader, StrictUndefined
+# Blocks as HTML
 
-    made = Environment(
-        loader=FunctionLoader(resource),
-        autoescape=True,
-        # Texts come from files; what is marked as markup was made by this package.
-        finalize=lambda value: shown(value) if type(value) is str else value,
-        undefined=StrictUndefined,
-        trim_blocks=True,
-        lstrip_blocks=True,
+MINUS = re.compile(r"(?<![\w.)\]-])-(?=[\d.∞])|(?<= )-(?= )")
+VIEW = '<script type="application/json" class="view-data">'
+
+
+def text_of(text: str, typeset: bool = True) -> str:
+    """A text as HTML, as it can be read; `typeset`: with proper minus signs before numbers."""
+    found = escape(shown(text))
+    return MINUS.sub("−", found) if typeset else found
+
+
+def html_of(
+    blocks: Iterable[Block], deep: int = 2, pictures: bool = True, summary: str = ""
+) -> str:
+    """Blocks as HTML under heads of level `deep`; figures that follow each other stand in a row.
+
+    Without `pictures` figures are left out, and of folds what is not `printed`.  A table does not
+    repeat the `summary` that they stand behind.
+    """
+    parts = []
+    for kind, several in groupby(blocks, type):
+        found = [_html(block, deep, pictures, summary) for block in several]
+        if kind is Figure and pictures:
+            found = [f'<div class="figures">{"".join(found)}</div>']
+        parts += found
+    return "\n".join(part for part in parts if part)
+
+
+def _html(block: Block, deep: int, pictures: bool, summary: str) -> str:
+    if isinstance(block, Verdict):
+        return _verdict(block)
+    if isinstance(block, Key):
+        return _key(block)
+    if isinstance(block, Heading):
+        return f"<h{deep}>{text_of(block.text)}</h{deep}>"
+    if isinstance(block, Text):
+        return f'<p class="{"soft" if block.soft else "told"}">{text_of(block.text)}</p>'
+    if isinstance(block, Lines):
+        return _lines(block)
+    if isinstance(block, Table):
+        return _titled_table(block, deep, summary) if block.rows else ""
+    if isinstance(block, Fold):
+        if not (pictures or block.printed):
+            return ""
+        inside = html_of(block.blocks(), deep + bool(block.summary), pictures, block.summary)
+        if not (inside and block.summary):
+            return inside
+        return f"<details><summary>{text_of(block.summary)}</summary>\n{inside}</details>"
+    return _picture(block) if pictures else ""
+
+
+def _verdict(v: Verdict) -> str:
+    tone = '<span class="tone" aria-hidden="true"></span>'
+    return (
+        f'<section class="judgement {v.tone}" aria-label="Verdict"><p class="headline">{tone} '
+        f"{text_of(v.sentence)}</p></section>"
     )
-    made.filters["minus"] = minus
-    return made
+
+
+def _key(key: Key) -> str:
+    figures = "".join(
+        f"<div><dt>{text_of(name)}</dt><dd>{text_of(number)}</dd></div>"
+        for name, number in key.figures
+    )
+    return f'<p class="change">{text_of(key.headline)}</p><dl class="key">{figures}</dl>'
+
+
+def _lines(block: Lines) -> str:
+    """A label once for sentences that follow each other."""
+    parts = []
+    for label, items in groupby(block.items, lambda item: item[0]):
+        texts = [text_of(text) for _, text in items]
+        told = texts[0] if len(texts) == 1 else f"<ul><li>{'</li><li>'.join(texts)}</li></ul>"
+        tone = ' class="warned"' if label == WARNING else ""
+        parts.append(f"<dt{tone}>{text_of(label)}</dt><dd>{told}</dd>")
+    return f'<dl class="lines">{"".join(parts)}</dl>' if parts else ""
+
+
+def _titled_table(t: Table, deep: int, summary: str) -> str:
+    told = not t.title or summary.startswith(t.title.partition(" (")[0])
+    title = "" if told else f"<h{deep}>{text_of(t.title)}</h{deep}>\n"
+    notes = " ".join(note for note in (t.of_bars, t.note) if note)
+    below = f'\n<p class="soft">{text_of(notes)}</p>' if notes else ""
+    return f"{title}{_table(t)}{below}"
+
+
+def _table(t: Table) -> str:
+    kinds = ["name" if k in t.words else "number" for k in range(len(t.heads))]
+    heads = [
+        f'<th scope="col" class="{kind}">{text_of(head)}</th>'
+        for kind, head in zip(kinds, t.heads, strict=True)
+    ]
+    heads += ['<th class="drawn"></th>'] if t.bars else []
+    rows = []
+    for k, row in enumerate(t.rows):
+        if k in t.groups:
+            rows.append(f'<tr class="group"><th scope="colgroup" colspan="{len(heads)}">'
+                        f"{text_of(t.groups[k])}</th></tr>")  # fmt: skip
+        cells = [_cell(*each) for each in zip(kinds, t.heads, row, strict=True)]
+        cells += [f'<td class="drawn">{_bar(t.bars[k])}</td>'] if t.bars else []
+        rows.append(f"<tr>{''.join(cells)}</tr>")
+    body = "\n".join(rows)
+    return (
+        f'<table class="data" data-name="{_slug(t.title or t.heads[0])}"><thead>'
+        f"<tr>{''.join(heads)}</tr></thead>\n<tbody>{body}</tbody></table>"
+    )
+
+
+def _cell(kind: str, head: str, text: str) -> str:
+    """`data-head` stands before the cell where a screen is too narrow for columns."""
+    tone = f" {text}" if text in ("inside", "outside", "changed") else ""
+    before = "" if head == "unit" else text_of(head)
+    return f'<td class="{kind}{tone}" data-head="{before}">{text_of(text)}</td>'
+
+
+def _slug(title: str) -> str:
+    """ "Predicted intervals (95 %)" → "predicted-intervals"."""
+    return "-".join(re.findall(r"[a-z0-9]+", re.split("[(,]", title)[0].lower()))
+
+
+def _bar(bar: Bar | None) -> str:
+    """The interval around a reference, in a box of 144 by 16."""
+    if bar is None:
+        return ""
+    low, high, value = (round(72 + 70 * x, 1) for x in (bar.low, bar.high, bar.value))
+    return (
+        '<svg class="bar" viewBox="0 0 144 16" aria-hidden="true">'
+        '<line class="axis" x1="2" x2="142" y1="8" y2="8"/>'
+        f'<line class="interval" x1="{low}" x2="{high}" y1="8" y2="8"/>'
+        f'<circle class="estimate" cx="{value}" cy="8" r="3.5"/>'
+        '<line class="reference" x1="72" x2="72" y1="1" y2="15"/></svg>'
+    )
+
+
+def _picture(block: Figure | Arm) -> str:
+    caption = f"<figcaption>{text_of(block.caption)}</figcaption>" if block.caption else ""
+    if isinstance(block, Figure):
+        from elastocal.report.figures import svg
+
+        return f"<figure>{svg(block)}{caption}</figure>"
+    from elastocal.report.arm_view import space_figure, space_json
+    from elastocal.report.figures import svg
+
+    return (
+        f'<figure class="view"><div class="still">{svg(space_figure(block))}</div>'
+        f'<div class="live" hidden></div>{VIEW}{space_json(block.space)}</script>{caption}</figure>'
+    )
+
+
+# What goes with a page
 
 
 @cache
@@ -187,29 +298,16 @@ def _digest(text: str) -> str:
     return base64.b64encode(hashlib.sha256(text.encode()).digest()).decode()
 
 
-def figures_of(result: object) -> dict[str, Any]:
-    """The figures of a result's page as matplotlib's, by name; none where it has no model."""
-    if isinstance(result, Diagnosis) and result.model is None:
-        return {}
-    contents = PAGES[type(result).__name__][1]
-    with as_figures():
-        return {name: f for name, f in contents(result).get("figures", {}).items() if f}
-
-
 def sources(result: Any) -> list[Path]:
     """The cell and the tables that a result came from, as far as they are files."""
-    if isinstance(result, Comparison):
-        named = [result.old.model.cell.path, result.old.source, result.new.source]
-    elif isinstance(result, Compensation):
-        named = [result.targets.table.source]
-    elif not hasattr(result, "model"):
-        named = [result.source]
-    else:
-        named = [result.model.cell.path]
-        if isinstance(result, Calibration):
-            named.append(result.observations.table.source)
-        elif isinstance(result, Diagnosis):
-            named.append(result.data)
+    of_kind: dict[str, Callable[[Any], list[Any]]] = {
+        "Comparison": lambda c: [c.old.model.cell.path, c.old.source, c.new.source],
+        "Compensation": lambda c: [c.targets.table.source],
+        "Calibration": lambda c: [c.model.cell.path, c.observations.table.source],
+        "Diagnosis": lambda d: [d.model.cell.path, d.data],
+        "Plan": lambda p: [p.model.cell.path],
+    }
+    named = of_kind.get(type(result).__name__, lambda r: [getattr(r, "source", None)])(result)
     return [Path(path) for path in named if path is not None and Path(path).is_file()]
 
 
@@ -233,122 +331,3 @@ def software(plotly: bool = False) -> str:
 
 def resource(name: str) -> str:
     return (resources.files("elastocal.report") / name).read_text(encoding="utf-8")
-
-
-# What the page of each kind of result shows, by the names that its template has for it.
-
-
-def _calibration(
-    result: Calibration, truth: Truth | None = None, published: Published | None = None
-) -> dict[str, Any]:
-    residuals, summary, budget = residuals_of(result), summary_of(result), gap_budget(result)
-    space = residual_space(result.model, result.observations, result.x, result.residual)
-    figures = drawn_for(result, residuals, summary, budget, space)
-    return {
-        **_of(result.model, figures),
-        **identification_contents(result, summary, budget, truth, published),
-        **_residuals(result.observations, residuals, space),
-        "n_markers": len(residuals.markers),
-        **_thinning(residuals),
-    }
-
-
-def _certificate(result: Calibration) -> dict[str, Any]:
-    return {**_of(result.model, {}), **certificate_contents(result, gap_budget(result))}
-
-
-def _diagnosis(d: Diagnosis) -> dict[str, Any]:
-    model, base = d.model, d.calibrated
-    assert model is not None  # `diagnose` states it
-    figures = {
-        "causes": share_bars(d) if d.components else "",
-        "waterfall": diagnosis_waterfall(d) if d.budget else "",
-        "candidates": candidate_bars(d),
-        "curves": unknown_curves(d) if d.curves else "",
-        "effects": effects_over_joints(d),
-    }
-    shown: dict[str, Any] = {"view": None}
-    if base is not None:
-        residuals = residuals_by(base.observed, base.residual)
-        space = residual_space(base.model, base.observed, base.x, base.residual)
-        shown = _residuals(base.observed, residuals, space)
-        title = "Residuals of the calibrated arm as arrows"
-        figures |= residual_figures(base.model, base.observed, base.x, residuals, space, title)
-    return {**_of(model, figures), **diagnosis_contents(d, model.chain.kinds), **shown}
-
-
-def _plan(plan: Plan) -> dict[str, Any]:
-    space = plan_space(plan)
-    figures = {
-        "space": space_picture(space, "The arm in the poses of the plan"),
-        "intervals": plan_intervals(plan) if plan.predicted else "",
-        "removed": plan_removed(plan),
-        "curve": plan_curve(plan) if plan.curve else "",
-    }
-    return {
-        **_of(plan.model, figures),
-        **plan_contents(plan),
-        "seed": plan.seed,
-        "view": space_json(space),
-        "drawn_from": space.shells.drawn_from,
-    }
-
-
-def _shown(what: str, found: Any) -> dict[str, Any]:
-    """What a notebook shows of it, and its figures."""
-    from markupsafe import Markup
-
-    view = view_of(found)
-    drawn = [Markup(svg_of(view.plot(found, kind, False), kind)) for kind in view.figures]
-    title = found.chain.name if isinstance(found, Compensation) else found.source
-    return {"what": what, "title": title, "shown": Markup(view.html(found)), "drawn": drawn}
-
-
-def _of(model: Model, figures: Mapping[str, str]) -> dict[str, Any]:
-    """Robot and cell, once where they have the same name; the figures (SVG, empty where there is
-    nothing to draw); what evaluated the model."""
-    from markupsafe import Markup
-
-    names = dict.fromkeys([model.chain.name, model.cell.name])
-    return {
-        "title": " – ".join(name for name in names if name),
-        "figures": {n: Markup(f) if isinstance(f, str) else f for n, f in figures.items()},
-        "backend": model.backend_report(),
-    }
-
-
-def _residuals(observed: Observations, residuals: Residuals, space: Space) -> dict[str, Any]:
-    return {
-        "view": space_json(space),
-        "view_caption": view_caption(space, len(residuals.labels)),
-        "time_caption": time_caption(observed),
-        "residual_table": residual_table(observed, residuals),
-    }
-
-
-def _thinning(residuals: Residuals) -> dict[str, str]:
-    """Sentences on how many readings the scatter plots show, empty where it is all."""
-    total, shown = len(residuals.value), len(residuals.shown)
-    in_joints = min(shown, MOST_JOINT_DOTS // residuals.positions)
-    text = " Dots are a random choice of {} of {} readings; everything else uses all of them."
-    return {
-        "thinned": text.format(shown, total) if shown < total else "",
-        "thinned_joints": text.format(in_joints, total) if in_joints < total else "",
-    }
-
-
-def _comparison(c: Comparison) -> dict[str, Any]:
-    draw = partial(draw_map, c=c)
-    figures = {"map": drawn(draw, 8.0, 3.6, "How far the tool has moved")}
-    return {**_of(c.old.model, figures), **changes_contents(c)}
-
-
-PAGES: dict[str, tuple[str, Callable[..., dict[str, Any]]]] = {
-    "Calibration": ("identification.html.j2", _calibration),
-    "Comparison": ("changes.html.j2", _comparison),
-    "Plan": ("plan.html.j2", _plan),
-    "Diagnosis": ("diagnosis.html.j2", _diagnosis),
-    "Compensation": ("shown.html.j2", partial(_shown, "Compensation")),
-    "Measurements": ("shown.html.j2", partial(_shown, "Readings")),
-    "NextPoses": ("shown.html.j2", partial(_shown, "Next poses")),
-}

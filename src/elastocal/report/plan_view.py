@@ -1,8 +1,10 @@
-"""What a measurement plan says: its rows and its sentences."""
+"""What a measurement plan says, as blocks: its worth, the stops, and what is behind them."""
 
 from __future__ import annotations
 
 import math
+from collections.abc import Iterator
+from dataclasses import replace
 from typing import TYPE_CHECKING, Any
 
 from elastocal.errors import option
@@ -10,42 +12,161 @@ from elastocal.planning.bodies import mounting_plane
 from elastocal.planning.criteria import CRITERIA
 from elastocal.planning.drift import DRIFT
 from elastocal.planning.plan import Plan, Predicted, Reason
+from elastocal.report.blocks import (
+    WARNING,
+    Block,
+    Figure,
+    Fold,
+    Key,
+    Lines,
+    Report,
+    Table,
+    Verdict,
+)
 from elastocal.report.formatting import (
-    ShownTable,
-    Tone,
-    capital,
     counted,
     display,
     joint_heads,
     joint_texts,
+    length,
     significant,
+    title_of,
 )
 from elastocal.text import listed, printable
 
 if TYPE_CHECKING:
     from elastocal.diagnosis.next_poses import NextPoses
 
+
+def report(plan: Plan) -> Report:
+    """A plan: what it is worth and the stops to make; behind them poses, proof and order."""
+    model = plan.model
+    title = title_of(model.chain.name, model.cell.name)
+    return Report("Measurement plan", title, plan_blocks(plan), model.backend_report(), plan.seed)
+
+
+def plan_blocks(plan: Plan) -> Iterator[Block]:
+    yield Fold("", lambda: [_key(plan)])
+    # A gap to the bound is no fault of the plan's: with few poses much of it is the bound's.
+    yield Verdict("warn" if plan.warnings else "good", plan_headline(plan))
+    yield Lines([(WARNING, printable(text)) for text in plan.warnings])
+    steps = Lines([("Next", text) for text in plan_steps(plan)])
+    yield Fold("", lambda: [steps, stop_table(plan), _arm(plan)], figures=("poses",))
+    yield Fold("Poses", lambda: [pose_table(plan)], printed=True)
+    yield Fold("Why each pose", lambda: [reason_table(plan)], printed=True)
+    yield Fold("Predicted intervals", lambda: [interval_table(plan), interval_figure(plan)],
+               printed=True, figures=("intervals",))  # fmt: skip
+    if plan.curve:
+        yield Fold("Number of poses", lambda: _curve(plan), printed=True, figures=("curve",))
+    if plan.timed:
+        yield Fold("Poses and readings within the time", lambda: [timed_table(plan)], printed=True)
+    yield Fold("What the plan is worth", lambda: [Lines(plan_lines(plan))], printed=True)
+    yield Fold("How each stop is reached", lambda: [way_table(plan)])
+    yield Fold("Feasible candidates", lambda: [removal_table(plan)])
+
+
+def next_report(found: NextPoses) -> Report:
+    """Whether to measure more, what it brings, and the poses."""
+    return Report("Next poses", printable(found.source), _next_blocks(found))
+
+
+def _next_blocks(found: NextPoses) -> Iterator[Block]:
+    yield Lines(next_lines(found))
+    yield Fold("", lambda: _next_figures(found), figures=("gain", "doubts"))
+    if found.plan is not None:
+        yield from plan_blocks(found.plan)
+
+
+def _key(plan: Plan) -> Key:
+    n, minutes = counted(len(plan.q), "pose"), f"{plan.execution.total / 60:.0f} min"
+    worth = f"{plan.criterion} = {plan.reported:.4g} {plan.unit}".rstrip()
+    figures = [("poses", str(len(plan.q)))]
+    if plan.of_test_poses:
+        worth = f"{_rho(plan):.3g} µm"
+        figures.append(("error at the test poses", worth))
+    if (e := plan.everywhere) is not None:
+        figures.append(("error over the joint ranges", f"{e.elsewhere * 1e6:.3g} µm"))
+    figures.append(("time", minutes))
+    if len(figures) < 4:
+        figures.append(("load states", str(len(plan.forces))))
+    return Key(f"{n} → {worth}, {minutes}", figures)
+
+
+def _arm(plan: Plan) -> Block:
+    from elastocal.report.arm_view import plan_arm
+
+    return plan_arm(plan)
+
+
+def _curve(plan: Plan) -> Iterator[Block]:
+    from elastocal.report.figures import plan_curve
+
+    yield curve_table(plan)
+    yield plan_curve(plan)
+
+
+MOST_DOTS = 40
+
+
+def interval_figure(plan: Plan) -> Figure:
+    """Half widths of the 95 % intervals that the plan promises."""
+    from elastocal.report.figures import Row, rows_of_dots
+
+    rows = []
+    for p in plan.predicted[:MOST_DOTS]:
+        half, unit = display(p.half_width, p.unit)
+        rows.append(Row(p.name, half, text=f"{significant(half, 2)} {unit}"))
+    axis = "half width of the 95 % interval, in the unit of the number"
+    return rows_of_dots("intervals", "Predicted intervals", rows, axis, logarithmic=True)
+
+
+def _next_figures(found: NextPoses) -> Iterator[Figure]:
+    """The error before and after the batch, and the effects that the model may lack."""
+    from elastocal.report.effect_names import name_of, probability
+    from elastocal.report.figures import Row, rows_of_dots
+
+    g = found.gain
+    names = ("measured so far", "with this batch")
+    rows = [
+        Row(f"{name}{model}", value * 1e6, text=length(value))
+        for model, values in (("", (g.before, g.after)),
+                              (", if the model is right", (g.model_before, g.model_after)))
+        for name, value in zip(names, values, strict=True) if math.isfinite(value)
+    ]  # fmt: skip
+    axis = "rms error at the test poses"
+    yield rows_of_dots("gain", "Error before and after the batch", rows, axis, lengths=True)
+    doubted = [
+        Row(name_of(f"{effect} at {where}"), p, text=probability(p))
+        for effect, where, p in found.doubts[:MOST_DOTS]
+    ]
+    title = "Effects that the model may lack"
+    yield rows_of_dots("doubts", title, doubted, "probability")
+
+
 TOLD = 2  # parameters that a pose serves, in the table
 SERVES = "most affected if dropped (standard deviation)"
 
 
-def pose_rows(plan: Plan, reasons: bool = True, decimals: int = 2) -> ShownTable:
-    """Joint values, load, place in the order of execution, and what the pose is there for."""
+def pose_table(plan: Plan) -> Table:
+    """Joint values, load, place in the order of execution; less digits where there is no room."""
+    two, one, none = (_poses(plan, decimals) for decimals in (2, 1, 0))
+    return replace(two, narrow=replace(one, narrow=none))
+
+
+def _poses(plan: Plan, decimals: int) -> Table:
     kinds = plan.model.chain.kinds
     loads = len(plan.forces) > 1 and bool((plan.load >= 0).any())
     heads = ["pose", *joint_heads(kinds), *(["load N"] if loads else []), "order"]
     heads += [] if plan.seen is None else ["markers"]
-    heads += [SERVES] if reasons else []
     order = first_stops(plan)
     rows: list[tuple[str, ...]] = []
-    for k, reason in enumerate(plan.reasons):
-        row = [plan.configurations[k], *joint_texts(plan.q[k], kinds, decimals)]
-        if loads:
-            row.append(force_text(plan, int(plan.load[k])))
+    for k, name in enumerate(plan.configurations):
+        row = [name, *joint_texts(plan.q[k], kinds, decimals)]
+        row += [force_text(plan, int(plan.load[k]))] if loads else []
         row += [str(order[k]), *([] if plan.seen is None else [printable(plan.markers(k))])]
-        rows.append((*row, *([served(reason)] if reasons else [])))
-    texts = [k for k, head in enumerate(heads) if head in ("markers", SERVES)]
-    return ShownTable(tuple(heads), rows, tuple(texts))
+        rows.append(tuple(row))
+    words = tuple(k for k, head in enumerate(heads) if head == "markers")
+    return Table(tuple(heads), rows, words, title="Poses")
 
 
 def first_stops(plan: Plan) -> dict[int, int]:
@@ -58,10 +179,10 @@ def force_text(plan: Plan, load: int) -> str:
     return " ".join(f"{f:g}" for f in plan.forces[load])
 
 
-def reason_rows(plan: Plan) -> ShownTable:
+def reason_table(plan: Plan) -> Table:
     """What each pose is there for."""
     rows = [(name, served(r)) for name, r in zip(plan.configurations, plan.reasons, strict=True)]
-    return ShownTable(("pose", SERVES), rows, (1,))
+    return Table(("pose", SERVES), rows, (1,), title="Why each pose")
 
 
 def served(reason: Reason) -> str:
@@ -73,7 +194,7 @@ def served(reason: Reason) -> str:
     return ", ".join(parts) or "all slightly"
 
 
-def interval_rows(plan: Plan) -> ShownTable:
+def interval_table(plan: Plan) -> Table:
     """Predicted half widths of the 95 % intervals."""
     combined = any(p.combined_with for p in plan.predicted)
     rows: list[tuple[str, ...]] = []
@@ -81,8 +202,9 @@ def interval_rows(plan: Plan) -> ShownTable:
         shown, unit = display(p.half_width, p.unit)
         row = (printable(p.name), significant(shown, 2), unit)
         rows.append((*row, _partners(p)) if combined else row)
-    heads = ("parameter", "± 95 %", "unit")
-    return ShownTable((*heads, "together with") if combined else heads, rows, (0, 2, 3))
+    heads: tuple[str, ...] = ("parameter", "± 95 %", "unit")
+    heads = (*heads, "together with") if combined else heads
+    return Table(heads, rows, (0, 2, 3), title="Predicted intervals")
 
 
 def _partners(p: Predicted) -> str:
@@ -90,24 +212,23 @@ def _partners(p: Predicted) -> str:
     return ", ".join(names[:3]) + (f" and {len(names) - 3} more" if len(names) > 3 else "")
 
 
-def curve_rows(plan: Plan) -> ShownTable:
+def curve_table(plan: Plan) -> Table:
     """The criterion against the number of poses."""
     heads = ("poses", f"{plan.criterion} {plan.unit}".strip(), "best possible on the pool")
     rows = [
         (str(s.poses), f"{s.value:.4g}", "–" if s.bound is None else f"{s.bound:.4g}")
         for s in plan.curve
     ]
-    return ShownTable(heads, rows, ())
+    return Table(heads, rows, (), title="Number of poses")
 
 
-def timed_rows(plan: Plan) -> ShownTable:
+def timed_table(plan: Plan) -> Table:
     """The criterion against numbers of poses and of readings that the time allows."""
     heads = ("poses", "readings each", "minutes", f"{plan.criterion} {plan.unit}".strip())
-    return ShownTable(
-        heads,
-        [(str(s.poses), str(s.repeats), f"{s.minutes:.0f}", f"{s.value:.4g}") for s in plan.timed],
-        (),
-    )
+    rows = [
+        (str(s.poses), str(s.repeats), f"{s.minutes:.0f}", f"{s.value:.4g}") for s in plan.timed
+    ]
+    return Table(heads, rows, (), title="Poses and readings within the time")
 
 
 def removed(plan: Plan) -> list[tuple[str, int]]:
@@ -116,42 +237,44 @@ def removed(plan: Plan) -> list[tuple[str, int]]:
     return [(name.replace("_", " "), n) for name, n in items if n]
 
 
-def removal_rows(plan: Plan) -> ShownTable:
+def removal_table(plan: Plan) -> Table:
     """What became of the candidates, rule by rule."""
     tried = max(plan.candidates.tried, 1)
     counts = [*removed(plan), ("feasible", plan.candidates.feasible)]
     rows: list[tuple[str, ...]] = [(name, str(n), f"{100 * n / tried:.1f} %") for name, n in counts]
-    return ShownTable(("rule", "candidates", "share"), rows)
+    note = "Rules are checked in order; a pose counts for the first it violates."
+    return Table(("rule", "candidates", "share"), rows, note=note)
 
 
-def stop_rows(plan: Plan) -> ShownTable:
-    """The stops in the order of execution: pose, load, how it is reached, what it takes."""
-    kinds = plan.model.chain.kinds
-    rows: list[tuple[str, ...]] = []
+def stop_table(plan: Plan) -> Table:
+    """The stops in the order of execution: what the operator does at each, with a box to tick."""
+    motion, rows, now = plan.execution.motion, [], 0.0
+    loads = len(plan.forces) > 1
     for k, stop in enumerate(plan.execution.stops):
-        rows.append(
-            (
-                str(k + 1),
-                stop.name(plan.configurations),
-                force_text(plan, stop.load),
-                "by hand" if stop.change_after is not None else "",
-                str(len(stop.via)),
-                f"{stop.travel:.1f}",
-                *joint_texts(stop.q, kinds),
-            )
-        )
-    heads = ("stop", "pose", "load N", "load change", "points in between", "travel s")
-    return ShownTable((*heads, *joint_heads(kinds)), rows, (2, 3))
+        change = stop.change_after is not None
+        now += stop.travel + motion.load_change * change
+        load = [f"{force_text(plan, stop.load)}{', to change' * change}"] if loads else []
+        rows.append((str(k + 1), stop.name(plan.configurations), *load, f"{now / 60:.0f}", "☐"))
+        now += motion.dwell
+    heads = ("stop", "pose", *(["load in N"] if loads else []), "minute", "done")
+    return Table(heads, rows, (2,) if loads else (), title="Stops in order")
+
+
+def way_table(plan: Plan) -> Table:
+    """How each stop is reached."""
+    kinds = plan.model.chain.kinds
+    rows = [
+        (str(k + 1), stop.name(plan.configurations), str(len(stop.via)), f"{stop.travel:.1f}",
+         *joint_texts(stop.q, kinds))
+        for k, stop in enumerate(plan.execution.stops)
+    ]  # fmt: skip
+    heads = ("stop", "pose", "via points", "travel s", *joint_heads(kinds))
+    note = "Via points lead around obstacles; nothing is measured there."
+    return Table(heads, rows, (), note=note)
 
 
 APART = 0.02  # of the criterion, between starts of the search: more of them may find better
 VAIN = 0.1  # below which the bound says nothing: so few poses cannot be spread as its weights are
-
-
-def plan_lead(plan: Plan) -> str:
-    n, forces = len(plan.q), len(plan.forces)
-    readings = f"{counted(n, 'pose')}, {counted(forces, 'load state')}"
-    return f"{readings}, {counted(len(plan.model.cell.tool.markers), 'marker')}"
 
 
 def plan_headline(plan: Plan) -> str:
@@ -182,11 +305,6 @@ def _apart(plan: Plan) -> bool:
     """Did the starts of the search end so far apart that more of them may find a better plan?"""
     ends = plan.certificate.starts
     return len(ends) > 1 and max(ends) - min(ends) > APART * max(abs(end) for end in ends)
-
-
-def plan_tone(plan: Plan) -> Tone:
-    """A gap to the bound is no fault of the plan's: with few poses much of it is the bound's."""
-    return "care" if plan.warnings else "good"
 
 
 def plan_steps(plan: Plan) -> list[str]:
@@ -232,7 +350,7 @@ def plan_lines(plan: Plan) -> list[tuple[str, str]]:
     if plan.polished:
         text = f"{plan.polished} of {len(plan.q)} poses come from local searches between the drawn"
         lines.append(("Polish", f"{text} candidates."))
-    return lines + [("Warning", printable(text)) for text in plan.warnings]
+    return lines
 
 
 def _chosen_lines(plan: Plan) -> list[tuple[str, str]]:
@@ -469,23 +587,3 @@ def next_lines(found: NextPoses) -> list[tuple[str, str]]:
     if doubts:
         lines.append(("In doubt", printable(f"likeliest {', '.join(doubts)}.")))
     return lines
-
-
-def plan_contents(plan: Plan) -> dict[str, Any]:
-    """Words and tables of the page, by the names that its template has for them."""
-    lines = plan_lines(plan)
-    return {
-        "lead": plan_lead(plan),
-        "headline": plan_headline(plan),
-        "tone": plan_tone(plan),
-        "verdict": [(label, capital(text)) for label, text in lines if label != "Warning"],
-        "warnings": [text for label, text in lines if label == "Warning"],
-        "steps": plan_steps(plan),
-        "poses": pose_rows(plan, reasons=False),
-        "reasons": reason_rows(plan),
-        "stops": stop_rows(plan),
-        "intervals": interval_rows(plan),
-        "removed": removal_rows(plan),
-        "curve": curve_rows(plan),
-        "timed": timed_rows(plan),
-    }

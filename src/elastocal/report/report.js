@@ -83,7 +83,7 @@ function prepareTable(table) {
     if (save.href.startsWith("blob:")) URL.revokeObjectURL(save.href);
     save.href = URL.createObjectURL(new Blob(["\ufeff" + csvOf(table)], { type: "text/csv" }));
   });
-  table.closest(".scroll").after(save);
+  table.after(save);
 }
 
 // The 3-D view.
@@ -221,7 +221,7 @@ class View {
   }
 
   draw() {
-    this.told.textContent = this.words();
+    this.told.textContent = this.words().replace(/(^|\s)-(?=\d)/g, "$1−");
     return Plotly.react(this.plot, this.traces(), this.layout(),
       { responsive: true, displaylogo: false, scrollZoom: true,
         modeBarButtons: [["zoom3d", "pan3d", "tableRotation", "resetCameraDefault3d"]] });
@@ -298,6 +298,7 @@ function drawsInSpace() {
 
 /** plotly.js, which the page carries packed. */
 async function loadPlotly() {
+  if (window.Plotly) return;
   const packed = atob(document.getElementById("plotly").textContent);
   const bytes = Uint8Array.from(packed, letter => letter.charCodeAt(0));
   const stream = new Blob([bytes]).stream().pipeThrough(new DecompressionStream("gzip"));
@@ -306,13 +307,21 @@ async function loadPlotly() {
   document.head.append(script);
 }
 
+/** Draw a view, when the fold that it stands in is opened: what is hidden has no size. */
+async function showView(figure) {
+  const fold = figure.closest("details");
+  if (fold && !fold.open) {
+    fold.addEventListener("toggle", () => showView(figure), { once: true });
+    return;
+  }
+  await loadPlotly();
+  await new View(figure).show();
+}
+
 async function showViews() {
-  const figures = [...document.querySelectorAll("figure.view")];
-  if (!figures.length) return;
   // The still picture stays where the browser cannot do better.
   if (typeof DecompressionStream === "undefined" || !drawsInSpace()) return;
-  await loadPlotly();
-  for (const figure of figures) await new View(figure).show();
+  for (const figure of document.querySelectorAll("figure.view")) await showView(figure);
 }
 
 document.querySelectorAll("table.data").forEach(prepareTable);

@@ -1,67 +1,79 @@
-"""The figures of the identification report, each an SVG element."""
+"""Figures of residuals: over configurations, joints and time, against normal noise, in space."""
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 from typing import TYPE_CHECKING
 
 import numpy as np
 
 from elastocal.errors import ElastocalError
-from elastocal.identification.error_budget import ErrorBudget
 from elastocal.identification.prediction import over_the_workspace
-from elastocal.identification.residuals import GroupSummary, ResidualSummary
+from elastocal.identification.residuals import ResidualSummary
 from elastocal.identification.result import Calibration
 from elastocal.identification.smooth_part import SmoothPart
 from elastocal.model.manipulator import Model
 from elastocal.model.observations import Observations
 from elastocal.model.rigid import nominal_flanges
-from elastocal.report.arm_view import Space, space_picture
-from elastocal.report.figures import (
-    FAINT,
-    INK,
-    SERIES,
-    dots,
-    drawn,
-    micrometre_axis,
-    panels_of,
-    waterfall_of_steps,
-)
-from elastocal.report.formatting import display, length, short_name, significant
-from elastocal.report.identification_view import before_and_after, budget_steps, rms_by_kind
-from elastocal.report.residual_view import Residuals, reach, rms_by_pose, running_mean
+from elastocal.report.arm_view import residual_arm
+from elastocal.report.blocks import Arm, Figure
+from elastocal.report.figures import FAINT, INK, SERIES, dots, panels_of
+from elastocal.report.formatting import display, short_name, significant
+from elastocal.report.residual_view import Residuals, reach, residuals_by, running_mean
 from elastocal.text import printable
 from elastocal.units import Array, IntArray
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
-    from matplotlib.figure import Figure
+    from matplotlib.figure import Figure as Drawing
 
-WIDTH = 9.9
-MOST_LABELS = 30
+MOST_LABELS = 20
 MOST_SMOOTH = 24  # smooth functions
 MOST_JOINT_DOTS = 2000  # per joint; the running mean uses every reading
 
 
-def by_configuration(residuals: Residuals) -> str:
+def residual_figures(
+    model: Model, observed: Observations, x: Array, residual: Array
+) -> Iterator[Figure | Arm]:
+    """Where, when and in which poses an arm at parameter values x (parameters,) errs, by its
+    `residual` (rows,)."""
+    residuals = residuals_by(observed, residual)
+    yield residual_arm(model, observed, x, residual)
+    yield over_configurations(residuals)
+    yield over_joints(model.chain.kinds, residuals)
+    yield over_time(observed, residuals)
+
+
+def _thinned(residuals: Residuals, most: int) -> str:
+    """That the dots are a choice, where they are."""
+    total, shown = len(residuals.value), min(len(residuals.shown), most)
+    if shown == total:
+        return ""
+    return f" Dots are a random choice of {shown} of {total} readings; all else uses all of them."
+
+
+def over_configurations(residuals: Residuals) -> Figure:
     """Residual of every reading over its configuration, a panel per direction."""
     n = len(residuals.components)
+    several = 1 < len(residuals.markers) <= len(SERIES)
 
-    def draw(figure: Figure) -> None:
+    def draw(figure: Drawing) -> None:
         panels = figure.subplots(n, 1, sharex=True, squeeze=False)[:, 0]
         for k, axes in enumerate(panels):
             _configuration_panel(axes, residuals, k)
         panels[-1].set_xlabel("configuration")
         every = range(0, len(residuals.labels), -(-len(residuals.labels) // MOST_LABELS))
         names = [short_name(residuals.labels[i]) for i in every]
-        turn = 90 if max(map(len, names)) > 3 else 0
+        turn = 90 if max(map(len, names)) > 2 else 0
         panels[-1].set_xticks(list(every), names, rotation=turn)
-        if 1 < len(residuals.markers) <= len(SERIES):
-            figure.legend(
-                *panels[0].get_legend_handles_labels(), loc="outside upper right", ncols=6
-            )
+        if several:
+            found = panels[0].get_legend_handles_labels()
+            figure.legend(*found, loc="outside upper right", ncols=6)
 
-    return drawn(draw, WIDTH, 0.6 + 1.5 * n, "Residuals by configuration, marker and direction")
+    caption = "Observed minus predicted, by configuration" + " and marker" * several + "."
+    caption += _thinned(residuals, len(residuals.shown))
+    title = "Residuals by configuration, marker and direction"
+    return Figure("residuals", title, draw, 0.7 + 1.3 * n, caption)
 
 
 def _configuration_panel(axes: Axes, residuals: Residuals, k: int) -> None:
@@ -85,25 +97,29 @@ def _configuration_panel(axes: Axes, residuals: Residuals, k: int) -> None:
     _limit(axes, values, reach(residuals.value[:, alike]))
 
 
-def against_joints(kinds: Sequence[str], residuals: Residuals) -> str:
+def over_joints(kinds: Sequence[str], residuals: Residuals) -> Figure:
     """Residual over the position of each joint, of `kinds`, with the running mean by direction."""
-    rows = -(-len(kinds) // 3)
-    n = residuals.positions
-    shown = residuals.shown
+    n, shown = residuals.positions, residuals.shown
     if len(shown) * n > MOST_JOINT_DOTS:
         shown = np.random.default_rng(0).choice(shown, MOST_JOINT_DOTS // n, replace=False)
 
-    def draw(figure: Figure) -> None:
-        panels = panels_of(figure, len(kinds), min(3, len(kinds)), sharey=True)
+    def draw(figure: Drawing) -> None:
+        panels = panels_of(figure, len(kinds), 2, sharey=True)
         for j, (axes, kind) in enumerate(zip(panels, kinds, strict=True)):
             q = np.degrees(residuals.q[:, j]) if kind == "revolute" else residuals.q[:, j] * 1e3
             _over(axes, q, residuals, shown, 1.3)
             axes.set_xlabel(f"joint {j + 1} in {'°' if kind == 'revolute' else 'mm'}")
-        figure.supylabel("residual in µm", fontsize=9)
-        handles = panels[0].get_legend_handles_labels()
-        figure.legend(*handles, loc="outside upper right", ncols=n)
+        figure.supylabel("residual in µm", fontsize=10)
+        found = panels[0].get_legend_handles_labels()
+        figure.legend(*found, loc="outside upper right", ncols=n)
 
-    return drawn(draw, WIDTH, 0.4 + 2.0 * rows, "Residuals against joint positions")
+    caption = (
+        "Over joint positions; lines are means of equally many readings with twice their standard "
+        "error. A wave or slope is an effect that the model lacks."
+    )
+    caption += _thinned(residuals, MOST_JOINT_DOTS // n)
+    height = 0.5 + 1.75 * -(-len(kinds) // 2)
+    return Figure("against_joints", "Residuals against joint positions", draw, height, caption)
 
 
 def _over(
@@ -124,73 +140,6 @@ def _over(
     axes.set_ylim(-height, height)
 
 
-def errors(result: Calibration) -> str:
-    """Nominal, fitted, held-out and test rms on one axis, logarithmic where they differ much."""
-    rows = [(name, v) for name, v in rms_by_kind(result) if np.isfinite(v) and v > 0]
-
-    def draw(figure: Figure) -> None:
-        axes = figure.subplots()
-        for k, (name, v) in enumerate(rows):
-            colour = SERIES[0] if name.startswith("nominal") else SERIES[1]
-            axes.plot([v * 1e6], [-k], "o", color=colour, markersize=8)
-            axes.annotate(length(v), (v * 1e6, -k), (0, 7), textcoords="offset points", ha="center")
-        names = [name.replace(" (", "\n(") for name, _ in rows]
-        axes.set_yticks([-k for k in range(len(rows))], names)
-        axes.set_ylim(0.6 - len(rows), 0.7)
-        sizes = [v for _, v in rows]
-        if max(sizes, default=1.0) > 8 * min(sizes, default=1.0):
-            axes.set_xscale("log")
-            axes.margins(x=0.25)
-        else:
-            axes.set_xlim(0, 1.25e6 * max(sizes, default=1.0))
-        micrometre_axis(axes, "rms error")
-
-    return drawn(draw, WIDTH / 2, 2.9, "Nominal, fitted, held-out and test error")
-
-
-def before_after(found: dict[str, Array]) -> str:
-    """Histograms of error lengths (n,) in m by name, on one logarithmic axis."""
-    every = np.maximum(np.concatenate(list(found.values())) * 1e6, 1e-6)
-    low, high = np.quantile(every, 0.005), 1.001 * every.max()
-    edges = np.geomspace(min(low, high / 2), high, 31)
-
-    def draw(figure: Figure) -> None:
-        axes = figure.subplots()
-        for k, (name, e) in enumerate(found.items()):
-            counts = np.histogram(np.clip(e * 1e6, edges[0], None), edges)[0] / len(e)
-            axes.stairs(counts, edges, fill=True, color=SERIES[k], alpha=0.35)
-            axes.stairs(counts, edges, color=SERIES[k], linewidth=1.4, label=name,
-                        linestyle=("-", "--", ":")[k % 3])  # fmt: skip
-        axes.set_xscale("log")
-        micrometre_axis(axes, "length of the error")
-        axes.set_ylabel("share of the readings")
-        axes.legend(fontsize=8)
-
-    return drawn(draw, WIDTH, 2.7, "Errors before and after calibration")
-
-
-def held_out(result: Calibration, residuals: Residuals) -> str:
-    """Held-out against fitted rms of every configuration: far above the line, few others help."""
-    fitted, held = rms_by_pose(result, residuals)
-    finite = np.isfinite(held)
-    unit, factor = ("mm", 1e-3) if fitted.max(initial=0.0) > 5e3 else ("µm", 1.0)
-
-    def draw(figure: Figure) -> None:
-        axes = figure.subplots()
-        top = 1.08 * factor * max([*fitted, *held[finite], 1e-9])
-        axes.plot([0, top], [0, top], color=FAINT, linewidth=1.0, label="no difference")
-        dots(axes, fitted * factor, held * factor, SERIES[2], 4.0, "a configuration")
-        axes.set_xlim(0, top)
-        axes.set_ylim(0, top)
-        axes.set_xlabel(f"fitted rms in {unit}")
-        axes.set_ylabel(f"held-out rms in {unit}")
-        axes.legend(loc="lower right", fontsize=8)
-        if not finite.all():
-            _remark(axes, f"{int((~finite).sum())} without held-out error")
-
-    return drawn(draw, WIDTH / 2, 2.9, "Held-out against fitted error by configuration")
-
-
 def _limit(axes: Axes, values: np.ndarray, height: float) -> None:
     axes.set_ylim(-height, height)
     if beyond := int((np.abs(values) > height).sum()):
@@ -201,30 +150,11 @@ def _remark(axes: Axes, text: str) -> None:
     axes.text(0.01, 0.97, text, transform=axes.transAxes, va="top", fontsize=8)
 
 
-def histogram(summary: ResidualSummary) -> str:
-    """Standardised residuals beside what the noise model expects in each bin."""
-
-    def draw(figure: Figure) -> None:
-        axes = figure.subplots()
-        _histogram_bars(axes, summary.whole, summary.edges, "residual / its standard deviation")
-        axes.set_ylabel("values")
-        axes.legend(loc="upper right", fontsize=8)
-
-    return drawn(draw, WIDTH / 2, 2.9, "Histogram of standardised residuals beside the expected")
-
-
-def _histogram_bars(axes: Axes, group: GroupSummary, edges: np.ndarray, label: str) -> None:
-    axes.stairs(group.counts, edges, fill=True, color=SERIES[0], alpha=0.5, label="observed")
-    axes.stairs(group.expected, edges, color=INK, linewidth=1.1, baseline=None, label="expected")
-    beyond = f"{group.beyond} beyond this axis" if group.beyond else ""
-    axes.set_xlabel("; ".join(text for text in (label, beyond) if text))
-
-
-def scores(summary: ResidualSummary) -> str:
+def normal_scores(summary: ResidualSummary) -> Figure:
     """Ordered residuals against normal order statistics, with the simultaneous 95 % band."""
     s = summary.whole.scores
 
-    def draw(figure: Figure) -> None:
+    def draw(figure: Drawing) -> None:
         axes = figure.subplots()
         axes.fill_between(s.expected, s.low, s.high, color=FAINT, alpha=0.3, linewidth=0,
                           label="95 % band for all together")  # fmt: skip
@@ -238,17 +168,18 @@ def scores(summary: ResidualSummary) -> str:
                       markersize=4.0, label="outside")  # fmt: skip
         axes.set_xlabel("expected of a normal distribution")
         axes.set_ylabel("observed")
-        axes.legend(loc="upper left", fontsize=8)
+        axes.legend(loc="upper left")
 
-    return drawn(draw, WIDTH / 2, 2.9, "Normal scores of the residuals with a 95 % band")
+    caption = (
+        "Residuals over their standard deviations, in order, against those of a normal "
+        "distribution. If the noise model is right, all dots stay in the band in 95 % of tables. "
+        "Ends that bend away are outliers; another slope is another size."
+    )
+    title = "Normal scores of the residuals with a 95 % band"
+    return Figure("scores", title, draw, 3.4, caption)
 
 
-CELLS = 6  # of the work space's longest side
-FEWEST = 3  # readings from which on a cell is told
-FEWEST_ON_MAP = 30  # poses
-
-
-def over_time(observed: Observations, residuals: Residuals) -> str:
+def over_time(observed: Observations, residuals: Residuals) -> Figure:
     """Residual of every reading over time, or over the table's order where no time was recorded."""
     table, lead = observed.table, observed.lead
     if table.time is None:
@@ -258,17 +189,32 @@ def over_time(observed: Observations, residuals: Residuals) -> str:
         hours = float(np.ptp(seconds)) > 3 * 3600
         at, label = seconds / (3600 if hours else 60), f"time in {'h' if hours else 'min'}"
 
-    def draw(figure: Figure) -> None:
+    def draw(figure: Drawing) -> None:
         axes = figure.subplots()
         _over(axes, at, residuals, residuals.shown, 1.5, ("-", "--", ":"))
         axes.set_xlabel(label)
         axes.set_ylabel("residual in µm")
         figure.legend(loc="outside upper right", ncols=residuals.positions)
 
-    return drawn(draw, WIDTH, 2.6, "Residuals over time")
+    when = (
+        "Over time"
+        if table.time is not None
+        else ("In the order of the table, which has no column time_s or time_min")
+    )
+    caption = (
+        f"{when}; lines are means with twice their standard error. A slope is a drift, a step "
+        "something that moved."
+    )
+    caption += _thinned(residuals, len(residuals.shown))
+    return Figure("over_time", "Residuals over time", draw, 2.9, caption)
 
 
-def uncertainty_map(result: Calibration) -> str:
+CELLS = 6  # of the work space's longest side
+FEWEST = 3  # readings from which on a cell is told
+FEWEST_ON_MAP = 30  # poses
+
+
+def uncertainty_map(result: Calibration) -> Figure | None:
     """How sure the tool's place is over reach and height, under the loads measured: rms in µm of
     each part of the workspace; empty where the model asks for more than joints and load."""
     model, point = result.model, None
@@ -281,23 +227,29 @@ def uncertainty_map(result: Calibration) -> str:
         found = result.position(poses.q, poses.force, point)
         nominal = nominal_flanges(model.chain, poses.q)[:, :3, 3]
     except ElastocalError:
-        return ""
+        return None
     variance = np.trace(found.covariance, axis1=1, axis2=2)
     good = np.isfinite(variance)
     if good.sum() < FEWEST_ON_MAP:
-        return ""
+        return None
     at = np.column_stack([np.hypot(nominal[:, 0], nominal[:, 1]), nominal[:, 2]])[good]
 
     what = printable(f"marker {point}" if point in markers else "tool")
 
-    def draw(figure: Figure) -> None:
+    def draw(figure: Drawing) -> None:
         axes = figure.subplots()
         axes.set_title(what)
         _map(axes, at, 1e12 * variance[good], float(np.ptp(at, axis=0).max()) / CELLS)
         axes.set_xlabel("distance from the base's z axis in m")
         axes.set_ylabel("height over the base in m")
 
-    return drawn(draw, WIDTH / 2, 3.6, "How sure the place of the tool is over the work space")
+    caption = (
+        "Expected error of the tool in µm (rms, measurement noise excluded), by where the nominal "
+        "flange stands: poses over the joint limits, under the loads measured. It counts the "
+        "covariance of the estimates, what these poses do not show, and possible model error."
+    )
+    title = "Expected error over the work space"
+    return Figure("sureness", title, draw, 4.2, caption)
 
 
 def _map(axes: Axes, at: Array, squared: Array, side: float) -> None:
@@ -319,14 +271,14 @@ def _map(axes: Axes, at: Array, squared: Array, side: float) -> None:
                                  facecolor=SERIES[0], alpha=shade, linewidth=0))  # fmt: skip
         middle = corner + side / 2
         axes.text(float(middle[0]), float(middle[1]), significant(float(size), 2), ha="center",
-                  va="center", fontsize=8)  # fmt: skip
+                  va="center", fontsize=9)  # fmt: skip
     high = low + side * (keys.max(axis=0) + 1)
     axes.set_xlim(float(low[0]) - 0.05 * side, float(high[0]) + 0.05 * side)
     axes.set_ylim(float(low[1]) - 0.05 * side, float(high[1]) + 0.05 * side)
     axes.set_aspect("equal")
 
 
-def smooth_figure(result: Calibration) -> str:
+def smooth_figure(result: Calibration) -> Figure | None:
     """Every function with its 95 % band, without what offsets and lengths can stand for."""
     found = [
         (part, unit)
@@ -335,15 +287,18 @@ def smooth_figure(result: Calibration) -> str:
         for unit in part.sizes
     ][:MOST_SMOOTH]
     if not found:
-        return ""
-    rows = -(-len(found) // 3)
+        return None
 
-    def draw(figure: Figure) -> None:
-        panels = panels_of(figure, len(found), min(3, len(found)))
-        for axes, (part, unit) in zip(panels, found, strict=True):
+    def draw(figure: Drawing) -> None:
+        for axes, (part, unit) in zip(panels_of(figure, len(found), 2), found, strict=True):
             _panel(axes, part, unit)
 
-    return drawn(draw, WIDTH, 0.3 + 2.2 * rows, "Smooth functions with their 95 % bands")
+    caption = (
+        "With 95 % bands, and without the mean and the wave of one period per turn, for which "
+        "offsets, lengths and tilts can stand."
+    )
+    height = 0.3 + 2.0 * -(-len(found) // 2)
+    return Figure("smooth", "Smooth functions with their 95 % bands", draw, height, caption)
 
 
 def _panel(axes: Axes, part: SmoothPart, unit: str) -> None:
@@ -364,44 +319,3 @@ def _panel(axes: Axes, part: SmoothPart, unit: str) -> None:
 
 def _places(x: Array, part: SmoothPart) -> Array:
     return np.degrees(x) if part.group.lasting else x / 3600
-
-
-def residual_figures(
-    model: Model, observed: Observations, x: Array, residuals: Residuals, space: Space, title: str
-) -> dict[str, str]:
-    """Where, when and in which poses an arm at parameter values x (parameters,) errs, as SVG."""
-    return {
-        "against_joints": against_joints(model.chain.kinds, residuals),
-        "over_time": over_time(observed, residuals),
-        "space": space_picture(space, title),
-    }
-
-
-def drawn_for(
-    result: Calibration,
-    residuals: Residuals,
-    summary: ResidualSummary | None,
-    budget: ErrorBudget | None,
-    space: Space,
-) -> dict[str, str]:
-    """Every figure of an identification's page: name → SVG, empty where nothing is to be drawn."""
-    spread = before_and_after(result, budget)
-    found = residual_figures(
-        result.model, result.observations, result.x, residuals, space,
-        "Residuals as arrows on the posed arm",
-    ) | {
-        "errors": errors(result),
-        "held_out": held_out(result, residuals),
-        "by_configuration": by_configuration(residuals),
-        "waterfall": "",
-        "smooth": smooth_figure(result),
-        "sureness": uncertainty_map(result),
-        "spread": before_after(spread) if spread else "",
-    }  # fmt: skip
-    if budget is not None:
-        steps = budget_steps(result, budget)
-        found["waterfall"] = waterfall_of_steps(steps, budget.floor, budget.floor_name)
-    if summary is not None:
-        found["histogram"] = histogram(summary)
-        found["scores"] = scores(summary)
-    return found

@@ -3,16 +3,14 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import cast
 
 import numpy as np
 from numpy.typing import NDArray
 
-from elastocal.identification.residuals import ResidualSummary, groupings, summarise_residuals
-from elastocal.identification.result import Calibration
-from elastocal.identification.weighted_problem import WeightKind, weights_for
+from elastocal.identification.residuals import groupings
 from elastocal.model.observations import COMPONENTS, Observations
-from elastocal.report.formatting import ShownTable, significant
+from elastocal.report.blocks import Table
+from elastocal.report.formatting import significant
 from elastocal.text import printable
 from elastocal.units import Array
 
@@ -44,10 +42,6 @@ class Residuals:
         return self.units.count("µm")
 
 
-def residuals_of(result: Calibration) -> Residuals:
-    return residuals_by(result.observations, result.residual)
-
-
 def residuals_by(observed: Observations, residual: Array) -> Residuals:
     """Residuals (rows,) in m (rad) by observation."""
     table = observed.table
@@ -72,39 +66,6 @@ def residuals_by(observed: Observations, residual: Array) -> Residuals:
         q=table.q[observed.lead],
         shown=shown,
     )
-
-
-def summary_of(result: Calibration) -> ResidualSummary | None:
-    """The result's own summary of its whitened residuals, else one of the standardised ones."""
-    if result.residual_summary is not None:
-        return result.residual_summary
-    return summarise_residuals(result.observations, standardised(result), absolute=False)
-
-
-def standardised(result: Calibration) -> Array:
-    """Weighted residuals (rows,) over their standard deviation; unweighted where the result does
-    not hold the weights: those of a given matrix or of an estimated noise."""
-    observed, kind = result.observations, result.noise.kind
-    if result.method == "wls" and kind in ("rows", "axis", "polar"):
-        weights = weights_for(observed, result.model.cell.tracker, cast(WeightKind, kind))
-        whitened = weights.apply(result.residual)
-        return np.asarray(whitened) / result.sigma
-    parts = result.residual.reshape(-1, observed.size)
-    spread = np.sqrt((parts**2).mean(axis=0))
-    if kind == "none":
-        spread = np.full(observed.size, result.sigma)
-    return (parts / np.where(spread > 0, spread, 1.0)).ravel()
-
-
-def rms_by_pose(result: Calibration, residuals: Residuals) -> tuple[Array, Array]:
-    """Fitted and held-out 3-D rms (configurations,) in µm; infinite where nothing is held out."""
-    size = result.observations.size
-    count = np.bincount(residuals.pose)
-    found = []
-    for rows in (result.residual, result.held_out):
-        squared = (rows.reshape(-1, size)[:, : residuals.positions] ** 2).sum(axis=1)
-        found.append(np.sqrt(np.bincount(residuals.pose, weights=squared) / count) * 1e6)
-    return found[0], found[1]
 
 
 def reach(values: Array) -> float:
@@ -135,12 +96,17 @@ def running_mean(x: Array, y: Array, bins: int = 12) -> tuple[Array, Array, Arra
     return middle, mean, error
 
 
+OF_RESIDUALS = (
+    "Of a direction, mean and largest are signed. Of all others the length of the 3-D residual is "
+    "given, and the mean is the length of the mean vector: near the rms, the residual is a common "
+    "shift; near zero, it is scatter."
+)
 HEADS = ("readings of", "number", "mean", "rms", "largest", "unit")
 MOST_CONFIGURATIONS = 200
 Rows = list[tuple[str, ...]]
 
 
-def residual_table(observed: Observations, residuals: Residuals) -> ShownTable:
+def residual_table(observed: Observations, residuals: Residuals) -> Table:
     """Mean, rms and largest residual of every direction, marker, load state and configuration.
 
     Of a direction they are signed; else lengths of the 3-D residual, and of its mean vector.
@@ -161,7 +127,7 @@ def residual_table(observed: Observations, residuals: Residuals) -> ShownTable:
         code = labels.code[:: observed.size]
         groups[len(rows)] = labels.by
         rows += _group_rows(part, code, tuple(labels.names[:MOST_CONFIGURATIONS]))
-    return ShownTable(HEADS, rows, words=(0, 5), groups=groups)
+    return Table(HEADS, rows, (0, 5), groups, title="Residuals", note=OF_RESIDUALS)
 
 
 def _group_rows(part: NDArray[np.float64], code: NDArray[np.int64], names: tuple[str, ...]) -> Rows:
@@ -180,4 +146,4 @@ def _size(values: NDArray[np.float64]) -> str:
 
 
 def _signed(value: float) -> str:
-    return f"{'−' if value < 0 else '+'}{significant(abs(float(value)))}"
+    return f"{'-' if value < 0 else '+'}{significant(abs(float(value)))}"
