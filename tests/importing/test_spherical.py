@@ -86,7 +86,7 @@ def test_the_length_is_the_range_whatever_the_angles(d, az, zen, clockwise, unit
     numbers = {"range": np.array([d]), "azimuth": np.array([az * scale]),
                "zenith": np.array([zen * scale * (1 - 1e-15)])}  # fmt: skip
     units = {"range": "mm", "azimuth": unit, "zenith": unit}
-    records = Records("p", np.array([2]), numbers, units, {}, None, observed)
+    records = Records(("p",), np.zeros(1, int), np.array([2]), numbers, units, {}, None, observed)
     found = with_positions(records, clockwise)
     assert set(found.numbers) == set(found.units) == set("xyz")
     assert set(found.units.values()) == {"mm"}

@@ -22,10 +22,8 @@ from elastocal.identification.mistakes import NominalFit, nominal_fit
 from elastocal.importing.joining import (
     DEFAULT,
     Joined,
-    PooledRecords,
     groups_alike,
     join,
-    joint_stems,
     pooled,
     with_joints,
 )
@@ -41,6 +39,7 @@ from elastocal.importing.records import (
     Records,
     Understood,
     is_spherical,
+    joint_stems,
     read_records,
     with_labels,
     with_positions,
@@ -58,7 +57,7 @@ UNLOADED = ("none", "unloaded", "0")
 
 def forces_of(
     where: str,
-    points: PooledRecords,
+    points: Records,
     loads: Mapping[str, NDArray[np.float64] | LoadStatesTable] | None,
 ) -> NDArray[np.float64] | None:
     """(n, 3) N in the tracker's frame (z up) for each point; None where no load is told.
@@ -189,7 +188,7 @@ class Assembled:
         return len(self.origin)
 
 
-def assemble(where: str, points: PooledRecords, log: PooledRecords | None, joined: Joined | None,
+def assemble(where: str, points: Records, log: Records | None, joined: Joined | None,
              mapping: MappingTable, loads: Mapping[str, Any] | None) -> Assembled:  # fmt: skip
     """One row per point that has joint values, in the points' order.
 
@@ -244,7 +243,7 @@ def assemble(where: str, points: PooledRecords, log: PooledRecords | None, joine
 
 
 def _numbers(
-    points: PooledRecords, log: PooledRecords | None, joined: Joined | None, rows: NDArray[np.int64]
+    points: Records, log: Records | None, joined: Joined | None, rows: NDArray[np.int64]
 ) -> tuple[dict[str, Array], dict[str, str]]:
     """Columns of the points, and of the joint log those that the points do not have."""
     numbers = {stem: values[rows] for stem, values in points.numbers.items()}
@@ -259,7 +258,7 @@ def _numbers(
 
 
 def _configurations(
-    points: PooledRecords, joined: Joined | None, rows: NDArray[np.int64], q: Array, spread: Array
+    points: Records, joined: Joined | None, rows: NDArray[np.int64], q: Array, spread: Array
 ) -> tuple[list[str], list[str]]:
     stated = points.labels.get("configuration")
     if stated is None and joined is not None:
@@ -289,9 +288,7 @@ def _configurations(
     ]
 
 
-def _repeats(
-    points: PooledRecords, rows: NDArray[np.int64], keys: list[tuple]
-) -> NDArray[np.int64]:
+def _repeats(points: Records, rows: NDArray[np.int64], keys: list[tuple]) -> NDArray[np.int64]:
     stated = points.labels.get("repeat")
     count: dict[tuple, int] = {}
     known: dict[tuple, int] = {}

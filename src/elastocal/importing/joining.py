@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import re
-from collections.abc import Callable, Iterable, Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 
 from elastocal.errors import InputError, require
 from elastocal.importing.mapping_file import JoinTable, JointsTable
-from elastocal.importing.records import Records
+from elastocal.importing.records import Records, joint_stems
 from elastocal.text import listed
 from elastocal.units import Array, IntArray, convert, quantities
 
@@ -72,12 +72,6 @@ def with_joints(
     for j in range(n):
         numbers[f"q{j + 1}"], own[f"q{j + 1}"] = values[j], units[j]
     return replace(records, numbers=numbers, units=own)
-
-
-def joint_stems(numbers: Iterable[str]) -> list[str]:
-    """q1, q2 … among the columns, in order."""
-    found = [stem for stem in numbers if re.fullmatch(r"q\d+", stem)]
-    return sorted(found, key=lambda stem: int(stem[1:]))
 
 
 def _stems(records: Records) -> list[str]:
@@ -149,56 +143,7 @@ DEFAULT = {
 }  # fmt: skip
 
 
-@dataclass(frozen=True)
-class PooledRecords:
-    """n rows of `files`; `file` (n,) and `line` (n,) say where each stands.
-
-    `numbers` stem → (n,) in `units[stem]`; `labels` configuration, marker, repeat, load → n
-    texts; `names` n texts; `time` (n,) s or None.
-    """
-
-    files: tuple[str, ...]
-    file: IntArray
-    line: IntArray
-    numbers: dict[str, Array]
-    units: dict[str, str]
-    names: list[str]
-    labels: dict[str, list[str]]
-    time: Array | None
-
-    def __len__(self) -> int:
-        return len(self.line)
-
-    def where(self, i: int) -> str:
-        """File and line of row i, as messages begin."""
-        return f"{self.files[self.file[i]]}, line {self.line[i]}"
-
-    def shown(self, i: int) -> str:
-        """Row i for a list in a message: its name and line."""
-        name = self.names[i]
-        return f"{name} (line {self.line[i]})" if name else f"line {self.line[i]}"
-
-    @property
-    def q(self) -> Array:
-        """(n, joints) joint values in the units of their columns."""
-        stems = joint_stems(self.numbers)
-        return np.column_stack([np.zeros((len(self), 0)), *(self.numbers[s] for s in stems)])
-
-    @property
-    def q_units(self) -> tuple[str, ...]:
-        return tuple(self.units[stem] for stem in joint_stems(self.numbers))
-
-    def spread(self, deg: float, mm: float) -> Array:
-        """(joints,) these tolerances in the unit of each joint."""
-        sizes = [
-            convert(np.array([deg]), "deg", u)[0] if "angle" in quantities(u)
-            else convert(np.array([mm]), "mm", u)[0]
-            for u in self.q_units
-        ]  # fmt: skip
-        return np.array(sizes)
-
-
-def pooled(records: Sequence[Records]) -> PooledRecords:
+def pooled(records: Sequence[Records]) -> Records:
     """The rows of all files, in the order of the files.
 
     Raises InputError where the files do not have the same columns.
@@ -215,28 +160,17 @@ def pooled(records: Sequence[Records]) -> PooledRecords:
         unit = first.units[stem]
         alike = all(r.units[stem] == unit for r in records)
         units[stem] = unit if alike else DEFAULT[quantities(unit)[0]]
-    numbers = {
-        stem: np.concatenate([convert(r.numbers[stem], r.units[stem], unit) for r in records])
-        for stem, unit in units.items()
-    }
-    labels = {
-        stem: [text for r in records for text in r.labels.get(stem, ())]
-        for stem in first.labels
-        if stem != "load"
-    }
-    if any(r.load is not None or "load" in r.labels for r in records):
-        labels["load"] = [text for r in records for text in _loads(r)]
-    times = [r.time for r in records if r.time is not None]
-    return PooledRecords(
-        files=tuple(r.source for r in records),
-        file=np.repeat(np.arange(len(records)), [len(r) for r in records]),
-        line=np.concatenate([r.line for r in records]),
-        numbers=numbers,
-        units=units,
-        names=[text for r in records for text in r.texts.get("name", [""] * len(r))],
-        labels=labels,
-        time=np.concatenate(times) if times else None,
-    )
+    loaded = any(r.load is not None or "load" in r.labels for r in records)
+    return Records.stacked([
+        replace(
+            r,
+            units=units,
+            numbers={s: convert(r.numbers[s], r.units[s], unit) for s, unit in units.items()},
+            labels={s: texts for s, texts in r.labels.items() if s != "load"}
+            | ({"load": _loads(r)} if loaded else {}),
+        )
+        for r in records
+    ])  # fmt: skip
 
 
 def _loads(records: Records) -> list[str]:
@@ -351,9 +285,7 @@ class Joined:
     remarks: tuple[str, ...]
 
 
-def join(
-    where: str, points: PooledRecords, log: PooledRecords, settings: JoinTable | None
-) -> Joined:
+def join(where: str, points: Records, log: Records, settings: JoinTable | None) -> Joined:
     """The joint values of every point.
 
     Raises InputError where points have no partner and [join] unmatched is not "leave_out", where
@@ -382,7 +314,7 @@ MOST_PAIRS = 1_000_000  # of points and standstills
 MOST_POINTS_JOINED = 0.8  # a share from which an offset is worth telling
 
 
-def _likely_offset(points: PooledRecords, log: PooledRecords, settings: JoinTable, how: str) -> str:
+def _likely_offset(points: Records, log: Records, settings: JoinTable, how: str) -> str:
     """The offset of the log's clock at which most points fall into standstills, as a hint.
 
     "" where the join is not by clocks, few points would, or two offsets would do as well.
@@ -420,14 +352,14 @@ _ADVICE = {
 }
 
 
-def _obvious(points: PooledRecords, log: PooledRecords) -> str:
+def _obvious(points: Records, log: Records) -> str:
     """By name where names agree, by time where both have one, else by order."""
     if "configuration" in points.labels and _keys(points.labels["configuration"], _names_of(log)):
         return "name"
     return "time" if points.time is not None and log.time is not None else "order"
 
 
-def _names_of(log: PooledRecords) -> list[str]:
+def _names_of(log: Records) -> list[str]:
     return log.labels.get("configuration") or (log.names if any(log.names) else [])
 
 
@@ -454,7 +386,7 @@ def _keys(ours: list[str], theirs: list[str]) -> Callable[[str], str] | None:
     return None
 
 
-def _loads_apart(points: PooledRecords, log: PooledRecords) -> list[tuple[str, IntArray, IntArray]]:
+def _loads_apart(points: Records, log: Records) -> list[tuple[str, IntArray, IntArray]]:
     """(load, points, rows of the log): a log without loads serves every load state."""
     if "load" not in points.labels:
         return [("", np.arange(len(points)), np.arange(len(log)))]
@@ -467,7 +399,7 @@ def _loads_apart(points: PooledRecords, log: PooledRecords) -> list[tuple[str, I
     return parts
 
 
-def _visits(points: PooledRecords, chosen: IntArray, per_pose: int | None) -> IntArray:
+def _visits(points: Records, chosen: IntArray, per_pose: int | None) -> IntArray:
     """(chosen,) number of the visit: points measured without moving the arm in between."""
     n = len(chosen)
     if per_pose is not None:
@@ -487,7 +419,7 @@ def _visits(points: PooledRecords, chosen: IntArray, per_pose: int | None) -> In
     return np.array(codes)
 
 
-def _by_order(where: str, points: PooledRecords, log: PooledRecords, settings: JoinTable) -> Joined:
+def _by_order(where: str, points: Records, log: Records, settings: JoinTable) -> Joined:
     row = np.full(len(points), -1)
     for load, chosen, rows in _loads_apart(points, log):
         visits = _visits(points, chosen, settings.points_per_pose)
@@ -514,7 +446,7 @@ def _by_order(where: str, points: PooledRecords, log: PooledRecords, settings: J
     return Joined("order", row, log.q[row], pose, (), (), ())
 
 
-def _by_name(where: str, points: PooledRecords, log: PooledRecords, settings: JoinTable) -> Joined:
+def _by_name(where: str, points: Records, log: Records, settings: JoinTable) -> Joined:
     names = _names_of(log)
     for pool, has in ((log, bool(names)), (points, "configuration" in points.labels)):
         if not has:
@@ -547,7 +479,7 @@ def _by_name(where: str, points: PooledRecords, log: PooledRecords, settings: Jo
 
 
 def _clocks(
-    points: PooledRecords, log: PooledRecords, settings: JoinTable, how: str
+    points: Records, log: Records, settings: JoinTable, how: str
 ) -> tuple[Array, Array, IntArray]:
     """Times of the points and, sorted and with the offset, of the log, and the log's rows so."""
     for pool in (points, log):
@@ -561,7 +493,7 @@ def _clocks(
     return points.time, log.time[order] + settings.offset_s, order
 
 
-def _by_time(where: str, points: PooledRecords, log: PooledRecords, settings: JoinTable) -> Joined:
+def _by_time(where: str, points: Records, log: Records, settings: JoinTable) -> Joined:
     at, clock, order = _clocks(points, log, settings, "time")
     after = np.clip(np.searchsorted(clock, at), 1, max(len(clock) - 1, 1))
     after = np.minimum(after, len(clock) - 1)
@@ -596,9 +528,7 @@ def _by_time(where: str, points: PooledRecords, log: PooledRecords, settings: Jo
     return Joined("time", row, log.q[row], None, left_out, (), tuple(remarks))
 
 
-def _by_standstill(
-    where: str, points: PooledRecords, log: PooledRecords, settings: JoinTable
-) -> Joined:
+def _by_standstill(where: str, points: Records, log: Records, settings: JoinTable) -> Joined:
     at, clock, order = _clocks(points, log, settings, "standstill")
     still, shortest = log.spread(settings.still_deg, settings.still_mm), settings.still_s
     found = dwells(clock, log.q[order], still, shortest)

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import re
-from collections.abc import Sequence
+from collections.abc import Iterable, Sequence
 from dataclasses import dataclass, field, replace
 from pathlib import Path
 
@@ -42,7 +42,7 @@ from elastocal.importing.mapping_file import (
 )
 from elastocal.tables import column
 from elastocal.text import is_label, listed, quoted
-from elastocal.units import Array, IntArray, convert
+from elastocal.units import Array, IntArray, convert, quantities
 
 MAX_ROWS = 2_000_000
 DECIMAL_SAMPLE = 2000
@@ -71,10 +71,14 @@ class Understood:
 
 @dataclass(frozen=True)
 class Records:
-    """n rows of a file.  `line` (n,); `numbers` stem → (n,) in `units[stem]`; `texts` and
-    `labels` (configuration, marker, repeat, load) → n texts; `time` (n,) s on the file's clock."""
+    """n rows of `files`; `file` (n,) and `line` (n,) say where each stands.
 
-    source: str
+    `numbers` stem → (n,) in `units[stem]`; `texts` and `labels` (configuration, marker, repeat,
+    load) → n texts; `time` (n,) s on the file's clock; `load` of all rows, where one is stated.
+    """
+
+    files: tuple[str, ...]
+    file: IntArray
     line: IntArray
     numbers: dict[str, Array]
     units: dict[str, str]
@@ -87,9 +91,84 @@ class Records:
     def __len__(self) -> int:
         return len(self.line)
 
+    @property
+    def source(self) -> str:
+        """The first file, as messages begin."""
+        return self.files[0]
+
+    @property
+    def names(self) -> list[str]:
+        return self.texts.get("name", [""] * len(self))
+
     def where(self, i: int) -> str:
-        """File and line of a row, as messages begin."""
-        return f"{self.source}, line {self.line[i]}"
+        """File and line of row i, as messages begin."""
+        return f"{self.files[self.file[i]]}, line {self.line[i]}"
+
+    def shown(self, i: int) -> str:
+        """Row i for a list in a message: its name and line."""
+        name = self.names[i]
+        return f"{name} (line {self.line[i]})" if name else f"line {self.line[i]}"
+
+    @property
+    def q(self) -> Array:
+        """(n, joints) joint values in the units of their columns."""
+        stems = joint_stems(self.numbers)
+        return np.column_stack([np.zeros((len(self), 0)), *(self.numbers[s] for s in stems)])
+
+    @property
+    def q_units(self) -> tuple[str, ...]:
+        return tuple(self.units[stem] for stem in joint_stems(self.numbers))
+
+    def spread(self, deg: float, mm: float) -> Array:
+        """(joints,) these tolerances in the unit of each joint."""
+        ways = {True: (deg, "deg"), False: (mm, "mm")}
+        each = [(ways["angle" in quantities(u)], u) for u in self.q_units]
+        return np.array([convert(np.array([size]), unit, u)[0] for (size, unit), u in each])
+
+    def take(self, rows: IntArray) -> Records:
+        """The rows of these numbers."""
+        return replace(
+            self,
+            file=self.file[rows],
+            line=self.line[rows],
+            numbers={stem: values[rows] for stem, values in self.numbers.items()},
+            texts=_taken(self.texts, rows),
+            labels=_taken(self.labels, rows),
+            time=None if self.time is None else self.time[rows],
+        )
+
+    @classmethod
+    def stacked(cls, parts: Sequence[Records]) -> Records:
+        """The rows of all parts, which have the same numbers in the same units."""
+        times = [part.time for part in parts if part.time is not None]
+        sizes = [len(part.files) for part in parts]
+        first = np.repeat(np.cumsum([0, *sizes[:-1]]), [len(part) for part in parts])
+        return replace(
+            parts[0],
+            files=tuple(file for part in parts for file in part.files),
+            file=np.concatenate([part.file for part in parts]) + first,
+            line=np.concatenate([part.line for part in parts]),
+            numbers={s: np.concatenate([p.numbers[s] for p in parts]) for s in parts[0].numbers},
+            texts=_stacked([part.texts for part in parts], list(map(len, parts))),
+            labels=_stacked([part.labels for part in parts], list(map(len, parts))),
+            time=np.concatenate(times) if times else None,
+        )
+
+
+def _taken(texts: dict[str, list[str]], rows: IntArray) -> dict[str, list[str]]:
+    return {stem: [own[i] for i in rows] for stem, own in texts.items()}
+
+
+def _stacked(parts: Sequence[dict[str, list[str]]], sizes: Sequence[int]) -> dict[str, list[str]]:
+    stems = dict.fromkeys(stem for part in parts for stem in part)
+    both = list(zip(parts, sizes, strict=True))
+    return {s: [text for part, n in both for text in part.get(s, [""] * n)] for s in stems}
+
+
+def joint_stems(numbers: Iterable[str]) -> list[str]:
+    """q1, q2 … among the columns, in order."""
+    found = [stem for stem in numbers if re.fullmatch(r"q\d+", stem)]
+    return sorted(found, key=lambda stem: int(stem[1:]))
 
 
 def read_records(where: str, path: Path, source: SourceTable, units: UnitsTable) -> Records:
@@ -160,34 +239,23 @@ def _read(
 
 def _side_by_side(parts: Sequence[Records], markers: Sequence[str]) -> Records:
     """One row for each marker of a row; of a marker without a value that one alone is left out."""
-    first = parts[0]
-    line = np.concatenate([part.line for part in parts])
-    order = np.argsort(line, kind="stable")
-
-    def in_order(texts: Sequence[Sequence[str]]) -> list[str]:
-        every = [text for part in texts for text in part]
-        return [every[k] for k in order]
-
-    texts = {stem: in_order([part.texts[stem] for part in parts]) for stem in first.texts}
-    texts["marker"] = in_order([[m] * len(p) for m, p in zip(markers, parts, strict=True)])
+    every = Records.stacked(
+        [
+            replace(part, texts=part.texts | {"marker": [name] * len(part)})
+            for part, name in zip(parts, markers, strict=True)
+        ]
+    )
     seen = [part.understood for part in parts]
     unused = set.intersection(*(set(understood.unused) for understood in seen))
     understood = replace(
         seen[0],
         columns=tuple(dict.fromkeys(column for u in seen for column in u.columns)),
         unused=tuple(name for name in seen[0].unused if name in unused),
-        rows=len(line),
+        rows=len(every),
         ignored=tuple(sorted({each for u in seen for each in u.ignored})),
     )
-    times = [part.time for part in parts if part.time is not None]
-    return replace(
-        first,
-        line=line[order],
-        numbers={s: np.concatenate([p.numbers[s] for p in parts])[order] for s in first.numbers},
-        texts=texts,
-        time=np.concatenate(times)[order] if times else None,
-        understood=understood,
-    )
+    one = replace(every, files=parts[0].files, file=np.zeros(len(every), dtype=np.int64))
+    return replace(one.take(np.argsort(one.line, kind="stable")), understood=understood)
 
 
 def likely_presets(path: Path) -> list[str]:
@@ -295,7 +363,10 @@ class _Reader:
         if written is not None and time is None:
             time = np.array([self._time(*at) for at in zip(self.line, written, strict=True)])
         line = np.array(self.line, dtype=np.int64)
-        return Records(self.source, line, numbers, units, texts, time, understood, source.load)
+        file = np.zeros(len(line), dtype=np.int64)
+        return Records(
+            (self.source,), file, line, numbers, units, texts, time, understood, source.load
+        )
 
     def _time(self, number: int, text: str) -> float:
         try:
@@ -404,12 +475,14 @@ def with_labels(where: str, records: Records, names: NamesTable | None) -> Recor
         found, bad = _labels_of_names(where, records, names, named)
         if bad:
             keep = np.setdiff1d(np.arange(len(records)), bad)
-            reasons = tuple(
+            reasons = [
                 (int(records.line[i]), f"{quoted(named[i])} matches no pattern") for i in bad
-            )
-            records = _taken(records, keep, reasons)
-            labels = {stem: [texts[i] for i in keep] for stem, texts in labels.items()}
-            found = {stem: [texts[i] for i in keep] for stem, texts in found.items()}
+            ]
+            before = records.understood
+            ignored = tuple(sorted([*before.ignored, *reasons]))
+            understood = replace(before, rows=len(keep), ignored=ignored)
+            records = replace(records.take(keep), understood=understood)
+            labels, found = _taken(labels, keep), _taken(found, keep)
         labels = found | labels
     if names.markers and "marker" in labels:
         labels["marker"] = [names.markers.get(m, m) for m in labels["marker"]]
@@ -472,17 +545,3 @@ def _labels_of_names(
             default = "0" if stem == "repeat" else "none"
             present[stem] = [text or default for text in texts]
     return present, bad
-
-
-def _taken(records: Records, keep: np.ndarray, reasons: tuple[tuple[int, str], ...]) -> Records:
-    """The rows `keep`; the others are listed as passed over."""
-    before = records.understood
-    ignored = tuple(sorted([*before.ignored, *reasons]))
-    return replace(
-        records,
-        line=records.line[keep],
-        numbers={stem: values[keep] for stem, values in records.numbers.items()},
-        texts={stem: [texts[i] for i in keep] for stem, texts in records.texts.items()},
-        time=None if records.time is None else records.time[keep],
-        understood=replace(before, rows=len(keep), ignored=ignored),
-    )
