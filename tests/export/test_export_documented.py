@@ -10,8 +10,6 @@ import pytest
 from support.exports import exported, flanges_in_base, write_result
 from support.robots import KR270
 
-from elastocal.export.export import ENDINGS, FORMATS
-
 PAGE = (Path(__file__).parents[2] / "docs" / "exporting.md").read_text(encoding="utf-8")
 
 
@@ -29,19 +27,3 @@ def test_the_example_moves_the_arm(
     T = flanges_in_base(calibrated, q, force)[0]
     own = [calibrated.values[f"marker:M1.{k}"] for k in "xyz"]
     assert np.abs(shown - (T[:3, :3] @ own + T[:3, 3])).max() < 1e-6
-
-
-def test_every_format_and_ending_is_told() -> None:
-    for word in (*FORMATS, *(ending for ending in ENDINGS if ending != ".yml")):
-        assert f"`{word}`" in PAGE
-
-
-def test_every_option_is_told() -> None:
-    from typer.main import get_command
-
-    from elastocal.cli.main import app
-
-    command = get_command(app).commands["export"]  # type: ignore[attr-defined]
-    options = [o for p in command.params for o in p.opts if o.startswith("--")]
-    for option in options:
-        assert option in PAGE or option in ("--output", "--help"), option

@@ -3,13 +3,11 @@
 import re
 from pathlib import Path
 
-import pytest
 from support.tracker_exports import kr270_readings, krl, spatialanalyzer
 from typer.testing import CliRunner
 
-from elastocal.cli.import_command import PRESET_NAMES
 from elastocal.cli.main import app
-from elastocal.importing.mapping_file import PRESETS, read_mapping, wanted
+from elastocal.importing.mapping_file import read_mapping, wanted
 
 PAGE = (Path(__file__).parents[2] / "docs" / "importing.md").read_text(encoding="utf-8")
 
@@ -22,11 +20,6 @@ def test_the_mapping_shown_is_a_mapping(tmp_path):
     assert [source.role for source in mapping.sources] == ["points", "points", "joints"]
     for source in mapping.sources:
         assert wanted("doc", source.columns or {}, source.optional or {})
-
-
-def test_every_preset_has_its_row():
-    assert re.findall(r"^\| `(\w+)` \| ", PAGE, re.M)[: len(PRESETS)] == list(PRESETS)
-    assert PRESET_NAMES.split(", ") == list(PRESETS)
 
 
 def test_the_preview_shown_is_what_is_printed(tmp_path, monkeypatch):
@@ -43,9 +36,3 @@ def test_the_preview_shown_is_what_is_printed(tmp_path, monkeypatch):
     for line in (" ".join(line.split()) for line in shown.splitlines()):
         if line and line != "..." and not line.startswith("Nominal arm"):
             assert line in printed
-
-
-@pytest.mark.parametrize("option", ["--preview", "--preset", "--show-preset", "--map", "--cell",
-                                    "--length-unit", "--angle-unit", "--json"])  # fmt: skip
-def test_every_option_is_told(option):
-    assert f"`{option}" in PAGE

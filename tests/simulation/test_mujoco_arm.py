@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import builtins
 from pathlib import Path
 
 import casadi as ca
@@ -11,7 +10,7 @@ import pytest
 from support.elastic_arms import MujocoArm, elastic_arm
 from support.robots import KR270, random_chain_urdf
 
-from elastocal.errors import ElastocalError, InputError
+from elastocal.errors import ElastocalError
 from elastocal.model.chain import Chain
 from elastocal.model.rigid import nominal_flange
 from elastocal.model.urdf import read_urdf
@@ -56,43 +55,6 @@ def test_a_buckling_load_is_refused(kr270: Chain) -> None:
     soft = np.full(6, 1e-3)
     with pytest.raises(ElastocalError, match=r"unstable|no static equilibrium"):
         MujocoArm(kr270, soft).equilibrium(np.radians([0, -90, 0, 0, 0, 0]), [0, 0, -1e5])
-
-
-@pytest.mark.parametrize(
-    "arguments, message",
-    [
-        ({"compliance": np.ones(5)}, "compliance: 6 finite numbers are needed"),
-        ({"compliance": -COMPLIANCE}, r"must be 0 \(rigid\) or more"),
-        ({"load_point": [0, 0]}, "load_point: 3 finite numbers"),
-        ({"markers": {"M1": [0, np.nan, 0]}}, "marker M1: 3 finite numbers"),
-        ({"gravity": 9.81}, "gravity: 3 finite numbers"),
-        ({"masses": [None]}, "masses: 1 given, the chain has 6 joints"),
-    ],
-)
-def test_wrong_arguments_are_explained(kr270: Chain, arguments: dict, message: str) -> None:
-    with pytest.raises(InputError, match=message):
-        MujocoArm(kr270, **{"compliance": COMPLIANCE, **arguments})
-
-
-def test_wrong_poses_and_forces_are_explained(kr270: Chain) -> None:
-    arm = MujocoArm(kr270, COMPLIANCE)
-    with pytest.raises(InputError, match="q: 6 finite numbers"):
-        arm.equilibrium(np.zeros(5))
-    with pytest.raises(InputError, match="force: 3 finite numbers"):
-        arm.equilibrium(np.zeros(6), [0, 0])
-
-
-def test_missing_mujoco_says_what_to_install(kr270: Chain, monkeypatch) -> None:
-    genuine = builtins.__import__
-
-    def without_mujoco(name, *args, **kwargs):
-        if name == "mujoco":
-            raise ImportError(name)
-        return genuine(name, *args, **kwargs)
-
-    monkeypatch.setattr(builtins, "__import__", without_mujoco)
-    with pytest.raises(InputError, match=r"pip install elastocal\[mujoco\]"):
-        MujocoArm(kr270, COMPLIANCE)
 
 
 def test_it_is_independent_of_our_kinematics() -> None:

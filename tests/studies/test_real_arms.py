@@ -39,14 +39,6 @@ def identified(folder, cell, data, *options):
     return json.loads(done.stdout)
 
 
-def test_ur5_predicts_poses_it_never_saw(folder):
-    """Published: 0.155 mm after, 2.57 mm before calibration."""
-    found = identified(folder, "ur5.toml", "ur5_grid.csv", "--test", "ur5_random.csv")
-    assert found["test_mean_um"] <= 105
-    assert found["heldout_rms_um"] == pytest.approx(found["residual_rms_um"], rel=0.05)
-    assert found["nominal_rms_um"] > 600
-
-
 def test_wam_is_no_matter_of_geometry_alone(folder):
     """A cable drive: fitted like the others, and what is left is far above any tracker."""
     found = identified(folder, "wam.toml", "wam_grid.csv", "--test", "wam_random.csv")

@@ -94,18 +94,6 @@ def test_iiwa_readings_that_the_compliance_explains_are_not_faulty(folder):
     assert all(reading["error_um"] < 2000 for reading in found["noise"]["faulty"])
 
 
-def test_ur5_gets_no_single_cause(folder):
-    """Residuals of geometry alone, which several gears share: no lone effect may be claimed."""
-    found = diagnosed(folder, "ur5.toml", "ur5_grid.csv")
-    assert found["gap"]["calibrated_um"] == pytest.approx(113, rel=0.1)
-    assert found["gap"]["noise_floor_um"] < 0.85 * found["gap"]["calibrated_um"]
-    assert found["verdict"] == "unknown_effect" or len(found["effects"]) > 1
-    shown = {test["driver"] for test in found["structure"] if test["p_family"] < 0.01}
-    assert {"joint1 angle", "joint2 angle"} <= shown
-    reasons = {row["effect"] for row in found["untested"]}
-    assert {"joint_compliance", "hysteresis", "joint_drift"} <= reasons
-
-
 def test_wam_is_not_explained_away(folder):
     """A cable drive: whatever is named, millimetres remain and the verdict says so."""
     found = diagnosed(folder, "wam.toml", "wam_grid.csv")

@@ -1,7 +1,5 @@
 """On a Dask cluster of two workers: the same numbers, whichever of them dies."""
 
-import os
-import signal
 import threading
 import time
 
@@ -69,13 +67,6 @@ def begun(marks):
     return [int(path.name.partition("_")[0]) for path in marks.iterdir()]
 
 
-def test_the_numbers_are_those_of_one_process(cluster, tmp_path):
-    folder = write_study(tmp_path / "study")
-    run_study(folder, tmp_path / "here")
-    run_study(folder, tmp_path / "there", at(cluster.scheduler_address))
-    pd.testing.assert_frame_equal(numbers(tmp_path / "there"), numbers(tmp_path / "here"))
-
-
 def test_a_worker_that_dies_in_the_middle_costs_nothing(cluster, tmp_path):
     folder, marks = marked(tmp_path, lethal={5: 1})
     ending = run_study(folder, tmp_path / "r", at(cluster.scheduler_address))
@@ -85,24 +76,6 @@ def test_a_worker_that_dies_in_the_middle_costs_nothing(cluster, tmp_path):
     assert list(killed["task"]) == list(range(12))
     run_study(folder, tmp_path / "undisturbed")
     pd.testing.assert_frame_equal(killed, numbers(tmp_path / "undisturbed"))
-
-
-def test_a_worker_that_is_killed_from_outside_costs_nothing(cluster, tmp_path):
-    folder, marks = marked(tmp_path, count=40)
-
-    def kill_one():
-        while len(list(marks.iterdir())) < 8:
-            time.sleep(0.01)
-        with distributed.Client(cluster.scheduler_address, set_as_default=False) as client:
-            os.kill(next(iter(client.run(os.getpid).values())), signal.SIGKILL)
-        killed.set()
-
-    killed = threading.Event()
-    threading.Thread(target=kill_one, daemon=True).start()
-    ending = run_study(folder, tmp_path / "r", at(cluster.scheduler_address))
-    assert killed.wait(10)
-    assert (ending.done, ending.failed) == (40, 0)
-    assert list(numbers(tmp_path / "r")["task"]) == list(range(40))
 
 
 def test_a_task_that_always_kills_its_worker_fails_and_is_told(cluster, tmp_path):

@@ -54,19 +54,3 @@ def test_another_seed_gives_other_numbers_and_is_refused_among_the_first(folder,
     assert not np.isclose(numbers(tmp_path)["mean"], whole["mean"]).any()
     with pytest.raises(InputError, match="the seed was 12, now it is 11"):
         run_study(folder, tmp_path)
-
-
-def test_a_second_run_does_nothing(folder, tmp_path):
-    run_study(folder, tmp_path)
-    before = {p: p.read_bytes() for p in tmp_path.glob("*.jsonl")}
-
-    def refuse(study):
-        def runner(jobs):
-            assert not jobs
-            yield from ()
-
-        return runner
-
-    ending = run_study(folder, tmp_path, refuse)
-    assert (ending.total, ending.before, ending.done) == (12, 12, 12)
-    assert {p: p.read_bytes() for p in tmp_path.glob("*.jsonl")} == before
