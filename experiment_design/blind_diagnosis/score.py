@@ -76,16 +76,6 @@ def told_apart(truth: Json, plan: Json, answer: Json | None) -> bool:
     return any(names <= {*group} for group in plan["inseparable"])
 
 
-def claimed(answer: Json | None) -> bool:
-    """Any effect is held to be there, of a known name or not."""
-    return answer is not None and answer["verdict"] != "nothing_significant"
-
-
-def sure(answer: Json | None) -> bool:
-    """An effect of the catalogue is named with more than 90 %."""
-    return answer is not None and any(e["probability"] > SURE for e in answer["effects"])
-
-
 def both_reported(truth: Json, rival: Place, answer: Json | None) -> bool:
     """The effect and the one that is alike stand in the same set."""
     (true,) = truths(truth)
@@ -117,18 +107,6 @@ def _matched(said: Sequence[list[Place]], true: Sequence[Place]) -> int:
         sum(t in members for t, members in zip(true, chosen, strict=True))
         for chosen in permutations([*said, *spare], len(true))
     )
-
-
-def named(truth: Json, answer: Json | None) -> list[tuple[float, bool]]:
-    """Probability of each effect named, and whether it is there."""
-    if answer is None:
-        return []
-    true = truths(truth)
-    return [(e["probability"], place(e) in true) for e in answer["effects"]]
-
-
-def is_unknown(answer: Json | None) -> bool:
-    return answer is not None and answer["verdict"] == "unknown_effect"
 
 
 def location_right(truth: Json, answer: Json) -> bool:
@@ -163,8 +141,3 @@ def _accepted(effect: Json, n_joints: int) -> set[str]:
 
 def _numbers(pattern: str, text: str) -> set[int]:
     return {int(j) for j in re.findall(pattern, text)}
-
-
-def weaker_distance(distances: Sequence[Json]) -> float:
-    """d of the true effect that is hardest to tell from its nearest rival or from nothing."""
-    return min(d["distance"] for d in distances)

@@ -14,7 +14,6 @@ pytest.importorskip("mujoco")
 FOLDER = Path(__file__).resolve().parents[2] / "experiment_design" / "blind_diagnosis"
 sys.path.insert(0, str(FOLDER))
 
-import bars
 import one_world
 import records
 import result_tables
@@ -127,7 +126,7 @@ def test_a_whole_arm_is_judged_and_its_rows_stand_in_the_tables():
     record["version"] = "0"
     rows = {
         r.measure: r
-        for r in bars.bar_rows(result_tables.by_suite([record]))
+        for r in result_tables.bar_rows(result_tables.judged([record]))
         if r.worlds == "whole arms, 60 poses"
     }
     assert rows["no worse than geometry alone"].measured.startswith("1.000")
