@@ -2,8 +2,9 @@
 
 After the equalities and the free minimum are taken out, x = centre + T u with the sum of squares
 rest + |u|², so that the constrained minimum is the point of a convex set nearest to u = 0.  A cone
-program (cvxpy with Clarabel) finds which constraints are active there; the point itself then comes
-from the equations of these, good to rounding and not to a solver's tolerance.
+program (cvxpy with Clarabel) finds which constraints are active there.  Under bounds alone the
+point itself then comes from their equations, good to rounding; beside a matrix inequality it is the
+program's, good to some 1e-8 of a standard deviation.
 """
 
 from __future__ import annotations
@@ -54,7 +55,7 @@ def equality_space(A: Array, b: Array) -> Affine:
 
 # The answer.
 
-ON_BOUND = 1e-7  # in units of x: what is closer to a bound lies on it
+ON_BOUND = 1e-7  # in standard deviations: what is closer to a bound lies on it
 
 
 @dataclass(frozen=True)
@@ -74,24 +75,28 @@ class ActiveConstraint:
 
 
 @dataclass(frozen=True)
+class Nearest:
+    """The point u (q,) of a region nearest to 0: u = Σ prices · rows + Σ ⟨prices, slopes⟩.
+
+    The prices of the rows (k,) and of each matrix (n, n), half of what they are for |u|².
+    """
+
+    u: Array
+    rows: Array
+    matrices: tuple[Array, ...]
+
+
+@dataclass(frozen=True)
 class Minimum:
     """Minimiser x (p,) of |t − J x|² under constraints, the objective there, what is active.
 
-    `u` (q,) is the same point in the coordinates of `Reduced`.
+    `nearest` is the same point in the coordinates of `Reduced`.
     """
 
     x: Array
     objective: float
     active: tuple[ActiveConstraint, ...]
-    u: Array
-
-
-@dataclass(frozen=True)
-class Active:
-    """Which rows of a region hold u back (k,), and a null-space basis (n, ·) of each matrix."""
-
-    rows: BoolArray
-    nulls: tuple[Array, ...]
+    nearest: Nearest
 
 
 @dataclass(frozen=True)
@@ -135,18 +140,10 @@ class Region:
     def holds(self, u: Array) -> bool:
         """Whether u lies in the region, matrices to round-off."""
         for matrix in self.matrices:
-            values = _eigenvalues(matrix, u)
+            values = np.linalg.eigvalsh(matrix.at(u))
             if values[0] < -ROUND_OFF * max(np.abs(values).max(), 0.0):
                 return False
         return bool((self.rows @ u >= self.least).all())
-
-    def about(self, u: Array, size: float, whole: bool = False) -> Region:
-        """The same region for v, where the point is u + size · v; `whole` as in `balanced`."""
-        matrices = tuple(
-            replace(m, constant=m.at(u), slopes=m.slopes * size).balanced(whole)
-            for m in self.matrices
-        )
-        return replace(self, least=(self.least - self.rows @ u) / size, matrices=matrices)
 
     def distance(self) -> float:
         """A lower bound of the way |u| from 0 into the region."""
@@ -155,36 +152,79 @@ class Region:
                  for m in self.matrices if m.slopes.any()]  # fmt: skip
         return max(0.0, float(np.max(self.least, initial=0.0)), *map(float, parts))
 
-    def tangent(self, active: Active, u: Array) -> tuple[Array, Array]:
-        """Rows and values of the equations on u that keep the active constraints active.
+    def touched(self, found: Nearest) -> BoolArray:
+        """Which rows (k,) the point lies on."""
+        slack = (self.rows @ found.u - self.least) * self.lengths
+        return np.asarray((found.rows > 0) | (slack <= ON_BOUND))
 
-        Of a matrix N_lᵀ dM N_l = −N_lᵀ M(u) N_l, the upper triangle, off-diagonal entries times
-        √2, so that ⟨Λ, N_lᵀ dM N_l⟩ is a scalar product.
+    def nulls(self, found: Nearest) -> list[Array]:
+        """A null-space basis (n, ·) of each matrix at the point.
+
+        M and its price Z share eigenvectors and M Z = 0, so that the negative eigenvalues of M − Z
+        are those of −Z, and belong to the null space.
         """
-        rows, values = [self.rows[active.rows]], [self.least[active.rows]]
-        for matrix, N in zip(self.matrices, active.nulls, strict=True):
-            i, j, factor = _triangle(N.shape[1])
-            own = ((N.T @ matrix.slopes @ N)[:, i, j] * factor).T
-            rows.append(own)
-            values.append(own @ u - (N.T @ matrix.at(u) @ N)[i, j] * factor)
-        return np.vstack(rows), np.concatenate(values)
+        out = []
+        for matrix, Z in zip(self.matrices, found.matrices, strict=True):
+            values, vectors = np.linalg.eigh(matrix.at(found.u) - Z)
+            out.append(vectors[:, values <= ON_BOUND])
+        return out
 
-    def curvature(self, active: Active, multipliers: tuple[Array, ...], u: Array) -> Array:
-        """Rows K with |K du|² = 2 Σ_l ⟨Z_l, dM M⁺ dM⟩, Z_l the multipliers.
+    def face(self, found: Nearest) -> Array:
+        """Orthonormal directions (q, ·) in which the constraints that the point lies on let u go:
+        of a matrix those with Nᵀ dM N = 0."""
+        rows = [self.rows[self.touched(found)]]
+        for matrix, N in zip(self.matrices, self.nulls(found), strict=True):
+            i, j = np.tril_indices(N.shape[1])
+            rows.append((N.T @ matrix.slopes @ N)[:, i, j].T)
+        stacked = np.vstack(rows)
+        return equality_space(stacked, np.zeros(len(stacked))).basis
 
-        The face of a matrix of fixed rank is curved, and this is what moving along it adds to the
-        Hessian of half the objective (the sigma term of Shapiro 1997).
-        """
-        found = [np.zeros((0, len(u)))]
-        for matrix, N, Z in zip(self.matrices, active.nulls, multipliers, strict=True):
-            k = N.shape[1]
-            if k:
-                values, vectors = np.linalg.eigh(matrix.at(u))
-                inverse = vectors[:, k:] / np.sqrt(np.maximum(values[k:], np.finfo(float).tiny))
-                sizes, axes = np.linalg.eigh(Z)
-                root = (axes * np.sqrt(2 * np.maximum(sizes, 0.0))).T
-                found.append((root @ matrix.slopes @ inverse).reshape(len(u), -1).T)
-        return np.vstack(found)
+    def nearest(self) -> Nearest | None:
+        """None where nothing satisfies all constraints."""
+        size = self.distance() or 1.0
+        for _ in range(5):
+            found = self._cone_program(size)
+            if found is None or np.linalg.norm(found.u) <= FAR * size:
+                break
+            size = float(np.linalg.norm(found.u))
+        if found is None or any(N.shape[1] for N in self.nulls(found)):
+            return found
+        held = found.rows > 0
+        u, prices = equality_space(self.rows[held], self.least[held]).origin, np.zeros(len(held))
+        prices[held] = optimize.nnls(self.rows[held].T, u)[0]
+        wrong = max(float(np.linalg.norm(u - self.rows.T @ prices)),
+                    float(np.max(self.least - self.rows @ u, initial=0.0)))  # fmt: skip
+        if not wrong <= CERTIFIED * max(float(np.linalg.norm(u)), size):
+            raise ElastocalError(
+                f"no certified minimum: the KKT residual is {wrong / size:.1e}; state values that "
+                "the constraints pin from two sides as equalities, and check the units of the "
+                "bounds"
+            )
+        return Nearest(u, prices, found.matrices)
+
+    def _cone_program(self, size: float) -> Nearest | None:
+        """The nearest point to a solver's accuracy, about `size` away, which is its unit."""
+        import cvxpy as cp
+
+        v = cp.Variable(self.rows.shape[1])
+        # No v of the length expected reaches a farther bound, whose size would cost digits.
+        near = self.least >= -FAR * size
+        bounds = [self.rows[near] @ v >= self.least[near] / size] if near.any() else []
+        matrices = [
+            _value(cp, replace(m, constant=m.constant / size), v) >> 0 for m in self.matrices
+        ]
+        status = _solve(cp.Problem(cp.Minimize(cp.sum_squares(v)), [*bounds, *matrices]))
+        if "infeasible" in status:
+            return None
+        if v.value is None:
+            raise _stopped(status)
+        u, prices = size * np.asarray(v.value), np.zeros(len(near))
+        if bounds:
+            # Active are those with slack < price (strict complementarity).
+            price, slack = size * bounds[0].dual_value / 2, self.rows[near] @ u - self.least[near]
+            prices[near] = np.where(slack < price, price, 0.0)
+        duals = tuple(size * (c.dual_value + c.dual_value.T) / 4 for c in matrices)
+        return Nearest(u, prices, duals)
 
 
 # The minimum.
@@ -194,7 +234,6 @@ CERTIFIED = 1e-6  # of |u|: KKT residual above which the point is no minimum
 UNDETERMINED = 1e-11  # singular value of unit columns, of the largest
 FAR = 10.0  # times the expected way: what is farther is out of reach
 STEEPEST = 1e7  # of an interval's 1/s: what it leaves across it is below 1e-7
-STEPS = 30  # of Newton's method, which needs three, on a curved face
 
 
 @dataclass(frozen=True)
@@ -237,88 +276,38 @@ class Reduced:
 
         Raises InputError where constraints contradict each other, which it names.
         """
-        u = np.zeros(self.T.shape[1])
-        active = Active(
-            np.zeros(len(self.region.least), bool),
-            tuple(np.zeros((len(m.balance), 0)) for m in self.region.matrices),
-        )
-        if not self.region.holds(u):
-            u, active = self._nearest()
-        x = self.unit * (self.centre + self.T @ u)
+        region, u = self.region, np.zeros(self.T.shape[1])
+        nearest: Nearest | None = Nearest(
+            u, np.zeros(len(region.least)),
+            tuple(np.zeros_like(m.constant) for m in region.matrices),
+        )  # fmt: skip
+        if not region.holds(u):
+            nearest = region.nearest()
+        if nearest is None:
+            raise_conflict(self.limits)
+        x = self.unit * (self.centre + self.T @ nearest.u)
         for kind, side in (("lower", 1), ("upper", -1)):
-            held = self.region.of[active.rows & (self.region.sides == side)]
+            held = region.of[(nearest.rows > 0) & (region.sides == side)]
             x[held] = getattr(self.system, kind)[held]
         left = self.t - self.J @ x
-        named = self._named(stated or self.system, active, u)
-        return Minimum(x, float(left @ left), named, u)
+        named = self._named(stated or self.system, nearest)
+        return Minimum(x, float(left @ left), named, nearest)
 
-    def _nearest(self) -> tuple[Array, Active]:
-        """The point of the region nearest to 0, and what is active there."""
-        origin, size = np.zeros(self.T.shape[1]), self.region.distance() or 1.0
-        for _ in range(5):
-            region = self.region.about(origin, size)
-            v, active, multipliers = self._cone_program(region)
-            length = float(np.linalg.norm(v))
-            if length <= FAR:
-                break
-            size *= length
-        moves = np.inf
-        for k in range(STEPS):
-            before, v = v, _newton(region, active, multipliers, v)
-            active, last = _refreshed(region, active, v), moves
-            rows, multipliers = _multipliers(region, active, v)
-            moves = float(np.linalg.norm(v - before))
-            # The first step may only move the multipliers to their new null space.
-            if not any(N.shape[1] for N in active.nulls) or (k > 1 and not moves < last / 2):
-                break
-        _certify(region, v, rows, multipliers)
-        return size * v, _refreshed(self.region, active, size * v)
-
-    def _cone_program(self, region: Region) -> tuple[Array, Active, tuple[Array, ...]]:
-        """The nearest point to a solver's accuracy, what is active, and the matrices' multipliers.
-
-        Active are those with slack < multiplier (strict complementarity).  M and its multiplier Z
-        share eigenvectors and M Z = 0, so the negative eigenvalues of M − Z are those of −Z, and
-        belong to the null space.
-        """
-        import cvxpy as cp
-
-        v = cp.Variable(self.T.shape[1])
-        # No v of the length expected reaches a farther bound, whose size would cost digits.
-        near = region.least >= -FAR
-        bounds = [region.rows[near] @ v >= region.least[near]] if near.any() else []
-        matrices = [_value(cp, m, v) >> 0 for m in region.matrices]
-        status = _solve(cp.Problem(cp.Minimize(cp.sum_squares(v)), [*bounds, *matrices]))
-        if "infeasible" in status:
-            raise_conflict(self.limits)
-        if v.value is None:
-            raise _stopped(status)
-        at, rows = np.asarray(v.value), np.zeros(len(near), bool)
-        if bounds:
-            rows[near] = region.rows[near] @ at - region.least[near] < bounds[0].dual_value / 2
-        duals = tuple((c.dual_value + c.dual_value.T) / 4 for c in matrices)
-        nulls = []
-        for matrix, Z in zip(region.matrices, duals, strict=True):
-            values, vectors = np.linalg.eigh(matrix.at(at) - Z)
-            nulls.append(vectors[:, values < 0])
-        return at, Active(rows, tuple(nulls)), duals
-
-    def _named(self, stated: System, active: Active, u: Array) -> tuple[ActiveConstraint, ...]:
+    def _named(self, stated: System, found: Nearest) -> tuple[ActiveConstraint, ...]:
         """Equalities, then bounds, then matrices on which u lies, prices in the units of x."""
-        region, limits, z = self.region, self.limits, self.T @ u
-        rows, matrices = _multipliers(region, active, u)
+        region, limits, z = self.region, self.limits, self.T @ found.u
         prices = np.zeros(len(z))
-        np.add.at(prices, region.of, region.sides * rows / region.lengths)
+        np.add.at(prices, region.of, region.sides * found.rows / region.lengths)
         # What they leave of the gradient of half the objective is the equalities'.
         J = self.J * self.unit
         pull = J.T @ (self.J @ (self.unit * (self.centre + z)) - self.t) - prices
-        for own, in_u, Z in zip(limits.matrices, region.matrices, matrices, strict=True):
+        for own, in_u, Z in zip(limits.matrices, region.matrices, found.matrices, strict=True):
             both = in_u.balance / own.balance
             pull -= np.tensordot(own.slopes, np.outer(both, both) * Z, axes=2)
         shares = least_norm(limits.A.T, pull) if len(limits.b) else np.zeros(0)
         noise = ROUND_OFF * float(np.linalg.norm(self.t))  # J has columns of unit length
         shares[np.abs(shares) * np.linalg.norm(limits.A, axis=1) <= noise] = 0.0
-        found = [
+        active = [
             ActiveConstraint(label, "equality", _names(stated, row), float(b), 2 * float(price))
             for row, label, b, price in zip(
                 stated.A, stated.equality_labels, stated.b, shares, strict=True
@@ -328,29 +317,23 @@ class Reduced:
             ("lower", ">=", z - limits.lower, 1), ("upper", "<=", limits.upper - z, -1),
         )  # fmt: skip
         for kind, sign, slack, side in sides:
-            held = region.of[active.rows & (region.sides == side)]
+            held = region.of[(found.rows > 0) & (region.sides == side)]
             for i in np.union1d(held, np.flatnonzero(slack <= ON_BOUND)):
                 name, value = stated.names[i], float(getattr(stated, kind)[i])
                 price = 2 * float(prices[i] / self.unit[i]) if i in held else 0.0
                 label = f"{name} {sign} {value:.6g}"
-                found.append(ActiveConstraint(label, kind, (name,), value, price))
-        for own, in_u, Z in zip(limits.matrices, region.matrices, matrices, strict=True):
-            if _eigenvalues(own, z)[0] <= ON_BOUND:
-                names = _names(stated, np.abs(own.slopes).sum(axis=(1, 2)))
-                price = 2 * float(in_u.balance**2 @ np.diag(Z))
-                found.append(ActiveConstraint(own.label, "semidefinite", names, 0.0, price))
-        return tuple(found)
+                active.append(ActiveConstraint(label, kind, (name,), value, price))
+        for matrix, N, Z in zip(region.matrices, region.nulls(found), found.matrices, strict=True):
+            if N.shape[1]:
+                in_x = next(m for m in limits.matrices if m.label == matrix.label)
+                names = _names(stated, np.abs(in_x.slopes).sum(axis=(1, 2)))
+                price = 2 * float(matrix.balance**2 @ np.diag(Z))
+                active.append(ActiveConstraint(matrix.label, "semidefinite", names, 0.0, price))
+        return tuple(active)
 
     def face(self, found: Minimum) -> Array:
         """Orthonormal directions (q, ·) in which the constraints on which `found` lies let u go."""
-        region, z = self.region, self.T @ found.u
-        touched = (region.rows @ found.u - region.least) * region.lengths <= ON_BOUND
-        nulls = [
-            np.linalg.eigh(own.at(found.u))[1][:, : int((_eigenvalues(m, z) <= ON_BOUND).sum())]
-            for own, m in zip(region.matrices, self.limits.matrices, strict=True)
-        ]
-        rows, _ = region.tangent(Active(touched, tuple(nulls)), found.u)
-        return equality_space(rows, np.zeros(len(rows))).basis
+        return self.region.face(found.nearest)
 
     def farthest(self, index: int, found: Minimum, rise: float, side: int) -> Array:
         """x (p,) with the least (side −1) or largest (1) x[index] where the objective is at most
@@ -359,14 +342,14 @@ class Reduced:
         These are the ends of the profile interval {v: S(v) − Ŝ ≤ rise}, S(v) the least objective
         with the parameter at v.
         """
-        c, s = side * self.T[index], float(np.sqrt(rise))
+        c, s, u = side * self.T[index], float(np.sqrt(rise)), found.nearest.u
         length = float(np.linalg.norm(c))
         if s == 0 or length <= RANK * float(np.max(np.linalg.norm(self.T, axis=1), initial=0.0)):
             return found.x  # equalities leave a single value
         v = c / length
-        if found.u.any() or not self.region.holds(s * v):
-            v = self._cone_end(v, found.u, s)
-        x = self.unit * (self.centre + self.T @ (found.u + s * v))
+        if u.any() or not self.region.holds(s * v):
+            v = self._cone_end(v, u, s)
+        x = self.unit * (self.centre + self.T @ (u + s * v))
         bound = (self.system.lower if side < 0 else self.system.upper)[index]
         near = ON_BOUND * self.unit[index] * length * s
         if side * (bound - x[index]) <= near:
@@ -377,18 +360,21 @@ class Reduced:
         """v farthest in the direction, where u + s v is allowed and |u + s v|² ≤ |u|² + s²."""
         import cvxpy as cp
 
-        region, v = self.region.about(u, s, whole=True), cp.Variable(len(u))
-        wanted = [_value(cp, m, v) >> 0 for m in region.matrices]
+        region, v = self.region, cp.Variable(len(u))
+        wanted = [
+            _value(cp, replace(m, constant=m.at(u), slopes=m.slopes * s).balanced(True), v) >> 0
+            for m in region.matrices
+        ]
         # What is allowed lies where u·v ≥ 0.  A minimum far from the free one leaves next to
         # nothing of that side.
-        steep = 2 * np.linalg.norm(u) / s
-        if steep < STEEPEST:
+        if 2 * np.linalg.norm(u) < STEEPEST * s:
             wanted.append(cp.sum_squares(v) + (2 / s) * u @ v <= 1)
         else:
             wanted += [cp.sum_squares(v) <= 1, u / np.linalg.norm(u) @ v <= 0]
-        near = region.least >= -FAR
+        least = (region.least - region.rows @ u) / s
+        near = least >= -FAR
         if near.any():  # u itself is allowed, whatever its rounding says
-            wanted.append(region.rows[near] @ v >= np.minimum(region.least[near], 0.0))
+            wanted.append(region.rows[near] @ v >= np.minimum(least[near], 0.0))
         status = _solve(cp.Problem(cp.Maximize(direction @ v), wanted))
         if v.value is None:
             raise _stopped(status)
@@ -420,75 +406,8 @@ def _free_minimum(J: Array, t: Array, space: Affine, names: tuple[str, ...]) -> 
     return space.origin + T @ (Q.T @ t), T
 
 
-def _newton(region: Region, active: Active, multipliers: tuple[Array, ...], u: Array) -> Array:
-    """The nearest point to 0 on the active constraints linearised at u; for bounds exact."""
-    space = equality_space(*region.tangent(active, u))
-    K = region.curvature(active, multipliers, u)
-    if not len(K) or not space.basis.shape[1]:
-        return space.origin
-    bent = K @ space.basis
-    slope = bent.T @ (K @ (u - space.origin))
-    w = linalg.solve(np.eye(bent.shape[1]) + bent.T @ bent, slope, assume_a="pos")
-    return space.origin + space.basis @ w
-
-
-def _certify(region: Region, u: Array, rows: Array, matrices: tuple[Array, ...]) -> None:
-    """Raise ElastocalError where u breaks a condition of Karush, Kuhn and Tucker."""
-    pull = region.rows.T @ rows
-    for matrix, Z in zip(region.matrices, matrices, strict=True):
-        pull = pull + np.tensordot(matrix.slopes, Z, axes=2)
-    wrong = [float(np.linalg.norm(u - pull)), np.max(-rows, initial=0.0)]
-    wrong += [np.max(region.least - region.rows @ u, initial=0.0)]
-    wrong += [m.shortfall(u) for m in region.matrices]
-    wrong += [-np.linalg.eigvalsh(Z)[0] for Z in matrices]
-    residual = float(np.max(wrong)) / max(float(np.linalg.norm(u)), 1.0)
-    if not residual <= CERTIFIED:
-        raise ElastocalError(
-            f"no certified minimum: the KKT residual is {residual:.1e}; state values that the "
-            "constraints pin from two sides as equalities, and check the units of the bounds"
-        )
-
-
-def _refreshed(region: Region, active: Active, u: Array) -> Active:
-    """The same bounds and ranks, with the null spaces of the matrices at u."""
-    nulls = [
-        np.linalg.eigh(matrix.at(u))[1][:, : N.shape[1]]
-        for matrix, N in zip(region.matrices, active.nulls, strict=True)
-    ]
-    return Active(active.rows, tuple(nulls))
-
-
-def _multipliers(region: Region, active: Active, u: Array) -> tuple[Array, tuple[Array, ...]]:
-    """Of the rows (k,) and of each matrix (n, n): what comes closest to u = Σ multiplier · row."""
-    G, _ = region.tangent(active, u)
-    found = least_norm(G.T, u) if len(G) else np.zeros(0)
-    rows = np.zeros(len(region.least))
-    held = int(active.rows.sum())
-    if held == len(found) and np.min(found, initial=0.0) < 0:  # several bounds pin one value
-        found = optimize.nnls(G.T, u)[0]
-    rows[active.rows], found = found[:held], found[held:]
-    matrices = []
-    for N in active.nulls:
-        i, j, factor = _triangle(N.shape[1])
-        inner = np.zeros((N.shape[1], N.shape[1]))
-        inner[i, j] = inner[j, i] = found[: len(i)] / factor
-        found = found[len(i) :]
-        matrices.append(N @ inner @ N.T)
-    return rows, tuple(matrices)
-
-
 def _names(system: System, chosen: Array) -> tuple[str, ...]:
     return tuple(system.names[i] for i in np.flatnonzero(chosen))
-
-
-def _eigenvalues(matrix: Matrix, x: Array) -> Array:
-    return np.asarray(np.linalg.eigvalsh(matrix.at(x)))
-
-
-def _triangle(k: int) -> tuple[IntArray, IntArray, Array]:
-    """The upper triangle (i, j) column by column, and √2 off the diagonal."""
-    j, i = np.tril_indices(k)
-    return i, j, np.where(i == j, 1.0, np.sqrt(2.0))
 
 
 # Which constraints contradict each other.

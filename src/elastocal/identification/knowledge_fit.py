@@ -7,7 +7,7 @@ from functools import cached_property
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy import sparse, special
+from scipy import special
 
 from elastocal.errors import ElastocalError, InputError, InsufficientDataError, option, require
 from elastocal.identification.constrained import (
@@ -28,7 +28,7 @@ from elastocal.identification.knowledge import (
 from elastocal.identification.least_squares import Fit, FitProblem
 from elastocal.identification.linear_solver import least_norm
 from elastocal.identification.options import Options
-from elastocal.identification.residuals import held_out_residual
+from elastocal.identification.residuals import growth
 from elastocal.identification.solve import WORTH_A_COLUMN, Reduction, Solution, residual_sigma
 from elastocal.identification.weighted_problem import RFactor
 from elastocal.model.manipulator import Regression
@@ -592,25 +592,14 @@ def _reduction(solution: Solution, found: ConstrainedFit) -> Reduction:
 def _held_out(solution: Solution, found: ConstrainedFit) -> Array:
     """Residual (rows,) of each configuration under a fit to the others and the prior.
 
-    Linearised, with the active constraints kept active.
+    Linearised, with the active constraints kept active: directions of the face are orthonormal by
+    the rows of readings and prior together.
     """
-    if not found.face.shape[1]:
-        return found.at.residual
+    face, residual = found.face, found.at.residual
+    if not face.shape[1]:
+        return residual
     observed, weights = solution.problem.observations, solution.problem.weights
-    # The prior's rows go with no configuration, so that they are never left out.
-    more = -len(found.posed.P) % observed.size
-    P = np.vstack([found.posed.P, np.zeros((more, len(found.columns)))])
     left_out = observed.configuration if weights.together is None else weights.together
-    own = left_out.max() + 1 + np.arange(len(P) // observed.size)
-    whiten = weights.whole
-    if whiten is None:
-        whiten = sparse.eye_array(len(found.at.residual))
-    both = sparse.block_diag([whiten, sparse.eye_array(len(P))], format="csr")
-    held = held_out_residual(
-        np.vstack([found.at.B, P]) @ found.face,
-        np.concatenate([found.at.residual, found.lack, np.zeros(more)]),
-        replace(weights, whiten=sparse.csr_array(both), low=None, common=None, together=None),
-        np.concatenate([left_out, own]),
-        observed.size,
-    )
-    return held[: len(found.at.residual)]
+    rows_of = np.repeat(left_out, observed.size)
+    grown = growth(found.at.B @ face, found.B @ face, np.eye(face.shape[1]), found.e, rows_of)
+    return np.asarray(residual + grown)

@@ -49,7 +49,7 @@ def held_out_residual(
         return residual + _growth_of_blocks(B, residual, weights, block)
     Q, R = linalg.qr(weights.apply(B), mode="economic")
     rows_of = np.repeat(configuration, size)
-    return residual + _growth(B, Q, R, weights.apply(residual), rows_of)
+    return residual + growth(B, Q, R, weights.apply(residual), rows_of)
 
 
 def held_out_by_parts(
@@ -75,7 +75,7 @@ def held_out_by_parts(
         if len(spans) == 1:
             part, B, Q, residual, e = rows(spans[0])
             rows_of = np.repeat(part.observations.configuration, size)
-            held[part.rows] = residual + _growth(B, Q, R, e, rows_of)
+            held[part.rows] = residual + growth(B, Q, R, e, rows_of)
             return
         shift: dict[int, list[Array]] = {}
         for span in spans:
@@ -100,9 +100,9 @@ def held_out_by_parts(
     return held
 
 
-def _growth(B: Array, Q: Array, R: Array, e: Array, configuration: IntArray) -> Array:
+def growth(B: Array, Q: Array, R: Array, e: Array, configuration: IntArray) -> Array:
     """By how much (rows,) the residual grows where its configuration is left out."""
-    growth = np.empty(len(e))
+    grown = np.empty(len(e))
     for rows in same_size(configuration):
         Qc, ec = Q[rows], e[rows]
         if rows.shape[1] > Q.shape[1]:
@@ -112,9 +112,9 @@ def _growth(B: Array, Q: Array, R: Array, e: Array, configuration: IntArray) -> 
             solved, alone = _moved(Qc @ Qc.transpose(0, 2, 1), ec)
             moved = _times(Qc.transpose(0, 2, 1), solved)
         shift = linalg.solve_triangular(R, moved.T).T
-        growth[rows] = _times(B[rows], shift)
-        growth[rows[alone]] = np.inf
-    return growth
+        grown[rows] = _times(B[rows], shift)
+        grown[rows[alone]] = np.inf
+    return grown
 
 
 def told_by_one(B: Array, configuration: IntArray) -> Array:
@@ -149,7 +149,7 @@ def _growth_of_blocks(B: Array, residual: Array, weights: Weights, block: IntArr
     e = e - Q @ (Q.T @ e)
     seen = np.hstack([np.vstack([B, np.zeros((k, p))]), np.zeros((n + k, k))])
     labels = np.concatenate([block, block.max() + 1 + np.arange(k)])
-    return _growth(seen, Q, R, e, labels)[:n]
+    return growth(seen, Q, R, e, labels)[:n]
 
 
 def as_of_another_campaign(B: Array, weights: Weights, size: int) -> Array:
