@@ -9,6 +9,7 @@ import pytest
 from scipy import stats
 from support.calibration import binomial_band, measured, with_values
 from support.cells import DOWN, SLANTED, TABLE_2, kr270_cell, table_of
+from support.constrained import equal
 
 from elastocal.errors import InputError
 from elastocal.identification.identify import identify
@@ -18,7 +19,6 @@ from elastocal.identification.knowledge import (
     GaussianPrior,
     LinearEquality,
     SemidefiniteMatrix,
-    equal,
     physical_constraints,
     read_knowledge,
 )
@@ -247,9 +247,6 @@ def test_an_equality_with_a_known_parameter_determines_an_unseen_one():
     assert one.value == pytest.approx(other.value, rel=1e-12)
     assert other.value == pytest.approx(alone["joint3.compliance"].value, rel=1e-6)
     assert one.std == pytest.approx(other.std) and one.note == ""
-
-
-# --- options ----------------------------------------------------------------------------------
 
 
 # --- the file ---------------------------------------------------------------------------------

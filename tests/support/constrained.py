@@ -6,10 +6,18 @@ import numpy as np
 from scipy import stats
 
 from elastocal.identification.constrained import Minimum, Reduced, minimise
-from elastocal.identification.knowledge import Constraints, System
+from elastocal.identification.knowledge import Bounds, Constraints, LinearEquality, System
 
 NONE = Constraints()
 CHI2 = float(stats.chi2.ppf(0.95, 1))
+
+
+def non_negative(*names: str) -> Constraints:
+    return Constraints(tuple(Bounds(name, lower=0.0) for name in names))
+
+
+def equal(first: str, other: str) -> Constraints:
+    return Constraints(equalities=(LinearEquality({first: 1.0, other: -1.0}),))
 
 
 def solve(

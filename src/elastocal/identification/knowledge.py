@@ -3,8 +3,6 @@
 from __future__ import annotations
 
 import math
-import re
-from collections import defaultdict
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from pathlib import Path
@@ -78,58 +76,48 @@ class System:
             for m in self.matrices
         )
         return replace(
-            self,
-            lower=(self.lower - centre) / unit,
-            upper=(self.upper - centre) / unit,
-            A=self.A * unit,
-            b=self.b - self.A @ centre,
-            matrices=matrices,
-        )
+            self, lower=(self.lower - centre) / unit, upper=(self.upper - centre) / unit,
+            A=self.A * unit, b=self.b - self.A @ centre, matrices=matrices,
+        )  # fmt: skip
 
     def restricted(self, columns: NDArray[np.int64], x: Array) -> System:
         """The constraints on x[columns], all other parameters held at x (p,).
 
         Raises InputError where the held values alone break a constraint.
         """
-        held = np.setdiff1d(np.arange(len(self.names)), columns)
+        rest = x.astype(float)
+        rest[columns] = 0.0
+        held = np.ones(len(x), dtype=bool)
+        held[columns] = False
         slack = ROUND_OFF * np.abs(x)
-        outside = (x < self.lower - slack) | (x > self.upper + slack)
-        for c in held[outside[held]]:
-            require(
-                False,
+        for c in np.flatnonzero(held & ((x < self.lower - slack) | (x > self.upper + slack))):
+            raise InputError(
                 f"{self.names[c]} is held at {x[c]:.6g}, outside its bounds "
-                f"[{self.lower[c]:.6g}, {self.upper[c]:.6g}]; free it, move it or widen them",
+                f"[{self.lower[c]:.6g}, {self.upper[c]:.6g}]; free it, move it or widen them"
             )
-        b = self.b - self.A[:, held] @ x[held]
-        size = np.abs(self.A[:, held]) @ np.abs(x[held]) + np.abs(self.b)
+        b, size = self.b - self.A @ rest, np.abs(self.A) @ np.abs(rest) + np.abs(self.b)
         free = (self.A[:, columns] != 0).any(axis=1)
-        for k in np.flatnonzero(~free):
-            require(
-                bool(abs(b[k]) <= ROUND_OFF * size[k]),
+        for k in np.flatnonzero(~free & (np.abs(b) > ROUND_OFF * size)):
+            raise InputError(
                 f"'{self.equality_labels[k]}' does not hold ({b[k]:+.3g} is missing), and every "
-                "parameter in it is held; free one of them or drop the equality",
+                "parameter in it is held; free one of them or drop the equality"
             )
-        rest = np.where(np.isin(np.arange(len(x)), held), x, 0.0)
         matrices = []
         for m in self.matrices:
             constant, slopes = m.at(rest), m.slopes[columns]
             if slopes.any():
                 matrices.append(replace(m, constant=constant, slopes=slopes))
-                continue
-            require(
-                m.shortfall(rest) <= ROUND_OFF * float(np.abs(constant).max(initial=0.0)),
-                f"'{m.label}' is not positive semidefinite, and every parameter in it is held; "
-                "free one of them or drop the matrix",
-            )
+            elif m.shortfall(rest) > ROUND_OFF * float(np.abs(constant).max(initial=0.0)):
+                raise InputError(
+                    f"'{m.label}' is not positive semidefinite, and every parameter in it is held; "
+                    "free one of them or drop the matrix"
+                )
         return System(
-            tuple(self.names[c] for c in columns),
-            self.lower[columns],
-            self.upper[columns],
-            self.A[np.ix_(free, columns)],
-            b[free],
+            tuple(self.names[c] for c in columns), self.lower[columns], self.upper[columns],
+            self.A[np.ix_(free, columns)], b[free],
             tuple(s for s, keep in zip(self.equality_labels, free, strict=True) if keep),
             tuple(matrices),
-        )
+        )  # fmt: skip
 
 
 # Constraints as people state them: by the names of parameters.
@@ -218,10 +206,9 @@ class Constraints:
 
     def __add__(self, other: Constraints) -> Constraints:
         return Constraints(
-            self.bounds + other.bounds,
-            self.equalities + other.equalities,
+            self.bounds + other.bounds, self.equalities + other.equalities,
             self.matrices + other.matrices,
-        )
+        )  # fmt: skip
 
     def resolve(self, names: Sequence[str]) -> System:
         """The constraints as numbers on the vector (p,) of these parameters.
@@ -253,24 +240,10 @@ class Constraints:
             labels.append(f"{names[i]} = {lower[i]:.6g}")
             lower[i], upper[i] = -np.inf, np.inf
         return System(
-            tuple(names),
-            lower,
-            upper,
-            np.array(rows).reshape(len(rows), p),
-            np.array(values, dtype=float),
-            tuple(labels),
+            tuple(names), lower, upper, np.array(rows).reshape(len(rows), p),
+            np.array(values, dtype=float), tuple(labels),
             tuple(_matrix(m, position) for m in self.matrices),
-        )
-
-
-def non_negative(*names: str) -> Constraints:
-    """x ≥ 0 for each of the named parameters."""
-    return Constraints(bounds=tuple(Bounds(name, lower=0.0) for name in names))
-
-
-def equal(first: str, *others: str) -> Constraints:
-    """All named parameters have one value: two drives of one type, a symmetric wrist."""
-    return Constraints(equalities=tuple(LinearEquality({first: 1.0, o: -1.0}) for o in others))
+        )  # fmt: skip
 
 
 def combination(entry: Entry) -> dict[str, float]:
@@ -315,57 +288,16 @@ def _matrix(stated: SemidefiniteMatrix, position: Mapping[str, int]) -> Matrix:
 
 # What physics demands of the parameters of a model.
 
-AXES = ("x", "y", "z", "rx", "ry", "rz")
-_ENDING = re.compile(r"(?P<stem>.+)_(?P<first>r?[xyz])(?P<second>r?[xyz])?")
-
 
 def physical_constraints(model: Model) -> Constraints:
-    """Passivity of the arm: bounds that effects state, and compliance matrices ⪰ 0.
+    """Passivity of the arm: the bounds that effects state.
 
-    A spring cannot give energy away, so a compliance matrix K, θ = K M, has xᵀKx ≥ 0.  Where an
-    effect has no coupling terms its matrix is diagonal, which is semidefinite exactly where its
-    entries are non-negative: bounds say that (`ParameterSpec.lower`), and are solved exactly.
-
-    With coupling terms there is a matrix for the family `PLACE.STEM_x`, `PLACE.STEM_xy`, … of one
-    effect: doubled axes (of x, y, z, rx, ry, rz) are off the diagonal.  At a joint, z is its own
-    axis: where the family has no `_z`, the diagonal there is the drive's `PLACE.compliance`.  An
-    entry that no parameter names is 0.
+    A spring cannot give energy away, so a compliance matrix K, θ = K M, has xᵀKx ≥ 0.  No effect
+    has coupling terms: its matrix is diagonal, which is semidefinite exactly where its entries are
+    non-negative, and bounds say that (`ParameterSpec.lower`).
     """
-    parameters = model.parameters
-    names = {p.name for p in parameters}
-    families: dict[tuple[str, str], dict[frozenset[str], str]] = defaultdict(dict)
-    for p in parameters:
-        ending = _ENDING.fullmatch(p.name.partition(".")[2])
-        if ending and "compliance" in ending["stem"]:
-            axes = frozenset({ending["first"], ending["second"] or ending["first"]})
-            families[p.where, ending["stem"]][axes] = p.name
-    matrices = []
-    for (where, stem), entries in families.items():
-        coupled = [axes for axes in entries if len(axes) == 2]
-        if not coupled:
-            continue
-        drive = f"{where}.compliance"
-        if drive in names and any("z" in axes for axes in coupled):
-            entries.setdefault(frozenset({"z"}), drive)
-        used = [a for a in AXES if any(a in axes for axes in entries)]
-        for axes in coupled:
-            missing = [a for a in sorted(axes) if frozenset({a}) not in entries]
-            require(
-                not missing,
-                f"{entries[axes]} couples an axis that has no compliance of its own: "
-                f"{where}.{stem}_{''.join(missing[:1])} is not a parameter; add it to the effect",
-            )
-        rows = tuple(tuple(entries.get(frozenset({a, b}), 0.0) for b in used) for a in used)
-        matrices.append(SemidefiniteMatrix(f"{where}.{stem}", rows))
-    # A semidefinite matrix has a non-negative diagonal; saying it twice only blurs multipliers.
-    implied = {str(m.entries[i][i]) for m in matrices for i in range(len(m.entries))}
-    bounds = tuple(
-        Bounds(p.name, p.lower, p.upper)
-        for p in parameters
-        if (np.isfinite(p.lower) and not (p.lower == 0 and p.name in implied))
-        or np.isfinite(p.upper)
-    )
-    return Constraints(bounds=bounds, matrices=tuple(matrices))
+    finite = (p for p in model.parameters if np.isfinite([p.lower, p.upper]).any())
+    return Constraints(tuple(Bounds(p.name, p.lower, p.upper) for p in finite))
 
 
 # Prior knowledge of parameters: data sheets, an earlier calibration, a sister robot.
@@ -421,14 +353,14 @@ class GaussianPrior:
         Raises InputError for a name that is not among the parameters `names` (p,).
         """
         position = {name: i for i, name in enumerate(names)}
+        root = self._root()
+        P = np.zeros((len(self.names), len(position)))
         for name in self.names:
             require(
                 name in position,
                 f"the prior names {quoted(name)}, which is not a parameter"
                 f"{did_you_mean(name, position)}; there are {listed(position)}",
             )
-        root = self._root()
-        P = np.zeros((len(self.names), len(position)))
         P[:, [position[name] for name in self.names]] = root
         return P, root @ self.mean
 

@@ -38,9 +38,9 @@ from elastocal.units import Array, IntArray, Progress
 # Constrained fit of the nonlinear model: Gauss–Newton on the exact B, steps halved.
 
 # Predicted fall of the objective, relative to it, below which the step is the last one.
-TOLERANCE = 1e-12
+TOLERANCE = 1e-10  # a solver's, where a matrix is active
 LEAST = 1e-12  # in typical sizes of the parameters: a step that moves nothing
-HALVINGS = 40
+HALVINGS = 20
 
 
 @dataclass(frozen=True)
@@ -140,11 +140,6 @@ class ConstrainedFit:
         return self.reduced.t[: len(self.at.residual)]
 
     @property
-    def lack(self) -> Array:
-        """What the prior's rows (k,) miss."""
-        return self.reduced.t[len(self.at.residual) :]
-
-    @property
     def B(self) -> Array:
         """Whitened regressor (rows, columns)."""
         return self.reduced.J[: len(self.at.residual)]
@@ -214,15 +209,15 @@ def constrained_fit(posed: KnowledgeProblem, max_steps: int = 60) -> Constrained
         converged = value - found.objective <= TOLERANCE * value or length <= LEAST
         # The last step cannot be judged by a fall that drowns in round-off.
         enough = value * (1 + TOLERANCE) if converged else value
-        for k in range(1 if converged else HALVINGS):
-            trial = posed.moved(x, found.x / 2**k)
-            if posed.value(trial) <= enough:
-                x = trial
-                at, J, t = posed.linearised(x)
-                value = float(t @ t)
-                break
-        else:
+        shares = (0.5**k for k in range(1 if converged else HALVINGS))
+        trials = (posed.moved(x, share * found.x) for share in shares)
+        better = next((trial for trial in trials if posed.value(trial) <= enough), None)
+        if better is None:
             converged = True
+            break
+        x = better
+        at, J, t = posed.linearised(x)
+        value = float(t @ t)
     reason = (
         "no step within the constraints improves the fit" if converged
         else "the step limit was reached; the start may be far off"
@@ -339,18 +334,6 @@ MOST_STEPS = 40
 ASTRAY = 0.5  # of the rise: how far the nonlinear objective may lie beyond it on the way
 
 
-def degrees_of_freedom(of_readings: Array, share: Array) -> Array:
-    """dof (p,) of a posterior variance of which the prior gave the `share` (p,).
-
-    A posterior variance V moves with the noise's variance s² by the readings' share of it,
-    d log V = (1 − share) d log s², so that by Satterthwaite it has dof/(1 − share)² where s² has
-    `of_readings` (p,); infinite where all is the prior's or fixed by equalities.
-    """
-    left = 1 - np.nan_to_num(share, nan=1.0)
-    full = np.full(len(left), np.inf)
-    return np.divide(of_readings, left**2, out=full, where=left > 1e-6)
-
-
 def intervals_with_knowledge(
     found: ConstrainedFit, of_readings: Array, kind: str, many: set[str]
 ) -> Intervals:
@@ -365,7 +348,11 @@ def intervals_with_knowledge(
     Parameters that are `many`, those of smooth functions, have t intervals in any case.
     """
     posed, matrix = found.posed, found.covariance
-    dof = degrees_of_freedom(of_readings, found.prior_share)
+    # A posterior variance V moves with the noise's variance s² by the readings' share of it,
+    # d log V = (1 − share) d log s²: by Satterthwaite it has dof/(1 − share)² where s² has dof.
+    left = 1 - np.nan_to_num(found.prior_share, nan=1.0)
+    full = np.full(len(left), np.inf)
+    dof = np.divide(of_readings, left**2, out=full, where=left > 1e-6)
     inside = not any(a.kind != "equality" for a in found.best.active)
     plain = Covariance("t", matrix, dof, "").interval(found.x[found.columns], LEVEL)
     if kind == "auto" and inside:
@@ -564,12 +551,12 @@ def _as_fit(found: ConstrainedFit) -> Fit:
     Without them a parameter that no reading shows would leave it singular; equalities weigh as
     much as the readings of a parameter do.
     """
-    unit = found.reduced.unit
-    A = found.reduced.system.A * unit
-    rows = np.vstack([found.B, found.posed.P, A / np.linalg.norm(A, axis=1)[:, None] / unit])
-    rest = np.concatenate([found.e, found.lack, np.zeros(len(A))])
+    reduced = found.reduced
+    A = reduced.system.A * reduced.unit
+    equalities = A / np.linalg.norm(A, axis=1)[:, None] / reduced.unit
+    factor = RFactor.of(np.vstack([reduced.J, equalities]), np.append(reduced.t, np.zeros(len(A))))
     return Fit(
-        found.x, found.at.residual, found.e, RFactor.of(rows, rest), found.converged,
+        found.x, found.at.residual, found.e, factor, found.converged,
         found.reason, found.steps, replace(found.posed.problem, x=found.x),
     )  # fmt: skip
 

@@ -4,14 +4,13 @@ import numpy as np
 import pytest
 from scipy import stats
 from support.calibration import binomial_band
-from support.constrained import CHI2, ends, solve
+from support.constrained import CHI2, ends, non_negative, solve
 
 from elastocal.identification.knowledge import (
     Bounds,
     Constraints,
     LinearEquality,
     SemidefiniteMatrix,
-    non_negative,
 )
 from elastocal.identification.linear_solver import solve_weighted
 
