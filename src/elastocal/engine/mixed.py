@@ -28,87 +28,96 @@ from elastocal.units import Array, BoolArray, IntArray
 LOG_2PI = float(np.log(2 * np.pi))
 
 
-# What V is made of: K of every cluster, and the number of its variance there.
+# What V is made of: several K of every cluster, and the numbers of their variances there.
 
 
-class NoisePart(Protocol):
-    """K of C clusters; `of` (C,) are the numbers of its variance, which need not be one."""
+class NoiseParts(Protocol):
+    """k parts K of each of C clusters; `of` (C, k) are the numbers of their variances."""
 
     @property
     def of(self) -> IntArray: ...
 
     def add(self, V: Array, theta: Array) -> None:
-        """θ K (C, m, m) onto V, θ (C,)."""
+        """Σ θ K (C, m, m) onto V, θ (C, k)."""
 
     def times(self, u: Array) -> Array:
-        """K u (C, m)."""
+        """K u (C, k, m)."""
 
     def trace(self, P: Array) -> Array:
-        """tr P K (C,)."""
+        """tr P K (C, k)."""
 
     def turned(self, root: Array) -> Array:
-        """root K rootᵀ (C, m, m)."""
+        """root K rootᵀ (C, k, m, m)."""
 
 
 @dataclass(frozen=True)
 class Diagonal:
-    """K diagonal, (C, m)."""
+    """K diagonal, (C, k, m)."""
 
     of: IntArray
     K: Array
 
     def add(self, V: Array, theta: Array) -> None:
-        np.einsum("cii->ci", V)[:] += theta[:, None] * self.K
+        np.einsum("cii->ci", V)[:] += (theta[:, None] @ self.K)[:, 0]
 
     def times(self, u: Array) -> Array:
-        return self.K * u
+        return self.K * u[:, None]
 
     def trace(self, P: Array) -> Array:
-        return np.asarray((np.einsum("cii->ci", P) * self.K).sum(axis=1))
+        return np.asarray((self.K @ np.einsum("cii->ci", P)[..., None])[..., 0])
 
     def turned(self, root: Array) -> Array:
-        return np.asarray((root * self.K[:, None, :]) @ root.transpose(0, 2, 1))
+        own = root[:, None]
+        return np.asarray((own * self.K[:, :, None]) @ own.swapaxes(2, 3))
 
 
 @dataclass(frozen=True)
 class Full:
-    """Any K, (C, m, m)."""
+    """Any K, (C, k, m, m)."""
 
     of: IntArray
     K: Array
 
     def add(self, V: Array, theta: Array) -> None:
-        V += theta[:, None, None] * self.K
+        V += (theta[:, None] @ self._flat).reshape(V.shape)
+
+    @property
+    def _flat(self) -> Array:
+        return self.K.reshape(*self.K.shape[:2], -1)
 
     def times(self, u: Array) -> Array:
-        return np.asarray((self.K @ u[..., None])[..., 0])
+        return np.asarray((self.K @ u[:, None, :, None])[..., 0])
 
     def trace(self, P: Array) -> Array:
-        return np.einsum("cij,cij->c", P, self.K)
+        return np.asarray((self._flat @ P.reshape(len(P), -1, 1))[..., 0])
 
     def turned(self, root: Array) -> Array:
-        return np.asarray(root @ self.K @ root.transpose(0, 2, 1))
+        own = root[:, None]
+        return np.asarray(own @ self.K @ own.swapaxes(2, 3))
 
 
 @dataclass(frozen=True)
 class Common:
-    """K = ℓℓᵀ of deviations that rows have in common, with their loadings ℓ (C, m, r)."""
+    """K = ℓℓᵀ of deviations that rows have in common, with their loadings ℓ (C, k, m, r)."""
 
     of: IntArray
     loading: Array
 
     def add(self, V: Array, theta: Array) -> None:
-        V += (theta[:, None, None] * self.loading) @ self.loading.transpose(0, 2, 1)
+        own = self.loading * np.sqrt(theta)[:, :, None, None]
+        own = own.swapaxes(1, 2).reshape(*V.shape[:2], -1)
+        V += own @ own.swapaxes(1, 2)
 
     def times(self, u: Array) -> Array:
-        return np.asarray((self.loading @ (u[:, None] @ self.loading).transpose(0, 2, 1))[..., 0])
+        along = u[:, None, None] @ self.loading
+        return np.asarray((self.loading @ along.swapaxes(2, 3))[..., 0])
 
     def trace(self, P: Array) -> Array:
-        return np.einsum("cmr,cmr->c", P @ self.loading, self.loading)
+        return np.asarray(((P[:, None] @ self.loading) * self.loading).sum(axis=(2, 3)))
 
     def turned(self, root: Array) -> Array:
-        own = root @ self.loading
-        return np.asarray(own @ own.transpose(0, 2, 1))
+        own = root[:, None] @ self.loading
+        return np.asarray(own @ own.swapaxes(2, 3))
 
 
 @dataclass(frozen=True)
@@ -120,8 +129,37 @@ class Pack:
 
     B: Array
     e: Array
-    parts: tuple[NoisePart, ...]
+    parts: tuple[NoiseParts, ...]
     absent: BoolArray
+
+    @cached_property
+    def of(self) -> IntArray:
+        """Numbers (C, k) of the variances of all parts."""
+        return np.concatenate([part.of for part in self.parts], axis=1)
+
+    @cached_property
+    def alike(self) -> bool:
+        """Whether all clusters have the same variances."""
+        return bool((self.of == self.of[:1]).all())
+
+    def added(self, values: Array, K: int) -> Array:
+        """Sums (K, …) of `values` (C, k, …) by the numbers of the variances."""
+        if self.alike:
+            of, values = self.of[0], values.sum(axis=0)
+        else:
+            of, values = self.of.ravel(), values.reshape(-1, *values.shape[2:])
+        if values.ndim == 1:
+            return np.bincount(of, values, K).astype(np.float64)
+        out = np.zeros((K, *values.shape[1:]))
+        np.add.at(out, of, values)
+        return out
+
+    def pairs(self, values: Array, K: int) -> Array:
+        """Sums (K, K) of `values` (C, k, k), or (k, k) of clusters alike."""
+        of = self.of[:1] if values.ndim == 2 else self.of
+        at = (of[:, :, None] * K + of[:, None, :]).ravel()
+        found = np.bincount(at, values.ravel(), K * K).astype(np.float64)
+        return found.reshape(K, K)
 
     def V(self, theta: Array) -> Array:
         """V (C, m, m) at θ (K,), absent rows as any others."""
@@ -254,25 +292,28 @@ class Mixed:
         curvature (Gilmour, Thompson and Cullis 1995, Biometrics 51, 1440): eᵀP K_k P K_l P e."""
         state = self.state(np.exp(t))
         K, p = self.K, len(self.precision)
-        slope, both, through = np.zeros(K), np.zeros(K * K), np.zeros((K, p))
+        slope, both, through = np.zeros(K), np.zeros((K, K)), np.zeros((K, p))
         for w, H, z in state.each():
+            pack, m = w.pack, z.shape[1]
             u = w.back(z[..., None])[..., 0]
-            P = w.back((np.eye(H.shape[1]) - H @ H.transpose(0, 2, 1)) @ w.root)
-            own = []
-            for part in w.pack.parts:
-                theta = state.theta[part.of]
-                moved = theta[:, None] * part.times(u)
-                slope += np.bincount(part.of, theta * part.trace(P) - (u * moved).sum(axis=1), K)
-                own.append((w.root @ moved[..., None])[..., 0])
-            for k, (part, f) in enumerate(zip(w.pack.parts, own, strict=True)):
+            P = w.back((np.eye(m) - H @ H.transpose(0, 2, 1)) @ w.root)
+            theta = state.theta[pack.of]
+            trace = theta * np.concatenate([part.trace(P) for part in pack.parts], axis=1)
+            moved = theta[..., None] * np.concatenate(
+                [part.times(u) for part in pack.parts], axis=1
+            )
+            slope += pack.added(trace - (moved @ u[..., None])[..., 0], K)
+            f = moved @ w.root.transpose(0, 2, 1)  # (C, k, m)
+            if pack.alike:
+                f = f.swapaxes(0, 1).reshape(f.shape[1], -1)
+                both += pack.pairs(f @ f.T, K)
                 if H.shape[2]:
-                    _add(through, part.of, (f[:, None] @ H)[:, 0])
-                for other, g in zip(w.pack.parts[: k + 1], own, strict=False):
-                    product, pair = (f * g).sum(axis=1), part.of * K + other.of
-                    both += np.bincount(pair, product, K * K)
-                    if other is not part:
-                        both += np.bincount(other.of * K + part.of, product, K * K)
-        information = both.reshape(K, K) - through @ through.T
+                    through += pack.added((f @ H.reshape(-1, p))[None], K)
+            else:
+                both += pack.pairs(f @ f.swapaxes(1, 2), K)
+                if H.shape[2]:
+                    through += pack.added(f @ H, K)
+        information = both - through @ through.T
         value = state.value
         if self.prior is not None:
             penalty, more = self.prior.penalty(t)
@@ -294,7 +335,7 @@ class Mixed:
             for part in pack.parts:
                 mine = part.of == k
                 mean += 0.5 * float(part.trace(P)[mine].sum())
-                U += 0.5 * float((u * part.times(u))[mine].sum())
+                U += 0.5 * float((part.times(u) @ u[..., None])[mine].sum())
         free, known = (theta > 0) & at.told, at.information
         across, own = known[free, k], known[np.ix_(free, free)]
         left = known[k, k] - float(across @ np.linalg.pinv(own, hermitian=True) @ across)
@@ -306,38 +347,24 @@ class Mixed:
         """The expected information on θ at a state, and what Kenward and Roger need."""
         K, p = self.K, len(self.precision)
         Phi, half = state.Phi, state.inverse.T
-        C, pairs, known = np.zeros((K, p, p)), np.zeros(K * K), np.zeros(K)
+        C, pairs, known = np.zeros((K, p, p)), np.zeros((K, K)), np.zeros(K)
         turned = []
         for w in state.packs:
-            parts = w.pack.parts
-            A = np.stack([part.turned(w.root) for part in parts], axis=1)  # (C, L, m, m)
-            of = np.stack([part.of for part in parts], axis=1)
-            flat = A.reshape(*of.shape, -1)
-            left = A
+            A = np.concatenate([part.turned(w.root) for part in w.pack.parts], axis=1)
+            flat, left = A.reshape(*A.shape[:2], -1), A  # (C, k, m, m)
             if w.B.shape[2]:
                 AB = A @ w.B[:, None]
-                for k, part in enumerate(parts):
-                    _add(C, part.of, w.B.transpose(0, 2, 1) @ AB[:, k])
+                C += w.pack.added(w.B.transpose(0, 2, 1)[:, None] @ AB, K)
                 H = w.B @ half
                 left = A - 2 * A @ (H @ H.transpose(0, 2, 1))[:, None]
-                turned.append((of, AB))
-            local = flat @ left.transpose(0, 1, 3, 2).reshape(*of.shape, -1).transpose(0, 2, 1)
-            pairs += np.bincount(
-                (of[:, :, None] * K + of[:, None, :]).ravel(), local.ravel(), K * K
-            )
-            known += np.bincount(of.ravel(), (flat**2).sum(axis=2).ravel(), K)
+                turned.append((w.pack.of, AB))
+            other = left.swapaxes(2, 3).reshape(flat.shape)
+            pairs += w.pack.pairs(flat @ other.transpose(0, 2, 1), K)
+            known += w.pack.added((flat**2).sum(axis=2), K)
         rotated = (half.T @ C @ half).reshape(K, -1)
-        information = 0.5 * (pairs.reshape(K, K) + rotated @ rotated.T)
+        information = 0.5 * (pairs + rotated @ rotated.T)
         information = (information + information.T) / 2
         return Expected(information, known, C, Phi, tuple(turned))
-
-
-def _add(out: Array, of: IntArray, values: Array) -> None:
-    """Each of the values (C, …) onto its place in `out` (K, …)."""
-    if (of == of[0]).all():
-        out[of[0]] += values.sum(axis=0)
-    else:
-        np.add.at(out, of, values)
 
 
 LEAST_TOLD = 1e-9  # of the information on θ_k that there would be if x were known

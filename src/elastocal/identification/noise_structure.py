@@ -10,7 +10,7 @@ from typing import ClassVar, NamedTuple
 import numpy as np
 from scipy import sparse
 
-from elastocal.engine.mixed import Common, Diagonal, Full, NoisePart, Pack
+from elastocal.engine.mixed import Common, Diagonal, Full, NoiseParts, Pack
 from elastocal.errors import InputError, option, require
 from elastocal.identification.visit_record import VisitRecord
 from elastocal.measurements import Measurements, firsts, numbered
@@ -567,10 +567,10 @@ def packs_of(
             order[np.minimum(starts[of][:, None] + place, sets.n - 1)], -1,
         )  # fmt: skip
         out = members < 0 if silent is None else (members < 0) | silent[members]
-        parts = _own_parts(index, matrix, members)
+        parts = [_own_parts(index, matrix, members)]
         for k, effect in zip(numbers, turned, strict=True):
-            number = np.full(len(members), k)
-            parts.append(Common(number, effect.packed(members)))
+            number = np.full((len(members), 1), k)
+            parts.append(Common(number, effect.packed(members)[:, None]))
         found.append((members, _pack(sets.B, sets.e, members, parts, out)))
     return found
 
@@ -578,12 +578,12 @@ def packs_of(
 def contrasts_of(sets: Sets, structure: Structure) -> Pack:
     """The contrasts between repeats, which hold their own noise alone."""
     matrix = sets.mean(structure.matrix)
-    parts = _own_parts(structure.index[sets.first], matrix, sets.sets[:, None])
+    own = _own_parts(structure.index[sets.first], matrix, sets.sets[:, None])
     e = sets.contrasts
-    return Pack(np.zeros((*e.shape, 0)), e, tuple(parts), np.zeros(e.shape, dtype=bool))
+    return Pack(np.zeros((*e.shape, 0)), e, (own,), np.zeros(e.shape, dtype=bool))
 
 
-def _pack(B: Array, e: Array, members: IntArray, parts: list[NoisePart], out: BoolArray) -> Pack:
+def _pack(B: Array, e: Array, members: IntArray, parts: list[NoiseParts], out: BoolArray) -> Pack:
     (C, M), (size, p) = members.shape, B.shape[1:]
     here = ~out[..., None]
     return Pack(
@@ -593,24 +593,19 @@ def _pack(B: Array, e: Array, members: IntArray, parts: list[NoisePart], out: Bo
     )  # fmt: skip
 
 
-def _own_parts(index: IntArray, matrix: Array, members: IntArray) -> list[NoisePart]:
+def _own_parts(index: IntArray, matrix: Array, members: IntArray) -> NoiseParts:
     """The parts of single readings: those of the k-th of a cluster's different variances, each."""
     (C, M), (L, size) = members.shape, matrix.shape[1:3]
     here = members >= 0
     own = np.where(here[..., None], index[members], -1)  # (C, M, L)
     blocks = np.where(here[..., None, None, None], matrix[members], 0.0)
     place = ranked_within(own.reshape(C, -1)).reshape(C, M, L)
-    diagonal = bool((blocks * (1 - np.eye(size)) == 0).all())
-    parts: list[NoisePart] = []
-    for k in range(int(place.max()) + 1):
-        mine = place == k
-        of = np.where(mine, own, 0).max(axis=(1, 2))
-        block = np.einsum("cml,cmlij->cmij", mine, blocks)
-        if diagonal:
-            parts.append(Diagonal(of, np.einsum("cmii->cmi", block).reshape(C, -1)))
-            continue
-        K = np.zeros((C, M, size, M, size))
-        at = np.arange(M)
-        K[:, at, :, at, :] = block.transpose(1, 0, 2, 3)
-        parts.append(Full(of, K.reshape(C, M * size, M * size)))
-    return parts
+    numbers = int(place.max()) + 1
+    mine = place == np.arange(numbers)[:, None, None, None]  # (k, C, M, L)
+    of = np.where(mine, own, 0).max(axis=(2, 3)).T
+    block = np.einsum("kcml,cmlij->ckmij", mine, blocks)
+    if bool((blocks * (1 - np.eye(size)) == 0).all()):
+        return Diagonal(of, np.einsum("ckmii->ckmi", block).reshape(C, numbers, -1))
+    K, at = np.zeros((C, numbers, M, size, M, size)), np.arange(M)
+    K[:, :, at, :, at, :] = block.transpose(2, 0, 1, 3, 4)
+    return Full(of, K.reshape(C, numbers, M * size, M * size))

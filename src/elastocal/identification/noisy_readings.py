@@ -8,7 +8,7 @@ from functools import cached_property
 import numpy as np
 from scipy import special
 
-from elastocal.engine.mixed import Diagonal, LogPrior, Mixed, MixedFit, NoisePart, Pack, fit
+from elastocal.engine.mixed import Diagonal, LogPrior, Mixed, MixedFit, Pack, fit
 from elastocal.errors import InputError, InsufficientDataError
 from elastocal.identification.linear_solver import least_norm
 from elastocal.identification.noise_structure import (
@@ -132,10 +132,9 @@ class NoisyReadings:
             packs.append(contrasts_of(self.sets, self.structure))
         p, size = self.sets.B.shape[2], self.readings.size
         if held := p - self.readings.n_parameters:
-            parts: tuple[NoisePart, ...] = tuple(
-                Diagonal(np.full(held // size, k), np.tile(axes, (held // size, 1)))
-                for k, (_, axes) in enumerate(self.drifts, self.own)
-            )
+            number = np.tile(self.own + np.arange(len(self.drifts)), (held // size, 1))
+            along = np.array([axes for _, axes in self.drifts])
+            parts = (Diagonal(number, np.tile(along, (held // size, 1, 1))),)
             B = np.eye(held, p, p - held).reshape(-1, size, p)
             packs.append(Pack(B, np.zeros(B.shape[:2]), parts, np.zeros(B.shape[:2], dtype=bool)))
         return Mixed(tuple(packs), len(self.names), np.zeros(p), prior)
