@@ -141,7 +141,7 @@ class SumAnswer:
         wide, noise, joints = self._wide, self.found.noise, list(map(index, self._without_lines))
         if not joints:
             return drawn(self.found, self.hidden, self._weighted, wide.precision, DRAWS, self.rng)
-        columns = np.moveaxis(wide.counting.G[:, :, joints], 2, 0) * LINE
+        columns = np.moveaxis(wide.masked(wide.G[:, :, joints]), 2, 0) * LINE
         fellows = tuple(f.size + np.log(f.rms) for f in families_of(self.found))
         unseen = Unseen(columns, fellows, len(turning_joints(self.dataset.base.model.chain)))
         shared = noise.shared.copy()

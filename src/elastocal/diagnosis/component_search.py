@@ -44,12 +44,12 @@ from elastocal.diagnosis.hypotheses import Hypothesis, judged_together
 from elastocal.diagnosis.line_orders import families_of, order_posterior, ripples
 from elastocal.diagnosis.model_set import Item, ModelSet, extended, packed_columns, spans_of
 from elastocal.diagnosis.noise_floor import (
-    ROUNDING,
     NoiseValues,
     NoisyData,
     posterior,
     project,
 )
+from elastocal.engine.mixed import ROUNDING
 from elastocal.model.effects.base import index
 from elastocal.model.effects.gears import GearRipple, GearSpectrum
 from elastocal.model.effects.gravity_sag import GravitySag, LinkWeights

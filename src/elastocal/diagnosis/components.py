@@ -609,7 +609,7 @@ def _at_maximum(problem: SumOfComponents, at: Sizes) -> FittedSum:
     variances = problem.variances(at)
     value = problem.factored(at)[1]
     score = -value / 2 - problem.pool.penalty(at.size)[0] / 2 - problem.pool.cost
-    score -= 0.5 * log_prior(problem.data.stated, problem.noise)[0]
+    score -= 0.5 * log_prior(problem.data.stated, problem.noise)
     (earned, within), own = problem.earned(at), variances[len(problem.data.precision) :]
     score += float(within.sum())
     return FittedSum(problem.components, at, problem.noise, earned, score, problem, own)

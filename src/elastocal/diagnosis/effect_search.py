@@ -179,7 +179,7 @@ KEPT = 4  # scans that are kept, the last ones
 def base_score(dataset: DiagnosisData, current: ModelSet, scanned: Scan) -> float:
     """Log posterior of the set as it is under the scan's noise."""
     items = sum(item.log_prior for item in current.items)
-    return scanned.marginal + items - 0.5 * log_prior(dataset.data.stated, scanned.noise)[0]
+    return scanned.marginal + items - 0.5 * log_prior(dataset.data.stated, scanned.noise)
 
 
 @dataclass

@@ -15,13 +15,13 @@ from elastocal.diagnosis.diagnosis import SMALLEST_P
 from elastocal.diagnosis.diagnosis_data import DiagnosisData
 from elastocal.diagnosis.hypotheses import NO_SETTINGS, SCALES, EntryKey, Hypothesis
 from elastocal.diagnosis.noise_floor import (
-    ROUNDING,
     NoiseValues,
     NoisyData,
     Projection,
     project,
 )
 from elastocal.diagnosis.unknown import Generic
+from elastocal.engine.mixed import ROUNDING
 from elastocal.model.effects.catalogue import SOMETHING
 from elastocal.model.evaluate import ahead
 from elastocal.units import Array

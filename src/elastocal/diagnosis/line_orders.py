@@ -170,7 +170,7 @@ def order_posterior(
     for scatter in tried:
         noise = with_scatter(found.noise, i, scatter)
         grams = beside(dataset, found, noise, own)
-        none.append(grams.at.marginal - 0.5 * log_prior(grams.data.stated, noise)[0])
+        none.append(grams.at.marginal - 0.5 * log_prior(grams.data.stated, noise))
         gains = [family_evidence(grams, h, part, m, scales)
                  for m, part in zip(MULTIPLES, grid, strict=True)]  # fmt: skip
         each.append(none[-1] + np.concatenate(gains))

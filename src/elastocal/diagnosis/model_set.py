@@ -162,7 +162,7 @@ def _fitted(
     assert noise is not None
     data = at(scales)
     mixed += _within_bounds(items, weighted.projection(data.precision))
-    prior = sum(item.log_prior for item in items) - 0.5 * log_prior(dataset.data.stated, noise)[0]
+    prior = sum(item.log_prior for item in items) - 0.5 * log_prior(dataset.data.stated, noise)
     return ModelSet(items, noise, data, mixed + prior, scales)
 
 

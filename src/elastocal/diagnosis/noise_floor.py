@@ -10,10 +10,19 @@ from scipy import linalg, optimize
 
 from elastocal.diagnosis.baseline import Blocks
 from elastocal.engine.climb import STRIDE, climb
+from elastocal.engine.mixed import (
+    LOG_2PI,
+    ROUNDING,
+    Common,
+    Full,
+    LogPrior,
+    Mixed,
+    Pack,
+    Whitened,
+)
 from elastocal.engine.sizes import inverse_triangle
-from elastocal.identification.weighted_problem import WhitenedBlocks
 from elastocal.model.evaluate import ahead, thread_count
-from elastocal.units import Array, BoolArray
+from elastocal.units import Array, BoolArray, IntArray
 
 # The noise floor: tracker noise, repeatability of each joint, scatter common to a configuration.
 #
@@ -56,6 +65,12 @@ class NoiseValues:
     def shared_by_all(self) -> float:
         """c of all joints together: rms of what a configuration has over that of a visit."""
         return float(np.linalg.norm(self.shared * self.joint) / np.linalg.norm(self.joint))
+
+    @property
+    def theta(self) -> Array:
+        """The variances (1 + 2 joints,) of the data's `model`: the instrument's, of each joint at a
+        configuration, of each at a visit."""
+        return np.concatenate([[self.factor**2], (self.joint * self.shared) ** 2, self.joint**2])
 
     def logs(self) -> Array:
         return np.log(np.concatenate([[self.factor], self.shared, self.joint]))
@@ -123,78 +138,54 @@ class NoisyData:
         return packed * keep.reshape(keep.shape + (1,) * (packed.ndim - 2))
 
     @cached_property
-    def counting(self) -> Counting:
-        """What is evaluated at many noises, rows that do not count set to zero once."""
-        G, keep = self.masked(self.G), ~self.left_out
-        both = keep[:, :, None] & keep[:, None, :]
-        visit = self.blocks.places.one_hot
-        by_visit = (visit[..., None] * G[:, :, None, :]).reshape(*G.shape[:2], -1)
-        by_visit = np.ascontiguousarray(by_visit.transpose(0, 2, 1))
-        return Counting(
-            self.masked(self.r), self.masked(self.X), G, by_visit,
-            self.covariance if keep.all() else self.covariance * both,
+    def model(self) -> Mixed:
+        """Of the variances `NoiseValues.theta`."""
+        (C, _, J), visit = self.G.shape, self.blocks.places.one_hot
+        G = np.ascontiguousarray(self.G.transpose(0, 2, 1))[..., None]  # (C, joints, m, 1)
+
+        def numbers(first: int, k: int) -> IntArray:
+            return np.tile(np.arange(first, first + k), (C, 1))
+
+        parts = (
+            Full(numbers(0, 1), self.covariance[:, None]), Common(numbers(1, J), G),
+            Common(numbers(1 + J, J), G * visit[:, None]),
         )  # fmt: skip
-
-
-@dataclass(frozen=True)
-class Counting:
-    """Residual, columns, joint columns, those of each visit by itself (C, visits·joints, m), and
-    stated covariance, with zeros where nothing counts."""
-
-    r: Array
-    X: Array
-    G: Array
-    by_visit: Array
-    covariance: Array
+        pack = Pack(self.X, self.r, parts, self.left_out)
+        return Mixed((pack,), 1 + 2 * J, self.precision)
 
 
 def covariance(data: NoisyData, noise: NoiseValues) -> Array:
     """V (C, m, m); rows left out have unit variance of their own."""
-    of = data.counting
-    back = of.G.transpose(0, 2, 1)
-    V = (of.G * noise.joint**2) @ back
-    V *= data.same_visit
-    V += (of.G * (noise.joint * noise.shared) ** 2) @ back
-    V += noise.factor**2 * of.covariance
-    m = np.arange(V.shape[1])
-    V[:, m, m] += data.left_out
+    V, keep = data.model.packs[0].V(noise.theta), ~data.left_out
+    V *= keep[:, :, None] & keep[:, None, :]
+    np.einsum("cii->ci", V)[:] += data.left_out
     return V
 
 
-def log_prior(stated: bool, noise: NoiseValues) -> tuple[float, Array]:
-    """−2 log prior of the logarithms and its slope.
+@cache
+def log_prior_of(stated: bool, joints: int) -> LogPrior:
+    """Prior of the logarithms (1 + 2 joints,).
 
-    The joints' logarithms have a common mean that is itself uncertain.
+    The joints' own have a common mean that is itself uncertain.
     """
-    theta, n = noise.logs(), len(noise.joint)
     spread = STATED_SPREAD if stated else UNSTATED_SPREAD
-    value, slope = float(theta[0] / spread) ** 2, np.empty_like(theta)
-    slope[0] = 2 * theta[0] / spread**2
-    for own, usual, apart, common in (
-        (slice(1, 1 + n), SHARED, SHARED_SPREAD, 0.0),
-        (slice(1 + n, None), REPEATABILITY, JOINT_SPREAD, REPEATABILITY_SPREAD),
-    ):
-        off = theta[own] - np.log(usual)
-        scaled = _precision(n, apart, common) @ off
-        value, slope[own] = value + float(off @ scaled), 2 * scaled
-    return value, slope
+    mean = [0.0, *[np.log(SHARED)] * joints, *[np.log(REPEATABILITY)] * joints]
+    own = (
+        _precision(1, spread, 0.0), _precision(joints, SHARED_SPREAD, 0.0),
+        _precision(joints, JOINT_SPREAD, REPEATABILITY_SPREAD),
+    )  # fmt: skip
+    return LogPrior(np.array(mean), linalg.block_diag(*own))
+
+
+def log_prior(stated: bool, noise: NoiseValues) -> float:
+    """−2 log prior of the logarithms, but for its constant."""
+    return log_prior_of(stated, len(noise.joint)).penalty(noise.logs())[0]
 
 
 def _precision(n: int, apart: float, common: float) -> Array:
     """Inverse of apart² 1 + common² (n, n)."""
     share = common**2 / (apart**2 + n * common**2)
     return np.asarray((np.eye(n) - share) / apart**2)
-
-
-@cache
-def prior_curvature(stated: bool, joints: int) -> Array:
-    """Second derivatives (1 + 2 joints, 1 + 2 joints) of −2 log prior; not to be written to."""
-    own = (
-        _precision(1, STATED_SPREAD if stated else UNSTATED_SPREAD, 0.0),
-        _precision(joints, SHARED_SPREAD, 0.0),
-        _precision(joints, JOINT_SPREAD, REPEATABILITY_SPREAD),
-    )
-    return np.asarray(2 * linalg.block_diag(*own))
 
 
 # Data under one noise: what is left of the residual, and how probable the noise is.
@@ -205,10 +196,6 @@ def prior_curvature(stated: bool, joints: int) -> Array:
 #     P = V⁻¹ − V⁻¹X (XᵀV⁻¹X + Λ)⁻¹ XᵀV⁻¹,
 #
 # (restricted likelihood where Λ → 0; Patterson and Thompson 1971).
-# ∂(−2ℓ)/∂θ = tr(P V_θ) − rᵀP V_θ P r.
-
-ROUNDING = 1e-12
-WHITENED = 100  # configurations at a time
 
 
 @dataclass(frozen=True)
@@ -268,20 +255,11 @@ class Weighted:
     alone: float
 
     @classmethod
-    def of(cls, data: NoisyData, noise: NoiseValues, room: Array | None = None) -> Weighted:
-        """`room` (C, m, p) is where K⁻¹X is put: at many noises one after the other the system
-        would else hand out the same pages anew each time, a fifth of all that an evaluation costs.
-        """
-        of = data.counting
-        white = WhitenedBlocks.of(covariance(data, noise), of.X[:, :, :0], of.r)
-        root, r, log_det = white.root, white.e, white.log_det
-        X, M = np.empty_like(of.X) if room is None else room, np.zeros((of.X.shape[2],) * 2)
-        # A piece is multiplied with itself while it is in the cache.
-        for some in (slice(k, k + WHITENED) for k in range(0, len(r), WHITENED)):
-            flat = np.matmul(root[some], of.X[some], out=X[some]).reshape(-1, len(M))
-            M += flat.T @ flat
-        alone = log_det + float(np.vdot(r, r)) + data.n_rows * float(np.log(2 * np.pi))
-        return cls(root, X, r, M, X.reshape(-1, len(M)).T @ r.ravel(), alone)
+    def of(cls, data: NoisyData, noise: NoiseValues) -> Weighted:
+        white = Whitened(data.model.packs[0], noise.theta)
+        flat, r = white.B.reshape(-1, white.B.shape[2]), white.e
+        alone = white.log_det + float(np.vdot(r, r)) + data.n_rows * LOG_2PI
+        return cls(white.root, white.B, r, flat.T @ flat, flat.T @ r.ravel(), alone)
 
     def prior(self, precision: Array) -> Array:
         """Λ's diagonal (p,), and a little more: what others show as well and the prior leaves wide
@@ -306,25 +284,14 @@ class Weighted:
     def projection(self, precision: Array) -> Projection:
         L, z, marginal = self.factored(precision)
         back = self.root.transpose(0, 2, 1)
-        H = back @ _times_transposed(self.X, inverse_triangle(L))
-        u = (back @ self.r[..., None])[..., 0] - _times(H, z)
+        H = back @ (self.X @ inverse_triangle(L).T)
+        u = (back @ self.r[..., None])[..., 0] - H @ z
         beta = linalg.solve_triangular(L, z, lower=True, trans="T", check_finite=False)
-        return Projection(back @ self.root, H, u, beta, marginal, L)
-
-
-def _times_transposed(rows: Array, lower: Array, overwrite: bool = False) -> Array:
-    """rows Tᵀ (…, p) of rows (…, p), in whose place they may be, and a lower triangular T (p, p).
-
-    By BLAS's triangular product: with T = L⁻¹ half the time of solving for every row.
-    """
-    flat = rows.reshape(-1, rows.shape[-1])
-    product = linalg.blas.dtrmm(1.0, lower, flat.T, lower=1, overwrite_b=overwrite)
-    return np.asarray(product.T.reshape(rows.shape))
-
-
-def _times(rows: Array, vector: Array) -> Array:
-    """rows (C, m, p) times a vector (p,), as one product: (C, m)."""
-    return np.asarray((rows.reshape(-1, rows.shape[2]) @ vector).reshape(rows.shape[:2]))
+        inverse = back @ self.root
+        # What does not count has a unit variance of its own.
+        diagonal = np.einsum("cii->ci", inverse)
+        diagonal[diagonal == 0] = 1.0
+        return Projection(inverse, H, u, beta, marginal, L)
 
 
 def project(data: NoisyData, noise: NoiseValues) -> Projection:
@@ -333,69 +300,20 @@ def project(data: NoisyData, noise: NoiseValues) -> Projection:
 
 def posterior(data: NoisyData, noise: NoiseValues) -> float:
     """−2 log of marginal likelihood times prior of the noise."""
-    marginal = Weighted.of(data, noise).marginal(data.precision)
-    return -2 * marginal + log_prior(data.stated, noise)[0]
+    return -2 * Weighted.of(data, noise).marginal(data.precision) + log_prior(data.stated, noise)
 
 
-def likelihood(data: NoisyData, noise: NoiseValues) -> tuple[float, Array]:
-    """−2 log of marginal likelihood times prior, and slope (1 + 2 joints,) in the logarithms."""
-    return curved_likelihood(data, noise)[:2]
-
-
-def curved_likelihood(
-    data: NoisyData, noise: NoiseValues, room: Array | None = None
-) -> tuple[float, Array, Array]:
-    """−2 log of marginal likelihood times prior, its slope in the logarithms (1 + 2 joints,), and
-    the curvature to expect there, tr P V_k P V_l, of each configuration by itself.
-
-    The slope wants gᵀQg, Q = P − uuᵀ, of the joints' columns g in every visit and configuration:
-    with g̃ = K⁻¹g, H̃ = X̃L⁻ᵀ and ẽ = K⁻¹(r − Xβ̂) it is g̃ᵀ(1 − H̃H̃ᵀ − ẽẽᵀ)g̃.  What is left of V
-    is the instrument's: tr QV = n − tr (M + Λ)⁻¹M − ẽᵀẽ; and of a configuration by itself
-    PVP = K⁻ᵀ(1 − H̃H̃ᵀ)²K⁻¹, so that g'PVPg is the square of h = (1 − H̃H̃ᵀ)g̃.
-    """
-    of, at, J = data.counting, Weighted.of(data, noise, room), data.G.shape[2]
-    L, z, marginal = at.factored(data.precision)
-    beta = linalg.solve_triangular(L, z, lower=True, trans="T", check_finite=False)
-    inverse, e = inverse_triangle(L), at.r - _times(at.X, beta)
-    H = _times_transposed(at.X, inverse, overwrite=True)
-    white = H @ H.transpose(0, 2, 1)
-    white *= -1.0
-    np.einsum("cii->ci", white)[:] += 1.0
-    g = of.by_visit @ at.root.transpose(0, 2, 1)
-    by_visit = len(g), g.shape[1] // J, J
-    h = g @ white
-    P = (h @ g.transpose(0, 2, 1)).reshape(*by_visit, *by_visit[1:])
-    h, f = h.reshape(*by_visit, -1), (g @ e[..., None]).reshape(by_visit)
-    fitted = len(L) - float((inverse**2 @ at.prior(data.precision)).sum())
-    single, shared = 2 * noise.joint**2, 2 * (noise.joint * noise.shared) ** 2
-
-    def traces(of_all: float, of_visits: Array, of_both: Array) -> Array:
-        """tr N V_k of tr N V, and of Σ gᵀNg (joints,) of each visit and of every two of one
-        configuration."""
-        of_shared = shared * of_both
-        of_joint = single * of_visits + of_shared
-        return np.concatenate([[of_all - of_joint.sum()], of_shared, of_joint])
-
-    prior, prior_slope = log_prior(data.stated, noise)
-    whole = 2 * (data.n_rows - float(np.vdot(e, e)) - fitted)
-    slope = prior_slope + traces(
-        whole, np.einsum("cvjvj->j", P) - np.einsum("cvj,cvj->j", f, f),
-        np.einsum("cvjwj->j", P) - (f.sum(axis=1) ** 2).sum(axis=0),
-    )  # fmt: skip
-    # From gᵀPg of every two visits of a configuration: those of visits, of both, of configurations.
-    across = np.einsum("cvjwk->cvjk", P)
-    vv = np.outer(single, single) * np.einsum("cvjwk,cvjwk->jk", P, P)
-    vs = np.outer(single, shared) * np.einsum("cvjk,cvjk->jk", across, across)
-    ss = np.outer(shared, shared) * (across.sum(axis=1) ** 2).sum(axis=0)
-    joints = np.block([[ss, vs.T + ss], [vs + ss, vv + vs + vs.T + ss]])
-    trace = traces(
-        2 * float(np.vdot(white, white)) - 2 * float(data.left_out.sum()),
-        np.einsum("cvjm,cvjm->j", h, h), (h.sum(axis=1) ** 2).sum(axis=(0, 2)),
-    )  # fmt: skip
-    mixed = 2 * trace[1:] - joints[J:].sum(axis=0)
-    alone = 2 * trace[0] - mixed[J:].sum()
-    curvature = np.block([[np.array([[alone]]), mixed[None]], [mixed[:, None], joints]])
-    return -2 * marginal + prior, slope, curvature + prior_curvature(data.stated, J)
+def likelihood(data: NoisyData, theta: Array) -> tuple[float, Array, Array]:
+    """−2 log of marginal likelihood times prior at logarithms θ (1 + 2 joints,), its slope, and its
+    average information."""
+    J = data.G.shape[2]
+    # The logarithms of the variances: twice those of factor, of c and s, of s.
+    to = 2 * np.eye(1 + 2 * J)
+    to[1 : 1 + J, 1 + J :] = 2 * np.eye(J)
+    value, slope, information = data.model.objective(to @ theta)
+    prior = log_prior_of(data.stated, J)
+    penalty, more = prior.penalty(theta)
+    return value + penalty, to.T @ slope + more, to.T @ information @ to + 2 * prior.precision
 
 
 ROUNDS = 10
@@ -437,10 +355,9 @@ def balanced(data: NoisyData) -> NoiseValues:
 def _climbed(data: NoisyData, start: NoiseValues, enough: float) -> NoiseValues:
     """Steps by the expected curvature, which few of them need; where they do not end, by L-BFGS."""
     lower, upper = _limits(data)
-    room = np.empty_like(data.X)
     theta, ended = climb(
-        lambda theta: curved_likelihood(data, NoiseValues.of_logs(theta), room),
-        np.clip(start.logs(), lower, upper), lower, upper, enough, SCORED,
+        lambda theta: likelihood(data, theta), np.clip(start.logs(), lower, upper), lower, upper,
+        enough, SCORED,
     )  # fmt: skip
     found = NoiseValues.of_logs(theta)
     return found if ended else _climbed_far(data, found, enough)
@@ -467,7 +384,7 @@ def _climbed_far(data: NoisyData, start: NoiseValues, enough: float) -> NoiseVal
         # A search begins where it has been: at the start, and where the last stride ended.
         key = scaled.tobytes()
         if key not in known:
-            value, slope = likelihood(data, NoiseValues.of_logs(scaled / curved))
+            value, slope, _ = likelihood(data, scaled / curved)
             known[key] = value, slope / curved
         value, slope = known[key]
         return value, slope.copy()
@@ -512,7 +429,7 @@ def noise_draws(
     k = len(theta)
 
     def slope(at: Array) -> Array:
-        return likelihood(data, NoiseValues.of_logs(at))[1]
+        return likelihood(data, at)[1]
 
     steps = STEP * np.concatenate([np.eye(k), -np.eye(k)])
     up, down = np.split(np.array(list(ahead(slope, theta + steps, data.threads))), 2)

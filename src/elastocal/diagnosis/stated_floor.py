@@ -196,14 +196,14 @@ def smooth_scatter(dataset: DiagnosisData, data: NoisyData, at: Projection) -> A
     Functions of several angles add up; what goes with all joints or with the order of measuring
     holds them.
     """
-    of = data.counting
-    J = of.G.shape[2]
+    G = data.masked(data.G)
+    J = G.shape[2]
     out = np.zeros(J)
     first = dataset.lead[dataset.blocks.member[:, 0]]
     q, moment = dataset.table.q[first], dataset.moment[dataset.blocks.member[:, 0]]
     limit = -float(special.ndtri(FALSE_SMOOTH / (J * (J + 2))))
-    h = np.einsum("cmj,cmj->cj", of.G, at.P @ of.G)
-    a = np.einsum("cmj,cm->cj", of.G, at.u)
+    h = np.einsum("cmj,cmj->cj", G, at.P @ G)
+    a = np.einsum("cmj,cm->cj", G, at.u)
     for j in range(J):
         known = np.flatnonzero(h[:, j] > 1e-9 * h[:, j].max(initial=1e-300))
         if len(known) < FEWEST_NEIGHBOURS:

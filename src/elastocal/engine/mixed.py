@@ -16,7 +16,7 @@ from __future__ import annotations
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 from functools import cached_property
-from typing import Protocol
+from typing import Protocol, TypeGuard
 
 import numpy as np
 from scipy import linalg, optimize, special
@@ -26,6 +26,8 @@ from elastocal.errors import InsufficientDataError
 from elastocal.units import Array, BoolArray, IntArray
 
 LOG_2PI = float(np.log(2 * np.pi))
+ROUNDING = 1e-12
+FORMED = 1e10  # operations on parts K of one evaluation
 
 
 # What V is made of: several K of every cluster, and the numbers of their variances there.
@@ -125,6 +127,7 @@ class Pack:
     """C clusters of m rows: B (C, m, p), p = 0 where they hold nothing of x; e (C, m); parts of V.
 
     Rows that are `absent` (C, m) do not count: padding, or readings that only are to be judged.
+    `parts` that are common come last.
     """
 
     B: Array
@@ -190,6 +193,57 @@ class Whitened:
     def back(self, rows: Array) -> Array:
         """R⁻ᵀ times rows (C, m, …)."""
         return np.asarray(self.root.transpose(0, 2, 1) @ rows)
+
+    @property
+    def cost(self) -> float:
+        """Operations that `local_information` takes, roughly."""
+        (C, m), parts = self.e.shape, self.pack.parts
+        common = sum(p.loading.shape[1] * p.loading.shape[3] for p in parts if _common(p))
+        formed = sum(p.of.shape[1] for p in parts if not _common(p))
+        return float(C * m * (2 * formed * m**2 + common * (2 * m + common + formed * m)))
+
+    def local_information(self, Q: Array, theta: Array) -> Array:
+        """θ_kθ_l tr P K_k P K_l (C, k, k) of each cluster by itself, P = R⁻ᵀQR⁻¹, θ (C, k).
+
+        Of what is common by its loadings: with W = R⁻¹ℓ, the squares of WᵀQW.
+        """
+        root, n = self.root[:, None], 0
+        whole, rows = [], []
+        for part in self.pack.parts:
+            own = theta[:, n : n + part.of.shape[1], None, None]
+            n += part.of.shape[1]
+            if _common(part):
+                W = (root @ part.loading) * np.sqrt(own)
+                rows.append((W, Q[:, None] @ W))
+            else:
+                whole.append(part.turned(self.root) * own)
+        out, first = np.zeros((*theta.shape, theta.shape[1])), 0
+        if whole:
+            A = np.concatenate(whole, axis=1)
+            first = A.shape[1]
+            QA = Q[:, None] @ A
+            flat = QA.reshape(*QA.shape[:2], -1)
+            out[:, :first, :first] = flat @ QA.swapaxes(2, 3).reshape(flat.shape).swapaxes(1, 2)
+        at = first
+        for i, (W, _) in enumerate(rows):
+            here, (C, k, m, r) = slice(at, at + W.shape[1]), W.shape
+            at, there = here.stop, first
+            left = W.swapaxes(2, 3).reshape(C, k * r, m)
+            if whole:
+                Y = rows[i][1].swapaxes(1, 2).reshape(C, 1, m, k * r)
+                both = ((A @ Y) * Y).sum(axis=2).reshape(C, first, k, r).sum(axis=3)
+                out[:, :first, here], out[:, here, :first] = both, both.swapaxes(1, 2)
+            for other in rows:
+                k2, r2 = other[1].shape[1], other[1].shape[3]
+                right = other[1].swapaxes(1, 2).reshape(C, m, k2 * r2)
+                square = ((left @ right) ** 2).reshape(C, k, r, k2, r2).sum(axis=(2, 4))
+                out[:, here, there : there + k2] = square
+                there += k2
+        return out
+
+
+def _common(part: NoiseParts) -> TypeGuard[Common]:
+    return isinstance(part, Common)
 
 
 @dataclass(frozen=True)
@@ -268,12 +322,15 @@ class Mixed:
         without a prior depend on each other."""
         packs = tuple(Whitened(pack, theta) for pack in self.packs)
         p = len(self.precision)
-        M, z, value = np.diag(self.precision), np.zeros(p), 0.0
+        known = self.precision > 0
+        M, z, value = np.zeros((p, p)), np.zeros(p), 0.0
         for w in packs:
             value += w.log_det + float(np.vdot(w.e, w.e))
             if w.B.shape[2]:
                 flat = w.B.reshape(-1, p)
                 M, z = M + flat.T @ flat, z + flat.T @ w.e.ravel()
+        # A little more than the prior: what others show as well must not drown in rounding.
+        M[np.diag_indices(p)] += self.precision + ROUNDING * known * np.diag(M)
         try:
             L = np.asarray(linalg.cholesky(M, lower=True))
         except linalg.LinAlgError:
@@ -281,30 +338,35 @@ class Mixed:
                 "the columns of B depend on each other under this noise model; measure more poses"
             ) from None
         x = linalg.cho_solve((L, True), z)
-        known = self.precision > 0
         value += 2 * float(np.log(np.diag(L)).sum()) - float(x @ z)
         value += (self.rows - int((~known).sum())) * LOG_2PI
         value -= float(np.log(self.precision[known]).sum())
         return State(theta, packs, x, L, value)
 
     def objective(self, t: Array) -> tuple[float, Array, Array]:
-        """−2 log posterior at logarithms t (K,), slope, and the average of observed and expected
-        curvature (Gilmour, Thompson and Cullis 1995, Biometrics 51, 1440): eᵀP K_k P K_l P e."""
+        """−2 log posterior at logarithms t (K,), its slope, and a curvature to step by.
+
+        tr P K_k P K_l, that to expect, of each cluster by itself.  Of large clusters the average of
+        the observed and the expected one, eᵀP K_k P K_l P e (Gilmour, Thompson and Cullis 1995,
+        Biometrics 51, 1440): it is formed of vectors alone, but leads less far.
+        """
         state = self.state(np.exp(t))
         K, p = self.K, len(self.precision)
         slope, both, through = np.zeros(K), np.zeros((K, K)), np.zeros((K, p))
         for w, H, z in state.each():
             pack, m = w.pack, z.shape[1]
             u = w.back(z[..., None])[..., 0]
-            P = w.back((np.eye(m) - H @ H.transpose(0, 2, 1)) @ w.root)
-            theta = state.theta[pack.of]
+            Q = np.eye(m) - H @ H.transpose(0, 2, 1)
+            P, theta = w.back(Q @ w.root), state.theta[pack.of]
             trace = theta * np.concatenate([part.trace(P) for part in pack.parts], axis=1)
             moved = theta[..., None] * np.concatenate(
                 [part.times(u) for part in pack.parts], axis=1
             )
             slope += pack.added(trace - (moved @ u[..., None])[..., 0], K)
             f = moved @ w.root.transpose(0, 2, 1)  # (C, k, m)
-            if pack.alike:
+            if w.cost <= FORMED:
+                both += pack.pairs(w.local_information(Q, theta), K)
+            elif pack.alike:
                 f = f.swapaxes(0, 1).reshape(f.shape[1], -1)
                 both += pack.pairs(f @ f.T, K)
                 if H.shape[2]:

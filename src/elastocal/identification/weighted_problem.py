@@ -7,7 +7,7 @@ from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass, replace
 from functools import cached_property, reduce
 from itertools import chain
-from typing import Literal, NamedTuple, TypeVar
+from typing import Literal, TypeVar
 
 import numpy as np
 from numpy.typing import NDArray
@@ -218,24 +218,6 @@ def inverse_factor(blocks: Array) -> Array:
             f"{option('covariance')}, the sigma columns of the table, or [tracker] of the cell"
         ) from None
     return lower_inverse(factor)
-
-
-class WhitenedBlocks(NamedTuple):
-    """Blocks of rows whitened by their covariances V = KKᵀ, as every restricted likelihood has
-    them: `root` K⁻¹ (C, m, m), K⁻¹B (C, m, p), K⁻¹e (C, m) and log|V| of all."""
-
-    root: Array
-    B: Array
-    e: Array
-    log_det: float
-
-    @classmethod
-    def of(cls, V: Array, B: Array, e: Array) -> WhitenedBlocks:
-        """Raises LinAlgError where V (C, m, m) is not positive definite."""
-        K = np.asarray(np.linalg.cholesky(V), dtype=np.float64)
-        log_det = 2 * float(np.log(np.diagonal(K, axis1=1, axis2=2)).sum())
-        root = lower_inverse(K)
-        return cls(root, root @ B, (root @ e[..., None])[..., 0], log_det)
 
 
 def same_size(codes: NDArray[np.integer]) -> Iterator[IntArray]:
