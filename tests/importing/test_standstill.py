@@ -30,7 +30,8 @@ def test_as_the_definition_says(steps, shortest):
     time = np.cumsum([dt for dt, _, _ in steps])
     q = np.cumsum([(a, b) for _, a, b in steps], axis=0).astype(float)
     still = np.array([1.0, 0.0])
-    found = dwells(time, q, still, shortest)
-    assert [(s.first, s.last) for s in found] == plainly(time, q, still, shortest)
-    for s in found:
-        np.testing.assert_array_equal(s.q, np.median(q[s.first : s.last + 1], axis=0))
+    first, last, standing = dwells(time, q, still, shortest)
+    ends = list(zip(first, last, strict=True))
+    assert ends == plainly(time, q, still, shortest)
+    for (a, b), there in zip(ends, standing, strict=True):
+        np.testing.assert_array_equal(there, np.median(q[a : b + 1], axis=0))

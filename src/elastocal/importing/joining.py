@@ -197,23 +197,17 @@ def _same(what: str, first: Records, other: Records, one: set[str], two: set[str
 CHUNK = 1024
 
 
-@dataclass(frozen=True)
-class Dwell:
-    """Rows `first` to `last` of the log, both included; the arm's `q` (n,) then (median)."""
-
-    first: int
-    last: int
-    q: Array
-
-
-def dwells(time: Array, q: Array, still: Array, shortest: float) -> list[Dwell]:
-    """The longest runs of rows in which no joint moves by more than `still`.
+def dwells(
+    time: Array, q: Array, still: Array, shortest: float
+) -> tuple[IntArray, IntArray, Array]:
+    """The longest runs of rows in which no joint moves by more than `still`: the first and the
+    last row of each (k,), and where the arm stands then (k, n), the median.
 
     `time` (m,) s, rising; `q` (m, n); `still` (n,): the largest max - min of each joint within a
     dwell, in the unit of q; `shortest` s between its first and last row.  Runs are taken from
     the start of the log on, each as long as it can be; shorter ones count as motion.
     """
-    found: list[Dwell] = []
+    found: list[tuple[int, int]] = []
     start, m = 0, len(time)
     while start + 1 < m:
         # The first row with which the run is long enough.
@@ -227,9 +221,11 @@ def dwells(time: Array, q: Array, still: Array, shortest: float) -> list[Dwell]:
             start += int(moved[-1]) + 1
             continue
         end = _last(q, start, still)
-        found.append(Dwell(start, end, np.median(q[start : end + 1], axis=0)))
+        found.append((start, end))
         start = end + 1
-    return found
+    first, last = np.array(found, dtype=np.int64).reshape(-1, 2).T
+    middle = [np.median(q[a : b + 1], axis=0) for a, b in found]
+    return first, last, np.array(middle).reshape(len(found), q.shape[1])
 
 
 def _spread(q: Array) -> Array:
@@ -323,10 +319,10 @@ def _likely_offset(points: Records, log: Records, settings: JoinTable, how: str)
         return ""
     at, clock, order = _clocks(points, log, settings, how)
     still = log.spread(settings.still_deg, settings.still_mm)
-    found = dwells(clock, log.q[order], still, settings.still_s)
-    if not found or len(at) * len(found) > MOST_PAIRS:
+    first, last, _ = dwells(clock, log.q[order], still, settings.still_s)
+    if not len(first) or len(at) * len(first) > MOST_PAIRS:
         return ""
-    ends = np.array([[clock[s.first], clock[s.last]] for s in found])
+    ends = np.column_stack([clock[first], clock[last]])
     middle = ends.mean(axis=1)
     tried = np.unique(np.round(at[:, None] - middle, 1))
     joined = np.zeros(len(tried), dtype=int)
@@ -531,27 +527,23 @@ def _by_time(where: str, points: Records, log: Records, settings: JoinTable) -> 
 def _by_standstill(where: str, points: Records, log: Records, settings: JoinTable) -> Joined:
     at, clock, order = _clocks(points, log, settings, "standstill")
     still, shortest = log.spread(settings.still_deg, settings.still_mm), settings.still_s
-    found = dwells(clock, log.q[order], still, shortest)
-    if not found:
+    starts, ends, standing = dwells(clock, log.q[order], still, shortest)
+    if not len(starts):
         raise InputError(
             f"{log.files[0]}: the arm never stood still for {shortest:g} s; correct still_s and "
             "still_deg in [join], or join by time"
         )
-    first = np.array([clock[s.first] for s in found])
-    last = np.array([clock[s.last] for s in found])
+    first, last = clock[starts], clock[ends]
     # 0 within a dwell, else the time to its nearer end.
     best = np.array([np.argmin(np.maximum(np.maximum(first - t, t - last), 0.0)) for t in at])
     apart = np.maximum(np.maximum(first[best] - at, at - last[best]), 0.0)
     good = apart <= settings.tolerance_s
-    q = np.array([s.q for s in found])[best]
-    row = np.where(good, order[np.array([s.first for s in found])[best]], -1)
+    row = np.where(good, order[starts[best]], -1)
     left_out = tuple(
         f"{points.shown(int(i))}, {apart[i]:.3g} s from the nearest standstill"
         for i in np.flatnonzero(~good)
     )  # fmt: skip
-    empty = np.setdiff1d(np.arange(len(found)), best[good])
-    unused = tuple(
-        f"standstill {k + 1} (from line {log.line[order[found[k].first]]})" for k in empty
-    )
-    remarks = (f"{len(found)} standstills of {shortest:g} s or more in {len(log)} rows",)
-    return Joined("standstill", row, q, None, left_out, unused, remarks)
+    empty = np.setdiff1d(np.arange(len(starts)), best[good])
+    unused = tuple(f"standstill {k + 1} (from line {log.line[order[starts[k]]]})" for k in empty)
+    remarks = (f"{len(starts)} standstills of {shortest:g} s or more in {len(log)} rows",)
+    return Joined("standstill", row, standing[best], None, left_out, unused, remarks)
