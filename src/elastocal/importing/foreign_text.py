@@ -472,7 +472,7 @@ def krl_rows(text: Text) -> Rows:
     """
     found = Rows(("name", *KRL_AXES), [], [], split_at="KRL")
     whole = "\n".join(_uncommented(line, ";") for line in text.lines)
-    count = _LineCounter(whole)
+    count = _line_counter(whole)
     for match in _KRL.finditer(whole):
         line = count(match.start(2))
         # The display of a variable writes the type too: {E6AXIS: A1 0.0, …}
@@ -484,14 +484,9 @@ def krl_rows(text: Text) -> Rows:
                 name = match[1] or "an aggregate"
                 found.ignored.append((line, f"{name} is a Cartesian position, not joint values"))
             continue
-        for axis in KRL_AXES:
-            if axis in values and not _NUMBER.fullmatch(values[axis]):
-                raise InputError(
-                    f"{text.source}, line {line}: {axis} is {quoted(values[axis])}, not a number; "
-                    "log values, not expressions"
-                )
-        cells = [match[1] or "", *(values.get(axis, "") for axis in KRL_AXES)]
-        found.rows.append((line, cells))
+        given = [_value(text, line, axis, values[axis]) if axis in values else ""
+                 for axis in KRL_AXES]  # fmt: skip
+        found.rows.append((line, [match[1] or "", *given]))
     return _complete(text, found, "no {A1 …, A2 …} with joint values")
 
 
@@ -504,7 +499,7 @@ def rapid_rows(text: Text) -> Rows:
     """
     found = Rows(("name", *RAPID_AXES), [], [], split_at="RAPID")
     whole = "\n".join(_uncommented(line, "!") for line in text.lines)
-    count = _LineCounter(whole)
+    count = _line_counter(whole)
     start = 0
     for statement in re.split(r";", whole):
         _rapid_statement(text, found, statement, start, count)
@@ -513,7 +508,7 @@ def rapid_rows(text: Text) -> Rows:
 
 
 def _rapid_statement(
-    text: Text, found: Rows, statement: str, start: int, count: _LineCounter
+    text: Text, found: Rows, statement: str, start: int, count: Callable[[int], int]
 ) -> None:
     declared = _RAPID_NAME.search(statement)
     kind = (declared[1] or "").lower() if declared else ""
@@ -530,16 +525,20 @@ def _rapid_statement(
     several = bool(declared and declared[3])
     for k, (match, (robot, external)) in enumerate(targets, start=1):
         line = count(start + match.start())
-        cells = []
-        for axis, cell in zip(RAPID_AXES, [*robot, *external], strict=True):
-            if not _NUMBER.fullmatch(cell):
-                raise InputError(
-                    f"{text.source}, line {line}: {axis} is {quoted(cell)}, not a number; log "
-                    "values, not expressions"
-                )
-            cells.append("" if float(cell) >= NOT_CONNECTED else cell)
+        both = zip(RAPID_AXES, [*robot, *external], strict=True)
+        given = [_value(text, line, axis, cell) for axis, cell in both]
+        cells = ["" if float(cell) >= NOT_CONNECTED else cell for cell in given]
         label = f"{name}{{{k}}}" if several else name
         found.rows.append((line, [label, *cells]))
+
+
+def _value(text: Text, line: int, axis: str, cell: str) -> str:
+    if not _NUMBER.fullmatch(cell):
+        raise InputError(
+            f"{text.source}, line {line}: {axis} is {quoted(cell)}, not a number; log values, not "
+            "expressions"
+        )
+    return cell
 
 
 def _complete(text: Text, found: Rows, what: str) -> Rows:
@@ -559,22 +558,11 @@ def _complete(text: Text, found: Rows, what: str) -> Rows:
 
 def _uncommented(line: str, mark: str) -> str:
     """The line up to a comment mark outside quotation marks."""
-    if mark not in line:
-        return line
-    inside = False
-    for i, character in enumerate(line):
-        if character == '"':
-            inside = not inside
-        elif character == mark and not inside:
-            return line[:i]
-    return line
+    found = re.match(rf"""(?:[^"{mark}]|"[^"]*(?:"|$))*""", line)
+    return found[0] if found else line
 
 
-class _LineCounter:
-    """The line in which an offset into a text lies."""
-
-    def __init__(self, text: str) -> None:
-        self._ends = [match.start() for match in re.finditer("\n", text)]
-
-    def __call__(self, offset: int) -> int:
-        return bisect_left(self._ends, offset) + 1
+def _line_counter(text: str) -> Callable[[int], int]:
+    """The line in which an offset into the text lies."""
+    ends = [match.start() for match in re.finditer("\n", text)]
+    return lambda offset: bisect_left(ends, offset) + 1
