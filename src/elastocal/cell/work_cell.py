@@ -2,7 +2,10 @@
 
 from __future__ import annotations
 
+import re
 from collections.abc import Collection, Iterable
+from datetime import date
+from functools import partial
 from pathlib import Path
 from typing import Annotated, Any
 
@@ -20,7 +23,17 @@ from elastocal.cell.file_keys import (
 )
 from elastocal.cell.plan_wishes import DesignSpec
 from elastocal.cell.workspace_rules import Workspace
-from elastocal.config import Positive, Table, Text, Vector2, checked, header, key, read_toml
+from elastocal.config import (
+    NonNegative,
+    Positive,
+    Table,
+    Text,
+    Vector2,
+    checked,
+    header,
+    key,
+    read_toml,
+)
 from elastocal.errors import require
 from elastocal.files import check_exists
 from elastocal.plugin_loader import is_plugin_file
@@ -58,6 +71,68 @@ class Acceptance:
     heldout: Positive | None = keyed("a positive number in µm", "heldout_um", default=None)
     new_poses: Positive | None = keyed("a positive number in µm", "new_poses_um", default=None)
     test: Positive | None = keyed("a positive number in µm", "test_um", default=None)
+
+
+ENTRY = partial(keyed, "a text", form=Text, default=None)
+
+
+def _is_a_day(text: str) -> bool:
+    try:
+        date.fromisoformat(text)
+    except ValueError:
+        return False
+    return True
+
+
+@record
+class CertificateEntries:
+    """What a calibration certificate states besides the results (ISO/IEC 17025, 7.8.2).
+
+    `country` by two letters (ISO 3166).  `temperature` in °C.  `instrument_uncertainty` m: expanded
+    (k = 2), of a length, as the instrument's own certificate `instrument_calibration` has it.
+    `limit` m: the largest position error with which the arm conforms; None for no such statement.
+    """
+
+    number: str | None = ENTRY()
+    laboratory: str | None = ENTRY()
+    country: str | None = ENTRY()
+    customer: str | None = ENTRY()
+    robot_serial: str | None = ENTRY()
+    tool_serial: str | None = ENTRY()
+    instrument: str | None = ENTRY()
+    instrument_calibration: str | None = ENTRY()
+    place: str | None = ENTRY()
+    measured_on: str | None = ENTRY()
+    operator: str | None = ENTRY()
+    procedure: str | None = ENTRY()
+    temperature: float | None = keyed("a number in °C", "temperature_c", default=None)
+    instrument_uncertainty: NonNegative | None = keyed(
+        "a number >= 0 in µm", "instrument_uncertainty_um", default=None
+    )
+    limit: Positive | None = keyed("a positive number in µm", "limit_um", default=None)
+
+    def __post_init__(self) -> None:
+        require(
+            self.country is None or bool(re.fullmatch("[A-Z]{2}", self.country)),
+            f"key certificate.country is {quoted(self.country)}, which takes the two letters of "
+            'ISO 3166, as in "DE"',
+        )
+        day = self.measured_on or "2000-01-01"
+        require(
+            bool(re.fullmatch(r"\d{4}-\d\d-\d\d", day)) and _is_a_day(day),
+            f"key certificate.measured_on is {quoted(day)}, which takes the date of measurement, "
+            'as in "2026-03-17"',
+        )
+
+    @property
+    def missing(self) -> list[str]:
+        """The keys without which a document is no certificate."""
+        needed = (name for name in vars(self) if name != "limit")
+        keys = {
+            "temperature": "temperature_c",
+            "instrument_uncertainty": "instrument_uncertainty_um",
+        }
+        return [keys.get(name, name) for name in needed if getattr(self, name) is None]
 
 
 @record
@@ -100,6 +175,7 @@ class Cell:
     workspace: Workspace = keyed("a table", default_factory=Workspace)
     design: DesignSpec = keyed("a table", default_factory=DesignSpec)
     require: Acceptance = keyed("a table", default_factory=Acceptance)
+    certificate: CertificateEntries = keyed("a table", default_factory=CertificateEntries)
     plugins: Many[Text] = keyed("a table", form=PluginsTable, into=_modules, default=())
     noise: Unsteadiness = keyed("a table", default_factory=Unsteadiness)
 

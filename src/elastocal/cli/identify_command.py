@@ -30,7 +30,7 @@ def identify(
     output: JsonFile = None,
     report: ReportFile = None,
     certificate: Annotated[
-        Path | None, typer.Option(help="Write a calibration certificate (one HTML page).")
+        Path | None, typer.Option(help="Write a calibration certificate (.html, or .xml: a DCC).")
     ] = None,
     residuals: Annotated[
         Path | None, typer.Option(help="Write residuals of every reading as CSV.")

@@ -388,19 +388,22 @@ class Calibration(Result):
         self, path: str | Path, *, inputs: Any = None, command: str | None = None,
         seed: int | None = None,
     ) -> None:  # fmt: skip
-        """Write the calibration certificate: one HTML page to print and file away.
+        """Write the calibration certificate: one HTML page to print and file away, or its XML.
 
-        Pose accuracy before and after in the sense of ISO 9283, instrument, loads, date, SHA-256
-        of cell and data, verdict.
+        Entries of [certificate] in the cell (ISO/IEC 17025), statement of conformity, expanded
+        uncertainty and its budget, pose accuracy before and after and repeatability in the sense
+        of ISO 9283, instrument, loads, SHA-256 of cell and data, verdict.  Without the entries it
+        is called a report.
 
         Args:
-            path: The page.
+            path: The page; where it ends in .xml, a digital calibration certificate (DCC).
             inputs: As for `report`, like the others.
             command: The command line that repeats the run, where there is one.
             seed: The seed of the run, to be named.
 
         Raises:
-            InputError: An input cannot be read, or the page not written.
+            InputError: An input cannot be read, the page not written, or an entry is missing
+                that a digital certificate needs.
 
         Examples:
             >>> ec.identify("cell.toml", "data.csv").certificate("certificate.html")

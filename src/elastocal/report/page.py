@@ -48,11 +48,17 @@ def write_page(
     result: object, path: Path, inputs: Inputs = None, command: str | None = None,
     seed: int | None = None, **told: Any,
 ) -> None:  # fmt: skip
-    """Write the result's page, whole or not at all; arguments as for `page_of`.
+    """Write the result's page, whole or not at all; arguments as for `page_of`.  A certificate
+    whose name ends in .xml is a digital one (DCC).
 
     Where no `inputs` are named, they are the files that the result came from.  Raises InputError
     where an input cannot be read or `path` cannot be written.
     """
+    if told.get("certificate") and path.suffix.lower() == ".xml":
+        from elastocal.report.dcc import dcc_text
+
+        fit: Any = result
+        return atomic_write_text(path, dcc_text(fit))
     inputs = sources(result) if inputs is None else inputs
     atomic_write_text(path, page_of(result, inputs, command, seed, **told))
 

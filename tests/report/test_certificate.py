@@ -1,0 +1,130 @@
+"""The certificate: entries, uncertainty, conformity, and the same as XML."""
+
+from __future__ import annotations
+
+import copy
+from dataclasses import replace
+from pathlib import Path
+from typing import Any
+from xml.etree import ElementTree
+
+import numpy as np
+import pytest
+from support.pages import Page
+
+from elastocal.cell.work_cell import CertificateEntries
+from elastocal.errors import InputError
+from elastocal.identification.error_budget import gap_budget
+from elastocal.report.certificate_view import (
+    Certified,
+    certified_values,
+    pose_repeatability,
+)
+from elastocal.report.formatting import length
+
+ENTRIES = CertificateEntries(
+    number="<b>17</b>", laboratory="Laboratory", country="DE", customer="Customer",
+    robot_serial="R-1", tool_serial="T-1", instrument="tracker", instrument_calibration="C-9",
+    place="hall", measured_on="2026-03-17", operator="A. B.", procedure="QP-17",
+    temperature=20.5, instrument_uncertainty=12e-6, limit=1.0,
+)  # fmt: skip
+NAMES = {"dcc": "https://ptb.de/dcc", "si": "https://ptb.de/si"}
+
+
+def stated(result: Any, entries: CertificateEntries = ENTRIES) -> Any:
+    """The result of a cell with these entries."""
+    model = copy.copy(result.model)
+    object.__setattr__(model, "cell", replace(model.cell, certificate=entries))
+    return replace(result, model=model)
+
+
+def written(result: Any, path: Path) -> str:
+    result.certificate(path, inputs={"d.csv": "abc"})
+    return path.read_text(encoding="utf-8")
+
+
+def test_without_entries_it_is_a_report_and_a_missing_one_is_named(case: Any, tmp_path: Path):
+    assert "<h1>Calibration report of" in written(case.result, tmp_path / "c.html")
+    some = written(stated(case.result, replace(ENTRIES, operator=None)), tmp_path / "c.html")
+    assert "<h1>Calibration report of" in some
+    assert "[certificate] of the cell lacks operator." in some
+    whole = written(stated(case.result), tmp_path / "c.html")
+    assert "<h1>Calibration certificate of" in whole and "lacks" not in whole
+    page = Page(whole)
+    page.check_harmless(whole)
+    rows = page.named_rows()
+    assert rows["number"][1] == "<b>17</b>" and rows["temperature"][1] == "20.5 °C"
+    with pytest.raises(InputError, match=r"needs \[certificate\] in the cell with number, lab"):
+        case.result.certificate(tmp_path / "c.xml")
+    assert not (tmp_path / "c.xml").exists()
+
+
+def test_u_is_twice_the_root_sum_of_squares_of_its_budget(case: Any, tmp_path: Path) -> None:
+    result = stated(case.result)
+    found, parts = certified_values(result, gap_budget(result)), result.uncertainty()
+    one = np.sqrt(sum(p**2 for p in parts.parts.values()) / 3 + (12e-6 / 2) ** 2)
+    assert found.expanded == pytest.approx(2 * one)
+    rows = Page(written(result, tmp_path / "c.html")).named_rows()
+    assert rows["expanded, U with k = 2"][2] == length(float(2 * one))
+
+
+@pytest.mark.parametrize(
+    ("limit", "words"),
+    [(130e-6, "Conforms"), (105e-6, "No statement"), (95e-6, "No statement"),
+     (70e-6, "Does not conform")],
+)  # fmt: skip
+def test_a_limit_within_the_guard_band_gives_no_statement(limit: float, words: str) -> None:
+    u = 20e-6 / 2 / np.sqrt(3)  # U of a distance is 20 µm
+    own = Certified((("reading", "A", u), ("model: lack of fit", "A", 1.0)), 100e-6, "here",
+                    np.zeros(0))  # fmt: skip
+    assert own.of_deviations == pytest.approx(20e-6)
+    assert own.conformity(limit).startswith(words)
+
+
+def test_repeatability_is_that_of_iso_9283(case: Any) -> None:
+    """Four readings of each place, two d apart from the mean and two 3 d: l = d, d, 3 d, 3 d."""
+    observed, d = case.result.observations, 5e-6
+    rows = np.repeat(np.arange(len(observed.table)), 4)
+    four = replace(observed, table=observed.table.take(rows), lead=np.arange(len(rows)))
+    away = np.tile([d, -d, 3 * d, -3 * d], len(rows) // 4)[:, None] * [1.0, 0.0, 0.0]
+    result = replace(case.result, observations=four, residual=away.ravel())
+    lengths = np.array([1, 1, 3, 3]) * d
+    expected = lengths.mean() + 3 * lengths.std(ddof=1)
+    assert pose_repeatability(result) == pytest.approx(expected)
+
+
+def test_the_xml_says_the_same_in_the_structure_of_a_dcc(case: Any, tmp_path: Path) -> None:
+    result = stated(case.result)
+    root = ElementTree.fromstring(written(result, tmp_path / "c.xml"))
+    assert root.tag == "{https://ptb.de/dcc}digitalCalibrationCertificate"
+    assert [child.tag.rpartition("}")[2] for child in root] == [
+        "administrativeData", "measurementResults",
+    ]  # fmt: skip
+    order = [child.tag.rpartition("}")[2] for child in root[0]]
+    assert order == ["dccSoftware", "coreData", "items", "calibrationLaboratory", "respPersons",
+                     "customer"]  # fmt: skip
+    core = root.find("dcc:administrativeData/dcc:coreData", NAMES)
+    assert core is not None
+    assert core.findtext("dcc:uniqueIdentifier", namespaces=NAMES) == "<b>17</b>"
+    found = {}
+    for one in root.iterfind(".//dcc:result", NAMES):
+        name = one.findtext("dcc:name/dcc:content", namespaces=NAMES)
+        real = one.find("dcc:data/dcc:quantity/si:real", NAMES)
+        assert name is not None and real is not None
+        mu = real.find("si:measurementUncertaintyUnivariate/si:expandedMU", NAMES)
+        assert mu is not None and mu.findtext("si:coverageFactor", namespaces=NAMES) == "2"
+        found[name] = (
+            float(real.findtext("si:value", namespaces=NAMES) or "nan"),
+            float(mu.findtext("si:valueExpandedMU", namespaces=NAMES) or "nan"),
+        )
+    for e in result.ordinary:
+        if e.value is not None:
+            assert found[e.name] == pytest.approx((e.value, 2 * e.std), rel=5e-3)
+    assert "Conforms" in "".join(root.itertext())
+
+
+def test_dates_and_countries_are_checked() -> None:
+    for entry in ({"country": "Germany"}, {"measured_on": "17.3.2026"},
+                  {"measured_on": "2026-02-30"}):  # fmt: skip
+        with pytest.raises(InputError, match=next(iter(entry))):
+            CertificateEntries(**entry)
