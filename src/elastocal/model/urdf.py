@@ -59,13 +59,14 @@ def read_urdf(path: str | Path, base: str | None = None, flange: str | None = No
     base = tree.root if base is None else tree.find_link("base", base)
     flange = tree.only_flange(base) if flange is None else tree.find_link("flange", flange)
     moving = tree.serial_chain(base, flange)
-    placements, end = tree.frames(base, flange)
+    with np.errstate(over="ignore", invalid="ignore"):  # numbers of 1e308 are judged later
+        placements, end = tree.frames(base, flange)
+        masses = tree.carried(moving)
     joints = []
     for source, placement in zip(moving, placements, strict=True):
         kind: JointKind = "prismatic" if source.kind == "prismatic" else "revolute"
         limits = source.limit or (-np.inf, np.inf)
         joints.append(Joint(source.name, kind, placement, np.array(source.axis), *limits))
-    masses = tree.carried(moving)
     return Chain(
         tree.name, tuple(joints), end, masses if any(body.mass > 0 for body in masses) else ()
     )
@@ -273,14 +274,17 @@ class Tree:
         """What each of the joints carries up to the next of them, in its frame."""
         own = {joint.child: k for k, joint in enumerate(moving)}
         mass, moment = np.zeros(len(moving)), np.zeros((len(moving), 3))
-        for name, body in self.links.items():
-            T, link = np.eye(4), name
-            while link not in own and link != self.root:
-                joint = self.parent_joint[link]
-                T, link = joint.origin @ T, joint.parent
-            if link in own:
-                mass[own[link]] += body.mass
-                moment[own[link]] += body.mass * (T @ [*body.com, 1.0])[:3]
+        at: dict[str, tuple[int | None, Array]] = {}  # number of the joint, place in its frame
+        for link in self._below(self.root):
+            before = self.parent_joint.get(link)
+            k, T = (None, np.eye(4)) if before is None else at[before.parent]
+            if before is not None:
+                k, T = (own[link], np.eye(4)) if link in own else (k, T @ before.origin)
+            at[link] = k, T
+            if k is not None:
+                body = self.links[link]
+                mass[k] += body.mass
+                moment[k] += body.mass * (T @ [*body.com, 1.0])[:3]
         return tuple(
             LinkMass(float(m), s / m if m > 0 else np.zeros(3))
             for m, s in zip(mass, moment, strict=True)
