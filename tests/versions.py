@@ -25,7 +25,8 @@ ROOT = Path(__file__).parents[1]
 VERSIONS = ("3.11", "3.12", "3.13")
 # Model, identification, planning, one of each verb, and what is written and read.
 SLICE = (
-    "tests/cli/test_verbs.py", "tests/identification/test_linear.py",
+    "tests/cli/test_verbs.py", "tests/cli/test_compensate.py",
+    "tests/identification/test_linear.py",
     "tests/model/test_agreement_with_pinocchio.py", "tests/planning/test_design_flow.py",
     "tests/studies/test_study_dataset.py", "tests/model/test_mjcf.py",
     "tests/export/test_mjcf_in_place.py",

@@ -188,9 +188,10 @@ SHARE = re.compile(r"\b(\d+) of (\d+)\b")
 
 
 @contextmanager
-def progress_line(quiet: bool) -> Iterator[Callable[[str], None]]:
+def progress_line(quiet: bool, every: float = 0.0) -> Iterator[Callable[[str], None]]:
     """A status line on stderr with the time since the start and, where a message counts ("3 of
-    12"), the share done; without a terminal a line for each message; nothing where `quiet`."""
+    12"), the share done; nothing where `quiet`.  Without a terminal a line for each message, of
+    those that come faster than `every` s the first and the last ("12 of 12")."""
     if quiet:
         yield lambda message: None
         return
@@ -198,8 +199,16 @@ def progress_line(quiet: bool) -> Iterator[Callable[[str], None]]:
 
     screen = safe_console(stderr=True)
     if not screen.is_terminal:
-        begun = monotonic()
-        yield lambda message: screen.print(f"… {message} ({monotonic() - begun:.0f} s)")
+        begun, told = monotonic(), -every
+
+        def line(message: str) -> None:
+            nonlocal told
+            now, found = monotonic() - begun, SHARE.search(message)
+            if now - told >= every or (found and found[1] == found[2]):
+                told = now
+                screen.print(f"… {message} ({now:.0f} s)")
+
+        yield line
         return
 
     class Share(BarColumn):

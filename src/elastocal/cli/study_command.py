@@ -3,16 +3,16 @@
 from __future__ import annotations
 
 import time
-from contextlib import AbstractContextManager, nullcontext
+from collections.abc import Callable
+from datetime import timedelta
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Any, Self
+from typing import TYPE_CHECKING, Annotated
 
 import typer
 
-from elastocal.cli.app import console
 from elastocal.cli.signatures import command
 from elastocal.errors import InsufficientDataError, require
-from elastocal.screen import say
+from elastocal.screen import progress_line, say
 
 if TYPE_CHECKING:
     from elastocal.studies.study_run import Ending
@@ -93,10 +93,11 @@ def study(
         page = Path(f"{output if output.name else output.resolve()}.md")
         StudyResults(results).check_page(page)
     prepared = read_study(folder, seed, set_ or ())
-    with StudyStop() as stop, StudyProgress(progress and not quiet) as shown:
+    with StudyStop() as stop, progress_line(quiet or not progress, EVERY) as tell:
         ending = run_study(
             prepared, results, jobs=jobs, cluster=cluster, only=only, restart=restart,
-            retry_failed=retry_failed, stop=stop, progress=shown.show, tell=shown.tell,
+            retry_failed=retry_failed, stop=stop, progress=Pace(tell).show,
+            tell=lambda text: say(f"… {text}", error=True),
             tls_ca=tls_ca, tls_cert=tls_cert, tls_key=tls_key, unencrypted=unencrypted,
         )  # fmt: skip
     say(_told(ending, results))
@@ -132,58 +133,19 @@ def _told(ending: Ending, results: Path) -> str:
     return text
 
 
-class StudyProgress:
-    """Done of total, rate per minute of this run, time left, failures; on stderr.
+class Pace:
+    """Says how far a study is: done of total, rate per minute of this run, time left, failures."""
 
-    Use it in `with`; silent where `shown` is false.
-    """
-
-    def __init__(self, shown: bool) -> None:
-        self._shown, self._screen = shown, console(stderr=True)
-        self._total = self._ended = self._failed = self._before = 0
-        self._begun = self._told = time.monotonic()
-        self._bar: Any = None
-        self._context: AbstractContextManager[Any] = nullcontext()
-
-    def __enter__(self) -> Self:
-        if self._shown and self._screen.is_terminal:
-            from rich.progress import BarColumn, Progress, TextColumn
-
-            columns = (BarColumn(), TextColumn("{task.description}"))
-            self._bar = Progress(*columns, console=self._screen)
-            self._context = self._bar
-        self._context.__enter__()
-        return self
-
-    def __exit__(self, *error: Any) -> None:
-        self._context.__exit__(*error)
+    def __init__(self, tell: Callable[[str], None]) -> None:
+        self._tell, self._begun, self._before = tell, time.monotonic(), -1
 
     def show(self, total: int, ended: int, failed: int) -> None:
         """`ended` of `total` tasks, failures among them, are there; the first call begins."""
-        now = time.monotonic()
-        first = self._total == 0
-        if first:
-            self._before, self._begun, self._told = ended, now, now
-        self._total, self._ended, self._failed = total, ended, failed
-        if self._bar is not None and first:
-            self._bar.add_task(self._line(), total=total, completed=ended)
-        elif self._bar is not None:
-            only = self._bar.task_ids[0]
-            self._bar.update(only, completed=ended, description=self._line())
-        elif self._shown and (first or now - self._told > EVERY or ended == total):
-            self._told = now
-            self._screen.print(f"… {self._line()}")
-
-    def tell(self, message: str) -> None:
-        """A message beside the bar, also where no progress is shown."""
-        self._screen.print(f"… {message}")
-
-    def _line(self) -> str:
-        text = f"{self._ended}/{self._total} tasks"
-        if self._ended > self._before:
-            rate = (self._ended - self._before) / max(time.monotonic() - self._begun, 1e-3)
-            left = round((self._total - self._ended) / rate)
-            hours, rest = divmod(left, 3600)
-            clock = f"{hours}:{rest // 60:02d}:{rest % 60:02d}"
-            text += f", {60 * rate:.{0 if rate > 1 else 1}f} per minute, {clock} left"
-        return text + (f", {self._failed} failed" if self._failed else "")
+        if self._before < 0:
+            self._begun, self._before = time.monotonic(), ended
+        text = f"{ended} of {total} tasks"
+        if ended > self._before:
+            rate = (ended - self._before) / max(time.monotonic() - self._begun, 1e-3)
+            left = timedelta(seconds=round((total - ended) / rate))
+            text += f", {60 * rate:.{0 if rate > 1 else 1}f} per minute, {left} left"
+        self._tell(text + (f", {failed} failed" if failed else ""))
