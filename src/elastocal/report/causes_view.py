@@ -191,7 +191,7 @@ def share_figure(d: Diagnosis) -> Figure:
         add(cause.name, cause.share, cause.share_ci90, colour)
         for c in cause.parts if len(cause.parts) > 1 else ():
             add(f"{place(c.where)}, {family(c)}", c.share, c.share_ci90, colour, True)
-    axis = "share of the remaining error in %, with 90 % interval"
+    axis = "share in %, with 90 % interval"
     caption = (
         "Part of the squared remaining error that goes when each cause is added last. Small dots: "
         "at each place."

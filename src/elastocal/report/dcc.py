@@ -62,18 +62,20 @@ def _administration(data: Element, result: Calibration) -> None:
         known = _add(_add(item, "identifications"), "identification")
         _add(known, "issuer", "manufacturer")
         _add(known, "value", serial)
-    _contact(_add(data, "calibrationLaboratory"), "contact", c.laboratory)
+    at = _contact(_add(data, "calibrationLaboratory"), "contact", c.laboratory)
+    _add(_add(at, "location"), "countryCode", c.country)
     person = _add(_add(data, "respPersons"), "respPerson")
     _contact(person, "person", c.operator)
     _add(person, "mainSigner", "true")
-    _contact(data, "customer", c.customer)
+    at = _contact(data, "customer", c.customer)
+    where = _add(_add(_add(at, "location"), "further"), "content", f"calibrated at: {c.place}")
+    where.set("lang", "en")
 
 
-def _contact(parent: Element, tag: str, name: str | None) -> None:
+def _contact(parent: Element, tag: str, name: str | None) -> Element:
     contact = _add(parent, tag)
     _named(contact, name)
-    if tag != "person":
-        _add(contact, "location")
+    return contact
 
 
 def _results(measured: Element, result: Calibration) -> None:

@@ -78,6 +78,7 @@ from elastocal.text import printable
 
 MOST_CANDIDATES, MOST_PRINTED = 40, 8
 MOST_TESTS = 12
+FEW = 2  # effects whose shapes stand open
 MOST_PLACES = 8
 MOST_VISITS = 200
 
@@ -102,7 +103,9 @@ def _blocks(d: Diagnosis, kinds: Sequence[str]) -> Iterator[Block]:
     lines += [("Not separable", capital(f"{text}.")) for text in alike(d)]
     lines += [("Next", text) for text in diagnosis_steps(d)]
     yield Lines([*lines, *((WARNING, capital(printable(text))) for text in d.warnings)])
-    yield Fold("", lambda: _figures(d), figures=("budget", "shares", "effects", "curves"))
+    yield Fold("", lambda: _figures(d), figures=("budget", "shares", "curves"))
+    shapes = "" if len(d.effects) <= FEW else "Found effects over the joints they act at"
+    yield Fold(shapes, lambda: _shapes(d), figures=("effects",))
     yield cause_table(d)
     yield added_parameter_table(d)
     places = place_table(d)
@@ -143,16 +146,21 @@ def _key(d: Diagnosis) -> Key:
 
 
 def _figures(d: Diagnosis) -> Iterator[Figure]:
-    from elastocal.report.figures import effects_over_joints, unknown_curves, waterfall
+    from elastocal.report.figures import unknown_curves, waterfall
 
     if d.components:
         yield share_figure(d)
     if d.budget:
         yield waterfall("budget", _named_steps(d), ("noise alone", d.gap.noise_floor))
-    if (found := effects_over_joints(d)) is not None:
-        yield found
     if d.curves:
         yield unknown_curves(d)
+
+
+def _shapes(d: Diagnosis) -> Iterator[Figure]:
+    from elastocal.report.figures import effects_over_joints
+
+    if (found := effects_over_joints(d)) is not None:
+        yield found
 
 
 def candidate_figure(d: Diagnosis) -> Figure:
@@ -520,7 +528,7 @@ def added_parameter_table(d: Diagnosis) -> Table:
         for p in f.parameters:
             rows.append((printable(p.name), *estimate(p.value, NORMAL_95 * p.std, p.unit)))
         if f.settings:
-            rows.append((effect_at(f), settings_of(d, f.settings), "", ""))
+            rows.append((f"{effect_at(f)}: {settings_of(d, f.settings)}", "", "", ""))
     title = "Parameters of the effects found"
     return Table(("parameter", "value", "± 95 %", "unit"), rows, (0, 3), title=title)
 

@@ -22,7 +22,7 @@ from elastocal.identification.linear_solver import least_norm
 from elastocal.model.manipulator import Model
 from elastocal.report import blocks
 from elastocal.report.effect_names import driver_name, effect_at
-from elastocal.report.formatting import length, short_name
+from elastocal.report.formatting import length, short_name, typeset
 from elastocal.report.residual_view import reach
 
 if TYPE_CHECKING:
@@ -173,6 +173,7 @@ ROW = 0.27  # inches per line of a name
 LONGEST_LINE = 25  # letters of a name, which has two lines at most
 # Lengths that span more than this are drawn on a logarithmic axis.
 WIDE_RANGE = 8.0
+DENSE = 25.0  # below which three ticks a decade have room
 
 
 @dataclass(frozen=True)
@@ -208,8 +209,9 @@ def rows_of_dots(
         for y, row in zip(at, rows, strict=True):
             axes.plot(row.ends, [y, y], color=row.colour, linewidth=1.1 if row.small else 2.0)
             axes.plot([row.value], [y], "o", color=row.colour, markersize=4 if row.small else 7)
-            axes.annotate(row.text, (row.value, y), (0, 6), textcoords="offset points",
-                          ha="center", fontsize=9)  # fmt: skip
+            end = np.nanmax([row.value, row.ends[1]])
+            axes.annotate(typeset(row.text), (end, y), (7, 0), textcoords="offset points",
+                          va="center", fontsize=9)  # fmt: skip
         axes.set_yticks(at, names)
         for tick, row in zip(axes.get_yticklabels(), rows, strict=True):
             tick.set_fontsize(8.5 if row.small else 9.5)
@@ -228,10 +230,11 @@ def rows_of_dots(
 def _scaled(axes: Axes, known: Sequence[float], logarithmic: bool, lengths: bool) -> None:
     from matplotlib.ticker import LogLocator
 
-    axes.margins(x=0.1)
+    axes.margins(x=0.18)  # with room for texts
     if logarithmic:
         axes.set_xscale("log")
-        axes.xaxis.set_major_locator(LogLocator(subs=(1.0, 2.0, 5.0), numticks=7))
+        dense = (1.0, 2.0, 5.0) if max(known) < DENSE * min(known) else (1.0, 3.0)
+        axes.xaxis.set_major_locator(LogLocator(subs=dense, numticks=9))
     elif min(known, default=0) >= 0 and axes.get_xlim()[1] > 0:
         low = axes.dataLim.x0
         axes.set_xlim(left=min(0.0, low) if math.isfinite(low) else 0.0)
@@ -242,7 +245,7 @@ def _scaled(axes: Axes, known: Sequence[float], logarithmic: bool, lengths: bool
 
 def _two_lines(name: str) -> str:
     """A printable name on two lines, cut where it is longer."""
-    lines = textwrap.wrap(short_name(name, 2 * LONGEST_LINE), LONGEST_LINE)
+    lines = textwrap.wrap(typeset(short_name(name, 2 * LONGEST_LINE)), LONGEST_LINE)
     return "\n".join(lines[:2]) + ("…" if len(lines) > 2 else "")
 
 
@@ -373,15 +376,19 @@ def effects_over_joints(d: Diagnosis) -> blocks.Figure | None:
         return None
 
     def draw(figure: Figure) -> None:
-        for axes, shape in zip(panels_of(figure, len(shapes), 1), shapes, strict=True):
+        panels = panels_of(figure, len(shapes), 1)
+        for axes, shape in zip(panels, shapes, strict=True):
             _effect(axes, shape)
+        found = [axes.get_legend_handles_labels() for axes in panels]
+        handles, labels = max(found, key=lambda each: len(each[1]))
+        figure.legend(handles, labels, loc="outside upper right", ncols=2, fontsize=8.5)
 
     caption = (
         "Dashes: the effect found, as a motion of its joint. Dots: the same with what is left of "
         "each reading when all is fitted."
     )
     title = "Found effects over the joints they act at"
-    return blocks.Figure("effects", title, draw, 0.3 + 2.5 * len(shapes), caption)
+    return blocks.Figure("effects", title, draw, 0.6 + 2.2 * len(shapes), caption)
 
 
 def _effect(axes: Axes, shape: EffectShape) -> None:
@@ -399,8 +406,6 @@ def _effect(axes: Axes, shape: EffectShape) -> None:
     axes.set_ylabel(f"motion in {'µrad' if revolute else 'µm'}")
     height = reach(1e6 * np.concatenate([shape.seen, shape.explained]))
     axes.set_ylim(-height, height)
-    # Above the axes: inside, it would hide readings.
-    axes.legend(fontsize=8, loc="lower right", bbox_to_anchor=(1, 1), ncols=2)
 
 
 def plan_curve(plan: Plan) -> blocks.Figure:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+import re
 from collections.abc import Iterable, Sequence
 from typing import Any
 
@@ -135,6 +136,14 @@ def counted(n: int, one: str, many: str | None = None) -> str:
 
 def signed_change(change: float) -> str:
     return f"{'-' if change < 0 else '+'}{length(abs(change))}"
+
+
+MINUS = re.compile(r"(?<![\w.)\]-])-(?=[\d.∞])|(?<= )-(?= )")
+
+
+def typeset(text: str) -> str:
+    """With proper minus signs before numbers and between terms, not in names."""
+    return MINUS.sub("−", text)
 
 
 def together(parts: Sequence[str], last: str = "and") -> str:

@@ -36,6 +36,7 @@ from elastocal.report.blocks import (
     Text,
     Verdict,
 )
+from elastocal.report.formatting import typeset
 from elastocal.report.terminal import report_of
 from elastocal.screen import shown
 
@@ -103,7 +104,7 @@ def _framed(head: str, body: str, space: bool, kind: str) -> str:
     script = resource("report.js")
     hashes = " ".join(f"'sha256-{_digest(text)}'" for text in (script, source) if text)
     carried = f'<script type="application/octet-stream" id="plotly">{packed}</script>'
-    contents, body = _with_contents(body)
+    contents, body = ("", body) if kind else _with_contents(body)
     return f"""<!doctype html>
 <html lang="en">
 <head>
@@ -139,14 +140,13 @@ def _with_contents(body: str) -> tuple[str, str]:
 
 # Blocks as HTML
 
-MINUS = re.compile(r"(?<![\w.)\]-])-(?=[\d.∞])|(?<= )-(?= )")
 VIEW = '<script type="application/json" class="view-data">'
 
 
-def text_of(text: str, typeset: bool = True) -> str:
-    """A text as HTML, as it can be read; `typeset`: with proper minus signs before numbers."""
+def text_of(text: str, minus: bool = True) -> str:
+    """A text as HTML, as it can be read; `minus`: with proper minus signs before numbers."""
     found = escape(shown(text))
-    return MINUS.sub("−", found) if typeset else found
+    return typeset(found) if minus else found
 
 
 def html_of(

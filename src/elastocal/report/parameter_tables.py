@@ -322,7 +322,7 @@ def parameter_figure(result: Calibration) -> Figure:
         value, half, unit, _ = texts(e, None)
         signed = half if half.startswith("[") else f"± {half}"
         number = (e.value - e.nominal) / reach
-        rows.append(Row(e.name, number, (low / reach, high / reach), f"{value} {signed} {unit}"))
+        rows.append(Row(f"{e.name} {value} {signed} {unit}", number, (low / reach, high / reach)))
     title, axis = (
         "Parameters beside their nominal values",
         "deviation from nominal over its largest",
