@@ -440,8 +440,8 @@ def test_parquet_columns_follow_the_same_rules(parquet):
     assert got.marker_names == ("B", "A")
     assert got.configuration_labels == ("7", "3")
     for bad, told in [
-        ({"x_mm": ["a", "b"]}, "column x_mm: holds"),
-        ({"x_mm": [True, False]}, "column x_mm: holds bool"),
+        ({"x_mm": ["a", "b"]}, "row 1, column x_mm: 'a' is not a number"),
+        ({"x_mm": [True, False]}, "row 1, column x_mm: 'True' is not a number"),
         ({"x_mm": [1.0, None]}, "row 2, column x_mm"),
         ({"marker": ["A", None]}, "row 2, column marker"),
         ({"marker": ["A", " "]}, "row 2, column marker"),

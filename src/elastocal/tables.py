@@ -174,6 +174,7 @@ def first_bad_cell(
     comma_allowed: bool,
     blanks: Container[str] = (),
     marks: dict[str, str] | None = None,
+    noun: str = "line",
 ) -> InputError | None:
     """What is wrong with the first bad cell of `rows`, or None.
 
@@ -189,9 +190,9 @@ def first_bad_cell(
                 continue
             problem = _problem(cell, comma_allowed)
             if problem is not None:
-                return InputError(f"{source}, line {number}, column {header}: {problem}")
+                return InputError(f"{source}, {noun} {number}, column {header}: {problem}")
             if mark := "." if "." in cell else "," if "," in cell else "":
-                marks.setdefault(mark, f"line {number}, column {header}: {quoted(cell)}")
+                marks.setdefault(mark, f"{noun} {number}, column {header}: {quoted(cell)}")
             if len(marks) == 2:
                 return InputError(
                     f"{source}: decimal points ({marks['.']}) and decimal commas ({marks[',']}) in "
@@ -522,40 +523,47 @@ def read_table(
     """
     source = str(path)
     if text is not None:
-        table = _read_csv(CsvLines(source, BytesIO(text.encode()), what, comments), choose)
+        lines = CsvLines(source, BytesIO(text.encode()), what, comments)
+        table = _read(source, "line", lines.header, lines.rows(), choose, lines.delimiter != ",")
     elif Path(path).suffix.lower() in (".parquet", ".pq"):
-        table = _read_parquet(source, choose, what)
+        frame = _parquet(source, what)
+        table = _read(source, "row", list(frame.columns), _rows_of(frame), choose, False)
     else:
         with open_input(path, what, most) as handle:
-            table = _read_csv(CsvLines(source, handle, what, comments), choose)
+            lines = CsvLines(source, handle, what, comments)
+            commas = lines.delimiter != ","
+            table = _read(source, "line", lines.header, lines.rows(), choose, commas)
     table.check_labels()
     return table
 
 
-def _read_csv(lines: CsvLines, choose: ChooseLayout) -> RawTable:
-    layout = choose(lines.header)
-    columns = {i: name for i, name in enumerate(lines.header) if name in layout.numbers}
+def _read(
+    source: str, noun: str, header: Sequence[str], rows: Iterator[Row], choose: ChooseLayout,
+    commas: bool,
+) -> RawTable:  # fmt: skip
+    """The columns that `choose` picks; `commas`: decimal commas may be used."""
+    layout = choose(header)
+    columns = {i: name for i, name in enumerate(header) if name in layout.numbers}
     found: list[int] = []
     pieces: dict[str, list[Array]] = {name: [] for name in layout.numbers}
     labels: dict[str, list[str]] = {name: [] for name in layout.labels}
     marks: dict[str, str] = {}
-    commas, rows = lines.delimiter != ",", lines.rows()
     while some := list(islice(rows, ROWS_AT_ONCE)):
         found += [number for number, _ in some]
         by_column = zip(*(cells for _, cells in some), strict=True)
-        texts = dict(zip(lines.header, by_column, strict=True))
+        texts = dict(zip(header, by_column, strict=True))
         plain = {name: _plain_numbers(texts[name]) for name in layout.numbers}
-        if commas or any(numbers is None for numbers in plain.values()):
-            problem = first_bad_cell(lines.source, some, columns, commas, layout.blanks, marks)
-            if problem is not None:
-                raise problem
+        unclear = commas or any(numbers is None for numbers in plain.values())
+        known = (columns, commas, layout.blanks, marks, noun)
+        if unclear and (problem := first_bad_cell(source, some, *known)):
+            raise problem
         for name, numbers in plain.items():
             pieces[name].append(_numbers(texts[name]) if numbers is None else numbers)
         for name, read in labels.items():
             read += texts[name]
     values = {name: np.concatenate(read) for name, read in pieces.items()}
     coded = {name: Labels.of(read) for name, read in labels.items()}
-    return RawTable(lines.source, "line", np.array(found, dtype=np.int64), layout, values, coded)
+    return RawTable(source, noun, np.array(found, dtype=np.int64), layout, values, coded)
 
 
 PLAIN = re.compile(r"(?:[ \t]*[+-]?[0-9]+(?:\.[0-9]*)?(?:[eE][+-]?[0-9]+)?[ \t]*\n)*")
@@ -575,8 +583,8 @@ def _numbers(cells: Iterable[str]) -> Array:
     return np.array([float(text or "nan") for text in texts])
 
 
-def _read_parquet(source: str, choose: ChooseLayout, what: str) -> RawTable:
-    """The same of a Parquet file, where pandas finds an engine to read it; rows from 1."""
+def _parquet(source: str, what: str) -> pd.DataFrame:
+    """What a Parquet file holds, where pandas finds an engine to read it."""
     import pandas as pd
 
     with open_input(source, what, MOST_BYTES) as handle:
@@ -593,14 +601,16 @@ def _read_parquet(source: str, choose: ChooseLayout, what: str) -> RawTable:
     except Exception as error:  # each engine has its own exceptions
         raise InputError(f"{source}: damaged Parquet file ({error}); write it again") from None
     frame.columns = [str(name) for name in frame.columns]
-    layout = choose(list(frame.columns))
     if not len(frame):
         raise InputError(f"{source}: has columns but no rows; add measurements")
-    return RawTable(
-        source, "row", np.arange(1, len(frame) + 1), layout,
-        {name: _parquet_numbers(source, name, frame[name]) for name in layout.numbers},
-        {name: _parquet_labels(source, name, frame[name]) for name in layout.labels},
-    )  # fmt: skip
+    return frame
+
+
+def _rows_of(frame: pd.DataFrame) -> Iterator[Row]:
+    """Rows from 1 of a data frame as texts, with all digits of its numbers."""
+    cells = frame.astype(object).where(frame.notna(), "")
+    for i, row in enumerate(cells.itertuples(index=False, name=None), start=1):
+        yield i, [str(cell) for cell in row]
 
 
 def _check_unpacked(source: str, what: str) -> None:
@@ -616,30 +626,6 @@ def _check_unpacked(source: str, what: str) -> None:
     if facts.num_rows > MAX_ROWS:
         raise InputError(f"{source}: more than {MAX_ROWS:,} rows; split the table, or thin it out")
     check_size(source, what, unpacked, MOST_BYTES)
-
-
-def _parquet_numbers(source: str, name: str, column: pd.Series) -> Array:
-    import pandas as pd
-
-    if not pd.api.types.is_numeric_dtype(column) or pd.api.types.is_bool_dtype(column):
-        raise InputError(f"{source}, column {name}: holds {column.dtype}, not numbers; convert it")
-    values: Array = column.to_numpy(dtype=np.float64, na_value=np.nan)
-    if not np.isfinite(values).all():
-        i = int(np.argmin(np.isfinite(values)))
-        raise InputError(
-            f"{source}, row {i + 1}, column {name}: {values[i]} is not a finite number; "
-            "drop the row, or measure again"
-        )
-    return values
-
-
-def _parquet_labels(source: str, name: str, column: pd.Series) -> Labels:
-    if column.isna().any():
-        i = int(np.argmax(column.isna().to_numpy()))
-        raise InputError(
-            f"{source}, row {i + 1}, column {name}: empty cell; write a name or number"
-        )
-    return Labels.of(column)
 
 
 # Writing
