@@ -32,6 +32,15 @@ UNIT_SUFFIX = re.compile(
     r"|deg_per_s|rad_per_s|m_per_s|mm_per_s)$"
 )
 
+# Keys that there were, and what does it instead.
+GONE = {
+    "design.load_choice": (
+        "every pose is read under each load; let [design.choose] loads pick fewer of them"
+    ),
+    "design.robust": "plan for the arm as it is identified so far (--augment), and drop the key",
+    "design.robust_samples": "it went with design.robust; drop it",
+}
+
 Keys = Sequence[str | int]
 
 
@@ -194,6 +203,8 @@ def _complaint(root: type[BaseModel], data: dict[str, Any], error: ValidationErr
     first = min(problems, key=lambda problem: problem["type"] != "extra_forbidden")
     spot = _spot(root, data, first["loc"])
     here = place(*spot.keys)
+    if first["type"] == "extra_forbidden" and here in GONE:
+        return f"key {here} is gone: {GONE[here]}"
     if first["type"] == "extra_forbidden":
         return f"unknown key {here}{_advice(spot, root)}"
     if first["type"] == "missing" and spot.found is None:

@@ -69,15 +69,12 @@ def design(
     candidates: int | str | Path | Sequence[int | str | Path] | None = None,
     repeats: int | None = None,
     loads: ArrayLike | None = None,
-    load_choice: bool | None = None,
     repeatability: float | None = None,
     marker_sigma: Mapping[str, float] | None = None,
     levels: Mapping[str, Sequence[float]] | None = None,
     per_level: Sequence[int] | None = None,
     interest: str | Sequence[str] | None = None,
     combination: Mapping[str, float] | None = None,
-    robust: Literal["none", "average", "worst"] | None = None,
-    robust_samples: int | None = None,
     test_poses: ArrayLike | Sequence[TargetPose] | None = None,
     test_path: str | Path | TargetPath | None = None,
     test_box: tuple[ArrayLike, ArrayLike] | TargetBox | None = None,
@@ -102,8 +99,8 @@ def design(
         model: The model, or a cell, or the path of a cell file.
         poses: Number of poses.
         criterion: What is to become small: "test_pose" (error at the test poses), "robust" (the
-            same with what the model may lack), "D", "A", "E", "G", "I", "c", "O1", "O2", "O3",
-            "O4" or "O5"; default as the cell says.
+            same with what the model may lack), "D", "A", "E", "G", "I", "c", "O1", "O3" or
+            "O5"; default as the cell says.
         target: Find the fewest poses that reach this error, for the criteria test_pose, robust, G
             and I.  In m.
         minutes: Find the best numbers of poses and readings within this time.  It stands instead
@@ -121,7 +118,6 @@ def design(
             from, or both, as in "taught.csv",500.  In Python ["taught.csv", 500].
         repeats: Readings per pose and load state.
         loads: Forces (L, 3) in N at the load point, in the data's frame.
-        load_choice: Choose one load for each pose, instead of measuring all of them there.
         repeatability: Standard deviation in m, per direction, of what a configuration's readings
             have in common.
         marker_sigma: Standard deviation in m per marker, instead of the tracker's noise.
@@ -129,8 +125,6 @@ def design(
         per_level: Number of poses of each level.
         interest: Parameters, places or effects that D, A, E and O count.
         combination: Factor by parameter, for the criterion c.
-        robust: Average over, or worst of, `robust_samples` draws of the parameters.
-        robust_samples: Their number.
         test_poses: Joints (k, joints) in rad or m where the position must be right.
         test_path: A table (CSV) of such places.
         test_box: Lower and upper corner (3,) in m of a box of such places, in the data's frame.
@@ -232,7 +226,7 @@ def _design_of(cell: Cell, asked: Mapping[str, Any]) -> Any:
         TargetPose,
         of_candidates,
     )
-    from elastocal.planning.criteria import CRITERIA
+    from elastocal.planning.criteria import CRITERIA, GONE
 
     chosen = {key: _plain(value) for key, value in asked.items() if value is not None}
     if "candidates" in chosen:
@@ -244,6 +238,8 @@ def _design_of(cell: Cell, asked: Mapping[str, Any]) -> Any:
         given = None if given is None else whole("candidates", given, 1)
         chosen |= {"candidates": given, "taught": None if taught is None else Path(taught)}
     if "criterion" in chosen:
+        name = str(chosen["criterion"])
+        require(name not in GONE, f"{option('criterion')} {name} is gone: {GONE.get(name)}")
         one_of("criterion", chosen["criterion"], tuple(CRITERIA))
     wishes = [key for key in ("poses", "target", "minutes") if key in chosen]
     require(

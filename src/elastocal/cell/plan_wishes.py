@@ -229,9 +229,9 @@ class DesignSpec:
     """`criterion`: the name of one that planning has.
 
     `levels` joint → values and `per_level` their numbers of poses (for at most one joint);
-    `loads` (L, 3) N: forces under which poses are measured, all of them at every pose, or one of
-    them chosen per pose where `load_choice`; `repeats` readings each.  `repeatability` m: standard
-    deviation of a deviation common to a configuration's readings, per direction; `marker_sigma`
+    `loads` (L, 3) N: forces under which poses are measured, all of them at every pose; `repeats`
+    readings each.  `repeatability` m: standard deviation of a deviation common to a
+    configuration's readings, per direction; `marker_sigma`
     m per marker instead of the tracker's noise; `interest`: parameters, places or effects that
     D, A, E and O count (default all but base and markers); `elsewhere`: the share of the weight
     that poses all over the joint ranges have beside the test poses; `elsewhere_cap`: by how much
@@ -253,7 +253,6 @@ class DesignSpec:
     loads: Annotated[Array, matrix(None, 3)] | None = keyed(
         "a list of forces in N, as in [[0, 0, 0], [0, 0, -2600]]", "loads_N", default=None
     )
-    load_choice: bool = keyed(default=False)
     repeatability: NonNegative = keyed("a number >= 0 in µm", "repeatability_um", default=0.0)
     marker_sigma: dict[str, Positive] = keyed(
         "a positive number in µm per marker", "marker_sigma_um", default_factory=dict
@@ -270,8 +269,6 @@ class DesignSpec:
         "a number from 0 to below 1", default=None
     )
     elsewhere_cap: NonNegative | None = keyed("a number >= 0, as in 0.05", default=None)
-    robust: Literal["none", "average", "worst"] = keyed(default="none")
-    robust_samples: Count = keyed("a whole number >= 1", default=8)
     candidates: Count | None = keyed(
         CANDIDATES,
         form=Count | Text | Annotated[list[Count | Text], Field(min_length=1, max_length=2)],

@@ -31,7 +31,6 @@ from elastocal.model.manipulator import Model
 from elastocal.model.observations import observe
 from elastocal.planning.candidates import draw
 from elastocal.planning.feasibility import Feasibility
-from elastocal.planning.information import LoadStates
 from elastocal.simulation.simulate import simulate
 from elastocal.units import Array, BoolArray, IntArray
 
@@ -74,14 +73,13 @@ def draw_pool(
     sides, waits = sides and table.approach is not None, waits and table.time is not None
     rng = np.random.default_rng(seed)
     forces = load_forces(table)
-    states = LoadStates(forces, False, np.ones(len(forces), dtype=bool))
     n = max(min(CANDIDATES, most) // (1 + sides) // (1 + waits), FEWEST_POSES)
     cell, chain = model.cell, model.chain
     if cell.model.compliance_levels and not cell.design.levels:
         # A joint whose compliance is known at its levels only can be nowhere else.
         spec = replace(cell.design, levels=cell.model.compliance_levels)
         cell = replace(cell, design=spec)
-    q = draw(cell, chain, states, Feasibility(cell, chain), n, seed).q
+    q = draw(cell, chain, forces, Feasibility(cell, chain), n, seed).q
     approach = time = None
     if table.approach is not None:
         approach = rng.choice([-1.0, 1.0], q.shape)

@@ -70,9 +70,11 @@ class _Ordering:
                 self.search.progress(
                     f"{self.gone} poses that no free move reaches are replaced by the best others"
                 )
-                stage = self.search.checkpoint.stage(f"replaced{self.gone}")
                 there = whole.pool.q[np.setdiff1d(whole.chosen, gone)]
-                chosen = stage.finished(lambda: self._replaced(found, gone, there))["chosen"]  # noqa: B023
+                chosen = self.search.checkpoint.finished(
+                    f"replaced{self.gone}",
+                    lambda: self._replaced(found, gone, there),  # noqa: B023
+                )["chosen"]
                 kept = np.setdiff1d(np.arange(len(pool)), gone)
                 value = self.search.value(pool, chosen)
                 first = found.first - int((gone < found.first).sum())
@@ -154,16 +156,15 @@ def _execution(
     setup: Setup, plan: Selection, paths: _Paths, seed: int, progress: Progress
 ) -> Execution:
     feasibility, pool, chosen = paths.feasibility, plan.pool, plan.chosen
-    cell, states = feasibility.cell, setup.information.states
+    cell = feasibility.cell
     return schedule(
         pool.q[chosen], at_stops(cell), paths,
-        loads=states.forces,
-        load=pool.load[chosen] if states.chosen else None,
+        loads=setup.information.forces,
         limits=joint_limits(cell, feasibility.chain),
         via=pool.q[:: max(len(pool) // VIA, 1)],
         blockers=Blockers(feasibility),
         alias=plan.alias,
-        paired=not states.observed.all(),
+        paired=cell.model.observe == "deflection",
         seed=seed, progress=progress,
     )  # fmt: skip
 
@@ -200,8 +201,8 @@ def _unwound(setup: Setup, plan: Selection, feasibility: Feasibility) -> Selecti
     own = plan.chosen[plan.chosen < len(pool) - plan.pinned]
     was = pool.q[own]
     near = _nearer(feasibility, was)
-    blocks, before = setup.information.blocks(near, pool.load[own]), pool.blocks[:, own]
-    off = np.abs(blocks - before).max(axis=(0, 2, 3)) > SAME * np.abs(before).max()
+    blocks, before = setup.information.blocks(near), pool.blocks[own]
+    off = np.abs(blocks - before).max(axis=(1, 2)) > SAME * np.abs(before).max()
     q = pool.q.copy()
     q[own] = np.where(off[:, None], was, near)
     return replace(plan, pool=replace(pool, q=q))

@@ -14,7 +14,6 @@ from elastocal.errors import InputError, InsufficientDataError, require
 from elastocal.measurements import Measurements
 from elastocal.model.chain import Chain, finite_ranges, joint_index, joint_limits
 from elastocal.planning.feasibility import Feasibility, PoseFeasibility
-from elastocal.planning.information import ALL_LOADS, LoadStates
 from elastocal.units import Array, BoolArray, IntArray, Progress
 
 # Where poses may lie: joint ranges, and one joint that may be held at fixed levels.
@@ -86,16 +85,13 @@ TRIES = 200  # per pose wanted, at most
 
 @dataclass(frozen=True)
 class Candidates:
-    """Feasible poses q (N, n) with their load state `load` (N,), ALL_LOADS where a pose is
-    measured in all of them, and their `group` (N,): the level of the held joint.
+    """Feasible poses q (N, n) and their `group` (N,): the level of the held joint.
 
-    Where the load state is chosen, one pose may be several candidates and counts once per state.
     `removed_by` counts what was tried in vain by the first rule broken:
     tried = feasible + Σ removed_by.
     """
 
     q: Array
-    load: IntArray
     group: IntArray
     tried: int
     feasible: int
@@ -105,24 +101,23 @@ class Candidates:
     def join(cls, lots: Sequence[Candidates]) -> Candidates:
         """Several lots, tried under the same rules, as one."""
         removed = {rule: sum(lot.removed_by[rule] for lot in lots) for rule in lots[0].removed_by}
-        q, load, group = (
-            np.concatenate([getattr(lot, name) for lot in lots]) for name in ("q", "load", "group")
-        )
+        q, group = (np.concatenate([getattr(lot, name) for lot in lots]) for name in ("q", "group"))
         tried, ok = sum(lot.tried for lot in lots), sum(lot.feasible for lot in lots)
-        return cls(q, load, group, tried, ok, removed)
+        return cls(q, group, tried, ok, removed)
 
 
 def draw(
     cell: Cell,
     chain: Chain,
-    states: LoadStates,
+    forces: Array,
     checker: Feasibility,
     n: int,
     seed: int,
     jobs: int = 1,
     progress: Progress = lambda message: None,
 ) -> Candidates:
-    """About `n` feasible candidates, equally many per level of the held joint.
+    """About `n` candidates feasible under all `forces` (L, 3) N, equally many per level of the held
+    joint.
 
     Owen-scrambled Sobol points (Owen 1998; scipy.stats.qmc) over the joint ranges, one sequence
     per level, filtered by the cell's rules chunk by chunk until there are enough, or until 200
@@ -139,7 +134,7 @@ def draw(
     drawn: list[Candidates] = []
     for group, stream in enumerate(np.random.SeedSequence(seed).spawn(groups)):
         progress(f"drawing candidates, level {group + 1} of {groups}")
-        chunks = _checked(checker, states, group, sobol(space, group, stream), jobs)
+        chunks = _checked(checker, forces, group, sobol(space, group, stream), jobs)
         lot, verdict = _fill(chunks, n // groups + (group < n % groups))
         if not len(lot.q):
             every = checker.check(verdict.q, verdict.force)
@@ -156,7 +151,7 @@ NO_LEVEL = "level"  # the rule that a pose brought along breaks where it stands 
 
 
 def brought(
-    cell: Cell, chain: Chain, states: LoadStates, checker: Feasibility, table: Measurements
+    cell: Cell, chain: Chain, forces: Array, checker: Feasibility, table: Measurements
 ) -> tuple[Candidates, list[str], dict[str, str]]:
     """The poses of a table that the cell allows, the name of each, and of those refused the rule
     that each breaks first.  A pose that stands in several rows is one.
@@ -179,15 +174,12 @@ def brought(
     lots, verdicts, told = [], [], []
     for level in range(space.n_groups):
         own = np.flatnonzero(at_level & (group == level))
-        lot, verdict = _check(checker, states, level, q[own])
+        lot, verdict = _check(checker, forces, level, q[own])
         lots.append(lot)
         verdicts.append(verdict)
-        broken = verdict.broken.reshape(-1, len(own), len(verdict.rules))
-        for k, i in enumerate(own):
-            if broken[:, k].any(axis=1).all():  # where the load is chosen, under every load
-                refused[names[i]] = verdict.rules[int(broken[0, k].argmax())]
-        place = {pose.tobytes(): names[i] for pose, i in zip(q[own], own, strict=True)}
-        told += [place[pose.tobytes()] for pose in lot.q]
+        told += [names[i] for i in own[verdict.ok]]
+        for i, broken in zip(own[~verdict.ok], verdict.broken[~verdict.ok], strict=True):
+            refused[names[i]] = verdict.rules[int(broken.argmax())]
     found = Candidates.join(lots)
     found.removed_by[NO_LEVEL] = int((~at_level).sum())
     found = replace(found, tried=found.tried + int((~at_level).sum()))
@@ -230,44 +222,32 @@ def deciding(checker: Feasibility, forces: Array) -> Array:
 
 
 def _check(
-    checker: Feasibility, states: LoadStates, group: int, q: Array
+    checker: Feasibility, forces: Array, group: int, q: Array
 ) -> tuple[Candidates, PoseFeasibility]:
-    """The feasible candidates among poses q (N, n) of a group, and the first rule that each breaks.
-
-    A pose measured in all load states must be feasible in each, and its verdict is that of the
-    first state that forbids it; where the state is chosen, (pose, state) pairs are judged.
-    """
-    if states.chosen:
-        verdict = PoseFeasibility.join([checker.check(q, f, every=False) for f in states.forces])
-        pose = np.tile(np.arange(len(q)), len(states.forces))[verdict.ok]
-        load = np.repeat(np.arange(len(states.forces)), len(q))[verdict.ok]
-    else:
-        heaviest, *others = deciding(checker, states.forces)
-        verdict = checker.check(q, heaviest, every=False)
-        for force in others:
-            left = np.flatnonzero(verdict.ok)
-            verdict.broken[left] = checker.check(q[left], force, every=False).broken
-        pose = np.flatnonzero(verdict.ok)
-        load = np.full(len(pose), ALL_LOADS)
-    order = np.lexsort((load, pose))
-    of_group = np.full(len(pose), group)
-    tried, found = len(verdict.ok), len(pose)
-    lot = Candidates(q[pose][order], load[order], of_group, tried, found, verdict.removed_by)
-    return lot, verdict
+    """The feasible candidates among poses q (N, n) of a group, and the first rule that each breaks:
+    under the first of the forces that forbids it."""
+    heaviest, *others = deciding(checker, forces)
+    verdict = checker.check(q, heaviest, every=False)
+    for force in others:
+        left = np.flatnonzero(verdict.ok)
+        verdict.broken[left] = checker.check(q[left], force, every=False).broken
+    ok = verdict.ok
+    n = int(ok.sum())
+    return Candidates(q[ok], np.full(n, group), len(ok), n, verdict.removed_by), verdict
 
 
 def _checked(
-    checker: Feasibility, states: LoadStates, group: int, chunks: Iterator[Array], jobs: int
+    checker: Feasibility, forces: Array, group: int, chunks: Iterator[Array], jobs: int
 ) -> Iterator[tuple[Candidates, PoseFeasibility]]:
     """Each chunk checked, in order, on `jobs` processes."""
     if jobs == 1:
-        yield from (_check(checker, states, group, q) for q in chunks)
+        yield from (_check(checker, forces, group, q) for q in chunks)
     from joblib import Parallel, delayed, effective_n_jobs
 
     with Parallel(n_jobs=jobs, batch_size=PER_TASK) as pool:
         while True:
             wave = islice(chunks, PER_TASK * effective_n_jobs(jobs))
-            yield from pool([delayed(_check)(checker, states, group, q) for q in wave])
+            yield from pool([delayed(_check)(checker, forces, group, q) for q in wave])
 
 
 def _fill(
@@ -284,7 +264,7 @@ def _fill(
             verdicts.append(verdict)
         count, tried = count + len(lot.q), tried + CHUNK
     found = Candidates.join(lots)
-    found = replace(found, q=found.q[:wanted], load=found.load[:wanted], group=found.group[:wanted])
+    found = replace(found, q=found.q[:wanted], group=found.group[:wanted])
     return found, PoseFeasibility.join(verdicts)
 
 

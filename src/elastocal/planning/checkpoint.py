@@ -12,6 +12,7 @@ from collections.abc import Callable, Iterable, Mapping
 from contextlib import suppress
 from dataclasses import dataclass
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -20,7 +21,7 @@ from elastocal import __version__
 from elastocal.errors import InputError, require
 from elastocal.files import atomic_write_bytes, open_input, remove_abandoned
 
-State = Mapping[str, NDArray]
+State = Mapping[str, Any]  # arrays and numbers, which become arrays
 MARK = "elastocal"  # an array of every file that a stage writes: what has none is not removed
 KEY = "[0-9a-f]{32}"
 
@@ -37,54 +38,9 @@ def key_of(files: Iterable[Path], **options: object) -> str:
 
 
 @dataclass(frozen=True)
-class Stage:
-    """What one stage of a design has finished so far; nowhere kept if `path` is None.
-
-    `check` is called before anything is kept: it raises where the work was interrupted.
-    """
-
-    path: Path | None
-    check: Callable[[], None] = lambda: None
-
-    def load(self) -> dict[str, NDArray] | None:
-        """What was saved last, None if nothing (readable) was."""
-        if self.path is None or not self.path.is_file():
-            return None
-        try:
-            with open(self.path, "rb") as file, np.load(file, allow_pickle=False) as saved:
-                return {name: saved[name] for name in saved.files if name != MARK}
-        except (OSError, ValueError, EOFError, zipfile.BadZipFile, zlib.error):
-            return None
-
-    def finished(self, make: Callable[[], State]) -> State:
-        """What was saved, or else what `make` returns, saved."""
-        saved = self.load()
-        if saved is not None:
-            return saved
-        self.save(made := make())
-        return made
-
-    def save(self, state: State) -> None:
-        """Keep `state`, whole or not at all."""
-        self.check()
-        if self.path is None:
-            return
-        text = io.BytesIO()
-        arrays = {MARK: np.array(__version__)} | {k: np.asarray(v) for k, v in state.items()}
-        np.savez(text, allow_pickle=False, **arrays)
-        self.path.parent.mkdir(parents=True, exist_ok=True)
-        try:
-            atomic_write_bytes(self.path, text.getvalue())
-        except InputError:
-            if self.path.parent.is_dir():
-                raise
-            # Another run of the same design has ended, and cleared the folder that both used.
-            self.save(state)
-
-
-@dataclass(frozen=True)
 class Checkpoint:
-    """The stages of one design, in a folder beside its output; nowhere if `folder` is None."""
+    """What the stages of a design have finished, in a folder beside its output; nowhere if `folder`
+    is None.  `check` is called before anything is kept: it raises where work was interrupted."""
 
     folder: Path | None = None
     check: Callable[[], None] = lambda: None
@@ -111,9 +67,19 @@ class Checkpoint:
         """Is there anything to go on from?"""
         return self.folder is not None and any(self.folder.glob("*.npz"))
 
-    def stage(self, name: str) -> Stage:
-        path = None if self.folder is None else self.folder / f"{name}.npz"
-        return Stage(path, self.check)
+    def finished(self, stage: str, make: Callable[[], State]) -> Mapping[str, NDArray]:
+        """What was saved of a stage, or else, saved, what `make` returns, as arrays."""
+        path = None if self.folder is None else self.folder / f"{stage}.npz"
+        # What cannot be read is made anew.
+        with suppress(OSError, ValueError, EOFError, zipfile.BadZipFile, zlib.error):
+            if path is not None and path.is_file():
+                with open(path, "rb") as file, np.load(file, allow_pickle=False) as saved:
+                    return {name: saved[name] for name in saved.files if name != MARK}
+        made = {name: np.asarray(value) for name, value in make().items()}
+        self.check()
+        if path is not None:
+            _save(path, made)
+        return made
 
     def drop(self) -> None:
         """This design ends without a plan: nothing to resume, but perhaps of another one."""
@@ -126,6 +92,20 @@ class Checkpoint:
             for folder in self.folder.parent.glob("*"):
                 if re.fullmatch(KEY, folder.name):
                     _remove(folder)
+
+
+def _save(path: Path, state: Mapping[str, NDArray]) -> None:
+    """Keep `state`, whole or not at all."""
+    text = io.BytesIO()
+    np.savez(text, allow_pickle=False, **{MARK: np.array(__version__)}, **state)
+    path.parent.mkdir(parents=True, exist_ok=True)
+    try:
+        atomic_write_bytes(path, text.getvalue())
+    except InputError:
+        if path.parent.is_dir():
+            raise
+        # Another run of the same design has ended, and cleared the folder that both used.
+        _save(path, state)
 
 
 def _remove(folder: Path) -> None:

@@ -25,11 +25,11 @@ from elastocal.model.manipulator import Model
 from elastocal.planning.candidates import Candidates, draw
 from elastocal.planning.criteria import CRITERIA
 from elastocal.planning.feasibility import Feasibility
-from elastocal.planning.information import PoseInformation, load_states
+from elastocal.planning.information import PoseInformation, plan_forces
 from elastocal.planning.relaxation import Relaxed, balanced, relax
 from elastocal.planning.setup import FeasiblePool, Known, Setup, set_up, shares_of
 from elastocal.planning.test_poses import TargetPoses
-from elastocal.units import Array, IntArray, Progress
+from elastocal.units import Array, Progress
 
 STARTS = 8  # places drawn in the boxes, besides those that the cell states
 SEARCHED, COMPARED = 400, 2000  # candidates while searching, and for the figures that are told
@@ -255,9 +255,9 @@ class Choice:
         there = _mobile(boxes, point.cell, setup.information)
 
         def value(unit: Array) -> float:
-            B = there(boxes.at(unit)).blocks(pool.q[used], pool.load[used])
+            B = there(boxes.at(unit)).blocks(pool.q[used])
             M = setup.gathered(B * np.sqrt(w[used])[:, None, None])
-            return float(np.log(setup.criterion.value(M)))
+            return float(np.log(setup.criterion.of_information(M)))
 
         unit = boxes.unit(boxes.places(point.cell))
         limits = [(0.0, 1.0)] * len(unit)
@@ -267,22 +267,20 @@ class Choice:
     def draw(self, cell: Cell, candidates: int = SEARCHED) -> Candidates:
         """Candidates that the rules of a cell allow."""
         rules = Feasibility(cell, self.work.chain)
-        return draw(cell, self.work.chain, load_states(cell), rules, candidates, self.seed)
+        return draw(cell, self.work.chain, plan_forces(cell), rules, candidates, self.seed)
 
     def relaxed(self, cell: Cell, drawn: Candidates | int = SEARCHED) -> RelaxedPoint | None:
         """The relaxed optimum of a cell on candidates drawn, or so many; None where it leaves
         something open."""
-        chain, states = self.work.chain, load_states(cell)
-        shares: IntArray = shares_of(cell)
+        chain, shares = self.work.chain, shares_of(cell)
         try:
             rules = Feasibility(cell, chain)
             drawn = self.draw(cell, drawn) if isinstance(drawn, int) else drawn
             setup = set_up(
-                Model.assembled(chain, cell), states, drawn.q, drawn.load, int(shares.sum()),
-                self.targets, self.known, self.seed, self.region,
-                rules.seen if rules.partial else None, self.work,
+                Model.assembled(chain, cell), drawn.q, int(shares.sum()), self.targets, self.known,
+                self.region, rules.seen if rules.partial else None, self.work,
             )  # fmt: skip
-            pool = setup.pool(drawn.q, drawn.load, drawn.group)
+            pool = setup.pool(drawn.q, drawn.group)
             relaxed = relax(balanced(setup.problem(pool, shares))[0], GAIN / 10)
         except ElastocalError:
             return None
@@ -309,9 +307,8 @@ def _mobile(
     def there(places: Array) -> PoseInformation:
         model = copy(mobile)
         model.cell = boxes.placed(cell, places)  # of which the noise asks the tracker
-        shift = (places - base)[on_tool].ravel()
-        x = np.stack([np.concatenate([one, shift]) for one in information.scenarios])
-        return replace(information, model=model, scenarios=x)
+        x = np.concatenate([information.x, (places - base)[on_tool].ravel()])
+        return replace(information, model=model, x=x)
 
     return there
 

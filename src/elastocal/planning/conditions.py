@@ -17,13 +17,7 @@ from elastocal.measurements import STILL
 from elastocal.model.manipulator import Model
 from elastocal.model.observations import observe
 from elastocal.planning.execution import Execution
-from elastocal.planning.information import (
-    PoseInformation,
-    load_states,
-    marker_sigmas,
-    minimal_set,
-    observed_weights,
-)
+from elastocal.planning.information import marker_sigmas, minimal_set, observed_weights
 from elastocal.planning.plan import Plan, Scheduled, predicted, remaining_rms
 from elastocal.planning.setup import Known, known_before
 from elastocal.planning.test_poses import TargetPoses, on_kept, prediction_rows
@@ -75,11 +69,8 @@ class ScheduledEffects:
         names = dict.fromkeys(
             p.effect for p in model.parameters if p.name not in self.without.names
         )
-        information = PoseInformation(
-            model, load_states(model.cell), x[None], np.arange(len(x)), sizes
-        )
         try:
-            A = on_kept(model, prediction_rows(information, targets, x)[None], found)[0]
+            A = on_kept(model, prediction_rows(model, targets, x), found)
         except InsufficientDataError:
             return replace(plan, predicted=shown, scheduled=Scheduled(tuple(names), None, None))
         weight = np.sqrt(targets.weight)[:, None, None]

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from dataclasses import dataclass, replace
 from functools import cached_property
-from typing import Any, ClassVar, Self, TypeVar, get_args
+from typing import ClassVar, Self, TypeVar
 
 import numpy as np
 
@@ -14,8 +14,6 @@ from elastocal.planning.criterion import (
     CriterionInputs,
     MeanCriterion,
     Need,
-    Objective,
-    Robust,
     ScenarioCriterion,
     SpectralCriterion,
     TraceCriterion,
@@ -25,7 +23,7 @@ from elastocal.planning.criterion import (
     triangular,
 )
 from elastocal.text import did_you_mean, is_label, listed, quoted
-from elastocal.units import Array, IntArray
+from elastocal.units import Array
 
 # Variances of linear functions of the parameters.
 
@@ -295,40 +293,6 @@ class FirstObservability(DeterminantCriterion):
 
 
 @dataclass(frozen=True)
-class ConditionCriterion(SpectralCriterion):
-    """Φ = λ_max^a / λ_min, to be minimised; the figure is O = 1/√Φ, to be maximised."""
-
-    power: ClassVar[int] = 1
-    better = "larger"
-    without_bound = "is not convex"
-
-    def phi(self, lam: Array) -> Array:
-        return np.asarray(lam[..., -1] ** self.power / lam[..., 0])
-
-    def phi_slope(self, lam: Array) -> Array:
-        slope = np.zeros_like(lam)
-        slope[-1] += self.power * lam[-1] ** (self.power - 1) / lam[0]
-        slope[0] -= lam[-1] ** self.power / lam[0] ** 2
-        return slope
-
-    def figure(self, value: float) -> float:
-        return float(1 / np.sqrt(value))
-
-
-@dataclass(frozen=True)
-class SecondObservability(ConditionCriterion):
-    """O2 = σ_min / σ_max, to be maximised: Φ = 1/O2² = λ_max / λ_min, without unit.
-
-    The squared condition number of the information of interest.  It has degree 0 in M and may
-    grow when a pose is added, so it gives no lower bound here.  `reported`: O2 between 0 and 1.
-    Source: Driels & Pathre 1990, J. Robotic Systems 7(1), 27–53.
-    """
-
-    name = "O2"
-    title = "observability index: inverse condition number"
-
-
-@dataclass(frozen=True)
 class ThirdObservability(EigenvalueCriterion):
     """O3 = σ_min, to be maximised: Φ = 1/O3² = λ_max(V_II); it orders plans as E does.
 
@@ -343,20 +307,6 @@ class ThirdObservability(EigenvalueCriterion):
 
     def figure(self, value: float) -> float:
         return float(1 / np.sqrt(value))
-
-
-@dataclass(frozen=True)
-class FourthObservability(ConditionCriterion):
-    """O4 = σ_min² / σ_max = O2 · O3, to be maximised: Φ = 1/O4² = λ_max² / λ_min.
-
-    The noise amplification index.  It has degree 1 in V, but may grow when a pose is added, and
-    1/Φ is not concave: no bound.
-    Source: Nahvi & Hollerbach 1996, IEEE Int. Conf. Robotics and Automation, 647–654.
-    """
-
-    power = 2
-    name = "O4"
-    title = "observability index: noise amplification"
 
 
 @dataclass(frozen=True)
@@ -391,12 +341,15 @@ CRITERIA: dict[str, type[ScenarioCriterion]] = {
         PredictionVariance,
         CombinationVariance,
         FirstObservability,
-        SecondObservability,
         ThirdObservability,
-        FourthObservability,
         FifthObservability,
     )
 }
+# What a plan for them would be made for instead.
+CONDITION = (
+    "its plans had no bound, and what it asks for is the worst-known direction: take E or O3"
+)
+GONE = {"O2": CONDITION, "O4": CONDITION}
 Registered = TypeVar("Registered", bound=type[ScenarioCriterion])
 # What criteria stated before they were functions of V.
 FORMER = ("each", "each_gradient", "each_after_adding", "term", "cone")
@@ -456,50 +409,10 @@ def _place(criterion: type[ScenarioCriterion]) -> tuple[str, str]:
 
 def criterion_named(name: str) -> type[ScenarioCriterion]:
     """The criterion that CRITERIA has under this name; InputError that lists them for another."""
+    require(name not in GONE, f"criterion {name} is gone: {GONE.get(name)}")
     require(
         name in CRITERIA,
         f"criterion {quoted(name)} is unknown{did_you_mean(name, CRITERIA)}; there are "
         f"{listed(CRITERIA)}",
     )
     return CRITERIA[name]
-
-
-def make_criterion(
-    name: str,
-    *,
-    parameters: int,
-    interest: IntArray,
-    scenarios: int = 1,
-    robust: Robust = "none",
-    A: Array | None = None,
-    **inputs: Any,
-) -> Objective:
-    """The criterion `name`, one of CRITERIA, for p = `parameters` scaled parameters.
-
-    A (S, T, r, p) under each of S = `scenarios` of the arm, all else as in CriterionInputs; over
-    several of them `robust` says whether the average or the worst counts.
-    Raises InputError for an unknown name, and where something the criterion needs is missing, of
-    another shape, or empty.
-    """
-    chosen = criterion_named(name)
-    options = get_args(Robust)
-    require(
-        robust in options,
-        f"robust = {quoted(robust)} is unknown{did_you_mean(robust, options)}; there are "
-        f"{listed(options)}",
-    )
-    require(
-        robust != "none" or scenarios == 1,
-        f"criterion {name} has {scenarios} scenarios of the arm to weigh: say whether the "
-        'average or the worst counts (robust = "average" or "worst")',
-    )
-    require(
-        A is None or len(A) == scenarios,
-        f"criterion {name}: derivatives of {scenarios} scenarios are needed",
-    )
-    indices = np.asarray(interest, dtype=np.int64)
-    each = tuple(
-        chosen.of(CriterionInputs(name, parameters, indices, None if A is None else A[s], **inputs))
-        for s in range(scenarios)
-    )
-    return Objective(each, np.inf if robust == "worst" else 1.0)

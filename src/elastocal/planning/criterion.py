@@ -24,7 +24,6 @@ from elastocal.errors import InputError, require
 from elastocal.text import did_you_mean, listed, quoted
 from elastocal.units import Array, BoolArray, IntArray
 
-Robust = Literal["none", "average", "worst"]
 Need = Literal["test_poses", "combination", "doubts"]
 
 # tr(H⁻¹) of M scaled to unit diagonal, H, above which M is singular to rounding: a matrix of rank
@@ -84,6 +83,14 @@ def triangular(F: Array) -> Array:
     return np.asarray(R, dtype=np.float64)
 
 
+@dataclass(frozen=True)
+class TangentBound:
+    """Φ(M') ≥ `value`²/⟨G, M'⟩ for every M' (p, p), of a certifiable criterion; G (p, p)."""
+
+    value: float
+    G: Array
+
+
 # What a criterion is made from, and what it is.
 
 
@@ -93,8 +100,7 @@ class CriterionInputs:
 
     `criterion`: the name asked for.  `interest` (k,): indices of the parameters that count, the
     others are nuisance.  A (T, r, p) = ∂(position at target t)/∂y in m, with `weights` (T,);
-    `combination` (p,) of y with its `unit`; `n_poses` of the plan; `names` (p,) and `sizes` (p,) in
-    SI units, where a criterion asks for parameters by name.
+    `combination` (p,) of y with its `unit`; `n_poses` of the plan; `names` and `sizes` (p,).
     """
 
     criterion: str
@@ -186,7 +192,7 @@ class CriterionInputs:
 
 
 class ScenarioCriterion(ABC):
-    """Φ(V) of degree 1 in the covariance V (p, p), to be minimised: under one scenario of the arm.
+    """Φ(V) of degree 1 in the covariance V (p, p), to be minimised, for one arm.
 
     `name` is how cell files and plans call it, `title` what it is in a few words, `unit` that of
     the figure a user knows (see `figure`), and `better` which figure is the better one.
@@ -202,7 +208,7 @@ class ScenarioCriterion(ABC):
     needs: ClassVar[tuple[Need, ...]] = ()
     certifiable: bool = False
     without_bound: str = "states no curvature"
-    kinked: ClassVar[bool] = False
+    kinked: bool = False
 
     @classmethod
     def of(cls, inputs: CriterionInputs) -> Self:
@@ -224,6 +230,21 @@ class ScenarioCriterion(ABC):
     @abstractmethod
     def figure(self, value: float) -> float:
         """The figure a user knows, from Φ."""
+
+    def reported(self, value: float) -> tuple[float, str]:
+        """The figure a user knows, from Φ, and its unit."""
+        return self.figure(value), self.unit
+
+    def of_information(self, M: Array) -> Array:
+        """Φ (...,) of M (..., p, p); inf where M is singular."""
+        V, ok = covariance(M)
+        V = np.where(ok[..., None, None], V, np.eye(M.shape[-1]))
+        return np.where(ok, self.value(V), np.inf)
+
+    def tangent_at(self, V: Array) -> TangentBound:
+        """The tangent of 1/Φ at V (p, p)."""
+        value, C = self.tangent(V)
+        return TangentBound(value, V @ C @ V)
 
     def turned(self, T: Array) -> ScenarioCriterion:
         """The same criterion of the parameters z, y = T z, T (p, k)."""
@@ -248,7 +269,7 @@ class Turned(ScenarioCriterion):
     T: Array
 
     def __post_init__(self) -> None:
-        for what in ("name", "title", "unit", "better", "certifiable", "without_bound"):
+        for what in ("name", "title", "unit", "better", "certifiable", "without_bound", "kinked"):
             object.__setattr__(self, what, getattr(self.base, what))
 
     def value(self, V: Array) -> Array:
@@ -406,110 +427,3 @@ class MeanCriterion(SpectralCriterion):
 
     def phi_curvature(self, lam: Array) -> Array:
         return mean_curvature(lam, self.order)
-
-
-# A criterion over scenarios of the arm, as a function of the plan's information.
-
-
-@dataclass(frozen=True)
-class TangentBound:
-    """Φ(M') ≥ `value`²/⟨G, M'⟩ for every M' (S, p, p), of a certifiable criterion; G (S, p, p)."""
-
-    value: float
-    G: Array
-
-
-@dataclass(frozen=True)
-class Objective:
-    """Φ(M) of M (..., S, p, p): the mean of Φ_s over S equally likely scenarios of the arm, or the
-    power mean of `order` q, inf for the least favourable of them (maximin design).
-
-    A nonlinear model's B depends on the parameters that are still to be found; the scenarios are
-    draws from what is known of them (Atkinson, Donev & Tobias 2007, ch. 17 and 18; Pronzato &
-    Walter 1988).  1/Φ is concave as the 1/Φ_s are.
-    """
-
-    each: tuple[ScenarioCriterion, ...]
-    order: float = 1.0
-
-    def __post_init__(self) -> None:
-        for what in ("name", "unit", "certifiable", "without_bound"):
-            object.__setattr__(self, what, getattr(self.each[0], what))
-
-    name: ClassVar[str]
-    unit: ClassVar[str]
-    certifiable: ClassVar[bool]
-    without_bound: ClassVar[str]
-
-    @property
-    def kinked(self) -> bool:
-        """Has Φ kinks?"""
-        base = self.each[0]
-        base = base.base if isinstance(base, Turned) else base
-        return base.kinked or self.order == np.inf
-
-    def figure(self, value: float) -> float:
-        """The figure a user knows, from Φ: ρ₀ in µm, log det, an index."""
-        return self.each[0].figure(value)
-
-    def reported(self, value: float) -> tuple[float, str]:
-        """The figure a user knows, from Φ, and its unit."""
-        return self.figure(value), self.unit
-
-    def value(self, M: Array) -> Array:
-        """Φ (...,) of M (..., S, p, p); inf where M is singular."""
-        V, ok = covariance(M)
-        V = np.where(ok[..., None, None], V, np.eye(M.shape[-1]))
-        return np.where(ok.all(axis=-1), self.of(V), np.inf)
-
-    def of(self, V: Array) -> Array:
-        """Φ (...,) of V (..., S, p, p)."""
-        if len(self.each) == 1:
-            return self.each[0].value(V[..., 0, :, :])
-        values = [one.value(V[..., s, :, :]) for s, one in enumerate(self.each)]
-        return power_mean(np.stack(values, axis=-1), self.order)
-
-    def slope(self, V: Array) -> tuple[float, Array]:
-        """Φ and ∂Φ/∂V (S, p, p) at V (S, p, p)."""
-        values, C = self._slopes(V, False)
-        weights = mean_slope(values, self.order)
-        return float(power_mean(values, self.order)), weights[:, None, None] * C
-
-    def tangent(self, V: Array) -> TangentBound:
-        """The tangent at V (S, p, p): G = V C V of weights that sum to 1."""
-        values, C = self._slopes(V, True)
-        weights = mean_slope(values, self.order)
-        if self.order != 1:
-            weights = weights / weights.sum()
-        return TangentBound(float(weights @ values), V @ (weights[:, None, None] * C) @ V)
-
-    def curvature(self, V: Array, X: Array) -> Array | float:
-        """D²Φ (k, k) for directions X (S, k, p, p) of V (S, p, p)."""
-        if len(self.each) == 1:
-            return self.each[0].curvature(V[0], X[0])
-        values, C = self._slopes(V, False)
-        along = np.stack([x.reshape(len(x), -1) @ c.ravel() for x, c in zip(X, C, strict=True)])
-        bent = along.T @ mean_curvature(values, self.order) @ along
-        for one, weight, v, x in zip(
-            self.each, mean_slope(values, self.order), V, X, strict=True
-        ):  # fmt: skip
-            bent = bent + weight * one.curvature(v, x)
-        return np.asarray(bent)
-
-    def turned(self, T: Array) -> Objective:
-        """Of the parameters z, y = T_s z, T (S, p, k)."""
-        each = tuple(one.turned(t) for one, t in zip(self.each, T, strict=True))
-        return replace(self, each=each)
-
-    def softened(self, q: float) -> Objective:
-        """Smooth, nowhere above this one, and the nearer the larger q is."""
-        if not self.kinked:
-            return self
-        order = q if self.order == np.inf and len(self.each) > 1 else self.order
-        return replace(self, each=tuple(one.softened(q) for one in self.each), order=order)
-
-    def _slopes(self, V: Array, tangent: bool) -> tuple[Array, Array]:
-        found = [
-            one.tangent(v) if tangent else one.slope(v) for one, v in zip(self.each, V, strict=True)
-        ]
-        return np.array([value for value, _ in found]), np.stack([C for _, C in found])

@@ -9,7 +9,6 @@ from pathlib import Path
 from typing import Literal, get_args
 
 import numpy as np
-from numpy.typing import NDArray
 from threadpoolctl import threadpool_limits
 
 from elastocal.cell.plan_wishes import TEST_POSE
@@ -31,11 +30,11 @@ from elastocal.planning.candidates import (
 from elastocal.planning.checkpoint import Checkpoint, State
 from elastocal.planning.choices import Choice
 from elastocal.planning.conditions import ScheduledEffects
-from elastocal.planning.criteria import CRITERIA
-from elastocal.planning.doubts import OPEN, Place, gain_of, in_doubt, leading_directions
-from elastocal.planning.exchange import random_information, size_curve, values_without
+from elastocal.planning.criteria import CRITERIA, GONE
+from elastocal.planning.doubts import OPEN, Place, gain_of, in_doubt
+from elastocal.planning.exchange import Sizes, random_information, values_without
 from elastocal.planning.feasibility import Feasibility
-from elastocal.planning.information import Done, load_states, measured, next_number, readings_each
+from elastocal.planning.information import Done, measured, next_number, plan_forces, readings_each
 from elastocal.planning.moves import Blockers
 from elastocal.planning.pins import Pins
 from elastocal.planning.plan import (
@@ -180,7 +179,7 @@ class _Design:
         self.chain = self.model.chain
         check_cell(self.cell, self.chain)
         _check_criterion(self.model)
-        self.states = load_states(self.cell)
+        self.forces = plan_forces(self.cell)
         self.space = joint_space(self.cell, self.chain)
         pins = self.options.pins
         self.feasibility = Feasibility(self.cell, self.chain, None if pins is None else pins.struck)
@@ -236,52 +235,47 @@ class _Design:
 
     def _chosen(self) -> Plan:
         progress, options = self.progress, self.options
-        nothing = np.zeros(0, dtype=np.int64)
-        pins, pinned_at = options.pins, (nothing, nothing)
+        pins, pinned_at = options.pins, np.zeros(0, dtype=np.int64)
         if pins is not None and len(pins.q):
-            pinned_at = pins.placed(self.cell, self.chain, self.states, self.feasibility)
-        self.pinned = np.bincount(pinned_at[1], minlength=self.space.n_groups)
+            pinned_at = pins.placed(self.cell, self.chain, self.feasibility)
+        self.pinned = np.bincount(pinned_at, minlength=self.space.n_groups)
         shares = self._shares()
         planned = [self._shares(n) for n in options.curve]
         planned += [shares] if self.cell.design.target is None else []
         targets, region = self.targets()
-        q, load, group, counts = self._candidates()
+        q, group, counts = self._candidates()
         for wanted in planned:
             check_available(self.cell, np.bincount(group), wanted)
         model, known = self.model, Known(options.fixed, options.prior)
         if "doubts" in CRITERIA[self.cell.design.criterion].needs:
-            model, known, self.doubts = in_doubt(model, known, self.states, q, load, options.doubts)
+            model, known, self.doubts = in_doubt(model, known, q, options.doubts)
         known = self._with_done(known, model)
         progress("information of the candidates")
         setup = set_up(
-            model, self.states, q, load, int((shares + self.pinned).sum()), targets, known,
-            options.seed, region, self.feasibility.seen if self.feasibility.partial else None,
+            model, q, int((shares + self.pinned).sum()), targets, known,
+            region, self.feasibility.seen if self.feasibility.partial else None,
             model if self.work is self.model else self.work.with_effects(model.cell.model.effects),
         )  # fmt: skip
         self.warnings += setup.warnings
-        pool, pinned = setup.pool(q, load, group), None
+        pool, pinned = setup.pool(q, group), None
         if pins is not None and len(pins.q):
-            pinned = setup.pool(pins.q, *pinned_at)
+            pinned = setup.pool(pins.q, pinned_at)
         search = setup.having(pinned)
         if cap := self.cell.design.cap:
-            state = self.checkpoint.stage("share").finished(
-                lambda: {"share": np.array(share_within(search, pool, shares, cap, progress))}
+            state = self.checkpoint.finished(
+                "share", lambda: {"share": share_within(search, pool, shares, cap, progress)}
             )
             setup = setup.sharing(float(state["share"]))
         search = setup.having(pinned)
         curve, shares, begun = self._sizes(search, pool, shares)
-        searches = Searches(setup.information, self.space, self.feasibility, self.feasibility.pairs)
-        own = np.isin(setup.information.names, self.model.names)
-        terms = None
-        if begun is None and not own.all() and search.target_rows is not None:
-            terms = leading_directions(search.problem(pool, shares), search.target_rows, ~own)
+        searches = Searches(setup.information, self.space, self.feasibility)
 
         def sought(
             shares: IntArray, pool: FeasiblePool, begun: IntArray | None, checkpoint: Checkpoint
         ) -> tuple[Search, Selection]:
-            seek = Search.of(
+            seek = Search(
                 search, pool, searches, shares, self._effort(), options.seed, checkpoint, progress,
-                terms, setup,
+                setup,
             )  # fmt: skip
             return seek, seek.select(pool, begun)
 
@@ -337,8 +331,8 @@ class _Design:
             return targets, None
         return targets, everywhere(cell, self.chain, at_work, seed)
 
-    def _candidates(self) -> tuple[Array, IntArray, IntArray, CandidateCounts]:
-        state = self.checkpoint.stage("candidates").finished(self._drawn)
+    def _candidates(self) -> tuple[Array, IntArray, CandidateCounts]:
+        state = self.checkpoint.finished("candidates", self._drawn)
         tried, feasible = (int(v) for v in state["tried"])
         removed = dict(zip(state["rules"].tolist(), state["removed"].tolist(), strict=True))
         counts = CandidateCounts(tried, feasible, removed)
@@ -346,11 +340,11 @@ class _Design:
         self.taught = {q.tobytes(): str(name) for q, name in names}
         if told := str(state["told"]):
             self.warnings.append(told)
-        return state["q"], state["load"], state["group"], counts
+        return state["q"], state["group"], counts
 
     def _drawn(self) -> State:
         """The candidates and how many poses each rule removed, as arrays."""
-        spec, asked = self.cell.design, (self.cell, self.chain, self.states, self.feasibility)
+        spec, asked = self.cell.design, (self.cell, self.chain, self.forces, self.feasibility)
         lots: list[Candidates] = []
         names: list[str] = []
         told = ""
@@ -368,7 +362,6 @@ class _Design:
             "names": np.array(names, dtype=np.str_),
             "told": np.array(told),
             "q": drawn.q,
-            "load": drawn.load,
             "group": drawn.group,
             "tried": np.array([drawn.tried, drawn.feasible]),
             "rules": np.array(list(drawn.removed_by), dtype=np.str_),
@@ -380,7 +373,7 @@ class _Design:
         which were refused."""
         self.progress(f"checking the poses of {path}")
         table = self.model.read_plan(path)
-        found, names, refused = brought(self.cell, self.chain, self.states, self.feasibility, table)
+        found, names, refused = brought(self.cell, self.chain, self.forces, self.feasibility, table)
         by_rule: dict[str, list[str]] = {}
         for name, rule in refused.items():
             by_rule.setdefault(rule.replace("_", " "), []).append(name)
@@ -394,7 +387,7 @@ class _Design:
         if pins is not None and len(pins.q):
             near = np.abs(found.q[:, None] - pins.q[None]).max(axis=2).min(axis=1) < LEVEL_SLACK
             kept = np.flatnonzero(~near)
-            found = replace(found, q=found.q[kept], load=found.load[kept], group=found.group[kept])
+            found = replace(found, q=found.q[kept], group=found.group[kept])
             names = [names[k] for k in kept]
         return found, names, told
 
@@ -406,8 +399,8 @@ class _Design:
         target, numbers = self.cell.design.target, self.options.curve
         if target is None and not numbers:
             return (), shares, None
-        state = self.checkpoint.stage("sizes").finished(
-            lambda: self._size_curve(setup, pool, target, numbers, shares)
+        state = self.checkpoint.finished(
+            "sizes", lambda: self._size_curve(setup, pool, target, numbers, shares)
         )
         reported = setup.criterion.reported
         points = tuple(
@@ -430,33 +423,30 @@ class _Design:
     def _size_curve(
         self, setup: Setup, pool: FeasiblePool, target: float | None, numbers: tuple[int, ...],
         shares: IntArray,
-    ) -> dict[str, NDArray]:  # fmt: skip
-        """As `size_curve`: bounds NaN where there are none, `smallest` 0 where none meets; what
-        was found of `smallest`, without a target of `shares` where these were among them."""
-        found = size_curve(
-            lambda n: setup.problem(pool, self._shares(n)),
-            numbers,
-            None if target is None else self._target(setup, target),
-            between=(
-                max(pool.n_groups, int(self.pinned.sum()) + 1),
-                most_poses(self.cell, np.bincount(pool.group), MOST_POSES),
-            ),
-            seed=self.options.seed,
-            progress=self.progress,
+    ) -> State:  # fmt: skip
+        """Plans by number of poses: bounds NaN where there are none, `smallest` 0 where none meets
+        the target; what was found of `smallest`, without a target of `shares` where these were
+        among them."""
+        sizes = Sizes(
+            lambda n: setup.problem(pool, self._shares(n)), self.options.seed, self.progress
         )
-        n = found.smallest or 0
-        total = int((shares + self.pinned).sum())
-        if target is None and np.array_equal(self._shares(total), shares):
-            n = total
-        bounds = [np.nan if p.bound is None else p.bound for p in found.points]
+        sizes.of(numbers)
+        n = total = int((shares + self.pinned).sum())
+        smallest = 0
+        if target is not None:
+            low = max(pool.n_groups, int(self.pinned.sum()) + 1)
+            most = most_poses(self.cell, np.bincount(pool.group), MOST_POSES)
+            n = smallest = sizes.fewest(self._target(setup, target), low, most) or 0
+        elif not np.array_equal(self._shares(total), shares):
+            n = 0
+        found = dict(sorted(sizes.found.items()))
+        bounds = [np.nan if p.bound is None else p.bound for p in found.values()]
         return {
-            "n": np.array([p.n_poses for p in found.points]),
-            "value": np.array([p.value for p in found.points]),
-            "bound": np.array(bounds),
-            "smallest": np.array(found.smallest or 0),
-            "chosen": next(
-                (p.chosen for p in found.points if p.n_poses == n), np.zeros(0, dtype=np.int64)
-            ),
+            "n": list(found),
+            "value": [p.value for p in found.values()],
+            "bound": bounds,
+            "smallest": smallest,
+            "chosen": found[n].chosen if n in found else np.zeros(0, dtype=np.int64),
         }
 
     def _fewer(
@@ -480,7 +470,7 @@ class _Design:
                 continue
             share = plan.certificate.efficiency_pool
             bound = None if share is None else reported(plan.value * share)[0]
-            tried.append(PlanSize(m, reported(plan.value)[0], bound))
+            tried.append(PlanSize(m + int(self.pinned.sum()), reported(plan.value)[0], bound))
             if plan.value <= target:
                 seek, found, n = less, plan, m
             else:
@@ -507,16 +497,16 @@ class _Design:
         found, execution, told = ordered(seek, found, pinned)
         self.warnings += told
         pool, chosen = found.pool, found.chosen
-        q, load, blocks = pool.q[chosen], pool.load[chosen], pool.blocks[:, chosen]
+        q, blocks = pool.q[chosen], pool.blocks[chosen]
         spec, model = self.cell.design, setup.information.model
         problem = setup.problem(pool, seek.shares)
-        M = setup.gathered(blocks)[0]
-        when = execution.times(len(q), len(self.states.forces))
+        M = setup.gathered(blocks)
+        when = execution.times(len(q), len(self.forces))
         noise, alias = model.cell.noise, found.alias
         left = M if alias is None or not noise.drift else alias.information(M, when, noise)
-        phi = np.sort(np.asarray(setup.criterion.value(drawn), dtype=np.float64))
-        seen = setup.information.seen(q, load)
-        numbers = round(blocks.shape[1] * blocks.shape[2] * seen.mean() * readings_each(self.cell))
+        phi = np.sort(np.asarray(setup.criterion.of_information(drawn), dtype=np.float64))
+        seen = setup.information.seen(q)
+        numbers = round(blocks.shape[0] * blocks.shape[1] * seen.mean() * readings_each(self.cell))
         numbers += 0 if known.done is None else known.done.numbers
         value, unit = setup.criterion.reported(found.value)
         bound = found.certificate.bound_pool
@@ -527,8 +517,7 @@ class _Design:
             reported=value,
             unit=unit,
             q=q,
-            load=load,
-            forces=self.states.forces,
+            forces=self.forces,
             group=pool.group[chosen],
             levels=self.space.levels,
             level_joint=None if self.space.held is None else f"joint{self.space.held + 1}",
@@ -544,7 +533,7 @@ class _Design:
                 if p.name in self.model.names
             ),
             reasons=reasons(
-                model, setup.found, blocks[0], setup.prior[0],
+                model, setup.found, blocks, setup.prior,
                 values_without(problem, chosen), found.value,
             ),
             targets=targets,
@@ -556,7 +545,7 @@ class _Design:
             first=next_number(self.options.done.configuration_labels if self.options.done else ()),
             names=self._names(found),
             chance=Chance.of(phi, found.value, setup.criterion),
-            everywhere=self._everywhere(setup, M, drawn[:, 0], left),
+            everywhere=self._everywhere(setup, M, drawn, left),
             seen=None if seen.all() else seen,
             doubts=tuple(self.doubts),
             gain=gain_of(setup, known, M, self.doubts, self.options.seed),
@@ -615,6 +604,7 @@ def _check_criterion(model: Model) -> None:
     cell = model.cell
     where, asked = cell.path or cell.name, cell.design.criterion
     takes = _joined([f'"{name}"' for name in CRITERIA], "or")
+    require(asked not in GONE, f"{where}: design.criterion {asked} is gone: {GONE.get(asked)}")
     require(
         asked in CRITERIA,
         f"{where}: key design.criterion takes {takes}; found {quoted(asked)}"

@@ -29,23 +29,13 @@ from elastocal.model.arm import usual_sizes
 from elastocal.model.effects.catalogue import CATALOGUE, SOMETHING
 from elastocal.model.manipulator import Model
 from elastocal.model.observations import observe
-from elastocal.planning.criterion import covariance
-from elastocal.planning.exchange import random_plan
-from elastocal.planning.information import (
-    LoadStates,
-    PoseInformation,
-    observed_weights,
-)
+from elastocal.planning.information import PoseInformation, observed_weights
 from elastocal.planning.plan import Doubt, Gain
-from elastocal.planning.relaxation import DesignProblem
 from elastocal.planning.setup import Known, Setup
-from elastocal.units import Array, BoolArray, IntArray
+from elastocal.units import Array
 
 POSES = 100  # that show how far
 SHOWN = 1.0  # standard deviation from 0 that all of these poses together would give it at least
-# Of Φ, what combinations of what is in doubt may add that the search for a plan passes over; and
-# the share of the parameters that may remain for it to be worth it; plans that this is judged by.
-LOST, WORTH, PLANS = 0.005, 0.8, 8
 # What a pose has only once it stands in an order.
 OPEN = frozenset({"time", "temperature", "approach"})
 
@@ -53,13 +43,12 @@ Place = tuple[str, str]  # an effect and where it acts
 
 
 def in_doubt(
-    model: Model, known: Known, states: LoadStates, q: Array, load: IntArray,
-    probability: Mapping[Place, float] | None = None,
-) -> tuple[Model, Known, dict[Place, float]]:  # fmt: skip
+    model: Model, known: Known, q: Array, probability: Mapping[Place, float] | None = None
+) -> tuple[Model, Known, dict[Place, float]]:
     """The model with all that it may lack, what is known of it, and the places that count, with
     their probability: the prior of the parameters that it then has more, sized at some of the poses
-    q (N, n) in load states `load` (N,).  Those that these do not show are held: no plan would lower
-    what they add at the test poses.
+    q (N, n).  Those that these do not show are held: no plan would lower what they add at the test
+    poses.
 
     `probability` that an effect is missing at a place, where more is known of it than its share of
     SOMETHING; places that it does not name are not in doubt.
@@ -73,9 +62,8 @@ def in_doubt(
         return model, known, {}
     whole = model.with_effects((*model.cell.model.effects, *(EffectChoice(*key) for key in places)))
     every = np.arange(len(whole.parameters))
-    information = PoseInformation(whole, states, whole.nominal[None], every, np.ones(len(every)))
-    step = -(-len(q) // POSES)
-    table = information.rows(q[::step], load[::step], whole.nominal)
+    information = PoseInformation(whole, whole.nominal, every, np.ones(len(every)))
+    table = information.rows(q[:: -(-len(q) // POSES)])
     added = np.flatnonzero(~np.isin(whole.names, model.names))
     observed = observe(table, whole.observe)
     B = whole.regressor(table, whole.nominal, added, observed).B
@@ -115,41 +103,6 @@ def missing(model: Model) -> list[Place]:
     ]  # fmt: skip
 
 
-def leading_directions(problem: DesignProblem, R: Array, doubtful: BoolArray) -> Array | None:
-    """T (1, p, k) of the parameters y = T z that count: all but the `doubtful` (p,), and of these
-    the combinations that could err most at the test poses, |R y| there in m, were they left out.
-
-    Whoever leaves out z errs by (R_z − R_y M_yy⁻¹ M_yz) z, y being what is estimated, and Φ is less
-    by the square of that at most.  To y are added singular directions of it, over PLANS drawn at
-    random and that of even weights, z of prior variance 1, until LOST of Φ is left to all others.
-    None where hardly any can go.
-    """
-    if len(problem.prior) > 1 or not doubtful.any():
-        return None
-    even = problem.at(problem.even())
-    rng = np.random.default_rng(0)
-    drawn = [problem.information(random_plan(problem, rng)) for _ in range(PLANS)]
-    x, u = np.flatnonzero(~doubtful), np.flatnonzero(doubtful)
-    unit = np.eye(len(doubtful))
-    unit[np.ix_(u, u)] = np.linalg.inv(np.linalg.cholesky(problem.prior[0][np.ix_(u, u)])).T
-    kept, target = np.eye(len(doubtful))[:, x], R @ unit  # in units of the prior
-    plans = [M for M in (even, *drawn) if covariance(M[:, x[:, None], x])[1].all()]
-    while plans and kept.shape[1] <= WORTH * len(doubtful):
-        errors = []
-        for M in plans:
-            known = kept.T @ unit.T @ M[0] @ unit
-            error = target - target @ kept @ np.linalg.solve(known @ kept, known)
-            errors.append(error / np.sqrt(float(problem.criterion.value(M)) * len(plans)))
-        new = np.vstack(errors)
-        _, values, turned = np.linalg.svd(new - new @ kept @ kept.T, full_matrices=False)
-        rest = np.append(np.cumsum(values[::-1] ** 2)[::-1], 0.0)
-        k = int(np.argmax(rest <= LOST))
-        if not k:
-            return (unit @ kept)[None]
-        kept = np.column_stack([kept, turned[:k].T])
-    return None
-
-
 def gain_of(
     setup: Setup, known: Known, after: Array, places: Mapping[Place, float], seed: int
 ) -> Gain | None:
@@ -167,6 +120,4 @@ def gain_of(
         own = np.array([k for k, a in enumerate(at) if (a.effect, a.where) == place], dtype=int)
         known_of = sizes[own] ** 2 / np.array([variance[at[k].name] for k in own])
         doubts.append(Doubt(p, own, (1 - p) * known_of))
-    return Gain.of(
-        setup.target_rows, setup.prior[0], after, doubts, done.pull[columns] * sizes, seed
-    )
+    return Gain.of(setup.target_rows, setup.prior, after, doubts, done.pull[columns] * sizes, seed)

@@ -46,15 +46,15 @@ class Alias:
         """Of the plan `chosen` (N,) from the pool; None where readings are distances, which a
         shift changes by no more than its part along the line of sight."""
         information = setup.information
-        observed, factor = information.noise(pool.q[chosen], pool.load[chosen])
+        observed, factor = information.noise(pool.q[chosen])
         if observed.kind == "distance":
             return None
-        blocks = pool.blocks[0, chosen]
-        M = setup.gathered(pool.blocks[:, chosen])[0]
+        blocks = pool.blocks[chosen]
+        M = setup.gathered(blocks)
         V = linalg.cho_solve(linalg.cho_factor(M), np.eye(len(M)))
         R = setup.target_rows
         root = np.linalg.cholesky(M).T if R is None else R
-        n, n_states = len(chosen), len(information.states.forces)
+        n, n_states = len(chosen), len(information.forces)
         rows = len(observed.table) // n
         T = observed.combine[: len(observed.lead) // n, :rows].toarray()
         force = observed.table.force.reshape(n, rows, 3)
@@ -62,7 +62,7 @@ class Alias:
         shift[:3, :3] = np.eye(3)
         share = np.zeros((n, n_states, len(root), 3))
         whitened = np.zeros((n, n_states, blocks.shape[1], 3))
-        for state, own in enumerate(information.states.forces):
+        for state, own in enumerate(information.forces):
             here = (np.abs(force - own) < 1e-9).all(axis=2)
             D = np.einsum("ak,nk,cx->nacx", T, here.astype(float), shift)
             whitened[:, state] = np.linalg.solve(factor, D.reshape(n, -1, 3))

@@ -6,14 +6,16 @@ a parameter open has an immense Φ and is left by the first exchange that closes
 
 from __future__ import annotations
 
+from bisect import bisect_left
 from collections.abc import Callable, Iterable
 from dataclasses import dataclass, field, replace
+from typing import Any
 
 import numpy as np
 
-from elastocal.errors import InsufficientDataError, require
+from elastocal.errors import InsufficientDataError
 from elastocal.planning.criteria import DeterminantCriterion
-from elastocal.planning.criterion import Objective, TangentBound, inverse
+from elastocal.planning.criterion import inverse
 from elastocal.planning.relaxation import (
     DesignProblem,
     Relaxed,
@@ -22,7 +24,7 @@ from elastocal.planning.relaxation import (
     check_enough,
     relax,
 )
-from elastocal.units import Array, BoolArray, IntArray, Progress
+from elastocal.units import Array, IntArray, Progress
 
 # Relative gain in Φ below which an exchange is not made: rounding must not decide.
 LEAST = 1e-9
@@ -49,16 +51,15 @@ def exchange(
     Of a criterion without a bound all are; with `looks`, no more than so many.
     """
     plan, criterion = plan.copy(), problem.criterion
-    count = np.bincount(plan, minlength=problem.n_candidates)
     V = inverse(problem.information(plan))
-    value, (phi, C) = float(criterion.of(V)), criterion.slope(V)
+    value, (phi, C) = float(criterion.value(V)), criterion.slope(V)
     places = list(np.argsort(problem.prices(V @ C @ V)[plan], kind="stable"))
     vain = 0
     while vain < len(plan):
         k = int(places[0])
         places = [*places[1:], k]
         V = inverse(problem.information(np.delete(plan, k)))
-        free = np.flatnonzero((problem.group == problem.group[plan[k]]) & (count < problem.most))
+        free = _free(problem, plan, problem.group[plan[k]])
         phi, C = criterion.slope(V)
         d = problem.prices(V @ C @ V)[free]
         upper = (1 + d / phi) / phi if criterion.certifiable else np.full(len(d), np.inf)
@@ -66,7 +67,7 @@ def exchange(
         rank, upper, size = free[order], upper[order], FIRST
         best, into = value * (1 - LEAST), None
         while len(rank) and upper[0] * best > 1:
-            phis = criterion.of(with_poses(V, problem.blocks[:, rank[:size]]))
+            phis = criterion.value(with_poses(V, problem.blocks[rank[:size]]))
             j = int(phis.argmin())
             if phis[j] < best:
                 best, into = float(phis[j]), int(rank[j])
@@ -77,55 +78,45 @@ def exchange(
         new = plan.copy()
         new[k] = into
         # Formed anew: where M is nearly singular, the update may promise what rounding takes.
-        found = float(criterion.of(inverse(problem.information(new))))
+        found = float(criterion.value(inverse(problem.information(new))))
         if found < value * (1 - LEAST):
-            count[plan[k]] -= 1
-            count[into] += 1
             plan, value, vain = new, found, 0
     return np.sort(plan), value
 
 
+def _free(problem: DesignProblem, plan: IntArray, group: Any) -> IntArray:
+    """The candidates of a group that the plan lacks."""
+    free = problem.group == group
+    free[plan] = False
+    return np.flatnonzero(free)
+
+
 def with_poses(V: Array, B: Array) -> Array:
-    """(M_s + B_siᵀB_si)⁻¹ (k, S, p, p) of V = M⁻¹ (S, p, p) and B (S, k, r, p) (Woodbury)."""
-    S, k, r, p = B.shape
-    BV = (B.reshape(S, k * r, p) @ V).reshape(B.shape)
-    K = np.eye(r) + BV @ B.swapaxes(-1, -2)
-    return np.asarray((V[:, None] - BV.swapaxes(-1, -2) @ np.linalg.solve(K, BV)).swapaxes(0, 1))
+    """(M + B_iᵀB_i)⁻¹ (k, p, p) of V = M⁻¹ (p, p) and B (k, r, p) (Woodbury)."""
+    BV = (B.reshape(-1, len(V)) @ V).reshape(B.shape)
+    K = np.eye(B.shape[1]) + BV @ B.swapaxes(-1, -2)
+    return np.asarray(V - BV.swapaxes(-1, -2) @ np.linalg.solve(K, BV))
 
 
 def rounded(
     problem: DesignProblem, weights: Array, rng: np.random.Generator | None = None
 ) -> IntArray:
-    """A plan (n,) of the largest relaxed weights (N,) of each group, each as often as it weighs;
-    with `rng` drawn in proportion to them (the largest log w + Gumbel noise)."""
-    whole = np.minimum(np.floor(weights), problem.most).astype(np.int64)
-    if problem.most == 1:
-        whole[:] = 0
-    left = problem.shares - np.bincount(problem.group, whole, minlength=len(problem.shares)).astype(
-        np.int64
-    )
-    score = np.log(np.maximum(weights - whole, 1e-9))
+    """A plan (n,) of the largest relaxed weights (N,) of each group; with `rng` drawn in proportion
+    to them (the largest log w + Gumbel noise)."""
+    score = np.log(np.maximum(weights, 1e-9))
     score = score if rng is None else score + rng.gumbel(size=len(weights))
-    plan = [np.repeat(np.arange(len(weights)), whole)]
-    while left.any():
-        more = best_of(np.where(whole < problem.most, score, -np.inf), problem.group, left)
-        whole[more] += 1
-        plan.append(more)
-        left = left - np.bincount(problem.group[more], minlength=len(left))
-    return np.sort(np.concatenate(plan))
+    return np.sort(best_of(score, problem.group, problem.shares))
 
 
 def random_plan(problem: DesignProblem, rng: np.random.Generator) -> IntArray:
-    """A plan (n,), sorted, drawn uniformly from the places that shares and repetitions leave."""
-    plan = [np.empty(0, dtype=np.int64)]
-    for label, share in enumerate(problem.shares):
-        places = np.repeat(np.flatnonzero(problem.group == label), problem.most)
-        plan.append(rng.choice(places, int(share), replace=False))
-    return np.sort(np.concatenate(plan))
+    """A plan (n,), sorted, drawn uniformly from those of the problem's shares."""
+    of_group = (np.flatnonzero(problem.group == label) for label in range(len(problem.shares)))
+    lots = zip(of_group, problem.shares.tolist(), strict=True)
+    return np.sort(np.concatenate([rng.choice(own, share, replace=False) for own, share in lots]))
 
 
 def random_information(problem: DesignProblem, seed: int, n: int = DRAWN) -> Array:
-    """M (n, S, p, p) of plans drawn uniformly from the candidates of `problem`, with its shares."""
+    """M (n, p, p) of plans drawn uniformly from the candidates of `problem`, with its shares."""
     rng = np.random.default_rng(np.random.SeedSequence(seed, spawn_key=(STREAM,)))
     return np.stack([problem.information(random_plan(problem, rng)) for _ in range(n)])
 
@@ -145,32 +136,27 @@ def fitted(problem: DesignProblem, plan: IntArray) -> IntArray:
         plan = np.delete(plan, out[np.argmin(values_without(problem, plan)[out])])
     while len(plan) < problem.n_poses:
         taken = np.bincount(problem.group[plan], minlength=L)
-        used = np.bincount(plan, minlength=problem.n_candidates)
-        free = np.flatnonzero((problem.shares > taken)[problem.group] & (used < problem.most))
+        lacking = np.flatnonzero(problem.shares > taken)
+        free = np.sort(np.concatenate([_free(problem, plan, g) for g in lacking]))
         V = inverse(problem.information(plan))
         _, C = problem.criterion.slope(V)
         near = free[np.argsort(-problem.prices(V @ C @ V)[free], kind="stable")[:LOOKS]]
-        phis = problem.criterion.of(with_poses(V, problem.blocks[:, near]))
+        phis = problem.criterion.value(with_poses(V, problem.blocks[near]))
         plan = np.sort(np.append(plan, near[phis.argmin()]))
     return plan
 
 
-def information_without(problem: DesignProblem, chosen: IntArray) -> Array:
-    """M (n, S, p, p) of the plan `chosen` (n,) without its k-th pose, for every k.
+def values_without(problem: DesignProblem, chosen: IntArray) -> Array:
+    """Φ (n,) of the plan `chosen` (n,) without its k-th pose; inf where nothing replaces it.
 
-    Sums of what comes before and after k: no subtraction, so that a pose that alone determines a
+    By sums of what comes before and after k: no subtraction, so that a pose that alone determines a
     parameter leaves an exactly singular M.
     """
-    each = problem.matrices(chosen).swapaxes(0, 1)
+    each = problem.matrices(chosen)
     before, after = np.zeros_like(each), np.zeros_like(each)
     before[1:] = np.cumsum(each[:-1], axis=0)
     after[:-1] = np.cumsum(each[:0:-1], axis=0)[::-1]
-    return np.asarray(problem.prior + before + after)
-
-
-def values_without(problem: DesignProblem, chosen: IntArray) -> Array:
-    """Φ (n,) of the plan `chosen` (n,) without its k-th pose; inf where nothing replaces it."""
-    return problem.criterion.value(information_without(problem, chosen))
+    return problem.criterion.of_information(problem.prior + before + after)
 
 
 # The best plan of several starts.
@@ -181,26 +167,8 @@ def prospects(problem: DesignProblem, gap: float = 1e-4, start: Array | None = N
     that has none that of D over all parameters, which bounds nothing."""
     if problem.criterion.certifiable:
         return relax(problem, gap, start)
-    p = problem.prior.shape[-1]
-    volume = Objective((DeterminantCriterion(np.eye(p)),) * len(problem.prior))
-    found = relax(replace(problem, criterion=volume), max(gap, 1e-3), start)
-    return replace(found, bound=0.0)
-
-
-def excluded(problem: DesignProblem, tangent: TangentBound, d: Array, value: float) -> BoolArray:
-    """(N,): no plan with Φ < `value` contains the candidate: the tangent with each group's least
-    price displaced by its own.
-
-    Harman & Pronzato (2007, Statistics & Probability Letters 77, 90–94) drop what no relaxed
-    optimum contains; against a known plan such an inequality drops what no better plan does.
-    """
-    reach, lost = float((tangent.G * problem.prior).sum()), np.full(len(d), np.inf)
-    for label in np.flatnonzero(problem.shares):
-        own = np.flatnonzero(problem.group == label)
-        top = np.sort(np.repeat(d[own], problem.most))[-problem.shares[label] :]
-        reach += float(top.sum())
-        lost[own] = np.maximum(top[0] - d[own], 0.0)
-    return (reach - lost) / tangent.value**2 <= (1 - LEAST) / value
+    volume = DeterminantCriterion(np.eye(len(problem.prior)))
+    return replace(relax(problem.judged_by(volume), max(gap, 1e-3), start), bound=0.0)
 
 
 def exact_plan(
@@ -217,30 +185,25 @@ def exact_plan(
     The first start is `warm`, a plan that may have other shares, or the rounded relaxation; others
     are roundings drawn at random.  Each is improved by exchange and by iterated local search
     (Lourenço, Martin & Stützle 2003) among the candidates near in price; the best at last by
-    exchange against all that a better plan may contain.
+    exchange against all.
     """
     rng, d = np.random.default_rng(seed), problem.prices(relaxed.tangent.G)
     shares = problem.shares
     sizes = np.minimum(NEAR_PER_POSE * shares, np.maximum(NEAR_PER_MANY * shares, NEAR_AT_LEAST))
     near = best_of(d, problem.group, sizes)
-    first = None if warm is None else fitted(problem, warm)
-    near = np.unique(np.append(near, rounded(problem, relaxed.weights)))
-    near = near if first is None else np.union1d(near, first)
+    first = rounded(problem, relaxed.weights)
+    near = np.union1d(near, first)
+    if warm is not None:
+        first = fitted(problem, warm)
+        near = np.union1d(near, first)
     some, weights = problem.restricted(near), relaxed.weights[near]
-    best, least = None, np.inf
-    for k in range(starts):
-        begun = rounded(some, weights, rng if k else None)
-        if not k and first is not None:
-            begun = np.searchsorted(near, first)
-        plan, value = _searched(some, begun, rng, patience)
-        if best is None or value < least:
-            best, least = near[plan], value
-    assert best is not None
-    left = np.arange(problem.n_candidates)
-    if problem.criterion.certifiable:
-        left = np.union1d(np.flatnonzero(~excluded(problem, relaxed.tangent, d, least)), best)
-    plan, value = exchange(problem.restricted(left), np.searchsorted(left, best))
-    return left[plan], value
+    plans = [
+        _searched(some, rounded(some, weights, rng) if k else np.searchsorted(near, first), rng,
+                  patience)
+        for k in range(starts)
+    ]  # fmt: skip
+    plan, _ = min(plans, key=lambda found: found[1])
+    return exchange(problem, near[plan])
 
 
 def _searched(
@@ -262,31 +225,19 @@ def _descended(problem: DesignProblem, plan: IntArray) -> tuple[IntArray, float]
     """Exchanges on the softened criterion first, where Φ has kinks: what lowers a maximum is shut
     out wherever two of its arguments are equal and each exchange raises one of them."""
     if problem.criterion.kinked:
-        smooth = _with(problem, problem.criterion.softened(SOFT))
-        plan, _ = exchange(smooth, plan, LOOKS)
-    looks = LOOKS if problem.criterion.certifiable else None
-    return exchange(problem, plan, looks)
-
-
-def _with(problem: DesignProblem, criterion: Objective) -> DesignProblem:
-    other = replace(problem, criterion=criterion)
-    other.__dict__["packed"] = problem.packed
-    return other
+        plan, _ = exchange(problem.judged_by(problem.criterion.softened(SOFT)), plan, LOOKS)
+    return exchange(problem, plan, LOOKS if problem.criterion.certifiable else None)
 
 
 def _changed(problem: DesignProblem, plan: IntArray, rng: np.random.Generator) -> IntArray:
     """The plan with some of its poses replaced by random ones of their groups."""
     new, n = plan.copy(), len(plan)
     for j in rng.choice(n, min(int(rng.integers(2, MOVED + 1)), n), replace=False):
-        used = np.bincount(np.delete(new, j), minlength=problem.n_candidates)
-        own = np.flatnonzero((problem.group == problem.group[new[j]]) & (used < problem.most))
-        new[j] = rng.choice(own)
+        new[j] = rng.choice(_free(problem, np.delete(new, j), problem.group[new[j]]))
     return np.sort(new)
 
 
 # How many poses: a curve of sizes, and the fewest that meet a target.
-
-ProblemOf = Callable[[int], DesignProblem]
 
 
 @dataclass(frozen=True)
@@ -298,122 +249,65 @@ class SizedPlan:
     value: float
     bound: float | None
 
-    @property
-    def n_poses(self) -> int:
-        return len(self.chosen)
-
 
 @dataclass(frozen=True)
-class SizeCurve:
-    """All sizes tried, ascending.
+class Sizes:
+    """Plans by number of poses, each begun from the next smaller one, and their relaxations.
 
-    `smallest`: the fewest poses with a plan found that meets the target, None if none does or no
-    target was given.  `excluded`: the certified bound excludes the target for every plan of so
-    many poses or fewer; with `smallest` − 1 = `excluded` the answer is proved on the pool.
+    `problem_of(n)` states the problem of n poses, on the same candidates for all n.  Where no
+    group's share falls with n, Φ does not rise with n.
     """
 
-    points: tuple[SizedPlan, ...]
-    smallest: int | None
-    excluded: int
-
-
-def size_curve(
-    problem_of: ProblemOf,
-    numbers: Iterable[int],
-    target: float | None = None,
-    *,
-    between: tuple[int, int] = (1, 100),
-    seed: int = 0,
-    progress: Progress = lambda message: None,
-) -> SizeCurve:
-    """The best plans found of the given `numbers` of poses, and the fewest with Φ ≤ `target`.
-
-    `problem_of(n)` states the problem of n poses, on the same candidates for all n.  The smaller
-    plan, extended, begins the larger one, so that where no group's share falls with n, Φ of the
-    points does not rise (O2 and O4, which more information may raise, excepted).  The bound falls
-    with n too; bisection finds the first n in `between` at which it allows the target.  From there
-    plans are sought with doubled steps, then between the last that failed and the first that met
-    it.
-
-    Raises InputError for no number and no target, an empty range, or a target that is not
-    positive; InsufficientDataError where no plan of one of `numbers` determines all parameters.
-    """
-    wanted = sorted(set(numbers))
-    require(bool(wanted) or target is not None, "a size curve needs numbers of poses or a target")
-    sizes = _Sizes(problem_of, seed, progress)
-    for n in wanted:
-        sizes.point(n)
-    if target is None:
-        return SizeCurve(sizes.points(), None, 0)
-    low, high = between
-    require(1 <= low <= high, f"no number of poses lies between {low} and {high}")
-    require(target > 0, f"the target must be positive, got {target}")
-    allowed = _first_with(lambda n: sizes.bound(n) <= target, low, high + 1)
-    _seek(sizes, target, allowed, high)
-    points = sizes.points()
-    smallest = min((p.n_poses for p in points if p.value <= target), default=None)
-    return SizeCurve(points, smallest, allowed - 1)
-
-
-def _seek(sizes: _Sizes, target: float, low: int, high: int) -> None:
-    """Plans until the fewest poses that meet the target, or `high`, are among them."""
-
-    def meets(n: int) -> bool:
-        try:
-            return sizes.point(n).value <= target
-        except InsufficientDataError:
-            if n == high:
-                raise
-            return False
-
-    n, step, failed = min(low, high), 1, low - 1
-    while not meets(n):
-        if n == high:
-            return
-        failed, n, step = n, min(n + step, high), 2 * step
-    _first_with(meets, failed + 1, n)
-
-
-def _first_with(holds: Callable[[int], bool], low: int, high: int) -> int:
-    """The smallest n in [low, high] where a monotone condition holds, taken to hold at high."""
-    while low < high:
-        middle = (low + high) // 2
-        if holds(middle):
-            high = middle
-        else:
-            low = middle + 1
-    return low
-
-
-@dataclass(frozen=True)
-class _Sizes:
-    """Plans and relaxations by number of poses, each begun from the next smaller one."""
-
-    problem_of: ProblemOf
-    seed: int
-    progress: Progress
+    problem_of: Callable[[int], DesignProblem]
+    seed: int = 0
+    progress: Progress = lambda message: None
     found: dict[int, SizedPlan] = field(default_factory=dict)
     relaxed: dict[int, Relaxed] = field(default_factory=dict)
 
-    def points(self) -> tuple[SizedPlan, ...]:
-        return tuple(self.found[n] for n in sorted(self.found))
+    def of(self, numbers: Iterable[int]) -> None:
+        """Raises InsufficientDataError where no plan of one of `numbers` determines everything."""
+        for n in sorted(numbers):
+            self.plan(n)
 
-    def bound(self, n: int) -> float:
-        """0 where there is none: it allows everything."""
-        problem = self.problem_of(n)
-        return self._relaxation(n, balanced(problem)[0]).bound
-
-    def point(self, n: int) -> SizedPlan:
+    def plan(self, n: int) -> SizedPlan:
+        """The best plan found of n poses."""
         if n not in self.found:
-            self._plan(n)
+            self._search(n)
             for larger in sorted(m for m in self.found if m > n):
                 # Found before a smaller one that turns out better: extend that one instead.
                 smaller = self.found[max(m for m in self.found if m < larger)]
                 if self.found[larger].value > smaller.value * (1 + LEAST):
-                    self._plan(larger)
+                    self._search(larger)
         return self.found[n]
 
-    def _plan(self, n: int) -> None:
+    def fewest(self, target: float, low: int, high: int) -> int | None:
+        """The fewest poses found in [low, high] with Φ ≤ `target`; None where none meet it.
+
+        The bound falls with n: plans are sought from the first n that it allows, with doubled
+        steps, then between the last that failed and the first that met the target.
+        """
+
+        def allows(n: int) -> bool:
+            return self._relaxation(n, balanced(self.problem_of(n))[0]).bound <= target
+
+        def meets(n: int) -> bool:
+            try:
+                return self.plan(n).value <= target
+            except InsufficientDataError:
+                if n == high:
+                    raise
+                return False
+
+        low = min(_first(allows, low, high + 1), high)
+        n, step = low, 1
+        while not meets(n):
+            if n == high:
+                return None
+            low, n, step = n + 1, min(n + step, high), 2 * step
+        _first(meets, low, n)
+        return min(m for m, plan in self.found.items() if plan.value <= target)
+
+    def _search(self, n: int) -> None:
         whole = self.problem_of(n)
         check_enough(whole)
         problem, _ = balanced(whole)
@@ -429,6 +323,7 @@ class _Sizes:
         self.progress(f"{n} poses: {value:.6g}{told}")
 
     def _relaxation(self, n: int, problem: DesignProblem) -> Relaxed:
+        """Of a criterion without a bound it is 0, which allows everything."""
         if n not in self.relaxed:
             near = min(self.relaxed, key=lambda m: abs(m - n), default=None)
             start = None if near is None else self.relaxed[near].weights
@@ -436,11 +331,16 @@ class _Sizes:
         return self.relaxed[n]
 
 
+def _first(holds: Callable[[int], bool], low: int, high: int) -> int:
+    """The smallest n in [low, high] where a monotone condition holds, taken to hold at high."""
+    return low + bisect_left(range(low, high), True, key=holds)
+
+
 def check_determined(problem: DesignProblem, value: float) -> None:
     """Raise InsufficientDataError where the best plan found leaves parameters open."""
     if not np.isfinite(value):
         raise InsufficientDataError(
             f"no plan of {problem.n_poses} poses that determines all "
-            f"{problem.prior.shape[-1]} parameters was found; plan more poses, other shares, or "
+            f"{len(problem.prior)} parameters was found; plan more poses, other shares, or "
             "state a prior"
         )

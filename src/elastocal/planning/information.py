@@ -5,6 +5,7 @@ from __future__ import annotations
 import re
 from collections.abc import Callable, Iterable
 from dataclasses import dataclass, replace
+from functools import cached_property
 
 import numpy as np
 from numpy.typing import NDArray
@@ -36,75 +37,43 @@ from elastocal.units import Array, BoolArray, IntArray
 # What a pose will be read as: its table rows, load states, and the covariance of its readings.
 
 Sight = Callable[[Array, Array], BoolArray]  # joints (N, n), force (3,) → (N, markers): seen?
-ALL_LOADS = -1  # a candidate measured in every load state
 NO_FORCE = 1e-9  # N
 NEVER = 1e9  # m (rad): standard deviation of a reading that is not made
 
 
-@dataclass(frozen=True)
-class LoadStates:
-    """`forces` (L, 3) N, the states a plan measures; `chosen`: a pose is measured in one of them.
+def plan_forces(cell: Cell) -> Array:
+    """The forces (L, 3) N under each of which every pose of the cell's plan is read.
 
-    `seen` (L,) says which states give an observation of their own: for deflections the unloaded
-    state is only what is subtracted.
+    Without `[design] loads_N` poses are read unloaded; where deflections are observed the unloaded
+    state, which they are subtracted from, comes first.  Raises InputError for these without a load.
     """
-
-    forces: Array
-    chosen: bool
-    observed: NDArray[np.bool_]
-
-    def of(self, load: int) -> IntArray:
-        """The states in which a candidate with `load` is measured."""
-        return np.arange(len(self.forces)) if load == ALL_LOADS else np.array([load])
-
-
-def load_states(cell: Cell) -> LoadStates:
-    """The load states of the cell's plan.
-
-    Without `[design] loads_N` poses are measured unloaded.  Raises InputError where deflections
-    are to be observed without a load, or with a load chosen per pose.
-    """
-    spec = cell.design
-    forces = np.zeros((1, 3)) if spec.loads is None else np.asarray(spec.loads, dtype=float)
-    loaded = np.linalg.norm(forces, axis=1) > NO_FORCE
+    loads = cell.design.loads
+    forces = np.zeros((1, 3)) if loads is None else np.asarray(loads, dtype=float)
     if cell.model.observe != "deflection":
-        return LoadStates(forces, spec.load_choice and len(forces) > 1, np.ones(len(forces), bool))
+        return forces
+    loaded = np.linalg.norm(forces, axis=1) > NO_FORCE
     require(
         bool(loaded.any()),
         f'{cell.path or cell.name}: observe = "deflection" needs a load; state it as in '
         "[design] loads_N = [[0, 0, -2600]]",
     )
-    require(
-        not spec.load_choice,
-        f"{cell.path or cell.name}: [design] load_choice has no meaning where deflections are "
-        "observed: every pose is measured unloaded and loaded; drop it",
-    )
-    forces = np.vstack([np.zeros((1, 3)), forces[loaded]])
-    return LoadStates(forces, False, np.arange(len(forces)) > 0)
+    return np.vstack([np.zeros((1, 3)), forces[loaded]])
 
 
-def rows_of(
-    q: Array, load: IntArray, states: LoadStates, marker_names: tuple[str, ...]
-) -> Measurements:
-    """Table rows of candidates: for each pose, each of its load states, each marker.
-
-    q (N, n); load (N,) as in LoadStates.of, all of the candidates ALL_LOADS or none.
-    """
-    n, markers = len(q), len(marker_names)
-    each = len(states.forces) if n and load[0] == ALL_LOADS else 1
-    state = np.tile(np.arange(each), n) if each > 1 else np.where(load < 0, 0, load)
-    pose = np.repeat(np.arange(n), each * markers)
-    count = len(pose)
+def rows_of(q: Array, forces: Array, marker_names: tuple[str, ...]) -> Measurements:
+    """Table rows of poses q (N, n): for each of them, each of the forces (L, 3), each marker."""
+    n, L, markers = len(q), len(forces), len(marker_names)
+    pose = np.repeat(np.arange(n), L * markers)
     return Measurements(
         source="plan",
         row=pose + 2,
         q=q[pose],
         configuration=pose,
         configuration_labels=tuple(map(str, range(1, n + 1))),
-        repeat=np.zeros(count, dtype=np.int64),
-        marker=np.tile(np.arange(markers), n * each),
+        repeat=np.zeros(len(pose), dtype=np.int64),
+        marker=np.tile(np.arange(markers), n * L),
         marker_names=marker_names,
-        force=states.forces[np.repeat(state, markers)],
+        force=forces[np.tile(np.repeat(np.arange(L), markers), n)],
     )
 
 
@@ -154,16 +123,14 @@ def _told(cell: Cell, readings: int, size: int) -> float:
     return 1.0 if dof is None else kept_of(dof, readings * size, size).variance
 
 
-def pose_covariance(
-    model: Model, observed: Observations, n_poses: int, states: LoadStates, x: Array | None = None
-) -> Array:
+def pose_covariance(model: Model, observed: Observations, n_poses: int, x: Array) -> Array:
     """Covariance (N, r, r) of a pose's observations, means of `[design] repeats` readings each.
 
     Σ = T Σ_rows Tᵀ / repeats + τ² per load state and direction + J diag(s²) Jᵀ: deflections share
     their unloaded reading; what the arm does not repeat, τ of `[design] repeatability_um` and s of
     the joints of `[noise]`, is common to the markers of a visit.  A pose that is approached from
     both sides is visited twice, but what its readings share by `[noise]` remains; deflections do
-    not have that.  `x` (parameters,): where J is taken.
+    not have that.  J is that of the arm x (parameters,).
     """
     spec = model.cell.design
     visits = 2 if spec.motion.both_directions else 1
@@ -183,7 +150,7 @@ def pose_covariance(
         moved = np.diag(np.arange(size) < 3).astype(float)
         covariance = covariance + spec.repeatability**2 * np.kron(same, moved)
     if model.cell.noise.joints.any():
-        settling = settling_joints(model, observed, model.nominal if x is None else x)
+        settling = settling_joints(model, observed, x)
         members = np.arange(len(observed.lead)).reshape(n_poses, -1)
         loading = settling.packed(members)
         covariance = covariance + loading @ loading.transpose(0, 2, 1)
@@ -208,7 +175,7 @@ def readings_each(cell: Cell) -> int:
     return cell.design.repeats * (2 if cell.design.motion.both_directions else 1)
 
 
-# From the symbolic model to information: whitened B of any pose, under scenarios of the arm.
+# From the symbolic model to information: whitened B of any pose.
 
 CHUNK_NUMBERS = 4_000_000  # numbers of a chunk's regressor held at once
 
@@ -217,88 +184,69 @@ CHUNK_NUMBERS = 4_000_000  # numbers of a chunk's regressor held at once
 class PoseInformation:
     """B of poses, whitened by their noise and scaled by the sizes of the parameters.
 
-    `scenarios` (S, parameters): parameter values at which the arm is linearised; `columns` (p,)
-    the parameters to be estimated, `sizes` (p,) what one unit of a scaled parameter is.
-    `sight`: which markers are seen, None for all of them; a reading that is not made counts as
-    one that shows nothing.
+    `x` (parameters,): values at which the arm is linearised; `columns` (p,) the parameters to be
+    estimated, `sizes` (p,) what one unit of a scaled parameter is.  `sight`: which markers are
+    seen, None for all of them; a reading that is not made counts as one that shows nothing.
     """
 
     model: Model
-    states: LoadStates
-    scenarios: Array
+    x: Array
     columns: IntArray
     sizes: Array
     sight: Sight | None = None
+
+    @cached_property
+    def forces(self) -> Array:
+        """The load states (L, 3) N in which each pose is read."""
+        return plan_forces(self.model.cell)
 
     @property
     def names(self) -> tuple[str, ...]:
         return tuple(self.model.names[c] for c in self.columns)
 
-    def blocks(self, q: Array, load: IntArray) -> Array:
-        """Whitened, scaled B (S, N, r, p) of poses q (N, n) in load states `load` (N,).
+    def blocks(self, q: Array) -> Array:
+        """Whitened, scaled B (N, r, p) of poses q (N, n).
 
         r counts the components of all markers and load states of a pose; W_i B_i with
         W_iᵀ W_i = Σ_i⁻¹ gives a pose's information B_iᵀ Σ_i⁻¹ B_i.  Raises ElastocalError where
         a pose has no static equilibrium.
         """
-        per_pose = len(self.model.cell.tool.markers) * len(self.states.forces)
+        per_pose = len(self.model.cell.tool.markers) * len(self.forces)
         size = max(CHUNK_NUMBERS // (per_pose * 6 * max(len(self.columns), 20)), 1)
-        found = [
-            np.stack(
-                [self._whitened(q[a : a + size], load[a : a + size], x) for x in self.scenarios]
-            )
-            for a in range(0, len(q), size)
-        ]
-        return np.concatenate(found, axis=1)
+        found = []
+        for k in range(0, len(q), size):
+            observed, factor = self.noise(part := q[k : k + size])
+            at = self.model.regressor(observed.table, self.x, self.columns, observed)
+            B = at.B.reshape(len(part), -1, len(self.columns)) * self.sizes
+            found.append(np.linalg.solve(factor, B))
+        return np.concatenate(found)
 
-    def rows(self, q: Array, load: IntArray, x: Array) -> Measurements:
-        """The table of these poses as the arm x would be read, without noise."""
-        markers = tuple(self.model.cell.tool.markers)
-        table = simulate(self.model, rows_of(q, load, self.states, markers), x, 0, noise=False)
+    def rows(self, q: Array) -> Measurements:
+        """The table of these poses as the arm would be read, without noise."""
+        table = rows_of(q, self.forces, tuple(self.model.cell.tool.markers))
+        table = simulate(self.model, table, self.x, 0, noise=False)
         return marker_sigmas(self.model.cell, table)
 
-    def _whitened(self, q: Array, load: IntArray, x: Array) -> Array:
-        observed, factor = self.noise(q, load, x)
-        at = self.model.regressor(observed.table, x, self.columns, observed)
-        B = at.B.reshape(len(q), -1, len(self.columns)) * self.sizes
-        return np.asarray(np.linalg.solve(factor, B), dtype=np.float64)
-
-    def whiteners(self, q: Array, load: IntArray) -> Array:
-        """W (S, N, r, r) of poses q (N, n): W B is a block before scaling."""
-        return np.stack([np.linalg.inv(self.noise(q, load, x)[1]) for x in self.scenarios])
-
-    def seen(self, q: Array, load: IntArray) -> BoolArray:
-        """(N, L, markers): which markers are seen of poses q (N, n) in each load state; True in
-        those in which a pose is not measured."""
-        markers, forces = len(self.model.cell.tool.markers), self.states.forces
-        found = np.ones((len(q), len(forces), markers), dtype=bool)
-        if self.sight is None:
-            return found
-        for state, force in enumerate(forces):
-            rows = np.flatnonzero((load == ALL_LOADS) | (load == state))
-            found[rows, state] = self.sight(q[rows], force)
-        if not self.states.observed.all():  # a difference takes both of its readings
+    def seen(self, q: Array) -> BoolArray:
+        """(N, L, markers): which markers are seen of poses q (N, n) in each load state."""
+        found = np.ones((len(q), len(self.forces), len(self.model.cell.tool.markers)), dtype=bool)
+        if self.sight is not None:
+            found = np.stack([self.sight(q, force) for force in self.forces], axis=1)
+        if self.model.cell.model.observe == "deflection":  # a difference takes both its readings
             found &= found.all(axis=1, keepdims=True)
         return found
 
-    def _unread(self, q: Array, load: IntArray, covariance: Array, size: int) -> Array:
-        """The covariance (N, r, r) with that of NEVER in place of what is not seen."""
-        seen = self.seen(q, load)
-        if load[0] != ALL_LOADS:
-            seen = seen[np.arange(len(q)), load][:, None]
-        each = covariance.shape[1] // (size * seen.shape[2])  # load states that are observed
-        read = np.repeat(seen[:, -each:].reshape(len(q), -1), size, axis=1)
-        alone = np.einsum("nr,rs->nrs", ~read * NEVER**2, np.eye(read.shape[1]))
-        return np.asarray(covariance * (read[:, :, None] & read[:, None]) + alone)
-
-    def noise(self, q: Array, load: IntArray, x: Array | None = None) -> tuple[Observations, Array]:
-        """What is read at the poses of the arm x, by default the one known best, and the Cholesky
-        factors (N, r, r) of its covariance."""
-        x = self.scenarios[0] if x is None else x
-        observed = observe(self.rows(q, load, x), self.model.observe)
-        covariance = pose_covariance(self.model, observed, len(q), self.states, x)
+    def noise(self, q: Array) -> tuple[Observations, Array]:
+        """What is read at the poses q (N, n), and the Cholesky factors (N, r, r) of its covariance,
+        that of NEVER in place of what is not seen."""
+        observed = observe(self.rows(q), self.model.observe)
+        covariance = pose_covariance(self.model, observed, len(q), self.x)
         if self.sight is not None:
-            covariance = self._unread(q, load, covariance, observed.size)
+            seen, size = self.seen(q), observed.size
+            states = covariance.shape[1] // (size * seen.shape[2])  # that are observed
+            read = np.repeat(seen[:, -states:].reshape(len(q), -1), size, axis=1)
+            never = np.einsum("nr,rs->nrs", ~read * NEVER**2, np.eye(read.shape[1]))
+            covariance = covariance * (read[:, :, None] & read[:, None]) + never
         return observed, np.asarray(np.linalg.cholesky(covariance), dtype=np.float64)
 
 
@@ -326,18 +274,16 @@ class Estimable:
         return self.reduction.kept
 
 
-def typical_sizes(information: PoseInformation, q: Array, load: IntArray) -> Array:
+def typical_sizes(information: PoseInformation, q: Array) -> Array:
     """Typical deviation (parameters,) of each parameter, as identification takes them."""
-    model, x = information.model, information.scenarios[0]
-    some = _sample(model, q, load)
-    table = information.rows(q[some], load[some], x)
-    return model.sizes(model.regressor(table, x, None, observe(table, model.observe)).B)
+    model, table = information.model, information.rows(q[_sample(information.model, q)])
+    at = model.regressor(table, information.x, None, observe(table, model.observe))
+    return model.sizes(at.B)
 
 
 def estimable(
     information: PoseInformation,
     q: Array,
-    load: IntArray,
     free: IntArray,
     prior: Array,
     n_poses: int,
@@ -351,12 +297,10 @@ def estimable(
     Raises InsufficientDataError where no pose shows anything.
     """
     model = information.model
-    some = _sample(model, q, load)
-    first = replace(information, scenarios=information.scenarios[:1])
-    blocks = first.blocks(q[some], load[some])[0]
-    columns = np.searchsorted(information.columns, free)
+    blocks = information.blocks(q[_sample(model, q)])
     B = np.zeros((blocks.shape[0] * blocks.shape[1], len(prior)))
-    B[:, free] = blocks.reshape(len(B), -1)[:, columns] * np.sqrt(n_poses / len(some))
+    own = np.searchsorted(information.columns, free)
+    B[:, free] = blocks.reshape(len(B), -1)[:, own] * np.sqrt(n_poses / len(blocks))
     return minimal_set(model, B, free, information.sizes, prior, stated)
 
 
@@ -450,15 +394,14 @@ def why(model: Model, found: Estimable, index: int) -> str:
     return f"{name} is held; drop it from {option('fixed')}"
 
 
-def _sample(model: Model, q: Array, load: IntArray) -> IntArray:
-    """Indices of about SAMPLE poses, equally many of each level and load state where there are."""
+def _sample(model: Model, q: Array) -> IntArray:
+    """Indices of about SAMPLE poses, equally many of each level where there are some."""
     cell = model.cell
     held = [joint_index(cell, model.chain, name, "[design.levels]") for name in cell.design.levels]
-    kinds, kind = np.unique(np.column_stack([q[:, held], load]), axis=0, return_inverse=True)
+    kinds, kind = np.unique(q[:, held], axis=0, return_inverse=True)
     each = -(-SAMPLE // len(kinds))
     members = [np.flatnonzero(kind.ravel() == k) for k in range(len(kinds))]
-    found = [own[:: -(-len(own) // each)] for own in members]
-    return np.sort(np.concatenate(found))
+    return np.sort(np.concatenate([own[:: -(-len(own) // each)] for own in members]))
 
 
 # Measurements already done: what they tell, so that a plan adds what they lack.

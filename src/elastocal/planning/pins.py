@@ -15,22 +15,19 @@ from elastocal.model.chain import Chain, joint_index
 from elastocal.model.manipulator import Model
 from elastocal.planning.candidates import LEVEL_SLACK
 from elastocal.planning.feasibility import Feasibility, Struck
-from elastocal.planning.information import ALL_LOADS, LoadStates
+from elastocal.planning.information import plan_forces
 from elastocal.planning.setup import shares_of
 from elastocal.text import did_you_mean, listed, quoted
 from elastocal.units import Array, IntArray
 
-SAME_FORCE = 1e-3  # N
-
 
 @dataclass(frozen=True)
 class Pins:
-    """Poses that stay, `names` (k,), `q` (k, n) and `force` (k, 3) N; those `struck` (m, n), near
-    which no other comes.  `taken`: all names that these plans have."""
+    """Poses that stay, `names` (k,) and `q` (k, n); those `struck` (m, n), near which no other may
+    come.  `taken`: all names that these plans have."""
 
     names: tuple[str, ...]
     q: Array
-    force: Array
     struck: Array
     taken: tuple[str, ...]
 
@@ -63,40 +60,28 @@ class Pins:
             clash = [name for name in kept if name in names]
             require(not clash, f"{table.source}: pose {listed(clash)} is to be kept twice")
             names += kept
-            rows += [(table.q[own[n]], table.force[own[n]]) for n in kept]
+            rows += [table.q[own[n]] for n in kept]
             taken |= dict.fromkeys(own)
         if not rows and not struck:
             return None
-        n = len((struck or [rows[0][0]])[0])
-        return cls(
-            tuple(names),
-            np.array([q for q, _ in rows]).reshape(-1, n),
-            np.array([force for _, force in rows]).reshape(-1, 3),
-            np.array(struck).reshape(-1, n),
-            tuple(taken),
-        )
+        n = len((struck or rows)[0])
+        kept_at, struck_at = (np.array(lot).reshape(-1, n) for lot in (rows, struck))
+        return cls(tuple(names), kept_at, struck_at, tuple(taken))
 
-    def placed(
-        self, cell: Cell, chain: Chain, states: LoadStates, rules: Feasibility
-    ) -> tuple[IntArray, IntArray]:
-        """Load state and level (k,) of the poses that stay.
+    def placed(self, cell: Cell, chain: Chain, rules: Feasibility) -> IntArray:
+        """The level (k,) of each pose that stays.
 
-        Raises InputError where one is under no load of the cell or at no level, or breaks a rule.
+        Raises InputError where one is at no level of the cell, or breaks a rule.
         """
-        load = np.full(len(self.q), ALL_LOADS)
         group = np.zeros(len(self.q), dtype=np.int64)
-        for k, (label, q, force) in enumerate(zip(self.names, self.q, self.force, strict=True)):
+        for k, (label, q) in enumerate(zip(self.names, self.q, strict=True)):
             where = f"{cell.path or cell.name}: pose {quoted(label)}, which is to be kept,"
-            if states.chosen:
-                off = np.abs(states.forces - force).max(axis=1)
-                load[k] = int(off.argmin())
-                require(off.min() < SAME_FORCE, f"{where} has a force that [design] loads_N lacks")
             for joint, levels in cell.design.levels.items():
                 away = np.abs(np.array(levels) - q[joint_index(cell, chain, joint, "levels")])
                 group[k] = int(away.argmin())
                 require(away.min() < LEVEL_SLACK, f"{where} is at no level of {joint}")
-            for state in states.of(int(load[k])):
-                verdict = rules.check(q, states.forces[state])
+            for force in plan_forces(cell):
+                verdict = rules.check(q, force)
                 # That it stands near one struck out is the user's choice.
                 rules_of = zip(verdict.rules, verdict.broken[0], strict=True)
                 broken = [name for name, hit in rules_of if hit and name != Struck.name]
@@ -105,7 +90,7 @@ class Pins:
                         f"{where} breaks {broken[0]}; strike it ({option('strike')}), or relax the "
                         "rule in the cell"
                     )
-        return load, group
+        return group
 
 
 def read_pins(

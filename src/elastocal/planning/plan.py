@@ -17,7 +17,7 @@ from elastocal.files import atomic_write_text
 from elastocal.measurements import DEFAULT_MARKER, Measurements, families
 from elastocal.model.manipulator import Model
 from elastocal.planning.choices import Chosen
-from elastocal.planning.criterion import Objective
+from elastocal.planning.criterion import ScenarioCriterion
 from elastocal.planning.execution import Execution, Stop
 from elastocal.planning.information import Estimable
 from elastocal.tables import column, csv_text
@@ -346,7 +346,7 @@ class Chance:
     efficiency: float | None
 
     @classmethod
-    def of(cls, values: Array, value: float, criterion: Objective) -> Chance:
+    def of(cls, values: Array, value: float, criterion: ScenarioCriterion) -> Chance:
         """What random plans of Φ = `values` (n,), ascending, are beside a plan of Φ = `value`."""
         phi = (float(np.median(values)), float(values[0]), float(values[-1]))
         median, best, worst = (criterion.reported(v)[0] if np.isfinite(v) else None for v in phi)
@@ -507,8 +507,7 @@ class Plan(Result):
         criterion: What was made small; `value` is it as the search has it (Φ), `reported` as people
             know it, in `unit`.
         q: Commanded joints (N, joints), in rad or m.
-        load: (N,), each pose's load state, an index into `forces`; −1 for all of them.
-        forces: Load states (L, 3), in N.
+        forces: Load states (L, 3), in N, in each of which all poses are read.
         group: (N,), the level of each pose, an index into `levels` of the joint `level_joint`.
         execution: The order of execution, with the points in between.
         candidates: How many poses were tried, and which rule removed how many.
@@ -550,7 +549,6 @@ class Plan(Result):
     reported: float
     unit: str
     q: Array
-    load: IntArray
     forces: Array
     group: IntArray
     levels: tuple[float, ...]
@@ -649,7 +647,7 @@ class Plan(Result):
         again = any(stop.again for stop in self.execution.stops)
         alike = self.seen is None or bool((self.seen == self.seen[:, :1]).all())
         again |= self.scheduled is not None or self.execution.stops[0].time is not None
-        every = usual and alike and (self.load < 0).all() and not again
+        every = usual and alike and not again
         return None if every else self.forces
 
     def to_json(self) -> dict[str, Any]:

@@ -5,7 +5,7 @@ first derivatives until none of them gains (column generation).  With the tangen
 
     Φ(w') ≥ Φ² / (⟨G, prior⟩ + max_w' Σ w'_i d_i),        d_i = ⟨G, B_iᵀB_i⟩
 
-for all weights 0 ≤ w'_i ≤ most with Σ_{i∈l} w'_i = n_l, exact plans among them; the maximum is
+for all weights 0 ≤ w'_i ≤ 1 with Σ_{i∈l} w'_i = n_l, exact plans among them; the maximum is
 taken greedily.  Sources: Pukelsheim, Optimal Design of Experiments (2006), ch. 5 and 7; Harman,
 Filová & Richtárik, J. Am. Stat. Assoc. 115 (2020) 348.
 """
@@ -18,8 +18,8 @@ from functools import cached_property, lru_cache
 import numpy as np
 
 from elastocal.errors import InsufficientDataError, require
-from elastocal.planning.criterion import Objective, TangentBound, covariance, inverse
-from elastocal.units import Array, BoolArray, IntArray, Progress
+from elastocal.planning.criterion import ScenarioCriterion, TangentBound, covariance, inverse
+from elastocal.units import Array, BoolArray, IntArray
 
 # Packed information larger than this (bytes) is not stored; pricing then goes through the blocks.
 PACKED_BYTES = 1_500_000_000
@@ -31,35 +31,21 @@ RIDGE = 1e-9
 
 @dataclass(frozen=True)
 class DesignProblem:
-    """Choose shares[l] of the candidates of each group l so that Φ(M) is smallest.
+    """Choose shares[l] of the candidates of each group l, each at most once, with the least Φ(M).
 
-    `blocks` (S, N, r, p): whitened, scaled B of candidate i under scenario s of the arm;
-    M_s(w) = prior_s + Σ_i w_i B_siᵀ B_si with `prior` (S, p, p) from prior knowledge and from
-    measurements already done.  `group` (N,) in 0 … L−1 and `shares` (L,) the numbers of poses.
-    `most`: how often one candidate may be measured in a plan.
+    `blocks` (N, r, p): whitened, scaled B of each candidate; M(w) = prior + Σ_i w_i B_iᵀB_i with
+    `prior` (p, p) from what is known and measured already.  `group` (N,) in 0 … L−1, `shares` (L,).
     """
 
     blocks: Array
     prior: Array
     group: IntArray
     shares: IntArray
-    criterion: Objective
-    most: int = 1
-
-    def __post_init__(self) -> None:
-        S, N, _, p = self.blocks.shape
-        require(self.prior.shape == (S, p, p), f"prior is {self.prior.shape}, not {(S, p, p)}")
-        require(self.group.shape == (N,), f"group is {self.group.shape}, not {(N,)}")
-        available = np.bincount(self.group, minlength=len(self.shares)) * self.most
-        short = np.flatnonzero(available < self.shares)
-        require(
-            len(short) == 0,
-            f"group {short[0] if len(short) else 0} has fewer candidates than its share",
-        )
+    criterion: ScenarioCriterion
 
     @property
     def n_candidates(self) -> int:
-        return int(self.blocks.shape[1])
+        return len(self.blocks)
 
     @property
     def n_poses(self) -> int:
@@ -67,48 +53,46 @@ class DesignProblem:
 
     @cached_property
     def packed(self) -> Array | None:
-        """A_si = B_siᵀB_si as its upper triangle, √2 off the diagonal (S, N, p(p+1)/2), so that
-        ⟨G, A_si⟩ is a product of rows; None where that takes too much memory."""
-        S, N, _, p = self.blocks.shape
+        """B_iᵀB_i as its upper triangle, √2 off the diagonal (N, p(p+1)/2), so that ⟨G, B_iᵀB_i⟩
+        is a product of rows; None where that takes too much memory."""
+        N, _, p = self.blocks.shape
         rows, columns, factor = triangle(p)
-        if 8 * S * N * len(rows) > PACKED_BYTES:
+        if 8 * N * len(rows) > PACKED_BYTES:
             return None
-        found = np.empty((S, N, len(rows)))
+        found = np.empty((N, len(rows)))
         for k in range(0, N, BATCH):
             A = self.matrices(np.arange(k, min(k + BATCH, N)))
-            found[:, k : k + BATCH] = A[..., rows, columns] * factor
+            found[k : k + BATCH] = A[:, rows, columns] * factor
         return found
 
     def matrices(self, chosen: IntArray) -> Array:
-        """A (S, k, p, p), B_siᵀB_si of the candidates `chosen` (k,)."""
-        B = self.blocks[:, chosen]
+        """B_iᵀB_i (k, p, p) of the candidates `chosen` (k,)."""
+        B = self.blocks[chosen]
         return np.asarray(B.swapaxes(-1, -2) @ B)
 
     def prices(self, G: Array) -> Array:
-        """d (N,): d_i = Σ_s tr(B_si G_s B_siᵀ) = −∂Φ/∂w_i for G (S, p, p)."""
+        """d (N,): d_i = tr(B_i G B_iᵀ) = −∂Φ/∂w_i for G (p, p)."""
         if self.packed is None:
             return block_prices(self.blocks, G)
-        rows, columns, factor = triangle(G.shape[-1])
-        flat = G[:, rows, columns] * factor
-        return np.asarray((self.packed @ flat[:, :, None])[..., 0].sum(axis=0))
+        rows, columns, factor = triangle(len(G))
+        return np.asarray(self.packed @ (G[rows, columns] * factor))
 
     def information(self, chosen: IntArray, weights: Array | None = None) -> Array:
-        """M (S, p, p) of the candidates `chosen` (k,), each once or with `weights` (k,)."""
-        B = self.blocks[:, chosen]
+        """M (p, p) of the candidates `chosen` (k,), each once or with `weights` (k,)."""
+        B = self.blocks[chosen]
         if weights is not None:
             B = B * np.sqrt(weights)[:, None, None]
-        B = B.reshape(len(B), -1, B.shape[-1])
-        return np.asarray(self.prior + B.swapaxes(1, 2) @ B)
+        B = B.reshape(-1, B.shape[-1])
+        return np.asarray(self.prior + B.T @ B)
 
     def at(self, weights: Array) -> Array:
-        """M (S, p, p) at weights w (N,)."""
+        """M (p, p) at weights w (N,)."""
         used = np.flatnonzero(weights)
         if self.packed is None or 4 * len(used) < len(weights):
             return self.information(used, weights[used])
-        p = self.blocks.shape[-1]
-        rows, columns, factor = triangle(p)
-        M = np.empty((len(self.packed), p, p))
-        M[:, rows, columns] = M[:, columns, rows] = weights @ self.packed / factor
+        rows, columns, factor = triangle(len(self.prior))
+        M = np.empty_like(self.prior)
+        M[rows, columns] = M[columns, rows] = weights @ self.packed / factor
         return self.prior + M
 
     def even(self) -> Array:
@@ -118,19 +102,25 @@ class DesignProblem:
 
     def value(self, chosen: IntArray) -> float:
         """Φ of a plan; inf where it leaves parameters open."""
-        return float(self.criterion.value(self.information(chosen)))
+        return float(self.criterion.of_information(self.information(chosen)))
 
     def restricted(self, kept: IntArray) -> DesignProblem:
         """With the candidates `kept` (k,) alone."""
-        part = replace(self, blocks=self.blocks[:, kept], group=self.group[kept])
+        part = replace(self, blocks=self.blocks[kept], group=self.group[kept])
         if "packed" in self.__dict__ and self.packed is not None:
-            part.__dict__["packed"] = self.packed[:, kept]
+            part.__dict__["packed"] = self.packed[kept]
         return part
+
+    def judged_by(self, criterion: ScenarioCriterion) -> DesignProblem:
+        """The same choice by another criterion."""
+        other = replace(self, criterion=criterion)
+        other.__dict__["packed"] = self.packed
+        return other
 
 
 def block_prices(blocks: Array, G: Array) -> Array:
-    """⟨G, B_iᵀB_i⟩ (N,), summed over scenarios, of blocks (S, N, r, p) and G (S, p, p)."""
-    return np.asarray(((blocks @ G[:, None]) * blocks).sum(axis=(0, 2, 3)))
+    """⟨G, B_iᵀB_i⟩ (N,) of blocks (N, r, p) and G (p, p)."""
+    return np.asarray(((blocks @ G) * blocks).sum(axis=(1, 2)))
 
 
 @lru_cache
@@ -141,54 +131,52 @@ def triangle(p: int) -> tuple[IntArray, IntArray, Array]:
 
 
 def balancing(problem: DesignProblem) -> Array:
-    """T (S, p, p): parameters z, y = T z, whose information at even weights is 1.
+    """T (p, p): parameters z, y = T z, whose information at even weights is 1.
 
     Where base, markers and geometry are identified together, information is conditioned so badly
     that an update of Φ by one pose would keep no digits otherwise.  Raises InsufficientDataError
     where all candidates together leave something open, as then every plan does.
     """
     M = problem.at(problem.even())
-    size = np.sqrt(np.maximum(np.diagonal(M, axis1=1, axis2=2), 0.0))
+    size = np.sqrt(np.maximum(np.diagonal(M), 0.0))
     scale = 1 / np.where(size > 0, size, 1.0)
-    ok = covariance(M)[1]
-    if not ok.all():
+    if not covariance(M)[1]:
         n = int(np.count_nonzero(problem.shares[problem.group]))
         raise InsufficientDataError(
             f"all {n} candidates of the groups with a share together do not determine the "
-            f"{M.shape[-1]} parameters; allow other joint levels or more load, switch effects off, "
+            f"{len(M)} parameters; allow other joint levels or more load, switch effects off, "
             "or add prior knowledge"
         )
-    L: Array = np.asarray(np.linalg.cholesky(M * scale[:, :, None] * scale[:, None, :]))
-    root = inverse(L)
-    return np.asarray(scale[:, :, None] * root.swapaxes(1, 2))
+    L: Array = np.asarray(np.linalg.cholesky(M * scale[:, None] * scale))
+    return np.asarray(scale[:, None] * inverse(L).T)
 
 
 def in_terms(problem: DesignProblem, T: Array, ridge: float = 0.0) -> DesignProblem:
-    """The problem of the parameters z, y = T_s z, T (S, p, k), `ridge` · 1 known before.
+    """The problem of the parameters z, y = T z, T (p, k), `ridge` · 1 known before.
 
     Where k < p, what T leaves out is taken for known: no plan has a larger Φ than before.
     """
-    prior = T.swapaxes(-1, -2) @ problem.prior @ T
+    prior = T.T @ problem.prior @ T
     return replace(
         problem,
-        blocks=problem.blocks @ T[:, None],
-        prior=(prior + prior.swapaxes(-1, -2)) / 2 + ridge * np.eye(T.shape[-1]),
+        blocks=problem.blocks @ T,
+        prior=(prior + prior.T) / 2 + ridge * np.eye(T.shape[-1]),
         criterion=problem.criterion.turned(T),
     )
 
 
 def balanced(problem: DesignProblem) -> tuple[DesignProblem, Array]:
-    """The problem of balanced parameters, in which all searches work, and T (S, p, p)."""
+    """The problem of balanced parameters, in which all searches work, and T (p, p)."""
     T = balancing(problem)
     return in_terms(problem, T, RIDGE), T
 
 
 def check_enough(problem: DesignProblem) -> None:
     """Raise InsufficientDataError where no plan of these shares can determine all parameters."""
-    _, _, r, p = problem.blocks.shape
+    _, r, p = problem.blocks.shape
     n = problem.n_poses
     # How many combinations of parameters the prior determines.
-    known = min(int(np.linalg.matrix_rank(prior, hermitian=True)) for prior in problem.prior)
+    known = int(np.linalg.matrix_rank(problem.prior, hermitian=True))
     needed = -(-(p - known) // r)
     if n < needed:
         prior = f" and the prior {known}" if known else ""
@@ -198,19 +186,15 @@ def check_enough(problem: DesignProblem) -> None:
         )
 
 
-def largest_sum(d: Array, group: IntArray, shares: IntArray, most: int) -> float:
-    """max Σ w_i d_i over 0 ≤ w_i ≤ most with Σ_{i∈l} w_i = shares[l]; d (N,), group (N,)."""
-    total = 0.0
-    for level in np.flatnonzero(shares):
-        full, rest = divmod(int(shares[level]), most)
-        best = np.sort(d[group == level])[::-1]
-        total += most * float(best[:full].sum()) + rest * float(best[full] if rest else 0.0)
-    return total
+def largest_sum(d: Array, group: IntArray, shares: IntArray) -> float:
+    """max Σ w_i d_i over 0 ≤ w_i ≤ 1 with Σ_{i∈l} w_i = shares[l]; d (N,), group (N,)."""
+    levels = np.flatnonzero(shares).tolist()
+    return float(sum(np.sort(d[group == level])[-shares[level] :].sum() for level in levels))
 
 
 def tangent_bound(problem: DesignProblem, tangent: TangentBound, d: Array) -> float:
     """No plan has a smaller Φ: by the tangent at any point and its prices `d` (N,)."""
-    reach = largest_sum(d, problem.group, problem.shares, problem.most)
+    reach = largest_sum(d, problem.group, problem.shares)
     return tangent.value**2 / (float((tangent.G * problem.prior).sum()) + reach)
 
 
@@ -235,8 +219,8 @@ NEGLIGIBLE = 1e-3  # of the largest weight, below which a candidate leaves the s
 class Relaxed:
     """Optimal weights (N,) of the relaxation, Φ = `value` there, and what is proved.
 
-    `bound`: no plan with these candidates, shares and repetitions has a smaller Φ.  `tangent`: the
-    (Φ, G) behind the bound, for prices off the pool.
+    `bound`: no plan with these candidates and shares has a smaller Φ.  `tangent`: the (Φ, G) behind
+    the bound, for prices off the pool.
     """
 
     weights: Array
@@ -250,13 +234,8 @@ class Relaxed:
         return max(1 - self.bound / self.value, 0.0)
 
 
-def relax(
-    problem: DesignProblem,
-    gap: float = GAP,
-    start: Array | None = None,
-    progress: Progress = lambda message: None,
-) -> Relaxed:
-    """Minimise Φ(prior + Σ w_i A_i) over 0 ≤ w_i ≤ most with Σ_{i∈l} w_i = shares[l].
+def relax(problem: DesignProblem, gap: float = GAP, start: Array | None = None) -> Relaxed:
+    """Minimise Φ(prior + Σ w_i A_i) over 0 ≤ w_i ≤ 1 with Σ_{i∈l} w_i = shares[l].
 
     The problem should be a `balanced` one.  `start` (N,) ≥ 0: weights near the optimum, as those of
     a smaller pool.  The result's gap may exceed `gap` where rounding forbids more; its bound holds
@@ -269,14 +248,14 @@ def relax(
         "with it by exchange alone, or take D, E or test_pose",
     )
     size = np.bincount(problem.group, minlength=len(problem.shares))
-    full = (size * problem.most == problem.shares)[problem.group]
+    full = (size == problem.shares)[problem.group]
     if full.any():
         return _around(problem, full, gap, start)
     weights, best = _first_weights(problem, start), None
-    least = problem.shares // problem.most + 2  # of a group: as its share takes, and a choice
+    least = problem.shares + 2  # of a group: as its share takes, and a choice
     sizes = np.where(
         problem.shares > 0,
-        -(-PER_PARAMETER * problem.prior.shape[-1] // np.count_nonzero(problem.shares)) + 2 * least,
+        -(-PER_PARAMETER * len(problem.prior) // np.count_nonzero(problem.shares)) + 2 * least,
         0,
     )
     support = best_of(weights, problem.group, sizes)
@@ -292,7 +271,6 @@ def relax(
             if best is not None and value > best.value:
                 weights, value = best.weights, best.value
             best = Relaxed(weights, value, max(bound, best.bound if best else 0.0), steepest)
-        progress(f"relaxation: within {best.gap:.1e} of the bound, {len(support)} candidates")
         if best.gap <= gap:
             break
         accuracy = min(accuracy, max(MASTER * best.gap, 0.3 * gap))
@@ -310,15 +288,14 @@ def relax(
 def _around(problem: DesignProblem, full: BoolArray, gap: float, start: Array | None) -> Relaxed:
     """Where shares take every candidate of a group, these count as known."""
     fixed, free = np.flatnonzero(full), np.flatnonzero(~full)
-    weights = np.where(full, float(problem.most), 0.0)
-    prior = problem.information(fixed, weights[fixed])
-    shares = problem.shares.copy()
+    weights, shares = full.astype(float), problem.shares.copy()
+    prior = problem.information(fixed)
     shares[np.unique(problem.group[fixed])] = 0
     if not shares.any():
-        tangent = problem.criterion.tangent(inverse(prior))
-        value = float(problem.criterion.of(inverse(prior)))
-        return Relaxed(weights, value, tangent_bound(problem, tangent, problem.prices(tangent.G)),
-                       tangent)  # fmt: skip
+        tangent = problem.criterion.tangent_at(inverse(prior))
+        value = float(problem.criterion.value(inverse(prior)))
+        bound = tangent_bound(problem, tangent, problem.prices(tangent.G))
+        return Relaxed(weights, value, bound, tangent)
     rest = replace(problem.restricted(free), prior=prior, shares=shares)
     found = relax(rest, gap, None if start is None else start[free])
     weights[free] = found.weights
@@ -335,7 +312,7 @@ def _first_weights(problem: DesignProblem, start: Array | None) -> Array:
     def mixed(w: Array) -> Array:
         total = np.bincount(problem.group, w, minlength=L)
         w = w * (problem.shares / np.where(total > 0, total, np.inf))[problem.group]
-        return EVEN * even + (1 - EVEN) * np.minimum(w, problem.most)
+        return EVEN * even + (1 - EVEN) * np.minimum(w, 1.0)
 
     w = even if start is None else mixed(start)
     criterion = problem.criterion.softened(1.0)  # on a kink these steps would swing
@@ -357,7 +334,7 @@ def best_of(score: Array, group: IntArray, counts: IntArray) -> IntArray:
 
 # Newton's method for a few hundred candidates, by a primal barrier:
 #
-#     minimise log Φ(M(w)) − s Σ_i [log w_i + log(u − w_i)],   E w = n,   s → 0
+#     minimise log Φ(M(w)) − s Σ_i [log w_i + log(1 − w_i)],   E w = n,   s → 0
 #
 # log Φ is convex since 1/Φ is concave; E (L, k) sums the weights of each group.  Kinks are softened
 # by a power mean whose order grows as s falls, so that what it hides is as small as the barrier's.
@@ -376,31 +353,25 @@ def newton(
 ) -> tuple[Array, TangentBound, float]:
     """Weights (k,) of the `support` whose log Φ is within `accuracy` of the least, the tangent that
     shows it, and Φ."""
-    u, k = float(problem.most), len(support)
-    A, group = problem.matrices(support), problem.group[support]
-    flat = A.reshape(len(A), k, -1)
+    k, A, group = len(support), problem.matrices(support), problem.group[support]
+    flat = A.reshape(k, -1)
     E = (group == np.flatnonzero(problem.shares)[:, None]).astype(float)
-    share = problem.shares[problem.shares > 0].astype(float)
-    w, s, best = _inside(w, E, share, u), None, None
+    w, s, best = _inside(w, E, problem.shares[problem.shares > 0].astype(float)), None, None
     criterion = problem.criterion.softened(4.0)
     centred = SETTLED if problem.criterion.kinked else CENTRED
 
-    def at(w: Array) -> tuple[Array, float, Array] | None:
-        M = problem.prior + np.einsum("k,skx->sx", w, flat).reshape(problem.prior.shape)
-        V = inverse(M)
-        phi, C = criterion.slope(V)
-        return (V, phi, C) if np.isfinite(phi) and phi > 0 else None
+    def at(w: Array) -> tuple[Array, float, Array]:
+        V = inverse(problem.prior + (w @ flat).reshape(problem.prior.shape))
+        return V, *criterion.slope(V)
 
     def merit(phi: float, w: Array, s: float) -> float:
-        return float(np.log(phi) - s * (np.log(w).sum() + np.log(u - w).sum()))
+        return float(np.log(phi) - s * (np.log(w).sum() + np.log(1 - w).sum()))
 
     here = at(w)
-    assert here is not None  # the ridge keeps every plan regular
     for _ in range(MOST_STEPS):
         V, phi, _ = here
-        tangent, value = criterion.tangent(V), float(problem.criterion.of(V))
-        d = np.einsum("skx,sx->k", flat, tangent.G.reshape(len(A), -1))
-        reach = largest_sum(d, group, problem.shares, problem.most)
+        tangent, value = criterion.tangent_at(V), float(problem.criterion.value(V))
+        reach = largest_sum(flat @ tangent.G.ravel(), group, problem.shares)
         bound = tangent.value**2 / (float((tangent.G * problem.prior).sum()) + reach)
         gap = float(np.log(value / bound))
         if best is None or gap < best[0]:
@@ -411,16 +382,16 @@ def newton(
             s = min(gap / (2 * k), 1.0)
             criterion = problem.criterion.softened(min(2 / gap + 4, SHARPEST))
             here = V, *criterion.slope(V)
-            V = here[0]
-        step, slope = _step(criterion, A, here, w, u, s, E)
-        low, high = float(np.min(step / w)), float(np.max(step / (u - w)))
+        step, slope = _step(criterion, A, here, w, s, E)
+        low, high = float(np.min(step / w)), float(np.max(step / (1 - w)))
         t = min(1.0, TO_BOUNDARY / max(-low, 1e-9), TO_BOUNDARY / max(high, 1e-9))
         now, moved = merit(phi, w, s), None
         while t > 1e-8:
-            moved = at(w + t * step)
-            if moved and merit(moved[1], w + t * step, s) <= now + 1e-4 * t * slope:
+            there = at(w + t * step)
+            if 0 < there[1] < np.inf and merit(there[1], w + t * step, s) <= now + 1e-4 * t * slope:
+                moved = there
                 break
-            t, moved = t / 2, None
+            t /= 2
         if moved is not None:
             w, here = w + t * step, moved
         if moved is None or -slope < centred * s * 2 * k:
@@ -432,33 +403,30 @@ def newton(
 
 
 def _step(
-    criterion: Objective, A: Array, here: tuple[Array, float, Array], w: Array, u: float, s: float,
+    criterion: ScenarioCriterion, A: Array, here: tuple[Array, float, Array], w: Array, s: float,
     E: Array,
 ) -> tuple[Array, float]:  # fmt: skip
     """Newton's step (k,) of the barrier function and its slope along it."""
-    (V, phi, C), k = here, A.shape[1]
-    G = V @ C @ V
-    AV = A @ V[:, None]
-    d = np.einsum("skij,sij->k", A, G) / phi
-    H = -np.outer(d, d)
-    for s_, AV_s in enumerate(AV):
-        AG = (A[s_] @ G[s_]).swapaxes(1, 2).reshape(k, -1)
-        H += 2 / phi * AV_s.reshape(k, -1) @ AG.T
-    bent = criterion.curvature(V, V[:, None] @ AV)
+    (V, phi, C), k = here, len(A)
+    G, AV = V @ C @ V, A @ V
+    d = np.einsum("kij,ij->k", A, G) / phi
+    AG = (A @ G).swapaxes(1, 2).reshape(k, -1)
+    H = 2 / phi * AV.reshape(k, -1) @ AG.T - np.outer(d, d)
+    bent = criterion.curvature(V, V @ AV)
     H = H + bent / phi if np.ndim(bent) else H
-    H[np.diag_indices(k)] += s / w**2 + s / (u - w) ** 2 + 1e-12 * np.trace(H) / k
-    g = -d - s / w + s / (u - w)
+    H[np.diag_indices(k)] += s / w**2 + s / (1 - w) ** 2 + 1e-12 * np.trace(H) / k
+    g = -d - s / w + s / (1 - w)
     solved = np.linalg.solve((H + H.T) / 2, np.column_stack([g, E.T]))
     step = solved[:, 1:] @ np.linalg.solve(E @ solved[:, 1:], E @ solved[:, 0]) - solved[:, 0]
     return step, float(g @ step)
 
 
-def _inside(w: Array, E: Array, share: Array, u: float) -> Array:
+def _inside(w: Array, E: Array, share: Array) -> Array:
     """w (k,) moved strictly inside its bounds, with the right sums per group."""
     room = (share / E.sum(axis=1)) @ E  # even weights, which are inside
-    w = np.clip(w, 0.0, u)
+    w = np.clip(w, 0.0, 1.0)
     for _ in range(20):
-        w = np.minimum(w * ((share / np.maximum(E @ w, 1e-300)) @ E), u)
+        w = np.minimum(w * ((share / np.maximum(E @ w, 1e-300)) @ E), 1.0)
     w = 0.98 * w + 0.02 * room
     missing = share - E @ w
-    return np.asarray(w + ((missing / (E @ (w * (u - w)))) @ E) * w * (u - w))
+    return np.asarray(w + ((missing / (E @ (w * (1 - w)))) @ E) * w * (1 - w))

@@ -6,7 +6,7 @@ on the pool is one on what was found between its candidates too.
 
 from __future__ import annotations
 
-from dataclasses import dataclass, field, replace
+from dataclasses import asdict, dataclass, replace
 
 import numpy as np
 
@@ -32,7 +32,7 @@ from elastocal.planning.relaxation import (
     in_terms,
 )
 from elastocal.planning.setup import FeasiblePool, Setup
-from elastocal.units import Array, IntArray, Progress
+from elastocal.units import IntArray, Progress
 
 POOL = 2000  # candidates where nobody asks for a number
 CLOSE, FINE = 1e-3, 1e-4  # gap of the relaxations that lead to the next one, and of the last
@@ -107,60 +107,42 @@ class Selection:
         where they are new, are among those that the continuum's bound is about.
         """
         c = self.certificate
-        shares = (c.efficiency_pool, c.efficiency_continuum)
         of_pool, of_continuum = (
-            None if share is None else min(share * (self.value / value), 1.0) for share in shares
+            None if share is None else min(share * (self.value / value), 1.0)
+            for share in (c.efficiency_pool, c.efficiency_continuum)
         )
         certificate = replace(c, efficiency_pool=of_pool, efficiency_continuum=of_continuum)
         return replace(self, pool=pool, chosen=chosen, value=value, certificate=certificate)
 
 
-@dataclass
 class Search:
     """What a plan is sought with: the setup, whose parameters y = T z are balanced.
 
-    The search may be one in few `terms` z of the parameters; its bounds hold for all of them, as
-    what is left out counts as known there.
+    `plain`: the setup without the poses that stay, where there are some.  Raises
+    InsufficientDataError where no plan can determine all parameters.
     """
 
-    setup: Setup
-    searches: Searches
-    shares: IntArray
-    effort: SearchEffort
-    seed: int
-    checkpoint: Checkpoint
-    progress: Progress
-    T: Array
-    plain: Setup
-    _last: list[tuple[FeasiblePool, DesignProblem]] = field(default_factory=list)
-
-    @classmethod
-    def of(
-        cls, setup: Setup, pool: FeasiblePool, searches: Searches, shares: IntArray,
-        effort: SearchEffort, seed: int, checkpoint: Checkpoint, progress: Progress,
-        terms: Array | None = None, plain: Setup | None = None,
-    ) -> Search:  # fmt: skip
-        """`plain`: the setup without the poses that stay, where there are some.
-
-        Raises InsufficientDataError where no plan can determine all parameters.
-        """
+    def __init__(
+        self, setup: Setup, pool: FeasiblePool, searches: Searches, shares: IntArray,
+        effort: SearchEffort, seed: int, checkpoint: Checkpoint, progress: Progress, plain: Setup,
+    ) -> None:  # fmt: skip
+        self.setup, self.searches, self.shares, self.plain = setup, searches, shares, plain
+        self.effort, self.seed = effort, seed
+        self.checkpoint, self.progress = checkpoint, progress
         whole = setup.problem(pool, shares)
         check_enough(whole)
-        some = whole if terms is None else in_terms(whole, terms)
-        T = balancing(some)
-        T = T if terms is None else terms @ T
-        return cls(setup, searches, shares, effort, seed, checkpoint, progress, T, plain or setup)
+        self.T = balancing(whole)
+        self._last: tuple[FeasiblePool, DesignProblem] | None = None
 
     def problem(self, pool: FeasiblePool) -> DesignProblem:
         """That of a pool, kept with what it has formed as long as the pool is the same."""
-        if not self._last or self._last[0][0] is not pool:
-            whole = self.setup.problem(pool, self.shares)
-            self._last[:] = [(pool, in_terms(whole, self.T, RIDGE))]
-        return self._last[0][1]
+        if self._last is None or self._last[0] is not pool:
+            self._last = pool, in_terms(self.setup.problem(pool, self.shares), self.T, RIDGE)
+        return self._last[1]
 
     def value(self, pool: FeasiblePool, chosen: IntArray) -> float:
-        """Φ of a plan, of all parameters."""
-        return float(self.setup.criterion.value(self.setup.gathered(pool.blocks[:, chosen])))
+        """Φ of a plan."""
+        return self.setup.problem(pool, self.shares).value(chosen)
 
     def select(self, pool: FeasiblePool, begun: IntArray | None = None) -> Selection:
         """The best plan found and its certificate; `begun` is a plan found on this pool already."""
@@ -184,8 +166,7 @@ class Search:
         if efforts.starts:
             relaxed = self._again(pool, relaxed, CLOSE if efforts.rounds else FINE)
             mixed, _ = exact_plan(self.problem(pool), relaxed, warm=best, starts=2, seed=self.seed)
-            if self.value(pool, mixed) < self.value(pool, best) * (1 - SAME):
-                best = mixed
+            best = self._better(pool, best, mixed)
         if efforts.rounds:
             pool, best = self.polished(pool, best, "last", fine=True)
         value = self.value(pool, best)
@@ -209,31 +190,30 @@ class Search:
             )  # fmt: skip
             return {"chosen": found[0]}
 
-        found = [self.checkpoint.stage("exchange").finished(make)["chosen"]]
+        found = [self.checkpoint.finished("exchange", make)["chosen"]]
         for k in range(1, self.effort.starts):
-            new = rounded(problem, relaxed.weights, rng) if k % 2 == 0 else None
-            found.append(random_plan(problem, rng) if new is None else new)
+            new = random_plan(problem, rng) if k % 2 else rounded(problem, relaxed.weights, rng)
+            found.append(new)
         return found
 
     def polished(
         self, pool: FeasiblePool, chosen: IntArray, name: str, fine: bool = False
     ) -> tuple[FeasiblePool, IntArray]:
         """The pool with the plan's polished poses, and the polished plan in it."""
-
-        def make() -> State:
-            q, _ = polish(
-                self.problem(pool), self.searches, self.T, pool.q[chosen], pool.load[chosen],
-                pool.group[chosen], fine,
-            )  # fmt: skip
-            return {"q": q}
-
-        q = self.checkpoint.stage(name).finished(make)["q"]
-        moved = (q != pool.q[chosen]).any(axis=1)
+        were, of = pool.q[chosen], pool.group[chosen]
+        q = self.checkpoint.finished(
+            name,
+            lambda: {"q": polish(self.problem(pool), self.searches, self.T, were, of, fine)},
+        )["q"]
+        moved = (q != were).any(axis=1)
         if not moved.any():
             return pool, chosen
-        were, now = chosen[moved], chosen.copy()
-        now[moved] = np.arange(len(pool), len(pool) + len(were))
-        return pool.joined(self.setup.pool(q[moved], pool.load[were], pool.group[were])), now
+        now = chosen.copy()
+        now[moved] = len(pool) + np.arange(moved.sum())
+        return pool.joined(self.setup.pool(q[moved], of[moved])), now
+
+    def _better(self, pool: FeasiblePool, best: IntArray, other: IntArray) -> IntArray:
+        return other if self.value(pool, other) < self.value(pool, best) * (1 - SAME) else best
 
     def _again(self, pool: FeasiblePool, relaxed: Relaxed, gap: float = CLOSE) -> Relaxed:
         """The relaxation on a pool that has grown since."""
@@ -242,7 +222,7 @@ class Search:
 
     def _continuum(self, pool: FeasiblePool, relaxed: Relaxed, seed: int) -> Continuum:
         return estimate(
-            self.problem(pool), relaxed.tangent, self.searches, self.T, pool.q, pool.load,
+            self.problem(pool), relaxed.tangent, self.searches, self.T, pool.q,
             seed=self.seed + seed, progress=self.progress,
         )  # fmt: skip
 
@@ -250,19 +230,13 @@ class Search:
         self, pool: FeasiblePool, relaxed: Relaxed, k: int, found: list[Continuum]
     ) -> FeasiblePool:
         """The pool with the poses of the continuum that the relaxed optimum lacks."""
-
-        def make() -> State:
-            c = self._continuum(pool, relaxed, k)
-            counts = np.array([c.searched, c.ascents])
-            return {"q": c.q, "load": c.load, "group": c.group, "bound": np.array(c.bound),
-                    "counts": counts}  # fmt: skip
-
-        s = self.checkpoint.stage(f"continuum{k}").finished(make)
-        counts = [int(n) for n in s["counts"]]
-        found.append(Continuum(float(s["bound"]), s["q"], s["load"], s["group"], *counts))
-        if not len(s["q"]):
-            return pool
-        return pool.joined(self.setup.pool(s["q"], s["load"], s["group"]))
+        state = self.checkpoint.finished(
+            f"continuum{k}", lambda: asdict(self._continuum(pool, relaxed, k))
+        )
+        q, group = state["q"], state["group"]
+        counts = (int(state[name]) for name in ("searched", "ascents"))
+        found.append(Continuum(float(state["bound"]), q, group, *counts))
+        return pool.joined(self.setup.pool(q, group)) if len(q) else pool
 
     def _bettered(
         self, pool: FeasiblePool, best: IntArray, relaxed: Relaxed, k: int
@@ -273,8 +247,7 @@ class Search:
         plans = [exact_plan(problem, relaxed, warm=w, patience=0)[0] for w in (best, None)]
         for name, chosen in zip((f"warm{k}", f"anew{k}"), plans, strict=True):
             pool, chosen = self.polished(pool, chosen, name)
-            if self.value(pool, chosen) < self.value(pool, best) * (1 - SAME):
-                best = chosen
+            best = self._better(pool, best, chosen)
         return pool, best
 
     def _certificate(
@@ -295,7 +268,7 @@ class Search:
             new = found[-1]
             if new.bound >= NEAR * relaxed.bound or not len(new.q):
                 break
-            pool = pool.joined(self.setup.pool(new.q, new.load, new.group))
+            pool = pool.joined(self.setup.pool(new.q, new.group))
             relaxed = self._again(pool, relaxed)
             found.append(self._continuum(pool, relaxed, (k + 2) * ROUND))
         beyond = min(found[-1].bound, bound)

@@ -13,14 +13,12 @@ from elastocal.cell.work_cell import Cell
 from elastocal.errors import InsufficientDataError, option, require
 from elastocal.identification.knowledge import GaussianPrior
 from elastocal.identification.start import fixed_and_free
-from elastocal.model.effects.catalogue import effect_of
 from elastocal.model.manipulator import Model
-from elastocal.planning.criteria import criterion_named, make_criterion
-from elastocal.planning.criterion import Objective
+from elastocal.planning.criteria import criterion_named
+from elastocal.planning.criterion import CriterionInputs, ScenarioCriterion
 from elastocal.planning.information import (
     Done,
     Estimable,
-    LoadStates,
     PoseInformation,
     Sight,
     estimable,
@@ -37,7 +35,7 @@ from elastocal.planning.test_poses import (
     remaining_bias,
     unpredictable,
 )
-from elastocal.simulation.simulate import draw_errors, values_from
+from elastocal.simulation.simulate import values_from
 from elastocal.text import listed
 from elastocal.units import Array, IntArray, Progress
 
@@ -112,7 +110,6 @@ def most_poses(cell: Cell, available: IntArray, limit: int) -> int:
 # Everything a design knows before it chooses: parameters, criterion, information known before.
 
 WORTH_TELLING = 1e-7  # m
-SCENARIO_STREAM = 1  # of the seed's children; see design.py
 
 
 @dataclass(frozen=True)
@@ -126,10 +123,9 @@ class Known:
 
 @dataclass(frozen=True)
 class FeasiblePool:
-    """Candidates q (N, n), their load state (N,) and group (N,), and blocks (S, N, r, p)."""
+    """Candidates q (N, n), their group (N,), and blocks (N, r, p)."""
 
     q: Array
-    load: IntArray
     group: IntArray
     blocks: Array
 
@@ -141,20 +137,19 @@ class FeasiblePool:
         return int(self.group.max()) + 1
 
     def take(self, kept: IntArray) -> FeasiblePool:
-        return FeasiblePool(self.q[kept], self.load[kept], self.group[kept], self.blocks[:, kept])
+        return FeasiblePool(self.q[kept], self.group[kept], self.blocks[kept])
 
     def joined(self, other: FeasiblePool) -> FeasiblePool:
         return FeasiblePool(
             np.vstack([self.q, other.q]),
-            np.concatenate([self.load, other.load]),
-            np.concatenate([self.group, other.group]),
-            np.concatenate([self.blocks, other.blocks], axis=1),
+            np.append(self.group, other.group),
+            np.concatenate([self.blocks, other.blocks]),
         )
 
 
 @dataclass(frozen=True)
 class Setup:
-    """`information` over the kept parameters, `prior` (S, p, p) scaled, and the criterion.
+    """`information` over the kept parameters, `prior` (p, p) scaled, and the criterion.
 
     `target_rows` (r, p): |R x| is the rms error at the test poses in m, `elsewhere_rows` that over
     all joint ranges; None where the criterion knows of none, or nothing can be said of them.
@@ -163,21 +158,20 @@ class Setup:
 
     information: PoseInformation
     found: Estimable
-    criterion: Objective
+    criterion: ScenarioCriterion
     prior: Array
     warnings: tuple[str, ...]
+    weighed: Callable[[float], ScenarioCriterion]
     target_rows: Array | None = None
     elsewhere_rows: Array | None = None
     share: float = 0.0
-    weighed: Callable[[float], Objective] | None = None
 
     def sharing(self, share: float) -> Setup:
         """With this share of the weight on what lies beside the test poses."""
-        assert self.weighed is not None
         return replace(self, criterion=self.weighed(share), share=share)
 
-    def pool(self, q: Array, load: IntArray, group: IntArray) -> FeasiblePool:
-        return FeasiblePool(q, load, group, self.information.blocks(q, load))
+    def pool(self, q: Array, group: IntArray) -> FeasiblePool:
+        return FeasiblePool(q, group, self.information.blocks(q))
 
     def having(self, pinned: FeasiblePool | None) -> Setup:
         """For what is chosen beside poses that stay: their information is known before."""
@@ -187,23 +181,22 @@ class Setup:
         return DesignProblem(pool.blocks, self.prior, pool.group, shares, self.criterion)
 
     def gathered(self, blocks: Array) -> Array:
-        """M (S, p, p) of a plan's blocks (S, N, r, p) and what was known before."""
-        return self.prior + np.einsum("snri,snrj->sij", blocks, blocks, optimize=True)
+        """M (p, p) of a plan's blocks (N, r, p) and what was known before."""
+        B = blocks.reshape(-1, blocks.shape[-1])
+        return np.asarray(self.prior + B.T @ B)
 
-    def value(self, q: Array, load: IntArray) -> float:
-        """Φ of any plan of poses q (N, n) in load states `load` (N,)."""
-        return float(self.criterion.value(self.gathered(self.information.blocks(q, load))))
+    def value(self, q: Array) -> float:
+        """Φ of any plan of poses q (N, n)."""
+        M = self.gathered(self.information.blocks(q))
+        return float(self.criterion.of_information(M))
 
 
 def set_up(
     model: Model,
-    states: LoadStates,
     q: Array,
-    load: IntArray,
     n_poses: int,
     targets: TargetPoses,
     known: Known,
-    seed: int,
     region: TargetPoses | None = None,
     sight: Sight | None = None,
     work: Model | None = None,
@@ -218,14 +211,14 @@ def set_up(
     with what it is combined with; InputError for unknown names.
     """
     spec = model.cell.design
-    scenarios = _scenarios(model, known, seed)
+    x = model.nominal if known.done is None else known.done.x
     every = np.arange(len(model.parameters))
-    raw = PoseInformation(model, states, scenarios, every, np.ones(len(every)), sight)
-    sizes = typical_sizes(raw, q, load)
+    raw = PoseInformation(model, x, every, np.ones(len(every)), sight)
+    sizes = typical_sizes(raw, q)
     information = replace(raw, sizes=sizes)
     prior, stated = known_before(model, known, sizes)
     free = fixed_and_free(model, known.fixed)
-    found = estimable(information, q, load, free, prior, n_poses, stated)
+    found = estimable(information, q, free, prior, n_poses, stated)
     kept = found.columns
     information = replace(information, columns=kept, sizes=sizes[kept])
     interest = interest_of(model, found)
@@ -238,55 +231,47 @@ def set_up(
     if "test_poses" in criterion_named(spec.criterion).needs:
         T, share = len(targets.q), spec.elsewhere or 0.0
         both = targets if region is None else joined(targets, region, share)
-        at_work = information if work is None else replace(information, model=work)
-        moved = at_work.model.nominal - model.nominal
-        rows = np.stack([prediction_rows(at_work, both, x + moved) for x in scenarios])
-        A = on_kept(model, rows[:, :T], found)
+        at_work = model if work is None else work
+        rows = prediction_rows(at_work, both, x + (at_work.nominal - model.nominal))
+        A = on_kept(model, rows[:T], found)
         if region is not None:
             # None where no plan could make the position at all of them certain.
             with suppress(InsufficientDataError):
-                beyond = on_kept(model, rows[:, T:], found)
+                beyond = on_kept(model, rows[T:], found)
         if share and beyond is None:
             raise InsufficientDataError(
                 f"{model.cell.path or model.cell.name}: [design] elsewhere asks for poses all over "
                 "the joint ranges, but the rules allow none, or no plan can make all of them "
                 "certain; leave it out"
             )
-        own = _root(A[0], targets.weight)
-        warnings += _held(model, found, remaining_bias(rows[0], both.weight, found))
+        own = _root(A, targets.weight)
+        warnings += _held(model, found, remaining_bias(rows, both.weight, found))
     combination = _combination(model, found)
     unit = units.pop() if len(units) == 1 else ""
 
-    def weighed(share: float) -> Objective:
+    def weighed(share: float) -> ScenarioCriterion:
         rows, weights = A, targets.weight
         if share and A is not None and beyond is not None and region is not None:
-            rows = np.concatenate([A, beyond], axis=1)
+            rows = np.concatenate([A, beyond])
             weights = joined(targets, region, share).weight
-        return make_criterion(
-            spec.criterion,
-            parameters=len(kept),
-            interest=interest,
-            scenarios=len(scenarios),
-            A=rows,
-            weights=weights,
-            combination=combination,
-            unit=unit,
-            n_poses=n_poses,
-            names=information.names,
-            sizes=information.sizes,
-            robust=spec.robust,
-        )
+        return criterion_named(spec.criterion).of(
+            CriterionInputs(
+                spec.criterion, len(kept), interest, rows, weights, combination,
+                unit, n_poses, information.names,
+                information.sizes,
+            )
+        )  # fmt: skip
 
     return Setup(
         information,
         found,
         weighed(share),
-        np.repeat(prior[np.ix_(kept, kept)][None], len(scenarios), axis=0),
+        prior[np.ix_(kept, kept)],
         warnings,
-        own,
-        None if beyond is None or region is None else _root(beyond[0], region.weight),
-        share,
         weighed,
+        own,
+        None if beyond is None or region is None else _root(beyond, region.weight),
+        share,
     )
 
 
@@ -309,19 +294,6 @@ def _unseen(model: Model, found: Estimable, unseen: list[int]) -> tuple[str, ...
         f"no feasible pose shows {listed(names)}: they move no marker in any of them; {remedy}, or "
         f"leave them out ({option('fixed', names[0])})",
     )
-
-
-def _scenarios(model: Model, known: Known, seed: int) -> Array:
-    """X (S, parameters): the arm as known best, and draws of what it may be besides."""
-    spec = model.cell.design
-    best = model.nominal if known.done is None else known.done.x
-    if spec.robust == "none":
-        return best[None]
-    rng = np.random.default_rng(np.random.SeedSequence(seed).spawn(SCENARIO_STREAM + 1)[-1])
-    arm = np.array([not effect_of(p.effect).registered for p in model.parameters])
-    draws = [values_from(model, draw_errors(model, 1.0, rng)) for _ in range(spec.robust_samples)]
-    moved = [np.where(arm, best + x - model.nominal, best) for x in draws]
-    return np.stack([best, *moved])
 
 
 def known_before(model: Model, known: Known, sizes: Array) -> tuple[Array, NDArray[np.bool_]]:
@@ -402,7 +374,7 @@ def share_within(
     for _ in range(TRIES):
         other = replace(problem, criterion=setup.sharing(share).criterion)
         weights = relax(in_terms(other, T), LOOSE, weights).weights
-        value = float(own.value(problem.at(weights)))
+        value = float(own.of_information(problem.at(weights)))
         if value <= limit:
             low = share
             if share == MOST or limit - value < CLOSE * (limit - least):

@@ -27,7 +27,7 @@ from elastocal.model.manipulator import Model
 from elastocal.planning.bodies import data_base
 from elastocal.planning.candidates import feasible, told
 from elastocal.planning.feasibility import Feasibility
-from elastocal.planning.information import Estimable, PoseInformation, why
+from elastocal.planning.information import Estimable, why
 from elastocal.tables import NO_UNIT, Family, Layout, RawTable, read_table
 from elastocal.text import listed, quoted
 from elastocal.units import Array, IntArray
@@ -560,7 +560,7 @@ def _sobol(dimension: int, count: int, seed: int) -> Array:
 OUTSIDE = 1e-6
 
 
-def prediction_rows(information: PoseInformation, targets: TargetPoses, x: Array) -> Array:
+def prediction_rows(model: Model, targets: TargetPoses, x: Array) -> Array:
     """A (T, r, parameters): ∂(position at the test pose)/∂X in m per unit, at arm values x.
 
     The position is that under load in the data's frame; base and markers move it too, so that it
@@ -568,7 +568,6 @@ def prediction_rows(information: PoseInformation, targets: TargetPoses, x: Array
     markers' own places are fitted and no point was stated, it is that of the M markers, each
     divided by √M, as only they can be known: the sum of squares is then their mean.
     """
-    model = information.model
     fitted = any(p.effect == MarkerPosition.name for p in model.parameters)
     by_marker = ~targets.stated & fitted
     markers = tuple(model.cell.tool.markers)
@@ -631,13 +630,13 @@ def _with_points(model: Model, points: dict[str, Array]) -> Model:
 
 
 def on_kept(model: Model, A: Array, found: Estimable) -> Array:
-    """A (S, T, r, kept) on the kept parameters, scaled by their sizes, under S scenarios.
+    """A (T, r, kept) on the kept parameters, scaled by their sizes.
 
     A test point is predictable where its motion by the dropped parameters is that by the kept
     ones they combine with: A_D = A_K · mixing.  Raises InsufficientDataError that names the
     parameter where it is not: no number of poses would make that position certain.
     """
-    lost = unpredictable(A[0], found)  # the mixing is that of the first scenario
+    lost = unpredictable(A, found)
     if lost is not None:
         pose, index = lost
         raise InsufficientDataError(

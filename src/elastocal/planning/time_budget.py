@@ -20,7 +20,7 @@ from elastocal.planning.candidates import Candidates
 from elastocal.planning.choices import Choice
 from elastocal.planning.exchange import exact_plan
 from elastocal.planning.execution import greedy_tour, tour_cost
-from elastocal.planning.information import load_states
+from elastocal.planning.information import plan_forces
 from elastocal.planning.moves import travel_times
 from elastocal.planning.plan import Plan, TimedSize
 from elastocal.planning.relaxation import balanced, check_enough
@@ -107,8 +107,7 @@ class _Budget:
             took = _minutes(cell, point.pool.q[chosen])
             if took <= self.minutes:
                 value = point.setup.criterion.figure(phi)
-                kept = problem.blocks.shape[-1]
-                return kept, phi, TimedSize(poses, repeats, took, value)
+                return len(problem.prior), phi, TimedSize(poses, repeats, took, value)
             poses = min(int(poses * self.minutes / took), poses - 1)
         return None
 
@@ -133,10 +132,10 @@ def _sized(cell: Cell, poses: int, repeats: int) -> Cell:
 
 def _minutes(cell: Cell, q: Array) -> float:
     """About how long the poses q (N, n) take, on a short way without obstacles."""
-    motion, states = at_stops(cell), load_states(cell)
-    heavy = int(np.any(states.forces != 0, axis=1).sum())
+    motion, forces = at_stops(cell), plan_forces(cell)
+    heavy = int(np.any(forces != 0, axis=1).sum())
     changes = (motion.load_changes or heavy + 1) if heavy else 0
-    visits = 1 if states.chosen else len(states.forces)
+    visits = len(forces)
     home = q[:1] if motion.home is None else motion.home[None]
     cost = travel_times(np.vstack([home, q]), motion.speed)
     waiting = visits * len(q) * motion.dwell * (2 if motion.both_directions else 1)

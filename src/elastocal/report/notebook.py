@@ -133,9 +133,6 @@ def _plan_frame(plan: Plan) -> pd.DataFrame:
 
     order = first_stops(plan)
     columns["order"] = [order.get(k) for k in range(len(plan.q))]
-    if (plan.load >= 0).any():
-        for k, axis in enumerate("xyz"):
-            columns[f"force_{axis}_N"] = plan.forces[plan.load, k]
     return pd.DataFrame(columns)
 
 

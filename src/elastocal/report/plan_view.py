@@ -148,21 +148,19 @@ SERVES = "most affected if dropped (standard deviation)"
 
 
 def pose_table(plan: Plan) -> Table:
-    """Joint values, load, place in the order of execution; less digits where there is no room."""
+    """Joint values and place in the order of execution; less digits where there is no room."""
     two, one, none = (_poses(plan, decimals) for decimals in (2, 1, 0))
     return replace(two, narrow=replace(one, narrow=none))
 
 
 def _poses(plan: Plan, decimals: int) -> Table:
     kinds = plan.model.chain.kinds
-    loads = len(plan.forces) > 1 and bool((plan.load >= 0).any())
-    heads = ["pose", *joint_heads(kinds), *(["load N"] if loads else []), "order"]
+    heads = ["pose", *joint_heads(kinds), "order"]
     heads += [] if plan.seen is None else ["markers"]
     order = first_stops(plan)
     rows: list[tuple[str, ...]] = []
     for k, name in enumerate(plan.configurations):
         row = [name, *joint_texts(plan.q[k], kinds, decimals)]
-        row += [force_text(plan, int(plan.load[k]))] if loads else []
         row += [str(order[k]), *([] if plan.seen is None else [printable(plan.markers(k))])]
         rows.append(tuple(row))
     words = tuple(k for k, head in enumerate(heads) if head == "markers")
