@@ -52,14 +52,11 @@ def test_every_key_arrives_in_si_units(read, folder):
 criterion = "c"
 repeats = 6
 loads_N = [[0, 0, 0], [0, 0, -2600]]
-load_choice = true
 repeatability_um = 60
 marker_sigma_um = { M1 = 10, M2 = 20.0 }
 interest = ["joint_compliance", "joint2", "joint3.offset"]
 combination = { "joint2.compliance" = 1.0, "joint3.compliance" = -2 }
 prior = "typical"
-robust = "worst"
-robust_samples = 4
 candidates = 5000
 target_um = 30
 [design.levels]
@@ -92,14 +89,14 @@ both_directions = true
 overshoot_deg = 3
 """
     ).design
-    assert (spec.poses, spec.criterion, spec.repeats, spec.load_choice) == (7, "c", 6, True)
+    assert (spec.poses, spec.criterion, spec.repeats) == (7, "c", 6)
     assert spec.loads.tolist() == [[0, 0, 0], [0, 0, -2600]]
     assert (spec.levels, spec.per_level) == ({"joint2": (-np.pi / 2, 0.0)}, (3, 4))
     assert (spec.repeatability, spec.target) == (6e-5, 3e-5)
     assert spec.marker_sigma == {"M1": 1e-5, "M2": 2e-5}
     assert spec.interest == ("joint_compliance", "joint2", "joint3.offset")
     assert spec.combination == {"joint2.compliance": 1.0, "joint3.compliance": -2.0}
-    assert (spec.prior, spec.robust, spec.robust_samples) == ("typical", "worst", 4)
+    assert spec.prior == "typical"
     assert spec.candidates == 5000
     first, second = spec.test_poses
     np.testing.assert_allclose(first.q, [np.pi / 2, np.pi])
@@ -185,7 +182,7 @@ def test_the_criterion_for_a_combination_may_be_asked_for_later(read):
         ("[design]\nloads_N = [[0, 0, 1], [0, 0, 1]]", ["design.loads_N repeats a load"]),
         ("[design]\nmarker_sigma_um = { M3 = 1 }", ["[design.marker_sigma_um] names 'M3'", "M1"]),
         ("[design]\nmarker_sigma_um = { M1 = 0 }", ["marker_sigma_um.M1", "positive"]),
-        ("[design]\nrobust = 'avrage'", ["design.robust", "did you mean 'average'"]),
+        ("[design]\nrobust = 'worst'", ["key design.robust is gone", "--augment"]),
         ("[design.levels]\njoint2_deg = 3", ["design.levels.joint2_deg", "joint2_deg = [-25.2"]),
         ("[design.levels]\njoint2_deg = []", ["design.levels.joint2_deg"]),
         ("[design.levels]\njoint2_deg = [1, 1]", ["repeats a level of joint2"]),

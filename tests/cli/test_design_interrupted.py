@@ -16,8 +16,7 @@ from support.design_commands import (
     write_cell,
 )
 
-from elastocal.planning import search
-from elastocal.planning.checkpoint import Stage
+from elastocal.planning import checkpoint, search
 
 GOING_ON = "resuming the interrupted design"
 # A child may inherit that SIGINT is ignored; here it must not.
@@ -43,15 +42,15 @@ def whole(tmp_path_factory):
 
 def interrupt_after(monkeypatch, saves):
     """Ctrl-C right after so many states were saved."""
-    save, count = Stage.save, [0]
+    save, count = checkpoint._save, [0]
 
-    def saving(self, state):
-        save(self, state)
-        count[0] += self.path is not None
-        if self.path is not None and count[0] == saves:
+    def saving(path, state):
+        save(path, state)
+        count[0] += 1
+        if count[0] == saves:
             signal.raise_signal(signal.SIGINT)
 
-    monkeypatch.setattr(Stage, "save", saving)
+    monkeypatch.setattr(checkpoint, "_save", saving)
 
 
 def interrupted(cell, monkeypatch, saves, *extra):

@@ -11,7 +11,7 @@ from typing import Any
 import numpy as np
 import pytest
 from numpy.typing import NDArray
-from support.calibration import placement, random_chain
+from support.calibration import placement
 from support.cells import DOWN
 from support.design_cells import FULL, any_cell, plan_cell, scara, sliding_chain
 from support.robots import packaged_urdf
@@ -26,7 +26,6 @@ from elastocal.model.urdf import read_urdf
 from elastocal.planning import design as design_module
 from elastocal.planning.design import DesignOptions, Effort, design
 from elastocal.planning.feasibility import Feasibility
-from elastocal.planning.information import ALL_LOADS
 from elastocal.planning.plan import Plan
 from elastocal.planning.setup import Setup, set_up
 
@@ -78,10 +77,6 @@ CELLS: dict[str, Callable[[], Cell]] = {
         loads=DOWN[None], poses=5, candidates=100,
         motion=Motion(home=HOME, both_directions=True, overshoot=0.05),
     ),
-    "load chosen": lambda: plan_cell(
-        ("joint_compliance", "joint_offset"), "position", loads=BOTH, load_choice=True, poses=9,
-        candidates=200, levels=LEVELS,
-    ),
     "full poses, A": lambda: plan_cell(
         FEW, "pose", loads=BOTH, poses=6, candidates=120, criterion="A",
         interest=("joint_compliance",),
@@ -96,13 +91,8 @@ CHAINS: dict[str, tuple[Callable[[], Chain], Callable[[Chain], Cell]]] = {
         lambda c: any_cell(c, ("joint_compliance",), loads=LIGHT, poses=5, candidates=60,
                            levels={"joint2": (-0.2, 0.1, 0.3)}, per_level=(1, 3, 1)),
     ),
-    "robust": (
-        lambda: random_chain(2),
-        lambda c: any_cell(c, FEW, loads=LIGHT, poses=8, candidates=80, robust="worst",
-                           robust_samples=2),
-    ),
 }  # fmt: skip
-LONG = ("UR10, geometry", "full poses, A", "robust")
+LONG = ("UR10, geometry", "full poses, A")
 ALL = [
     pytest.param(name, marks=pytest.mark.long if name in LONG else ()) for name in (*CELLS, *CHAINS)
 ]
@@ -133,17 +123,13 @@ def planned(name: str, effort: Effort = "quick", seed: int = 0) -> tuple[Plan, S
     return plan, setup, Feasibility(plan.model.cell, plan.model.chain)
 
 
-def loads_of(plan: Plan, k: int) -> NDArray:
-    return plan.forces if plan.load[k] == ALL_LOADS else plan.forces[plan.load[k]][None]
-
-
 @pytest.mark.parametrize("name", ALL)
 def test_every_pose_is_allowed_in_every_state_it_is_measured_in(name: str) -> None:
     plan, _, rules = planned(name)
     lower, upper = joint_limits(plan.model.cell, plan.model.chain)
     assert ((lower - 1e-12 <= plan.q) & (plan.q <= upper + 1e-12)).all()
     for k in range(len(plan.q)):
-        for force in loads_of(plan, k):
+        for force in plan.forces:
             verdict = rules.check(plan.q[k], force)
             assert verdict.ok.all(), verdict.removed_by
 
@@ -170,13 +156,7 @@ def test_every_reading_has_a_stop_and_every_move_is_free(name: str) -> None:
     start, end, hanging = (np.array(v) for v in zip(*moves, strict=True))
     assert rules.paths_free(start, end, hanging).all()
     visits = {(s.pose, s.load) for s in execution.stops}
-    states = np.arange(len(plan.forces))
-    wanted = {
-        (k, int(s))
-        for k, load in enumerate(plan.load)
-        for s in (states if load == ALL_LOADS else [load])
-    }
-    assert visits == wanted
+    assert visits == {(k, s) for k in range(len(plan)) for s in range(len(plan.forces))}
     assert len({(s.pose, s.load, s.side, s.part) for s in execution.stops}) == len(execution.stops)
     most = 2 if motion.both_directions else 1
     times = Counter((s.pose, s.load, s.part) for s in execution.stops)
@@ -187,7 +167,7 @@ def test_every_reading_has_a_stop_and_every_move_is_free(name: str) -> None:
 @pytest.mark.parametrize("name", ALL)
 def test_the_value_is_that_of_the_poses_and_no_less_than_its_bound(name: str) -> None:
     plan, setup, _ = planned(name)
-    value = setup.value(plan.q, plan.load)
+    value = setup.value(plan.q)
     assert plan.value == pytest.approx(value, rel=1e-9)
     assert (plan.reported, plan.unit) == setup.criterion.reported(plan.value)
     c = plan.certificate
@@ -203,7 +183,7 @@ def test_the_value_is_that_of_the_poses_and_no_less_than_its_bound(name: str) ->
 @pytest.mark.parametrize("name", ALL)
 def test_what_is_predicted_is_the_inverse_of_the_information(name: str) -> None:
     plan, setup, _ = planned(name)
-    M = setup.gathered(setup.information.blocks(plan.q, plan.load))[0]
+    M = setup.gathered(setup.information.blocks(plan.q))
     scale = np.sqrt(np.diag(M))
     V = np.linalg.inv(M / np.outer(scale, scale)) / np.outer(scale, scale)
     assert tuple(p.name for p in plan.predicted) == setup.information.names
@@ -258,8 +238,8 @@ def test_test_poses_are_where_the_plan_makes_position_certain(
         plans.append(plan)
         setups.append(setup)
     for k in (0, 1):
-        own = setups[k].value(plans[k].q, plans[k].load)
-        assert own < setups[k].value(plans[1 - k].q, plans[1 - k].load)
+        own = setups[k].value(plans[k].q)
+        assert own < setups[k].value(plans[1 - k].q)
 
 
 @pytest.mark.parametrize(

@@ -5,12 +5,11 @@ from __future__ import annotations
 import numpy as np
 import pytest
 from support.cells import DOWN, kr270_chain, random_poses
-from support.design_cells import all_loads, plan_cell, set_up, target_poses
+from support.design_cells import plan_cell, set_up, target_poses
 
 from elastocal.model.manipulator import Model
 from elastocal.planning.doubts import in_doubt
 from elastocal.planning.exchange import exact_plan
-from elastocal.planning.information import load_states
 from elastocal.planning.plan import Doubt, Gain
 from elastocal.planning.relaxation import balanced, relax
 from elastocal.planning.setup import Known, Setup
@@ -22,12 +21,9 @@ FEW = {("joint_hardening", "joint3"): 0.3, ("off_axis_compliance", "joint2"): 0.
 
 def setup_with(doubts: dict | None, known: Known | None = None, n_poses: int = 5) -> Setup:
     cell = plan_cell(loads=DOWN[None], criterion="robust")
-    states, load = load_states(cell), all_loads(POSES)
-    model, known, _ = in_doubt(
-        Model.assembled(CHAIN, cell), known or Known(), states, POSES, load, doubts
-    )
+    model, known, _ = in_doubt(Model.assembled(CHAIN, cell), known or Known(), POSES, doubts)
     targets = target_poses.test_poses(cell, CHAIN, None, 0)
-    return set_up(model, states, POSES, load, n_poses, targets, known, 0)
+    return set_up(model, POSES, n_poses, targets, known)
 
 
 @pytest.fixture(scope="module")
@@ -38,9 +34,9 @@ def setup() -> Setup:
 def test_it_is_the_error_of_the_best_linear_estimate(setup: Setup) -> None:
     """By the covariance of the readings, as in kriging with a trend: y = B x + Z u + noise."""
     own = np.array(["hardening" not in n and "off_axis" not in n for n in setup.information.names])
-    blocks = setup.information.blocks(POSES[:8], all_loads(POSES[:8]))[0]
+    blocks = setup.information.blocks(POSES[:8])
     Y = blocks.reshape(-1, blocks.shape[2])
-    D = np.linalg.inv(setup.prior[0][np.ix_(~own, ~own)])
+    D = np.linalg.inv(setup.prior[np.ix_(~own, ~own)])
     V = np.eye(len(Y)) + Y[:, ~own] @ D @ Y[:, ~own].T
     R = setup.target_rows
     assert R is not None
@@ -50,11 +46,11 @@ def test_it_is_the_error_of_the_best_linear_estimate(setup: Setup) -> None:
     rest = R[:, own] - R[:, ~own] @ K @ B
     error = R[:, ~own] @ (D - K @ Y[:, ~own] @ D) @ R[:, ~own].T
     error += rest @ np.linalg.inv(B.T @ W @ B) @ rest.T
-    assert setup.value(POSES[:8], all_loads(POSES[:8])) == pytest.approx(np.trace(error), rel=1e-6)
+    assert setup.value(POSES[:8]) == pytest.approx(np.trace(error), rel=1e-6)
 
 
 def test_no_plan_beats_the_bound(setup: Setup) -> None:
-    pool = setup.pool(POSES, all_loads(POSES), np.zeros(len(POSES), dtype=np.int64))
+    pool = setup.pool(POSES, np.zeros(len(POSES), dtype=np.int64))
     problem, _ = balanced(setup.problem(pool, np.array([8])))
     relaxed = relax(problem)
     assert relaxed.gap < 1e-3

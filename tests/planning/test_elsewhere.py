@@ -5,13 +5,12 @@ from __future__ import annotations
 import numpy as np
 import pytest
 from support.cells import DOWN, kr270_chain, random_poses
-from support.design_cells import all_loads, plan_cell
+from support.design_cells import plan_cell
 
 from elastocal.cell.plan_wishes import TargetPose
 from elastocal.model.manipulator import Model
 from elastocal.planning import test_poses as target_poses
 from elastocal.planning.exchange import exact_plan
-from elastocal.planning.information import load_states
 from elastocal.planning.plan import Everywhere
 from elastocal.planning.relaxation import balanced, relax
 from elastocal.planning.setup import Known, Setup, set_up, share_within
@@ -28,29 +27,27 @@ def made(share: float | None) -> Setup:
     assert region is not None and len(region.q) == ELSEWHERE
     targets = target_poses.test_poses(cell, CHAIN)
     model = Model.assembled(CHAIN, cell)
-    return set_up(
-        model, load_states(cell), Q, all_loads(Q), 10**9, targets, Known(), 0, region
-    )  # fmt: skip
+    return set_up(model, Q, 10**9, targets, Known(), region)
 
 
 def errors(setup: Setup, chosen: np.ndarray) -> Everywhere:
     assert setup.target_rows is not None and setup.elsewhere_rows is not None
-    M = setup.gathered(setup.information.blocks(Q, all_loads(Q))[:, chosen])[0]
+    M = setup.gathered(setup.information.blocks(Q)[chosen])
     return Everywhere.of(setup.target_rows, setup.elsewhere_rows, M, M[None], M)
 
 
 def test_the_criterion_is_the_weighted_mean_of_both_errors() -> None:
     setup, chosen = made(0.25), np.arange(8)
     e = errors(setup, chosen)
-    M = setup.gathered(setup.information.blocks(Q, all_loads(Q))[:, chosen])
+    M = setup.gathered(setup.information.blocks(Q)[chosen])
     mean = 0.75 * e.test_poses**2 + 0.25 * e.elsewhere**2
-    assert float(setup.criterion.value(M)) == pytest.approx(mean, rel=1e-9)
+    assert float(setup.criterion.of_information(M)) == pytest.approx(mean, rel=1e-9)
     assert (e.random_test_poses, e.random_elsewhere) == (e.test_poses, e.elsewhere)
 
 
 def test_the_share_is_the_largest_that_the_cap_allows_and_no_plan_beats_the_bound() -> None:
     setup, six = made(None), np.array([6])
-    pool = setup.pool(Q, all_loads(Q), np.zeros(60, dtype=np.int64))
+    pool = setup.pool(Q, np.zeros(60, dtype=np.int64))
     share = share_within(setup, pool, six, 0.05, lambda message: None)
     assert 0.02 < share < 0.9
     own, least = setup.criterion, relax(balanced(setup.problem(pool, six))[0]).value
@@ -61,7 +58,7 @@ def test_the_share_is_the_largest_that_the_cap_allows_and_no_plan_beats_the_boun
         turned, _ = balanced(problem)
         relaxed = relax(turned)
         assert relaxed.bound <= exact_plan(turned, relaxed)[1]
-        return float(np.sqrt(own.value(problem.at(relaxed.weights)) / least) - 1)
+        return float(np.sqrt(own.of_information(problem.at(relaxed.weights)) / least) - 1)
 
     assert 0.045 < price(share) < 0.0505
     assert price(1.3 * share) > 0.05

@@ -16,7 +16,7 @@ from elastocal.identification.weighted_problem import weights_for
 from elastocal.measurements import Measurements
 from elastocal.model.manipulator import Model
 from elastocal.model.observations import observe
-from elastocal.planning.information import ALL_LOADS, PoseInformation, load_states, pose_covariance
+from elastocal.planning.information import PoseInformation, pose_covariance
 from elastocal.simulation.simulate import expand_plan, simulate
 
 POLAR = PolarNoise(10e-6, 0.3e-6, 15e-6, 6e-6)
@@ -35,11 +35,11 @@ def information_of(cell: Cell, x: np.ndarray | None = None) -> PoseInformation:
     model = Model.assembled(kr270_chain(), cell)
     x = model.nominal if x is None else x
     n = len(model.parameters)
-    return PoseInformation(model, load_states(cell), x[None], np.arange(n), np.ones(n))
+    return PoseInformation(model, x, np.arange(n), np.ones(n))
 
 
 def gathered(information: PoseInformation, q: np.ndarray) -> np.ndarray:
-    B = information.blocks(q, np.full(len(q), ALL_LOADS))[0].reshape(-1, len(information.columns))
+    B = information.blocks(q).reshape(-1, len(information.columns))
     return B.T @ B
 
 
@@ -64,7 +64,7 @@ def test_information_of_poses_is_that_of_their_readings(observed: str, noise: ob
 
 
 def _plan(information: PoseInformation):
-    rows = information.rows(TABLE_2, np.full(len(TABLE_2), ALL_LOADS), information.scenarios[0])
+    rows = information.rows(TABLE_2)
     first = np.unique(rows.configuration, return_index=True)[1]
     return replace(rows.take(first), force=np.zeros((len(first), 3)), sigma=None)
 
@@ -75,13 +75,12 @@ def _plan(information: PoseInformation):
         (cell_for("position", None), "needs the noise of a reading"),
         (cell_for("deflection", AXIS), "needs a load"),
         (cell_for("deflection", AXIS, loads=np.zeros((1, 3))), "needs a load"),
-        (cell_for("deflection", AXIS, loads=DOWN[None], load_choice=True), "load_choice"),
         (cell_for("position", AXIS, marker_sigma={"M1": 1e-5}), "no σ for marker"),
     ],
 )
 def test_what_a_plan_needs_to_know_is_asked_for(cell: Cell, said: str) -> None:
     with pytest.raises(InputError, match=said):
-        information_of(cell).blocks(TABLE_2, np.full(15, ALL_LOADS))
+        information_of(cell).blocks(TABLE_2)
 
 
 @pytest.mark.parametrize("own", [0.0, 60e-6])
@@ -93,7 +92,9 @@ def test_joints_and_configurations_scatter_readings_as_planned(observed: str, ow
     information = information_of(cell)
     model, plan = information.model, _plan(information)
     rows = expand_plan(plan, tuple(cell.tool.markers), 1, DOWN)
-    planned = pose_covariance(model, observe(rows_read(model, rows), observed), len(plan), None)
+    planned = pose_covariance(
+        model, observe(rows_read(model, rows), observed), len(plan), model.nominal
+    )
     read = [observe(simulate(model, rows, model.nominal, k), observed).value for k in range(200)]
     off = np.array(read) - observe(rows_read(model, rows), observed).value
     off = off.reshape(200, len(plan), -1)

@@ -9,7 +9,7 @@ from typing import Any
 import numpy as np
 import pytest
 from support.cells import DOWN, kr270_chain, random_poses
-from support.design_cells import all_loads, plan_cell, setup_of
+from support.design_cells import plan_cell, setup_of
 
 from elastocal.planning.arrangement import ordered
 from elastocal.planning.candidates import joint_space
@@ -40,9 +40,9 @@ class Walled(Feasibility):
 def selection() -> tuple[Any, Selection]:
     q = random_poses(CHAIN, 60, seed=2)
     setup = setup_of(CELL, q)
-    pool = setup.pool(q, all_loads(q), np.zeros(len(q), dtype=np.int64))
+    pool = setup.pool(q, np.zeros(len(q), dtype=np.int64))
     chosen = np.argsort(q[:, 0])[[0, 10, 20, 30, 40, 59]]
-    value = float(setup.criterion.value(setup.gathered(pool.blocks[:, chosen])))
+    value = float(setup.criterion.of_information(setup.gathered(pool.blocks[chosen])))
     certificate = Certificate(len(pool), value / 2, 0.5, value / 4, 0.25)
     return setup, Selection(pool, chosen, value, certificate, 50)
 
@@ -55,10 +55,11 @@ def walled(wall: float) -> Walled:
 
 def search(setup: Any, found: Selection, cell: Walled, effort: str) -> Search:
     space = joint_space(CELL, CHAIN)
-    searches = Searches(setup.information, space, cell, cell.pairs)
-    return Search.of(
-        setup, found.pool, searches, SHARES, EFFORTS[effort], 0, Checkpoint(), lambda text: None
-    )
+    searches = Searches(setup.information, space, cell)
+    return Search(
+        setup, found.pool, searches, SHARES, EFFORTS[effort], 0, Checkpoint(), lambda text: None,
+        setup,
+    )  # fmt: skip
 
 
 @pytest.mark.parametrize("effort", ["batch", "quick"])
@@ -71,7 +72,7 @@ def test_unreachable_poses_are_replaced_and_the_bound_still_holds(effort: str) -
     q = after.pool.q[after.chosen]
     assert (q[:, 0] < wall).all() and len(q) == 6
     assert after.value == pytest.approx(
-        float(setup.criterion.value(setup.gathered(after.pool.blocks[:, after.chosen])))
+        float(setup.criterion.of_information(setup.gathered(after.pool.blocks[after.chosen])))
     )
     c = after.certificate
     assert c.bound_pool == found.certificate.bound_pool

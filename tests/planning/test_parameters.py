@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 from support.cells import DOWN, TABLE_2, kr270_chain, random_poses
-from support.design_cells import FULL, all_loads, any_cell, plan_cell, scara, setup_of, spread
+from support.design_cells import FULL, any_cell, plan_cell, scara, setup_of, spread
 
 from elastocal.cell.work_cell import Cell
 from elastocal.errors import InputError, InsufficientDataError
@@ -16,7 +16,7 @@ from elastocal.identification.identify import identify
 from elastocal.identification.options import Options
 from elastocal.model.manipulator import Model
 from elastocal.planning import information as parameters
-from elastocal.planning.information import PoseInformation, load_states
+from elastocal.planning.information import PoseInformation
 from elastocal.planning.setup import Known
 from elastocal.simulation.simulate import simulate
 
@@ -30,10 +30,8 @@ def stacked(cell: Cell, q: NDArray, chain: Any = CHAIN) -> tuple[Model, NDArray]
     """B of all parameters, scaled to columns of equal length."""
     model = Model.assembled(chain, cell)
     n = len(model.names)
-    found = PoseInformation(
-        model, load_states(cell), model.nominal[None], np.arange(n), np.ones(n)
-    ).blocks(q, all_loads(q))
-    B = found[0].reshape(-1, n)
+    found = PoseInformation(model, model.nominal, np.arange(n), np.ones(n)).blocks(q)
+    B = found.reshape(-1, n)
     length = np.linalg.norm(B, axis=0)
     return model, B / np.where(length > 0, length, 1.0)
 
@@ -73,16 +71,10 @@ def test_what_is_dropped_moves_the_readings_as_its_mixing_says() -> None:
     setup = setup_of(plan_cell(FULL, "position", loads=BOTH), POSES)
     model, r = setup.information.model, setup.found.reduction
     n = len(model.names)
-    whole = PoseInformation(
-        model, setup.information.states, model.nominal[None], np.arange(n), setup.found.sizes
-    )
-    B = whole.blocks(TABLE_2, all_loads(TABLE_2))[0].reshape(-1, n) / setup.found.sizes
+    whole = PoseInformation(model, model.nominal, np.arange(n), setup.found.sizes)
+    B = whole.blocks(TABLE_2).reshape(-1, n) / setup.found.sizes
     off = (B[:, r.dropped] - B[:, r.kept] @ r.mixing) * setup.found.sizes[r.dropped]
     assert np.abs(off).max() < 1e-6 * np.abs(B * setup.found.sizes).max()
-
-
-def plan() -> tuple[NDArray, NDArray]:
-    return TABLE_2, all_loads(TABLE_2)
 
 
 # --- what counts --------------------------------------------------------------------------
@@ -104,8 +96,8 @@ def test_interest_names_parameters_places_or_effects(interest: Any, counted: Any
     chosen = parameters.interest_of(model, setup.found)
     expected = [k for k, c in enumerate(kept) if counted(model.parameters[c])]
     assert chosen.tolist() == expected
-    V = np.linalg.inv(setup.gathered(setup.information.blocks(*plan()))[0])
-    assert setup.value(*plan()) == pytest.approx(np.trace(V[np.ix_(chosen, chosen)]), rel=1e-8)
+    V = np.linalg.inv(setup.gathered(setup.information.blocks(TABLE_2)))
+    assert setup.value(TABLE_2) == pytest.approx(np.trace(V[np.ix_(chosen, chosen)]), rel=1e-8)
 
 
 @pytest.mark.parametrize(
@@ -132,11 +124,11 @@ def test_a_combination_has_the_variance_of_its_terms() -> None:
     terms = {"joint2.compliance": 1.0, "joint3.compliance": -2.0}
     cell = plan_cell(loads=DOWN[None], criterion="c", combination=terms)
     setup = setup_of(cell, POSES)
-    V = np.linalg.inv(setup.gathered(setup.information.blocks(*plan()))[0])
+    V = np.linalg.inv(setup.gathered(setup.information.blocks(TABLE_2)))
     V = V * np.outer(setup.information.sizes, setup.information.sizes)
     expected = V[0, 0] - 4 * V[0, 1] + 4 * V[1, 1]
-    assert setup.value(*plan()) == pytest.approx(expected, rel=1e-9)
-    assert setup.criterion.reported(setup.value(*plan())) == pytest.approx(
+    assert setup.value(TABLE_2) == pytest.approx(expected, rel=1e-9)
+    assert setup.criterion.reported(setup.value(TABLE_2)) == pytest.approx(
         (np.sqrt(expected), "rad/(N*m)")
     )
 
@@ -151,7 +143,7 @@ def test_a_plan_estimates_what_identification_will() -> None:
     )
     setup = setup_of(cell, TABLE_2, n_poses=len(TABLE_2))
     model = setup.information.model
-    rows = setup.information.rows(*plan(), model.nominal)
+    rows = setup.information.rows(TABLE_2)
     data = simulate(model, rows, model.nominal, 3)
     result = identify(model, data, Options(method="wls", faulty="keep"))
     assert set(setup.information.names) == set(result.determined)

@@ -14,7 +14,7 @@ import elastocal as ec
 from elastocal.cell.arm_description import Tool, Tracker
 from elastocal.cell.workspace_rules import Visibility, Workspace
 from elastocal.model.observations import observe
-from elastocal.planning.information import ALL_LOADS, observed_weights
+from elastocal.planning.information import observed_weights
 
 STATES = np.array([[0.0, 0, 0], DOWN])
 Q = TABLE_2[:6]
@@ -46,13 +46,12 @@ def test_a_marker_is_seen_in_range_turned_to_the_tracker_and_behind_nothing() ->
 def test_information_is_that_of_the_readings_that_are_made(observed: str, tau: float) -> None:
     """With what an arm does not repeat, which the markers of a visit share."""
     whole = information_of(cell_for(observed, AXIS, loads=STATES, repeatability=tau))
-    model, x = whole.model, whole.scenarios[0]
+    model, x = whole.model, whole.x
     rng = np.random.default_rng(3)
     shown = {tuple(f): rng.random((len(Q), 3)) < 0.7 for f in STATES}
     part = replace(whole, sight=lambda q, force: shown[tuple(force)])
-    load = np.full(len(Q), ALL_LOADS)
-    seen = part.seen(Q, load)
+    seen = part.seen(Q)
     assert 0 < seen.mean() < 1
-    read = observe(part.rows(Q, load, x).take(seen.reshape(-1)), observed)
+    read = observe(part.rows(Q).take(seen.reshape(-1)), observed)
     B = observed_weights(model, read, x).apply(model.regressor(read.table, x, None, read).B)
     assert relative(gathered(part, Q), B.T @ B) < 1e-9

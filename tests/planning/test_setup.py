@@ -10,7 +10,6 @@ import pytest
 from numpy.typing import NDArray
 from support.cells import COMPENSATOR, COMPLIANCE, DOWN, TABLE_2, kr270_chain, random_poses
 from support.design_cells import (
-    all_loads,
     any_cell,
     as_table,
     plan_cell,
@@ -138,7 +137,7 @@ def test_the_value_is_what_identification_would_leave_at_the_test_poses(
     targets = target_poses.test_poses(cell, chain)
     setup = setup_of(cell, spread(chain, 80, 4), chain)
     expected = remaining_error(cell, chain, q, targets)
-    value = setup.value(q, all_loads(q))
+    value = setup.value(q)
     assert value == pytest.approx(expected, rel=1e-5)
     assert setup.criterion.reported(value) == (pytest.approx(1e6 * np.sqrt(expected)), "µm")
 
@@ -152,35 +151,16 @@ def test_a_prior_adds_its_information() -> None:
     prior = GaussianPrior(names, np.zeros(2), np.diag(std**2))
     setup = setup_of(cell, POSES, known=Known(prior=prior))
     without = setup_of(cell, POSES)
-    added = (setup.prior - without.prior)[0] / np.outer(*[setup.information.sizes] * 2)
+    added = (setup.prior - without.prior) / np.outer(*[setup.information.sizes] * 2)
     expected = np.zeros_like(added)
     for name, s in zip(names, std, strict=True):
         k = setup.information.names.index(name)
         expected[k, k] = s**-2
     assert np.allclose(added, expected, rtol=1e-12)
-    plan = (TABLE_2, all_loads(TABLE_2))
-    assert setup.value(*plan) < without.value(*plan)
+    assert setup.value(TABLE_2) < without.value(TABLE_2)
 
 
 def test_a_prior_of_an_unknown_parameter_is_refused() -> None:
     prior = GaussianPrior.independent(("joint9.compliance",), [0.0], [1.0])
     with pytest.raises(InputError, match=r"joint9\.compliance.*did you mean"):
         setup_of(plan_cell(loads=DOWN[None]), POSES, known=Known(prior=prior))
-
-
-# --- scenarios -------------------------------------------------------------------------------
-
-
-def test_scenarios_come_from_the_seed_and_move_the_arm_alone() -> None:
-    effects = ("base_frame", "joint_offset", "joint_compliance", "marker_position")
-    cell = plan_cell(effects, "position", loads=BOTH, robust="average", robust_samples=3)
-    first, again, other = (setup_of(cell, POSES[:20], seed=s) for s in (4, 4, 5))
-    a, b, c = (s.information.scenarios for s in (first, again, other))
-    assert np.array_equal(a, b)
-    model = first.information.model
-    assert len(a) == 4
-    assert np.array_equal(a[0], model.nominal)
-    placed = np.array([p.effect in ("base_frame", "marker_position") for p in model.parameters])
-    assert (a[1:, placed] == model.nominal[placed]).all()
-    assert (a[1:, ~placed] != model.nominal[~placed]).all()
-    assert not np.isclose(a[1:, ~placed], c[1:, ~placed]).any()

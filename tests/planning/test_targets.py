@@ -18,7 +18,6 @@ from elastocal.model.arm import Parameter
 from elastocal.model.chain import Chain
 from elastocal.model.manipulator import Model
 from elastocal.planning import test_poses as target_poses
-from elastocal.planning.information import PoseInformation, load_states
 from elastocal.planning.test_poses import TargetPoses, prediction_rows
 
 CHAIN = kr270_chain()
@@ -29,9 +28,7 @@ LEVELS = tuple(np.unique(TABLE_2[:, 1]).tolist())
 
 def rows_at(cell: Cell, targets: TargetPoses, x: NDArray, chain: Chain = CHAIN) -> NDArray:
     model = Model.assembled(chain, cell)
-    n = len(model.names)
-    information = PoseInformation(model, load_states(cell), x[None], np.arange(n), np.ones(n))
-    return prediction_rows(information, targets, x)
+    return prediction_rows(model, targets, x)
 
 
 def somewhere(model: Model, seed: int = 0) -> NDArray:

@@ -19,7 +19,6 @@ from elastocal.measurements import Measurements
 from elastocal.model.chain import Chain, Joint, LinkMass
 from elastocal.model.manipulator import Model
 from elastocal.planning import test_poses as target_poses
-from elastocal.planning.information import ALL_LOADS, load_states
 from elastocal.planning.setup import Known, Setup, set_up
 from elastocal.planning.test_poses import TargetPoses
 from elastocal.units import Array
@@ -87,21 +86,15 @@ def setup_of(
     chain: Chain | None = None,
     known: Known | None = None,
     seed: int = 0,
-    load: NDArray | None = None,
     targets: TargetPoses | None = None,
     n_poses: int = 10**9,  # so many show whatever can be shown
 ) -> Setup:
     """What a design knows before it chooses among candidates q (N, n)."""
     chain = chain or kr270_chain()
     return set_up(
-        Model.assembled(chain, cell), load_states(cell), q,
-        all_loads(q) if load is None else load, n_poses,
-        targets or target_poses.test_poses(cell, chain, None, seed), known or Known(), seed,
+        Model.assembled(chain, cell), q, n_poses,
+        targets or target_poses.test_poses(cell, chain, None, seed), known or Known(),
     )  # fmt: skip
-
-
-def all_loads(q: NDArray) -> NDArray:
-    return np.full(len(q), ALL_LOADS)
 
 
 def as_table(q: NDArray) -> Measurements:

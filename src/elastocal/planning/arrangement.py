@@ -13,7 +13,7 @@ from elastocal.planning.drift import Alias
 from elastocal.planning.exchange import exchange, fitted
 from elastocal.planning.execution import Execution, schedule
 from elastocal.planning.feasibility import Feasibility
-from elastocal.planning.moves import Blockers, Unreachable
+from elastocal.planning.moves import Unreachable, blockers_of
 from elastocal.planning.search import Search, Selection
 from elastocal.planning.setup import FeasiblePool, Setup
 from elastocal.planning.time_budget import at_stops
@@ -162,7 +162,7 @@ def _execution(
         loads=setup.information.forces,
         limits=joint_limits(cell, feasibility.chain),
         via=pool.q[:: max(len(pool) // VIA, 1)],
-        blockers=Blockers(feasibility),
+        blockers=blockers_of(feasibility),
         alias=plan.alias,
         paired=cell.model.observe == "deflection",
         seed=seed, progress=progress,

@@ -35,7 +35,7 @@ from elastocal.planning.doubts import OPEN, Place, gain_of, in_doubt
 from elastocal.planning.exchange import Sizes, random_information, values_without
 from elastocal.planning.feasibility import Feasibility
 from elastocal.planning.information import Done, measured, next_number, plan_forces, readings_each
-from elastocal.planning.moves import Blockers
+from elastocal.planning.moves import blockers_of
 from elastocal.planning.pins import Pins
 from elastocal.planning.plan import (
     CandidateCounts,
@@ -590,7 +590,7 @@ def _check_home(cell: Cell, feasibility: Feasibility) -> None:
     home = cell.design.motion.home
     if home is None:
         return
-    met = Blockers(feasibility)(home, home, False)
+    met = blockers_of(feasibility)(home, home, False)
     require(
         not met,
         f"{cell.path or cell.name}: [design.motion] home brings {listed(met)} too close to each "

@@ -16,7 +16,7 @@ from elastocal.errors import require
 from elastocal.identification.visit_record import course_waves
 from elastocal.planning.moves import Costs, Moves
 from elastocal.planning.setup import FeasiblePool, Setup
-from elastocal.units import Array, IntArray
+from elastocal.units import Array, IntArray, Progress
 
 # What a steady drift of tracker or base does to what the readings are evaluated for.
 
@@ -135,10 +135,6 @@ def in_turns(tour: list[int], load: IntArray, sequence: list[int]) -> list[int]:
     return [int(v) for s in sequence for v in parts[s].pop(0)]
 
 
-def _travel(costs: Costs) -> Array:
-    return costs.cost - costs.apart - costs.changed
-
-
 # The order: first little bias, then little travel, by simulated annealing.
 
 # Temperatures in units of a bias that is as good as none: the searches begin at those of HOT, the
@@ -146,18 +142,21 @@ def _travel(costs: Costs) -> Array:
 # making or but for moves that turn out to be blocked, is bettered from WARM.
 HOT, WARM, COLD = (4.0, 4.0, 4.0, 1.0, 0.25), 0.06, 1e-3
 STEPS, FEW, MENDING = 40_000, 10_000, 2_500  # from HOT, from WARM, and of blocked moves
+ROUNDS = 12  # of blocked moves found and the order mended, before the ways around are taken
+HOPED = 0.5  # of its bias is left by a whole search, at best, to an order that is nearly good
 
 
 @dataclass(frozen=True)
-class VisitTimes:
+class Clock:
     """When each visit of an order is read, and what a drift then does.
 
-    `travel` (V + 1, V + 1) s between nodes, `change` s where that changes the load, `visit` s of
-    reading at a node; `share` (V, m·3) of each visit.  Of travel `longest` s are allowed; a bias
-    of `enough` per m of drift is as good as none.
+    `change` (V + 1, V + 1) s where a move changes the load, `visit` s of reading at a node; `share`
+    (V, m·3) of each visit.  Of travel `longest` s are allowed; a bias of `enough` per m of drift is
+    as good as none.
     """
 
-    travel: Array
+    moves: Moves
+    costs: Costs
     change: Array
     visit: float
     share: Array
@@ -167,29 +166,29 @@ class VisitTimes:
     @classmethod
     def of(
         cls, moves: Moves, motion: Motion, costs: Costs, alias: Alias | None, shortest: list[int]
-    ) -> VisitTimes:
+    ) -> Clock:
         """Allows so much more travel than in the `shortest` tour as `motion` has extra time."""
-        visits = moves.visits
-        share = np.zeros((1 + visits.pose.max(), 1 + visits.load.max(), 1, 3))
+        share = np.zeros((1 + moves.pose.max(), 1 + moves.load.max(), 1, 3))
         if alias is not None:
             share = alias.share
         times = np.zeros(share.shape[:2])  # that each is read; each time with a part of it
-        np.add.at(times, (visits.pose, visits.load), 1.0)
+        np.add.at(times, (moves.pose, moves.load), 1.0)
         share = share / np.maximum(times, 1.0)[..., None, None]
         made = cls(
-            travel=_travel(costs),
-            change=np.where(costs.changed > 0, motion.load_change, 0.0),
+            moves,
+            costs,
+            change=np.where(costs.changed, motion.load_change, 0.0),
             visit=motion.dwell * (1 if moves.signs is None else 2),
-            share=share[visits.pose, visits.load].reshape(len(visits.pose), -1),
+            share=share[moves.pose, moves.load].reshape(len(moves.pose), -1),
             longest=np.inf,
             enough=1.0 if alias is None else HARMLESS * alias.noise / DRIFT,
         )
         longest = made.driving(shortest) + motion.longer * made.time(shortest)
         return replace(made, longest=longest)
 
-    def at(self, costs: Costs) -> VisitTimes:
+    def known(self) -> Clock:
         """With what is known of the moves since."""
-        return replace(self, travel=_travel(costs))
+        return replace(self, costs=self.moves.costs())
 
     def possible(self, tour: list[int]) -> bool:
         """Has every move a way, within the time allowed?"""
@@ -197,11 +196,11 @@ class VisitTimes:
 
     def driving(self, tour: list[int]) -> float:
         ring = np.array([0, *tour, 0])
-        return float(self.travel[ring[:-1], ring[1:]].sum())
+        return float(self.costs.travel[ring[:-1], ring[1:]].sum())
 
     @cached_property
     def _step(self) -> Array:
-        return self.travel + self.change + self.visit
+        return self.costs.travel + self.change + self.visit
 
     def time(self, tour: list[int]) -> float:
         """s from the first move to the last."""
@@ -210,55 +209,125 @@ class VisitTimes:
         return self.driving(tour) + self.visit * len(tour) + changing
 
     def _errors(self, ring: IntArray) -> Array:
-        """(m·3,) error per m of drift in x, y, z, counted from the readings' mean time; the visits
+        """(m, 3) error per m of drift in x, y, z, counted from the readings' mean time; the visits
         with a node 0 before and after them."""
         there = ring[1:-1]
         time = self._step[ring[:-2], there].cumsum()
-        at = np.zeros(len(self.travel))
+        at = np.zeros(len(self._step))
         at[there] = time - np.add.reduce(time) / len(time)
-        return np.asarray(at[1:] @ self.share / max(float(time[-1] - time[0]), 1e-300))
+        errors = at[1:] @ self.share / max(float(time[-1] - time[0]), 1e-300)
+        return np.asarray(errors.reshape(-1, 3))
 
     def bias(self, tour: list[int]) -> float:
         """Error per m of drift in its worst direction."""
-        ring = np.array([0, *tour, 0])
-        return float(np.linalg.norm(self._errors(ring).reshape(-1, 3), ord=2))
+        return float(np.linalg.norm(self._errors(np.array([0, *tour, 0])), ord=2))
 
     def price(self, tour: list[int]) -> float:
         """What annealing makes small: bias beyond `enough`, travel beyond `longest`, travel."""
         ring = np.array([0, *tour, 0])
-        errors = self._errors(ring).reshape(-1, 3)
+        errors = self._errors(ring)
         across = errors.T @ errors
         # Between rms and worst direction, which is what counts: Schatten's norm of order 4.
         bias = math.sqrt(math.sqrt(np.vdot(across, across))) / self.enough
-        driving = float(np.add.reduce(self.travel[ring[:-1], ring[1:]])) / self.longest
+        driving = float(np.add.reduce(self.costs.travel[ring[:-1], ring[1:]])) / self.longest
         return max(bias - 1, 0.0) + 100 * max(driving - 1, 0.0) + 0.1 * driving
 
+    def annealed(self, tour: list[int], seed: int, steps: int, hot: float) -> list[int]:
+        """The tour with its visits exchanged and moved between blocks of the same load state,
+        never more changes of load, by annealing the price from `hot` down to COLD."""
+        if len(tour) < 3 or not steps:
+            return tour
+        rng = np.random.default_rng(seed)
+        here, price = list(tour), self.price(tour)
+        best, least = here, price
+        loads = [-1, *self.moves.load.tolist()]  # by node
+        cooling, temperature = (COLD / hot) ** (1 / steps), hot
+        for kind, a, b, luck in rng.random((steps, 4)).tolist():
+            temperature *= cooling
+            new = _moved(here, loads, kind, int(a * len(here)), int(b * len(here)))
+            if new is None:
+                continue
+            found = self.price(new)
+            if found <= price or luck < math.exp((price - found) / temperature):
+                here, price = new, found
+                if price < least:
+                    best, least = here, price
+        return best
 
-def balanced(
-    tour: list[int], load: IntArray, clock: VisitTimes, seed: int, steps: int, hot: float
-) -> list[int]:
-    """The tour with its visits exchanged and moved between blocks of the same load state (V,),
-    never more changes of load, by annealing the clock's price from `hot` down to COLD."""
-    if len(tour) < 3 or not steps:
-        return tour
-    rng = np.random.default_rng(seed)
-    here, price = list(tour), clock.price(tour)
-    best, least = here, price
-    draws = rng.random((steps, 4)).tolist()
-    loads = [-1, *load.tolist()]  # by node
-    cooling = (COLD / hot) ** (1 / steps)
-    temperature = hot
-    for kind, a, b, luck in draws:
-        temperature *= cooling
-        new = _moved(here, loads, kind, int(a * len(here)), int(b * len(here)))
-        if new is None:
-            continue
-        found = clock.price(new)
-        if found <= price or luck < math.exp((price - found) / temperature):
-            here, price = new, found
-            if price < least:
-                best, least = here, price
-    return best
+    def searched(self, near: list[int], seed: int, progress: Progress) -> tuple[list[int], Clock]:
+        """The order of least price found from one that is `near` a good one."""
+        best, clock, moves = near, self, self.moves
+        for k, hot in enumerate((None, *HOT)):
+            new = near if hot is None else clock.annealed(best, seed + k, STEPS, hot)
+            rounds = 0
+            while moves.check(new, clock.costs):
+                progress(f"order of execution against drift: {moves.checked} moves checked")
+                rounds += 1
+                if moves.crowded or rounds == ROUNDS:
+                    moves.settle()
+                clock = clock.known()
+                if rounds <= ROUNDS:
+                    new = clock.annealed(new, seed + rounds, MENDING, WARM)
+            best = min(best, new, key=clock.price)
+            # Enough where a drift does no harm any more; without an alias the way alone counts.
+            if clock.possible(best) and clock.share.any() and clock.bias(best) <= clock.enough:
+                break
+        return best, clock
+
+
+def against_drift(
+    moves: Moves,
+    motion: Motion,
+    tour: list[int],
+    costs: Costs,
+    alias: Alias | None,
+    seed: int,
+    progress: Progress,
+) -> tuple[list[int], Moves, Costs, Drifting | None]:
+    """The visits of the shortest `tour` in the order that a drift harms least, with the moves and
+    costs that they are nodes of, and what the drift does to it; the shortest tour itself where no
+    other is better.  Where there is time for it, all poses are read twice without load; where no
+    extra time is stated, if (ρ² + b²) t falls, of the error at the test poses ρ, the drift's
+    part of it b and the time t: if more readings, by which ρ² falls as 1/t, would give less."""
+    used = [int(s) for s in dict.fromkeys(moves.load[np.array(tour) - 1])]
+    sequence = turns(moves.loaded.tolist(), used, motion.load_changes)
+    clock = Clock.of(moves, motion, costs, alias, tour)
+    before, noise = clock.bias(tour), 0.0 if alias is None else alias.noise
+    as_pays = motion.extra_time is None
+
+    def harm(bias: float, time: float) -> float:
+        squared = noise**2 + (DRIFT * bias) ** 2
+        return squared * time if as_pays else max(bias, clock.enough)
+
+    once = clock.annealed(in_turns(tour, moves.load, sequence), seed, FEW, WARM)
+    (spread, again), twice = moves.unloaded_twice(tour), None
+    longer = len(again) * clock.visit
+    left = clock.longest - (0.0 if as_pays else longer)
+    once_harms = clock.bias(once), clock.time(once)
+    # Can it pay, if no drift is left at all?
+    pays = harm(0.0, clock.time(tour) + longer) < harm(*once_harms)
+    if alias is not None and len(again) and pays and left >= clock.driving(tour):
+        own = replace(Clock.of(spread, motion, spread.costs(), alias, tour), longest=left)
+        begun = own.annealed(in_turns([*tour, *again], spread.load, sequence), seed, FEW, WARM)
+        found, own = own.searched(begun, seed, progress)
+        if own.possible(found):
+            twice = found, own
+    twice_harms = (
+        np.inf if twice is None else harm(twice[1].bias(twice[0]), twice[1].time(twice[0]))
+    )
+    if harm(HOPED * once_harms[0], once_harms[1]) <= twice_harms:
+        once, clock = clock.known().searched(once, seed, progress)
+        more = bool(motion.load_changes) and alias is None
+        if not clock.possible(once) or not (more or clock.bias(once) < before):
+            once = tour
+    if twice is not None and twice_harms < harm(clock.bias(once), clock.time(once)):
+        once, clock = twice
+    while clock.moves.check(once, clock.costs):
+        clock = clock.known()
+    drift = None
+    if alias is not None:
+        drift = Drifting(DRIFT * clock.bias(once), DRIFT * before, noise, alias.at_test_poses)
+    return once, clock.moves, clock.costs, drift
 
 
 def _moved(tour: list[int], load: list[int], kind: float, i: int, j: int) -> list[int] | None:
@@ -300,23 +369,22 @@ def with_references(
     is visited in all.  Where readings are `paired`, loaded with unloaded, it is visited loaded no
     more often than without load.
     """
-    visits = moves.visits
-    mean = _travel(costs)[1:, 1:].mean(axis=0)
-    states = [int(s) for s in dict.fromkeys(visits.load[np.array(tour) - 1])]
-    common = set.intersection(*(set(visits.pose[visits.load == s].tolist()) for s in states))
+    mean = costs.travel[1:, 1:].mean(axis=0)
+    states = [int(s) for s in dict.fromkeys(moves.load[np.array(tour) - 1])]
+    common = set.intersection(*(set(moves.pose[moves.load == s].tolist()) for s in states))
     if common:
-        best = min(sorted(common), key=lambda k: float(mean[visits.pose == k].sum()))
-        candidates = visits.pose == best
+        best = min(sorted(common), key=lambda k: float(mean[moves.pose == k].sum()))
+        candidates = moves.pose == best
     else:
-        candidates = np.ones(len(visits.pose), dtype=bool)
+        candidates = np.ones(len(moves.pose), dtype=bool)
     chosen = {
-        s: 1 + min(np.flatnonzero(candidates & (visits.load == s)).tolist(), key=lambda v: mean[v])
+        s: 1 + min(np.flatnonzero(candidates & (moves.load == s)).tolist(), key=lambda v: mean[v])
         for s in states
     }
     times = dict.fromkeys(states, 0)
     found: list[tuple[int, int]] = []
     for k, node in enumerate([*tour, tour[-1]]):
-        state = int(visits.load[node - 1])
+        state = int(moves.load[node - 1])
         if k % every == 0 or k == len(tour):
             times[state] += 1
             found.append((chosen[state], times[state]))
@@ -327,6 +395,6 @@ def with_references(
         found = [
             (node, again)
             for node, again in found
-            if again <= most or not moves.loaded[visits.load[node - 1]]
+            if again <= most or not moves.loaded[moves.load[node - 1]]
         ]
     return found

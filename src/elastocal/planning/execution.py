@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections import Counter
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from itertools import pairwise
 
@@ -11,30 +11,9 @@ import numpy as np
 
 from elastocal.cell.plan_wishes import Motion
 from elastocal.errors import require
-from elastocal.planning.drift import (
-    DRIFT,
-    FEW,
-    HOT,
-    MENDING,
-    STEPS,
-    WARM,
-    Alias,
-    Drifting,
-    VisitTimes,
-    balanced,
-    in_turns,
-    turns,
-    with_references,
-)
-from elastocal.planning.moves import (
-    BlockersOf,
-    Costs,
-    Moves,
-    PathChecker,
-    check_reachable,
-    refuse_impossible,
-)
-from elastocal.units import Array, IntArray
+from elastocal.planning.drift import Alias, Drifting, against_drift, with_references
+from elastocal.planning.moves import BlockersOf, Costs, Moves, PathChecker, Reach
+from elastocal.units import Array, IntArray, Progress
 
 # The order of execution as it is handed on: stops, how to get to them, what it takes.
 
@@ -130,8 +109,8 @@ class Execution:
 def _stops(moves: Moves, u: int, v: int, costs: Costs) -> list[Stop]:
     """The reading of node v after node u, or two where it is approached from both sides."""
     _, way = moves.way(u, v, costs)
-    visits, node = moves.visits, v - 1
-    pose, load, leave = int(visits.pose[node]), int(visits.load[node]), int(visits.leave[node])
+    node = v - 1
+    pose, load, leave = int(moves.pose[node]), int(moves.load[node]), int(moves.leave[node])
     q, side = moves.points[leave], int(costs.side[u, node])
     before, after = moves.carries(u), moves.carries(v)
     if moves.signs is None:
@@ -145,9 +124,9 @@ def _stops(moves: Moves, u: int, v: int, costs: Costs) -> list[Stop]:
     signs, opposite = moves.signs[pose], 1 - side
     time = _time(moves, [*way, leave])
     first = Stop(pose, load, q, moves.points[passed], time, change, signs[side], side)
-    if not np.isfinite(visits.inside[node, opposite]):
+    if not np.isfinite(moves.inside[node, opposite]):
         return [first]
-    other = int(visits.entry[node, opposite])
+    other = int(moves.entry[node, opposite])
     time = _time(moves, [leave, other, leave])
     via = moves.points[[other]]
     return [first, Stop(pose, load, q, via, time, None, signs[opposite], opposite)]
@@ -267,7 +246,6 @@ def schedule(
     checker: PathChecker,
     *,
     loads: Array | None = None,
-    load: IntArray | None = None,
     limits: tuple[Array, Array] | None = None,
     via: Array | None = None,
     blockers: BlockersOf | None = None,
@@ -275,27 +253,25 @@ def schedule(
     paired: bool = False,
     seed: int = 0,
     kicks: int = KICKS,
-    progress: Callable[[str], None] = lambda message: None,
+    progress: Progress = lambda message: None,
 ) -> Execution:
     """The order of `q` (N, n) with the least travel time found, from and to `motion.home`.
 
-    Every pose is visited under each of `loads` (L, 3) N (None: once, without load), or under
-    loads[load[i]] where `load` (N,) says so.  Load states are done one after the other with as
-    few changes as possible, unloaded first where that costs nothing.  A move is straight in
-    joint space; where that is blocked, it goes through other poses, home, or points `via`
-    (k, n), which are not measured.  With `motion.both_directions` each pose is measured twice,
-    the joints coming from below and from above, inside `limits` (lower, upper); once where one
-    side is blocked (`Execution.one_sided`).
+    Every pose is visited under each of `loads` (L, 3) N (None: once, without load).  Load states
+    are done one after the other with as few changes as possible, unloaded first where that costs
+    nothing.  A move is straight in joint space; where that is blocked, it goes through other poses,
+    home, or points `via` (k, n), which are not measured.  With `motion.both_directions` each pose
+    is measured twice, the joints coming from below and from above, inside `limits` (lower, upper);
+    once where one side is blocked (`Execution.one_sided`).
 
     Solve, check the moves of the solution, forbid the blocked ones, and again: at the end all
     moves are checked, and the tour is one that the search holds best at costs that are
     nowhere above the true ones.  The same seed gives the same order.
 
-    With an `alias` the order found is one in which a drift does little to what the plan is for,
-    as far as `motion.extra_time` allows more travel than the shortest takes (None: EXTRA_TIME,
-    and poses are read twice without load where that pays) and `motion.load_changes` more changes
-    of load.  `motion.reference_every` visits one pose is
-    visited again; where readings are `paired`, loaded with unloaded, no more often loaded.
+    With an `alias` the order found is one in which a drift does little to what the plan is for, as
+    far as `motion.extra_time` and `motion.load_changes` allow.  After `motion.reference_every`
+    visits one pose is visited again; where readings are `paired`, loaded with unloaded, no more
+    often loaded.
 
     Raises InsufficientDataError that names a pose which no free move reaches, or which cannot
     be approached as asked, and what is in the way if `blockers` can tell; InputError for
@@ -304,8 +280,8 @@ def schedule(
     q = np.asarray(q, dtype=float)
     require(q.ndim == 2 and len(q) > 0, "there is no pose to put in order")
     forces = np.zeros((1, 3)) if loads is None else np.asarray(loads, dtype=float)
-    moves = Moves.of(q, motion, checker, forces, load, limits, via)
-    check_reachable(moves, blockers)
+    moves = Moves.of(q, motion, checker, forces, limits, via)
+    Reach(moves, blockers).check()
     costs = moves.costs()
     tour = greedy_tour(costs.cost)
     thorough, done, rounds = False, False, 0
@@ -320,20 +296,17 @@ def schedule(
                 moves.settle()
             costs = moves.costs()
         done, thorough = thorough and not blocked, not blocked
-    refuse_impossible(moves, tour, costs, blockers)
+    Reach(moves, blockers).check_tour(tour, costs)
     drift = None
     if (alias is not None or motion.load_changes) and motion.longer > 0:
-        tour, moves, later, drift = _against_drift(
-            moves, motion, tour, costs, alias, seed, progress
-        )
-        costs = later
+        tour, moves, costs, drift = against_drift(moves, motion, tour, costs, alias, seed, progress)
     order = [(node, 0) for node in tour]
     if motion.reference_every:
         order = with_references(tour, moves, costs, motion.reference_every, paired)
         while moves.check([node for node, _ in order], costs):
             costs = moves.costs()
     nodes = [node for node, _ in order]
-    refuse_impossible(moves, nodes, costs, blockers)
+    Reach(moves, blockers).check_tour(nodes, costs)
     stops = [
         replace(stop, again=again)
         for (u, (v, again)) in zip([0, *nodes], order, strict=False)
@@ -358,118 +331,6 @@ def schedule(
     )
 
 
-ROUNDS = 12  # of blocked moves found and the order mended, before the ways around are taken
-HOPED = 0.5  # of its bias is left by a whole search, at best, to an order that is nearly good
-
-
-@dataclass(frozen=True)
-class _Order:
-    """Visits in an order, with the moves, costs and times that they are nodes of."""
-
-    tour: list[int]
-    moves: Moves
-    costs: Costs
-    clock: VisitTimes
-
-    @property
-    def bias(self) -> float:
-        return self.clock.bias(self.tour)
-
-    @property
-    def time(self) -> float:
-        return self.clock.time(self.tour)
-
-    @property
-    def possible(self) -> bool:
-        return self.clock.possible(self.tour)
-
-    @property
-    def price(self) -> float:
-        return self.clock.price(self.tour)
-
-    def annealed(self, seed: int, steps: int, hot: float) -> _Order:
-        load = self.moves.visits.load
-        return replace(self, tour=balanced(self.tour, load, self.clock, seed, steps, hot))
-
-    def known(self) -> _Order:
-        """With what is known of the moves since."""
-        costs = self.moves.costs()
-        return replace(self, costs=costs, clock=self.clock.at(costs))
-
-
-def _against_drift(
-    moves: Moves,
-    motion: Motion,
-    tour: list[int],
-    costs: Costs,
-    alias: Alias | None,
-    seed: int,
-    progress: Callable[[str], None],
-) -> tuple[list[int], Moves, Costs, Drifting | None]:
-    """The visits of the shortest `tour` in the order that a drift harms least, with the moves and
-    costs that they are nodes of, and what the drift does to it; the shortest tour itself where no
-    other is better.  Where there is time for it, all poses are read twice without load; where no
-    extra time is stated, if (ρ² + b²) t falls, of the error at the test poses ρ, the drift's
-    part of it b and the time t: if more readings, by which ρ² falls as 1/t, would give less."""
-    load = moves.visits.load
-    used = [int(s) for s in dict.fromkeys(load[np.array(tour) - 1])]
-    sequence = turns(moves.loaded.tolist(), used, motion.load_changes)
-    clock = VisitTimes.of(moves, motion, costs, alias, tour)
-    before, noise = clock.bias(tour), 0.0 if alias is None else alias.noise
-    as_pays = motion.extra_time is None
-
-    def harm(bias: float, time: float) -> float:
-        squared = noise**2 + (DRIFT * bias) ** 2
-        return squared * time if as_pays else max(bias, clock.enough)
-
-    once = _Order(in_turns(tour, load, sequence), moves, costs, clock).annealed(seed, FEW, WARM)
-    (spread, again), twice = moves.unloaded_twice(tour), None
-    longer = len(again) * clock.visit
-    left = clock.longest - (0.0 if as_pays else longer)
-    # Can it pay, if no drift is left at all?
-    pays = harm(0.0, clock.time(tour) + longer) < harm(once.bias, once.time)
-    if alias is not None and len(again) and pays and left >= clock.driving(tour):
-        own = VisitTimes.of(spread, motion, spread.costs(), alias, tour)
-        begun = in_turns([*tour, *again], spread.visits.load, sequence)
-        found = _Order(begun, spread, spread.costs(), replace(own, longest=left))
-        found = _searched(found.annealed(seed, FEW, WARM), seed, progress)
-        twice = found if found.possible else None
-    if twice is None or harm(HOPED * once.bias, once.time) <= harm(twice.bias, twice.time):
-        once = _searched(once.known(), seed, progress)
-        more = bool(motion.load_changes) and alias is None
-        if not once.possible or not (more or once.bias < before):
-            once = replace(once, tour=tour)
-    best = once
-    if twice is not None and harm(twice.bias, twice.time) < harm(once.bias, once.time):
-        best = twice
-    while best.moves.check(best.tour, best.costs):
-        best = best.known()
-    drift = None
-    if alias is not None:
-        drift = Drifting(DRIFT * best.bias, DRIFT * before, noise, alias.at_test_poses)
-    return best.tour, best.moves, best.costs, drift
-
-
-def _searched(near: _Order, seed: int, progress: Callable[[str], None]) -> _Order:
-    """The order of least price found from one that is `near` a good one."""
-    best, moves = near, near.moves
-    for k, hot in enumerate((None, *HOT)):
-        new, rounds = near if hot is None else best.annealed(seed + k, STEPS, hot), 0
-        while moves.check(new.tour, new.costs):
-            progress(f"order of execution against drift: {moves.checked} moves checked")
-            rounds += 1
-            if moves.crowded or rounds == ROUNDS:
-                moves.settle()
-            new = new.known()
-            if rounds <= ROUNDS:
-                new = new.annealed(seed + rounds, MENDING, WARM)
-        best = min(replace(new, tour=best.tour), new, key=lambda order: order.price)
-        # Enough where a drift does no harm any more; without an alias the way alone counts.
-        if best.possible and best.clock.share.any() and best.bias <= best.clock.enough:
-            break
-    return best
-
-
 def _unloaded_first(tour: list[int], cost: Array, moves: Moves) -> list[int]:
     """The tour or its reverse: the cheaper one, else the one that begins without load, else
     with the lower pose, so that the answer does not hang on the solver's whim."""
@@ -479,6 +340,6 @@ def _unloaded_first(tour: list[int], cost: Array, moves: Moves) -> list[int]:
 
     def key(order: list[int]) -> tuple[bool, int]:
         first = order[0] - 1
-        return bool(moves.loaded[moves.visits.load[first]]), int(moves.visits.pose[first])
+        return bool(moves.loaded[moves.load[first]]), int(moves.pose[first])
 
     return min(tour, tour[::-1], key=key)

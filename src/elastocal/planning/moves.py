@@ -2,9 +2,8 @@
 
 from __future__ import annotations
 
-import dataclasses
 from collections.abc import Callable, Iterable, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from itertools import pairwise, product
 from typing import Protocol
 
@@ -13,107 +12,10 @@ from numpy.typing import NDArray
 from scipy.sparse import csgraph
 
 from elastocal.cell.plan_wishes import Motion
-from elastocal.errors import InputError, InsufficientDataError, require
+from elastocal.errors import InputError, InsufficientDataError
 from elastocal.planning.collision import Collisions
 from elastocal.planning.feasibility import LOADED, Feasibility
-from elastocal.units import Array, IntArray
-
-# Approach of a pose from both sides, so that backlash and hysteresis show.
-
-
-def approach_signs(q: Array, lower: Array, upper: Array, overshoot: float) -> IntArray:
-    """Directions (N, 2, n) of the last motion of each joint: first upwards (+1), then down (−1).
-
-    The arm starts that motion at q − sign · overshoot, for poses `q` (N, n), in rad or m.  A
-    joint that would leave its limits [lower, upper] (n,) there comes from its other side both
-    times.  Raises InputError where neither side has room.
-    """
-    require(overshoot > 0, f"the overshoot must be positive; found {overshoot:g}")
-    below, above = q - overshoot >= lower, q + overshoot <= upper
-    if not (below | above).all():
-        i, j = (int(v) for v in np.argwhere(~(below | above))[0])
-        raise InputError(
-            f"pose {i + 1}: joint {j + 1} has no room on either side of {q[i, j]:.4g} for an "
-            f"overshoot of {overshoot:g}; lower overshoot_deg in [design.motion], or widen its "
-            "limits"
-        )
-    return np.stack([np.where(below, 1, -1), np.where(above, -1, 1)], axis=1)
-
-
-# What has to be visited: poses under load states, from which points they are entered and left.
-
-
-@dataclass(frozen=True)
-class Visits:
-    """V visits, each of one pose in one load state, as indices into the roadmap's points.
-
-    A visit is entered at one of `entry` (V, O), takes `inside` (V, O) s from there on, inf where
-    that entry is blocked, and is left from `leave` (V,), where the pose is.  Entry o is the side
-    from which the pose is approached first; without approaches the pose itself is the one entry.
-    """
-
-    pose: IntArray
-    load: IntArray
-    leave: IntArray
-    entry: IntArray
-    inside: Array
-
-
-@dataclass(frozen=True)
-class Costs:
-    """`cost` (V + 1, V + 1) of going from one visit through the next one, node 0 being the
-    beginning and the end, and `side` (V + 1, V): the entry taken.
-
-    Contained in `cost`: `apart` for going to another load state, `changed` where that changes
-    what hangs on the arm.
-    """
-
-    cost: Array
-    apart: Array
-    changed: Array
-    side: IntArray
-
-
-def visit_costs(
-    visits: Visits, loaded: NDArray[np.bool_], times: tuple[Array, Array], home: int | None
-) -> Costs:
-    """Costs of all moves, from the times (m, m) between points without and with load.
-
-    Load states are kept together and changed as rarely as can be: going to another one costs
-    more than all travelling, and twice that if what hangs on the arm changes.  The arm begins
-    and ends without load, at point `home` or, where that is None, anywhere.  What cannot be
-    reached costs more than everything else together.
-    """
-    n = len(visits.pose)
-    # The load is on the arm during a move only if it is before and after: it is hung and taken
-    # off where the arm stands for a loaded reading.
-    carries = np.concatenate([[False], loaded[visits.load]])
-    with_load = carries[:, None] & carries[None, :]
-    travel = np.zeros((n + 1, n + 1))
-    side = np.zeros((n + 1, n), dtype=np.int64)
-    for layer, between in enumerate(times):
-        leave = visits.leave if home is None else np.append(home, visits.leave)
-        ways = between[leave[:, None, None], visits.entry[None]]
-        back = np.zeros(n) if home is None else between[visits.leave, home]
-        if home is None:
-            ways = np.concatenate([np.zeros((1, *ways.shape[1:])), ways])
-        ways = ways + visits.inside
-        here = with_load == bool(layer)
-        side = np.where(here[:, 1:], ways.argmin(axis=2), side)
-        travel[:, 1:] = np.where(here[:, 1:], ways.min(axis=2), travel[:, 1:])
-        travel[1:, 0] = np.where(here[1:, 0], back, travel[1:, 0])
-    np.fill_diagonal(travel, 0.0)
-    finite = np.isfinite(travel)
-    # Any tour travels less than this in all, if it needs no unreachable move.
-    change = max(float(travel[finite].max()) * (n + 1), 1.0)
-    states = np.append(-1, visits.load)
-    # The beginning is a state of its own; the unloaded states carry the same as it: nothing.
-    carried = np.append(-1, np.where(loaded[visits.load], visits.load, -1))
-    apart = change * (states[:, None] != states[None])
-    changed = change * (carried[:, None] != carried[None])
-    travel[~finite] = 4 * change * (n + 1)
-    return Costs(travel + apart + changed, apart, changed, side)
-
+from elastocal.units import Array, BoolArray, IntArray
 
 # Which joint moves are free: a graph over joint vectors whose edges are checked when needed.
 
@@ -124,11 +26,9 @@ PER_EDGE = 1e-9
 class PathChecker(Protocol):
     """Says whether the arm may move straight in joint space from one joint vector to another."""
 
-    def paths_free(self, q_from: Array, q_to: Array, loaded: bool) -> NDArray[np.bool_]:
-        """(M,): are all configurations from q_from to q_to (M, n), ends included, allowed?
-
-        `loaded`: with the hanging load.  The answer for the way back is the same.
-        """
+    def paths_free(self, q_from: Array, q_to: Array, loaded: bool) -> BoolArray:
+        """(M,): are all configurations from q_from to q_to (M, n), ends included, allowed, with the
+        hanging load where `loaded`?  The answer for the way back is the same."""
         ...
 
 
@@ -143,7 +43,7 @@ def travel_times(points: Array, speed: Array | None) -> Array:
 
 
 class Roadmap:
-    """Joint vectors `points` (m, n) and the straight moves between them, in one load state.
+    """Joint vectors `points` (m, n) and the straight moves between them, with or without load.
 
     A move counts as free until it is checked; a blocked one is replaced by the fastest way
     through other points.  So costs never exceed the true ones, and a tour that is optimal at
@@ -170,11 +70,6 @@ class Roadmap:
             self.direct[i[blocked], j[blocked]] = self.direct[j[blocked], i[blocked]] = np.inf
             self._ways = None
         return all(self.verdict[pair] for pair in pairs)
-
-    @property
-    def blocked(self) -> int:
-        """How many straight moves were found blocked."""
-        return sum(not verdict for verdict in self.verdict.values())
 
     def costs(self) -> Array:
         """Times (m, m) between points: straight, or by the fastest way around; inf for none."""
@@ -216,8 +111,7 @@ class Roadmap:
         """
         part = np.arange(len(self.points))
         for among in (needed, list(range(len(self.points)))):
-            if len(set(part[needed])) > 1:
-                self._join(part, np.array(among), needed)
+            self._join(part, np.array(among), needed)
         labels = part[needed]
         found = [[p for p in needed if part[p] == label] for label in dict.fromkeys(labels)]
         return sorted(found, key=len, reverse=True)
@@ -251,21 +145,42 @@ FEW = 2000  # pairs of visits: so many ways are checked at once where orders nee
 
 
 @dataclass(frozen=True)
+class Costs:
+    """`cost` (V + 1, V + 1) of going from one visit through the next one, node 0 being the
+    beginning and the end: `travel` in s, and more for changing what hangs on the arm (`changed`);
+    `side` (V + 1, V): the entry taken."""
+
+    cost: Array
+    travel: Array
+    changed: BoolArray
+    side: IntArray
+
+
+@dataclass(frozen=True)
 class Moves:
     """Home, poses, points of approach and via points in one list, and the visits among them.
 
-    `points` (m, n), and `times` (m, m) between them; `maps`: the roadmaps without and with
-    load; `home`: its point or None; `signs` (N, 2, n) where poses are approached from both
-    sides; `loaded` (L,): which load states have a load.
+    `points` (m, n), and `times` (m, m) between them; `maps`: the roadmaps without and with load;
+    `home`: its point or None; `signs` (N, 2, n) where poses are approached from both sides;
+    `loaded` (L,): which load states have a load.
+
+    V visits, each of `pose` (V,) in the load state `load` (V,): entered at one of `entry` (V, O),
+    taking `inside` (V, O) s from there on, inf where that entry is blocked, and left from `leave`
+    (V,), where the pose is.  Entry o is the side from which the pose is approached first; without
+    approaches the pose itself is the one entry.
     """
 
     points: Array
     times: Array
     maps: tuple[Roadmap, Roadmap]
-    visits: Visits
-    loaded: NDArray[np.bool_]
+    loaded: BoolArray
     home: int | None
     signs: IntArray | None
+    pose: IntArray
+    load: IntArray
+    leave: IntArray
+    entry: IntArray
+    inside: Array
 
     @classmethod
     def of(
@@ -274,24 +189,17 @@ class Moves:
         motion: Motion,
         checker: PathChecker,
         forces: Array,
-        load: IntArray | None,
         limits: tuple[Array, Array] | None,
         via: Array | None,
     ) -> Moves:
-        """The arguments of `schedule`, checked and laid out."""
+        """The arguments of `schedule`, laid out."""
         n_poses, n = q.shape
-        _check_motion(motion, n)
-        pose = np.repeat(np.arange(n_poses), len(forces) if load is None else 1)
-        state = np.tile(np.arange(len(forces)), n_poses) if load is None else np.asarray(load)
-        require(
-            state.shape == pose.shape and bool(np.isin(state, np.arange(len(forces))).all()),
-            f"load must be one of {len(forces)} load states for each of {n_poses} poses",
-        )
+        pose = np.repeat(np.arange(n_poses), len(forces))
+        load = np.tile(np.arange(len(forces)), n_poses)
         home = None if motion.home is None else 0
         start = np.zeros((0, n)) if motion.home is None else motion.home[None]
         leave = len(start) + pose
-        between, signs = np.zeros((0, n)), None
-        entry = leave[:, None]
+        between, signs, entry = np.zeros((0, n)), None, leave[:, None]
         if motion.both_directions:
             if limits is None:
                 raise InputError("approaches from both sides need the joint limits")
@@ -306,11 +214,10 @@ class Moves:
         if signs is not None:
             # From the first entry on: the approach, then to the other side and back, where that
             # is free; inf where this side is not.
-            free = _free_sides(maps, loaded[state], leave, entry)
+            free = _free_sides(maps, loaded[load], leave, entry)
             back = np.where(free, 2 * inside, 0.0)[:, ::-1]
             inside = np.where(free, inside + back, np.inf)
-        visits = Visits(pose, state, leave, entry, inside)
-        return cls(points, times, maps, visits, loaded, home, signs)
+        return cls(points, times, maps, loaded, home, signs, pose, load, leave, entry, inside)
 
     @property
     def checked(self) -> int:
@@ -318,7 +225,8 @@ class Moves:
 
     @property
     def blocked(self) -> int:
-        return sum(roadmap.blocked for roadmap in self.maps)
+        """How many straight moves were found blocked."""
+        return sum(not free for roadmap in self.maps for free in roadmap.verdict.values())
 
     @property
     def crowded(self) -> bool:
@@ -327,25 +235,56 @@ class Moves:
 
     def carries(self, node: int) -> int:
         """The load state on the arm at a node of a tour, −1 for none; node 0 is without."""
-        state = -1 if node == 0 else int(self.visits.load[node - 1])
+        state = -1 if node == 0 else int(self.load[node - 1])
         return state if state >= 0 and self.loaded[state] else -1
 
     def unloaded_twice(self, tour: list[int]) -> tuple[Moves, list[int]]:
         """With another visit of each pose that is read without load, and these nodes, in the
         reverse order of the tour; none where nothing is read under load."""
-        visits = self.visits
-        if not self.loaded[visits.load].any():
+        if not self.loaded[self.load].any():
             return self, []
-        again = np.array([v - 1 for v in tour[::-1] if not self.loaded[visits.load[v - 1]]], int)
-        fields = ((f.name, getattr(visits, f.name)) for f in dataclasses.fields(visits))
-        more = Visits(**{name: np.concatenate([v, v[again]]) for name, v in fields})
-        nodes = len(visits.pose) + 1 + np.arange(len(again))
-        return dataclasses.replace(self, visits=more), nodes.tolist()
+        again = np.array([v - 1 for v in tour[::-1] if not self.loaded[self.load[v - 1]]], int)
+        names = ("pose", "load", "leave", "entry", "inside")
+        more = {n: np.concatenate([getattr(self, n), getattr(self, n)[again]]) for n in names}
+        return replace(self, **more), (len(self.pose) + 1 + np.arange(len(again))).tolist()
 
     def costs(self) -> Costs:
-        """Costs between visits as known so far."""
-        times = (self.maps[0].costs(), self.maps[1].costs())
-        return visit_costs(self.visits, self.loaded, times, self.home)
+        """Costs between visits as known so far.
+
+        Load states are kept together and changed as rarely as can be: going to another one costs
+        more than all travelling, and twice that if what hangs on the arm changes.  The arm begins
+        and ends without load, at home or, where there is none, anywhere.  What cannot be reached
+        costs more than everything else together.
+        """
+        n, home = len(self.pose), self.home
+        # The load is on the arm during a move only if it is before and after: it is hung and taken
+        # off where the arm stands for a loaded reading.
+        carries = np.append(False, self.loaded[self.load])
+        with_load = carries[:, None] & carries[None, :]
+        travel, side = np.zeros((n + 1, n + 1)), np.zeros((n + 1, n), dtype=np.int64)
+        for layer, roadmap in enumerate(self.maps):
+            between = roadmap.costs()
+            leave = self.leave if home is None else np.append(home, self.leave)
+            ways = between[leave[:, None, None], self.entry[None]]
+            back = np.zeros(n) if home is None else between[self.leave, home]
+            if home is None:
+                ways = np.concatenate([np.zeros((1, *ways.shape[1:])), ways])
+            ways = ways + self.inside
+            here = with_load == bool(layer)
+            side = np.where(here[:, 1:], ways.argmin(axis=2), side)
+            travel[:, 1:] = np.where(here[:, 1:], ways.min(axis=2), travel[:, 1:])
+            travel[1:, 0] = np.where(here[1:, 0], back, travel[1:, 0])
+        np.fill_diagonal(travel, 0.0)
+        finite = np.isfinite(travel)
+        # Any tour travels less than this in all, if it needs no unreachable move.
+        change = max(float(travel[finite].max()) * (n + 1), 1.0)
+        travel[~finite] = 4 * change * (n + 1)
+        states = np.append(-1, self.load)
+        # The beginning is a state of its own; the unloaded states carry the same as it: nothing.
+        carried = np.append(-1, np.where(self.loaded[self.load], self.load, -1))
+        changed = carried[:, None] != carried[None]
+        cost = travel + change * (states[:, None] != states[None]) + change * changed
+        return Costs(cost, travel, changed, side)
 
     def way(self, u: int, v: int, costs: Costs) -> tuple[Roadmap, list[int]]:
         """The roadmap and the points from node u to the entry of node v, both included.
@@ -354,46 +293,58 @@ class Moves:
         end; the ends alone where no way is known.
         """
         roadmap = self.maps[int(self.carries(u) >= 0 and self.carries(v) >= 0)]
-        goal = self.home if v == 0 else int(self.visits.entry[v - 1, costs.side[u, v - 1]])
-        start = self.home if u == 0 else int(self.visits.leave[u - 1])
+        goal = self.home if v == 0 else int(self.entry[v - 1, costs.side[u, v - 1]])
+        start = self.home if u == 0 else int(self.leave[u - 1])
         if goal is None:
             return roadmap, []
-        if start is None:
-            return roadmap, [goal]
-        return roadmap, [start, *roadmap.way(start, goal)]
+        return roadmap, [goal] if start is None else [start, *roadmap.way(start, goal)]
 
     def check(self, tour: list[int], costs: Costs) -> bool:
         """Check every straight move of the tour not yet checked; is one of them news, blocked?"""
-        return self._blocked(pairwise([0, *tour, 0]), costs)
-
-    def settle(self) -> None:
-        """Check the ways between all visits, where these are few or most moves are blocked: many
-        at once take less time than a few again and again."""
-        visits = self.visits
-        pairs: list[set[tuple[int, int]]] = [set(), set()]
-        every = np.ones(len(visits.load), dtype=bool)
-        for k, here in enumerate((every, self.loaded[visits.load])):
-            ends = visits.entry[here][np.isfinite(visits.inside[here])].tolist()
-            starts = visits.leave[here].tolist()
-            if not k and self.home is not None:
-                starts, ends = [self.home, *starts], [self.home, *ends]
-            pairs[k] = {(min(m), max(m)) for m in product(starts, ends) if m[0] != m[1]}
-        if self.crowded or len(pairs[0]) + len(pairs[1]) <= FEW:
-            for roadmap, wanted in zip(self.maps, pairs, strict=True):
-                roadmap.settle(sorted(wanted))
-
-    def _blocked(self, steps: Iterable[tuple[int, int]], costs: Costs) -> bool:
         wanted: list[list[tuple[int, int]]] = [[], []]
-        for u, v in steps:
+        for u, v in pairwise([0, *tour, 0]):
             roadmap, way = self.way(u, v, costs)
             # Where no way is left, every move has been checked: nothing to be learnt.
             wanted[roadmap.loaded] += [m for m in pairwise(way) if np.isfinite(roadmap.direct[m])]
         return not all([self.maps[k].check(wanted[k]) for k in (0, 1)])
 
+    def settle(self) -> None:
+        """Check the ways between all visits, where these are few or most moves are blocked: many
+        at once take less time than a few again and again."""
+        pairs: list[set[tuple[int, int]]] = []
+        for here in (np.ones(len(self.load), dtype=bool), self.loaded[self.load]):
+            ends = self.entry[here][np.isfinite(self.inside[here])].tolist()
+            starts = self.leave[here].tolist()
+            if not pairs and self.home is not None:
+                starts, ends = [self.home, *starts], [self.home, *ends]
+            pairs.append({(min(m), max(m)) for m in product(starts, ends) if m[0] != m[1]})
+        if self.crowded or sum(map(len, pairs)) <= FEW:
+            for roadmap, wanted in zip(self.maps, pairs, strict=True):
+                roadmap.settle(sorted(wanted))
+
+
+def approach_signs(q: Array, lower: Array, upper: Array, overshoot: float) -> IntArray:
+    """Directions (N, 2, n) of the last motion of each joint: first upwards (+1), then down (−1), so
+    that backlash and hysteresis show.
+
+    The arm starts that motion at q − sign · overshoot, for poses `q` (N, n), in rad or m.  A
+    joint that would leave its limits [lower, upper] (n,) there comes from its other side both
+    times.  Raises InputError where neither side has room.
+    """
+    below, above = q - overshoot >= lower, q + overshoot <= upper
+    if not (below | above).all():
+        i, j = (int(v) for v in np.argwhere(~(below | above))[0])
+        raise InputError(
+            f"pose {i + 1}: joint {j + 1} has no room on either side of {q[i, j]:.4g} for an "
+            f"overshoot of {overshoot:g}; lower overshoot_deg in [design.motion], or widen its "
+            "limits"
+        )
+    return np.stack([np.where(below, 1, -1), np.where(above, -1, 1)], axis=1)
+
 
 def _free_sides(
-    maps: tuple[Roadmap, Roadmap], loaded: NDArray[np.bool_], leave: IntArray, entry: IntArray
-) -> NDArray[np.bool_]:
+    maps: tuple[Roadmap, Roadmap], loaded: BoolArray, leave: IntArray, entry: IntArray
+) -> BoolArray:
     """(V, 2): is the last stretch to the pose free from that side?"""
     stretch = np.stack([entry, np.broadcast_to(leave[:, None], entry.shape)], axis=2)
     for roadmap in maps:
@@ -404,49 +355,29 @@ def _free_sides(
     return free
 
 
-def _check_motion(motion: Motion, n: int) -> None:
-    speed, home = motion.speed, motion.home
-    require(
-        speed is None or (speed.shape in ((1,), (n,)) and bool((speed > 0).all())),
-        f"[design.motion] needs {n} positive joint speeds, or one for all; found {speed}",
-    )
-    require(
-        home is None or home.shape == (n,),
-        f"[design.motion] home needs {n} joint values; found {home}",
-    )
-
-
-# What stands in the way of a straight joint move, for messages.
-
-SAMPLES = 200
-
-
-class Blockers:
-    """The pairs of bodies that come too close on the way from one joint vector to another."""
-
-    def __init__(self, feasibility: Feasibility) -> None:
-        self.feasibility = feasibility
-
-    def __call__(self, q_from: Array, q_to: Array, loaded: bool) -> tuple[str, ...]:
-        """ "link3 and pillar", …, in the order in which they are met, from samples of the way."""
-        step = np.linspace(0.0, 1.0, SAMPLES)[:, None]
-        force = LOADED if loaded else np.zeros(3)
-        kinematics = self.feasibility.kinematics
-        poses = kinematics.poses(q_from + step * (q_to - q_from), force)
-        met = []
-        for pair in self.feasibility.pairs:
-            hits = Collisions(kinematics, [pair]).hits(poses)
-            if hits.any():
-                met.append((int(np.argmax(hits)), " and ".join(pair.names)))
-        return tuple(name for _, name in sorted(met))
-
-
 # Poses that no collision-free move reaches, told before and after the routing.
+
+SAMPLES = 200  # of a way, in which bodies that come too close are sought
+MOST_NAMED = 3
 
 # The bodies in the way of the straight move between two joint vectors (n,), with or without load.
 BlockersOf = Callable[[Array, Array, bool], Sequence[str]]
 
-MOST_NAMED = 3
+
+def blockers_of(rules: Feasibility) -> BlockersOf:
+    """The pairs of bodies that come too close on a way, "link3 and pillar", …, as they are met."""
+
+    def met(q_from: Array, q_to: Array, loaded: bool) -> Sequence[str]:
+        step = np.linspace(0.0, 1.0, SAMPLES)[:, None]
+        poses = rules.kinematics.poses(q_from + step * (q_to - q_from), LOADED * loaded)
+        found = []
+        for pair in rules.pairs:
+            hits = Collisions(rules.kinematics, [pair]).hits(poses)
+            if hits.any():
+                found.append((int(np.argmax(hits)), " and ".join(pair.names)))
+        return [name for _, name in sorted(found)]
+
+    return met
 
 
 class Unreachable(InsufficientDataError):
@@ -457,84 +388,82 @@ class Unreachable(InsufficientDataError):
         self.poses = poses
 
 
-def check_reachable(moves: Moves, blockers: BlockersOf | None) -> None:
-    """Raise Unreachable for a pose that cannot be approached from either side, where
-    it has to be, or that no chain of free moves joins to the others (or home) of its load state."""
-    for roadmap in moves.maps:
-        here = moves.loaded[moves.visits.load] == roadmap.loaded
-        leave = moves.visits.leave[here]
-        if moves.signs is not None:
-            _check_approaches(moves, roadmap, here, blockers)
-        needed = [int(point) for point in dict.fromkeys(leave)]
-        if moves.home is not None and len(needed) and not roadmap.loaded:
-            needed.insert(0, moves.home)
-        if len(needed) < 2:
-            continue
-        most, *lost = roadmap.parts(needed)
-        if lost:
-            every = [point for part in lost for point in part]
-            # Where most hang together, all others are told at once.
-            clear = len(most) > len(every) and moves.home not in every
-            raise _unreachable(moves, roadmap, every if clear else lost[0], blockers)
+@dataclass(frozen=True)
+class Reach:
+    """Raises Unreachable where moves lack a way, and names what is in the way where `blockers` can
+    tell."""
 
+    moves: Moves
+    blockers: BlockersOf | None
 
-def _check_approaches(
-    moves: Moves, roadmap: Roadmap, here: NDArray[np.bool_], blockers: BlockersOf | None
-) -> None:
-    for v in np.flatnonzero(here & ~np.isfinite(moves.visits.inside).any(axis=1)):
-        pose, (below, above) = int(moves.visits.leave[v]), moves.visits.entry[v].tolist()
-        raise Unreachable(
-            f"{_name(moves, pose)} cannot be approached{_carrying(roadmap)}, neither from below"
-            f"{_in_the_way(roadmap, below, pose, blockers)} nor from above"
-            f"{_in_the_way(roadmap, above, pose, blockers)}; lower overshoot_deg in "
-            "[design.motion], or raise clearance_mm in [workspace]",
-            moves.visits.pose[[v]],
+    def check(self) -> None:
+        """Can each pose be approached from one side at least, where it has to be, and does a chain
+        of free moves join it to the others (and home) of its load state?"""
+        moves = self.moves
+        for roadmap in moves.maps:
+            here = moves.loaded[moves.load] == roadmap.loaded
+            if moves.signs is not None:
+                self._check_approaches(roadmap, here)
+            needed = [int(point) for point in dict.fromkeys(moves.leave[here])]
+            if moves.home is not None and len(needed) and not roadmap.loaded:
+                needed.insert(0, moves.home)
+            if len(needed) < 2:
+                continue
+            most, *lost = roadmap.parts(needed)
+            if lost:
+                every = [point for part in lost for point in part]
+                # Where most hang together, all others are told at once.
+                clear = len(most) > len(every) and moves.home not in every
+                raise self._unreachable(roadmap, every if clear else lost[0])
+
+    def check_tour(self, tour: list[int], costs: Costs) -> None:
+        """Has every move of the tour a way?"""
+        for u, v in pairwise([0, *tour, 0]):
+            roadmap, way = self.moves.way(u, v, costs)
+            if len(way) > 1 and not np.isfinite(roadmap.direct[way[:-1], way[1:]]).all():
+                raise self._unreachable(roadmap, [int(self.moves.leave[(v or u) - 1])])
+
+    def _check_approaches(self, roadmap: Roadmap, here: BoolArray) -> None:
+        moves = self.moves
+        for v in np.flatnonzero(here & ~np.isfinite(moves.inside).any(axis=1)):
+            pose, (below, above) = int(moves.leave[v]), moves.entry[v].tolist()
+            raise Unreachable(
+                f"{self._name(pose)} cannot be approached{_carrying(roadmap)}, neither from below"
+                f"{self._in_the_way(roadmap, below, pose)} nor from above"
+                f"{self._in_the_way(roadmap, above, pose)}; lower overshoot_deg in "
+                "[design.motion], or raise clearance_mm in [workspace]",
+                moves.pose[[v]],
+            )
+
+    def _unreachable(self, roadmap: Roadmap, lost: list[int]) -> Unreachable:
+        moves = self.moves
+        named = ", ".join(self._name(point) for point in lost[:MOST_NAMED])
+        more = f" and {len(lost) - MOST_NAMED} more" if len(lost) > MOST_NAMED else ""
+        others = np.setdiff1d(np.arange(len(moves.points)), lost)
+        between = moves.times[lost][:, others]
+        i, j = np.unravel_index(int(np.argmin(between)), between.shape)
+        by = self._in_the_way(roadmap, int(others[j]), lost[int(i)])
+        return Unreachable(
+            f"{named}{more} cannot be reached{_carrying(roadmap)} by collision-free joint moves, "
+            f"neither directly nor through home and other poses{by}; give "
+            "another home in [design.motion], free the way, or narrow [limits] to exclude such "
+            "poses",
+            np.unique(moves.pose[np.isin(moves.leave, lost)]),
         )
 
+    def _name(self, point: int) -> str:
+        joints = ", ".join(f"{value:.3f}" for value in self.moves.points[point])
+        if point == self.moves.home:
+            return f"home (joints {joints})"
+        return f"pose {point + (self.moves.home is None)} (joints {joints})"
 
-def refuse_impossible(
-    moves: Moves, tour: list[int], costs: Costs, blockers: BlockersOf | None
-) -> None:
-    """Raise Unreachable where the tour holds a move for which no way is left."""
-    for u, v in pairwise([0, *tour, 0]):
-        roadmap, way = moves.way(u, v, costs)
-        if len(way) > 1 and not np.isfinite(roadmap.direct[way[:-1], way[1:]]).all():
-            lost = [int(moves.visits.leave[(v or u) - 1])]
-            raise _unreachable(moves, roadmap, lost, blockers)
-
-
-def _unreachable(
-    moves: Moves, roadmap: Roadmap, lost: list[int], blockers: BlockersOf | None
-) -> Unreachable:
-    named = ", ".join(_name(moves, point) for point in lost[:MOST_NAMED])
-    more = f" and {len(lost) - MOST_NAMED} more" if len(lost) > MOST_NAMED else ""
-    others = np.setdiff1d(np.arange(len(moves.points)), lost)
-    between = moves.times[lost][:, others]
-    i, j = np.unravel_index(int(np.argmin(between)), between.shape)
-    by = _in_the_way(roadmap, int(others[j]), lost[int(i)], blockers)
-    return Unreachable(
-        f"{named}{more} cannot be reached{_carrying(roadmap)} by collision-free joint moves, "
-        f"neither directly nor through home and other poses{by}; give "
-        "another home in [design.motion], free the way, or narrow [limits] to exclude such poses",
-        np.unique(moves.visits.pose[np.isin(moves.visits.leave, lost)]),
-    )
-
-
-def _name(moves: Moves, point: int) -> str:
-    joints = ", ".join(f"{value:.3f}" for value in moves.points[point])
-    if point == moves.home:
-        return f"home (joints {joints})"
-    first = 0 if moves.home is None else 1
-    return f"pose {point - first + 1} (joints {joints})"
+    def _in_the_way(self, roadmap: Roadmap, i: int, j: int) -> str:
+        """What blocks the straight move between two points, in brackets, where it can be told."""
+        if self.blockers is None:
+            return ""
+        names = self.blockers(roadmap.points[i], roadmap.points[j], roadmap.loaded)
+        return f" (in the way: {', '.join(names)})" if names else ""
 
 
 def _carrying(roadmap: Roadmap) -> str:
     return " with the load" if roadmap.loaded else ""
-
-
-def _in_the_way(roadmap: Roadmap, i: int, j: int, blockers: BlockersOf | None) -> str:
-    """What blocks the straight move between two points, in brackets, where it can be told."""
-    if blockers is None:
-        return ""
-    names = blockers(roadmap.points[i], roadmap.points[j], roadmap.loaded)
-    return f" (in the way: {', '.join(names)})" if names else ""

@@ -5,7 +5,7 @@ from itertools import groupby
 import numpy as np
 import pytest
 from support.cells import DOWN, kr270_chain, random_poses
-from support.design_cells import all_loads, plan_cell, setup_of
+from support.design_cells import plan_cell, setup_of
 from support.discs import Discs
 
 from elastocal.cell.arm_description import Unsteadiness
@@ -102,25 +102,25 @@ def test_the_alias_is_what_least_squares_make_of_shifted_readings():
     q = random_poses(chain, 8, seed=4)
     setup = setup_of(cell, q)
     information = setup.information
-    pool = setup.pool(q, all_loads(q), np.zeros(8, dtype=int))
+    pool = setup.pool(q, np.zeros(8, dtype=int))
     alias = Alias.of(setup, pool, np.arange(8))
     rng = np.random.default_rng(0)
     time, direction = rng.uniform(size=(8, 2)), rng.normal(size=3)
-    observed, _ = information.noise(q, all_loads(q))
-    table, model, x = observed.table, information.model, information.scenarios[0]
+    observed, _ = information.noise(q)
+    table, model, x = observed.table, information.model, information.x
     state = (table.force != 0).any(axis=1).astype(int)
     d = observed.apply(time[table.configuration, state][:, None] * direction)
     B = model.regressor(table, x, information.columns, observed).B
     B = B.reshape(8, -1, len(information.columns))
-    root = np.linalg.cholesky(pose_covariance(model, observed, 8, information.states))
+    root = np.linalg.cholesky(pose_covariance(model, observed, 8, x))
     B, d = (np.linalg.solve(root, v) for v in (B, d.reshape(8, -1, 1)))
     wrong = np.linalg.lstsq(B.reshape(-1, B.shape[-1]), d.ravel(), rcond=None)[0]
     targets = target_poses.test_poses(cell, chain, None, 0)
-    A = prediction_rows(information, targets, x)[..., information.columns]
+    A = prediction_rows(model, targets, x)[..., information.columns]
     rms = np.sqrt(targets.weight @ ((A @ wrong) ** 2).sum(axis=1))
     found = np.einsum("nl,nlmx,x->m", time, alias.share, direction)
     assert np.linalg.norm(found) == pytest.approx(rms, rel=1e-8)
-    assert alias.noise == pytest.approx(np.sqrt(setup.value(q, all_loads(q))), rel=1e-9)
+    assert alias.noise == pytest.approx(np.sqrt(setup.value(q)), rel=1e-9)
     assert DRIFT > 0
 
     # What is left of the information where all drifts: generalised least squares with V + FFᵀ.

@@ -16,10 +16,10 @@ from elastocal.cell.plan_wishes import DesignSpec
 from elastocal.cell.workspace_rules import Workspace
 from elastocal.model.manipulator import Model
 from elastocal.planning.candidates import Candidates, JointSpace, draw, joint_space
-from elastocal.planning.criteria import make_criterion
-from elastocal.planning.criterion import Objective
+from elastocal.planning.criteria import CRITERIA
+from elastocal.planning.criterion import CriterionInputs, ScenarioCriterion
 from elastocal.planning.feasibility import Feasibility
-from elastocal.planning.information import LoadStates, PoseInformation, load_states
+from elastocal.planning.information import PoseInformation
 from elastocal.planning.polish import Searches
 from elastocal.planning.relaxation import DesignProblem
 
@@ -36,10 +36,6 @@ class Case:
     model: Model
 
     @cached_property
-    def states(self) -> LoadStates:
-        return load_states(self.model.cell)
-
-    @cached_property
     def rules(self) -> Feasibility:
         return Feasibility(self.model.cell, self.model.chain)
 
@@ -50,33 +46,31 @@ class Case:
     @cached_property
     def information(self) -> PoseInformation:
         columns = np.arange(len(self.model.names))
-        x = self.model.nominal[None]
-        return PoseInformation(self.model, self.states, x, columns, np.full(len(columns), TYPICAL))
+        typical = np.full(len(columns), TYPICAL)
+        return PoseInformation(self.model, self.model.nominal, columns, typical)
 
     @cached_property
     def searches(self) -> Searches:
-        return Searches(self.information, self.space, self.rules, self.rules.pairs)
+        return Searches(self.information, self.space, self.rules)
 
     def draw(self, n: int, seed: int = 0, jobs: int = 1) -> Candidates:
         model = self.model
-        return draw(model.cell, model.chain, self.states, self.rules, n, seed, jobs)
+        return draw(model.cell, model.chain, self.information.forces, self.rules, n, seed, jobs)
 
-    def criterion(self, name: str) -> Objective:
+    def criterion(self, name: str) -> ScenarioCriterion:
         """`name` on three test poses."""
         p = len(self.information.columns)
         q = np.array([[0.0, 0.3, -0.5, 0.4], [0.5, -0.4, 1.0, 0.2], [0.0, -1.2, 1.5, -1.0]])
-        A = self.information.blocks(q, np.full(3, -1))[:, :, -3:] * SIGMA
-        return make_criterion(
-            name, parameters=p, interest=np.arange(p), A=A, weights=np.ones(3), n_poses=3
-        )
+        A = self.information.blocks(q)[:, -3:] * SIGMA
+        inputs = CriterionInputs(name, p, np.arange(p), A, np.ones(3), n_poses=3)
+        return CRITERIA[name].of(inputs)
 
     def problem(
-        self, pool: Candidates, shares: Sequence[int], criterion: Objective, prior: float = 1e-2
+        self, pool: Candidates, shares: Sequence[int], criterion: ScenarioCriterion
     ) -> DesignProblem:
         p = len(self.information.columns)
-        blocks = self.information.blocks(pool.q, pool.load)
-        known = prior * np.eye(p)[None]
-        return DesignProblem(blocks, known, pool.group, np.array(shares), criterion)
+        blocks = self.information.blocks(pool.q)
+        return DesignProblem(blocks, 1e-2 * np.eye(p), pool.group, np.array(shares), criterion)
 
 
 @pytest.fixture(scope="session")

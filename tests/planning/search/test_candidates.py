@@ -36,7 +36,7 @@ def test_only_feasible_poses_and_all_tries_counted(case: Build) -> None:
     arm = case(CLUTTER)
     found = arm.draw(2000)
     assert len(found.q) == 2000
-    assert arm.rules.check(found.q, arm.states.forces[-1]).ok.all()
+    assert arm.rules.check(found.q, arm.information.forces[-1]).ok.all()
     assert found.tried == found.feasible + sum(found.removed_by.values())
     assert found.removed_by["keep_out"] > 0 and found.removed_by["obstacle"] > 0
     assert found.tried % CHUNK == 0 and found.feasible >= 2000
