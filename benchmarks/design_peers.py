@@ -25,7 +25,6 @@ from peer_kr270 import Arm, evolved, prepared
 from peer_tools import ONE_THREAD, Row, Seconds, peer, required, seconds_of, starts, table, timed
 
 from elastocal.planning.criteria import DeterminantCriterion
-from elastocal.planning.criterion import Objective
 from elastocal.planning.exchange import exact_plan, exchange, rounded
 from elastocal.planning.polish import polish
 from elastocal.planning.relaxation import DesignProblem, balanced, relax
@@ -64,19 +63,17 @@ def beside_figaroh(python: Path, folder: Path) -> None:
         """log det, in FIGAROH's units, of an information of this Φ = det^(−1/p)."""
         return float(-p * np.log(phi) + 2 * np.log(columns).sum())
 
-    def problem(most: int) -> DesignProblem:
-        blocks, prior = (R / columns)[None], np.zeros((1, p, p))
-        criterion = Objective((DeterminantCriterion(np.eye(p)),))
-        group = np.zeros(POOL, dtype=np.int64)
-        whole = DesignProblem(blocks, prior, group, np.array([POSES]), criterion, most)
-        return balanced(whole)[0]
+    def problem(poses: int) -> DesignProblem:
+        criterion, group = DeterminantCriterion(np.eye(p)), np.zeros(POOL, dtype=np.int64)
+        shares = np.array([poses])
+        return balanced(DesignProblem(R / columns, np.zeros((p, p)), group, shares, criterion))[0]
 
     print(f"\n## UR10: {POOL} poses, {p} parameters, regressor of FIGAROH")
-    # FIGAROH's weights of sum 1 have no upper limit; nor has a pose measured up to POSES times.
-    ours, took = timed(partial(relax, problem(POSES), 1e-6))
+    # FIGAROH's weights of sum 1 have no upper limit, as those of a plan of one pose.
+    ours, took = timed(partial(relax, problem(1), 1e-6))
     socp = seconds_of(theirs, "socp")
-    top = log_det_of(ours.bound) - p * np.log(POSES)
-    found = log_det(ours.weights / POSES)
+    top = log_det_of(ours.bound)
+    found = log_det(ours.weights)
     table(
         "relaxed weights of sum 1", "log det M", 6, "below the certified bound",
         [
@@ -93,7 +90,7 @@ def beside_figaroh(python: Path, folder: Path) -> None:
         socp.wall > FASTER * took.wall and socp.cpu > FASTER * took.cpu,
     )
 
-    once = problem(1)
+    once = problem(POSES)
     relaxed, relaxing = timed(partial(relax, once))
     top = log_det_of(relaxed.bound)
     cut = np.isin(np.arange(POOL), theirs["ranked"][:POSES])
@@ -118,7 +115,7 @@ def beside_exchange(python: Path | None, folder: Path) -> None:
     arm, pooling = timed(partial(prepared, folder, SEED))
     print(
         f"\n## KR 270: {arm.poses} poses, pool of {len(arm.pool)} (drawn and evaluated in "
-        f"{pooling.wall:.2f} s), {arm.problem.blocks.shape[3]} parameters, ρ₀ at {arm.n_targets} "
+        f"{pooling.wall:.2f} s), {arm.problem.blocks.shape[2]} parameters, ρ₀ at {arm.n_targets} "
         "test poses"
     )
     ours, bound = _ours(arm, pooling)
@@ -158,8 +155,8 @@ def _ours(arm: Arm, pooling: Seconds) -> tuple[list[Row], float]:
     for k in range(POLISHED):
         rng = np.random.default_rng(SEED + k) if k else None
         plan, took = timed(partial(rounded, problem, relaxed.weights, rng))
-        poses = q[plan], arm.pool.load[plan], arm.pool.group[plan]
-        (off, _), last = timed(partial(polish, problem, arm.searches, T, *poses))
+        poses = q[plan], arm.pool.group[plan]
+        off, last = timed(partial(polish, problem, arm.searches, T, *poses))
         value, total = min(value, arm.rho(off)), total + took + last
         name = "elastocal, 1 start, polished" if k == 0 else f"elastocal, best of {k + 1} polished"
         rows.append(Row(name, value, total))
@@ -168,7 +165,7 @@ def _ours(arm: Arm, pooling: Seconds) -> tuple[list[Row], float]:
 
 def _pydoe(python: Path, folder: Path, arm: Arm, pooling: Seconds) -> Iterator[Row]:
     given, out = folder / "kr270_pool.npz", folder / "pydoe.npz"
-    np.savez(given, blocks=arm.pool.blocks[0], C=arm.C, n_poses=arm.poses)
+    np.savez(given, blocks=arm.pool.blocks, C=arm.C, n_poses=arm.poses)
     found = peer(python, "pydoe_exchange.py", given, out)
     for name in ("simple_exchange", "modified_fedorov", "detmax"):
         took = pooling + seconds_of(found, name)

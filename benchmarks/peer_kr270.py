@@ -17,7 +17,7 @@ from elastocal.model.manipulator import Model
 from elastocal.planning.candidates import draw, joint_space
 from elastocal.planning.criterion import TraceCriterion
 from elastocal.planning.feasibility import Feasibility
-from elastocal.planning.information import load_states
+from elastocal.planning.information import plan_forces
 from elastocal.planning.polish import Searches
 from elastocal.planning.relaxation import DesignProblem
 from elastocal.planning.setup import FeasiblePool, Known, Setup, set_up
@@ -71,9 +71,8 @@ class Arm:
     @property
     def C(self) -> Array:
         """C (p, p) of ρ₀² = tr(C M⁻¹)."""
-        (criterion,) = self.setup.criterion.each
-        assert isinstance(criterion, TraceCriterion)
-        return criterion.C
+        assert isinstance(self.setup.criterion, TraceCriterion)
+        return self.setup.criterion.C
 
     def rho(self, q: Array) -> float:
         """ρ₀ in µm of the plan q (n_poses, 6)."""
@@ -82,11 +81,10 @@ class Arm:
     def rhos(self, q: Array) -> Array:
         """ρ₀ (K,) in µm of plans q (K, n_poses, 6), by the batch evaluator."""
         flat = q.reshape(-1, q.shape[2])
-        load = np.full(len(flat), self.pool.load[0])
-        B = self.setup.information.blocks(flat, load)[0]
+        B = self.setup.information.blocks(flat)
         B = B.reshape(len(q), -1, B.shape[2])
-        M = self.setup.prior + (B.transpose(0, 2, 1) @ B)[:, None]
-        return 1e6 * np.sqrt(self.setup.criterion.value(M))
+        M = self.setup.prior + B.transpose(0, 2, 1) @ B
+        return 1e6 * np.sqrt(self.setup.criterion.of_information(M))
 
 
 def prepared(folder: Path, seed: int) -> Arm:
@@ -94,14 +92,14 @@ def prepared(folder: Path, seed: int) -> Arm:
     path = folder / "cell.toml"
     path.write_text(CELL)
     model = Model(read_cell(path, known_effects=tuple(CATALOGUE)))
-    rules, states = Feasibility(model.cell, model.chain), load_states(model.cell)
-    drawn = draw(model.cell, model.chain, states, rules, POOL, seed)
+    rules, forces = Feasibility(model.cell, model.chain), plan_forces(model.cell)
+    drawn = draw(model.cell, model.chain, forces, rules, POOL, seed)
     assert drawn.tried == drawn.feasible, "joint limits alone remove nothing"
     targets = test_poses(model.cell, model.chain, rules, seed)
-    setup = set_up(model, states, drawn.q, drawn.load, POSES, targets, Known(), seed)
+    setup = set_up(model, drawn.q, POSES, targets, Known())
     space = joint_space(model.cell, model.chain)
-    searches = Searches(setup.information, space, rules, rules.pairs)
-    return Arm(setup, setup.pool(drawn.q, drawn.load, drawn.group), searches, len(targets.q))
+    searches = Searches(setup.information, space, rules)
+    return Arm(setup, setup.pool(drawn.q, drawn.group), searches, len(targets.q))
 
 
 def evolved(arm: Arm, generations: int, seed: int) -> tuple[Array, int]:

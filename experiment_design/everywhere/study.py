@@ -21,7 +21,7 @@ from elastocal.model.manipulator import Model
 from elastocal.planning.candidates import draw
 from elastocal.planning.exchange import exact_plan, random_information
 from elastocal.planning.feasibility import Feasibility
-from elastocal.planning.information import load_states
+from elastocal.planning.information import plan_forces
 from elastocal.planning.plan import Everywhere
 from elastocal.planning.relaxation import balanced, relax
 from elastocal.planning.setup import Known, set_up, share_within
@@ -71,17 +71,16 @@ def rows_of(arm: str, stated: bool, candidates: int, campaigns: int) -> list[str
     """Rms over the campaigns, in µm: noise drawn, through B to the parameters, to the tool."""
     cell = cell_of(arm, stated)
     model = Model(cell)
-    chain, states, rules = model.chain, load_states(cell), Feasibility(cell, model.chain)
-    poses = draw(cell, chain, states, rules, candidates, 0)
+    chain, forces, rules = model.chain, plan_forces(cell), Feasibility(cell, model.chain)
+    poses = draw(cell, chain, forces, rules, candidates, 0)
     targets = test_poses(cell, chain, rules)
     setup, fresh = (
         set_up(
-            model, states, poses.q, poses.load, POSES, targets, Known(), 0,
-            everywhere(cell, chain, rules, seed),
+            model, poses.q, POSES, targets, Known(), everywhere(cell, chain, rules, seed)
         )
         for seed in (0, FRESH)
     )  # fmt: skip
-    pool, shares = setup.pool(poses.q, poses.load, poses.group), np.array([POSES])
+    pool, shares = setup.pool(poses.q, poses.group), np.array([POSES])
     assert fresh.target_rows is not None and fresh.elsewhere_rows is not None
     figures = {}
     for k, (name, cap) in enumerate(PLANS.items()):
@@ -93,15 +92,15 @@ def rows_of(arm: str, stated: bool, candidates: int, campaigns: int) -> list[str
             chosen, _ = exact_plan(problem, relax(problem), starts=2)
             file.parent.mkdir(exist_ok=True)
             np.save(file, chosen)
-        blocks = pool.blocks[:, np.load(file)]
-        M, B = setup.gathered(blocks)[0], blocks[0].reshape(-1, blocks.shape[-1])
+        blocks = pool.blocks[np.load(file)]
+        M, B = setup.gathered(blocks), blocks.reshape(-1, blocks.shape[-1])
         noise = np.random.default_rng(1).standard_normal((len(B), campaigns))
         x = np.linalg.solve(M, B.T @ noise)
         figures[name] = [
             float(np.sqrt(((R @ x) ** 2).sum(axis=0).mean()))
             for R in (fresh.target_rows, fresh.elsewhere_rows)
         ]
-    drawn = random_information(setup.problem(pool, shares), 0)[:, 0]
+    drawn = random_information(setup.problem(pool, shares), 0)
     chance = Everywhere.of(fresh.target_rows, fresh.elsewhere_rows, drawn[0], drawn, drawn[0])
     figures["random, median"] = [chance.random_test_poses, chance.random_elsewhere]
     least = figures["least ρ₀"][0]

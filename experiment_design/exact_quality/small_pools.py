@@ -2,11 +2,12 @@
 
 from __future__ import annotations
 
-from itertools import combinations_with_replacement, product
+from itertools import combinations, product
 
 import numpy as np
 
-from elastocal.planning.criteria import make_criterion
+from elastocal.planning.criteria import criterion_named
+from elastocal.planning.criterion import CriterionInputs
 from elastocal.planning.relaxation import DesignProblem
 from elastocal.units import Array, IntArray
 
@@ -14,7 +15,7 @@ CRITERIA = ("test_pose", "D", "E")
 ROWS = 3
 
 
-def random_problem(name: str, seed: int, *, most: int = 1, prior: float = 0.0) -> DesignProblem:
+def random_problem(name: str, seed: int, *, prior: float = 0.0) -> DesignProblem:
     """4 to 6 poses out of 10 to 16 candidates in 1 to 3 groups, for 4 to 9 parameters.
 
     Three readings per pose, normal B; shares
@@ -26,21 +27,17 @@ def random_problem(name: str, seed: int, *, most: int = 1, prior: float = 0.0) -
     group, shares = np.zeros(N, dtype=np.int64), np.full(1, N + 1)
     while (np.bincount(group, minlength=L) < shares).any():
         group, shares = rng.integers(0, L, N), rng.multinomial(n, np.ones(L) / L)
-    blocks = rng.normal(size=(1, N, ROWS, p))
-    targets = rng.normal(size=(1, 8, ROWS, p))
+    blocks = rng.normal(size=(N, ROWS, p))
+    targets = rng.normal(size=(8, ROWS, p))
     done = np.sqrt(prior) * rng.normal(size=(2 * ROWS, p))
-    criterion = make_criterion(name, parameters=p, interest=np.arange(p), A=targets)
-    return DesignProblem(blocks, (done.T @ done)[None], group, shares, criterion, most)
+    criterion = criterion_named(name).of(CriterionInputs(name, p, np.arange(p), targets))
+    return DesignProblem(blocks, done.T @ done, group, shares, criterion)
 
 
 def all_plans(problem: DesignProblem) -> IntArray:
-    """Every plan (k, n_poses) of these shares, no candidate more often than `most`."""
+    """Every plan (k, n_poses) of these shares."""
     parts = [
-        [
-            plan
-            for plan in combinations_with_replacement(np.flatnonzero(problem.group == g), share)
-            if all(one != later for one, later in zip(plan, plan[problem.most :], strict=False))
-        ]
+        list(combinations(np.flatnonzero(problem.group == g), share))
         for g, share in enumerate(problem.shares)
     ]
     return np.array([sum(plan, ()) for plan in product(*parts)], dtype=np.int64)
@@ -48,5 +45,5 @@ def all_plans(problem: DesignProblem) -> IntArray:
 
 def all_values(problem: DesignProblem, plans: IntArray) -> Array:
     """Φ (k,) of the plans (k, n_poses), straight from the definition of M."""
-    each = np.einsum("snri,snrj->nsij", problem.blocks, problem.blocks)
-    return problem.criterion.value(problem.prior + each[plans].sum(axis=1))
+    each = np.einsum("nri,nrj->nij", problem.blocks, problem.blocks)
+    return problem.criterion.of_information(problem.prior + each[plans].sum(axis=1))

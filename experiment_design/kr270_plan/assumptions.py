@@ -18,7 +18,7 @@ from elastocal.cell.work_cell import Cell, read_cell
 from elastocal.model.manipulator import Model
 from elastocal.planning.candidates import draw, joint_space
 from elastocal.planning.feasibility import Feasibility
-from elastocal.planning.information import ALL_LOADS, load_states
+from elastocal.planning.information import plan_forces
 from elastocal.planning.relaxation import relax
 from elastocal.planning.setup import Known, set_up, shares_of
 from elastocal.planning.test_poses import TargetPoses
@@ -66,16 +66,16 @@ def main() -> None:
 def margins(cell: Cell) -> list[float]:
     """ρ₀ of Table 2 over the bound, for each set of test poses."""
     model = Model(cell)
-    states, space = load_states(cell), joint_space(cell, model.chain)
-    drawn = draw(cell, model.chain, states, Feasibility(cell, model.chain), CANDIDATES, 0)
+    forces, space = plan_forces(cell), joint_space(cell, model.chain)
+    drawn = draw(cell, model.chain, forces, Feasibility(cell, model.chain), CANDIDATES, 0)
     shares = shares_of(cell)
     found = []
     for seed in range(SETS):
         targets = _test_poses(cell, space, np.random.default_rng(seed))
-        setup = set_up(model, states, drawn.q, drawn.load, 15, targets, Known(), seed)
-        pool = setup.pool(drawn.q, drawn.load, drawn.group)
+        setup = set_up(model, drawn.q, 15, targets, Known())
+        pool = setup.pool(drawn.q, drawn.group)
         q = table_2(model)
-        value = setup.value(q, np.full(len(q), ALL_LOADS))
+        value = setup.value(q)
         found.append(float(np.sqrt(value / relax(setup.problem(pool, shares)).bound)))
     return found
 

@@ -14,7 +14,7 @@ from elastocal.identification.identify import identify
 from elastocal.identification.options import Options
 from elastocal.measurements import Measurements
 from elastocal.model.manipulator import Model
-from elastocal.planning.information import ALL_LOADS, rows_of
+from elastocal.planning.information import rows_of
 from elastocal.simulation.simulate import simulate, values_from
 
 STEP = 1e-6  # rad, differences of the tool's position
@@ -45,7 +45,7 @@ def _instruments(name: str) -> tuple[Study, Tool]:
 
 def _one(study: Study, tool: Tool, q: np.ndarray, seed: np.random.SeedSequence) -> float:
     model, truth = study.model, tool.truth
-    rows = rows_of(q, np.full(len(q), ALL_LOADS), study.states, tuple(study.cell.tool.markers))
+    rows = rows_of(q, study.forces, tuple(study.cell.tool.markers))
     repeats = study.cell.design.repeats
     n = len(rows)
     table = rows.take(np.repeat(np.arange(n), repeats))

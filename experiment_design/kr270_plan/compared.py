@@ -15,7 +15,7 @@ from elastocal.planning.candidates import draw
 from elastocal.planning.checkpoint import Checkpoint
 from elastocal.planning.design import DesignOptions, design
 from elastocal.planning.feasibility import Feasibility
-from elastocal.planning.information import ALL_LOADS, LoadStates, load_states
+from elastocal.planning.information import plan_forces
 from elastocal.planning.plan import Plan
 from elastocal.planning.setup import FeasiblePool, Known, Setup, set_up, shares_of
 from elastocal.planning.test_poses import TargetPoses, test_poses
@@ -33,7 +33,7 @@ class Study:
     name: str
     cell: Cell
     model: Model
-    states: LoadStates
+    forces: np.ndarray
     feasibility: Feasibility
     targets: TargetPoses
     setup: Setup
@@ -45,22 +45,22 @@ class Study:
         cell, chain = model.cell, model.chain
         cell = replace(cell, design=replace(cell.design, candidates=candidates))
         model = Model.assembled(chain, cell)
-        states, feasibility = load_states(cell), Feasibility(cell, chain)
+        forces, feasibility = plan_forces(cell), Feasibility(cell, chain)
         targets = test_poses(cell, chain)
-        drawn = draw(cell, chain, states, feasibility, 2000, SEED)
+        drawn = draw(cell, chain, forces, feasibility, 2000, SEED)
         n = int(shares_of(cell).sum())
-        setup = set_up(model, states, drawn.q, drawn.load, n, targets, Known(), SEED)
-        pool = setup.pool(drawn.q, drawn.load, drawn.group)
-        return cls(name, cell, model, states, feasibility, targets, setup, pool)
+        setup = set_up(model, drawn.q, n, targets, Known())
+        pool = setup.pool(drawn.q, drawn.group)
+        return cls(name, cell, model, forces, feasibility, targets, setup, pool)
 
     def rho(self, q: np.ndarray) -> float:
         """Predicted ρ₀ in µm of the poses q (N, n)."""
-        value = self.setup.value(q, np.full(len(q), ALL_LOADS))
+        value = self.setup.value(q)
         return self.setup.criterion.reported(value)[0]
 
     def allowed(self, q: np.ndarray) -> np.ndarray:
         """(N,) poses that the cell allows in every load state."""
-        return np.logical_and.reduce([self.feasibility.check(q, f).ok for f in self.states.forces])
+        return np.logical_and.reduce([self.feasibility.check(q, f).ok for f in self.forces])
 
     def planned(self, criterion: str, effort: str, jobs: int) -> Plan:
         """Our plan; what an interrupted run had finished is taken from runs/."""

@@ -20,7 +20,6 @@ from elastocal.planning.arrangement import VIA
 from elastocal.planning.conditions import clocked
 from elastocal.planning.drift import DRIFT, Alias
 from elastocal.planning.execution import schedule
-from elastocal.planning.information import ALL_LOADS
 from elastocal.planning.time_budget import at_stops
 
 CANDIDATES = 2000  # those behind the setup, and the points that moves may go through
@@ -58,15 +57,14 @@ def main() -> None:
 
 
 def _rows(study: Study, q: np.ndarray) -> list[str]:
-    every = np.full(len(q), ALL_LOADS)
-    pool = study.setup.pool(q, every, np.zeros(len(q), dtype=int))
+    pool = study.setup.pool(q, np.zeros(len(q), dtype=int))
     alias = Alias.of(study.setup, pool, np.arange(len(q)))
     assert alias is not None and alias.at_test_poses
     rows = []
     for order, (changes, extra) in ORDERS.items():
         motion = replace(at_stops(study.cell), load_changes=changes, extra_time=extra)
         execution = schedule(
-            q, motion, study.feasibility, loads=study.states.forces,
+            q, motion, study.feasibility, loads=study.forces,
             via=study.pool.q[:: max(len(study.pool) // VIA, 1)], alias=alias,
         )  # fmt: skip
         stops = clocked(execution).stops

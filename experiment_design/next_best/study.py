@@ -38,7 +38,7 @@ from elastocal.planning.candidates import draw
 from elastocal.planning.design import DesignOptions, design
 from elastocal.planning.doubts import in_doubt, missing
 from elastocal.planning.feasibility import Feasibility
-from elastocal.planning.information import ALL_LOADS, load_states, rows_of
+from elastocal.planning.information import plan_forces, rows_of
 from elastocal.planning.setup import Known
 from elastocal.simulation.simulate import simulate
 
@@ -75,7 +75,7 @@ def model() -> Model:
 def feasible(n: int, seed: int) -> np.ndarray:
     """Random poses that the cell allows."""
     cell, chain = model().cell, model().chain
-    return draw(cell, chain, load_states(cell), Feasibility(cell, chain), n, seed).q
+    return draw(cell, chain, plan_forces(cell), Feasibility(cell, chain), n, seed).q
 
 
 @lru_cache(maxsize=16)
@@ -101,8 +101,7 @@ class TrueArm:
             self.where = str(rng.choice([w for name, w in places if name == self.effect]))
             q = feasible(100, 0)
             self.model, known, _ = in_doubt(
-                own, Known(), load_states(own.cell), q, np.full(len(q), ALL_LOADS),
-                {(self.effect, self.where): 1.0},
+                own, Known(), q, {(self.effect, self.where): 1.0}
             )  # fmt: skip
             if known.prior is not None:
                 names += known.prior.names
@@ -115,7 +114,7 @@ class TrueArm:
 
     def read(self, q: np.ndarray, noise: bool = True) -> Measurements:
         """The poses q (n, joints) under both loads; a pose's noise follows from its number."""
-        rows = rows_of(q, np.full(len(q), ALL_LOADS), load_states(model().cell), ("M1",))
+        rows = rows_of(q, plan_forces(model().cell), ("M1",))
         exact = simulate(self.model, rows, self.x, 0, noise=False)
         drawn = np.random.default_rng([self.number, 1]).standard_normal((1000, 3))
         return replace(exact, position=exact.position + noise * SIGMA * drawn[: len(exact)])

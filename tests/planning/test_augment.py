@@ -80,7 +80,7 @@ def test_the_same_campaign_again_halves_the_variances() -> None:
     assert twice.value(TABLE_2) == pytest.approx(once.value(TABLE_2) / 2, rel=1e-6)
 
     def variances(setup: Any) -> NDArray:
-        M = setup.gathered(setup.information.blocks(*plan))[0]
+        M = setup.gathered(setup.information.blocks(TABLE_2))
         return np.array([p.std**2 for p in predicted(setup.information.model, setup.found, M, 270)])
 
     assert np.allclose(variances(twice), variances(once) / 2, rtol=1e-6)

@@ -244,9 +244,12 @@ class Moves:
         if not self.loaded[self.load].any():
             return self, []
         again = np.array([v - 1 for v in tour[::-1] if not self.loaded[self.load[v - 1]]], int)
-        names = ("pose", "load", "leave", "entry", "inside")
-        more = {n: np.concatenate([getattr(self, n), getattr(self, n)[again]]) for n in names}
-        return replace(self, **more), (len(self.pose) + 1 + np.arange(len(again))).tolist()
+        pose, load, leave, entry, inside = (
+            np.concatenate([of, of[again]])
+            for of in (self.pose, self.load, self.leave, self.entry, self.inside)
+        )
+        more = replace(self, pose=pose, load=load, leave=leave, entry=entry, inside=inside)
+        return more, (len(self.pose) + 1 + np.arange(len(again))).tolist()
 
     def costs(self) -> Costs:
         """Costs between visits as known so far.
