@@ -15,7 +15,7 @@ from elastocal.cell.work_cell import read_cell
 from elastocal.model.effects.catalogue import CATALOGUE
 from elastocal.model.manipulator import Model
 from elastocal.planning.candidates import draw, joint_space
-from elastocal.planning.criterion import TraceCriterion
+from elastocal.planning.criteria import TraceCriterion
 from elastocal.planning.feasibility import Feasibility
 from elastocal.planning.information import plan_forces
 from elastocal.planning.polish import Searches

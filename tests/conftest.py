@@ -31,15 +31,15 @@ def short_search(request: pytest.FixtureRequest) -> Iterator[None]:
         yield
         return
     names = ("execution", "polish", "search")
-    execution, polish, search = (import_module(f"elastocal.planning.{name}") for name in names)
+    drift, polish, search = (import_module(f"elastocal.planning.{name}") for name in names)
     with pytest.MonkeyPatch.context() as patch:
         quick = replace(search.EFFORTS["quick"], starts=1)
         patch.setitem(search.EFFORTS, "quick", quick)
         patch.setattr(search, "REFINED", 0)
         patch.setattr(polish, "POINTS", 1)
         patch.setattr(polish, "STARTS", 1)
-        patch.setattr(execution, "STEPS", 1000)
-        patch.setattr(execution, "FEW", 1000)
+        patch.setattr(drift, "STEPS", 1000)
+        patch.setattr(drift, "FEW", 1000)
         yield
 
 

@@ -4,8 +4,7 @@ from __future__ import annotations
 
 import inspect
 
-from elastocal.planning.criteria import CRITERIA
-from elastocal.planning.criterion import ScenarioCriterion
+from elastocal.planning.criteria import CRITERIA, ScenarioCriterion
 
 HEAD = """# Criteria
 

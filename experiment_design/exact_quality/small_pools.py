@@ -6,8 +6,7 @@ from itertools import combinations, product
 
 import numpy as np
 
-from elastocal.planning.criteria import criterion_named
-from elastocal.planning.criterion import CriterionInputs
+from elastocal.planning.criteria import CriterionInputs, criterion_named
 from elastocal.planning.relaxation import DesignProblem
 from elastocal.units import Array, IntArray
 

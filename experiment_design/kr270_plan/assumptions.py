@@ -16,11 +16,11 @@ from compared import HERE, table_2
 from elastocal.cell.arm_description import Tool
 from elastocal.cell.work_cell import Cell, read_cell
 from elastocal.model.manipulator import Model
-from elastocal.planning.candidates import draw, joint_space
+from elastocal.planning.candidates import draw, joint_space, shares_of
 from elastocal.planning.feasibility import Feasibility
 from elastocal.planning.information import plan_forces
 from elastocal.planning.relaxation import relax
-from elastocal.planning.setup import Known, set_up, shares_of
+from elastocal.planning.setup import Known, set_up
 from elastocal.planning.test_poses import TargetPoses
 
 CANDIDATES = 20_000

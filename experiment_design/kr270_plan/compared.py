@@ -11,13 +11,13 @@ import numpy as np
 from elastocal.cell.work_cell import Cell, read_cell
 from elastocal.measurements import read_plan
 from elastocal.model.manipulator import Model
-from elastocal.planning.candidates import draw
+from elastocal.planning.candidates import draw, shares_of
 from elastocal.planning.checkpoint import Checkpoint
 from elastocal.planning.design import DesignOptions, design
 from elastocal.planning.feasibility import Feasibility
 from elastocal.planning.information import plan_forces
 from elastocal.planning.plan import Plan
-from elastocal.planning.setup import FeasiblePool, Known, Setup, set_up, shares_of
+from elastocal.planning.setup import FeasiblePool, Known, Setup, set_up
 from elastocal.planning.test_poses import TargetPoses, test_poses
 
 HERE = Path(__file__).parent

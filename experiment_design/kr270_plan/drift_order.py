@@ -17,10 +17,9 @@ from compared import HERE, Study, table_2
 
 from elastocal.measurements import read_plan
 from elastocal.planning.arrangement import VIA
-from elastocal.planning.conditions import clocked
-from elastocal.planning.drift import DRIFT, Alias
-from elastocal.planning.execution import schedule
-from elastocal.planning.time_budget import at_stops
+from elastocal.planning.choices import at_stops
+from elastocal.planning.execution import DRIFT, Alias, schedule
+from elastocal.planning.further_effects import clocked
 
 CANDIDATES = 2000  # those behind the setup, and the points that moves may go through
 ORDERS = {  # changes of load, share of extra time

@@ -36,8 +36,8 @@ from elastocal.measurements import Measurements
 from elastocal.model.manipulator import Model
 from elastocal.planning.candidates import draw
 from elastocal.planning.design import DesignOptions, design
-from elastocal.planning.doubts import in_doubt, missing
 from elastocal.planning.feasibility import Feasibility
+from elastocal.planning.further_effects import in_doubt, missing
 from elastocal.planning.information import plan_forces, rows_of
 from elastocal.planning.setup import Known
 from elastocal.simulation.simulate import simulate

@@ -49,7 +49,7 @@ from elastocal.model.effects.driven import (
     MarkerMotion,
 )
 from elastocal.planning import criteria
-from elastocal.planning.criterion import (
+from elastocal.planning.criteria import (
     CriterionInputs,
     ScenarioCriterion,
     SpectralCriterion,

@@ -175,8 +175,8 @@ def design_request(
     """
     from elastocal.model.choice import cell_of
     from elastocal.model.manipulator import Model
+    from elastocal.planning.candidates import read_pins
     from elastocal.planning.design import DesignOptions
-    from elastocal.planning.pins import read_pins
 
     cell = model.cell if isinstance(model, Model) else cell_of(_checked_cell(model))
     of_the_search = ("effort", "seed", "jobs", "doubts")

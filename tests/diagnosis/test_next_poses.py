@@ -15,7 +15,7 @@ from elastocal.demo.example import run_demo
 from elastocal.diagnosis.diagnosis import Candidate, Diagnosis, FoundEffect
 from elastocal.diagnosis.next_poses import doubts_after, verdict_of, with_effects_of
 from elastocal.model.effects.catalogue import SOMETHING
-from elastocal.planning.doubts import missing
+from elastocal.planning.further_effects import missing
 from elastocal.planning.plan import Gain
 
 FEW = ["--candidates", "60", "-q"]

@@ -7,8 +7,7 @@ import numpy as np
 import pytest
 
 from elastocal.errors import InputError, InsufficientDataError
-from elastocal.planning.criteria import CRITERIA
-from elastocal.planning.criterion import CriterionInputs, SpectralCriterion
+from elastocal.planning.criteria import CRITERIA, CriterionInputs, SpectralCriterion
 from elastocal.planning.exchange import (
     Sizes,
     exact_plan,

@@ -10,7 +10,8 @@ from typing import Any
 import numpy as np
 import pytest
 from support.calibration import random_chain
-from support.cells import kr270_cell, kr270_chain
+from support.cells import DOWN, kr270_cell, kr270_chain, random_poses
+from support.design_cells import plan_cell, setup_of
 from support.robots import KR270
 
 from elastocal.cell.plan_wishes import DesignSpec, Motion, TargetPose
@@ -18,6 +19,7 @@ from elastocal.cell.work_cell import Cell, read_cell
 from elastocal.cell.workspace_rules import CarriedBody, Solid, Workspace
 from elastocal.errors import InputError
 from elastocal.planning import test_poses as target_poses
+from elastocal.planning.candidates import joint_space
 from elastocal.planning.test_poses import check_cell
 
 HOME = np.radians([0.0, -90.0, 90.0, 0.0, 0.0, 0.0])
@@ -84,6 +86,19 @@ def test_what_does_not_fit_is_told_with_key_found_and_remedy(bad: Cell, told: li
     with pytest.raises(InputError) as caught:
         check_cell(bad, kr270_chain())
     assert not [part for part in told if part not in str(caught.value)], str(caught.value)
+
+
+def test_a_compliance_known_at_levels_asks_test_poses_and_plan_to_keep_to_them() -> None:
+    levels = {"compliance_levels": {"joint2": (-1.0, 0.0)}}
+    off = plan_cell(
+        model=levels, levels={"joint2": (-1.0,)}, loads=DOWN[None], test_poses=(TargetPose(HOME),)
+    )
+    q = random_poses(kr270_chain(), 30, seed=1)
+    q[:, 1] = -1.0
+    with pytest.raises(InputError, match=r"test pose 1: joint2 at -90° is none of its .*, 0°"):
+        setup_of(off, q)
+    with pytest.raises(InputError, match=r"levels\] joint2_deg = .* instead of joint3"):
+        joint_space(cell(model=levels, levels={"joint3": (0.0,)}), kr270_chain())
 
 
 @pytest.mark.parametrize(

@@ -6,13 +6,15 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from elastocal.errors import InputError
-from elastocal.planning.criteria import CRITERIA, criterion_named, register
-from elastocal.planning.criterion import (
+from elastocal.planning.criteria import (
+    CRITERIA,
     CriterionInputs,
     ScenarioCriterion,
     SpectralCriterion,
     TraceCriterion,
+    criterion_named,
     inverse,
+    register,
 )
 
 P = 6
@@ -180,7 +182,6 @@ OWN = {
         ((TraceCriterion,), {"name": "own"}, r"\('own'\) is not complete: define of$"),
         ((SpectralCriterion,), {"name": "own"}, "not complete: define figure, phi, phi_slope"),
         ((SpectralCriterion,), OWN, "is certifiable but states no curvature"),
-        ((Named,), {"name": "own", "term": 1}, "defines term, functions of M; state value, slope"),
         ((), {"name": "own"}, "takes a class derived from ScenarioCriterion"),
     ],
 )

@@ -8,8 +8,8 @@ from support.cells import DOWN, kr270_chain, random_poses
 from support.design_cells import plan_cell, set_up, target_poses
 
 from elastocal.model.manipulator import Model
-from elastocal.planning.doubts import in_doubt
 from elastocal.planning.exchange import exact_plan
+from elastocal.planning.further_effects import in_doubt
 from elastocal.planning.plan import Doubt, Gain
 from elastocal.planning.relaxation import balanced, relax
 from elastocal.planning.setup import Known, Setup

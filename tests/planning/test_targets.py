@@ -7,13 +7,15 @@ from dataclasses import replace
 import numpy as np
 import pytest
 from numpy.typing import NDArray
-from support.cells import COMPENSATOR, COMPLIANCE, DOWN, TABLE_2, kr270_chain
+from scipy.spatial.transform import Rotation
+from support.cells import COMPENSATOR, COMPLIANCE, DOWN, TABLE_2, kr270_chain, random_poses
 from support.cells import table_of as rows_with_markers
-from support.design_cells import FULL, any_cell, plan_cell, sliding_chain, spread
+from support.design_cells import FULL, any_cell, plan_cell, setup_of, sliding_chain, spread
 
 from elastocal.cell.arm_description import Nominal
 from elastocal.cell.plan_wishes import TargetPose
 from elastocal.cell.work_cell import Cell
+from elastocal.errors import InsufficientDataError
 from elastocal.model.arm import Parameter
 from elastocal.model.chain import Chain
 from elastocal.model.manipulator import Model
@@ -119,3 +121,35 @@ def test_the_rows_are_how_position_changes_with_the_parameters(case: str) -> Non
     assert np.abs(A - expected).max(axis=(0, 1)) == pytest.approx(0 * scale, abs=2e-6 * scale.max())
     observed = scale > 0
     assert (np.abs(A - expected).max(axis=(0, 1))[observed] < 1e-5 * scale[observed] + 1e-11).all()
+
+
+def test_a_point_on_the_tool_goes_with_fitted_markers_where_nothing_else_tells() -> None:
+    """Against the least-squares motion of the markers, by differences of where they are."""
+    q = TABLE_2[[0, 8]]
+    poses = tuple(TargetPose(one, point=POINT) for one in q)
+    cell = plan_cell(FULL, "position", loads=BOTH, test_poses=poses)
+    setup = setup_of(cell, random_poses(CHAIN, 120, seed=1))
+    (told,) = [text for text in setup.warnings if "point_m" in text]
+    assert "fixed to the markers" in told and np.isfinite(setup.value(TABLE_2))
+    model, targets = Model.assembled(CHAIN, cell), target_poses.test_poses(cell, CHAIN)
+    x, names = model.nominal, tuple(cell.tool.markers)
+    A = prediction_rows(model, targets, x, carried=True)
+    table = replace(rows_with_markers(targets.q, np.zeros(3), names),
+                    force=np.repeat(targets.force, len(names), axis=0))  # fmt: skip
+    places = np.array(list(cell.tool.markers.values()))
+
+    def at(x: NDArray) -> NDArray:
+        """Where the point is (T, 3), by Kabsch's rotation of the markers' places."""
+        found = []
+        for seen in model.predict(table, x).reshape(len(q), len(names), 3):
+            middle, own = seen.mean(axis=0), places.mean(axis=0)
+            turn = Rotation.align_vectors(seen - middle, places - own)[0]
+            found.append(middle + turn.apply(POINT - own))
+        return np.array(found)
+
+    step = 1e-4 * np.random.default_rng(0).normal(size=len(x)) * [size(p) for p in model.parameters]
+    expected = (at(x + step) - at(x - step)) / 2
+    assert A @ step == pytest.approx(expected, abs=1e-5 * np.abs(expected).max())
+    two = replace(cell, tool=replace(cell.tool, markers=dict(list(cell.tool.markers.items())[:2])))
+    with pytest.raises(InsufficientDataError, match=r"leave out point_m, .* or measure a third"):
+        setup_of(two, random_poses(CHAIN, 120, seed=1))

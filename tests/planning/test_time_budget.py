@@ -16,10 +16,9 @@ from elastocal.errors import InputError, InsufficientDataError
 from elastocal.model.manipulator import Model
 from elastocal.planning import choices, time_budget
 from elastocal.planning import test_poses as target_poses
-from elastocal.planning.choices import Choice
+from elastocal.planning.choices import Choice, _Budget, _minutes, at_stops
 from elastocal.planning.plan import TimedSize
 from elastocal.planning.setup import Known
-from elastocal.planning.time_budget import _Budget, _minutes, at_stops
 
 ONE = (TargetPose(np.radians([0.0, -90, 90, 0, 30, 0])),)
 MOTION = Motion(speed=np.ones(6), dwell=10.0, reading=2.0, load_change=120.0, extra_time=0.0)

@@ -108,7 +108,7 @@ def design(
     """
     from elastocal.files import together
     from elastocal.model.choice import cell_of
-    from elastocal.planning.pins import plan_and_names
+    from elastocal.planning.candidates import plan_and_names
     from elastocal.report.terminal import print_report
     from elastocal.saving import beside
 

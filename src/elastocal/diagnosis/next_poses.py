@@ -33,7 +33,7 @@ from elastocal.model.effects.catalogue import SOMETHING
 from elastocal.model.manipulator import Model
 from elastocal.planning.criteria import RobustError
 from elastocal.planning.design import DesignOptions, design
-from elastocal.planning.doubts import Place, missing
+from elastocal.planning.further_effects import Place, missing
 from elastocal.planning.plan import Gain, Plan
 from elastocal.planning.test_poses import where_used
 from elastocal.units import Progress

@@ -8,15 +8,14 @@ import numpy as np
 
 from elastocal.model.chain import finite_ranges, joint_limits
 from elastocal.planning.checkpoint import State
-from elastocal.planning.criterion import inverse
-from elastocal.planning.drift import Alias
+from elastocal.planning.choices import at_stops
+from elastocal.planning.criteria import inverse
 from elastocal.planning.exchange import exchange, fitted
-from elastocal.planning.execution import Execution, schedule
+from elastocal.planning.execution import Alias, Execution, schedule
 from elastocal.planning.feasibility import Feasibility
 from elastocal.planning.moves import Unreachable, blockers_of
 from elastocal.planning.search import Search, Selection
 from elastocal.planning.setup import FeasiblePool, Setup
-from elastocal.planning.time_budget import at_stops
 from elastocal.units import Array, BoolArray, IntArray, Progress
 
 SAME = 1e-9  # of the largest number of the blocks: rounding
@@ -91,7 +90,10 @@ class _Ordering:
         setup = search.setup
         if self.unwound:
             plan = _unwound(setup, plan, self.paths.feasibility)
-        plan = replace(plan, alias=Alias.of(search.plain, plan.pool, plan.chosen))
+        q, blocks = plan.pool.q[plan.chosen], plan.pool.blocks[plan.chosen]
+        plain, M = search.plain, search.plain.gathered(blocks)
+        alias = Alias.of(plain.information, q, blocks, M, plain.target_rows)
+        plan = replace(plan, alias=alias)
         return plan, _execution(setup, plan, self.paths, search.seed, search.progress)
 
     def polished(self, plan: Selection, execution: Execution) -> tuple[Selection, Execution]:

@@ -1,4 +1,4 @@
-"""Candidate poses: scrambled Sobol points within the limits and levels that the cell allows."""
+"""Candidate poses: drawn within limits and levels or brought, which the cell allows; which stay."""
 
 from __future__ import annotations
 
@@ -6,14 +6,18 @@ import math
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, replace
 from itertools import islice
+from pathlib import Path
 
 import numpy as np
 
 from elastocal.cell.work_cell import Cell
-from elastocal.errors import InputError, InsufficientDataError, require
+from elastocal.errors import InputError, InsufficientDataError, option, require
 from elastocal.measurements import Measurements
 from elastocal.model.chain import Chain, finite_ranges, joint_index, joint_limits
-from elastocal.planning.feasibility import Feasibility, PoseFeasibility
+from elastocal.model.manipulator import Model
+from elastocal.planning.feasibility import Feasibility, PoseFeasibility, Struck
+from elastocal.planning.information import plan_forces
+from elastocal.text import did_you_mean, listed, quoted
 from elastocal.units import Array, BoolArray, IntArray, Progress
 
 # Where poses may lie: joint ranges, and one joint that may be held at fixed levels.
@@ -60,14 +64,17 @@ def joint_space(cell: Cell, chain: Chain) -> JointSpace:
     """
     lower, upper = finite_ranges(chain, *joint_limits(cell, chain))
     wanted = cell.design.levels
-    for joint, levels in cell.model.compliance_levels.items() if not wanted else ():
+    for joint, levels in cell.model.compliance_levels.items():
+        if joint in wanted:
+            continue
         i = joint_index(cell, chain, joint, "[model.compliance_levels]")
         turns = chain.kinds[i] == "revolute"
         stated = ", ".join(f"{math.degrees(v) if turns else v:.6g}" for v in levels)
+        instead = f" instead of {next(iter(wanted))}" if wanted else ""
         raise InputError(
             f"{cell.path or cell.name}: [model.compliance_levels] has {joint} at levels, and the "
             f"plan must keep to them; add [design.levels] {joint}_{'deg' if turns else 'm'} = "
-            f"[{stated}]"
+            f"[{stated}]{instead}"
         )
     if not wanted:
         return JointSpace(lower, upper)
@@ -277,3 +284,190 @@ def _at(chain: Chain, space: JointSpace, group: int) -> str:
 def told(chain: Chain, j: int, value: float) -> str:
     """A value in rad or m of joint j as people read it: "-25.24°"."""
     return f"{np.degrees(value):.6g}°" if chain.kinds[j] == "revolute" else f"{value:.6g} m"
+
+
+# How many poses a plan has at each level.
+
+DEFAULT = 15  # poses, as in Table 2 of Klimchik et al. 2013
+
+
+def shares_of(cell: Cell, n_poses: int | None = None) -> IntArray:
+    """Poses (L,) per level of [design.levels]; (1,) without levels.
+
+    `n_poses` overrides what the cell says; what does not divide evenly goes to the first levels.
+    Raises InputError where levels would be left without a pose, or `per_level` contradicts.
+    """
+    spec = cell.design
+    levels = max(max((len(v) for v in spec.levels.values()), default=1), 1)
+    where = f"{cell.path or cell.name}: [design]"
+    if spec.per_level and n_poses is None:
+        each = spec.per_level * levels if len(spec.per_level) == 1 else spec.per_level
+        require(
+            len(each) == levels,
+            f"{where} poses_per_level has {len(each)} numbers, but there are {levels} levels",
+        )
+        return np.array(each, dtype=np.int64)
+    total = n_poses or spec.poses or DEFAULT
+    require(
+        total >= levels,
+        f"{where} asks for {total} poses at {levels} levels; ask for {levels} at least, or drop "
+        "levels",
+    )
+    return np.array([total // levels + (k < total % levels) for k in range(levels)], dtype=np.int64)
+
+
+def check_available(cell: Cell, available: IntArray, shares: IntArray) -> None:
+    """Are there as many candidates per level, `available` (L,), as the plan has poses there?
+
+    A candidate stands in a plan once.  Raises InputError where too few were asked for,
+    InsufficientDataError where too few are feasible.
+    """
+    short = np.flatnonzero(available < shares)
+    if not len(short):
+        return
+    k, drawn = int(short[0]), cell.design.candidates or int(available.sum())
+    level = f" takes {shares[k]} at level {k + 1} of {next(iter(cell.design.levels), '')}"
+    where = f"{cell.path or cell.name}: a plan of {int(shares.sum())} poses"
+    where += level if len(shares) > 1 else ""
+    if (taught := cell.design.taught) is not None:
+        raise InsufficientDataError(
+            f"{where}, but of the poses of {taught} the cell allows {available[k]} there; bring "
+            f'more, draw others beside them (candidates = ["{taught.name}", 500]), or plan fewer'
+        )
+    asked = drawn // len(shares) + (k < drawn % len(shares))
+    require(
+        asked >= shares[k],
+        f"{where}, but {drawn} candidates leave {asked} to choose from; ask for more "
+        f"({option('candidates')}, or [design] candidates)",
+    )
+    raise InsufficientDataError(
+        f"{where}, but only {available[k]} feasible candidates were found; plan fewer poses, or "
+        "relax the limits or the rules of [workspace]"
+    )
+
+
+def most_poses(cell: Cell, available: IntArray, limit: int) -> int:
+    """The most poses, `limit` at most, for which `available` (L,) candidates per level suffice."""
+    n = len(available)
+    while n < limit and (shares_of(cell, n + 1) <= available).all():
+        n += 1
+    return n
+
+
+@dataclass(frozen=True)
+class Pins:
+    """Poses that stay, `names` (k,) and `q` (k, n); those `struck` (m, n), near which no other may
+    come.  `taken`: all names that these plans have."""
+
+    names: tuple[str, ...]
+    q: Array
+    struck: Array
+    taken: tuple[str, ...]
+
+    @classmethod
+    def of(
+        cls,
+        keep: tuple[Measurements, Sequence[str]] | None,
+        strike: tuple[Measurements, Sequence[str]] | None,
+    ) -> Pins | None:
+        """Of the plans' poses with these names: those to keep (all, where none is named), and
+        those to strike, of which plan all others are kept.  Raises InputError for a name that
+        the plan lacks, and where nothing is named to strike."""
+        names: list[str] = []
+        rows, struck, taken = [], [], dict[str, None]()
+        for given, stays in ((keep, True), (strike, False)):
+            if given is None:
+                continue
+            table, named = given
+            own = _poses(table)
+            for name in named:
+                require(
+                    name in own,
+                    f"{table.source}: there is no pose {quoted(name)}"
+                    f"{did_you_mean(name, list(own))}; there are {listed(list(own))}",
+                )
+            require(bool(named) or stays, f"{option('strike')} takes poses, as in plan.csv:3,7")
+            kept = [n for n in own if (n in named) == stays] if named else list(own)
+            gone = [] if stays else [own[n] for n in named]
+            struck += [table.q[row] for row in gone]
+            clash = [name for name in kept if name in names]
+            require(not clash, f"{table.source}: pose {listed(clash)} is to be kept twice")
+            names += kept
+            rows += [table.q[own[n]] for n in kept]
+            taken |= dict.fromkeys(own)
+        if not rows and not struck:
+            return None
+        n = len((struck or rows)[0])
+        kept_at, struck_at = (np.array(lot).reshape(-1, n) for lot in (rows, struck))
+        return cls(tuple(names), kept_at, struck_at, tuple(taken))
+
+    def placed(self, cell: Cell, chain: Chain, rules: Feasibility) -> IntArray:
+        """The level (k,) of each pose that stays.
+
+        Raises InputError where one is at no level of the cell, or breaks a rule.
+        """
+        group = np.zeros(len(self.q), dtype=np.int64)
+        for k, (label, q) in enumerate(zip(self.names, self.q, strict=True)):
+            where = f"{cell.path or cell.name}: pose {quoted(label)}, which is to be kept,"
+            for joint, levels in cell.design.levels.items():
+                away = np.abs(np.array(levels) - q[joint_index(cell, chain, joint, "levels")])
+                group[k] = int(away.argmin())
+                require(away.min() < LEVEL_SLACK, f"{where} is at no level of {joint}")
+            for force in plan_forces(cell):
+                verdict = rules.check(q, force)
+                # That it stands near one struck out is the user's choice.
+                rules_of = zip(verdict.rules, verdict.broken[0], strict=True)
+                broken = [name for name, hit in rules_of if hit and name != Struck.name]
+                if broken:
+                    raise InputError(
+                        f"{where} breaks {broken[0]}; strike it ({option('strike')}), or relax the "
+                        "rule in the cell"
+                    )
+        return group
+
+
+def read_pins(
+    cell: Cell, model: Model, keep: str | Path | None, strike: str | Path | None, sized: bool
+) -> tuple[Cell, Pins | None]:
+    """What stays and what is struck by the names of files, as in "plan.csv:3,7"; and the cell,
+    which asks for as many poses as the plan had of which poses are struck, unless it is `sized`.
+
+    Raises InputError as `Pins.of` does, and for files that cannot be read.
+    """
+
+    def read(text: str | Path) -> tuple[Measurements, tuple[str, ...]]:
+        path, names = plan_and_names(text)
+        return model.read_plan(path), names
+
+    repaired = None if strike is None else read(strike)
+    pins = Pins.of(None if keep is None else read(keep), repaired)
+    if repaired is not None and not sized and cell.design.target is None:
+        n = len(_poses(repaired[0]))
+        if n != int(shares_of(cell).sum()):
+            cell = replace(cell, design=replace(cell.design, poses=n, per_level=()))
+    return cell, pins
+
+
+def plan_and_names(text: str | Path) -> tuple[Path, tuple[str, ...]]:
+    """ "plan.csv:3,7": a plan's file, and the poses named behind it."""
+    path, colon, names = str(text).rpartition(":")
+    if not colon or Path(text).exists():
+        return Path(text), ()
+    return Path(path), tuple(name.strip() for name in names.split(",") if name.strip())
+
+
+def _poses(table: Measurements) -> dict[str, int]:
+    """Pose → its first row, in the order of the table.
+
+    "7+" and "7-", the sides from which pose 7 is approached, are one; reference visits, "7r1",
+    are none of the plan's own."""
+    labels = table.configuration_labels
+    found: dict[str, int] = {}
+    for row, configuration in enumerate(table.configuration):
+        name = labels[configuration]
+        if name[-1] in "+-" and name[:-1] + "+" in labels and name[:-1] + "-" in labels:
+            name = name[:-1]
+        again = name.rpartition("r")
+        if not (again[2].isdigit() and again[0] in found):
+            found.setdefault(name, row)
+    return found

@@ -23,20 +23,22 @@ from elastocal.planning.candidates import (
     LEVEL_SLACK,
     NO_LEVEL,
     Candidates,
+    Pins,
     brought,
+    check_available,
     draw,
     joint_space,
+    most_poses,
+    shares_of,
 )
 from elastocal.planning.checkpoint import Checkpoint, State
-from elastocal.planning.choices import Choice
-from elastocal.planning.conditions import ScheduledEffects
+from elastocal.planning.choices import Choice, within
 from elastocal.planning.criteria import CRITERIA, GONE
-from elastocal.planning.doubts import OPEN, Place, gain_of, in_doubt
 from elastocal.planning.exchange import Sizes, random_information, values_without
 from elastocal.planning.feasibility import Feasibility
+from elastocal.planning.further_effects import OPEN, Place, ScheduledEffects, gain_of, in_doubt
 from elastocal.planning.information import Done, measured, next_number, plan_forces, readings_each
 from elastocal.planning.moves import blockers_of
-from elastocal.planning.pins import Pins
 from elastocal.planning.plan import (
     CandidateCounts,
     Chance,
@@ -48,18 +50,8 @@ from elastocal.planning.plan import (
 )
 from elastocal.planning.polish import Searches
 from elastocal.planning.search import EFFORTS, POOL, Search, SearchEffort, Selection
-from elastocal.planning.setup import (
-    FeasiblePool,
-    Known,
-    Setup,
-    check_available,
-    most_poses,
-    set_up,
-    share_within,
-    shares_of,
-)
+from elastocal.planning.setup import FeasiblePool, Known, Setup, set_up, share_within
 from elastocal.planning.test_poses import TargetPoses, check_cell, everywhere, test_poses
-from elastocal.planning.time_budget import within
 from elastocal.text import did_you_mean, listed, quoted
 from elastocal.units import Array, IntArray, Progress
 

@@ -14,8 +14,7 @@ from typing import Any
 import numpy as np
 
 from elastocal.errors import InsufficientDataError
-from elastocal.planning.criteria import DeterminantCriterion
-from elastocal.planning.criterion import inverse
+from elastocal.planning.criteria import DeterminantCriterion, inverse
 from elastocal.planning.relaxation import (
     DesignProblem,
     Relaxed,

@@ -1,19 +1,406 @@
-"""The order of execution: the shortest tour through all poses and loads, and its stops."""
+"""The order of execution: the shortest tour through all poses and loads, or one in which a drift is
+not taken for a parameter, and its stops."""
 
 from __future__ import annotations
 
+import math
 from collections import Counter
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
+from functools import cached_property
 from itertools import pairwise
 
 import numpy as np
+from scipy import linalg
 
+from elastocal.cell.arm_description import Unsteadiness
 from elastocal.cell.plan_wishes import Motion
 from elastocal.errors import require
-from elastocal.planning.drift import Alias, Drifting, against_drift, with_references
+from elastocal.identification.visit_record import course_waves
+from elastocal.planning.information import PoseInformation
 from elastocal.planning.moves import BlockersOf, Costs, Moves, PathChecker, Reach
 from elastocal.units import Array, IntArray, Progress
+
+# What a steady drift of tracker or base does to what the readings are evaluated for.
+
+DRIFT = 50e-6  # m, from the first reading to the last: a tracker or a base over an hour
+HARMLESS = 0.1  # of what noise leaves: adds half a per cent to the error
+
+
+@dataclass(frozen=True)
+class Alias:
+    """How a shift of single readings comes back as an error of what the plan is for.
+
+    `share` (N, L, m, 3): the error (m,) that a shift (3,) m of the readings of pose i in load
+    state l leaves: R M⁻¹ B_iᵀ Σ_i⁻¹ D_il, D_il how readings enter the observations, |R x| the rms
+    error at the test poses in m where `at_test_poses`, else x in its own standard deviations.
+    `noise`: what the readings' noise leaves, in the same terms.  `whitened` (N, L, r, 3): the
+    Σ_i^(-1/2) D_il, beside the `blocks` (N, r, p) of the plan's information.
+    """
+
+    share: Array
+    noise: float
+    at_test_poses: bool
+    whitened: Array
+    blocks: Array
+
+    @classmethod
+    def of(
+        cls, information: PoseInformation, q: Array, blocks: Array, M: Array, R: Array | None
+    ) -> Alias | None:
+        """Of a plan of poses q (N, n) with `blocks` (N, r, p) and all that is known M (p, p), |R x|
+        the rms error at the test poses; None where readings are distances, which a shift changes
+        by no more than its part along the line of sight."""
+        observed, factor = information.noise(q)
+        if observed.kind == "distance":
+            return None
+        V = linalg.cho_solve(linalg.cho_factor(M), np.eye(len(M)))
+        root = np.linalg.cholesky(M).T if R is None else R
+        n, n_states = len(q), len(information.forces)
+        rows = len(observed.table) // n
+        T = observed.combine[: len(observed.lead) // n, :rows].toarray()
+        force = observed.table.force.reshape(n, rows, 3)
+        shift = np.zeros((observed.size, 3))
+        shift[:3, :3] = np.eye(3)
+        share = np.zeros((n, n_states, len(root), 3))
+        whitened = np.zeros((n, n_states, blocks.shape[1], 3))
+        for state, own in enumerate(information.forces):
+            here = (np.abs(force - own) < 1e-9).all(axis=2)
+            D = np.einsum("ak,nk,cx->nacx", T, here.astype(float), shift)
+            whitened[:, state] = np.linalg.solve(factor, D.reshape(n, -1, 3))
+            share[:, state] = root @ V @ np.einsum("nrp,nrx->npx", blocks, whitened[:, state])
+        noise = float(np.sqrt(np.trace(root @ V @ root.T)))
+        return cls(share, noise, R is not None, whitened, blocks)
+
+    def information(self, M: Array, time: Array, noise: Unsteadiness) -> Array:
+        """What is left of the information M (p, p) where all drifts as the cell's `noise` says,
+        poses being read at `time` (N, L) in s.
+
+        The drift's course is a sum of waves F u, u ~ N(0, I), that are estimated beside the
+        parameters: M − BᵀF (I + FᵀF)⁻¹ FᵀB.
+        """
+        span = max(float(np.ptp(time)), 1e-9)
+        waves = course_waves((time.ravel() - time.min()) / span, noise.lasting / span)
+        F = np.einsum("nlrx,nlk->nrxk", self.whitened, waves.reshape(*time.shape, -1))
+        F = noise.drift * F.reshape(self.blocks.shape[0] * self.blocks.shape[1], -1)
+        across = F.T @ self.blocks.reshape(len(F), -1)
+        return np.asarray(M - across.T @ np.linalg.solve(np.eye(F.shape[1]) + F.T @ F, across))
+
+
+@dataclass(frozen=True)
+class Drifting:
+    """What a steady drift of DRIFT over the measurements puts on what the plan is for, at worst:
+    `bias` in this order, `shortest` in the shortest order, `noise` beside it, in m at the test
+    poses, or in standard deviations of the parameters where not `at_test_poses`."""
+
+    bias: float
+    shortest: float
+    noise: float
+    at_test_poses: bool
+
+
+# The load states in turn, within a number of changes of load.
+
+
+def turns(loaded: Sequence[bool], used: Sequence[int], changes: int | None) -> list[int]:
+    """Load states in the order in which they come, each entry one block of visits.
+
+    `loaded` (L,): which states have a load; `used`: those that are visited.  At most `changes`
+    loads are hung, exchanged or taken off, the arm beginning and ending without; None: as few as
+    the states allow.  Without load the arm is measured in every gap, first and last of all, so
+    that neither the loads nor their absence fall to one part of the time.  Raises InputError
+    where there are fewer changes than loads need.
+    """
+    free = [state for state in used if not loaded[state]]
+    heavy = [state for state in used if loaded[state]]
+    if not heavy:
+        return free[:1]
+    least = len(heavy) + 1
+    require(
+        changes is None or changes >= least,
+        f"[design.motion] load_changes is {changes}, but the loads are hung, exchanged and taken "
+        f"off {least} times at least; allow {least}, or plan fewer loads",
+    )
+    changes = changes or least
+    if len(heavy) == 1:
+        blocks = changes // 2 if free else 1
+        return [*free, *(heavy + free) * blocks]
+    there_and_back = heavy + heavy[-2:0:-1]
+    return [*free, *(there_and_back[k % len(there_and_back)] for k in range(changes - 1)), *free]
+
+
+def in_turns(tour: list[int], load: IntArray, sequence: list[int]) -> list[int]:
+    """The visits of a tour, of load states (V,), in blocks of `sequence`, as many in each block of
+    a state, in the order of the tour."""
+    of_state = {s: [v for v in tour if load[v - 1] == s] for s in set(sequence)}
+    parts = {s: np.array_split(visits, sequence.count(s)) for s, visits in of_state.items()}
+    return [int(v) for s in sequence for v in parts[s].pop(0)]
+
+
+# The order: first little bias, then little travel, by simulated annealing.
+
+# Temperatures in units of a bias that is as good as none: the searches begin at those of HOT, the
+# first three from anywhere, the others near the best found; an order that is nearly good, by its
+# making or but for moves that turn out to be blocked, is bettered from WARM.
+HOT, WARM, COLD = (4.0, 4.0, 4.0, 1.0, 0.25), 0.06, 1e-3
+STEPS, FEW, MENDING = 40_000, 10_000, 2_500  # from HOT, from WARM, and of blocked moves
+ROUNDS = 12  # of blocked moves found and the order mended, before the ways around are taken
+HOPED = 0.5  # of its bias is left by a whole search, at best, to an order that is nearly good
+
+
+@dataclass(frozen=True)
+class Clock:
+    """When each visit of an order is read, and what a drift then does.
+
+    `change` (V + 1, V + 1) s where a move changes the load, `visit` s of reading at a node; `share`
+    (V, m·3) of each visit.  Of travel `longest` s are allowed; a bias of `enough` per m of drift is
+    as good as none.
+    """
+
+    moves: Moves
+    costs: Costs
+    change: Array
+    visit: float
+    share: Array
+    longest: float
+    enough: float
+
+    @classmethod
+    def of(
+        cls, moves: Moves, motion: Motion, costs: Costs, alias: Alias | None, shortest: list[int]
+    ) -> Clock:
+        """Allows so much more travel than in the `shortest` tour as `motion` has extra time."""
+        share = np.zeros((1 + moves.pose.max(), 1 + moves.load.max(), 1, 3))
+        if alias is not None:
+            share = alias.share
+        times = np.zeros(share.shape[:2])  # that each is read; each time with a part of it
+        np.add.at(times, (moves.pose, moves.load), 1.0)
+        share = share / np.maximum(times, 1.0)[..., None, None]
+        made = cls(
+            moves,
+            costs,
+            change=np.where(costs.changed, motion.load_change, 0.0),
+            visit=motion.dwell * (1 if moves.signs is None else 2),
+            share=share[moves.pose, moves.load].reshape(len(moves.pose), -1),
+            longest=np.inf,
+            enough=1.0 if alias is None else HARMLESS * alias.noise / DRIFT,
+        )
+        longest = made.driving(shortest) + motion.longer * made.time(shortest)
+        return replace(made, longest=longest)
+
+    def known(self) -> Clock:
+        """With what is known of the moves since."""
+        return replace(self, costs=self.moves.costs())
+
+    def possible(self, tour: list[int]) -> bool:
+        """Has every move a way, within the time allowed?"""
+        return self.driving(tour) <= self.longest
+
+    def driving(self, tour: list[int]) -> float:
+        ring = np.array([0, *tour, 0])
+        return float(self.costs.travel[ring[:-1], ring[1:]].sum())
+
+    @cached_property
+    def _step(self) -> Array:
+        return self.costs.travel + self.change + self.visit
+
+    def time(self, tour: list[int]) -> float:
+        """s from the first move to the last."""
+        ring = np.array([0, *tour, 0])
+        changing = float(self.change[ring[:-1], ring[1:]].sum())
+        return self.driving(tour) + self.visit * len(tour) + changing
+
+    def _errors(self, ring: IntArray) -> Array:
+        """(m, 3) error per m of drift in x, y, z, counted from the readings' mean time; the visits
+        with a node 0 before and after them."""
+        there = ring[1:-1]
+        time = self._step[ring[:-2], there].cumsum()
+        at = np.zeros(len(self._step))
+        at[there] = time - np.add.reduce(time) / len(time)
+        errors = at[1:] @ self.share / max(float(time[-1] - time[0]), 1e-300)
+        return np.asarray(errors.reshape(-1, 3))
+
+    def bias(self, tour: list[int]) -> float:
+        """Error per m of drift in its worst direction."""
+        return float(np.linalg.norm(self._errors(np.array([0, *tour, 0])), ord=2))
+
+    def price(self, tour: list[int]) -> float:
+        """What annealing makes small: bias beyond `enough`, travel beyond `longest`, travel."""
+        ring = np.array([0, *tour, 0])
+        errors = self._errors(ring)
+        across = errors.T @ errors
+        # Between rms and worst direction, which is what counts: Schatten's norm of order 4.
+        bias = math.sqrt(math.sqrt(np.vdot(across, across))) / self.enough
+        driving = float(np.add.reduce(self.costs.travel[ring[:-1], ring[1:]])) / self.longest
+        return max(bias - 1, 0.0) + 100 * max(driving - 1, 0.0) + 0.1 * driving
+
+    def annealed(self, tour: list[int], seed: int, steps: int, hot: float) -> list[int]:
+        """The tour with its visits exchanged and moved between blocks of the same load state,
+        never more changes of load, by annealing the price from `hot` down to COLD."""
+        if len(tour) < 3 or not steps:
+            return tour
+        rng = np.random.default_rng(seed)
+        here, price = list(tour), self.price(tour)
+        best, least = here, price
+        loads = [-1, *self.moves.load.tolist()]  # by node
+        cooling, temperature = (COLD / hot) ** (1 / steps), hot
+        for kind, a, b, luck in rng.random((steps, 4)).tolist():
+            temperature *= cooling
+            new = _moved(here, loads, kind, int(a * len(here)), int(b * len(here)))
+            if new is None:
+                continue
+            found = self.price(new)
+            if found <= price or luck < math.exp((price - found) / temperature):
+                here, price = new, found
+                if price < least:
+                    best, least = here, price
+        return best
+
+    def searched(self, near: list[int], seed: int, progress: Progress) -> tuple[list[int], Clock]:
+        """The order of least price found from one that is `near` a good one."""
+        best, clock, moves = near, self, self.moves
+        for k, hot in enumerate((None, *HOT)):
+            new = near if hot is None else clock.annealed(best, seed + k, STEPS, hot)
+            rounds = 0
+            while moves.check(new, clock.costs):
+                progress(f"order of execution against drift: {moves.checked} moves checked")
+                rounds += 1
+                if moves.crowded or rounds == ROUNDS:
+                    moves.settle()
+                clock = clock.known()
+                if rounds <= ROUNDS:
+                    new = clock.annealed(new, seed + rounds, MENDING, WARM)
+            best = min(best, new, key=clock.price)
+            # Enough where a drift does no harm any more; without an alias the way alone counts.
+            if clock.possible(best) and clock.share.any() and clock.bias(best) <= clock.enough:
+                break
+        return best, clock
+
+
+def against_drift(
+    moves: Moves,
+    motion: Motion,
+    tour: list[int],
+    costs: Costs,
+    alias: Alias | None,
+    seed: int,
+    progress: Progress,
+) -> tuple[list[int], Moves, Costs, Drifting | None]:
+    """The visits of the shortest `tour` in the order that a drift harms least, with the moves and
+    costs that they are nodes of, and what the drift does to it; the shortest tour itself where no
+    other is better.  Where there is time for it, all poses are read twice without load; where no
+    extra time is stated, if (ρ² + b²) t falls, of the error at the test poses ρ, the drift's
+    part of it b and the time t: if more readings, by which ρ² falls as 1/t, would give less."""
+    used = [int(s) for s in dict.fromkeys(moves.load[np.array(tour) - 1])]
+    sequence = turns(moves.loaded.tolist(), used, motion.load_changes)
+    clock = Clock.of(moves, motion, costs, alias, tour)
+    before, noise = clock.bias(tour), 0.0 if alias is None else alias.noise
+    as_pays = motion.extra_time is None
+
+    def harm(bias: float, time: float) -> float:
+        squared = noise**2 + (DRIFT * bias) ** 2
+        return squared * time if as_pays else max(bias, clock.enough)
+
+    once = clock.annealed(in_turns(tour, moves.load, sequence), seed, FEW, WARM)
+    (spread, again), twice = moves.unloaded_twice(tour), None
+    longer = len(again) * clock.visit
+    left = clock.longest - (0.0 if as_pays else longer)
+    once_harms = clock.bias(once), clock.time(once)
+    # Can it pay, if no drift is left at all?
+    pays = harm(0.0, clock.time(tour) + longer) < harm(*once_harms)
+    if alias is not None and len(again) and pays and left >= clock.driving(tour):
+        own = replace(Clock.of(spread, motion, spread.costs(), alias, tour), longest=left)
+        begun = own.annealed(in_turns([*tour, *again], spread.load, sequence), seed, FEW, WARM)
+        found, own = own.searched(begun, seed, progress)
+        if own.possible(found):
+            twice = found, own
+    twice_harms = (
+        np.inf if twice is None else harm(twice[1].bias(twice[0]), twice[1].time(twice[0]))
+    )
+    if harm(HOPED * once_harms[0], once_harms[1]) <= twice_harms:
+        once, clock = clock.known().searched(once, seed, progress)
+        more = bool(motion.load_changes) and alias is None
+        if not clock.possible(once) or not (more or clock.bias(once) < before):
+            once = tour
+    if twice is not None and twice_harms < harm(clock.bias(once), clock.time(once)):
+        once, clock = twice
+    while clock.moves.check(once, clock.costs):
+        clock = clock.known()
+    drift = None
+    if alias is not None:
+        drift = Drifting(DRIFT * clock.bias(once), DRIFT * before, noise, alias.at_test_poses)
+    return once, clock.moves, clock.costs, drift
+
+
+def _moved(tour: list[int], load: list[int], kind: float, i: int, j: int) -> list[int] | None:
+    """Visits i and j exchanged, i put beside j, or what lies between them turned round; None
+    where that would change the blocks of equal `load` by node."""
+    here = load[tour[i]]
+    if i == j or here != load[tour[j]]:
+        return None
+    new = tour.copy()
+    if kind < 0.5:
+        new[i], new[j] = new[j], new[i]
+        return new
+    low, high = min(i, j), max(i, j)
+    if kind < 0.7:
+        if any(load[node] != here for node in tour[low : high + 1]):
+            return None
+        new[low : high + 1] = new[low : high + 1][::-1]
+        return new
+    alone = (i == 0 or load[tour[i - 1]] != here) and (
+        i + 1 == len(tour) or load[tour[i + 1]] != here
+    )
+    if alone:
+        return None  # its block would be gone
+    new.insert(j, new.pop(i))
+    return new
+
+
+# Reference poses: the same pose again and again, which shows a drift by itself.
+
+
+def with_references(
+    tour: list[int], moves: Moves, costs: Costs, every: int, paired: bool
+) -> list[tuple[int, int]]:
+    """The tour's nodes, 0 behind each, with one pose of each load state visited again before the
+    first, after `every` visits, and at the end, under the load that hangs there, its number
+    behind it.
+
+    The pose is the one with the least way to the others, the same for all load states where one
+    is visited in all.  Where readings are `paired`, loaded with unloaded, it is visited loaded no
+    more often than without load.
+    """
+    mean = costs.travel[1:, 1:].mean(axis=0)
+    states = [int(s) for s in dict.fromkeys(moves.load[np.array(tour) - 1])]
+    common = set.intersection(*(set(moves.pose[moves.load == s].tolist()) for s in states))
+    if common:
+        best = min(sorted(common), key=lambda k: float(mean[moves.pose == k].sum()))
+        candidates = moves.pose == best
+    else:
+        candidates = np.ones(len(moves.pose), dtype=bool)
+    chosen = {
+        s: 1 + min(np.flatnonzero(candidates & (moves.load == s)).tolist(), key=lambda v: mean[v])
+        for s in states
+    }
+    times = dict.fromkeys(states, 0)
+    found: list[tuple[int, int]] = []
+    for k, node in enumerate([*tour, tour[-1]]):
+        state = int(moves.load[node - 1])
+        if k % every == 0 or k == len(tour):
+            times[state] += 1
+            found.append((chosen[state], times[state]))
+        if k < len(tour):
+            found.append((node, 0))
+    most = min((n for s, n in times.items() if not moves.loaded[s]), default=0)
+    if paired:
+        found = [
+            (node, again)
+            for node, again in found
+            if again <= most or not moves.loaded[moves.load[node - 1]]
+        ]
+    return found
+
 
 # The order of execution as it is handed on: stops, how to get to them, what it takes.
 

@@ -17,7 +17,7 @@ from elastocal.files import atomic_write_text
 from elastocal.measurements import DEFAULT_MARKER, Measurements, families
 from elastocal.model.manipulator import Model
 from elastocal.planning.choices import Chosen
-from elastocal.planning.criterion import ScenarioCriterion
+from elastocal.planning.criteria import ScenarioCriterion
 from elastocal.planning.execution import Execution, Stop
 from elastocal.planning.information import Estimable
 from elastocal.tables import column, csv_text

@@ -18,7 +18,7 @@ from functools import cached_property, lru_cache
 import numpy as np
 
 from elastocal.errors import InsufficientDataError, require
-from elastocal.planning.criterion import ScenarioCriterion, TangentBound, covariance, inverse
+from elastocal.planning.criteria import ScenarioCriterion, TangentBound, covariance, inverse
 from elastocal.units import Array, BoolArray, IntArray
 
 # Packed information larger than this (bytes) is not stored; pricing then goes through the blocks.

@@ -11,7 +11,6 @@ from dataclasses import asdict, dataclass, replace
 import numpy as np
 
 from elastocal.planning.checkpoint import Checkpoint, State
-from elastocal.planning.drift import Alias
 from elastocal.planning.exchange import (
     PATIENCE,
     check_determined,
@@ -20,6 +19,7 @@ from elastocal.planning.exchange import (
     random_plan,
     rounded,
 )
+from elastocal.planning.execution import Alias
 from elastocal.planning.plan import Certificate
 from elastocal.planning.polish import Continuum, Searches, estimate, polish
 from elastocal.planning.relaxation import (

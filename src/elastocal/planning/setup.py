@@ -1,4 +1,4 @@
-"""What a design knows before it chooses: parameters, criterion, earlier information, shares."""
+"""What a design knows before it chooses: parameters, criterion, earlier information."""
 
 from __future__ import annotations
 
@@ -9,13 +9,11 @@ from dataclasses import dataclass, replace
 import numpy as np
 from numpy.typing import NDArray
 
-from elastocal.cell.work_cell import Cell
-from elastocal.errors import InsufficientDataError, option, require
+from elastocal.errors import InsufficientDataError, option
 from elastocal.identification.knowledge import GaussianPrior
 from elastocal.identification.start import fixed_and_free
 from elastocal.model.manipulator import Model
-from elastocal.planning.criteria import criterion_named
-from elastocal.planning.criterion import CriterionInputs, ScenarioCriterion
+from elastocal.planning.criteria import CriterionInputs, ScenarioCriterion, criterion_named
 from elastocal.planning.information import (
     Done,
     Estimable,
@@ -29,83 +27,14 @@ from elastocal.planning.information import (
 from elastocal.planning.relaxation import DesignProblem, balancing, in_terms, relax
 from elastocal.planning.test_poses import (
     TargetPoses,
-    joined,
+    known_rows,
     on_kept,
-    prediction_rows,
     remaining_bias,
     unpredictable,
 )
 from elastocal.simulation.simulate import values_from
 from elastocal.text import listed
 from elastocal.units import Array, IntArray, Progress
-
-# How many poses a plan has at each level.
-
-DEFAULT = 15  # poses, as in Table 2 of Klimchik et al. 2013
-
-
-def shares_of(cell: Cell, n_poses: int | None = None) -> IntArray:
-    """Poses (L,) per level of [design.levels]; (1,) without levels.
-
-    `n_poses` overrides what the cell says; what does not divide evenly goes to the first levels.
-    Raises InputError where levels would be left without a pose, or `per_level` contradicts.
-    """
-    spec = cell.design
-    levels = max(max((len(v) for v in spec.levels.values()), default=1), 1)
-    where = f"{cell.path or cell.name}: [design]"
-    if spec.per_level and n_poses is None:
-        each = spec.per_level * levels if len(spec.per_level) == 1 else spec.per_level
-        require(
-            len(each) == levels,
-            f"{where} poses_per_level has {len(each)} numbers, but there are {levels} levels",
-        )
-        return np.array(each, dtype=np.int64)
-    total = n_poses or spec.poses or DEFAULT
-    require(
-        total >= levels,
-        f"{where} asks for {total} poses at {levels} levels; ask for {levels} at least, or drop "
-        "levels",
-    )
-    return np.array([total // levels + (k < total % levels) for k in range(levels)], dtype=np.int64)
-
-
-def check_available(cell: Cell, available: IntArray, shares: IntArray) -> None:
-    """Are there as many candidates per level, `available` (L,), as the plan has poses there?
-
-    A candidate stands in a plan once.  Raises InputError where too few were asked for,
-    InsufficientDataError where too few are feasible.
-    """
-    short = np.flatnonzero(available < shares)
-    if not len(short):
-        return
-    k, drawn = int(short[0]), cell.design.candidates or int(available.sum())
-    level = f" takes {shares[k]} at level {k + 1} of {next(iter(cell.design.levels), '')}"
-    where = f"{cell.path or cell.name}: a plan of {int(shares.sum())} poses"
-    where += level if len(shares) > 1 else ""
-    if (taught := cell.design.taught) is not None:
-        raise InsufficientDataError(
-            f"{where}, but of the poses of {taught} the cell allows {available[k]} there; bring "
-            f'more, draw others beside them (candidates = ["{taught.name}", 500]), or plan fewer'
-        )
-    asked = drawn // len(shares) + (k < drawn % len(shares))
-    require(
-        asked >= shares[k],
-        f"{where}, but {drawn} candidates leave {asked} to choose from; ask for more "
-        f"({option('candidates')}, or [design] candidates)",
-    )
-    raise InsufficientDataError(
-        f"{where}, but only {available[k]} feasible candidates were found; plan fewer poses, or "
-        "relax the limits or the rules of [workspace]"
-    )
-
-
-def most_poses(cell: Cell, available: IntArray, limit: int) -> int:
-    """The most poses, `limit` at most, for which `available` (L,) candidates per level suffice."""
-    n = len(available)
-    while n < limit and (shares_of(cell, n + 1) <= available).all():
-        n += 1
-    return n
-
 
 # Everything a design knows before it chooses: parameters, criterion, information known before.
 
@@ -230,9 +159,10 @@ def set_up(
     own, share = None, 0.0
     if "test_poses" in criterion_named(spec.criterion).needs:
         T, share = len(targets.q), spec.elsewhere or 0.0
-        both = targets if region is None else joined(targets, region, share)
+        both = targets if region is None else targets.with_others(region, share)
         at_work = model if work is None else work
-        rows = prediction_rows(at_work, both, x + (at_work.nominal - model.nominal))
+        rows, told = known_rows(model, at_work, both, x + (at_work.nominal - model.nominal), found)
+        warnings += told
         A = on_kept(model, rows[:T], found)
         if region is not None:
             # None where no plan could make the position at all of them certain.
@@ -253,7 +183,7 @@ def set_up(
         rows, weights = A, targets.weight
         if share and A is not None and beyond is not None and region is not None:
             rows = np.concatenate([A, beyond])
-            weights = joined(targets, region, share).weight
+            weights = targets.with_others(region, share).weight
         return criterion_named(spec.criterion).of(
             CriterionInputs(
                 spec.criterion, len(kept), interest, rows, weights, combination,

@@ -7,7 +7,6 @@ from dataclasses import dataclass, replace
 from pathlib import Path
 
 import numpy as np
-from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
 from elastocal.cell.arm_description import EffectChoice
@@ -30,7 +29,7 @@ from elastocal.planning.feasibility import Feasibility
 from elastocal.planning.information import Estimable, why
 from elastocal.tables import NO_UNIT, Family, Layout, RawTable, read_table
 from elastocal.text import listed, quoted
-from elastocal.units import Array, IntArray
+from elastocal.units import Array, BoolArray, IntArray
 
 # Does what the cell asks of a plan fit the robot?  Checked once, before anything is designed.
 
@@ -69,11 +68,8 @@ def beyond_limits(cell: Cell, chain: Chain, q: Array) -> str | None:
     if not len(beyond):
         return None
     j = int(beyond[0])
-    low, high = told(chain, j, lower[j]), told(chain, j, upper[j])
-    return (
-        f"joint{j + 1} ({chain.joints[j].name}) at {told(chain, j, q[j])} is beyond its limits, "
-        f"{low} to {high}"
-    )
+    at, low, high = (told(chain, j, value) for value in (q[j], lower[j], upper[j]))
+    return f"joint{j + 1} ({chain.joints[j].name}) at {at} is beyond its limits, {low} to {high}"
 
 
 def _check_count(cell: Cell, chain: Chain, key: str, found: Sized, one: bool = False) -> None:
@@ -152,9 +148,9 @@ MOST_POSES = 10_000
 
 @dataclass(frozen=True)
 class PathTable:
-    """N poses in SI units: either joints `q` (N, n), or `position` (N, 3) in the data's frame
-    and perhaps `rotation` (N, 3), a rotation vector; `force` (N, 3), None where not stated;
-    `weight` (N,).  `raw` tells where each row stands in the file."""
+    """N poses in SI units: joints `q` (N, n), or `position` (N, 3) in the data's frame and perhaps
+    `rotation` (N, 3), a rotation vector; `force` (N, 3), None where not stated; `weight` (N,).
+    `raw` tells where each row stands in the file."""
 
     raw: RawTable
     q: Array | None
@@ -175,11 +171,7 @@ def read_path(path: Path, joint_kinds: Sequence[str]) -> PathTable:
     prescribed; force_x_N … and weight may be added.  Raises InputError that names file, line,
     column and the offending text.
     """
-
-    def choose(header: Sequence[str]) -> Layout:
-        return _layout(str(path), header, joint_kinds)
-
-    raw = read_table(path, choose)
+    raw = read_table(path, lambda header: _layout(str(path), header, joint_kinds))
     require(
         len(raw.row) <= MOST_POSES,
         f"{raw.source}: {len(raw.row)} poses; a path takes at most {MOST_POSES}; thin it out: "
@@ -188,13 +180,9 @@ def read_path(path: Path, joint_kinds: Sequence[str]) -> PathTable:
     weight = raw.si(WEIGHT.name)
     if weight is not None:
         raw.check(WEIGHT.name, weight > 0, "a weight must be positive")
+    weight = np.ones(len(raw.row)) if weight is None else weight[:, 0]
     return PathTable(
-        raw=raw,
-        q=raw.si("q"),
-        position=raw.si("position"),
-        rotation=rotation_column(raw),
-        force=raw.si("force"),
-        weight=np.ones(len(raw.row)) if weight is None else weight[:, 0],
+        raw, raw.si("q"), raw.si("position"), rotation_column(raw), raw.si("force"), weight
     )
 
 
@@ -252,14 +240,10 @@ class Places:
     point: Array
     force: Array | None
 
-    def take(self, index: NDArray[np.int64]) -> Places:
+    def take(self, index: IntArray) -> Places:
         """Some of the places."""
-        return replace(
-            self,
-            position=self.position[index],
-            rotation=None if self.rotation is None else self.rotation[index],
-            force=None if self.force is None else self.force[index],
-        )
+        rotation, force = (None if v is None else v[index] for v in (self.rotation, self.force))
+        return replace(self, position=self.position[index], rotation=rotation, force=force)
 
 
 def reach(cell: Cell, chain: Chain, places: Places, seed: int, postures: int = FEW) -> Postures:
@@ -286,30 +270,24 @@ def preferred(
     first, and the text says of how many places that holds.
     """
     q = found.q[:, 0].copy()
-    if rules is None:
-        return q, ""
-    stuck = _take_allowed(cell, places, found, rules, q, np.arange(len(q)))
-    if len(stuck):
-        more = reach(cell, chain, places.take(stuck), seed, MANY)
-        stuck = _take_allowed(cell, places.take(stuck), more, rules, q, stuck)
+    stuck = np.arange(0 if rules is None else len(q))
+    for postures in (FEW, MANY):
+        if rules is None or not len(stuck):
+            break
+        some = places.take(stuck)
+        found = found if postures == FEW else reach(cell, chain, some, seed, postures)
+        T, K, n = found.q.shape
+        allowed = found.reached.copy()
+        loads = working_loads(cell)[:, None] if some.force is None else some.force[None]
+        for load in loads:
+            of_each = np.repeat(np.broadcast_to(load, (T, 3)), K, axis=0)
+            verdict = rules.check(found.q.reshape(T * K, n), of_each, every=False)
+            allowed &= np.asarray(verdict.ok).reshape(T, K)
+        some_allowed = allowed.any(axis=1)
+        q[stuck[some_allowed]] = found.q[some_allowed, allowed[some_allowed].argmax(axis=1)]
+        stuck = stuck[~some_allowed]
     lost = f" ({len(stuck)} of them in no posture that the work cell allows)"
     return q, lost if len(stuck) else ""
-
-
-def _take_allowed(
-    cell: Cell, places: Places, found: Postures, rules: Feasibility, q: Array, rows: IntArray
-) -> IntArray:
-    """Put the first allowed posture of each place into q[rows]; the rows that have none."""
-    T, K, n = found.q.shape
-    allowed = found.reached.copy()
-    loads = working_loads(cell)[:, None] if places.force is None else places.force[None]
-    for load in loads:
-        of_each = np.repeat(np.broadcast_to(load, (T, 3)), K, axis=0)
-        verdict = rules.check(found.q.reshape(T * K, n), of_each, every=False)
-        allowed &= np.asarray(verdict.ok).reshape(T, K)
-    some = allowed.any(axis=1)
-    q[rows[some]] = found.q[some, allowed[some].argmax(axis=1)]
-    return rows[~some]
 
 
 def how_near(found: Postures, t: int) -> str:
@@ -351,21 +329,42 @@ class TargetPoses:
     force: Array
     weight: Array
     point: Array
-    stated: NDArray[np.bool_]
+    stated: BoolArray
     source: str
 
+    @classmethod
+    def of(
+        cls, q: Array, force: Array | None, weight: Array, point: Array, stated: bool, loads: Array,
+        source: str,
+    ) -> TargetPoses:  # fmt: skip
+        """Poses q (n, joints) of one source; those without a `force` (n, 3) of their own are taken
+        under each of the `loads` (L, 3), which share their weight (n,)."""
+        each = 1 if force is not None else len(loads)
+        n = each * len(q)
+        return cls(
+            np.repeat(q, each, axis=0),
+            np.tile(loads, (len(q), 1)) if force is None else np.asarray(force),
+            np.repeat(weight / each, each),
+            np.broadcast_to(point, (n, 3)),
+            np.full(n, stated),
+            source,
+        )
 
-@dataclass(frozen=True)
-class _Group:
-    """Poses of one source: q (N, n), force (N, 3) or None for the cell's loads, weight (N,);
-    `source` in words."""
+    @classmethod
+    def together(cls, groups: Sequence[TargetPoses], source: str) -> TargetPoses:
+        """Several sources as one."""
+        q, force, weight, point, stated = (
+            np.concatenate([getattr(group, name) for group in groups])
+            for name in ("q", "force", "weight", "point", "stated")
+        )
+        weight = weight / weight.max()  # so that no sum overflows
+        return cls(q, force, weight / weight.sum(), point, stated, source)
 
-    q: Array
-    force: Array | None
-    weight: Array
-    point: Array
-    source: str
-    stated: bool
+    def with_others(self, others: TargetPoses, share: float) -> TargetPoses:
+        """Both, of which `others` have `share` of the weight."""
+        both = TargetPoses.together([self, others], self.source)
+        weight = np.concatenate([(1 - share) * self.weight, share * others.weight])
+        return replace(both, weight=weight)
 
 
 def test_poses(
@@ -381,16 +380,16 @@ def test_poses(
     Raises InputError where a pose lies beyond the joint limits or out of reach, a table is wrong,
     and InsufficientDataError where the cell allows none of the drawn poses.
     """
-    spec, groups = cell.design, []
+    spec, loads = cell.design, working_loads(cell)
     point = _point_of(cell)
+    groups = []
     for k, pose in enumerate(spec.test_poses):
         key = place("design", "test_pose", k, "q_deg" if pose.degrees else "q_si")
         check_posture(cell, chain, key, pose.q, pose.degrees)
         own = point if pose.point is None else pose.point
         force = None if pose.force is None else pose.force[None]
-        groups.append(
-            _Group(pose.q[None], force, np.array([pose.weight]), own, "", pose.point is not None)
-        )
+        weight, stated = np.array([pose.weight]), pose.point is not None
+        groups.append(TargetPoses.of(pose.q[None], force, weight, own, stated, loads, ""))
     sources = [f"{len(groups)} of [[design.test_pose]]"] if groups else []
     if spec.test_path is not None:
         groups.append(_along_path(cell, chain, spec.test_path, point, feasibility, seed))
@@ -399,7 +398,7 @@ def test_poses(
     if not groups:
         groups.append(_drawn(cell, chain, point, feasibility, seed))
     sources += [g.source for g in groups if g.source]
-    return _together(groups, working_loads(cell), "test poses: " + ", ".join(sources))
+    return TargetPoses.together(groups, "test poses: " + ", ".join(sources))
 
 
 def where_used(model: Model) -> NewPoses | None:
@@ -421,7 +420,7 @@ def everywhere(
         group = _drawn(cell, chain, point, feasibility, seed + APART, ELSEWHERE)
     except InsufficientDataError:
         return None
-    return _together([group], working_loads(cell), "")
+    return TargetPoses.together([group], "")
 
 
 def _point_of(cell: Cell) -> Array:
@@ -431,34 +430,9 @@ def _point_of(cell: Cell) -> Array:
     return np.asarray(np.mean(list(cell.tool.markers.values()), axis=0))
 
 
-def joined(stated: TargetPoses, others: TargetPoses, share: float) -> TargetPoses:
-    """Both, of which `others` have `share` of the weight."""
-    q, force, point, own = (
-        np.concatenate([getattr(stated, name), getattr(others, name)])
-        for name in ("q", "force", "point", "stated")
-    )
-    weight = np.concatenate([(1 - share) * stated.weight, share * others.weight])
-    return TargetPoses(q, force, weight, point, own, stated.source)
-
-
-def _together(groups: Sequence[_Group], loads: Array, source: str) -> TargetPoses:
-    q, force, weight, point, stated = [], [], [], [], []
-    for group in groups:
-        each = loads if group.force is None else np.zeros((1, 3))
-        q.append(np.repeat(group.q, len(each), axis=0))
-        force.append(np.tile(loads, (len(group.q), 1)) if group.force is None else group.force)
-        weight.append(np.repeat(group.weight / len(each), len(each)))
-        point.append(np.broadcast_to(group.point, (len(q[-1]), 3)))
-        stated.append(np.full(len(q[-1]), group.stated))
-    w = np.concatenate(weight)
-    w = w / w.max()  # so that no sum overflows
-    joints, forces, points = np.vstack(q), np.vstack(force), np.vstack(point)
-    return TargetPoses(joints, forces, w / w.sum(), points, np.concatenate(stated), source)
-
-
 def _along_path(
     cell: Cell, chain: Chain, spec: TargetPath, point: Array, rules: Feasibility | None, seed: int
-) -> _Group:
+) -> TargetPoses:
     path = read_path(spec.file, chain.kinds)
     stated = spec.point is not None
     point = point if spec.point is None else spec.point
@@ -468,7 +442,8 @@ def _along_path(
     if path.q is not None:
         _check_path_limits(cell, chain, path, path.q)
         source = f"{len(path.q)} of {spec.file.name}"
-        return _Group(path.q, force, path.weight, point, source, stated)
+        loads = working_loads(cell)
+        return TargetPoses.of(path.q, force, path.weight, point, stated, loads, source)
     assert path.position is not None  # read_path: joints or positions
     rotation = None if path.rotation is None else Rotation.from_rotvec(path.rotation).as_matrix()
     places = Places(path.position, rotation, point, force)
@@ -481,7 +456,8 @@ def _along_path(
             f"{len(path.weight)} places); {remedy(cell)}"
         )
     q, lost = preferred(cell, chain, places, found, rules, seed)
-    return _Group(q, force, path.weight, point, f"{len(q)} of {spec.file.name}{lost}", stated)
+    source = f"{len(q)} of {spec.file.name}{lost}"
+    return TargetPoses.of(q, force, path.weight, point, stated, working_loads(cell), source)
 
 
 def _check_path_limits(cell: Cell, chain: Chain, path: PathTable, q: Array) -> None:
@@ -498,7 +474,7 @@ def _check_path_limits(cell: Cell, chain: Chain, path: PathTable, q: Array) -> N
 
 def _in_box(
     cell: Cell, chain: Chain, box: TargetBox, point: Array, rules: Feasibility | None, seed: int
-) -> _Group:
+) -> TargetPoses:
     stated = box.point is not None
     point = point if box.point is None else box.point
     position = box.lower + (box.upper - box.lower) * _sobol(3, box.count, seed)
@@ -516,13 +492,14 @@ def _in_box(
             f"{'leave out rpy_deg, ' if box.rotation is not None else ''}{remedy(cell)}"
         )
     q, lost = preferred(cell, chain, places, found, rules, seed)
-    return _Group(q, force, np.ones(len(q)), point, f"{len(q)} in [design.test_box]{lost}", stated)
+    source = f"{len(q)} in [design.test_box]{lost}"
+    return TargetPoses.of(q, force, np.ones(len(q)), point, stated, working_loads(cell), source)
 
 
 def _drawn(
     cell: Cell, chain: Chain, point: Array, rules: Feasibility | None, seed: int,
     most: int = DEFAULT_COUNT,
-) -> _Group:  # fmt: skip
+) -> TargetPoses:  # fmt: skip
     low, high = finite_ranges(chain, *joint_limits(cell, chain))
     count = most if rules is None else DRAWN
     q = low + (high - low) * _sobol(chain.n_joints, count, seed)
@@ -543,7 +520,7 @@ def _drawn(
                 "[[design.test_pose]], or relax the rules of [workspace]"
             )
     source = f"{len(q)} drawn over the joint limits (the cell states none)"
-    return _Group(q, None, np.ones(len(q)), point, source, False)
+    return TargetPoses.of(q, None, np.ones(len(q)), point, False, working_loads(cell), source)
 
 
 def _sobol(dimension: int, count: int, seed: int) -> Array:
@@ -560,34 +537,73 @@ def _sobol(dimension: int, count: int, seed: int) -> Array:
 OUTSIDE = 1e-6
 
 
-def prediction_rows(model: Model, targets: TargetPoses, x: Array) -> Array:
+def prediction_rows(model: Model, targets: TargetPoses, x: Array, carried: bool = False) -> Array:
     """A (T, r, parameters): ∂(position at the test pose)/∂X in m per unit, at arm values x.
 
     The position is that under load in the data's frame; base and markers move it too, so that it
     does not depend on how the arm's frames are chosen.  It is that of the test point.  Where the
     markers' own places are fitted and no point was stated, it is that of the M markers, each
-    divided by √M, as only they can be known: the sum of squares is then their mean.
+    divided by √M, as only they can be known: the sum of squares is then their mean.  A stated point
+    may be `carried` by the markers instead of the flange, as a body that they are fixed to.
     """
-    fitted = any(p.effect == MarkerPosition.name for p in model.parameters)
-    by_marker = ~targets.stated & fitted
-    markers = tuple(model.cell.tool.markers)
-    M = len(markers) if by_marker.any() else 1
-    A = np.zeros((len(targets.q), M, 3, len(model.parameters)))
-    if by_marker.any():
-        own = replace(model.cell.model, observe="position")
-        arm = Model.assembled(model.chain, replace(model.cell, model=own))
-        which = np.flatnonzero(by_marker)
-        code = np.tile(np.arange(M), len(which))
-        table = _table(targets, np.repeat(which, M), code, markers)
-        A[which] = arm.regressor(table, x).B.reshape(len(which), M, 3, -1) / np.sqrt(M)
-    if not by_marker.all():
-        which = np.flatnonzero(~by_marker)
+    by_marker = ~targets.stated & fitted_markers(model)
+    bodies = targets.stated & carried
+    n, T = len(model.cell.tool.markers), len(targets.q)
+    A = np.zeros((T, n if by_marker.any() else 1, 3, len(model.parameters)))
+    if (which := np.flatnonzero(by_marker)).size:
+        A[which] = _marker_rows(model, targets, which, x)[0] / np.sqrt(n)
+    if (which := np.flatnonzero(bodies)).size:
+        B, R = _marker_rows(model, targets, which, x)
+        J = R[:, None] @ _carrying(model.cell, targets.point[which]) @ R[:, None].swapaxes(-1, -2)
+        A[which, 0] = np.einsum("tmij,tmjp->tip", J, B)
+    if (which := np.flatnonzero(~by_marker & ~bodies)).size:
         points, code = np.unique(targets.point[which], axis=0, return_inverse=True)
         names = tuple(f"test point {k + 1}" for k in range(len(points)))
         arm = _with_points(model, dict(zip(names, points, strict=True)))
         table = _table(targets, which, code.ravel(), names)
         A[which, 0] = arm.regressor(table, x).B.reshape(len(which), 3, -1)
-    return A.reshape(len(A), 3 * M, -1)
+    return A.reshape(T, -1, len(model.parameters))
+
+
+def _marker_rows(
+    model: Model, targets: TargetPoses, which: IntArray, x: Array
+) -> tuple[Array, Array]:
+    """∂(position of each marker)/∂X (T, M, 3, parameters) at some of the test poses, and how the
+    flange is turned there (T, 3, 3)."""
+    markers = tuple(model.cell.tool.markers)
+    own = replace(model.cell.model, observe="position")
+    arm = Model.assembled(model.chain, replace(model.cell, model=own))
+    n, T = len(markers), len(which)
+    table = _table(targets, np.repeat(which, n), np.tile(np.arange(n), T), markers)
+    turned = arm.flange_poses(replace(table, rotation=np.zeros((n * T, 3))), x)[::n, :3, :3]
+    return arm.regressor(table, x).B.reshape(T, n, 3, -1), turned
+
+
+def fitted_markers(model: Model) -> bool:
+    """Are places of markers among the parameters?"""
+    return any(p.effect == MarkerPosition.name for p in model.parameters)
+
+
+def _carrying(cell: Cell, point: Array) -> Array:
+    """J (T, M, 3, 3): δp_t = Σ_m J_tm δ_m of points p (T, 3) on the body that M markers are fixed
+    to, whose motion is the least-squares one of theirs: with r from the markers' mean c,
+
+        δp = mean δ + ω × (p − c),   (Σ |r|² 1 − r rᵀ) ω = Σ r_m × δ_m
+
+    Raises InsufficientDataError where the markers do not hold a body: fewer than three, or in line.
+    """
+    places = np.array(list(cell.tool.markers.values()))
+    r = places - places.mean(axis=0)
+    inertia = (r**2).sum() * np.eye(3) - r.T @ r
+    if len(places) < 3 or np.linalg.matrix_rank(inertia, tol=1e-6 * np.trace(inertia)) < 3:
+        raise InsufficientDataError(
+            f"{cell.path or cell.name}: point_m of the test poses is not known where the places of "
+            "the markers are fitted, as fewer than three, or three in line, hold no point; leave "
+            "out point_m, so that the markers themselves count, or measure a third marker"
+        )
+    cross = np.cross(np.eye(3)[None], (point - places.mean(axis=0))[:, None])  # [s]×
+    turned = np.linalg.inv(inertia) @ np.cross(np.eye(3)[None], -r[:, None])
+    return np.eye(3) / len(places) + cross[:, None] @ turned[None]
 
 
 def _table(
@@ -627,6 +643,38 @@ def _with_points(model: Model, points: dict[str, Array]) -> Model:
     spec = replace(cell.model, effects=effects, observe="position")
     tool = replace(cell.tool, markers=cell.tool.markers | points)
     return Model.assembled(model.chain, replace(cell, model=spec, tool=tool))
+
+
+def known_rows(
+    model: Model, at_work: Model, targets: TargetPoses, x: Array, found: Estimable
+) -> tuple[Array, tuple[str, ...]]:
+    """The rows of `prediction_rows` of the arm `at_work`, and what to say of them: where the
+    markers' places are fitted and the readings cannot tell where the flange is, points that are
+    stated are taken to be fixed to the markers.
+
+    Raises InputError where a joint whose compliance is known at levels stands at none of them.
+    """
+    cell, chain = at_work.cell, at_work.chain
+    for joint, levels in cell.model.compliance_levels.items():
+        j = joint_index(cell, chain, joint, "[model.compliance_levels]")
+        off = np.abs(targets.q[:, [j]] - np.array(levels)).min(axis=1) > LEVEL_TOLERANCE
+        if off.any():
+            k = int(off.argmax())
+            raise InputError(
+                f"{cell.path or cell.name}: test pose {k + 1}: {joint} at "
+                f"{told(chain, j, targets.q[k, j])} is none of its levels in "
+                f"[model.compliance_levels], {listed([told(chain, j, v) for v in levels])}; "
+                "elsewhere its compliance is not known: state test poses at these, or add the level"
+            )
+    rows = prediction_rows(at_work, targets, x)
+    stated = rows[targets.stated]
+    if not len(stated) or not fitted_markers(model) or unpredictable(stated, found) is None:
+        return rows, ()
+    fixed = (
+        "point_m of the test poses is taken to be fixed to the markers as they stand in the cell: "
+        "their places are fitted, and the readings cannot tell where the flange is"
+    )
+    return prediction_rows(at_work, targets, x, carried=True), (fixed,)
 
 
 def on_kept(model: Model, A: Array, found: Estimable) -> Array:

@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING, Any
 from elastocal.errors import option
 from elastocal.planning.bodies import mounting_plane
 from elastocal.planning.criteria import CRITERIA
-from elastocal.planning.drift import DRIFT
+from elastocal.planning.execution import DRIFT
 from elastocal.planning.plan import Plan, Predicted, Reason
 from elastocal.report.blocks import (
     WARNING,

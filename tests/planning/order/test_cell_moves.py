@@ -12,7 +12,7 @@ from elastocal.cell.workspace_rules import CarriedBody, HalfSpace, HangingLoad, 
 from elastocal.errors import InsufficientDataError
 from elastocal.planning.execution import schedule
 from elastocal.planning.feasibility import Feasibility
-from elastocal.planning.moves import Blockers
+from elastocal.planning.moves import blockers_of
 
 LOADS = np.array([[0.0, 0, 0], [0, 0, -2600.0]])
 HOME = np.radians([0.0, -90, 90, 0, 45, 0])
@@ -61,7 +61,7 @@ def test_every_move_keeps_clear_with_and_without_the_load(feasibility):
 
 
 def test_the_bodies_in_the_way_are_named(feasibility):
-    blockers = Blockers(feasibility)
+    blockers = blockers_of(feasibility)
     q = np.radians([-39.0, -20, 60, 0, 0, 0])  # the arm stretched out through the pillar
     turn = np.array([1.2, 0, 0, 0, 0, 0])
     met = blockers(q - turn, q + turn, False)
@@ -75,4 +75,4 @@ def test_a_home_behind_the_pillar_is_told_with_the_pillar(feasibility):
     q = random_poses(feasibility.chain, 60, seed=3)
     q = q[feasibility.feasible(q, LOADS[0])][:3]
     with pytest.raises(InsufficientDataError, match=r"home .*in the way: .*pillar"):
-        schedule(q, Motion(home=inside), feasibility, blockers=Blockers(feasibility))
+        schedule(q, Motion(home=inside), feasibility, blockers=blockers_of(feasibility))

@@ -12,10 +12,9 @@ from elastocal.cell.arm_description import Unsteadiness
 from elastocal.cell.plan_wishes import Motion
 from elastocal.errors import InputError
 from elastocal.identification.visit_record import course_waves
-from elastocal.planning import execution as execution_module
+from elastocal.planning import execution as drift_module
 from elastocal.planning import test_poses as target_poses
-from elastocal.planning.drift import DRIFT, Alias, turns
-from elastocal.planning.execution import schedule
+from elastocal.planning.execution import DRIFT, Alias, schedule, turns
 from elastocal.planning.information import pose_covariance
 from elastocal.planning.plan import plan_rows
 from elastocal.planning.test_poses import prediction_rows
@@ -30,9 +29,9 @@ PAIRS = Alias(np.concatenate([-OWN, OWN], axis=1) / 12, 5e-6, True, OWN, OWN)
 
 @pytest.fixture(autouse=True)
 def brief_annealing(monkeypatch):
-    monkeypatch.setattr(execution_module, "STEPS", 8000)
-    monkeypatch.setattr(execution_module, "FEW", 2000)
-    monkeypatch.setattr(execution_module, "HOT", (4.0,))
+    monkeypatch.setattr(drift_module, "STEPS", 8000)
+    monkeypatch.setattr(drift_module, "FEW", 2000)
+    monkeypatch.setattr(drift_module, "HOT", (4.0,))
 
 
 def ordered(alias=PAIRS, **motion):

@@ -16,8 +16,7 @@ from elastocal.cell.plan_wishes import DesignSpec
 from elastocal.cell.workspace_rules import Workspace
 from elastocal.model.manipulator import Model
 from elastocal.planning.candidates import Candidates, JointSpace, draw, joint_space
-from elastocal.planning.criteria import CRITERIA
-from elastocal.planning.criterion import CriterionInputs, ScenarioCriterion
+from elastocal.planning.criteria import CRITERIA, CriterionInputs, ScenarioCriterion
 from elastocal.planning.feasibility import Feasibility
 from elastocal.planning.information import PoseInformation
 from elastocal.planning.polish import Searches

@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 
 from elastocal.cell.workspace_rules import HalfSpace, Solid, Workspace
-from elastocal.planning.criterion import inverse
+from elastocal.planning.criteria import inverse
 from elastocal.planning.exchange import random_plan
 from elastocal.planning.polish import estimate, polish
 from elastocal.planning.relaxation import RIDGE, balancing, in_terms, relax

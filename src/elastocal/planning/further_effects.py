@@ -1,37 +1,49 @@
-"""Effects that the model may lack, as parameters with a prior: what a robust plan shows as well.
+"""Effects beside those that poses are chosen for: what the model may lack, and what time shows.
 
-The model is given every effect of the catalogue that poses and loads can show, at every place; each
-parameter of them has mean 0 and variance π s², π the probability that the effect is missing and s
-its typical size.  Of what is known beforehand the best linear estimate asks these two moments only
-(Goldstein & Wooff 2007, Bayes Linear Statistics, ch. 3), so that
+**In doubt.** The model is given every effect of the catalogue that poses and loads can show, at
+every place; each parameter of them has mean 0 and variance π s², π the probability that the effect
+is missing and s its typical size.  Of what is known beforehand the best linear estimate asks these
+two moments only (Goldstein & Wooff 2007, Bayes Linear Statistics, ch. 3), so that
 
     tr(C M⁻¹),   M = diag(0, 1/(π s²)) + Σ_i B_iᵀ Σ_i⁻¹ B_i
 
-is the mean square error at the test poses of one who reckons with what may be missing; who judges
-every effect by its evidence does no worse.  A plan that makes it small determines the model's own
-parameters, and tells the effects from them and from each other as far as the test poses ask for it.
+is the mean square error at the test poses of one who reckons with what may be missing
+(DuMouchel & Jones 1994, Technometrics 36, 37–47, there with D and π = 1).
 
-Source: DuMouchel & Jones 1994, Technometrics 36, 37–47, there with D and π = 1.
+**Scheduled.** The order says when each reading is made and from where each joint came, so that B
+holds the columns of drift, warming and hysteresis too.  More parameters never lower Φ: the
+certificate's bound holds for them as well.
 """
 
 from __future__ import annotations
 
 from collections import Counter
 from collections.abc import Mapping
-from dataclasses import replace
+from dataclasses import dataclass, replace
 
 import numpy as np
 from scipy import linalg
 
 from elastocal.cell.arm_description import EffectChoice
+from elastocal.errors import InsufficientDataError
 from elastocal.identification.knowledge import GaussianPrior
+from elastocal.identification.start import fixed_and_free
+from elastocal.measurements import STILL
 from elastocal.model.arm import usual_sizes
 from elastocal.model.effects.catalogue import CATALOGUE, SOMETHING
 from elastocal.model.manipulator import Model
 from elastocal.model.observations import observe
-from elastocal.planning.information import PoseInformation, observed_weights
-from elastocal.planning.plan import Doubt, Gain
-from elastocal.planning.setup import Known, Setup
+from elastocal.planning.execution import Execution
+from elastocal.planning.information import (
+    PoseInformation,
+    marker_sigmas,
+    minimal_set,
+    observed_weights,
+)
+from elastocal.planning.plan import Doubt, Gain, Plan, Scheduled, predicted, remaining_rms
+from elastocal.planning.setup import Known, Setup, known_before
+from elastocal.planning.test_poses import TargetPoses, known_rows, on_kept
+from elastocal.simulation.simulate import expand_plan, simulate
 from elastocal.units import Array
 
 POSES = 100  # that show how far
@@ -121,3 +133,58 @@ def gain_of(
         known_of = sizes[own] ** 2 / np.array([variance[at[k].name] for k in own])
         doubts.append(Doubt(p, own, (1 - p) * known_of))
     return Gain.of(setup.target_rows, setup.prior, after, doubts, done.pull[columns] * sizes, seed)
+
+
+def clocked(execution: Execution) -> Execution:
+    """With the time of each stop, in s from the beginning to the middle of its readings, and the
+    sign of each joint's last motion on the way to it, 0 where it has not moved yet."""
+    motion, now, stops = execution.motion, 0.0, []
+    last = execution.stops[0].q if motion.home is None else motion.home
+    sign = np.zeros(len(last), dtype=np.int64)
+    for stop in execution.stops:
+        for q in (*stop.via, stop.q):
+            step = q - last
+            sign = np.where(np.abs(step) > STILL, np.sign(step), sign).astype(np.int64)
+            last = q
+        now += stop.travel + (0.0 if stop.change_after is None else motion.load_change)
+        came = sign if stop.approach is None else stop.approach
+        stops.append(replace(stop, time=now + motion.dwell / 2, approach=came))
+        now += motion.dwell
+    return replace(execution, stops=tuple(stops))
+
+
+@dataclass(frozen=True)
+class ScheduledEffects:
+    """The model `whole` with its effects of time and approach, of which `without` lacks some."""
+
+    whole: Model
+    without: Model
+
+    def promised(self, plan: Plan, targets: TargetPoses, known: Known) -> Plan:
+        """The plan with times and sides, and what it promises of all parameters."""
+        model, spec = self.whole, self.whole.cell.design
+        plan = replace(plan, model=model, execution=clocked(plan.execution))
+        rows = expand_plan(plan.table(), tuple(model.cell.tool.markers), spec.repeats)
+        x = model.nominal
+        table = marker_sigmas(model.cell, simulate(model, rows, x, 0, noise=False))
+        observed = observe(table, model.observe)
+        at = model.regressor(table, x, None, observed)
+        sizes = model.sizes(at.B)
+        B = observed_weights(model, observed, x).apply(at.B) * sizes
+        prior, stated = known_before(model, known, sizes)
+        found = minimal_set(model, B, fixed_and_free(model, known.fixed), sizes, prior, stated)
+        kept = found.columns
+        M = B[:, kept].T @ B[:, kept] + prior[np.ix_(kept, kept)]
+        own = np.isin([model.names[c] for c in kept], self.without.names)
+        shown = predicted(model, found, M, len(B))
+        names = dict.fromkeys(
+            p.effect for p in model.parameters if p.name not in self.without.names
+        )
+        try:
+            A = on_kept(model, known_rows(model, model, targets, x, found)[0], found)
+        except InsufficientDataError:
+            return replace(plan, predicted=shown, scheduled=Scheduled(tuple(names), None, None))
+        weight = np.sqrt(targets.weight)[:, None, None]
+        R = np.asarray((weight * A).reshape(-1, A.shape[-1]))
+        errors = remaining_rms(R, M), remaining_rms(R[:, own], M[np.ix_(own, own)])
+        return replace(plan, predicted=shown, scheduled=Scheduled(tuple(names), *errors))
