@@ -16,8 +16,7 @@ from elastocal.errors import InputError, InsufficientDataError
 from elastocal.model.manipulator import Model
 from elastocal.planning import choices, time_budget
 from elastocal.planning import test_poses as target_poses
-from elastocal.planning.choices import Choice, _Budget, _minutes, at_stops
-from elastocal.planning.plan import TimedSize
+from elastocal.planning.choices import Choice, TimedSize, _Budget, _minutes, at_stops
 from elastocal.planning.setup import Known
 
 ONE = (TargetPose(np.radians([0.0, -90, 90, 0, 30, 0])),)

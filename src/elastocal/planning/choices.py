@@ -14,7 +14,7 @@ from collections.abc import Callable
 from copy import copy
 from dataclasses import dataclass, replace
 from itertools import combinations
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 from scipy.optimize import minimize
@@ -31,11 +31,14 @@ from elastocal.planning.execution import greedy_tour, tour_cost
 from elastocal.planning.feasibility import Feasibility
 from elastocal.planning.information import PoseInformation, plan_forces
 from elastocal.planning.moves import travel_times
-from elastocal.planning.plan import Plan, TimedSize
 from elastocal.planning.relaxation import Relaxed, balanced, check_enough, relax
 from elastocal.planning.setup import FeasiblePool, Known, Setup, set_up
 from elastocal.planning.test_poses import TargetPoses
 from elastocal.units import Array, Progress
+
+if TYPE_CHECKING:
+    from elastocal.planning.plan import Plan
+
 
 STARTS = 8  # places drawn in the boxes, besides those that the cell states
 SEARCHED, COMPARED = 400, 2000  # candidates while searching, and for the figures that are told
@@ -338,6 +341,17 @@ def at_stops(cell: Cell) -> Motion:
     """The motion, with what the readings of a stop take in its dwell."""
     motion, readings = cell.design.motion, cell.design.repeats * max(len(cell.tool.markers), 1)
     return replace(motion, dwell=motion.dwell + motion.reading * readings)
+
+
+@dataclass(frozen=True)
+class TimedSize:
+    """`poses` with `repeats` readings of each marker in each load state take about `minutes` and
+    reach `value`, the criterion in the plan's unit, on few candidates."""
+
+    poses: int
+    repeats: int
+    minutes: float
+    value: float
 
 
 def within(

@@ -16,7 +16,7 @@ from elastocal.errors import InputError, require
 from elastocal.files import atomic_write_text
 from elastocal.measurements import DEFAULT_MARKER, Measurements, families
 from elastocal.model.manipulator import Model
-from elastocal.planning.choices import Chosen
+from elastocal.planning.choices import Chosen, TimedSize
 from elastocal.planning.criteria import ScenarioCriterion
 from elastocal.planning.execution import Execution, Stop
 from elastocal.planning.information import Estimable
@@ -485,17 +485,6 @@ class Scheduled:
     effects: tuple[str, ...]
     test_poses: float | None
     without: float | None
-
-
-@dataclass(frozen=True)
-class TimedSize:
-    """`poses` with `repeats` readings of each marker in each load state take about `minutes` and
-    reach `value`, the criterion in the plan's unit, on few candidates."""
-
-    poses: int
-    repeats: int
-    minutes: float
-    value: float
 
 
 @dataclass(frozen=True, repr=False, eq=False)
