@@ -56,8 +56,9 @@ def main() -> None:
 
 
 def _rows(study: Study, q: np.ndarray) -> list[str]:
-    pool = study.setup.pool(q, np.zeros(len(q), dtype=int))
-    alias = Alias.of(study.setup, pool, np.arange(len(q)))
+    blocks = study.setup.information.blocks(q)
+    M, R = study.setup.gathered(blocks), study.setup.target_rows
+    alias = Alias.of(study.setup.information, q, blocks, M, R)
     assert alias is not None and alias.at_test_poses
     rows = []
     for order, (changes, extra) in ORDERS.items():

@@ -37,7 +37,7 @@ GONE = {
     "design.load_choice": (
         "every pose is read under each load; let [design.choose] loads pick fewer of them"
     ),
-    "design.robust": "plan for the arm as it is identified so far (--augment), and drop the key",
+    "design.robust": "plans are made for the arm as identified so far (augment); drop the key",
     "design.robust_samples": "it went with design.robust; drop it",
 }
 

@@ -182,7 +182,7 @@ def test_the_criterion_for_a_combination_may_be_asked_for_later(read):
         ("[design]\nloads_N = [[0, 0, 1], [0, 0, 1]]", ["design.loads_N repeats a load"]),
         ("[design]\nmarker_sigma_um = { M3 = 1 }", ["[design.marker_sigma_um] names 'M3'", "M1"]),
         ("[design]\nmarker_sigma_um = { M1 = 0 }", ["marker_sigma_um.M1", "positive"]),
-        ("[design]\nrobust = 'worst'", ["key design.robust is gone", "--augment"]),
+        ("[design]\nrobust = 'worst'", ["key design.robust is gone", "augment"]),
         ("[design.levels]\njoint2_deg = 3", ["design.levels.joint2_deg", "joint2_deg = [-25.2"]),
         ("[design.levels]\njoint2_deg = []", ["design.levels.joint2_deg"]),
         ("[design.levels]\njoint2_deg = [1, 1]", ["repeats a level of joint2"]),

@@ -9,7 +9,7 @@ import pytest
 from elastocal.errors import InputError, InsufficientDataError
 from elastocal.planning.criteria import CRITERIA, CriterionInputs, SpectralCriterion
 from elastocal.planning.exchange import (
-    Sizes,
+    SizedPlans,
     exact_plan,
     exchange,
     prospects,
@@ -182,13 +182,13 @@ def test_sizes_fall_with_the_number_of_poses_and_the_fewest_that_meet_a_target_a
     def of(n):
         return problem_of("test_pose", 6, N=40, n=n)
 
-    curve = Sizes(of)
+    curve = SizedPlans(of)
     curve.of([4, 6, 9])
     values = [curve.found[n].value for n in (4, 6, 9)]
     assert values == sorted(values, reverse=True)
     assert all(p.bound <= p.value for p in curve.found.values())
     target = values[1] * 1.05
-    again = Sizes(of)
+    again = SizedPlans(of)
     smallest = again.fewest(target, 3, 20)
     assert smallest <= 6 and again.found[smallest].value <= target
     below = smallest - 1

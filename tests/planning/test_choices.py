@@ -18,7 +18,8 @@ from elastocal.cell.work_cell import Cell
 from elastocal.model.manipulator import Model
 from elastocal.planning import choices
 from elastocal.planning import test_poses as target_poses
-from elastocal.planning.choices import Choice, Chosen
+from elastocal.planning.choices import Choice, applied
+from elastocal.planning.plan import Chosen
 from elastocal.planning.setup import Known
 
 CHAIN = kr270_chain()
@@ -59,7 +60,7 @@ def test_places_stay_in_their_boxes_and_lower_the_relaxed_optimum() -> None:
         assert (np.abs(after - before) <= 0.1 + 1e-9).all()
         assert (after >= box[0] - 1e-9).all() and (after <= box[1] + 1e-9).all()
     # The same cell again, as it would be measured with.
-    placed = found.applied(cell_with(Freedom()))
+    placed = applied(found, cell_with(Freedom()))
     assert placed.tool.load_point == pytest.approx(found.places["load point"][1])
 
 

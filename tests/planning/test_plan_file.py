@@ -26,8 +26,8 @@ LEVEL = np.repeat(np.arange(5), 3) + 1
 LIMITS = (np.full(6, -9.0), np.full(6, 9.0))
 
 
-def execution_of(q=TABLE_2, forces=FORCES, load=None, **motion):
-    return schedule(q, Motion(**motion), Discs(), loads=forces, load=load, limits=LIMITS, kicks=30)
+def execution_of(q=TABLE_2, forces=FORCES, **motion):
+    return schedule(q, Motion(**motion), Discs(), loads=forces, limits=LIMITS, kicks=30)
 
 
 joint_values = st.floats(-6.3, 6.3) | st.sampled_from([0.0, -0.0, np.pi, 1e-12, -1e-300])

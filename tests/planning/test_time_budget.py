@@ -14,9 +14,10 @@ from elastocal.cell.plan_wishes import Motion, TargetPose
 from elastocal.cell.work_cell import Cell
 from elastocal.errors import InputError, InsufficientDataError
 from elastocal.model.manipulator import Model
-from elastocal.planning import choices, time_budget
+from elastocal.planning import choices
 from elastocal.planning import test_poses as target_poses
-from elastocal.planning.choices import Choice, TimedSize, _Budget, _minutes, at_stops
+from elastocal.planning.choices import Choice, _Budget, _minutes, at_stops
+from elastocal.planning.plan import TimedSize
 from elastocal.planning.setup import Known
 
 ONE = (TargetPose(np.radians([0.0, -90, 90, 0, 30, 0])),)
@@ -34,7 +35,7 @@ def sizes(cell: Cell, minutes: float) -> tuple[tuple[TimedSize, ...], TimedSize]
 @pytest.fixture(autouse=True)
 def short(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(choices.Choice.draw, "__defaults__", (150,))
-    monkeypatch.setattr(time_budget, "REPEATS", (1, 6))
+    monkeypatch.setattr(choices, "REPEATS", (1, 6))
 
 
 def test_a_stop_takes_what_its_readings_take() -> None:

@@ -14,7 +14,6 @@ from collections.abc import Callable
 from copy import copy
 from dataclasses import dataclass, replace
 from itertools import combinations
-from typing import TYPE_CHECKING, Any
 
 import numpy as np
 from scipy.optimize import minimize
@@ -31,14 +30,11 @@ from elastocal.planning.execution import greedy_tour, tour_cost
 from elastocal.planning.feasibility import Feasibility
 from elastocal.planning.information import PoseInformation, plan_forces
 from elastocal.planning.moves import travel_times
+from elastocal.planning.plan import LOAD_POINT, TRACKER, Chosen, Plan, TimedSize
 from elastocal.planning.relaxation import Relaxed, balanced, check_enough, relax
 from elastocal.planning.setup import FeasiblePool, Known, Setup, set_up
 from elastocal.planning.test_poses import TargetPoses
 from elastocal.units import Array, Progress
-
-if TYPE_CHECKING:
-    from elastocal.planning.plan import Plan
-
 
 STARTS = 8  # places drawn in the boxes, besides those that the cell states
 SEARCHED, COMPARED = 400, 2000  # candidates while searching, and for the figures that are told
@@ -48,53 +44,6 @@ STEP = 1e-6  # of a box, for differences of B, which has twelve digits
 DIGITS = 6  # of a place in m: more cannot be built
 USED = 1e-4  # of the largest weight: candidates that count while places move
 MOST_CHOICES = 100  # of loads
-
-
-LOAD_POINT, TRACKER = "load point", "tracker"  # beside the markers' names
-
-
-@dataclass(frozen=True)
-class Chosen:
-    """`places` name → before and after (2, 3) m, `loads` (k, 3) N where they were chosen; the
-    relaxed optimum `before` and `after` in `unit`, and the `share` of feasible poses, each on
-    `candidates` that the rules allow there; None where the cell as it stands has no plan."""
-
-    places: dict[str, Array]
-    loads: Array | None
-    before: float | None
-    after: float
-    unit: str
-    candidates: int
-    share: tuple[float | None, float]
-
-    def applied(self, cell: Cell) -> Cell:
-        """The cell with what was chosen."""
-        after = np.array([at[1] for at in self.places.values()])
-        cell = Boxes(tuple(self.places), after, after).placed(cell, after)
-        return cell if self.loads is None else _with_loads(cell, self.loads)
-
-    def to_json(self) -> dict[str, Any]:
-        """As numbers and texts."""
-        return {
-            "cell": self.keys,
-            "relaxed": {"before": self.before, "after": self.after, "candidates": self.candidates},
-            "feasible": {"before": self.share[0], "after": self.share[1]},
-        }
-
-    @property
-    def keys(self) -> dict[str, dict[str, Any]]:
-        """What is to stand in the cell file, by table."""
-        at = {name: place[1].tolist() for name, place in self.places.items()}
-        found: dict[str, dict[str, Any]] = {"tool": {}, "tracker": {}, "design": {}}
-        if LOAD_POINT in at:
-            found["tool"]["load_point_m"] = at.pop(LOAD_POINT)
-        if TRACKER in at:
-            found["tracker"]["position_m"] = at.pop(TRACKER)
-        if at:
-            found["tool"]["markers_m"] = at
-        if self.loads is not None:
-            found["design"]["loads_N"] = self.loads.tolist()
-        return {table: keys for table, keys in found.items() if keys}
 
 
 @dataclass(frozen=True)
@@ -322,6 +271,13 @@ def _mobile(
     return there
 
 
+def applied(chosen: Chosen, cell: Cell) -> Cell:
+    """The cell with what was chosen."""
+    after = np.array([at[1] for at in chosen.places.values()])
+    cell = Boxes(tuple(chosen.places), after, after).placed(cell, after)
+    return cell if chosen.loads is None else _with_loads(cell, chosen.loads)
+
+
 def _with_loads(cell: Cell, loads: Array) -> Cell:
     return replace(cell, design=replace(cell.design, loads=loads))
 
@@ -341,17 +297,6 @@ def at_stops(cell: Cell) -> Motion:
     """The motion, with what the readings of a stop take in its dwell."""
     motion, readings = cell.design.motion, cell.design.repeats * max(len(cell.tool.markers), 1)
     return replace(motion, dwell=motion.dwell + motion.reading * readings)
-
-
-@dataclass(frozen=True)
-class TimedSize:
-    """`poses` with `repeats` readings of each marker in each load state take about `minutes` and
-    reach `value`, the criterion in the plan's unit, on few candidates."""
-
-    poses: int
-    repeats: int
-    minutes: float
-    value: float
 
 
 def within(

@@ -32,9 +32,9 @@ from elastocal.planning.candidates import (
     shares_of,
 )
 from elastocal.planning.checkpoint import Checkpoint, State
-from elastocal.planning.choices import Choice, within
+from elastocal.planning.choices import Choice, applied, within
 from elastocal.planning.criteria import CRITERIA, GONE
-from elastocal.planning.exchange import Sizes, random_information, values_without
+from elastocal.planning.exchange import SizedPlans, random_information, values_without
 from elastocal.planning.feasibility import Feasibility
 from elastocal.planning.further_effects import OPEN, Place, ScheduledEffects, gain_of, in_doubt
 from elastocal.planning.information import Done, measured, next_number, plan_forces, readings_each
@@ -131,7 +131,7 @@ def _planned(
         return whole.run()
     choice = Choice(whole.model, *whole.targets(), whole.known(), options.seed, progress)
     chosen = None if spec.choose is None else choice.best()
-    placed = cell if chosen is None else chosen.applied(cell)
+    placed = cell if chosen is None else applied(chosen, cell)
 
     def plan_of(cell: Cell) -> Plan:
         folder, own = checkpoint.folder, checkpoint
@@ -419,7 +419,7 @@ class _Design:
         """Plans by number of poses: bounds NaN where there are none, `smallest` 0 where none meets
         the target; what was found of `smallest`, without a target of `shares` where these were
         among them."""
-        sizes = Sizes(
+        sizes = SizedPlans(
             lambda n: setup.problem(pool, self._shares(n)), self.options.seed, self.progress
         )
         sizes.of(numbers)

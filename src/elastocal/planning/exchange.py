@@ -250,7 +250,7 @@ class SizedPlan:
 
 
 @dataclass(frozen=True)
-class Sizes:
+class SizedPlans:
     """Plans by number of poses, each begun from the next smaller one, and their relaxations.
 
     `problem_of(n)` states the problem of n poses, on the same candidates for all n.  Where no

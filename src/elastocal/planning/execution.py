@@ -149,7 +149,7 @@ HOPED = 0.5  # of its bias is left by a whole search, at best, to an order that 
 
 
 @dataclass(frozen=True)
-class Clock:
+class VisitTimes:
     """When each visit of an order is read, and what a drift then does.
 
     `change` (V + 1, V + 1) s where a move changes the load, `visit` s of reading at a node; `share`
@@ -168,7 +168,7 @@ class Clock:
     @classmethod
     def of(
         cls, moves: Moves, motion: Motion, costs: Costs, alias: Alias | None, shortest: list[int]
-    ) -> Clock:
+    ) -> VisitTimes:
         """Allows so much more travel than in the `shortest` tour as `motion` has extra time."""
         share = np.zeros((1 + moves.pose.max(), 1 + moves.load.max(), 1, 3))
         if alias is not None:
@@ -188,7 +188,7 @@ class Clock:
         longest = made.driving(shortest) + motion.longer * made.time(shortest)
         return replace(made, longest=longest)
 
-    def known(self) -> Clock:
+    def known(self) -> VisitTimes:
         """With what is known of the moves since."""
         return replace(self, costs=self.moves.costs())
 
@@ -256,7 +256,9 @@ class Clock:
                     best, least = here, price
         return best
 
-    def searched(self, near: list[int], seed: int, progress: Progress) -> tuple[list[int], Clock]:
+    def searched(
+        self, near: list[int], seed: int, progress: Progress
+    ) -> tuple[list[int], VisitTimes]:
         """The order of least price found from one that is `near` a good one."""
         best, clock, moves = near, self, self.moves
         for k, hot in enumerate((None, *HOT)):
@@ -293,7 +295,7 @@ def against_drift(
     part of it b and the time t: if more readings, by which ρ² falls as 1/t, would give less."""
     used = [int(s) for s in dict.fromkeys(moves.load[np.array(tour) - 1])]
     sequence = turns(moves.loaded.tolist(), used, motion.load_changes)
-    clock = Clock.of(moves, motion, costs, alias, tour)
+    clock = VisitTimes.of(moves, motion, costs, alias, tour)
     before, noise = clock.bias(tour), 0.0 if alias is None else alias.noise
     as_pays = motion.extra_time is None
 
@@ -309,7 +311,7 @@ def against_drift(
     # Can it pay, if no drift is left at all?
     pays = harm(0.0, clock.time(tour) + longer) < harm(*once_harms)
     if alias is not None and len(again) and pays and left >= clock.driving(tour):
-        own = replace(Clock.of(spread, motion, spread.costs(), alias, tour), longest=left)
+        own = replace(VisitTimes.of(spread, motion, spread.costs(), alias, tour), longest=left)
         begun = own.annealed(in_turns([*tour, *again], spread.load, sequence), seed, FEW, WARM)
         found, own = own.searched(begun, seed, progress)
         if own.possible(found):

@@ -16,7 +16,6 @@ from elastocal.errors import InputError, require
 from elastocal.files import atomic_write_text
 from elastocal.measurements import DEFAULT_MARKER, Measurements, families
 from elastocal.model.manipulator import Model
-from elastocal.planning.choices import Chosen, TimedSize
 from elastocal.planning.criteria import ScenarioCriterion
 from elastocal.planning.execution import Execution, Stop
 from elastocal.planning.information import Estimable
@@ -485,6 +484,58 @@ class Scheduled:
     effects: tuple[str, ...]
     test_poses: float | None
     without: float | None
+
+
+LOAD_POINT, TRACKER = "load point", "tracker"  # beside the markers' names
+
+
+@dataclass(frozen=True)
+class Chosen:
+    """`places` name → before and after (2, 3) m, `loads` (k, 3) N where they were chosen; the
+    relaxed optimum `before` and `after` in `unit`, and the `share` of feasible poses, each on
+    `candidates` that the rules allow there; None where the cell as it stands has no plan."""
+
+    places: dict[str, Array]
+    loads: Array | None
+    before: float | None
+    after: float
+    unit: str
+    candidates: int
+    share: tuple[float | None, float]
+
+    def to_json(self) -> dict[str, Any]:
+        """As numbers and texts."""
+        return {
+            "cell": self.keys,
+            "relaxed": {"before": self.before, "after": self.after, "candidates": self.candidates},
+            "feasible": {"before": self.share[0], "after": self.share[1]},
+        }
+
+    @property
+    def keys(self) -> dict[str, dict[str, Any]]:
+        """What is to stand in the cell file, by table."""
+        at = {name: place[1].tolist() for name, place in self.places.items()}
+        found: dict[str, dict[str, Any]] = {"tool": {}, "tracker": {}, "design": {}}
+        if LOAD_POINT in at:
+            found["tool"]["load_point_m"] = at.pop(LOAD_POINT)
+        if TRACKER in at:
+            found["tracker"]["position_m"] = at.pop(TRACKER)
+        if at:
+            found["tool"]["markers_m"] = at
+        if self.loads is not None:
+            found["design"]["loads_N"] = self.loads.tolist()
+        return {table: keys for table, keys in found.items() if keys}
+
+
+@dataclass(frozen=True)
+class TimedSize:
+    """`poses` with `repeats` readings of each marker in each load state take about `minutes` and
+    reach `value`, the criterion in the plan's unit, on few candidates."""
+
+    poses: int
+    repeats: int
+    minutes: float
+    value: float
 
 
 @dataclass(frozen=True, repr=False, eq=False)

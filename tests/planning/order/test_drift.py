@@ -101,8 +101,8 @@ def test_the_alias_is_what_least_squares_make_of_shifted_readings():
     q = random_poses(chain, 8, seed=4)
     setup = setup_of(cell, q)
     information = setup.information
-    pool = setup.pool(q, np.zeros(8, dtype=int))
-    alias = Alias.of(setup, pool, np.arange(8))
+    blocks = information.blocks(q)
+    alias = Alias.of(information, q, blocks, setup.gathered(blocks), setup.target_rows)
     rng = np.random.default_rng(0)
     time, direction = rng.uniform(size=(8, 2)), rng.normal(size=3)
     observed, _ = information.noise(q)

@@ -144,10 +144,6 @@ def test_an_unreachable_pose_is_named_with_what_is_in_the_way():
 @pytest.mark.parametrize(
     "change, message",
     [
-        ({"motion": Motion(speed=np.ones(3))}, "2 positive joint speeds"),
-        ({"motion": Motion(home=np.zeros(3))}, "home needs 2"),
-        ({"load": np.array([0, 2])}, "load must be one of 2"),
-        ({"load": np.array([0])}, "load must be one of 2"),
         ({"motion": Motion(both_directions=True)}, "joint limits"),
         ({"motion": Motion(both_directions=True, overshoot=4.0), "limits": LIMITS}, "no room"),
         ({"q": np.zeros((0, 2))}, "no pose"),
