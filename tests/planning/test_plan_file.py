@@ -1,35 +1,17 @@
 """plan.csv and plan.json: read back exactly, and taken by simulate and identify."""
 
-import json
-
 import numpy as np
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
-from support.cells import TABLE_2, kr270_chain
-from support.discs import Discs
-from support.files import write_campaign
-from typer.testing import CliRunner
+from support.cells import kr270_chain
 
-from elastocal.cell.plan_wishes import Motion
-from elastocal.cli.main import app
 from elastocal.errors import InputError
 from elastocal.measurements import read_plan
-from elastocal.planning.execution import schedule
-from elastocal.planning.plan import PlanRows, plan_rows, write_plan
+from elastocal.planning.plan import PlanRows, write_plan
 from elastocal.text import is_label
 
-FORCES = np.array([[0.0, 0, 0], [0, 0, -2600.0]])
 KINDS = kr270_chain().kinds
-NAMES = [str(i + 1) for i in range(len(TABLE_2))]
-LEVEL = np.repeat(np.arange(5), 3) + 1
-LIMITS = (np.full(6, -9.0), np.full(6, 9.0))
-
-
-def execution_of(q=TABLE_2, forces=FORCES, **motion):
-    return schedule(q, Motion(**motion), Discs(), loads=forces, limits=LIMITS, kicks=30)
-
-
 joint_values = st.floats(-6.3, 6.3) | st.sampled_from([0.0, -0.0, np.pi, 1e-12, -1e-300])
 labels = st.text(st.characters(codec="utf-8"), min_size=1, max_size=12).filter(is_label)
 # What is less than a micronewton is read as no load.
@@ -85,53 +67,3 @@ def test_what_no_table_can_hold_is_refused_and_nothing_is_written(tmp_path, chan
     with pytest.raises(InputError, match="does not exist"):
         write_plan(tmp_path / "no" / "plan.csv", PlanRows(**rows), KINDS)
     assert not list(tmp_path.iterdir())
-
-
-def run(*arguments):
-    result = CliRunner().invoke(app, [str(a) for a in arguments], catch_exceptions=False)
-    assert result.exit_code == 0, result.stderr
-
-
-DEFLECTION = """
-[robot]
-urdf = "arm.urdf"
-[tool]
-load_point_m = [0.2, 0.0, 0.25]
-[tool.markers_m]
-M1 = [0.25, 0.0, 0.05]
-M2 = [-0.12, 0.22, 0.10]
-[tracker]
-sigma_um = 10
-[model]
-observe = "deflection"
-effects = ["joint_compliance"]
-[model.nominal]
-joint_compliance = [3.5e-7, 0.287e-6, 0.416e-6, 2.786e-6, 3.483e-6, 2.074e-6]
-"""
-
-
-@pytest.mark.parametrize("stated", [True, False])
-def test_simulate_and_identify_take_a_plan_of_deflections(tmp_path, stated):
-    write_campaign(tmp_path)
-    cell, plan, data = (tmp_path / name for name in ("cell.toml", "plan.csv", "data.csv"))
-    cell.write_text(DEFLECTION, encoding="utf-8")
-    rows = plan_rows(execution_of(), NAMES, LEVEL, FORCES if stated else None)
-    write_plan(plan, rows, KINDS)
-    load = () if stated else ("--load", "0", "0", "-2600")
-    run(
-        "simulate",
-        cell,
-        plan,
-        "-o",
-        data,
-        "--set",
-        "joint3.compliance=5e-7",
-        "--repeats",
-        "2",
-        *load,
-    )
-    assert len(data.read_text().splitlines()) == 1 + 15 * 2 * 2 * 2
-    run("identify", cell, data, "-o", tmp_path / "result.json", "-q")
-    result = json.loads((tmp_path / "result.json").read_text())
-    found = {p["name"]: p["value"] for p in result["parameters"]}
-    assert found["joint3.compliance"] == pytest.approx(5e-7, rel=0.02)

@@ -2,7 +2,8 @@
 
 The arm is diagnosed and identified.  Effects found join the model; what else it may lack is in
 doubt, with the probability that the diagnosis leaves it.  The next poses make the error at the test
-poses small that counts both, parameters and doubts (`planning.further_effects`), with all readings so far.
+poses small that counts parameters and doubts (`planning.further_effects`), with all readings so
+far.
 """
 
 from __future__ import annotations

@@ -85,7 +85,6 @@ class _Ordering:
             return plan, execution
 
     def put(self, found: Selection) -> tuple[Selection, Execution]:
-        """The whole plan and its execution; Unreachable where there is none."""
         search, plan = self.search, found.whole(self.pinned)
         setup = search.setup
         if self.unwound:
@@ -97,7 +96,6 @@ class _Ordering:
         return plan, _execution(setup, plan, self.paths, search.seed, search.progress)
 
     def polished(self, plan: Selection, execution: Execution) -> tuple[Selection, Execution]:
-        """With all poses polished again, where moves reach them and that is better."""
         found, search = self.found, self.search
         if found is None or not search.effort.starts:
             return plan, execution
@@ -144,7 +142,6 @@ class _Paths:
         self.known: dict[tuple[object, ...], bool] = {}
 
     def paths_free(self, q_from: Array, q_to: Array, loaded: bool) -> BoolArray:
-        """As `Feasibility.paths_free`, of moves (M, n)."""
         ends = zip(q_from, q_to, strict=True)
         keys = [(*sorted((a.tobytes(), b.tobytes())), loaded) for a, b in ends]
         new = list({key: k for k, key in enumerate(keys) if key not in self.known}.values())

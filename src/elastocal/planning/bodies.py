@@ -500,7 +500,6 @@ def _ignored(cell: Cell, bodies: tuple[Body, ...]) -> set[frozenset[str]]:
 
 
 def _joined(a: Body, b: Body, workspace: Workspace, chain: Chain, holding: set[str]) -> bool:
-    """True where the two cannot or need not keep apart."""
     if a.carrier == b.carrier:
         return True
     if a.hangs or b.hangs:

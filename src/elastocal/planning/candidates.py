@@ -106,7 +106,6 @@ class Candidates:
 
     @classmethod
     def join(cls, lots: Sequence[Candidates]) -> Candidates:
-        """Several lots, tried under the same rules, as one."""
         removed = {rule: sum(lot.removed_by[rule] for lot in lots) for rule in lots[0].removed_by}
         q, group = (np.concatenate([getattr(lot, name) for lot in lots]) for name in ("q", "group"))
         tried, ok = sum(lot.tried for lot in lots), sum(lot.feasible for lot in lots)
@@ -246,7 +245,6 @@ def _check(
 def _checked(
     checker: Feasibility, forces: Array, group: int, chunks: Iterator[Array], jobs: int
 ) -> Iterator[tuple[Candidates, PoseFeasibility]]:
-    """Each chunk checked, in order, on `jobs` processes."""
     if jobs == 1:
         yield from (_check(checker, forces, group, q) for q in chunks)
     from joblib import Parallel, delayed, effective_n_jobs
@@ -260,7 +258,6 @@ def _checked(
 def _fill(
     chunks: Iterator[tuple[Candidates, PoseFeasibility]], wanted: int
 ) -> tuple[Candidates, PoseFeasibility]:
-    """`wanted` candidates, fewer where the tries run out; the verdict on the first tries."""
     lots: list[Candidates] = []
     verdicts: list[PoseFeasibility] = []
     count = tried = 0

@@ -64,7 +64,6 @@ class Checkpoint:
 
     @property
     def begun(self) -> bool:
-        """Is there anything to go on from?"""
         return self.folder is not None and any(self.folder.glob("*.npz"))
 
     def finished(self, stage: str, make: Callable[[], State]) -> Mapping[str, NDArray]:
@@ -95,7 +94,6 @@ class Checkpoint:
 
 
 def _save(path: Path, state: Mapping[str, NDArray]) -> None:
-    """Keep `state`, whole or not at all."""
     text = io.BytesIO()
     np.savez(text, allow_pickle=False, **{MARK: np.array(__version__)}, **state)
     path.parent.mkdir(parents=True, exist_ok=True)
@@ -109,7 +107,6 @@ def _save(path: Path, state: Mapping[str, NDArray]) -> None:
 
 
 def _remove(folder: Path) -> None:
-    """The files that stages wrote into `folder`, and the folders that are empty then."""
     with suppress(OSError):
         remove_abandoned(folder, r".*\.npz")
     for path in folder.glob("*.npz"):

@@ -83,7 +83,6 @@ class Boxes:
         return np.clip(np.where(width > 0, part, 0.5), 0.0, 1.0).ravel()
 
     def placed(self, cell: Cell, places: Array) -> Cell:
-        """The cell with everything at its place."""
         at = dict(zip(self.names, np.round(places, DIGITS), strict=True))
         point = at.pop(LOAD_POINT, cell.tool.load_point)
         tracker = replace(cell.tracker, position=at.pop(TRACKER, cell.tracker.position))
@@ -161,7 +160,6 @@ class Choice:
         )
 
     def _loads(self, most: int | None) -> RelaxedPoint | None:
-        """The best `most` of the loads that are not zero, where the cell has its places."""
         cell, given = self.work.cell, self.work.cell.design.loads
         if most is None or given is None:
             return self.relaxed(cell)
@@ -180,7 +178,6 @@ class Choice:
         return _least(points)
 
     def _placed(self, boxes: Boxes, begun: RelaxedPoint | None) -> RelaxedPoint | None:
-        """The best places found from where the cell has them and from others in the boxes."""
         from scipy.stats import qmc  # slow to import, and identify needs this module
 
         cell = self.work.cell if begun is None else begun.cell
@@ -223,7 +220,6 @@ class Choice:
         return np.asarray(minimize(value, unit, method="L-BFGS-B", bounds=limits, options=how).x)
 
     def draw(self, cell: Cell, candidates: int = SEARCHED) -> Candidates:
-        """Candidates that the rules of a cell allow."""
         rules = Feasibility(cell, self.work.chain)
         return draw(cell, self.work.chain, plan_forces(cell), rules, candidates, self.seed)
 
@@ -272,7 +268,6 @@ def _mobile(
 
 
 def applied(chosen: Chosen, cell: Cell) -> Cell:
-    """The cell with what was chosen."""
     after = np.array([at[1] for at in chosen.places.values()])
     cell = Boxes(tuple(chosen.places), after, after).placed(cell, after)
     return cell if chosen.loads is None else _with_loads(cell, chosen.loads)
@@ -283,7 +278,6 @@ def _with_loads(cell: Cell, loads: Array) -> Cell:
 
 
 def _least(points: list[RelaxedPoint | None]) -> RelaxedPoint | None:
-    """The point with the least Φ."""
     found = [point for point in points if point is not None]
     return min(found, key=lambda point: point.value, default=None)
 
@@ -373,7 +367,6 @@ class _Budget:
         return None
 
     def _fitting(self, q: Array, repeats: int) -> int:
-        """How many of the poses q (N, n), as they come, fit."""
         low, high = 0, len(q)
         while low < high:
             middle = (low + high + 1) // 2

@@ -56,11 +56,9 @@ class Poses:
 
     @cached_property
     def flange(self) -> Array:
-        """T_data_flange (N, 4, 4)."""
         return np.asarray(self.frames[:, self.q.shape[1] - 1] @ self.flange_placement)
 
     def take(self, index: NDArray) -> Poses:
-        """The poses `index` (integers or a mask)."""
         return Poses(self.q[index], self.force[index], self.frames[index], self.flange_placement)
 
 
@@ -86,7 +84,6 @@ class Kinematics:
         self._compiled = BatchFunction([q], [*frames, rigid.point(flange, self.load_point)])
 
     def poses(self, q: Array, force: Array) -> Poses:
-        """Poses for joint values q (N, n) and a force (3,) or (N, 3)."""
         q = np.ascontiguousarray(np.atleast_2d(q), dtype=float)
         n = self.chain.n_joints
         frames = np.zeros((len(q), n + 2, 4, 4))
@@ -432,7 +429,6 @@ class Paths:
         self._revolute = np.array(revolute, dtype=float)
 
     def free(self, q_from: Array, q_to: Array, loaded: BoolArray) -> BoolArray:
-        """(M,) for moves q_from → q_to (M, n), with the load where `loaded` (M,)."""
         free = np.ones(len(q_from), dtype=bool)
         move = np.arange(len(q_from))
         middle, width = np.full(len(move), 0.5), np.full(len(move), 0.5)

@@ -320,7 +320,6 @@ class TraceCriterion(ScenarioCriterion):
 
     @cached_property
     def C(self) -> Array:
-        """FᵀF (p, p)."""
         return np.asarray(self.F.T @ self.F)
 
     def value(self, V: Array) -> Array:
@@ -363,7 +362,6 @@ class SpectralCriterion(ScenarioCriterion):
         """∂φ/∂λ_i (k,) at λ (k,)."""
 
     def phi_curvature(self, lam: Array) -> Array:
-        """∂²φ/∂λ_i∂λ_j (k, k) at λ (k,)."""
         raise NotImplementedError
 
     def value(self, V: Array) -> Array:
@@ -554,7 +552,6 @@ class GCriterion(ScenarioCriterion):
 
     @cached_property
     def C(self) -> Array:
-        """A_tᵀA_t as rows (T, p²)."""
         return np.asarray((self.A.swapaxes(-1, -2) @ self.A).reshape(len(self.A), -1))
 
     def _each(self, V: Array) -> Array:

@@ -178,7 +178,6 @@ class _Design:
         _check_home(self.cell, self.feasibility)
 
     def _without_functions(self, options: DesignOptions) -> tuple[Model, DesignOptions]:
-        """The model without its smooth functions, which no plan is made for."""
         whole = self.model
         functions = dict.fromkeys(p.effect for p in whole.parameters if p.shrunk)
         self.warnings.append(
@@ -218,7 +217,6 @@ class _Design:
         return rest, fewer
 
     def run(self) -> Plan:
-        """The plan, and what it promises of effects of time and approach."""
         plan = self._chosen()
         if self.conditions is None:
             return plan
@@ -298,11 +296,9 @@ class _Design:
         return shares
 
     def known(self) -> Known:
-        """What is known before."""
         return self._with_done(Known(self.options.fixed, self.options.prior), self.model)
 
     def _with_done(self, known: Known, model: Model) -> Known:
-        """With the measurements done, of the parameters of `model`."""
         options = self.options
         if options.done is None:
             return known
@@ -335,7 +331,6 @@ class _Design:
         return state["q"], state["group"], counts
 
     def _drawn(self) -> State:
-        """The candidates and how many poses each rule removed, as arrays."""
         spec, asked = self.cell.design, (self.cell, self.chain, self.forces, self.feasibility)
         lots: list[Candidates] = []
         names: list[str] = []
@@ -388,58 +383,48 @@ class _Design:
     ) -> tuple[tuple[PlanSize, ...], IntArray, IntArray | None]:
         """The curve of criterion against number of poses, where there is a target the shares that
         meet it, and what was found for these shares."""
-        target, numbers = self.cell.design.target, self.options.curve
-        if target is None and not numbers:
+        numbers, wanted = self.options.curve, self.cell.design.target
+        if wanted is None and not numbers:
             return (), shares, None
-        state = self.checkpoint.finished(
-            "sizes", lambda: self._size_curve(setup, pool, target, numbers, shares)
-        )
-        reported = setup.criterion.reported
+        target = None if wanted is None else self._target(setup, wanted)
+        total = int((shares + self.pinned).sum())
+
+        def make() -> State:
+            # Bounds are NaN where there are none, the number is 0 where none meets the target.
+            sizes = SizedPlans(
+                lambda n: setup.problem(pool, self._shares(n)), self.options.seed, self.progress
+            )
+            sizes.of(numbers)
+            n = total if np.array_equal(self._shares(total), shares) else 0
+            if target is not None:
+                low = max(pool.n_groups, int(self.pinned.sum()) + 1)
+                most = most_poses(self.cell, np.bincount(pool.group), MOST_POSES)
+                n = sizes.fewest(target, low, most) or 0
+            found = dict(sorted(sizes.found.items()))
+            return {
+                "n": list(found),
+                "value": [p.value for p in found.values()],
+                "bound": [np.nan if p.bound is None else p.bound for p in found.values()],
+                "number": n,
+                "chosen": found[n].chosen if n in found else np.zeros(0, dtype=np.int64),
+            }
+
+        state, figure = self.checkpoint.finished("sizes", make), setup.criterion.figure
         points = tuple(
-            PlanSize(int(n), reported(value)[0], None if np.isnan(b) else reported(b)[0])
-            for n, value, b in zip(state["n"], state["value"], state["bound"], strict=True)
+            PlanSize(int(n), figure(value), None if np.isnan(bound) else figure(bound))
+            for n, value, bound in zip(state["n"], state["value"], state["bound"], strict=True)
         )
         begun = state["chosen"] if len(state["chosen"]) else None
-        if target is None:
+        if wanted is None:
             return points, shares, begun
-        smallest = int(state["smallest"])
-        if not smallest:
+        if not state["number"]:
             last = points[-1]
             raise InsufficientDataError(
                 f"{self.cell.path or self.cell.name}: no plan of up to {last.poses} poses meets "
-                f"the target of {target * 1e6:g} µm; the best found reaches {last.value:.4g} µm: "
+                f"the target of {wanted * 1e6:g} µm; the best found reaches {last.value:.4g} µm: "
                 "ask for less, measure more repeats, or take a better tracker"
             )
-        return points, self._shares(smallest), begun
-
-    def _size_curve(
-        self, setup: Setup, pool: FeasiblePool, target: float | None, numbers: tuple[int, ...],
-        shares: IntArray,
-    ) -> State:  # fmt: skip
-        """Plans by number of poses: bounds NaN where there are none, `smallest` 0 where none meets
-        the target; what was found of `smallest`, without a target of `shares` where these were
-        among them."""
-        sizes = SizedPlans(
-            lambda n: setup.problem(pool, self._shares(n)), self.options.seed, self.progress
-        )
-        sizes.of(numbers)
-        n = total = int((shares + self.pinned).sum())
-        smallest = 0
-        if target is not None:
-            low = max(pool.n_groups, int(self.pinned.sum()) + 1)
-            most = most_poses(self.cell, np.bincount(pool.group), MOST_POSES)
-            n = smallest = sizes.fewest(self._target(setup, target), low, most) or 0
-        elif not np.array_equal(self._shares(total), shares):
-            n = 0
-        found = dict(sorted(sizes.found.items()))
-        bounds = [np.nan if p.bound is None else p.bound for p in found.values()]
-        return {
-            "n": list(found),
-            "value": [p.value for p in found.values()],
-            "bound": bounds,
-            "smallest": smallest,
-            "chosen": found[n].chosen if n in found else np.zeros(0, dtype=np.int64),
-        }
+        return points, self._shares(int(state["number"])), begun
 
     def _fewer(
         self, seek: Search, found: Selection, target: float,
@@ -450,19 +435,18 @@ class _Design:
 
         Φ goes about as 1/n: that tells which number to try next.
         """
-        reported, tried = seek.setup.criterion.reported, list[PlanSize]()
+        figure, tried, kept = seek.setup.criterion.figure, list[PlanSize](), int(self.pinned.sum())
         n, least = int(seek.shares.sum()), max(len(seek.shares), 1)
         while found.value <= target and least < n:
             m = max(min(int(np.ceil(n * found.value / target)), n - 1), least)
             try:
-                less, plan = sought(self._shares(m + int(self.pinned.sum())), found.pool, None,
-                                    Checkpoint())  # fmt: skip
+                less, plan = sought(self._shares(m + kept), found.pool, None, Checkpoint())
             except (InputError, InsufficientDataError):
                 least = m + 1
                 continue
             share = plan.certificate.efficiency_pool
-            bound = None if share is None else reported(plan.value * share)[0]
-            tried.append(PlanSize(m + int(self.pinned.sum()), reported(plan.value)[0], bound))
+            bound = None if share is None else figure(plan.value * share)
+            tried.append(PlanSize(m + kept, figure(plan.value), bound))
             if plan.value <= target:
                 seek, found, n = less, plan, m
             else:
@@ -470,16 +454,14 @@ class _Design:
         return seek, found, tuple(tried)
 
     def _target(self, setup: Setup, target: float) -> float:
-        """Φ of a target in m."""
-        unit_value, unit = setup.criterion.reported(1.0)
         metric = [name for name, criterion in CRITERIA.items() if criterion.unit == "µm"]
         require(
-            unit == "µm",
+            setup.criterion.unit == "µm",
             f"{self.cell.path or self.cell.name}: a target in µm goes with the criteria "
             f"{_joined(metric, 'and')}, not with {self.cell.design.criterion}; drop it, or "
             f"compare by {option('curve')}",
         )
-        return (target * 1e6 / unit_value) ** 2
+        return (target * 1e6 / setup.criterion.figure(1.0)) ** 2
 
     def _plan(
         self, setup: Setup, seek: Search, found: Selection, counts: CandidateCounts, targets: str,
@@ -537,7 +519,9 @@ class _Design:
             first=next_number(self.options.done.configuration_labels if self.options.done else ()),
             names=self._names(found),
             chance=Chance.of(phi, found.value, setup.criterion),
-            everywhere=self._everywhere(setup, M, drawn, left),
+            everywhere=Everywhere.of(
+                setup.target_rows, setup.elsewhere_rows, M, drawn, left, setup.share, spec.cap
+            ),
             seen=None if seen.all() else seen,
             doubts=tuple(self.doubts),
             gain=gain_of(setup, known, M, self.doubts, self.options.seed),
@@ -557,19 +541,10 @@ class _Design:
             names.append(str(next(new)) if name is None or name in names else name)
         return tuple(names)
 
-    def _everywhere(self, setup: Setup, M: Array, random: Array, left: Array) -> Everywhere | None:
-        """The error at the test poses and elsewhere of the plan of information M (p, p), of random
-        plans' (n, p, p), and of what a drift leaves of the plan's (p, p)."""
-        own, elsewhere = setup.target_rows, setup.elsewhere_rows
-        if own is None or elsewhere is None:
-            return None
-        return Everywhere.of(own, elsewhere, M, random, left, setup.share, self.cell.design.cap)
-
 
 def _without(
     model: Model, effects: tuple[str, ...], options: DesignOptions
 ) -> tuple[Model, DesignOptions]:
-    """The model without these effects, and nothing of them held."""
     rest = tuple(c for c in model.cell.model.effects if c.name not in effects)
     gone = {k for k, p in enumerate(model.parameters) if p.effect in effects}
     meant = {name: set(model.meant_by(name)) for name in options.fixed}
@@ -578,7 +553,6 @@ def _without(
 
 
 def _check_home(cell: Cell, feasibility: Feasibility) -> None:
-    """Told before the search: at home the arm touches nothing."""
     home = cell.design.motion.home
     if home is None:
         return
@@ -623,5 +597,4 @@ def _check_criterion(model: Model) -> None:
 
 
 def _joined(names: list[str], word: str) -> str:
-    """a, b and c."""
     return f"{', '.join(names[:-1])} {word} {names[-1]}"

@@ -84,7 +84,6 @@ def exchange(
 
 
 def _free(problem: DesignProblem, plan: IntArray, group: Any) -> IntArray:
-    """The candidates of a group that the plan lacks."""
     free = problem.group == group
     free[plan] = False
     return np.flatnonzero(free)
@@ -229,7 +228,6 @@ def _descended(problem: DesignProblem, plan: IntArray) -> tuple[IntArray, float]
 
 
 def _changed(problem: DesignProblem, plan: IntArray, rng: np.random.Generator) -> IntArray:
-    """The plan with some of its poses replaced by random ones of their groups."""
     new, n = plan.copy(), len(plan)
     for j in rng.choice(n, min(int(rng.integers(2, MOVED + 1)), n), replace=False):
         new[j] = rng.choice(_free(problem, np.delete(new, j), problem.group[new[j]]))
@@ -269,7 +267,6 @@ class SizedPlans:
             self.plan(n)
 
     def plan(self, n: int) -> SizedPlan:
-        """The best plan found of n poses."""
         if n not in self.found:
             self._search(n)
             for larger in sorted(m for m in self.found if m > n):

@@ -189,7 +189,6 @@ class VisitTimes:
         return replace(made, longest=longest)
 
     def known(self) -> VisitTimes:
-        """With what is known of the moves since."""
         return replace(self, costs=self.moves.costs())
 
     def possible(self, tour: list[int]) -> bool:
@@ -205,7 +204,6 @@ class VisitTimes:
         return self.costs.travel + self.change + self.visit
 
     def time(self, tour: list[int]) -> float:
-        """s from the first move to the last."""
         ring = np.array([0, *tour, 0])
         changing = float(self.change[ring[:-1], ring[1:]].sum())
         return self.driving(tour) + self.visit * len(tour) + changing
@@ -486,7 +484,6 @@ class Execution:
 
     @property
     def total(self) -> float:
-        """s of travelling, measuring and changing loads."""
         motion = self.motion
         waiting = motion.dwell * len(self.stops) + motion.load_change * self.load_changes
         return self.travel + waiting
@@ -576,7 +573,6 @@ def shortest_tour(cost: Array, start: list[int], seed: int, kicks: int) -> list[
 
 
 def _locally_best(cost: Array, tour: IntArray) -> IntArray:
-    """The tour once neither turning a segment round nor putting one elsewhere shortens it."""
     enough = GAINED * tour_cost(cost, tour.tolist())
     while True:
         gain, move = _best_turn(cost, tour)
@@ -590,7 +586,6 @@ def _locally_best(cost: Array, tour: IntArray) -> IntArray:
 
 
 def _best_turn(cost: Array, tour: IntArray) -> tuple[float, IntArray]:
-    """What turning the best segment i … j round gains, and the tour then."""
     ring = np.concatenate([[0], tour, [0]])
     here, before, after = ring[1:-1], ring[:-2], ring[2:]
     forth = np.concatenate([[0.0], cost[here[:-1], here[1:]].cumsum()])
@@ -604,7 +599,6 @@ def _best_turn(cost: Array, tour: IntArray) -> tuple[float, IntArray]:
 
 
 def _best_shift(cost: Array, tour: IntArray, size: int) -> tuple[float, IntArray]:
-    """What putting the best segment of `size` visits elsewhere gains, and the tour then."""
     ring, n = np.concatenate([[0], tour, [0]]), len(tour)
     first = np.arange(1, n - size + 2)  # its place in the ring
     a, b = ring[first], ring[first + size - 1]

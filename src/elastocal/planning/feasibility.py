@@ -184,7 +184,6 @@ class LineOfSight(Rule):
         return hidden
 
     def hides(self, poses: Poses, marker: str) -> BoolArray:
-        """(N,): this marker is not seen."""
         return self._sight.blocked(poses, self._markers[marker])
 
     def causes(self, poses: Poses) -> dict[str, BoolArray]:
@@ -255,7 +254,6 @@ class PoseFeasibility:
 
     @property
     def ok(self) -> BoolArray:
-        """(N,): breaks no rule."""
         return np.asarray(~self.broken.any(axis=1))
 
     @property
@@ -266,7 +264,6 @@ class PoseFeasibility:
 
     @classmethod
     def join(cls, verdicts: Sequence[PoseFeasibility]) -> PoseFeasibility:
-        """Several batches under the same rules as one."""
         broken, q, force = (
             np.concatenate([getattr(verdict, name) for verdict in verdicts])
             for name in ("broken", "q", "force")
@@ -462,7 +459,6 @@ class Feasibility:
 
     @property
     def partial(self) -> bool:
-        """May a pose show only some of the markers?"""
         return any(isinstance(rule, EnoughMarkers) for rule in self.rules)
 
     def seen(self, q: Array, force: Array) -> BoolArray:
@@ -475,7 +471,6 @@ class Feasibility:
         return np.ones((len(poses), len(self.cell.tool.markers)), dtype=bool)
 
     def advice(self, verdict: PoseFeasibility) -> str:
-        """Which rule to relax, how many candidates that frees, and how."""
         text = advice(verdict, self.rules, self.kinematics)
         for a, b in self.always_in_contact:
             text += (

@@ -332,7 +332,6 @@ def minimal_set(
 
 
 def _reduced(model: Model, B: Array, free: IntArray, sizes: Array, threshold: float) -> Reduction:
-    """The reduction of B (rows, free), whose columns are scaled by sizes, over all parameters."""
     parameters = tuple(model.parameters[c] for c in free)
     local = reduce(B, np.ones(len(free)), parameters, sigma=1.0, threshold=threshold)
     kept, dropped = free[local.kept], free[local.dropped]
@@ -395,7 +394,6 @@ def why(model: Model, found: Estimable, index: int) -> str:
 
 
 def _sample(model: Model, q: Array) -> IntArray:
-    """Indices of about SAMPLE poses, equally many of each level where there are some."""
     cell = model.cell
     held = [joint_index(cell, model.chain, name, "[design.levels]") for name in cell.design.levels]
     kinds, kind = np.unique(q[:, held], axis=0, return_inverse=True)

@@ -192,7 +192,6 @@ class Moves:
         limits: tuple[Array, Array] | None,
         via: Array | None,
     ) -> Moves:
-        """The arguments of `schedule`, laid out."""
         n_poses, n = q.shape
         pose = np.repeat(np.arange(n_poses), len(forces))
         load = np.tile(np.arange(len(forces)), n_poses)
@@ -225,12 +224,10 @@ class Moves:
 
     @property
     def blocked(self) -> int:
-        """How many straight moves were found blocked."""
         return sum(not free for roadmap in self.maps for free in roadmap.verdict.values())
 
     @property
     def crowded(self) -> bool:
-        """Are most moves blocked?"""
         return 2 * self.blocked > self.checked
 
     def carries(self, node: int) -> int:
@@ -348,7 +345,6 @@ def approach_signs(q: Array, lower: Array, upper: Array, overshoot: float) -> In
 def _free_sides(
     maps: tuple[Roadmap, Roadmap], loaded: BoolArray, leave: IntArray, entry: IntArray
 ) -> BoolArray:
-    """(V, 2): is the last stretch to the pose free from that side?"""
     stretch = np.stack([entry, np.broadcast_to(leave[:, None], entry.shape)], axis=2)
     for roadmap in maps:
         roadmap.check(stretch[loaded == roadmap.loaded].reshape(-1, 2).tolist())
@@ -420,7 +416,6 @@ class Reach:
                 raise self._unreachable(roadmap, every if clear else lost[0])
 
     def check_tour(self, tour: list[int], costs: Costs) -> None:
-        """Has every move of the tour a way?"""
         for u, v in pairwise([0, *tour, 0]):
             roadmap, way = self.moves.way(u, v, costs)
             if len(way) > 1 and not np.isfinite(roadmap.direct[way[:-1], way[1:]]).all():
@@ -461,7 +456,6 @@ class Reach:
         return f"pose {point + (self.moves.home is None)} (joints {joints})"
 
     def _in_the_way(self, roadmap: Roadmap, i: int, j: int) -> str:
-        """What blocks the straight move between two points, in brackets, where it can be told."""
         if self.blockers is None:
             return ""
         names = self.blockers(roadmap.points[i], roadmap.points[j], roadmap.loaded)

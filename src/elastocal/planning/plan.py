@@ -171,13 +171,12 @@ def plan_rows(
 
     With `forces` (L, 3) N of the load states one row per reading, under its force; without, one
     row per pose and side, to be measured in every load state, `order` being its place in the
-    order in the first state, note_order_2 that in the second, and so on; what is read in two parts
-    has the place of the second behind these.  note_load, note_load_2, … then say what hangs at each
-    of these places, where any of the load states `carried` (L, 3) N is one.  `configurations` and
-    `level`: one per pose.  Where a pose is approached from both sides, they are two
-    configurations, 7+ (joints moving up to it) and 7-: the difference between them is what such a
-    plan is for, not noise of repeats.  With `seen`, which markers are read of each pose in each
-    load state (N, L), there is a row for each of them.
+    order in the first state, note_order_2 that in the second, …, and behind these that of what is
+    read in two parts.  note_load, note_load_2, … then say what hangs at each of these places, where
+    any of the load states `carried` (L, 3) N is one.  `configurations` and `level`: one per pose.
+    A pose that is approached from both sides is two configurations, 7+ (joints moving up to it)
+    and 7-: the difference between them is what such a plan is for, not noise of repeats.  With
+    `seen`, which markers are read of each pose in each load state (N, L), there is a row for each.
     """
     numbered = list(enumerate(execution.stops, start=1))
     readings: dict[tuple[int, ...], list[tuple[int, Stop]]] = {}
@@ -259,7 +258,6 @@ def write_plan(path: str | Path, rows: PlanRows, joint_kinds: Sequence[str]) -> 
 
 
 def _columns(rows: PlanRows, joint_kinds: Sequence[str]) -> dict[str, Sequence[str]]:
-    """Header → cells, in the units and names of the measurement table."""
     known = families(joint_kinds)
     columns: dict[str, Sequence[str]] = {"configuration": rows.configuration}
     if rows.marker is not None:
@@ -282,7 +280,6 @@ def _columns(rows: PlanRows, joint_kinds: Sequence[str]) -> dict[str, Sequence[s
 
 
 def in_unit(values: Array, kind: str) -> Array:
-    """A joint's values in rad or m in the unit of the file."""
     return np.degrees(values) if kind == "revolute" else values * 1e3
 
 
@@ -311,10 +308,10 @@ class CandidateCounts:
 class Certificate:
     """How far the plan is from the best, as shares of the criterion (1: cannot be better).
 
-    `efficiency_pool` is certified: no plan with the same shares from the `pool` candidates has a
-    value below `bound_pool`.  `efficiency_continuum` is an estimate: the search tried `searched`
-    poses and `ascents` local searches, and a better pose may still exist.  Values Φ; None where
-    the criterion has no bound.  `starts`: Φ at which each start of the search ended.
+    `efficiency_pool` is certified: no plan with the same shares from the `pool` candidates has a Φ
+    below `bound_pool`.  `efficiency_continuum` is an estimate: the search tried `searched` poses
+    and `ascents` local searches.  None where the criterion has no bound.  `starts`: Φ at which each
+    start of the search ended.
     """
 
     pool: int
@@ -331,10 +328,9 @@ class Certificate:
 class Chance:
     """The same number of random feasible poses: criteria of `n` such plans in the plan's unit.
 
-    `determined` of them determine every parameter; `median`, `best` and `worst` are None where
-    that plan does not.  `efficiency` is the plan's Φ over the median's, None where the criterion
-    has no bound: such a Φ does not count poses.  Φ is homogeneous of degree −1 in the number of
-    readings: without prior knowledge random plans need 1/efficiency times as many readings.
+    `determined` of them determine every parameter; `median`, `best` and `worst` are None where that
+    plan does not.  `efficiency` is the plan's Φ over the median's, None where the criterion has no
+    bound: without prior knowledge random plans need 1/efficiency times as many readings.
     """
 
     n: int
@@ -346,13 +342,12 @@ class Chance:
 
     @classmethod
     def of(cls, values: Array, value: float, criterion: ScenarioCriterion) -> Chance:
-        """What random plans of Φ = `values` (n,), ascending, are beside a plan of Φ = `value`."""
         phi = (float(np.median(values)), float(values[0]), float(values[-1]))
-        median, best, worst = (criterion.reported(v)[0] if np.isfinite(v) else None for v in phi)
-        counts = criterion.certifiable and np.isfinite(phi[0])
-        efficiency = value / phi[0] if counts else None
+        median, best, worst = (criterion.figure(v) if np.isfinite(v) else None for v in phi)
+        counts = criterion.certifiable and median is not None
         determined = int(np.isfinite(values).sum())
-        return cls(len(values), determined, median, best, worst, efficiency)
+        share = value / phi[0] if counts else None
+        return cls(len(values), determined, median, best, worst, share)
 
 
 @dataclass(frozen=True)
@@ -374,15 +369,18 @@ class Everywhere:
 
     @classmethod
     def of(
-        cls, own: Array, elsewhere: Array, M: Array, random: Array, left: Array,
+        cls, own: Array | None, elsewhere: Array | None, M: Array, random: Array, left: Array,
         share: float = 0.0, cap: float = 0.0,
-    ) -> Everywhere:  # fmt: skip
-        """Of R (r, p) at both, the plan's information M (p, p), random plans' (n, p, p), and
-        what a drift leaves of the plan's (p, p)."""
+    ) -> Everywhere | None:  # fmt: skip
+        """Of R (r, p) at both, where they are known, the plan's information M (p, p), random plans'
+        (n, p, p), and what a drift leaves of the plan's (p, p)."""
+        if own is None or elsewhere is None:
+            return None
         chance = [float(np.median([remaining_rms(R, m) for m in random])) for R in (own, elsewhere)]
-        told = [value if np.isfinite(value) else None for value in chance]
-        still, drifting = ((remaining_rms(own, K), remaining_rms(elsewhere, K)) for K in (M, left))
-        return cls(*still, told[0], told[1], *drifting, share, cap)
+        at, beyond = (value if np.isfinite(value) else None for value in chance)
+        errors = (remaining_rms(R, K) for K in (M, left) for R in (own, elsewhere))
+        still, still_beyond, drifting, drifting_beyond = errors
+        return cls(still, still_beyond, at, beyond, drifting, drifting_beyond, share, cap)
 
 
 def remaining_rms(R: Array, M: Array) -> float:
@@ -504,7 +502,6 @@ class Chosen:
     share: tuple[float | None, float]
 
     def to_json(self) -> dict[str, Any]:
-        """As numbers and texts."""
         return {
             "cell": self.keys,
             "relaxed": {"before": self.before, "after": self.after, "candidates": self.candidates},
@@ -513,7 +510,6 @@ class Chosen:
 
     @property
     def keys(self) -> dict[str, dict[str, Any]]:
-        """What is to stand in the cell file, by table."""
         at = {name: place[1].tolist() for name, place in self.places.items()}
         found: dict[str, dict[str, Any]] = {"tool": {}, "tracker": {}, "design": {}}
         if LOAD_POINT in at:
@@ -637,7 +633,6 @@ class Plan(Result):
 
     @property
     def rows(self) -> PlanRows:
-        """What its file has."""
         return plan_rows(
             self.execution, self.configurations, self.group + 1, self.stated_forces, self._read,
             self.forces,
@@ -661,7 +656,6 @@ class Plan(Result):
 
     @property
     def configurations(self) -> tuple[str, ...]:
-        """Their names: numbers from `first` on, unless poses of an earlier plan have theirs."""
         return self.names or tuple(str(self.first + k) for k in range(len(self.q)))
 
     @property

@@ -84,11 +84,9 @@ class _Frames:
         return cls(carriers, flange, load_point)
 
     def point(self, body: Body, p: Array) -> ca.SX:
-        """A point (3,) of the carrier's frame in the data's frame."""
         return rigid.point(self.carriers[body.carrier], rigid.constant(p))
 
     def seen_from(self, body: Body, p: ca.SX) -> ca.SX:
-        """A point (3,) of the data's frame in the carrier's."""
         T = self.carriers[body.carrier]
         return T[:3, :3].T @ (p - T[:3, 3])
 
@@ -216,7 +214,6 @@ def _midpoints(count: int) -> Array:
 
 
 def _boxed(solid: Solid) -> Solid:
-    """A mesh as the box around it in its own axes; any other solid unchanged."""
     if solid.shape != "mesh":
         return solid
     points = mesh_hull(solid)[0]
@@ -265,7 +262,6 @@ class Searches:
     _joint: dict[bytes, JointSearch] = field(default_factory=dict)
 
     def feasible(self, q: Array) -> BoolArray:
-        """The full check of poses q (N, n)."""
         return feasible(self.checker, q, self.information.forces)
 
     def rows(self, q: Array, level: int) -> tuple[ca.Function, ca.Function]:
@@ -279,18 +275,15 @@ class Searches:
 
     @cached_property
     def margins(self) -> ca.Function | None:
-        """q (n,) → margins (m,) of the rules."""
         info = self.information
         return margins(info.model.cell, info.model.chain, self.checker.pairs, info.forces)
 
     def joint(self, q: Array, group: IntArray) -> JointSearch:
-        """The search over poses of these groups (k,), near q (k, n)."""
         if (key := group.tobytes()) not in self._joint:
             self._joint[key] = JointSearch(self, q, group)
         return self._joint[key]
 
     def bounds(self, group: IntArray) -> tuple[Array, Array]:
-        """Joint limits (k, n) each of poses of these groups."""
         found = [self.space.bounds(int(g)) for g in group]
         return np.array([low for low, _ in found]), np.array([high for _, high in found])
 
@@ -466,7 +459,6 @@ def polish(
 
 
 def _allowed(searches: Searches, q: Array, end: Array) -> Array:
-    """(k,) how far the rules let each pose go on its way from q to its end (k, n)."""
     left = np.flatnonzero((q != end).any(axis=1))
     part = np.ones(len(q))
     part[left] = 0.0
@@ -482,7 +474,6 @@ def _allowed(searches: Searches, q: Array, end: Array) -> Array:
 def _one_by_one(
     q: Array, B: Array, z: Array, moved: Array, value: Callable[[Array], float]
 ) -> Array:
-    """Of the poses z (k, n) with blocks `moved` those that better the plan, one after another."""
     q, B, phi = q.copy(), B.copy(), value(B)
     for k in range(len(q)):
         was = B[k].copy()
@@ -590,7 +581,6 @@ def estimate(
 
 
 def _best_feasible(searches: Searches, q: Array, d: Array) -> tuple[Array, Array]:
-    """The best feasible of new poses q (N, n) with prices d (N,), a few that lie apart at least."""
     order, so_far = np.argsort(-d, kind="stable"), np.zeros(0, dtype=np.int64)
     for lot in range(LOTS):
         part = order[lot * LOT : (lot + 1) * LOT]

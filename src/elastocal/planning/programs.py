@@ -33,7 +33,6 @@ def plain(text: str) -> str:
 
 
 def number(value: float, digits: int) -> str:
-    """Decimal digits without exponent; no negative zero."""
     text = f"{value:.{digits}f}".rstrip("0").rstrip(".")
     return "0" if text in ("-0", "") else text
 
@@ -85,7 +84,6 @@ def steps_of(
 
 
 def load_name(force: Array) -> str:
-    """The load state in words: its force in N in the data's frame."""
     if not np.any(force):
         return "no load"
     return "load of ({:g}, {:g}, {:g}) N".format(*np.asarray(force, dtype=float) + 0.0)

@@ -105,14 +105,12 @@ class DesignProblem:
         return float(self.criterion.of_information(self.information(chosen)))
 
     def restricted(self, kept: IntArray) -> DesignProblem:
-        """With the candidates `kept` (k,) alone."""
         part = replace(self, blocks=self.blocks[kept], group=self.group[kept])
         if "packed" in self.__dict__ and self.packed is not None:
             part.__dict__["packed"] = self.packed[kept]
         return part
 
     def judged_by(self, criterion: ScenarioCriterion) -> DesignProblem:
-        """The same choice by another criterion."""
         other = replace(self, criterion=criterion)
         other.__dict__["packed"] = self.packed
         return other
@@ -230,7 +228,6 @@ class Relaxed:
 
     @property
     def gap(self) -> float:
-        """1 − bound/Φ."""
         return max(1 - self.bound / self.value, 0.0)
 
 
@@ -406,7 +403,6 @@ def _step(
     criterion: ScenarioCriterion, A: Array, here: tuple[Array, float, Array], w: Array, s: float,
     E: Array,
 ) -> tuple[Array, float]:  # fmt: skip
-    """Newton's step (k,) of the barrier function and its slope along it."""
     (V, phi, C), k = here, len(A)
     G, AV = V @ C @ V, A @ V
     d = np.einsum("kij,ij->k", A, G) / phi

@@ -55,7 +55,6 @@ class SearchEffort:
 
     @property
     def in_pool(self) -> SearchEffort:
-        """For poses that are brought: none is moved."""
         return SearchEffort(0, 0, max(self.starts, 1))
 
 
@@ -135,13 +134,11 @@ class Search:
         self._last: tuple[FeasiblePool, DesignProblem] | None = None
 
     def problem(self, pool: FeasiblePool) -> DesignProblem:
-        """That of a pool, kept with what it has formed as long as the pool is the same."""
         if self._last is None or self._last[0] is not pool:
             self._last = pool, in_terms(self.setup.problem(pool, self.shares), self.T, RIDGE)
         return self._last[1]
 
     def value(self, pool: FeasiblePool, chosen: IntArray) -> float:
-        """Φ of a plan."""
         return self.setup.problem(pool, self.shares).value(chosen)
 
     def select(self, pool: FeasiblePool, begun: IntArray | None = None) -> Selection:
@@ -199,7 +196,6 @@ class Search:
     def polished(
         self, pool: FeasiblePool, chosen: IntArray, name: str, fine: bool = False
     ) -> tuple[FeasiblePool, IntArray]:
-        """The pool with the plan's polished poses, and the polished plan in it."""
         were, of = pool.q[chosen], pool.group[chosen]
         q = self.checkpoint.finished(
             name,

@@ -115,7 +115,6 @@ class Setup:
         return np.asarray(self.prior + B.T @ B)
 
     def value(self, q: Array) -> float:
-        """Φ of any plan of poses q (N, n)."""
         M = self.gathered(self.information.blocks(q))
         return float(self.criterion.of_information(M))
 
@@ -212,7 +211,6 @@ def _root(A: Array, weight: Array) -> Array:
 
 
 def _unseen(model: Model, found: Estimable, unseen: list[int]) -> tuple[str, ...]:
-    """Why no feasible pose shows these parameters, in one sentence for those alike."""
     if len(unseen) < 2:
         return tuple(why(model, found, i) for i in unseen)
     names = [model.names[i] for i in unseen]
@@ -246,7 +244,6 @@ def known_before(model: Model, known: Known, sizes: Array) -> tuple[Array, NDArr
 
 
 def _combination(model: Model, found: Estimable) -> Array | None:
-    """The coefficients (kept,) of `[design] combination`, scaled."""
     wanted = model.cell.design.combination
     if not wanted:
         return None
@@ -264,7 +261,6 @@ def _combination(model: Model, found: Estimable) -> Array | None:
 
 
 def _held(model: Model, found: Estimable, bias: float) -> tuple[str, ...]:
-    """A sentence on what ρ₀ leaves out, where that is worth one."""
     held = [model.names[c] for c in found.structure.kept if c not in found.columns]
     if bias < WORTH_TELLING or not held:
         return ()
@@ -320,7 +316,6 @@ def share_within(
 
 
 def _some(problem: DesignProblem) -> DesignProblem:
-    """The problem with about SOME of its candidates, equally many of each group."""
     each = max(SOME // len(problem.shares), 20 * int(problem.shares.max()))
     members = [np.flatnonzero(problem.group == g) for g in range(len(problem.shares))]
     return problem.restricted(np.sort(np.concatenate([m[:: -(-len(m) // each)] for m in members])))

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence, Sized
+from collections.abc import Callable, Sequence, Sized
 from dataclasses import dataclass, replace
 from pathlib import Path
 
@@ -73,7 +73,6 @@ def beyond_limits(cell: Cell, chain: Chain, q: Array) -> str | None:
 
 
 def _check_count(cell: Cell, chain: Chain, key: str, found: Sized, one: bool = False) -> None:
-    """One number per joint, or where `one` allows it a single number for all."""
     n = chain.n_joints
     if len(found) != n and not (one and len(found) == 1):
         raise InputError(
@@ -160,7 +159,6 @@ class PathTable:
     weight: Array
 
     def columns(self, family: str) -> tuple[str, ...]:
-        """The headers of a family of columns."""
         return tuple(column.header for column in self.raw.layout.columns[family])
 
 
@@ -241,7 +239,6 @@ class Places:
     force: Array | None
 
     def take(self, index: IntArray) -> Places:
-        """Some of the places."""
         rotation, force = (None if v is None else v[index] for v in (self.rotation, self.force))
         return replace(self, position=self.position[index], rotation=rotation, force=force)
 
@@ -291,7 +288,6 @@ def preferred(
 
 
 def how_near(found: Postures, t: int) -> str:
-    """How near the arm gets to target t."""
     distance, turn = found.miss[t, 0] * 1e3, np.degrees(found.turn[t, 0])
     # A place missed by this much is given in another unit than its column says.
     near = f"{distance:.4g} mm" if distance < WRONG_UNIT else f"{distance:.0f} mm, wrong unit?"
@@ -300,7 +296,6 @@ def how_near(found: Postures, t: int) -> str:
 
 
 def remedy(cell: Cell) -> str:
-    """What to do about a place out of reach."""
     if cell.model.nominal.base_position is None:
         return (
             "move it, or state where the arm stands in the data's frame ([model.nominal] "
@@ -352,7 +347,6 @@ class TargetPoses:
 
     @classmethod
     def together(cls, groups: Sequence[TargetPoses], source: str) -> TargetPoses:
-        """Several sources as one."""
         q, force, weight, point, stated = (
             np.concatenate([getattr(group, name) for group in groups])
             for name in ("q", "force", "weight", "point", "stated")
@@ -424,7 +418,6 @@ def everywhere(
 
 
 def _point_of(cell: Cell) -> Array:
-    """The load point where the cell states one, else the mean over the markers."""
     if cell.tool.load_point.any() or not cell.tool.markers:
         return cell.tool.load_point
     return np.asarray(np.mean(list(cell.tool.markers.values()), axis=0))
@@ -441,23 +434,36 @@ def _along_path(
         force = np.broadcast_to(spec.force, (len(path.weight), 3))
     if path.q is not None:
         _check_path_limits(cell, chain, path, path.q)
-        source = f"{len(path.q)} of {spec.file.name}"
-        loads = working_loads(cell)
+        source, loads = f"{len(path.q)} of {spec.file.name}", working_loads(cell)
         return TargetPoses.of(path.q, force, path.weight, point, stated, loads, source)
     assert path.position is not None  # read_path: joints or positions
     rotation = None if path.rotation is None else Rotation.from_rotvec(path.rotation).as_matrix()
     places = Places(path.position, rotation, point, force)
+
+    def missed(t: int, near: str) -> str:
+        raw, headers = path.raw, ", ".join(path.columns("position"))
+        return (
+            f"{raw.source}, {raw.noun} {raw.row[t]}, columns {headers}: the place is out of reach, "
+            f"{near}; {remedy(cell)}"
+        )
+
+    source = f"of {spec.file.name}"
+    return _reached(cell, chain, places, path.weight, stated, rules, seed, source, missed)
+
+
+def _reached(
+    cell: Cell, chain: Chain, places: Places, weight: Array, stated: bool,
+    rules: Feasibility | None, seed: int, source: str, missed: Callable[[int, str], str],
+) -> TargetPoses:  # fmt: skip
+    """Test poses at places; InputError with what `missed` says of the first out of reach."""
     found = reach(cell, chain, places, seed)
     for t in found.out_of_reach[:1]:
-        raw, headers = path.raw, path.columns("position")
-        raise InputError(
-            f"{raw.source}, {raw.noun} {raw.row[t]}, columns {', '.join(headers)}: the place is "
-            f"out of reach, {how_near(found, t)} ({len(found.out_of_reach)} of "
-            f"{len(path.weight)} places); {remedy(cell)}"
-        )
+        lost = f"{how_near(found, t)} ({len(found.out_of_reach)} of {len(weight)} places)"
+        raise InputError(missed(int(t), lost))
     q, lost = preferred(cell, chain, places, found, rules, seed)
-    source = f"{len(q)} of {spec.file.name}{lost}"
-    return TargetPoses.of(q, force, path.weight, point, stated, working_loads(cell), source)
+    told = f"{len(q)} {source}{lost}"
+    loads = working_loads(cell)
+    return TargetPoses.of(q, places.force, weight, places.point, stated, loads, told)
 
 
 def _check_path_limits(cell: Cell, chain: Chain, path: PathTable, q: Array) -> None:
@@ -482,18 +488,17 @@ def _in_box(
     force = None if box.force is None else np.broadcast_to(box.force, each)
     rotation = None if box.rotation is None else np.broadcast_to(box.rotation, (*each, 3))
     places = Places(position, rotation, point, force)
-    found = reach(cell, chain, places, seed)
-    for t in found.out_of_reach[:1]:
+
+    def missed(t: int, near: str) -> str:
         x, y, z = position[t]
-        raise InputError(
+        turned = "" if box.rotation is None else "leave out rpy_deg, "
+        return (
             f"{cell.path or cell.name}: [design.test_box]: the place [{x:.3f}, {y:.3f}, {z:.3f}] m "
-            f"in it is out of reach, {how_near(found, t)} ({len(found.out_of_reach)} of "
-            f"{box.count} places); make the box smaller, "
-            f"{'leave out rpy_deg, ' if box.rotation is not None else ''}{remedy(cell)}"
+            f"in it is out of reach, {near}; make the box smaller, {turned}{remedy(cell)}"
         )
-    q, lost = preferred(cell, chain, places, found, rules, seed)
-    source = f"{len(q)} in [design.test_box]{lost}"
-    return TargetPoses.of(q, force, np.ones(len(q)), point, stated, working_loads(cell), source)
+
+    weight, source = np.ones(box.count), "in [design.test_box]"
+    return _reached(cell, chain, places, weight, stated, rules, seed, source, missed)
 
 
 def _drawn(
@@ -524,7 +529,6 @@ def _drawn(
 
 
 def _sobol(dimension: int, count: int, seed: int) -> Array:
-    """`count` scrambled Sobol points (count, dimension) in the unit cube."""
     from scipy.stats import qmc  # slow to import, seldom asked for
 
     sampler = qmc.Sobol(dimension, scramble=True, seed=seed)
@@ -580,7 +584,6 @@ def _marker_rows(
 
 
 def fitted_markers(model: Model) -> bool:
-    """Are places of markers among the parameters?"""
     return any(p.effect == MarkerPosition.name for p in model.parameters)
 
 
@@ -609,7 +612,6 @@ def _carrying(cell: Cell, point: Array) -> Array:
 def _table(
     targets: TargetPoses, pose: IntArray, marker: IntArray, names: tuple[str, ...]
 ) -> Measurements:
-    """The test poses `pose` (R,) as rows with these markers."""
     n = len(pose)
     return Measurements(
         source="test poses",
