@@ -27,7 +27,6 @@ from elastocal.units import Array, BoolArray, IntArray
 
 LOG_2PI = float(np.log(2 * np.pi))
 ROUNDING = 1e-12
-FORMED = 1e10  # operations on parts K of one evaluation
 
 
 # What V is made of: several K of every cluster, and the numbers of their variances there.
@@ -158,11 +157,10 @@ class Pack:
         return out
 
     def pairs(self, values: Array, K: int) -> Array:
-        """Sums (K, K) of `values` (C, k, k), or (k, k) of clusters alike."""
-        of = self.of[:1] if values.ndim == 2 else self.of
+        """Sums (K, K) of `values` (C, k, k) by the numbers of two variances."""
+        of, values = (self.of[:1], values.sum(axis=0)) if self.alike else (self.of, values)
         at = (of[:, :, None] * K + of[:, None, :]).ravel()
-        found = np.bincount(at, values.ravel(), K * K).astype(np.float64)
-        return found.reshape(K, K)
+        return np.bincount(at, values.ravel(), K * K).astype(np.float64).reshape(K, K)
 
     def V(self, theta: Array) -> Array:
         """V (C, m, m) at θ (K,), absent rows as any others."""
@@ -193,14 +191,6 @@ class Whitened:
     def back(self, rows: Array) -> Array:
         """R⁻ᵀ times rows (C, m, …)."""
         return np.asarray(self.root.transpose(0, 2, 1) @ rows)
-
-    @property
-    def cost(self) -> float:
-        """Operations that `local_information` takes, roughly."""
-        (C, m), parts = self.e.shape, self.pack.parts
-        common = sum(p.loading.shape[1] * p.loading.shape[3] for p in parts if _common(p))
-        formed = sum(p.of.shape[1] for p in parts if not _common(p))
-        return float(C * m * (2 * formed * m**2 + common * (2 * m + common + formed * m)))
 
     def local_information(self, Q: Array, theta: Array) -> Array:
         """θ_kθ_l tr P K_k P K_l (C, k, k) of each cluster by itself, P = R⁻ᵀQR⁻¹, θ (C, k).
@@ -344,38 +334,18 @@ class Mixed:
         return State(theta, packs, x, L, value)
 
     def objective(self, t: Array) -> tuple[float, Array, Array]:
-        """−2 log posterior at logarithms t (K,), its slope, and a curvature to step by.
-
-        tr P K_k P K_l, that to expect, of each cluster by itself.  Of large clusters the average of
-        the observed and the expected one, eᵀP K_k P K_l P e (Gilmour, Thompson and Cullis 1995,
-        Biometrics 51, 1440): it is formed of vectors alone, but leads less far.
-        """
-        state = self.state(np.exp(t))
-        K, p = self.K, len(self.precision)
-        slope, both, through = np.zeros(K), np.zeros((K, K)), np.zeros((K, p))
+        """−2 log posterior at logarithms t (K,), its slope, and the curvature to expect of each
+        cluster by itself, tr P K_k P K_l."""
+        state, K = self.state(np.exp(t)), self.K
+        slope, information = np.zeros(K), np.zeros((K, K))
         for w, H, z in state.each():
-            pack, m = w.pack, z.shape[1]
-            u = w.back(z[..., None])[..., 0]
-            Q = np.eye(m) - H @ H.transpose(0, 2, 1)
+            pack, u = w.pack, w.back(z[..., None])[..., 0]
+            Q = np.eye(z.shape[1]) - H @ H.transpose(0, 2, 1)
             P, theta = w.back(Q @ w.root), state.theta[pack.of]
-            trace = theta * np.concatenate([part.trace(P) for part in pack.parts], axis=1)
-            moved = theta[..., None] * np.concatenate(
-                [part.times(u) for part in pack.parts], axis=1
-            )
-            slope += pack.added(trace - (moved @ u[..., None])[..., 0], K)
-            f = moved @ w.root.transpose(0, 2, 1)  # (C, k, m)
-            if w.cost <= FORMED:
-                both += pack.pairs(w.local_information(Q, theta), K)
-            elif pack.alike:
-                f = f.swapaxes(0, 1).reshape(f.shape[1], -1)
-                both += pack.pairs(f @ f.T, K)
-                if H.shape[2]:
-                    through += pack.added((f @ H.reshape(-1, p))[None], K)
-            else:
-                both += pack.pairs(f @ f.swapaxes(1, 2), K)
-                if H.shape[2]:
-                    through += pack.added(f @ H, K)
-        information = both - through @ through.T
+            squares = np.concatenate([part.times(u) @ u[..., None] for part in pack.parts], axis=1)
+            trace = np.concatenate([part.trace(P) for part in pack.parts], axis=1)
+            slope += pack.added(theta * (trace - squares[..., 0]), K)
+            information += pack.pairs(w.local_information(Q, theta), K)
         value = state.value
         if self.prior is not None:
             penalty, more = self.prior.penalty(t)
