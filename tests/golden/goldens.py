@@ -127,7 +127,7 @@ GOLDENS: dict[str, Golden] = {
     "design_test_pose": Golden(CAMPAIGN, (
         "design planned.toml -o plan.csv --effort quick -q --fix joint1.compliance "
         "--report page.html",
-    ), engine=True),
+    ), engine=True, tied=True),
     "next": Golden(CAMPAIGN, (
         "next wished.toml data.csv -o next.csv --batch 2 --candidates 40 --require new_poses=50 -q",
         "next wished.toml data.csv -o more.csv --batch 2 --candidates 20 -q "

@@ -45,12 +45,14 @@ class Golden:
     """`steps` in a copy of `inputs`, folders below the root; `engine`: as tolerance.py says.
 
     `needs`: an environment variable that names measurements which are not part of the repository.
+    `tied`: the order of its poses is one of several alike, between which rounding decides.
     """
 
     inputs: tuple[str, ...]
     steps: tuple[Step, ...]
     engine: bool = False
     needs: str = ""
+    tied: bool = False
 
 
 def run(golden: Golden) -> list[dict[str, Any]]:

@@ -127,8 +127,10 @@ def mean_squares(arm: CalibratedArm, B: Array, size: int) -> tuple[float, float]
 
 
 def _blamed(left: OpenParameters, harm: Array) -> tuple[str, ...]:
-    """Parameters that do harm (D,), the worst first."""
-    return tuple(left.names[int(i)] for i in np.argsort(-harm) if harm[i] > 0)
+    """Parameters that do harm (D,), the worst first; of those alike but for rounding, as they are
+    ordered in the model."""
+    size = np.round(harm / max(float(harm.max(initial=0.0)), 1e-300), 9)
+    return tuple(left.names[int(i)] for i in np.argsort(-size, kind="stable") if harm[i] > 0)
 
 
 def left_open(solution: Solution) -> OpenParameters:
