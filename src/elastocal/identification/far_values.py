@@ -114,9 +114,8 @@ def scale_of(result: Calibration) -> float | None:
     n, turn = len(table), problem.flange_rotation
     G = np.zeros((n, 3, len(found.markers), 3))
     G[np.arange(n), :, table.marker] = found.rotation @ turn
-    body = np.einsum("nij,nj->ni", turn, found.markers[table.marker]) + problem.flange_position
-    arm = body @ found.rotation.T
-    left = np.asarray(table.position) - found.translation - arm
+    place = found.places(turn, problem.flange_position, table.marker)
+    arm, left = place - found.translation, np.asarray(table.position) - place
     about = np.cross(np.eye(3), arm[:, None, :])
     columns = np.concatenate(
         [arm[:, :, None], about.transpose(0, 2, 1), np.tile(np.eye(3), (n, 1, 1)),

@@ -105,11 +105,15 @@ def _others(chain: Chain) -> Iterator[JointMap]:
 
 @dataclass(frozen=True)
 class LinearFits:
-    """Of K joint tables: A's determinant (K,), the rms (K,) in m that is left in each component,
+    """Of K joint tables: A (K, 3, 3), and the rms (K,) in m that is left in each component,
     infinite where A is no rotation with a scale."""
 
-    determinant: Array
+    matrix: Array
     left: Array
+
+    @property
+    def determinant(self) -> Array:
+        return np.linalg.det(self.matrix)
 
     @property
     def scale(self) -> Array:
@@ -144,4 +148,4 @@ def _linear_fits(G: Array, Q: Array, back: Array) -> tuple[Array, Array]:
     A = back @ (along[..., -1] + np.einsum("karm,km->kar", along[..., :-1], m[..., 0]))
     size = np.linalg.svd(A, compute_uv=False)
     left[~(size[:, 0] <= UNSKEWED * size[:, -1])] = np.inf
-    return np.linalg.det(A), left
+    return A, left

@@ -103,8 +103,7 @@ def _errors(model: Model, table: Measurements) -> tuple[float, float]:
     """Distance (m) from the nominal arm that half of the readings keep to, and that MOST do."""
     problem = nominal_problem(model, table)
     found = register(problem)
-    body = np.einsum("nij,nj->ni", problem.flange_rotation, found.markers[table.marker])
-    place = (body + problem.flange_position) @ found.rotation.T + found.translation
+    place = found.places(problem.flange_rotation, problem.flange_position, table.marker)
     distance = np.linalg.norm(problem.points - place, axis=1)
     return found.error, float(np.percentile(distance, MOST))
 

@@ -112,8 +112,7 @@ def _blocks(
 def _distances(found: Registration, table: Measurements, flange: Array, shifts: IntArray) -> Array:
     """Distance (n, shifts) in m of every reading from the nominal place of the row that many
     further on; infinite beyond the table."""
-    own = np.einsum("nij,nj->ni", flange[:, :3, :3], found.markers[table.marker])
-    place = (own + flange[:, :3, 3]) @ found.rotation.T + found.translation
+    place = found.places(flange[:, :3, :3], flange[:, :3, 3], table.marker)
     n, points = len(table), np.asarray(table.position)
     distance = np.full((n, len(shifts)), np.inf)
     for k, s in enumerate(shifts):

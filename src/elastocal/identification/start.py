@@ -11,14 +11,14 @@ from scipy.optimize import least_squares
 from scipy.spatial.transform import Rotation
 
 from elastocal.errors import InputError, InsufficientDataError, option
-from elastocal.identification.linear_solver import least_norm
+from elastocal.identification.joint_maps import linear_fits
 from elastocal.measurements import Measurements
 from elastocal.model.chain import joint_limits
 from elastocal.model.effects.placements import BaseFrame, DistanceSensor, MarkerPosition
 from elastocal.model.manipulator import Model
 from elastocal.model.observations import Observations
 from elastocal.text import did_you_mean
-from elastocal.units import Array
+from elastocal.units import Array, BoolArray, IntArray
 
 # Does the table fit the robot?  Checked once, before anything is fitted.
 
@@ -131,7 +131,7 @@ def _reach(model: Model, table: Measurements) -> float:
     return float(np.linalg.norm(np.ptp(model.rigid.flange_poses(table)[:, :3, 3], axis=0)))
 
 
-def fixed_and_free(model: Model, fixed: tuple[str, ...]) -> NDArray[np.int64]:
+def fixed_and_free(model: Model, fixed: tuple[str, ...]) -> IntArray:
     """Indices of the parameters to fit; `fixed` names parameters, places or effects to hold.
 
     Raises InputError for a name that is none of these, or when nothing is left.
@@ -154,7 +154,7 @@ def fixed_and_free(model: Model, fixed: tuple[str, ...]) -> NDArray[np.int64]:
     return free
 
 
-def ordinary(model: Model, free: NDArray[np.int64]) -> NDArray[np.int64]:
+def ordinary(model: Model, free: IntArray) -> IntArray:
     """Those of the parameters `free` that no smooth function consists of.
 
     Raises InputError where there are none.
@@ -205,6 +205,11 @@ class Registration:
     markers: Array
     error: float
 
+    def places(self, turn: Array, position: Array, marker: IntArray) -> Array:
+        """Where flanges at `turn` (n, 3, 3) and `position` (n, 3) have each `marker` (n,)."""
+        body = np.einsum("nij,nj->ni", turn, self.markers[marker]) + position
+        return np.asarray(body @ self.rotation.T + self.translation)
+
 
 @dataclass(frozen=True)
 class RegistrationProblem:
@@ -219,9 +224,9 @@ class RegistrationProblem:
     flange_rotation: Array
     flange_position: Array
     points: Array
-    marker: NDArray[np.int64]
+    marker: IntArray
     start_markers: Array
-    free_markers: NDArray[np.bool_]
+    free_markers: BoolArray
     free_base: bool
     base_rotation: Array
     base_translation: Array
@@ -250,7 +255,10 @@ def register(problem: RegistrationProblem, seed: int = 0) -> Registration:
         problem = replace(problem, **{name: getattr(problem, name)[chosen] for name in of_rows})
     starts = problem.base_rotation[None]
     if problem.free_base:
-        U, _, Vt = np.linalg.svd(any_matrix(problem)[0].T)
+        flange = np.zeros((len(problem.points), 4, 4))
+        flange[:, :3, :3], flange[:, :3, 3] = problem.flange_rotation, problem.flange_position
+        linear = linear_fits(flange[None], problem.points, problem.marker).matrix[0]
+        U, _, Vt = np.linalg.svd(linear.T)
         body = _body_points(problem, problem.start_markers)
         starts = np.stack([
             U @ np.diag([1.0, 1.0, np.linalg.det(U @ Vt)]) @ Vt,
@@ -349,23 +357,6 @@ def _rotation_between(body: Array, points: Array, weight: Array) -> Array:
     return np.asarray(U @ Vt, dtype=np.float64)
 
 
-def any_matrix(problem: RegistrationProblem) -> tuple[Array, float]:
-    """A (3, 3) of the least squares A p + s − R_i m = t_i with any matrix A, shift s and markers
-    m, and the rms that it leaves."""
-    n, M = len(problem.points), len(problem.start_markers)
-    columns = np.zeros((n, 3, 12 + 3 * M))
-    for k in range(3):
-        columns[:, k, 3 * k : 3 * k + 3] = problem.points
-        columns[:, k, 9 + k] = 1.0
-    for c in range(M):
-        here = (problem.marker == c)[:, None, None]
-        columns[:, :, 12 + 3 * c : 15 + 3 * c] = -(here * problem.flange_rotation)
-    matrix, target = columns.reshape(3 * n, -1), problem.flange_position.ravel()
-    x = least_norm(matrix, target, cond=1e-9)
-    left = float(np.sqrt(np.mean((matrix @ x - target) ** 2)))
-    return np.asarray(x[:9].reshape(3, 3), dtype=np.float64), left
-
-
 # Starting values found from the data: base, markers and target orientation, or cable geometry.
 
 DISTANCE_STARTS = 64
@@ -373,7 +364,7 @@ DISTANCE_SAMPLE = 300
 
 
 def start_values(
-    model: Model, table: Measurements, seed: int = 0, free: NDArray[np.int64] | None = None
+    model: Model, table: Measurements, seed: int = 0, free: IntArray | None = None
 ) -> Array:
     """Parameter values (parameters,) near the data: nominal, but base, markers and cable placed.
 
