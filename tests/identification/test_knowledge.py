@@ -14,11 +14,7 @@ from support.constrained import equal
 from elastocal.errors import InputError
 from elastocal.identification.identify import identify
 from elastocal.identification.knowledge import (
-    Bounds,
-    Constraints,
     GaussianPrior,
-    LinearEquality,
-    SemidefiniteMatrix,
     physical_constraints,
     read_knowledge,
 )
@@ -98,14 +94,6 @@ def test_a_negative_compliance_is_reported_at_its_bound_with_a_one_sided_interva
     np.testing.assert_allclose(found.x, held.x, rtol=1e-5, atol=1e-13)
     assert found.heldout_rms == pytest.approx(held.heldout_rms, rel=1e-4)
     assert found.dof == held.dof
-
-
-def test_the_profile_of_the_nonlinear_fit_agrees_where_the_model_is_nearly_linear():
-    linear, exact = by_physics(), by_physics(intervals="profile")
-    assert "linearised" in linear.noise.interval_description
-    assert "nonlinear" in exact.noise.interval_description
-    for one, other in zip(linear.estimates, exact.estimates, strict=True):
-        np.testing.assert_allclose(one.ci95, other.ci95, atol=0.01 * one.std)
 
 
 # --- priors -----------------------------------------------------------------------------------
@@ -263,37 +251,6 @@ def test_the_file_shown_in_the_documentation_is_read(tmp_path):
     known = read_knowledge(written(tmp_path, block))
     assert known.physical and known.prior is not None
     assert known.constraints.bounds and known.constraints.equalities and known.constraints.matrices
-
-
-def test_a_file_means_what_it_says(tmp_path):
-    text = """
-        physical = true
-        [prior."joint2.compliance"]
-        mean = 2.9e-7
-        std = 3e-8
-        [[bounds]]
-        parameter = "joint3.compliance"
-        upper = 1e-6
-        [[equality]]
-        terms = { "joint4.compliance" = 1, "joint5.compliance" = -1.0 }
-        label = "one drive type"
-        [[semidefinite]]
-        entries = [["joint2.off_axis_compliance_x", 0], [0, "joint2.off_axis_compliance_y"]]
-    """
-    known = read_knowledge(written(tmp_path, text))
-    constraints, prior = known.of(bearings())
-    stated = Constraints(
-        (Bounds("joint3.compliance", upper=1e-6),),
-        (
-            LinearEquality(
-                {"joint4.compliance": 1.0, "joint5.compliance": -1.0}, 0.0, "one drive type"
-            ),
-        ),
-        (SemidefiniteMatrix("matrix 1", ((BEARING_X, 0), (0, BEARING_Y))),),
-    )
-    assert constraints == physical_constraints(bearings()) + stated
-    assert prior.names == ("joint2.compliance",)
-    assert (prior.mean[0], prior.covariance[0, 0]) == (2.9e-7, 3e-8**2)
 
 
 @pytest.mark.parametrize(

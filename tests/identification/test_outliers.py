@@ -11,7 +11,6 @@ from support.calibration import (
     cell_of,
     measured,
     planar_chain,
-    random_chain,
     table_at,
     true_values,
     with_values,
@@ -63,20 +62,13 @@ def test_clean_tables_hardly_ever_raise_an_alarm():
     assert false_alarms(model, 40, 12) <= limit
 
 
-@pytest.mark.long
-@pytest.mark.parametrize("effects", [("base_frame",), PLACED, GEOMETRY], ids="+".join)
-def test_clean_tables_hardly_ever_raise_an_alarm_however_many_parameters(effects):
-    limit = stats.binom.isf(1e-4, 200, FALSE_ALARM)
-    assert false_alarms(Model.assembled(random_chain(1, 4), cell_of(effects)), 200, 25) <= limit
-
-
 # --- gross errors ---------------------------------------------------------------------------
 
 
-@pytest.mark.parametrize("seed", range(4))
+@pytest.mark.parametrize("seed", range(2))
 def test_a_tenth_of_gross_errors_is_found_and_little_else(seed):
     """20 σ and more are far beyond any limit.  A good reading is accused in one table of a
-    hundred, so not one of 4 · 54 with a probability of 96 %; one per table is allowed."""
+    hundred, so not one of 2 · 54 with a probability of 96 %; one per table is allowed."""
     model = Model.assembled(planar_chain(), cell_of(GEOMETRY))
     table, _, rng = clean_table(model, seed, 60)
     wrong, bad = with_gross_errors(table, rng, 0.1)
@@ -123,7 +115,7 @@ def test_a_shifted_block_of_two_fifths_of_the_distances_is_found(seed, shift):
 # --- leaving them out -----------------------------------------------------------------------
 
 
-@pytest.mark.parametrize("seed", [2, 3, 4])
+@pytest.mark.parametrize("seed", [2])
 def test_dropping_equals_never_having_had_them(seed):
     model = Model.assembled(planar_chain(), cell_of(PLACED))
     table, _, rng = clean_table(model, seed, 40)
@@ -138,14 +130,6 @@ def test_dropping_equals_never_having_had_them(seed):
     np.testing.assert_allclose(dropped.covariance, never.covariance, rtol=1e-4,
                                atol=1e-6 * np.outer(std, std).max())  # fmt: skip
     assert dropped.heldout_rms == pytest.approx(never.heldout_rms, rel=1e-4)
-
-
-def test_errors_of_decimetres_do_not_end_the_identification():
-    """6 of 40 readings off by up to 0.1 m, base and marker to be placed."""
-    model = Model.assembled(planar_chain(), cell_of(PLACED))
-    table, _, rng = clean_table(model, 0, 40)
-    wrong, bad = with_gross_errors(table, rng, 0.15)
-    assert np.array_equal(rows_of(identify(model, wrong).faulty), bad)
 
 
 def test_nothing_is_left_out_in_silence():
@@ -182,6 +166,3 @@ def test_stated_sigmas_count():
     position[20] = exact.position[20] + [1e-3, 0, 0]
     result = identify(model, replace(plan, sigma=sigma, position=position))
     assert rows_of(result.faulty).tolist() == [20]
-
-
-# --- the trimmed fit ------------------------------------------------------------------------

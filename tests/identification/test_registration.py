@@ -19,7 +19,7 @@ ATTITUDES = {
     **HALF_TURNS,
     "90° about z": Rotation.from_euler("z", 90, degrees=True),
     "upside down, oblique": Rotation.from_euler("xyz", [175, 20, -130], degrees=True),
-    **{f"random {s}": Rotation.random(random_state=s) for s in range(6)},
+    "random": Rotation.random(random_state=0),
 }
 
 
@@ -53,8 +53,7 @@ def case(
 
 
 def predicted(problem, found):
-    turned = np.einsum("nij,nj->ni", problem.flange_rotation, found.markers[problem.marker])
-    return (turned + problem.flange_position) @ found.rotation.T + found.translation
+    return found.places(problem.flange_rotation, problem.flange_position, problem.marker)
 
 
 def assert_registered(problem, exact, found, sigma=SIGMA):
@@ -79,23 +78,13 @@ def test_any_attitude_with_an_unknown_tool(name):
     np.testing.assert_allclose(found.markers, true, atol=2e-4)
 
 
-@pytest.mark.parametrize("seed", range(4))
-@pytest.mark.parametrize("name", HALF_TURNS)
+@pytest.mark.parametrize(("seed", "name"), list(enumerate(HALF_TURNS)))
 def test_half_turns_with_wrong_readings_and_several_markers(name, seed):
-    problem, _, exact, _ = case(random_chain(seed), HALF_TURNS[name], seed, markers=3, wrong=0.2)
-    assert_registered(problem, exact, register(problem))
-
-
-@pytest.mark.parametrize("n", [6, 7])
-@pytest.mark.parametrize("seed", range(6))
-def test_random_chains_with_a_fifth_of_the_readings_wrong(seed, n):
-    turn = Rotation.random(random_state=seed + 50)
-    problem, _, exact, bad = case(random_chain(seed, n), turn, seed, wrong=0.2)
-    found = register(problem, seed)
+    problem, _, exact, bad = case(random_chain(seed), HALF_TURNS[name], seed, markers=3, wrong=0.2)
+    found = register(problem)
     assert_registered(problem, exact, found)
     miss = np.linalg.norm(predicted(problem, found) - problem.points, axis=1)
-    good = np.setdiff1d(np.arange(POSES), bad)
-    assert miss[bad].min() > miss[good].max()
+    assert miss[bad].min() > np.delete(miss, bad).max()
 
 
 def test_a_known_base_is_kept_and_the_tool_found():

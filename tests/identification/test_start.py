@@ -28,7 +28,7 @@ def rms(difference):
     return np.sqrt(np.mean(np.sum(difference.reshape(-1, 3) ** 2, axis=1)))
 
 
-@pytest.mark.parametrize("seed", range(4))
+@pytest.mark.parametrize("seed", range(2))
 def test_position_start_is_as_near_as_the_nominal_geometry_allows(seed):
     """1 mm and 1 mrad of error per link parameter move a 6-axis arm's marker by some mm; the
     start, which fits base and marker to the nominal arm, must not miss by more than the truth
@@ -49,7 +49,7 @@ def test_position_start_is_as_near_as_the_nominal_geometry_allows(seed):
     assert miss < 1.5 * rms(table.position.ravel() - model.predict(table, without_errors))
 
 
-@pytest.mark.parametrize("seed", range(5))
+@pytest.mark.parametrize("seed", range(2))
 def test_pose_start_finds_the_orientation_of_the_target(seed):
     chain, rng = random_chain(seed), np.random.default_rng(seed)
     effects = ("base_frame", "marker_position", "marker_orientation")

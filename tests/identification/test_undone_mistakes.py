@@ -58,14 +58,6 @@ def joints(change: Callable[[np.ndarray], None]) -> Callable[[ec.Measurements], 
     return changed
 
 
-def two_signs(q: np.ndarray) -> None:
-    q[[1, 4]] *= -1
-
-
-def exchanged(q: np.ndarray) -> None:
-    q[[1, 2]] = q[[2, 1]]
-
-
 def exchanged_and_turned(q: np.ndarray) -> None:
     q[[3, 4]] = q[[4, 3]]
     q[1] *= -1
@@ -83,8 +75,6 @@ def wrist(q: np.ndarray) -> None:
 @pytest.mark.parametrize(
     ("change", "told"),
     [
-        (two_signs, "with the sign of joints 2, 5 turned round they"),
-        (exchanged, "with the columns of joints 2 and 3 exchanged they"),
         (exchanged_and_turned, "joints 4 and 5 exchanged and with the sign of joint 2 turned"),
         (offset_and_turned, "with offset_deg 90 at joint 2 and with the sign of joint 3 turned"),
         (wrist, "sign of joint 5 turned round and with coupling { joint = 5, of = 4, factor = 1 }"),
@@ -125,17 +115,17 @@ def test_one_row_that_closed_up_lets_markers_change_places(made):
     assert "line 33" in found and "one row later" in found
 
 
-@pytest.mark.parametrize("axis", [0, 1, 2])
-def test_a_column_that_holds_one_value_is_named(made, axis):
+def test_a_column_that_holds_one_value_is_named(made):
     path, table = made
     stuck = table.position.copy()
-    stuck[:, axis] = stuck[0, axis]
+    stuck[:, 1] = stuck[0, 1]
     found = refusal(path, replace(table, position=stuck))
-    assert f"column {'xyz'[axis]} holds one value in all 120 rows" in found
+    assert "column y holds one value in all 120 rows" in found
 
 
-@pytest.mark.parametrize("effects", [("base_frame", "marker_position"), None])
-@pytest.mark.parametrize("factor", [0.97, 1.03])
+@pytest.mark.parametrize(
+    ("effects", "factor"), [(("base_frame", "marker_position"), 0.97), (None, 1.03)]
+)
 def test_one_scale_of_all_lengths_is_named_and_not_trusted(tmp_path, effects, factor):
     """Whether the model's lengths follow it, or leave it in the residual."""
     path = cell(tmp_path, **({} if effects is None else {"effects": effects}))
