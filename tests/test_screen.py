@@ -158,7 +158,7 @@ def run():
 """,
     "by CasADi": """
 import casadi as ca
-from elastocal.cli.app import Interrupts
+from elastocal.screen import interrupt_check
 from elastocal.planning.polish import IPOPT_OPTIONS
 class Goal(ca.Callback):
     def __init__(self):
@@ -169,12 +169,12 @@ class Goal(ca.Callback):
         return [given[0]]
 def run():
     x, goal = ca.MX.sym("x"), Goal()
-    with Interrupts() as stop:
-        try:
-            ca.nlpsol("s", "ipopt", {"x": x, "f": goal(x) ** 2}, IPOPT_OPTIONS)(x0=1.0)
-        except RuntimeError:
-            pass
-        stop.check()
+    check = interrupt_check()
+    try:
+        ca.nlpsol("s", "ipopt", {"x": x, "f": goal(x) ** 2}, IPOPT_OPTIONS)(x0=1.0)
+    except RuntimeError:
+        pass
+    check()
 """,
     "by nobody, when Python is half taken down": """
 class Late:

@@ -131,6 +131,21 @@ def _note(number: int, frame: FrameType | None) -> None:
     signal.default_int_handler(number, frame)
 
 
+def interrupt_check() -> Callable[[], None]:
+    """Raises KeyboardInterrupt, whenever it is called, where one came since now.
+
+    CasADi catches one inside a solver and returns where the search stood: without the check the
+    work would go on, with results that depend on when the key was pressed.
+    """
+    before = len(interrupts)
+
+    def check() -> None:
+        if len(interrupts) > before:
+            raise KeyboardInterrupt
+
+    return check
+
+
 def end_at_once() -> None:
     """All is written: from here on Ctrl-C ends the process with its one line and no traceback."""
 

@@ -17,6 +17,7 @@ from support.design_commands import (
 )
 
 from elastocal.planning import checkpoint, search
+from elastocal.screen import noting_interrupts
 
 GOING_ON = "resuming the interrupted design"
 # A child may inherit that SIGINT is ignored; here it must not.
@@ -93,9 +94,10 @@ def test_an_interrupt_that_a_solver_catches_is_not_lost(tmp_path, monkeypatch):
 
     cell = write_cell(tmp_path, altered(DEFLECTION, poses="2", candidates="20"))
     arguments = ("design", cell, "-o", tmp_path / "plan.csv", "-q")
-    with monkeypatch.context() as patch:
+    with monkeypatch.context() as patch, noting_interrupts():  # as the command itself does
         patch.setattr(search, "polish", interrupted_polish)
         result = elastocal(*arguments)
+    signal.signal(signal.SIGINT, signal.default_int_handler)
     assert result.exit_code == 130
     (state,) = (tmp_path / "plan.csv.resume").iterdir()
     assert everything_in(state) == ["candidates.npz", "exchange.npz"]

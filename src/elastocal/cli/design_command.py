@@ -3,16 +3,17 @@
 from __future__ import annotations
 
 import math
+from collections.abc import Callable
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
 
 import typer
 
 from elastocal import verbs
-from elastocal.cli.app import Interrupts, files_of, repeated
+from elastocal.cli.app import files_of, repeated
 from elastocal.cli.signatures import Asked, CellFile, ReportFile, Run, command
 from elastocal.errors import InputError, require
-from elastocal.screen import say
+from elastocal.screen import interrupt_check, say
 from elastocal.text import listed
 
 if TYPE_CHECKING:
@@ -116,10 +117,11 @@ def design(
     programs = program or []
     _check_suffixes(programs, picture)
     run.writes(output, summary, *programs, picture, report, cell_out)
-    with run.progress() as tell, Interrupts() as interrupts:
+    check = interrupt_check()
+    with run.progress() as tell:
 
         def progress(message: str) -> None:
-            interrupts.check()
+            check()
             tell(message)
 
         progress("reading")
@@ -132,7 +134,7 @@ def design(
         pinned = [plan_and_names(asked[name])[0] for name in ("keep", "strike") if name in asked]
         stated = [asked.get(name) for name in ("augment", "knowledge")]
         files = run.reads(cell, *stated, *pinned, *files_of(wanted))
-        plan, checkpoint = _resumed(wanted, options, output, files, asked, interrupts, progress)
+        plan, checkpoint = _resumed(wanted, options, output, files, asked, check, progress)
         with together(run.written):
             _write_all(plan, output, programs, picture)
             if cell_out is not None:
@@ -153,7 +155,7 @@ def design(
 
 def _resumed(
     cell: Cell, options: DesignOptions, output: Path, files: list[Path], asked: Asked,
-    interrupts: Interrupts, progress: Progress,
+    check: Callable[[], None], progress: Progress,
 ) -> tuple[Plan, Checkpoint]:  # fmt: skip
     """The plan, where an interrupted run of the same input left off, and what that left."""
     from elastocal.planning.checkpoint import Checkpoint, key_of
@@ -161,18 +163,18 @@ def _resumed(
 
     apart = ("jobs", "augment", "knowledge")  # these are among the files
     told = {name: value for name, value in asked.items() if name not in apart}
-    checkpoint = Checkpoint.beside(output, key_of(files, **told), interrupts.check)
+    checkpoint = Checkpoint.beside(output, key_of(files, **told), check)
     if checkpoint.begun:
         progress("resuming the interrupted design")
     try:
         plan = run(cell, options, checkpoint, progress)
     except Exception as error:
-        interrupts.check()
+        check()
         if not isinstance(error, OSError):
             # The same input ends here again: there is nothing to go on with.
             checkpoint.drop()
         raise
-    interrupts.check()
+    check()
     return plan, checkpoint
 
 
