@@ -35,6 +35,7 @@ class DesignProblem:
 
     `blocks` (N, r, p): whitened, scaled B of each candidate; M(w) = prior + Σ_i w_i B_iᵀB_i with
     `prior` (p, p) from what is known and measured already.  `group` (N,) in 0 … L−1, `shares` (L,).
+    `source`: the cell's file, as messages begin.
     """
 
     blocks: Array
@@ -42,6 +43,7 @@ class DesignProblem:
     group: IntArray
     shares: IntArray
     criterion: ScenarioCriterion
+    source: str = ""
 
     @property
     def n_candidates(self) -> int:
@@ -179,7 +181,7 @@ def check_enough(problem: DesignProblem) -> None:
     if n < needed:
         prior = f" and the prior {known}" if known else ""
         raise InsufficientDataError(
-            f"fewer equations than parameters: {n} poses of {r} readings give {n * r}{prior}, for "
+            f"{problem.source}fewer equations than parameters: {n} poses of {r} readings give {n * r}{prior}, for "
             f"{p} parameters; plan at least {needed} poses, switch effects off or state a prior"
         )
 

@@ -107,7 +107,11 @@ class Setup:
         return self if pinned is None else replace(self, prior=self.gathered(pinned.blocks))
 
     def problem(self, pool: FeasiblePool, shares: IntArray) -> DesignProblem:
-        return DesignProblem(pool.blocks, self.prior, pool.group, shares, self.criterion)
+        cell = self.information.model.cell
+        source = f"{cell.path or cell.name}: "
+        return DesignProblem(
+            pool.blocks, self.prior, pool.group, shares, self.criterion, source=source
+        )
 
     def gathered(self, blocks: Array) -> Array:
         """M (p, p) of a plan's blocks (N, r, p) and what was known before."""
