@@ -10,7 +10,7 @@ from hypothesis import strategies as st
 from support.tracker_exports import imported, krl, rapid
 
 from elastocal.errors import InputError
-from elastocal.importing.foreign_text import Clock, Text, krl_rows, rapid_rows
+from elastocal.importing.foreign_text import Clock, ForeignText, krl_rows, rapid_rows
 from elastocal.importing.mapping_file import read_mapping
 
 QUIET = settings(max_examples=40, deadline=None, suppress_health_check=list(HealthCheck))
@@ -103,7 +103,7 @@ def test_any_mapping_is_read_or_refused_by_name(data):
 def test_any_program_text_is_read_or_refused(text):
     for read in (krl_rows, rapid_rows):
         try:
-            found = read(Text("f", "ASCII", text.split("\n")))
+            found = read(ForeignText("f", "ASCII", text.split("\n")))
         except InputError as error:
             assert str(error).startswith("f")
         else:
@@ -116,7 +116,7 @@ def test_any_program_text_is_read_or_refused(text):
 def test_programs_hold_what_was_written(poses):
     q = np.array(poses)
     for text, read in ((krl(q), krl_rows), (rapid(q), rapid_rows)):
-        found = read(Text("f", "ASCII", text.split("\n")))
+        found = read(ForeignText("f", "ASCII", text.split("\n")))
         values = [[float(cell) for cell in cells[1:7]] for _, cells in found.rows]
         np.testing.assert_array_equal(values, q)
 

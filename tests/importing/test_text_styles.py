@@ -5,7 +5,7 @@ import pytest
 from support.tracker_exports import imported
 
 from elastocal.errors import InputError
-from elastocal.importing.foreign_text import Text, krl_rows, rapid_rows, read_lines
+from elastocal.importing.foreign_text import ForeignText, krl_rows, rapid_rows, read_lines
 from elastocal.units import convert, split_unit
 
 ROWS = [(10.0, 20.5, -30.25, 1234.5, 0.125, -7.0), (11.0, 21.5, -31.25, -2234.5, 1.125, -8.0)]
@@ -78,7 +78,7 @@ def test_rows_without_a_value_are_left_out_by_name(tmp_path):
 
 
 def lines(text):
-    return Text("f", "ASCII", text.split("\n"))
+    return ForeignText("f", "ASCII", text.split("\n"))
 
 
 def test_krl_over_several_lines_in_logs_and_arrays():

@@ -310,6 +310,8 @@ class HeldArm:
         self._pieces, self._mujoco, model = pieces, import_mujoco(), arm.model
         if not pieces.masses:
             model.opt.gravity[:] = 0.0
+        # No contacts are sought: nothing touches a spring.
+        model.opt.disableflags |= int(self._mujoco.mjtDisableBit.mjDSBL_CONSTRAINT)
         self._data = self._mujoco.MjData(model)
         springs = [j for j in range(model.njnt) if model.joint(j).name.startswith(SPRING)]
         self._moved = model.jnt_qposadr[springs]

@@ -43,7 +43,7 @@ ISO = "ISO 8601"
 
 
 @dataclass(frozen=True)
-class Text:
+class ForeignText:
     """`lines` without their ends; line k of the file is lines[k - 1]."""
 
     source: str
@@ -51,7 +51,7 @@ class Text:
     lines: list[str]
 
 
-def read_lines(path: str | Path, encoding: str = "auto") -> Text:
+def read_lines(path: str | Path, encoding: str = "auto") -> ForeignText:
     """The lines of a text file of at most 300 MB.
 
     `encoding` "auto": by the byte order mark, else UTF-8 where the bytes allow, else UTF-16
@@ -78,7 +78,7 @@ def read_lines(path: str | Path, encoding: str = "auto") -> Text:
         if len(content) > MAX_LINE:
             raise InputError(f"{source}, line {number}: longer than {MAX_LINE // 1024} KiB; this "
                              "is no table of readings")  # fmt: skip
-    return Text(source, name, lines)
+    return ForeignText(source, name, lines)
 
 
 def _decode(source: str, data: bytes, encoding: str) -> tuple[str, str]:
@@ -204,7 +204,7 @@ class Rows:
 
 
 def table_rows(
-    text: Text, settings: TextSourceKeys, is_header: Judge | None, is_data: Judge
+    text: ForeignText, settings: TextSourceKeys, is_header: Judge | None, is_data: Judge
 ) -> Rows:
     """The rows of a delimited table.
 
@@ -328,7 +328,7 @@ def _named_header(
 
 
 def _unnamed_header(
-    text: Text, split: _Splitter, content: list[tuple[int, str]], is_data: Judge
+    text: ForeignText, split: _Splitter, content: list[tuple[int, str]], is_data: Judge
 ) -> tuple[int, tuple[str, ...]]:
     before: tuple[int, list[str]] | None = None
     for number, line in content[:SAMPLE]:
@@ -464,7 +464,7 @@ _RAPID_NAME = re.compile(r"(?:\b(\w++)\s++)?\b([A-Za-z]\w*+)\s*+(\{[\d,\s]*+\})?
 _RAPID_PAIR = re.compile(r"\[\s*+\[([^\[\]]*+)\]\s*+,\s*+\[([^\[\]]*+)\]\s*+\]")
 
 
-def krl_rows(text: Text) -> Rows:
+def krl_rows(text: ForeignText) -> Rows:
     """Every aggregate of A1, A2 … (and E1 …) of a KRL .dat or .src file, or of a log of them.
 
     Aggregates of FRAME, POS and E6POS (X, Y, Z) hold no joint values and are passed over, named.
@@ -490,7 +490,7 @@ def krl_rows(text: Text) -> Rows:
     return _complete(text, found, "no {A1 …, A2 …} with joint values")
 
 
-def rapid_rows(text: Text) -> Rows:
+def rapid_rows(text: ForeignText) -> Rows:
     """Every jointtarget [[rax_1 … rax_6], [eax_a … eax_f]] of a RAPID module or a log of them.
 
     An array's members are named P{1}, P{2} …; robtargets hold no joint values, and o_jointtarget
@@ -508,7 +508,7 @@ def rapid_rows(text: Text) -> Rows:
 
 
 def _rapid_statement(
-    text: Text, found: Rows, statement: str, start: int, count: Callable[[int], int]
+    text: ForeignText, found: Rows, statement: str, start: int, count: Callable[[int], int]
 ) -> None:
     declared = _RAPID_NAME.search(statement)
     kind = (declared[1] or "").lower() if declared else ""
@@ -532,7 +532,7 @@ def _rapid_statement(
         found.rows.append((line, [label, *cells]))
 
 
-def _value(text: Text, line: int, axis: str, cell: str) -> str:
+def _value(text: ForeignText, line: int, axis: str, cell: str) -> str:
     if not _NUMBER.fullmatch(cell):
         raise InputError(
             f"{text.source}, line {line}: {axis} is {quoted(cell)}, not a number; log values, not "
@@ -541,7 +541,7 @@ def _value(text: Text, line: int, axis: str, cell: str) -> str:
     return cell
 
 
-def _complete(text: Text, found: Rows, what: str) -> Rows:
+def _complete(text: ForeignText, found: Rows, what: str) -> Rows:
     if not found.rows:
         n = len(found.ignored)
         passed_over = f" ({n} Cartesian positions passed over)" if n else ""

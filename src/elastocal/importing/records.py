@@ -13,9 +13,9 @@ from elastocal.errors import ElastocalError, InputError
 from elastocal.importing.foreign_text import (
     SAMPLE,
     Clock,
+    ForeignText,
     NumberCells,
     Rows,
-    Text,
     bounded_search,
     compiled,
     krl_rows,
@@ -193,8 +193,8 @@ def read_records(where: str, path: Path, source: SourceTable, units: UnitsTable)
 
 
 def _read(
-    text: Text, table: Rows, asked: Sequence[ColumnKey], source: SourceTable, units: UnitsTable,
-    hint: str | None,
+    text: ForeignText, table: Rows, asked: Sequence[ColumnKey], source: SourceTable,
+    units: UnitsTable, hint: str | None,
 ) -> Records:  # fmt: skip
     """The rows of a table with these columns."""
     settings = source.text or TextSourceKeys()
@@ -271,7 +271,7 @@ def likely_presets(path: Path) -> list[str]:
     return [name for name, n in rows.items() if n == max(rows.values())]
 
 
-def _table(text: Text, settings: TextSourceKeys, asked: Sequence[ColumnKey]) -> Rows:
+def _table(text: ForeignText, settings: TextSourceKeys, asked: Sequence[ColumnKey]) -> Rows:
     kind = settings.format or "table"
     if kind != "table":
         return (krl_rows if kind == "krl" else rapid_rows)(text)
