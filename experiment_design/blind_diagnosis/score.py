@@ -8,8 +8,10 @@ from __future__ import annotations
 import re
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
-from itertools import permutations
 from typing import Any, Literal
+
+import numpy as np
+from scipy.optimize import linear_sum_assignment
 
 Place = tuple[str, str]  # effect, where
 Json = Mapping[str, Any]
@@ -102,11 +104,9 @@ def pair(truth: Json, answer: Json | None) -> Pair:
 
 def _matched(said: Sequence[list[Place]], true: Sequence[Place]) -> int:
     """The most truths that have a claim each."""
-    spare: list[list[Place]] = [[] for _ in true]
-    return max(
-        sum(t in members for t, members in zip(true, chosen, strict=True))
-        for chosen in permutations([*said, *spare], len(true))
-    )
+    there = np.array([[t in members for members in said] for t in true], dtype=int)
+    there = there.reshape(len(true), len(said))
+    return int(there[linear_sum_assignment(there, maximize=True)].sum())
 
 
 def location_right(truth: Json, answer: Json) -> bool:
