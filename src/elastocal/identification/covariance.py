@@ -4,15 +4,15 @@ from __future__ import annotations
 
 from collections.abc import Iterator
 from dataclasses import dataclass, replace
-from typing import Literal, get_args
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 from scipy import linalg, special
 
-from elastocal.errors import InputError, InsufficientDataError, require
+from elastocal.errors import InputError, InsufficientDataError
 from elastocal.identification.linear_solver import checked_problem
-from elastocal.units import Array
+from elastocal.identification.weighted_problem import same_size
+from elastocal.units import Array, IntArray
 
 # An estimated covariance of a fit, and the t intervals that follow from it.
 
@@ -62,15 +62,7 @@ class Covariance:
 
     def interval(self, x: Array, level: float = 0.95) -> Array:
         """x_j ± t_{dof_j}((1 + level)/2) · std_j as (p, 2), for the estimate x (p,); std_j by the
-        share of `tails`.
-
-        Raises InputError where x does not match or `level` is not between 0 and 1.
-        """
-        x = np.asarray(x, dtype=np.float64)
-        require(
-            x.shape == self.dof.shape,
-            f"the covariance is of {self.dof.size} parameters, but x has shape {x.shape}",
-        )
+        share of `tails`."""
         share = self.tails(np.eye(len(x))[:, None])[1] if self.among else 1.0
         half = t_quantile(level, self.dof) * self.std * np.sqrt(share)
         return np.column_stack([x - half, x + half])
@@ -82,11 +74,8 @@ def variance_of(rows: Array, covariance: Array) -> Array:
 
 
 def t_quantile(level: float, dof: Array) -> Array:
-    """Two-sided quantile of t with `dof`, at any shape: P(|t| ≤ quantile) = level.
-
-    Infinite at dof 0.  Raises InputError unless 0 < level < 1.
-    """
-    require(0 < level < 1, f"level must lie between 0 and 1, for example 0.95; got {level}")
+    """Two-sided quantile of t with `dof`, at any shape: P(|t| ≤ quantile) = level; infinite at
+    dof 0."""
     p, few = (1 + level) / 2, np.where((dof > 0) & np.isfinite(dof), dof, 1.0)
     t = np.where(np.isinf(dof), special.ndtri(p), special.stdtrit(few, p))
     return np.where(dof > 0, t, np.inf)
@@ -200,8 +189,6 @@ class SatterthwaiteSums:
 
 ALONE = 1e-9  # 1 − leverage below which a cluster is fitted exactly, whatever was read there
 ENTRIES = 2**22  # of a temporary array, 32 MB
-CRKind = Literal["CR0", "CR1", "CR2", "CR3"]
-HCKind = Literal["HC0", "HC1", "HC2", "HC3"]
 DEPENDS = 1e-6  # share of a parameter in such a direction above which it depends on it
 
 CLUSTER_DESCRIPTION = {
@@ -212,103 +199,60 @@ CLUSTER_DESCRIPTION = {
 }
 
 
-@dataclass(frozen=True)
-class Clusters:
-    """Rows by cluster: `order` sorts them, cluster g has rows order[start[g] : start[g]+size[g]].
-
-    `label` (G,) are the labels given, ascending.
-    """
-
-    label: NDArray[np.int64]
-    order: NDArray[np.intp]
-    start: NDArray[np.intp]
-    size: NDArray[np.intp]
-
-    def __len__(self) -> int:
-        return self.label.size
-
-    def sums(self, rows: Array) -> Array:
-        """Sum over each cluster (G, ...) of an array (rows, ...)."""
-        return np.asarray(np.add.reduceat(rows[self.order], self.start, axis=0))
-
-    def blocks(self, columns: int) -> Iterator[tuple[NDArray[np.intp], NDArray[np.intp]]]:
-        """Clusters (k,) of equal size and their rows (k, size), in blocks of bounded memory."""
-        for size in np.unique(self.size):
-            same = np.flatnonzero(self.size == size)
-            step = max(1, ENTRIES // (columns * max(int(size), columns)))
-            for first in range(0, same.size, step):
-                some = same[first : first + step]
-                yield some, self.order[self.start[some][:, None] + np.arange(size)]
-
-
-def clusters_of(cluster: ArrayLike, rows: int) -> Clusters:
-    """Clusters of the integer labels (rows,).
-
-    Raises InputError where there is not one integer per row, InsufficientDataError for a single
-    cluster.
-    """
-    labels = np.asarray(cluster)
-    if labels.shape != (rows,) or not np.issubdtype(labels.dtype, np.integer):
-        raise InputError(
-            f"cluster must be {rows} integer labels, one per row of B; got shape {labels.shape}"
-            f" of {labels.dtype} (repeat a label for each component of an observation)"
-        )
-    order = np.argsort(labels, kind="stable")
-    label, start, size = np.unique(labels[order], return_index=True, return_counts=True)
-    if label.size < 2:
-        raise InsufficientDataError(
-            "a cluster-robust covariance compares clusters, but all rows are in one;"
-            " measure more configurations, or use a covariance of independent rows (HC3)"
-        )
-    return Clusters(label.astype(np.int64), order, start, size)
-
-
-def cluster_robust(
-    B: ArrayLike, e: ArrayLike, cluster: ArrayLike, kind: CRKind = "CR2"
-) -> Covariance:
+def cluster_robust(B: Array, e: Array, cluster: IntArray, kind: str = "CR2") -> Covariance:
     """Covariance of x̂ that allows any correlation within a cluster (equations above).
 
-    B (n, p) and e (n,) whitened, e = y − B x̂ the least-squares residual; `cluster` (n,) integer
-    labels in any order.  Degrees of freedom by Satterthwaite for every kind, each for its own
+    B (n, p) and e (n,) whitened, e = y − B x̂ the least-squares residual; `cluster` (n,) labels in
+    any order.  Degrees of freedom by Satterthwaite for every kind, each for its own
     A_c (Pustejovsky & Tipton 2018); at most G, or G − 1 for CR0 and CR1, whose scores sum to zero
     over the clusters, and far fewer where few clusters matter.
 
     Where a cluster alone determines a direction, I − Q_cQ_cᵀ is singular: CR2 takes the
     generalised inverse square root, which leaves parameters outside that direction unbiased
     (there, Theorem 1).  A parameter that depends on it has no cluster-robust variance: its dof
-    is 0 and its interval unbounded.  CR3 does not exist then: InsufficientDataError.
+    is 0 and its interval unbounded.  CR3 does not exist then: InsufficientDataError, as for a
+    single cluster.
 
     Cost: n p² + G p³ operations and 32 MB of temporaries; nothing of size n² is formed.
-    Raises InputError and InsufficientDataError as `orthogonal` and `clusters_of`.
     """
-    require(kind in get_args(CRKind), f"kind must be one of {get_args(CRKind)}; got {kind!r}")
     factors, e = orthogonal(B, e)
     Q, V = factors.Q, factors.V
     n, p = Q.shape
-    groups = clusters_of(cluster, n)
-    what, left = ("row", "HC") if len(groups) == n else ("cluster", "CR")
+    G = len(np.unique(cluster))
+    if G < 2:
+        raise InsufficientDataError(
+            "a cluster-robust covariance compares clusters, but all rows are in one;"
+            " measure more configurations, or use a covariance of independent rows (HC3)"
+        )
     meat, sums, alone = np.zeros((p, p)), SatterthwaiteSums(p), np.zeros(p, dtype=bool)
-    for some, rows in groups.blocks(p):
+    for rows in _blocks(cluster, p):
         Qc = Q[rows]
         adjusted, determined = _adjusted(Qc, kind)
-        if determined.any():
-            if kind == "CR3":
-                label = groups.label[some[np.argmax(determined)]]
-                raise InsufficientDataError(
-                    f"{what} {label} alone determines a combination of the parameters: leaving it"
-                    f" out, as {left}3 does, leaves no answer; fit fewer parameters or use {left}2"
-                )
-            alone |= _depends(Qc[determined], V)
+        if determined.any() and kind == "CR3":
+            what, left = ("row", "HC") if n == G else ("cluster", "CR")
+            raise InsufficientDataError(
+                f"{what} {cluster[rows[determined][0, 0]]} alone determines a combination of the "
+                f"parameters: leaving it out, as {left}3 does, leaves no answer; fit fewer "
+                f"parameters or use {left}2"
+            )
+        alone |= _depends(Qc[determined], V)
         scores = (e[rows][:, None, :] @ adjusted)[:, 0]
         meat += scores.T @ scores
         a = adjusted @ V.T
         sums.add(np.sum(a * a, axis=1), Qc.transpose(0, 2, 1) @ a)
     if kind == "CR1":
-        meat *= len(groups) / (len(groups) - 1) * (n - 1) / (n - p)
-    text = f"rows correlated within {len(groups)} clusters, {CLUSTER_DESCRIPTION[kind]}"
+        meat *= G / (G - 1) * (n - 1) / (n - p)
+    text = f"rows correlated within {G} clusters, {CLUSTER_DESCRIPTION[kind]}"
     if alone.any():
         text += f"; parameters {np.flatnonzero(alone).tolist()} hang on a single cluster"
     return Covariance(kind, factors.sandwich(meat), np.where(alone, 0.0, sums.dof()), text)
+
+
+def _blocks(cluster: IntArray, columns: int) -> Iterator[IntArray]:
+    """Rows (k, size) of clusters of one size, in blocks of bounded memory."""
+    for rows in same_size(cluster):
+        numbers = len(rows) * columns * max(rows.shape[1], columns)
+        yield from np.array_split(rows, -(-numbers // ENTRIES))
 
 
 ROW_DESCRIPTION = {
@@ -319,21 +263,19 @@ ROW_DESCRIPTION = {
 }
 
 
-def hc(B: ArrayLike, e: ArrayLike, kind: HCKind = "HC3") -> Covariance:
+def hc(B: Array, e: Array, kind: str = "HC3") -> Covariance:
     """Covariance of x̂ with independent rows, each of its own variance: every row a cluster.
 
-    B (n, p) and e (n,) whitened.  Degrees of freedom are n − p for HC0 and HC1.  Raises InputError
-    and InsufficientDataError as `cluster_robust`.
+    B (n, p) and e (n,) whitened.  Degrees of freedom are n − p for HC0 and HC1.
     """
-    require(kind in get_args(HCKind), f"kind must be one of {get_args(HCKind)}; got {kind!r}")
-    n = len(np.atleast_1d(e))
-    found = cluster_robust(B, e, np.arange(n), f"CR{kind[2]}")  # type: ignore[arg-type]
+    n = len(e)
+    found = cluster_robust(B, e, np.arange(n), f"CR{kind[2]}")
     plain = kind in ("HC0", "HC1")
     dof = np.full(len(found.dof), float(n - len(found.dof))) if plain else found.dof
     return replace(found, kind=kind, dof=dof, description=ROW_DESCRIPTION[kind])
 
 
-def _adjusted(Qc: Array, kind: CRKind) -> tuple[Array, NDArray[np.bool_]]:
+def _adjusted(Qc: Array, kind: str) -> tuple[Array, NDArray[np.bool_]]:
     """A_cQ_c (k, size, p), and which of the k clusters determine a direction alone.
 
     For g(I − Q_cQ_cᵀ) Q_c = Q_c g(I − Q_cᵀQ_c) the smaller of the two is decomposed.

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from collections import defaultdict
 from collections.abc import Callable
 from dataclasses import dataclass, replace
 from typing import Literal, get_args
@@ -14,8 +13,15 @@ from elastocal.errors import ElastocalError, InputError, option, require
 from elastocal.identification.covariance import Covariance, cluster_robust, hc, t_quantile
 from elastocal.identification.least_squares import Fit, FitProblem, fit
 from elastocal.identification.noise_choice import NoiseFit
+from elastocal.identification.residuals import whole_groups
 from elastocal.identification.solve import Solution, residual_sigma
-from elastocal.identification.weighted_problem import Partition, Span, in_order, regressor
+from elastocal.identification.weighted_problem import (
+    Partition,
+    Span,
+    in_order,
+    regressor,
+    same_size,
+)
 from elastocal.units import Array
 
 # Cluster-robust covariance of a fit to a table too large for its B to be formed.
@@ -38,28 +44,18 @@ def cluster_by_parts(fit: Fit, parts: Partition) -> Covariance:
     configurations and n rows; t with G − 1 degrees of freedom.
     """
     model, size = fit.problem.model, fit.problem.sizes[fit.columns]
-    p = len(size)
 
-    def scores(span: Span) -> dict[int, Array]:
+    def meat(span: Span) -> Array:
         part = parts.part(span)
         at = regressor(model, part, fit.x, fit.columns)
         B, e = part.weights.apply(at.B * size), part.weights.apply(at.residual)
         rows_of = np.repeat(part.observations.configuration, part.observations.size)
-        codes, where = np.unique(rows_of, return_inverse=True)
-        order = np.argsort(where, kind="stable")
-        starts = np.searchsorted(where[order], np.arange(len(codes)))
-        sums = np.add.reduceat((B * e[:, None])[order], starts, axis=0)
-        return dict(zip(codes.tolist(), sums, strict=True))
-
-    def meat(spans: tuple[Span, ...]) -> Array:
-        total: dict[int, Array] = defaultdict(lambda: np.zeros(p))
-        for span in spans:
-            for code, score in scores(span).items():
-                total[code] += score
-        S = np.array(list(total.values()))
+        scores = [np.einsum("grp,gr->gp", B[rows], e[rows]) for rows in same_size(rows_of)]
+        S = np.concatenate(scores)
         return np.asarray(S.T @ S)
 
-    middle = sum(in_order(parts.groups, meat), np.zeros((p, p)))
+    p = len(size)
+    middle = sum(in_order(whole_groups(parts), meat), np.zeros((p, p)))
     n, G = len(parts.observed.value), parts.observed.n_configurations
     factor = G / (G - 1) * (n - 1) / (n - p)
     cofactor = fit.cofactor() / np.outer(size, size)
@@ -80,25 +76,11 @@ def cluster_by_parts(fit: Fit, parts: Partition) -> Covariance:
 # transformation of the parameter.
 
 Objective = Callable[[float], float]
-End = Literal["crossing", "bound", "unbounded", "no_fit"]
 
 DOUBLINGS = 10  # of t·std in search of a crossing; beyond 1000 times the interval is flat
 FAR = 10.0  # τ/t beyond which its size no longer matters
-JUMP = 0.01  # of τ over a step of 10 PRECISION that no continuous profile makes
 PRECISION = 1e-6  # of an end, in units of t·std
 LOWER_BY = 1e-3  # (Ŝ − S)/s² above which the fit was not at its minimum
-
-
-@dataclass(frozen=True)
-class ProfileInterval:
-    """The interval (lower, upper) in units of the parameter, and why each side ends there.
-
-    `ends`: "crossing" (τ² reached the F quantile), "bound", "unbounded" (±inf), "no_fit".
-    """
-
-    lower: float
-    upper: float
-    ends: tuple[End, End]
 
 
 def profile_interval(
@@ -109,26 +91,21 @@ def profile_interval(
     level: float = 0.95,
     lower: float = -np.inf,
     upper: float = np.inf,
-) -> ProfileInterval:
-    """Profile-likelihood interval of one parameter about `estimate`.
+) -> tuple[float, float]:
+    """Profile-likelihood interval of one parameter about `estimate`, inside its bounds; infinite
+    on a side where τ² never reaches the quantile.
 
     objective(value) -> S: minimum of the whitened rss with the parameter at `value`; it may raise
-    ElastocalError where no fit exists.  std: standard deviation of the linearised fit, which only
-    scales the search.  dof: residual degrees of freedom; np.inf where the noise is known, then
-    s² = 1 and F becomes χ²₁.  lower, upper: the parameter's bounds.
+    ElastocalError where no fit exists, and there the interval ends.  std: standard deviation of the
+    linearised fit, which only scales the search.  dof: residual degrees of freedom.
 
-    Raises InputError for a std or dof that is not positive, an estimate outside the bounds or a
-    bad level; ElastocalError where a value is found whose S lies below that of the estimate.
+    Raises InputError where there are none, or no residual; ElastocalError where a value is found
+    whose S lies below that of the estimate.
     """
-    require(0 < std < np.inf, f"std must be positive and finite, got {std}")
     require(dof > 0, f"a profile needs positive degrees of freedom, got {dof}")
-    require(
-        lower <= estimate <= upper,
-        f"the estimate {estimate:g} lies outside its bounds {lower:g} to {upper:g}",
-    )
     t = float(t_quantile(level, np.asarray(dof)))
     least = objective(estimate)
-    s2 = 1.0 if np.isinf(dof) else least / dof
+    s2 = least / dof
     require(s2 > 0, "the fit leaves no residual, so there is no noise to judge its parameters by")
 
     def excess(value: float) -> float:
@@ -144,47 +121,32 @@ def profile_interval(
             )
         return min(np.sqrt(max(rise, 0.0)), (1 + FAR) * t) - t if np.isfinite(rise) else FAR * t
 
-    low, low_end = _side(excess, estimate, -t * std, lower)
-    high, high_end = _side(excess, estimate, t * std, upper)
-    return ProfileInterval(low, high, (low_end, high_end))
+    return _end(excess, estimate, -t * std, lower), _end(excess, estimate, t * std, upper)
 
 
-def _side(excess: Objective, estimate: float, step: float, bound: float) -> tuple[float, End]:
+def _end(excess: Objective, estimate: float, step: float, bound: float) -> float:
     """The end of the interval in the direction of `step`, whose size is that of the t interval."""
     inside = estimate
-    for k in range(DOUBLINGS + 1):
-        outside = estimate + step * 2.0**k
-        at_bound = (outside - bound) * step >= 0
-        outside = bound if at_bound else outside
-        if outside == estimate:
-            return estimate, "bound"
-        value = excess(outside)
+    for size in 2.0 ** np.arange(DOUBLINGS + 1):
+        outside = estimate + step * float(size)
+        outside = bound if (outside - bound) * step >= 0 else outside
+        value = 0.0 if outside == estimate else excess(outside)
         if abs(value) <= PRECISION:  # rounding alone decides its sign
-            return outside, "crossing"
+            return outside
         if value > 0:
-            break
-        if at_bound:
-            return outside, "bound"
+            return float(optimize.brentq(excess, inside, outside, xtol=PRECISION * abs(step)))
+        if outside == bound:
+            return bound
         inside = outside
-    else:
-        return float(np.copysign(np.inf, step)), "unbounded"
-    xtol = PRECISION * abs(step)
-    end = float(optimize.brentq(excess, inside, outside, xtol=xtol))
-    # At a crossing τ is continuous, so a step of 10 xtol inwards still sees it close to t.
-    before = excess(end - 10 * xtol * np.sign(step))
-    return end, "no_fit" if before < -JUMP else "crossing"
+    return float(np.copysign(np.inf, step))
 
 
 def profile_of(problem: FitProblem, found: Fit, index: int) -> Objective:
     """S(value) of `profile_interval` for parameter `index` of the model, one of problem.columns.
 
     Each call holds the parameter and refits the other columns with `fit`, from the nearest fit so
-    far.  It raises ElastocalError where that does not converge, InputError where the problem has
-    ties (they are no data) or `index` was not fitted.
+    far.  It raises ElastocalError where that does not converge.
     """
-    require(problem.tie is None, "a profile needs a problem without ties")
-    fitted = bool(np.isin(index, problem.columns))
-    require(fitted, f"parameter {index} was not fitted: columns are {problem.columns.tolist()}")
     others = problem.columns[problem.columns != index]
     known = [found.x]
 
@@ -214,7 +176,6 @@ IntervalKind = Literal[
 ]  # fmt: skip
 KINDS = get_args(IntervalKind)
 LEVEL = 0.95
-DRAWS = 999
 
 
 @dataclass(frozen=True)
@@ -260,14 +221,15 @@ def intervals_of(solution: Solution, kind: IntervalKind, noise: NoiseFit | None)
             f"{option('intervals', kind)} needs B as a whole, which a table of this size does not "
             "allow; use cr1 or classical"
         )
+    if kind == "profile":
+        return _profiled(solution, classical)
     size = solution.sizes[fit.columns]
-    B, e = solution.problem.weights.apply(fit.B * size), fit.whitened
-    cluster = np.repeat(observed.configuration, observed.size)
+    B, e = problem.weights.apply(fit.B * size), fit.whitened
     if kind.startswith("hc"):
-        return by_t(_scaled(hc(B, e, kind.upper()), size))  # type: ignore[arg-type]
-    if kind.startswith("cr"):
-        return by_t(_scaled(cluster_robust(B, e, cluster, kind.upper()), size))  # type: ignore[arg-type]
-    return _profiled(solution, classical)
+        found = hc(B, e, kind.upper())
+    else:
+        found = cluster_robust(B, e, np.repeat(observed.configuration, observed.size), kind.upper())
+    return by_t(replace(found, matrix=found.matrix * np.outer(size, size)))
 
 
 def _classical(solution: Solution) -> Covariance:
@@ -280,22 +242,16 @@ def _classical(solution: Solution) -> Covariance:
     )  # fmt: skip
 
 
-def _scaled(found: Covariance, size: Array) -> Covariance:
-    """From parameters in typical sizes to their own units."""
-    return replace(found, matrix=found.matrix * np.outer(size, size))
-
-
 def _profiled(solution: Solution, classical: Covariance) -> Intervals:
     fit = solution.fit
     ends = []
     for k, c in enumerate(fit.columns.tolist()):
-        parameter, bounds = solution.problem.model.parameters[c], (-np.inf, np.inf)
-        if solution.problem.bounded:
-            bounds = (parameter.lower, parameter.upper)
-        found = profile_interval(
-            profile_of(fit.problem, fit, c), float(fit.x[c]), float(classical.std[k]),
-            float(classical.dof[k]), LEVEL, *bounds,
+        p, bounded = solution.problem.model.parameters[c], solution.problem.bounded
+        ends.append(
+            profile_interval(
+                profile_of(fit.problem, fit, c), float(fit.x[c]), float(classical.std[k]),
+                float(classical.dof[k]), LEVEL, *((p.lower, p.upper) if bounded else ()),
+            )
         )  # fmt: skip
-        ends.append((found.lower, found.upper))
     text = "profile of the nonlinear sum of squares (all readings independent)"
     return Intervals(replace(classical, kind="profile", description=text), np.array(ends))

