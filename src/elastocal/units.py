@@ -50,6 +50,11 @@ _BRACKETED = re.compile(r"[\[(]([^\[\]()]++)[\])]$")
 _TAILED = re.compile(r"(?:[_/,.]|(?<!\s) )\s*+([A-Za-zµμ°]+)$")
 
 
+def microns(metres: float | None) -> float | None:
+    """Metres as µm for JSON, which has no infinity: None where there is no number."""
+    return None if metres is None or not math.isfinite(metres) else metres * 1e6
+
+
 def rotation_from_rpy(rpy: Sequence[float] | Array) -> Array:
     """Rz(yaw) Ry(pitch) Rx(roll), (3, 3), of angles in rad: the URDF's convention."""
     (cr, cp, cy), (sr, sp, sy) = np.cos(rpy), np.sin(rpy)

@@ -14,9 +14,10 @@ from support.cells import random_poses
 from elastocal.cell.arm_description import CartesianNoise, Tracker
 from elastocal.diagnosis import diagnosis as diagnosis_result
 from elastocal.identification import findings as module
-from elastocal.identification.findings import judged, warning_sentences
+from elastocal.identification.findings import judged
 from elastocal.identification.identify import identify
 from elastocal.identification.noise_summary import LackOfFit
+from elastocal.identification.sentences import warning_sentences
 from elastocal.model.manipulator import Model
 
 SIGMA = 5e-5

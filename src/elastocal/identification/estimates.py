@@ -10,7 +10,7 @@ from scipy import linalg
 
 from elastocal.identification.covariance import variance_of
 from elastocal.identification.faulty_readings import report_faulty
-from elastocal.identification.findings import judged, of_solution, warning_sentences
+from elastocal.identification.findings import judged, of_solution
 from elastocal.identification.methods import MethodResult, is_exact
 from elastocal.identification.noise_summary import noise_of, noise_parts
 from elastocal.identification.outliers import Outlier
@@ -28,6 +28,7 @@ from elastocal.identification.residuals import (
 )
 from elastocal.identification.result import Calibration, Combination, Estimate
 from elastocal.identification.scrutiny import MOST_NUMBERS
+from elastocal.identification.sentences import warning_sentences
 from elastocal.identification.solve import Solution, bent, residual_sigma
 from elastocal.measurements import ranked
 from elastocal.model.arm import Parameter
@@ -61,7 +62,10 @@ def summarise(
     observed = solution.problem.observations
     set_apart = len(observed.lead) < len(every.problem.observations.lead)
     covariance = found.intervals.covariance.matrix
-    apart = faulty if set_apart else ()
+    report = None
+    if not is_exact(every):
+        fitted = found.solution if set_apart or found.smooth else sound
+        report = report_faulty(every, fitted, found.noise, found.good, found.standard)
     result = Calibration(
         model=model,
         method=found.method,
@@ -83,18 +87,10 @@ def summarise(
         converged=final.converged,
         reason=final.reason,
         outliers=() if set_apart else faulty,
-        excluded=apart,
+        excluded=faulty if set_apart else (),
         warnings=(),
         residual_summary=_residual_summary(solution, found.leverage),
-        faulty_report=None
-        if is_exact(every)
-        else report_faulty(
-            every,
-            found.solution if set_apart or found.smooth else sound,
-            found.noise,
-            found.good,
-            found.standard,
-        ),
+        faulty_report=report,
         active=found.active,
         prior_share=found.prior_share,
         smooth=found.smooth,
@@ -102,24 +98,30 @@ def summarise(
         copies=copies,
         weights=solution.problem.weights,
         noise_parts=noise_parts(found),
+        shown=_shown(solution, covariance, found.leverage),
     )
-    result = replace(result, shown=_shown(solution, covariance, found.leverage))
+    return _judged(
+        result, found, new_poses or over_the_workspace(model.cell, model, observed.table)
+    )
+
+
+def _judged(result: Calibration, found: MethodResult, poses: NewPoses) -> Calibration:
+    """The result with the error expected at those poses, findings and warnings."""
+    solution = found.solution
     predicted = predicted_error(
-        result.arm, observed, result.excess, result.spread,
-        new_poses or over_the_workspace(model.cell, model, observed.table),
-        np.random.default_rng(0), _unchecked(result, solution),
+        result.arm, result.observations, result.excess, result.spread, poses,
+        np.random.default_rng(0), _unchecked(result),
     )  # fmt: skip
     result = replace(result, predicted=predicted)
     result = judged(result, of_solution(result, solution))
-    told = tuple(f"The robot's file: {note}." for note in model.chain.notes)
+    told = tuple(f"The robot's file: {note}." for note in result.model.chain.notes)
     return replace(result, warnings=(*found.warnings, *warning_sentences(result), *told))
 
 
-def _unchecked(result: Calibration, solution: Solution) -> Array | None:
+def _unchecked(result: Calibration) -> Array | None:
     """What single configurations alone hold (`told_by_one`); None where it is not to be had."""
-    observed, kept = result.observations, solution.reduction.kept
+    observed, kept, weights = result.observations, result.columns, result.weights
     lone = ~np.isfinite(result.held_out)
-    weights = solution.problem.weights
     if not lone.any():
         return np.zeros((len(kept), len(kept)))
     usual = not (

@@ -1,33 +1,29 @@
-"""What a result is worth: the error budget, judgements with their numbers, what to do next."""
+"""What a result is worth: each judgement with its numbers, its threshold and what to do."""
 
 from __future__ import annotations
 
 import math
-from collections.abc import Iterable, Iterator
+from collections.abc import Iterator
 from dataclasses import replace
-from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 from scipy import linalg, special
 
 from elastocal.errors import option
-from elastocal.identification.assumptions import assumption_findings
 from elastocal.identification.far_values import STATED_BY_FILE, far_values, only_placed
+from elastocal.identification.mistakes import CELL, KILOGRAMS, load_ratio
 from elastocal.identification.noise_structure import JOINTS, TIME
-from elastocal.identification.outliers import Outlier, blocks
+from elastocal.identification.noise_summary import Drift, NoiseSize
 from elastocal.identification.residuals import ResidualSummary
 from elastocal.identification.result import Calibration, Estimate, Finding, Number, Severity
 from elastocal.identification.solve import Solution
 from elastocal.identification.tails import kept_of
 from elastocal.measurements import firsts, numbered
 from elastocal.model.effects.catalogue import effect_of
-from elastocal.text import gathered, listed
+from elastocal.text import listed
 
-# What a result is worth, judged once: each finding with its numbers, its threshold and a remedy.
-#
-# Terminal, page, notebook and JSON print these findings and judge nothing of their own.  A
-# threshold stands here or nowhere.
+# Judged once: terminal, page, notebook and JSON print these findings and judge nothing of their
+# own.  A threshold stands here or nowhere.
 
 STATED = (0.005, 0.995)  # quantiles of χ² between which the residual agrees with the stated noise
 # Beside a stated variance of more than twice what the residual shows, an effect as large as all of
@@ -90,14 +86,19 @@ def judged(result: Calibration, of_solution: tuple[Finding, ...] | None = None) 
         of_solution = tuple(f for f in result.findings if f.kind in OF_SOLUTION)
     noise = (*_against_stated_noise(result), *_repeats(result))
     explained = _explained(result, {f.kind for f in noise})
+    visits = tuple(_visits(result))
     found = [
         *_spoilt(result),
         *far_values(result, explained, _lacking(result)),
-        *assumption_findings(result, explained),
+        *_copies(result),
+        *_load_unit(result),
+        *_hardly_shown(result),
+        *(f for f in visits if f.kind == "scatter_not_counted"),
+        *_alike_in_time(result, explained),
         *_few_poses(result),
         *(f for f in of_solution if f.kind == "ill_conditioned"),
         *noise,
-        *_visits(result),
+        *(f for f in visits if f.kind != "scatter_not_counted"),
         *_prediction(result, explained),
         *_new_poses(result, explained),
         *(f for f in of_solution if f.kind != "ill_conditioned"),
@@ -150,6 +151,79 @@ def _explained(result: Calibration, told: set[str]) -> bool:
     n, held = len(result.observations.value), result.heldout_rms
     expected = result.residual_rms * n / max(result.dof, 1)
     return agrees and "lack_of_fit" not in told and held <= FLATTERS * expected
+
+
+# What an identification takes for granted.
+
+
+def _copies(result: Calibration) -> Iterator[Finding]:
+    if result.copies:
+        n = len(result.copies)
+        yield Finding(
+            "copied_readings", "note",
+            {"copies": n, "fitted": len(result.observations.lead), "lines": result.copies},
+            "Find out how lines came to be in the table twice; readings that were rounded until "
+            "they agree should be given with all their digits.",
+        )  # fmt: skip
+
+
+def _load_unit(result: Calibration) -> Iterator[Finding]:
+    """Are all compliances about as much too large as kilograms for newtons make them, or too small?
+
+    Without a load there is no unit of one.  On the scale of the logarithm the ratio has to lie
+    nearer to that factor than to one.  By the links' weights alone, a rule of thumb, it is worth a
+    look, and no more.
+    """
+    if not result.observations.table.force.any():
+        return
+    known = {e.name: e.value for e in result.ordinary if e.value is not None}
+    found = load_ratio(result.model, known)
+    if found is None:
+        return
+    ratio, by = found
+    nearer = abs(abs(math.log(ratio)) - math.log(KILOGRAMS)) < math.log(KILOGRAMS) / 2
+    if not nearer:
+        return
+    unit = "kilograms" if ratio > 1 else "newtons times 9.81"
+    yield Finding(
+        "load_unit", "care" if by == CELL else "note", {"ratio": ratio, "by": by, "unit": unit},
+        f"Check the unit of the loads: the compliances are {ratio:.2g} times what {by} let expect, "
+        f"as where forces in N hold {unit}.",
+    )  # fmt: skip
+
+
+def _hardly_shown(result: Calibration) -> Iterator[Finding]:
+    names = tuple(e.name for e in result.ordinary if e.limits is not None)
+    if names:
+        yield Finding(
+            "hardly_shown", "note", {"parameters": names},
+            "Measure poses and loads that strain what the readings hardly show (elastocal design "
+            "plans them), or give it a prior.",
+        )  # fmt: skip
+
+
+def _alike_in_time(result: Calibration, explained: bool) -> Iterator[Finding]:
+    """Residuals of visits that follow each other, by a permutation test.
+
+    Where the noise explains the residual, what they share is a small part of it, for which the
+    error at new poses has room.
+    """
+    found = result.autocorrelation
+    if found is None or found.p >= SCATTERS:
+        return
+    counted = result.noise.drift is not None
+    yield Finding(
+        "autocorrelated", "note" if counted or explained else "care",
+        {
+            "lag1": found.correlations[0], "p": found.p, "visits": found.visits, "by": found.by,
+            "counted": "yes" if counted else "no",
+        },
+        ""
+        if counted
+        else "Visit poses and loads in random order and return to a reference pose every ten "
+        "poses: residuals of visits that follow each other are alike, as where something drifts, "
+        "or where the model lacks what neighbouring poses have in common.",
+    )  # fmt: skip
 
 
 def _few_poses(result: Calibration) -> Iterator[Finding]:
@@ -266,36 +340,49 @@ def _repeats(result: Calibration) -> Iterator[Finding]:
 
 def _visits(result: Calibration) -> Iterator[Finding]:
     """Joints that settle anew at each visit, and a drift: what a test of false-alarm rate SCATTERS
-    finds, and the noise model has."""
+    finds, whether the noise model has it or not."""
     noise, sizes = result.noise, result.noise.sizes or ()
-    p = {test.part: test.p for test in noise.tests}
-    joints = [s for s in sizes if s.of_joints and s.sigma]
-    if joints and p.get(JOINTS, 1.0) < SCATTERS:
-        yield Finding(
-            "joint_scatter", "note",
-            {
-                "of": tuple(s.name for s in joints), "p": p[JOINTS],
-                "sigma_urad": tuple(_um(s.sigma) for s in joints if s.sigma is not None),
-            },
-            "Measure more poses, not more repeats, and approach each from the same side: the "
-            "joints settle anew at every visit. State it as [noise] joints_urad in the cell for "
-            "design and simulate.",
-        )  # fmt: skip
-    drifts = [s for s in sizes if s.drift and s.sigma]
-    if noise.drift is not None and drifts and p.get(TIME, 1.0) < SCATTERS:
-        seconds = noise.drift.seconds
+    for test in noise.tests:
+        if test.p >= SCATTERS or test.part not in (JOINTS, TIME):
+            continue
+        joints = [s for s in sizes if s.of_joints and s.sigma]
+        if test.part == JOINTS and joints:
+            yield Finding(
+                "joint_scatter", "note",
+                {
+                    "of": tuple(s.name for s in joints), "p": test.p,
+                    "sigma_urad": tuple(_um(s.sigma or 0.0) for s in joints),
+                },
+                "Measure more poses, not more repeats, and approach each from the same side: the "
+                "joints settle anew at every visit. State it as [noise] joints_urad in the cell "
+                "for design and simulate.",
+            )  # fmt: skip
+        elif test.part == TIME and noise.drift is not None:
+            yield from _drift(noise.drift, [s for s in sizes if s.drift and s.sigma], test.p)
+        else:
+            yield Finding(
+                "scatter_not_counted", "care",
+                {"part": "joints" if test.part == JOINTS else "time", "p": test.p},
+                "Ask what the model lacks (elastocal diagnose): residuals change from visit to "
+                "visit or in time, and noise that does so does not predict poses better.",
+            )  # fmt: skip
+
+
+def _drift(drift: Drift, sizes: list[NoiseSize], p: float) -> Iterator[Finding]:
+    if sizes:
+        timed = drift.seconds is not None
         yield Finding(
             "drift", "care",
             {
-                "sigma_um": _um(drifts[0].sigma or 0.0), "p": p[TIME],
-                "lasting_s": seconds, "lasting_share": noise.drift.share,
-                "by": "times" if seconds is not None else "order of the rows",
+                "sigma_um": _um(sizes[0].sigma or 0.0), "p": p,
+                "lasting_s": drift.seconds, "lasting_share": drift.share,
+                "by": "times" if timed else "order of the rows",
             },
             "Measure poses and loads in random order, return to a reference pose every ten poses, "
-            + ("" if seconds is not None else "record times, ")
+            + ("" if timed else "record times, ")
             + "and let arm and tracker warm up. State it as [noise] drift_um in the cell for "
             "design and simulate."
-            + ("" if noise.drift.ends else WANDERS),
+            + ("" if drift.ends else WANDERS),
         )  # fmt: skip
 
 
@@ -373,11 +460,7 @@ def spare_equations(result: Calibration) -> int:
     seen = code[firsts(marked, int(marked.max()) + 1)]
     size = 1 if observed.kind == "distance" else observed.size
     told = np.minimum(size * np.bincount(seen), 6)
-    return int(told.sum()) - int(np.sum(~result.model.shrunk[_columns(result)]))
-
-
-def _columns(result: Calibration) -> NDArray[np.bool_]:
-    return np.isin(result.model.names, result.determined)
+    return int(told.sum()) - int(np.sum(~result.model.shrunk[result.columns]))
 
 
 def _faulty(result: Calibration) -> Iterator[Finding]:
@@ -553,170 +636,3 @@ def _bounds(result: Calibration, solution: Solution) -> Iterator[Finding]:
                 "Check load direction and torque signs, measure poses that load it more, or fit "
                 "with bounds.",
             )  # fmt: skip
-
-
-# Sentences.
-
-# What a warning says of a finding: its numbers and its remedy by name.
-SENTENCES = {
-    "copied_readings": (
-        "{copies} readings repeat others to the last digit (lines {lines}) and were excluded: "
-        "copies add no information and make intervals too narrow. {remedy}"
-    ),
-    "load_unit": "{remedy}",
-    "scatter_not_counted": "{remedy}",
-    "not_converged": "The fit did not converge: {reason}. {remedy}",
-    "few_degrees_of_freedom": (
-        "Only {dof} degrees of freedom for {parameters} determined parameters: intervals are wide "
-        "and the residual is too small. {remedy}"
-    ),
-    "not_held_out": (
-        "Some configuration alone determines a parameter, so there is no held-out error for "
-        "it. Measure more configurations."
-    ),
-    "ill_conditioned": (
-        "Ill-conditioned (condition number {condition_number:.1e} after scaling): the data barely "
-        "separate {parameters}. {remedy}"
-    ),
-    "residual_above_stated_noise": (
-        "The residual is {ratio:.1f} times the stated noise: an effect is missing or the stated "
-        "noise is too small. Intervals use the residual, not the stated noise. Look for missing "
-        "effects (diagnose)."
-    ),
-    "lack_of_fit": (
-        "Configurations scatter more than their repeats (lack of fit: F = {F:.2f} on {dof_between} "
-        "and {dof_pure} degrees of freedom, p = {p:.1g}): the arm does not return to the same "
-        "place, or an effect is missing. The intervals assume independent readings and are too "
-        "narrow: use the default method, whose noise model has this scatter, or intervals by cr2; "
-        "measure more configurations rather than more repeats."
-    ),
-    "drift": (
-        "Base or tracker drift during the session ({sigma_um:.3g} µm in each direction, by the "
-        "{by}; p = {p:.1g}). Weights and intervals account for it, and whole blocks in time are "
-        "held out. {remedy}"
-    ),
-    "joint_scatter": (
-        "The joints settle anew at every visit of the arm (standard deviation {sigma_urad} µrad; "
-        "p = {p:.1g}). Weights and intervals account for it. {remedy}"
-    ),
-    "at_bound": (
-        "{parameter} stands at its bound {bound:g} {unit}; it is held there and has no interval. "
-        "{remedy}"
-    ),
-    "beyond_bound": (
-        "{parameter} = {value:.3g} ± {std:.2g} {unit} lies beyond its physical bound {bound:g}: "
-        "{remedy}"
-    ),
-    "many_faulty_readings": (
-        "Too many for reading errors: a shifted block of readings, or a missing effect in some "
-        "load state, marker or region. {remedy}"
-    ),
-}
-# The same of several parameters, whose names are told together.
-OF_SEVERAL = {
-    "at_bound": "{named} stand at their bound {bound:g} {unit}; they are held there and have no "
-    "interval. {remedy}",
-    "beyond_bound": "{named} lie beyond their physical bound {bound:g} {unit} ({values}): {remedy}",
-}
-
-
-class Told(str):
-    """A sentence that knows the `kind` of the finding it tells; in JSON a text as any other."""
-
-    kind: str
-
-    def __new__(cls, text: str, kind: str = "") -> Told:
-        told = super().__new__(cls, text)
-        told.kind = kind
-        return told
-
-
-def warning_sentences(result: Calibration) -> tuple[Told, ...]:
-    """The findings that call for attention as sentences that name the remedy; of those that are
-    alike one sentence."""
-    told: list[Told] = []
-    alike: dict[tuple[Any, ...], list[Finding]] = {}
-    for f in result.findings:
-        if f.kind in OF_SEVERAL:
-            alike.setdefault((f.kind, f.numbers["bound"], f.numbers["unit"]), []).append(f)
-    for f in result.findings:
-        same = alike.get((f.kind, f.numbers.get("bound"), f.numbers.get("unit")), [])
-        if len(same) > 1:
-            if f is same[0]:
-                told.append(Told(_of_several(same), f.kind))
-        elif f.kind == "faulty_readings":
-            told += [Told(text, f.kind) for text in _faulty_readings(result)]
-        elif f.kind in SENTENCES and f.numbers.get("counted_by", "nothing") == "nothing":
-            words = {k: ", ".join(map(_word, v)) if isinstance(v, tuple) else v
-                     for k, v in f.numbers.items()}  # fmt: skip
-            if f.kind == "copied_readings":
-                words["lines"] = _runs(result.copies)
-            within = f.kind == "beyond_bound"  # there the remedy ends a sentence
-            remedy = f.remedy[:1].lower() + f.remedy[1:] if within else f.remedy
-            told.append(Told(SENTENCES[f.kind].format(**words, remedy=remedy), f.kind))
-    return tuple(told)
-
-
-def _of_several(same: list[Finding]) -> str:
-    first, remedy = same[0].numbers, same[0].remedy
-    if "std" in first:
-        remedy = remedy[:1].lower() + remedy[1:]
-    values = [f"{f.numbers.get('value', 0):.3g} ± {f.numbers.get('std', 0):.2g}" for f in same]
-    named = gathered(str(f.numbers["parameter"]) for f in same)
-    words = first | {"remedy": remedy, "named": named, "values": listed(values, 4)}
-    return OF_SEVERAL[same[0].kind].format(**words)
-
-
-def _word(value: float | str) -> str:
-    return value if isinstance(value, str) else f"{value:.3g}"
-
-
-def _faulty_readings(result: Calibration) -> list[str]:
-    found = []
-    if result.outliers:
-        found.append(
-            f"{_count(result.outliers, 'lies', 'lie')} beyond what the noise explains "
-            f"({_lines(result.outliers)}); they are in the fit. Check them; "
-            f"{option('outliers', 'drop')} excludes them."
-        )
-    if result.excluded:
-        found.append(
-            f"{_count(result.excluded, 'was', 'were')} excluded as outliers "
-            f"({_lines(result.excluded)}). They are mistakes, or signs of a missing effect. All "
-            f"are listed in the result under 'excluded'; {option('outliers', 'keep')} keeps them."
-        )
-    return found
-
-
-def _lines(readings: tuple[Outlier, ...]) -> str:
-    return f"lines {_runs(o.line for o in readings)}"
-
-
-def _runs(lines: Iterable[int]) -> str:
-    """ "142–507, 610 …": runs of lines, the first eight."""
-    runs = blocks(list(lines))
-    shown = ", ".join(str(a) if a == b else f"{a}–{b}" for a, b in runs[:8])
-    return f"{shown}{' …' if len(runs) > 8 else ''}"
-
-
-def _count(readings: tuple[Outlier, ...], one: str, many: str) -> str:
-    n = len(readings)
-    return f"1 reading {one}" if n == 1 else f"{n} readings {many}"
-
-
-# Of these the warning, or the line on the prior, says what to do.
-TOLD_ELSEWHERE = (
-    "not_converged", "few_degrees_of_freedom", "ill_conditioned", "at_bound", "beyond_bound",
-    "many_faulty_readings", "mostly_prior", "drift", "joint_scatter", "copied_readings",
-    "load_unit", "scatter_not_counted",
-)  # fmt: skip
-
-
-def next_steps(result: Calibration) -> list[Finding]:
-    """Findings whose remedy is still to be told, each remedy once."""
-    steps = {f.remedy: f for f in reversed(result.findings) if f.kind not in TOLD_ELSEWHERE}
-    # One that begins with another says that too.
-    whole = {r for r in steps if r and not any(s != r and s.startswith(r) for s in steps)}
-    order = [f for f in result.findings if f.remedy in whole and steps[f.remedy] is f]
-    trust = [f for f in order if f.kind == "trust"]
-    return [f for f in order if f.kind != "trust"] + trust

@@ -187,8 +187,7 @@ def _test_errors(model: Model, result: Calibration, table: Measurements) -> Test
     errors = TestErrors(rms, float(length.mean()), float(length.max()), len(length), errors=length)
     if result.shown is None:
         return errors
-    columns = np.array([model.names.index(name) for name in result.determined], dtype=np.int64)
-    B = model.regressor(table, result.x, columns, observed).B
+    B = model.regressor(table, result.x, result.columns, observed).B
     here = uncertainty_of(observed, B, result.covariance)
     far = int((here > result.shown.most).sum())
     return replace(

@@ -25,7 +25,7 @@ from elastocal.identification.weighted_problem import (
 )
 from elastocal.measurements import Measurements
 from elastocal.model.observations import Observations, pure_error
-from elastocal.units import Array
+from elastocal.units import Array, microns
 
 # Lack of fit: do configurations scatter more than repeats of one configuration?
 
@@ -98,7 +98,7 @@ class NoiseSize:
 
     def to_json(self) -> dict[str, Any]:
         unit = "sigma_urad" if self.of_joints and not self.name.endswith(SLIDES) else "sigma_um"
-        size: dict[str, Any] = {"name": self.name, unit: _um(self.sigma)}
+        size: dict[str, Any] = {"name": self.name, unit: microns(self.sigma)}
         return size if self.factor is None else size | {"factor": self.factor}
 
 
@@ -154,6 +154,16 @@ class Noise:
         """Whether the noise model has a deviation common to the readings of a configuration."""
         return SHARED in self.kind
 
+    def scatter(self, n_joints: int) -> tuple[Array, float]:
+        """What a visit scatters by: joints (joints,) in rad or m, and m on each axis in common."""
+        joints, common = np.zeros(n_joints), 0.0
+        for size in self.sizes or ():
+            if size.of_joints:
+                joints[list(size.joints)] = size.sigma
+            elif size.shared and size.sigma is not None:
+                common = float(np.hypot(common, size.sigma))
+        return joints, common
+
     @property
     def held_out_by(self) -> str:
         """What is left out at a time to judge predictions: whole blocks in time where something
@@ -171,7 +181,7 @@ class Noise:
         content: dict[str, Any] = {
             "kind": self.kind,
             "description": self.description,
-            "sigma_um": _um(self.sigma),
+            "sigma_um": microns(self.sigma),
             "ratio_to_stated": self.ratio_to_stated,
             "lack_of_fit": None if self.lack_of_fit is None else asdict(self.lack_of_fit),
             "held_out_by": self.held_out_by,
@@ -193,10 +203,6 @@ class Noise:
                 for t in self.tried
             ]
         return content
-
-
-def _um(metres: float | None) -> float | None:
-    return None if metres is None else metres * 1e6
 
 
 def noise_of(found: MethodResult, sigma: float) -> Noise:

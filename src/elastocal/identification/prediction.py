@@ -38,7 +38,7 @@ from elastocal.model.calibrated_tool import CalibratedTool
 from elastocal.model.chain import finite_ranges, joint_index, joint_limits
 from elastocal.model.manipulator import Model
 from elastocal.model.observations import Observations, observe
-from elastocal.units import Array, IntArray
+from elastocal.units import Array, IntArray, microns
 
 # What the identification knows of where the tool will be, and what it does not.
 
@@ -280,18 +280,19 @@ def half_axes(covariance: Array, level: float = 0.95) -> Array:
 
 
 def position_at(
-    tool: CalibratedTool, table: Measurements, q: Array, scatter: Scatter, spread: Covariance
+    tool: CalibratedTool, table: Measurements, noise: Noise, spread: Covariance
 ) -> Position:
-    """The tool's position at joints q (n, joints) in the circumstances of the table (n,); `spread`
-    is the covariance of what was determined.
+    """The tool's position at the joints and in the circumstances of the table (n,); `spread` is the
+    covariance of what was determined.
 
     NaN where there is no static equilibrium.
     """
-    rows = tool.rows(table)
+    rows, q = tool.rows(table), table.q
+    joints, common = noise.scatter(q.shape[1])
     found = uncertainty_at(tool, rows, q, rows)
     place = tool.poses(rows, q)[0]
     J = tool.errors(rows, q, place, None)[1]
-    visit = (J * scatter.joints**2) @ J.transpose(0, 2, 1) + scatter.common**2 * np.eye(3)
+    visit = (J * joints**2) @ J.transpose(0, 2, 1) + common**2 * np.eye(3)
     arm = tool.calibrated
     moved = np.zeros((len(q), 0, len(arm.determined)))
     if spread.among:
@@ -300,28 +301,9 @@ def position_at(
     return Position(place, found.total, visit, *spread.tails(moved))
 
 
-@dataclass(frozen=True)
-class Scatter:
-    """What a visit scatters by: `joints` (joints,) in rad or m, `common` in m on each axis."""
-
-    joints: Array
-    common: float
-
-
-def scatter_of(noise: Noise, n_joints: int) -> Scatter:
-    """What the noise model says of a visit's scatter; zero where it has none."""
-    joints, common = np.zeros(n_joints), 0.0
-    for size in noise.sizes or ():
-        if size.of_joints:
-            joints[list(size.joints)] = size.sigma
-        elif size.shared and size.sigma is not None:
-            common = float(np.hypot(common, size.sigma))
-    return Scatter(joints, common)
-
-
 # The error to be expected at poses that nobody measured.
 
-MOST_LOADS = 100  # kept with a result
+MOST_LOADS, MOST_VISITS = 100, 400  # kept with a result
 POSES = 256  # drawn over the joint limits where nobody says where the arm will work
 DRAWS = 2000
 FEWEST_REPEATS = 10  # degrees of freedom within repeats from which on they tell the noise
@@ -363,20 +345,19 @@ def _loads(force: Array, observe: str) -> Array:
 
 def measured_loads(observed: Observations) -> Array:
     """The forces (L, 3) N of the readings, at most MOST_LOADS of them, evenly chosen."""
-    forces = _loads(observed.table.force, observed.kind)
-    chosen = np.linspace(0, len(forces) - 1, min(len(forces), MOST_LOADS)).round().astype(int)
-    return np.asarray(forces[chosen])
+    return _evenly(_loads(observed.table.force, observed.kind), MOST_LOADS)
 
 
-MOST_VISITS = 400  # kept with a result
+def _evenly(rows: Array, most: int) -> Array:
+    chosen = np.linspace(0, len(rows) - 1, min(len(rows), most)).round().astype(int)
+    return np.asarray(rows[chosen])
 
 
 def measured_visits(observed: Observations) -> MeasuredVisits:
     """Joints and force of the readings, each pair once, at most MOST_VISITS, evenly chosen."""
     rows = np.hstack([observed.table.q, observed.table.force])[observed.lead]
     first = np.sort(np.unique(rows.round(9), axis=0, return_index=True)[1])
-    chosen = np.linspace(0, len(first) - 1, min(len(first), MOST_VISITS)).round().astype(int)
-    rows = rows[first[chosen]]
+    rows = _evenly(rows[first], MOST_VISITS)
     return MeasuredVisits(rows[:, :-3], rows[:, -3:])
 
 
@@ -409,8 +390,8 @@ class PredictedError:
         return {
             "rms": self.rms * 1e6, "ci95": [low * 1e6, high * 1e6],
             "parameters": self.parameters * 1e6, "open_parameters": self.open * 1e6,
-            "lack_of_fit": None if self.lacking is None else self.lacking * 1e6,
-            "unchecked": self.unchecked * 1e6 if np.isfinite(self.unchecked) else None,
+            "lack_of_fit": microns(self.lacking),
+            "unchecked": microns(self.unchecked),
             "blamed": list(self.blamed), "poses": self.poses, "source": self.source,
         }  # fmt: skip
 

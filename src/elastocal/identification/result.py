@@ -30,7 +30,6 @@ from elastocal.identification.prediction import (
     measured_visits,
     over_the_workspace,
     position_at,
-    scatter_of,
 )
 from elastocal.identification.residuals import ResidualSummary
 from elastocal.identification.scrutiny import MOST_NUMBERS
@@ -46,7 +45,7 @@ from elastocal.model.calibrated import (
 from elastocal.model.calibrated_tool import CalibratedTool, tool_point
 from elastocal.model.manipulator import Model
 from elastocal.model.observations import COMPONENTS, Observations
-from elastocal.units import Array
+from elastocal.units import Array, IntArray, microns
 
 SCHEMA = "elastocal/identification/1"
 FEW_POSES = 64  # of those over the workspace, for an rms
@@ -119,6 +118,13 @@ class Combination:
             text += f" {'-' if factor < 0 else '+'} {size}{deviation(name, self.held.get(name))}"
         return text
 
+    def to_json(self) -> dict[str, Any]:
+        return {
+            "terms": self.terms, "held": {name: self.held.get(name, 0.0) for name in self.terms},
+            "expression": self.expression, "unit": self.unit, "value": self.value,
+            "std": _finite(self.std), "ci95": [_finite(v) for v in self.ci95],
+        }  # fmt: skip
+
 
 def deviation(name: str, held: float | None, digits: int = 6) -> str:
     """A parameter as its deviation from where it is held: "(link1.rz - 0.001)"; plain from 0."""
@@ -152,9 +158,9 @@ class TestErrors:
     def to_json(self) -> dict[str, float | None]:
         known = math.isfinite(self.std)
         return {
-            "rms_um": _um(self.rms), "mean_um": _um(self.mean), "max_um": _um(self.maximum),
-            "n": self.n, "predicted_std_um": _um(self.std) if known else None,
-            "fitted_std_um": _um(self.most_fitted) if known else None,
+            "rms_um": microns(self.rms), "mean_um": microns(self.mean),
+            "max_um": microns(self.maximum), "n": self.n, "predicted_std_um": microns(self.std),
+            "fitted_std_um": microns(self.most_fitted),
             "far": self.far if known else None, "p_far": self.p_far if known else None,
         }  # fmt: skip
 
@@ -304,6 +310,8 @@ class Calibration(Result):
     outliers: tuple[Outlier, ...]
     excluded: tuple[Outlier, ...]
     warnings: tuple[str, ...]
+    weights: Weights
+    noise_parts: dict[str, float]
     test: TestErrors | None = None
     residual_summary: ResidualSummary | None = None
     faulty_report: OutlierReport | None = None
@@ -314,8 +322,6 @@ class Calibration(Result):
     left: OpenParameters | None = None
     predicted: PredictedError | None = None
     copies: tuple[int, ...] = ()
-    weights: Weights | None = field(default=None, compare=False)
-    noise_parts: dict[str, float] = field(default_factory=dict)
     shown: ShownPoses | None = None
 
     @property
@@ -329,7 +335,7 @@ class Calibration(Result):
         a cell whose plans and simulations have it."""
         drift = next((s.sigma for s in self.noise.sizes or () if s.drift), None) or 0.0
         lasting = None if self.noise.drift is None else self.noise.drift.seconds
-        joints = scatter_of(self.noise, self.model.chain.n_joints).joints
+        joints, _ = self.noise.scatter(self.model.chain.n_joints)
         if not joints.any():
             joints = np.zeros(1)
         own = next((s.sigma for s in self.noise.sizes or () if s.of_configuration), None) or 0.0
@@ -460,31 +466,28 @@ class Calibration(Result):
             f"{functions}{held}>"
         )
 
-    @property
+    @cached_property
+    def columns(self) -> IntArray:
+        """Indices (determined,) of the parameters `determined` among the model's."""
+        index = {name: i for i, name in enumerate(self.model.names)}
+        return np.array([index[name] for name in self.determined], dtype=np.int64)
+
+    @cached_property
     def B(self) -> Array:
         """B (rows, parameters) of the readings at the values found, in m (rad) per unit."""
         observed = self.observations
         return self.model.regressor(observed.table, self.x, observations=observed).B
 
-    @cached_property
-    def _looked(self) -> scrutiny.Looked | None:
-        """The fit for a second look; None for a table too large to do it in passing, for an exact
-        fit, which leaves nothing to look at, and for one that priors or bounds hold as well: what
-        a configuration decides there is not said by B alone."""
-        if (
-            self.weights is None
-            or self.prior_share
-            or self.smooth
-            or self.active
-            or not self.residual.any()
-            or len(self.residual) * len(self.estimates) > MOST_NUMBERS
-        ):
-            return None
-        columns = np.array([self.model.names.index(name) for name in self.determined])
-        return scrutiny.Looked(
-            self.model, self.observations, self.weights, self.x, self.B, columns.astype(np.int64),
-            self.residual, self.dof,
-        )  # fmt: skip
+    @property
+    def _by_readings_alone(self) -> bool:
+        """Whether a second look says anything: not of a table too large to do it in passing, of an
+        exact fit, which leaves nothing to look at, or of one that priors or bounds hold as well:
+        what a configuration decides there is not said by B alone."""
+        return (
+            not (self.prior_share or self.smooth or self.active)
+            and bool(self.residual.any())
+            and len(self.residual) * len(self.estimates) <= MOST_NUMBERS
+        )
 
     def influence(self) -> tuple[scrutiny.Influence, ...]:
         """Leverage and influence of every configuration, in the table's order; empty for tables
@@ -496,18 +499,16 @@ class Calibration(Result):
             >>> strongest.configuration, strongest.leverage, strongest.moved
             ('...', 1..., 'joint...')
         """
-        return () if self._looked is None else scrutiny.influence(self._looked)
+        return scrutiny.influence(self) if self._by_readings_alone else ()
 
     def parameter_sets(self) -> tuple[scrutiny.ParameterSet, ...]:
         """Sets of parameters side by side: held-out errors and restricted likelihoods."""
-        return () if self._looked is None else scrutiny.parameter_sets(self._looked)
+        return scrutiny.parameter_sets(self) if self._by_readings_alone else ()
 
     def uncertainty(self, table: Measurements | None = None) -> scrutiny.UncertaintyBudget | None:
         """What a predicted reading's error is made of, at the poses and loads of a `table` or those
         fitted; None for tables too large to look again."""
-        if self._looked is None:
-            return None
-        return scrutiny.uncertainty_budget(self._looked, self.arm, self.noise_parts, table)
+        return scrutiny.uncertainty_budget(self, table) if self._by_readings_alone else None
 
     @cached_property
     def autocorrelation(self) -> scrutiny.Autocorrelation | None:
@@ -582,9 +583,7 @@ class Calibration(Result):
         """
         model = self.model
         tool = CalibratedTool(self.arm, tool_point(model.cell, point))
-        table = model.table(q, load)
-        scatter = scatter_of(self.noise, model.chain.n_joints)
-        return position_at(tool, table, table.q, scatter, self.spread)
+        return position_at(tool, model.table(q, load), self.noise, self.spread)
 
     def predict(self, q: ArrayLike, load: ArrayLike | None = None) -> Array:
         """Where the tool is at any pose, (n, 3) in m: `position` without its uncertainty."""
@@ -640,57 +639,29 @@ class Calibration(Result):
 
     def to_json(self) -> dict[str, Any]:
         """The result as a JSON-ready dictionary (DESIGN: identify → JSON)."""
+        chain, observed = self.model.chain, self.observations
         return {
             "schema": SCHEMA,
-            "robot": self.model.chain.name,
-            "joints": [joint.name for joint in self.model.chain.joints],
-            "nominal_flange": nominal_flange_rows(self.model.chain),
+            "robot": chain.name,
+            "joints": [joint.name for joint in chain.joints],
+            "nominal_flange": nominal_flange_rows(chain),
             "cell": self.model.cell.name,
-            "data": self.observations.table.source,
+            "data": observed.table.source,
             "method": self.method,
             "parameters": [_estimate_json(e) for e in self.estimates],
-            "combinations": [
-                {"terms": c.terms, "held": {name: c.held.get(name, 0.0) for name in c.terms},
-                 "expression": c.expression, "unit": c.unit,
-                 "value": c.value, "std": _finite(c.std), "ci95": [_finite(v) for v in c.ci95]}
-                for c in self.combinations
-            ],
+            "combinations": [c.to_json() for c in self.combinations],
             "covariance": self.covariance.tolist(),
             "covariance_of": list(self.determined),
             "correlations": [list(c) for c in self.correlations],
-            "loads_N": measured_loads(self.observations).tolist(),
+            "loads_N": measured_loads(observed).tolist(),
             "n_rows": len(self.residual),
-            "n_readings": len(self.observations.lead),
+            "n_readings": len(observed.lead),
             "dof": self.dof,
-            "residual_rms_um": _um(self.residual_rms),
-            "heldout_rms_um": _um(self.heldout_rms),
-            "heldout_kept_rms_um": _um(self.heldout_rms),
-            "heldout_all_rms_um": _um(self.heldout_all_rms),
-            "nominal_rms_um": _um(self.nominal_rms),
-            "test": None if self.test is None else self.test.to_json(),
-            "test_rms_um": None if self.test is None else _um(self.test.rms),
-            "test_mean_um": None if self.test is None else _um(self.test.mean),
-            "test_max_um": None if self.test is None else _um(self.test.maximum),
-            "verdict": self.verdict.to_json()
-            | {"sentence": headline(self) if self.findings else None},
-            "predicted_new_poses_um": None if self.predicted is None else self.predicted.to_json(),
-            "measured_visits": measured_visits(self.observations).to_json(),
-            "load_point_um": None
-            if self.load_point_error is None
-            else _um(self.load_point_error),
-            "measured_poses": None if self.shown is None else self.shown.to_json(),
-            "open": None if self.left is None else self.left.to_json(),
-            "noise": self.noise.to_json(),
-            "tails": None,
-            "cell_noise": {
-                "joints_urad": (1e6 * self.unsteadiness.joints).tolist(),
-                "drift_um": _um(self.unsteadiness.drift), "lasting_s": self.unsteadiness.lasting,
-                "configuration_um": _um(self.unsteadiness.configuration),
-                "tails": None,
-            },
-            "residual_summary": (
-                None if self.residual_summary is None else self.residual_summary.to_json()
-            ),
+            **self._errors_json(),
+            "measured_visits": measured_visits(observed).to_json(),
+            "measured_poses": _json(self.shown),
+            "open": _json(self.left),
+            **self._noise_json(),
             "active": [
                 {"label": a.label, "kind": a.kind, "parameters": list(a.names),
                  "value": a.value, "multiplier": a.multiplier}
@@ -698,27 +669,54 @@ class Calibration(Result):
             ],
             "prior_share": self.prior_share,
             "smooth": [entry for part in self.smooth for entry in part.to_json()],
-            "faulty_report": (
-                None if self.faulty_report is None else self.faulty_report.to_json()
-            ),
+            "faulty_report": _json(self.faulty_report),
             "converged": self.converged,
             "backend": self.model.backend_report(),
             "outliers": [vars(o) for o in self.outliers],
             "excluded": [vars(o) for o in self.excluded],
             "copies": list(self.copies),
-            **self._second_look(),
+            "influence": [c.to_json() for c in self.influence()],
+            "parameter_sets": [s.to_json() for s in self.parameter_sets()],
+            "autocorrelation": _json(self.autocorrelation),
+            "uncertainty": _json(self.uncertainty()),
             "warnings": list(self.warnings),
             "findings": [f.to_json() for f in self.findings],
         }  # fmt: skip
 
-    def _second_look(self) -> dict[str, Any]:
-        budget, course = self.uncertainty(), self.autocorrelation
+    def _errors_json(self) -> dict[str, Any]:
+        test = self.test
         return {
-            "influence": [c.to_json() for c in self.influence()],
-            "parameter_sets": [s.to_json() for s in self.parameter_sets()],
-            "autocorrelation": None if course is None else course.to_json(),
-            "uncertainty": None if budget is None else budget.to_json(),
+            "residual_rms_um": microns(self.residual_rms),
+            "heldout_rms_um": microns(self.heldout_rms),
+            "heldout_kept_rms_um": microns(self.heldout_rms),
+            "heldout_all_rms_um": microns(self.heldout_all_rms),
+            "nominal_rms_um": microns(self.nominal_rms),
+            "test": _json(test),
+            "test_rms_um": None if test is None else microns(test.rms),
+            "test_mean_um": None if test is None else microns(test.mean),
+            "test_max_um": None if test is None else microns(test.maximum),
+            "verdict": self.verdict.to_json()
+            | {"sentence": headline(self) if self.findings else None},
+            "predicted_new_poses_um": _json(self.predicted),
+            "load_point_um": microns(self.load_point_error),
         }
+
+    def _noise_json(self) -> dict[str, Any]:
+        off = self.unsteadiness
+        return {
+            "noise": self.noise.to_json(),
+            "tails": None,
+            "cell_noise": {
+                "joints_urad": (1e6 * off.joints).tolist(), "drift_um": microns(off.drift),
+                "lasting_s": off.lasting, "configuration_um": microns(off.configuration),
+                "tails": None,
+            },
+            "residual_summary": _json(self.residual_summary),
+        }  # fmt: skip
+
+
+def _json(part: Any) -> dict[str, Any] | None:
+    return None if part is None else part.to_json()
 
 
 def _estimate_json(e: Estimate) -> dict[str, Any]:
@@ -744,8 +742,3 @@ def _endless(ci95: tuple[float, float] | None) -> str:
 def _finite(value: float) -> float | None:
     """None for an interval without an end, and for the infinite dof of a normal distribution."""
     return value if np.isfinite(value) else None
-
-
-def _um(value: float) -> float | None:
-    """Metres to µm; None where there is no number (JSON has no infinity)."""
-    return value * 1e6 if np.isfinite(value) else None

@@ -8,7 +8,7 @@ from the fit's B, its weights and its residual; nothing is fitted anew.
 from __future__ import annotations
 
 from dataclasses import asdict, dataclass
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 from scipy import linalg, special
@@ -17,34 +17,15 @@ from elastocal.engine.sizes import Standardised
 from elastocal.identification.linear_solver import least_norm
 from elastocal.identification.prediction import mean_squares
 from elastocal.identification.residuals import ALONE, held_out_residual, rms_3d
-from elastocal.identification.weighted_problem import Weights
 from elastocal.measurements import Measurements
-from elastocal.model.calibrated import CalibratedArm
 from elastocal.model.effects.catalogue import CATALOGUE
-from elastocal.model.manipulator import Model
 from elastocal.model.observations import Observations
-from elastocal.units import Array, BoolArray, IntArray
+from elastocal.units import Array, BoolArray, microns
+
+if TYPE_CHECKING:
+    from elastocal.identification.result import Calibration
 
 MOST_NUMBERS = 10_000_000  # of a B that is looked at in passing
-
-
-@dataclass(frozen=True)
-class Looked:
-    """The fit as it ended: B (rows, parameters) of all parameters, which of them were fitted
-    (`columns`, by index), residual (rows,), weights."""
-
-    model: Model
-    observations: Observations
-    weights: Weights
-    x: Array
-    B: Array
-    columns: IntArray
-    residual: Array
-    dof: int
-
-    @property
-    def fitted(self) -> Array:
-        return self.B[:, self.columns]
 
 
 # Leverage and influence.
@@ -79,11 +60,11 @@ class Influence:
         }
 
 
-def influence(fit: Looked) -> tuple[Influence, ...]:
+def influence(fit: Calibration) -> tuple[Influence, ...]:
     """Leverage and influence of every configuration, in the order of the table."""
-    observed, weights, B = fit.observations, fit.weights, fit.fitted
-    p = B.shape[1]
-    rows, e = weights.beside_common(B, fit.residual)  # what all share is fitted along
+    observed, p = fit.observations, len(fit.determined)
+    # What all readings share is fitted along.
+    rows, e = fit.weights.beside_common(fit.B[:, fit.columns], fit.residual)
     Q, R = linalg.qr(rows, mode="economic")
     e = e - Q @ (Q.T @ e)
     s2 = float(e @ e) / max(fit.dof, 1)
@@ -98,21 +79,16 @@ def influence(fit: Looked) -> tuple[Influence, ...]:
         Qc = Q[mine]
         gap = np.eye(len(mine)) - Qc @ Qc.T
         name = observed.table.configuration_labels[int(c)]
-        count, leverage = len(mine) // observed.size, float((Qc**2).sum())
         if np.linalg.eigvalsh(gap)[0] < ALONE:
-            k = int(np.argmax(np.abs(back @ Qc.T).max(axis=1) / std))
-            found.append(Influence(name, count, leverage, np.inf, _name(fit, k), np.inf))
-            continue
-        move = back @ (Qc.T @ np.linalg.solve(gap, e[mine]))
-        shift = np.divide(np.abs(move), std, out=np.zeros(p), where=std > 0)
-        k = int(np.argmax(shift))
-        cook = float(move @ information @ move) / (p * s2) if s2 > 0 else 0.0
-        found.append(Influence(name, count, leverage, cook, _name(fit, k), float(shift[k])))
+            k, by, cook = int(np.argmax(np.abs(back @ Qc.T).max(axis=1) / std)), np.inf, np.inf
+        else:
+            move = back @ (Qc.T @ np.linalg.solve(gap, e[mine]))
+            shift = np.divide(np.abs(move), std, out=np.zeros(p), where=std > 0)
+            k, by = int(np.argmax(shift)), float(shift.max())
+            cook = float(move @ information @ move) / (p * s2) if s2 > 0 else 0.0
+        count, leverage = len(mine) // observed.size, float((Qc**2).sum())
+        found.append(Influence(name, count, leverage, cook, fit.determined[k], by))
     return tuple(found)
-
-
-def _name(fit: Looked, k: int) -> str:
-    return str(fit.model.names[fit.columns[k]])
 
 
 # Residuals from visit to visit.
@@ -220,17 +196,13 @@ class ParameterSet:
     log_likelihood: float
 
     def to_json(self) -> dict[str, Any]:
-        um = {k: _um(getattr(self, k)) for k in ("residual_rms", "heldout_rms")}
         return {
             "set": self.name, "parameters": self.parameters,
-            **{f"{k}_um": v for k, v in um.items()},
-            "heldout_over_chosen_um": _um(self.heldout_over_chosen),
-            "ci95_um": [_um(v) for v in self.ci95], "log_likelihood": self.log_likelihood,
+            "residual_rms_um": microns(self.residual_rms),
+            "heldout_rms_um": microns(self.heldout_rms),
+            "heldout_over_chosen_um": microns(self.heldout_over_chosen),
+            "ci95_um": [microns(v) for v in self.ci95], "log_likelihood": self.log_likelihood,
         }  # fmt: skip
-
-
-def _um(metres: float) -> float | None:
-    return metres * 1e6 if np.isfinite(metres) else None
 
 
 CHOSEN = "chosen"
@@ -238,7 +210,7 @@ STRUCTURAL = 1e-7  # share of a column's length off the span of others, below wh
 RESAMPLED = 1000
 
 
-def parameter_sets(fit: Looked) -> tuple[ParameterSet, ...]:
+def parameter_sets(fit: Calibration) -> tuple[ParameterSet, ...]:
     """Base and markers alone, with geometry, with compliance, with what was chosen, and with all
     that is told apart at all; those that are the same as another once."""
     model, free = fit.model, ~fit.model.shrunk
@@ -270,9 +242,7 @@ def parameter_sets(fit: Looked) -> tuple[ParameterSet, ...]:
         # Whole rows count by the fit's weights, whatever the set.
         left = y - fit.B[:, chosen] @ least_norm(white[:, chosen], target)
         plain.append(rms_3d(left, size))
-        own = held_out_residual(
-            fit.B[:, chosen], left, weights, observed.configuration, observed.size
-        )
+        own = held_out_residual(fit.B[:, chosen], left, weights, observed.configuration, size)
         held.append((own.reshape(-1, size)[:, :3] ** 2).sum(axis=1))
     likelihood = [
         _restricted(white, target, chosen & (stage == 0), chosen & (stage > 0), typical, s2)
@@ -297,7 +267,7 @@ def parameter_sets(fit: Looked) -> tuple[ParameterSet, ...]:
     return tuple(found)
 
 
-def _independent(fit: Looked, fitted: BoolArray, free: BoolArray) -> BoolArray:
+def _independent(fit: Calibration, fitted: BoolArray, free: BoolArray) -> BoolArray:
     """The fitted parameters and, beside them, those whose columns lie in no span of others."""
     white = fit.weights.apply(fit.B)
     length = np.linalg.norm(white, axis=0)
@@ -366,21 +336,16 @@ class UncertaintyBudget:
 
     def to_json(self) -> dict[str, Any]:
         told = self.parts | {"total": self.total}
-        return {"at": self.at, **{f"{k}_um": _um(v) for k, v in told.items()}}
+        return {"at": self.at, **{f"{k}_um": microns(v) for k, v in told.items()}}
 
 
-def uncertainty_budget(
-    fit: Looked, arm: CalibratedArm, parts: dict[str, float], table: Measurements | None = None
-) -> UncertaintyBudget:
-    """The budget at the poses and loads of a `table`, by default those fitted.
-
-    `parts`: mean squares (m²) of the noise, "readings" and "visits".
-    """
-    B, at = fit.B, "the poses fitted"
+def uncertainty_budget(fit: Calibration, table: Measurements | None = None) -> UncertaintyBudget:
+    """The budget at the poses and loads of a `table`, by default those fitted."""
+    arm, B, at = fit.arm, fit.B, "the poses fitted"
     if table is not None:
         B, at = fit.model.regressor(table, fit.x).B, table.source
     own, left = mean_squares(arm, B, fit.observations.size)
-    visits, readings = parts.get("visits", 0.0), parts.get("readings", 0.0)
+    visits, readings = (fit.noise_parts.get(part, 0.0) for part in ("visits", "readings"))
     lack = min(max(arm.lacking**2 - visits, 0.0), readings)
     parameters, open_, shared, single, beyond = np.sqrt(
         [own, left, visits, readings - lack, lack]

@@ -8,8 +8,8 @@ from dataclasses import dataclass
 
 from elastocal.errors import option
 from elastocal.identification.far_values import only_placed
-from elastocal.identification.findings import next_steps
 from elastocal.identification.result import Calibration, Finding
+from elastocal.identification.sentences import next_steps
 from elastocal.report.blocks import Tone
 from elastocal.report.formatting import counted, display, estimate, length, significant
 from elastocal.text import listed, printable
