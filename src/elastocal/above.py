@@ -12,6 +12,8 @@ from importlib import import_module
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
+from elastocal.errors import InputError, option
+
 if TYPE_CHECKING:
     import pandas as pd
 
@@ -143,7 +145,7 @@ def effects(cell: Any = None) -> pd.DataFrame:
     """The physical effects that can be fitted.
 
     Args:
-        cell: The cell, or its file, whose arm decides on places and sizes; None takes the KR 270
+        cell: The cell, its file or model, whose arm decides on places and sizes; None takes the KR 270
             of the demo.
 
     Returns:
@@ -161,4 +163,8 @@ def effects(cell: Any = None) -> pd.DataFrame:
     import pandas as pd
 
     given = Path(__file__).parent / "demo" / "cell.toml" if cell is None else cell
+    given = getattr(given, "cell", given)
+    if not isinstance(given, str | Path) and type(given).__name__ != "Cell":
+        found = type(cell).__name__
+        raise InputError(f"{option('cell')} takes a Cell or the path of a cell file; found {found}")
     return pd.DataFrame(import_module(NAMES).effect_entries(given))

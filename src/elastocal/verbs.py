@@ -290,10 +290,14 @@ def _design_of(cell: Cell, asked: Mapping[str, Any]) -> Any:
 
 def _wish(record: Any, key: str, value: Any) -> Any:
     """A value as a record of the cell takes it.  Raises InputError that names the option."""
+    from elastocal.cell.file_keys import fields_of
+
     try:
         return getattr(record(**{key: value}), key)
     except InputError as error:
         told = str(error).replace(f"{record.__name__}: {key}", option(key), 1)
+        for known in fields_of(record)[key]:
+            told = told.replace(f"key design.{known.name}", option(key))
         raise InputError(told) from None
 
 

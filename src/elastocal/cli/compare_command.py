@@ -20,7 +20,10 @@ def compare(
     new: Annotated[
         Path | None, typer.Argument(help="Result of identify (JSON), the later one.")
     ] = None,
-    cell_of_old: Annotated[Path | None, typer.Option("--cell", hidden=True)] = None,
+    cell_of_old: Annotated[
+        Path | None,
+        typer.Option("--cell", hidden=True, help="Cell file of both, in the old order OLD NEW."),
+    ] = None,
     output: JsonFile = None,
     report: ReportFile = None,
     load: Annotated[

@@ -142,7 +142,7 @@ def _offered(
     for name in names:
         kinds, default = kinds_of(signature[name].annotation), signature[name].default
         taken = next(kind for known, kind in TAKEN.items() if known in kinds)
-        metavar, help = None, told[name]
+        metavar, help = None, told.get(name, "")  # none by python -OO
         if name in texts:
             taken, default, metavar = str, None, texts[name][0]
         elif taken == list[str]:
