@@ -145,8 +145,8 @@ def effects(cell: Any = None) -> pd.DataFrame:
     """The physical effects that can be fitted.
 
     Args:
-        cell: The cell, its file or model, whose arm decides on places and sizes; None takes the KR 270
-            of the demo.
+        cell: The cell, its file or model, whose arm decides on places and sizes; None takes the
+            KR 270 of the demo.
 
     Returns:
         A row per effect: name, stage, whether the cell has it `on`, what it is, its places, the
