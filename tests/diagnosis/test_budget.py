@@ -40,7 +40,7 @@ def test_a_drift_is_judged_on_hours_that_were_left_out() -> None:
     chosen = fit_set(dataset, (Item(h, np.array([1200.0]), 0.0),))
     drift = left_out_together(dataset, chosen)
     assert drift is not None and len(np.unique(drift)) == 10
-    (still,) = (h for h in dataset.hypotheses if h.label == "encoder_scale at joint3")
+    (still,) = (h for h in dataset.hypotheses if h.label == "encoder_scale:joint3")
     assert left_out_together(dataset, fit_set(dataset, (Item(still, np.zeros(0), 0.0),))) is None
 
 

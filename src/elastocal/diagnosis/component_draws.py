@@ -34,11 +34,14 @@ from elastocal.diagnosis.components import (
     precision_of_sizes,
     presence_cost,
 )
+from elastocal.diagnosis.evidence import at_scales
 from elastocal.diagnosis.model_set import spans_of
 from elastocal.diagnosis.noise_floor import Weighted
+from elastocal.engine.sizes import beside
 from elastocal.units import Array, IntArray
 
 GRID = np.linspace(GONE, LARGEST, 41)  # logarithms of sizes
+SIZES = np.exp(GRID)
 SPREADS = np.linspace(0.1, 0.9, 9) * SPREAD  # what sizes of a kind may spread by
 SETTLING = 30  # sweeps
 
@@ -110,7 +113,8 @@ def drawn(
         if sweep < 0 and scatter is None:
             continue
         beta = np.zeros(len(prior))
-        A, i = _beside(S, sized)
+        i = np.flatnonzero(sized < np.inf)
+        A = S[np.ix_(i, i)] + np.diag(sized[i])
         apart = np.linalg.solve(np.linalg.cholesky(A).T, rng.normal(size=len(i)))
         beta[c[i]] = np.linalg.solve(A, t[i]) + apart
         rest = z - across @ beta[c] + rng.normal(size=len(x))
@@ -243,33 +247,17 @@ def _log_density(logs: Array, spread: float) -> float:
     return 0.5 * float(log_det - logs @ precision_of_sizes(k, spread) @ logs) if k else 0.0
 
 
-def _beside(S: Array, sized: Array) -> tuple[Array, IntArray]:
-    """The normal matrix with its prior of what has a size, and its columns."""
-    i = np.flatnonzero(sized < np.inf)
-    A = S[np.ix_(i, i)]
-    A[np.diag_indices_from(A)] += sized[i]
-    return A, i
-
-
 def _at_sizes(S: Array, t: Array, sized: Array, span: slice) -> Array:
     """Log evidence of the columns `span` at every size of the GRID, over none, beside all others
     that have one."""
-    others = sized.copy()
-    others[span] = np.inf
-    A, i = _beside(S, others)
-    solved = np.linalg.solve(A, np.column_stack([S[i, span], t[i]]))
-    left = np.column_stack([S[span, span], t[span]]) - S[span][:, i] @ solved
-    if len(left) > 1:
-        values, vectors = np.linalg.eigh(left[:, :-1])
-        values, b = np.maximum(values, 0.0), vectors.T @ left[:, -1]
-    else:
-        values, b = np.maximum(left[0, :1], 0.0), left[0, 1:]
-    return _on_grid(values, b)
+    others = np.flatnonzero(sized < np.inf)
+    others = others[(others < span.start) | (others >= span.stop)]
+    ((A, b),) = beside(S, t, sized, others, [span])
+    values, vectors = np.linalg.eigh(A)
+    return _on_grid(np.maximum(values, 0.0), vectors.T @ b)
 
 
 def _on_grid(a: Array, b: Array) -> Array:
-    """Σ ½ s²b²/(1 + s²a) − ½ log(1 + s²a) at every size s of the GRID: the log evidence, over none,
-    of coefficients that do not hang together, with a and b (k,) their normal matrix' diagonal and
-    their right side."""
-    v = np.exp(2 * GRID)[:, None]
-    return np.asarray(0.5 * (v * b**2 / (1 + v * a) - np.log1p(v * a)).sum(axis=1))
+    """The log evidence, over none, at every size of the GRID of coefficients that do not hang
+    together, with a and b (k,) their normal matrix' diagonal and their right side."""
+    return at_scales(a[None], b[None, None], SIZES)[0, :, 0]

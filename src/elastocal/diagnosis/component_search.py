@@ -2,13 +2,12 @@
 
 from __future__ import annotations
 
-from collections import Counter, defaultdict
+from collections import Counter
 from collections.abc import Container, Mapping, Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property
 
 import numpy as np
-from scipy import linalg
 from scipy.special import expit
 
 from elastocal.diagnosis.baseline import from_centre, prior_deviations
@@ -39,7 +38,7 @@ from elastocal.diagnosis.components import (
 )
 from elastocal.diagnosis.diagnosis_data import DiagnosisData
 from elastocal.diagnosis.effect_search import about
-from elastocal.diagnosis.evidence import ANOTHER, log_prior_odds, spectrum
+from elastocal.diagnosis.evidence import ANOTHER, evidence_of_groups, log_prior_odds
 from elastocal.diagnosis.hypotheses import Hypothesis, judged_together
 from elastocal.diagnosis.line_orders import families_of, order_posterior, ripples
 from elastocal.diagnosis.model_set import Item, ModelSet, extended, packed_columns, spans_of
@@ -50,11 +49,12 @@ from elastocal.diagnosis.noise_floor import (
     project,
 )
 from elastocal.engine.mixed import ROUNDING
+from elastocal.engine.sizes import beside
 from elastocal.model.effects.base import index
 from elastocal.model.effects.gears import GearRipple, GearSpectrum
 from elastocal.model.effects.gravity_sag import GravitySag, LinkWeights
 from elastocal.model.effects.smooth import JointCurve, ResidualField
-from elastocal.units import Array, IntArray, Progress
+from elastocal.units import Array, Progress
 
 # Nats by which a sum must be more probable than what the forward search found; and those that its
 # components must promise before one is looked for, since beside each other, their sizes and the
@@ -352,12 +352,9 @@ def hidden_fellows(found: FittedSum, components: Sequence[Component]) -> tuple[C
         c for c in components if c.effect.name in here and c.fellows > 1 and id(c) not in taken
     ]
     sizes = [np.full((1, c.width), np.exp(size_of_fellows(found, c))) for c in hidden]
-    beside = Beside(found, [c.columns for c in hidden])
-    each = beside.evidence(slice(0, 0), beside.spans, np.ones(1), sizes)
-    odds = [
-        evidence + log_odds(found.components, c) for evidence, c in zip(each, hidden, strict=True)
-    ]
-    return tuple(c for c, own in zip(hidden, odds, strict=True) if expit(own) > CHANCE)
+    each = evidence_beside(found, hidden, np.ones(1), sizes)
+    pairs = zip(each, hidden, strict=True)
+    return tuple(c for e, c in pairs if expit(e + log_odds(found.components, c)) > CHANCE)
 
 
 def size_of_fellows(found: FittedSum, c: Component) -> float:
@@ -471,45 +468,9 @@ class Beside:
     ) -> list[float]:  # fmt: skip
         """Of each of the columns `tried`, over none, beside all of the sum but those that are
         `gone`; times its `scalings` (L, k) where given, at the best of these."""
-        x = np.r_[0 : gone.start, gone.stop : len(self.prior)]
-        half = _half(self.M, self.z, self.prior, x, np.r_[(slice(0, 0), *tried)])
-        blocks, start = [], 0
-        for span in tried:
-            own = half[:, start : start + span.stop - span.start]
-            blocks.append((self.M[span, span] - own.T @ own, self.z[span] - own.T @ half[:, -1]))
-            start += own.shape[1]
-        return _evidence_of(blocks, scales, scalings)
-
-
-def _half(M: Array, z: Array, prior: Array, x: IntArray, c: IntArray) -> Array:
-    """L⁻¹ (M_xc, z_x) (x, c + 1), LLᵀ = M_xx + Λ.
-
-    With M the normal matrix of all columns, those of the others (x) integrated out,
-    A = M_cc − M_cx (M_xx + Λ)⁻¹ M_xc, and b the same of z.
-    """
-    L = M[np.ix_(x, x)]
-    L[np.diag_indices_from(L)] += prior[x]
-    L = linalg.cholesky(L, lower=True, overwrite_a=True, check_finite=False)
-    right = np.column_stack([M[np.ix_(x, c)], z[x]])
-    return np.asarray(linalg.solve_triangular(L, right, lower=True, check_finite=False))
-
-
-def _evidence_of(
-    blocks: Sequence[tuple[Array, Array]], scales: Array, scalings: Sequence[Array] | None
-) -> list[float]:
-    """Log evidence of each group of columns by its A (k, k) and b (k,), times its `scalings`
-    (L, k) where given, at the best of these."""
-    # Those of one width at once: hundreds of tiny decompositions cost a call each.
-    of_width = defaultdict[int, list[tuple[int, Array, Array]]](list)
-    for n, (A, b) in enumerate(blocks):
-        for d in np.ones((1, len(b))) if scalings is None else scalings[n]:
-            of_width[len(b)].append((n, A * d * d[:, None], b * d))
-    best = np.full(len(blocks), -np.inf)
-    for k, same in of_width.items():
-        of, A, b = (np.array(each) for each in zip(*same, strict=True))
-        found = spectrum(A, b, np.zeros((0, len(b), k)))
-        np.maximum.at(best, of, found.evidence(scales))
-    return best.tolist()
+        others = np.r_[0 : gone.start, gone.stop : len(self.prior)]
+        groups = beside(self.M, self.z, self.prior, others, tried)
+        return evidence_of_groups(groups, scales, scalings)
 
 
 def promised(chosen: ModelSet, components: Sequence[Component]) -> float:
@@ -523,13 +484,11 @@ def promised(chosen: ModelSet, components: Sequence[Component]) -> float:
     sums, p = posed(data, others, chosen.noise), len(data.precision)
     M, z = sums.weighted.M, sums.weighted.z
     prior = data.precision + ROUNDING * np.diag(M)[:p]
-    half = _half(M, z, prior, np.arange(p), np.arange(p, len(M)))
-    A = M[p:, p:] - half[:, :-1].T @ half[:, :-1]
-    b = z[p:] - half[:, :-1].T @ half[:, -1]
+    ((A, b),) = beside(M, z, prior, np.arange(p), [slice(p, len(M))])
     total, left = 0.0, list(zip(spans_of([c.width for c in others], len(b)), others, strict=True))
     while left:
         blocks = [(A[span, span], b[span]) for span, _ in left]
-        each = _evidence_of(blocks, WIDE, [c.scalings for _, c in left])
+        each = evidence_of_groups(blocks, WIDE, [c.scalings for _, c in left])
         if (best := max(each)) <= 0:
             break
         total += best
@@ -539,10 +498,15 @@ def promised(chosen: ModelSet, components: Sequence[Component]) -> float:
     return total
 
 
-def evidence_beside(found: FittedSum, components: Sequence[Component]) -> list[float]:
-    """Log evidence of each component beside the sum, of a smooth one at its best length."""
-    beside = Beside(found, [c.columns for c in components])
-    return beside.evidence(slice(0, 0), beside.spans, scalings=[c.scalings for c in components])
+def evidence_beside(
+    found: FittedSum, components: Sequence[Component], scales: Array = WIDE,
+    scalings: Sequence[Array] | None = None,
+) -> list[float]:  # fmt: skip
+    """Log evidence of each component beside the sum, of a smooth one at its best length; or times
+    its `scalings`."""
+    known = Beside(found, [c.columns for c in components])
+    scalings = scalings or [c.scalings for c in components]
+    return known.evidence(slice(0, 0), known.spans, scales, scalings)
 
 
 class Rivals:

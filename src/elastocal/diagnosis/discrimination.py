@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, fields, replace
-from itertools import chain, islice, pairwise, permutations
+from itertools import chain, islice, permutations
 from typing import Any
 
 import numpy as np
@@ -16,7 +16,7 @@ from elastocal.diagnosis.diagnosis import Diagnosis, RivalPair
 from elastocal.diagnosis.diagnosis_data import DiagnosisData, diagnosis_data_of
 from elastocal.diagnosis.evidence import evidence_of
 from elastocal.diagnosis.hypotheses import Hypothesis
-from elastocal.diagnosis.model_set import PLAUSIBLE, packed_columns
+from elastocal.diagnosis.model_set import PLAUSIBLE, packed_columns, spans_of
 from elastocal.diagnosis.noise_floor import NoiseValues, covariance
 from elastocal.diagnosis.rivals import (
     RivalSet,
@@ -218,61 +218,6 @@ def campaign_of(
     return Campaign(dataset.without(dataset.data.faulty | hidden), measured, noise)
 
 
-@dataclass(frozen=True)
-class WhitenedRows:
-    """Whitened rows of one set of rivals.
-
-    `gram` (w, w) = Wᵀ V⁻¹ W of the data so far, with the nuisance's prior precision; `pool`
-    (N, m, w) = V^−½ W of each candidate; `response` (w,) = Wᵀ V⁻¹ r.  Columns W: the `nuisance`
-    first ones are those of the fitted parameters and of the effects beside the rivals.  Counted
-    from there come each rival's own, at `groups`, and at `alternatives` those with which it may
-    imitate others instead: at other settings or about other starts, each by itself.
-    """
-
-    gram: Array
-    pool: Array
-    response: Array
-    nuisance: int
-    groups: tuple[slice, ...]
-    alternatives: tuple[tuple[slice, ...], ...]
-
-
-def rows_of(campaign: Campaign, rivals: RivalSet) -> WhitenedRows:
-    """Whiten the columns of the rivals by V = covariance of each configuration."""
-    dataset, data = campaign.dataset, campaign.dataset.data
-    searched = alternatives(campaign.so_far, campaign.noise, rivals)
-    # What is beside counts by the widest size of its prior.
-    beside = [
-        data.masked(packed_columns(dataset, item)) * float(item.scales.max())
-        for item in rivals.beside
-    ]
-    others = [
-        [*(packed_columns(dataset, i) for i in items), *columns_of_starts(dataset, rival)]
-        for rival, items in zip(rivals.rivals, searched, strict=True)
-    ]
-    own = [packed_columns(dataset, rival) for rival in rivals.rivals]
-    own = [data.masked(C) for C in [*own, *chain.from_iterable(others)]]
-    nuisance = data.X.shape[2] + sum(C.shape[2] for C in beside)
-    ends = np.cumsum([0, *(C.shape[2] for C in own)])
-    spans = [slice(int(a), int(b)) for a, b in pairwise(ends)]
-    W = np.concatenate(
-        [data.masked(data.X), *beside, *own, data.masked(data.r)[:, :, None]], axis=2
-    )
-    white = np.linalg.solve(np.linalg.cholesky(covariance(data, campaign.noise)), W)
-    so_far = white[: campaign.measured].reshape(-1, W.shape[2])
-    gram = so_far.T @ so_far
-    fitted = data.X.shape[2]
-    gram[:fitted, :fitted] += np.diag(data.precision)
-    gram[fitted:nuisance, fitted:nuisance] += np.eye(nuisance - fitted)
-    n = len(rivals.rivals)
-    rest = iter(spans[n:])
-    by = [tuple(islice(rest, len(each))) or (spans[b],) for b, each in enumerate(others)]
-    return WhitenedRows(
-        gram[:-1, :-1], white[campaign.measured :, :, :-1], gram[:-1, -1], nuisance,
-        tuple(spans[:n]), tuple(by),
-    )  # fmt: skip
-
-
 def eliminated(gram: Array, nuisance: int) -> tuple[Array, Array]:
     """Schur complement of the nuisance in gram (w, w), and its inverse Gram (p, p)."""
     factor = linalg.cho_factor(gram[:nuisance, :nuisance])
@@ -303,27 +248,59 @@ DRAWS = 32  # of each sign
 class Discrimination:
     """One set of rivals to be told apart, with everything that judges a choice of candidates.
 
-    `draws`: γ (draws, k) of each rival; `before` (rivals, rivals, draws) d² in the data so far;
-    `classes` (rivals,): those with the same number are not asked to be told apart.
+    With whitened columns W, `known` (w, w) is WᵀV⁻¹W of the data so far with the nuisance's prior
+    precision, `pool` (N, m, w) V^−½W of each candidate.  The `nuisance` first columns are those of
+    the fitted parameters and of the effects beside the rivals.  Counted from there come each
+    rival's own, at `groups`, and at `alternatives` those with which it may imitate others instead:
+    at other settings or about other starts, each by itself.  `draws`: γ (draws, k) of each rival;
+    `before` (rivals, rivals, draws) d² in the data so far; `classes` (rivals,): those with the same
+    number are not asked to be told apart.
     """
 
     rivals: RivalSet
-    rows: WhitenedRows
+    known: Array
+    pool: Array
+    nuisance: int
+    groups: tuple[slice, ...]
+    alternatives: tuple[tuple[slice, ...], ...]
     draws: tuple[Array, ...]
     before: Array
     classes: IntArray
 
     @classmethod
-    def of(cls, rivals: RivalSet, rows: WhitenedRows, rng: np.random.Generator) -> Discrimination:
-        draws = _posterior_draws(rivals, rows, rng)
-        n = len(draws)
-        start = cls(rivals, rows, draws, np.zeros((n, n, 2 * DRAWS)), np.arange(n))
-        S = eliminated(rows.gram, rows.nuisance)[0]
-        return replace(start, before=start._squared(S[None])[0])
-
-    def in_classes(self, classes: IntArray) -> Discrimination:
-        """The same judged by telling these classes (rivals,) apart."""
-        return replace(self, classes=classes)
+    def of(cls, campaign: Campaign, rivals: RivalSet, rng: np.random.Generator) -> Discrimination:
+        """Columns of the rivals whitened by V, the covariance of each configuration."""
+        dataset, data = campaign.dataset, campaign.dataset.data
+        searched = alternatives(campaign.so_far, campaign.noise, rivals)
+        # What is beside counts by the widest size of its prior.
+        beside = [
+            packed_columns(dataset, item) * float(item.scales.max()) for item in rivals.beside
+        ]
+        others = [
+            [*(packed_columns(dataset, i) for i in items), *columns_of_starts(dataset, rival)]
+            for rival, items in zip(rivals.rivals, searched, strict=True)
+        ]
+        own = [packed_columns(dataset, rival) for rival in rivals.rivals]
+        own += chain.from_iterable(others)
+        fitted, n = data.X.shape[2], len(rivals.rivals)
+        nuisance = fitted + sum(C.shape[2] for C in beside)
+        W = np.concatenate([data.X, *beside, *own, data.r[:, :, None]], axis=2)
+        L = np.linalg.cholesky(covariance(data, campaign.noise))
+        white = np.linalg.solve(L, data.masked(W))
+        so_far = white[: campaign.measured].reshape(-1, W.shape[2])
+        gram = so_far.T @ so_far
+        gram[np.diag_indices(nuisance)] += np.append(data.precision, np.ones(nuisance - fitted))
+        widths = [C.shape[2] for C in own]
+        spans = spans_of(widths, sum(widths))
+        groups, rest = spans[:n], iter(spans[n:])
+        by = tuple(tuple(islice(rest, len(each))) or (groups[b],) for b, each in enumerate(others))
+        S = eliminated(gram, nuisance)[0]
+        draws = _posterior_draws(rivals, groups, S, rng)
+        start = cls(
+            rivals, gram[:-1, :-1], white[campaign.measured :, :, :-1], nuisance, groups, by,
+            draws, np.zeros((n, n, 2 * DRAWS)), np.arange(n),
+        )  # fmt: skip
+        return replace(start, before=start._squared(S[None, :-1, :-1])[0])
 
     @property
     def open(self) -> bool:
@@ -332,12 +309,12 @@ class Discrimination:
 
     def gram(self, chosen: Sequence[int]) -> Array:
         """Gram matrix (w, w) of the data so far and the chosen candidates."""
-        H = self.rows.pool[list(chosen)].reshape(-1, len(self.rows.gram))
-        return self.rows.gram + H.T @ H
+        H = self.pool[list(chosen)].reshape(-1, len(self.known))
+        return self.known + H.T @ H
 
     def squared(self, gram: Array) -> Array:
         """d² (rivals, rivals, draws) of every ordered pair; zero of a rival with itself."""
-        return self._squared(eliminated(gram, self.rows.nuisance)[0][None])[0]
+        return self._squared(eliminated(gram, self.nuisance)[0][None])[0]
 
     def squared_with_each(self, gram: Array) -> Array:
         """d² (N, rivals, rivals, draws) with each candidate added to the visits behind `gram`.
@@ -345,9 +322,9 @@ class Discrimination:
         A candidate's few rows H = [H_X, H_R] change S by EᵀK⁻¹E with E = H_R − H_X M⁻¹ M_XR and
         K = I + H_X M⁻¹ H_Xᵀ (Woodbury), which spares an elimination for each.
         """
-        p = self.rows.nuisance
+        p = self.nuisance
         S, inverse = eliminated(gram, p)
-        H = self.rows.pool
+        H = self.pool
         through = H[:, :, :p] @ inverse
         E = H[:, :, p:] - through @ gram[:p, p:]
         K = np.eye(H.shape[1]) + through @ H[:, :, :p].transpose(0, 2, 1)
@@ -357,10 +334,10 @@ class Discrimination:
         n = len(self.draws)
         out = np.zeros((len(S), n, n, 2 * DRAWS))
         for a, b in permutations(range(n), 2):
-            of_a, g = self.rows.groups[a], self.draws[a]
+            of_a, g = self.groups[a], self.draws[a]
             size = PLAUSIBLE * self.rivals.rivals[b].scales.max()
             nearest = np.full((len(S), len(g)), np.inf)
-            for of_b in self.rows.alternatives[b]:
+            for of_b in self.alternatives[b]:
                 tie = np.eye(of_b.stop - of_b.start) / size**2
                 taken = np.linalg.solve(S[:, of_b, of_b] + tie, S[:, of_b, of_a])
                 D = S[:, of_a, of_a] - S[:, of_a, of_b] @ taken
@@ -369,7 +346,7 @@ class Discrimination:
         return out
 
     def gained(self, squared: Array) -> Array:
-        """δ² (…, rivals, rivals, draws): what the visits add to the data so far."""
+        """δ² (…, rivals, rivals, draws)."""
         return np.maximum(squared - self.before, 0.0)
 
     def error_bound(self, squared: Array) -> Array:
@@ -417,18 +394,15 @@ class Discrimination:
 
 
 def _posterior_draws(
-    rivals: RivalSet, rows: WhitenedRows, rng: np.random.Generator
+    rivals: RivalSet, groups: Sequence[slice], S: Array, rng: np.random.Generator
 ) -> tuple[Array, ...]:
     """γ (2·DRAWS, k) of each rival as if it were the one at work, antithetic about its estimate.
 
     γ | data ~ N(mean, A⁻¹), A = S_aa + I/s², at the scale s of the size prior that explains the
-    data best.
+    data best; S's last row is that of the readings.
     """
-    S = eliminated(np.block([
-        [rows.gram, rows.response[:, None]], [rows.response, np.zeros(1)],
-    ]), rows.nuisance)[0]  # fmt: skip
     out = []
-    for item, of in zip(rivals.rivals, rows.groups, strict=True):
+    for item, of in zip(rivals.rivals, groups, strict=True):
         lam, U = np.linalg.eigh(S[of, of])
         lam = np.maximum(lam, 0.0)
         beta = U.T @ S[of, -1]
@@ -453,7 +427,7 @@ def discriminations_of(
     sets = list(suspects.sets)
     if suspects.unknown:
         sets.append(suspects.unknown_set(campaign.so_far, campaign.noise))
-    return [Discrimination.of(s, rows_of(campaign, s), np.random.default_rng(seed)) for s in sets]
+    return [Discrimination.of(campaign, s, np.random.default_rng(seed)) for s in sets]
 
 
 def judged(
@@ -463,10 +437,10 @@ def judged(
     with their distance in all of it."""
     out, hopeless = [], {}
     for c in tasks:
-        d = c.distances(c.squared(c.gram(range(len(c.rows.pool)))))
+        d = c.distances(c.squared(c.gram(range(len(c.pool)))))
         near = d < 2 * float(special.ndtri(HOPE))
         classes = connected_components(near, directed=False)[1].astype(np.int64)
-        out.append(c.in_classes(classes))
+        out.append(replace(c, classes=classes))
         names = c.rivals.names
         for a, b in zip(*np.nonzero(np.triu(near, 1)), strict=True):
             hopeless[names[a], names[b]] = float(d[a, b])

@@ -73,7 +73,7 @@ class Spectrum:
     def flipped(self, log_prior: Array, scales: Array = SCALES) -> Array:
         """Log evidence (W, F) of the residuals with flipped signs: of W hypotheses, whose V/W
         groups stand one after the other and are weighed by `log_prior` (W, V/W)."""
-        each = _at_scales(self.lam, self.flips, scales)
+        each = at_scales(self.lam, self.flips, scales)
         each = each.reshape(*log_prior.shape, *each.shape[1:])
         each += (log_prior - np.log(len(scales)))[:, :, None, None]
         top = each.max(axis=(1, 2))
@@ -107,11 +107,11 @@ def exceedance(flipped: Array, observed: float) -> float:
 
 def evidence_of(lam: Array, beta: Array, scales: Array) -> Array:
     """Log evidence (…,) from eigenvalues (V, K) and β (…, V, K); mixed over `scales` (S,)."""
-    each = log_sum(_at_scales(lam, beta.reshape(-1, *lam.shape), scales), axis=1)
+    each = log_sum(at_scales(lam, beta.reshape(-1, *lam.shape), scales), axis=1)
     return np.asarray((each - np.log(len(scales))).T.reshape(beta.shape[:-1]))
 
 
-def _at_scales(lam: Array, beta: Array, scales: Array) -> Array:
+def at_scales(lam: Array, beta: Array, scales: Array) -> Array:
     """Log evidence (V, S, F) at each of the scales, from eigenvalues (V, K) and β (F, V, K)."""
     squared = scales[:, None] ** 2
     shrunk = squared * lam[:, None, :]
@@ -125,6 +125,24 @@ def log_sum(values: Array, axis: int = -1) -> Array:
     """log Σ exp of finite values along an axis."""
     top = values.max(axis=axis, keepdims=True)
     return np.asarray(np.log(np.exp(values - top).sum(axis=axis)) + top.squeeze(axis))
+
+
+def evidence_of_groups(
+    groups: Sequence[tuple[Array, Array]], scales: Array, scalings: Sequence[Array] | None = None
+) -> list[float]:
+    """Log evidence of each group of columns by its A (k, k) and b (k,), times its `scalings`
+    (L, k) where given, at the best of these."""
+    # Those of one width at once: hundreds of tiny decompositions cost a call each.
+    of_width = defaultdict[int, list[tuple[int, Array, Array]]](list)
+    for n, (A, b) in enumerate(groups):
+        for d in np.ones((1, len(b))) if scalings is None else scalings[n]:
+            of_width[len(b)].append((n, A * d * d[:, None], b * d))
+    best = np.full(len(groups), -np.inf)
+    for k, same in of_width.items():
+        of, A, b = (np.array(each) for each in zip(*same, strict=True))
+        found = spectrum(A, b, np.zeros((0, len(b), k)))
+        np.maximum.at(best, of, found.evidence(scales))
+    return best.tolist()
 
 
 def spectrum(A: Array, b: Array, flips: Array) -> Spectrum:

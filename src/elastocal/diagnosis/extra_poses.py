@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Sequence
+from collections.abc import Sequence
 from dataclasses import replace
 from itertools import count, islice
 
@@ -47,13 +47,16 @@ def fewest(tasks: Sequence[Discrimination], most: int, enough: float = ENOUGH) -
     """Candidates, at most `most`, with which the right one is named with a probability of
     `enough`; `most` where fewer do not reach it."""
     chosen: list[int] = []
-    while len(chosen) < min(most, len(tasks[0].rows.pool)):
+    while len(chosen) < min(most, len(tasks[0].pool)):
         chosen.append(_best(tasks, chosen)[0])
         if expected(tasks, chosen) >= enough:
             break
     _exchange(tasks, chosen)
     while len(chosen) > 1 and expected(tasks, chosen) >= enough:
-        fewer = _without_least(tasks, chosen)
+        fewer = min(
+            (chosen[:k] + chosen[k + 1 :] for k in range(len(chosen))),
+            key=lambda left: _error(tasks, left),
+        )
         _exchange(tasks, fewer)
         if expected(tasks, fewer) < enough:
             break
@@ -69,7 +72,7 @@ def expected(tasks: Sequence[Discrimination], chosen: Sequence[int]) -> float:
 
 def expected_of_random(tasks: Sequence[Discrimination], n: int, rng: np.random.Generator) -> float:
     """The same for as many candidates drawn at random: the mean of RANDOM_DRAWS draws."""
-    N = len(tasks[0].rows.pool)
+    N = len(tasks[0].pool)
     picks = [rng.choice(N, size=n, replace=False).tolist() for _ in range(RANDOM_DRAWS)]
     return float(np.mean([expected(tasks, pick) for pick in picks]))
 
@@ -80,12 +83,6 @@ def _best(tasks: Sequence[Discrimination], chosen: Sequence[int]) -> tuple[int, 
     error[list(chosen)] = np.inf
     best = int(np.argmin(error))
     return best, float(error[best])
-
-
-def _without_least(tasks: Sequence[Discrimination], chosen: list[int]) -> list[int]:
-    """All but the one without which the error grows least."""
-    fewer = [chosen[:k] + chosen[k + 1 :] for k in range(len(chosen))]
-    return min(fewer, key=lambda left: _error(tasks, left))
 
 
 def _error(tasks: Sequence[Discrimination], chosen: Sequence[int]) -> float:
@@ -154,18 +151,12 @@ def _tour(pool: VisitPool, chosen: list[int], start: Array) -> list[int]:
 
 
 def inseparable_advice(group: Sequence[str], distance: float, tried: int) -> str:
-    """That no pose separates these rivals, neighbours among which are so far apart at most."""
+    """`distance`: how far apart neighbours among the group are at most."""
     names = " and ".join([", ".join(group[:-1]), group[-1]])
     near = f"they would be {distance:.1f} standard deviations apart"
     if len(group) > 2:
         near = f"each would be within {distance:.1f} standard deviations of another of them"
     return f"no pose separates {names}: measured in all {tried} poses that were tried {near}"
-
-
-def other_means(pairs: Iterable[tuple[str, str]]) -> list[str]:
-    """What else tells the rivals of inseparable pairs apart."""
-    effects = [name.partition(":")[0] for pair in pairs for name in pair]
-    return list(dict.fromkeys(remedy for e in effects if (remedy := effect_of(e).remedy)))
 
 
 def recording_advice(sets: Sequence[RivalSet]) -> list[str]:
@@ -222,8 +213,7 @@ def plan_extra(
     progress("extra poses: drawing candidates")
     try:
         pool = draw_pool(
-            model, base.x, table, sides=suspects.sides_matter, waits=suspects.waiting_matters,
-            most=_room(base), seed=seed,
+            model, base.x, table, **suspects.matters, most=_room(base), seed=seed
         )  # fmt: skip
     except InsufficientDataError as error:
         return _nothing(suspects.sets, suspects, (str(error),))
@@ -243,7 +233,8 @@ def _chosen(
     for group in groups:
         near = max(d for pair, d in hopeless.items() if {*pair} <= {*group})
         notes.append(inseparable_advice(group, near, len(pool)))
-    notes += other_means(hopeless)
+    effects = [name.partition(":")[0] for pair in hopeless for name in pair]
+    notes += dict.fromkeys(remedy for e in effects if (remedy := effect_of(e).remedy))
     covered = suspects.covered
     if covered < MOSTLY:
         notes.append(
@@ -326,7 +317,7 @@ def _pull_notes(
             f"pulley, would separate {apart}: measure poses under it, too"
         )
     if pulled and n:
-        same = [p.in_classes(c.classes) for p, c in zip(pulled, tasks, strict=True)]
+        same = [replace(p, classes=c.classes) for p, c in zip(pulled, tasks, strict=True)]
         chosen = fewest(same, n)
         reached = expected(same, chosen)
         if reached > after + GAIN:

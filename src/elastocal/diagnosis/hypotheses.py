@@ -93,7 +93,7 @@ class Hypothesis:
 
     @property
     def label(self) -> str:
-        return f"{self.name} at {self.where}"
+        return ":".join(self.key)
 
     @property
     def key(self) -> tuple[str, str]:

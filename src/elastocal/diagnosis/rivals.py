@@ -12,7 +12,7 @@ from scipy.special import softmax
 from elastocal.diagnosis.baseline import Baseline
 from elastocal.diagnosis.diagnosis import Diagnosis
 from elastocal.diagnosis.diagnosis_data import DiagnosisData, diagnosis_data_of
-from elastocal.diagnosis.evidence import Grams, direct
+from elastocal.diagnosis.evidence import Grams
 from elastocal.diagnosis.hypotheses import Hypothesis, possible
 from elastocal.diagnosis.model_set import (
     Item,
@@ -23,7 +23,7 @@ from elastocal.diagnosis.model_set import (
     with_items,
 )
 from elastocal.diagnosis.noise_floor import SMALLEST_NOISE, NoiseValues, project
-from elastocal.diagnosis.unknown import UNKNOWN_EFFECT, Generic, generic_blocks
+from elastocal.diagnosis.unknown import UNKNOWN_EFFECT, generic_blocks
 from elastocal.diagnosis.verdict import TOO_NEAR
 from elastocal.errors import InputError, require
 from elastocal.measurements import Measurements
@@ -75,20 +75,14 @@ class RivalSet:
 
     @property
     def names(self) -> tuple[str, ...]:
-        return tuple(name_of(item) for item in self.rivals)
+        return tuple(item.what.label for item in self.rivals)
 
     def depends_on(self, column: str) -> bool:
         """Whether a rival needs the table's column: "time" or "approach"."""
-        return any(_depends(item.what, column) for item in self.rivals)
-
-
-def name_of(item: Item) -> str:
-    """ "gear_eccentricity:joint2", or a block's label."""
-    return ":".join(item.key) if item.known else item.what.label
-
-
-def _depends(what: Hypothesis | Generic, column: str) -> bool:
-    return column in (what.effect.needs if isinstance(what, Hypothesis) else what.kind)
+        whats = (item.what for item in self.rivals)
+        return any(
+            column in (w.effect.needs if isinstance(w, Hypothesis) else w.kind) for w in whats
+        )
 
 
 class Suspects:
@@ -108,6 +102,8 @@ class Suspects:
                 settings = np.array([c.settings[s.key] for s in h.settings])
                 self.items[h.key], self.p[h.key] = Item(h, settings, 0.0), c.probability
         self._found = [(f.effect, f.where) for f in diagnosis.effects]
+        # Whether something without a name is at work.
+        self.unknown = diagnosis.verdict == "unknown_effect"
         named = [(e.effect, e.where) for group in diagnosis.indistinguishable for e in group]
         for effect, where in [*self._found, *named]:
             require(
@@ -152,20 +148,15 @@ class Suspects:
         return [h for h in whats if isinstance(h, Hypothesis)]
 
     @property
-    def unknown(self) -> bool:
-        """Whether something without a name is at work."""
-        return self.diagnosis.verdict == "unknown_effect"
-
-    @property
-    def sides_matter(self) -> bool:
-        """Whether the side of approach may tell the rivals apart."""
-        return self.unknown or any(s.depends_on("approach") for s in self.sets)
-
-    @property
-    def waiting_matters(self) -> bool:
-        """Whether some rival relaxes with time, so that later poses may tell more."""
+    def matters(self) -> dict[str, bool]:
+        """Whether the side of approach may tell the rivals apart, and waiting, since some rival
+        relaxes with time."""
         constants = [s.kind for h in self.hypotheses for s in h.settings]
-        return self.unknown or "time_constant" in constants
+        sides = any(s.depends_on("approach") for s in self.sets)
+        return {
+            "sides": self.unknown or sides,
+            "waits": self.unknown or "time_constant" in constants,
+        }
 
     def unknown_set(self, dataset: DiagnosisData, noise: NoiseValues) -> RivalSet:
         """The blocks that explain the data best where the diagnosis locates the effect, and the
@@ -173,11 +164,10 @@ class Suspects:
         location = self.diagnosis.location
         assert location is not None  # an unknown effect was found somewhere
         near = list(dict.fromkeys([location.where, *location.places]))[:PLACES]
-        at = project(dataset.data, noise)
         blocks = [block for block in generic_blocks(dataset) if block.where in near]
         items = [Item(block, np.zeros(0), 0.0) for block in blocks]
-        columns = (dataset.data.masked(packed_columns(dataset, item)) for item in items)
-        evidence = np.array([float(direct(C, at).evidence()[0]) for C in columns])
+        grams = Grams(dataset, dataset.data, project(dataset.data, noise))
+        evidence = np.array([float(grams.of(block).evidence()[0]) for block in blocks])
         best = np.argsort(-evidence, kind="stable")[:BLOCKS]
         share = self.diagnosis.probability_unknown * softmax(evidence[best])
         keys = self._likeliest()

@@ -118,6 +118,27 @@ class Standardised:
         return out
 
 
+def beside(
+    M: Array, z: Array, prior: Array, others: IntArray, groups: Sequence[slice]
+) -> list[tuple[Array, Array]]:
+    """Of each of these groups c of columns what the others x, of prior precisions Λ, leave of
+    their normal matrix and right side:
+
+    A = M_cc − M_cx (M_xx + Λ)⁻¹ M_xc and b = z_c − M_cx (M_xx + Λ)⁻¹ z_x.
+    """
+    L = M[np.ix_(others, others)]
+    L[np.diag_indices_from(L)] += prior[others]
+    L = linalg.cholesky(L, lower=True, overwrite_a=True, check_finite=False)
+    right = np.column_stack([M[np.ix_(others, np.r_[(slice(0, 0), *groups)])], z[others]])
+    half = linalg.solve_triangular(L, right, lower=True, check_finite=False)
+    out, start = [], 0
+    for c in groups:
+        own = half[:, start : start + c.stop - c.start]
+        out.append((M[c, c] - own.T @ own, z[c] - own.T @ half[:, -1]))
+        start += own.shape[1]
+    return out
+
+
 def inverse_triangle(L: Array) -> Array:
     """L⁻¹ of a lower triangular L (p, p), by halves: BLAS's products of triangles are two to three
     times as fast as LAPACK's inverse."""
