@@ -213,7 +213,6 @@ def random_data(
         precision=rng.uniform(0.2, 3.0, p),
         covariance=blocks.pack_square(covariance),
         G=blocks.pack(rng.normal(size=(n, size, joints))),
-        same_visit=blocks.same_visit,
         left_out=blocks.absent,
         stated=stated,
     )

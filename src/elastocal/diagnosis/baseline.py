@@ -92,13 +92,6 @@ class Blocks:
         """Rows (C, M·size) that hold no observation."""
         return np.repeat(self.member == self.n, self.size, axis=1)
 
-    @property
-    def same_visit(self) -> Array:
-        """1 where two rows of a block belong to the same visit (C, M·size, M·size)."""
-        visit = np.concatenate([self.visit, [-1]])[self.member]
-        same = (visit[:, :, None] == visit[:, None, :]) & (visit >= 0)[:, :, None]
-        return np.repeat(np.repeat(same, self.size, axis=1), self.size, axis=2).astype(float)
-
 
 @dataclass(frozen=True)
 class VisitPlaces:

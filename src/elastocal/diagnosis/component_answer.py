@@ -36,7 +36,7 @@ from elastocal.diagnosis.diagnosis import (
     Verdict,
 )
 from elastocal.diagnosis.diagnosis_data import DiagnosisData
-from elastocal.diagnosis.left_out import left_out_residual, left_out_square, squared_lengths
+from elastocal.diagnosis.left_out import left_out_residual, squared_lengths
 from elastocal.diagnosis.line_orders import families_of, ripples
 from elastocal.diagnosis.model_set import spans_of
 from elastocal.diagnosis.noise_floor import NoisyData, Projection, Weighted, covariance, project
@@ -261,8 +261,13 @@ class SumAnswer:
     @cached_property
     def supported(self) -> SupportedFloor:
         """What of the noise beside the sum is noise, and what is unexplained."""
-        best = math.sqrt(left_out_square(_thinned(self.found.data), self.found.noise))
+        squares, count = self._left_out
+        best = math.sqrt(squares.sum() / count.sum())
         return supported_floor(self.dataset, self.found.data, self.found.noise, best)
+
+    @cached_property
+    def _left_out(self) -> tuple[Array, Array]:
+        return self._left_out_without([])
 
     @cached_property
     def unexplained(self) -> float:
@@ -278,8 +283,7 @@ class SumAnswer:
     def _left_by_names(self) -> float:
         """Mean square (m²) by which the names alone err at left-out configurations, beyond what
         noise and the uncertainty of their fit make of it: r_c − X_c β̂₋c has covariance P_cc⁻¹."""
-        named = [k for k, c in enumerate(self.found.components) if c.named]
-        data = _thinned(self._of_components(named))
+        data = _thinned(self._without_these(self._unnamed))
         at = project(data, self.found.noise)
         squares, count = squared_lengths(data, left_out_residual(at))
         variance = np.diagonal(np.linalg.inv(at.P), axis1=1, axis2=2)
@@ -339,9 +343,9 @@ class SumAnswer:
             if all(self.found.components[k].named for k in own)
             and not any(self.found.components[k].given for k in own)
         }  # fmt: skip
-        now = self._left_out_without(gone)
+        now = self._left_out[0]
         while named:
-            without = {key: self._left_out_without([*gone, *own]) for key, own in named.items()}
+            without = {key: self._left_out_without([*gone, *own])[0] for key, own in named.items()}
             key = min(without, key=lambda key: without[key].sum())
             if without[key].sum() > (1 + PAYS) ** 2 * now.sum():
                 break
@@ -351,19 +355,18 @@ class SumAnswer:
             gone += named.pop(key)
         return out
 
-    def _left_out_without(self, gone: Sequence[int]) -> Array:
+    def _left_out_without(self, gone: Sequence[int]) -> tuple[Array, Array]:
         """Σ of squared errors (C,) in m² of left-out configurations, these components not in the
-        fit."""
-        kept = [k for k in range(len(self.found.components)) if k not in gone]
-        data = _thinned(self._of_components(kept))
-        return squared_lengths(data, left_out_residual(project(data, self.found.noise)))[0]
+        fit, and the number of readings."""
+        data = _thinned(self._without_these(gone))
+        return squared_lengths(data, left_out_residual(project(data, self.found.noise)))
 
-    def _of_components(self, kept: Sequence[int]) -> NoisyData:
-        """The data with the columns of the arm's own parameters and of these components."""
+    def _without_these(self, gone: Sequence[int]) -> NoisyData:
+        """The data with the columns of the arm's own parameters and of all other components."""
         data = self.found.data
-        keep = np.arange(data.X.shape[2]) < self._own
-        for k in kept:
-            keep[self.found.spans[k]] = True
+        keep = np.ones(data.X.shape[2], dtype=bool)
+        for k in gone:
+            keep[self.found.spans[k]] = False
         return replace(data, X=data.X[:, :, keep], precision=data.precision[keep])
 
     # Shares.
@@ -532,7 +535,7 @@ class SumAnswer:
         what each stage contributes, and how surely anything acts at each stage and place."""
         at_stage, at_place = self._by(_stage_of), self._by(lambda c: c.where)
         stages, places = (
-            {key: max(map(self._there, own)) for key, own in groups.items()}
+            {key: float(self._present[own].max()) for key, own in groups.items()}
             for groups in (at_stage, at_place)
         )
         shares = {stage: float(np.median(self.shares(own))) for stage, own in at_stage.items()}
@@ -593,7 +596,7 @@ class SumAnswer:
         """Probability that these are there, and move the markers, `together` with others, by SLIGHT
         of the whole or more."""
         enough = self.squares(together or members) >= SLIGHT**2 * self.total
-        return max(map(self._there, members)) * float(enough.mean())
+        return float(self._present[members].max() * enough.mean())
 
     def _found_effects(self, named: bool, slight: bool = False) -> Iterator[FoundEffect]:
         at_place = {
@@ -611,14 +614,11 @@ class SumAnswer:
 
     @cached_property
     def _present(self) -> Array:
+        """Probability (K,) that there is anything at a component's place."""
         return np.asarray(expit(self.found.earned - self.found.costs))
 
-    def _there(self, k: int) -> float:
-        """Probability that there is anything at a component's place."""
-        return float(self._present[k])
-
     def _probability(self, k: int) -> float:
-        there = self._there(k)
+        there = float(self._present[k])
         hypothesis = self.found.components[k].hypothesis
         if k in self._rivals and hypothesis is not None:
             return there * self._rivals[k].get(hypothesis.key, CHANCE)
@@ -702,7 +702,9 @@ class SumAnswer:
         return tuple(steps)
 
     def _step(self, name: str, members: list[int]) -> BudgetStep:
-        part = self._of_components(members)
+        part = self._without_these(
+            [k for k in range(len(self.found.components)) if k not in members]
+        )
         left = left_out_residual(project(part, self.found.noise))
         return BudgetStep(name, *rms_with_interval(part, left, self.rng))
 

@@ -4,8 +4,7 @@ from __future__ import annotations
 
 from collections import Counter
 from collections.abc import Container, Mapping, Sequence
-from dataclasses import dataclass, replace
-from functools import cached_property
+from dataclasses import replace
 
 import numpy as np
 from scipy.special import expit
@@ -66,19 +65,6 @@ LINE_SEARCHES, FIELD_SEARCHES, TWICE = 16, 3, 2
 MOST_FIELDS = 4  # that one search adds
 
 
-@dataclass(frozen=True, eq=False)
-class TriedComponents:
-    """What a sum is looked for among: error curves of joints, and all other components."""
-
-    curves: Sequence[Component]
-    others: Sequence[Component]
-
-    @cached_property
-    def both(self) -> Sequence[Component]:
-        """One object, by which a sum knows what it has been completed from."""
-        return [*self.curves, *self.others]
-
-
 def search_components(
     dataset: DiagnosisData, chosen: ModelSet, without: Container[str] = (),
     progress: Progress = lambda message: None,
@@ -100,26 +86,27 @@ def search_components(
         moving = () if ResidualField.name in without else drifts(full)
         every = [*moving, *known, *_searched(full, chosen)]
         curves = () if JointCurve.name in without else joint_curves(full)
-        tried = TriedComponents(list(curves), _first(every))
-        if not (weighed or chosen.unknown or promised(chosen, tried.both) > PROMISING):
+        curves, others = list(curves), _first(every)
+        tried = [*curves, *others]  # one object, by which a sum knows what completed it
+        if not (weighed or chosen.unknown or promised(chosen, tried) > PROMISING):
             return None
-        progress(f"sizes of {len(tried.both)} components at once")
-        found = _swapped(full, fit_sum(data, tried.both, instrument), tried.both)
+        progress(f"sizes of {len(tried)} components at once")
+        found = _swapped(full, fit_sum(data, tried, instrument), tried)
         if weighed or not any(isinstance(c.effect, LinkWeights) for c in found.components):
             break
         # A compliance that was fitted without weights is wrong, and so are their columns by it.
         full = about_sum(full, found)
-    found = with_own_axes(found)
-    if len(full.blocks.member) <= FEW_POSES:
+    found, few = with_own_axes(found), len(full.blocks.member) <= FEW_POSES
+    if few:
         progress("families of lines before curves")
-        found = _with_lines_first(full, found, tried, instrument)
+        found = _with_lines_first(full, found, curves, others, tried, instrument)
     else:
         progress("families of lines beside the components")
         found = _with_lines(full, found)
     progress("what shows now that the noise is smaller")
     found = with_shorter_drifts(full, found)
     again = with_returned(found, every)
-    if again is not found and len(full.blocks.member) <= FEW_POSES:
+    if again is not found and few:
         again = with_returned(_with_lines(full, again), every)
     found = again
     for _ in range(0 if ResidualField.name in without else FIELD_SEARCHES):
@@ -129,40 +116,40 @@ def search_components(
             break
         found = wider
     progress("what can be left out")
-    found = _swapped(full, with_own_axes(found), tried.both)
-    found = completed(with_shorter_drifts(full, _spared(found)), tried.both)
-    if len(full.blocks.member) <= FEW_POSES:
-        for _ in range(TWICE):
-            before = with_likelier_orders(full, with_expected_families(full, found))
-            # Which of two laws the last move follows shows where the lines are right.
-            found = completed(before, tried.both)
-            if found.score <= before.score + GAINED:
-                break
-            found = _with_lines(full, found)
-    return full, found, hidden_fellows(found, tried.others)
+    found = _swapped(full, with_own_axes(found), tried)
+    found = completed(with_shorter_drifts(full, _spared(found)), tried)
+    for _ in range(TWICE if few else 0):
+        before = with_likelier_orders(full, with_expected_families(full, found))
+        # Which of two laws the last move follows shows where the lines are right.
+        found = completed(before, tried)
+        if found.score <= before.score + GAINED:
+            break
+        found = _with_lines(full, found)
+    return full, found, hidden_fellows(found, others)
 
 
 def _with_lines_first(
-    dataset: DiagnosisData, found: FittedSum, tried: TriedComponents, instrument: NoiseValues
-) -> FittedSum:
+    dataset: DiagnosisData, found: FittedSum, curves: Sequence[Component],
+    others: Sequence[Component], tried: Sequence[Component], instrument: NoiseValues,
+) -> FittedSum:  # fmt: skip
     """The sum with families of lines, sought beside the others before curves join.
 
     A curve takes up the lines of its joint as far as few poses show them, and then none of them
     stands out.  A sum without curves is one of the others already.
     """
-    curved = any(c is curve for c in found.components for curve in tried.curves)
-    first, pool = found, tried.both
+    curved = any(c is curve for c in found.components for curve in curves)
+    first, pool = found, tried
     if curved:
-        alone = fit_sum(found.sums.data, tried.others, instrument)
-        first, pool = _swapped(dataset, alone, tried.others), tried.others
+        alone = fit_sum(found.sums.data, others, instrument)
+        first, pool = _swapped(dataset, alone, others), others
     first = begun = _spared(completed(first, pool))
     for _ in range(TWICE):
         before = first
-        first = completed(_with_lines(dataset, first), tried.both)
+        first = completed(_with_lines(dataset, first), tried)
         if first.score <= before.score + GAINED:
             break
     if curved or first is not begun:
-        first = _wider(first, tried.curves)
+        first = _wider(first, curves)
     return first if not curved or first.score > found.score else _with_lines(dataset, found)
 
 
@@ -391,7 +378,6 @@ def _wider(found: FittedSum, more: Sequence[Component]) -> FittedSum:
 
 
 def _refitted(found: FittedSum) -> FittedSum:
-    """The sum with its noise fitted anew beside it."""
     return fit_sum(found.sums.data, found.components, found.noise, found.sizes)
 
 

@@ -275,16 +275,12 @@ def _diagnosed(
     rng = np.random.default_rng(options.seed)
     whole, nats, fields = _sum_of_all(dataset, found, options, rng, progress)
     progress("confirming")
-    found = search.settled(found) if whole is None else found
     tests = structure_tests(found.first)
     if whole is None:
-        gap, steps = budget(dataset, found, rng)
-        judged = judge(found, gap.open)
-        answers = _of_few(dataset, found, judged, tests, gap, rng) | {"budget": steps}
-        answers["fields"] = fields if judged.verdict == "unknown_effect" else ()
+        found = search.settled(found)
+        judged, answers = _of_few(dataset, found, tests, fields, rng)
     else:
-        judged = judge(found)
-        answers = _of_sum(whole, dataset, found, tests)
+        judged, answers = judge(found), _of_sum(whole, dataset, found, tests)
     added = (*answers["effects"], *answers.get("slight", ()))
     there = () if whole is None else {(f.effect, f.where) for f in added}
     small = [u for u in too_small(dataset, found) if (u.effect, u.where) not in there]
@@ -349,14 +345,19 @@ def _sum_of_all(
 
 
 def _of_few(
-    dataset: DiagnosisData, found: SelectedEffects, answer: Answer,
-    tests: tuple[StructureTest, ...], gap: Gap, rng: np.random.Generator,
-) -> dict[str, Any]:  # fmt: skip
+    dataset: DiagnosisData, found: SelectedEffects, tests: tuple[StructureTest, ...],
+    fields: tuple[FoundEffect, ...], rng: np.random.Generator,
+) -> tuple[Answer, dict[str, Any]]:  # fmt: skip
     """What a diagnosis says of what the forward search found."""
-    return {
+    gap, steps = budget(dataset, found, rng)
+    answer = judge(found, gap.open)
+    effects, unknown = _findings(found, answer, dataset.base, gap, rng), answer.unknown
+    return answer, {
         "verdict": answer.verdict,
         "gap": gap,
-        "effects": _findings(found, answer, dataset.base, gap, rng),
+        "budget": steps,
+        "effects": beside_unknown(effects) if unknown else effects,
+        "fields": fields if unknown else (),
         "indistinguishable": answer.indistinguishable,
         "location": location(found, tests),
         "noise": noise_floor(found.dataset, found.chosen.data, found.chosen.noise),
@@ -370,7 +371,6 @@ def _of_sum(
     tests: tuple[StructureTest, ...],
 ) -> dict[str, Any]:  # fmt: skip
     """What it says where many causes act at once."""
-    data = answer.found.data
     first = first_steps(dataset, found.nothing, None, answer.rng)
     steps = answer.budget(first)
     named = [step for step in steps if not step.step.startswith("unknown")]
@@ -386,7 +386,7 @@ def _of_sum(
         "effects": beside_unknown(answer.effects) if gap.open else answer.effects,
         "indistinguishable": answer.indistinguishable,
         "location": answer.location(tests),
-        "noise": noise_floor(answer.dataset, data, answer.found.noise),
+        "noise": noise_floor(answer.dataset, answer.found.data, answer.found.noise),
         "probability_unknown": max(answer.unnamed_probability, gap.open * (1 - FALSE_SMOOTH)),
         "curves": answer.curves(),
         "components": answer.components,

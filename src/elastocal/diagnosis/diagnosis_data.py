@@ -296,7 +296,6 @@ def diagnosis_data_of(
         precision=np.ones(B.shape[2]),
         covariance=blocks.pack_square(base.covariance) + faster,
         G=blocks.pack(columns.entry(("joint_motion", joints))[observed.lead]),
-        same_visit=blocks.same_visit,
         left_out=blocks.absent,
         stated=base.stated is not None,
     )

@@ -96,7 +96,6 @@ class NoisyData:
     precision: Array
     covariance: Array
     G: Array
-    same_visit: Array
     left_out: BoolArray
     stated: bool
 
@@ -112,7 +111,7 @@ class NoisyData:
 
     def every(self, step: int) -> NoisyData:
         """The data of every `step`-th configuration alone."""
-        per_row = ("r", "X", "covariance", "G", "same_visit", "left_out")
+        per_row = ("r", "X", "covariance", "G", "left_out")
         blocks = replace(self.blocks, member=self.blocks.member[::step])
         return replace(self, blocks=blocks, **{k: getattr(self, k)[::step] for k in per_row})
 

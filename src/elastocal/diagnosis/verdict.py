@@ -48,6 +48,10 @@ class Answer:
     rivals: tuple[tuple[tuple[Item, float], ...], ...]
 
     @property
+    def unknown(self) -> bool:
+        return self.verdict == "unknown_effect"
+
+    @property
     def indistinguishable(self) -> tuple[tuple[EffectAt, ...], ...]:
         return tuple(
             tuple(EffectAt(*item.key) for item, _ in rivals)
@@ -67,8 +71,6 @@ def judge(found: SelectedEffects, unexplained: bool = False) -> Answer:
         rivals.append(others)
     if found.chosen.unknown or unexplained:
         verdict: Verdict = "unknown_effect"
-        # What is named beside something without a name may be part of its imitation.
-        probability = [min(p, TOO_NEAR_PROBABILITY) for p in probability]
     elif all(len(r) == 1 for r in rivals):
         verdict = "explained"
     else:

@@ -22,7 +22,6 @@ from elastocal.diagnosis.discrimination import (
     _hidden,
     campaign_of,
     joined,
-    rows_of,
     visit_pool_of,
 )
 from elastocal.diagnosis.extra_poses import expected, expected_of_random, fewest
@@ -80,7 +79,7 @@ def discrimination(base: Baseline, pool: VisitPool) -> Discrimination:
     diagnosis = type("Found", (), {"noise": found})
     whole = campaign_of(base, pool, [known[k] for k in RIVALS], diagnosis)  # type: ignore
     rivals = RivalSet.of(items, list(PROBABILITY), [])
-    return Discrimination.of(rivals, rows_of(whole, rivals), np.random.default_rng(0))
+    return Discrimination.of(whole, rivals, np.random.default_rng(0))
 
 
 def dense_distance(base: Baseline, table: Measurements, a: int, b: int, size: Array) -> float:
@@ -149,7 +148,7 @@ def test_a_rival_with_settings_imitates_by_its_best_ones(base, pool, discriminat
     drifts = alternatives(whole.so_far, NOISE, rivals)[1]
     assert drifts[0].settings[0] == pytest.approx(TIME_CONSTANT)
     assert 1 < len({float(item.settings[0]) for item in drifts}) == len(drifts) <= SETTINGS
-    d = Discrimination.of(rivals, rows_of(whole, rivals), np.random.default_rng(0))
+    d = Discrimination.of(whole, rivals, np.random.default_rng(0))
     assert d.distances(d.before)[0, 1] < 0.1
 
 
