@@ -85,8 +85,8 @@ def search_components(
                  for c in catalogue_components(full))  # fmt: skip
         moving = () if ResidualField.name in without else drifts(full)
         every = [*moving, *known, *_searched(full, chosen)]
-        curves = () if JointCurve.name in without else joint_curves(full)
-        curves, others = list(curves), _first(every)
+        curves = [] if JointCurve.name in without else list(joint_curves(full))
+        others = _first(every)
         tried = [*curves, *others]  # one object, by which a sum knows what completed it
         if not (weighed or chosen.unknown or promised(chosen, tried) > PROMISING):
             return None
