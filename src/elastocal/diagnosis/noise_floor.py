@@ -283,7 +283,11 @@ class Weighted:
     def projection(self, precision: Array) -> Projection:
         L, z, marginal = self.factored(precision)
         back = self.root.transpose(0, 2, 1)
-        H = back @ (self.X @ inverse_triangle(L).T)
+        # As one product: a small one for each configuration waits for memory.
+        turned = linalg.blas.dtrmm(
+            1.0, inverse_triangle(L), self.X.reshape(-1, len(L)).T, lower=1
+        ).T
+        H = back @ turned.reshape(self.X.shape)
         u = (back @ self.r[..., None])[..., 0] - H @ z
         beta = linalg.solve_triangular(L, z, lower=True, trans="T", check_finite=False)
         inverse = back @ self.root

@@ -262,8 +262,9 @@ class State:
     def each(self) -> Iterator[tuple[Whitened, Array, Array]]:
         """The packs with H = R⁻¹BL⁻ᵀ (C, m, p), so that P = R⁻ᵀ(1 − HHᵀ)R⁻¹, and R⁻¹(e − Bx)."""
         for w in self.packs:
-            if w.B.shape[2]:
-                yield w, w.B @ self.inverse.T, w.e - w.B @ self.x
+            if p := w.B.shape[2]:
+                flat = w.B.reshape(-1, p)  # one product, not one for each cluster
+                yield w, (flat @ self.inverse.T).reshape(w.B.shape), w.e - w.B @ self.x
             else:
                 yield w, w.B, w.e
 
