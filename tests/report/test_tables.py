@@ -8,12 +8,12 @@ import numpy as np
 import pytest
 from rich.console import Console
 
-from elastocal.report.blocks import Table
+from elastocal.report.blocks import ShownTable
 from elastocal.report.parameter_tables import bar, parameter_table, texts, undetermined_table
 from elastocal.report.terminal import print_report
 
 
-def cells(table: Table) -> list[dict[str, str]]:
+def cells(table: ShownTable) -> list[dict[str, str]]:
     """Rows of a table, column header → text."""
     return [dict(zip(table.heads, row, strict=True)) for row in table.rows]
 

@@ -192,7 +192,7 @@ def _cost_table(title: str, cost: Cost) -> Table:
         cells = [length(size) for size in sizes] or [""] * 4
         rows.append((printable(name), *cells, printable(note)))
     heads = ("effect", "markers rms", "max", "flange rms", "max", "")
-    return table_of(blocks.Table(heads, rows, (0, 5), title=title))
+    return table_of(blocks.ShownTable(heads, rows, (0, 5), title=title))
 
 
 # At the start of a sentence and in a title.

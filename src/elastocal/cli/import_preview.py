@@ -114,7 +114,7 @@ def _columns_of(observed: Understood) -> Table:
         (printable(name), printable(column), printable(unit or "–"))
         for name, column, unit in observed.columns
     ]
-    return table_of(blocks.Table(("in the file", "read as", "unit"), rows, (0, 1, 2)))
+    return table_of(blocks.ShownTable(("in the file", "read as", "unit"), rows, (0, 1, 2)))
 
 
 def _first_rows(found: Imported, width: int) -> Table:
@@ -130,7 +130,7 @@ def _first_rows(found: Imported, width: int) -> Table:
         for i in range(min(FIRST_ROWS, len(found.assembled)))
     ]
     title = f"The first rows of the table{more}"
-    return table_of(blocks.Table(tuple(shown), rows, tuple(words), title=title))
+    return table_of(blocks.ShownTable(tuple(shown), rows, tuple(words), title=title))
 
 
 def _cell(values: Sequence[str] | np.ndarray, i: int) -> str:
@@ -145,7 +145,7 @@ def _ranges(found: Imported) -> Table:
         for name, values in found.assembled.columns.items()
         if isinstance(values, np.ndarray) and name != "repeat"
     ]
-    return table_of(blocks.Table(("column", "least", "largest"), rows, title="Ranges"))
+    return table_of(blocks.ShownTable(("column", "least", "largest"), rows, title="Ranges"))
 
 
 def _counts(found: Imported) -> list[tuple[str, str]]:

@@ -33,8 +33,7 @@ from elastocal.planning.collision import Kinematics
 from elastocal.planning.plan import Plan
 from elastocal.report import blocks
 from elastocal.report.figures import ARM, FAINT, INK, SERIES, figure_of, style
-from elastocal.report.formatting import joint_heads, joint_texts, length, short_name
-from elastocal.report.plan_view import first_stops
+from elastocal.report.formatting import first_stops, joint_heads, joint_texts, length, short_name
 from elastocal.text import printable
 from elastocal.units import Array, IntArray
 
@@ -317,7 +316,9 @@ MOST_POSES = 80  # in the page; of more, those with the largest residuals and a 
 WORST = 30
 
 
-def residual_arm(model: Model, observed: Observations, x: Array, residual: Array) -> blocks.Arm:
+def residual_arm(
+    model: Model, observed: Observations, x: Array, residual: Array
+) -> blocks.ShownArm:
     """The arm with its residuals as arrows, and what they are."""
     space = residual_space(model, observed, x, residual)
     shown, several = len(space.poses), observed.n_configurations
@@ -331,7 +332,7 @@ def residual_arm(model: Model, observed: Observations, x: Array, residual: Array
             f" {shown} poses of {several} configurations: those with the largest residuals, and a "
             "random choice."
         )
-    return blocks.Arm("space", space, "Residuals as arrows on the posed arm", text)
+    return blocks.ShownArm("space", space, "Residuals as arrows on the posed arm", text)
 
 
 def residual_space(model: Model, observed: Observations, x: Array, residual: Array) -> Space:
@@ -423,7 +424,7 @@ TOP = np.eye(3)
 SIDE = np.array([[1.0, 0, 0], [0, 0, 1.0], [0, -1.0, 0]])
 
 
-def space_figure(arm: blocks.Arm) -> blocks.Figure:
+def space_figure(arm: blocks.ShownArm) -> blocks.Figure:
     """The first pose seen obliquely, and all poses from above and from the side."""
     space = arm.space
 
@@ -467,14 +468,14 @@ def plan_figure(plan: Plan) -> Any:
     return figure_of(space_figure(plan_arm(plan)))
 
 
-def plan_arm(plan: Plan) -> blocks.Arm:
+def plan_arm(plan: Plan) -> blocks.ShownArm:
     """The arm in every pose of a plan."""
     space = plan_space(plan)
     caption = (
         "The arm in the poses of the plan, numbered at the flange. The arm is drawn as "
         f"{space.shells.drawn_from}."
     )
-    return blocks.Arm("poses", space, "The arm in the poses of the plan", caption)
+    return blocks.ShownArm("poses", space, "The arm in the poses of the plan", caption)
 
 
 def _draw(axes: Axes, space: Space, view: Array, whole: bool) -> None:

@@ -10,10 +10,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Iterable, Iterator, Sequence
 from dataclasses import dataclass, field, replace
-from typing import TYPE_CHECKING, Any, Literal
-
-if TYPE_CHECKING:
-    from elastocal.report.arm_view import Space
+from typing import Any, Literal
 
 # good: use it; warn: use it knowing what is wrong, or look what changed; poor: do not use it.
 Tone = Literal["good", "warn", "poor"]
@@ -21,7 +18,7 @@ TONES: dict[str, Tone] = {"good": "good", "note": "good", "care": "warn", "poor"
 
 
 @dataclass(frozen=True)
-class Verdict:
+class ShownVerdict:
     """The answer in a sentence."""
 
     tone: Tone
@@ -29,7 +26,7 @@ class Verdict:
 
 
 @dataclass(frozen=True)
-class Key:
+class KeyFigures:
     """What came out in one line of numbers, and the four that count (what it is, number); a
     terminal has both in sentences."""
 
@@ -43,7 +40,7 @@ class Heading:
 
 
 @dataclass(frozen=True)
-class Text:
+class Sentence:
     """A sentence; `soft`: an explanation, which stands back."""
 
     text: str
@@ -70,7 +67,7 @@ class Bar:
 
 
 @dataclass(frozen=True)
-class Table:
+class ShownTable:
     """A table of texts.  `words` are the columns that hold words; the others hold numbers.
 
     `groups` names the rows that follow, by the index of the first: {0: "base frame", 6: …}; a page
@@ -86,16 +83,16 @@ class Table:
     note: str = ""
     bars: Sequence[Bar | None] = ()
     of_bars: str = ""
-    narrow: Table | None = None
+    narrow: ShownTable | None = None
 
-    def without(self, *columns: int) -> Table:
+    def without(self, *columns: int) -> ShownTable:
         """The table without some columns."""
         kept = [k for k in range(len(self.heads)) if k not in columns]
         heads, *rows = (tuple(row[k] for k in kept) for row in (self.heads, *self.rows))
         words = tuple(n for n, k in enumerate(kept) if k in self.words)
         return replace(self, heads=heads, rows=rows, words=words, bars=(), narrow=None)
 
-    def when_narrow(self, *columns: int) -> Table:
+    def when_narrow(self, *columns: int) -> ShownTable:
         """The table that loses some columns where there is no room for them."""
         return replace(self, narrow=self.without(*columns))
 
@@ -116,11 +113,11 @@ class Figure:
 
 
 @dataclass(frozen=True)
-class Arm:
-    """The arm in space: to be turned on a page, a picture elsewhere."""
+class ShownArm:
+    """The arm in a `space` (arm_view.Space): to be turned on a page, a picture elsewhere."""
 
     name: str
-    space: Space
+    space: Any
     title: str
     caption: str
 
@@ -138,7 +135,9 @@ class Fold:
     figures: tuple[str, ...] = ()
 
 
-Block = Verdict | Key | Heading | Text | Lines | Table | Figure | Arm | Fold
+Block = (
+    ShownVerdict | KeyFigures | Heading | Sentence | Lines | ShownTable | Figure | ShownArm | Fold
+)
 
 
 @dataclass(frozen=True)

@@ -7,7 +7,7 @@ from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
 
 from elastocal.diagnosis.diagnosis import ComponentShare, Curve, Diagnosis, FoundEffect, Interval
-from elastocal.report.blocks import Figure, Table
+from elastocal.report.blocks import Figure, ShownTable
 from elastocal.report.effect_names import (
     effect_at_places,
     place,
@@ -128,7 +128,7 @@ def headline_of_causes(d: Diagnosis) -> str:
     )
 
 
-def cause_table(d: Diagnosis) -> Table:
+def cause_table(d: Diagnosis) -> ShownTable:
     """One row per finding: its share of the gap, and what it takes off the error of new poses."""
     rows = [
         (
@@ -141,13 +141,13 @@ def cause_table(d: Diagnosis) -> Table:
     if d.gap.unexplained_share >= FINE**2:
         rows.append(("unexplained", share_text(d.gap.unexplained_share), "–", "–", "–"))
     heads = ("cause", "share", "90 %", "error falls by", "90 %")
-    return Table(heads, rows, title="Causes of the remaining error", note=(
+    return ShownTable(heads, rows, title="Causes of the remaining error", note=(
         "share: part of the squared remaining error that goes when this is added last. error falls "
         "by: at new poses, if only this is added to the model."
     ))  # fmt: skip
 
 
-def place_table(d: Diagnosis) -> Table:
+def place_table(d: Diagnosis) -> ShownTable:
     """What acts at each place, below the finding that it belongs to."""
     rows: list[tuple[str, ...]] = []
     groups: dict[int, str] = {}
@@ -165,7 +165,7 @@ def place_table(d: Diagnosis) -> Table:
             ))  # fmt: skip
         told += parts
     heads = ("place", "error", "as", "rms (95 %)", "share (90 %)", "probability")
-    table = Table(heads, rows, (0, 1, 2), groups, title="Place by place")
+    table = ShownTable(heads, rows, (0, 1, 2), groups, title="Place by place")
     return table.when_narrow(2)  # what it is as effects stands in the table of parameters too
 
 
@@ -238,7 +238,7 @@ def slight_text(d: Diagnosis) -> str:
 # Corrections that have no name.
 
 
-def field_table(d: Diagnosis) -> Table:
+def field_table(d: Diagnosis) -> ShownTable:
     """The smooth corrections without a name: where, what they follow, how large and how smooth."""
     rows = [row for f in d.fields for row in _followed(f)]
     heads = ("correction at", "follows", "size", "over", "error falls by", "95 %")
@@ -246,7 +246,7 @@ def field_table(d: Diagnosis) -> Table:
         "Smooth functions without a physical name; they hold where the arm was measured: size "
         "(standard deviation) and the length over which they change."
     )
-    return Table(heads, rows, (0, 1), title="Smooth corrections", note=note)
+    return ShownTable(heads, rows, (0, 1), title="Smooth corrections", note=note)
 
 
 def _followed(f: FoundEffect) -> Iterable[tuple[str, ...]]:

@@ -17,7 +17,7 @@ import numpy as np
 from elastocal.identification.error_budget import ErrorBudget, gap_budget, pose_accuracy
 from elastocal.identification.prediction import measured_loads
 from elastocal.identification.result import Calibration
-from elastocal.report.blocks import Block, Heading, Report, Table, Text, Verdict
+from elastocal.report.blocks import Block, Heading, Report, Sentence, ShownTable, ShownVerdict
 from elastocal.report.formatting import length, sentence, title_of
 from elastocal.report.identification_view import (
     at_new_poses,
@@ -49,18 +49,18 @@ def certificate_report(result: Calibration) -> Report:
 def _blocks(result: Calibration) -> Iterator[Block]:
     entries, budget = result.model.cell.certificate, gap_budget(result)
     verdict, certified = judgement(result), certified_values(result, budget)
-    yield Verdict(verdict.tone, verdict.headline)
+    yield ShownVerdict(verdict.tone, verdict.headline)
     told = entry_rows(result)
     if told:
-        yield Table(("entry", ""), told, (0, 1), title="Entries")
+        yield ShownTable(("entry", ""), told, (0, 1), title="Entries")
     if told and entries.missing:
-        yield Text(
+        yield Sentence(
             f"Not a certificate: [certificate] of the cell lacks {listed(entries.missing)}.",
             soft=True,
         )
     if entries.limit is not None:
         yield Heading("Statement of conformity")
-        yield Text(certified.conformity(entries.limit))
+        yield Sentence(certified.conformity(entries.limit))
     yield from _uncertainty(certified)
     yield from _poses(result, budget, certified)
     facts = [
@@ -74,7 +74,7 @@ def _blocks(result: Calibration) -> Iterator[Block]:
         *([("Expected error", at_new_poses(result.predicted))] if result.predicted else []),
         *prediction_lines(result),
     ]
-    yield Table(("what", ""), facts, (0, 1), title="What was calibrated, and by what")
+    yield ShownTable(("what", ""), facts, (0, 1), title="What was calibrated, and by what")
 
 
 def entry_rows(result: Calibration) -> list[tuple[str, str]]:
@@ -198,7 +198,7 @@ def _uncertainty(certified: Certified) -> Iterator[Block]:
     )
     if all(name != INSTRUMENT for name, *_ in certified.sources):
         note += " Without the instrument's own calibration, which [certificate] does not state."
-    yield Table(heads, rows, (0, 1), title="Uncertainty", note=note)
+    yield ShownTable(heads, rows, (0, 1), title="Uncertainty", note=note)
 
 
 def _poses(
@@ -213,7 +213,7 @@ def _poses(
         }
         table = spread_table(found, "places", "Pose accuracy before and after")
         yield table
-        yield Text(
+        yield Sentence(
             "In the sense of ISO 9283: the distance between the place that was meant and the mean "
             "of what was read there, at every configuration, marker and load. “Calibrated” is what "
             "the calibrated model predicts for a configuration that was left out of the fit; both "
@@ -222,9 +222,9 @@ def _poses(
             soft=True,
         )
     else:
-        yield Text("Pose accuracy is not known: no configuration can be left out of the fit.")
+        yield Sentence("Pose accuracy is not known: no configuration can be left out of the fit.")
     if len(rp := certified.repeatability):
-        yield Text(
+        yield Sentence(
             f"Pose repeatability RP (ISO 9283): {length(float(rp.mean()))} in the mean of "
             f"{len(rp)} places read {FEWEST} times or more, {length(float(rp.max()))} at most; the "
             "instrument's noise is included."

@@ -8,7 +8,16 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from elastocal.diagnosis.changes import Comparison
-from elastocal.report.blocks import Block, Figure, Fold, Key, Lines, Report, Table, Verdict
+from elastocal.report.blocks import (
+    Block,
+    Figure,
+    Fold,
+    KeyFigures,
+    Lines,
+    Report,
+    ShownTable,
+    ShownVerdict,
+)
 from elastocal.report.effect_names import p_value, size_of
 from elastocal.report.formatting import estimate, length, title_of
 from elastocal.text import listed, printable
@@ -19,7 +28,7 @@ if TYPE_CHECKING:
 NAMED = 3  # parameters in a headline
 
 
-def report(c: Comparison) -> Report:
+def changes_report(c: Comparison) -> Report:
     """Two calibrations of one arm: has it changed, how far does the tool move, and by what."""
     model = c.old.model
     title = title_of(model.chain.name, model.cell.name)
@@ -29,19 +38,19 @@ def report(c: Comparison) -> Report:
 def _blocks(c: Comparison) -> Iterator[Block]:
     yield Fold("", lambda: [_key(c)])
     same = c.verdict == "no_change_shown" and not c.one_result
-    yield Verdict("good" if same else "warn", headline(c))
+    yield ShownVerdict("good" if same else "warn", headline(c))
     yield Lines(changes_lines(c))
     yield Fold("", lambda: [_map(c)], figures=("moved",))
     yield change_table(c)
 
 
-def _key(c: Comparison) -> Key:
+def _key(c: Comparison) -> KeyFigures:
     rms, noise = (length(float(np.sqrt(np.mean(v**2)))) for v in (c.distance, c.chance))
     figures = [
         ("the tool has moved, rms", rms), ("at most", length(float(c.distance.max()))),
         ("noise alone", noise), ("all parameters together", size_of(c.p)),
     ]  # fmt: skip
-    return Key(f"moved by {rms} (noise {noise})", figures)
+    return KeyFigures(f"moved by {rms} (noise {noise})", figures)
 
 
 def _map(c: Comparison) -> Figure:
@@ -138,7 +147,7 @@ def steps(c: Comparison) -> list[str]:
     ]
 
 
-def change_table(c: Comparison) -> Table:
+def change_table(c: Comparison) -> ShownTable:
     """A row for each parameter, the changed first, then by their effect at the tool."""
     heads = ("parameter", "old", "new", "change", "± std", "unit", "p (Holm)", "moves the tool", "")
     rows = []
@@ -156,7 +165,7 @@ def change_table(c: Comparison) -> Table:
         "of such a difference where nothing has changed, corrected for all parameters. Moves the "
         "tool: rms over the poses, by this change alone."
     )
-    table = Table(heads, rows, (0, 5, 8), title="Parameter by parameter", note=note)
+    table = ShownTable(heads, rows, (0, 5, 8), title="Parameter by parameter", note=note)
     return table.when_narrow(1, 2)
 
 

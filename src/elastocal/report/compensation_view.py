@@ -8,7 +8,16 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from elastocal.compensation.compensate import in_file_units, joint_columns, summary
-from elastocal.report.blocks import WARNING, Block, Figure, Fold, Lines, Report, Table, Text
+from elastocal.report.blocks import (
+    WARNING,
+    Block,
+    Figure,
+    Fold,
+    Lines,
+    Report,
+    Sentence,
+    ShownTable,
+)
 from elastocal.report.formatting import length
 from elastocal.text import printable
 from elastocal.units import Array
@@ -20,7 +29,7 @@ if TYPE_CHECKING:
 MOST_ROWS = 40  # drawn, and shown of tables
 
 
-def report(c: Compensation) -> Report:
+def compensation_report(c: Compensation) -> Report:
     """Commands for targets: the predicted errors, the commands, what is not reached."""
     return Report("Compensation", printable(c.chain.name), _blocks(c))
 
@@ -47,8 +56,8 @@ def compensation_blocks(content: dict[str, Any]) -> Iterator[Block]:
         yield _spreads("Position of the tool, predicted", rows)
         for k, command in enumerate(commands.get("commands", ())):
             joints = ", ".join(f"{n} {v:.6f}" for n, v in command.items() if n != "status")
-            yield Text(f"target {k + 1}: {joints or command['status']}")
-        yield Text(
+            yield Sentence(f"target {k + 1}: {joints or command['status']}")
+        yield Sentence(
             f"{commands['reached']} of {commands['n']} targets reached by the {commands['point']}; "
             f"targets in the {commands['frame']} frame."
         )
@@ -59,25 +68,25 @@ def compensation_blocks(content: dict[str, Any]) -> Iterator[Block]:
         yield _spreads(
             f"Position of the tool at {table['checked_between']} points between the grid's", rows
         )
-        yield Text(
+        yield Sentence(
             f"{table['points']} grid points: {table['exact']} exact, {table['first_order']} of "
             "first order (beside singular postures or limits)."
         )
 
 
-def _spreads(title: str, rows: dict[str, dict[str, Any]]) -> Table:
+def _spreads(title: str, rows: dict[str, dict[str, Any]]) -> ShownTable:
     cells = [
         (name, *("–" if v is None else _fine_length(v) for v in values.values()))
         for name, values in rows.items()
     ]
-    return Table(("", "rms", "95 %", "max"), cells, title=title)
+    return ShownTable(("", "rms", "95 %", "max"), cells, title=title)
 
 
 def _fine_length(um: float) -> str:
     return "< 0.01 µm" if um < 0.01 else length(um * 1e-6)
 
 
-def _commands(c: Compensation) -> Table:
+def _commands(c: Compensation) -> ShownTable:
     table, kinds = c.targets.table, c.chain.kinds
     q, std = in_file_units(c.q, kinds), c.uncertainty.std * 1e6
     rows = []
@@ -89,7 +98,7 @@ def _commands(c: Compensation) -> Table:
     heads = ("configuration", *joint_columns(kinds), "std_um", "status")
     more = len(c.status) - len(rows)
     note = f"and {more} more in the file of commands" if more else ""
-    return Table(heads, rows, (0, len(heads) - 1), note=note)
+    return ShownTable(heads, rows, (0, len(heads) - 1), note=note)
 
 
 def _figures(c: Compensation) -> Iterator[Figure]:
@@ -121,7 +130,7 @@ def _of_readings(table: Measurements) -> Iterator[Block]:
         for name, values in table.columns().items() if len(values)
     ]  # fmt: skip
     heads = ("column", "different", "least", "largest")
-    yield Table(heads, rows, title=f"{len(table)} rows of {printable(table.source)}")
+    yield ShownTable(heads, rows, title=f"{len(table)} rows of {printable(table.source)}")
     yield Fold("", lambda: [_joints(table)], figures=("joints",))
 
 

@@ -25,16 +25,16 @@ from elastocal.measurements import by_rows
 from elastocal.report.blocks import (
     TONES,
     WARNING,
-    Arm,
     Block,
     Figure,
     Fold,
-    Key,
+    KeyFigures,
     Lines,
     Report,
-    Table,
-    Text,
-    Verdict,
+    Sentence,
+    ShownArm,
+    ShownTable,
+    ShownVerdict,
 )
 from elastocal.report.causes_view import (
     assumed_order,
@@ -83,7 +83,7 @@ MOST_PLACES = 8
 MOST_VISITS = 200
 
 
-def report(d: Diagnosis) -> Report:
+def diagnosis_report(d: Diagnosis) -> Report:
     """Why the arm still differs from the model, and what follows."""
     title, backend = printable(d.data), ""
     if d.model is not None:
@@ -98,7 +98,9 @@ def _kinds(d: Diagnosis) -> Sequence[str]:
 
 def _blocks(d: Diagnosis, kinds: Sequence[str]) -> Iterator[Block]:
     yield Fold("", lambda: [_key(d)])
-    yield Verdict(TONES[d.findings[0].severity] if d.findings else "good", diagnosis_headline(d))
+    yield ShownVerdict(
+        TONES[d.findings[0].severity] if d.findings else "good", diagnosis_headline(d)
+    )
     lines = [(label, capital(text)) for label, text in diagnosis_lines(d)]
     lines += [("Not separable", capital(f"{text}.")) for text in alike(d)]
     lines += [("Next", text) for text in diagnosis_steps(d)]
@@ -132,7 +134,7 @@ def _blocks(d: Diagnosis, kinds: Sequence[str]) -> Iterator[Block]:
                    figures=("space", "residuals", "against_joints", "over_time"))  # fmt: skip
 
 
-def _key(d: Diagnosis) -> Key:
+def _key(d: Diagnosis) -> KeyFigures:
     """The error before and after the effects found, and the noise in both."""
     gap = d.gap
     calibrated, floor = length(gap.calibrated), length(gap.noise_floor)
@@ -142,7 +144,7 @@ def _key(d: Diagnosis) -> Key:
         headline += f" → {length(gap.explained)}"
         figures.append(("with the effects found", length(gap.explained)))
     figures += [("noise alone", floor), ("readings", str(d.n_readings))]
-    return Key(f"{headline} (noise {floor})", figures)
+    return KeyFigures(f"{headline} (noise {floor})", figures)
 
 
 def _figures(d: Diagnosis) -> Iterator[Figure]:
@@ -178,7 +180,7 @@ def candidate_figure(d: Diagnosis) -> Figure:
 
 def _nameless(d: Diagnosis) -> Iterator[Block]:
     if text := slight_text(d):
-        yield Text(text)
+        yield Sentence(text)
     yield field_table(d)
 
 
@@ -193,13 +195,13 @@ def _outliers(d: Diagnosis) -> Iterable[Block]:
     return outlier_blocks("", [(f, f.error, f.sigmas) for f in faulty])
 
 
-def _residuals(d: Diagnosis) -> Iterator[Arm | Block]:
+def _residuals(d: Diagnosis) -> Iterator[ShownArm | Block]:
     from elastocal.report.residual_figures import residual_figures
     from elastocal.report.residual_view import residual_table, residuals_by
 
     base = d.calibrated
     assert base is not None
-    yield Text("What the model leaves before the effects found are added.")
+    yield Sentence("What the model leaves before the effects found are added.")
     yield from residual_figures(base.model, base.observed, base.x, base.residual)
     yield residual_table(base.observed, residuals_by(base.observed, base.residual))
 
@@ -486,7 +488,7 @@ def error_steps(d: Diagnosis) -> tuple[BudgetStep, ...]:
     return tuple(step for step in d.budget if step.step != "noise_floor")
 
 
-def gap_table(d: Diagnosis) -> Table:
+def gap_table(d: Diagnosis) -> ShownTable:
     """The budget step by step, the noise last."""
     return budget_table(_named_steps(d), ("noise alone", d.gap.noise_floor))
 
@@ -502,7 +504,7 @@ OF_CANDIDATES = (
 )
 
 
-def candidate_table(d: Diagnosis, first: int, last: int) -> Table:
+def candidate_table(d: Diagnosis, first: int, last: int) -> ShownTable:
     """The candidates of these ranks, the best first; with rank 0 an unknown effect and none, which
     are candidates as well."""
     rows = [
@@ -517,11 +519,11 @@ def candidate_table(d: Diagnosis, first: int, last: int) -> Table:
         rows.append(("an effect outside the catalogue", probability(d.probability_unknown), *none))
         rows.append(("no further effect", probability(d.probability_nothing), *none))
     heads = ("candidate", "probability", "evidence", "d", "seen from", "settings")
-    table = Table(heads, rows, (0, 5), title=title, note=OF_CANDIDATES)
+    table = ShownTable(heads, rows, (0, 5), title=title, note=OF_CANDIDATES)
     return table.when_narrow(5) if any(row[5] for row in rows) else table.without(5)
 
 
-def added_parameter_table(d: Diagnosis) -> Table:
+def added_parameter_table(d: Diagnosis) -> ShownTable:
     """Fitted parameters of the effects found, with 95 % half widths, and their settings."""
     rows: Rows = []
     for f in d.effects:
@@ -530,10 +532,10 @@ def added_parameter_table(d: Diagnosis) -> Table:
         if f.settings:
             rows.append((f"{effect_at(f)}: {settings_of(d, f.settings)}", "", "", ""))
     title = "Parameters of the effects found"
-    return Table(("parameter", "value", "± 95 %", "unit"), rows, (0, 3), title=title)
+    return ShownTable(("parameter", "value", "± 95 %", "unit"), rows, (0, 3), title=title)
 
 
-def structure_table(d: Diagnosis, most: int) -> Table:
+def structure_table(d: Diagnosis, most: int) -> ShownTable:
     """Tests that name no effect, the most conspicuous first."""
     tests = sorted(d.structure, key=lambda t: (t.p_family, t.p_value))[:most]
     rows: Rows = [(driver_name(t.driver), p_value(t.p_value), p_value(t.p_family)) for t in tests]
@@ -541,10 +543,10 @@ def structure_table(d: Diagnosis, most: int) -> Table:
         "Does the residual depend on it at all? These tests name no effect: whole configurations "
         f"change sign, and the last column counts all {len(d.structure)}."
     )
-    return Table(("depends on", "p", "p, all tests"), rows, note=note)
+    return ShownTable(("depends on", "p", "p, all tests"), rows, note=note)
 
 
-def pair_table(d: Diagnosis) -> Table:
+def pair_table(d: Diagnosis) -> ShownTable:
     """How far apart each pair of rivals is before and after the extra poses."""
     rows = [
         (
@@ -559,10 +561,10 @@ def pair_table(d: Diagnosis) -> Table:
         "them is right with probability Φ(d/2)."
     )
     heads = ("rivals", "d so far", "d with the extra poses")
-    return Table(heads, rows, title="Rivals", note=note)
+    return ShownTable(heads, rows, title="Rivals", note=note)
 
 
-def untested_table(d: Diagnosis) -> Table:
+def untested_table(d: Diagnosis) -> ShownTable:
     """Effects that could not be tested, those with the same reason and remedy in one row."""
     groups: dict[tuple[str, str], dict[str, list[str]]] = {}
     for u in d.untested:
@@ -572,7 +574,7 @@ def untested_table(d: Diagnosis) -> Table:
         (", ".join(f"{name} ({places(at, True)})" for name, at in effects.items()), *reason)
         for reason, effects in groups.items()
     ]
-    return Table(("effect", "why", "record or measure"), rows, (0, 1, 2), title="Not tested")
+    return ShownTable(("effect", "why", "record or measure"), rows, (0, 1, 2), title="Not tested")
 
 
 def alike(d: Diagnosis) -> list[str]:
@@ -587,11 +589,11 @@ def alike(d: Diagnosis) -> list[str]:
     return [together([told(e) for e in rivals]) for rivals in d.indistinguishable]
 
 
-def stage_table(d: Diagnosis) -> Table:
+def stage_table(d: Diagnosis) -> ShownTable:
     """The stages of the chain from commanded joints to tracker, with the evidence for each."""
     location = d.location
     if location is None:
-        return Table((), [])
+        return ShownTable((), [])
     shared = bool(location.shares)
     found = location.shares or location.stages
     rows = [
@@ -599,21 +601,21 @@ def stage_table(d: Diagnosis) -> Table:
         for stage, name in STAGES.items()
         for value in (found.get(stage, 0.0),)
     ]
-    return Table(("stage", "share of the error" if shared else "probability"), rows)
+    return ShownTable(("stage", "share of the error" if shared else "probability"), rows)
 
 
-def place_probabilities(d: Diagnosis) -> Table:
+def place_probabilities(d: Diagnosis) -> ShownTable:
     """The likeliest places, the likeliest first."""
     found = [] if d.location is None or d.location.shares else d.location.places.items()
     order = sorted(found, key=lambda item: -item[1])
     rows = [(place(where), probability(p)) for where, p in order[:MOST_PLACES]]
-    return Table(("place", "probability"), rows)
+    return ShownTable(("place", "probability"), rows)
 
 
-def extra_visits(d: Diagnosis, kinds: Sequence[str]) -> Table:
+def extra_visits(d: Diagnosis, kinds: Sequence[str]) -> ShownTable:
     """The extra poses in the order of measuring."""
     if d.extra is None or d.extra.plan is None:
-        return Table((), [])
+        return ShownTable((), [])
     plan = d.extra.plan
     heads = ["order", "pose", *joint_heads(kinds), "force N"]
     heads += ["approach"] if plan.approach is not None else []
@@ -629,4 +631,6 @@ def extra_visits(d: Diagnosis, kinds: Sequence[str]) -> Table:
             row.append(f"{plan.time[i] / 60:.1f}")
         table.append(tuple(row))
     more = len(plan) - len(table)
-    return Table(tuple(heads), table, (), title="Poses", note=f"and {more} more" if more else "")
+    return ShownTable(
+        tuple(heads), table, (), title="Poses", note=f"and {more} more" if more else ""
+    )

@@ -5,10 +5,13 @@ from __future__ import annotations
 import math
 import re
 from collections.abc import Iterable, Sequence
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
-from elastocal.report.blocks import Table, Text
+from elastocal.report.blocks import Sentence, ShownTable
 from elastocal.text import printable
+
+if TYPE_CHECKING:
+    from elastocal.planning.plan import Plan
 
 # SI unit → (factor, unit shown).
 SHOWN = {
@@ -169,7 +172,9 @@ def title_of(*names: str) -> str:
 MOST_FAULTY = 100  # rows of the table of outliers
 
 
-def outlier_blocks(title: str, found: Sequence[tuple[Any, float, float]]) -> list[Table | Text]:
+def outlier_blocks(
+    title: str, found: Sequence[tuple[Any, float, float]]
+) -> list[ShownTable | Sentence]:
     """Readings beyond the noise: each with its line and names, its error in m, and that over the
     noise."""
     rows = [
@@ -179,13 +184,13 @@ def outlier_blocks(title: str, found: Sequence[tuple[Any, float, float]]) -> lis
     ]  # fmt: skip
     heads = ("line", "configuration", "marker", "error", "error / noise")
     more = len(found) - len(rows)
-    blocks: list[Table | Text] = [Table(heads, rows, (1, 2), title=title)]
-    return [*blocks, Text(f"and {more} more", soft=True)] if more else blocks
+    blocks: list[ShownTable | Sentence] = [ShownTable(heads, rows, (1, 2), title=title)]
+    return [*blocks, Sentence(f"and {more} more", soft=True)] if more else blocks
 
 
 def budget_table(
     steps: Sequence[tuple[str, float, tuple[float, float]]], floor: tuple[str, float] | None
-) -> Table:
+) -> ShownTable:
     """Steps (name, held-out rms in m, its 95 % interval) and what each changes; `floor` last."""
     rows: list[tuple[str, ...]] = []
     for k, (name, rms, ci95) in enumerate(steps):
@@ -194,7 +199,7 @@ def budget_table(
     if floor is not None:
         rows.append((floor[0], length(floor[1]), "", ""))
     heads = ("model", "held-out rms", "95 %", "change")
-    return Table(heads, rows, title="Error budget (3-D rms error at held-out poses)")
+    return ShownTable(heads, rows, title="Error budget (3-D rms error at held-out poses)")
 
 
 def joint_heads(kinds: Sequence[str]) -> list[str]:
@@ -207,3 +212,9 @@ def joint_texts(q: Iterable[float], kinds: Sequence[str], decimals: int = 2) -> 
         f"{math.degrees(v) if kind == 'revolute' else v * 1e3:.{decimals}f}"
         for v, kind in zip(q, kinds, strict=True)
     ]
+
+
+def first_stops(plan: Plan) -> dict[int, int]:
+    """Pose → its first place in the order of execution, from 1."""
+    stops = reversed(list(enumerate(plan.execution.stops)))
+    return {stop.pose: k + 1 for k, stop in stops if not stop.again}

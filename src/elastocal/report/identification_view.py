@@ -19,12 +19,12 @@ from elastocal.report.blocks import (
     WARNING,
     Block,
     Fold,
-    Key,
+    KeyFigures,
     Lines,
     Report,
-    Table,
-    Text,
-    Verdict,
+    Sentence,
+    ShownTable,
+    ShownVerdict,
 )
 from elastocal.report.formatting import (
     budget_table,
@@ -73,15 +73,10 @@ FEW = 6  # rows that stand open
 MOST_CORRELATIONS = 30
 
 
-def report(
-    result: Calibration, truth: Truth | None = None, published: Published | None = None,
-    certificate: bool = False,
-) -> Report:  # fmt: skip
+def calibration_report(
+    result: Calibration, truth: Truth | None = None, published: Published | None = None
+) -> Report:
     """An identification; `truth` and `published` (SI) stand beside the estimates."""
-    if certificate:
-        from elastocal.report.certificate_view import certificate_report
-
-        return certificate_report(result)
     found = _blocks(result, truth, published)
     title = title_of(result.model.chain.name, result.model.cell.name)
     return Report("Identification", title, found, result.model.backend_report())
@@ -93,7 +88,7 @@ def _blocks(
     budget = cache(lambda: gap_budget(result))
     yield Fold("", lambda: [key(result, budget())])
     verdict = judgement(result)
-    yield Verdict(verdict.tone, verdict.headline)
+    yield ShownVerdict(verdict.tone, verdict.headline)
     new = [] if result.predicted is None else [("Expected", at_new_poses(result.predicted))]
     yield Lines([
         ("Error (rms)", error_line(result)), *new,
@@ -107,7 +102,7 @@ def _blocks(
         yield from _open_if_few(combination_table(result, truth), told)
         yield Fold("Combinations with all their members", lambda: _whole_combinations(result))
     for line in undetermined_lines(result, FEW):
-        yield Text(sentence(line), soft=True)
+        yield Sentence(sentence(line), soft=True)
     yield Lines([
         ("Readings", readings(result)),
         ("Identified", what_was_identified(result)),
@@ -127,7 +122,7 @@ def _blocks(
 MOST_GROUPS = 3
 
 
-def _open_if_few(table: Table, summary: str) -> Iterator[Block]:
+def _open_if_few(table: ShownTable, summary: str) -> Iterator[Block]:
     if len(table.rows) <= FEW:
         yield table
     else:
@@ -142,7 +137,7 @@ def _folds(
     missing = undetermined_table(result, truth)
     if missing.rows:
         why = f"Every parameter without a value, and why ({len(missing.rows)})"
-        remedy = Text(
+        remedy = Sentence(
             "To see an invisible parameter, measure poses and loads that move the markers through "
             "it. To separate a combination, add markers, loads or poses in which its members "
             "differ.",
@@ -166,7 +161,7 @@ def _folds(
     yield Fold("Sets of parameters side by side", lambda: [sets_table(result)])
 
 
-def key(result: Calibration, budget: ErrorBudget | None) -> Key:
+def key(result: Calibration, budget: ErrorBudget | None) -> KeyFigures:
     """The error before and after, and the noise that is in both."""
     floor = None if budget is None else budget.floor
     held = math.isfinite(result.heldout_rms)
@@ -181,7 +176,7 @@ def key(result: Calibration, budget: ErrorBudget | None) -> Key:
         figures.append(("new poses, without noise", f"≤ {length(at)}"))
     if floor is not None and budget is not None:
         figures.append((f"noise ({budget.floor_name})", length(floor)))
-    return Key(headline, figures)
+    return KeyFigures(headline, figures)
 
 
 def _error_figures(result: Calibration, budget: ErrorBudget | None) -> Iterator[Block]:
@@ -243,9 +238,9 @@ def _distribution(result: Calibration) -> Iterator[Block]:
 
     summary = result.residual_summary
     assert summary is not None
-    yield Text(shape_line(summary))
+    yield Sentence(shape_line(summary))
     if (scatter := summary.whole.held_out_mean_square) is not None:
-        yield Text(
+        yield Sentence(
             f"In held-out configurations the scatter is {significant(scatter**0.5)} times that of "
             "the noise model."
         )
@@ -256,7 +251,7 @@ def _distribution(result: Calibration) -> Iterator[Block]:
 def _outliers(result: Calibration) -> Iterator[Block]:
     if groups := fault_lines(result):
         yield Lines([("Groups", text) for text in groups])
-        yield Text(false_alarm_line(result) or "", soft=True)
+        yield Sentence(false_alarm_line(result) or "", soft=True)
     every = (
         (f"Kept in the fit; {option('outliers', 'drop')} excludes them", result.outliers),
         ("Excluded from the fit", result.excluded),
@@ -270,10 +265,10 @@ def _whole_combinations(result: Calibration) -> Iterator[Block]:
     for c in result.combinations:
         whole = shortened(c, len(c.terms))
         if whole != shortened(c):
-            yield Text(whole)
+            yield Sentence(whole)
 
 
-def correlation_table(result: Calibration) -> Table:
+def correlation_table(result: Calibration) -> ShownTable:
     """The parameters that are known far better together than each alone."""
     rows = [
         (printable(a), printable(b), f"{r:+.3f}" if abs(r) < 0.9995 else f"{r:+.6f}")
@@ -285,7 +280,7 @@ def correlation_table(result: Calibration) -> Table:
         "it, and so does every prediction."
     )
     note += f" {more} more are in the result's file." if more else ""
-    return Table(("parameter", "and", "correlation"), rows, (0, 1), note=note)
+    return ShownTable(("parameter", "and", "correlation"), rows, (0, 1), note=note)
 
 
 # Sentences
@@ -443,14 +438,16 @@ def before_and_after(result: Calibration, budget: ErrorBudget | None) -> dict[st
     return found
 
 
-def spread_table(found: dict[str, Array], count: str, title: str = "Before and after") -> Table:
+def spread_table(
+    found: dict[str, Array], count: str, title: str = "Before and after"
+) -> ShownTable:
     """Mean, standard deviation, 95 % quantile and maximum of lengths (n,) in m, by name."""
     rows = []
     for name, e in found.items():
         sizes = (e.mean(), e.std(), np.quantile(e, 0.95), e.max())
         rows.append((name, str(len(e)), *(length(float(size)) for size in sizes)))
     heads = ("error of the position", count, "mean", "std", "95 %", "max")
-    return Table(heads, rows, title=title)
+    return ShownTable(heads, rows, title=title)
 
 
 def budget_steps(
@@ -474,7 +471,7 @@ OF_SETS = (
 )
 
 
-def influence_table(result: Calibration) -> Table:
+def influence_table(result: Calibration) -> ShownTable:
     """The configurations that decide most, by Cook's distance; those without others to judge them
     first."""
     found = sorted(result.influence(), key=lambda c: (-c.cook, -c.leverage))[:MOST_INFLUENTIAL]
@@ -490,7 +487,7 @@ def influence_table(result: Calibration) -> Table:
         "configuration", "readings", "leverage (parameters)", "Cook's distance", "moves most",
         "by (std)",
     )  # fmt: skip
-    return Table(
+    return ShownTable(
         heads,
         rows,
         (0, 4),
@@ -498,7 +495,7 @@ def influence_table(result: Calibration) -> Table:
     )
 
 
-def sets_table(result: Calibration) -> Table:
+def sets_table(result: Calibration) -> ShownTable:
     """Sets of parameters side by side."""
     rows = []
     for s in result.parameter_sets():
@@ -515,7 +512,7 @@ def sets_table(result: Calibration) -> Table:
         "set", "parameters", "fitted rms", "held-out rms", "over the chosen", "95 %",
         "log-likelihood over the chosen",
     )  # fmt: skip
-    return Table(
+    return ShownTable(
         heads,
         rows,
         note=OF_SETS,
@@ -536,11 +533,11 @@ SOURCES = {
 }
 
 
-def uncertainty_table(result: Calibration) -> Table:
+def uncertainty_table(result: Calibration) -> ShownTable:
     """What the error of a predicted reading is made of."""
     budget = result.uncertainty()
     if budget is None:
-        return Table((), [])
+        return ShownTable((), [])
     total = budget.total
     rows = [
         (words, length(part), f"{100 * (part / total) ** 2 if total else 0:.0f} %")
@@ -549,4 +546,4 @@ def uncertainty_table(result: Calibration) -> Table:
     ]
     title = "Parts of the error of a predicted reading"
     note = "At the poses fitted, each as if it had not been; the squares add up."
-    return Table(("source", "3-D rms", "share of the square"), rows, title=title, note=note)
+    return ShownTable(("source", "3-D rms", "share of the square"), rows, title=title, note=note)

@@ -15,7 +15,7 @@ from elastocal.identification.noise_summary import SLIDES, Noise, NoiseSize
 from elastocal.identification.residuals import GroupSummary, ResidualSummary
 from elastocal.identification.result import Calibration
 from elastocal.model.observations import available_noise
-from elastocal.report.blocks import Table
+from elastocal.report.blocks import ShownTable
 from elastocal.report.formatting import (
     counted,
     display,
@@ -51,9 +51,6 @@ INTERVALS = {
         "t intervals that assume independent readings (after weighting), with the noise level "
         "from the residual, even if stated"
     ),
-    "clustered": (
-        "robust to correlation within a configuration; they assume independent configurations"
-    ),
     "profile": (
         "profile of the sum of squares, which follows the curvature of the model and may be "
         "lopsided; assumes independent normal noise"
@@ -70,9 +67,6 @@ INTERVALS = {
         "profile of the fit under the constraints: one-sided at a bound, and too wide rather than "
         "too narrow near one; assumes normal noise"
     ),
-    "eq7": "as published, eq. (7): equal, independent noise of the residual's size",
-    "eq8": "as published, eq. (8): independent noise with σ taken as known",
-    "eq11": "as published, eq. (11): independent noise with σ taken as known",
     "eq13": (
         "as published, eq. (13): weights taken as known although they come from the same "
         "residuals, so the intervals are too narrow"
@@ -318,11 +312,11 @@ def size_rows(noise: Noise) -> list[tuple[str, str]]:
     ]
 
 
-def size_table(noise: Noise) -> Table:
-    return Table(("part", "size"), size_rows(noise), title="Noise, standard deviations")
+def size_table(noise: Noise) -> ShownTable:
+    return ShownTable(("part", "size"), size_rows(noise), title="Noise, standard deviations")
 
 
-def candidate_table(noise: Noise) -> Table:
+def candidate_table(noise: Noise) -> ShownTable:
     """Noise models that were tried, best first: words, variances, criterion above the best."""
     tried = sorted(noise.tried or (), key=lambda t: t.criterion)
     rows = [
@@ -334,7 +328,7 @@ def candidate_table(noise: Noise) -> Table:
         "The information criterion: twice the loss in log-likelihood and a price per variance; 10 "
         "above the best is practically no support."
     )
-    return Table(heads, rows, title="Noise models tried", note=note)
+    return ShownTable(heads, rows, title="Noise models tried", note=note)
 
 
 def kind_in_words(kind: str) -> str:
@@ -423,13 +417,13 @@ def in_time_line(result: Calibration) -> str | None:
     )
 
 
-def deviating_table(summary: ResidualSummary) -> Table:
+def deviating_table(summary: ResidualSummary) -> ShownTable:
     """Groups of readings that scatter unlike the noise model."""
     rows = [
         (group_name(by, g), str(g.n), ratio(g), f"{g.p_holm:.1g}") for by, g in summary.deviating
     ]
     heads = ("scatters unlike the noise model", "values", "observed / expected", "p (Holm)")
-    return Table(heads, rows)
+    return ShownTable(heads, rows)
 
 
 def group_name(by: str, group: GroupSummary) -> str:
@@ -536,7 +530,7 @@ def _bends(result: Calibration, finding: FaultyGroup) -> bool:
 SMOOTH_HEADS = ("smooth function", "rms", "95 %", "known to ±", "unit", "coefficients' worth")
 
 
-def smooth_table(result: Calibration) -> Table:
+def smooth_table(result: Calibration) -> ShownTable:
     """A row for each function and unit; what was left out has none."""
     rows = []
     for part in result.smooth:
@@ -556,7 +550,7 @@ def smooth_table(result: Calibration) -> Table:
         "where it was measured, and explain nothing. Each takes as many of its coefficients as "
         "the readings pay for."
     )
-    return Table(SMOOTH_HEADS, rows, (0, 4), title="Smooth functions", note=note)
+    return ShownTable(SMOOTH_HEADS, rows, (0, 4), title="Smooth functions", note=note)
 
 
 def counted_functions(result: Calibration) -> str:

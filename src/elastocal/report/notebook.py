@@ -13,7 +13,8 @@ import numpy as np
 from elastocal.compensation.compensate import commands_csv, in_file_units, joint_columns
 from elastocal.errors import InputError
 from elastocal.model.effects.catalogue import effect_of
-from elastocal.report.blocks import Arm, Figure, Fold, unfolded
+from elastocal.report.blocks import Figure, Fold, ShownArm, unfolded
+from elastocal.report.formatting import first_stops
 from elastocal.report.page import html_of
 from elastocal.report.terminal import report_of
 from elastocal.text import cell_meaning, did_you_mean, listed, quoted
@@ -50,13 +51,13 @@ def plot(result: object, kind: str | None, interactive: bool, ax: Any = None) ->
     if interactive and kind is None and arms:
         chosen = arms[0]
     opened = unfolded(folds, lambda fold: chosen in fold.figures)
-    found = [b for b in opened if isinstance(b, Figure | Arm) and b.name == chosen]
+    found = [b for b in opened if isinstance(b, Figure | ShownArm) and b.name == chosen]
     if not found:
         raise InputError(
             f"no figure {quoted(chosen)}{did_you_mean(chosen, every)}; there are {listed(every)}"
         )
     if interactive:
-        if not isinstance(found[0], Arm):
+        if not isinstance(found[0], ShownArm):
             told = f"; interactive=True turns the arm: {listed(arms)}" if arms else ""
             raise InputError(f"the figure {quoted(chosen)} stands still{told}")
         from elastocal.report.arm_view import turned
@@ -66,7 +67,7 @@ def plot(result: object, kind: str | None, interactive: bool, ax: Any = None) ->
     from elastocal.report.figures import figure_of
 
     block = found[0]
-    drawn = space_figure(block) if isinstance(block, Arm) else block
+    drawn = space_figure(block) if isinstance(block, ShownArm) else block
     if ax is not None:
         return figure_of(drawn, _instead(ax))
     figure: Any = figure_of(drawn)
@@ -129,8 +130,6 @@ def _plan_frame(plan: Plan) -> pd.DataFrame:
     columns |= dict(zip(joint_columns(kinds), in_file_units(plan.q, kinds).T, strict=True))
     if plan.level_joint is not None:
         columns["level"] = plan.group + 1
-    from elastocal.report.plan_view import first_stops
-
     order = first_stops(plan)
     columns["order"] = [order.get(k) for k in range(len(plan.q))]
     return pd.DataFrame(columns)

@@ -24,23 +24,22 @@ from elastocal import __version__
 from elastocal.files import atomic_write_text, open_input
 from elastocal.report.blocks import (
     WARNING,
-    Arm,
     Bar,
     Block,
     Figure,
     Fold,
     Heading,
-    Key,
+    KeyFigures,
     Lines,
-    Table,
-    Text,
-    Verdict,
+    Sentence,
+    ShownArm,
+    ShownTable,
+    ShownVerdict,
 )
 from elastocal.report.formatting import typeset
 from elastocal.report.terminal import report_of
 from elastocal.screen import shown
 
-FEWEST_SECTIONS = 4  # that are worth a list
 LIBRARIES = ("numpy", "scipy", "casadi")
 Inputs = Mapping[str, str] | Iterable[str | Path] | None
 
@@ -104,7 +103,6 @@ def _framed(head: str, body: str, space: bool, kind: str) -> str:
     script = resource("report.js")
     hashes = " ".join(f"'sha256-{_digest(text)}'" for text in (script, source) if text)
     carried = f'<script type="application/octet-stream" id="plotly">{packed}</script>'
-    contents, body = ("", body) if kind else _with_contents(body)
     return f"""<!doctype html>
 <html lang="en">
 <head>
@@ -118,24 +116,12 @@ style-src 'unsafe-inline'; img-src data: blob:; script-src {hashes}">
 </head>
 <body class="{kind}">
 <h1>{head}</h1>
-{contents}
 {body}
 {carried if space else ""}
 <script>{script}</script>
 </body>
 </html>
 """
-
-
-def _with_contents(body: str) -> tuple[str, str]:
-    """A list of the sections, where there are some, and the body with the places that it names."""
-    heads = re.findall(r"<h2>(.*?)</h2>", body)
-    if len(heads) < FEWEST_SECTIONS:
-        return "", body
-    number = iter(range(len(heads)))
-    body = re.sub("<h2>", lambda _: f'<h2 id="part{next(number)}">', body)
-    links = "".join(f'<a href="#part{k}">{head}</a>' for k, head in enumerate(heads))
-    return f'<nav aria-label="Contents">{links}</nav>', body
 
 
 # Blocks as HTML
@@ -167,17 +153,17 @@ def html_of(
 
 
 def _html(block: Block, deep: int, pictures: bool, summary: str) -> str:
-    if isinstance(block, Verdict):
+    if isinstance(block, ShownVerdict):
         return _verdict(block)
-    if isinstance(block, Key):
+    if isinstance(block, KeyFigures):
         return _key(block)
     if isinstance(block, Heading):
         return f"<h{deep}>{text_of(block.text)}</h{deep}>"
-    if isinstance(block, Text):
+    if isinstance(block, Sentence):
         return f'<p class="{"soft" if block.soft else "told"}">{text_of(block.text)}</p>'
     if isinstance(block, Lines):
         return _lines(block)
-    if isinstance(block, Table):
+    if isinstance(block, ShownTable):
         return _titled_table(block, deep, summary) if block.rows else ""
     if isinstance(block, Fold):
         if not (pictures or block.printed):
@@ -189,7 +175,7 @@ def _html(block: Block, deep: int, pictures: bool, summary: str) -> str:
     return _picture(block) if pictures else ""
 
 
-def _verdict(v: Verdict) -> str:
+def _verdict(v: ShownVerdict) -> str:
     tone = '<span class="tone" aria-hidden="true"></span>'
     return (
         f'<section class="judgement {v.tone}" aria-label="Verdict"><p class="headline">{tone} '
@@ -197,7 +183,7 @@ def _verdict(v: Verdict) -> str:
     )
 
 
-def _key(key: Key) -> str:
+def _key(key: KeyFigures) -> str:
     figures = "".join(
         f"<div><dt>{text_of(name)}</dt><dd>{text_of(number)}</dd></div>"
         for name, number in key.figures
@@ -216,7 +202,7 @@ def _lines(block: Lines) -> str:
     return f'<dl class="lines">{"".join(parts)}</dl>' if parts else ""
 
 
-def _titled_table(t: Table, deep: int, summary: str) -> str:
+def _titled_table(t: ShownTable, deep: int, summary: str) -> str:
     told = not t.title or summary.startswith(t.title.partition(" (")[0])
     title = "" if told else f"<h{deep}>{text_of(t.title)}</h{deep}>\n"
     notes = " ".join(note for note in (t.of_bars, t.note) if note)
@@ -224,7 +210,7 @@ def _titled_table(t: Table, deep: int, summary: str) -> str:
     return f"{title}{_table(t)}{below}"
 
 
-def _table(t: Table) -> str:
+def _table(t: ShownTable) -> str:
     kinds = ["name" if k in t.words else "number" for k in range(len(t.heads))]
     heads = [
         f'<th scope="col" class="{kind}">{text_of(head)}</th>'
@@ -272,7 +258,7 @@ def _bar(bar: Bar | None) -> str:
     )
 
 
-def _picture(block: Figure | Arm) -> str:
+def _picture(block: Figure | ShownArm) -> str:
     caption = f"<figcaption>{text_of(block.caption)}</figcaption>" if block.caption else ""
     if isinstance(block, Figure):
         from elastocal.report.figures import svg

@@ -21,7 +21,7 @@ from elastocal.identification.result import (
     Estimate,
     deviation,
 )
-from elastocal.report.blocks import Bar, Figure, Table
+from elastocal.report.blocks import Bar, Figure, ShownTable
 from elastocal.report.formatting import (
     display,
     estimate,
@@ -204,7 +204,7 @@ def _sides(value: float, ci95: tuple[float, float]) -> tuple[float, float]:
 
 def parameter_table(
     result: Calibration, truth: Truth | None = None, published: Published | None = None
-) -> Table:
+) -> ShownTable:
     """The parameters identified alone, by effect; `published`: what others found (SI)."""
     own = [e for e in result.ordinary if e.identifiable]
     effects = {p.name: p.effect.replace("_", " ") for p in result.model.parameters}
@@ -229,7 +229,7 @@ def parameter_table(
     return replace(table, groups=groups)
 
 
-def combination_table(result: Calibration, truth: Truth | None = None) -> Table:
+def combination_table(result: Calibration, truth: Truth | None = None) -> ShownTable:
     """Sums of parameters that the data determine although their members they do not."""
     found = result.combinations
     true = None
@@ -243,7 +243,7 @@ def _numbers(
     title: str, first: str, found: Iterable[Estimate | Combination], names: list[str],
     truth: list[float | None] | None, references: list[float | None] | None,
     after: dict[str, list[str]],
-) -> Table:  # fmt: skip
+) -> ShownTable:  # fmt: skip
     """Names, values, intervals and units, with true values where known, and columns `after`.
 
     Bars show the interval beside the true value, else beside the reference.
@@ -276,13 +276,13 @@ def _numbers(
         bars.append(None if at is None or e.value is None or ci95 is None
                     else bar(e.value, ci95, at, bool(truth)))  # fmt: skip
     words = tuple(k for k, head in enumerate(heads) if head in (first, "unit", "in 95 %", "note"))
-    narrow = Table((first, f"value {half}", *(["in 95 %"] if truth else [])), brief, (0, 1, 2),
+    narrow = ShownTable((first, f"value {half}", *(["in 95 %"] if truth else [])), brief, (0, 1, 2),
                    title=title)  # fmt: skip
     drawn = bars if any(bars) else []
     note = "Bars are 95 % intervals beside the nominal value (upright line), each on its own scale."
     if truth:
         note = "Bars are 95 % intervals around the true value (upright line), all equally wide."
-    return Table(tuple(heads), rows, words, title=title, bars=drawn, narrow=narrow,
+    return ShownTable(tuple(heads), rows, words, title=title, bars=drawn, narrow=narrow,
                  of_bars=note if drawn else "")  # fmt: skip
 
 
@@ -291,7 +291,7 @@ def _published(found: tuple[float, float] | None, unit: str) -> str:
     return "–" if found is None else " ± ".join(estimate(*found, unit)[:2])
 
 
-def undetermined_table(result: Calibration, truth: Truth | None = None) -> Table:
+def undetermined_table(result: Calibration, truth: Truth | None = None) -> ShownTable:
     """Every parameter without a value of its own, and why."""
     heads = ["parameter", "nominal", "unit", *(["truth"] if truth else []), "why"]
     rows = []
@@ -302,7 +302,7 @@ def undetermined_table(result: Calibration, truth: Truth | None = None) -> Table
         known = [texts(e, truth.get(e.name))[3]] if truth else []
         unit = display(0.0, e.unit)[1]
         rows.append((printable(e.name), nominal, unit, *known, why_without(result, e)))
-    return Table(tuple(heads), rows, (0, 2, len(heads) - 1))
+    return ShownTable(tuple(heads), rows, (0, 2, len(heads) - 1))
 
 
 MOST_DOTS = 40

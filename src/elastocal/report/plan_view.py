@@ -17,15 +17,16 @@ from elastocal.report.blocks import (
     Block,
     Figure,
     Fold,
-    Key,
+    KeyFigures,
     Lines,
     Report,
-    Table,
-    Verdict,
+    ShownTable,
+    ShownVerdict,
 )
 from elastocal.report.formatting import (
     counted,
     display,
+    first_stops,
     joint_heads,
     joint_texts,
     length,
@@ -38,7 +39,7 @@ if TYPE_CHECKING:
     from elastocal.diagnosis.next_poses import NextPoses
 
 
-def report(plan: Plan) -> Report:
+def plan_report(plan: Plan) -> Report:
     """A plan: what it is worth and the stops to make; behind them poses, proof and order."""
     model = plan.model
     title = title_of(model.chain.name, model.cell.name)
@@ -48,7 +49,7 @@ def report(plan: Plan) -> Report:
 def plan_blocks(plan: Plan) -> Iterator[Block]:
     yield Fold("", lambda: [_key(plan)])
     # A gap to the bound is no fault of the plan's: with few poses much of it is the bound's.
-    yield Verdict("warn" if plan.warnings else "good", plan_headline(plan))
+    yield ShownVerdict("warn" if plan.warnings else "good", plan_headline(plan))
     yield Lines([(WARNING, printable(text)) for text in plan.warnings])
     steps = Lines([("Next", text) for text in plan_steps(plan)])
     yield Fold("", lambda: [steps, stop_table(plan), _arm(plan)], figures=("poses",))
@@ -77,7 +78,7 @@ def _next_blocks(found: NextPoses) -> Iterator[Block]:
         yield from plan_blocks(found.plan)
 
 
-def _key(plan: Plan) -> Key:
+def _key(plan: Plan) -> KeyFigures:
     n, minutes = counted(len(plan.q), "pose"), f"{plan.execution.total / 60:.0f} min"
     worth = f"{plan.criterion} = {plan.reported:.4g} {plan.unit}".rstrip()
     figures = [("poses", str(len(plan.q)))]
@@ -89,7 +90,7 @@ def _key(plan: Plan) -> Key:
     figures.append(("time", minutes))
     if len(figures) < 4:
         figures.append(("load states", str(len(plan.forces))))
-    return Key(f"{n} → {worth}, {minutes}", figures)
+    return KeyFigures(f"{n} → {worth}, {minutes}", figures)
 
 
 def _arm(plan: Plan) -> Block:
@@ -147,13 +148,13 @@ TOLD = 2  # parameters that a pose serves, in the table
 SERVES = "most affected if dropped (standard deviation)"
 
 
-def pose_table(plan: Plan) -> Table:
+def pose_table(plan: Plan) -> ShownTable:
     """Joint values and place in the order of execution; less digits where there is no room."""
     two, one, none = (_poses(plan, decimals) for decimals in (2, 1, 0))
     return replace(two, narrow=replace(one, narrow=none))
 
 
-def _poses(plan: Plan, decimals: int) -> Table:
+def _poses(plan: Plan, decimals: int) -> ShownTable:
     kinds = plan.model.chain.kinds
     heads = ["pose", *joint_heads(kinds), "order"]
     heads += [] if plan.seen is None else ["markers"]
@@ -164,23 +165,17 @@ def _poses(plan: Plan, decimals: int) -> Table:
         row += [str(order[k]), *([] if plan.seen is None else [printable(plan.markers(k))])]
         rows.append(tuple(row))
     words = tuple(k for k, head in enumerate(heads) if head == "markers")
-    return Table(tuple(heads), rows, words, title="Poses")
-
-
-def first_stops(plan: Plan) -> dict[int, int]:
-    """Pose → its first place in the order of execution, from 1."""
-    stops = reversed(list(enumerate(plan.execution.stops)))
-    return {stop.pose: k + 1 for k, stop in stops if not stop.again}
+    return ShownTable(tuple(heads), rows, words, title="Poses")
 
 
 def force_text(plan: Plan, load: int) -> str:
     return " ".join(f"{f:g}" for f in plan.forces[load])
 
 
-def reason_table(plan: Plan) -> Table:
+def reason_table(plan: Plan) -> ShownTable:
     """What each pose is there for."""
     rows = [(name, served(r)) for name, r in zip(plan.configurations, plan.reasons, strict=True)]
-    return Table(("pose", SERVES), rows, (1,), title="Why each pose")
+    return ShownTable(("pose", SERVES), rows, (1,), title="Why each pose")
 
 
 def served(reason: Reason) -> str:
@@ -192,7 +187,7 @@ def served(reason: Reason) -> str:
     return ", ".join(parts) or "all slightly"
 
 
-def interval_table(plan: Plan) -> Table:
+def interval_table(plan: Plan) -> ShownTable:
     """Predicted half widths of the 95 % intervals."""
     combined = any(p.combined_with for p in plan.predicted)
     rows: list[tuple[str, ...]] = []
@@ -202,7 +197,7 @@ def interval_table(plan: Plan) -> Table:
         rows.append((*row, _partners(p)) if combined else row)
     heads: tuple[str, ...] = ("parameter", "± 95 %", "unit")
     heads = (*heads, "together with") if combined else heads
-    return Table(heads, rows, (0, 2, 3), title="Predicted intervals")
+    return ShownTable(heads, rows, (0, 2, 3), title="Predicted intervals")
 
 
 def _partners(p: Predicted) -> str:
@@ -210,23 +205,23 @@ def _partners(p: Predicted) -> str:
     return ", ".join(names[:3]) + (f" and {len(names) - 3} more" if len(names) > 3 else "")
 
 
-def curve_table(plan: Plan) -> Table:
+def curve_table(plan: Plan) -> ShownTable:
     """The criterion against the number of poses."""
     heads = ("poses", f"{plan.criterion} {plan.unit}".strip(), "best possible on the pool")
     rows = [
         (str(s.poses), f"{s.value:.4g}", "–" if s.bound is None else f"{s.bound:.4g}")
         for s in plan.curve
     ]
-    return Table(heads, rows, (), title="Number of poses")
+    return ShownTable(heads, rows, (), title="Number of poses")
 
 
-def timed_table(plan: Plan) -> Table:
+def timed_table(plan: Plan) -> ShownTable:
     """The criterion against numbers of poses and of readings that the time allows."""
     heads = ("poses", "readings each", "minutes", f"{plan.criterion} {plan.unit}".strip())
     rows = [
         (str(s.poses), str(s.repeats), f"{s.minutes:.0f}", f"{s.value:.4g}") for s in plan.timed
     ]
-    return Table(heads, rows, (), title="Poses and readings within the time")
+    return ShownTable(heads, rows, (), title="Poses and readings within the time")
 
 
 def removed(plan: Plan) -> list[tuple[str, int]]:
@@ -235,16 +230,16 @@ def removed(plan: Plan) -> list[tuple[str, int]]:
     return [(name.replace("_", " "), n) for name, n in items if n]
 
 
-def removal_table(plan: Plan) -> Table:
+def removal_table(plan: Plan) -> ShownTable:
     """What became of the candidates, rule by rule."""
     tried = max(plan.candidates.tried, 1)
     counts = [*removed(plan), ("feasible", plan.candidates.feasible)]
     rows: list[tuple[str, ...]] = [(name, str(n), f"{100 * n / tried:.1f} %") for name, n in counts]
     note = "Rules are checked in order; a pose counts for the first it violates."
-    return Table(("rule", "candidates", "share"), rows, note=note)
+    return ShownTable(("rule", "candidates", "share"), rows, note=note)
 
 
-def stop_table(plan: Plan) -> Table:
+def stop_table(plan: Plan) -> ShownTable:
     """The stops in the order of execution: what the operator does at each, with a box to tick."""
     motion, rows, now = plan.execution.motion, [], 0.0
     loads = len(plan.forces) > 1
@@ -255,10 +250,10 @@ def stop_table(plan: Plan) -> Table:
         rows.append((str(k + 1), stop.name(plan.configurations), *load, f"{now / 60:.0f}", "☐"))
         now += motion.dwell
     heads = ("stop", "pose", *(["load in N"] if loads else []), "minute", "done")
-    return Table(heads, rows, (2,) if loads else (), title="Stops in order")
+    return ShownTable(heads, rows, (2,) if loads else (), title="Stops in order")
 
 
-def way_table(plan: Plan) -> Table:
+def way_table(plan: Plan) -> ShownTable:
     """How each stop is reached."""
     kinds = plan.model.chain.kinds
     rows = [
@@ -268,7 +263,7 @@ def way_table(plan: Plan) -> Table:
     ]  # fmt: skip
     heads = ("stop", "pose", "via points", "travel s", *joint_heads(kinds))
     note = "Via points lead around obstacles; nothing is measured there."
-    return Table(heads, rows, (), note=note)
+    return ShownTable(heads, rows, (), note=note)
 
 
 APART = 0.02  # of the criterion, between starts of the search: more of them may find better

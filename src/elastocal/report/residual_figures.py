@@ -16,7 +16,7 @@ from elastocal.model.manipulator import Model
 from elastocal.model.observations import Observations
 from elastocal.model.rigid import nominal_flanges
 from elastocal.report.arm_view import residual_arm
-from elastocal.report.blocks import Arm, Figure
+from elastocal.report.blocks import Figure, ShownArm
 from elastocal.report.figures import FAINT, INK, SERIES, dots, panels_of
 from elastocal.report.formatting import display, short_name, significant
 from elastocal.report.residual_view import Residuals, reach, residuals_by, running_mean
@@ -34,7 +34,7 @@ MOST_JOINT_DOTS = 2000  # per joint; the running mean uses every reading
 
 def residual_figures(
     model: Model, observed: Observations, x: Array, residual: Array
-) -> Iterator[Figure | Arm]:
+) -> Iterator[Figure | ShownArm]:
     """Where, when and in which poses an arm at parameter values x (parameters,) errs, by its
     `residual` (rows,)."""
     residuals = residuals_by(observed, residual)

@@ -9,7 +9,7 @@ from numpy.typing import NDArray
 
 from elastocal.identification.residuals import groupings
 from elastocal.model.observations import COMPONENTS, Observations
-from elastocal.report.blocks import Table
+from elastocal.report.blocks import ShownTable
 from elastocal.report.formatting import significant
 from elastocal.text import printable
 from elastocal.units import Array
@@ -106,7 +106,7 @@ MOST_CONFIGURATIONS = 200
 Rows = list[tuple[str, ...]]
 
 
-def residual_table(observed: Observations, residuals: Residuals) -> Table:
+def residual_table(observed: Observations, residuals: Residuals) -> ShownTable:
     """Mean, rms and largest residual of every direction, marker, load state and configuration.
 
     Of a direction they are signed; else lengths of the 3-D residual, and of its mean vector.
@@ -125,7 +125,7 @@ def residual_table(observed: Observations, residuals: Residuals) -> Table:
         if by != "component":
             groups[len(rows)] = by
             rows += _group_rows(part, code[:: observed.size], tuple(names[:MOST_CONFIGURATIONS]))
-    return Table(HEADS, rows, (0, 5), groups, title="Residuals", note=OF_RESIDUALS)
+    return ShownTable(HEADS, rows, (0, 5), groups, title="Residuals", note=OF_RESIDUALS)
 
 
 def _group_rows(part: NDArray[np.float64], code: NDArray[np.int64], names: tuple[str, ...]) -> Rows:

@@ -3,15 +3,14 @@
 from __future__ import annotations
 
 from collections.abc import Iterable
-from importlib import import_module
 from io import StringIO
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, cast
 
 from rich.box import SIMPLE_HEAD
 from rich.console import Console
 from rich.measure import Measurement
-from rich.table import Table as RichTable
-from rich.text import Text as RichText
+from rich.table import Table
+from rich.text import Text
 
 from elastocal.errors import option
 from elastocal.report.blocks import (
@@ -20,9 +19,9 @@ from elastocal.report.blocks import (
     Heading,
     Lines,
     Report,
-    Table,
-    Text,
-    Verdict,
+    Sentence,
+    ShownTable,
+    ShownVerdict,
     unfolded,
 )
 from elastocal.screen import safe_console
@@ -32,27 +31,39 @@ if TYPE_CHECKING:
     from rich.console import RenderableType
 
 PRINTED_WIDTH = 100  # columns of a result as plain text
-# Which module has the report of each kind of result; one result does not load what others need.
-REPORTS = {
-    "Calibration": "identification_view",
-    "Plan": "plan_view",
-    "NextPoses": "plan_view",
-    "Diagnosis": "diagnosis_view",
-    "Comparison": "changes_view",
-    "Compensation": "compensation_view",
-    "Measurements": "compensation_view",
-}
-REPORT_OF = {"NextPoses": "next_report", "Measurements": "readings_report"}
 
 
-def report_of(result: object, **told: Any) -> Report:
-    """What is to be said of a result.  TypeError for a kind without a report."""
-    kind = type(result).__name__
-    if kind not in REPORTS:
-        raise TypeError(kind)
-    module = import_module(f"elastocal.report.{REPORTS[kind]}")
-    found: Report = getattr(module, REPORT_OF.get(kind, "report"))(result, **told)
-    return found
+def report_of(result: object, certificate: bool = False, **told: Any) -> Report:
+    """What is to be said of a result.  Each kind has its module, which no other result loads.
+
+    TypeError for a kind without a report.
+    """
+    kind, fit = type(result).__name__, cast(Any, result)
+    if certificate:
+        from elastocal.report.certificate_view import certificate_report
+
+        return certificate_report(fit)
+    if kind == "Calibration":
+        from elastocal.report.identification_view import calibration_report
+
+        return calibration_report(fit, **told)
+    if kind == "Diagnosis":
+        from elastocal.report.diagnosis_view import diagnosis_report
+
+        return diagnosis_report(fit)
+    if kind == "Comparison":
+        from elastocal.report.changes_view import changes_report
+
+        return changes_report(fit)
+    if kind in ("Plan", "NextPoses"):
+        from elastocal.report.plan_view import next_report, plan_report
+
+        return plan_report(fit) if kind == "Plan" else next_report(fit)
+    if kind in ("Compensation", "Measurements"):
+        from elastocal.report.compensation_view import compensation_report, readings_report
+
+        return compensation_report(fit) if kind == "Compensation" else readings_report(fit)
+    raise TypeError(kind)
 
 
 def print_report(console: Console, result: object, details: bool = True, **told: Any) -> None:
@@ -61,7 +72,7 @@ def print_report(console: Console, result: object, details: bool = True, **told:
     print_blocks(console, report_of(result, **told).blocks, details)
     if not details:
         more = f"{option('details', True)} tells of method, noise, residuals, intervals"
-        console.print(RichText(f"{more} and every combination; so does the report.", style="dim"))
+        console.print(Text(f"{more} and every combination; so does the report.", style="dim"))
 
 
 def printed_text(result: object) -> str:
@@ -83,7 +94,7 @@ def print_blocks(console: Console, blocks: Iterable[Block], details: bool = Fals
             if before not in ("", kind, "Table"):  # a table ends with one
                 console.print()
             if heading and _needs(heading, block):
-                console.print(RichText(heading, style="bold underline"))
+                console.print(Text(heading, style="bold underline"))
             for each in shown:
                 console.print(each)
             heading, before = "", kind
@@ -91,22 +102,22 @@ def print_blocks(console: Console, blocks: Iterable[Block], details: bool = Fals
 
 def _needs(heading: str, block: Block) -> bool:
     """Whether the heading says more than the block below it."""
-    told = block.title if isinstance(block, Table) else ""
+    told = block.title if isinstance(block, ShownTable) else ""
     if isinstance(block, Lines):
         told = block.items[0][0]
     return not (told and heading.startswith(told.partition(" (")[0].partition(",")[0]))
 
 
 def _shown(console: Console, block: Block) -> Iterable[RenderableType]:
-    if isinstance(block, Verdict):
+    if isinstance(block, ShownVerdict):
         style = "bold" if block.tone == "good" else "bold yellow"
         yield _line("Verdict", block.sentence, style)
     elif isinstance(block, Lines):
         for label, text in block.items:
             yield _line(label, text, "bold yellow" if label == WARNING else "bold")
-    elif isinstance(block, Text):
-        yield RichText(printable(block.text), style="dim" if block.soft else "")
-    elif isinstance(block, Table) and block.rows:
+    elif isinstance(block, Sentence):
+        yield Text(printable(block.text), style="dim" if block.soft else "")
+    elif isinstance(block, ShownTable) and block.rows:
         shown, room = block, console.options.update(max_width=WIDEST)
         while True:
             table = table_of(shown)
@@ -116,11 +127,11 @@ def _shown(console: Console, block: Block) -> Iterable[RenderableType]:
             shown = shown.narrow
         yield table
         if block.note:
-            yield RichText(printable(block.note), style="dim")
+            yield Text(printable(block.note), style="dim")
 
 
-def _line(label: str, text: str, style: str) -> RichText:
-    return RichText.assemble((f"{label}: ", style), printable(text))
+def _line(label: str, text: str, style: str) -> Text:
+    return Text.assemble((f"{label}: ", style), printable(text))
 
 
 WIDEST = 1000  # columns; more than any table needs
@@ -128,10 +139,10 @@ STYLES = {"inside": "green", "outside": "bold red", "changed": "bold yellow"}
 LONGEST_WHOLE = 28  # letters; a longer name breaks where its column ends
 
 
-def table_of(shown: Table) -> RichTable:
+def table_of(shown: ShownTable) -> Table:
     """For the terminal: under its title, with a rule below its heads and no frame; words to the
     left, numbers to the right."""
-    table = RichTable(title=shown.title or None, title_justify="left", title_style="bold",
+    table = Table(title=shown.title or None, title_justify="left", title_style="bold",
                       box=SIMPLE_HEAD, pad_edge=False, collapse_padding=True)  # fmt: skip
     for k, head in enumerate(shown.heads):
         words = k in shown.words
@@ -142,5 +153,5 @@ def table_of(shown: Table) -> RichTable:
         table.add_column(head, justify="left" if words else "right", min_width=least,
                          overflow="fold")  # fmt: skip
     for row in shown.rows:
-        table.add_row(*(RichText(printable(cell), STYLES.get(cell, "")) for cell in row))
+        table.add_row(*(Text(printable(cell), STYLES.get(cell, "")) for cell in row))
     return table
