@@ -187,20 +187,31 @@ class Region:
             if found is None or np.linalg.norm(found.u) <= FAR * size:
                 break
             size = float(np.linalg.norm(found.u))
-        if found is None or any(N.shape[1] for N in self.nulls(found)):
-            return found
-        held = found.rows > 0
-        u, prices = equality_space(self.rows[held], self.least[held]).origin, np.zeros(len(held))
-        prices[held] = optimize.nnls(self.rows[held].T, u)[0]
-        wrong = max(float(np.linalg.norm(u - self.rows.T @ prices)),
-                    float(np.max(self.least - self.rows @ u, initial=0.0)))  # fmt: skip
-        if not wrong <= CERTIFIED * max(float(np.linalg.norm(u)), size):
+        if found is None:
+            return None
+        allowed = INEXACT
+        if not any(N.shape[1] for N in self.nulls(found)):
+            held, allowed = found.rows > 0, CERTIFIED
+            u = equality_space(self.rows[held], self.least[held]).origin
+            prices = np.zeros(len(held))
+            prices[held] = optimize.nnls(self.rows[held].T, u)[0]
+            found = Nearest(u, prices, tuple(np.zeros_like(Z) for Z in found.matrices))
+        residual = self._breach(found) / max(float(np.linalg.norm(found.u)), size)
+        if not residual <= allowed:
             raise ElastocalError(
-                f"no certified minimum: the KKT residual is {wrong / size:.1e}; state values that "
-                "the constraints pin from two sides as equalities, and check the units of the "
-                "bounds"
+                f"no certified minimum: the KKT residual is {residual:.1e}; state values that the "
+                "constraints pin from two sides as equalities, and check the units of the bounds"
             )
-        return Nearest(u, prices, found.matrices)
+        return found
+
+    def _breach(self, found: Nearest) -> float:
+        """The largest breach of what Karush, Kuhn and Tucker ask of a nearest point."""
+        pull = self.rows.T @ found.rows
+        for matrix, Z in zip(self.matrices, found.matrices, strict=True):
+            pull = pull + np.tensordot(matrix.slopes, Z, axes=2)
+        missed = float(np.max(self.least - self.rows @ found.u, initial=0.0))
+        short = [m.shortfall(found.u) for m in self.matrices]
+        return max(float(np.linalg.norm(found.u - pull)), missed, *short)
 
     def _cone_program(self, size: float) -> Nearest | None:
         """The nearest point to a solver's accuracy, about `size` away, which is its unit."""
@@ -231,6 +242,7 @@ class Region:
 
 CONTRADICTION = 1e-9  # what equalities may miss each other by, of the size of x
 CERTIFIED = 1e-6  # of |u|: KKT residual above which the point is no minimum
+INEXACT = 1e-4  # the same, of a point that is the cone program's own
 UNDETERMINED = 1e-11  # singular value of unit columns, of the largest
 FAR = 10.0  # times the expected way: what is farther is out of reach
 STEEPEST = 1e7  # of an interval's 1/s: what it leaves across it is below 1e-7
@@ -323,9 +335,10 @@ class Reduced:
                 price = 2 * float(prices[i] / self.unit[i]) if i in held else 0.0
                 label = f"{name} {sign} {value:.6g}"
                 active.append(ActiveConstraint(label, kind, (name,), value, price))
-        for matrix, N, Z in zip(region.matrices, region.nulls(found), found.matrices, strict=True):
+        for in_x, matrix, N, Z in zip(
+            limits.matrices, region.matrices, region.nulls(found), found.matrices, strict=True
+        ):
             if N.shape[1]:
-                in_x = next(m for m in limits.matrices if m.label == matrix.label)
                 names = _names(stated, np.abs(in_x.slopes).sum(axis=(1, 2)))
                 price = 2 * float(matrix.balance**2 @ np.diag(Z))
                 active.append(ActiveConstraint(matrix.label, "semidefinite", names, 0.0, price))
@@ -361,10 +374,11 @@ class Reduced:
         import cvxpy as cp
 
         region, v = self.region, cp.Variable(len(u))
-        wanted = [
-            _value(cp, replace(m, constant=m.at(u), slopes=m.slopes * s).balanced(True), v) >> 0
-            for m in region.matrices
-        ]
+        wanted = []
+        for m in region.matrices:  # u itself is allowed, whatever its rounding says
+            about = m.at(u) + m.shortfall(u) * np.eye(len(m.balance))
+            scaled = replace(m, constant=about, slopes=m.slopes * s).balanced(True)
+            wanted.append(_value(cp, scaled, v) >> 0)
         # What is allowed lies where u·v ≥ 0.  A minimum far from the free one leaves next to
         # nothing of that side.
         if 2 * np.linalg.norm(u) < STEEPEST * s:
@@ -373,7 +387,7 @@ class Reduced:
             wanted += [cp.sum_squares(v) <= 1, u / np.linalg.norm(u) @ v <= 0]
         least = (region.least - region.rows @ u) / s
         near = least >= -FAR
-        if near.any():  # u itself is allowed, whatever its rounding says
+        if near.any():
             wanted.append(region.rows[near] @ v >= np.minimum(least[near], 0.0))
         status = _solve(cp.Problem(cp.Maximize(direction @ v), wanted))
         if v.value is None:

@@ -241,14 +241,9 @@ def _suspects(solution: Solution) -> BoolArray:
     problem = solution.problem
     model, observed = problem.model, problem.observations
     placed = problem.free[is_placed(model)[problem.free]]
-    if not len(placed):
-        e = problem.weights.apply(residual_at(model, problem.parts, solution.fit.x))
-        return ~majority(np.zeros((len(e), 0)), e, observed.size)
-    at = model.regressor(observed.table, problem.x0, placed, observed)
-    B = problem.weights.apply(at.B)
-    scale = np.linalg.norm(B, axis=0)
-    residual = problem.weights.apply(at.residual)
-    return ~majority(B / np.where(scale > 0, scale, 1.0), residual, observed.size)
+    x = problem.x0 if len(placed) else solution.fit.x
+    at = model.regressor(observed.table, x, placed, observed)
+    return ~majority(problem.weights.apply(at.B), problem.weights.apply(at.residual), observed.size)
 
 
 def _agreeing_with_a_sample(solution: Solution) -> BoolArray:

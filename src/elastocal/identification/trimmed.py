@@ -79,8 +79,11 @@ def majority(B: Array, e: Array, size: int, seed: int = 0) -> BoolArray:
     than chance would have it of the whole table.
     """
     n, limit = len(e) // size, special.chdtri(size, INSIDE)
-    U, values, _ = linalg.svd(B, full_matrices=False) if B.size else (B, np.zeros(0), None)
-    Q = U[:, values > 1e-10 * np.max(values, initial=0.0)]
+    Q = B
+    if B.size:
+        scale = np.linalg.norm(B, axis=0)
+        U, values, _ = linalg.svd(B / np.where(scale > 0, scale, 1.0), full_matrices=False)
+        Q = U[:, values > 1e-10 * values[0]]
     # Mean of a χ² variable cut at its 99 % point, per degree of freedom.
     cut = special.chdtr(size + 2, limit) / (1 - INSIDE)
     squared = ((e - Q @ trimmed_fit(Q, e, size, seed)).reshape(n, size) ** 2).sum(axis=1)
