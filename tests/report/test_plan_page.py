@@ -8,6 +8,7 @@ from typing import Any
 
 import numpy as np
 import pytest
+from report.test_words import seen
 from support.cells import kr270_cell
 from support.design_commands import design as design_command
 from support.design_commands import everything_in, write_cell
@@ -62,6 +63,12 @@ def test_view_has_the_poses_of_the_plan(page: Page, plan: Any) -> None:
         away = np.linalg.norm(pose.markers - pose.flange[:3, 3], axis=1)
         local = np.array(list(plan.model.cell.tool.markers.values()))
         assert away == pytest.approx(np.linalg.norm(local, axis=1))
+
+
+def test_a_plan_has_600_words_open_and_among_them_every_stop(plan: Any, no_figures: None) -> None:
+    text = seen(page_of(plan))
+    assert len(text.split()) <= 600
+    assert text.count("☐") == len(plan.execution.stops) > 0
 
 
 def test_writing_is_whole_or_not_at_all(plan: Any, tmp_path: Any) -> None:
