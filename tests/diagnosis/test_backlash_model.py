@@ -9,10 +9,10 @@ import pytest
 from support.cells import kr270_chain
 from support.diagnosis_data import FITTED, Fault, cell, measured, plan
 
-from elastocal.diagnosis.backlash_model import with_likelier_backlash_model
 from elastocal.diagnosis.baseline import fit_baseline
 from elastocal.diagnosis.diagnosis_data import DiagnosisData, diagnosis_data_of
 from elastocal.diagnosis.hypotheses import possible, with_recorded_drivers
+from elastocal.diagnosis.model_set import with_likelier_backlash_model
 from elastocal.model.manipulator import Model
 
 PLAY = Fault("backlash", "joint3", {"backlash": 3e-4})

@@ -9,9 +9,9 @@ from support.diagnosis_data import SIGMA, campaign, diagnosed, random_data
 from elastocal.diagnosis.baseline import fit_baseline
 from elastocal.diagnosis.diagnosis_data import diagnosis_data_of
 from elastocal.diagnosis.hypotheses import possible
-from elastocal.diagnosis.left_out import left_out_residual, left_out_together
 from elastocal.diagnosis.model_set import Item, fit_set
 from elastocal.diagnosis.noise_floor import NoiseValues, covariance, project
+from elastocal.diagnosis.stated_floor import left_out_residual, left_out_together
 
 NOISE = NoiseValues(1.2, np.array([4e-6, 9e-6, 1e-5]), np.full(3, 0.4))
 SEEDS = range(4)

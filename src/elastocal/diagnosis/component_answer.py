@@ -36,12 +36,16 @@ from elastocal.diagnosis.diagnosis import (
     Verdict,
 )
 from elastocal.diagnosis.diagnosis_data import DiagnosisData
-from elastocal.diagnosis.left_out import left_out_residual, squared_lengths
 from elastocal.diagnosis.line_orders import families_of, ripples
 from elastocal.diagnosis.model_set import spans_of
 from elastocal.diagnosis.noise_floor import NoisyData, Projection, Weighted, covariance, project
 from elastocal.diagnosis.shrinkage import NEW_POSES, Shrinkage, rms_with_interval
-from elastocal.diagnosis.stated_floor import SupportedFloor, supported_floor
+from elastocal.diagnosis.stated_floor import (
+    SupportedFloor,
+    left_out_residual,
+    squared_lengths,
+    supported_floor,
+)
 from elastocal.identification.error_budget import BudgetStep
 from elastocal.model.effects.base import Stage, index, turning_joints
 from elastocal.model.effects.gears import GearSpectrum

@@ -15,7 +15,6 @@ from scipy.special import expit
 
 from elastocal.cell.work_cell import Cell, read_cell
 from elastocal.config import read_toml
-from elastocal.diagnosis.backlash_model import with_likelier_backlash_model
 from elastocal.diagnosis.baseline import Baseline, fit_baseline, thinned
 from elastocal.diagnosis.component_answer import PAYS, SumAnswer
 from elastocal.diagnosis.component_search import CLEARLY, compared_score, search_components
@@ -36,14 +35,13 @@ from elastocal.diagnosis.hypotheses import (
     possible,
     with_recorded_drivers,
 )
-from elastocal.diagnosis.model_set import settings_of
+from elastocal.diagnosis.model_set import settings_of, with_likelier_backlash_model
 from elastocal.diagnosis.reading_faults import OutlierScreening, screen_outliers
 from elastocal.diagnosis.shrinkage import (
     Confirmation,
     between_visits,
     budget,
     first_steps,
-    refit,
     shrinkage,
 )
 from elastocal.diagnosis.stated_floor import FALSE_SMOOTH, noise_floor
@@ -458,7 +456,6 @@ def _findings(
     if not known:
         return ()
     confirmation = Confirmation.of(found, plain, rng)
-    parameters = refit(confirmation.parameters, [chosen.items[k] for k in known])
     stays = confirmation.unnamed + gap.unexplained**2
     if chosen.unknown:
         stays = max(stays, gap.explained**2 - gap.noise_floor**2)
@@ -469,7 +466,7 @@ def _findings(
         change = between_visits(dataset, chosen, k)
         measured = len(dataset.blocks.member)
         reduction, ci90, ci95 = shrinkage(posterior_draws, measured, stays, change, rng)
-        fitted, settings = parameters[item.key], settings_of(item)
+        fitted, settings = confirmation.parameters[item.key], settings_of(item)
         findings.append(
             FoundEffect(*item.key, answer.probability[k], reduction, ci90, ci95, fitted, settings)
         )

@@ -504,8 +504,7 @@ def publish(diagnosis: Diagnosis, model: Model, data: str) -> dict[str, Any]:
     the key says _um, everything else in the SI unit that stands beside it.  A number that is not
     known or not finite is null, as JSON has none.
     """
-    d, noise, near = diagnosis, diagnosis.noise, diagnosis.noise.near_repeats
-    units = ["rad" if kind == "revolute" else "m" for kind in model.chain.kinds]
+    d = diagnosis
     content = {
         "schema": SCHEMA,
         "robot": model.chain.name,
@@ -532,23 +531,7 @@ def publish(diagnosis: Diagnosis, model: Model, data: str) -> dict[str, Any]:
         "location": d.location and _location(d.location),
         "structure": d.structure,
         "curves": d.curves,
-        "noise": {
-            "stated": noise.stated,
-            "stated_factor": noise.stated_factor,
-            "ratio_to_stated": noise.ratio_to_stated if noise.stated else None,
-            "reading_sigma_um": _um(noise.reading_sigma),
-            "repeatability": [
-                {"where": f"joint{i}", "value": value, "unit": unit}
-                for i, (value, unit) in enumerate(zip(noise.repeatability, units, strict=True), 1)
-            ],
-            "shared": noise.shared,
-            "shared_by_joint": noise.shared_by_joint,
-            "drift_um": _um(noise.drift),
-            "pure_error_um": _um(noise.pure_error),
-            "near_repeat_um": near and _um(near.scatter),
-            "near_repeats": near and _without(_in_um(near, "soon", "later"), "scatter"),
-            "faulty": [_in_um(reading, "error") for reading in noise.faulty],
-        },
+        "noise": _noise(d.noise, model),
         "untested": d.untested,
         "extra_plan": d.extra and _without(vars(d.extra), "plan"),
         "model_keys": d.model_keys,
@@ -559,6 +542,29 @@ def publish(diagnosis: Diagnosis, model: Model, data: str) -> dict[str, Any]:
         "n_configurations": d.n_configurations,
     }
     return {key: plain(value) for key, value in content.items()}
+
+
+def _noise(noise: NoiseFloor, model: Model) -> dict[str, Any]:
+    near, units = noise.near_repeats, {"revolute": "rad"}
+    return {
+        "stated": noise.stated,
+        "stated_factor": noise.stated_factor,
+        "ratio_to_stated": noise.ratio_to_stated if noise.stated else None,
+        "reading_sigma_um": _um(noise.reading_sigma),
+        "repeatability": [
+            {"where": f"joint{i}", "value": value, "unit": units.get(kind, "m")}
+            for i, (value, kind) in enumerate(
+                zip(noise.repeatability, model.chain.kinds, strict=True), 1
+            )
+        ],
+        "shared": noise.shared,
+        "shared_by_joint": noise.shared_by_joint,
+        "drift_um": _um(noise.drift),
+        "pure_error_um": _um(noise.pure_error),
+        "near_repeat_um": near and _um(near.scatter),
+        "near_repeats": near and _without(_in_um(near, "soon", "later"), "scatter"),
+        "faulty": [_in_um(reading, "error") for reading in noise.faulty],
+    }
 
 
 def _um(length: Any) -> Any:

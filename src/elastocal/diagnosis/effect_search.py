@@ -21,7 +21,6 @@ from elastocal.diagnosis.evidence import (
     scan,
 )
 from elastocal.diagnosis.hypotheses import Hypothesis
-from elastocal.diagnosis.left_out import left_out_square, left_out_together
 from elastocal.diagnosis.model_set import (
     Item,
     ModelSet,
@@ -32,6 +31,7 @@ from elastocal.diagnosis.model_set import (
     signal_of,
 )
 from elastocal.diagnosis.noise_floor import NoiseValues, log_prior
+from elastocal.diagnosis.stated_floor import left_out_square, left_out_together
 from elastocal.diagnosis.unknown import Generic
 from elastocal.model.effects.catalogue import SOMETHING
 from elastocal.units import Array

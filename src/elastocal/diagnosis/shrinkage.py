@@ -12,14 +12,12 @@ from numpy.typing import NDArray
 from scipy import linalg
 from scipy.spatial import cKDTree
 
-from elastocal.diagnosis.backlash_model import EFFECT, under_other_backlash_model
 from elastocal.diagnosis.baseline import Baseline, from_centre, prior_deviations
 from elastocal.diagnosis.diagnosis import FittedParameter, Gap
 from elastocal.diagnosis.diagnosis_data import DiagnosisData
 from elastocal.diagnosis.effect_search import SelectedEffects
 from elastocal.diagnosis.evidence import Grams
 from elastocal.diagnosis.hypotheses import Hypothesis
-from elastocal.diagnosis.left_out import left_out_residual, left_out_together, squared_lengths
 from elastocal.diagnosis.model_set import (
     Item,
     ModelSet,
@@ -28,14 +26,21 @@ from elastocal.diagnosis.model_set import (
     fit_extended,
     fit_set,
     signal_of,
+    under_other_backlash_model,
     with_items,
 )
 from elastocal.diagnosis.noise_floor import NoiseValues, NoisyData, noise_draws, project
-from elastocal.diagnosis.stated_floor import supported_floor
+from elastocal.diagnosis.stated_floor import (
+    left_out_residual,
+    left_out_together,
+    squared_lengths,
+    supported_floor,
+)
 from elastocal.identification.error_budget import BudgetStep, resampled_rms
 from elastocal.identification.scrutiny import stage_of
 from elastocal.measurements import Measurements, visits
 from elastocal.model.effects.placements import BaseFrame
+from elastocal.model.effects.play import Backlash
 from elastocal.model.manipulator import Model, Regression
 from elastocal.model.observations import Observations, observe
 from elastocal.units import Array, IntArray
@@ -381,13 +386,8 @@ class Posterior:
     """Values x (parameters,) of a model, and `spread` (parameters, k): x + spread·z with standard
     normal z (k,) is a draw from what the data leave possible."""
 
-    base: Baseline
     x: Array
     spread: Array
-
-    @property
-    def std(self) -> Array:
-        return np.asarray(np.linalg.norm(self.spread, axis=1))
 
 
 def posteriors(
@@ -421,19 +421,7 @@ def posteriors(
     for noise in noises:
         fit = project(data, noise)
         spread = linalg.solve_triangular(fit.factor, np.diag(width), lower=True).T
-        yield Posterior(base, centre + width * fit.beta, spread)
-
-
-def refit(
-    fitted: Posterior, items: list[Item]
-) -> dict[tuple[str, str], tuple[FittedParameter, ...]]:
-    """Parameters of the known `items` with standard deviations, by effect and place."""
-    std = fitted.std
-    out: dict[tuple[str, str], list[FittedParameter]] = {}
-    for k, p in enumerate(fitted.base.model.parameters):
-        found = FittedParameter(p.name, float(fitted.x[k]), p.unit, float(std[k]))
-        out.setdefault((p.effect, p.where), []).append(found)
-    return {item.key: tuple(out[item.key]) for item in items}
+        yield Posterior(centre + width * fit.beta, spread)
 
 
 # What an effect's searched constants may be instead, and what that does at new poses.
@@ -523,10 +511,17 @@ class Confirmation:
         return cls(dataset, chosen, plain, fitted, observed, tuple(noise))
 
     @cached_property
-    def parameters(self) -> Posterior:
-        """The exact model's values, weighted by all the noise that was found."""
+    def parameters(self) -> dict[tuple[str, str], tuple[FittedParameter, ...]]:
+        """The exact model's values by effect and place, weighted by all the noise that was
+        found."""
         measured, noise = self._regressions(self.fitted)[0], self.chosen.noise
-        return next(posteriors(self.dataset, self.fitted, measured, [noise]))
+        fit = next(posteriors(self.dataset, self.fitted, measured, [noise]))
+        out: dict[tuple[str, str], tuple[FittedParameter, ...]] = {}
+        known = zip(self.fitted.model.parameters, fit.x, fit.spread, strict=True)
+        for p, x, spread in known:
+            found = FittedParameter(p.name, float(x), p.unit, float(np.linalg.norm(spread)))
+            out[p.effect, p.where] = (*out.get((p.effect, p.where), ()), found)
+        return out
 
     @cached_property
     def _after(self) -> Array:
@@ -580,7 +575,7 @@ class Confirmation:
     ) -> list[PosteriorDraw]:
         """What is true if item k, where it is play, follows its law, and if it follows another."""
         doubt, item = self.dataset.other_backlash, self.chosen.items[k]
-        if not (isinstance(item.what, Hypothesis) and item.what.name == EFFECT and doubt):
+        if not (isinstance(item.what, Hypothesis) and item.what.name == Backlash.name and doubt):
             return posterior_draws
         held = [replace(d, probability=d.probability * (1 - doubt)) for d in posterior_draws]
         other = extended(under_other_backlash_model(self.plain.model), _known(self.chosen.items))

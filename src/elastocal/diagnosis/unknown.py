@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+from collections.abc import Iterator, Mapping
 from dataclasses import dataclass
 from typing import ClassVar
 
@@ -86,20 +86,23 @@ def covariates(dataset: DiagnosisData) -> Iterator[Covariate]:
         if size.max() > 0:
             by.append(a * size / size.max())
         yield Covariate("approach", f"approach of joint{i + 1}", np.stack(by, axis=2), joint=i)
-    # A stiffness that changes with the joint's own angle, or with time.
-    for i in loaded:
-        name = f"joint{i + 1} torque"
-        tau = (torque[:, :, i] / np.abs(torque[:, :, i][present]).max())[:, :, None]
+    yield from _of_stiffness(q, {i: torque[:, :, i] for i in loaded}, present, slow)
+    for i in joints if slow is not None else ():
+        product = few[i][:, :, :, None] * slow[:, :, None, :]
+        both = product.reshape(*product.shape[:2], -1)
+        yield Covariate("time × angle", f"time × joint{i + 1} angle", both)
+
+
+def _of_stiffness(
+    q: Array, torque: Mapping[int, Array], present: NDArray[np.bool_], slow: Array | None
+) -> Iterator[Covariate]:
+    """A stiffness that changes with the joint's own angle, or with time."""
+    for i, own in torque.items():
+        name, tau = f"joint{i + 1} torque", (own / np.abs(own[present]).max())[:, :, None]
         by_angle = waves(q[:, :, i], present, WAVES - FEW_WAVES) * tau
         yield Covariate("torque × angle", f"{name} × its angle", by_angle, joint=i)
         if slow is not None:
             yield Covariate("torque × time", f"{name} × time", slow * tau, joint=i)
-    for i in joints:
-        if slow is None:
-            break
-        product = few[i][:, :, :, None] * slow[:, :, None, :]
-        both = product.reshape(*product.shape[:2], -1)
-        yield Covariate("time × angle", f"time × joint{i + 1} angle", both)
 
 
 def wrenches(dataset: DiagnosisData) -> Iterator[tuple[Array, Array]]:

@@ -8,7 +8,6 @@ from dataclasses import dataclass
 import numpy as np
 from scipy import special
 
-from elastocal.diagnosis.backlash_model import EFFECT
 from elastocal.diagnosis.diagnosis import (
     Candidate,
     Curve,
@@ -26,6 +25,7 @@ from elastocal.diagnosis.model_set import Item, ModelSet, distances, settings_of
 from elastocal.diagnosis.noise_floor import NoiseValues, NoisyData
 from elastocal.diagnosis.reading_faults import OutlierScreening
 from elastocal.identification.single_readings import BEYOND, single_readings
+from elastocal.model.effects.play import Backlash
 from elastocal.model.observations import subset
 
 # From scores to an answer: explained, ambiguous, unknown, or nothing significant.
@@ -300,7 +300,7 @@ def _stated_wrong(dataset: DiagnosisData, data: NoisyData, factor: float) -> boo
 def _undecided_backlash(found: SelectedEffects) -> str:
     """That the model of the backlash that was found is not known, where it is not."""
     named = [i.what.where for i in found.chosen.items if isinstance(i.what, Hypothesis)
-             and i.what.name == EFFECT]  # fmt: skip
+             and i.what.name == Backlash.name]  # fmt: skip
     if not named or found.dataset.other_backlash <= OPEN_BACKLASH:
         return ""
     places = " and ".join(named)
