@@ -53,7 +53,6 @@ class Blocks:
 
     @cached_property
     def places(self) -> VisitPlaces:
-        """Where visits stand in the blocks."""
         return VisitPlaces.of(self)
 
     def pack(self, rows: Array) -> Array:

@@ -179,7 +179,6 @@ class SumAnswer:
         return self._followed(self._wide.X[self._rows][:, self._own :])
 
     def _followed(self, moved: Array) -> Array:
-        """What is left (rows, n) of motions of the positions."""
         return np.asarray(moved - self._fitted_directions @ (self._fitted_directions.T @ moved))
 
     @cached_property
@@ -366,7 +365,6 @@ class SumAnswer:
         return squared_lengths(data, left_out_residual(project(data, self.found.noise)))
 
     def _without_these(self, gone: Sequence[int]) -> NoisyData:
-        """The data with the columns of the arm's own parameters and of all other components."""
         data = self.found.data
         keep = np.ones(data.X.shape[2], dtype=bool)
         for k in gone:
@@ -386,7 +384,6 @@ class SumAnswer:
         return tuple(sorted(rows, key=lambda row: -row.share))
 
     def _share(self, family: str, where: str, members: list[int]) -> ComponentShare:
-        """Of these components; of none where there are only lines that are not seen."""
         chosen = [self.found.components[k] for k in members]
         hidden = [
             k for k, c in enumerate(self.hidden, start=len(self.found.components))
@@ -422,7 +419,6 @@ class SumAnswer:
         return EffectGroup(name, places, effects, *share, fall.reduction, fall.ci90)
 
     def _of_kind(self, name: str) -> list[int]:
-        """All components of a kind, the hidden ones with them."""
         every = (*self.found.components, *self.hidden)
         return [k for k, c in enumerate(every) if _kind(c) == name]
 
@@ -520,7 +516,6 @@ class SumAnswer:
 
     @property
     def n_causes(self) -> int:
-        """How many kinds of dependence at how many places."""
         return len(self._by(lambda c: (c.family, c.where)))
 
     @property
@@ -531,7 +526,6 @@ class SumAnswer:
 
     @property
     def unnamed_probability(self) -> float:
-        """Probability that something without a name is at work."""
         return max(map(self._probability, self._unnamed), default=0.0)
 
     def location(self, tests: Sequence[StructureTest]) -> Location:
@@ -664,7 +658,6 @@ class SumAnswer:
         return settings
 
     def _parameter_sizes(self, k: int) -> Iterator[tuple[str, float]]:
-        """Prior size of each parameter of a component that no setting states: key and SI value."""
         c = self.found.components[k]
         if c.hypothesis is not None and not c.effect.sized_by:
             size = float(np.exp(self.found.sizes.size[k]))
@@ -713,7 +706,6 @@ class SumAnswer:
         return BudgetStep(name, *rms_with_interval(part, left, self.rng))
 
     def curves(self) -> tuple[Curve, ...]:
-        """The error curve of every joint that has one."""
         out = []
         for k, c in enumerate(self.found.components):
             if not isinstance(c.effect, JointCurve) or c.waves is None:
@@ -734,7 +726,6 @@ MOST_STEPS = 4
 
 
 def _stage_of(c: Component) -> Stage:
-    """The stage of the chain at which a component acts."""
     if c.named:
         return c.effect.stage
     stages: dict[str, Stage] = {"joint": "transmission", "link": "geometry", "base": "tracker"}

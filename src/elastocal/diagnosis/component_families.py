@@ -22,7 +22,7 @@ from elastocal.model.effects.compliances import LoadedEffect
 from elastocal.model.effects.driven import DrivenEffect
 from elastocal.model.effects.gears import MOST_LINES, GearRipple, GearSpectrum
 from elastocal.model.effects.smooth import JointCurve, ResidualField
-from elastocal.units import Array, IntArray
+from elastocal.units import Array
 
 # Lengths in rad of a joint's curve that are tried; what the poses do not resolve is left to lines.
 SHORTEST, LONGEST = 0.06, 3.0
@@ -37,7 +37,6 @@ OF_NEED: dict[str, Family] = {"time": "time", "temperature": "temperature", "app
 
 
 def family_of(effect: Effect, cell: Cell) -> Family:
-    """What an effect depends on in the first place."""
     if effect.family:
         return effect.family  # type: ignore[return-value]
     needed = effect.needed(cell)
@@ -52,7 +51,6 @@ def family_of(effect: Effect, cell: Cell) -> Family:
 def driven_columns(
     dataset: DiagnosisData, effect: DrivenEffect, where: str, settings: dict[str, float]
 ) -> Array:
-    """Packed columns (C, m, k) of a driven effect at these settings, per parameter."""
     chain, cell = dataset.base.model.chain, cell_with(dataset.base.model.cell, where, settings)
     h = Hypothesis(effect, where, effect.parameters(where, chain, cell), ())
     D = RegressorDirection(h, chain, cell)(dataset.table, np.zeros((1, 0)))[:, 0]
@@ -63,7 +61,6 @@ def driven_columns(
 
 
 def joint_curves(dataset: DiagnosisData) -> Iterator[Component]:
-    """An error of every joint against its own angle."""
     effect, model = JointCurve(), dataset.base.model
     joints = turning_joints(model.chain)
     n = len(dataset.blocks.member)
@@ -89,7 +86,6 @@ def joint_curves(dataset: DiagnosisData) -> Iterator[Component]:
 
 
 def catalogue_components(dataset: DiagnosisData) -> Iterator[Component]:
-    """Every hypothesis whose columns need no search."""
     cell = dataset.base.model.cell
     places = Counter(h.effect.name for h in dataset.hypotheses)
     for h in dataset.hypotheses:
@@ -199,7 +195,6 @@ HOPELESS = -3.0
 
 
 def with_scatter(noise: NoiseValues, i: int, scatter: tuple[float, float]) -> NoiseValues:
-    """The noise with another scatter of joint i (0-based)."""
     joint, shared = noise.joint.copy(), noise.shared.copy()
     joint[i], shared[i] = scatter
     return replace(noise, joint=joint, shared=shared)
@@ -261,7 +256,9 @@ def sharpened(dataset: DiagnosisData, found: FittedSum) -> list[Component] | Non
     if not families:
         return None
     now, moved = found, False
-    lines, shifts = zip(*(_lines_and_shifts(found.spans[k]) for k in families), strict=True)
+    # Of each pair of amplitudes, sine and cosine, the columns and then those of their shifts.
+    quads = [np.r_[found.spans[k]].reshape(-1, 4) for k in families]
+    lines, shifts = ([quad[:, some].ravel() for quad in quads] for some in ([0, 1], [2, 3]))
     kept = np.ones(found.data.X.shape[2], dtype=bool)
     kept[np.concatenate(shifts)] = False
     places = [found.components[k].where for k in families]
@@ -328,12 +325,6 @@ def with_multiples(dataset: DiagnosisData, c: Component) -> dict[int, Component]
         for n in MULTIPLES
         if n != m and n * order <= HIGHEST
     }
-
-
-def _lines_and_shifts(span: slice) -> tuple[IntArray, IntArray]:
-    """Columns of a family's amplitudes, sine and cosine, and of their shifts after each pair."""
-    columns = np.arange(span.start, span.stop).reshape(-1, 4)
-    return columns[:, :2].ravel(), columns[:, 2:].ravel()
 
 
 def refined_order(
@@ -404,7 +395,6 @@ def beside(
 
 
 def fields(dataset: DiagnosisData, found: FittedSum, most: int) -> list[Component]:
-    """The smooth dependences without a name that explain most beside the sum."""
     effect, model = ResidualField(), dataset.base.model
     chain, cell = model.chain, model.cell
     follow = [w for w in turning_joints(chain) if np.ptp(dataset.table.q[:, index(w)]) > MOVED]

@@ -29,6 +29,7 @@ from elastocal.diagnosis.components import (
     Component,
     FittedSum,
     Pool,
+    Sizes,
     fit_sum,
     log_odds,
     posed,
@@ -72,9 +73,9 @@ def search_components(
     """The most probable sum beside the fitted parameters, the data with all its columns, and what
     may be there as well though these data do not show it.
 
-    `chosen` is what the forward search found: its searched constants are tried as they are.  None
-    where it has names and all else beside it does not promise that a sum is CLEARLY better.  None
-    of the effects `without` is in it.
+    `chosen` is what the forward search found: its searched constants are tried as they are, the
+    effects `without` not.  None where it has names and no sum beside it promises to be CLEARLY
+    better.
     """
     full = _with_together(dataset, without)
     for weighed in (False, True):
@@ -97,11 +98,10 @@ def search_components(
         # A compliance that was fitted without weights is wrong, and so are their columns by it.
         full = about_sum(full, found)
     found, few = with_own_axes(found), len(full.blocks.member) <= FEW_POSES
+    progress(f"families of lines {'before curves' if few else 'beside the components'}")
     if few:
-        progress("families of lines before curves")
         found = _with_lines_first(full, found, curves, others, tried, instrument)
     else:
-        progress("families of lines beside the components")
         found = _with_lines(full, found)
     progress("what shows now that the noise is smaller")
     found = with_shorter_drifts(full, found)
@@ -387,9 +387,8 @@ def exchanged(
 ) -> FittedSum:  # fmt: skip
     """The sum with `more` components in the place of those `gone`, fitted from where it is."""
     kept = [k for k, c in enumerate(found.components) if not any(c is other for other in gone)]
-    start = found.sizes.chosen(kept)
-    for component in more:
-        start = start.and_one(component)
+    now, new = found.sizes.chosen(kept), Sizes.start(more)
+    start = Sizes(now.factor, np.append(now.size, new.size), np.append(now.length, new.length))
     components = [*(found.components[k] for k in kept), *more]
     return fit_sum(found.sums.data, components, found.noise, start, refit_noise, found.sums)
 

@@ -138,12 +138,6 @@ class Sizes:
         at = np.asarray(index, dtype=np.int64)
         return Sizes(self.factor, self.size[at], self.length[at])
 
-    def and_one(self, component: Component) -> Sizes:
-        new = Sizes.start([component])
-        return Sizes(
-            self.factor, np.append(self.size, new.size), np.append(self.length, new.length)
-        )
-
 
 @cache
 def precision_of_sizes(k: int, alone: float = ALONE) -> Array:
@@ -297,7 +291,6 @@ class SumOfComponents:
 
     @cached_property
     def products_of_all(self) -> Products:
-        """Of all columns."""
         return Products(self.weighted.M, self.weighted.z, self.squares, self.rows)
 
     @property
@@ -314,7 +307,6 @@ class SumOfComponents:
         return replace(self, weighted=weighted, noise=noise)
 
     def only(self, kept: Sequence[int]) -> SumOfComponents:
-        """The same with these components alone, without whitening anything anew."""
         w, own = self.weighted, np.arange(len(self.data.precision))
         index = np.concatenate([own, indices([self.spans[k] for k in kept])])
         narrow = replace(w, M=w.M[np.ix_(index, index)], z=w.z[index])
@@ -422,7 +414,6 @@ class SumOfComponents:
 
 
 def side_by_side(data: NoisyData, columns: Sequence[Array]) -> Array:
-    """Columns (C, m, Σ k) side by side; none where there are none."""
     return np.concatenate([np.zeros((*data.r.shape, 0)), *columns], axis=2)
 
 
@@ -488,7 +479,6 @@ def posed(
 
 
 def _rows(columns: Array) -> Array:
-    """Columns (C, m, k) as (C·m, k)."""
     return columns.reshape(-1, columns.shape[2])
 
 
@@ -513,20 +503,17 @@ class FittedSum:
 
     @cached_property
     def data(self) -> NoisyData:
-        """The data with the components' columns and their prior precisions."""
         plain = self.sums.data
         columns = side_by_side(plain, [plain.masked(c.columns) for c in self.components])
         return plain.with_columns(columns, 1 / self.variances)
 
     @cached_property
     def priors(self) -> tuple[Array, ...]:
-        """The prior variances (k,) of each component's coefficients."""
         first = self.sums.data.X.shape[2]
         return tuple(self.variances[span.start - first : span.stop - first] for span in self.spans)
 
     @cached_property
     def _shown(self) -> tuple[Array, ...]:
-        """The directions (C, m, k) of each component that these data show."""
         plain, root = self.sums.data, self.sums.weighted.root
         return tuple(
             _compressed(plain.masked(c.columns), prior, root, HARDLY)
@@ -589,7 +576,6 @@ def fit_sum(
 
 
 def with_own_noise(found: FittedSum) -> FittedSum:
-    """The sum at its sizes with the noise fitted anew beside it."""
     return _at_maximum(_under_own_noise(found.sums, found.sizes), found.sizes)
 
 
@@ -605,7 +591,6 @@ def _under_own_noise(problem: SumOfComponents, at: Sizes) -> SumOfComponents:
 
 
 def _at_maximum(problem: SumOfComponents, at: Sizes) -> FittedSum:
-    """The sum of all its components at these sizes."""
     variances = problem.variances(at)
     value = problem.factored(at)[1]
     score = -value / 2 - problem.pool.penalty(at.size)[0] / 2 - problem.pool.cost

@@ -125,7 +125,6 @@ def write_extended_cell(
 
 
 def _join(data: dict[str, Any], keys: Mapping[str, Any]) -> None:
-    """`keys` into `data`, table by table."""
     for name, value in keys.items():
         if isinstance(value, Mapping):
             _join(data.setdefault(name, {}), value)
@@ -150,7 +149,6 @@ def _switch_on(model: dict[str, Any], found: Sequence[FoundEffect]) -> None:
 
 
 def _redirect(data: dict[str, Any], old: Path, new: Path) -> None:
-    """Make relative paths, which lead from the folder `old`, lead from `new` to the same files."""
     # The real folders: ".." of a link to a folder is not where the link stands.
     folder = os.path.realpath(new)
 
@@ -346,7 +344,6 @@ def _of_few(
     dataset: DiagnosisData, found: SelectedEffects, tests: tuple[StructureTest, ...],
     fields: tuple[FoundEffect, ...], rng: np.random.Generator,
 ) -> tuple[Answer, dict[str, Any]]:  # fmt: skip
-    """What a diagnosis says of what the forward search found."""
     gap, steps = budget(dataset, found, rng)
     answer = judge(found, gap.open)
     effects, unknown = _findings(found, answer, dataset.base, gap, rng), answer.unknown
@@ -368,7 +365,6 @@ def _of_sum(
     answer: SumAnswer, dataset: DiagnosisData, found: SelectedEffects,
     tests: tuple[StructureTest, ...],
 ) -> dict[str, Any]:  # fmt: skip
-    """What it says where many causes act at once."""
     first = first_steps(dataset, found.nothing, None, answer.rng)
     steps = answer.budget(first)
     named = [step for step in steps if not step.step.startswith("unknown")]

@@ -59,7 +59,6 @@ class KeptColumns:
     room: int = KEPT
 
     def keep(self, key: tuple[str, str, bytes], direction: Array) -> None:
-        """Keep a direction that is not kept yet."""
         if direction.size <= self.room:
             self.room -= direction.size
             self.directions[key] = direction
@@ -120,7 +119,6 @@ class DiagnosisData:
 
     @cached_property
     def noise(self) -> NoiseValues:
-        """The most probable noise beside the fitted parameters alone."""
         return fit_noise(self.data)
 
     @cached_property
@@ -145,7 +143,6 @@ class DiagnosisData:
 
     @cached_property
     def sizes(self) -> dict[tuple[str, str], Array]:
-        """Typical size of every hypothesis' parameters, by effect and place."""
         return {
             h.key: np.array([p.typical or 0.0 for p in h.parameters]) if h.driven
             else self.sizes_in(h, self.columns.of(h))
@@ -167,7 +164,6 @@ class DiagnosisData:
 
     @cached_property
     def grids(self) -> dict[tuple[str, str], SettingsGrid]:
-        """Settings that are searched, by effect and place."""
         table = self.visit_table.take(self.present.ravel())
         grids = {h.key: grid_of(h, table) for h in self.hypotheses if h.driven}
         for key, share in self.columns.shares.items():

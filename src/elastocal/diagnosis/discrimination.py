@@ -152,7 +152,6 @@ def load_forces(table: Measurements) -> Array:
 
 
 def time_step(table: Measurements) -> float:
-    """How long a visit usually takes, in s."""
     assert table.time is not None
     moments = np.unique(table.time)
     return float(np.median(np.diff(moments))) if len(moments) > 1 else 0.0
@@ -185,7 +184,6 @@ class Campaign:
 
     @property
     def so_far(self) -> DiagnosisData:
-        """The same where only the data so far count."""
         data, blocks = self.dataset.data, self.dataset.blocks
         later = np.isin(np.arange(blocks.n), blocks.member[self.measured :])
         return replace(self.dataset, data=data.without(later | data.faulty))
@@ -304,7 +302,6 @@ class Discrimination:
 
     @property
     def open(self) -> bool:
-        """Whether there is anything to tell apart."""
         return bool(np.any(self.classes != self.classes[0]))
 
     def gram(self, chosen: Sequence[int]) -> Array:
@@ -422,7 +419,6 @@ HOPE = 0.9
 def discriminations_of(
     base: Baseline, pool: VisitPool, suspects: Suspects, seed: int
 ) -> list[Discrimination]:
-    """What the diagnosis leaves to be told apart, with the candidates of a pool."""
     campaign = campaign_of(base, pool, suspects.hypotheses, suspects.diagnosis)
     sets = list(suspects.sets)
     if suspects.unknown:
@@ -448,7 +444,6 @@ def judged(
 
 
 def together(c: Discrimination) -> Iterator[tuple[str, ...]]:
-    """The rivals of each class that has several."""
     for k in np.unique(c.classes):
         names = [name for name, own in zip(c.rivals.names, c.classes, strict=True) if own == k]
         if len(names) > 1:
@@ -456,7 +451,6 @@ def together(c: Discrimination) -> Iterator[tuple[str, ...]]:
 
 
 def pairs_of(tasks: Sequence[Discrimination], chosen: Sequence[int]) -> tuple[RivalPair, ...]:
-    """Every two rivals, with their distances before and after the chosen visits."""
     out = []
     for c in tasks:
         before, after = c.distances(c.before), c.distances(c.squared(c.gram(chosen)))

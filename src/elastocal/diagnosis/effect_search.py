@@ -100,7 +100,6 @@ FAR = 2e-4
 
 
 def is_far(dataset: DiagnosisData, chosen: ModelSet) -> bool:
-    """Whether one of the set's effects that are not mere motions is large."""
     used = ~dataset.data.left_out
     signals = (signal_of(dataset, chosen, k)[used] for k in _direct(chosen))
     return any(float(np.sqrt((signal**2).mean())) > FAR for signal in signals)
@@ -174,12 +173,6 @@ CLEARLY = 10.0  # nats by which several named effects must beat fewer without a 
 PART = 0.3
 MOST_EFFECTS, MOST_BESIDE_UNKNOWN = 4, 2
 KEPT = 4  # scans that are kept, the last ones
-
-
-def base_score(dataset: DiagnosisData, current: ModelSet, scanned: Scan) -> float:
-    """Log posterior of the set as it is under the scan's noise."""
-    items = sum(item.log_prior for item in current.items)
-    return scanned.marginal + items - 0.5 * log_prior(dataset.data.stated, scanned.noise)
 
 
 @dataclass
@@ -302,7 +295,6 @@ class ForwardSelection:
         return self._scanned[key]
 
     def _prior(self, current: ModelSet) -> Array:
-        """Log odds of one item more."""
         something = ANOTHER if current.items else SOMETHING
         return log_prior_odds(self.dataset.hypotheses, self.generic, something)
 
@@ -332,10 +324,10 @@ class ForwardSelection:
         return best, Slot(slot.items, scores)
 
     def _options(self, current: ModelSet, scanned: Scan) -> Slot:
-        """Everything that could be added, scored under the scan's noise."""
         prior = self._prior(current)
         # Scores count from the set as it is, under the noise that suits it best.
-        offset = base_score(self.dataset, current, scanned) - current.score
+        offset = sum(item.log_prior for item in current.items) - current.score
+        offset += scanned.marginal - 0.5 * log_prior(self.dataset.data.stated, scanned.noise)
         whats: tuple[Hypothesis | Generic, ...] = (*self.dataset.hypotheses, *self.generic)
         # What the search over settings costs stays with the item.
         items = [

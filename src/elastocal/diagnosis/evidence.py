@@ -52,7 +52,6 @@ class Spectrum:
 
     @classmethod
     def joined(cls, pieces: list[Spectrum]) -> Spectrum:
-        """The groups of several spectra as one."""
         lam, beta, flips = zip(*((s.lam, s.beta, s.flips) for s in pieces), strict=True)
         return cls(np.concatenate(lam), np.concatenate(beta), np.concatenate(flips, axis=1))
 
@@ -122,7 +121,6 @@ def at_scales(lam: Array, beta: Array, scales: Array) -> Array:
 
 
 def log_sum(values: Array, axis: int = -1) -> Array:
-    """log Σ exp of finite values along an axis."""
     top = values.max(axis=axis, keepdims=True)
     return np.asarray(np.log(np.exp(values - top).sum(axis=axis)) + top.squeeze(axis))
 

@@ -90,7 +90,6 @@ def _error(tasks: Sequence[Discrimination], chosen: Sequence[int]) -> float:
 
 
 def _exchange(tasks: Sequence[Discrimination], chosen: list[int]) -> None:
-    """Replace candidates in place while another one is better."""
     for _ in range(ROUNDS if len(chosen) > 1 else 0):
         changed = False
         for k, own in enumerate(list(chosen)):
@@ -135,7 +134,6 @@ def measuring_order(pool: VisitPool, chosen: Sequence[int], table: Measurements)
 
 
 def _tour(pool: VisitPool, chosen: list[int], start: Array) -> list[int]:
-    """Nearest next, among those that are due first."""
     out: list[int] = []
     at, left, time = start, list(chosen), pool.time
     while left:
@@ -224,7 +222,6 @@ def _chosen(
     base: Baseline, pool: VisitPool, suspects: Suspects, most: int, seed: int, notes: list[str],
     progress: Progress,
 ) -> ExtraPlan:  # fmt: skip
-    """The plan from this pool, `notes` and what there is to say of it as its advice."""
     progress("extra poses: columns of the candidates")
     drawn = discriminations_of(base, pool, suspects, seed)
     sets = [c.rivals for c in drawn]
@@ -278,13 +275,11 @@ def _chosen(
 
 
 def _room(base: Baseline) -> int:
-    """How many candidates fit into memory beside the data."""
     C, M = base.blocks.member.shape
     return max(NUMBERS // (M * base.observed.size) ** 2 - C, 0)
 
 
 def _nothing(sets: Sequence[RivalSet], suspects: Suspects, notes: tuple[str, ...]) -> ExtraPlan:
-    """No pose helps: the right one is named as often as the likeliest is right."""
     likeliest = [float(s.probability.max()) for s in sets]
     p = float(np.prod(likeliest)) if sets else suspects.diagnosis.probability_unknown
     p *= suspects.covered

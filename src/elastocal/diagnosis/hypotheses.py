@@ -105,12 +105,10 @@ class Hypothesis:
 
     @property
     def driven(self) -> bool:
-        """Whether it moves an entry of the chain by a function of the visit."""
         return isinstance(self.effect, DrivenEffect)
 
     @property
     def width(self) -> int:
-        """Number of columns."""
         return len(self.parameters)
 
     @property
@@ -253,13 +251,11 @@ def with_recorded_drivers(
 
 
 def with_keys(model: Model, **keys: str) -> Model:
-    """The model with these keys of [model]."""
     cell = replace(model.cell, model=replace(model.cell.model, **keys))  # type: ignore[arg-type]
     return Model.assembled(model.chain, cell)
 
 
 def model_keys(model: Model, found: tuple[FoundEffect, ...]) -> dict[str, str]:
-    """Keys of [model] that the effects found rest on."""
     names, spec = {f.effect for f in found}, model.cell.model
     used = [(key, value) for key, value, _, effect in CHOICES if effect in names]
     keys = {key: value for key, value in used if getattr(spec, key) == value}
@@ -318,13 +314,14 @@ def grid_of(hypothesis: Hypothesis, visits: Measurements) -> SettingsGrid:
 
 
 def _axis(setting: Setting, where: str, visits: Measurements) -> SettingsGrid:
-    """Values (G, 1) of one setting."""
     if setting.kind == "order":
         return _orders(setting, where, visits)
     if setting.kind == "range":
         values = np.linspace(setting.lower, setting.upper, RANGE_VALUES)
     elif setting.kind == "change_time":
-        values = change_times(_time(visits))
+        every = moments_between(_time(visits))
+        evenly = np.linspace(0, len(every) - 1, min(len(every), CHANGE_TIMES))
+        values = every[evenly.round().astype(int)]
     else:
         span = float(np.ptp(_time(visits)))
         low, high = max(span / 20, setting.lower), min(3 * span, setting.upper)
@@ -338,7 +335,6 @@ def _time(visits: Measurements) -> Array:
 
 
 def _thinned(axis: SettingsGrid, share: float) -> SettingsGrid:
-    """The axis at `share` of its values, from first to last."""
     count = max(2, int(len(axis.values) * share))
     if count >= len(axis.values):
         return axis
@@ -353,15 +349,6 @@ def moments_between(time: Array) -> Array:
     known = np.sort(time)
     middle = np.unique((known[1:-2] + known[2:-1]) / 2)
     return middle if len(middle) else np.array([known.mean()])
-
-
-def change_times(time: Array) -> Array:
-    """Moments between visits that are tried first: CHANGE_TIMES at most, evenly spaced."""
-    middle = moments_between(time)
-    if len(middle) > CHANGE_TIMES:
-        chosen = np.linspace(0, len(middle) - 1, CHANGE_TIMES).round().astype(int)
-        middle = middle[chosen]
-    return middle
 
 
 def _orders(setting: Setting, where: str, visits: Measurements) -> SettingsGrid:
@@ -579,7 +566,6 @@ class StartSearch:
 
     @cached_property
     def _span(self) -> Array:
-        """Orthonormal columns (rows, rank) of what the fitted parameters can do."""
         U, s, _ = np.linalg.svd(self.X, full_matrices=False)
         return np.asarray(U[:, s > 1e-9 * s.max(initial=0.0)])
 
@@ -610,7 +596,6 @@ class StartSearch:
 
 
 def own_columns(full: Model, h: Hypothesis) -> list[int]:
-    """Where the hypothesis' parameters stand among those of `full`."""
     return [k for k, p in enumerate(full.parameters) if (p.effect, p.where) == h.key]
 
 
@@ -644,12 +629,6 @@ class Columns:
     def of(self, hypothesis: Hypothesis) -> Array:
         """Columns (n_rows, size, k) of a hypothesis that is not driven."""
         return self.rows[:, :, self.places[hypothesis.key]]
-
-    def from_each_start(self, hypothesis: Hypothesis) -> Iterator[Array]:
-        """Its columns (n_rows, size, k) about the starts of which `of` has the best."""
-        search = StartSearch.of(self.full, hypothesis, self.base, self.x, self.rows)
-        for tangent in search.tangents():
-            yield tangent.columns
 
     def torques(self) -> Array:
         """The load's torque τ (n_rows, joints) on every joint, zero where nothing depends on it.

@@ -229,7 +229,6 @@ def families_of(found: FittedSum) -> list[KnownFamily]:
 
 
 def ripples(dataset: DiagnosisData) -> list[Hypothesis]:
-    """One for each joint whose lines can be sought."""
     return [
         h for h in dataset.hypotheses
         if isinstance(h.effect, GearRipple) and np.ptp(dataset.table.q[:, index(h.where)]) >= MOVED

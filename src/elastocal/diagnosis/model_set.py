@@ -60,7 +60,6 @@ class Item:
 
     @property
     def width(self) -> int:
-        """Number of columns."""
         return self.what.width
 
     def same_as(self, other: Item) -> bool:
@@ -100,7 +99,6 @@ class ModelSet:
 
     @property
     def spans(self) -> tuple[slice, ...]:
-        """Where each item's coefficients stand among those of the data, last of all."""
         return spans_of([item.width for item in self.items], self.data.X.shape[2])
 
     def without(self, k: int) -> tuple[Item, ...]:
@@ -174,7 +172,6 @@ def _precision(data: NoisyData, items: tuple[Item, ...], scales: tuple[float, ..
 
 
 def _within_bounds(items: tuple[Item, ...], at: Projection) -> float:
-    """`within_bounds` of all items' parameters."""
     spans = spans_of([item.width for item in items], len(at.beta))
     bounded = [
         span.start + k
@@ -286,7 +283,6 @@ def with_items(
 
 
 def beside(dataset: DiagnosisData, chosen: ModelSet, k: int) -> NoisyData:
-    """The set's data without item k."""
     return with_items(dataset, chosen.without(k), chosen.scales[:k] + chosen.scales[k + 1 :])
 
 
@@ -346,7 +342,6 @@ def settings_to_try(dataset: DiagnosisData, rival: Hypothesis, item: Item) -> Ar
 
 
 def extended(model: Model, items: Sequence[Item]) -> Model:
-    """The model with the effects of the known items active, at their settings."""
     spec = model.cell.model
     for item in items:
         if item.known:
@@ -357,7 +352,6 @@ def extended(model: Model, items: Sequence[Item]) -> Model:
 
 
 def settings_of(item: Item) -> dict[str, float]:
-    """Searched constants of an item by their keys."""
     return {s.key: float(v) for s, v in zip(item.what.settings, item.settings, strict=True)}
 
 
@@ -423,7 +417,6 @@ def with_likelier_backlash_model(dataset: DiagnosisData) -> DiagnosisData:
 
 
 def under_other_backlash_model(model: Model) -> Model:
-    """The model with play under the backlash model that it does not have."""
     by_load = model.cell.model.play_side == BY_LOAD
     return with_keys(model, play_side=BY_BOTH if by_load else BY_LOAD)
 

@@ -105,12 +105,10 @@ class NoisyData:
         return replace(self, X=X, precision=np.concatenate([self.precision, precision]))
 
     def without(self, faulty: BoolArray) -> NoisyData:
-        """The same with the observations where `faulty` (N,) holds left out."""
         padded = np.concatenate([faulty, [True]])[self.blocks.member]
         return replace(self, left_out=np.repeat(padded, self.blocks.size, axis=1))
 
     def every(self, step: int) -> NoisyData:
-        """The data of every `step`-th configuration alone."""
         per_row = ("r", "X", "covariance", "G", "left_out")
         blocks = replace(self.blocks, member=self.blocks.member[::step])
         return replace(self, blocks=blocks, **{k: getattr(self, k)[::step] for k in per_row})
@@ -277,7 +275,6 @@ class Weighted:
         return L, z, -0.5 * (self.alone + log_det - float(z @ z))
 
     def marginal(self, precision: Array) -> float:
-        """The log marginal likelihood ℓ alone, for a prior of precision Λ (p,)."""
         return self.factored(precision)[2]
 
     def projection(self, precision: Array) -> Projection:

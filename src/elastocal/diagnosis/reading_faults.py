@@ -257,7 +257,6 @@ def left_out_errors(
 
 
 def accidental(dataset: DiagnosisData, faulty: BoolArray) -> bool:
-    """Whether the faulty readings (N,) spread over markers, load states and time as all do."""
     if not faulty.any():
         return True
     from scipy.stats import hypergeom  # slow to import, seldom asked for

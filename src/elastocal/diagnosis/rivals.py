@@ -13,7 +13,7 @@ from elastocal.diagnosis.baseline import Baseline
 from elastocal.diagnosis.diagnosis import Diagnosis
 from elastocal.diagnosis.diagnosis_data import DiagnosisData, diagnosis_data_of
 from elastocal.diagnosis.evidence import Grams
-from elastocal.diagnosis.hypotheses import Hypothesis, possible
+from elastocal.diagnosis.hypotheses import Hypothesis, StartSearch, possible
 from elastocal.diagnosis.model_set import (
     Item,
     distances,
@@ -123,7 +123,6 @@ class Suspects:
         return min(max(1 - missed, 0.0), 1.0)
 
     def _named_sets(self) -> Iterator[RivalSet]:
-        """The sets that the diagnosis calls indistinguishable."""
         for group in self.diagnosis.indistinguishable:
             keys = [(e.effect, e.where) for e in group if e.effect != UNKNOWN_EFFECT]
             if len(keys) > 1:
@@ -132,14 +131,12 @@ class Suspects:
                 yield RivalSet.of([self.items[key] for key in keys], p, beside)
 
     def _rivals(self) -> list[tuple[str, str]]:
-        """The known rivals, and what is at work beside them."""
         items = [item for s in self.sets for item in (*s.rivals, *s.beside)]
         keys = [item.key for item in items] + self._found
         return keys + self._likeliest() if self.unknown else keys
 
     @property
     def hypotheses(self) -> list[Hypothesis]:
-        """Everything that may take part."""
         keys = self._rivals()
         if self.unknown:
             # Torques, which may drive what is unknown, come from the compliances' columns.
@@ -185,7 +182,6 @@ class Suspects:
 
 
 def check_open(diagnosis: Diagnosis) -> None:
-    """InputError where the verdict leaves no rivals to tell apart."""
     if diagnosis.verdict not in ("ambiguous", "unknown_effect"):
         raise InputError(
             f"the verdict is {diagnosis.verdict}: there are no rivals to tell apart; extra poses "
@@ -252,8 +248,9 @@ def columns_of_starts(dataset: DiagnosisData, item: Item) -> list[Array]:
         return []
     if not what.effect.starts(what.where, model.chain, model.cell):
         return []
-    each = dataset.columns.from_each_start(what)
-    return [dataset.pack(rows) * dataset.sizes_in(what, rows) for rows in each]
+    of = dataset.columns
+    starts = StartSearch.of(of.full, what, of.base, of.x, of.rows).tangents()
+    return [dataset.pack(t.columns) * dataset.sizes_in(what, t.columns) for t in starts]
 
 
 # The settings with which one rival may imitate the others: its order, its time.

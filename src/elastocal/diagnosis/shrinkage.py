@@ -198,7 +198,6 @@ def _reductions(
     draw: PosteriorDraw, n: int, measured: int, unnamed: float, change: Change,
     rng: np.random.Generator,
 ) -> Array:  # fmt: skip
-    """(n,) draws."""
     moved = draw.spread @ rng.normal(size=(draw.spread.shape[2], n))
     poses, at, count = np.unique(draw.pose, return_inverse=True, return_counts=True)
     share = rng.dirichlet(np.full(len(poses), measured / len(poses)), n)
@@ -263,7 +262,6 @@ def _inside(model: Model, table: Measurements, drawn: Measurements, n: int) -> I
 
 
 def _joints(table: Measurements) -> Array:
-    """Joints (configurations, joints) of each configuration's first row."""
     return table.q[np.unique(table.configuration, return_index=True)[1]]
 
 

@@ -149,7 +149,6 @@ def _nearest(x: Array, norm: float = 2.0) -> tuple[IntArray, Array]:
 
 
 def _unordered(pairs: IntArray) -> IntArray:
-    """Each pair once, the smaller number first."""
     return np.unique(np.sort(pairs, axis=1), axis=0)
 
 

@@ -187,14 +187,12 @@ class Generic:
 
     @property
     def width(self) -> int:
-        """Number of columns."""
         functions = self.direction if self.columns is None else self.columns
         assert functions is not None
         return functions.shape[-1]
 
 
 def generic_blocks(dataset: DiagnosisData) -> list[Generic]:
-    """Every block that the recorded columns allow."""
     return [*_driven(dataset), *_of_force(dataset), *_of_reading(dataset)]
 
 
@@ -235,7 +233,6 @@ def _driven(dataset: DiagnosisData) -> Iterator[Generic]:
 
 
 def _of_force(dataset: DiagnosisData) -> Iterator[Generic]:
-    """Force and moment at a link's end, each moving or turning it along any axis."""
     for k, (force, moment) in enumerate(wrenches(dataset)):
         direction = np.zeros((*force.shape[:2], 6, 18))
         for a in range(3):

@@ -298,7 +298,6 @@ def _stated_wrong(dataset: DiagnosisData, data: NoisyData, factor: float) -> boo
 
 
 def _undecided_backlash(found: SelectedEffects) -> str:
-    """That the model of the backlash that was found is not known, where it is not."""
     named = [i.what.where for i in found.chosen.items if isinstance(i.what, Hypothesis)
              and i.what.name == Backlash.name]  # fmt: skip
     if not named or found.dataset.other_backlash <= OPEN_BACKLASH:
