@@ -41,7 +41,14 @@ from elastocal.diagnosis.effect_search import about
 from elastocal.diagnosis.evidence import ANOTHER, evidence_of_groups, log_prior_odds
 from elastocal.diagnosis.hypotheses import Hypothesis, judged_together
 from elastocal.diagnosis.line_orders import families_of, order_posterior, ripples
-from elastocal.diagnosis.model_set import Item, ModelSet, extended, packed_columns, spans_of
+from elastocal.diagnosis.model_set import (
+    Item,
+    ModelSet,
+    extended,
+    packed_columns,
+    settings_of,
+    spans_of,
+)
 from elastocal.diagnosis.noise_floor import (
     NoiseValues,
     NoisyData,
@@ -648,13 +655,10 @@ def _searched(dataset: DiagnosisData, chosen: ModelSet) -> list[Component]:
     for item in chosen.items:
         h = item.what
         if isinstance(h, Hypothesis) and len(item.settings):
-            pairs = zip((s.key for s in h.settings), item.settings.tolist(), strict=True)
             family = family_of(h.effect, dataset.base.model.cell)
-            columns = packed_columns(dataset, item)
-            component = Component(
-                family, h.effect, h.where, columns, settings=tuple(pairs), hypothesis=h
-            )
-            found.append(component)
+            columns, settings = packed_columns(dataset, item), tuple(settings_of(item).items())
+            found.append(Component(family, h.effect, h.where, columns, settings=settings,
+                                   hypothesis=h))  # fmt: skip
     return found
 
 

@@ -358,12 +358,13 @@ def settings_of(item: Item) -> dict[str, float]:
 # Estimates of a set: what its columns stand for, and the fit of the model with them in it.
 
 
-def linear_estimates(dataset: DiagnosisData, chosen: ModelSet) -> dict[str, float]:
-    """Posterior means of the known items' parameters by name; where one was looked for from many
-    starts, its columns' own point: its geometry is far from linear."""
-    out: dict[str, float] = {}
+def fit_extended(dataset: DiagnosisData, chosen: ModelSet, items: Sequence[Item]) -> Baseline:
+    """The nonlinear fit of the model with `items` of the set in it, from the posterior means of
+    its known items' parameters; where one was looked for from many starts, from its columns' own
+    point: its geometry is far from linear."""
     model, columns = dataset.base.model, dataset.columns
     about = dict(zip(columns.full.names, columns.x, strict=True))
+    start = dict(zip(model.names, dataset.base.x, strict=True))
     for item, span in zip(chosen.items, chosen.spans, strict=True):
         what = item.what
         if isinstance(what, Hypothesis):
@@ -371,17 +372,10 @@ def linear_estimates(dataset: DiagnosisData, chosen: ModelSet) -> dict[str, floa
             starts = what.effect.starts(what.where, model.chain, model.cell)
             for p, v in zip(what.parameters, values, strict=True):
                 name = f"{what.where}.{p.key}"
-                out[name] = float(about[name]) if starts else float(v) + p.nominal
-    return out
-
-
-def fit_extended(dataset: DiagnosisData, chosen: ModelSet, items: Sequence[Item]) -> Baseline:
-    """The nonlinear fit of the model with `items` of the set in it, from the linear estimate."""
-    base = dataset.base
-    model = extended(base.model, items)
-    start = dict(zip(base.model.names, base.x, strict=True)) | linear_estimates(dataset, chosen)
-    x0 = np.array([start.get(p.name, p.nominal) for p in model.parameters])
-    return fit_baseline(model, base.observed.table, x0=x0)
+                start[name] = float(about[name]) if starts else float(v) + p.nominal
+    whole = extended(model, items)
+    x0 = np.array([start.get(p.name, p.nominal) for p in whole.parameters])
+    return fit_baseline(whole, dataset.base.observed.table, x0=x0)
 
 
 # The backlash model of an arm's gears: whether play follows load alone, or load and last motion.

@@ -33,6 +33,7 @@ from elastocal.diagnosis.noise_floor import NoiseValues, NoisyData, noise_draws,
 from elastocal.diagnosis.stated_floor import (
     left_out_residual,
     left_out_together,
+    nearest,
     squared_lengths,
     supported_floor,
 )
@@ -274,9 +275,7 @@ def _unlike(measured: Array, new: Array, rng: np.random.Generator) -> bool:
     if len(measured) > len(new):
         measured = measured[rng.choice(len(measured), len(new), replace=False)]
     both = np.concatenate([measured, new])
-    scaled = both / np.maximum(measured.std(axis=0), 1e-12)
-    near = cKDTree(scaled).query(scaled, k=2)[1]
-    near = np.where(near[:, 0] == np.arange(len(both)), near[:, 1], near[:, 0])
+    near = nearest(both / np.maximum(measured.std(axis=0), 1e-12))[0][:, 1]
     kind = np.arange(len(both)) < len(measured)
     own = int((kind == kind[near]).sum())
     allotted = rng.permuted(np.tile(kind, (PERMUTED, 1)), axis=1)

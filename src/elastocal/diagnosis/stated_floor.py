@@ -134,12 +134,12 @@ def near_pairs(dataset: DiagnosisData, good: BoolArray) -> IntArray:
         # One reading of each configuration: the others are repeats.
         mine = mine[np.unique(table.configuration[lead[mine]], return_index=True)[1]]
         if len(mine) > 1:
-            pairs, distance = _nearest(table.q[lead[mine]], np.inf)
+            pairs, distance = nearest(table.q[lead[mine]], np.inf)
             found.append(_unordered(mine[pairs[distance <= NEAR]]))
     return np.concatenate(found)
 
 
-def _nearest(x: Array, norm: float = 2.0) -> tuple[IntArray, Array]:
+def nearest(x: Array, norm: float = 2.0) -> tuple[IntArray, Array]:
     """Each of the points x (n, d) beside the nearest other one (n, 2), and how far that is (n,)."""
     distance, near = cKDTree(x).query(x, k=2, p=norm)
     own = np.arange(len(x))
@@ -214,7 +214,7 @@ def smooth_scatter(dataset: DiagnosisData, data: NoisyData, at: Projection) -> A
         z = a[known, j] / np.sqrt(h[known, j])
         pairs = [*(_next_to(q[known, k]) for k in range(J)), _next_to(moment[known])]
         scaled = q[known] / np.maximum(q[known].std(axis=0), 1e-12)
-        one, other = _unordered(_nearest(scaled)[0]).T
+        one, other = _unordered(nearest(scaled)[0]).T
         pairs.append((one, other))
         rho = np.array([_correlation(z, *p, limit) for p in pairs])
         share = min(max(float(rho[:J].sum()), float(rho[J:].max())), 1.0)

@@ -87,7 +87,9 @@ def covariates(dataset: DiagnosisData) -> Iterator[Covariate]:
             by.append(a * size / size.max())
         yield Covariate("approach", f"approach of joint{i + 1}", np.stack(by, axis=2), joint=i)
     yield from _of_stiffness(q, {i: torque[:, :, i] for i in loaded}, present, slow)
-    for i in joints if slow is not None else ():
+    for i in joints:
+        if slow is None:
+            break
         product = few[i][:, :, :, None] * slow[:, :, None, :]
         both = product.reshape(*product.shape[:2], -1)
         yield Covariate("time × angle", f"time × joint{i + 1} angle", both)
