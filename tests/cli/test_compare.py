@@ -112,7 +112,7 @@ def test_a_softer_joint_is_seen_under_the_loads_of_the_campaigns(folder):
         ec.identify(model, data).save(f"soft{k}.json")
     code, out, err = run("soft.toml", "soft0.json", "soft1.json", "-o", "c.json")
     assert code == 0, err
-    assert "under (0, 0, -300) N, those of the earlier campaign" in " ".join(out.split())
+    assert "under (0, 0, -300) N, those of the earlier session" in " ".join(out.split())
     found = json.loads(Path("c.json").read_text())
     assert found["changed"] == [name]
     assert found["tool"]["forces_N"] == [[0, 0, -300]] == [found["tool"]["force_N"]]

@@ -85,13 +85,13 @@ def printed_text(result: object) -> str:
 
 def print_blocks(console: Console, blocks: Iterable[Block], details: bool = False) -> None:
     """Print blocks; a blank line separates tables from sentences."""
-    heading = before = ""
+    heading, before = "", None
     for block in unfolded(blocks, lambda fold: details and fold.printed):
         if isinstance(block, Heading):
             heading = block.text
         elif shown := list(_shown(console, block)):
-            kind = type(block).__name__.replace("Verdict", "Lines")
-            if before not in ("", kind, "Table"):  # a table ends with one
+            kind = Lines if isinstance(block, ShownVerdict) else type(block)
+            if before not in (None, kind, ShownTable):  # a table ends with one
                 console.print()
             if heading and _needs(heading, block):
                 console.print(Text(heading, style="bold underline"))
