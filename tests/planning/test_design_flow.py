@@ -13,14 +13,13 @@ import pytest
 from numpy.typing import NDArray
 from support.calibration import placement
 from support.cells import DOWN
-from support.design_cells import FULL, any_cell, plan_cell, scara, sliding_chain
+from support.design_cells import any_cell, plan_cell, scara, sliding_chain
 from support.robots import packaged_urdf
 
 from elastocal.cell.arm_description import Robot
 from elastocal.cell.plan_wishes import Motion, TargetPose
 from elastocal.cell.work_cell import Cell
 from elastocal.cell.workspace_rules import CarriedBody, HalfSpace, HangingLoad, Solid, Workspace
-from elastocal.errors import InputError, InsufficientDataError
 from elastocal.model.chain import Chain, joint_limits
 from elastocal.model.urdf import read_urdf
 from elastocal.planning import design as design_module
@@ -240,25 +239,3 @@ def test_test_poses_are_where_the_plan_makes_position_certain(
     for k in (0, 1):
         own = setups[k].value(plans[k].q)
         assert own < setups[k].value(plans[1 - k].q)
-
-
-@pytest.mark.parametrize(
-    ("cell", "error", "told"),
-    [
-        (plan_cell(poses=5, candidates=50), InputError, "needs a load"),
-        (plan_cell(loads=DOWN[None], noise=None, candidates=50), InputError, "noise of a reading"),
-        (
-            plan_cell(FULL, "position", loads=BOTH, poses=1, candidates=50),
-            InsufficientDataError,
-            "poses",
-        ),
-        (
-            plan_cell(loads=DOWN[None], criterion="D", interest=("joint1",), candidates=50),
-            InsufficientDataError,
-            "joint1.compliance",
-        ),
-    ],
-)
-def test_what_no_plan_can_do_is_said(cell: Cell, error: type[Exception], told: str) -> None:
-    with pytest.raises(error, match=told):
-        design(cell, DesignOptions("quick"))
