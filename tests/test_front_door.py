@@ -328,6 +328,11 @@ def test_every_option_of_the_packages_is_a_keyword(verb, kind, renamed):
         ("design", {"loads": [[0, 0, 1], [0, 0, 1]]}, "^`loads` repeats a load"),
         ("design", {"loads": [1, 2]}, "`loads` takes an array \\(n, 3\\)"),
         ("design", {"prior": "some"}, '`prior` takes "none" or "typical"; found'),
+        (
+            "design",
+            {"robust": "worst"},
+            "`robust` is gone: plans are made for the arm as identified",
+        ),
         ("identify", {"method": "olss"}, "`method` takes one of .*did you mean 'ols'"),
         ("identify", {"outliers": "dropp"}, "`outliers` takes one of auto, drop, keep"),
         ("identify", {"noise": "white"}, "`noise` takes one of"),

@@ -20,7 +20,7 @@ from pathlib import Path
 from typing import Any, TypeVar
 
 from elastocal.above import Saved
-from elastocal.errors import InputError, option, require
+from elastocal.errors import GONE, InputError, option, require
 from elastocal.text import did_you_mean, listed, quoted
 
 # numpy is loaded where a value is looked at: the command line reads the kinds alone, for --help.
@@ -177,6 +177,9 @@ def checked_arguments(function: F) -> F:
 
     @functools.wraps(function)
     def run(*args: Any, **kwargs: Any) -> Any:
+        for name in kwargs:
+            key = f"{function.__name__}.{name}"
+            require(key not in GONE, f"{option(name)} is gone: {GONE.get(key)}")
         bound = signature.bind(*args, **kwargs)
         given = bound.arguments
         check(given, simple)

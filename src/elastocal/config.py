@@ -20,7 +20,7 @@ import numpy as np
 from pydantic import BaseModel, ConfigDict, Field, PlainValidator, ValidationError
 from pydantic_core import PydanticCustomError
 
-from elastocal.errors import InputError
+from elastocal.errors import GONE, InputError
 from elastocal.files import check_nesting, read_text
 from elastocal.text import did_you_mean, listed, nearest, quoted
 from elastocal.units import Array
@@ -31,15 +31,6 @@ UNIT_SUFFIX = re.compile(
     r"_(um|mm|cm|m|deg|rad|urad|mrad|ppm|N|kN|Nm|N_per_m|N_per_mm|s|min|si"
     r"|deg_per_s|rad_per_s|m_per_s|mm_per_s)$"
 )
-
-# Keys that there were, and what does it instead.
-GONE = {
-    "design.load_choice": (
-        "every pose is read under each load; let [design.choose] loads pick fewer of them"
-    ),
-    "design.robust": "plans are made for the arm as identified so far (augment); drop the key",
-    "design.robust_samples": "it went with design.robust; drop it",
-}
 
 Keys = Sequence[str | int]
 

@@ -28,6 +28,14 @@ LISTS = ("fixed", "without", "options", "presets")
 
 _flags = False
 
+# Keys of cells, and keywords of verbs, that there were, and what does it instead.
+GONE = {
+    "design.load_choice": (
+        "every pose is read under each load; let [design.choose] loads pick fewer of them"
+    ),
+    "design.robust": "plans are made for the arm as identified so far (augment); drop the key",
+    "design.robust_samples": "it went with design.robust; drop it",
+}
 # No name of a file is as long, and nobody reads more.
 LONGEST_WORD, LONGEST_MESSAGE = 400, 8000
 _LONG_WORD = re.compile(rf"\S{{{LONGEST_WORD},}}")

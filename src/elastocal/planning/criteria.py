@@ -338,6 +338,9 @@ class TraceCriterion(ScenarioCriterion):
         return self.scale * float(np.sqrt(value))
 
 
+# Eigenvalues of the covariance of the parameters of interest.
+
+
 @dataclass(frozen=True)
 class SpectralCriterion(ScenarioCriterion):
     """Φ = φ(λ_1, …, λ_k), λ the eigenvalues of E V Eᵀ in ascending order, E (k, p).
