@@ -182,7 +182,8 @@ def check_enough(problem: DesignProblem) -> None:
         prior = f" and the prior {known}" if known else ""
         raise InsufficientDataError(
             f"{problem.source}fewer equations than parameters: {n} poses of {r} readings give "
-            f"{n * r}{prior}, for {p} parameters; plan at least {needed} poses, switch effects off or state a prior"
+            f"{n * r}{prior}, for {p} parameters; plan at least {needed} poses, switch effects off "
+            "or state a prior"
         )
 
 
