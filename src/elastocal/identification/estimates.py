@@ -47,10 +47,8 @@ def summarise(
 ) -> Calibration:  # fmt: skip
     """The result of a method: estimates with intervals, what is combined, noise, warnings.
 
-    `every` holds all readings, `sound` the fit to those that agree.  `faulty` are the readings
-    beyond the noise: set apart where the method did so, else only listed.  `new_poses` are where
-    the arm will be used; without them it is the workspace that the joint limits span.  `copies`
-    are the lines of readings that were left out since they repeat others to the last digit.
+    `every` holds all readings, `sound` the fit to those that agree; `faulty` are those beyond the
+    noise.  `new_poses`: where the arm will be used, by default the workspace.
     """
     solution, final = found.solution, found.solution.fit
     kept = solution.reduction.kept

@@ -478,23 +478,19 @@ def predicted_error(
     if not len(weight):
         return None
     known, off = _moves(arm, left, B[:, :3])
-    size, axes = np.linalg.eigh((arm.covariance + arm.covariance.T) / 2)
-    root = axes * np.sqrt(np.maximum(size, 0.0))
+    root = _root((arm.covariance + arm.covariance.T) / 2)
     each = np.sqrt(weight)[:, None, None]
     F = np.concatenate([known @ root, off], axis=2) * each
     F = F.reshape(-1, F.shape[2])
     n = root.shape[1]
     G = F.T @ F
-    value, vector = np.linalg.eigh(G)
-    half = vector * np.sqrt(np.maximum(value, 0.0))
     z = rng.standard_normal((DRAWS, len(G)))
-    inflated = np.ones(DRAWS) if excess is None else excess.inflated
+    missing = excess or Excess(np.zeros(DRAWS), np.ones(DRAWS))
+    inflated, lacking = missing.inflated, float(missing.squared.mean())
     (dof,), (share,) = spread.tails((known * each).reshape(1, -1, n))
     wide = _chi2(max(int(dof), 1), rng) if np.isfinite(dof) else np.ones(DRAWS)
     z[:, :n] *= np.sqrt(share * wide * inflated)[:, None]
-    squares = ((z @ half) ** 2).sum(axis=1)
-    lacking = None if excess is None else float(excess.squared.mean())
-    squares = squares if excess is None else squares + excess.squared
+    squares = ((z @ _root(G)) ** 2).sum(axis=1) + missing.squared
     own = float(np.trace(G[:n, :n]) * inflated.mean())
     rest = float(np.trace(G[n:, n:]))
     alone = np.inf
@@ -502,17 +498,23 @@ def predicted_error(
         alone = float(np.sqrt((((known @ (unchecked @ root)) * each) ** 2).sum() * inflated.mean()))
     low, high, sure = np.sqrt(np.quantile(squares, [0.025, 0.975, 0.95]))
     return PredictedError(
-        float(np.sqrt(own + rest + (lacking or 0.0))),
+        float(np.sqrt(own + rest + lacking)),
         (float(low), float(high)),
         float(np.sqrt(own)),
         float(np.sqrt(rest)),
-        None if lacking is None else float(np.sqrt(lacking)),
+        None if excess is None else float(np.sqrt(lacking)),
         _blamed(left, np.diag(G)[n:]),
         len(poses.q),
         poses.source,
         alone,
         float(sure),
     )
+
+
+def _root(matrix: Array) -> Array:
+    """L with L Lᵀ = matrix, symmetric."""
+    size, axes = np.linalg.eigh(matrix)
+    return np.asarray(axes * np.sqrt(np.maximum(size, 0.0)))
 
 
 def readings_at(

@@ -25,7 +25,7 @@ A smooth function corrects the arm and explains nothing.
 from __future__ import annotations
 
 import math
-from collections.abc import Iterator
+from collections.abc import Iterator, Mapping
 from dataclasses import dataclass, replace
 
 import casadi as ca
@@ -149,15 +149,35 @@ class Course:
     def waves(self) -> Waves:
         return Waves.over(self.low, self.high, self.length, self.turns)
 
-    def function(self, keys: tuple[tuple[str, ...], ...], units: tuple[str, ...]) -> SmoothFunction:
-        """What follows it, with the parameters `keys` of each component."""
-        return SmoothFunction(
-            self.name, keys, units, self.size, self.length, self.low, self.high, self.waves.at
-        )
+    def keys(self, components: Mapping[str, str]) -> tuple[tuple[str, ...], ...]:
+        """Those of the waves' coefficients for each of the `components`: how its keys begin → unit
+        of its values."""
+        numbers = range(1, self.waves.count + 1)
+        return tuple(tuple(f"{start}_{k}" for k in numbers) for start in components)
 
-    def of(self, arm: Arm) -> ca.SX:
-        """The quantity of the row."""
-        return arm.input("time", 1) if not self.turns else arm.q_commanded[index(self.name)]
+    def parameters(self, components: Mapping[str, str]) -> list[ParameterSpec]:
+        sd = np.sqrt(self.waves.variances(self.size, self.length)).tolist()
+        return [
+            ParameterSpec(key, unit, 0.0, size, shrunk=True)
+            for keys, unit in zip(self.keys(components), components.values(), strict=True)
+            for key, size in zip(keys, sd, strict=True)
+        ]
+
+    def function(self, components: Mapping[str, str]) -> SmoothFunction:
+        return SmoothFunction(
+            self.name, self.keys(components), tuple(components.values()), self.size, self.length,
+            self.low, self.high, self.waves.at,
+        )  # fmt: skip
+
+    def values(self, arm: Arm, components: Mapping[str, str], p: Symbols) -> ca.SX:
+        """The function (components,) of the row."""
+        x = arm.q_commanded[index(self.name)] if self.turns else arm.input("time", 1)
+        waves = ca.vertcat(*self.waves.values(x))
+        every = (ca.vertcat(*(p[key] for key in keys)) for keys in self.keys(components))
+        return ca.vertcat(*(ca.dot(coefficients, waves) for coefficients in every))
+
+
+CURVE = {"curve": "rad"}
 
 
 class JointCurve(DrivenEffect):
@@ -187,22 +207,13 @@ class JointCurve(DrivenEffect):
         return Course(place, *self.stated(place, chain, cell).values())
 
     def parameters(self, place: str, chain: Chain, cell: Cell) -> tuple[ParameterSpec, ...]:
-        course = self.course(place, chain, cell)
-        sd = np.sqrt(course.waves.variances(course.size, course.length))
-        return tuple(
-            ParameterSpec(f"curve_{k + 1}", "rad", 0.0, float(s), shrunk=True)
-            for k, s in enumerate(sd)
-        )
+        return tuple(self.course(place, chain, cell).parameters(CURVE))
 
     def functions(self, place: str, chain: Chain, cell: Cell) -> tuple[SmoothFunction, ...]:
-        course = self.course(place, chain, cell)
-        keys = tuple(f"curve_{k + 1}" for k in range(course.waves.count))
-        return (course.function((keys,), ("rad",)),)
+        return (self.course(place, chain, cell).function(CURVE),)
 
     def drive(self, arm: Arm, place: str, p: Symbols) -> ca.SX:
-        course = self.course(place, arm.chain, arm.cell)
-        waves = course.waves.values(course.of(arm))
-        return sum((p[f"curve_{k + 1}"] * wave for k, wave in enumerate(waves)), ca.SX(0))
+        return self.course(place, arm.chain, arm.cell).values(arm, CURVE, p)
 
 
 class ResidualField(DrivenEffect):
@@ -261,30 +272,21 @@ class ResidualField(DrivenEffect):
         return ("time",) if timed else ()
 
     def parameters(self, place: str, chain: Chain, cell: Cell) -> tuple[ParameterSpec, ...]:
-        specs = []
-        for course in self.courses(place, chain, cell):
-            sd = np.sqrt(course.waves.variances(course.size, course.length))
-            specs += [
-                ParameterSpec(
-                    f"field_{course.name}_{c + 1}_{k + 1}", unit, 0.0, float(s), shrunk=True
-                )
-                for c, unit in enumerate(self.entry_at(place).units)
-                for k, s in enumerate(sd)
-            ]
-        return tuple(specs)
+        return tuple(
+            spec
+            for course in self.courses(place, chain, cell)
+            for spec in course.parameters(self._components(place, course))
+        )
 
     def functions(self, place: str, chain: Chain, cell: Cell) -> tuple[SmoothFunction, ...]:
-        units = self.entry_at(place).units
         return tuple(
-            course.function(
-                tuple(
-                    tuple(f"field_{course.name}_{c + 1}_{k + 1}" for k in range(course.waves.count))
-                    for c in range(len(units))
-                ),
-                units,
-            )
+            course.function(self._components(place, course))
             for course in self.courses(place, chain, cell)
         )
+
+    def _components(self, place: str, course: Course) -> dict[str, str]:
+        units = self.entry_at(place).units
+        return {f"field_{course.name}_{c}": unit for c, unit in enumerate(units, start=1)}
 
     def lasting(self, cell: Cell) -> Cell:
         settings = {
@@ -295,13 +297,9 @@ class ResidualField(DrivenEffect):
         return replace(cell, model=replace(cell.model, nominal=nominal))
 
     def drive(self, arm: Arm, place: str, p: Symbols) -> ca.SX:
-        size = self.entry_at(place).size
-        u = ca.SX.zeros(size)
+        u = ca.SX.zeros(self.entry_at(place).size)
         for course in self.courses(place, arm.chain, arm.cell):
-            waves = course.waves.values(course.of(arm))
-            for c in range(size):
-                for k, wave in enumerate(waves):
-                    u[c] += p[f"field_{course.name}_{c + 1}_{k + 1}"] * wave
+            u += course.values(arm, self._components(place, course), p)
         return u
 
     def shape(self, arm: Arm, place: str, p: Symbols) -> None:
