@@ -152,18 +152,6 @@ def test_a_compliance_that_hardly_shows_has_no_value():
     assert entry["value"] is None and entry["limits95"] == [low, high]
 
 
-def test_no_compliance_is_stated_below_zero():
-    """Over clean campaigns with compliances of zero; the model that is used has none either."""
-    model, plan = arm(poses=12, nominal=None)
-    for seed in range(2):
-        table, _ = campaign(model, plan, seed, np.zeros(6))
-        result = identify(model, table)
-        for i in compliances(model):
-            e = result.estimates[i]
-            assert e.value is None or e.ci95[0] > 0
-            assert e.held >= 0 or result.finding("beyond_bound") is not None
-
-
 def test_the_nominal_stands_where_the_readings_hardly_tell_better():
     """Where nominal values are good, holding them errs less than estimating what hardly shows."""
     nominal = tuple(0.03 * np.array(STIFF))

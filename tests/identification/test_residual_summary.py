@@ -12,7 +12,6 @@ from support.calibration import binomial_band, table_at
 from elastocal.identification.residuals import (
     ResidualSummary,
     normal_scores,
-    simultaneous_level,
     summarise_residuals,
 )
 from elastocal.model.observations import Observations
@@ -117,17 +116,10 @@ def test_a_group_that_scatters_more_is_named_and_clean_tables_name_none() -> Non
     assert found["z"].mean_square < 1
 
 
-@pytest.mark.parametrize("n", [8, 15, 50, 150, 400])
+@pytest.mark.parametrize("n", [8, 50, 400])
 def test_band_holds_the_whole_sample_in_95_percent(n: int) -> None:
     """1500 samples: the binomial band at 99.9 % is ± 1.9 %, beside 0.5 % for the approximation."""
     rng = np.random.default_rng(n)
     outside = sum(not normal_scores(rng.normal(size=n), n).inside for _ in range(1500))
     low, high = binomial_band(1500, 0.05)
     assert low - 8 <= outside <= high + 8
-
-
-def test_local_level_falls_with_n_and_lies_above_bonferroni() -> None:
-    n = np.array([8, 9, 20, 49, 50, 199, 200, 1000, 10**6])
-    level = np.array([simultaneous_level(int(k)) for k in n])
-    assert ((level > 0.05 / n) & (level < 0.05)).all()
-    assert (np.diff(level[[0, 2, 4, 6, 7, 8]]) < 0).all()

@@ -77,12 +77,6 @@ def test_arrays_of_other_shapes_are_refused(wrong: tuple) -> None:
             function(backend)(*wrong)
 
 
-def test_inputs_of_different_lengths_are_refused() -> None:
-    p = ca.SX.sym("p", 2)
-    with pytest.raises(ValueError, match="per row"):
-        BatchFunction([X, p], [X + p])(ROWS, ROWS[:4])
-
-
 def test_a_summary_counts_expressions() -> None:
     numpy = BackendReport("numpy", 2)
     found = summary([numpy, numpy, BackendReport("casadi"), BackendReport("none")])

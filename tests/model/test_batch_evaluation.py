@@ -152,9 +152,6 @@ def test_arrays_of_any_layout(given_as, backend: str) -> None:
 ANALYTIC = ("neg", "exp", "log", "sqrt", "sq", "sin", "cos", "tan", "asin", "acos", "atan",
             "sinh", "cosh", "tanh", "inv", "log1p", "expm1", "twice", "identity",
             "power 3", "power 2.5")  # fmt: skip
-REAL_ONLY = {"floor": UNARY["floor"], "ceil": UNARY["ceil"], "atan2": ca.atan2(X, 2),
-             "hypot": ca.hypot(X, 2), "fmod": ca.fmod(X, 2),
-             "copysign": ca.copysign(X, 2)}  # fmt: skip
 PIECEWISE = {"fmax": ca.fmax(X, 1.0), "fmin": ca.fmin(X, 1.0), "lt": (X < 1) * X,
              "if_else_zero": ca.if_else(X > 1, X * X, 0)}  # fmt: skip
 
@@ -171,9 +168,3 @@ def assert_complex_step(expression: ca.SX, at: np.ndarray) -> None:
 def test_complex_step_is_the_derivative(name: str) -> None:
     expression = UNARY[name] if name in ANALYTIC else PIECEWISE[name]
     assert_complex_step(expression, np.array([[0.3], [0.9], [1.7], [3.1]]))
-
-
-@pytest.mark.parametrize("name", REAL_ONLY)
-def test_what_numpy_has_for_real_numbers_only_is_refused_not_wrong(name: str) -> None:
-    with pytest.raises(TypeError):
-        BatchFunction([X], [REAL_ONLY[name]])(np.array([[0.3 + 1e-30j]]))

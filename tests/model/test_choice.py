@@ -37,20 +37,11 @@ def model_of(*effects: str, **model) -> Model:
 # --- names ---------------------------------------------------------------------------------
 
 
-@pytest.mark.parametrize(
-    "wrong, right",
-    [
-        ("joint_complience", "joint_compliance"),
-        ("base_frames", "base_frame"),
-        ("gravity_compensater", "gravity_compensator"),
-        ("marker_positions", "marker_position"),
-    ],
-)
-def test_an_unknown_effect_meets_its_nearest(wrong: str, right: str) -> None:
+def test_an_unknown_effect_meets_its_nearest() -> None:
     with pytest.raises(InputError) as caught:
-        chosen("joint_offset", wrong)
+        chosen("joint_offset", "joint_complience")
     text = str(caught.value)
-    assert f"unknown effect '{wrong}'" in text and f"did you mean '{right}'?" in text
+    assert "unknown effect 'joint_complience'" in text and "mean 'joint_compliance'?" in text
     assert "[model] effects" in text and "kr270" in text
     assert all(name in text for name in CATALOGUE)
 
@@ -58,11 +49,8 @@ def test_an_unknown_effect_meets_its_nearest(wrong: str, right: str) -> None:
 @pytest.mark.parametrize(
     "wrong, right",
     [
-        ("joint_compliance:joint7", "joint"),
         ("joint_compliance:jiont2", "joint2"),
-        ("link_geometry:lnk3", "link3"),
         ("marker_position:marker:M4", "marker:M"),
-        ("base_frame:bas", "base"),
     ],
 )
 def test_an_unknown_place_meets_its_nearest(wrong: str, right: str) -> None:
@@ -131,10 +119,9 @@ def test_an_unknown_marker_in_the_table_is_refused() -> None:
 # --- nominal values ------------------------------------------------------------------------
 
 
-@pytest.mark.parametrize("count", [0, 1, 5, 7])
-def test_compliances_must_be_one_per_joint(count: int) -> None:
-    nominal = Nominal(joint_compliance=(1e-6,) * count)
-    with pytest.raises(InputError, match=f"joint_compliance has {count} values.*has 6 joints"):
+def test_compliances_must_be_one_per_joint() -> None:
+    nominal = Nominal(joint_compliance=(1e-6,) * 5)
+    with pytest.raises(InputError, match=r"joint_compliance has 5 values.*has 6 joints"):
         model_of("joint_compliance", nominal=nominal)
 
 
@@ -143,12 +130,7 @@ def half_turn(*axis: float) -> np.ndarray:
     return 2 * np.outer(axis, axis) - np.eye(3)
 
 
-@pytest.mark.parametrize(
-    "R",
-    [half_turn(0, 0, 1), half_turn(1, 0, 0), half_turn(0, 1, 0), half_turn(0.6, 0, 0.8),
-     np.array([[0.0, 0, -1], [0, -1, 0], [-1, 0, 0]])],
-    ids=["z", "x", "y", "oblique", "rpy 0 90 180"],
-)  # fmt: skip
+@pytest.mark.parametrize("R", [half_turn(1, 0, 0), half_turn(0.6, 0, 0.8)], ids=["x", "oblique"])
 def test_the_base_may_be_half_turned(R: np.ndarray) -> None:
     """An arm that faces its tracker, or hangs from the ceiling."""
     nominal = model_of("base_frame", nominal=Nominal(base_rotation=R)).nominal

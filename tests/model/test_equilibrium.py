@@ -1,7 +1,7 @@
-"""The loaded arm at rest: torque balance, energy, MuJoCo's arm, and where eq. (3) stops holding.
+"""The loaded arm at rest: torque balance, MuJoCo's arm, and where eq. (3) stops holding.
 
-References: pinocchio on the URDF for load and weight torques and energies, MuJoCo's springs for
-whole deflected arms, numpy for the gravity compensator's formulas.
+References: pinocchio on the URDF for load and weight torques, MuJoCo's springs for whole deflected
+arms, numpy for the gravity compensator's formulas.
 """
 
 from __future__ import annotations
@@ -53,7 +53,7 @@ def kr270_poses(count: int) -> Array:
 
 
 class Pinocchio:
-    """Torques and energy of weights and load on the URDF's own bodies, base as given."""
+    """Torques of weights and load on the URDF's own bodies, base as given."""
 
     def __init__(self, gravity: Array, R_tracker_base: Array | None = None) -> None:
         self.model = pin.buildModelFromUrdf(str(KR270))
@@ -73,13 +73,6 @@ class Pinocchio:
         weights = pin.computeGeneralizedGravity(self.model, self.data, q)
         return J[:3].T @ (self.R.T @ force) - weights
 
-    def energy(self, q: Array, force: Array) -> float:
-        """Potential energy of weights and load in J."""
-        pin.framesForwardKinematics(self.model, self.data, q)
-        point = self.data.oMf[self.load].translation
-        weights = pin.computePotentialEnergy(self.model, self.data, q)
-        return float(weights - (self.R.T @ force) @ point)
-
 
 class Compensator:
     """FACTS' formulas of the gravity compensator, in their own words."""
@@ -97,15 +90,6 @@ class Compensator:
     def torque(self, q2: float) -> float:
         stretched = 1 - self.s0 / self.length(q2)
         return float(-self.Kc * stretched * self.a * self.L * np.sin(self.alpha - q2))
-
-    def stiffness(self, q2: float) -> float:
-        """K2(q2) − K2⁰."""
-        s, aL, phi = self.length(q2), self.a * self.L, self.alpha - q2
-        bracket = self.s0 / s * (np.cos(phi) + aL / s**2 * np.sin(phi) ** 2) - np.cos(phi)
-        return float(self.Kc * aL * bracket)
-
-    def energy(self, q2: float) -> float:
-        return float(self.Kc * (self.length(q2) - self.s0) ** 2 / 2)
 
 
 # --- balance -------------------------------------------------------------------------------
@@ -127,22 +111,18 @@ def test_torques_balance_at_the_deflected_pose(weights: bool, force: Array) -> N
 # --- MuJoCo --------------------------------------------------------------------------------
 
 
-@pytest.mark.parametrize("force", [DOWN, SLANTED], ids=["down", "slanted"])
-@pytest.mark.parametrize("weights", [False, True], ids=["weightless", "weights"])
-def test_markers_agree_with_mujoco(weights: bool, force: Array) -> None:
-    """2.6 kN at the load point, Table 2 and 25 random poses: the same arm within 1 µm."""
+def test_markers_agree_with_mujoco() -> None:
+    """Weights and 2.6 kN, Table 2 and 10 random poses: the same arm within 1 µm."""
     pytest.importorskip("mujoco")
-    poses = kr270_poses(25)
-    gravity = GRAVITY if weights else None
-    arm = MujocoArm(kr270_chain(), K, LOAD_POINT, MARKERS, gravity=gravity)
-    ours = positions(kr270(link_gravity=weights), poses, force)
+    poses, force = kr270_poses(10), SLANTED
+    arm = MujocoArm(kr270_chain(), K, LOAD_POINT, MARKERS, gravity=GRAVITY)
+    ours = positions(kr270(link_gravity=True), poses, force)
     difference, bent = [], []
     for q, predicted in zip(poses, ours, strict=True):
         theirs = np.array(list(arm.markers(arm.equilibrium(q, force)).values()))
         difference.append(predicted - theirs)
         bent.append(theirs - np.array(list(arm.markers(q).values())))
     worst = np.linalg.norm(difference, axis=-1).max()
-    print(f"markers differ from MuJoCo's by at most {worst * 1e6:.2e} µm")
     assert worst < 1e-6
     assert np.linalg.norm(bent, axis=-1).max() > 5e-3
 
@@ -228,29 +208,6 @@ def test_compensator_torque() -> None:
     assert np.abs(M).max() > 1e3
 
 
-def test_compensator_changes_the_stiffness_of_joint_2() -> None:
-    """A little more load bends joint 2 by its torque over K2(q2), FACTS' formula."""
-    k2 = COMPLIANCE[1]
-    only_joint_2 = Nominal((0.0, k2, 0.0, 0.0, 0.0, 0.0), gravity_compensator=COMPENSATOR)
-    model = kr270("joint_compliance", "gravity_compensator", nominal=only_joint_2)
-    spring, reference = Compensator(), Pinocchio(np.zeros(3))
-    changes = []
-    for q in kr270_poses(30):
-        bent, torque = [], []
-        for force in (-DOWN / 26, DOWN / 26):  # 100 N
-            theta = model.deflection(table_of(q[None], force, ("M1",)))[0]
-            bent.append(theta[1])
-            torque.append(reference.torques(q + theta, force)[1])
-        if abs(torque[1] - torque[0]) < 20:  # the arm is folded over the joint: no lever
-            continue
-        effective = (torque[1] - torque[0]) / (bent[1] - bent[0])
-        q2 = q[1] + np.mean(bent)
-        assert effective == pytest.approx(1 / k2 + spring.stiffness(q2), rel=1e-7)
-        changes.append(spring.stiffness(q2) * k2)
-    assert len(changes) > 30
-    assert max(np.abs(changes)) > 1e-3  # far above the tolerance
-
-
 # --- too much load -------------------------------------------------------------------------
 
 
@@ -275,9 +232,8 @@ def test_a_load_without_equilibrium_is_nan_and_named() -> None:
     assert np.isfinite(kept.B).all()
 
 
-@pytest.mark.parametrize("load", [1e5, 1e7])
-def test_no_joint_deflects_by_a_turn(load: float) -> None:
+def test_no_joint_deflects_by_a_turn() -> None:
     """Newton's method wanders under absurd loads; where it ends is not a deflection."""
-    table = table_of(random_poses(kr270_chain(), 40, seed=1), np.array([0, 0, -load]), ("M1",))
+    table = table_of(random_poses(kr270_chain(), 40, seed=1), np.array([0, 0, -1e7]), ("M1",))
     theta = kr270(nominal=SOFT).deflection(table)
     assert not np.any(np.abs(theta) > np.pi)

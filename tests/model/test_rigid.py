@@ -81,14 +81,3 @@ def test_near_pi_digits_go_as_the_inverse_distance(short_of_pi: float, axis: np.
     r = (np.pi - short_of_pi) * axis
     tolerance = 10 * np.finfo(float).eps / short_of_pi
     np.testing.assert_allclose(log(exp(r)), r, rtol=0, atol=tolerance)
-
-
-def test_motions_and_points() -> None:
-    R = Rotation.from_rotvec([0.3, -0.2, 0.5]).as_matrix()
-    T = rigid.transform(rigid.constant(R), rigid.constant([1.0, 2.0, 3.0]))
-    p = np.array([0.1, 0.2, 0.3])
-    moved = np.array(ca.evalf(rigid.point(T, p))).ravel()
-    np.testing.assert_allclose(moved, R @ p + [1, 2, 3], rtol=0, atol=1e-15)
-    slide = rigid.joint_motion("prismatic", (0.0, 0.6, 0.8), ca.SX(0.5))
-    np.testing.assert_array_equal(np.array(ca.evalf(slide))[:3, 3], [0, 0.3, 0.4])
-    np.testing.assert_array_equal(np.array(ca.evalf(rigid.transform())), np.eye(4))

@@ -45,7 +45,6 @@ def somewhere(model: Model, seed: int) -> Array:
     return np.where(x == 0, 1e-3 * rng.normal(size=len(x)), x * rng.uniform(0.8, 1.2, len(x)))
 
 
-@pytest.mark.parametrize("seed", range(3))
 @pytest.mark.parametrize(
     ("effects", "observe", "options"),
     [
@@ -56,12 +55,12 @@ def somewhere(model: Model, seed: int) -> Array:
     ],
 )
 def test_explicit_models_agree_to_rounding(
-    effects: tuple[str, ...], observe: str, options: dict[str, Any], seed: int
+    effects: tuple[str, ...], observe: str, options: dict[str, Any]
 ) -> None:
     model = model_of(effects, observe, **options)
-    q = random_poses(model.chain, 1, seed)
+    q = random_poses(model.chain, 1, 0)
     table = replace(table_of(q, SLANTED, both=True), distance=np.ones(6))
-    symbolic, reference = both(model, table, somewhere(model, seed))
+    symbolic, reference = both(model, table, somewhere(model, 0))
     assert np.abs(symbolic - reference).max() <= 1e-12 * np.abs(reference).max()
 
 

@@ -32,9 +32,7 @@ def polar_draws(sight, sigma, rng, n):
                             r_n * np.sin(elevation)])  # fmt: skip
 
 
-@pytest.mark.parametrize(
-    "sight", [[2, 1, 0.5], [-1, 3, -1], [0.5, -0.2, 1.5], [-4, -4, 0], [0, 1, 0]]
-)
+@pytest.mark.parametrize("sight", [[-1, 3, -1], [0.5, -0.2, 1.5]])
 @pytest.mark.parametrize("rows", [False, True])
 def test_polar_covariance_against_draws_in_polar_coordinates(sight, rows):
     """n draws: an entry of the sample covariance has standard error ≤ √(2/n) of the two
@@ -83,9 +81,3 @@ def test_noise_that_is_not_stated_is_refused(kind, tracker, message):
 def test_a_marker_inside_the_tracker_is_refused():
     with pytest.raises(InputError, match="a marker stands at the tracker's own position"):
         position_covariance(table([STATION]), Tracker(STATION, NOISE), "polar")
-
-
-def test_polar_noise_needs_positions():
-    bare = replace(table([[1.0, 2.0, 3.0]]), position=None)
-    with pytest.raises(InputError, match=r"table\.csv has no positions"):
-        position_covariance(bare, Tracker(noise=NOISE), "polar")

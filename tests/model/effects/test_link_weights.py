@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 from model.effects.stick import model, positions, rows, stick
 from model.test_agreement_with_pinocchio import random_configurations, standing_arm
-from support.cells import kr270_cell, kr270_chain, random_table
+from support.cells import kr270_cell, kr270_chain
 
 from elastocal.cell.arm_description import Nominal
 from elastocal.cell.work_cell import Cell
@@ -17,7 +17,6 @@ from elastocal.model.arm import Arm
 from elastocal.model.chain import Chain
 from elastocal.model.effects.gravity_sag import LinkWeights
 from elastocal.model.effects.loads import STANDARD_GRAVITY
-from elastocal.model.manipulator import Model
 from elastocal.units import Array
 
 WEIGHTS = LinkWeights()
@@ -34,7 +33,7 @@ def torques(chain: Chain, cell: Cell, q: Array) -> Array:
     return np.stack([f(row).full() for row in q])
 
 
-@pytest.mark.parametrize("seed", range(8))
+@pytest.mark.parametrize("seed", range(3))
 def test_one_set_of_moments_makes_the_torques_of_any_weights_about_all_joints(
     tmp_path: Path, seed: int
 ) -> None:
@@ -76,18 +75,3 @@ def test_each_joint_yields_by_its_compliance_times_the_torque() -> None:
     np.testing.assert_allclose(found, positions(rigid, rows(sagged)), atol=1e-7)
     lowered = positions(rigid, rows(q))[:, 2] - found[:, 2]
     assert (lowered[[0, 2]] > 1e-5).all()
-
-
-@pytest.mark.parametrize("deflection_model", ["equilibrium", "linear"])
-def test_their_columns_follow_the_compliances(deflection_model: str) -> None:
-    """B against finite differences away from zero: compliance times moment is bilinear."""
-    cell = kr270_cell(["joint_compliance", "link_weights"], deflection_model=deflection_model)
-    m = Model.assembled(kr270_chain(), cell)
-    table = random_table(kr270_chain(), 4, seed=5)
-    x = m.nominal + np.array([0.3 * (p.typical or 1e-7) for p in m.parameters])
-    B = m.regressor(table, x).B
-    for j, p in enumerate(m.parameters):
-        h = np.zeros(len(x))
-        h[j] = 1e-2 * (p.typical or 1e-7)
-        slope = (m.predict(table, x + h) - m.predict(table, x - h)).ravel() / (2 * h[j])
-        np.testing.assert_allclose(B[:, j], slope, atol=1e-5 * max(np.abs(B[:, j]).max(), 1e-12))

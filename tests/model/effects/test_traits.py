@@ -11,40 +11,11 @@ from elastocal.model.effects.base import Effect, Symbols
 from elastocal.model.effects.catalogue import CATALOGUE, register
 from elastocal.model.effects.driven import JointMotion
 
-COMPLIANCES = {"joint_compliance", "off_axis_compliance", "link_bending", "base_compliance"}
-
 
 class Stranger(JointMotion):
     """Nothing but what every effect must state."""
 
     name = "stranger"
-
-
-def having(trait: str) -> set[str]:
-    return {name for name, effect in CATALOGUE.items() if getattr(effect, trait)}
-
-
-def test_traits_of_the_catalogue() -> None:
-    assert having("registered") == {
-        "base_frame", "marker_position", "marker_orientation", "distance_sensor",
-    }  # fmt: skip
-    assert having("elastic") == COMPLIANCES
-    assert having("sized_by_value") == COMPLIANCES - {"link_bending"}
-    assert having("of_the_measurement") == {
-        "base_drift", "frame_jump", "distance_sensor", "tracker_distortion", "marker_slip",
-    }  # fmt: skip
-    assert having("remedy") == {
-        "base_drift", "frame_jump", "tracker_distortion", "link_mass_error",
-        "gravity_compensator", "payload_error",
-    }  # fmt: skip
-    ranks = [{n for n, e in CATALOGUE.items() if e.rank == k} for k in (0, 1, 2, 3, 5)]
-    assert ranks == [
-        (COMPLIANCES - {"link_bending"}) | {"gravity_compensator"},
-        {"base_frame", "distance_sensor"},
-        {"marker_position", "marker_orientation"},
-        {"joint_offset"},
-        {"link_geometry"},
-    ]
 
 
 @pytest.mark.parametrize("observe", ["position", "pose", "distance"])
