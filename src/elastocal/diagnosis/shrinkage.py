@@ -378,21 +378,13 @@ def _timed(new: Measurements, table: Measurements, rng: np.random.Generator) -> 
 # The nonlinear fit of the model with the found effects in it, weighted by the fitted noise.
 
 
-@dataclass(frozen=True)
-class Posterior:
-    """Values x (parameters,) of a model, and `spread` (parameters, k): x + spread·z with standard
-    normal z (k,) is a draw from what the data leave possible."""
-
-    x: Array
-    spread: Array
-
-
 def posteriors(
     dataset: DiagnosisData, base: Baseline, at: Regression, noises: Sequence[NoiseValues],
     further: Array | None = None, prior: Mapping[str, float] | None = None,
-) -> Iterator[Posterior]:  # fmt: skip
+) -> Iterator[tuple[Array, Array]]:  # fmt: skip
     """One step from the fit `base`, at which the model is evaluated, to the readings of `dataset`
-    under each of the noises.
+    under each of the noises: x (parameters,) and S (parameters, k), so that x + S z with standard
+    normal z is a draw from what the data leave possible.
 
     `further` (rows, k) columns of constants that are not among the model's parameters, scaled to
     their prior deviations, stand last: at zero in x.  `prior` holds standard deviations of
@@ -418,7 +410,7 @@ def posteriors(
     for noise in noises:
         fit = project(data, noise)
         spread = linalg.solve_triangular(fit.factor, np.diag(width), lower=True).T
-        yield Posterior(centre + width * fit.beta, spread)
+        yield centre + width * fit.beta, spread
 
 
 # What an effect's searched constants may be instead, and what that does at new poses.
@@ -512,17 +504,12 @@ class Confirmation:
         """The exact model's values by effect and place, weighted by all the noise that was
         found."""
         measured, noise = self._regressions(self.fitted)[0], self.chosen.noise
-        fit = next(posteriors(self.dataset, self.fitted, measured, [noise]))
+        values, spreads = next(posteriors(self.dataset, self.fitted, measured, [noise]))
         out: dict[tuple[str, str], tuple[FittedParameter, ...]] = {}
-        known = zip(self.fitted.model.parameters, fit.x, fit.spread, strict=True)
-        for p, x, spread in known:
+        for p, x, spread in zip(self.fitted.model.parameters, values, spreads, strict=True):
             found = FittedParameter(p.name, float(x), p.unit, float(np.linalg.norm(spread)))
             out[p.effect, p.where] = (*out.get((p.effect, p.where), ()), found)
         return out
-
-    @cached_property
-    def _after(self) -> Array:
-        return self._regressions(self.fitted)[1].prediction
 
     @cached_property
     def _known_regressions(self) -> dict[tuple[Model, bytes], tuple[Regression, Regression]]:
@@ -611,11 +598,12 @@ class Confirmation:
             return rows.reshape(-1, size, *rows.shape[1:])[:, : min(size, 3)]
 
         out = []
-        for fit in posteriors(self.dataset, base, here, self.noise, measured, self._prior(true)):
-            readings = at.prediction + B @ (fit.x - start)
-            errors = lengths(before - readings), lengths(self._after - readings)
+        prior, after = self._prior(true), self._regressions(self.fitted)[1].prediction
+        for x, spread in posteriors(self.dataset, base, here, self.noise, measured, prior):
+            readings = at.prediction + B @ (x - start)
+            errors = lengths(before - readings), lengths(after - readings)
             pose, share = self.observed.configuration, probability / len(self.noise)
-            out.append(PosteriorDraw(*errors, lengths(B @ fit.spread), pose, share))
+            out.append(PosteriorDraw(*errors, lengths(B @ spread), pose, share))
         return out
 
     def _prior(self, true: ModelSet) -> dict[str, float]:
