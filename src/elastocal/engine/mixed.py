@@ -21,7 +21,7 @@ from typing import Protocol, TypeGuard
 import numpy as np
 from scipy import linalg, optimize, special
 
-from elastocal.engine.climb import climb
+from elastocal.engine.climb import Objective, climb
 from elastocal.errors import InsufficientDataError
 from elastocal.units import Array, BoolArray, IntArray
 
@@ -511,27 +511,40 @@ class MixedFit:
         return found - 0.5 * prior.penalty(np.log(theta))[0] + 0.5 * (log_dets[0] - log_dets[1])
 
 
-def fit(model: Mixed, start: Array, may_vanish: Sequence[int] = ()) -> MixedFit:
-    """Maximise the restricted likelihood (times the prior of log θ) from θ = `start` (K,).
+def fit(
+    model: Mixed, start: Array, may_vanish: Sequence[int] = (), enough: float = ENOUGH
+) -> MixedFit:
+    """Maximise the restricted likelihood (times the prior of log θ) from θ = `start` (K,), until a
+    step promises less than `enough` of −2ℓ.
 
     Variances that `may_vanish` are zero where the likelihood does not miss them.
     """
-    t = np.log(start)
-    lower, upper = t + np.log(SMALLEST), t + np.log(LARGEST)
-    ended = False
-    # Those that the columns could explain all of say nothing, and stand where they are: at none.
-    told = model.expected(model.state(start)).told
-    held = np.array([k for k in may_vanish if not told[k]], dtype=np.int64)
+    t, known = np.log(start), {}
+    lower, upper, ended = t + np.log(SMALLEST), t + np.log(LARGEST), False
+    held = np.zeros(0, dtype=np.int64)
+    if len(may_vanish):
+        # Those that the columns could explain all of say nothing: they are none.
+        told = model.expected(model.state(start)).told
+        held = np.array([k for k in may_vanish if not told[k]], dtype=np.int64)
+
+    def evaluated(t: Array) -> tuple[float, Array, Array]:
+        if (key := t.tobytes()) not in known:
+            try:
+                known[key] = model.objective(t)
+            except np.linalg.LinAlgError:
+                known[key] = np.inf, np.zeros(len(t)), np.eye(len(t))
+        return known[key]
+
     for _ in range(ROUNDS):
         t[held], lower[held], upper[held] = -np.inf, -np.inf, -np.inf
-        t, ended = _climbed(model, t, lower, upper)
-        value, slope, information = model.objective(t)
+        t, ended = _climbed(evaluated, t, lower, upper, enough)
+        value, slope, information = evaluated(t)
         falling = (slope > 0) & (slope < NEAR) & (np.diag(information) < FLAT) & np.isfinite(t)
         gone: list[int] = []
         for k in may_vanish:
             without = t.copy()
             without[[*gone, k]] = -np.inf
-            if falling[k] and model.objective(without)[0] <= value + FINE:
+            if falling[k] and evaluated(without)[0] <= value + FINE:
                 gone.append(k)
         if ended and not gone:
             break
@@ -539,7 +552,10 @@ def fit(model: Mixed, start: Array, may_vanish: Sequence[int] = ()) -> MixedFit:
     return MixedFit(model, model.state(np.exp(t)), ended)
 
 
-def _climbed(model: Mixed, t: Array, lower: Array, upper: Array) -> tuple[Array, bool]:
+def _climbed(
+    evaluated: Objective, t: Array, lower: Array, upper: Array, enough: float
+) -> tuple[Array, bool]:
+    """The climb in those logarithms that are finite."""
     free = np.flatnonzero(np.isfinite(t))
     if not len(free):
         return t, True
@@ -550,14 +566,11 @@ def _climbed(model: Mixed, t: Array, lower: Array, upper: Array) -> tuple[Array,
         return out
 
     def objective(own: Array) -> tuple[float, Array, Array]:
-        try:
-            value, slope, information = model.objective(full(own))
-        except np.linalg.LinAlgError:
-            return np.inf, np.zeros(len(free)), np.eye(len(free))
+        value, slope, information = evaluated(full(own))
         ridge = 1e-9 * max(float(np.diag(information).max()), 1e-3) * np.eye(len(free))
         return value, slope[free], information[np.ix_(free, free)] + ridge
 
-    found, ended = climb(objective, t[free], lower[free], upper[free], ENOUGH, STEPS)
+    found, ended = climb(objective, t[free], lower[free], upper[free], enough, STEPS)
     if not ended and np.array_equal(found, t[free]):  # where the information does not lead
         by = optimize.minimize(
             lambda own: objective(own)[:2], found, jac=True, method="L-BFGS-B",

@@ -48,6 +48,7 @@ from elastocal.units import Array
 # clearly better only makes the judgement of faulty readings erratic; so for joints told apart.  For
 # shared effects it is Akaike's (AIC): one that is left out wrongly makes intervals too narrow.
 
+ROUGHLY = 1e-3  # of −2ℓ: what decides between models need not be finer
 ROWS_PER_VARIANCE = 5  # degrees of freedom that a variance needs before it is worth trying
 MOST_GROUPS = 1000  # configurations: their information matrix has (3 · 1000)² entries
 # Readings, and those per parameter, that the choice is made from: so many tell a variance to 3 %.
@@ -182,12 +183,14 @@ class _Choice:
                 self._with_time(names[0], readings.visits.lasting)
         _, kind, best = self.best
         reason, trials = _reason(kind.name, self.trials), tuple(self.trials)
+        best = fitted(readings, kind, best, best.lasting)
         return _result(kind.name, best, T, trials, reason, tuple(self.tests))
 
     def attempt(self, kind: Kind, lasting: float | None = None) -> Fitted | None:
         """Fit a kind of noise and keep it where it is better than what there is."""
         try:
-            found = fitted(self.readings, kind, self.best[2] if self.best else None, lasting)
+            like = self.best[2] if self.best else None
+            found = fitted(self.readings, kind, like, lasting, ROUGHLY)
         except InsufficientDataError:
             return None
         kind, own, common = found.found, found.noisy.own, len(found.told)
@@ -271,8 +274,8 @@ class _Choice:
         assert self.best is not None
         less = self.best[2]
         if less.structure.name != kind.own:
-            less = fitted(self.readings, kind._replace(time=False), less)
-        more = fitted(self.readings, kind, less, lasting)
+            less = fitted(self.readings, kind._replace(time=False), less, None, ROUGHLY)
+        more = fitted(self.readings, kind, less, lasting, ROUGHLY)
         k = np.arange(1, len(more.drift) + 1)
         gain = 2 * (more.log_likelihood - less.log_likelihood)
         share = special.binom(len(k), k) / 2 ** len(k)

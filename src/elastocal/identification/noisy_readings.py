@@ -8,7 +8,7 @@ from functools import cached_property
 import numpy as np
 from scipy import special
 
-from elastocal.engine.mixed import Diagonal, LogPrior, Mixed, MixedFit, Pack, fit
+from elastocal.engine.mixed import ENOUGH, Diagonal, LogPrior, Mixed, MixedFit, Pack, fit
 from elastocal.errors import InputError, InsufficientDataError
 from elastocal.identification.linear_solver import least_norm
 from elastocal.identification.noise_structure import (
@@ -222,8 +222,9 @@ class Fitted:
 
 
 def fitted(
-    readings: Readings, kind: Kind, like: Fitted | None = None, lasting: float | None = None
-) -> Fitted:
+    readings: Readings, kind: Kind, like: Fitted | None = None, lasting: float | None = None,
+    enough: float = ENOUGH,
+) -> Fitted:  # fmt: skip
     """A model's fit; the search starts from the variances of `like` where it has the same.
 
     What drifts is `lasting` so long, as in `like`, or as is the most likely.
@@ -235,7 +236,7 @@ def fitted(
                 "time, or successive poses are near each other; visit poses in random order"
             )
         if lasting is None and (like is None or like.lasting is None):
-            tried = [fitted(readings, kind, like, each) for each in readings.visits.lasting]
+            tried = [fitted(readings, kind, like, each, enough) for each in readings.visits.lasting]
             return max(tried, key=lambda one: one.log_likelihood)
         lasting = lasting if lasting is not None or like is None else like.lasting
     noisy, prior = NoisyReadings(readings, kind, lasting if kind.time else None), None
@@ -248,7 +249,7 @@ def fitted(
             start[: noisy.own] = np.exp(prior.mean)
     # Own variances are never none: a reading without noise would decide everything; nor is a drift.
     first = noisy.own + len(noisy.drifts)
-    return Fitted(noisy, fit(noisy.model(prior), start, range(first, len(start))))
+    return Fitted(noisy, fit(noisy.model(prior), start, range(first, len(start)), enough))
 
 
 # Many variances from few readings each: shrink their logarithms towards one another.
