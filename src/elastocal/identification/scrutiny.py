@@ -8,7 +8,7 @@ from the fit's B, its weights and its residual; nothing is fitted anew.
 from __future__ import annotations
 
 from dataclasses import asdict, dataclass
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import numpy as np
 from scipy import linalg, special
@@ -17,15 +17,30 @@ from elastocal.engine.sizes import Standardised
 from elastocal.identification.linear_solver import least_norm
 from elastocal.identification.prediction import mean_squares
 from elastocal.identification.residuals import ALONE, held_out_residual, rms_3d
+from elastocal.identification.weighted_problem import Weights
 from elastocal.measurements import Measurements
+from elastocal.model.calibrated import CalibratedArm
 from elastocal.model.effects.catalogue import CATALOGUE
+from elastocal.model.manipulator import Model
 from elastocal.model.observations import Observations
-from elastocal.units import Array, BoolArray, microns
-
-if TYPE_CHECKING:
-    from elastocal.identification.result import Calibration
+from elastocal.units import Array, BoolArray, IntArray, microns
 
 MOST_NUMBERS = 10_000_000  # of a B that is looked at in passing
+
+
+@dataclass(frozen=True)
+class Looked:
+    """The fit as it ended: B (rows, parameters) of all parameters, which of them were fitted
+    (`columns`, by index), residual (rows,), weights."""
+
+    model: Model
+    observations: Observations
+    weights: Weights
+    x: Array
+    B: Array
+    columns: IntArray
+    residual: Array
+    dof: int
 
 
 # Leverage and influence.
@@ -60,9 +75,9 @@ class Influence:
         }
 
 
-def influence(fit: Calibration) -> tuple[Influence, ...]:
+def influence(fit: Looked) -> tuple[Influence, ...]:
     """Leverage and influence of every configuration, in the order of the table."""
-    observed, p = fit.observations, len(fit.determined)
+    observed, p = fit.observations, len(fit.columns)
     # What all readings share is fitted along.
     rows, e = fit.weights.beside_common(fit.B[:, fit.columns], fit.residual)
     Q, R = linalg.qr(rows, mode="economic")
@@ -87,7 +102,8 @@ def influence(fit: Calibration) -> tuple[Influence, ...]:
             k, by = int(np.argmax(shift)), float(shift.max())
             cook = float(move @ information @ move) / (p * s2) if s2 > 0 else 0.0
         count, leverage = len(mine) // observed.size, float((Qc**2).sum())
-        found.append(Influence(name, count, leverage, cook, fit.determined[k], by))
+        moved = fit.model.names[fit.columns[k]]
+        found.append(Influence(name, count, leverage, cook, moved, by))
     return tuple(found)
 
 
@@ -210,7 +226,7 @@ STRUCTURAL = 1e-7  # share of a column's length off the span of others, below wh
 RESAMPLED = 1000
 
 
-def parameter_sets(fit: Calibration) -> tuple[ParameterSet, ...]:
+def parameter_sets(fit: Looked) -> tuple[ParameterSet, ...]:
     """Base and markers alone, with geometry, with compliance, with what was chosen, and with all
     that is told apart at all; those that are the same as another once."""
     model, free = fit.model, ~fit.model.shrunk
@@ -267,7 +283,7 @@ def parameter_sets(fit: Calibration) -> tuple[ParameterSet, ...]:
     return tuple(found)
 
 
-def _independent(fit: Calibration, fitted: BoolArray, free: BoolArray) -> BoolArray:
+def _independent(fit: Looked, fitted: BoolArray, free: BoolArray) -> BoolArray:
     """The fitted parameters and, beside them, those whose columns lie in no span of others."""
     white = fit.weights.apply(fit.B)
     length = np.linalg.norm(white, axis=0)
@@ -339,13 +355,18 @@ class UncertaintyBudget:
         return {"at": self.at, **{f"{k}_um": microns(v) for k, v in told.items()}}
 
 
-def uncertainty_budget(fit: Calibration, table: Measurements | None = None) -> UncertaintyBudget:
-    """The budget at the poses and loads of a `table`, by default those fitted."""
-    arm, B, at = fit.arm, fit.B, "the poses fitted"
+def uncertainty_budget(
+    fit: Looked, arm: CalibratedArm, parts: dict[str, float], table: Measurements | None = None
+) -> UncertaintyBudget:
+    """The budget at the poses and loads of a `table`, by default those fitted.
+
+    `parts`: mean squares (m²) of the noise, "readings" and "visits".
+    """
+    B, at = fit.B, "the poses fitted"
     if table is not None:
         B, at = fit.model.regressor(table, fit.x).B, table.source
     own, left = mean_squares(arm, B, fit.observations.size)
-    visits, readings = (fit.noise_parts.get(part, 0.0) for part in ("visits", "readings"))
+    visits, readings = (parts.get(part, 0.0) for part in ("visits", "readings"))
     lack = min(max(arm.lacking**2 - visits, 0.0), readings)
     parameters, open_, shared, single, beyond = np.sqrt(
         [own, left, visits, readings - lack, lack]
