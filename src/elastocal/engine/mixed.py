@@ -522,7 +522,7 @@ def fit(
     t, known = np.log(start), {}
     lower, upper, ended = t + np.log(SMALLEST), t + np.log(LARGEST), False
     held = np.zeros(0, dtype=np.int64)
-    if len(may_vanish):
+    if any(_common(part) for pack in model.packs for part in pack.parts):
         # Those that the columns could explain all of say nothing: they are none.
         told = model.expected(model.state(start)).told
         held = np.array([k for k in may_vanish if not told[k]], dtype=np.int64)

@@ -247,9 +247,11 @@ def fitted(
         prior = prior_of_groups(noisy)
         if like is None or like.structure.names != noisy.structure.names:
             start[: noisy.own] = np.exp(prior.mean)
-    # Own variances are never none: a reading without noise would decide everything; nor is a drift.
-    first = noisy.own + len(noisy.drifts)
-    return Fitted(noisy, fit(noisy.model(prior), start, range(first, len(start)), enough))
+    # Without what drifts its waves have no prior.  Of own variances those may be none that leave
+    # every reading some noise: the likelihood knows.
+    drifting = range(noisy.own, noisy.own + len(noisy.drifts))
+    others = [k for k in range(len(start)) if k not in drifting]
+    return Fitted(noisy, fit(noisy.model(prior), start, others, enough))
 
 
 # Many variances from few readings each: shrink their logarithms towards one another.
