@@ -1,0 +1,150 @@
+"""What a diagnosed cell promises at new poses beside what it does there, on real arms.
+
+ELASTOCAL_DATASETS=… python promises.py            writes promises.md, out/promise_*
+ELASTOCAL_DATASETS=… python promises.py irb120 ur5 runs these arms again, keeps the others
+
+Each table is split: at random, by blocks of rows, at random after its rows were shuffled, or every
+second row.  The cell is identified on the one part before and after a diagnosis of it; what it
+promises is the held-out error of that fit, what is found the error of the other part's poses.
+"""
+
+from __future__ import annotations
+
+import json
+import sys
+from collections.abc import Iterator
+from dataclasses import dataclass
+from pathlib import Path
+from statistics import median
+
+import numpy as np
+from diagnose import OUT, elastocal, identified, read
+from prepare import HERE, prepare
+
+FAULTY = (142, 507)  # lines of the cable's table: README.md
+BLOCKS = 10
+
+
+@dataclass(frozen=True)
+class Split:
+    """`most`: configurations that are fitted at most, evenly from those of the part."""
+
+    arm: str
+    cell: str
+    table: str
+    way: str
+    seed: int
+    most: int = 400
+
+    @property
+    def stem(self) -> str:
+        return f"promise_{self.arm}_{self.way}_{self.seed}"
+
+    def write(self, data: Path) -> tuple[Path, Path]:
+        """Tables to fit and to test."""
+        header, *lines = (data / self.table).read_text(encoding="utf-8").splitlines()
+        if self.arm == "irb120":
+            lines = [v for k, v in enumerate(lines, 2) if not FAULTY[0] <= k <= FAULTY[1]]
+        at = header.split(",").index("configuration") if "configuration" in header else None
+        own = [k if at is None else v.split(",")[at] for k, v in enumerate(lines)]
+        order = list(dict.fromkeys(own))
+        rng = np.random.default_rng(self.seed)
+        if self.way == "shuffled":
+            order = [order[k] for k in rng.permutation(len(order))]
+        place = np.arange(len(order))
+        if self.way in ("random", "shuffled"):
+            fit = rng.permutation(len(order)) < 0.75 * len(order)
+        elif self.way == "blocks":
+            fit = (place * BLOCKS // len(order) + self.seed) % 4 > 0
+        else:
+            fit = place % 2 == self.seed % 2
+        chosen = np.flatnonzero(fit)
+        if len(chosen) > self.most:
+            chosen = chosen[np.linspace(0, len(chosen) - 1, self.most).round().astype(int)]
+        fitted = {order[k] for k in chosen}
+        tested = {order[k] for k in np.flatnonzero(~fit)}
+        rank = {c: k for k, c in enumerate(order)}
+        rows = sorted(zip(own, lines, strict=True), key=lambda row: rank[row[0]])
+        paths = []
+        for name, part in (("fit", fitted), ("test", tested)):
+            paths.append(OUT / f"{self.stem}_{name}.csv")
+            kept = [line for c, line in rows if c in part]
+            paths[-1].write_text("\n".join([header, *kept]) + "\n", encoding="utf-8")
+        return paths[0], paths[1]
+
+
+ARMS = {
+    "ur10": ("ur10.toml", "ur10_3000.csv"),
+    "ur5": ("ur5.toml", "ur5_grid.csv"),
+    "wam": ("wam.toml", "wam_grid.csv"),
+    "iiwa7": ("iiwa7_rigid.toml", "iiwa7.csv"),
+    "irb120": ("irb120.toml", "irb120.csv"),
+}
+WAYS = (("random", 1), ("blocks", 0), ("shuffled", 2), ("second", 0))
+
+
+def splits(arm: str) -> Iterator[Split]:
+    ways = [*WAYS, ("random", 3), ("blocks", 2)] if arm == "irb120" else WAYS
+    for way, seed in ways:
+        yield Split(arm, *ARMS[arm], way, seed)
+
+
+def measure(split: Split, data: Path) -> dict[str, float]:
+    fit, test = split.write(data)
+    cell = OUT / f"{split.stem}.toml"
+    out = OUT / f"{split.stem}.json"
+    elastocal("diagnose", HERE / split.cell, fit, "-o", out, "--cell-out", cell)
+    found: dict[str, float] = {}
+    for when, path in (("before", HERE / split.cell), ("after", cell)):
+        result = identified(path, fit, f"{split.stem}_{when}", "--test", test)
+        found |= {
+            f"{when}_promised": result["heldout_rms_um"], f"{when}_found": result["test"]["rms_um"]
+        }  # fmt: skip
+    diagnosis = read(out)
+    budget = [s["heldout_rms_um"] for s in diagnosis["budget"][:-1]]
+    return found | {"diagnosed": budget[-1], "verdict": diagnosis["verdict"]}
+
+
+def row(split: Split, found: dict[str, float]) -> str:
+    def mm(key: str) -> str:
+        return f"{found[key] / 1e3:.3f}"
+
+    ratio = {w: found[f"{w}_found"] / found[f"{w}_promised"] for w in ("before", "after")}
+    values = (
+        split.arm, f"{split.way} {split.seed}", str(found["verdict"]), mm("before_promised"),
+        mm("before_found"), f"{ratio['before']:.2f}", mm("diagnosed"), mm("after_promised"),
+        mm("after_found"), f"{ratio['after']:.2f}",
+    )  # fmt: skip
+    return f"| {' | '.join(values)} |"
+
+
+HEAD = (
+    "| arm | split | verdict | geometry: promised | found | ratio | diagnosis promised "
+    "| its cell: promised | found | ratio |\n|---|---|---|---|---|---|---|---|---|---|"
+)
+
+
+def main(chosen: list[str]) -> None:
+    data = prepare()
+    OUT.mkdir(exist_ok=True)
+    print(HEAD)
+    for arm in chosen or ARMS:
+        for split in splits(arm):
+            found = measure(split, data)
+            (OUT / f"{split.stem}_measured.json").write_text(json.dumps(found), encoding="utf-8")
+            print(row(split, found), flush=True)
+    rows, ratios = [], []
+    for arm in ARMS:
+        for split in splits(arm):
+            kept = OUT / f"{split.stem}_measured.json"
+            if kept.is_file():
+                found = read(kept)
+                rows.append(row(split, found))
+                ratios.append(found["after_found"] / found["after_promised"])
+    last = f"Found over promised by the diagnosed cell: {median(ratios):.2f} in the median."
+    (HERE / "promises.md").write_text("\n".join([HEAD, *rows, "", last]) + "\n", encoding="utf-8")
+    print(f"\n{last}")
+
+
+if __name__ == "__main__":
+    main(sys.argv[1:])
