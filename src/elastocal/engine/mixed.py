@@ -456,6 +456,7 @@ class Expected:
 # Steps before it is asked which variances are none, and how often; of −2ℓ: what a last step may
 # promise, and what none may cost.
 STEPS, ROUNDS, ENOUGH, FINE = 6, 15, 1e-7, 1e-3
+KEPT = 3  # evaluations, to be asked for again
 SMALLEST, LARGEST = 1e-10, 1e6  # of the start
 UNSEEN = 1e-5  # curvature of ℓ in its logarithm below which a variance is as good as none
 FLAT, NEAR = 1.0, 0.1  # curvature and slope in it below which it may be none
@@ -519,7 +520,8 @@ def fit(
 
     Variances that `may_vanish` are zero where the likelihood does not miss them.
     """
-    t, known = np.log(start), {}
+    t = np.log(start)
+    known: dict[bytes, tuple[float, Array, Array]] = {}
     lower, upper, ended = t + np.log(SMALLEST), t + np.log(LARGEST), False
     held = np.zeros(0, dtype=np.int64)
     if any(_common(part) for pack in model.packs for part in pack.parts):
@@ -529,6 +531,8 @@ def fit(
 
     def evaluated(t: Array) -> tuple[float, Array, Array]:
         if (key := t.tobytes()) not in known:
+            while len(known) > KEPT:  # a thousand groups have an information of 70 MB
+                known.pop(next(iter(known)))
             try:
                 known[key] = model.objective(t)
             except np.linalg.LinAlgError:
