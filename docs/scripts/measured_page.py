@@ -65,7 +65,7 @@ PAGES: dict[str, tuple[Part, ...]] = {
         Part(
             "Diagnosed",
             'Error in mm, with `--test` where a second run exists. "Earlier version": causes judged one by one; '
-            '"as diagnosed": all causes judged together.',
+            '"as diagnosed": all causes judged together. Times were taken on a busy two-core machine.',
             "python experiment_design/real_arms/diagnose.py",
             f"{STUDIES}/real_arms/diagnosis.md",
             tables=1,

@@ -116,6 +116,7 @@ def reporting_errors(command: Callable[..., None]) -> Callable[..., None]:
 
     @functools.wraps(command)
     def run(*args: Any, **kwargs: Any) -> None:
+        before = len(interrupts)  # of an earlier command in this process
         try:
             with options_as_flags(), warnings.catch_warnings():
                 # numpy's, of overflows: what comes of them is judged where a number must be one.
@@ -133,7 +134,7 @@ def reporting_errors(command: Callable[..., None]) -> Callable[..., None]:
         except Exception as error:
             if hasattr(error, "show"):  # of typer's own: a usage error
                 raise
-            if interrupts:  # which a library has turned into an error of its own
+            if len(interrupts) > before:  # which a library has turned into an error of its own
                 raise typer.Exit(INTERRUPTED) from None
             if os.environ.get(TRACEBACK):
                 traceback.print_exc()

@@ -78,6 +78,22 @@ class NoisyReadings:
         """How many of the variances are those of single readings."""
         return len(self.structure.names)
 
+    @property
+    def spare(self) -> list[int]:
+        """Own variances that may be none together, the others still giving every reading noise in
+        every direction: the last that can be spared first."""
+        theta = np.ones(self.own)
+        found: list[int] = []
+        if self.structure.index.shape[1] == 1 or self.structure.shrunk:
+            return found
+        for k in reversed(range(self.own)):
+            theta[k] = 0.0
+            if np.linalg.eigvalsh(self.structure.covariance(theta)).min() > 0:
+                found.append(k)
+            else:
+                theta[k] = 1.0
+        return found
+
     @cached_property
     def shared(self) -> tuple[SharedEffect, ...]:
         readings = self.readings
@@ -247,11 +263,9 @@ def fitted(
         prior = prior_of_groups(noisy)
         if like is None or like.structure.names != noisy.structure.names:
             start[: noisy.own] = np.exp(prior.mean)
-    # Without what drifts its waves have no prior.  Of own variances those may be none that leave
-    # every reading some noise: the likelihood knows.
-    drifting = range(noisy.own, noisy.own + len(noisy.drifts))
-    others = [k for k in range(len(start)) if k not in drifting]
-    return Fitted(noisy, fit(noisy.model(prior), start, others, enough))
+    # Without what drifts its waves have no prior.
+    shared = range(noisy.own + len(noisy.drifts), len(start))
+    return Fitted(noisy, fit(noisy.model(prior), start, (*noisy.spare, *shared), enough))
 
 
 # Many variances from few readings each: shrink their logarithms towards one another.
