@@ -80,7 +80,7 @@ def test_time_grows_as_the_text_does(reader: str, tmp_path: Path) -> None:
         assert costs[1] <= MOST * costs[0], (beginning, piece, costs)
 
 
-@pytest.mark.parametrize("expression", ["^(a+)+$", "^(a|a)*$", "(a*)*b", "(.*a){25}b"])
+@pytest.mark.parametrize("expression", ["^(a+)+$", "(.*a){25}b"])
 def test_a_mappings_own_expression_has_its_time(expression: str, tmp_path: Path) -> None:
     name = "a" * 60 + "!"
     (tmp_path / "points.csv").write_text(

@@ -289,7 +289,7 @@ COMMANDS = (
     Command("init", "arm.urdf -o out.toml", ("out.toml",)),
     Command("init", "arm.csv -o out.toml --convention modified", ("out.toml",)),
     Command("effects", "placed.toml --json", (), ("arm.urdf",)),
-    Command("compare", "placed.json placed.json --cell placed.toml -o out.json --poses 20 -q "
+    Command("compare", "placed.toml placed.json placed.json -o out.json --poses 20 -q "
             "--load 0 0 -98", ("out.json",), ("arm.urdf",)),
     Command("study", "study -o results --set replicates=3 -q --jobs 1", (),
             ("study/study.toml", "study/study.py")),

@@ -153,7 +153,7 @@ def chain(rng: Random, robot: str) -> list[Command]:
     ends = (
         Command("export", f"cell.toml out.json -o arm2{ending} --poses 20 -q"),
         Command("compensate", "cell.toml out.json --target 600,100,700 --point M1 -q"),
-        Command("compare", "out.json out.json --cell cell.toml -q --poses 20"),
+        Command("compare", "cell.toml out.json out.json -q --poses 20"),
         Command("diagnose", "cell.toml out.csv -q -o why.json", ("why.json",)),
     )  # fmt: skip
     return rng.choice(

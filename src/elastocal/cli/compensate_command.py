@@ -115,8 +115,8 @@ def compensate(
     )
     if shown and output is not None:
         say(
-            f"Next: run the commands of {output.name} (its q columns) and measure some: the tool "
-            "should lie within two or three std_um, and the tracker's noise, of its targets."
+            f"Next: run the commands of {output.name} (its q columns) and measure some: 19 of 20 "
+            "should lie within within95_um of their targets, with the tracker's noise on top."
         )
 
 

@@ -538,7 +538,7 @@ class SumAnswer:
         )
         shares = {stage: float(np.median(self.shares(own))) for stage, own in at_stage.items()}
         unknown = self.verdict == "unknown_effect"
-        chosen = self._unnamed if unknown else range(len(self.found.components))
+        chosen = (unknown and self._unnamed) or range(len(self.found.components))
         largest = max(chosen, key=lambda k: float(np.median(self.squares([k]))))
         c = self.found.components[largest]
         return Location(

@@ -156,12 +156,13 @@ class Suspects:
         }
 
     def unknown_set(self, dataset: DiagnosisData, noise: NoiseValues) -> RivalSet:
-        """The blocks that explain the data best where the diagnosis locates the effect, and the
-        likeliest effects of the catalogue; in `dataset` only the data so far count."""
-        location = self.diagnosis.location
-        assert location is not None  # an unknown effect was found somewhere
-        near = list(dict.fromkeys([location.where, *location.places]))[:PLACES]
-        blocks = [block for block in generic_blocks(dataset) if block.where in near]
+        """The blocks that explain the data best where the diagnosis locates the effect (anywhere,
+        where it only says that a gap is left), and the likeliest effects of the catalogue; in
+        `dataset` only the data so far count."""
+        blocks = generic_blocks(dataset)
+        if location := self.diagnosis.location:
+            near = list(dict.fromkeys([location.where, *location.places]))[:PLACES]
+            blocks = [block for block in blocks if block.where in near]
         items = [Item(block, np.zeros(0), 0.0) for block in blocks]
         grams = Grams(dataset, dataset.data, project(dataset.data, noise))
         evidence = np.array([float(grams.of(block).evidence()[0]) for block in blocks])

@@ -134,3 +134,13 @@ def test_a_verdict_without_rivals_is_refused(narrow) -> None:
         plan_extra(*narrow, settled)
     with pytest.raises(InputError, match="at least one"):
         plan_extra(*narrow, diagnosis_of({ECCENTRIC: 0.5, SCALE: 0.5}), most=0)
+
+
+def test_a_gap_that_is_nowhere_located_is_looked_for_everywhere(narrow) -> None:
+    """A verdict may rest on what is left alone: unknown, though no block was found for it."""
+    nowhere = diagnosis_of({ECCENTRIC: 0.1})
+    nowhere.verdict, nowhere.effects, nowhere.indistinguishable = "unknown_effect", (), ()
+    nowhere.probability_unknown = 0.9
+    extra = plan_extra(*narrow, nowhere, most=2)
+    places = {rival.partition(":")[2] for p in extra.pairs for rival in (p.first, p.second)}
+    assert len(places) > 1, extra.pairs
