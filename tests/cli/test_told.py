@@ -10,7 +10,6 @@ from support.files import write_campaign
 from support.registered import forgotten
 from typer.testing import CliRunner, Result
 
-from elastocal import screen
 from elastocal.cli.main import app
 from elastocal.errors import InputError
 
@@ -81,7 +80,8 @@ def test_a_plug_in_that_fails_at_work_is_to_blame_itself(
     effects = '"joint_offset", "mine"' if "DrivenEffect" in code else '"joint_offset"'
     text = cell.read_text().replace('"joint_offset"', effects)
     cell.write_text(f'{text}\n[plugins]\nmodules = ["{module}"]\n')
-    screen.interrupts.append(2)  # Ctrl-C in an earlier command of this process is not one here
+    # Ctrl-C in an earlier command of this process is not one here.
+    monkeypatch.setattr("elastocal.cli.app.interrupts", [2])
     with forgotten():
         done = run("identify", cell, tmp_path / "data.csv", "--plugins", "-q")
     assert done.exit_code == 2 and re.search(told, done.stderr), done.stderr

@@ -194,7 +194,8 @@ class Region:
             held, allowed = found.rows > 0, CERTIFIED
             u = equality_space(self.rows[held], self.least[held]).origin
             prices = np.zeros(len(held))
-            prices[held] = optimize.nnls(self.rows[held].T, u)[0]
+            if held.any():  # scipy's nnls of no column at all ends the process
+                prices[held] = optimize.nnls(self.rows[held].T, u)[0]
             found = Nearest(u, prices, tuple(np.zeros_like(Z) for Z in found.matrices))
         residual = self._breach(found) / max(float(np.linalg.norm(found.u)), size)
         if not residual <= allowed:
