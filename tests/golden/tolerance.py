@@ -157,7 +157,7 @@ def _numbers(
     path: str, key: str, expected: float, found: float, measure: Measure
 ) -> Iterator[Difference]:
     off, sd = abs(found - expected), measure.sd
-    nothing = NOTHING_SMALL if key.endswith(("_um", "_urad")) else NOTHING
+    nothing = NOTHING_SMALL if re.search(r"_u(m|rad)\b", path) else NOTHING
     allowed = nothing + (ENGINE if measure.engine else EXACT) * max(abs(expected), measure.size)
     if measure.engine:
         rule = next((r for r in RULES if r[0].match(key)), None)
