@@ -482,15 +482,18 @@ class MixedFit:
         return self.model.expected(self.state)
 
     @cached_property
+    def _curvature(self) -> Array:
+        """That of −ℓ to expect in log θ (K, K), with the prior's."""
+        H = self.theta[:, None] * self.expected.information * self.theta
+        return H if self.model.prior is None else self.model.prior.curved(H)
+
+    @cached_property
     def covariance(self) -> Array:
         """W (K, K) of θ̂.  A variance that is none is taken for zero, not for uncertain (the
         convention of mixed-model software): counting it widens what is wide enough already."""
-        at, theta = self.expected, self.theta
-        out = np.zeros_like(at.information)
-        H = theta[:, None] * at.information * theta
-        if self.model.prior is not None:
-            H = self.model.prior.curved(H)
-        free = np.flatnonzero((np.diag(H) > UNSEEN) & at.told)
+        theta, H = self.theta, self._curvature
+        out = np.zeros_like(H)
+        free = np.flatnonzero((np.diag(H) > UNSEEN) & self.expected.told)
         if len(free):
             scale = 1 / np.sqrt(np.diag(H)[free])
             own = H[np.ix_(free, free)] * np.outer(scale, scale)
@@ -506,10 +509,11 @@ class MixedFit:
         found, prior = self.state.log_likelihood, self.model.prior
         if prior is None:
             return found
-        k, theta = len(prior.mean), self.theta[: len(prior.mean)]
-        H = theta[:, None] * self.expected.information[:k, :k] * theta + prior.precision
+        k = len(prior.mean)
+        H = self._curvature[:k, :k]
         log_dets = [float(np.linalg.slogdet(part)[1]) for part in (prior.precision, H)]
-        return found - 0.5 * prior.penalty(np.log(theta))[0] + 0.5 * (log_dets[0] - log_dets[1])
+        off = prior.penalty(np.log(self.theta[:k]))[0]
+        return found - 0.5 * off + 0.5 * (log_dets[0] - log_dets[1])
 
 
 def fit(

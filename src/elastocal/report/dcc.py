@@ -139,7 +139,7 @@ def _quantity(
     if value is None:
         _add(quantity, "noQuantity")
         return
-    real = ElementTree.SubElement(quantity, f"{{{SI}}}real")
+    real = _si(quantity, "real")
     _si(real, "value", f"{value:.9g}")
     _si(real, "unit", unit)
     if expanded is not None:
@@ -155,14 +155,12 @@ def _named(parent: Element, name: str | None) -> None:
     content.set("lang", "en")
 
 
-def _add(parent: Element, tag: str, text: str | None = None) -> Element:
-    found = ElementTree.SubElement(parent, f"{{{DCC}}}{tag}")
+def _add(parent: Element, tag: str, text: str | None = None, space: str = DCC) -> Element:
+    found = ElementTree.SubElement(parent, f"{{{space}}}{tag}")
     if text is not None:
         found.text = printable(text)
     return found
 
 
 def _si(parent: Element, tag: str, text: str | None = None) -> Element:
-    found = ElementTree.SubElement(parent, f"{{{SI}}}{tag}")
-    found.text = text
-    return found
+    return _add(parent, tag, text, SI)
