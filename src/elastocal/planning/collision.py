@@ -10,6 +10,7 @@ from typing import Any
 import casadi as ca
 import numpy as np
 from numpy.typing import NDArray
+from scipy.linalg import null_space
 from scipy.spatial.transform import Rotation
 
 from elastocal.cell.work_cell import Cell
@@ -345,12 +346,19 @@ class MotionBound:
     ) -> None:
         chain = kinematics.chain
         n = chain.n_joints
-        self._axes = np.array([joint.axis for joint in chain.joints])
-        self._revolute = [joint.kind == "revolute" for joint in chain.joints]
+        # Two directions across each revolute axis, in the joint's frame.
+        self._across = [
+            null_space(joint.axis[None]).T if joint.kind == "revolute" else None
+            for joint in chain.joints
+        ]
         load_point = (chain.flange_placement @ [*kinematics.load_point, 1.0])[None, :3]
         # The points and radii whose motion bounds that of all bodies on a joint; the load point.
-        self._carried = [(i, *_reach([b for b in bodies if b.carrier == i])) for i in range(n)]
-        self._carried.append((n - 1, load_point, np.zeros(1)))
+        parts = [(i, *_reach([b for b in bodies if b.carrier == i])) for i in range(n)]
+        parts.append((n - 1, load_point, np.zeros(1)))
+        sizes = [len(points) for _, points, _ in parts]
+        self._first = np.cumsum([0, *sizes[:-1]])
+        self._carried = [(carrier, points.T) for carrier, points, _ in parts]
+        self._radii = np.concatenate([radii for _, _, radii in parts])
         # Each pair's bound is one entry of S, or the sum of two.
         at = np.zeros((2, 2, len(pairs)), dtype=int)
         at[1, 1] = n  # S after the last joint is zero
@@ -368,30 +376,34 @@ class MotionBound:
     def __call__(self, poses: Poses, half: Array) -> Array:
         """Changes (N, pairs) in m for middles `poses` and half-widths h (N, n) in rad or m."""
         n = half.shape[1]
-        S = np.zeros((len(poses), len(self._carried), n + 1))
-        for c, (carrier, points, radii) in enumerate(self._carried):
-            T = poses.frames[:, carrier]
-            world = T[:, :3, :3] @ points.T + T[:, :3, 3:]
-            for j in range(carrier, -1, -1):
-                S[:, c, j] = S[:, c, j + 1] + half[:, j]
-                if self._revolute[j]:
-                    axis = poses.frames[:, j, :3, :3] @ self._axes[j]
-                    arm = world - poses.frames[:, j, :3, 3:]
-                    along = (axis[:, None] @ arm)[:, 0]
-                    square = np.einsum("nik,nik->nk", arm, arm) - along**2
-                    lever = (np.sqrt(np.maximum(square, 0.0)) + radii).max(axis=1, initial=0.0)
-                    S[:, c, j] = S[:, c, j + 1] + half[:, j] * (lever + S[:, c, j + 1])
+        S = np.zeros((len(poses), n + 1, n + 1))  # of what joint 1 to n carry and the load point
+        T = poses.frames[..., :3, :]
+        placed = [T[:, c, :, :3] @ points + T[:, c, :, 3:] for c, points in self._carried]
+        world = np.concatenate(placed, axis=2)
+        for j in reversed(range(n)):
+            S[:, j:, j] = S[:, j:, j + 1] + half[:, j, None]
+            across = self._across[j]
+            if across is not None:
+                start = self._first[j]
+                frame = poses.frames[:, j]
+                turned = across @ frame[:, :3, :3].transpose(0, 2, 1)
+                arm = turned @ world[:, :, start:] - turned @ frame[:, :3, 3:]
+                levers = np.hypot(arm[:, 0], arm[:, 1]) + self._radii[start:]
+                lever = np.maximum.reduceat(levers, self._first[j:] - start, axis=1)
+                S[:, j:, j] = S[:, j:, j + 1] + half[:, j, None] * (lever + S[:, j:, j + 1])
         (one, upto), (two, upto_two) = self._at
         return np.asarray(S[:, one, upto] + S[:, two, upto_two])
 
 
 def _reach(bodies: Sequence[Body]) -> tuple[Array, Array]:
     """Points (k, 3) on a joint and what any point of its bodies may be further out (k,)."""
-    points, radii = [np.zeros((0, 3))], [np.zeros(0)]
+    points, radii = [], []
     for body in bodies:
         own, radius = few_points(body.solid)
         points.append(own)
         radii.append(np.full(len(own), radius if body.solid.shape == "cylinder" else 0.0))
+    if not points:  # its origin, which bounds nothing that is asked for
+        return np.zeros((1, 3)), np.zeros(1)
     return np.concatenate(points), np.concatenate(radii)
 
 
