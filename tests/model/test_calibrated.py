@@ -74,6 +74,8 @@ def test_markers_that_only_the_table_named_are_found_in_the_result(
         (lambda r: r["parameters"].append({"name": "joint9.offset", "held": 0}), "joint9.offset"),
         (lambda r: r["parameters"].append(r["parameters"][0]), "is listed twice"),
         (lambda r: r["parameters"][2].update(held=None), r"parameters\[2\] needs"),
+        (lambda r: r["parameters"][2].update(combined_with=[3]), r"parameters\[2\] .* names"),
+        (lambda r: r["parameters"][2].update(dof="many"), r"parameters\[2\] .* number under dof"),
         (lambda r: r["parameters"][2].update(held=float("nan")), "NaN is no number of JSON"),
         (lambda r: r["covariance_of"].pop(), "covariance of"),
     ],

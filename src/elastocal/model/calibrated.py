@@ -317,6 +317,13 @@ def _held(result: dict[str, Any], path: str | Path) -> dict[str, float]:
             ) from None
         if not np.isfinite(value):
             raise InputError(f"{path}: parameters[{k}] '{name}' holds {value}, no finite number")
+        dof, others = entry.get("dof"), entry.get("combined_with")
+        named = isinstance(others, list | None) and all(isinstance(o, str) for o in others or ())
+        if not (isinstance(dof, float | int | None) and named):
+            raise InputError(
+                f"{path}: parameters[{k}] '{name}' needs a number under dof and a list of names "
+                "under combined_with; write the result anew with identify"
+            )
         if name in held:
             raise InputError(f"{path}: parameter '{name}' is listed twice")
         held[name] = value
