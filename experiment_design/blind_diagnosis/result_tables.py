@@ -28,7 +28,7 @@ from suites import FEW_POSES, MANY_POSES, SUITES, WHOLE_SUITES
 from whole_score import SMALL
 from whole_world import over_oracle
 
-from elastocal.studies.study_results import read_results
+from elastocal.studies.results import read_results
 
 FAR, WELL_APART = 5.0, 10.0  # d
 NEARLY_CERTAIN = 0.97

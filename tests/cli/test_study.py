@@ -15,7 +15,7 @@ from typer.testing import CliRunner
 
 from elastocal.cli.main import app
 from elastocal.cli.study_command import Pace
-from elastocal.studies.study_results import read_results
+from elastocal.studies.results import read_results
 
 # A child may inherit that SIGINT is ignored; here it must not.
 PROGRAM = (

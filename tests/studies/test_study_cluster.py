@@ -8,8 +8,15 @@ import pytest
 from support.study_folders import numbers, run_study, write_study
 
 from elastocal.errors import InputError
-from elastocal.studies.study_results import read_results
-from elastocal.studies.study_run import ClusterLostError, StudyStop, _security, connect, run_cluster
+from elastocal.studies.results import read_results
+from elastocal.studies.run import (
+    ClusterLostError,
+    DaskWorkers,
+    StudyStop,
+    _security,
+    connect,
+    hand_out,
+)
 
 dask = pytest.importorskip("dask", reason="needs the extra 'cluster'")
 distributed = pytest.importorskip("distributed", reason="needs the extra 'cluster'")
@@ -58,9 +65,9 @@ def marked(tmp_path, lethal=None, count=12, sleep=0.02):
     return write_study(tmp_path / "study", script), marks
 
 
-def at(address, stop=None, told=None):
-    stop, told = stop or StudyStop(), [] if told is None else told
-    return lambda study: lambda tasks: run_cluster(study, tasks, address, stop, told.append)
+def at(address):
+    crew = DaskWorkers(connect(address), print)
+    return lambda study: lambda tasks: hand_out(crew, study, tasks, StudyStop())
 
 
 def begun(marks):
@@ -102,7 +109,7 @@ def test_others_on_the_same_worker_are_not_blamed(tmp_path):
 
 
 def test_no_scheduler_is_told(monkeypatch):
-    monkeypatch.setattr("elastocal.studies.study_run.ANSWER", 0.5)
+    monkeypatch.setattr("elastocal.studies.run.ANSWER", 0.5)
     nothing = dask.config.set({"scheduler-address": None})
     with nothing, pytest.raises(InputError, match="names no scheduler"):
         connect("config")
@@ -130,8 +137,7 @@ def test_no_scheduler_beyond_this_host_is_reached_in_the_clear(address, allowed)
         _security(distributed, address, unencrypted=True)
 
 
-def test_a_scheduler_that_goes_away_ends_the_run_and_keeps_what_is_done(tmp_path, monkeypatch):
-    monkeypatch.setattr("elastocal.studies.study_run.PATIENCE", 1.0)
+def test_a_scheduler_that_goes_away_ends_the_run_and_keeps_what_is_done(tmp_path):
     folder, marks = marked(tmp_path, count=200, sleep=0.05)
     cluster = distributed.LocalCluster(
         n_workers=1, threads_per_worker=1, processes=False, dashboard_address=":0"

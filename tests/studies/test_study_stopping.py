@@ -6,8 +6,8 @@ import sys
 import pytest
 from support.study_folders import here, on_processes, run_study, write_study
 
-from elastocal.studies.study_results import read_results
-from elastocal.studies.study_run import StudyStop
+from elastocal.studies.results import read_results
+from elastocal.studies.run import StudyStop
 
 pytestmark = pytest.mark.skipif(sys.platform == "win32", reason="signals of POSIX")
 

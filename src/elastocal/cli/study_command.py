@@ -15,7 +15,7 @@ from elastocal.errors import InsufficientDataError, require
 from elastocal.screen import progress_line, say
 
 if TYPE_CHECKING:
-    from elastocal.studies.study_run import Ending
+    from elastocal.studies.run import Ending
 
 EVERY = 10.0  # s between plain lines of progress
 
@@ -83,15 +83,15 @@ def study(
     Example: elastocal study experiment_design/coverage --jobs 4
     """
     require(cluster is None or jobs is None, "--jobs is for this machine; leave it with --cluster")
-    from elastocal.studies.study_folder import read_study
-    from elastocal.studies.study_results import StudyResults
-    from elastocal.studies.study_run import StudyStop, run_study, summarise
+    from elastocal.studies.results import check_page
+    from elastocal.studies.run import StudyStop, run_study, summarise
+    from elastocal.studies.study import read_study
 
     results = folder / "results" if output is None else output
     page = folder / "result.md"
     if output is not None:
         page = Path(f"{output if output.name else output.resolve()}.md")
-        StudyResults(results).check_page(page)
+        check_page(results, page)
     prepared = read_study(folder, seed, set_ or ())
     with StudyStop() as stop, progress_line(quiet or not progress, EVERY) as tell:
         ending = run_study(
@@ -121,7 +121,7 @@ def _told(ending: Ending, results: Path) -> str:
         text += f", {ending.failed} failed"
     text += f"; results in {results}"
     if ending.failed:
-        from elastocal.studies.study_results import read_results
+        from elastocal.studies.results import read_results
 
         first = read_results(results, failed=True).iloc[0]
         text += (

@@ -1,5 +1,9 @@
 """A study run: tasks on joblib's processes or a Dask cluster, recorded as they come, stopped.
 
+    study = read_study("experiment_design/coverage", options=["replicates=200"])
+    run_study(study, "look", jobs=4)
+    frame = read_results("look")
+
 Workers know nothing of what a task computes, and only the one process that the user started
 writes.  However a run ends, what was done by then is kept, and the next one goes on from there.
 """
@@ -22,20 +26,19 @@ from dataclasses import dataclass
 from functools import partial
 from ipaddress import ip_address
 from pathlib import Path
-from types import FrameType, ModuleType
+from types import FrameType
 from typing import Any, Self
 
 from elastocal import __version__
 from elastocal.errors import ElastocalError, InputError, option, require
 from elastocal.files import read_bytes
-from elastocal.studies.study_folder import Row, Sources, Study, StudyTask, calling, execute
-from elastocal.studies.study_results import StudyResults, opened, read_results
+from elastocal.studies import results
+from elastocal.studies.study import Row, Study, StudyTask, calling, execute
 from elastocal.text import printable, quoted
 
 GRACE = 30.0  # s that running tasks are waited for
 ANSWER = 10.0  # s in which a scheduler answers
 MOST_PEM_BYTES = 1_000_000
-PATIENCE = 60.0  # s without a scheduler before the run gives up
 # What limits threads of linear algebra: the processes share the cores.
 THREADS = (
     "OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS", "BLIS_NUM_THREADS",
@@ -57,7 +60,6 @@ class StudyStop:
         self.asked = self._now = False
         self._grace, self._tell = grace, tell or _write
         self._before: dict[int, Any] = {}
-        self._timer: threading.Timer | None = None
 
     def check(self) -> None:
         """Raise KeyboardInterrupt where it came to that before."""
@@ -66,14 +68,14 @@ class StudyStop:
 
     def __enter__(self) -> Self:
         if threading.current_thread() is threading.main_thread():  # only it may set handlers
-            for number in (signal.SIGINT, signal.SIGTERM):
+            for number in (signal.SIGINT, signal.SIGTERM, signal.SIGALRM):
                 if signal.getsignal(number) is not signal.SIG_IGN:  # as under nohup
                     self._before[number] = signal.signal(number, self._note)
         return self
 
     def __exit__(self, *_: object) -> None:
-        if self._timer is not None:
-            self._timer.cancel()
+        if self._before:
+            signal.setitimer(signal.ITIMER_REAL, 0.0)
         while self._before:
             signal.signal(*self._before.popitem())
 
@@ -85,9 +87,7 @@ class StudyStop:
         self._tell(
             f"stopping: the running tasks have {self._grace:.0f} s to end (Ctrl-C again: at once)"
         )
-        self._timer = threading.Timer(self._grace, os.kill, (os.getpid(), number))
-        self._timer.daemon = True
-        self._timer.start()
+        signal.setitimer(signal.ITIMER_REAL, self._grace)
 
 
 def _write(message: str) -> None:
@@ -95,8 +95,98 @@ def _write(message: str) -> None:
     os.write(2, f"\nelastocal: {message}\n".encode())
 
 
+class Processes:
+    """Processes on this machine: joblib's, replaced by new ones when one of them dies."""
+
+    tries = 3  # of a task whose process dies
+
+    def __init__(self, number: int) -> None:
+        from joblib import cpu_count
+
+        self.number = number
+        self._pool: Any = None
+        threads = str(max(cpu_count() // number, 1))
+        self._env = {name: os.environ.get(name, threads) for name in THREADS}
+
+    def places(self) -> int:
+        return self.number
+
+    def submit(self, *call: Any) -> Any:
+        from joblib.externals.loky import ProcessPoolExecutor
+
+        while True:
+            self._pool = self._pool or ProcessPoolExecutor(
+                self.number,
+                initializer=partial(signal.signal, signal.SIGINT, signal.SIG_IGN),  # Ctrl-C
+                env=self._env,
+            )
+            try:
+                return self._pool.submit(*call)
+            except BrokenProcessPool:
+                self._pool = None
+
+    def deaths(self, error: Exception) -> int:
+        return int(isinstance(error, BrokenProcessPool))
+
+    def close(self, out: list[Any]) -> None:
+        if self._pool is not None:
+            self._pool.shutdown(kill_workers=bool(out))
+
+
+class DaskWorkers:
+    """The workers of a Dask cluster, which gives the tasks of a dead one to another.
+
+    Each task has a future of its own: one that killed more workers than the cluster allows
+    (distributed.scheduler.allowed-failures) fails alone, where joblib's backend for Dask gives up
+    the whole run.
+    """
+
+    def __init__(self, client: Any, tell: Callable[[str], None]) -> None:
+        self._client, self._tell, self._told = client, tell, False
+        self._threads, self._looked, self.tries = 0, float("-inf"), 1
+
+    def places(self) -> int:
+        """Returns the threads of all workers; raises ClusterLostError without a scheduler."""
+        if self._client.status != "running":
+            raise self._lost()
+        if time.monotonic() - self._looked > 1.0:
+            threads = self._client.nthreads().values()
+            self._threads, self._looked = sum(threads), time.monotonic()
+            if max(threads, default=0) > 1:
+                self.tries = 2  # a worker may have died of another task that it ran
+            if not threads and not self._told:
+                self._tell("the cluster has no worker; waiting for one")
+            self._told = not threads
+        return self._threads
+
+    def submit(self, *call: Any) -> Any:
+        return self._client.submit(*call, pure=False)  # no other call may answer for this one
+
+    def deaths(self, error: Exception) -> int:
+        if isinstance(error, CancelledError | OSError):
+            raise self._lost() from None
+        return int(getattr(error, "allowed_failures", -1)) + 1  # as a KilledWorker has
+
+    def close(self, out: list[Any]) -> None:
+        if out and self._client.status == "running":
+            self._client.cancel(out, force=True)
+        self._client.close()
+
+    def _lost(self) -> ClusterLostError:
+        return ClusterLostError(
+            f"the scheduler at {self._client.scheduler.address} went away or cancelled the tasks; "
+            "what was done is kept, and the same command goes on with the rest"
+        )
+
+
+class ClusterLostError(ElastocalError):
+    """The scheduler went away; what was done is kept."""
+
+    exit_code = 1
+
+
 def hand_out(
-    crew: Processes, sources: Sources, tasks: Sequence[StudyTask], stop: StudyStop
+    crew: Processes | DaskWorkers, study: Study, tasks: Sequence[StudyTask], stop: StudyStop
 ) -> Lines:
     """Lines of results as they come, none twice; none new begins once `stop` is asked for.
 
@@ -113,7 +203,7 @@ def hand_out(
             places = crew.places()
             while not stop.asked and len(out) < places and (waiting or (suspects and not out)):
                 task = (waiting or suspects).popleft()
-                future = crew.submit(execute, sources, task)
+                future = crew.submit(execute, study.sources, task)
                 out[future] = task
                 future.add_done_callback(ended.put)
             if not out and (stop.asked or not (waiting or suspects)):
@@ -149,7 +239,7 @@ def run_local(study: Study, tasks: Sequence[StudyTask], jobs: int | None, stop: 
 
     jobs = min(jobs or joblib.cpu_count(), len(tasks))
     if jobs > 1:
-        yield from hand_out(Processes(jobs), study.sources, tasks, stop)
+        yield from hand_out(Processes(jobs), study, tasks, stop)
         return
     for task in tasks:
         if stop.asked:
@@ -157,136 +247,18 @@ def run_local(study: Study, tasks: Sequence[StudyTask], jobs: int | None, stop: 
         yield execute(study.sources, task)
 
 
-class Processes:
-    """Processes on this machine: joblib's, replaced by new ones when one of them dies."""
-
-    tries = 3
-
-    def __init__(self, number: int) -> None:
-        self._number = number
-        self._pool: Any = None
-
-    def places(self) -> int:
-        return self._number
-
-    def submit(self, *call: Any) -> Any:
-        from joblib import cpu_count
-        from joblib.externals.loky import ProcessPoolExecutor
-
-        threads = str(max(cpu_count() // self._number, 1))
-        while True:
-            self._pool = self._pool or ProcessPoolExecutor(
-                self._number,
-                initializer=partial(signal.signal, signal.SIGINT, signal.SIG_IGN),  # Ctrl-C
-                env={name: os.environ.get(name, threads) for name in THREADS},
-            )
-            try:
-                return self._pool.submit(*call)
-            except BrokenProcessPool:
-                self._pool = None
-
-    def deaths(self, error: Exception) -> int:
-        return int(isinstance(error, BrokenProcessPool))
-
-    def close(self, out: list[Any]) -> None:
-        if self._pool is not None:
-            self._pool.shutdown(kill_workers=bool(out))
-
-
-class ClusterLostError(ElastocalError):
-    """The scheduler went away; what was done is kept."""
-
-    exit_code = 1
-
-
-def run_cluster(
-    study: Study,
-    tasks: Sequence[StudyTask],
-    address: str,
-    stop: StudyStop,
-    tell: Callable[[str], None],
-    **way: Any,
-) -> Lines:
-    """Runs tasks on the Dask cluster at `address`, or that of Dask's configuration.
-
-    Raises InputError where `connect` does, ClusterLostError where the scheduler goes away.
-    """
-    if tasks:
-        yield from hand_out(DaskWorkers(connect(address, **way), tell), study.sources, tasks, stop)
-
-
-class DaskWorkers(Processes):
-    """The workers of a Dask cluster, which gives the tasks of a dead one to another.
-
-    `distributed` itself rather than joblib's backend for it: each task has its own future, so
-    one that killed more workers than the cluster allows (distributed.scheduler.allowed-failures)
-    fails alone, where joblib gives up the whole run.
-    """
-
-    def __init__(self, client: Any, tell: Callable[[str], None]) -> None:
-        self.tries = 1
-        self._client, self._tell, self._told = client, tell, False
-        self._places, self._seen, self._looked = 0, time.monotonic(), float("-inf")
-
-    def places(self) -> int:
-        """Returns the threads of all workers, looked up once a second at most.
-
-        Raises ClusterLostError where the scheduler is gone for PATIENCE seconds.
-        """
-        now = time.monotonic()
-        if self._client.status != "running":
-            if now - self._seen > PATIENCE or self._client.status == "closed":
-                raise self._lost()
-            return 0
-        self._seen = now
-        if now - self._looked > 1.0:
-            threads = self._client.nthreads().values()
-            self._places, self._looked = sum(threads), now
-            if max(threads, default=0) > 1:
-                self.tries = 2  # a worker may have died of another task that it ran
-            if not threads and not self._told:
-                self._tell("the cluster has no worker; waiting for one")
-            self._told = not threads
-        return self._places
-
-    def submit(self, *call: Any) -> Any:
-        return self._client.submit(*call, pure=False)  # no other call may answer for this one
-
-    def deaths(self, error: Exception) -> int:
-        if isinstance(error, CancelledError | OSError):
-            raise self._lost() from None
-        return int(getattr(error, "allowed_failures", -1)) + 1  # as a KilledWorker has
-
-    def close(self, out: list[Any]) -> None:
-        if out and self._client.status == "running":
-            self._client.cancel(out, force=True)
-        self._client.close()
-
-    def _lost(self) -> ClusterLostError:
-        return ClusterLostError(
-            f"the scheduler at {self._client.scheduler.address} went away or cancelled the tasks; "
-            "what was done is kept, and the same command goes on with the rest"
-        )
-
-
 def _security(
-    distributed: ModuleType,
-    address: str,
-    tls_ca: Path | None = None,
-    tls_cert: Path | None = None,
-    tls_key: Path | None = None,
-    unencrypted: bool = False,
+    distributed: Any, address: str, unencrypted: bool = False, **files: Path | None
 ) -> Any:
-    """Dask's Security for a client of `address`, with these TLS files (PEM) or those of Dask's
-    configuration.
+    """Dask's Security for a client of `address`: with the `files` tls_ca, tls_cert and tls_key
+    (PEM) or those of Dask's configuration.
 
     Whoever stands between could run code of their own here and there: tasks and results are
     pickles.  So another host is reached by TLS only, unless `unencrypted` allows it.
     """
-    files = {"tls_ca": tls_ca, "tls_cert": tls_cert, "tls_key": tls_key}
-    for name, path in files.items():
-        if path is not None:
-            read_bytes(path, f"file of {option(name)}", MOST_PEM_BYTES)
+    given = {name: path for name, path in files.items() if path is not None}
+    for name, path in given.items():
+        read_bytes(path, f"file of {option(name)}", MOST_PEM_BYTES)
     scheme, _, rest = address.rpartition("://")
     host = rest.rsplit(":", 1)[0].strip("[]")
     here = scheme == "inproc" or host == "localhost"
@@ -299,9 +271,8 @@ def _security(
         f"{option('tls_ca')}, {option('tls_cert')} and {option('tls_key')}, a tunnel to this "
         f"host, or allow it with {option('unencrypted', True)}",
     )
-    keys = ("tls_ca_file", "tls_client_cert", "tls_client_key")
-    stated = {k: str(p) for k, p in zip(keys, files.values(), strict=True) if p is not None}
-    return distributed.Security(**stated)
+    keys = {"tls_ca": "tls_ca_file", "tls_cert": "tls_client_cert", "tls_key": "tls_client_key"}
+    return distributed.Security(**{keys[name]: str(path) for name, path in given.items()})
 
 
 def connect(address: str, **way: Any) -> Any:
@@ -310,9 +281,14 @@ def connect(address: str, **way: Any) -> Any:
     Raises InputError where distributed is not installed, the way there is not allowed, there is
     no scheduler, or a worker lacks this version of elastocal.
     """
-    distributed = dask_distributed()
-    import dask
-
+    try:
+        import dask
+        import distributed
+    except ImportError:
+        here = option("cluster", "ADDRESS")
+        raise InputError(
+            f"{here} needs dask.distributed; run: pip install 'elastocal[cluster]'"
+        ) from None
     where = dask.config.get("scheduler-address", None) if address == "config" else address
     require(
         where is not None,
@@ -320,7 +296,7 @@ def connect(address: str, **way: Any) -> Any:
         "DASK_SCHEDULER_ADDRESS or scheduler-address, or give "
         f"{option('cluster', 'tcp://HOST:8786')}",
     )
-    security = _security(distributed, str(where), **way)
+    here, security = option("cluster", where), _security(distributed, str(where), **way)
     # Its log lines tell of dead workers with tracebacks; what matters is told by the study.
     for name in [n for n in logging.root.manager.loggerDict if n.startswith("distributed")]:
         logging.getLogger(name).setLevel(logging.CRITICAL)
@@ -328,37 +304,22 @@ def connect(address: str, **way: Any) -> Any:
         client = distributed.Client(where, timeout=ANSWER, set_as_default=False, security=security)
     except (OSError, ValueError, TypeError, RuntimeError) as error:
         raise InputError(
-            f"{option('cluster', where)}: no scheduler answers ({error}); check the address, or "
+            f"{here}: no scheduler answers ({error}); check the address, or "
             "start one for this host alone: dask scheduler"
         ) from None
     try:
-        versions = client.run(_version).items()
-        wrong = [f"worker {name} has elastocal {found}" for name, found in versions
-                 if found != __version__]  # fmt: skip
+        found = client.run(_version).items()
+        wrong = [f"worker {name} has elastocal {has}" for name, has in found if has != __version__]
     except Exception as error:  # of the worker: whatever its Python lacks
         wrong = [f"a worker cannot import elastocal ({error})"]
     if wrong:
         client.close()
-        here = option("cluster", where)
         raise InputError(f"{here}: {wrong[0]}; install elastocal {__version__} there, as here")
     return client
 
 
 def _version() -> str:
     return __version__
-
-
-def dask_distributed() -> ModuleType:
-    """Returns the module distributed; raises InputError where it is not installed."""
-    try:
-        import distributed
-    except ImportError:
-        raise InputError(
-            f"{option('cluster', 'ADDRESS')} needs dask.distributed; run: pip install "
-            "'elastocal[cluster]'"
-        ) from None
-    module: ModuleType = distributed
-    return module
 
 
 @dataclass(frozen=True)
@@ -402,27 +363,23 @@ def run_study(
     Raises InputError where the results in `output` are of another seed, source or task, or the
     cluster cannot be reached; ClusterLostError where the scheduler goes away.
     """
-    stop = stop or StudyStop()
-    if runner is None and cluster is not None:
-        dask_distributed()
-        address = cluster
-        runner = lambda left: run_cluster(study, left, address, stop, tell, **way)  # noqa: E731
-    elif runner is None:
-        runner = partial(run_local, study, jobs=jobs, stop=stop)
-    version = source_version()
-    with opened(Path(output)) as results:
-        if restart:
-            if cluster is not None:
-                # One that cannot be reached must not cost the results.
-                connect(cluster, **way).close()
-            results.clear()
-        failures = _known(study, results)
-        if retry_failed and any(failures.values()):
-            results.drop(failed=True)
-            failures = {index: False for index, failed in failures.items() if not failed}
-        results.state(study, version)
+    folder, stop, version = Path(output), stop or StudyStop(), source_version()
+    with results.opened(folder):
+        known = {} if restart else _known(study, folder)
+        failures = {k: failed for k, failed in known.items() if not (failed and retry_failed)}
         wanted = study.tasks[:only]
         left = [task for task in wanted if task.index not in failures]
+        if runner is None and cluster is not None and left:
+            # Before results are discarded: one that cannot be reached must not cost them.
+            crew = DaskWorkers(connect(cluster, **way), tell)
+            runner = lambda tasks: hand_out(crew, study, tasks, stop)  # noqa: E731
+        elif runner is None:
+            runner = partial(run_local, study, jobs=jobs, stop=stop)
+        if restart:
+            results.clear(folder)
+        if retry_failed:
+            results.drop(folder, failed=True)
+        results.state(folder, study, version)
         total, before = len(wanted), len(wanted) - len(left)
         ended, failed = before, sum(failures.get(task.index, False) for task in wanted)
         progress(total, ended, failed)
@@ -430,7 +387,7 @@ def run_study(
             with closing(runner(left)) as lines:
                 for line in lines:
                     stop.check()
-                    results.add(line, version)
+                    results.add(folder, line, version)
                     failed += line["task_error"] is not None
                     ended += 1
                     progress(total, ended, failed)
@@ -440,25 +397,23 @@ def run_study(
     return Ending(total, before, ended - failed, failed, stop.asked)
 
 
-def _known(study: Study, results: StudyResults) -> dict[int, bool]:
+def _known(study: Study, folder: Path) -> dict[int, bool]:
     """Whether it failed, by index of each task that the results hold.
 
     Raises InputError where a task there is not the study's task of that index now.
     """
     here = f"Run with {option('restart', True)} to discard them, or with {option('output', 'NEW')}"
-    before, columns = results.stated(), dict(study.sources.columns)
+    before, columns = results.stated(folder), dict(study.sources.columns)
     require(
         before.get("columns", columns) == columns,
-        f"{results.folder}: has other columns, types or units than the study now. {here}",
+        f"{folder}: has other columns, types or units than the study now. {here}",
     )
-    lines = [line for line in results.lines() if line["task"] < len(study.tasks)]
+    lines = [line for line in results.lines(folder) if line["task"] < len(study.tasks)]
     for line in lines:
         if study.tasks[line["task"]].hash != line["task_hash"]:
             changes = _changes(study, before) or [f"task {line['task']} was another one"]
-            raise InputError(
-                f"{results.folder}: holds results of another study: {'; '.join(changes)}. {here} "
-                "to keep them"
-            )
+            told = f"{folder}: holds results of another study: {'; '.join(changes)}"
+            raise InputError(f"{told}. {here} to keep them")
     return {line["task"]: line["task_error"] is not None for line in lines}
 
 
@@ -487,14 +442,14 @@ def summarise(study: Study, output: str | Path, page: str | Path) -> str | None:
     summary = getattr(study.module, "summary", None)
     if summary is None:
         return None
-    frame = read_results(output)
+    frame = results.read_results(output)
     frame = frame[frame["task"] < len(study.tasks)]
     text = calling(study.folder, "summary()", lambda: summary(frame))
     if not isinstance(text, str):
         kind = type(text).__name__
         raise InputError(f"{study.folder / 'study.py'}: summary() returned {kind}; it returns text")
     lines = (printable(line).replace("\\t", "\t") for line in text.rstrip("\n").split("\n"))
-    StudyResults(Path(output)).write_page(Path(page), "\n".join(lines) + "\n")
+    results.write_page(Path(output), Path(page), "\n".join(lines) + "\n")
     return text
 
 

@@ -19,7 +19,7 @@ import threading
 import time
 import tomllib
 import traceback
-from collections.abc import Callable, Iterable, Mapping
+from collections.abc import Callable, Iterable, Iterator, Mapping
 from contextlib import suppress
 from dataclasses import dataclass
 from functools import cached_property
@@ -41,17 +41,15 @@ from elastocal.text import did_you_mean, listed, quoted
 
 MAX_TASKS = 200_000  # each is kept in memory, and has a row or more in the results
 RESERVED = ("task", "task_hash", "task_row", "task_seconds", "elastocal", "task_error")
-MAX_BYTES = 1_000_000_000  # of a file that study.toml names: a table, at most
 TAKEN = f"{', '.join(RESERVED)} are columns of every study"
+MAX_BYTES = 1_000_000_000  # of a file that study.toml names: a table, at most
 # What a column takes, by its unit in study.toml; every other unit is that of a number.
-Row = dict[str, Any]
-KINDS: dict[str, tuple[str, type, tuple[type, ...]]] = {
-    "yes/no": ("true or false", bool, (bool, np.bool_)),
-    "count": ("a whole number", int, (int, np.integer)),
-    "text": ("text", str, (str,)),
-}
-NUMBER = ("a number", float, (int, float, np.integer, np.floating))
+KINDS: dict[str, tuple[type, str]] = {
+    "yes/no": (bool, "true or false"), "count": (int, "a whole number"), "text": (str, "text"),
+}  # fmt: skip
+WRITTEN = {**dict(KINDS.values()), float: "a number"}  # how a type is asked for
 
+Row = dict[str, Any]
 _LOCK = threading.Lock()
 _here: tuple[str, Path, ModuleType] | None = None  # digest, folder and study.py of what is loaded
 
@@ -91,25 +89,15 @@ class StudyTask:
     seed: int
     hash: str
 
-    @property
-    def values(self) -> dict[str, Any]:
-        """The values, a copy of their own at each call."""
-        values: dict[str, Any] = json.loads(self.text)
-        return values
-
     def line(self) -> Row:
         """The line of results of a task that gave none yet."""
         return {
-            "task": self.index, "task_hash": self.hash, "values": self.values, "rows": [],
-            "task_seconds": 0.0, "elastocal": __version__, "task_error": None,
+            "task": self.index, "task_hash": self.hash, "values": json.loads(self.text),
+            "rows": [], "task_seconds": 0.0, "elastocal": __version__, "task_error": None,
         }  # fmt: skip
 
     def rng(self) -> np.random.Generator:
-        """Child `index` of SeedSequence(seed): the same as .spawn(n)[index], for every n.
-
-        So the numbers depend on the seed and on the task's place, not on who computes it, when,
-        or how many tasks there are.
-        """
+        """Child `index` of SeedSequence(seed), whoever computes it and however many there are."""
         return np.random.default_rng(np.random.SeedSequence(self.seed, spawn_key=(self.index,)))
 
 
@@ -148,25 +136,12 @@ def read_study(folder: str | Path, seed: int | None = None, options: Iterable[st
     folder = Path(folder)
     require(folder.is_dir(), f"{folder}: no such folder; name the folder of a study")
     for name, what in (("study.py", "tasks() and run()"), ("study.toml", "seed and columns")):
-        require(
-            (folder / name).is_file(),
-            f"{folder}: holds no {name}; a study has one, with its {what}",
-        )
+        told = f"{folder}: holds no {name}; a study has one, with its {what}"
+        require((folder / name).is_file(), told)
     path = folder / "study.toml"
     stated = checked(StudyFile, read_toml(path, "study file", 1_000_000), path)
     for name in stated.columns:
         require(name not in RESERVED, f"{path}: columns.{name} cannot be a column; {TAKEN}")
-    for name in stated.files:
-        require(
-            not PurePosixPath(name).is_absolute() and ".." not in PurePosixPath(name).parts,
-            f"{path}: key files names {quoted(name)}, outside the folder; a cluster cannot reach "
-            "it, copy it into the folder",
-        )
-        require(
-            (folder / name).is_file(),
-            f"{path}: key files names {quoted(name)}, which is no file of the folder",
-        )
-    seed = stated.seed if seed is None else seed
     chosen = _with_options(path, stated.options, options)
     for key, value in chosen.items():
         try:
@@ -176,26 +151,32 @@ def read_study(folder: str | Path, seed: int | None = None, options: Iterable[st
                 f"{path}: key options.{quoted(key)} cannot be recorded ({error}); use finite "
                 "numbers, text, true/false, lists and tables of them"
             ) from None
-    sources = _sources(folder.resolve(), stated)
+    sources = Sources(folder.resolve(), _contents(folder.resolve(), stated, path), stated.columns)
+    seed = stated.seed if seed is None else seed
     module = load(sources)
-    title = stated.title or folder.resolve().name
     tasks = tuple(_tasks(folder, module, chosen, sources, seed))
-    return Study(folder, title, seed, chosen, sources, module, tasks)
+    return Study(
+        folder, stated.title or folder.resolve().name, seed, chosen, sources, module, tasks
+    )
 
 
-def _sources(folder: Path, stated: StudyFile) -> Sources:
-    """Sources of the study as its folder stands now, without hidden folders and caches."""
+def _contents(folder: Path, stated: StudyFile, path: Path) -> dict[str, bytes]:
+    """The files of the study as its folder stands now, without hidden folders and caches."""
+    for name in stated.files:
+        named = f"{path}: key files names {quoted(name)}"
+        inside = not PurePosixPath(name).is_absolute() and ".." not in PurePosixPath(name).parts
+        told = "outside the folder; a cluster cannot reach it, copy it into the folder"
+        require(inside, f"{named}, {told}")
+        require((folder / name).is_file(), f"{named}, which is no file of the folder")
     names = {path.relative_to(folder) for path in folder.rglob("*.py")}
     hidden = {n for n in names if any(p.startswith(".") or p == "__pycache__" for p in n.parts)}
     parts = sorted({n.as_posix() for n in names - hidden} | set(stated.files))
-    contents = {name: read_bytes(folder / name, "file of a study", MAX_BYTES) for name in parts}
-    return Sources(folder, contents, stated.columns)
+    return {name: read_bytes(folder / name, "file of a study", MAX_BYTES) for name in parts}
 
 
 def _with_options(path: Path, defaults: Mapping[str, Any], given: Iterable[str]) -> dict[str, Any]:
     """The defaults, with KEY=VALUE in their place; a value is of its default's type."""
     options = dict(defaults)
-    kinds = {bool: "true or false", int: "a whole number", float: "a number", str: "text"}
     for text in given:
         key, equals, written = (part.strip() for part in text.partition("="))
         here = option("options", text)
@@ -212,7 +193,7 @@ def _with_options(path: Path, defaults: Mapping[str, Any], given: Iterable[str])
             value = written
         if type(default) is float and type(value) is int:
             value = float(value)
-        kind = kinds.get(type(default), f"a TOML value like {quoted(default)}")
+        kind = WRITTEN.get(type(default), f"a TOML value like {quoted(default)}")
         require(type(value) is type(default), f"{here}: takes {kind}, as in study.toml")
         options[key] = value
     return options
@@ -220,22 +201,17 @@ def _with_options(path: Path, defaults: Mapping[str, Any], given: Iterable[str])
 
 def _tasks(
     folder: Path, module: ModuleType, options: Mapping[str, Any], sources: Sources, seed: int
-) -> Iterable[StudyTask]:
+) -> Iterator[StudyTask]:
     script = folder / "study.py"
     for name in ("tasks", "run"):
-        require(
-            callable(getattr(module, name, None)),
-            f"{script}: defines no function {name}(); a study has tasks(options) "
-            "and run(task, rng)",
-        )
+        told = f"defines no function {name}(); a study has tasks(options) and run(task, rng)"
+        require(callable(getattr(module, name, None)), f"{script}: {told}")
     found = calling(
         folder, "tasks()", lambda: list(islice(module.tasks(dict(options)), MAX_TASKS + 1))
     )
     require(bool(found), f"{script}: tasks() gives no task with these options; nothing to do")
-    require(
-        len(found) <= MAX_TASKS,
-        f"{script}: tasks() gives more than {MAX_TASKS} tasks with these options; let each do more",
-    )
+    told = f"tasks() gives more than {MAX_TASKS} tasks with these options; let each do more"
+    require(len(found) <= MAX_TASKS, f"{script}: {told}")
     for index, task in enumerate(found):
         where = f"{script}, task {index}"
         if not isinstance(task, Mapping):
@@ -246,10 +222,8 @@ def _tasks(
                 isinstance(key, str) and key not in RESERVED,
                 f"{where}: {quoted(key)} cannot be a key; keys are text, and {TAKEN}",
             )
-            require(
-                key not in sources.columns,
-                f"study.toml: columns.{key} is also a value of the tasks; rename one of them",
-            )
+            told = f"study.toml: columns.{key} is also a value of the tasks; rename one of them"
+            require(key not in sources.columns, told)
         try:
             text = json.dumps(dict(task), allow_nan=False)
         except (TypeError, ValueError) as error:
@@ -300,10 +274,7 @@ def _standing(sources: Sources) -> Path:
 
 
 def _forget(folder: Path) -> None:
-    """Drop what an earlier study, or an earlier state of this one, imported from its folder.
-
-    A worker outlives a study, and two studies may both have a scenarios.py.
-    """
+    """Drop what an earlier study imported: a worker outlives it; two may have a scenarios.py."""
     for name, module in list(sys.modules.items()):
         if Path(getattr(module, "__file__", None) or "/").is_relative_to(folder):
             del sys.modules[name]
@@ -346,12 +317,11 @@ def execute(sources: Sources, task: StudyTask) -> Row:
                 f"this worker has elastocal {__version__}, the study was started with "
                 f"{sources.version}; install the same there"
             )
-        found = load(sources).run(task.values, task.rng())
-        line["rows"] = _checked_rows(found, sources.columns, task.values)
+        found = load(sources).run(json.loads(task.text), task.rng())
+        line["rows"] = _checked_rows(found, sources.columns, line["values"])
     except (Exception, SystemExit) as caught:
-        line |= {
-            "task_error": f"{type(caught).__name__}: {caught}", "trace": traceback.format_exc()
-        }  # fmt: skip
+        line["task_error"] = f"{type(caught).__name__}: {caught}"
+        line["trace"] = traceback.format_exc()
     line["task_seconds"] = time.perf_counter() - begun
     return line
 
@@ -360,9 +330,8 @@ def _checked_rows(found: Any, columns: Mapping[str, str], task: Row) -> list[Row
     """What run() returned, as rows of plain values of the types that `columns` states."""
     rows = [found] if isinstance(found, Mapping) else found
     if not isinstance(rows, list | tuple) or not all(isinstance(row, Mapping) for row in rows):
-        raise TypeError(
-            f"run() returned {type(found).__name__}; it returns a dict or a list of them"
-        )
+        told = f"run() returned {type(found).__name__}; it returns a dict or a list of them"
+        raise TypeError(told)
     for name in (name for row in rows for name in row):
         if name in task:
             raise ValueError(f"run() returned {name!r}, which is a value of the task itself")
@@ -375,17 +344,16 @@ def _checked_rows(found: Any, columns: Mapping[str, str], task: Row) -> list[Row
 
 
 def _plain(name: str, value: Any, unit: str) -> Any:
-    """`value` as bool, int, float or str after the column's unit, as JSON can hold it.
-
-    None stays None, and NaN becomes it; an infinite number becomes its name as text.
-    """
-    if isinstance(value, np.ndarray) and value.ndim == 0:
+    """`value` after the column's unit, as JSON can hold it: NaN as None, infinity as its name."""
+    if isinstance(value, np.generic) or (isinstance(value, np.ndarray) and value.ndim == 0):
         value = value.item()
-    takes, made, accepted = KINDS.get(unit, NUMBER)
-    is_bool = isinstance(value, bool | np.bool_)
-    if value is not None and not (isinstance(value, accepted) and is_bool == (made is bool)):
+    if value is None:
+        return None
+    kind, takes = KINDS.get(unit, (float, "a number"))
+    if type(value) is int and kind is float:
+        value = float(value)
+    if not isinstance(value, kind) or (isinstance(value, bool) and kind is not bool):
         raise TypeError(f"column {name!r} takes {takes}; found {type(value).__name__}")
-    kept: Any = None if value is None else made(value)
-    if made is not float or kept is None or math.isfinite(kept):
-        return kept
-    return None if math.isnan(kept) else str(kept)
+    if isinstance(value, float) and not math.isfinite(value):
+        return None if math.isnan(value) else str(value)
+    return value
