@@ -36,9 +36,9 @@ TESTED = """\
 | B against independent derivatives, every effect and observation | 1e-7 relative | `tests/model/test_derivatives.py` |
 | equilibrium against MuJoCo, KR 270, 2.6 kN | 1 µm | `tests/simulation/test_mujoco_arm.py` |
 | exported arms read back (URDF by pinocchio, MJCF at equilibrium under load by MuJoCo, DH tables) | 1 µm | `tests/export` |
-| NIST reference regressions, certified digits: eleven linear sets by the linear solver | 9; 7 on Filip and Wampler4, 5 on Wampler5 | `tests/identification/test_nist_linear.py` |
-| the same through the fit of an arm under estimated noise of one size | 9; 7 on Filip | `tests/identification/test_nist_nonlinear.py` |
-| twelve nonlinear NIST sets through the fit of an arm, from both of NIST's starts | 7 | `tests/identification/test_nist_nonlinear.py` |
+| NIST reference regressions, certified digits: eleven linear sets by ordinary least squares as published | 9; 7 on Filip and Wampler4, 5 on Wampler5 | `tests/identification/test_nist_linear.py` |
+| the same through the fit of an arm under estimated noise of one size | 9; 8 on Wampler4, 7 on Filip, 5 on Wampler5 | `tests/identification/test_nist_nonlinear.py` |
+| twelve nonlinear NIST sets through the fit of an arm, from both of NIST's starts | 5 | `tests/identification/test_nist_nonlinear.py` |
 """
 
 

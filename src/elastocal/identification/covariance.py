@@ -6,11 +6,10 @@ from collections.abc import Iterator
 from dataclasses import dataclass, replace
 
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import NDArray
 from scipy import linalg, special
 
 from elastocal.errors import InputError, InsufficientDataError
-from elastocal.identification.linear_solver import checked_problem
 from elastocal.identification.weighted_problem import same_size
 from elastocal.units import Array, IntArray
 
@@ -103,13 +102,12 @@ class Orthogonal:
         return (matrix + matrix.T) / 2
 
 
-def orthogonal(B: ArrayLike, y: ArrayLike) -> tuple[Orthogonal, Array]:
-    """Factors of the whitened B (rows, p), and y or e (rows,) as a checked float array.
+def orthogonal(B: Array) -> Orthogonal:
+    """Factors of the whitened B (rows, p).
 
-    Raises InputError where the arrays do not match, are not finite or the columns depend on each
-    other, InsufficientDataError where there are no more rows than parameters.
+    Raises InputError where the columns depend on each other, InsufficientDataError where there are
+    no more rows than parameters.
     """
-    B, y, _, _ = checked_problem(B, y, None, None)
     rows, p = B.shape
     if rows <= p:
         raise InsufficientDataError(
@@ -126,7 +124,7 @@ def orthogonal(B: ArrayLike, y: ArrayLike) -> tuple[Orthogonal, Array]:
         raise InputError(f"columns {names} of B depend on the others; drop them first")
     V = np.empty((p, p))
     V[order] = linalg.solve_triangular(R, np.eye(p)) / lengths[order, None]
-    return Orthogonal(Q, V), y
+    return Orthogonal(Q, V)
 
 
 # Satterthwaite degrees of freedom of variance estimates that are sums of squares.
@@ -215,7 +213,7 @@ def cluster_robust(B: Array, e: Array, cluster: IntArray, kind: str = "CR2") -> 
 
     Cost: n p² + G p³ operations and 32 MB of temporaries; nothing of size n² is formed.
     """
-    factors, e = orthogonal(B, e)
+    factors = orthogonal(B)
     Q, V = factors.Q, factors.V
     n, p = Q.shape
     G = len(np.unique(cluster))

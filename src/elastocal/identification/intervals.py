@@ -2,16 +2,20 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
 from dataclasses import dataclass, replace
 from typing import Literal, get_args
 
 import numpy as np
-from scipy import optimize
 
-from elastocal.errors import ElastocalError, InputError, option, require
+from elastocal.errors import InputError, option
+from elastocal.identification.constrained_fit import (
+    KnowledgeProblem,
+    constrained_fit,
+    own_bounds,
+    profile_end,
+)
 from elastocal.identification.covariance import Covariance, cluster_robust, hc, t_quantile
-from elastocal.identification.least_squares import Fit, FitProblem, fit
+from elastocal.identification.least_squares import Fit
 from elastocal.identification.noise_choice import NoiseFit
 from elastocal.identification.residuals import whole_groups
 from elastocal.identification.solve import Solution, residual_sigma
@@ -62,110 +66,6 @@ def cluster_by_parts(fit: Fit, parts: Partition) -> Covariance:
     matrix = factor * cofactor @ middle @ cofactor * np.outer(size, size)
     text = f"readings of a configuration may depend on each other ({G} configurations)"
     return Covariance("CR1", matrix, np.full(p, float(G - 1)), text)
-
-
-# Profile-likelihood intervals: how far a parameter can move before the fit becomes too bad.
-#
-# With S(v) the least weighted sum of squares where the parameter is held at v and the others are
-# refitted, and Ŝ its minimum, the interval is
-#
-#     { v : τ²(v) = (S(v) − Ŝ)/s² ≤ F_{1,dof}(level) },   s² = Ŝ/dof
-#
-# (Bates & Watts 1988, chapter 6).  In a linear model it is the t interval; where the model bends,
-# its ends are not equally far from the estimate, and it stays the same interval under any
-# transformation of the parameter.
-
-Objective = Callable[[float], float]
-
-DOUBLINGS = 10  # of t·std in search of a crossing; beyond 1000 times the interval is flat
-FAR = 10.0  # τ/t beyond which its size no longer matters
-PRECISION = 1e-6  # of an end, in units of t·std
-LOWER_BY = 1e-3  # (Ŝ − S)/s² above which the fit was not at its minimum
-
-
-def profile_interval(
-    objective: Objective,
-    estimate: float,
-    std: float,
-    dof: float,
-    level: float = 0.95,
-    lower: float = -np.inf,
-    upper: float = np.inf,
-) -> tuple[float, float]:
-    """Profile-likelihood interval of one parameter about `estimate`, inside its bounds; infinite
-    on a side where τ² never reaches the quantile.
-
-    objective(value) -> S: minimum of the whitened rss with the parameter at `value`; it may raise
-    ElastocalError where no fit exists, and there the interval ends.  std: standard deviation of the
-    linearised fit, which only scales the search.  dof: residual degrees of freedom.
-
-    Raises InputError where there are none, or no residual; ElastocalError where a value is found
-    whose S lies below that of the estimate.
-    """
-    require(dof > 0, f"a profile needs positive degrees of freedom, got {dof}")
-    t = float(t_quantile(level, np.asarray(dof)))
-    least = objective(estimate)
-    s2 = least / dof
-    require(s2 > 0, "the fit leaves no residual, so there is no noise to judge its parameters by")
-
-    def excess(value: float) -> float:
-        """τ − t, cut off where it no longer matters so that the root finder is not led astray."""
-        try:
-            rise = (objective(value) - least) / s2
-        except ElastocalError:
-            return FAR * t
-        if rise < -LOWER_BY:
-            raise ElastocalError(
-                f"held at {value:g} the fit is better than at the estimate {estimate:g}, so that"
-                " was not the minimum; fit again from there"
-            )
-        return min(np.sqrt(max(rise, 0.0)), (1 + FAR) * t) - t if np.isfinite(rise) else FAR * t
-
-    return _end(excess, estimate, -t * std, lower), _end(excess, estimate, t * std, upper)
-
-
-def _end(excess: Objective, estimate: float, step: float, bound: float) -> float:
-    """The end of the interval in the direction of `step`, whose size is that of the t interval."""
-    inside = estimate
-    for size in 2.0 ** np.arange(DOUBLINGS + 1):
-        outside = estimate + step * float(size)
-        outside = bound if (outside - bound) * step >= 0 else outside
-        value = 0.0 if outside == estimate else excess(outside)
-        if abs(value) <= PRECISION:  # rounding alone decides its sign
-            return outside
-        if value > 0:
-            return float(optimize.brentq(excess, inside, outside, xtol=PRECISION * abs(step)))
-        if outside == bound:
-            return bound
-        inside = outside
-    return float(np.copysign(np.inf, step))
-
-
-def profile_of(problem: FitProblem, found: Fit, index: int) -> Objective:
-    """S(value) of `profile_interval` for parameter `index` of the model, one of problem.columns.
-
-    Each call holds the parameter and refits the other columns with `fit`, from the nearest fit so
-    far.  It raises ElastocalError where that does not converge.
-    """
-    others = problem.columns[problem.columns != index]
-    known = [found.x]
-
-    def objective(value: float) -> float:
-        x = min(known, key=lambda near: abs(near[index] - value)).copy()
-        x[index] = value
-        if others.size == 0:
-            observed = problem.observations
-            rest = observed.value - problem.model.predict(observed.table, x, observed)
-            whitened = problem.weights.apply(rest)
-        else:
-            again = fit(replace(problem, x=x, columns=others))
-            if not again.converged:
-                raise ElastocalError(f"no fit with parameter {index} at {value:g}: {again.reason}")
-            known.append(again.x)
-            whitened = again.whitened
-        return float(whitened @ whitened)
-
-    return objective
 
 
 # Standard deviations and 95 % intervals of the fitted parameters, by the method asked for.
@@ -243,15 +143,15 @@ def _classical(solution: Solution) -> Covariance:
 
 
 def _profiled(solution: Solution, classical: Covariance) -> Intervals:
+    """{v: S(v) − Ŝ ≤ t² s²}, the fit being at its minimum."""
     fit = solution.fit
-    ends = []
-    for k, c in enumerate(fit.columns.tolist()):
-        p, bounded = solution.problem.model.parameters[c], solution.problem.bounded
-        ends.append(
-            profile_interval(
-                profile_of(fit.problem, fit, c), float(fit.x[c]), float(classical.std[k]),
-                float(classical.dof[k]), LEVEL, *((p.lower, p.upper) if bounded else ()),
-            )
-        )  # fmt: skip
+    sigma = residual_sigma(fit, len(fit.columns))
+    stated = replace(solution.problem, bounded=False).fit_of(fit.columns, fit.x, solution.sizes)
+    found = constrained_fit(KnowledgeProblem.of(stated, own_bounds(solution), None, sigma))
+    rises = (sigma * t_quantile(LEVEL, classical.dof)) ** 2
+    ends = [
+        [profile_end(found, k, float(rise), side) for side in (-1, 1)]
+        for k, rise in enumerate(rises)
+    ]
     text = "profile of the nonlinear sum of squares (all readings independent)"
     return Intervals(replace(classical, kind="profile", description=text), np.array(ends))

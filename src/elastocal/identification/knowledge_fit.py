@@ -3,229 +3,31 @@
 from __future__ import annotations
 
 from dataclasses import dataclass, replace
-from functools import cached_property
 
 import numpy as np
 from numpy.typing import NDArray
 from scipy import special
 
-from elastocal.errors import ElastocalError, InputError, InsufficientDataError, option, require
-from elastocal.identification.constrained import (
-    ActiveConstraint,
-    Minimum,
-    Reduced,
-    minimise,
+from elastocal.errors import InputError, InsufficientDataError, option, require
+from elastocal.identification.constrained import ActiveConstraint
+from elastocal.identification.constrained_fit import (
+    ConstrainedFit,
+    KnowledgeProblem,
+    constrained_fit,
+    own_bounds,
+    profile_end,
 )
 from elastocal.identification.covariance import Covariance, t_quantile
 from elastocal.identification.intervals import LEVEL, Intervals
-from elastocal.identification.knowledge import (
-    Bounds,
-    Constraints,
-    GaussianPrior,
-    System,
-    share_of_prior,
-)
-from elastocal.identification.least_squares import Fit, FitProblem
+from elastocal.identification.knowledge import Constraints, GaussianPrior
+from elastocal.identification.least_squares import Fit
 from elastocal.identification.linear_solver import least_norm
 from elastocal.identification.options import Options
 from elastocal.identification.residuals import growth
 from elastocal.identification.solve import WORTH_A_COLUMN, Reduction, Solution, residual_sigma
 from elastocal.identification.weighted_problem import RFactor
-from elastocal.model.manipulator import Regression
 from elastocal.text import listed, quoted
 from elastocal.units import Array, IntArray, Progress
-
-# Constrained fit of the nonlinear model: Gauss–Newton on the exact B, steps halved.
-
-# Predicted fall of the objective, relative to it, below which the step is the last one.
-TOLERANCE = 1e-10  # a solver's, where a matrix is active
-LEAST = 1e-12  # in typical sizes of the parameters: a step that moves nothing
-HALVINGS = 20
-
-
-@dataclass(frozen=True)
-class KnowledgeProblem:
-    """|W (y − h(X))|² + |target − P X|² over X[columns] under `system`, the others held.
-
-    P (k, columns) and target (k,) are the prior's rows in units of the noise `sigma` of a whitened
-    row; `system` holds the constraints on the columns.
-    """
-
-    problem: FitProblem
-    P: Array
-    target: Array
-    system: System
-    sigma: float
-
-    @classmethod
-    def of(
-        cls, problem: FitProblem, constraints: Constraints, prior: GaussianPrior | None,
-        sigma: float,
-    ) -> KnowledgeProblem:  # fmt: skip
-        """Raises InputError where a held parameter alone breaks a constraint."""
-        columns, names = problem.columns, problem.model.names
-        P, target = np.zeros((0, len(columns))), np.zeros(0)
-        if prior is not None:
-            P, target = prior.rows(names)
-            held = np.setdiff1d(np.arange(len(problem.x)), columns)
-            target = sigma * (target - P[:, held] @ problem.x[held])
-            P = sigma * P[:, columns]
-        system = constraints.resolve(names).restricted(columns, problem.x)
-        return cls(problem, P, target, system, sigma)
-
-    def moved(self, x: Array, step: Array) -> Array:
-        """x (parameters,) with `step` (columns,) added."""
-        trial = x.astype(float)
-        trial[self.problem.columns] += step
-        return trial
-
-    def limits(self, x: Array) -> System:
-        """The constraints on a step from x."""
-        return self.system.moved(x[self.problem.columns], np.ones(len(self.problem.columns)))
-
-    def linearised(self, x: Array) -> tuple[Regression, Array, Array]:
-        """Regression at x, and J and t with the objective |t − J step|²."""
-        problem, apply = self.problem, self.problem.weights.apply
-        observed, columns = problem.observations, problem.columns
-        at = problem.model.regressor(observed.table, x, columns, observed)
-        lack = self.target - self.P @ x[columns]
-        J = np.vstack([apply(at.B), self.P])
-        return at, J, np.concatenate([apply(at.residual), lack])
-
-    def value(self, x: Array) -> float:
-        """The objective at x; infinite where a pose has no equilibrium."""
-        observed = self.problem.observations
-        misfit = observed.value - self.problem.model.predict(observed.table, x, observed)
-        e, lack = self.problem.weights.apply(misfit), self.target - self.P @ x[self.problem.columns]
-        value = float(e @ e + lack @ lack)
-        return value if np.isfinite(value) else np.inf
-
-
-# What equalities leave of a parameter that they fix, of unit columns.
-PINNED = 1e-12
-
-
-@dataclass(frozen=True)
-class ConstrainedFit:
-    """The minimum x (parameters,), the regression `at` it, and the model linearised there.
-
-    `reduced` is the linear problem of the step δ (columns,) from x, |e − B δ|² + |lack − P δ|² with
-    the whitened B and residual e, and `best` its minimum, δ = 0 to rounding.
-    """
-
-    posed: KnowledgeProblem
-    x: Array
-    at: Regression
-    reduced: Reduced
-    best: Minimum
-    converged: bool
-    reason: str
-    steps: int
-
-    @property
-    def columns(self) -> IntArray:
-        return self.posed.problem.columns
-
-    @property
-    def names(self) -> tuple[str, ...]:
-        return self.posed.system.names
-
-    @property
-    def objective(self) -> float:
-        return float(self.reduced.t @ self.reduced.t)
-
-    @property
-    def e(self) -> Array:
-        """Whitened residual (rows,)."""
-        return self.reduced.t[: len(self.at.residual)]
-
-    @property
-    def B(self) -> Array:
-        """Whitened regressor (rows, columns)."""
-        return self.reduced.J[: len(self.at.residual)]
-
-    @cached_property
-    def face(self) -> Array:
-        """Directions (columns, q), orthonormal by J, in which active constraints let x move."""
-        return self.reduced.unit[:, None] * self.reduced.T @ self.reduced.face(self.best)
-
-    @cached_property
-    def cofactor(self) -> Array:
-        """(NᵀBᵀB N + NᵀPᵀP N)⁻¹ in the directions N that the equalities leave."""
-        return self._pinned(self.reduced.unit[:, None] * self.reduced.T)
-
-    @cached_property
-    def on_face(self) -> Array:
-        """The same with every active constraint taken for an equality."""
-        return self._pinned(self.face)
-
-    @property
-    def covariance(self) -> Array:
-        """Posterior covariance (columns, columns), equalities exact, inequalities left out."""
-        return self.posed.sigma**2 * self.cofactor
-
-    @property
-    def prior_share(self) -> Array:
-        """Share (columns,) of each estimate's information that is the prior's; NaN where fixed."""
-        return share_of_prior(self.cofactor, self.posed.P)
-
-    @property
-    def effective(self) -> float:
-        """How many parameters' worth the readings determine: tr(cofactor BᵀB) on the face."""
-        return self.face.shape[1] - float(((self.posed.P @ self.face) ** 2).sum())
-
-    @property
-    def leverage(self) -> Array:
-        """Diagonal (rows,) of B cofactor Bᵀ on the face, at most 1."""
-        return np.minimum(((self.B @ self.face) ** 2).sum(axis=1), 1.0)
-
-    def _pinned(self, half: Array) -> Array:
-        fixed = np.linalg.norm(half, axis=1) <= PINNED * self.reduced.unit
-        half = np.where(fixed[:, None], 0.0, half)
-        return np.asarray(half @ half.T)
-
-
-def constrained_fit(posed: KnowledgeProblem, max_steps: int = 60) -> ConstrainedFit:
-    """Minimise the objective under its constraints.
-
-    Each step goes to the minimum of the linearised model under the constraints, which are convex
-    and kept as they are; it is halved until the true objective falls too.  Every iterate satisfies
-    the constraints; at the limit no step improves the linearised model, which is the condition of
-    Karush, Kuhn and Tucker of the nonlinear problem.
-
-    Raises InputError as `minimise` does; ElastocalError where the start has poses without
-    equilibrium.
-    """
-    problem = posed.problem
-    size = problem.sizes[problem.columns]
-    nearest = minimise(np.diag(1 / size), np.zeros(len(size)), posed.limits(problem.x)).x
-    x = posed.moved(problem.x, nearest)
-    at, J, t = posed.linearised(x)
-    value, steps, converged = float(t @ t), 0, False
-    while steps < max_steps and not converged:
-        steps += 1
-        found = minimise(J, t, posed.limits(x))
-        length = float(np.max(np.abs(found.x) / size, initial=0.0))
-        converged = value - found.objective <= TOLERANCE * value or length <= LEAST
-        # The last step cannot be judged by a fall that drowns in round-off.
-        enough = value * (1 + TOLERANCE) if converged else value
-        shares = (0.5**k for k in range(1 if converged else HALVINGS))
-        trials = (posed.moved(x, share * found.x) for share in shares)
-        better = next((trial for trial in trials if posed.value(trial) <= enough), None)
-        if better is None:
-            converged = True
-            break
-        x = better
-        at, J, t = posed.linearised(x)
-        value = float(t @ t)
-    reason = (
-        "no step within the constraints improves the fit" if converged
-        else "the step limit was reached; the start may be far off"
-    )  # fmt: skip
-    reduced = Reduced.of(J, t, posed.limits(x))
-    best = reduced.minimum(posed.system)
-    return ConstrainedFit(posed, x, at, reduced, best, converged, reason, steps)
-
 
 # Which parameters a fit with constraints and a prior has, and its constraints on these alone.
 
@@ -310,14 +112,6 @@ def _told_apart(
     return off > TOLD_APART and off * lengths[-1] > WORTH_A_COLUMN
 
 
-def own_bounds(solution: Solution) -> Constraints:
-    """The bounds that the effects of a bounded problem state themselves."""
-    if not solution.problem.bounded:
-        return Constraints()
-    parameters = solution.problem.model.parameters
-    return Constraints(tuple(Bounds(p.name, p.lower, p.upper) for p in parameters))
-
-
 # Intervals of a fit under constraints or with a prior.
 #
 # At a bound the estimate is not normal and the likelihood ratio not χ²: where the truth lies on one
@@ -329,9 +123,6 @@ def own_bounds(solution: Solution) -> Constraints:
 # 90°)/360°, which is 95 % at 150° and 93.8 % in the limit of 180°, two columns that nearly cancel.
 
 ONE_SIDED = "one-sided at a bound, and wide rather than narrow near one"
-PRECISION = 1e-7  # of an interval: a step that short is the last
-MOST_STEPS = 40
-ASTRAY = 0.5  # of the rise: how far the nonlinear objective may lie beyond it on the way
 
 
 def intervals_with_knowledge(
@@ -362,44 +153,21 @@ def intervals_with_knowledge(
         lower, upper = posed.system.lower[:, None], posed.system.upper[:, None]
         covariance = Covariance(name, matrix, dof, f"{text}; assumes normal noise")
         return Intervals(covariance, np.clip(plain, lower, upper))
-    ends = plain
+    ends = np.repeat(found.x[found.columns][:, None], 2, axis=1)
+    of_functions = np.array([name in many for name in found.names])
+    ends[of_functions] = plain[of_functions]
     # Prior and noise are widened alike, by t for the normal quantile, so that their ratio stays.
     rises = (posed.sigma * t_quantile(LEVEL, np.maximum(dof, 1.0))) ** 2
     for k, name in enumerate(found.names):
         for end, side in enumerate((-1, 1)) if name not in many else ():
-            step = found.reduced.farthest(k, found.best, float(rises[k]), side)
-            x = posed.moved(found.x, step)
+            rise = float(rises[k])
             if kind == "profile":
-                x = profile_end(found, k, float(rises[k]), side)
-            ends[k, end] = x[found.columns[k]]
+                ends[k, end] = profile_end(found, k, rise, side)
+            else:
+                ends[k, end] += found.reduced.farthest(k, found.best, rise, side)[k]
     model = "nonlinear" if kind == "profile" else "linearised"
     text = f"profile of the {model} fit under the constraints, {ONE_SIDED}; assumes normal noise"
     return Intervals(Covariance("constrained profile", matrix, dof, text), ends)
-
-
-def profile_end(found: ConstrainedFit, index: int, rise: float, side: int) -> Array:
-    """Parameters where the fitted one no. `index` is least (side −1) or largest (1) of all with
-    the nonlinear objective at most `rise` above its minimum: an end of the profile interval.
-
-    Each step goes to that end of the model linearised where the last one ended, and is halved
-    until the objective there is near what is allowed.  An end may also be where poses have no
-    equilibrium any more.
-
-    Raises ElastocalError where the steps do not settle.
-    """
-    posed, limit, x = found.posed, found.objective + rise, found.x
-    for _ in range(MOST_STEPS):
-        _, J, t = posed.linearised(x)
-        reduced = Reduced.of(J, t, posed.limits(x))
-        best = reduced.minimum()
-        step = reduced.farthest(index, best, max(limit - best.objective, 0.0), side)
-        while not posed.value(posed.moved(x, step)) <= limit + ASTRAY * rise:
-            step = step / 2
-        x = posed.moved(x, step)
-        if np.linalg.norm(J @ step) <= PRECISION * np.sqrt(rise):
-            return x
-    name = found.names[index]
-    raise ElastocalError(f"the profile interval of {name} has no end: its steps did not settle")
 
 
 # The fit of a method, its knowledge added: one more step on the weights that the method ends with.

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, field
 from functools import cached_property
 
 import numpy as np
@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 from scipy.optimize import lsq_linear
 
 from elastocal.errors import ElastocalError
-from elastocal.identification.linear_solver import least_norm, solve_weighted
+from elastocal.identification.linear_solver import least_norm
 from elastocal.identification.weighted_problem import (
     Evaluation,
     Partition,
@@ -21,7 +21,7 @@ from elastocal.identification.weighted_problem import (
     is_reduced,
     partition,
 )
-from elastocal.model.manipulator import Model, Regression
+from elastocal.model.manipulator import Model
 from elastocal.model.observations import Observations
 from elastocal.units import Array
 
@@ -142,13 +142,10 @@ def _steepest(at: Evaluation) -> float:
 
 # Nonlinear weighted least squares on the exact B.
 
-# What a step promises of the cost where the descent ends; one exact Gauss–Newton step follows and
-# squares what error is left.
-TOLERANCE = 1e-10
-FIRST, LAST, MOST_POLISHES = 1e-6, 1e-11, 50
-# The same of a large table, whose evaluations are dear.  The last step is taken: at a million rows
-# it is a tenth of a standard deviation, and what it leaves behind is smaller by orders.
-LARGE_TOLERANCE = 1e-8
+# What a step promises of the cost where the descent ends.  The last step is taken: at a million
+# rows of a large table, whose evaluations are dear, it is a tenth of a standard deviation, and what
+# it leaves behind is smaller by orders.
+TOLERANCE, LARGE_TOLERANCE = 1e-12, 1e-8
 
 
 @dataclass(frozen=True)
@@ -204,7 +201,7 @@ class FitProblem:
 
     @property
     def reduced(self) -> bool:
-        """Whether B is reduced to its R factor at once, part by part where the table is large."""
+        """Whether the readings are so many that an evaluation is dear."""
         return is_reduced(self.observations, int((~self.model.shrunk).sum()))
 
 
@@ -233,91 +230,35 @@ class Fit:
     @cached_property
     def B(self) -> Array:
         """B (rows, fitted) at x, raw.  Formed on demand: of a large table, use `r_factor`."""
-        return _regression(self.problem, self.x).B
+        observed = self.problem.observations
+        return self.problem.model.regressor(observed.table, self.x, self.columns, observed).B
 
     def cofactor(self) -> Array:
-        """(BᵀW²B)⁻¹ (fitted, fitted): covariance at unit variance (eq. 7 and 13).
-
-        Exact to working precision for tables of ordinary size; of many readings from the R factor,
-        exact to working precision times condition number.
-        """
-        scale = self.problem.sizes[self.columns]
-        if self.problem.reduced:
-            return self.r_factor.cofactor(scale)
-        B = self.problem.weights.apply(self.B)
-        return solve_weighted(B, self.whitened, scale=scale).cofactor
+        """(BᵀW²B)⁻¹ (fitted, fitted): covariance at unit variance (eq. 7 and 13)."""
+        return self.r_factor.cofactor(self.problem.sizes[self.columns])
 
 
 def fit(problem: FitProblem, max_steps: int = 60, tolerance: float = LARGE_TOLERANCE) -> Fit:
     """Levenberg–Marquardt from the problem's x, derivatives exact.
 
-    Many readings are fitted on R factors, with the cost and the gradient of all rows, until a step
-    promises less than `tolerance` of the cost.
+    On R factors, with the cost and the gradient of all rows, until a step promises less than
+    TOLERANCE of the cost, of many readings `tolerance`.  Every step starts from the residual of the
+    exact model, so that the rounding of one is taken back by the next.
 
     Raises ElastocalError where the start has poses without equilibrium.
     """
-    if problem.reduced:
-        return _fit_in_parts(problem, max_steps, tolerance)
-    return _fit_whole(problem, max_steps)
-
-
-def _regression(problem: FitProblem, x: Array) -> Regression:
-    observed = problem.observations
-    return problem.model.regressor(observed.table, x, problem.columns, observed)
-
-
-def _fit_whole(problem: FitProblem, max_steps: int) -> Fit:
-    weights, columns = problem.weights, problem.columns
-    size = problem.sizes[columns]
-    last: dict[bytes, Regression] = {}
+    columns = problem.columns
+    size, (lower, upper) = problem.sizes[columns], problem.limits
+    tie = np.full(len(columns), np.inf) if problem.tie is None else problem.tie / size
+    centre = (problem.tied_to - problem.x[columns]) / size
 
     def evaluated(u: Array) -> Evaluation:
-        at = _regression(problem, problem.values(u))
-        whitened = weights.apply(at.residual)
-        if not np.isfinite(whitened).all():
+        at = evaluate(problem.model, problem.parts, problem.values(u), columns)
+        if not np.isfinite(at.r_factor.rss):
             raise ElastocalError(
                 f"{problem.observations.table.source}: the model predicts no finite numbers at the "
                 "start values; look in the cell for a length, force or compliance far too large"
             )
-        last.clear()
-        last[u.tobytes()] = at
-        return Evaluation(at.residual, RFactor.of(weights.apply(at.B * size), whitened))
-
-    found = _descent(problem, evaluated, None, TOLERANCE, max_steps)
-    x = problem.values(found.u)
-    final = last.get(found.u.tobytes()) or _regression(problem, x)
-    if problem.tie is None and not problem.bounded and found.converged:
-        x, final = _polished(problem, x, final)
-    whitened = weights.apply(final.residual)
-    return Fit(
-        x, final.residual, whitened, RFactor.of(weights.apply(final.B), whitened),
-        found.converged, found.reason, found.evaluations, problem,
-    )  # fmt: skip
-
-
-def _descent(
-    problem: FitProblem,
-    evaluated: Callable[[Array], Evaluation],
-    evaluated_last: Callable[[Array], Evaluation] | None,
-    tolerance: float,
-    max_steps: int,
-) -> Descent:
-    """The descent from the problem's x, in typical sizes of its columns."""
-    columns, (lower, upper) = problem.columns, problem.limits
-    size = problem.sizes[columns]
-    tie = np.full(len(columns), np.inf) if problem.tie is None else problem.tie / size
-    centre = (problem.tied_to - problem.x[columns]) / size
-    objective = SumOfSquares(evaluated, tie, centre, lower, upper, evaluated_last)
-    start = np.clip(np.zeros(len(columns)), lower, upper)
-    return descend(objective, start, tolerance, max_steps)
-
-
-def _fit_in_parts(problem: FitProblem, max_steps: int, tolerance: float) -> Fit:
-    columns = problem.columns
-    size = problem.sizes[columns]
-
-    def evaluated(u: Array) -> Evaluation:
-        at = evaluate(problem.model, problem.parts, problem.values(u), columns)
         return Evaluation(at.residual, at.r_factor.scaled(size))
 
     def among_others(u: Array) -> Evaluation:
@@ -327,39 +268,12 @@ def _fit_in_parts(problem: FitProblem, max_steps: int, tolerance: float) -> Fit:
         return Evaluation(at.residual, own.scaled(size), at.r_factor)
 
     last = None if problem.among is None else among_others
-    found = _descent(problem, evaluated, last, tolerance, max_steps)
+    objective = SumOfSquares(evaluated, tie, centre, lower, upper, last)
+    start = np.clip(np.zeros(len(columns)), lower, upper)
+    enough = tolerance if problem.reduced else TOLERANCE
+    found = descend(objective, start, enough, max_steps)
     return Fit(
         problem.values(found.u), found.at.residual, problem.weights.apply(found.at.residual),
         found.at.r_factor.scaled(1 / size), found.converged, found.reason, found.evaluations,
         problem, found.at.wide,
     )  # fmt: skip
-
-
-def _polished(problem: FitProblem, x: Array, at: Regression) -> tuple[Array, Regression]:
-    """Gauss–Newton steps with the exact linear solver, kept where they do not cost.
-
-    For an arm one is enough, whose step is then less than FIRST of the residual; a model that
-    bends within its residual takes more, until what is left after them is less than LAST.
-    """
-    weights, columns, last = problem.weights, problem.columns, 0.0
-    if weights.even:
-        weights = replace(weights, whiten=None)
-    for _ in range(MOST_POLISHES):
-        B, before = weights.apply(at.B), weights.apply(at.residual)
-        step = solve_weighted(B, before, scale=problem.sizes[columns]).x
-        moved = x.copy()
-        moved[columns] += step
-        try:
-            there = _regression(problem, moved)
-        except ElastocalError:
-            break
-        after = weights.apply(there.residual)
-        cost = float(before @ before)
-        if not np.isfinite(after).all() or after @ after > cost * (1 + ROUNDING):
-            break
-        x, at = moved, there
-        moves = float(np.linalg.norm(B @ step)) / max(np.sqrt(cost), np.finfo(float).tiny)
-        if moves <= FIRST and not moves**2 > LAST * last > 0:
-            break
-        last = moves
-    return x, at

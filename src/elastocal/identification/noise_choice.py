@@ -321,7 +321,7 @@ def _orthonormal(readings: Readings) -> tuple[Readings, Array]:
     depend on each other are found out.
     """
     n, size, p = readings.B.shape
-    factors, _ = orthogonal(readings.B.reshape(-1, p), readings.e.ravel())
+    factors = orthogonal(readings.B.reshape(-1, p))
     return replace(readings, B=factors.Q.reshape(n, size, p)), factors.V
 
 

@@ -11,9 +11,9 @@ from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import NDArray
+from scipy import linalg
 
 from elastocal.errors import InputError
-from elastocal.identification.linear_solver import LinearSolution, solve_weighted
 from elastocal.units import Array
 
 SMALLEST = 1e-9  # m, below any tracker's resolution: σ_i of zero has no inverse
@@ -47,7 +47,7 @@ def ols(B: Array, dp: Array, sigma: Array | None = None) -> PublishedFit:
     """
     found = _solve(B, dp, np.ones(len(dp)))
     if sigma is None:
-        covariance = found.covariance()
+        covariance = found.variance * found.cofactor
     else:
         covariance = _sandwich(B, np.ones(len(dp)), _positive(sigma, len(dp)), found.cofactor)
     return PublishedFit("ols", found.x, covariance, np.ones(len(dp)), found.residual)
@@ -128,13 +128,49 @@ def _sigma(residual: Array, group: NDArray[np.int64] | None) -> Array:
     return np.abs(residual) if group is None else group_sigma(residual, group)
 
 
-def _solve(B: Array, dp: Array, w: Array) -> LinearSolution:
-    found = solve_weighted(B, dp, w)
-    if found.dropped.size:
+@dataclass(frozen=True)
+class _Solution:
+    """x (parameters,), Δp − B x (rows,), (BᵀW²B)⁻¹, and the weighted sum of squares over its
+    degrees of freedom."""
+
+    x: Array
+    residual: Array
+    cofactor: Array
+    variance: float
+
+
+def _solve(B: Array, dp: Array, w: Array) -> _Solution:
+    """min Σ (w_i (B x − Δp)_i)² by pivoted QR of unit columns, and two refinements."""
+    B, dp = _finite("B", B, 2), _finite("y", dp, 1)
+    rows, p = B.shape
+    if dp.shape != (rows,):
+        raise InputError(f"y must have shape ({rows},), as B has {rows} rows; got {dp.shape}")
+    A = w[:, None] * B
+    length = np.linalg.norm(A, axis=0)
+    length[length == 0] = 1.0
+    Q, R, order = linalg.qr(A / length, mode="economic", pivoting=True)
+    pivots = np.abs(np.diag(R))
+    rank = int((pivots > max(B.shape) * np.finfo(float).eps * pivots[0]).sum())
+    if rank < p:
         raise InputError(
-            f"columns {found.dropped.tolist()} of B depend on the others; drop them first"
+            f"columns {sorted(order[rank:].tolist())} of B depend on the others; drop them first"
         )
-    return found
+    V = np.empty((p, p))
+    V[order] = linalg.solve_triangular(R, np.eye(p)) / length[order, None]
+    x, left = np.zeros(p), w * dp
+    for _ in range(3):
+        x = x + V @ (Q.T @ left)
+        left = w * (dp - B @ x)
+    variance = float(left @ left) / (rows - p) if rows > p else np.nan
+    return _Solution(x, dp - B @ x, V @ V.T, variance)
+
+
+def _finite(name: str, values: Array, dimensions: int) -> Array:
+    array = np.asarray(values, dtype=float)
+    if array.ndim != dimensions or 0 in array.shape or not np.isfinite(array).all():
+        shape = "(rows, parameters)" if dimensions == 2 else "(rows,)"
+        raise InputError(f"{name} must be finite numbers {shape}; got shape {array.shape}")
+    return array
 
 
 def _sandwich(B: Array, w: Array, sigma: Array, cofactor: Array) -> Array:

@@ -8,7 +8,7 @@ from dataclasses import dataclass
 from typing import Any, Literal
 
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import NDArray
 from scipy import linalg, optimize, special
 
 from elastocal.errors import ElastocalError, InsufficientDataError, require
@@ -55,9 +55,9 @@ class Design:
         return max(median_scale(length, self.size), self.floor)
 
 
-def design(B: ArrayLike, y: ArrayLike, size: int) -> Design:
+def design(B: Array, y: Array, size: int) -> Design:
     """B (n·size, p) and y (n·size,) in those coordinates; raises as `orthogonal`."""
-    factors, y = orthogonal(B, y)
+    factors = orthogonal(B)
     return Design(y, size, factors.Q, factors.V)
 
 

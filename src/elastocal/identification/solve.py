@@ -11,7 +11,7 @@ from scipy import linalg
 
 from elastocal.errors import ElastocalError, InsufficientDataError
 from elastocal.identification.least_squares import Fit, FitProblem, fit
-from elastocal.identification.linear_solver import least_norm, solve_weighted
+from elastocal.identification.linear_solver import least_norm
 from elastocal.identification.residuals import (
     CHANCE,
     as_of_another_campaign,
@@ -270,18 +270,16 @@ def fit_kept(
 def heldout_of(problem: Problem, found: Fit) -> Array:
     """Residual (rows,) of each configuration under a fit to the others; under a drift, of each
     block in time, as far off as readings of another day are."""
-    if not problem.large:
-        observed, weights = problem.observations, problem.weights
-        held = held_out_residual(
-            found.B, found.residual, weights, observed.configuration, observed.size
-        )
-        if weights.together is None:
-            return held
-        return held * as_of_another_campaign(found.B, weights, observed.size)
-    return held_out_by_parts(
-        problem.model, problem.parts, found.x, found.columns, found.r_factor,
-        np.zeros(len(found.columns)),
-    )  # fmt: skip
+    observed, weights = problem.observations, problem.weights
+    if weights.together is None:
+        return held_out_by_parts(
+            problem.model, problem.parts, found.x, found.columns, found.r_factor,
+            np.zeros(len(found.columns)),
+        )  # fmt: skip
+    held = held_out_residual(
+        found.B, found.residual, weights, observed.configuration, observed.size
+    )
+    return held * as_of_another_campaign(found.B, weights, observed.size)
 
 
 def wider_is_needed(problem: Problem, narrow: Array, wide: Array) -> bool:
@@ -336,18 +334,7 @@ def _linear_step(
     problem: Problem, sizes: Array, x: Array, chosen: Reduction, r_factor: RFactor
 ) -> tuple[Array, Array]:
     """x after one Gauss–Newton step of the chosen set, and the linear model's held-out residual."""
-    kept, observed = chosen.kept, problem.observations
-    moved = x.copy()
-    if not problem.large:
-        at = problem.model.regressor(observed.table, x, kept, observed)
-        B, e = problem.weights.apply(at.B), problem.weights.apply(at.residual)
-        step = solve_weighted(B, e).x
-        moved[kept] += step
-        residual = at.residual - at.B @ step
-        held = held_out_residual(
-            at.B, residual, problem.weights, observed.configuration, observed.size
-        )
-        return moved, held
+    kept, moved = chosen.kept, x.copy()
     own = r_factor.of_columns(np.searchsorted(problem.free, kept))
     step = own.step(sizes[kept])
     moved[kept] += step

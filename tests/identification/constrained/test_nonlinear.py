@@ -10,17 +10,17 @@ from support.calibration import measured, with_values
 from support.cells import SLANTED, TABLE_2, kr270_cell, table_of
 from support.constrained import NONE, non_negative
 
+from elastocal.identification.constrained_fit import (
+    ConstrainedFit,
+    KnowledgeProblem,
+    constrained_fit,
+    profile_end,
+)
 from elastocal.identification.knowledge import (
     Bounds,
     Constraints,
     SemidefiniteMatrix,
     physical_constraints,
-)
-from elastocal.identification.knowledge_fit import (
-    ConstrainedFit,
-    KnowledgeProblem,
-    constrained_fit,
-    profile_end,
 )
 from elastocal.identification.least_squares import FitProblem, fit
 from elastocal.identification.weighted_problem import Weights
@@ -102,11 +102,11 @@ def test_ends_of_a_profile_are_where_the_objective_has_risen_as_far_as_allowed(n
     stated, physics = negative_bearing(), physical_constraints(arm())
     found, i = fitted(stated, physics), arm().names.index(name)
     for side in (-1, 1):
-        x = profile_end(found, i, 3.84, side)
+        end = profile_end(found, i, 3.84, side)
         if name == BEARING_X and side < 0:
-            assert x[i] == 0
+            assert end == 0
             continue
-        assert side * (x[i] - found.x[i]) > 0
-        at_end = Constraints((Bounds(name, x[i], x[i]),))
+        assert side * (end - found.x[i]) > 0
+        at_end = Constraints((Bounds(name, end, end),))
         rise = fitted(stated, physics + at_end).objective - found.objective
         assert rise == pytest.approx(3.84, abs=1e-5)

@@ -1,106 +1,76 @@
-"""Profile-likelihood intervals: exact cases (t, transformed t, Fieller), ends, a real model."""
+"""The profile interval of where a line crosses zero is Fieller's set (1954), in closed form."""
 
 import numpy as np
 import pytest
-from scipy import stats
+from scipy import sparse, stats
 
-from elastocal.errors import ElastocalError
-from elastocal.identification.intervals import profile_interval
+from elastocal.identification.constrained_fit import KnowledgeProblem, constrained_fit, profile_end
+from elastocal.identification.knowledge import Bounds, Constraints
+from elastocal.identification.least_squares import FitProblem
+from elastocal.identification.weighted_problem import Weights
+from elastocal.model.manipulator import Regression
+from elastocal.model.observations import Observations
 
-
-def least(B, y):
-    """(x, rss) of the least-squares fit."""
-    x = np.linalg.lstsq(B, y, rcond=None)[0]
-    return x, float(np.sum((y - B @ x) ** 2))
-
-
-def line(seed, slope=1.0, n=12):
-    rng = np.random.default_rng(seed)
-    B = np.column_stack([np.ones(n), np.linspace(-1, 2, n)])
-    return B, B @ [0.8, slope] + 0.3 * rng.normal(size=n)
+X = np.linspace(-1, 2, 12)
+F = stats.f.ppf(0.95, 1, 10)
 
 
-@pytest.mark.parametrize("level", [0.5, 0.999])
-def test_a_linear_model_has_its_t_interval(level):
-    B, y = line(0)
-    x, rss = least(B, y)
+class Crossing:
+    """y = b (x − θ), which stands in the fit in the place of an arm: parameters θ and b."""
 
-    def objective(value):
-        return least(B[:, :1], y - value * B[:, 1])[1]
+    names = ("theta", "b")
 
-    std = np.sqrt(rss / 10 * np.linalg.inv(B.T @ B)[1, 1])
-    half = stats.t.ppf((1 + level) / 2, 10) * std
-    found = profile_interval(objective, x[1], 1.7 * std, 10, level)  # std only sets the scale
-    np.testing.assert_allclose(found, [x[1] - half, x[1] + half], atol=1e-5 * half)
+    def predict(self, table, x, observed):
+        return x[1] * (X - x[0])
 
-
-def test_follows_any_transformation():
-    """A stiffness is the reciprocal of a compliance, and so is its interval; far from symmetric."""
-
-    def objective(compliance):
-        return 5.0 + ((compliance - 1.0) / 0.3) ** 2
-
-    direct = profile_interval(objective, 1.0, 0.3, 5)
-    lower, upper = profile_interval(lambda k: objective(1 / k), 1.0, 0.3, 5)
-    assert upper - 1 > 2 * (1 - lower)
-    np.testing.assert_allclose([1 / upper, 1 / lower], direct, rtol=1e-5)
+    def regressor(self, table, x, columns, observed):
+        B = np.column_stack([np.full(12, -x[1]), X - x[0]])
+        return Regression(B[:, columns], self.predict(table, x, observed), observed)
 
 
-def ratio(seed, slope):
-    """Where a line crosses zero, θ = −b₀/b₁, by its profile, and Fieller's set (low, high)."""
-    B, y = line(seed, slope)
-    (b0, b1), rss = least(B, y)
-    s2, v = rss / 10, np.linalg.inv(B.T @ B)
-    F = stats.f.ppf(0.95, 1, 10) * s2
-    # (b₀ + θ b₁)² ≤ F (v₀₀ + 2θ v₀₁ + θ² v₁₁)
-    roots = np.roots([b1**2 - F * v[1, 1], 2 * (b0 * b1 - F * v[0, 1]), b0**2 - F * v[0, 0]])
-    theta = -b0 / b1
-    gradient = np.array([-1 / b1, b0 / b1**2])
-    std = np.sqrt(s2 * gradient @ v @ gradient)
+def line(seed, slope):
+    return 0.8 + slope * X + 0.3 * np.random.default_rng(seed).normal(size=12)
 
-    def objective(value):
-        return least((B[:, 1] - value)[:, None], y)[1]
 
-    return profile_interval(objective, theta, std, 10), np.sort(roots), theta
+def profile(y, constraints=()):
+    """θ, and the ends of its 95 % interval."""
+    (b1, b0), (rss,), *_ = np.polyfit(X, y, 1, full=True)
+    observed = Observations("distance", y, sparse.eye_array(12, format="csr"), np.arange(12), None)
+    start = np.array([-b0 / b1, b1])
+    problem = FitProblem(
+        Crossing(), observed, Weights("none", None, False, ""), start, np.arange(2), np.ones(2)
+    )
+    sigma = float(np.sqrt(rss / 10))
+    found = constrained_fit(KnowledgeProblem.of(problem, Constraints(constraints), None, sigma))
+    return found.x[0], [profile_end(found, 0, F * sigma**2, side) for side in (-1, 1)]
+
+
+def fieller(y):
+    """(b₀ + θ b₁)² ≤ F (v₀₀ + 2θ v₀₁ + θ² v₁₁)"""
+    B = np.column_stack([np.ones(12), X])
+    (b0, b1), (rss,), *_ = np.linalg.lstsq(B, y)
+    v = np.linalg.inv(B.T @ B) * F * rss / 10
+    return np.sort(np.roots([b1**2 - v[1, 1], 2 * (b0 * b1 - v[0, 1]), b0**2 - v[0, 0]]))
 
 
 def test_equals_fieller():
-    """The profile interval of a ratio is Fieller's (1954), in closed form."""
-    found, fieller, theta = ratio(3, slope=0.8)
-    np.testing.assert_allclose(found, fieller, rtol=1e-5)
-    assert not np.isclose(fieller.sum() / 2, theta, rtol=0.02)
+    y = line(3, 0.8)
+    theta, ends = profile(y)
+    np.testing.assert_allclose(ends, fieller(y), rtol=1e-5)
+    assert not np.isclose(sum(ends) / 2, theta, rtol=0.02)
 
 
 def test_a_flat_side_is_unbounded():
-    """A slope that may be zero: Fieller's set is the outside of its roots, so one side of the
-    crossing runs to infinity."""
-    found, fieller, theta = ratio(1, slope=0.12)
-    assert np.iscomplexobj(fieller) or theta < fieller[0] or theta > fieller[1]
-    assert np.isinf(found).any()
-
-
-def parabola(value):
-    return 10.0 + (value - 1.0) ** 2
+    """A slope that may be zero: the set is the outside of its roots."""
+    y = line(1, 0.12)
+    theta, ends = profile(y)
+    roots = fieller(y)
+    assert np.iscomplexobj(roots) or theta < roots[0] or theta > roots[1]
+    assert np.isinf(ends).any()
 
 
 def test_bounds_end_the_interval():
-    t = stats.t.ppf(0.975, 10)
-    lower, upper = profile_interval(parabola, 1.0, 1.0, 10, lower=0.5, upper=1 + 2 * t)
-    assert lower == 0.5 and upper == pytest.approx(1 + t, abs=1e-5)
-    assert profile_interval(parabola, 1.0, 1.0, 10, lower=1.0)[0] == 1.0
-
-
-@pytest.mark.parametrize("fails", ["raises", "infinite"])
-def test_where_no_fit_exists_the_interval_ends(fails):
-    """Also far below the quantile, and without disturbing a crossing on the other side."""
-
-    def objective(value):
-        if value > 1.6:
-            if fails == "raises":
-                raise ElastocalError("no equilibrium")
-            return np.inf
-        return parabola(value)
-
-    lower, upper = profile_interval(objective, 1.0, 1.0, 10)
-    assert upper == pytest.approx(1.6, abs=1e-5)
-    assert lower == pytest.approx(1 - stats.t.ppf(0.975, 10), abs=1e-5)
+    y = line(3, 0.8)
+    low = fieller(y)[0] / 2 + profile(y)[0] / 2
+    _, ends = profile(y, (Bounds("theta", low),))
+    assert ends == pytest.approx([low, fieller(y)[1]], rel=1e-5)
