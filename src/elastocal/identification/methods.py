@@ -21,7 +21,7 @@ from elastocal.identification.noise_choice import (
     over_times,
     weights_of,
 )
-from elastocal.identification.noise_judge import outlier_screening, settle
+from elastocal.identification.noise_judge import NoiseAndOutliers, outlier_screening, settle
 from elastocal.identification.noise_structure import Kind, Readings
 from elastocal.identification.options import ROBUST, Options
 from elastocal.identification.residuals import held_out_residual, rms_3d
@@ -47,15 +47,18 @@ Refit = Callable[[BoolArray, bool], Solution]  # of these observations, with wid
 
 ROUNDS = 6
 RESTARTS = 3
-SETTLED = 0.01  # of a standard deviation: what relinearising may still move an estimate by
+# Of a standard deviation: what relinearising may still move an estimate by at the end, and where
+# the kind of noise is chosen.
+SETTLED, LINEAR = 0.01, 1.0
 
 # A fit to the good observations (N,), the noise found from them, and which they are.
 Adapted = tuple[Solution, NoiseFit, BoolArray]
 
 
 def _adapted(
-    every: Solution, sound: Solution, faulty: BoolArray, refit: Refit, kind: str, progress: Progress
-) -> Adapted:
+    every: Solution, sound: Solution, faulty: BoolArray, refit: Refit, kind: str,
+    progress: Progress, known: NoiseAndOutliers | None = None,
+) -> Adapted:  # fmt: skip
     """Fit with weights that the residuals tell, from a fit that faulty readings do not bend.
 
     `every` holds all observations, `sound` the fit to those that are not `faulty` (N,) at equal or
@@ -66,18 +69,23 @@ def _adapted(
     """
     start, good = sound, ~faulty
     for _ in range(RESTARTS):
-        solution, noise, judged = _settled(every, start, good, kind, progress)
+        solution, noise, judged = _settled(every, start, good, kind, progress, known)
         if np.array_equal(judged, good):
             break
-        good = judged
+        good, known = judged, NoiseAndOutliers(noise, judged)
         start = every if good.all() else refit(good, True)
     return solution, noise, judged
 
 
 def _settled(
-    every: Solution, start: Solution, good: BoolArray | None, kind: str, progress: Progress
-) -> Adapted:
-    """The noise and the fit in turn, from `start`; all observations where `good` is None."""
+    every: Solution, start: Solution, good: BoolArray | None, kind: str, progress: Progress,
+    known: NoiseAndOutliers | None = None,
+) -> Adapted:  # fmt: skip
+    """The noise and the fit in turn, from `start`; all observations where `good` is None.
+
+    The kind of noise is chosen once, unless it is `known`, and again where other readings turn out
+    good, more parameters show or the fit has moved.
+    """
     asked = "auto" if kind == OF_READINGS else kind
     problem, kept = every.problem, start.reduction.kept
     model, observed = problem.model, problem.observations
@@ -87,14 +95,17 @@ def _settled(
     for left in reversed(range(ROUNDS)):
         before = now
         if good is None:
-            noise = estimate_noise(readings, asked)
+            like = None if known is None else known.noise
+            noise = estimate_noise(readings, asked if like is None else like.kind, like)
         else:
-            noise, now = settle(readings, asked, now)
+            noise, now = settle(readings, asked, now, known)
         progress(f"fitting with the noise found ({noise.kind})")
         expected = solution.fit.x[kept] + noise.x
         solution = refined(every, start, solution.fit.x, now, weights_of(noise, readings.take(now)))
         readings = _linearised(model, observed, solution.fit.x, kept, kind)
         moved = np.abs(solution.fit.x[kept] - expected) / noise.covariance.std
+        # What relinearising moves by more may have looked like some noise.
+        known = NoiseAndOutliers(noise, now) if moved.max(initial=0.0) < LINEAR else None
         if moved.max(initial=0.0) < SETTLED and np.array_equal(now, before):
             # Weights that make light of what is noisy may show more than those of the first fit.
             other = noise.kind not in FIRST and left > 0
@@ -105,9 +116,7 @@ def _settled(
             readings = _linearised(model, observed, solution.fit.x, kept, kind)
     # One that ended at a bound is held there and no longer a column.
     fitted = readings.take(now).of_columns(np.isin(kept, solution.reduction.kept))
-    final = over_times(estimate_noise(fitted, noise.kind, noise), fitted)
-    final = replace(final, trials=noise.trials, reason=noise.reason, tests=noise.tests)
-    return solution, final, now
+    return solution, over_times(estimate_noise(fitted, noise.kind, noise), fitted), now
 
 
 FIRST = ("independent", "stated")  # noise whose weights are those of the first fit
@@ -336,8 +345,7 @@ def _holding(
         readings = linearised(problem.model, observed, fit.x, reduction.kept)
         if len(problem.observations.lead) < len(found.good):
             readings = readings.take(found.good)
-        again = over_times(estimate_noise(readings, noise.kind, noise), readings)
-        noise = replace(again, trials=noise.trials, reason=noise.reason, tests=noise.tests)
+        noise = over_times(estimate_noise(readings, noise.kind, noise), readings)
     intervals = intervals_of(solution, options.intervals, noise)
     return replace(found, solution=solution, intervals=intervals, noise=noise)
 
@@ -361,8 +369,8 @@ def _reml(
     options: Options,
     progress: Progress,
 ) -> MethodResult:
-    def found(kind: str) -> Adapted:
-        solution, noise, good = _adapted(every, sound, faulty, refit, kind, progress)
+    def found(kind: str, known: NoiseAndOutliers | None = None) -> Adapted:
+        solution, noise, good = _adapted(every, sound, faulty, refit, kind, progress, known)
         if not good.all() and not _set_aside(~good, options):
             # So many faulty readings look like anything that scatters or drifts.
             plainly = OF_READINGS if kind == "auto" else kind
@@ -374,7 +382,7 @@ def _reml(
         # What the model lacks looks like scatter of the joints as well.  That is no noise: weights
         # which make light of it let the fit go where poses left out are predicted worse.
         progress("comparing with noise of the readings alone")
-        plain = found(OF_READINGS)
+        plain = found(OF_READINGS, NoiseAndOutliers(noise.of_readings(), good))
         if _held_out_rms(solution, solution) > WORSE * _held_out_rms(plain[0], solution):
             tests = noise.tests
             solution, noise, good = plain

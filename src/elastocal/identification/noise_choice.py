@@ -115,6 +115,12 @@ class NoiseFit:
         """Correlation time of what drifts, as a share of the campaign; None where nothing does."""
         return self.fit.lasting
 
+    def of_readings(self) -> NoiseFit:
+        """Named as the best of what was tried that knows nothing of the arm's visits."""
+        tried = tuple(t for t in self.trials if not Kind.of(t.kind).by_visit)
+        kind = min(tried, key=lambda t: t.criterion).kind
+        return replace(self, kind=kind, trials=tried, reason=_reason(kind, list(tried)))
+
 
 def estimate_noise(
     readings: Readings, kind: str = "auto", like: NoiseFit | None = None
@@ -127,7 +133,8 @@ def estimate_noise(
     that the table has the labels and the readings for, each with shared effects, takes the one
     with the smallest criterion, and leaves the shared effects out where it is smaller without;
     scatter of the joints and drift are tried where a test finds a trace of them.
-    `like`, a fit of nearly the same readings, is where the search of a named kind starts.
+    `like`, a fit of nearly the same readings, is where the search of a named kind starts; how it
+    was chosen there holds here.
 
     Raises InputError for an unknown kind or one that the readings do not support.
     """
@@ -135,7 +142,10 @@ def estimate_noise(
     if kind == "auto":
         return replace(_chosen(basis, T), course=readings.visits)
     found = fitted(basis, asked, None if like is None else like.fit)
-    return replace(_result(kind, found, T, (), "as asked for"), course=readings.visits)
+    made = replace(_result(kind, found, T, (), "as asked for"), course=readings.visits)
+    if like is None or like.kind != kind:
+        return made
+    return replace(made, trials=like.trials, reason=like.reason, tests=like.tests)
 
 
 def _chosen(readings: Readings, T: Array) -> NoiseFit:

@@ -175,9 +175,13 @@ class NoiseAndOutliers(NamedTuple):
 
 
 def settle(
-    readings: Readings, kind: str = "auto", good: BoolArray | None = None
-) -> NoiseAndOutliers:
+    readings: Readings, kind: str = "auto", good: BoolArray | None = None,
+    known: NoiseAndOutliers | None = None,
+) -> NoiseAndOutliers:  # fmt: skip
     """Noise and good readings that agree with each other, starting from `good` (default all).
+
+    A kind of noise that is `known` from such readings is only chosen again where those that turn
+    out good are not those that it was chosen from, or have other columns.
 
     The noise model is fitted to the good readings, every reading is judged by the error of its
     prediction from them (false-alarm rate 1 % for the whole table), and so on.  Starting from
@@ -189,11 +193,15 @@ def settle(
     allows, that set stands.
     """
     good = np.ones(len(readings), dtype=bool) if good is None else good
+    like = None if known is None else known.noise
+    first = kind if like is None else like.kind
     try:
-        noise = estimate_noise(readings.take(good), kind)
+        noise = estimate_noise(readings.take(good), first, like)
     except ElastocalError:
         good = np.ones(len(readings), dtype=bool)  # the others alone do not show all parameters
-        noise = estimate_noise(readings, kind)
+        noise = estimate_noise(readings, first, like)
+    chosen_from = good if known is None else known.good
+    anew = known is not None and len(known.noise.x) != readings.n_parameters
     own = np.asarray(np.linalg.inv(own_noise(noise.fit, readings)[0]), dtype=np.float64)
     visited = [(_misfit(noise, readings, own), good, noise)]
     for _ in range(ROUNDS):
@@ -205,8 +213,7 @@ def settle(
         if again is not None:
             updated = np.logical_or.reduce(masks[again:])
         try:
-            near = None if noise.lasting is None else noise  # how long it lasts is known by now
-            noise = estimate_noise(readings.take(updated), noise.kind, near)
+            noise = estimate_noise(readings.take(updated), noise.kind, noise)
         except ElastocalError:
             break  # so few readings cannot judge the others
         good = updated
@@ -218,7 +225,7 @@ def settle(
     if last[0] > best[0] * special.fdtri(half, half, 1 - FALSE_ALARM):
         last = best
     _, good, noise = last
-    if len(visited) > 1 and kind == "auto":
+    if kind == "auto" and (anew or not np.array_equal(good, chosen_from)):
         noise = estimate_noise(readings.take(good), kind)
     return NoiseAndOutliers(noise, good)
 
