@@ -22,10 +22,11 @@ from elastocal.cell.arm_description import (
 from elastocal.cell.work_cell import Cell
 from elastocal.identification.solve import reduce
 from elastocal.measurements import Measurements, with_moves
+from elastocal.model.chain import joint_limits
 from elastocal.model.manipulator import Model
 from elastocal.model.observations import polar_axes
 from elastocal.model.urdf import read_urdf
-from elastocal.simulation.simulate import simulate
+from elastocal.simulation.simulate import expand_plan, simulate
 
 EFFECTS = ("base_frame", "joint_offset", "link_geometry", "marker_position", "joint_compliance")
 COMPLIANCE = (3.5e-7, 0.287e-6, 0.416e-6, 2.786e-6, 3.483e-6, 2.074e-6)  # rad/(N m)
@@ -102,22 +103,12 @@ def true_arm(rng: np.random.Generator) -> np.ndarray:
 
 def rows_at(poses: int, rng: np.random.Generator) -> Measurements:
     """Random poses, each visited without and with the load, all markers read at each visit."""
-    chain, states, m = arm().chain, len(LOADS), len(MARKERS)
-    low = np.array([max(j.lower, -np.pi) for j in chain.joints])
-    high = np.array([min(j.upper, np.pi) for j in chain.joints])
-    pose = np.repeat(np.arange(poses), states * m)
-    return with_moves(
-        Measurements(
-            source="simulated", row=np.arange(len(pose)) + 2,
-            q=rng.uniform(low, high, (poses, len(low)))[pose],
-            configuration=pose,
-            configuration_labels=tuple(str(i + 1) for i in range(poses)),
-            repeat=np.zeros(len(pose), dtype=np.int64),
-            marker=np.tile(np.arange(m), poses * states), marker_names=tuple(MARKERS),
-            force=np.repeat(np.tile(LOADS, (poses, 1)), m, axis=0),
-            time=VISIT * (np.arange(len(pose)) // m).astype(float),
-        )
-    )  # fmt: skip
+    low, high = (np.clip(limits, -np.pi, np.pi) for limits in joint_limits(arm().cell, arm().chain))
+    q = rng.uniform(low, high, (poses, len(low)))
+    plan = Measurements.of_poses("simulated", q, LOADS[0])
+    rows = expand_plan(plan, tuple(MARKERS), 1, LOADS[1])
+    visit = np.arange(len(rows)) // len(MARKERS)
+    return with_moves(replace(rows, time=VISIT * visit.astype(float)))
 
 
 class Campaign:
@@ -132,12 +123,15 @@ class Campaign:
         self.noise, self.clean = self.drawn(self.exact)
         self.table = replace(self.exact, position=self.exact.position + self.noise)
 
+    @property
+    def sizes(self) -> np.ndarray:
+        """σ (3,) m of single readings, where it is the same at all."""
+        return SIGMA * np.array([0.5, 1.0, 2.0] if self.scenario.key == "axes" else [1.0] * 3)
+
     def drawn(self, exact: Measurements) -> tuple[np.ndarray, np.ndarray]:
         """Noise (n, 3) of readings at `exact` in m, and which of them (n,) are no outliers."""
         rng, key, n = self.rng, self.scenario.key, len(exact)
-        size = np.full((n, 3), SIGMA)
-        if key == "axes":
-            size *= [0.5, 1.0, 2.0]
+        size = self.sizes * np.ones((n, 1))
         noise = size * (rng.standard_t(3, (n, 3)) if key == "tails" else rng.normal(size=(n, 3)))
         clean = np.ones(n, dtype=bool)
         visit = np.arange(n) // len(MARKERS)
@@ -154,9 +148,9 @@ class Campaign:
         if key == "polar":
             noise = np.einsum("nij,nj->ni", self.polar_root(exact), rng.normal(size=(n, 3)))
         if key == "joints":
-            moved = exact.q + SCATTER * rng.normal(size=(n, 6))[visit]
-            shifted = simulate(arm(), replace(exact, q=moved), self.true, rng, False)
-            noise += shifted.position - exact.position
+            q = exact.q + SCATTER * rng.normal(size=(n, 6))[visit]
+            moved = simulate(arm(), replace(exact, q=q), self.true, rng, False)
+            noise += moved.position - exact.position
         if key == "drift":
             root = np.linalg.cholesky(self.drifting(exact) + 1e-12 * np.eye(n))
             noise += DRIFT * root @ rng.normal(size=(n, 3))
@@ -179,10 +173,7 @@ class Campaign:
     def covariance(self) -> np.ndarray:
         """True covariance (3n, 3n) of the clean noise."""
         exact, key, n = self.exact, self.scenario.key, len(self.exact)
-        size = np.full((n, 3), SIGMA)
-        if key == "axes":
-            size *= [0.5, 1.0, 2.0]
-        V = np.diag(size.ravel() ** 2) * (3.0 if key == "tails" else 1.0)
+        V = np.diag(np.tile(self.sizes, n) ** 2) * (3.0 if key == "tails" else 1.0)
         if key == "polar":
             root = self.polar_root(exact)
             blocks = root @ root.transpose(0, 2, 1)
@@ -201,16 +192,14 @@ class Campaign:
     @cached_property
     def joint_columns(self) -> np.ndarray:
         """∂(reading)/∂q (3n, 6) by central differences of the simulated arm."""
-        columns = []
-        for j in range(6):
-            moved = []
-            for step in (1e-5, -1e-5):
-                q = self.exact.q + step * np.eye(6)[j]
-                moved.append(
-                    simulate(arm(), replace(self.exact, q=q), self.true, 0, False).position
-                )
-            columns.append((moved[0] - moved[1]).ravel() / 2e-5)
-        return np.column_stack(columns)
+        moved = [
+            self.at(self.exact.q + step * axis) for step in (1e-5, -1e-5) for axis in np.eye(6)
+        ]
+        return (np.stack(moved[:6], axis=-1) - np.stack(moved[6:], axis=-1)).reshape(-1, 6) / 2e-5
+
+    def at(self, q: np.ndarray) -> np.ndarray:
+        """Exact readings (n, 3) with the joints at q (n, 6) instead."""
+        return simulate(arm(), replace(self.exact, q=q), self.true, 0, False).position
 
     @cached_property
     def test(self) -> Measurements:

@@ -7,15 +7,15 @@ from __future__ import annotations
 
 from pathlib import Path
 
-from draw import draw_world
+from draw import Recipe
 from world_files import write_world
 
 HERE = Path(__file__).resolve().parent
 
 
 def main() -> None:
-    world = draw_world((2026, 11), "example", ["backlash"], arm="heavy", level=25e-6)
-    write_world(world, HERE / "example", HERE / "example_truth")
+    recipe = Recipe("example", (2026, 11), ("backlash",), arm="heavy", level=25e-6)
+    write_world(recipe.draw(), HERE / "example", HERE / "example_truth")
 
 
 if __name__ == "__main__":

@@ -12,11 +12,10 @@ from dataclasses import dataclass
 
 import numpy as np
 from chance import log_uniform, sign, spread
-from inside import settled
+from inside import SPREAD, settled, time_constant
 from mjcf import Spring
 from numpy.typing import NDArray
 from places import Site
-from sizes import SPREAD, time_constant
 from world import Effect, Hooks, Motion, Sight, TrueArm, Visits
 
 Array = NDArray[np.float64]

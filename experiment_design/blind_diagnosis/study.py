@@ -15,9 +15,9 @@ from typing import Any
 import numpy as np
 import pandas as pd
 from one_world import in_own_worker
-from result_tables import records_of, report
 from suites import SUITES, named
 from suites import tasks as suite_tasks
+from table import records_of, report
 
 
 def tasks(options: dict[str, Any]) -> Iterator[dict[str, Any]]:

@@ -5,7 +5,8 @@
 Rms errors at 200 new poses and loads, in mm: of the cell's own model, of what `diagnose --cell-out`
 added, both by `identify --test`; of the oracle; their ratio, what is claimed and how long it took.
 With `--keep FOLDER` cell, readings and answers stay there, with the truth; `--first K` begins with
-world K.
+world K.  `--withhold` diagnoses each arm once more without the kind of effect that does most on
+it, and prints its verdict, its wrong names, and its error over that with the kind in.
 Blindness is the study's matter: here all runs in one process.
 """
 
@@ -24,13 +25,20 @@ from typing import Any
 import numpy as np
 from diagnose_many import run
 from whole_draw import WholeRecipe
-from whole_world import judged, over_oracle
+from whole_score import judged, kind_of, over_oracle
 from world_files import write_world
 
-HEAD = (
-    "| world | arm | noise, µm | approach told | geometry, mm | as diagnosed | oracle | ratio "
-    "| s | verdict | shares held | wrong names | missed | named |\n" + "|" + "---|" * 14
-)
+COLUMNS = (
+    "world", "arm", "noise, µm", "approach told", "geometry, mm", "as diagnosed", "oracle", "ratio",
+    "s", "verdict", "shares held", "wrong names", "missed", "named",
+)  # fmt: skip
+WITHHELD = ("withheld", "verdict without", "wrong names", "error over that with it")
+STANDS_FOR = {  # withheld for a true part of this kind
+    "load": ("link_mass_error", "gravity_sag", "link_weights", "torque_coupling", "torque_tilt"),
+    "angle": ("gear_eccentricity", "gear_ripple", "gear_spectrum", "gear_second_harmonic"),
+    "move": ("hysteresis", "backlash", "move_lag", "move_hysteresis"),
+    "time": ("base_drift", "joint_drift", "thermal_expansion"),
+}
 
 
 def main() -> None:
@@ -40,25 +48,27 @@ def main() -> None:
     parser.add_argument("--first", type=int, default=0)
     parser.add_argument("--poses", type=int, default=60)
     parser.add_argument("--keep", type=Path)
+    parser.add_argument("--withhold", action="store_true")
     asked = parser.parse_args()
-    print(HEAD, flush=True)
+    head = COLUMNS + WITHHELD * asked.withhold
+    print(f"| {' | '.join(head)} |\n|{'---|' * len(head)}", flush=True)
     ratios = []
     for k in range(asked.first, asked.first + asked.worlds):
         recipe = WholeRecipe(f"whole-{asked.poses}-{k:03d}", (asked.seed, 9, k), asked.poses)
         folder = Path(tempfile.mkdtemp()) if asked.keep is None else asked.keep / recipe.name
         try:
-            line, ratio = one_world(recipe, folder)
+            cells, ratio = one_world(recipe, folder, asked.withhold)
         finally:
             if asked.keep is None:
                 shutil.rmtree(folder)
-        print(f"| {k} | {line} |", flush=True)
+        print(f"| {' | '.join([str(k), *cells])} |", flush=True)
         ratios.append(ratio)
     known = np.array([r for r in ratios if np.isfinite(r)])
     if len(known):
         print(f"\nRatio: median {np.median(known):.2f}, 90 % {np.quantile(known, 0.9):.2f}.")
 
 
-def one_world(recipe: WholeRecipe, folder: Path) -> tuple[str, float]:
+def one_world(recipe: WholeRecipe, folder: Path, withhold: bool) -> tuple[list[str], float]:
     """Its row, and the tool's error over the oracle's."""
     world = recipe.draw()
     observed, sealed = folder / "seen", folder / "sealed"
@@ -71,22 +81,29 @@ def one_world(recipe: WholeRecipe, folder: Path) -> tuple[str, float]:
             print(f"{arguments[0]}: {told}", file=sys.stderr, flush=True)
         return int(str(done["exit"]))
 
-    start, answer = time.perf_counter(), None
-    options = ("-o", "diagnosis.json", "--cell-out", "extended.toml")
-    if command("diagnose", "cell.toml", "data.csv", *options) == 0:
-        answer = json.loads((observed / "diagnosis.json").read_text(encoding="utf-8"))
-    seconds = time.perf_counter() - start
-    whole = judged(world, observed, sealed / "fresh.csv", command, answer, "extended.toml")
+    def diagnosed(out: str, *more: str) -> tuple[Mapping[str, Any] | None, dict[str, Any], float]:
+        start, answer = time.perf_counter(), None
+        options = ("-o", "diagnosis.json", "--cell-out", out, *more)
+        if command("diagnose", "cell.toml", "data.csv", *options) == 0:
+            answer = json.loads((observed / "diagnosis.json").read_text(encoding="utf-8"))
+        seconds = time.perf_counter() - start
+        fresh = sealed / "fresh.csv"
+        return answer, judged(world, observed, fresh, command, answer, out), seconds
+
+    answer, whole, seconds = diagnosed("extended.toml")
     (folder / "judged.json").write_text(json.dumps(whole, indent=2), encoding="utf-8")
     errors = [whole[key] or np.nan for key in ("geometry_mm", "tool_mm", "oracle_mm")]
     ratio = over_oracle(whole)
-    parts = [
-        world.spec.name,
-        f"{1e6 * world.noise.level:.0f}",
-        "yes" if world.told.approach else "no",
-    ]
-    parts += [*(f"{e:.4f}" for e in errors), f"{ratio:.2f}", f"{seconds:.0f}"]
-    return " | ".join(parts + said(answer, whole)), ratio
+    cells = [world.spec.name, f"{1e6 * world.noise.level:.0f}"]
+    cells += ["yes" if world.told.approach else "no", *(f"{e:.4f}" for e in errors)]
+    cells += [f"{ratio:.2f}", f"{seconds:.0f}", *said(answer, whole)]
+    if withhold:
+        kind = kind_of(max(whole["strengths"].items(), key=lambda part: part[1])[0].split(":")[0])
+        without = [w for effect in STANDS_FOR[kind] for w in ("--without", effect)]
+        less, found, _ = diagnosed("less.toml", *without)
+        verdict, _, wrong, *_ = said(less, found)
+        cells += [kind, verdict, wrong, f"{(found['tool_mm'] or np.nan) / errors[1]:.2f}"]
+    return cells, ratio
 
 
 def said(answer: Mapping[str, Any] | None, whole: Mapping[str, Any]) -> list[str]:

@@ -1,9 +1,8 @@
 """What moves the markers of a whole arm, to first order about the arm as it stands.
 
-Markers at P (n, M, 3) m hang behind joint j, which turns about a_j through o_j: an angle there
-moves them by a_j × (P − o_j).  All that is wrong with an arm is such an angle, a shift, or a turn:
-errors of gears and of the last move in the joint, sag k_j τ_j, frames, base.  τ_j of weight
-and centre of link i ≥ j is a_j · ((p_i − o_j) m_i + R_i m_i c_i) × g.
+All that is wrong with an arm is an angle of a joint, a shift, or a turn of base or link: the arm at
+rest is placed rigidly, and again with each of these a little changed.  The load of joint j by
+weight and first moment of link i is −g ∂z/∂θ_j of the link's origin and axes.
 """
 
 from __future__ import annotations
@@ -16,10 +15,10 @@ from mjcf import GRAVITY
 from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 from whole_laws import CREEP, LAST_MOVE, LINES, WEIGHTS, creep, gear_error, last_move, weights
-from world import Effect, Motion, Visits
+from world import Effect, TrueArm, Visits
 
 Array = NDArray[np.float64]
-DOWN = np.array([0.0, 0.0, -GRAVITY])
+STEP = 1e-5  # m, rad; central differences, each off by 1e-10 of itself
 
 
 @dataclass(frozen=True)
@@ -40,98 +39,80 @@ class Scene:
     carried: Array
     weighing: Array
 
-    def bent(self, angles: Array) -> Array:
-        """Motion (n, K) by angles (n, J) rad of the joints."""
-        return np.einsum("nkj,nj->nk", self.joint, angles)
-
 
 def scene_of(world: World, visits: Visits) -> Scene:
     """The columns about the true arm with everything that is wrong with it."""
-    compliance = world.specimen.true.compliance
+    arm = world.specimen.true
     rest, motion = world.physics.rest(visits)
     bare, _ = replace(world, effects=()).physics.rest(visits)
-    return _columns(world, visits, motion, compliance * rest.load, rest.load, bare.load)
+    q = visits.q + arm.offset + motion.drive + arm.compliance * rest.load
+    J, M = q.shape[1], len(arm.markers)
 
+    def heights(angles: Array) -> Array:
+        """(n, J, 4): z of each link's origin, and of its axes."""
+        R, o = _placed(arm, q + angles, motion.base)
+        return np.concatenate([o[:, :-1, 2:], R[:, :-1, 2]], axis=2)
 
-def _columns(
-    world: World, visits: Visits, motion: Motion, bent: Array, load: Array, carried: Array
-) -> Scene:
-    arm = world.specimen.true
-    skeleton = arm.skeleton
-    n, J = visits.q.shape
-    M = len(arm.markers)
-    turn = Rotation.from_rotvec(motion.base[:, 3:]).as_matrix() @ arm.base_rotation
-    foot = arm.base_position + motion.base[:, :3]
-    R, o = skeleton.forward(visits.q + arm.offset + motion.drive + bent)
-    R = np.einsum("nab,njbc->njac", turn, R)
-    o = foot[:, None] + np.einsum("nab,njb->nja", turn, o)
-    flange = R[:, -1]
-    P = o[:, -1, None] + np.einsum("nab,mb->nma", flange, arm.markers)
+    def seen(angles: Array = 0, base: Array = 0, link: tuple[int, Array] | None = None) -> Array:
+        bent = arm if link is None else _bent(arm, *link)
+        R, o = _placed(bent, q + angles, motion.base + base)
+        points = o[:, -1, None] + np.einsum("nab,mb->nma", R[:, -1], arm.markers)
+        return points.reshape(len(q), -1)
 
-    def turned(axis: Array, origin: Array) -> Array:
-        """axis × (P − origin) of every marker, (n, 3 M); both (n, 3)."""
-        return np.cross(axis[:, None], P - origin[:, None]).reshape(n, -1)
-
-    def shifted(axis: Array) -> Array:
-        return np.tile(axis, (1, M))
-
-    axes = np.einsum("njab,jb->nja", R[:, :-1], skeleton.axis)
-    joint = np.stack([turned(axes[:, j], o[:, j]) for j in range(J)], axis=2)
-    unit = np.tile(np.eye(3), (n, 1, 1))
-    base = [shifted(unit[:, a]) for a in range(3)] + [turned(unit[:, a], foot) for a in range(3)]
-    links = []
-    for j in range(J):
-        end = R[:, j] @ skeleton.rotation[j + 1]
-        links += [shifted(end[:, :, a]) for a in range(3)]
-        links += [turned(end[:, :, a], o[:, j + 1]) for a in range(3)]
-    markers = np.zeros((n, M, 3, M, 3))
-    for m in range(M):
-        markers[:, m, :, m] = flange
+    along, small = np.eye(J), np.eye(6)
+    flange = _placed(arm, q, motion.base)[0][:, -1]
     return Scene(
-        joint, np.stack(base, axis=2), np.stack(links, axis=2), markers.reshape(n, 3 * M, 3 * M),
-        load, carried, _weighing(axes, R, o),
+        joint=_slopes([lambda h, a=a: seen(angles=h * a) for a in along]),
+        base=_slopes([lambda h, a=a: seen(base=h * a) for a in small]),
+        links=_slopes([lambda h, j=j, a=a: seen(link=(j, h * a)) for j in range(J) for a in small]),
+        markers=np.einsum("nab,lm->nlamb", flange, np.eye(M)).reshape(len(q), 3 * M, 3 * M),
+        load=rest.load, carried=bare.load,
+        weighing=-GRAVITY * _slopes(
+            [lambda h, a=a: heights(h * a).reshape(len(q), -1) for a in along]
+        ).transpose(0, 2, 1),
     )  # fmt: skip
 
 
-def _weighing(axes: Array, R: Array, o: Array) -> Array:
-    n, J = axes.shape[:2]
-    out = np.zeros((n, J, J, 4))
-    for j in range(J):
-        for i in range(j, J):
-            arm = np.cross(o[:, i] - o[:, j], DOWN)
-            out[:, j, i, 0] = np.einsum("na,na->n", axes[:, j], arm)
-            for a in range(3):
-                arm = np.cross(R[:, i, :, a], DOWN)
-                out[:, j, i, 1 + a] = np.einsum("na,na->n", axes[:, j], arm)
-    return out.reshape(n, J, 4 * J)
+def _slopes(changed: list) -> Array:
+    """(n, K, columns) of functions h → (n, K), by central differences."""
+    return np.stack([(f(STEP) - f(-STEP)) / (2 * STEP) for f in changed], axis=2)
 
 
-@dataclass(frozen=True)
-class Component:
-    """One part of the gap: its family, place, and what it moves the coordinates by (n, K) m."""
+def _placed(arm: TrueArm, q: Array, base: Array) -> tuple[Array, Array]:
+    """Rotations and origins of all frames, links and flange, with the base moved by (n, 6)."""
+    turn = Rotation.from_rotvec(base[:, 3:]).as_matrix() @ arm.base_rotation
+    R, o = arm.skeleton.forward(q)
+    foot = arm.base_position + base[:, :3]
+    return turn[:, None] @ R, foot[:, None] + np.einsum("nab,njb->nja", turn, o)
 
-    family: str
-    where: str
-    moved: Array
+
+def _bent(arm: TrueArm, j: int, change: Array) -> TrueArm:
+    """The end of link j shifted and turned along its own axes, by (6,)."""
+    s = arm.skeleton
+    position, rotation = s.position.copy(), s.rotation.copy()
+    position[j + 1] += s.rotation[j + 1] @ change[:3]
+    rotation[j + 1] = rotation[j + 1] @ Rotation.from_rotvec(change[3:]).as_matrix()
+    return replace(arm, skeleton=replace(s, position=position, rotation=rotation))
 
 
-def components(world: World, visits: Visits, scene: Scene) -> list[Component]:
-    """What is wrong with a whole arm, part by part."""
-    out = []
-    J = visits.q.shape[1]
+def components(world: World, visits: Visits, scene: Scene) -> dict[tuple[str, str], Array]:
+    """What is wrong with a whole arm: what each family at each place moves the coordinates by,
+    (n, K) m."""
+    out = {}
     for e in world.effects:
-        if e.name == LINES:
-            out.append(_at_joint("angle", e, gear_error(e, visits.q[:, e.index]), scene))
-        elif e.name == LAST_MOVE:
-            out.append(_at_joint("move", e, last_move(e, visits.approach[:, e.index]), scene))
+        if e.name in (LINES, LAST_MOVE):
+            lines = e.name == LINES
+            angle = gear_error(e, visits.q[:, e.index]) if lines else (
+                last_move(e, visits.approach[:, e.index])
+            )  # fmt: skip
+            moved = scene.joint[:, :, e.index] * angle[:, None]
+            out["angle" if lines else "move", e.where] = moved
         elif e.name == WEIGHTS:
             sag = world.specimen.true.compliance * (scene.weighing @ moments(e))
-            for j in range(J):
-                moved = scene.joint[:, :, j] * sag[:, j, None]
-                out.append(Component("gravity", f"joint{j + 1}", moved))
+            for j, angle in enumerate(sag.T):
+                out["gravity", f"joint{j + 1}"] = scene.joint[:, :, j] * angle[:, None]
         elif e.name == CREEP:
-            moved = np.einsum("nkb,nb->nk", scene.base, creep(e, visits.time))
-            out.append(Component("time", e.where, moved))
+            out["time", e.where] = np.einsum("nkb,nb->nk", scene.base, creep(e, visits.time))
     return out
 
 
@@ -139,7 +120,3 @@ def moments(e: Effect) -> Array:
     """Mass and first moment of each link, (4 J,) kg and kg·m."""
     masses, centres = weights(e)
     return np.concatenate([masses[:, None], masses[:, None] * centres], axis=1).ravel()
-
-
-def _at_joint(family: str, e: Effect, angle: Array, scene: Scene) -> Component:
-    return Component(family, e.where, scene.joint[:, :, e.index] * angle[:, None])

@@ -12,7 +12,7 @@ joints' true scatter.  With r the noise of the readings, X the columns, D the pr
 from __future__ import annotations
 
 from collections.abc import Iterator, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 from arm_data import ANGLE, BASE_ANGLE, BASE_POSITION, COMPLIANCE_SPREAD, LENGTH, MARKER, OFFSET
@@ -34,14 +34,12 @@ SMALLEST = 1e-10  # of the creep's largest variance: what is below is left out
 @dataclass(frozen=True)
 class Block:
     """Parameters of one kind: columns at the campaign and elsewhere, (n, K, p) each; standard
-    deviation (p,) of the prior, and how far the truth (p,) is from its mean.  `line` is the name
-    of a gear's line."""
+    deviation (p,) of the prior, and how far the truth (p,) is from its mean."""
 
     here: Array
     there: Array
     deviation: Array
     away: Array
-    line: str = ""
 
 
 @dataclass(frozen=True)
@@ -70,16 +68,7 @@ def second_moment(bounds: tuple[float, float]) -> float:
 def oracle_errors(sights: Sights) -> tuple[float, float]:
     """Rms length (m) of the oracle's errors at the other poses, and that which its posterior
     covariance lets expect."""
-    error, factor, other = _fit(sights, [*geometry(sights), *effects(sights)], ())
-    variance = (other.T * cho_solve(factor, other.T)).sum() / len(other)
-    return rms_length(error), float(np.sqrt(3 * variance))
-
-
-def _fit(
-    sights: Sights, blocks: Sequence[Block], hidden: Sequence[Block]
-) -> tuple[Array, tuple, Array]:
-    """Errors at the other poses, the factor of the information, and columns there, in units of
-    the priors."""
+    blocks = [*geometry(sights), *effects(sights)]
     X, other = (
         np.concatenate([getattr(b, side) * b.deviation for b in blocks], axis=2)
         for side in ("here", "there")
@@ -88,16 +77,14 @@ def _fit(
     world = sights.world
     truth = world.noise_free(world.visits)
     r = (world.readings() - truth).reshape(len(truth), -1)
-    unknown = np.zeros(other.shape[:2])
-    for b in hidden:
-        r, unknown = r + b.here @ b.away, unknown + b.there @ b.away
     root = np.linalg.cholesky(covariance(sights, truth))
     X, r = np.linalg.solve(root, X), np.linalg.solve(root, r[:, :, None])
     X, other = (x.reshape(-1, x.shape[2]) for x in (X, other))
-    # |r − X u|² + |u + away|².
+    # |r − X u|² + |u + away|², in units of the priors.
     factor = cho_factor(X.T @ X + np.eye(X.shape[1]))
     u = cho_solve(factor, X.T @ r.ravel() - away)
-    return other @ u - unknown.ravel(), factor, other
+    variance = (other.T * cho_solve(factor, other.T)).sum() / len(other)
+    return rms_length(other @ u), float(np.sqrt(3 * variance))
 
 
 def oracle_error(sights: Sights) -> float:
@@ -165,7 +152,7 @@ def effects(sights: Sights) -> Iterator[Block]:
                 ]
                 size = spec.gear * line_deviation(line)
                 truth = e.vector(f"{line}_sin", f"{line}_cos")
-                yield Block(*columns, np.full(2, size), truth, line)
+                yield Block(*columns, np.full(2, size), truth)
         elif e.name == LAST_MOVE:
             columns = [at.joint[:, :, [e.index]] * v.approach[:, None, [e.index]]
                        for v, at in sides]  # fmt: skip
@@ -226,11 +213,6 @@ class Gap:
     products: Array
     rms: float
 
-    def share(self, parts: Sequence[tuple[str, str]]) -> float:
-        """What these parts add to the mean square of the whole, over that: shares sum to one."""
-        at = [self.parts.index(p) for p in parts]
-        return float(self.products[at].sum() / self.rms**2)
-
     def strength(self, parts: Sequence[tuple[str, str]]) -> float:
         """Mean square of what these parts do together, over that of the whole: never negative."""
         at = [self.parts.index(p) for p in parts]
@@ -241,24 +223,14 @@ def gap_of(sights: Sights) -> Gap:
     """Each part's motion without what the fitted geometry takes on of it, by least squares."""
     world, scene = sights.world, sights.at_here
     parts = components(world, sights.here, scene)
-    moved = np.stack([p.moved.ravel() for p in parts], axis=1)
-    X = _fitted(sights)[0]
+    moved = np.stack([part.ravel() for part in parts.values()], axis=1)
+    # The cell's model knows no weights: its compliances answer to the payload.
+    *frames, springs = geometry(sights)
+    springs = replace(springs, here=scene.joint * scene.carried[:, None])
+    X = np.concatenate([b.here * b.deviation for b in (*frames, springs)], axis=2)
+    X = X.reshape(len(moved), -1)
     # Axes that are all but parallel in this one arm show nothing: no fit would follow there.
     X = X / np.maximum(np.linalg.norm(X, axis=0), 1e-300)
     left = moved - X @ np.linalg.lstsq(X, moved, rcond=SHOWN)[0]
     products = left.T @ left / len(left)
-    names = tuple((p.family, p.where) for p in parts)
-    return Gap(names, products, float(np.sqrt(products.sum())))
-
-
-def _fitted(sights: Sights) -> tuple[Array, Array]:
-    """Columns of the cell's own parameters at both tables, in units of their priors; its model
-    knows no weights, so that compliances answer to the payload."""
-    *frames, springs = geometry(sights)
-    out = []
-    for side, scene in (("here", sights.at_here), ("there", sights.at_there)):
-        blocks = [getattr(b, side) * b.deviation for b in frames]
-        blocks.append(scene.joint * scene.carried[:, None] * springs.deviation)
-        X = np.concatenate(blocks, axis=2)
-        out.append(X.reshape(-1, X.shape[2]))
-    return out[0], out[1]
+    return Gap(tuple(parts), products, float(np.sqrt(products.sum())))

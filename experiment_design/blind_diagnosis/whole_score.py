@@ -1,4 +1,4 @@
-"""What counts as right of a whole arm: shares of the gap, and names.
+"""A whole arm after its diagnosis: errors at new poses beside the oracle's, shares and names.
 
 The diagnosis lists `components`, each a family of errors at a place with its share of the gap
 (of the squared gap: what goes when it is added last) and 90 % interval.  Families
@@ -8,20 +8,26 @@ here; a place without a number stands for all places of its kind.
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
+import json
+import shutil
+from collections.abc import Callable, Mapping, Sequence
+from pathlib import Path
 from typing import Any
 
 import numpy as np
-from whole_oracle import Gap
+from draw import World
+from whole_oracle import Gap, Sights, gap_of, oracle_error
 
 Json = Mapping[str, Any]
 Part = tuple[str, str]
+# Runs `elastocal ARGUMENTS` in the visible folder; its exit code.
+Command = Callable[..., int]
 
+NEW, RESULT = "new.csv", "result.json"
 SMALL = 0.01  # of the gap, in mean squares: what is less need not be found
 ABSENT_BELOW = 1e-4  # a hundredth of the gap's rms: what is less is as good as absent
 LIKELY = 0.5
-KIND = {"torque": "load", "gravity": "load", "load": "load"}
+KIND = {"torque": "load", "gravity": "load"}
 # Effects of the catalogue that whole arms have, and what they are errors against; all others that
 # FAMILY and ABSENT do not list are judged by their place alone.
 FAMILY = {
@@ -40,64 +46,62 @@ ABSENT = (
 NAMELESS = ("joint_curve", "residual_field")  # correct the arm, explain nothing
 
 
-@dataclass(frozen=True)
-class Share:
-    """One stated share: of which kind and place, the truth, the interval, and whether it holds."""
+def judged(
+    world: World,
+    visible: Path,
+    fresh: Path,
+    command: Command,
+    answer: Json | None,
+    extended: str,
+) -> dict[str, Any]:
+    """What the campaign's answer is worth; the new poses are shown to the tool only now.
 
-    kind: str
-    where: str
-    true: float
-    stated: float
-    low: float
-    high: float
-
-    @property
-    def held(self) -> bool:
-        return self.low <= self.true <= self.high
-
-
-@dataclass(frozen=True)
-class Name:
-    """What is claimed to be there, "name:where", the mean square of what its kind truly does at
-    that place over that of the gap, and whether an arm of this kind has such a thing at all."""
-
-    name: str
-    true: float
-    known: bool
-
-    @property
-    def right(self) -> bool:
-        return self.known and self.true >= ABSENT_BELOW
-
-
-@dataclass(frozen=True)
-class Scored:
-    """shares: of every part that is stated with one; names: what is claimed to be there; missed:
-    parts above SMALL of the gap that no component stands for."""
-
-    shares: tuple[Share, ...]
-    names: tuple[Name, ...]
-    missed: tuple[str, ...]
-
-
-def score_parts(gap: Gap, answer: Json) -> Scored:
-    stated = stated_parts(answer)
-    shares = []
-    for (kind, where), found in stated.items():
-        own = [c for c in found if "share_ci90" in c and c.get("share") is not None]
-        if own:
-            shares.append(_share(kind, where, own, strength(gap, (kind, where))))
-    names = [
-        Name(name, strength(gap, part), name.partition(":")[0] not in ABSENT)
-        for name, part in named_parts(answer, stated)
-    ]
+    Rms lengths in mm of the errors at new poses: geometry_mm of the cell as it is, tool_mm of the
+    `extended` one, both as `identify --test` has them, None where it fails; oracle_mm; gap_um: rms
+    of a coordinate of what geometry leaves of the effects; strengths: mean squares of its parts
+    over that of all.
+    shares: of every part that is stated with one, its truth and its interval; names: what is
+    claimed to be there, the mean square of what its kind truly does at that place over that of the
+    gap, and whether an arm of this kind has it; missed: parts above SMALL without a component.
+    """
+    sights = Sights.of(world)
+    shutil.copyfile(fresh, visible / NEW)
+    gap = gap_of(sights)
+    stated = {} if answer is None else stated_parts(answer)
     covered = [p for key in stated for p in matching(gap, key)]
-    missed = [
-        f"{family}:{where}"
-        for family, where in gap.parts
-        if (family, where) not in covered and gap.strength([(family, where)]) >= SMALL
-    ]
-    return Scored(tuple(shares), tuple(names), tuple(missed))
+    strengths = {part: gap.strength([part]) for part in gap.parts}
+    return {
+        "geometry_mm": _tested(visible, command, "cell.toml"),
+        "tool_mm": None if answer is None else _tested(visible, command, extended),
+        "oracle_mm": 1e3 * oracle_error(sights),
+        "gap_um": 1e6 * gap.rms,
+        "strengths": {":".join(part): size for part, size in strengths.items()},
+        "shares": [
+            _share(part, own, strength(gap, part))
+            for part, found in stated.items()
+            if (own := [c for c in found if "share_ci90" in c and c.get("share") is not None])
+        ],
+        "names": [] if answer is None else [
+            {"name": name, "true": true, "right": true >= ABSENT_BELOW and known}
+            for name, part in named_parts(answer, stated)
+            for true, known in [(strength(gap, part), name.partition(":")[0] not in ABSENT)]
+        ],
+        "missed": [] if answer is None else [
+            ":".join(p) for p in gap.parts if p not in covered and strengths[p] >= SMALL
+        ],
+    }  # fmt: skip
+
+
+def over_oracle(whole: Json, key: str = "tool_mm") -> float:
+    """The tool's error, or that of geometry, over the oracle's; infinite where there is none."""
+    return np.inf if whole[key] is None else float(whole[key] / whole["oracle_mm"])
+
+
+def _tested(visible: Path, command: Command, cell: str) -> float | None:
+    if command("identify", cell, "data.csv", "--test", NEW, "-o", RESULT) != 0:
+        return None
+    result = json.loads((visible / RESULT).read_text(encoding="utf-8"))
+    return float(result["test"]["rms_um"]) / 1e3
 
 
 def stated_parts(answer: Json) -> dict[Part, list[Json]]:
@@ -137,18 +141,15 @@ def place_of(where: str) -> str:
 
 
 def matching(gap: Gap, part: Part) -> list[Part]:
-    """The true parts that a stated one stands for."""
+    """The true parts that a stated one stands for: joint 1 turns as the base does."""
     kind, where = part
+    all_places = where in ("", "all", "arm", "joints")
     return [
         (f, w)
         for f, w in gap.parts
-        if kind in ("any", kind_of(f)) and (w == where or where in imitated(w))
+        if kind in ("any", kind_of(f))
+        and (w == where or all_places or (w, where) == ("base", "joint1"))
     ]
-
-
-def imitated(where: str) -> tuple[str, ...]:
-    """Other words for a true place: all of its kind; joint 1 turns as the base does."""
-    return ("", "all", "arm", "joints") + (("joint1",) if where == "base" else ())
 
 
 def strength(gap: Gap, part: Part) -> float:
@@ -157,9 +158,13 @@ def strength(gap: Gap, part: Part) -> float:
     return gap.strength(true) if true else 0.0
 
 
-def _share(kind: str, where: str, found: Sequence[Json], true: float) -> Share:
+def _share(part: Part, found: Sequence[Json], true: float) -> dict[str, Any]:
     """Several of one kind at one place add up, their intervals' halves in quadrature."""
-    middle = sum(float(c["share"]) for c in found)
-    below = np.hypot.reduce([float(c["share"]) - float(c["share_ci90"][0]) for c in found])
-    above = np.hypot.reduce([float(c["share_ci90"][1]) - float(c["share"]) for c in found])
-    return Share(kind, where, true, middle, middle - float(below), middle + float(above))
+    low, high = np.array([c["share_ci90"] for c in found], dtype=float).T
+    each = np.array([c["share"] for c in found], dtype=float)
+    middle = float(each.sum())
+    ends = middle - float(np.linalg.norm(each - low)), middle + float(np.linalg.norm(high - each))
+    return {
+        "kind": part[0], "where": part[1], "true": true, "stated": middle,
+        "low": ends[0], "high": ends[1], "held": ends[0] <= true <= ends[1],
+    }  # fmt: skip

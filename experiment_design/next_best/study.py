@@ -1,6 +1,6 @@
 """Poses until an arm is good enough: chosen as one goes, planned once, at random.
 
-elastocal study experiment_design/next_best [--set arms=100] [--set named=100]
+elastocal study experiment_design/next_best [--set arms=100]
 """
 
 from __future__ import annotations
@@ -50,7 +50,6 @@ REQUIRED = 50e-6  # m
 SIZES = (8, 12, 16, 20, 24, 28, 32)  # poses; the first is what every policy begins with
 SAME = 20  # poses after which all policies are compared on the same arms
 CANDIDATES = 120
-NAMED_FROM = 30  # poses
 NEW = 200  # poses that nobody measured
 
 
@@ -79,9 +78,9 @@ def feasible(n: int, seed: int) -> np.ndarray:
 
 
 @lru_cache(maxsize=16)
-def planned(n: int, criterion: str = "test_pose") -> np.ndarray:
+def planned(n: int) -> np.ndarray:
     """The poses of the best plan found, before any data."""
-    spec = replace(model().cell.design, poses=n, criterion=criterion)
+    spec = replace(model().cell.design, poses=n)
     return design(replace(model().cell, design=spec), DesignOptions("batch")).q
 
 
@@ -139,27 +138,19 @@ class TrueArm:
 def tasks(options: dict[str, Any]) -> Iterator[dict[str, Any]]:
     for number in range(options["arms"]):
         for policy in ("adaptive", "planned", "random"):
-            yield {"kind": "stop", "policy": policy, "arm": number}
-    for number in range(options["named"]):
-        for policy in ("random", "planned", "robust"):
-            yield {"kind": "name", "policy": policy, "arm": number}
+            yield {"policy": policy, "arm": number}
 
 
 def run(task: dict[str, Any], rng: np.random.Generator) -> dict[str, Any]:
     """A row of study.toml's columns; an arm's seed follows from its number."""
     number, policy = task["arm"], task["policy"]
-    arm = TrueArm(number, task["kind"] == "name" or number % 2 == 1)
-    row = {"effect": arm.effect, "where": arm.where, "verdict": "", "kept_um": np.nan, "first": 0}
-    row["same_um"] = np.nan
-    if task["kind"] == "name":
-        return row | arm.judged(poses(policy, NAMED_FROM, number))
+    arm = TrueArm(number, number % 2 == 1)
+    row = {"effect": arm.effect, "where": arm.where, "verdict": "", "kept_um": np.nan}
     return row | (adaptive(arm) if policy == "adaptive" else grown(arm, policy))
 
 
 def poses(policy: str, n: int, number: int) -> np.ndarray:
-    if policy == "random":
-        return feasible(NAMED_FROM + SIZES[-1], 10 + number)[:n]
-    return planned(n, "robust" if policy == "robust" else "test_pose")
+    return feasible(62, 10 + number)[:n] if policy == "random" else planned(n)
 
 
 def grown(arm: TrueArm, policy: str) -> dict[str, Any]:
@@ -202,8 +193,7 @@ def summary(frame: pd.DataFrame) -> str:
     lines = ["| policy | lacking | arms | below 50 µm | after poses, median (mean) | "
              f"rms error after {SAME} | named |",
              "|---|---|---|---|---|---|---|"]  # fmt: skip
-    stop, name = (frame[frame["kind"] == kind] for kind in ("stop", "name"))
-    for (lacking, policy), some in stop.groupby([stop["effect"] != "", "policy"]):
+    for (lacking, policy), some in frame.groupby([frame["effect"] != "", "policy"]):
         there = some["first"][some["first"] > 0]
         named = f"{int(some['named'].sum())} of {len(some)}" if lacking else "–"
         lines.append(
@@ -211,21 +201,10 @@ def summary(frame: pd.DataFrame) -> str:
             f"{there.median():.0f} ({there.mean():.1f}) | "
             f"{np.sqrt((some['same_um'] ** 2).mean()):.1f} µm | {named} |"
         )
-    enough = stop[stop["verdict"] == "enough"]
+    enough = frame[frame["verdict"] == "enough"]
     right = int((enough["error_um"] <= 1e6 * REQUIRED).sum())
     lines.append(
         f'\nStops at "enough": {len(enough)}, after {enough["poses"].mean():.1f} poses in '
         f"the mean; the true error was below 50 µm in {right} of them."
     )
-    if len(name):
-        lines += [
-            "",
-            "| 30 poses | arms | effect named | true error, median |",
-            "|---|---|---|---|",
-        ]
-        for policy, some in name.groupby("policy"):
-            lines.append(
-                f"| {policy} | {len(some)} | {int(some['named'].sum())} | "
-                f"{some['error_um'].median():.1f} µm |"
-            )
     return "\n".join(lines) + "\n"

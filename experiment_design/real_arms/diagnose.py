@@ -8,20 +8,17 @@ from __future__ import annotations
 
 import json
 import os
-import re
 import subprocess
 import sys
 import time
-from collections import Counter
 from collections.abc import Iterator
-from dataclasses import asdict, dataclass
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
 from prepare import HERE, prepare
 
 OUT = HERE / "out"
-SHOWN = 5  # candidates of a set
 CERTAIN = 0.995
 
 
@@ -85,17 +82,11 @@ SUMMARY = (
 )
 
 
-@dataclass(frozen=True)
-class Cost:
-    """What a command took: `peak` is its resident memory in MB."""
+def elastocal(*arguments: object) -> dict[str, float]:
+    """Run the command line: its seconds, those of CPU, its peak of resident memory in MB.
 
-    seconds: float
-    cpu: float
-    peak: float
-
-
-def elastocal(*arguments: object) -> Cost:
-    """Run the command line; raises CalledProcessError where it fails."""
+    Raises CalledProcessError where it fails.
+    """
     command = [sys.executable, "-m", "elastocal", *map(str, arguments), "--quiet"]
     begun = time.perf_counter()
     child = subprocess.Popen(command, stdout=subprocess.DEVNULL)
@@ -103,8 +94,8 @@ def elastocal(*arguments: object) -> Cost:
     child.returncode = os.waitstatus_to_exitcode(status)
     if child.returncode:
         raise subprocess.CalledProcessError(child.returncode, command)
-    seconds = time.perf_counter() - begun
-    return Cost(seconds, used.ru_utime + used.ru_stime, used.ru_maxrss / 1024)
+    cpu, peak = used.ru_utime + used.ru_stime, used.ru_maxrss / 1024
+    return {"seconds": time.perf_counter() - begun, "cpu": cpu, "peak": peak}
 
 
 def read(path: Path) -> dict[str, Any]:
@@ -140,128 +131,38 @@ def percent(share: float) -> str:
     return f"{100 * share:.{1 if abs(share) < 0.095 else 0}f}"
 
 
-def places(names: list[str]) -> str:
-    """ "joints 1, 2 and 3" for joint1, joint2, joint3; other places as they are."""
-    joints = [name[5:] for name in names if re.fullmatch(r"joint\d+", name)]
-    others = [name for name in names if not re.fullmatch(r"joint\d+", name)]
-    listed = ", ".join(joints[:-1]) + " and " * (len(joints) > 1) + "".join(joints[-1:])
-    return ", ".join([f"joint{'s' * (len(joints) > 1)} {listed}"] * bool(joints) + others)
+def between(low: float, high: float) -> str:
+    return f"{percent(low)} to {percent(high)}"
 
 
-def group_lines(found: dict[str, Any]) -> Iterator[str]:
-    """Where many causes act at once: each kind at all its places, then what has no name."""
-    for group in found["groups"]:
-        low, high = group["share_ci90"]
-        yield (
-            f"- **{group['name']}** at {places(group['places'])} ({', '.join(group['effects'])}): "
-            f"{percent(group['share'])} % ({percent(low)} to {percent(high)} %) of the gap; takes "
-            f"away {percent(group['gap_reduction'])} % of the noise-free error of new poses"
-        )
-    unnamed = [c for c in found["components"] if not c["named"]]
-    for c in unnamed:
-        low, high = c["share_ci90"]
-        yield (
-            f"- something without a name, by {c['family']}, at {c['where']}: "
-            f"{percent(c['share'])} % ({percent(low)} to {percent(high)} %) of the gap"
-        )
-    if found["components"]:
-        yield ""
-        yield "| depends on | place | effects | share of the gap, % | 90 % | rms, mm | there |"
-        yield "|---|---|---|---|---|---|---|"
+def causes(found: dict[str, Any]) -> Iterator[str]:
+    """What is said to be there: of one or two causes each, of many each error at its place."""
+    if not found["components"]:
+        for e in found["effects"]:
+            yield (
+                f"- **{e['effect']} at {e['where']}**, probability {chance(e['probability'])}: "
+                f"takes away {between(*e['gap_reduction_ci95'])} % of the error of new poses"
+            )
+        if not found["effects"]:
+            yield f"- {found['verdict']}"
+        return
+    yield "| depends on | place | effects | share of the gap, % | 90 % | rms, mm | there |"
+    yield "|---|---|---|---|---|---|---|"
     for c in found["components"]:
-        low, high = c["share_ci90"]
         values = (
             c["family"], c["where"], ", ".join(c["effects"]), percent(c["share"]),
-            f"{percent(low)} to {percent(high)}", mm(c["rms_um"]), chance(c["probability"]),
+            between(*c["share_ci90"]), mm(c["rms_um"]), chance(c["probability"]),
         )  # fmt: skip
         yield f"| {' | '.join(values)} |"
 
 
-def effect_line(effect: dict[str, Any]) -> str:
-    low, high = effect["gap_reduction_ci95"]
-    values = [
-        f"{p['name']} = {p['value']:.3g} ± {1.96 * p['std']:.1g} {p['unit']}"
-        for p in effect["parameters"]
-    ]
-    values += [f"{key} = {value:.4g}" for key, value in effect["settings"].items()]
-    return (
-        f"- **{effect['effect']} at {effect['where']}**, probability "
-        f"{chance(effect['probability'])}: takes away {100 * effect['gap_reduction']:.0f} % "
-        f"({100 * low:.0f} to {100 * high:.0f} %) of the noise-free error of new poses; "
-        f"{', '.join(values)}"
-    )
-
-
-def finding_lines(found: dict[str, Any]) -> list[str]:
-    many = list(group_lines(found))
-    lines = many or [effect_line(effect) for effect in found["effects"]]
-    lines += [""] * bool(many and found["indistinguishable"])
-    for rivals in found["indistinguishable"]:
-        names = " or ".join(f"{r['effect']} at {r['where']}" for r in rivals)
-        lines.append(f"- not to be told apart by these data: {names}")
-    if many:
-        return lines
-    if found["verdict"] == "unknown_effect":
-        place = found["location"]
-        lines.append(
-            f"- **something without a name** at {place['where']}, stage {place['stage']}, "
-            f"probability of the place {chance(place['probability'])}"
-        )
-    for curve in found["curves"]:
-        span = 1e3 * (max(curve["y"]) - min(curve["y"]))
-        lines.append(
-            f"- its shape: {curve['driver']} moves {curve['entry']} by {span:.2g} "
-            f"m{curve['y_unit']} in all"
-        )
-    return lines or ["- nothing significant"]
-
-
-def budget_lines(found: dict[str, Any]) -> list[str]:
-    lines = ["| step | held-out rms, mm | 95 % |", "|---|---|---|"]
+def budget(found: dict[str, Any]) -> Iterator[str]:
+    yield "| step | held-out rms, mm | 95 % |"
+    yield "|---|---|---|"
     for step in found["budget"]:
         low, high = step["ci95"]
         span = "" if low == high else f"{mm(low)} to {mm(high)}"
-        lines.append(f"| {step['step']} | {mm(step['heldout_rms_um'])} | {span} |")
-    return lines
-
-
-def untold_lines(found: dict[str, Any]) -> list[str]:
-    """What the data cannot test, by reason, with the number of places of each effect."""
-    reasons: dict[tuple[str, str], list[str]] = {}
-    for row in found["untested"]:
-        reasons.setdefault((row["reason"], row["advice"]), []).append(row["effect"])
-    lines = []
-    for (reason, advice), effects in reasons.items():
-        counts = Counter(effects)
-        names = ", ".join(f"{name} ({n})" if n > 1 else name for name, n in counts.items())
-        lines.append(f"- {reason}: {names}. To do: {advice}.")
-    return lines
-
-
-def section(run: Run, found: dict[str, Any]) -> list[str]:
-    best = [
-        f"{c['effect']} at {c['where']} ({c['score']:+.0f})" for c in found["candidates"][:SHOWN]
-    ]
-    noise = found["noise"]
-    scatter = ", ".join(f"{1e6 * joint['value']:.0f}" for joint in noise["repeatability"])
-    return [
-        f"## {run.label}",
-        "",
-        *finding_lines(found),
-        "",
-        *budget_lines(found),
-        "",
-        f"Best named candidates (log evidence): {', '.join(best)}.",
-        "",
-        f"Noise: reading {mm(noise['reading_sigma_um'])} mm per axis, joints {scatter} µrad; "
-        f"{len(noise['faulty'])} of {found['n_readings']} readings left out as faulty.",
-        "",
-        "What these data cannot tell:",
-        "",
-        *untold_lines(found),
-        *(f"- Warning: {text}." for text in found["warnings"]),
-        "",
-    ]
+        yield f"| {step['step']} | {mm(step['heldout_rms_um'])} | {span} |"
 
 
 def errors(found: dict[str, Any]) -> float:
@@ -279,7 +180,7 @@ def diagnose(run: Run, data: Path) -> None:
     options = ("--test", data / run.test) if run.test else ()
     before = identified(HERE / run.cell, table, f"{run.stem}_before", *options)
     after = identified(cell, table, f"{run.stem}_after", *options)
-    measured = asdict(cost) | {"before": errors(before), "after": errors(after)}
+    measured = cost | {"before": errors(before), "after": errors(after)}
     measured["nominal"] = before["nominal_rms_um"]
     measured["dropped"] = [len(fit["excluded"]) for fit in (before, after)]
     (OUT / f"{run.stem}_measured.json").write_text(json.dumps(measured), encoding="utf-8")
@@ -305,7 +206,7 @@ def write_summary(runs: tuple[Run, ...]) -> None:
         if (kept := OUT / f"{run.stem}_measured.json").is_file():
             found = read(OUT / f"{run.stem}.json")
             rows.append(row(run, found, read(kept)))
-            sections += section(run, found)
+            sections += [f"## {run.label}", "", *causes(found), "", *budget(found), ""]
     whole = "\n".join([*rows, "", *sections]).rstrip() + "\n"
     (HERE / "diagnosis.md").write_text(whole, encoding="utf-8")
 

@@ -5,11 +5,9 @@ ELASTOCAL_DATASETS=… python run.py      prints a table, writes result.md and o
 
 from __future__ import annotations
 
-import json
-import subprocess
-import sys
 from pathlib import Path
 
+from diagnose import OUT, identified
 from prepare import HERE, prepare
 
 KEEP, DROP = ("--outliers", "keep"), ("--outliers", "drop")
@@ -35,18 +33,14 @@ def mm(value: float | None) -> str:
 
 
 def main() -> None:
-    data, out = prepare(), HERE / "out"
-    out.mkdir(exist_ok=True)
+    data = prepare()
+    OUT.mkdir(exist_ok=True)
     lines = [HEADER]
     print("\nErrors in mm: rms and mean of the 3-D position error, of the length for cables.\n")
     print(HEADER)
     for k, (label, cell, table, test, options) in enumerate(RUNS):
-        result = out / f"{k}_{Path(cell).stem}.json"
-        command = [sys.executable, "-m", "elastocal", "identify", str(HERE / cell)]
-        command += [str(data / table), "-o", str(result), "--quiet", *options]
-        command += ["--test", str(data / test)] if test else []
-        subprocess.run(command, check=True, stdout=subprocess.DEVNULL)
-        found = json.loads(result.read_text())
+        more = (*options, *(("--test", data / test) if test else ()))
+        found = identified(HERE / cell, data / table, f"{k}_{Path(cell).stem}", *more)
         tested = found["test"] or {}
         lines.append(
             f"| {label} | {len(found['covariance_of'])} | {mm(found['nominal_rms_um'])} "

@@ -23,7 +23,7 @@ from elastocal.measurements import Measurements
 from elastocal.model.chain import Chain, finite_ranges
 from elastocal.model.manipulator import Model
 from elastocal.model.urdf import read_urdf
-from elastocal.simulation.simulate import simulate
+from elastocal.simulation.simulate import expand_plan, simulate
 
 HERE = Path(__file__).parent
 ARMS = {
@@ -73,10 +73,11 @@ def campaign(number: int) -> Campaign:
     low, high = finite_ranges(chain, *_limits(chain))
     middle = low + rng.uniform(share / 2, 1 - share / 2, len(low)) * (high - low)
     near = middle + share / 2 * (high - low) * rng.uniform(-1, 1, (poses, len(low)))
-    loads = [[0.0, 0.0, 0.0]] if what == "geometry" else [[0.0, 0.0, 0.0], [0.0, 0.0, -weight]]
-    table = _measured(real, near, loads, repeats, x, rng, sigma, hidden == "joint scatter", size)
+    load = None if what == "geometry" else np.array([0.0, 0.0, -weight])
+    rows = _rows(real, near, load, repeats)
+    table = _measured(real, rows, x, rng, sigma, 20e-6 * size * (hidden == "joint scatter"))
     far = rng.uniform(low, high, (TEST_POSES, len(low)))
-    exact = simulate(real, _rows(real, far, loads, 1), x, rng, False)
+    exact = simulate(real, _rows(real, far, load, 1), x, rng, False)
     kind = {
         "arm": str(arm), "model": str(what), "hidden": hidden, "size": size, "scale": scale,
         "sigma_um": sigma * 1e6, "stated": "yes" if stated else "no",
@@ -133,33 +134,22 @@ def _true(
     return x
 
 
-def _rows(model: Model, q: np.ndarray, loads: list[list[float]], repeats: int) -> Measurements:
-    n, states, m = len(q), len(loads), len(model.cell.tool.markers)
-    pose = np.repeat(np.arange(n), repeats * states * m)
-    each = np.tile(np.repeat(np.arange(states), m), n * repeats)
-    return Measurements(
-        source="simulated", row=np.arange(len(pose)) + 2, q=q[pose], configuration=pose,
-        configuration_labels=tuple(str(i + 1) for i in range(n)),
-        repeat=np.tile(np.repeat(np.arange(repeats), states * m), n),
-        marker=np.tile(np.arange(m), n * repeats * states),
-        marker_names=tuple(model.cell.tool.markers), force=np.array(loads)[each],
-    )  # fmt: skip
+def _rows(model: Model, q: np.ndarray, load: np.ndarray | None, repeats: int) -> Measurements:
+    plan = Measurements.of_poses("simulated", q, np.zeros(3))
+    rows = expand_plan(plan, tuple(model.cell.tool.markers), repeats, load)
+    return replace(rows, move=None, direction=None)
 
 
 def _measured(
-    model: Model, q: np.ndarray, loads: list[list[float]], repeats: int, x: np.ndarray,
-    rng: np.random.Generator, sigma: float, scatter: bool, size: float,
+    model: Model, rows: Measurements, x: np.ndarray, rng: np.random.Generator, sigma: float,
+    scatter: float,
 ) -> Measurements:  # fmt: skip
-    rows = _rows(model, q, loads, repeats)
-    if scatter:  # the joints settle anew at each visit, by 20 µrad times the size
-        visit = np.unique(
-            np.column_stack([rows.configuration, rows.repeat, rows.force]), axis=0,
-            return_inverse=True,
-        )[1].ravel()  # fmt: skip
-        off = 20e-6 * size * rng.normal(size=(visit.max() + 1, q.shape[1]))
-        exact = simulate(model, replace(rows, q=rows.q + off[visit]), x, rng, False)
-        exact = replace(exact, q=rows.q)
-    else:
-        exact = simulate(model, rows, x, rng, False)
-    assert exact.position is not None
-    return replace(exact, position=exact.position + sigma * rng.normal(size=exact.position.shape))
+    """Noisy readings; the joints settle anew at each visit, by `scatter` rad."""
+    moved = rows
+    if scatter:
+        keys = np.column_stack([rows.configuration, rows.repeat, rows.force])
+        visit = np.unique(keys, axis=0, return_inverse=True)[1].ravel()
+        off = scatter * rng.normal(size=(visit.max() + 1, rows.q.shape[1]))
+        moved = replace(rows, q=rows.q + off[visit])
+    exact = simulate(model, moved, x, rng, False).position
+    return replace(rows, position=exact + sigma * rng.normal(size=exact.shape))

@@ -4,7 +4,6 @@
 
 import json
 import sys
-from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -16,11 +15,10 @@ FOLDER = Path(__file__).resolve().parents[2] / "experiment_design" / "blind_diag
 sys.path.insert(0, str(FOLDER))
 
 import one_world
-import records
 import score
 import suites
 import worker
-from draw import Recipe, draw_world
+from draw import Recipe
 from support.study_scripts import study_of
 from world_files import write_world
 
@@ -96,14 +94,14 @@ class Blindfold(worker.Worker):
     def diagnose(self, folder, *arguments):
         self.observed.append((folder, arguments, sorted(p.name for p in folder.iterdir())))
         self.tables.append((folder / "data.csv").read_text().splitlines())
-        given = dict.fromkeys(records.KEPT) | NOTHING | {"candidates": [{}] * 99}
+        given = dict.fromkeys(score.KEPT) | NOTHING | {"candidates": [{}] * 99}
         (folder / one_world.ANSWER).write_text(json.dumps(given))
         return worker.Run(0, 1.0, "")
 
 
-def task(**changes):
+def task():
     recipe = Recipe("encoder_scale-8-000", (5, 1), ("encoder_scale",), poses=8)
-    return replace(suites.Task("left_out", recipe, without=("encoder_scale",)), **changes)
+    return suites.Task("left_out", recipe)
 
 
 def test_the_tool_sees_neither_the_truth_nor_a_name_that_betrays_it(monkeypatch):
@@ -130,7 +128,7 @@ def test_the_tool_sees_neither_the_truth_nor_a_name_that_betrays_it(monkeypatch)
     assert not visible.is_relative_to(sealed) and not sealed.is_relative_to(visible)
     assert "encoder" not in str(visible) and visible.name[:6] != sealed.name[:6]
     assert record["truth"]["effects"][0]["effect"] == "encoder_scale"
-    assert len(record["answer"]["candidates"]) == records.CANDIDATES
+    assert len(record["answer"]["candidates"]) == score.CANDIDATES
     assert not visible.exists() and not sealed.exists()
 
 
@@ -176,7 +174,7 @@ def test_a_worker_that_dies_or_hangs_is_a_failed_world_and_the_next_one_is_serve
 
 def test_the_script_runs_the_command_in_the_folder_and_passes_on_exit_code_and_message(tmp_path):
     """A table of too few poses: exit 1, and the tool's own words."""
-    world = draw_world((5, 2), "few", [], poses=3, arm="medium")
+    world = Recipe("few", (5, 2), poses=3, arm="medium").draw()
     write_world(world, tmp_path / "v", tmp_path / "s")
     asked = worker.Worker()
     done = asked.diagnose(tmp_path / "v", "-o", "diagnosis.json")
@@ -247,4 +245,5 @@ def test_the_report_counts_every_world_and_says_which_bars_are_met():
     assert bar[alone, "wrong name"] == ["0.050 (0.009 to 0.236)", "20", "NO"]
     assert bar["… with d ≥ 5", "named outright"][1:] == ["19", "yes"]
     assert bar["no effect, outliers", "an effect claimed"][1:] == ["10", "NO"]
-    assert "1 × encoder_scale:joint3" in text
+    assert "| … gear_eccentricity | right |  | 0.950 (" in text
+    assert "| … d 1 to 2 | wrong name |  | 1.000 (0.207 to 1.000) | 1 |  |" in text

@@ -17,9 +17,10 @@ FOLDER = Path(__file__).resolve().parents[2] / "experiment_design" / "blind_diag
 sys.path.insert(0, str(FOLDER))
 
 from arm_data import ARMS
-from draw import ALIKE, CATALOGUE, World, draw_world, pair_worlds
+from draw import ALIKE, CATALOGUE, Recipe, World
 from instrument import OUTLIER_SIZE, REPEATABILITY, VARIANTS, draw_noise
 from mjcf import GRAVITY
+from suites import tasks
 from world_files import write_table, write_world
 
 from elastocal.cell.arm_description import EffectChoice
@@ -29,7 +30,7 @@ from elastocal.model.manipulator import Model
 
 WORLD_MODULES = {
     "arm_data", "chance", "draw", "inside", "instrument", "mechanics", "mjcf", "outside", "places",
-    "sizes", "skeleton", "visits", "whole_columns", "whole_draw", "whole_laws", "whole_oracle",
+    "skeleton", "visits", "whole_columns", "whole_draw", "whole_laws", "whole_oracle",
     "whole_score", "world", "world_files",
 }  # fmt: skip
 CASES = [
@@ -96,7 +97,7 @@ def model_error(world: World, folder: Path) -> np.ndarray:
 @pytest.mark.parametrize("arm", ARMS)
 def test_the_arm_rests_where_its_energy_is_stationary(arm):
     """|k ∂V/∂θ| ≤ 1e-9 rad, with V from plain kinematics: weights, springs and the hook's load."""
-    world = draw_world((3,), "clean", arm=arm, poses=8)
+    world = Recipe("clean", (3,), arm=arm, poses=8).draw()
     true, visits = world.specimen.true, world.visits
     rest, _ = world.physics.rest(visits)
     deflection = true.compliance * rest.load
@@ -119,7 +120,7 @@ def test_the_arm_rests_where_its_energy_is_stationary(arm):
 
 @pytest.mark.parametrize("arm", ARMS)
 def test_a_plain_world_is_what_elastocal_predicts(arm, tmp_path):
-    assert np.abs(model_error(draw_world((5,), "plain", arm=arm), tmp_path)).max() < 1e-7
+    assert np.abs(model_error(Recipe("plain", (5,), arm=arm).draw(), tmp_path)).max() < 1e-7
 
 
 @pytest.mark.parametrize(("name", "arm"), CASES)
@@ -129,7 +130,7 @@ def test_a_catalogue_effect_is_the_one_that_elastocal_knows(name, arm, tmp_path)
     elastocal rounds the step of backlash too: compared only where the load on the joint is above
     a quarter of its largest.
     """
-    world = draw_world((6,), name, [name], arm=arm, factor=1.0, poses=40)
+    world = Recipe(name, (6,), (name,), 1.0, 40, arm=arm).draw()
     error, moved = model_error(world, tmp_path), signal(world)
     if name == "backlash":
         load = np.abs(world.physics.rest(world.visits)[0].load[:, world.effects[0].index])
@@ -141,7 +142,7 @@ def test_a_catalogue_effect_is_the_one_that_elastocal_knows(name, arm, tmp_path)
 @pytest.mark.parametrize("effect", ALIKE)
 def test_an_effect_said_to_be_alike_is_imitated(effect, tmp_path):
     """Its signal, off what the plain cell fits, lies in the rival's span to 2 %."""
-    world = draw_world((15,), "alike", [effect], arm="heavy", factor=1.0)
+    world = Recipe("alike", (15,), (effect,), 1.0, arm="heavy").draw()
     name, _, where = ALIKE[effect].partition(":")
     left = []
     for rivals in ([], [(name, where, world.effects[0].settings)]):
@@ -176,7 +177,8 @@ def test_noise_is_of_the_kind_and_size_stated(variant):
 
 def test_the_tool_sees_nothing_of_the_truth(tmp_path):
     """Cell and arm are those of the same world without effects; no file names an effect."""
-    for world in [*pair_worlds(12, 3), draw_world((12,), "outside", ["floor_wave"])]:
+    recipes = [task.recipe for task in tasks("pairs", 12, 1)][:3]
+    for world in [r.draw() for r in (*recipes, Recipe("outside", (12,), ("floor_wave",)))]:
         observed, sealed = tmp_path / "seen" / world.name, tmp_path / "sealed" / world.name
         write_world(world, observed, sealed)
         write_world(replace(world, effects=()), tmp_path / "clean", tmp_path / "none")
@@ -192,7 +194,7 @@ def test_the_tool_sees_nothing_of_the_truth(tmp_path):
 
 
 def test_truth_within_the_tools_reach_is_refused(tmp_path):
-    world = draw_world((13,), "clean", poses=3)
+    world = Recipe("clean", (13,), poses=3).draw()
     with pytest.raises(ValueError, match="within the tool's reach"):
         write_world(world, tmp_path, tmp_path / "sealed")
 

@@ -15,9 +15,9 @@ FOLDER = Path(__file__).resolve().parents[2] / "experiment_design" / "blind_diag
 sys.path.insert(0, str(FOLDER))
 
 import one_world
-import records
-import result_tables
+import score
 import suites
+import table
 import worker
 from arm_data import ARMS
 from whole_columns import components, moments, scene_of
@@ -56,7 +56,7 @@ def test_the_arm_moves_as_the_columns_say(sights):
     whole, bare = (w.noise_free(world.visits) for w in (world, replace(world, effects=())))
     parts = components(world, world.visits, sights.at_here)
     moved = (whole - bare).reshape(len(whole), -1)
-    assert rms(moved - sum(p.moved for p in parts)) < 0.01 * rms(moved)
+    assert rms(moved - sum(parts.values())) < 0.01 * rms(moved)
     (heavy,) = (e for e in world.effects if e.name == WEIGHTS)
     load = sights.at_here.carried + sights.at_here.weighing @ moments(heavy)
     assert load == pytest.approx(sights.at_here.load, abs=2e-3 * np.abs(load).max())
@@ -107,7 +107,7 @@ class Stand(worker.Worker):
     def run(self, folder, *arguments):
         if arguments[0] == "diagnose":
             assert not (folder / "new.csv").exists()
-            given = dict.fromkeys(records.KEPT) | {"candidates": [], "effects": []}
+            given = dict.fromkeys(score.KEPT) | {"candidates": [], "effects": []}
             given |= {"verdict": "unknown_effect", "indistinguishable": []}
             given["components"] = [component("gravity", "joint2", 0.7, 0.3)]
             (folder / one_world.ANSWER).write_text(json.dumps(given))
@@ -124,11 +124,9 @@ def test_a_whole_arm_is_judged_and_its_rows_stand_in_the_tables():
     assert whole["geometry_mm"] == pytest.approx(0.1) and whole["tool_mm"] == pytest.approx(0.09)
     assert whole["shares"][0]["kind"] == "load" and "load:joint2" in whole["names"][0]["name"]
     record["version"] = "0"
-    rows = {
-        r.measure: r
-        for r in result_tables.bar_rows(result_tables.judged([record]))
-        if r.worlds == "whole arms, 60 poses"
-    }
-    assert rows["no worse than geometry alone"].measured.startswith("1.000")
-    text = result_tables.report([record])
-    assert "Whole arms, 60 poses" in text and "| load | 1 |" in text
+    text = table.report([record])
+    assert "| whole arms, 60 poses | no worse than geometry alone |  | 1.000 (" in text
+    assert (
+        "| whole arms, 60 poses | 90 % interval of a share holds the truth | ≥ 0.85, ≤ 0.95 |"
+        in text
+    )
