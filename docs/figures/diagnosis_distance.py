@@ -11,12 +11,16 @@ RESULT = ROOT / "experiment_design" / "blind_diagnosis" / "result.md"
 
 
 def figure(colours: Colours) -> Figure:
-    head, rows = table_of(RESULT, "## Distance d to the nearest rival")
-    labels = [f"{row[0].replace(' to ', '–')}\nn = {row[1]}" for row in rows]
-    x = np.arange(len(rows))
+    _, rows = table_of(RESULT, "# Blind check")
+    found: dict[str, dict[str, tuple[float, str]]] = {}
+    for worlds, measure, _, measured, n, _ in rows:
+        if worlds.startswith("… d "):
+            found.setdefault(worlds, {})[measure] = float(measured.split()[0]), n
+    labels = [f"{d[4:].replace(' to ', '–')}\nn = {row['right'][1]}" for d, row in found.items()]
+    x = np.arange(len(found))
     right, outright, wrong = (
-        np.array([float(row[head.index(name)]) for row in rows])
-        for name in ("right", "outright", "wrong")
+        np.array([row[name][0] for row in found.values()])
+        for name in ("right", "named outright", "wrong name")
     )
     fig, axis = plt.subplots(figsize=(7.6, 3.8))
     axis.bar(x, outright, 0.62, color=colours.one, label="named outright")

@@ -34,7 +34,10 @@ TESTED = """\
 | what | bound | test |
 |---|---|---|
 | B against independent derivatives, every effect and observation | 1e-7 relative | `tests/model/test_derivatives.py` |
-| equilibrium against MuJoCo, KR 270, 2.6 kN | 1 µm | `tests/simulation/test_mujoco_arm.py` |
+| equilibrium against MuJoCo, KR 270, 2.6 kN | 1 µm | `tests/model/test_equilibrium.py` |
+| error at new poses against the Cramér–Rao bound, parameters selected from the data | 10 % | `tests/identification/test_identify.py` |
+| relaxation and exchange against all plans of small pools | the best one | `tests/planning/test_bounds.py` |
+| realised over predicted error of plans, drift and joint scatter stated | 4 standard errors | `tests/planning/test_promise.py` |
 | exported arms read back (URDF by pinocchio, MJCF at equilibrium under load by MuJoCo, DH tables) | 1 µm | `tests/export` |
 | NIST reference regressions, certified digits: eleven linear sets by ordinary least squares as published | 9; 7 on Filip and Wampler4, 5 on Wampler5 | `tests/identification/test_nist_linear.py` |
 | the same through the fit of an arm under estimated noise of one size | 9; 8 on Wampler4, 7 on Filip, 5 on Wampler5 | `tests/identification/test_nist_nonlinear.py` |
@@ -70,12 +73,6 @@ PAGES: dict[str, tuple[Part, ...]] = {
             f"{STUDIES}/real_arms/diagnosis.md",
             tables=1,
         ),
-        Part(
-            "Outliers found, IRB 120 by cable",
-            "",
-            "python experiment_design/real_arms/faulty_rows.py",
-            f"{STUDIES}/real_arms/faulty_rows.md",
-        ),
     ),
     "Intervals and noise": (
         Part(
@@ -89,28 +86,6 @@ PAGES: dict[str, tuple[Part, ...]] = {
             "",
             "elastocal study experiment_design/arm_coverage",
             f"{STUDIES}/arm_coverage/result.md",
-        ),
-        Part(
-            "Correlation time of a drift",
-            "",
-            "python experiment_design/arm_coverage/lasting.py 8 8",
-            f"{STUDIES}/arm_coverage/README.md",
-            "How long a drift lasts",
-            tables=1,
-        ),
-        Part(
-            "Predicted error of plans under nine kinds of noise",
-            "Realised over predicted rms error at the test poses; plans with `--effort quick`.",
-            "python experiment_design/arm_coverage/planned.py 200",
-            f"{STUDIES}/arm_coverage/README.md",
-            "What plans promise",
-            tables=1,
-        ),
-        Part(
-            "The Cramér–Rao bound",
-            "",
-            "elastocal study experiment_design/cramer_rao",
-            f"{STUDIES}/cramer_rao/result.md",
         ),
         Part(
             "The paper's iterated weights: noise of Table 1",
@@ -149,38 +124,12 @@ PAGES: dict[str, tuple[Part, ...]] = {
             f"{STUDIES}/kr270_plan/assumptions.md",
         ),
         Part(
-            "Effect of a steady drift of 50 µm, by order of the poses",
-            "",
-            "python experiment_design/kr270_plan/drift_order.py",
-            f"{STUDIES}/kr270_plan/drift.md",
-        ),
-        Part(
             "CPU time of a quick plan when nine of ten moves are blocked",
             "",
             "time elastocal design experiment_design/kr270_plan/crowded.toml --effort quick -o plan.csv",
             f"{STUDIES}/kr270_plan/README.md",
             "CPU of a quick plan",
             tables=1,
-        ),
-        Part(
-            "Effects named from 30 poses, 100 arms with one missing effect",
-            "",
-            "elastocal study experiment_design/next_best --set arms=0 --set named=100",
-            f"{STUDIES}/next_best/README.md",
-            "Effects named from 30 poses",
-            tables=1,
-        ),
-        Part(
-            "Error outside the test poses",
-            "",
-            "python experiment_design/everywhere/study.py",
-            f"{STUDIES}/everywhere/result.md",
-        ),
-        Part(
-            "All subsets of small pools",
-            "",
-            "elastocal study experiment_design/exact_quality",
-            f"{STUDIES}/exact_quality/result.md",
         ),
         Part(
             "Feasible poses and free moves, checked in MuJoCo",
@@ -211,7 +160,8 @@ PAGES: dict[str, tuple[Part, ...]] = {
             "Arms simulated in MuJoCo ([how](../../experiment_design/blind_diagnosis/README.md)).",
             "elastocal study experiment_design/blind_diagnosis",
             f"{STUDIES}/blind_diagnosis/result.md",
-            "Bars",
+            "Blind check",
+            tables=1,
         ),
         Part(
             "Whole arms",
@@ -248,14 +198,6 @@ PAGES: dict[str, tuple[Part, ...]] = {
             "",
             "python experiment_design/compensation/study.py --arms 3",
             f"{STUDIES}/compensation/result.md",
-        ),
-        Part(
-            "Public MuJoCo models",
-            "From `init` to `export` ([each arm](../../experiment_design/mujoco_arms/README.md)).",
-            "python experiment_design/mujoco_arms/walk.py",
-            f"{STUDIES}/mujoco_arms/README.md",
-            "From a MuJoCo model",
-            tables=1,
         ),
     ),
 }

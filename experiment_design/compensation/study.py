@@ -24,7 +24,7 @@ from joblib import Parallel, delayed
 from scipy.spatial.transform import Rotation
 from scipy.stats import chi2
 
-from elastocal.cell.work_cell import read_cell
+from elastocal.cell.work_cell import Cell, read_cell
 from elastocal.compensation.compensate import compensate
 from elastocal.compensation.targets import read_targets
 from elastocal.measurements import Measurements, write_measurements
@@ -33,6 +33,7 @@ from elastocal.model.calibrated_tool import tool_point
 from elastocal.model.chain import Chain, joint_limits
 from elastocal.model.choice import load_chain
 from elastocal.model.rigid import nominal_flanges
+from elastocal.simulation.simulate import expand_plan
 
 HERE = Path(__file__).resolve().parent
 NOISE = 20e-6  # m per axis
@@ -91,23 +92,18 @@ class TrueArm:
         n = chain.n_joints
         self.offset = ANGLE * rng.normal(size=n)
         self.T = pose(rng.uniform(-3, 3, 3), Rotation.from_euler("z", rng.uniform(-np.pi, np.pi)))
-        self.T[:3, :3] = (
-            self.T[:3, :3] @ Rotation.from_rotvec(3e-3 * rng.normal(size=3)).as_matrix()
-        )
+        self.T[:3, :3] @= Rotation.from_rotvec(3e-3 * rng.normal(size=3)).as_matrix()
         errors = [
             pose(LENGTH * rng.normal(size=3), Rotation.from_rotvec(ANGLE * rng.normal(size=3)))
             for _ in range(n)
         ]
         # As an error at the distal end of link i: the next joint's placement is off.
-        joints = list(chain.joints)
-        for i in range(1, n):
-            joints[i] = replace(joints[i], placement=joints[i].placement @ errors[i - 1])
-        real = replace(
-            chain,
-            joints=tuple(joints),
-            flange_placement=chain.flange_placement @ errors[-1],
-            masses=(),
-        )
+        joints = [
+            replace(joint, placement=joint.placement @ error)
+            for joint, error in zip(chain.joints, [np.eye(4), *errors[:-1]], strict=True)
+        ]
+        end = chain.flange_placement @ errors[-1]
+        real = replace(chain, joints=tuple(joints), flange_placement=end, masses=())
         k = np.array(COMPLIANCE[name]) * (1 + 0.2 * rng.uniform(-1, 1, n))
         places = MARKERS if name == KR270 else SHORT
         self.markers = {m: np.array(p) + 5e-3 * rng.normal(size=3) for m, p in places.items()}
@@ -172,7 +168,7 @@ def cell_file(name: str, folder: Path) -> Path:
     return path
 
 
-def regular_poses(chain: Chain, cell, count: int, rng: np.random.Generator) -> np.ndarray:
+def regular_poses(chain: Chain, cell: Cell, count: int, rng: np.random.Generator) -> np.ndarray:
     """Poses over 0.9 of the joint ranges that are not near a singular one."""
     lower, upper = (np.clip(limit, -np.pi, np.pi) for limit in joint_limits(cell, chain))
     middle, half = (lower + upper) / 2, 0.9 * (upper - lower) / 2
@@ -197,23 +193,11 @@ def jacobians(chain: Chain, q: np.ndarray) -> np.ndarray:
 def measured(
     truth: TrueArm, q: np.ndarray, load: np.ndarray, rng: np.random.Generator
 ) -> Measurements:
-    rows = [(i, f, m) for i in range(len(q)) for f in range(2) for m in range(len(truth.markers))]
-    names = tuple(truth.markers)
-    observed = [[truth.measure(pose, f * load) for f in range(2)] for pose in q]
-    position = np.array([observed[i][f][names[m]] for i, f, m in rows])
-    index, state, marker = (np.array(v) for v in zip(*rows, strict=True))
-    return Measurements(
-        source="data.csv",
-        row=np.arange(len(rows)) + 2,
-        q=q[index],
-        configuration=index,
-        configuration_labels=tuple(map(str, range(1, len(q) + 1))),
-        repeat=np.zeros(len(rows), dtype=np.int64),
-        marker=marker,
-        marker_names=names,
-        force=state[:, None] * load,
-        position=position + NOISE * rng.normal(size=position.shape),
-    )
+    plan = Measurements.of_poses("data.csv", q, np.zeros(3))
+    rows = expand_plan(plan, tuple(truth.markers), 1, load)
+    seen = [list(truth.measure(pose, f * load).values()) for pose in q for f in range(2)]
+    position = np.array(seen).reshape(-1, 3)
+    return replace(rows, position=position + NOISE * rng.normal(size=position.shape))
 
 
 def write_targets(

@@ -14,6 +14,7 @@ import numpy as np
 from compared import HERE, table_2
 
 from elastocal.cell.arm_description import Tool
+from elastocal.cell.plan_wishes import TargetPose
 from elastocal.cell.work_cell import Cell, read_cell
 from elastocal.model.manipulator import Model
 from elastocal.planning.candidates import draw, joint_space, shares_of
@@ -21,7 +22,7 @@ from elastocal.planning.feasibility import Feasibility
 from elastocal.planning.information import plan_forces
 from elastocal.planning.relaxation import relax
 from elastocal.planning.setup import Known, set_up
-from elastocal.planning.test_poses import TargetPoses
+from elastocal.planning.test_poses import test_poses
 
 CANDIDATES = 20_000
 SETS = 5  # sets of twenty test poses, drawn over the joint limits
@@ -65,32 +66,20 @@ def main() -> None:
 
 def margins(cell: Cell) -> list[float]:
     """ρ₀ of Table 2 over the bound, for each set of test poses."""
-    model = Model(cell)
-    forces, space = plan_forces(cell), joint_space(cell, model.chain)
+    model, forces = Model(cell), plan_forces(cell)
+    space = joint_space(cell, model.chain)
     drawn = draw(cell, model.chain, forces, Feasibility(cell, model.chain), CANDIDATES, 0)
-    shares = shares_of(cell)
     found = []
     for seed in range(SETS):
-        targets = _test_poses(cell, space, np.random.default_rng(seed))
+        rng = np.random.default_rng(seed)
+        q = np.concatenate([space.poses(rng.uniform(size=(4, 5)), level) for level in range(5)])
+        spec = replace(cell.design, test_poses=tuple(TargetPose(pose) for pose in q))
+        targets = test_poses(replace(cell, design=spec), model.chain)
         setup = set_up(model, drawn.q, 15, targets, Known())
         pool = setup.pool(drawn.q, drawn.group)
-        q = table_2(model)
-        value = setup.value(q)
-        found.append(float(np.sqrt(value / relax(setup.problem(pool, shares)).bound)))
+        bound = relax(setup.problem(pool, shares_of(cell))).bound
+        found.append(float(np.sqrt(setup.value(table_2(model)) / bound)))
     return found
-
-
-def _test_poses(cell: Cell, space: object, rng: np.random.Generator) -> TargetPoses:
-    q = np.concatenate([space.poses(rng.uniform(size=(4, 5)), level) for level in range(5)])
-    T = len(q)
-    return TargetPoses(
-        q=q,
-        force=np.tile(cell.design.loads[-1], (T, 1)),
-        weight=np.full(T, 1 / T),
-        point=np.tile(cell.tool.load_point, (T, 1)),
-        stated=np.ones(T, dtype=bool),
-        source="drawn",
-    )
 
 
 if __name__ == "__main__":
