@@ -17,7 +17,7 @@ import signal
 import sys
 import time
 from collections import Counter
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Sequence
 from functools import cached_property
 from itertools import chain, product
 from pathlib import Path
@@ -281,10 +281,10 @@ def _broken(name: str, content: bytes, size: int) -> str | None:
 
 
 def run_kills(
-    base: Path, folder: Path, seed: int, times: dict[str, int], part: slice = slice(None),
-    until: float = math.inf,
+    base: Path, folder: Path, seed: int, times: dict[str, int], verbs: Sequence[str] = KILLED,
+    part: slice = slice(None), until: float = math.inf,
 ) -> tuple[int, Counter]:  # fmt: skip
-    """Do to each verb what `times` says so many times, as HARMS has it; findings are printed.
+    """Do to each of the `verbs` what `times` says so many times, as HARMS has it; findings are printed.
 
     A few times are of the verb's first command alone, many are of all.  `part` of them is run,
     those that begin before `until` on the monotonic clock.
@@ -296,9 +296,9 @@ def run_kills(
             Victim(c, base, folder / f"kill-{verb}{i}")
             for i, c in enumerate([c for c in COMMANDS if c.verb == verb][: 1 + len(harms) // 20])
         ]
-        for verb in KILLED
+        for verb in verbs
     }
-    for (i, (_, harm, k)), verb in product(list(enumerate(sorted(harms)))[part], KILLED):
+    for (i, (_, harm, k)), verb in product(list(enumerate(sorted(harms)))[part], verbs):
         if time.monotonic() > until:
             break
         rng, victim = Random(f"{seed} {verb} {harm} {k}"), victims[verb][i % len(victims[verb])]

@@ -100,7 +100,8 @@ def fork(asked: argparse.Namespace, base: Path, folder: Path, part: int) -> int:
         }  # fmt: skip
         if any(times.values()):
             own, share = folder / f"kills{part}", slice(part, None, asked.jobs)
-            found, tried = kills.run_kills(base, own, asked.seed, times, share, until)
+            verbs = asked.verb or kills.KILLED
+            found, tried = kills.run_kills(base, own, asked.seed, times, verbs, share, until)
             tally.count.update(tried)
             tally.broken += found
         (folder / f"part{part}").write_bytes(pickle.dumps(tally))

@@ -28,10 +28,15 @@ def fuzzed(*words: str) -> str:
     return done.stdout
 
 
-def test_spoilt_input_ends_with_a_message_and_a_kill_with_whole_files() -> None:
-    told = fuzzed("--cases", "12", "--seed", "1", "--kills", "1")
-    assert "12 cases from 1 on, 6 kills, interrupts and full disks (seed 1)" in told
-    assert ": 0 with a finding" in told
+def test_spoilt_input_ends_with_a_message() -> None:
+    told = fuzzed("--cases", "36", "--seed", "17")
+    assert "36 cases from 17 on" in told and ": 0 with a finding" in told
+
+
+def test_a_kill_leaves_whole_files() -> None:
+    verbs = ("identify", "simulate", "export", "study")
+    told = fuzzed("--cases", "0", "--kills", "1", *(w for v in verbs for w in ("--verb", v)))
+    assert "4 kills, interrupts and full disks" in told and ": 0 with a finding" in told
 
 
 @pytest.mark.long
