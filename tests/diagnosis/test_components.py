@@ -7,9 +7,9 @@ from dataclasses import replace
 import numpy as np
 import pytest
 from scipy.stats import multivariate_normal
-from support.diagnosis_data import campaign, dense_noise, diagnosed, random_data, used_rows
+from support.diagnosis_data import campaign
+from support.noisy_data import dense_noise, random_data, used_rows
 
-from elastocal.diagnosis.component_answer import PROBABLE, TOLD
 from elastocal.diagnosis.components import Component, FittedSum, Sizes, fit_sum, posed
 from elastocal.diagnosis.hypotheses import possible
 from elastocal.diagnosis.noise_floor import NoiseValues, NoisyData
@@ -115,27 +115,3 @@ def test_nothing_is_found_in_noise() -> None:
         quiet = NoiseValues.usual(3).of_instrument()
         count += len(fit_sum(data, components, quiet, refit_noise=False).components)
     assert count <= 2
-
-
-MANY = (
-    "gear_eccentricity:joint2",
-    "gear_eccentricity:joint4",
-    "gear_ripple:joint5",
-    "encoder_scale:joint3",
-    "off_axis_compliance:joint3",
-    "tracker_distortion:tracker",
-)
-
-
-@pytest.mark.long
-def test_many_effects_at_once_are_one_sum() -> None:
-    d = diagnosed(*MANY, n=60)
-    assert len(d.components) >= 4
-    assert sum(c.share for c in d.components) == pytest.approx(1.0, abs=0.05)
-    assert {"joint2", "joint4", "joint5"} <= {c.where for c in d.components if c.family == "angle"}
-    assert d.gap.explained < 0.5 * d.gap.calibrated
-    assert d.groups[0].share == max(g.share for g in d.groups)
-    shares = {(name, c.where): c.share for c in d.components for name in c.effects}
-    assert not {(e.effect, e.where) for e in d.effects} & {(e.effect, e.where) for e in d.slight}
-    for e in d.effects:
-        assert e.probability >= PROBABLE or abs(shares[e.effect, e.where]) >= TOLD

@@ -6,13 +6,13 @@ import numpy as np
 import pytest
 from scipy import stats
 from scipy.special import logsumexp
-from support.diagnosis_data import dense_noise, random_data, used_rows
+from support.noisy_data import dense_noise, random_data, used_rows
 
 from elastocal.diagnosis.evidence import SCALES, direct, exceedance
 from elastocal.diagnosis.noise_floor import NoiseValues, NoisyData, project
 
 NOISE = NoiseValues(0.9, np.array([4e-6, 9e-6, 1e-5]), np.full(3, 0.5))
-SEEDS = range(4)
+SEEDS = range(2)
 
 
 def group(data: NoisyData, seed: int, k: int = 3) -> np.ndarray:
@@ -44,15 +44,14 @@ def test_the_evidence_is_the_ratio_of_dense_densities(seed: int) -> None:
     assert found.evidence()[0] == pytest.approx(mixed, rel=1e-7, abs=1e-7)
 
 
-@pytest.mark.parametrize(("kind", "true"), [("one", 5e-4), ("largest", 2e-3), ("rare", 5e-4)])
+@pytest.mark.parametrize(("kind", "true"), [("one", 5e-4), ("rare", 5e-4)])
 def test_p_values_from_the_tail_are_not_below_what_they_are(kind: str, true: float) -> None:
-    """Log evidences of one effect and of many, their sums and maxima: the p-value at the quantile
+    """Log evidences of one effect, and sums of many: the p-value at the quantile
     that leaves `true` beyond it is no smaller in the median, and nine times as large at most."""
 
     def draw(rng: np.random.Generator, n: int) -> np.ndarray:
         return {
             "one": lambda: rng.chisquare(1, n) / 2,
-            "largest": lambda: rng.chisquare(2, (n, 20)).max(axis=1) / 2,
             "rare": lambda: logsumexp(rng.chisquare(1, (n, 100)) / 2 - 2, axis=1),
         }[kind]()
 

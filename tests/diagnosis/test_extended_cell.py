@@ -7,20 +7,18 @@ import re
 import tempfile
 from dataclasses import fields, is_dataclass, replace
 from pathlib import Path
-from typing import Any, get_args
+from typing import Any
 
 import numpy as np
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
-from pydantic import BaseModel
 from support.diagnoses import ECCENTRICITY, JUMP
 from support.robots import KR270
 
 from elastocal.cell.arm_description import EffectChoice
-from elastocal.cell.file_keys import table_of
-from elastocal.cell.work_cell import Cell, read_cell
-from elastocal.diagnosis.diagnose import PATHS, write_extended_cell
+from elastocal.cell.work_cell import read_cell
+from elastocal.diagnosis.diagnose import write_extended_cell
 from elastocal.errors import InputError
 from elastocal.model.effects.catalogue import CATALOGUE
 from elastocal.model.manipulator import Model
@@ -107,23 +105,6 @@ def test_reading_it_back_gives_the_same_cell_and_the_additions(layout, found, fo
         assert source.read_text(encoding="utf-8") == text
 
 
-def test_every_path_of_the_schema_is_redirected():
-    def paths(table: type[BaseModel], above: tuple[str, ...]) -> set[tuple[str, ...]]:
-        found = set()
-        for key, known in table.model_fields.items():
-            if "the path of" in (known.description or ""):
-                found.add((*above, key))
-            stack = [known.annotation]
-            while stack:
-                annotation = stack.pop()
-                stack += get_args(annotation)
-                if isinstance(annotation, type) and issubclass(annotation, BaseModel):
-                    found |= paths(annotation, (*above, key))
-        return found
-
-    assert paths(table_of(Cell), ()) == {(*table, key) for table, keys in PATHS for key in keys}
-
-
 def test_the_model_gains_the_parameters_of_the_effects_and_no_others(tmp_path):
     (tmp_path / "arm.urdf").write_bytes(KR270.read_bytes())
     source = tmp_path / "cell.toml"
@@ -170,3 +151,21 @@ def test_the_cell_says_where_its_smooth_functions_end(tmp_path):
     cell = write_extended_cell(source, tmp_path / "new.toml", (curve,))
     assert f"{curve.where} from -85.9° to 85.9°;" in (tmp_path / "new.toml").read_text()
     assert cell.model == read_cell(tmp_path / "new.toml").model
+
+
+def test_a_spring_begins_where_it_was_found(tmp_path):
+    """From the example's geometry a fit would not find it again.  The other end of the arm is the
+    same spring, anchored on the other side."""
+    (tmp_path / "cell.toml").write_text(f'[robot]\nurdf = "{KR270}"\n', encoding="utf-8")
+    values = {"stiffness": 2.5e4, "anchor_x": 0.2, "anchor_y": -0.5, "arm": -0.3,
+              "free_length": -0.4}  # fmt: skip
+    fitted = tuple(
+        replace(ECCENTRICITY.parameters[0], name=f"joint2.compensator_{k}", value=v)
+        for k, v in values.items()
+    )
+    found = replace(ECCENTRICITY, effect="gravity_compensator", parameters=fitted)
+    spring = Model(write_extended_cell(tmp_path / "cell.toml", tmp_path / "new.toml", [found]))
+    at = dict(zip(spring.names, spring.nominal, strict=True))
+    assert at["joint2.compensator_arm"] == 0.3 and at["joint2.compensator_anchor_y"] == 0.5
+    assert at["joint2.compensator_free_length"] == -0.4
+    assert at["joint2.compensator_stiffness"] == 2.5e4

@@ -7,7 +7,8 @@ from dataclasses import replace
 import numpy as np
 import pytest
 from scipy import optimize, stats
-from support.diagnosis_data import campaign, dense_noise, random_data, used_rows
+from support.diagnosis_data import campaign
+from support.noisy_data import dense_noise, random_data, used_rows
 
 from elastocal.cell.arm_description import Unsteadiness
 from elastocal.diagnosis.baseline import Blocks, fit_baseline
@@ -25,7 +26,7 @@ from elastocal.measurements import visits
 from elastocal.model.manipulator import Model
 
 NOISE = NoiseValues(1.3, np.array([4e-6, 9e-6, 2e-5]), np.array([0.4, 0.1, 0.9]))
-SEEDS = range(4)
+SEEDS = range(2)
 
 
 @pytest.mark.parametrize("seed", SEEDS)
@@ -65,36 +66,24 @@ def drawn(true_noise: NoiseValues, n: int, seed: int) -> NoisyData:
     return replace(base, r=base.masked(noise + base.X @ rng.normal(size=5)))
 
 
-@pytest.mark.parametrize(
-    "true_noise",
-    [
-        NoiseValues(1.4, np.array([5e-6, 1.5e-5]), np.full(2, 0.6)),
-        NoiseValues(0.7, np.array([1.2e-5, 8e-6]), np.full(2, 0.2)),
-    ],
-)
-def test_the_noise_that_made_the_readings_is_found(true_noise: NoiseValues) -> None:
+def test_the_noise_that_made_the_readings_is_found() -> None:
     """Nearly: 400 configurations tell the joints to a tenth, and what a joint does at each better
     than whether it does so at every visit."""
-    found = fit_noise(drawn(true_noise, 400, 3))
+    true_noise = NoiseValues(1.4, np.array([5e-6, 1.5e-5]), np.full(2, 0.6))
+    data = drawn(true_noise, 400, 3)
+    found = fit_noise(data)
     assert found.factor == pytest.approx(true_noise.factor, rel=0.05)
     np.testing.assert_allclose(found.joint, true_noise.joint, rtol=0.2)
     assert found.shared_by_all == pytest.approx(true_noise.shared_by_all, abs=0.35)
     both = (noise.joint * np.hypot(1, noise.shared) for noise in (found, true_noise))
     np.testing.assert_allclose(*both, rtol=0.15)
-
-
-@pytest.mark.parametrize("n", [60, 400, 1100])
-def test_the_noise_found_is_the_most_probable_one(n: int) -> None:
-    """No search from it or from the true noise finds a twentieth of −2 log posterior more."""
-    true_noise = NoiseValues(1.4, np.array([5e-6, 1.5e-5]), np.full(2, 0.6))
-    data = drawn(true_noise, n, 3)
-    best = fit_noise(data)
-    for start in (best, true_noise):
+    # No search from it or from the true noise finds a twentieth of −2 log posterior more.
+    for start in (found, true_noise):
         further = optimize.minimize(
             lambda t: likelihood(data, t)[:2], start.logs(), jac=True,
             method="BFGS",
         )  # fmt: skip
-        assert likelihood(data, best.logs())[0] < further.fun + 0.05
+        assert likelihood(data, found.logs())[0] < further.fun + 0.05
 
 
 def test_a_stated_drift_is_noise_that_readings_have_in_common_by_their_times() -> None:

@@ -284,10 +284,10 @@ def run_kills(
     base: Path, folder: Path, seed: int, times: dict[str, int], verbs: Sequence[str] = KILLED,
     part: slice = slice(None), until: float = math.inf,
 ) -> tuple[int, Counter]:  # fmt: skip
-    """Do to each of the `verbs` what `times` says so many times, as HARMS has it; findings are printed.
+    """Do to each of the `verbs` what `times` says so many times, as HARMS has it.
 
-    A few times are of the verb's first command alone, many are of all.  `part` of them is run,
-    those that begin before `until` on the monotonic clock.
+    Findings are printed.  A few times are of the verb's first command alone, many are of all.
+    `part` of them is run, those that begin before `until` on the monotonic clock.
     """
     broken, tried = 0, Counter[tuple[str, str]]()
     harms = [(k / number, harm, k) for harm, number in times.items() for k in range(number)]
