@@ -2,13 +2,12 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, field
 from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
-from elastocal.errors import ElastocalError
 from elastocal.identification.linear_solver import least_norm
 from elastocal.identification.prediction import FEWEST_REPEATS
 from elastocal.identification.residuals import held_out_residual
@@ -22,7 +21,6 @@ from elastocal.units import Array
 
 STAGES = ("nominal_arm", "geometry", "compliance", "smooth functions")
 MOST_NUMBERS = 30_000_000  # of a regressor held at once; larger tables get no budget
-STEPS, SETTLED = 4, 1e-3  # Gauss-Newton steps, and the relative gain that ends them
 DRAWS = 1000
 
 
@@ -51,7 +49,7 @@ def gap_budget(result: Calibration) -> ErrorBudget | None:
     functions.
 
     Each step fits the parameters of its stages that the whole fit determined, the later ones held
-    at nominal, by a few Gauss-Newton steps from the whole fit; each configuration is predicted by
+    at nominal, on the model linearised at the whole fit; each configuration is predicted by
     the fit to the others (`held_out_residual`), the last step as the result has it.  The first
     step is "nominal_arm", with base and markers placed by the other configurations.  Intervals are
     by resampling configurations.  None where some configuration cannot be left out, and for tables
@@ -81,34 +79,22 @@ def gap_budget(result: Calibration) -> ErrorBudget | None:
 def _fitted(
     result: Calibration, columns: NDArray[np.int64], held: NDArray[np.bool_]
 ) -> Array | None:
-    """Held-out residual (rows,) with `columns` fitted and the parameters `held` at nominal."""
-    model, observed = result.model, result.observations
+    """Held-out residual (rows,) with `columns` fitted and the parameters `held` at nominal, by the
+    model linearised at the whole fit."""
+    model, observed, B = result.model, result.observations, result.B
     weights = weights_for(observed, model.cell.tracker, "auto")
-    x = np.where(held, model.nominal, result.x)
-    best: tuple[float, Array, Array] | None = None
-    try:
-        for _ in range(STEPS):
-            at = model.regressor(observed.table, x, columns, observed)
-            error = weights.apply(at.residual)
-            if best is None and result.smooth and len(columns):
-                # What has a prior in the whole fit has none here: a minimal complete set.
-                own = _worth_a_column(model, columns, weights.apply(at.B), error)
-                columns, at = columns[own], replace(at, B=at.B[:, own])
-            cost = float(error @ error)
-            if best is not None and cost > (1 - SETTLED) * best[0]:
-                break
-            best = cost, at.B, at.residual
-            if not len(columns):
-                break
-            x = x.copy()
-            x[columns] += least_norm(weights.apply(at.B), error)
-    except (ElastocalError, np.linalg.LinAlgError):
-        return None  # the arm without its compliances stands nowhere near: no step of a budget
-    assert best is not None
-    _, B, residual = best
+    y = result.residual + B @ np.where(held, result.x - model.nominal, 0.0)
+    white, error = weights.apply(B[:, columns]), weights.apply(y)
+    if result.smooth and len(columns):
+        # What has a prior in the whole fit has none here: a minimal complete set.
+        own = _worth_a_column(model, columns, white, error)
+        columns, white = columns[own], white[:, own]
     if not len(columns):
-        return residual
-    found = held_out_residual(B, residual, weights, observed.configuration, observed.size)
+        return y
+    residual = y - B[:, columns] @ least_norm(white, error)
+    found = held_out_residual(
+        B[:, columns], residual, weights, observed.configuration, observed.size
+    )
     return found if np.isfinite(found).all() else None
 
 

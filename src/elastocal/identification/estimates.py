@@ -11,7 +11,8 @@ from scipy import linalg
 from elastocal.identification.covariance import variance_of
 from elastocal.identification.faulty_readings import report_faulty
 from elastocal.identification.findings import judged, of_solution
-from elastocal.identification.methods import MethodResult, is_exact
+from elastocal.identification.method_result import MethodResult
+from elastocal.identification.methods import is_exact
 from elastocal.identification.noise_summary import noise_of, noise_parts
 from elastocal.identification.outliers import Outlier
 from elastocal.identification.prediction import (

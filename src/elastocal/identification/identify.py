@@ -9,8 +9,8 @@ from numpy.typing import NDArray
 
 from elastocal.identification.estimates import summarise, uncertainty_of
 from elastocal.identification.findings import judged
+from elastocal.identification.method_result import MethodResult
 from elastocal.identification.methods import (
-    MethodResult,
     is_exact,
     run_method,
     with_limits,

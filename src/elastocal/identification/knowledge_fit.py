@@ -9,7 +9,6 @@ from numpy.typing import NDArray
 from scipy import special
 
 from elastocal.errors import InputError, InsufficientDataError, option, require
-from elastocal.identification.constrained import ActiveConstraint
 from elastocal.identification.constrained_fit import (
     ConstrainedFit,
     KnowledgeProblem,
@@ -22,6 +21,7 @@ from elastocal.identification.intervals import LEVEL, Intervals
 from elastocal.identification.knowledge import Constraints, GaussianPrior
 from elastocal.identification.least_squares import Fit
 from elastocal.identification.linear_solver import least_norm
+from elastocal.identification.method_result import MethodResult
 from elastocal.identification.options import Options
 from elastocal.identification.residuals import growth
 from elastocal.identification.solve import WORTH_A_COLUMN, Reduction, Solution, residual_sigma
@@ -177,24 +177,6 @@ CONTRADICTED = 0.001  # false-alarm rate of a sentence that doubts what the user
 
 
 @dataclass(frozen=True)
-class KnowledgeFit:
-    """A solution under constraints and with a prior, its intervals, and what each contributed.
-
-    `prior_share` by parameter, empty without a prior; parameters that equalities fix are left
-    out.  `effective` is how many parameters the readings paid for, `leverage` (rows,) how much
-    each drew the fit to itself.  `warnings` say where the readings contradict the knowledge.
-    """
-
-    solution: Solution
-    intervals: Intervals
-    active: tuple[ActiveConstraint, ...]
-    prior_share: dict[str, float]
-    effective: int
-    leverage: Array
-    warnings: tuple[str, ...]
-
-
-@dataclass(frozen=True)
 class FunctionPrior:
     """What smooth functions bring into a fit: the `prior` of their parameters, the noise `sigma`
     of a whitened row beside them and its degrees of freedom `dof`, and where the prior's part of
@@ -223,56 +205,59 @@ def joined(stated: GaussianPrior | None, own: GaussianPrior | None) -> GaussianP
 
 
 def fit_with_knowledge(
-    solution: Solution, before: Intervals, options: Options, progress: Progress,
-    own: FunctionPrior | None = None,
-) -> KnowledgeFit:  # fmt: skip
+    before: MethodResult, options: Options, progress: Progress, own: FunctionPrior | None = None
+) -> MethodResult:
     """Minimise |W (y − h(X))|² + σ² (X − m)ᵀ C⁻¹ (X − m) under `options.constraints`.
 
-    W and the readings are those of the method's `solution`, σ the noise of a whitened row under
-    it.  `fitted_columns` says what is fitted, `intervals_with_knowledge` what the intervals are; t
-    intervals have the degrees of freedom of `before`, the method's own.  `own` is the prior of
-    smooth functions, which joins the stated one.
+    W and the readings are those that the method ended with `before`, σ the noise of a whitened row
+    under it.  `fitted_columns` says what is fitted, `intervals_with_knowledge` what the intervals
+    are; t intervals have the method's own degrees of freedom.  `own` is the prior of smooth
+    functions, which joins the stated one.
 
     Raises InputError for constraints that contradict each other or held values, names that are no
     parameters, and tables too large to hold B; InsufficientDataError where an equality names a
     parameter that readings, prior and equalities do not determine.
     """
-    problem = solution.problem
+    solution = before.solution
+    problem, fit = solution.problem, solution.fit
     if problem.large:
         raise InputError(
             "constraints and priors need B as a whole, which a table of this size does not allow: "
             f"fit a part of the table, or {option('bounded', True)} for the physical bounds alone"
         )
+    if own is not None:
+        problem = replace(problem, free=np.union1d(problem.free, fit.columns))
+        solution = replace(solution, problem=problem)
     constraints = (options.constraints or Constraints()) + own_bounds(solution)
     prior = joined(options.prior, None if own is None else own.prior)
-    fit = solution.fit
     sigma = residual_sigma(fit, len(fit.columns)) if own is None else own.sigma
-    columns = fitted_columns(solution, before.covariance.std, constraints, prior)
+    columns = fitted_columns(solution, before.intervals.covariance.std, constraints, prior)
     # Of the effects' own bounds, where asked for, the constraints speak.
     stated = replace(problem, bounded=False).fit_of(columns, fit.x, solution.sizes)
     posed = KnowledgeProblem.of(stated, constraints, prior, sigma)
     progress("fitting under constraints" if prior is None else "fitting with the prior")
     found = constrained_fit(posed)
     progress("intervals under constraints" if prior is None else "intervals with the prior")
-    dof = _dof(solution, before, columns) if own is None else np.full(len(columns), own.dof)
+    dof = np.full(len(columns), own.dof) if own else _dof(solution, before.intervals, columns)
     many = set() if own is None else set(own.prior.names)
     intervals = intervals_with_knowledge(found, dof, options.intervals, many)
     # Of smooth functions' parameters, which are many, nobody asks.
     shares = {} if prior is None else {
-        name: share for c, name, share in zip(columns, found.names, found.prior_share, strict=True)
-        if not problem.model.shrunk[c]
+        name: float(share)
+        for c, name, share in zip(columns, found.names, found.prior_share, strict=True)
+        if np.isfinite(share) and not problem.model.shrunk[c]
     }  # fmt: skip
+    fitted, matrix = _as_fit(found), intervals.covariance.matrix
     known = replace(
-        solution,
-        fit=_as_fit(found),
-        reduction=_reduction(solution, found),
+        solution, fit=fitted, reduction=_reduction(solution, found),
         heldout=_held_out(solution, found),
-    )
-    return KnowledgeFit(
-        known, intervals, found.best.active,
-        {n: float(s) for n, s in shares.items() if np.isfinite(s)},
-        round(found.effective), found.leverage,
-        _contradiction(solution, before, found, own),
+    )  # fmt: skip
+    told = _contradiction(solution, before.intervals, found, own)
+    return replace(
+        before, method="constrained", solution=known, intervals=intervals,
+        active=found.best.active, prior_share=shares, effective=round(found.effective),
+        leverage=found.leverage, warnings=(*before.warnings, *told),
+        smooth=tuple(part.refitted(fitted.x, columns, matrix) for part in before.smooth),
     )  # fmt: skip
 
 

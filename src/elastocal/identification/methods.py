@@ -3,17 +3,17 @@
 from __future__ import annotations
 
 from collections.abc import Callable
-from dataclasses import dataclass, field, replace
+from dataclasses import replace
 
 import numpy as np
 from scipy import sparse
 
 from elastocal.errors import InputError
 from elastocal.identification import published
-from elastocal.identification.constrained import ActiveConstraint
 from elastocal.identification.covariance import Covariance
 from elastocal.identification.intervals import LEVEL, Intervals, intervals_of
 from elastocal.identification.knowledge_fit import fit_with_knowledge
+from elastocal.identification.method_result import MethodResult
 from elastocal.identification.noise_choice import (
     NoiseFit,
     estimate_noise,
@@ -26,8 +26,7 @@ from elastocal.identification.noise_structure import Kind, Readings
 from elastocal.identification.options import ROBUST, Options
 from elastocal.identification.residuals import held_out_residual, rms_3d
 from elastocal.identification.robust import asymptotic_covariance, clustered_covariance, robust_fit
-from elastocal.identification.smooth_fit import fit_smooth, with_functions_free
-from elastocal.identification.smooth_part import SmoothPart
+from elastocal.identification.smooth_fit import fit_smooth
 from elastocal.identification.solve import (
     Problem,
     Solution,
@@ -158,34 +157,6 @@ COMPUTED = (
 )
 
 
-@dataclass(frozen=True)
-class MethodResult:
-    """The final fit, its intervals, and the noise where it was estimated.
-
-    Readings that are not `good` (N,) lie beyond the noise, whether or not they had a part in the
-    fit.  What constraints and a prior add: `active` constraints, `prior_share` by parameter, how
-    many parameters the readings paid for (`effective`), `leverage` (rows,), and `warnings` where
-    the readings contradict them; in a fit to readings alone effective and leverage follow from
-    the solution.  `smooth` are the smooth functions, with which `standard` (N, size) are the
-    residuals of all readings free of the fit's part in them.  `limits` are the 95 % intervals of
-    the parameters that the readings `hardly_shown`, by their index.
-    """
-
-    method: str
-    solution: Solution
-    intervals: Intervals
-    noise: NoiseFit | None
-    good: BoolArray
-    active: tuple[ActiveConstraint, ...] = ()
-    prior_share: dict[str, float] = field(default_factory=dict)
-    effective: int | None = None
-    leverage: Array | None = None
-    warnings: tuple[str, ...] = ()
-    smooth: tuple[SmoothPart, ...] = ()
-    standard: Array | None = None
-    limits: dict[int, tuple[float, float]] = field(default_factory=dict)
-
-
 def run_method(
     every: Solution,
     sound: Solution,
@@ -202,7 +173,7 @@ def run_method(
     if options.knows:
         alone = replace(options, constraints=None, prior=None, intervals="auto")
         found = run_method(every, sound, faulty, refit, alone, progress)
-        return _with_knowledge(found, options, progress)
+        return fit_with_knowledge(found, options, progress)
     method, exact = options.resolved, is_exact(sound)
     if method == "reml" and not every.problem.large and not exact:
         return _reml(every, sound, faulty, refit, options, progress)
@@ -231,32 +202,8 @@ def with_smooth(
 
     `every` and `sound` are fits of the ordinary ones alone.
     """
-    found = fit_smooth(every, sound, faulty, free, options, progress)
-    result = MethodResult(
-        found.method, found.solution, found.intervals, found.noise, found.good,
-        prior_share=found.prior_share, effective=found.effective, leverage=found.leverage,
-        warnings=found.warnings, smooth=found.parts, standard=found.standard,
-    )  # fmt: skip
-    if not options.knows:
-        return result
-    known = fit_with_knowledge(
-        with_functions_free(found.solution), found.intervals, options, progress, found.prior
-    )
-    fit, matrix = known.solution.fit, known.intervals.covariance.matrix
-    return replace(
-        result, method="constrained", solution=known.solution, intervals=known.intervals,
-        active=known.active, prior_share=known.prior_share, effective=known.effective,
-        leverage=known.leverage, warnings=(*result.warnings, *known.warnings),
-        smooth=tuple(part.refitted(fit.x, fit.columns, matrix) for part in found.parts),
-    )  # fmt: skip
-
-
-def _with_knowledge(found: MethodResult, options: Options, progress: Progress) -> MethodResult:
-    known = fit_with_knowledge(found.solution, found.intervals, options, progress)
-    return MethodResult(
-        "constrained", known.solution, known.intervals, found.noise, found.good,
-        known.active, known.prior_share, known.effective, known.leverage, known.warnings,
-    )  # fmt: skip
+    found, prior = fit_smooth(every, sound, faulty, free, options, progress)
+    return fit_with_knowledge(found, options, progress, prior) if options.knows else found
 
 
 # Parameters that the readings hardly show.

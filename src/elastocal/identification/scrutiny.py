@@ -111,8 +111,6 @@ def influence(fit: Looked) -> tuple[Influence, ...]:
 
 LAGS = 10
 FEWEST_VISITS = 12
-PERMUTATIONS = 999
-MOST_PERMUTED = 1000  # visits; of more, the sum of products is normal for all that a p-value shows
 
 
 @dataclass(frozen=True)
@@ -137,9 +135,9 @@ def autocorrelation(residual: Array, observed: Observations) -> Autocorrelation 
     """The correlation of residuals (rows,) from visit to visit of a configuration; None for fewer
     than 12 visits.
 
-    The p-value is that of a permutation test: exact where visits are exchangeable, whatever the
-    distribution of the noise; for more than a thousand visits from the exact mean and variance
-    over all permutations (after Wald and Wolfowitz 1943).
+    The p-value is that of a permutation test, whatever the distribution of the noise: the sum of
+    products of neighbours is nearly normal over all orders, with an exact mean and variance (after
+    Wald and Wolfowitz 1943).
     """
     parts = residual.reshape(-1, observed.size)[:, :3]
     spread = np.sqrt((parts**2).mean(axis=0))
@@ -158,16 +156,9 @@ def autocorrelation(residual: Array, observed: Observations) -> Autocorrelation 
     total = float((mean**2).sum())
     lags = range(1, min(LAGS, number // 4) + 1)
     found = tuple(float((mean[:-k] * mean[k:]).sum()) / total for k in lags)
-    if number > MOST_PERMUTED:
-        centre, width = over_permutations(mean)
-        p = float(special.ndtr((centre / total - found[0]) / (width / total)))
-        band = float(special.ndtri(0.975)) * width / total
-    else:
-        rng = np.random.default_rng(0)
-        other = mean[[rng.permutation(number) for _ in range(PERMUTATIONS)]]
-        chance = np.einsum("knd,knd->k", other[:, :-1], other[:, 1:]) / total
-        p = (1 + int((chance >= found[0]).sum())) / (1 + PERMUTATIONS)
-        band = float(np.quantile(np.abs(chance), 0.95))
+    centre, width = over_permutations(mean)
+    p = float(special.ndtr((centre / total - found[0]) / (width / total)))
+    band = float(special.ndtri(0.975)) * width / total
     return Autocorrelation(found, p, band, number, "times" if timed else "order of the rows")
 
 

@@ -26,12 +26,13 @@ from elastocal.identification.intervals import LEVEL, Intervals
 from elastocal.identification.knowledge import GaussianPrior
 from elastocal.identification.knowledge_fit import FunctionPrior
 from elastocal.identification.least_squares import Fit
+from elastocal.identification.method_result import MethodResult
 from elastocal.identification.noise_choice import NoiseFit, estimate_noise, linearised, weights_of
 from elastocal.identification.noise_judge import outlier_screening, settle
 from elastocal.identification.noise_structure import Readings
 from elastocal.identification.options import Options, check_for_functions
 from elastocal.identification.outliers import FALSE_ALARM
-from elastocal.identification.residuals import rms_3d
+from elastocal.identification.residuals import rms_3d, whole_groups
 from elastocal.identification.smooth_part import SmoothPart
 from elastocal.identification.smooth_prior import (
     LinearRows,
@@ -41,14 +42,12 @@ from elastocal.identification.smooth_prior import (
     Sums,
 )
 from elastocal.identification.solve import (
-    WIDER,
     WORTH_A_COLUMN,
     Problem,
     Reduction,
     Solution,
     choose,
     is_placed,
-    wider_is_needed,
 )
 from elastocal.identification.weighted_problem import (
     Part,
@@ -67,7 +66,7 @@ from elastocal.model.smooth_groups import SmoothGroup, smooth_groups
 from elastocal.text import listed
 from elastocal.units import Array, BoolArray, IntArray, Progress
 
-STEPS, FEW, HALVINGS = 25, 3, 8
+STEPS, HALVINGS = 25, 8
 SETTLED = 1e-4  # of a χ²: what the last step may still gain
 ROUGH = 1e-2  # the same, where rounding allows no better step
 ROUNDING = 1e-12
@@ -82,29 +81,6 @@ ALONE = 1e-9  # share of a direction that other configurations and the prior mus
 # above the second no doubt is left that it is there.
 LEAST_GAIN, CERTAIN = 0.01, 50.0
 MOST_SET_ASIDE = 0.1
-
-
-class SmoothFit(NamedTuple):
-    """What `fit_smooth` found; `good` (N,) are the readings that the noise explains.
-
-    `parts` are the functions; `effective` says how many parameters the readings paid for,
-    `leverage` (rows,) how much each row drew the fit to itself.
-    `standard` (N, size) are the residuals of all readings as they would be without the fit's part
-    in them, `prior_share` says what share of a sized parameter's information is the prior's.
-    """
-
-    method: str
-    solution: Solution
-    intervals: Intervals
-    noise: NoiseFit | None
-    good: BoolArray
-    parts: tuple[SmoothPart, ...]
-    prior: FunctionPrior
-    effective: int
-    leverage: Array
-    standard: Array
-    prior_share: dict[str, float]
-    warnings: tuple[str, ...]
 
 
 @dataclass(frozen=True)
@@ -186,22 +162,17 @@ class JointFit:
         """Of a whitened row."""
         return float(np.sqrt(self.scales.variance))
 
-    def chosen(self, sizes: Array, threshold: float) -> Reduction:
-        """The ordinary parameters worth a column at another threshold."""
-        return _chosen(self.problem, sizes, self.free, self.scales, threshold)
-
-    def linear(self, scales: Scales, reduction: Reduction) -> tuple[JointFit, Array]:
-        """The posterior of other sizes and ordinary parameters, the model linearised at this x,
-        and the step (parameters,) to its minimum."""
-        posterior = _shrunk(self.problem, self.free, reduction.kept).posterior(scales)
-        other = replace(self, scales=scales, posterior=posterior, reduction=reduction)
+    def linear(self, scales: Scales) -> tuple[JointFit, Array]:
+        """The posterior of other sizes, the model linearised at this x, and the step (parameters,)
+        to its minimum."""
+        posterior = _shrunk(self.problem, self.free, self.reduction.kept).posterior(scales)
+        other = replace(self, scales=scales, posterior=posterior)
         return other, _moved(other, posterior)[0] - self.x
 
 
 def joint_fit(
     problem: Problem, sizes: Array, functions: Functions, x: Array, reduction: Reduction,
     scales: Scales | None = None, *, choosing: bool = True, sizing: bool = True,
-    most: int = STEPS,
 ) -> JointFit:  # fmt: skip
     """Gauss–Newton on readings and prior from x.
 
@@ -252,7 +223,7 @@ def joint_fit(
             problem, parts, functions, reduction, x, residual, scales, posterior, free, False, steps
         )
         moved, gain = _moved(now, posterior)
-        if gain <= SETTLED or steps >= most:
+        if gain <= SETTLED or steps >= STEPS:
             return replace(now, converged=gain <= SETTLED)
         cost = _cost(now, x, sums)
         for _ in range(HALVINGS):
@@ -269,13 +240,10 @@ def joint_fit(
         x, (residual, sums) = moved, there
 
 
-def _chosen(
-    problem: Problem, sizes: Array, free: LinearRows, scales: Scales,
-    threshold: float = WORTH_A_COLUMN,
-) -> Reduction:  # fmt: skip
+def _chosen(problem: Problem, sizes: Array, free: LinearRows, scales: Scales) -> Reduction:
     """The ordinary parameters that are worth a column beside the functions."""
     marginal = free.only(np.arange(len(problem.free))).posterior(scales).marginal
-    return choose(problem, sizes, marginal, float(np.sqrt(scales.variance)), threshold)
+    return choose(problem, sizes, marginal, float(np.sqrt(scales.variance)), WORTH_A_COLUMN)
 
 
 def _shrunk(problem: Problem, free: LinearRows, kept: IntArray) -> ShrunkProblem:
@@ -341,28 +309,36 @@ def crossed(fit: JointFit, step: Array | None = None) -> Crossed:
     `step` (parameters,) leads from the fit's x to the minimum of the model linearised there,
     where x itself is none.
     """
-    observed = fit.problem.observations
-    found = Crossed(*(np.empty(len(observed.value)) for _ in range(3)))
-    R, columns = fit.posterior.R, fit.columns
-    spans = [(group[0][0], group[-1][1]) for group in fit.parts.groups]
+    return _seen(fit, fit.parts, -1, step)
+
+
+def left_out(fit: JointFit, observed: Observations, weights: Weights) -> Array:
+    """Residuals (rows,) of observations that had no part in the fit, in m or rad, free of the
+    fit's uncertainty."""
+    return _seen(fit, partition(observed, weights, len(fit.columns)), 1, None).standard
+
+
+def _seen(fit: JointFit, parts: Partition, side: int, step: Array | None) -> Crossed:
+    """Rows that vary by 1 + side · QQᵀ: of the fit (−1), by configurations, or others (1)."""
+    size = parts.observed.size
+    found = Crossed(*(np.empty(len(parts.observed.value)) for _ in range(3)))
+    moved = np.zeros(0, dtype=np.int64) if step is None else np.flatnonzero(step)
 
     def one(span: Span) -> None:
-        part = fit.parts.part(span)
-        at = regressor(fit.problem.model, part, fit.x, columns)
+        part = parts.part(span)
+        at = regressor(fit.problem.model, part, fit.x, fit.columns)
         residual = at.residual
         if step is not None:
-            by = np.flatnonzero(step)
-            residual = residual - regressor(fit.problem.model, part, fit.x, by).B @ step[by]
-        e, Q = part.weights.apply(residual), _triangular(R, part.weights.apply(at.B))
-        standard, growth = np.empty(len(e)), np.empty(len(e))
-        lost = np.zeros(len(e), dtype=bool)
-        rows_of = np.repeat(part.observations.configuration, observed.size)
-        for rows in same_size(rows_of):
-            Qc, ec = Q[rows], e[rows]
-            gap = np.eye(rows.shape[1]) - Qc @ Qc.transpose(0, 2, 1)
+            residual = residual - regressor(fit.problem.model, part, fit.x, moved).B @ step[moved]
+        e, Q = part.weights.apply(residual), _triangular(fit.posterior.R, part.weights.apply(at.B))
+        standard, growth, lost = np.empty(len(e)), np.empty(len(e)), np.zeros(len(e), dtype=bool)
+        own = part.observations
+        labels = own.configuration if side < 0 else np.arange(len(own.lead))
+        for rows in same_size(np.repeat(labels, size)):
+            gap = np.eye(rows.shape[1]) + side * Q[rows] @ Q[rows].transpose(0, 2, 1)
             values, vectors = np.linalg.eigh(gap)
             known = np.maximum(values, ALONE)
-            turned = (vectors.transpose(0, 2, 1) @ ec[..., None])[..., 0]
+            turned = (vectors.transpose(0, 2, 1) @ e[rows][..., None])[..., 0]
             standard[rows] = (vectors @ (turned / np.sqrt(known))[..., None])[..., 0]
             growth[rows] = (vectors @ (turned / known)[..., None])[..., 0]
             lost[rows[values[:, 0] < ALONE]] = True
@@ -373,34 +349,9 @@ def crossed(fit: JointFit, step: Array | None = None) -> Crossed:
         found.leverage[part.rows] = np.minimum((Q**2).sum(axis=1), 1.0)
         found.standard[part.rows] = _unwhitened(part.weights, standard)
 
-    for _ in in_order(spans, one):
+    for _ in in_order(whole_groups(parts), one):
         pass
     return found
-
-
-def left_out(fit: JointFit, observed: Observations, weights: Weights) -> tuple[Array, Array]:
-    """Residuals (rows,) of observations that had no part in the fit, in m or rad, free of the
-    fit's uncertainty; and Q (rows, columns), QQᵀ the covariance of their predictions over σ²."""
-    columns, R = fit.columns, fit.posterior.R
-    parts = partition(observed, weights, len(columns))
-    standard, every = np.empty(len(observed.value)), np.empty((len(observed.value), len(columns)))
-
-    def one(span: Span) -> None:
-        part = parts.part(span)
-        at = regressor(fit.problem.model, part, fit.x, columns)
-        size = observed.size
-        Q = _triangular(R, part.weights.apply(at.B))
-        every[part.rows] = Q
-        Q = Q.reshape(-1, size, len(columns))
-        e = part.weights.apply(at.residual).reshape(-1, size, 1)
-        values, vectors = np.linalg.eigh(np.eye(size) + Q @ Q.transpose(0, 2, 1))
-        turned = vectors.transpose(0, 2, 1) @ e
-        own = vectors @ (turned / np.sqrt(values)[..., None])
-        standard[part.rows] = _unwhitened(part.weights, own.ravel())
-
-    for _ in in_order(parts.spans, one):
-        pass
-    return standard, every
 
 
 def _triangular(R: Array, B: Array) -> Array:
@@ -415,21 +366,14 @@ def _unwhitened(weights: Weights, e: Array) -> Array:
     return np.asarray(sparse.linalg.spsolve(weights.whiten.tocsc(), e))
 
 
-def with_functions_free(solution: Solution) -> Solution:
-    """The solution as one whose problem has the columns of functions among the free ones."""
-    problem = solution.problem
-    free = np.union1d(problem.free, solution.fit.columns)
-    return replace(solution, problem=replace(problem, free=free))
-
-
 # The course: fit, noise and faulty readings in turn, then what else may change.
 
 
 def fit_smooth(
     every: Solution, sound: Solution, faulty: BoolArray, free: IntArray, options: Options,
     progress: Progress,
-) -> SmoothFit:  # fmt: skip
-    """All free parameters fitted together, from fits of the ordinary ones alone.
+) -> tuple[MethodResult, FunctionPrior]:  # fmt: skip
+    """All free parameters fitted together, from fits of the ordinary ones alone, and the prior.
 
     `every` holds all observations, `sound` the fit to those that are not `faulty` (N,); both know
     nothing of the smooth functions, whose parameters are among `free`.
@@ -442,8 +386,7 @@ def fit_smooth(
         progress("fitting smooth functions")
         search = _Course(every, sound, Functions.of(model, free, sized), options, progress)
         fit, noise, good = search.settled(~faulty)
-        fit, cross = search.wider(search.bounded(fit))
-        fit, cross = search.without_those_that_harm(fit, cross)
+        fit, cross = search.without_those_that_harm(search.bounded(fit))
         held = rms_3d(cross.held_out, size)
         tried.append((not fit.converged, held, search, (fit, cross, noise, good)))
         # A prior that leads astray predicts worse than the ordinary parameters alone.
@@ -499,6 +442,7 @@ class _Course:
         visits = None if bare.visits is None else replace(bare.visits, drifts=False)
         self.readings: Readings = replace(bare, B=column, visits=visits)
         self.standard = np.zeros(bare.e.shape)
+        self.alike = np.zeros(len(bare), dtype=bool)  # as readings of other configurations
 
     def problem_of(self, good: BoolArray, weights: Weights) -> Problem:
         observed = self.observed if good.all() else subset(self.observed, good)
@@ -528,7 +472,7 @@ class _Course:
             self.standard = self._standard(fit, noise, fitted)
             before, kind = judged, None if noise is None else noise.kind
             noise, judged = self.judged(noise, judged, first=k == 0)
-            judged = self.corroborated(fit, noise, judged)
+            judged = self.corroborated(fit, noise, fitted, judged)
             after = judged if self.set_aside(~judged) else np.ones_like(good)
             same = noise is None or (still and noise.kind == kind)
             if same and np.array_equal(after, fitted) and np.array_equal(before, judged):
@@ -546,8 +490,7 @@ class _Course:
         found[fitted] = crossed(fit).standard.reshape(shape)
         if not fitted.all():
             rest = subset(self.observed, ~fitted)
-            apart = left_out(fit, rest, self.weights(noise, ~fitted))[0]
-            found[~fitted] = apart.reshape(shape)
+            found[~fitted] = left_out(fit, rest, self.weights(noise, ~fitted)).reshape(shape)
         return found
 
     def judged(
@@ -574,36 +517,31 @@ class _Course:
                 found = estimate_noise(readings.take(good), noise.kind, noise)
         return found, good
 
-    def corroborated(self, fit: JointFit, noise: NoiseFit | None, good: BoolArray) -> BoolArray:
-        """The good readings (N,) and those of which another configuration says the same.
+    def corroborated(
+        self, fit: JointFit, noise: NoiseFit | None, fitted: BoolArray, good: BoolArray
+    ) -> BoolArray:
+        """The good readings (N,) and those outside the fit of which another configuration says the
+        same.
 
         Two readings at nearly the same pose that err alike, beside a fit without them, are no
         errors of reading: the model lacks something there, and what it has corrects part of it.
         """
-        suspects = np.flatnonzero(~good)
-        if len(suspects) < 2 or not self.set_aside(~good):
-            return good
-        problem = self.problem_of(good, self.weights(noise, good))
-        scales = replace(fit.scales, variance=1.0) if noise is not None else fit.scales
-        try:
-            without = joint_fit(
-                problem, self.every.sizes, self.functions, fit.x, fit.reduction, scales,
-                choosing=False, sizing=False, most=FEW,
-            )  # fmt: skip
-        except (ElastocalError, np.linalg.LinAlgError):
-            return good
-        rest = subset(self.observed, ~good)
-        e, Q = left_out(without, rest, self.weights(noise, ~good))
-        e = e.reshape(len(suspects), -1)
+        suspects = np.flatnonzero(~good & ~fitted)
+        if len(suspects) < 2:
+            return good | self.alike
+        outside = np.isin(np.arange(len(good)), suspects)
+        rest, model = subset(self.observed, outside), self.model
+        at = model.regressor(rest.table, fit.x, fit.columns, rest)
+        Q = _triangular(fit.posterior.R, self.weights(noise, outside).apply(at.B))
         Q = Q.reshape(len(suspects), -1)
         Q = Q / np.linalg.norm(Q, axis=1, keepdims=True)
+        e = self.standard[suspects]
         length = np.linalg.norm(e, axis=1)
         apart = np.linalg.norm(e[:, None] - e[None], axis=2)
         alike = (Q @ Q.T > SAME_POSE) & (apart < ALIKE * np.minimum.outer(length, length))
         alike &= rest.configuration[:, None] != rest.configuration[None]
-        found = good.copy()
-        found[suspects[alike.any(axis=1)]] = True
-        return found
+        self.alike[suspects[alike.any(axis=1)]] = True
+        return good | self.alike
 
     def set_aside(self, faulty: BoolArray) -> bool:
         if self.options.faulty == "auto":
@@ -634,66 +572,33 @@ class _Course:
             )  # fmt: skip
         return fit
 
-    def wider(self, fit: JointFit) -> tuple[JointFit, Crossed]:
-        """A wider set of ordinary parameters where held-out configurations show it is needed."""
-        cross = crossed(fit)
-        if fit.reduction.at_bound.size:
-            return fit, cross
-        self.progress("comparing with wider sets")
-        tried = len(fit.reduction.kept)
-        for threshold in WIDER:
-            wide = fit.chosen(self.every.sizes, threshold)
-            if len(wide.kept) <= tried:
-                continue
-            tried = len(wide.kept)
-            there = crossed(*fit.linear(fit.scales, wide))
-            if not wider_is_needed(fit.problem, cross.held_out, there.held_out):
-                continue
-            try:
-                other = joint_fit(
-                    fit.problem, self.every.sizes, fit.functions, fit.x, wide, fit.scales,
-                    choosing=False, sizing=False, most=FEW,
-                )  # fmt: skip
-                there = crossed(other)
-            except (ElastocalError, np.linalg.LinAlgError, ValueError):
-                continue  # along an undetermined direction it may leave every valid arm
-            held = cross.held_out, there.held_out
-            if other.converged and wider_is_needed(fit.problem, *held):
-                fit, cross = other, there
-        return fit, cross
-
-    def without_those_that_harm(self, fit: JointFit, cross: Crossed) -> tuple[JointFit, Crossed]:
+    def without_those_that_harm(self, fit: JointFit) -> tuple[JointFit, Crossed]:
         """Without the functions that the readings do not show, or that predict held-out
         configurations worse than none; the least supported is tried first."""
-        size, alive = self.observed.size, fit.scales.scale > 0
-        for g in np.argsort(fit.scales.gain[: len(self.functions.groups)]):
-            if not alive[g] or fit.scales.gain[g] > CERTAIN:
+        size, scales, cross = self.observed.size, fit.scales, crossed(fit)
+        for g in np.argsort(scales.gain[: len(self.functions.groups)]):
+            if not scales.scale[g] or scales.gain[g] > CERTAIN:
                 continue
-            scale = np.where(alive, fit.scales.scale, 0.0)
+            scale = scales.scale.copy()
             scale[g] = 0.0
-            trial, step = fit.linear(replace(fit.scales, scale=scale), fit.reduction)
-            there = crossed(trial, step)
-            shown = fit.scales.gain[g] > LEAST_GAIN
+            there = crossed(*fit.linear(replace(scales, scale=scale)))
+            shown = scales.gain[g] > LEAST_GAIN
             if shown and rms_3d(there.held_out, size) > rms_3d(cross.held_out, size):
                 continue
             if shown:
                 self.harmful.append(self.functions.groups[g].name)
-            alive[g], cross = False, there
-            fit = replace(
-                fit, scales=replace(fit.scales, scale=np.where(alive, fit.scales.scale, 0.0))
-            )
-        if (fit.scales.scale > 0).all():
+            scales, cross = replace(scales, scale=scale), there
+        if (scales.scale > 0).all():
             return fit, cross
         fit = joint_fit(
-            fit.problem, self.every.sizes, self.functions, fit.x, fit.reduction,
-            fit.scales, choosing=False,
+            fit.problem, self.every.sizes, self.functions, fit.x, fit.reduction, scales,
+            choosing=False,
         )  # fmt: skip
         return fit, crossed(fit)
 
     def result(
         self, fit: JointFit, cross: Crossed, noise: NoiseFit | None, good: BoolArray
-    ) -> SmoothFit:
-        """The parts of a solution."""
+    ) -> tuple[MethodResult, FunctionPrior]:
         posterior, k = fit.posterior, fit.posterior.ordinary
         columns, effective = fit.columns, round(posterior.effective)
         whitened = fit.problem.weights.apply(fit.residual)
@@ -728,11 +633,12 @@ class _Course:
         method = self.options.resolved
         if not self.estimating:
             method = "ols" if fit.problem.weights.kind == "none" else "wls"
-        return SmoothFit(
-            method, solution, intervals, noise, good, self._parts(fit, covariance.matrix),
-            self._prior(fit, spare), effective, cross.leverage, self.standard,
-            self._shares(fit), self._warnings(fit),
+        result = MethodResult(
+            method, solution, intervals, noise, good, prior_share=self._shares(fit),
+            effective=effective, leverage=cross.leverage, warnings=self._warnings(fit),
+            smooth=self._parts(fit, covariance.matrix), standard=self.standard,
         )  # fmt: skip
+        return result, self._prior(fit, spare)
 
     def _parts(self, fit: JointFit, covariance: Array) -> tuple[SmoothPart, ...]:
         f = fit.functions

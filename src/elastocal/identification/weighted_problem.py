@@ -85,15 +85,6 @@ class Weights:
         return replace(self, low=low[:, size > 0], common=F, together=together)
 
     @property
-    def even(self) -> bool:
-        """Whether all rows have one weight: a fit is the same without, and rounds less."""
-        W = self.whiten
-        if W is None or self.low is not None:
-            return self.low is None
-        alike = W.nnz == W.shape[0] and bool((W.data == W.data[:1]).all())
-        return alike and bool((W.indices == np.arange(W.shape[0])).all())
-
-    @property
     def whole(self) -> sparse.csr_array | None:
         """W (rows, rows), all of it."""
         if self.low is None or self.whiten is None:
