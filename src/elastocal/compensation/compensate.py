@@ -147,7 +147,7 @@ def compensate(
     status = _status(search, found, nominal)
     reached = found.reached
     progress("uncertainty")
-    uncertainty = _uncertainty(tool, rows, found.q, reached, seed)
+    uncertainty = _uncertainty(tool, rows, found.q, reached)
     task = Reaching(chain, in_base, flange, place[0], None, *limits)
     path = jumps(task, found.q, reached)
     result = Compensation(
@@ -217,13 +217,13 @@ def _status(search: Commanding, found: Solved, nominal: Array) -> tuple[str, ...
 
 
 def _uncertainty(
-    tool: CalibratedTool, rows: list[NDArray], q: Array, reached: NDArray[np.bool_], seed: int
+    tool: CalibratedTool, rows: list[NDArray], q: Array, reached: NDArray[np.bool_]
 ) -> Uncertainty:
     n = len(q)
     covariance, unknown = np.full((n, 3, 3), np.nan), np.full(n, np.nan)
     total = covariance.copy()
     good = np.flatnonzero(reached)
-    found = uncertainty_at(tool, [values[good] for values in rows], q[good], rows, seed)
+    found = uncertainty_at(tool, [values[good] for values in rows], q[good])
     covariance[good], total[good], unknown[good] = found.covariance, found.total, found.unknown
     return Uncertainty(covariance, total, unknown, found.blamed)
 

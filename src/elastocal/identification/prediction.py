@@ -43,9 +43,11 @@ from elastocal.units import Array, IntArray, microns
 # What the identification knows of where the tool will be, and what it does not.
 
 OUTSIDE = 1e-6  # share of the tool's motion that may lie outside what is known: rounding
-SPARE = 4  # readings for every parameter, at random poses
 NEVER_SHOWN = 0.1  # standard deviations; a hundred times as many readings would show one
 SENSITIVITIES = 5000  # rows at a time, which bounds the memory
+
+
+NONE_OPEN = OpenParameters((), np.zeros((0, 0)), np.zeros(0))
 
 
 @dataclass(frozen=True)
@@ -74,16 +76,13 @@ class Uncertainty:
         return np.asarray(np.sqrt(np.trace(self.covariance, axis1=1, axis2=2)))
 
 
-def uncertainty_at(
-    tool: CalibratedTool, rows: list[NDArray], q: Array, circumstances: list[NDArray], seed: int = 0
-) -> Uncertainty:
+def uncertainty_at(tool: CalibratedTool, rows: list[NDArray], q: Array) -> Uncertainty:
     """Σ_p = A_K Σ A_Kᵀ and O S at commanded joints q (n, joints) under the inputs `rows`.
 
-    `circumstances` are rows under which the random poses stand that a result asks for which does
-    not say what its open parameters went into.  NaN where the result determined nothing.
+    NaN where the result determined nothing.
     """
     arm = tool.calibrated
-    left = arm.left or _by_random_poses(tool, circumstances, seed)
+    left = arm.left or NONE_OPEN
     known, off = [], []
     for first in range(0, len(q), SENSITIVITIES):
         some = slice(first, first + SENSITIVITIES)
@@ -111,7 +110,7 @@ def _moves(arm: CalibratedArm, left: OpenParameters, A: Array) -> tuple[Array, A
     index = {name: i for i, name in enumerate(arm.model.names)}
     known = A[..., [index[name] for name in arm.determined]]
     move = A[..., [index[name] for name in left.names]] * left.typical
-    off = move - known @ (left.mixing * left.typical)
+    off = move - known @ (left.mixing * left.typical) if left.names else move
     size = np.abs(move).max(axis=(0, 1), initial=0.0)
     off[np.abs(off) <= OUTSIDE * np.maximum(size, np.abs(move).max(initial=0.0))] = 0.0
     return known, off
@@ -120,8 +119,7 @@ def _moves(arm: CalibratedArm, left: OpenParameters, A: Array) -> tuple[Array, A
 def mean_squares(arm: CalibratedArm, B: Array, size: int) -> tuple[float, float]:
     """Mean squares in m² of the position error of readings of B (n·size, parameters): by what the
     estimates leave uncertain, and by typical deviations of parameters left open."""
-    left = arm.left or OpenParameters((), np.zeros((len(arm.determined), 0)), np.zeros(0))
-    known, off = _moves(arm, left, B.reshape(-1, size, B.shape[1])[:, :3])
+    known, off = _moves(arm, arm.left or NONE_OPEN, B.reshape(-1, size, B.shape[1])[:, :3])
     own = variance_of(known, arm.covariance)
     return float(own.mean()), float((off**2).sum(axis=(1, 2)).mean())
 
@@ -189,31 +187,6 @@ def _shares(B_K: Array, B_D: Array, kept: Array, left: Array) -> Array:
     known = left > 0
     found[:, known] *= kept[:, None] / left[known]
     return np.asarray(found)
-
-
-def _by_random_poses(tool: CalibratedTool, rows: list[NDArray], seed: int) -> OpenParameters:
-    """By least squares on the markers' places at random poses, in the targets' circumstances.
-
-    What the identification left out as indistinguishable leaves no residual there; what it left
-    out although it moves markers by itself does, and is then unknown at the targets as well.
-    """
-    arm = tool.calibrated
-    model = arm.model
-    names = {name: i for i, name in enumerate(model.names)}
-    kept = np.array([names[name] for name in arm.determined], dtype=np.int64)
-    # Smooth functions have their prior: where the readings do not show them they are zero.
-    left = np.setdiff1d(np.flatnonzero(~model.shrunk), kept)
-    sizes, own = typical_sizes(model.parameters, arm.x, kept), ~model.shrunk[kept]
-    mixing = np.zeros((len(kept), len(left)))
-    if len(left) and own.any():
-        low, high = finite_ranges(tool.chain, *joint_limits(tool.cell, tool.chain))
-        n = max(SPARE * int((~model.shrunk).sum()) // 3, 1)
-        q = np.random.default_rng(seed).uniform(low, high, (n, tool.chain.n_joints))
-        some = [values[np.arange(n) % len(values)] for values in rows]
-        B = tool.marker_sensitivity(some, q)
-        B = B[np.isfinite(B).all(axis=(1, 2))].reshape(-1, len(names)) * sizes
-        mixing[own] = _shares(B[:, kept[own]], B[:, left], sizes[kept[own]], sizes[left])
-    return OpenParameters(tuple(model.names[d] for d in left), mixing, sizes[left])
 
 
 def typical_sizes(parameters: tuple[Parameter, ...], x: Array, kept: IntArray) -> Array:
@@ -289,7 +262,7 @@ def position_at(
     """
     rows, q = tool.rows(table), table.q
     joints, common = noise.scatter(q.shape[1])
-    found = uncertainty_at(tool, rows, q, rows)
+    found = uncertainty_at(tool, rows, q)
     place = tool.poses(rows, q)[0]
     J = tool.errors(rows, q, place, None)[1]
     visit = (J * joints**2) @ J.transpose(0, 2, 1) + common**2 * np.eye(3)

@@ -251,7 +251,7 @@ def read_calibrated(
         covariance,
         str(result_path),
         tuple(entries[name] for name in model.names),
-        _left_open(result.get("open"), held, determined, result_path),
+        _left_open(result.get("open"), model, determined, result_path),
         _lacking(result.get("predicted_new_poses_um")),
         _loads(result.get("loads_N", []), result_path),
         _shown(result.get("measured_poses")),
@@ -354,18 +354,23 @@ def _covariance(
 
 
 def _left_open(
-    stated: Any, held: dict[str, float], determined: tuple[str, ...], path: str | Path
-) -> OpenParameters | None:
-    """What the result says of the parameters that the data left open; older ones say nothing."""
+    stated: Any, model: Model, determined: tuple[str, ...], path: str | Path
+) -> OpenParameters:
+    """What the result says of the parameters that the data left open; where it says nothing, each
+    that was not determined counts by itself."""
     if stated is None:
-        return None
+        rest = [p for p in model.parameters if p.name not in determined and not p.shrunk]
+        typical = np.array([p.typical or abs(p.nominal) for p in rest])
+        none = np.zeros((len(determined), len(rest)))
+        return OpenParameters(tuple(p.name for p in rest), none, typical)
     try:
         names = tuple(map(str, stated["names"]))
         mixing = np.array(stated["mixing"], dtype=float).reshape(len(determined), len(names))
         typical = np.array(stated["typical"], dtype=float).reshape(len(names))
     except (TypeError, KeyError, ValueError, OverflowError):
         names, mixing, typical = ("",), np.zeros((0, 0)), np.zeros(0)
-    if not (set(names) <= set(held) and np.isfinite(mixing).all() and np.isfinite(typical).all()):
+    known = set(names) <= set(model.names)
+    if not (known and np.isfinite(mixing).all() and np.isfinite(typical).all()):
         raise InputError(
             f"{path}: open does not say names, typical sizes and shares of the parameters left "
             "open; write the result anew with identify"

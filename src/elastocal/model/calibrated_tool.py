@@ -176,18 +176,6 @@ class CalibratedTool:
         return self._sensitivity(self._at(rows, q), self.x)[1]
 
     @cached_property
-    def _markers(self) -> Total:
-        own = self._symbolic.arm
-        places = [rigid.point(own.T_tracker_flange, place) for place in own.markers.values()]
-        return Total(self._symbolic, ca.vertcat(*places), self._symbolic.p)
-
-    def marker_sensitivity(self, rows: list[NDArray], q: Array) -> Array:
-        """(n, 3 markers, parameters) = d(all markers' positions)/dX in m per unit."""
-        places, slope = self._markers(self._at(rows, q), self.x)
-        slope[~np.isfinite(places).all(axis=1)] = np.nan
-        return slope
-
-    @cached_property
     def _errors(self) -> dict[bool, Total]:
         goal, turned = ca.SX.sym("goal", 3), ca.SX.sym("turned", 9)
         r = self._position - goal
