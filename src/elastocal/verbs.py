@@ -466,7 +466,7 @@ def identify(
             configuration), "profile".
         outliers: "auto" (exclude, unless they are a tenth or more), "drop", "keep"; they are
             listed in any case.
-        bounded: Keep parameters inside their physical bounds.
+        bounded: Keep parameters inside their physical bounds, as `physical`.
         physical: No negative compliance, compliance matrices semidefinite.
         knowledge: Prior knowledge: priors, bounds, equalities (TOML).  Or a `Knowledge`.
         prior: What is known by name, {"joint2.compliance": {"mean": 2.9e-7, "std": 3e-8}}.
@@ -511,12 +511,11 @@ def identify(
         covariance=None if covariance is None else np.asarray(covariance, dtype=float),
         intervals=intervals,
         fixed=_names("fixed", fixed),
-        bounded=bounded,
         faulty=outliers,
         seed=cast(int, seed),
         jobs=jobs,
     )
-    known = knowledge_of(knowledge, physical)
+    known = knowledge_of(knowledge, physical or bounded)
     tell = progress or _silent
     tell("reading")
     made = _model(model)

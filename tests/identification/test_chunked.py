@@ -20,6 +20,9 @@ from elastocal.cell.arm_description import Nominal
 from elastocal.identification import outliers, solve
 from elastocal.identification import weighted_problem as chunked
 from elastocal.identification import weighted_problem as partition
+from elastocal.identification.identify import identify
+from elastocal.identification.knowledge import physical_constraints
+from elastocal.identification.options import Options
 from elastocal.identification.outliers import describe
 from elastocal.identification.residuals import held_out_by_parts
 from elastocal.identification.solve import residual_sigma
@@ -109,27 +112,23 @@ def test_faulty_readings_are_found_in_parts_too(in_parts):
     np.testing.assert_allclose([o.residual for o in one], [o.residual for o in other], rtol=0.01)
 
 
-def test_a_bounded_fit_in_parts_is_the_constrained_minimum(in_parts):
-    """Two true compliances are zero.  Nowhere outside the bounds, never above the sum of squares
-    that the interior-point fit of the whole table reaches (it stops 1e-10 rad/(N m) short of a
-    bound), and the free minimum where that is inside."""
+def test_a_bounded_fit_in_parts_is_that_of_the_whole_table(in_parts):
+    """Two true compliances are zero, of which one is held at its bound."""
     chain = planar_chain(4)
     cell = cell_of(("joint_compliance",), nominal=Nominal(joint_compliance=(1e-5,) * 4))
     model = Model.assembled(chain, cell)
-    truth = np.array([1e-5, 0.0, 1e-5, 0.0])
     plan = table_at(random_poses(chain, 60, 3), [[0, 0, 0], [80, 40, -200]])
-    tables = [measured(model, plan, truth, SIGMA, np.random.default_rng(k)) for k in range(3)]
-    free = [solved(model, table).fit for table in tables]
-    whole = [solved(model, table, bounded=True).fit for table in tables]
+    truth, rng = np.array([1e-5, 0.0, 1e-5, 0.0]), np.random.default_rng(0)
+    table = measured(model, plan, truth, SIGMA, rng)
+    options = Options(method="ols", constraints=physical_constraints(model))
+    whole = identify(model, table, options)
     in_parts()
-    parts = [solved(model, table, bounded=True).fit for table in tables]
-    inside = [bool((f.x >= 0).all()) for f in free]
-    assert True in inside and False in inside
-    for f, w, p, free_is_inside in zip(free, whole, parts, inside, strict=True):
-        assert (p.x >= 0).all() and (p.x == 0).any() != free_is_inside
-        assert p.residual @ p.residual <= w.residual @ w.residual * (1 + 1e-12)
-        if free_is_inside:
-            np.testing.assert_allclose(p.x, f.x, rtol=1e-6)
+    parts = identify(model, table, options)
+    assert (whole.x >= 0).all() and (whole.x == 0).any() and whole.active
+    np.testing.assert_allclose(parts.x, whole.x, rtol=1e-6)
+    assert [a.label for a in parts.active] == [a.label for a in whole.active]
+    np.testing.assert_allclose(parts.covariance, whole.covariance, rtol=1e-4, atol=1e-16)
+    np.testing.assert_allclose(parts.held_out, whole.held_out, rtol=1e-5, atol=1e-9)
 
 
 # --- passes ---------------------------------------------------------------------------------

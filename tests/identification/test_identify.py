@@ -29,6 +29,7 @@ from support.robots import packaged_urdf
 
 from elastocal.cell.arm_description import CartesianNoise, Nominal, Tracker
 from elastocal.identification.identify import identify
+from elastocal.identification.knowledge import physical_constraints
 from elastocal.identification.options import Options
 from elastocal.identification.solve import reduce
 from elastocal.model.manipulator import Model
@@ -352,7 +353,7 @@ def test_fixing_the_base_at_its_hint():
 
 def test_bounded_keeps_compliances_physical_and_changes_nothing_else():
     model, table, _ = springs_case()
-    free, bounded = identify(model, table), identify(model, table, Options(bounded=True))
+    free, bounded = identify(model, table), identify(model, table, bounds_of(model))
     np.testing.assert_allclose(bounded.residual, free.residual, atol=1e-3 * SIGMA)
     soft = Model.assembled(planar_chain(), cell_of(("base_frame", "joint_compliance"),
                                          nominal=Nominal((2e-5,) * 3)))  # fmt: skip
@@ -360,9 +361,12 @@ def test_bounded_keeps_compliances_physical_and_changes_nothing_else():
     plan = table_at(random_poses(soft.chain, 20, 0), [[0, 0, 0], [0, 0, -400]])
     table = measured(soft, plan, wrong, SIGMA, np.random.default_rng(0))
     assert identify(soft, table)["joint2.compliance"].held < -1e-5
-    held = [e.held for e in identify(soft, table, Options(bounded=True)).estimates
-            if e.name.endswith("compliance")]  # fmt: skip
-    assert min(held) >= 0.0
+    found = identify(soft, table, bounds_of(soft))
+    assert min(e.held for e in found.estimates if e.name.endswith("compliance")) >= 0.0
+
+
+def bounds_of(model):
+    return Options(constraints=physical_constraints(model))
 
 
 # --- (l) the result -----------------------------------------------------------------------------

@@ -104,15 +104,13 @@ def distances() -> Case:
 CASES = (positions, unit_weights_and_loads, polar, deflections, poses, distances)
 
 
-def solved(
-    model: Model, table: Measurements, bounded: bool = False, covariance: Array | None = None
-) -> Solution:
+def solved(model: Model, table: Measurements, covariance: Array | None = None) -> Solution:
     """The weighted fit from nothing, before anything is made of it."""
     observed = observe(table, model.observe)
     weights = weights_for(observed, model.cell.tracker, "auto", covariance)
     free = fixed_and_free(model, ())
     x0 = start_values(model, table, 0, free)
-    return solve(Problem(model, observed, weights, x0, free, bounded))
+    return solve(Problem(model, observed, weights, x0, free))
 
 
 def faulty_of(solution: Solution) -> tuple[NDArray[np.bool_], Solution]:

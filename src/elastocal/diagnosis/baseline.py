@@ -174,7 +174,7 @@ def fit_baseline(
     started = x0 is not None
     if x0 is None:
         x0 = start_values(model, table, seed)
-    problem = Problem(model, observed, weights, x0, free, False)
+    problem = Problem(model, observed, weights, x0, free)
     sizes = sizes_and_check(problem)
     placed, nominal = free[is_placed(model)], None
     if len(placed) and not started:

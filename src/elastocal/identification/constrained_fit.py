@@ -9,15 +9,13 @@ import numpy as np
 
 from elastocal.identification.constrained import Minimum, Reduced, minimise
 from elastocal.identification.knowledge import (
-    Bounds,
     Constraints,
     GaussianPrior,
     System,
     share_of_prior,
 )
 from elastocal.identification.least_squares import FitProblem
-from elastocal.identification.solve import Solution
-from elastocal.model.manipulator import Regression
+from elastocal.identification.weighted_problem import Evaluation, evaluate, residual_at
 from elastocal.units import Array, IntArray
 
 # Constrained fit of the nonlinear model: Gauss–Newton on the exact B, steps halved.
@@ -68,20 +66,19 @@ class KnowledgeProblem:
         """The constraints on a step from x."""
         return self.system.moved(x[self.problem.columns], np.ones(len(self.problem.columns)))
 
-    def linearised(self, x: Array) -> tuple[Regression, Array, Array]:
-        """Regression at x, and J and t with the objective |t − J step|²."""
-        problem, apply = self.problem, self.problem.weights.apply
-        observed, columns = problem.observations, problem.columns
-        at = problem.model.regressor(observed.table, x, columns, observed)
-        lack = self.target - self.P @ x[columns]
-        J = np.vstack([apply(at.B), self.P])
-        return at, J, np.concatenate([apply(at.residual), lack])
+    def linearised(self, x: Array) -> tuple[Evaluation, Array, Array]:
+        """The readings at x, and J and t with the objective |t − J step|²: their R factor and the
+        prior's rows."""
+        problem = self.problem
+        at = evaluate(problem.model, problem.parts, x, problem.columns)
+        rows, lack = at.r_factor.augmented, self.target - self.P @ x[problem.columns]
+        return at, np.vstack([rows[:, :-1], self.P]), np.concatenate([rows[:, -1], lack])
 
     def value(self, x: Array) -> float:
         """The objective at x; infinite where a pose has no equilibrium."""
-        observed = self.problem.observations
-        misfit = observed.value - self.problem.model.predict(observed.table, x, observed)
-        e, lack = self.problem.weights.apply(misfit), self.target - self.P @ x[self.problem.columns]
+        problem = self.problem
+        e = problem.weights.apply(residual_at(problem.model, problem.parts, x))
+        lack = self.target - self.P @ x[problem.columns]
         value = float(e @ e + lack @ lack)
         return value if np.isfinite(value) else np.inf
 
@@ -92,7 +89,7 @@ PINNED = 1e-12
 
 @dataclass(frozen=True)
 class ConstrainedFit:
-    """The minimum x (parameters,), the regression `at` it, and the model linearised there.
+    """The minimum x (parameters,), the readings `at` it, and the model linearised there.
 
     `reduced` is the linear problem of the step δ (columns,) from x, |e − B δ|² + |lack − P δ|² with
     the whitened B and residual e, and `best` its minimum, δ = 0 to rounding.
@@ -100,7 +97,7 @@ class ConstrainedFit:
 
     posed: KnowledgeProblem
     x: Array
-    at: Regression
+    at: Evaluation
     reduced: Reduced
     best: Minimum
     converged: bool
@@ -118,16 +115,6 @@ class ConstrainedFit:
     @property
     def objective(self) -> float:
         return float(self.reduced.t @ self.reduced.t)
-
-    @property
-    def e(self) -> Array:
-        """Whitened residual (rows,)."""
-        return self.reduced.t[: len(self.at.residual)]
-
-    @property
-    def B(self) -> Array:
-        """Whitened regressor (rows, columns)."""
-        return self.reduced.J[: len(self.at.residual)]
 
     @cached_property
     def face(self) -> Array:
@@ -158,11 +145,6 @@ class ConstrainedFit:
     def effective(self) -> float:
         """How many parameters' worth the readings determine: tr(cofactor BᵀB) on the face."""
         return self.face.shape[1] - float(((self.posed.P @ self.face) ** 2).sum())
-
-    @property
-    def leverage(self) -> Array:
-        """Diagonal (rows,) of B cofactor Bᵀ on the face, at most 1."""
-        return np.minimum(((self.B @ self.face) ** 2).sum(axis=1), 1.0)
 
     def _pinned(self, half: Array) -> Array:
         fixed = np.linalg.norm(half, axis=1) <= PINNED * self.reduced.unit
@@ -210,14 +192,6 @@ def constrained_fit(posed: KnowledgeProblem, max_steps: int = 60) -> Constrained
     reduced = Reduced.of(J, t, posed.limits(x))
     best = reduced.minimum(posed.system)
     return ConstrainedFit(posed, x, at, reduced, best, converged, reason, steps)
-
-
-def own_bounds(solution: Solution) -> Constraints:
-    """The bounds that the effects of a bounded problem state themselves."""
-    if not solution.problem.bounded:
-        return Constraints()
-    parameters = solution.problem.model.parameters
-    return Constraints(tuple(Bounds(p.name, p.lower, p.upper) for p in parameters))
 
 
 # Ends of profile intervals: how far a parameter can move before the fit becomes too bad.

@@ -221,8 +221,6 @@ def _estimates(
         if int(d) not in invisible and partners[int(d)]:
             note = "held: known only together with " + ", ".join(partners[int(d)])
         found[int(d)] = estimate(d, combined_with=tuple(partners[int(d)]), note=note)
-    for c in reduction.at_bound:
-        found[int(c)] = estimate(c, note=f"held at its bound {x[c]:g}: the data want it beyond")
     for i, limits in method.limits.items():
         found[i] = estimate(i, limits=limits, note=_hardly_shown(model.parameters[i], x[i]))
     for i in range(len(model.parameters)):

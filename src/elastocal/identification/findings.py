@@ -74,7 +74,7 @@ USE = (
     "Use it (elastocal compensate, elastocal export) where poses and loads are like those measured."
 )
 # These come from the solver and stay when a result is judged anew.
-OF_SOLUTION = ("ill_conditioned", "at_bound", "beyond_bound")
+OF_SOLUTION = ("ill_conditioned", "beyond_bound")
 
 
 def judged(result: Calibration, of_solution: tuple[Finding, ...] | None = None) -> Calibration:
@@ -593,8 +593,8 @@ def _test(result: Calibration) -> Iterator[Finding]:
 
 
 def of_solution(result: Calibration, solution: Solution) -> tuple[Finding, ...]:
-    """Conditioning of the fit, and parameters at or beyond their physical bounds."""
-    return (*_conditioning(result, solution), *_bounds(result, solution))
+    """Conditioning of the fit, and parameters beyond their physical bounds."""
+    return (*_conditioning(result, solution), *_bounds(result))
 
 
 def _conditioning(result: Calibration, solution: Solution) -> Iterator[Finding]:
@@ -616,23 +616,18 @@ def _conditioning(result: Calibration, solution: Solution) -> Iterator[Finding]:
     )  # fmt: skip
 
 
-def _bounds(result: Calibration, solution: Solution) -> Iterator[Finding]:
-    at_bound = {result.model.names[c] for c in solution.reduction.at_bound}
+def _bounds(result: Calibration) -> Iterator[Finding]:
     at = {name: k for k, name in enumerate(result.determined)}
     for e, p in zip(result.estimates, result.model.parameters, strict=True):
-        if p.lower < e.held < p.upper or not (np.isfinite(p.lower) or np.isfinite(p.upper)):
+        if e.limits is None or not (e.limits[1] < p.lower or e.limits[0] > p.upper):
             continue
-        bound = p.lower if e.held <= p.lower else p.upper
-        numbers: dict[str, Number] = {"parameter": e.name, "unit": e.unit, "bound": bound}
-        if p.name in at_bound:
-            yield Finding(
-                "at_bound", "note", numbers,
-                "Check load direction and torque signs, or measure poses that load it more.",
-            )  # fmt: skip
-        elif e.limits is not None and (e.limits[1] < p.lower or e.limits[0] > p.upper):
-            std = float(np.sqrt(result.covariance[at[e.name], at[e.name]]))
-            yield Finding(
-                "beyond_bound", "note", numbers | {"value": e.held, "std": std},
-                "Check load direction and torque signs, measure poses that load it more, or fit "
-                "with bounds.",
-            )  # fmt: skip
+        std = float(np.sqrt(result.covariance[at[e.name], at[e.name]]))
+        yield Finding(
+            "beyond_bound", "note",
+            {
+                "parameter": e.name, "unit": e.unit,
+                "bound": p.lower if e.held <= p.lower else p.upper, "value": e.held, "std": std,
+            },
+            "Check load direction and torque signs, measure poses that load it more, or fit "
+            "with bounds.",
+        )  # fmt: skip

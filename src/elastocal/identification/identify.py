@@ -163,7 +163,7 @@ def _solution(
 ) -> Solution:
     kind = "none" if options.method == "ols" else options.weights
     weights = weights_for(observed, model.cell.tracker, kind, options.covariance)
-    problem = Problem(model, observed, weights, x0, free, options.bounded)
+    problem = Problem(model, observed, weights, x0, free)
     solution = solve(problem, progress, try_wider)
     if observed.kind == "pose" and weights.kind == "none" and kind == "auto":
         # Without stated noise, metres and radians get their relative weight from a first fit.

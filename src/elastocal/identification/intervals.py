@@ -11,10 +11,10 @@ from elastocal.errors import InputError, option
 from elastocal.identification.constrained_fit import (
     KnowledgeProblem,
     constrained_fit,
-    own_bounds,
     profile_end,
 )
 from elastocal.identification.covariance import Covariance, cluster_robust, hc, t_quantile
+from elastocal.identification.knowledge import Constraints
 from elastocal.identification.least_squares import Fit
 from elastocal.identification.noise_choice import NoiseFit
 from elastocal.identification.residuals import whole_groups
@@ -146,8 +146,8 @@ def _profiled(solution: Solution, classical: Covariance) -> Intervals:
     """{v: S(v) − Ŝ ≤ t² s²}, the fit being at its minimum."""
     fit = solution.fit
     sigma = residual_sigma(fit, len(fit.columns))
-    stated = replace(solution.problem, bounded=False).fit_of(fit.columns, fit.x, solution.sizes)
-    found = constrained_fit(KnowledgeProblem.of(stated, own_bounds(solution), None, sigma))
+    problem = solution.problem.fit_of(fit.columns, fit.x, solution.sizes)
+    found = constrained_fit(KnowledgeProblem.of(problem, Constraints(), None, sigma))
     rises = (sigma * t_quantile(LEVEL, classical.dof)) ** 2
     ends = [
         [profile_end(found, k, float(rise), side) for side in (-1, 1)]

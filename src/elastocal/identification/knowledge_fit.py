@@ -8,12 +8,11 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy import special
 
-from elastocal.errors import InputError, InsufficientDataError, option, require
+from elastocal.errors import InsufficientDataError, option, require
 from elastocal.identification.constrained_fit import (
     ConstrainedFit,
     KnowledgeProblem,
     constrained_fit,
-    own_bounds,
     profile_end,
 )
 from elastocal.identification.covariance import Covariance, t_quantile
@@ -23,9 +22,15 @@ from elastocal.identification.least_squares import Fit
 from elastocal.identification.linear_solver import least_norm
 from elastocal.identification.method_result import MethodResult
 from elastocal.identification.options import Options
-from elastocal.identification.residuals import growth
+from elastocal.identification.residuals import growth, whole_groups
 from elastocal.identification.solve import WORTH_A_COLUMN, Reduction, Solution, residual_sigma
-from elastocal.identification.weighted_problem import RFactor
+from elastocal.identification.weighted_problem import (
+    RFactor,
+    Span,
+    evaluate,
+    in_order,
+    regressor,
+)
 from elastocal.text import listed, quoted
 from elastocal.units import Array, IntArray, Progress
 
@@ -41,7 +46,7 @@ def fitted_columns(
 ) -> IntArray:
     """Indices of the parameters to fit under the constraints and the prior, ascending.
 
-    These are the kept parameters of the solution (and those that bounds held); the free ones that
+    These are the kept parameters of the solution; the free ones that
     the prior or an equality names, for that is knowledge of themselves; and, of the parameters
     that are known only together with one of these, as many as can now be told apart from it: with
     a prior on k, readings of k + d are knowledge of d.  Told apart is what readings, prior and
@@ -66,7 +71,7 @@ def fitted_columns(
         f"a prior is stated for {listed(fixed)}, which is held fixed; drop the prior or the fixing",
     )
     named = {names.index(n) for n in tied | priors} & free
-    columns = {*reduction.kept.tolist(), *reduction.at_bound.tolist(), *named}
+    columns = {*reduction.kept.tolist(), *named}
 
     def told_apart(c: int) -> bool:
         return _told_apart(solution, [*sorted(columns - {c}), c], constraints, prior)
@@ -92,12 +97,11 @@ def _told_apart(
     solution: Solution, columns: list[int], constraints: Constraints, prior: GaussianPrior | None
 ) -> bool:
     """Whether readings, prior and equalities tell the last of the columns from the others."""
-    problem, observed, e = solution.problem, solution.problem.observations, solution.fit.whitened
+    problem, e = solution.problem, solution.fit.whitened
     chosen = np.array(columns)
     size, names = solution.sizes[chosen], problem.model.names
-    at = problem.model.regressor(observed.table, solution.fit.x, chosen, observed)
     sigma = max(float(np.sqrt(e @ e / len(e))), 1e-12)
-    J = problem.weights.apply(at.B) * size / sigma
+    J = evaluate(problem.model, problem.parts, solution.fit.x, chosen).r_factor.R * size / sigma
     if prior is not None:
         J = np.vstack([J, prior.rows(names)[0][:, chosen] * size])
     A = constraints.resolve(names).A[:, chosen] * size
@@ -214,26 +218,20 @@ def fit_with_knowledge(
     are; t intervals have the method's own degrees of freedom.  `own` is the prior of smooth
     functions, which joins the stated one.
 
-    Raises InputError for constraints that contradict each other or held values, names that are no
-    parameters, and tables too large to hold B; InsufficientDataError where an equality names a
-    parameter that readings, prior and equalities do not determine.
+    Raises InputError for constraints that contradict each other or held values and names that are
+    no parameters; InsufficientDataError where an equality names a parameter that readings, prior
+    and equalities do not determine.
     """
     solution = before.solution
     problem, fit = solution.problem, solution.fit
-    if problem.large:
-        raise InputError(
-            "constraints and priors need B as a whole, which a table of this size does not allow: "
-            f"fit a part of the table, or {option('bounded', True)} for the physical bounds alone"
-        )
     if own is not None:
         problem = replace(problem, free=np.union1d(problem.free, fit.columns))
         solution = replace(solution, problem=problem)
-    constraints = (options.constraints or Constraints()) + own_bounds(solution)
+    constraints = options.constraints or Constraints()
     prior = joined(options.prior, None if own is None else own.prior)
     sigma = residual_sigma(fit, len(fit.columns)) if own is None else own.sigma
     columns = fitted_columns(solution, before.intervals.covariance.std, constraints, prior)
-    # Of the effects' own bounds, where asked for, the constraints speak.
-    stated = replace(problem, bounded=False).fit_of(columns, fit.x, solution.sizes)
+    stated = problem.fit_of(columns, fit.x, solution.sizes)
     posed = KnowledgeProblem.of(stated, constraints, prior, sigma)
     progress("fitting under constraints" if prior is None else "fitting with the prior")
     found = constrained_fit(posed)
@@ -248,15 +246,13 @@ def fit_with_knowledge(
         if np.isfinite(share) and not problem.model.shrunk[c]
     }  # fmt: skip
     fitted, matrix = _as_fit(found), intervals.covariance.matrix
-    known = replace(
-        solution, fit=fitted, reduction=_reduction(solution, found),
-        heldout=_held_out(solution, found),
-    )  # fmt: skip
+    leverage, heldout = _looked(found)
+    known = replace(solution, fit=fitted, reduction=_reduction(solution, found), heldout=heldout)
     told = _contradiction(solution, before.intervals, found, own)
     return replace(
         before, method="constrained", solution=known, intervals=intervals,
         active=found.best.active, prior_share=shares, effective=round(found.effective),
-        leverage=found.leverage, warnings=(*before.warnings, *told),
+        leverage=leverage, warnings=(*before.warnings, *told),
         smooth=tuple(part.refitted(fitted.x, columns, matrix) for part in before.smooth),
     )  # fmt: skip
 
@@ -304,13 +300,13 @@ def _as_fit(found: ConstrainedFit) -> Fit:
     Without them a parameter that no reading shows would leave it singular; equalities weigh as
     much as the readings of a parameter do.
     """
-    reduced = found.reduced
+    reduced, problem = found.reduced, found.posed.problem
     A = reduced.system.A * reduced.unit
     equalities = A / np.linalg.norm(A, axis=1)[:, None] / reduced.unit
     factor = RFactor.of(np.vstack([reduced.J, equalities]), np.append(reduced.t, np.zeros(len(A))))
     return Fit(
-        found.x, found.at.residual, found.e, factor, found.converged,
-        found.reason, found.steps, replace(found.posed.problem, x=found.x),
+        found.x, found.at.residual, problem.weights.apply(found.at.residual), factor,
+        found.converged, found.reason, found.steps, replace(problem, x=found.x),
     )  # fmt: skip
 
 
@@ -320,26 +316,38 @@ def _reduction(solution: Solution, found: ConstrainedFit) -> Reduction:
     A parameter that an active constraint holds back does not move: it stands for itself.
     """
     before, problem = solution.reduction, solution.problem
-    observed, columns = problem.observations, found.columns
+    columns, k = found.columns, len(found.columns)
     dropped = np.setdiff1d(before.dropped, columns)
-    at = problem.model.regressor(observed.table, found.x, dropped, observed)
-    mixing = found.on_face @ (found.B.T @ problem.weights.apply(at.B))
+    both = np.concatenate([columns, dropped])
+    R = evaluate(problem.model, problem.parts, found.x, both).r_factor.R
+    mixing = found.on_face @ (R[:, :k].T @ R[:, k:])
     share = np.abs(mixing) * solution.sizes[dropped] / solution.sizes[columns][:, None]
     mixing[share < ROUNDING] = 0.0
     return Reduction(columns, dropped, mixing, np.setdiff1d(before.invisible, columns))
 
 
-def _held_out(solution: Solution, found: ConstrainedFit) -> Array:
-    """Residual (rows,) of each configuration under a fit to the others and the prior.
+def _looked(found: ConstrainedFit) -> tuple[Array, Array]:
+    """Leverage (rows,), at most 1, and the residual (rows,) of each configuration under a fit to
+    the others and the prior.
 
     Linearised, with the active constraints kept active: directions of the face are orthonormal by
     the rows of readings and prior together.
     """
-    face, residual = found.face, found.at.residual
-    if not face.shape[1]:
-        return residual
-    observed, weights = solution.problem.observations, solution.problem.weights
-    left_out = observed.configuration if weights.together is None else weights.together
-    rows_of = np.repeat(left_out, observed.size)
-    grown = growth(found.at.B @ face, found.B @ face, np.eye(face.shape[1]), found.e, rows_of)
-    return np.asarray(residual + grown)
+    problem, face, residual = found.posed.problem, found.face, found.at.residual
+    parts, together = problem.parts, problem.weights.together
+    leverage, held = np.zeros(len(residual)), residual.copy()
+
+    def of_part(span: Span) -> None:
+        part = parts.part(span)
+        B = regressor(problem.model, part, found.x, found.columns).B
+        Q, own = part.weights.apply(B) @ face, residual[part.rows]
+        leverage[part.rows] = np.minimum((Q**2).sum(axis=1), 1.0)
+        labels = part.observations.configuration if together is None else together
+        rows_of = np.repeat(labels, parts.observed.size)
+        unit, e = np.eye(face.shape[1]), part.weights.apply(own)
+        held[part.rows] += growth(B @ face, Q, unit, e, rows_of)
+
+    if face.shape[1]:
+        for _ in in_order(whole_groups(parts), of_part):
+            pass
+    return leverage, held

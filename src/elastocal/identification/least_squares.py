@@ -8,7 +8,6 @@ from functools import cached_property
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy.optimize import lsq_linear
 
 from elastocal.errors import ElastocalError
 from elastocal.identification.linear_solver import least_norm
@@ -49,7 +48,7 @@ class Descent:
 
 @dataclass(frozen=True)
 class SumOfSquares:
-    """|e(u)|² + |(u − centre)/tie|² over lower ≤ u ≤ upper, B = −∂e/∂u.
+    """|e(u)|² + |(u − centre)/tie|², B = −∂e/∂u.
 
     `evaluate` gives the R factor of e and of B per unit of u, (p,) in typical sizes; it raises
     ElastocalError where the model has no prediction.  A `tie` (p,) of infinity is none.
@@ -60,8 +59,6 @@ class SumOfSquares:
     evaluate: Callable[[Array], Evaluation]
     tie: Array
     centre: Array
-    lower: Array
-    upper: Array
     evaluate_last: Callable[[Array], Evaluation] | None = None
 
     def cost(self, u: Array, at: Evaluation) -> float:
@@ -75,12 +72,8 @@ class SumOfSquares:
         b = np.concatenate([at.r_factor.projected, (self.centre - u) / self.tie])
         damped = np.vstack([A, np.sqrt(damping) * np.eye(p)])
         target = np.concatenate([b, np.zeros(p)])
-        if np.isfinite(self.lower).any() or np.isfinite(self.upper).any():
-            box = (self.lower - u, self.upper - u)
-            step = lsq_linear(damped, target, box, method="bvls", tol=1e-14).x
-        else:
-            cond = max(at.r_factor.rows, p) * np.finfo(float).eps
-            step = least_norm(damped, target, cond=cond)
+        cond = max(at.r_factor.rows, p) * np.finfo(float).eps
+        step = least_norm(damped, target, cond=cond)
         left = b - A @ step
         return step, float(b @ b - left @ left)
 
@@ -167,7 +160,6 @@ class FitProblem:
     sizes: Array
     tie: Array | None = None
     centre: Array | None = None
-    bounded: bool = False
     # The table in parts, where whoever poses the problem has cut it already.
     cut: Partition | None = None
     among: NDArray[np.int64] | None = None
@@ -182,16 +174,6 @@ class FitProblem:
     def tied_to(self) -> Array:
         """What `tie` ties the columns to."""
         return (self.x if self.centre is None else self.centre)[self.columns]
-
-    @property
-    def limits(self) -> tuple[Array, Array]:
-        """Bounds (columns,) on the variables u of `values`, infinite unless the fit is bounded."""
-        fitted = [self.model.parameters[c] for c in self.columns]
-        if not self.bounded:
-            return np.full(len(fitted), -np.inf), np.full(len(fitted), np.inf)
-        x, size = self.x[self.columns], self.sizes[self.columns]
-        lower, upper = np.array([(p.lower, p.upper) for p in fitted]).T
-        return (lower - x) / size, (upper - x) / size
 
     def values(self, u: Array) -> Array:
         """Parameters (parameters,) with the columns moved by u typical sizes."""
@@ -248,7 +230,7 @@ def fit(problem: FitProblem, max_steps: int = 60, tolerance: float = LARGE_TOLER
     Raises ElastocalError where the start has poses without equilibrium.
     """
     columns = problem.columns
-    size, (lower, upper) = problem.sizes[columns], problem.limits
+    size = problem.sizes[columns]
     tie = np.full(len(columns), np.inf) if problem.tie is None else problem.tie / size
     centre = (problem.tied_to - problem.x[columns]) / size
 
@@ -268,10 +250,9 @@ def fit(problem: FitProblem, max_steps: int = 60, tolerance: float = LARGE_TOLER
         return Evaluation(at.residual, own.scaled(size), at.r_factor)
 
     last = None if problem.among is None else among_others
-    objective = SumOfSquares(evaluated, tie, centre, lower, upper, last)
-    start = np.clip(np.zeros(len(columns)), lower, upper)
+    objective = SumOfSquares(evaluated, tie, centre, last)
     enough = tolerance if problem.reduced else TOLERANCE
-    found = descend(objective, start, enough, max_steps)
+    found = descend(objective, np.zeros(len(columns)), enough, max_steps)
     return Fit(
         problem.values(found.u), found.at.residual, problem.weights.apply(found.at.residual),
         found.at.r_factor.scaled(1 / size), found.converged, found.reason, found.evaluations,

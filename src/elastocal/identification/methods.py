@@ -32,7 +32,6 @@ from elastocal.identification.solve import (
     Solution,
     chosen_again,
     fit_kept,
-    held_at_bounds,
     heldout_of,
 )
 from elastocal.identification.weighted_problem import Weights
@@ -113,8 +112,7 @@ def _settled(
                 break
             start, kept = replace(start, reduction=more), more.kept
             readings = _linearised(model, observed, solution.fit.x, kept, kind)
-    # One that ended at a bound is held there and no longer a column.
-    fitted = readings.take(now).of_columns(np.isin(kept, solution.reduction.kept))
+    fitted = readings.take(now)
     return solution, over_times(estimate_noise(fitted, noise.kind, noise), fitted), now
 
 
@@ -137,11 +135,7 @@ def refined(
     chosen = observed if good.all() else subset(observed, good)
     problem: Problem = replace(start.problem, observations=chosen, weights=weights)
     found = fit_kept(problem, start.sizes, x, start.reduction)
-    reduction = start.reduction
-    if problem.bounded:
-        found, reduction = held_at_bounds(problem, start.sizes, found, reduction)
-    heldout = heldout_of(problem, found)
-    return replace(start, problem=problem, fit=found, reduction=reduction, heldout=heldout)
+    return replace(start, problem=problem, fit=found, heldout=heldout_of(problem, found))
 
 
 # The methods by name.
@@ -239,7 +233,7 @@ def with_limits(every: Solution, found: MethodResult, options: Options) -> Metho
     squares all stay fitted; where bounds or knowledge were given, these say what the readings do
     not, and nothing is held.
     """
-    if options.bounded or options.knows:
+    if options.knows:
         return found
     fitted = found.method in ("reml", "wls", "ols")
     limits: dict[int, tuple[float, float]] = {}
@@ -396,9 +390,9 @@ def _robust(
     method: str, sound: Solution, every: Solution, good: BoolArray, options: Options
 ) -> MethodResult:
     """A robust fit of all readings in the parameters that the good ones determine."""
-    if every.problem.bounded or every.problem.large:
+    if every.problem.large:
         raise InputError(
-            f"the method {method} takes no bounds and no table of this size; use the default "
+            f"the method {method} takes no table of this size; use the default "
             "method, which sets faulty readings apart"
         )
     if options.intervals not in ("auto", "cr3"):

@@ -89,10 +89,6 @@ class Readings:
         order = np.random.default_rng(0).permutation(len(count))
         return self.take(np.isin(code, order[: np.searchsorted(np.cumsum(count[order]), n) + 1]))
 
-    def of_columns(self, chosen: BoolArray) -> Readings:
-        """Only the columns of B where `chosen` (p,) holds."""
-        return replace(self, B=self.B[:, :, chosen])
-
     def moved(self, e: Array) -> Readings:
         """The same readings with other residuals (N, size)."""
         return replace(self, e=e)

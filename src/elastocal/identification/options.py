@@ -47,7 +47,7 @@ class Options:
     robust.  `noise`: the model whose variances reml estimates (structure.noise_models).
     `weights`: auto, none, rows, axis, polar or covariance (then `covariance` (rows, rows) in m²).
     `intervals`: auto goes with the method.  `fixed`: names of parameters held at their start.
-    `bounded`: keep parameters inside their physical bounds.  `constraints` and `prior`: a
+    `constraints` and `prior`: a
     constrained or regularised fit on top of the method's weights (knowledge_fit).  `faulty`:
     readings beyond the noise are set apart (auto: unless they are too many to be reading errors),
     always, or never; they are listed in the result in any case.  `seed`: of multi-start and
@@ -60,7 +60,6 @@ class Options:
     covariance: NDArray[np.float64] | None = None
     intervals: IntervalKind = "auto"
     fixed: tuple[str, ...] = ()
-    bounded: bool = False
     constraints: Constraints | None = None
     prior: GaussianPrior | None = None
     faulty: FaultyReadings = "auto"

@@ -279,7 +279,7 @@ def _fit_to(solution: Solution, good: BoolArray) -> Solution:
     if good.sum() <= len(good) // 2:
         raise InsufficientDataError("fewer than half of the readings agree with each other")
     part = part_of(problem.observations, problem.weights, np.flatnonzero(good))
-    own = replace(problem, observations=part.observations, weights=part.weights, bounded=False)
+    own = replace(problem, observations=part.observations, weights=part.weights)
     placed, found, reduction, *_ = settle(own, solution.sizes)
     return replace(solution, problem=placed, fit=found, reduction=reduction)
 

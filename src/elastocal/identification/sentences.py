@@ -52,10 +52,6 @@ SENTENCES = {
         "The joints settle anew at every visit of the arm (standard deviation {sigma_urad} µrad; "
         "p = {p:.1g}). Weights and intervals account for it. {remedy}"
     ),
-    "at_bound": (
-        "{parameter} stands at its bound {bound:g} {unit}; it is held there and has no interval. "
-        "{remedy}"
-    ),
     "beyond_bound": (
         "{parameter} = {value:.3g} ± {std:.2g} {unit} lies beyond its physical bound {bound:g}: "
         "{remedy}"
@@ -67,8 +63,6 @@ SENTENCES = {
 }
 # The same of several parameters, whose names are told together.
 OF_SEVERAL = {
-    "at_bound": "{named} stand at their bound {bound:g} {unit}; they are held there and have no "
-    "interval. {remedy}",
     "beyond_bound": "{named} lie beyond their physical bound {bound:g} {unit} ({values}): {remedy}",
 }
 

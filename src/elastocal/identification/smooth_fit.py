@@ -386,7 +386,7 @@ def fit_smooth(
         progress("fitting smooth functions")
         search = _Course(every, sound, Functions.of(model, free, sized), options, progress)
         fit, noise, good = search.settled(~faulty)
-        fit, cross = search.without_those_that_harm(search.bounded(fit))
+        fit, cross = search.without_those_that_harm(fit)
         held = rms_3d(cross.held_out, size)
         tried.append((not fit.converged, held, search, (fit, cross, noise, good)))
         # A prior that leads astray predicts worse than the ordinary parameters alone.
@@ -417,7 +417,6 @@ def _without(solution: Solution, sized: IntArray) -> Solution:
         reduction=replace(
             r, kept=r.kept[kept], dropped=r.dropped[dropped], mixing=r.mixing[kept][:, dropped],
             invisible=np.setdiff1d(r.invisible, sized),
-            at_bound=np.setdiff1d(r.at_bound, sized),
         ),
     )  # fmt: skip
 
@@ -547,30 +546,6 @@ class _Course:
         if self.options.faulty == "auto":
             return bool(0 < faulty.mean() <= MOST_SET_ASIDE)
         return self.options.faulty == "drop" and bool(faulty.any())
-
-    def bounded(self, fit: JointFit) -> JointFit:
-        """With ordinary parameters beyond a bound held there, where bounds are asked for."""
-        if not self.options.bounded:
-            return fit
-        for _ in range(3):
-            kept = fit.reduction.kept
-            own = [self.model.parameters[c] for c in kept]
-            low, high = (np.array([getattr(p, s) for p in own]) for s in ("lower", "upper"))
-            at = (fit.x[kept] < low) | (fit.x[kept] > high)
-            if not at.any():
-                break
-            x = fit.x.copy()
-            x[kept] = np.clip(x[kept], low, high)
-            r = fit.reduction
-            inner = replace(
-                r, kept=kept[~at], mixing=r.mixing[~at],
-                at_bound=np.concatenate([r.at_bound, kept[at]]),
-            )  # fmt: skip
-            fit = joint_fit(
-                fit.problem, self.every.sizes, fit.functions, x, inner, fit.scales,
-                choosing=False, sizing=False,
-            )  # fmt: skip
-        return fit
 
     def without_those_that_harm(self, fit: JointFit) -> tuple[JointFit, Crossed]:
         """Without the functions that the readings do not show, or that predict held-out

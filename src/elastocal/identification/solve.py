@@ -59,17 +59,15 @@ class Reduction:
     """`kept` and `dropped` parameter indices; `mixing` (kept, dropped) with B_D ≈ B_K · mixing.
 
     The data determine β_k = X_k + Σ_d mixing[k, d] X_d, the kept parameter with what it stands
-    for.  `invisible` are dropped parameters that move no reading at all,
-    `at_bound` those that a bounded fit holds at their bound, `with_prior` those that were no part
-    of this choice: a prior makes up for what the readings do not say of them.  `threshold`: what
-    it takes to be kept (`reduce`).
+    for.  `invisible` are dropped parameters that move no reading at all, `with_prior` those that
+    were no part of this choice: a prior makes up for what the readings do not say of them.
+    `threshold`: what it takes to be kept (`reduce`).
     """
 
     kept: NDArray[np.int64]
     dropped: NDArray[np.int64]
     mixing: Array
     invisible: NDArray[np.int64]
-    at_bound: NDArray[np.int64] = field(default_factory=lambda: np.zeros(0, dtype=np.int64))
     with_prior: NDArray[np.int64] = field(default_factory=lambda: np.zeros(0, dtype=np.int64))
     threshold: float = 0.0
 
@@ -166,7 +164,7 @@ def _groups(parameters: tuple[Parameter, ...]) -> list[list[int]]:
     return [[i for i, own in enumerate(ranks) if own == rank] for rank in sorted(set(ranks))]
 
 
-# Which parameters are fitted: a minimal complete set, a wider one, what ends at a bound.
+# Which parameters are fitted: a minimal complete set, a wider one.
 
 # A typical deviation must move the data by this many standard deviations to earn a column:
 # at 1, the variance it adds equals the squared bias it removes.
@@ -183,7 +181,6 @@ class Problem:
     weights: Weights
     x0: Array
     free: NDArray[np.int64]
-    bounded: bool = False
 
     @cached_property
     def parts(self) -> Partition:
@@ -197,8 +194,7 @@ class Problem:
     def fit_of(self, columns: NDArray[np.int64], x: Array, sizes: Array) -> FitProblem:
         """The fit of `columns` from x, the other parameters held."""
         return FitProblem(
-            self.model, self.observations, self.weights, x, columns, sizes,
-            bounded=self.bounded, cut=self.parts,
+            self.model, self.observations, self.weights, x, columns, sizes, cut=self.parts
         )  # fmt: skip
 
 
@@ -341,28 +337,7 @@ def _linear_step(
     return moved, held_out_by_parts(problem.model, problem.parts, x, kept, own, step)
 
 
-def held_at_bounds(
-    problem: Problem, sizes: Array, found: Fit, chosen: Reduction
-) -> tuple[Fit, Reduction]:
-    """Refit with the parameters that ended at a bound held there: they have no interval."""
-    lower, upper = (
-        np.array([getattr(problem.model.parameters[c], side) for c in chosen.kept])
-        for side in ("lower", "upper")
-    )
-    x, slack = found.x[chosen.kept], 1e-6 * sizes[chosen.kept]
-    at = (x <= lower + slack) | (x >= upper - slack)
-    if not at.any():
-        return found, chosen
-    start = found.x.copy()
-    start[chosen.kept[at]] = np.where(x <= lower + slack, lower, upper)[at]
-    kept = chosen.kept[~at]
-    if not len(kept):
-        return found, chosen
-    inner = replace(chosen, kept=kept, mixing=chosen.mixing[~at], at_bound=chosen.kept[at])
-    return fit(problem.fit_of(kept, start, sizes)), inner
-
-
-# The course of a fit: place, tie weakly, choose the parameters, fit, compare, hold at bounds.
+# The course of a fit: place, tie weakly, choose the parameters, fit, compare.
 
 # Width of the weak tie that keeps undetermined directions still before they are recognised:
 # in typical sizes for deviations from nominal, in m and rad for what registration placed.
@@ -406,9 +381,6 @@ def solve(
         found, reduction, heldout = prefer_wider(
             problem, sizes, found, reduction, heldout, r_factor
         )
-    if problem.bounded:
-        found, reduction = held_at_bounds(problem, sizes, found, reduction)
-        heldout = heldout_of(problem, found)
     nominal = rms_3d(placed, problem.observations.size)
     return Solution(problem, found, reduction, sizes, heldout, nominal)
 
@@ -571,8 +543,7 @@ def _tied_from(problem: Problem, sizes: Array, x: Array, sigma: float, tolerance
     free = problem.free
     width = np.where(is_placed(problem.model), sizes, LOOSE * sizes)[free]
     while True:
-        untied = replace(problem, bounded=False).fit_of(free, x, sizes)
-        tied = replace(untied, tie=width / sigma, centre=problem.x0)
+        tied = replace(problem.fit_of(free, x, sizes), tie=width / sigma, centre=problem.x0)
         found = fit(tied, max_steps=25, tolerance=tolerance)
         previous, sigma, x = sigma, residual_sigma(found, 0), found.x
         if sigma > 0.7 * previous or sigma <= 1e-12:
