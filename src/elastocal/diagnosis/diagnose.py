@@ -15,7 +15,7 @@ from scipy.special import expit
 
 from elastocal.cell.work_cell import Cell, read_cell
 from elastocal.config import read_toml
-from elastocal.diagnosis.baseline import Baseline, fit_baseline, thinned
+from elastocal.diagnosis.baseline import fit_baseline, thinned
 from elastocal.diagnosis.component_answer import PAYS, SumAnswer
 from elastocal.diagnosis.component_search import CLEARLY, compared_score, search_components
 from elastocal.diagnosis.diagnosis import (
@@ -39,10 +39,8 @@ from elastocal.diagnosis.model_set import settings_of, with_likelier_backlash_mo
 from elastocal.diagnosis.reading_faults import OutlierScreening, screen_outliers
 from elastocal.diagnosis.shrinkage import (
     Confirmation,
-    between_visits,
     budget,
     first_steps,
-    shrinkage,
 )
 from elastocal.diagnosis.stated_floor import FALSE_SMOOTH, noise_floor
 from elastocal.diagnosis.unknown import generic_blocks
@@ -346,7 +344,7 @@ def _of_few(
 ) -> tuple[Answer, dict[str, Any]]:  # fmt: skip
     gap, steps = budget(dataset, found, rng)
     answer = judge(found, gap.open)
-    effects, unknown = _findings(found, answer, dataset.base, gap, rng), answer.unknown
+    effects, unknown = _findings(found, answer, gap, rng), answer.unknown
     return answer, {
         "verdict": answer.verdict,
         "gap": gap,
@@ -440,29 +438,26 @@ def _check_enough(table: Measurements) -> None:
 
 
 def _findings(
-    found: SelectedEffects, answer: Answer, plain: Baseline, gap: Gap, rng: np.random.Generator
+    found: SelectedEffects, answer: Answer, gap: Gap, rng: np.random.Generator
 ) -> tuple[FoundEffect, ...]:
     """The known items with their probabilities, parameters and confirmed shrinkage.
 
     What is unexplained is no noise, and stays whichever effect joins the model; beside something
     without a name so does all that the named effects leave at held-out poses above the noise.
     """
-    chosen, dataset = found.chosen, found.dataset
+    chosen = found.chosen
     known = [k for k, item in enumerate(chosen.items) if item.known]
     if not known:
         return ()
-    confirmation = Confirmation.of(found, plain, rng)
+    confirmation = Confirmation.of(found)
     stays = confirmation.unnamed + gap.unexplained**2
     if chosen.unknown:
         stays = max(stays, gap.explained**2 - gap.noise_floor**2)
     findings = []
     for k in known:
         item = chosen.items[k]
-        posterior_draws = confirmation.posterior_draws(k, answer.rivals[k])
-        change = between_visits(dataset, chosen, k)
-        measured = len(dataset.blocks.member)
-        reduction, ci90, ci95 = shrinkage(posterior_draws, measured, stays, change, rng)
-        fitted, settings = confirmation.parameters[item.key], settings_of(item)
+        reduction, ci90, ci95 = confirmation.reduction(k, answer.rivals[k], stays, rng)
+        fitted, settings = confirmation.parameters(k), settings_of(item)
         findings.append(
             FoundEffect(*item.key, answer.probability[k], reduction, ci90, ci95, fitted, settings)
         )

@@ -6,10 +6,10 @@ from dataclasses import dataclass, replace
 from functools import cache, cached_property
 
 import numpy as np
-from scipy import linalg, optimize
+from scipy import linalg
 
 from elastocal.diagnosis.baseline import Blocks
-from elastocal.engine.climb import STRIDE, climb
+from elastocal.engine.climb import climb
 from elastocal.engine.mixed import (
     LOG_2PI,
     ROUNDING,
@@ -21,7 +21,7 @@ from elastocal.engine.mixed import (
     Whitened,
 )
 from elastocal.engine.sizes import inverse_triangle
-from elastocal.model.evaluate import ahead, thread_count
+from elastocal.model.evaluate import thread_count
 from elastocal.units import Array, BoolArray, IntArray
 
 # The noise floor: tracker noise, repeatability of each joint, scatter common to a configuration.
@@ -316,16 +316,15 @@ def likelihood(data: NoisyData, theta: Array) -> tuple[float, Array, Array]:
     return value + penalty, to.T @ slope + more, to.T @ information @ to + 2 * prior.precision
 
 
-ROUNDS = 10
-SCORED = 30  # steps by the expected curvature
+STEPS = 200  # by the expected curvature; a few of them do mostly
 SOME = 250  # configurations that show where the optimum is
-ENOUGH, LEVEL = 1e-3, 3e-3  # change of −2ℓ, and its slope, at which a search ends
+ENOUGH = 1e-3  # change of −2ℓ at which a search ends
 
 
 def fit_noise(
     data: NoisyData, start: NoiseValues | None = None, enough: float = ENOUGH
 ) -> NoiseValues:
-    """The most probable noise values, by a quasi-Newton search in their logarithms.
+    """The most probable noise values, by steps of the expected curvature in their logarithms.
 
     Where nothing is stated it starts from two ends, unless a start is given; with many
     configurations it comes from some of them to all.  The search ends where −2ℓ changes by less
@@ -353,14 +352,11 @@ def balanced(data: NoisyData) -> NoiseValues:
 
 
 def _climbed(data: NoisyData, start: NoiseValues, enough: float) -> NoiseValues:
-    """Steps by the expected curvature, which few of them need; where they do not end, by L-BFGS."""
     lower, upper = _limits(data)
-    theta, ended = climb(
-        lambda theta: likelihood(data, theta), np.clip(start.logs(), lower, upper), lower, upper,
-        enough, SCORED,
-    )  # fmt: skip
-    found = NoiseValues.of_logs(theta)
-    return found if ended else _climbed_far(data, found, enough)
+    begin = np.clip(start.logs(), lower, upper)
+    return NoiseValues.of_logs(
+        climb(lambda at: likelihood(data, at), begin, lower, upper, enough, STEPS)[0]
+    )
 
 
 def _limits(data: NoisyData) -> tuple[Array, Array]:
@@ -372,77 +368,3 @@ def _limits(data: NoisyData) -> tuple[Array, Array]:
         np.array([-4 * spread, *[-5.0] * n, *[least] * n]),
         np.array([4 * spread, *[5.0] * n, *[most] * n]),
     )
-
-
-def _climbed_far(data: NoisyData, start: NoiseValues, enough: float) -> NoiseValues:
-    n = data.G.shape[2]
-    # Roughly the roots of −2ℓ's curvatures: a first step along its slope else is one of the factor.
-    curved = np.sqrt([3 * data.n_rows, *[len(data.r) / 9] * n, *[len(data.r)] * n])
-    known: dict[bytes, tuple[float, Array]] = {}
-
-    def cost(scaled: Array) -> tuple[float, Array]:
-        # A search begins where it has been: at the start, and where the last stride ended.
-        key = scaled.tobytes()
-        if key not in known:
-            value, slope, _ = likelihood(data, scaled / curved)
-            known[key] = value, slope / curved
-        value, slope = known[key]
-        return value, slope.copy()
-
-    lower, upper = (curved * limit for limit in _limits(data))
-    theta = np.clip(curved * start.logs(), lower, upper)
-    ftol = enough / max(abs(cost(theta)[0]), 1.0)
-    # Step by step: one long stride of the line search ends where V is singular to rounding.
-    # A round ends at the first small gain, often that of a poor first direction: the search is
-    # over when a whole round gains nothing.
-    for _ in range(ROUNDS):
-        stride = STRIDE * curved
-        low, high = np.maximum(lower, theta - stride), np.minimum(upper, theta + stride)
-        found = optimize.minimize(
-            cost, theta, jac=True, method="L-BFGS-B", bounds=list(zip(low, high, strict=True)),
-            options={"maxiter": 60, "ftol": ftol, "gtol": LEVEL * enough / ENOUGH},
-        )  # fmt: skip
-        gain, theta = cost(theta)[0] - float(found.fun), found.x
-        inside = (theta > low) & (theta < high) | (theta == lower) | (theta == upper)
-        if inside.all() and gain < enough:
-            break
-    return NoiseValues.of_logs(theta / curved)
-
-
-# What the noise may be instead: draws about its most probable values.
-
-STEP = 0.05  # of the logarithms, for a difference quotient of the likelihood's slope
-FLATTEST = 0.5  # smallest curvature of −2ℓ: where the prior is all that holds a logarithm
-TRIED = 6  # draws from the Gaussian for each that is kept
-
-
-def noise_draws(
-    data: NoisyData, noise: NoiseValues, n: int, rng: np.random.Generator
-) -> list[NoiseValues]:
-    """n draws of the noise values from likelihood times prior.
-
-    Of draws from the Gaussian about the maximum, logarithms with covariance 2 (∂²(−2ℓ))⁻¹, some
-    are kept, each with the probability that it has beside what the Gaussian gives it (sampling
-    importance resampling, Rubin 1988): a joint's scatter may be anything below what shows.
-    """
-    theta = noise.logs()
-    k = len(theta)
-
-    def slope(at: Array) -> Array:
-        return likelihood(data, at)[1]
-
-    steps = STEP * np.concatenate([np.eye(k), -np.eye(k)])
-    up, down = np.split(np.array(list(ahead(slope, theta + steps, data.threads))), 2)
-    H = (up - down) / (2 * STEP)
-    values, vectors = np.linalg.eigh((H + H.T) / 2)
-    root = vectors * np.sqrt(2 / np.maximum(values, FLATTEST))
-    z = rng.normal(size=(TRIED * n, k))
-    drawn = theta + z @ root.T
-    joints = slice(1 + len(noise.joint), None)
-    drawn[:, joints] = np.clip(drawn[:, joints], np.log(SMALLEST_NOISE), np.log(LARGEST))
-    each = ahead(lambda at: posterior(data, NoiseValues.of_logs(at)), drawn, data.threads)
-    minus_two = np.array(list(each))
-    log_weight = -0.5 * minus_two + 0.5 * (z**2).sum(axis=1)
-    weight = np.exp(log_weight - log_weight.max())
-    kept = rng.choice(len(drawn), n, p=weight / weight.sum())
-    return [NoiseValues.of_logs(drawn[i]) for i in kept]

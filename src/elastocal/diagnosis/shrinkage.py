@@ -2,17 +2,13 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property
 from typing import NamedTuple
 
 import numpy as np
-from numpy.typing import NDArray
-from scipy import linalg
-from scipy.spatial import cKDTree
 
-from elastocal.diagnosis.baseline import Baseline, from_centre, prior_deviations
 from elastocal.diagnosis.diagnosis import FittedParameter, Gap
 from elastocal.diagnosis.diagnosis_data import DiagnosisData
 from elastocal.diagnosis.effect_search import SelectedEffects
@@ -22,29 +18,23 @@ from elastocal.diagnosis.model_set import (
     Item,
     ModelSet,
     beside,
-    extended,
-    fit_extended,
     fit_set,
     signal_of,
-    under_other_backlash_model,
+    spans_of,
     with_items,
 )
-from elastocal.diagnosis.noise_floor import NoiseValues, NoisyData, noise_draws, project
+from elastocal.diagnosis.noise_floor import NoisyData, Projection, covariance, project
 from elastocal.diagnosis.stated_floor import (
     left_out_residual,
     left_out_together,
-    nearest,
     squared_lengths,
     supported_floor,
 )
 from elastocal.identification.error_budget import BudgetStep, resampled_rms
 from elastocal.identification.scrutiny import stage_of
-from elastocal.measurements import Measurements, visits
+from elastocal.model.effects.loads import PayloadError
 from elastocal.model.effects.placements import BaseFrame
-from elastocal.model.effects.play import Backlash
-from elastocal.model.manipulator import Model, Regression
-from elastocal.model.observations import Observations, observe
-from elastocal.units import Array, IntArray
+from elastocal.units import Array, BoolArray, IntArray
 
 
 def rms_with_interval(
@@ -122,18 +112,23 @@ def _fitted_steps(dataset: DiagnosisData) -> Iterator[tuple[str, NoisyData]]:
 
 # How far the gap shrinks on poses that had no part in choosing or fitting the effect.
 #
-# The error of a model at a new pose is its prediction less the true arm's, without noise:
+# A configuration c that is left out of a fit is a new pose for it.  The error of a model there is
+# its prediction less the true arm's, without noise:
 #
-#     e(θ*) = f(q, x̂) − h(q, θ*),    θ* ~ posterior given all data,
+#     before   e_c = X_c β̂₋c − W_c θ*,    after   e_c = W_c (θ̂ − θ*),
 #
-# where f is the model before and after the effect is added, each fitted by the instrument's noise
-# as a calibration would, and h what is held to be true: at times a rival or another constant,
-# as probable as each is, which charges the interval for the selection.  The remaining fraction is
-# the ratio of the rms errors over a set of NEW_POSES, drawn anew for every θ* from a population
-# that is itself known from the campaign's poses only (Bayesian bootstrap, Rubin 1981).
+# each fitted by the instrument's noise, as a calibration would that knows nothing of the joints'
+# scatter.  θ* is drawn from the posterior given all data, its spread about what is most probable at
+# c as large as without c.  W are the columns of what is held to be true: at times a rival or
+# another constant, as probable as each is, which charges the interval for the selection.
+# The remaining fraction is the ratio of the rms errors over a set of NEW_POSES, drawn anew for
+# every θ* from a population that is itself known from the campaign's poses only (Bayesian
+# bootstrap, Rubin 1981).
 
 BOOTSTRAP_DRAWS = 400
 NEW_POSES = 100  # in the set that the intervals are for
+NUDGE = 0.01  # of a setting's grid step: a difference quotient in constants that are not parameters
+WORTH_A_DRAW = 0.01  # probability from which a rival may be drawn as true
 
 
 class Shrinkage(NamedTuple):
@@ -153,15 +148,12 @@ class Shrinkage(NamedTuple):
 
 
 @dataclass(frozen=True)
-class PosteriorDraw:
-    """A draw from the posterior predictive, at its most probable values: errors (rows, components)
-    of the models `before` and `after` at new poses if it is true.  It moves by `spread` (rows,
-    components, k) times standard normal numbers.  `pose` (rows,) numbers each reading's pose."""
+class Truth:
+    """What may be true: the most probable readings (readings, components) without noise, which
+    move by `spread` (readings, components, k) times standard normal numbers."""
 
-    before: Array
-    after: Array
+    readings: Array
     spread: Array
-    pose: NDArray[np.int64]
     probability: float
 
 
@@ -177,240 +169,208 @@ class Change:
 
 
 def shrinkage(
-    posterior_draws: Sequence[PosteriorDraw], measured: int, unnamed: float, change: Change,
-    rng: np.random.Generator,
+    predicted: tuple[Array, Array], truths: Sequence[Truth], pose: IntArray, unnamed: float,
+    change: Change, rng: np.random.Generator,
 ) -> Shrinkage:  # fmt: skip
-    """Reduction of the rms error from before to after, one of the draws being true.
+    """Reduction of the rms error from before to after, one of the truths being true.
 
-    `measured` is the number of poses that tell what poses there are; `unnamed` (m²) the mean
-    squared length of what is known to be there without a name: neither model has it, and it is
-    taken to be as large at new poses as it was at the measured ones.
+    `predicted` (readings, components) before and after, at the configurations `pose` (readings,);
+    `unnamed` (m²) the mean squared length of what is known to be there
+    without a name: neither model has it.
     """
-    weights = np.array([draw.probability for draw in posterior_draws])
-    which = rng.choice(len(posterior_draws), BOOTSTRAP_DRAWS, p=weights / weights.sum())
-    parts = [
-        _reductions(posterior_draws[k], int((which == k).sum()), measured, unnamed, change, rng)
-        for k in np.unique(which)
-    ]
+    weights = np.array([truth.probability for truth in truths])
+    which = rng.choice(len(truths), BOOTSTRAP_DRAWS, p=weights / weights.sum())
+    _, at, count = np.unique(pose, return_inverse=True, return_counts=True)
+    parts = []
+    for k in np.unique(which):
+        truth, n = truths[k], int((which == k).sum())
+        moved = truth.spread @ rng.normal(size=(truth.spread.shape[2], n))
+        chosen = rng.multinomial(NEW_POSES, rng.dirichlet(np.ones(len(count)), n))
+        before, after = (
+            _mean_square(each - truth.readings, moved, at, chosen, count) + unnamed
+            for each in predicted
+        )
+        times = round(NEW_POSES * change.visits)
+        late = rng.binomial(times, change.share * rng.random(n)) / times
+        after = after + late * change.square
+        parts.append(1 - np.sqrt(after / np.maximum(before, 1e-300)))
     return Shrinkage.of(np.concatenate(parts))
 
 
-def _reductions(
-    draw: PosteriorDraw, n: int, measured: int, unnamed: float, change: Change,
-    rng: np.random.Generator,
-) -> Array:  # fmt: skip
-    moved = draw.spread @ rng.normal(size=(draw.spread.shape[2], n))
-    poses, at, count = np.unique(draw.pose, return_inverse=True, return_counts=True)
-    share = rng.dirichlet(np.full(len(poses), measured / len(poses)), n)
-    chosen = rng.multinomial(NEW_POSES, share)
-    mean = []
-    for error in (draw.before, draw.after):
-        squares = ((error[:, :, None] - moved) ** 2).sum(axis=1)
-        total = np.zeros((len(poses), n))
-        np.add.at(total, at, squares)
-        readings = chosen @ count
-        mean.append((chosen.T * total).sum(axis=0) / readings + unnamed)
-    times = round(NEW_POSES * change.visits)
-    late = rng.binomial(times, change.share * rng.random(n)) / times
-    mean[1] = mean[1] + late * change.square
-    return np.asarray(1 - np.sqrt(mean[1] / np.maximum(mean[0], 1e-300)))
+def _mean_square(
+    error: Array, moved: Array, at: IntArray, chosen: IntArray, count: IntArray
+) -> Array:
+    """Mean squared length (n,) per reading of errors (readings, components) less what the draws
+    have `moved` (readings, components, n), in n sets of poses, each `chosen` (n, poses) times."""
+    squares = ((error[:, :, None] - moved) ** 2).sum(axis=1)
+    total = np.zeros((len(count), squares.shape[1]))
+    np.add.at(total, at, squares)
+    return np.asarray((chosen.T * total).sum(axis=0) / (chosen @ count))
 
 
-# Poses that had no part in a fit: those that another campaign of the same kind might visit.
+@dataclass(frozen=True)
+class Confirmation:
+    """What the set says of its known items: parameters, and how far each lowers the error."""
 
-CANDIDATES = 10  # times as many poses as are wanted
-UNLIKE = 0.01  # chance of poses so unlike the measured ones, if all came from one population
-PERMUTED = 199  # allotments of the names "measured" and "new" that it is judged by
-NEIGHBOURS = 4  # of a pose, between which and itself a new one may lie
-ROUNDS, HEAVIEST = 20, 20.0  # of raking, and how many times the mean weight a pose may count
+    dataset: DiagnosisData
+    chosen: ModelSet
 
+    @classmethod
+    def of(cls, found: SelectedEffects) -> Confirmation:
+        """Without the load point's tolerance: what is only uncertain of it is no error of the
+        model."""
+        dataset, data = found.dataset, found.dataset.data
+        own = np.array([name != PayloadError.name for name in dataset.fitted])
+        data = replace(data, X=data.X[:, :, own], precision=data.precision[own])
+        return cls(replace(dataset, data=data), found.chosen)
 
-def new_pose_table(
-    model: Model, table: Measurements, n: int, rng: np.random.Generator
-) -> Measurements:
-    """n new configurations like those of the table.
+    def parameters(self, k: int) -> tuple[FittedParameter, ...]:
+        """The values of item k's parameters, weighted by all the noise that was found."""
+        dataset, what = self.dataset, self.chosen.items[k].what
+        assert isinstance(what, Hypothesis)
+        items, scales = self.chosen.items, _wide(self.chosen.scales)
+        at = project(with_items(dataset, items, scales), self.chosen.noise)
+        span = self._span(items, k)
+        beta, std = at.beta[span], np.linalg.norm(at.beta_deviation[:, span], axis=0)
+        model, columns = dataset.base.model, dataset.columns
+        start = np.array([p.nominal for p in what.parameters])
+        if what.effect.starts(what.where, model.chain, model.cell):
+            # The geometry of what was sought from many starts is counted from the best of them.
+            start[1:] = columns.x[columns.places[what.key]][1:]
+        size = dataset.sizes[what.key]
+        return tuple(
+            FittedParameter(f"{what.where}.{p.key}", float(value), p.unit, float(spread))
+            for p, value, spread in zip(
+                what.parameters, start + beta * size, std * size, strict=True
+            )
+        )
 
-    Each repeats the load states, repeats and markers of one that was measured.  Every joint's
-    angle (with the side it came from, and the torque at it) is that of another one drawn at
-    random, independently of the other joints, and all markers stay inside the box that the
-    measured ones show: floor and fixtures keep new poses out of the same regions (unless
-    hardly any is inside).  Of those, angles that lead out of the box more often are chosen more
-    often, until every joint is as far from its middle as it was in the campaign.  Times are
-    uniform over the campaign's.  Readings are left as they are and mean nothing.
+    def reduction(
+        self, k: int, rivals: Sequence[tuple[Item, float]], stays: float, rng: np.random.Generator
+    ) -> Shrinkage:
+        """By how much the error falls with item k, if what is true is that item at any plausible
+        setting or one of its `rivals`, of which itself is the first, with their probabilities.
 
-    Where the campaign's joints depend on each other (a grid of positions, the tool held upright),
-    such poses are unlike the measured ones; then each lies near a measured one instead, up to half
-    the way towards or away from one of its neighbours.
-    """
-    drawn, donors = _recombined(table, CANDIDATES * n, rng)
-    inside = _inside(model, table, drawn, n)
-    chosen = rng.choice(inside, n, replace=False, p=_raked(donors[inside]))
-    new = drawn.take(np.isin(drawn.configuration, chosen))
-    if _unlike(_joints(table), _joints(new), rng):
-        drawn = _beside_measured(table, CANDIDATES * n, rng)
-        chosen = rng.choice(_inside(model, table, drawn, n), n, replace=False)
-        new = drawn.take(np.isin(drawn.configuration, chosen))
-    return new
+        `stays` (m²) is what is there without a name.
+        """
+        dataset, chosen, scales = self.dataset, self.chosen, self.chosen.scales
+        known = [n for n, item in enumerate(chosen.items) if item.known]
+        predicted = self._before([n for n in known if n != k]), self._after(known)
+        truths = [
+            self._truth(self._instead(k, item), scales, k, rivals[0][1] * share)
+            for item, share in other_settings(dataset, chosen, k)
+        ]
+        for item, share in rivals[1:]:
+            if share >= WORTH_A_DRAW and item.known:
+                rival = fit_set(dataset, self._instead(k, item), chosen.noise)
+                truths.append(self._truth(rival.items, rival.scales, k, share))
+        pose, change = np.nonzero(self._used)[0], between_visits(dataset, chosen, k)
+        return shrinkage(predicted, truths, pose, stays, change, rng)
 
+    def _instead(self, k: int, item: Item) -> tuple[Item, ...]:
+        return (*self.chosen.items[:k], item, *self.chosen.items[k + 1 :])
 
-def _inside(model: Model, table: Measurements, drawn: Measurements, n: int) -> IntArray:
-    """Configurations of `drawn` inside the table's box; all of them where fewer than n are."""
-    low, high = _box(model.target_poses(table)[1], table.configuration)
-    at = model.target_poses(drawn)[1]
-    outside = ((at < low) | (at > high)).any(axis=1)
-    inside = np.setdiff1d(drawn.configuration, drawn.configuration[outside])
-    return inside if len(inside) >= n else np.unique(drawn.configuration)
+    def _span(self, items: Sequence[Item], k: int) -> slice:
+        """Where item k's coefficients stand behind the fitted parameters'."""
+        widths = [item.width for item in items]
+        return spans_of(widths, self.dataset.data.X.shape[2] + sum(widths))[k]
 
+    @cached_property
+    def _used(self) -> BoolArray:
+        """Readings (C, M) that count."""
+        blocks = self.dataset.blocks
+        left_out = self.chosen.data.left_out.reshape(*blocks.member.shape, blocks.size)
+        return np.asarray(~left_out[:, :, 0])
 
-def _joints(table: Measurements) -> Array:
-    return table.q[np.unique(table.configuration, return_index=True)[1]]
+    def _lengths(self, packed: Array) -> Array:
+        """Packed (C, m, …) → what counts of positions or distances (readings, components, …)."""
+        size = self.dataset.blocks.size
+        rows = packed.reshape(*self._used.shape, size, *packed.shape[2:])[self._used]
+        return np.asarray(rows[:, : min(size, 3)])
 
+    def _before(self, members: Sequence[int]) -> Array:
+        """What the model with these items alone predicts of each configuration that is left out."""
+        data, at = self._fit(members)
+        together = left_out_together(self.dataset, self.chosen)
+        return self._lengths(data.r - left_out_residual(at, together))
 
-def _unlike(measured: Array, new: Array, rng: np.random.Generator) -> bool:
-    """Whether poses `new` (m, joints) are of another population than the `measured` (n, joints).
+    def _after(self, members: Sequence[int]) -> Array:
+        """What the model with all items that have a name predicts."""
+        data, at = self._fit(members)
+        return self._lengths(data.X @ at.beta)
 
-    By how many have their nearest neighbour among their own kind (Schilling 1986, J. Am. Stat.
-    Assoc. 81), against the same names allotted at random.
-    """
-    if len(measured) > len(new):
-        measured = measured[rng.choice(len(measured), len(new), replace=False)]
-    both = np.concatenate([measured, new])
-    near = nearest(both / np.maximum(measured.std(axis=0), 1e-12))[0][:, 1]
-    kind = np.arange(len(both)) < len(measured)
-    own = int((kind == kind[near]).sum())
-    allotted = rng.permuted(np.tile(kind, (PERMUTED, 1)), axis=1)
-    as_many = (allotted == allotted[:, near]).sum(axis=1) >= own
-    return bool((1 + as_many.sum()) / (1 + PERMUTED) <= UNLIKE)
+    def _fit(self, members: Sequence[int]) -> tuple[NoisyData, Projection]:
+        chosen = self.chosen
+        items = tuple(chosen.items[n] for n in members)
+        data = with_items(self.dataset, items, _wide([chosen.scales[n] for n in members]))
+        return data, project(data, chosen.noise.of_instrument())
 
+    def _truth(
+        self, items: tuple[Item, ...], scales: Sequence[float], k: int, probability: float
+    ) -> Truth:
+        """If that set is true."""
+        data, noise = with_items(self.dataset, items, _wide(scales)), self.chosen.noise
+        slopes = self._by_constants(items[k], project(data, noise).beta[self._span(items, k)])
+        # What has no name stays with both models, and is told by its size.
+        own = np.ones(data.X.shape[2] + slopes.shape[2], dtype=bool)
+        for n, other in enumerate(items):
+            own[self._span(items, n)] = other.known
+        data = data.with_columns(slopes, np.ones(slopes.shape[2]))
+        at, W = project(data, noise), self._lengths(data.X)[:, :, own]
+        spread = W @ at.beta_deviation[:, own].T
+        return Truth(W @ at.beta[own], spread * self._grown(at, spread), probability)
 
-def _beside_measured(table: Measurements, n: int, rng: np.random.Generator) -> Measurements:
-    """n poses, each a measured one moved by up to half the way to one of its neighbours, or by as
-    much away from it."""
-    codes, first = np.unique(table.configuration, return_index=True)
-    q = table.q[first]
-    scaled = q / np.maximum(q.std(axis=0), 1e-12)
-    k = min(NEIGHBOURS, len(q) - 1)
-    near = cKDTree(scaled).query(scaled, k=k + 1)[1]
-    own = rng.integers(len(codes), size=n)
-    other = near[own, rng.integers(1, k + 1, n)]
-    step = rng.uniform(-0.5, 0.5, (n, 1)) * (q[other] - q[own])
-    rows_of = [np.flatnonzero(table.configuration == c) for c in codes]
-    new, _ = _repeated(table, [rows_of[c] for c in own])
-    new = replace(new, q=new.q + step[new.configuration])
-    return _timed(new, table, rng)
+    def _grown(self, at: Projection, spread: Array) -> Array:
+        """By how much (readings, 1, 1) more is uncertain of each configuration where it is left
+        out of the fit: its readings less what they are predicted to be have covariance P_cc⁻¹."""
+        V, all_ = (
+            self._lengths(np.diagonal(each, axis1=1, axis2=2)).sum(axis=1)
+            for each in (covariance(self.chosen.data, self.chosen.noise), np.linalg.inv(at.P))
+        )
+        pose = np.nonzero(self._used)[0]
+        own, left_out = (
+            np.bincount(pose, each) for each in ((spread**2).sum(axis=(1, 2)), all_ - V)
+        )
+        return np.asarray(np.sqrt(left_out / np.maximum(own, 1e-300))[pose, None, None])
 
+    def _by_constants(self, item: Item, beta: Array) -> Array:
+        """Difference quotients (C, m, k) in the item's constants that vary smoothly, each by the
+        step of the grid it was searched on: it is not known better than the data tell."""
+        what, dataset, out = item.what, self.dataset, [np.zeros((*self.dataset.data.r.shape, 0))]
+        assert isinstance(what, Hypothesis)
+        for s, setting in enumerate(what.settings):
+            if setting.kind == "change_time":
+                continue
+            grid = dataset.grids[what.key]
+            step = float(grid.step[grid.nearest(item.settings), s])
+            # At a bound, where the search may well end, the quotient is one-sided.
+            near = item.settings[s] + NUDGE * step * np.array([1.0, -1.0])
+            near = np.clip(near, setting.lower, setting.upper)
+            up, down = np.tile(item.settings, (2, 1))
+            up[s], down[s] = near
+            moved = dataset.packed(what, up) @ beta - dataset.packed(what, down) @ beta
+            out.append(dataset.data.masked(moved)[:, :, None] * step / (near[0] - near[1]))
+        return np.concatenate(out, axis=2)
 
-def _repeated(table: Measurements, rows: list[IntArray]) -> tuple[Measurements, IntArray]:
-    """A configuration for each of the groups of rows, with fresh numbers; and each row's place
-    in its group."""
-    n = len(rows)
-    configuration = np.repeat(np.arange(n), [len(r) for r in rows])
-    labels = tuple(str(c + 1) for c in range(n))
-    new = table.take(np.concatenate(rows))
-    new = replace(new, configuration=configuration, configuration_labels=labels)
-    return new, np.concatenate([np.arange(len(r)) for r in rows])
-
-
-def _raked(donors: IntArray) -> Array:
-    """Probabilities (n,) of poses so that each donor of a joint's angle, `donors` (n, joints), is
-    as probable as the others: raking (Deming and Stephan 1940, Ann. Math. Stat. 11)."""
-    weight = np.full(len(donors), 1 / len(donors))
-    for _ in range(ROUNDS):
-        for of_joint in donors.T:
-            share = np.bincount(of_joint, weight)
-            wanted = 1 / np.count_nonzero(share)
-            weight *= (wanted / np.where(share > 0, share, 1.0))[of_joint]
-        weight = np.minimum(weight, HEAVIEST / len(weight))
-        weight /= weight.sum()
-    return weight
-
-
-def _box(at: Array, configuration: IntArray) -> tuple[Array, Array]:
-    """Ends (3,) of the box that positions `at` (n_rows, 3) were drawn from.
-
-    n draws leave a part of 1/(n + 1) beyond each end on average, as long as the step from the last
-    configuration to the one before it; without it the poses that err most would be missing.
-    """
-    codes = np.unique(configuration)
-    low = np.sort([at[configuration == c].min(axis=0) for c in codes], axis=0)
-    high = np.sort([at[configuration == c].max(axis=0) for c in codes], axis=0)
-    return 2 * low[0] - low[min(1, len(low) - 1)], 2 * high[-1] - high[max(-2, -len(high))]
-
-
-# What a table says of each joint by itself.
-OF_JOINTS = ("q", "approach", "torque", "move", "direction")
-
-
-def _recombined(
-    table: Measurements, n: int, rng: np.random.Generator
-) -> tuple[Measurements, IntArray]:
-    """n poses, and which measured configuration (n, joints) each joint's angle is from."""
-    codes = np.unique(table.configuration)
-    rows_of = [np.flatnonzero(table.configuration == c) for c in codes]
-    new, place = _repeated(table, [rows_of[k] for k in rng.integers(len(codes), size=n)])
-    configuration = new.configuration
-    own = {name: getattr(new, name) for name in OF_JOINTS}
-    donors = rng.integers(len(codes), size=(n, table.q.shape[1]))
-    count, every = np.array([len(rows) for rows in rows_of]), np.concatenate(rows_of)
-    begin = np.cumsum(count) - count
-    for j, of_joint in enumerate(donors.T):
-        of = of_joint[configuration]
-        source = every[begin[of] + place % count[of]]
-        for name, values in own.items():
-            if values is not None:
-                values[:, j] = getattr(table, name)[source, j]
-    return _timed(new, table, rng), donors
-
-
-def _timed(new: Measurements, table: Measurements, rng: np.random.Generator) -> Measurements:
-    """`new` at times uniform over those of the table, as warm as it was then."""
-    if table.time is None:
-        return new
-    at = visits(new)
-    time = rng.uniform(table.time.min(), table.time.max(), at.max() + 1)[at]
-    warmth = None
-    if table.temperature is not None:
-        order = np.argsort(table.time)
-        warmth = np.interp(time, table.time[order], table.temperature[order])
-    return replace(new, time=time, temperature=warmth)
-
-
-# The nonlinear fit of the model with the found effects in it, weighted by the fitted noise.
+    @cached_property
+    def unnamed(self) -> float:
+        """Mean squared length (m²) of what is in the set without a name, of each block what the
+        fitted parameters cannot follow: the error of configurations left out of a fit to it."""
+        total = 0.0
+        for k, item in enumerate(self.chosen.items):
+            if not item.known:
+                signal = signal_of(self.dataset, self.chosen, k)
+                alone = replace(beside(self.dataset, self.chosen, k), r=signal)
+                error = left_out_residual(project(alone, self.chosen.noise.of_instrument()))
+                squares, count = squared_lengths(alone, alone.masked(error))
+                total += float(squares.sum() / count.sum())
+        return total
 
 
-def posteriors(
-    dataset: DiagnosisData, base: Baseline, at: Regression, noises: Sequence[NoiseValues],
-    further: Array | None = None, prior: Mapping[str, float] | None = None,
-) -> Iterator[tuple[Array, Array]]:  # fmt: skip
-    """One step from the fit `base`, at which the model is evaluated, to the readings of `dataset`
-    under each of the noises: x (parameters,) and S (parameters, k), so that x + S z with standard
-    normal z is a draw from what the data leave possible.
-
-    `further` (rows, k) columns of constants that are not among the model's parameters, scaled to
-    their prior deviations, stand last: at zero in x.  `prior` holds standard deviations of
-    parameters by name, where they are not wide.
-    """
-    wide = dict(zip(base.model.names, prior_deviations(base), strict=True))
-    width = np.array([(prior or {}).get(name, wide[name]) for name in wide])
-    B = at.B * width
-    away = from_centre(base)
-    # What no reading shows and nobody has sized, as friction that grows with a load where there is
-    # none, has no width: it stays.
-    residual = at.residual + B @ np.divide(away, width, out=np.zeros_like(away), where=width > 0)
-    centre = base.x - away
-    if further is not None:
-        k = further.shape[1]
-        B, width = np.hstack([B, further]), np.append(width, np.ones(k))
-        centre = np.append(centre, np.zeros(k))
-    pack, size = dataset.blocks.pack, base.observed.size
-    data = replace(
-        dataset.data, r=pack(residual.reshape(-1, size, 1))[:, :, 0],
-        X=pack(B.reshape(-1, size, B.shape[1])), precision=np.ones(B.shape[1]),
-    )  # fmt: skip
-    for noise in noises:
-        fit = project(data, noise)
-        spread = linalg.solve_triangular(fit.factor, np.diag(width), lower=True).T
-        yield centre + width * fit.beta, spread
+def _wide(scales: Sequence[float]) -> tuple[float, ...]:
+    """Typical sizes, or larger where the readings prefer that: a tie to the usual size would make
+    what is true smaller than what was found."""
+    return tuple(max(scale, 1.0) for scale in scales)
 
 
 # What an effect's searched constants may be instead, and what that does at new poses.
@@ -465,187 +425,3 @@ def between_visits(dataset: DiagnosisData, chosen: ModelSet, k: int) -> Change:
     shown = squares > 0
     per_reading = float(squares[shown].sum() / max(count[shown].sum(), 1))
     return Change(per_reading, pause / 2, float(dataset.present.sum() / len(dataset.present)))
-
-
-# What may be true at new poses, given what was found: each as probable as it is.
-
-DRAWN = 200  # new poses that the sets are drawn from
-NOISES = 10  # values of the noise that what may be true is drawn under
-NUDGE = 0.01  # of a setting's grid step: a difference quotient in constants that are not parameters
-WORTH_A_DRAW = 0.01  # probability from which a rival may be drawn as true
-
-
-@dataclass(frozen=True)
-class Confirmation:
-    """Models before and after effects are added, and new poses to compare them at.
-
-    `fitted` is the exact model with all known effects, fitted to the readings; `plain` the cell's
-    own model.
-    """
-
-    dataset: DiagnosisData
-    chosen: ModelSet
-    plain: Baseline
-    fitted: Baseline
-    observed: Observations
-    noise: tuple[NoiseValues, ...]
-
-    @classmethod
-    def of(cls, found: SelectedEffects, plain: Baseline, rng: np.random.Generator) -> Confirmation:
-        chosen, dataset = found.chosen, found.dataset
-        fitted = fit_extended(dataset, chosen, _known(chosen.items))
-        table = new_pose_table(plain.model, plain.observed.table, DRAWN, rng)
-        observed = observe(table, plain.model.observe)
-        noise = noise_draws(chosen.data, chosen.noise, NOISES, rng)
-        return cls(dataset, chosen, plain, fitted, observed, tuple(noise))
-
-    @cached_property
-    def parameters(self) -> dict[tuple[str, str], tuple[FittedParameter, ...]]:
-        """The exact model's values by effect and place, weighted by all the noise that was
-        found."""
-        measured, noise = self._regressions(self.fitted)[0], self.chosen.noise
-        values, spreads = next(posteriors(self.dataset, self.fitted, measured, [noise]))
-        out: dict[tuple[str, str], tuple[FittedParameter, ...]] = {}
-        for p, x, spread in zip(self.fitted.model.parameters, values, spreads, strict=True):
-            found = FittedParameter(p.name, float(x), p.unit, float(np.linalg.norm(spread)))
-            out[p.effect, p.where] = (*out.get((p.effect, p.where), ()), found)
-        return out
-
-    @cached_property
-    def _known_regressions(self) -> dict[tuple[Model, bytes], tuple[Regression, Regression]]:
-        return {}
-
-    def _regressions(self, base: Baseline) -> tuple[Regression, Regression]:
-        """A model at the measured rows and at the new ones; kept, since the draws of all items
-        begin with the one that was fitted."""
-        key = base.model, base.x.tobytes()
-        if key not in self._known_regressions:
-            measured, new = (
-                base.model.regressor(observed.table, base.x, observations=observed)
-                for observed in (base.observed, self.observed)
-            )
-            self._known_regressions[key] = measured, new
-        return self._known_regressions[key]
-
-    def posterior_draws(
-        self, k: int, rivals: tuple[tuple[Item, float], ...]
-    ) -> list[PosteriorDraw]:
-        """Errors without and with item k if what is true is item k at any plausible setting, or
-        one of its `rivals`, of which itself is the first, with their probabilities.
-
-        Before it the model is fitted as a calibration would that knows nothing of the joints'
-        scatter: the scatter fitted beside a missing effect is the effect, which weights by it
-        would spare.
-        """
-        others = _known(self.chosen.without(k))
-        plain = fit_extended(self.dataset, self.chosen, others) if others else self.plain
-        before = plain.model.predict(self.observed.table, plain.x, self.observed)
-        out = []
-        for item, share in other_settings(self.dataset, self.chosen, k):
-            like = replace(self.chosen, items=self._with(k, item))
-            at = replace(self.fitted, model=extended(self.plain.model, _known(like.items)))
-            out += self._draws(at, like, item, before, rivals[0][1] * share)
-        out = self._under_both_backlash_models(k, before, out)
-        for item, share in rivals[1:]:
-            if share < WORTH_A_DRAW or not item.known:
-                continue
-            rival = fit_set(self.dataset, self._with(k, item), self.chosen.noise)
-            at = fit_extended(self.dataset, rival, _known(rival.items))
-            out += self._draws(at, rival, item, before, share)
-        return out
-
-    def _under_both_backlash_models(
-        self, k: int, before: Array, posterior_draws: list[PosteriorDraw]
-    ) -> list[PosteriorDraw]:
-        """What is true if item k, where it is play, follows its law, and if it follows another."""
-        doubt, item = self.dataset.other_backlash, self.chosen.items[k]
-        if not (isinstance(item.what, Hypothesis) and item.what.name == Backlash.name and doubt):
-            return posterior_draws
-        held = [replace(d, probability=d.probability * (1 - doubt)) for d in posterior_draws]
-        other = extended(under_other_backlash_model(self.plain.model), _known(self.chosen.items))
-        share = doubt * sum(d.probability for d in posterior_draws)
-        at = replace(self.fitted, model=other)
-        return held + self._draws(at, self.chosen, item, before, share)
-
-    def _with(self, k: int, item: Item) -> tuple[Item, ...]:
-        return (*self.chosen.items[:k], item, *self.chosen.items[k + 1 :])
-
-    @cached_property
-    def unnamed(self) -> float:
-        """Mean squared length (m²) of what is in the set without a name, of each block what the
-        fitted parameters cannot follow: the error of configurations left out of a fit to it."""
-        total = 0.0
-        for k, item in enumerate(self.chosen.items):
-            if not item.known:
-                signal = signal_of(self.dataset, self.chosen, k)
-                alone = replace(beside(self.dataset, self.chosen, k), r=signal)
-                error = left_out_residual(project(alone, self.chosen.noise.of_instrument()))
-                squares, count = squared_lengths(alone, alone.masked(error))
-                total += float(squares.sum() / count.sum())
-        return total
-
-    def _draws(
-        self, base: Baseline, true: ModelSet, item: Item, before: Array, probability: float
-    ) -> list[PosteriorDraw]:
-        """If that set is true, fitted as `base`, under each of the noises."""
-        measured, new = self._by_constant(base, _known(true.items), item)
-        here, at = self._regressions(base)
-        B = np.hstack([at.B, new])
-        start = np.append(base.x, np.zeros(measured.shape[1]))
-        size = self.observed.size
-
-        def lengths(rows: Array) -> Array:
-            return rows.reshape(-1, size, *rows.shape[1:])[:, : min(size, 3)]
-
-        out = []
-        prior, after = self._prior(true), self._regressions(self.fitted)[1].prediction
-        for x, spread in posteriors(self.dataset, base, here, self.noise, measured, prior):
-            readings = at.prediction + B @ (x - start)
-            errors = lengths(before - readings), lengths(after - readings)
-            pose, share = self.observed.configuration, probability / len(self.noise)
-            out.append(PosteriorDraw(*errors, lengths(B @ spread), pose, share))
-        return out
-
-    def _prior(self, true: ModelSet) -> dict[str, float]:
-        """Prior deviations of the set's parameters: their typical sizes, times the scale that the
-        readings prefer where the effect is larger than usual; a tie to the usual size would make
-        what is true smaller than what was found."""
-        out = {}
-        for item, scale in zip(true.items, true.scales, strict=True):
-            if isinstance(item.what, Hypothesis):
-                size = self.dataset.sizes[item.what.key] * max(scale, 1.0)
-                for p, s in zip(item.what.parameters, size, strict=True):
-                    out[f"{item.what.where}.{p.key}"] = float(s)
-        return out
-
-    def _by_constant(self, base: Baseline, known: list[Item], item: Item) -> list[Array]:
-        """Difference quotients (rows, k) in the item's constants that vary smoothly, of the
-        measured readings and of the new ones, each by the step of the grid it was searched on:
-        it is not known better than the data tell."""
-        what = item.what
-        assert isinstance(what, Hypothesis)
-        sets = (self.dataset.base.observed, self.observed)
-        columns = [np.zeros((observed.size * len(observed.lead), 0)) for observed in sets]
-        for s, setting in enumerate(what.settings):
-            if setting.kind == "change_time":
-                continue
-            grid = self.dataset.grids[what.key]
-            step = float(grid.step[grid.nearest(item.settings), s])
-            # At a bound, where the search may well end, the quotient is one-sided.
-            near = item.settings[s] + NUDGE * step * np.array([1.0, -1.0])
-            near = np.clip(near, setting.lower, setting.upper)
-            ends = []
-            for value in near:
-                moved = item.settings.copy()
-                moved[s] = value
-                items = [replace(i, settings=moved) if i.same_as(item) else i for i in known]
-                model = extended(self.plain.model, items)
-                ends.append([model.predict(observed.table, base.x, observed) for observed in sets])
-            apart = float(near[0] - near[1]) / step
-            slopes = [(up - down) / apart for up, down in zip(*ends, strict=True)]
-            columns = [np.column_stack(pair) for pair in zip(columns, slopes, strict=True)]
-        return columns
-
-
-def _known(items: tuple[Item, ...]) -> list[Item]:
-    return [item for item in items if item.known]
