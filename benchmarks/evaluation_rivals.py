@@ -45,26 +45,6 @@ def python_loop(f: ca.Function, arrays: Sequence[Array], n: int) -> list[Array]:
     return results
 
 
-def buffered_loop(f: ca.Function, arrays: Sequence[Array], n: int) -> list[Array]:
-    """CasADi's own remedy, `FunctionBuffer`: arrays are filled in place, one call per row."""
-    results = [np.empty((n, c, r)) for r, c in (f.size_out(k) for k in range(f.n_out()))]
-    buffer, run = f.buffer()
-    given = [np.array(a[0] if a.ndim == 2 else a) for a in arrays]
-    out = [np.empty(r.shape[1:]) for r in results]
-    for k, a in enumerate(given):
-        buffer.set_arg(k, memoryview(a))
-    for k, a in enumerate(out):
-        buffer.set_res(k, memoryview(a))
-    rows = [(k, a) for k, a in enumerate(arrays) if a.ndim == 2 and a.shape[1]]
-    for i in range(n):
-        for k, a in rows:
-            given[k][:] = a[i]
-        run()
-        for result, value in zip(results, out, strict=True):
-            result[i] = value
-    return [r.transpose(0, 2, 1) for r in results]
-
-
 class Mapped:
     """`Function.map` over MAPPED rows at a time, or fewer where the table is smaller."""
 

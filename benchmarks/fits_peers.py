@@ -1,6 +1,6 @@
 """Whole fits beside those of FIGAROH and pybotics: same readings, times and held-out errors.
 
-    python benchmarks/fits_peers.py [--peers-python PATH] [--quick] [--every] [--rounds N]
+    python benchmarks/fits_peers.py [--peers-python PATH] [--quick] [--rounds N]
 
 A UR10 with base and tool unknown, one marker, positions; 30, 100 and 300 random poses.  Every fit
 runs in a process of its own, one after the other in turns, with one BLAS thread; of each number of
@@ -20,8 +20,8 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
+from bench_tools import peer, required, table, where
 from fits_arm import TRUTHS, Campaign, campaign, write
-from peer_tools import peer, required
 
 SEED = 1
 SIZES = (30, 100, 300)
@@ -32,12 +32,11 @@ STEPS = ("import", "read", "fit")
 
 @dataclass(frozen=True)
 class Contender:
-    """A script and how it is to fit; `slow` ones run with --every alone."""
+    """A script and how it is to fit."""
 
     name: str
     script: str
     how: str
-    slow: bool = False
 
     @property
     def own(self) -> bool:
@@ -51,12 +50,7 @@ CONTENDERS = (
     Contender("FIGAROH: structural (default)", "fits_figaroh.py", "structural"),
     Contender("FIGAROH: excitation", "fits_figaroh.py", "excitation"),
     Contender("FIGAROH: map", "fits_figaroh.py", "map"),
-    Contender("FIGAROH: map_cv", "fits_figaroh.py", "map_cv", slow=True),
-    Contender("FIGAROH: cv_subset", "fits_figaroh.py", "cv_subset", slow=True),
     Contender("pybotics: x, y, z of the error", "fits_pybotics.py", "components"),
-    Contender(
-        "pybotics: length of the error (its example)", "fits_pybotics.py", "lengths", slow=True
-    ),
 )
 JUDGED = [c for c in CONTENDERS if c.script == "fits_elastocal.py" and c.how != "ols"]
 
@@ -97,18 +91,14 @@ def compared(
 
 
 def show(truth: str, poses: int, found: dict[Contender, Found]) -> None:
-    print(
-        f"\n### Truth {truth}, {poses} poses\n\n"
-        "| fit | parameters | held-out, exact, µm | held-out, as read, µm | fit, CPU s "
-        "| fit, wall s | reading, CPU s | import, CPU s |\n|---|---|---|---|---|---|---|---|"
-    )
-    for contender, row in found.items():
-        print(
-            f"| {contender.name} | {row.parameters} | {row.exact:.2f} | {row.read:.2f} "
-            f"| {row.seconds['cpu_fit']:.3f} | {row.seconds['wall_fit']:.3f} "
-            f"| {row.seconds['cpu_read']:.3f} | {row.seconds['cpu_import']:.2f} |"
-        )
-    print(flush=True)
+    columns = ("fit", "parameters", "held-out, exact, µm", "held-out, as read, µm", "fit, CPU s",
+               "fit, wall s", "reading, CPU s", "import, CPU s")  # fmt: skip
+    clocks = ("cpu_fit", "wall_fit", "cpu_read", "cpu_import")
+    table(f"Truth {truth}, {poses} poses", columns, [
+        (contender.name, row.parameters, f"{row.exact:.2f}", f"{row.read:.2f}",
+         *(f"{row.seconds[clock]:.3f}" for clock in clocks))
+        for contender, row in found.items()
+    ])  # fmt: skip
 
 
 def judged(found: dict[Contender, Found]) -> None:
@@ -122,8 +112,8 @@ def judged(found: dict[Contender, Found]) -> None:
             goal = f"{GOAL} times as fast" if theirs.script == "fits_figaroh.py" else "faster"
             least = GOAL if theirs.script == "fits_figaroh.py" else 1
             required(
-                f"{ours.name}, beside {theirs.name}: {goal}, here {ratio['cpu']:.1f} times (wall: "
-                f"{ratio['wall']:.1f}), at equal or better error, here {mine.exact:.2f} against "
+                f"{ours.name}, beside {theirs.name}: {goal}, at equal or better error",
+                f"{ratio['cpu']:.1f} times (wall {ratio['wall']:.1f}), {mine.exact:.2f} against "
                 f"{row.exact:.2f} µm",
                 ratio["cpu"] >= least and mine.exact <= EQUAL * row.exact,
             )
@@ -137,7 +127,6 @@ def main() -> None:
         help="Python with FIGAROH and pybotics (default: ELASTOCAL_PEERS_PYTHON)",
     )
     parser.add_argument("--quick", action="store_true", help="one truth, 1 round")
-    parser.add_argument("--every", action="store_true", help="the slow ways as well")
     parser.add_argument("--rounds", type=int, help="how often each fit runs (default: 3)")
     parser.add_argument("--truth", choices=TRUTHS, help="one truth instead of both")
     parser.add_argument("--poses", type=int, nargs="+", help=f"default: {SIZES}")
@@ -155,10 +144,8 @@ def main() -> None:
         parser.error(f"--rounds takes 1 or more; found {rounds}")
     truths = (chosen.truth,) if chosen.truth else TRUTHS[: 1 if chosen.quick else 2]
     sizes = tuple(chosen.poses or SIZES)
-    contenders = [
-        c for c in CONTENDERS if (c.own or python is not None) and (chosen.every or not c.slow)
-    ]
-    print(f"{os.cpu_count()} cores, load {os.getloadavg()[0]:.1f}, one BLAS thread each")
+    contenders = [c for c in CONTENDERS if c.own or python is not None]
+    print(where())
     with tempfile.TemporaryDirectory() as name:
         for truth in truths:
             for poses in sizes:

@@ -1,10 +1,9 @@
 """pybotics' side of fits_peers.py: one calibration, timed.
 
-    PEERS_PYTHON benchmarks/fits_pybotics.py lengths|components FOLDER OUT.npz
+    PEERS_PYTHON benchmarks/fits_pybotics.py components FOLDER OUT.npz
 
-`lengths`: as its calibration example does it, the length of each reading's error handed to scipy's
-least_squares with its defaults.  `components`: its x, y and z instead, which its `Robot.fk` allows
-and the example does not do.  Runs in the peers' environment, imports nothing of elastocal.
+x, y and z of each reading's error are handed to scipy's least_squares with its defaults.  Runs in
+the peers' environment, imports nothing of elastocal.
 """
 
 from __future__ import annotations
@@ -19,7 +18,7 @@ clock = Clock()
 with clock.step("import"):
     import numpy as np
     from pybotics.geometry import vector_2_matrix
-    from pybotics.optimization import OptimizationHandler, optimize_accuracy
+    from pybotics.optimization import OptimizationHandler
     from pybotics.robot import Robot
     from pybotics.tool import Tool
     from scipy.optimize import least_squares
@@ -39,7 +38,7 @@ def positions(robot: Robot, qs: Any) -> Any:
     return np.array([robot.fk(q)[:3, 3] for q in qs])
 
 
-def main(residual: str, folder: Path, out: Path) -> None:
+def main(folder: Path, out: Path) -> None:
     given = np.load(folder / "given.npz")
     with clock.step("read"):
         # The start of base and tool comes from whoever measures: 10 mm and half a degree off.
@@ -56,7 +55,7 @@ def main(residual: str, folder: Path, out: Path) -> None:
         )
     with clock.step("fit"):
         found = least_squares(
-            optimize_accuracy if residual == "lengths" else components,
+            components,
             handler.generate_optimization_vector(),
             args=(handler, given["q"], given["points"]),
         )
@@ -68,4 +67,4 @@ def main(residual: str, folder: Path, out: Path) -> None:
 
 
 if __name__ == "__main__":
-    main(sys.argv[1], Path(sys.argv[2]), Path(sys.argv[3]))
+    main(*map(Path, sys.argv[2:]))

@@ -13,9 +13,8 @@ import numpy as np
 import pytest
 
 BENCHMARKS = Path(__file__).parents[1] / "benchmarks"
-MODULES = ("bench_part", "bench_clock", "bench_arms", "evaluation_numpy", "evaluation_rivals",
-           "evaluation", "scaling", "startup", "diagnosis", "run", "fits_clock",
-           "fits_arm", "fits_elastocal")  # fmt: skip
+MODULES = ("bench_tools", "bench_arms", "evaluation_rivals", "evaluation", "costs", "run",
+           "fits_clock", "fits_arm", "fits_elastocal")  # fmt: skip
 
 
 @pytest.fixture(scope="module")
@@ -30,22 +29,18 @@ def bench() -> Iterator[dict[str, ModuleType]]:
             sys.modules.pop(name, None)
 
 
-def test_b_by_hand_and_every_other_way_is_the_models_b(bench, tmp_path: Path) -> None:
+def test_every_way_to_b_is_the_models(bench, tmp_path: Path) -> None:
     """At disturbed parameters; `agreement` ends the benchmark where one way differs."""
     evaluation, arms = bench["evaluation"], bench["bench_arms"]
     model = arms.kr270(tmp_path, arms.GEOMETRY)
     table, x = arms.poses(model, 20), arms.truth(model)
-    expected = model.regressor(table, x).B.reshape(20, 3, -1)
-    by_hand = bench["evaluation_numpy"].NumpyRegressor(model)(table.q, x)
-    np.testing.assert_allclose(by_hand, expected, rtol=0, atol=1e-9)
     rivals = bench["evaluation_rivals"]
     symbolic = model._symbolic
     inputs = [*symbolic.arm.inputs.values(), symbolic.p]
     f = rivals.function_of(inputs, [symbolic.reading])
     arrays = [*evaluation.row_inputs(symbolic.arm, table), x]
     position = model.predict(table, x).reshape(20, 3)
-    for way in (rivals.python_loop, rivals.buffered_loop, rivals.Mapped(f, 7)):
-        found = way(arrays, 20) if isinstance(way, rivals.Mapped) else way(f, arrays, 20)
+    for found in (rivals.python_loop(f, arrays, 20), rivals.Mapped(f, 7)(arrays, 20)):
         np.testing.assert_allclose(found[0][..., 0], position, rtol=0, atol=1e-12)
 
 
@@ -63,10 +58,9 @@ def test_a_fit_beside_its_peers_ends_at_the_arm(bench, tmp_path: Path, how: str)
 
 
 @pytest.mark.long
-@pytest.mark.parametrize("part", ["evaluation", "scaling", "startup", "diagnosis"])
-def test_every_part_runs_in_tiny(part: str, tmp_path: Path) -> None:
+@pytest.mark.parametrize("part", ["evaluation", "costs"])
+def test_every_part_runs_in_tiny(part: str) -> None:
     command = [sys.executable, str(BENCHMARKS / f"{part}.py"), "--size", "tiny"]
-    done = subprocess.run([*command, "--json", str(tmp_path / "part.json")], capture_output=True,
-                          text=True)  # fmt: skip
+    done = subprocess.run(command, capture_output=True, text=True)
     assert done.returncode == 0, done.stderr
-    assert "| " in done.stdout and (tmp_path / "part.json").exists()
+    assert "| " in done.stdout and "- " in done.stdout

@@ -145,14 +145,6 @@ PAGES: dict[str, tuple[Part, ...]] = {
             "UR10: 1000 poses",
             tables=2,
         ),
-        Part(
-            "Compared with pyDOE3 and scipy: KR 270",
-            "",
-            "python benchmarks/design_peers.py",
-            "benchmarks/README.md",
-            "KR 270: 15 poses, pool of 5000",
-            tables=1,
-        ),
     ),
     "Diagnosis of simulated arms": (
         Part(
@@ -184,11 +176,11 @@ PAGES: dict[str, tuple[Part, ...]] = {
             tables=1,
         ),
         Part(
-            "The commands on the demo",
+            "The commands",
             "",
             "make bench",
             "benchmarks/result.md",
-            "The verbs on the demo",
+            "The commands",
             tables=1,
         ),
     ),
