@@ -14,6 +14,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass
+from functools import cached_property
 
 import numpy as np
 from scipy import linalg
@@ -100,7 +101,7 @@ class Standardised:
         """L⁻¹ (k, k)."""
         return inverse_triangle(self.L)
 
-    @property
+    @cached_property
     def covariance(self) -> Array:
         """A⁻¹ (k, k), its lower triangle."""
         return np.asarray(linalg.lapack.dpotri(self.L, lower=1)[0])
