@@ -19,7 +19,7 @@ from functools import cached_property
 from typing import Protocol, TypeGuard
 
 import numpy as np
-from scipy import linalg, optimize, special
+from scipy import linalg, optimize
 
 from elastocal.engine.climb import Objective, climb
 from elastocal.errors import InsufficientDataError
@@ -354,27 +354,6 @@ class Mixed:
             slope[: len(more)] += more
             information = 2 * self.prior.curved(information / 2)
         return value, slope, information
-
-    def none(self, theta: Array, k: int) -> float:
-        """p-value of the hypothesis θ_k = 0, `theta` (K,) being the fit under it.
-
-        U = ½ eᵀP K_k P e has the mean ½ tr P K_k and, the other variances being estimated, the
-        variance I_kk − I_ko I_oo⁻¹ I_ok; a scaled χ² with the same two moments gives its p-value
-        (Zhang and Lin 2003, Biostatistics 4, 57).
-        """
-        state = self.state(theta)
-        at, mean, U = self.expected(state), 0.0, 0.0
-        for pack, P, u in state.projected():
-            for part in pack.parts:
-                mine = part.of == k
-                mean += 0.5 * float(part.trace(P)[mine].sum())
-                U += 0.5 * float((part.times(u) @ u[..., None])[mine].sum())
-        free, known = (theta > 0) & at.told, at.information
-        across, own = known[free, k], known[np.ix_(free, free)]
-        left = known[k, k] - float(across @ np.linalg.pinv(own, hermitian=True) @ across)
-        if not at.told[k] or mean <= 0 or left <= LEAST_TOLD * known[k, k]:
-            return 1.0
-        return float(special.chdtrc(2 * mean**2 / left, 2 * mean * U / left))
 
     def expected(self, state: State) -> Expected:
         """The expected information on θ at a state, and what Kenward and Roger need."""

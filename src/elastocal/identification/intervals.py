@@ -17,7 +17,6 @@ from elastocal.identification.covariance import Covariance, cluster_robust, hc, 
 from elastocal.identification.knowledge import Constraints
 from elastocal.identification.least_squares import Fit
 from elastocal.identification.noise_choice import NoiseFit
-from elastocal.identification.residuals import whole_groups
 from elastocal.identification.solve import Solution, residual_sigma
 from elastocal.identification.weighted_problem import (
     Partition,
@@ -59,7 +58,7 @@ def cluster_by_parts(fit: Fit, parts: Partition) -> Covariance:
         return np.asarray(S.T @ S)
 
     p = len(size)
-    middle = sum(in_order(whole_groups(parts), meat), np.zeros((p, p)))
+    middle = sum(in_order(parts.spans, meat), np.zeros((p, p)))
     n, G = len(parts.observed.value), parts.observed.n_configurations
     factor = G / (G - 1) * (n - 1) / (n - p)
     cofactor = fit.cofactor() / np.outer(size, size)

@@ -22,7 +22,7 @@ from elastocal.identification.least_squares import Fit
 from elastocal.identification.linear_solver import least_norm
 from elastocal.identification.method_result import MethodResult
 from elastocal.identification.options import Options
-from elastocal.identification.residuals import growth, whole_groups
+from elastocal.identification.residuals import growth
 from elastocal.identification.solve import WORTH_A_COLUMN, Reduction, Solution, residual_sigma
 from elastocal.identification.weighted_problem import (
     RFactor,
@@ -348,6 +348,6 @@ def _looked(found: ConstrainedFit) -> tuple[Array, Array]:
         held[part.rows] += growth(B @ face, Q, unit, e, rows_of)
 
     if face.shape[1]:
-        for _ in in_order(whole_groups(parts), of_part):
+        for _ in in_order(parts.spans, of_part):
             pass
     return leverage, held

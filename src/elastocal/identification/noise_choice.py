@@ -23,7 +23,6 @@ from elastocal.identification.noise_structure import (
 )
 from elastocal.identification.noisy_readings import (
     Fitted,
-    NoisyReadings,
     covariance_of,
     deviations_of,
     fitted,
@@ -165,7 +164,8 @@ def _chosen(readings: Readings, T: Array) -> NoiseFit:
 
 
 class _Choice:
-    """The search for the model with the smallest criterion, among those of these `names`."""
+    """The search for the model with the smallest criterion; parts that know of visits join where a
+    test finds a trace of them."""
 
     def __init__(self, readings: Readings, names: list[str]) -> None:
         self.readings, self.names = readings, names
@@ -175,9 +175,9 @@ class _Choice:
         self.tests: list[NoiseTest] = []
 
     def result(self, T: Array) -> NoiseFit:
-        readings, names = self.readings, self.names
+        readings = self.readings
         could_share = bool(shared_effects(readings))
-        for name in names:
+        for name in self.names:
             self.attempt(Kind(name, could_share))
         if self.best is None:
             raise InsufficientDataError(
@@ -185,24 +185,27 @@ class _Choice:
             )
         if self.best[1].shared:
             self.attempt(self.best[1]._replace(shared=False))
-        if self._knows_visits():
-            assert readings.visits is not None
-            if self._sees_joints():
-                self._with_joints(names[0])
-            if readings.visits.drifts:
-                self._with_time(names[0], readings.visits.lasting)
+        record = readings.visits
+        if record is not None and self._knows(record):
+            if record.per_visit >= SEVERAL:
+                self._with_joints()
+            if record.drifts:
+                self._with_time(record.lasting)
         _, kind, best = self.best
         reason, trials = _reason(kind.name, self.trials), tuple(self.trials)
         best = fitted(readings, kind, best, best.lasting)
         return _result(kind.name, best, T, trials, reason, tuple(self.tests))
 
-    def attempt(self, kind: Kind, lasting: float | None = None) -> Fitted | None:
-        """Fit a kind of noise and keep it where it is better than what there is."""
+    def attempt(
+        self, kind: Kind, lasting: float | None = None, found: Fitted | None = None
+    ) -> None:
+        """Fit a kind of noise, unless it is `found`, and keep it where it is better than what there
+        is."""
         try:
             like = self.best[2] if self.best else None
-            found = fitted(self.readings, kind, like, lasting, ROUGHLY)
+            found = found or fitted(self.readings, kind, like, lasting, ROUGHLY)
         except InsufficientDataError:
-            return None
+            return
         kind, own, common = found.found, found.noisy.own, len(found.told)
         if found.structure.shrunk:
             own = self.readings.size + 2  # means of log θ and its two variances
@@ -214,82 +217,69 @@ class _Choice:
         self.trials.append(Trial(kind.name, own + spent, float(criterion)))
         if self.best is None or criterion < self.best[0]:
             self.best = (float(criterion), kind, found)
-        return found
 
-    def _knows_visits(self) -> bool:
-        record = self.readings.visits
-        if record is None or record.n_visits < FEWEST_VISITS:
-            return False
+    def _knows(self, record: VisitRecord) -> bool:
         together = np.unique(self.readings.configuration, return_counts=True)[1]
-        return int(together.max()) * self.readings.size <= MOST_TOGETHER
+        rows = int(together.max()) * self.readings.size
+        return record.n_visits >= FEWEST_VISITS and rows <= MOST_TOGETHER
 
-    def _sees_joints(self) -> bool:
-        """Are there mostly several readings to a visit?  A single one tells the joints' scatter
-        from its own noise by nothing but how both change from pose to pose, as the model's own
-        errors do."""
-        assert self.readings.visits is not None
-        own = self.readings.visits.visit
-        return bool(np.median(np.unique(own[own >= 0], return_counts=True)[1]) >= SEVERAL)
-
-    def _plain(self, first: str) -> list[str]:
-        """Structures to add to: the best one, and the `first` one where that has a prior."""
+    def _plain(self) -> list[str]:
+        """Structures to add to: the best one, and the first one where that has a prior."""
         assert self.best is not None
         _, kind, found = self.best
-        return [kind.own, first] if found.structure.shrunk else [kind.own]
+        return [kind.own, self.names[0]] if found.structure.shrunk else [kind.own]
 
-    def _with_joints(self, first: str) -> None:
+    def _with_joints(self) -> None:
         assert self.best is not None
         kind = self.best[1]
-        p = self._sees(kind._replace(joints=JOINTS))
-        self.tests.append(NoiseTest(JOINTS, p))
-        if p < TRACE:
-            for own in self._plain(first):
-                for shared in (True, False) if kind.shared else (False,):
+        first = self._trace(JOINTS, kind._replace(joints=JOINTS), None)
+        if first is None:
+            return
+        self.attempt(kind._replace(joints=JOINTS), found=first)
+        for own in self._plain():
+            for shared in (True, False) if kind.shared else (False,):
+                if (own, shared) != (kind.own, kind.shared):
                     self.attempt(self.best[1]._replace(own=own, shared=shared, joints=JOINTS))
-            if self.best[1].joints:
-                self.attempt(self.best[1]._replace(joints=EACH))
+        if self.best[1].joints:
+            self.attempt(self.best[1]._replace(joints=EACH))
 
-    def _with_time(self, first: str, lasting: tuple[float, ...]) -> None:
+    def _with_time(self, lasting: tuple[float, ...]) -> None:
         assert self.best is not None
-        name = next((own for own in self._plain(first) if own != "groups"), first)
+        name = next((own for own in self._plain() if own != "groups"), self.names[0])
         kind = self.best[1]._replace(own=name, time=True)
-        p = self._drifts(kind, lasting[0])
-        self.tests.append(NoiseTest(TIME, p))
-        if p >= TRACE:
+        first = self._trace(TIME, kind, lasting[0])
+        if first is None:
             return
-        for each in lasting:
+        self.attempt(kind, found=first)
+        for each in lasting[1:]:
             self.attempt(kind, each)
-        if not self.best[1].time:
-            return
-        found = self.best[2].lasting
-        for less in (kind._replace(shared=False), kind._replace(joints="")):
-            if less != kind:
-                self.attempt(less, found)
+        if self.best[1].time:
+            longest = self.best[2].lasting
+            for less in (kind._replace(shared=False), kind._replace(joints="")):
+                if less != kind:
+                    self.attempt(less, longest)
 
-    def _sees(self, joints: Kind) -> float:
-        """p-value of the joints not settling anew."""
-        assert self.best is not None
-        noisy = NoisyReadings(self.readings, joints, self.best[2].lasting)
-        known = dict(zip(self.best[2].noisy.names, self.best[2].theta, strict=True))
-        theta = np.array([known.get(name, 0.0) for name in noisy.names])
-        first = noisy.own + len(noisy.drifts)
-        looked = [k for k, e in enumerate(noisy.shared, first) if e.joints]
-        found = [noisy.model().none(theta, k) for k in looked]
-        return min(1.0, len(found) * min(found, default=1.0))
+    def _trace(self, part: str, kind: Kind, lasting: float | None) -> Fitted | None:
+        """The fit of a kind with this part, where the likelihood shows a trace of it beside what
+        there is.
 
-    def _drifts(self, kind: Kind, lasting: float) -> float:
-        """p-value of nothing drifting: twice what the likelihood gains, against a mixture of χ²
-        with as many degrees of freedom as of its k variances are not at zero, a half of them on
-        average (Self and Liang 1987, J. Am. Stat. Assoc. 82, 605)."""
+        Twice what it gains, against a mixture of χ² with as many degrees of freedom as of the k
+        variances of the part are not at zero, a half of them on average (Self and Liang 1987, J.
+        Am. Stat. Assoc. 82, 605).
+        """
         assert self.best is not None
         less = self.best[2]
         if less.structure.name != kind.own:
-            less = fitted(self.readings, kind._replace(time=False), less, None, ROUGHLY)
+            without = kind._replace(time=False, joints="" if part == JOINTS else kind.joints)
+            less = fitted(self.readings, without, less, None, ROUGHLY)
         more = fitted(self.readings, kind, less, lasting, ROUGHLY)
-        k = np.arange(1, len(more.drift) + 1)
+        joints = sum(bool(e.joints) for e in more.shared)
+        k = np.arange(1, 1 + (joints if part == JOINTS else len(more.drift)))
         gain = 2 * (more.log_likelihood - less.log_likelihood)
         share = special.binom(len(k), k) / 2 ** len(k)
-        return float(share @ special.chdtrc(k, gain)) if gain > 0 else 1.0
+        p = float(share @ special.chdtrc(k, gain)) if gain > 2 * ROUGHLY else 1.0
+        self.tests.append(NoiseTest(part, p))
+        return more if p < TRACE else None
 
 
 def _supported(readings: Readings) -> list[str]:

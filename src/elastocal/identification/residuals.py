@@ -51,11 +51,6 @@ def held_out_residual(
     return residual + growth(B, Q, R, weights.apply(residual), rows_of)
 
 
-def whole_groups(parts: Partition) -> list[Span]:
-    """Spans that hold every configuration as a whole, however long it is."""
-    return [(spans[0][0], spans[-1][1]) for spans in parts.groups]
-
-
 def held_out_by_parts(
     model: Model, parts: Partition, x: Array, columns: IntArray, r_factor: RFactor, step: Array
 ) -> Array:
@@ -76,7 +71,7 @@ def held_out_by_parts(
         e = part.weights.apply(residual)
         held[part.rows] = residual + growth(at.B, Q, R, e, rows_of)
 
-    for _ in in_order(whole_groups(parts), leave_out):
+    for _ in in_order(parts.spans, leave_out):
         pass
     return held
 

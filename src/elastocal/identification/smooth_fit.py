@@ -32,7 +32,7 @@ from elastocal.identification.noise_judge import outlier_screening, settle
 from elastocal.identification.noise_structure import Readings
 from elastocal.identification.options import Options, check_for_functions
 from elastocal.identification.outliers import FALSE_ALARM
-from elastocal.identification.residuals import rms_3d, whole_groups
+from elastocal.identification.residuals import rms_3d
 from elastocal.identification.smooth_part import SmoothPart
 from elastocal.identification.smooth_prior import (
     LinearRows,
@@ -349,7 +349,7 @@ def _seen(fit: JointFit, parts: Partition, side: int, step: Array | None) -> Cro
         found.leverage[part.rows] = np.minimum((Q**2).sum(axis=1), 1.0)
         found.standard[part.rows] = _unwhitened(part.weights, standard)
 
-    for _ in in_order(whole_groups(parts), one):
+    for _ in in_order(parts.spans, one):
         pass
     return found
 

@@ -3,10 +3,10 @@
 from __future__ import annotations
 
 from dataclasses import dataclass, replace
-from functools import cached_property
+from functools import cached_property, lru_cache
 
 import numpy as np
-from scipy import optimize, special
+from scipy import special
 
 from elastocal.measurements import Measurements, visits
 from elastocal.model.effects.driven import JointMotion
@@ -58,6 +58,12 @@ class VisitRecord:
     @cached_property
     def n_visits(self) -> int:
         return len(np.unique(self.visit[self.visit >= 0]))
+
+    @property
+    def per_visit(self) -> float:
+        """Readings to a visit, at the median.  A single one tells the joints' scatter from its own
+        noise by nothing but how both change from pose to pose, as the model's own errors do."""
+        return float(np.median(np.unique(self.visit[self.visit >= 0], return_counts=True)[1]))
 
     def waves(self, lasting: float) -> Array:
         """Loadings (N, k) on independent deviations of variance 1, which add up to a random course
@@ -149,13 +155,14 @@ def _when(table: Measurements) -> tuple[Array, float, bool]:
 
 # A course in time as a sum of waves.
 #
-# On [0, 1] the correlation exp(−c|t − t′|) has the eigenfunctions cos ω(t − ½) with ω tan(ω/2) = c
-# and sin ω(t − ½) with ω cot(ω/2) = −c, of eigenvalues 2c/(ω² + c²) (Karhunen and Loève; Ghanem and
-# Spanos 1991, section 2.3.3).  Those left out are what changes faster than the k-th wave: noise of
-# single visits, of the same variance (`VisitRecord.faster`).  Without it a long course and a
-# deviation of each configuration look more likely than the short course that there is.
+# The eigenfunctions φ of the correlation exp(−|t − t′|/lasting) on [0, 1], of eigenvalues λ
+# (Karhunen and Loève; Ghanem and Spanos 1991, section 2.3), on the middles of GRID intervals and
+# from there by √λ φ(t) = ∫ exp(−|t − s|/lasting) φ(s) ds/√λ (Nyström).  Those left out are what
+# changes faster than the k-th wave: noise of single visits, of the same variance
+# (`VisitRecord.faster`).  Without it a long course and a deviation of each configuration look more
+# likely than the short course that there is.
 
-MOST_WAVES = 20
+GRID, MOST_WAVES = 400, 20
 # Of the variance.  A course that lasts longer than the campaign is nearly a constant, which the
 # base takes over, and varies about it by little more than the inverse of how much longer.
 LEFT = 0.03
@@ -163,22 +170,16 @@ LEFT = 0.03
 
 def course_waves(t: Array, lasting: float) -> Array:
     """Waves (n, k) at t (n,) in 0 … 1, their products summing to nearly exp(−|t − t′|/lasting)."""
-    c = 1 / lasting
-    found, told = [], 0.0
-    for k in range(MOST_WAVES):
-        even = k % 2 == 0
+    middles, loading = _eigenfunctions(lasting)
+    return np.asarray(np.exp(-np.abs(t[:, None] - middles) / lasting) @ loading)
 
-        def end(w: float, even: bool = even) -> float:
-            s, v = np.sin(w / 2), np.cos(w / 2)
-            return float(w * s - c * v) if even else float(w * v + c * s)
 
-        w = optimize.brentq(end, k * np.pi, (k + 1) * np.pi) if k or end(0.0) else 0.0
-        value = 2 * c / (w**2 + c**2)
-        # ∫ cos² and ∫ sin² over the interval.
-        norm = 0.5 * (1 + np.sin(w) / w) if even else 0.5 * (1 - np.sin(w) / w)
-        wave = np.cos(w * (t - 0.5)) if even else np.sin(w * (t - 0.5))
-        found.append(wave * np.sqrt(value / norm))
-        told += value
-        if 1 - told < LEFT * min(c, 1.0):
-            break
-    return np.column_stack(found)
+@lru_cache(maxsize=16)
+def _eigenfunctions(lasting: float) -> tuple[Array, Array]:
+    middles = (np.arange(GRID) + 0.5) / GRID
+    value, vector = np.linalg.eigh(np.exp(-np.abs(middles[:, None] - middles) / lasting) / GRID)
+    value, vector = value[::-1], vector[:, ::-1]
+    left = 1 - np.cumsum(value)
+    k = int(np.argmax(left < LEFT * min(1 / lasting, 1.0))) + 1
+    own = slice(0, min(k, MOST_WAVES))
+    return middles, vector[:, own] / np.sqrt(GRID * value[own])

@@ -276,16 +276,15 @@ class Part:
 
 @dataclass(frozen=True)
 class Partition:
-    """All observations in `groups` of spans of `order` (None: as they stand in the table).
+    """All observations in `spans` of `order` (None: as they stand in the table).
 
-    Correlated observations share a span, and observations of one configuration share a group.
-    A group is one span, unless a configuration is larger than a part.
+    Correlated observations share a span, and so do those of one configuration.
     """
 
     observed: Observations
     weights: Weights
     order: IntArray | None
-    groups: tuple[tuple[Span, ...], ...]
+    spans: tuple[Span, ...]
 
     @cached_property
     def blocks(self) -> IntArray | None:
@@ -295,13 +294,9 @@ class Partition:
         """
         return _correlated(self.observed, self.weights)
 
-    @property
-    def spans(self) -> list[Span]:
-        return [span for group in self.groups for span in group]
-
     def part(self, span: Span) -> Part:
         """The observations of a span, in the table's order."""
-        if len(self.groups) == 1 and len(self.groups[0]) == 1:
+        if len(self.spans) == 1:
             n, rows = len(self.observed.lead), len(self.observed.value)
             return Part(np.arange(n), np.arange(rows), self.observed, self.weights)
         index = np.arange(*span) if self.order is None else np.sort(self.order[slice(*span)])
@@ -353,25 +348,19 @@ def sample(parts: Partition, n: int, seed: int = 0) -> Part:
 def partition(observed: Observations, weights: Weights, n_parameters: int) -> Partition:
     """Cut the observations so that B of `n_parameters` has at most PART numbers in each part.
 
-    A table that is not large stays in one part; so do observations that are all correlated.
+    A table that is not large stays in one part; so do observations that are all correlated, and
+    those of one configuration.
     """
     n = len(observed.lead)
     if not is_large(observed, n_parameters):
-        return Partition(observed, weights, None, (((0, n),),))
+        return Partition(observed, weights, None, ((0, n),))
     blocks = _correlated(observed, weights)
     limit = max(PART // (observed.size * n_parameters), 1)
     unit = _units(observed.configuration, blocks)
     order = np.lexsort((unit,) if blocks is None else (blocks, unit))
-    inner = np.arange(1, n + 1) if blocks is None else _ends(blocks[order])
-    groups: list[tuple[Span, ...]] = []
-    for start, stop in _packed(_ends(unit[order]), 0, limit):
-        if stop - start <= limit:
-            groups.append(((start, stop),))
-        else:
-            inside = inner[(inner > start) & (inner <= stop)]
-            groups.append(tuple(_packed(inside, start, limit)))
+    spans = _packed(_ends(unit[order]), 0, limit)
     in_order = bool((np.diff(order) == 1).all())
-    return Partition(observed, weights, None if in_order else order, tuple(groups))
+    return Partition(observed, weights, None if in_order else order, tuple(spans))
 
 
 def _correlated(observed: Observations, weights: Weights) -> IntArray | None:
