@@ -60,9 +60,9 @@ def plain_layout(request: pytest.FixtureRequest) -> Iterator[None]:
 def known_instructions() -> Iterator[None]:
     """Models of the same cell are made in hundreds of tests: half of what that takes is to ask
     CasADi for the instructions, which are the same wherever the expressions are."""
-    from elastocal.model import numpy_engine
+    from elastocal.model import evaluate
 
-    ask, known = numpy_engine.instructions, {}
+    ask, known = evaluate.instructions, {}
 
     def remembered(function: Any) -> Any:
         key = function.serialize()
@@ -71,5 +71,5 @@ def known_instructions() -> Iterator[None]:
         return known[key]
 
     with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(numpy_engine, "instructions", remembered)
+        patch.setattr(evaluate, "instructions", remembered)
         yield

@@ -152,7 +152,7 @@ def wish_of(
     """
     from elastocal.export.export import Wish, format_of
     from elastocal.export.urdf_file import Frames
-    from elastocal.model.valued import Conditions
+    from elastocal.model.calibrated import Conditions
 
     chosen = format_of(path, format)
     for name, value, low, high in (

@@ -7,9 +7,9 @@ from support.exports import GEOMETRY, LOAD, SPRINGS, exported, poses_of, write_r
 from support.mjcf_text import ARM, LOADABLE, write_arm
 
 from elastocal.export.exportable import evaluate_pieces, keep
+from elastocal.model.calibrated import Conditions
 from elastocal.model.mjcf import MjcfArm
 from elastocal.model.rigid import nominal_flanges
-from elastocal.model.valued import Conditions
 
 MICROMETRE, NANOMETRE = 1e-6, 1e-9
 

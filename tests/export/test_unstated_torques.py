@@ -11,7 +11,7 @@ from support.cells import COMPLIANCE, kr270_cell, random_table
 import elastocal as ec
 from elastocal.cell.arm_description import Nominal
 from elastocal.export.exportable import keep
-from elastocal.model.valued import Conditions
+from elastocal.model.calibrated import Conditions
 
 
 def test_an_arm_with_torque_couplings_is_exported_without_them(tmp_path: Path) -> None:

@@ -96,8 +96,7 @@ def effects(
 def _print_effects(screen: Console, cell: Any, entries: Any) -> None:
     from rich.padding import Padding
 
-    from elastocal.model.choice import load_chain
-    from elastocal.model.joint_names import names_told
+    from elastocal.model.choice import load_chain, names_told
     from elastocal.report.effect_names import effect_lines
 
     stage = ""

@@ -30,10 +30,17 @@ from elastocal.errors import InputError, InsufficientDataError, option, require
 from elastocal.identification.result import Calibration
 from elastocal.measurements import Measurements
 from elastocal.model.arm import given_force
-from elastocal.model.calibrated import CalibratedArm, given_arm
+from elastocal.model.calibrated import (
+    CalibratedArm,
+    Conditions,
+    Valued,
+    arm_with,
+    given_arm,
+    random_table,
+    unstated_needs,
+)
 from elastocal.model.effects.catalogue import CATALOGUE
 from elastocal.model.manipulator import Model
-from elastocal.model.valued import Conditions, Valued, arm_with, random_table, unstated_needs
 from elastocal.units import Array
 
 SCHEMA = "elastocal/comparison/1"

@@ -16,7 +16,15 @@ from elastocal.errors import InsufficientDataError, option
 from elastocal.measurements import Measurements
 from elastocal.model import rigid
 from elastocal.model.arm import Arm
-from elastocal.model.calibrated import CalibratedArm
+from elastocal.model.calibrated import (
+    RECORDED,
+    CalibratedArm,
+    Conditions,
+    Valued,
+    arm_with,
+    random_table,
+    unstated_needs,
+)
 from elastocal.model.chain import Chain, LinkMass
 from elastocal.model.effects.base import Format
 from elastocal.model.effects.catalogue import CATALOGUE
@@ -25,14 +33,6 @@ from elastocal.model.effects.placements import link_ends
 from elastocal.model.manipulator import Model
 from elastocal.model.symbolic import SymbolicArm
 from elastocal.model.urdf import urdf_bytes
-from elastocal.model.valued import (
-    RECORDED,
-    Conditions,
-    Valued,
-    arm_with,
-    random_table,
-    unstated_needs,
-)
 from elastocal.units import Array, rpy_from_rotation
 
 

@@ -24,6 +24,7 @@ from elastocal.export.exportable import Kept, evaluate_pieces, points_of
 from elastocal.export.joint_correction import CorrectionCurve, JointCorrection
 from elastocal.measurements import Measurements
 from elastocal.model.arm import row_inputs
+from elastocal.model.calibrated import Valued, random_table, table_at
 from elastocal.model.chain import finite_ranges, joint_limits
 from elastocal.model.effects.catalogue import effect_of
 from elastocal.model.effects.gears import JointOffset
@@ -31,7 +32,6 @@ from elastocal.model.effects.placements import LinkGeometry
 from elastocal.model.evaluate import BatchFunction
 from elastocal.model.manipulator import Model
 from elastocal.model.symbolic import SymbolicArm
-from elastocal.model.valued import Valued, random_table, table_at
 from elastocal.units import Array, IntArray
 
 GEOMETRY = (JointOffset.name, LinkGeometry.name)  # which every format holds

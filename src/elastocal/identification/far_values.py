@@ -18,8 +18,7 @@ from elastocal.model.arm import Parameter
 from elastocal.model.effects.catalogue import effect_of
 from elastocal.model.effects.compliances import JointCompliance
 from elastocal.model.effects.gears import JointOffset
-from elastocal.model.effects.placements import LinkGeometry
-from elastocal.model.effects.tracker_distortion import TrackerDistortion
+from elastocal.model.effects.placements import LinkGeometry, TrackerDistortion
 from elastocal.text import listed
 
 SCALED = 0.005  # no arm's lengths are this far off together, relatively: the readings' are

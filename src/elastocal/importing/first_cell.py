@@ -21,11 +21,10 @@ from elastocal.errors import InputError, option, require
 from elastocal.files import atomic_writer
 from elastocal.model import ur_table
 from elastocal.model.chain import Chain, Joint, finite_ranges
-from elastocal.model.choice import load_chain
+from elastocal.model.choice import clashing, load_chain, names_told
 from elastocal.model.effects.compliances import JointCompliance
 from elastocal.model.effects.gears import JointOffset
 from elastocal.model.effects.placements import BaseFrame, LinkGeometry, MarkerPosition
-from elastocal.model.joint_names import clashing, names_told
 from elastocal.model.mjcf import MjcfArm
 from elastocal.model.plausible import jaw_told
 from elastocal.model.rigid import nominal_flanges

@@ -18,12 +18,11 @@ from elastocal.errors import InputError, option, require
 from elastocal.measurements import DEFAULT_MARKER, Measurements, read_measurements, read_plan
 from elastocal.model.arm import Parameter, row_inputs
 from elastocal.model.chain import Chain
-from elastocal.model.choice import cell_of, load_chain
+from elastocal.model.choice import cell_of, load_chain, numbered
 from elastocal.model.effects.base import Effect
 from elastocal.model.effects.catalogue import effect_of
 from elastocal.model.effects.driven import JointMotion
 from elastocal.model.evaluate import CHUNK, row_blocks, summary
-from elastocal.model.joint_names import numbered
 from elastocal.model.observations import Observations, observe
 from elastocal.model.symbolic import SymbolicArm
 from elastocal.text import listed

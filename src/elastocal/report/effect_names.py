@@ -14,10 +14,9 @@ from elastocal.diagnosis.diagnosis import SMALLEST_P, Candidate, EffectAt, Found
 from elastocal.errors import InputError
 from elastocal.model.arm import ParameterSpec
 from elastocal.model.chain import Chain
-from elastocal.model.choice import cell_of, load_chain
+from elastocal.model.choice import cell_of, load_chain, numbered
 from elastocal.model.effects.base import Effect
 from elastocal.model.effects.catalogue import CATALOGUE
-from elastocal.model.joint_names import numbered
 from elastocal.report.formatting import display, significant, together, with_uncertainty
 from elastocal.text import printable
 

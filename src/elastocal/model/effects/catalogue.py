@@ -17,8 +17,6 @@ from elastocal.model.effects import (
     placements,
     play,
     smooth,
-    torque_couplings,
-    tracker_distortion,
 )
 from elastocal.model.effects.base import Effect, check
 from elastocal.plugin_loader import same_class
@@ -41,9 +39,9 @@ CATALOGUE: dict[str, Effect] = {
         play.MoveLag(),
         play.MoveHysteresis(),
         gravity_sag.GravitySag(),
-        torque_couplings.TorqueCoupling(),
+        compliances.TorqueCoupling(),
         placements.LinkGeometry(),
-        torque_couplings.TorqueTilt(),
+        compliances.TorqueTilt(),
         changes_in_time.ThermalExpansion(),
         smooth.ResidualField(),
         compliances.JointCompliance(),
@@ -65,7 +63,7 @@ CATALOGUE: dict[str, Effect] = {
         changes_in_time.BaseDrift(),
         changes_in_time.FrameJump(),
         placements.DistanceSensor(),
-        tracker_distortion.TrackerDistortion(),
+        placements.TrackerDistortion(),
     )
 }
 BUILT_IN = frozenset(CATALOGUE)
