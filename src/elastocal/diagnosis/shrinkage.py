@@ -18,6 +18,7 @@ from elastocal.diagnosis.model_set import (
     Item,
     ModelSet,
     beside,
+    fit_extended,
     fit_set,
     signal_of,
     spans_of,
@@ -224,25 +225,25 @@ class Confirmation:
         data = replace(data, X=data.X[:, :, own], precision=data.precision[own])
         return cls(replace(dataset, data=data), found.chosen)
 
+    @cached_property
+    def _refitted(self) -> dict[str, float]:
+        """Values by name of the exact model with all items that have a name, fitted to the
+        readings: where a geometry is sought, its columns are no line to it."""
+        known = [item for item in self.chosen.items if item.known]
+        fitted = fit_extended(self.dataset, self.chosen, known)
+        return dict(zip(fitted.model.names, fitted.x.tolist(), strict=True))
+
     def parameters(self, k: int) -> tuple[FittedParameter, ...]:
-        """The values of item k's parameters, weighted by all the noise that was found."""
-        dataset, what = self.dataset, self.chosen.items[k].what
+        """The values of item k's parameters; their deviations by all the noise that was found."""
+        items, what = self.chosen.items, self.chosen.items[k].what
         assert isinstance(what, Hypothesis)
-        items, scales = self.chosen.items, _wide(self.chosen.scales)
-        at = project(with_items(dataset, items, scales), self.chosen.noise)
-        span = self._span(items, k)
-        beta, std = at.beta[span], np.linalg.norm(at.beta_deviation[:, span], axis=0)
-        model, columns = dataset.base.model, dataset.columns
-        start = np.array([p.nominal for p in what.parameters])
-        if what.effect.starts(what.where, model.chain, model.cell):
-            # The geometry of what was sought from many starts is counted from the best of them.
-            start[1:] = columns.x[columns.places[what.key]][1:]
-        size = dataset.sizes[what.key]
+        data = with_items(self.dataset, items, _wide(self.chosen.scales))
+        deviation = project(data, self.chosen.noise).beta_deviation[:, self._span(items, k)]
+        std = np.linalg.norm(deviation, axis=0) * self.dataset.sizes[what.key]
+        named = [(f"{what.where}.{p.key}", p.unit) for p in what.parameters]
         return tuple(
-            FittedParameter(f"{what.where}.{p.key}", float(value), p.unit, float(spread))
-            for p, value, spread in zip(
-                what.parameters, start + beta * size, std * size, strict=True
-            )
+            FittedParameter(name, self._refitted[name], unit, float(s))
+            for (name, unit), s in zip(named, std, strict=True)
         )
 
     def reduction(
