@@ -234,16 +234,19 @@ class Confirmation:
         return dict(zip(fitted.model.names, fitted.x.tolist(), strict=True))
 
     def parameters(self, k: int) -> tuple[FittedParameter, ...]:
-        """The values of item k's parameters; their deviations by all the noise that was found."""
-        items, what = self.chosen.items, self.chosen.items[k].what
+        """The values of item k's parameters: of the exact fit by the instrument's noise, and one
+        step from there by all the noise that was found."""
+        items, what, noise = self.chosen.items, self.chosen.items[k].what, self.chosen.noise
         assert isinstance(what, Hypothesis)
         data = with_items(self.dataset, items, _wide(self.chosen.scales))
-        deviation = project(data, self.chosen.noise).beta_deviation[:, self._span(items, k)]
-        std = np.linalg.norm(deviation, axis=0) * self.dataset.sizes[what.key]
+        at, plain = project(data, noise), project(data, noise.of_instrument())
+        span, size = self._span(items, k), self.dataset.sizes[what.key]
+        step = (at.beta - plain.beta)[span] * size
+        std = np.linalg.norm(at.beta_deviation[:, span], axis=0) * size
         named = [(f"{what.where}.{p.key}", p.unit) for p in what.parameters]
         return tuple(
-            FittedParameter(name, self._refitted[name], unit, float(s))
-            for (name, unit), s in zip(named, std, strict=True)
+            FittedParameter(name, self._refitted[name] + float(more), unit, float(s))
+            for (name, unit), more, s in zip(named, step, std, strict=True)
         )
 
     def reduction(
