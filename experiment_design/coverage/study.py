@@ -20,7 +20,7 @@ from scipy import stats
 from elastocal.identification.covariance import cluster_robust
 from elastocal.identification.noise_judge import outlier_screening, settle
 from elastocal.identification.published import eq14, ols
-from elastocal.identification.robust import design, tukey
+from elastocal.identification.trimmed import majority
 
 CHUNK = 50
 PUBLISHED_EVERY = 10  # thirty iterations of a weighted fit each: a tenth of the replicates do
@@ -70,9 +70,10 @@ def estimates(s: Setting, replicate: int) -> np.ndarray:
     def put(method: str, x: np.ndarray, std: np.ndarray, dof: np.ndarray | float) -> None:
         found[METHODS.index(method)] = np.column_stack([x, std, np.broadcast_to(dof, p)])
 
-    readings, majority = s.readings(e), tukey(design(B, e, 3))
-    good = outlier_screening(readings, majority.residual.reshape(-1, 3))
-    noise = settle(readings, good=good).noise
+    readings = s.readings(e)
+    good = np.repeat(majority(readings.B, readings.e)[0], 3)
+    left = e - B @ np.linalg.lstsq(B[good], e[good])[0]
+    noise = settle(readings, good=outlier_screening(readings, left.reshape(-1, 3))).noise
     put("default", noise.x, noise.covariance.std, noise.covariance.dof)
     put("oracle", *s.oracle(e, clean), np.inf)
     plain = ols(B, e)

@@ -149,7 +149,7 @@ OPTIONS = (
     Mistake("an output over an input", "identify placed.toml placed.csv -q -o placed.csv"),
     Mistake("an empty argument", f"{FIT} --report ''"),
     Mistake("no file of knowledge", f"{DEFLECT} --knowledge none.toml"),
-    Mistake("a method without constraints", f"{DEFLECT} --physical --method tukey"),
+    Mistake("a method without constraints", f"{DEFLECT} --physical --method huber"),
     Mistake("no file of a covariance", f"{DEFLECT} --covariance noise.csv"),
     Mistake("a folder as a covariance", f"{DEFLECT} --covariance study"),
     Mistake("a covariance of two rows", f"{DEFLECT} --weights covariance --covariance links.csv",

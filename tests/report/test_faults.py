@@ -22,10 +22,9 @@ def outliers(lines: range, residual: float = 4.5e-3) -> tuple[Outlier, ...]:
 
 
 def with_findings(result: Any, *findings: FaultyGroup, named: bool = True, **to: Any) -> Any:
-    n = len(result.determined)
     good = np.ones(len(result.observations.lead), dtype=bool)
     names = tuple(result.determined) if named else ()
-    report = OutlierReport(findings, np.zeros(n), 1.0, 100, good, {}, 0.01, names)
+    report = OutlierReport(findings, 1.0, 100, good, {}, 0.01, names)
     return replace(result, **{"method": "reml", "outliers": (), "excluded": ()} | to,
                    faulty_report=report)  # fmt: skip
 

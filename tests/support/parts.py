@@ -115,11 +115,7 @@ def solved(model: Model, table: Measurements, covariance: Array | None = None) -
 
 def faulty_of(solution: Solution) -> tuple[NDArray[np.bool_], Solution]:
     """Faulty observations, the others solved anew with weights of their own."""
-    problem = solution.problem
-
-    def refit(good: NDArray[np.bool_]) -> Solution:
-        observed = subset(problem.observations, good)
-        weights = weights_for(observed, problem.model.cell.tracker)
-        return solve(replace(problem, observations=observed, weights=weights), try_wider=False)
-
-    return find_faulty(solution, refit)
+    problem, faulty = solution.problem, find_faulty(solution)
+    observed = subset(problem.observations, ~faulty)
+    weights = weights_for(observed, problem.model.cell.tracker)
+    return faulty, solve(replace(problem, observations=observed, weights=weights), try_wider=False)

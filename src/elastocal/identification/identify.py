@@ -7,6 +7,7 @@ from dataclasses import replace
 import numpy as np
 from numpy.typing import NDArray
 
+from elastocal.errors import ElastocalError
 from elastocal.identification.estimates import summarise, uncertainty_of
 from elastocal.identification.findings import judged
 from elastocal.identification.method_result import MethodResult
@@ -117,19 +118,18 @@ def _fitted(
     smooth = bool(model.shrunk[free].any())
     every = _solution(model, observed, x0, ordinary(model, free), options, progress, not smooth)
 
-    def refit(good: NDArray[np.bool_], final: bool = False) -> Solution:
-        chosen = _without(options, ~good, observed.size)
-        silent = progress if final else _silent
-        own = ordinary(model, free)
-        wider = final and not smooth
-        return _solution(model, subset(observed, good), x0, own, chosen, silent, wider)
+    def refit(good: NDArray[np.bool_]) -> Solution:
+        chosen, own = _without(options, ~good, observed.size), ordinary(model, free)
+        return _solution(model, subset(observed, good), x0, own, chosen, progress, not smooth)
 
     progress("looking for faulty readings")
-    faulty, sound = np.zeros(len(observed.lead), dtype=bool), every
-    if not is_exact(every):
-        faulty, sound = find_faulty(every, refit)
-    if 0 < faulty.mean() < 1:
-        sound = refit(~faulty, final=True)
+    none = np.zeros(len(observed.lead), dtype=bool)
+    faulty, sound = none if is_exact(every) else find_faulty(every), every
+    if faulty.any():
+        try:
+            sound = refit(~faulty)
+        except ElastocalError:
+            faulty = none  # what does not determine a valid arm cannot judge the others
     refuse_nonsense(
         model, sound.problem.observations, sound.fit.x, sound.fit.residual, table,
         subset(observed, faulty) if faulty.any() and sound is not every else None,
@@ -146,10 +146,6 @@ def _without(options: Options, left_out: NDArray[np.bool_], size: int) -> Option
         return options
     rows = np.repeat(~left_out, size)
     return replace(options, covariance=options.covariance[np.ix_(rows, rows)])
-
-
-def _silent(message: str) -> None:
-    """Refits of the search for faulty readings are not worth a line each."""
 
 
 def _solution(

@@ -41,7 +41,7 @@ from elastocal.units import Array, BoolArray, IntArray, Progress
 
 # The default method: noise estimated from the residuals, faulty readings judged by that noise.
 
-Refit = Callable[[BoolArray, bool], Solution]  # of these observations, with wider sets tried
+Refit = Callable[[BoolArray], Solution]  # of these observations
 
 ROUNDS = 6
 RESTARTS = 3
@@ -71,7 +71,7 @@ def _adapted(
         if np.array_equal(judged, good):
             break
         good, known = judged, NoiseAndOutliers(noise, judged)
-        start = every if good.all() else refit(good, True)
+        start = every if good.all() else refit(good)
     return solution, noise, judged
 
 
@@ -402,7 +402,7 @@ def _robust(
         )
     problem, kept = every.problem, sound.reduction.kept
     observed = problem.observations
-    found = robust_fit(problem.fit_of(kept, sound.fit.x, sound.sizes), method, options.seed)  # type: ignore[arg-type]
+    found = robust_fit(problem.fit_of(kept, sound.fit.x, sound.sizes), method)
     if options.intervals == "cr3":
         covariance = clustered_covariance(found.linear, observed.configuration)
     else:

@@ -16,18 +16,16 @@ from elastocal.identification.noise_structure import Kind
 from elastocal.identification.weighted_problem import WeightKind
 from elastocal.text import did_you_mean, quoted
 
-Method = Literal[
-    "auto", "reml", "ols", "wls", "eq14", "eq14-residual", "huber", "tukey", "l1", "student-t"
-]
+Method = Literal["auto", "reml", "ols", "wls", "eq14", "eq14-residual", "huber", "l1"]
 FaultyReadings = Literal["auto", "drop", "keep"]
 METHODS = get_args(Method)
-ROBUST = ("huber", "tukey", "l1", "student-t")
+ROBUST = ("huber", "l1")
 WITH_KNOWLEDGE = ("auto", "profile")
 # What there was once, or is looked for by this name: what does the same.
 SUCCESSORS = {
     "method": dict.fromkeys(
-        ("lts", "s", "mm"),
-        "tukey, which starts from the fit of the majority and rejects what lies far from it",
+        ("lts", "s", "mm", "tukey", "student-t"),
+        "the default method, which excludes what the fit of the majority contradicts, or huber",
     ),
     "intervals": {
         "wild": "cr2, which allows any correlation within a configuration as well",
@@ -43,8 +41,8 @@ class Options:
 
     `method`: auto is reml, weights estimated by restricted likelihood, unless `weights` names
     stated ones; ols is eq. (6), wls eq. (10) with stated noise, eq14 and eq14-residual the
-    published weights with σ by group or from each residual; huber, tukey (MM), l1, student-t are
-    robust.  `noise`: the model whose variances reml estimates (structure.noise_models).
+    published weights with σ by group or from each residual; huber and l1 are robust.  `noise`: the
+    model whose variances reml estimates (structure.noise_models).
     `weights`: auto, none, rows, axis, polar or covariance (then `covariance` (rows, rows) in m²).
     `intervals`: auto goes with the method.  `fixed`: names of parameters held at their start.
     `constraints` and `prior`: a

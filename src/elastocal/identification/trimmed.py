@@ -24,28 +24,26 @@ RIDGE = 1e-12  # keeps a direction that some observations do not show where it i
 INSIDE, ALONE = 0.01, 0.01  # chance of a clean observation, of a clean table, to lie outside
 
 
-def trimmed_fit(Q: Array, e: Array, size: int, seed: int = 0) -> Array:
-    """z (p,) minimising the sum of the smaller half of |e_i − Q_i z|², Q (n·size, p) orthonormal.
+def trimmed_fit(Q: Array, e: Array, seed: int = 0) -> Array:
+    """z (p,) minimising the sum of the smaller half of |e_i − Q_i z|², Q (n, size, p) orthonormal.
 
-    `size` rows of e (n·size,) per observation; up to half of the observations may be arbitrarily
-    wrong.  FAST-LTS (Rousseeuw and Van Driessen 2006): many smallest possible random subsets and
-    z = 0, refits to the half with the smallest residuals, the best few run to the end.
+    Up to half of the observations e (n, size) may be arbitrarily wrong.  FAST-LTS (Rousseeuw and
+    Van Driessen 2006): many smallest possible random subsets and z = 0, refits to the half with the
+    smallest residuals, the best few run to the end.
 
-    Student's t of the majority and least absolute values, which need no subsets, follow a block of
-    two fifths of the readings that err alike; this does not.
+    Student's t with the median's scale needs no subsets and resists scattered errors as well, but
+    follows a block of two fifths of the readings that err alike: in 11 of 24 tables of distances
+    with one degree of freedom, in 3 with 0.3; this in none.
     """
-    n, p = len(e) // size, Q.shape[1]
-    if p == 0:
-        return np.zeros(0)
+    n, size, p = Q.shape
     half = (n + p // size + 1) // 2
-    Q3, e3 = Q.reshape(n, size, p), e.reshape(n, size, 1)
     # The normal equations of any choice of observations are a sum of those of single ones.
-    products = Q3.transpose(0, 2, 1) @ np.concatenate([Q3, e3], axis=2)
+    products = Q.transpose(0, 2, 1) @ np.concatenate([Q, e[..., None]], axis=2)
     products = products.reshape(n, -1)
 
     def squares(z: Array) -> Array:
-        left = e[:, None] - Q @ z.T
-        return np.asarray((left.reshape(n, size, -1) ** 2).sum(axis=1).T)
+        left = e[..., None] - Q @ z.T
+        return np.asarray((left**2).sum(axis=1).T)
 
     def concentrated(chosen: IntArray, steps: int) -> tuple[Array, Array]:
         """Fits (starts, p) `steps` from the `chosen` (starts, k), and their trimmed costs."""
@@ -70,33 +68,36 @@ def trimmed_fit(Q: Array, e: Array, size: int, seed: int = 0) -> Array:
     return np.asarray(z[int(np.argmin(cost))], dtype=np.float64)
 
 
-def majority(B: Array, e: Array, size: int, seed: int = 0) -> BoolArray:
-    """Observations (n,) that agree with the least trimmed squares fit of the majority.
+def majority(B: Array, e: Array, seed: int = 0) -> tuple[BoolArray, float]:
+    """Observations (n,) that agree with the least trimmed squares fit of the majority, B (n, size,
+    p) and e (n, size), and the variance of their rows.
 
     Reweighted LTS, repeated: fit to the observations inside the 99 % limit of χ²(size), scale
     from those corrected for the cut, new limit.  Up to one in a hundred clean observations is
     left outside, so this is a suspicion, not a verdict; nobody is, where none lies farther out
     than chance would have it of the whole table.
     """
-    n, limit = len(e) // size, special.chdtri(size, INSIDE)
-    Q = B
-    if B.size:
-        scale = np.linalg.norm(B, axis=0)
-        U, values, _ = linalg.svd(B / np.where(scale > 0, scale, 1.0), full_matrices=False)
-        Q = U[:, values > 1e-10 * values[0]]
+    n, size, p = B.shape
+    limit, Q, z = special.chdtri(size, INSIDE), B, np.zeros(0)
+    if p:
+        flat = B.reshape(-1, p)
+        scale = np.linalg.norm(flat, axis=0)
+        U, values, _ = linalg.svd(flat / np.where(scale > 0, scale, 1.0), full_matrices=False)
+        Q = U[:, values > 1e-10 * values[0]].reshape(n, size, -1)
+        z = trimmed_fit(Q, e, seed)
     # Mean of a χ² variable cut at its 99 % point, per degree of freedom.
     cut = special.chdtr(size + 2, limit) / (1 - INSIDE)
-    squared = ((e - Q @ trimmed_fit(Q, e, size, seed)).reshape(n, size) ** 2).sum(axis=1)
+    squared = ((e - Q @ z) ** 2).sum(axis=1)
     variance = median_scale(np.sqrt(squared), size) ** 2
     good = squared <= limit * variance
     for _ in range(50):
-        rows = np.repeat(good, size)
-        z = least_norm(Q[rows], e[rows]) if Q.shape[1] else np.zeros(0)
-        squared = ((e - Q @ z).reshape(n, size) ** 2).sum(axis=1)
-        variance = squared[good].mean() / (size * cut)
+        if p:
+            z = least_norm(Q[good].reshape(-1, Q.shape[2]), e[good].ravel())
+        squared = ((e - Q @ z) ** 2).sum(axis=1)
+        variance = float(squared[good].mean() / (size * cut))
         updated = squared <= limit * variance
         if np.array_equal(updated, good) or updated.sum() <= n // 2:
             break
         good = updated
     far = squared > special.chdtri(size, ALONE / n) * variance
-    return np.asarray(good if far.any() else np.ones(n, dtype=bool))
+    return np.asarray(good if far.any() else np.ones(n, dtype=bool)), variance

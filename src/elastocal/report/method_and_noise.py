@@ -36,9 +36,7 @@ METHODS = {
         "it acts like a robust fit, and its stated intervals are far too narrow"
     ),
     "huber": "robust M-estimate with Huber's loss, which limits the weight of outliers",
-    "tukey": "robust MM-estimate with Tukey's biweight, which gives outliers no weight",
     "l1": "least sum of residual lengths (L1), robust like the median",
-    "student-t": "maximum likelihood under Student-t noise, which allows for outliers",
 }
 # What the weights are is said by the method itself, or by the line on the noise model.
 SAID = {"reml", "ols", "eq14", "eq14-residual"}
@@ -215,7 +213,7 @@ COMPARED = (
 SHAPES = {
     "residuals_skew": "errors are skewed, as with a missing effect.",
     "residuals_heavy_tailed": (
-        "large errors are more frequent. A robust method (huber, tukey, student-t) shows "
+        "large errors are more frequent. A robust method (huber, l1) shows "
         "whether the estimates depend on them."
     ),
     "residuals_light_tailed": "large errors are rarer, as with rounded or selected readings.",

@@ -7,20 +7,9 @@ from support.calibration import binomial_band
 from elastocal.identification.robust import (
     asymptotic_covariance,
     clustered_covariance,
-    design,
     huber,
     least_absolute,
-    m_estimate,
-    student_t,
-    tukey,
 )
-
-FITS = {
-    "huber": lambda B, y: m_estimate(design(B, y, 3), huber(3)),
-    "tukey": lambda B, y: tukey(design(B, y, 3)),
-    "l1": lambda B, y: least_absolute(design(B, y, 3)),
-    "student-t": lambda B, y: student_t(design(B, y, 3), nu=5.0),
-}
 
 
 def tables(arm, share, count, seed=0):
@@ -34,47 +23,31 @@ def holds(x, covariance, truth):
     return (low < truth) & (truth < high)
 
 
-def coverage(arm, name, share, count):
+def coverage(arm, fit, share, count):
     return np.array(
         [
             holds(found.x, asymptotic_covariance(found), arm.x)
-            for found in (FITS[name](arm.B, y) for y in tables(arm, share, count))
+            for found in (fit(arm.B, y, 3) for y in tables(arm, share, count))
         ]
     )
 
 
 @pytest.mark.parametrize("share", [0.0, 0.05])
-@pytest.mark.parametrize("name", ["huber", "tukey", "l1", "student-t"])
-def test_intervals_hold_the_truth(arm, name, share):
+@pytest.mark.parametrize("fit", [huber, least_absolute], ids=["huber", "l1"])
+def test_intervals_hold_the_truth(arm, fit, share):
     """95 % of 30 tables × 9 parameters; parameters of a table are nearly independent (each level
     has its own column), and the band of 99.9 % is that of a third as many."""
-    held = coverage(arm, name, share, 30)
+    held = coverage(arm, fit, share, 30)
     low, high = binomial_band(held.size // 3, 0.95)
     assert low <= held.sum() / 3 <= high
 
     # The deviations they are compared with are the true ones: test_intervals_hold_the_truth.
 
 
-def test_intervals_hold_where_blunders_are_leverage_points(arm):
-    """27 of 270 readings ten times as far out and wrong: their information does not count, and the
-    truth is held as often as 99.9 % of binomial counts."""
-    rng = np.random.default_rng(1)
-    bad = np.repeat(np.arange(270) % 10 == 0, 3)
-    B = np.where(bad[:, None], 10 * arm.B, arm.B)
-    held = []
-    for _ in range(30):
-        y = arm.observed(arm.errors(rng)[0])
-        y[bad] += 1000.0
-        found = FITS["tukey"](B, y)
-        held.append(holds(found.x, asymptotic_covariance(found), arm.x))
-    low, high = binomial_band(np.size(held) // 3, 0.95)
-    assert low <= np.sum(held) / 3 <= high
-
-
 def test_with_every_observation_its_own_cluster_it_is_the_jackknife(arm):
     """For a loss that is quadratic throughout: refits of least squares without each reading."""
     y = arm.observed(arm.errors(np.random.default_rng(5))[0])
-    found = m_estimate(design(arm.B, y, 3), huber(3, 1e6))
+    found = huber(arm.B, y, 3, c=1e6)
     shifts = []
     for i in range(270):
         kept = np.ones(810, dtype=bool)
@@ -89,7 +62,7 @@ def test_dof_are_satterthwaites_of_the_quadratic_form(arm):
     """For least squares the estimated variance of x_j is Σ_g (a_gᵀ e)² with e = (I − H)ε: the form
     written out with all 810 rows."""
     y = arm.observed(arm.errors(np.random.default_rng(8))[0])
-    found = m_estimate(design(arm.B, y, 3), huber(3, 1e6))
+    found = huber(arm.B, y, 3, c=1e6)
     covariance = clustered_covariance(found, arm.configuration)
     project = np.eye(810) - arm.B @ np.linalg.pinv(arm.B)
     A = np.zeros((15, 9, 810))

@@ -4,19 +4,20 @@ import numpy as np
 import pytest
 from scipy import stats
 
-from elastocal.identification.faulty_readings import CleanFit, outlier_report
-from elastocal.identification.outliers import FALSE_ALARM
-from elastocal.identification.robust import design, tukey
+from elastocal.identification.faulty_readings import outlier_report
+from elastocal.identification.outliers import FALSE_ALARM, FitToGood
+from elastocal.identification.trimmed import majority
+
+WIDE = 1e3  # deviation that the weak prior gives each parameter
 
 
 def agreeing(B, y, tests, seed=0):
-    """Readings of three rows that the fit to the others does not contradict: those near the
-    MM-estimate, and from there until the set stands.  `tests` is what their p-values share."""
-    found = tukey(design(B, y, 3), seed=seed)
-    length = np.linalg.norm(found.residual.reshape(-1, 3), axis=1)
-    good = length <= found.scale * stats.chi.isf(0.01, 3)
+    """Readings that the fit to the others does not contradict: the majority, and from there until
+    the set stands.  `tests` is what their p-values share."""
+    good = majority(B, y, seed)[0]
     for _ in range(30):
-        better = CleanFit(found.design, good).reading_p() >= FALSE_ALARM / tests
+        fit = FitToGood(B * WIDE, y, good, 1.0)
+        better = fit.p_values(fit.T, fit.e, good) >= FALSE_ALARM / tests
         if 2 * better.sum() <= len(better) or np.array_equal(better, good):
             break
         good = better
@@ -25,10 +26,12 @@ def agreeing(B, y, tests, seed=0):
 
 def report(arm, noise, seed=0):
     """Lines 2 to 271, in the order of configuration, marker, repeat."""
-    y = arm.observed(noise)
-    good = agreeing(arm.B, y, 4 * 270, seed)
+    B, y = arm.B.reshape(270, 3, -1), arm.observed(noise).reshape(270, 3)
+    good = agreeing(B, y, 4 * 270, seed)
+    residual = y - B @ np.linalg.lstsq(B[good].reshape(-1, 9), y[good].ravel())[0]
     marker = np.array(["M1", "M2", "M3"])[arm.marker]
-    return outlier_report(design(arm.B, y, 3), good, np.arange(270) + 2, marker, arm.configuration)
+    lines = np.arange(270) + 2
+    return outlier_report(B * WIDE, residual, good, lines, marker, arm.configuration)
 
 
 def clean(arm, seed=0):
