@@ -143,7 +143,8 @@ def _agreeing(
     B, e = _whitened(problem, part, x)
     good, variance = majority(B[:, :, placed], e)
     masks: list[BoolArray] = []
-    final = best = (np.inf, np.ones(n, dtype=bool), None)
+    none: tuple[float, BoolArray, FitToGood | None] = np.inf, np.ones(n, dtype=bool), None
+    final = best = none
     for _ in range(ROUNDS):
         z = (x - x0)[free] / width
         fit = FitToGood(B * width, e + B @ (x - x0)[free], good, max(variance, TINY))
