@@ -80,8 +80,7 @@ def test_time_grows_as_the_text_does(reader: str, tmp_path: Path) -> None:
         assert costs[1] <= MOST * costs[0], (beginning, piece, costs)
 
 
-@pytest.mark.parametrize("expression", ["^(a+)+$", "(.*a){25}b"])
-def test_a_mappings_own_expression_has_its_time(expression: str, tmp_path: Path) -> None:
+def test_a_mappings_own_expression_has_its_time(tmp_path: Path) -> None:
     name = "a" * 60 + "!"
     (tmp_path / "points.csv").write_text(
         f"name,q1,q2,q3,q4,q5,q6,x,y,z\n{name},1,2,3,4,5,6,1,2,3\n"
@@ -89,7 +88,7 @@ def test_a_mappings_own_expression_has_its_time(expression: str, tmp_path: Path)
     (tmp_path / "map.toml").write_text(
         '[[source]]\nrole = "both"\n[source.text]\ndelimiter = ","\n[source.columns]\n'
         'name = "name"\nx_mm = "x"\n"q#_deg" = "q#"\n'
-        f'y_mm = "y"\nz_mm = "z"\n[source.names]\npattern = \'(?P<configuration>{expression})\'\n'
+        'y_mm = "y"\nz_mm = "z"\n[source.names]\npattern = \'(?P<configuration>^(a+)+$)\'\n'
     )
     words = ["import", "points.csv", "--map", "map.toml", "--preview"]
     begun = time.process_time()

@@ -117,9 +117,8 @@ def test_a_curve_falls_and_stays_above_its_bound(tmp_path):
 
 def test_a_target_is_met_by_the_fewest_poses(tmp_path):
     cell = write_cell(tmp_path)
-    easy, hard = (planned(cell, "--target", target) for target in (6, 5))
-    assert easy["n_poses"] < hard["n_poses"]
-    assert easy["value"] <= 6 and hard["value"] <= 5
+    hard = planned(cell, "--target", 5)
+    assert hard["value"] <= 5
     fewer = planned(cell, "--poses", hard["n_poses"] - 1)
     assert fewer["certificate"]["bound_pool"] > 5
 

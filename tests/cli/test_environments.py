@@ -79,7 +79,6 @@ def test_streams_that_lack_letters(campaign, encoding, words, name):
     [
         ('"$@" | head -n 1 > /dev/null', 0),
         ('"$@" >&-', 0),
-        ('"$@" <&- 2>&-', 0),
         ('"$@" > /dev/full', 2),
     ],
 )

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import shutil
 import sys
 from collections.abc import Iterator
 from dataclasses import replace
@@ -61,15 +62,17 @@ def _as_before() -> Iterator[None]:
         yield
 
 
-@pytest.fixture
-def folder(tmp_path: Path) -> Path:
+@pytest.fixture(scope="module")
+def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
     """The cell with its plug-in, and readings of an arm whose third gear has three lobes."""
+    tmp_path = tmp_path_factory.mktemp("lobes")
     write_example(tmp_path, "three_lobes.py")
     path = tmp_path / "cell.toml"
     path.write_text(CELL, encoding="utf-8")
-    plain = Model(path, plugins=True).cell
-    chain = kr270_chain()
-    table = measured(chain, plain, [LOBES], unloaded(chain, 25), 1)
+    with forgotten():
+        plain = Model(path, plugins=True).cell
+        chain = kr270_chain()
+        table = measured(chain, plain, [LOBES], unloaded(chain, 25), 1)
     table.save(tmp_path / "data.csv")
     return tmp_path
 
@@ -90,7 +93,7 @@ def with_effect(folder: Path, entry: str) -> Path:
     return cell
 
 
-def test_identify_fits_it(folder: Path) -> None:
+def test_identify_fits_it_and_export_leaves_it_out(folder: Path) -> None:
     out = folder / "result.json"
     cell = with_effect(folder, "three_lobes:joint3")
     assert run("identify", cell, folder / "data.csv", "-o", out, "-q").exit_code == 0
@@ -98,6 +101,11 @@ def test_identify_fits_it(folder: Path) -> None:
     for key, value in LOBES.values.items():
         entry = found[f"joint3.{key}"]
         assert abs(entry["value"] - value) < 4 * entry["std"] < 4e-5
+    # A file of the arm cannot hold it, and says what that costs.
+    result = run("export", cell, out, "-o", folder / "arm.urdf", "--json")
+    assert result.exit_code == 0, result.stderr
+    (left_out,) = json.loads(result.stdout)["cannot_hold"]["effects"]
+    assert left_out["effect"] == "three_lobes" and left_out["difference"]["marker_rms_um"] > 10
 
 
 def test_diagnose_suspects_it_at_all_its_places_and_finds_it(folder: Path) -> None:
@@ -115,17 +123,6 @@ def test_diagnose_suspects_it_at_all_its_places_and_finds_it(folder: Path) -> No
     assert [(e["effect"], e["where"]) for e in why["effects"]] == [("three_lobes", "joint3")]
     # The extended cell, in another folder, finds the plug-in where it was.
     assert "three_lobes" in [choice.name for choice in read_cell(extended).model.effects]
-
-
-def test_export_and_compensate_know_it(folder: Path) -> None:
-    """A file cannot hold it, and says what that costs."""
-    out = folder / "result.json"
-    cell = with_effect(folder, "three_lobes:joint3")
-    assert run("identify", cell, folder / "data.csv", "-o", out, "-q").exit_code == 0
-    result = run("export", cell, out, "-o", folder / "arm.urdf", "--json")
-    assert result.exit_code == 0, result.stderr
-    (left_out,) = json.loads(result.stdout)["cannot_hold"]["effects"]
-    assert left_out["effect"] == "three_lobes" and left_out["difference"]["marker_rms_um"] > 10
 
 
 def noisy_days(folder: Path) -> Path:
@@ -220,21 +217,31 @@ Path(__file__).with_name("ran").touch()
 """
 
 
-@pytest.fixture
-def strange(tmp_path: Path) -> Path:
-    """A cell whose plug-in leaves a file, `ran`, where it runs; data of it, and two results."""
-    cell = tmp_path / "cell.toml"
+@pytest.fixture(scope="module")
+def identified(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """A cell with a plug-in, data of it, and two results."""
+    folder = tmp_path_factory.mktemp("identified")
+    cell = folder / "cell.toml"
     cell.write_text(CELL.replace("three_lobes.py", "absent.py"), encoding="utf-8")
-    (tmp_path / "absent.py").touch()
-    model = Model(cell, plugins=True)
-    table = unloaded(model.chain, 25)
-    replace(table, position=model.predict(table).reshape(-1, 3)).save(tmp_path / "data.csv")
-    for name in ("a.json", "b.json"):
-        done = run("identify", cell, tmp_path / "data.csv", "-o", tmp_path / name, "-q")
-        assert done.exit_code == 0, done.stderr
-    cell.write_text(CELL.replace("three_lobes.py", "helper.py"), encoding="utf-8")
+    (folder / "absent.py").touch()
+    with forgotten():
+        model = Model(cell, plugins=True)
+        table = unloaded(model.chain, 25)
+        replace(table, position=model.predict(table).reshape(-1, 3)).save(folder / "data.csv")
+        done = run("identify", cell, folder / "data.csv", "-o", folder / "a.json", "-q")
+    assert done.exit_code == 0, done.stderr
+    shutil.copyfile(folder / "a.json", folder / "b.json")
+    (folder / "targets.csv").write_text("x_mm,y_mm,z_mm\n2000,0,1500\n")
+    return folder
+
+
+@pytest.fixture
+def strange(identified: Path, tmp_path: Path) -> Path:
+    """The same with a plug-in that leaves a file, `ran`, where it runs."""
+    shutil.copytree(identified, tmp_path, dirs_exist_ok=True)
+    text = CELL.replace("three_lobes.py", "helper.py")
+    (tmp_path / "cell.toml").write_text(text, encoding="utf-8")
     (tmp_path / "helper.py").write_text(STRANGE, encoding="utf-8")
-    (tmp_path / "targets.csv").write_text("x_mm,y_mm,z_mm\n2000,0,1500\n")
     return tmp_path
 
 

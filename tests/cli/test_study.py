@@ -168,6 +168,7 @@ def test_a_killed_study_leaves_nothing_half_written(tmp_path):
     pd.testing.assert_frame_equal(numbers(folder / "results"), numbers(tmp_path / "undisturbed"))
 
 
+@pytest.mark.long
 @posix
 def test_a_study_on_a_cluster_is_interrupted_and_goes_on(tmp_path, monkeypatch):
     distributed = pytest.importorskip("distributed", reason="needs the extra 'cluster'")

@@ -32,6 +32,7 @@ def test_an_effect_that_is_taken_out_is_named_by_no_engine() -> None:
     assert diagnosed("without_ignored").effects[0].effect == "gravity_sag"
 
 
+@pytest.mark.long
 def test_what_imitates_a_withheld_effect_of_many_is_not_sure() -> None:
     """An arm with errors at every joint, its weights taken out of the catalogue: what stands in
     for them leaves more than the noise, and is no name above 0.9."""

@@ -91,8 +91,8 @@ def check(ratio, held, efficiency):
 
 @pytest.mark.parametrize(("repeats", "common"), [(6, 80e-6)])
 def test_intervals_hold_and_errors_are_near_the_best(kr270, repeats, common):
-    """60 tables: the rms error over the oracle's is itself known to 4 %."""
-    check(*study(campaign(kr270, repeats), common, 60, 1), efficiency=1.15)
+    """30 tables: the rms error over the oracle's is itself known to 5 %."""
+    check(*study(campaign(kr270, repeats), common, 30, 1), efficiency=1.18)
 
 
 @pytest.mark.long

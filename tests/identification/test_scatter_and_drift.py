@@ -1,6 +1,7 @@
 """What `identify` says of joints that settle anew at each visit, and of a drift in time."""
 
 from dataclasses import replace
+from functools import cache
 
 import numpy as np
 from support.calibration import PLACED, cell_of, random_chain, table_at, true_values
@@ -10,6 +11,7 @@ from elastocal.cell.arm_description import CartesianNoise, Tracker, Unsteadiness
 from elastocal.identification import visit_record
 from elastocal.identification.findings import judged
 from elastocal.identification.identify import identify
+from elastocal.identification.result import Calibration
 from elastocal.identification.visit_record import in_random_order
 from elastocal.model.manipulator import Model
 from elastocal.report.method_and_noise import noise_model_line
@@ -40,6 +42,11 @@ def identified(scatter=0.0, drift=0.0, timed=True, ordered=False, stated=True, s
     return identify(model, replace(read, time=time if timed else None))
 
 
+@cache
+def steady_drift() -> Calibration:
+    return identified(drift=DRIFT)
+
+
 def test_neither_is_told_where_there_is_none():
     result = identified()
     assert result.finding("joint_scatter", "drift") is None
@@ -61,7 +68,7 @@ def test_joints_that_settle_anew_are_told_with_their_size():
 
 
 def test_a_drift_is_told_and_whole_blocks_are_left_out():
-    result = identified(drift=DRIFT)
+    result = steady_drift()
     finding = result.finding("drift")
     assert finding is not None and finding.severity == "care" and "time" in result.noise.kind
     assert finding.numbers["by"] == "times" and finding.number("lasting_s") > 60
@@ -78,7 +85,7 @@ def test_a_drift_is_told_and_whole_blocks_are_left_out():
 
 
 def test_how_long_a_drift_lasts_is_not_taken_for_known_unless_the_cell_states_it():
-    stated = identified(drift=DRIFT)
+    stated = steady_drift()
     drift, (_, only) = stated.noise.drift, *stated.spread.among
     assert drift is not None and drift.ends and drift.seconds == LASTING * 60 * 35
     np.testing.assert_allclose(only, stated.spread.matrix)

@@ -23,7 +23,9 @@ def steps(fit: ec.Calibration) -> str:
     return " ".join(f.remedy for f in fit.findings)
 
 
-@pytest.mark.parametrize(("markers", "repeats"), [(THREE, 1), (ONE, 3)])
+@pytest.mark.parametrize(
+    ("markers", "repeats"), [pytest.param(THREE, 1, marks=pytest.mark.long), (ONE, 3)]
+)
 def test_both_verbs_say_the_same_and_to_correct_what_is_stated(tmp_path, markers, repeats):
     """By markers of one pose, or by repeats; what is larger than stated is noise and no doubt."""
     table = readings(tmp_path, markers, repeats)

@@ -52,8 +52,9 @@ def check(chain: Chain, found: Postures, position: NDArray, rotation: NDArray | 
         assert off.max() < 1.1e-6
 
 
-@pytest.mark.parametrize("name", ROBOTS)
-@pytest.mark.parametrize("oriented", [False, True])
+@pytest.mark.parametrize(
+    ("name", "oriented"), [*((name, True) for name in ROBOTS), ("KR270", False), ("Panda", False)]
+)
 def test_whatever_the_arm_reaches_is_reached(name: str, oriented: bool) -> None:
     chain = robot(name)
     position, rotation = places(chain, random_poses(chain, 40, seed=1))
@@ -69,14 +70,14 @@ def test_the_first_posture_is_the_nearest(name: str) -> None:
     """Against constrained minimisation (SLSQP) of the distance from many starts."""
     chain = robot(name)
     lower, upper = limits(chain)
-    position, _ = places(chain, random_poses(chain, 6, seed=1), np.zeros(3))
+    position, _ = places(chain, random_poses(chain, 4, seed=1), np.zeros(3))
     near = random_poses(chain, 1, seed=77)[0]
     found = inverse_kinematics(chain, position, (lower, upper), near=near)
     symbol = ca.SX.sym("q", chain.n_joints)
     place = nominal_flange(chain, symbol)[:3, 3]
     f = ca.Function("f", [symbol], [place])
     J = ca.Function("J", [symbol], [ca.jacobian(place, symbol)])
-    starts = np.vstack([near, random_poses(chain, 6, seed=5)])
+    starts = np.vstack([near, random_poses(chain, 4, seed=5)])
     for target, q in zip(position, found.q[:, 0], strict=True):
         reach: dict[str, Any] = {
             "type": "eq",

@@ -76,7 +76,7 @@ def by_cone(problem, name):
 @pytest.mark.parametrize("name", FIVE)
 @pytest.mark.parametrize("prior", [0.0, 0.5])
 def test_the_relaxed_optimum_is_that_of_a_cone_solver(name, prior):
-    for seed in range(3):
+    for seed in range(2):
         problem = problem_of(name, seed, N=30, n=7, prior=prior)
         found = relax(balanced(problem)[0], 1e-5)
         expected = by_cone(problem, name)
@@ -90,7 +90,7 @@ def test_the_relaxed_optimum_is_that_of_a_cone_solver(name, prior):
 
 @pytest.mark.parametrize("name", FIVE)
 def test_no_plan_is_better_than_the_bound_and_the_search_finds_the_best(name):
-    for seed in range(4):
+    for seed in range(2):
         problem = problem_of(name, seed, prior=0.2 * (seed % 2))
         values = all_values(problem)
         turned, _ = balanced(problem)

@@ -122,9 +122,7 @@ def planned(name: str, effort: Effort = "quick", seed: int = 0) -> tuple[Plan, S
     return plan, setup, Feasibility(plan.model.cell, plan.model.chain)
 
 
-@pytest.mark.parametrize("name", ALL)
-def test_every_pose_is_allowed_in_every_state_it_is_measured_in(name: str) -> None:
-    plan, _, rules = planned(name)
+def every_pose_is_allowed_in_every_state(plan: Plan, _: Setup, rules: Feasibility) -> None:
     lower, upper = joint_limits(plan.model.cell, plan.model.chain)
     assert ((lower - 1e-12 <= plan.q) & (plan.q <= upper + 1e-12)).all()
     for k in range(len(plan.q)):
@@ -133,9 +131,9 @@ def test_every_pose_is_allowed_in_every_state_it_is_measured_in(name: str) -> No
             assert verdict.ok.all(), verdict.removed_by
 
 
-@pytest.mark.parametrize("name", ALL)
-def test_every_reading_has_a_stop_and_every_move_is_free(name: str) -> None:
-    plan, _, rules = planned(name)
+def every_reading_has_a_stop_and_every_move_is_free(
+    plan: Plan, _: Setup, rules: Feasibility
+) -> None:
     execution, motion = plan.execution, plan.model.cell.design.motion
     here, loaded, moves = motion.home, False, []
     for stop in execution.stops:
@@ -163,9 +161,9 @@ def test_every_reading_has_a_stop_and_every_move_is_free(name: str) -> None:
     assert {pose for (pose, *_), n in times.items() if n < most} == set(execution.one_sided)
 
 
-@pytest.mark.parametrize("name", ALL)
-def test_the_value_is_that_of_the_poses_and_no_less_than_its_bound(name: str) -> None:
-    plan, setup, _ = planned(name)
+def the_value_is_that_of_the_poses_and_no_less_than_its_bound(
+    plan: Plan, setup: Setup, _: Feasibility
+) -> None:
     value = setup.value(plan.q)
     assert plan.value == pytest.approx(value, rel=1e-9)
     assert (plan.reported, plan.unit) == setup.criterion.reported(plan.value)
@@ -179,9 +177,9 @@ def test_the_value_is_that_of_the_poses_and_no_less_than_its_bound(name: str) ->
     assert c.pool >= plan.model.cell.design.candidates  # with what polish found
 
 
-@pytest.mark.parametrize("name", ALL)
-def test_what_is_predicted_is_the_inverse_of_the_information(name: str) -> None:
-    plan, setup, _ = planned(name)
+def what_is_predicted_is_the_inverse_of_the_information(
+    plan: Plan, setup: Setup, _: Feasibility
+) -> None:
     M = setup.gathered(setup.information.blocks(plan.q))
     scale = np.sqrt(np.diag(M))
     V = np.linalg.inv(M / np.outer(scale, scale)) / np.outer(scale, scale)
@@ -190,6 +188,15 @@ def test_what_is_predicted_is_the_inverse_of_the_information(name: str) -> None:
     assert np.allclose([p.std for p in plan.predicted], std, rtol=1e-5)
     assert all(r.loss >= 1 - 1e-9 for r in plan.reasons)
     assert len(plan.reasons) == len(plan.q)
+
+
+@pytest.mark.parametrize("name", ALL)
+def test_a_plan_is_allowed_free_and_worth_what_it_says(name: str) -> None:
+    found = planned(name)
+    every_pose_is_allowed_in_every_state(*found)
+    every_reading_has_a_stop_and_every_move_is_free(*found)
+    the_value_is_that_of_the_poses_and_no_less_than_its_bound(*found)
+    what_is_predicted_is_the_inverse_of_the_information(*found)
 
 
 @pytest.mark.long

@@ -75,6 +75,7 @@ def test_names_from_files_are_text(hostile: Any) -> None:
     assert json.loads(view)["poses"][0]["names"][0] == "<script>alert(1)</script>"
 
 
+@pytest.mark.long
 def test_size_of_a_long_table(case: Any, tmp_path: Path) -> None:
     """40 000 readings: thinned, said so, and below 6 MB."""
     observed = case.result.observations

@@ -139,7 +139,9 @@ def test_a_catalogue_effect_is_the_one_that_elastocal_knows(name, arm, tmp_path)
     assert rms(error) < (0.05 if name == "hysteresis" else 0.02) * rms(moved)
 
 
-@pytest.mark.parametrize("effect", ALIKE)
+@pytest.mark.parametrize(
+    "effect", [pytest.param(e, marks=pytest.mark.long if k else ()) for k, e in enumerate(ALIKE)]
+)
 def test_an_effect_said_to_be_alike_is_imitated(effect, tmp_path):
     """Its signal, off what the plain cell fits, lies in the rival's span to 2 %."""
     world = Recipe("alike", (15,), (effect,), 1.0, arm="heavy").draw()

@@ -94,6 +94,7 @@ def test_a_task_that_always_kills_its_worker_fails_and_is_told(cluster, tmp_path
     assert error.startswith("its worker process died 3 times")
 
 
+@pytest.mark.long
 def test_others_on_the_same_worker_are_not_blamed(tmp_path):
     folder, marks = marked(tmp_path, lethal={1: 10**6}, count=6, sleep=0.2)
     with (

@@ -87,7 +87,9 @@ def test_a_task_may_return_no_row_and_is_done(tmp_path):
     assert len(read_results(tmp_path / "r")) == 0
 
 
-@pytest.mark.parametrize(("deaths", "failed"), [(1, 0), (10**6, 1)])
+@pytest.mark.parametrize(
+    ("deaths", "failed"), [pytest.param(1, 0, marks=pytest.mark.long), (10**6, 1)]
+)
 def test_one_that_kills_its_process_is_tried_three_times(tmp_path, deaths, failed):
     marks = tmp_path / "marks"
     marks.mkdir()

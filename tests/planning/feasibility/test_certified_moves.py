@@ -88,7 +88,7 @@ def distances(rules, q):
     return np.array(found)
 
 
-@pytest.mark.parametrize("loaded", [False, True])
+@pytest.mark.parametrize("loaded", [pytest.param(False, marks=pytest.mark.long), True])
 def test_free_moves_are_free_wherever_one_looks(loaded):
     rules = Feasibility(kr270_cell(), KR270_CHAIN)
     force = DOWN if loaded else NOTHING

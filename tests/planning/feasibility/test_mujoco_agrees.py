@@ -11,6 +11,7 @@ from elastocal.planning.collision import END, Collisions
 from elastocal.planning.feasibility import Feasibility
 
 pytest.importorskip("mujoco")
+BOTH = [pytest.param(DOWN, id="loaded"), pytest.param(NOTHING, id="not", marks=pytest.mark.long)]
 TOLERANCE = 1e-5  # m between two implementations of GJK
 
 
@@ -30,7 +31,7 @@ def judge(rules, slack):
     return module.MujocoCell(rules.cell, rules.chain, rules.bodies, rules.pairs, slack)
 
 
-@pytest.mark.parametrize("force", [DOWN, NOTHING], ids=["loaded", "unloaded"])
+@pytest.mark.parametrize("force", BOTH)
 def test_poses_in_contact_are_in_contact_and_free_ones_free(rules, force):
     loaded = bool(force.any())
     q = poses(rules, 1500)
@@ -41,7 +42,7 @@ def test_poses_in_contact_are_in_contact_and_free_ones_free(rules, force):
     assert 300 < hit.sum() < 1400
 
 
-@pytest.mark.parametrize("force", [DOWN, NOTHING], ids=["loaded", "unloaded"])
+@pytest.mark.parametrize("force", BOTH)
 def test_feasible_poses_are_seen_by_rays(rules, force):
     loaded = bool(force.any())
     q = poses(rules, 60_000, seed=1)
@@ -64,7 +65,7 @@ def test_what_rays_cannot_reach_is_hidden(rules):
     assert (blocked & ~by_ray).sum() < 0.1 * len(q) and by_ray.sum() > 50
 
 
-@pytest.mark.parametrize("force", [DOWN, NOTHING], ids=["loaded", "unloaded"])
+@pytest.mark.parametrize("force", BOTH)
 def test_moves_hold_at_every_tenth_of_a_degree(rules, force):
     check, loaded = study_module("check"), bool(force.any())
     q = poses(rules, 150_000 if loaded else 20_000, seed=3)
