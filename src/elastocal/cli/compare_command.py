@@ -51,13 +51,15 @@ def compare(
     from elastocal.report.terminal import print_report
     from elastocal.saving import write_json
 
-    if new is None:
+    if old_order := new is None:
         cell, old, new = _in_old_order(cell, old, cell_of_old)
     run.writes(output, report)
     inputs = run.reads(cell, old, new)
     with run.progress() as progress:
         progress("reading")
         arms = [read_calibrated(cell, path, run.plugins) for path in (old, new)]
+        if old_order:
+            complain(f"the cell comes first now: elastocal compare {cell} {old} {new}")
         run.reads(cell=arms[0].model.cell)
         progress("comparing")
         found = compared(*arms, load=load, level=level, poses=poses, seed=seed)
@@ -71,11 +73,14 @@ def compare(
 
 def _in_old_order(old: Path, new: Path, cell: Path | None) -> tuple[Path, Path, Path]:
     """Cell and both results where the cell does not come first, as it once did not."""
+    if old.suffix.lower() == ".toml":
+        raise InputError(
+            f"the argument NEW is missing: elastocal compare {old} {new} NEW, the later result"
+        )
     known = old.parent / "cell.toml" if cell is None else cell
     if cell is None and not known.is_file():
         raise InputError(
             f"there is no cell.toml beside {old}; name the cell first: elastocal compare CELL "
             f"{old} {new}"
         )
-    complain(f"the cell comes first now: elastocal compare {known} {old} {new}")
     return known, old, new
