@@ -118,12 +118,6 @@ PAGES: dict[str, tuple[Part, ...]] = {
             "KR 270-2 in a work cell",
         ),
         Part(
-            "Table 2 under other assumptions on tool and markers",
-            "",
-            "python experiment_design/kr270_plan/assumptions.py",
-            f"{STUDIES}/kr270_plan/assumptions.md",
-        ),
-        Part(
             "CPU time of a quick plan when nine of ten moves are blocked",
             "",
             "time elastocal design experiment_design/kr270_plan/crowded.toml --effort quick -o plan.csv",
@@ -188,7 +182,7 @@ PAGES: dict[str, tuple[Part, ...]] = {
         Part(
             "Commands of `compensate` in MuJoCo",
             "",
-            "python experiment_design/compensation/study.py --arms 3",
+            "python experiment_design/compensation/study.py",
             f"{STUDIES}/compensation/result.md",
         ),
     ),

@@ -12,7 +12,6 @@ from scipy.spatial.transform import Rotation
 
 from elastocal.cell.arm_description import (
     CartesianNoise,
-    EffectChoice,
     ModelSpec,
     Nominal,
     Robot,
@@ -73,11 +72,8 @@ BY_KEY = {s.key: s for s in SCENARIOS}
 @lru_cache(maxsize=1)
 def arm() -> Model:
     """The KR 270 with all its geometry and joint compliances free, its base anywhere."""
-    spec = ModelSpec(
-        observe="position",
-        effects=tuple(EffectChoice(name, None) for name in EFFECTS),
-        nominal=Nominal(joint_compliance=COMPLIANCE),
-    )
+    nominal = Nominal(joint_compliance=COMPLIANCE)
+    spec = ModelSpec(observe="position", effects=EFFECTS, nominal=nominal)
     tracker = Tracker(noise=CartesianNoise(np.full(3, SIGMA)))
     tool = Tool(np.array([0.20, 0.0, 0.25]), dict(MARKERS))
     chain = read_urdf(

@@ -10,13 +10,12 @@ task is one campaign.
 from __future__ import annotations
 
 from collections.abc import Iterator
-from functools import lru_cache
 from typing import Any
 
 import numpy as np
 import pandas as pd
 from campaigns import BY_KEY, SCENARIOS, Campaign, arm
-from scipy import optimize, stats
+from scipy import stats
 
 from elastocal.identification.identify import identify
 from elastocal.identification.result import Calibration
@@ -37,8 +36,8 @@ def run(task: dict[str, Any], rng: np.random.Generator) -> list[dict[str, Any]]:
     model, true = arm(), campaign.true
     result = identify(model, campaign.table)
     determined = np.array([model.names.index(name) for name in result.determined])
-    error, std, dof = estimates(result, true)
-    held = {name: holds(error, std, dof, level) for name, level in LEVELS.items()}
+    error, std = estimates(result, true)
+    held = {name: holds(error, std, result.spread.dof, level) for name, level in LEVELS.items()}
     springs = np.array([name.endswith("compliance") for name in result.determined])
     row = {"estimates": len(error), "springs": int(springs.sum())}
     for name, inside in held.items():
@@ -53,8 +52,7 @@ def run(task: dict[str, Any], rng: np.random.Generator) -> list[dict[str, Any]]:
     dof, share = result.spread.tails(B[:, None, :])
     spread = np.sqrt(share * np.einsum("ij,jk,ik->i", B, result.covariance, B))
     for key, level in (("positions_held", 0.95), ("positions_held_9973", 0.9973)):
-        quantile = stats.t.isf((1 - level) / 2, dof)
-        row[key] = float((np.abs(off.ravel()) <= quantile * spread).mean())
+        row[key] = float(holds(off.ravel(), spread, dof, level).mean())
     # A reading at a new pose errs by the prediction and by noise of its own, of another campaign.
     noise, clean = campaign.drawn(campaign.test)
     reading = (off - noise)[clean]
@@ -67,31 +65,17 @@ def run(task: dict[str, Any], rng: np.random.Generator) -> list[dict[str, Any]]:
     return [row | {"trusted": int(trust is not None and trust.severity == "good")}]
 
 
-def estimates(result: Calibration, true: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Error, standard deviation and degrees of freedom of each parameter or combination."""
-    index = {name: k for k, name in enumerate(result.model.names)}
+def estimates(result: Calibration, true: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Error and standard deviation of each determined parameter or combination."""
+    truths = dict(zip(result.model.names, true, strict=True))
     found = []
     for name in result.determined:
-        e = result[name]
-        if e.identifiable:
-            value, std, end, truth = e.value, e.std, e.ci95[1], true[index[name]]
-        else:
-            c = result.combination(name)
-            value, std, end = c.value, c.std, c.ci95[1]
-            truth = sum(
-                factor * (true[index[part]] - c.held.get(part, 0.0))
-                for part, factor in c.terms.items()
-            )
-        found.append([value - truth, std, dof_of(round((end - value) / std, 10))])
+        e, truth = result[name], truths[name]
+        if not e.identifiable:
+            e = result.combination(name)
+            truth = sum(f * (truths[part] - e.held.get(part, 0.0)) for part, f in e.terms.items())
+        found.append([e.value - truth, e.std])
     return tuple(np.array(found).T)
-
-
-@lru_cache(maxsize=64)
-def dof_of(quantile: float) -> float:
-    """Degrees of freedom with this 97.5 % quantile of t."""
-    if quantile < stats.norm.ppf(0.975) * (1 + 1e-6):
-        return np.inf
-    return float(optimize.brentq(lambda f: stats.t.ppf(0.975, f) - quantile, 0.5, 1e7))
 
 
 def holds(error: np.ndarray, std: np.ndarray, dof: np.ndarray, level: float) -> np.ndarray:

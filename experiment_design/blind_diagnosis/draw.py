@@ -8,20 +8,24 @@ Everything that the tool may see goes to the first folder, what it may not to th
 from __future__ import annotations
 
 from dataclasses import dataclass, replace
+from typing import Literal
 
 import numpy as np
 from arm_data import ARMS, ArmSpec, Specimen, draw_specimen
-from chance import log_uniform
 from inside import KINDS, ORDERS, draw_effect, possible
 from instrument import Noise, Variant, draw_noise
 from numpy.typing import NDArray
 from outside import OUTSIDE, draw_outside
-from places import Site
-from visits import Plan, draw_poses, draw_visits
+from places import Site, log_uniform
 from whole_laws import WHOLE
 from world import Effect, Physics, Visits
 
 Array = NDArray[np.float64]
+Plan = Literal["interleaved", "blocks"]
+
+MINUTES_PER_VISIT = 0.6
+CLEARANCE = 0.08  # markers and joints stay this share of the reach above the base's foot
+SEPARATION = 0.05  # rad, in the joint that differs most: no pose twice
 CATALOGUE: tuple[str, ...] = tuple(KINDS)
 OUTSIDE_EFFECTS: tuple[str, ...] = tuple(OUTSIDE)
 HOOKS = {name: kind.hooks for name, kind in (KINDS | OUTSIDE).items()} | WHOLE
@@ -134,3 +138,48 @@ class Recipe:
             self.name, self.seed, spec, specimen, effects, orders, visits, plan, by_motion,
             noise, self.told,
         )  # fmt: skip
+
+
+# Which poses are measured, in which order, when, and from which side each joint came.
+
+
+def draw_poses(spec: ArmSpec, n: int, rng: np.random.Generator) -> Array:
+    """(n, J) rad, uniform in the joint limits, above the floor, all distinct; 9 decimals."""
+    s = spec.skeleton
+    kept: list[Array] = []
+    while len(kept) < n:
+        q = rng.uniform(s.lower, s.upper, (4 * n, s.n_joints)).round(9)
+        R, p = s.forward(q)
+        points = np.concatenate([np.array(spec.markers), [spec.hook]])
+        tool = p[:, -1, None] + np.einsum("nij,mj->nmi", R[:, -1], points)
+        lowest = np.minimum(p[:, 2:, 2].min(axis=1), tool[..., 2].min(axis=1))
+        for pose in q[lowest > CLEARANCE * spec.reach]:
+            if len(kept) < n and all(np.abs(pose - k).max() > SEPARATION for k in kept):
+                kept.append(pose)
+    return np.array(kept)
+
+
+def draw_visits(
+    spec: ArmSpec, poses: Array, plan: Plan, approach_by_motion: bool, rng: np.random.Generator
+) -> Visits:
+    """Every pose (n, J) unloaded and loaded, in the order given.
+
+    "interleaved": the load goes on right after, without a motion; "blocks": all poses unloaded,
+    then all loaded.  `approach_by_motion`: directions are those of the motion from the pose
+    before; else the controller approaches each joint from a side of its own choice.
+    """
+    n, J = poses.shape
+    order = np.arange(n)
+    if plan == "interleaved":
+        pose, loaded = np.repeat(order, 2), np.tile([False, True], n)
+    else:
+        pose, loaded = np.tile(order, 2), np.repeat([False, True], n)
+    q = poses[pose]
+    step = np.diff(q, axis=0, prepend=rng.uniform(-1, 1, (1, J)))
+    approach = np.sign(step) if approach_by_motion else rng.choice([-1.0, 1.0], q.shape)
+    for i in np.flatnonzero(~step.any(axis=1)):
+        approach[i] = approach[i - 1]
+    force = np.outer(loaded, [0.0, 0.0, -spec.payload])
+    minutes = MINUTES_PER_VISIT * rng.uniform(0.9, 1.1, len(pose))
+    time = (np.cumsum(minutes) - minutes[0]).round(3) * 60
+    return Visits(q, force, time, approach, pose)

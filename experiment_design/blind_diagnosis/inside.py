@@ -13,10 +13,23 @@ from dataclasses import dataclass
 
 import numpy as np
 from arm_data import ArmSpec
-from chance import Values, log_uniform, positive, sign, spread
-from mjcf import Spring, Tendon
+from mechanics import Spring, Tendon
 from numpy.typing import NDArray
-from places import Places, Site, all_or_one, at_joints, at_links, compensators, markers, only
+from places import (
+    Places,
+    Site,
+    Values,
+    all_or_one,
+    at_joints,
+    at_links,
+    compensators,
+    log_uniform,
+    markers,
+    only,
+    positive,
+    sign,
+    spread,
+)
 from skeleton import Skeleton, transverse
 from world import Effect, Hooks, Motion, Sight, TrueArm, Visits, reweighed
 
@@ -197,10 +210,6 @@ def time_constant(rng: np.random.Generator) -> Values:
     return {"time_constant_s": log_uniform(TIME_CONSTANT, rng)}
 
 
-def change_time(site: Site, key: str, rng: np.random.Generator) -> Values:
-    return {key: float(rng.uniform(*CHANGE) * site.duration)}
-
-
 def _pair(prefix: str, size: float) -> Draw:
     keys = (f"{prefix}_sin", f"{prefix}_cos")
     return lambda site, j, f, rng: (spread(keys, f * site.spec.gear * size, rng), {})
@@ -294,7 +303,7 @@ def _with(draw: Draw, more: Callable[[Site, np.random.Generator], Values]) -> Dr
 
 
 def _changes(key: str) -> Callable[[Site, np.random.Generator], Values]:
-    return lambda site, rng: change_time(site, key, rng)
+    return lambda site, rng: {key: float(rng.uniform(*CHANGE) * site.duration)}
 
 
 def _settles(site: Site, rng: np.random.Generator) -> Values:

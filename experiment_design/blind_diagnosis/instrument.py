@@ -6,8 +6,8 @@ from dataclasses import dataclass
 from typing import Literal
 
 import numpy as np
-from chance import log_uniform
 from numpy.typing import NDArray
+from places import log_uniform
 
 Array = NDArray[np.float64]
 Variant = Literal[

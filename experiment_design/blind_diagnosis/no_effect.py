@@ -34,14 +34,13 @@ MARKERS = np.array([[0.12, 0.02, 0.05], [-0.06, 0.1, 0.08], [-0.05, -0.09, 0.03]
 LOAD, COMPLIANCE = -1000.0, 1e-6  # N, rad/(N·m)
 REPEATABILITY = 6e-6
 POSES = (18, 30, 60)
+GEOMETRY = ["base_frame", "joint_offset", "link_geometry", "marker_position"]
 EFFECTS = {
-    "position": ["base_frame", "joint_offset", "link_geometry", "marker_position"],
-    "pose": [
-        "base_frame", "joint_offset", "link_geometry", "marker_position", "marker_orientation",
-    ],
+    "position": GEOMETRY,
+    "pose": [*GEOMETRY, "marker_orientation"],
     "deflection": ["joint_compliance"],
     "distance": ["joint_offset", "link_geometry", "base_frame", "marker_position"],
-}  # fmt: skip
+}
 
 
 @dataclass(frozen=True)
@@ -59,8 +58,8 @@ class Arm:
     def drawn(cls, kind: str, rng: np.random.Generator) -> Arm:
         dh = DH + rng.normal(size=DH.shape) * [5e-4, 3e-4, 3e-4, 3e-4]
         if kind == "deflection":  # a base that is as stated: deflections are to tell springs
-            return cls(DH, np.zeros((6, 3)), np.zeros((6, 3)), Rotation.identity(), np.zeros(3),
-                       COMPLIANCE * np.exp(0.5 * rng.normal(size=6)))  # fmt: skip
+            no, springs = np.zeros((6, 3)), COMPLIANCE * np.exp(0.5 * rng.normal(size=6))
+            return cls(DH, no, no, Rotation.identity(), np.zeros(3), springs)
         turned = Rotation.from_rotvec([0, 0, rng.uniform(-np.pi, np.pi)])
         return cls(
             dh, rng.normal(size=(6, 3)) * 3e-4, rng.normal(size=(6, 3)) * 3e-4,
@@ -73,32 +72,20 @@ class Arm:
         """In the tracker's frame, of joint angles (n, 6)."""
         turn = Rotation.concatenate([self.base] * len(q))
         at = np.tile(self.origin, (len(q), 1))
-        for k in range(6):
-            theta0, d, a, alpha = self.dh[k]
-            about = Rotation.from_rotvec(np.outer(q[:, k] + theta0, [0, 0, 1]))
-            turn = turn * about
+        for k, (theta0, d, a, alpha) in enumerate(self.dh):
+            turn = turn * Rotation.from_rotvec(np.outer(q[:, k] + theta0, [0, 0, 1]))
             at = at + turn.apply([a, 0, d])
             turn = turn * Rotation.from_rotvec([alpha, 0, 0])
             at = at + turn.apply(self.shift[k])
             turn = turn * Rotation.from_rotvec(self.tilt[k])
         return turn, at
 
-    def markers(self, q: Array) -> Array:
-        """(n, markers, 3)."""
-        turn, at = self.flange(q)
-        return np.stack([at + turn.apply(m) for m in MARKERS], axis=1)
-
     def loaded(self, q: Array) -> Array:
         """Joint angles at rest under the load, which hangs at the flange."""
-        at = q
+        at, step = q, 1e-6 * np.eye(6)
         for _ in range(4):
-            torque = np.empty_like(q)
-            for j in range(6):
-                step = np.zeros(6)
-                step[j] = 1e-6
-                up, down = (self.flange(at + s * step)[1] for s in (1, -1))
-                torque[:, j] = (up - down)[:, 2] / 2e-6 * LOAD
-            at = q + self.springs * torque
+            slopes = [(self.flange(at + h)[1] - self.flange(at - h)[1])[:, 2] / 2e-6 for h in step]
+            at = q + self.springs * LOAD * np.column_stack(slopes)
         return at
 
 
@@ -116,17 +103,12 @@ class World:
         header = "theta0_rad,d_m,a_m,alpha_rad"
         np.savetxt(folder / "dh.csv", DH, delimiter=",", header=header, comments="", fmt="%.16g")
         q = rng.uniform(-LIMITS, LIMITS, (self.poses, 6))
-        rows = list(self._rows(arm, q, rng))
-        (folder / "data.csv").write_text("\n".join([self._header, *rows]) + "\n")
+        (folder / "data.csv").write_text("\n".join([self._header, *self._rows(arm, q, rng)]) + "\n")
         (folder / "cell.toml").write_text(self._cell)
 
     @property
     def _markers(self) -> int:
         return 1 if self.kind in ("pose", "distance") else len(MARKERS)
-
-    @property
-    def _turns(self) -> float:
-        return self.sigma / 0.3
 
     @property
     def _header(self) -> str:
@@ -139,43 +121,42 @@ class World:
     @property
     def _cell(self) -> str:
         markers = "\n".join(f"M{m + 1} = {MARKERS[m].tolist()}" for m in range(self._markers))
-        stated = ""
-        if self.kind == "distance":
-            stated = "anchor_m = [0, 0, 0]\n"
-            stated += f"distance_um = {self.sigma * 1e6}\n" if self.stated else ""
-        elif self.stated:
-            stated = f"sigma_um = {self.sigma * 1e6}\n"
-            stated += f"rotation_urad = {self._turns * 1e6}\n" if self.kind == "pose" else ""
-        base = "base_position_m = [2, 1.5, 0.4]" if self.kind == "distance" else ""
-        compliance = f"joint_compliance = {[COMPLIANCE] * 6}" if self.kind == "deflection" else base
+        noise = {"distance": f"distance_um = {self.sigma * 1e6}\n"}.get(
+            self.kind, f"sigma_um = {self.sigma * 1e6}\n"
+        )
+        if self.kind == "pose":
+            noise += f"rotation_urad = {self.sigma / 0.3 * 1e6}\n"
+        nominal = {
+            "distance": "base_position_m = [2, 1.5, 0.4]",
+            "deflection": f"joint_compliance = {[COMPLIANCE] * 6}",
+        }
         return (
             f'[robot]\ndh = "dh.csv"\n[tool]\nload_point_m = [0, 0, 0]\n[tool.markers_m]\n'
-            f"{markers}\n[tracker]\n{stated}"
-            f'[model]\nobserve = "{self.kind}"\neffects = {EFFECTS[self.kind]}\n'
-            f"[model.nominal]\n{compliance}\n"
+            f"{markers}\n[tracker]\n{'anchor_m = [0, 0, 0]' * (self.kind == 'distance')}\n"
+            f'{noise * self.stated}\n[model]\nobserve = "{self.kind}"\n'
+            f"effects = {EFFECTS[self.kind]}\n[model.nominal]\n{nominal.get(self.kind, '')}\n"
         )
 
     def _rows(self, arm: Arm, q: Array, rng: np.random.Generator) -> Iterator[str]:
         def settled() -> Array:
             return q + REPEATABILITY * rng.normal(size=q.shape)
 
-        states = ((0.0, settled()),)
+        states = [(0.0, settled())]
         if self.kind == "deflection":
-            states = ((0.0, settled()), (LOAD, arm.loaded(settled())))
+            states = [(0.0, settled()), (LOAD, arm.loaded(settled()))]
         for force, at in states:
-            turn, _ = arm.flange(at)
-            turned = turn * Rotation.from_rotvec(self._turns * rng.normal(size=(len(q), 3)))
-            points = arm.markers(at)
-            points = points + self.sigma * rng.normal(size=points.shape)
-            lengths = np.linalg.norm(arm.markers(at), axis=2)
-            lengths = lengths + self.sigma * rng.normal(size=lengths.shape)
+            turn, origin = arm.flange(at)
+            turned = turn * Rotation.from_rotvec(self.sigma / 0.3 * rng.normal(size=(len(q), 3)))
+            exact = np.stack([origin + turn.apply(m) for m in MARKERS], axis=1)
+            points = exact + self.sigma * rng.normal(size=exact.shape)
+            lengths = np.linalg.norm(exact, axis=2)[..., None]
+            lengths = lengths + self.sigma * rng.normal(size=lengths.shape[:2])[..., None]
+            read = 1e3 * (lengths if self.kind == "distance" else points)
             for c in range(len(q)):
                 for m in range(self._markers):
                     cells = [f"{c + 1}", f"M{m + 1}", *(f"{v:.9f}" for v in q[c])]
-                    if self.kind == "deflection":
-                        cells += ["0", "0", f"{force}"]
-                    read = [lengths[c, m]] if self.kind == "distance" else points[c, m]
-                    cells += [f"{1e3 * v:.7f}" for v in read]
+                    cells += ["0", "0", f"{force}"] * (self.kind == "deflection")
+                    cells += [f"{v:.7f}" for v in read[c, m]]
                     if self.kind == "pose":
                         x, y, z, w = turned[c].as_quat()
                         cells += [f"{v:.12f}" for v in (w, x, y, z)]

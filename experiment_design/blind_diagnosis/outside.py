@@ -11,11 +11,10 @@ from collections.abc import Callable
 from dataclasses import dataclass
 
 import numpy as np
-from chance import log_uniform, sign, spread
 from inside import SPREAD, settled, time_constant
-from mjcf import Spring
+from mechanics import Spring
 from numpy.typing import NDArray
-from places import Site
+from places import Site, log_uniform, sign, spread
 from world import Effect, Hooks, Motion, Sight, TrueArm, Visits
 
 Array = NDArray[np.float64]

@@ -7,7 +7,7 @@ from __future__ import annotations
 
 import re
 from collections.abc import Mapping, Sequence
-from typing import Any, Literal
+from typing import Any
 
 import numpy as np
 from draw import ALIKE
@@ -16,7 +16,6 @@ from scipy.optimize import linear_sum_assignment
 Place = tuple[str, str]  # effect, where
 Json = Mapping[str, Any]
 Record = dict[str, Any]
-Outcome = Literal["", "right", "wrong", "vague", "nothing", "unknown", "failed"]
 
 LARGEST_SET = 3  # an ambiguous answer is right where the truth is one of so many
 SURE = 0.9
@@ -91,7 +90,7 @@ def claims(answer: Json | None) -> list[list[Place]]:
     return out
 
 
-def one_effect(truth: Json, answer: Json | None) -> Outcome:
+def one_effect(truth: Json, answer: Json | None) -> str:
     """Of a world with one effect of the catalogue; "" where it has none or several.
 
     right: the effect and its place, or a set of at most three that holds it, and nothing else.

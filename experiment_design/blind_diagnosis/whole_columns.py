@@ -11,7 +11,7 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 from draw import World
-from mjcf import GRAVITY
+from mechanics import GRAVITY
 from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 from whole_laws import CREEP, LAST_MOVE, LINES, WEIGHTS, creep, gear_error, last_move, weights

@@ -22,13 +22,11 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 from arm_data import ARMS, ArmSpec, draw_specimen
-from chance import Values, log_uniform
-from draw import Told, World
+from draw import Plan, Told, World, draw_poses, draw_visits
 from inside import POSE
 from instrument import draw_noise
 from numpy.typing import NDArray
-from skeleton import Skeleton
-from visits import Plan, draw_poses, draw_visits
+from places import Values, log_uniform
 from whole_laws import CREEP, LAST_MOVE, LINES, WEIGHTS
 from world import Effect
 
@@ -95,23 +93,23 @@ def draw_whole(
     scatter = np.array([log_uniform(RANGES.scatter, rng) for _ in range(J)]) * spec.gear
     effects = [
         *(_gear(spec, j, rng) for j in range(J)),
-        *(_last_move(spec, j, rng) for j in range(J)),
+        *(
+            Effect(LAST_MOVE, f"joint{j + 1}", {"half_width": spec.gear * half})
+            for j in range(J)
+            for half in [log_uniform(RANGES.half_width, rng)]
+        ),
         _weights(spec, rng),
         _creep(rng),
     ]
     plan: Plan = "interleaved" if rng.random() < 0.5 else "blocks"
     visits = draw_visits(spec, draw_poses(spec, poses, rng), plan, True, rng)
-    bare = replace(true, skeleton=_weightless(true.skeleton))
+    light = replace(true.skeleton, mass=np.full(J, NOTHING), com=np.zeros((J, 3)))
+    bare = replace(true, skeleton=light)
     return World(
         name, tuple(seed), spec, replace(specimen, true=bare), tuple(effects), np.zeros(0),
         visits, plan, True, replace(noise, repeatability=scatter),
         Told(weights=False, approach=approach),
     )  # fmt: skip
-
-
-def _weightless(skeleton: Skeleton) -> Skeleton:
-    J = skeleton.n_joints
-    return replace(skeleton, mass=np.full(J, NOTHING), com=np.zeros((J, 3)))
 
 
 def _line(name: str, amplitude: float, rng: np.random.Generator) -> Values:
@@ -133,11 +131,6 @@ def _gear(spec: ArmSpec, j: int, rng: np.random.Generator) -> Effect:
             values |= _line(f"line{multiple}", amplitude, rng)
         amplitude *= rng.uniform(*RANGES.next_line)
     return Effect(LINES, f"joint{j + 1}", values, settings)
-
-
-def _last_move(spec: ArmSpec, j: int, rng: np.random.Generator) -> Effect:
-    half = spec.gear * log_uniform(RANGES.half_width, rng)
-    return Effect(LAST_MOVE, f"joint{j + 1}", {"half_width": half})
 
 
 def _weights(spec: ArmSpec, rng: np.random.Generator) -> Effect:

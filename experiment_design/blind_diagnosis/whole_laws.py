@@ -5,6 +5,8 @@ Names are not those of elastocal, which is asked for sizes and causes here, not 
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import numpy as np
 from inside import POSE
 from numpy.typing import NDArray
@@ -64,10 +66,7 @@ def weights(e: Effect) -> tuple[Array, Array]:
 
 def _weigh(e: Effect, skeleton: Skeleton) -> Skeleton:
     masses, centres = weights(e)
-    return Skeleton(
-        skeleton.rotation, skeleton.position, skeleton.axis, skeleton.lower, skeleton.upper,
-        masses, centres,
-    )  # fmt: skip
+    return replace(skeleton, mass=masses, com=centres)
 
 
 WHOLE: dict[str, Hooks] = {

@@ -142,13 +142,10 @@ def effects(sights: Sights) -> Iterator[Block]:
     for e in world.effects:
         if e.name == LINES:
             for line, order in e.settings.items():
-                waves = [
-                    np.stack([np.sin(order * v.q[:, e.index]), np.cos(order * v.q[:, e.index])], 1)
-                    for v, _ in sides
-                ]
                 columns = [
-                    at.joint[:, :, e.index, None] * wave[:, None]
-                    for (_, at), wave in zip(sides, waves, strict=True)
+                    at.joint[:, :, e.index, None]
+                    * np.stack([f(order * v.q[:, e.index]) for f in (np.sin, np.cos)], 1)[:, None]
+                    for v, at in sides
                 ]
                 size = spec.gear * line_deviation(line)
                 truth = e.vector(f"{line}_sin", f"{line}_cos")

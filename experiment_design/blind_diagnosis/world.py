@@ -7,8 +7,7 @@ from dataclasses import dataclass, field, replace
 from functools import cached_property
 
 import numpy as np
-from mechanics import ElasticArm, Placement, Rest
-from mjcf import Spring, Tendon
+from mechanics import ElasticArm, Placement, Rest, Spring, Tendon
 from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 from skeleton import Skeleton

@@ -2,6 +2,10 @@
 
 visible/  arm.urdf  cell.toml  data.csv
 sealed/   truth.json  fresh.csv (the same columns; 100 other poses, no noise, no scatter)
+
+    python experiment_design/blind_diagnosis/world_files.py
+
+writes the campaign of the README's example, its truth beside it for once.
 """
 
 from __future__ import annotations
@@ -12,7 +16,7 @@ import xml.etree.ElementTree as ElementTree
 from pathlib import Path
 
 import numpy as np
-from draw import World
+from draw import Recipe, World
 from numpy.typing import NDArray
 from world import Effect, Visits
 
@@ -147,3 +151,9 @@ def _effect(effect: Effect) -> dict[str, object]:
         "values": effect.values,
         "settings": effect.settings,
     } | ({"location": location} if effect.stage else {})
+
+
+if __name__ == "__main__":
+    HERE = Path(__file__).resolve().parent
+    recipe = Recipe("example", (2026, 11), ("backlash",), arm="heavy", level=25e-6)
+    write_world(recipe.draw(), HERE / "example", HERE / "example_truth")

@@ -49,17 +49,11 @@ class Scenario:
         return "_".join([self.noise.replace(" ", ""), str(self.repeats), *marks])
 
 
-SCENARIOS = tuple(
-    Scenario(noise, effect, outliers, repeats)
-    for noise, effect, outliers in (
-        ("table 1", False, False),
-        ("table 1", True, False),
-        ("table 1", False, True),
-        ("table 1", True, True),
-        ("polar", False, False),
-    )
-    for repeats in (6, 3)
-)
+KINDS = (
+    ("table 1", False, False), ("table 1", True, False), ("table 1", False, True),
+    ("table 1", True, True), ("polar", False, False),
+)  # fmt: skip
+SCENARIOS = tuple(Scenario(*kind, repeats) for kind in KINDS for repeats in (6, 3))
 
 
 class Setting:
@@ -137,10 +131,7 @@ class Setting:
         return Phi @ (weighted.T @ e[rows]), np.sqrt(np.diag(Phi))
 
 
-@lru_cache(maxsize=2)
-def setting(scenario: Scenario) -> Setting:
-    """The scenario's setting, kept: chunks of one scenario follow each other."""
-    return Setting(scenario)
+setting = lru_cache(maxsize=2)(Setting)  # chunks of one scenario follow each other
 
 
 def _positions() -> np.ndarray:

@@ -63,20 +63,16 @@ def check(feasibility: Feasibility, wanted: int, force: np.ndarray, jobs: int) -
     certified = time.perf_counter()
     moves = np.flatnonzero(free)
     print(f"{len(q)} poses, {len(moves)} free moves in {certified - started:.0f} s")
-    parts = Parallel(n_jobs=jobs)(
-        delayed(recheck)(feasibility, q[part], q[part + 1], loaded)
-        for part in np.array_split(moves, max(len(moves) // MOVES_AT_A_TIME, 1))
-    )
-    poses = Parallel(n_jobs=jobs)(
-        delayed(recheck_poses)(feasibility, part, loaded) for part in np.array_split(q, 2 * jobs)
-    )
-    blocked = np.flatnonzero(~free)
-    agreed = sum(
-        Parallel(n_jobs=jobs)(
-            delayed(blocked_too)(feasibility, q[part], q[part + 1], loaded)
-            for part in np.array_split(blocked[:: max(len(blocked) // 500, 1)], 2 * jobs)
-        )
-    )
+    refused = np.flatnonzero(~free)
+    refused = refused[:: max(len(refused) // 500, 1)]
+
+    def shared(work, split: list[np.ndarray]) -> list:
+        return Parallel(n_jobs=jobs)(delayed(work)(feasibility, part, loaded) for part in split)
+
+    pairs = np.stack([q[:-1], q[1:]], axis=1)
+    parts = shared(recheck, np.array_split(pairs[moves], max(len(moves) // MOVES_AT_A_TIME, 1)))
+    poses = shared(recheck_poses, np.array_split(q, 2 * jobs))
+    agreed = sum(shared(blocked_too, np.array_split(pairs[refused], 2 * jobs)))
     ended = time.perf_counter()
     counts = {f"removed by {rule}": f"{n:,}" for rule, n in removed.items()}
     return {
@@ -89,7 +85,7 @@ def check(feasibility: Feasibility, wanted: int, force: np.ndarray, jobs: int) -
         "of these certified free": f"{len(moves):,}",
         "poses on free moves checked by MuJoCo": f"{sum(p[0] for p in parts):,}",
         "violations on free moves": str(sum(p[1] for p in parts)),
-        "refused moves looked at": f"{len(blocked[:: max(len(blocked) // 500, 1)]):,}",
+        "refused moves looked at": f"{len(refused):,}",
         "of these in contact or beyond the rope's angle": f"{agreed:,}",
         "drawing, s": f"{drawn - started:.1f}",
         "certifying moves, s": f"{certified - ordered:.1f}",
@@ -143,29 +139,28 @@ def recheck_poses(feasibility: Feasibility, q: np.ndarray, loaded: bool) -> tupl
     return bodies, sum(bool(judge.hidden(pose, end, loaded)) for pose in q)
 
 
-def dense(start: np.ndarray, end: np.ndarray) -> np.ndarray:
-    """Poses from start to end, at most STEP apart in every joint."""
+def dense(move: np.ndarray) -> np.ndarray:
+    """Poses on a move (2, n), at most STEP apart in every joint."""
+    start, end = move
     count = int(np.ceil(np.abs(end - start).max() / STEP)) + 1
     return start + np.linspace(0.0, 1.0, max(count, 2))[:, None] * (end - start)
 
 
-def recheck(
-    feasibility: Feasibility, start: np.ndarray, end: np.ndarray, loaded: bool
-) -> tuple[int, int]:
+def recheck(feasibility: Feasibility, free: np.ndarray, loaded: bool) -> tuple[int, int]:
     """Poses looked at on free moves, and those of them in which a margin is broken."""
     judge = mujoco(feasibility, -TOLERANCE)
-    poses = [pose for a, b in zip(start, end, strict=True) for pose in dense(a, b)]
+    poses = [pose for move in free for pose in dense(move)]
     return len(poses), sum(judge.touches(pose, loaded) for pose in poses)
 
 
-def blocked_too(feasibility: Feasibility, start: np.ndarray, end: np.ndarray, loaded: bool) -> int:
+def blocked_too(feasibility: Feasibility, refused: np.ndarray, loaded: bool) -> int:
     """Refused moves on which MuJoCo finds less than margin + 1 mm, or too slanted a rope."""
     judge = mujoco(feasibility, 1e-3)
     load = feasibility.cell.workspace.load
     rope = load.rope_axis, np.cos(load.max_angle)
     return sum(
-        any(judge.touches(q, loaded) or (loaded and judge.slanted(*rope)) for q in dense(a, b))
-        for a, b in zip(start, end, strict=True)
+        any(judge.touches(q, loaded) or (loaded and judge.slanted(*rope)) for q in dense(move))
+        for move in refused
     )
 
 

@@ -98,7 +98,9 @@ def _mjcf(
     eye = np.array(cell.tracker.position, dtype=float)
     for body in bodies:
         if body.carrier == WORLD:
-            _geom(world, asset, body.solid, UNSEEN if _is_instrument(body.solid, eye) else SEEN)
+            # What stands where the tracker does is the instrument itself.
+            instrument = np.linalg.norm(body.solid.placement[:3, 3] - eye) < 1e-9
+            _geom(world, asset, body.solid, UNSEEN if instrument else SEEN)
     spaces = {pair.other.name: pair.other for pair in pairs if not isinstance(pair.other, Body)}
     for space in spaces.values():
         z = Rotation.align_vectors(space.normal[None], [[0.0, 0.0, 1.0]])[0]
@@ -148,11 +150,6 @@ def _geom(parent: ET.Element, asset: ET.Element, solid: Solid, group: int) -> No
 
 def _off(group: int) -> dict[str, str]:
     return {"contype": "0", "conaffinity": "0", "group": str(group)}
-
-
-def _is_instrument(solid: Solid, eye: np.ndarray) -> bool:
-    """The solid's centre is where the tracker stands."""
-    return bool(np.linalg.norm(solid.placement[:3, 3] - eye) < 1e-9)
 
 
 def _pose(T: np.ndarray) -> dict[str, str]:

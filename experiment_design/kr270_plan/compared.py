@@ -1,29 +1,39 @@
-"""The plans that this study compares, and what each is worth by prediction."""
+"""The plans that this study compares: what each is worth by prediction, and in simulated campaigns
+that measure, identify, and compensate at the test poses."""
 
 from __future__ import annotations
 
 from dataclasses import dataclass, replace
+from functools import cache
 from importlib.resources import files
 from pathlib import Path
 
 import numpy as np
+from joblib import Parallel, delayed
 
 from elastocal.cell.work_cell import Cell, read_cell
-from elastocal.measurements import read_plan
+from elastocal.demo.example import published_compliances
+from elastocal.identification.identify import identify
+from elastocal.identification.options import Options
+from elastocal.measurements import Measurements, read_plan
 from elastocal.model.manipulator import Model
 from elastocal.planning.candidates import draw, shares_of
 from elastocal.planning.checkpoint import Checkpoint
 from elastocal.planning.design import DesignOptions, design
 from elastocal.planning.feasibility import Feasibility
-from elastocal.planning.information import plan_forces
+from elastocal.planning.information import plan_forces, rows_of
 from elastocal.planning.plan import Plan
 from elastocal.planning.setup import FeasiblePool, Known, Setup, set_up
 from elastocal.planning.test_poses import TargetPoses, test_poses
+from elastocal.simulation.simulate import simulate, values_from
 
 HERE = Path(__file__).parent
 DEMO = Path(str(files("elastocal.demo")))
 SEED = 2013
 RANDOM_PLANS = 1000
+STEP = 1e-6  # rad, differences of the tool's position
+ROUNDS = 6
+CLOSE = 1e-9  # m: how near the calibrated model is brought to the target
 
 
 @dataclass(frozen=True)
@@ -69,23 +79,99 @@ class Study:
         done = Checkpoint(HERE / "runs" / f"{self.name}-{criterion}-{effort}")
         return design(cell, options, done, lambda text: print(f"  {text}", flush=True))
 
+    def random_plan(self, rng: np.random.Generator) -> np.ndarray:
+        """Numbers of candidates, with our plan's shares of each level."""
+        return np.concatenate([
+            rng.choice(np.flatnonzero(self.pool.group == level), n, replace=False)
+            for level, n in enumerate(shares_of(self.cell))
+        ])  # fmt: skip
+
     def at_random(self) -> np.ndarray:
-        """ρ₀ in µm of RANDOM_PLANS plans of the same shares, drawn from feasible candidates."""
+        """ρ₀ in µm of RANDOM_PLANS random plans."""
         rng = np.random.default_rng(SEED)
-        shares = shares_of(self.cell)
-        found = np.empty(RANDOM_PLANS)
-        for k in range(RANDOM_PLANS):
-            chosen = np.concatenate(
-                [
-                    rng.choice(np.flatnonzero(self.pool.group == level), n, replace=False)
-                    for level, n in enumerate(shares)
-                ]
-            )
-            M = self.setup.gathered(self.pool.blocks[:, chosen])
-            found[k] = self.setup.criterion.reported(float(self.setup.criterion.value(M)))[0]
-        return found
+        return np.array([self.rho(self.pool.q[self.random_plan(rng)]) for _ in range(RANDOM_PLANS)])
 
 
 def table_2(model: Model) -> np.ndarray:
     """The poses (15, 6) of Table 2 of Klimchik et al. 2013."""
     return read_plan(DEMO / "plan.csv", joint_kinds=model.chain.kinds).q
+
+
+def realised(study: Study, q: np.ndarray, campaigns: int, jobs: int) -> np.ndarray:
+    """Square mean over the test poses (campaigns,) in m² of the true arm's error after
+    compensation with what each campaign identified."""
+    seeds = np.random.SeedSequence(0).spawn(campaigns)
+    chunks = [seeds[k::32] for k in range(32)]
+    parts = Parallel(n_jobs=jobs)(delayed(_some)(study.name, q, chunk) for chunk in chunks)
+    return np.concatenate(parts)
+
+
+def _some(name: str, q: np.ndarray, seeds: list) -> np.ndarray:
+    study, tool = _instruments(name)
+    return np.array([_one(study, tool, q, seed) for seed in seeds])
+
+
+@cache
+def _instruments(name: str) -> tuple[Study, Tool]:
+    """Each process has its own: symbolic models do not pickle."""
+    study = Study.of(name, 1)
+    return study, Tool(study)
+
+
+def _one(study: Study, tool: Tool, q: np.ndarray, seed: np.random.SeedSequence) -> float:
+    model, truth = study.model, tool.truth
+    rows = rows_of(q, study.forces, tuple(study.cell.tool.markers))
+    repeats = study.cell.design.repeats
+    n = len(rows)
+    table = rows.take(np.repeat(np.arange(n), repeats))
+    table = replace(table, repeat=np.tile(np.arange(repeats), n), row=np.arange(n * repeats) + 2)
+    data = simulate(model, table, truth, np.random.default_rng(seed))
+    options = Options(method="wls", faulty="keep", fixed=("joint1.compliance",))
+    return tool.remaining(identify(model, data, options).x)
+
+
+class Tool:
+    """The tool's load point at the test poses under load, for any parameter values."""
+
+    def __init__(self, study: Study) -> None:
+        cell, targets = study.cell, study.targets
+        marker = {"load point": targets.point[0]}
+        spec = replace(cell.model, observe="position")
+        tool = replace(cell.tool, markers=marker)
+        self.model = Model.assembled(study.model.chain, replace(cell, model=spec, tool=tool))
+        q, zeros = targets.q, np.zeros((len(targets.q), 3))
+        self.rows = Measurements.of_poses("test poses", q, targets.force, *marker, position=zeros)
+        named, _ = published_compliances(DEMO)
+        self.truth = values_from(study.model, named)
+        rigid = np.zeros(len(self.truth))
+        self.target = self.at(targets.q, rigid)
+        self.inverse = np.linalg.pinv(self._slope(targets.q, rigid))
+
+    def at(self, q: np.ndarray, x: np.ndarray) -> np.ndarray:
+        """Position (T, 3) at commanded joints q (T, n)."""
+        return self.model.predict(replace(self.rows, q=q), x).reshape(-1, 3)
+
+    def _slope(self, q: np.ndarray, x: np.ndarray) -> np.ndarray:
+        """∂position/∂q (T, 3, n); joint 2 stays at its level, where its compliance is known."""
+        J = np.zeros((len(q), 3, q.shape[1]))
+        for j in (0, 2, 3, 4, 5):
+            step = np.zeros(q.shape[1])
+            step[j] = STEP
+            J[:, :, j] = (self.at(q + step, x) - self.at(q - step, x)) / (2 * STEP)
+        return J
+
+    def commanded(self, x: np.ndarray) -> np.ndarray:
+        """Joints (T, n) at which an arm with parameters x puts the tool at the targets."""
+        q = self.rows.q.copy()
+        for _ in range(ROUNDS):
+            miss = self.target - self.at(q, x)
+            if np.abs(miss).max() < CLOSE:
+                break
+            q += np.einsum("tij,tj->ti", self.inverse, miss)
+        assert np.abs(miss).max() < 1e3 * CLOSE
+        return q
+
+    def remaining(self, x: np.ndarray) -> float:
+        """Mean square error in m² of the true arm at the joints commanded with x."""
+        error = self.at(self.commanded(x), self.truth) - self.target
+        return float((error**2).sum(axis=1).mean())

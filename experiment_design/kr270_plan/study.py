@@ -12,8 +12,7 @@ import time
 from pathlib import Path
 
 import numpy as np
-from campaigns import realised
-from compared import Study, table_2
+from compared import Study, realised, table_2
 
 from elastocal.planning.plan import Plan, plan_rows, write_plan
 from elastocal.report.arm_view import write_plan_picture
@@ -44,12 +43,11 @@ def _of_cell(study: Study, asked: argparse.Namespace) -> list[str]:
     print(f"{study.name}: D-optimal", flush=True)
     by_determinant = study.planned("D", "normal", asked.jobs)
     random = study.at_random()
-    rng = np.random.default_rng(1)
     plans = {
         "ours": ours.q,
         "D-optimal": by_determinant.q,
         "Table 2": table_2(study.model),
-        "random (one of them)": _one_at_random(study, rng),
+        "random (one of them)": study.pool.q[study.random_plan(np.random.default_rng(1))],
     }
     bound = float(ours.bound_reported or np.nan)
     lines = [
@@ -93,14 +91,6 @@ def _of_cell(study: Study, asked: argparse.Namespace) -> list[str]:
 def _removed(plan: Plan) -> str:
     removed = [f"{rule} {n}" for rule, n in plan.candidates.removed_by.items() if n]
     return f" (removed by {', '.join(removed)})" if removed else ""
-
-
-def _one_at_random(study: Study, rng: np.random.Generator) -> np.ndarray:
-    chosen = [
-        rng.choice(np.flatnonzero(study.pool.group == level), 3, replace=False)
-        for level in range(study.pool.n_groups)
-    ]
-    return study.pool.q[np.concatenate(chosen)]
 
 
 def _keep(study: Study, plan: Plan, name: str) -> None:

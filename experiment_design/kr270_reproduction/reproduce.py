@@ -23,8 +23,8 @@ EFFECT = 80e-6  # m, configuration effect of the second scenario
 METHODS = ("OLS, eq. (8)", "eq. (14) by group", "eq. (14) per residual", "true σ, eq. (13)")
 
 
-def rows_of(name: str) -> list[dict[str, str]]:
-    with open(DEMO / name, newline="", encoding="utf-8") as handle:
+def rows_of(name: str, folder: Path = DEMO) -> list[dict[str, str]]:
+    with open(folder / name, newline="", encoding="utf-8") as handle:
         return list(csv.DictReader(handle))
 
 
@@ -60,7 +60,7 @@ def tables_3_and_4(c: Campaign, dp: np.ndarray) -> tuple[list[str], list[str]]:
         "| published | ratio | ratio by group | published ratio |",
         "|" + "---|" * 10,
     ]
-    published = csv_rows(HERE / "table4_published.csv")
+    published = rows_of("table4_published.csv", HERE)
     for k, row in enumerate(rows_of("table3_compliances.csv")):
         cells = [row["parameter"], f"{c.truth[k] * 1e6:.3f}"]
         fits = [plain, *(per_residual[lam][-1] for lam in (0.5, 1.0, 2.0)), group]
@@ -95,11 +95,6 @@ def location(ols: float, half_ols: float, wls: float, half_wls: float) -> str:
     low, high = ((wls + s * half_wls - ols) / half_ols for s in (-1, 1))
     where = "inside" if low >= -1 and high <= 1 else "outside" if low > 1 or high < -1 else "across"
     return f"{where}, {100 * low:+.0f} to {100 * high:+.0f} %"
-
-
-def csv_rows(path: Path) -> list[dict[str, str]]:
-    with open(path, newline="", encoding="utf-8") as handle:
-        return list(csv.DictReader(handle))
 
 
 def figure_3(c: Campaign, dp: np.ndarray, path: Path) -> list[str]:

@@ -46,31 +46,27 @@ class Split:
         if self.arm == "irb120":
             lines = [v for k, v in enumerate(lines, 2) if not FAULTY[0] <= k <= FAULTY[1]]
         at = header.split(",").index("configuration") if "configuration" in header else None
-        own = [k if at is None else v.split(",")[at] for k, v in enumerate(lines)]
-        order = list(dict.fromkeys(own))
-        rng = np.random.default_rng(self.seed)
+        groups: dict[object, list[str]] = {}
+        for k, line in enumerate(lines):
+            groups.setdefault(k if at is None else line.split(",")[at], []).append(line)
+        rng, rows = np.random.default_rng(self.seed), list(groups.values())
         if self.way == "shuffled":
-            order = [order[k] for k in rng.permutation(len(order))]
-        place = np.arange(len(order))
+            rows = [rows[k] for k in rng.permutation(len(rows))]
+        place = np.arange(len(rows))
         if self.way in ("random", "shuffled"):
-            fit = rng.permutation(len(order)) < 0.75 * len(order)
+            fit = rng.permutation(len(rows)) < 0.75 * len(rows)
         elif self.way == "blocks":
-            fit = (place * BLOCKS // len(order) + self.seed) % 4 > 0
+            fit = (place * BLOCKS // len(rows) + self.seed) % 4 > 0
         else:
             fit = place % 2 == self.seed % 2
         chosen = np.flatnonzero(fit)
         if len(chosen) > self.most:
             chosen = chosen[np.linspace(0, len(chosen) - 1, self.most).round().astype(int)]
-        fitted = {order[k] for k in chosen}
-        tested = {order[k] for k in np.flatnonzero(~fit)}
-        rank = {c: k for k, c in enumerate(order)}
-        rows = sorted(zip(own, lines, strict=True), key=lambda row: rank[row[0]])
-        paths = []
-        for name, part in (("fit", fitted), ("test", tested)):
-            paths.append(OUT / f"{self.stem}_{name}.csv")
-            kept = [line for c, line in rows if c in part]
-            paths[-1].write_text("\n".join([header, *kept]) + "\n", encoding="utf-8")
-        return paths[0], paths[1]
+        paths = OUT / f"{self.stem}_fit.csv", OUT / f"{self.stem}_test.csv"
+        for path, part in zip(paths, (chosen, np.flatnonzero(~fit)), strict=True):
+            kept = [line for k in part for line in rows[k]]
+            path.write_text("\n".join([header, *kept]) + "\n", encoding="utf-8")
+        return paths
 
 
 ARMS = {
@@ -128,21 +124,17 @@ def main(chosen: list[str]) -> None:
     data = prepare()
     OUT.mkdir(exist_ok=True)
     print(HEAD)
-    for arm in chosen or ARMS:
-        for split in splits(arm):
-            found = measure(split, data)
-            (OUT / f"{split.stem}_measured.json").write_text(json.dumps(found), encoding="utf-8")
-            print(row(split, found), flush=True)
-    rows, ratios = [], []
-    for arm in ARMS:
-        for split in splits(arm):
-            kept = OUT / f"{split.stem}_measured.json"
-            if kept.is_file():
-                found = read(kept)
-                rows.append(row(split, found))
-                ratios.append(found["after_found"] / found["after_promised"])
+    rows, ratios = [HEAD], []
+    for split in (split for arm in ARMS for split in splits(arm)):
+        kept = OUT / f"{split.stem}_measured.json"
+        if not chosen or split.arm in chosen:
+            kept.write_text(json.dumps(measure(split, data)), encoding="utf-8")
+            print(row(split, read(kept)), flush=True)
+        if kept.is_file():
+            rows.append(row(split, read(kept)))
+            ratios.append(read(kept)["after_found"] / read(kept)["after_promised"])
     last = f"Found over promised by the diagnosed cell: {median(ratios):.2f} in the median."
-    (HERE / "promises.md").write_text("\n".join([HEAD, *rows, "", last]) + "\n", encoding="utf-8")
+    (HERE / "promises.md").write_text("\n".join([*rows, "", last]) + "\n", encoding="utf-8")
     print(f"\n{last}")
 
 

@@ -7,7 +7,8 @@ from pathlib import Path
 import casadi as ca
 import numpy as np
 import pytest
-from support.elastic_arms import MujocoArm, elastic_arm
+from support import elastic_arms
+from support.elastic_arms import MujocoArm
 from support.robots import KR270, random_chain_urdf
 
 from elastocal.errors import ElastocalError
@@ -58,6 +59,6 @@ def test_a_buckling_load_is_refused(kr270: Chain) -> None:
 
 
 def test_it_is_independent_of_our_kinematics() -> None:
-    lines = Path(str(elastic_arm.__file__)).read_text().splitlines()
+    lines = Path(str(elastic_arms.__file__)).read_text().splitlines()
     imported = {line.split()[1] for line in lines if line.startswith("from elastocal")}
     assert imported <= {"elastocal.errors", "elastocal.model.chain", "elastocal.units"}

@@ -19,7 +19,7 @@ sys.path.insert(0, str(FOLDER))
 from arm_data import ARMS
 from draw import ALIKE, CATALOGUE, Recipe, World
 from instrument import OUTLIER_SIZE, REPEATABILITY, VARIANTS, draw_noise
-from mjcf import GRAVITY
+from mechanics import GRAVITY
 from suites import tasks
 from world_files import write_table, write_world
 
@@ -29,8 +29,8 @@ from elastocal.measurements import Measurements, read_measurements
 from elastocal.model.manipulator import Model
 
 WORLD_MODULES = {
-    "arm_data", "chance", "draw", "inside", "instrument", "mechanics", "mjcf", "outside", "places",
-    "skeleton", "visits", "whole_columns", "whole_draw", "whole_laws", "whole_oracle",
+    "arm_data", "draw", "inside", "instrument", "mechanics", "outside", "places",
+    "skeleton", "whole_columns", "whole_draw", "whole_laws", "whole_oracle",
     "whole_score", "world", "world_files",
 }  # fmt: skip
 CASES = [

@@ -76,11 +76,11 @@ def test_moves_hold_at_every_tenth_of_a_degree(rules, force):
     load = rules.cell.workspace.load
     for a, b, said in zip(q[:-1], q[1:], free, strict=True):
         if said:
-            assert not any(strict.touches(pose, loaded) for pose in check.dense(a, b)[::3])
+            assert not any(strict.touches(pose, loaded) for pose in check.dense((a, b))[::3])
         else:
             assert any(
                 lenient.touches(pose, loaded)
                 or (loaded and lenient.slanted(load.rope_axis, np.cos(load.max_angle)))
-                for pose in check.dense(a, b)
+                for pose in check.dense((a, b))
             )
     assert 0 < free.sum() < len(free)
