@@ -15,11 +15,10 @@ import math
 import os
 import re
 import struct
-from collections import deque
-from collections.abc import Callable, Iterator, Mapping
+from collections.abc import Callable, Hashable, Iterable, Iterator, Mapping
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
+from typing import Any, TypeVar
 from xml.etree import ElementTree as ET
 
 from elastocal.errors import InputError, require
@@ -240,14 +239,14 @@ def _pixels(path: Path) -> float:
 
 # Closed loops: <equality> that ties joints of the arm to each other.
 #
-# A chain of independent joints is read from the file, so none of them may depend on another.  With
-# bodies as the vertices of a graph, their places in the tree and the constraints its edges (a body
-# that floats, <freejoint> or mocap, has none to its parent), the arm is open where every edge that
-# a joint of it moves is a bridge.  Constraints on joint values (joint, fixed tendon) take one
-# degree of freedom each: they bind the arm where a group of joints has more of them than joints
-# beside the arm.
+# A chain of independent joints is read from the file, so none of them may depend on another.
+# Bodies that constraints tie, directly or over bodies that float (<freejoint>, mocap), have to be
+# carried by the same joint of the arm: otherwise those between are part of a loop.  Constraints on
+# joint values (joint, fixed tendon) take one degree of freedom each: they bind the arm where a
+# group of joints has more of them than joints beside the arm.
 
 WORLD = 0
+Tied = TypeVar("Tied", bound=Hashable)
 
 
 @dataclass(frozen=True)
@@ -313,38 +312,34 @@ def check_open(arm: Any, ties: list[Tie]) -> None:
     people drag the flange by it.
     """
     _check_values(arm, [tie for tie in ties if tie.joints])
-    edges = [(a, b, tie) for tie in ties for a, b in _bodies(arm, tie)]
-    model = arm.model
-    free = _floating(arm)
-    beside: list[list[tuple[int, Tie | None]]] = [[] for _ in range(model.nbody)]
-    pairs: list[tuple[int, int, Tie | None]] = [*edges]
-    pairs += [
-        (b, int(model.body_parentid[b]), None) for b in range(1, model.nbody) if b not in free
-    ]
-    for a, b, tie in pairs:
-        beside[a].append((b, tie))
-        beside[b].append((a, tie))
-    for j in arm.joints:
-        body = int(model.jnt_bodyid[j])
-        way = _way_around(beside, body, int(model.body_parentid[body]))
-        require(
-            not way,
-            f"{arm.path}: joint '{arm.joint_name(j)}' is part of a closed loop, by "
-            f"{listed(map(str, way))}; loops are not supported between base and flange, remove the "
-            "constraint or choose another flange",
-        )
+    free, order = _floating(arm), {None: -1} | {j: k for k, j in enumerate(arm.joints)}
+    tied = ((pair, tie) for tie in ties for pair in _bodies(arm, tie))
+    for bodies, members in _groups(tied):
+        carriers = {order[arm.carrier(body)] for body in bodies - free}
+        if len(carriers) > 1:
+            joint = arm.joint_name(arm.joints[min(carriers) + 1])
+            raise InputError(
+                f"{arm.path}: joint '{joint}' is part of a closed loop, by "
+                f"{listed(map(str, dict.fromkeys(members)))}; loops are not supported between base "
+                "and flange, remove the constraint or choose another flange"
+            )
 
 
-def _check_values(arm: Any, ties: list[Tie]) -> None:
-    own = {arm.model.joint(j).name for j in arm.joints} - {""}
-    groups: list[tuple[set[str], list[Tie]]] = []
-    for tie in ties:
-        names, members = set(tie.joints), [tie]
+def _groups(ties: Iterable[tuple[Iterable[Tied], Tie]]) -> list[tuple[set[Tied], list[Tie]]]:
+    """What constraints tie to each other, with the constraints that do."""
+    groups: list[tuple[set[Tied], list[Tie]]] = []
+    for what, tie in ties:
+        names, members = set(what), [tie]
         for other in [g for g in groups if g[0] & names]:
             groups.remove(other)
             names, members = names | other[0], other[1] + members
         groups.append((names, members))
-    for names, members in groups:
+    return groups
+
+
+def _check_values(arm: Any, ties: list[Tie]) -> None:
+    own = {arm.model.joint(j).name for j in arm.joints} - {""}
+    for names, members in _groups((tie.joints, tie) for tie in ties):
         # joint1 of <joint> follows joint2, as a mimic does in a URDF.
         follows = [tie for tie in members if tie.kind == "joint" and tie.joints[0] in own]
         bound = names & own and len(members) > len(names - own)
@@ -381,21 +376,3 @@ def _floating(arm: Any) -> set[int]:
     model, free = arm.model, mujoco.mjtJoint.mjJNT_FREE
     loose = {int(model.jnt_bodyid[j]) for j in range(model.njnt) if model.jnt_type[j] == free}
     return loose | {b for b in range(model.nbody) if model.body_mocapid[b] >= 0}
-
-
-def _way_around(beside: list[list[tuple[int, Tie | None]]], start: int, end: int) -> list[Tie]:
-    """The constraints on a way from a body to its parent that is not the edge between them."""
-    came: dict[int, tuple[int, Tie | None]] = {start: (start, None)}
-    waiting = deque([start])
-    while waiting and end not in came:
-        body = waiting.popleft()
-        for other, tie in beside[body]:
-            if other not in came and not (body == start and other == end and tie is None):
-                came[other] = (body, tie)
-                waiting.append(other)
-    way, body = [], end
-    while body in came and body != start:
-        body, tie = came[body]
-        if tie is not None and tie not in way:
-            way.append(tie)
-    return way
