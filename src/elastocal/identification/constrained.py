@@ -28,29 +28,22 @@ from elastocal.units import Array, BoolArray, IntArray
 RANK = 1e-10  # of unit rows or columns: what is smaller is taken for round-off
 
 
-@dataclass(frozen=True)
-class Affine:
-    """{origin + basis w}: all x with A x = b; `gap` is the largest |A x − b| left, unit rows."""
-
-    origin: Array  # (p,) the shortest such x
-    basis: Array  # (p, q) orthonormal
-    gap: float
-
-
-def equality_space(A: Array, b: Array) -> Affine:
-    """All solutions of A x = b (k, p); least-squares ones where the rows contradict each other."""
+def equality_space(A: Array, b: Array) -> tuple[Array, Array, float]:
+    """All x with A x = b (k, p), or the least-squares ones where the rows contradict each other:
+    the shortest (p,), an orthonormal basis (p, q) of the way to the others, and the largest
+    |A x − b| left, of unit rows."""
     p = A.shape[1]
     norms = np.linalg.norm(A, axis=1)
     rows = A[norms > 0] / norms[norms > 0, None]
     values = b[norms > 0] / norms[norms > 0]
     if not len(rows):
-        return Affine(np.zeros(p), np.eye(p), float(np.max(np.abs(b), initial=0.0)))
+        return np.zeros(p), np.eye(p), float(np.max(np.abs(b), initial=0.0))
     Q, R, _ = linalg.qr(rows.T, pivoting=True)
     sizes = np.abs(np.diag(R))
     rank = int(np.count_nonzero(sizes > RANK * sizes[0]))
     origin = Q[:, :rank] @ least_norm(rows @ Q[:, :rank], values)
     gap = float(np.max(np.abs(rows @ origin - values)))
-    return Affine(origin, Q[:, rank:], max(gap, float(np.max(np.abs(b[norms == 0]), initial=0.0))))
+    return origin, Q[:, rank:], max(gap, float(np.max(np.abs(b[norms == 0]), initial=0.0)))
 
 
 # The answer.
@@ -177,7 +170,7 @@ class Region:
             i, j = np.tril_indices(N.shape[1])
             rows.append((N.T @ matrix.slopes @ N)[:, i, j].T)
         stacked = np.vstack(rows)
-        return equality_space(stacked, np.zeros(len(stacked))).basis
+        return equality_space(stacked, np.zeros(len(stacked)))[1]
 
     def nearest(self) -> Nearest | None:
         """None where nothing satisfies all constraints."""
@@ -192,7 +185,7 @@ class Region:
         allowed = INEXACT
         if not any(N.shape[1] for N in self.nulls(found)):
             held, allowed = found.rows > 0, CERTIFIED
-            u = equality_space(self.rows[held], self.least[held]).origin
+            u = equality_space(self.rows[held], self.least[held])[0]
             prices = np.zeros(len(held))
             if held.any():  # scipy's nnls of no column at all ends the process
                 prices[held] = optimize.nnls(self.rows[held].T, u)[0]
@@ -274,10 +267,10 @@ class Reduced:
         unit = 1 / np.where(norms > 0, norms, 1.0)
         zero = np.zeros(len(unit))
         limits = system.moved(zero, unit)
-        space = equality_space(limits.A, limits.b)
-        if space.gap > CONTRADICTION * max(1.0, float(np.max(np.abs(space.origin), initial=0.0))):
+        origin, basis, gap = equality_space(limits.A, limits.b)
+        if gap > CONTRADICTION * max(1.0, float(np.max(np.abs(origin), initial=0.0))):
             raise_conflict(limits)
-        centre, T = _free_minimum(J * unit, t, space, system.names)
+        centre, T = _free_minimum(J * unit, t, origin, basis, system.names)
         # About the free minimum numbers are as small as the constraints allow.
         limits = limits.moved(centre, zero + 1)
         region = Region.of_system(limits, T)
@@ -401,24 +394,25 @@ def minimise(J: Array, t: Array, system: System, stated: System | None = None) -
     return Reduced.of(J, t, system).minimum(stated)
 
 
-def _free_minimum(J: Array, t: Array, space: Affine, names: tuple[str, ...]) -> tuple[Array, Array]:
-    """Least-squares x (p,) in the space, and T (p, q) with |J T u| = |u|."""
-    t = t - J @ space.origin
-    if not space.basis.shape[1]:
-        return space.origin, space.basis
-    Q, R = linalg.qr(J @ space.basis, mode="economic")
+def _free_minimum(
+    J: Array, t: Array, origin: Array, basis: Array, names: tuple[str, ...]
+) -> tuple[Array, Array]:
+    """Least-squares x (p,) among origin + basis · w, and T (p, q) with |J T u| = |u|."""
+    if not basis.shape[1]:
+        return origin, basis
+    Q, R = linalg.qr(J @ basis, mode="economic")
     singular, right = linalg.svd(R)[1:]
     tiny = UNDETERMINED * float(np.max(singular, initial=0.0))
     loose = right[int((singular > tiny).sum()) :]
     if len(loose):
-        moved = np.abs(loose @ space.basis.T).max(axis=0)
+        moved = np.abs(loose @ basis.T).max(axis=0)
         free = [n for n, m in zip(names, moved, strict=True) if m > 1e-3 * moved.max()]
         raise InsufficientDataError(
             f"data, prior and equalities do not determine {listed(free)}: values can change "
             "together without moving a reading; hold some of them, or state a prior"
         )
-    T = linalg.solve_triangular(R, space.basis.T, trans="T").T
-    return space.origin + T @ (Q.T @ t), T
+    T = linalg.solve_triangular(R, basis.T, trans="T").T
+    return origin + T @ (Q.T @ (t - J @ origin)), T
 
 
 def _names(system: System, chosen: Array) -> tuple[str, ...]:

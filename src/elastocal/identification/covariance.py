@@ -96,11 +96,6 @@ class Orthogonal:
     Q: Array
     V: Array
 
-    def sandwich(self, meat: Array) -> Array:
-        """V · meat · Vᵀ (p, p), symmetric to the last bit, of QᵀΩQ (p, p)."""
-        matrix = self.V @ meat @ self.V.T
-        return (matrix + matrix.T) / 2
-
 
 def orthogonal(B: Array) -> Orthogonal:
     """Factors of the whitened B (rows, p).
@@ -243,7 +238,7 @@ def cluster_robust(B: Array, e: Array, cluster: IntArray, kind: str = "CR2") -> 
     text = f"rows correlated within {G} clusters, {CLUSTER_DESCRIPTION[kind]}"
     if alone.any():
         text += f"; parameters {np.flatnonzero(alone).tolist()} hang on a single cluster"
-    return Covariance(kind, factors.sandwich(meat), np.where(alone, 0.0, sums.dof()), text)
+    return Covariance(kind, V @ ((meat + meat.T) / 2) @ V.T, np.where(alone, 0.0, sums.dof()), text)
 
 
 def _blocks(cluster: IntArray, columns: int) -> Iterator[IntArray]:

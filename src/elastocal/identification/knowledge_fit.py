@@ -23,7 +23,13 @@ from elastocal.identification.linear_solver import least_norm
 from elastocal.identification.method_result import MethodResult
 from elastocal.identification.options import Options
 from elastocal.identification.residuals import growth
-from elastocal.identification.solve import WORTH_A_COLUMN, Reduction, Solution, residual_sigma
+from elastocal.identification.solve import (
+    WORTH_A_COLUMN,
+    Reduction,
+    Solution,
+    free_r_factor,
+    residual_sigma,
+)
 from elastocal.identification.weighted_problem import (
     RFactor,
     Span,
@@ -73,8 +79,12 @@ def fitted_columns(
     named = {names.index(n) for n in tied | priors} & free
     columns = {*reduction.kept.tolist(), *named}
 
+    R = np.zeros((len(problem.free), len(names)))
+    R[:, problem.free] = free_r_factor(problem, solution.fit).R
+
     def told_apart(c: int) -> bool:
-        return _told_apart(solution, [*sorted(columns - {c}), c], constraints, prior)
+        chosen = np.array([*sorted(columns - {c}), c])
+        return _told_apart(solution, R[:, chosen], chosen, constraints, prior)
 
     new = {names.index(n) for n in tied - priors} & free - set(reduction.kept.tolist())
     unknown = [quoted(names[c]) for c in sorted(new) if not told_apart(c)]
@@ -94,14 +104,15 @@ def fitted_columns(
 
 
 def _told_apart(
-    solution: Solution, columns: list[int], constraints: Constraints, prior: GaussianPrior | None
-) -> bool:
-    """Whether readings, prior and equalities tell the last of the columns from the others."""
-    problem, e = solution.problem, solution.fit.whitened
-    chosen = np.array(columns)
-    size, names = solution.sizes[chosen], problem.model.names
+    solution: Solution, R: Array, chosen: IntArray, constraints: Constraints,
+    prior: GaussianPrior | None,
+) -> bool:  # fmt: skip
+    """Whether readings (their R), prior and equalities tell the last of the columns `chosen` from
+    the others."""
+    e = solution.fit.whitened
+    size, names = solution.sizes[chosen], solution.problem.model.names
     sigma = max(float(np.sqrt(e @ e / len(e))), 1e-12)
-    J = evaluate(problem.model, problem.parts, solution.fit.x, chosen).r_factor.R * size / sigma
+    J = R * size / sigma
     if prior is not None:
         J = np.vstack([J, prior.rows(names)[0][:, chosen] * size])
     A = constraints.resolve(names).A[:, chosen] * size

@@ -172,13 +172,12 @@ class JointFit:
 
 def joint_fit(
     problem: Problem, sizes: Array, functions: Functions, x: Array, reduction: Reduction,
-    scales: Scales | None = None, *, choosing: bool = True, sizing: bool = True,
+    scales: Scales | None = None, *, choosing: bool = True,
 ) -> JointFit:  # fmt: skip
     """Gauss–Newton on readings and prior from x.
 
-    The sizes of the functions are estimated on the way, from `scales` on, unless `sizing` is
-    False; which ordinary parameters are fitted is chosen anew beside them, from `reduction` on,
-    unless `choosing` is.
+    The sizes of the functions are estimated on the way, from `scales` on; which ordinary parameters
+    are fitted is chosen anew beside them, from `reduction` on, unless `choosing` is False.
 
     Raises ElastocalError where the start has poses without equilibrium.
     """
@@ -201,7 +200,7 @@ def joint_fit(
         gone = functions.columns[(scales.scale == 0)[functions.group]]
         x[gone] = problem.model.nominal[gone]
     residual, sums = at(x)
-    rounds = 0 if not sizing else CHOICES if scales is None else 1
+    rounds = CHOICES if scales is None else 1
     steps = 0
     while True:
         free = _from_nominal(problem, functions, x, sums)

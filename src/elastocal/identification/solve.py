@@ -284,14 +284,13 @@ def wider_is_needed(problem: Problem, narrow: Array, wide: Array) -> bool:
     return predicts_better(narrow, wide, problem.weights, observed.configuration, observed.size)
 
 
-def fits_better(narrow: Fit, wide: Fit) -> bool:
+def fits_better(narrow: RFactor, wide: RFactor) -> bool:
     """Does the wider set fit the readings better than chance alone in CHANCE of all cases (F)?
 
     Beside the held-out residuals, which a few configurations of weight can sway.
     """
-    before, after = (float(found.whitened @ found.whitened) for found in (narrow, wide))
-    more, dof = len(wide.columns) - len(narrow.columns), len(wide.whitened) - len(wide.columns)
-    return bool(f_test(before - after, more, after, max(dof, 1))[1] < CHANCE)
+    more, dof = wide.columns - narrow.columns, wide.rows - wide.columns
+    return bool(f_test(narrow.rest**2 - wide.rest**2, more, wide.rest**2, max(dof, 1))[1] < CHANCE)
 
 
 def prefer_wider(
@@ -301,17 +300,16 @@ def prefer_wider(
     """A wider set, up to full rank, where held-out configurations show that it is needed.
 
     Typical sizes are prior knowledge and may be wrong for this arm; a test on held-out data
-    decides, first on the linearised model, then on the refitted one.  `r_factor` is that of the
-    free columns.
+    decides, where the linearised model fits better.  `r_factor` is that of the free columns.
     """
     for threshold in WIDER:
         sigma = residual_sigma(found, len(reduction.kept))
         wider = choose(problem, sizes, r_factor, sigma, threshold)
-        if len(wider.kept) <= len(reduction.kept):
+        own = r_factor.of_columns(np.searchsorted(problem.free, wider.kept))
+        if own.columns <= len(reduction.kept) or not fits_better(found.r_factor, own):
             continue
-        x, linear_heldout = _linear_step(problem, sizes, found.x, wider, r_factor)
-        if not wider_is_needed(problem, heldout, linear_heldout):
-            continue
+        x = found.x.copy()
+        x[wider.kept] += own.step(sizes[wider.kept])
         try:
             wide = fit_kept(problem, sizes, x, wider, max_steps=30, again=True)
             wide_heldout = heldout_of(problem, wide)
@@ -319,22 +317,11 @@ def prefer_wider(
             # Along an undetermined direction the wide set may leave every valid arm, or come to
             # rest where it is singular.
             continue
-        needed = wide.converged and fits_better(found, wide)
+        needed = wide.converged and fits_better(found.r_factor, wide.r_factor)
         if needed and wider_is_needed(problem, heldout, wide_heldout):
             found, reduction, heldout = wide, wider, wide_heldout
             r_factor = free_r_factor(problem, found)
     return found, reduction, heldout
-
-
-def _linear_step(
-    problem: Problem, sizes: Array, x: Array, chosen: Reduction, r_factor: RFactor
-) -> tuple[Array, Array]:
-    """x after one Gauss–Newton step of the chosen set, and the linear model's held-out residual."""
-    kept, moved = chosen.kept, x.copy()
-    own = r_factor.of_columns(np.searchsorted(problem.free, kept))
-    step = own.step(sizes[kept])
-    moved[kept] += step
-    return moved, held_out_by_parts(problem.model, problem.parts, x, kept, own, step)
 
 
 # The course of a fit: place, tie weakly, choose the parameters, fit, compare.
