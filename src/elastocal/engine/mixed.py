@@ -355,6 +355,16 @@ class Mixed:
             information = 2 * self.prior.curved(information / 2)
         return value, slope, information
 
+    def told(self, state: State) -> BoolArray:
+        """Which θ_k (K,) the readings say anything of: not those that x could explain all of, which
+        then is so in every cluster by itself."""
+        left, whole = np.zeros(self.K), np.zeros(self.K)
+        for w, H, _ in state.each():
+            theta, one = state.theta[w.pack.of], np.broadcast_to(np.eye(H.shape[1]), w.root.shape)
+            for out, Q in ((left, one - H @ H.transpose(0, 2, 1)), (whole, one)):
+                out += np.diag(w.pack.pairs(w.local_information(Q, theta), self.K))
+        return left > LEAST_TOLD * whole
+
     def expected(self, state: State) -> Expected:
         """The expected information on θ at a state, and what Kenward and Roger need."""
         K, p = self.K, len(self.precision)
@@ -509,7 +519,7 @@ def fit(
     held = np.zeros(0, dtype=np.int64)
     if any(_common(part) for pack in model.packs for part in pack.parts):
         # Those that the columns could explain all of say nothing: they are none.
-        told = model.expected(model.state(start)).told
+        told = model.told(model.state(start))
         held = np.array([k for k in may_vanish if not told[k]], dtype=np.int64)
 
     def evaluated(t: Array) -> tuple[float, Array, Array]:

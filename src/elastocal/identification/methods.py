@@ -102,8 +102,9 @@ def _settled(
         solution = refined(every, start, solution.fit.x, now, weights_of(noise, readings.take(now)))
         readings = _linearised(model, observed, solution.fit.x, kept, kind)
         moved = np.abs(solution.fit.x[kept] - expected) / noise.covariance.std
-        # What relinearising moves by more may have looked like some noise.
-        known = NoiseAndOutliers(noise, now) if moved.max(initial=0.0) < LINEAR else None
+        # What relinearising moves by more may have looked like some noise: it is chosen again.
+        near = moved.max(initial=0.0) < LINEAR
+        known = NoiseAndOutliers(noise, now if near else np.zeros_like(now))
         if moved.max(initial=0.0) < SETTLED and np.array_equal(now, before):
             # Weights that make light of what is noisy may show more than those of the first fit.
             other = noise.kind not in FIRST and left > 0

@@ -47,7 +47,7 @@ from elastocal.units import Array
 # clearly better only makes the judgement of faulty readings erratic; so for joints told apart.  For
 # shared effects it is Akaike's (AIC): one that is left out wrongly makes intervals too narrow.
 
-ROUGHLY = 1e-3  # of −2ℓ: what decides between models need not be finer
+ROUGHLY = 1e-2  # of −2ℓ: what decides between models need not be finer
 ROWS_PER_VARIANCE = 5  # degrees of freedom that a variance needs before it is worth trying
 MOST_GROUPS = 1000  # configurations: their information matrix has (3 · 1000)² entries
 # Readings, and those per parameter, that the choice is made from: so many tell a variance to 3 %.
@@ -277,7 +277,7 @@ class _Choice:
         k = np.arange(1, 1 + (joints if part == JOINTS else len(more.drift)))
         gain = 2 * (more.log_likelihood - less.log_likelihood)
         share = special.binom(len(k), k) / 2 ** len(k)
-        p = float(share @ special.chdtrc(k, gain)) if gain > 2 * ROUGHLY else 1.0
+        p = float(share @ special.chdtrc(k, gain)) if gain > ROUGHLY else 1.0
         self.tests.append(NoiseTest(part, p))
         return more if p < TRACE else None
 

@@ -300,7 +300,8 @@ def prefer_wider(
     """A wider set, up to full rank, where held-out configurations show that it is needed.
 
     Typical sizes are prior knowledge and may be wrong for this arm; a test on held-out data
-    decides, where the linearised model fits better.  `r_factor` is that of the free columns.
+    decides, first on the linearised model, then on the refitted one.  `r_factor` is that of the
+    free columns.
     """
     for threshold in WIDER:
         sigma = residual_sigma(found, len(reduction.kept))
@@ -308,8 +309,12 @@ def prefer_wider(
         own = r_factor.of_columns(np.searchsorted(problem.free, wider.kept))
         if own.columns <= len(reduction.kept) or not fits_better(found.r_factor, own):
             continue
+        step = own.step(sizes[wider.kept])
+        linear = held_out_by_parts(problem.model, problem.parts, found.x, wider.kept, own, step)
+        if not wider_is_needed(problem, heldout, linear):
+            continue
         x = found.x.copy()
-        x[wider.kept] += own.step(sizes[wider.kept])
+        x[wider.kept] += step
         try:
             wide = fit_kept(problem, sizes, x, wider, max_steps=30, again=True)
             wide_heldout = heldout_of(problem, wide)
