@@ -9,10 +9,13 @@ import pytest
 from support.cells import MARKERS, kr270_cell, kr270_chain, random_poses, table_of
 
 from elastocal.cell.arm_description import CartesianNoise, Tracker
+from elastocal.cell.plan_wishes import DesignSpec
 from elastocal.identification.identify import identify
 from elastocal.identification.options import Method, Options
 from elastocal.identification.result import Calibration
 from elastocal.model.manipulator import Model
+from elastocal.planning.design import DesignOptions, design
+from elastocal.planning.plan import Plan
 from elastocal.report import figures
 from elastocal.simulation.simulate import simulate, values_from
 
@@ -105,6 +108,19 @@ def pose() -> Case:
 def bare() -> Case:
     """Base frame only, from one marker without stated noise, one reading faulty."""
     return make_case(("M1",), ("base_frame",), sigma=None, faulty=1)
+
+
+@pytest.fixture(scope="session")
+def plan() -> Plan:
+    """Four poses at two levels of joint 2; the first marker's name has markup."""
+    loads = np.array([[0, 0, 0], [0, 0, -2600.0]])
+    spec = DesignSpec(poses=4, loads=loads, candidates=30, levels={"joint2": (-0.5, -1.0)})
+    cell = kr270_cell(["joint_compliance"], observe="deflection")
+    markers = dict(zip([SCRIPT, "M2", "M3"], cell.tool.markers.values(), strict=True))
+    noise = CartesianNoise(np.full(3, 1e-5))
+    tracker = Tracker(np.array([3.0, 0.0, 1.0]), noise)
+    cell = replace(cell, tool=replace(cell.tool, markers=markers), tracker=tracker, design=spec)
+    return design(cell, DesignOptions(effort="quick"))
 
 
 @pytest.fixture

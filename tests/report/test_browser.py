@@ -18,11 +18,8 @@ import pytest
 from support.cells import kr270_cell, kr270_chain
 from support.diagnoses import EXPLAINED, HOSTILE
 
-from elastocal.cell.arm_description import CartesianNoise, Tracker
-from elastocal.cell.plan_wishes import DesignSpec
 from elastocal.diagnosis.baseline import Baseline
 from elastocal.model.manipulator import Model
-from elastocal.planning.design import DesignOptions, design
 from elastocal.report.page import page_of
 
 playwright = pytest.importorskip("playwright.sync_api")
@@ -59,20 +56,16 @@ def browser() -> Iterator[Any]:
 
 
 @pytest.fixture(scope="module")
-def texts(hostile: Any) -> dict[str, str]:
+def texts(hostile: Any, plan: Any) -> dict[str, str]:
     observed = hostile.result.observations
     model = hostile.result.model
     base = Baseline(model, observed, hostile.result.x, np.ones(len(model.names)),
                     hostile.result.residual, hostile.result.residual, None)  # fmt: skip
     arm = Model.assembled(kr270_chain(), kr270_cell(("base_frame",)))
-    spec = DesignSpec(poses=4, loads=np.array([[0, 0, 0], [0, 0, -2600.0]]), candidates=30)
-    cell = kr270_cell(["joint_compliance"], observe="deflection")
-    cell = replace(cell, tracker=Tracker(noise=CartesianNoise(np.full(3, 1e-5))), design=spec)
-    planned = design(cell, DesignOptions(effort="quick"))
     return {
         "identification": page_of(hostile.result, command="elastocal identify"),
         "diagnosis": page_of(replace(EXPLAINED, calibrated=base, model=arm, data=HOSTILE)),
-        "plan": page_of(planned),
+        "plan": page_of(plan),
     }
 
 

@@ -1,7 +1,6 @@
 """Results in a notebook: HTML without anybody's markup, figures, data frames."""
 
 import re
-from dataclasses import replace
 from html.parser import HTMLParser
 
 import numpy as np
@@ -40,22 +39,6 @@ def parsed(result):
     page.feed(result._repr_html_())
     assert page.open == []
     return page
-
-
-@pytest.fixture(scope="module")
-def plan():
-
-    from support.cells import kr270_cell
-
-    from elastocal.cell.arm_description import CartesianNoise, Tracker
-    from elastocal.cell.plan_wishes import DesignSpec
-    from elastocal.planning.design import DesignOptions, design
-
-    loads = np.array([[0, 0, 0], [0, 0, -2600.0]])
-    spec = DesignSpec(poses=4, loads=loads, candidates=30, levels={"joint2": (-0.5, -1.0)})
-    cell = kr270_cell(["joint_compliance"], observe="deflection")
-    cell = replace(cell, tracker=Tracker(noise=CartesianNoise(np.full(3, 1e-5))), design=spec)
-    return design(cell, DesignOptions(effort="quick"))
 
 
 def test_names_of_the_user_are_no_markup(hostile):

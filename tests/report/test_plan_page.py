@@ -9,35 +9,16 @@ from typing import Any
 import numpy as np
 import pytest
 from report.test_words import seen
-from support.cells import kr270_cell
 from support.design_commands import design as design_command
 from support.design_commands import everything_in, write_cell
 from support.pages import Page
 
-from elastocal.cell.arm_description import CartesianNoise, Tracker
-from elastocal.cell.plan_wishes import DesignSpec
 from elastocal.errors import InputError
-from elastocal.planning.design import DesignOptions, design
 from elastocal.planning.plan import PlanSize
 from elastocal.report.arm_view import plan_space
 from elastocal.report.page import page_of, write_page
 
 SCRIPT = "<script>alert(1)</script>"
-
-
-@pytest.fixture(scope="module")
-def plan() -> Any:
-    loads = np.array([[0, 0, 0], [0, 0, -2600.0]])
-    spec = DesignSpec(poses=4, loads=loads, candidates=30, levels={"joint2": (-0.5, -1.0)})
-    cell = kr270_cell(["joint_compliance"], observe="deflection")
-    markers = dict(zip([SCRIPT, "M2", "M3"], cell.tool.markers.values(), strict=True))
-    cell = replace(
-        cell,
-        tool=replace(cell.tool, markers=markers),
-        tracker=Tracker(np.array([3.0, 0.0, 1.0]), CartesianNoise(np.full(3, 1e-5))),
-        design=spec,
-    )
-    return design(cell, DesignOptions(effort="quick"))
 
 
 @pytest.fixture(scope="module")

@@ -2,11 +2,13 @@
 
 from __future__ import annotations
 
+import re
 from typing import Any
 
 import numpy as np
 import pytest
 from rich.console import Console
+from support.diagnoses import VERDICTS
 
 from elastocal.report.blocks import ShownTable
 from elastocal.report.parameter_tables import bar, parameter_table, texts, undetermined_table
@@ -68,3 +70,22 @@ def test_bars_reach_where_the_interval_does() -> None:
     assert bar(1.0, (-np.inf, np.inf), 1.0, alike=True) is None
     found = bar(1.0, (1.0, 3.0), 2.0, alike=False)
     assert found is not None and -found.low == found.high == pytest.approx(1 / 1.05)
+
+
+def test_digits_go_with_the_uncertainty(case: Any) -> None:
+    """The last digit of a value is that of its half width, of which one or two are told."""
+    found = re.findall(r"^ ?joint\d\.\S+ +(-?[\d.]+) +([\d.]+) +m?", str(case.result), re.MULTILINE)
+    assert found
+    for value, half in found:
+        assert len(value.partition(".")[2]) == len(half.partition(".")[2])
+        assert len(half.replace(".", "").lstrip("0")) <= 2
+
+
+@pytest.mark.parametrize("name", VERDICTS)
+def test_a_diagnosis_fits_and_obeys_no_control_character(name: str) -> None:
+    text = printed(60, VERDICTS[name])
+    assert max(map(len, text.splitlines())) <= 60
+    assert "\x1b" not in text
+    words = " ".join(text.split())
+    for part in ("Verdict:", "Error budget", "rank 1 to 8 of 10", "Noise:", "Next:"):
+        assert part in words

@@ -7,7 +7,6 @@ import sys
 from pathlib import Path
 
 import numpy as np
-import pandas as pd
 import pytest
 
 pytest.importorskip("mujoco")
@@ -20,7 +19,6 @@ import suites
 import worker
 from draw import Recipe
 from support.study_scripts import study_of
-from world_files import write_world
 
 study = study_of(FOLDER)
 ECCENTRIC, MASS, SCALE = (
@@ -152,37 +150,6 @@ def test_the_worker_is_given_no_environment_and_cannot_import_the_study(tmp_path
     assert cannot_import and Path(cwd) != FOLDER
 
 
-@pytest.mark.parametrize(("body", "why"), [("sys.exit(3)", "crashed"), ("time.sleep(60)", "time")])
-def test_a_worker_that_dies_or_hangs_is_a_failed_world_and_the_next_one_is_served(
-    tmp_path, monkeypatch, body, why
-):
-    script = tmp_path / "script.py"
-    script.write_text(
-        "import json, sys, time\n"
-        "for line in sys.stdin:\n"
-        "    if 'bad' in line:\n"
-        f"        {body}\n"
-        "    print(json.dumps({'exit': 0, 'seconds': 0.0, 'message': ''}), flush=True)\n"
-    )
-    monkeypatch.setattr(worker, "SCRIPT", script)
-    asked = worker.Worker(timeout=2.0)
-    failed = asked.diagnose(tmp_path / "bad")
-    assert failed.exit == -1 and why in failed.message
-    assert asked.diagnose(tmp_path / "good").exit == 0
-    asked.close()
-
-
-def test_the_script_runs_the_command_in_the_folder_and_passes_on_exit_code_and_message(tmp_path):
-    """A table of too few poses: exit 1, and the tool's own words."""
-    world = Recipe("few", (5, 2), poses=3, arm="medium").draw()
-    write_world(world, tmp_path / "v", tmp_path / "s")
-    asked = worker.Worker()
-    done = asked.diagnose(tmp_path / "v", "-o", "diagnosis.json")
-    asked.close()
-    assert done.exit == 1 and "data.csv" in done.message and "Traceback" not in done.message
-    assert not (tmp_path / "v" / "diagnosis.json").exists()
-
-
 # --- the study ---------------------------------------------------------------------------------
 
 
@@ -215,35 +182,3 @@ def test_a_task_is_the_suites_world_of_that_name_under_the_studys_seed(monkeypat
     assert {t["suite"] for t in fewer} == {
         name for name in suites.SUITES if name != "catalogue" and "clean" not in name
     }
-
-
-# --- tables -----------------------------------------------------------------------------------
-
-
-def test_the_report_counts_every_world_and_says_which_bars_are_met():
-    def record(suite, k, given, **more):
-        sealed = truth(ECCENTRIC) | {"plan": {"poses": 60}}
-        return {
-            "suite": suite, "world": f"{suite}-{k}", "seed": 5, "factor": None,
-            "seconds": 4.0, "truth": sealed, "answer": given,
-        } | more  # fmt: skip
-
-    right, wrong, done = answer("explained", ECCENTRIC), answer("explained", SCALE), []
-    for k in range(20):
-        at = [{"distance": 7.0 if k else 1.5, "nothing": 7.5}]
-        given = right if k else wrong
-        done.append(record("catalogue", k, given, distances=at))
-    for k in range(10):
-        done.append(record("clean-outliers", k, NOTHING if k else right))
-    lines = {"record": [json.dumps(r) for r in done], "elastocal": ["0.1+gabc"] * len(done)}
-    text = study.summary(pd.DataFrame(lines))
-    cells = [line.strip("| ").split(" | ") for line in text.splitlines()]
-    bar = {(row[0], row[1]): row[3:] for row in cells if len(row) == 6}
-    alone = "one effect, 60 poses"
-    assert "seed 5" in text and "30 worlds" in text and "0.1+gabc" in text
-    assert bar[alone, "right"] == ["0.950 (0.764 to 0.991)", "20", "yes"]
-    assert bar[alone, "wrong name"] == ["0.050 (0.009 to 0.236)", "20", "NO"]
-    assert bar["… with d ≥ 5", "named outright"][1:] == ["19", "yes"]
-    assert bar["no effect, outliers", "an effect claimed"][1:] == ["10", "NO"]
-    assert "| … gear_eccentricity | right |  | 0.950 (" in text
-    assert "| … d 1 to 2 | wrong name |  | 1.000 (0.207 to 1.000) | 1 |  |" in text

@@ -31,12 +31,16 @@ def folder(tmp_path_factory):
     return work
 
 
-def identified(folder, cell, data, *options):
-    arguments = ["identify", str(folder / cell), str(folder / "data" / data), "-q", "--json"]
+def ran(verb, folder, cell, data, *options):
+    arguments = [verb, str(folder / cell), str(folder / "data" / data), "-q", "--json"]
     arguments += [str(folder / "data" / o) if o.endswith(".csv") else o for o in options]
     done = CliRunner().invoke(app, arguments)
     assert done.exit_code == 0, done.stderr
     return json.loads(done.stdout)
+
+
+def identified(folder, cell, data, *options):
+    return ran("identify", folder, cell, data, *options)
 
 
 def test_wam_is_no_matter_of_geometry_alone(folder):
@@ -67,3 +71,74 @@ def test_the_faulty_block_of_the_cable_data_is_found(folder):
     left_out = {o["line"] for o in clean["excluded"]}
     assert len(left_out & set(range(142, 508))) > 350 and len(left_out) < 400
     assert clean["heldout_rms_um"] < 620 < as_is["heldout_rms_um"]
+
+
+# Diagnosis
+
+
+def of_written_cell(folder, cell, train, test=None):
+    """Errors in µm of the poses never fitted, else held out: of the cell, and of the one that the
+    diagnosis of its training table writes."""
+    data, written = folder / "data", folder / f"written_{Path(train).stem}.toml"
+    arguments = ["diagnose", folder / cell, data / train, "--cell-out", written, "-q"]
+    assert CliRunner().invoke(app, [str(a) for a in arguments]).exit_code == 0
+    errors = []
+    for file in (folder / cell, written):
+        arguments = ["identify", file, data / train, *(("--test", data / test) if test else ())]
+        done = CliRunner().invoke(app, [*(str(a) for a in arguments), "-q", "--json"])
+        assert done.exit_code == 0, done.stderr
+        found = json.loads(done.stdout)
+        errors.append(found["test"]["rms_um"] if test else found["heldout_rms_um"])
+    return errors
+
+
+@pytest.mark.long
+@pytest.mark.parametrize(
+    "cell, train, test, bar",
+    [
+        ("ur10.toml", "ur10_100.csv", "ur10_test.csv", 190),
+        ("ur10.toml", "ur10_600.csv", "ur10_test.csv", 125),
+        ("ur5.toml", "ur5_grid.csv", "ur5_random.csv", 80),
+        ("wam.toml", "wam_grid.csv", "wam_random.csv", 3280),
+        ("iiwa7_rigid.toml", "iiwa7_train.csv", "iiwa7_test.csv", 320),
+    ],
+)
+def test_what_is_diagnosed_corrects_poses_never_fitted(folder, cell, train, test, bar):
+    geometry, corrected = of_written_cell(folder, cell, train, test)
+    assert corrected <= bar and corrected < 0.8 * geometry
+
+
+def diagnosed(folder, cell, data):
+    return ran("diagnose", folder, cell, data)
+
+
+@pytest.mark.long
+@pytest.mark.parametrize(
+    "cell, calibrated", [("iiwa7_rigid.toml", 1650), ("iiwa7_rigid_scale.toml", 990)]
+)
+def test_iiwa_without_springs_is_found_to_bend_at_joint_2(folder, cell, calibrated):
+    """What identification shows (README): 1.6 to 0.4 mm with one compliance near 1e-4."""
+    found = diagnosed(folder, cell, "iiwa7.csv")
+    first = found["effects"][0]
+    assert (first["effect"], first["where"]) == ("joint_compliance", "joint2")
+    assert first["probability"] > 0.85
+    (compliance,) = first["parameters"]
+    assert 5e-5 < compliance["value"] < 1.5e-4
+    assert found["gap"]["calibrated_um"] == pytest.approx(calibrated, rel=0.1)
+    assert found["gap"]["explained_um"] < 500
+    assert first["gap_reduction_ci95"][0] > 0.5
+
+
+@pytest.mark.long
+def test_iiwa_readings_that_the_compliance_explains_are_not_faulty(folder):
+    """Left out for their deflection, they must come back once the compliance is found."""
+    found = diagnosed(folder, "iiwa7_rigid_scale.toml", "iiwa7.csv")
+    assert all(reading["error_um"] < 2000 for reading in found["noise"]["faulty"])
+
+
+@pytest.mark.long
+def test_wam_is_not_explained_away(folder):
+    """A cable drive: whatever is named, millimetres remain and the verdict says so."""
+    found = diagnosed(folder, "wam.toml", "wam_grid.csv")
+    assert found["verdict"] in ("unknown_effect", "ambiguous")
+    assert found["gap"]["explained_um"] > 1000

@@ -2,7 +2,6 @@
 
 # ruff: noqa: E402  (the study is a script: its folder has to be found first)
 
-import json
 import sys
 from dataclasses import replace
 from pathlib import Path
@@ -14,11 +13,6 @@ pytest.importorskip("mujoco")
 FOLDER = Path(__file__).resolve().parents[2] / "experiment_design" / "blind_diagnosis"
 sys.path.insert(0, str(FOLDER))
 
-import one_world
-import score
-import suites
-import table
-import worker
 from arm_data import ARMS
 from whole_columns import components, moments, scene_of
 from whole_draw import draw_whole
@@ -86,47 +80,3 @@ def test_the_oracle_errs_as_its_covariance_says():
     every = [oracle_errors(Sights.of(draw_whole((8, 7, k), "w", 40))) for k in range(5)]
     ratios = np.array([error / expected for error, expected in every])
     assert np.mean(ratios**2) == pytest.approx(1.0, abs=0.2)
-
-
-# --- scores -----------------------------------------------------------------------------------
-
-
-def component(family, where, share, half=0.05, **more):
-    return {
-        "family": family, "where": where, "share": share, "probability": 0.9,
-        "share_ci90": [share - half, share + half], "effect": None,
-    } | more  # fmt: skip
-
-
-# --- the study --------------------------------------------------------------------------------
-
-
-class Stand(worker.Worker):
-    """Answers as the command would; the model it writes errs a tenth less than the cell's own."""
-
-    def run(self, folder, *arguments):
-        if arguments[0] == "diagnose":
-            assert not (folder / "new.csv").exists()
-            given = dict.fromkeys(score.KEPT) | {"candidates": [], "effects": []}
-            given |= {"verdict": "unknown_effect", "indistinguishable": []}
-            given["components"] = [component("gravity", "joint2", 0.7, 0.3)]
-            (folder / one_world.ANSWER).write_text(json.dumps(given))
-        else:
-            error = 90.0 if one_world.CELL in arguments else 100.0
-            (folder / "result.json").write_text(json.dumps({"test": {"rms_um": error}}))
-        return worker.Run(0, 1.0, "")
-
-
-def test_a_whole_arm_is_judged_and_its_rows_stand_in_the_tables():
-    task = next(suites.tasks("whole", 3, 1))
-    record = one_world.diagnose_world(task, Stand(), {"seed": 3})
-    whole = json.loads(json.dumps(record))["whole"]
-    assert whole["geometry_mm"] == pytest.approx(0.1) and whole["tool_mm"] == pytest.approx(0.09)
-    assert whole["shares"][0]["kind"] == "load" and "load:joint2" in whole["names"][0]["name"]
-    record["version"] = "0"
-    text = table.report([record])
-    assert "| whole arms, 60 poses | no worse than geometry alone |  | 1.000 (" in text
-    assert (
-        "| whole arms, 60 poses | 90 % interval of a share holds the truth | ≥ 0.85, ≤ 0.95 |"
-        in text
-    )
