@@ -69,6 +69,7 @@ def design(
     candidates: int | str | Path | Sequence[int | str | Path] | None = None,
     repeats: int | None = None,
     loads: ArrayLike | None = None,
+    load_states: Literal["all", "chosen"] | None = None,
     repeatability: float | None = None,
     marker_sigma: Mapping[str, float] | None = None,
     levels: Mapping[str, Sequence[float]] | None = None,
@@ -118,6 +119,8 @@ def design(
             from, or both, as in "taught.csv",500.  In Python ["taught.csv", 500].
         repeats: Readings per pose and load state.
         loads: Forces (L, 3) in N at the load point, in the data's frame.
+        load_states: "all" reads each pose in every load state, "chosen" in those where it tells
+            most, with as many stops in all.
         repeatability: Standard deviation in m, per direction, of what a configuration's readings
             have in common.
         marker_sigma: Standard deviation in m per marker, instead of the tracker's noise.

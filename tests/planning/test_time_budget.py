@@ -45,7 +45,9 @@ def test_a_stop_takes_what_its_readings_take() -> None:
     q[:, 0] = np.arange(5) * 0.6  # a row of poses, 36 s of travel for each load state
     cell = replace(cell, design=replace(cell.design, motion=replace(MOTION, speed=np.full(6, 0.1))))
     # Two load states of five stops, 24 s there and 24 s back each, two changes.
-    assert _minutes(cell, q) == pytest.approx((10 * 34 + 2 * 48 + 2 * 120) / 60)
+    assert _minutes(cell, q, np.ones((5, 2), dtype=int)) == pytest.approx(
+        (10 * 34 + 2 * 48 + 2 * 120) / 60
+    )
 
 
 def one_marker(**design: object) -> Cell:
@@ -76,3 +78,15 @@ def test_the_plan_keeps_the_time() -> None:
     assert plan.to_json()["minutes"] == plan.execution.total / 60
     with pytest.raises(InputError, match="asks for the number of poses"):
         ec.design(cell, minutes=20, poses=5)
+
+
+def test_loads_are_chosen_with_poses_and_readings() -> None:
+    effects = ("base_frame", "joint_compliance", "marker_position")
+    loads = np.array([[0.0, 0, 0], DOWN / 2, DOWN])
+    few = FEW | {"loads": loads, "motion": MOTION, "minutes": 20}
+    crossed, chosen = (
+        ec.design(plan_cell(effects, "position", load_states=states, **few), effort="batch")
+        for states in ("all", "chosen")
+    )
+    assert chosen.execution.total <= 20 * 60 and chosen.reported < 0.95 * crossed.reported
+    assert chosen.execution.load_changes < crossed.execution.load_changes

@@ -229,14 +229,14 @@ class DesignSpec:
     """`criterion`: the name of one that planning has.
 
     `levels` joint → values and `per_level` their numbers of poses (for at most one joint);
-    `loads` (L, 3) N: forces under which poses are measured, all of them at every pose; `repeats`
-    readings each.  `repeatability` m: standard deviation of a deviation common to a
-    configuration's readings, per direction; `marker_sigma`
-    m per marker instead of the tracker's noise; `interest`: parameters, places or effects that
-    D, A, E and O count (default all but base and markers); `elsewhere`: the share of the weight
-    that poses all over the joint ranges have beside the test poses; `elsewhere_cap`: by how much
-    the test poses may be worse for as little error there as can be had (see `cap`);
-    `combination` name → factor for c; `candidates` to draw, and `taught`: a table of poses that are
+    `loads` (L, 3) N: forces under which poses are measured, `load_states`: all of them at every
+    pose, or chosen ones; `repeats` readings each.  `repeatability` m: standard deviation of a
+    deviation common to a configuration's readings, per direction; `marker_sigma` m per marker
+    instead of the tracker's noise; `interest`: parameters, places or effects that D, A, E and O
+    count (default all but base and markers); `elsewhere`: the share of the weight that poses all
+    over the joint ranges have beside the test poses; `elsewhere_cap`: by how much the test poses
+    may be worse for as little error there as can be had (see `cap`); `combination` name → factor
+    for c; `candidates` to draw, and `taught`: a table of poses that are
     brought, instead of these or beside them."""
 
     poses: Count | None = keyed("a whole number >= 1", default=None)
@@ -264,6 +264,7 @@ class DesignSpec:
         'factors by parameter, with names in quotes, as in { "joint2.compliance" = 1.0 }',
         default_factory=dict,
     )
+    load_states: Literal["all", "chosen"] = keyed(default="all")
     prior: Literal["none", "typical"] = keyed(default="none")
     elsewhere: Annotated[float, Field(ge=0, lt=1)] | None = keyed(
         "a number from 0 to below 1", default=None

@@ -62,7 +62,7 @@ def _candidates(text: str) -> int | str | list[int | str]:
 @command(
     verb=verbs.design,
     offers="poses criterion target minutes curve augment keep strike knowledge fixed candidates "
-    "effort elsewhere elsewhere_cap load_changes reference_every jobs seed",
+    "effort elsewhere elsewhere_cap load_states load_changes reference_every jobs seed",
     texts={
         "target": ("µm", _target),
         "curve": ("N,N,…", _numbers),

@@ -8,10 +8,9 @@ import numpy as np
 
 from elastocal.model.chain import finite_ranges, joint_limits
 from elastocal.planning.checkpoint import State
-from elastocal.planning.choices import at_stops
 from elastocal.planning.criteria import inverse
 from elastocal.planning.exchange import exchange, fitted
-from elastocal.planning.execution import Alias, Execution, schedule
+from elastocal.planning.execution import Alias, Execution, at_stops, schedule
 from elastocal.planning.feasibility import Feasibility
 from elastocal.planning.moves import Unreachable, blockers_of
 from elastocal.planning.search import Search, Selection
@@ -51,7 +50,7 @@ class _Ordering:
 
     def reachable(self, found: Selection) -> tuple[Selection, Execution]:
         """The plan, or that with others in the place of unreachable poses, in an order."""
-        shares = self.search.shares
+        shares = self.search.problem(found.pool).shares
         while True:
             try:
                 plan, execution = self.put(found)
@@ -91,7 +90,8 @@ class _Ordering:
             plan = _unwound(setup, plan, self.paths.feasibility)
         q, blocks = plan.pool.q[plan.chosen], plan.pool.blocks[plan.chosen]
         plain, M = search.plain, search.plain.gathered(blocks)
-        alias = Alias.of(plain.information, q, blocks, M, plain.target_rows)
+        readings = plan.pool.readings[plan.chosen]
+        alias = Alias.of(plain.information, q, blocks, M, plain.target_rows, readings)
         plan = replace(plan, alias=alias)
         return plan, _execution(setup, plan, self.paths, search.seed, search.progress)
 
@@ -159,6 +159,7 @@ def _execution(
     return schedule(
         pool.q[chosen], at_stops(cell), paths,
         loads=setup.information.forces,
+        read=pool.readings[chosen] > 0,
         limits=joint_limits(cell, feasibility.chain),
         via=pool.q[:: max(len(pool) // VIA, 1)],
         blockers=blockers_of(feasibility),
@@ -200,7 +201,7 @@ def _unwound(setup: Setup, plan: Selection, feasibility: Feasibility) -> Selecti
     own = plan.chosen[plan.chosen < len(pool) - plan.pinned]
     was = pool.q[own]
     near = _nearer(feasibility, was)
-    blocks, before = setup.information.blocks(near), pool.blocks[own]
+    blocks, before = setup.information.blocks(near, pool.readings[own]), pool.blocks[own]
     off = np.abs(blocks - before).max(axis=(1, 2)) > SAME * np.abs(before).max()
     q = pool.q.copy()
     q[own] = np.where(off[:, None], was, near)

@@ -18,7 +18,6 @@ from itertools import combinations
 import numpy as np
 from scipy.optimize import minimize
 
-from elastocal.cell.plan_wishes import Motion
 from elastocal.cell.work_cell import Cell
 from elastocal.errors import ElastocalError, InsufficientDataError, require
 from elastocal.model.effects.driven import Entry, LoadPointMotion, MarkerMotion
@@ -26,15 +25,16 @@ from elastocal.model.manipulator import Model
 from elastocal.planning.candidates import Candidates, draw, shares_of
 from elastocal.planning.criteria import CRITERIA
 from elastocal.planning.exchange import exact_plan
-from elastocal.planning.execution import greedy_tour, tour_cost
+from elastocal.planning.execution import at_stops, greedy_tour, tour_cost
 from elastocal.planning.feasibility import Feasibility
 from elastocal.planning.information import PoseInformation, plan_forces
+from elastocal.planning.load_states import chosen_states
 from elastocal.planning.moves import travel_times
 from elastocal.planning.plan import LOAD_POINT, TRACKER, Chosen, Plan, TimedSize
 from elastocal.planning.relaxation import Relaxed, balanced, check_enough, relax
 from elastocal.planning.setup import FeasiblePool, Known, Setup, set_up
 from elastocal.planning.test_poses import TargetPoses
-from elastocal.units import Array, Progress
+from elastocal.units import Array, IntArray, Progress
 
 STARTS = 8  # places drawn in the boxes, besides those that the cell states
 SEARCHED, COMPARED = 400, 2000  # candidates while searching, and for the figures that are told
@@ -210,7 +210,7 @@ class Choice:
         there = _mobile(boxes, point.cell, setup.information)
 
         def value(unit: Array) -> float:
-            B = there(boxes.at(unit)).blocks(pool.q[used])
+            B = there(boxes.at(unit)).blocks(pool.q[used], pool.readings[used])
             M = setup.gathered(B * np.sqrt(w[used])[:, None, None])
             return float(np.log(setup.criterion.of_information(M)))
 
@@ -234,6 +234,9 @@ class Choice:
                 Model.assembled(chain, cell), drawn.q, int(shares.sum()), self.targets, self.known,
                 self.region, rules.seen if rules.partial else None, self.work,
             )  # fmt: skip
+            if cell.design.load_states == "chosen":
+                ways, _ = chosen_states(setup, drawn.q, drawn.group, shares, self.progress)
+                setup = replace(setup, ways=ways)
             pool = setup.pool(drawn.q, drawn.group)
             relaxed = relax(balanced(setup.problem(pool, shares))[0], GAIN / 10)
         except ElastocalError:
@@ -285,12 +288,6 @@ def _least(points: list[RelaxedPoint | None]) -> RelaxedPoint | None:
 REPEATS = (1, 2, 3, 4, 6, 8, 12, 16, 24)
 WORSE = 2  # numbers of repeats in a row that are worse than fewer: more are not tried
 TRIES = 3  # plans whose moves took longer than was thought
-
-
-def at_stops(cell: Cell) -> Motion:
-    """The motion, with what the readings of a stop take in its dwell."""
-    motion, readings = cell.design.motion, cell.design.repeats * max(len(cell.tool.markers), 1)
-    return replace(motion, dwell=motion.dwell + motion.reading * readings)
 
 
 def within(
@@ -347,7 +344,7 @@ class _Budget:
     def _best(self, drawn: Candidates, repeats: int) -> tuple[int, float, TimedSize] | None:
         """How many parameters a plan of as many poses as fit determines, Φ of it, and what it is;
         None where there is none."""
-        poses = self._fitting(drawn.q, repeats)
+        poses, found = self._fitting(drawn.q, repeats), None
         while poses > 0:
             cell = _sized(self.cell, poses, repeats)
             try:
@@ -359,18 +356,28 @@ class _Budget:
                 chosen, phi = exact_plan(balanced(problem)[0], point.relaxed)
             except ElastocalError:
                 return None
-            took = _minutes(cell, point.pool.q[chosen])
+            took = _minutes(cell, point.pool.q[chosen], point.pool.readings[chosen])
+            fitting = int(poses * self.minutes / took)
             if took <= self.minutes:
                 value = point.setup.criterion.figure(phi)
-                return len(problem.prior), phi, TimedSize(poses, repeats, took, value)
-            poses = min(int(poses * self.minutes / took), poses - 1)
-        return None
+                found = len(problem.prior), phi, TimedSize(poses, repeats, took, value)
+                # Where a load is not hung there is time for more.
+                if took > self.minutes - cell.design.motion.load_change / 60 or fitting <= poses:
+                    return found
+                poses = fitting
+            elif found is not None:
+                return found
+            else:
+                poses = min(fitting, poses - 1)
+        return found
 
     def _fitting(self, q: Array, repeats: int) -> int:
         low, high = 0, len(q)
         while low < high:
             middle = (low + high + 1) // 2
-            fits = _minutes(_sized(self.cell, middle, repeats), q[:middle]) <= self.minutes
+            sized = _sized(self.cell, middle, repeats)
+            everything = np.ones((middle, len(plan_forces(sized))), dtype=np.int64)
+            fits = _minutes(sized, q[:middle], everything) <= self.minutes
             low, high = (middle, high) if fits else (low, middle - 1)
         return low
 
@@ -384,15 +391,17 @@ def _sized(cell: Cell, poses: int, repeats: int) -> Cell:
     return replace(cell, design=spec)
 
 
-def _minutes(cell: Cell, q: Array) -> float:
-    """About how long the poses q (N, n) take, on a short way without obstacles."""
-    motion, forces = at_stops(cell), plan_forces(cell)
-    heavy = int(np.any(forces != 0, axis=1).sum())
+def _minutes(cell: Cell, q: Array, readings: IntArray) -> float:
+    """About how long the poses q (N, n) take, each read in the load states that have `readings`
+    (N, L), on a short way without obstacles."""
+    motion, read = at_stops(cell), readings > 0
+    heavy = int((np.any(plan_forces(cell) != 0, axis=1) & read.any(axis=0)).sum())
     changes = (motion.load_changes or heavy + 1) if heavy else 0
-    visits = len(forces)
     home = q[:1] if motion.home is None else motion.home[None]
-    cost = travel_times(np.vstack([home, q]), motion.speed)
-    waiting = visits * len(q) * motion.dwell * (2 if motion.both_directions else 1)
-    travel = visits * tour_cost(cost, greedy_tour(cost))
+    waiting = read.sum() * motion.dwell * (2 if motion.both_directions else 1)
+    travel = 0.0
+    for visited, states in zip(*np.unique(read.T, axis=0, return_counts=True), strict=True):
+        cost = travel_times(np.vstack([home, q[visited]]), motion.speed)
+        travel += states * tour_cost(cost, greedy_tour(cost))
     total = waiting + travel + changes * motion.load_change
     return float(total * (1 + motion.longer) / 60)

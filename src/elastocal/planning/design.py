@@ -37,7 +37,8 @@ from elastocal.planning.criteria import CRITERIA, GONE
 from elastocal.planning.exchange import SizedPlans, random_information, values_without
 from elastocal.planning.feasibility import Feasibility
 from elastocal.planning.further_effects import OPEN, Place, ScheduledEffects, gain_of, in_doubt
-from elastocal.planning.information import Done, measured, next_number, plan_forces, readings_each
+from elastocal.planning.information import Done, measured, next_number, plan_forces
+from elastocal.planning.load_states import LoadStates, chosen_states
 from elastocal.planning.moves import blockers_of
 from elastocal.planning.plan import (
     CandidateCounts,
@@ -53,7 +54,7 @@ from elastocal.planning.search import EFFORTS, POOL, Search, SearchEffort, Selec
 from elastocal.planning.setup import FeasiblePool, Known, Setup, set_up, share_within
 from elastocal.planning.test_poses import TargetPoses, check_cell, everywhere, test_poses
 from elastocal.text import did_you_mean, listed, quoted
-from elastocal.units import Array, IntArray, Progress
+from elastocal.units import Array, BoolArray, IntArray, Progress
 
 # How a plan is searched for; what it is to be stands in the cell's [design].
 
@@ -247,9 +248,11 @@ class _Design:
             model if self.work is self.model else self.work.with_effects(model.cell.model.effects),
         )  # fmt: skip
         self.warnings += setup.warnings
-        pool, pinned = setup.pool(q, group), None
+        pinned = None
         if pins is not None and len(pins.q):
             pinned = setup.pool(pins.q, pinned_at)
+        setup = self._reading(setup, pinned, q, group, shares)
+        pool = setup.pool(q, group)
         search = setup.having(pinned)
         if cap := self.cell.design.cap:
             state = self.checkpoint.finished(
@@ -278,6 +281,16 @@ class _Design:
         progress("random plans beside it")
         drawn = random_information(search.problem(pool, shares), options.seed)
         return self._plan(setup, seek, found, counts, targets.source, curve, known, drawn, pinned)
+
+    def _reading(
+        self, setup: Setup, pinned: FeasiblePool | None, q: Array, group: IntArray, shares: IntArray
+    ) -> Setup:
+        """The setup with the ways in which poses are read."""
+        self.states: LoadStates | None = None
+        if self.cell.design.load_states == "all":
+            return setup
+        ways, self.states = chosen_states(setup.having(pinned), q, group, shares, self.progress)
+        return replace(setup, ways=ways)
 
     def _effort(self) -> SearchEffort:
         effort = EFFORTS[self.options.effort]
@@ -471,7 +484,7 @@ class _Design:
         found, execution, told = ordered(seek, found, pinned)
         self.warnings += told
         pool, chosen = found.pool, found.chosen
-        q, blocks = pool.q[chosen], pool.blocks[chosen]
+        q, blocks, readings = pool.q[chosen], pool.blocks[chosen], pool.readings[chosen]
         spec, model = self.cell.design, setup.information.model
         problem = setup.problem(pool, seek.shares)
         M = setup.gathered(blocks)
@@ -479,8 +492,11 @@ class _Design:
         noise, alias = model.cell.noise, found.alias
         left = M if alias is None or not noise.drift else alias.information(M, when, noise)
         phi = np.sort(np.asarray(setup.criterion.of_information(drawn), dtype=np.float64))
-        seen = setup.information.seen(q)
-        numbers = round(blocks.shape[0] * blocks.shape[1] * seen.mean() * readings_each(self.cell))
+        seen, read = setup.information.seen(q), setup.information.seen(q, readings)
+        observed = readings.shape[1] - (model.cell.model.observe == "deflection")
+        numbers = int((read * readings[:, :, None])[:, -observed:].sum())
+        numbers *= blocks.shape[1] // (observed * read.shape[2])
+        numbers *= 2 if spec.motion.both_directions else 1
         numbers += 0 if known.done is None else known.done.numbers
         value, unit = setup.criterion.reported(found.value)
         bound = found.certificate.bound_pool
@@ -523,6 +539,8 @@ class _Design:
                 setup.target_rows, setup.elsewhere_rows, M, drawn, left, setup.share, spec.cap
             ),
             seen=None if seen.all() else seen,
+            readings=readings,
+            states=self.states,
             doubts=tuple(self.doubts),
             gain=gain_of(setup, known, M, self.doubts, self.options.seed),
         )  # fmt: skip
@@ -530,15 +548,23 @@ class _Design:
     def _names(self, found: Selection) -> tuple[str, ...]:
         """Those that stay keep theirs, and the others are numbered after all there have been."""
         pins, q = self.options.pins, found.pool.q
-        if pins is None and not self.taught:
+        crossed = len(np.unique(q[found.chosen], axis=0)) == len(found.chosen)
+        if pins is None and not self.taught and crossed:
             return ()
         labels = self.options.done.configuration_labels if self.options.done else ()
         kept, taken = ((), ()) if pins is None else (pins.names, pins.taken)
         new = count(next_number((*labels, *taken, *self.taught.values())))
-        own, names = len(found.pool) - found.pinned, list[str]()
+        own, names, read = len(found.pool) - found.pinned, list[str](), found.pool.readings > 0
+        of_pose: dict[bytes, tuple[str, BoolArray]] = {}  # its name, and where it is read so far
         for i in found.chosen:
             name = kept[i - own] if i >= own else self.taught.get(q[i].tobytes())
-            names.append(str(next(new)) if name is None or name in names else name)
+            same, before = of_pose.get(q[i].tobytes(), (None, read[i]))
+            if same is not None and not (before & read[i]).any():
+                name = same  # in another load state
+            elif name is None or name in names:
+                name = str(next(new))
+            names.append(name)
+            of_pose[q[i].tobytes()] = name, read[i] if same is None else before | read[i]
         return tuple(names)
 
 

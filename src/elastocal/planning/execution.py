@@ -15,11 +15,19 @@ from scipy import linalg
 
 from elastocal.cell.arm_description import Unsteadiness
 from elastocal.cell.plan_wishes import Motion
+from elastocal.cell.work_cell import Cell
 from elastocal.errors import require
 from elastocal.identification.visit_record import course_waves
 from elastocal.planning.information import PoseInformation
 from elastocal.planning.moves import BlockersOf, Costs, Moves, PathChecker, Reach
-from elastocal.units import Array, IntArray, Progress
+from elastocal.units import Array, BoolArray, IntArray, Progress
+
+
+def at_stops(cell: Cell) -> Motion:
+    """The motion, with what the readings of a stop take in its dwell."""
+    motion, readings = cell.design.motion, cell.design.repeats * max(len(cell.tool.markers), 1)
+    return replace(motion, dwell=motion.dwell + motion.reading * readings)
+
 
 # What a steady drift of tracker or base does to what the readings are evaluated for.
 
@@ -46,12 +54,13 @@ class Alias:
 
     @classmethod
     def of(
-        cls, information: PoseInformation, q: Array, blocks: Array, M: Array, R: Array | None
-    ) -> Alias | None:
-        """Of a plan of poses q (N, n) with `blocks` (N, r, p) and all that is known M (p, p), |R x|
-        the rms error at the test poses; None where readings are distances, which a shift changes
-        by no more than its part along the line of sight."""
-        observed, factor = information.noise(q)
+        cls, information: PoseInformation, q: Array, blocks: Array, M: Array, R: Array | None,
+        readings: IntArray | None = None,
+    ) -> Alias | None:  # fmt: skip
+        """Of a plan of poses q (N, n) with `blocks` (N, r, p), read as `readings` (N, L), and all
+        that is known M (p, p), |R x| the rms error at the test poses; None where readings are
+        distances, which a shift changes by no more than its part along the line of sight."""
+        observed, factor = information.noise(q, readings)
         if observed.kind == "distance":
             return None
         V = linalg.cho_solve(linalg.cho_factor(M), np.eye(len(M)))
@@ -471,7 +480,8 @@ class Execution:
         return sum(stop.change_after is not None for stop in self.stops) + self.take_off
 
     def times(self, poses: int, states: int) -> Array:
-        """When (poses, states) in s each pose is read in each load state; the mean of several."""
+        """When (poses, states) in s each pose is read in each load state; the mean of several, and
+        of all where it is not."""
         step = [
             stop.travel + self.motion.dwell
             + self.motion.load_change * (stop.change_after is not None)
@@ -479,8 +489,9 @@ class Execution:
         ]  # fmt: skip
         at = np.array([stop.pose * states + stop.load for stop in self.stops])
         total = np.bincount(at, np.cumsum(step), poses * states)
-        count = np.maximum(np.bincount(at, minlength=poses * states), 1)
-        return np.asarray(total / count).reshape(poses, states)
+        count = np.bincount(at, minlength=poses * states)
+        mean = np.where(count > 0, total / np.maximum(count, 1), total.sum() / len(step))
+        return np.asarray(mean).reshape(poses, states)
 
     @property
     def total(self) -> float:
@@ -629,6 +640,7 @@ def schedule(
     checker: PathChecker,
     *,
     loads: Array | None = None,
+    read: BoolArray | None = None,
     limits: tuple[Array, Array] | None = None,
     via: Array | None = None,
     blockers: BlockersOf | None = None,
@@ -640,7 +652,8 @@ def schedule(
 ) -> Execution:
     """The order of `q` (N, n) with the least travel time found, from and to `motion.home`.
 
-    Every pose is visited under each of `loads` (L, 3) N (None: once, without load).  Load states
+    Every pose is visited under each of `loads` (L, 3) N (None: once, without load) in which it is
+    `read` (N, L) (None: in all).  Load states
     are done one after the other with as few changes as possible, unloaded first where that costs
     nothing.  A move is straight in joint space; where that is blocked, it goes through other poses,
     home, or points `via` (k, n), which are not measured.  With `motion.both_directions` each pose
@@ -663,7 +676,7 @@ def schedule(
     q = np.asarray(q, dtype=float)
     require(q.ndim == 2 and len(q) > 0, "there is no pose to put in order")
     forces = np.zeros((1, 3)) if loads is None else np.asarray(loads, dtype=float)
-    moves = Moves.of(q, motion, checker, forces, limits, via)
+    moves = Moves.of(q, motion, checker, forces, limits, via, read)
     Reach(moves, blockers).check()
     costs = moves.costs()
     tour = greedy_tour(costs.cost)

@@ -123,8 +123,11 @@ def _told(cell: Cell, readings: int, size: int) -> float:
     return 1.0 if dof is None else kept_of(dof, readings * size, size).variance
 
 
-def pose_covariance(model: Model, observed: Observations, n_poses: int, x: Array) -> Array:
-    """Covariance (N, r, r) of a pose's observations, means of `[design] repeats` readings each.
+def pose_covariance(
+    model: Model, observed: Observations, n_poses: int, x: Array, readings: IntArray | None = None
+) -> Array:
+    """Covariance (N, r, r) of a pose's observations, means of `readings` (N, L) each in the load
+    states, `[design] repeats` where these are None.
 
     Σ = T Σ_rows Tᵀ / repeats + τ² per load state and direction + J diag(s²) Jᵀ: deflections share
     their unloaded reading; what the arm does not repeat, τ of `[design] repeatability_um` and s of
@@ -134,11 +137,14 @@ def pose_covariance(model: Model, observed: Observations, n_poses: int, x: Array
     """
     spec = model.cell.design
     visits = 2 if spec.motion.both_directions else 1
-    single = reading_covariance(model, observed) / spec.repeats
+    single = reading_covariance(model, observed)
     size, rows = single.shape[1], len(observed.table) // n_poses
+    each = np.full((n_poses, 1), spec.repeats) if readings is None else np.maximum(readings, 1)
+    single = single.reshape(n_poses, rows, size, size)
+    single = single / np.repeat(each, rows // each.shape[1], axis=1)[:, :, None, None]
     full = np.zeros((n_poses, rows, size, rows, size))
     index = np.arange(rows)
-    full[:, index, :, index, :] = single.reshape(n_poses, rows, size, size).transpose(1, 0, 2, 3)
+    full[:, index, :, index, :] = single.transpose(1, 0, 2, 3)
     # Rows combine to observations in the same way at every pose.
     T = observed.combine[: len(observed.lead) // n_poses, :rows].toarray()
     covariance = np.einsum("ak,nkilj,bl->naibj", T, full, T, optimize=True)
@@ -170,11 +176,6 @@ def settling_joints(model: Model, observed: Observations, x: Array) -> SharedEff
     return SharedEffect("joints", (VISIT,), record.visit, loading)
 
 
-def readings_each(cell: Cell) -> int:
-    """How often a plan reads each pose in each load state: repeats, from one side or from both."""
-    return cell.design.repeats * (2 if cell.design.motion.both_directions else 1)
-
-
 # From the symbolic model to information: whitened B of any pose.
 
 CHUNK_NUMBERS = 4_000_000  # numbers of a chunk's regressor held at once
@@ -201,11 +202,17 @@ class PoseInformation:
         return plan_forces(self.model.cell)
 
     @property
+    def everything(self) -> IntArray:
+        """Readings (1, L) of a pose that is read in all load states."""
+        return np.full((1, len(self.forces)), self.model.cell.design.repeats)
+
+    @property
     def names(self) -> tuple[str, ...]:
         return tuple(self.model.names[c] for c in self.columns)
 
-    def blocks(self, q: Array) -> Array:
-        """Whitened, scaled B (N, r, p) of poses q (N, n).
+    def blocks(self, q: Array, readings: IntArray | None = None) -> Array:
+        """Whitened, scaled B (N, r, p) of poses q (N, n), with `readings` (N, L) in each load state
+        or, None, `[design] repeats` in all; what is not read shows nothing.
 
         r counts the components of all markers and load states of a pose; W_i B_i with
         W_iᵀ W_i = Σ_i⁻¹ gives a pose's information B_iᵀ Σ_i⁻¹ B_i.  Raises ElastocalError where
@@ -215,7 +222,8 @@ class PoseInformation:
         size = max(CHUNK_NUMBERS // (per_pose * 6 * max(len(self.columns), 20)), 1)
         found = []
         for k in range(0, len(q), size):
-            observed, factor = self.noise(part := q[k : k + size])
+            own = None if readings is None else readings[k : k + size]
+            observed, factor = self.noise(part := q[k : k + size], own)
             at = self.model.regressor(observed.table, self.x, self.columns, observed)
             B = at.B.reshape(len(part), -1, len(self.columns)) * self.sizes
             found.append(np.linalg.solve(factor, B))
@@ -227,22 +235,25 @@ class PoseInformation:
         table = simulate(self.model, table, self.x, 0, noise=False)
         return marker_sigmas(self.model.cell, table)
 
-    def seen(self, q: Array) -> BoolArray:
-        """(N, L, markers): which markers are seen of poses q (N, n) in each load state."""
+    def seen(self, q: Array, readings: IntArray | None = None) -> BoolArray:
+        """(N, L, markers): which markers are seen and read of poses q (N, n) in each load state."""
         found = np.ones((len(q), len(self.forces), len(self.model.cell.tool.markers)), dtype=bool)
         if self.sight is not None:
             found = np.stack([self.sight(q, force) for force in self.forces], axis=1)
+        if readings is not None:
+            found &= (readings > 0)[:, :, None]
         if self.model.cell.model.observe == "deflection":  # a difference takes both its readings
-            found &= found.all(axis=1, keepdims=True)
+            found[:, 1:] &= found[:, :1]
+            found[:, 0] &= found[:, 1:].any(axis=1)
         return found
 
-    def noise(self, q: Array) -> tuple[Observations, Array]:
+    def noise(self, q: Array, readings: IntArray | None = None) -> tuple[Observations, Array]:
         """What is read at the poses q (N, n), and the Cholesky factors (N, r, r) of its covariance,
-        that of NEVER in place of what is not seen."""
+        that of NEVER in place of what is not seen or read."""
         observed = observe(self.rows(q), self.model.observe)
-        covariance = pose_covariance(self.model, observed, len(q), self.x)
-        if self.sight is not None:
-            seen, size = self.seen(q), observed.size
+        covariance = pose_covariance(self.model, observed, len(q), self.x, readings)
+        if not (seen := self.seen(q, readings)).all():
+            size = observed.size
             states = covariance.shape[1] // (size * seen.shape[2])  # that are observed
             read = np.repeat(seen[:, -states:].reshape(len(q), -1), size, axis=1)
             never = np.einsum("nr,rs->nrs", ~read * NEVER**2, np.eye(read.shape[1]))

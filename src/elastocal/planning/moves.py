@@ -191,10 +191,11 @@ class Moves:
         forces: Array,
         limits: tuple[Array, Array] | None,
         via: Array | None,
+        read: BoolArray | None = None,
     ) -> Moves:
         n_poses, n = q.shape
-        pose = np.repeat(np.arange(n_poses), len(forces))
-        load = np.tile(np.arange(len(forces)), n_poses)
+        read = np.ones((n_poses, len(forces)), dtype=bool) if read is None else read
+        pose, load = np.nonzero(read)
         home = None if motion.home is None else 0
         start = np.zeros((0, n)) if motion.home is None else motion.home[None]
         leave = len(start) + pose

@@ -19,6 +19,7 @@ from elastocal.model.manipulator import Model
 from elastocal.planning.criteria import ScenarioCriterion
 from elastocal.planning.execution import Execution, Stop
 from elastocal.planning.information import Estimable
+from elastocal.planning.load_states import LoadStates
 from elastocal.tables import column, csv_text
 from elastocal.text import is_label, json_text, quoted
 from elastocal.units import Array, BoolArray, IntArray, to_si
@@ -166,6 +167,7 @@ def plan_rows(
     forces: Array | None = None,
     seen: Mapping[str, BoolArray] | None = None,
     carried: Array | None = None,
+    counts: IntArray | None = None,
 ) -> PlanRows:
     """The rows of an execution, sorted by pose, then side of approach, then load state.
 
@@ -177,6 +179,8 @@ def plan_rows(
     A pose that is approached from both sides is two configurations, 7+ (joints moving up to it)
     and 7-: the difference between them is what such a plan is for, not noise of repeats.  With
     `seen`, which markers are read of each pose in each load state (N, L), there is a row for each.
+    With `counts` (N, L), where not all poses are read in all load states, note_load and
+    note_readings say what hangs and how often each marker is read.
     """
     numbered = list(enumerate(execution.stops, start=1))
     readings: dict[tuple[int, ...], list[tuple[int, Stop]]] = {}
@@ -204,6 +208,9 @@ def plan_rows(
             ]
             for i in range(most)
         }
+    if counts is not None and carried is not None:
+        notes["note_load"] = [load_name(carried[stop.load]) for stop in first]
+        notes["note_readings"] = [str(counts[stop.pose, stop.load]) for stop in first]
     approach = [stop.approach for stop in first if stop.approach is not None]
     marker = None
     if seen is not None:
@@ -561,6 +568,8 @@ class Plan(Result):
         chance: What as many random poses would reach.
         everywhere: The error at the test poses and over all joint ranges, in m.
         seen: Which markers are read of each pose in each load state (N, L, markers); None for all.
+        readings: How often each of them is read of each pose in each load state (N, L).
+        states: Whether poses are read in all load states or in chosen ones, where it was asked.
         names: Of the configurations, where poses of an earlier plan were kept.
         gain: What the plan adds to measurements done, where it does.
         doubts: Effects and places that the model may lack and the plan counts, where it does.
@@ -604,6 +613,8 @@ class Plan(Result):
     chance: Chance | None = None
     everywhere: Everywhere | None = None
     seen: BoolArray | None = None
+    readings: IntArray = field(kw_only=True)
+    states: LoadStates | None = None
     names: tuple[str, ...] = ()
     gain: Gain | None = None
     doubts: tuple[tuple[str, str], ...] = ()
@@ -635,8 +646,17 @@ class Plan(Result):
     def rows(self) -> PlanRows:
         return plan_rows(
             self.execution, self.configurations, self.group + 1, self.stated_forces, self._read,
-            self.forces,
+            self.forces, None if self.crossed else self.readings,
         )  # fmt: skip
+
+    @property
+    def crossed(self) -> bool:
+        """Is every pose read in every load state?"""
+        return bool((self.readings > 0).all())
+
+    def loads(self, k: int) -> str:
+        """The load states in which pose k is read."""
+        return ", ".join(load_name(force) for force in self.forces[self.readings[k] > 0])
 
     @property
     def _read(self) -> dict[str, BoolArray] | None:
@@ -681,7 +701,7 @@ class Plan(Result):
         again = any(stop.again for stop in self.execution.stops)
         alike = self.seen is None or bool((self.seen == self.seen[:, :1]).all())
         again |= self.scheduled is not None or self.execution.stops[0].time is not None
-        every = usual and alike and not again
+        every = usual and alike and self.crossed and not again
         return None if every else self.forces
 
     def to_json(self) -> dict[str, Any]:
@@ -708,6 +728,11 @@ class Plan(Result):
             "everywhere": None if self.everywhere is None else asdict(self.everywhere),
             "gain": None if self.gain is None else asdict(self.gain),
             "chosen": None if self.chosen is None else self.chosen.to_json(),
+            "load_states": (
+                None
+                if self.states is None
+                else self.states.to_json(self.forces, self.readings, self.unit)
+            ),
             "drift": None if self.execution.drift is None else asdict(self.execution.drift),
             "predicted": [
                 {
@@ -724,6 +749,8 @@ class Plan(Result):
                     "configuration": k + 1,
                     "markers": self.markers(k),
                     "name": self.configurations[k],
+                    "loads_N": self.forces[self.readings[k] > 0].tolist(),
+                    "readings": int(self.readings[k].max()),
                     "value_without": None if not np.isfinite(r.loss) else r.loss,
                     "serves": [
                         {"name": name, "std_without": None if not np.isfinite(f) else f}

@@ -258,29 +258,31 @@ class Searches:
     information: PoseInformation
     space: JointSpace
     checker: Feasibility
-    _rows: dict[int, tuple[ca.Function, ca.Function]] = field(default_factory=dict)
+    _rows: dict[tuple[int, bytes], tuple[ca.Function, ca.Function]] = field(default_factory=dict)
     _joint: dict[bytes, JointSearch] = field(default_factory=dict)
 
     def feasible(self, q: Array) -> BoolArray:
         return feasible(self.checker, q, self.information.forces)
 
-    def rows(self, q: Array, level: int) -> tuple[ca.Function, ca.Function]:
-        """B (q, x) and its adjoint (q, x, W) of poses at a level, as q (n,) is."""
-        if level not in self._rows:
+    def rows(self, q: Array, level: int, read: BoolArray) -> tuple[ca.Function, ca.Function]:
+        """B (q, x) and its adjoint (q, x, W) of poses at a level, as q (n,) is, in the load states
+        in which they are `read` (L,)."""
+        if (key := (level, read.tobytes())) not in self._rows:
             info = self.information
-            arm = SymbolicArm(info.model.chain, info.model.cell)
-            rows = configuration_rows(arm, info.rows(q[None]), info.columns)
-            self._rows[level] = rows.function, rows.adjoint
-        return self._rows[level]
+            arm, table = SymbolicArm(info.model.chain, info.model.cell), info.rows(q[None])
+            table = table.take(np.flatnonzero(np.repeat(read, len(table) // len(read))))
+            rows = configuration_rows(arm, table, info.columns)
+            self._rows[key] = rows.function, rows.adjoint
+        return self._rows[key]
 
     @cached_property
     def margins(self) -> ca.Function | None:
         info = self.information
         return margins(info.model.cell, info.model.chain, self.checker.pairs, info.forces)
 
-    def joint(self, q: Array, group: IntArray) -> JointSearch:
-        if (key := group.tobytes()) not in self._joint:
-            self._joint[key] = JointSearch(self, q, group)
+    def joint(self, q: Array, group: IntArray, readings: IntArray) -> JointSearch:
+        if (key := group.tobytes() + readings.tobytes()) not in self._joint:
+            self._joint[key] = JointSearch(self, q, group, readings)
         return self._joint[key]
 
     def bounds(self, group: IntArray) -> tuple[Array, Array]:
@@ -289,17 +291,23 @@ class Searches:
 
 
 class JointSearch:
-    """min f(B(q_1) … B(q_k)) inside bounds and margins, over all poses at once."""
+    """min f(B(q_1) … B(q_k)) inside bounds and margins, over all poses at once, which are read as
+    `readings` (k, L) say."""
 
-    def __init__(self, searches: Searches, q: Array, group: IntArray) -> None:
-        self.searches, self.maps = searches, []
-        # B differs where a joint's compliance is split by level.
-        split = bool(searches.information.model.cell.model.compliance_levels)
-        levels = group if split else 0 * group
-        for level in dict.fromkeys(levels.tolist()):
-            own = np.flatnonzero(levels == level)
-            B, adjoint = searches.rows(q[own[0]], level)
-            self.maps.append((own, B.map(len(own)), adjoint.map(len(own))))
+    def __init__(self, searches: Searches, q: Array, group: IntArray, readings: IntArray) -> None:
+        self.searches, self.maps, self.readings = searches, [], readings
+        model = searches.information.model
+        # B differs where a joint's compliance is split by level, and in other load states.
+        split = bool(model.cell.model.compliance_levels)
+        kinds = np.column_stack([group if split else 0 * group, readings > 0])
+        for kind in np.unique(kinds, axis=0):
+            own = np.flatnonzero((kinds == kind).all(axis=1))
+            B, adjoint = searches.rows(q[own[0]], int(kind[0]), kind[1:] > 0)
+            # Deflections are from the first state, which has no rows of its own.
+            read = kind[1:] if model.cell.model.observe != "deflection" else kind[2:]
+            each = B.size1_out(0) // np.count_nonzero(read)
+            rows = np.flatnonzero(np.repeat(read, each))
+            self.maps.append((np.ix_(own, rows), B.map(len(own)), adjoint.map(len(own))))
         flat, self.margins = ca.MX.sym("z", q.size), None
         self.f = _Value(self, q.shape)
         self.problem: dict[str, Any] = {"x": flat, "f": self.f(flat)}
@@ -323,7 +331,7 @@ class JointSearch:
         only stay what it is.
         """
         self.goal, self.T, self.f.last = goal, T, None
-        self.whitener = inverse(self.searches.information.noise(q)[1])
+        self.whitener = inverse(self.searches.information.noise(q, self.readings)[1])
         if (most, fine) not in self.solvers:
             options = IPOPT_OPTIONS | {"ipopt.max_iter": most} | (FINE if fine else {})
             self.solvers[most, fine] = ca.nlpsol("polish", "ipopt", self.problem, options)
@@ -340,18 +348,19 @@ class JointSearch:
     def blocks(self, q: Array) -> Array:
         """Blocks (k, r, p) of poses q (k, n), by the symbolic model."""
         info = self.searches.information
-        found = np.empty((*self.whitener.shape[:2], len(info.columns)))
-        for own, B, _ in self.maps:
+        found = np.zeros((*self.whitener.shape[:2], len(info.columns)))
+        for at, B, _ in self.maps:
+            own = at[0].ravel()
             raw = B(q[own].T, np.tile(info.x[:, None], len(own))).full()
-            found[own] = raw.reshape(len(raw), len(own), -1).swapaxes(0, 1)
+            found[at] = raw.reshape(len(raw), len(own), -1).swapaxes(0, 1)
         return np.asarray(self.whitener @ found * info.sizes @ self.T)
 
     def slope(self, q: Array, W: Array) -> Array:
         """∂/∂q (k, n) of ⟨W, blocks(q)⟩, W (k, r, p)."""
         info, total = self.searches.information, np.zeros_like(q)
         raw = self.whitener.swapaxes(-1, -2) @ W @ self.T.T * info.sizes
-        for own, _, adjoint in self.maps:
-            weights = raw[own].swapaxes(0, 1).reshape(raw.shape[1], -1)
+        for at, _, adjoint in self.maps:
+            own, weights = at[0].ravel(), raw[at].swapaxes(0, 1).reshape(at[1].size, -1)
             total[own] = adjoint(q[own].T, np.tile(info.x[:, None], len(own)), weights).full().T
         return total
 
@@ -417,9 +426,11 @@ def polish(
     T: Array,
     q: Array,
     group: IntArray,
+    readings: IntArray,
     fine: bool = False,
 ) -> Array:
-    """The plan's poses (k, n) moved to a local optimum of Φ; q itself where none is better.
+    """The plan's poses (k, n), read as `readings` (k, L), moved to a local optimum of Φ; q itself
+    where none is better.
 
     `problem` is that of the parameters z, y = T z.  No rule is broken that the poses q keep.
     `fine`: until nothing is gained any more.
@@ -440,13 +451,13 @@ def polish(
         return float(criterion.value(covariance_of(B)))
 
     lower, upper = searches.bounds(group)
-    search, B = searches.joint(q, group), searches.information.blocks(q) @ T
+    search, B = searches.joint(q, group, readings), searches.information.blocks(q, readings) @ T
     phi = value(B)
     for _ in range(ROUNDS):
         end = search.end(goal, T, q, lower, upper, fine=fine)
         part = _allowed(searches, q, end)
         z = q + part[:, None] * (end - q)
-        moved = searches.information.blocks(z) @ T
+        moved = searches.information.blocks(z, readings) @ T
         found = value(moved)
         if found >= phi * (1 - LEAST_GAIN):
             return _one_by_one(q, B, z, moved, value)
@@ -508,13 +519,15 @@ class Continuum:
     """`bound` on Φ from the largest d found on the continuum: an estimate from above, as a larger d
     may have been missed, and then no plan is held to it.
 
-    `q` (k, n), `group` (k,): feasible poses found whose d exceeds all of the pool's; they belong in
-    the pool.  Effort: `searched` new points and `ascents` local searches.
+    `q` (k, n), `group` (k,), `readings` (k, L): feasible poses found, and how they are read, whose
+    d exceeds all of the pool's; they belong in the pool.  Effort: `searched` new points and
+    `ascents` local searches.
     """
 
     bound: float
     q: Array
     group: IntArray
+    readings: IntArray
     searched: int
     ascents: int
 
@@ -525,19 +538,22 @@ def estimate(
     searches: Searches,
     T: Array,
     q: Array,
+    readings: IntArray,
     *,
+    ways: IntArray,
     seed: int = 0,
     progress: Progress = lambda message: None,
 ) -> Continuum:
     """The largest d on the continuum per group, for the tangent (Φ, G) of the pool's optimum.
 
-    `q` (N, n): the problem's candidates, of the parameters z, y = T z.  Every maximum is evaluated
-    exactly and passed by the cell's own rules.
+    `q` (N, n), `readings` (N, L): the problem's candidates, of the parameters z, y = T z; poses may
+    be read in `ways` (K, L).  Every maximum is evaluated exactly and passed by the cell's rules.
     """
     d = problem.prices(tangent.G)
 
-    def price(q: Array) -> Array:
-        found = [searches.information.blocks(q[k : k + CHUNK]) for k in range(0, len(q), CHUNK)]
+    def price(q: Array, read: IntArray) -> Array:
+        lots = [slice(k, k + CHUNK) for k in range(0, len(q), CHUNK)]
+        found = (searches.information.blocks(q[lot], read[lot]) for lot in lots)
         return np.concatenate([block_prices(B @ T, tangent.G) for B in found])
 
     def goal(B: Array) -> tuple[float, Array]:
@@ -551,22 +567,28 @@ def estimate(
         progress(f"searching the continuum, level {group + 1} of {len(problem.shares)}")
         new = np.concatenate([*islice(sobol(searches.space, group, streams[group]),
                                       -(-POINTS // CHUNK))])  # fmt: skip
-        drawn, of = _best_feasible(searches, new, price(new))
+        worth = np.stack([price(new, np.tile(way, (len(new), 1))) for way in ways])
+        best = _best_feasible(searches, new, worth.max(axis=0))
+        drawn, of, read = new[best], worth.max(axis=0)[best], ways[worth.argmax(axis=0)[best]]
         own = np.flatnonzero(problem.group == group)
         both, first = np.vstack([drawn, q[own]]), np.append(of, d[own])
         order = np.argsort(-first, kind="stable")
         kept = order[distinct(both[order], STARTS)]
-        starts.append((both[kept], first[kept], np.full(len(kept), group)))
-        found.append((drawn, of, np.full(len(drawn), group)))
-    begun, unit, at_group = (np.concatenate(part) for part in zip(*starts, strict=True))
+        both_read = np.vstack([read, readings[own]])[kept]
+        starts.append((both[kept], first[kept], np.full(len(kept), group), both_read))
+        found.append((drawn, of, np.full(len(drawn), group), read))
+    begun, unit, at_group, begun_read = (np.concatenate(part) for part in zip(*starts, strict=True))
     lower, upper = searches.bounds(at_group)
-    ends = searches.joint(begun, at_group).end(goal, T, begun, lower, upper, CLIMBING)
+    search = searches.joint(begun, at_group, begun_read)
+    ends = search.end(goal, T, begun, lower, upper, CLIMBING)
     tried = np.concatenate([begun + step * (ends - begun) for step in STEPS])
-    height = price(tried)
-    rose = np.flatnonzero(height > np.tile(unit, len(STEPS)))
+    of_start = np.tile(np.arange(len(begun)), len(STEPS))
+    height = price(tried, begun_read[of_start])
+    rose = np.flatnonzero(height > unit[of_start])
     rose = rose[searches.feasible(tried[rose])]
-    found.insert(0, (tried[rose], height[rose], np.tile(at_group, len(STEPS))[rose]))
-    poses, values, groups = (np.concatenate(part) for part in zip(*found, strict=True))
+    of_start = of_start[rose]
+    found.insert(0, (tried[rose], height[rose], at_group[of_start], begun_read[of_start]))
+    poses, values, groups, reads = (np.concatenate(part) for part in zip(*found, strict=True))
     largest, top_poses = np.zeros(len(problem.shares)), []
     for group in levels:
         top = d[problem.group == group].max()
@@ -577,17 +599,18 @@ def estimate(
     reach = float(np.sum(tangent.G * problem.prior)) + float(problem.shares @ largest)
     at = np.concatenate(top_poses)
     searched = len(levels) * CHUNK * -(-POINTS // CHUNK)
-    return Continuum(tangent.value**2 / reach, poses[at], groups[at], searched, len(begun))
+    bound = tangent.value**2 / reach
+    return Continuum(bound, poses[at], groups[at], reads[at], searched, len(begun))
 
 
-def _best_feasible(searches: Searches, q: Array, d: Array) -> tuple[Array, Array]:
+def _best_feasible(searches: Searches, q: Array, d: Array) -> IntArray:
     order, so_far = np.argsort(-d, kind="stable"), np.zeros(0, dtype=np.int64)
     for lot in range(LOTS):
         part = order[lot * LOT : (lot + 1) * LOT]
         so_far = np.append(so_far, part[searches.feasible(q[part])])
         if len(distinct(q[so_far], STARTS)) == STARTS:
             break
-    return q[so_far], d[so_far]
+    return so_far
 
 
 def distinct(q: Array, count: int) -> IntArray:

@@ -196,17 +196,18 @@ class Search:
     def polished(
         self, pool: FeasiblePool, chosen: IntArray, name: str, fine: bool = False
     ) -> tuple[FeasiblePool, IntArray]:
-        were, of = pool.q[chosen], pool.group[chosen]
-        q = self.checkpoint.finished(
-            name,
-            lambda: {"q": polish(self.problem(pool), self.searches, self.T, were, of, fine)},
-        )["q"]
+        were, of, read = pool.q[chosen], pool.group[chosen], pool.readings[chosen]
+
+        def make() -> State:
+            return {"q": polish(self.problem(pool), self.searches, self.T, were, of, read, fine)}
+
+        q = self.checkpoint.finished(name, make)["q"]
         moved = (q != were).any(axis=1)
         if not moved.any():
             return pool, chosen
         now = chosen.copy()
         now[moved] = len(pool) + np.arange(moved.sum())
-        return pool.joined(self.setup.pool(q[moved], of[moved])), now
+        return pool.joined(self.setup.pool(q[moved], of[moved], read[moved])), now
 
     def _better(self, pool: FeasiblePool, best: IntArray, other: IntArray) -> IntArray:
         return other if self.value(pool, other) < self.value(pool, best) * (1 - SAME) else best
@@ -218,8 +219,8 @@ class Search:
 
     def _continuum(self, pool: FeasiblePool, relaxed: Relaxed, seed: int) -> Continuum:
         return estimate(
-            self.problem(pool), relaxed.tangent, self.searches, self.T, pool.q,
-            seed=self.seed + seed, progress=self.progress,
+            self.problem(pool), relaxed.tangent, self.searches, self.T, pool.q, pool.readings,
+            ways=self.setup.ways, seed=self.seed + seed, progress=self.progress,
         )  # fmt: skip
 
     def _widened(
@@ -229,10 +230,10 @@ class Search:
         state = self.checkpoint.finished(
             f"continuum{k}", lambda: asdict(self._continuum(pool, relaxed, k))
         )
-        q, group = state["q"], state["group"]
+        at = state["q"], state["group"], state["readings"]
         counts = (int(state[name]) for name in ("searched", "ascents"))
-        found.append(Continuum(float(state["bound"]), q, group, *counts))
-        return pool.joined(self.setup.pool(q, group)) if len(q) else pool
+        found.append(Continuum(float(state["bound"]), *at, *counts))
+        return pool.joined(self.setup.pool(*at)) if len(at[0]) else pool
 
     def _bettered(
         self, pool: FeasiblePool, best: IntArray, relaxed: Relaxed, k: int
@@ -264,7 +265,7 @@ class Search:
             new = found[-1]
             if new.bound >= NEAR * relaxed.bound or not len(new.q):
                 break
-            pool = pool.joined(self.setup.pool(new.q, new.group))
+            pool = pool.joined(self.setup.pool(new.q, new.group, new.readings))
             relaxed = self._again(pool, relaxed)
             found.append(self._continuum(pool, relaxed, (k + 2) * ROUND))
         beyond = min(found[-1].bound, bound)

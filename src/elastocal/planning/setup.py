@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from contextlib import suppress
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 
 import numpy as np
 from numpy.typing import NDArray
@@ -52,10 +52,12 @@ class Known:
 
 @dataclass(frozen=True)
 class FeasiblePool:
-    """Candidates q (N, n), their group (N,), and blocks (N, r, p)."""
+    """Candidates q (N, n), their group (N,), how often each is read in each load state (N, L), and
+    blocks (N, r, p)."""
 
     q: Array
     group: IntArray
+    readings: IntArray
     blocks: Array
 
     def __len__(self) -> int:
@@ -66,12 +68,13 @@ class FeasiblePool:
         return int(self.group.max()) + 1
 
     def take(self, kept: IntArray) -> FeasiblePool:
-        return FeasiblePool(self.q[kept], self.group[kept], self.blocks[kept])
+        return FeasiblePool(self.q[kept], self.group[kept], self.readings[kept], self.blocks[kept])
 
     def joined(self, other: FeasiblePool) -> FeasiblePool:
         return FeasiblePool(
             np.vstack([self.q, other.q]),
             np.append(self.group, other.group),
+            np.vstack([self.readings, other.readings]),
             np.concatenate([self.blocks, other.blocks]),
         )
 
@@ -83,6 +86,7 @@ class Setup:
     `target_rows` (r, p): |R x| is the rms error at the test poses in m, `elsewhere_rows` that over
     all joint ranges; None where the criterion knows of none, or nothing can be said of them.
     `share` of the criterion's weight lies on the latter, `weighed` makes the criterion of another.
+    `ways` (K, L): how a pose may be read, as readings in each load state; each candidate is one.
     """
 
     information: PoseInformation
@@ -94,19 +98,26 @@ class Setup:
     target_rows: Array | None = None
     elsewhere_rows: Array | None = None
     share: float = 0.0
+    ways: IntArray = field(kw_only=True)
 
     def sharing(self, share: float) -> Setup:
         """With this share of the weight on what lies beside the test poses."""
         return replace(self, criterion=self.weighed(share), share=share)
 
-    def pool(self, q: Array, group: IntArray) -> FeasiblePool:
-        return FeasiblePool(q, group, self.information.blocks(q))
+    def pool(self, q: Array, group: IntArray, readings: IntArray | None = None) -> FeasiblePool:
+        """Candidates q (N, n) read as `readings` (N, L) say, or in each of the ways in turn."""
+        if readings is None:
+            readings = np.repeat(self.ways, len(q), axis=0)
+            q, group = np.tile(q, (len(self.ways), 1)), np.tile(group, len(self.ways))
+        return FeasiblePool(q, group, readings, self.information.blocks(q, readings))
 
     def having(self, pinned: FeasiblePool | None) -> Setup:
         """For what is chosen beside poses that stay: their information is known before."""
         return self if pinned is None else replace(self, prior=self.gathered(pinned.blocks))
 
     def problem(self, pool: FeasiblePool, shares: IntArray) -> DesignProblem:
+        """Of as many stops as the `shares` (L,) of poses take in all load states."""
+        shares = shares * self.ways.shape[1] // np.count_nonzero(self.ways[0])
         cell = self.information.model.cell
         source = f"{cell.path or cell.name}: "
         return DesignProblem(
@@ -205,6 +216,7 @@ def set_up(
         own,
         None if beyond is None or region is None else _root(beyond, region.weight),
         share,
+        ways=information.everything,
     )
 
 

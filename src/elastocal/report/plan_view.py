@@ -11,7 +11,7 @@ from elastocal.errors import option
 from elastocal.planning.bodies import mounting_plane
 from elastocal.planning.criteria import CRITERIA
 from elastocal.planning.execution import DRIFT
-from elastocal.planning.plan import Plan, Predicted, Reason
+from elastocal.planning.plan import Plan, Predicted, Reason, load_name
 from elastocal.report.blocks import (
     WARNING,
     Block,
@@ -157,14 +157,16 @@ def pose_table(plan: Plan) -> ShownTable:
 def _poses(plan: Plan, decimals: int) -> ShownTable:
     kinds = plan.model.chain.kinds
     heads = ["pose", *joint_heads(kinds), "order"]
+    heads += [] if plan.crossed else ["load"]
     heads += [] if plan.seen is None else ["markers"]
     order = first_stops(plan)
     rows: list[tuple[str, ...]] = []
     for k, name in enumerate(plan.configurations):
         row = [name, *joint_texts(plan.q[k], kinds, decimals)]
-        row += [str(order[k]), *([] if plan.seen is None else [printable(plan.markers(k))])]
+        row += [str(order[k]), *([] if plan.crossed else [plan.loads(k)])]
+        row += [] if plan.seen is None else [printable(plan.markers(k))]
         rows.append(tuple(row))
-    words = tuple(k for k, head in enumerate(heads) if head == "markers")
+    words = tuple(k for k, head in enumerate(heads) if head in ("load", "markers"))
     return ShownTable(tuple(heads), rows, words, title="Poses")
 
 
@@ -324,7 +326,7 @@ def plan_steps(plan: Plan) -> list[str]:
 
 def plan_lines(plan: Plan) -> list[tuple[str, str]]:
     """What the plan is worth, as (label, sentence)."""
-    lines = [*_chosen_lines(plan), _criterion_line(plan)]
+    lines = [*_chosen_lines(plan), *_state_lines(plan), _criterion_line(plan)]
     lines += [*_everywhere_lines(plan), *_chance_lines(plan)]
     lines.append(_candidate_line(plan))
     lines += _certificate_lines(plan)
@@ -369,6 +371,28 @@ def _chosen_lines(plan: Plan) -> list[tuple[str, str]]:
         f"{100 * c.share[1]:.1f} %"
     )
     return [("Chosen", f"{'; '.join(told)}."), ("Chosen", f"{worth}.")]
+
+
+def _state_lines(plan: Plan) -> list[tuple[str, str]]:
+    """In which load states poses are measured, and what that is worth."""
+    s = plan.states
+    if s is None:
+        return []
+    worth, unit = "", f" {plan.unit}" if plan.unit else ""
+    if s.crossed is not None and s.chosen is not None:
+        worth = (
+            f" (relaxed on candidates, in the same time: in all load states {s.crossed:.4g}{unit}, "
+            f"chosen for each pose {s.chosen:.4g}{unit})"
+        )
+    if s.used == "all":
+        return [("Loads", f"every pose in every load state, as {s.why}{worth}.")]
+    counts = (plan.readings > 0).sum(axis=0)
+    told = [
+        f"{counted(int(n), 'pose')} {'' if name == 'unloaded' else 'under '}{name}"
+        for n, name in zip(counts, map(load_name, plan.forces), strict=True)
+        if n
+    ]
+    return [("Loads", f"{listed(told)}{worth}.")]
 
 
 def _criterion_line(plan: Plan) -> tuple[str, str]:

@@ -1,0 +1,74 @@
+"""Load states chosen with the poses against every pose in every load state, in the same minutes.
+
+    .venv/bin/python experiment_design/load_states/study.py
+
+prints a row per cell, which result.md has.  The UR10 is that of ../everywhere, the KR 270 that of
+../kr270_plan/crowded.toml without its obstacles.
+"""
+
+from __future__ import annotations
+
+import sys
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+
+import elastocal as ec
+from elastocal.cell.work_cell import Cell
+from elastocal.cell.workspace_rules import Workspace
+
+HERE = Path(__file__).parent
+sys.path.insert(0, str(HERE.parent / "everywhere"))
+from study import cell_of  # noqa: E402
+
+HEADS = ("cell", "loads", "crossed", "chosen", "lower by", "relaxed", "minutes", "poses per load")
+
+
+def cells() -> dict[str, tuple[Cell, int]]:
+    """By name, each with its number of poses."""
+    kr270 = replace(
+        ec.read_cell(HERE.parent / "kr270_plan" / "crowded.toml"), workspace=Workspace()
+    )
+    ur10 = cell_of("UR10", stated=True)
+    paper = ec.read_cell(HERE.parent / "kr270_plan" / "joint_limits.toml")
+    return {
+        "UR10": (ur10, 20),
+        "UR10, half the load too": (_with_half(ur10), 20),
+        "KR 270": (kr270, 15),
+        "KR 270, half the load too": (_with_half(kr270), 15),
+        "KR 270, deflections": (paper, 15),
+    }
+
+
+def _with_half(cell: Cell) -> Cell:
+    loads = cell.design.loads
+    assert loads is not None
+    return replace(cell, design=replace(cell.design, loads=np.insert(loads, 1, loads[-1] / 2, 0)))
+
+
+def row_of(name: str, cell: Cell, poses: int) -> str:
+    crossed, chosen = (
+        ec.design(
+            cell, poses=poses, per_level=(), elsewhere=0.0, candidates=500, effort="quick",
+            load_states=states,
+        )
+        for states in ("all", "chosen")
+    )  # fmt: skip
+    states = chosen.states
+    assert states is not None
+    relaxed = "–"
+    if states.crossed is not None and states.chosen is not None:
+        relaxed = f"{100 * (1 - states.chosen / states.crossed):.1f} %"
+    took = " / ".join(f"{plan.execution.total / 60:.0f}" for plan in (crossed, chosen))
+    told = " + ".join(map(str, (chosen.readings > 0).sum(axis=0))) if not states.why else states.why
+    figures = f"{crossed.reported:.3f} | {chosen.reported:.3f}"
+    lower = f"{100 * (1 - chosen.reported / crossed.reported):.1f} %"
+    return f"| {name} | {len(crossed.forces)} | {figures} | {lower} | {relaxed} | {took} | {told} |"
+
+
+if __name__ == "__main__":
+    print(f"| {' | '.join(HEADS)} |\n|{'---|' * len(HEADS)}")
+    for name, (cell, poses) in cells().items():
+        if len(sys.argv) < 2 or name in sys.argv[1:]:
+            print(row_of(name, cell, poses), flush=True)
