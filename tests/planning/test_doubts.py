@@ -9,10 +9,9 @@ from support.design_cells import plan_cell, set_up, target_poses
 
 from elastocal.model.manipulator import Model
 from elastocal.planning.exchange import exact_plan
-from elastocal.planning.further_effects import in_doubt
 from elastocal.planning.plan import Doubt, Gain
 from elastocal.planning.relaxation import balanced, relax
-from elastocal.planning.setup import Known, Setup
+from elastocal.planning.setup import Known, Setup, in_doubt
 
 CHAIN = kr270_chain()
 POSES = random_poses(CHAIN, 60, seed=1)

@@ -2,7 +2,7 @@
 
 The arm is diagnosed and identified.  Effects found join the model; what else it may lack is in
 doubt, with the probability that the diagnosis leaves it.  The next poses make the error at the test
-poses small that counts parameters and doubts (`planning.further_effects`), with all readings so
+poses small that counts parameters and doubts (`planning.setup`), with all readings so
 far.
 """
 
@@ -34,8 +34,8 @@ from elastocal.model.effects.catalogue import SOMETHING
 from elastocal.model.manipulator import Model
 from elastocal.planning.criteria import RobustError
 from elastocal.planning.design import DesignOptions, design
-from elastocal.planning.further_effects import Place, missing
 from elastocal.planning.plan import Gain, Plan
+from elastocal.planning.setup import Place, missing
 from elastocal.planning.test_poses import where_used
 from elastocal.units import Progress
 

@@ -18,7 +18,6 @@ from elastocal.identification.knowledge import GaussianPrior
 from elastocal.measurements import Measurements
 from elastocal.model.effects.catalogue import effect_of
 from elastocal.model.manipulator import Model
-from elastocal.planning.arrangement import ordered
 from elastocal.planning.candidates import (
     LEVEL_SLACK,
     NO_LEVEL,
@@ -32,13 +31,11 @@ from elastocal.planning.candidates import (
     shares_of,
 )
 from elastocal.planning.checkpoint import Checkpoint, State
-from elastocal.planning.choices import Choice, applied, within
+from elastocal.planning.choices import Choice, LoadStates, applied, chosen_states, within
 from elastocal.planning.criteria import CRITERIA, GONE
 from elastocal.planning.exchange import SizedPlans, random_information, values_without
 from elastocal.planning.feasibility import Feasibility
-from elastocal.planning.further_effects import OPEN, Place, ScheduledEffects, gain_of, in_doubt
 from elastocal.planning.information import Done, measured, next_number, plan_forces
-from elastocal.planning.load_states import LoadStates, chosen_states
 from elastocal.planning.moves import blockers_of
 from elastocal.planning.plan import (
     CandidateCounts,
@@ -50,8 +47,19 @@ from elastocal.planning.plan import (
     reasons,
 )
 from elastocal.planning.polish import Searches
-from elastocal.planning.search import EFFORTS, POOL, Search, SearchEffort, Selection
-from elastocal.planning.setup import FeasiblePool, Known, Setup, set_up, share_within
+from elastocal.planning.search import EFFORTS, POOL, Search, SearchEffort, Selection, ordered
+from elastocal.planning.setup import (
+    OPEN,
+    FeasiblePool,
+    Known,
+    Place,
+    ScheduledEffects,
+    Setup,
+    gain_of,
+    in_doubt,
+    set_up,
+    share_within,
+)
 from elastocal.planning.test_poses import TargetPoses, check_cell, everywhere, test_poses
 from elastocal.text import did_you_mean, listed, quoted
 from elastocal.units import Array, BoolArray, IntArray, Progress

@@ -9,6 +9,7 @@ from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property
 from itertools import pairwise
+from random import Random
 
 import numpy as np
 from scipy import linalg
@@ -533,11 +534,15 @@ def _time(moves: Moves, way: list[int]) -> float:
     return float(sum(moves.times[i, j] for i, j in pairwise(way)))
 
 
-# The shortest tour through given costs, by iterated local search.
+# The shortest tour through given costs, by simulated annealing too.
 
+PER_VISIT, FEW_PER_VISIT = (
+    6000,
+    600,
+)  # steps; the few while moves of the tour turn out to be blocked
+FROM, TO = 0.15, 0.01  # temperatures, of the median move
+GAINED = 1e-6  # of the first temperature, that a tour must gain to be better
 PART = 3  # visits that are put elsewhere together, at most
-WINDOW = 30  # visits among which a kick mixes segments
-GAINED = 1e-9  # of the tour, that a step must gain
 
 
 def tour_cost(cost: Array, tour: list[int]) -> float:
@@ -559,78 +564,53 @@ def greedy_tour(cost: Array) -> list[int]:
     return tour
 
 
-def shortest_tour(cost: Array, start: list[int], seed: int, kicks: int) -> list[int]:
+def shortest_tour(cost: Array, start: list[int], seed: int, per_visit: int) -> list[int]:
     """A short tour 0 → every node → 0, never worse than `start`.
 
-    `cost` (V + 1, V + 1), finite and not negative, need not be symmetric.  Segments are turned
-    round (2-opt) or put elsewhere (Or-opt) until that gains nothing; then segments are exchanged
-    at random (double bridge), and again, `kicks` times from the best tour (Martin, Otto & Felten
-    1991).  The same seed gives the same tour on any machine.
+    `cost` (V + 1, V + 1), finite and not negative, need not be symmetric.  Stretches are turned
+    round (2-opt) or put elsewhere (Or-opt), as Metropolis' rule takes them (Kirkpatrick, Gelatt &
+    Vecchi 1983), `per_visit` V times.  The same seed gives the same tour on any machine.
     """
-    rng = np.random.default_rng(seed)
-    best = _locally_best(cost, np.array(start, dtype=np.int64))
-    least = tour_cost(cost, best.tolist())
-    for _ in range(kicks if len(best) > PART else 0):
-        width = min(WINDOW, len(best))
-        first = int(rng.integers(len(best) - width + 1))
-        a, b, c = (first + np.sort(rng.choice(width + 1, 3, replace=False))).tolist()
-        new = np.concatenate([best[:a], best[b:c], best[a:b], best[c:]])
-        new = _locally_best(cost, new)
-        found = tour_cost(cost, new.tolist())
-        if found < least * (1 - GAINED):
-            best, least = new, found
-    tour = [int(node) for node in best]
-    return tour if least < tour_cost(cost, start) else start
-
-
-def _locally_best(cost: Array, tour: IntArray) -> IntArray:
-    enough = GAINED * tour_cost(cost, tour.tolist())
-    while True:
-        gain, move = _best_turn(cost, tour)
-        for size in range(1, min(PART, len(tour) - 1) + 1):
-            other = _best_shift(cost, tour, size)
-            if other[0] > gain:
-                gain, move = other
-        if gain <= enough:
-            return tour
-        tour = move
-
-
-def _best_turn(cost: Array, tour: IntArray) -> tuple[float, IntArray]:
-    ring = np.concatenate([[0], tour, [0]])
-    here, before, after = ring[1:-1], ring[:-2], ring[2:]
-    forth = np.concatenate([[0.0], cost[here[:-1], here[1:]].cumsum()])
-    back = np.concatenate([[0.0], cost[here[1:], here[:-1]].cumsum()])
-    inside = (forth - back)[None, :] - (forth - back)[:, None]
-    gain = cost[before, here][:, None] + cost[here, after][None, :] + inside
-    gain = gain - cost[before[:, None], here[None, :]] - cost[here[:, None], after[None, :]]
-    gain = np.triu(gain, 1)
-    i, j = np.unravel_index(int(gain.argmax()), gain.shape)
-    return float(gain[i, j]), np.concatenate([tour[:i], tour[i : j + 1][::-1], tour[j + 1 :]])
-
-
-def _best_shift(cost: Array, tour: IntArray, size: int) -> tuple[float, IntArray]:
-    ring, n = np.concatenate([[0], tour, [0]]), len(tour)
-    first = np.arange(1, n - size + 2)  # its place in the ring
-    a, b = ring[first], ring[first + size - 1]
-    p, q = ring[first - 1], ring[first + size]
-    left = cost[p, a] + cost[b, q] - cost[p, q]
-    u, v = ring[:-1], ring[1:]  # between which it goes
-    added = cost[u[None, :], a[:, None]] + cost[b[:, None], v[None, :]] - cost[u, v][None, :]
-    gain = left[:, None] - added
-    place = np.arange(n + 1)[None, :]
-    gain[(place >= first[:, None] - 1) & (place <= first[:, None] + size - 1)] = -np.inf
-    i, k = np.unravel_index(int(gain.argmax()), gain.shape)
-    start, rest = int(first[i]) - 1, np.delete(tour, np.arange(first[i] - 1, first[i] - 1 + size))
-    at = int(k) if k < start else int(k) - size
-    part = tour[start : start + size]
-    return float(gain[i, k]), np.concatenate([rest[:at], part, rest[at:]])
+    ring, n, c = [0, *start, 0], len(start), cost.tolist()
+    steps, best, now, least = per_visit * n, list(start), 0.0, 0.0
+    if n < 2 or not steps:
+        return start
+    rng, even = Random(seed), bool((cost == cost.T).all())
+    hot = FROM * max(float(np.median(cost[ring[:-1], ring[1:]])), np.finfo(float).tiny)
+    for k in range(steps):
+        temperature = hot * (TO / FROM) ** (k / steps)
+        i, j = int(rng.random() * n) + 1, int(rng.random() * n) + 1
+        turned = rng.random() < 0.5
+        size = abs(j - i) + 1 if turned else min(int(rng.random() * PART) + 1, n - i + 1)
+        i = min(i, j) if turned else i
+        before, first, last, after = ring[i - 1], ring[i], ring[i + size - 1], ring[i + size]
+        gain = c[before][first] + c[last][after]
+        if turned:
+            worse = c[before][last] + c[first][after] - gain
+            if not even:
+                worse += sum(c[v][u] - c[u][v] for u, v in pairwise(ring[i : i + size]))
+        elif i - 1 <= j < i + size:
+            continue
+        else:
+            u, v = ring[j], ring[j + 1]
+            worse = c[before][after] + c[u][first] + c[last][v] - c[u][v] - gain
+        if worse > 0 and rng.random() >= math.exp(-worse / temperature):
+            continue
+        part = ring[i : i + size]
+        if turned:
+            ring[i : i + size] = part[::-1]
+        else:
+            del ring[i : i + size]
+            at = j + 1 if j < i else j + 1 - size
+            ring[at:at] = part
+        now += worse
+        if now < least - GAINED * hot:
+            best, least = ring[1:-1], now
+    return best
 
 
 # The shortest execution of a plan: every pose in its load states, by collision-free moves.
 
-KICKS = 400
-FEW_KICKS = 30  # while moves of the tour still turn out to be blocked
 PATIENT = 5  # times, before all ways are checked
 
 
@@ -647,7 +627,7 @@ def schedule(
     alias: Alias | None = None,
     paired: bool = False,
     seed: int = 0,
-    kicks: int = KICKS,
+    per_visit: int = PER_VISIT,
     progress: Progress = lambda message: None,
 ) -> Execution:
     """The order of `q` (N, n) with the least travel time found, from and to `motion.home`.
@@ -682,7 +662,7 @@ def schedule(
     tour = greedy_tour(costs.cost)
     thorough, done, rounds = False, False, 0
     while not done:
-        effort = kicks if thorough else min(kicks, FEW_KICKS)
+        effort = per_visit if thorough else min(per_visit, FEW_PER_VISIT)
         tour = shortest_tour(costs.cost, tour, seed, effort)
         tour = _unloaded_first(tour, costs.cost, moves)
         blocked = moves.check(tour, costs)

@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Mapping, Sequence
 from dataclasses import asdict, dataclass, field
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 from scipy import linalg, special
@@ -19,10 +19,12 @@ from elastocal.model.manipulator import Model
 from elastocal.planning.criteria import ScenarioCriterion
 from elastocal.planning.execution import Execution, Stop
 from elastocal.planning.information import Estimable
-from elastocal.planning.load_states import LoadStates
 from elastocal.tables import column, csv_text
 from elastocal.text import is_label, json_text, quoted
 from elastocal.units import Array, BoolArray, IntArray, to_si
+
+if TYPE_CHECKING:
+    from elastocal.planning.choices import LoadStates
 
 # What a plan promises, and why each pose is in it.
 

@@ -218,9 +218,11 @@ def check_six_axes(chain: Chain, language: str) -> None:
         )
 
 
-# KUKA robot language: a .src file of PTP moves in axis angles.
+# The two languages: what stands before, at and behind the steps.
 
-PERCENT = 10  # of the axes' greatest speed and acceleration
+PERCENT = 10  # of a KUKA's greatest axis speed and acceleration
+MOTION = "a=0.5, v=0.5"  # rad/s², rad/s of the leading axis of a Universal Robot
+FIRST = "The first move begins wherever the arm stands; only the moves after it were checked."
 
 
 def krl_program(
@@ -230,23 +232,18 @@ def krl_program(
     forces: Array | None = None,
     *,
     name: str = "elastocal_plan",
-    percent: int = PERCENT,
     limits: Limits | None = None,
 ) -> str:
     """The text of NAME.src: moves, WAIT SEC where the tracker measures, HALT for the load.
 
-    Axis angles are the plan's joint values in degrees, A1 … A6 being joints 1 … 6.  `percent` of
-    the axes' greatest speed and acceleration.  Moves are exact stops (no C_PTP), so the checked
-    paths are those that are driven.  No .dat file is needed.  `name` is reduced to one that KRL
-    allows.  Raises InputError for an arm of other joints than six revolute ones, for joint values
-    outside `limits` (lower, upper; rad; by default the robot's), and for a speed above 100 %;
+    Axis angles are the plan's joint values in degrees, A1 … A6 being joints 1 … 6.  Moves are exact
+    stops (no C_PTP), so the checked paths are those that are driven.  No .dat file is needed.
+    `name` is reduced to one that KRL allows.  Raises InputError for an arm of other joints than six
+    revolute ones and for joint values outside `limits` (lower, upper; rad; by default the robot's);
     ElastocalError where the text, read back, is not the plan.
     """
-    check_six_axes(chain, "KRL")
-    require(1 <= percent <= 100, f"the speed is 1 to 100 % of the axes' greatest; found {percent}")
+    steps = _checked(execution, chain, configurations, forces, limits, "KRL")
     module = program_name(name)
-    steps = list(steps_of(execution, configurations, forces))
-    check_driven(steps, chain, limits)
     lines = [
         "&ACCESS RVP",
         "&REL 1",
@@ -256,14 +253,14 @@ def krl_program(
         "; Units: axis angles in degrees, stops in s, loads in N along x, y, z of the data's",
         "; frame.  Axis moves: neither $BASE nor $TOOL changes where they lead.",
         f"; Inside the limits in degrees: {limits_text(chain, limits)}.",
-        f"; Speed and acceleration: {percent} % of the axes' greatest.",
+        f"; Speed and acceleration: {PERCENT} % of the axes' greatest.",
         "; Axis angles in degrees as the robot description counts them: before the first run,",
         "; compare signs and zeros with the controller, and run in T1.",
-        "; The first move begins wherever the arm stands; only the moves after it were checked.",
+        f"; {FIRST}",
         "DECL INT AXIS_NO",
         f"FOR AXIS_NO = 1 TO {AXES}",
-        f"  $VEL_AXIS[AXIS_NO] = {percent}",
-        f"  $ACC_AXIS[AXIS_NO] = {percent}",
+        f"  $VEL_AXIS[AXIS_NO] = {PERCENT}",
+        f"  $ACC_AXIS[AXIS_NO] = {PERCENT}",
         "ENDFOR",
     ]
     for step in steps:
@@ -275,15 +272,7 @@ def krl_program(
                 lines += [f"; {plain(order)}, then start again", "HALT"]
             case "measure", dwell, note:
                 lines += [f"; measure {plain(note)}", f"WAIT SEC {number(dwell, 3)}"]
-    text = "\n".join([*lines, "END"]) + "\n"
-    check_program(text, steps)
-    return text
-
-
-# URScript of Universal Robots: a function of movej moves.
-
-MOST_SPEED, MOST_ACCELERATION = 3.14, 10.0  # rad/s, rad/s²: what the arms of this language do
-SPEED, ACCELERATION = 0.5, 0.5  # rad/s, rad/s² of the leading axis
+    return _as_planned([*lines, "END"], steps)
 
 
 def urscript_program(
@@ -293,51 +282,50 @@ def urscript_program(
     forces: Array | None = None,
     *,
     name: str = "elastocal_plan",
-    speed: float = SPEED,
-    acceleration: float = ACCELERATION,
     limits: Limits | None = None,
 ) -> str:
     """The text of a script: moves, sleep where the tracker measures, a popup for the load.
 
-    Joint values in rad, in the order of the chain; `speed` rad/s and `acceleration` rad/s² of
-    the leading axis.  Moves are without blend radius, so the checked paths are those that are
-    driven.  `name` is reduced to one that a function can have.  Raises InputError for an arm of
-    other joints than six revolute ones, for joint values outside `limits` (lower, upper; rad; by
-    default the robot's), and for a speed outside 0.001 to 3.14 rad/s or an acceleration outside
-    0.001 to 10 rad/s²; ElastocalError where the text, read back, is not the plan.
+    Joint values in rad, in the order of the chain.  Moves are without blend radius, so the checked
+    paths are those that are driven.  `name` is reduced to one that a function can have.  Raises as
+    `krl_program` does.
     """
-    check_six_axes(chain, "URScript")
-    for what, value, most in (
-        ("speed", speed, MOST_SPEED), ("acceleration", acceleration, MOST_ACCELERATION),
-    ):  # fmt: skip
-        require(
-            1e-3 <= value <= most,
-            f"the {what} must be at least 0.001 and at most {most:g}; found {value:g}",
-        )
+    steps = _checked(execution, chain, configurations, forces, limits, "URScript")
     function = program_name(name)
-    steps = list(steps_of(execution, configurations, forces))
-    check_driven(steps, chain, limits)
     lines = [
         f"# elastocal: {len(execution.stops)} readings of robot {plain(chain.name)}",
         "# Joint values in rad as the robot description counts them: before the first run,",
         "# compare signs and zeros with the controller, and run at reduced speed.",
-        "# The first move begins wherever the arm stands; only the moves after it were checked.",
+        f"# {FIRST}",
         "# Units: rad, rad/s, rad/s^2, s; loads in N along x, y, z of the data's frame.  Joint",
         "# moves: neither the TCP nor a feature plane changes where they lead.",
         f"# Inside the limits in degrees: {limits_text(chain, limits)}.",
         f"def {function}():",
     ]
-    motion = f"a={number(acceleration, 4)}, v={number(speed, 4)}"
     for step in steps:
         match step:
             case "move", q, note:
                 joints = ", ".join(number(v, 9) for v in q)
-                lines += [f"  # {plain(note)}", f"  movej([{joints}], {motion})"]
+                lines += [f"  # {plain(note)}", f"  movej([{joints}], {MOTION})"]
             case "load", order:
                 text = plain(order)
                 lines.append(f'  popup("{text}, then continue", title="Load", blocking=True)')
             case "measure", dwell, note:
                 lines += [f'  textmsg("measure {plain(note)}")', f"  sleep({number(dwell, 3)})"]
-    text = "\n".join([*lines, "end", "", f"{function}()"]) + "\n"
+    return _as_planned([*lines, "end", "", f"{function}()"], steps)
+
+
+def _checked(
+    execution: Execution, chain: Chain, configurations: Sequence[str], forces: Array | None,
+    limits: Limits | None, language: str,
+) -> list[Step]:  # fmt: skip
+    check_six_axes(chain, language)
+    steps = list(steps_of(execution, configurations, forces))
+    check_driven(steps, chain, limits)
+    return steps
+
+
+def _as_planned(lines: list[str], steps: list[Step]) -> str:
+    text = "\n".join(lines) + "\n"
     check_program(text, steps)
     return text

@@ -37,7 +37,7 @@ def chain():
 def execution_of(chain, **motion):
     q = random_poses(chain, 5, seed=1)
     limits = np.full(6, -9.0), np.full(6, 9.0)
-    return schedule(q, Motion(**motion), Discs(), loads=FORCES, limits=limits, kicks=30)
+    return schedule(q, Motion(**motion), Discs(), loads=FORCES, limits=limits, per_visit=600)
 
 
 def planned(execution):
@@ -137,13 +137,3 @@ def test_a_program_read_back_is_the_plan_to_a_millionth_of_a_radian(chain, write
         assert wrong != text
         with pytest.raises(ElastocalError, match="do not run it"):
             check_program(wrong, steps)
-
-
-def test_speeds_out_of_range(chain):
-    with pytest.raises(InputError, match="1 to 100 %"):
-        krl_program(execution_of(chain), chain, NAMES, percent=0)
-    with pytest.raises(InputError, match="at least"):
-        urscript_program(execution_of(chain), chain, NAMES, speed=0.0)
-    for wrong in ({"speed": 4.0}, {"acceleration": 11.0}, {"speed": np.nan}):
-        with pytest.raises(InputError, match="at most"):
-            urscript_program(execution_of(chain), chain, NAMES, **wrong)
