@@ -2,26 +2,27 @@
 
     .venv/bin/python experiment_design/load_states/study.py
 
-prints a row per cell, which result.md has.  The UR10 is that of ../everywhere, the KR 270 that of
-../kr270_plan/crowded.toml without its obstacles.
+prints a row per cell, which result.md has.  The UR10's file comes with the package
+example-robot-data; the KR 270 is that of ../kr270_plan/crowded.toml without its obstacles.
 """
 
 from __future__ import annotations
 
 import sys
 from dataclasses import replace
+from importlib import metadata
 from pathlib import Path
 
 import numpy as np
 
 import elastocal as ec
+from elastocal.cell.arm_description import CartesianNoise, ModelSpec, Nominal, Robot, Tool, Tracker
+from elastocal.cell.plan_wishes import DesignSpec, TargetPose
 from elastocal.cell.work_cell import Cell
 from elastocal.cell.workspace_rules import Workspace
 
 HERE = Path(__file__).parent
-sys.path.insert(0, str(HERE.parent / "everywhere"))
-from study import cell_of  # noqa: E402
-
+EFFECTS = ("base_frame", "joint_offset", "link_geometry", "joint_compliance", "marker_position")
 HEADS = ("cell", "loads", "crossed", "chosen", "lower by", "relaxed", "minutes", "poses per load")
 
 
@@ -30,7 +31,7 @@ def cells() -> dict[str, tuple[Cell, int]]:
     kr270 = replace(
         ec.read_cell(HERE.parent / "kr270_plan" / "crowded.toml"), workspace=Workspace()
     )
-    ur10 = cell_of("UR10", stated=True)
+    ur10 = _ur10()
     paper = ec.read_cell(HERE.parent / "kr270_plan" / "joint_limits.toml")
     return {
         "UR10": (ur10, 20),
@@ -39,6 +40,29 @@ def cells() -> dict[str, tuple[Cell, int]]:
         "KR 270, half the load too": (_with_half(kr270), 15),
         "KR 270, deflections": (paper, 15),
     }
+
+
+def _ur10() -> Cell:
+    """Three markers, 80 N at most, eight test poses about one posture."""
+    files = metadata.distribution("example-robot-data").files or ()
+    path = next(Path(str(f.locate())) for f in files if str(f).endswith("urdf/ur10_robot.urdf"))
+    middle = np.radians([0, -90, 90, 0, 60, 0])
+    near = middle + np.random.default_rng(0).uniform(-0.5, 0.5, (8, 6))
+    return Cell(
+        name="UR10",
+        robot=Robot.from_urdf(path, flange="tool0"),
+        tool=Tool(
+            load_point=[0.0, 0.0, 0.1],
+            markers={"M1": [0.08, 0, 0.05], "M2": [-0.06, 0.07, 0.06], "M3": [-0.05, -0.08, 0.07]},
+        ),
+        tracker=Tracker(position=[2.5, -1.5, 1.0], noise=CartesianNoise([15e-6] * 3)),
+        model=ModelSpec(
+            effects=EFFECTS, nominal=Nominal(joint_compliance=(3e-5, 3e-5, 5e-5, 1e-4, 1e-4, 1e-4))
+        ),
+        design=DesignSpec(
+            repeats=3, loads=[[0, 0, 0], [0, 0, -80]], test_poses=tuple(map(TargetPose, near))
+        ),
+    )
 
 
 def _with_half(cell: Cell) -> Cell:
