@@ -258,7 +258,7 @@ def fit_with_knowledge(
     }  # fmt: skip
     fitted, matrix = _as_fit(found), intervals.covariance.matrix
     leverage, heldout = _looked(found)
-    known = replace(solution, fit=fitted, reduction=_reduction(solution, found), heldout=heldout)
+    known = replace(solution, fit=fitted, reduction=_reduction(solution, found), held=heldout)
     told = _contradiction(solution, before.intervals, found, own)
     return replace(
         before, method="constrained", solution=known, intervals=intervals,

@@ -32,7 +32,6 @@ from elastocal.identification.solve import (
     Solution,
     chosen_again,
     fit_kept,
-    heldout_of,
 )
 from elastocal.identification.weighted_problem import Weights
 from elastocal.model.manipulator import Model
@@ -136,7 +135,7 @@ def refined(
     chosen = observed if good.all() else subset(observed, good)
     problem: Problem = replace(start.problem, observations=chosen, weights=weights)
     found = fit_kept(problem, start.sizes, x, start.reduction)
-    return replace(start, problem=problem, fit=found, heldout=heldout_of(problem, found))
+    return replace(start, problem=problem, fit=found)
 
 
 # The methods by name.
@@ -279,9 +278,7 @@ def _holding(
     fit = fit_kept(problem, solution.sizes, solution.fit.x, reduction)
     if not fit.converged:
         return None
-    solution = replace(
-        solution, problem=problem, fit=fit, reduction=reduction, heldout=heldout_of(problem, fit)
-    )
+    solution = replace(solution, problem=problem, fit=fit, reduction=reduction)
     if noise is not None:
         observed = every.problem.observations
         readings = linearised(problem.model, observed, fit.x, reduction.kept)
@@ -422,9 +419,7 @@ def _robust(
     weights = replace(problem.weights, whiten=whiten)
     groups = observed.configuration
     heldout = held_out_residual(fit.B, found.residual, weights, groups, observed.size)
-    solution = replace(
-        sound, problem=replace(problem, x0=sound.problem.x0), fit=fit, heldout=heldout
-    )
+    solution = replace(sound, problem=replace(problem, x0=sound.problem.x0), fit=fit, held=heldout)
     x = found.x[kept]
     intervals = Intervals(covariance, covariance.interval(x, LEVEL))
     return MethodResult(method, solution, intervals, None, good)

@@ -27,8 +27,8 @@ from elastocal.identification.knowledge import GaussianPrior
 from elastocal.identification.knowledge_fit import FunctionPrior
 from elastocal.identification.least_squares import Fit
 from elastocal.identification.method_result import MethodResult
-from elastocal.identification.noise_choice import NoiseFit, estimate_noise, linearised, weights_of
-from elastocal.identification.noise_judge import outlier_screening, settle
+from elastocal.identification.noise_choice import NoiseFit, linearised, weights_of
+from elastocal.identification.noise_judge import NoiseAndOutliers, outlier_screening, settle
 from elastocal.identification.noise_structure import Readings
 from elastocal.identification.options import Options, check_for_functions
 from elastocal.identification.outliers import FALSE_ALARM
@@ -459,27 +459,25 @@ class _Course:
     def settled(self, good: BoolArray) -> tuple[JointFit, NoiseFit | None, BoolArray]:
         """Fit, noise and good readings that agree with each other."""
         noise: NoiseFit | None = None
-        judged, fitted = good, good if self.set_aside(~good) else np.ones_like(good)
         x, reduction, scales = self.sound.fit.x, self.sound.reduction, None
         level = np.inf
         for k in range(ROUNDS):
+            fitted = good if self.set_aside(~good) else np.ones_like(good)
             problem = self.problem_of(fitted, self.weights(noise, fitted))
             fit = joint_fit(problem, self.every.sizes, self.functions, x, reduction, scales)
             x, reduction, scales = fit.x, fit.reduction, fit.scales
             still, level = abs(scales.variance - level) < STILL, scales.variance
             self.standard = self._standard(fit, noise, fitted)
-            before, kind = judged, None if noise is None else noise.kind
-            noise, judged = self.judged(noise, judged, first=k == 0)
-            judged = self.corroborated(fit, noise, fitted, judged)
-            after = judged if self.set_aside(~judged) else np.ones_like(good)
+            before, kind = good, None if noise is None else noise.kind
+            noise, good = self.judged(noise, good, k)
+            good = self.corroborated(fit, noise, fitted, good)
             same = noise is None or (still and noise.kind == kind)
-            if same and np.array_equal(after, fitted) and np.array_equal(before, judged):
+            if same and np.array_equal(before, good):
                 break
-            fitted = after
             if noise is not None:  # in units of which rows are whitened next
                 scales = replace(scales, variance=1.0)
                 self.progress(f"fitting with the noise found ({noise.kind})")
-        return fit, noise, judged
+        return fit, noise, good
 
     def _standard(self, fit: JointFit, noise: NoiseFit | None, fitted: BoolArray) -> Array:
         """Residuals (N, size) of all readings, free of the fit's part in them."""
@@ -492,9 +490,10 @@ class _Course:
         return found
 
     def judged(
-        self, noise: NoiseFit | None, good: BoolArray, first: bool
+        self, noise: NoiseFit | None, good: BoolArray, k: int
     ) -> tuple[NoiseFit | None, BoolArray]:
-        """The noise of the standardised residuals, and which readings it explains."""
+        """The noise of the standardised residuals in the k-th round, and which readings it
+        explains."""
         if not self.estimating:
             e = self.every.problem.weights.apply(self.standard.ravel())
             squared = (e.reshape(self.standard.shape) ** 2).sum(axis=1)
@@ -504,16 +503,11 @@ class _Course:
             limit = size * s2 * special.fdtri(size, dof, 1 - FALSE_ALARM / n)
             return None, np.asarray(squared <= limit)
         readings = self.readings.moved(self.standard)
-        if first:
+        if k == 0:
             good = outlier_screening(readings, readings.e, good)
-        kind = self.options.noise
-        found, good = settle(readings, kind, good)
-        if noise is not None and found.kind != noise.kind and kind == "auto":
-            # Two models that take turns are alike: the first one stays.
-            tried = {t.kind: t.criterion for t in found.trials}
-            if noise.kind in tried and tried[noise.kind] - tried[found.kind] < 2.0:
-                found = estimate_noise(readings.take(good), noise.kind, noise)
-        return found, good
+        # From the second round on, whose fit has such weights, the kind of noise is known.
+        known = NoiseAndOutliers(noise, good) if noise is not None and k > 1 else None
+        return settle(readings, self.options.noise, good, known)
 
     def corroborated(
         self, fit: JointFit, noise: NoiseFit | None, fitted: BoolArray, good: BoolArray
@@ -586,7 +580,7 @@ class _Course:
         mixing = np.zeros((len(columns), len(r.dropped)))
         mixing[:k] = r.mixing
         solution = replace(
-            self.sound, problem=fit.problem, fit=found, heldout=cross.held_out,
+            self.sound, problem=fit.problem, fit=found, held=cross.held_out,
             reduction=replace(
                 r, kept=columns, mixing=mixing, with_prior=fit.functions.columns
             ),

@@ -294,15 +294,15 @@ def fits_better(narrow: RFactor, wide: RFactor) -> bool:
 
 
 def prefer_wider(
-    problem: Problem, sizes: Array, found: Fit, reduction: Reduction, heldout: Array,
-    r_factor: RFactor,
-) -> tuple[Fit, Reduction, Array]:  # fmt: skip
+    problem: Problem, sizes: Array, found: Fit, reduction: Reduction, r_factor: RFactor
+) -> tuple[Fit, Reduction]:
     """A wider set, up to full rank, where held-out configurations show that it is needed.
 
     Typical sizes are prior knowledge and may be wrong for this arm; a test on held-out data
     decides, first on the linearised model, then on the refitted one.  `r_factor` is that of the
     free columns.
     """
+    heldout: Array | None = None
     for threshold in WIDER:
         sigma = residual_sigma(found, len(reduction.kept))
         wider = choose(problem, sizes, r_factor, sigma, threshold)
@@ -311,6 +311,7 @@ def prefer_wider(
             continue
         step = own.step(sizes[wider.kept])
         linear = held_out_by_parts(problem.model, problem.parts, found.x, wider.kept, own, step)
+        heldout = heldout_of(problem, found) if heldout is None else heldout
         if not wider_is_needed(problem, heldout, linear):
             continue
         x = found.x.copy()
@@ -326,7 +327,7 @@ def prefer_wider(
         if needed and wider_is_needed(problem, heldout, wide_heldout):
             found, reduction, heldout = wide, wider, wide_heldout
             r_factor = free_r_factor(problem, found)
-    return found, reduction, heldout
+    return found, reduction
 
 
 # The course of a fit: place, tie weakly, choose the parameters, fit, compare.
@@ -345,17 +346,22 @@ SAMPLE = 5000
 class Solution:
     """The fit of the kept set, which parameters those are, and how well it predicts.
 
-    `reduction` holds indices into the model's parameters; `heldout` (rows,) residuals of each
-    configuration under a fit to the others; `nominal_rms` the 3-D rms in m of the nominal arm
-    with only base, markers and cable placed.
+    `reduction` holds indices into the model's parameters; `nominal_rms` is the 3-D rms in m of the
+    nominal arm with only base, markers and cable placed; `held` is `heldout` where that is not what
+    B and weights say.
     """
 
     problem: Problem
     fit: Fit
     reduction: Reduction
     sizes: Array
-    heldout: Array
     nominal_rms: float
+    held: Array | None = None
+
+    @cached_property
+    def heldout(self) -> Array:
+        """Residual (rows,) of each configuration under a fit to the others."""
+        return heldout_of(self.problem, self.fit) if self.held is None else self.held
 
 
 def solve(
@@ -367,14 +373,11 @@ def solve(
     """
     sizes = sizes_and_check(problem)
     problem, found, reduction, r_factor, placed = settle(problem, sizes, progress)
-    heldout = heldout_of(problem, found)
     if try_wider:
         progress("comparing with wider sets")
-        found, reduction, heldout = prefer_wider(
-            problem, sizes, found, reduction, heldout, r_factor
-        )
+        found, reduction = prefer_wider(problem, sizes, found, reduction, r_factor)
     nominal = rms_3d(placed, problem.observations.size)
-    return Solution(problem, found, reduction, sizes, heldout, nominal)
+    return Solution(problem, found, reduction, sizes, nominal)
 
 
 def settle(
