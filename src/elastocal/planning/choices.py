@@ -14,7 +14,6 @@ from collections.abc import Callable
 from copy import copy
 from dataclasses import dataclass, replace
 from itertools import combinations
-from typing import Any, Literal
 
 import numpy as np
 from scipy.optimize import minimize
@@ -30,7 +29,7 @@ from elastocal.planning.execution import at_stops, greedy_tour, tour_cost
 from elastocal.planning.feasibility import Feasibility
 from elastocal.planning.information import PoseInformation, plan_forces
 from elastocal.planning.moves import travel_times
-from elastocal.planning.plan import LOAD_POINT, TRACKER, Chosen, Plan, TimedSize
+from elastocal.planning.plan import LOAD_POINT, TRACKER, Chosen, LoadStates, Plan, TimedSize
 from elastocal.planning.relaxation import Relaxed, balanced, check_enough, relax
 from elastocal.planning.setup import FeasiblePool, Known, Setup, set_up
 from elastocal.planning.test_poses import TargetPoses
@@ -419,32 +418,6 @@ def _minutes(cell: Cell, q: Array, readings: IntArray) -> float:
 # simpler to measure, and a noise that is stated is not known to that.
 SIMPLER = 0.02
 SOME = 1000  # poses that the choice is made on
-
-
-@dataclass(frozen=True)
-class LoadStates:
-    """In which load states poses are read: each in `"all"`, or each in those `"chosen"` for it.
-
-    `crossed` and `chosen`: the relaxed optimum of both in the plan's unit, in the same time; None
-    where there is nothing to choose, and `why`.
-    """
-
-    used: Literal["all", "chosen"]
-    why: str
-    crossed: float | None = None
-    chosen: float | None = None
-
-    def to_json(self, forces: Array, readings: IntArray, unit: str) -> dict[str, Any]:
-        """With the numbers of poses of a plan that reads them as `readings` (N, L) say."""
-        counts = np.count_nonzero(readings, axis=0).tolist()
-        stops = zip(forces.tolist(), counts, strict=True)
-        return {
-            "used": self.used,
-            "why": self.why,
-            "unit": unit,
-            "relaxed": {"all": self.crossed, "chosen": self.chosen},
-            "stops": [{"load_N": force, "poses": n} for force, n in stops],
-        }
 
 
 def single_ways(information: PoseInformation) -> IntArray:

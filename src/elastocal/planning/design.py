@@ -31,7 +31,7 @@ from elastocal.planning.candidates import (
     shares_of,
 )
 from elastocal.planning.checkpoint import Checkpoint, State
-from elastocal.planning.choices import Choice, LoadStates, applied, chosen_states, within
+from elastocal.planning.choices import Choice, applied, chosen_states, within
 from elastocal.planning.criteria import CRITERIA, GONE
 from elastocal.planning.exchange import SizedPlans, random_information, values_without
 from elastocal.planning.feasibility import Feasibility
@@ -41,6 +41,7 @@ from elastocal.planning.plan import (
     CandidateCounts,
     Chance,
     Everywhere,
+    LoadStates,
     Plan,
     PlanSize,
     predicted,

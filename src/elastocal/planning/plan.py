@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Mapping, Sequence
 from dataclasses import asdict, dataclass, field
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import Any, Literal
 
 import numpy as np
 from scipy import linalg, special
@@ -22,9 +22,6 @@ from elastocal.planning.information import Estimable
 from elastocal.tables import column, csv_text
 from elastocal.text import is_label, json_text, quoted
 from elastocal.units import Array, BoolArray, IntArray, to_si
-
-if TYPE_CHECKING:
-    from elastocal.planning.choices import LoadStates
 
 # What a plan promises, and why each pose is in it.
 
@@ -530,6 +527,32 @@ class Chosen:
         if self.loads is not None:
             found["design"]["loads_N"] = self.loads.tolist()
         return {table: keys for table, keys in found.items() if keys}
+
+
+@dataclass(frozen=True)
+class LoadStates:
+    """In which load states poses are read: each in `"all"`, or each in those `"chosen"` for it.
+
+    `crossed` and `chosen`: the relaxed optimum of both in the plan's unit, in the same time; None
+    where there is nothing to choose, and `why`.
+    """
+
+    used: Literal["all", "chosen"]
+    why: str
+    crossed: float | None = None
+    chosen: float | None = None
+
+    def to_json(self, forces: Array, readings: IntArray, unit: str) -> dict[str, Any]:
+        """With the numbers of poses of a plan that reads them as `readings` (N, L) say."""
+        counts = np.count_nonzero(readings, axis=0).tolist()
+        stops = zip(forces.tolist(), counts, strict=True)
+        return {
+            "used": self.used,
+            "why": self.why,
+            "unit": unit,
+            "relaxed": {"all": self.crossed, "chosen": self.chosen},
+            "stops": [{"load_N": force, "poses": n} for force, n in stops],
+        }
 
 
 @dataclass(frozen=True)
