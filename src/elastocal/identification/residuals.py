@@ -83,9 +83,9 @@ def growth(B: Array, Q: Array, R: Array, e: Array, configuration: IntArray) -> A
         Qc, ec = Q[rows], e[rows]
         if rows.shape[1] > Q.shape[1]:
             # (I − Q_cᵀQ_c)⁻¹ Q_cᵀ is the same map, by a matrix of the parameters' size.
-            moved, alone = _moved(Qc.transpose(0, 2, 1) @ Qc, _times(Qc.transpose(0, 2, 1), ec))
+            moved, alone = moved_by(Qc.transpose(0, 2, 1) @ Qc, _times(Qc.transpose(0, 2, 1), ec))
         else:
-            solved, alone = _moved(Qc @ Qc.transpose(0, 2, 1), ec)
+            solved, alone = moved_by(Qc @ Qc.transpose(0, 2, 1), ec)
             moved = _times(Qc.transpose(0, 2, 1), solved)
         shift = linalg.solve_triangular(R, moved.T).T
         grown[rows] = _times(B[rows], shift)
@@ -160,7 +160,7 @@ def as_of_another_campaign(B: Array, weights: Weights, size: int) -> Array:
     return factor
 
 
-def _moved(share: Array, right: Array) -> tuple[Array, NDArray[np.bool_]]:
+def moved_by(share: Array, right: Array) -> tuple[Array, NDArray[np.bool_]]:
     """(I − share)⁻¹ right per configuration, and where it is alone in some direction.
 
     `share` (g, k, k) positive semidefinite, `right` (g, k); meaningless where alone.

@@ -16,7 +16,8 @@ from scipy import linalg, special
 from elastocal.engine.sizes import Standardised
 from elastocal.identification.linear_solver import least_norm
 from elastocal.identification.prediction import mean_squares
-from elastocal.identification.residuals import ALONE, held_out_residual, rms_3d
+from elastocal.identification.residuals import held_out_residual, moved_by, rms_3d
+from elastocal.identification.weighted_problem import same_size
 from elastocal.measurements import Measurements
 from elastocal.model.effects.catalogue import CATALOGUE
 from elastocal.model.observations import Observations
@@ -56,7 +57,7 @@ class Influence:
         """Plain numbers; what is infinite is None."""
         return {
             k: None if isinstance(v, float) and not np.isfinite(v) else v
-            for k, v in asdict(self).items()
+            for k, v in vars(self).items()
         }
 
 
@@ -64,32 +65,36 @@ def influence(fit: Calibration) -> tuple[Influence, ...]:
     """Leverage and influence of every configuration, in the order of the table."""
     observed, p = fit.observations, len(fit.columns)
     # What all readings share is fitted along.
-    rows, e = fit.weights.beside_common(fit.B[:, fit.columns], fit.residual)
-    Q, R = linalg.qr(rows, mode="economic")
+    white, e = fit.weights.beside_common(fit.B[:, fit.columns], fit.residual)
+    Q, R = linalg.qr(white, mode="economic")
     e = e - Q @ (Q.T @ e)
     s2 = float(e @ e) / max(fit.dof, 1)
     back = linalg.solve_triangular(R, np.eye(len(R)))[:p]  # of the parameters alone
     information = np.linalg.inv(back @ back.T)
     std = np.sqrt(s2 * np.diag(back @ back.T))
     labels = np.repeat(observed.configuration, observed.size)
-    codes, first = np.unique(labels, return_index=True)
-    found = []
-    for c in codes[np.argsort(first)]:
-        mine = np.flatnonzero(labels == c)
-        Qc = Q[mine]
-        gap = np.eye(len(mine)) - Qc @ Qc.T
-        name = observed.table.configuration_labels[int(c)]
-        if np.linalg.eigvalsh(gap)[0] < ALONE:
-            k, by, cook = int(np.argmax(np.abs(back @ Qc.T).max(axis=1) / std)), np.inf, np.inf
-        else:
-            move = back @ (Qc.T @ np.linalg.solve(gap, e[mine]))
-            shift = np.divide(np.abs(move), std, out=np.zeros(p), where=std > 0)
-            k, by = int(np.argmax(shift)), float(shift.max())
-            cook = float(move @ information @ move) / (p * s2) if s2 > 0 else 0.0
-        count, leverage = len(mine) // observed.size, float((Qc**2).sum())
-        moved = fit.model.names[fit.columns[k]]
-        found.append(Influence(name, count, leverage, cook, moved, by))
-    return tuple(found)
+    found: list[tuple[Any, ...]] = []
+    for rows in same_size(labels):
+        Qc, Qt = Q[rows], Q[rows].transpose(0, 2, 1)
+        moved, alone = moved_by(Qc @ Qt, e[rows])
+        move = (Qt @ moved[..., None])[..., 0] @ back.T
+        # A configuration that alone determines something moves that without end.
+        move[alone] = np.abs(back @ Qt[alone]).max(axis=2)
+        shift = np.divide(np.abs(move), std, out=np.zeros(move.shape), where=std > 0)
+        by, cook = shift.max(axis=1), ((move @ information) * move).sum(axis=1)
+        cook = cook / (p * s2) if s2 > 0 else 0 * cook
+        by[alone] = cook[alone] = np.inf
+        taken = (Qc**2).sum(axis=(1, 2))
+        found += zip(rows[:, 0], taken, cook, shift.argmax(axis=1), by, strict=True)
+    count = np.bincount(labels) // observed.size
+    names = observed.table.configuration_labels
+    return tuple(
+        Influence(
+            names[labels[first]], int(count[labels[first]]), float(taken), float(cook),
+            fit.model.names[fit.columns[k]], float(by),
+        )
+        for first, taken, cook, k, by in sorted(found)
+    )  # fmt: skip
 
 
 # Residuals from visit to visit.
