@@ -45,16 +45,6 @@ class Readings:
     lead: IntArray | None = None
     visits: VisitRecord | None = None
 
-    def __post_init__(self) -> None:
-        n, size = self.e.shape
-        require(
-            self.B.shape[:2] == (n, size),
-            f"B is {self.B.shape} where {n} readings of {size} components need ({n}, {size}, p)",
-        )
-        for name in ("configuration", "load", "marker"):
-            found = getattr(self, name).shape
-            require(found == (n,), f"{name} is {found}; one label per reading, ({n},), is needed")
-
     def __len__(self) -> int:
         return len(self.e)
 

@@ -12,16 +12,15 @@ from scipy import special
 from elastocal.errors import InputError
 from elastocal.identification.method_result import MethodResult
 from elastocal.identification.noise_choice import NoiseFit, NoiseTest, Trial, linearised
-from elastocal.identification.noise_structure import DRIFT, SHARED
+from elastocal.identification.noise_structure import DRIFT, SHARED, Readings
 from elastocal.identification.noisy_readings import deviations_of, own_noise
 from elastocal.identification.single_readings import SingleReadings, single_readings
+from elastocal.identification.solve import Solution
 from elastocal.identification.tails import kept_of
 from elastocal.identification.weighted_problem import (
-    Weights,
-    block_diagonal,
+    inverse_factor,
     stated_by_observation,
     weights_for,
-    whitener,
 )
 from elastocal.measurements import Measurements
 from elastocal.model.observations import Observations, pure_error
@@ -78,8 +77,11 @@ class NoiseSize:
     name: str
     sigma: float | None
     factor: float | None = None
-    of_joints: bool = False
     joints: tuple[int, ...] = ()
+
+    @property
+    def of_joints(self) -> bool:
+        return bool(self.joints)
 
     @property
     def shared(self) -> bool:
@@ -230,24 +232,19 @@ def _estimated(noise: Noise, found: NoiseFit, table: Measurements) -> Noise:
     def label(numbered: re.Match[str]) -> str:
         return f"{numbered[1]} {labels[numbered[1]][int(numbered[2])]}"
 
-    # The structure numbers markers and configurations; the user knows their names.
-    names = [NUMBERED.sub(label, name) for name in fit.structure.names]
-    own = [
-        NoiseSize(name, None, float(np.sqrt(v)))
-        if fit.structure.name == "stated"
-        else NoiseSize(name, float(np.sqrt(v)))
-        for name, v in zip(names, fit.own, strict=True)
-    ]
-    own += [
-        NoiseSize(name, float(np.sqrt(v)))
-        for (name, _), v in zip(fit.noisy.drifts, fit.drift, strict=True)
-    ]
-    shared = [
-        NoiseSize(SCATTER.format(e.name), float(np.sqrt(v)), None, True, e.joints)
-        if e.joints
-        else NoiseSize(f"{COMMON} {e.name}", float(np.sqrt(v)))
-        for e, v in zip(fit.shared, fit.common, strict=True)
-    ]
+    def size(k: int, name: str, sigma: float) -> NoiseSize:
+        if k < own + len(fit.drift):
+            # The structure numbers markers and configurations; the user knows their names.
+            name = NUMBERED.sub(label, name)
+            stated = fit.structure.name == "stated" and k < own
+            return NoiseSize(name, None, sigma) if stated else NoiseSize(name, sigma)
+        effect = fit.shared[k - own - len(fit.drift)]
+        if effect.joints:
+            return NoiseSize(SCATTER.format(name), sigma, None, effect.joints)
+        return NoiseSize(f"{COMMON} {name}", sigma)
+
+    own, sigma = fit.noisy.own, np.sqrt(fit.theta).tolist()
+    sizes = tuple(map(size, range(len(sigma)), fit.noisy.names, sigma))
     drift = None
     if found.lasting is not None and found.course is not None:
         drift = Drift(
@@ -255,14 +252,14 @@ def _estimated(noise: Noise, found: NoiseFit, table: Measurements) -> Noise:
             found.lasting * found.course.span if found.course.timed else None,
             found.to_longest > LIKELY,
         )
-    alone = fit.structure.name == "independent" and len(own) == 1
+    alone = fit.structure.name == "independent" and own == 1
     return replace(
         noise,
         kind=found.kind,
         description=found.description,
         reason=found.reason,
         sigma=float(np.sqrt(fit.own[0])) if alone else None,
-        sizes=(*own, *shared),
+        sizes=sizes,
         tried=found.trials,
         tests=found.tests,
         drift=drift,
@@ -281,17 +278,21 @@ def noise_parts(found: MethodResult) -> dict[str, float]:
         squared = fit.residual.reshape(n, size)[:, :3] ** 2
         spare = max(len(fit.residual) - _spent(found), 1)
         return {"readings": float(squared.sum()) / n * len(fit.residual) / spare}
-    noise, few = found.noise.fit, fit.columns[~solution.problem.model.shrunk[fit.columns]]
-    readings = linearised(solution.problem.model, observed, fit.x, few)
+    readings, noise = _bare(solution), found.noise.fit
     own = np.diagonal(own_noise(noise, readings)[0], axis1=1, axis2=2)[:, :3].sum(axis=1).mean()
-    visits = 0.0
-    drift = float(noise.drift[0]) if len(noise.drift) else 0.0
+    visits = float(noise.drift[:1].sum()) * min(size, 3)
     for effect, variance in deviations_of(noise, readings):
         loading = np.where(effect.unit[:, :, None, None] >= 0, effect.loading, 0.0)
         if effect.name != DRIFT:
             visits += variance * float((loading[:, :, :3] ** 2).sum(axis=(1, 2, 3)).mean())
-    visits += drift * min(size, 3)
     return {"readings": float(own), "visits": visits}
+
+
+def _bare(solution: Solution) -> Readings:
+    """The readings fitted, without columns of B."""
+    problem = solution.problem
+    none = np.zeros(0, dtype=np.int64)
+    return linearised(problem.model, problem.observations, solution.fit.x, none)
 
 
 def _ratio_to_stated(found: MethodResult, sigma: float) -> float | None:
@@ -332,15 +333,9 @@ def _spent(found: MethodResult) -> int:
 def _lack_of_fit(found: MethodResult) -> LackOfFit | None:
     """Repeats against configurations, each reading weighted by its own noise alone."""
     solution = found.solution
-    problem, fit = solution.problem, solution.fit
-    weights = problem.weights
-    common = found.noise is not None and (
-        bool(found.noise.fit.common.any()) or found.noise.lasting is not None
-    )
-    if common and found.noise is not None:
-        few = fit.columns[~np.isin(fit.columns, solution.reduction.with_prior)]
-        readings = linearised(problem.model, problem.observations, fit.x, few)
-        own = block_diagonal(own_noise(found.noise.fit, readings)[0])
-        weights = Weights("own", whitener(own), True, "")
-    whitened = weights.apply(fit.residual)
+    problem, residual = solution.problem, solution.fit.residual
+    noise, whitened = found.noise, problem.weights.apply(residual)
+    if noise is not None and (noise.fit.common.any() or noise.lasting is not None):
+        own = inverse_factor(own_noise(noise.fit, _bare(solution))[0])
+        whitened = (own @ residual.reshape(*own.shape[:2], 1)).ravel()
     return lack_of_fit(problem.observations, whitened, _spent(found))
