@@ -9,7 +9,7 @@ from scipy import optimize, special
 from scipy.spatial import cKDTree
 
 from elastocal.diagnosis.diagnosis_data import DiagnosisData
-from elastocal.diagnosis.noise_floor import NoiseValues, NoisyData, Projection, project
+from elastocal.diagnosis.noise_floor import NoiseValues, NoisyData, project
 from elastocal.units import Array, BoolArray, IntArray
 
 # A reading i left out has the error e = P_ii⁻¹u_i with covariance P_ii⁻¹ (u = P r), so uᵢᵀP_ii⁻¹u_i
@@ -84,39 +84,40 @@ class DirectChecks:
     allow."""
 
     def __init__(self, dataset: DiagnosisData) -> None:
-        self.dataset = dataset
-        self.size = dataset.blocks.size
-        self.scales: dict[str, dict[int, float]] = {"visits": {}, "repeats": {}}
-        self.stated = dataset.data.stated
+        self.dataset, blocks = dataset, dataset.blocks
+        self.size = size = blocks.size
         self.usual = NoiseValues.usual(dataset.data.G.shape[2])
         last = f"link{dataset.base.model.chain.n_joints}"
-        rigid = dataset.entry(("link_frame", (last,)))
-        self.rigid = dataset.blocks.unpack(rigid)
-        self.covariance = dataset.blocks.unpack_square(dataset.data.covariance)
-        order = np.argsort(dataset.blocks.visit, kind="stable")
-        ends = np.flatnonzero(np.diff(dataset.blocks.visit[order])) + 1
-        self.visits = [v for v in np.split(order, ends) if len(v) > 1]
+        rigid = blocks.unpack(dataset.entry(("link_frame", (last,))))
+        same = np.broadcast_to(np.eye(size), (blocks.n, size, size))
+        root = np.linalg.inv(np.linalg.cholesky(blocks.unpack_square(dataset.data.covariance)))
+        self.root = np.asarray(root, dtype=np.float64)
+        self.shared = [(_groups(blocks.visit), rigid), (_groups(dataset.repeated), same)]
+        self.scales: list[dict[int, float]] = [{}, {}]
 
     def excess(self, data: NoisyData) -> Array:
         """Squared error (N,) of every reading over what is allowed; 0 where it is left out.
 
         By the model, or less where visit, repeats or neighbours speak for the reading.
         """
-        at, used = project(data, self.usual), ~data.faulty
-        squared, error, weight = left_out_errors(self.dataset, at, used)
+        at, used, blocks = project(data, self.usual), ~data.faulty, self.dataset.blocks
+        weight = np.where(used[:, None, None], blocks.unpack_square(at.P), 0.0)
+        trace = np.trace(weight, axis1=1, axis2=2)[:, None, None]
+        u = np.where(used[:, None], blocks.unpack(at.u[..., None])[:, :, 0], 0.0)
+        regular = weight + (1e-12 * trace + ~used[:, None, None]) * np.eye(self.size)
+        error = np.linalg.solve(regular, u[..., None])[..., 0]
+        squared = (u * error).sum(axis=1)
         chi2 = float(special.chdtri(self.size, LEVEL / len(used)))
         median = max(float(np.median(squared[used])), TINY)
-        scale = median / float(special.chdtri(self.size, 0.5))
-        out = np.where(used, squared, 0.0) / (chi2 * scale)
+        out = squared / (chi2 * median / float(special.chdtri(self.size, 0.5)))
         suspect = out > 1
         if not suspect.any():
             return out
-        e = self.dataset.blocks.unpack((data.r - data.X @ at.beta)[..., None])[:, :, 0]
+        e = blocks.unpack((data.r - data.X @ at.beta)[..., None])[:, :, 0]
         direct = np.full(len(out), np.nan)
-        for found, power in (
-            self._within_visits(e, error, used, suspect), self._repeated(e, error, used),
-        ):  # fmt: skip
-            told = suspect & (power > 1)
+        for (groups, shared), scales in zip(self.shared, self.scales, strict=True):
+            found, would = self._beside(groups, shared, scales, e, error, used, suspect)
+            told = suspect & (would > 1)
             direct[told] = np.fmax(direct[told], found[told])
         told = ~np.isnan(direct)
         out[told] = np.minimum(out[told], direct[told])
@@ -151,71 +152,49 @@ class DirectChecks:
         limit, half = special.fdtri(k, nu, [1 - level, 0.5])
         return float(limit / half) * median
 
-    def _within_visits(
-        self, e: Array, error: Array, used: BoolArray, suspect: BoolArray
-    ) -> tuple[Array, Array]:
-        """What the markers' distances allow, of the residuals e (N, size), and whether they would
-        have shown the reading's `error` (N, size): both over their limits.
+    def _beside(
+        self, groups: list[IntArray], shared: Array, scales: dict[int, float], e: Array,
+        error: Array, used: BoolArray, suspect: BoolArray,
+    ) -> tuple[Array, Array]:  # fmt: skip
+        """What the others of a reading's group allow, of the residuals e (N, size), and whether
+        they would have shown the reading's `error` (N, size): both over their limits.
 
-        With the visit's rows whitened, e and the flange's six motions A, is Q = I − AA⁺ and
-        w = Q e; of a reading alone, wᵢᵀQ_ii⁺wᵢ and, as it would be, errorᵀQ_ii error.
+        With the group's rows whitened, e and the motions A that its readings have in common
+        (`shared`), is Q = I − AA⁺ and w = Q e; of a reading alone, wᵢᵀQ_ii⁺wᵢ and, as it would be,
+        errorᵀQ_ii error follow χ², their scale set by the median when they are first looked at.
         """
-        n = len(used)
+        n, k = len(used), self.size
         squared, power, dof = np.zeros(n), np.zeros(n), np.zeros(n, dtype=np.int64)
-        k = self.size
-        for visit in self.visits:
-            rows = visit[used[visit]]
-            # All visits are looked at once, for the scale, then those with suspects.
-            if len(rows) < 2 or (self.scales["visits"] and not suspect[rows].any()):
+        for group in groups:
+            rows = group[used[group]]
+            # All are looked at once, for the scale, then those with suspects.
+            if len(rows) < 2 or (scales and not suspect[rows].any()):
                 continue
-            root = np.linalg.inv(np.linalg.cholesky(self.covariance[rows]))
-            A = (root @ self.rigid[rows]).reshape(len(rows) * k, -1)
+            root = self.root[rows]
+            A = (root @ shared[rows]).reshape(len(rows) * k, -1)
             U, s, _ = np.linalg.svd(A, full_matrices=False)
             U = U[:, s > 1e-6 * s[0]]
             Q = np.eye(len(A)) - U @ U.T
-            w = Q @ (root @ e[rows][..., None]).ravel()
+            w = (Q @ (root @ e[rows][..., None]).ravel()).reshape(-1, k)
             own = (root @ error[rows][..., None])[..., 0]
-            for i, row in enumerate(rows):
-                span = slice(i * k, (i + 1) * k)
-                values, vectors = np.linalg.eigh(Q[span, span])
-                seen = values > SEEN
-                along = vectors[:, seen].T
-                squared[row] = ((along @ w[span]) ** 2 / values[seen]).sum()
-                power[row] = float(own[i] @ Q[span, span] @ own[i])
-                dof[row] = int(seen.sum())
-        return self._over_limits(squared, power, dof, "visits")
-
-    def _repeated(self, e: Array, error: Array, used: BoolArray) -> tuple[Array, Array]:
-        """The same by the other readings of the same marker at the same pose and load, in other
-        visits."""
-        group = self.dataset.repeated
-        count = np.bincount(group, used, minlength=int(group.max()) + 1)
-        others = count[group] - used
-        total = np.zeros((len(count), self.size))
-        np.add.at(total, group[used], e[used])
-        mean = (total[group] - np.where(used[:, None], e, 0.0)) / np.maximum(others, 1)[:, None]
-        root = np.linalg.inv(np.linalg.cholesky(self.covariance))
-        known = used & (others > 0)
-        off, own = ((root @ v[..., None])[..., 0] for v in (e - mean, error))
-        spread = 1 + 1 / np.maximum(others, 1)
-        squared = np.where(known, (off**2).sum(axis=1) / spread, 0.0)
-        power = np.where(known, (own**2).sum(axis=1) / spread, 0.0)
-        return self._over_limits(squared, power, np.where(known, self.size, 0), "repeats")
-
-    def _over_limits(
-        self, squared: Array, power: Array, dof: IntArray, check: str
-    ) -> tuple[Array, Array]:
-        """χ² statistics (N,) over their limits, the scale set by their median when the `check` is
-        first made."""
-        found, would = np.zeros_like(squared), np.zeros_like(power)
-        for k in np.unique(dof[dof > 0]):
-            own = dof == k
-            limit = float(special.chdtri(k, LEVEL / len(dof)))
+            at = np.arange(len(rows))
+            Q = Q.reshape(len(rows), k, len(rows), k)[at, :, at]
+            values, vectors = np.linalg.eigh(Q)
+            seen = values > SEEN
+            along = np.einsum("nij,ni->nj", vectors, w) ** 2
+            squared[rows] = np.where(seen, along / np.where(seen, values, 1.0), 0.0).sum(axis=1)
+            power[rows] = np.einsum("ni,nij,nj->n", own, Q, own)
+            dof[rows] = seen.sum(axis=1)
+        for number in np.unique(dof[dof > 0]):
+            mine = dof == number
+            half, limit = special.chdtri(number, [0.5, LEVEL / n])
             # Readings better than stated are not faulty yet.
-            scale = float(np.median(squared[own])) / float(special.chdtri(k, 0.5))
-            scale = self.scales[check].setdefault(int(k), max(scale, 1.0 if self.stated else TINY))
-            found[own], would[own] = squared[own] / (limit * scale), power[own] / (limit * scale)
-        return found, would
+            least = 1.0 if self.dataset.data.stated else TINY
+            scale = max(float(np.median(squared[mine]) / half), least)
+            limit *= scales.setdefault(int(number), scale)
+            squared[mine] /= limit
+            power[mine] /= limit
+        return squared, np.where(dof > 0, power, 0.0)
 
     def _unlike_neighbours(
         self, error: Array, weight: Array, chosen: IntArray, used: BoolArray
@@ -241,19 +220,11 @@ class DirectChecks:
         return out
 
 
-def left_out_errors(
-    dataset: DiagnosisData, at: Projection, used: BoolArray
-) -> tuple[Array, Array, Array]:
-    """Of every observation uᵢᵀP_ii⁻¹u_i (N,), its error P_ii⁻¹u_i (N, size) against the fit to the
-    others, and P_ii (N, size, size); zeros where it is not `used`."""
-    blocks = dataset.blocks
-    weight = blocks.unpack_square(at.P)
-    trace = np.trace(weight, axis1=1, axis2=2)[:, None, None]
-    weight = np.where(used[:, None, None], weight, 0.0)
-    regular = weight + (1e-12 * trace + ~used[:, None, None]) * np.eye(blocks.size)
-    u = np.where(used[:, None], blocks.unpack(at.u[..., None])[:, :, 0], 0.0)
-    error = np.linalg.solve(regular, u[..., None])[..., 0]
-    return (u * error).sum(axis=1), error, weight
+def _groups(number: IntArray) -> list[IntArray]:
+    """Members of each group of more than one."""
+    order = np.argsort(number, kind="stable")
+    ends = np.flatnonzero(np.diff(number[order])) + 1
+    return [group for group in np.split(order, ends) if len(group) > 1]
 
 
 def accidental(dataset: DiagnosisData, faulty: BoolArray) -> bool:
@@ -267,8 +238,9 @@ def accidental(dataset: DiagnosisData, faulty: BoolArray) -> bool:
         groups = np.unique(label)
         if len(groups) < 2:
             continue
-        counts = np.array([[(faulty & (label == g)).sum(), (label == g).sum()] for g in groups])
-        found, size = counts.T
+        found, size = np.transpose(
+            [[(faulty & of).sum(), of.sum()] for of in label == groups[:, None]]
+        )
         # Each group's count given the total is hypergeometric; the most conspicuous one decides.
         p = hypergeom.sf(found - 1, size.sum(), found.sum(), size).min() * len(groups)
         if p < ACCIDENT:
