@@ -8,7 +8,6 @@ from dataclasses import replace
 import numpy as np
 from scipy import sparse
 
-from elastocal.errors import InputError
 from elastocal.identification import published
 from elastocal.identification.covariance import Covariance
 from elastocal.identification.intervals import LEVEL, Intervals, intervals_of
@@ -25,7 +24,7 @@ from elastocal.identification.noise_judge import NoiseAndOutliers, outlier_scree
 from elastocal.identification.noise_structure import Kind, Readings
 from elastocal.identification.options import ROBUST, Options
 from elastocal.identification.residuals import held_out_residual, rms_3d
-from elastocal.identification.robust import asymptotic_covariance, clustered_covariance, robust_fit
+from elastocal.identification.robust import robust_result
 from elastocal.identification.smooth_fit import fit_smooth
 from elastocal.identification.solve import (
     Problem,
@@ -172,7 +171,7 @@ def run_method(
     if method == "reml" and not every.problem.large and not exact:
         return _reml(every, sound, faulty, refit, options, progress)
     if method in ROBUST:
-        return _robust(method, sound, every, ~faulty, options)
+        return robust_result(method, every, sound, ~faulty, options.intervals)
     # As published, every reading counts; and at equal weights noisy readings look faulty.
     drop = _set_aside(faulty, options) and (method in ("wls", "reml") or options.faulty == "drop")
     solution, good = (sound if drop else every), ~faulty
@@ -382,44 +381,3 @@ def _published(
     return MethodResult(
         method, solution, Intervals(covariance, covariance.interval(x, LEVEL)), None, good
     )
-
-
-def _robust(
-    method: str, sound: Solution, every: Solution, good: BoolArray, options: Options
-) -> MethodResult:
-    """A robust fit of all readings in the parameters that the good ones determine."""
-    if every.problem.large:
-        raise InputError(
-            f"the method {method} takes no table of this size; use the default "
-            "method, which sets faulty readings apart"
-        )
-    if options.intervals not in ("auto", "cr3"):
-        raise InputError(
-            f"the method {method} has intervals of its own: 'auto' for independent readings, "
-            "'cr3' where readings of a configuration depend on each other"
-        )
-    problem, kept = every.problem, sound.reduction.kept
-    observed = problem.observations
-    found = robust_fit(problem.fit_of(kept, sound.fit.x, sound.sizes), method)
-    if options.intervals == "cr3":
-        covariance = clustered_covariance(found.linear, observed.configuration)
-    else:
-        covariance = asymptotic_covariance(found.linear)
-    fit = replace(
-        sound.fit, x=found.x, residual=found.residual, whitened=found.whitened,
-        converged=found.converged, steps=found.steps,
-        problem=problem.fit_of(kept, found.x, sound.sizes),
-        reason=sound.fit.reason if found.converged else "the robust steps did not settle",
-    )  # fmt: skip
-    # Only for predicting left-out configurations do ψ(d)/d stand in as weights.
-    share = np.sqrt(np.repeat(np.minimum(found.linear.weights, 1e6), observed.size))
-    whiten = sparse.csr_array(sparse.diags_array(share))
-    if problem.weights.whiten is not None:
-        whiten = sparse.csr_array(whiten @ problem.weights.whiten)
-    weights = replace(problem.weights, whiten=whiten)
-    groups = observed.configuration
-    heldout = held_out_residual(fit.B, found.residual, weights, groups, observed.size)
-    solution = replace(sound, problem=replace(problem, x0=sound.problem.x0), fit=fit, held=heldout)
-    x = found.x[kept]
-    intervals = Intervals(covariance, covariance.interval(x, LEVEL))
-    return MethodResult(method, solution, intervals, None, good)

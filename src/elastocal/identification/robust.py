@@ -13,14 +13,17 @@ The weights solve Σ B_iᵀ Ψ(e_i/σ) = 0, Ψ(r) = ψ(|r|) r/|r|; they are no i
 from __future__ import annotations
 
 import warnings
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
-from scipy import linalg, special
+from scipy import linalg, sparse, special
 
-from elastocal.errors import ElastocalError, InsufficientDataError, require
+from elastocal.errors import ElastocalError, InputError, InsufficientDataError
 from elastocal.identification.covariance import Covariance, SatterthwaiteSums, orthogonal
-from elastocal.identification.least_squares import FitProblem
+from elastocal.identification.intervals import LEVEL, Intervals
+from elastocal.identification.method_result import MethodResult
+from elastocal.identification.residuals import held_out_residual
+from elastocal.identification.solve import Problem, Solution
 from elastocal.identification.trimmed import median_scale
 from elastocal.units import Array, BoolArray, IntArray
 
@@ -69,11 +72,6 @@ class RobustEstimate:
         """Σ ρ."""
         c = self.c
         return float((np.where(d <= c, d**2 / 2, c * (d - c / 2)) if c else d).sum())
-
-    @property
-    def psi(self) -> Array:
-        """ψ(d) (n,)."""
-        return np.minimum(self.distance, self.c) if self.c else np.ones(self.n)
 
     @property
     def weights(self) -> Array:
@@ -193,70 +191,6 @@ def least_absolute(B: Array, y: Array, size: int) -> RobustEstimate:
     return RobustEstimate(Q, factors.V, r, size, 0.0, z, _scale(r, size, y), bool(converged))
 
 
-# Robust fit of the nonlinear model: linear robust steps on the exact B.
-
-METHODS = {"huber": huber, "l1": least_absolute}
-SETTLED = 1e-5  # |B δx| in units of the scale at which the steps have converged
-MOST_MOVES = 40
-
-
-@dataclass(frozen=True)
-class RobustFit:
-    """x (parameters,), raw and whitened residual (rows,), and the robust estimate of the `linear`
-    model at x, whose step is negligible."""
-
-    x: Array
-    residual: Array
-    whitened: Array
-    linear: RobustEstimate
-    converged: bool
-    steps: int
-
-
-def robust_fit(problem: FitProblem, method: str) -> RobustFit:
-    """Minimise Σ ρ(|W (y − h(X))_i|/σ) over X[columns] by damped Gauss–Newton steps.
-
-    Each step is the robust linear fit of the whitened residual to the whitened B at X; it is
-    halved until Σ ρ at the step's σ falls.
-
-    Whitening by a covariance that couples observations (deflections that share an unloaded
-    reading) mixes them: a bad reading then also shows in those whitened after it.
-
-    Raises InputError for dependent columns; ElastocalError where the start has poses without
-    equilibrium.
-    """
-    observed, columns, whiten = problem.observations, problem.columns, problem.weights.apply
-    x, steps = problem.x.copy(), 0
-    while True:
-        at = problem.model.regressor(observed.table, x, columns, observed)
-        e = whiten(at.residual)
-        found = METHODS[method](whiten(at.B), e, observed.size)
-        moved = float(np.linalg.norm(found.z))
-        converged = moved <= SETTLED * found.scale * np.sqrt(len(columns))
-        share = 0.0 if converged or steps == MOST_MOVES else _damping(problem, x, e, found)
-        if share == 0.0:
-            return RobustFit(x, at.residual, e, found, converged, steps)
-        x[columns] += share * found.x
-        steps += 1
-
-
-def _damping(problem: FitProblem, x: Array, e: Array, found: RobustEstimate) -> float:
-    """Largest of 1, ½, ¼, … of the step that lowers Σ ρ at its scale; 0 where none does."""
-    size, observed, columns = found.size, problem.observations, problem.columns
-    before = found.rho(lengths(e, size) / found.scale)
-    for share in 0.5 ** np.arange(20):
-        trial = x.copy()
-        trial[columns] += share * found.x
-        try:
-            residual = observed.value - problem.model.predict(observed.table, trial, observed)
-        except ElastocalError:
-            continue
-        d = lengths(problem.weights.apply(residual), size) / found.scale
-        if np.isfinite(d).all() and found.rho(d) <= before * (1 + 1e-12):
-            return float(share)
-    return 0.0
-
-
 # Covariance of an M-estimate: from ψ and ψ′, never from the weights of its iteration.
 #
 # With r_i = e_i/σ and u = r/|r| the derivative of an observation's score is
@@ -272,45 +206,45 @@ def _damping(problem: FitProblem, x: Array, e: Array, found: RobustEstimate) -> 
 # The weights ψ/d as inverse variances would be wrong: a weight is small because that residual came
 # out large, not because its variance was known to be.
 
-UNDETERMINED = (
-    "so many observations lie far from the fit that the rest do not determine the parameters' "
-    "covariance; use the default method, or look for the cause of the outliers"
-)
 EXACT = 1e-8  # scaled length below which an l1 fit passes through an observation
+ALONE = 1e-9  # of the information: what the others must have of every direction
+UNDETERMINED = (
+    "so many readings lie far from the fit that the others do not determine every parameter, or "
+    "one configuration alone does; use the default method, or measure more configurations"
+)
 
 
 def asymptotic_covariance(found: RobustEstimate) -> Covariance:
-    """Covariance (p, p) of x̂; t intervals with the rows that keep a weight less p as dof.
+    """Covariance (p, p) of x̂ of independent readings; t intervals with rows less p as dof.
 
     Huber's H2, k σ² (b̂/â) W⁻¹, with â the mean eigenvalue of J_i, b̂ = Σψ²/(n·size − p), and his
-    small-sample factor k = 1 + (p/(n·size)) Var(eigenvalues)/â² (k = 1 for l1).  Under dependence
-    or unequal spread use `clustered_covariance`.
+    small-sample factor k = 1 + (p/(n·size)) Var(eigenvalues)/â² (k = 1 for l1).
 
     Raises InsufficientDataError where W is not positive definite.
     """
     along, across = found.curvature()
     rows, p, size = len(found.residual), len(found.z), found.size
+    W = found.information(np.zeros(found.n, dtype=np.int64))[0]
     a = float(np.mean(along + (size - 1) * across)) / size
-    if not a > 0:
+    if not a > 0 or np.linalg.eigvalsh(W)[0] <= 0:
         raise InsufficientDataError(UNDETERMINED)
-    b = float((found.psi**2).sum()) / (rows - p)
-    k = 1.0
+    psi = np.minimum(found.distance, found.c) if found.c else np.ones(found.n)
+    b, k = float(psi @ psi) / (rows - p), 1.0
     if found.c:
         square = float((along**2).sum() + (size - 1) * (across**2).sum()) / rows
         k = 1 + p / rows * (square - a**2) / a**2
-    W = found.information(np.zeros(found.n, dtype=np.int64))[0]
-    matrix = found.V @ (k * found.scale**2 * b / a * _inverse_of(W)) @ found.V.T
+    matrix = k * found.scale**2 * b / a * found.V @ np.linalg.inv(W) @ found.V.T
     text = f"asymptotic covariance H2 of the {found.name} estimate, from ψ and ψ′"
     return Covariance("H2", matrix, np.full(p, float(rows - p)), text)
 
 
 def clustered_covariance(found: RobustEstimate, cluster: IntArray) -> Covariance:
-    """Covariance (p, p) of x̂ under any dependence within clusters, with t dofs (p,).
+    """Covariance (p, p) of x̂ under any dependence within clusters (n,), such as configurations,
+    with t dofs (p,).
 
-    `cluster` (n,) integer label of each observation, such as its configuration.  Leaving cluster
-    g out moves x̂ by δ_g = σ (W − W_g)⁻¹ s_g to first order, with the scores s_g = Σ_{i∈g} B_iᵀΨ_i
-    and W_g = Σ_{i∈g} B_iᵀ J_i B_i; the jackknife of these (CR3 of Bell and McCaffrey 2002 for the
-    M-estimate's score),
+    Leaving cluster g out moves x̂ by δ_g = σ (W − W_g)⁻¹ s_g to first order, with the scores
+    s_g = Σ_{i∈g} B_iᵀΨ_i and W_g = Σ_{i∈g} B_iᵀ J_i B_i; the jackknife of these (CR3 of Bell and
+    McCaffrey 2002 for the M-estimate's score),
 
         cov x̂ = (G − 1)/G Σ_g δ_g δ_gᵀ,
 
@@ -318,37 +252,107 @@ def clustered_covariance(found: RobustEstimate, cluster: IntArray) -> Covariance
     clusters.  dof are Satterthwaite's under independence, (tr T)²/tr T² with the quadratic form
     T of each parameter: few clusters, or few that see a parameter, have few.
 
-    Raises InputError for a single cluster, InsufficientDataError where without one cluster the
-    others do not determine every parameter.
+    Raises InsufficientDataError where without one cluster the others do not determine every
+    parameter.
     """
-    names, code = np.unique(cluster, return_inverse=True)
-    require(len(names) > 1, "a clustered covariance needs at least two clusters; found one")
-    W_g, p = found.information(code), len(found.z)
+    p, size, code = len(found.z), found.size, np.unique(cluster, return_inverse=True)[1].ravel()
+    W_g = found.information(code)
     W = W_g.sum(axis=0)
-    inverse, rest = _inverse_of(W), W - W_g
-    alone = np.linalg.eigvalsh(rest)[:, 0] <= 1e-9 * np.linalg.eigvalsh(W)[-1]
-    if alone.any():
-        raise InsufficientDataError(
-            f"without cluster {names[alone][0]} the others do not determine every parameter, so "
-            "its scatter cannot be judged; measure more such configurations or fit fewer parameters"
-        )
-    scores, size = np.zeros((len(names), p)), found.size
+    rest = W - W_g
+    if (np.linalg.eigvalsh(rest)[:, 0] <= ALONE * np.linalg.eigvalsh(W)[-1]).any():
+        raise InsufficientDataError(UNDETERMINED)
+    scores, G = np.zeros((len(W_g), p)), len(W_g)
     weighted = np.repeat(found.weights, size) * found.residual / found.scale
     np.add.at(scores, np.repeat(code, size), weighted[:, None] * found.Q)
     shift = found.scale * np.linalg.solve(rest, scores[..., None])[..., 0] @ found.V.T
-    matrix = (len(names) - 1) / len(names) * shift.T @ shift
-    # T = diag(own) − K with K_gh = m_gᵀ W⁻¹ m_h, never formed: there may be thousands of clusters.
+    # T = diag(own) − K with K_gh = m_gᵀ W⁻¹ m_h, never formed: there may be thousands of groups.
     reach = np.linalg.solve(rest, np.broadcast_to(found.V.T, rest.shape))  # by parameter
     m, sums = W_g @ reach, SatterthwaiteSums(p)
-    sums.add(np.einsum("gij,gij->gj", reach, m), linalg.cholesky(inverse) @ m)
-    text = f"jackknife of the {found.name} scores over {len(names)} clusters"
-    return Covariance("clustered", matrix, sums.dof(), text)
+    sums.add(np.einsum("gij,gij->gj", reach, m), linalg.cholesky(np.linalg.inv(W)) @ m)
+    text = f"jackknife of the {found.name} scores over {G} clusters"
+    return Covariance("clustered", (G - 1) / G * shift.T @ shift, sums.dof(), text)
 
 
-def _inverse_of(matrix: Array) -> Array:
-    """Inverse of a symmetric positive definite matrix; raises where the data left after rejection
-    make it none."""
-    try:
-        return np.asarray(linalg.cho_solve(linalg.cho_factor(matrix), np.eye(len(matrix))))
-    except linalg.LinAlgError:
-        raise InsufficientDataError(UNDETERMINED) from None
+# Robust fit of the nonlinear model: linear robust steps on the exact B.
+
+METHODS = {"huber": huber, "l1": least_absolute}
+SETTLED = 1e-5  # |B δx| in units of the scale at which the steps have converged
+MOST_MOVES = 40
+
+
+def robust_result(
+    method: str, every: Solution, sound: Solution, good: BoolArray, intervals: str
+) -> MethodResult:
+    """The robust fit of all readings in the parameters that the `good` ones (N,) determine.
+
+    Minimises Σ ρ(|W (y − h(X))_i|/σ) over X[kept] by damped Gauss–Newton steps: each is the robust
+    linear fit of the whitened residual to the whitened B at X, halved until Σ ρ at its σ falls.
+
+    Whitening by a covariance that couples observations (deflections that share an unloaded
+    reading) mixes them: a bad reading then also shows in those whitened after it.
+
+    Raises InputError for a large table, other intervals and dependent columns, ElastocalError where
+    the start has poses without equilibrium.
+    """
+    problem, kept, x, steps = every.problem, sound.reduction.kept, sound.fit.x.copy(), 0
+    if problem.large:
+        raise InputError(
+            f"the method {method} takes no table of this size; use the default "
+            "method, which sets faulty readings apart"
+        )
+    if intervals not in ("auto", "cr3"):
+        raise InputError(
+            f"the method {method} has intervals of its own: 'auto' for independent readings, "
+            "'cr3' where readings of a configuration depend on each other"
+        )
+    observed, weights = problem.observations, problem.weights
+    while True:
+        at = problem.model.regressor(observed.table, x, kept, observed)
+        e = weights.apply(at.residual)
+        found = METHODS[method](weights.apply(at.B), e, observed.size)
+        converged = bool(np.linalg.norm(found.z) <= SETTLED * found.scale * np.sqrt(len(kept)))
+        share = 0.0 if converged or steps == MOST_MOVES else _damping(problem, x, kept, e, found)
+        if share == 0.0:
+            break
+        x[kept] += share * found.x
+        steps += 1
+    fit = replace(
+        sound.fit, x=x, residual=at.residual, whitened=e, converged=converged, steps=steps,
+        problem=problem.fit_of(kept, x, sound.sizes),
+        reason=sound.fit.reason if converged else "the robust steps did not settle",
+    )  # fmt: skip
+    # Only for predicting left-out configurations do ψ(d)/d stand in as weights.
+    root = np.sqrt(np.repeat(np.minimum(found.weights, 1e6), observed.size))
+    whiten = sparse.csr_array(sparse.diags_array(root))
+    if weights.whiten is not None:
+        whiten = sparse.csr_array(whiten @ weights.whiten)
+    heldout = held_out_residual(
+        fit.B, at.residual, replace(weights, whiten=whiten), observed.configuration, observed.size
+    )
+    problem = replace(problem, x0=sound.problem.x0)
+    solution = replace(sound, problem=problem, fit=fit, held=heldout)
+    if intervals == "auto":
+        covariance = asymptotic_covariance(found)
+    else:
+        covariance = clustered_covariance(found, observed.configuration)
+    ends = covariance.interval(x[kept], LEVEL)
+    return MethodResult(method, solution, Intervals(covariance, ends), None, good)
+
+
+def _damping(
+    problem: Problem, x: Array, kept: IntArray, e: Array, found: RobustEstimate
+) -> float:  # fmt: skip
+    """Largest of 1, ½, ¼, … of the step that lowers Σ ρ at its scale; 0 where none does."""
+    size, observed = found.size, problem.observations
+    before = found.rho(lengths(e, size) / found.scale)
+    for share in 0.5 ** np.arange(20):
+        trial = x.copy()
+        trial[kept] += share * found.x
+        try:
+            residual = observed.value - problem.model.predict(observed.table, trial, observed)
+        except ElastocalError:
+            continue
+        d = lengths(problem.weights.apply(residual), size) / found.scale
+        if np.isfinite(d).all() and found.rho(d) <= before * (1 + 1e-12):
+            return float(share)
+    return 0.0
