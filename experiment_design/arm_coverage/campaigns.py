@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from functools import cached_property, lru_cache
 from importlib.resources import files
 from pathlib import Path
@@ -46,27 +46,18 @@ VISIT = 60.0  # s between visits
 TEST_POSES = 200
 
 
-@dataclass(frozen=True)
-class Scenario:
-    """A kind of noise, beside that of the tracker, and how many configurations are measured."""
-
-    key: str
-    name: str
-    configurations: int = 30
-
-
-SCENARIOS = (
-    Scenario("independent", "independent"),
-    Scenario("axes", "one size per axis"),
-    Scenario("effect", "80 µm configuration effect"),
-    Scenario("outliers", "5 % outliers of 1 to 10 mm"),
-    Scenario("tails", "heavy tails (t, 3 degrees)"),
-    Scenario("polar", "polar tracker, not declared"),
-    Scenario("joints", "joints settle anew at each visit, 20 µrad"),
-    Scenario("few", "12 configurations", 12),
-    Scenario("drift", "drift, correlated in time"),
-)
-BY_KEY = {s.key: s for s in SCENARIOS}
+POSES, FEW = 30, 12  # of a campaign, and of the scenario "few"
+SCENARIOS = {
+    "independent": "independent",
+    "axes": "one size per axis",
+    "effect": "80 µm configuration effect",
+    "outliers": "5 % outliers of 1 to 10 mm",
+    "tails": "heavy tails (t, 3 degrees)",
+    "polar": "polar tracker, not declared",
+    "joints": "joints settle anew at each visit, 20 µrad",
+    "few": f"{FEW} configurations",
+    "drift": "drift, correlated in time",
+}  # kinds of noise, beside that of the tracker
 
 
 @lru_cache(maxsize=1)
@@ -110,23 +101,25 @@ def rows_at(poses: int, rng: np.random.Generator) -> Measurements:
 class Campaign:
     """One campaign: a `true` arm, its exact and noisy readings, and which of these are clean."""
 
-    def __init__(self, scenario: Scenario, number: int) -> None:
+    def __init__(self, scenario: str, number: int) -> None:
         self.scenario = scenario
-        marks = [sum(scenario.key.encode()), number]
+        marks = [sum(scenario.encode()), number]
         self.rng = rng = np.random.default_rng(np.random.SeedSequence(marks))
         self.true = true_arm(rng)
-        self.exact = simulate(arm(), rows_at(scenario.configurations, rng), self.true, rng, False)
+        self.exact = simulate(
+            arm(), rows_at(FEW if scenario == "few" else POSES, rng), self.true, rng, False
+        )
         self.noise, self.clean = self.drawn(self.exact)
         self.table = replace(self.exact, position=self.exact.position + self.noise)
 
     @property
     def sizes(self) -> np.ndarray:
         """σ (3,) m of single readings, where it is the same at all."""
-        return SIGMA * np.array([0.5, 1.0, 2.0] if self.scenario.key == "axes" else [1.0] * 3)
+        return SIGMA * np.array([0.5, 1.0, 2.0] if self.scenario == "axes" else [1.0] * 3)
 
     def drawn(self, exact: Measurements) -> tuple[np.ndarray, np.ndarray]:
         """Noise (n, 3) of readings at `exact` in m, and which of them (n,) are no outliers."""
-        rng, key, n = self.rng, self.scenario.key, len(exact)
+        rng, key, n = self.rng, self.scenario, len(exact)
         size = self.sizes * np.ones((n, 1))
         noise = size * (rng.standard_t(3, (n, 3)) if key == "tails" else rng.normal(size=(n, 3)))
         clean = np.ones(n, dtype=bool)
@@ -168,7 +161,7 @@ class Campaign:
     @cached_property
     def covariance(self) -> np.ndarray:
         """True covariance (3n, 3n) of the clean noise."""
-        exact, key, n = self.exact, self.scenario.key, len(self.exact)
+        exact, key, n = self.exact, self.scenario, len(self.exact)
         V = np.diag(np.tile(self.sizes, n) ** 2) * (3.0 if key == "tails" else 1.0)
         if key == "polar":
             root = self.polar_root(exact)

@@ -14,7 +14,7 @@ from typing import Any
 
 import numpy as np
 import pandas as pd
-from campaigns import BY_KEY, SCENARIOS, Campaign, arm
+from campaigns import SCENARIOS, Campaign, arm
 from scipy import stats
 
 from elastocal.identification.identify import identify
@@ -24,15 +24,15 @@ LEVELS = {"held_95": 0.95, "held_9973": 0.9973}
 
 
 def tasks(options: dict[str, Any]) -> Iterator[dict[str, Any]]:
-    chosen = [s for s in SCENARIOS if options["only"] in ("", s.key)]
+    chosen = [s for s in SCENARIOS if options["only"] in ("", s)]
     for number in range(options["first"], options["first"] + options["replicates"]):
         for scenario in chosen:
-            yield {"scenario": scenario.key, "number": number}
+            yield {"scenario": scenario, "number": number}
 
 
 def run(task: dict[str, Any], rng: np.random.Generator) -> list[dict[str, Any]]:
     """A row of study.toml's columns; the campaign's seed follows from scenario and number."""
-    campaign = Campaign(BY_KEY[task["scenario"]], task["number"])
+    campaign = Campaign(task["scenario"], task["number"])
     model, true = arm(), campaign.true
     result = identify(model, campaign.table)
     determined = np.array([model.names.index(name) for name in result.determined])
@@ -91,8 +91,8 @@ def summary(frame: pd.DataFrame) -> str:
         "position 95 / 99.73 % | joint scatter told | drift told | trusted |",
         "|" + "---|" * 10,
     ]
-    for scenario in SCENARIOS:
-        rows = frame[frame["scenario"] == scenario.key]
+    for scenario, name in SCENARIOS.items():
+        rows = frame[frame["scenario"] == scenario]
         if not len(rows):
             continue
         total = rows.sum(numeric_only=True)
@@ -107,7 +107,7 @@ def summary(frame: pd.DataFrame) -> str:
             f"{100 * rows[k].mean():.0f} %" for k in ("told_joint_scatter", "told_drift", "trusted")
         ]
         lines.append(
-            f"| {scenario.name} | {len(rows)} | {share('held_95', 'estimates')} / "
+            f"| {name} | {len(rows)} | {share('held_95', 'estimates')} / "
             f"{share('held_9973', 'estimates')} | {share('springs_held_95', 'springs')} / "
             f"{share('springs_held_9973', 'springs')} | {ratio:.3f} | {held:.3f} | "
             f"{100 * rows['positions_held'].mean():.1f} / "

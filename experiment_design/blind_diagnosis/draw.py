@@ -17,7 +17,6 @@ from instrument import Noise, Variant, draw_noise
 from numpy.typing import NDArray
 from outside import OUTSIDE, draw_outside
 from places import Site, log_uniform
-from whole_laws import WHOLE
 from world import Effect, Physics, Visits
 
 Array = NDArray[np.float64]
@@ -28,7 +27,6 @@ CLEARANCE = 0.08  # markers and joints stay this share of the reach above the ba
 SEPARATION = 0.05  # rad, in the joint that differs most: no pose twice
 CATALOGUE: tuple[str, ...] = tuple(KINDS)
 OUTSIDE_EFFECTS: tuple[str, ...] = tuple(OUTSIDE)
-HOOKS = {name: kind.hooks for name, kind in (KINDS | OUTSIDE).items()} | WHOLE
 # Effects that another one imitates at any poses, and that other; joint 1 is vertical.
 ALIKE = {
     "gear_eccentricity:joint2": "link_mass_error:link2",
@@ -67,7 +65,7 @@ class World:
 
     @property
     def physics(self) -> Physics:
-        return Physics(self.specimen.true, self.effects, HOOKS)
+        return Physics(self.specimen.true, self.effects)
 
     def measure(self, visits: Visits, rng: np.random.Generator) -> Array:
         """Noisy readings (n, M, 3) m of any visits: also of poses that were proposed later."""
@@ -128,7 +126,7 @@ class Recipe:
         visits = draw_visits(spec, draw_poses(spec, self.poses, rng), plan, by_motion, rng)
         distance = float(np.linalg.norm(specimen.base_position))
         noise = draw_noise(self.variant, J, distance, rng, self.level)
-        load = Physics(specimen.true, (), HOOKS).rest(visits)[0].load
+        load = Physics(specimen.true, ()).rest(visits)[0].load
         site = Site(spec, specimen.true, load, float(visits.time[-1]), orders)
         effects = tuple(
             (draw_effect if name in KINDS else draw_outside)(effect, site, rng, self.factor)

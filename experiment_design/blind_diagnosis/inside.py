@@ -20,8 +20,7 @@ from places import (
     Site,
     Values,
     all_or_one,
-    at_joints,
-    at_links,
+    at,
     compensators,
     log_uniform,
     markers,
@@ -198,7 +197,7 @@ def draw_effect(
     where, index = places[rng.integers(len(places))]
     drawn = log_uniform(SPREAD, rng)
     values, settings = KINDS[name].draw(site, index, drawn if factor is None else factor, rng)
-    return Effect(name, where, values, settings)
+    return Effect(name, where, values, settings, hooks=KINDS[name].hooks)
 
 
 def possible(name: str, spec: ArmSpec) -> bool:
@@ -310,8 +309,8 @@ def _settles(site: Site, rng: np.random.Generator) -> Values:
     return time_constant(rng)
 
 
-_EVERY = at_joints(lambda s: s.joints)
-_AT_WORK = at_joints(lambda s: s.at_work)
+_EVERY = at("joint", lambda s: s.joints)
+_AT_WORK = at("joint", lambda s: s.at_work)
 KINDS: dict[str, Kind] = {
     "encoder_scale": Kind(_EVERY, _signed("encoder_scale", 1e-4), Hooks(move=_encoder_scale)),
     "gear_eccentricity": Kind(
@@ -333,7 +332,7 @@ KINDS: dict[str, Kind] = {
         _EVERY, _soft("off_axis_compliance_x", "off_axis_compliance_y"), Hooks(springs=_off_axis)
     ),
     "link_bending": Kind(
-        at_links(lambda s: s.long_links),
+        at("link", lambda s: s.long_links),
         _soft("bending_y", "bending_z", "torsion"),
         Hooks(springs=_link_bending),
     ),
@@ -341,7 +340,7 @@ KINDS: dict[str, Kind] = {
     "gravity_compensator": Kind(compensators, _balance, Hooks(tendon=_compensator)),
     "payload_error": Kind(only("load"), _payload, Hooks(move=_payload_error)),
     "link_mass_error": Kind(
-        at_links(lambda s: s.massive_links), _mass, Hooks(weigh=_link_mass_error)
+        at("link", lambda s: s.massive_links), _mass, Hooks(weigh=_link_mass_error)
     ),
     "thermal_expansion": Kind(
         all_or_one,

@@ -121,9 +121,8 @@ class World:
     @property
     def _cell(self) -> str:
         markers = "\n".join(f"M{m + 1} = {MARKERS[m].tolist()}" for m in range(self._markers))
-        noise = {"distance": f"distance_um = {self.sigma * 1e6}\n"}.get(
-            self.kind, f"sigma_um = {self.sigma * 1e6}\n"
-        )
+        size = "distance_um" if self.kind == "distance" else "sigma_um"
+        noise = f"{size} = {self.sigma * 1e6}\n"
         if self.kind == "pose":
             noise += f"rotation_urad = {self.sigma / 0.3 * 1e6}\n"
         nominal = {
@@ -196,9 +195,8 @@ def main() -> None:
         for kind in asked.kinds.split(","):
             tried = list(worlds(kind, asked.seed, asked.worlds))
             found = list(pool.map(verdict, tried))
-            claimed = [
-                (w, f) for w, f in zip(tried, found, strict=True) if f[0] != "nothing_significant"
-            ]
+            both = zip(tried, found, strict=True)
+            claimed = [(w, f) for w, f in both if f[0] != "nothing_significant"]
             k, n = len(claimed), len(tried)
             low, high = beta.ppf([0.025, 0.975], [k, k + 1], [n - k + 1, n - k])
             print(f"| {kind} | {n} | {k} | {np.nan_to_num(low):.3f} to {high:.3f} |", flush=True)

@@ -8,7 +8,7 @@ a joint's commanded angle "q2", its load "torque2" or direction "approach1", "ti
 from __future__ import annotations
 
 from collections.abc import Callable
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 from inside import SPREAD, settled, time_constant
@@ -34,7 +34,8 @@ def draw_outside(
 ) -> Effect:
     """The named effect at a random place; factor over its size, log-uniform where none is given."""
     drawn = log_uniform(SPREAD, rng)
-    return OUTSIDE[name].make(site, drawn if factor is None else factor, rng)
+    made = OUTSIDE[name].make(site, drawn if factor is None else factor, rng)
+    return replace(made, hooks=OUTSIDE[name].hooks)
 
 
 # --- transmission -----------------------------------------------------------------------------

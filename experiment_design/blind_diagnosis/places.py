@@ -63,14 +63,9 @@ class Site:
 Places = Callable[[Site], list[tuple[str, int]]]
 
 
-def at_joints(chosen: Callable[[Site], list[int]]) -> Places:
-    """Joints by 0-based index."""
-    return lambda site: [(f"joint{j + 1}", j) for j in chosen(site)]
-
-
-def at_links(chosen: Callable[[Site], list[int]]) -> Places:
-    """Links by 0-based index."""
-    return lambda site: [(f"link{j + 1}", j) for j in chosen(site)]
+def at(kind: str, chosen: Callable[[Site], list[int]]) -> Places:
+    """Joints or links by 0-based index."""
+    return lambda site: [(f"{kind}{j + 1}", j) for j in chosen(site)]
 
 
 def only(where: str) -> Places:
@@ -83,7 +78,7 @@ def markers(site: Site) -> list[tuple[str, int]]:
 
 def all_or_one(site: Site) -> list[tuple[str, int]]:
     """Every second warm arm is warm all over."""
-    single = at_links(lambda s: s.long_links)(site)
+    single = at("link", lambda s: s.long_links)(site)
     return [("all", 0)] * len(single) + single
 
 

@@ -31,6 +31,7 @@ ALLOWED_SECONDS = 10.0
 DISTANCES = (0.0, 1.0, 2.0, 3.0, 4.0, 5.0, np.inf)
 BINS = 10  # of stated probabilities
 UNANSWERABLE = ("outside", "left_out", "whole", "whole300")
+Bar = float | None
 Line = tuple[str, str, str, str, object, str]  # worlds, measure, bar, measured, n, met
 
 
@@ -57,30 +58,21 @@ def line(
     measure: str,
     value: float,
     n: int,
-    at_least: float | None = None,
-    at_most: float | None = None,
+    least: Bar = None,
+    most: Bar = None,
     told: str = "",
 ) -> Line:
     """A measure of n worlds beside its bar, which the value itself has to meet."""
-    limits = [f"{sign} {v:g}" for sign, v in (("≥", at_least), ("≤", at_most)) if v is not None]
-    low, high = (
-        (-np.inf if at_least is None else at_least),
-        (np.inf if at_most is None else at_most),
-    )
-    met = "" if not limits else "yes" if low <= value <= high else "NO"
-    return worlds, measure, ", ".join(limits), told or f"{value:.2f}", n, met
+    limits = [f"{sign} {v:g}" for sign, v in (("≥", least), ("≤", most)) if v is not None]
+    met = (least is None or value >= least) and (most is None or value <= most)
+    said = ("yes" if met else "NO") if limits else ""
+    return worlds, measure, ", ".join(limits), told or f"{value:.2f}", n, said
 
 
-def share(
-    worlds: str,
-    measure: str,
-    hits: Sequence[Any] | pd.Series,
-    at_least: float | None = None,
-    at_most: float | None = None,
-) -> Line:
+def share(worlds: str, measure: str, hits: Any, least: Bar = None, most: Bar = None) -> Line:
     k, n = int(sum(map(bool, hits))), len(hits)
     told = f"{k / n:.3f} ({wilson(k, n)})" if n else ""
-    return line(worlds, measure, k / n if n else np.nan, n, at_least, at_most, told)
+    return line(worlds, measure, k / n if n else np.nan, n, least, most, told)
 
 
 def wilson(k: int, n: int) -> str:
@@ -99,12 +91,12 @@ def lines(f: pd.DataFrame) -> Iterator[Line]:
     seen = alike[alike["from_nothing"] >= FAR]
     yield share("alike for any poses", "both reported", alike["both"], 0.95)
     yield share("… with d ≥ 5 from nothing", "both reported", seen["both"])
-    yield share("alike for any poses", "one claimed with > 90 %", alike["sure"], at_most=0.05)
+    yield share("alike for any poses", "one claimed with > 90 %", alike["sure"], most=0.05)
     for variant in VARIANTS:
         most, told = 0.05 if variant == "as_modelled" else 0.07, variant.replace("_", " ")
         for kind, worlds in (("clean", f"no effect, {told}"), ("timeless", f"… {told}, no times")):
             hits = suite[f"{kind}-{variant}"]["claimed"]
-            yield share(worlds, "an effect claimed", hits, at_most=most)
+            yield share(worlds, "an effect claimed", hits, most=most)
     pairs, two = suite["pairs"], "two effects, × 1.5"
     apart = pairs[pairs["d"] >= WELL_APART]
     yield share(two, "both right", pairs["found"] == 2, 0.80)
@@ -123,7 +115,7 @@ def lines(f: pd.DataFrame) -> Iterator[Line]:
         yield from _extra(f"after {poses} poses", suite[name])
     for poses, name, bars in ((60, "whole", (1.25, 1.6)), (300, "whole300", (1.1, 1.3))):
         yield from _whole(f"whole arms, {poses} poses", suite[name], *bars)
-    yield share("all", "no answer", f["verdict"] == "failed", at_most=0.0)
+    yield share("all", "no answer", f["verdict"] == "failed", most=0.0)
     single = f[f["whole"].isna()]
     for poses, at_least in ((FEW_POSES, 0.95), (MANY_POSES, None)):
         yield _time(f"{poses} poses", single[single["poses"] == poses], at_least)
@@ -134,7 +126,7 @@ def _one_effect(suite: dict[str, pd.DataFrame]) -> Iterator[Line]:
     one, many = suite["catalogue"], suite["catalogue300"]
     far = one[one["d"] >= FAR]
     yield share("one effect, 60 poses", "right", one["outcome"] == "right", 0.92)
-    yield share("one effect, 60 poses", "wrong name", one["outcome"] == "wrong", at_most=0.03)
+    yield share("one effect, 60 poses", "wrong name", one["outcome"] == "wrong", most=0.03)
     yield share("… with d ≥ 5", "named outright", far["outright"], 0.98)
     yield share("one effect, 300 poses", "right", many["outcome"] == "right", 0.96)
     for effect, some in one.groupby("effect", sort=False):
@@ -154,7 +146,7 @@ def _unknown(worlds: str, f: pd.DataFrame) -> Iterator[Line]:
     called, claim = f["verdict"] == "unknown_effect", "an effect of the catalogue claimed"
     yield share(worlds, "unknown_effect", called, 0.85)
     yield share(worlds, "its location right", f[called]["located"], 0.8)
-    yield share(worlds, f"{claim} with > 90 %", f["sure"], at_most=0.05)
+    yield share(worlds, f"{claim} with > 90 %", f["sure"], most=0.05)
 
 
 def _probabilities(f: pd.DataFrame) -> Iterator[Line]:

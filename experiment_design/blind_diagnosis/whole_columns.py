@@ -14,7 +14,7 @@ from draw import World
 from mechanics import GRAVITY
 from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
-from whole_laws import CREEP, LAST_MOVE, LINES, WEIGHTS, creep, gear_error, last_move, weights
+from whole_draw import CREEP, LAST_MOVE, LINES, WEIGHTS, creep, gear_error, last_move, weights
 from world import Effect, TrueArm, Visits
 
 Array = NDArray[np.float64]

@@ -27,10 +27,67 @@ from inside import POSE
 from instrument import draw_noise
 from numpy.typing import NDArray
 from places import Values, log_uniform
-from whole_laws import CREEP, LAST_MOVE, LINES, WEIGHTS
-from world import Effect
+from skeleton import Skeleton
+from world import Effect, Hooks, Motion, Visits
 
 Array = NDArray[np.float64]
+
+
+# How the effects act, several at every joint.  Their names are not those of elastocal, which is
+# asked for sizes and causes here, not for a name.
+LINES, WEIGHTS, LAST_MOVE, CREEP = "gear_lines", "unknown_weights", "last_move", "slow_creep"
+
+
+def gear_error(e: Effect, q: Array) -> Array:
+    """Error (n,) rad of a gear at its joint's angle q (n,): lines of any order, each
+    a sin(order q) + b cos(order q)."""
+    error = np.zeros(len(q))
+    for line, order in e.settings.items():
+        a, b = e.vector(f"{line}_sin", f"{line}_cos")
+        error += a * np.sin(order * q) + b * np.cos(order * q)
+    return error
+
+
+def last_move(e: Effect, approach: Array) -> Array:
+    """Where a joint stops (n,) rad: beyond its target, or before it, by the side it came from."""
+    return e.values["half_width"] * approach
+
+
+def creep(e: Effect, time: Array) -> Array:
+    """Shift and turn of the base (n, 6) m, rad: waves whose frequencies are drawn from the
+    spectrum of a Gaussian process of squared exponential covariance."""
+    moved = np.zeros((len(time), 6))
+    frequencies = [w for key, w in e.settings.items() if key.startswith("frequency")]
+    for k, frequency in enumerate(frequencies):
+        for wave, name in ((np.cos, "cos"), (np.sin, "sin")):
+            size = e.vector(*[f"{axis}_{name}{k}" for axis in POSE])
+            moved += np.outer(wave(frequency * time), size)
+    return moved
+
+
+def _gear_moves(e: Effect, v: Visits, m: Motion) -> None:
+    m.drive[:, e.index] += gear_error(e, v.q[:, e.index])
+
+
+def _last_moves(e: Effect, v: Visits, m: Motion) -> None:
+    m.drive[:, e.index] += last_move(e, v.approach[:, e.index])
+
+
+def _creep_moves(e: Effect, v: Visits, m: Motion) -> None:
+    m.base += creep(e, v.time)
+
+
+def weights(e: Effect) -> tuple[Array, Array]:
+    """Masses (J,) kg of the links and their centres (J, 3) m in the joints' frames."""
+    J = len(e.values) // 4
+    masses = e.vector(*[f"mass{j + 1}" for j in range(J)])
+    centres = [e.vector(*[f"com{j + 1}_{axis}" for axis in "xyz"]) for j in range(J)]
+    return masses, np.array(centres)
+
+
+def _weigh(e: Effect, skeleton: Skeleton) -> Skeleton:
+    masses, centres = weights(e)
+    return replace(skeleton, mass=masses, com=centres)
 
 
 @dataclass(frozen=True)
@@ -93,11 +150,7 @@ def draw_whole(
     scatter = np.array([log_uniform(RANGES.scatter, rng) for _ in range(J)]) * spec.gear
     effects = [
         *(_gear(spec, j, rng) for j in range(J)),
-        *(
-            Effect(LAST_MOVE, f"joint{j + 1}", {"half_width": spec.gear * half})
-            for j in range(J)
-            for half in [log_uniform(RANGES.half_width, rng)]
-        ),
+        *(_last_move(spec, j, rng) for j in range(J)),
         _weights(spec, rng),
         _creep(rng),
     ]
@@ -130,7 +183,12 @@ def _gear(spec: ArmSpec, j: int, rng: np.random.Generator) -> Effect:
             settings[f"line{multiple}"] = multiple * first
             values |= _line(f"line{multiple}", amplitude, rng)
         amplitude *= rng.uniform(*RANGES.next_line)
-    return Effect(LINES, f"joint{j + 1}", values, settings)
+    return Effect(LINES, f"joint{j + 1}", values, settings, hooks=Hooks(move=_gear_moves))
+
+
+def _last_move(spec: ArmSpec, j: int, rng: np.random.Generator) -> Effect:
+    half = {"half_width": spec.gear * log_uniform(RANGES.half_width, rng)}
+    return Effect(LAST_MOVE, f"joint{j + 1}", half, hooks=Hooks(move=_last_moves))
 
 
 def _weights(spec: ArmSpec, rng: np.random.Generator) -> Effect:
@@ -139,7 +197,7 @@ def _weights(spec: ArmSpec, rng: np.random.Generator) -> Effect:
         moved = centre + rng.normal(0.0, RANGES.centre * spec.reach, 3)
         values[f"mass{j + 1}"] = float(mass) * log_uniform(RANGES.mass, rng)
         values |= {f"com{j + 1}_{axis}": float(c) for axis, c in zip("xyz", moved, strict=True)}
-    return Effect(WEIGHTS, "all", values)
+    return Effect(WEIGHTS, "all", values, hooks=Hooks(weigh=_weigh))
 
 
 def _creep(rng: np.random.Generator) -> Effect:
@@ -152,4 +210,5 @@ def _creep(rng: np.random.Generator) -> Effect:
             drawn = size / np.sqrt(WAVES) * rng.normal(size=WAVES)
             values |= {f"{axis}_{name}{k}": float(a) for k, a in enumerate(drawn)}
     settings = {f"frequency{k}": float(w) for k, w in enumerate(frequencies)}
-    return Effect(CREEP, "base", values, settings | {"length_s": length})
+    settings["length_s"] = length
+    return Effect(CREEP, "base", values, settings, hooks=Hooks(move=_creep_moves))

@@ -22,8 +22,7 @@ from numpy.typing import NDArray
 from scipy.linalg import cho_factor, cho_solve
 from scipy.spatial.transform import Rotation
 from whole_columns import Scene, components, moments, scene_of
-from whole_draw import RANGES
-from whole_laws import CREEP, LAST_MOVE, LINES, WEIGHTS, creep
+from whole_draw import CREEP, LAST_MOVE, LINES, RANGES, WEIGHTS, creep
 from world import Effect, Visits
 
 Array = NDArray[np.float64]

@@ -16,30 +16,6 @@ Array = NDArray[np.float64]
 
 
 @dataclass(frozen=True)
-class Effect:
-    """What is wrong: its name and place, values in SI, settings (times, orders, periods).
-
-    `where` and the keys of catalogue effects are those of elastocal, so that answers compare.
-    `stage` and `driver` state the true location of an effect outside the catalogue.
-    """
-
-    name: str
-    where: str
-    values: dict[str, float]
-    settings: dict[str, float] = field(default_factory=dict)
-    stage: str = ""
-    driver: str = ""
-
-    @property
-    def index(self) -> int:
-        """0-based number of a joint or link: 1 for "joint2"."""
-        return int(self.where.lstrip("abcdefghijklmnopqrstuvwxyz")) - 1
-
-    def vector(self, *keys: str) -> Array:
-        return np.array([self.values[key] for key in keys])
-
-
-@dataclass(frozen=True)
 class Visits:
     """n visits of a pose: commanded joints (n, J) rad, force (n, 3) N, time (n,) s, direction of
     the last motion of each joint (n, J) ±1, and which pose it is (n,)."""
@@ -115,23 +91,44 @@ class Hooks:
 
 
 @dataclass(frozen=True)
+class Effect:
+    """What is wrong: its name and place, values in SI, settings (times, orders, periods).
+
+    `where` and the keys of catalogue effects are those of elastocal, so that answers compare.
+    `stage` and `driver` state the true location of an effect outside the catalogue; `hooks` say
+    how it acts.
+    """
+
+    name: str
+    where: str
+    values: dict[str, float]
+    settings: dict[str, float] = field(default_factory=dict)
+    stage: str = ""
+    driver: str = ""
+    hooks: Hooks = Hooks()
+
+    @property
+    def index(self) -> int:
+        """0-based number of a joint or link: 1 for "joint2"."""
+        return int(self.where.lstrip("abcdefghijklmnopqrstuvwxyz")) - 1
+
+    def vector(self, *keys: str) -> Array:
+        return np.array([self.values[key] for key in keys])
+
+
+@dataclass(frozen=True)
 class Physics:
-    """The true arm with its effects; `kinds` says how each named effect acts."""
+    """The true arm with its effects."""
 
     arm: TrueArm
     effects: tuple[Effect, ...]
-    kinds: dict[str, Hooks]
-
-    @cached_property
-    def _acting(self) -> list[tuple[Effect, Hooks]]:
-        return [(effect, self.kinds[effect.name]) for effect in self.effects]
 
     @cached_property
     def _skeleton(self) -> Skeleton:
         skeleton = self.arm.skeleton
-        for effect, hooks in self._acting:
-            if hooks.weigh:
-                skeleton = hooks.weigh(effect, skeleton)
+        for effect in self.effects:
+            if effect.hooks.weigh:
+                skeleton = effect.hooks.weigh(effect, skeleton)
         return skeleton
 
     @cached_property
@@ -142,9 +139,9 @@ class Physics:
             for j, (axis, k) in enumerate(zip(arm.skeleton.axis, arm.compliance, strict=True))
         ]
         tendon = None
-        for effect, hooks in self._acting:
-            springs += hooks.springs(effect, arm) if hooks.springs else []
-            tendon = hooks.tendon(effect) if hooks.tendon else tendon
+        for effect in self.effects:
+            springs += effect.hooks.springs(effect, arm) if effect.hooks.springs else []
+            tendon = effect.hooks.tendon(effect) if effect.hooks.tendon else tendon
         return ElasticArm(self._skeleton, springs, tendon)
 
     def rest(self, visits: Visits, jitter: Array | None = None) -> tuple[Rest, Motion]:
@@ -155,14 +152,14 @@ class Physics:
 
         def slack(load: Array) -> Array:
             free = np.zeros_like(load)
-            for effect, hooks in self._acting:
-                if hooks.slack:
-                    hooks.slack(effect, visits, load, free)
+            for effect in self.effects:
+                if effect.hooks.slack:
+                    effect.hooks.slack(effect, visits, load, free)
             return free
 
         play: dict[int, float] = {}
-        for effect, hooks in self._acting:
-            play |= hooks.play(effect) if hooks.play else {}
+        for effect in self.effects:
+            play |= effect.hooks.play(effect) if effect.hooks.play else {}
         drive = visits.q + self.arm.offset + motion.drive
         placement = self._placement(motion)
         rest = self._elastic.rest(drive, placement, motion.force, motion.hook, slack, play)
@@ -174,9 +171,9 @@ class Physics:
         local = self.arm.markers + motion.markers
         points = rest.position[:, None] + np.einsum("nij,nmj->nmi", rest.rotation, local)
         sight = Sight(points, rest.rotation)
-        for effect, hooks in self._acting:
-            if hooks.see:
-                hooks.see(effect, self.arm, visits, sight)
+        for effect in self.effects:
+            if effect.hooks.see:
+                effect.hooks.see(effect, self.arm, visits, sight)
         return sight.points
 
     def _motion(self, visits: Visits) -> Motion:
@@ -186,9 +183,9 @@ class Physics:
             np.zeros((n, len(self.arm.markers), 3)), visits.force.copy(),
             np.tile(self.arm.hook, (n, 1)),
         )  # fmt: skip
-        for effect, hooks in self._acting:
-            if hooks.move:
-                hooks.move(effect, visits, motion)
+        for effect in self.effects:
+            if effect.hooks.move:
+                effect.hooks.move(effect, visits, motion)
         return motion
 
     def _placement(self, motion: Motion) -> Placement:

@@ -142,15 +142,11 @@ def truth_of(world: World) -> dict[str, object]:
     }
 
 
-def _effect(effect: Effect) -> dict[str, object]:
-    location = {"stage": effect.stage, "where": effect.where, "driver": effect.driver}
-    return {
-        "effect": effect.name,
-        "where": effect.where,
-        "in_catalogue": not effect.stage,
-        "values": effect.values,
-        "settings": effect.settings,
-    } | ({"location": location} if effect.stage else {})
+def _effect(e: Effect) -> dict[str, object]:
+    told = {"effect": e.name, "where": e.where, "in_catalogue": not e.stage}
+    told |= {"values": e.values, "settings": e.settings}
+    place = {"location": {"stage": e.stage, "where": e.where, "driver": e.driver}}
+    return told | (place if e.stage else {})
 
 
 if __name__ == "__main__":

@@ -135,29 +135,6 @@ def figure_3(c: Campaign, dp: np.ndarray, path: Path) -> list[str]:
     ]
 
 
-def iterating(c: Campaign, replicates: int, jobs: int) -> list[str]:
-    """What the iterations add to the stated precision of a single one, over campaigns.
-
-    "This allows us to increase additionally identification accuracy by the factor 3-20 comparing
-    with single iteration WLS", says the paper.
-    """
-
-    def gains(seed: int) -> np.ndarray:
-        history = eq14(c.B, c.draw([seed, 0]))
-        std = np.array([history[k].std for k in (0, 1, -1)])
-        return np.array([std[0] / std[1], std[1] / std[2]])
-
-    found = np.array(Parallel(jobs)(delayed(gains)(s) for s in range(replicates)))
-    single, more = (np.median(found[:, k], axis=0) for k in (0, 1))
-    quantiles = np.quantile(found[:, 1], [0.05, 0.95])
-    return [
-        f"A single iteration states a gain of {single.min():.1f} to {single.max():.1f} over OLS "
-        f"(medians of the nine parameters), the iterations after it {more.min():.1f} to "
-        f"{more.max():.1f} times more (5 to 95 % of all: {quantiles[0]:.1f} to "
-        f"{quantiles[1]:.1f}); published is a factor of 3 to 20."
-    ]
-
-
 def replicate(c: Campaign, seed: int, effect: float) -> np.ndarray:
     """(method, parameter, error and stated σ) of one campaign."""
     dp = c.draw([seed, int(effect * 1e6)], effect)
@@ -202,9 +179,6 @@ def main() -> None:
         "Table 3: compliances in µrad/(N·m), ±3σ as stated": three,
         "Table 4: stated intervals": four,
         "Fig. 3: iteration of eq. (14) on each residual": figure_3(c, dp, HERE / "fig3.png"),
-        "What iterating adds to a single iteration": iterating(
-            c, min(chosen.replicates, 40), chosen.jobs
-        ),
         "What it is worth: noise of Table 1": worth(c, 0.0, chosen.replicates, chosen.jobs),
         "What it is worth: with an 80 µm configuration effect": worth(
             c, EFFECT, chosen.replicates, chosen.jobs

@@ -30,7 +30,7 @@ from elastocal.model.manipulator import Model
 
 WORLD_MODULES = {
     "arm_data", "draw", "inside", "instrument", "mechanics", "outside", "places",
-    "skeleton", "whole_columns", "whole_draw", "whole_laws", "whole_oracle",
+    "skeleton", "whole_columns", "whole_draw", "whole_oracle",
     "whole_score", "world", "world_files",
 }  # fmt: skip
 CASES = [

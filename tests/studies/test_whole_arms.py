@@ -15,8 +15,7 @@ sys.path.insert(0, str(FOLDER))
 
 from arm_data import ARMS
 from whole_columns import components, moments, scene_of
-from whole_draw import draw_whole
-from whole_laws import WEIGHTS
+from whole_draw import WEIGHTS, draw_whole
 from whole_oracle import Sights, oracle_errors
 from world_files import write_world
 
