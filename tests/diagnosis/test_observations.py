@@ -12,6 +12,7 @@ from support.diagnosis_data import Fault, campaign, cell, measured, plan, zigzag
 import elastocal as ec
 from elastocal import Diagnosis
 from elastocal.cell.arm_description import Nominal
+from elastocal.diagnosis.baseline import thinned
 from elastocal.errors import InsufficientDataError
 from elastocal.model.manipulator import Model
 
@@ -106,3 +107,15 @@ def test_missing_readings_and_unequal_repeats() -> None:
     assert d.verdict == "explained" and key(d) == ("encoder_scale", "joint3")
     # Repeats copy the first reading and add 10 µm: their scatter is 10/√2.
     assert d.noise.pure_error == pytest.approx(1e-5 / np.sqrt(2), rel=0.15)
+
+
+def test_of_a_large_table_a_part_is_looked_at_from_its_first_hour_to_its_last() -> None:
+    """Configurations stay whole and evenly spaced, and that is said."""
+    _, table = campaign()
+    kept, said = thinned(table, most_rows=60)
+    assert len(kept) == 60 and said is not None and f"60 of {len(table)} rows" in said
+    assert (np.bincount(kept.configuration)[np.unique(kept.configuration)] == 6).all()
+    times = np.unique(kept.time)
+    assert np.ptp(times) > 0.95 * np.ptp(table.time)
+    assert np.diff(times).max() < 4 * np.ptp(table.time) / len(times)
+    assert thinned(table) == (table, None)

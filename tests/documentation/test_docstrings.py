@@ -94,7 +94,14 @@ def test_no_example_of_a_public_class_is_left_out():
     assert own - {"Cell.read"} <= set(LISTED)  # which is read_cell
 
 
-@pytest.mark.parametrize("name", [name for name in SHOWN if name not in BARE])
+@pytest.mark.parametrize(
+    "name",
+    [
+        pytest.param(name, marks=pytest.mark.long if name == "next_poses" else ())
+        for name in SHOWN
+        if name not in BARE
+    ],
+)
 def test_the_examples_run(name, folder, known, monkeypatch):
     monkeypatch.chdir(folder)
     finder = doctest.DocTestFinder(recurse=False)
