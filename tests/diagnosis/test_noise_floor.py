@@ -23,13 +23,13 @@ def curve(q: np.ndarray, seed: int) -> np.ndarray:
     return AMPLITUDE * np.sqrt(2 / 400) * np.cos(q[:, None] * w + phase).sum(axis=1)
 
 
-def diagnosed(curves: bool, shake: float = 0.0) -> tuple[Diagnosis, float]:
-    """Of poses of which a third come twice, 2 mrad apart in their joints, later in the campaign;
+def diagnosed(curves: bool, again: int, shake: float = 0.0) -> tuple[Diagnosis, float]:
+    """Of poses of which so many come `again`, 2 mrad apart in their joints, later in the campaign;
     and the 3-D rms (m) of the tracker's noise and of the joints' scatter that was put in."""
-    chain, n, near = kr270_chain(), 30, 2e-3
-    q = random_poses(chain, n, 1)
-    step = np.random.default_rng(4).uniform(-near, near, (n // 3, q.shape[1]))
-    q = np.concatenate([q, q[: n // 3] + step])
+    chain, near = kr270_chain(), 2e-3
+    q = random_poses(chain, 40 - again, 1)
+    step = np.random.default_rng(4).uniform(-near, near, (again, q.shape[1]))
+    q = np.concatenate([q, q[:again] + step])
     table = table_of(q, np.zeros(3), both=False)
     table = replace(table, time=30.0 * table.configuration)
     off = table.q.copy()
@@ -50,12 +50,12 @@ def diagnosed(curves: bool, shake: float = 0.0) -> tuple[Diagnosis, float]:
 
 def test_an_error_curve_is_no_scatter() -> None:
     """A fit takes it for scatter of its joints; poses that nearly come again say it is none."""
-    why, true = diagnosed(curves=True)
+    why, true = diagnosed(curves=True, again=10)
     assert why.gap.noise_floor == pytest.approx(true, rel=0.15)
     assert why.gap.calibrated > 3 * true
 
 
 def test_on_an_arm_that_only_scatters_nothing_is_unexplained() -> None:
-    why, true = diagnosed(curves=False, shake=1e-4)
+    why, true = diagnosed(curves=False, again=0, shake=1e-4)
     assert why.gap.unexplained == 0.0 and why.verdict == "nothing_significant"
     assert why.gap.noise_floor == pytest.approx(true, rel=0.15)
