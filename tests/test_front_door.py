@@ -467,7 +467,7 @@ def test_a_figure_is_drawn_in_axes_of_the_users_own(fit):
     figure = Figure(figsize=(12, 5), layout="constrained")
     left, right = figure.subplots(1, 2)
     left.plot([1, 2])
-    part = fit.plot("parameters", ax=right)
+    part = fit.plot("waterfall", ax=right)
     assert part in figure.subfigs and part.axes[0].get_xlabel() and len(figure.axes) == 2
     figure.savefig("both.png")
     with pytest.raises(ec.InputError, match="`ax` takes axes"):

@@ -95,11 +95,10 @@ class Result(Saved):
 
         Args:
             kind: Which of the result's figures.  A `Calibration` has "residuals" (the default),
-                "parameters", "waterfall", "sureness", "against_joints", "over_time", "scores",
-                "smooth" and "space"; a `Plan` "poses", "intervals" and "curve"; a `Diagnosis`
-                "budget", "candidates", "shares", "curves", "effects" and those of residuals; a
-                `Compensation` "errors" and "uncertainty"; a `Comparison` "moved"; `Measurements`
-                "joints"; `NextPoses` "gain" and "doubts".
+                "waterfall", "sureness", "against_joints", "over_time", "smooth" and "space"; a
+                `Plan` "poses", "intervals" and "curve"; a `Diagnosis` "budget", "candidates",
+                "shares", "curves", "effects" and those of residuals; a `Compensation` "errors"; a
+                `Comparison` "moved"; `Measurements` "joints"; `NextPoses` "gain" and "doubts".
             interactive: The arm in space ("space", "poses") to be turned.
             ax: Axes of matplotlib's subplots, in whose place the figure is drawn.
 
@@ -112,8 +111,8 @@ class Result(Saved):
                 that there are.
 
         Examples:
-            >>> figure = ec.identify("cell.toml", "data.csv").plot("parameters")
-            >>> figure.savefig("parameters.png")
+            >>> figure = ec.identify("cell.toml", "data.csv").plot("waterfall")
+            >>> figure.savefig("waterfall.png")
         """
         return import_module(VIEWS).plot(self, kind, interactive, ax)
 

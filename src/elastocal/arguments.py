@@ -72,14 +72,15 @@ def _number(value: Any) -> bool:
     return bool(size <= LARGEST)
 
 
-def _path(value: Any) -> bool:
-    return isinstance(value, Path) or (isinstance(value, str) and bool(value))
+def _text(value: Any) -> bool:
+    return isinstance(value, str)
 
 
-def _list_of(check: Check) -> Check:
+def _list_of(check: Check, least: int = 0, kind: Any = Collection) -> Check:
     def checked(value: Any) -> bool:
-        several = isinstance(value, Collection) and not isinstance(value, str | bytes)
-        return several and getattr(value, "ndim", 1) == 1 and all(map(check, value))
+        several = isinstance(value, kind) and not isinstance(value, str | bytes)
+        flat = several and getattr(value, "ndim", 1) == 1
+        return flat and least <= len(value) and all(map(check, value))
 
     return checked
 
@@ -89,22 +90,6 @@ def _table_of(key: Check, check: Check) -> Check:
         return isinstance(value, Mapping) and all(key(k) and check(v) for k, v in value.items())
 
     return checked
-
-
-def _text(value: Any) -> bool:
-    return isinstance(value, str)
-
-
-def _texts(value: Any) -> bool:
-    return isinstance(value, tuple) and all(map(_text, value))
-
-
-def _two(value: Any) -> bool:
-    return isinstance(value, Collection) and len(value) == 2 and all(map(_array, value))
-
-
-def _filled(value: Any) -> bool:
-    return _list_of(_number)(value) and len(value) > 0
 
 
 def _seed(value: Any) -> bool:
@@ -119,7 +104,7 @@ KINDS: dict[str, tuple[str, Check]] = {
     "float": ("a finite number", _number),
     "bool": ("True or False", _truth),
     "str": ("a text", _text),
-    "Path": ("a path", _path),
+    "Path": ("a path", lambda v: isinstance(v, Path) or bool(_text(v) and v)),
     "ArrayLike": ("finite numbers", _array),
     "Array": ("numbers", _values),
     "Sequence[int]": ("a list of whole numbers", _list_of(_counted)),
@@ -128,11 +113,15 @@ KINDS: dict[str, tuple[str, Check]] = {
         "a list of TargetPose", _list_of(lambda v: type(v).__name__ == "TargetPose"),
     ),
     "Mapping[str, float]": ("numbers by name", _table_of(_text, _number)),
-    "Mapping[str, Sequence[float]]": ("a list of numbers by name", _table_of(_text, _filled)),
-    "Mapping[tuple[str, str], float]": (
-        "numbers by effect and place", _table_of(_texts, _number),
+    "Mapping[str, Sequence[float]]": (
+        "a list of numbers by name", _table_of(_text, _list_of(_number, 1)),
     ),
-    "tuple[ArrayLike, ArrayLike]": ("two corners", _two),
+    "Mapping[tuple[str, str], float]": (
+        "numbers by effect and place", _table_of(_list_of(_text, kind=tuple), _number),
+    ),
+    "tuple[ArrayLike, ArrayLike]": (
+        "two corners", lambda v: isinstance(v, Collection) and len(v) == 2 and all(map(_array, v)),
+    ),
     "Progress": ("a function", callable),
     "None": ("None", lambda v: v is None),
 }  # fmt: skip

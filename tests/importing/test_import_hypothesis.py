@@ -10,7 +10,7 @@ from hypothesis import strategies as st
 from support.tracker_exports import imported, krl, rapid
 
 from elastocal.errors import InputError
-from elastocal.importing.foreign_text import Clock, ForeignText, krl_rows, rapid_rows
+from elastocal.importing.foreign_text import ForeignText, program_rows, seconds_of
 from elastocal.importing.mapping_file import read_mapping
 
 QUIET = settings(max_examples=40, deadline=None, suppress_health_check=list(HealthCheck))
@@ -101,9 +101,9 @@ def test_any_mapping_is_read_or_refused_by_name(data):
 @QUIET
 @given(st.text('{}[](),;:=!."A1E6XYZ \n-+0189ax', max_size=80))
 def test_any_program_text_is_read_or_refused(text):
-    for read in (krl_rows, rapid_rows):
+    for kind in ("krl", "rapid"):
         try:
-            found = read(ForeignText("f", "ASCII", text.split("\n")))
+            found = program_rows(ForeignText("f", "ASCII", text.split("\n")), kind)
         except InputError as error:
             assert str(error).startswith("f")
         else:
@@ -115,8 +115,8 @@ def test_any_program_text_is_read_or_refused(text):
                 min_size=1, max_size=5))  # fmt: skip
 def test_programs_hold_what_was_written(poses):
     q = np.array(poses)
-    for text, read in ((krl(q), krl_rows), (rapid(q), rapid_rows)):
-        found = read(ForeignText("f", "ASCII", text.split("\n")))
+    for text, kind in ((krl(q), "krl"), (rapid(q), "rapid")):
+        found = program_rows(ForeignText("f", "ASCII", text.split("\n")), kind)
         values = [[float(cell) for cell in cells[1:7]] for _, cells in found.rows]
         np.testing.assert_array_equal(values, q)
 
@@ -125,10 +125,10 @@ def test_programs_hold_what_was_written(poses):
 @given(st.datetimes(min_value=datetime(1990, 1, 1)))
 def test_times_are_seconds(moment):
     whole = moment.replace(microsecond=0)
-    clock = Clock(("%d.%m.%Y %H:%M:%S",))
+    form = "%d.%m.%Y %H:%M:%S"
     later = whole.replace(second=(whole.second + 30) % 60)
-    apart = clock.seconds(later.strftime("%d.%m.%Y %H:%M:%S")) - clock.seconds(
-        whole.strftime("%d.%m.%Y %H:%M:%S")
-    )
-    assert apart == later.second - whole.second
-    assert Clock(()).seconds(whole.isoformat()) == Clock(()).seconds(whole.isoformat() + "Z")
+    texts = [whole.strftime(form), later.strftime(form)]
+    before, after = seconds_of("f", [1, 2], texts, [form])
+    assert after - before == later.second - whole.second
+    without, utc = seconds_of("f", [1, 2], [whole.isoformat(), whole.isoformat() + "Z"], [])
+    assert without == utc

@@ -5,7 +5,7 @@ import pytest
 from support.tracker_exports import imported
 
 from elastocal.errors import InputError
-from elastocal.importing.foreign_text import ForeignText, krl_rows, rapid_rows, read_lines
+from elastocal.importing.foreign_text import ForeignText, program_rows, read_lines
 from elastocal.units import convert, split_unit
 
 ROWS = [(10.0, 20.5, -30.25, 1234.5, 0.125, -7.0), (11.0, 21.5, -31.25, -2234.5, 1.125, -8.0)]
@@ -77,15 +77,14 @@ def test_rows_without_a_value_are_left_out_by_name(tmp_path):
     assert found.understood[0].ignored == ((4, "no value in column Achse 2"),)
 
 
-def lines(text):
-    return ForeignText("f", "ASCII", text.split("\n"))
+def program(text, kind):
+    return program_rows(ForeignText("f", "ASCII", text.split("\n")), kind)
 
 
 def test_krl_over_several_lines_in_logs_and_arrays():
-    found = krl_rows(
-        lines("$AXIS_ACT={E6AXIS: A1 1.5, A2 -2E1,\n A3 3, A4 4, A5 5, A6 6}\n"
-              "DECL AXIS P[2]={A1 7,A2 8,A3 9,A4 1,A5 2,A6 3} ; {A1 9}\nPOS Q={X 1,Y 2,Z 3}")
-    )  # fmt: skip
+    found = program("$AXIS_ACT={E6AXIS: A1 1.5, A2 -2E1,\n A3 3, A4 4, A5 5, A6 6}\n"
+              "DECL AXIS P[2]={A1 7,A2 8,A3 9,A4 1,A5 2,A6 3} ; {A1 9}\nPOS Q={X 1,Y 2,Z 3}",
+              "krl")  # fmt: skip
     assert found.header == ("name", "A1", "A2", "A3", "A4", "A5", "A6")
     assert [cells[:4] for _, cells in found.rows] == [
         ["$AXIS_ACT", "1.5", "-2E1", "3"], ["P[2]", "7", "8", "9"]
@@ -95,21 +94,20 @@ def test_krl_over_several_lines_in_logs_and_arrays():
 
 
 def test_rapid_arrays_robtargets_and_original_positions():
-    found = rapid_rows(
-        lines("PERS jointtarget j{2}:=[[[1,2,3,4,5,6],[1.5,9E9,9E9,9E9,9E9,9E9]],\n"
+    found = program("PERS jointtarget j{2}:=[[[1,2,3,4,5,6],[1.5,9E9,9E9,9E9,9E9,9E9]],\n"
               "[[7,8,9,1,2,3],[2.5,9E9,9E9,9E9,9E9,9E9]]];\n"
               "CONST robtarget r:=[[1,2,3],[1,0,0,0],[0,0,0,0],[9E9,9E9,9E9,9E9,9E9,9E9]];\n"
-              "CONST o_jointtarget o_j:=[[0,0,0,0,0,0],[0,9E9,9E9,9E9,9E9,9E9]];")
-    )  # fmt: skip
+              "CONST o_jointtarget o_j:=[[0,0,0,0,0,0],[0,9E9,9E9,9E9,9E9,9E9]];",
+              "rapid")  # fmt: skip
     assert [cells[0] for _, cells in found.rows] == ["j{1}", "j{2}"]
     assert found.header == ("name", *(f"rax_{i}" for i in range(1, 7)), "eax_a")
     assert [line for line, _ in found.ignored] == [3, 4]
 
 
-@pytest.mark.parametrize("read", [krl_rows, rapid_rows])
-def test_programs_without_joint_values(read):
+@pytest.mark.parametrize("kind", ["krl", "rapid"])
+def test_programs_without_joint_values(kind):
     with pytest.raises(InputError, match=r"^f: no "):
-        read(lines("MODULE x\nENDMODULE"))
+        program("MODULE x\nENDMODULE", kind)
 
 
 @pytest.mark.parametrize(
@@ -169,4 +167,4 @@ def test_thousands_separators_that_nobody_told_of_are_refused(tmp_path):
 
 def test_krl_expressions_are_no_values():
     with pytest.raises(InputError, match=r"f, line 1: A2 is 'B-1', not a number"):
-        krl_rows(lines("XP1={A1 1,A2 B-1,A3 2}"))
+        program("XP1={A1 1,A2 B-1,A3 2}", "krl")

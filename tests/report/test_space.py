@@ -17,12 +17,10 @@ from elastocal.cell.arm_description import Robot
 from elastocal.cell.workspace_rules import Solid, Workspace
 from elastocal.model.choice import load_chain
 from elastocal.report.arm_view import (
-    base_or_joint,
     frames_at,
     in_script,
     residual_space,
     shells_of,
-    space_json,
     triangles_of,
 )
 
@@ -95,7 +93,7 @@ def test_arrows_are_mean_residuals_by_configuration_load_and_marker(case: Any) -
     assert pose.flange == pytest.approx(result.model.flange_poses(table.take(row), result.x)[0])
     sizes = [np.sqrt((p.arrows**2).sum(axis=1).mean()) for p in space.poses]
     assert space.first == int(np.argmax(sizes))
-    content = json.loads(space_json(space))
+    content = json.loads(space.json)
     assert len(content["poses"]) == len(space.poses)
     assert content["scale"] == space.scale
 
@@ -106,7 +104,7 @@ def test_a_urdf_with_collision_meshes_at_hand_is_drawn_from_them() -> None:
     chain = load_chain(cell)
     shells = shells_of(cell, chain)
     assert "URDF" in shells.drawn_from
-    assert {base_or_joint(shell) for shell in shells.arm} == set(range(chain.n_joints + 1))
+    assert {shell.carrier for shell in shells.arm} == set(range(chain.n_joints + 1))
     # Radii that the cell states come first.
     stated = replace(cell, workspace=Workspace(link_radius=(0.05,)))
     assert "capsules" in shells_of(stated, chain).drawn_from

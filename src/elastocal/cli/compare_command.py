@@ -15,28 +15,15 @@ from elastocal.screen import complain
 
 @command(short_help="What has changed since the last calibration?")
 def compare(
-    cell: Annotated[Path, typer.Argument(help="Cell file (TOML) of both.")],
-    old: Annotated[Path, typer.Argument(help="Result of identify (JSON), the earlier one.")],
-    new: Annotated[
-        Path | None, typer.Argument(help="Result of identify (JSON), the later one.")
-    ] = None,
-    cell_of_old: Annotated[
-        Path | None,
-        typer.Option("--cell", hidden=True, help="Cell file of both, in the old order OLD NEW."),
-    ] = None,
+    cell: Path,
+    old: Path,
+    new: Annotated[Path | None, typer.Argument()] = None,
+    cell_of_old: Annotated[Path | None, typer.Option("--cell", hidden=True)] = None,
     output: JsonFile = None,
     report: ReportFile = None,
-    load: Annotated[
-        FORCE | None,
-        typer.Option(
-            metavar="X Y Z",
-            help="Force in N at the load point (tracker's axes); default: the measured loads.",
-        ),
-    ] = None,
-    level: Annotated[
-        float, typer.Option(help="Probability of any finding if nothing has changed.")
-    ] = 0.05,
-    poses: Annotated[int, typer.Option(min=2, max=100_000, help="Random poses.")] = 300,
+    load: FORCE | None = None,
+    level: float = 0.05,
+    poses: Annotated[int, typer.Option(min=2, max=100_000)] = 300,
     seed: Seed = 0,
     *,
     run: Run,
@@ -44,6 +31,15 @@ def compare(
     """What has changed between two calibrations: by parameter, and how far the tool moved.
 
     Example: elastocal compare cell.toml january.json june.json --report changes.html
+
+    Args:
+        cell: Cell file (TOML) of both.
+        old: Result of identify (JSON), the earlier one.
+        new: Result of identify (JSON), the later one.
+        cell_of_old: Cell file of both, in the old order OLD NEW.
+        load: Force in N at the load point (tracker's axes); default: the measured loads.
+        level: Probability of any finding if nothing has changed.
+        poses: Random poses.
     """
     from elastocal.diagnosis.changes import compare as compared
     from elastocal.files import together

@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING, Annotated, Any
 import typer
 
 from elastocal import verbs
-from elastocal.cli.signatures import Asked, CellFile, ResultFile, Run, command
+from elastocal.cli.signatures import AnyOutput, Asked, CellFile, ResultFile, Run, command
 from elastocal.errors import InputError, require
 from elastocal.screen import say
 
@@ -23,45 +23,15 @@ if TYPE_CHECKING:
 def compensate(
     cell: CellFile,
     result: ResultFile,
-    targets: Annotated[
-        Path | None,
-        typer.Argument(help="Targets (CSV): x_mm, y_mm, z_mm, rx_deg, …, or q1_deg, …"),
-    ] = None,
-    output: Annotated[
-        Path | None, typer.Option("-o", "--output", help="Commands to write (CSV).")
-    ] = None,
-    target: Annotated[
-        str | None,
-        typer.Option(metavar="X,Y,Z[,RX,RY,RZ]", help="One target instead, in mm and degrees."),
-    ] = None,
-    near: Annotated[
-        str | None,
-        typer.Option(
-            metavar="Q1,Q2,…",
-            help="Joints in degrees (mm where prismatic) of a posture to start near.",
-        ),
-    ] = None,
-    partial: Annotated[
-        bool, typer.Option("--partial", help="Write the rows reached; leave others empty.")
-    ] = False,
-    table: Annotated[
-        Path | None, typer.Option(help="Correction table to write (CSV), over --grid.")
-    ] = None,
-    grid: Annotated[
-        str,
-        typer.Option(metavar="N[,N…]", help="Levels per joint (or of x, y, z): 5 or 9,7,7,3,3,1."),
-    ] = "5",
-    box: Annotated[
-        str | None,
-        typer.Option(
-            metavar="X0,Y0,Z0,X1,Y1,Z1",
-            help="Grid over this box in mm in the base frame, not over the joints.",
-        ),
-    ] = None,
-    rotation: Annotated[
-        str | None,
-        typer.Option(metavar="RX,RY,RZ", help="Rotation vector of the tool in --box, in degrees."),
-    ] = None,
+    targets: Annotated[Path | None, typer.Argument()] = None,
+    output: AnyOutput = None,
+    target: str | None = None,
+    near: str | None = None,
+    partial: bool = False,
+    table: Path | None = None,
+    grid: str = "5",
+    box: str | None = None,
+    rotation: str | None = None,
     *,
     asked: Asked,
     run: Run,
@@ -72,6 +42,17 @@ def compensate(
     controller adds to nominal targets.
 
     Example: elastocal compensate cell.toml result.json targets.csv -o commands.csv
+
+    Args:
+        targets: Targets (CSV): x_mm, y_mm, z_mm, rx_deg, …, or q1_deg, …
+        output: Commands to write (CSV).
+        target (X,Y,Z[,RX,RY,RZ]): One target instead, in mm and degrees.
+        near (Q1,Q2,…): Joints in degrees (mm where prismatic) of a posture to start near.
+        partial: Write the rows reached; leave others empty.
+        table: Correction table to write (CSV), over --grid.
+        grid (N[,N…]): Levels per joint (or of x, y, z): 5 or 9,7,7,3,3,1.
+        box (X0,Y0,Z0,X1,Y1,Z1): Grid over this box in mm in the base frame, not over the joints.
+        rotation (RX,RY,RZ): Rotation vector of the tool in --box, in degrees.
     """
     from elastocal.compensation.targets import one_target
     from elastocal.files import atomic_write_text, together

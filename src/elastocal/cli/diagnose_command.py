@@ -27,17 +27,9 @@ def diagnose(
     data: DataFile,
     output: JsonFile = None,
     report: ReportFile = None,
-    plan: Annotated[
-        Path | None,
-        typer.Option(help="Write extra poses (CSV) that separate the remaining hypotheses."),
-    ] = None,
-    poses: Annotated[
-        int | None,
-        typer.Option(min=1, help=f"Most extra poses of --plan.  [default: {MOST_POSES}]"),
-    ] = None,
-    cell_out: Annotated[
-        Path | None, typer.Option(help="Write the cell (TOML) with the effects found added.")
-    ] = None,
+    plan: Path | None = None,
+    poses: Annotated[int | None, typer.Option(min=1)] = None,
+    cell_out: Path | None = None,
     *,
     asked: Asked,
     run: Run,
@@ -48,6 +40,11 @@ def diagnose(
     error at new poses falls once it is added.
 
     Example: elastocal diagnose cell.toml data.csv -o diagnosis.json --report diagnosis.html
+
+    Args:
+        plan: Write extra poses (CSV) that separate the remaining hypotheses.
+        poses: Most extra poses of --plan; default: 10.
+        cell_out: Write the cell (TOML) with the effects found added.
     """
     from elastocal.diagnosis.diagnosis import publish
     from elastocal.files import together

@@ -3,20 +3,19 @@
 from __future__ import annotations
 
 import math
+from collections.abc import Iterator
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
 
 import typer
 
-from elastocal.cli.signatures import FORCE, CellFile, ResultFile, Run, Seed, command
+from elastocal.cli.signatures import FORCE, CellFile, Output, ResultFile, Run, Seed, command
 
 if TYPE_CHECKING:
-    from rich.console import Console
-    from rich.table import Table
-
     from elastocal.export.export import Exported
     from elastocal.export.exportable import Cost
     from elastocal.export.refit import Refit
+    from elastocal.report.blocks import Block
 
 
 WORTH_TELLING = 10e-6  # m, as for what compensate leaves open
@@ -26,49 +25,15 @@ WORTH_TELLING = 10e-6  # m, as for what compensate leaves open
 def export(
     cell: CellFile,
     result: ResultFile,
-    output: Annotated[
-        Path,
-        typer.Option(
-            "-o", "--output", help="File to write: .urdf, .xml or .mjcf, .csv (DH), .yaml, .json."
-        ),
-    ],
-    format: Annotated[
-        str | None,
-        typer.Option(
-            help="urdf, mjcf, dh, mdh (modified DH), yaml, json, or corrections (smooth functions "
-            "as CSV); default: by the ending."
-        ),
-    ] = None,
-    load: Annotated[
-        FORCE | None,
-        typer.Option(
-            metavar="X Y Z",
-            help="Force in N at the load point (tracker's axes) for costs and fit.",
-        ),
-    ] = None,
-    frames: Annotated[
-        bool,
-        typer.Option("--frames/--no-frames", help="URDF: links for markers and load point."),
-    ] = True,
-    base_frame: Annotated[
-        bool,
-        typer.Option("--base-frame", help="Put the tracker's frame above the robot's base."),
-    ] = False,
-    joint_correction: Annotated[
-        Path | None,
-        typer.Option(
-            help="Write the joint correction for simulators (CSV); the file is fitted with it."
-        ),
-    ] = None,
-    temperature_c: Annotated[
-        float | None, typer.Option("--temperature-c", help="Temperature in °C to export at.")
-    ] = None,
-    time_s: Annotated[
-        float | None, typer.Option("--time-s", help="Time in s, as in the data, to export at.")
-    ] = None,
-    poses: Annotated[
-        int, typer.Option(min=2, max=1_000_000, help="Random poses to find costs at.")
-    ] = 500,
+    output: Output,
+    format: str | None = None,
+    load: FORCE | None = None,
+    frames: Annotated[bool, typer.Option("--frames/--no-frames")] = True,
+    base_frame: bool = False,
+    joint_correction: Path | None = None,
+    temperature_c: float | None = None,
+    time_s: float | None = None,
+    poses: Annotated[int, typer.Option(min=2, max=1_000_000)] = 500,
     seed: Seed = 0,
     *,
     run: Run,
@@ -76,10 +41,24 @@ def export(
     """Write the calibrated arm as URDF, MJCF, DH table or parameters, and state the loss.
 
     Example: elastocal export cell.toml result.json -o calibrated.urdf --load 0 0 -2600
+
+    Args:
+        output: File to write: .urdf, .xml or .mjcf, .csv (DH), .yaml, .json.
+        format: urdf, mjcf, dh, mdh (modified DH), yaml, json, or corrections (smooth functions
+            as CSV); default: by the ending.
+        load: Force in N at the load point (tracker's axes) for costs and fit.
+        frames: URDF: links for markers and load point.
+        base_frame: Put the tracker's frame above the robot's base.
+        joint_correction: Write the joint correction for simulators (CSV); the file is fitted
+            with it.
+        temperature_c: Temperature in °C to export at.
+        time_s: Time in s, as in the data, to export at.
+        poses: Random poses to find costs at.
     """
     from elastocal.export.export import export as exported
     from elastocal.export.export import write
     from elastocal.model.calibrated import read_calibrated
+    from elastocal.report.terminal import print_blocks
     from elastocal.saving import wish_of
 
     run.writes(output, joint_correction)
@@ -93,56 +72,57 @@ def export(
         run.reads(cell, result, cell=calibrated.model.cell)
         done = exported(calibrated, wish, progress)
     write(done, output, joint_correction)
-    run.answer(lambda: {"output": str(output)} | done.to_json(), lambda screen: _tell(screen, done))
+    run.answer(
+        lambda: {"output": str(output)} | done.to_json(),
+        lambda screen: print_blocks(screen, _tell(done)),
+    )
 
 
-def _tell(screen: Console, done: Exported) -> None:
+def _tell(done: Exported) -> Iterator[Block]:
     """What the file holds and what not, for people."""
-    from elastocal.text import printable
+    from elastocal.report.blocks import Sentence, ShownTable
+    from elastocal.report.formatting import length
+
+    def rounding(metres: float) -> str:  # what is below a nanometre is no number to read
+        return "< 0.001 µm" if metres < 1e-9 else length(metres)
 
     cost, (name, in_title) = done.cost, NAMES[done.format]
     if cost.effects:
-        screen.print(_cost_table(f"What {in_title} cannot hold", cost))
-    held = list(done.held)
-    more = f" and {len(held) - 8} more" if len(held) > 8 else ""
-    for wanted, sentence in (
-        (not cost.effects, f"{name} holds all of the calibrated model."),
-        (
-            cost.effects,
+        every = [(e.effect.replace("_", " "), e.difference, e.note) for e in cost.effects]
+        rows = []
+        for effect, d, note in [*every, ("all of it", cost.total, "")]:
+            sizes = () if d is None else (d.marker_rms, d.marker_max, d.flange_rms, d.flange_max)
+            rows.append((effect, *([length(size) for size in sizes] or [""] * 4), note))
+        heads = ("effect", "markers rms", "max", "flange rms", "max", "")
+        yield ShownTable(heads, rows, (0, 5), title=f"What {in_title} cannot hold")
+        yield Sentence(
             f"Costs: differences from the calibrated model at {cost.poses} random poses within the "
             f"joint {'ranges measured' if cost.measured else 'limits'} under "
-            f"{_loads(cost)}, each effect left out alone.",
-        ),
-        (
-            done.refit is not None,
-            _fit(done.refit),
-        ),
-        (
-            done.checked is not None,
-            f"Read back with {done.checked_with}: {_rounding(done.checked)} at most.",
-        ),
-        (
-            done.without_beta is not None,
-            f"Without the column beta_rad: {_rounding(done.without_beta)} at most.",
-        ),
-        (
-            held,
+            f"{_loads(cost)}, each effect left out alone."
+        )
+    else:
+        yield Sentence(f"{name} holds all of the calibrated model.")
+    if done.refit is not None:
+        yield Sentence(_fit(done.refit))
+    if done.checked is not None:
+        yield Sentence(f"Read back with {done.checked_with}: {rounding(done.checked)} at most.")
+    if done.without_beta is not None:
+        yield Sentence(f"Without the column beta_rad: {rounding(done.without_beta)} at most.")
+    if held := list(done.held):
+        more = f" and {len(held) - 8} more" if len(held) > 8 else ""
+        yield Sentence(
             "Not determined by the data, at the values that the identification predicts with: "
-            f"{', '.join(held[:8])}{more}.",
-        ),
-        (
-            done.of_the_measurement,
-            f"Left out, effects of the measurement: {', '.join(done.of_the_measurement)}.",
-        ),
-        *((True, f"Note: {warning}.") for warning in done.warnings),
-        (
-            cost.total is not None and cost.total.marker_rms > WORTH_TELLING,
-            "Next: if that matters, elastocal compensate corrects it with the same cell "
-            "and result.",
-        ),
-    ):
-        if wanted:
-            screen.print(printable(sentence), markup=False)
+            f"{', '.join(held[:8])}{more}."
+        )
+    if done.of_the_measurement:
+        left = ", ".join(done.of_the_measurement)
+        yield Sentence(f"Left out, effects of the measurement: {left}.")
+    for warning in done.warnings:
+        yield Sentence(f"Note: {warning}.")
+    if cost.total.marker_rms > WORTH_TELLING:
+        yield Sentence(
+            "Next: if that matters, elastocal compensate corrects it with the same cell and result."
+        )
 
 
 def _loads(cost: Cost) -> str:
@@ -152,12 +132,10 @@ def _loads(cost: Cost) -> str:
     return f"the {len(sizes)} loads measured, {min(sizes):.4g} to {max(sizes):.4g} N"
 
 
-def _fit(refit: Refit | None) -> str:
+def _fit(refit: Refit) -> str:
     """How far the file is from the arm."""
     from elastocal.report.formatting import length
 
-    if refit is None:
-        return ""
     told = f"the markers are {length(refit.after)} rms off"
     if refit.correction is not None:
         told = f"{told}, with its joint correction {length(refit.correction)}"
@@ -172,36 +150,10 @@ def _fit(refit: Refit | None) -> str:
     return f"{told}, the nominal file with base and tool placed {length(refit.nominal)}{worse}."
 
 
-def _rounding(metres: float | None) -> str:
-    """A length; what is below a nanometre is rounding and no number to read."""
-    from elastocal.report.formatting import length
-
-    return "< 0.001 µm" if not metres or metres < 1e-9 else length(metres)
-
-
-def _cost_table(title: str, cost: Cost) -> Table:
-    from elastocal.report import blocks
-    from elastocal.report.formatting import length
-    from elastocal.report.terminal import table_of
-    from elastocal.text import printable
-
-    rows = []
-    every = [(e.effect.replace("_", " "), e.difference, e.note) for e in cost.effects]
-    for name, d, note in [*every, ("all of it", cost.total, "")]:
-        sizes = () if d is None else (d.marker_rms, d.marker_max, d.flange_rms, d.flange_max)
-        cells = [length(size) for size in sizes] or [""] * 4
-        rows.append((printable(name), *cells, printable(note)))
-    heads = ("effect", "markers rms", "max", "flange rms", "max", "")
-    return table_of(blocks.ShownTable(heads, rows, (0, 5), title=title))
-
-
 # At the start of a sentence and in a title.
 NAMES = {
     "urdf": ("The URDF", "a URDF"),
     "mjcf": ("The MJCF", "this MJCF"),
-    "dh": ("The DH table", "a DH table"),
-    "mdh": ("The DH table", "a DH table"),
-    "yaml": ("Geometry alone", "geometry alone"),
-    "json": ("Geometry alone", "geometry alone"),
-    "corrections": ("Geometry alone", "geometry alone"),
+    **dict.fromkeys(("dh", "mdh"), ("The DH table", "a DH table")),
+    **dict.fromkeys(("yaml", "json", "corrections"), ("Geometry alone", "geometry alone")),
 }

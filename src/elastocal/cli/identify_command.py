@@ -4,9 +4,7 @@ from __future__ import annotations
 
 import math
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated
-
-import typer
+from typing import TYPE_CHECKING
 
 from elastocal import verbs
 from elastocal.cli.app import repeated
@@ -29,31 +27,24 @@ def identify(
     data: DataFile,
     output: JsonFile = None,
     report: ReportFile = None,
-    certificate: Annotated[
-        Path | None, typer.Option(help="Write a calibration certificate (.html, or .xml: a DCC).")
-    ] = None,
-    residuals: Annotated[
-        Path | None, typer.Option(help="Write residuals of every reading as CSV.")
-    ] = None,
-    require: Annotated[
-        list[str] | None,
-        typer.Option(
-            metavar="NAME=UM",
-            help="Largest error in µm that is accepted: heldout=, new_poses=, test=; repeatable, "
-            "else as [require] of the cell says. Exit code 3 where one is exceeded.",
-        ),
-    ] = None,
+    certificate: Path | None = None,
+    residuals: Path | None = None,
+    require: list[str] | None = None,
     *,
     asked: Asked,
-    details: Annotated[
-        bool,
-        typer.Option("--details", help="Also method, noise, residuals, intervals, all lists."),
-    ] = False,
+    details: bool = False,
     run: Run,
 ) -> None:
     """What are the parameters of my arm, and how certain are they?
 
     Example: elastocal identify cell.toml data.csv -o result.json --test other.csv
+
+    Args:
+        certificate: Write a calibration certificate (.html, or .xml: a DCC).
+        residuals: Write residuals of every reading as CSV.
+        require (NAME=UM): Largest error in µm that is accepted: heldout=, new_poses=, test=;
+            repeatable, else as [require] of the cell says. Exit code 3 where one is exceeded.
+        details: Also method, noise, residuals, intervals, all lists.
     """
     from elastocal.model.choice import cell_of
     from elastocal.report.terminal import print_report

@@ -8,7 +8,7 @@ from typing import Annotated
 import typer
 
 from elastocal.cli.app import console
-from elastocal.cli.signatures import Run, command
+from elastocal.cli.signatures import AnyOutput, Run, command
 from elastocal.errors import InputError, require
 from elastocal.screen import say
 from elastocal.text import json_text
@@ -22,37 +22,15 @@ PRESET_NAMES = "spatialanalyzer, polyworks, leica, faro, spherical, wide, kuka, 
     flags="json",
 )
 def import_(
-    files: Annotated[
-        list[Path] | None,
-        typer.Argument(help="Exports of the tracker and logs of the joints, in any order."),
-    ] = None,
-    output: Annotated[
-        Path | None, typer.Option("-o", "--output", help="Measurements to write (CSV).")
-    ] = None,
-    mapping: Annotated[
-        Path | None, typer.Option("--map", help="Mapping file (TOML): what the columns mean.")
-    ] = None,
-    preset: Annotated[
-        list[str] | None,
-        typer.Option(metavar="NAME", help=f"One for all files, or one per file: {PRESET_NAMES}."),
-    ] = None,
-    show_preset: Annotated[
-        str | None,
-        typer.Option(metavar="NAME", help="Print a preset to copy from, and stop."),
-    ] = None,
-    preview: Annotated[
-        bool, typer.Option("--preview", help="Show what was understood; needs no --output.")
-    ] = False,
-    cell: Annotated[
-        Path | None,
-        typer.Option(help="Cell file: check joints, limits, markers and the fit to its robot."),
-    ] = None,
-    length_unit: Annotated[
-        str | None, typer.Option(help="Unit of lengths where a file does not say: mm, m, um, in.")
-    ] = None,
-    angle_unit: Annotated[
-        str | None, typer.Option(help="Unit of angles where a file does not say: deg, rad, gon.")
-    ] = None,
+    files: Annotated[list[Path] | None, typer.Argument()] = None,
+    output: AnyOutput = None,
+    mapping: Annotated[Path | None, typer.Option("--map")] = None,
+    preset: list[str] | None = None,
+    show_preset: str | None = None,
+    preview: bool = False,
+    cell: Path | None = None,
+    length_unit: str | None = None,
+    angle_unit: str | None = None,
     *,
     run: Run,
 ) -> None:
@@ -60,6 +38,18 @@ def import_(
 
     Example: elastocal import points.txt poses.dat --preset spatialanalyzer --preset kuka
     --cell cell.toml --preview -o data.csv
+
+    Args:
+        files: Exports of the tracker and logs of the joints, in any order.
+        output: Measurements to write (CSV).
+        mapping: Mapping file (TOML): what the columns mean.
+        preset (NAME): One for all files, or one per file: spatialanalyzer, polyworks, leica,
+            faro, spherical, wide, kuka, abb, ros.
+        show_preset (NAME): Print a preset to copy from, and stop.
+        preview: Show what was understood; needs no --output.
+        cell: Cell file: check joints, limits, markers and the fit to its robot.
+        length_unit: Unit of lengths where a file does not say: mm, m, um, in.
+        angle_unit: Unit of angles where a file does not say: deg, rad, gon.
     """
     from elastocal.cell.work_cell import read_cell
     from elastocal.cli.import_preview import left_out, print_preview, summary

@@ -8,14 +8,13 @@ from typing import Any
 
 import numpy as np
 from rich.console import Console
-from rich.table import Table
 from rich.text import Text
 
 from elastocal.importing.assemble import Imported
 from elastocal.importing.records import Understood
-from elastocal.report import blocks
+from elastocal.report.blocks import WARNING, Lines, ShownTable
 from elastocal.report.formatting import counted
-from elastocal.report.terminal import table_of
+from elastocal.report.terminal import print_blocks
 from elastocal.text import listed, printable
 
 
@@ -68,7 +67,7 @@ def summary(found: Imported, output: Path | None) -> dict[str, Any]:
     }  # fmt: skip
 
 
-# What an import understood, as tables for the terminal.
+# What an import understood, as blocks for the terminal.
 
 FIRST_ROWS = 5
 MOST_COLUMNS = 14  # of the first rows, on a wide terminal
@@ -78,24 +77,33 @@ def print_preview(console: Console, found: Imported) -> None:
     """Files and their columns, the first rows, ranges, counts, what was left out, warnings."""
     for observed in found.understood:
         console.print(Text(_heading(observed), style="bold"))
-        console.print(_columns_of(observed))
-        if observed.unused:
-            _line(console, "Not used", listed(observed.unused, 20))
+        rows = [(name, column, unit or "–") for name, column, unit in observed.columns]
+        unused = [("Not used", listed(observed.unused, 20))] if observed.unused else []
+        heads = ("in the file", "read as", "unit")
+        print_blocks(console, [ShownTable(heads, rows, (0, 1, 2)), Lines(unused)])
         console.print()
-    console.print(_first_rows(found, console.width))
-    console.print(_ranges(found))
-    console.print()
-    for label, text in _counts(found):
-        _line(console, label, text)
-    for text in left_out(found):
-        _line(console, "Left out", text)
-    for text in found.warnings:
-        _line(console, "Warning", text)
-
-
-def _line(console: Console, label: str, text: str) -> None:
-    style = "bold yellow" if label == "Warning" else "bold"
-    console.print(Text.assemble((f"{label}: ", style), printable(text)))
+    columns = found.assembled.columns
+    most = max(4, min(MOST_COLUMNS, console.width // 10))
+    shown = [name for name in columns if name != "note_source"][:most]
+    rest = len(columns) - len(shown)
+    words = tuple(k for k, n in enumerate(shown) if not isinstance(columns[n], np.ndarray))
+    first = range(min(FIRST_ROWS, len(found.assembled)))
+    ranges = [
+        (name, f"{values.min():.6g}", f"{values.max():.6g}")
+        for name, values in columns.items()
+        if isinstance(values, np.ndarray) and name != "repeat"
+    ]
+    title = "The first rows of the table" + (f", {rest} more columns" if rest else "")
+    print_blocks(console, [
+        ShownTable(tuple(shown), [tuple(_cell(columns[n], i) for n in shown) for i in first],
+                   words, title=title),
+        ShownTable(("column", "least", "largest"), ranges, title="Ranges"),
+        Lines([
+            *_counts(found),
+            *(("Left out", text) for text in left_out(found)),
+            *((WARNING, text) for text in found.warnings),
+        ]),
+    ])  # fmt: skip
 
 
 def _heading(observed: Understood) -> str:
@@ -104,33 +112,8 @@ def _heading(observed: Understood) -> str:
     decimals = ", decimal commas" if observed.decimal == "," else ""
     return printable(
         f"{observed.path}: {counted(observed.rows, 'row')} of {kind[observed.role]} "
-        f"({preset}{observed.encoding}, "
-        f"{observed.layout}{decimals})"
+        f"({preset}{observed.encoding}, {observed.layout}{decimals})"
     )
-
-
-def _columns_of(observed: Understood) -> Table:
-    rows = [
-        (printable(name), printable(column), printable(unit or "–"))
-        for name, column, unit in observed.columns
-    ]
-    return table_of(blocks.ShownTable(("in the file", "read as", "unit"), rows, (0, 1, 2)))
-
-
-def _first_rows(found: Imported, width: int) -> Table:
-    columns = found.assembled.columns
-    shown = [name for name in columns if name != "note_source"][
-        : max(4, min(MOST_COLUMNS, width // 10))
-    ]
-    rest = len(columns) - len(shown)
-    more = f", {rest} more columns" if rest else ""
-    words = [k for k, name in enumerate(shown) if not isinstance(columns[name], np.ndarray)]
-    rows = [
-        tuple(_cell(columns[name], i) for name in shown)
-        for i in range(min(FIRST_ROWS, len(found.assembled)))
-    ]
-    title = f"The first rows of the table{more}"
-    return table_of(blocks.ShownTable(tuple(shown), rows, tuple(words), title=title))
 
 
 def _cell(values: Sequence[str] | np.ndarray, i: int) -> str:
@@ -139,36 +122,23 @@ def _cell(values: Sequence[str] | np.ndarray, i: int) -> str:
     return f"{values[i]:d}" if values.dtype.kind == "i" else f"{values[i]:.6g}"
 
 
-def _ranges(found: Imported) -> Table:
-    rows = [
-        (name, f"{values.min():.6g}", f"{values.max():.6g}")
-        for name, values in found.assembled.columns.items()
-        if isinstance(values, np.ndarray) and name != "repeat"
-    ]
-    return table_of(blocks.ShownTable(("column", "least", "largest"), rows, title="Ranges"))
-
-
 def _counts(found: Imported) -> list[tuple[str, str]]:
     table, joined = found.table, found.joined
     forces, sizes = np.unique(table.force, axis=0, return_counts=True)
-    loads = "; ".join(
-        f"{'unloaded' if not f.any() else '(' + ', '.join(f'{v:g}' for v in f) + ') N'}: "
-        f"{counted(int(n), 'reading')}"
-        for f, n in zip(forces[:8], sizes, strict=False)
-    )
-    repeats = np.unique(
-        np.column_stack([table.configuration, table.marker, table.force]), axis=0,
-        return_counts=True,
-    )[1]  # fmt: skip
-    span = f"{repeats.min()}" if repeats.min() == repeats.max() else (
-        f"{repeats.min()} to {repeats.max()}"
-    )  # fmt: skip
+    names = [
+        "(" + ", ".join(f"{v:g}" for v in f) + ") N" if f.any() else "unloaded" for f in forces
+    ]
+    loads = [f"{name}: {counted(int(n), 'reading')}" for name, n in zip(names, sizes, strict=True)]
+    more = [f"{len(loads) - 8} more"] if len(loads) > 8 else []
+    alike = np.column_stack([table.configuration, table.marker, table.force])
+    repeats = np.unique(alike, axis=0, return_counts=True)[1]
+    span = " to ".join(dict.fromkeys((str(repeats.min()), str(repeats.max()))))
     lines = [
         ("Table", f"{counted(len(table), 'reading')} of "
          f"{counted(len(table.configuration_labels), 'configuration')}, {span} per configuration, "
          "marker and load"),
         ("Markers", listed(table.marker_names, 20)),
-        ("Loads", loads + (f"; {len(forces) - 8} more" if len(forces) > 8 else "")),
+        ("Loads", "; ".join(loads[:8] + more)),
     ]  # fmt: skip
     if joined is not None:
         remarks = [r for r in joined.remarks if not r.startswith("WARNING: ")]

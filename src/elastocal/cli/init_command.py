@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
-from elastocal.cli.signatures import Run, command
+from elastocal.cli.signatures import Output, Run, command
 from elastocal.screen import say
 
 if TYPE_CHECKING:
@@ -16,33 +16,29 @@ if TYPE_CHECKING:
 
 @command(short_help="Write a working cell file for my arm", flags="")
 def init(
-    robot: Annotated[
-        Path,
-        typer.Argument(
-            help="URDF (.urdf), MuJoCo model (.xml, .mjcf), DH table (.csv) or factory calibration "
-            "of a UR (.conf, .yaml)."
-        ),
-    ],
-    output: Annotated[
-        Path, typer.Option("-o", "--output", help="Cell file to write (TOML).")
-    ] = Path("cell.toml"),
-    base: Annotated[str | None, typer.Option(help="First link or body; default: the root.")] = None,
-    flange: Annotated[
-        str | None, typer.Option(help="Last link, body or site; default: as found.")
-    ] = None,
-    convention: Annotated[
-        str, typer.Option(help="Of a DH table: standard or modified.")
-    ] = "standard",
-    ur_model: Annotated[
-        str | None, typer.Option(help="Of a calibration.conf: the robot, as UR10e.")
-    ] = None,
-    force: Annotated[bool, typer.Option("--force", help="Write over a file.")] = False,
+    robot: Path,
+    output: Output = Path("cell.toml"),
+    base: str | None = None,
+    flange: str | None = None,
+    convention: str = "standard",
+    ur_model: str | None = None,
+    force: bool = False,
     *,
     run: Run,
 ) -> None:
     """Write a working cell: joints and limits from the robot's file, commented guesses elsewhere.
 
     Example: elastocal init arm.urdf -o cell.toml
+
+    Args:
+        robot: URDF (.urdf), MuJoCo model (.xml, .mjcf), DH table (.csv) or factory calibration
+            of a UR (.conf, .yaml).
+        output: Cell file to write (TOML).
+        base: First link or body; default: the root.
+        flange: Last link, body or site; default: as found.
+        convention: Of a DH table: standard or modified.
+        ur_model: Of a calibration.conf: the robot, as UR10e.
+        force: Write over a file.
     """
     from elastocal.cell.work_cell import read_cell
     from elastocal.importing.first_cell import init as write
@@ -71,15 +67,16 @@ def init(
 
 @command(short_help="List the effects that can be fitted", flags="plugins json")
 def effects(
-    cell: Annotated[
-        Path | None, typer.Argument(help="Cell file (TOML); default: the KR 270 of the demo.")
-    ] = None,
+    cell: Annotated[Path | None, typer.Argument()] = None,
     *,
     run: Run,
 ) -> None:
     """Every effect of the catalogue: its parameters' unit and typical size, what it is, and where.
 
     Example: elastocal effects cell.toml
+
+    Args:
+        cell: Cell file (TOML); default: the KR 270 of the demo.
     """
     from elastocal.demo import example
     from elastocal.model.choice import cell_of

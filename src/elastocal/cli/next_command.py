@@ -3,14 +3,13 @@
 from __future__ import annotations
 
 from functools import partial
-from pathlib import Path
 from typing import Annotated
 
 import typer
 
 from elastocal.cli.app import repeated
 from elastocal.cli.identify_command import limits_of
-from elastocal.cli.signatures import CellFile, DataFile, Run, Seed, command
+from elastocal.cli.signatures import CellFile, DataFile, Output, Run, Seed, command
 from elastocal.screen import say
 
 
@@ -18,27 +17,12 @@ from elastocal.screen import say
 def next_command(
     cell: CellFile,
     data: DataFile,
-    output: Annotated[
-        Path, typer.Option("-o", "--output", help="The poses to write (CSV); .json beside it.")
-    ],
-    batch: Annotated[int, typer.Option(min=1, help="Number of poses.")] = 5,
-    required: Annotated[
-        str | None,
-        typer.Option(
-            "--require",
-            metavar="new_poses=UM",
-            help="Error in µm at new poses that is enough where it is kept with 95 %; default as "
-            "[require] of the cell says.",
-        ),
-    ] = None,
-    least_gain: Annotated[
-        float,
-        typer.Option(min=0, max=99, metavar="%", help="A batch pays that lowers the error so far."),
-    ] = 1.0,
-    candidates: Annotated[
-        int, typer.Option(min=1, help="Feasible candidates to choose from.")
-    ] = 400,
-    jobs: Annotated[int, typer.Option(help="Processes; -1 for all cores.")] = 1,
+    output: Output,
+    batch: Annotated[int, typer.Option(min=1)] = 5,
+    required: Annotated[str | None, typer.Option("--require")] = None,
+    least_gain: Annotated[float, typer.Option(min=0, max=99)] = 1.0,
+    candidates: Annotated[int, typer.Option(min=1)] = 400,
+    jobs: int = 1,
     seed: Seed = 0,
     *,
     run: Run,
@@ -50,6 +34,15 @@ def next_command(
     error is kept, or no batch gains enough.
 
     Example: elastocal next cell.toml data.csv -o next.csv --batch 5 --require new_poses=50
+
+    Args:
+        output: The poses to write (CSV); .json beside it.
+        batch: Number of poses.
+        required (new_poses=UM): Error in µm at new poses that is enough where it is kept with
+            95 %; default as [require] of the cell says.
+        least_gain (%): A batch pays that lowers the error so far.
+        candidates: Feasible candidates to choose from.
+        jobs: Processes; -1 for all cores.
     """
     from elastocal.diagnosis.next_poses import next_poses
     from elastocal.files import together

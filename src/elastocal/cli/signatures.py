@@ -5,7 +5,9 @@
 
 In place of `asked` stand the options that the verb `offers`: name, kind and default are those of
 its argument, the help is the first sentence of what its docstring says of that.  In place of `run`
-stand the flags that all commands have.
+stand the flags that all commands have.  All others are arguments, and where they have a default
+options, of the command itself: the help of each stands under Args in its docstring, in brackets
+what stands for a value, as in "set_ (KEY=VALUE): Option of the study".
 """
 
 from __future__ import annotations
@@ -15,8 +17,9 @@ import inspect
 import re
 from collections.abc import Callable, Iterable, Iterator, Mapping
 from contextlib import AbstractContextManager
+from copy import copy
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Any, TypeAlias
+from typing import TYPE_CHECKING, Annotated, Any, TypeAlias, get_args
 
 import typer
 
@@ -40,6 +43,8 @@ CellFile = Annotated[Path, typer.Argument(help="Cell file (TOML): robot, tool, t
 DataFile = Annotated[Path, typer.Argument(help="Measurements (CSV or Parquet).")]
 ResultFile = Annotated[Path, typer.Argument(help="Result of identify -o (JSON).")]
 ReportFile = Annotated[Path | None, typer.Option(help="Write a report (one HTML page).")]
+Output = Annotated[Path, typer.Option("-o", "--output")]
+AnyOutput = Annotated[Path | None, typer.Option("-o", "--output")]
 JsonFile = Annotated[Path | None, typer.Option("-o", "--output", help="Write the result as JSON.")]
 SEED = typer.Option(min=0, max=LARGEST_SEED, help="Seed of all random draws.")
 Seed = Annotated[int, SEED]
@@ -104,6 +109,7 @@ def command(
     def register(function: Callable[..., None]) -> Callable[..., None]:
         offered = {} if verb is None else dict(_offered(verb, offers.split(), texts or {}))
         own = inspect.signature(function, eval_str=True).parameters
+        told = _told(function)
         parameters: list[inspect.Parameter] = []
         for each in own.values():
             if each.name == "asked":
@@ -111,7 +117,7 @@ def command(
             elif each.name == "run":
                 parameters += [_parameter(n, bool, False, FLAGS[n]) for n in flags.split()]
             else:
-                parameters.append(each.replace(kind=inspect.Parameter.KEYWORD_ONLY))
+                parameters.append(_own(each, *told.get(each.name, ("", None))))
 
         @functools.wraps(function)
         def run(**given: Any) -> None:
@@ -127,6 +133,7 @@ def command(
                 }
             function(**given)
 
+        run.__doc__ = (inspect.getdoc(function) or "").partition("\n\nArgs:\n")[0]
         run.__signature__ = inspect.Signature(parameters)  # type: ignore[attr-defined]
         run.__annotations__ = {each.name: each.annotation for each in parameters}
         return app.command(*name, **how)(reporting_errors(run))
@@ -142,7 +149,8 @@ def _offered(
     for name in names:
         kinds, default = kinds_of(signature[name].annotation), signature[name].default
         taken = next(kind for known, kind in TAKEN.items() if known in kinds)
-        metavar, help = None, told.get(name, "")  # none by python -OO
+        metavar, (help, _) = None, told.get(name, ("", None))  # none by python -OO
+        help = re.split(r"(?<=\.) (?=[A-Z(])", help)[0]
         if name in texts:
             taken, default, metavar = str, None, texts[name][0]
         elif taken == list[str]:
@@ -154,17 +162,34 @@ def _offered(
         yield name, _parameter(name, kind, default, SEED if name == "seed" else option)
 
 
+def _own(each: inspect.Parameter, help: str, metavar: str | None) -> inspect.Parameter:
+    """An argument or option that a command has of itself, with its help."""
+    kind, stated = each.annotation, getattr(each.annotation, "__metadata__", ())
+    if stated:
+        kind, option = get_args(each.annotation)[0], copy(stated[0])
+    elif each.default is inspect.Parameter.empty:
+        option = typer.Argument()
+    else:
+        option = typer.Option(flag_of(each.name.rstrip("_")))
+    option.help, option.metavar = option.help or help, option.metavar or metavar
+    if FORCE in (kind, *get_args(kind)):
+        option.metavar = "X Y Z"
+    return _parameter(each.name, kind, each.default, option)
+
+
 def _parameter(name: str, kind: Any, default: Any, option: Any) -> inspect.Parameter:
     how = inspect.Parameter.KEYWORD_ONLY
     return inspect.Parameter(name, how, default=default, annotation=Annotated[kind, option])
 
 
-def _told(verb: Callable[..., Any]) -> dict[str, str]:
-    """The first sentence on each argument in a docstring, with flags for the names of others."""
+def _told(verb: Callable[..., Any]) -> dict[str, tuple[str, str | None]]:
+    """What a docstring says of each argument, with flags for the names of others, and what stands
+    for its value."""
     block = (inspect.getdoc(verb) or "").partition("Args:\n")[2].partition("\n\n")[0]
-    entries = re.split(r"^    (?=\w+: )", block, flags=re.M)[1:]
-    found = {}
-    for name, _, text in (" ".join(entry.split()).partition(": ") for entry in entries):
-        sentence = re.split(r"(?<=\.) (?=[A-Z(])", text)[0].replace('"', "")
-        found[name] = re.sub(r"`(\w+)`", lambda word: flag_of(word[1]), sentence)
+    entries = re.split(r"^    (?=\w+(?: \(\S+\))?: )", block, flags=re.M)[1:]
+    found: dict[str, tuple[str, str | None]] = {}
+    for head, _, text in (" ".join(entry.split()).partition(": ") for entry in entries):
+        name, _, metavar = head.removesuffix(")").partition(" (")
+        flagged = re.sub(r"`(\w+)`", lambda word: flag_of(word[1]), text.replace('"', ""))
+        found[name] = flagged, metavar or None
     return found

@@ -3,12 +3,9 @@
 from __future__ import annotations
 
 from pathlib import Path
-from typing import Annotated
-
-import typer
 
 from elastocal import verbs
-from elastocal.cli.signatures import Asked, CellFile, Run, Seed, command
+from elastocal.cli.signatures import Asked, CellFile, Output, Run, Seed, command
 from elastocal.errors import InputError
 from elastocal.screen import say
 
@@ -21,16 +18,11 @@ from elastocal.screen import say
 )
 def simulate(
     cell: CellFile,
-    plan: Annotated[Path, typer.Argument(help="Poses (CSV): configuration, q1_deg, …")],
-    output: Annotated[Path, typer.Option("-o", "--output", help="Measurements to write (CSV).")],
-    set_: Annotated[
-        list[str] | None,
-        typer.Option("--set", metavar="NAME=VALUE", help="True value in SI units; repeatable."),
-    ] = None,
-    truth: Annotated[
-        Path | None, typer.Option(help="Write the true values used, as JSON {name: value}.")
-    ] = None,
-    no_noise: Annotated[bool, typer.Option("--no-noise", help="Exact readings.")] = False,
+    plan: Path,
+    output: Output,
+    set_: list[str] | None = None,
+    truth: Path | None = None,
+    no_noise: bool = False,
     *,
     asked: Asked,
     run: Run,
@@ -39,6 +31,13 @@ def simulate(
 
     Example: elastocal simulate cell.toml plan.csv -o data.csv --set joint2.compliance=3e-7
     --load 0 0 -2600 --repeats 6
+
+    Args:
+        plan: Poses (CSV): configuration, q1_deg, …
+        output: Measurements to write (CSV).
+        set_ (NAME=VALUE): True value in SI units; repeatable.
+        truth: Write the true values used, as JSON {name: value}.
+        no_noise: Exact readings.
     """
     from elastocal.files import together
     from elastocal.model.manipulator import Model
@@ -81,12 +80,7 @@ def _assignment(text: str) -> tuple[str, float]:
 
 @command(short_help="Simulate and calibrate a KR 270 (Klimchik et al. 2013)", flags="json quiet")
 def demo(
-    folder: Annotated[
-        Path,
-        typer.Option(
-            "-o", "--output", help="Folder for the example's files, data, result and report."
-        ),
-    ] = Path("demo_out"),
+    folder: Output = Path("demo_out"),
     seed: Seed = 2013,
     *,
     run: Run,
@@ -94,6 +88,9 @@ def demo(
     """The KR 270 example of Klimchik et al. 2013, measured (simulated) and identified.
 
     Example: elastocal demo -o demo_out
+
+    Args:
+        folder: Folder for the example's files, data, result and report.
     """
     from elastocal.cli.identify_command import write_results
     from elastocal.demo.example import run_demo

@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING, Annotated
 
 import typer
 
-from elastocal.cli.signatures import command
+from elastocal.cli.signatures import AnyOutput, command
 from elastocal.errors import InsufficientDataError, require
 from elastocal.screen import progress_line, say
 
@@ -22,58 +22,21 @@ EVERY = 10.0  # s between plain lines of progress
 
 @command(short_help="Run many simulations on all cores or a cluster")
 def study(
-    folder: Annotated[Path, typer.Argument(help="Folder with study.py and study.toml.")],
-    jobs: Annotated[
-        int | None,
-        typer.Option(min=1, help="Processes on this machine; default: one per core."),
-    ] = None,
-    cluster: Annotated[
-        str | None,
-        typer.Option(
-            metavar="ADDRESS",
-            help="Dask scheduler, as in tcp://HOST:8786, or 'config' for Dask's own.",
-        ),
-    ] = None,
-    tls_ca: Annotated[
-        Path | None, typer.Option(help="Certificate authority (PEM) of a tls:// scheduler.")
-    ] = None,
-    tls_cert: Annotated[
-        Path | None, typer.Option(help="This client's certificate (PEM) for it.")
-    ] = None,
-    tls_key: Annotated[Path | None, typer.Option(help="The key of that (PEM).")] = None,
-    unencrypted: Annotated[
-        bool, typer.Option("--unencrypted", help="Reach another host without TLS.")
-    ] = False,
-    seed: Annotated[
-        int | None, typer.Option(min=0, help="Seed; default: that of study.toml.")
-    ] = None,
-    set_: Annotated[
-        list[str] | None,
-        typer.Option("--set", metavar="KEY=VALUE", help="Option of the study; repeatable."),
-    ] = None,
-    output: Annotated[
-        Path | None,
-        typer.Option(
-            "-o",
-            "--output",
-            help="Folder of the results, with the summary in OUTPUT.md; default: FOLDER/results "
-            "and FOLDER/result.md.",
-        ),
-    ] = None,
-    progress: Annotated[
-        bool,
-        typer.Option("--progress", show_default=False, help="Rate and time left: the default."),
-    ] = True,
-    quiet: Annotated[
-        bool, typer.Option("--quiet", "-q", "--no-progress", help="No progress.")
-    ] = False,
-    only: Annotated[int | None, typer.Option(min=1, help="Run the first N tasks alone.")] = None,
-    restart: Annotated[
-        bool, typer.Option("--restart", help="Discard the results that are there.")
-    ] = False,
-    retry_failed: Annotated[
-        bool, typer.Option("--retry-failed", help="Run tasks that failed again.")
-    ] = False,
+    folder: Path,
+    jobs: Annotated[int | None, typer.Option(min=1)] = None,
+    cluster: str | None = None,
+    tls_ca: Path | None = None,
+    tls_cert: Path | None = None,
+    tls_key: Path | None = None,
+    unencrypted: bool = False,
+    seed: Annotated[int | None, typer.Option(min=0)] = None,
+    set_: list[str] | None = None,
+    output: AnyOutput = None,
+    progress: Annotated[bool, typer.Option("--progress", show_default=False)] = True,
+    quiet: Annotated[bool, typer.Option("--quiet", "-q", "--no-progress")] = False,
+    only: Annotated[int | None, typer.Option(min=1)] = None,
+    restart: bool = False,
+    retry_failed: bool = False,
 ) -> None:
     """Run a study's tasks that have no result yet; after Ctrl-C the same command resumes.
 
@@ -81,6 +44,24 @@ def study(
     only folders that you trust.
 
     Example: elastocal study experiment_design/coverage --jobs 4
+
+    Args:
+        folder: Folder with study.py and study.toml.
+        jobs: Processes on this machine; default: one per core.
+        cluster (ADDRESS): Dask scheduler, as in tcp://HOST:8786, or 'config' for Dask's own.
+        tls_ca: Certificate authority (PEM) of a tls:// scheduler.
+        tls_cert: This client's certificate (PEM) for it.
+        tls_key: The key of that (PEM).
+        unencrypted: Reach another host without TLS.
+        seed: Seed; default: that of study.toml.
+        set_ (KEY=VALUE): Option of the study; repeatable.
+        output: Folder of the results, with the summary in OUTPUT.md; default: FOLDER/results
+            and FOLDER/result.md.
+        progress: Rate and time left: the default.
+        quiet: No progress.
+        only: Run the first N tasks alone.
+        restart: Discard the results that are there.
+        retry_failed: Run tasks that failed again.
     """
     require(cluster is None or jobs is None, "--jobs is for this machine; leave it with --cluster")
     from elastocal.studies.results import check_page

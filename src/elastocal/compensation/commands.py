@@ -57,24 +57,23 @@ def nominal_path(
     return walk.q, walk.reached
 
 
+@dataclass(eq=False)
 class _Walk:
-    def __init__(
-        self,
-        chain: Chain,
-        position: Array,
-        rotation: Array | None,
-        point: Array,
-        limits: tuple[Array, Array],
-        seed: int,
-    ) -> None:
-        self.chain, self.position, self.rotation = chain, position, rotation
-        self.point, self.limits, self.seed = point, limits, seed
-        self.q = np.zeros((len(position), chain.n_joints))
-        self.reached = np.zeros(len(position), dtype=bool)
+    chain: Chain
+    position: Array
+    rotation: Array | None
+    point: Array
+    limits: tuple[Array, Array]
+    seed: int
+
+    def __post_init__(self) -> None:
+        self.q = np.zeros((len(self.position), self.chain.n_joints))
+        self.reached = np.zeros(len(self.position), dtype=bool)
         self.last: Array | None = None
         self._ahead: Postures | None = None
         self._ahead_from, self._leaps = 0, 1
-        self._task = Reaching(chain, position, rotation, point, None, *limits)
+        place = self.position, self.rotation, self.point
+        self._task = Reaching(self.chain, *place, None, *self.limits)
 
     def piece(self, first: int, length: int) -> int:
         """How many of the next places are reached smoothly from the last posture; kept if so."""
@@ -250,10 +249,7 @@ class Commanding(BoundedSearch):
             active = active[moved > SETTLED]
             if not len(active):
                 break
-        return self._better(q, started, nominal, target)
-
-    def _better(self, q: Array, started: Array, nominal: Array, target: IntArray) -> Array:
-        """Of two sets of commands, row by row those that reach with the smaller correction."""
+        # Row by row what reaches with the smaller correction.
         now, before = (self.judged(v, target) for v in (q, started))
         shorter = np.linalg.norm(q - nominal, axis=1) <= np.linalg.norm(started - nominal, axis=1)
         take = now.reached & (shorter | ~before.reached)

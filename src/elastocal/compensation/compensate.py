@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
 from typing import Any
 
@@ -10,7 +10,6 @@ import numpy as np
 from numpy.typing import NDArray
 
 from elastocal.above import Result
-from elastocal.cell.work_cell import Cell
 from elastocal.compensation.commands import Commanding, Goals, Solved, jumps, nominal_path
 from elastocal.compensation.targets import Targets
 from elastocal.errors import InsufficientDataError, option
@@ -155,14 +154,13 @@ def compensate(
         np.column_stack([before[1], found.turn]), status, goals, force, T, place, turn,
         task.errors(nominal, every)[0], uncertainty, (),
     )  # fmt: skip
-    told = notices_of(tool.cell, result, limits, path)
-    told += _beyond_functions(arm, result) + _beyond_poses(arm, result)
+    told = [*_of_joints(result, limits, path), *_of_loads(arm, result), *_of_places(arm, result)]
     if of_one_campaign:
-        told += (
+        told.append(
             f"The {listed(of_one_campaign, 4)} {'is' if len(of_one_campaign) == 1 else 'are'} of "
-            "one campaign and no part of these commands.",
+            "one campaign and no part of these commands."
         )
-    return replace(result, warnings=told)
+    return replace(result, warnings=tuple(told))
 
 
 def _goals(targets: Targets, chain: Chain, T: Array, place: Array, turn: Array) -> Goals:
@@ -237,127 +235,102 @@ LEVEL_SLACK = 0.01  # rad or m
 WORTH_TELLING = 10e-6  # m
 
 
-def notices_of(
-    cell: Cell, result: Compensation, limits: tuple[Array, Array], jumps: IntArray
-) -> tuple[str, ...]:
-    """What the rows that are reached give reason to say; each sentence names rows and remedy.
+UNLIKELY = 0.01  # probability, were the targets drawn as the poses measured
 
-    `jumps`: the rows at which the solution branch changes.
-    """
-    chain, targets, q, before = result.chain, result.targets, result.q, result.before
-    reached, uncertainty = result.reached, result.uncertainty
-    told = []
-    lower, upper = limits
-    held = ((q <= lower + AT_LIMIT) | (q >= upper - AT_LIMIT)) & reached[:, None]
+
+def _of_joints(c: Compensation, limits: tuple[Array, Array], jumps: IntArray) -> Iterator[str]:
+    """What the joints of rows that are reached give reason to say; `jumps`: the rows at which the
+    solution branch changes."""
+    targets, q, kinds = c.targets, c.q, c.chain.kinds
+    held = ((q <= limits[0] + AT_LIMIT) | (q >= limits[1] - AT_LIMIT)) & c.reached[:, None]
     for limited in np.flatnonzero(held.any(axis=0)):
-        told.append(
+        yield (
             f"{_rows(targets, held[:, limited])}: joint {limited + 1} stands at its limit; the "
             "target is reached by the other joints"
         )
     if len(jumps):
         i = int(jumps[0])
         j = int(np.abs(q[i] - q[i - 1]).argmax())
-        revolute = chain.kinds[j] == "revolute"
         size = np.abs(q[i, j] - q[i - 1, j])
-        by = f"{np.degrees(size):.0f}°" if revolute else f"{size * 1e3:.0f} mm"
-        told.append(
+        by = f"{np.degrees(size):.0f}°" if kinds[j] == "revolute" else f"{size * 1e3:.0f} mm"
+        yield (
             f"{_rows(targets, jumps)}: the solution branch changes (joint {j + 1} moves by {by} to "
             f"line {targets.table.row[i]}, much more than the tool's motion asks for); where the "
             "rows are a path, move it away from limits and singular postures, or give q1_deg … of "
             "the posture wanted"
         )
-    change = np.where([kind == "revolute" for kind in chain.kinds], np.abs(q - result.nominal), 0.0)
-    large = reached & (change.max(axis=1) > LARGE_CORRECTION)
+    change = np.where([kind == "revolute" for kind in kinds], np.abs(q - c.nominal), 0.0)
+    large = c.reached & (change.max(axis=1) > LARGE_CORRECTION)
     if large.any():
-        told.append(
+        yield (
             f"{_rows(targets, large)}: a joint is corrected by up to "
             f"{np.degrees(change[large].max()):.1f}°, as beside a singular posture; check that the "
             "path may be moved there"
         )
-    if targets.q is not None and targets.position is not None:
-        far = before > FAR
-        if far.any():
-            told.append(
-                f"{_rows(targets, far)}: the nominal command q1_deg … puts the tool up to "
-                f"{before[far].max() * 1e3:.0f} mm from its target; check {option('frame')}, "
-                f"{option('point')} and units"
+    far = c.before > FAR
+    if targets.q is not None and targets.position is not None and far.any():
+        yield (
+            f"{_rows(targets, far)}: the nominal command q1_deg … puts the tool up to "
+            f"{c.before[far].max() * 1e3:.0f} mm from its target; check {option('frame')}, "
+            f"{option('point')} and units"
+        )
+
+
+def _of_loads(arm: CalibratedArm, c: Compensation) -> Iterator[str]:
+    """A load that was forgotten, joints beyond the levels of their compliance."""
+    spec, targets = arm.model.cell.model, c.targets
+    elastic = any(effect_of(choice.name).elastic for choice in spec.effects)
+    acts = targets.table.force.any() or spec.link_gravity or spec.torque != "computed"
+    if elastic and not acts:
+        yield (
+            f"{targets.table.source}: no load is stated, so no compliance is compensated; where "
+            f"the tool carries one, give {option('load')} or force_x_N, force_y_N, force_z_N"
+        )
+    for name, values in spec.compliance_levels.items():
+        angle = c.q[:, int(name.removeprefix("joint")) - 1]
+        off = (angle < min(values) - LEVEL_SLACK) | (angle > max(values) + LEVEL_SLACK)
+        if (off & c.reached).any():
+            yield (
+                f"{_rows(targets, off & c.reached)}: {name} stands beyond its levels in "
+                "[model.compliance_levels], where the compliance of the nearest level is assumed"
             )
-    told += _without_load(cell, targets)
-    told += _beyond_levels(cell, targets, q, reached)
-    unknown = uncertainty.unknown[reached]
+
+
+def _of_places(arm: CalibratedArm, c: Compensation) -> Iterator[str]:
+    """Places that depend on what the data do not determine, or lie where no reading shows it."""
+    sure, reached = c.uncertainty, c.reached
+    unknown, std = sure.unknown[reached], sure.std[reached]
     rms = float(np.sqrt(np.mean(unknown**2))) if len(unknown) else 0.0
-    stated = float(np.sqrt(np.mean(uncertainty.std[reached] ** 2))) if len(unknown) else 0.0
-    if rms > max(WORTH_TELLING, stated):
-        told.append(
-            f"The data do not determine {listed(uncertainty.blamed, 4)}, on which the place of "
+    if len(unknown) and rms > max(WORTH_TELLING, float(np.sqrt(np.mean(std**2)))):
+        yield (
+            f"The data do not determine {listed(sure.blamed, 4)}, on which the place of "
             f"this point depends: typical deviations of them would move it by {rms * 1e6:.0f} µm "
             "rms, which the stated uncertainty leaves out; choose a marker that was fitted "
             f"({option('point')}), or measure what is missing"
         )
-    return tuple(told)
-
-
-def _without_load(cell: Cell, targets: Targets) -> list[str]:
-    """A load that was forgotten: the commands are then those of the arm without it."""
-    spec = cell.model
-    elastic = any(effect_of(choice.name).elastic for choice in spec.effects)
-    if not elastic or targets.table.force.any() or spec.link_gravity or spec.torque != "computed":
-        return []
-    return [
-        f"{targets.table.source}: no load is stated, so no compliance is compensated; where the "
-        f"tool carries one, give {option('load')} or force_x_N, force_y_N, force_z_N"
-    ]
-
-
-def _beyond_levels(cell: Cell, targets: Targets, q: Array, reached: NDArray[np.bool_]) -> list[str]:
-    told = []
-    for name, values in cell.model.compliance_levels.items():
-        angle = q[:, int(name.removeprefix("joint")) - 1]
-        off = (angle < min(values) - LEVEL_SLACK) | (angle > max(values) + LEVEL_SLACK)
-        if (off & reached).any():
-            told.append(
-                f"{_rows(targets, off & reached)}: {name} stands beyond its levels in "
-                "[model.compliance_levels], where the compliance of the nearest level is assumed"
-            )
-    return told
-
-
-def _beyond_functions(arm: CalibratedArm, result: Compensation) -> tuple[str, ...]:
-    """Commands where no reading shows what a smooth function corrects elsewhere."""
-    told = []
     known = np.isin(arm.model.names, arm.determined)
     for group in smooth_groups(arm.model):
         if group.basis is None or group.whole_turn or not known[group.columns].any():
             continue
-        angle = result.q[:, group.joint]
-        out = result.reached & ((angle < group.low) | (angle > group.high))
+        angle = c.q[:, group.joint]
+        out = reached & ((angle < group.low) | (angle > group.high))
         if out.any():
             low, high = np.degrees([group.low, group.high])
-            told.append(
-                f"{_rows(result.targets, out)}: {group.follows} stands outside {low:.1f}° to "
+            yield (
+                f"{_rows(c.targets, out)}: {group.follows} stands outside {low:.1f}° to "
                 f"{high:.1f}°, where the {group.name} was measured; there it ends, the arm is "
                 "that of the model without it, and the uncertainty grows to its whole size"
             )
-    return tuple(told)
-
-
-UNLIKELY = 0.01  # probability, were the targets drawn as the poses measured
-
-
-def _beyond_poses(arm: CalibratedArm, result: Compensation) -> tuple[str, ...]:
-    """Targets of which the fit knows less than of every pose measured."""
-    shown, std = arm.shown, result.uncertainty.std
-    if shown is None or arm.model.observe == "distance":
-        return ()
-    far = result.reached & (std > shown.most)
-    if shown.chance(int(far.sum()), int(result.reached.sum())) >= UNLIKELY:
-        return ()
-    return (
-        f"{_rows(result.targets, far)}: what was measured tells less of this place (standard "
-        f"deviation up to {std[far].max() * 1e6:.0f} µm) than of any pose measured "
-        f"({shown.most * 1e6:.0f} µm at most), so that it is extrapolated; measure poses there, "
-        f"or choose a marker that was fitted ({option('point')})",
-    )
+    if (shown := arm.shown) is None or arm.model.observe == "distance":
+        return
+    far = reached & (sure.std > shown.most)
+    if shown.chance(int(far.sum()), int(reached.sum())) < UNLIKELY:
+        yield (
+            f"{_rows(c.targets, far)}: what was measured tells less of this place (standard "
+            f"deviation up to {sure.std[far].max() * 1e6:.0f} µm) than of any pose measured "
+            f"({shown.most * 1e6:.0f} µm at most), so that it is extrapolated; measure poses there,"
+            f" or choose a marker that was fitted ({option('point')})"
+        )
 
 
 def _rows(targets: Targets, which: NDArray) -> str:

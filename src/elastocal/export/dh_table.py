@@ -32,7 +32,7 @@ from elastocal.units import Array
 # Below this angle between two axes (rad) the foot of their common normal runs away with the
 # smallest error, a/α away; Hayati's parameter keeps it in place.
 NEARLY_PARALLEL = 0.02
-ANGLES = (0, 3, 4)
+ARE_ANGLES = np.array([1, 0, 0, 1, 1])
 
 
 @dataclass(frozen=True)
@@ -60,10 +60,14 @@ class DhRow:
 
     def near(self, other: DhRow, tolerance: float = 1e-12) -> DhRow:
         """This row with the other's number wherever the two agree to rounding."""
-        mine, theirs = astuple(self), astuple(other)
-        return DhRow(
-            *(t if abs(m - t) < tolerance else m for m, t in zip(mine, theirs, strict=True))
-        )
+        mine, theirs = np.array(astuple(self)), np.array(astuple(other))
+        return DhRow(*np.where(np.abs(mine - theirs) < tolerance, theirs, mine).tolist())
+
+    def turned_as(self, other: DhRow) -> DhRow:
+        """This row with the other's whole turns."""
+        mine, theirs = np.array(astuple(self)), np.array(astuple(other))
+        turns = np.round((theirs - mine) / (2 * np.pi)) * ARE_ANGLES
+        return DhRow(*(mine + 2 * np.pi * turns).tolist())
 
 
 def split(T: Array, near: DhRow | None = None, height: float = 0.0) -> tuple[DhRow, Array]:
@@ -78,9 +82,15 @@ def split(T: Array, near: DhRow | None = None, height: float = 0.0) -> tuple[DhR
         ways = [_skew(T, sign) for sign in (1.0, -1.0)]
     else:
         ways = [_parallel(T, sign, near, height) for sign in (1.0, -1.0)]
-    row = min(ways, key=lambda way: _distance(way, near))
-    if near is not None:
-        row = _same_turns(row, near)
+
+    def away(row: DhRow) -> float:
+        if near is None:
+            return abs(row.theta) - 1e-9 * row.a
+        turn = [1 - math.cos(x - y) for x, y in ((row.theta, near.theta), (row.alpha, near.alpha))]
+        return sum(turn) + abs(row.a - near.a)
+
+    row = min(ways, key=away)
+    row = row if near is None else row.turned_as(near)
     return row, np.asarray(np.linalg.solve(row.transform(), T), dtype=np.float64)
 
 
@@ -108,23 +118,6 @@ def _parallel(T: Array, sign: float, near: DhRow | None, height: float) -> DhRow
     alpha = math.atan2(-u[1], u[2])
     beta = math.atan2(u[0], math.hypot(u[1], u[2]))
     return DhRow(theta, d, a, alpha, beta)
-
-
-def _distance(row: DhRow, near: DhRow | None) -> float:
-    if near is None:
-        return abs(row.theta) - 1e-9 * row.a
-    turn = [1 - math.cos(x - y) for x, y in ((row.theta, near.theta), (row.alpha, near.alpha))]
-    return sum(turn) + abs(row.a - near.a)
-
-
-def _same_turns(row: DhRow, near: DhRow) -> DhRow:
-    mine, theirs = astuple(row), astuple(near)
-    return DhRow(
-        *(
-            m + 2 * math.pi * round((t - m) / (2 * math.pi)) if k in ANGLES else m
-            for k, (m, t) in enumerate(zip(mine, theirs, strict=True))
-        )
-    )
 
 
 # The calibrated arm as a Denavit–Hartenberg table, standard or modified.
@@ -191,15 +184,19 @@ def dh_csv(lines: Sequence[Line], comments: Sequence[str] = ()) -> str:
     beta_rad stands there only where a row needs it; limits are those of commanded values; comments
     begin with #.
     """
-    with_beta = any(line.row.beta for line in lines)
-    kinds = {line.joint.kind for line in lines if line.joint is not None and _limits(line.joint)}
-    limits = [name for kind, names in LIMITS.items() if kind in kinds for name in names]
-    header = [*(HEADER if with_beta else HEADER[:-1]), *limits]
-    rows = []
+    found = []
     for line in lines:
         numbers = dict(zip(HEADER[2:], astuple(line.row), strict=True))
-        if line.joint is not None:
-            numbers |= _limits(line.joint)
+        if (joint := line.joint) is not None:
+            ends = zip(LIMITS[joint.kind], (joint.lower, joint.upper), strict=True)
+            numbers |= {name: value for name, value in ends if math.isfinite(value)}
+        found.append(numbers)
+    bounded = {name for numbers in found for name in numbers}
+    limits = [n for names in LIMITS.values() if bounded & set(names) for n in names]
+    with_beta = any(line.row.beta for line in lines)
+    header = [*(HEADER if with_beta else HEADER[:-1]), *limits]
+    rows = []
+    for line, numbers in zip(lines, found, strict=True):
         kind = dh.FIXED if line.joint is None else line.joint.kind
         cells = [repr(numbers[name] + 0.0) if name in numbers else "" for name in header[2:]]
         rows.append([line.name, kind, *cells])
@@ -219,7 +216,10 @@ def _decompose(
     `keep_last`: the last row changes in θ and d alone, the rest is the flange's.  Its z is often
     in line with the last axis, where a row of its own would turn any way.
     """
-    turned = [_z_to(joint.axis) for joint in chain.joints]
+    turned = []
+    for joint in chain.joints:  # rotations whose z column is the axis
+        turned.append(np.eye(4))
+        turned[-1][:3, :3] = np.column_stack([*transverse_axes(joint.axis), joint.axis])
     ends = [*(joint.placement for joint in chain.joints), chain.flange_placement]
     starts = [np.eye(4), *turned]
     rows: list[DhRow] = []
@@ -229,28 +229,15 @@ def _decompose(
         T = carried @ np.linalg.inv(start) @ end @ (np.eye(4) if last else turned[i])
         near = like[i]
         if last and keep_last and near is not None:
-            row = _along_axis(T, near)
+            # The turn about and the shift along the axis that bring it closest to T.
+            R = T[:3, :3] @ near.trailing()[:3, :3].T
+            theta = math.atan2(R[1, 0] - R[0, 1], R[0, 0] + R[1, 1])
+            row = replace(near, theta=theta, d=float(T[2, 3])).turned_as(near)
             carried = np.asarray(np.linalg.solve(row.transform(), T), dtype=np.float64)
         else:
             row, carried = split(T, near, height=float(T[2, 3]) if last else 0.0)
         rows.append(row)
     return rows, carried
-
-
-def _along_axis(T: Array, near: DhRow) -> DhRow:
-    """`near` with the turn about and the shift along its axis that bring it closest to T."""
-    R = T[:3, :3] @ near.trailing()[:3, :3].T
-    theta = math.atan2(R[1, 0] - R[0, 1], R[0, 0] + R[1, 1])
-    theta += 2 * math.pi * round((near.theta - theta) / (2 * math.pi))
-    return replace(near, theta=theta, d=float(T[2, 3]))
-
-
-def _z_to(axis: Array) -> Array:
-    """A rotation (4, 4) whose z column is the axis; the identity where that is z already."""
-    T = np.eye(4)
-    x, y = transverse_axes(axis)
-    T[:3, :3] = np.column_stack([x, y, axis])
-    return T
 
 
 def _nominal_rows(robot: Robot, chain: Chain, convention: Convention) -> list[DhRow | None]:
@@ -273,8 +260,3 @@ def _nominal_rows(robot: Robot, chain: Chain, convention: Convention) -> list[Dh
     first = replace(own[0], theta=0.0, d=0.0)
     pairs = zip(own, after, strict=True)
     return [first, *(replace(a, theta=row.theta, d=row.d) for row, a in pairs)]
-
-
-def _limits(joint: Joint) -> dict[str, float]:
-    ends = zip(LIMITS[joint.kind], (joint.lower, joint.upper), strict=True)
-    return {name: value for name, value in ends if math.isfinite(value)}

@@ -55,37 +55,7 @@ PARAMETERS = "elastocal/parameters/1"
 KEYS = ("value", "unit", "std", "ci95", "identifiable", "combined_with", "nominal", "held", "note")
 
 
-def to_yaml(data: Any) -> str:
-    """`data` (dicts with text keys, lists, texts, numbers, booleans, None) as YAML; lists of plain
-    values stand on one line."""
-    import yaml
-
-    text: str = yaml.safe_dump(data, sort_keys=False, default_flow_style=None, width=np.inf)
-    return text
-
-
-def estimates_of(calibrated: CalibratedArm) -> list[dict[str, Any]]:
-    """Per parameter, in the model's order: name and what identify says of it.
-
-    What an older result does not have is null.
-    """
-    return [
-        {"name": name} | {key: plain(entry.get(key)) for key in KEYS}
-        for name, entry in zip(calibrated.model.names, calibrated.entries, strict=True)
-    ]
-
-
-def held_values(calibrated: CalibratedArm, estimates: list[dict[str, Any]]) -> dict[str, float]:
-    """Parameters that the data did not determine, with the values used for them (SI), but those of
-    smooth functions, which are zero where nothing shows them."""
-    both = zip(estimates, calibrated.model.shrunk, strict=True)
-    left = [e for e, shrunk in both if not shrunk and e["identifiable"] is not True]
-    return {e["name"]: e["held"] for e in left}
-
-
-def parameter_document(
-    calibrated: CalibratedArm, estimates: list[dict[str, Any]], pieces: ExportNumbers, cost: Cost
-) -> dict[str, Any]:
+def _parameters(calibrated: CalibratedArm, pieces: ExportNumbers, cost: Cost) -> dict[str, Any]:
     """Everything to be written: estimates, the geometry they make, and that geometry's cost.
 
     Joint and flange placements are those of the calibrated URDF: in the frame before, in m and
@@ -99,7 +69,10 @@ def parameter_document(
         "cell": None if cell.path is None else Path(cell.path).name,
         "result": Path(calibrated.source).name,
         "units": "SI: m, rad, N, kg",
-        "parameters": estimates,
+        "parameters": [  # what an older result does not have is null
+            {"name": name} | {key: plain(entry.get(key)) for key in KEYS}
+            for name, entry in zip(calibrated.model.names, calibrated.entries, strict=True)
+        ],
         "geometry": {
             "tracker_to_base": _placed(pieces.T_tracker_base),
             "joints": [
@@ -111,23 +84,7 @@ def parameter_document(
             "markers": {name: _placed(T) for name, T in pieces.markers.items()},
             "load_point_m": [float(v) for v in pieces.load_point],
         },
-        "geometry_alone": cost_json(cost),
-    }  # fmt: skip
-
-
-def cost_json(cost: Cost) -> dict[str, Any]:
-    """A cost in µm, with what it was found under."""
-    return {
-        "poses": cost.poses,
-        "poses_without_equilibrium": cost.unsettled,
-        "force_N": cost.forces[0].tolist() if len(cost.forces) == 1 else None,
-        "forces_N": cost.forces.tolist(),
-        "total": cost.total.to_json(),
-        "effects": [
-            {"effect": e.effect, "note": e.note,
-             "difference": None if e.difference is None else e.difference.to_json()}
-            for e in cost.effects
-        ],
+        "geometry_alone": cost.to_json(),
     }  # fmt: skip
 
 
@@ -136,6 +93,14 @@ def _placed(T: Array) -> dict[str, list[float]]:
         "xyz_m": [float(v) + 0.0 for v in T[:3, 3]],
         "rpy_rad": [v + 0.0 for v in rpy_from_rotation(T[:3, :3])],
     }
+
+
+def _yaml(data: Any) -> str:
+    """`data` as YAML; lists of plain values stand on one line."""
+    import yaml
+
+    text: str = yaml.safe_dump(data, sort_keys=False, default_flow_style=None, width=np.inf)
+    return text
 
 
 # Smooth functions as a table: what no format of geometry holds, for controllers of one's own.
@@ -160,11 +125,8 @@ def corrections_csv(calibrated: CalibratedArm, note: str) -> str:
 
     Raises InputError where the arm has no such function.
     """
-    rows = [
-        row
-        for group in smooth_groups(calibrated.model)
-        for row in _correction_rows(calibrated, group)
-    ]
+    groups = smooth_groups(calibrated.model)
+    rows = [row for group in groups for row in _correction_rows(calibrated, group)]
     if not rows:
         raise InputError(
             f"{calibrated.source}: this arm has no smooth function to be written as corrections; "
@@ -181,41 +143,31 @@ def _correction_rows(calibrated: CalibratedArm, group: SmoothGroup) -> Iterator[
     x = group.grid(min(max(steps + 1, FEWEST), MOST))
     waves = group.basis(x)
     quantile = float(t_quantile(LEVEL, np.array(np.inf)))
-    for component, (columns, unit) in enumerate(zip(group.columns, group.units, strict=True)):
-        value = waves @ calibrated.x[columns]
+    for component, (columns, unit) in enumerate(zip(group.columns, group.units, strict=True), 1):
         known = np.array([names[c] in place for c in columns])
         at = [place[names[c]] for c in columns[known]]
         own = waves[:, known]
         variance = np.einsum("nk,kl,nl->n", own, calibrated.covariance[np.ix_(at, at)], own)
         half = quantile * np.sqrt(np.maximum(variance, 0.0))
-        for position, moved, width in zip(x, value, half, strict=True):
+        value = waves @ calibrated.x[columns]
+        for position, *sizes in zip(x, value, half, strict=True):
+            angle, time = f"{np.degrees(position):.4f}", f"{position:.1f}"
+            micro = (f"{size * 1e6 + 0.0:.3f}" for size in sizes)
             yield (
-                group.effect, group.where, group.follows, *_position(group, position),
-                str(component + 1), MICRO.get(unit, unit), _micro(moved), _micro(width),
+                group.effect, group.where, group.follows,
+                *((angle, "") if group.lasting else ("", time)),
+                str(component), MICRO.get(unit, unit), *micro,
             )  # fmt: skip
-
-
-def _position(group: SmoothGroup, x: float) -> tuple[str, str]:
-    return (f"{np.degrees(x):.4f}", "") if group.lasting else ("", f"{x:.1f}")
-
-
-def _micro(value: float) -> str:
-    """In µm or µrad, to a thousandth of one."""
-    return f"{value * 1e6 + 0.0:.3f}"
 
 
 # Which format a file is written in: by its ending, or as asked for.
 
 ENDINGS = {
-    ".urdf": "urdf",
-    ".xml": "mjcf",
-    ".mjcf": "mjcf",
-    ".csv": "dh",
-    ".yaml": "yaml",
-    ".yml": "yaml",
-    ".json": "json",
-}
+    ".urdf": "urdf", ".xml": "mjcf", ".mjcf": "mjcf", ".csv": "dh", ".yaml": "yaml",
+    ".yml": "yaml", ".json": "json",
+}  # fmt: skip
 FORMATS = ("urdf", "mjcf", "dh", "mdh", "yaml", "json", "corrections")
+FITTED = ("urdf", "mjcf", "dh", "mdh")
 
 
 def format_of(path: Path, asked: str | None) -> str:
@@ -239,78 +191,7 @@ def format_of(path: Path, asked: str | None) -> str:
     return found
 
 
-# What was written is read back, by the library that users read it with, before it is kept.
-
-LARGEST = 1e-8  # m; a hundred times the rounding of a chain of a few metres
-# Origin and points 0.1 m along the flange's axes, homogeneous (4, 4).
-CORNERS = np.vstack([np.hstack([np.zeros((3, 1)), 0.1 * np.eye(3)]), np.ones((1, 4))])
-LARGEST_AT_REST = 1e-6  # m
-
-
-def check_chain(
-    text: str,
-    ending: str,
-    read: Callable[[Path], Chain],
-    chain: Chain,
-    kept: Kept,
-    seed: int,
-    largest: float | None = LARGEST,
-) -> float:
-    """Largest distance in m between the flange of the written text, read back, and `chain`'s: of
-    its origin and of points on its axes, so that its orientation counts.
-
-    Raises ElastocalError where it is more than `largest` (None: any will do).
-    """
-    with tempfile.TemporaryDirectory() as folder:
-        path = Path(folder) / f"written{ending}"
-        atomic_write_text(path, text)
-        back = read(path)
-    q = random_table(kept.full.model, kept.conditions, 100, seed).q
-    return _apart(nominal_flanges(back, q), nominal_flanges(chain, q), largest)
-
-
-def _apart(found: Array, expected: Array, largest: float | None = LARGEST) -> float:
-    """Largest distance in m between flanges (n, 4, 4), of origin and points on the axes."""
-    apart = (found - expected)[:, :3] @ CORNERS
-    worst = float(np.linalg.norm(apart, axis=1).max())
-    return worst if largest is None else _accepted(worst, largest)
-
-
-def check_rest(
-    at_rest: Callable[[Array, Array], Array],
-    pieces: ExportNumbers,
-    kept: Kept,
-    T_world_base: Array,
-    seed: int,
-) -> float:
-    """Largest distance in m of flange and markers between MuJoCo at rest and the exported model.
-
-    `at_rest`: `pieces.points` (k, 3) in the MJCF's world by commanded joints and force;
-    `T_world_base` (4, 4) there.  Raises ElastocalError where they differ.
-    """
-    part = kept.exported
-    table = random_table(kept.full.model, kept.conditions, POSES_AT_REST, seed)
-    placed = T_world_base @ np.linalg.inv(pieces.T_tracker_base)
-    expected = placed @ part.model.flange_poses(table, part.x)
-    worst = 0.0
-    for q, force, T in zip(table.q, table.force, expected, strict=True):
-        if np.isfinite(T).all():
-            away = at_rest(q, force) - (pieces.points @ T[:3, :3].T + T[:3, 3])
-            worst = max(worst, float(np.linalg.norm(away, axis=1).max()))
-    return _accepted(worst, LARGEST_AT_REST)
-
-
-def _accepted(distance: float, largest: float) -> float:
-    if not distance <= largest:
-        raise ElastocalError(
-            f"the written file, read back, is {distance * 1e6:.3g} µm from the model and was not "
-            "kept; please report this robot description"
-        )
-    return distance
-
-
 SCHEMA = "elastocal/export/1"
-POSES_AT_REST = 20
 
 
 @dataclass(frozen=True)
@@ -351,13 +232,17 @@ class Exported:
 
     def to_json(self) -> dict[str, Any]:
         """The answer as a JSON-ready dictionary, lengths in µm."""
+
+        def um(metres: float | None) -> float | None:
+            return None if metres is None else metres * 1e6
+
         return {
             "schema": SCHEMA,
             "format": self.format,
-            "cannot_hold": cost_json(self.cost),
+            "cannot_hold": self.cost.to_json(),
             "refit": None if self.refit is None else self.refit.to_json(),
-            "read_back": {"with": self.checked_with, "max_um": _um(self.checked)},
-            "without_beta_max_um": _um(self.without_beta),
+            "read_back": {"with": self.checked_with, "max_um": um(self.checked)},
+            "without_beta_max_um": um(self.without_beta),
             "held": self.held,
             "of_the_measurement": list(self.of_the_measurement),
             "warnings": list(self.warnings),
@@ -375,8 +260,11 @@ def export(
     """
     if wish.correct_joints:
         _check_correctable(calibrated, wish)
-    estimates = estimates_of(calibrated)
-    conditions = _conditions(calibrated, wish)
+    # The visits measured, where they are known, count under the load that was asked for.
+    visits, conditions = calibrated.visits, wish.conditions
+    if visits is not None and (wish.load_stated or conditions.force.any()):
+        visits = replace(visits, force=np.broadcast_to(conditions.force, visits.force.shape))
+    conditions = replace(conditions, visits=visits)
     kept = keep(calibrated, elastic=wish.format == "mjcf", conditions=conditions)
     refit, correction = None, JointCorrection(())
     if wish.format in FITTED:
@@ -386,39 +274,33 @@ def export(
     progress("what the format cannot hold")
     cost = cost_of(kept, wish.poses, wish.seed)
     progress("writing and reading back")
-    written: Written = "", None, "", [], None
     if wish.format in WRITERS:
-        written = WRITERS[wish.format](calibrated, wish, kept, pieces)
-    text, checked, tool, warnings, beta = written
-    if checked is not None and not np.isfinite(checked):
+        found = WRITERS[wish.format](calibrated, wish, kept, pieces)
+    else:
+        document = _parameters(calibrated, pieces, cost)
+        found = Written(_yaml(document) if wish.format == "yaml" else json_text(document) + "\n")
+    if found.checked is not None and not np.isfinite(found.checked):
         raise InsufficientDataError(
             f"{calibrated.source}: its corrections are larger than a file of a robot can hold; "
             "look at its values"
         )
-    if not text:
-        document = parameter_document(calibrated, estimates, pieces, cost)
-        text = to_yaml(document) if wish.format == "yaml" else json_text(document) + "\n"
+    # Smooth functions are zero where nothing shows them: no values that are held.
+    model, entries = calibrated.model, calibrated.entries
+    each = zip(model.names, entries, model.shrunk, strict=True)
     return Exported(
-        text=text,
+        text=found.text,
         format=wish.format,
         cost=cost,
-        checked=checked,
-        checked_with=tool,
-        held=held_values(calibrated, estimates),
+        checked=found.checked,
+        checked_with=found.tool,
+        held={n: plain(e.get("held")) for n, e, shrunk in each
+              if not shrunk and e.get("identifiable") is not True},
         of_the_measurement=kept.of_the_measurement,
-        warnings=(*_warnings(calibrated, kept, cost), *warnings),
-        without_beta=beta,
+        warnings=(*_warnings(calibrated, kept, cost), *found.warnings),
+        without_beta=found.without_beta,
         refit=refit,
         correction=correction,
-    )
-
-
-def _conditions(calibrated: CalibratedArm, wish: Wish) -> Conditions:
-    """With the visits measured, where they are known, under the load that was asked for."""
-    visits, given = calibrated.visits, wish.conditions
-    if visits is not None and (wish.load_stated or given.force.any()):
-        visits = replace(visits, force=np.broadcast_to(given.force, visits.force.shape))
-    return replace(given, visits=visits)
+    )  # fmt: skip
 
 
 def _check_correctable(calibrated: CalibratedArm, wish: Wish) -> None:
@@ -432,7 +314,30 @@ def _check_correctable(calibrated: CalibratedArm, wish: Wish) -> None:
         )
 
 
-FITTED = ("urdf", "mjcf", "dh", "mdh")
+def _warnings(calibrated: CalibratedArm, kept: Kept, cost: Cost) -> list[str]:
+    found = []
+    if kept.fitted and len(cost.forces) > 1 and not kept.exported.elastic:
+        found.append(
+            f"the arm sags under its load and this file cannot: it is fitted to all "
+            f"{len(cost.forces)} loads measured; state {option('load')} for the one that it is for"
+        )
+    spec = calibrated.model.cell.model
+    elastic = any(effect_of(choice.name).elastic for choice in spec.effects)
+    if elastic and not cost.forces.any() and not spec.link_gravity:
+        found.append(
+            f"no load is given, so compliances cost nothing here: state one with {option('load')} "
+            "(N, in the tracker's axes)"
+        )
+    if spec.torque == "measured":
+        found.append(
+            "joint torques are taken from the load here, as a file has no measured torques"
+        )
+    if cost.unsettled:
+        found.append(
+            f"{cost.unsettled} of {cost.poses} random poses have no static equilibrium under the "
+            "load and are left out"
+        )
+    return found
 
 
 def write(done: Exported, path: Path, correction: str | Path | None) -> None:
@@ -444,8 +349,74 @@ def write(done: Exported, path: Path, correction: str | Path | None) -> None:
             atomic_write_text(correction, done.correction.csv([told]))
 
 
-# Text, distance when read back, by what, warnings, distance without beta.
-Written = tuple[str, float | None, str, list[str], float | None]
+# Each format written, and read back by the library that users read it with before it is kept.
+
+LARGEST = 1e-8  # m; a hundred times the rounding of a chain of a few metres
+LARGEST_AT_REST = 1e-6  # m
+POSES_AT_REST = 20
+# Origin and points 0.1 m along the flange's axes, homogeneous (4, 4).
+CORNERS = np.vstack([np.hstack([np.zeros((3, 1)), 0.1 * np.eye(3)]), np.ones((1, 4))])
+
+
+@dataclass(frozen=True)
+class Written:
+    """A text, its largest distance in m when read back by which tool, what to know of it, and of a
+    DH table the distance without β."""
+
+    text: str
+    checked: float | None = None
+    tool: str = ""
+    warnings: tuple[str, ...] = ()
+    without_beta: float | None = None
+
+
+def _apart(found: Array, expected: Array, largest: float | None = LARGEST) -> float:
+    """Largest distance in m between flanges (n, 4, 4), of origin and points on the axes, so that
+    orientations count.  Raises ElastocalError where it is more than `largest` (None: any will do).
+    """
+    apart = (found - expected)[:, :3] @ CORNERS
+    worst = float(np.linalg.norm(apart, axis=1).max())
+    return worst if largest is None else _accepted(worst, largest)
+
+
+def _accepted(distance: float, largest: float) -> float:
+    if not distance <= largest:
+        raise ElastocalError(
+            f"the written file, read back, is {distance * 1e6:.3g} µm from the model and was not "
+            "kept; please report this robot description"
+        )
+    return distance
+
+
+def _read_back(text: str, ending: str, read: Callable[[Path], Chain]) -> Chain:
+    with tempfile.TemporaryDirectory() as folder:
+        path = Path(folder) / f"written{ending}"
+        atomic_write_text(path, text)
+        return read(path)
+
+
+def _check_rest(
+    at_rest: Callable[[Array, Array], Array],
+    pieces: ExportNumbers,
+    kept: Kept,
+    T_world_base: Array,
+    seed: int,
+) -> float:
+    """Largest distance in m of flange and markers between MuJoCo at rest and the exported model.
+
+    `at_rest`: `pieces.points` (k, 3) in the MJCF's world by commanded joints and force;
+    `T_world_base` (4, 4) there.  Raises ElastocalError where they differ.
+    """
+    part = kept.exported
+    table = random_table(kept.full.model, kept.conditions, POSES_AT_REST, seed)
+    placed = T_world_base @ np.linalg.inv(pieces.T_tracker_base)
+    expected = placed @ part.model.flange_poses(table, part.x)
+    worst = 0.0
+    for q, force, T in zip(table.q, table.force, expected, strict=True):
+        if np.isfinite(T).all():
+            away = at_rest(q, force) - (pieces.points @ T[:3, :3].T + T[:3, 3])
+            worst = max(worst, float(np.linalg.norm(away, axis=1).max()))
+    return _accepted(worst, LARGEST_AT_REST)
 
 
 def _note(calibrated: CalibratedArm, kept: Kept) -> str:
@@ -477,20 +448,20 @@ def _urdf(calibrated: CalibratedArm, wish: Wish, kept: Kept, pieces: ExportNumbe
     else:
         text = new_urdf(pieces, wish.frames, note)
         base, flange = BASE, FLANGE
-    read = partial(read_urdf, base=base, flange=flange)
-    chain = pieces.calibrated_chain()
-    apart = check_chain(text, ".urdf", read, chain, kept, wish.seed)
+    back = _read_back(text, ".urdf", partial(read_urdf, base=base, flange=flange))
     q = random_table(kept.full.model, kept.conditions, 100, wish.seed).q
-    names = [joint.name for joint in chain.joints]
+    chain = pieces.calibrated_chain()
+    expected = nominal_flanges(chain, q)
+    apart = _apart(nominal_flanges(back, q), expected)
     try:
-        found = urdf_flanges(text, names, base, flange, q)
+        found = urdf_flanges(text, [joint.name for joint in chain.joints], base, flange, q)
     except (ValueError, RuntimeError) as error:  # pinocchio's own
-        told = [
+        told = (
             "pinocchio's own reader refuses this file, as it does without the corrections "
             f"({str(error).strip().splitlines()[0]}); only elastocal's has read it back"
-        ]
-        return text, apart, "elastocal's reader of URDF", told, None
-    return text, max(apart, _apart(found, nominal_flanges(chain, q))), "pinocchio", [], None
+        )
+        return Written(text, apart, "elastocal's reader of URDF", (told,))
+    return Written(text, max(apart, _apart(found, expected)), "pinocchio")
 
 
 def _mjcf(calibrated: CalibratedArm, wish: Wish, kept: Kept, pieces: ExportNumbers) -> Written:
@@ -520,12 +491,12 @@ def _mjcf(calibrated: CalibratedArm, wish: Wish, kept: Kept, pieces: ExportNumbe
         import mujoco  # noqa: F401
     except ImportError:
         warnings.append("not read back: MuJoCo is not installed (pip install elastocal[mujoco])")
-        return text, None, "", warnings, None
+        return Written(text, warnings=tuple(warnings))
     names = ["flange", *(f"marker_{name}" for name in pieces.markers)]
     placed = pieces.T_tracker_base if wish.frames.base else np.eye(4)
     at_rest = partial(MujocoRest(text).sites, names=names)
-    distance = check_rest(at_rest, pieces, kept, placed, wish.seed)
-    return text, distance, "MuJoCo, at rest under the load", warnings, None
+    distance = _check_rest(at_rest, pieces, kept, placed, wish.seed)
+    return Written(text, distance, "MuJoCo, at rest under the load", tuple(warnings))
 
 
 def _corrected(calibrated: CalibratedArm, wish: Wish, kept: Kept, pieces: ExportNumbers) -> Written:
@@ -539,30 +510,29 @@ def _corrected(calibrated: CalibratedArm, wish: Wish, kept: Kept, pieces: Export
         raise NotInPlace("weights were identified without those of the file (link_gravity = false)")
     text, warnings = corrected_mjcf(cell.robot, pieces, wish.frames.tool, _note(calibrated, kept))
     arm = HeldArm(text, cell.robot, pieces)
-    distance = check_rest(arm, pieces, kept, arm.T_world_base, wish.seed)
-    springs = [s for s in pieces.springs if s.compliance > 0]
-    if springs and not pieces.masses:
+    distance = _check_rest(arm, pieces, kept, arm.T_world_base, wish.seed)
+    if pieces.yielding and not pieces.masses:
         warnings.append(
             "the links weigh in this file and did not in the model that was identified: their "
             "weights deflect the springs a second time; set [model] link_gravity = true and "
             "identify anew, or switch gravity off in the file"
         )
-    if springs:
+    if pieces.yielding:
         warnings += _rigid_joints(pieces, "")
         warnings.append(
             "the springs stand in series with the joints: hold those by stiff actuators, whose "
             "own error would come on top"
         )
-    if b"file=" in text.encode():
+    if "file=" in text:
         warnings.append(
             "meshes and included files are named relative to the file: keep it in the folder of "
             f"{cell.robot.mjcf.name if cell.robot.mjcf else 'the old one'}"
         )
-    return text, distance, "MuJoCo, at rest under the load", warnings, None
+    return Written(text, distance, "MuJoCo, at rest under the load", tuple(warnings))
 
 
 def _rigid_joints(pieces: ExportNumbers, how: str) -> list[str]:
-    springs = {s.site for s in pieces.springs if s.compliance > 0}
+    springs = {s.site for s in pieces.yielding}
     joints = [f"joint{i + 1}" for i in range(pieces.chain.n_joints)]
     rigid = ", ".join(joint for joint in joints if joint not in springs)
     return [f"no compliance was identified for {rigid}: rigid in this file{how}"] if rigid else []
@@ -582,60 +552,32 @@ def _dh(calibrated: CalibratedArm, wish: Wish, kept: Kept, pieces: ExportNumbers
 
     convention = CONVENTIONS[wish.format]
     lines = dh_lines(calibrated.model.cell.robot, pieces, convention)
-    read: Callable[[Path], Chain] = partial(read_dh, convention=convention)
-    chain = pieces.calibrated_chain()
-    checked = check_chain(dh_csv(lines), ".csv", read, chain, kept, wish.seed)
+    q = random_table(kept.full.model, kept.conditions, 100, wish.seed).q
+    expected = nominal_flanges(pieces.calibrated_chain(), q)
+
+    def checked(text: str, largest: float | None = LARGEST) -> float:
+        back = _read_back(text, ".csv", partial(read_dh, convention=convention))
+        return _apart(nominal_flanges(back, q), expected, largest)
+
+    apart, beta = checked(dh_csv(lines)), None
     comments = [
         f"{_note(calibrated, kept)}; {convention} convention: {FORMULA[convention]}",
-        f"largest flange error of this table: {checked * 1e6:.2g} um",
+        f"largest flange error of this table: {apart * 1e6:.2g} um",
     ]
-    beta = None
     if any(line.row.beta for line in lines):
-        plain = dh_csv(without_beta(lines))
-        beta = check_chain(plain, ".csv", read, chain, kept, wish.seed, largest=None)
+        beta = checked(dh_csv(without_beta(lines)), largest=None)
         comments.append(f"without the column beta_rad: {beta * 1e6:.3g} um")
     text = dh_csv(lines, comments)
-    check_chain(text, ".csv", read, chain, kept, wish.seed)
-    return text, checked, "elastocal's own reader of DH tables", [], beta
+    checked(text)
+    return Written(text, apart, "elastocal's own reader of DH tables", (), beta)
 
 
 def _corrections(
     calibrated: CalibratedArm, wish: Wish, kept: Kept, pieces: ExportNumbers
 ) -> Written:
-    text = corrections_csv(calibrated, _note(calibrated, kept))
-    return text, None, "", [], None
+    return Written(corrections_csv(calibrated, _note(calibrated, kept)))
 
 
 WRITERS = {
     "urdf": _urdf, "mjcf": _mjcf, "dh": _dh, "mdh": _dh, "corrections": _corrections,
 }  # fmt: skip
-
-
-def _warnings(calibrated: CalibratedArm, kept: Kept, cost: Cost) -> list[str]:
-    found = []
-    if kept.fitted and len(cost.forces) > 1 and not kept.exported.elastic:
-        found.append(
-            f"the arm sags under its load and this file cannot: it is fitted to all "
-            f"{len(cost.forces)} loads measured; state {option('load')} for the one that it is for"
-        )
-    spec = calibrated.model.cell.model
-    elastic = any(effect_of(choice.name).elastic for choice in spec.effects)
-    if elastic and not cost.forces.any() and not spec.link_gravity:
-        found.append(
-            f"no load is given, so compliances cost nothing here: state one with {option('load')} "
-            "(N, in the tracker's axes)"
-        )
-    if spec.torque == "measured":
-        found.append(
-            "joint torques are taken from the load here, as a file has no measured torques"
-        )
-    if cost.unsettled:
-        found.append(
-            f"{cost.unsettled} of {cost.poses} random poses have no static equilibrium under the "
-            "load and are left out"
-        )
-    return found
-
-
-def _um(metres: float | None) -> float | None:
-    return None if metres is None else metres * 1e6

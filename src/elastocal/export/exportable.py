@@ -5,6 +5,7 @@ from __future__ import annotations
 from collections import defaultdict
 from dataclasses import dataclass, replace
 from pathlib import Path
+from typing import Any
 from xml.etree import ElementTree as ET
 
 import casadi as ca
@@ -15,7 +16,6 @@ from scipy.spatial.transform import Rotation
 from elastocal.errors import InsufficientDataError, option
 from elastocal.measurements import Measurements
 from elastocal.model import rigid
-from elastocal.model.arm import Arm
 from elastocal.model.calibrated import (
     RECORDED,
     CalibratedArm,
@@ -123,28 +123,24 @@ def keep(calibrated: CalibratedArm, elastic: bool, conditions: Conditions) -> Ke
     stated = [name for name, needs in unstated.items() if not needs]
     full = arm_with(calibrated, stated)
     format: Format = "elastic" if elastic else "rigid"
-    dropped = {}  # effects whose values no physical spring or body has, with the reason
-    for name in full.effects if elastic else ():
-        if reason := CATALOGUE[name].unphysical(full.values, full.model.chain, full.model.cell):
-            dropped[name] = reason
-    kept_names = [
-        name for name in stated if format in CATALOGUE[name].formats and name not in dropped
-    ]
-    omissions = [
-        Omission(name, dropped.get(name, ""), arm_with(calibrated, set(stated) - {name}))
-        for name in stated
-        if name not in kept_names
-    ]
+    kept, omissions = [], []
+    for name in stated:
+        # Values that no physical spring or body has stay out, with the reason.
+        args = full.values, full.model.chain, full.model.cell
+        reason = CATALOGUE[name].unphysical(*args) if elastic and name in full.effects else ""
+        if format in CATALOGUE[name].formats and not reason:
+            kept.append(name)
+        else:
+            without = arm_with(calibrated, set(stated) - {name})
+            omissions.append(Omission(name, reason or "", without))
     for name, needs in unstated.items():
         if needs:
             missing = " and ".join(RECORDED.get(need) or option(OPTIONS[need]) for need in needs)
             omissions.append(Omission(name, f"no cost without {missing}", None))
-    exported = full if len(kept_names) == len(stated) else arm_with(calibrated, kept_names)
+    exported = full if len(kept) == len(stated) else arm_with(calibrated, kept)
     if elastic:
         exported, changed = _as_springs(exported)
-        omissions += [
-            Omission(effect, sentence, _as_springs(full, effect)[0]) for effect, sentence in changed
-        ]
+        omissions += [Omission(e, told, _as_springs(full, e)[0]) for e, told in changed]
     return Kept(full, exported, conditions, tuple(omissions), instrument)
 
 
@@ -222,6 +218,14 @@ class ExportNumbers:
         return ca.DM(rigid.joint_motion(joint.kind, joint.axis, float(self.offsets[i]))).full()
 
     @property
+    def yielding(self) -> list[SpringValue]:
+        """The springs that yield."""
+        return [s for s in self.springs if s.compliance > 0]
+
+    def springs_at(self, site: str) -> list[SpringValue]:
+        return [s for s in self.yielding if s.site == site]
+
+    @property
     def points(self) -> Array:
         """(1 + markers, 3) m in the flange frame: its origin and the markers."""
         return np.array([np.zeros(3), *(T[:3, 3] for T in self.markers.values())])
@@ -270,16 +274,18 @@ def evaluate_pieces(part: Valued, conditions: Conditions) -> ExportNumbers:
     ]
     function = ca.Function("pieces", [*arm.inputs.values(), symbolic.p], expressions)
     found = [value.full() for value in function.call([*inputs, part.x])]
-    n = model.chain.n_joints
+    n, values = model.chain.n_joints, part.values
     links, (offsets, T_tracker_base), rest = found[:n], found[n : n + 2], found[n + 2 :]
-    values = part.values
+    markers = {name: np.eye(4) for name in arm.markers}
+    for k, T in enumerate(markers.values()):
+        T[:3, 3], T[:3, :3] = rest[k][:, 0], rest[len(markers) + k]
     scale, *shift = (values.get(name, 0.0) for name in PAYLOAD)
     return ExportNumbers(
         chain=model.chain,
         links=tuple(links),
         offsets=offsets[:, 0],
         T_tracker_base=T_tracker_base,
-        markers=_markers(arm, rest),
+        markers=markers,
         load_point=model.cell.tool.load_point + np.array(shift),
         load_scale=1.0 + scale,
         springs=tuple(
@@ -288,15 +294,6 @@ def evaluate_pieces(part: Valued, conditions: Conditions) -> ExportNumbers:
         ),
         masses=_masses(model.chain, values, model.cell.model.link_gravity),
     )
-
-
-def _markers(arm: Arm, found: list[Array]) -> dict[str, Array]:
-    placed = {}
-    for k, name in enumerate(arm.markers):
-        T = np.eye(4)
-        T[:3, 3], T[:3, :3] = found[k][:, 0], found[len(arm.markers) + k]
-        placed[name] = T
-    return placed
 
 
 def _masses(chain: Chain, values: dict[str, float], link_gravity: bool) -> tuple[LinkMass, ...]:
@@ -352,6 +349,21 @@ class Cost:
     forces: Array
     measured: bool
 
+    def to_json(self) -> dict[str, Any]:
+        """JSON-ready, lengths in µm."""
+        return {
+            "poses": self.poses,
+            "poses_without_equilibrium": self.unsettled,
+            "force_N": self.forces[0].tolist() if len(self.forces) == 1 else None,
+            "forces_N": self.forces.tolist(),
+            "total": self.total.to_json(),
+            "effects": [
+                {"effect": e.effect, "note": e.note,
+                 "difference": None if e.difference is None else e.difference.to_json()}
+                for e in self.effects
+            ],
+        }  # fmt: skip
+
 
 def cost_of(kept: Kept, poses: int, seed: int) -> Cost:
     """Differences at `poses` random poses inside the joint limits, under the stated conditions.
@@ -371,16 +383,21 @@ def cost_of(kept: Kept, poses: int, seed: int) -> Cost:
             f"{table.force[0].tolist()} N; check {option('load')} and the "
             "compliances of the result"
         )
-    effects = []
-    for omission in kept.omissions:
-        if omission.without is not None:
-            without = points_of(omission.without, table, markers)
-            difference = _difference(full[settled], without[settled])
-            omission = replace(omission, difference=difference)
-        effects.append(omission)
+
+    def apart(other: Array) -> Difference:
+        distance = np.linalg.norm(full[settled] - other[settled], axis=2)
+        sizes = ((np.sqrt(np.mean(d**2)), d.max()) for d in (distance[:, :1], distance[:, 1:]))
+        return Difference(*(float(v) for both in sizes for v in both))
+
+    effects = [
+        o
+        if o.without is None
+        else replace(o, difference=apart(points_of(o.without, table, markers)))
+        for o in kept.omissions
+    ]
     effects.sort(key=lambda e: -np.inf if e.difference is None else -e.difference.marker_rms)
     return Cost(
-        total=_difference(full[settled], exported[settled]),
+        total=apart(exported),
         effects=tuple(effects),
         poses=poses,
         unsettled=int((~settled).sum()),
@@ -393,11 +410,3 @@ def points_of(part: Valued, table: Measurements, points: Array) -> Array:
     """Points (k, 3) of the flange frame in the tracker frame (poses, k, 3); NaN: no equilibrium."""
     T = part.model.flange_poses(table, part.x)
     return np.asarray(T[:, None, :3, :3] @ points[..., None])[..., 0] + T[:, None, :3, 3]
-
-
-def _difference(a: Array, b: Array) -> Difference:
-    distance = np.linalg.norm(a - b, axis=2)
-    parts = distance[:, :1], distance[:, 1:]
-    return Difference(
-        *(float(v) for part in parts for v in (np.sqrt(np.mean(part**2)), part.max()))
-    )

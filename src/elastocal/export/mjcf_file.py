@@ -56,56 +56,51 @@ def calibrated_mjcf(
     root = ET.Element("mujoco", model=chain.name)
     root.append(ET.Comment(f" {note.replace('--', '- -')} "))
     ET.SubElement(root, "compiler", angle="radian", balanceinertia="true", autolimits="false")
-    R = pieces.T_tracker_base[:3, :3]
-    up = np.array([0.0, 0.0, 1.0]) if base_frame else R.T @ [0.0, 0.0, 1.0]
+    R = np.eye(3) if base_frame else pieces.T_tracker_base[:3, :3].T
     ET.SubElement(
-        root, "option", gravity=numbers(-STANDARD_GRAVITY * up), integrator="implicitfast"
-    )
+        root, "option", gravity=numbers(R @ [0.0, 0.0, -STANDARD_GRAVITY]),
+        integrator="implicitfast",
+    )  # fmt: skip
     world = ET.SubElement(root, "worldbody")
     tracker = np.eye(4)
-    tracker[:3, :3] = np.eye(3) if base_frame else R.T
+    tracker[:3, :3] = R
     ET.SubElement(world, "site", placed_body("tracker_axes", tracker))
     actuators = ET.Element("actuator")
-    T_base = pieces.T_tracker_base if base_frame else np.eye(4)
-    body = _body(world, "base", T_base, None, None)
-    for spring in springs_at(pieces, "base"):
-        _passive(body, spring, np.eye(4))
+    body = _body(world, "base", pieces.T_tracker_base if base_frame else np.eye(4))
+    _passive(body, pieces.springs_at("base"))
     before: list[SpringValue] = []
-    motors = motor_names(chain)
-    for i, joint in enumerate(chain.joints):
-        own, in_series = _drive(pieces, i)
-        offset = pieces.offset_motion(i)
-        mass = pieces.masses[i] if pieces.masses else None
-        T = pieces.placement(i)
+    for i, (joint, name) in enumerate(zip(chain.joints, motor_names(chain), strict=True)):
+        drive, in_series = _drive(pieces, i)
+        offset, T = pieces.offset_motion(i), pieces.placement(i)
         if before:  # on a body of their own: MuJoCo takes six joints at most in one
-            body = _body(body, f"link{i}_end", T, None, None)
-            for spring in before:
-                _passive(body, spring, np.eye(4))
-            T = np.eye(4)
-        if compensator is not None and compensator["joint"] == i:
-            _anchor(body, T, joint.axis, compensator)
+            body, T = _body(body, f"link{i}_end", T), np.eye(4)
+            _passive(body, before)
+        compensated = compensator if compensator and compensator["joint"] == i else None
+        if compensated:
+            _compensate(root, body, T, joint.axis, compensated)
+        mass = pieces.masses[i] if pieces.masses else None
         body = _body(body, f"link{i + 1}", T @ offset, mass, inertias[i] if inertias else None)
-        for spring in in_series:
-            _passive(body, spring, offset)
-        _motor(body, actuators, joint, motors[i], own)
-        if compensator is not None and compensator["joint"] == i:
-            _arm_end(body, joint.axis, offset, compensator)
-        before = springs_at(pieces, f"link{i + 1}")
-        _draw(body, pieces.links[i])
-    flange = _body(body, "flange", pieces.links[-1], None, None)
-    for spring in before:
-        _passive(flange, spring, np.eye(4))
-    _sites(flange, pieces)
-    if compensator is not None:
-        _tendon(root, compensator)
-    _load(actuators, pieces.load_scale)
+        # Their axes stand before the body was turned by the joint's offset.
+        _passive(body, in_series, np.asarray(np.linalg.inv(offset)))
+        _motor(body, actuators, joint, name, drive)
+        if compensated:
+            # The offset turns the frame about the axis before the joint moves, and the model's
+            # angle counts it; so the arm's end stands at angle zero of the joint's own frame.
+            arm = compensated["compensator_arm"] * transverse_axes(joint.axis)[0]
+            ET.SubElement(body, "site", name="compensator_arm", pos=numbers(arm))
+        before = pieces.springs_at(f"link{i + 1}")
+        end = pieces.links[i][:3, 3]
+        if np.linalg.norm(end) >= SHORTEST:  # to be seen only: it weighs and touches nothing
+            ET.SubElement(
+                body, "geom", type="capsule", fromto=numbers([0, 0, 0, *end]), size="0.02",
+                mass="0", contype="0", conaffinity="0", group="2",
+            )  # fmt: skip
+    flange = _body(body, "flange", pieces.links[-1])
+    _passive(flange, before)
+    _sites_and_load(flange, actuators, pieces)
     root.append(actuators)
     ET.indent(root)
     return ET.tostring(root, encoding="unicode") + "\n"
-
-
-def springs_at(pieces: ExportNumbers, site: str) -> list[SpringValue]:
-    return [s for s in pieces.springs if s.site == site and s.compliance > 0]
 
 
 def _drive(pieces: ExportNumbers, i: int) -> tuple[float, list[SpringValue]]:
@@ -115,21 +110,21 @@ def _drive(pieces: ExportNumbers, i: int) -> tuple[float, list[SpringValue]]:
     axes do not commute, and so that spring is a passive joint as well, with a rigid drive.
     """
     axis = tuple(map(float, pieces.chain.joints[i].axis))
-    springs = springs_at(pieces, f"joint{i + 1}")
+    springs = pieces.springs_at(f"joint{i + 1}")
     if all(s.axis == axis and s.kind == pieces.chain.joints[i].kind for s in springs):
         return sum(s.compliance for s in springs), []
     return 0.0, springs
 
 
 def _body(
-    parent: ET.Element, name: str, T: Array, mass: LinkMass | None, inertia: Array | None
-) -> ET.Element:
+    parent: ET.Element, name: str, T: Array, mass: LinkMass | None = None,
+    inertia: Array | None = None,
+) -> ET.Element:  # fmt: skip
     body = ET.SubElement(parent, "body", placed_body(name, T))
     mass = LinkMass(0.0, np.zeros(3)) if mass is None else mass
     inertial = {"pos": numbers(mass.com), "mass": repr(max(float(mass.mass), NO_MASS))}
-    moments = np.diag(inertia).tolist() if inertia is not None else [0.0]
-    if inertia is not None and min(moments) > NO_INERTIA:
-        entries = [*moments, inertia[0, 1], inertia[0, 2], inertia[1, 2]]
+    if inertia is not None and min(np.diag(inertia)) > NO_INERTIA:
+        entries = [*np.diag(inertia), inertia[0, 1], inertia[0, 2], inertia[1, 2]]
         inertial["fullinertia"] = numbers(entries)
     else:
         inertial["diaginertia"] = numbers([NO_INERTIA] * 3)
@@ -137,9 +132,10 @@ def _body(
     return body
 
 
-def _passive(body: ET.Element, spring: SpringValue, offset: Array) -> None:
-    """A spring of the model; its axis stands before the body was turned by the joint's offset."""
-    ET.SubElement(body, "joint", spring_joint("spring_", spring, np.asarray(np.linalg.inv(offset))))
+def _passive(body: ET.Element, springs: Sequence[SpringValue], frame: Array | None = None) -> None:
+    for spring in springs:
+        placed = np.eye(4) if frame is None else frame
+        ET.SubElement(body, "joint", spring_joint("spring_", spring, placed))
 
 
 def spring_joint(prefix: str, spring: SpringValue, F: Array) -> dict[str, str]:
@@ -152,23 +148,22 @@ def spring_joint(prefix: str, spring: SpringValue, F: Array) -> dict[str, str]:
         "axis": numbers(F[:3, :3] @ spring.axis),
         "stiffness": repr(stiffness),
         "damping": repr(SETTLING * stiffness),
-        "armature": armature(stiffness),
+        "armature": _armature(stiffness),
     }
 
 
-def armature(stiffness: float) -> str:
+def _armature(stiffness: float) -> str:
     return repr(max(ARMATURE, ARMATURE_PER_STIFFNESS * stiffness))
 
 
 def motor_names(chain: Chain) -> list[str]:
     """The names of joints and their actuators: the file's, but for those that stand for others."""
     taken = {f"load_{axis}" for axis in "xyz"}
-    numbers = [f"joint{i}" for i in range(1, chain.n_joints + 1)]
     names = [joint.name for joint in chain.joints]
     good = len(set(names)) == len(names) and not any(
         name in taken or name.startswith("spring_") for name in names
     )
-    return names if good else numbers
+    return names if good else [f"joint{i}" for i in range(1, chain.n_joints + 1)]
 
 
 def _motor(
@@ -177,7 +172,7 @@ def _motor(
     kp = 1.0 / compliance if compliance > 0 else RIGID
     ET.SubElement(
         body, "joint", name=name, type=MOTIONS[joint.kind], axis=numbers(joint.axis),
-        armature=armature(kp),
+        armature=_armature(kp),
     )  # fmt: skip
     drive = {"name": name, "joint": name, "kp": repr(kp), "kv": repr(SETTLING * kp)}
     # Limits are stated for what is commanded; the joint itself may yield past them.
@@ -186,56 +181,31 @@ def _motor(
     ET.SubElement(actuators, "position", drive)
 
 
-def _draw(body: ET.Element, T: Array) -> None:
-    """A line to the next frame, to be seen only: it weighs nothing and touches nothing."""
-    if np.linalg.norm(T[:3, 3]) < SHORTEST:
-        return
-    ends = numbers([0, 0, 0, *T[:3, 3]])
-    ET.SubElement(
-        body, "geom", type="capsule", fromto=ends, size="0.02", mass="0", contype="0",
-        conaffinity="0", group="2",
-    )  # fmt: skip
-
-
-def _sites(flange: ET.Element, pieces: ExportNumbers) -> None:
+def _sites_and_load(flange: ET.Element, actuators: ET.Element, pieces: ExportNumbers) -> None:
+    """Flange, load point and markers; forces in N along the tracker's axes, which keep their
+    direction while the arm moves."""
     load = np.eye(4)
     load[:3, 3] = pieces.load_point
     placed = {f"marker_{name}": T for name, T in pieces.markers.items()}
     for name, T in {"flange": np.eye(4), "load_point": load, **placed}.items():
         ET.SubElement(flange, "site", placed_body(name, T))
-
-
-def _load(actuators: ET.Element, scale: float) -> None:
-    """Forces in N along the tracker's axes, which keep their direction while the arm moves."""
-    for k, axis in enumerate("xyz"):
-        gear = np.zeros(6)
-        gear[k] = scale
+    for axis, unit in zip("xyz", np.eye(3, 6), strict=True):
         ET.SubElement(
             actuators, "motor", name=f"load_{axis}", site="load_point", refsite="tracker_axes",
-            gear=numbers(gear),
+            gear=numbers(pieces.load_scale * unit),
         )  # fmt: skip
 
 
-def _anchor(body: ET.Element, T: Array, axis: Array, values: dict[str, float]) -> None:
-    """Where the compensator's spring hangs on the link before the joint: opposite (a_x, a_y)."""
+def _compensate(
+    root: ET.Element, body: ET.Element, T: Array, axis: Array, values: dict[str, float]
+) -> None:
+    """The compensator's spring, which hangs on the link before the joint: opposite (a_x, a_y)."""
     x, y = transverse_axes(axis)
     point = -values["compensator_anchor_x"] * x - values["compensator_anchor_y"] * y
     place = T[:3, :3] @ point + T[:3, 3]
     ET.SubElement(body, "site", name="compensator_anchor", pos=numbers(place))
-
-
-def _arm_end(body: ET.Element, axis: Array, offset: Array, values: dict[str, float]) -> None:
-    # The offset turns the frame about the axis before the joint moves, and the model's angle
-    # counts it; so the arm's end stands at angle zero of the joint's own, offset frame.
-    x, _ = transverse_axes(axis)
-    place = values["compensator_arm"] * x
-    ET.SubElement(body, "site", name="compensator_arm", pos=numbers(place))
-
-
-def _tendon(root: ET.Element, values: dict[str, float]) -> None:
-    tendon = ET.SubElement(root, "tendon")
     spring = ET.SubElement(
-        tendon, "spatial", name="compensator",
+        ET.SubElement(root, "tendon"), "spatial", name="compensator",
         stiffness=repr(values["compensator_stiffness"]),
         springlength=repr(values["compensator_free_length"]),
     )  # fmt: skip

@@ -13,20 +13,17 @@ actuators, sensors and ranges stay as they are; keyframes get a zero for it.
 
 from __future__ import annotations
 
-from collections.abc import Sequence
-
 import numpy as np
 
 from elastocal.cell.arm_description import Robot
 from elastocal.errors import ElastocalError
 from elastocal.export.exportable import (
     ExportNumbers,
-    SpringValue,
     nothing,
     numbers,
     placed_body,
 )
-from elastocal.export.mjcf_file import joint_stiffness, settle, spring_joint, springs_at
+from elastocal.export.mjcf_file import joint_stiffness, settle, spring_joint
 from elastocal.export.urdf_file import PREFIX, tool_frames
 from elastocal.model.effects.loads import STANDARD_GRAVITY
 from elastocal.model.mjcf import SPRING, MjcfArm, import_mujoco, mjcf_bytes, transform
@@ -49,15 +46,41 @@ class NotInPlace(ElastocalError):
     """Why the user's file cannot take the corrections; a new file can."""
 
 
-class _MjcfText(XmlText):
-    """The text of an MJCF that MuJoCo reads; `bodies` in MuJoCo's order, the world first."""
+def corrected_mjcf(
+    robot: Robot, pieces: ExportNumbers, frames: bool, note: str
+) -> tuple[str, list[str]]:
+    """Text of the robot's MJCF with the calibrated arm, and what to know of it.
 
-    def __init__(self, arm: MjcfArm) -> None:
+    `frames`: sites elastocal_marker_NAME and elastocal_load_point on the flange.
+
+    Raises NotInPlace where the file cannot take a correction, with the reason.
+    """
+    assert robot.mjcf is not None
+    text = _MjcfText(MjcfArm.read(robot.mjcf, robot.base, robot.flange), pieces)
+    if pieces.springs_at(f"link{pieces.chain.n_joints}"):
+        raise NotInPlace("a spring behind the last joint has no joint to stand before")
+    sprung: dict[int, int] = {}  # joint → springs put before it
+    for i, j in enumerate(text.arm.joints):
+        text.correct_joint(i, j)
+        sprung[j] = text.add_springs(i, j)
+    if any(sprung.values()):
+        text.lengthen_keys(sprung)
+    told = text.let_act() if pieces.yielding else []
+    told += text.correct_flange(frames)
+    text.correct_masses()
+    text.insert_in(text.tags[0], f"\n  {comment(note)}")
+    return text.result(), told
+
+
+class _MjcfText(XmlText):
+    """The text of an MJCF that MuJoCo reads, and what is to be changed in it; `bodies` in MuJoCo's
+    order, the world first."""
+
+    def __init__(self, arm: MjcfArm, pieces: ExportNumbers) -> None:
         super().__init__(arm.path, mjcf_bytes(arm.path))
-        self.root = self.tags[0]
-        world = [tag for tag in self.tags if tag.name == "worldbody"]
+        self.arm, self.model, self.pieces = arm, arm.model, pieces
         below = [tag for tag in self.tags if tag.name == "body" and tag.within("worldbody")]
-        self.bodies = world[:1] + below
+        self.bodies = [*self.anywhere("worldbody")[:1], *below]
         names = [arm.model.body(i).name for i in range(1, arm.model.nbody)]
         if [body.stated.get("name", "") for body in below] != names:
             raise NotInPlace(
@@ -77,223 +100,180 @@ class _MjcfText(XmlText):
             if tag.name == name and above in ("", tag.above.name if tag.above else "")
         ]  # fmt: skip
 
+    def place(self, tag: Tag, T: Array) -> None:
+        self.set(tag, _pose(T), ORIENTATIONS[1:])
 
-def corrected_mjcf(
-    robot: Robot, pieces: ExportNumbers, frames: bool, note: str
-) -> tuple[str, list[str]]:
-    """Text of the robot's MJCF with the calibrated arm, and what to know of it.
+    def move(self, body: int, error: Array) -> None:
+        """T ← T · error for the body's own attributes, whatever frames stand around it, and in
+        MuJoCo's model of the file."""
+        tag, own = self.bodies[body], self.arm.local(body)
+        if tag.above is not None and tag.above.name == "frame":
+            own = self.stated(tag)
+        self.place(tag, own @ error)
+        for name, value in _pose(self.arm.local(body) @ error).items():
+            getattr(self.model, f"body_{name}")[body] = np.array(value.split(), dtype=float)
 
-    `frames`: sites elastocal_marker_NAME and elastocal_load_point on the flange.
+    def stated(self, tag: Tag) -> Array:
+        """T (4, 4) that a body's own attributes say, as MuJoCo understands them."""
+        kept = {k: v for k, v in tag.stated.items() if k in ("pos", *ORIENTATIONS)}
+        stated = [item for tag in self.anywhere("compiler") for item in tag.stated.items()]
+        how = {k: v for k, v in stated if k in ("angle", "eulerseq")}
+        world = element("worldbody", {}, element("body", kept))
+        alone = element("mujoco", {}, element("compiler", how), world)
+        model = import_mujoco().MjModel.from_xml_string(alone)
+        return transform(model.body_pos[1], model.body_quat[1])
 
-    Raises NotInPlace where the file cannot take a correction, with the reason.
-    """
-    assert robot.mjcf is not None
-    arm = MjcfArm.read(robot.mjcf, robot.base, robot.flange)
-    text = _MjcfText(arm)
-    told: list[str] = []
-    sprung: dict[int, int] = {}  # joint → springs put before it
-    if springs_at(pieces, f"link{pieces.chain.n_joints}"):
-        raise NotInPlace("a spring behind the last joint has no joint to stand before")
-    for i, j in enumerate(arm.joints):
-        _correct_joint(arm, text, pieces, i, j)
-        sprung[j] = _add_springs(arm, text, pieces, i, j)
-    if any(sprung.values()):
-        _lengthen_keys(arm, text, sprung)
-    if springs_of(pieces):
-        told += _let_act(arm, text, pieces)
-    told += _flange_and_sites(arm, text, pieces, frames)
-    _correct_masses(arm, text, pieces)
-    text.insert_in(text.root, f"\n  {comment(note)}")
-    return text.result(), told
+    def correct_joint(self, i: int, j: int) -> None:
+        if nothing(correction := self.pieces.correction(i)):
+            return
+        body = int(self.model.jnt_bodyid[j])
+        if self.arm.joints_of(body)[0] != j:
+            raise NotInPlace(
+                f"joint '{self.arm.joint_name(j)}' shares its body with another; give it a body of "
+                "its own"
+            )
+        X = self.arm.before(j)
+        self.move(body, X @ correction @ np.linalg.inv(X))
 
-
-def _correct_joint(arm: MjcfArm, text: _MjcfText, pieces: ExportNumbers, i: int, j: int) -> None:
-    if nothing(correction := pieces.correction(i)):
-        return
-    body = int(arm.model.jnt_bodyid[j])
-    if arm.joints_of(body)[0] != j:
-        raise NotInPlace(
-            f"joint '{arm.joint_name(j)}' shares its body with another; give it a body of its own"
-        )
-    X = arm.before(j)
-    _move(arm, text, body, X @ correction @ np.linalg.inv(X))
-
-
-def _move(arm: MjcfArm, text: _MjcfText, body: int, error: Array) -> None:
-    """T ← T · error for the body's own attributes, whatever frames stand around it, and in MuJoCo's
-    model of the file."""
-    tag, own = text.bodies[body], arm.local(body)
-    if tag.above is not None and tag.above.name == "frame":
-        own = _stated(text, tag)
-    text.set(tag, _placed(own @ error), ORIENTATIONS[1:])
-    for name, value in _placed(arm.local(body) @ error).items():
-        getattr(arm.model, f"body_{name}")[body] = np.array(value.split(), dtype=float)
-
-
-def _stated(text: _MjcfText, tag: Tag) -> Array:
-    """T (4, 4) that a body's own attributes say, as MuJoCo understands them."""
-    kept = {k: v for k, v in tag.stated.items() if k in ("pos", *ORIENTATIONS)}
-    stated = [item for tag in text.anywhere("compiler") for item in tag.stated.items()]
-    how = {k: v for k, v in stated if k in ("angle", "eulerseq")}
-    world = element("worldbody", {}, element("body", kept))
-    alone = element("mujoco", {}, element("compiler", how), world)
-    model = import_mujoco().MjModel.from_xml_string(alone)
-    return transform(model.body_pos[1], model.body_quat[1])
-
-
-def _placed(T: Array) -> dict[str, str]:
-    """`pos` and `quat` of a transform (4, 4)."""
-    placed = placed_body("", T)
-    return {name: placed[name] for name in ("pos", "quat")}
-
-
-def _add_springs(arm: MjcfArm, text: _MjcfText, pieces: ExportNumbers, i: int, j: int) -> int:
-    """Put the springs between link i and joint i before the joint; returns how many."""
-    before = springs_at(pieces, f"link{i}" if i else "base")
-    springs = [*before, *springs_at(pieces, f"joint{i + 1}")]
-    body = int(arm.model.jnt_bodyid[j])
-    first = int(arm.model.body_jntadr[body])
-    tags = text.joints(body)
-    old = [k for k in range(first, j) if arm.model.joint(k).name.startswith(SPRING)]
-    for k in old:  # of an earlier export
-        text.remove(tags[k - first])
-    if not springs:
-        if old:
-            raise NotInPlace("springs of an earlier export would be lost")
-        return 0
-    count = len(arm.joints_of(body)) + len(springs)
-    if count > MOST_JOINTS:
-        raise NotInPlace(f"{count} joints would stand on one body, and MuJoCo takes {MOST_JOINTS}")
-    # The springs' frame in that of the moved body: before the joint turns by its offset.
-    F = arm.before(j) @ np.linalg.inv(pieces.offset_motion(i))
-    base = F if i else F @ np.linalg.inv(pieces.placement(0))  # the base's frame in that body's
-    placed = [(s, base if s.site == "base" else F) for s in springs]
-    joints = (element("joint", spring_joint(SPRING, *one) | WITHOUT_DEFAULTS) for one in placed)
-    text.insert(tags[j - first].start, "".join(f"{joint} " for joint in joints))
-    return len(springs) - len(old)
-
-
-def _correct_masses(arm: MjcfArm, text: _MjcfText, pieces: ExportNumbers) -> None:
-    """What each joint carries is what the model says, also where a flange moved with its mass."""
-    model = arm.model
-    told = [tag.stated.get("inertiafromgeom") for tag in text.anywhere("compiler")]
-    from_geoms = "true" in [value for value in told if value][-1:]
-    for j, old, new in zip(arm.joints, arm.masses(), pieces.masses, strict=False):
-        mass = new.mass - old.mass
-        moment = new.mass * new.com - old.mass * old.com
-        if abs(mass) < SMALLEST and np.abs(moment).max() < SMALLEST:
-            continue
+    def add_springs(self, i: int, j: int) -> int:
+        """Put the springs between link i and joint i before the joint; returns how many."""
+        pieces, model = self.pieces, self.model
+        before = pieces.springs_at(f"link{i}" if i else "base")
+        springs = [*before, *pieces.springs_at(f"joint{i + 1}")]
         body = int(model.jnt_bodyid[j])
-        whole = float(model.body_mass[body]) + mass
-        if whole <= 0 or from_geoms:
-            raise NotInPlace(f"body '{model.body(body).name}' cannot take the mass that is missing")
-        moment = model.body_mass[body] * model.body_ipos[body] + moment + mass * model.jnt_pos[j]
-        changed = {"mass": repr(whole), "pos": numbers(moment / whole)}
-        stated = {
-            "quat": numbers(model.body_iquat[body]),
-            "diaginertia": numbers(model.body_inertia[body]),
-        }
-        given = text.bodies[body].first("inertial")
-        text.set_in(text.bodies[body], "inertial", changed if given else changed | stated)
+        first = int(model.body_jntadr[body])
+        tags = self.joints(body)
+        old = [k for k in range(first, j) if model.joint(k).name.startswith(SPRING)]
+        for k in old:  # of an earlier export
+            self.remove(tags[k - first])
+        if old and not springs:
+            raise NotInPlace("springs of an earlier export would be lost")
+        count = len(self.arm.joints_of(body)) + len(springs)
+        if springs and count > MOST_JOINTS:
+            told = f"{count} joints would stand on one body, and MuJoCo takes {MOST_JOINTS}"
+            raise NotInPlace(told)
+        # The springs' frame in that of the moved body: before the joint turns by its offset.
+        F = self.arm.before(j) @ np.linalg.inv(pieces.offset_motion(i))
+        base = F if i else F @ np.linalg.inv(pieces.placement(0))  # the base's frame there
+        placed = [(s, base if s.site == "base" else F) for s in springs]
+        joints = (element("joint", spring_joint(SPRING, *one) | WITHOUT_DEFAULTS) for one in placed)
+        self.insert(tags[j - first].start, "".join(f"{joint} " for joint in joints))
+        return len(springs) - len(old)
 
-
-def _lengthen_keys(arm: MjcfArm, text: _MjcfText, sprung: dict[int, int]) -> None:
-    """Zeros for the new joints in the positions and velocities of keyframes."""
-    for tag in text.anywhere("key", "keyframe"):
-        changed = {}
-        for name, address in (("qpos", arm.model.jnt_qposadr), ("qvel", arm.model.jnt_dofadr)):
-            if name in tag.stated:
+    def lengthen_keys(self, sprung: dict[int, int]) -> None:
+        """Zeros for the new joints in the positions and velocities of keyframes."""
+        for tag in self.anywhere("key", "keyframe"):
+            for name, address in (
+                ("qpos", self.model.jnt_qposadr),
+                ("qvel", self.model.jnt_dofadr),
+            ):
+                if name not in tag.stated:
+                    continue
                 values = tag.stated[name].split()
-                for j, count in sorted(sprung.items(), key=lambda pair: -address[pair[0]]):
+                for j in sorted(sprung, key=lambda j: -address[j]):
                     at = int(address[j])
-                    values[at:at] = ["0"] * count
-                changed[name] = " ".join(values)
-        if changed:
-            text.set(tag, changed)
+                    values[at:at] = ["0"] * sprung[j]
+                self.set(tag, {name: " ".join(values)})
 
-
-def springs_of(pieces: ExportNumbers) -> list[SpringValue]:
-    """The springs that yield."""
-    return [s for s in pieces.springs if s.compliance > 0]
-
-
-def _let_act(arm: MjcfArm, text: _MjcfText, pieces: ExportNumbers) -> list[str]:
-    """Let springs yield and weights act in the file, as they do in the model; what that changes."""
-    told = _enabled(arm, text, ("passive", "spring"))
-    if not pieces.masses:
+    def let_act(self) -> list[str]:
+        """Let springs yield and weights act in the file, as they do in the model; what that
+        changes."""
+        told = self.enable("passive", "spring")
+        if not self.pieces.masses:
+            return told
+        # Gravity along the vertical that was identified, where the file has another.
+        up = self.arm.placed(self.arm.base)[:3, :3] @ self.pieces.T_tracker_base[:3, :3].T
+        wanted = up @ [0.0, 0.0, -STANDARD_GRAVITY]
+        if np.abs(self.model.opt.gravity - wanted).max() >= SMALLEST:
+            self.set_in(self.tags[0], "option", {"gravity": numbers(wanted)})
+        told += self.enable("gravity")
+        moved = [b for b in range(1, self.model.nbody) if self.arm.carrier(b) is not None]
+        held = [b for b in moved if self.model.body_gravcomp[b]]
+        for b in held:
+            self.set(self.bodies[b], {"gravcomp": "0"})
+        if held:
+            names = listed((self.model.body(b).name or f"body {b}" for b in held), 4)
+            told.append(f"gravcomp of {names} is 0 in this file, so that weights bend the springs")
         return told
-    _turn_gravity(arm, text, pieces)
-    told += _enabled(arm, text, ("gravity",))
-    moved = [b for b in range(1, arm.model.nbody) if arm.carrier(b) is not None]
-    held = [b for b in moved if arm.model.body_gravcomp[b]]
-    for b in held:
-        text.set(text.bodies[b], {"gravcomp": "0"})
-    if held:
-        names = listed((arm.model.body(b).name or f"body {b}" for b in held), 4)
-        told.append(f"gravcomp of {names} is 0 in this file, so that weights bend the springs")
-    return told
 
+    def enable(self, *names: str) -> list[str]:
+        """Switch on what <flag> of the file switches off, of these."""
+        import mujoco
 
-def _enabled(arm: MjcfArm, text: _MjcfText, names: Sequence[str]) -> list[str]:
-    """Switch on what <flag> of the file switches off, of these."""
-    import mujoco
+        told = []
+        for name in names:
+            bit = getattr(mujoco.mjtDisableBit, f"mjDSBL_{name.upper()}", 0)  # as versions differ
+            if self.model.opt.disableflags & int(bit):
+                flags = self.anywhere("flag", "option")
+                if not flags:
+                    raise NotInPlace(f'its <flag {name}="disable"/> stands in another file')
+                self.set(flags[-1], {name: "enable"})
+                what = f"{name} is switched on in this file"
+                told.append(f"{what}, so that the springs yield to weights")
+        return told
 
-    told = []
-    for name in names:
-        bit = getattr(mujoco.mjtDisableBit, f"mjDSBL_{name.upper()}", 0)  # as versions differ
-        if arm.model.opt.disableflags & int(bit):
-            flags = text.anywhere("flag", "option")
-            if not flags:
-                raise NotInPlace(f'its <flag {name}="disable"/> stands in another file')
-            text.set(flags[-1], {name: "enable"})
-            told.append(f"{name} is switched on in this file, so that the springs yield to weights")
-    return told
-
-
-def _turn_gravity(arm: MjcfArm, text: _MjcfText, pieces: ExportNumbers) -> None:
-    """Gravity along the vertical that was identified, where the file has another."""
-    base = arm.placed(arm.base)[:3, :3]
-    wanted = -STANDARD_GRAVITY * base @ pieces.T_tracker_base[:3, :3].T @ [0.0, 0.0, 1.0]
-    if np.abs(arm.model.opt.gravity - wanted).max() < SMALLEST:
-        return
-    stated = {"gravity": numbers(wanted)}
-    if options := text.anywhere("option"):
-        text.set(options[0], stated)
-    else:
-        text.insert_in(text.root, f"\n  {element('option', stated)}")
-
-
-def _flange_and_sites(
-    arm: MjcfArm, text: _MjcfText, pieces: ExportNumbers, frames: bool
-) -> list[str]:
-    error = pieces.error(pieces.chain.n_joints - 1)
-    body, told = arm.flange, []
-    T = np.eye(4)
-    sites = {tag.stated.get("name", ""): tag for tag in text.bodies[body].all("site")}
-    extra: dict[str, Array] = {}
-    if arm.site is not None:
-        T = arm.flange_in_body @ error
-        if not nothing(error):
-            if arm.end_name not in sites:
-                raise NotInPlace(f"site '{arm.end_name}' stands in a <frame>")
-            text.set(sites[arm.end_name], _placed(T), ORIENTATIONS[1:])
-    elif not nothing(error):
-        if arm.model.body_jntnum[body] == 0:
-            _move(arm, text, body, error)
-        else:
+    def correct_flange(self, frames: bool) -> list[str]:
+        arm, pieces = self.arm, self.pieces
+        error = pieces.error(pieces.chain.n_joints - 1)
+        body, told, T = arm.flange, [], np.eye(4)
+        sites = {tag.stated.get("name", ""): tag for tag in self.bodies[body].all("site")}
+        extra: dict[str, Array] = {}
+        if arm.site is not None:
+            T = arm.flange_in_body @ error
+            if not nothing(error):
+                if arm.end_name not in sites:
+                    raise NotInPlace(f"site '{arm.end_name}' stands in a <frame>")
+                self.place(sites[arm.end_name], T)
+        elif not nothing(error) and arm.model.body_jntnum[body] == 0:
+            self.move(body, error)
+        elif not nothing(error):
             T, extra = error, {FLANGE: error}
             told.append(
                 f"the flange is the body that the last joint moves: the calibrated one is site "
                 f"'{FLANGE}', and what hangs on '{arm.end_name}' stays where it was"
             )
-    tool = tool_frames(pieces) if frames else {}
-    for name, place in (extra | {n: T @ P for n, P in tool.items()}).items():
-        if name in sites:
-            text.set(sites[name], _placed(place), ORIENTATIONS[1:])
-        else:
-            site = placed_body(name, place) | {"size": "0.005", "group": "4"}
-            text.insert_in(text.bodies[body], element("site", site))
-    return told
+        tool = tool_frames(pieces) if frames else {}
+        for name, place in (extra | {n: T @ P for n, P in tool.items()}).items():
+            if name in sites:
+                self.place(sites[name], place)
+            else:
+                site = placed_body(name, place) | {"size": "0.005", "group": "4"}
+                self.insert_in(self.bodies[body], element("site", site))
+        return told
+
+    def correct_masses(self) -> None:
+        """What each joint carries is what the model says, also where a flange moved with its
+        mass."""
+        model = self.model
+        told = [tag.stated.get("inertiafromgeom") for tag in self.anywhere("compiler")]
+        from_geoms = "true" in [value for value in told if value][-1:]
+        masses = zip(self.arm.joints, self.arm.masses(), self.pieces.masses, strict=False)
+        for j, old, new in masses:
+            mass = new.mass - old.mass
+            moment = new.mass * new.com - old.mass * old.com
+            if abs(mass) < SMALLEST and np.abs(moment).max() < SMALLEST:
+                continue
+            body = int(model.jnt_bodyid[j])
+            whole = float(model.body_mass[body]) + mass
+            if whole <= 0 or from_geoms:
+                name = model.body(body).name
+                raise NotInPlace(f"body '{name}' cannot take the mass that is missing")
+            moment = (
+                model.body_mass[body] * model.body_ipos[body] + moment + mass * model.jnt_pos[j]
+            )
+            changed = {"mass": repr(whole), "pos": numbers(moment / whole)}
+            stated = {
+                "quat": numbers(model.body_iquat[body]),
+                "diaginertia": numbers(model.body_inertia[body]),
+            }
+            given = self.bodies[body].first("inertial")
+            self.set_in(self.bodies[body], "inertial", changed if given else changed | stated)
+
+
+def _pose(T: Array) -> dict[str, str]:
+    """`pos` and `quat` of a transform (4, 4)."""
+    placed = placed_body("", T)
+    return {name: placed[name] for name in ("pos", "quat")}
 
 
 class HeldArm:

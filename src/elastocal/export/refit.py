@@ -18,6 +18,7 @@ from typing import Any
 
 import casadi as ca
 import numpy as np
+from scipy.optimize import lsq_linear
 
 from elastocal.cell.arm_description import EffectChoice, Tool
 from elastocal.export.exportable import Kept, evaluate_pieces, points_of
@@ -246,17 +247,10 @@ def _is_free(effect: str, geometry: bool) -> bool:
 def _step(B: Array, r: Array, size: Array, away: Array, least: Array) -> Array:
     """The step d that minimises |B d − r|² + Σ ((d + away) / size)², no less than `least`: a spring
     that would yield the wrong way is rigid."""
-    bound = np.zeros(len(size), dtype=bool)
-    while True:
-        d = np.where(bound, least, 0.0)
-        A = B[:, ~bound] * size[~bound]
-        b = A.T @ (r - B[:, bound] @ d[bound]) - (away / size)[~bound]
-        N = A.T @ A + np.eye(A.shape[1])
-        d[~bound] = np.linalg.solve(N, b) * size[~bound]
-        beyond = ~bound & (d < least)
-        if not beyond.any():
-            return d
-        bound |= beyond
+    A = np.vstack([B * size, np.eye(len(size))])
+    b = np.concatenate([r, -away / size])
+    found = lsq_linear(A, b, (least / size, np.inf), method="bvls")
+    return np.where(found.active_mask < 0, least, found.x * size)  # at its bound to the last bit
 
 
 class _Curves:

@@ -179,11 +179,10 @@ def new_urdf(pieces: ExportNumbers, frames: Frames, note: str) -> str:
 def _link(name: str, body: LinkMass | None) -> list[str]:
     if body is None:
         return [element("link", {"name": name})]
-    inertia = dict.fromkeys(("ixx", "ixy", "ixz", "iyy", "iyz", "izz"), "0")
     return _nested("link", {"name": name}, _nested("inertial", {}, [
         element("origin", {"xyz": numbers(body.com), "rpy": "0 0 0"}),
         element("mass", {"value": repr(float(body.mass))}),
-        element("inertia", inertia),
+        element("inertia", dict.fromkeys(("ixx", "ixy", "ixz", "iyy", "iyz", "izz"), "0")),
     ]))  # fmt: skip
 
 

@@ -49,7 +49,7 @@ from elastocal.model.chain import joint_limits
 from elastocal.model.choice import load_chain
 from elastocal.tables import Family, column, csv_text
 from elastocal.text import did_you_mean, listed, quoted
-from elastocal.units import Array, convert, quantities
+from elastocal.units import Array, IntArray, convert, quantities
 
 GRAVITY = 9.80665  # m/s², standard
 UNLOADED = ("none", "unloaded", "0")
@@ -243,7 +243,7 @@ def assemble(where: str, points: Records, log: Records | None, joined: Joined | 
 
 
 def _numbers(
-    points: Records, log: Records | None, joined: Joined | None, rows: NDArray[np.int64]
+    points: Records, log: Records | None, joined: Joined | None, rows: IntArray
 ) -> tuple[dict[str, Array], dict[str, str]]:
     """Columns of the points, and of the joint log those that the points do not have."""
     numbers = {stem: values[rows] for stem, values in points.numbers.items()}
@@ -258,7 +258,7 @@ def _numbers(
 
 
 def _configurations(
-    points: Records, joined: Joined | None, rows: NDArray[np.int64], q: Array, spread: Array
+    points: Records, joined: Joined | None, rows: IntArray, q: Array, spread: Array
 ) -> tuple[list[str], list[str]]:
     stated = points.labels.get("configuration")
     if stated is None and joined is not None:
@@ -288,7 +288,7 @@ def _configurations(
     ]
 
 
-def _repeats(points: Records, rows: NDArray[np.int64], keys: list[tuple]) -> NDArray[np.int64]:
+def _repeats(points: Records, rows: IntArray, keys: list[tuple]) -> IntArray:
     stated = points.labels.get("repeat")
     count: dict[tuple, int] = {}
     known: dict[tuple, int] = {}
@@ -355,30 +355,20 @@ def validated(text: str, name: str, made: Assembled, cell: Cell | None) -> Measu
     With `cell`, joints, markers and columns must be those that it asks for.  Raises InputError
     as the reader does, about the table `name`.
     """
-    kinds = made.kinds
-    markers: tuple[str, ...] = ()
     observe = "position" if any(c.startswith("x_") for c in made.columns) else "distance"
-    if cell is not None:
-        kinds = load_chain(cell).kinds
-        markers = tuple(cell.tool.markers)
-        observe = cell.model.observe
     try:
         return read_measurements(
             f"{name} (not written)",
-            joint_kinds=kinds,
-            marker_names=markers,
-            observe=observe,
+            joint_kinds=made.kinds if cell is None else load_chain(cell).kinds,
+            marker_names=() if cell is None else tuple(cell.tool.markers),
+            observe=observe if cell is None else cell.model.observe,
             text=text,
         )
     except InputError as error:
-        raise InputError(f"{error}{_meant(made, str(error))}") from None
-
-
-def _meant(made: Assembled, message: str) -> str:
-    """Where the line that a message names comes from."""
-    found = re.search(r"line (\d+)", message)
-    row = int(found[1]) - 2 if found else -1
-    return f" (from {made.origin[row]})" if 0 <= row < len(made) else ""
+        named = re.search(r"line (\d+)", str(error))
+        row = int(named[1]) - 2 if named else -1
+        meant = f" (from {made.origin[row]})" if 0 <= row < len(made) else ""
+        raise InputError(f"{error}{meant}") from None
 
 
 # Whether an imported table can be right: its units, and whether the robot of a cell fits it.
@@ -394,7 +384,7 @@ LARGEST_SIGMA_M = 5e-3
 def plausibility(made: Assembled, table: Measurements, observe: str | None) -> list[str]:
     """Sentences about columns that are likely in another unit, and about pairs that are missing."""
     with np.errstate(over="ignore"):  # numbers of 1e300 are told as implausible, too
-        warnings = [*_joints(made, table), *_positions(table)]
+        warnings = [told for told in (_joints(made, table), _positions(table)) if told]
         force = np.linalg.norm(table.force, axis=1)
     if force.max() > LARGEST_FORCE_N:
         warnings.append(
@@ -408,65 +398,54 @@ def plausibility(made: Assembled, table: Measurements, observe: str | None) -> l
         warnings.append(
             "some forces point up (+z of the tracker's frame); a hanging load is negative"
         )
-    if observe == "deflection":
-        warnings += _pairs(table)
+    labels, loaded = table.configuration_labels, np.any(table.force != 0, axis=1)
+    states = [set(loaded[table.configuration == code]) for code in range(len(labels))]
+    lonely = [label for label, found in zip(labels, states, strict=True) if len(found) == 1]
+    if observe == "deflection" and lonely:
+        warnings.append(
+            f"{len(lonely)} of {len(labels)} configurations were not measured both "
+            f"unloaded and loaded, as deflections need: {listed(lonely, 8)}"
+        )
     return warnings
 
 
-def _joints(made: Assembled, table: Measurements) -> list[str]:
-    revolute = np.array([kind == "revolute" for kind in made.kinds])
-    q = table.q[:, revolute]
+def _joints(made: Assembled, table: Measurements) -> str:
+    q = table.q[:, np.array([kind == "revolute" for kind in made.kinds])]
     if not q.size:
-        return []
+        return ""
     first = next(header for header in made.columns if header.startswith("q1"))
     if np.abs(q).max() > LARGEST_TURN:
-        return [
+        return (
             f"a joint stands at {np.degrees(np.abs(q).max()):.4g}°, more than two turns: degrees "
             "read as radians? Map q#_deg"
-        ]
+        )
     several = len(np.unique(table.q, axis=0)) >= 5
     span = np.degrees(np.ptp(q, axis=0)).max()
     if several and first.endswith("_deg") and span < SMALLEST_SPREAD_DEG:
-        return [f"no joint moves by more than {span:.3g}°: radians read as degrees? Map q#_rad"]
+        return f"no joint moves by more than {span:.3g}°: radians read as degrees? Map q#_rad"
     still = [f"joint {j + 1}" for j in range(table.q.shape[1]) if np.ptp(table.q[:, j]) == 0]
     if several and still:
-        return [f"{listed(still)} never moved; is it mapped to the right column?"]
-    return []
+        return f"{listed(still)} never moved; is it mapped to the right column?"
+    return ""
 
 
-def _positions(table: Measurements) -> list[str]:
+def _positions(table: Measurements) -> str:
     if table.position is None:
-        return []
+        return ""
     far = float(np.linalg.norm(table.position, axis=1).max())
     spread = float(np.linalg.norm(np.ptp(table.position, axis=0)))
     if far > FARTHEST_M or spread > LARGEST_SPREAD_M:
-        return [
+        return (
             f"points lie up to {far:.3g} m from the tracker and span {spread:.3g} m: mm read as m? "
             "Map x_mm, y_mm, z_mm"
-        ]
+        )
     moved = float(np.ptp(table.q, axis=0).max()) if len(table) else 0.0
     if moved > 0.3 and spread < LEAST_SPREAD_M:
-        return [
+        return (
             f"all points lie within {spread * 1e3:.3g} mm although the arm moved: m read as mm? "
             "Map x_m, y_m, z_m"
-        ]
-    return []
-
-
-def _pairs(table: Measurements) -> list[str]:
-    """Configurations that lack the loaded or the unloaded state, which deflections need."""
-    loaded = np.any(table.force != 0, axis=1)
-    lonely = [
-        label
-        for code, label in enumerate(table.configuration_labels)
-        if (here := table.configuration == code).any() and len(set(loaded[here])) < 2
-    ]
-    if not lonely:
-        return []
-    return [
-        f"{len(lonely)} of {len(table.configuration_labels)} configurations were not measured both "
-        f"unloaded and loaded, as deflections need: {listed(lonely, 8)}"
-    ]
+        )
+    return ""
 
 
 SLACK = 1e-6  # rad or m beyond a limit that rounding explains

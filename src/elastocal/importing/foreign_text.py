@@ -8,11 +8,10 @@ import math
 import re
 import signal
 import threading
-import time
 from bisect import bisect_left
 from collections.abc import Callable, Iterable, Iterator, Sequence
 from contextlib import contextmanager, suppress
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from datetime import UTC, datetime
 from pathlib import Path
 
@@ -37,6 +36,7 @@ SHOWN = 120
 
 # Whether the cells of a line are the header that a mapping asks for, or numbers where it has them.
 Judge = Callable[[Sequence[str]], bool]
+Line = tuple[int, list[str]]  # its number and cells
 
 MISSING = ("", "-", "--", "---", "n/a", "na", "nan", "none", "null")
 ISO = "ISO 8601"
@@ -83,32 +83,29 @@ def read_lines(path: str | Path, encoding: str = "auto") -> ForeignText:
 
 def _decode(source: str, data: bytes, encoding: str) -> tuple[str, str]:
     """The text, and what its encoding is called."""
-    if encoding == "auto":
-        for mark, codec, name in _MARKS:
-            if data.startswith(mark):
-                return decoded(source, data, SAVE_AS, codec, name), name
-        wide = _wide(data)
-        if wide:
-            return decoded(source, data, SAVE_AS, wide, "UTF-16"), "UTF-16"
-        plain = "ASCII" if data.isascii() else "UTF-8"
-        for codec, name in (("utf-8", plain), ("cp1252", "Windows-1252")):
-            with suppress(UnicodeDecodeError):
-                return data.decode(codec), name
-        return data.decode("latin-1"), "Latin-1"
-    codec = {"utf-8": "utf-8-sig"}.get(encoding, encoding)
-    if encoding == "utf-16" and not data.startswith(codecs.BOM_UTF16):
-        codec = _wide(data) or "utf-16-le"
-    return decoded(source, data, SAVE_AS, codec, encoding), encoding
+    if encoding != "auto":
+        codec = "utf-8-sig" if encoding == "utf-8" else encoding
+        if encoding == "utf-16" and not data.startswith(codecs.BOM_UTF16):
+            codec = _wide(data) or "utf-16-le"
+        return decoded(source, data, SAVE_AS, codec, encoding), encoding
+    for mark, codec, name in _MARKS:
+        if data.startswith(mark):
+            return decoded(source, data, SAVE_AS, codec, name), name
+    if codec := _wide(data):
+        return decoded(source, data, SAVE_AS, codec, "UTF-16"), "UTF-16"
+    plain = "ASCII" if data.isascii() else "UTF-8"
+    for codec, name in (("utf-8", plain), ("cp1252", "Windows-1252")):
+        with suppress(UnicodeDecodeError):
+            return data.decode(codec), name
+    return data.decode("latin-1"), "Latin-1"
 
 
-def _wide(data: bytes) -> str | None:
+def _wide(data: bytes) -> str:
     """UTF-16 without a byte order mark shows by zeros at every other place."""
-    start = data[:4000]
-    even, odd = start[0::2].count(0), start[1::2].count(0)
-    for codec, many, few in (("utf-16-le", odd, even), ("utf-16-be", even, odd)):
-        if many > 0.4 * len(start) / 2 and few < many / 4:
-            return codec
-    return None
+    even, odd = (data[at:4000:2].count(0) for at in (0, 1))
+    if max(even, odd) <= max(0.2 * min(len(data), 4000), 4 * min(even, odd)):
+        return ""
+    return "utf-16-le" if odd > even else "utf-16-be"
 
 
 def unit_in_comments(where: str, pattern: str | None, comments: Sequence[str]) -> str | None:
@@ -124,12 +121,9 @@ def unit_in_comments(where: str, pattern: str | None, comments: Sequence[str]) -
             f"{where}: unit_comment = {quoted(pattern)} has no group (?P<unit>…); name the part "
             "that is the unit so"
         )
-    with bounded_search(where) as search:
-        for comment in comments:
-            found = search(expression, comment)
-            if found and found["unit"] and known_unit(found["unit"]):
-                return found["unit"]
-    return None
+    with bounded(where, comments):
+        found = (match["unit"] for text in comments if (match := expression.search(text)))
+        return next((unit for unit in found if unit and known_unit(unit)), None)
 
 
 def compiled(where: str, key: str, pattern: str) -> re.Pattern[str]:
@@ -145,44 +139,28 @@ def compiled(where: str, key: str, pattern: str) -> re.Pattern[str]:
 PATIENCE = 2.0  # s of processor time; a letter and a text have theirs beside it
 PER_LETTER, PER_TEXT = 2e-6, 2e-5  # s, twenty times what such expressions take
 
-Search = Callable[[re.Pattern[str], str], re.Match[str] | None]
-
 
 @contextmanager
-def bounded_search(where: str) -> Iterator[Search]:
-    """In a `with` block, Pattern.search for expressions of a mapping, which may be exponential.
-
-    Raises InputError where it takes longer than PATIENCE and what any number of texts may take:
-    in the main thread, and where the system has a timer.
-    """
-    now: tuple[str, str] | None = None
-    letters = texts = 0
-    begun = time.thread_time()
-
-    def search(expression: re.Pattern[str], text: str) -> re.Match[str] | None:
-        nonlocal now, letters, texts
-        letters, texts = letters + len(text), texts + 1
-        now = expression.pattern, text
-        found = expression.search(text)
-        now = None
-        return found
-
-    def look(number: int, frame: object) -> None:
-        allowed = PATIENCE + PER_LETTER * letters + PER_TEXT * texts
-        if now is not None and time.thread_time() - begun > allowed:
-            raise InputError(
-                f"{where}: the expression {quoted(now[0])} takes too long to tell whether it is "
-                f"in {quoted(now[1])}; write it without repeats of repeats, as (a+)+"
-            )
-
+def bounded(where: str, texts: Sequence[str]) -> Iterator[None]:
+    """In a `with` block, expressions of a mapping, which may be exponential, are looked for in
+    these texts.  Raises InputError where that takes longer than any number of them may: in the main
+    thread, and where the system has a timer."""
     main = threading.current_thread() is threading.main_thread()
-    if not (main and hasattr(signal, "SIGVTALRM")):
-        yield search
+    if not (texts and main and hasattr(signal, "SIGVTALRM")):
+        yield
         return
-    before = signal.signal(signal.SIGVTALRM, look)
-    signal.setitimer(signal.ITIMER_VIRTUAL, PATIENCE / 4, PATIENCE / 4)
+
+    def late(number: int, frame: object) -> None:
+        raise InputError(
+            f"{where}: an expression of the mapping takes too long; write it without repeats of "
+            "repeats, as (a+)+"
+        )
+
+    before = signal.signal(signal.SIGVTALRM, late)
+    allowed = PATIENCE + PER_TEXT * len(texts) + PER_LETTER * sum(map(len, texts))
+    signal.setitimer(signal.ITIMER_VIRTUAL, allowed)
     try:
-        yield search
+        yield
     finally:
         signal.setitimer(signal.ITIMER_VIRTUAL, 0.0)
         signal.signal(signal.SIGVTALRM, before)
@@ -196,7 +174,7 @@ class Rows:
     """
 
     header: tuple[str, ...]
-    rows: list[tuple[int, list[str]]]
+    rows: list[Line]
     ignored: list[tuple[int, str]]
     header_line: int = 0
     split_at: str = ""
@@ -217,29 +195,27 @@ def table_rows(
     marks = tuple(settings.comments or ())
     skip = None if settings.ignore is None else compiled(text.source, "ignore", settings.ignore)
     content, comments, ignored = [], [], []
-    with bounded_search(text.source) as search:
+    with bounded(text.source, text.lines if skip else ()):
         for number, line in enumerate(text.lines, start=1):
             bare = line.strip()
-            if not bare:
-                continue
             if marks and bare.startswith(marks):
                 comments.append((number, bare))
-            elif skip is not None and search(skip, line):
+            elif bare and skip is not None and skip.search(line):
                 ignored.append((number, f"matches ignore: {bare[:SHOWN]}"))
-            else:
+            elif bare:
                 content.append((number, line))
     if not content:
         raise InputError(f"{text.source}: only comments and blank lines; export the points again")
-    delimiter: str = settings.delimiter or "auto"
-    if delimiter == "auto":
-        delimiter = _sniffed(content[:SAMPLE], comments[:SAMPLE], marks, is_header)
-    split = _Splitter(text.source, delimiter)
     if is_header is not None:
-        header_line, header = _named_header(split, content, comments, marks, is_header)
+        delimiter, header_line, header = _named_header(
+            text.source, settings, content, comments, is_header
+        )
     else:
-        header_line, header = _unnamed_header(text, split, content, is_data)
-    rows: list[tuple[int, list[str]]] = []
-    for number, cells in split.all(content):
+        delimiter = settings.delimiter or "auto"
+        delimiter = _by_numbers(content)[0] if delimiter == "auto" else delimiter
+        header_line, header = _unnamed_header(text.source, delimiter, content, is_data)
+    rows: list[Line] = []
+    for number, cells in _split(text.source, delimiter, content):
         if is_header is None and header_line == 0 and not rows and not is_data(cells):
             ignored.append((number, "stands above the first reading"))
         elif number < header_line:
@@ -253,96 +229,81 @@ def table_rows(
     if not rows:
         raise InputError(f"{text.source}: a header but no readings below it; export the points")
     told = tuple(line for _, line in comments)
-    return Rows(tuple(header), rows, ignored, header_line, delimiter, told)
+    return Rows(header, rows, ignored, header_line, delimiter, told)
 
 
-def _sniffed(
-    content: list[tuple[int, str]],
-    comments: list[tuple[int, str]],
-    marks: tuple[str, ...],
-    is_header: Judge | None,
-) -> str:
-    """The delimiter that leaves the most cells that are numbers; commas may be decimal marks.
+def _split(source: str, name: str, lines: Sequence[tuple[int, str]]) -> Iterator[Line]:
+    """(line number, cells) of each line; a quotation mark that runs on is an error."""
+    reader = csv.reader(
+        (" ".join(line.split()) if name == "space" else line for _, line in lines),
+        delimiter=DELIMITER_NAMES[name], skipinitialspace=True,
+    )  # fmt: skip
+    for before, cells in enumerate(reader):
+        number, line = lines[before]
+        if reader.line_num != before + 1:
+            raise InputError(
+                f"{source}, line {number}: quotation marks do not match in "
+                f"{quoted(line.strip())}; close them on the same line"
+            )
+        yield number, cells
 
-    Where a header is looked for, it must show with that delimiter.
-    """
+
+def _by_numbers(content: list[tuple[int, str]]) -> list[str]:
+    """Delimiters by how many cells that are numbers they leave in a line of the median; commas may
+    be decimal marks."""
 
     def numbers(delimiter: str) -> int:
-        split = _Splitter("", delimiter)
         counts = []
-        for _, line in content:
+        for line in content[:SAMPLE]:
             with suppress(InputError):
-                cells = split.one(0, line)
+                ((_, cells),) = _split("", delimiter, [line])
                 counts.append(sum(bool(NUMBER.fullmatch(cell.strip())) for cell in cells))
         return sorted(counts)[len(counts) // 2] if counts else 0
 
-    best = sorted(DELIMITER_NAMES, key=numbers, reverse=True)
-    if is_header is not None:
-        for delimiter in best:
-            with suppress(InputError):
-                split = _Splitter("", delimiter)
-                if _named_header(split, content, comments, marks, is_header)[0]:
-                    return delimiter
-    return best[0]
-
-
-class _Splitter:
-    def __init__(self, source: str, delimiter: str) -> None:
-        self.source, self.name = source, delimiter
-        self.character = DELIMITER_NAMES[delimiter]
-
-    def one(self, number: int, line: str) -> list[str]:
-        return next(cells for _, cells in self.all([(number, line)]))
-
-    def all(self, lines: Sequence[tuple[int, str]]) -> Iterator[tuple[int, list[str]]]:
-        """(line number, cells) of each line; a quotation mark that runs on is an error."""
-        reader = csv.reader(
-            (" ".join(line.split()) if self.name == "space" else line for _, line in lines),
-            delimiter=self.character, skipinitialspace=True,
-        )  # fmt: skip
-        before = 0
-        for cells in reader:
-            number, line = lines[before]
-            if reader.line_num != before + 1:
-                raise InputError(
-                    f"{self.source}, line {number}: quotation marks do not match in "
-                    f"{quoted(line.strip())}; close them on the same line"
-                )
-            before = reader.line_num
-            yield number, cells
+    return sorted(DELIMITER_NAMES, key=numbers, reverse=True)
 
 
 def _named_header(
-    split: _Splitter, content: list[tuple[int, str]], comments: list[tuple[int, str]],
-    marks: tuple[str, ...], is_header: Judge,
-) -> tuple[int, tuple[str, ...]]:  # fmt: skip
+    source: str, settings: TextSourceKeys, content: list[tuple[int, str]],
+    comments: list[tuple[int, str]], is_header: Judge,
+) -> tuple[str, int, tuple[str, ...]]:  # fmt: skip
+    """The delimiter with which a line is the header, that line's number (0: none is) and cells."""
     # Some write the names of the columns as a comment.
-    for some, off in ((content, ()), (comments, sorted(marks, key=len, reverse=True))):
-        for number, line in some[:SAMPLE]:
-            for mark in off:
-                line = line.removeprefix(mark)
-            cells = tuple(cell.strip() for cell in split.one(number, line))
-            if is_header(cells):
-                return number, cells
-    return 0, ()
+    marks = sorted(settings.comments or (), key=len, reverse=True)
+    bare = []
+    for number, line in comments[:SAMPLE]:
+        for mark in marks:
+            line = line.removeprefix(mark)
+        bare.append((number, line))
+    chosen: str = settings.delimiter or "auto"
+    tried = _by_numbers(content) if chosen == "auto" else [chosen]
+    for delimiter in tried:
+        try:
+            for one in [*content[:SAMPLE], *bare]:
+                ((number, cells),) = _split(source, delimiter, [one])
+                header = tuple(cell.strip() for cell in cells)
+                if is_header(header):
+                    return delimiter, number, header
+        except InputError:  # quotation marks that do not match with this one
+            if chosen != "auto":
+                raise
+    return tried[0], 0, ()
 
 
 def _unnamed_header(
-    text: ForeignText, split: _Splitter, content: list[tuple[int, str]], is_data: Judge
+    source: str, delimiter: str, content: list[tuple[int, str]], is_data: Judge
 ) -> tuple[int, tuple[str, ...]]:
-    before: tuple[int, list[str]] | None = None
-    for number, line in content[:SAMPLE]:
-        cells = split.one(number, line)
+    before: Line = 0, []
+    for number, cells in _split(source, delimiter, content[:SAMPLE]):
         if is_data(cells):
-            if before is not None and len(before[1]) == len(cells):
-                return before[0], tuple(cell.strip() for cell in before[1])
-            return 0, ()
+            alike = len(before[1]) == len(cells)
+            return (before[0], tuple(cell.strip() for cell in before[1])) if alike else (0, ())
         before = number, cells
     number, line = content[0]
     raise InputError(
-        f"{text.source}, line {number}: no numbers where the mapping has them, in "
+        f"{source}, line {number}: no numbers where the mapping has them, in "
         f"{quoted(line.strip())} and the {min(len(content), SAMPLE) - 1} lines after it (columns "
-        f"split at {split.name!r}); correct the places or the delimiter in [source]"
+        f"split at {delimiter!r}); correct the places or the delimiter in [source]"
     )
 
 
@@ -413,43 +374,31 @@ class NumberCells:
         return InputError(f"{found or f'{where}: {quoted(cell)} is not a number'}; {advice}")
 
 
-class Clock:
-    """Texts → seconds since 1970 (UTC); a time without a zone is taken as UTC.
+def seconds_of(
+    source: str, lines: Sequence[int], texts: Sequence[str], formats: Sequence[str]
+) -> list[float]:
+    """Seconds since 1970 (UTC) of the times of a column; one without a zone is taken as UTC.
 
-    The first of `formats` (strptime, or ISO 8601) that reads a column's first text reads all.
+    The first of `formats` (strptime, or ISO 8601) that reads the first text reads all.  Raises
+    InputError where none does.
     """
-
-    def __init__(self, formats: Sequence[str]) -> None:
-        self.formats = tuple(formats)
-        self.chosen: str | None = None
-
-    def seconds(self, text: str) -> float:
-        """Seconds of one text.  Raises ValueError where no format fits."""
-        for candidate in (self.chosen,) if self.chosen else (*self.formats, ISO):
-            with suppress(ValueError):
-                value = _moment(text, candidate)
-                self.chosen = candidate
-                return value
-        raise ValueError(text)
-
-    def complaint(self, where: str, text: str) -> InputError:
-        """What to say of a text that `seconds` did not take."""
-        expected = self.chosen or " or ".join([*self.formats, ISO])
-        return InputError(
-            f"{where}: {quoted(text)} is no time of the form {expected}; set time_format in "
-            "[[source]]"
-        )
-
-
-def _moment(text: str, form: str) -> float:
-    bare = " ".join(text.split())
-    moment = datetime.fromisoformat(bare) if form == ISO else datetime.strptime(bare, form)
-    if moment.tzinfo is None:
-        moment = moment.replace(tzinfo=UTC)
-    try:
-        return moment.timestamp()
-    except OverflowError:
-        raise ValueError(text) from None
+    chosen, found = [*formats, ISO], list[float]()
+    for line, text in zip(lines, texts, strict=True):
+        for form in chosen:
+            with suppress(ValueError, OverflowError):
+                bare = " ".join(text.split())
+                moment = (
+                    datetime.fromisoformat(bare) if form == ISO else datetime.strptime(bare, form)
+                )
+                found.append((moment if moment.tzinfo else moment.replace(tzinfo=UTC)).timestamp())
+                chosen = [form]
+                break
+        else:
+            raise InputError(
+                f"{source}, line {line}: {quoted(text)} is no time of the form "
+                f"{' or '.join(chosen)}; set time_format in [[source]]"
+            )
+    return found
 
 
 KRL_AXES = tuple(f"{letter}{i}" for letter in "AE" for i in range(1, 7))
@@ -464,105 +413,86 @@ _RAPID_NAME = re.compile(r"(?:\b(\w++)\s++)?\b([A-Za-z]\w*+)\s*+(\{[\d,\s]*+\})?
 _RAPID_PAIR = re.compile(r"\[\s*+\[([^\[\]]*+)\]\s*+,\s*+\[([^\[\]]*+)\]\s*+\]")
 
 
-def krl_rows(text: ForeignText) -> Rows:
-    """Every aggregate of A1, A2 … (and E1 …) of a KRL .dat or .src file, or of a log of them.
+def program_rows(text: ForeignText, kind: str) -> Rows:
+    """The joint values in a robot program, KRL or RAPID, or in a log of its variables.
 
-    Aggregates of FRAME, POS and E6POS (X, Y, Z) hold no joint values and are passed over, named.
-    Raises InputError for a joint value that is no number and where no aggregate has any.
+    KRL: every aggregate of A1, A2 … (and E1 …); FRAME, POS and E6POS (X, Y, Z) are passed over.
+    RAPID: every jointtarget [[rax_1 … rax_6], [eax_a … eax_f]], an array's members named P{1},
+    P{2} …; robtargets hold no joint values and o_jointtarget is the position before a correction:
+    both are passed over.  What is passed over is named.
+    Raises InputError for a joint value that is no number and where there is none.
     """
-    found = Rows(("name", *KRL_AXES), [], [], split_at="KRL")
-    whole = "\n".join(_uncommented(line, ";") for line in text.lines)
-    count = _line_counter(whole)
-    for match in _KRL.finditer(whole):
-        line = count(match.start(2))
-        # The display of a variable writes the type too: {E6AXIS: A1 0.0, …}
-        body = re.sub(r"^\s*E?\d?[A-Za-z]*\d*AXIS\s*:", "", match[2], flags=re.IGNORECASE)
-        parts = [m for part in body.split(",") if (m := _KRL_PART.fullmatch(part.strip()))]
-        values = {m[1].upper(): m[2].strip() for m in parts}
-        if "A1" not in values:
-            if "X" in values:
-                name = match[1] or "an aggregate"
-                found.ignored.append((line, f"{name} is a Cartesian position, not joint values"))
+    axes, mark, read, what = {
+        "krl": (KRL_AXES, ";", _krl, "no {A1 …, A2 …} with joint values"),
+        "rapid": (RAPID_AXES, "!", _rapid, "no jointtarget [[…], […]]"),
+    }[kind]
+    # Comments, outside quotation marks, go.
+    bare = re.compile(rf"""(?:[^"{mark}]|"[^"]*(?:"|$))*""")
+    whole = "\n".join(found[0] for line in text.lines if (found := bare.match(line)))
+    ends = [match.start() for match in re.finditer("\n", whole)]
+    rows: list[Line] = []
+    ignored: list[tuple[int, str]] = []
+    for offset, name, values in read(whole):
+        line = bisect_left(ends, offset) + 1
+        if isinstance(values, str):
+            ignored.append((line, f"{name} {values}"))
             continue
-        given = [_value(text, line, axis, values[axis]) if axis in values else ""
-                 for axis in KRL_AXES]  # fmt: skip
-        found.rows.append((line, [match[1] or "", *given]))
-    return _complete(text, found, "no {A1 …, A2 …} with joint values")
-
-
-def rapid_rows(text: ForeignText) -> Rows:
-    """Every jointtarget [[rax_1 … rax_6], [eax_a … eax_f]] of a RAPID module or a log of them.
-
-    An array's members are named P{1}, P{2} …; robtargets hold no joint values, and o_jointtarget
-    is the position before a correction: both are passed over, named.
-    Raises InputError for a value that is no number and where there is no jointtarget.
-    """
-    found = Rows(("name", *RAPID_AXES), [], [], split_at="RAPID")
-    whole = "\n".join(_uncommented(line, "!") for line in text.lines)
-    count = _line_counter(whole)
-    start = 0
-    for statement in re.split(r";", whole):
-        _rapid_statement(text, found, statement, start, count)
-        start += len(statement) + 1
-    return _complete(text, found, "no jointtarget [[…], […]]")
-
-
-def _rapid_statement(
-    text: ForeignText, found: Rows, statement: str, start: int, count: Callable[[int], int]
-) -> None:
-    declared = _RAPID_NAME.search(statement)
-    kind = (declared[1] or "").lower() if declared else ""
-    name = declared[2] if declared else ""
-    if kind in ("robtarget", "o_robtarget", "o_jointtarget") and declared:
-        reason = "the position before a correction" if kind[0:2] == "o_" else "no joint values"
-        found.ignored.append((count(start + declared.start(2)), f"{name} is {kind}: {reason}"))
-        return
-    pairs = [
-        (match, [[part.strip() for part in match[k].split(",")] for k in (1, 2)])
-        for match in _RAPID_PAIR.finditer(statement)
-    ]
-    targets = [(m, parts) for m, parts in pairs if len(parts[0]) == 6 and len(parts[1]) == 6]
-    several = bool(declared and declared[3])
-    for k, (match, (robot, external)) in enumerate(targets, start=1):
-        line = count(start + match.start())
-        both = zip(RAPID_AXES, [*robot, *external], strict=True)
-        given = [_value(text, line, axis, cell) for axis, cell in both]
-        cells = ["" if float(cell) >= NOT_CONNECTED else cell for cell in given]
-        label = f"{name}{{{k}}}" if several else name
-        found.rows.append((line, [label, *cells]))
-
-
-def _value(text: ForeignText, line: int, axis: str, cell: str) -> str:
-    if not _NUMBER.fullmatch(cell):
-        raise InputError(
-            f"{text.source}, line {line}: {axis} is {quoted(cell)}, not a number; log values, not "
-            "expressions"
-        )
-    return cell
-
-
-def _complete(text: ForeignText, found: Rows, what: str) -> Rows:
-    if not found.rows:
-        n = len(found.ignored)
+        for axis, cell in values.items():
+            if not _NUMBER.fullmatch(cell):
+                raise InputError(
+                    f"{text.source}, line {line}: {axis} is {quoted(cell)}, not a number; log "
+                    "values, not expressions"
+                )
+        kept = {axis: v for axis, v in values.items() if kind == "krl" or float(v) < NOT_CONNECTED}
+        rows.append((line, [name, *(kept.get(axis, "") for axis in axes)]))
+    if not rows:
+        n = len(ignored)
         passed_over = f" ({n} Cartesian positions passed over)" if n else ""
         raise InputError(
             f"{text.source}: {what} in {len(text.lines)} lines{passed_over}; check the file, or "
             "its format in [source.text]"
         )
     # Axes that no row has (E1 … of a robot without them) are no columns.
-    names = range(len(found.header))
-    used = [i for i in names if i == 0 or any(cells[i] for _, cells in found.rows)]
-    rows = [(line, [cells[i] for i in used]) for line, cells in found.rows]
-    return replace(found, header=tuple(found.header[i] for i in used), rows=rows)
+    header = ("name", *axes)
+    used = [i for i in range(len(header)) if i == 0 or any(cells[i] for _, cells in rows)]
+    rows = [(line, [cells[i] for i in used]) for line, cells in rows]
+    return Rows(tuple(header[i] for i in used), rows, ignored, split_at=kind.upper())
 
 
-def _uncommented(line: str, mark: str) -> str:
-    """The line up to a comment mark outside quotation marks."""
-    found = re.match(rf"""(?:[^"{mark}]|"[^"]*(?:"|$))*""", line)
-    return found[0] if found else line
+# Offset into the text, name, and the values by axis or why there are none.
+Found = Iterator[tuple[int, str, dict[str, str] | str]]
 
 
-def _line_counter(text: str) -> Callable[[int], int]:
-    """The line in which an offset into the text lies."""
-    ends = [match.start() for match in re.finditer("\n", text)]
-    return lambda offset: bisect_left(ends, offset) + 1
+def _krl(whole: str) -> Found:
+    for match in _KRL.finditer(whole):
+        # The display of a variable writes the type too: {E6AXIS: A1 0.0, …}
+        body = re.sub(r"^\s*E?\d?[A-Za-z]*\d*AXIS\s*:", "", match[2], flags=re.IGNORECASE)
+        parts = [m for part in body.split(",") if (m := _KRL_PART.fullmatch(part.strip()))]
+        values = {m[1].upper(): m[2].strip() for m in parts}
+        if "A1" in values:
+            known = {axis: values[axis] for axis in KRL_AXES if axis in values}
+            yield match.start(2), match[1] or "", known
+        elif "X" in values:
+            told = "is a Cartesian position, not joint values"
+            yield match.start(2), match[1] or "an aggregate", told
+
+
+def _rapid(whole: str) -> Found:
+    start = 0
+    for statement in whole.split(";"):
+        declared = _RAPID_NAME.search(statement)
+        kind = (declared[1] or "").lower() if declared else ""
+        name = declared[2] if declared else ""
+        if declared and kind in ("robtarget", "o_robtarget", "o_jointtarget"):
+            before = kind.startswith("o_")
+            reason = "the position before a correction" if before else "no joint values"
+            yield start + declared.start(2), name, f"is {kind}: {reason}"
+        else:
+            several, k = bool(declared and declared[3]), 0
+            for match in _RAPID_PAIR.finditer(statement):
+                cells = [[part.strip() for part in match[k].split(",")] for k in (1, 2)]
+                if list(map(len, cells)) == [6, 6]:
+                    k += 1
+                    values = dict(zip(RAPID_AXES, cells[0] + cells[1], strict=True))
+                    yield start + match.start(), f"{name}{{{k}}}" if several else name, values
+        start += len(statement) + 1

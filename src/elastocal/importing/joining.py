@@ -30,9 +30,15 @@ def with_joints(
     brought into the order of [joints] names, else of `model_names` where the file has them all.
     Raises InputError for gaps in the joint numbers and for lists of another length.
     """
-    stems = _stems(records)
+    stems = joint_stems(records.numbers)
     if not stems:
         return records
+    wrong = [stem for i, stem in enumerate(stems, 1) if stem != f"q{i}"]
+    if wrong:
+        raise InputError(
+            f"{records.source}: the mapping fills {listed(stems)}, but not q"
+            f"{int(wrong[0][1:]) - 1}; joints are numbered from 1 without gaps"
+        )
     joints = joints or JointsTable()
     values = [records.numbers[stem] for stem in stems]
     units = [records.units[stem] for stem in stems]
@@ -72,17 +78,6 @@ def with_joints(
     for j in range(n):
         numbers[f"q{j + 1}"], own[f"q{j + 1}"] = values[j], units[j]
     return replace(records, numbers=numbers, units=own)
-
-
-def _stems(records: Records) -> list[str]:
-    stems = joint_stems(records.numbers)
-    wrong = [stem for i, stem in enumerate(stems, 1) if stem != f"q{i}"]
-    if wrong:
-        raise InputError(
-            f"{records.source}: the mapping fills {listed(stems)}, but not q"
-            f"{int(wrong[0][1:]) - 1}; joints are numbered from 1 without gaps"
-        )
-    return stems
 
 
 def _order(
@@ -176,11 +171,11 @@ def pooled(records: Sequence[Records]) -> Records:
 def _loads(records: Records) -> list[str]:
     """The load of each row: what its name or column says, else what its file is said to be."""
     named = records.labels.get("load")
-    if named is None and records.load is None:
-        raise InputError(
-            f"{records.source}: says no load, other files do; give load in its [[source]], or a "
-            "group (?P<load>…) in its pattern"
-        )
+    require(
+        named is not None or records.load is not None,
+        f"{records.source}: says no load, other files do; give load in its [[source]], or a "
+        "group (?P<load>…) in its pattern",
+    )
     return named if named is not None else [str(records.load)] * len(records)
 
 
@@ -214,13 +209,16 @@ def dwells(
         end = max(int(np.searchsorted(time, time[start] + shortest)), start + 1)
         if end >= m:
             break
-        spread = _spread(q[start : end + 1][::-1])[::-1]
-        moved = np.flatnonzero((spread > still).any(axis=1))
+        moved = np.flatnonzero(_over(q[start : end + 1][::-1], still)[::-1])
         if len(moved):
             # From there to `end` is too much, and every run that starts before holds both.
             start += int(moved[-1]) + 1
             continue
-        end = _last(q, start, still)
+        # Its last row: looked for in longer and longer pieces of the log.
+        size = CHUNK
+        while not (over := _over(q[start : start + size], still)).any() and start + size < m:
+            size *= 2
+        end = start + (int(np.argmax(over)) if over.any() else len(over)) - 1
         found.append((start, end))
         start = end + 1
     first, last = np.array(found, dtype=np.int64).reshape(-1, 2).T
@@ -228,21 +226,10 @@ def dwells(
     return first, last, np.array(middle).reshape(len(found), q.shape[1])
 
 
-def _spread(q: Array) -> Array:
-    """(rows, n) max - min of each joint over the rows so far."""
-    return np.maximum.accumulate(q) - np.minimum.accumulate(q)
-
-
-def _last(q: Array, start: int, still: Array) -> int:
-    """The last row of the run from `start` in which no joint moves by more than `still`."""
-    size = CHUNK
-    while True:
-        over = np.flatnonzero((_spread(q[start : start + size]) > still).any(axis=1))
-        if len(over):
-            return start + int(over[0]) - 1
-        if start + size >= len(q):
-            return len(q) - 1
-        size *= 2
+def _over(q: Array, still: Array) -> NDArray[np.bool_]:
+    """(rows,) whether any joint spans more than `still` over the rows so far."""
+    spread = np.maximum.accumulate(q) - np.minimum.accumulate(q)
+    return np.asarray((spread > still).any(axis=1))
 
 
 def groups_alike(q: Array, tolerance: Array) -> NDArray[np.int64]:

@@ -8,7 +8,7 @@ from __future__ import annotations
 
 import re
 import tomllib
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 from importlib import resources
 from pathlib import Path
@@ -37,16 +37,8 @@ Place = Annotated[int, Field(ge=1)] | Text
 Where = Place | Annotated[list[Place], Field(min_length=1)]
 Texts = Annotated[list[Text], Field(min_length=1)]
 PRESETS = (
-    "spatialanalyzer",
-    "polyworks",
-    "leica",
-    "faro",
-    "spherical",
-    "wide",
-    "kuka",
-    "abb",
-    "ros",
-)
+    "spatialanalyzer", "polyworks", "leica", "faro", "spherical", "wide", "kuka", "abb", "ros",
+)  # fmt: skip
 COLUMNS = (
     'places in the file by column of the measurement table, as in x_mm = "X [mm]", q1_deg = 5, '
     'q#_deg = "A#" or name = "Point"'
@@ -244,20 +236,14 @@ def _with_preset(where: str, source: dict[str, Any]) -> dict[str, Any]:
         base = tomllib.loads(preset_text(name))
     except InputError as error:
         raise InputError(f"{where}: {error}") from None
-    merged = {**base, **source}
-    for part in ("text", "names"):
-        merged[part] = base.get(part, {}) | source.get(part, {})
     # x_mm of the user replaces the preset's x_auto, whichever table either stands in.
     own = source.get("columns", {}) | source.get("optional", {})
     taken = {_UNIT.sub("", column) for column in own} | set(own)
     for part in ("columns", "optional"):
-        kept = {
-            column: at
-            for column, at in base.get(part, {}).items()
-            if _UNIT.sub("", column) not in taken and column not in taken
-        }
-        merged[part] = kept | source.get(part, {})
-    return merged
+        base[part] = {c: at for c, at in base.get(part, {}).items()
+                      if not {c, _UNIT.sub("", c)} & taken}  # fmt: skip
+    tables = ("text", "names", "columns", "optional")
+    return base | source | {part: base.get(part, {}) | source.get(part, {}) for part in tables}
 
 
 # Which column of an export fills which column of the measurement table, and in which unit.
@@ -498,20 +484,15 @@ def resolve(
     Raises InputError for names and numbers that the file does not have, names that stand for
     several columns, and units that contradict the header.
     """
-    columns = [c for target in asked for c in _columns(source, target, header, width)]
-    return tuple(_with_unit(source, column, units, hint) for column in columns)
-
-
-def _columns(
-    source: str, target: ColumnKey, header: Sequence[str], width: int
-) -> Iterator[FileColumn]:
-    """The column of a key where the file has it; of a template those of all joints."""
-    templates = (target.numbered(i) for i in range(1, MOST_JOINTS + 1))
-    for one in templates if target.is_template else (target,):
-        found = _column(source, one, header, width)
-        if found is None:
-            return
-        yield found
+    columns: list[FileColumn] = []
+    for target in asked:
+        joints = (target.numbered(i) for i in range(1, MOST_JOINTS + 1))
+        for one in joints if target.is_template else (target,):
+            found = _column(source, one, header, width)
+            if found is None:
+                break
+            columns.append(_with_unit(source, found, units, hint))
+    return tuple(columns)
 
 
 def _column(source: str, target: ColumnKey, header: Sequence[str], width: int) -> FileColumn | None:

@@ -12,15 +12,14 @@ import numpy as np
 from elastocal.errors import ElastocalError, InputError
 from elastocal.importing.foreign_text import (
     SAMPLE,
-    Clock,
     ForeignText,
     NumberCells,
     Rows,
-    bounded_search,
+    bounded,
     compiled,
-    krl_rows,
-    rapid_rows,
+    program_rows,
     read_lines,
+    seconds_of,
     table_rows,
     unit_in_comments,
 )
@@ -149,8 +148,8 @@ class Records:
             file=np.concatenate([part.file for part in parts]) + first,
             line=np.concatenate([part.line for part in parts]),
             numbers={s: np.concatenate([p.numbers[s] for p in parts]) for s in parts[0].numbers},
-            texts=_stacked([part.texts for part in parts], list(map(len, parts))),
-            labels=_stacked([part.labels for part in parts], list(map(len, parts))),
+            texts=_stacked([(part.texts, len(part)) for part in parts]),
+            labels=_stacked([(part.labels, len(part)) for part in parts]),
             time=np.concatenate(times) if times else None,
         )
 
@@ -159,10 +158,9 @@ def _taken(texts: dict[str, list[str]], rows: IntArray) -> dict[str, list[str]]:
     return {stem: [own[i] for i in rows] for stem, own in texts.items()}
 
 
-def _stacked(parts: Sequence[dict[str, list[str]]], sizes: Sequence[int]) -> dict[str, list[str]]:
-    stems = dict.fromkeys(stem for part in parts for stem in part)
-    both = list(zip(parts, sizes, strict=True))
-    return {s: [text for part, n in both for text in part.get(s, [""] * n)] for s in stems}
+def _stacked(parts: Sequence[tuple[dict[str, list[str]], int]]) -> dict[str, list[str]]:
+    stems = dict.fromkeys(stem for part, _ in parts for stem in part)
+    return {s: [text for part, n in parts for text in part.get(s, [""] * n)] for s in stems}
 
 
 def joint_stems(numbers: Iterable[str]) -> list[str]:
@@ -197,9 +195,8 @@ def _read(
     units: UnitsTable, hint: str | None,
 ) -> Records:  # fmt: skip
     """The rows of a table with these columns."""
-    settings = source.text or TextSourceKeys()
-    width = len(table.rows[0][1])
-    columns = resolve(text.source, asked, table.header, width, units, hint)
+    settings, name = source.text or TextSourceKeys(), text.source
+    columns = resolve(name, asked, table.header, len(table.rows[0][1]), units, hint)
     numeric = [c for c in columns if not c.target.is_text]
     cells = NumberCells(
         settings.decimal or "auto",
@@ -208,33 +205,92 @@ def _read(
         (row[c.index[0]] for _, row in table.rows[:DECIMAL_SAMPLE]
          for c in numeric if c.index[0] < len(row)),
     )  # fmt: skip
-    given = source.time_format or ()
-    formats = (given,) if isinstance(given, str) else given
-    reader = _Reader(text.source, columns, cells, formats)
-    for number, row in table.rows:
-        reader.add(number, row)
-    if not reader.line:
-        number, reason = reader.ignored[0]
+    kept, values, ignored = _rows(name, table, columns, cells)
+    if not kept:
+        number, reason = ignored[0]
         raise InputError(
-            f"{text.source}: none of its {len(table.rows)} rows is complete (line {number}: "
+            f"{name}: none of its {len(table.rows)} rows is complete (line {number}: "
             f"{reason}); correct the places in [source.columns]"
         )
     used = {i for c in columns for i in c.index}
+    head = f"header in line {table.header_line}" if table.header_line else "no header"
+    mark = {"tab": "tabs", "space": "blanks"}.get(table.split_at, f"{table.split_at!r}")
+    program = table.split_at in ("KRL", "RAPID")
     understood = Understood(
-        path=text.source,
+        path=name,
         preset=source.preset,
         role=source.role or "both",
         encoding=text.encoding,
-        layout=_layout(table),
+        layout=table.split_at if program else f"columns split at {mark}, {head}",
         decimal=cells.decimal,
         columns=tuple((c.header, column(c.target.stem, c.unit), c.unit) for c in columns),
-        unused=tuple(
-            name or f"column {i + 1}" for i, name in enumerate(table.header) if i not in used
-        ),
-        rows=len(reader.line),
-        ignored=tuple(sorted([*table.ignored, *reader.ignored])),
+        unused=tuple(n or f"column {i + 1}" for i, n in enumerate(table.header) if i not in used),
+        rows=len(kept),
+        ignored=tuple(sorted([*table.ignored, *ignored])),
     )
-    return reader.records(understood, source)
+    line = np.array([number for number, _ in kept], dtype=np.int64)
+    time: Array | None = None
+    numbers: dict[str, Array] = {}
+    for c, own in zip(numeric, np.array(values).reshape(len(kept), -1).T, strict=True):
+        if c.target.stem == "time":  # seconds and nanoseconds add up
+            time = convert(own, c.unit, "s") + (0.0 if time is None else time)
+        else:
+            spread = c.target.stem.startswith("sigma_") and source.coverage_factor
+            numbers[c.target.stem] = own / spread if spread else own
+    texts = _texts([row for _, row in kept], columns)
+    written = texts.pop("time_text", None)
+    if written is not None and time is None:
+        form = source.time_format or ()
+        formats = [form] if isinstance(form, str) else form
+        time = np.array(seconds_of(name, line.tolist(), written, formats))
+    of = {c.target.stem: c.unit for c in numeric if c.target.stem in numbers}
+    file = np.zeros(len(line), dtype=np.int64)
+    return Records((name,), file, line, numbers, of, texts, time, understood, source.load)
+
+
+def _rows(
+    name: str, table: Rows, columns: Sequence[FileColumn], cells: NumberCells
+) -> tuple[list[tuple[int, list[str]]], list[list[float]], list[tuple[int, str]]]:
+    """The complete rows, their numbers, and the lines of the others with what is missing."""
+    numeric = [c for c in columns if not c.target.is_text]
+    widest = max(columns, key=lambda c: max(c.index))
+    kept, values, ignored = [], [], []
+    for number, row in table.rows:
+        if max(widest.index) >= len(row):
+            raise InputError(
+                f"{name}, line {number}: {len(row)} columns, but {widest.target.key} "
+                f"is column {max(widest.index) + 1} ({widest.header}); correct the line, "
+                "or pass over such lines with ignore in [source.text]"
+            )
+        found = []
+        for c in numeric:
+            cell = row[c.index[0]]
+            try:
+                value = cells.value(cell)
+            except ValueError:
+                raise cells.complaint(name, number, cell, c.header) from None
+            if value is None:
+                ignored.append((number, f"no value in column {c.header}"))
+                break
+            found.append(value)
+        else:
+            kept.append((number, row))
+            values.append(found)
+    return kept, values, ignored
+
+
+def _texts(rows: Sequence[list[str]], columns: Sequence[FileColumn]) -> dict[str, list[str]]:
+    """The texts by column; a load that is a bare size gets the unit in its header."""
+    loads = (re.search(UNIT_OF_LOAD, c.header) for c in columns if c.target.stem == "load")
+    unit = next((found[1] for found in loads if found), "")
+    texts = {}
+    for c in (c for c in columns if c.target.is_text):
+        glue = " " if c.target.stem == "time_text" else "::"
+        found = [glue.join(row[i].strip() for i in c.index) for row in rows]
+        if c.target.stem == "load":
+            found = [f"{t} {unit}".strip() if re.fullmatch(r"[\d.,]+", t) else t for t in found]
+        texts[c.target.stem] = found
+    return texts
 
 
 def _side_by_side(parts: Sequence[Records], markers: Sequence[str]) -> Records:
@@ -272,9 +328,8 @@ def likely_presets(path: Path) -> list[str]:
 
 
 def _table(text: ForeignText, settings: TextSourceKeys, asked: Sequence[ColumnKey]) -> Rows:
-    kind = settings.format or "table"
-    if kind != "table":
-        return (krl_rows if kind == "krl" else rapid_rows)(text)
+    if settings.format in ("krl", "rapid"):
+        return program_rows(text, settings.format)
     guess = NumberCells("auto", settings.thousands or "none", settings.missing or (), ())
     named = by_name(asked)
     places = [c.at for c in asked if c.required and not c.is_text and isinstance(c.at, int)]
@@ -289,90 +344,6 @@ def _table(text: ForeignText, settings: TextSourceKeys, asked: Sequence[ColumnKe
     if named and not table.header_line:
         raise no_header(text.source, asked, table.rows[:SAMPLE])
     return table
-
-
-def _layout(table: Rows) -> str:
-    if table.split_at in ("KRL", "RAPID"):
-        return table.split_at
-    head = f"header in line {table.header_line}" if table.header_line else "no header"
-    mark = {"tab": "tabs", "space": "blanks"}.get(table.split_at, f"{table.split_at!r}")
-    return f"columns split at {mark}, {head}"
-
-
-class _Reader:
-    """Gathers the cells of one file row by row."""
-
-    def __init__(
-        self, source: str, columns: Sequence[FileColumn], cells: NumberCells, formats: Sequence[str]
-    ) -> None:
-        self.source, self.cells = source, cells
-        self.clock = Clock(formats)
-        self.line: list[int] = []
-        self.ignored: list[tuple[int, str]] = []
-        self.numeric = [c for c in columns if not c.target.is_text]
-        self.textual = [c for c in columns if c.target.is_text]
-        self.values: list[list[float]] = [[] for _ in self.numeric]
-        self.texts: list[list[str]] = [[] for _ in self.textual]
-        loads = (re.search(UNIT_OF_LOAD, c.header) for c in columns if c.target.stem == "load")
-        self.load_unit = next((found[1] for found in loads if found), "")
-        self.widest = max(columns, key=lambda c: max(c.index))
-
-    def add(self, number: int, row: list[str]) -> None:
-        if max(self.widest.index) >= len(row):
-            raise InputError(
-                f"{self.source}, line {number}: {len(row)} columns, but {self.widest.target.key} "
-                f"is column {max(self.widest.index) + 1} ({self.widest.header}); correct the line, "
-                "or pass over such lines with ignore in [source.text]"
-            )
-        found = []
-        for place in self.numeric:
-            cell = row[place.index[0]]
-            try:
-                value = self.cells.value(cell)
-            except ValueError:
-                raise self.cells.complaint(self.source, number, cell, place.header) from None
-            if value is None:
-                self.ignored.append((number, f"no value in column {place.header}"))
-                return
-            found.append(value)
-        for values, value in zip(self.values, found, strict=True):
-            values.append(value)
-        for texts, place in zip(self.texts, self.textual, strict=True):
-            glue = " " if place.target.stem == "time_text" else "::"
-            text = glue.join(row[i].strip() for i in place.index)
-            if place.target.stem == "load" and re.fullmatch(r"[\d.,]+", text):
-                text = f"{text} {self.load_unit}".strip()
-            texts.append(text)
-        self.line.append(number)
-
-    def records(self, understood: Understood, source: SourceTable) -> Records:
-        numbers: dict[str, Array] = {}
-        units: dict[str, str] = {}
-        time: Array | None = None
-        for place, values in zip(self.numeric, self.values, strict=True):
-            stem, array = place.target.stem, np.array(values, dtype=np.float64)
-            if stem == "time":
-                seconds = convert(array, place.unit, "s")
-                time = seconds if time is None else time + seconds
-                continue
-            if stem.startswith("sigma_") and source.coverage_factor is not None:
-                array = array / source.coverage_factor
-            numbers[stem], units[stem] = array, place.unit
-        texts = {c.target.stem: t for c, t in zip(self.textual, self.texts, strict=True)}
-        written = texts.pop("time_text", None)
-        if written is not None and time is None:
-            time = np.array([self._time(*at) for at in zip(self.line, written, strict=True)])
-        line = np.array(self.line, dtype=np.int64)
-        file = np.zeros(len(line), dtype=np.int64)
-        return Records(
-            (self.source,), file, line, numbers, units, texts, time, understood, source.load
-        )
-
-    def _time(self, number: int, text: str) -> float:
-        try:
-            return self.clock.seconds(text)
-        except ValueError:
-            raise self.clock.complaint(f"{self.source}, line {number}", text) from None
 
 
 HEIGHT = ("zenith", "elevation")
@@ -518,9 +489,9 @@ def _labels_of_names(
             )
     found: dict[str, list[str]] = {stem: [] for stem in GROUPS}
     bad: list[int] = []
-    with bounded_search(where) as search:
+    with bounded(where, named):
         for i, name in enumerate(named):
-            match = next((m for e in expressions if (m := search(e, name))), None)
+            match = next((m for e in expressions if (m := e.search(name))), None)
             if match is None:
                 bad.append(i)
             groups = match.groupdict() if match else {}

@@ -4,7 +4,9 @@ from __future__ import annotations
 
 import json
 from collections.abc import Sequence
+from contextlib import suppress
 from dataclasses import dataclass, replace
+from functools import cached_property
 from html import escape
 from io import BytesIO
 from pathlib import Path
@@ -19,16 +21,7 @@ from elastocal.files import atomic_write_bytes
 from elastocal.model.chain import Chain
 from elastocal.model.manipulator import Model
 from elastocal.model.observations import Observations
-from elastocal.planning.bodies import (
-    WORLD,
-    Body,
-    cell_bodies,
-    hull,
-    mesh_hull,
-    outward,
-    skeleton,
-    urdf_bodies,
-)
+from elastocal.planning.bodies import cell_bodies, hull, mesh_hull, outward, skeleton, urdf_bodies
 from elastocal.planning.collision import Kinematics
 from elastocal.planning.plan import Plan
 from elastocal.report import blocks
@@ -52,8 +45,8 @@ STOUT, SLIM = 0.038, 0.014
 class Shell:
     """A convex body as triangles: `points` (k, 3) m in its carrier's frame, `faces` (f, 3).
 
-    `carrier`: i ≥ 0 the frame of joint i after its motion, WORLD the base frame for the arm and
-    the data's frame for what stands in the cell.
+    `carrier`: 0 the base frame, i the frame of joint i after its motion; of what stands in the
+    cell 0 is the data's frame.
     """
 
     points: Array
@@ -74,49 +67,40 @@ class Shells:
 
 def shells_of(cell: Cell, chain: Chain) -> Shells:
     """The bodies of a cell; a geometry that cannot be had is replaced by capsules, and said so."""
-    arm, drawn_from = _arm(cell, chain)
+    radii, drawn_from = cell.workspace.link_radius, "capsules between its joints"
+    arm: tuple[Shell, ...] = ()
+    if cell.robot.urdf is not None and not radii:
+        with suppress(ElastocalError):  # no collision geometry, or without its files
+            arm = _shells(urdf_bodies(cell, chain))
+        if sum(len(s.faces) for s in arm) > MOST_TRIANGLES:
+            arm = ()
+        if arm:
+            drawn_from = "the convex hulls of the URDF's collision geometry"
+    if not arm:
+        steps = [*(joint.placement for joint in chain.joints), chain.flange_placement]
+        whole = float(sum(np.linalg.norm(T[:3, 3]) for T in steps)) or 1.0
+        radii = radii or tuple((whole * np.linspace(STOUT, SLIM, chain.n_joints)).tolist())
+        capsules = skeleton(chain, radii, np.eye(4), f"{cell.path or cell.name}: [workspace]")
+        arm = _shells([(body.solid, body.carrier) for body in capsules])
     try:
-        bodies: Sequence[Body] = cell_bodies(cell, chain)
+        bodies = list(cell_bodies(cell, chain))
     except ElastocalError:
-        bodies = ()  # a mesh that is not there stops no report
+        bodies = []  # a mesh that is not there stops no report
     carried = [b for b in bodies if b.kind == "carried" and b.carrier >= 0]
-    around = [b for b in bodies if b.kind == "obstacle"]
     return Shells(
         (*arm, *_shells([(b.solid, b.carrier) for b in carried])),
-        _shells([(b.solid, b.carrier) for b in around]),
+        _shells([(b.solid, -1) for b in bodies if b.kind == "obstacle"]),
         cell.workspace.keep_out,
         drawn_from,
     )
 
 
-def _arm(cell: Cell, chain: Chain) -> tuple[tuple[Shell, ...], str]:
-    radii = cell.workspace.link_radius
-    if cell.robot.urdf is not None and not radii:
-        try:
-            shells = _shells(urdf_bodies(cell, chain))
-        except ElastocalError:
-            shells = ()  # no collision geometry, or its files are not there: meshes are optional
-        if shells and sum(len(s.faces) for s in shells) <= MOST_TRIANGLES:
-            return shells, "the convex hulls of the URDF's collision geometry"
-    if not radii:
-        length = chain_length(chain)
-        radii = tuple(float(r) for r in length * np.linspace(STOUT, SLIM, chain.n_joints))
-    capsules = skeleton(chain, radii, np.eye(4), f"{cell.path or cell.name}: [workspace]")
-    text = "capsules between its joints"
-    return _shells([(body.solid, body.carrier) for body in capsules]), text
-
-
-def chain_length(chain: Chain) -> float:
-    """Sum in m of the distances from joint to joint and to the flange; 1 m where all coincide."""
-    steps = [*(joint.placement for joint in chain.joints), chain.flange_placement]
-    return float(sum(np.linalg.norm(T[:3, 3]) for T in steps)) or 1.0
-
-
 def _shells(solids: Sequence[tuple[Solid, int]]) -> tuple[Shell, ...]:
+    """Of solids and their carriers as collisions have them: 0 the first joint's frame."""
     found = []
     for solid, carrier in solids:
         try:
-            found.append(Shell(*triangles_of(solid), carrier, solid.name))
+            found.append(Shell(*triangles_of(solid), max(carrier, -1) + 1, solid.name))
         except ElastocalError:
             continue  # an unreadable mesh: the others are still worth drawing
     return tuple(found)
@@ -127,36 +111,24 @@ def triangles_of(solid: Solid) -> tuple[Array, IntArray]:
 
     Round shapes become inscribed polyhedra.  Raises InputError for a mesh that cannot be read.
     """
+    R, p = solid.placement[:3, :3], solid.placement[:3, 3]
     if solid.shape == "mesh":
         points, faces = mesh_hull(solid)
-        return points @ solid.placement[:3, :3].T + solid.placement[:3, 3], faces
-    if solid.shape == "cylinder":
-        ring = _ring() * float(solid.size[0])
-        half = np.array([0.0, 0.0, float(solid.size[1]) / 2])
-        cloud = np.vstack([ring - half, ring + half])
-        cloud = cloud @ solid.placement[:3, :3].T + solid.placement[:3, 3]
-    else:
-        centres, radius = hull(solid)
-        ball = _ball() @ solid.placement[:3, :3].T
-        cloud = (centres[:, None] + radius * ball).reshape(-1, 3) if radius else centres
-    return outward(cloud)
-
-
-def _ring() -> Array:
+        return points @ R.T + p, faces
     angle = np.linspace(0, 2 * np.pi, MERIDIANS, endpoint=False)
-    return np.column_stack([np.cos(angle), np.sin(angle), np.zeros(MERIDIANS)])
-
-
-def _ball() -> Array:
-    """Points of the unit sphere: poles, and rings of which one is the equator."""
+    ring = np.column_stack([np.cos(angle), np.sin(angle), np.zeros(MERIDIANS)])
+    if solid.shape == "cylinder":
+        half = np.array([0.0, 0.0, float(solid.size[1]) / 2])
+        ends = [float(solid.size[0]) * ring + side * half for side in (-1, 1)]
+        return outward(np.vstack(ends) @ R.T + p)
+    centres, radius = hull(solid)
+    if not radius:
+        return outward(centres)
+    # Points of the unit sphere: poles, and rings of which one is the equator.
     height = np.sin(np.linspace(-np.pi / 2, np.pi / 2, 2 * PARALLELS + 1))[1:-1]
-    rings = [_ring() * np.sqrt(1 - h * h) + [0.0, 0.0, h] for h in height]
-    return np.vstack([*rings, [[0.0, 0.0, 1.0], [0.0, 0.0, -1.0]]])
-
-
-def base_or_joint(shell: Shell) -> int:
-    """Index of the shell's carrier among the frames (base, joint 1, …, joint n)."""
-    return 0 if shell.carrier == WORLD else shell.carrier + 1
+    rings = [ring * np.sqrt(1 - h * h) + [0.0, 0.0, h] for h in height]
+    ball = np.vstack([*rings, [[0.0, 0.0, 1.0], [0.0, 0.0, -1.0]]]) @ R.T
+    return outward((centres[:, None] + radius * ball).reshape(-1, 3))
 
 
 ARROW = 0.12  # length of a long arrow over the reach of what is drawn
@@ -206,10 +178,10 @@ class Space:
     def bodies(self) -> list[Array]:
         """Points (k, 3) m of the arm's bodies in the first pose."""
         frames = self.poses[self.first].frames
-        placed = [(s.points, frames[base_or_joint(s)]) for s in self.shells.arm]
+        placed = [(s.points, frames[s.carrier]) for s in self.shells.arm]
         return [points @ T[:3, :3].T + T[:3, 3] for points, T in placed]
 
-    @property
+    @cached_property
     def extent(self) -> Array:
         """Corners (2, 3) of the box around everything that is drawn, with room for arrows."""
         every = np.vstack([points for p in self.poses for points in (p.line, p.markers)])
@@ -235,6 +207,47 @@ class Space:
         wanted = ARROW * float(np.ptp(self.extent, axis=0).max()) / long
         power = 10.0 ** np.floor(np.log10(wanted))
         return float(max(f * power for f in (1, 2, 5) if f * power <= wanted))
+
+    @property
+    def json(self) -> str:
+        """For the page's script: lengths in m, arrows in µm; safe within a script element."""
+        content = {
+            "what": self.what,
+            "first": self.first,
+            "scale": self.scale,
+            "arrows": self.has_arrows,
+            "range": self.extent.T.round(3).tolist(),
+            "tracker": None if self.tracker is None else self.tracker.round(3).tolist(),
+            "bodies": [_shell_json(s) for s in self.shells.arm],
+            "things": [_shell_json(s) for s in self.shells.around],
+            "poses": [_pose_json(p) for p in self.poses],
+        }
+        return in_script(content)
+
+
+def _shell_json(s: Shell) -> dict[str, object]:
+    points, faces = s.points.round(4).ravel().tolist(), s.faces.ravel().tolist()
+    return {"carrier": s.carrier, "points": points, "faces": faces}
+
+
+def _pose_json(p: Posed) -> dict[str, object]:
+    return {
+        "name": printable(p.name),
+        "about": printable(p.about),
+        "frames": p.frames[:, :3].round(5).reshape(len(p.frames), 12).tolist(),
+        "line": p.line.round(4).tolist(),
+        "markers": p.markers.round(4).tolist(),
+        "names": [printable(name) for name in p.names],
+        "arrows": None if p.arrows is None else (p.arrows * 1e6).round(2).tolist(),
+    }
+
+
+def in_script(content: object) -> str:
+    """JSON in which nothing can end the element that holds it, whatever names hold."""
+    text = json.dumps(content, ensure_ascii=False, separators=(",", ":"), allow_nan=False)
+    for character in "<>&":
+        text = text.replace(character, f"\\u{ord(character):04x}")
+    return text
 
 
 def frames_at(
@@ -270,48 +283,6 @@ def space_of(
     return replace(space, tracker=at if near else None)
 
 
-def space_json(space: Space) -> str:
-    """The space for the page's script: lengths in m, arrows in µm; safe within a script element."""
-    low, high = space.extent
-    content = {
-        "what": space.what,
-        "first": space.first,
-        "scale": space.scale,
-        "arrows": space.has_arrows,
-        "range": np.stack([low, high], axis=1).round(3).tolist(),
-        "tracker": None if space.tracker is None else space.tracker.round(3).tolist(),
-        "bodies": [_shell(s, base_or_joint(s)) for s in space.shells.arm],
-        "things": [_shell(s, 0) for s in space.shells.around],
-        "poses": [_posed(p) for p in space.poses],
-    }
-    return in_script(content)
-
-
-def in_script(content: object) -> str:
-    """JSON in which nothing can end the element that holds it, whatever names hold."""
-    text = json.dumps(content, ensure_ascii=False, separators=(",", ":"), allow_nan=False)
-    for character in "<>&":
-        text = text.replace(character, f"\\u{ord(character):04x}")
-    return text
-
-
-def _shell(shell: Shell, carrier: int) -> dict[str, object]:
-    points = shell.points.round(4).ravel().tolist()
-    return {"carrier": carrier, "points": points, "faces": shell.faces.ravel().tolist()}
-
-
-def _posed(p: Posed) -> dict[str, object]:
-    return {
-        "name": printable(p.name),
-        "about": printable(p.about),
-        "frames": p.frames[:, :3].round(5).reshape(len(p.frames), 12).tolist(),
-        "line": p.line.round(4).tolist(),
-        "markers": p.markers.round(4).tolist(),
-        "names": [printable(name) for name in p.names],
-        "arrows": None if p.arrows is None else (p.arrows * 1e6).round(2).tolist(),
-    }
-
-
 MOST_POSES = 80  # in the page; of more, those with the largest residuals and a random choice
 WORST = 30
 
@@ -341,25 +312,33 @@ def residual_space(model: Model, observed: Observations, x: Array, residual: Arr
     `residual` (rows,) is observed minus predicted at parameter values x (parameters,); of a pose
     the position counts, a distance's residual lies along the line from its anchor.
     """
-    table = observed.table
+    table, marker = observed.table, observed.table.marker[observed.lead]
     force = np.round(table.force[observed.lead], 3)
     key = np.column_stack([observed.configuration, force])
     _, first, entry = np.unique(key, axis=0, return_index=True, return_inverse=True)
     entry = entry.ravel()
-    vectors = residual_vectors(model, observed, x, residual)
+    # Where the markers (N, 3) were seen, or where the model puts them if only a distance was.
+    if table.position is None:
+        at = model.target_poses(table, x)[1][observed.lead]
+    else:
+        at = table.position[observed.lead]
+    vectors = residual.reshape(-1, observed.size)
+    if observed.kind == "distance":
+        anchor = model.cell.tracker.anchor
+        line = at - (np.zeros(3) if anchor is None else anchor)
+        vectors = vectors * line / np.linalg.norm(line, axis=1, keepdims=True)
+    vectors = vectors[:, :3]
     rms = np.sqrt(np.bincount(entry, (vectors**2).sum(axis=1)) / np.bincount(entry))
     chosen = _chosen(rms, np.argsort(first))
     rows = observed.lead[first[chosen]]
-    frames, flange = frames_at(
-        model.cell, model.chain, table.q[rows], model.flange_poses(table.take(rows), x)
-    )
-    at = marker_positions(model, observed, x)
+    flanges = model.flange_poses(table.take(rows), x)
+    frames, flange = frames_at(model.cell, model.chain, table.q[rows], flanges)
     several = len(np.unique(force, axis=0)) > 1
     poses = []
     for k, code in enumerate(chosen):
         own = np.flatnonzero(entry == code)
-        markers = np.unique(table.marker[observed.lead[own]])
-        groups = [own[table.marker[observed.lead[own]] == m] for m in markers]
+        markers = np.unique(marker[own])
+        groups = [own[marker[own] == m] for m in markers]
         name = table.configuration_labels[table.configuration[rows[k]]]
         poses.append(
             Posed(
@@ -385,31 +364,46 @@ def _chosen(rms: Array, order: IntArray) -> IntArray:
     return order[np.isin(order, np.concatenate([worst, drawn]))]
 
 
-def residual_vectors(model: Model, observed: Observations, x: Array, residual: Array) -> Array:
-    """Residuals (N, 3) in m as vectors in the data's frame."""
-    parts = residual.reshape(-1, observed.size)
-    if observed.kind != "distance":
-        return np.asarray(parts[:, :3])
-    anchor = model.cell.tracker.anchor
-    line = marker_positions(model, observed, x) - (np.zeros(3) if anchor is None else anchor)
-    return np.asarray(parts * line / np.linalg.norm(line, axis=1, keepdims=True))
-
-
-def marker_positions(model: Model, observed: Observations, x: Array) -> Array:
-    """Where the markers (N, 3) were seen, or where the model puts them if only a distance was."""
-    table = observed.table
-    if table.position is not None:
-        return np.asarray(table.position[observed.lead])
-    return model.target_poses(table, x)[1][observed.lead]
-
-
 def _load(force: Array) -> str:
     if not force.any():
         return "unloaded"
     return "(" + ", ".join(f"{f + 0.0:.6g}" for f in force) + ") N"
 
 
+def plan_arm(plan: Plan) -> blocks.ShownArm:
+    """The arm in every pose of a plan."""
+    space = plan_space(plan)
+    caption = (
+        "The arm in the poses of the plan, numbered at the flange. The arm is drawn as "
+        f"{space.shells.drawn_from}."
+    )
+    return blocks.ShownArm("poses", space, "The arm in the poses of the plan", caption)
+
+
+def plan_space(plan: Plan) -> Space:
+    """The arm in every pose of the plan."""
+    cell, chain = plan.model.cell, plan.model.chain
+    frames, flange = frames_at(cell, chain, plan.q)
+    local = np.array(list(cell.tool.markers.values())).reshape(-1, 3)
+    order, heads = first_stops(plan), joint_heads(chain.kinds)
+    poses = []
+    for k, T in enumerate(flange):
+        joints = zip(map(str.split, heads), joint_texts(plan.q[k], chain.kinds), strict=True)
+        told = ", ".join(f"{name} {text} {unit}" for (name, unit), text in joints)
+        group = plan.group_names[plan.group[k]]
+        about = [f"stop {order[k]}", *([group] if plan.level_joint else []), told]
+        markers, names = local @ T[:3, :3].T + T[:3, 3], tuple(cell.tool.markers)
+        poses.append(
+            Posed(plan.configurations[k], "; ".join(about), frames[k], T, markers, names, None,
+                  int(plan.group[k]))
+        )  # fmt: skip
+    return space_of(cell, chain, poses, groups=plan.group_names)
+
+
+# The still picture
+
 MOST_NUMBERED = 80  # beyond that numbers hide each other
+LONGEST_NAME = 24
 SIGNS = ("o", "s", "^", "D", "v", "P")  # of groups, which differ in more than colour
 # Rows: to the right and upwards on paper, and towards the reader.
 _TURN, _TILT = np.radians(-50.0), np.radians(22.0)
@@ -446,16 +440,14 @@ def space_figure(arm: blocks.ShownArm) -> blocks.Figure:
     return blocks.Figure(arm.name, arm.title, draw, 7.0, arm.caption)
 
 
-SUFFIXES = (".png", ".svg")
-
-
 def write_plan_picture(path: str | Path, plan: Plan) -> None:
     """Draw the poses of a plan; PNG or SVG by suffix, and the same plan gives the same file.
 
     Raises InputError for another suffix and an unwritable place.
     """
     suffix = Path(path).suffix.lower()
-    require(suffix in SUFFIXES, f"{path}: a picture of poses is written as .png or .svg")
+    told = f"{path}: a picture of poses is written as .png or .svg"
+    require(suffix in (".png", ".svg"), told)
     picture, figure = BytesIO(), plan_figure(plan)
     nothing = {"Date": None, "Creator": None} if suffix == ".svg" else {"Software": None}
     with style():
@@ -468,19 +460,47 @@ def plan_figure(plan: Plan) -> Any:
     return figure_of(space_figure(plan_arm(plan)))
 
 
-def plan_arm(plan: Plan) -> blocks.ShownArm:
-    """The arm in every pose of a plan."""
-    space = plan_space(plan)
-    caption = (
-        "The arm in the poses of the plan, numbered at the flange. The arm is drawn as "
-        f"{space.shells.drawn_from}."
-    )
-    return blocks.ShownArm("poses", space, "The arm in the poses of the plan", caption)
-
-
 def _draw(axes: Axes, space: Space, view: Array, whole: bool) -> None:
     """`whole`: all poses as lines; else the first as bodies, and with arrows it alone."""
-    shown = space.poses[space.first]
+    every = whole or not space.has_arrows
+    poses = space.poses if every else (space.poses[space.first],)
+    _draw_around(axes, space, view, whole)
+    for pose in poses if every else ():
+        line, colour = pose.line @ view.T, SERIES[pose.group % len(SERIES)]
+        axes.plot(line[:, 0], line[:, 1], color=colour, linewidth=0.9, alpha=0.5)
+    if not whole:  # the furthest first
+        for points in sorted((b @ view.T for b in space.bodies), key=lambda p: p[:, 2].mean()):
+            _fill(axes, points, ARM, 1.0)
+    elif not space.has_arrows:
+        _tips(axes, space, view)
+    for pose in poses if whole else (space.poses[space.first],):
+        at, tip = pose.markers @ view.T, pose.line[-1] @ view.T
+        for marker in () if whole else at:
+            axes.plot([tip[0], marker[0]], [tip[1], marker[1]], color=INK, linewidth=0.8)
+        axes.plot(at[:, 0], at[:, 1], ".", color=INK, markersize=2 if whole else 5)
+        if pose.arrows is not None:
+            step = space.scale * pose.arrows @ view.T
+            axes.quiver(at[:, 0], at[:, 1], step[:, 0], step[:, 1], angles="xy",
+                        scale_units="xy", scale=1, color=SERIES[1], width=0.004, headwidth=3.5,
+                        headlength=4, zorder=3)  # fmt: skip
+    if space.tracker is not None:
+        x, y, _ = view @ space.tracker
+        axes.plot([x], [y], "D", color=SERIES[2], markersize=6)
+        axes.annotate("tracker", (x, y), (6, 3), textcoords="offset points", fontsize=8)
+    axes.set_aspect("equal")
+    # Limits that hold arms, arrows and tracker; of what stands around, what lies within.
+    drawn = [] if whole else space.bodies
+    drawn += [points for p in poses for points in (p.line, p.markers)]
+    drawn += [p.markers + space.scale * p.arrows for p in poses if p.arrows is not None]
+    drawn += [] if space.tracker is None else [space.tracker[None]]
+    flat = (np.vstack(drawn) @ view.T)[:, :2]
+    low, high = flat.min(axis=0), flat.max(axis=0)
+    room = 0.09 * (high - low).max()
+    axes.set(xlim=(low[0] - room, high[0] + room), ylim=(low[1] - room, high[1] + room))
+
+
+def _draw_around(axes: Axes, space: Space, view: Array, whole: bool) -> None:
+    """Obstacles; where `whole` with their names, and keep-out planes that stand upright."""
     for shell in space.shells.around:
         points = shell.points @ view.T
         _fill(axes, points, FAINT, 0.25)
@@ -488,35 +508,7 @@ def _draw(axes: Axes, space: Space, view: Array, whole: bool) -> None:
             top = (float(points[:, 0].mean()), float(points[:, 1].max()))
             axes.annotate(short_name(shell.name, LONGEST_NAME), top, (0, 2), ha="center",
                           textcoords="offset points", fontsize=7, clip_on=True)  # fmt: skip
-    if whole:
-        _walls(axes, space, view)
-    if whole or not space.has_arrows:
-        for pose in space.poses:
-            line, colour = pose.line @ view.T, SERIES[pose.group % len(SERIES)]
-            axes.plot(line[:, 0], line[:, 1], color=colour, linewidth=0.9, alpha=0.5)
-    if not whole:
-        _bodies(axes, space, view)
-    elif not space.has_arrows:
-        _tips(axes, space, view)
-    for pose in space.poses if whole else (shown,):
-        _markers(axes, pose, view, spokes=not whole)
-        if pose.arrows is not None:
-            _arrows(axes, pose, space.scale, view)
-    if space.tracker is not None:
-        at = view @ space.tracker
-        axes.plot([at[0]], [at[1]], "D", color=SERIES[2], markersize=6)
-        axes.annotate("tracker", (at[0], at[1]), (6, 3), textcoords="offset points", fontsize=8)
-    axes.set_aspect("equal")
-    drawn_poses = space.poses if whole or not space.has_arrows else (shown,)
-    _limit_view(axes, space, view, drawn_poses, [] if whole else space.bodies)
-
-
-LONGEST_NAME = 24
-
-
-def _walls(axes: Axes, space: Space, view: Array) -> None:
-    """Boundaries of keep-out half-spaces that stand upright in a view."""
-    for wall in space.shells.walls:
+    for wall in space.shells.walls if whole else ():
         normal, at = (view @ wall.normal)[:2], (view @ wall.point)[:2]
         if abs(float(np.linalg.norm(normal)) - 1) < 1e-6:
             beyond = (float(at[0] - normal[1]), float(at[1] + normal[0]))
@@ -539,28 +531,6 @@ def _tips(axes: Axes, space: Space, view: Array) -> None:
                           textcoords="offset points", fontsize=7)  # fmt: skip
 
 
-def _limit_view(
-    axes: Axes, space: Space, view: Array, poses: Sequence[Posed], bodies: list[Array]
-) -> None:
-    """Limits that hold arms, arrows and tracker; of what stands around, what lies within."""
-    points = list(bodies)
-    points += [points for p in poses for points in (p.line, p.markers)]
-    points += [p.markers + space.scale * p.arrows for p in poses if p.arrows is not None]
-    points += [] if space.tracker is None else [space.tracker[None]]
-    flat = np.vstack(points) @ view.T
-    low, high = flat.min(axis=0), flat.max(axis=0)
-    room = 0.09 * float((high - low)[:2].max())
-    axes.set_xlim(float(low[0]) - room, float(high[0]) + room)
-    axes.set_ylim(float(low[1]) - room, float(high[1]) + room)
-
-
-def _bodies(axes: Axes, space: Space, view: Array) -> None:
-    """Silhouettes of the first pose's bodies, the furthest first."""
-    placed = [points @ view.T for points in space.bodies]
-    for points in sorted(placed, key=lambda p: float(p[:, 2].mean())):
-        _fill(axes, points, ARM, 1.0)
-
-
 def _fill(axes: Axes, points: Array, colour: str, alpha: float) -> None:
     from scipy.spatial import ConvexHull, QhullError
 
@@ -572,48 +542,6 @@ def _fill(axes: Axes, points: Array, colour: str, alpha: float) -> None:
               alpha=alpha)  # fmt: skip
 
 
-def _markers(axes: Axes, pose: Posed, view: Array, spokes: bool) -> None:
-    at, tip = pose.markers @ view.T, pose.line[-1] @ view.T
-    if spokes:
-        for marker in at:
-            axes.plot([tip[0], marker[0]], [tip[1], marker[1]], color=INK, linewidth=0.8)
-    axes.plot(at[:, 0], at[:, 1], ".", color=INK, markersize=5 if spokes else 2)
-
-
-def _arrows(axes: Axes, pose: Posed, scale: float, view: Array) -> None:
-    assert pose.arrows is not None
-    at, step = pose.markers @ view.T, scale * pose.arrows @ view.T
-    axes.quiver(at[:, 0], at[:, 1], step[:, 0], step[:, 1], angles="xy", scale_units="xy", scale=1,
-                color=SERIES[1], width=0.004, headwidth=3.5, headlength=4, zorder=3)  # fmt: skip
-
-
-def plan_space(plan: Plan) -> Space:
-    """The arm in every pose of the plan."""
-    cell, chain = plan.model.cell, plan.model.chain
-    frames, flange = frames_at(cell, chain, plan.q)
-    names = tuple(cell.tool.markers)
-    local = np.array(list(cell.tool.markers.values())).reshape(-1, 3)
-    order, heads = first_stops(plan), joint_heads(chain.kinds)
-    poses = []
-    for k, T in enumerate(flange):
-        joints = zip(map(str.split, heads), joint_texts(plan.q[k], chain.kinds), strict=True)
-        told = ", ".join(f"{name} {text} {unit}" for (name, unit), text in joints)
-        group = plan.group_names[plan.group[k]]
-        about = [f"stop {order[k]}", *([group] if plan.level_joint else []), told]
-        poses.append(
-            Posed(
-                name=plan.configurations[k],
-                about="; ".join(about),
-                frames=frames[k],
-                flange=T,
-                markers=local @ T[:3, :3].T + T[:3, 3],
-                names=names,
-                group=int(plan.group[k]),
-            )
-        )
-    return space_of(cell, chain, poses, groups=plan.group_names)
-
-
 def turned(space: Space) -> Any:
     """The poses as plotly's figure, to be turned."""
     import plotly.graph_objects as go
@@ -622,28 +550,23 @@ def turned(space: Space) -> Any:
         return escape(short_name(text, LONGEST_NAME), quote=False)
 
     figure = go.Figure()
+
+    def add(points: Array, mode: str, **how: Any) -> None:
+        x, y, z = points.T
+        figure.add_scatter3d(x=x, y=y, z=z, mode=mode, **how)
+
     for pose in space.poses:
-        colour, line = SERIES[pose.group % len(SERIES)], pose.line.T
-        figure.add_scatter3d(
-            x=line[0], y=line[1], z=line[2], mode="lines+markers", name=name(f"pose {pose.name}"),
-            line={"color": colour, "width": 4}, marker={"size": 2, "color": colour},
-        )  # fmt: skip
-        at = pose.markers.T
-        figure.add_scatter3d(
-            x=at[0], y=at[1], z=at[2], mode="markers", text=[*map(name, pose.names)],
-            marker={"size": 3, "color": colour, "symbol": "diamond"}, hoverinfo="text",
-            showlegend=False,
-        )  # fmt: skip
-        arrows = np.zeros((0, 3)) if pose.arrows is None else space.scale * pose.arrows
+        colour = SERIES[pose.group % len(SERIES)]
+        add(pose.line, "lines+markers", name=name(f"pose {pose.name}"),
+            line={"color": colour, "width": 4}, marker={"size": 2, "color": colour})  # fmt: skip
+        add(pose.markers, "markers", text=[*map(name, pose.names)], hoverinfo="text",
+            marker={"size": 3, "color": colour, "symbol": "diamond"},
+            showlegend=False)  # fmt: skip
+        arrows = () if pose.arrows is None else space.scale * pose.arrows
         for start, arrow in zip(pose.markers, arrows, strict=False):
-            ends = np.stack([start, start + arrow], axis=1)
-            figure.add_scatter3d(
-                x=ends[0], y=ends[1], z=ends[2], mode="lines", showlegend=False, hoverinfo="skip",
-                line={"color": SERIES[1], "width": 4},
-            )  # fmt: skip
+            add(np.stack([start, start + arrow]), "lines", showlegend=False, hoverinfo="skip",
+                line={"color": SERIES[1], "width": 4})  # fmt: skip
     if space.tracker is not None:
-        x, y, z = ([v] for v in space.tracker)
-        figure.add_scatter3d(x=x, y=y, z=z, mode="markers", name="tracker",
-                             marker={"size": 5, "color": INK})  # fmt: skip
+        add(space.tracker[None], "markers", name="tracker", marker={"size": 5, "color": INK})
     axes = {f"{a}axis": {"title": {"text": f"{a} in m"}} for a in "xyz"}
     return figure.update_layout(scene={"aspectmode": "data", **axes}, height=640)

@@ -41,28 +41,22 @@ def _blocks(c: Comparison) -> Iterator[Block]:
     yield ShownVerdict("good" if same else "warn", headline(c))
     yield Lines(changes_lines(c))
     yield Fold("", lambda: [_map(c)], figures=("moved",))
-    yield change_table(c)
+    yield _change_table(c)
+
+
+def _moved(c: Comparison) -> tuple[str, str, str]:
+    """How far the tool has moved, rms and at most, and what noise alone gives."""
+    rms, noise = (length(float(np.sqrt(np.mean(v**2)))) for v in (c.distance, c.chance))
+    return rms, length(float(c.distance.max())), noise
 
 
 def _key(c: Comparison) -> KeyFigures:
-    rms, noise = (length(float(np.sqrt(np.mean(v**2)))) for v in (c.distance, c.chance))
+    rms, most, noise = _moved(c)
     figures = [
-        ("the tool has moved, rms", rms), ("at most", length(float(c.distance.max()))),
-        ("noise alone", noise), ("all parameters together", size_of(c.p)),
+        ("the tool has moved, rms", rms), ("at most", most), ("noise alone", noise),
+        ("all parameters together", size_of(c.p)),
     ]  # fmt: skip
     return KeyFigures(f"moved by {rms} (noise {noise})", figures)
-
-
-def _map(c: Comparison) -> Figure:
-    caption = (
-        "Random poses within the joint limits, in the data's frame of the old session. A disc's "
-        "area shows how far the tool has moved for the same command."
-    )
-
-    def draw(figure: Drawing) -> None:
-        draw_map(figure, c)
-
-    return Figure("moved", "How far the tool has moved", draw, 6.4, caption)
 
 
 def headline(c: Comparison) -> str:
@@ -83,13 +77,12 @@ def headline(c: Comparison) -> str:
 
 def changes_lines(c: Comparison) -> list[tuple[str, str]]:
     """Displacement, chance, what was compared, what to do."""
-    far, chance = c.distance, np.sqrt(np.mean(c.chance**2))
+    rms, most, noise = _moved(c)
     lines = [
         (
             "Tool",
-            f"Moved by {length(float(np.sqrt(np.mean(far**2))))} rms for the same commands, "
-            f"{length(float(far.max()))} at most, at {len(far)} random poses "
-            f"within the joint limits {under(c)}; noise alone gives {length(float(chance))} rms.",
+            f"Moved by {rms} rms for the same commands, {most} at most, at {len(c.distance)} "
+            f"random poses within the joint limits {_under(c)}; noise alone gives {noise} rms.",
         ),
         (
             "Chance",
@@ -111,10 +104,26 @@ def changes_lines(c: Comparison) -> list[tuple[str, str]]:
                 "old, to first order.",
             )
         )
-    return [*lines, *(("Next", step) for step in steps(c))]
+    if c.one_result:
+        return [
+            *lines,
+            ("Next", "Give the results of two sessions: this is one of them and its copy."),
+        ]
+    if c.verdict == "no_change_shown":
+        told = "Nothing: the old calibration still holds within the noise of both sessions."
+        return [*lines, ("Next", told)]
+    return [
+        *lines,
+        ("Next", "Use the new calibration (elastocal compensate, elastocal export)."),
+        (
+            "Next",
+            "Look for the cause at the joints and links named. A missing effect can look like a "
+            "change if poses or loads differ (elastocal diagnose with the new data).",
+        ),
+    ]
 
 
-def under(c: Comparison) -> str:
+def _under(c: Comparison) -> str:
     """Under which loads the tool was compared, and whose they are."""
     if len(c.forces) == 1:
         force = ", ".join(f"{v:g}" for v in c.forces[0])
@@ -134,20 +143,7 @@ OF_LOADS = {
 }
 
 
-def steps(c: Comparison) -> list[str]:
-    """What to do."""
-    if c.one_result:
-        return ["Give the results of two sessions: this is one of them and its copy."]
-    if c.verdict == "no_change_shown":
-        return ["Nothing: the old calibration still holds within the noise of both sessions."]
-    return [
-        "Use the new calibration (elastocal compensate, elastocal export).",
-        "Look for the cause at the joints and links named. A missing effect can look like a "
-        "change if poses or loads differ (elastocal diagnose with the new data).",
-    ]
-
-
-def change_table(c: Comparison) -> ShownTable:
+def _change_table(c: Comparison) -> ShownTable:
     """A row for each parameter, the changed first, then by their effect at the tool."""
     heads = ("parameter", "old", "new", "change", "± std", "unit", "p (Holm)", "moves the tool", "")
     rows = []
@@ -169,17 +165,25 @@ def change_table(c: Comparison) -> ShownTable:
     return table.when_narrow(1, 2)
 
 
-def draw_map(figure: Drawing, c: Comparison) -> None:
+def _map(c: Comparison) -> Figure:
     """The poses from above and from the side, each a disc as large as the tool moves there."""
     from elastocal.report.figures import INK, SERIES
 
-    far = c.distance
-    area = 120.0 * far / max(float(far.max()), 1e-12)
-    for k, (i, j, title) in enumerate(((0, 1, "from above"), (0, 2, "from the side"))):
-        axes = figure.add_subplot(2, 1, k + 1)
-        axes.scatter(c.place[:, i], c.place[:, j], s=area, color=SERIES[0], alpha=0.6, linewidths=0)
-        axes.scatter(c.place[:, i], c.place[:, j], s=2, color=INK)
-        axes.set_aspect("equal", adjustable="datalim")
-        axes.set_title(f"{title}; the largest disc is {length(float(far.max()))}")
-        axes.set_xlabel(f"{'xyz'[i]} in m")
-        axes.set_ylabel(f"{'xyz'[j]} in m")
+    def draw(figure: Drawing) -> None:
+        most = float(c.distance.max())
+        area = 120.0 * c.distance / max(most, 1e-12)
+        for k, (j, title) in enumerate(((1, "from above"), (2, "from the side"))):
+            axes = figure.add_subplot(2, 1, k + 1)
+            x, y = c.place[:, 0], c.place[:, j]
+            axes.scatter(x, y, s=area, color=SERIES[0], alpha=0.6, linewidths=0)
+            axes.scatter(x, y, s=2, color=INK)
+            axes.set_aspect("equal", adjustable="datalim")
+            axes.set_title(f"{title}; the largest disc is {length(most)}")
+            axes.set_xlabel("x in m")
+            axes.set_ylabel(f"{'xyz'[j]} in m")
+
+    caption = (
+        "Random poses within the joint limits, in the data's frame of the old session. A disc's "
+        "area shows how far the tool has moved for the same command."
+    )
+    return Figure("moved", "How far the tool has moved", draw, 6.4, caption)

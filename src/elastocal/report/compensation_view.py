@@ -20,7 +20,6 @@ from elastocal.report.blocks import (
 )
 from elastocal.report.formatting import length
 from elastocal.text import printable
-from elastocal.units import Array
 
 if TYPE_CHECKING:
     from elastocal.compensation.compensate import Compensation
@@ -36,7 +35,7 @@ def compensation_report(c: Compensation) -> Report:
 
 def _blocks(c: Compensation) -> Iterator[Block]:
     yield from compensation_blocks({"commands": summary(c, c.chain.kinds, commands=False)})
-    yield Fold("", lambda: _figures(c), figures=("errors", "uncertainty"))
+    yield Fold("", lambda: [_errors(c)], figures=("errors",))
     yield Fold("Commands", lambda: [_commands(c)])
 
 
@@ -101,20 +100,16 @@ def _commands(c: Compensation) -> ShownTable:
     return ShownTable(heads, rows, (0, len(heads) - 1), note=note)
 
 
-def _figures(c: Compensation) -> Iterator[Figure]:
-    yield _of_targets("errors", c, c.before, "error at the nominal command")
-    yield _of_targets("uncertainty", c, c.uncertainty.std, "standard uncertainty at the command")
-
-
-def _of_targets(name: str, c: Compensation, metres: Array, axis: str) -> Figure:
+def _errors(c: Compensation) -> Figure:
     from elastocal.report.figures import Row, rows_of_dots
 
     table = c.targets.table
     rows = [
-        Row(table.configuration_labels[table.configuration[i]], float(metres[i]) * 1e6)
+        Row(table.configuration_labels[table.configuration[i]], float(c.before[i]) * 1e6)
         for i in np.flatnonzero(c.reached)[:MOST_ROWS]
     ]
-    return rows_of_dots(name, f"Targets: {axis}", rows, axis, lengths=True)
+    axis = "error at the nominal command"
+    return rows_of_dots("errors", f"Targets: {axis}", rows, axis, lengths=True)
 
 
 def readings_report(table: Measurements) -> Report:

@@ -196,8 +196,7 @@ def _outliers(d: Diagnosis) -> Iterable[Block]:
 
 
 def _residuals(d: Diagnosis) -> Iterator[ShownArm | Block]:
-    from elastocal.report.residual_figures import residual_figures
-    from elastocal.report.residual_view import residual_table, residuals_by
+    from elastocal.report.residual_figures import residual_figures, residual_table, residuals_by
 
     base = d.calibrated
     assert base is not None

@@ -23,7 +23,6 @@ from elastocal.model.manipulator import Model
 from elastocal.report import blocks
 from elastocal.report.effect_names import driver_name, effect_at
 from elastocal.report.formatting import length, short_name, typeset
-from elastocal.report.residual_view import reach
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
@@ -108,24 +107,16 @@ def svg(block: blocks.Figure) -> str:
         text = rendered(figure)
     text = text[text.index("<svg") :]
     text = re.sub(r'<g id="[^"]*"', "<g", text)  # several figures share a page
-    head = _head(block.title, block.width)
+    head = (
+        '<svg xmlns="http://www.w3.org/2000/svg" xmlns:xlink="http://www.w3.org/1999/xlink" '
+        rf'viewBox="\1" role="img" aria-label="{block.title}" '
+        f'style="max-width:{block.width * 96:.0f}px">'
+    )
     text = re.sub(r"<svg [^>]*viewBox=\"([^\"]*)\"[^>]*>", head, text, count=1)
     for colour, variable in _VARIABLES.items():
         text = text.replace(colour, variable)
-    return _numbered(text, block.title)
-
-
-def rendered(figure: Figure) -> str:
-    """matplotlib's SVG file of a figure."""
-    buffer = io.StringIO()
-    nothing = {"Date": None, "Creator": None, "Format": None, "Type": None}
-    figure.savefig(buffer, format="svg", metadata=nothing)
-    return buffer.getvalue()
-
-
-def _numbered(text: str, title: str) -> str:
-    """Ids by order and title: matplotlib's hash the layout, whose last bits differ between runs."""
-    prefix = hashlib.sha256(title.encode()).hexdigest()[:8]
+    # Ids by order and title: matplotlib's hash the layout, whose last bits differ between runs.
+    prefix = hashlib.sha256(block.title.encode()).hexdigest()[:8]
     number: dict[str, int] = {}
 
     def name(match: re.Match[str]) -> str:
@@ -134,11 +125,12 @@ def _numbered(text: str, title: str) -> str:
     return re.sub(r'(id="|#)([a-z][0-9a-f]{10})\b', name, text)
 
 
-def _head(title: str, width: float) -> str:
-    return (
-        '<svg xmlns="http://www.w3.org/2000/svg" xmlns:xlink="http://www.w3.org/1999/xlink" '
-        rf'viewBox="\1" role="img" aria-label="{title}" style="max-width:{width * 96:.0f}px">'
-    )
+def rendered(figure: Figure) -> str:
+    """matplotlib's SVG file of a figure."""
+    buffer = io.StringIO()
+    nothing = {"Date": None, "Creator": None, "Format": None, "Type": None}
+    figure.savefig(buffer, format="svg", metadata=nothing)
+    return buffer.getvalue()
 
 
 def dots(axes: Axes, x: NDArray, y: NDArray, colour: str, size: float, label: str = "") -> None:
@@ -161,6 +153,16 @@ def dots(axes: Axes, x: NDArray, y: NDArray, colour: str, size: float, label: st
     axes.autoscale_view()
 
 
+def reach(values: NDArray) -> float:
+    """Half height of an axis: all values, or 8 robust deviations where some lie far beyond."""
+    size = np.abs(values[np.isfinite(values)])
+    if not len(size) or size.max() == 0:
+        return 1.0
+    robust = 8 * 1.4826 * float(np.median(size))
+    largest = 1.08 * float(size.max())
+    return robust if 0 < robust < largest / 1.5 else largest
+
+
 def panels_of(figure: Figure, n: int, across: int, **how: Any) -> list[Axes]:
     """The first `n` axes of a grid `across` wide; the others are not seen."""
     grid = figure.subplots(max(-(-n // across), 1), across, squeeze=False, **how).ravel()
@@ -170,7 +172,7 @@ def panels_of(figure: Figure, n: int, across: int, **how: Any) -> list[Axes]:
 
 
 ROW = 0.27  # inches per line of a name
-LONGEST_LINE = 25  # letters of a name, which has two lines at most
+LONGEST = 25  # letters of a name, which has two lines at most
 # Lengths that span more than this are drawn on a logarithmic axis.
 WIDE_RANGE = 8.0
 DENSE = 25.0  # below which three ticks a decade have room
@@ -196,7 +198,9 @@ def rows_of_dots(
 
     `lengths`: values in µm, which may span decades.
     """
-    names = [_two_lines(row.name) for row in rows]
+    # On two lines, cut where a name is longer.
+    wrapped = [textwrap.wrap(typeset(short_name(r.name, 2 * LONGEST)), LONGEST) for r in rows]
+    names = ["\n".join(w[:2]) + "…" * (len(w) > 2) for w in wrapped]
     lines = [name.count("\n") for name in names]
     at = np.cumsum([0.0, *(1 + 0.4 * (a + b) for a, b in pairwise(lines))])
     dashed = line if line is not None and math.isfinite(line[1]) else None
@@ -241,12 +245,6 @@ def _scaled(axes: Axes, known: Sequence[float], logarithmic: bool, lengths: bool
     if lengths:
         axes.xaxis.set_major_formatter(lambda x, _: f"{x:g} µm" if x < 1e3 else f"{x / 1e3:g} mm")
         axes.xaxis.set_minor_formatter(lambda x, _: "")
-
-
-def _two_lines(name: str) -> str:
-    """A printable name on two lines, cut where it is longer."""
-    lines = textwrap.wrap(typeset(short_name(name, 2 * LONGEST_LINE)), LONGEST_LINE)
-    return "\n".join(lines[:2]) + ("…" if len(lines) > 2 else "")
 
 
 def waterfall(

@@ -137,8 +137,12 @@ def counted(n: int, one: str, many: str | None = None) -> str:
     return f"{n} {one if n == 1 else many or one + 's'}"
 
 
-def signed_change(change: float) -> str:
-    return f"{'-' if change < 0 else '+'}{length(abs(change))}"
+def signed(value: float) -> str:
+    return f"{'-' if value < 0 else '+'}{significant(abs(value))}"
+
+
+def signed_change(metres: float) -> str:
+    return f"{'-' if metres < 0 else '+'}{length(abs(metres))}"
 
 
 MINUS = re.compile(r"(?<![\w.)\]-])-(?=[\d.∞])|(?<= )-(?= )")

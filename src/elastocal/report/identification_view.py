@@ -15,6 +15,7 @@ from elastocal.identification.prediction import PredictedError
 from elastocal.identification.result import Calibration
 from elastocal.identification.scrutiny import stage_of
 from elastocal.model.choice import names_told
+from elastocal.report import method_and_noise as words
 from elastocal.report.blocks import (
     WARNING,
     Block,
@@ -32,35 +33,17 @@ from elastocal.report.formatting import (
     length,
     outlier_blocks,
     sentence,
+    signed_change,
     significant,
     title_of,
 )
 from elastocal.report.judgement_view import judgement, warnings_beside
-from elastocal.report.method_and_noise import (
-    candidate_table,
-    constraints_line,
-    counted_functions,
-    deviating_table,
-    does_noise_explain_it,
-    false_alarm_line,
-    fault_lines,
-    in_time_line,
-    intervals_line,
-    method_and_weights,
-    noise_model_line,
-    prior_line,
-    repeats_line,
-    shape_line,
-    size_table,
-    smooth_table,
-)
 from elastocal.report.parameter_tables import (
     Published,
     Truth,
     combination_table,
     coverage,
     names_of,
-    parameter_figure,
     parameter_table,
     shortened,
     undetermined_lines,
@@ -70,7 +53,16 @@ from elastocal.text import printable
 from elastocal.units import Array
 
 FEW = 6  # rows that stand open
+MOST_GROUPS = 3
 MOST_CORRELATIONS = 30
+MOST_INFLUENTIAL = 12
+NOMINAL = "nominal arm"  # its `nominal_rms`: with base and markers placed by all readings
+READINGS = {
+    "position": "position readings",
+    "deflection": "deflections (loaded minus unloaded readings)",
+    "pose": "pose readings",
+    "distance": "distance readings",
+}
 
 
 def calibration_report(
@@ -86,7 +78,7 @@ def _blocks(
     result: Calibration, truth: Truth | None, published: Published | None
 ) -> Iterator[Block]:
     budget = cache(lambda: gap_budget(result))
-    yield Fold("", lambda: [key(result, budget())])
+    yield Fold("", lambda: [_key(result, budget())])
     verdict = judgement(result)
     yield ShownVerdict(verdict.tone, verdict.headline)
     new = [] if result.predicted is None else [("Expected", at_new_poses(result.predicted))]
@@ -99,34 +91,34 @@ def _blocks(
     yield parameter_table(result, truth, published)
     if result.combinations:
         told = "Combinations that are determined although their members are not"
-        yield from _open_if_few(combination_table(result, truth), told)
-        yield Fold("Combinations with all their members", lambda: _whole_combinations(result))
+        yield _open_if_few(combination_table(result, truth), told)
+        whole = [(shortened(c, len(c.terms)), shortened(c)) for c in result.combinations]
+        longer = [Sentence(every) for every, some in whole if every != some]
+        yield Fold("Combinations with all their members", lambda: longer)
     for line in undetermined_lines(result, FEW):
         yield Sentence(sentence(line), soft=True)
+    constraints, prior = words.constraints_line(result), words.prior_line(result)
+    hit, n = coverage(result, truth) if truth else (0, 0)
+    held = f"{hit} of {n} intervals at 95 % hold the true value (expected: {0.95 * n:.1f})."
     yield Lines([
         ("Readings", readings(result)),
         ("Identified", what_was_identified(result)),
         *joint_lines(result),
-        ("Noise", does_noise_explain_it(result)),
-        *held_lines(result),
-        *([("Truth", coverage_line(result, truth))] if truth else []),
-        *(("Outliers", text) for text in fault_lines(result, MOST_GROUPS)),
+        ("Noise", words.does_noise_explain_it(result)),
+        *([("Constraints", constraints)] if constraints else []),
+        *([("Prior", prior)] if prior else []),
+        *([("Truth", held)] if truth else []),
+        *(("Outliers", text) for text in words.fault_lines(result, MOST_GROUPS)),
     ])  # fmt: skip
     yield Fold("", lambda: _residual_figures(result), figures=("residuals", "against_joints"))
-    yield from _open_if_few(smooth_table(result), "Smooth functions")
-    summary = "Parameters beside their nominal values, drawn"
-    yield Fold(summary, lambda: [parameter_figure(result)], figures=("parameters",))
+    yield _open_if_few(words.smooth_table(result), "Smooth functions")
     yield from _folds(result, truth, budget)
 
 
-MOST_GROUPS = 3
-
-
-def _open_if_few(table: ShownTable, summary: str) -> Iterator[Block]:
+def _open_if_few(table: ShownTable, summary: str) -> Block:
     if len(table.rows) <= FEW:
-        yield table
-    else:
-        yield Fold(f"{summary} ({len(table.rows)})", lambda: [table], printed=True)
+        return table
+    return Fold(f"{summary} ({len(table.rows)})", lambda: [table], printed=True)
 
 
 def _folds(
@@ -145,7 +137,7 @@ def _folds(
         )
         yield Fold(why, lambda: [missing, remedy], printed=True)
     if result.correlations:
-        yield Fold("Correlations over 0.9", lambda: [correlation_table(result)], printed=True)
+        yield Fold("Correlations over 0.9", lambda: [_correlation_table(result)], printed=True)
     yield Fold("Errors in numbers", lambda: _errors(result, budget()))
     yield Fold(
         "Residuals on the arm, over time and by group",
@@ -153,15 +145,15 @@ def _folds(
         figures=("space", "over_time", "smooth"),
     )
     if result.residual_summary is not None:
-        yield Fold("Are the residuals normal?", lambda: _distribution(result), figures=("scores",))
+        yield Fold("Are the residuals normal?", lambda: _distribution(result))
     single = len(result.outliers) + len(result.excluded)
-    if single or fault_lines(result):
+    if single or words.fault_lines(result):
         yield Fold(f"Outliers ({single})", lambda: _outliers(result))
-    yield Fold("Which configurations decide the fit", lambda: [influence_table(result)])
-    yield Fold("Sets of parameters side by side", lambda: [sets_table(result)])
+    yield Fold("Which configurations decide the fit", lambda: [_influence_table(result)])
+    yield Fold("Sets of parameters side by side", lambda: [_sets_table(result)])
 
 
-def key(result: Calibration, budget: ErrorBudget | None) -> KeyFigures:
+def _key(result: Calibration, budget: ErrorBudget | None) -> KeyFigures:
     """The error before and after, and the noise that is in both."""
     floor = None if budget is None else budget.floor
     held = math.isfinite(result.heldout_rms)
@@ -184,46 +176,27 @@ def _error_figures(result: Calibration, budget: ErrorBudget | None) -> Iterator[
     from elastocal.report.residual_figures import uncertainty_map
 
     if budget is not None:
-        floor = None if budget.floor is None else (budget.floor_name, budget.floor)
-        yield waterfall("waterfall", budget_steps(result, budget), floor)
+        yield waterfall("waterfall", *budget_steps(result, budget))
     if (found := uncertainty_map(result)) is not None:
         yield found
 
 
 def _residual_figures(result: Calibration) -> Iterator[Block]:
-    from elastocal.report.residual_figures import over_configurations, over_joints
-    from elastocal.report.residual_view import residuals_by
+    from elastocal.report.residual_figures import over_configurations, over_joints, residuals_by
 
     residuals = residuals_by(result.observations, result.residual)
     yield over_configurations(residuals)
     yield over_joints(result.model.chain.kinds, residuals)
 
 
-def _method(result: Calibration) -> Iterator[Block]:
-    yield Lines([
-        ("Method", sentence(method_and_weights(result))),
-        ("Degrees of freedom", f"{result.dof}."),
-        *prediction_lines(result),
-        *noise_lines(result),
-        ("Intervals", sentence(intervals_line(result))),
-    ])  # fmt: skip
-    for table in (size_table(result.noise), candidate_table(result.noise)):
-        if len(table.rows) > 1:
-            yield table
-
-
-def _errors(result: Calibration, budget: ErrorBudget | None) -> Iterator[Block]:
-    if budget is not None:
-        floor = None if budget.floor is None else (budget.floor_name, budget.floor)
-        yield budget_table(budget_steps(result, budget), floor)
-    yield spread_table(before_and_after(result, budget), "readings")
-    yield uncertainty_table(result)
-
-
 def _residuals(result: Calibration) -> Iterator[Block]:
     from elastocal.report.arm_view import residual_arm
-    from elastocal.report.residual_figures import over_time, smooth_figure
-    from elastocal.report.residual_view import residual_table, residuals_by
+    from elastocal.report.residual_figures import (
+        over_time,
+        residual_table,
+        residuals_by,
+        smooth_figure,
+    )
 
     residuals = residuals_by(result.observations, result.residual)
     yield residual_arm(result.model, result.observations, result.x, result.residual)
@@ -233,43 +206,48 @@ def _residuals(result: Calibration) -> Iterator[Block]:
     yield residual_table(result.observations, residuals)
 
 
-def _distribution(result: Calibration) -> Iterator[Block]:
-    from elastocal.report.residual_figures import normal_scores
+def _method(result: Calibration) -> Iterator[Block]:
+    yield Lines([
+        ("Method", sentence(words.method_and_weights(result))),
+        ("Degrees of freedom", f"{result.dof}."),
+        *prediction_lines(result),
+        *words.noise_lines(result),
+        ("Intervals", sentence(words.intervals_line(result))),
+    ])  # fmt: skip
+    for table in (words.size_table(result.noise), words.candidate_table(result.noise)):
+        if len(table.rows) > 1:
+            yield table
 
+
+def _errors(result: Calibration, budget: ErrorBudget | None) -> Iterator[Block]:
+    if budget is not None:
+        yield budget_table(*budget_steps(result, budget))
+    yield spread_table(before_and_after(result, budget), "readings")
+
+
+def _distribution(result: Calibration) -> Iterator[Block]:
     summary = result.residual_summary
     assert summary is not None
-    yield Sentence(shape_line(summary))
+    yield Sentence(words.shape_line(summary))
     if (scatter := summary.whole.held_out_mean_square) is not None:
         yield Sentence(
             f"In held-out configurations the scatter is {significant(scatter**0.5)} times that of "
             "the noise model."
         )
-    yield normal_scores(summary)
-    yield deviating_table(summary)
+    yield words.deviating_table(summary)
 
 
 def _outliers(result: Calibration) -> Iterator[Block]:
-    if groups := fault_lines(result):
+    if groups := words.fault_lines(result):
         yield Lines([("Groups", text) for text in groups])
-        yield Sentence(false_alarm_line(result) or "", soft=True)
-    every = (
-        (f"Kept in the fit; {option('outliers', 'drop')} excludes them", result.outliers),
-        ("Excluded from the fit", result.excluded),
-    )
-    for title, found in every:
+        yield Sentence(words.false_alarm_line(result) or "", soft=True)
+    kept = f"Kept in the fit; {option('outliers', 'drop')} excludes them"
+    for title, found in ((kept, result.outliers), ("Excluded from the fit", result.excluded)):
         if found:
             yield from outlier_blocks(title, [(o, o.residual, o.ratio) for o in found])
 
 
-def _whole_combinations(result: Calibration) -> Iterator[Block]:
-    for c in result.combinations:
-        whole = shortened(c, len(c.terms))
-        if whole != shortened(c):
-            yield Sentence(whole)
-
-
-def correlation_table(result: Calibration) -> ShownTable:
-    """The parameters that are known far better together than each alone."""
+def _correlation_table(result: Calibration) -> ShownTable:
     rows = [
         (printable(a), printable(b), f"{r:+.3f}" if abs(r) < 0.9995 else f"{r:+.6f}")
         for a, b, r in result.correlations[:MOST_CORRELATIONS]
@@ -283,16 +261,6 @@ def correlation_table(result: Calibration) -> ShownTable:
     return ShownTable(("parameter", "and", "correlation"), rows, (0, 1), note=note)
 
 
-# Sentences
-
-READINGS = {
-    "position": "position readings",
-    "deflection": "deflections (loaded minus unloaded readings)",
-    "pose": "pose readings",
-    "distance": "distance readings",
-}
-
-
 def what_was_identified(result: Calibration) -> str:
     alone, n = len(names_of(result, ALONE)), len(result.combinations)
     text = f"{alone} of {counted(len(result.ordinary), 'parameter')}"
@@ -302,15 +270,17 @@ def what_was_identified(result: Calibration) -> str:
             f", and {counted(n, 'combination')} of parameters that these readings cannot separate "
             f"({absorbed} held in exchange)"
         )
-    if weak := len(names_of(result, WEAK)):
-        text += f"; {weak} hardly shown"
-    if unseen := len(names_of(result, INVISIBLE)):
-        text += f"; {unseen} not visible in these data"
-    if fixed := len(names_of(result, FIXED)):
-        text += f"; {fixed} fixed by the user"
+    told = {
+        WEAK: "hardly shown",
+        INVISIBLE: "not visible in these data",
+        FIXED: "fixed by the user",
+    }
+    for standing, why in told.items():
+        if found := len(names_of(result, standing)):
+            text += f"; {found} {why}"
     if (far := result.finding("unheard_of")) is not None:
         text += f"; {len(far.listed('parameters'))} with implausible values"
-    return text + counted_functions(result) + "."
+    return text + words.counted_functions(result) + "."
 
 
 def prediction_lines(result: Calibration) -> list[tuple[str, str]]:
@@ -348,42 +318,23 @@ def at_new_poses(found: PredictedError) -> str:
     )
 
 
-NOMINAL = "nominal arm"  # its `nominal_rms`: with base and markers placed by all readings
-
-
-def nominal_held_out(result: Calibration) -> str:
-    """The nominal arm as the budget has it: base and markers placed by the other configurations."""
-    placed = any(stage_of(p.effect) == 0 for p in result.model.parameters)
-    return f"{NOMINAL}, held out" if placed else NOMINAL
-
-
-def rms_by_kind(result: Calibration) -> list[tuple[str, float]]:
-    """What the errors are with the nominal arm, fitted, held out and on test data (3-D rms, m)."""
-    rows = [
-        (NOMINAL, result.nominal_rms),
-        ("fitted poses", result.residual_rms),
-        ("held-out poses", result.heldout_rms),
-    ]
-    return rows if result.test is None else [*rows, ("test data", result.test.rms)]
-
-
-def rotation_rms(result: Calibration) -> tuple[float, float] | None:
-    """Fitted and held-out rms length of the rotation error in rad; None where none was read."""
-    if result.observations.kind != "pose":
-        return None
-    parts = [r.reshape(-1, 6)[:, 3:] for r in (result.residual, result.held_out)]
-    fitted, held = (float(np.sqrt((p**2).sum(axis=1).mean())) for p in parts)
-    return fitted, held
-
-
 def error_line(result: Calibration) -> str:
-    """All rms errors in one line."""
-    text = ", ".join(f"{name} {length(value)}" for name, value in rms_by_kind(result))
-    if (turns := rotation_rms(result)) is not None:
-        fitted, held = (
-            significant(v * 1e6) if math.isfinite(v) else "not available" for v in turns
+    """All rms errors in one line: 3-D, and of poses the length of the rotation error."""
+    sizes = {
+        NOMINAL: result.nominal_rms,
+        "fitted poses": result.residual_rms,
+        "held-out poses": result.heldout_rms,
+    }
+    if result.test is not None:
+        sizes["test data"] = result.test.rms
+    text = ", ".join(f"{name} {length(value)}" for name, value in sizes.items())
+    if result.observations.kind == "pose":
+        turns = (r.reshape(-1, 6)[:, 3:] for r in (result.residual, result.held_out))
+        rms = (float(np.sqrt((turn**2).sum(axis=1).mean())) for turn in turns)
+        told = (
+            f"{significant(v * 1e6)} µrad" if math.isfinite(v) else "not available" for v in rms
         )
-        text += f"; rotations {fitted} µrad fitted, {held} µrad held out"
+        text += f"; rotations {next(told)} fitted, {next(told)} held out"
     return text
 
 
@@ -395,35 +346,27 @@ def joint_lines(result: Calibration) -> list[tuple[str, str]]:
 
 def readings(result: Calibration) -> str:
     observed = result.observations
-    poses = observed.n_configurations
     markers = len(np.unique(observed.table.marker[observed.lead]))
     return (
-        f"{len(observed.lead)} {READINGS[observed.kind]} in {counted(poses, 'configuration')}, "
+        f"{len(observed.lead)} {READINGS[observed.kind]} in "
+        f"{counted(observed.n_configurations, 'configuration')}, "
         f"{counted(markers, 'marker')} ({printable(observed.table.source)})"
     )
 
 
-def coverage_line(result: Calibration, truth: Truth) -> str:
-    hit, n = coverage(result, truth)
-    return f"{hit} of {n} intervals at 95 % hold the true value (expected: {0.95 * n:.1f})."
+def nominal_held_out(result: Calibration) -> str:
+    """The nominal arm as the budget has it: base and markers placed by the other configurations."""
+    placed = any(stage_of(p.effect) == 0 for p in result.model.parameters)
+    return f"{NOMINAL}, held out" if placed else NOMINAL
 
 
-def noise_lines(result: Calibration) -> list[tuple[str, str]]:
-    """Label and sentence: estimated noise model, repeats, shape of the residuals."""
-    summary = result.residual_summary
-    found = [
-        ("Noise model", noise_model_line(result)),
-        ("Repeats", repeats_line(result)),
-        ("Residuals", None if summary is None else shape_line(summary)),
-        ("In time", in_time_line(result)),
-    ]
-    return [(label, text) for label, text in found if text is not None]
-
-
-def held_lines(result: Calibration) -> list[tuple[str, str]]:
-    """Label and sentence: what constraints and prior put into the estimates."""
-    found = [("Constraints", constraints_line(result)), ("Prior", prior_line(result))]
-    return [(label, text) for label, text in found if text is not None]
+def budget_steps(
+    result: Calibration, budget: ErrorBudget
+) -> tuple[list[tuple[str, float, tuple[float, float]]], tuple[str, float] | None]:
+    """Name, held-out rms (m) and its 95 % interval of every step; name and size of the floor."""
+    named = {"nominal_arm": nominal_held_out(result)}
+    steps = [(named.get(s.step, s.step), s.heldout_rms, s.ci95) for s in budget.steps]
+    return steps, None if budget.floor is None else (budget.floor_name, budget.floor)
 
 
 def before_and_after(result: Calibration, budget: ErrorBudget | None) -> dict[str, Array]:
@@ -450,28 +393,7 @@ def spread_table(
     return ShownTable(heads, rows, title=title)
 
 
-def budget_steps(
-    result: Calibration, budget: ErrorBudget
-) -> list[tuple[str, float, tuple[float, float]]]:
-    """Name, held-out rms (m) and its 95 % interval of every step."""
-    named = {"nominal_arm": nominal_held_out(result)}
-    return [(named.get(s.step, s.step), s.heldout_rms, s.ci95) for s in budget.steps]
-
-
-MOST_INFLUENTIAL = 12
-OF_INFLUENCE = (
-    "Without a configuration the estimates move, one of them most. Cook's distance counts all of "
-    "them together: at 1 they move about to the edge of their 50 % region. To depend less on one, "
-    "measure more like it."
-)
-OF_SETS = (
-    "By the weights of the fit, on the model linearised there. Differences and their 95 % are of "
-    "the held-out error, by resampling configurations. The likelihood is restricted to what base "
-    "and markers leave, with the other parameters of typical size."
-)
-
-
-def influence_table(result: Calibration) -> ShownTable:
+def _influence_table(result: Calibration) -> ShownTable:
     """The configurations that decide most, by Cook's distance; those without others to judge them
     first."""
     found = sorted(result.influence(), key=lambda c: (-c.cook, -c.leverage))[:MOST_INFLUENTIAL]
@@ -487,22 +409,21 @@ def influence_table(result: Calibration) -> ShownTable:
         "configuration", "readings", "leverage (parameters)", "Cook's distance", "moves most",
         "by (std)",
     )  # fmt: skip
-    return ShownTable(
-        heads,
-        rows,
-        (0, 4),
-        note=OF_INFLUENCE,
+    note = (
+        "Without a configuration the estimates move, one of them most. Cook's distance counts all "
+        "of them together: at 1 they move about to the edge of their 50 % region. To depend less "
+        "on one, measure more like it."
     )
+    return ShownTable(heads, rows, (0, 4), note=note)
 
 
-def sets_table(result: Calibration) -> ShownTable:
-    """Sets of parameters side by side."""
+def _sets_table(result: Calibration) -> ShownTable:
     rows = []
     for s in result.parameter_sets():
         over, ends = "", ""
         if s.heldout_over_chosen and math.isfinite(s.heldout_over_chosen):
-            over = _signed(s.heldout_over_chosen)
-            ends = f"{_signed(s.ci95[0])} to {_signed(s.ci95[1])}"
+            over = signed_change(s.heldout_over_chosen)
+            ends = " to ".join(map(signed_change, s.ci95))
         rows.append((
             s.name, str(s.parameters), length(s.residual_rms),
             length(s.heldout_rms) if math.isfinite(s.heldout_rms) else "undetermined", over, ends,
@@ -512,38 +433,9 @@ def sets_table(result: Calibration) -> ShownTable:
         "set", "parameters", "fitted rms", "held-out rms", "over the chosen", "95 %",
         "log-likelihood over the chosen",
     )  # fmt: skip
-    return ShownTable(
-        heads,
-        rows,
-        note=OF_SETS,
+    note = (
+        "By the weights of the fit, on the model linearised there. Differences and their 95 % are "
+        "of the held-out error, by resampling configurations. The likelihood is restricted to what "
+        "base and markers leave, with the other parameters of typical size."
     )
-
-
-def _signed(metres: float) -> str:
-    return f"{'-' if metres < 0 else '+'}{length(abs(metres))}"
-
-
-SOURCES = {
-    "parameters": "parameters: uncertainty of the estimates",
-    "open_parameters": "undetermined parameters: typical deviations",
-    "repeatability": "repeatability: common to the readings of a visit",
-    "instrument": "instrument: single readings",
-    "lack_of_fit": "lack of fit: further scatter of configurations",
-    "total": "total",
-}
-
-
-def uncertainty_table(result: Calibration) -> ShownTable:
-    """What the error of a predicted reading is made of."""
-    budget = result.uncertainty()
-    if budget is None:
-        return ShownTable((), [])
-    total = budget.total
-    rows = [
-        (words, length(part), f"{100 * (part / total) ** 2 if total else 0:.0f} %")
-        for name, words in SOURCES.items()
-        for part in (getattr(budget, name),)
-    ]
-    title = "Parts of the error of a predicted reading"
-    note = "At the poses fitted, each as if it had not been; the squares add up."
-    return ShownTable(("source", "3-D rms", "share of the square"), rows, title=title, note=note)
+    return ShownTable(heads, rows, note=note)

@@ -30,7 +30,7 @@ def judgement(result: Calibration) -> Judgement:
     if trust.severity == "poor":
         why = next(f for f in result.findings if f.severity == "poor" and f is not trust)
         return Judgement("poor", f"Do not use this calibration: {DOUBTS[why.kind](why)}.", steps)
-    told = f"{_accuracy(result)}{_load_point(result)}"
+    told = _accuracy(result)
     verdict = result.verdict
     if trust.severity == "care":
         named = "; and ".join(DOUBTS[f.kind](f) for f in verdict.missing)
@@ -43,13 +43,10 @@ def judgement(result: Calibration) -> Judgement:
     return Judgement("good", f"This calibration can be used. {told}{noise}", steps)
 
 
-# What verdict, next step and the line on noise say already.
-SAID = ("residual_above_stated_noise", "scatter_not_counted")
-
-
 def warnings_beside(result: Calibration) -> list[str]:
-    """The warnings that say more than the verdict and what to do next."""
-    said = {f.kind for f in result.verdict.missing} & set(SAID)
+    """The warnings that say more than the verdict, what to do next and the line on noise."""
+    told = {"residual_above_stated_noise", "scatter_not_counted"}
+    said = {f.kind for f in result.verdict.missing} & told
     return [printable(str(w)) for w in result.warnings if getattr(w, "kind", "") not in said]
 
 
@@ -156,28 +153,25 @@ def _unheard_of(f: Finding) -> str:
 
 
 def _accuracy(result: Calibration) -> str:
-    """The arm's own error where nobody measured, and that of readings, which has their noise."""
-    of = {"deflection": " of deflections", "distance": " of distances"}.get(
-        result.observations.kind, ""
-    )
+    """The arm's own error where nobody measured, and that of readings, which has their noise;
+    that the load point is known worse than the markers."""
+    kind = result.observations.kind
+    of = f" of {kind}s" if kind in ("deflection", "distance") else ""
     own = "Expected error at new poses: not known."
     if (at := result.verdict.at) is not None:
         own = f"Expected error at new poses: ≤ {length(at)} rms (95 %), measurement noise excluded."
-    if not math.isfinite(result.heldout_rms):
-        return f"{own} Residual{of}: {length(result.residual_rms)} rms; no held-out error."
     text = f"{own} Held-out error{of}: {length(result.heldout_rms)} rms"
-    if only_placed(result):
-        return f"{text}{_placed_markers(result)}."
-    return f"{text} (nominal arm {length(result.nominal_rms)})."
-
-
-def _load_point(result: Calibration) -> str:
-    """That the load point is known worse than the markers."""
+    if not math.isfinite(result.heldout_rms):
+        text = f"{own} Residual{of}: {length(result.residual_rms)} rms; no held-out error"
+    elif only_placed(result):
+        text += _placed_markers(result)
+    else:
+        text += f" (nominal arm {length(result.nominal_rms)})"
     if result.load_point_error is None:
-        return ""
+        return f"{text}."
     marker = printable(next(iter(result.model.cell.tool.markers)))
     return (
-        " The load point, default of compensate, is known only to "
+        f"{text}. The load point, default of compensate, is known only to "
         f"{length(result.load_point_error)} rms: measure a marker there, or state "
         f"{option('point')} {marker}."
     )

@@ -16,13 +16,7 @@ from elastocal.identification.residuals import GroupSummary, ResidualSummary
 from elastocal.identification.result import Calibration
 from elastocal.model.observations import available_noise
 from elastocal.report.blocks import ShownTable
-from elastocal.report.formatting import (
-    counted,
-    display,
-    length,
-    plain,
-    significant,
-)
+from elastocal.report.formatting import counted, display, length, plain, significant
 from elastocal.text import printable
 
 MOST_NAMED = 6
@@ -40,6 +34,13 @@ METHODS = {
 }
 # What the weights are is said by the method itself, or by the line on the noise model.
 SAID = {"reml", "ols", "eq14", "eq14-residual"}
+HC = "every reading may have a variance of its own; they assume independent readings"
+CR = (
+    "readings of a configuration may be correlated in any way; they assume independent "
+    "configurations"
+)
+# Without correction for leverage: right in the limit of many rows or configurations.
+LARGE = " and that these are many"
 INTERVALS = {
     "kenward-roger": (
         "t intervals of Kenward and Roger, which account for estimated weights; they "
@@ -69,29 +70,14 @@ INTERVALS = {
         "as published, eq. (13): weights taken as known although they come from the same "
         "residuals, so the intervals are too narrow"
     ),
+    "h2": "asymptotic covariance of the robust estimate (H2); assumes independent readings",
+    **{f"hc{k}": f"robust to unequal noise (HC{k}): {HC}{LARGE * (k < 2)}" for k in range(4)},
+    **{f"cr{k}": f"cluster-robust (CR{k}): {CR}{LARGE}" for k in (0, 1)},
+    **{f"cr{k}": f"cluster-robust (CR{k}): {CR}" for k in (2, 3)},
 }
-HC = (
-    "robust to unequal noise ({}): every reading may have a variance of its own; they assume "
-    "independent readings"
-)
-CR = (
-    "cluster-robust ({}): readings of a configuration may be correlated in any way; they assume "
-    "independent configurations"
-)
-# Without correction for leverage: right in the limit of many rows or configurations.
-LARGE = {
-    "hc0": "that these are many",
-    "hc1": "that these are many",
-    "cr0": "that these are many",
-    "cr1": "that these are many, ten or more per parameter",
-}
+INTERVALS["cr0"] += ", ten or more per parameter"
+INTERVALS["cr1"] += ", ten or more per parameter"
 SIGNS = {"lower": "≥", "upper": "≤", "equality": "="}
-HELD = {
-    "constrained profile": (
-        "Intervals keep the constraints: they stop at bounds and take equalities for exact"
-    ),
-}
-ROBUST = "asymptotic covariance of the robust estimate ({}); assumes independent readings"
 
 
 def method_of(result: Calibration) -> str:
@@ -102,41 +88,24 @@ def method_and_weights(result: Calibration) -> str:
     """The method, and the weights where the method does not say them."""
     method, noise = method_of(result), result.noise
     if method == "constrained":
-        return _constrained(result)
+        # The weights are those that the method before it gave to the readings.
+        text = "fit with a prior" if result.prior_share else "fit under constraints"
+        text += " and under constraints" if result.prior_share and result.active else ""
+        if noise.kind == "none":
+            return f"{text}, all readings weighted alike"
+        how = "weights estimated by restricted likelihood (REML): " if noise.estimated else ""
+        return f"{text}, {how}{printable(noise.description)}"
     text = METHODS.get(method, printable(method))
     if method in SAID or noise.kind == "none":
         return text
     return f"{text}, {printable(noise.description)}"
 
 
-def _constrained(result: Calibration) -> str:
-    """What was known besides the readings, and the weights that the method before it gave these."""
-    prior, active = bool(result.prior_share), bool(result.active)
-    text = "fit with a prior" if prior else "fit under constraints"
-    text += " and under constraints" if prior and active else ""
-    noise = result.noise
-    if noise.kind == "none":
-        return f"{text}, all readings weighted alike"
-    how = "weights estimated by restricted likelihood (REML): " if noise.estimated else ""
-    return f"{text}, {how}{printable(noise.description)}"
-
-
-def interval_kind(result: Calibration) -> str:
-    return result.noise.interval_kind.lower()
-
-
 def intervals_line(result: Calibration) -> str:
     """Which kind of interval, and what it assumes."""
-    kind = interval_kind(result)
-    if kind in INTERVALS:
-        return INTERVALS[kind]
-    if kind.startswith(("hc", "cr")):
-        text = (HC if kind.startswith("hc") else CR).format(printable(kind.upper()))
-        return f"{text} and {LARGE[kind]}" if kind in LARGE else text
-    if kind in ("h1", "h2", "h3"):
-        return ROBUST.format(kind.upper())
-    description = result.noise.interval_description
-    return printable(f"{kind}: {description}" if description else kind)
+    kind, description = result.noise.interval_kind.lower(), result.noise.interval_description
+    told = f"{kind}: {description}" if description else kind
+    return INTERVALS.get(kind, printable(told))
 
 
 def constraints_line(result: Calibration) -> str | None:
@@ -145,16 +114,18 @@ def constraints_line(result: Calibration) -> str | None:
     if not active:
         return None
     units = {p.name: p.unit for p in result.model.parameters}
-    texts = [_in_words(a, units) for a in active[:MOST_NAMED]]
+    texts = [_constraint(a, units) for a in active[:MOST_NAMED]]
     more = len(active) - len(texts)
     text = "; ".join([*texts, *([f"and {more} more"] if more else [])])
     bound = any(a.kind != "equality" for a in active)
     want = "; the readings alone would go beyond the bounds" if bound else ""
-    held = HELD.get(interval_kind(result), "Intervals take these for exact")
+    held = "Intervals take these for exact"
+    if result.noise.interval_kind.lower() == "constrained profile":
+        held = "Intervals keep the constraints: they stop at bounds and take equalities for exact"
     return f"Active: {text}. {held}{want}."
 
 
-def _in_words(a: ActiveConstraint, units: dict[str, str]) -> str:
+def _constraint(a: ActiveConstraint, units: dict[str, str]) -> str:
     """ "joint2.compliance ≥ 0 µrad/(N·m)"; a label of the user's own stays as it is."""
     label = printable(a.label)
     if a.kind == "semidefinite":
@@ -178,10 +149,10 @@ def prior_line(result: Calibration) -> str | None:
     mostly = [str(name) for name in found.listed("parameters")]
     named = ", ".join(f"{printable(n)} {_percent(shares[n])}" for n in mostly[:MOST_NAMED])
     more = len(mostly) - MOST_NAMED
-    text = f"Mostly prior, share of the information: {named}" + (
-        f", and {more} more" if more > 0 else ""
+    tail = f", and {more} more" if more > 0 else ""
+    return (
+        f"Mostly prior, share of the information: {named}{tail}. Measure poses that load them more."
     )
-    return f"{text}. Measure poses that load them more."
 
 
 def _percent(share: float) -> str:
@@ -220,15 +191,28 @@ SHAPES = {
 }
 
 
+def noise_lines(result: Calibration) -> list[tuple[str, str]]:
+    """Label and sentence: estimated noise model, repeats, shape of the residuals."""
+    summary = result.residual_summary
+    found = {
+        "Noise model": noise_model_line(result),
+        "Repeats": _repeats_line(result),
+        "Residuals": None if summary is None else shape_line(summary),
+        "In time": _in_time_line(result),
+    }
+    return [(label, text) for label, text in found.items() if text is not None]
+
+
 def does_noise_explain_it(result: Calibration) -> str:
     """Residual against stated noise, as the finding has it."""
+    # Whether the weights come from a noise model with estimated variances.
+    estimated = method_of(result) in ("reml", "constrained") and result.noise.estimated
     f = result.finding(*COMPARED)
     if f is None:
-        sigma, method = result.noise.sigma, method_of(result)
-        size = ""
-        if sigma is not None and method == "ols":
+        sigma, size = result.noise.sigma, ""
+        if sigma is not None and method_of(result) == "ols":
             size = f"; the residual amounts to {length(sigma)} per coordinate"
-        elif _is_estimated(result):
+        elif estimated:
             size = "; the noise level was estimated from the readings"
         return f"{_why_not_judged(result)}{size}."
     size = (
@@ -250,14 +234,7 @@ def does_noise_explain_it(result: Calibration) -> str:
         )
     else:
         text = f"The residual is smaller than the stated noise ({size}), which is too large."
-    if _is_estimated(result):
-        text += " Weights and intervals use the estimated noise."
-    return text
-
-
-def _is_estimated(result: Calibration) -> bool:
-    """Whether the weights come from a noise model with estimated variances."""
-    return method_of(result) in ("reml", "constrained") and result.noise.estimated
+    return text + " Weights and intervals use the estimated noise." * estimated
 
 
 def _why_not_judged(result: Calibration) -> str:
@@ -266,19 +243,18 @@ def _why_not_judged(result: Calibration) -> str:
     stated = available_noise(observed.table, tracker) != "none"
     if observed.kind == "distance":
         stated = tracker.distance_sigma is not None
-    nothing_says = "so the residual cannot be judged"
     if observed.kind == "pose" and stated != (tracker.rotation_sigma is not None):
         which = "positions" if stated else "rotations"
-        return f"Noise was stated for {which} only, {nothing_says}"
+        return f"Noise was stated for {which} only, so the residual cannot be judged"
     if stated or result.noise.kind == "covariance":
         return "The residual was not compared with the stated noise"
-    return f"No noise was stated, {nothing_says}"
+    return "No noise was stated, so the residual cannot be judged"
 
 
 def noise_model_line(result: Calibration) -> str | None:
     """The estimated noise model with its sizes, and why it was chosen."""
     noise = result.noise
-    sizes, reason = size_rows(noise), noise.reason
+    sizes, reason = size_table(noise).rows, noise.reason
     if not sizes and not reason:
         return None
     text = printable(noise.description)
@@ -293,32 +269,37 @@ def noise_model_line(result: Calibration) -> str | None:
     return f"{text}. Chosen: {printable(reason)}." if reason else f"{text}."
 
 
-def size_rows(noise: Noise) -> list[tuple[str, str]]:
+def size_table(noise: Noise) -> ShownTable:
     """Name and standard deviation of every noise component; of many, the two extremes."""
     sizes = noise.sizes or ()
     shared = [s for s in sizes if s.shared or s.of_joints or s.drift]
-    own = [s for s in sizes if s not in shared]
-    if len(own) <= FEW:
-        return [(printable(s.name), _size(s)) for s in [*own, *shared]]
-    ordered = sorted(own, key=_number)
-    middle = ordered[len(ordered) // 2]
-    named = [("smallest", ordered[0]), ("largest", ordered[-1])]
-    return [
-        (f"median of {len(own)}", _size(middle)),
-        *((f"{which} ({printable(s.name)})", _size(s)) for which, s in named),
-        *((printable(s.name), _size(s)) for s in shared),
-    ]
+    own = sorted((s for s in sizes if s not in shared), key=_number)
+    named = [(s.name, s) for s in sizes if s in own]
+    if len(own) > FEW:
+        named = [(f"median of {len(own)}", own[len(own) // 2])]
+        named += [(f"smallest ({own[0].name})", own[0]), (f"largest ({own[-1].name})", own[-1])]
+    rows = [(printable(name), _size(s)) for name, s in [*named, *((s.name, s) for s in shared)]]
+    return ShownTable(("part", "size"), rows, title="Noise, standard deviations")
 
 
-def size_table(noise: Noise) -> ShownTable:
-    return ShownTable(("part", "size"), size_rows(noise), title="Noise, standard deviations")
+def _number(s: NoiseSize) -> float:
+    return (s.factor or 0.0) if s.sigma is None else s.sigma
+
+
+def _size(s: NoiseSize) -> str:
+    if s.sigma is None:
+        return significant(_number(s))
+    of_joint = s.of_joints and not s.name.endswith(SLIDES)
+    if of_joint or s.name in TURNED or s.name.endswith("(rotation)"):
+        return f"{significant(s.sigma * 1e6)} µrad"
+    return length(s.sigma)
 
 
 def candidate_table(noise: Noise) -> ShownTable:
     """Noise models that were tried, best first: words, variances, criterion above the best."""
     tried = sorted(noise.tried or (), key=lambda t: t.criterion)
     rows = [
-        (kind_in_words(t.kind), str(t.n_variances), f"{t.criterion - tried[0].criterion:.1f}")
+        (_kind_in_words(t.kind), str(t.n_variances), f"{t.criterion - tried[0].criterion:.1f}")
         for t in tried
     ]
     heads = ("noise model", "variances", "criterion over best")
@@ -329,17 +310,16 @@ def candidate_table(noise: Noise) -> ShownTable:
     return ShownTable(heads, rows, title="Noise models tried", note=note)
 
 
-def kind_in_words(kind: str) -> str:
+def _kind_in_words(kind: str) -> str:
     parts = Kind.parsed(kind)
-    own = parts.own
     known = KINDS | {name: model.description for name, model in REGISTERED.items()}
-    text = printable(known.get(own, own))
+    text = printable(known.get(parts.own, parts.own))
     text += " + deviations of a configuration" if parts.shared else ""
     text += SCATTERS.get(parts.joints, "")
     return f"{text} + drift in time" if parts.time else text
 
 
-def repeats_line(result: Calibration) -> str | None:
+def _repeats_line(result: Calibration) -> str | None:
     """The lack-of-fit test, and what follows from it for the intervals; None without repeats."""
     f = result.finding("lack_of_fit", "repeats_agree")
     if f is None:
@@ -348,10 +328,10 @@ def repeats_line(result: Calibration) -> str | None:
         f"lack of fit: F = {f.number('F'):.2f} on {f.numbers['dof_between']} and "
         f"{f.numbers['dof_pure']} degrees of freedom, {_p(f.number('p'))}"
     )
-    counted = f.numbers["counted_by"]
+    by_model = f.numbers["counted_by"] == "the noise model"
     if f.kind == "repeats_agree":
         text = f"Repeats agree with the scatter between configurations ({numbers})"
-        if counted == "the noise model":
+        if by_model:
             return (
                 f"{text}: the test shows no common deviation. The noise model, chosen by its "
                 "criterion, has one; the intervals include it."
@@ -361,9 +341,9 @@ def repeats_line(result: Calibration) -> str | None:
         f"Configurations scatter more than their repeats ({numbers}): the arm does not "
         "return to the same place, or an effect is missing."
     )
-    if counted == "the noise model":
+    if by_model:
         return f"{text} The noise model has this common deviation; the intervals include it."
-    if counted == "the intervals":
+    if f.numbers["counted_by"] == "the intervals":
         return f"{text} The intervals take each configuration as a whole and include it."
     return (
         f"{text} The intervals do not include it and are too narrow: use the default method, whose "
@@ -379,22 +359,37 @@ def shape_line(summary: ResidualSummary) -> str:
     )
     if f.kind == "residuals_too_few":
         text = f"Too few values to judge whether residuals are normal ({numbers})."
-    elif f.kind == "residuals_normal":
-        numbers += f", {_p(f.number('p'))}"
-        text = f"Standardised residuals agree with a normal distribution ({numbers})."
     else:
         numbers += f", {_p(f.number('p'))}"
-        text = f"Standardised residuals are not normal ({numbers}): {SHAPES[f.kind]}"
+        text = f"Standardised residuals agree with a normal distribution ({numbers})."
+        if f.kind != "residuals_normal":
+            text = f"Standardised residuals are not normal ({numbers}): {SHAPES[f.kind]}"
     found = sum(g.n_deviating for g in summary.groupings)
     if not found:
         return f"{text} No group of readings deviates from the noise model."
-    named = [f"{group_name(by, g)} {ratio(g)} times" for by, g in summary.deviating[:MOST_GROUPS]]
+    named = [f"{_group(by, g)} {_ratio(g)} times" for by, g in summary.deviating[:MOST_GROUPS]]
     more = found - len(named)
     tail = f", and {more} more" if more else ""
     return f"{text} Scatter unlike the noise model: {', '.join(named)}{tail}."
 
 
-def in_time_line(result: Calibration) -> str | None:
+def deviating_table(summary: ResidualSummary) -> ShownTable:
+    """Groups of readings that scatter unlike the noise model."""
+    rows = [(_group(by, g), str(g.n), _ratio(g), f"{g.p_holm:.1g}") for by, g in summary.deviating]
+    heads = ("scatters unlike the noise model", "values", "observed / expected", "p (Holm)")
+    return ShownTable(heads, rows)
+
+
+def _group(by: str, group: GroupSummary) -> str:
+    return f"{by} {printable(group.name)}"
+
+
+def _ratio(group: GroupSummary) -> str:
+    """Observed over expected standard deviation."""
+    return significant(float(np.sqrt(group.mean_square)), 2)
+
+
+def _in_time_line(result: Calibration) -> str | None:
     """How alike the residuals of visits are that follow each other; None for few visits."""
     found = result.autocorrelation
     if found is None:
@@ -415,38 +410,6 @@ def in_time_line(result: Calibration) -> str | None:
     )
 
 
-def deviating_table(summary: ResidualSummary) -> ShownTable:
-    """Groups of readings that scatter unlike the noise model."""
-    rows = [
-        (group_name(by, g), str(g.n), ratio(g), f"{g.p_holm:.1g}") for by, g in summary.deviating
-    ]
-    heads = ("scatters unlike the noise model", "values", "observed / expected", "p (Holm)")
-    return ShownTable(heads, rows)
-
-
-def group_name(by: str, group: GroupSummary) -> str:
-    return f"{by} {printable(group.name)}"
-
-
-def ratio(group: GroupSummary) -> str:
-    """Observed over expected standard deviation."""
-    return significant(float(np.sqrt(group.mean_square)), 2)
-
-
-def _size(s: NoiseSize) -> str:
-    if s.sigma is None:
-        return significant(_number(s))
-    if s.of_joints and not s.name.endswith(SLIDES):
-        return f"{significant(s.sigma * 1e6)} µrad"
-    if s.name in TURNED or s.name.endswith("(rotation)"):
-        return f"{significant(s.sigma * 1e6)} µrad"
-    return length(s.sigma)
-
-
-def _number(s: NoiseSize) -> float:
-    return (s.factor or 0.0) if s.sigma is None else s.sigma
-
-
 def _p(p: float) -> str:
     return "p < 1e-6" if p < 1e-6 else f"p = {significant(p, 2)}"
 
@@ -463,7 +426,7 @@ def fault_lines(result: Calibration, most: int | None = None) -> list[str]:
     """A sentence per group of readings beyond the noise, the largest first; of more, how many."""
     report = result.faulty_report
     groups = [] if report is None else [f for f in report.findings if f.level != "reading"]
-    lines = [_sentence(result, finding) for finding in groups[:most]]
+    lines = [_fault(result, finding) for finding in groups[:most]]
     more = len(groups) - len(lines)
     return [*lines, f"And {more} more."] if more else lines
 
@@ -477,70 +440,55 @@ def false_alarm_line(result: Calibration) -> str | None:
     return f"False-alarm rate: at most {share:g} % of tables without outliers."
 
 
-def _sentence(result: Calibration, finding: FaultyGroup) -> str:
+def _fault(result: Calibration, finding: FaultyGroup) -> str:
     n, beyond = len(finding.lines), finding.beyond
+    apart = {o.line for o in result.excluded} & set(finding.lines)
+    bends = method_of(result) in FULL_WEIGHT and not apart  # readings of full weight in the fit
     how = "err in common by" if finding.pattern == "common" else "scatter by"
-    size, noise = _metres(result, finding), f"{significant(finding.sigmas, 2)} times the noise"
+    noise = f"{significant(finding.sigmas, 2)} times the noise"
+    size = None if bends else _metres(result, finding)
     text = f"{PLACE[finding.level].format(printable(finding.name))}: {n} readings {how} "
     text += noise if size is None else f"{length(size)} ({noise})"
     if beyond < n:
         text += f", {beyond or 'none'} of them beyond the noise"
-    return f"{text}{_influence(result, finding)}."
+    names = () if result.faulty_report is None else result.faulty_report.names
+    name = printable(names[finding.column]) if names else "a parameter"
+    if not math.isfinite(finding.influence):
+        return f"{text}; the other readings leave {name} undetermined."
+    moves = "in the fit they move" if bends else "fitted along they would move"
+    count = significant(finding.influence, 2)
+    return f"{text}; {moves} {name} by {count} standard deviation{'s' * (count != '1.0')}."
 
 
 def _metres(result: Calibration, finding: FaultyGroup) -> float | None:
     """Typical error in m, None where most of the readings are not listed one by one.
 
-    The median where they err in common, which those that do not leave alone; else the rms.  Where
-    they bend the fit, the listed errors are smaller than those found.  Of a pose the list has the
-    position's error only, and the finding may be one of rotation.
+    The median where they err in common, which those that do not leave alone; else the rms.  Of a
+    pose the list has the position's error only, and the finding may be one of rotation.
     """
-    if result.observations.kind == "pose" or _bends(result, finding):
-        return None
     lines = set(finding.lines)
     listed = [o.residual for o in result.faulty if o.line in lines]
-    if not listed or 2 * len(listed) < len(lines):
+    if result.observations.kind == "pose" or not listed or 2 * len(listed) < len(lines):
         return None
     if finding.pattern == "common":
         return median(listed)
     return math.sqrt(sum(r * r for r in listed) / len(listed))
 
 
-def _influence(result: Calibration, finding: FaultyGroup) -> str:
-    """What they do, or would do if fitted along, to the parameter that they move most."""
-    names = () if result.faulty_report is None else result.faulty_report.names
-    name = printable(names[finding.column]) if names else "a parameter"
-    if not math.isfinite(finding.influence):
-        return f"; the other readings leave {name} undetermined"
-    how = "in the fit they move" if _bends(result, finding) else "fitted along they would move"
-    count = significant(finding.influence, 2)
-    return f"; {how} {name} by {count} standard deviation{'' if count == '1.0' else 's'}"
-
-
-def _bends(result: Calibration, finding: FaultyGroup) -> bool:
-    """Whether the readings have their full weight in the fit."""
-    apart = {o.line for o in result.excluded} & set(finding.lines)
-    return method_of(result) in FULL_WEIGHT and not apart
-
-
 # The smooth functions that were fitted.
-
-SMOOTH_HEADS = ("smooth function", "rms", "95 %", "known to ±", "unit", "coefficients' worth")
 
 
 def smooth_table(result: Calibration) -> ShownTable:
     """A row for each function and unit; what was left out has none."""
     rows = []
-    for part in result.smooth:
-        if not part.scale:
-            continue
+    for part in (part for part in result.smooth if part.scale):
         for unit, (rms, (low, high), half) in part.sizes.items():
-            numbers = [significant(display(v, unit)[0]) for v in (rms, low, high, half)]
+            size, *ends, known = (significant(display(v, unit)[0]) for v in (rms, low, high, half))
             worth = f"{significant(part.effective, 2)} of {part.coefficients}"
             rows.append(
                 (
-                    printable(part.group.name), numbers[0], f"{numbers[1]} to {numbers[2]}",
-                    numbers[3], display(0.0, unit)[1], worth,
+                    printable(part.group.name), size, " to ".join(ends), known,
+                    display(0.0, unit)[1], worth,
                 )
             )  # fmt: skip
     note = (
@@ -548,7 +496,8 @@ def smooth_table(result: Calibration) -> ShownTable:
         "where it was measured, and explain nothing. Each takes as many of its coefficients as "
         "the readings pay for."
     )
-    return ShownTable(SMOOTH_HEADS, rows, (0, 4), title="Smooth functions", note=note)
+    heads = ("smooth function", "rms", "95 %", "known to ±", "unit", "coefficients' worth")
+    return ShownTable(heads, rows, (0, 4), title="Smooth functions", note=note)
 
 
 def counted_functions(result: Calibration) -> str:

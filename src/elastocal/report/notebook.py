@@ -101,19 +101,10 @@ def _estimates(result: Calibration) -> pd.DataFrame:
     import pandas as pd
 
     rows = [
-        {
-            "parameter": e.name,
-            "unit": e.unit,
-            "value": e.value,
-            "std": e.std,
-            "ci95_low": None if e.ci95 is None else e.ci95[0],
-            "ci95_high": None if e.ci95 is None else e.ci95[1],
-            "nominal": e.nominal,
-            "held": e.held,
-            "identifiable": e.identifiable,
-            "combined_with": ", ".join(e.combined_with),
-            "note": e.note,
-        }
+        {"parameter": e.name, "unit": e.unit, "value": e.value, "std": e.std}
+        | dict(zip(("ci95_low", "ci95_high"), e.ci95 or (None, None), strict=True))
+        | {"nominal": e.nominal, "held": e.held, "identifiable": e.identifiable}
+        | {"combined_with": ", ".join(e.combined_with), "note": e.note}
         for e in result.estimates
     ]
     frame = pd.DataFrame(rows)
@@ -150,23 +141,17 @@ def _candidates(d: Diagnosis) -> pd.DataFrame:
     import pandas as pd
 
     found = {(f.effect, f.where): f for f in d.effects}
-    tried = {(c.effect, c.where) for c in d.candidates}
-    rows = [
-        {
-            "effect": f.effect, "where": f.where, "stage": effect_of(f.effect).stage,
-            "probability": f.probability, "score": np.nan, "detectable": np.nan, "found": True,
-            "gap_reduction": f.gap_reduction,
-        }
-        for key, f in found.items() if key not in tried
-    ]  # fmt: skip
-    for c in d.candidates:
-        f = found.get((c.effect, c.where))
+    tried = {(c.effect, c.where): c for c in d.candidates}
+    rows = []
+    for key in dict.fromkeys([*(key for key in found if key not in tried), *tried]):
+        f, c = found.get(key), tried.get(key)
         rows.append(
             {
-                "effect": c.effect, "where": c.where, "stage": c.stage,
-                "probability": c.probability, "score": c.score, "detectable": c.detectable,
-                "found": f is not None,
-                "gap_reduction": np.nan if f is None else f.gap_reduction,
+                "effect": key[0], "where": key[1], "stage": effect_of(key[0]).stage,
+                "probability": getattr(c or f, "probability", np.nan),
+                "score": getattr(c, "score", np.nan),
+                "detectable": getattr(c, "detectable", np.nan), "found": f is not None,
+                "gap_reduction": getattr(f, "gap_reduction", np.nan),
             }
         )  # fmt: skip
     return pd.DataFrame(rows)

@@ -40,7 +40,7 @@ from elastocal.report.formatting import typeset
 from elastocal.report.terminal import report_of
 from elastocal.screen import shown
 
-LIBRARIES = ("numpy", "scipy", "casadi")
+LIBRARIES = ("numpy", "scipy", "casadi")  # that the numbers depend on
 Inputs = Mapping[str, str] | Iterable[str | Path] | None
 
 
@@ -78,9 +78,12 @@ def page_of(
     report = report_of(result, **told)
     body = html_of(report.blocks)
     space = VIEW in body
+    libraries = (*LIBRARIES, "plotly") if space else LIBRARIES
+    versions = [f"{name} {metadata.version(name)}" for name in libraries]
     found = (
         ("command", command), ("elastocal", __version__), ("made on", date.today().isoformat()),
-        ("with", software(space)), ("model evaluated by", report.backend),
+        ("with", ", ".join([f"Python {platform.python_version()}", *versions])),
+        ("model evaluated by", report.backend),
         ("seed", seed if report.seed is None else report.seed),
         *((name, f"SHA-256 {digest}") for name, digest in named.items()),
     )  # fmt: skip
@@ -264,12 +267,12 @@ def _picture(block: Figure | ShownArm) -> str:
         from elastocal.report.figures import svg
 
         return f"<figure>{svg(block)}{caption}</figure>"
-    from elastocal.report.arm_view import space_figure, space_json
+    from elastocal.report.arm_view import space_figure
     from elastocal.report.figures import svg
 
     return (
         f'<figure class="view"><div class="still">{svg(space_figure(block))}</div>'
-        f'<div class="live" hidden></div>{VIEW}{space_json(block.space)}</script>{caption}</figure>'
+        f'<div class="live" hidden></div>{VIEW}{block.space.json}</script>{caption}</figure>'
     )
 
 
@@ -312,13 +315,6 @@ def digests(inputs: Inputs) -> dict[str, str]:
         with open_input(path, "input file") as handle:
             found[str(path)] = hashlib.file_digest(handle, "sha256").hexdigest()  # type: ignore[arg-type]
     return found
-
-
-def software(plotly: bool = False) -> str:
-    """Python and the libraries that the numbers depend on; plotly where the page draws with it."""
-    names = (*LIBRARIES, "plotly") if plotly else LIBRARIES
-    versions = [f"{name} {metadata.version(name)}" for name in names]
-    return ", ".join([f"Python {platform.python_version()}", *versions])
 
 
 def resource(name: str) -> str:

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Iterable, Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import replace
 
 from elastocal.identification.findings import (
@@ -21,7 +21,7 @@ from elastocal.identification.result import (
     Estimate,
     deviation,
 )
-from elastocal.report.blocks import Bar, Figure, ShownTable
+from elastocal.report.blocks import Bar, ShownTable
 from elastocal.report.formatting import (
     display,
     estimate,
@@ -88,13 +88,6 @@ def limits(result: Calibration, e: Estimate) -> str:
     return f"{text}; {used} is used"
 
 
-def held_where(result: Calibration, names: list[str]) -> str:
-    """Where all of `names` are held: at nominal, or at a start value that is none."""
-    chosen = [e for e in result.estimates if printable(e.name) in names]
-    at_nominal = all(e.held == e.nominal and nominal_known(result, e.name) for e in chosen)
-    return "held at nominal" if at_nominal else "held at the start value"
-
-
 def combination_truth(result: Calibration, combination: Combination, truth: Truth) -> float | None:
     """True value X_k + Σ f·(X_d − held_d), None where a member's true value is not known."""
     (first, _), *rest = combination.terms.items()
@@ -126,31 +119,31 @@ def nominal_known(result: Calibration, name: str) -> bool:
 
 def undetermined_lines(result: Calibration, most: int | None = None) -> list[str]:
     """Which parameters have no number of their own, and why, one line per reason; `most` names."""
-    lines = []
-
-    def told(names: list[str]) -> str:
-        return listed(names, most or len(names))
-
-    extra = {printable(name) for name in result.left.redundant} if result.left else set()
     weak = [
         f"{printable(e.name)} ({limits(result, e)})"
         for e in result.ordinary
         if e.limits is not None
     ]
-    if weak:
-        lines.append(f"hardly shown, so without a value (95 %): {told(weak)}")
-    if names := [n for n in names_of(result, INVISIBLE) if n not in extra]:
-        where = held_where(result, names)
-        lines.append(f"{where} (not visible in these data): {told(names)}")
-    if names := [n for n in names_of(result, ABSORBED) if n not in extra]:
-        where = held_where(result, names)
-        lines.append(f"{where}, absorbed in a combination: {told(names)}")
-    if names := [n for s in (INVISIBLE, ABSORBED) for n in names_of(result, s) if n in extra]:
-        where = held_where(result, names)
-        lines.append(f"{where}, not identifiable with these loads (expected): {told(names)}")
-    if names := names_of(result, FIXED):
-        lines.append(f"fixed by the user: {told(names)}")
-    return lines
+    invisible, absorbed, fixed = (names_of(result, s) for s in (INVISIBLE, ABSORBED, FIXED))
+    extra = {printable(name) for name in result.left.redundant} if result.left else set()
+    held = {
+        " (not visible in these data)": [n for n in invisible if n not in extra],
+        ", absorbed in a combination": [n for n in absorbed if n not in extra],
+        ", not identifiable with these loads (expected)": [
+            n for n in (*invisible, *absorbed) if n in extra
+        ],
+    }
+    found = {"hardly shown, so without a value (95 %)": weak}
+    found |= {f"{_held_where(result, names)}{why}": names for why, names in held.items()}
+    found["fixed by the user"] = fixed
+    return [f"{why}: {listed(n, most or len(n))}" for why, n in found.items() if n]
+
+
+def _held_where(result: Calibration, names: list[str]) -> str:
+    """Where all of `names` are held: at nominal, or at a start value that is none."""
+    chosen = [e for e in result.estimates if printable(e.name) in names]
+    at_nominal = all(e.held == e.nominal and nominal_known(result, e.name) for e in chosen)
+    return "held at nominal" if at_nominal else "held at the start value"
 
 
 def texts(e: Estimate | Combination, true: float | None) -> tuple[str, str, str, str]:
@@ -172,7 +165,7 @@ def texts(e: Estimate | Combination, true: float | None) -> tuple[str, str, str,
 
 def is_lopsided(value: float, ci95: tuple[float, float]) -> bool:
     """Whether the interval needs both ends to be told: not symmetric, or without an end."""
-    below, above = _sides(value, ci95)
+    below, above = value - ci95[0], ci95[1] - value
     if not (math.isfinite(below) and math.isfinite(above)):
         return True
     return abs(above - below) > max(LOPSIDED * max(above, below), ROUNDING * abs(value))
@@ -189,7 +182,7 @@ def bar(value: float, ci95: tuple[float, float], reference: float, alike: bool) 
     is away; else on a scale of its own, which shows all.  An open end reaches the end of the bar.
     """
     far = [abs(x - reference) for x in (value, *ci95) if math.isfinite(x)]
-    sides = [side for side in _sides(value, ci95) if math.isfinite(side)]
+    sides = [side for side in (value - ci95[0], ci95[1] - value) if math.isfinite(side)]
     half = (ci95[1] - ci95[0]) / 2 if len(sides) == 2 else max(sides, default=0.0)
     reach = TRUTH_REACH * half if alike else 1.05 * max(far, default=0.0)
     if not reach > 0 or not sides:
@@ -198,97 +191,71 @@ def bar(value: float, ci95: tuple[float, float], reference: float, alike: bool) 
     return Bar(low, high, middle)
 
 
-def _sides(value: float, ci95: tuple[float, float]) -> tuple[float, float]:
-    return value - ci95[0], ci95[1] - value
-
-
 def parameter_table(
     result: Calibration, truth: Truth | None = None, published: Published | None = None
 ) -> ShownTable:
     """The parameters identified alone, by effect; `published`: what others found (SI)."""
     own = [e for e in result.ordinary if e.identifiable]
     effects = {p.name: p.effect.replace("_", " ") for p in result.model.parameters}
-    after: dict[str, list[str]] = {
-        "nominal": [
-            plain(display(e.nominal, e.unit)[0]) if nominal_known(result, e.name) else "–"
-            for e in own
-        ]
-    }
+    known = [nominal_known(result, e.name) for e in own]
+    shown = [plain(display(e.nominal, e.unit)[0]) for e in own]
+    after = {"nominal": [n if k else "–" for n, k in zip(shown, known, strict=True)]}
     if published:
-        after["published"] = [_published(published.get(e.name), e.unit) for e in own]
+        given = [(published.get(e.name), e.unit) for e in own]
+        after["published"] = ["–" if v is None else " ± ".join(estimate(*v, unit)[:2])
+                              for v, unit in given]  # fmt: skip
     if any(e.note for e in own):
         after["note"] = [printable(e.note) for e in own]
     true = None if truth is None else [truth.get(e.name) for e in own]
-    references = [e.nominal if nominal_known(result, e.name) else None for e in own]
-    table = _numbers("Parameters", "parameter", own, [printable(e.name) for e in own], true,
-                     references, after)  # fmt: skip
-    groups: dict[int, str] = {}
-    for k, e in enumerate(own):
-        if not k or effects[e.name] != effects[own[k - 1].name]:
-            groups[k] = effects[e.name]
+    nominal = [e.nominal if k else None for e, k in zip(own, known, strict=True)]
+    table = _numbers("Parameters", [printable(e.name) for e in own], own, true, nominal, after)
+    of = [effects[e.name] for e in own]
+    groups = {k: name for k, name in enumerate(of) if not k or name != of[k - 1]}
     return replace(table, groups=groups)
 
 
 def combination_table(result: Calibration, truth: Truth | None = None) -> ShownTable:
     """Sums of parameters that the data determine although their members they do not."""
     found = result.combinations
-    true = None
-    if truth is not None:
-        true = [combination_truth(result, c, truth) for c in found]
+    true = None if truth is None else [combination_truth(result, c, truth) for c in found]
     title = "Combinations (factors in SI units)"
-    return _numbers(title, "combination", found, [*map(shortened, found)], true, None, {})
+    return _numbers(title, [*map(shortened, found)], found, true, [None] * len(found), {})
 
 
 def _numbers(
-    title: str, first: str, found: Iterable[Estimate | Combination], names: list[str],
-    truth: list[float | None] | None, references: list[float | None] | None,
-    after: dict[str, list[str]],
+    title: str, names: list[str], found: Sequence[Estimate | Combination],
+    truth: list[float | None] | None, nominal: list[float | None], after: dict[str, list[str]],
 ) -> ShownTable:  # fmt: skip
     """Names, values, intervals and units, with true values where known, and columns `after`.
 
-    Bars show the interval beside the true value, else beside the reference.
+    Bars show the interval beside the true value, else beside the nominal one.
     """
-    found = list(found)
     lopsided = any(
         e.value is not None and e.ci95 is not None and is_lopsided(e.value, e.ci95) for e in found
     )
-    half = "95 %" if lopsided else "± 95 %"
-    heads = [first, "value", half, "unit", *(["truth", "in 95 %"] if truth else []), *after]
-    true = truth or [None] * len(found)
+    first, half = title.split()[0].lower().removesuffix("s"), "95 %" if lopsided else "± 95 %"
+    of_truth = ["truth", "in 95 %"] if truth else []
+    heads = (first, "value", half, "unit", *of_truth, *after)
     rows, bars, brief = [], [], []
-    beside = true if truth else references or true
     for k, e in enumerate(found):
-        value, width, unit, known = texts(e, true[k])
+        at = truth[k] if truth else nominal[k]
+        value, width, unit, known = texts(e, at if truth else None)
         signed = width if width.startswith(("[", "–")) else f"± {width}"
-        held = [inside(true[k], e.ci95)] if truth else []
-        rows.append(
-            (
-                names[k],
-                value,
-                signed if lopsided else width,
-                unit,
-                *([known, *held] if truth else []),
-                *(own[k] for own in after.values()),
-            )
-        )
+        held = [inside(at, e.ci95)] if truth else []
+        rest = [*([known, *held] if truth else []), *(own[k] for own in after.values())]
+        rows.append((names[k], value, signed if lopsided else width, unit, *rest))
         brief.append((names[k], f"{value} {signed} {unit}", *held))
-        at, ci95 = beside[k], e.ci95
-        bars.append(None if at is None or e.value is None or ci95 is None
-                    else bar(e.value, ci95, at, bool(truth)))  # fmt: skip
+        drawn = None
+        if at is not None and e.value is not None and e.ci95 is not None:
+            drawn = bar(e.value, e.ci95, at, bool(truth))
+        bars.append(drawn)
     words = tuple(k for k, head in enumerate(heads) if head in (first, "unit", "in 95 %", "note"))
-    narrow = ShownTable((first, f"value {half}", *(["in 95 %"] if truth else [])), brief, (0, 1, 2),
-                   title=title)  # fmt: skip
-    drawn = bars if any(bars) else []
+    narrow = ShownTable((first, f"value {half}", *of_truth[1:]), brief, (0, 1, 2), title=title)
     note = "Bars are 95 % intervals beside the nominal value (upright line), each on its own scale."
     if truth:
         note = "Bars are 95 % intervals around the true value (upright line), all equally wide."
-    return ShownTable(tuple(heads), rows, words, title=title, bars=drawn, narrow=narrow,
-                 of_bars=note if drawn else "")  # fmt: skip
-
-
-def _published(found: tuple[float, float] | None, unit: str) -> str:
-    """ "0.287 ± 0.003", in the unit of the row."""
-    return "–" if found is None else " ± ".join(estimate(*found, unit)[:2])
+    shown = ShownTable(heads, rows, words, title=title, narrow=narrow)
+    return replace(shown, bars=bars, of_bars=note) if any(bars) else shown
 
 
 def undetermined_table(result: Calibration, truth: Truth | None = None) -> ShownTable:
@@ -303,28 +270,3 @@ def undetermined_table(result: Calibration, truth: Truth | None = None) -> Shown
         unit = display(0.0, e.unit)[1]
         rows.append((printable(e.name), nominal, unit, *known, why_without(result, e)))
     return ShownTable(tuple(heads), rows, (0, 2, len(heads) - 1))
-
-
-MOST_DOTS = 40
-
-
-def parameter_figure(result: Calibration) -> Figure:
-    """Deviation of each identified parameter from nominal with its 95 % interval, each on a scale
-    of its own; the numbers stand with the names."""
-    from elastocal.report.figures import Row, rows_of_dots
-
-    rows = []
-    for e in result.ordinary:
-        if e.value is None or e.ci95 is None or not all(map(math.isfinite, e.ci95)):
-            continue
-        low, high = (end - e.nominal for end in e.ci95)
-        reach = max(abs(low), abs(high)) or 1.0
-        value, half, unit, _ = texts(e, None)
-        signed = half if half.startswith("[") else f"± {half}"
-        number = (e.value - e.nominal) / reach
-        rows.append(Row(f"{e.name} {value} {signed} {unit}", number, (low / reach, high / reach)))
-    title, axis = (
-        "Parameters beside their nominal values",
-        "deviation from nominal over its largest",
-    )
-    return rows_of_dots("parameters", title, rows[:MOST_DOTS], axis)

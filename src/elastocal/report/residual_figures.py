@@ -1,25 +1,26 @@
-"""Figures of residuals: over configurations, joints and time, against normal noise, in space."""
+"""Residuals as a table and as figures: over configurations, joints and time, on the arm; how sure
+the arm's place is over its workspace; smooth functions."""
 
 from __future__ import annotations
 
 from collections.abc import Iterator, Sequence
+from dataclasses import dataclass
 from typing import TYPE_CHECKING
 
 import numpy as np
 
 from elastocal.errors import ElastocalError
 from elastocal.identification.prediction import over_the_workspace
-from elastocal.identification.residuals import ResidualSummary
+from elastocal.identification.residuals import groupings
 from elastocal.identification.result import Calibration
 from elastocal.identification.smooth_part import SmoothPart
 from elastocal.model.manipulator import Model
-from elastocal.model.observations import Observations
+from elastocal.model.observations import COMPONENTS, Observations
 from elastocal.model.rigid import nominal_flanges
 from elastocal.report.arm_view import residual_arm
-from elastocal.report.blocks import Figure, ShownArm
-from elastocal.report.figures import FAINT, INK, SERIES, dots, panels_of
-from elastocal.report.formatting import display, short_name, significant
-from elastocal.report.residual_view import Residuals, reach, residuals_by, running_mean
+from elastocal.report.blocks import Figure, ShownArm, ShownTable
+from elastocal.report.figures import FAINT, SERIES, dots, panels_of, reach
+from elastocal.report.formatting import display, short_name, signed, significant
 from elastocal.text import printable
 from elastocal.units import Array, IntArray
 
@@ -27,9 +28,95 @@ if TYPE_CHECKING:
     from matplotlib.axes import Axes
     from matplotlib.figure import Figure as Drawing
 
+MOST_DRAWN = 5000  # observations; figures of larger tables show a random choice of them
 MOST_LABELS = 20
 MOST_SMOOTH = 24  # smooth functions
 MOST_JOINT_DOTS = 2000  # per joint; the running mean uses every reading
+
+
+@dataclass(frozen=True)
+class Residuals:
+    """Residuals (observations, components) in µm (µrad for rotations) and where they belong.
+
+    `pose` (observations,) counts configurations from 0 in the table's order, `labels` names
+    them; `marker` indexes `markers`; `q` (observations, joints) in rad or m; `shown` are the
+    observations to draw, all or a random choice.
+    """
+
+    components: tuple[str, ...]
+    units: tuple[str, ...]
+    value: Array
+    pose: IntArray
+    labels: tuple[str, ...]
+    marker: IntArray
+    markers: tuple[str, ...]
+    q: Array
+    shown: IntArray
+
+    @property
+    def lengths(self) -> Array:
+        """The components that are lengths (observations, 3 or 1); they come first."""
+        return self.value[:, : self.units.count("µm")]
+
+
+def residuals_by(observed: Observations, residual: Array) -> Residuals:
+    """Residuals (rows,) in m (rad) by observation."""
+    table, names = observed.table, COMPONENTS[observed.kind]
+    codes, first, pose = np.unique(observed.configuration, return_index=True, return_inverse=True)
+    order = np.argsort(first)
+    used, marker = np.unique(table.marker[observed.lead], return_inverse=True)
+    n = len(observed.lead)
+    shown = np.arange(n)
+    if n > MOST_DRAWN:
+        shown = np.sort(np.random.default_rng(0).choice(n, MOST_DRAWN, replace=False))
+    return Residuals(
+        components=names,
+        units=tuple("µrad" if name.startswith("r") else "µm" for name in names),
+        value=residual.reshape(-1, observed.size) * 1e6,
+        pose=np.argsort(order)[pose],
+        labels=tuple(table.configuration_labels[codes[k]] for k in order),
+        marker=marker,
+        markers=tuple(table.marker_names[k] for k in used),
+        q=table.q[observed.lead],
+        shown=shown,
+    )
+
+
+OF_RESIDUALS = (
+    "Of a direction, mean and largest are signed. Of all others the length of the 3-D residual is "
+    "given, and the mean is the length of the mean vector: near the rms, the residual is a common "
+    "shift; near zero, it is scatter."
+)
+MOST_CONFIGURATIONS = 200
+
+
+def residual_table(observed: Observations, residuals: Residuals) -> ShownTable:
+    """Mean, rms and largest residual of every direction, marker, load state and configuration.
+
+    Of a direction they are signed; else lengths of the 3-D residual, and of its mean vector.
+    """
+    rows: list[tuple[str, ...]] = []
+
+    def add(name: str, sizes: Array, mean: str, largest: str, unit: str = "µm") -> None:
+        rms = significant(float(np.sqrt((sizes**2).mean())))
+        rows.append((name, str(len(sizes)), mean, rms, largest, unit))
+
+    groups = {0: "direction"}
+    columns = residuals.value.T
+    for name, unit, value in zip(residuals.components, residuals.units, columns, strict=True):
+        largest = float(value[np.argmax(np.abs(value))])
+        add(name, value, signed(float(value.mean())), signed(largest), unit)
+    every = np.ones(len(observed.value), dtype=bool)
+    for by, code, names in groupings(observed, every):
+        if by == "component":
+            continue
+        groups[len(rows)] = by
+        for k, name in enumerate(names[:MOST_CONFIGURATIONS]):
+            own = residuals.lengths[code[:: observed.size] == k]
+            sizes, mean = np.linalg.norm(own, axis=1), float(np.linalg.norm(own.mean(axis=0)))
+            add(printable(name), sizes, significant(mean), significant(float(sizes.max())))
+    heads = ("readings of", "number", "mean", "rms", "largest", "unit")
+    return ShownTable(heads, rows, (0, 5), groups, title="Residuals", note=OF_RESIDUALS)
 
 
 def residual_figures(
@@ -77,29 +164,30 @@ def over_configurations(residuals: Residuals) -> Figure:
 
 
 def _configuration_panel(axes: Axes, residuals: Residuals, k: int) -> None:
-    many = len(residuals.markers)
-    values = residuals.value[:, k]
-    size = 2.6 if len(residuals.shown) <= 1500 else 1.6
-    shift = 0.6 * (np.arange(many) - (many - 1) / 2) / many
+    many, shown, values = len(residuals.markers), residuals.shown, residuals.value[:, k]
+    size = 2.6 if len(shown) <= 1500 else 1.6
+    x = residuals.pose + 0.6 * (residuals.marker - (many - 1) / 2) / many
     axes.axhline(0, color=FAINT, linewidth=0.8)
     if many > len(SERIES):
-        at = residuals.shown
-        x = residuals.pose[at] + shift[residuals.marker[at]]
-        dots(axes, x, values[at], SERIES[0], size)
+        dots(axes, x[shown], values[shown], SERIES[0], size)
     else:
         for m, name in enumerate(residuals.markers):
-            at = residuals.shown[residuals.marker[residuals.shown] == m]
-            dots(axes, residuals.pose[at] + shift[m], values[at], SERIES[m], size, short_name(name))
+            at = shown[residuals.marker[shown] == m]
+            dots(axes, x[at], values[at], SERIES[m], size, short_name(name))
     axes.grid(axis="x", visible=False)
     axes.set_xlim(-0.7, len(residuals.labels) - 0.3)
-    axes.set_ylabel(f"{residuals.components[k]} in {residuals.units[k]}")
-    alike = [i for i, unit in enumerate(residuals.units) if unit == residuals.units[k]]
-    _limit(axes, values, reach(residuals.value[:, alike]))
+    unit = residuals.units[k]
+    axes.set_ylabel(f"{residuals.components[k]} in {unit}")
+    height = reach(residuals.value[:, [u == unit for u in residuals.units]])
+    axes.set_ylim(-height, height)
+    if beyond := int((np.abs(values) > height).sum()):
+        told = f"{beyond} beyond this axis"
+        axes.text(0.01, 0.97, told, transform=axes.transAxes, va="top", fontsize=8)
 
 
 def over_joints(kinds: Sequence[str], residuals: Residuals) -> Figure:
     """Residual over the position of each joint, of `kinds`, with the running mean by direction."""
-    n, shown = residuals.positions, residuals.shown
+    n, shown = residuals.lengths.shape[1], residuals.shown
     if len(shown) * n > MOST_JOINT_DOTS:
         shown = np.random.default_rng(0).choice(shown, MOST_JOINT_DOTS // n, replace=False)
 
@@ -127,56 +215,31 @@ def _over(
     styles: Sequence[str] = ("-",),
 ) -> None:  # fmt: skip
     """Residuals of positions over x (observations,): dots of the `shown`, running means of all."""
-    values = residuals.value[:, : residuals.positions]
     axes.axhline(0, color=FAINT, linewidth=0.8)
-    for k, own in enumerate(values.T):
+    for k, own in enumerate(residuals.lengths.T):
         dots(axes, x[shown], own[shown], SERIES[k], size)
-    for k, own in enumerate(values.T):
-        middle, mean, error = running_mean(x, own)
-        axes.errorbar(middle, mean, 2 * error, color=SERIES[k], linewidth=1.4, elinewidth=0.8,
+    for k, own in enumerate(residuals.lengths.T):
+        axes.errorbar(*running_mean(x, own), color=SERIES[k], linewidth=1.4, elinewidth=0.8,
                       linestyle=styles[k % len(styles)],
                       label=residuals.components[k])  # fmt: skip
-    height = reach(values)
+    height = reach(residuals.lengths)
     axes.set_ylim(-height, height)
 
 
-def _limit(axes: Axes, values: np.ndarray, height: float) -> None:
-    axes.set_ylim(-height, height)
-    if beyond := int((np.abs(values) > height).sum()):
-        _remark(axes, f"{beyond} beyond this axis")
+def running_mean(x: Array, y: Array, bins: int = 12) -> tuple[Array, Array, Array]:
+    """Mean x, mean y and twice its standard error in bins of equally many x.
 
-
-def _remark(axes: Axes, text: str) -> None:
-    axes.text(0.01, 0.97, text, transform=axes.transAxes, va="top", fontsize=8)
-
-
-def normal_scores(summary: ResidualSummary) -> Figure:
-    """Ordered residuals against normal order statistics, with the simultaneous 95 % band."""
-    s = summary.whole.scores
-
-    def draw(figure: Drawing) -> None:
-        axes = figure.subplots()
-        axes.fill_between(s.expected, s.low, s.high, color=FAINT, alpha=0.3, linewidth=0,
-                          label="95 % band for all together")  # fmt: skip
-        ends = s.expected[[0, -1]]
-        axes.plot(ends, ends, color=INK, linewidth=1.0, label="normal")
-        outside = (s.observed < s.low) | (s.observed > s.high)
-        axes.plot(s.expected[~outside], s.observed[~outside], "o", color=SERIES[0], markersize=2.6,
-                  label="inside")  # fmt: skip
-        if outside.any():
-            axes.plot(s.expected[outside], s.observed[outside], "D", color=SERIES[1],
-                      markersize=4.0, label="outside")  # fmt: skip
-        axes.set_xlabel("expected of a normal distribution")
-        axes.set_ylabel("observed")
-        axes.legend(loc="upper left")
-
-    caption = (
-        "Residuals over their standard deviations, in order, against those of a normal "
-        "distribution. If the noise model is right, all dots stay in the band in 95 % of tables. "
-        "Ends that bend away are outliers; another slope is another size."
-    )
-    title = "Normal scores of the residuals with a 95 % band"
-    return Figure("scores", title, draw, 3.4, caption)
+    Where x takes few different values, each is a bin.
+    """
+    order = np.argsort(x, kind="stable")
+    steps = np.flatnonzero(np.diff(x[order]) > 1e-9 * (np.abs(x).max(initial=0.0) + 1e-300)) + 1
+    if len(steps) >= 1.5 * bins:
+        parts = np.array_split(order, min(bins, max(len(x) // 8, 1)))
+    else:
+        parts = np.split(order, steps)
+    parts = [p for p in parts if len(p) > 1]
+    middle, mean = (np.array([v[p].mean() for p in parts]) for v in (x, y))
+    return middle, mean, np.array([2 * y[p].std(ddof=1) / np.sqrt(len(p)) for p in parts])
 
 
 def over_time(observed: Observations, residuals: Residuals) -> Figure:
@@ -184,23 +247,19 @@ def over_time(observed: Observations, residuals: Residuals) -> Figure:
     table, lead = observed.table, observed.lead
     if table.time is None:
         at, label = np.arange(len(lead), dtype=float), "reading, in the order of the table"
+        when = "In the order of the table, which has no column time_s or time_min"
     else:
-        seconds = table.time[lead]
-        hours = float(np.ptp(seconds)) > 3 * 3600
-        at, label = seconds / (3600 if hours else 60), f"time in {'h' if hours else 'min'}"
+        hours = float(np.ptp(table.time[lead])) > 3 * 3600
+        at, label = table.time[lead] / (3600 if hours else 60), f"time in {'h' if hours else 'min'}"
+        when = "Over time"
 
     def draw(figure: Drawing) -> None:
         axes = figure.subplots()
         _over(axes, at, residuals, residuals.shown, 1.5, ("-", "--", ":"))
         axes.set_xlabel(label)
         axes.set_ylabel("residual in µm")
-        figure.legend(loc="outside upper right", ncols=residuals.positions)
+        figure.legend(loc="outside upper right", ncols=residuals.lengths.shape[1])
 
-    when = (
-        "Over time"
-        if table.time is not None
-        else ("In the order of the table, which has no column time_s or time_min")
-    )
     caption = (
         f"{when}; lines are means with twice their standard error. A slope is a drift, a step "
         "something that moved."
@@ -234,11 +293,9 @@ def uncertainty_map(result: Calibration) -> Figure | None:
         return None
     at = np.column_stack([np.hypot(nominal[:, 0], nominal[:, 1]), nominal[:, 2]])[good]
 
-    what = printable(f"marker {point}" if point in markers else "tool")
-
     def draw(figure: Drawing) -> None:
         axes = figure.subplots()
-        axes.set_title(what)
+        axes.set_title(printable(f"marker {point}" if point in markers else "tool"))
         _map(axes, at, 1e12 * variance[good], float(np.ptp(at, axis=0).max()) / CELLS)
         axes.set_xlabel("distance from the base's z axis in m")
         axes.set_ylabel("height over the base in m")
@@ -248,29 +305,24 @@ def uncertainty_map(result: Calibration) -> Figure | None:
         "flange stands: poses over the joint limits, under the loads measured. It counts the "
         "covariance of the estimates, what these poses do not show, and possible model error."
     )
-    title = "Expected error over the work space"
-    return Figure("sureness", title, draw, 4.2, caption)
+    return Figure("sureness", "Expected error over the work space", draw, 4.2, caption)
 
 
 def _map(axes: Axes, at: Array, squared: Array, side: float) -> None:
+    """Cells of `side` m that hold places `at` (n, 2): the rms of `squared` (n,) as shade, text."""
     from matplotlib.patches import Rectangle
 
     low = at.min(axis=0)
-    cell = np.floor((at - low) / side).astype(np.int64)
-    keys, code = np.unique(cell, axis=0, return_inverse=True)
+    keys, code = np.unique(np.floor((at - low) / side), axis=0, return_inverse=True)
     count = np.bincount(code.ravel())
     rms = np.sqrt(np.bincount(code.ravel(), squared) / count)
     told = count >= FEWEST
     largest = float(rms[told].max(initial=0.0)) or 1.0
-    for key, size, enough in zip(keys, rms, told, strict=True):
-        if not enough:
-            continue
-        corner = low + side * key
-        shade = 0.75 * size / largest
-        axes.add_patch(Rectangle((float(corner[0]), float(corner[1])), side, side,
-                                 facecolor=SERIES[0], alpha=shade, linewidth=0))  # fmt: skip
-        middle = corner + side / 2
-        axes.text(float(middle[0]), float(middle[1]), significant(float(size), 2), ha="center",
+    for key, size in zip(keys[told], rms[told], strict=True):
+        x, y = (low + side * key).tolist()
+        axes.add_patch(Rectangle((x, y), side, side, facecolor=SERIES[0], linewidth=0,
+                                 alpha=0.75 * size / largest))  # fmt: skip
+        axes.text(x + side / 2, y + side / 2, significant(float(size), 2), ha="center",
                   va="center", fontsize=9)  # fmt: skip
     high = low + side * (keys.max(axis=0) + 1)
     axes.set_xlim(float(low[0]) - 0.05 * side, float(high[0]) + 0.05 * side)
@@ -291,7 +343,7 @@ def smooth_figure(result: Calibration) -> Figure | None:
 
     def draw(figure: Drawing) -> None:
         for axes, (part, unit) in zip(panels_of(figure, len(found), 2), found, strict=True):
-            _panel(axes, part, unit)
+            _smooth_panel(axes, part, unit)
 
     caption = (
         "With 95 % bands, and without the mean and the wave of one period per turn, for which "
@@ -301,21 +353,17 @@ def smooth_figure(result: Calibration) -> Figure | None:
     return Figure("smooth", "Smooth functions with their 95 % bands", draw, height, caption)
 
 
-def _panel(axes: Axes, part: SmoothPart, unit: str) -> None:
+def _smooth_panel(axes: Axes, part: SmoothPart, unit: str) -> None:
     x, value, half = part.shape()
-    shown = _places(x, part)
+    x = np.degrees(x) if part.group.lasting else x / 3600
     axes.axhline(0, color=FAINT, linewidth=0.8)
-    own = [c for c, u in enumerate(part.group.units) if u == unit]
     factor, text = display(1.0, unit)
+    own = [c for c, u in enumerate(part.group.units) if u == unit]
     for k, c in enumerate(own):
-        colour = SERIES[k % len(SERIES)]
         low, high = ((value[c] + sign * half[c]) * factor for sign in (-1, 1))
-        axes.fill_between(shown, low, high, color=colour, alpha=0.25, linewidth=0)
-        axes.plot(shown, value[c] * factor, color=colour, linewidth=1.2)
+        colour = SERIES[k % len(SERIES)]
+        axes.fill_between(x, low, high, color=colour, alpha=0.25, linewidth=0)
+        axes.plot(x, value[c] * factor, color=colour, linewidth=1.2)
     axes.set_title(printable(part.group.name))
     axes.set_ylabel(text)
     axes.set_xlabel(f"{part.group.follows} in {'°' if part.group.lasting else 'h'}")
-
-
-def _places(x: Array, part: SmoothPart) -> Array:
-    return np.degrees(x) if part.group.lasting else x / 3600
