@@ -3,8 +3,8 @@
 import numpy as np
 import pytest
 
-from elastocal.identification import linear_solver
-from elastocal.identification.linear_solver import least_norm
+from elastocal.identification import weighted_problem
+from elastocal.identification.weighted_problem import least_norm
 
 
 @pytest.mark.parametrize("shape", [(9, 4), (4, 9), (6, 6)])
@@ -17,12 +17,12 @@ def test_least_norm_where_divide_and_conquer_does_not_converge(
     A[:, 1] = 2 * A[:, 0]
     expected = np.linalg.pinv(A, rcond=1e-12) @ b
     np.testing.assert_allclose(least_norm(A, b, cond=1e-12), expected, atol=1e-12)
-    lstsq = linear_solver.linalg.lstsq
+    lstsq = weighted_problem.linalg.lstsq
 
     def failing(*arguments, lapack_driver=None, **options):
         if lapack_driver is None:
-            raise linear_solver.linalg.LinAlgError("SVD did not converge")
+            raise weighted_problem.linalg.LinAlgError("SVD did not converge")
         return lstsq(*arguments, lapack_driver=lapack_driver, **options)
 
-    monkeypatch.setattr(linear_solver.linalg, "lstsq", failing)
+    monkeypatch.setattr(weighted_problem.linalg, "lstsq", failing)
     np.testing.assert_allclose(least_norm(A, b, cond=1e-12), expected, atol=1e-12)

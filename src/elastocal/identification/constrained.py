@@ -19,7 +19,7 @@ from scipy import linalg, optimize
 
 from elastocal.errors import ElastocalError, InputError, InsufficientDataError
 from elastocal.identification.knowledge import ROUND_OFF, Matrix, System
-from elastocal.identification.linear_solver import least_norm
+from elastocal.identification.weighted_problem import least_norm
 from elastocal.text import listed
 from elastocal.units import Array, BoolArray, IntArray
 

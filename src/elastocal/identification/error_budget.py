@@ -8,13 +8,12 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from elastocal.identification.linear_solver import least_norm
 from elastocal.identification.prediction import FEWEST_REPEATS
 from elastocal.identification.residuals import held_out_residual
 from elastocal.identification.result import Calibration
 from elastocal.identification.scrutiny import stage_of
 from elastocal.identification.solve import WORTH_A_COLUMN, reduce
-from elastocal.identification.weighted_problem import weights_for
+from elastocal.identification.weighted_problem import least_norm, weights_for
 from elastocal.model.manipulator import Model
 from elastocal.model.observations import Observations, pure_error
 from elastocal.units import Array

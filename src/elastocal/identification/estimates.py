@@ -11,7 +11,7 @@ from scipy import linalg
 from elastocal.identification.covariance import variance_of
 from elastocal.identification.faulty_readings import report_faulty
 from elastocal.identification.findings import judged, of_solution
-from elastocal.identification.method_result import MethodResult
+from elastocal.identification.intervals import MethodResult
 from elastocal.identification.methods import is_exact
 from elastocal.identification.noise_summary import noise_of, noise_parts
 from elastocal.identification.outliers import Outlier

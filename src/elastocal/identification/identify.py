@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 from elastocal.errors import ElastocalError
 from elastocal.identification.estimates import summarise, uncertainty_of
 from elastocal.identification.findings import judged
-from elastocal.identification.method_result import MethodResult
+from elastocal.identification.intervals import MethodResult
 from elastocal.identification.methods import (
     is_exact,
     run_method,

@@ -2,12 +2,13 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 from typing import Literal, get_args
 
 import numpy as np
 
 from elastocal.errors import InputError, option
+from elastocal.identification.constrained import ActiveConstraint
 from elastocal.identification.constrained_fit import (
     KnowledgeProblem,
     constrained_fit,
@@ -17,6 +18,7 @@ from elastocal.identification.covariance import Covariance, cluster_robust, hc, 
 from elastocal.identification.knowledge import Constraints
 from elastocal.identification.least_squares import Fit
 from elastocal.identification.noise_choice import NoiseFit
+from elastocal.identification.smooth_part import SmoothPart
 from elastocal.identification.solve import Solution, residual_sigma
 from elastocal.identification.weighted_problem import (
     Partition,
@@ -25,7 +27,7 @@ from elastocal.identification.weighted_problem import (
     regressor,
     same_size,
 )
-from elastocal.units import Array
+from elastocal.units import Array, BoolArray
 
 # Cluster-robust covariance of a fit to a table too large for its B to be formed.
 
@@ -154,3 +156,34 @@ def _profiled(solution: Solution, classical: Covariance) -> Intervals:
     ]
     text = "profile of the nonlinear sum of squares (all readings independent)"
     return Intervals(replace(classical, kind="profile", description=text), np.array(ends))
+
+
+# What a method ends with.
+
+
+@dataclass(frozen=True)
+class MethodResult:
+    """The final fit, its intervals, and the noise where it was estimated.
+
+    Readings that are not `good` (N,) lie beyond the noise, whether or not they had a part in the
+    fit.  What constraints and a prior add: `active` constraints, `prior_share` by parameter, how
+    many parameters the readings paid for (`effective`), `leverage` (rows,), and `warnings` where
+    the readings contradict them; in a fit to readings alone effective and leverage follow from
+    the solution.  `smooth` are the smooth functions, with which `standard` (N, size) are the
+    residuals of all readings free of the fit's part in them.  `limits` are the 95 % intervals of
+    the parameters that the readings `hardly_shown`, by their index.
+    """
+
+    method: str
+    solution: Solution
+    intervals: Intervals
+    noise: NoiseFit | None
+    good: BoolArray
+    active: tuple[ActiveConstraint, ...] = ()
+    prior_share: dict[str, float] = field(default_factory=dict)
+    effective: int | None = None
+    leverage: Array | None = None
+    warnings: tuple[str, ...] = ()
+    smooth: tuple[SmoothPart, ...] = ()
+    standard: Array | None = None
+    limits: dict[int, tuple[float, float]] = field(default_factory=dict)

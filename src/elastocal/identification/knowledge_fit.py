@@ -16,18 +16,15 @@ from elastocal.identification.constrained_fit import (
     profile_end,
 )
 from elastocal.identification.covariance import Covariance, t_quantile
-from elastocal.identification.intervals import LEVEL, Intervals
+from elastocal.identification.intervals import LEVEL, Intervals, MethodResult
 from elastocal.identification.knowledge import Constraints, GaussianPrior
 from elastocal.identification.least_squares import Fit
-from elastocal.identification.linear_solver import least_norm
-from elastocal.identification.method_result import MethodResult
 from elastocal.identification.options import Options
 from elastocal.identification.residuals import growth
 from elastocal.identification.solve import (
     WORTH_A_COLUMN,
     Reduction,
     Solution,
-    free_r_factor,
     residual_sigma,
 )
 from elastocal.identification.weighted_problem import (
@@ -35,6 +32,7 @@ from elastocal.identification.weighted_problem import (
     Span,
     evaluate,
     in_order,
+    least_norm,
     regressor,
 )
 from elastocal.text import listed, quoted
@@ -52,10 +50,10 @@ def fitted_columns(
 ) -> IntArray:
     """Indices of the parameters to fit under the constraints and the prior, ascending.
 
-    These are the kept parameters of the solution; the free ones that
-    the prior or an equality names, for that is knowledge of themselves; and, of the parameters
-    that are known only together with one of these, as many as can now be told apart from it: with
-    a prior on k, readings of k + d are knowledge of d.  Told apart is what readings, prior and
+    These are the kept parameters of the solution; the free ones that the prior or an equality
+    names, for that is knowledge of themselves; and, of the parameters that are known only together
+    with one of these, as many as can now be told apart from it: with a prior on k, readings of
+    k + d are knowledge of d.  Told apart is what readings, prior and
     equalities determine better than its typical size, as in the choice of the kept parameters.
     Bounds and matrices make nothing known: they act on the fitted parameters, with all others
     held where the fit held them.
@@ -78,9 +76,9 @@ def fitted_columns(
     )
     named = {names.index(n) for n in tied | priors} & free
     columns = {*reduction.kept.tolist(), *named}
-
     R = np.zeros((len(problem.free), len(names)))
-    R[:, problem.free] = free_r_factor(problem, solution.fit).R
+    at = evaluate(problem.model, problem.parts, solution.fit.x, problem.free)
+    R[:, problem.free] = at.r_factor.R
 
     def told_apart(c: int) -> bool:
         chosen = np.array([*sorted(columns - {c}), c])

@@ -10,7 +10,6 @@ import numpy as np
 from numpy.typing import NDArray
 
 from elastocal.errors import ElastocalError
-from elastocal.identification.linear_solver import least_norm
 from elastocal.identification.weighted_problem import (
     Evaluation,
     Partition,
@@ -18,6 +17,7 @@ from elastocal.identification.weighted_problem import (
     Weights,
     evaluate,
     is_reduced,
+    least_norm,
     partition,
 )
 from elastocal.model.manipulator import Model

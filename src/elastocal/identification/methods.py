@@ -10,9 +10,8 @@ from scipy import sparse
 
 from elastocal.identification import published
 from elastocal.identification.covariance import Covariance
-from elastocal.identification.intervals import LEVEL, Intervals, intervals_of
+from elastocal.identification.intervals import LEVEL, Intervals, MethodResult, intervals_of
 from elastocal.identification.knowledge_fit import fit_with_knowledge
-from elastocal.identification.method_result import MethodResult
 from elastocal.identification.noise_choice import (
     NoiseFit,
     estimate_noise,

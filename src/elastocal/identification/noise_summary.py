@@ -10,7 +10,7 @@ import numpy as np
 from scipy import special
 
 from elastocal.errors import InputError
-from elastocal.identification.method_result import MethodResult
+from elastocal.identification.intervals import MethodResult
 from elastocal.identification.noise_choice import NoiseFit, NoiseTest, Trial, linearised
 from elastocal.identification.noise_structure import DRIFT, SHARED, Readings
 from elastocal.identification.noisy_readings import deviations_of, own_noise

@@ -10,7 +10,6 @@ from scipy import special
 
 from elastocal.engine.mixed import ENOUGH, Diagonal, LogPrior, Mixed, MixedFit, Pack, fit
 from elastocal.errors import InputError, InsufficientDataError
-from elastocal.identification.linear_solver import least_norm
 from elastocal.identification.noise_structure import (
     EACH,
     SHARED,
@@ -29,6 +28,7 @@ from elastocal.identification.noise_structure import (
     packs_of,
     shared_effects,
 )
+from elastocal.identification.weighted_problem import least_norm
 from elastocal.units import Array, BoolArray, IntArray
 
 TINY = 1e-100  # stands for the variance of perfect data: its square is still a number

@@ -26,11 +26,11 @@ from scipy import linalg, special
 from elastocal.cell.work_cell import Cell
 from elastocal.errors import ElastocalError
 from elastocal.identification.covariance import Covariance, variance_of
-from elastocal.identification.linear_solver import least_norm
 from elastocal.identification.methods import EXACT
 from elastocal.identification.noise_summary import Noise
 from elastocal.identification.residuals import rms_3d
 from elastocal.identification.solve import STRUCTURAL, Solution, free_r_factor
+from elastocal.identification.weighted_problem import least_norm
 from elastocal.measurements import Measurements
 from elastocal.model.arm import Parameter
 from elastocal.model.calibrated import CalibratedArm, MeasuredVisits, OpenParameters

@@ -479,13 +479,18 @@ class Calibration(Result):
         return self.model.regressor(observed.table, self.x, observations=observed).B
 
     @property
-    def _plain(self) -> bool:
-        """Whether the fit can be looked at again: not of a table too large to do it in passing, nor
-        an exact fit, which leaves nothing to look at, nor one that priors or bounds hold as well:
-        what a configuration decides there is not said by B alone."""
+    def _looked(self) -> scrutiny.Looked | None:
+        """The fit for a second look; None for a table too large to do it in passing, for an exact
+        fit, which leaves nothing to look at, and for one that priors or bounds hold as well: what
+        a configuration decides there is not said by B alone."""
         others = self.prior_share or self.smooth or self.active
         numbers = len(self.residual) * len(self.estimates)
-        return bool(not others and self.residual.any() and numbers <= MOST_NUMBERS)
+        if others or not self.residual.any() or numbers > MOST_NUMBERS:
+            return None
+        return scrutiny.Looked(
+            self.model, self.observations, self.weights, self.x, self.B, self.columns,
+            self.residual, self.dof,
+        )  # fmt: skip
 
     def influence(self) -> tuple[scrutiny.Influence, ...]:
         """Leverage and influence of every configuration, in the table's order; empty for tables
@@ -497,16 +502,21 @@ class Calibration(Result):
             >>> strongest.configuration, strongest.leverage, strongest.moved
             ('...', 1..., 'joint...')
         """
-        return scrutiny.influence(self) if self._plain else ()
+        fit = self._looked
+        return () if fit is None else scrutiny.influence(fit)
 
     def parameter_sets(self) -> tuple[scrutiny.ParameterSet, ...]:
         """Sets of parameters side by side: held-out errors and restricted likelihoods."""
-        return scrutiny.parameter_sets(self) if self._plain else ()
+        fit = self._looked
+        return () if fit is None else scrutiny.parameter_sets(fit)
 
     def uncertainty(self, table: Measurements | None = None) -> scrutiny.UncertaintyBudget | None:
         """What a predicted reading's error is made of, at the poses and loads of a `table` or those
         fitted; None for tables too large to look again."""
-        return scrutiny.uncertainty_budget(self, table) if self._plain else None
+        fit = self._looked
+        if fit is None:
+            return None
+        return scrutiny.uncertainty_budget(fit, self.arm, self.noise_parts, table)
 
     @cached_property
     def autocorrelation(self) -> scrutiny.Autocorrelation | None:

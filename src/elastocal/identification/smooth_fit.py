@@ -22,11 +22,10 @@ from scipy import linalg, sparse, special
 
 from elastocal.errors import ElastocalError
 from elastocal.identification.covariance import Covariance
-from elastocal.identification.intervals import LEVEL, Intervals
+from elastocal.identification.intervals import LEVEL, Intervals, MethodResult
 from elastocal.identification.knowledge import GaussianPrior
 from elastocal.identification.knowledge_fit import FunctionPrior
 from elastocal.identification.least_squares import Fit
-from elastocal.identification.method_result import MethodResult
 from elastocal.identification.noise_choice import NoiseFit, linearised, weights_of
 from elastocal.identification.noise_judge import NoiseAndOutliers, outlier_screening, settle
 from elastocal.identification.noise_structure import Readings

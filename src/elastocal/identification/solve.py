@@ -11,7 +11,6 @@ from scipy import linalg
 
 from elastocal.errors import ElastocalError, InsufficientDataError
 from elastocal.identification.least_squares import Fit, FitProblem, fit
-from elastocal.identification.linear_solver import least_norm
 from elastocal.identification.residuals import (
     CHANCE,
     as_of_another_campaign,
@@ -31,6 +30,7 @@ from elastocal.identification.weighted_problem import (
     evaluate,
     is_large,
     is_reduced,
+    least_norm,
     merge,
     partition,
     regressor,

@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 from scipy import linalg, special
 
-from elastocal.identification.linear_solver import least_norm
+from elastocal.identification.weighted_problem import least_norm
 from elastocal.units import Array, BoolArray, IntArray
 
 

@@ -18,7 +18,7 @@ from numpy.typing import NDArray
 
 from elastocal.diagnosis.diagnosis import Curve, Diagnosis
 from elastocal.errors import ElastocalError
-from elastocal.identification.linear_solver import least_norm
+from elastocal.identification.weighted_problem import least_norm
 from elastocal.model.manipulator import Model
 from elastocal.report import blocks
 from elastocal.report.effect_names import driver_name, effect_at
