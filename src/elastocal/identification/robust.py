@@ -20,8 +20,7 @@ from scipy import linalg, sparse, special
 
 from elastocal.errors import ElastocalError, InputError, InsufficientDataError
 from elastocal.identification.covariance import Covariance, SatterthwaiteSums, orthogonal
-from elastocal.identification.intervals import LEVEL, Intervals
-from elastocal.identification.method_result import MethodResult
+from elastocal.identification.intervals import LEVEL, Intervals, MethodResult
 from elastocal.identification.residuals import held_out_residual
 from elastocal.identification.solve import Problem, Solution
 from elastocal.identification.trimmed import median_scale
