@@ -77,9 +77,14 @@ def calibrated(name: str) -> CalibratedArm:
 
 
 @pytest.mark.parametrize("name", [name for name in CATALOGUE if name not in ALWAYS])
-@pytest.mark.parametrize("elastic", [False, True])
-def test_it_is_accounted_for(name: str, elastic: bool) -> None:
-    kept = keep(calibrated(name), elastic, CONDITIONS)
+def test_it_is_accounted_for(name: str) -> None:
+    arm = calibrated(name)
+    for elastic in (False, True):
+        check_kept(arm, name, elastic)
+
+
+def check_kept(arm: CalibratedArm, name: str, elastic: bool) -> None:
+    kept = keep(arm, elastic, CONDITIONS)
     held = RIGID | (SPRINGS if elastic else set())
     left_out = {omission.effect for omission in kept.omissions}
     assert (name in kept.of_the_measurement) == (name in INSTRUMENT)

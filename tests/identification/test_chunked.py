@@ -67,7 +67,11 @@ def assert_same_estimates(parts, whole):
                                covariance / np.outer(std, std), atol=1e-6)  # fmt: skip
 
 
-@pytest.mark.parametrize("case", CASES, ids=lambda case: case.__name__)
+@pytest.mark.parametrize(
+    "case",
+    [pytest.param(c, marks=pytest.mark.long if "distances" in c.__name__ else ()) for c in CASES],
+    ids=lambda case: case.__name__,
+)
 def test_in_parts_equals_whole(case, in_parts):
     model, table = case()
     whole = solved(model, table)
@@ -160,12 +164,12 @@ def peak_of_a_pass(model, truth, observed):
 
 
 def test_a_longer_table_takes_no_more_than_its_residual(monkeypatch):
-    """Parts of 4 MB: B of the longer table is 194 MB, and both tables need the same few parts.
+    """Parts of 4 MB: B of the longer table is 97 MB, and both tables need the same few parts.
     What grows with the table is one residual (8 bytes a row), and the list of its parts."""
     monkeypatch.setattr(partition, "PART", 2**19)
     model, plan, truth, _ = arm(GEOMETRY, 9, 500)
     peaks, rows = [], []
-    for n in (100_000, 300_000):
+    for n in (50_000, 150_000):
         many = plan.take(np.arange(n) % 500)
         observed = observe(replace(many, configuration=np.arange(n)), "position")
         assert partition.is_large(observed, len(model.parameters))
