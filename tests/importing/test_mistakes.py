@@ -93,9 +93,6 @@ def test_a_header_that_contradicts_the_mapping(tmp_path):
     ("cell", "match"),
     [
         ("abc", r"data.csv, line 3, column x: 'abc' is not a number"),
-        ("1e999", r"line 3, column x: '1e999' is too large"),
-        ("1_0", r"line 3, column x: '1_0' is not a number"),
-        ("inf", r"line 3, column x: 'inf'"),
     ],
 )
 def test_cells_that_are_no_numbers(tmp_path, cell, match):

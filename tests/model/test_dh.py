@@ -149,23 +149,15 @@ def test_limits_and_names(tmp_path: Path) -> None:
 ROW = "0,0.1,0.2,0"
 WRONG_DH = {
     "empty": ("", "empty file; the first line names the columns"),
-    "no unit": ("theta0,d_m,a_m,alpha_rad\n", "'theta0' has no unit; write theta0_rad or"),
     "no unit on limit": (HEADER + ",lower\n", "write lower_rad or lower_deg or lower_m"),
-    "misspelt": ("theta_rad,d_m,a_m,alpha_rad\n", r"'theta_rad' \(did you mean 'theta0_rad'"),
     "mixed angles": ("theta0_rad,d_m,a_m,alpha_deg\n", "theta0_rad and alpha_deg mix units"),
     "mixed lengths": ("theta0_rad,d_m,a_mm,alpha_rad\n", "d_m and a_mm mix units"),
-    "same twice": (HEADER + ",d_mm\n", "columns d_m and d_mm say the same"),
-    "repeated": (HEADER + ",d_m\n", "column 'd_m' appears 2 times"),
     "missing": (
         "theta0_rad,d_m,alpha_rad\n",
         "d_m without a_m; the table needs all columns of the lengths$",
     ),
     "no angles": ("d_m,a_m\n", "theta0_rad,alpha_rad are missing, which a DH table needs"),
-    "text": (f"{HEADER}\n{ROW}\n0,x,0,0\n", "line 3, column d_m: 'x' is not a number"),
     "nan": (f"{HEADER}\nnan,0,0,0\n", "line 2, column theta0_rad: 'nan' is not a finite"),
-    "infinite": (f"{HEADER}\n0,0,inf,0\n", "line 2, column a_m: 'inf' is not a finite"),
-    "blank": (f"{HEADER}\n" + f"{ROW}\n" * 4 + "0,,0,0\n", "line 6, column d_m: empty cell"),
-    "decimal comma": (f"{HEADER}\n0,0,5,0,0\n", "line 2 has 5 fields, header has 4"),
     "too few": (f"{HEADER}\n" + f"{ROW}\n" * 3, "3 rows below the header.*4 to 9"),
     "too many": (f"{HEADER}\n" + f"{ROW}\n" * 10, "10 rows below the header.*4 to 9"),
     "degrees": (f"{HEADER}\n" + "0,0,0,90\n" * 4, "90 rad is more than two turns.*alpha_deg"),
@@ -203,16 +195,13 @@ MASSES = "link,mass_kg,com_x_m,com_y_m,com_z_m\n"
 ALL = "".join(f"{i},1,0,0,0\n" for i in range(1, 7))
 WRONG_MASSES = {
     "unknown link": (MASSES + "link7,1,0,0,0\n", r"line 2, column link: unknown link 'link7'"),
-    "misspelt link": (MASSES + "lnk3,1,0,0,0\n", r"unknown link 'lnk3' \(did you mean 'link3'"),
     "twice": (MASSES + ALL + "link2,1,0,0,0\n", "line 8, column link: 'link2' appears twice"),
     "missing": (MASSES + ALL[: -2 * len("6,1,0,0,0\n")], "no row for link5, link6"),
     "negative": (MASSES + "1,-2,0,0,0\n", "line 2, column mass_kg: -2 is negative"),
-    "no unit": ("link,mass,com_x_m,com_y_m,com_z_m\n", "'mass' has no unit; write mass_kg"),
     "no link column": (
         "mass_kg,com_x_m,com_y_m,com_z_m\n1,0,0,0\n",
         "the columns link are missing, which a table of link masses",
     ),
-    "blank": (MASSES + "1,1,,0,0\n", "line 2, column com_x_m: empty cell"),
 }
 
 
