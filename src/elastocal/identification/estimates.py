@@ -6,7 +6,6 @@ from dataclasses import replace
 from typing import Any
 
 import numpy as np
-from scipy import linalg
 
 from elastocal.identification.covariance import variance_of
 from elastocal.identification.faulty_readings import report_faulty
@@ -61,6 +60,9 @@ def summarise(
     observed = solution.problem.observations
     set_apart = len(observed.lead) < len(every.problem.observations.lead)
     covariance = found.intervals.covariance.matrix
+    leverage = found.leverage
+    if leverage is None and not solution.problem.large:
+        leverage = solution.leverage
     report = None
     if not is_exact(every):
         fitted = found.solution if set_apart or found.smooth else sound
@@ -88,7 +90,7 @@ def summarise(
         outliers=() if set_apart else faulty,
         excluded=faulty if set_apart else (),
         warnings=(),
-        residual_summary=_residual_summary(solution, found.leverage),
+        residual_summary=_residual_summary(solution, leverage),
         faulty_report=report,
         active=found.active,
         prior_share=found.prior_share,
@@ -97,7 +99,7 @@ def summarise(
         copies=copies,
         weights=solution.problem.weights,
         noise_parts=noise_parts(found),
-        shown=_shown(solution, covariance, found.leverage),
+        shown=_shown(solution, covariance, leverage),
     )
     return _judged(
         result, found, new_poses or over_the_workspace(model.cell, model, observed.table)
@@ -134,26 +136,12 @@ def _unchecked(result: Calibration) -> Array | None:
 
 
 def _residual_summary(solution: Solution, leverage: Array | None) -> ResidualSummary | None:
-    """The whitened residuals against what the noise model says of them.
-
-    `leverage` (rows,) of the fit, where it is not that of its B alone.
-    """
+    """The whitened residuals against what the noise model says of them."""
     problem, fit = solution.problem, solution.fit
     return summarise_residuals(
-        problem.observations, fit.whitened, leverage_of(solution, leverage),
+        problem.observations, fit.whitened, leverage,
         problem.weights.apply(solution.heldout), absolute=problem.weights.absolute,
     )  # fmt: skip
-
-
-def leverage_of(solution: Solution, known: Array | None) -> Array | None:
-    """How much each row (rows,) draws the fit to itself, 0 to 1, where it is not `known`; None of a
-    large table."""
-    problem, fit = solution.problem, solution.fit
-    if known is not None or problem.large:
-        return known
-    R = fit.r_factor.R[: len(fit.columns)]
-    Q = linalg.solve_triangular(R, problem.weights.apply(fit.B).T, trans="T")
-    return np.minimum((Q**2).sum(axis=0), 1.0)
 
 
 def uncertainty_of(
@@ -174,13 +162,12 @@ def uncertainty_of(
 SEEN_BY_OTHERS = 1e-6  # of a row: the least that other configurations must see of it
 
 
-def _shown(solution: Solution, covariance: Array, known: Array | None) -> ShownPoses | None:
+def _shown(solution: Solution, covariance: Array, leverage: Array | None) -> ShownPoses | None:
     """How sure the fit is where it was measured; None where the table is too large to say."""
-    observed, leverage = solution.problem.observations, leverage_of(solution, known)
     if solution.problem.large or leverage is None or not np.isfinite(covariance).all():
         return None
     left = np.maximum(1 - leverage, SEEN_BY_OTHERS)
-    std = uncertainty_of(observed, solution.fit.B, covariance, left)
+    std = uncertainty_of(solution.problem.observations, solution.fit.B, covariance, left)
     return ShownPoses(float(std.max()), len(std))
 
 

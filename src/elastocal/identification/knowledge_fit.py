@@ -20,7 +20,7 @@ from elastocal.identification.intervals import LEVEL, Intervals, MethodResult
 from elastocal.identification.knowledge import Constraints, GaussianPrior
 from elastocal.identification.least_squares import Fit
 from elastocal.identification.options import Options
-from elastocal.identification.residuals import growth
+from elastocal.identification.residuals import held_out_by_parts
 from elastocal.identification.solve import (
     WORTH_A_COLUMN,
     Reduction,
@@ -29,11 +29,8 @@ from elastocal.identification.solve import (
 )
 from elastocal.identification.weighted_problem import (
     RFactor,
-    Span,
     evaluate,
-    in_order,
     least_norm,
-    regressor,
 )
 from elastocal.text import listed, quoted
 from elastocal.units import Array, IntArray, Progress
@@ -255,7 +252,11 @@ def fit_with_knowledge(
         if np.isfinite(share) and not problem.model.shrunk[c]
     }  # fmt: skip
     fitted, matrix = _as_fit(found), intervals.covariance.matrix
-    leverage, heldout = _looked(found)
+    # Linearised, with the active constraints kept active: directions of the face are orthonormal by
+    # the rows of readings and prior together.
+    heldout, leverage = held_out_by_parts(
+        problem.model, problem.parts, found.x, columns, found.face
+    )
     known = replace(solution, fit=fitted, reduction=_reduction(solution, found), held=heldout)
     told = _contradiction(solution, before.intervals, found, own)
     return replace(
@@ -333,30 +334,3 @@ def _reduction(solution: Solution, found: ConstrainedFit) -> Reduction:
     share = np.abs(mixing) * solution.sizes[dropped] / solution.sizes[columns][:, None]
     mixing[share < ROUNDING] = 0.0
     return Reduction(columns, dropped, mixing, np.setdiff1d(before.invisible, columns))
-
-
-def _looked(found: ConstrainedFit) -> tuple[Array, Array]:
-    """Leverage (rows,), at most 1, and the residual (rows,) of each configuration under a fit to
-    the others and the prior.
-
-    Linearised, with the active constraints kept active: directions of the face are orthonormal by
-    the rows of readings and prior together.
-    """
-    problem, face, residual = found.posed.problem, found.face, found.at.residual
-    parts, together = problem.parts, problem.weights.together
-    leverage, held = np.zeros(len(residual)), residual.copy()
-
-    def of_part(span: Span) -> None:
-        part = parts.part(span)
-        B = regressor(problem.model, part, found.x, found.columns).B
-        Q, own = part.weights.apply(B) @ face, residual[part.rows]
-        leverage[part.rows] = np.minimum((Q**2).sum(axis=1), 1.0)
-        labels = part.observations.configuration if together is None else together
-        rows_of = np.repeat(labels, parts.observed.size)
-        unit, e = np.eye(face.shape[1]), part.weights.apply(own)
-        held[part.rows] += growth(B @ face, Q, unit, e, rows_of)
-
-    if face.shape[1]:
-        for _ in in_order(parts.spans, of_part):
-            pass
-    return leverage, held

@@ -13,7 +13,6 @@ from scipy import linalg, special
 
 from elastocal.identification.weighted_problem import (
     Partition,
-    RFactor,
     Span,
     Weights,
     in_order,
@@ -48,36 +47,45 @@ def held_out_residual(
         return residual + _growth_of_blocks(B, residual, weights, block)
     Q, R = linalg.qr(weights.apply(B), mode="economic")
     rows_of = np.repeat(configuration, size)
-    return residual + growth(B, Q, R, weights.apply(residual), rows_of)
+    return residual + growth(_orthonormal(B, R), Q, weights.apply(residual), rows_of)
+
+
+def _orthonormal(B: Array, R: Array) -> Array:
+    """B R⁻¹."""
+    return np.asarray(linalg.solve_triangular(R, B.T, trans="T").T)
 
 
 def held_out_by_parts(
-    model: Model, parts: Partition, x: Array, columns: IntArray, r_factor: RFactor, step: Array
-) -> Array:
-    """The same with the model linearised at x, a part at a time.
+    model: Model, parts: Partition, x: Array, columns: IntArray, half: Array,
+    step: Array | None = None,
+) -> tuple[Array, Array]:  # fmt: skip
+    """The same with the model linearised at x, a part at a time, and the leverage (rows,) of each.
 
-    `r_factor` is that of the whitened B of `columns` and residual at x, `step` (columns,) the
-    Gauss–Newton step to the linear model's minimum, zero where x is it.
+    `half` (columns, q) with half · halfᵀ the cofactor of the estimates: R⁻¹ of the whitened B, or
+    the directions in which constraints let them move.  `step` (columns,) is the Gauss–Newton step
+    to the linear model's minimum, where x is not it.
     """
-    held = np.empty(len(parts.observed.value))
-    size, R = parts.observed.size, r_factor.R
+    held, leverage = np.empty((2, len(parts.observed.value)))
+    together = parts.weights.together
 
     def leave_out(span: Span) -> None:
         part = parts.part(span)
         at = regressor(model, part, x, columns)
-        residual = at.residual - at.B @ step
-        Q = linalg.solve_triangular(R, part.weights.apply(at.B).T, trans="T").T
-        rows_of = np.repeat(part.observations.configuration, size)
-        e = part.weights.apply(residual)
-        held[part.rows] = residual + growth(at.B, Q, R, e, rows_of)
+        residual = at.residual if step is None else at.residual - at.B @ step
+        B = at.B @ half
+        Q, e = part.weights.apply(B), part.weights.apply(residual)
+        labels = part.observations.configuration if together is None else together
+        held[part.rows] = residual + growth(B, Q, e, np.repeat(labels, parts.observed.size))
+        leverage[part.rows] = np.minimum((Q**2).sum(axis=1), 1.0)
 
     for _ in in_order(parts.spans, leave_out):
         pass
-    return held
+    return held, leverage
 
 
-def growth(B: Array, Q: Array, R: Array, e: Array, configuration: IntArray) -> Array:
-    """By how much (rows,) the residual grows where its configuration is left out."""
+def growth(B: Array, Q: Array, e: Array, configuration: IntArray) -> Array:
+    """By how much (rows,) the residual grows where its configuration is left out; B are columns
+    that are orthonormal as whitened ones, Q."""
     grown = np.empty(len(e))
     for rows in same_size(configuration):
         Qc, ec = Q[rows], e[rows]
@@ -87,8 +95,7 @@ def growth(B: Array, Q: Array, R: Array, e: Array, configuration: IntArray) -> A
         else:
             solved, alone = moved_by(Qc @ Qc.transpose(0, 2, 1), ec)
             moved = _times(Qc.transpose(0, 2, 1), solved)
-        shift = linalg.solve_triangular(R, moved.T).T
-        grown[rows] = _times(B[rows], shift)
+        grown[rows] = _times(B[rows], moved)
         grown[rows[alone]] = np.inf
     return grown
 
@@ -125,7 +132,7 @@ def _growth_of_blocks(B: Array, residual: Array, weights: Weights, block: IntArr
     e = e - Q @ (Q.T @ e)
     seen = np.hstack([np.vstack([B, np.zeros((k, p))]), np.zeros((n + k, k))])
     labels = np.concatenate([block, block.max() + 1 + np.arange(k)])
-    return growth(seen, Q, R, e, labels)[:n]
+    return growth(_orthonormal(seen, R), Q, e, labels)[:n]
 
 
 def as_of_another_campaign(B: Array, weights: Weights, size: int) -> Array:

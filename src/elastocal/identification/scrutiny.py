@@ -16,6 +16,7 @@ from scipy import linalg, special
 from elastocal.engine.sizes import Standardised
 from elastocal.identification.prediction import mean_squares
 from elastocal.identification.residuals import held_out_residual, moved_by, rms_3d
+from elastocal.identification.solve import reduce
 from elastocal.identification.weighted_problem import Weights, least_norm, same_size
 from elastocal.measurements import Measurements
 from elastocal.model.calibrated import CalibratedArm
@@ -216,7 +217,6 @@ class ParameterSet:
 
 
 CHOSEN = "chosen"
-STRUCTURAL = 1e-7  # share of a column's length off the span of others, below which it lies in it
 RESAMPLED = 1000
 
 
@@ -226,12 +226,18 @@ def parameter_sets(fit: Looked) -> tuple[ParameterSet, ...]:
     model, free = fit.model, ~fit.model.shrunk
     stage = np.array([stage_of(p.effect) for p in model.parameters], dtype=np.int64)
     fitted = np.isin(np.arange(len(stage)), fit.columns) & free
+    observed, weights, size = fit.observations, fit.weights, fit.observations.size
+    white, typical, at = weights.apply(fit.B), model.sizes(fit.B), np.flatnonzero(free)
+    parameters = tuple(model.parameters[c] for c in at)
+    apart = at[reduce(white[:, at], typical[at], parameters, 1.0, 0.0).kept]
+    # As many columns as rows fit anything.
+    every = np.isin(np.arange(len(stage)), apart) if len(apart) < len(white) else fitted
     named: list[tuple[str, BoolArray]] = [
         ("base and markers", fitted & (stage == 0)),
         ("with geometry", fitted & (stage <= 1)),
         ("with compliance", fitted & (stage != 1)),
         (CHOSEN, fitted),
-        ("all that readings tell apart", _independent(fit, fitted, free)),
+        ("all that readings tell apart", every),
     ]
     seen: dict[bytes, tuple[str, BoolArray]] = {}
     for name, chosen in named:
@@ -240,13 +246,10 @@ def parameter_sets(fit: Looked) -> tuple[ParameterSet, ...]:
     sets = list(seen.values())
     if len(sets) < 2:
         return ()
-    observed, weights, size = fit.observations, fit.weights, fit.observations.size
     moves = np.where(fitted & (stage > 0), fit.x - model.nominal, 0.0)
     y = fit.residual + fit.B @ moves
-    typical = model.sizes(fit.B)
-    e = weights.apply(fit.residual)
+    e, target = weights.apply(fit.residual), weights.apply(y)
     s2 = float(e @ e) / max(fit.dof, 1)
-    white, target = weights.apply(fit.B), weights.apply(y)
     held, plain = [], []
     for _, chosen in sets:
         # Whole rows count by the fit's weights, whatever the set.
@@ -258,42 +261,23 @@ def parameter_sets(fit: Looked) -> tuple[ParameterSet, ...]:
         _restricted(white, target, chosen & (stage == 0), chosen & (stage > 0), typical, s2)
         for _, chosen in sets
     ]
-    at = next(k for k, (name, _) in enumerate(sets) if name == CHOSEN)
+    first = next(k for k, (name, _) in enumerate(sets) if name == CHOSEN)
     _, code = np.unique(observed.configuration, return_inverse=True)
     share = np.random.default_rng(0).dirichlet(np.ones(code.max() + 1), RESAMPLED)
     draws = share @ np.bincount(code)
     rms = [np.sqrt(share @ np.bincount(code, h) / draws) for h in held]
     found = []
     for k, (name, chosen) in enumerate(sets):
-        over = rms[k] - rms[at] if np.isfinite(held[k]).all() else np.full(RESAMPLED, np.inf)
+        over = rms[k] - rms[first] if np.isfinite(held[k]).all() else np.full(RESAMPLED, np.inf)
         low, high = (float(v) for v in np.quantile(over, [0.025, 0.975], method="nearest"))
-        whole = float(np.sqrt(held[k].mean())), float(np.sqrt(held[at].mean()))
+        whole = float(np.sqrt(held[k].mean())), float(np.sqrt(held[first].mean()))
         found.append(
             ParameterSet(
                 name, int(chosen.sum()), plain[k], whole[0], whole[0] - whole[1], (low, high),
-                likelihood[k] - likelihood[at],
+                likelihood[k] - likelihood[first],
             )
         )  # fmt: skip
     return tuple(found)
-
-
-def _independent(fit: Looked, fitted: BoolArray, free: BoolArray) -> BoolArray:
-    """The fitted parameters and, beside them, those whose columns lie in no span of others."""
-    white = fit.weights.apply(fit.B)
-    length = np.linalg.norm(white, axis=0)
-    others = np.flatnonzero(free & ~fitted & (length > 0))
-    if not len(others):
-        return fitted
-    basis = linalg.qr(white[:, fitted], mode="economic")[0]
-    off = white[:, others] / length[others]
-    off -= basis @ (basis.T @ off)
-    off -= basis @ (basis.T @ off)
-    _, R, order = linalg.qr(off, mode="economic", pivoting=True)
-    more = np.abs(np.diag(R)) > STRUCTURAL
-    found = fitted.copy()
-    found[others[order[: len(more)][more]]] = True
-    room = len(white) - int(fitted.sum())  # as many columns as rows fit anything
-    return found if int(found.sum()) < len(fitted) + room and found.sum() < len(white) else fitted
 
 
 def _restricted(

@@ -184,15 +184,7 @@ def joint_fit(
     parts = partition(problem.observations, problem.weights, len(columns))
 
     def at(x: Array) -> tuple[Array, Sums]:
-        residual = np.empty(len(problem.observations.value))
-
-        def summed(part: Part) -> Sums:
-            found = regressor(problem.model, part, x, columns)
-            residual[part.rows] = found.residual
-            apply = part.weights.apply
-            return Sums.of(apply(found.B), apply(found.residual), len(problem.free))
-
-        return residual, reduce(Sums.merged, each(parts, summed))
+        return _summed(problem, parts, x, columns)
 
     x = _started(problem, functions, x, reduction)
     if scales is not None:
@@ -236,6 +228,19 @@ def joint_fit(
         else:
             return replace(now, converged=gain <= ROUGH)
         x, (residual, sums) = moved, there
+
+
+def _summed(problem: Problem, parts: Partition, x: Array, columns: IntArray) -> tuple[Array, Sums]:
+    """Residual (rows,) at x, and the sums over whitened rows."""
+    residual = np.empty(len(problem.observations.value))
+
+    def summed(part: Part) -> Sums:
+        found = regressor(problem.model, part, x, columns)
+        residual[part.rows] = found.residual
+        apply = part.weights.apply
+        return Sums.of(apply(found.B), apply(found.residual), len(problem.free))
+
+    return residual, reduce(Sums.merged, each(parts, summed))
 
 
 def _chosen(problem: Problem, sizes: Array, free: LinearRows, scales: Scales) -> Reduction:

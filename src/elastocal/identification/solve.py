@@ -263,19 +263,19 @@ def fit_kept(
     return fit(replace(problem.fit_of(kept, problem.x0, sizes), among=among), max_steps)
 
 
-def heldout_of(problem: Problem, found: Fit) -> Array:
-    """Residual (rows,) of each configuration under a fit to the others; under a drift, of each
-    block in time, as far off as readings of another day are."""
+def looked_at(problem: Problem, found: Fit) -> tuple[Array, Array]:
+    """Residual (rows,) of each configuration under a fit to the others, under a drift of each block
+    in time, as far off as readings of another day are; and leverage (rows,) in the fit."""
     observed, weights = problem.observations, problem.weights
-    if weights.together is None:
-        return held_out_by_parts(
-            problem.model, problem.parts, found.x, found.columns, found.r_factor,
-            np.zeros(len(found.columns)),
-        )  # fmt: skip
-    held = held_out_residual(
-        found.B, found.residual, weights, observed.configuration, observed.size
+    held, leverage = held_out_by_parts(
+        problem.model, problem.parts, found.x, found.columns, found.r_factor.half
     )
-    return held * as_of_another_campaign(found.B, weights, observed.size)
+    if weights.together is not None:
+        held = held_out_residual(
+            found.B, found.residual, weights, observed.configuration, observed.size
+        )
+        held = held * as_of_another_campaign(found.B, weights, observed.size)
+    return held, leverage
 
 
 def wider_is_needed(problem: Problem, narrow: Array, wide: Array) -> bool:
@@ -310,15 +310,17 @@ def prefer_wider(
         if own.columns <= len(reduction.kept) or not fits_better(found.r_factor, own):
             continue
         step = own.step(sizes[wider.kept])
-        linear = held_out_by_parts(problem.model, problem.parts, found.x, wider.kept, own, step)
-        heldout = heldout_of(problem, found) if heldout is None else heldout
-        if not wider_is_needed(problem, heldout, linear):
+        linear = held_out_by_parts(
+            problem.model, problem.parts, found.x, wider.kept, own.half, step
+        )
+        heldout = looked_at(problem, found)[0] if heldout is None else heldout
+        if not wider_is_needed(problem, heldout, linear[0]):
             continue
         x = found.x.copy()
         x[wider.kept] += step
         try:
             wide = fit_kept(problem, sizes, x, wider, max_steps=30, again=True)
-            wide_heldout = heldout_of(problem, wide)
+            wide_heldout = looked_at(problem, wide)[0]
         except (ElastocalError, np.linalg.LinAlgError, ValueError):
             # Along an undetermined direction the wide set may leave every valid arm, or come to
             # rest where it is singular.
@@ -359,9 +361,18 @@ class Solution:
     held: Array | None = None
 
     @cached_property
+    def _looked(self) -> tuple[Array, Array]:
+        return looked_at(self.problem, self.fit)
+
+    @property
     def heldout(self) -> Array:
         """Residual (rows,) of each configuration under a fit to the others."""
-        return heldout_of(self.problem, self.fit) if self.held is None else self.held
+        return self._looked[0] if self.held is None else self.held
+
+    @property
+    def leverage(self) -> Array:
+        """How much each row (rows,) draws the fit to itself, 0 to 1."""
+        return self._looked[1]
 
 
 def solve(

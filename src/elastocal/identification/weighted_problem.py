@@ -479,6 +479,11 @@ class RFactor:
         """The R factor of B with its columns multiplied by `scale` (p,)."""
         return RFactor(self.augmented * np.append(scale, 1.0), self.rows)
 
+    @property
+    def half(self) -> Array:
+        """R⁻¹ (p, p)."""
+        return np.asarray(linalg.solve_triangular(self.R, np.eye(self.columns)))
+
     def step(self, scale: Array) -> Array:
         """Minimiser (p,) of |e − B x|², of least length in x/scale where several are.
 
@@ -489,7 +494,7 @@ class RFactor:
 
     def cofactor(self, scale: Array) -> Array:
         """(BᵀB)⁻¹ (p, p) of a B with full column rank."""
-        inverse = linalg.solve_triangular(self.R * scale, np.eye(self.columns))
+        inverse = self.scaled(scale).half
         return (inverse @ inverse.T) * np.outer(scale, scale)
 
 
