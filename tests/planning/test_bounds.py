@@ -9,12 +9,13 @@ import pytest
 from elastocal.errors import InputError, InsufficientDataError
 from elastocal.planning.criteria import CRITERIA, CriterionInputs, SpectralCriterion
 from elastocal.planning.exchange import (
-    SizedPlans,
     exact_plan,
     exchange,
+    first_allowed,
     prospects,
     random_plan,
     rounded,
+    sized_plans,
     values_without,
 )
 from elastocal.planning.relaxation import (
@@ -178,19 +179,15 @@ def test_too_few_poses_and_pools_that_leave_something_open_are_refused():
         balanced(problem)
 
 
-def test_sizes_fall_with_the_number_of_poses_and_the_fewest_that_meet_a_target_are_found():
+def test_sizes_fall_with_the_number_of_poses_and_bounds_tell_where_a_target_may_be_met():
     def of(n):
         return problem_of("test_pose", 6, N=40, n=n)
 
-    curve = SizedPlans(of)
-    curve.of([4, 6, 9])
-    values = [curve.found[n].value for n in (4, 6, 9)]
-    assert values == sorted(values, reverse=True)
-    assert all(p.bound <= p.value for p in curve.found.values())
-    target = values[1] * 1.05
-    again = SizedPlans(of)
-    smallest = again.fewest(target, 3, 20)
-    assert smallest <= 6 and again.found[smallest].value <= target
-    below = smallest - 1
-    assert again.relaxed[below].bound > target or again.found[below].value > target
-    assert again.fewest(values[2] / 100, 3, 20) is None
+    found = sized_plans(of, [6, 4, 9], 0, lambda message: None)
+    values = [value for value, _ in found.values()]
+    assert list(found) == [4, 6, 9] and values == sorted(values, reverse=True)
+    assert all(bound <= value for value, bound in found.values())
+    first = first_allowed(of, values[1] * 1.05, 3, 20)
+    assert first <= 6
+    assert first == 3 or relax(balanced(of(first - 1))[0], 1e-3).bound > values[1] * 1.05
+    assert first_allowed(of, values[2] / 100, 3, 20) == 21

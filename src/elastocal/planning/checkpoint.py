@@ -40,10 +40,12 @@ def key_of(files: Iterable[Path], **options: object) -> str:
 @dataclass(frozen=True)
 class Checkpoint:
     """What the stages of a design have finished, in a folder beside its output; nowhere if `folder`
-    is None.  `check` is called before anything is kept: it raises where work was interrupted."""
+    is None.  `check` is called before anything is kept: it raises where work was interrupted.
+    `prefix`: of one of several plans that the design searches."""
 
     folder: Path | None = None
     check: Callable[[], None] = lambda: None
+    prefix: str = ""
 
     @classmethod
     def beside(cls, output: Path, key: str, check: Callable[[], None] = lambda: None) -> Checkpoint:
@@ -68,7 +70,7 @@ class Checkpoint:
 
     def finished(self, stage: str, make: Callable[[], State]) -> Mapping[str, NDArray]:
         """What was saved of a stage, or else, saved, what `make` returns, as arrays."""
-        path = None if self.folder is None else self.folder / f"{stage}.npz"
+        path = None if self.folder is None else self.folder / f"{self.prefix}{stage}.npz"
         # What cannot be read is made anew.
         with suppress(OSError, ValueError, EOFError, zipfile.BadZipFile, zlib.error):
             if path is not None and path.is_file():

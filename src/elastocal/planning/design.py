@@ -33,7 +33,12 @@ from elastocal.planning.candidates import (
 from elastocal.planning.checkpoint import Checkpoint, State
 from elastocal.planning.choices import Choice, applied, chosen_states, within
 from elastocal.planning.criteria import CRITERIA, GONE
-from elastocal.planning.exchange import SizedPlans, random_information, values_without
+from elastocal.planning.exchange import (
+    first_allowed,
+    random_information,
+    sized_plans,
+    values_without,
+)
 from elastocal.planning.feasibility import Feasibility
 from elastocal.planning.information import Done, measured, next_number, plan_forces
 from elastocal.planning.moves import blockers_of
@@ -48,6 +53,7 @@ from elastocal.planning.plan import (
     reasons,
 )
 from elastocal.planning.polish import Searches
+from elastocal.planning.relaxation import DesignProblem
 from elastocal.planning.search import EFFORTS, POOL, Search, SearchEffort, Selection, ordered
 from elastocal.planning.setup import (
     OPEN,
@@ -144,9 +150,9 @@ def _planned(
     placed = cell if chosen is None else applied(chosen, cell)
 
     def plan_of(cell: Cell) -> Plan:
-        folder, own = checkpoint.folder, checkpoint
-        if folder is not None and spec.minutes:  # poses come in several numbers
-            own = replace(own, folder=folder / f"{cell.design.poses}x{cell.design.repeats}")
+        own = checkpoint
+        if spec.minutes:  # poses come in several numbers
+            own = replace(own, prefix=f"{cell.design.poses}x{cell.design.repeats}_")
         made = _Design(cell, options, own, progress, whole)
         return replace(made.run(), chosen=chosen)
 
@@ -269,26 +275,23 @@ class _Design:
             )
             setup = setup.sharing(float(state["share"]))
         search = setup.having(pinned)
-        curve, shares, begun = self._sizes(search, pool, shares)
         searches = Searches(setup.information, self.space, self.feasibility)
 
-        def sought(
-            shares: IntArray, pool: FeasiblePool, begun: IntArray | None, checkpoint: Checkpoint
-        ) -> tuple[Search, Selection]:
+        def sought(shares: IntArray, checkpoint: Checkpoint) -> tuple[Search, Selection]:
             seek = Search(
                 search, pool, searches, shares, self._effort(), options.seed, checkpoint, progress,
                 setup,
             )  # fmt: skip
-            return seek, seek.select(pool, begun)
+            return seek, seek.select(pool)
 
-        seek, found = sought(shares, pool, begun, self.checkpoint)
-        if self.cell.design.target is not None:
-            seek, found, sizes = self._fewer(
-                seek, found, self._target(search, self.cell.design.target), sought
-            )
+        curve = self._curve(search, pool)
+        if self.cell.design.target is None:
+            seek, found = sought(shares, self.checkpoint)
+        else:
+            seek, found, sizes = self._fewest(search, pool, sought)
             curve = tuple(sorted((*curve, *sizes), key=lambda size: size.poses))
         progress("random plans beside it")
-        drawn = random_information(search.problem(pool, shares), options.seed)
+        drawn = random_information(search.problem(pool, seek.shares), options.seed)
         return self._plan(setup, seek, found, counts, targets.source, curve, known, drawn, pinned)
 
     def _reading(
@@ -400,80 +403,74 @@ class _Design:
             names = [names[k] for k in kept]
         return found, names, told
 
-    def _sizes(
-        self, setup: Setup, pool: FeasiblePool, shares: IntArray
-    ) -> tuple[tuple[PlanSize, ...], IntArray, IntArray | None]:
-        """The curve of criterion against number of poses, where there is a target the shares that
-        meet it, and what was found for these shares."""
-        numbers, wanted = self.options.curve, self.cell.design.target
-        if wanted is None and not numbers:
-            return (), shares, None
-        target = None if wanted is None else self._target(setup, wanted)
-        total = int((shares + self.pinned).sum())
+    def _curve(self, setup: Setup, pool: FeasiblePool) -> tuple[PlanSize, ...]:
+        """The criterion against the numbers of poses that are asked for."""
+        if not self.options.curve:
+            return ()
 
         def make() -> State:
-            # Bounds are NaN where there are none, the number is 0 where none meets the target.
-            sizes = SizedPlans(
-                lambda n: setup.problem(pool, self._shares(n)), self.options.seed, self.progress
-            )
-            sizes.of(numbers)
-            n = total if np.array_equal(self._shares(total), shares) else 0
-            if target is not None:
-                low = max(pool.n_groups, int(self.pinned.sum()) + 1)
-                most = most_poses(self.cell, np.bincount(pool.group), MOST_POSES)
-                n = sizes.fewest(target, low, most) or 0
-            found = dict(sorted(sizes.found.items()))
-            return {
-                "n": list(found),
-                "value": [p.value for p in found.values()],
-                "bound": [np.nan if p.bound is None else p.bound for p in found.values()],
-                "number": n,
-                "chosen": found[n].chosen if n in found else np.zeros(0, dtype=np.int64),
-            }
+            found = sized_plans(
+                lambda n: setup.problem(pool, self._shares(n)), self.options.curve,
+                self.options.seed, self.progress,
+            )  # fmt: skip
+            # Bounds are NaN where there are none.
+            values = [
+                (value, np.nan if bound is None else bound) for value, bound in found.values()
+            ]
+            return {"n": list(found), "value": values}
 
         state, figure = self.checkpoint.finished("sizes", make), setup.criterion.figure
-        points = tuple(
+        return tuple(
             PlanSize(int(n), figure(value), None if np.isnan(bound) else figure(bound))
-            for n, value, bound in zip(state["n"], state["value"], state["bound"], strict=True)
+            for n, (value, bound) in zip(state["n"], state["value"], strict=True)
         )
-        begun = state["chosen"] if len(state["chosen"]) else None
-        if wanted is None:
-            return points, shares, begun
-        if not state["number"]:
-            last = points[-1]
+
+    def _fewest(
+        self, setup: Setup, pool: FeasiblePool,
+        sought: Callable[[IntArray, Checkpoint], tuple[Search, Selection]],
+    ) -> tuple[Search, Selection, tuple[PlanSize, ...]]:  # fmt: skip
+        """The plan of the fewest poses that meets the target, and the sizes that were tried.
+
+        The bound tells where to begin; as Φ goes about as 1/n, each plan tells what to try next.
+        """
+        wanted, figure = self.cell.design.target, setup.criterion.figure
+        assert wanted is not None
+        target, tried = self._target(setup, wanted), dict[int, PlanSize]()
+        low = max(pool.n_groups, int(self.pinned.sum()) + 1)
+        most = most_poses(self.cell, np.bincount(pool.group), MOST_POSES)
+        best, high = None, most + 1  # the fewest are in [low, high), or high
+
+        def problem_of(n: int) -> DesignProblem:
+            return setup.problem(pool, self._shares(n))
+
+        n = first_allowed(problem_of, target, low, most)
+        if n > most:
+            value, _ = sized_plans(problem_of, [most], self.options.seed, self.progress)[most]
+            tried[most], low = PlanSize(most, figure(value), None), high
+        while low < high:
+            try:
+                seek, found = sought(self._shares(n), replace(self.checkpoint, prefix=f"{n}_"))
+            except (InputError, InsufficientDataError):
+                if n == most:
+                    raise
+                low = n = n + 1
+                continue
+            share = found.certificate.efficiency_pool
+            bound = None if share is None else figure(found.value * share)
+            tried[n] = PlanSize(n, figure(found.value), bound)
+            if found.value <= target:
+                best, high = (seek, found), n
+            else:
+                low = n + 1
+            n = min(max(int(np.ceil(n * found.value / target)), low), high - 1)
+        if best is None:
+            last = tried[max(tried)]
             raise InsufficientDataError(
                 f"{self.cell.path or self.cell.name}: no plan of up to {last.poses} poses meets "
                 f"the target of {wanted * 1e6:g} µm; the best found reaches {last.value:.4g} µm: "
                 "ask for less, measure more repeats, or take a better tracker"
             )
-        return points, self._shares(int(state["number"])), begun
-
-    def _fewer(
-        self, seek: Search, found: Selection, target: float,
-        sought: Callable[..., tuple[Search, Selection]],
-    ) -> tuple[Search, Selection, tuple[PlanSize, ...]]:  # fmt: skip
-        """The plan of the fewest poses that meets Φ ≤ `target` once its poses are polished, and
-        the sizes that were tried: n was found on the drawn poses, where plans are worse.
-
-        Φ goes about as 1/n: that tells which number to try next.
-        """
-        figure, tried, kept = seek.setup.criterion.figure, list[PlanSize](), int(self.pinned.sum())
-        n, least = int(seek.shares.sum()), max(len(seek.shares), 1)
-        while found.value <= target and least < n:
-            m = max(min(int(np.ceil(n * found.value / target)), n - 1), least)
-            try:
-                less, plan = sought(self._shares(m + kept), found.pool, None, Checkpoint())
-            except (InputError, InsufficientDataError):
-                least = m + 1
-                continue
-            share = plan.certificate.efficiency_pool
-            bound = None if share is None else figure(plan.value * share)
-            tried.append(PlanSize(m + kept, figure(plan.value), bound))
-            if plan.value <= target:
-                seek, found, n = less, plan, m
-            else:
-                least = m + 1
-        return seek, found, tuple(tried)
+        return *best, tuple(tried.values())
 
     def _target(self, setup: Setup, target: float) -> float:
         metric = [name for name, criterion in CRITERIA.items() if criterion.unit == "µm"]

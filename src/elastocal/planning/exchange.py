@@ -8,7 +8,7 @@ from __future__ import annotations
 
 from bisect import bisect_left
 from collections.abc import Callable, Iterable
-from dataclasses import dataclass, field, replace
+from dataclasses import replace
 from typing import Any
 
 import numpy as np
@@ -234,102 +234,44 @@ def _changed(problem: DesignProblem, plan: IntArray, rng: np.random.Generator) -
     return np.sort(new)
 
 
-# How many poses: a curve of sizes, and the fewest that meet a target.
+# How many poses: a curve of sizes, and the fewest that the bound allows.
 
 
-@dataclass(frozen=True)
-class SizedPlan:
-    """The best plan found of as many poses as `chosen` has, its Φ, and the bound on all such; None
-    where the criterion has none."""
+def sized_plans(
+    problem_of: Callable[[int], DesignProblem], numbers: Iterable[int], seed: int,
+    progress: Progress,
+) -> dict[int, tuple[float, float | None]]:  # fmt: skip
+    """Φ of the best plan found by number of poses, and the bound on all such; None without one.
 
-    chosen: IntArray
-    value: float
-    bound: float | None
-
-
-@dataclass(frozen=True)
-class SizedPlans:
-    """Plans by number of poses, each begun from the next smaller one, and their relaxations.
-
-    `problem_of(n)` states the problem of n poses, on the same candidates for all n.  Where no
-    group's share falls with n, Φ does not rise with n.
+    `problem_of(n)` states the problem of n poses, on the same candidates for all n.  Each plan is
+    begun from the next smaller one: where no group's share falls with n, Φ does not rise.  Raises
+    InsufficientDataError where no plan of one of `numbers` determines everything.
     """
-
-    problem_of: Callable[[int], DesignProblem]
-    seed: int = 0
-    progress: Progress = lambda message: None
-    found: dict[int, SizedPlan] = field(default_factory=dict)
-    relaxed: dict[int, Relaxed] = field(default_factory=dict)
-
-    def of(self, numbers: Iterable[int]) -> None:
-        """Raises InsufficientDataError where no plan of one of `numbers` determines everything."""
-        for n in sorted(numbers):
-            self.plan(n)
-
-    def plan(self, n: int) -> SizedPlan:
-        if n not in self.found:
-            self._search(n)
-            for larger in sorted(m for m in self.found if m > n):
-                # Found before a smaller one that turns out better: extend that one instead.
-                smaller = self.found[max(m for m in self.found if m < larger)]
-                if self.found[larger].value > smaller.value * (1 + LEAST):
-                    self._search(larger)
-        return self.found[n]
-
-    def fewest(self, target: float, low: int, high: int) -> int | None:
-        """The fewest poses found in [low, high] with Φ ≤ `target`; None where none meet it.
-
-        The bound falls with n: plans are sought from the first n that it allows, with doubled
-        steps, then between the last that failed and the first that met the target.
-        """
-
-        def allows(n: int) -> bool:
-            return self._relaxation(n, balanced(self.problem_of(n))[0]).bound <= target
-
-        def meets(n: int) -> bool:
-            try:
-                return self.plan(n).value <= target
-            except InsufficientDataError:
-                if n == high:
-                    raise
-                return False
-
-        low = min(_first(allows, low, high + 1), high)
-        n, step = low, 1
-        while not meets(n):
-            if n == high:
-                return None
-            low, n, step = n + 1, min(n + step, high), 2 * step
-        _first(meets, low, n)
-        return min(m for m, plan in self.found.items() if plan.value <= target)
-
-    def _search(self, n: int) -> None:
-        whole = self.problem_of(n)
+    found: dict[int, tuple[float, float | None]] = {}
+    chosen, weights = None, None
+    for n in sorted(numbers):
+        whole = problem_of(n)
         check_enough(whole)
         problem, _ = balanced(whole)
-        relaxed = self._relaxation(n, problem)
-        smaller = [m for m in self.found if m < n]
-        warm = self.found[max(smaller)].chosen if smaller else None
-        chosen, _ = exact_plan(problem, relaxed, warm=warm, seed=self.seed)
-        value = whole.value(chosen)
+        relaxed = prospects(problem, start=weights)
+        chosen, _ = exact_plan(problem, relaxed, warm=chosen, seed=seed)
+        value, weights = whole.value(chosen), relaxed.weights
         check_determined(whole, value)
-        bound = relaxed.bound if problem.criterion.certifiable else None
-        self.found[n] = SizedPlan(chosen, value, bound)
-        told = "" if bound is None else f", bound {bound:.6g}"
-        self.progress(f"{n} poses: {value:.6g}{told}")
-
-    def _relaxation(self, n: int, problem: DesignProblem) -> Relaxed:
-        """Of a criterion without a bound it is 0, which allows everything."""
-        if n not in self.relaxed:
-            near = min(self.relaxed, key=lambda m: abs(m - n), default=None)
-            start = None if near is None else self.relaxed[near].weights
-            self.relaxed[n] = prospects(problem, start=start)
-        return self.relaxed[n]
+        found[n] = value, relaxed.bound if problem.criterion.certifiable else None
+        progress(f"{n} poses: {value:.6g}")
+    return found
 
 
-def _first(holds: Callable[[int], bool], low: int, high: int) -> int:
-    """The smallest n in [low, high] where a monotone condition holds, taken to hold at high."""
-    return low + bisect_left(range(low, high), True, key=holds)
+def first_allowed(
+    problem_of: Callable[[int], DesignProblem], target: float, low: int, high: int
+) -> int:
+    """The least n in [low, high] for which the bound, which falls with n, allows Φ ≤ `target`;
+    high + 1 where there is none."""
+
+    def allows(n: int) -> bool:
+        return prospects(balanced(problem_of(n))[0], 1e-3).bound <= target
+
+    return low + bisect_left(range(low, high + 1), True, key=allows)
 
 
 def check_determined(problem: DesignProblem, value: float) -> None:

@@ -147,12 +147,12 @@ class Search:
     def value(self, pool: FeasiblePool, chosen: IntArray) -> float:
         return self.setup.problem(pool, self.shares).value(chosen)
 
-    def select(self, pool: FeasiblePool, begun: IntArray | None = None) -> Selection:
-        """The best plan found and its certificate; `begun` is a plan found on this pool already."""
+    def select(self, pool: FeasiblePool) -> Selection:
+        """The best plan found and its certificate."""
         first, efforts = len(pool), self.effort
         self.progress(f"relaxation over {len(pool)} candidates")
         relaxed = prospects(self.problem(pool), CLOSE if efforts.starts else FINE)
-        begins = self._begins(pool, relaxed, begun)
+        begins = self._begins(pool, relaxed)
         best, least, ends = begins[0], np.inf, list[float]()
         for k, chosen in enumerate(begins[: efforts.starts]):
             pool, end = self.polished(pool, chosen, f"start{k}")
@@ -178,9 +178,7 @@ class Search:
         certificate = replace(certificate, starts=tuple(ends))
         return Selection(pool, best, value, certificate, first)
 
-    def _begins(
-        self, pool: FeasiblePool, relaxed: Relaxed, begun: IntArray | None
-    ) -> list[IntArray]:
+    def _begins(self, pool: FeasiblePool, relaxed: Relaxed) -> list[IntArray]:
         """Plans to polish: that of exchange, then roundings and random plans in turn."""
         problem, rng = self.problem(pool), np.random.default_rng(self.seed)
 
@@ -188,9 +186,8 @@ class Search:
             # Where plans are polished, other starts better them more than a longer search here.
             patience = 0 if self.effort.starts else PATIENCE
             found = exact_plan(
-                problem, relaxed, warm=begun, starts=self.effort.exchanges, seed=self.seed,
-                patience=patience,
-            )  # fmt: skip
+                problem, relaxed, starts=self.effort.exchanges, seed=self.seed, patience=patience
+            )
             return {"chosen": found[0]}
 
         found = [self.checkpoint.finished("exchange", make)["chosen"]]
