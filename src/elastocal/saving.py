@@ -8,6 +8,7 @@ from __future__ import annotations
 
 from collections import Counter
 from collections.abc import Callable, Sequence
+from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -16,7 +17,7 @@ import numpy as np
 from elastocal.arguments import checked_arguments
 from elastocal.errors import InputError, option, require
 from elastocal.files import atomic_write_text, read_json
-from elastocal.measurements import Measurements, write_measurements
+from elastocal.measurements import DEFAULT_MARKER, Measurements, write_measurements
 from elastocal.model.arm import given_force
 from elastocal.tables import csv_text
 from elastocal.text import json_text
@@ -92,7 +93,7 @@ def save_plan(plan: Plan, path: Path, command: str | None = None) -> None:
     from elastocal.planning.plan import write_plan, write_plan_json
 
     summary = beside(path)
-    write_plan(path, plan.rows, plan.model.chain.kinds)
+    write_plan(path, *plan.rows, forces=plan.stated_forces is not None)
     repeat = {"command": command, "backend": plan.model.backend_report()}
     write_plan_json(summary, plan.to_json() | repeat)
 
@@ -185,7 +186,7 @@ def save_extra_poses(path: str | Path, plan: Measurements, kinds: Sequence[str])
     pose that is visited again under the same force is a configuration of its own: 4, 4/2, ….
     Raises InputError where the place cannot be written.
     """
-    from elastocal.planning.plan import PlanRows, write_plan
+    from elastocal.planning.plan import write_plan
 
     names = []
     visits: Counter[tuple[int, bytes]] = Counter()
@@ -193,19 +194,13 @@ def save_extra_poses(path: str | Path, plan: Measurements, kinds: Sequence[str])
         visits[key := (int(code), force.tobytes())] += 1
         again = f"/{visits[key]}" if visits[key] > 1 else ""
         names.append(plan.configuration_labels[code] + again)
-    approach = None if plan.approach is None else plan.approach.astype(np.int64)
-    # `simulate` takes the time of a plan's row as that of its readings.
-    time = {} if plan.time is None else {"time_s": [repr(float(t)) for t in plan.time]}
-    rows = PlanRows(
-        configuration=tuple(names),
-        q=plan.q,
-        level=np.ones(len(plan), dtype=np.int64),
-        order=np.arange(1, len(plan) + 1),
-        force=plan.force,
-        approach=approach,
-        notes=time,
-    )
-    write_plan(path, rows, kinds)
+    labels, order = tuple(dict.fromkeys(names)), map(str, range(1, len(plan) + 1))
+    table = replace(
+        plan, configuration=np.array([labels.index(name) for name in names], dtype=np.int64),
+        configuration_labels=labels, marker=np.zeros(len(plan), dtype=np.int64),
+        marker_names=(DEFAULT_MARKER,), joint_kinds=tuple(kinds),
+    )  # fmt: skip
+    write_plan(path, table, {"level": ["1"] * len(plan), "order": list(order)})
 
 
 def save_next(found: NextPoses, path: Path) -> None:

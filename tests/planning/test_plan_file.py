@@ -7,8 +7,8 @@ from hypothesis import strategies as st
 from support.cells import kr270_chain
 
 from elastocal.errors import InputError
-from elastocal.measurements import read_plan
-from elastocal.planning.plan import PlanRows, write_plan
+from elastocal.measurements import DEFAULT_MARKER, Measurements, read_plan
+from elastocal.planning.plan import write_plan
 from elastocal.text import is_label
 
 KINDS = kr270_chain().kinds
@@ -16,6 +16,19 @@ joint_values = st.floats(-6.3, 6.3) | st.sampled_from([0.0, -0.0, np.pi, 1e-12, 
 labels = st.text(st.characters(codec="utf-8"), min_size=1, max_size=12).filter(is_label)
 # What is less than a micronewton is read as no load.
 forces = st.just(0.0) | st.floats(1e-3, 1e5) | st.floats(-1e5, -1e-3)
+
+
+def plan_of(names, q, kinds, force=None, approach=None):
+    """A plan's table, a row per configuration."""
+    n = len(names)
+    return Measurements(
+        source="plan", row=np.arange(n) + 2, q=q, configuration=np.arange(n),
+        configuration_labels=tuple(names), repeat=np.zeros(n, dtype=int),
+        marker=np.zeros(n, dtype=int), marker_names=(DEFAULT_MARKER,),
+        force=np.zeros((n, 3)) if force is None else np.reshape(force, (n, 3)),
+        approach=None if approach is None else np.reshape(approach, q.shape).astype(float),
+        joint_kinds=tuple(kinds),
+    )  # fmt: skip
 
 
 @settings(max_examples=60, deadline=None)
@@ -30,21 +43,13 @@ def test_what_is_written_is_read_back(tmp_path_factory, data):
     force = data.draw(st.none() | drawn)
     signs = st.lists(st.sampled_from([-1, 1]), min_size=n * joints, max_size=n * joints)
     approach = data.draw(st.none() | signs)
-    rows = PlanRows(
-        configuration=tuple(names),
-        q=q,
-        level=np.ones(n, dtype=int),
-        order=np.arange(n) + 1,
-        force=None if force is None else np.reshape(force, (n, 3)),
-        approach=None if approach is None else np.reshape(approach, (n, joints)),
-        notes={"note_order_2": ["x"] * n},
-    )
+    rows = plan_of(names, q, kinds, force, approach)
     path = tmp_path_factory.mktemp("plan") / "plan.csv"
-    write_plan(path, rows, kinds)
+    write_plan(path, rows, {"note_order_2": ["x"] * n}, forces=force is not None)
     plan = read_plan(path, joint_kinds=tuple(kinds))
     assert np.allclose(plan.q, q, rtol=0, atol=1e-9)
     assert [plan.configuration_labels[k] for k in plan.configuration] == names
-    assert np.array_equal(plan.force, np.zeros((n, 3)) if force is None else rows.force)
+    assert np.array_equal(plan.force, rows.force)
     assert (
         plan.approach is None if approach is None else np.array_equal(plan.approach, rows.approach)
     )
@@ -55,15 +60,14 @@ def test_what_is_written_is_read_back(tmp_path_factory, data):
     [
         ({"q": np.full((2, 6), np.nan)}, "finite"),
         ({"force": np.full((2, 3), np.inf)}, "finite"),
-        ({"configuration": ("a", " b")}, "cannot stand in a table"),
-        ({"configuration": ("a", "a")}, "same name"),
+        ({"names": ("a", " b")}, "cannot stand in a table"),
+        ({"names": ("a", "a")}, "same name"),
     ],
 )
 def test_what_no_table_can_hold_is_refused_and_nothing_is_written(tmp_path, change, message):
-    rows = {"configuration": ("a", "b"), "q": np.zeros((2, 6)), "level": np.ones(2),
-            "order": np.arange(2)}  # fmt: skip
+    rows = {"names": ("a", "b"), "q": np.zeros((2, 6)), "kinds": KINDS}
     with pytest.raises(InputError, match=message):
-        write_plan(tmp_path / "plan.csv", PlanRows(**(rows | change)), KINDS)
+        write_plan(tmp_path / "plan.csv", plan_of(**(rows | change)), {})
     with pytest.raises(InputError, match="does not exist"):
-        write_plan(tmp_path / "no" / "plan.csv", PlanRows(**rows), KINDS)
+        write_plan(tmp_path / "no" / "plan.csv", plan_of(**rows), {})
     assert not list(tmp_path.iterdir())

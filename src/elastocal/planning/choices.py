@@ -33,7 +33,7 @@ from elastocal.planning.plan import LOAD_POINT, TRACKER, Chosen, LoadStates, Pla
 from elastocal.planning.relaxation import Relaxed, balanced, check_enough, relax
 from elastocal.planning.setup import FeasiblePool, Known, Setup, set_up
 from elastocal.planning.test_poses import TargetPoses
-from elastocal.units import Array, IntArray, Progress
+from elastocal.units import Array, BoolArray, IntArray, Progress
 
 STARTS = 8  # places drawn in the boxes, besides those that the cell states
 SEARCHED, COMPARED = 400, 2000  # candidates while searching, and for the figures that are told
@@ -222,9 +222,11 @@ class Choice:
         rules = Feasibility(cell, self.work.chain)
         return draw(cell, self.work.chain, plan_forces(cell), rules, candidates, self.seed)
 
-    def relaxed(self, cell: Cell, drawn: Candidates | int = SEARCHED) -> RelaxedPoint | None:
-        """The relaxed optimum of a cell on candidates drawn, or so many; None where it leaves
-        something open."""
+    def relaxed(
+        self, cell: Cell, drawn: Candidates | int = SEARCHED, read: BoolArray | None = None
+    ) -> RelaxedPoint | None:
+        """The relaxed optimum of a cell on candidates drawn, or so many, `read` in load states
+        (K, L) that were chosen before; None where it leaves something open."""
         chain, shares = self.work.chain, shares_of(cell)
         try:
             rules = Feasibility(cell, chain)
@@ -233,7 +235,9 @@ class Choice:
                 Model.assembled(chain, cell), drawn.q, int(shares.sum()), self.targets, self.known,
                 self.region, rules.seen if rules.partial else None, self.work,
             )  # fmt: skip
-            if cell.design.load_states == "chosen":
+            if read is not None:
+                setup = replace(setup, ways=cell.design.repeats * read)
+            elif cell.design.load_states == "chosen":
                 ways, _ = chosen_states(setup, drawn.q, drawn.group, shares, self.progress)
                 setup = replace(setup, ways=ways)
             pool = setup.pool(drawn.q, drawn.group)
@@ -298,8 +302,8 @@ def within(
     """
     asked = minutes
     for left in reversed(range(TRIES)):
-        sizes, best = _Budget(choice, cell, asked).sizes()
-        plan = plan_of(_sized(cell, best.poses, best.repeats))
+        sizes, best, poses = _Budget(choice, cell, asked).sizes()
+        plan = plan_of(_sized(cell, poses, best.repeats))
         took = plan.execution.total / 60
         if took <= minutes or not left:
             break
@@ -315,19 +319,21 @@ class _Budget:
     cell: Cell
     minutes: float
 
-    def sizes(self) -> tuple[tuple[TimedSize, ...], TimedSize]:
-        """What fits, by numbers of repeats, and the best of them."""
+    def sizes(self) -> tuple[tuple[TimedSize, ...], TimedSize, int]:
+        """What fits, by numbers of repeats, the best of them, and the number of poses in all load
+        states that has as many stops."""
         spec = self.cell.design
         # Where a reading takes no time nothing says how many of them there may be.
         numbers = REPEATS if spec.motion.reading > 0 else (spec.repeats,)
-        drawn, found = self.choice.draw(self.cell), []
+        drawn, found, read = self.choice.draw(self.cell), [], None
         for repeats in numbers:
             self.choice.progress(f"within {self.minutes:.4g} minutes: {repeats} readings each")
-            size = self._best(drawn, repeats)
+            size = self._best(drawn, repeats, read)
             if size is not None:
-                found.append(size)
-            least = min((value for _, value, _ in found), default=np.inf)
-            if len(found) > WORSE and min(value for _, value, _ in found[-WORSE:]) > least:
+                *told, read = size
+                found.append(told)
+            least = min((value for _, value, *_ in found), default=np.inf)
+            if len(found) > WORSE and min(value for _, value, *_ in found[-WORSE:]) > least:
                 break
         if not found:
             raise InsufficientDataError(
@@ -336,18 +342,22 @@ class _Budget:
                 "and load_change_s of [design.motion] where they are too high"
             )
         # A plan that holds more parameters errs less in the others, but not in all.
-        most = max(kept for kept, _, _ in found)
-        whole = [(value, size) for kept, value, size in found if kept == most]
-        return tuple(size for _, size in whole), min(whole, key=lambda one: one[0])[1]
+        most = max(kept for kept, *_ in found)
+        whole = [told for kept, *told in found if kept == most]
+        _, best, poses = min(whole, key=lambda told: told[0])
+        return tuple(size for _, size, _ in whole), best, poses
 
-    def _best(self, drawn: Candidates, repeats: int) -> tuple[int, float, TimedSize] | None:
-        """How many parameters a plan of as many poses as fit determines, Φ of it, and what it is;
+    def _best(
+        self, drawn: Candidates, repeats: int, read: BoolArray | None
+    ) -> tuple[int, float, TimedSize, int, BoolArray] | None:
+        """How many parameters a plan of as many poses as fit determines, Φ of it, what it is, as
+        many stops as so many poses in all load states, and in which states candidates are `read`;
         None where there is none."""
         poses, found = self._fitting(drawn.q, repeats), None
         while poses > 0:
             cell = _sized(self.cell, poses, repeats)
             try:
-                point = self.choice.relaxed(cell, drawn)
+                point = self.choice.relaxed(cell, drawn, read)
                 if point is None:
                     return None
                 problem = point.setup.problem(point.pool, shares_of(cell))
@@ -359,7 +369,8 @@ class _Budget:
             fitting = int(poses * self.minutes / took)
             if took <= self.minutes:
                 value = point.setup.criterion.figure(phi)
-                found = len(problem.prior), phi, TimedSize(poses, repeats, took, value)
+                size, read = TimedSize(len(chosen), repeats, took, value), point.setup.ways > 0
+                found = len(problem.prior), phi, size, poses, read
                 # Where a load is not hung there is time for more.
                 if took > self.minutes - cell.design.motion.load_change / 60 or fitting <= poses:
                     return found

@@ -114,61 +114,18 @@ DIGITS = 9
 UNITS = {"revolute": "deg", "prismatic": "mm"}
 
 
-@dataclass(frozen=True)
-class PlanRows:
-    """R rows of plan.csv: `configuration` names, `q` (R, n) rad or m, `level` (R,) from 1 on,
-    `order` (R,) of execution from 1 on, and where the plan states them `force` (R, 3) N and
-    `approach` (R, n) of ±1, and `marker` (R,) of `marker_names` where not all of them are read.
-    `time` (R,) in s, where it counts.  `notes`: further columns for people, passed over when read.
-    """
-
-    configuration: tuple[str, ...]
-    q: Array
-    level: IntArray
-    order: IntArray
-    force: Array | None = None
-    approach: IntArray | None = None
-    notes: Mapping[str, Sequence[str]] | None = None
-    marker: IntArray | None = None
-    marker_names: tuple[str, ...] = (DEFAULT_MARKER,)
-    time: Array | None = None
-
-    def table(self, joint_kinds: Sequence[str]) -> Measurements:
-        """What `measurement_reader.read_plan` reads of these rows once they are written."""
-        n = len(self.configuration)
-        labels = tuple(dict.fromkeys(self.configuration))
-        q = np.column_stack(
-            [
-                to_si(np.round(in_unit(values, kind), DIGITS), UNITS[kind])
-                for values, kind in zip(self.q.T, joint_kinds, strict=True)
-            ]
-        )
-        return Measurements(
-            source="plan",
-            row=np.arange(2, n + 2),
-            q=q,
-            configuration=np.array([labels.index(name) for name in self.configuration]),
-            configuration_labels=labels,
-            repeat=np.zeros(n, dtype=np.int64),
-            marker=np.zeros(n, dtype=np.int64) if self.marker is None else self.marker,
-            marker_names=self.marker_names,
-            force=np.zeros((n, 3)) if self.force is None else self.force,
-            approach=None if self.approach is None else self.approach.astype(float),
-            time=None if self.time is None else np.round(self.time, 3),
-            joint_kinds=tuple(joint_kinds),
-        )
-
-
-def plan_rows(
+def plan_table(
     execution: Execution,
     configurations: Sequence[str],
     level: IntArray,
+    kinds: Sequence[str],
     forces: Array | None = None,
     seen: Mapping[str, BoolArray] | None = None,
     carried: Array | None = None,
     counts: IntArray | None = None,
-) -> PlanRows:
-    """The rows of an execution, sorted by pose, then side of approach, then load state.
+) -> tuple[Measurements, dict[str, list[str]]]:
+    """An execution as the table that `read_plan` reads once it is written, and its columns beside:
+    level, order and notes.  Sorted by pose, then side of approach, then load state.
 
     With `forces` (L, 3) N of the load states one row per reading, under its force; without, one
     row per pose and side, to be measured in every load state, `order` being its place in the
@@ -219,18 +176,29 @@ def plan_rows(
         approach = [approach[k] for k in of] if approach else []
         notes = {name: [cells[k] for k in of] for name, cells in notes.items()}
     time = [np.mean([stop.time for _, stop in row]) for row in rows if row[0][1].time is not None]
-    return PlanRows(
-        configuration=tuple(stop.name(configurations) + sides[stop.side] for stop in first),
-        q=np.array([stop.q for stop in first]),
-        level=np.array([level[stop.pose] for stop in first]),
-        order=np.array([row[0][0] for row in rows]),
-        force=None if forces is None else forces[[stop.load for stop in first]],
-        approach=np.array(approach) if approach else None,
-        notes=notes,
-        marker=marker,
+    names = [stop.name(configurations) + sides[stop.side] for stop in first]
+    labels, n = tuple(dict.fromkeys(names)), len(names)
+    # As the digits of the file say it.
+    q = [
+        to_si(np.round(in_unit(values, kind), DIGITS), UNITS[kind])
+        for values, kind in zip(np.array([stop.q for stop in first]).T, kinds, strict=True)
+    ]
+    table = Measurements(
+        source="plan",
+        row=np.arange(2, n + 2),
+        q=np.column_stack(q),
+        configuration=np.array([labels.index(name) for name in names]),
+        configuration_labels=labels,
+        repeat=np.zeros(n, dtype=np.int64),
+        marker=np.zeros(n, dtype=np.int64) if marker is None else marker,
         marker_names=(DEFAULT_MARKER,) if seen is None else tuple(seen),
-        time=np.array(time) if time else None,
+        force=np.zeros((n, 3)) if forces is None else forces[[stop.load for stop in first]],
+        approach=np.array(approach, dtype=float) if approach else None,
+        time=np.round(time, 3) if time else None,
+        joint_kinds=tuple(kinds),
     )
+    levels = [str(level[stop.pose]) for stop in first]
+    return table, {"level": levels, "order": [str(row[0][0]) for row in rows], **notes}
 
 
 def load_name(force: Array) -> str:
@@ -240,49 +208,45 @@ def load_name(force: Array) -> str:
     return " ".join(f"{value + 0.0:g}" for value in force) + " N"
 
 
-def write_plan(path: str | Path, rows: PlanRows, joint_kinds: Sequence[str]) -> None:
-    """Write plan.csv, whole or not at all; angles in degrees, travel in mm.
+def write_plan(
+    path: str | Path, table: Measurements, more: Mapping[str, Sequence[str]], forces: bool = True
+) -> None:
+    """Write plan.csv, whole or not at all; angles in degrees, travel in mm; with the forces of the
+    rows or not, and `more` columns.
 
     `measurements.read_plan` reads it back to 1e-11 rad.  Raises InputError for values that
     are not finite, names that cannot stand in a table or repeat, and an unwritable place.
     """
-    columns = _columns(rows, joint_kinds)
-    for name in rows.configuration:
+    known = families(table.joint_kinds)
+    names = [table.configuration_labels[k] for k in table.configuration]
+    for name in names:
         if not is_label(name):
             raise InputError(
                 f"{path}: configuration name {quoted(name)} cannot stand in a table; use one "
                 "line without blanks at its ends"
             )
-    more = [] if rows.marker is None else [rows.marker]
-    more += [] if rows.force is None else list(rows.force.T)
-    keys = list(zip(rows.configuration, *more, strict=True))
+    keys = list(zip(names, table.marker, *(table.force.T if forces else ()), strict=True))
     require(len(set(keys)) == len(keys), f"{path}: two rows of the plan have the same name")
-    for values in (rows.q, rows.force):
-        if values is not None and not np.isfinite(values).all():
+    for values in (table.q, table.force):
+        if not np.isfinite(values).all():
             raise InputError(f"{path}: the plan's joint values and forces must be finite")
-    atomic_write_text(path, csv_text(columns, zip(*columns.values(), strict=True)))
-
-
-def _columns(rows: PlanRows, joint_kinds: Sequence[str]) -> dict[str, Sequence[str]]:
-    known = families(joint_kinds)
-    columns: dict[str, Sequence[str]] = {"configuration": rows.configuration}
-    if rows.marker is not None:
-        columns["marker"] = [rows.marker_names[k] for k in rows.marker]
-    for stem, kind, values in zip(known["q"].units, joint_kinds, rows.q.T, strict=True):
+    columns: dict[str, Sequence[str]] = {"configuration": names}
+    if table.marker_names != (DEFAULT_MARKER,):
+        columns["marker"] = [table.marker_names[k] for k in table.marker]
+    kinds = zip(known["q"].units, table.joint_kinds, table.q.T, strict=True)
+    for stem, kind, values in kinds:
         columns[column(stem, UNITS[kind])] = [
             repr(round(float(v), DIGITS) + 0.0) for v in in_unit(values, kind)
         ]
-    if rows.force is not None:
-        for stem, values in zip(known["force"].units, rows.force.T, strict=True):
-            columns[column(stem, "N")] = [repr(float(v) + 0.0) for v in values]
-    if rows.approach is not None:
-        for stem, values in zip(known["approach"].units, rows.approach.T, strict=True):
+    for stem, values in zip(known["force"].units, table.force.T, strict=True) if forces else ():
+        columns[column(stem, "N")] = [repr(float(v) + 0.0) for v in values]
+    if table.approach is not None:
+        for stem, values in zip(known["approach"].units, table.approach.T, strict=True):
             columns[stem] = [str(int(v)) for v in values]
-    if rows.time is not None:
-        columns["time_s"] = [repr(round(float(t), 3)) for t in rows.time]
-    columns["level"] = [str(int(v)) for v in rows.level]
-    columns["order"] = [str(int(v)) for v in rows.order]
-    return columns | dict(rows.notes or {})
+    if table.time is not None:
+        columns["time_s"] = [repr(round(float(t), 3)) for t in table.time]
+    columns |= more
+    atomic_write_text(path, csv_text(columns, zip(*columns.values(), strict=True)))
 
 
 def in_unit(values: Array, kind: str) -> Array:
@@ -660,7 +624,7 @@ class Plan(Result):
 
     def table(self) -> Measurements:
         """The poses as a table for `simulate`, as the plan's file has them."""
-        return self.rows.table(self.model.chain.kinds)
+        return self.rows[0]
 
     @property
     def of_test_poses(self) -> bool:
@@ -668,10 +632,10 @@ class Plan(Result):
         return self.criterion == TEST_POSE
 
     @property
-    def rows(self) -> PlanRows:
-        return plan_rows(
-            self.execution, self.configurations, self.group + 1, self.stated_forces, self._read,
-            self.forces, None if self.crossed else self.readings,
+    def rows(self) -> tuple[Measurements, dict[str, list[str]]]:
+        return plan_table(
+            self.execution, self.configurations, self.group + 1, self.model.chain.kinds,
+            self.stated_forces, self._read, self.forces, None if self.crossed else self.readings,
         )  # fmt: skip
 
     @property
