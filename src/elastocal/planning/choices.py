@@ -14,6 +14,7 @@ from collections.abc import Callable
 from copy import copy
 from dataclasses import dataclass, replace
 from itertools import combinations
+from typing import NamedTuple
 
 import numpy as np
 from scipy.optimize import minimize
@@ -313,6 +314,17 @@ def within(
     return replace(plan, timed=sizes, warnings=warnings)
 
 
+class _Fit(NamedTuple):
+    """A plan that fits a time: how many parameters it determines, its Φ, what it is, of how many
+    poses in all load states it has the stops, and in which states (K, L) candidates are read."""
+
+    kept: int
+    value: float
+    size: TimedSize
+    poses: int
+    read: BoolArray
+
+
 @dataclass(frozen=True)
 class _Budget:
     choice: Choice
@@ -325,15 +337,13 @@ class _Budget:
         spec = self.cell.design
         # Where a reading takes no time nothing says how many of them there may be.
         numbers = REPEATS if spec.motion.reading > 0 else (spec.repeats,)
-        drawn, found, read = self.choice.draw(self.cell), [], None
+        drawn, found = self.choice.draw(self.cell), list[_Fit]()
         for repeats in numbers:
             self.choice.progress(f"within {self.minutes:.4g} minutes: {repeats} readings each")
-            size = self._best(drawn, repeats, read)
-            if size is not None:
-                *told, read = size
-                found.append(told)
-            least = min((value for _, value, *_ in found), default=np.inf)
-            if len(found) > WORSE and min(value for _, value, *_ in found[-WORSE:]) > least:
+            fit = self._best(drawn, repeats, found[-1].read if found else None)
+            found += [] if fit is None else [fit]
+            least = min((fit.value for fit in found), default=np.inf)
+            if len(found) > WORSE and min(fit.value for fit in found[-WORSE:]) > least:
                 break
         if not found:
             raise InsufficientDataError(
@@ -342,17 +352,14 @@ class _Budget:
                 "and load_change_s of [design.motion] where they are too high"
             )
         # A plan that holds more parameters errs less in the others, but not in all.
-        most = max(kept for kept, *_ in found)
-        whole = [told for kept, *told in found if kept == most]
-        _, best, poses = min(whole, key=lambda told: told[0])
-        return tuple(size for _, size, _ in whole), best, poses
+        most = max(fit.kept for fit in found)
+        whole = [fit for fit in found if fit.kept == most]
+        best = min(whole, key=lambda fit: fit.value)
+        return tuple(fit.size for fit in whole), best.size, best.poses
 
-    def _best(
-        self, drawn: Candidates, repeats: int, read: BoolArray | None
-    ) -> tuple[int, float, TimedSize, int, BoolArray] | None:
-        """How many parameters a plan of as many poses as fit determines, Φ of it, what it is, as
-        many stops as so many poses in all load states, and in which states candidates are `read`;
-        None where there is none."""
+    def _best(self, drawn: Candidates, repeats: int, read: BoolArray | None) -> _Fit | None:
+        """A plan of as many poses as fit, candidates being `read` in load states that were chosen
+        before; None where there is none."""
         poses, found = self._fitting(drawn.q, repeats), None
         while poses > 0:
             cell = _sized(self.cell, poses, repeats)
@@ -370,7 +377,7 @@ class _Budget:
             if took <= self.minutes:
                 value = point.setup.criterion.figure(phi)
                 size, read = TimedSize(len(chosen), repeats, took, value), point.setup.ways > 0
-                found = len(problem.prior), phi, size, poses, read
+                found = _Fit(len(problem.prior), phi, size, poses, read)
                 # Where a load is not hung there is time for more.
                 if took > self.minutes - cell.design.motion.load_change / 60 or fitting <= poses:
                     return found

@@ -175,7 +175,8 @@ def plan_table(
         rows, first = [rows[k] for k in of], [first[k] for k in of]
         approach = [approach[k] for k in of] if approach else []
         notes = {name: [cells[k] for k in of] for name, cells in notes.items()}
-    time = [np.mean([stop.time for _, stop in row]) for row in rows if row[0][1].time is not None]
+    times = [[stop.time for _, stop in row if stop.time is not None] for row in rows]
+    time = np.array([sum(each) / len(each) for each in times if each])
     names = [stop.name(configurations) + sides[stop.side] for stop in first]
     labels, n = tuple(dict.fromkeys(names)), len(names)
     # As the digits of the file say it.
@@ -194,7 +195,7 @@ def plan_table(
         marker_names=(DEFAULT_MARKER,) if seen is None else tuple(seen),
         force=np.zeros((n, 3)) if forces is None else forces[[stop.load for stop in first]],
         approach=np.array(approach, dtype=float) if approach else None,
-        time=np.round(time, 3) if time else None,
+        time=np.round(time, 3) if len(time) else None,
         joint_kinds=tuple(kinds),
     )
     levels = [str(level[stop.pose]) for stop in first]
