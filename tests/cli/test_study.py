@@ -14,7 +14,7 @@ from support.study_folders import SCRIPT, numbers, run_study, write_study
 from typer.testing import CliRunner
 
 from elastocal.cli.main import app
-from elastocal.cli.study_command import Pace
+from elastocal.cli.using import Pace
 from elastocal.studies.results import read_results
 
 # A child may inherit that SIGINT is ignored; here it must not.

@@ -19,19 +19,7 @@ import typer
 from elastocal import __version__
 
 # Importing a command registers it.
-from elastocal.cli import (  # noqa: F401
-    compare_command,
-    compensate_command,
-    design_command,
-    diagnose_command,
-    export_command,
-    identify_command,
-    import_command,
-    init_command,
-    next_command,
-    simulate_command,
-    study_command,
-)
+from elastocal.cli import judging, measuring, using  # noqa: F401
 from elastocal.cli.app import app, reporting_errors
 from elastocal.screen import close_streams, complain, prepare_streams, say
 

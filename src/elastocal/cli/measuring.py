@@ -1,0 +1,584 @@
+"""Verbs up to the measurements: init, effects, design, simulate, demo, import."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated, Any
+
+import typer
+
+from elastocal import verbs
+from elastocal.cli.app import console, files_of, repeated
+from elastocal.cli.signatures import (
+    AnyOutput,
+    Asked,
+    CellFile,
+    Output,
+    ReportFile,
+    Run,
+    Seed,
+    command,
+)
+from elastocal.errors import InputError, require
+from elastocal.screen import interrupt_check, say
+from elastocal.text import json_text, listed
+
+if TYPE_CHECKING:
+    from rich.console import Console
+
+    from elastocal.cell.work_cell import Cell
+    from elastocal.model.chain import Chain
+    from elastocal.planning.checkpoint import Checkpoint
+    from elastocal.planning.design import DesignOptions
+    from elastocal.planning.execution import Execution
+    from elastocal.planning.plan import Plan
+    from elastocal.units import Array, Progress
+
+
+@command(short_help="Write a working cell file for my arm", flags="")
+def init(
+    robot: Path,
+    output: Output = Path("cell.toml"),
+    base: str | None = None,
+    flange: str | None = None,
+    convention: str = "standard",
+    ur_model: str | None = None,
+    force: bool = False,
+    *,
+    run: Run,
+) -> None:
+    """Write a working cell: joints and limits from the robot's file, commented guesses elsewhere.
+
+    Example: elastocal init arm.urdf -o cell.toml
+
+    Args:
+        robot: URDF (.urdf), MuJoCo model (.xml, .mjcf), DH table (.csv) or factory calibration
+            of a UR (.conf, .yaml).
+        output: Cell file to write (TOML).
+        base: First link or body; default: the root.
+        flange: Last link, body or site; default: as found.
+        convention: Of a DH table: standard or modified.
+        ur_model: Of a calibration.conf: the robot, as UR10e.
+        force: Write over a file.
+    """
+    from elastocal.cell.work_cell import read_cell
+    from elastocal.importing.first_cell import init as write
+    from elastocal.importing.first_cell import notes_of, reach_of
+    from elastocal.model.choice import load_chain
+
+    run.writes(output)
+    run.reads(robot)
+    write(robot, output, base=base, flange=flange, convention=convention,  # type: ignore[arg-type]
+          ur_model=ur_model, force=force)  # fmt: skip
+    cell = read_cell(output)
+    chain = load_chain(cell)
+    names = [joint.name for joint in chain.joints]
+    reach = f"reach {reach_of(chain):.2f} m"
+    say(f"wrote {output}: {len(names)} joints ({', '.join(names)}), {reach}")
+    for note in notes_of(cell.robot, chain):
+        say(f"Note: {note}.")
+    if cell.robot.flange is not None:
+        say(f"The flange is '{cell.robot.flange}'; --flange names another.")
+    say("Replace what is marked as a guess. It runs as it is:")
+    say(f"  elastocal design {output} -o plan.csv --effort quick")
+    loads = cell.design.loads
+    load = " ".join(f"{v:g}" for v in loads[-1]) if loads is not None else "0 0 -100"
+    say(f"  elastocal simulate {output} plan.csv -o data.csv --draw 1 --load {load}")
+
+
+@command(short_help="List the effects that can be fitted", flags="plugins json")
+def effects(
+    cell: Annotated[Path | None, typer.Argument()] = None,
+    *,
+    run: Run,
+) -> None:
+    """Every effect of the catalogue: its parameters' unit and typical size, what it is, and where.
+
+    Example: elastocal effects cell.toml
+
+    Args:
+        cell: Cell file (TOML); default: the KR 270 of the demo.
+    """
+    from elastocal.demo import example
+    from elastocal.model.choice import cell_of
+    from elastocal.report.effect_names import effect_entries
+
+    known = cell_of(cell or Path(example.__file__).parent / "cell.toml", run.plugins)
+    entries = effect_entries(known)
+    run.answer(
+        lambda: {"schema": "elastocal/effects/1", "effects": entries},
+        lambda screen: _print_effects(screen, known, entries),
+    )
+
+
+def _print_effects(screen: Console, cell: Any, entries: Any) -> None:
+    from rich.padding import Padding
+
+    from elastocal.model.choice import load_chain, names_told
+    from elastocal.report.effect_names import effect_lines
+
+    stage = ""
+    for its_stage, head, what in effect_lines(entries):
+        if its_stage != stage:
+            stage = its_stage
+            screen.print(f"\n{stage.capitalize()}", style="bold")
+        screen.print(Padding(head, (0, 0, 0, 2)))
+        screen.print(Padding(what, (0, 0, 0, 6)), style="dim")
+    screen.print()
+    if told := names_told(load_chain(cell)):
+        screen.print(f"Joints: {told}")
+    screen.print("Each line: effect (* fitted or acting), places, typical size of its parameters.")
+    screen.print('In the cell: [model] effects = ["joint_offset", "backlash:joint2"].')
+
+
+# init and effects: how to begin, and what there is to fit.
+
+PROGRAMS = {".src": "KUKA KRL", ".script": "URScript"}
+PICTURES = (".png", ".svg")
+
+
+def _target(text: str) -> float:
+    """--target in m."""
+    try:
+        target = float(text)
+    except ValueError:
+        target = math.nan
+    require(
+        math.isfinite(target) and target > 0,
+        f"--target takes a positive number of µm; found {text}",
+    )
+    return target * 1e-6
+
+
+def _numbers(text: str) -> list[int]:
+    try:
+        return [int(part) for part in text.split(",")]
+    except ValueError:
+        raise InputError(
+            f"--curve takes numbers of poses, as in 10,15,20; found '{text}'"
+        ) from None
+
+
+def _candidates(text: str) -> int | str | list[int | str]:
+    """--candidates 500, taught.csv or taught.csv,500."""
+    if text.isdecimal():
+        return int(text)
+    path, comma, number = text.rpartition(",")
+    return [path, int(number)] if comma and number.isdecimal() else text
+
+
+@command(
+    verb=verbs.design,
+    offers="poses criterion target minutes curve augment keep strike knowledge fixed candidates "
+    "effort elsewhere elsewhere_cap load_states load_changes reference_every jobs seed",
+    texts={
+        "target": ("µm", _target),
+        "curve": ("N,N,…", _numbers),
+        "keep": ("PLAN[:3,7]", str),
+        "strike": ("PLAN:3,7", str),
+        "candidates": ("N|FILE[,N]", _candidates),
+    },
+)
+def design(
+    cell: CellFile,
+    output: Annotated[
+        Path,
+        typer.Option(
+            "-o",
+            "--output",
+            help="The plan to write (CSV), .json beside it; OUTPUT.resume while it works.",
+        ),
+    ],
+    *,
+    asked: Asked,
+    program: Annotated[
+        list[Path] | None,
+        typer.Option(
+            metavar="FILE",
+            help="Robot program to write: NAME.src (KRL), NAME.script (URScript); repeatable.",
+        ),
+    ] = None,
+    picture: Annotated[
+        Path | None, typer.Option(help="Picture of the poses to write (PNG, SVG).")
+    ] = None,
+    cell_out: Annotated[
+        Path | None,
+        typer.Option(help="Cell file to write, with what [design.choose] has chosen."),
+    ] = None,
+    report: ReportFile = None,
+    run: Run,
+) -> None:
+    """Which poses should I measure?
+
+    Writes the plan (CSV) and plan.json beside it.  An interrupted run, started again with
+    the same input, resumes.
+
+    Example: elastocal design cell.toml -o plan.csv --poses 15 --picture poses.png
+    """
+    from elastocal.files import together
+    from elastocal.model.choice import cell_of
+    from elastocal.planning.candidates import plan_and_names
+    from elastocal.report.terminal import print_report
+    from elastocal.saving import beside
+
+    summary = beside(output)
+    programs = program or []
+    _check_suffixes(programs, picture)
+    run.writes(output, summary, *programs, picture, report, cell_out)
+    check = interrupt_check()
+    with run.progress() as tell:
+
+        def progress(message: str) -> None:
+            check()
+            tell(message)
+
+        progress("reading")
+        wanted, options = verbs.design_request(cell_of(cell, run.plugins), **asked)
+        _check_programs(wanted, programs)
+        require(
+            cell_out is None or wanted.design.choose is not None,
+            f"--cell-out {cell_out}: nothing is chosen; state [design.choose] in {cell}",
+        )
+        pinned = [plan_and_names(asked[name])[0] for name in ("keep", "strike") if name in asked]
+        stated = [asked.get(name) for name in ("augment", "knowledge")]
+        files = run.reads(cell, *stated, *pinned, *files_of(wanted))
+        plan, checkpoint = _resumed(wanted, options, output, files, asked, check, progress)
+        with together(run.written):
+            _write_all(plan, output, programs, picture)
+            if cell_out is not None:
+                from elastocal.diagnosis.diagnose import write_extended_cell
+
+                keys = plan.chosen.keys if plan.chosen else {}
+                write_extended_cell(cell, cell_out, (), keys=keys)
+            if report is not None:
+                progress("writing the report")
+                plan.report(report, inputs=list(dict.fromkeys(files)), command=repeated())
+        checkpoint.clear()
+    if run.json:
+        say(summary.read_text(encoding="utf-8"), end="")
+    else:
+        run.answer(plan.to_json, lambda screen: print_report(screen, plan))
+        say(_what_next(cell, output, asked.get("augment"), plan))
+
+
+def _resumed(
+    cell: Cell, options: DesignOptions, output: Path, files: list[Path], asked: Asked,
+    check: Callable[[], None], progress: Progress,
+) -> tuple[Plan, Checkpoint]:  # fmt: skip
+    """The plan, where an interrupted run of the same input left off, and what that left."""
+    from elastocal.planning.checkpoint import Checkpoint, key_of
+    from elastocal.planning.design import design as run
+
+    apart = ("jobs", "augment", "knowledge")  # these are among the files
+    told = {name: value for name, value in asked.items() if name not in apart}
+    checkpoint = Checkpoint.beside(output, key_of(files, **told), check)
+    if checkpoint.begun:
+        progress("resuming the interrupted design")
+    try:
+        plan = run(cell, options, checkpoint, progress)
+    except Exception as error:
+        check()
+        if not isinstance(error, OSError):
+            # The same input ends here again: there is nothing to go on with.
+            checkpoint.drop()
+        raise
+    check()
+    return plan, checkpoint
+
+
+def _what_next(cell: Path, output: Path, augment: Path | None, plan: Plan) -> str:
+    """What to do with the plan."""
+    from elastocal.planning.plan import load_name
+
+    loads = plan.forces[(plan.forces != 0).any(axis=1)]
+    carried, hung = "", ""
+    if len(loads) and plan.stated_forces is None:  # else the plan's rows state their forces
+        names = listed(load_name(force) for force in plan.forces)
+        hung = f"with the loads of its note_load ({names}), "
+        carried = f" --load {' '.join(f'{value:g}' for value in loads[0])}"
+    elif len(loads):
+        hung = "each row under its force, "
+    added = "" if augment is None else f" (add them to {augment})"
+    return (
+        f"Next: measure {output} in its order, {hung}a row with x_mm, y_mm, z_mm for each "
+        f"marker{added}; then\n"
+        f"  elastocal identify {cell} {augment or 'data.csv'} --report report.html\n"
+        f"To try it without an arm: elastocal simulate {cell} {output} -o data.csv --draw 1"
+        f"{carried}"
+    )
+
+
+def _check_suffixes(programs: list[Path], picture: Path | None) -> None:
+    """Refuse names that do not say which kind of file is wanted."""
+    for path in programs:
+        require(
+            path.suffix.lower() in PROGRAMS,
+            f"--program {path}: the suffix says the language, "
+            + " or ".join(f"{suffix} for {name}" for suffix, name in PROGRAMS.items()),
+        )
+    require(
+        picture is None or picture.suffix.lower() in PICTURES,
+        f"--picture {picture}: name it {' or '.join(PICTURES)}",
+    )
+
+
+def _check_programs(cell: Cell, programs: list[Path]) -> None:
+    """Can these robot programs be written for this arm?  Told before the work, not after it."""
+    import numpy as np
+
+    from elastocal.cell.plan_wishes import Motion
+    from elastocal.model.choice import load_chain
+    from elastocal.planning.execution import Execution
+
+    if programs:
+        chain = load_chain(cell)
+        nothing = Execution((), np.zeros((0, chain.n_joints)), 0.0, False, Motion(), 0, 0)
+        for path in programs:
+            _program(path, nothing, chain)
+
+
+def _write_all(plan: Plan, output: Path, programs: list[Path], picture: Path | None) -> None:
+    """plan.csv, plan.json, robot programs and picture."""
+    from elastocal.files import atomic_write_text
+    from elastocal.model.chain import joint_limits
+    from elastocal.planning.programs import check_program, steps_of
+    from elastocal.saving import save_plan
+
+    chain = plan.model.chain
+    limits = joint_limits(plan.model.cell, chain)
+    save_plan(plan, output, repeated())
+    for path in programs:
+        text = _program(path, plan.execution, chain, plan.configurations, plan.forces, limits)
+        # Before it appears: a program that moves elsewhere than the plan is not left behind.
+        check_program(text, list(steps_of(plan.execution, plan.configurations, plan.forces)))
+        atomic_write_text(path, text)
+    if picture is not None:
+        from elastocal.report.arm_view import write_plan_picture
+
+        write_plan_picture(picture, plan)
+
+
+def _program(
+    path: Path, execution: Execution, chain: Chain,
+    configurations: tuple[str, ...] = (), forces: Array | None = None,
+    limits: tuple[Array, Array] | None = None,
+) -> str:  # fmt: skip
+    """The robot program to write to `path`."""
+    from elastocal.planning.programs import krl_program, urscript_program
+
+    text = krl_program if path.suffix.lower() == ".src" else urscript_program
+    try:
+        return text(execution, chain, configurations, forces, name=path.stem, limits=limits)
+    except InputError as error:
+        raise InputError(f"--program {path}: {error}") from None
+
+
+# simulate and demo: measurements of a plan that were never made; the example.
+
+
+@command(
+    short_help="Simulate the measurements of a plan",
+    verb=verbs.simulate,
+    offers="draw load repeats seed",
+    flags="plugins json",
+)
+def simulate(
+    cell: CellFile,
+    plan: Path,
+    output: Output,
+    set_: list[str] | None = None,
+    truth: Path | None = None,
+    no_noise: bool = False,
+    *,
+    asked: Asked,
+    run: Run,
+) -> None:
+    """Simulate measurements from the cell's model, with chosen errors and noise.
+
+    Example: elastocal simulate cell.toml plan.csv -o data.csv --set joint2.compliance=3e-7
+    --load 0 0 -2600 --repeats 6
+
+    Args:
+        plan: Poses (CSV): configuration, q1_deg, …
+        output: Measurements to write (CSV).
+        set_ (NAME=VALUE): True value in SI units; repeatable.
+        truth: Write the true values used, as JSON {name: value}.
+        no_noise: Exact readings.
+    """
+    from elastocal.files import together
+    from elastocal.model.manipulator import Model
+    from elastocal.saving import write_json
+
+    run.writes(output, truth)
+    model = Model(cell, plugins=run.plugins)
+    run.reads(cell, plan, cell=model.cell)
+    poses = model.read_plan(plan)
+    values = dict(_assignment(text) for text in set_ or ())
+    table, x = verbs.simulated(model, poses, **asked, values=values, noise=not no_noise)
+    planned = model.cell.design.loads
+    if "load" not in asked and not table.force.any() and planned is not None and planned.any():
+        say(
+            f"Warning: {plan} states no load and none is given, so every reading is unloaded; the "
+            "cell plans some ([design] loads_N): simulate one by --load",
+            error=True,
+        )
+    named = dict(zip(model.names, x.tolist(), strict=True))
+    with together(run.written):
+        table.save(output)
+        if truth is not None:
+            write_json(truth, named)
+    summary = {"output": str(output), "readings": len(table), "poses": len(poses)}
+    told = f"wrote {len(table)} readings of {len(poses)} poses to {output}"
+    run.answer(
+        lambda: summary | {"seed": asked["seed"], "truth": named}, lambda _: say(told), files=False
+    )
+
+
+def _assignment(text: str) -> tuple[str, float]:
+    name, _, value = text.partition("=")
+    try:
+        return name.strip(), float(value)
+    except ValueError:
+        raise InputError(
+            f"--set takes NAME=VALUE with a number in SI units; found '{text}'"
+        ) from None
+
+
+@command(short_help="Simulate and calibrate a KR 270 (Klimchik et al. 2013)", flags="json quiet")
+def demo(
+    folder: Output = Path("demo_out"),
+    seed: Seed = 2013,
+    *,
+    run: Run,
+) -> None:
+    """The KR 270 example of Klimchik et al. 2013, measured (simulated) and identified.
+
+    Example: elastocal demo -o demo_out
+
+    Args:
+        folder: Folder for the example's files, data, result and report.
+    """
+    from elastocal.cli.judging import write_results
+    from elastocal.demo.example import run_demo
+    from elastocal.report.terminal import print_report
+
+    with run.progress() as progress:
+        done = run_demo(folder, seed, progress)
+        report = folder / "report.html"
+        inputs = [done.cell, done.plan, done.data]
+        write_results(
+            done.result, folder / "result.json", report, None, inputs, seed, done.truth,
+            done.published,
+        )  # fmt: skip
+    if run.answer(
+        lambda: done.result.to_json() | {"truth": done.truth},
+        lambda screen: print_report(screen, done.result, details=False, truth=done.truth),
+    ):
+        say(
+            f"\nTo repeat it by hand: elastocal identify {done.cell} {done.data} -o result.json\n"
+            f"Report to open: {report.absolute()}"
+        )
+
+
+# import: tracker exports and joint logs → the measurement table.
+
+PRESET_NAMES = "spatialanalyzer, polyworks, leica, faro, spherical, wide, kuka, abb, ros"
+
+
+@command(
+    "import",
+    short_help="Convert tracker exports and joint logs to the measurement table",
+    flags="json",
+)
+def import_(
+    files: Annotated[list[Path] | None, typer.Argument()] = None,
+    output: AnyOutput = None,
+    mapping: Annotated[Path | None, typer.Option("--map")] = None,
+    preset: list[str] | None = None,
+    show_preset: str | None = None,
+    preview: bool = False,
+    cell: Path | None = None,
+    length_unit: str | None = None,
+    angle_unit: str | None = None,
+    *,
+    run: Run,
+) -> None:
+    """Convert exports of a laser tracker and joint logs to the measurement table.
+
+    Example: elastocal import points.txt poses.dat --preset spatialanalyzer --preset kuka
+    --cell cell.toml --preview -o data.csv
+
+    Args:
+        files: Exports of the tracker and logs of the joints, in any order.
+        output: Measurements to write (CSV).
+        mapping: Mapping file (TOML): what the columns mean.
+        preset (NAME): One for all files, or one per file: spatialanalyzer, polyworks, leica,
+            faro, spherical, wide, kuka, abb, ros.
+        show_preset (NAME): Print a preset to copy from, and stop.
+        preview: Show what was understood; needs no --output.
+        cell: Cell file: check joints, limits, markers and the fit to its robot.
+        length_unit: Unit of lengths where a file does not say: mm, m, um, in.
+        angle_unit: Unit of angles where a file does not say: deg, rad, gon.
+    """
+    from elastocal.cell.work_cell import read_cell
+    from elastocal.cli.import_preview import left_out, print_preview, summary
+    from elastocal.importing.assemble import import_files
+    from elastocal.importing.mapping_file import preset_text, read_mapping, with_units
+
+    if show_preset is not None:
+        say(preset_text(show_preset), end="")
+        return
+    paths = list(files or ())
+    require(
+        bool(paths),
+        "the argument FILES is missing: the tracker's export, and the log of the joints",
+    )
+    require(
+        output is not None or preview or run.json,
+        "import needs -o data.csv to write to, or --preview to only look",
+    )
+    if mapping is None and not preset:
+        raise InputError(
+            f"import needs --map mapping.toml, or --preset: {PRESET_NAMES}{_suggestion(paths)}"
+        )
+    run.writes(output)
+    run.reads(*paths, mapping, cell)
+    read = with_units(read_mapping(mapping, preset or ()), length_unit, angle_unit)
+    known = None if cell is None else read_cell(cell)
+    run.reads(cell=known)
+    found = import_files(paths, read, known, str(output or "the table"))
+    if run.json:
+        say(json_text(summary(found, output)))
+    elif preview:
+        print_preview(console(), found)
+    else:
+        for warning in found.warnings:
+            say(f"Warning: {warning}", error=True)
+        for line in left_out(found):
+            say(line, error=True)
+    if found.refused:
+        raise InputError(found.refused)
+    if output is None:
+        return
+    from elastocal.files import atomic_write_text
+
+    atomic_write_text(output, found.text)
+    if not run.json:
+        table = found.table
+        say(
+            f"wrote {len(table)} readings of {len(table.configuration_labels)} configurations to "
+            f"{output}"
+        )
+
+
+def _suggestion(paths: list[Path]) -> str:
+    """The presets that read the files, as a hint."""
+    from elastocal.importing.records import likely_presets
+
+    told = []
+    for path in paths:
+        if path.is_file() and (found := likely_presets(path)):
+            told.append(f"{path} as --preset {' or '.join(found)}")
+    return f"; what reads your files: {', '.join(told)}" if told else ""

@@ -1,0 +1,517 @@
+"""Verbs that use a result, and studies: compensate, export, study."""
+
+from __future__ import annotations
+
+import math
+import time
+from collections.abc import Callable, Iterator
+from datetime import timedelta
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated, Any
+
+import typer
+
+from elastocal import verbs
+from elastocal.cli.signatures import (
+    FORCE,
+    AnyOutput,
+    Asked,
+    CellFile,
+    Output,
+    ResultFile,
+    Run,
+    Seed,
+    command,
+)
+from elastocal.errors import InputError, InsufficientDataError, require
+from elastocal.screen import progress_line, say
+
+if TYPE_CHECKING:
+    from elastocal.compensation.compensate import Compensation
+    from elastocal.compensation.correction_table import CorrectionGrid, CorrectionTable
+    from elastocal.export.export import Exported
+    from elastocal.export.exportable import Cost
+    from elastocal.export.refit import Refit
+    from elastocal.model.calibrated import CalibratedArm
+    from elastocal.report.blocks import Block
+    from elastocal.studies.run import Ending
+    from elastocal.units import Array
+
+
+@command(verb=verbs.compensate, offers="frame point load seed", texts={"point": ("POINT", str)})
+def compensate(
+    cell: CellFile,
+    result: ResultFile,
+    targets: Annotated[Path | None, typer.Argument()] = None,
+    output: AnyOutput = None,
+    target: str | None = None,
+    near: str | None = None,
+    partial: bool = False,
+    table: Path | None = None,
+    grid: str = "5",
+    box: str | None = None,
+    rotation: str | None = None,
+    *,
+    asked: Asked,
+    run: Run,
+) -> None:
+    """Compute corrected joint commands for targets.
+
+    Solves the calibrated arm under load for every target.  --table writes corrections that a
+    controller adds to nominal targets.
+
+    Example: elastocal compensate cell.toml result.json targets.csv -o commands.csv
+
+    Args:
+        targets: Targets (CSV): x_mm, y_mm, z_mm, rx_deg, …, or q1_deg, …
+        output: Commands to write (CSV).
+        target (X,Y,Z[,RX,RY,RZ]): One target instead, in mm and degrees.
+        near (Q1,Q2,…): Joints in degrees (mm where prismatic) of a posture to start near.
+        partial: Write the rows reached; leave others empty.
+        table: Correction table to write (CSV), over --grid.
+        grid (N[,N…]): Levels per joint (or of x, y, z): 5 or 9,7,7,3,3,1.
+        box (X0,Y0,Z0,X1,Y1,Z1): Grid over this box in mm in the base frame, not over the joints.
+        rotation (RX,RY,RZ): Rotation vector of the tool in --box, in degrees.
+    """
+    from elastocal.compensation.targets import one_target
+    from elastocal.files import atomic_write_text, together
+    from elastocal.model.arm import given_force
+    from elastocal.model.calibrated import read_calibrated
+    from elastocal.report.compensation_view import compensation_blocks
+    from elastocal.report.terminal import print_blocks
+
+    # What can be wrong with the options is told before any file is read.
+    verbs.check_frame(asked["frame"])
+    force = given_force(asked.get("load"))
+    _check(targets, target, output, table, (grid, box, rotation))
+    run.writes(output, table)
+    content, texts = {}, {}
+    with run.progress() as progress:
+        progress("reading")
+        arm = read_calibrated(cell, result, run.plugins)
+        run.reads(cell, result, targets, cell=arm.model.cell)
+        start = _posture(arm, near)
+        lines = None if table is None else _grid(arm, grid, box, rotation)
+        wanted = targets if target is None else one_target(target, asked["frame"], force)
+        if wanted is not None:
+            found = verbs.compensate(arm, wanted, **asked, near=start, progress=progress)
+            content["commands"], text = _commands(found, output is None, partial)
+            if output is not None:
+                texts[output] = text
+        if table is not None and lines is not None:
+            from elastocal.compensation.correction_table import correction_table
+            from elastocal.model.calibrated_tool import tool_point
+
+            where = tool_point(arm.model.cell, asked.get("point"))
+            corrections = correction_table(arm, lines, where, force, start, asked["seed"], progress)
+            content["table"], texts[table] = _table(corrections, arm, partial)
+        # Nothing is written before every answer is there: a refused table leaves no commands.
+        with together(run.written):
+            for path, text in texts.items():
+                atomic_write_text(path, text)
+    shown = run.answer(
+        lambda: content.get("commands", {}) | {k: v for k, v in content.items() if k == "table"},
+        lambda screen: print_blocks(screen, compensation_blocks(content)),
+    )
+    if shown and output is not None:
+        say(
+            f"Next: run the commands of {output.name} (its q columns) and measure some: 19 of 20 "
+            "should lie within within95_um of their targets, with the tracker's noise on top."
+        )
+
+
+def _check(
+    targets: Path | None, target: str | None, output: Path | None, table: Path | None,
+    of_a_table: tuple[str, str | None, str | None],
+) -> None:  # fmt: skip
+    """Raises InputError for options that do not go together."""
+    _, box, rotation = of_a_table
+    require(
+        targets is not None or target is not None or table is not None,
+        "nothing to compensate: name a table of targets, or give --target x,y,z or --table FILE",
+    )
+    require(
+        targets is None or target is None,
+        f"both {targets} and --target are given; drop one of them",
+    )
+    require(
+        output is None or targets is not None or target is not None,
+        "-o writes the commands of targets; name a table of them, or give --target",
+    )
+    require(
+        table is not None or of_a_table == ("5", None, None),
+        "--grid, --box and --rotation belong to a correction table; give --table FILE",
+    )
+    require(rotation is None or box is not None, "--rotation belongs to --box")
+
+
+GRID_REMEDIES = {
+    "limit": "joint limits prevent it: widen [limits], or give a smaller --box or another --near",
+    "not reached": "out of reach, or beside a singular posture: give a smaller --box, another "
+    "--rotation or another --near",
+    "no equilibrium": "no static equilibrium under this load: check --load",
+}
+
+
+def _posture(arm: CalibratedArm, text: str | None) -> Array | None:
+    """--near as joints (n,) in rad or m."""
+    import numpy as np
+
+    from elastocal.compensation.compensate import in_file_units
+    from elastocal.model.calibrated_tool import numbers
+    from elastocal.model.chain import joint_limits
+
+    if text is None:
+        return None
+    chain = arm.model.chain
+    n = chain.n_joints
+    values = numbers("--near", text, (n,), f"{n} numbers, one per joint, in degrees (or mm)")
+    values = values / in_file_units(np.ones(n), chain.kinds)
+    lower, upper = joint_limits(arm.model.cell, chain)
+    if ((values < lower) | (values > upper)).any():
+        j = int(np.argmax((values < lower) | (values > upper)))
+        raise InputError(f"--near: joint {j + 1} is beyond its limits; give a posture within them")
+    return values
+
+
+def _grid(arm: CalibratedArm, grid: str, box: str | None, rotation: str | None) -> CorrectionGrid:
+    """The grid that --grid, --box and --rotation ask for."""
+    import numpy as np
+    from scipy.spatial.transform import Rotation
+
+    from elastocal.compensation.correction_table import box_grid, joint_grid
+    from elastocal.model.calibrated_tool import numbers
+
+    try:
+        counts = tuple(int(part) for part in grid.split(","))
+    except ValueError:
+        raise InputError(
+            f"--grid takes whole numbers, as in 5 or 9,7,7,3,3,1; found '{grid}'"
+        ) from None
+    if box is None:
+        return joint_grid(arm, counts)
+    corners = numbers("--box", box, (6,), "x0,y0,z0,x1,y1,z1 in mm in the base frame") / 1e3
+    turned = None
+    if rotation is not None:
+        vector = numbers("--rotation", rotation, (3,), "a rotation vector rx,ry,rz in degrees")
+        turned = Rotation.from_rotvec(np.radians(vector)).as_matrix()
+    return box_grid(corners[:3], corners[3:], counts, turned)
+
+
+def _commands(found: Compensation, listed: bool, partial: bool) -> tuple[dict[str, Any], str]:
+    """Summary of the commands, with each of them where `listed`, and their table as CSV.
+
+    Raises InsufficientDataError where rows are not reached and `partial` does not allow for that.
+    """
+    from elastocal.compensation.compensate import check_reached, commands_csv, summary
+
+    if not partial:
+        check_reached(found)
+    kinds = found.chain.kinds
+    return summary(found, kinds, commands=listed), commands_csv(found, kinds)
+
+
+def _table(found: CorrectionTable, arm: CalibratedArm, partial: bool) -> tuple[dict[str, Any], str]:
+    """Summary of the correction table, and the table as CSV; refused as `_commands` is."""
+    import numpy as np
+
+    from elastocal.compensation.compensate import check_status, in_file_units, joint_columns, spread
+    from elastocal.compensation.correction_table import EXACT, FIRST_ORDER
+    from elastocal.tables import csv_text
+
+    kinds = arm.model.chain.kinds
+    if found.grid.joints:
+        heads, points = joint_columns(kinds), in_file_units(found.points, kinds)
+    else:
+        heads, points = ["x_mm", "y_mm", "z_mm"], found.points * 1e3
+    known = np.all(np.isfinite(found.correction), axis=1).tolist()
+    plain = tuple(EXACT if good else s for good, s in zip(known, found.status, strict=True))
+    # A grid point has no line in any file of the user's: it is named by where it lies.
+    named = [f"({', '.join(f'{v:.5g}' for v in p + 0.0)})" for p in points]
+    what = f"--table: %d of %d grid points ({', '.join(heads)})"
+    if not partial:
+        check_status(what, named, plain, EXACT, GRID_REMEDIES)
+    heads += ["dx_mm", "dy_mm", "dz_mm"]
+    columns = [found.correction[:, :3] * 1e3]
+    if found.oriented:
+        heads += ["drx_deg", "dry_deg", "drz_deg"]
+        columns.append(np.degrees(found.correction[:, 3:]))
+    order = np.lexsort(found.points.T[::-1])
+    rows = []
+    values = np.hstack(columns)
+    for i in order:
+        cells = [f"{v + 0.0:.7f}" if np.isfinite(v) else "" for v in values[i]]
+        rows.append([*(f"{v + 0.0:.9g}" for v in points[i]), *cells, found.status[i]])
+    content: dict[str, Any] = {
+        "points": len(found.status),
+        "exact": found.status.count(EXACT),
+        "first_order": found.status.count(FIRST_ORDER),
+        "levels": [len(axis) for axis in found.grid.axes],
+        "checked_between": len(found.between),
+        "error_without_um": spread(found.before[:, 0]),
+        "error_with_um": spread(found.between[:, 0]),
+    }
+    if found.oriented:
+        content["rotation_without_urad"] = spread(found.before[:, 1])
+        content["rotation_with_urad"] = spread(found.between[:, 1])
+    return content, csv_text([*heads, "status"], rows)
+
+
+# export: the calibrated arm for other programs.
+
+WORTH_TELLING = 10e-6  # m, as for what compensate leaves open
+
+
+@command(short_help="Write the calibrated model: URDF, MuJoCo, DH table")
+def export(
+    cell: CellFile,
+    result: ResultFile,
+    output: Output,
+    format: str | None = None,
+    load: FORCE | None = None,
+    frames: Annotated[bool, typer.Option("--frames/--no-frames")] = True,
+    base_frame: bool = False,
+    joint_correction: Path | None = None,
+    temperature_c: float | None = None,
+    time_s: float | None = None,
+    poses: Annotated[int, typer.Option(min=2, max=1_000_000)] = 500,
+    seed: Seed = 0,
+    *,
+    run: Run,
+) -> None:
+    """Write the calibrated arm as URDF, MJCF, DH table or parameters, and state the loss.
+
+    Example: elastocal export cell.toml result.json -o calibrated.urdf --load 0 0 -2600
+
+    Args:
+        output: File to write: .urdf, .xml or .mjcf, .csv (DH), .yaml, .json.
+        format: urdf, mjcf, dh, mdh (modified DH), yaml, json, or corrections (smooth functions
+            as CSV); default: by the ending.
+        load: Force in N at the load point (tracker's axes) for costs and fit.
+        frames: URDF: links for markers and load point.
+        base_frame: Put the tracker's frame above the robot's base.
+        joint_correction: Write the joint correction for simulators (CSV); the file is fitted
+            with it.
+        temperature_c: Temperature in °C to export at.
+        time_s: Time in s, as in the data, to export at.
+        poses: Random poses to find costs at.
+    """
+    from elastocal.export.export import export as exported
+    from elastocal.export.export import write
+    from elastocal.model.calibrated import read_calibrated
+    from elastocal.report.terminal import print_blocks
+    from elastocal.saving import wish_of
+
+    run.writes(output, joint_correction)
+    wish = wish_of(
+        output, format, load, frames, base_frame, temperature_c, time_s, poses, seed,
+        joint_correction is not None,
+    )  # fmt: skip
+    with run.progress() as progress:
+        progress("reading")
+        calibrated = read_calibrated(cell, result, run.plugins)
+        run.reads(cell, result, cell=calibrated.model.cell)
+        done = exported(calibrated, wish, progress)
+    write(done, output, joint_correction)
+    run.answer(
+        lambda: {"output": str(output)} | done.to_json(),
+        lambda screen: print_blocks(screen, _tell(done)),
+    )
+
+
+def _tell(done: Exported) -> Iterator[Block]:
+    """What the file holds and what not, for people."""
+    from elastocal.report.blocks import Sentence, ShownTable
+    from elastocal.report.formatting import length
+
+    def rounding(metres: float) -> str:  # what is below a nanometre is no number to read
+        return "< 0.001 µm" if metres < 1e-9 else length(metres)
+
+    cost, (name, in_title) = done.cost, NAMES[done.format]
+    if cost.effects:
+        every = [(e.effect.replace("_", " "), e.difference, e.note) for e in cost.effects]
+        rows = []
+        for effect, d, note in [*every, ("all of it", cost.total, "")]:
+            sizes = () if d is None else (d.marker_rms, d.marker_max, d.flange_rms, d.flange_max)
+            rows.append((effect, *([length(size) for size in sizes] or [""] * 4), note))
+        heads = ("effect", "markers rms", "max", "flange rms", "max", "")
+        yield ShownTable(heads, rows, (0, 5), title=f"What {in_title} cannot hold")
+        yield Sentence(
+            f"Costs: differences from the calibrated model at {cost.poses} random poses within the "
+            f"joint {'ranges measured' if cost.measured else 'limits'} under "
+            f"{_loads(cost)}, each effect left out alone."
+        )
+    else:
+        yield Sentence(f"{name} holds all of the calibrated model.")
+    if done.refit is not None:
+        yield Sentence(_fit(done.refit))
+    if done.checked is not None:
+        yield Sentence(f"Read back with {done.checked_with}: {rounding(done.checked)} at most.")
+    if done.without_beta is not None:
+        yield Sentence(f"Without the column beta_rad: {rounding(done.without_beta)} at most.")
+    if held := list(done.held):
+        more = f" and {len(held) - 8} more" if len(held) > 8 else ""
+        yield Sentence(
+            "Not determined by the data, at the values that the identification predicts with: "
+            f"{', '.join(held[:8])}{more}."
+        )
+    if done.of_the_measurement:
+        left = ", ".join(done.of_the_measurement)
+        yield Sentence(f"Left out, effects of the measurement: {left}.")
+    for warning in done.warnings:
+        yield Sentence(f"Note: {warning}.")
+    if cost.total.marker_rms > WORTH_TELLING:
+        yield Sentence(
+            "Next: if that matters, elastocal compensate corrects it with the same cell and result."
+        )
+
+
+def _loads(cost: Cost) -> str:
+    if len(cost.forces) == 1:
+        return f"a load of ({', '.join(f'{v:g}' for v in cost.forces[0])}) N"
+    sizes = [math.hypot(*force) for force in cost.forces]
+    return f"the {len(sizes)} loads measured, {min(sizes):.4g} to {max(sizes):.4g} N"
+
+
+def _fit(refit: Refit) -> str:
+    """How far the file is from the arm."""
+    from elastocal.report.formatting import length
+
+    told = f"the markers are {length(refit.after)} rms off"
+    if refit.correction is not None:
+        told = f"{told}, with its joint correction {length(refit.correction)}"
+    if refit.taken or refit.correction is not None:
+        told = (
+            f"Refitted to the calibrated arm at {refit.visits} measured visits: "
+            f"{told}, with the values identified {length(refit.before)}"
+        )
+    else:
+        told = f"Values as identified; no refit is better: {told}"
+    worse = "" if refit.after < refit.nominal else "; it is worse than the nominal file"
+    return f"{told}, the nominal file with base and tool placed {length(refit.nominal)}{worse}."
+
+
+# At the start of a sentence and in a title.
+NAMES = {
+    "urdf": ("The URDF", "a URDF"),
+    "mjcf": ("The MJCF", "this MJCF"),
+    **dict.fromkeys(("dh", "mdh"), ("The DH table", "a DH table")),
+    **dict.fromkeys(("yaml", "json", "corrections"), ("Geometry alone", "geometry alone")),
+}
+
+
+# study: a scripted study, on the local cores or on a Dask cluster.
+
+EVERY = 10.0  # s between plain lines of progress
+
+
+@command(short_help="Run many simulations on all cores or a cluster")
+def study(
+    folder: Path,
+    jobs: Annotated[int | None, typer.Option(min=1)] = None,
+    cluster: str | None = None,
+    tls_ca: Path | None = None,
+    tls_cert: Path | None = None,
+    tls_key: Path | None = None,
+    unencrypted: bool = False,
+    seed: Annotated[int | None, typer.Option(min=0)] = None,
+    set_: list[str] | None = None,
+    output: AnyOutput = None,
+    progress: Annotated[bool, typer.Option("--progress", show_default=False)] = True,
+    quiet: Annotated[bool, typer.Option("--quiet", "-q", "--no-progress")] = False,
+    only: Annotated[int | None, typer.Option(min=1)] = None,
+    restart: bool = False,
+    retry_failed: bool = False,
+) -> None:
+    """Run a study's tasks that have no result yet; after Ctrl-C the same command resumes.
+
+    study.py in the folder is Python code and runs with your rights, here and on a cluster: run
+    only folders that you trust.
+
+    Example: elastocal study experiment_design/coverage --jobs 4
+
+    Args:
+        folder: Folder with study.py and study.toml.
+        jobs: Processes on this machine; default: one per core.
+        cluster (ADDRESS): Dask scheduler, as in tcp://HOST:8786, or 'config' for Dask's own.
+        tls_ca: Certificate authority (PEM) of a tls:// scheduler.
+        tls_cert: This client's certificate (PEM) for it.
+        tls_key: The key of that (PEM).
+        unencrypted: Reach another host without TLS.
+        seed: Seed; default: that of study.toml.
+        set_ (KEY=VALUE): Option of the study; repeatable.
+        output: Folder of the results, with the summary in OUTPUT.md; default: FOLDER/results
+            and FOLDER/result.md.
+        progress: Rate and time left: the default.
+        quiet: No progress.
+        only: Run the first N tasks alone.
+        restart: Discard the results that are there.
+        retry_failed: Run tasks that failed again.
+    """
+    require(cluster is None or jobs is None, "--jobs is for this machine; leave it with --cluster")
+    from elastocal.studies.results import check_page
+    from elastocal.studies.run import StudyStop, run_study, summarise
+    from elastocal.studies.study import read_study
+
+    results = folder / "results" if output is None else output
+    page = folder / "result.md"
+    if output is not None:
+        page = Path(f"{output if output.name else output.resolve()}.md")
+        check_page(results, page)
+    prepared = read_study(folder, seed, set_ or ())
+    with StudyStop() as stop, progress_line(quiet or not progress, EVERY) as tell:
+        ending = run_study(
+            prepared, results, jobs=jobs, cluster=cluster, only=only, restart=restart,
+            retry_failed=retry_failed, stop=stop, progress=Pace(tell).show,
+            tell=lambda text: say(f"… {text}", error=True),
+            tls_ca=tls_ca, tls_cert=tls_cert, tls_key=tls_key, unencrypted=unencrypted,
+        )  # fmt: skip
+    say(_told(ending, results))
+    if ending.stopped and not ending.complete:
+        raise typer.Exit(130)
+    if ending.failed:
+        raise InsufficientDataError(
+            f"{results}: {ending.failed} of {ending.total} tasks failed; see _failures.log there"
+        )
+    if ending.done == len(prepared.tasks):
+        text = summarise(prepared, results, page)
+        if text is not None:
+            say(f"\n{text}")
+
+
+def _told(ending: Ending, results: Path) -> str:
+    text = f"{ending.done} of {ending.total} tasks done"
+    if ending.before:
+        text += f" ({ending.before} were there)"
+    if ending.failed:
+        text += f", {ending.failed} failed"
+    text += f"; results in {results}"
+    if ending.failed:
+        from elastocal.studies.results import read_results
+
+        first = read_results(results, failed=True).iloc[0]
+        text += (
+            f"\nfirst failure: task {first['task']}: {first['task_error']}\n"
+            f"tracebacks in {results / '_failures.log'}; --retry-failed runs such tasks again"
+        )
+    if ending.stopped and not ending.complete:
+        text += "\nstopped; the same command goes on with the rest"
+    return text
+
+
+class Pace:
+    """Says how far a study is: done of total, rate per minute of this run, time left, failures."""
+
+    def __init__(self, tell: Callable[[str], None]) -> None:
+        self._tell, self._begun, self._before = tell, time.monotonic(), -1
+
+    def show(self, total: int, ended: int, failed: int) -> None:
+        """`ended` of `total` tasks, failures among them, are there; the first call begins."""
+        if self._before < 0:
+            self._begun, self._before = time.monotonic(), ended
+        text = f"{ended} of {total} tasks"
+        if ended > self._before:
+            rate = (ended - self._before) / max(time.monotonic() - self._begun, 1e-3)
+            left = timedelta(seconds=round((total - ended) / rate))
+            text += f", {60 * rate:.{0 if rate > 1 else 1}f} per minute, {left} left"
+        self._tell(text + (f", {failed} failed" if failed else ""))
