@@ -19,7 +19,7 @@ from functools import cached_property
 from typing import Protocol, TypeGuard
 
 import numpy as np
-from scipy import linalg, optimize
+from scipy import linalg
 
 from elastocal.engine.climb import Objective, climb
 from elastocal.errors import InsufficientDataError
@@ -534,7 +534,7 @@ def fit(
 
     for _ in range(ROUNDS):
         t[held], lower[held], upper[held] = -np.inf, -np.inf, -np.inf
-        t, ended = _climbed(evaluated, t, lower, upper, enough)
+        before, (t, ended) = t, _climbed(evaluated, t, lower, upper, enough)
         value, slope, information = evaluated(t)
         falling = (slope > 0) & (slope < NEAR) & (np.diag(information) < FLAT) & np.isfinite(t)
         gone: list[int] = []
@@ -543,7 +543,7 @@ def fit(
             without[[*gone, k]] = -np.inf
             if falling[k] and evaluated(without)[0] <= value + FINE:
                 gone.append(k)
-        if ended and not gone:
+        if not gone and (ended or np.array_equal(t, before)):
             break
         held = np.append(held, gone).astype(np.int64)
     return MixedFit(model, model.state(np.exp(t)), ended)
@@ -568,13 +568,6 @@ def _climbed(
         return value, slope[free], information[np.ix_(free, free)] + ridge
 
     found, ended = climb(objective, t[free], lower[free], upper[free], enough, STEPS)
-    if not ended and np.array_equal(found, t[free]):  # where the information does not lead
-        by = optimize.minimize(
-            lambda own: objective(own)[:2], found, jac=True, method="L-BFGS-B",
-            bounds=list(zip(lower[free], upper[free], strict=True)),
-            options={"maxiter": 10 * STEPS, "ftol": 1e-13},
-        )  # fmt: skip
-        found, ended = by.x, bool(by.success)
     return full(found), ended
 
 

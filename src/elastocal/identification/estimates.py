@@ -130,7 +130,7 @@ def _unchecked(result: Calibration) -> Array | None:
     )
     if not usual or len(lone) * len(kept) > MOST_NUMBERS:
         return None
-    B = result.model.regressor(observed.table, result.x, kept, observed).B
+    B = result.B[:, kept]
     configuration = np.repeat(observed.configuration, observed.size)
     return told_by_one(weights.apply(B), np.where(lone, configuration, -1))
 
