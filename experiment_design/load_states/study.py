@@ -2,8 +2,9 @@
 
     .venv/bin/python experiment_design/load_states/study.py
 
-prints a row per cell, which result.md has.  The UR10's file comes with the package
-example-robot-data; the KR 270 is that of ../kr270_plan/crowded.toml without its obstacles.
+prints a row per cell, and what unequal numbers of readings could gain, which result.md has.  The
+UR10's file comes with the package example-robot-data; the KR 270 is that of
+../kr270_plan/crowded.toml without its obstacles.
 """
 
 from __future__ import annotations
@@ -20,6 +21,14 @@ from elastocal.cell.arm_description import CartesianNoise, ModelSpec, Nominal, R
 from elastocal.cell.plan_wishes import DesignSpec, TargetPose
 from elastocal.cell.work_cell import Cell
 from elastocal.cell.workspace_rules import Workspace
+from elastocal.model.manipulator import Model
+from elastocal.planning.candidates import draw
+from elastocal.planning.choices import single_ways
+from elastocal.planning.feasibility import Feasibility
+from elastocal.planning.information import plan_forces
+from elastocal.planning.relaxation import balanced, relax
+from elastocal.planning.setup import Known, set_up
+from elastocal.planning.test_poses import test_poses
 
 HERE = Path(__file__).parent
 EFFECTS = ("base_frame", "joint_offset", "link_geometry", "joint_compliance", "marker_position")
@@ -91,8 +100,26 @@ def row_of(name: str, cell: Cell, poses: int) -> str:
     return f"| {name} | {len(crossed.forces)} | {figures} | {lower} | {relaxed} | {took} | {told} |"
 
 
+def unequal(cell: Cell, poses: int, times: int = 3) -> float:
+    """By how much the relaxed ρ₀ falls where a pose may be read up to so many times as often as
+    others, with as many readings in all."""
+    model = Model(cell)
+    rules = Feasibility(cell, model.chain)
+    q = draw(cell, model.chain, plan_forces(cell), rules, 1000, 0)
+    setup = set_up(model, q.q, poses, test_poses(cell, model.chain, rules, 0), Known())
+    setup = replace(setup, ways=single_ways(setup.information))
+    problem, _ = balanced(setup.problem(setup.pool(q.q, q.group), np.array([poses])))
+    once = relax(problem, 1e-3)
+    some = problem.restricted(np.argsort(-once.weights)[:400])
+    blocks, group = np.tile(some.blocks, (times, 1, 1)), np.tile(some.group, times)
+    often = relax(replace(some, blocks=blocks, group=group), 1e-3)
+    return float(1 - np.sqrt(often.value / once.value))
+
+
 if __name__ == "__main__":
     print(f"| {' | '.join(HEADS)} |\n|{'---|' * len(HEADS)}")
     for name, (cell, poses) in cells().items():
         if len(sys.argv) < 2 or name in sys.argv[1:]:
             print(row_of(name, cell, poses), flush=True)
+    for name in ("UR10", "KR 270"):
+        print(f"\n{name}: unequal readings, {100 * unequal(*cells()[name]):.1f} % lower at best")
