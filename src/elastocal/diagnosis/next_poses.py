@@ -178,7 +178,7 @@ def next_poses(
     return NextPoses(
         verdict=verdict,
         plan=plan if verdict == "measure" else None,
-        batch=batch,
+        batch=len(plan),
         gain=gain,
         required=required,
         reached=reached,
