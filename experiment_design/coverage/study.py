@@ -18,7 +18,7 @@ from scenarios import SCENARIOS, Setting, setting
 from scipy import stats
 
 from elastocal.identification.covariance import cluster_robust
-from elastocal.identification.noise_judge import outlier_screening, settle
+from elastocal.identification.noise_judge import settle
 from elastocal.identification.published import eq14, ols
 from elastocal.identification.trimmed import majority
 
@@ -71,9 +71,7 @@ def estimates(s: Setting, replicate: int) -> np.ndarray:
         found[METHODS.index(method)] = np.column_stack([x, std, np.broadcast_to(dof, p)])
 
     readings = s.readings(e)
-    good = np.repeat(majority(readings.B, readings.e)[0], 3)
-    left = e - B @ np.linalg.lstsq(B[good], e[good])[0]
-    noise = settle(readings, good=outlier_screening(readings, left.reshape(-1, 3))).noise
+    noise = settle(readings, good=majority(readings.B, readings.e)[0]).noise
     put("default", noise.x, noise.covariance.std, noise.covariance.dof)
     put("oracle", *s.oracle(e, clean), np.inf)
     plain = ols(B, e)

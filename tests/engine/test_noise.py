@@ -10,10 +10,11 @@ from scipy import stats
 
 from elastocal.errors import InputError, InsufficientDataError
 from elastocal.identification.noise_choice import estimate_noise
-from elastocal.identification.noise_judge import _predicted, outlier_screening, settle
+from elastocal.identification.noise_judge import _predicted, settle
 from elastocal.identification.noise_structure import Readings, noise_models
 from elastocal.identification.noisy_readings import own_noise
 from elastocal.identification.outliers import FALSE_ALARM
+from elastocal.identification.trimmed import majority
 
 BASE = Table(configurations=12, markers=3, repeats=4, unbalanced=False)
 
@@ -213,13 +214,13 @@ def test_gross_errors_are_found_and_nothing_else(kind):
         bad = rng.permutation(len(r))[:3]
         e = 1e-5 * rng.normal(size=r.e.shape)
         e[bad, rng.integers(3, size=3)] += 1e-3
-        start = outlier_screening(r, e) if kind == "auto" else None
+        start = majority(r.B, e)[0] if kind == "auto" else None
         assert set(np.flatnonzero(~settle(r.moved(e), kind, start).good)) == set(bad)
 
 
 def test_errors_that_mask_each_other_are_found_from_a_robust_start():
     """Two readings with the same error and the same great leverage draw the fit to them: each is
-    predicted well by the other.  Starting from all readings they stay; the screening finds them."""
+    predicted well by the other.  Starting from all readings they stay; the majority finds them."""
     r = table(4, configurations=10, repeats=4, unbalanced=False)
     bad = np.flatnonzero((r.configuration == 0) & (r.marker == 0))[:2]
     B, e = r.B.copy(), 1e-5 * np.random.default_rng(5).normal(size=r.e.shape)
@@ -228,7 +229,7 @@ def test_errors_that_mask_each_other_are_found_from_a_robust_start():
     marker = np.where(np.isin(np.arange(len(r)), bad), 9, r.marker)
     r = Readings(B, e, r.configuration, r.load, marker)
     assert settle(r, "independent").good[bad].all()
-    first = outlier_screening(r, e)  # what a robust fit leaves: the errors
+    first = majority(r.B, e)[0]
     assert not first[bad].any()
     assert set(np.flatnonzero(~settle(r, "independent", first).good)) == set(bad)
 
@@ -241,13 +242,3 @@ def test_more_than_half_are_never_excluded(monkeypatch, share, kept):
     judge = "elastocal.identification.noise_judge.unexplained_readings"
     monkeypatch.setattr(judge, lambda *_: faulty)
     assert settle(r, "independent").good.all() == kept
-
-
-def test_a_component_far_from_its_group_is_suspected_and_clean_noise_is_not():
-    """Five robust deviations of 12 readings: fewer than one reading in fifty."""
-    c = np.repeat(np.arange(300), 12)
-    r = Readings(np.zeros((len(c), 3, 1)), np.zeros((len(c), 3)), c, 0 * c, 0 * c)
-    e = np.random.default_rng(0).normal(size=(len(c), 3))
-    assert outlier_screening(r, e).mean() > 0.98
-    e[7, 1] = 8.0
-    assert not outlier_screening(r, e)[7]

@@ -50,10 +50,11 @@ class FaultyGroup:
 
     `readings` (k,) indices of its observations and `lines` their lines; `beyond` how many of
     these lie beyond the noise on their own.  `pattern` says whether a group errs in common, a
-    displacement, or by scatter; `error` is the length of the common error or the rms length, in
-    the units of y, `sigmas` the same over the noise of a row.  `p_value` is adjusted for all
-    tests of the report.  `influence` is the largest change of a parameter, in its standard
-    deviations, if the readings were fitted along, and `column` that parameter.
+    displacement, or by scatter; `error` is the length in m of the median error or the rms length,
+    of poses the position's, `sigmas` that of the whitened errors over the noise of a row.
+    `p_value` is adjusted for all tests of the report.  `influence` is the largest change of a
+    parameter, in its standard deviations, if the readings were fitted along, and `column` that
+    parameter.
     """
 
     level: Level
@@ -224,6 +225,7 @@ def _weight(candidate: tuple[Group, GroupTest]) -> float:
 def outlier_report(
     B: Array,
     y: Array,
+    off: Array,
     good: BoolArray,
     lines: IntArray,
     marker: NDArray[Any] | None = None,
@@ -231,7 +233,7 @@ def outlier_report(
     fitted_markers: Collection[str] = (),
 ) -> OutlierReport:
     """What is wrong with the readings y (n, size) ≈ B z, whitened, B (n, size, p) per prior
-    deviation.
+    deviation; `off` (n, …) are their errors in m.
 
     `good` (n,) says which observations to rely on; reported are the others, alone or as groups,
     and groups of good ones that err together: one at a time, the one that explains most first, as
@@ -265,30 +267,28 @@ def outlier_report(
     for i in np.flatnonzero(active & ~fit.good):
         p = min(1.0, float(alone[i]) * adjust["reading"])
         accepted.append((Group("reading", str(lines[i]), np.arange(n) == i), p, 1))
-    findings = [_finding(fit, group, lines, beyond, p) for group, p, beyond in accepted]
+    findings = [_finding(fit, group, off, lines, beyond, p) for group, p, beyond in accepted]
     findings.sort(key=lambda f: (f.level == "reading", -f.sigmas))
     sigma = float(np.sqrt(fit.variance))
     return OutlierReport(tuple(findings), sigma, round(fit.dof), fit.good, tests)
 
 
 def _finding(
-    fit: FitToGood, group: Group, lines: IntArray, beyond: int, p: float
+    fit: FitToGood, group: Group, off: Array, lines: IntArray, beyond: int, p: float
 ) -> FaultyGroup:  # fmt: skip
     """The group as it errs under the fit without any of the others."""
     move = np.abs(_move(fit, group.members))
     column = int(np.argmax(move))
     chosen = np.flatnonzero(group.members)
-    error = float(np.sqrt((fit.e[chosen] ** 2).sum(axis=1).mean()))
-    shift, sigma = None, float(np.sqrt(fit.variance))
-    pattern: Pattern = "single"
-    if group.level != "reading":
-        shift = group.test(fit, group.members).shift
-        pattern = "scatter" if shift is None else "common"
+    shift = None if group.level == "reading" else group.test(fit, group.members).shift
+    pattern: Pattern = "single" if group.level == "reading" else "scatter"
+    own, error = (float(np.sqrt((e[chosen] ** 2).sum(axis=1).mean())) for e in (fit.e, off))
     if shift is not None:
-        error = float(np.linalg.norm(shift))
+        pattern, own = "common", float(np.linalg.norm(shift))
+        error = float(np.linalg.norm(np.median(off[chosen], axis=0)))
     return FaultyGroup(
         group.level, group.name, pattern, tuple(chosen.tolist()), tuple(lines[chosen].tolist()),
-        beyond, error, error / sigma, p, float(move[column]), column,
+        beyond, error, own / float(np.sqrt(fit.variance)), p, float(move[column]), column,
     )  # fmt: skip
 
 
@@ -348,8 +348,9 @@ def report_faulty(
     marker = _labels(table.marker_names, table.marker[lead])
     visited = _labels(table.configuration_labels, table.configuration[lead])
     report = outlier_report(
-        B.reshape(len(lead), observed.size, -1), e.reshape(len(lead), -1), good, table.row[lead],
-        marker, None if shared else visited, _fitted_markers(problem.model, columns),
+        B.reshape(len(lead), observed.size, -1), e.reshape(len(lead), -1), readings.e[:, :3], good,
+        table.row[lead], marker, None if shared else visited,
+        _fitted_markers(problem.model, columns),
     )  # fmt: skip
     return replace(report, names=tuple(problem.model.names[c] for c in columns))
 

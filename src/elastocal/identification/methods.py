@@ -19,7 +19,7 @@ from elastocal.identification.noise_choice import (
     over_times,
     weights_of,
 )
-from elastocal.identification.noise_judge import NoiseAndOutliers, outlier_screening, settle
+from elastocal.identification.noise_judge import NoiseAndOutliers, settle
 from elastocal.identification.noise_structure import Kind, Readings
 from elastocal.identification.options import ROBUST, Options
 from elastocal.identification.residuals import held_out_residual, rms_3d
@@ -86,7 +86,7 @@ def _settled(
     model, observed = problem.model, problem.observations
     solution, everything = start, np.ones(len(observed.lead), dtype=bool)
     readings = _linearised(model, observed, start.fit.x, kept, kind)
-    now = everything if good is None else outlier_screening(readings, readings.e, good)
+    now = everything if good is None else good
     for left in reversed(range(ROUNDS)):
         before = now
         if good is None:

@@ -19,8 +19,6 @@ from elastocal.identification.noisy_readings import (
 )
 from elastocal.identification.outliers import FALSE_ALARM
 from elastocal.identification.tails import rejection_point
-from elastocal.identification.weighted_problem import same_size
-from elastocal.measurements import numbered
 from elastocal.units import Array, BoolArray
 
 # Is a reading explained by the others?  Deletion residuals under an estimated noise model.
@@ -116,49 +114,6 @@ def _deleted(noisy: NoisyReadings, P: Array, Pe: Array, own: Array) -> Array:
     d = (spread @ right[..., None])[..., 0]
     deviation = np.sqrt(np.diagonal(spread, axis1=1, axis2=2))
     return np.divide(d, deviation, out=np.zeros_like(d), where=deviation > 0)
-
-
-# A first guess at the faulty readings, from a robust fit: where the search for them starts.
-
-OWN_SCALE = 6  # readings that a group needs for a median and a scale of its own
-MOVED = 1 / 3  # share of a configuration's readings
-LIMIT = 5.0  # robust standard deviations; the verdict that follows takes back what it can explain
-
-
-def outlier_screening(
-    readings: Readings, residual: Array, good: BoolArray | None = None
-) -> BoolArray:
-    """Readings (N,) whose residual (N, size) from a robust fit lies with the others.
-
-    Each component is compared with the median and the median absolute deviation of its
-    configuration (under its load), where that holds enough readings; else with zero and the
-    deviation of the `good` readings (N,) of the whole table (default all).  Where noise is stated,
-    residuals count in units of it.
-
-    What moves a configuration or a marker in it as a whole moves its median too: readings that are
-    not `good` stay out where they make up a third of their configuration.
-    """
-    if readings.stated is not None:
-        residual = residual / np.sqrt(np.diagonal(readings.stated, axis1=1, axis2=2))
-    table = _scale(np.abs(residual if good is None else residual[good]))
-    deviation, scale = np.abs(residual), np.broadcast_to(table, residual.shape).copy()
-    group = numbered(readings.configuration, readings.load)
-    for members in same_size(group):
-        if members.shape[1] >= OWN_SCALE:
-            r = residual[members]
-            deviation[members] = np.abs(r - np.median(r, axis=1, keepdims=True))
-            scale[members] = _scale(deviation[members], axis=1)[:, None]
-    # A group that happens to agree is no reason to suspect the one reading that differs a little.
-    scale = np.maximum(scale, 0.2 * table)
-    near = (deviation <= LIMIT * scale).all(axis=1)
-    if good is None:
-        return np.asarray(near)
-    share = (np.bincount(group, ~good) / np.bincount(group))[group]
-    return np.asarray(near & (good | (share < MOVED)))
-
-
-def _scale(deviation: Array, axis: int = 0) -> Array:
-    return np.median(deviation, axis=axis) / special.ndtri(0.75)
 
 
 # The default estimate: faulty readings set apart, noise model chosen, x by its weights.

@@ -13,7 +13,7 @@ from elastocal.identification.solve import LOOSE, PLACED, SAMPLE, Problem, Solut
 from elastocal.identification.trimmed import majority, median_scale
 from elastocal.identification.weighted_problem import (
     Part,
-    of_some,
+    each,
     regressor,
     residual_at,
     sample,
@@ -180,26 +180,25 @@ def _contradicting(problem: Problem, fit: FitToGood, width: Array, known: Part) 
     """Observations (N,) of a large table, but those of the part that the fit is of, which it
     contradicts.
 
-    B is evaluated of those alone whose error would be too large were the fit exact.
+    B is evaluated in those parts alone that hold errors too large were the fit exact.
     """
     x, n, size = problem.x0.copy(), len(problem.observations.lead), problem.observations.size
     x[problem.free] += width * fit.z
     e = problem.weights.apply(residual_at(problem.model, problem.parts, x)).reshape(n, size)
-    limit = float(special.fdtri(size, max(fit.dof, 1.0), 1 - FALSE_ALARM / n))
-    suspect = (e**2).sum(axis=1) > size * fit.variance * limit
-    suspect[known.index] = False
-    beyond = np.zeros(n, dtype=bool)
+    level = FALSE_ALARM / n
+    limit = float(special.fdtri(size, max(fit.dof, 1.0), 1 - level))
+    beyond = (e**2).sum(axis=1) > size * fit.variance * limit
+    beyond[known.index] = False
 
     def of_part(part: Part) -> None:
-        B, own = _whitened(problem, part, x)
-        outside = np.zeros(len(own), dtype=bool)
-        beyond[part.index] = fit.p_values(fit.coordinates(B * width), own, outside) < (
-            FALSE_ALARM / n
-        )
+        if beyond[part.index].any():
+            B, own = _whitened(problem, part, x)
+            outside = np.zeros(len(own), dtype=bool)
+            beyond[part.index] &= fit.p_values(fit.coordinates(B * width), own, outside) < level
 
-    for _ in of_some(problem.parts, suspect, of_part):
+    for _ in each(problem.parts, of_part):
         pass
-    return beyond & suspect
+    return beyond
 
 
 def describe(solution: Solution, fitted: Solution, faulty: BoolArray) -> tuple[Outlier, ...]:

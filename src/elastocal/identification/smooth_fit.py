@@ -27,7 +27,7 @@ from elastocal.identification.knowledge import GaussianPrior
 from elastocal.identification.knowledge_fit import FunctionPrior
 from elastocal.identification.least_squares import Fit
 from elastocal.identification.noise_choice import NoiseFit, linearised, weights_of
-from elastocal.identification.noise_judge import NoiseAndOutliers, outlier_screening, settle
+from elastocal.identification.noise_judge import NoiseAndOutliers, settle
 from elastocal.identification.noise_structure import Readings
 from elastocal.identification.options import Options, check_for_functions
 from elastocal.identification.outliers import FALSE_ALARM
@@ -507,8 +507,6 @@ class _Course:
             limit = size * s2 * special.fdtri(size, dof, 1 - FALSE_ALARM / n)
             return None, np.asarray(squared <= limit)
         readings = self.readings.moved(self.standard)
-        if k == 0:
-            good = outlier_screening(readings, readings.e, good)
         # From the second round on, whose fit has such weights, the kind of noise is known.
         known = NoiseAndOutliers(noise, good) if noise is not None and k > 1 else None
         return settle(readings, self.options.noise, good, known)

@@ -6,7 +6,6 @@ from collections.abc import Callable, Iterable, Iterator, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass, replace
 from functools import cached_property, reduce
-from itertools import chain
 from typing import Literal, TypeVar
 
 import numpy as np
@@ -610,28 +609,6 @@ def regressor(model: Model, part: Part, x: Array, columns: NDArray[np.integer]) 
 def each(parts: Partition, work: Callable[[Part], Result]) -> Iterator[Result]:
     """`work` on every part, results in order."""
     return in_order(parts.spans, lambda span: work(parts.part(span)))
-
-
-def of_some(
-    parts: Partition, chosen: NDArray[np.bool_], work: Callable[[Part], Result]
-) -> Iterator[Result]:
-    """`work` on what the parts have of the `chosen` observations (N,), with at least all that these
-    are correlated with; results in order.  Parts that are mostly chosen are worked on whole."""
-    if parts.blocks is not None:
-        chosen = np.isin(parts.blocks, parts.blocks[chosen])
-
-    def own(span: Span) -> list[Result]:
-        part = parts.part(span)
-        inside = chosen[part.index]
-        if not inside.any():
-            return []
-        if inside.mean() < 1 / 2:
-            few = part_of(part.observations, part.weights, np.flatnonzero(inside))
-            rows = part.rows.reshape(-1, parts.observed.size)[few.index].ravel()
-            part = replace(few, index=part.index[few.index], rows=rows)
-        return [work(part)]
-
-    return chain.from_iterable(in_order(parts.spans, own))
 
 
 def in_order(items: Sequence[Item], work: Callable[[Item], Result]) -> Iterator[Result]:

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import math
-from statistics import median
 
 import numpy as np
 
@@ -446,9 +445,10 @@ def _fault(result: Calibration, finding: FaultyGroup) -> str:
     bends = method_of(result) in FULL_WEIGHT and not apart  # readings of full weight in the fit
     how = "err in common by" if finding.pattern == "common" else "scatter by"
     noise = f"{significant(finding.sigmas, 2)} times the noise"
-    size = None if bends else _metres(result, finding)
     text = f"{PLACE[finding.level].format(printable(finding.name))}: {n} readings {how} "
-    text += noise if size is None else f"{length(size)} ({noise})"
+    # Of a pose the error is the position's, and the finding may be one of rotation.
+    turned = result.observations.kind == "pose"
+    text += noise if turned else f"{length(finding.error)} ({noise})"
     if beyond < n:
         text += f", {beyond or 'none'} of them beyond the noise"
     names = () if result.faulty_report is None else result.faulty_report.names
@@ -458,21 +458,6 @@ def _fault(result: Calibration, finding: FaultyGroup) -> str:
     moves = "in the fit they move" if bends else "fitted along they would move"
     count = significant(finding.influence, 2)
     return f"{text}; {moves} {name} by {count} standard deviation{'s' * (count != '1.0')}."
-
-
-def _metres(result: Calibration, finding: FaultyGroup) -> float | None:
-    """Typical error in m, None where most of the readings are not listed one by one.
-
-    The median where they err in common, which those that do not leave alone; else the rms.  Of a
-    pose the list has the position's error only, and the finding may be one of rotation.
-    """
-    lines = set(finding.lines)
-    listed = [o.residual for o in result.faulty if o.line in lines]
-    if result.observations.kind == "pose" or not listed or 2 * len(listed) < len(lines):
-        return None
-    if finding.pattern == "common":
-        return median(listed)
-    return math.sqrt(sum(r * r for r in listed) / len(listed))
 
 
 # The smooth functions that were fitted.

@@ -31,7 +31,7 @@ def report(arm, noise, seed=0):
     residual = y - B @ np.linalg.lstsq(B[good].reshape(-1, 9), y[good].ravel())[0]
     marker = np.array(["M1", "M2", "M3"])[arm.marker]
     lines = np.arange(270) + 2
-    return outlier_report(B * WIDE, residual, good, lines, marker, arm.configuration)
+    return outlier_report(B * WIDE, residual, residual, good, lines, marker, arm.configuration)
 
 
 def clean(arm, seed=0):
