@@ -144,8 +144,6 @@ def _folds(
         lambda: _residuals(result),
         figures=("space", "over_time", "smooth"),
     )
-    if result.residual_summary is not None:
-        yield Fold("Are the residuals normal?", lambda: _distribution(result))
     single = len(result.outliers) + len(result.excluded)
     if single or words.fault_lines(result):
         yield Fold(f"Outliers ({single})", lambda: _outliers(result))
@@ -217,24 +215,14 @@ def _method(result: Calibration) -> Iterator[Block]:
     for table in (words.size_table(result.noise), words.candidate_table(result.noise)):
         if len(table.rows) > 1:
             yield table
+    if result.residual_summary is not None:
+        yield words.deviating_table(result.residual_summary)
 
 
 def _errors(result: Calibration, budget: ErrorBudget | None) -> Iterator[Block]:
     if budget is not None:
         yield budget_table(*budget_steps(result, budget))
     yield spread_table(before_and_after(result, budget), "readings")
-
-
-def _distribution(result: Calibration) -> Iterator[Block]:
-    summary = result.residual_summary
-    assert summary is not None
-    yield Sentence(words.shape_line(summary))
-    if (scatter := summary.whole.held_out_mean_square) is not None:
-        yield Sentence(
-            f"In held-out configurations the scatter is {significant(scatter**0.5)} times that of "
-            "the noise model."
-        )
-    yield words.deviating_table(summary)
 
 
 def _outliers(result: Calibration) -> Iterator[Block]:

@@ -363,6 +363,11 @@ def shape_line(summary: ResidualSummary) -> str:
         text = f"Standardised residuals agree with a normal distribution ({numbers})."
         if f.kind != "residuals_normal":
             text = f"Standardised residuals are not normal ({numbers}): {SHAPES[f.kind]}"
+    if (scatter := summary.whole.held_out_mean_square) is not None:
+        text += (
+            f" In held-out configurations the scatter is {significant(scatter**0.5)} times that of "
+            "the noise model."
+        )
     found = sum(g.n_deviating for g in summary.groupings)
     if not found:
         return f"{text} No group of readings deviates from the noise model."
