@@ -11,9 +11,9 @@ from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy import linalg
 
 from elastocal.errors import InputError
+from elastocal.identification.covariance import orthogonal
 from elastocal.units import Array
 
 SMALLEST = 1e-9  # m, below any tracker's resolution: σ_i of zero has no inverse
@@ -45,12 +45,14 @@ def ols(B: Array, dp: Array, sigma: Array | None = None) -> PublishedFit:
     Covariance by eq. (7), s² (BᵀB)⁻¹ with s² = rss/(rows − parameters), or, where `sigma`
     (rows,) is given, by the sandwich of eq. (8), (BᵀB)⁻¹ BᵀΣ²B (BᵀB)⁻¹.
     """
-    found = _solve(B, dp, np.ones(len(dp)))
+    one = np.ones(len(dp))
+    x, cofactor = _solve(B, dp, one)
+    residual = dp - B @ x
     if sigma is None:
-        covariance = found.variance * found.cofactor
+        covariance = float(residual @ residual) / (len(dp) - len(x)) * cofactor
     else:
-        covariance = _sandwich(B, np.ones(len(dp)), _positive(sigma, len(dp)), found.cofactor)
-    return PublishedFit("ols", found.x, covariance, np.ones(len(dp)), found.residual)
+        covariance = _sandwich(B, one, _positive(sigma, len(dp)), cofactor)
+    return PublishedFit("ols", x, covariance, one, residual)
 
 
 def wls(B: Array, dp: Array, weights: Array, sigma: Array | None = None) -> PublishedFit:
@@ -60,11 +62,10 @@ def wls(B: Array, dp: Array, weights: Array, sigma: Array | None = None) -> Publ
     corrected eq. (13), (BᵀΣ⁻²B)⁻¹ with σ = 1/w, which is what (11) becomes where WΣ = I.
     """
     w = _positive(weights, len(dp))
-    found = _solve(B, dp, w)
-    covariance = found.cofactor
+    x, covariance = _solve(B, dp, w)
     if sigma is not None:
-        covariance = _sandwich(B, w, _positive(sigma, len(dp)), found.cofactor)
-    return PublishedFit("wls", found.x, covariance, w, found.residual)
+        covariance = _sandwich(B, w, _positive(sigma, len(dp)), covariance)
+    return PublishedFit("wls", x, covariance, w, dp - B @ x)
 
 
 def eq14_weights(sigma: Array, sigma_0: float = SIGMA_0, lam: float = 1.0) -> Array:
@@ -128,41 +129,16 @@ def _sigma(residual: Array, group: NDArray[np.int64] | None) -> Array:
     return np.abs(residual) if group is None else group_sigma(residual, group)
 
 
-@dataclass(frozen=True)
-class _Solution:
-    """x (parameters,), Δp − B x (rows,), (BᵀW²B)⁻¹, and the weighted sum of squares over its
-    degrees of freedom."""
-
-    x: Array
-    residual: Array
-    cofactor: Array
-    variance: float
-
-
-def _solve(B: Array, dp: Array, w: Array) -> _Solution:
-    """min Σ (w_i (B x − Δp)_i)² by pivoted QR of unit columns, and two refinements."""
+def _solve(B: Array, dp: Array, w: Array) -> tuple[Array, Array]:
+    """x with the least Σ (w_i (B x − Δp)_i)², refined twice, and (BᵀW²B)⁻¹."""
     B, dp = _finite("B", B, 2), _finite("y", dp, 1)
-    rows, p = B.shape
-    if dp.shape != (rows,):
-        raise InputError(f"y must have shape ({rows},), as B has {rows} rows; got {dp.shape}")
-    A = w[:, None] * B
-    length = np.linalg.norm(A, axis=0)
-    length[length == 0] = 1.0
-    Q, R, order = linalg.qr(A / length, mode="economic", pivoting=True)
-    pivots = np.abs(np.diag(R))
-    rank = int((pivots > max(B.shape) * np.finfo(float).eps * pivots[0]).sum())
-    if rank < p:
-        raise InputError(
-            f"columns {sorted(order[rank:].tolist())} of B depend on the others; drop them first"
-        )
-    V = np.empty((p, p))
-    V[order] = linalg.solve_triangular(R, np.eye(p)) / length[order, None]
-    x, left = np.zeros(p), w * dp
+    if len(dp) != len(B):
+        raise InputError(f"y must have shape ({len(B)},), as B has {len(B)} rows; got {dp.shape}")
+    factors = orthogonal(w[:, None] * B)
+    x = np.zeros(B.shape[1])
     for _ in range(3):
-        x = x + V @ (Q.T @ left)
-        left = w * (dp - B @ x)
-    variance = float(left @ left) / (rows - p) if rows > p else np.nan
-    return _Solution(x, dp - B @ x, V @ V.T, variance)
+        x = x + factors.V @ (factors.Q.T @ (w * (dp - B @ x)))
+    return x, factors.V @ factors.V.T
 
 
 def _finite(name: str, values: Array, dimensions: int) -> Array:
