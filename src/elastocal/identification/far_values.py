@@ -12,8 +12,8 @@ from collections.abc import Iterator
 
 import numpy as np
 
+from elastocal.identification.joint_maps import linear_fits
 from elastocal.identification.result import Calibration, Finding
-from elastocal.identification.start import nominal_problem, register
 from elastocal.model.arm import Parameter
 from elastocal.model.effects.catalogue import effect_of
 from elastocal.model.effects.compliances import JointCompliance
@@ -93,12 +93,9 @@ def scale_of(result: Calibration) -> float | None:
     """By what factor all lengths that were read exceed those of the nominal arm; None where no such
     scale shows.
 
-    With base and markers placed, x_i = R (G_i m + t_i) + s of the nominal arm leaves r_i, and
-
-        r_i = σ (p_i − s) + ω × (p_i − s) + δs + R G_i δm
-
-    is linear.  A scale that takes nine tenths of the square away, and is larger than any arm's
-    lengths err together, is one of the readings.
+    The linear map A of the readings onto the nominal arm is a rotation with a scale where that is
+    wrong.  One that takes nine tenths of the square away, differs less between directions than from
+    one, and is larger than any arm's lengths err together, is one of the readings.
     """
     table = result.observations.table
     own = any(p.effect == TrackerDistortion.name for p in result.model.parameters)
@@ -108,26 +105,14 @@ def scale_of(result: Calibration) -> float | None:
     if not SCALED * extent / 10 < result.nominal_rms < math.inf:
         return None
     table = table.take(result.observations.lead[:: max(len(result.observations.lead) // SOME, 1)])
-    problem = nominal_problem(result.model, table)
-    found = register(problem)
-    n, turn = len(table), problem.flange_rotation
-    G = np.zeros((n, 3, len(found.markers), 3))
-    G[np.arange(n), :, table.marker] = found.rotation @ turn
-    place = found.places(turn, problem.flange_position, table.marker)
-    arm, left = place - found.translation, np.asarray(table.position) - place
-    about = np.cross(np.eye(3), arm[:, None, :])
-    columns = np.concatenate(
-        [arm[:, :, None], about.transpose(0, 2, 1), np.tile(np.eye(3), (n, 1, 1)),
-         G.reshape(n, 3, -1)], axis=2,
-    ).reshape(3 * n, -1)  # fmt: skip
-    target = left.ravel()
-    squares, coefficients = [], np.zeros(1)
-    for B in (columns[:, 1:], columns):
-        coefficients = np.linalg.lstsq(B, target, rcond=1e-9)[0]
-        squares.append(float(((target - B @ coefficients) ** 2).sum()))
-    scale = 1 + float(coefficients[0])
-    shown = squares[1] < NEARLY * squares[0] and SCALED < abs(scale - 1) < LARGEST
-    return scale if shown else None
+    flange = result.model.rigid.flange_poses(table)
+    found = linear_fits(flange[None], np.asarray(table.position), table.marker)
+    if not 3 * found.left[0] ** 2 < NEARLY * result.nominal_rms**2:
+        return None
+    size = np.linalg.svd(found.matrix[0], compute_uv=False)
+    off = abs(float(found.scale[0]) - 1)
+    alike = found.determinant[0] > 0 and size[0] - size[-1] < off
+    return 1 / float(found.scale[0]) if alike and SCALED < off < LARGEST else None
 
 
 def only_placed(result: Calibration) -> bool:
