@@ -16,7 +16,7 @@ from elastocal.planning import execution as drift_module
 from elastocal.planning import test_poses as target_poses
 from elastocal.planning.execution import DRIFT, Alias, schedule, turns
 from elastocal.planning.information import pose_covariance
-from elastocal.planning.plan import plan_rows
+from elastocal.planning.plan import plan_table
 from elastocal.planning.test_poses import prediction_rows
 
 BOTH = np.array([[0.0, 0, 0], [0, 0, -100.0]])
@@ -86,14 +86,16 @@ def test_where_there_is_time_poses_are_read_before_and_after_their_load():
     shortest = ordered(alias=None)
     assert once.total < twice.total < 1.5 * shortest.total
     names, level = tuple(map(str, range(1, 13))), np.zeros(12, dtype=int)
-    rows = plan_rows(twice, names, level)
-    assert rows.configuration == names and set(rows.notes) == {"note_order_2", "note_order_3"}
-    places = np.array([rows.order, *([int(v) for v in note] for note in rows.notes.values())]).T
+    kinds = ("revolute", "revolute")
+    table, more = plan_table(twice, names, level, kinds)
+    assert table.configuration_labels == names and len(table) == 12
+    assert set(more) == {"level", "order", "note_order_2", "note_order_3"}
+    places = np.array([[int(v) for v in more[k]] for k in more if k != "level"]).T
     assert sorted(places.ravel()) == list(range(1, 37)) and (places[:, 0] < places[:, 2]).all()
     loaded = [k + 1 for k, stop in enumerate(twice.stops) if stop.load]
     assert sorted(places[:, 1]) == loaded
     # With forces stated, the second part stands in the row of the first.
-    assert len(plan_rows(twice, names, level, BOTH).configuration) == 24
+    assert len(plan_table(twice, names, level, kinds, BOTH)[0]) == 24
 
 
 def test_the_alias_is_what_least_squares_make_of_shifted_readings():
