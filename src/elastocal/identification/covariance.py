@@ -72,6 +72,12 @@ def variance_of(rows: Array, covariance: Array) -> Array:
     return np.asarray(((rows @ covariance) * rows).sum(axis=(1, 2)))
 
 
+def root_of(covariance: Array) -> Array:
+    """L (p, p) with L Lᵀ = covariance, which may be singular."""
+    value, axes = np.linalg.eigh(covariance)
+    return np.asarray(axes * np.sqrt(np.maximum(value, 0.0)))
+
+
 def t_quantile(level: float, dof: Array) -> Array:
     """Two-sided quantile of t with `dof`, at any shape: P(|t| ≤ quantile) = level; infinite at
     dof 0."""

@@ -48,23 +48,22 @@ def cluster_by_parts(fit: Fit, parts: Partition) -> Covariance:
     C Σ_c (B_cᵀe_c)(B_cᵀe_c)ᵀ C · G/(G − 1) · (n − 1)/(n − p) with C = (BᵀB)⁻¹, whitened, G
     configurations and n rows; t with G − 1 degrees of freedom.
     """
-    model, size = fit.problem.model, fit.problem.sizes[fit.columns]
 
     def meat(span: Span) -> Array:
         part = parts.part(span)
-        at = regressor(model, part, fit.x, fit.columns)
-        B, e = part.weights.apply(at.B * size), part.weights.apply(at.residual)
+        at = regressor(fit.problem.model, part, fit.x, fit.columns)
+        B, e = part.weights.apply(at.B), part.weights.apply(at.residual)
         rows_of = np.repeat(part.observations.configuration, part.observations.size)
         scores = [np.einsum("grp,gr->gp", B[rows], e[rows]) for rows in same_size(rows_of)]
         S = np.concatenate(scores)
         return np.asarray(S.T @ S)
 
-    p = len(size)
+    p = len(fit.columns)
     middle = sum(in_order(parts.spans, meat), np.zeros((p, p)))
     n, G = len(parts.observed.value), parts.observed.n_configurations
     factor = G / (G - 1) * (n - 1) / (n - p)
-    cofactor = fit.cofactor() / np.outer(size, size)
-    matrix = factor * cofactor @ middle @ cofactor * np.outer(size, size)
+    cofactor = fit.cofactor()
+    matrix = factor * cofactor @ middle @ cofactor
     text = f"readings of a configuration may depend on each other ({G} configurations)"
     return Covariance("CR1", matrix, np.full(p, float(G - 1)), text)
 
@@ -124,13 +123,11 @@ def intervals_of(solution: Solution, kind: IntervalKind, noise: NoiseFit | None)
         )
     if kind == "profile":
         return _profiled(solution, classical)
-    size = solution.sizes[fit.columns]
-    B, e = problem.weights.apply(fit.B * size), fit.whitened
+    B, e = problem.weights.apply(fit.B), fit.whitened
     if kind.startswith("hc"):
-        found = hc(B, e, kind.upper())
-    else:
-        found = cluster_robust(B, e, np.repeat(observed.configuration, observed.size), kind.upper())
-    return by_t(replace(found, matrix=found.matrix * np.outer(size, size)))
+        return by_t(hc(B, e, kind.upper()))
+    rows_of = np.repeat(observed.configuration, observed.size)
+    return by_t(cluster_robust(B, e, rows_of, kind.upper()))
 
 
 def _classical(solution: Solution) -> Covariance:

@@ -25,7 +25,7 @@ from scipy import linalg, special
 
 from elastocal.cell.work_cell import Cell
 from elastocal.errors import ElastocalError
-from elastocal.identification.covariance import Covariance, variance_of
+from elastocal.identification.covariance import Covariance, root_of, variance_of
 from elastocal.identification.methods import EXACT
 from elastocal.identification.noise_summary import Noise
 from elastocal.identification.residuals import rms_3d
@@ -451,7 +451,7 @@ def predicted_error(
     if not len(weight):
         return None
     known, off = _moves(arm, left, B[:, :3])
-    root = _root((arm.covariance + arm.covariance.T) / 2)
+    root = root_of((arm.covariance + arm.covariance.T) / 2)
     each = np.sqrt(weight)[:, None, None]
     F = np.concatenate([known @ root, off], axis=2) * each
     F = F.reshape(-1, F.shape[2])
@@ -463,7 +463,7 @@ def predicted_error(
     (dof,), (share,) = spread.tails((known * each).reshape(1, -1, n))
     wide = _chi2(max(int(dof), 1), rng) if np.isfinite(dof) else np.ones(DRAWS)
     z[:, :n] *= np.sqrt(share * wide * inflated)[:, None]
-    squares = ((z @ _root(G)) ** 2).sum(axis=1) + missing.squared
+    squares = ((z @ root_of(G)) ** 2).sum(axis=1) + missing.squared
     own = float(np.trace(G[:n, :n]) * inflated.mean())
     rest = float(np.trace(G[n:, n:]))
     alone = np.inf
@@ -482,12 +482,6 @@ def predicted_error(
         alone,
         float(sure),
     )
-
-
-def _root(matrix: Array) -> Array:
-    """L with L Lᵀ = matrix, symmetric."""
-    size, axes = np.linalg.eigh(matrix)
-    return np.asarray(axes * np.sqrt(np.maximum(size, 0.0)))
 
 
 def readings_at(

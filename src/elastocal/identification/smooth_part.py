@@ -8,7 +8,7 @@ from typing import Any
 
 import numpy as np
 
-from elastocal.identification.covariance import t_quantile
+from elastocal.identification.covariance import root_of, t_quantile
 from elastocal.model.smooth_groups import SmoothGroup
 from elastocal.units import Array, IntArray
 
@@ -111,7 +111,7 @@ class SmoothPart:
             k = waves.shape[1]
             total, spread = np.zeros(DRAWS), 0.0
             for c, m in zip(own, mean, strict=True):
-                drawn = rng.normal(size=(DRAWS, k)) @ _root(self._block(c, k)).T @ waves.T
+                drawn = rng.normal(size=(DRAWS, k)) @ root_of(self._block(c, k)).T @ waves.T
                 total += ((m + drawn) ** 2).mean(axis=1)
                 spread += float(((waves @ self._block(c, k)) * waves).sum(axis=1).mean())
             rms = np.sqrt(total / (1 if basis is None else len(own)))
@@ -140,11 +140,6 @@ def _thinned(places: Array) -> Array:
         return places
     ordered = np.sort(places)
     return np.asarray(ordered[np.linspace(0, len(ordered) - 1, PLACES).astype(int)])
-
-
-def _root(covariance: Array) -> Array:
-    values, vectors = np.linalg.eigh(covariance)
-    return np.asarray(vectors * np.sqrt(np.maximum(values, 0.0)))
 
 
 def _finite(value: float) -> float | None:

@@ -10,6 +10,7 @@ from numpy.typing import NDArray
 from scipy import linalg
 
 from elastocal.errors import ElastocalError, InsufficientDataError
+from elastocal.identification.covariance import root_of
 from elastocal.identification.least_squares import Fit, FitProblem, fit
 from elastocal.identification.residuals import (
     CHANCE,
@@ -489,8 +490,7 @@ def bent(solution: Solution, covariance: Array) -> Array:
         return none
     size = solution.sizes[kept]
     typical = np.where(is_placed(problem.model), 0.0, solution.sizes)[dropped]
-    value, axes = linalg.eigh(covariance / np.outer(size, size))
-    root = size[:, None] * axes * np.sqrt(np.maximum(value, 0.0))
+    root = size[:, None] * root_of(covariance / np.outer(size, size))
     # Of many readings some tell it as well: it is no smaller where there are more of them.
     n = len(problem.observations.lead)
     parts = problem.parts

@@ -1,5 +1,7 @@
 """The profile interval of where a line crosses zero is Fieller's set (1954), in closed form."""
 
+from types import SimpleNamespace
+
 import numpy as np
 import pytest
 from scipy import sparse, stats
@@ -13,12 +15,14 @@ from elastocal.model.observations import Observations
 
 X = np.linspace(-1, 2, 12)
 F = stats.f.ppf(0.95, 1, 10)
+TABLE = SimpleNamespace(source="data")
 
 
 class Crossing:
     """y = b (x − θ), which stands in the fit in the place of an arm: parameters θ and b."""
 
     names = ("theta", "b")
+    shrunk = np.zeros(2, dtype=bool)
 
     def predict(self, table, x, observed):
         return x[1] * (X - x[0])
@@ -35,7 +39,7 @@ def line(seed, slope):
 def profile(y, constraints=()):
     """θ, and the ends of its 95 % interval."""
     (b1, b0), (rss,), *_ = np.polyfit(X, y, 1, full=True)
-    observed = Observations("distance", y, sparse.eye_array(12, format="csr"), np.arange(12), None)
+    observed = Observations("distance", y, sparse.eye_array(12, format="csr"), np.arange(12), TABLE)
     start = np.array([-b0 / b1, b1])
     problem = FitProblem(
         Crossing(), observed, Weights("none", None, False, ""), start, np.arange(2), np.ones(2)
