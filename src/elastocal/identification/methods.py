@@ -138,9 +138,6 @@ def refined(
 
 # The methods by name.
 
-# A larger share of readings beyond the noise is no accident of measuring: an effect that the model
-# lacks looks like that.  Setting them apart would hide it.
-MOST_SET_ASIDE = 0.1
 # Residuals below this, in m, are rounding: no instrument resolves it, and it tells of no noise.
 EXACT = 1e-11
 COMPUTED = (
@@ -172,7 +169,7 @@ def run_method(
     if method in ROBUST:
         return robust_result(method, every, sound, ~faulty, options.intervals)
     # As published, every reading counts; and at equal weights noisy readings look faulty.
-    drop = _set_aside(faulty, options) and (method in ("wls", "reml") or options.faulty == "drop")
+    drop = options.sets_aside(faulty) and (method in ("wls", "reml") or options.faulty == "drop")
     solution, good = (sound if drop else every), ~faulty
     if method in ("eq14", "eq14-residual"):
         return _published(method, every, solution, good, options, progress)
@@ -292,12 +289,6 @@ def is_exact(solution: Solution) -> bool:
     return rms_3d(solution.fit.residual, solution.problem.observations.size) < EXACT
 
 
-def _set_aside(faulty: BoolArray, options: Options) -> bool:
-    if options.faulty == "auto":
-        return bool(0 < faulty.mean() <= MOST_SET_ASIDE)
-    return options.faulty == "drop" and bool(faulty.any())
-
-
 def _reml(
     every: Solution,
     sound: Solution,
@@ -308,7 +299,7 @@ def _reml(
 ) -> MethodResult:
     def found(kind: str, known: NoiseAndOutliers | None = None) -> Adapted:
         solution, noise, good = _adapted(every, sound, faulty, refit, kind, progress, known)
-        if not good.all() and not _set_aside(~good, options):
+        if not good.all() and not options.sets_aside(~good):
             # So many faulty readings look like anything that scatters or drifts.
             plainly = OF_READINGS if kind == "auto" else kind
             solution, noise, _ = _settled(every, every, None, plainly, progress)

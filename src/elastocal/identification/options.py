@@ -21,6 +21,9 @@ FaultyReadings = Literal["auto", "drop", "keep"]
 METHODS = get_args(Method)
 ROBUST = ("huber", "l1")
 WITH_KNOWLEDGE = ("auto", "profile")
+# A larger share of readings beyond the noise is no accident of measuring: an effect that the model
+# lacks looks like that.  Setting them apart would hide it.
+MOST_SET_ASIDE = 0.1
 # What there was once, or is looked for by this name: what does the same.
 SUCCESSORS = {
     "method": dict.fromkeys(
@@ -105,6 +108,12 @@ class Options:
                 f"{option('intervals', self.intervals)} knows of neither constraints nor a prior; "
                 f"with these there are {', '.join(WITH_KNOWLEDGE)}"
             )
+
+    def sets_aside(self, faulty: NDArray[np.bool_]) -> bool:
+        """Whether the `faulty` readings (N,) are left out of the fit."""
+        if self.faulty == "auto":
+            return bool(0 < faulty.mean() <= MOST_SET_ASIDE)
+        return self.faulty == "drop" and bool(faulty.any())
 
     @property
     def knows(self) -> bool:

@@ -79,7 +79,6 @@ ALONE = 1e-9  # share of a direction that other configurations and the prior mus
 # Logarithms of the likelihood ratio: below the first the readings do not show a function at all,
 # above the second no doubt is left that it is there.
 LEAST_GAIN, CERTAIN = 0.01, 50.0
-MOST_SET_ASIDE = 0.1
 
 
 @dataclass(frozen=True)
@@ -466,7 +465,7 @@ class _Course:
         x, reduction, scales = self.sound.fit.x, self.sound.reduction, None
         level = np.inf
         for k in range(ROUNDS):
-            fitted = good if self.set_aside(~good) else np.ones_like(good)
+            fitted = good if self.options.sets_aside(~good) else np.ones_like(good)
             problem = self.problem_of(fitted, self.weights(noise, fitted))
             fit = joint_fit(problem, self.every.sizes, self.functions, x, reduction, scales)
             x, reduction, scales = fit.x, fit.reduction, fit.scales
@@ -536,11 +535,6 @@ class _Course:
         alike &= rest.configuration[:, None] != rest.configuration[None]
         self.alike[suspects[alike.any(axis=1)]] = True
         return good | self.alike
-
-    def set_aside(self, faulty: BoolArray) -> bool:
-        if self.options.faulty == "auto":
-            return bool(0 < faulty.mean() <= MOST_SET_ASIDE)
-        return self.options.faulty == "drop" and bool(faulty.any())
 
     def without_those_that_harm(self, fit: JointFit) -> tuple[JointFit, Crossed]:
         """Without the functions that the readings do not show, or that predict held-out
