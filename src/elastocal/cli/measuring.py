@@ -183,30 +183,12 @@ def _candidates(text: str) -> int | str | list[int | str]:
 )
 def design(
     cell: CellFile,
-    output: Annotated[
-        Path,
-        typer.Option(
-            "-o",
-            "--output",
-            help="The plan to write (CSV), .json beside it; OUTPUT.resume while it works.",
-        ),
-    ],
+    output: Output,
     *,
     asked: Asked,
-    program: Annotated[
-        list[Path] | None,
-        typer.Option(
-            metavar="FILE",
-            help="Robot program to write: NAME.src (KRL), NAME.script (URScript); repeatable.",
-        ),
-    ] = None,
-    picture: Annotated[
-        Path | None, typer.Option(help="Picture of the poses to write (PNG, SVG).")
-    ] = None,
-    cell_out: Annotated[
-        Path | None,
-        typer.Option(help="Cell file to write, with what [design.choose] has chosen."),
-    ] = None,
+    program: list[Path] | None = None,
+    picture: Path | None = None,
+    cell_out: Path | None = None,
     report: ReportFile = None,
     run: Run,
 ) -> None:
@@ -216,6 +198,12 @@ def design(
     the same input, resumes.
 
     Example: elastocal design cell.toml -o plan.csv --poses 15 --picture poses.png
+
+    Args:
+        output: The plan to write (CSV), .json beside it; OUTPUT.resume while it works.
+        program (FILE): Robot program to write: NAME.src (KRL), NAME.script (URScript); repeatable.
+        picture: Picture of the poses to write (PNG, SVG).
+        cell_out: Cell file to write, with what [design.choose] has chosen.
     """
     from elastocal.files import together
     from elastocal.model.choice import cell_of
