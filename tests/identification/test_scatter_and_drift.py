@@ -14,7 +14,7 @@ from elastocal.identification.identify import identify
 from elastocal.identification.result import Calibration
 from elastocal.identification.visit_record import in_random_order
 from elastocal.model.manipulator import Model
-from elastocal.report.method_and_noise import noise_model_line
+from elastocal.report.judgement_view import noise_model_line
 from elastocal.simulation.simulate import simulate
 
 SIGMA, SCATTER, DRIFT, LASTING = 2e-5, 1e-4, 1e-4, 0.2

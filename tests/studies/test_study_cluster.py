@@ -8,7 +8,6 @@ import pytest
 from support.study_folders import numbers, run_study, write_study
 
 from elastocal.errors import InputError
-from elastocal.studies.results import read_results
 from elastocal.studies.run import (
     ClusterLostError,
     DaskWorkers,
@@ -17,6 +16,7 @@ from elastocal.studies.run import (
     connect,
     hand_out,
 )
+from elastocal.studies.study import read_results
 
 dask = pytest.importorskip("dask", reason="needs the extra 'cluster'")
 distributed = pytest.importorskip("distributed", reason="needs the extra 'cluster'")

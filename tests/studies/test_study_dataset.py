@@ -7,9 +7,8 @@ import pytest
 from support.study_folders import SCRIPT, TOML, numbers, run_study, write_study
 
 from elastocal.errors import InputError
-from elastocal.studies.results import opened, read_results
 from elastocal.studies.run import run_study as run_prepared
-from elastocal.studies.study import read_study
+from elastocal.studies.study import opened, read_results, read_study
 
 
 @pytest.fixture

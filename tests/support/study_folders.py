@@ -8,10 +8,9 @@ from typing import Any
 
 import pandas as pd
 
-from elastocal.studies.results import read_results
 from elastocal.studies.run import Ending, StudyStop, run_local
 from elastocal.studies.run import run_study as run_prepared
-from elastocal.studies.study import Study, execute, read_study
+from elastocal.studies.study import Study, execute, read_results, read_study
 
 SCRIPT = """\
 def tasks(options):

@@ -449,9 +449,8 @@ def study(
         retry_failed: Run tasks that failed again.
     """
     require(cluster is None or jobs is None, "--jobs is for this machine; leave it with --cluster")
-    from elastocal.studies.results import check_page
     from elastocal.studies.run import StudyStop, run_study, summarise
-    from elastocal.studies.study import read_study
+    from elastocal.studies.study import check_page, read_study
 
     results = folder / "results" if output is None else output
     page = folder / "result.md"
@@ -487,7 +486,7 @@ def _told(ending: Ending, results: Path) -> str:
         text += f", {ending.failed} failed"
     text += f"; results in {results}"
     if ending.failed:
-        from elastocal.studies.results import read_results
+        from elastocal.studies.study import read_results
 
         first = read_results(results, failed=True).iloc[0]
         text += (

@@ -27,8 +27,14 @@ from elastocal.export.exportable import (
     link_inertias,
 )
 from elastocal.export.joint_correction import JointCorrection
-from elastocal.export.mjcf_file import RIGID, MujocoRest, calibrated_mjcf
-from elastocal.export.mjcf_in_place import HeldArm, NotInPlace, corrected_mjcf
+from elastocal.export.mjcf_file import (
+    RIGID,
+    HeldArm,
+    MujocoRest,
+    NotInPlace,
+    calibrated_mjcf,
+    corrected_mjcf,
+)
 from elastocal.export.refit import Refit, refitted
 from elastocal.export.urdf_file import (
     BASE,

@@ -28,8 +28,7 @@ from elastocal.report.identification_view import (
     spread_table,
     what_was_identified,
 )
-from elastocal.report.judgement_view import judgement
-from elastocal.report.method_and_noise import method_and_weights
+from elastocal.report.judgement_view import judgement, method_and_weights
 from elastocal.text import listed, printable
 from elastocal.units import Array
 

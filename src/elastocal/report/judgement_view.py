@@ -1,4 +1,5 @@
-"""The judgement of an identification in words: the verdict, what speaks against it, what to do."""
+"""The judgement of an identification in words: the verdict, what speaks against it, what to do; how
+the numbers came about: method, intervals, noise, faulty readings, functions."""
 
 from __future__ import annotations
 
@@ -6,12 +7,21 @@ import math
 from collections.abc import Callable
 from dataclasses import dataclass
 
+import numpy as np
+
 from elastocal.errors import option
+from elastocal.identification.constrained import ActiveConstraint
 from elastocal.identification.far_values import only_placed
+from elastocal.identification.faulty_readings import FaultyGroup
+from elastocal.identification.findings import shape_of
+from elastocal.identification.noise_structure import EACH, JOINTS, REGISTERED, Kind
+from elastocal.identification.noise_summary import SLIDES, Noise, NoiseSize
+from elastocal.identification.residuals import GroupSummary, ResidualSummary
 from elastocal.identification.result import Calibration, Finding
 from elastocal.identification.sentences import next_steps
-from elastocal.report.blocks import Tone
-from elastocal.report.formatting import counted, display, estimate, length, significant
+from elastocal.model.observations import available_noise
+from elastocal.report.blocks import ShownTable, Tone
+from elastocal.report.formatting import counted, display, estimate, length, plain, significant
 from elastocal.text import listed, printable
 
 
@@ -188,3 +198,484 @@ def _placed_markers(result: Calibration) -> str:
     told = [f"{printable(name.removeprefix('marker:'))} lies at {', '.join(axes)}"
             for name, axes in found.items() if len(axes) == 3]  # fmt: skip
     return f"; {listed(told, 3)} (95 %)" if told else ""
+
+
+MOST_NAMED = 6
+METHODS = {
+    "reml": "generalised least squares, weights estimated by restricted likelihood (REML)",
+    "ols": "ordinary least squares, all readings weighted alike",
+    "wls": "weighted least squares",
+    "eq14": "weighted least squares as published, weights of eq. (14) with σ by group, iterated",
+    "eq14-residual": (
+        "weighted least squares as published, weights of eq. (14) from each residual, iterated; "
+        "it acts like a robust fit, and its stated intervals are far too narrow"
+    ),
+    "huber": "robust M-estimate with Huber's loss, which limits the weight of outliers",
+    "l1": "least sum of residual lengths (L1), robust like the median",
+}
+# What the weights are is said by the method itself, or by the line on the noise model.
+SAID = {"reml", "ols", "eq14", "eq14-residual"}
+HC = "every reading may have a variance of its own; they assume independent readings"
+CR = (
+    "readings of a configuration may be correlated in any way; they assume independent "
+    "configurations"
+)
+# Without correction for leverage: right in the limit of many rows or configurations.
+LARGE = " and that these are many"
+INTERVALS = {
+    "kenward-roger": (
+        "t intervals of Kenward and Roger, which account for estimated weights; they "
+        "assume the noise model and normal noise"
+    ),
+    "classical": (
+        "t intervals that assume independent readings (after weighting), with the noise level "
+        "from the residual, even if stated"
+    ),
+    "profile": (
+        "profile of the sum of squares, which follows the curvature of the model and may be "
+        "lopsided; assumes independent normal noise"
+    ),
+    "t under constraints": (
+        "t intervals that take equalities for exact and end at bounds; no bound is active, and "
+        "they assume the noise of the method"
+    ),
+    "posterior": (
+        "t intervals of readings and prior together, ending at bounds; they trust the "
+        "prior and assume the noise of the method"
+    ),
+    "constrained profile": (
+        "profile of the fit under the constraints: one-sided at a bound, and too wide rather than "
+        "too narrow near one; assumes normal noise"
+    ),
+    "eq13": (
+        "as published, eq. (13): weights taken as known although they come from the same "
+        "residuals, so the intervals are too narrow"
+    ),
+    "h2": "asymptotic covariance of the robust estimate (H2); assumes independent readings",
+    **{f"hc{k}": f"robust to unequal noise (HC{k}): {HC}{LARGE * (k < 2)}" for k in range(4)},
+    **{f"cr{k}": f"cluster-robust (CR{k}): {CR}{LARGE}" for k in (0, 1)},
+    **{f"cr{k}": f"cluster-robust (CR{k}): {CR}" for k in (2, 3)},
+}
+INTERVALS["cr0"] += ", ten or more per parameter"
+INTERVALS["cr1"] += ", ten or more per parameter"
+SIGNS = {"lower": "≥", "upper": "≤", "equality": "="}
+
+
+def method_of(result: Calibration) -> str:
+    return str(result.method).replace("_", "-")
+
+
+def method_and_weights(result: Calibration) -> str:
+    """The method, and the weights where the method does not say them."""
+    method, noise = method_of(result), result.noise
+    if method == "constrained":
+        # The weights are those that the method before it gave to the readings.
+        text = "fit with a prior" if result.prior_share else "fit under constraints"
+        text += " and under constraints" if result.prior_share and result.active else ""
+        if noise.kind == "none":
+            return f"{text}, all readings weighted alike"
+        how = "weights estimated by restricted likelihood (REML): " if noise.estimated else ""
+        return f"{text}, {how}{printable(noise.description)}"
+    text = METHODS.get(method, printable(method))
+    if method in SAID or noise.kind == "none":
+        return text
+    return f"{text}, {printable(noise.description)}"
+
+
+def intervals_line(result: Calibration) -> str:
+    """Which kind of interval, and what it assumes."""
+    kind, description = result.noise.interval_kind.lower(), result.noise.interval_description
+    told = f"{kind}: {description}" if description else kind
+    return INTERVALS.get(kind, printable(told))
+
+
+def constraints_line(result: Calibration) -> str | None:
+    """Which constraints hold with equality, and what the intervals make of them."""
+    active = result.active
+    if not active:
+        return None
+    units = {p.name: p.unit for p in result.model.parameters}
+    texts = [_constraint(a, units) for a in active[:MOST_NAMED]]
+    more = len(active) - len(texts)
+    text = "; ".join([*texts, *([f"and {more} more"] if more else [])])
+    bound = any(a.kind != "equality" for a in active)
+    want = "; the readings alone would go beyond the bounds" if bound else ""
+    held = "Intervals take these for exact"
+    if result.noise.interval_kind.lower() == "constrained profile":
+        held = "Intervals keep the constraints: they stop at bounds and take equalities for exact"
+    return f"Active: {text}. {held}{want}."
+
+
+def _constraint(a: ActiveConstraint, units: dict[str, str]) -> str:
+    """ "joint2.compliance ≥ 0 µrad/(N·m)"; a label of the user's own stays as it is."""
+    label = printable(a.label)
+    if a.kind == "semidefinite":
+        return f"{label} (semidefinite)"
+    own = a.kind == "equality" and a.label != f"{a.names[0]} = {a.value:.6g}"
+    if len(a.names) != 1 or own or a.names[0] not in units:
+        return label
+    value, unit = display(a.value, units[a.names[0]])
+    return f"{printable(a.names[0])} {SIGNS[a.kind]} {plain(value)} {unit}"
+
+
+def prior_line(result: Calibration) -> str | None:
+    """Parameters that owe more than half of their information to the prior."""
+    shares = result.prior_share
+    if not shares:
+        return None
+    found = result.finding("mostly_prior")
+    if found is None:
+        largest = max((s for s in shares.values() if s == s), default=0.0)  # NaN: constrained
+        return f"No estimate is mostly prior (largest share {_percent(largest)})."
+    mostly = [str(name) for name in found.listed("parameters")]
+    named = ", ".join(f"{printable(n)} {_percent(shares[n])}" for n in mostly[:MOST_NAMED])
+    more = len(mostly) - MOST_NAMED
+    tail = f", and {more} more" if more > 0 else ""
+    return (
+        f"Mostly prior, share of the information: {named}{tail}. Measure poses that load them more."
+    )
+
+
+def _percent(share: float) -> str:
+    """Never 100 % where the data say anything."""
+    return f"{min(100 * share, 99.9):.3g} %" if share < 1 else "100 %"
+
+
+FEW = 6  # sizes that are named one by one; of more, the range and the extremes
+MOST_GROUPS = 4
+TURNED = ("rx", "ry", "rz", "rotation", "angular")  # sizes in rad
+KINDS = {
+    "independent": "equal noise",
+    "axis": "one size per axis",
+    "marker": "one size per marker",
+    "groups": "one size per configuration and direction",
+    "polar": "range and transverse sizes of the tracker",
+    "stated": "stated noise × factor",
+}
+SCATTERS = {
+    JOINTS: " + joints that settle anew at each visit",
+    EACH: " + joints that settle anew at each visit, each by its own size",
+}
+COMPARED = (
+    "residual_above_stated_noise",
+    "residual_agrees_with_stated_noise",
+    "residual_below_stated_noise",
+    "residual_agrees_with_readings",
+)
+SHAPES = {
+    "residuals_skew": "errors are skewed, as with a missing effect.",
+    "residuals_heavy_tailed": (
+        "large errors are more frequent. A robust method (huber, l1) shows "
+        "whether the estimates depend on them."
+    ),
+    "residuals_light_tailed": "large errors are rarer, as with rounded or selected readings.",
+}
+
+
+def noise_lines(result: Calibration) -> list[tuple[str, str]]:
+    """Label and sentence: estimated noise model, repeats, shape of the residuals."""
+    summary = result.residual_summary
+    found = {
+        "Noise model": noise_model_line(result),
+        "Repeats": _repeats_line(result),
+        "Residuals": None if summary is None else shape_line(summary),
+        "In time": _in_time_line(result),
+    }
+    return [(label, text) for label, text in found.items() if text is not None]
+
+
+def does_noise_explain_it(result: Calibration) -> str:
+    """Residual against stated noise, as the finding has it."""
+    # Whether the weights come from a noise model with estimated variances.
+    estimated = method_of(result) in ("reml", "constrained") and result.noise.estimated
+    f = result.finding(*COMPARED)
+    if f is None:
+        sigma, size = result.noise.sigma, ""
+        if sigma is not None and method_of(result) == "ols":
+            size = f"; the residual amounts to {length(sigma)} per coordinate"
+        elif estimated:
+            size = "; the noise level was estimated from the readings"
+        return f"{_why_not_judged(result)}{size}."
+    size = (
+        f"{significant(f.number('ratio'))} times the stated noise; chance alone gives "
+        f"{f.number('by_chance_from'):.2f} to {f.number('by_chance_to'):.2f}"
+    )
+    if f.kind == "residual_agrees_with_stated_noise":
+        return f"The residual agrees with the stated noise ({size})."
+    single = result.finding("stated_noise_too_small")
+    if f.kind == "residual_agrees_with_readings" and single is not None:
+        text = (
+            f"The stated noise is too small: the residual is {size}, and {single.numbers['by']} "
+            f"scatter by {significant(single.number('ratio'))} times the stated noise."
+        )
+    elif f.kind == "residual_above_stated_noise":
+        text = (
+            f"The residual is larger than the stated noise explains ({size}): an effect is "
+            "missing, or the noise is larger than stated."
+        )
+    else:
+        text = f"The residual is smaller than the stated noise ({size}), which is too large."
+    return text + " Weights and intervals use the estimated noise." * estimated
+
+
+def _why_not_judged(result: Calibration) -> str:
+    """What is missing for a comparison of the residual with stated noise."""
+    observed, tracker = result.observations, result.model.cell.tracker
+    stated = available_noise(observed.table, tracker) != "none"
+    if observed.kind == "distance":
+        stated = tracker.distance_sigma is not None
+    if observed.kind == "pose" and stated != (tracker.rotation_sigma is not None):
+        which = "positions" if stated else "rotations"
+        return f"Noise was stated for {which} only, so the residual cannot be judged"
+    if stated or result.noise.kind == "covariance":
+        return "The residual was not compared with the stated noise"
+    return "No noise was stated, so the residual cannot be judged"
+
+
+def noise_model_line(result: Calibration) -> str | None:
+    """The estimated noise model with its sizes, and why it was chosen."""
+    noise = result.noise
+    sizes, reason = size_table(noise).rows, noise.reason
+    if not sizes and not reason:
+        return None
+    text = printable(noise.description)
+    text = text[:1].upper() + text[1:]
+    if sizes:
+        text += ": " + "; ".join(f"{name} {size}" for name, size in sizes)
+    candidates = candidate_table(noise).rows
+    if len(candidates) > 1:
+        second, _, gap = candidates[1]
+        n = len(candidates)
+        reason = f"smallest information criterion of {n} models, next {second} (+{gap})"
+    return f"{text}. Chosen: {printable(reason)}." if reason else f"{text}."
+
+
+def size_table(noise: Noise) -> ShownTable:
+    """Name and standard deviation of every noise component; of many, the two extremes."""
+    sizes = noise.sizes or ()
+    shared = [s for s in sizes if s.shared or s.of_joints or s.drift]
+    own = sorted((s for s in sizes if s not in shared), key=_number)
+    named = [(s.name, s) for s in sizes if s in own]
+    if len(own) > FEW:
+        named = [(f"median of {len(own)}", own[len(own) // 2])]
+        named += [(f"smallest ({own[0].name})", own[0]), (f"largest ({own[-1].name})", own[-1])]
+    rows = [(printable(name), _size(s)) for name, s in [*named, *((s.name, s) for s in shared)]]
+    return ShownTable(("part", "size"), rows, title="Noise, standard deviations")
+
+
+def _number(s: NoiseSize) -> float:
+    return (s.factor or 0.0) if s.sigma is None else s.sigma
+
+
+def _size(s: NoiseSize) -> str:
+    if s.sigma is None:
+        return significant(_number(s))
+    of_joint = s.of_joints and not s.name.endswith(SLIDES)
+    if of_joint or s.name in TURNED or s.name.endswith("(rotation)"):
+        return f"{significant(s.sigma * 1e6)} µrad"
+    return length(s.sigma)
+
+
+def candidate_table(noise: Noise) -> ShownTable:
+    """Noise models that were tried, best first: words, variances, criterion above the best."""
+    tried = sorted(noise.tried or (), key=lambda t: t.criterion)
+    rows = [
+        (_kind_in_words(t.kind), str(t.n_variances), f"{t.criterion - tried[0].criterion:.1f}")
+        for t in tried
+    ]
+    heads = ("noise model", "variances", "criterion over best")
+    note = (
+        "The information criterion: twice the loss in log-likelihood and a price per variance; 10 "
+        "above the best is practically no support."
+    )
+    return ShownTable(heads, rows, title="Noise models tried", note=note)
+
+
+def _kind_in_words(kind: str) -> str:
+    parts = Kind.parsed(kind)
+    known = KINDS | {name: model.description for name, model in REGISTERED.items()}
+    text = printable(known.get(parts.own, parts.own))
+    text += " + deviations of a configuration" if parts.shared else ""
+    text += SCATTERS.get(parts.joints, "")
+    return f"{text} + drift in time" if parts.time else text
+
+
+def _repeats_line(result: Calibration) -> str | None:
+    """The lack-of-fit test, and what follows from it for the intervals; None without repeats."""
+    f = result.finding("lack_of_fit", "repeats_agree")
+    if f is None:
+        return None
+    numbers = (
+        f"lack of fit: F = {f.number('F'):.2f} on {f.numbers['dof_between']} and "
+        f"{f.numbers['dof_pure']} degrees of freedom, {_p(f.number('p'))}"
+    )
+    by_model = f.numbers["counted_by"] == "the noise model"
+    if f.kind == "repeats_agree":
+        text = f"Repeats agree with the scatter between configurations ({numbers})"
+        if by_model:
+            return (
+                f"{text}: the test shows no common deviation. The noise model, chosen by its "
+                "criterion, has one; the intervals include it."
+            )
+        return f"{text}: readings of one configuration have no common deviation."
+    text = (
+        f"Configurations scatter more than their repeats ({numbers}): the arm does not "
+        "return to the same place, or an effect is missing."
+    )
+    if by_model:
+        return f"{text} The noise model has this common deviation; the intervals include it."
+    if f.numbers["counted_by"] == "the intervals":
+        return f"{text} The intervals take each configuration as a whole and include it."
+    return (
+        f"{text} The intervals do not include it and are too narrow: use the default method, whose "
+        "noise model has it, or intervals by cr2; measure more configurations, not more repeats."
+    )
+
+
+def shape_line(summary: ResidualSummary) -> str:
+    """Are the standardised residuals normal, and does any group scatter unlike the model?"""
+    f = shape_of(summary)
+    numbers = (
+        f"skewness {f.number('skewness'):+.2f}, excess kurtosis {f.number('excess_kurtosis'):+.2f}"
+    )
+    if f.kind == "residuals_too_few":
+        text = f"Too few values to judge whether residuals are normal ({numbers})."
+    else:
+        numbers += f", {_p(f.number('p'))}"
+        text = f"Standardised residuals agree with a normal distribution ({numbers})."
+        if f.kind != "residuals_normal":
+            text = f"Standardised residuals are not normal ({numbers}): {SHAPES[f.kind]}"
+    if (scatter := summary.whole.held_out_mean_square) is not None:
+        text += (
+            f" In held-out configurations the scatter is {significant(scatter**0.5)} times that of "
+            "the noise model."
+        )
+    found = sum(g.n_deviating for g in summary.groupings)
+    if not found:
+        return f"{text} No group of readings deviates from the noise model."
+    named = [f"{_group(by, g)} {_ratio(g)} times" for by, g in summary.deviating[:MOST_GROUPS]]
+    more = found - len(named)
+    tail = f", and {more} more" if more else ""
+    return f"{text} Scatter unlike the noise model: {', '.join(named)}{tail}."
+
+
+def deviating_table(summary: ResidualSummary) -> ShownTable:
+    """Groups of readings that scatter unlike the noise model."""
+    rows = [(_group(by, g), str(g.n), _ratio(g), f"{g.p_holm:.1g}") for by, g in summary.deviating]
+    heads = ("scatters unlike the noise model", "values", "observed / expected", "p (Holm)")
+    return ShownTable(heads, rows)
+
+
+def _group(by: str, group: GroupSummary) -> str:
+    return f"{by} {printable(group.name)}"
+
+
+def _ratio(group: GroupSummary) -> str:
+    """Observed over expected standard deviation."""
+    return significant(float(np.sqrt(group.mean_square)), 2)
+
+
+def _in_time_line(result: Calibration) -> str | None:
+    """How alike the residuals of visits are that follow each other; None for few visits."""
+    found = result.autocorrelation
+    if found is None:
+        return None
+    numbers = (
+        f"correlation {found.correlations[0]:+.2f} over {found.visits} visits in the order of "
+        f"{'their times' if found.by == 'times' else 'the rows'}, {_p(found.p)}"
+    )
+    told = result.finding("autocorrelated")
+    which = "Residuals of successive visits are"
+    if told is None:
+        return f"{which} no more alike than others ({numbers})."
+    if told.numbers["counted"] == "yes":
+        return f"{which} alike ({numbers}); the noise model has this as a drift."
+    return (
+        f"{which} alike ({numbers}): drift, or an effect missing at neighbouring poses. Intervals "
+        "are too narrow."
+    )
+
+
+def _p(p: float) -> str:
+    return "p < 1e-6" if p < 1e-6 else f"p = {significant(p, 2)}"
+
+
+FULL_WEIGHT = ("reml", "ols", "wls", "eq14")  # methods that let far readings bend the fit
+PLACE = {
+    "block": "Block of lines {}",
+    "marker": "Marker {}",
+    "configuration": "Configuration {}",
+}
+
+
+def fault_lines(result: Calibration, most: int | None = None) -> list[str]:
+    """A sentence per group of readings beyond the noise, the largest first; of more, how many."""
+    report = result.faulty_report
+    groups = [] if report is None else [f for f in report.findings if f.level != "reading"]
+    lines = [_fault(result, finding) for finding in groups[:most]]
+    more = len(groups) - len(lines)
+    return [*lines, f"And {more} more."] if more else lines
+
+
+def false_alarm_line(result: Calibration) -> str | None:
+    """How often the search would accuse readings of a table in which nothing is wrong."""
+    report = result.faulty_report
+    if report is None or not fault_lines(result):
+        return None
+    share = 100 * report.false_alarm
+    return f"False-alarm rate: at most {share:g} % of tables without outliers."
+
+
+def _fault(result: Calibration, finding: FaultyGroup) -> str:
+    n, beyond = len(finding.lines), finding.beyond
+    apart = {o.line for o in result.excluded} & set(finding.lines)
+    bends = method_of(result) in FULL_WEIGHT and not apart  # readings of full weight in the fit
+    how = "err in common by" if finding.pattern == "common" else "scatter by"
+    noise = f"{significant(finding.sigmas, 2)} times the noise"
+    text = f"{PLACE[finding.level].format(printable(finding.name))}: {n} readings {how} "
+    # Of a pose the error is the position's, and the finding may be one of rotation.
+    turned = result.observations.kind == "pose"
+    text += noise if turned else f"{length(finding.error)} ({noise})"
+    if beyond < n:
+        text += f", {beyond or 'none'} of them beyond the noise"
+    names = () if result.faulty_report is None else result.faulty_report.names
+    name = printable(names[finding.column]) if names else "a parameter"
+    if not math.isfinite(finding.influence):
+        return f"{text}; the other readings leave {name} undetermined."
+    moves = "in the fit they move" if bends else "fitted along they would move"
+    count = significant(finding.influence, 2)
+    return f"{text}; {moves} {name} by {count} standard deviation{'s' * (count != '1.0')}."
+
+
+# The smooth functions that were fitted.
+
+
+def smooth_table(result: Calibration) -> ShownTable:
+    """A row for each function and unit; what was left out has none."""
+    rows = []
+    for part in (part for part in result.smooth if part.scale):
+        for unit, (rms, (low, high), half) in part.sizes.items():
+            size, *ends, known = (significant(display(v, unit)[0]) for v in (rms, low, high, half))
+            worth = f"{significant(part.effective, 2)} of {part.coefficients}"
+            rows.append(
+                (
+                    printable(part.group.name), size, " to ".join(ends), known,
+                    display(0.0, unit)[1], worth,
+                )
+            )  # fmt: skip
+    note = (
+        "What the arm does besides, as smooth functions of joint angles or time: they correct it "
+        "where it was measured, and explain nothing. Each takes as many of its coefficients as "
+        "the readings pay for."
+    )
+    heads = ("smooth function", "rms", "95 %", "known to ±", "unit", "coefficients' worth")
+    return ShownTable(heads, rows, (0, 4), title="Smooth functions", note=note)
+
+
+def counted_functions(result: Calibration) -> str:
+    """ "; and 6 smooth functions of 648 coefficients", "" where there are none."""
+    found = [part for part in result.smooth if part.scale]
+    if not found:
+        return ""
+    n = sum(part.coefficients for part in found)
+    return f"; and {counted(len(found), 'smooth function')} of {n} coefficients"

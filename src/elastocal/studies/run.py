@@ -32,8 +32,22 @@ from typing import Any, Self
 from elastocal import __version__
 from elastocal.errors import ElastocalError, InputError, option, require
 from elastocal.files import read_bytes
-from elastocal.studies import results
-from elastocal.studies.study import Row, Study, StudyTask, calling, execute
+from elastocal.studies.study import (
+    Row,
+    Study,
+    StudyTask,
+    add_line,
+    calling,
+    clear_results,
+    drop_lines,
+    execute,
+    opened,
+    read_results,
+    result_lines,
+    statement_of,
+    write_page,
+    write_statement,
+)
 from elastocal.text import printable, quoted
 
 GRACE = 30.0  # s that running tasks are waited for
@@ -364,7 +378,7 @@ def run_study(
     cluster cannot be reached; ClusterLostError where the scheduler goes away.
     """
     folder, stop, version = Path(output), stop or StudyStop(), source_version()
-    with results.opened(folder):
+    with opened(folder):
         known = {} if restart else _known(study, folder)
         failures = {k: failed for k, failed in known.items() if not (failed and retry_failed)}
         wanted = study.tasks[:only]
@@ -376,10 +390,10 @@ def run_study(
         elif runner is None:
             runner = partial(run_local, study, jobs=jobs, stop=stop)
         if restart:
-            results.clear(folder)
+            clear_results(folder)
         if retry_failed:
-            results.drop(folder, failed=True)
-        results.state(folder, study, version)
+            drop_lines(folder, failed=True)
+        write_statement(folder, study, version)
         total, before = len(wanted), len(wanted) - len(left)
         ended, failed = before, sum(failures.get(task.index, False) for task in wanted)
         progress(total, ended, failed)
@@ -387,7 +401,7 @@ def run_study(
             with closing(runner(left)) as lines:
                 for line in lines:
                     stop.check()
-                    results.add(folder, line, version)
+                    add_line(folder, line, version)
                     failed += line["task_error"] is not None
                     ended += 1
                     progress(total, ended, failed)
@@ -403,12 +417,12 @@ def _known(study: Study, folder: Path) -> dict[int, bool]:
     Raises InputError where a task there is not the study's task of that index now.
     """
     here = f"Run with {option('restart', True)} to discard them, or with {option('output', 'NEW')}"
-    before, columns = results.stated(folder), dict(study.sources.columns)
+    before, columns = statement_of(folder), dict(study.sources.columns)
     require(
         before.get("columns", columns) == columns,
         f"{folder}: has other columns, types or units than the study now. {here}",
     )
-    lines = [line for line in results.lines(folder) if line["task"] < len(study.tasks)]
+    lines = [line for line in result_lines(folder) if line["task"] < len(study.tasks)]
     for line in lines:
         if study.tasks[line["task"]].hash != line["task_hash"]:
             changes = _changes(study, before) or [f"task {line['task']} was another one"]
@@ -442,14 +456,14 @@ def summarise(study: Study, output: str | Path, page: str | Path) -> str | None:
     summary = getattr(study.module, "summary", None)
     if summary is None:
         return None
-    frame = results.read_results(output)
+    frame = read_results(output)
     frame = frame[frame["task"] < len(study.tasks)]
     text = calling(study.folder, "summary()", lambda: summary(frame))
     if not isinstance(text, str):
         kind = type(text).__name__
         raise InputError(f"{study.folder / 'study.py'}: summary() returned {kind}; it returns text")
     lines = (printable(line).replace("\\t", "\t") for line in text.rstrip("\n").split("\n"))
-    results.write_page(Path(output), Path(page), "\n".join(lines) + "\n")
+    write_page(Path(output), Path(page), "\n".join(lines) + "\n")
     return text
 
 

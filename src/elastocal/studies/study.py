@@ -1,4 +1,5 @@
-"""A study as its folder states it, its tasks, and one of them carried out in whatever process.
+"""A study as its folder states it, its tasks, one of them carried out in whatever process, and the
+results on disk.
 
 The folder holds `study.py` (what to compute) and `study.toml` (seed, options, files, columns).
 What a worker needs of it travels as `Sources`; their hash, the seed and the task's values say
@@ -20,7 +21,7 @@ import time
 import tomllib
 import traceback
 from collections.abc import Callable, Iterable, Iterator, Mapping
-from contextlib import suppress
+from contextlib import contextmanager, suppress
 from dataclasses import dataclass
 from functools import cached_property
 from importlib.machinery import ModuleSpec, SourceFileLoader
@@ -28,7 +29,7 @@ from importlib.util import module_from_spec, spec_from_loader
 from itertools import islice
 from pathlib import Path, PurePosixPath
 from types import ModuleType
-from typing import Any, cast
+from typing import TYPE_CHECKING, Any, cast
 
 import numpy as np
 from pydantic import Field
@@ -36,18 +37,22 @@ from pydantic import Field
 from elastocal import __version__
 from elastocal.config import Table, checked, read_toml
 from elastocal.errors import InputError, option, require
-from elastocal.files import read_bytes
+from elastocal.files import atomic_write_text, read_bytes, read_json, read_text
+from elastocal.screen import shown
 from elastocal.text import did_you_mean, listed, quoted
+
+if TYPE_CHECKING:
+    import pandas
 
 MAX_TASKS = 200_000  # each is kept in memory, and has a row or more in the results
 RESERVED = ("task", "task_hash", "task_row", "task_seconds", "elastocal", "task_error")
 TAKEN = f"{', '.join(RESERVED)} are columns of every study"
-MAX_BYTES = 1_000_000_000  # of a file that study.toml names: a table, at most
+MOST_OF_A_FILE = 1_000_000_000  # of a file that study.toml names: a table, at most
 # What a column takes, by its unit in study.toml; every other unit is that of a number.
 KINDS: dict[str, tuple[type, str]] = {
     "yes/no": (bool, "true or false"), "count": (int, "a whole number"), "text": (str, "text"),
 }  # fmt: skip
-WRITTEN = {**dict(KINDS.values()), float: "a number"}  # how a type is asked for
+ASKED_FOR = {**dict(KINDS.values()), float: "a number"}  # how a type is asked for
 
 Row = dict[str, Any]
 _LOCK = threading.Lock()
@@ -171,7 +176,7 @@ def _contents(folder: Path, stated: StudyFile, path: Path) -> dict[str, bytes]:
     names = {path.relative_to(folder) for path in folder.rglob("*.py")}
     hidden = {n for n in names if any(p.startswith(".") or p == "__pycache__" for p in n.parts)}
     parts = sorted({n.as_posix() for n in names - hidden} | set(stated.files))
-    return {name: read_bytes(folder / name, "file of a study", MAX_BYTES) for name in parts}
+    return {name: read_bytes(folder / name, "file of a study", MOST_OF_A_FILE) for name in parts}
 
 
 def _with_options(path: Path, defaults: Mapping[str, Any], given: Iterable[str]) -> dict[str, Any]:
@@ -193,7 +198,7 @@ def _with_options(path: Path, defaults: Mapping[str, Any], given: Iterable[str])
             value = written
         if type(default) is float and type(value) is int:
             value = float(value)
-        kind = WRITTEN.get(type(default), f"a TOML value like {quoted(default)}")
+        kind = ASKED_FOR.get(type(default), f"a TOML value like {quoted(default)}")
         require(type(value) is type(default), f"{here}: takes {kind}, as in study.toml")
         options[key] = value
     return options
@@ -357,3 +362,163 @@ def _plain(name: str, value: Any, unit: str) -> Any:
     if isinstance(value, float) and not math.isfinite(value):
         return None if math.isnan(value) else str(value)
     return value
+
+
+# The results on disk: JSON lines, one for each task that ended, written by one process.
+#
+# A line is written when its task ends and says all of it: whatever stops a run leaves whole lines
+# and at most the beginning of one, which the next run takes away.
+
+MAX_BYTES = 100_000_000  # of the record
+MOST_RESULTS = 10_000_000_000  # bytes
+SCHEMA = "elastocal/study/1"
+RESULTS, STATEMENT, FAILURES, LOCK = "results.jsonl", "_study.json", "_failures.log", ".lock"
+WRITTEN = "_written.txt"  # digests of the pages that the study wrote
+OURS = {RESULTS, STATEMENT, FAILURES, WRITTEN}
+
+
+@contextmanager
+def opened(folder: Path) -> Iterator[None]:
+    """The results in `folder`, made where absent, with no other process writing to it.
+
+    Raises InputError where the folder cannot be made, holds something else, or another run has
+    it.  What a killed run left half-written is removed.
+    """
+    import fcntl
+
+    try:
+        folder.mkdir(parents=True, exist_ok=True)
+    except OSError as error:
+        raise InputError(f"{folder}: cannot be made ({error.strerror}); name another") from None
+    ours = OURS if statement_of(folder).get("schema") == SCHEMA else set()
+    visible = {p.name for p in folder.iterdir() if not p.name.startswith(".")}
+    foreign = ", ".join(sorted(visible - ours)[:3])
+    told = f"{folder}: holds {foreign}, which no study wrote; name a folder of its own"
+    require(not foreign, told)
+    with open(folder / LOCK, "a", encoding="utf-8") as lock:
+        try:
+            fcntl.flock(lock, fcntl.LOCK_EX | fcntl.LOCK_NB)
+        except OSError:
+            raise InputError(
+                f"{folder}: another run of the study is writing there; wait for it, or name "
+                f"another folder with {option('output', 'NEW')}"
+            ) from None
+        drop_lines(folder)
+        yield
+
+
+def add_line(folder: Path, line: Row, version: str) -> None:
+    """Write the line of a task that ended, made by `version`; its traceback goes to the log."""
+    if trace := line.pop("trace", None):
+        with open(folder / FAILURES, "a", encoding="utf-8") as log:
+            log.write(shown(f"task {line['task']} {json.dumps(line['values'])}\n{trace}\n"))
+    text = json.dumps(line | {"elastocal": version}, ensure_ascii=False, allow_nan=False)
+    with open(folder / RESULTS, "a", encoding="utf-8") as handle:
+        handle.write(text + "\n")
+
+
+def drop_lines(folder: Path, failed: bool = False) -> None:
+    """Take away the beginning of a line that a killed run left, and `failed` tasks' lines."""
+    if not (folder / RESULTS).exists():
+        return
+    text = read_text(folder / RESULTS, "results", MOST_RESULTS)
+    kept = [line for line in text.split("\n")[:-1]
+            if not failed or json.loads(line)["task_error"] is None]  # fmt: skip
+    if (whole := "".join(f"{line}\n" for line in kept)) != text:
+        atomic_write_text(folder / RESULTS, whole)
+
+
+def clear_results(folder: Path) -> None:
+    for name in (RESULTS, STATEMENT, FAILURES):
+        (folder / name).unlink(missing_ok=True)
+
+
+def result_lines(folder: Path) -> list[Row]:
+    """Returns all lines in the order of their tasks.
+
+    Raises InputError where one is damaged, or a task has more than one.
+    """
+    path, found = folder / RESULTS, dict[int, Row]()
+    text = read_text(path, "results", MOST_RESULTS) if path.exists() else ""
+    for number, written in enumerate(text.split("\n"), 1):
+        if not written:
+            continue
+        here = f"{path}, line {number}"
+        try:
+            line = json.loads(written)
+            index = int(line["task"])
+        except (ValueError, KeyError, TypeError) as error:
+            told = f"{here}: is damaged ({error}); delete it, and its task runs again"
+            raise InputError(told) from None
+        require(
+            index not in found,
+            f"{here}: task {index} has more than one result; results of two runs were put "
+            f"together: remove one, or run with {option('restart', True)}",
+        )
+        found[index] = line
+    return [found[index] for index in sorted(found)]
+
+
+def write_statement(folder: Path, study: Study, version: str) -> None:
+    """Write down what the results are of: seed, options, hashes of the sources."""
+    statement = {
+        "schema": SCHEMA, "title": study.title, "seed": study.seed,
+        "options": dict(study.options), "tasks": len(study.tasks),
+        "columns": dict(study.sources.columns), "sources": study.sources.digests,
+        "elastocal": version,
+    }  # fmt: skip
+    text = json.dumps(statement, indent=1, ensure_ascii=False, allow_nan=False)
+    atomic_write_text(folder / STATEMENT, text + "\n")
+
+
+def statement_of(folder: Path) -> dict[str, Any]:
+    """Returns what `write_statement` wrote; empty where there is none."""
+    try:
+        found = read_json(folder / STATEMENT, "record", MAX_BYTES, "remove it")
+    except InputError:
+        return {}
+    return found if isinstance(found, dict) else {}
+
+
+def check_page(folder: Path, page: Path) -> None:
+    """Raise InputError where `page` is there and not as a summary of the study wrote it."""
+    if not page.exists():
+        return
+    digest = hashlib.sha256(read_bytes(page, "page", MAX_BYTES)).hexdigest()
+    ledger = folder / WRITTEN
+    require(
+        ledger.exists() and digest in read_text(ledger, "record", MAX_BYTES).split(),
+        f"{page}: would be written over, and is not as the study left it; move it "
+        f"elsewhere, or name another folder with {option('output', 'NEW')}",
+    )
+
+
+def write_page(folder: Path, page: Path, text: str) -> None:
+    """Write the summary, and remember it: no other page is written over."""
+    with open(folder / WRITTEN, "a", encoding="utf-8") as ledger:
+        ledger.write(hashlib.sha256(text.encode()).hexdigest() + "\n")
+    atomic_write_text(page, text)
+
+
+def read_results(folder: str | Path, failed: bool = False) -> pandas.DataFrame:
+    """Returns the rows of a study, sorted by task and row; failed tasks only where `failed`.
+
+    Columns: task, task_hash, the task's values, task_row, the results, task_seconds,
+    elastocal (version), task_error.
+    Raises InputError where there are none, or a result is there twice.
+    """
+    import pandas as pd
+
+    found, columns = result_lines(Path(folder)), statement_of(Path(folder)).get("columns", {})
+    require(bool(found), f"{folder}: holds no results; run elastocal study first")
+    values = list(dict.fromkeys(name for line in found for name in line["values"]))
+    names = ["task", "task_hash", *values, "task_row", *columns, "task_seconds", "elastocal"]
+    rows = [
+        line | line["values"] | row
+        for line in found
+        if (line["task_error"] is not None) == failed
+        for row in ([{}] if failed else [{"task_row": k} | r for k, r in enumerate(line["rows"])])
+    ]
+    frame = pd.DataFrame(rows, columns=[*names, "task_error"])
+    numbers = [name for name, unit in columns.items() if unit not in KINDS]
+    return frame.astype(dict.fromkeys(numbers, "float64"))
