@@ -97,7 +97,7 @@ def refitted(
     check = random_table(model, conditions, poses, seed)
     more = random_table(model, conditions, MORE_OF_CURVES if correct else MORE, seed + 1)
     q, force = np.vstack([visits.q, more.q]), np.vstack([visits.force, more.force])
-    fit = _Fit(kept, table_at(model, conditions, q, force, rng))
+    fit = _ArmFit(kept, table_at(model, conditions, q, force, rng))
     others = [choice for choice in own if choice.name not in GEOMETRY]
     whole = _with(part, [*others, *map(EffectChoice, GEOMETRY)])
     start = _gears(kept) if correct else JointCorrection(())
@@ -166,7 +166,7 @@ def _gears(kept: Kept) -> JointCorrection:
     return JointCorrection(tuple(curves)).merged()
 
 
-class _Fit:
+class _ArmFit:
     """Fits to where `kept.full` has points of its tool at the poses of a table."""
 
     def __init__(self, kept: Kept, table: Measurements) -> None:
