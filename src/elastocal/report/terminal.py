@@ -3,9 +3,8 @@
 from __future__ import annotations
 
 from collections.abc import Iterable
-from importlib import import_module
 from io import StringIO
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, cast
 
 from rich.box import SIMPLE_HEAD
 from rich.console import Console
@@ -34,30 +33,37 @@ if TYPE_CHECKING:
 PRINTED_WIDTH = 100  # columns of a result as plain text
 
 
-# Kind of result → the module that says what is to be said of it, and which function.
-VIEWS = {
-    "Calibration": "identification_view.calibration_report",
-    "Diagnosis": "diagnosis_view.diagnosis_report",
-    "Comparison": "changes_view.changes_report",
-    "Plan": "plan_view.plan_report",
-    "NextPoses": "plan_view.next_report",
-    "Compensation": "compensation_view.compensation_report",
-    "Measurements": "compensation_view.readings_report",
-}
-
-
 def report_of(result: object, certificate: bool = False, **told: Any) -> Report:
     """What is to be said of a result.  Each kind has its module, which no other result loads.
 
     TypeError for a kind without a report.
     """
-    kind = type(result).__name__
-    if kind not in VIEWS:
-        raise TypeError(kind)
-    view = "certificate_view.certificate_report" if certificate else VIEWS[kind]
-    module, _, name = view.partition(".")
-    report: Report = getattr(import_module(f"elastocal.report.{module}"), name)(result, **told)
-    return report
+    kind, fit = type(result).__name__, cast(Any, result)
+    if certificate:
+        from elastocal.report.certificate_view import certificate_report
+
+        return certificate_report(fit)
+    if kind == "Calibration":
+        from elastocal.report.identification_view import calibration_report
+
+        return calibration_report(fit, **told)
+    if kind == "Diagnosis":
+        from elastocal.report.diagnosis_view import diagnosis_report
+
+        return diagnosis_report(fit)
+    if kind == "Comparison":
+        from elastocal.report.changes_view import changes_report
+
+        return changes_report(fit)
+    if kind in ("Plan", "NextPoses"):
+        from elastocal.report.plan_view import next_report, plan_report
+
+        return plan_report(fit) if kind == "Plan" else next_report(fit)
+    if kind in ("Compensation", "Measurements"):
+        from elastocal.report.compensation_view import compensation_report, readings_report
+
+        return compensation_report(fit) if kind == "Compensation" else readings_report(fit)
+    raise TypeError(kind)
 
 
 def print_report(console: Console, result: object, details: bool = True, **told: Any) -> None:
