@@ -19,7 +19,7 @@ import numpy as np
 from scipy import linalg, sparse, special
 
 from elastocal.errors import ElastocalError, InputError, InsufficientDataError
-from elastocal.identification.covariance import Covariance, SatterthwaiteSums, orthogonal
+from elastocal.identification.covariance import Covariance, cluster_robust, orthogonal
 from elastocal.identification.intervals import LEVEL, Intervals, MethodResult
 from elastocal.identification.residuals import held_out_residual
 from elastocal.identification.solve import Problem, Solution
@@ -97,21 +97,6 @@ class RobustEstimate:
         level = np.full_like(d, 4 * h / max(high - low, np.finfo(float).tiny))
         return level, level
 
-    def information(self, code: IntArray) -> Array:
-        """Σ Q_iᵀ J_i Q_i (groups, p, p) per group `code` (n,) of the observations."""
-        p, (along, across) = len(self.z), self.curvature()
-        Q = self.Q.reshape(self.n, self.size, p)
-        r = self.residual.reshape(self.n, self.size)
-        u = r / np.maximum(np.linalg.norm(r, axis=1), np.finfo(float).tiny)[:, None]
-        toward = np.einsum("nij,ni->nj", Q, u)
-
-        def of(chosen: BoolArray) -> Array:
-            rows, own = Q[chosen].reshape(-1, p), toward[chosen]
-            within = (rows.T * np.repeat(across[chosen], self.size)) @ rows
-            return np.asarray(within + (own.T * (along - across)[chosen]) @ own)
-
-        return np.array([of(code == g) for g in range(code.max() + 1)])
-
 
 def lengths(residual: Array, size: int) -> Array:
     """|e_i| (n,) of each observation."""
@@ -157,6 +142,7 @@ def huber(B: Array, y: Array, size: int, c: float | None = None) -> RobustEstima
 
 
 OPTIMAL = 5e-6  # relative duality gap that counts as solved
+EXACT = 1e-8  # scaled length below which an l1 fit passes through an observation
 ACCURATE = 1e-12  # asked of the cone solver, which ends where rounding allows no more
 
 
@@ -196,80 +182,44 @@ def least_absolute(B: Array, y: Array, size: int) -> RobustEstimate:
 #
 #     J_i = ∂Ψ/∂r = ψ′(d_i) u uᵀ + (ψ(d_i)/d_i)(I − u uᵀ),      d_i = |r_i|,
 #
-# eigenvalue ψ′ along the error and ψ/d across it (size − 1 times; for size 1 only ψ′).  Expanding
-# Σ B_iᵀ Ψ(e_i/σ) = 0 gives x̂ − x ≈ σ W⁻¹ Σ B_iᵀ Ψ_i, W = Σ B_iᵀ J_i B_i, and for errors that are
-# symmetric in direction E J = a I, E ΨΨᵀ = b I,
+# eigenvalue ψ′ along the error and ψ/d across it (size − 1 times; for size 1 only ψ′).  For errors
+# that are symmetric in direction E J = a I, E ΨΨᵀ = b I, and expanding Σ B_iᵀ Ψ(e_i/σ) = 0 gives
 #
-#     cov x̂ = σ² (b/a²) (BᵀB)⁻¹        (Huber 1981, sections 7.6 and 7.10, per row; Maronna 1976)
+#     x̂ − x ≈ (BᵀB)⁻¹ Bᵀ (σ/a) Ψ,    cov x̂ = σ² (b/a²) (BᵀB)⁻¹
 #
-# The weights ψ/d as inverse variances would be wrong: a weight is small because that residual came
-# out large, not because its variance was known to be.
-
-EXACT = 1e-8  # scaled length below which an l1 fit passes through an observation
-ALONE = 1e-9  # of the information: what the others must have of every direction
-UNDETERMINED = (
-    "so many readings lie far from the fit that the others do not determine every parameter, or "
-    "one configuration alone does; use the default method, or measure more configurations"
-)
+# (Huber 1981, sections 7.6 and 7.10, per row; Maronna 1976): that of least squares whose residuals
+# are (σ/a) Ψ.  The weights ψ/d as inverse variances would be wrong: a weight is small because that
+# residual came out large, not because its variance was known to be.
 
 
-def asymptotic_covariance(found: RobustEstimate) -> Covariance:
-    """Covariance (p, p) of x̂ of independent readings; t intervals with rows less p as dof.
+def covariance_of(found: RobustEstimate, B: Array, cluster: IntArray | None = None) -> Covariance:
+    """Covariance (p, p) of x̂ of y ≈ B x.
 
-    Huber's H2, k σ² (b̂/â) W⁻¹, with â the mean eigenvalue of J_i, b̂ = Σψ²/(n·size − p), and his
-    small-sample factor k = 1 + (p/(n·size)) Var(eigenvalues)/â² (k = 1 for l1).
+    Of independent readings Huber's H1, k² σ² (b̂/â²) (BᵀB)⁻¹, with b̂ = Σψ²/(n·size − p) and his
+    small-sample factor k = 1 + (p/(n·size)) Var(eigenvalues)/â² (k = 1 for l1); t intervals with
+    rows less p as dof.  Under any dependence within a `cluster` (n,), such as a configuration, CR3
+    of (σ/a) Ψ.
 
-    Raises InsufficientDataError where W is not positive definite.
+    Raises InsufficientDataError where nearly all readings lie far from the fit, or a cluster alone
+    determines a combination of the parameters.
     """
     along, across = found.curvature()
     rows, p, size = len(found.residual), len(found.z), found.size
-    W = found.information(np.zeros(found.n, dtype=np.int64))[0]
     a = float(np.mean(along + (size - 1) * across)) / size
-    if not a > 0 or np.linalg.eigvalsh(W)[0] <= 0:
-        raise InsufficientDataError(UNDETERMINED)
+    if not a > 0:
+        raise InsufficientDataError(
+            "so many readings lie far from the fit that its covariance cannot be told; use the "
+            "default method, or look for the cause of the outliers"
+        )
+    if cluster is not None:
+        psi = np.repeat(found.weights, size) * found.residual / a
+        return cluster_robust(B, psi, np.repeat(cluster, size), "CR3")
     psi = np.minimum(found.distance, found.c) if found.c else np.ones(found.n)
-    b, k = float(psi @ psi) / (rows - p), 1.0
-    if found.c:
-        square = float((along**2).sum() + (size - 1) * (across**2).sum()) / rows
-        k = 1 + p / rows * (square - a**2) / a**2
-    matrix = k * found.scale**2 * b / a * found.V @ np.linalg.inv(W) @ found.V.T
-    text = f"asymptotic covariance H2 of the {found.name} estimate, from ψ and ψ′"
-    return Covariance("H2", matrix, np.full(p, float(rows - p)), text)
-
-
-def clustered_covariance(found: RobustEstimate, cluster: IntArray) -> Covariance:
-    """Covariance (p, p) of x̂ under any dependence within clusters (n,), such as configurations,
-    with t dofs (p,).
-
-    Leaving cluster g out moves x̂ by δ_g = σ (W − W_g)⁻¹ s_g to first order, with the scores
-    s_g = Σ_{i∈g} B_iᵀΨ_i and W_g = Σ_{i∈g} B_iᵀ J_i B_i; the jackknife of these (CR3 of Bell and
-    McCaffrey 2002 for the M-estimate's score),
-
-        cov x̂ = (G − 1)/G Σ_g δ_g δ_gᵀ,
-
-    needs no model of the dependence, and dividing by W − W_g undoes that a fit follows its own
-    clusters.  dof are Satterthwaite's under independence, (tr T)²/tr T² with the quadratic form
-    T of each parameter: few clusters, or few that see a parameter, have few.
-
-    Raises InsufficientDataError where without one cluster the others do not determine every
-    parameter.
-    """
-    p, size, code = len(found.z), found.size, np.unique(cluster, return_inverse=True)[1].ravel()
-    W_g = found.information(code)
-    W = W_g.sum(axis=0)
-    rest = W - W_g
-    if (np.linalg.eigvalsh(rest)[:, 0] <= ALONE * np.linalg.eigvalsh(W)[-1]).any():
-        raise InsufficientDataError(UNDETERMINED)
-    scores, G = np.zeros((len(W_g), p)), len(W_g)
-    weighted = np.repeat(found.weights, size) * found.residual / found.scale
-    np.add.at(scores, np.repeat(code, size), weighted[:, None] * found.Q)
-    shift = found.scale * np.linalg.solve(rest, scores[..., None])[..., 0] @ found.V.T
-    # T = diag(own) − K with K_gh = m_gᵀ W⁻¹ m_h, never formed: there may be thousands of groups.
-    reach = np.linalg.solve(rest, np.broadcast_to(found.V.T, rest.shape))  # by parameter
-    m, sums = W_g @ reach, SatterthwaiteSums(p)
-    sums.add(np.einsum("gij,gij->gj", reach, m), linalg.cholesky(np.linalg.inv(W)) @ m)
-    text = f"jackknife of the {found.name} scores over {G} clusters"
-    return Covariance("clustered", (G - 1) / G * shift.T @ shift, sums.dof(), text)
+    square = float((along**2).sum() + (size - 1) * (across**2).sum()) / rows
+    k = 1 + p / rows * (square - a**2) / a**2 if found.c else 1.0
+    variance = (k * found.scale / a) ** 2 * float(psi @ psi) / (rows - p)
+    text = f"asymptotic covariance H1 of the {found.name} estimate, from ψ and ψ′"
+    return Covariance("H1", variance * found.V @ found.V.T, np.full(p, float(rows - p)), text)
 
 
 # Robust fit of the nonlinear model: linear robust steps on the exact B.
@@ -307,8 +257,8 @@ def robust_result(
     observed, weights = problem.observations, problem.weights
     while True:
         at = problem.model.regressor(observed.table, x, kept, observed)
-        e = weights.apply(at.residual)
-        found = METHODS[method](weights.apply(at.B), e, observed.size)
+        B, e = weights.apply(at.B), weights.apply(at.residual)
+        found = METHODS[method](B, e, observed.size)
         converged = bool(np.linalg.norm(found.z) <= SETTLED * found.scale * np.sqrt(len(kept)))
         share = 0.0 if converged or steps == MOST_MOVES else _damping(problem, x, kept, e, found)
         if share == 0.0:
@@ -330,10 +280,8 @@ def robust_result(
     )
     problem = replace(problem, x0=sound.problem.x0)
     solution = replace(sound, problem=problem, fit=fit, held=heldout)
-    if intervals == "auto":
-        covariance = asymptotic_covariance(found)
-    else:
-        covariance = clustered_covariance(found, observed.configuration)
+    cluster = None if intervals == "auto" else observed.configuration
+    covariance = covariance_of(found, B, cluster)
     ends = covariance.interval(x[kept], LEVEL)
     return MethodResult(method, solution, Intervals(covariance, ends), None, good)
 

@@ -4,12 +4,7 @@ import numpy as np
 import pytest
 from support.calibration import binomial_band
 
-from elastocal.identification.robust import (
-    asymptotic_covariance,
-    clustered_covariance,
-    huber,
-    least_absolute,
-)
+from elastocal.identification.robust import covariance_of, huber, least_absolute
 
 
 def tables(arm, share, count, seed=0):
@@ -23,10 +18,10 @@ def holds(x, covariance, truth):
     return (low < truth) & (truth < high)
 
 
-def coverage(arm, fit, share, count):
+def coverage(arm, fit, share, count, cluster=None):
     return np.array(
         [
-            holds(found.x, asymptotic_covariance(found), arm.x)
+            holds(found.x, covariance_of(found, arm.B, cluster), arm.x)
             for found in (fit(arm.B, y, 3) for y in tables(arm, share, count))
         ]
     )
@@ -44,36 +39,15 @@ def test_intervals_hold_the_truth(arm, fit, share):
     # The deviations they are compared with are the true ones: test_intervals_hold_the_truth.
 
 
-def test_with_every_observation_its_own_cluster_it_is_the_jackknife(arm):
-    """For a loss that is quadratic throughout: refits of least squares without each reading."""
-    y = arm.observed(arm.errors(np.random.default_rng(5))[0])
-    found = huber(arm.B, y, 3, c=1e6)
-    shifts = []
-    for i in range(270):
-        kept = np.ones(810, dtype=bool)
-        kept[3 * i : 3 * i + 3] = False
-        shifts.append(found.x - np.linalg.lstsq(arm.B[kept], y[kept])[0])
-    expected = 269 / 270 * np.transpose(shifts) @ shifts
-    covariance = clustered_covariance(found, np.arange(270))
-    np.testing.assert_allclose(covariance.matrix, expected, rtol=1e-8, atol=1e-15)
-
-
-def test_dof_are_satterthwaites_of_the_quadratic_form(arm):
-    """For least squares the estimated variance of x_j is Σ_g (a_gᵀ e)² with e = (I − H)ε: the form
-    written out with all 810 rows."""
-    y = arm.observed(arm.errors(np.random.default_rng(8))[0])
-    found = huber(arm.B, y, 3, c=1e6)
-    covariance = clustered_covariance(found, arm.configuration)
-    project = np.eye(810) - arm.B @ np.linalg.pinv(arm.B)
-    A = np.zeros((15, 9, 810))
-    for g in range(15):
-        rows = np.repeat(arm.configuration == g, 3)
-        others = np.linalg.inv(arm.B[~rows].T @ arm.B[~rows])
-        A[g][:, rows] = others @ arm.B[rows].T
-    for j in range(9):
-        T = A[:, j] @ project @ A[:, j].T
-        expected = np.trace(T) ** 2 / (T**2).sum()
-        assert covariance.dof[j] == pytest.approx(expected, rel=1e-8)
-        assert covariance.matrix[j, j] == pytest.approx(
-            14 / 15 * ((A[:, j] @ found.residual) ** 2).sum(), rel=1e-8
-        )
+def test_intervals_hold_the_truth_where_readings_of_a_configuration_err_alike(arm):
+    """A deviation as large as the noise, in 15 clusters; intervals of independent readings do
+    not."""
+    rng, held = np.random.default_rng(4), {"alike": [], "alone": []}
+    for _ in range(20):
+        common = np.repeat(rng.normal(size=(15, 3)), 18, axis=0)
+        found = huber(arm.B, arm.observed(arm.errors(rng)[0] + common), 3)
+        for name, cluster in (("alike", arm.configuration), ("alone", None)):
+            held[name].append(holds(found.x, covariance_of(found, arm.B, cluster), arm.x))
+    low, _ = binomial_band(np.size(held["alike"]) // 3, 0.95)
+    assert low <= np.sum(held["alike"]) / 3
+    assert np.sum(held["alone"]) / 3 < low
