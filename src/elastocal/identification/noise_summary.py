@@ -175,8 +175,7 @@ class Noise:
     @property
     def intervals_by_configuration(self) -> bool:
         """Whether the intervals hold where the readings of a configuration are correlated."""
-        kind = self.interval_kind.lower()
-        return kind == "clustered" or kind.startswith("cr")
+        return self.interval_kind.lower().startswith("cr")
 
     def to_json(self) -> dict[str, Any]:
         """JSON-ready: lengths in µm, and only what is known of a noise that was not estimated."""

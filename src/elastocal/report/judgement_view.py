@@ -251,7 +251,7 @@ INTERVALS = {
         "as published, eq. (13): weights taken as known although they come from the same "
         "residuals, so the intervals are too narrow"
     ),
-    "h2": "asymptotic covariance of the robust estimate (H2); assumes independent readings",
+    "h1": "asymptotic covariance of the robust estimate (H1); assumes independent readings",
     **{f"hc{k}": f"robust to unequal noise (HC{k}): {HC}{LARGE * (k < 2)}" for k in range(4)},
     **{f"cr{k}": f"cluster-robust (CR{k}): {CR}{LARGE}" for k in (0, 1)},
     **{f"cr{k}": f"cluster-robust (CR{k}): {CR}" for k in (2, 3)},
