@@ -14,7 +14,6 @@ from elastocal.identification.result import Calibration
 from elastocal.identification.scrutiny import stage_of
 from elastocal.identification.solve import WORTH_A_COLUMN, reduce
 from elastocal.identification.weighted_problem import least_norm, weights_for
-from elastocal.model.manipulator import Model
 from elastocal.model.observations import Observations, pure_error
 from elastocal.units import Array
 
@@ -86,8 +85,11 @@ def _fitted(
     white, error = weights.apply(B[:, columns]), weights.apply(y)
     if result.smooth and len(columns):
         # What has a prior in the whole fit has none here: a minimal complete set.
-        own = _worth_a_column(model, columns, white, error)
-        columns, white = columns[own], white[:, own]
+        own = tuple(model.parameters[c] for c in columns)
+        sizes = np.array([p.typical or 1.0 for p in own])
+        sigma = max(float(np.sqrt(np.mean(error**2))), 1e-300)
+        kept = reduce(white, sizes, own, sigma, WORTH_A_COLUMN).kept
+        columns, white = columns[kept], white[:, kept]
     if not len(columns):
         return y
     residual = y - B[:, columns] @ least_norm(white, error)
@@ -95,16 +97,6 @@ def _fitted(
         B[:, columns], residual, weights, observed.configuration, observed.size
     )
     return found if np.isfinite(found).all() else None
-
-
-def _worth_a_column(
-    model: Model, columns: NDArray[np.int64], B: Array, error: Array
-) -> NDArray[np.int64]:
-    """Which columns of the whitened B make up a minimal complete set beside this residual."""
-    sigma = max(float(np.sqrt(np.mean(error**2))), 1e-300)
-    own = tuple(model.parameters[c] for c in columns)
-    sizes = np.array([p.typical or 1.0 for p in own])
-    return reduce(B, sizes, own, sigma, WORTH_A_COLUMN).kept
 
 
 def _step(name: str, result: Calibration, residual: Array, rng: np.random.Generator) -> BudgetStep:
