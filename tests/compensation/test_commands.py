@@ -25,7 +25,12 @@ from elastocal.cell.arm_description import Nominal
 from elastocal.compensation.compensate import compensate
 from elastocal.compensation.targets import targets_at
 from elastocal.errors import InputError
-from elastocal.model.calibrated import ShownPoses
+from elastocal.model.calibrated import (
+    Conditions,
+    OpenParameters,
+    ShownPoses,
+    random_table,
+)
 from elastocal.model.calibrated_tool import tool_point
 from elastocal.model.manipulator import Model
 from elastocal.model.rigid import nominal_flanges
@@ -230,7 +235,19 @@ def test_what_no_marker_showed_is_told():
     arm = calibrated(chain, cell, std=0.01)
     kept = tuple(name for name in arm.model.names if not name.startswith("link6"))
     n = len(kept)
-    arm = replace(arm, determined=kept, covariance=1e-12 * np.eye(n))
+    # What link 6 does to the markers went into the estimates of their places.
+    markers, drawn = tuple(cell.tool.markers), random_table(arm.model, Conditions(), 60, 0)
+    rows = replace(
+        drawn.take(np.repeat(np.arange(60), len(markers))), marker_names=markers,
+        marker=np.tile(np.arange(len(markers)), 60), position=np.zeros((60 * len(markers), 3)),
+    )  # fmt: skip
+    B = arm.model.regressor(rows, arm.x).B
+    open_ = [k for k, name in enumerate(arm.model.names) if name not in kept]
+    known = [k for k, name in enumerate(arm.model.names) if name in kept]
+    mixing = np.linalg.lstsq(B[:, known], B[:, open_], rcond=1e-9)[0]
+    typical = np.array([arm.model.parameters[k].typical for k in open_])
+    left = OpenParameters(tuple(arm.model.names[k] for k in open_), mixing, typical)
+    arm = replace(arm, determined=kept, covariance=1e-12 * np.eye(n), left=left)
     targets = targets_at("t", None, None, "base", None, q=POSTURES)
     marker = compensate(arm, targets, tool_point(cell, "M1"))
     assert np.all(marker.uncertainty.unknown < 1e-9)
