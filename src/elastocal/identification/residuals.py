@@ -202,7 +202,7 @@ def f_test(
 ) -> tuple[Any, Any]:
     """F and its p-value where `columns` took `gain` off a sum of squares of whitened residuals, of
     which `rest` is left with `dof` degrees of freedom: p is the chance of that if they are none."""
-    with np.errstate(divide="ignore", invalid="ignore"):  # nothing is left
+    with np.errstate(divide="ignore", invalid="ignore", over="ignore"):  # nothing is left
         F = np.divide(gain, columns) * dof / rest
     return F, special.fdtrc(columns, dof, F)
 
