@@ -60,9 +60,7 @@ def summarise(
     observed = solution.problem.observations
     set_apart = len(observed.lead) < len(every.problem.observations.lead)
     covariance = found.intervals.covariance.matrix
-    leverage = found.leverage
-    if leverage is None and not solution.problem.large:
-        leverage = solution.leverage
+    leverage = _leverage(found)
     report = None
     if not is_exact(every):
         fitted = found.solution if set_apart or found.smooth else sound
@@ -133,6 +131,14 @@ def _unchecked(result: Calibration) -> Array | None:
     B = result.B[:, kept]
     configuration = np.repeat(observed.configuration, observed.size)
     return told_by_one(weights.apply(B), np.where(lone, configuration, -1))
+
+
+def _leverage(found: MethodResult) -> Array | None:
+    """How much each row (rows,) draws the fit to itself; None of a large table."""
+    solution = found.solution
+    if found.leverage is None and not solution.problem.large:
+        return solution.leverage
+    return found.leverage
 
 
 def _residual_summary(solution: Solution, leverage: Array | None) -> ResidualSummary | None:
