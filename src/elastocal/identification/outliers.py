@@ -9,7 +9,7 @@ from scipy import linalg, special
 
 from elastocal.errors import ElastocalError
 from elastocal.identification.residuals import f_test
-from elastocal.identification.solve import LOOSE, PLACED, SAMPLE, Problem, Solution, is_placed
+from elastocal.identification.solve import PLACED, SAMPLE, Problem, Solution, is_placed
 from elastocal.identification.trimmed import majority, median_scale
 from elastocal.identification.weighted_problem import (
     Part,
@@ -98,6 +98,9 @@ class FitToGood:
 
 # Which observations does a fit of the others contradict?  Judged in turns until it stands.
 
+# Typical sizes in a deviation of the prior: readings of an arm whose errors are five typical sizes
+# must not be taken for faulty because they move its parameters.
+WEAK = 10.0
 ROUNDS = 12
 SETTLED = 0.1  # of its deviation: what a round may still move an estimate by
 
@@ -125,7 +128,7 @@ def find_faulty(solution: Solution) -> BoolArray:
 def prior_widths(model: Model, sizes: Array) -> Array:
     """Deviations (parameters,) of the weak prior about a start: what the readings do not show stays
     there, and is not known any better."""
-    return np.where(is_placed(model), PLACED, LOOSE * sizes)
+    return np.where(is_placed(model), PLACED, WEAK * sizes)
 
 
 def _agreeing(

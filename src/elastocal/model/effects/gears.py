@@ -161,7 +161,7 @@ class GearSpectrum(DrivenEffect):
         known = range(1, MOST_LINES + 1)
         lines = max((k for k in known if f"order_{k}" in stated), default=1)
         orders = (Setting(f"order_{k}", "order", 0.0, 0.0, 1000.0) for k in known[:lines])
-        spreads = (Setting(f"order_sd_{k}", "range", 0.0, 0.0, 10.0) for k in known[:lines])
+        spreads = (Setting(f"order_sd_{k}", "range", 0.0, 0.0, 1000.0) for k in known[:lines])
         return (
             Setting("spectrum_size_rad", "range", 5e-5, 1e-12, 1.0),
             Setting("spectrum_centre_rad", "range", 0.0, -100.0, 100.0),
