@@ -52,6 +52,12 @@ def test_an_origin_is_changed_where_it_stands(tmp_path: Path) -> None:
     assert text.result() == expected
 
 
+def test_a_carriage_return_alone_ends_a_line(tmp_path: Path) -> None:
+    """As XML has it; in the file written it would be a control character."""
+    old = text_of(tmp_path, ODD.replace("\r\n", "\n").replace("\n", "\r")).result()
+    assert old == ODD.replace("\r\n", "\n")
+
+
 def changed_lines(old: str, new: str) -> list[str]:
     lines = difflib.ndiff(old.splitlines(), new.splitlines())
     return [line for line in lines if line[:1] in "+-"]

@@ -178,7 +178,8 @@ class XmlText:
     """
 
     def __init__(self, path: Path, data: bytes) -> None:
-        self.data = as_utf8(path, data)
+        # A carriage return by itself ends a line in XML, and is a control character elsewhere.
+        self.data = re.sub(rb"\r(?!\n)", b"\n", as_utf8(path, data))
         self.tags: list[Tag] = []
         self.end = len(self.data)
         self._inserted: list[tuple[int, int, bytes]] = []
