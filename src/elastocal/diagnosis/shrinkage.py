@@ -229,17 +229,22 @@ class Confirmation:
     def _refitted(self) -> dict[str, float]:
         """Values by name of the exact model with all items that have a name, fitted to the
         readings: where a geometry is sought, its columns are no line to it."""
-        known = [item for item in self.chosen.items if item.known]
+        known = [self.chosen.items[n] for n in self._known]
         fitted = fit_extended(self.dataset, self.chosen, known)
         return dict(zip(fitted.model.names, fitted.x.tolist(), strict=True))
+
+    @cached_property
+    def _whole(self) -> tuple[Projection, Projection]:
+        """The data with all items under all the noise, and under the instrument's alone."""
+        chosen = self.chosen
+        data = with_items(self.dataset, chosen.items, _wide(chosen.scales))
+        return project(data, chosen.noise), project(data, chosen.noise.of_instrument())
 
     def parameters(self, k: int) -> tuple[FittedParameter, ...]:
         """The values of item k's parameters: of the exact fit by the instrument's noise, and one
         step from there by all the noise that was found."""
-        items, what, noise = self.chosen.items, self.chosen.items[k].what, self.chosen.noise
+        items, what, (at, plain) = self.chosen.items, self.chosen.items[k].what, self._whole
         assert isinstance(what, Hypothesis)
-        data = with_items(self.dataset, items, _wide(self.chosen.scales))
-        at, plain = project(data, noise), project(data, noise.of_instrument())
         span, size = self._span(items, k), self.dataset.sizes[what.key]
         step = (at.beta - plain.beta)[span] * size
         std = np.linalg.norm(at.beta_deviation[:, span], axis=0) * size
@@ -258,8 +263,7 @@ class Confirmation:
         `stays` (m²) is what is there without a name.
         """
         dataset, chosen, scales = self.dataset, self.chosen, self.chosen.scales
-        known = [n for n, item in enumerate(chosen.items) if item.known]
-        predicted = self._before([n for n in known if n != k]), self._after(known)
+        predicted = self._before([n for n in self._known if n != k]), self._after
         truths = [
             self._truth(self._instead(k, item), scales, k, rivals[0][1] * share)
             for item, share in other_settings(dataset, chosen, k)
@@ -270,6 +274,10 @@ class Confirmation:
                 truths.append(self._truth(rival.items, rival.scales, k, share))
         pose, change = np.nonzero(self._used)[0], between_visits(dataset, chosen, k)
         return shrinkage(predicted, truths, pose, stays, change, rng)
+
+    @property
+    def _known(self) -> list[int]:
+        return [n for n, item in enumerate(self.chosen.items) if item.known]
 
     def _instead(self, k: int, item: Item) -> tuple[Item, ...]:
         return (*self.chosen.items[:k], item, *self.chosen.items[k + 1 :])
@@ -298,9 +306,10 @@ class Confirmation:
         together = left_out_together(self.dataset, self.chosen)
         return self._lengths(data.r - left_out_residual(at, together))
 
-    def _after(self, members: Sequence[int]) -> Array:
+    @cached_property
+    def _after(self) -> Array:
         """What the model with all items that have a name predicts."""
-        data, at = self._fit(members)
+        data, at = self._fit(self._known)
         return self._lengths(data.X @ at.beta)
 
     def _fit(self, members: Sequence[int]) -> tuple[NoisyData, Projection]:
@@ -314,28 +323,36 @@ class Confirmation:
     ) -> Truth:
         """If that set is true."""
         data, noise = with_items(self.dataset, items, _wide(scales)), self.chosen.noise
-        slopes = self._by_constants(items[k], project(data, noise).beta[self._span(items, k)])
+        at = project(data, noise)
+        slopes = self._by_constants(items[k], at.beta[self._span(items, k)])
+        if slopes.shape[2]:
+            data = data.with_columns(slopes, np.ones(slopes.shape[2]))
+            at = project(data, noise)
         # What has no name stays with both models, and is told by its size.
-        own = np.ones(data.X.shape[2] + slopes.shape[2], dtype=bool)
+        own = np.ones(data.X.shape[2], dtype=bool)
         for n, other in enumerate(items):
             own[self._span(items, n)] = other.known
-        data = data.with_columns(slopes, np.ones(slopes.shape[2]))
-        at, W = project(data, noise), self._lengths(data.X)[:, :, own]
+        W = self._lengths(data.X)[:, :, own]
         spread = W @ at.beta_deviation[:, own].T
         return Truth(W @ at.beta[own], spread * self._grown(at, spread), probability)
 
     def _grown(self, at: Projection, spread: Array) -> Array:
         """By how much (readings, 1, 1) more is uncertain of each configuration where it is left
         out of the fit: its readings less what they are predicted to be have covariance P_cc⁻¹."""
-        V, all_ = (
-            self._lengths(np.diagonal(each, axis1=1, axis2=2)).sum(axis=1)
-            for each in (covariance(self.chosen.data, self.chosen.noise), np.linalg.inv(at.P))
-        )
+        all_ = self._of_readings(np.asarray(np.linalg.inv(at.P)))
         pose = np.nonzero(self._used)[0]
         own, left_out = (
-            np.bincount(pose, each) for each in ((spread**2).sum(axis=(1, 2)), all_ - V)
+            np.bincount(pose, each) for each in ((spread**2).sum(axis=(1, 2)), all_ - self._noise)
         )
         return np.asarray(np.sqrt(left_out / np.maximum(own, 1e-300))[pose, None, None])
+
+    @cached_property
+    def _noise(self) -> Array:
+        return self._of_readings(covariance(self.chosen.data, self.chosen.noise))
+
+    def _of_readings(self, variance: Array) -> Array:
+        """Of packed covariances (C, m, m) the sum (readings,) over a reading's components."""
+        return np.asarray(self._lengths(np.diagonal(variance, axis1=1, axis2=2)).sum(axis=1))
 
     def _by_constants(self, item: Item, beta: Array) -> Array:
         """Difference quotients (C, m, k) in the item's constants that vary smoothly, each by the
