@@ -7,7 +7,7 @@ from collections.abc import Iterator, KeysView
 from dataclasses import dataclass, field
 from functools import cached_property
 from pathlib import Path
-from typing import Any, Literal
+from typing import TYPE_CHECKING, Any, Literal
 
 import numpy as np
 from numpy.typing import ArrayLike
@@ -44,8 +44,11 @@ from elastocal.model.calibrated import (
 )
 from elastocal.model.calibrated_tool import CalibratedTool, tool_point
 from elastocal.model.manipulator import Model
-from elastocal.model.observations import COMPONENTS, Observations
+from elastocal.model.observations import COMPONENTS, Observations, observe
 from elastocal.units import Array, IntArray, microns
+
+if TYPE_CHECKING:
+    from pandas import DataFrame
 
 SCHEMA = "elastocal/identification/1"
 FEW_POSES = 64  # of those over the workspace, for an rms
@@ -90,6 +93,12 @@ class Estimate:
         """Do the data determine it alone?"""
         return self.value is not None
 
+    def __str__(self) -> str:
+        if self.value is None or self.std is None:
+            others = ", ".join(self.combined_with)
+            return f"{self.name}: no value" + (f", combined with {others}" if others else "")
+        return f"{self.name} = {with_std(self.value, self.std)} {self.unit}"
+
 
 @dataclass(frozen=True)
 class Combination:
@@ -106,6 +115,9 @@ class Combination:
     std: float
     ci95: tuple[float, float]
     held: dict[str, float] = field(default_factory=dict)
+
+    def __str__(self) -> str:
+        return f"{self.expression} = {with_std(self.value, self.std)} {self.unit}"
 
     @property
     def expression(self) -> str:
@@ -124,6 +136,16 @@ class Combination:
             "expression": self.expression, "unit": self.unit, "value": self.value,
             "std": _finite(self.std), "ci95": [_finite(v) for v in self.ci95],
         }  # fmt: skip
+
+
+def with_std(value: float, std: float) -> str:
+    """ "4.167e-07 ± 0.014e-07" as "(4.167 ± 0.014)e-07": the digits that the deviation allows."""
+    if not (math.isfinite(std) and std > 0):
+        return f"{value:.6g}"
+    power = math.floor(math.log10(max(abs(value), std)))
+    digits = max(power - math.floor(math.log10(std)) + 1, 1)
+    shown = f"{value / 10.0**power:.{digits}f} ± {std / 10.0**power:.{digits}f}"
+    return f"({shown})e{power:+03d}"
 
 
 def deviation(name: str, held: float | None, digits: int = 6) -> str:
@@ -593,9 +615,16 @@ class Calibration(Result):
         tool = CalibratedTool(self.arm, tool_point(model.cell, point))
         return position_at(tool, model.table(q, load), self.noise, self.spread)
 
-    def predict(self, q: ArrayLike, load: ArrayLike | None = None) -> Array:
-        """Where the tool is at any pose, (n, 3) in m: `position` without its uncertainty."""
-        return self.position(q, load).position
+    def predict(
+        self, q: ArrayLike | Measurements | DataFrame, load: ArrayLike | None = None
+    ) -> Array:
+        """Where the tool is at any pose, (n, 3) in m: `position` without its uncertainty; of a
+        table (measurements or a data frame) what its readings should be, (n, components)."""
+        table = self.model.read(q) if hasattr(q, "to_csv") else q
+        if isinstance(table, Measurements):
+            observed = observe(table, self.model.observe)
+            return self.model.predict(table, self.x, observed).reshape(-1, observed.size)
+        return self.position(table, load).position
 
     @property
     def params(self) -> dict[str, float]:
