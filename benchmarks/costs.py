@@ -28,7 +28,7 @@ from elastocal.cell.work_cell import read_cell
 from elastocal.measurements import write_measurements
 from elastocal.model.chain import joint_limits
 from elastocal.model.manipulator import Model
-from elastocal.simulation.simulate import simulate
+from elastocal.simulation import simulate
 
 EXAMPLE = HERE.parent / "experiment_design" / "blind_diagnosis" / "example"
 ROWS = {"tiny": (1000,), "short": (10_000,), "full": (10_000, 1_000_000)}

@@ -28,9 +28,8 @@ from elastocal.export.export import export
 from elastocal.export.mjcf_file import MujocoRest
 from elastocal.export.urdf_file import urdf_flanges
 from elastocal.measurements import Measurements
-from elastocal.model.chain import finite_ranges, joint_limits
+from elastocal.model.chain import extent, finite_ranges, joint_limits
 from elastocal.model.dh import read_dh
-from elastocal.model.plausible import extent
 from elastocal.model.rigid import nominal_flanges
 from elastocal.saving import wish_of
 from elastocal.units import Array, rotation_from_rpy

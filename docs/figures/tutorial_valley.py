@@ -12,7 +12,7 @@ from style import ROOT, Colours, draw, plt
 from elastocal.cell.work_cell import read_cell
 from elastocal.measurements import read_plan
 from elastocal.model.manipulator import Model
-from elastocal.simulation.simulate import expand_plan, simulate, values_from
+from elastocal.simulation import expand_plan, simulate, values_from
 
 TUTORIAL = ROOT / "docs" / "tutorial"
 TRUTH = {

@@ -11,9 +11,9 @@ from elastocal.cell.work_cell import Cell, read_cell
 from elastocal.demo import example
 from elastocal.model.arm import ParameterSpec, Setting
 from elastocal.model.chain import Chain
-from elastocal.model.choice import load_chain
 from elastocal.model.effects.base import Effect
 from elastocal.model.effects.catalogue import CATALOGUE
+from elastocal.model.manipulator import load_chain
 from elastocal.report.formatting import display
 
 STAGES = {

@@ -25,7 +25,7 @@ from elastocal.model.chain import joint_limits
 from elastocal.model.manipulator import Model
 from elastocal.model.observations import polar_axes
 from elastocal.model.urdf import read_urdf
-from elastocal.simulation.simulate import expand_plan, simulate
+from elastocal.simulation import expand_plan, simulate
 
 EFFECTS = ("base_frame", "joint_offset", "link_geometry", "marker_position", "joint_compliance")
 COMPLIANCE = (3.5e-7, 0.287e-6, 0.416e-6, 2.786e-6, 3.483e-6, 2.074e-6)  # rad/(N m)

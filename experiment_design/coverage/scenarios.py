@@ -19,7 +19,7 @@ from elastocal.identification.noise_structure import Readings
 from elastocal.measurements import read_plan
 from elastocal.model.manipulator import Model
 from elastocal.model.observations import polar_axes
-from elastocal.simulation.simulate import expand_plan, values_from
+from elastocal.simulation import expand_plan, values_from
 
 EFFECT = 80e-6  # m, configuration effect in each direction
 OUTLIERS = 0.05, 1e-3, 1e-2  # share of readings, least and largest error in m

@@ -21,7 +21,7 @@ from scipy.stats import qmc
 
 from elastocal.cell.work_cell import read_cell
 from elastocal.model.chain import joint_limits
-from elastocal.model.choice import load_chain
+from elastocal.model.manipulator import load_chain
 from elastocal.planning.collision import END
 from elastocal.planning.feasibility import Feasibility
 

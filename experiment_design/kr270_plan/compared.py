@@ -25,7 +25,7 @@ from elastocal.planning.information import plan_forces, rows_of
 from elastocal.planning.plan import Plan
 from elastocal.planning.setup import FeasiblePool, Known, Setup, set_up
 from elastocal.planning.test_poses import TargetPoses, test_poses
-from elastocal.simulation.simulate import simulate, values_from
+from elastocal.simulation import simulate, values_from
 
 HERE = Path(__file__).parent
 DEMO = Path(str(files("elastocal.demo")))

@@ -13,7 +13,7 @@ from elastocal.demo.example import LOAD_N, REPEATS, published_compliances, readi
 from elastocal.measurements import read_plan
 from elastocal.model.manipulator import Model
 from elastocal.model.observations import observe
-from elastocal.simulation.simulate import expand_plan, simulate, values_from
+from elastocal.simulation import expand_plan, simulate, values_from
 
 DEMO = Path(str(files("elastocal.demo")))
 

@@ -32,7 +32,7 @@ from elastocal.model.chain import Chain, finite_ranges
 from elastocal.model.manipulator import Model
 from elastocal.model.observations import observe
 from elastocal.model.urdf import read_urdf
-from elastocal.simulation.simulate import expand_plan, simulate
+from elastocal.simulation import expand_plan, simulate
 
 ARM_FILES = Path(__file__).parent.parent / "blind_diagnosis" / "arms"
 ARMS = {

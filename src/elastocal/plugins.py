@@ -31,7 +31,13 @@ from elastocal.model.arm import Arm, ParameterSpec, Setting, Spring
 from elastocal.model.chain import Chain
 from elastocal.model.effects import catalogue
 from elastocal.model.effects.base import (
+    BaseMotion,
+    DrivenEffect,
     Effect,
+    JointMotion,
+    LinkFrame,
+    LinkLength,
+    MarkerMotion,
     Symbols,
     index,
     joints,
@@ -40,14 +46,6 @@ from elastocal.model.effects.base import (
     turning_joints,
 )
 from elastocal.model.effects.compliances import LoadedEffect, TorqueEffect, add_deflection
-from elastocal.model.effects.driven import (
-    BaseMotion,
-    DrivenEffect,
-    JointMotion,
-    LinkFrame,
-    LinkLength,
-    MarkerMotion,
-)
 from elastocal.planning import criteria
 from elastocal.planning.criteria import (
     CriterionInputs,

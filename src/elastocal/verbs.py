@@ -176,7 +176,7 @@ def design_request(
 
     Raises InputError that names the keyword.
     """
-    from elastocal.model.choice import cell_of
+    from elastocal.model.effects.catalogue import cell_of
     from elastocal.model.manipulator import Model
     from elastocal.planning.candidates import read_pins
     from elastocal.planning.design import DesignOptions
@@ -387,8 +387,8 @@ def simulated(
 
     from elastocal.identification.start import check_limits
     from elastocal.model.arm import given_force
-    from elastocal.simulation.simulate import draw_errors, expand_plan, values_from
-    from elastocal.simulation.simulate import simulate as run
+    from elastocal.simulation import draw_errors, expand_plan, values_from
+    from elastocal.simulation import simulate as run
 
     force = given_force(load)
     told = f"{option('draw')} takes a factor of the typical sizes, 0 or more; found {draw:g}"

@@ -15,7 +15,7 @@ from elastocal.errors import InputError
 from elastocal.measurements import Measurements, read_plan
 from elastocal.model.chain import finite_ranges, joint_limits
 from elastocal.model.manipulator import Model
-from elastocal.simulation.simulate import expand_plan, simulate
+from elastocal.simulation import expand_plan, simulate
 
 NARROW = {"joint3.eccentricity_sin": 1.5e-4, "joint3.eccentricity_cos": -1e-4}
 

@@ -34,7 +34,7 @@ from elastocal.identification.options import Options
 from elastocal.identification.solve import reduce
 from elastocal.model.manipulator import Model
 from elastocal.model.urdf import read_urdf
-from elastocal.simulation.simulate import simulate
+from elastocal.simulation import simulate
 
 SIGMA = 5e-5
 KR270_LOADS = [[0, 0, 0], [0, 0, -2600], [800, 0, -2600]]

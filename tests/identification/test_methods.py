@@ -22,7 +22,7 @@ from elastocal.identification.identify import identify
 from elastocal.identification.options import METHODS, ROBUST, Options
 from elastocal.model.manipulator import Model
 from elastocal.model.observations import observe
-from elastocal.simulation.simulate import simulate
+from elastocal.simulation import simulate
 
 SIGMA = 5e-5
 MARKERS = {"M1": np.array([0.1, 0, 0]), "M2": np.array([0, 0.1, 0.1])}

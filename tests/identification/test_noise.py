@@ -15,7 +15,7 @@ from elastocal.identification.options import Options
 from elastocal.identification.weighted_problem import weights_for
 from elastocal.model.manipulator import Model
 from elastocal.model.observations import observe
-from elastocal.simulation.simulate import simulate
+from elastocal.simulation import simulate
 
 POLAR = Tracker(np.array([0.3, -0.2, 0.1]), PolarNoise(2e-6, 3e-6, 5e-6, 2e-5))
 AXIS = Tracker(noise=CartesianNoise(np.array([1e-5, 2e-5, 3e-5])))

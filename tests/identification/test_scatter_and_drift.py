@@ -15,7 +15,7 @@ from elastocal.identification.result import Calibration
 from elastocal.identification.visit_record import in_random_order
 from elastocal.model.manipulator import Model
 from elastocal.report.judgement_view import noise_model_line
-from elastocal.simulation.simulate import simulate
+from elastocal.simulation import simulate
 
 SIGMA, SCATTER, DRIFT, LASTING = 2e-5, 1e-4, 1e-4, 0.2
 MARKERS = {"M1": np.array([0.3, 0, 0.1]), "M2": np.array([-0.2, 0.2, 0.1])}

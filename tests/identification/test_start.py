@@ -19,7 +19,7 @@ from support.cells import random_poses
 from elastocal.cell.arm_description import Tracker
 from elastocal.identification.start import start_values
 from elastocal.model.manipulator import Model
-from elastocal.simulation.simulate import simulate
+from elastocal.simulation import simulate
 
 SIGMA = 5e-5
 

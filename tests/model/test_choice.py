@@ -18,8 +18,7 @@ from support.cells import (
 from elastocal.cell.arm_description import Nominal, Tool
 from elastocal.cell.work_cell import Cell
 from elastocal.errors import InputError
-from elastocal.model.choice import choose_effects
-from elastocal.model.effects.catalogue import CATALOGUE
+from elastocal.model.effects.catalogue import CATALOGUE, choose_effects
 from elastocal.model.manipulator import Model
 
 NAMES = sorted(set(CATALOGUE) - {"payload", "link_gravity"})

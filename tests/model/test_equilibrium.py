@@ -30,7 +30,7 @@ from support.robots import KR270
 from elastocal.cell.arm_description import Nominal
 from elastocal.errors import ElastocalError
 from elastocal.model.chain import Chain, Joint, LinkMass
-from elastocal.model.effects.compliances import transverse_axes
+from elastocal.model.effects.placements import transverse_axes
 from elastocal.model.manipulator import Model
 from elastocal.units import Array
 

@@ -18,7 +18,7 @@ from elastocal.model.manipulator import Model
 from elastocal.planning.information import PoseInformation, measured, next_number
 from elastocal.planning.plan import predicted
 from elastocal.planning.setup import Known
-from elastocal.simulation.simulate import expand_plan, simulate
+from elastocal.simulation import expand_plan, simulate
 
 CHAIN = kr270_chain()
 BOTH = np.array([[0.0, 0, 0], DOWN])

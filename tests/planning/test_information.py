@@ -17,7 +17,7 @@ from elastocal.measurements import Measurements
 from elastocal.model.manipulator import Model
 from elastocal.model.observations import observe
 from elastocal.planning.information import PoseInformation, pose_covariance
-from elastocal.simulation.simulate import expand_plan, simulate
+from elastocal.simulation import expand_plan, simulate
 
 POLAR = PolarNoise(10e-6, 0.3e-6, 15e-6, 6e-6)
 AXIS = CartesianNoise(np.array([10e-6, 15e-6, 20e-6]))

@@ -18,7 +18,7 @@ from elastocal.model.manipulator import Model
 from elastocal.planning import information as parameters
 from elastocal.planning.information import PoseInformation
 from elastocal.planning.setup import Known
-from elastocal.simulation.simulate import simulate
+from elastocal.simulation import simulate
 
 CHAIN = kr270_chain()
 BOTH = np.array([[0.0, 0, 0], DOWN])

@@ -22,7 +22,7 @@ from elastocal.measurements import Measurements
 from elastocal.planning import test_poses as target_poses
 from elastocal.planning.design import DesignOptions, design
 from elastocal.planning.plan import Plan
-from elastocal.simulation.simulate import expand_plan, simulate
+from elastocal.simulation import expand_plan, simulate
 
 CHAIN = kr270_chain()
 BOTH = np.array([[0.0, 0, 0], DOWN])

@@ -34,7 +34,7 @@ from elastocal.model.urdf import read_urdf
 from elastocal.planning import test_poses as target_poses
 from elastocal.planning.setup import Known
 from elastocal.planning.test_poses import TargetPoses
-from elastocal.simulation.simulate import expand_plan, simulate
+from elastocal.simulation import expand_plan, simulate
 
 CHAIN = kr270_chain()
 BOTH = np.array([[0.0, 0, 0], DOWN])

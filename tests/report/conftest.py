@@ -17,7 +17,7 @@ from elastocal.model.manipulator import Model
 from elastocal.planning.design import DesignOptions, design
 from elastocal.planning.plan import Plan
 from elastocal.report import figures
-from elastocal.simulation.simulate import simulate, values_from
+from elastocal.simulation import simulate, values_from
 
 EFFECTS = ("base_frame", "joint_offset", "joint_compliance", "marker_position")
 SCRIPT = "<script>alert(1)</script>"

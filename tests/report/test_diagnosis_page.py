@@ -20,7 +20,7 @@ from elastocal.model.manipulator import Model
 from elastocal.model.observations import observe
 from elastocal.report.figures import effect_shapes
 from elastocal.report.page import page_of, write_page
-from elastocal.simulation.simulate import simulate
+from elastocal.simulation import simulate
 
 
 @pytest.fixture(scope="module")

@@ -15,7 +15,7 @@ from support.robots import packaged_urdf
 
 from elastocal.cell.arm_description import Robot
 from elastocal.cell.workspace_rules import Solid, Workspace
-from elastocal.model.choice import load_chain
+from elastocal.model.manipulator import load_chain
 from elastocal.report.arm_view import (
     frames_at,
     in_script,

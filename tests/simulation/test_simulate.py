@@ -18,7 +18,7 @@ from elastocal.cell.arm_description import (
 from elastocal.errors import InputError
 from elastocal.model.manipulator import Model
 from elastocal.model.observations import observe, position_covariance
-from elastocal.simulation.simulate import draw_errors, expand_plan, simulate, values_from
+from elastocal.simulation import draw_errors, expand_plan, simulate, values_from
 
 AXIS = Tracker(noise=CartesianNoise(np.array([1e-5, 2e-5, 5e-5])))
 POLAR = Tracker(np.array([3.0, 0.5, 1.0]), PolarNoise(2e-6, 5e-6, 1e-5, 3e-5))

@@ -22,7 +22,7 @@ from elastocal.identification.identify import identify
 from elastocal.identification.options import Options
 from elastocal.measurements import read_plan
 from elastocal.model.manipulator import Model
-from elastocal.simulation.simulate import expand_plan, simulate, values_from
+from elastocal.simulation import expand_plan, simulate, values_from
 
 study = study_of(FOLDER)
 NAMES = {s.key: s for s in scenarios.SCENARIOS}

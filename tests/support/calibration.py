@@ -17,7 +17,7 @@ from elastocal.identification.result import Calibration
 from elastocal.measurements import Measurements
 from elastocal.model.chain import Chain, Joint, LinkMass
 from elastocal.model.manipulator import Model
-from elastocal.simulation.simulate import simulate
+from elastocal.simulation import simulate
 from elastocal.units import Array
 
 GEOMETRY = ("base_frame", "joint_offset", "link_geometry", "marker_position")

@@ -28,7 +28,7 @@ from elastocal.cell.work_cell import Cell
 from elastocal.measurements import Measurements
 from elastocal.model.chain import Chain, Joint
 from elastocal.model.manipulator import Model
-from elastocal.simulation.simulate import draw_errors, simulate, values_from
+from elastocal.simulation import draw_errors, simulate, values_from
 
 Array = np.ndarray
 FITTED = ("base_frame", "joint_offset", "joint_compliance", "marker_position")

@@ -19,7 +19,7 @@ from elastocal.identification.weighted_problem import weights_for
 from elastocal.measurements import Measurements
 from elastocal.model.manipulator import Model
 from elastocal.model.observations import observe, subset
-from elastocal.simulation.simulate import simulate
+from elastocal.simulation import simulate
 from elastocal.units import Array
 
 SIGMA = 3e-5

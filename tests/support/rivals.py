@@ -16,7 +16,7 @@ from elastocal.diagnosis.diagnosis import Candidate, EffectAt, NoiseFloor
 from elastocal.measurements import Measurements
 from elastocal.model.chain import finite_ranges, joint_limits
 from elastocal.model.manipulator import Model
-from elastocal.simulation.simulate import simulate, values_from
+from elastocal.simulation import simulate, values_from
 
 Key = tuple[str, str]
 

@@ -64,7 +64,7 @@ def identify(
             repeatable, else as [require] of the cell says. Exit code 3 where one is exceeded.
         details: Also method, noise, residuals, intervals, all lists.
     """
-    from elastocal.model.choice import cell_of
+    from elastocal.model.effects.catalogue import cell_of
     from elastocal.report.terminal import print_report
 
     run.writes(output, report, residuals, certificate)
@@ -160,7 +160,7 @@ def diagnose(
     """
     from elastocal.diagnosis.diagnosis import publish
     from elastocal.files import together
-    from elastocal.model.choice import cell_of
+    from elastocal.model.effects.catalogue import cell_of
     from elastocal.report.page import write_page
     from elastocal.report.terminal import print_report
     from elastocal.saving import save_diagnosis
@@ -271,7 +271,7 @@ def next_command(
     """
     from elastocal.diagnosis.next_poses import next_poses
     from elastocal.files import together
-    from elastocal.model.choice import cell_of
+    from elastocal.model.effects.catalogue import cell_of
     from elastocal.report.terminal import print_report
     from elastocal.saving import beside, save_plan
 

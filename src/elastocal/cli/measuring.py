@@ -66,7 +66,7 @@ def init(
     from elastocal.cell.work_cell import read_cell
     from elastocal.importing.first_cell import init as write
     from elastocal.importing.first_cell import notes_of, reach_of
-    from elastocal.model.choice import load_chain
+    from elastocal.model.manipulator import load_chain
 
     run.writes(output)
     run.reads(robot)
@@ -102,7 +102,7 @@ def effects(
         cell: Cell file (TOML); default: the KR 270 of the demo.
     """
     from elastocal.demo import example
-    from elastocal.model.choice import cell_of
+    from elastocal.model.effects.catalogue import cell_of
     from elastocal.report.effect_names import effect_entries
 
     known = cell_of(cell or Path(example.__file__).parent / "cell.toml", run.plugins)
@@ -116,7 +116,8 @@ def effects(
 def _print_effects(screen: Console, cell: Any, entries: Any) -> None:
     from rich.padding import Padding
 
-    from elastocal.model.choice import load_chain, names_told
+    from elastocal.model.chain import names_told
+    from elastocal.model.manipulator import load_chain
     from elastocal.report.effect_names import effect_lines
 
     stage = ""
@@ -206,7 +207,7 @@ def design(
         cell_out: Cell file to write, with what [design.choose] has chosen.
     """
     from elastocal.files import together
-    from elastocal.model.choice import cell_of
+    from elastocal.model.effects.catalogue import cell_of
     from elastocal.planning.candidates import plan_and_names
     from elastocal.report.terminal import print_report
     from elastocal.saving import beside
@@ -317,7 +318,7 @@ def _check_programs(cell: Cell, programs: list[Path]) -> None:
     import numpy as np
 
     from elastocal.cell.plan_wishes import Motion
-    from elastocal.model.choice import load_chain
+    from elastocal.model.manipulator import load_chain
     from elastocal.planning.execution import Execution
 
     if programs:

@@ -47,7 +47,7 @@ def run_demo(
     from elastocal.cell.work_cell import read_cell
     from elastocal.identification.identify import identify
     from elastocal.model.manipulator import Model
-    from elastocal.simulation.simulate import expand_plan, simulate, values_from
+    from elastocal.simulation import expand_plan, simulate, values_from
 
     progress("copying the example")
     cell_path, plan_path = _copy_example(folder)

@@ -17,9 +17,8 @@ from elastocal.diagnosis.hypotheses import Hypothesis, RegressorDirection, cell_
 from elastocal.diagnosis.noise_floor import NoiseValues, project
 from elastocal.diagnosis.unknown import Generic
 from elastocal.measurements import Measurements
-from elastocal.model.effects.base import Effect, Stage, index, turning_joints
+from elastocal.model.effects.base import DrivenEffect, Effect, Stage, index, turning_joints
 from elastocal.model.effects.compliances import LoadedEffect
-from elastocal.model.effects.driven import DrivenEffect
 from elastocal.model.effects.gears import MOST_LINES, GearRipple, GearSpectrum
 from elastocal.model.effects.smooth import JointCurve, ResidualField
 from elastocal.units import Array

@@ -59,7 +59,7 @@ from elastocal.engine.mixed import ROUNDING
 from elastocal.engine.sizes import beside
 from elastocal.model.effects.base import index
 from elastocal.model.effects.gears import GearRipple, GearSpectrum
-from elastocal.model.effects.gravity_sag import GravitySag, LinkWeights
+from elastocal.model.effects.loads import GravitySag, LinkWeights
 from elastocal.model.effects.smooth import JointCurve, ResidualField
 from elastocal.units import Array, Progress
 

@@ -31,7 +31,7 @@ from elastocal.model.manipulator import Model
 from elastocal.model.observations import observe
 from elastocal.planning.candidates import draw
 from elastocal.planning.feasibility import Feasibility
-from elastocal.simulation.simulate import simulate
+from elastocal.simulation import simulate
 from elastocal.units import Array, BoolArray, IntArray
 
 CANDIDATES, FEWEST_POSES = 256, 64

@@ -19,22 +19,22 @@ from elastocal.diagnosis.diagnosis import Diagnosis, FoundEffect, Untested
 from elastocal.measurements import Measurements, by_rows, in_any_order
 from elastocal.model.arm import Arm, ParameterSpec, Setting, row_inputs
 from elastocal.model.chain import Chain
-from elastocal.model.choice import set_constants
-from elastocal.model.effects.base import Effect, Stage, index
-from elastocal.model.effects.catalogue import CATALOGUE
-from elastocal.model.effects.changes_in_time import ThermalExpansion
-from elastocal.model.effects.compliances import JointCompliance
-from elastocal.model.effects.driven import (
+from elastocal.model.effects.base import (
     BaseMotion,
     DrivenEffect,
+    Effect,
     Entry,
     JointMotion,
     LinkFrame,
     LinkLength,
     MarkerMotion,
+    Stage,
+    index,
 )
-from elastocal.model.effects.gears import GearSpectrum
-from elastocal.model.effects.play import BY_ORDER, Backlash, Hysteresis
+from elastocal.model.effects.catalogue import CATALOGUE, set_constants
+from elastocal.model.effects.compliances import JointCompliance
+from elastocal.model.effects.gears import BY_ORDER, Backlash, GearSpectrum, Hysteresis
+from elastocal.model.effects.placements import ThermalExpansion
 from elastocal.model.effects.smooth import JointCurve, ResidualField
 from elastocal.model.evaluate import BatchFunction
 from elastocal.model.manipulator import Model

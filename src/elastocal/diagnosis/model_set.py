@@ -26,7 +26,7 @@ from elastocal.diagnosis.noise_floor import (
     project,
 )
 from elastocal.diagnosis.unknown import Generic
-from elastocal.model.effects.play import Backlash
+from elastocal.model.effects.gears import Backlash
 from elastocal.model.evaluate import ahead
 from elastocal.model.manipulator import Model
 from elastocal.units import Array

@@ -25,7 +25,7 @@ from elastocal.diagnosis.model_set import Item, ModelSet, distances, settings_of
 from elastocal.diagnosis.noise_floor import NoiseValues, NoisyData
 from elastocal.diagnosis.reading_faults import OutlierScreening
 from elastocal.identification.single_readings import BEYOND, single_readings
-from elastocal.model.effects.play import Backlash
+from elastocal.model.effects.gears import Backlash
 from elastocal.model.observations import subset
 
 # From scores to an answer: explained, ambiguous, unknown, or nothing significant.

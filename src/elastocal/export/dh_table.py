@@ -13,8 +13,8 @@ from elastocal.cell.arm_description import Robot
 from elastocal.export.exportable import ExportNumbers
 from elastocal.model import dh
 from elastocal.model.chain import Chain, Joint
-from elastocal.model.effects.compliances import transverse_axes
-from elastocal.model.ur_table import ENDINGS
+from elastocal.model.dh import UR_ENDINGS
+from elastocal.model.effects.placements import transverse_axes
 from elastocal.tables import csv_text
 from elastocal.units import Array
 
@@ -243,7 +243,7 @@ def _decompose(
 def _nominal_rows(robot: Robot, chain: Chain, convention: Convention) -> list[DhRow | None]:
     """What the user's own table says of links 0 … n; None where it is in another convention."""
     nothing: list[DhRow | None] = [None] * (chain.n_joints + 1)
-    if robot.dh is None or robot.dh_convention != convention or robot.dh.suffix in ENDINGS:
+    if robot.dh is None or robot.dh_convention != convention or robot.dh.suffix in UR_ENDINGS:
         return nothing
     table = dh.read_dh_table(robot.dh)
     n = len(table.row)

@@ -15,8 +15,8 @@ from elastocal.errors import ElastocalError, InputError
 from elastocal.export.exportable import ExportNumbers, SpringValue, nothing, numbers, placed_body
 from elastocal.export.urdf_file import PREFIX, tool_frames
 from elastocal.model.chain import Chain, Joint, LinkMass
-from elastocal.model.effects.compliances import transverse_axes
 from elastocal.model.effects.loads import STANDARD_GRAVITY
+from elastocal.model.effects.placements import transverse_axes
 from elastocal.model.mjcf import SPRING, MjcfArm, import_mujoco, mjcf_bytes, transform
 from elastocal.model.xml_file import Tag, XmlText, comment, element
 from elastocal.text import listed

@@ -42,7 +42,7 @@ from elastocal.identification.weighted_problem import (
 )
 from elastocal.measurements import NEVER_YET, Measurements, order_contradicted
 from elastocal.model.effects.catalogue import effect_of
-from elastocal.model.effects.play import BY_ORDER
+from elastocal.model.effects.gears import BY_ORDER
 from elastocal.model.manipulator import Model
 from elastocal.model.observations import Observations, observe, subset
 from elastocal.units import Array, Progress

@@ -9,7 +9,7 @@ import numpy as np
 from scipy import special
 
 from elastocal.measurements import Measurements, visits
-from elastocal.model.effects.driven import JointMotion
+from elastocal.model.effects.base import JointMotion
 from elastocal.model.manipulator import Model
 from elastocal.model.observations import Observations
 from elastocal.units import Array, BoolArray, IntArray

@@ -46,7 +46,7 @@ from elastocal.importing.records import (
 )
 from elastocal.measurements import Measurements, families, read_measurements
 from elastocal.model.chain import joint_limits
-from elastocal.model.choice import load_chain
+from elastocal.model.manipulator import load_chain
 from elastocal.tables import Family, column, csv_text
 from elastocal.text import did_you_mean, listed, quoted
 from elastocal.units import Array, IntArray, convert, quantities

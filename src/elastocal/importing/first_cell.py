@@ -19,14 +19,13 @@ from elastocal.cell.arm_description import SOURCES, Convention, Robot
 from elastocal.cell.work_cell import Cell, read_cell
 from elastocal.errors import InputError, option, require
 from elastocal.files import atomic_writer
-from elastocal.model import ur_table
-from elastocal.model.chain import Chain, Joint, finite_ranges
-from elastocal.model.choice import clashing, load_chain, names_told
+from elastocal.model.chain import Chain, Joint, clashing, finite_ranges, jaw_told, names_told
+from elastocal.model.dh import UR_ENDINGS
 from elastocal.model.effects.compliances import JointCompliance
 from elastocal.model.effects.gears import JointOffset
 from elastocal.model.effects.placements import BaseFrame, LinkGeometry, MarkerPosition
+from elastocal.model.manipulator import load_chain
 from elastocal.model.mjcf import MjcfArm
-from elastocal.model.plausible import jaw_told
 from elastocal.model.rigid import nominal_flanges
 from elastocal.model.urdf import MOVING, check_urdf
 from elastocal.model.xml_file import xacro_left
@@ -34,7 +33,7 @@ from elastocal.text import listed, printable
 from elastocal.units import Array, rpy_from_rotation
 
 ENDINGS = {".urdf": "urdf", ".xml": "mjcf", ".mjcf": "mjcf", ".csv": "dh"}
-ENDINGS |= dict.fromkeys(ur_table.ENDINGS, "dh")
+ENDINGS |= dict.fromkeys(UR_ENDINGS, "dh")
 # Sites that are flanges by what MuJoCo users call them.
 FLANGE_SITES = ("attachment_site", "flange", "tool0", "ee_site")
 MOST_SITES = 8  # listed as markers; of more most are something else

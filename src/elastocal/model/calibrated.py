@@ -19,8 +19,7 @@ from elastocal.errors import InputError, option
 from elastocal.files import read_json
 from elastocal.measurements import Measurements
 from elastocal.model.chain import Chain, finite_ranges, joint_limits
-from elastocal.model.choice import cell_of
-from elastocal.model.effects.catalogue import CATALOGUE, effect_of
+from elastocal.model.effects.catalogue import CATALOGUE, cell_of, effect_of
 from elastocal.model.effects.loads import LinkGravity
 from elastocal.model.manipulator import Model
 from elastocal.model.rigid import nominal_flange

@@ -1,14 +1,18 @@
-"""The nominal serial chain: what a URDF or a DH table says, and how far its joints may move."""
+"""The nominal serial chain: its joints and their names and limits, and whether it can be one."""
 
 from __future__ import annotations
 
-from dataclasses import dataclass, field
-from typing import Literal
+import math
+import re
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass, field, replace
+from typing import Literal, TypeVar
 
 import numpy as np
 
 from elastocal.cell.work_cell import Cell
-from elastocal.errors import InputError
+from elastocal.errors import InputError, require
+from elastocal.text import did_you_mean, listed, printable
 from elastocal.units import Array
 
 JointKind = Literal["revolute", "prismatic"]
@@ -119,3 +123,285 @@ def joint_index(cell: Cell, chain: Chain, name: str, where: str) -> int:
             f"{chain.n_joints} joints"
         )
     return i
+
+
+# Can a nominal chain be meant as its file states it?  One rule for URDF, MJCF and DH tables.
+# Lengths off by 1000 (mm and m) or angles off by 57.3 (degrees and rad) make another arm, whose
+# simulation and fit look as good as the right one's.  What no arm can be is refused; what hardly
+# any is becomes a note of the chain, which `init` and `identify` show.
+
+# A thousandth of the longest: an arm of at most MAX_LENGTH in m, read as mm, is shorter.
+MIN_LENGTH = MAX_LENGTH / 1000
+# Two turns: beyond them an angle of the geometry, four a limit, is in another unit.  Limits of many
+# whole turns and powers of ten occur: the latter stand for no limit.
+MAX_ANGLE, MAX_LIMIT = 4 * math.pi, 8 * math.pi
+MOST_DEGREES = 720.0  # no limit in degrees is larger, so a larger one in rad stands for none
+# Two turns in rad, read as degrees: no range of an arm's joints is as narrow.
+NARROWEST, SHORTEST = math.radians(MAX_ANGLE), 1e-3  # rad, m
+# What names of fingers and of their joints have in them, and how far a jaw slides at most, in m.
+FINGERS = re.compile("finger|gripper|jaw|knuckle|thumb|claw|hand", re.IGNORECASE)
+LONGEST_JAW = 0.15
+# Between neighbouring axes: calibrated parallel ones are below 0.5°, and pi/4 … 2 pi rad, read as
+# degrees, lie between these.
+TILT = math.radians(0.75), math.radians(2 * math.pi + 0.01)
+
+
+def plausible(chain: Chain, source: object) -> Chain:
+    """The chain of the file `source`, with limits that stand for none taken out and notes of what
+    is doubtful.  Raises InputError where it is longer, shorter or heavier than any arm, or has
+    limits that only another unit explains."""
+    _check_lengths(chain, source)
+    _check_masses(chain, source)
+    joints = tuple(_limited(joint, f"{source}: joint '{joint.name}'") for joint in chain.joints)
+    chain = replace(chain, joints=joints)
+    return replace(chain, notes=(*chain.notes, *_doubts(chain)))
+
+
+def check_angles(where: str, angles: tuple[float, ...], meant: str) -> None:
+    """Raise InputError where an angle in rad is beyond two turns; `meant`: the file's unit."""
+    worst = max(map(abs, angles), default=0.0)
+    require(
+        worst <= MAX_ANGLE,
+        f"{where}: {worst:g} rad is more than two turns; {meant}: convert degrees",
+    )
+
+
+def jaw_told(chain: Chain, moved: str = "") -> list[str]:
+    """A sentence where the last joint, or the link `moved` by it, looks like a gripper's jaw, which
+    is no part of the arm."""
+    last = chain.joints[-1]
+    slides = last.kind == "prismatic" and last.upper - last.lower < LONGEST_JAW
+    if chain.n_joints <= MIN_JOINTS or not (slides or FINGERS.search(f"{last.name} {moved}")):
+        return []
+    return [
+        f"the last joint '{last.name}' looks like a jaw of a gripper; if it is, name what carries "
+        "it as flange"
+    ]
+
+
+def extent(chain: Chain) -> float:
+    """Length in m from joint to joint and on to the flange."""
+    ends = [*(joint.placement for joint in chain.joints[1:]), chain.flange_placement]
+    return float(sum(np.linalg.norm(T[:3, 3]) for T in ends))
+
+
+def near_the_arm(chain: Chain) -> Chain:
+    """The same motion with every joint's frame slid along its axis to the foot of the perpendicular
+    from the frame before it.
+
+    With s_i the shift along axis i, X_i ← s_{i−1}⁻¹ X_i s_i, which the motions about and along the
+    axes commute with.
+    """
+    joints: list[Joint] = []
+    masses: list[LinkMass] = []
+    slid: Array = np.zeros(3)  # of the joint before, in its frame
+    for i, joint in enumerate(chain.joints):
+        T = joint.placement.copy()
+        T[:3, 3] -= slid
+        along = T[:3, :3] @ joint.axis
+        height = -float(along @ T[:3, 3])
+        T[:3, 3] += height * along
+        slid = height * joint.axis
+        joints.append(replace(joint, placement=T))
+        if chain.masses:
+            masses.append(replace(chain.masses[i], com=chain.masses[i].com - slid))
+    flange = chain.flange_placement.copy()
+    flange[:3, 3] -= slid
+    return replace(
+        chain, joints=tuple(joints), flange_placement=flange, masses=tuple(masses)
+    )  # fmt: skip
+
+
+def _check_lengths(chain: Chain, source: object) -> None:
+    places = [*(f"joint {i}" for i in range(1, chain.n_joints + 1)), "the flange"]
+    ends = [*(joint.placement for joint in chain.joints), chain.flange_placement]
+    for place, T in zip(places, ends, strict=True):
+        length = float(np.linalg.norm(T[:3, 3]))
+        require(
+            length <= MAX_LENGTH,
+            f"{source}: {length:g} m before {place} is too long for a link; correct it",
+        )
+    whole = extent(chain)
+    require(
+        whole <= MAX_LENGTH,
+        f"{source}: the links are {whole:g} m long together, which no arm is; if its lengths are "
+        "millimetres, state them in m (DH table: d_mm, a_mm)",
+    )
+    require(
+        whole >= MIN_LENGTH,
+        f"{source}: the links are {whole * 1e3:.3g} mm long together, which no arm is; if its "
+        "lengths are metres, state them so (DH table: d_m, a_m)",
+    )
+
+
+def _check_masses(chain: Chain, source: object) -> None:
+    for i, body in enumerate(chain.masses, start=1):
+        require(
+            body.mass <= MAX_MASS,
+            f"{source}: {body.mass:g} kg is too heavy for link {i}; correct it",
+        )
+        offset = float(np.linalg.norm(body.com))
+        require(
+            offset <= MAX_LENGTH,
+            f"{source}: {offset:g} m to the centre of mass is too far for link {i}; correct it",
+        )
+
+
+def _limited(joint: Joint, where: str) -> Joint:
+    """The joint without limits that stand for none; InputError for those in another unit."""
+    turns = joint.kind == "revolute"
+    most, none = (MAX_LIMIT, MOST_DEGREES) if turns else (MAX_LENGTH, MAX_LENGTH * 1000)
+    ends = [joint.lower, joint.upper]
+    far = [abs(v) for v in ends if math.isfinite(v) and abs(v) > most]
+    if far and all(v > none or 10.0 ** round(math.log10(v)) == v for v in far):
+        low, high = (math.copysign(math.inf, v) if abs(v) > most else v for v in ends)
+        return replace(joint, lower=low, upper=high)
+    if not far or (turns and all(abs(v / math.pi - round(v / math.pi)) < 1e-3 for v in far)):
+        return joint
+    unit, told, wrong = (
+        ("rad", f"more than {max(far) / 2 / math.pi:.0f} turns", "degrees, convert them to rad")
+        if turns
+        else ("m", "longer than any axis", "millimetres, convert them to m")
+    )
+    raise InputError(
+        f"{where}: limits {joint.lower:g}, {joint.upper:g} {unit} are {told}; if these are "
+        f"{wrong}; if there is no limit, state none"
+    )
+
+
+def _doubts(chain: Chain) -> list[str]:
+    """What hardly any arm has, as sentences that name the likely cause."""
+    found = []
+    axes = [joint.placement[:3, :3] @ joint.axis for joint in chain.joints]
+    before = [joint.axis for joint in chain.joints]
+    apart = [math.acos(min(abs(float(a @ b)), 1.0)) for a, b in zip(before, axes[1:], strict=False)]
+    if TILT[0] < (largest := max(apart, default=0.0)) < TILT[1]:
+        found.append(
+            f"neighbouring axes are at most {math.degrees(largest):.4f} degrees apart, as where an "
+            "angle of pi/4, pi/2 or pi rad is read as degrees; if the file's angles are radians, "
+            "state that (DH table: theta0_rad, alpha_rad; MJCF: compiler angle)"
+        )
+    for kind, least, told in (
+        ("revolute", NARROWEST, "{:.3g} degrees, as where limits in rad are read as degrees"),
+        ("prismatic", SHORTEST, "{:.3g} mm, as where limits in m are read as mm"),
+    ):
+        spans = [j.upper - j.lower for j in chain.joints if j.kind == kind]
+        if spans and max(spans) < least:
+            widest = math.degrees(max(spans)) if kind == "revolute" else max(spans) * 1e3
+            names = listed((j.name for j in chain.joints if j.kind == kind), 4)
+            found.append(
+                f"the widest range of {names} is {told.format(widest)}; check the unit of limits"
+            )
+    return found
+
+
+# Joints by the names of the robot's file, beside joint1 … jointN in the order of the chain.
+
+Value = TypeVar("Value")
+
+
+def file_names(chain: Chain) -> dict[str, str]:
+    """jointN → the file's name, of those joints that the file calls otherwise."""
+    both = ((f"joint{i}", joint.name) for i, joint in enumerate(chain.joints, start=1))
+    return {number: name for number, name in both if name != number}
+
+
+def clashing(chain: Chain) -> list[str]:
+    """Names jointN that the file gives to another than its Nth joint."""
+    numbers = {f"joint{i}" for i in range(1, chain.n_joints + 1)}
+    return sorted(numbers.intersection(file_names(chain).values()))
+
+
+def names_told(chain: Chain) -> str:
+    """ "joint1 = shoulder_pan, joint2 = …", or "" where the file's names end with these numbers."""
+    names = file_names(chain)
+    ends = [re.search(r"[0-9]+$", name) for name in names.values()]
+    if all(
+        end and number == f"joint{int(end[0])}" for number, end in zip(names, ends, strict=True)
+    ):
+        return ""
+    return listed(f"{number} = {printable(name)}" for number, name in names.items())
+
+
+def numbered(cell: Cell, chain: Chain) -> Cell:
+    """The cell with every joint that it names as jointN, N its place in the chain.
+
+    A joint may be named as in the robot's file wherever jointN may stand.  Where the file calls
+    another than the Nth joint jointN, `[robot] joint_names` says which is meant.
+
+    Raises InputError for such a name without it, and for a joint that there is not.
+    """
+    one = _resolver(cell, chain)
+    loose = _resolver(cell, chain, others=True)
+
+    def keys(
+        table: Mapping[str, Value], where: str, of: Callable[[str, str], str]
+    ) -> dict[str, Value]:
+        found = {of(name, where): value for name, value in table.items()}
+        if len(found) < len(table):
+            raise InputError(
+                f"{cell.path or cell.name}: {where} names a joint twice, by its name in the "
+                f"robot's file and by its number ({names_told(chain)}); keep one"
+            )
+        return found
+
+    spec, wishes = cell.model, cell.design
+    spring = spec.nominal.gravity_compensator
+    where = "[model.nominal.gravity_compensator] joint"
+    nominal = replace(
+        spec.nominal,
+        settings=keys(spec.nominal.settings, "[model.nominal.settings]", loose),
+        sizes=keys(spec.nominal.sizes, "[model.nominal.sizes]", loose),
+        gravity_compensator=spring and spring | {"joint": one(str(spring["joint"]), where)},
+    )
+    effects = tuple(
+        e if e.where is None else replace(e, where=loose(e.where, "[model] effects"))
+        for e in spec.effects
+    )
+    levels = keys(spec.compliance_levels, "[model.compliance_levels]", one)
+    combination = {
+        ".".join([loose(place, "[design] combination"), *rest]): value
+        for name, value in wishes.combination.items()
+        for place, *rest in [name.rsplit(".", 1)]
+    }
+    return replace(
+        cell,
+        limits=keys(cell.limits, "[limits]", one),
+        model=replace(spec, nominal=nominal, effects=effects, compliance_levels=levels),
+        design=replace(
+            wishes,
+            levels=keys(wishes.levels, "[design.levels]", one),
+            interest=tuple(loose(name, "[design] interest") for name in wishes.interest),
+            combination=combination,
+        ),
+    )
+
+
+def _resolver(cell: Cell, chain: Chain, others: bool = False) -> Callable[[str, str], str]:
+    """Name and where it stands → jointN; with `others` what is no joint stays."""
+    by_file = {name: number for number, name in file_names(chain).items()}
+    by_order = {f"joint{i}": f"joint{i}" for i in range(1, chain.n_joints + 1)}
+    clash = clashing(chain) if cell.robot.joint_names is None else []
+    known = by_order | by_file
+    if cell.robot.joint_names == "order":
+        known = by_file | by_order
+    elif clashing(chain):  # by the file: a number that is no name there means nothing
+        same = {joint.name: joint.name for joint in chain.joints if joint.name not in by_file}
+        known = same | by_file
+
+    def resolve(name: str, where: str) -> str:
+        if name in clash:
+            raise InputError(
+                f"{cell.path or cell.name}: {where} names {name}, which in the robot's file is "
+                f"joint number {by_file[name].removeprefix('joint')} of the arm "
+                f'({names_told(chain)}); say which is meant: [robot] joint_names = "file" (names '
+                'of the file) or "order" (jointN is the Nth)'
+            )
+        if name in known or others:
+            return known.get(name, name)
+        raise InputError(
+            f"{cell.path or cell.name}: {where} names {name}, but robot '{chain.name}' has "
+            f"{chain.n_joints} joints{did_you_mean(name, known)}; they are {listed(known)}"
+        )
+
+    return resolve

@@ -17,11 +17,9 @@ from elastocal.cell.work_cell import Cell
 from elastocal.errors import InputError, option, require
 from elastocal.measurements import DEFAULT_MARKER, Measurements, read_measurements, read_plan
 from elastocal.model.arm import Parameter, row_inputs
-from elastocal.model.chain import Chain
-from elastocal.model.choice import cell_of, load_chain, numbered
-from elastocal.model.effects.base import Effect
-from elastocal.model.effects.catalogue import effect_of
-from elastocal.model.effects.driven import JointMotion
+from elastocal.model.chain import Chain, numbered, plausible
+from elastocal.model.effects.base import Effect, JointMotion
+from elastocal.model.effects.catalogue import cell_of, effect_of
 from elastocal.model.evaluate import CHUNK, row_blocks, summary
 from elastocal.model.observations import Observations, observe
 from elastocal.model.symbolic import SymbolicArm
@@ -500,3 +498,25 @@ def _rows_of_three(what: str, values: ArrayLike, n: int) -> Array:
         f"{found.shape}",
     )
     return np.broadcast_to(found, (n, 3)).copy()
+
+
+def load_chain(cell: Cell) -> Chain:
+    """The nominal chain of the cell's robot, from its URDF, MuJoCo model, DH table or factory
+    calibration."""
+    from elastocal.model.dh import UR_ENDINGS, read_dh, read_ur_table
+    from elastocal.model.mjcf import read_mjcf
+    from elastocal.model.urdf import read_urdf
+
+    robot = cell.robot
+    if robot.mjcf is not None:
+        return plausible(read_mjcf(robot.mjcf, robot.base, robot.flange), robot.mjcf)
+    if robot.urdf is not None:
+        return plausible(read_urdf(robot.urdf, robot.base, robot.flange), robot.urdf)
+    if robot.dh is not None and robot.dh.suffix.lower() in UR_ENDINGS:
+        if robot.masses is not None:
+            raise InputError(f"{robot.dh}: takes no [robot] masses; state the arm as a DH table")
+        return plausible(read_ur_table(robot.dh, robot.ur_model), robot.dh)
+    if robot.dh is not None:
+        chain = read_dh(robot.dh, convention=robot.dh_convention, masses_path=robot.masses)
+        return plausible(chain, robot.masses or robot.dh)
+    raise InputError(f"{cell.path}: [robot] needs urdf, mjcf or dh")

@@ -27,10 +27,17 @@ import numpy as np
 from elastocal.errors import InputError, require
 from elastocal.files import read_bytes
 from elastocal.model import rigid
-from elastocal.model.chain import MAX_JOINTS, MIN_JOINTS, Chain, Joint, JointKind, LinkMass
+from elastocal.model.chain import (
+    MAX_JOINTS,
+    MIN_JOINTS,
+    Chain,
+    Joint,
+    JointKind,
+    LinkMass,
+    check_angles,
+)
 from elastocal.model.effects.loads import STANDARD_GRAVITY
 from elastocal.model.mjcf_checks import check_bounds, check_open, ties_of
-from elastocal.model.plausible import check_angles
 from elastocal.model.urdf import MAX_BYTES, MOST_IN_A_FINGER
 from elastocal.model.xml_file import as_utf8, xml_tree
 from elastocal.text import did_you_mean, listed, printable

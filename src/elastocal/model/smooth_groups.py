@@ -8,11 +8,10 @@ from dataclasses import dataclass
 import numpy as np
 
 from elastocal.cell.work_cell import Cell
-from elastocal.model.choice import load_chain
 from elastocal.model.effects.base import Effect, SmoothFunction, index
 from elastocal.model.effects.catalogue import effect_of
 from elastocal.model.effects.smooth import FULL_TURN
-from elastocal.model.manipulator import Model
+from elastocal.model.manipulator import Model, load_chain
 from elastocal.units import Array, IntArray
 
 

@@ -16,8 +16,8 @@ from elastocal.measurements import Measurements, firsts, numbered
 from elastocal.model import rigid
 from elastocal.model.arm import Arm, Parameter, row_inputs
 from elastocal.model.chain import Chain
-from elastocal.model.choice import choose_effects, set_constants, sized_parameters
 from elastocal.model.effects.base import Effect
+from elastocal.model.effects.catalogue import choose_effects, set_constants, sized_parameters
 from elastocal.model.evaluate import BackendReport, BatchFunction, row_blocks
 from elastocal.model.observations import observe
 from elastocal.units import Array, IntArray

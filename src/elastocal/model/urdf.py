@@ -19,8 +19,16 @@ import numpy as np
 
 from elastocal.errors import InputError, require
 from elastocal.files import read_bytes
-from elastocal.model.chain import MAX_JOINTS, MIN_JOINTS, Chain, Joint, JointKind, LinkMass
-from elastocal.model.plausible import FINGERS, check_angles
+from elastocal.model.chain import (
+    FINGERS,
+    MAX_JOINTS,
+    MIN_JOINTS,
+    Chain,
+    Joint,
+    JointKind,
+    LinkMass,
+    check_angles,
+)
 from elastocal.model.xml_file import xacro_left, xml_tree
 from elastocal.text import did_you_mean, listed
 from elastocal.units import Array

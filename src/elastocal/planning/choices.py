@@ -21,7 +21,7 @@ from scipy.optimize import minimize
 
 from elastocal.cell.work_cell import Cell
 from elastocal.errors import ElastocalError, InsufficientDataError, require
-from elastocal.model.effects.driven import Entry, LoadPointMotion, MarkerMotion
+from elastocal.model.effects.base import Entry, LoadPointMotion, MarkerMotion
 from elastocal.model.manipulator import Model
 from elastocal.planning.candidates import Candidates, draw, shares_of
 from elastocal.planning.criteria import CRITERIA

@@ -30,7 +30,7 @@ from elastocal.model.chain import joint_index
 from elastocal.model.effects.catalogue import effect_of
 from elastocal.model.manipulator import Model
 from elastocal.model.observations import Observations, available_noise, observe
-from elastocal.simulation.simulate import simulate
+from elastocal.simulation import simulate
 from elastocal.text import did_you_mean, listed, quoted
 from elastocal.units import Array, BoolArray, IntArray
 

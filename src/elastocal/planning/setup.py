@@ -44,7 +44,7 @@ from elastocal.planning.test_poses import (
     remaining_bias,
     unpredictable,
 )
-from elastocal.simulation.simulate import expand_plan, simulate, values_from
+from elastocal.simulation import expand_plan, simulate, values_from
 from elastocal.text import listed
 from elastocal.units import Array, IntArray, Progress
 

@@ -13,10 +13,10 @@ from elastocal.cell.work_cell import Cell
 from elastocal.diagnosis.diagnosis import SMALLEST_P, Candidate, EffectAt, FoundEffect
 from elastocal.errors import InputError
 from elastocal.model.arm import ParameterSpec
-from elastocal.model.chain import Chain
-from elastocal.model.choice import cell_of, load_chain, numbered
+from elastocal.model.chain import Chain, numbered
 from elastocal.model.effects.base import Effect
-from elastocal.model.effects.catalogue import CATALOGUE
+from elastocal.model.effects.catalogue import CATALOGUE, cell_of
+from elastocal.model.manipulator import load_chain
 from elastocal.report.formatting import display, significant, together, with_uncertainty
 from elastocal.text import printable
 

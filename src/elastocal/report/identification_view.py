@@ -14,7 +14,7 @@ from elastocal.identification.findings import ABSORBED, ALONE, FIXED, INVISIBLE,
 from elastocal.identification.prediction import PredictedError
 from elastocal.identification.result import Calibration
 from elastocal.identification.scrutiny import stage_of
-from elastocal.model.choice import names_told
+from elastocal.model.chain import names_told
 from elastocal.report import judgement_view as words
 from elastocal.report.blocks import (
     WARNING,

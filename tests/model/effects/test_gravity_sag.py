@@ -15,7 +15,7 @@ from elastocal.cell.arm_description import Nominal
 from elastocal.cell.work_cell import Cell
 from elastocal.model.arm import Arm
 from elastocal.model.chain import Chain
-from elastocal.model.effects.gravity_sag import GravitySag
+from elastocal.model.effects.loads import GravitySag
 from elastocal.model.manipulator import Model
 from elastocal.units import Array
 

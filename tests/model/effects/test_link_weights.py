@@ -15,8 +15,7 @@ from elastocal.cell.arm_description import Nominal
 from elastocal.cell.work_cell import Cell
 from elastocal.model.arm import Arm
 from elastocal.model.chain import Chain
-from elastocal.model.effects.gravity_sag import LinkWeights
-from elastocal.model.effects.loads import STANDARD_GRAVITY
+from elastocal.model.effects.loads import STANDARD_GRAVITY, LinkWeights
 from elastocal.units import Array
 
 WEIGHTS = LinkWeights()

@@ -11,8 +11,8 @@ from support.cells import COMPLIANCE, MARKERS, kr270_cell, kr270_chain, random_t
 from elastocal.cell.arm_description import Nominal
 from elastocal.errors import InputError
 from elastocal.model.arm import Arm
+from elastocal.model.effects.base import DrivenEffect
 from elastocal.model.effects.catalogue import CATALOGUE
-from elastocal.model.effects.driven import DrivenEffect
 from elastocal.model.manipulator import Model
 
 

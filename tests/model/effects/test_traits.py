@@ -7,9 +7,8 @@ from support.cells import kr270_cell
 from support.registered import forgotten
 
 from elastocal.errors import InputError
-from elastocal.model.effects.base import Effect, Symbols
+from elastocal.model.effects.base import Effect, JointMotion, Symbols
 from elastocal.model.effects.catalogue import CATALOGUE, register
-from elastocal.model.effects.driven import JointMotion
 
 
 class Stranger(JointMotion):

@@ -6,7 +6,7 @@ from planning.feasibility.small_cells import CHECK, DOWN, NOTHING, study_module
 
 from elastocal.cell.work_cell import read_cell
 from elastocal.model.chain import joint_limits
-from elastocal.model.choice import load_chain
+from elastocal.model.manipulator import load_chain
 from elastocal.planning.collision import END, Collisions
 from elastocal.planning.feasibility import Feasibility
 

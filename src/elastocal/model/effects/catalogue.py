@@ -7,19 +7,26 @@ file of the user's own that calls `register`.
 
 from __future__ import annotations
 
-from elastocal.errors import require
+from collections.abc import Callable, Mapping
+from dataclasses import replace
+from pathlib import Path
+
+import casadi as ca
+
+from elastocal.cell.work_cell import Cell, read_cell
+from elastocal.errors import InputError, require
+from elastocal.model.arm import ParameterSpec
+from elastocal.model.chain import Chain
 from elastocal.model.effects import (
-    changes_in_time,
     compliances,
     gears,
-    gravity_sag,
     loads,
     placements,
-    play,
     smooth,
 )
 from elastocal.model.effects.base import Effect, check
-from elastocal.plugin_loader import same_class
+from elastocal.plugin_loader import load_installed, load_named, same_class
+from elastocal.text import did_you_mean, listed
 
 # Effects act in this order: what sets a frame or a marker stands before what moves it.
 CATALOGUE: dict[str, Effect] = {
@@ -34,34 +41,34 @@ CATALOGUE: dict[str, Effect] = {
         gears.GearSpectrum(),
         smooth.JointCurve(),
         gears.WristCoupling(),
-        changes_in_time.JointDrift(),
-        changes_in_time.EncoderJump(),
-        play.MoveLag(),
-        play.MoveHysteresis(),
-        gravity_sag.GravitySag(),
+        placements.JointDrift(),
+        placements.EncoderJump(),
+        gears.MoveLag(),
+        gears.MoveHysteresis(),
+        loads.GravitySag(),
         compliances.TorqueCoupling(),
         placements.LinkGeometry(),
         compliances.TorqueTilt(),
-        changes_in_time.ThermalExpansion(),
+        placements.ThermalExpansion(),
         smooth.ResidualField(),
         compliances.JointCompliance(),
         compliances.JointHardening(),
-        play.Backlash(),
-        play.Hysteresis(),
+        gears.Backlash(),
+        gears.Hysteresis(),
         compliances.OffAxisCompliance(),
         compliances.LinkBending(),
         compliances.BaseCompliance(),
         loads.GravityCompensator(),
         loads.LinkGravity(),
         loads.LinkMassError(),
-        gravity_sag.LinkWeights(),
+        loads.LinkWeights(),
         loads.Payload(),
         loads.PayloadError(),
         placements.MarkerPosition(),
-        changes_in_time.MarkerSlip(),
+        placements.MarkerSlip(),
         placements.MarkerOrientation(),
-        changes_in_time.BaseDrift(),
-        changes_in_time.FrameJump(),
+        placements.BaseDrift(),
+        placements.FrameJump(),
         placements.DistanceSensor(),
         placements.TrackerDistortion(),
     )
@@ -97,3 +104,137 @@ def register(effect: Effect) -> None:
     order.insert(last + 1, effect)
     CATALOGUE.clear()
     CATALOGUE.update({each.name: each for each in order})
+
+
+# What a cell asks for of it: which effects, at which places, with which settings.
+
+
+def cell_of(cell: Cell | str | Path, plugins: bool | None = False) -> Cell:
+    """The cell itself, or that of a cell file; its plug-ins run where `plugins` or the environment
+    allows it.
+
+    `plugins` None: they are done without where the catalogue has all effects of its model.  Raises
+    InputError where the file is wrong, or names plug-ins that may not run.
+    """
+    fresh = not isinstance(cell, Cell)
+    read = cell if isinstance(cell, Cell) else read_cell(cell)
+    load_installed()
+    if plugins is not None or any(each.name not in CATALOGUE for each in read.model.effects):
+        load_named(read.path or Path(read.name), read.plugins, bool(plugins), fresh)
+    if fresh:
+        read.check(known_effects=tuple(CATALOGUE))
+    return read
+
+
+def choose_effects(chain: Chain, cell: Cell) -> list[tuple[Effect, str]]:
+    """(effect, place) for everything active, in the catalogue's order.
+
+    The table's force always acts (`payload`); link weights act where `link_gravity` says so.
+    Raises InputError for an unknown effect, place or setting, with the nearest valid one, and
+    for an effect that has no place on this arm.
+    """
+    check_settings(chain, cell)
+    wanted: dict[str, list[str | None]] = {
+        name: [None] for name, effect in CATALOGUE.items() if effect.acts_unasked(cell)
+    }
+    for choice in cell.model.effects:
+        if choice.name not in CATALOGUE:
+            raise InputError(_unknown("effects", "effect", choice.name, list(CATALOGUE), cell))
+        wanted.setdefault(choice.name, []).append(choice.where)
+    chosen = []
+    for name, effect in CATALOGUE.items():
+        places = effect.places(chain, cell)
+        asked = wanted.get(name, [])
+        if asked and not places:
+            raise InputError(
+                f"{cell.path or cell.name}: [model] effects: {name} has no place on robot "
+                f"'{chain.name}' with observe = \"{cell.model.observe}\"; leave it out"
+            )
+        for where in asked:
+            if where is not None and where not in places:
+                raise InputError(_unknown("effects", f"place of {name}", where, list(places), cell))
+        chosen += [(effect, place) for place in places if None in asked or place in asked]
+    return chosen
+
+
+def check_settings(chain: Chain, cell: Cell) -> None:
+    """InputError where the cell sets, or states the size of, what no effect of the catalogue has
+    on this arm."""
+    nominal = cell.model.nominal
+    if nominal.settings:
+        _check_keys("settings", "setting", nominal.settings, _keys_of_settings, chain, cell)
+    if nominal.sizes:
+        _check_keys("sizes", "parameter", nominal.sizes, _keys_of_sizes, chain, cell)
+
+
+def _keys_of_settings(effect: Effect, place: str, chain: Chain, cell: Cell) -> list[str]:
+    return [setting.key for setting in effect.settings(place, chain, cell)]
+
+
+def _keys_of_sizes(effect: Effect, place: str, chain: Chain, cell: Cell) -> list[str]:
+    """Shrunk parameters have their size from a setting; an effect that this arm cannot have (masses
+    that nobody stated) has none."""
+    try:
+        return [p.key for p in effect.parameters(place, chain, cell) if not p.shrunk]
+    except InputError:
+        return []
+
+
+def _check_keys(
+    table: str, what: str, given: Mapping[str, Mapping[str, float]],
+    keys_of: Callable[[Effect, str, Chain, Cell], list[str]], chain: Chain, cell: Cell,
+) -> None:  # fmt: skip
+    """InputError where a key of [model.nominal.`table`] is not one that some effect has there."""
+    known: dict[str, list[str]] = {}
+    for effect in CATALOGUE.values():
+        for place in effect.places(chain, cell):
+            if keys := keys_of(effect, place, chain, cell):
+                known.setdefault(place, []).extend(keys)
+    for place, values in given.items():
+        if place not in known:
+            raise InputError(_unknown(f"nominal.{table}", "place", place, list(known), cell))
+        for key in values:
+            if key not in known[place]:
+                kind = f"{what} of {place}"
+                raise InputError(_unknown(f"nominal.{table}", kind, key, known[place], cell))
+
+
+def sized_parameters(
+    effect: Effect, place: str, chain: Chain, cell: Cell
+) -> tuple[ParameterSpec, ...]:
+    """The effect's parameters at a place, of the typical sizes that the cell states."""
+    stated = cell.model.nominal.sizes.get(place, {})
+    return tuple(
+        replace(p, typical=stated[p.key]) if p.key in stated and not p.shrunk else p
+        for p in effect.parameters(place, chain, cell)
+    )
+
+
+def set_constants(effect: Effect, place: str, chain: Chain, cell: Cell) -> dict[str, ca.SX]:
+    """Values of the effect's settings at a place: the cell's, else their defaults.
+
+    Raises InputError where one has neither, or lies outside its range.
+    """
+    given = cell.model.nominal.settings.get(place, {})
+    values = {}
+    for setting in effect.settings(place, chain, cell):
+        value = given.get(setting.key, setting.default)
+        where = f"{cell.path or cell.name}: [model.nominal.settings.{place}] {setting.key}"
+        if value is None:
+            raise InputError(
+                f"{where} is missing, which {effect.name} at {place} needs; `elastocal diagnose` "
+                "searches for it"
+            )
+        if not setting.lower <= value <= setting.upper:
+            raise InputError(
+                f"{where} takes {setting.lower:g} to {setting.upper:g}; found {value:g}"
+            )
+        values[setting.key] = ca.SX(value)
+    return values
+
+
+def _unknown(key: str, what: str, found: str, valid: list[str], cell: Cell) -> str:
+    return (
+        f"{cell.path or cell.name}: [model] {key}: unknown {what} '{found}'"
+        f"{did_you_mean(found, valid)}; valid: {listed(valid)}"
+    )

@@ -14,16 +14,18 @@ from elastocal.model.arm import Arm, ParameterSpec, Setting, Spring
 from elastocal.model.chain import Chain
 from elastocal.model.effects.base import (
     STIFFNESS,
+    DrivenEffect,
     Effect,
+    JointMotion,
+    LinkFrame,
     Symbols,
     index,
     links,
     motion_unit,
     turning_joints,
 )
-from elastocal.model.effects.driven import DrivenEffect, JointMotion, LinkFrame
 from elastocal.model.effects.loads import STANDARD_GRAVITY
-from elastocal.model.effects.placements import SHORTEST, link_ends
+from elastocal.model.effects.placements import SHORTEST, link_ends, transverse_axes
 from elastocal.units import Array
 
 
@@ -183,17 +185,6 @@ class JointHardening(TorqueEffect):
     def shape(self, arm: Arm, place: str, p: Symbols) -> None:
         k3 = p["hardening"]
         add_deflection(arm, index(place), f"{place}.hardening", lambda tau: k3 * tau**3)
-
-
-def transverse_axes(axis: Array) -> tuple[Array, Array]:
-    """Two unit axes x, y with x × y = axis; the frame's own x and y where the axis is z.
-
-    x is the coordinate axis farthest from the joint axis that comes first, made orthogonal.
-    """
-    start = np.eye(3)[int(np.argmin(np.abs(axis).round(9)))]
-    x = start - axis * (axis @ start)
-    x /= np.linalg.norm(x)
-    return x, np.cross(axis, x)
 
 
 class OffAxisCompliance(LoadedEffect):

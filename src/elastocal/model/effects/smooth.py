@@ -35,20 +35,18 @@ from elastocal.cell.work_cell import Cell
 from elastocal.model.arm import Arm, ParameterSpec, Setting
 from elastocal.model.chain import Chain
 from elastocal.model.effects.base import (
-    SmoothFunction,
-    Symbols,
-    index,
-    joints,
-    links,
-    turning_joints,
-)
-from elastocal.model.effects.driven import (
     BaseMotion,
     DrivenEffect,
     Entry,
     JointMotion,
     LinkFrame,
     MarkerMotion,
+    SmoothFunction,
+    Symbols,
+    index,
+    joints,
+    links,
+    turning_joints,
 )
 from elastocal.units import Array
 

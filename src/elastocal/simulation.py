@@ -9,11 +9,11 @@ from scipy.spatial.transform import Rotation
 
 from elastocal.errors import InputError, option
 from elastocal.measurements import Measurements, visits, with_moves
+from elastocal.model.chain import extent
 from elastocal.model.effects.compliances import JointCompliance
 from elastocal.model.effects.loads import STANDARD_GRAVITY
 from elastocal.model.manipulator import Model, check_equilibrium
 from elastocal.model.observations import available_noise, position_covariance
-from elastocal.model.plausible import extent
 from elastocal.text import did_you_mean, listed
 from elastocal.units import Array
 
