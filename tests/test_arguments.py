@@ -63,7 +63,7 @@ CALLS: dict[str, Any] = {
         ["poses", "criterion", "target", "minutes", "curve", "augment", "knowledge", "prior",
          "effort", "candidates", "repeats", "loads", "repeatability", "marker_sigma", "levels",
          "per_level", "test_poses", "test_path", "test_box", "choose", "motion",
-         "load_changes", "reference_every", "doubts", "seed"],
+         "load_changes", "reference_every", "seed"],
         lambda m, d, f, **k: ec.design(m, **{"candidates": 1, "effort": "quick"} | k),
     ),
     "compensate": (

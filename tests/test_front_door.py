@@ -331,6 +331,8 @@ def test_every_option_of_the_packages_is_a_keyword(verb, kind, renamed):
             {"robust": "worst"},
             "`robust` is gone: plans are made for the arm as identified",
         ),
+        ("design", {"doubts": {}}, "`doubts` is gone: for effects that the model may lack"),
+        ("design", {"criterion": "robust"}, "`criterion` robust is gone: take test_pose"),
         ("identify", {"method": "olss"}, "`method` takes one of .*did you mean 'ols'"),
         ("identify", {"outliers": "dropp"}, "`outliers` takes one of auto, drop, keep"),
         ("identify", {"fixed": "joint9"}, r"fixed=\['joint9'\]: the model has no such"),

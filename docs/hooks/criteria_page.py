@@ -20,7 +20,6 @@ covariance of the scaled parameters. Where it has a bound, the plan comes with a
 NEEDS = {
     "test_poses": "test poses (20 are drawn where the cell states none)",
     "combination": "`[design] combination`",
-    "doubts": "effects that the model may lack, with their prior",
 }
 
 

@@ -76,9 +76,9 @@ def _text(value: Any) -> bool:
     return isinstance(value, str)
 
 
-def _list_of(check: Check, least: int = 0, kind: Any = Collection) -> Check:
+def _list_of(check: Check, least: int = 0) -> Check:
     def checked(value: Any) -> bool:
-        several = isinstance(value, kind) and not isinstance(value, str | bytes)
+        several = isinstance(value, Collection) and not isinstance(value, str | bytes)
         flat = several and getattr(value, "ndim", 1) == 1
         return flat and least <= len(value) and all(map(check, value))
 
@@ -115,9 +115,6 @@ KINDS: dict[str, tuple[str, Check]] = {
     "Mapping[str, float]": ("numbers by name", _table_of(_text, _number)),
     "Mapping[str, Sequence[float]]": (
         "a list of numbers by name", _table_of(_text, _list_of(_number, 1)),
-    ),
-    "Mapping[tuple[str, str], float]": (
-        "numbers by effect and place", _table_of(_list_of(_text, kind=tuple), _number),
     ),
     "tuple[ArrayLike, ArrayLike]": (
         "two corners", lambda v: isinstance(v, Collection) and len(v) == 2 and all(map(_array, v)),

@@ -33,6 +33,10 @@ GONE = {
     "design.load_choice": (
         "every pose is read under each load; let [design.choose] loads pick fewer of them"
     ),
+    "design.doubts": (
+        "for effects that the model may lack measure, and ask next, or diagnose with a plan of "
+        "extra poses"
+    ),
     "design.robust": "plans are made for the arm as identified so far (augment); drop the key",
     "design.robust_samples": "it went with design.robust; drop it",
 }

@@ -85,7 +85,6 @@ def design(
     motion: Motion | None = None,
     load_changes: int | None = None,
     reference_every: int | None = None,
-    doubts: Mapping[tuple[str, str], float] | None = None,
     seed: Seed = 0,
     jobs: int = 1,
     progress: Progress | None = None,
@@ -99,11 +98,10 @@ def design(
     Args:
         model: The model, or a cell, or the path of a cell file.
         poses: Number of poses.
-        criterion: What is to become small: "test_pose" (error at the test poses), "robust" (the
-            same with what the model may lack), "D", "A", "E", "G", "I", "c", "O1", "O3" or
-            "O5"; default as the cell says.
-        target: Find the fewest poses that reach this error, for the criteria test_pose, robust, G
-            and I.  In m.
+        criterion: What is to become small: "test_pose" (error at the test poses), "D", "A", "E",
+            "G", "I", "c", "O1", "O3" or "O5"; default as the cell says.
+        target: Find the fewest poses that reach this error, for the criteria test_pose, G and I.
+            In m.
         minutes: Find the best numbers of poses and readings within this time.  It stands instead
             of `poses` and `target`.
         curve: Compare numbers of poses, as in 10,15,20,30.
@@ -138,8 +136,6 @@ def design(
         motion: How the arm moves between poses, which decides their order.
         load_changes: Load changes allowed; more reduce the effect of drift; default: the fewest.
         reference_every: Visit a reference pose again after so many stops.
-        doubts: Probability that the model lacks an effect at a place, {("backlash", "joint2"):
-            0.1}, for the criterion robust; default equal shares of the catalogue.
         seed: Seed of all random draws, or a numpy Generator.
         jobs: Processes; -1 for all cores.
         progress: Is told what is done.
@@ -182,7 +178,7 @@ def design_request(
     from elastocal.planning.design import DesignOptions
 
     cell = model.cell if isinstance(model, Model) else cell_of(_checked_cell(model))
-    of_the_search = ("effort", "seed", "jobs", "doubts")
+    of_the_search = ("effort", "seed", "jobs")
     search = {name: asked.pop(name) for name in of_the_search if name in asked}
     if isinstance(prior, str):
         asked["prior"], prior = prior, None

@@ -37,7 +37,7 @@ COMMANDS = (
             ("plan.csv", "plan.json", "robot.script", "design.html"),
             ("arm.csv", "links.csv", "path.csv", "fixture.stl")),
     Command("design", "wished.toml -o plan.csv --effort quick --poses 4 --candidates 40 "
-            "--criterion robust --keep poses.csv:1,3 -q", ("plan.csv", "plan.json"),
+            "--criterion G --keep poses.csv:1,3 -q", ("plan.csv", "plan.json"),
             ("arm.csv", "links.csv", "poses.csv")),
     Command("next", "wished.toml data.csv -o next.csv --batch 2 --candidates 40 --require "
             "new_poses=50", ("next.csv", "next.json"), ("arm.csv", "links.csv")),

@@ -104,7 +104,6 @@ def test_every_criterion_is_what_its_definition_says():
     w, errors = np.array([1.0, 2.0, 0.5, 3.0, 1.0]) / 7.5, np.einsum("tri,ij,trj->t", A, V, A)
     expected = {
         "test_pose": (1e6 * np.sqrt(w @ errors), "µm"),
-        "robust": (1e6 * np.sqrt(w @ errors), "µm"),
         "I": (1e6 * np.sqrt(errors.mean()), "µm"),
         "G": (1e6 * np.sqrt(errors.max()), "µm"),
         "c": (np.sqrt(c @ V @ c), "mrad"),
@@ -130,8 +129,9 @@ A = np.ones((2, 3, P))
     ("name", "change", "message"),
     [
         ("d", {}, "criterion 'd' is unknown .did you mean 'D'"),
-        ("V", {}, "there are test_pose, robust, D, A, E, G, I, c, O1, O3, O5"),
+        ("V", {}, "there are test_pose, D, A, E, G, I, c, O1, O3, O5"),
         ("O2", {}, "O2 is gone: its plans had no bound, .* take E or O3"),
+        ("robust", {}, "robust is gone: take test_pose; .* next, or diagnose"),
         ("D", {"interest": []}, "no parameter of interest is left"),
         ("E", {"interest": [1, 1]}, "repeated or unknown"),
         ("A", {"interest": [P]}, "repeated or unknown"),

@@ -255,8 +255,7 @@ def next_command(
     """Which poses should I measure next, or are these enough?
 
     Diagnoses and identifies the measurements so far, and writes the next poses (CSV and
-    plan.json) for the parameters and for effects that may be missing; none if the required
-    error is kept, or no batch gains enough.
+    plan.json); none if the required error is kept, or no batch gains enough.
 
     Example: elastocal next cell.toml data.csv -o next.csv --batch 5 --require new_poses=50
 

@@ -1,15 +1,14 @@
 """Which poses next, and whether more are worth measuring: plans from what was measured so far.
 
-The arm is diagnosed and identified.  Effects found join the model; what else it may lack is in
-doubt, with the probability that the diagnosis leaves it.  The next poses make the error at the test
-poses small that counts parameters and doubts (`planning.setup`), with all readings so
-far.
+The arm is diagnosed and identified, and effects found join the model.  The next poses make the
+error at the test poses small, with all readings so far.  What the model may lack besides is in the
+errors that are stated: as much as configurations scatter beyond their noise, with the probability
+that something unknown is at work.
 """
 
 from __future__ import annotations
 
 import math
-from collections import Counter
 from contextlib import suppress
 from dataclasses import asdict, dataclass, replace
 from pathlib import Path
@@ -19,27 +18,26 @@ import numpy as np
 
 from elastocal.above import Result
 from elastocal.arguments import checked_arguments
+from elastocal.cell.plan_wishes import TEST_POSE
 from elastocal.cell.work_cell import Cell
 from elastocal.diagnosis.diagnose import FEWEST, DiagnosisOptions, diagnose
 from elastocal.diagnosis.diagnosis import Diagnosis, FoundEffect
 from elastocal.diagnosis.discrimination import load_forces
-from elastocal.diagnosis.evidence import ANOTHER
 from elastocal.errors import InsufficientDataError, option
 from elastocal.errors import require as check
 from elastocal.identification.identify import identify
-from elastocal.identification.prediction import over_the_workspace, predicted_error
+from elastocal.identification.prediction import (
+    PredictedError,
+    over_the_workspace,
+    predicted_error,
+)
 from elastocal.identification.result import Calibration
 from elastocal.measurements import Measurements
-from elastocal.model.effects.catalogue import SOMETHING
 from elastocal.model.manipulator import Model
-from elastocal.planning.criteria import RobustError
 from elastocal.planning.design import DesignOptions, design
 from elastocal.planning.plan import Gain, Plan
-from elastocal.planning.setup import Place, missing
 from elastocal.planning.test_poses import where_used
 from elastocal.units import Progress
-
-CRITERION = RobustError.name
 
 NextVerdict = Literal["measure", "enough", "no_gain"]
 
@@ -56,7 +54,7 @@ class NextPoses(Result):
         required: The error at new poses that is asked for, in m; None where none is.
         reached: The error that the model as it is now keeps with 95 %, in m.
         found: The effects that the diagnosis found, which the model then has.
-        doubts: What it may lack besides and the poses can show, the likeliest first.
+        doubts: What it may lack besides, with its probability, the likeliest first.
         source: The readings that it is said of.
         diagnosis: Of these readings; None for fewer than can be diagnosed.
         calibration: The arm identified with what was found; None where they do not suffice.
@@ -111,10 +109,9 @@ def next_poses(
 ) -> NextPoses:
     """Which poses should I measure next, or are these enough?
 
-    The data are diagnosed and identified.  The next poses make the error at the test poses small
-    that counts the parameters and, with the probability that the diagnosis leaves them, the
-    effects that the model may lack.  Enough is what both say: the error of the estimates, and
-    that averaged over what the model may lack.
+    The data are diagnosed and identified, and effects found join the model.  The next poses make
+    the error at the test poses small.  Enough counts with what the model may lack: with what
+    configurations scatter beyond their noise, as probable as that something unknown is at work.
 
     Args:
         model: The model, or a cell, or the path of a cell file.
@@ -155,26 +152,24 @@ def next_poses(
         why = diagnose(model, table, DiagnosisOptions(seed), progress)
         model = with_effects_of(model, why)
     progress("identifying")
-    kept, fit = math.inf, None
+    error, fit = None, None
     with suppress(InsufficientDataError):  # then these are not enough
         fit = identify(model, table)
-        kept = _kept(fit, 1.0 if why is None else why.probability_unknown)
-    chances = doubts_after(model, why)
+        error = _error_now(fit, 1.0 if why is None else why.probability_unknown)
     spec = model.cell.design
     spec = replace(
-        spec, poses=batch, per_level=(), target=None, criterion=CRITERION, candidates=candidates,
+        spec, poses=batch, per_level=(), target=None, criterion=TEST_POSE, candidates=candidates,
         loads=load_forces(table) if spec.loads is None else spec.loads,
         # A joint whose compliance is known at its levels only can be nowhere else.
         levels=spec.levels or model.cell.model.compliance_levels,
     )  # fmt: skip
     cell = replace(model.cell, design=spec)
-    options = DesignOptions("batch", seed, jobs, done=table, doubts=chances)
-    plan = design(cell, options, progress=progress)
-    gain = plan.gain
-    assert gain is not None  # the criterion has test poses
-    reached = max(gain.sure, kept)
+    plan = design(cell, DesignOptions("batch", seed, jobs, done=table), progress=progress)
+    assert plan.gain is not None  # the criterion has test poses
+    reached = math.inf if error is None else max(plan.gain.sure, error.sure)
+    lacking = 0.0 if error is None else error.lacking or 0.0
+    plan = replace(plan, gain=(gain := plan.gain.lacking(lacking, reached)))
     verdict = verdict_of(gain, reached, required, least_gain)
-    likeliest = sorted(plan.doubts, key=lambda place: -chances[place])
     return NextPoses(
         verdict=verdict,
         plan=plan if verdict == "measure" else None,
@@ -183,7 +178,7 @@ def next_poses(
         required=required,
         reached=reached,
         found=() if why is None else why.effects,
-        doubts=tuple((*place, chances[place]) for place in likeliest),
+        doubts=() if why is None else _in_doubt(why),
         least_gain=least_gain,
         source=table.source,
         diagnosis=why,
@@ -191,17 +186,24 @@ def next_poses(
     )
 
 
-def _kept(fit: Calibration, unknown: float) -> float:
-    """The error at new poses that the estimates keep with 95 %, in m.
+def _error_now(fit: Calibration, unknown: float) -> PredictedError | None:
+    """The error at new poses.
 
     That configurations scatter beyond their noise is lack of fit with the probability that
-    something `unknown` is at work; else it is their noise.  What has a name is in doubt by itself.
+    something `unknown` is at work; else it is their noise.
     """
     model, observed, rng = fit.model, fit.observations, np.random.default_rng(0)
     excess = None if fit.excess is None else fit.excess.with_chance(unknown, rng)
     poses = where_used(model) or over_the_workspace(model.cell, model, observed.table)
-    found = predicted_error(fit.arm, observed, excess, fit.spread, poses, rng)
-    return math.inf if found is None else found.sure
+    return predicted_error(fit.arm, observed, excess, fit.spread, poses, rng)
+
+
+def _in_doubt(why: Diagnosis) -> tuple[tuple[str, str, float], ...]:
+    """What may be missing beside or instead of what was found: effect, place and probability."""
+    found = {(f.effect, f.where) for f in why.effects}
+    left = [c for c in why.candidates if (c.effect, c.where) not in found and c.probability > 0]
+    left.sort(key=lambda c: -c.probability)
+    return tuple((c.effect, c.where, c.probability) for c in left)
 
 
 def verdict_of(
@@ -221,26 +223,3 @@ def with_effects_of(model: Model, why: Diagnosis) -> Model:
         spec = spec.with_effect(f.effect, f.where, f.settings, f.sizes)
     cell = replace(model.cell, model=spec)
     return Model.assembled(model.chain, cell) if why.effects else model
-
-
-def doubts_after(model: Model, why: Diagnosis | None) -> dict[Place, float]:
-    """Probability that the model lacks an effect at a place.
-
-    As the diagnosis has it, where nothing was found.  Beside what was found it is that of the
-    effect instead of it, or of one effect more: ANOTHER in equal shares, times what evidence at
-    the distance d costs where nothing shows, 1/√(1 + d²).
-    """
-    places = missing(model)
-    kinds = Counter(name for name, _ in places)
-    share = {key: 1 / (len(kinds) * kinds[key[0]]) for key in places}
-    if why is None:
-        return {key: SOMETHING * p for key, p in share.items()}
-    judged = {(c.effect, c.where): c for c in why.candidates}
-    out = {}
-    for key, p in share.items():
-        found = judged.get(key)
-        seen = 0.0 if found is None else found.detectable
-        instead = SOMETHING * p if found is None else found.probability
-        more = ANOTHER * p / math.hypot(1.0, seen) if why.effects else 0.0
-        out[key] = max(instead, more)
-    return out

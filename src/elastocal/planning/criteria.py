@@ -25,7 +25,7 @@ from elastocal.errors import InputError, require
 from elastocal.text import did_you_mean, is_label, listed, quoted
 from elastocal.units import Array, BoolArray, IntArray
 
-Need = Literal["test_poses", "combination", "doubts"]
+Need = Literal["test_poses", "combination"]
 
 # tr(H⁻¹) of M scaled to unit diagonal, H, above which M is singular to rounding: a matrix of rank
 # p − 1 formed in double precision shows 1/(p ε) ≈ 10¹⁴ or more.
@@ -452,21 +452,6 @@ class RemainingError(TraceCriterion):
 
 
 @dataclass(frozen=True)
-class RobustError(RemainingError):
-    """Φ as of test_pose, with the effects that the model may lack among the parameters.
-
-    Each of their parameters has mean 0 and the variance π s²: the probability π that the effect is
-    missing, its typical size s.  `reported`: √Φ in µm, the error at the test poses of one who
-    reckons with them.
-    Source: DuMouchel & Jones 1994, Technometrics 36, 37–47.
-    """
-
-    name = "robust"
-    title = "position error at the test poses, effects that the model may lack included, rms"
-    needs = ("test_poses", "doubts")
-
-
-@dataclass(frozen=True)
 class PredictionVariance(RemainingError):
     """Φ = (1/T) Σ_t tr(A_t V A_tᵀ), V = M⁻¹, in m²: `test_pose` with equal weights, the mean over a
     region's T points of the variance of what is predicted there.
@@ -725,7 +710,6 @@ CRITERIA: dict[str, type[ScenarioCriterion]] = {
     criterion.name: criterion
     for criterion in (
         RemainingError,
-        RobustError,
         DeterminantCriterion,
         ParameterVariance,
         EigenvalueCriterion,
@@ -741,7 +725,12 @@ CRITERIA: dict[str, type[ScenarioCriterion]] = {
 CONDITION = (
     "its plans had no bound, and what it asks for is the worst-known direction: take E or O3"
 )
-GONE = {"O2": CONDITION, "O4": CONDITION}
+GONE = {
+    "O2": CONDITION,
+    "O4": CONDITION,
+    "robust": f"take {TEST_POSE}; for effects that the model may lack measure, and ask next, or "
+    "diagnose with a plan of extra poses",
+}
 Registered = TypeVar("Registered", bound=type[ScenarioCriterion])
 
 

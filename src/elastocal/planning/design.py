@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping
+from collections.abc import Callable
 from dataclasses import dataclass, field, replace
 from itertools import count
 from pathlib import Path
@@ -46,6 +46,7 @@ from elastocal.planning.plan import (
     CandidateCounts,
     Chance,
     Everywhere,
+    Gain,
     LoadStates,
     Plan,
     PlanSize,
@@ -59,11 +60,8 @@ from elastocal.planning.setup import (
     OPEN,
     FeasiblePool,
     Known,
-    Place,
     ScheduledEffects,
     Setup,
-    gain_of,
-    in_doubt,
     set_up,
     share_within,
 )
@@ -81,8 +79,7 @@ class DesignOptions:
     """`fixed`: parameters, places or effects held; `prior`: what is known of parameters;
     `done`: measurements that the plan adds to; `curve`: numbers of poses to compare; `notes`:
     sentences on how these came about, for the plan's warnings; `pins`: poses that stay or are
-    struck out; `doubts`: probability that an effect is missing at a place, for a criterion that
-    asks."""
+    struck out."""
 
     effort: Effort = "normal"
     seed: int = 0
@@ -93,7 +90,6 @@ class DesignOptions:
     curve: tuple[int, ...] = field(default=())
     notes: tuple[str, ...] = field(default=())
     pins: Pins | None = None
-    doubts: Mapping[Place, float] | None = None
 
     def __post_init__(self) -> None:
         efforts = get_args(Effort)
@@ -175,14 +171,13 @@ class _Design:
         if cell.design.candidates is None and cell.design.taught is None:
             cell = replace(cell, design=replace(cell.design, candidates=POOL))
         self.checkpoint, self.progress = checkpoint, progress
-        self.doubts: dict[Place, float] = {}
         self.model = Model(cell, options.done.marker_names if options.done else ())
         if self.model.shrunk.any():
             self.model, options = self._without_functions(options)
         self.model, self.options = self._without_conditions(options)
         # What the cell as it stands says of test poses and of measurements holds for others too.
         self.work: Model = self.model if first is None else first.work
-        self.done: dict[tuple[str, ...], Done] = {} if first is None else first.done
+        self.done: Done | None = None if first is None else first.done
         self.cell = self.model.cell
         self.chain = self.model.chain
         check_cell(self.cell, self.chain)
@@ -252,15 +247,11 @@ class _Design:
         q, group, counts = self._candidates()
         for wanted in planned:
             check_available(self.cell, np.bincount(group), wanted)
-        model, known = self.model, Known(options.fixed, options.prior)
-        if "doubts" in CRITERIA[self.cell.design.criterion].needs:
-            model, known, self.doubts = in_doubt(model, known, q, options.doubts)
-        known = self._with_done(known, model)
+        known = self.known()
         progress("information of the candidates")
         setup = set_up(
-            model, q, int((shares + self.pinned).sum()), targets, known,
-            region, self.feasibility.seen if self.feasibility.partial else None,
-            model if self.work is self.model else self.work.with_effects(model.cell.model.effects),
+            self.model, q, int((shares + self.pinned).sum()), targets, known,
+            region, self.feasibility.seen if self.feasibility.partial else None, self.work,
         )  # fmt: skip
         self.warnings += setup.warnings
         pinned = None
@@ -321,17 +312,12 @@ class _Design:
         return shares
 
     def known(self) -> Known:
-        return self._with_done(Known(self.options.fixed, self.options.prior), self.model)
-
-    def _with_done(self, known: Known, model: Model) -> Known:
         options = self.options
-        if options.done is None:
-            return known
-        if model.names not in self.done:
+        if options.done is not None and self.done is None:
             self.progress("information of the measurements done")
-            self.done[model.names] = measured(self.model, options.done, options.fixed, model)
-            self.warnings.append(f"B is taken at {self.done[model.names].note}")
-        return replace(known, done=self.done[model.names])
+            self.done = measured(self.model, options.done, options.fixed)
+            self.warnings.append(f"B is taken at {self.done.note}")
+        return Known(options.fixed, options.prior, self.done)
 
     def targets(self) -> tuple[TargetPoses, TargetPoses | None]:
         """The test poses of the cell as it stands, and the rest of the joint ranges."""
@@ -523,11 +509,7 @@ class _Design:
                 found.certificate,
                 starts=tuple(setup.criterion.figure(v) for v in found.certificate.starts),
             ),
-            predicted=tuple(
-                p
-                for p in predicted(model, setup.found, left, numbers)
-                if p.name in self.model.names
-            ),
+            predicted=predicted(model, setup.found, left, numbers),
             reasons=reasons(
                 model, setup.found, blocks, setup.prior,
                 values_without(problem, chosen), found.value,
@@ -547,8 +529,11 @@ class _Design:
             seen=None if seen.all() else seen,
             readings=readings,
             states=self.states,
-            doubts=tuple(self.doubts),
-            gain=gain_of(setup, known, M, self.doubts, self.options.seed),
+            gain=(
+                None
+                if known.done is None or setup.target_rows is None
+                else Gain.of(setup.target_rows, setup.prior, M, self.options.seed)
+            ),
         )  # fmt: skip
 
     def _names(self, found: Selection) -> tuple[str, ...]:

@@ -419,24 +419,19 @@ def _sample(model: Model, q: Array) -> IntArray:
 @dataclass(frozen=True)
 class Done:
     """`x` (parameters,) the arm as identified so far, `information` (parameters, parameters) in
-    the parameters' units, `pull` (parameters,) = BᵀΣ⁻¹(readings − prediction), `numbers` observed,
-    `note` on where x comes from."""
+    the parameters' units, `numbers` observed, `note` on where x comes from."""
 
     x: Array
     information: Array
-    pull: Array
     numbers: int
     note: str
 
 
-def measured(
-    model: Model, table: Measurements, fixed: tuple[str, ...], whole: Model | None = None
-) -> Done:
+def measured(model: Model, table: Measurements, fixed: tuple[str, ...]) -> Done:
     """Information BᵀΣ⁻¹B of a table of measurements, at the parameters it identifies.
 
     Where it does not suffice to identify the arm, B is taken at the nominal one.  The noise is
-    the stated one, as for the poses to come.  `whole`: the model with further effects, which are
-    at nominal, for the information on these too.
+    the stated one, as for the poses to come.
     """
     if table.sigma is None:
         table = marker_sigmas(model.cell, table)
@@ -445,15 +440,10 @@ def measured(
         note = "the arm as identified from the measurements done"
     except InsufficientDataError as error:
         x, note = model.nominal, f"the nominal arm, as the measurements do not suffice ({error})"
-    if whole is not None:
-        known = dict(zip(model.names, x, strict=True))
-        x = np.array([known.get(p.name, p.nominal) for p in whole.parameters])
-        model = whole
     observed = observe(table, model.observe)
     weights = observed_weights(model, observed, x)
-    at = model.regressor(table, x, None, observed)
-    B = weights.apply(at.B)
-    return Done(x, B.T @ B, B.T @ weights.apply(at.residual), len(B), note)
+    B = weights.apply(model.regressor(table, x, None, observed).B)
+    return Done(x, B.T @ B, len(B), note)
 
 
 def next_number(labels: Iterable[str]) -> int:

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from dataclasses import asdict, dataclass, field
+from dataclasses import asdict, dataclass, field, replace
 from pathlib import Path
 from typing import Any, Literal
 
@@ -364,26 +364,15 @@ def remaining_rms(R: Array, M: Array) -> float:
 
 
 DRAWS = 2000  # of what the arm may be
-HARDLY = 1e-6  # probability of an effect below which what it would do is not asked
-
-
-@dataclass(frozen=True)
-class Doubt:
-    """An effect that may be missing: its `probability` π, the `columns` (k,) of its parameters, and
-    `spare` (k,), by how much less is known of them before if it is there: (1 − π)/(π s²)."""
-
-    probability: float
-    columns: IntArray
-    spare: Array
 
 
 @dataclass(frozen=True)
 class Gain:
     """What a plan adds to measurements done: rms position error in m at the test poses.
 
-    `before` and `after` it averaged over what may be missing, `model_before` and `model_after` were
-    the model right; inf where the measurements leave parameters open.  `sure`: with 95 % the error
-    of the model as it is now identified, of which `before` is the rms, is smaller.
+    `model_before` and `model_after` are its expectation by the parameters alone, `before` and
+    `after` with what the model lacks, as far as measurements show it; inf where they leave
+    parameters open.  `sure`: with 95 % the present error is smaller.
     """
 
     before: float
@@ -393,47 +382,20 @@ class Gain:
     sure: float
 
     @classmethod
-    def of(
-        cls, R: Array, before: Array, after: Array, doubts: Sequence[Doubt], pull: Array, seed: int
-    ) -> Gain:
-        """Of R (r, p) at the test poses, the information (p, p) before and after the plan, the
-        effects in doubt, and `pull` (p,) = Bᵀ Σ⁻¹ (readings − model).
+    def of(cls, R: Array, before: Array, after: Array, seed: int) -> Gain:
+        """Of R (r, p) at the test poses and the information (p, p) before and after the plan."""
+        known, found = remaining_rms(R, before), remaining_rms(R, after)
+        sure = np.inf
+        if np.isfinite(known):
+            z = np.random.default_rng(seed).standard_normal((DRAWS, len(R)))
+            variance = np.maximum(np.linalg.eigvalsh(R @ np.linalg.solve(before, R.T)), 0.0)
+            sure = float(np.sqrt(np.quantile(z**2 @ variance, 0.95)))
+        return cls(known, found, known, found, sure)
 
-        The arm is averaged over what may be missing (Hoeting et al. 1999, Statistical Science 14):
-        nothing, or one of the effects, each with its probability; it is then N(V pull, V) away from
-        the model, V⁻¹ the information on the model's parameters and those of that effect.  Of mean
-        square C in all, it is (C⁻¹ + after − before)⁻¹ away from the best linear estimate that
-        starts with the model and adds the plan's readings.
-        """
-        own = np.setdiff1d(np.arange(len(before)), [k for d in doubts for k in d.columns])
-        part = np.ix_(own, own)
-        right = remaining_rms(R[:, own], before[part]), remaining_rms(R[:, own], after[part])
-        if not np.isfinite(remaining_rms(R, before)):
-            return cls(np.inf, remaining_rms(R, after), *right, np.inf)
-        rng = np.random.default_rng(seed)
-        chance = np.array([d.probability for d in doubts])
-        nothing = Doubt(max(1 - chance.sum(), 0.0), own[:0], np.zeros(0))
-        shares = np.array([nothing.probability, *chance]) / max(chance.sum(), 1.0)
-        errors, C, drawn = [], np.zeros_like(before), rng.multinomial(DRAWS, shares)
-        for share, n, doubt in zip(shares, drawn, (nothing, *doubts), strict=True):
-            if share < HARDLY:
-                continue
-            there = np.append(own, doubt.columns)
-            M = before[np.ix_(there, there)].copy()
-            M[len(own) :, len(own) :] -= np.diag(doubt.spare)
-            factor = linalg.cholesky(M, lower=True)
-            root = linalg.solve_triangular(factor, np.eye(len(there)), lower=True, trans="T")
-            off = root @ (root.T @ pull[there])
-            C[np.ix_(there, there)] += share * (root @ root.T + np.outer(off, off))
-            away = off[:, None] + root @ rng.standard_normal((len(there), n))
-            errors.append(np.linalg.norm(R[:, there] @ away, axis=0))
-        size = np.sqrt(np.diag(C))
-        scale = np.where(size > 0, size, 1.0)
-        values, turned = np.linalg.eigh(C / scale / scale[:, None])
-        S = size[:, None] * turned * np.sqrt(np.maximum(values, 0.0))
-        shown = np.eye(len(C)) + S.T @ (after - before) @ S
-        rms = float(np.linalg.norm(R @ S)), remaining_rms(R @ S, shown)
-        return cls(*rms, *right, float(np.quantile(np.concatenate(errors), 0.95)))
+    def lacking(self, error: float, sure: float) -> Gain:
+        """With what the model lacks, which moves the tool by `error` rms; `sure` is kept."""
+        both = np.hypot((self.before, self.after), error)
+        return replace(self, before=float(both[0]), after=float(both[1]), sure=sure)
 
 
 @dataclass(frozen=True)
@@ -562,7 +524,6 @@ class Plan(Result):
         states: Whether poses are read in all load states or in chosen ones, where it was asked.
         names: Of the configurations, where poses of an earlier plan were kept.
         gain: What the plan adds to measurements done, where it does.
-        doubts: Effects and places that the model may lack and the plan counts, where it does.
         chosen: What was chosen besides the poses, where [design.choose] asks for it.
         scheduled: What effects of time and approach make of it, where the cell has some.
         timed: Numbers of poses and readings that a time allows, where one was given.
@@ -607,7 +568,6 @@ class Plan(Result):
     states: LoadStates | None = None
     names: tuple[str, ...] = ()
     gain: Gain | None = None
-    doubts: tuple[tuple[str, str], ...] = ()
     chosen: Chosen | None = None
     timed: tuple[TimedSize, ...] = ()
     scheduled: Scheduled | None = None

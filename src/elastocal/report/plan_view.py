@@ -591,9 +591,8 @@ def next_lines(found: NextPoses) -> list[tuple[str, str]]:
     lines.append(
         (
             "Gain",
-            f"{n} lower the rms error at the test poses from {both(g.before, g.after)}, averaged "
-            "over possible missing effects; from "
-            f"{both(g.model_before, g.model_after)} if the model is right.",
+            f"{n} lower the rms error at the test poses from {both(g.before, g.after)} with what "
+            f"the model may lack; from {both(g.model_before, g.model_after)} if it is right.",
         )
     )
     named = [f"{f.effect} at {f.where} ({f.probability:.2f})" for f in found.found]
@@ -602,5 +601,7 @@ def next_lines(found: NextPoses) -> list[tuple[str, str]]:
         lines.append(("Found", printable(f"{text} (diagnose, {option('cell_out')}).")))
     doubts = [f"{e} at {w} ({p:.2g})" for e, w, p in found.doubts[:3]]
     if doubts:
-        lines.append(("In doubt", printable(f"likeliest {', '.join(doubts)}.")))
+        rivals = found.diagnosis is not None and found.diagnosis.open
+        apart = f"; poses that tell them apart: diagnose {option('plan')}" if rivals else ""
+        lines.append(("In doubt", printable(f"likeliest {', '.join(doubts)}{apart}.")))
     return lines
