@@ -2,6 +2,6 @@
 
 A view says what a result holds, as `blocks` (`identification_view`, `plan_view`, `diagnosis_view`,
 `changes_view`, `compensation_view`, `certificate_view`); `terminal`, `page` and `notebook` show
-them, `figures`, `residual_figures` and `arm_view` draw.  What a result is worth is judged where it
-is made, as findings.
+them, `figures` and `arm_view` draw.  What a result is worth is judged
+where it is made, as findings.
 """

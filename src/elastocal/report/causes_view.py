@@ -7,7 +7,7 @@ from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
 
 from elastocal.diagnosis.diagnosis import ComponentShare, Curve, Diagnosis, FoundEffect, Interval
-from elastocal.report.blocks import Figure, ShownTable
+from elastocal.report.blocks import ShownTable
 from elastocal.report.effect_names import (
     effect_at_places,
     place,
@@ -174,29 +174,6 @@ def lengths(ends: Interval) -> str:
     low, high = map(length, ends)
     unit = high[high.rfind(" ") :]
     return f"{low.removesuffix(unit)} to {high}" if low.endswith(unit) else f"{low} to {high}"
-
-
-def share_figure(d: Diagnosis) -> Figure:
-    """The share of every finding with its 90 % interval, and below it each of its places."""
-    from elastocal.report.figures import SERIES, Row, rows_of_dots
-
-    rows: list[Row] = []
-
-    def add(name: str, share: float, ci90: Interval, colour: str, small: bool = False) -> None:
-        ends = (100 * ci90[0], 100 * ci90[1])
-        rows.append(Row(name, 100 * share, ends, share_text(share), colour, small))
-
-    for cause in causes(d):
-        colour = SERIES[0] if cause.named else SERIES[1]
-        add(cause.name, cause.share, cause.share_ci90, colour)
-        for c in cause.parts if len(cause.parts) > 1 else ():
-            add(f"{place(c.where)}, {family(c)}", c.share, c.share_ci90, colour, True)
-    axis = "share in %, with 90 % interval"
-    caption = (
-        "Part of the squared remaining error that goes when each cause is added last. Small dots: "
-        "at each place."
-    )
-    return rows_of_dots("shares", "Causes of the remaining error", rows, axis, caption)
 
 
 def curve_span(curve: Curve) -> str:

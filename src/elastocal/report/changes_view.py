@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from collections.abc import Iterator
-from typing import TYPE_CHECKING
 
 import numpy as np
 
@@ -22,10 +21,8 @@ from elastocal.report.effect_names import p_value, size_of
 from elastocal.report.formatting import estimate, length, title_of
 from elastocal.text import listed, printable
 
-if TYPE_CHECKING:
-    from matplotlib.figure import Figure as Drawing
-
 NAMED = 3  # parameters in a headline
+MOST_DRAWN = 20  # parameters
 
 
 def changes_report(c: Comparison) -> Report:
@@ -40,7 +37,7 @@ def _blocks(c: Comparison) -> Iterator[Block]:
     same = c.verdict == "no_change_shown" and not c.one_result
     yield ShownVerdict("good" if same else "warn", headline(c))
     yield Lines(changes_lines(c))
-    yield Fold("", lambda: [_map(c)], figures=("moved",))
+    yield Fold("", lambda: [_moves(c)], figures=("moved",))
     yield _change_table(c)
 
 
@@ -165,25 +162,13 @@ def _change_table(c: Comparison) -> ShownTable:
     return table.when_narrow(1, 2)
 
 
-def _map(c: Comparison) -> Figure:
-    """The poses from above and from the side, each a disc as large as the tool moves there."""
-    from elastocal.report.figures import INK, SERIES
+def _moves(c: Comparison) -> Figure:
+    """How far the tool moves by each change alone, the largest first."""
+    from elastocal.report.figures import rows_of_dots
 
-    def draw(figure: Drawing) -> None:
-        most = float(c.distance.max())
-        area = 120.0 * c.distance / max(most, 1e-12)
-        for k, (j, title) in enumerate(((1, "from above"), (2, "from the side"))):
-            axes = figure.add_subplot(2, 1, k + 1)
-            x, y = c.place[:, 0], c.place[:, j]
-            axes.scatter(x, y, s=area, color=SERIES[0], alpha=0.6, linewidths=0)
-            axes.scatter(x, y, s=2, color=INK)
-            axes.set_aspect("equal", adjustable="datalim")
-            axes.set_title(f"{title}; the largest disc is {length(most)}")
-            axes.set_xlabel("x in m")
-            axes.set_ylabel(f"{'xyz'[j]} in m")
-
-    caption = (
-        "Random poses within the joint limits, in the data's frame of the old session. A disc's "
-        "area shows how far the tool has moved for the same command."
-    )
-    return Figure("moved", "How far the tool has moved", draw, 6.4, caption)
+    most = sorted(c.changes, key=lambda change: -change.moves)[:MOST_DRAWN]
+    rows = [(one.name, one.moves * 1e6, (np.nan, np.nan), length(one.moves)) for one in most]
+    noise = ("all by noise alone", 1e6 * float(np.sqrt(np.mean(c.chance**2))))
+    caption = "The largest changes by what each alone moves the tool, rms over the poses."
+    title = "How far each change moves the tool"
+    return rows_of_dots("moved", title, rows, "tool moved, rms", caption, noise, lengths=True)

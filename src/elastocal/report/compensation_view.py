@@ -101,11 +101,11 @@ def _commands(c: Compensation) -> ShownTable:
 
 
 def _errors(c: Compensation) -> Figure:
-    from elastocal.report.figures import Row, rows_of_dots
+    from elastocal.report.figures import rows_of_dots
 
-    table = c.targets.table
+    table, no_ends = c.targets.table, (np.nan, np.nan)
     rows = [
-        Row(table.configuration_labels[table.configuration[i]], float(c.before[i]) * 1e6)
+        (table.configuration_labels[table.configuration[i]], float(c.before[i]) * 1e6, no_ends, "")
         for i in np.flatnonzero(c.reached)[:MOST_ROWS]
     ]
     axis = "error at the nominal command"
@@ -131,12 +131,12 @@ def _of_readings(table: Measurements) -> Iterator[Block]:
 
 def _joints(table: Measurements) -> Figure:
     """Where each joint stood: the middle of its values, and from end to end."""
-    from elastocal.report.figures import Row, rows_of_dots
+    from elastocal.report.figures import rows_of_dots
 
     q = in_file_units(table.q, table.kinds)
     ends = np.column_stack([q.min(axis=0), q.max(axis=0)]) if len(q) else np.zeros((q.shape[1], 2))
     rows = [
-        Row(name, float(np.mean(e)), (float(e[0]), float(e[1])))
+        (name, float(np.mean(e)), (float(e[0]), float(e[1])), "")
         for name, e in zip(joint_columns(table.kinds), ends, strict=True)
     ]
     axis = "middle and ends of the values, in ° or mm"

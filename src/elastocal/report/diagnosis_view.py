@@ -44,7 +44,6 @@ from elastocal.report.causes_view import (
     field_table,
     headline_of_causes,
     place_table,
-    share_figure,
     share_text,
     slight_text,
 )
@@ -105,7 +104,7 @@ def _blocks(d: Diagnosis, kinds: Sequence[str]) -> Iterator[Block]:
     lines += [("Not separable", capital(f"{text}.")) for text in alike(d)]
     lines += [("Next", text) for text in diagnosis_steps(d)]
     yield Lines([*lines, *((WARNING, capital(printable(text))) for text in d.warnings)])
-    yield Fold("", lambda: _figures(d), figures=("budget", "shares", "curves"))
+    yield Fold("", lambda: _figures(d), figures=("budget", "curves"))
     shapes = "" if len(d.effects) <= FEW else "Found effects over the joints they act at"
     yield Fold(shapes, lambda: _shapes(d), figures=("effects",))
     yield cause_table(d)
@@ -116,8 +115,6 @@ def _blocks(d: Diagnosis, kinds: Sequence[str]) -> Iterator[Block]:
     yield Fold("Error budget", lambda: [gap_table(d)], printed=True)
     best = candidate_table(d, 0, MOST_PRINTED)
     yield Fold("Candidates", lambda: [best], printed=True)
-    yield Fold("Probability of every candidate", lambda: [candidate_figure(d)],
-               figures=("candidates",))  # fmt: skip
     if len(d.candidates) > MOST_PRINTED:
         more = candidate_table(d, MOST_PRINTED, MOST_CANDIDATES)
         yield Fold("Further candidates", lambda: [more])
@@ -150,8 +147,6 @@ def _key(d: Diagnosis) -> KeyFigures:
 def _figures(d: Diagnosis) -> Iterator[Figure]:
     from elastocal.report.figures import unknown_curves, waterfall
 
-    if d.components:
-        yield share_figure(d)
     if d.budget:
         yield waterfall("budget", _named_steps(d), ("noise alone", d.gap.noise_floor))
     if d.curves:
@@ -163,19 +158,6 @@ def _shapes(d: Diagnosis) -> Iterator[Figure]:
 
     if (found := effects_over_joints(d)) is not None:
         yield found
-
-
-def candidate_figure(d: Diagnosis) -> Figure:
-    """Probability of the best candidates, of an effect outside the catalogue, and of none."""
-    from elastocal.report.figures import FAINT, SERIES, Row, rows_of_dots
-
-    every = [(effect_at(c), c.probability, SERIES[0]) for c in d.candidates[:MOST_PRINTED]]
-    every.append(("an effect outside the catalogue", d.probability_unknown, SERIES[1]))
-    every.append(("no further effect", d.probability_nothing, FAINT))
-    rows = [Row(name, p, text=probability(p), colour=colour) for name, p, colour in every]
-    caption = "Probability of each, given these data and typical sizes."
-    title = "Probability of every candidate"
-    return rows_of_dots("candidates", title, rows, "probability", caption)
 
 
 def _nameless(d: Diagnosis) -> Iterator[Block]:
@@ -196,13 +178,18 @@ def _outliers(d: Diagnosis) -> Iterable[Block]:
 
 
 def _residuals(d: Diagnosis) -> Iterator[ShownArm | Block]:
-    from elastocal.report.residual_figures import residual_figures, residual_table, residuals_by
+    from elastocal.report import figures
+    from elastocal.report.arm_view import residual_arm
 
     base = d.calibrated
     assert base is not None
+    residuals = figures.residuals_by(base.observed, base.residual)
     yield Sentence("What the model leaves before the effects found are added.")
-    yield from residual_figures(base.model, base.observed, base.x, base.residual)
-    yield residual_table(base.observed, residuals_by(base.observed, base.residual))
+    yield residual_arm(base.model, base.observed, base.x, base.residual)
+    yield figures.over_configurations(residuals)
+    yield figures.over_joints(base.model.chain.kinds, residuals)
+    yield figures.over_time(base.observed, residuals)
+    yield figures.residual_table(base.observed, residuals)
 
 
 def repeatabilities(noise: NoiseFloor, kinds: Iterable[str]) -> str:

@@ -142,7 +142,7 @@ def _folds(
     yield Fold(
         "Residuals on the arm, over time and by group",
         lambda: _residuals(result),
-        figures=("space", "over_time", "smooth"),
+        figures=("space", "over_time"),
     )
     single = len(result.outliers) + len(result.excluded)
     if single or words.fault_lines(result):
@@ -170,8 +170,7 @@ def _key(result: Calibration, budget: ErrorBudget | None) -> KeyFigures:
 
 
 def _error_figures(result: Calibration, budget: ErrorBudget | None) -> Iterator[Block]:
-    from elastocal.report.figures import waterfall
-    from elastocal.report.residual_figures import uncertainty_map
+    from elastocal.report.figures import uncertainty_map, waterfall
 
     if budget is not None:
         yield waterfall("waterfall", *budget_steps(result, budget))
@@ -180,7 +179,7 @@ def _error_figures(result: Calibration, budget: ErrorBudget | None) -> Iterator[
 
 
 def _residual_figures(result: Calibration) -> Iterator[Block]:
-    from elastocal.report.residual_figures import over_configurations, over_joints, residuals_by
+    from elastocal.report.figures import over_configurations, over_joints, residuals_by
 
     residuals = residuals_by(result.observations, result.residual)
     yield over_configurations(residuals)
@@ -189,18 +188,11 @@ def _residual_figures(result: Calibration) -> Iterator[Block]:
 
 def _residuals(result: Calibration) -> Iterator[Block]:
     from elastocal.report.arm_view import residual_arm
-    from elastocal.report.residual_figures import (
-        over_time,
-        residual_table,
-        residuals_by,
-        smooth_figure,
-    )
+    from elastocal.report.figures import over_time, residual_table, residuals_by
 
     residuals = residuals_by(result.observations, result.residual)
     yield residual_arm(result.model, result.observations, result.x, result.residual)
     yield over_time(result.observations, residuals)
-    if (found := smooth_figure(result)) is not None:
-        yield found
     yield residual_table(result.observations, residuals)
 
 

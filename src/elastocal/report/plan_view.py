@@ -55,8 +55,7 @@ def plan_blocks(plan: Plan) -> Iterator[Block]:
     yield Fold("", lambda: [steps, stop_table(plan), _arm(plan)], figures=("poses",))
     yield Fold("Poses", lambda: [pose_table(plan)], printed=True)
     yield Fold("Why each pose", lambda: [reason_table(plan)], printed=True)
-    yield Fold("Predicted intervals", lambda: [interval_table(plan), interval_figure(plan)],
-               printed=True, figures=("intervals",))  # fmt: skip
+    yield Fold("Predicted intervals", lambda: [interval_table(plan)], printed=True)
     if plan.curve:
         yield Fold("Number of poses", lambda: _curve(plan), printed=True, figures=("curve",))
     if plan.timed:
@@ -73,7 +72,7 @@ def next_report(found: NextPoses) -> Report:
 
 def _next_blocks(found: NextPoses) -> Iterator[Block]:
     yield Lines(next_lines(found))
-    yield Fold("", lambda: _next_figures(found), figures=("gain", "doubts"))
+    yield Fold("", lambda: _next_figures(found), figures=("gain",))
     if found.plan is not None:
         yield from plan_blocks(found.plan)
 
@@ -106,42 +105,20 @@ def _curve(plan: Plan) -> Iterator[Block]:
     yield plan_curve(plan)
 
 
-MOST_DOTS = 40
-
-
-def interval_figure(plan: Plan) -> Figure:
-    """Half widths of the 95 % intervals that the plan promises."""
-    from elastocal.report.figures import Row, rows_of_dots
-
-    rows = []
-    for p in plan.predicted[:MOST_DOTS]:
-        half, unit = display(p.half_width, p.unit)
-        rows.append(Row(p.name, half, text=f"{significant(half, 2)} {unit}"))
-    axis = "half width of the 95 % interval, in the unit of the number"
-    return rows_of_dots("intervals", "Predicted intervals", rows, axis, logarithmic=True)
-
-
 def _next_figures(found: NextPoses) -> Iterator[Figure]:
-    """The error before and after the batch, and the effects that the model may lack."""
-    from elastocal.report.effect_names import name_of, probability
-    from elastocal.report.figures import Row, rows_of_dots
+    """The error before and after the batch."""
+    from elastocal.report.figures import rows_of_dots
 
-    g = found.gain
+    g, no_ends = found.gain, (math.nan, math.nan)
     names = ("measured so far", "with this batch")
     rows = [
-        Row(f"{name}{model}", value * 1e6, text=length(value))
+        (f"{name}{model}", value * 1e6, no_ends, length(value))
         for model, values in (("", (g.before, g.after)),
                               (", if the model is right", (g.model_before, g.model_after)))
         for name, value in zip(names, values, strict=True) if math.isfinite(value)
     ]  # fmt: skip
     axis = "rms error at the test poses"
     yield rows_of_dots("gain", "Error before and after the batch", rows, axis, lengths=True)
-    doubted = [
-        Row(name_of(f"{effect} at {where}"), p, text=probability(p))
-        for effect, where, p in found.doubts[:MOST_DOTS]
-    ]
-    title = "Effects that the model may lack"
-    yield rows_of_dots("doubts", title, doubted, "probability")
 
 
 TOLD = 2  # parameters that a pose serves, in the table
