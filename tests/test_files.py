@@ -15,7 +15,6 @@ from elastocal.config import read_toml
 from elastocal.errors import InputError
 from elastocal.files import (
     DEEPEST,
-    atomic_binary_writer,
     atomic_write_bytes,
     atomic_write_text,
     atomic_writer,
@@ -33,6 +32,7 @@ NESTED = {
     "dots": ".".join("a" * 400_000) + " = 1",
     "quoted": ".".join(['"a"', " 'b' "] * 50_000) + " = 1",
     "header": "[" + ".".join("a" * 400_000) + "]",
+    "within": "b = {c = 1, " + ".".join("a" * 400_000) + " = 1}",
 }
 
 
@@ -54,10 +54,11 @@ def test_a_large_file_is_refused_before_it_is_read(tmp_path):
 
 
 @pytest.mark.parametrize("kind", NESTED)
-def test_nesting_is_refused_at_once_with_its_line(tmp_path, kind):
+def test_nesting_is_refused_at_once(tmp_path, kind):
     (tmp_path / "cell.toml").write_text(f"name = 'arm'  # [[[\n{NESTED[kind]}\n")
     begun = time.perf_counter()
-    with pytest.raises(InputError, match=f"line 2: nested more than {DEEPEST} deep"):
+    told = "nested without end" if kind in ("lists", "tables") else f"line 2: nested more than {DEEPEST}"
+    with pytest.raises(InputError, match=told):
         read_toml(tmp_path / "cell.toml", "cell")
     assert time.perf_counter() - begun < 5.0
 
@@ -122,14 +123,9 @@ def test_a_failure_leaves_the_old_file_and_no_temporary_one(tmp_path, failure):
     assert os.listdir(tmp_path) == ["a.txt"]
 
 
-def test_bytes_are_written_whole_or_not_at_all(tmp_path):
+def test_bytes_are_written_as_they_are(tmp_path):
     atomic_write_bytes(tmp_path / "a.bin", b"\r\n\0")
     assert (tmp_path / "a.bin").read_bytes() == b"\r\n\0"
-    with pytest.raises(RuntimeError), atomic_binary_writer(tmp_path / "a.bin") as handle:
-        handle.write(b"half")
-        raise RuntimeError
-    assert (tmp_path / "a.bin").read_bytes() == b"\r\n\0"
-    assert os.listdir(tmp_path) == ["a.bin"]
 
 
 def test_missing_folder_is_an_input_error_that_names_it(tmp_path):
@@ -194,8 +190,8 @@ with together(sys.argv[1:]):
 def test_what_a_killed_process_left_goes_when_the_output_is_written_again(tmp_path):
     """Not before it is killed; and nothing but what it wrote."""
     outputs = [tmp_path / "a.txt", tmp_path / ("b" * 60)]
-    others = [tmp_path / name for name in (".a.txt.tmp", ".c.txt.0123abcd.tmp", "a.txt.tmp")]
-    (tmp_path / ".a.txt.0123abcd.tmp").symlink_to("link")
+    others = [tmp_path / name for name in (".a.txt.tmp", ".c.txt.999999999-0123abcd.tmp", "a.txt.tmp")]
+    (tmp_path / ".a.txt.999999999-0123abcd.tmp").symlink_to("link")
     for path in (*others, tmp_path / "link"):
         path.write_text("of the user")
     command = [sys.executable, "-c", WRITER, *map(str, outputs)]

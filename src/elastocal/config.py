@@ -117,7 +117,9 @@ def parsed_toml(path: str | Path, text: str) -> dict[str, Any]:
     check_nesting(path, text)
     try:
         return tomllib.loads(text)
-    except (ValueError, RecursionError) as error:
+    except RecursionError:
+        raise InputError(f"{path}: nested without end; check its brackets") from None
+    except ValueError as error:
         reason = str(error)
         if "(at end of document)" in reason:
             lines = text.split("\n")

@@ -22,24 +22,18 @@ from typing import Any, BinaryIO, TextIO
 from elastocal.errors import InputError
 from elastocal.text import SHOWN
 
-# What is being written ends so.  A process that was killed leaves it, no longer locked.
+# What is being written ends so, after the number of the process that writes it.
 UNFINISHED = ".tmp"
-_TAKEN_AT_RANDOM = r"\.[0-9a-f]{8}"
-# Lists and tables within each other, and parts of a dotted key: a file that people write has six.
-# tomllib takes time and memory that grow with the square of them.
+# Elements within each other, and parts of a dotted key: a file that people write has six.
 DEEPEST = 32
-# A string without an end takes all that is left of its line or text: none is looked through twice.
-_TOKEN = re.compile(
-    r'"""(?:[^"\\]|\\.|"(?!""))*+(?:"{3,5}+)?|'
-    r"'''(?:[^']|'(?!''))*+(?:'{3,5}+)?|"
-    r'"(?:[^"\\\n]|\\.)*+"?|'
-    r"'[^'\n]*+'?"
-    r"|#[^\n]*|[\[{]|[\]}]|\.|[\w-]+|[ \t]+|[^\w\s]|\n+|\s",
-    re.DOTALL,
+# A key of that many parts where a key may begin, for which tomllib takes time that grows with their
+# square.
+_DOTTED = re.compile(
+    r"""(?:^|[{,])[ \t]*+\[{0,2}+(?:[ \t]*+(?:[\w-]++|"[^"\n]*+"|'[^'\n]*+')[ \t]*+\.){%d}"""
+    % (DEEPEST - 1),
+    re.MULTILINE,
 )
 LONGEST_INTEGER = 18  # digits; a longer one is read as a float
-# No link is followed, no pipe waited for; on Windows bytes are taken as they are.
-HOW_TO_OPEN = sum(getattr(os, name, 0) for name in ("O_NOFOLLOW", "O_NONBLOCK", "O_BINARY"))
 
 
 def check_regular(path: str | Path, what: str) -> int:
@@ -152,27 +146,13 @@ def read_json(path: str | Path, what: str, max_bytes: int, remedy: str) -> Any:
 
 
 def check_nesting(path: str | Path, text: str) -> None:
-    """Raise InputError where the TOML `text` nests deeper than DEEPEST, naming the line.
-
-    Lists and tables within each other count, and the parts of a dotted key.
-    """
-    depth = dots = 0
-    for token in _TOKEN.finditer(text):
-        first = token[0][0]
-        if first in "[{":
-            depth += 1
-        elif first in "]}":
-            depth -= 1
-        if first == ".":
-            dots += 1
-        elif not (first in "\"' \t-_" or first.isalnum()):
-            dots = 0
-        if max(depth, dots) >= DEEPEST:
-            line = text.count("\n", 0, token.start()) + 1
-            raise InputError(
-                f"{path}, line {line}: nested more than {DEEPEST} deep; no key needs more than a "
-                "few levels, so check the brackets and dots there"
-            )
+    """Raise InputError where a key of the TOML `text` has DEEPEST parts or more, naming the line."""
+    if found := _DOTTED.search(text):
+        line = text.count("\n", 0, found.end()) + 1
+        raise InputError(
+            f"{path}, line {line}: nested more than {DEEPEST} deep; no key needs more than a few "
+            "levels, so check the dots there"
+        )
 
 
 def decoded(
@@ -233,17 +213,9 @@ def atomic_writer(path: str | Path) -> Iterator[TextIO]:
         yield handle
 
 
-@contextmanager
-def atomic_binary_writer(path: str | Path) -> Iterator[BinaryIO]:
-    """The same for bytes."""
-    with _atomic(path, "b") as handle:
-        yield handle
-
-
-# While `together` runs: the files that it holds back, and what is written of them so far, with the
-# descriptor that locks it.
+# While `together` runs: the files that it holds back, and what is written of them so far.
 _held: set[Path] = set()
-_written: list[tuple[Path, Path, int | None]] = []
+_written: list[tuple[Path, Path]] = []
 
 
 @contextmanager
@@ -256,14 +228,13 @@ def together(paths: Iterable[str | Path]) -> Iterator[None]:
     try:
         yield
         with _undisturbed():
-            for temporary, target, _ in _written:
+            for temporary, target in _written:
                 with _write_errors(target):
                     os.replace(temporary, target)
     finally:
-        for temporary, _, lock in _written:
+        for temporary, _ in _written:
             with suppress(OSError):
                 temporary.unlink()
-            _unlock(lock)
         _held.clear()
         _written.clear()
 
@@ -284,60 +255,26 @@ def _undisturbed() -> Iterator[None]:
         before(signal.SIGINT, None)
 
 
-def _begun(target: Path) -> tuple[Path, int | None]:
-    """A hidden empty file of its own beside `target`, and the descriptor that locks it.
-
-    When the process ends, however it does, the system unlocks it.  None where there are no locks.
-    """
-    while True:
-        name = f".{target.name[:40]}.{secrets.token_hex(4)}{UNFINISHED}"
-        temporary = target.with_name(name)
-        lock = os.open(temporary, os.O_RDWR | os.O_CREAT | os.O_EXCL, 0o666)
-        locked = _locked(lock, wait=True)
-        # Somebody who sweeps may have had it before it was locked.
-        if locked and os.fstat(lock).st_nlink:
-            return temporary, lock
-        os.close(lock)
-        if not locked:
-            return temporary, None
-
-
-def _locked(descriptor: int, wait: bool = False) -> bool | None:
-    """Lock the file; False where another process has it, None where the system has no locks."""
-    try:
-        import fcntl
-
-        fcntl.flock(descriptor, fcntl.LOCK_EX | (0 if wait else fcntl.LOCK_NB))
-    except BlockingIOError:
-        return False
-    except (ImportError, OSError):
-        return None
-    return True
-
-
-def _unlock(descriptor: int | None) -> None:
-    if descriptor is not None:
-        os.close(descriptor)
-
-
 def remove_abandoned(folder: Path, name: str) -> None:
-    """Remove what killed processes left in `folder` of files whose names match the pattern `name`.
-
-    That is a regular file of the user's own, named as unfinished ones are, that no process locks.
-    """
-    known = re.compile(rf"\.{name}{_TAKEN_AT_RANDOM}{re.escape(UNFINISHED)}", re.DOTALL)
+    """Remove what killed processes left in `folder` of files whose names match the pattern `name`:
+    regular files named as unfinished ones are, whose process runs no longer."""
+    known = re.compile(rf"\.{name}\.(\d+)-[0-9a-f]{{8}}{re.escape(UNFINISHED)}", re.DOTALL)
     for path in folder.iterdir():
-        if not known.fullmatch(path.name):
-            continue
-        with suppress(OSError):
-            descriptor = os.open(path, os.O_RDWR | HOW_TO_OPEN)
-            try:
-                found = os.fstat(descriptor)
-                own = not hasattr(os, "getuid") or found.st_uid == os.getuid()
-                if own and stat.S_ISREG(found.st_mode) and _locked(descriptor):
-                    path.unlink()
-            finally:
-                os.close(descriptor)
+        found = known.fullmatch(path.name)
+        if found and stat.S_ISREG(path.lstat().st_mode) and not _runs(int(found[1])):
+            path.unlink()
+
+
+def _runs(process: int) -> bool:
+    """Whether a process of this number may run."""
+    try:
+        if os.name == "posix":  # elsewhere the signal 0 would end it
+            os.kill(process, 0)
+    except ProcessLookupError:
+        return False
+    except (OSError, OverflowError):  # somebody else's
+        return True
+    return True
 
 
 def _final(path: str | Path) -> Path:
@@ -359,27 +296,23 @@ def _atomic(path: str | Path, binary: str, **options: Any) -> Iterator[Any]:
         target = _final(target)
         with suppress(OSError):
             remove_abandoned(target.parent, re.escape(target.name[:40]))
-        temporary, lock = _begun(target)
-        kept = False
+        own = f"{os.getpid()}-{secrets.token_hex(4)}"
+        temporary = target.with_name(f".{target.name[:40]}.{own}{UNFINISHED}")
         try:
-            with open(temporary, f"w{binary}", **options) as handle:
+            with open(temporary, f"x{binary}", **options) as handle:
                 if target.exists():  # what others may not read they may not read afterwards
                     os.chmod(temporary, stat.S_IMODE(target.stat().st_mode))
                 yield handle
                 handle.flush()
                 os.fsync(handle.fileno())
             if target in _held:
-                _written.append((temporary, target, lock))
-                kept = True
+                _written.append((temporary, target))
             else:
                 os.replace(temporary, target)
         except BaseException:
             with suppress(OSError):
                 temporary.unlink()
             raise
-        finally:
-            if not kept:
-                _unlock(lock)
 
 
 @contextmanager
@@ -407,5 +340,5 @@ def atomic_write_text(path: str | Path, text: str) -> None:
 
 def atomic_write_bytes(path: str | Path, data: bytes) -> None:
     """The same for bytes."""
-    with atomic_binary_writer(path) as handle:
+    with _atomic(path, "b") as handle:
         handle.write(data)
