@@ -57,7 +57,11 @@ def test_a_large_file_is_refused_before_it_is_read(tmp_path):
 def test_nesting_is_refused_at_once(tmp_path, kind):
     (tmp_path / "cell.toml").write_text(f"name = 'arm'  # [[[\n{NESTED[kind]}\n")
     begun = time.perf_counter()
-    told = "nested without end" if kind in ("lists", "tables") else f"line 2: nested more than {DEEPEST}"
+    told = (
+        "nested without end"
+        if kind in ("lists", "tables")
+        else f"line 2: nested more than {DEEPEST}"
+    )
     with pytest.raises(InputError, match=told):
         read_toml(tmp_path / "cell.toml", "cell")
     assert time.perf_counter() - begun < 5.0
@@ -190,7 +194,9 @@ with together(sys.argv[1:]):
 def test_what_a_killed_process_left_goes_when_the_output_is_written_again(tmp_path):
     """Not before it is killed; and nothing but what it wrote."""
     outputs = [tmp_path / "a.txt", tmp_path / ("b" * 60)]
-    others = [tmp_path / name for name in (".a.txt.tmp", ".c.txt.999999999-0123abcd.tmp", "a.txt.tmp")]
+    others = [
+        tmp_path / name for name in (".a.txt.tmp", ".c.txt.999999999-0123abcd.tmp", "a.txt.tmp")
+    ]
     (tmp_path / ".a.txt.999999999-0123abcd.tmp").symlink_to("link")
     for path in (*others, tmp_path / "link"):
         path.write_text("of the user")

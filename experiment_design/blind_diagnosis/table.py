@@ -23,7 +23,7 @@ from score import Record, judged
 from suites import FEW_POSES, MANY_POSES, SUITES
 from whole_score import SMALL, over_oracle
 
-from elastocal.studies.study import read_results
+from elastocal.studies import read_results
 
 FAR, WELL_APART = 5.0, 10.0  # d
 NEARLY_CERTAIN = 0.97

@@ -29,8 +29,8 @@ DEEPEST = 32
 # A key of that many parts where a key may begin, for which tomllib takes time that grows with their
 # square.
 _DOTTED = re.compile(
-    r"""(?:^|[{,])[ \t]*+\[{0,2}+(?:[ \t]*+(?:[\w-]++|"[^"\n]*+"|'[^'\n]*+')[ \t]*+\.){%d}"""
-    % (DEEPEST - 1),
+    r"""(?:^|[{,])[ \t]*+\[{0,2}+(?:[ \t]*+(?:[\w-]++|"[^"\n]*+"|'[^'\n]*+')[ \t]*+\.)"""
+    rf"{{{DEEPEST - 1}}}",
     re.MULTILINE,
 )
 LONGEST_INTEGER = 18  # digits; a longer one is read as a float
@@ -146,7 +146,7 @@ def read_json(path: str | Path, what: str, max_bytes: int, remedy: str) -> Any:
 
 
 def check_nesting(path: str | Path, text: str) -> None:
-    """Raise InputError where a key of the TOML `text` has DEEPEST parts or more, naming the line."""
+    """Raise InputError, naming the line, where a key of the TOML `text` has DEEPEST parts."""
     if found := _DOTTED.search(text):
         line = text.count("\n", 0, found.end()) + 1
         raise InputError(

@@ -15,7 +15,7 @@ from typer.testing import CliRunner
 
 from elastocal.cli.main import app
 from elastocal.cli.using import Pace
-from elastocal.studies.study import read_results
+from elastocal.studies import read_results
 
 # A child may inherit that SIGINT is ignored; here it must not.
 PROGRAM = (

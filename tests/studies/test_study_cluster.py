@@ -8,7 +8,8 @@ import pytest
 from support.study_folders import numbers, run_study, write_study
 
 from elastocal.errors import InputError
-from elastocal.studies.run import (
+from elastocal.studies import read_results
+from elastocal.study_runs import (
     ClusterLostError,
     DaskWorkers,
     StudyStop,
@@ -16,7 +17,6 @@ from elastocal.studies.run import (
     connect,
     hand_out,
 )
-from elastocal.studies.study import read_results
 
 dask = pytest.importorskip("dask", reason="needs the extra 'cluster'")
 distributed = pytest.importorskip("distributed", reason="needs the extra 'cluster'")
@@ -94,23 +94,8 @@ def test_a_task_that_always_kills_its_worker_fails_and_is_told(cluster, tmp_path
     assert error.startswith("its worker process died 3 times")
 
 
-@pytest.mark.long
-def test_others_on_the_same_worker_are_not_blamed(tmp_path):
-    folder, marks = marked(tmp_path, lethal={1: 10**6}, count=6, sleep=0.2)
-    with (
-        dask.config.set({"distributed.scheduler.allowed-failures": 0}),
-        distributed.LocalCluster(
-            n_workers=1, threads_per_worker=4, processes=True, dashboard_address=":0"
-        ) as crowded,
-    ):
-        ending = run_study(folder, tmp_path / "r", at(crowded.scheduler_address))
-    assert (ending.done, ending.failed) == (5, 1)
-    assert begun(marks).count(1) == 2
-    assert list(numbers(tmp_path / "r")["task"]) == [0, 2, 3, 4, 5]
-
-
 def test_no_scheduler_is_told(monkeypatch):
-    monkeypatch.setattr("elastocal.studies.run.ANSWER", 0.5)
+    monkeypatch.setattr("elastocal.study_runs.ANSWER", 0.5)
     nothing = dask.config.set({"scheduler-address": None})
     with nothing, pytest.raises(InputError, match="names no scheduler"):
         connect("config")

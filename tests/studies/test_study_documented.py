@@ -5,7 +5,7 @@ from pathlib import Path
 
 from support.study_folders import run_study, write_study
 
-from elastocal.studies.study import read_results, read_study
+from elastocal.studies import read_results, read_study
 
 PAGE = Path(__file__).parents[2] / "docs" / "studies.md"
 

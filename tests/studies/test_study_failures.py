@@ -3,7 +3,7 @@
 import pytest
 from support.study_folders import SCRIPT, TOML, numbers, on_processes, run_study, write_study
 
-from elastocal.studies.study import read_results
+from elastocal.studies import read_results
 
 RAISING = SCRIPT.replace(
     "    x = rng",

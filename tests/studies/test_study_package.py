@@ -6,7 +6,7 @@ import pytest
 from support.study_folders import SCRIPT, TOML, write_study
 
 from elastocal.errors import InputError
-from elastocal.studies.study import Sources, execute, read_study
+from elastocal.studies import Sources, execute, read_study
 
 WITH_PARTS = """\
 from pathlib import Path
@@ -40,7 +40,7 @@ def result_of(study, sources=None):
 
 def test_a_worker_without_the_folder_unpacks_it(folder, tmp_path, monkeypatch):
     study = read_study(folder)
-    monkeypatch.setattr("elastocal.studies.study._here", ("", folder.resolve(), None))
+    monkeypatch.setattr("elastocal.studies._here", ("", folder.resolve(), None))
     elsewhere = Sources(tmp_path / "not here", study.sources.contents, study.sources.columns)
     assert result_of(study, elsewhere)["rows"][0]["mean"] == 42
     module = sys.modules["study_part_of_test"]

@@ -6,8 +6,8 @@ import sys
 import pytest
 from support.study_folders import here, on_processes, run_study, write_study
 
-from elastocal.studies.run import StudyStop
-from elastocal.studies.study import read_results
+from elastocal.studies import read_results
+from elastocal.study_runs import StudyStop
 
 pytestmark = pytest.mark.skipif(sys.platform == "win32", reason="signals of POSIX")
 

@@ -8,9 +8,9 @@ from typing import Any
 
 import pandas as pd
 
-from elastocal.studies.run import Ending, StudyStop, run_local
-from elastocal.studies.run import run_study as run_prepared
-from elastocal.studies.study import Study, execute, read_results, read_study
+from elastocal.studies import Study, execute, read_results, read_study
+from elastocal.study_runs import Ending, StudyStop, run_local
+from elastocal.study_runs import run_study as run_prepared
 
 SCRIPT = """\
 def tasks(options):

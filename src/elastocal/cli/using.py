@@ -34,7 +34,7 @@ if TYPE_CHECKING:
     from elastocal.export.refit import Refit
     from elastocal.model.calibrated import CalibratedArm
     from elastocal.report.blocks import Block
-    from elastocal.studies.run import Ending
+    from elastocal.study_runs import Ending
     from elastocal.units import Array
 
 
@@ -449,8 +449,8 @@ def study(
         retry_failed: Run tasks that failed again.
     """
     require(cluster is None or jobs is None, "--jobs is for this machine; leave it with --cluster")
-    from elastocal.studies.run import StudyStop, run_study, summarise
-    from elastocal.studies.study import check_page, read_study
+    from elastocal.studies import check_page, read_study
+    from elastocal.study_runs import StudyStop, run_study, summarise
 
     results = folder / "results" if output is None else output
     page = folder / "result.md"
@@ -486,7 +486,7 @@ def _told(ending: Ending, results: Path) -> str:
         text += f", {ending.failed} failed"
     text += f"; results in {results}"
     if ending.failed:
-        from elastocal.studies.study import read_results
+        from elastocal.studies import read_results
 
         first = read_results(results, failed=True).iloc[0]
         text += (

@@ -1,8 +1,11 @@
-"""A study as its folder states it, its tasks, one of them carried out in whatever process, and the
-results on disk.
+"""Studies: many independent tasks, each result of which is kept as it comes.
 
-The folder holds `study.py` (what to compute) and `study.toml` (seed, options, files, columns).
-What a worker needs of it travels as `Sources`; their hash, the seed and the task's values say
+    study = read_study("experiment_design/coverage", options=["replicates=200"])
+    run_study(study, "look", jobs=4)  # of elastocal.study_runs
+    frame = read_results("look")
+
+A study's folder holds `study.py` (what to compute) and `study.toml` (seed, options, columns).  What
+a worker needs of it travels as `Sources`; their hash, the seed and the task's values say
 whether a result on disk is of this very task.
 """
 
@@ -149,13 +152,7 @@ def read_study(folder: str | Path, seed: int | None = None, options: Iterable[st
         require(name not in RESERVED, f"{path}: columns.{name} cannot be a column; {TAKEN}")
     chosen = _with_options(path, stated.options, options)
     for key, value in chosen.items():
-        try:
-            json.dumps(value, allow_nan=False)
-        except (TypeError, ValueError) as error:
-            raise InputError(
-                f"{path}: key options.{quoted(key)} cannot be recorded ({error}); use finite "
-                "numbers, text, true/false, lists and tables of them"
-            ) from None
+        _json(f"{path}: key options.{quoted(key)} cannot be recorded", value)
     sources = Sources(folder.resolve(), _contents(folder.resolve(), stated, path), stated.columns)
     seed = stated.seed if seed is None else seed
     module = load(sources)
@@ -229,14 +226,18 @@ def _tasks(
             )
             told = f"study.toml: columns.{key} is also a value of the tasks; rename one of them"
             require(key not in sources.columns, told)
-        try:
-            text = json.dumps(dict(task), allow_nan=False)
-        except (TypeError, ValueError) as error:
-            raise InputError(
-                f"{where}: {error}; use plain JSON values (numbers, text, true/false, lists, dicts)"
-            ) from None
+        text = _json(where, dict(task))
         whole = f"{sources.digest}\n{seed}\n{index}\n{json.dumps(json.loads(text), sort_keys=True)}"
         yield StudyTask(index, text, seed, hashlib.sha256(whole.encode()).hexdigest())
+
+
+def _json(where: str, value: Any) -> str:
+    """`value` as JSON text; raises InputError where it has no such form."""
+    try:
+        return json.dumps(value, allow_nan=False)
+    except (TypeError, ValueError) as error:
+        told = "finite numbers, text, true/false, lists and tables of them"
+        raise InputError(f"{where}: {error}; use plain JSON values: {told}") from None
 
 
 def load(sources: Sources) -> ModuleType:
@@ -381,8 +382,7 @@ OURS = {RESULTS, STATEMENT, FAILURES, WRITTEN}
 def opened(folder: Path) -> Iterator[None]:
     """The results in `folder`, made where absent, with no other process writing to it.
 
-    Raises InputError where the folder cannot be made, holds something else, or another run has
-    it.  What a killed run left half-written is removed.
+    Raises InputError where the folder cannot be made, holds something else, or another run has it.
     """
     import fcntl
 
@@ -403,46 +403,31 @@ def opened(folder: Path) -> Iterator[None]:
                 f"{folder}: another run of the study is writing there; wait for it, or name "
                 f"another folder with {option('output', 'NEW')}"
             ) from None
-        drop_lines(folder)
         yield
 
 
-def add_line(folder: Path, line: Row, version: str) -> None:
-    """Write the line of a task that ended, made by `version`; its traceback goes to the log."""
+def add_line(folder: Path, line: Row) -> None:
+    """Write the line of a task that ended; its traceback goes to the log."""
     if trace := line.pop("trace", None):
         with open(folder / FAILURES, "a", encoding="utf-8") as log:
             log.write(shown(f"task {line['task']} {json.dumps(line['values'])}\n{trace}\n"))
-    text = json.dumps(line | {"elastocal": version}, ensure_ascii=False, allow_nan=False)
     with open(folder / RESULTS, "a", encoding="utf-8") as handle:
-        handle.write(text + "\n")
+        handle.write(as_text(line))
 
 
-def drop_lines(folder: Path, failed: bool = False) -> None:
-    """Take away the beginning of a line that a killed run left, and `failed` tasks' lines."""
-    if not (folder / RESULTS).exists():
-        return
-    text = read_text(folder / RESULTS, "results", MOST_RESULTS)
-    kept = [line for line in text.split("\n")[:-1]
-            if not failed or json.loads(line)["task_error"] is None]  # fmt: skip
-    if (whole := "".join(f"{line}\n" for line in kept)) != text:
-        atomic_write_text(folder / RESULTS, whole)
-
-
-def clear_results(folder: Path) -> None:
-    for name in (RESULTS, STATEMENT, FAILURES):
-        (folder / name).unlink(missing_ok=True)
+def as_text(line: Row) -> str:
+    return json.dumps(line, ensure_ascii=False, allow_nan=False) + "\n"
 
 
 def result_lines(folder: Path) -> list[Row]:
-    """Returns all lines in the order of their tasks.
+    """Returns all whole lines in the order of their tasks: a killed run may leave the beginning of
+    one.
 
     Raises InputError where one is damaged, or a task has more than one.
     """
     path, found = folder / RESULTS, dict[int, Row]()
     text = read_text(path, "results", MOST_RESULTS) if path.exists() else ""
-    for number, written in enumerate(text.split("\n"), 1):
-        if not written:
-            continue
+    for number, written in enumerate(text.split("\n")[:-1], 1):
         here = f"{path}, line {number}"
         try:
             line = json.loads(written)
@@ -459,13 +444,13 @@ def result_lines(folder: Path) -> list[Row]:
     return [found[index] for index in sorted(found)]
 
 
-def write_statement(folder: Path, study: Study, version: str) -> None:
+def write_statement(folder: Path, study: Study) -> None:
     """Write down what the results are of: seed, options, hashes of the sources."""
     statement = {
         "schema": SCHEMA, "title": study.title, "seed": study.seed,
         "options": dict(study.options), "tasks": len(study.tasks),
         "columns": dict(study.sources.columns), "sources": study.sources.digests,
-        "elastocal": version,
+        "elastocal": __version__,
     }  # fmt: skip
     text = json.dumps(statement, indent=1, ensure_ascii=False, allow_nan=False)
     atomic_write_text(folder / STATEMENT, text + "\n")

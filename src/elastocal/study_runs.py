@@ -1,9 +1,5 @@
 """A study run: tasks on joblib's processes or a Dask cluster, recorded as they come, stopped.
 
-    study = read_study("experiment_design/coverage", options=["replicates=200"])
-    run_study(study, "look", jobs=4)
-    frame = read_results("look")
-
 Workers know nothing of what a task computes, and only the one process that the user started
 writes.  However a run ends, what was done by then is kept, and the next one goes on from there.
 """
@@ -14,10 +10,8 @@ import logging
 import os
 import queue
 import signal
-import subprocess
 import threading
-import time
-from collections import defaultdict, deque
+from collections import Counter, deque
 from collections.abc import Callable, Generator, Sequence
 from concurrent.futures import CancelledError
 from concurrent.futures.process import BrokenProcessPool
@@ -29,17 +23,18 @@ from pathlib import Path
 from types import FrameType
 from typing import Any, Self
 
-from elastocal import __version__
 from elastocal.errors import ElastocalError, InputError, option, require
-from elastocal.files import read_bytes
-from elastocal.studies.study import (
+from elastocal.files import atomic_write_text, read_bytes
+from elastocal.studies import (
+    FAILURES,
+    RESULTS,
+    STATEMENT,
     Row,
     Study,
     StudyTask,
     add_line,
+    as_text,
     calling,
-    clear_results,
-    drop_lines,
     execute,
     opened,
     read_results,
@@ -110,68 +105,62 @@ def _write(message: str) -> None:
 
 
 class Processes:
-    """Processes on this machine: joblib's, replaced by new ones when one of them dies."""
+    """A process of joblib's for each task that is out, which takes one after the other."""
 
     tries = 3  # of a task whose process dies
 
     def __init__(self, number: int) -> None:
         from joblib import cpu_count
 
-        self.number = number
-        self._pool: Any = None
+        self.places = number
+        self._pools, self._free = list[Any](), list[Any]()
         threads = str(max(cpu_count() // number, 1))
         self._env = {name: os.environ.get(name, threads) for name in THREADS}
-
-    def places(self) -> int:
-        return self.number
 
     def submit(self, *call: Any) -> Any:
         from joblib.externals.loky import ProcessPoolExecutor
 
-        while True:
-            self._pool = self._pool or ProcessPoolExecutor(
-                self.number,
-                initializer=partial(signal.signal, signal.SIGINT, signal.SIG_IGN),  # Ctrl-C
-                env=self._env,
-            )
-            try:
-                return self._pool.submit(*call)
-            except BrokenProcessPool:
-                self._pool = None
+        if not self._free:
+            ignore = partial(signal.signal, signal.SIGINT, signal.SIG_IGN)  # Ctrl-C is for us
+            self._pools.append(ProcessPoolExecutor(1, initializer=ignore, env=self._env))
+            self._free.append(self._pools[-1])
+        pool = self._free.pop()
+        future = pool.submit(*call)
+
+        def ended(future: Any) -> None:
+            if not future.cancelled() and future.exception() is None:  # the process lives
+                self._free.append(pool)
+
+        future.add_done_callback(ended)
+        return future
 
     def deaths(self, error: Exception) -> int:
         return int(isinstance(error, BrokenProcessPool))
 
     def close(self, out: list[Any]) -> None:
-        if self._pool is not None:
-            self._pool.shutdown(kill_workers=bool(out))
+        for pool in self._pools:
+            pool.shutdown(kill_workers=bool(out))
 
 
 class DaskWorkers:
-    """The workers of a Dask cluster, which gives the tasks of a dead one to another.
+    """The workers of a Dask cluster, which gives the tasks of a dead one to another, and gives up a
+    task that killed more than the cluster allows (distributed.scheduler.allowed-failures)."""
 
-    Each task has a future of its own: one that killed more workers than the cluster allows
-    (distributed.scheduler.allowed-failures) fails alone, where joblib's backend for Dask gives up
-    the whole run.
-    """
+    tries = 1
 
     def __init__(self, client: Any, tell: Callable[[str], None]) -> None:
         self._client, self._tell, self._told = client, tell, False
-        self._threads, self._looked, self.tries = 0, float("-inf"), 1
 
+    @property
     def places(self) -> int:
-        """Returns the threads of all workers; raises ClusterLostError without a scheduler."""
+        """The threads of all workers; raises ClusterLostError without a scheduler."""
         if self._client.status != "running":
             raise self._lost()
-        if time.monotonic() - self._looked > 1.0:
-            threads = self._client.nthreads().values()
-            self._threads, self._looked = sum(threads), time.monotonic()
-            if max(threads, default=0) > 1:
-                self.tries = 2  # a worker may have died of another task that it ran
-            if not threads and not self._told:
-                self._tell("the cluster has no worker; waiting for one")
-            self._told = not threads
-        return self._threads
+        threads = sum(self._client.nthreads().values())
+        if not threads and not self._told:
+            self._tell("the cluster has no worker; waiting for one")
+        self._told = not threads
+        return threads
 
     def submit(self, *call: Any) -> Any:
         return self._client.submit(*call, pure=False)  # no other call may answer for this one
@@ -204,24 +193,17 @@ def hand_out(
 ) -> Lines:
     """Lines of results as they come, none twice; none new begins once `stop` is asked for.
 
-    No task waits at a worker: what is out is what is waited for on Ctrl-C.  A process that dies
-    may have died of another task that was out, so those that were have further tries at the end,
-    each alone; one whose processes still die has failed.
+    No task waits at a worker: what is out is what is waited for on Ctrl-C.
     """
-    waiting, suspects = deque(tasks), deque[StudyTask]()
-    out: dict[Any, StudyTask] = {}
-    ended: queue.SimpleQueue[Any] = queue.SimpleQueue()
-    died = defaultdict[int, list[int]](list)
+    waiting, out = deque(tasks), dict[Any, StudyTask]()
+    ended, died = queue.SimpleQueue[Any](), Counter[int]()
     try:
-        while True:
-            places = crew.places()
-            while not stop.asked and len(out) < places and (waiting or (suspects and not out)):
-                task = (waiting or suspects).popleft()
+        while out or (waiting and not stop.asked):
+            while waiting and not stop.asked and len(out) < crew.places:
+                task = waiting.popleft()
                 future = crew.submit(execute, study.sources, task)
                 out[future] = task
                 future.add_done_callback(ended.put)
-            if not out and (stop.asked or not (waiting or suspects)):
-                return
             try:
                 future = ended.get(timeout=1.0 if out else 0.1)
             except queue.Empty:
@@ -230,15 +212,15 @@ def hand_out(
             try:
                 line = future.result()
             except Exception as error:  # execute() returns what a task raises
-                deaths = died[task.index]
-                deaths.append(crew.deaths(error))
-                if deaths[-1] and len(deaths) < crew.tries:
-                    suspects.append(task)
+                deaths = crew.deaths(error)
+                died[task.index] += deaths
+                if deaths and died[task.index] < crew.tries:
+                    waiting.appendleft(task)
                     continue
                 told = f"the worker could not run it: {type(error).__name__}: {error}"
-                if deaths[-1]:
+                if deaths:
                     told = (
-                        f"its worker process died {sum(deaths)} times (out of memory, killed, "
+                        f"its worker process died {died[task.index]} times (out of memory, killed, "
                         "or crashed in a library)"
                     )
                 line = task.line() | {"task_error": told, "trace": f"{told}\n{error}\n"}
@@ -292,8 +274,8 @@ def _security(
 def connect(address: str, **way: Any) -> Any:
     """Returns a client of the scheduler at `address`, or in Dask's configuration ("config").
 
-    Raises InputError where distributed is not installed, the way there is not allowed, there is
-    no scheduler, or a worker lacks this version of elastocal.
+    Raises InputError where distributed is not installed, the way there is not allowed, or there is
+    no scheduler.
     """
     try:
         import dask
@@ -315,25 +297,12 @@ def connect(address: str, **way: Any) -> Any:
     for name in [n for n in logging.root.manager.loggerDict if n.startswith("distributed")]:
         logging.getLogger(name).setLevel(logging.CRITICAL)
     try:
-        client = distributed.Client(where, timeout=ANSWER, set_as_default=False, security=security)
+        return distributed.Client(where, timeout=ANSWER, set_as_default=False, security=security)
     except (OSError, ValueError, TypeError, RuntimeError) as error:
         raise InputError(
             f"{here}: no scheduler answers ({error}); check the address, or "
             "start one for this host alone: dask scheduler"
         ) from None
-    try:
-        found = client.run(_version).items()
-        wrong = [f"worker {name} has elastocal {has}" for name, has in found if has != __version__]
-    except Exception as error:  # of the worker: whatever its Python lacks
-        wrong = [f"a worker cannot import elastocal ({error})"]
-    if wrong:
-        client.close()
-        raise InputError(f"{here}: {wrong[0]}; install elastocal {__version__} there, as here")
-    return client
-
-
-def _version() -> str:
-    return __version__
 
 
 @dataclass(frozen=True)
@@ -377,31 +346,32 @@ def run_study(
     Raises InputError where the results in `output` are of another seed, source or task, or the
     cluster cannot be reached; ClusterLostError where the scheduler goes away.
     """
-    folder, stop, version = Path(output), stop or StudyStop(), source_version()
+    folder, stop = Path(output), stop or StudyStop()
     with opened(folder):
-        known = {} if restart else _known(study, folder)
-        failures = {k: failed for k, failed in known.items() if not (failed and retry_failed)}
+        known = [] if restart else _known(study, folder)
+        kept = [line for line in known if not (retry_failed and line["task_error"])]
+        there = {line["task"]: line["task_error"] is not None for line in kept}
         wanted = study.tasks[:only]
-        left = [task for task in wanted if task.index not in failures]
+        left = [task for task in wanted if task.index not in there]
         if runner is None and cluster is not None and left:
             # Before results are discarded: one that cannot be reached must not cost them.
             crew = DaskWorkers(connect(cluster, **way), tell)
             runner = lambda tasks: hand_out(crew, study, tasks, stop)  # noqa: E731
         elif runner is None:
             runner = partial(run_local, study, jobs=jobs, stop=stop)
-        if restart:
-            clear_results(folder)
-        if retry_failed:
-            drop_lines(folder, failed=True)
-        write_statement(folder, study, version)
+        for name in (RESULTS, STATEMENT, FAILURES) if restart else ():
+            (folder / name).unlink(missing_ok=True)
+        if left:  # without the beginning of a line
+            atomic_write_text(folder / RESULTS, "".join(map(as_text, kept)))
+        write_statement(folder, study)
         total, before = len(wanted), len(wanted) - len(left)
-        ended, failed = before, sum(failures.get(task.index, False) for task in wanted)
+        ended, failed = before, sum(there.get(task.index, False) for task in wanted)
         progress(total, ended, failed)
         try:
             with closing(runner(left)) as lines:
                 for line in lines:
                     stop.check()
-                    add_line(folder, line, version)
+                    add_line(folder, line)
                     failed += line["task_error"] is not None
                     ended += 1
                     progress(total, ended, failed)
@@ -411,8 +381,8 @@ def run_study(
     return Ending(total, before, ended - failed, failed, stop.asked)
 
 
-def _known(study: Study, folder: Path) -> dict[int, bool]:
-    """Whether it failed, by index of each task that the results hold.
+def _known(study: Study, folder: Path) -> list[Row]:
+    """The lines that the results hold.
 
     Raises InputError where a task there is not the study's task of that index now.
     """
@@ -422,13 +392,14 @@ def _known(study: Study, folder: Path) -> dict[int, bool]:
         before.get("columns", columns) == columns,
         f"{folder}: has other columns, types or units than the study now. {here}",
     )
-    lines = [line for line in result_lines(folder) if line["task"] < len(study.tasks)]
+    lines = result_lines(folder)
     for line in lines:
-        if study.tasks[line["task"]].hash != line["task_hash"]:
-            changes = _changes(study, before) or [f"task {line['task']} was another one"]
+        at = line["task"]
+        if at < len(study.tasks) and study.tasks[at].hash != line["task_hash"]:
+            changes = _changes(study, before) or [f"task {at} was another one"]
             told = f"{folder}: holds results of another study: {'; '.join(changes)}"
             raise InputError(f"{told}. {here} to keep them")
-    return {line["task"]: line["task_error"] is not None for line in lines}
+    return lines
 
 
 def _changes(now: Study, before: dict[str, Any]) -> list[str]:
@@ -465,17 +436,3 @@ def summarise(study: Study, output: str | Path, page: str | Path) -> str | None:
     lines = (printable(line).replace("\\t", "\t") for line in text.rstrip("\n").split("\n"))
     write_page(Path(output), Path(page), "\n".join(lines) + "\n")
     return text
-
-
-def source_version() -> str:
-    """Version of elastocal, with the commit where it stands in a git checkout: 0.1.0+gabc1234."""
-    here = Path(__file__)
-    git = partial(
-        subprocess.run, cwd=here.parent, capture_output=True, text=True, timeout=10, check=True
-    )
-    try:
-        told = git(["git", "describe", "--always", "--dirty", "--exclude=*"])
-        git(["git", "ls-files", "--error-unmatch", here.name])
-    except (OSError, subprocess.SubprocessError):
-        return __version__
-    return f"{__version__}+g{told.stdout.strip()}"
