@@ -18,9 +18,8 @@ from scenarios import SCENARIOS, Setting, setting
 from scipy import stats
 
 from elastocal.identification.covariance import cluster_robust
-from elastocal.identification.noise_judge import settle
+from elastocal.identification.outliers import majority, settle
 from elastocal.identification.published import eq14, ols
-from elastocal.identification.trimmed import majority
 
 CHUNK = 50
 PUBLISHED_EVERY = 10  # thirty iterations of a weighted fit each: a tenth of the replicates do

@@ -15,8 +15,8 @@ import numpy as np
 import pytest
 from scipy import stats
 
-from elastocal.identification.noise_judge import settle
 from elastocal.identification.noise_structure import Readings
+from elastocal.identification.outliers import settle
 
 
 @dataclass(frozen=True)

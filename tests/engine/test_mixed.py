@@ -12,8 +12,8 @@ from scipy import optimize
 
 from elastocal.engine.mixed import LogPrior, fit
 from elastocal.identification.covariance import Covariance
+from elastocal.identification.noise_choice import NoisyReadings, fitted, prior_of_groups
 from elastocal.identification.noise_structure import STRUCTURES, Kind, Readings
-from elastocal.identification.noisy_readings import NoisyReadings, fitted, prior_of_groups
 
 TABLES = {
     "size 1": Table(size=1, configurations=5, markers=3, repeats=3, p=3),

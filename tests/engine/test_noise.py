@@ -9,12 +9,9 @@ from engine.dense import Table, own_parts, readings, shared_part
 from scipy import stats
 
 from elastocal.errors import InputError, InsufficientDataError
-from elastocal.identification.noise_choice import estimate_noise
-from elastocal.identification.noise_judge import _predicted, settle
+from elastocal.identification.noise_choice import estimate_noise, own_noise
 from elastocal.identification.noise_structure import Readings, noise_models
-from elastocal.identification.noisy_readings import own_noise
-from elastocal.identification.outliers import FALSE_ALARM
-from elastocal.identification.trimmed import majority
+from elastocal.identification.outliers import FALSE_ALARM, _predicted, majority, settle
 
 BASE = Table(configurations=12, markers=3, repeats=4, unbalanced=False)
 
@@ -239,6 +236,6 @@ def test_more_than_half_are_never_excluded(monkeypatch, share, kept):
     """Where most readings would have to go, the model is at fault, and all stay."""
     r = table(4, configurations=10)
     faulty = np.arange(len(r)) < share * len(r)
-    judge = "elastocal.identification.noise_judge.unexplained_readings"
+    judge = "elastocal.identification.outliers.unexplained_readings"
     monkeypatch.setattr(judge, lambda *_: faulty)
     assert settle(r, "independent").good.all() == kept

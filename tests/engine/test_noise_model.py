@@ -11,9 +11,8 @@ from engine.dense import Table, readings
 from support.registered import forgotten
 
 from elastocal.errors import InputError
-from elastocal.identification.noise_choice import estimate_noise
+from elastocal.identification.noise_choice import NoisyReadings, estimate_noise, own_noise
 from elastocal.identification.noise_structure import Kind, NoiseModel, Readings
-from elastocal.identification.noisy_readings import NoisyReadings, own_noise
 from elastocal.plugins import register_noise_model
 
 UNBALANCED = readings(Table(configurations=10, markers=3, repeats=3), 4)

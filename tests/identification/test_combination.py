@@ -9,7 +9,7 @@ from support.calibration import GEOMETRY, cell_of, combination_truth, measured, 
 from support.cells import kr270_chain, random_poses
 
 from elastocal.cell.arm_description import CartesianNoise, Nominal, Tracker
-from elastocal.identification import estimates
+from elastocal.identification import identify as estimates
 from elastocal.identification.identify import identify
 from elastocal.model.manipulator import Model
 from elastocal.text import json_text

@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 from scipy import optimize, stats
 
-from elastocal.identification.smooth_prior import LinearRows, Scales, Sums
+from elastocal.identification.smooth_functions import LinearRows, Scales, Sums
 
 ROWS, FREE, SHRUNK = 80, 4, 15
 GROUP = np.repeat([0, 1, 2], 5)

@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 
-from elastocal.identification.tails import kept_of, rejection_point
+from elastocal.identification.outliers import kept_of, rejection_point
 
 N, SIZE = 300, 3
 

@@ -13,8 +13,8 @@ from elastocal.above import Result
 from elastocal.compensation.commands import Commanding, Goals, Solved, jumps, nominal_path
 from elastocal.compensation.targets import Targets
 from elastocal.errors import InsufficientDataError, option
+from elastocal.identification.checks import check_limits
 from elastocal.identification.prediction import Uncertainty, uncertainty_at
-from elastocal.identification.start import check_limits
 from elastocal.measurements import families
 from elastocal.model.calibrated import CalibratedArm, lasting
 from elastocal.model.calibrated_tool import CalibratedTool, ToolPoint

@@ -30,9 +30,8 @@ from elastocal.diagnosis.hypotheses import (
 )
 from elastocal.diagnosis.noise_floor import NoiseValues, NoisyData, fit_noise
 from elastocal.errors import InsufficientDataError
-from elastocal.identification.noise_structure import along_axes, faster_course
-from elastocal.identification.upright import as_placed
-from elastocal.identification.visit_record import visit_record
+from elastocal.identification.checks import as_placed
+from elastocal.identification.noise_structure import along_axes, faster_course, visit_record
 from elastocal.measurements import Measurements, numbered
 from elastocal.model.arm import usual_sizes
 from elastocal.model.effects.catalogue import CATALOGUE

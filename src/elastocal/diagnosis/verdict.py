@@ -24,7 +24,7 @@ from elastocal.diagnosis.hypotheses import Hypothesis
 from elastocal.diagnosis.model_set import Item, ModelSet, distances, settings_of
 from elastocal.diagnosis.noise_floor import NoiseValues, NoisyData
 from elastocal.diagnosis.reading_faults import OutlierScreening
-from elastocal.identification.single_readings import BEYOND, single_readings
+from elastocal.identification.noise_summary import BEYOND, single_readings
 from elastocal.model.effects.gears import Backlash
 from elastocal.model.observations import subset
 

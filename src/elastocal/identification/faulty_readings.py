@@ -10,12 +10,17 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy import special
 
-from elastocal.identification.noise_choice import NoiseFit, linearised, weights_of
-from elastocal.identification.noisy_readings import own_noise
-from elastocal.identification.outliers import FALSE_ALARM, TINY, FitToGood, blocks, prior_widths
+from elastocal.identification.noise_choice import NoiseFit, linearised, own_noise, weights_of
+from elastocal.identification.outliers import (
+    FALSE_ALARM,
+    TINY,
+    FitToGood,
+    blocks,
+    median_scale,
+    prior_widths,
+)
 from elastocal.identification.residuals import f_test
 from elastocal.identification.solve import Solution
-from elastocal.identification.trimmed import median_scale
 from elastocal.identification.weighted_problem import block_diagonal, inverse_factor
 from elastocal.model.effects.placements import MarkerPosition
 from elastocal.model.manipulator import Model

@@ -8,8 +8,8 @@ from typing import Literal, get_args
 import numpy as np
 
 from elastocal.errors import InputError, option
-from elastocal.identification.constrained import ActiveConstraint
-from elastocal.identification.constrained_fit import (
+from elastocal.identification.constrained import (
+    ActiveConstraint,
     KnowledgeProblem,
     constrained_fit,
     profile_end,
@@ -18,7 +18,7 @@ from elastocal.identification.covariance import Covariance, cluster_robust, hc, 
 from elastocal.identification.knowledge import Constraints
 from elastocal.identification.least_squares import Fit
 from elastocal.identification.noise_choice import NoiseFit
-from elastocal.identification.smooth_part import SmoothPart
+from elastocal.identification.smooth_functions import SmoothPart
 from elastocal.identification.solve import Solution, residual_sigma
 from elastocal.identification.weighted_problem import (
     Partition,

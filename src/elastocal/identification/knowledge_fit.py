@@ -9,7 +9,7 @@ from numpy.typing import NDArray
 from scipy import special
 
 from elastocal.errors import InsufficientDataError, option, require
-from elastocal.identification.constrained_fit import (
+from elastocal.identification.constrained import (
     ConstrainedFit,
     KnowledgeProblem,
     constrained_fit,

@@ -19,9 +19,9 @@ from elastocal.identification.noise_choice import (
     over_times,
     weights_of,
 )
-from elastocal.identification.noise_judge import NoiseAndOutliers, settle
 from elastocal.identification.noise_structure import Kind, Readings
 from elastocal.identification.options import ROBUST, Options
+from elastocal.identification.outliers import NoiseAndOutliers, settle
 from elastocal.identification.residuals import held_out_residual, rms_3d
 from elastocal.identification.robust import robust_result
 from elastocal.identification.smooth_fit import fit_smooth

@@ -7,19 +7,23 @@ whose residuals no arm could have ends here, with the likely cause.
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from dataclasses import dataclass, replace
+from itertools import combinations
 
 import numpy as np
-from scipy import special
 
 from elastocal.cell.arm_description import ModelSpec, Tool
 from elastocal.cell.work_cell import Cell
 from elastocal.errors import InsufficientDataError
-from elastocal.identification.far_values import SCALED
-from elastocal.identification.joint_maps import LinearFits, joint_maps, linear_fits
-from elastocal.identification.shifted_rows import Slipped, slipped
-from elastocal.identification.start import nominal_problem, register
+from elastocal.identification.start import (
+    SCALED,
+    LinearFits,
+    Registration,
+    linear_fits,
+    nominal_problem,
+    register,
+)
 from elastocal.measurements import Measurements
 from elastocal.model.chain import Chain
 from elastocal.model.effects.base import index
@@ -33,7 +37,220 @@ from elastocal.model.manipulator import Model
 from elastocal.model.observations import Observations
 from elastocal.model.rigid import nominal_flanges
 from elastocal.text import listed
-from elastocal.units import Array, BoolArray
+from elastocal.units import Array, IntArray
+
+# Readings that have slipped against the joint values beside them, from some rows on.
+#
+# A reading that is missing lets all later ones close up.  Row r then holds the reading of row
+# r + s_r with s_r constant in blocks.  A block that is long enough places base and markers; then
+#
+#     minimise  Σ_r min(|p_r − x(q_{r+s_r})| / τ, 1) + λ · (number of changes of s)
+#
+# over all s is a shortest path through rows and shifts (Viterbi 1967), and base and markers follow
+# from all rows again.
+
+NEAR, NEAREST = 0.06, 0.005  # m: τ is six times the error of a block, within these
+CHANGE = 1.5  # λ: a block is there from two rows on, and one stray row makes none
+FARTHEST_ROW = 6  # visits that readings are looked for away from their row
+BLOCK, WINDOWS = 8, 16  # visits that place base and markers, and how many such blocks are tried
+PLACED = 6  # of these, tried in earnest
+FITS = 0.8  # share of the rows that must fit, so that it is an explanation
+FEWEST = 4  # visits to a block, on average
+MOST_ROWS = 20_000
+Place = Callable[[Measurements], Registration]
+
+
+@dataclass(frozen=True)
+class Slipped:
+    """Blocks of rows, each by its first row and the shift of its readings in rows and in visits
+    (None where it differs), and the median distance `error` in m of readings from the nominal arm
+    then."""
+
+    starts: tuple[int, ...]
+    rows: tuple[int, ...]
+    visits: tuple[int | None, ...]
+    error: float
+
+
+def slipped(chain: Chain, table: Measurements, place: Place) -> Slipped | None:
+    """Where readings slipped, in the order of the rows; None where no few shifts explain them.
+
+    `place` finds base and markers by a table.
+    """
+    visit = np.cumsum(np.r_[0, np.any(np.diff(table.q, axis=0) != 0, axis=1)])
+    visits = int(visit[-1]) + 1
+    if visits < BLOCK or len(table) > MOST_ROWS:
+        return None
+    most = FARTHEST_ROW * max(round(len(table) / visits), 1)
+    shifts = np.arange(-most, most + 1)
+    flange, rows = nominal_flanges(chain, table.q), np.arange(len(table))
+    for block, s in _blocks(table, flange, visit, shifts):
+        found = place(_moved(table, block, s))
+        if found.error <= NEAR / 2:
+            break
+    else:
+        return None
+    path = np.zeros(0, dtype=np.int64)
+    for _ in range(3):
+        distance = _distances(found, table, flange, shifts)
+        path = _path(distance / np.clip(6 * found.error, NEAREST, NEAR))
+        moved = shifts[path]
+        inside = (rows + moved >= 0) & (rows + moved < len(rows))
+        found = place(_moved(table, rows[inside], moved[inside]))
+    own, moved = distance[rows, path], shifts[path]
+    starts = np.flatnonzero(np.r_[True, np.diff(moved) != 0])
+    good = own <= NEAR
+    if good.mean() < FITS or len(starts) * FEWEST > visits or not moved.any():
+        return None
+    later = visit[np.clip(rows + moved, 0, len(rows) - 1)] - visit
+    blocks = np.split(rows, starts[1:])
+    by_visits = [np.unique(later[b[good[b]]]) for b in blocks]
+    return Slipped(
+        tuple(starts.tolist()), tuple(moved[starts].tolist()),
+        tuple(int(v[0]) if len(v) == 1 else None for v in by_visits), float(np.median(own)),
+    )  # fmt: skip
+
+
+def _moved(table: Measurements, rows: IntArray, shift: IntArray | int) -> Measurements:
+    """These rows with the joint values and markers of the rows `shift` further on."""
+    return replace(
+        table.take(rows), q=table.q[rows + shift], marker=table.marker[rows + shift]
+    )  # fmt: skip
+
+
+def _blocks(
+    table: Measurements, flange: Array, visit: IntArray, shifts: IntArray
+) -> list[tuple[IntArray, int]]:
+    """Blocks of rows and shifts with which they fit best, those of small shifts first."""
+    found = []
+    last = int(visit[-1]) + 1 - BLOCK
+    for first in np.unique(np.linspace(0, last, min(WINDOWS, last + 1)).astype(int)):
+        rows = np.flatnonzero((visit >= first) & (visit < first + BLOCK))
+        own = shifts[(rows[0] + shifts >= 0) & (rows[-1] + shifts < len(table))]
+        at = rows + own[:, None]
+        fits = linear_fits(flange[at], np.asarray(table.position)[rows], table.marker[at])
+        found += [(left > NEAR / 2, abs(s), left, first, rows, int(s))
+                  for s, left in zip(own.tolist(), fits.left.tolist(), strict=True)]  # fmt: skip
+    found.sort(key=lambda one: one[:4])
+    return [(rows, s) for *_, rows, s in found[:PLACED]]
+
+
+def _distances(found: Registration, table: Measurements, flange: Array, shifts: IntArray) -> Array:
+    """Distance (n, shifts) in m of every reading from the nominal place of the row that many
+    further on; infinite beyond the table."""
+    place = found.places(flange[:, :3, :3], flange[:, :3, 3], table.marker)
+    n, points = len(table), np.asarray(table.position)
+    distance = np.full((n, len(shifts)), np.inf)
+    for k, s in enumerate(shifts):
+        low, high = max(0, -s), min(n, n - s)
+        if low < high:
+            off = points[low:high] - place[low + s : high + s]
+            distance[low:high, k] = np.linalg.norm(off, axis=1)
+    return distance
+
+
+def _path(cost: Array) -> IntArray:
+    """Number (n,) of the shift of each row on the cheapest path, each cost (n, shifts) up to 1."""
+    cost = np.minimum(cost, 1.0)
+    total, came = cost[0], np.zeros(cost.shape, dtype=np.int64)
+    own = np.arange(cost.shape[1])
+    for r in range(1, len(cost)):
+        best = int(total.argmin())
+        changes = total[best] + CHANGE < total
+        came[r] = np.where(changes, best, own)
+        total = np.where(changes, total[best] + CHANGE, total) + cost[r]
+    path = np.empty(len(cost), dtype=np.int64)
+    path[-1] = int(total.argmin())
+    for r in range(len(cost) - 1, 0, -1):
+        path[r - 1] = came[r, path[r]]
+    return path
+
+
+# Joint values as a controller may count them.  Its c become the model's q by signs, offsets, an
+# exchange of columns, and a coupling of neighbouring joints (Fanuc displays joint 3 against the
+# floor), as `[joints]` of a mapping has it:
+#
+#     q = (1 + κ E_{j,j±1}) (D P c + o),  D a matrix of signs, P an exchange of two columns.
+
+MOST_SIGNS = 7  # joints of which every choice of signs is tried; of more, up to two
+TURNS = (90, -90, 180)
+
+
+@dataclass(frozen=True)
+class JointMap:
+    """q = c · matrixᵀ + offset (joints,), of so many `mistakes` in `words`; of two that do the same
+    (half a turn of joint 4 and a sign of joint 5) an offset counts a little more."""
+
+    matrix: Array
+    offset: Array
+    words: tuple[str, ...]
+    mistakes: float
+
+    def of(self, c: Array) -> Array:
+        return c @ self.matrix.T + self.offset
+
+    def after(self, first: JointMap) -> JointMap:
+        """This map of what `first` gives."""
+        return JointMap(
+            self.matrix @ first.matrix, self.matrix @ first.offset + self.offset,
+            first.words + self.words, first.mistakes + self.mistakes,
+        )  # fmt: skip
+
+
+def joint_maps(chain: Chain) -> list[JointMap]:
+    """Single mistakes, all signs with each coupling, and pairs of the others."""
+    n = chain.n_joints
+    none = JointMap(np.eye(n), np.zeros(n), (), 0)
+    signs, couplings, others = list(_signs(n)), list(_couplings(chain)), list(_others(chain))
+    found = [none, *signs, *couplings, *others]
+    found += [coupling.after(sign) for sign in signs for coupling in couplings]
+    found += [b.after(a) for a, b in combinations(couplings, 2)]
+    found += [b.after(a) for a, b in combinations(others, 2)]
+    single = [sign for sign in signs if sign.mistakes == 1]
+    found += [b.after(a) for a in others for b in (*single, *couplings)]
+    return found
+
+
+def _signs(n: int) -> Iterator[JointMap]:
+    for k in range(1, (n if n <= MOST_SIGNS else 2) + 1):
+        for turned in combinations(range(n), k):
+            D = np.eye(n)
+            D[turned, turned] = -1.0
+            names = listed([str(j + 1) for j in turned])
+            joints = "joint" if k == 1 else "joints"
+            words = f"with the sign of {joints} {names} turned round"
+            yield JointMap(D, np.zeros(n), (words,), k)
+
+
+def _couplings(chain: Chain) -> Iterator[JointMap]:
+    n = chain.n_joints
+    for j in range(1, n):
+        for factor in (1.0, -1.0) if chain.kinds[j] == chain.kinds[j - 1] else ():
+            C = np.eye(n)
+            C[j, j - 1] = factor
+            words = f"with coupling {{ joint = {j + 1}, of = {j}, factor = {factor:g} }}"
+            yield JointMap(C, np.zeros(n), (words,), 1)
+
+
+def _others(chain: Chain) -> Iterator[JointMap]:
+    n = chain.n_joints
+    turning = np.array([kind == "revolute" for kind in chain.kinds])
+    for factor, words in ((np.pi / 180, "degrees read as radians"),
+                          (180 / np.pi, "radians read as degrees")):  # fmt: skip
+        unit = np.diag(np.where(turning, factor, 1.0))
+        yield JointMap(unit, np.zeros(n), (f"if joints were {words}",), 1)
+    for j in np.flatnonzero(turning):
+        for degrees in TURNS:
+            offset = np.radians(degrees) * (np.arange(n) == j)
+            yield JointMap(np.eye(n), offset, (f"with offset_deg {degrees} at joint {j + 1}",), 1.1)
+    for first, second in combinations(range(n), 2):
+        order = np.arange(n)
+        order[[first, second]] = second, first
+        words = f"with the columns of joints {first + 1} and {second + 1} exchanged"
+        yield JointMap(np.eye(n)[order], np.zeros(n), (words,), 1)
+
+
+# Which of these, and which units, would make the readings fit the nominal arm.
 
 FEWEST_POSES = 8  # base (6) and a marker (3) from fewer fit anything
 POOR = 0.03  # m: no nominal arm is this wrong, wrong signs and units are far more
@@ -211,61 +428,6 @@ def _slipped_words(table: Measurements, found: Slipped) -> str:
 
 def _mm(found: Slipped) -> str:
     return f"{found.error * 1e3:.3g} mm"
-
-
-# Readings that are copies of others.
-#
-# A repeat differs from its first reading by the noise.  It agrees to the last digit only where
-# that is rounded more coarsely than the noise, and then more often in one coordinate than in all.
-
-NO_FINER = 1e-7  # m; readings with more digits than this agree in all of them by no chance
-ROUNDS = 20  # of the equation for P
-COPIED = 0.01  # p-value below which equal readings are too many for rounding
-
-
-def copied(observed: Observations) -> BoolArray:
-    """Observations (N,) that repeat an earlier one to the last digit: joint values, load, marker
-    and reading, whatever they are called.
-
-    Where readings are rounded, those of one pose, load and marker that differ tell how often a
-    coordinate agrees by rounding (with half a reading more of either kind): of pairs that differ
-    somewhere, a share s_a = (p_a - P)/(1 - P) agrees in coordinate a, P the product of all p_a.
-    Equal readings that are no more frequent than P explains are true repeats.
-    """
-    table, n = observed.table, len(observed.lead)
-    value, own = observed.value.reshape(n, observed.size), observed.lead
-    if observed.kind == "pose" and table.rotation is not None:  # its value has zeros there
-        value = np.hstack([value[:, :3], table.rotation[own]])
-    said = [table.q, table.force, table.marker[:, None]]
-    said += [] if table.torque is None else [table.torque]
-    found = np.zeros(n, dtype=bool)
-    # Sorting whole rows takes long, and most tables have none to look at.
-    ordered = np.sort(value[:, 0])
-    alike = np.flatnonzero(np.isin(value[:, 0], ordered[1:][ordered[1:] == ordered[:-1]]))
-    if not len(alike):
-        return found
-    key = np.column_stack(said)[own]
-    _, first = np.unique(np.hstack([key[alike], value[alike]]), axis=0, return_index=True)
-    found[np.delete(alike, first)] = True
-    if not found.any():
-        return found
-    steps = value[:, :3] / NO_FINER
-    if np.abs(steps - np.round(steps)).max() > 1e-3:
-        return found
-    _, start, group = np.unique(key, axis=0, return_index=True, return_inverse=True)
-    group = group.ravel()
-    others = np.flatnonzero(start[group] != np.arange(n))
-    same = value[others] == value[start[group[others]]]
-    differing = same[~same.all(axis=1)]
-    partly = (differing.sum(axis=0) + 0.5) / (len(differing) + 1)
-    share = 0.0
-    for _ in range(ROUNDS):
-        share = float(np.prod(partly * (1 - share) + share))
-    # A reading with k others before it is like one of them with probability 1 - (1 - P)^k.
-    before = np.arange(int(np.bincount(group).max()))
-    alike_by_chance = np.cumsum(1 - (1 - share) ** before)[np.bincount(group) - 1]
-    chance = special.gammainc(int(found.sum()), float(alike_by_chance.sum()))
-    return found & bool(chance < COPIED)
 
 
 # Loads in another unit.

@@ -33,7 +33,7 @@ from elastocal.identification.prediction import (
 )
 from elastocal.identification.residuals import ResidualSummary
 from elastocal.identification.scrutiny import MOST_NUMBERS
-from elastocal.identification.smooth_part import SmoothPart
+from elastocal.identification.smooth_functions import SmoothPart
 from elastocal.identification.weighted_problem import Weights
 from elastocal.measurements import Measurements
 from elastocal.model.calibrated import (

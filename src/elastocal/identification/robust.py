@@ -21,9 +21,9 @@ from scipy import linalg, sparse, special
 from elastocal.errors import ElastocalError, InputError, InsufficientDataError
 from elastocal.identification.covariance import Covariance, cluster_robust, orthogonal
 from elastocal.identification.intervals import LEVEL, Intervals, MethodResult
+from elastocal.identification.outliers import median_scale
 from elastocal.identification.residuals import held_out_residual
 from elastocal.identification.solve import Problem, Solution
-from elastocal.identification.trimmed import median_scale
 from elastocal.units import Array, BoolArray, IntArray
 
 # c of Huber's loss by the rows of an observation, 1 to 6: 95 % efficient.  Under normal noise d

@@ -27,17 +27,16 @@ from elastocal.identification.knowledge import GaussianPrior
 from elastocal.identification.knowledge_fit import FunctionPrior
 from elastocal.identification.least_squares import Fit
 from elastocal.identification.noise_choice import NoiseFit, linearised, weights_of
-from elastocal.identification.noise_judge import NoiseAndOutliers, settle
 from elastocal.identification.noise_structure import Readings
 from elastocal.identification.options import Options, check_for_functions
-from elastocal.identification.outliers import FALSE_ALARM
+from elastocal.identification.outliers import FALSE_ALARM, NoiseAndOutliers, settle
 from elastocal.identification.residuals import rms_3d
-from elastocal.identification.smooth_part import SmoothPart
-from elastocal.identification.smooth_prior import (
+from elastocal.identification.smooth_functions import (
     LinearRows,
     Scales,
     ShrunkPosterior,
     ShrunkProblem,
+    SmoothPart,
     Sums,
 )
 from elastocal.identification.solve import (

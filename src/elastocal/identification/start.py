@@ -1,4 +1,4 @@
-"""Before the first fit: does the table fit the robot, and where do base and markers start?"""
+"""Before the first fit: where base and markers are, from the nominal arm and the readings."""
 
 from __future__ import annotations
 
@@ -6,184 +6,71 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy import linalg
 from scipy.optimize import least_squares
 from scipy.spatial.transform import Rotation
 
-from elastocal.errors import InputError, InsufficientDataError, option
-from elastocal.identification.joint_maps import linear_fits
 from elastocal.measurements import Measurements
-from elastocal.model.chain import joint_limits
 from elastocal.model.effects.placements import BaseFrame, DistanceSensor, MarkerPosition
 from elastocal.model.manipulator import Model
-from elastocal.model.observations import Observations
-from elastocal.text import did_you_mean
 from elastocal.units import Array, BoolArray, IntArray
 
-# Does the table fit the robot?  Checked once, before anything is fitted.
+# The linear map of readings onto the nominal arm.  With G_i m + t_i the nominal place of a marker
+# m, the readings p_i fit where A p_i + s = G_i m + t_i has a solution: linear in A (3, 3), s and m.
+# Of such an A, det says whether the frame of the readings is mirrored and by what scale they are
+# too short.
 
-# Readings and nominal arm may differ this much in extent (a long tool, few joints moving)
-# before a wrong unit is the likelier cause.
-EXTENT_FACTOR = 30.0
-SMALL_ANGLE = np.radians(2 * np.pi)  # what a full turn in rad reads as in degrees
-LIMIT_SLACK = np.radians(0.5)  # controllers overshoot soft limits by a little
-SAME = 1e-9
-SOME = 2**14  # readings that are enough to tell their unit
-
-
-def check_table(model: Model, table: Measurements) -> None:
-    """A table to fit: as any table, and more than one pose.
-
-    Raises InputError that names file, line, joint and remedy; InsufficientDataError where all
-    rows hold the same pose.
-    """
-    check_rows(model, table)
-    if (table.q == table.q[:1]).all():
-        raise InsufficientDataError(
-            f"{table.source}: all {len(table)} rows hold the same pose; measure at different "
-            "joint angles (at least as many poses as a third of the parameters)"
-        )
+UNSKEWED = 1.25  # largest over smallest singular value of an A that may be a rotation and a scale
+TOGETHER = 2**18  # rows at a time
+DIGITS = 1e-12
+SCALED = 0.005  # no arm's lengths are this far off together, relatively: the readings' are
 
 
-def check_rows(model: Model, table: Measurements) -> None:
-    """Any table: finite numbers, joint count, joint limits, units; InputError otherwise."""
-    n = model.chain.n_joints
-    if table.q.shape[1] != n:
-        raise InputError(
-            f"{table.source} has {table.q.shape[1]} joint columns, but robot "
-            f"'{model.chain.name}' has {n} joints"
-        )
-    for name in ("q", "position", "rotation", "distance", "force", "torque", "sigma"):
-        values = getattr(table, name)
-        if values is not None and not np.isfinite(values).all():
-            k = int(np.argwhere(~np.isfinite(values))[0][0])
-            raise InputError(f"{table.source}, line {table.row[k]}: {name} is not finite")
-    check_limits(model, table)
-    _check_units(model, table)
+@dataclass(frozen=True)
+class LinearFits:
+    """Of K joint tables: A (K, 3, 3), and the rms (K,) in m that is left in each component,
+    infinite where A is no rotation with a scale."""
+
+    matrix: Array
+    left: Array
+
+    @property
+    def determinant(self) -> Array:
+        return np.linalg.det(self.matrix)
+
+    @property
+    def scale(self) -> Array:
+        """By what the readings (K,) are to be multiplied."""
+        return np.cbrt(np.abs(self.determinant))
 
 
-def check_limits(model: Model, table: Measurements) -> None:
-    """Joint values within the limits of robot and cell; InputError names line, joint and remedy."""
-    revolute = np.array([k == "revolute" for k in model.chain.kinds])
-    wound = np.abs(table.q[:, revolute]) > 4 * np.pi
-    if wound.any():
-        i = int(np.flatnonzero(wound.any(axis=1))[0])
-        raise InputError(
-            f"{table.source}, line {table.row[i]}: a joint stands at "
-            f"{np.abs(table.q[i]).max():.4g} rad, more than two turns "
-            f"({int(wound.any(axis=1).sum())} lines); these are probably degrees in a column "
-            "named …_rad: rename it to …_deg"
-        )
-    lower, upper = joint_limits(model.cell, model.chain)
-    beyond = (table.q < lower - LIMIT_SLACK) | (table.q > upper + LIMIT_SLACK)
-    if beyond.any():
-        i, j = (int(v) for v in np.argwhere(beyond)[0])
-        unit, factor = ("°", 180 / np.pi) if revolute[j] else (" m", 1.0)
-        share = beyond.any(axis=1).mean()
-        hint = (
-            "; most lines are beyond: probably degrees given as radians (or the reverse), or "
-            "another robot"
-            if share > 0.5
-            else "; correct the line or the limits"
-        )
-        raise InputError(
-            f"{table.source}, line {table.row[i]}: joint{j + 1} ({model.chain.joints[j].name}) at "
-            f"{table.q[i, j] * factor:.4g}{unit} is beyond its limits "
-            f"[{lower[j] * factor:.4g}, {upper[j] * factor:.4g}]{unit} "
-            f"({int(beyond.any(axis=1).sum())} of {len(table)} lines){hint}"
-        )
+def linear_fits(flange: Array, points: Array, marker: IntArray) -> LinearFits:
+    """Fits of readings `points` (n, 3) of `marker` (n,) or (K, n) to flanges (K, n, 4, 4)."""
+    marker = np.broadcast_to(marker, flange.shape[:2])
+    markers = int(marker.max()) + 1
+    step = max(TOGETHER // max(flange.shape[1], 1), 1)
+    # Rows are components of a reading, one after the other; A and s are the same for all tables
+    # and are fitted along by an orthonormal basis.
+    Q, R = np.linalg.qr(np.hstack([points - points.mean(axis=0), np.ones((len(points), 1))]))
+    back = np.linalg.pinv(R)[:3]
+    parts = []
+    for k in range(0, len(flange), step):
+        T, own = flange[k : k + step], marker[k : k + step, :, None] == np.arange(markers)
+        G = (T[..., :3, None, :3] * own[:, :, None, :, None]).reshape(*T.shape[:2], 3, -1)
+        parts.append(_linear_fits(np.concatenate([G, T[..., :3, 3:]], axis=3), Q, back))
+    return LinearFits(*(np.concatenate(some) for some in zip(*parts, strict=True)))
 
 
-def _check_units(model: Model, table: Measurements) -> None:
-    """Compare the extent of the readings with that of the nominal arm at the same joints."""
-    if table.position is None:
-        return
-    if len(table) > SOME:  # some of many readings tell it as well
-        table = table.take(np.linspace(0, len(table) - 1, SOME).astype(np.int64))
-    reach = _reach(model, table)
-    extent = float(np.linalg.norm(np.ptp(np.asarray(table.position), axis=0)))
-    if reach < SAME or extent < SAME:
-        return
-    ratio = extent / reach
-    if _looks_like_radians(model, table, ratio, extent):
-        cause = "the joint angles are probably radians in columns named …_deg: rename to …_rad"
-    elif ratio > EXTENT_FACTOR:
-        cause = "the positions are probably millimetres in columns named …_m: rename to …_mm"
-    elif ratio < 1 / EXTENT_FACTOR:
-        cause = "the positions are probably metres in columns named …_mm: rename to …_m"
-    else:
-        return
-    raise InputError(
-        f"{table.source}: the readings extend over {extent * 1e3:.4g} mm, but the nominal arm's "
-        f"flange moves over {reach * 1e3:.4g} mm at these joint values; {cause}"
-    )
-
-
-def _looks_like_radians(model: Model, table: Measurements, ratio: float, extent: float) -> bool:
-    """Radians read as degrees: the arm hardly moves, and turned back it moves as measured."""
-    if ratio < 3 or "prismatic" in model.chain.kinds or np.abs(table.q).max() > SMALL_ANGLE:
-        return False
-    return 1 / 3 < extent / _reach(model, replace(table, q=np.degrees(table.q))) < 3
-
-
-def _reach(model: Model, table: Measurements) -> float:
-    """Diagonal of the box in m that the nominal arm's flange moves in."""
-    return float(np.linalg.norm(np.ptp(model.rigid.flange_poses(table)[:, :3, 3], axis=0)))
-
-
-def fixed_and_free(model: Model, fixed: tuple[str, ...]) -> IntArray:
-    """Indices of the parameters to fit; `fixed` names parameters, places or effects to hold.
-
-    Raises InputError for a name that is none of these, or when nothing is left.
-    """
-    held = set()
-    for name in fixed:
-        match = model.meant_by(name)
-        if not match:
-            raise InputError(
-                f"{option('fixed', name)}: the model has no such parameter, place or effect"
-                f"{did_you_mean(name, model.all_names)}"
-            )
-        held |= set(match)
-    free = np.array([i for i in range(len(model.parameters)) if i not in held], dtype=np.int64)
-    if not len(free):
-        raise InputError(
-            f"{model.cell.path or model.cell.name}: nothing is left to identify; choose "
-            f"effects with parameters in [model] effects, or hold fewer by {option('fixed')}"
-        )
-    return free
-
-
-def ordinary(model: Model, free: IntArray) -> IntArray:
-    """Those of the parameters `free` that no smooth function consists of.
-
-    Raises InputError where there are none.
-    """
-    found = free[~model.shrunk[free]]
-    if not len(found):
-        raise InputError(
-            "nothing but smooth functions is left to identify; add base_frame and "
-            "marker_position to [model] effects, or free some parameters"
-        )
-    return found
-
-
-def check_enough(model: Model, observed: Observations, scaled: Array) -> None:
-    """Refuse when the equations are too few for the minimal set; `scaled`: B
-    (rows, free) in typical sizes, or its R."""
-    rows = len(observed.value)
-    kept = linalg.qr(scaled, mode="r", pivoting=True)[0]
-    diagonal = np.abs(np.diag(kept))
-    rank = int((diagonal > 1e-7 * diagonal.max(initial=0.0)).sum())
-    if rank < rows:
-        return
-    lacking = -(-(rank + 1) // observed.size)
-    raise InsufficientDataError(
-        f"{observed.table.source}: {rows} equations from {len(observed.lead)} readings cannot "
-        f"determine the model's {scaled.shape[1]} parameters and their uncertainty; measure more "
-        f"poses (more than {max(lacking, -(-scaled.shape[1] // observed.size))} readings) or fit "
-        "fewer effects"
-    )
+def _linear_fits(G: Array, Q: Array, back: Array) -> tuple[Array, Array]:
+    along = np.einsum("na,knrm->karm", Q, G)
+    off = (G - np.einsum("na,karm->knrm", Q, along)).reshape(len(G), -1, G.shape[3])
+    X, y = off[..., :-1], off[..., -1:]
+    Xt = X.transpose(0, 2, 1)
+    m = -np.linalg.pinv(Xt @ X, rcond=DIGITS, hermitian=True) @ (Xt @ y)
+    left = np.sqrt(((X @ m + y) ** 2).mean(axis=(1, 2)))
+    A = back @ (along[..., -1] + np.einsum("karm,km->kar", along[..., :-1], m[..., 0]))
+    size = np.linalg.svd(A, compute_uv=False)
+    left[~(size[:, 0] <= UNSKEWED * size[:, -1])] = np.inf
+    return A, left
 
 
 # A start from nothing: where base and markers are, from the nominal arm and the readings.

@@ -14,11 +14,10 @@ from scipy import linalg, sparse
 from elastocal.cell.work_cell import Cell
 from elastocal.errors import InputError, InsufficientDataError, option, require
 from elastocal.identification.identify import identify
-from elastocal.identification.noise_structure import VISIT, SharedEffect
+from elastocal.identification.noise_structure import VISIT, SharedEffect, visit_record
 from elastocal.identification.options import Options
+from elastocal.identification.outliers import kept_of
 from elastocal.identification.solve import WORTH_A_COLUMN, Reduction, reduce
-from elastocal.identification.tails import kept_of
-from elastocal.identification.visit_record import visit_record
 from elastocal.identification.weighted_problem import (
     Weights,
     stated_covariance,

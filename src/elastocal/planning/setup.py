@@ -10,8 +10,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from elastocal.errors import InsufficientDataError, option
+from elastocal.identification.checks import fixed_and_free
 from elastocal.identification.knowledge import GaussianPrior
-from elastocal.identification.start import fixed_and_free
 from elastocal.measurements import STILL
 from elastocal.model.manipulator import Model
 from elastocal.model.observations import observe

@@ -11,9 +11,8 @@ import numpy as np
 
 from elastocal.errors import option
 from elastocal.identification.constrained import ActiveConstraint
-from elastocal.identification.far_values import only_placed
 from elastocal.identification.faulty_readings import FaultyGroup
-from elastocal.identification.findings import shape_of
+from elastocal.identification.findings import only_placed, shape_of
 from elastocal.identification.noise_structure import EACH, JOINTS, REGISTERED, Kind
 from elastocal.identification.noise_summary import SLIDES, Noise, NoiseSize
 from elastocal.identification.residuals import GroupSummary, ResidualSummary

@@ -10,7 +10,7 @@ from support.calibration import measured, with_values
 from support.cells import SLANTED, TABLE_2, kr270_cell, table_of
 from support.constrained import NONE, non_negative
 
-from elastocal.identification.constrained_fit import (
+from elastocal.identification.constrained import (
     ConstrainedFit,
     KnowledgeProblem,
     constrained_fit,

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 from scipy import sparse, stats
 
-from elastocal.identification.constrained_fit import KnowledgeProblem, constrained_fit, profile_end
+from elastocal.identification.constrained import KnowledgeProblem, constrained_fit, profile_end
 from elastocal.identification.knowledge import Bounds, Constraints
 from elastocal.identification.least_squares import FitProblem
 from elastocal.identification.weighted_problem import Weights

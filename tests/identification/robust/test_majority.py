@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 
-from elastocal.identification.trimmed import majority
+from elastocal.identification.outliers import majority
 
 
 def kept(arm, B, y):

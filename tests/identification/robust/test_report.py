@@ -5,8 +5,7 @@ import pytest
 from scipy import stats
 
 from elastocal.identification.faulty_readings import outlier_report
-from elastocal.identification.outliers import FALSE_ALARM, FitToGood
-from elastocal.identification.trimmed import majority
+from elastocal.identification.outliers import FALSE_ALARM, FitToGood, majority
 
 WIDE = 1e3  # deviation that the weak prior gives each parameter
 
