@@ -5,7 +5,8 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 import numpy as np
-from scipy import optimize, special
+import scipy
+from scipy import special
 from scipy.spatial import cKDTree
 
 from elastocal.diagnosis.diagnosis_data import DiagnosisData
@@ -148,7 +149,7 @@ class DirectChecks:
         low, high = float(np.log(HEAVIEST)), float(np.log(LIGHTEST))
         if too_heavy(high) >= 0:
             return by_chi2
-        nu = np.exp(low if too_heavy(low) <= 0 else optimize.brentq(too_heavy, low, high))
+        nu = np.exp(low if too_heavy(low) <= 0 else scipy.optimize.brentq(too_heavy, low, high))
         limit, half = special.fdtri(k, nu, [1 - level, 0.5])
         return float(limit / half) * median
 

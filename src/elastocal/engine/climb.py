@@ -5,7 +5,8 @@ from __future__ import annotations
 from collections.abc import Callable
 
 import numpy as np
-from scipy import linalg, optimize
+import scipy
+from scipy import linalg
 
 from elastocal.units import Array
 
@@ -76,4 +77,4 @@ def least_within(H: Array, slope: Array, low: Array, high: Array) -> Array:
             return np.asarray(step)
     root = linalg.cholesky(H)
     target = -linalg.solve_triangular(root, slope, trans="T")
-    return np.asarray(optimize.lsq_linear(root, target, (low, high), method="bvls").x)
+    return np.asarray(scipy.optimize.lsq_linear(root, target, (low, high), method="bvls").x)

@@ -16,7 +16,8 @@ from types import ModuleType
 from typing import Any, Literal, NoReturn
 
 import numpy as np
-from scipy import linalg, optimize
+import scipy
+from scipy import linalg
 
 from elastocal.errors import ElastocalError, InputError, InsufficientDataError
 from elastocal.identification.knowledge import (
@@ -197,7 +198,7 @@ class Region:
             u = equality_space(self.rows[held], self.least[held])[0]
             prices = np.zeros(len(held))
             if held.any():  # scipy's nnls of no column at all ends the process
-                prices[held] = optimize.nnls(self.rows[held].T, u)[0]
+                prices[held] = scipy.optimize.nnls(self.rows[held].T, u)[0]
             found = Nearest(u, prices, tuple(np.zeros_like(Z) for Z in found.matrices))
         residual = self._breach(found) / max(float(np.linalg.norm(found.u)), size)
         if not residual <= allowed:

@@ -5,8 +5,8 @@ from __future__ import annotations
 from dataclasses import dataclass, replace
 
 import numpy as np
+import scipy  # whose `optimize` loads where it is used: it takes as long as a small fit
 from numpy.typing import NDArray
-from scipy.optimize import least_squares
 from scipy.spatial.transform import Rotation
 
 from elastocal.measurements import Measurements
@@ -359,7 +359,7 @@ def _distance_start(
         if anchor and not (given and k == 0):
             unit = direction / np.linalg.norm(direction)
             trial[anchor] = centre + unit * np.median(distance)
-        found = least_squares(
+        found = scipy.optimize.least_squares(
             residual, trial[columns], jacobian, loss="soft_l1", f_scale=2e-3, max_nfev=60
         )
         if found.cost < best_cost:
