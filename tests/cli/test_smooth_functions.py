@@ -12,8 +12,7 @@ from support.robots import KR270
 from typer.testing import CliRunner, Result
 
 from elastocal.cli.main import app
-from elastocal.model.manipulator import Model
-from elastocal.model.smooth_groups import smooth_groups
+from elastocal.model.manipulator import Model, smooth_groups
 
 CELL = """
 name = "curved"

@@ -12,9 +12,8 @@ from elastocal.cell.arm_description import Nominal
 from elastocal.identification.identify import identify
 from elastocal.identification.options import Options
 from elastocal.measurements import Measurements
-from elastocal.model.manipulator import Model
+from elastocal.model.manipulator import Model, smooth_groups
 from elastocal.model.observations import observe, subset
-from elastocal.model.smooth_groups import smooth_groups
 from elastocal.units import Array
 
 SIGMA = 2e-5  # m

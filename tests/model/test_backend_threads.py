@@ -33,7 +33,6 @@ def test_results_do_not_depend_on_the_number_of_threads(monkeypatch: pytest.Monk
         monkeypatch.setenv("OMP_NUM_THREADS", str(threads))
         function = BatchFunction(*mixed(), "numpy")
         found[threads] = function(x, np.array([1.7]))
-        assert function.report.threads == threads
     for one, three in zip(found[1], found[3], strict=True):
         assert one.tobytes() == three.tobytes()
 

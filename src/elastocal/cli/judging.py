@@ -203,7 +203,7 @@ def _write_extended(
 ) -> Iterator[str]:
     """Write the cell with the effects found, and say so and what to do with it."""
     from elastocal.diagnosis.diagnose import write_extended_cell
-    from elastocal.model.smooth_groups import where_smooth_functions_end
+    from elastocal.model.manipulator import where_smooth_functions_end
     from elastocal.report.causes_view import added_text
 
     extra = (*found.effects, *found.slight, *found.fields)

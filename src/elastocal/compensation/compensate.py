@@ -21,8 +21,8 @@ from elastocal.model.calibrated_tool import CalibratedTool, ToolPoint
 from elastocal.model.chain import Chain, joint_limits
 from elastocal.model.effects.catalogue import effect_of
 from elastocal.model.inverse_kinematics import Reaching, inverse_kinematics
+from elastocal.model.manipulator import smooth_groups
 from elastocal.model.rigid import nominal_flanges
-from elastocal.model.smooth_groups import smooth_groups
 from elastocal.tables import column, csv_text
 from elastocal.text import listed, plain
 from elastocal.units import Array, IntArray

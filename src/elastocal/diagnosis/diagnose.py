@@ -62,8 +62,7 @@ from elastocal.identification.error_budget import BudgetStep
 from elastocal.identification.mistakes import refuse_nonsense
 from elastocal.measurements import Measurements, order_contradicted
 from elastocal.model.effects.catalogue import CATALOGUE, effect_of
-from elastocal.model.manipulator import Model
-from elastocal.model.smooth_groups import where_smooth_functions_end
+from elastocal.model.manipulator import Model, where_smooth_functions_end
 from elastocal.plugin_loader import is_plugin_file
 from elastocal.text import did_you_mean, listed
 from elastocal.units import BoolArray, Progress

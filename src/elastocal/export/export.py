@@ -49,8 +49,8 @@ from elastocal.identification.covariance import t_quantile
 from elastocal.model.calibrated import CalibratedArm, Conditions, Valued, random_table
 from elastocal.model.chain import Chain
 from elastocal.model.effects.catalogue import effect_of
+from elastocal.model.manipulator import SmoothGroup, smooth_groups
 from elastocal.model.rigid import nominal_flanges
-from elastocal.model.smooth_groups import SmoothGroup, smooth_groups
 from elastocal.tables import csv_text
 from elastocal.text import did_you_mean, json_text, listed, plain
 from elastocal.units import Array, rpy_from_rotation

@@ -117,7 +117,7 @@ def keep(calibrated: CalibratedArm, elastic: bool, conditions: Conditions) -> Ke
     Springs follow the load's torque at the deflected pose, whatever `[model] torque` says: a
     file has no column of measured torques.
     """
-    chosen = Valued(calibrated.model, calibrated.x).effects
+    chosen = calibrated.effects
     instrument = tuple(name for name in chosen if CATALOGUE[name].of_the_measurement)
     unstated = unstated_needs(calibrated, conditions)
     stated = [name for name, needs in unstated.items() if not needs]
@@ -150,7 +150,7 @@ def _as_springs(part: Valued, only: str | None = None) -> tuple[Valued, list[tup
     A joint split into levels gets their mean; a negative compliance becomes rigid; deflections
     are those at the deflected pose.  `only` makes the change of one of them alone.
     """
-    cell, values = part.model.cell, part.values
+    cell, values = part.model.cell, dict(part.values)
     changed = defaultdict[str, list[str]](list)
     spec = cell.model
     if spec.compliance_levels and JointCompliance.name in part.effects and only in (None, LEVELS):

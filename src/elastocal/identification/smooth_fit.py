@@ -58,9 +58,8 @@ from elastocal.identification.weighted_problem import (
     regressor,
     same_size,
 )
-from elastocal.model.manipulator import Model
+from elastocal.model.manipulator import Model, SmoothGroup, smooth_groups
 from elastocal.model.observations import Observations, subset
-from elastocal.model.smooth_groups import SmoothGroup, smooth_groups
 from elastocal.text import listed
 from elastocal.units import Array, BoolArray, IntArray, Progress
 

@@ -22,7 +22,7 @@ from elastocal.engine.climb import climb
 from elastocal.engine.sizes import Products, Standardised
 from elastocal.identification.covariance import root_of, t_quantile
 from elastocal.identification.weighted_problem import RFactor
-from elastocal.model.smooth_groups import SmoothGroup
+from elastocal.model.manipulator import SmoothGroup
 from elastocal.units import Array, IntArray
 
 # Scales λ beyond these are no longer told apart: nothing is left of the group, or of its prior.

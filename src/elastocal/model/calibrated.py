@@ -2,33 +2,35 @@
 
 from __future__ import annotations
 
-import math
 from collections.abc import Collection, Mapping
 from dataclasses import dataclass, field, replace
 from functools import cached_property
 from pathlib import Path
-from typing import Any
+from typing import Annotated, Any
 
 import casadi as ca
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
+from pydantic import ConfigDict, PlainValidator
+from pydantic_core import PydanticCustomError
 
 from elastocal.above import Saved
 from elastocal.arguments import checked_arguments
-from elastocal.errors import InputError, option
+from elastocal.config import Table, checked, key, required
+from elastocal.errors import InputError, option, require
 from elastocal.files import read_json
 from elastocal.measurements import Measurements
 from elastocal.model.chain import Chain, finite_ranges, joint_limits
 from elastocal.model.effects.catalogue import CATALOGUE, cell_of, effect_of
 from elastocal.model.effects.loads import LinkGravity
-from elastocal.model.manipulator import Model
+from elastocal.model.manipulator import Model, smooth_groups
 from elastocal.model.rigid import nominal_flange
-from elastocal.model.smooth_groups import smooth_groups
 from elastocal.text import quoted
 from elastocal.units import Array
 
 SCHEMA = "elastocal/identification/1"
 SAME = 1e-6  # m, and of directions: two arms of one design differ by nothing
+ANEW = "write the result anew with identify"
 MOST_BYTES = 200_000_000  # a covariance of 3000 parameters
 
 
@@ -91,8 +93,39 @@ class MeasuredVisits:
         }
 
 
+@dataclass(frozen=True)
+class Valued:
+    """A model and the values x (parameters,) to evaluate it at."""
+
+    model: Model
+    x: Array
+
+    @cached_property
+    def values(self) -> dict[str, float]:
+        """Name → value in SI units."""
+        return dict(zip(self.model.names, map(float, self.x), strict=True))
+
+    def x_of(self, other: Model) -> Array:
+        """The values of the parameters of a model that has some of these."""
+        return np.array([self.values[name] for name in other.names])
+
+    @property
+    def effects(self) -> list[str]:
+        """Active effects in the catalogue's order, link weights included, the load left out."""
+        spec = self.model.cell.model
+        active = {choice.name for choice in spec.effects}
+        if spec.link_gravity:
+            active.add(LinkGravity.name)
+        return [name for name in CATALOGUE if name in active]
+
+    @property
+    def elastic(self) -> bool:
+        """Whether loads deflect it."""
+        return any(CATALOGUE[name].elastic for name in self.effects)
+
+
 @dataclass(frozen=True, repr=False, eq=False)
-class CalibratedArm(Saved):
+class CalibratedArm(Valued, Saved):
     """A calibrated arm: a model and the parameter values that it predicts with.
 
     `Calibration.arm` is one, in memory; `read_calibrated` reads one from the files of an earlier
@@ -120,8 +153,6 @@ class CalibratedArm(Saved):
         4.1...e-07
     """
 
-    model: Model
-    x: Array
     determined: tuple[str, ...]
     covariance: Array
     source: str
@@ -137,11 +168,6 @@ class CalibratedArm(Saved):
             f"<CalibratedArm {self.model.chain.name}: {len(self.determined)} of {len(self.x)} "
             f"parameters determined, from {self.source}>"
         )
-
-    @cached_property
-    def values(self) -> dict[str, float]:
-        """Name → value in SI units."""
-        return dict(zip(self.model.names, map(float, self.x), strict=True))
 
     @checked_arguments
     def pose(self, q: ArrayLike, force: ArrayLike | None = None) -> NDArray:
@@ -188,22 +214,17 @@ def lasting(arm: CalibratedArm) -> tuple[CalibratedArm, tuple[str, ...]]:
     for name in dict.fromkeys(choice.name for choice in cell.model.effects):
         cell = effect_of(name).lasting(cell)
     rest = Model.assembled(model.chain, cell)
-    left = set(rest.names)
-    kept = [k for k, name in enumerate(arm.determined) if name in left]
+    kept = [k for k, name in enumerate(arm.determined) if name in rest.names]
     entries = dict(zip(model.names, arm.entries, strict=True)) if arm.entries else {}
-    return CalibratedArm(
-        rest,
-        np.array([arm.values[name] for name in rest.names]),
-        tuple(arm.determined[k] for k in kept),
-        arm.covariance[np.ix_(kept, kept)],
-        arm.source,
-        tuple(entries[name] for name in rest.names if name in entries),
-        None if arm.left is None else replace(arm.left, mixing=arm.left.mixing[kept]),
-        arm.lacking,
-        arm.loads,
-        arm.shown,
-        arm.visits,
-    ), tuple(gone)  # fmt: skip
+    return replace(
+        arm,
+        model=rest,
+        x=arm.x_of(rest),
+        determined=tuple(arm.determined[k] for k in kept),
+        covariance=arm.covariance[np.ix_(kept, kept)],
+        entries=tuple(entries[name] for name in rest.names if name in entries),
+        left=None if arm.left is None else replace(arm.left, mixing=arm.left.mixing[kept]),
+    ), tuple(gone)
 
 
 @checked_arguments
@@ -230,34 +251,103 @@ def read_calibrated(
         <CalibratedArm kuka_kr270_2: 9 of 10 parameters determined, from result.json>
     """
     cell = cell_of(cell_path, plugins or None)
-    result = _read_result(Path(result_path))
-    held = _held(result, result_path)
+    raw, stated = _read_result(Path(result_path))
+    held = {entry.name: entry.held for entry in stated.parameters}
     # A cell that lists no markers took them from the table; their names stand in the parameters.
-    markers = tuple(
-        dict.fromkeys(
-            where.removeprefix("marker:")
-            for where in (name.rpartition(".")[0] for name in held)
-            if where.startswith("marker:")
-        )
-    )
-    model = Model(cell, markers, plugins=plugins or None)
+    places = (name.rpartition(".")[0] for name in held)
+    markers = (place.removeprefix("marker:") for place in places if place.startswith("marker:"))
+    model = Model(cell, tuple(dict.fromkeys(markers)), plugins=plugins or None)
     _check_same(model, held, cell_path, result_path)
-    _check_robot(model, result.get("nominal_flange"), cell_path, result_path)
-    determined, covariance = _covariance(result, held, result_path)
-    entries = {str(entry["name"]): entry for entry in result["parameters"]}
+    _check_robot(model, stated.nominal_flange, cell_path, result_path)
+    determined = tuple(stated.covariance_of)
+    n, lack = len(determined), stated.predicted_new_poses_um
+    require(
+        set(determined) <= set(held) and stated.covariance.size == n**2,
+        f"{result_path}: covariance of {stated.covariance.size} numbers for {n} names in "
+        f"covariance_of; {ANEW}",
+    )
+    entries = {entry["name"]: entry for entry in raw}
     return CalibratedArm(
         model,
         np.array([held[name] for name in model.names]),
         determined,
-        covariance,
+        stated.covariance.reshape(n, n),
         str(result_path),
         tuple(entries[name] for name in model.names),
-        _left_open(result.get("open"), model, determined, result_path),
-        _lacking(result.get("predicted_new_poses_um")),
-        _loads(result.get("loads_N", []), result_path),
-        _shown(result.get("measured_poses")),
-        _visits(result.get("measured_visits"), model.chain.n_joints),
+        _left_open(stated.open, model, determined, result_path),
+        ((lack and lack.lack_of_fit) or 0.0) * 1e-6,
+        stated.loads_N.reshape(-1, 3),
+        _shown(stated.measured_poses),
+        _visits(stated.measured_visits, model.chain.n_joints),
     )
+
+
+def _array(*columns: int) -> PlainValidator:
+    """The validator of a table of numbers, an array (n, columns) or of whatever shape without
+    them; null is NaN where the shape is free."""
+
+    def check(value: object) -> Array:
+        try:
+            found = np.array(value, dtype=float)
+            found = found.reshape(len(found), *columns) if columns else found
+        except (TypeError, ValueError, OverflowError):
+            found = np.full(1, np.inf)
+        if np.isinf(found).any() or (columns and np.isnan(found).any()):
+            raise PydanticCustomError("numbers", "numbers")
+        return found
+
+    return PlainValidator(check)
+
+
+Matrix = Annotated[Array, _array()]
+Triples = Annotated[Array, _array(3)]
+NONE = np.zeros(0)
+
+
+class _Stated(Table):
+    """What a reader needs of a table in the result; more may stand beside it."""
+
+    model_config = Table.model_config | ConfigDict(extra="ignore")
+
+
+class _Entry(_Stated):
+    name: str = required("a name")
+    held: float = required("a number")
+    dof: float | None = key("a number")
+    combined_with: list[str] | None = key("a list of names")
+
+
+class _Open(_Stated):
+    names: list[str] = required("a list of names")
+    mixing: Matrix = required("shares, a row for each parameter of covariance_of")
+    typical: Matrix = required("a number for each of its names")
+    redundant: list[str] = key("a list of names", [])
+
+
+class _Shown(_Stated):
+    largest_std_um: float | None = key("a number")
+    configurations: int = required("a whole number")
+
+
+class _Visits(_Stated):
+    q: Matrix = required("joints, a row for each visit")
+    force_N: Triples = required("forces, three numbers for each visit")
+
+
+class _Predicted(_Stated):
+    lack_of_fit: float | None = key("a number")
+
+
+class _Result(_Stated):
+    parameters: list[_Entry] = required("a list of parameters")
+    nominal_flange: Annotated[Array, _array(4)] | None = key("3 rows of 4 numbers")
+    covariance_of: list[str] = key("a list of names", [])
+    covariance: Matrix = key("a square table of finite numbers", NONE)
+    open: _Open | None = key("a table of the parameters left open")
+    predicted_new_poses_um: _Predicted | None = key("a table")
+    loads_N: Triples = key("a list of forces, three numbers each", NONE)
+    measured_poses: _Shown | None = key("a table")
+    measured_visits: _Visits | None = key("a table")
 
 
 def nominal_flange_rows(chain: Chain) -> list[list[float]]:
@@ -271,20 +361,11 @@ def nominal_flange_rows(chain: Chain) -> list[list[float]]:
     return [[round(float(v), 9) + 0.0 for v in row] for row in T[:3]]
 
 
-def _check_robot(model: Model, stated: Any, cell: str | Path, result: str | Path) -> None:
+def _check_robot(model: Model, stated: Array | None, cell: str | Path, result: str | Path) -> None:
     """Results that state no nominal flange, as older ones, are believed."""
-    if stated is None:
-        return
     here = np.array(nominal_flange_rows(model.chain))
-    try:
-        there = np.array(stated, dtype=float)
-    except (TypeError, ValueError, OverflowError):
-        there = np.zeros(0)
-    if there.shape != here.shape or not np.isfinite(there).all():
-        raise InputError(
-            f"{result}: nominal_flange is no table of 3 rows with 4 numbers; "
-            "write the result anew with identify"
-        )
+    there = here if stated is None else stated
+    require(there.shape == here.shape, f"{result}: nominal_flange takes 3 rows; {ANEW}")
     if np.abs(here - there).max() > SAME:
         off = np.linalg.norm(here[:, 3] - there[:, 3])
         raise InputError(
@@ -294,68 +375,23 @@ def _check_robot(model: Model, stated: Any, cell: str | Path, result: str | Path
         )
 
 
-def _read_result(path: Path) -> dict[str, Any]:
+def _read_result(path: Path) -> tuple[list[dict[str, Any]], _Result]:
+    """The entries of the parameters as they stand in the file, and the file checked."""
     remedy = "give the file that identify wrote"
     result = read_json(path, "result of identify", MOST_BYTES, remedy)
     found = result.get("schema") if isinstance(result, dict) else None
-    if found != SCHEMA:
-        raise InputError(f"{path}: schema is {quoted(found)}, and {SCHEMA!r} is needed; {remedy}")
-    return dict(result)
-
-
-def _held(result: dict[str, Any], path: str | Path) -> dict[str, float]:
-    entries = result.get("parameters")
-    if not isinstance(entries, list):
-        raise InputError(f"{path}: key parameters is no list; write the result with identify")
-    held = {}
-    for k, entry in enumerate(entries):
-        try:
-            name, value = str(entry["name"]), float(entry["held"])
-        except (TypeError, KeyError, ValueError, OverflowError):
-            raise InputError(
-                f"{path}: parameters[{k}] needs a name and a number under held; "
-                "write the result anew with identify"
-            ) from None
-        if not np.isfinite(value):
-            raise InputError(f"{path}: parameters[{k}] '{name}' holds {value}, no finite number")
-        dof, others = entry.get("dof"), entry.get("combined_with")
-        named = isinstance(others, list | None) and all(isinstance(o, str) for o in others or ())
-        if not (isinstance(dof, float | int | None) and named):
-            raise InputError(
-                f"{path}: parameters[{k}] '{name}' needs a number under dof and a list of names "
-                "under combined_with; write the result anew with identify"
-            )
-        if name in held:
-            raise InputError(f"{path}: parameter '{name}' is listed twice")
-        held[name] = value
-    return held
-
-
-def _covariance(
-    result: dict[str, Any], held: dict[str, float], path: str | Path
-) -> tuple[tuple[str, ...], Array]:
-    """Names of what was determined, and its covariance (determined, determined)."""
-    names, rows = result.get("covariance_of", []), result.get("covariance", [])
-    try:
-        determined = tuple(map(str, names))
-        covariance = np.array(rows, dtype=float)
-    except (TypeError, ValueError, OverflowError):
-        raise InputError(
-            f"{path}: covariance is no table of numbers, or covariance_of no list of names; "
-            "write the result anew with identify"
-        ) from None
-    if not set(determined) <= set(held) or covariance.size != len(determined) ** 2:
-        raise InputError(
-            f"{path}: covariance of {covariance.size} numbers for {len(determined)} names "
-            "in covariance_of; write the result anew with identify"
-        )
-    if np.isinf(covariance).any():
-        raise InputError(f"{path}: covariance holds numbers beyond all measure; write it anew")
-    return determined, covariance.reshape(len(determined), len(determined))
+    require(
+        found == SCHEMA, f"{path}: schema is {quoted(found)}, and {SCHEMA!r} is needed; {remedy}"
+    )
+    stated = checked(_Result, result, path)
+    names = [entry.name for entry in stated.parameters]
+    for name in names:
+        require(names.count(name) == 1, f"{path}: parameter '{name}' is listed twice; {ANEW}")
+    return result["parameters"], stated
 
 
 def _left_open(
-    stated: Any, model: Model, determined: tuple[str, ...], path: str | Path
+    stated: _Open | None, model: Model, determined: tuple[str, ...], path: str | Path
 ) -> OpenParameters:
     """What the result says of the parameters that the data left open; where it says nothing, each
     that was not determined counts by itself."""
@@ -364,56 +400,30 @@ def _left_open(
         typical = np.array([p.typical or abs(p.nominal) for p in rest])
         none = np.zeros((len(determined), len(rest)))
         return OpenParameters(tuple(p.name for p in rest), none, typical)
-    try:
-        names = tuple(map(str, stated["names"]))
-        mixing = np.array(stated["mixing"], dtype=float).reshape(len(determined), len(names))
-        typical = np.array(stated["typical"], dtype=float).reshape(len(names))
-    except (TypeError, KeyError, ValueError, OverflowError):
-        names, mixing, typical = ("",), np.zeros((0, 0)), np.zeros(0)
-    known = set(names) <= set(model.names)
-    if not (known and np.isfinite(mixing).all() and np.isfinite(typical).all()):
-        raise InputError(
-            f"{path}: open does not say names, typical sizes and shares of the parameters left "
-            "open; write the result anew with identify"
-        )
-    return OpenParameters(names, mixing, typical, tuple(map(str, stated.get("redundant", []))))
+    shape = len(determined), len(stated.names)
+    require(
+        set(stated.names) <= set(model.names)
+        and (stated.mixing.size, stated.typical.size) == (shape[0] * shape[1], shape[1])
+        and bool(np.isfinite([*stated.mixing.flat, *stated.typical.flat]).all()),
+        f"{path}: open does not say names, typical sizes and shares of the parameters left open; "
+        f"{ANEW}",
+    )
+    return OpenParameters(
+        tuple(stated.names), stated.mixing.reshape(shape), stated.typical.ravel(),
+        tuple(stated.redundant),
+    )  # fmt: skip
 
 
-def _lacking(predicted: Any) -> float:
-    """What the result says that the model may lack, in m; 0 where it says nothing."""
-    found = predicted.get("lack_of_fit") if isinstance(predicted, dict) else None
-    return found * 1e-6 if isinstance(found, int | float) and np.isfinite(found) else 0.0
-
-
-def _loads(stated: Any, path: str | Path) -> Array:
-    try:
-        loads = np.array(stated, dtype=float).reshape(len(stated), 3)
-    except (TypeError, ValueError, OverflowError):
-        loads = np.full((1, 3), np.nan)
-    if not np.isfinite(loads).all():
-        raise InputError(
-            f"{path}: loads_N is no list of forces, three numbers each; write the result anew with "
-            "identify"
-        )
-    return loads
-
-
-def _shown(stated: Any) -> ShownPoses | None:
-    try:
-        found = ShownPoses(float(stated["largest_std_um"]) * 1e-6, int(stated["configurations"]))
-    except (TypeError, KeyError, ValueError, OverflowError):
+def _shown(stated: _Shown | None) -> ShownPoses | None:
+    if stated is None or stated.largest_std_um is None or stated.configurations < 1:
         return None
-    return found if math.isfinite(found.most) and found.configurations > 0 else None
+    return ShownPoses(stated.largest_std_um * 1e-6, stated.configurations)
 
 
-def _visits(stated: Any, n_joints: int) -> MeasuredVisits | None:
-    try:
-        found = MeasuredVisits(*(np.array(stated[key], dtype=float) for key in ("q", "force_N")))
-    except (TypeError, KeyError, ValueError, OverflowError):
+def _visits(stated: _Visits | None, n_joints: int) -> MeasuredVisits | None:
+    if stated is None or not len(stated.q) or stated.q.shape != (len(stated.force_N), n_joints):
         return None
-    shapes = (found.q.shape, found.force.shape)
-    fit = shapes == ((len(found.q), n_joints), (len(found.q), 3)) and len(found.q) > 0
-    return found if fit and np.isfinite(np.hstack([found.q, found.force])).all() else None
+    return MeasuredVisits(stated.q, stated.force_N)
 
 
 def _check_same(model: Model, held: dict[str, float], cell: str | Path, result: str | Path) -> None:
@@ -452,33 +462,6 @@ class Conditions:
         return need not in RECORDED and getattr(self, need, 0.0) is not None
 
 
-@dataclass(frozen=True)
-class Valued:
-    """A model and the values x (parameters,) to evaluate it at."""
-
-    model: Model
-    x: Array
-
-    @property
-    def values(self) -> dict[str, float]:
-        """Name → value in SI units."""
-        return dict(zip(self.model.names, map(float, self.x), strict=True))
-
-    @property
-    def effects(self) -> list[str]:
-        """Active effects in the catalogue's order, link weights included, the load left out."""
-        spec = self.model.cell.model
-        active = {choice.name for choice in spec.effects}
-        if spec.link_gravity:
-            active.add(LinkGravity.name)
-        return [name for name in CATALOGUE if name in active]
-
-    @property
-    def elastic(self) -> bool:
-        """Whether loads deflect it."""
-        return any(CATALOGUE[name].elastic for name in self.effects)
-
-
 def unstated_needs(calibrated: CalibratedArm, conditions: Conditions) -> dict[str, list[str]]:
     """By effect of the arm itself what it needs and the conditions do not state."""
     return {
@@ -487,7 +470,7 @@ def unstated_needs(calibrated: CalibratedArm, conditions: Conditions) -> dict[st
             for need in CATALOGUE[name].needed(calibrated.model.cell)
             if not conditions.state(need)
         ]
-        for name in Valued(calibrated.model, calibrated.x).effects
+        for name in calibrated.effects
         if not CATALOGUE[name].of_the_measurement
     }
 
@@ -504,7 +487,7 @@ def arm_with(calibrated: CalibratedArm, names: Collection[str]) -> Valued:
         torque="computed",
     )
     model = Model.assembled(calibrated.model.chain, replace(cell, model=spec))
-    return Valued(model, np.array([calibrated.values[name] for name in model.names]))
+    return Valued(model, calibrated.x_of(model))
 
 
 def random_table(model: Model, conditions: Conditions, poses: int, seed: int) -> Measurements:

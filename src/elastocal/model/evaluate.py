@@ -9,9 +9,8 @@ import threading
 from collections import deque
 from collections.abc import Callable, Iterable, Iterator, Sequence
 from concurrent.futures import Future, ThreadPoolExecutor
-from dataclasses import dataclass
 from functools import cached_property
-from itertools import accumulate, pairwise
+from itertools import pairwise
 from typing import Any, TypeVar
 
 import casadi as ca
@@ -109,14 +108,12 @@ def instructions(function: ca.Function) -> tuple[NDArray[np.int32], NDArray, int
     return table, np.array(constants), int(function.sz_w())
 
 
-def row_by_row(sparsity: ca.Sparsity) -> list[int]:
-    """Where each nonzero, in CasADi's order, stands in its matrix written row by row."""
-    columns = sparsity.size2()
-    return [r * columns + c for r, c in zip(sparsity.row(), sparsity.get_col(), strict=True)]
-
-
 def _steps(f: ca.Function, constants: list[float]) -> Iterator[tuple[int, int, int, int, int]]:
-    places = [row_by_row(f.sparsity_out(k)) for k in range(f.n_out())]
+    # Where each nonzero of an output, in CasADi's order, stands in its matrix written row by row.
+    outputs = [f.sparsity_out(k) for k in range(f.n_out())]
+    places = [
+        [r * s.size2() + c for r, c in zip(s.row(), s.get_col(), strict=True)] for s in outputs
+    ]
     for k in range(f.n_instructions()):
         code = f.instruction_id(k)
         if code == ca.OP_CONST:
@@ -154,8 +151,6 @@ class NumpyFunction:
     one number.  Raises NotImplementedError for a CasADi operation that numpy has no counterpart
     for.
     """
-
-    name = "numpy"
 
     def __init__(self, function: ca.Function) -> None:
         self._table, self._constants, self.n_registers = instructions(function)
@@ -326,84 +321,14 @@ def chosen_backend(name: str | None = None) -> str:
     return checked(os.environ.get(VARIABLE, "").strip() or "auto", f"{VARIABLE} in the environment")
 
 
-@dataclass(frozen=True)
-class BackendReport:
-    """What evaluated a function last: `backend` "casadi", "numpy" or, before any call, "none"."""
-
-    backend: str
-    threads: int = 1
-
-    def __str__(self) -> str:
-        return f"{self.backend} ({self.threads} thread{'s' if self.threads > 1 else ''})"
-
-
-def summary(reports: Iterable[BackendReport]) -> str:
-    """One line for a report: every engine that was used, and by how many of the functions."""
-    threads: dict[str, list[int]] = {}
-    for report in reports:
-        if report.backend != "none":
-            threads.setdefault(report.backend, []).append(report.threads)
-    total = sum(map(len, threads.values()))
-    return (
-        "; ".join(
-            (f"{len(used)} of {total} expressions: " if len(threads) > 1 else "")
-            + str(BackendReport(engine, max(used)))
-            for engine, used in threads.items()
-        )
-        or "nothing evaluated yet"
-    )
+def evaluated_by(asked: str | None = None) -> str:
+    """What evaluates tables, for reports: engines and threads."""
+    engines = "casadi for few rows, else " if chosen_backend(asked) == "auto" else ""
+    threads = thread_count()
+    return f"{engines}numpy ({threads} thread{'s' if threads > 1 else ''})"
 
 
 CHUNK = 8192  # rows at a time: registers stay in cache, numpy's call overhead is spread
-
-
-class RowByRow:
-    """A function evaluated by CasADi itself, one call for each row.
-
-    A table of a few rows takes numpy one call per instruction, as one of thousands does: of 3600
-    instructions one row takes CasADi 0.2 ms and numpy 2 to 3 ms, 16 rows 0.7 and 2.3 ms.
-    """
-
-    name, largest_block = "casadi", CHUNK
-
-    def __init__(self, function: ca.Function) -> None:
-        self._function = function
-        outputs = range(self._function.n_out())
-        self._places = [row_by_row(self._function.sparsity_out(k)) for k in outputs]
-        self._spans = _side_by_side(map(len, self._places))
-
-    def evaluate(
-        self, inputs: Sequence[NDArray], results: Sequence[NDArray], blocks: Sequence[slice]
-    ) -> None:
-        """Rows of `blocks` of `results` (n, rows, columns)."""
-        call: Any
-        call, run = self._function.buffer()
-        # All that varies by row side by side, and all that is found: one copy each for a row.
-        varying = [a for a in inputs if a.ndim == 2]
-        rows = np.concatenate(varying, axis=1) if varying else np.zeros((1, 0))
-        given, found = np.zeros(rows.shape[1]), np.zeros(sum(map(len, self._places)))
-        spans = _side_by_side(a.shape[1] if a.ndim == 2 else 0 for a in inputs)
-        held = [
-            given[span] if a.ndim == 2 else a.copy() for a, span in zip(inputs, spans, strict=True)
-        ]
-        for k, array in enumerate(held):
-            call.set_arg(k, array.data)
-        for k, span in enumerate(self._spans):
-            call.set_res(k, found[span].data)
-        numbers = [i for block in blocks for i in range(block.start, block.stop)]
-        all_found = np.empty((len(numbers), len(found)))
-        for i, out in zip(numbers, all_found, strict=True):
-            given[:] = rows[i]
-            run()
-            out[:] = found
-        for result, places, span in zip(results, self._places, self._spans, strict=True):
-            flat = result.reshape(len(result), result.shape[1] * result.shape[2])
-            flat[np.ix_(numbers, places)] = all_found[:, span]
-
-
-def _side_by_side(widths: Iterable[int]) -> list[slice]:
-    """Where each of several pieces stands in a row of all."""
-    return [slice(a, b) for a, b in pairwise(accumulate(widths, initial=0))]
 
 
 class BatchFunction:
@@ -427,39 +352,36 @@ class BatchFunction:
         self.shapes = [f.size_out(k) for k in range(f.n_out())]
         self._sizes = [f.nnz_in(k) for k in range(f.n_in())]
         self.n_instructions = int(f.n_instructions())
-        self._report = BackendReport("none")
 
     def __getstate__(self) -> dict[str, Any]:
-        """Without engines, which are made again where it goes."""
-        engines = ("_by_numpy", "_by_casadi")
-        return {key: value for key, value in self.__dict__.items() if key not in engines}
+        """Without the instructions, which are made again where it goes."""
+        return {key: value for key, value in self.__dict__.items() if key != "_by_numpy"}
 
     @cached_property
     def _by_numpy(self) -> NumpyFunction:
         return NumpyFunction(self._function)
-
-    @cached_property
-    def _by_casadi(self) -> RowByRow:
-        return RowByRow(self._function)
-
-    @property
-    def report(self) -> BackendReport:
-        """What evaluated the last call."""
-        return self._report
 
     def __call__(self, *inputs: NDArray, chunk: int = CHUNK) -> list[NDArray]:
         arrays, n = self._rows(inputs)
         dtype = np.result_type(np.float64, *arrays)
         results = [np.zeros((n, r, c), dtype=dtype) for r, c in self.shapes]
         few = n <= FEW * -(-n // max(chunk, 1)) and dtype == np.float64
-        by_casadi = chosen_backend(self._asked) == "auto" and few
-        engine = self._by_casadi if by_casadi else self._by_numpy
+        if few and chosen_backend(self._asked) == "auto":
+            self._by_casadi(arrays, results)
+            return results
+        engine = self._by_numpy
         blocks = row_blocks(n, min(chunk, engine.largest_block))
-        # CasADi holds the interpreter's lock; numpy lets others run while it computes.
-        threads = 1 if by_casadi else max(1, min(len(blocks), _threads_here()))
-        self._report = BackendReport(engine.name, threads)
+        threads = max(1, min(len(blocks), _threads_here()))
         run_blocks(lambda share: engine.evaluate(arrays, results, share), blocks, threads)
         return results
+
+    def _by_casadi(self, arrays: Sequence[NDArray], results: Sequence[NDArray]) -> None:
+        """CasADi takes rows side by side, and what is the same in all of them once."""
+        found = self._function.call([ca.DM(a.T if a.ndim == 2 else a) for a in arrays])
+        for result, value in zip(results, found, strict=True):
+            _, rows, columns = result.shape
+            if result.size:
+                result[:] = value.full().reshape(rows, -1, columns).transpose(1, 0, 2)
 
     def _rows(self, inputs: Sequence[NDArray]) -> tuple[list[NDArray], int]:
         """The inputs as arrays of the right shapes, and the number of rows."""

@@ -18,13 +18,13 @@ from elastocal.errors import InputError, option, require
 from elastocal.measurements import DEFAULT_MARKER, Measurements, read_measurements, read_plan
 from elastocal.model.arm import Parameter, row_inputs
 from elastocal.model.chain import Chain, numbered, plausible
-from elastocal.model.effects.base import Effect, JointMotion
+from elastocal.model.effects.base import Effect, JointMotion, SmoothFunction, index
 from elastocal.model.effects.catalogue import cell_of, effect_of
-from elastocal.model.evaluate import CHUNK, row_blocks, summary
+from elastocal.model.evaluate import CHUNK, evaluated_by, row_blocks
 from elastocal.model.observations import Observations, observe
 from elastocal.model.symbolic import SymbolicArm
 from elastocal.text import listed
-from elastocal.units import Array
+from elastocal.units import Array, IntArray
 
 if TYPE_CHECKING:
     from pandas import DataFrame
@@ -286,8 +286,8 @@ class Model:
         return sorted({v for p in self.parameters for v in (p.name, p.where, p.effect)})
 
     def backend_report(self) -> str:
-        """What evaluates this model, for reports: engine and threads."""
-        return summary(self._symbolic.backend_reports)
+        """What evaluates this model, for reports: engines and threads."""
+        return evaluated_by(self._symbolic.backend)
 
     @property
     def nominal(self) -> Array:
@@ -520,3 +520,76 @@ def load_chain(cell: Cell) -> Chain:
         chain = read_dh(robot.dh, convention=robot.dh_convention, masses_path=robot.masses)
         return plausible(chain, robot.masses or robot.dh)
     raise InputError(f"{cell.path}: [robot] needs urdf, mjcf or dh")
+
+
+# The shrunk parameters of a model in groups: one for each smooth function, whose size is one.
+
+
+@dataclass(frozen=True, kw_only=True)
+class SmoothGroup(SmoothFunction):
+    """Shrunk parameters that have one scale: those of a smooth function, or of an effect's place.
+
+    `columns` (components, waves) index the model's parameters.  Where these are no function of one
+    quantity, `follows` is "", length and range are NaN, and `basis` None.
+    """
+
+    effect: str
+    where: str
+    columns: IntArray
+
+    @property
+    def name(self) -> str:
+        """ "joint curve of joint2", "residual field of link3, following joint1"."""
+        text = f"{self.effect.replace('_', ' ')} of {self.where}"
+        return text if self.follows in ("", self.where) else f"{text}, following {self.follows}"
+
+    @property
+    def joint(self) -> int:
+        """Index of the joint that it follows."""
+        return index(self.follows)
+
+    def grid(self, n: int) -> Array:
+        """n values (n,) of what it follows, over its range."""
+        return np.linspace(self.low, self.high, n)
+
+
+def smooth_groups(model: Model) -> tuple[SmoothGroup, ...]:
+    """The groups of all shrunk parameters, in the model's order."""
+    place = {name: k for k, name in enumerate(model.names)}
+    found: list[SmoothGroup] = []
+    shrunk = [p for p in model.parameters if p.shrunk]
+    for effect, where in dict.fromkeys((p.effect, p.where) for p in shrunk):
+        functions = list(effect_of(effect).functions(where, model.chain, model.cell))
+        taken = {f"{where}.{key}" for f in functions for keys in f.keys for key in keys}
+        own = [p for p in shrunk if (p.effect, p.where) == (effect, where)]
+        rest = [p for p in own if p.name not in taken]
+        for unit in dict.fromkeys(p.unit for p in rest):
+            alike = [p for p in rest if p.unit == unit]
+            size = float(np.sqrt(sum((p.typical or 0.0) ** 2 for p in alike)))
+            keys = tuple(p.name.removeprefix(f"{where}.") for p in alike)
+            functions.append(SmoothFunction("", (keys,), (unit,), size))
+        for f in functions:
+            columns = np.array([[place[f"{where}.{key}"] for key in keys] for keys in f.keys])
+            found.append(SmoothGroup(**vars(f), effect=effect, where=where, columns=columns))
+    return tuple(found)
+
+
+def where_smooth_functions_end(cell: Cell) -> str:
+    """Up to where the cell's smooth functions correct the arm, "joint1 from -85.9° to 85.9°, …";
+    empty where none ends."""
+    chosen = [(effect_of(choice.name), choice.where) for choice in cell.model.effects]
+    chosen = [each for each in chosen if type(each[0]).functions is not Effect.functions]
+    chain = load_chain(cell) if chosen else None
+    ends: dict[str, tuple[float, float]] = {}
+    for effect, place in chosen:
+        assert chain is not None
+        for where in [place] if place else effect.places(chain, cell):
+            for f in effect.functions(where, chain, cell):
+                if not f.whole_turn:
+                    low, high = ends.get(f.follows, (f.low, f.high))
+                    ends[f.follows] = min(low, f.low), max(high, f.high)
+    return ", ".join(
+        f"{name} from {low:.0f} s to {high:.0f} s" if name == "time"
+        else f"{name} from {np.degrees(low):.1f}° to {np.degrees(high):.1f}°"
+        for name, (low, high) in sorted(ends.items())
+    )  # fmt: skip

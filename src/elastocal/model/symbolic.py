@@ -18,7 +18,7 @@ from elastocal.model.arm import Arm, Parameter, row_inputs
 from elastocal.model.chain import Chain
 from elastocal.model.effects.base import Effect
 from elastocal.model.effects.catalogue import choose_effects, set_constants, sized_parameters
-from elastocal.model.evaluate import BackendReport, BatchFunction, row_blocks
+from elastocal.model.evaluate import BatchFunction, row_blocks
 from elastocal.model.observations import observe
 from elastocal.units import Array, IntArray
 
@@ -29,10 +29,8 @@ LARGEST = 0.5  # rad or m
 # F_θ written out whole takes about half of F's instructions for every spring.  Beyond this many,
 # one derivative along a direction is evaluated in every direction first: with 56 springs and the
 # whole catalogue 15 000 instructions instead of 174 000, which are made and evaluated on a small
-# table in a fraction of the time.  A row takes twice as long, so that after ROWS_THAT_PAY rows
-# F_θ is written out after all; counted and not timed, so that nothing depends on the clock.
+# table in a fraction of the time; a row of a large one takes twice as long.
 LARGEST_JACOBIAN = 60_000
-ROWS_THAT_PAY = 2000
 AT_A_TIME = 16_384  # rows × directions evaluated together
 KEPT = 4_000_000  # numbers of F_θ up to which an answer is kept
 EVALUATIONS, KEPT_ROWS = 3, 12_000  # of y and dy/dz that are kept, each of so many rows at most
@@ -79,10 +77,9 @@ class Equilibrium:
     ) -> None:
         self.size = theta.shape[0]
         self._symbols, self._expression = [*inputs, p, theta], residual
-        self._backend, self._rows = backend, 0
+        self._backend = backend
         self._value = BatchFunction(self._symbols, [residual], backend)
         self._large = self._value.n_instructions * self.size / 2 > LARGEST_JACOBIAN
-        self._last = self._value
         self._answers = LastAnswers(self._solve, 1, KEPT // max(self.size**2, 1))
         self._states: tuple[NDArray, IntArray, IntArray] | None = None
 
@@ -99,21 +96,13 @@ class Equilibrium:
         slope = ca.jtimes(self._expression, self._symbols[-1], direction)
         return BatchFunction([*self._symbols, direction], [slope], self._backend)
 
-    @property
-    def reports(self) -> list[BackendReport]:
-        """What evaluated F and F_θ last."""
-        return [self._last.report]
-
     def _residual(
         self, inputs: Sequence[NDArray], p: NDArray, theta: NDArray
     ) -> tuple[NDArray, NDArray]:
         """F (n, size, 1) and F_θ (n, size, size); p (parameters,), or (n, parameters) by row."""
-        self._rows += len(theta)
-        if not self._large or self._rows > ROWS_THAT_PAY:
-            self._last = self._whole
+        if not self._large:
             F, F_theta = self._whole(*inputs, p, theta)
             return F, F_theta
-        self._last = self._along
         (F,) = self._value(*inputs, p, theta)
         F_theta = np.empty((len(theta), self.size, self.size), dtype=F.dtype)
         for block in row_blocks(len(theta), max(AT_A_TIME // self.size, 1)):
@@ -322,13 +311,6 @@ class SymbolicArm:
         inputs = list(self.arm.inputs.values())
         return Equilibrium(inputs, self.p, self.arm.theta, self.residual, self.backend)
 
-    @property
-    def backend_reports(self) -> list[BackendReport]:
-        """What evaluated each function last."""
-        built = [self.__dict__[k] for k in ("regressor", "equilibrium") if k in self.__dict__]
-        own = [function.report for function in self._functions.values()]
-        return own + [report for one in built for report in one.reports]
-
     def function(self, name: str) -> BatchFunction:
         """Built on first use: "reading", and "frames" of flange, marker and target."""
         if name not in self._functions:
@@ -377,12 +359,6 @@ class Total:
         """∂y/∂θ."""
         outputs = [ca.jacobian(self._y, self._arm.arm.theta)]
         return BatchFunction(self._inputs, outputs, self._arm.backend)
-
-    @property
-    def reports(self) -> list[BackendReport]:
-        """What evaluated each function last."""
-        slopes = [self._slopes] if "_slopes" in self.__dict__ else []
-        return [function.report for function in (*self._functions.values(), *slopes)]
 
     def _held(self, columns: tuple[int, ...]) -> tuple[int, ...]:
         """The columns of the function that serves these: all, where there is one of all already

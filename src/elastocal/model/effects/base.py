@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from abc import abstractmethod
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
@@ -48,6 +49,9 @@ RECORD_TORQUES = (
 WEIGH_LOAD = "weigh the load and measure where it hangs"
 
 
+FULL_TURN = 0.98  # of 2π: a range from which on a joint's curve is periodic
+
+
 @dataclass(frozen=True)
 class SmoothFunction:
     """What shrunk parameters of an effect make up: a smooth function of one quantity of a row.
@@ -62,10 +66,20 @@ class SmoothFunction:
     keys: tuple[tuple[str, ...], ...]
     units: tuple[str, ...]
     size: float
-    length: float
-    low: float
-    high: float
-    basis: Callable[[Array], Array]
+    length: float = math.nan
+    low: float = math.nan
+    high: float = math.nan
+    basis: Callable[[Array], Array] | None = None
+
+    @property
+    def lasting(self) -> bool:
+        """Whether it belongs to the arm, and not to the time of one campaign."""
+        return self.follows != "time"
+
+    @property
+    def whole_turn(self) -> bool:
+        """Whether it was measured all the way round, so that no angle lies outside."""
+        return self.lasting and self.high - self.low >= FULL_TURN * 2 * math.pi
 
 
 class Effect:

@@ -35,6 +35,7 @@ from elastocal.cell.work_cell import Cell
 from elastocal.model.arm import Arm, ParameterSpec, Setting
 from elastocal.model.chain import Chain
 from elastocal.model.effects.base import (
+    FULL_TURN,
     BaseMotion,
     DrivenEffect,
     Entry,
@@ -50,7 +51,6 @@ from elastocal.model.effects.base import (
 )
 from elastocal.units import Array
 
-FULL_TURN = 0.98  # of 2π: a range from which on a joint's curve is periodic
 # Waves up to this many times 1/ℓ: what is beyond has 0.2 % of the variance.
 HIGHEST = 6.0
 MOST_WAVES = 160
