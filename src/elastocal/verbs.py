@@ -14,7 +14,7 @@ from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Literal, TypeAlias, cast
 
-from elastocal.arguments import checked_arguments, one_of, whole
+from elastocal.arguments import checked_arguments, whole
 from elastocal.errors import InputError, option, require
 from elastocal.text import quoted
 
@@ -225,7 +225,7 @@ def _design_of(cell: Cell, asked: Mapping[str, Any]) -> Any:
         TargetPose,
         of_candidates,
     )
-    from elastocal.planning.criteria import CRITERIA, GONE
+    from elastocal.planning.criteria import criterion_named
 
     chosen = {key: _plain(value) for key, value in asked.items() if value is not None}
     if "candidates" in chosen:
@@ -237,9 +237,7 @@ def _design_of(cell: Cell, asked: Mapping[str, Any]) -> Any:
         given = None if given is None else whole("candidates", given, 1)
         chosen |= {"candidates": given, "taught": None if taught is None else Path(taught)}
     if "criterion" in chosen:
-        name = str(chosen["criterion"])
-        require(name not in GONE, f"{option('criterion')} {name} is gone: {GONE.get(name)}")
-        one_of("criterion", chosen["criterion"], tuple(CRITERIA))
+        criterion_named(chosen["criterion"], option("criterion"))
     wishes = [key for key in ("poses", "target", "minutes") if key in chosen]
     require(
         len(wishes) < 2,

@@ -132,17 +132,10 @@ A = np.ones((2, 3, P))
         ("V", {}, "there are test_pose, D, A, E, G, I, c, O1, O3, O5"),
         ("O2", {}, "O2 is gone: its plans had no bound, .* take E or O3"),
         ("robust", {}, "robust is gone: take test_pose; .* next, or diagnose"),
-        ("D", {"interest": []}, "no parameter of interest is left"),
-        ("E", {"interest": [1, 1]}, "repeated or unknown"),
-        ("A", {"interest": [P]}, "repeated or unknown"),
         ("test_pose", {"A": None}, "test_pose needs test poses"),
-        ("I", {"A": A[..., :2]}, r"shape \(2, 3, 2\) was given, not \(n, n, 6\)"),
-        ("test_pose", {"A": A * np.nan}, "not finite"),
         ("G", {"A": 0 * A}, "no target depends on the parameters"),
-        ("test_pose", {"A": A, "weights": np.array([1.0, -1.0])}, "none may be negative"),
         ("c", {"combination": None}, "c needs a parameter or combination"),
         ("c", {"combination": np.zeros(P)}, "F of the c criterion is zero"),
-        ("O1", {"n_poses": None}, "O1 needs the number of poses"),
     ],
 )
 def test_what_is_missing_or_wrong_is_named(name, change, message):

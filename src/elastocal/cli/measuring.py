@@ -332,7 +332,6 @@ def _write_all(plan: Plan, output: Path, programs: list[Path], picture: Path | N
     """plan.csv, plan.json, robot programs and picture."""
     from elastocal.files import atomic_write_text
     from elastocal.model.chain import joint_limits
-    from elastocal.planning.programs import check_program, steps_of
     from elastocal.saving import save_plan
 
     chain = plan.model.chain
@@ -340,8 +339,6 @@ def _write_all(plan: Plan, output: Path, programs: list[Path], picture: Path | N
     save_plan(plan, output, repeated())
     for path in programs:
         text = _program(path, plan.execution, chain, plan.configurations, plan.forces, limits)
-        # Before it appears: a program that moves elsewhere than the plan is not left behind.
-        check_program(text, list(steps_of(plan.execution, plan.configurations, plan.forces)))
         atomic_write_text(path, text)
     if picture is not None:
         from elastocal.report.arm_view import write_plan_picture
@@ -355,11 +352,12 @@ def _program(
     limits: tuple[Array, Array] | None = None,
 ) -> str:  # fmt: skip
     """The robot program to write to `path`."""
-    from elastocal.planning.programs import krl_program, urscript_program
+    from elastocal.planning.programs import robot_program
 
-    text = krl_program if path.suffix.lower() == ".src" else urscript_program
     try:
-        return text(execution, chain, configurations, forces, name=path.stem, limits=limits)
+        return robot_program(
+            path.suffix, execution, chain, configurations, forces, name=path.stem, limits=limits
+        )
     except InputError as error:
         raise InputError(f"--program {path}: {error}") from None
 

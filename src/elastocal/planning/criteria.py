@@ -96,7 +96,7 @@ class TangentBound:
 @dataclass(frozen=True)
 class CriterionInputs:
     """What cell and model give a criterion: p scaled parameters y, x_i = `sizes`_i · y_i.  What is
-    asked for and missing, or of another shape, is an InputError.
+    asked for and missing is an InputError.
 
     `criterion`: the name asked for.  `interest` (k,): indices of the parameters that count, the
     others are nuisance.  A (T, r, p) = ∂(position at target t)/∂y in m, with `weights` (T,);
@@ -110,45 +110,24 @@ class CriterionInputs:
     weights: Array | None = None
     combination: Array | None = None
     unit: str = ""
-    n_poses: int | None = None
+    n_poses: int = 1
     names: tuple[str, ...] = ()
     sizes: Array | None = None
 
     def counted(self) -> Array:
         """E (k, p), which picks the parameters of interest."""
-        chosen = np.asarray(self.interest)
-        require(
-            chosen.ndim == 1 and len(chosen) > 0,
-            "no parameter of interest is left: every parameter counts as nuisance; name "
-            "parameters or effects in [design] interest",
-        )
-        inside = (chosen >= 0) & (chosen < self.parameters)
-        require(
-            bool(inside.all()) and len(np.unique(chosen)) == len(chosen),
-            f"parameters of interest are repeated or unknown: {chosen.tolist()} of "
-            f"{self.parameters}",
-        )
-        return np.eye(self.parameters)[chosen]
+        return np.eye(self.parameters)[self.interest]
 
     def targets(self) -> Array:
-        return self._given(self.A, "test poses", (None, None, self.parameters))
+        return self._given(self.A, "test poses")
 
     def target_weights(self) -> Array:
         """Weights (T,) of the test poses, equal where none are stated."""
-        shape = self.targets().shape[:1]
-        if self.weights is None:
-            return np.ones(shape)
-        weights = self._given(self.weights, "weights of the test poses", shape)
-        require(
-            bool((weights >= 0).all() and weights.any()),
-            f"weights of the test poses are {quoted(weights.tolist())}: none may be negative, and "
-            "one at least must be positive",
-        )
-        return weights
+        return np.ones(len(self.targets())) if self.weights is None else self.weights
 
     def stated_combination(self) -> Array:
         """`[design] combination` as coefficients (p,) of y."""
-        return self._given(self.combination, "a parameter or combination", (self.parameters,))
+        return self._given(self.combination, "a parameter or combination")
 
     def row(self, factors: Mapping[str, float]) -> Array:
         """Coefficients (p,) of y for Σ factor · x over parameters by name, in SI units."""
@@ -165,26 +144,12 @@ class CriterionInputs:
             coefficients[i] = factor * sizes[i]
         return coefficients
 
-    def _given(self, array: Array | None, what: str, shape: tuple[int | None, ...]) -> Array:
-        # A length of None is any positive one.
-        name = self.criterion
+    def _given(self, array: Array | None, what: str) -> Array:
         if array is None:
-            raise InputError(f"criterion {name} needs {what}: add to [design], or choose another")
-        found = np.asarray(array, dtype=float)
-        fits = found.ndim == len(shape) and all(
-            n > 0 if wanted is None else n == wanted
-            for n, wanted in zip(found.shape, shape, strict=True)
-        )
-        wanted = ", ".join("n" if length is None else str(length) for length in shape)
-        require(
-            fits, f"criterion {name}: an array of shape {found.shape} was given, not ({wanted})"
-        )
-        require(
-            bool(np.isfinite(found).all()),
-            f"criterion {name}: {what} with derivatives that are not finite; check that every test "
-            "pose is within reach and has a static equilibrium",
-        )
-        return found
+            raise InputError(
+                f"criterion {self.criterion} needs {what}: add to [design], or choose another"
+            )
+        return array
 
 
 class ScenarioCriterion(ABC):
@@ -310,10 +275,8 @@ class TraceCriterion(ScenarioCriterion):
     certifiable = True
 
     def __post_init__(self) -> None:
-        F = self.F
-        require(F.ndim == 2, f"F of the {self.name} criterion has shape {F.shape}; give (q, p)")
         require(
-            bool(np.isfinite(F).all() and F.any()),
+            bool(np.isfinite(self.F).all() and self.F.any()),
             f"F of the {self.name} criterion is zero or not finite: no target depends on the "
             "parameters; check the test poses, loads and parameters of interest",
         )
@@ -660,10 +623,7 @@ class FirstObservability(DeterminantCriterion):
 
     @classmethod
     def of(cls, inputs: CriterionInputs) -> Self:
-        n = inputs.n_poses
-        if not n:
-            raise InputError("criterion O1 needs the number of poses: set [design] poses")
-        return cls(inputs.counted(), n_poses=n)
+        return cls(inputs.counted(), n_poses=inputs.n_poses)
 
     def figure(self, value: float) -> float:
         return float(1 / np.sqrt(self.n_poses * value))
@@ -778,12 +738,13 @@ def _place(criterion: type[ScenarioCriterion]) -> tuple[str, str]:
     return criterion.__module__, criterion.__qualname__
 
 
-def criterion_named(name: str) -> type[ScenarioCriterion]:
-    """The criterion that CRITERIA has under this name; InputError that lists them for another."""
-    require(name not in GONE, f"criterion {name} is gone: {GONE.get(name)}")
+def criterion_named(name: str, what: str = "criterion") -> type[ScenarioCriterion]:
+    """The criterion that CRITERIA has under this name; InputError that lists them for another,
+    which `what` begins."""
+    require(name not in GONE, f"{what} {name} is gone: {GONE.get(name)}")
     require(
         name in CRITERIA,
-        f"criterion {quoted(name)} is unknown{did_you_mean(name, CRITERIA)}; there are "
+        f"{what} {quoted(name)} is unknown{did_you_mean(name, CRITERIA)}; there are "
         f"{listed(CRITERIA)}",
     )
     return CRITERIA[name]

@@ -32,7 +32,7 @@ from elastocal.planning.candidates import (
 )
 from elastocal.planning.checkpoint import Checkpoint, State
 from elastocal.planning.choices import Choice, applied, chosen_states, within
-from elastocal.planning.criteria import CRITERIA, GONE
+from elastocal.planning.criteria import CRITERIA, criterion_named
 from elastocal.planning.exchange import (
     first_allowed,
     random_information,
@@ -463,8 +463,8 @@ class _Design:
         require(
             setup.criterion.unit == "µm",
             f"{self.cell.path or self.cell.name}: a target in µm goes with the criteria "
-            f"{_joined(metric, 'and')}, not with {self.cell.design.criterion}; drop it, or "
-            f"compare by {option('curve')}",
+            f"{', '.join(metric[:-1])} and {metric[-1]}, not with {setup.criterion.name}; drop it, "
+            f"or compare by {option('curve')}",
         )
         return (target * 1e6 / setup.criterion.figure(1.0)) ** 2
 
@@ -586,13 +586,7 @@ def _check_criterion(model: Model) -> None:
     parameters."""
     cell = model.cell
     where, asked = cell.path or cell.name, cell.design.criterion
-    takes = _joined([f'"{name}"' for name in CRITERIA], "or")
-    require(asked not in GONE, f"{where}: design.criterion {asked} is gone: {GONE.get(asked)}")
-    require(
-        asked in CRITERIA,
-        f"{where}: key design.criterion takes {takes}; found {quoted(asked)}"
-        f"{did_you_mean(asked, CRITERIA)}",
-    )
+    needs = criterion_named(asked, f"{where}: key design.criterion").needs
     require(
         not cell.design.elsewhere_cap or asked == TEST_POSE,
         f'{where}: key design.elsewhere_cap goes with criterion = "{TEST_POSE}", not with '
@@ -600,7 +594,7 @@ def _check_criterion(model: Model) -> None:
     )
     names = cell.design.combination
     require(
-        bool(names) or "combination" not in CRITERIA[asked].needs,
+        bool(names) or "combination" not in needs,
         f'{where}: key design.combination is missing; beside criterion = "{asked}" it takes '
         "factors by parameter, as in "
         f'combination = {{ "{next(iter(model.names), "joint2.compliance")}" = 1.0 }}',
@@ -611,7 +605,3 @@ def _check_criterion(model: Model) -> None:
             f"{where}: [design] combination names {quoted(name)}, which is no parameter of the "
             f"model{did_you_mean(name, model.names)}; there are {listed(model.names)}",
         )
-
-
-def _joined(names: list[str], word: str) -> str:
-    return f"{', '.join(names[:-1])} {word} {names[-1]}"

@@ -115,13 +115,9 @@ def program_name(text: str, most: int = 24) -> str:
     return f"{name}_plan"[:most] if name.lower() in RESERVED or name == "p" else name
 
 
-def check_driven(steps: Sequence[Step], chain: Chain, limits: Limits | None) -> None:
-    """Raise InputError where a joint value lies outside `limits` (lower, upper; rad), by default
-    the robot's, or a stop would last for no time or more than a day."""
-    lower, upper = limits or (
-        np.array([joint.lower for joint in chain.joints]),
-        np.array([joint.upper for joint in chain.joints]),
-    )
+def check_driven(steps: Sequence[Step], lower: Array, upper: Array) -> None:
+    """Raise InputError where a joint value lies outside the limits (n,) rad, or a stop would last
+    for more than a day."""
     for k, step in enumerate(steps):
         if step[0] == "measure":
             require(0 <= step[1] <= LONGEST_STOP, f"a stop of {step[1]:g} s; give 0 to 86400 s")
@@ -136,11 +132,10 @@ def check_driven(steps: Sequence[Step], chain: Chain, limits: Limits | None) -> 
                 )
 
 
-def limits_text(chain: Chain, limits: Limits | None) -> str:
+def limits_text(lower: Array, upper: Array) -> str:
     """The limits that every joint value was checked against, in degrees."""
-    ends = zip(*limits, strict=True) if limits else ((j.lower, j.upper) for j in chain.joints)
     shown = []
-    for i, (low, high) in enumerate(ends, 1):
+    for i, (low, high) in enumerate(zip(lower, upper, strict=True), 1):
         told = [f"from {math.degrees(low):.4g}"] if math.isfinite(low) else []
         told += [f"to {math.degrees(high):.4g}"] if math.isfinite(high) else []
         shown.append(f"J{i} {' '.join(told).removeprefix('from ' * (len(told) == 2)) or 'any'}")
@@ -151,7 +146,6 @@ def limits_text(chain: Chain, limits: Limits | None) -> str:
 
 SAME = 1e-6  # rad, between a value of the plan and of the program
 LONGEST_STOP = 86_400.0  # s
-Limits = tuple[Array, Array]
 _NUMBER = r"-?[0-9]+(?:\.[0-9]+)?"
 _NOTE = r"[ !#-\[\]-~]*"  # printable ASCII without quotation marks and backslashes
 # Every kind of line that a program has; the first group of a move holds its numbers.
@@ -208,7 +202,6 @@ def check_program(text: str, planned: Sequence[Step]) -> None:
 
 
 def check_six_axes(chain: Chain, language: str) -> None:
-    """Raise InputError unless the arm has six revolute joints, which is what `language` moves."""
     sliding = [joint.name for joint in chain.joints if joint.kind != "revolute"]
     if chain.n_joints != AXES or sliding:
         what = f"joint {', '.join(sliding)} slides" if sliding else f"it has {chain.n_joints}"
@@ -218,41 +211,56 @@ def check_six_axes(chain: Chain, language: str) -> None:
         )
 
 
-# The two languages: what stands before, at and behind the steps.
+# The two languages: what stands before, at and behind the steps.  Moves are exact stops, without
+# blend, so that the checked paths are those that are driven.
 
 PERCENT = 10  # of a KUKA's greatest axis speed and acceleration
 MOTION = "a=0.5, v=0.5"  # rad/s², rad/s of the leading axis of a Universal Robot
 FIRST = "The first move begins wherever the arm stands; only the moves after it were checked."
 
 
-def krl_program(
+def robot_program(
+    suffix: str,
     execution: Execution,
     chain: Chain,
     configurations: Sequence[str],
     forces: Array | None = None,
     *,
     name: str = "elastocal_plan",
-    limits: Limits | None = None,
+    limits: tuple[Array, Array] | None = None,
 ) -> str:
-    """The text of NAME.src: moves, WAIT SEC where the tracker measures, HALT for the load.
+    """The text of NAME.src (KRL) or NAME.script (URScript): moves, stops in which the tracker
+    measures, and halts for the load; joint values in the order of the chain.
 
-    Axis angles are the plan's joint values in degrees, A1 … A6 being joints 1 … 6.  Moves are exact
-    stops (no C_PTP), so the checked paths are those that are driven.  No .dat file is needed.
-    `name` is reduced to one that KRL allows.  Raises InputError for an arm of other joints than six
-    revolute ones and for joint values outside `limits` (lower, upper; rad; by default the robot's);
-    ElastocalError where the text, read back, is not the plan.
+    `name` is reduced to one that the language allows.  Raises InputError for an arm of other joints
+    than six revolute ones and for joint values outside `limits` (lower, upper; rad; by default the
+    robot's); ElastocalError where the text, read back, is not the plan.
     """
-    steps = _checked(execution, chain, configurations, forces, limits, "KRL")
-    module = program_name(name)
+    language, write = LANGUAGES[suffix.lower()]
+    check_six_axes(chain, language)
+    lower, upper = limits or (
+        np.array([joint.lower for joint in chain.joints]),
+        np.array([joint.upper for joint in chain.joints]),
+    )
+    steps = list(steps_of(execution, configurations, forces))
+    check_driven(steps, lower, upper)
+    told = f"elastocal: {len(execution.stops)} readings of robot {plain(chain.name)}"
+    text = "\n".join(write(program_name(name), told, limits_text(lower, upper), steps)) + "\n"
+    check_program(text, steps)
+    return text
+
+
+def _krl(module: str, told: str, limits: str, steps: Sequence[Step]) -> list[str]:
+    """Axis angles in degrees, A1 … A6 being joints 1 … 6.  No .dat file is needed."""
     lines = [
         "&ACCESS RVP",
         "&REL 1",
         f"DEF {module}()",
-        f"; elastocal: {len(execution.stops)} readings of robot {plain(chain.name)}",
+        f"; {told}",
         f"; This is module {module}: on the controller its file must be {module}.src.",
         "; Units: axis angles in degrees, stops in s, loads in N along x, y, z of the data's",
         "; frame.  Axis moves: neither $BASE nor $TOOL changes where they lead.",
-        f"; Inside the limits in degrees: {limits_text(chain, limits)}.",
+        f"; Inside the limits in degrees: {limits}.",
         f"; Speed and acceleration: {PERCENT} % of the axes' greatest.",
         "; Axis angles in degrees as the robot description counts them: before the first run,",
         "; compare signs and zeros with the controller, and run in T1.",
@@ -272,34 +280,18 @@ def krl_program(
                 lines += [f"; {plain(order)}, then start again", "HALT"]
             case "measure", dwell, note:
                 lines += [f"; measure {plain(note)}", f"WAIT SEC {number(dwell, 3)}"]
-    return _as_planned([*lines, "END"], steps)
+    return [*lines, "END"]
 
 
-def urscript_program(
-    execution: Execution,
-    chain: Chain,
-    configurations: Sequence[str],
-    forces: Array | None = None,
-    *,
-    name: str = "elastocal_plan",
-    limits: Limits | None = None,
-) -> str:
-    """The text of a script: moves, sleep where the tracker measures, a popup for the load.
-
-    Joint values in rad, in the order of the chain.  Moves are without blend radius, so the checked
-    paths are those that are driven.  `name` is reduced to one that a function can have.  Raises as
-    `krl_program` does.
-    """
-    steps = _checked(execution, chain, configurations, forces, limits, "URScript")
-    function = program_name(name)
+def _urscript(function: str, told: str, limits: str, steps: Sequence[Step]) -> list[str]:
     lines = [
-        f"# elastocal: {len(execution.stops)} readings of robot {plain(chain.name)}",
+        f"# {told}",
         "# Joint values in rad as the robot description counts them: before the first run,",
         "# compare signs and zeros with the controller, and run at reduced speed.",
         f"# {FIRST}",
         "# Units: rad, rad/s, rad/s^2, s; loads in N along x, y, z of the data's frame.  Joint",
         "# moves: neither the TCP nor a feature plane changes where they lead.",
-        f"# Inside the limits in degrees: {limits_text(chain, limits)}.",
+        f"# Inside the limits in degrees: {limits}.",
         f"def {function}():",
     ]
     for step in steps:
@@ -312,20 +304,7 @@ def urscript_program(
                 lines.append(f'  popup("{text}, then continue", title="Load", blocking=True)')
             case "measure", dwell, note:
                 lines += [f'  textmsg("measure {plain(note)}")', f"  sleep({number(dwell, 3)})"]
-    return _as_planned([*lines, "end", "", f"{function}()"], steps)
+    return [*lines, "end", "", f"{function}()"]
 
 
-def _checked(
-    execution: Execution, chain: Chain, configurations: Sequence[str], forces: Array | None,
-    limits: Limits | None, language: str,
-) -> list[Step]:  # fmt: skip
-    check_six_axes(chain, language)
-    steps = list(steps_of(execution, configurations, forces))
-    check_driven(steps, chain, limits)
-    return steps
-
-
-def _as_planned(lines: list[str], steps: list[Step]) -> str:
-    text = "\n".join(lines) + "\n"
-    check_program(text, steps)
-    return text
+LANGUAGES = {".src": ("KRL", _krl), ".script": ("URScript", _urscript)}

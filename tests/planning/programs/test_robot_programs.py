@@ -2,6 +2,7 @@
 
 import re
 from dataclasses import replace
+from functools import partial
 
 import numpy as np
 import pytest
@@ -17,16 +18,16 @@ from elastocal.planning.execution import schedule
 from elastocal.planning.programs import (
     RESERVED,
     check_program,
-    krl_program,
     program_name,
     program_steps,
+    robot_program,
     steps_of,
-    urscript_program,
 )
 
 FORCES = np.array([[0.0, 0, 0], [0, 0, -2600.0]])
 HOME = np.radians([0.0, -90, 90, 0, 45, 0])
 NAMES = [f"c{i}" for i in range(1, 6)]
+KRL, URSCRIPT = (partial(robot_program, suffix) for suffix in (".src", ".SCRIPT"))
 
 
 @pytest.fixture(scope="module")
@@ -50,7 +51,7 @@ def planned(execution):
 
 
 def test_the_load_is_hung_before_the_first_loaded_reading_and_taken_off_after_the_last(chain):
-    lines = krl_program(execution_of(chain, home=HOME), chain, NAMES, FORCES).splitlines()
+    lines = KRL(execution_of(chain, home=HOME), chain, NAMES, FORCES).splitlines()
     events = [
         "load" if "load of" in line else "free"
         for line in lines
@@ -65,7 +66,7 @@ def test_the_load_is_hung_before_the_first_loaded_reading_and_taken_off_after_th
     assert max(k for k in range(first) if "; measure" in lines[k]) < hang < first < last < off
 
 
-@pytest.mark.parametrize("write", [krl_program, urscript_program])
+@pytest.mark.parametrize("write", [KRL, URSCRIPT])
 def test_the_text_is_the_same_every_time_and_names_cannot_break_it(chain, write):
     execution = execution_of(chain)
     assert write(execution, chain, NAMES, FORCES) == write(execution, chain, NAMES, FORCES)
@@ -76,7 +77,7 @@ def test_the_text_is_the_same_every_time_and_names_cannot_break_it(chain, write)
     assert text.count("\n") == ours.count("\n") and text.count('"') == ours.count('"')
 
 
-@pytest.mark.parametrize("write", [krl_program, urscript_program])
+@pytest.mark.parametrize("write", [KRL, URSCRIPT])
 def test_other_arms_than_six_revolute_joints_are_refused(chain, write):
     execution = execution_of(chain)
     seven = Chain("seven", (*chain.joints, chain.joints[0]), np.eye(4))
@@ -100,7 +101,7 @@ def test_any_name_is_reduced_to_one_that_both_languages_allow(name):
     assert program_name(reduced) == reduced
 
 
-@pytest.mark.parametrize("write", [krl_program, urscript_program])
+@pytest.mark.parametrize("write", [KRL, URSCRIPT])
 def test_a_joint_value_outside_the_limits_is_refused(chain, write):
     execution = execution_of(chain)
     beyond = replace(execution.stops[2], q=execution.stops[2].q + np.array([0, 0, 9.0, 0, 0, 0]))
@@ -116,7 +117,7 @@ def test_a_joint_value_outside_the_limits_is_refused(chain, write):
         write(execution, chain, NAMES, FORCES, limits=tight)
 
 
-@pytest.mark.parametrize("write", [krl_program, urscript_program])
+@pytest.mark.parametrize("write", [KRL, URSCRIPT])
 def test_a_program_read_back_is_the_plan_to_a_millionth_of_a_radian(chain, write):
     execution = execution_of(chain, home=HOME, both_directions=True)
     text = write(execution, chain, NAMES, FORCES)
