@@ -16,7 +16,7 @@ from support.robots import KR270
 
 from elastocal.cell.plan_wishes import DesignSpec, Motion, TargetPose
 from elastocal.cell.work_cell import Cell, read_cell
-from elastocal.cell.workspace_rules import CarriedBody, Solid, Workspace
+from elastocal.cell.workspace_rules import Solid, Workspace
 from elastocal.errors import InputError
 from elastocal.planning import test_poses as target_poses
 from elastocal.planning.candidates import joint_space
@@ -39,9 +39,6 @@ def cell(workspace: Workspace | None = None, model: Any = None, **design: Any) -
     "good",
     [
         cell(),
-        cell(Workspace(link_radius=(0.1,), torque_limits=(1e3,) * 6)),
-        cell(Workspace(link_radius=(0.1,) * 6)),
-        cell(Workspace(bodies=(CarriedBody(BALL, "link6"), CarriedBody(BALL, "base")))),
         cell(levels={"joint2": (-np.pi / 2, 0.0)}),
         cell(model={"compliance_levels": {"joint2": (-1.0, 0.0)}}, levels={"joint2": (-1.0,)}),
         cell(motion=Motion(home=HOME, speed=np.ones(6))),
@@ -56,12 +53,6 @@ def test_what_fits_passes(good: Cell) -> None:
 @pytest.mark.parametrize(
     ("bad", "told"),
     [
-        (cell(Workspace(link_radius=(0.1, 0.1))), ["link_radius_mm has 2", "6 joints", "for all"]),
-        (cell(Workspace(torque_limits=(1e3,))), ["torque_limits_Nm has 1 numbers", "give 6"]),
-        (
-            cell(Workspace(bodies=(CarriedBody(BALL, "link7"),))),
-            ["on of [[workspace.body]] no. 1 is 'link7'", "link1 to link6"],
-        ),
         (cell(levels={"joint7": (0.0,)}), ["[design.levels] names joint7", "6 joints"]),
         (cell(levels={"joint2": (-1.0, 0.2)}), ["joint2 at 11.4592°", "-146° to 0°"]),
         (

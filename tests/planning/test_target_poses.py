@@ -179,10 +179,10 @@ class Elbow:
 
     least: float
     forces: tuple[float, ...] = (0.0, -2600.0)
-    of_force = True
 
-    def feasible(self, q: NDArray, force: NDArray) -> Any:
-        return self.check(q, np.broadcast_to(force, (len(q), 3))).ok
+    def feasible(self, q: NDArray, forces: NDArray) -> Any:
+        under = (np.broadcast_to(force, (len(q), 3)) for force in forces)
+        return np.all([self.check(q, force).ok for force in under], axis=0)
 
     def check(self, q: NDArray, force: NDArray, every: bool = True) -> Any:
         assert force.shape == (len(q), 3)

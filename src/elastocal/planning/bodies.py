@@ -330,8 +330,8 @@ def skeleton(
     radius = radius * chain.n_joints if len(radius) == 1 else radius
     if len(radius) != chain.n_joints:
         raise InputError(
-            f"{where} link_radius has {len(radius)} values, but robot '{chain.name}' has "
-            f"{chain.n_joints} links"
+            f"{where} link_radius_mm has {len(radius)} values, but robot '{chain.name}' has "
+            f"{chain.n_joints} links; give one for each, or one for all"
         )
     ends = [T[:3, 3] for T in distal_placements(chain)]
     foot, first = T_data_base[:3, 3], (T_data_base @ chain.joints[0].placement)[:3, 3]

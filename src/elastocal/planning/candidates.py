@@ -18,7 +18,7 @@ from elastocal.model.manipulator import Model
 from elastocal.planning.feasibility import Feasibility, PoseFeasibility, Struck
 from elastocal.planning.information import plan_forces
 from elastocal.text import did_you_mean, listed, quoted
-from elastocal.units import Array, BoolArray, IntArray, Progress
+from elastocal.units import Array, IntArray, Progress
 
 # Where poses may lie: joint ranges, and one joint that may be held at fixed levels.
 
@@ -211,32 +211,10 @@ def sobol(space: JointSpace, group: int, stream: np.random.SeedSequence) -> Iter
         yield space.poses(engine.random(CHUNK), group)
 
 
-def feasible(checker: Feasibility, q: Array, forces: Array) -> BoolArray:
-    """(N,): poses q (N, n) break no rule under any of `forces` (k, 3) N."""
-    ok = np.ones(len(q), dtype=bool)
-    for force in deciding(checker, forces):
-        ok[ok] = checker.feasible(q[ok], force)
-    return ok
-
-
-def deciding(checker: Feasibility, forces: Array) -> Array:
-    """The `forces` (k, 3), the heaviest first, that say under which of them a pose is feasible:
-    where no rule asks how heavy the load is, where it hangs everything counts that counts at all.
-    """
-    ranked = forces[np.argsort(-np.linalg.norm(forces, axis=1), kind="stable")]
-    return ranked if checker.of_force else ranked[:1]
-
-
 def _check(
     checker: Feasibility, forces: Array, group: int, q: Array
 ) -> tuple[Candidates, PoseFeasibility]:
-    """The feasible candidates among poses q (N, n) of a group, and the first rule that each breaks:
-    under the first of the forces that forbids it."""
-    heaviest, *others = deciding(checker, forces)
-    verdict = checker.check(q, heaviest, every=False)
-    for force in others:
-        left = np.flatnonzero(verdict.ok)
-        verdict.broken[left] = checker.check(q[left], force, every=False).broken
+    verdict = checker.under(q, forces)
     ok = verdict.ok
     n = int(ok.sum())
     return Candidates(q[ok], np.full(n, group), len(ok), n, verdict.removed_by), verdict

@@ -7,7 +7,6 @@ from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from functools import cached_property
 from typing import Any
-from uuid import uuid4
 
 import numpy as np
 
@@ -400,17 +399,6 @@ LOADED = np.array([0.0, 0.0, -1.0])  # any force: the load hangs
 MOST_TRIED = 300  # random poses in which a pair must once keep apart to be believed
 
 
-_last_restored: dict[str, Feasibility] = {}
-
-
-def _restored(token: str, cell: Cell, chain: Chain, struck: Array | None) -> Feasibility:
-    """The rules anew, once per process: with every task the same ones are sent again."""
-    if token not in _last_restored:
-        _last_restored.clear()
-        _last_restored[token] = Feasibility(cell, chain, struck)
-    return _last_restored[token]
-
-
 class Feasibility:
     """The rules of a cell for the nominal, rigid arm.
 
@@ -421,8 +409,7 @@ class Feasibility:
     """
 
     def __init__(self, cell: Cell, chain: Chain, struck: Array | None = None) -> None:
-        self.cell, self.chain, self._token = cell, chain, uuid4().hex
-        self._struck = struck
+        self.cell, self.chain, self._struck = cell, chain, struck
         self.kinematics = Kinematics(cell, chain)
         self.bodies: tuple[Body, ...] = cell_bodies(cell, chain)
         self.pairs: tuple[Pair, ...] = cell_pairs(cell, chain, self.bodies)
@@ -431,7 +418,7 @@ class Feasibility:
             self.rules = (self.rules[0], Struck(struck), *self.rules[1:])
 
     def __reduce__(self) -> tuple[Any, ...]:
-        return _restored, (self._token, self.cell, self.chain, self._struck)
+        return Feasibility, (self.cell, self.chain, self._struck)
 
     def check(self, q: Array, force: Array, every: bool = True) -> PoseFeasibility:
         """Every rule on every pose q (N, n) rad or m under a force (3,) or (N, 3) N; not `every`:
@@ -448,14 +435,20 @@ class Feasibility:
             left = left if every else left[~hit]
         return PoseFeasibility(tuple(r.name for r in self.rules), broken, poses.q, poses.force)
 
-    def feasible(self, q: Array, force: Array) -> BoolArray:
-        """(N,) as check(q, force).ok, quicker."""
-        return self.check(q, force, every=False).ok
+    def under(self, q: Array, forces: Array) -> PoseFeasibility:
+        """The first rule that each pose q (N, n) breaks under the first of `forces` (k, 3) that
+        forbids it, the heaviest first; alone where no rule asks how heavy the load is: where it
+        hangs everything counts that counts at all."""
+        ranked = forces[np.argsort(-np.linalg.norm(forces, axis=1), kind="stable")]
+        verdict = self.check(q, ranked[0], every=False)
+        for force in ranked[1:] if self.cell.workspace.torque_limits else ():
+            left = np.flatnonzero(verdict.ok)
+            verdict.broken[left] = self.check(q[left], force, every=False).broken
+        return verdict
 
-    @property
-    def of_force(self) -> bool:
-        """Does a rule ask for more of the force than whether the load hangs?"""
-        return bool(self.cell.workspace.torque_limits)
+    def feasible(self, q: Array, forces: Array) -> BoolArray:
+        """(N,): poses q (N, n) break no rule under any of `forces` (k, 3) or (3,) N."""
+        return self.under(q, np.atleast_2d(forces)).ok
 
     @property
     def partial(self) -> bool:

@@ -26,7 +26,7 @@ from elastocal.model.chain import Chain
 from elastocal.model.effects.loads import STANDARD_GRAVITY
 from elastocal.model.symbolic import SymbolicArm, configuration_rows
 from elastocal.planning.bodies import HANGING, WORLD, Body, Pair, data_base, few_points, mesh_hull
-from elastocal.planning.candidates import CHUNK, JointSpace, feasible, sobol
+from elastocal.planning.candidates import CHUNK, JointSpace, sobol
 from elastocal.planning.collision import arm_frames
 from elastocal.planning.criteria import TangentBound, inverse
 from elastocal.planning.feasibility import POSE_SLACK, Feasibility
@@ -262,7 +262,7 @@ class Searches:
     _joint: dict[bytes, JointSearch] = field(default_factory=dict)
 
     def feasible(self, q: Array) -> BoolArray:
-        return feasible(self.checker, q, self.information.forces)
+        return self.checker.feasible(q, self.information.forces)
 
     def rows(self, q: Array, level: int, read: BoolArray) -> tuple[ca.Function, ca.Function]:
         """B (q, x) and its adjoint (q, x, W) of poses at a level, as q (n,) is, in the load states

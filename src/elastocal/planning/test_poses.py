@@ -24,7 +24,7 @@ from elastocal.model.effects.placements import MarkerPosition
 from elastocal.model.inverse_kinematics import Postures, inverse_kinematics
 from elastocal.model.manipulator import Model
 from elastocal.planning.bodies import data_base
-from elastocal.planning.candidates import feasible, told
+from elastocal.planning.candidates import told
 from elastocal.planning.feasibility import Feasibility
 from elastocal.planning.information import Estimable, why
 from elastocal.tables import NO_UNIT, Family, Layout, RawTable, read_table
@@ -37,11 +37,10 @@ LIMIT_SLACK = 1e-6  # rad or m: what rounding to printed digits may push over a 
 
 
 def check_cell(cell: Cell, chain: Chain) -> None:
-    """Numbers of joints, links, and joint values of [workspace] and [design].
+    """Numbers of joints and joint values of [design].
 
     Raises InputError that names the key, what was found and what to do.
     """
-    _check_workspace(cell, chain)
     _check_levels(cell, chain)
     _check_motion(cell, chain)
     for k, pose in enumerate(cell.design.test_poses):
@@ -89,21 +88,6 @@ def _check_revolute(cell: Cell, chain: Chain, key: str) -> None:
             f"{cell.path or cell.name}: key {key} gives degrees, but joint{sliding[0] + 1} "
             f"({chain.joints[sliding[0]].name}) is prismatic; use {other}, in rad and m"
         )
-
-
-def _check_workspace(cell: Cell, chain: Chain) -> None:
-    space, n = cell.workspace, chain.n_joints
-    if space.link_radius:
-        _check_count(cell, chain, "workspace.link_radius_mm", space.link_radius, one=True)
-    if space.torque_limits:
-        _check_count(cell, chain, "workspace.torque_limits_Nm", space.torque_limits)
-    links = {f"link{i}" for i in range(1, n + 1)}
-    for k, body in enumerate(space.bodies):
-        if body.on.startswith("link") and body.on not in links:
-            raise InputError(
-                f"{cell.path or cell.name}: key {place('workspace', 'body', k, 'on')} is "
-                f"'{body.on}', but robot '{chain.name}' has {n} moving links, link1 to link{n}"
-            )
 
 
 def _check_levels(cell: Cell, chain: Chain) -> None:
@@ -514,7 +498,7 @@ def _drawn(
     if rules is not None:
         found = [q[:0]]
         for part in np.split(q, range(LOT, count, LOT)):
-            found.append(part[feasible(rules, part, working_loads(cell))])
+            found.append(part[rules.feasible(part, working_loads(cell))])
             if sum(map(len, found)) >= most:
                 break
         q = np.concatenate(found)[:most]

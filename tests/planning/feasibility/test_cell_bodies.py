@@ -21,7 +21,7 @@ def named(workspace, chain=KR270_CHAIN, **changes):
 @pytest.mark.parametrize(
     ("workspace", "message"),
     [
-        (Workspace(link_radius=(0.1, 0.2)), "link_radius has 2 values.*6 links"),
+        (Workspace(link_radius=(0.1, 0.2)), "link_radius_mm has 2 values.*6 links"),
         (
             Workspace(bodies=(CarriedBody(sphere("a", 1, (0, 0, 0)), "link33"),)),
             "'a' is on 'link33' .did you mean 'link3'",
