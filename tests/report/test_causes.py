@@ -4,15 +4,9 @@ from __future__ import annotations
 
 from dataclasses import replace
 
-from support.diagnoses import (
-    MANY,
-    MANY_UNKNOWN,
-)
+from support.diagnoses import MANY, MANY_UNKNOWN
 
-from elastocal.report.causes_view import (
-    causes,
-    place_table,
-)
+from elastocal.report.diagnosis_view import causes, place_table
 
 
 def test_a_finding_has_its_places_below_it_and_every_part_once():

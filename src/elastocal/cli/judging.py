@@ -204,7 +204,7 @@ def _write_extended(
     """Write the cell with the effects found, and say so and what to do with it."""
     from elastocal.diagnosis.diagnose import write_extended_cell
     from elastocal.model.manipulator import where_smooth_functions_end
-    from elastocal.report.causes_view import added_text
+    from elastocal.report.diagnosis_view import added_text
 
     extra = (*found.effects, *found.slight, *found.fields)
     extended = write_extended_cell(cell, path, extra, found.model_keys)

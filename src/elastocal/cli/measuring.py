@@ -29,6 +29,7 @@ if TYPE_CHECKING:
     from rich.console import Console
 
     from elastocal.cell.work_cell import Cell
+    from elastocal.importing.assemble import Imported
     from elastocal.model.chain import Chain
     from elastocal.planning.checkpoint import Checkpoint
     from elastocal.planning.design import DesignOptions
@@ -510,9 +511,10 @@ def import_(
         angle_unit: Unit of angles where a file does not say: deg, rad, gon.
     """
     from elastocal.cell.work_cell import read_cell
-    from elastocal.cli.import_preview import left_out, print_preview, summary
     from elastocal.importing.assemble import import_files
     from elastocal.importing.mapping_file import preset_text, read_mapping, with_units
+    from elastocal.report.smaller_views import import_blocks, left_out
+    from elastocal.report.terminal import print_blocks
 
     if show_preset is not None:
         say(preset_text(show_preset), end="")
@@ -537,9 +539,10 @@ def import_(
     run.reads(cell=known)
     found = import_files(paths, read, known, str(output or "the table"))
     if run.json:
-        say(json_text(summary(found, output)))
+        say(json_text(_understood(found, output)))
     elif preview:
-        print_preview(console(), found)
+        screen = console()
+        print_blocks(screen, import_blocks(found, screen.width))
     else:
         for warning in found.warnings:
             say(f"Warning: {warning}", error=True)
@@ -558,6 +561,38 @@ def import_(
             f"wrote {len(table)} readings of {len(table.configuration_labels)} configurations to "
             f"{output}"
         )
+
+
+def _understood(found: Imported, output: Path | None) -> dict[str, Any]:
+    """The preview as JSON."""
+    table, joined = found.table, found.joined
+    return {
+        "schema": "elastocal/import/1",
+        "output": None if output is None else str(output),
+        "readings": len(table),
+        "configurations": len(table.configuration_labels),
+        "markers": list(table.marker_names),
+        "columns": list(found.assembled.columns),
+        "joined_by": None if joined is None else joined.how,
+        "left_out": [] if joined is None else list(joined.left_out),
+        "poses_without_point": [] if joined is None else list(joined.unused),
+        "nominal_fit_um": None if found.fit is None else found.fit.error * 1e6,
+        "files": [
+            {
+                "file": observed.path, "preset": observed.preset, "role": observed.role,
+                "encoding": observed.encoding, "layout": observed.layout,
+                "decimal": observed.decimal,
+                "rows": observed.rows, "unused": list(observed.unused),
+                "columns": [
+                    {"from": name, "to": to, "unit": unit} for name, to, unit in observed.columns
+                ],
+                "ignored": [{"line": line, "reason": why} for line, why in observed.ignored],
+            }
+            for observed in found.understood
+        ],
+        "warnings": list(found.warnings),
+        "refused": found.refused or None,
+    }  # fmt: skip
 
 
 def _suggestion(paths: list[Path]) -> str:

@@ -26,7 +26,14 @@ from elastocal.planning.collision import Kinematics
 from elastocal.planning.plan import Plan
 from elastocal.report import blocks
 from elastocal.report.figures import ARM, FAINT, INK, SERIES, figure_of, style
-from elastocal.report.formatting import first_stops, joint_heads, joint_texts, length, short_name
+from elastocal.report.formatting import (
+    first_stops,
+    joint_heads,
+    joint_texts,
+    length,
+    load_text,
+    short_name,
+)
 from elastocal.text import printable
 from elastocal.units import Array, IntArray
 
@@ -342,7 +349,7 @@ def residual_space(model: Model, observed: Observations, x: Array, residual: Arr
         name = table.configuration_labels[table.configuration[rows[k]]]
         poses.append(
             Posed(
-                name=f"{name}, {_load(table.force[rows[k]])}" if several else name,
+                name=f"{name}, {load_text(table.force[rows[k]])}" if several else name,
                 about=f"rms residual {length(float(rms[code]))} of {len(own)} readings",
                 frames=frames[k],
                 flange=flange[k],
@@ -362,12 +369,6 @@ def _chosen(rms: Array, order: IntArray) -> IntArray:
     rest = np.setdiff1d(order, worst)
     drawn = np.random.default_rng(0).choice(rest, MOST_POSES - WORST, replace=False)
     return order[np.isin(order, np.concatenate([worst, drawn]))]
-
-
-def _load(force: Array) -> str:
-    if not force.any():
-        return "unloaded"
-    return "(" + ", ".join(f"{f + 0.0:.6g}" for f in force) + ") N"
 
 
 def plan_arm(plan: Plan) -> blocks.ShownArm:

@@ -1,7 +1,7 @@
 """What a result says as a list of blocks, made once and shown by terminal, page and notebook.
 
 Each kind of result has a function that gives its `Report` (`identification_view`, `plan_view`,
-`diagnosis_view`, `changes_view`, `compensation_view`).  Texts are plain: a renderer escapes them,
+`diagnosis_view`, `certificate_view`, `smaller_views`).  Texts are plain: a renderer escapes them,
 typesets minus signs and decides on the layout.  A terminal shows what stands open, and with
 details the folds that are `printed`; it leaves out figures.
 """

@@ -18,7 +18,7 @@ from elastocal.identification.error_budget import ErrorBudget, gap_budget, pose_
 from elastocal.identification.prediction import measured_loads
 from elastocal.identification.result import Calibration
 from elastocal.report.blocks import Block, Heading, Report, Sentence, ShownTable, ShownVerdict
-from elastocal.report.formatting import length, sentence, title_of
+from elastocal.report.formatting import length, newtons, sentence, title_of
 from elastocal.report.identification_view import (
     at_new_poses,
     before_and_after,
@@ -67,7 +67,7 @@ def _blocks(result: Calibration) -> Iterator[Block]:
         *joint_lines(result),
         ("Instrument, standard deviations", _stated_noise(result)),
         ("Readings", readings(result)),
-        ("Loads", "; ".join(_newtons(f) for f in measured_loads(result.observations))),
+        ("Loads", "; ".join(newtons(f) for f in measured_loads(result.observations))),
         ("Identified", what_was_identified(result)),
         ("Method", sentence(method_and_weights(result))),
         *([("Expected error", at_new_poses(result.predicted))] if result.predicted else []),
@@ -240,10 +240,6 @@ def _stated_noise(result: Calibration) -> str:
         + (" per m" if name.endswith("per_m") else "")
         for name, value in vars(stated).items()
     )
-
-
-def _newtons(force: Array) -> str:
-    return f"({', '.join(f'{v:g}' for v in force)}) N"
 
 
 def _each(value: Any) -> Array:

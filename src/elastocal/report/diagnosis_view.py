@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Iterable, Iterator, Mapping, Sequence
+from dataclasses import dataclass
 
 import numpy as np
 
@@ -11,16 +12,16 @@ from elastocal.diagnosis.diagnosis import (
     NORMAL_95,
     STRUCTURE,
     Candidate,
+    ComponentShare,
     Curve,
     Diagnosis,
     EffectAt,
     ExtraPlan,
     FoundEffect,
+    Interval,
     Location,
-    NearRepeats,
     NoiseFloor,
 )
-from elastocal.identification.error_budget import BudgetStep
 from elastocal.measurements import by_rows
 from elastocal.report.blocks import (
     TONES,
@@ -36,21 +37,11 @@ from elastocal.report.blocks import (
     ShownTable,
     ShownVerdict,
 )
-from elastocal.report.causes_view import (
-    assumed_order,
-    cause_table,
-    curve_line,
-    curve_span,
-    field_table,
-    headline_of_causes,
-    place_table,
-    share_text,
-    slight_text,
-)
 from elastocal.report.effect_names import (
     STAGES,
     driver_name,
     effect_at,
+    effect_at_places,
     name_of,
     p_value,
     place,
@@ -58,15 +49,16 @@ from elastocal.report.effect_names import (
     plain_name,
     probability,
     reduction,
+    setting_value,
     settings_text,
     size_of,
 )
 from elastocal.report.formatting import (
     budget_table,
     capital,
+    counted,
+    display,
     estimate,
-    joint_heads,
-    joint_texts,
     length,
     outlier_blocks,
     significant,
@@ -75,11 +67,25 @@ from elastocal.report.formatting import (
 )
 from elastocal.text import printable
 
-MOST_CANDIDATES, MOST_PRINTED = 40, 8
+MOST_CANDIDATES = 8
 MOST_TESTS = 12
+# What an error of each family goes with.
+FAMILIES = {
+    "angle": "against its own angle",
+    "gravity": "by gravity",
+    "torque": "by torque",
+    "load": "by load",
+    "move": "by the last move",
+    "time": "with time",
+    "temperature": "with temperature",
+    "pose": "with the pose",
+    "tool": "of the tool",
+}
+NAMELESS = "without a name"
+MOST_IN_HEADLINE = 3
+FINE = 0.1  # fraction below which a tenth of a percent is told
 FEW = 2  # effects whose shapes stand open
 MOST_PLACES = 8
-MOST_VISITS = 200
 
 
 def diagnosis_report(d: Diagnosis) -> Report:
@@ -113,13 +119,9 @@ def _blocks(d: Diagnosis, kinds: Sequence[str]) -> Iterator[Block]:
     yield Fold("Place by place", lambda: [places], printed=True)
     yield Fold("Smooth corrections", lambda: _nameless(d), printed=True)
     yield Fold("Error budget", lambda: [gap_table(d)], printed=True)
-    best = candidate_table(d, 0, MOST_PRINTED)
+    best = candidate_table(d)
     yield Fold("Candidates", lambda: [best], printed=True)
-    if len(d.candidates) > MOST_PRINTED:
-        more = candidate_table(d, MOST_PRINTED, MOST_CANDIDATES)
-        yield Fold("Further candidates", lambda: [more])
     yield Fold("Rivals", lambda: [pair_table(d)], printed=True)
-    yield Fold("Extra poses", lambda: [extra_visits(d, kinds)])
     yield Fold("Where the error comes from", lambda: _where(d))
     yield Fold("Not tested", lambda: [untested_table(d)], printed=True)
     noise = [("Noise", text) for text in noise_floor_lines(d.noise, kinds)]
@@ -167,9 +169,8 @@ def _nameless(d: Diagnosis) -> Iterator[Block]:
 
 
 def _where(d: Diagnosis) -> Iterator[Block]:
-    yield stage_table(d)
-    yield place_probabilities(d)
-    yield structure_table(d, MOST_TESTS)
+    yield location_table(d)
+    yield structure_table(d)
 
 
 def _outliers(d: Diagnosis) -> Iterable[Block]:
@@ -192,28 +193,22 @@ def _residuals(d: Diagnosis) -> Iterator[ShownArm | Block]:
     yield figures.residual_table(base.observed, residuals)
 
 
-def repeatabilities(noise: NoiseFloor, kinds: Iterable[str]) -> str:
-    """Every joint's scatter from visit to visit: "joint 1 6.0 µrad, joint 2 5.1 µrad"."""
-    texts = [
+def noise_floor_lines(noise: NoiseFloor, kinds: Iterable[str]) -> list[str]:
+    """What the data themselves say of the noise, a sentence each."""
+    text = f"A reading scatters by {length(noise.reading_sigma)} rms per axis"
+    if noise.stated:
+        text += (
+            f", {significant(noise.stated_factor, 2)} times what is stated, and "
+            f"{significant(noise.ratio_to_stated)} times with the scatter of the joints."
+        )
+    else:
+        text += "; nothing was stated."
+    joints = [
         f"joint {i + 1} {significant(value * 1e6, 2)} {'µrad' if kind == 'revolute' else 'µm'}"
         for i, (value, kind) in enumerate(zip(noise.repeatability, kinds, strict=True))
         if value > 0
     ]
-    return ", ".join(texts) or "none found"
-
-
-def noise_floor_lines(noise: NoiseFloor, kinds: Iterable[str]) -> list[str]:
-    """What the data themselves say of the noise, a sentence each."""
-    sigma = length(noise.reading_sigma)
-    if noise.stated:
-        text = f"A reading scatters by {sigma} rms per axis, {significant(noise.stated_factor, 2)}"
-        lines = [
-            f"{text} times what is stated, and {significant(noise.ratio_to_stated)} times with the "
-            "scatter of the joints."
-        ]
-    else:
-        lines = [f"A reading scatters by {sigma} rms per axis; nothing was stated."]
-    lines.append(f"Repeatability from visit to visit: {repeatabilities(noise, kinds)}.")
+    lines = [text, f"Repeatability from visit to visit: {', '.join(joints) or 'none found'}."]
     if noise.shared > 0:
         lines.append(
             "Visits of a configuration have a common scatter of "
@@ -227,33 +222,29 @@ def noise_floor_lines(noise: NoiseFloor, kinds: Iterable[str]) -> list[str]:
         lines.append("No repeats: the noise is estimated from residuals only.")
     else:
         lines.append(f"Repeats scatter by {length(noise.pure_error)} rms per axis.")
-    if noise.near_repeats is not None:
-        lines.append(_near_repeats_line(noise.near_repeats))
-    if noise.faulty:
-        n = len(noise.faulty)
+    if (near := noise.near_repeats) is not None:
+        text = (
+            f"Readings at nearly the same pose ({counted(near.pairs, 'pair')}) scatter by "
+            f"{length(near.scatter)} rms per axis"
+        )
+        if near.soon is not None and near.later is not None:
+            text += (
+                f" (measured soon after each other {length(near.soon)}, in other parts of the "
+                f"session {length(near.later)})"
+            )
+        lines.append(f"{text}.")
+    if n := len(noise.faulty):
         lines.append(
-            f"{n} outlier{'s were' if n > 1 else ' was'} excluded, the worst "
+            f"{counted(n, 'outlier was', 'outliers were')} excluded, the worst "
             f"{length(max(f.error for f in noise.faulty))} off."
         )
     return lines
 
 
-def _near_repeats_line(near: NearRepeats) -> str:
-    pairs = f"{near.pairs} pair{'s' if near.pairs > 1 else ''}"
-    text = (
-        f"Readings at nearly the same pose ({pairs}) scatter by {length(near.scatter)} rms per axis"
-    )
-    if near.soon is not None and near.later is not None:
-        text += (
-            f" (measured soon after each other {length(near.soon)}, in other parts of the session "
-            f"{length(near.later)})"
-        )
-    return f"{text}."
-
-
 ABSURD = 100.0  # typical sizes: no arm has an effect that large, whatever the readings could show
 MOST_NAMED = 6
 MOMENTS = ("jump_time_s", "slip_time_s")
+MATERIAL = 0.2  # of the noise: 2 % more in all
 
 
 def diagnosis_headline(d: Diagnosis) -> str:
@@ -264,7 +255,9 @@ def diagnosis_headline(d: Diagnosis) -> str:
         named = together(_likely(d))
         return f"{capital(named)} explain{'s' * (len(d.effects) == 1)} the remaining error."
     if d.verdict == "ambiguous":
-        return _ambiguous(d)
+        sets = [f"either {together([effect_at(e) for e in s], 'or')}" for s in d.indistinguishable]
+        verb = "causes" if len(sets) == 1 else "cause"
+        return f"{capital(together(sets))} {verb} the remaining error; these data cannot decide."
     if d.verdict == "unknown_effect":
         return _unknown(d)
     return (
@@ -274,33 +267,23 @@ def diagnosis_headline(d: Diagnosis) -> str:
 
 
 def _likely(d: Diagnosis) -> list[str]:
-    return [f"{effect_at(f)} (probability {probability(f.probability)}{_when(d, f)})"
-            for f in d.effects]  # fmt: skip
-
-
-def _when(d: Diagnosis, f: FoundEffect) -> str:
-    """When it happened, where it happened once."""
-    moments = {k: v for k, v in f.settings.items() if k in MOMENTS}
-    return f"; {settings_of(d, moments)}" if moments else ""
-
-
-def _ambiguous(d: Diagnosis) -> str:
-    sets = [together([effect_at(e) for e in rivals], "or") for rivals in d.indistinguishable]
-    text = together([f"either {rivals}" for rivals in sets])
-    verb = "causes" if len(sets) == 1 else "cause"
-    return f"{capital(text)} {verb} the remaining error; these data cannot decide."
+    """Each effect with its probability and, where it happened once, when."""
+    told = []
+    for f in d.effects:
+        moments = {k: v for k, v in f.settings.items() if k in MOMENTS}
+        when = f"; {settings_of(d, moments)}" if moments else ""
+        told.append(f"{effect_at(f)} (probability {probability(f.probability)}{when})")
+    return told
 
 
 def _unknown(d: Diagnosis) -> str:
-    text = "An effect outside the catalogue causes the remaining error"
+    where = f"{location_text(d.location)}" if d.location else ""
     if d.effects:
         verb = "cause" if len(d.effects) > 1 else "causes"
         text = f"{capital(together(_likely(d)))} {verb} part of the remaining error; an effect "
-        text += "outside the catalogue"
-        return f"{text} acts {location_text(d.location)}." if d.location else f"{text} acts."
-    if d.location is None:
-        return f"{text}; the data do not show where."
-    return f"{text}, {location_text(d.location)}."
+        return f"{text}outside the catalogue acts{f' {where}' if where else ''}."
+    text = "An effect outside the catalogue causes the remaining error"
+    return f"{text}, {where}." if where else f"{text}; the data do not show where."
 
 
 def location_text(location: Location) -> str:
@@ -333,11 +316,15 @@ def diagnosis_lines(d: Diagnosis) -> list[tuple[str, str]]:
 def _error_lines(d: Diagnosis) -> list[str]:
     """Error on held-out poses before and after, and the part of it that the effects remove."""
     calibrated, floor = length(d.gap.calibrated), length(d.gap.noise_floor)
-    rest = _unexplained_lines(d)
+    rest = []
+    if d.gap.unexplained > MATERIAL * d.gap.noise_floor:  # what looks like noise and is none
+        rest.append(
+            f"{length(d.gap.unexplained)} rms are unexplained: they look like scatter of the arm, "
+            "but repeats do not show them, neighbours in pose or time share them, or joints do not "
+            "scatter that much."
+        )
     if not d.effects:
-        return [
-            f"Held-out error: {calibrated} rms (noise alone: {floor}).", *rest,
-        ]  # fmt: skip
+        return [f"Held-out error: {calibrated} rms (noise alone: {floor}).", *rest]
     text = (
         f"Held-out error: {calibrated} rms, with the effects found {length(d.gap.explained)} rms "
         f"(noise alone: {floor})."
@@ -356,29 +343,12 @@ def _error_lines(d: Diagnosis) -> list[str]:
     return [f"{text} {last}", *rest]
 
 
-MATERIAL = 0.2  # of the noise: 2 % more in all
-
-
-def _unexplained_lines(d: Diagnosis) -> list[str]:
-    """What looks like noise and is none."""
-    if d.gap.unexplained <= MATERIAL * d.gap.noise_floor:
-        return []
-    return [
-        f"{length(d.gap.unexplained)} rms are unexplained: they look like scatter of the arm, but "
-        "repeats do not show them, neighbours in pose or time share them, or joints do not scatter "
-        "that much."
-    ]
-
-
 def _finding_line(d: Diagnosis, f: FoundEffect) -> tuple[str, str]:
     """An effect beside the open question, or the likeliest answer to it."""
     open_sets = {(e.effect, e.where) for rivals in d.indistinguishable for e in rivals}
-    label = "Likeliest" if (f.effect, f.where) in open_sets else "Besides"
     text = f"{effect_at(f)} (probability {probability(f.probability)}"
-    return (
-        label,
-        f"{text}; {settings_of(d, f.settings)})." if f.settings else f"{text}).",
-    )
+    text += f"; {settings_of(d, f.settings)})." if f.settings else ")."
+    return "Likeliest" if (f.effect, f.where) in open_sets else "Besides", text
 
 
 def settings_of(d: Diagnosis, settings: Mapping[str, float]) -> str:
@@ -466,21 +436,14 @@ def extra_lines(extra: ExtraPlan) -> list[str]:
     return lines + [capital(printable(text)) for text in extra.advice]
 
 
-Rows = list[tuple[str, ...]]
-
-
-def error_steps(d: Diagnosis) -> tuple[BudgetStep, ...]:
-    """The steps of the gap budget that are models; the noise floor is none."""
-    return tuple(step for step in d.budget if step.step != "noise_floor")
-
-
 def gap_table(d: Diagnosis) -> ShownTable:
     """The budget step by step, the noise last."""
     return budget_table(_named_steps(d), ("noise alone", d.gap.noise_floor))
 
 
 def _named_steps(d: Diagnosis) -> list[tuple[str, float, tuple[float, float]]]:
-    return [(name_of(step.step), step.heldout_rms, step.ci95) for step in error_steps(d)]
+    models = (step for step in d.budget if step.step != "noise_floor")
+    return [(name_of(step.step), step.heldout_rms, step.ci95) for step in models]
 
 
 OF_CANDIDATES = (
@@ -490,20 +453,18 @@ OF_CANDIDATES = (
 )
 
 
-def candidate_table(d: Diagnosis, first: int, last: int) -> ShownTable:
-    """The candidates of these ranks, the best first; with rank 0 an unknown effect and none, which
-    are candidates as well."""
+def candidate_table(d: Diagnosis) -> ShownTable:
+    """The likeliest candidates; an unknown effect and none are candidates as well."""
     rows = [
         (effect_at(c), probability(c.probability), f"{c.score:+.1f}",
          significant(c.detectable, 2), seen_from(c), settings_of(d, c.settings))
-        for c in d.candidates[first:last]
+        for c in d.candidates[:MOST_CANDIDATES]
     ]  # fmt: skip
-    title = f"{'Further c' if first else 'C'}andidates{' one at a time' if d.groups else ''}"
-    title += f", rank {first + 1} to {first + len(rows)} of {len(d.candidates)}"
-    if not first:
-        none = ("", "", "", "")
-        rows.append(("an effect outside the catalogue", probability(d.probability_unknown), *none))
-        rows.append(("no further effect", probability(d.probability_nothing), *none))
+    title = f"Candidates{' one at a time' if d.groups else ''}"
+    title += f", rank 1 to {len(rows)} of {len(d.candidates)}"
+    none = ("", "", "", "")
+    rows.append(("an effect outside the catalogue", probability(d.probability_unknown), *none))
+    rows.append(("no further effect", probability(d.probability_nothing), *none))
     heads = ("candidate", "probability", "evidence", "d", "seen from", "settings")
     table = ShownTable(heads, rows, (0, 5), title=title, note=OF_CANDIDATES)
     return table.when_narrow(5) if any(row[5] for row in rows) else table.without(5)
@@ -511,7 +472,7 @@ def candidate_table(d: Diagnosis, first: int, last: int) -> ShownTable:
 
 def added_parameter_table(d: Diagnosis) -> ShownTable:
     """Fitted parameters of the effects found, with 95 % half widths, and their settings."""
-    rows: Rows = []
+    rows: list[tuple[str, ...]] = []
     for f in d.effects:
         for p in f.parameters:
             rows.append((printable(p.name), *estimate(p.value, NORMAL_95 * p.std, p.unit)))
@@ -521,10 +482,10 @@ def added_parameter_table(d: Diagnosis) -> ShownTable:
     return ShownTable(("parameter", "value", "± 95 %", "unit"), rows, (0, 3), title=title)
 
 
-def structure_table(d: Diagnosis, most: int) -> ShownTable:
+def structure_table(d: Diagnosis) -> ShownTable:
     """Tests that name no effect, the most conspicuous first."""
-    tests = sorted(d.structure, key=lambda t: (t.p_family, t.p_value))[:most]
-    rows: Rows = [(driver_name(t.driver), p_value(t.p_value), p_value(t.p_family)) for t in tests]
+    tests = sorted(d.structure, key=lambda t: (t.p_family, t.p_value))[:MOST_TESTS]
+    rows = [(driver_name(t.driver), p_value(t.p_value), p_value(t.p_family)) for t in tests]
     note = (
         "Does the residual depend on it at all? These tests name no effect: whole configurations "
         f"change sign, and the last column counts all {len(d.structure)}."
@@ -575,8 +536,9 @@ def alike(d: Diagnosis) -> list[str]:
     return [together([told(e) for e in rivals]) for rivals in d.indistinguishable]
 
 
-def stage_table(d: Diagnosis) -> ShownTable:
-    """The stages of the chain from commanded joints to tracker, with the evidence for each."""
+def location_table(d: Diagnosis) -> ShownTable:
+    """The stages of the chain from commanded joints to tracker with the evidence for each, and the
+    likeliest places."""
     location = d.location
     if location is None:
         return ShownTable((), [])
@@ -587,36 +549,238 @@ def stage_table(d: Diagnosis) -> ShownTable:
         for stage, name in STAGES.items()
         for value in (found.get(stage, 0.0),)
     ]
-    return ShownTable(("stage", "share of the error" if shared else "probability"), rows)
+    groups = {0: "stages"}
+    if not shared:
+        groups[len(rows)] = "places"
+        order = sorted(location.places.items(), key=lambda item: -item[1])
+        rows += [(place(where), probability(p)) for where, p in order[:MOST_PLACES]]
+    heads = ("where", "share of the error" if shared else "probability")
+    return ShownTable(heads, rows, groups=groups)
 
 
-def place_probabilities(d: Diagnosis) -> ShownTable:
-    """The likeliest places, the likeliest first."""
-    found = [] if d.location is None or d.location.shares else d.location.places.items()
-    order = sorted(found, key=lambda item: -item[1])
-    rows = [(place(where), probability(p)) for where, p in order[:MOST_PLACES]]
-    return ShownTable(("place", "probability"), rows)
+# Many causes at once: findings, and their places below them.
 
 
-def extra_visits(d: Diagnosis, kinds: Sequence[str]) -> ShownTable:
-    """The extra poses in the order of measuring."""
-    if d.extra is None or d.extra.plan is None:
-        return ShownTable((), [])
-    plan = d.extra.plan
-    heads = ["order", "pose", *joint_heads(kinds), "force N"]
-    heads += ["approach"] if plan.approach is not None else []
-    heads += ["time min"] if plan.time is not None else []
-    table: list[tuple[str, ...]] = []
-    for i in range(min(len(plan), MOST_VISITS)):
-        row = [str(i + 1), printable(plan.configuration_labels[plan.configuration[i]])]
-        row += joint_texts(plan.q[i] + 0.0, kinds)
-        row.append(" ".join(significant(f) for f in plan.force[i]))
-        if plan.approach is not None:
-            row.append(" ".join("+" if a > 0 else "-" if a < 0 else "0" for a in plan.approach[i]))
-        if plan.time is not None:
-            row.append(f"{plan.time[i] / 60:.1f}")
-        table.append(tuple(row))
-    more = len(plan) - len(table)
-    return ShownTable(
-        tuple(heads), table, (), title="Poses", note=f"and {more} more" if more else ""
+@dataclass(frozen=True)
+class Cause:
+    """One finding: its share of the gap, by how much the error of new poses falls with it, and
+    what it does at each place, the largest first.  `reduction` is None for what has no name."""
+
+    name: str
+    share: float
+    share_ci90: Interval
+    reduction: float | None
+    reduction_ci90: Interval
+    parts: tuple[ComponentShare, ...]
+    named: bool = True
+
+
+def causes(d: Diagnosis) -> list[Cause]:
+    """What the gap is made of, the largest first; what has no name last, each by itself."""
+    named = [c for c in d.components if c.named]
+    rows = [
+        Cause(
+            effect_at_places(g.name, g.places), g.share, g.share_ci90,
+            g.gap_reduction, g.gap_reduction_ci90,
+            tuple(c for c in named if c.where in g.places and set(c.effects) & set(g.effects)),
+        )
+        for g in d.groups
+    ]  # fmt: skip
+    for c in d.components:
+        if not c.named:
+            name = f"{NAMELESS}, {family(c)} at {place(c.where)}"
+            none = (math.nan, math.nan)
+            rows.append(Cause(name, c.share, c.share_ci90, None, none, (c,), named=False))
+    return rows
+
+
+def family(c: ComponentShare) -> str:
+    """What an error goes with, in words."""
+    return FAMILIES.get(c.family, plain_name(c.family))
+
+
+def share_text(fraction: float, fine: bool | None = None) -> str:
+    """ "55 %", "1.6 %", "< 0.1 %"."""
+    if not math.isfinite(fraction):
+        return "–"
+    fine = abs(fraction) < FINE if fine is None else fine
+    if fine and 0 < fraction < 0.0005:
+        return "< 0.1 %"
+    digits = 1 if fine else 0
+    return f"{round(100 * fraction, digits) + 0.0:.{digits}f} %"
+
+
+def span_text(ends: Interval, middle: float) -> str:
+    """ "50 to 59 %", "1.2 to 2.0 %", as fine as what is in the `middle`."""
+    low, high = ends
+    if not (math.isfinite(low) and math.isfinite(high)):
+        return "–"
+    fine = abs(middle) < FINE
+    return f"{share_text(low, fine).removesuffix(' %')} to {share_text(high, fine)}"
+
+
+def headline_of_causes(d: Diagnosis) -> str:
+    """The largest causes with their shares, and what is left open."""
+    found = [c for c in causes(d) if c.named]
+    large = [c for k, c in enumerate(found[:MOST_IN_HEADLINE]) if k == 0 or c.share >= FINE]
+    told = [
+        f"{c.name} ({share_text(c.share)}{' of the remaining error' * (k == 0)})"
+        for k, c in enumerate(large)
+    ]
+    if more := len(found) - len(told):
+        told.append(counted(more, "smaller cause"))
+    first = d.groups[0]
+    plural = len(first.places) > 1 or first.name.endswith("errors")
+    text, several = together(told), len(found) > 1 or plural
+    if d.verdict == "explained":
+        return f"{text} explain{'s' * (not several)} the remaining error."
+    if d.verdict == "ambiguous":
+        n = len(d.indistinguishable)
+        names = "one effect" if n == 1 else f"{n} effects"
+        verb = "cause" if several else "causes"
+        return f"{text} {verb} the remaining error; these data leave {names} of it open."
+    at = places(dict.fromkeys(c.where for c in d.components if not c.named))
+    where = f" at {at}" if at else ""
+    return (
+        f"{text} cause{'s' * (not several)} part of the remaining error; an effect outside the "
+        f"catalogue acts{where}."
     )
+
+
+def cause_table(d: Diagnosis) -> ShownTable:
+    """One row per finding: its share of the gap, and what it takes off the error of new poses."""
+    rows = [
+        (
+            c.name, share_text(c.share), span_text(c.share_ci90, c.share),
+            "–" if c.reduction is None else share_text(c.reduction),
+            span_text(c.reduction_ci90, c.reduction or 0.0),
+        )
+        for c in causes(d)
+    ]  # fmt: skip
+    if d.gap.unexplained_share >= FINE**2:
+        rows.append(("unexplained", share_text(d.gap.unexplained_share), "–", "–", "–"))
+    heads = ("cause", "share", "90 %", "error falls by", "90 %")
+    return ShownTable(heads, rows, title="Causes of the remaining error", note=(
+        "share: part of the squared remaining error that goes when this is added last. error falls "
+        "by: at new poses, if only this is added to the model."
+    ))  # fmt: skip
+
+
+def place_table(d: Diagnosis) -> ShownTable:
+    """What acts at each place, below the finding that it belongs to."""
+    rows: list[tuple[str, ...]] = []
+    groups: dict[int, str] = {}
+    told: list[ComponentShare] = []
+    for cause in causes(d):
+        parts = [c for c in cause.parts if c not in told]
+        if parts:
+            groups[len(rows)] = cause.name
+        for c in parts:
+            effects = ", ".join(map(plain_name, c.effects)) if c.named else NAMELESS
+            rows.append((
+                place(c.where), family(c), effects, f"{length(c.rms)} ({lengths(c.rms_ci95)})",
+                f"{share_text(c.share)} ({span_text(c.share_ci90, c.share).removesuffix(' %')})",
+                probability(c.probability),
+            ))  # fmt: skip
+        told += parts
+    heads = ("place", "error", "as", "rms (95 %)", "share (90 %)", "probability")
+    table = ShownTable(heads, rows, (0, 1, 2), groups, title="Place by place")
+    return table.when_narrow(2)  # what it is as effects stands in the table of parameters too
+
+
+def lengths(ends: Interval) -> str:
+    """ "266 to 293 µm", "0.90 µm to 1.20 mm"."""
+    low, high = map(length, ends)
+    unit = high[high.rfind(" ") :]
+    return f"{low.removesuffix(unit)} to {high}" if low.endswith(unit) else f"{low} to {high}"
+
+
+def curve_span(curve: Curve) -> str:
+    """How far a curve goes from its lowest to its highest point."""
+    moved = max(curve.y) - min(curve.y)
+    if curve.y_unit == "m":
+        return length(moved)
+    shown, unit = display(moved, curve.y_unit)
+    return f"{significant(shown)} {unit}"
+
+
+def curve_line(d: Diagnosis) -> str:
+    """How far the error curve of each joint goes from its lowest to its highest point."""
+    told = [f"{curve_span(curve)} ({place(curve.entry)})" for curve in d.curves]
+    return f"the joints' errors against their own angles span {together(told)}." if told else ""
+
+
+def assumed_order(d: Diagnosis) -> str:
+    """That the moves between visits were taken from the order of the rows, where they matter."""
+    matters = any(c.family == "move" for c in d.components) or "approach" in d.model_keys
+    if not matters or d.calibrated is None or d.calibrated.observed.table.time is not None:
+        return ""
+    return (
+        "the last move is that from the visit before, in the order of the rows; if they were not "
+        "measured so, do not rely on effects of the last move."
+    )
+
+
+def slight_text(d: Diagnosis) -> str:
+    """What is in the model and no finding; nothing where all matters."""
+    if not d.slight:
+        return ""
+    return (
+        f"{added_text(d.slight)}: each probably moves the markers by less than a hundredth of the "
+        "remaining error. They correct the arm and are not findings."
+    )
+
+
+# Corrections that have no name.
+
+
+def field_table(d: Diagnosis) -> ShownTable:
+    """The smooth corrections without a name: where, what they follow, how large and how smooth."""
+    rows = [row for f in d.fields for row in _followed(f)]
+    heads = ("correction at", "follows", "size", "over", "error falls by", "95 %")
+    note = (
+        "Smooth functions without a physical name; they hold where the arm was measured: size "
+        "(standard deviation) and the length over which they change."
+    )
+    return ShownTable(heads, rows, (0, 1), title="Smooth corrections", note=note)
+
+
+def _followed(f: FoundEffect) -> Iterable[tuple[str, ...]]:
+    """A row for everything that a field follows; the last columns in the first row only."""
+    fall = f.gap_reduction
+    told: Sequence[str] = (share_text(fall), span_text(f.gap_reduction_ci95, fall))
+    for key, value in f.settings.items():
+        name, _, rest = key.rpartition("size")
+        if not name or rest not in ("", "_rad"):
+            continue
+        over = f.settings.get(f"{name}length{rest}", math.nan)
+        of = name.rstrip("_").partition("_")[2]
+        timed = of == "time"
+        suffix = "s" if timed else "rad"
+        yield (
+            place(f.where),
+            "the time" if timed else f"the angle of {place(of)}" if of else "its own angle",
+            _motion(f.where, value),
+            setting_value(f"over_{suffix}", over) if math.isfinite(over) else "–",
+            *told,
+        )
+        told = ("", "")
+
+
+def _motion(where: str, size: float) -> str:
+    """A size that is m and rad, or one of them, by the place that moves."""
+    if where.startswith("joint"):
+        return f"{significant(size * 1e3, 2)} mrad"
+    if where.startswith("marker:"):
+        return f"{significant(size * 1e3, 2)} mm"
+    return f"{significant(size * 1e3, 2)} mm, mrad"
+
+
+def added_text(found: Sequence[FoundEffect]) -> str:
+    """What a written cell has more, by effect: "gear_ripple:joint1", or many of them in short."""
+    if len(found) <= 2 * MOST_IN_HEADLINE:
+        return ", ".join(f"{f.effect}:{f.where}" for f in found)
+    at: dict[str, list[str]] = {}
+    for f in found:
+        at.setdefault(f.effect, []).append(f.where)
+    return ", ".join(f"{printable(name)} ({places(where)})" for name, where in at.items())

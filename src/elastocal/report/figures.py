@@ -187,6 +187,7 @@ LONGEST = 25  # letters of a name, which has two lines at most
 # Lengths that span more than this are drawn on a logarithmic axis.
 WIDE_RANGE = 8.0
 DENSE = 25.0  # below which three ticks a decade have room
+NO_ENDS = (math.nan, math.nan)
 
 
 def rows_of_dots(

@@ -9,6 +9,7 @@ from typing import TYPE_CHECKING, Any
 
 from elastocal.report.blocks import Sentence, ShownTable
 from elastocal.text import printable
+from elastocal.units import Array
 
 if TYPE_CHECKING:
     from elastocal.planning.plan import Plan
@@ -113,6 +114,23 @@ def length(metres: float) -> str:
     if abs(metres) < 0.9995:
         return f"{significant(metres * 1e3)} mm"
     return f"{significant(metres)} m"
+
+
+def newtons(force: Iterable[float]) -> str:
+    """ "(0, 0, -2600) N"."""
+    return f"({', '.join(f'{v + 0.0:g}' for v in force)}) N"
+
+
+def load_text(force: Iterable[float]) -> str:
+    return newtons(force) if any(force) else "unloaded"
+
+
+def loads_text(forces: Array, one: str, several: str) -> str:
+    """Forces in the words for `one` of them, or for their number and how large they are."""
+    if len(forces) == 1:
+        return one.format(newtons(forces[0]))
+    sizes = [math.hypot(*force) for force in forces]
+    return f"{several.format(len(sizes))}, {min(sizes):.4g} to {max(sizes):.4g} N"
 
 
 def _end(value: float, half: float) -> str:

@@ -107,12 +107,12 @@ def _curve(plan: Plan) -> Iterator[Block]:
 
 def _next_figures(found: NextPoses) -> Iterator[Figure]:
     """The error before and after the batch."""
-    from elastocal.report.figures import rows_of_dots
+    from elastocal.report.figures import NO_ENDS, rows_of_dots
 
-    g, no_ends = found.gain, (math.nan, math.nan)
+    g = found.gain
     names = ("measured so far", "with this batch")
     rows = [
-        (f"{name}{model}", value * 1e6, no_ends, length(value))
+        (f"{name}{model}", value * 1e6, NO_ENDS, length(value))
         for model, values in (("", (g.before, g.after)),
                               (", if the model is right", (g.model_before, g.model_after)))
         for name, value in zip(names, values, strict=True) if math.isfinite(value)

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable
+from collections.abc import Callable, Iterable
 from io import StringIO
 from typing import TYPE_CHECKING, Any, cast
 
@@ -36,7 +36,7 @@ PRINTED_WIDTH = 100  # columns of a result as plain text
 def report_of(result: object, certificate: bool = False, **told: Any) -> Report:
     """What is to be said of a result.  Each kind has its module, which no other result loads.
 
-    TypeError for a kind without a report.
+    KeyError for a kind without a report.
     """
     kind, fit = type(result).__name__, cast(Any, result)
     if certificate:
@@ -51,19 +51,18 @@ def report_of(result: object, certificate: bool = False, **told: Any) -> Report:
         from elastocal.report.diagnosis_view import diagnosis_report
 
         return diagnosis_report(fit)
-    if kind == "Comparison":
-        from elastocal.report.changes_view import changes_report
-
-        return changes_report(fit)
     if kind in ("Plan", "NextPoses"):
         from elastocal.report.plan_view import next_report, plan_report
 
         return plan_report(fit) if kind == "Plan" else next_report(fit)
-    if kind in ("Compensation", "Measurements"):
-        from elastocal.report.compensation_view import compensation_report, readings_report
+    from elastocal.report import smaller_views
 
-        return compensation_report(fit) if kind == "Compensation" else readings_report(fit)
-    raise TypeError(kind)
+    views: dict[str, Callable[[Any], Report]] = {
+        "Comparison": smaller_views.changes_report,
+        "Compensation": smaller_views.compensation_report,
+        "Measurements": smaller_views.readings_report,
+    }
+    return views[kind](fit)
 
 
 def print_report(console: Console, result: object, details: bool = True, **told: Any) -> None:

@@ -1,0 +1,453 @@
+"""What a comparison, commands, readings, an export and an import say, as blocks."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Sequence
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+
+from elastocal.report.blocks import (
+    WARNING,
+    Block,
+    Figure,
+    Fold,
+    Heading,
+    KeyFigures,
+    Lines,
+    Report,
+    Sentence,
+    ShownTable,
+    ShownVerdict,
+)
+from elastocal.report.formatting import (
+    counted,
+    estimate,
+    length,
+    load_text,
+    loads_text,
+    title_of,
+)
+from elastocal.text import listed, printable
+
+if TYPE_CHECKING:
+    from elastocal.compensation.compensate import Compensation
+    from elastocal.diagnosis.changes import Comparison
+    from elastocal.export.export import Exported
+    from elastocal.export.refit import Refit
+    from elastocal.importing.assemble import Imported
+    from elastocal.measurements import Measurements
+
+NAMED = 3  # parameters in a headline
+MOST_DRAWN = 20  # parameters
+MOST_ROWS = 40  # drawn, and shown of tables
+
+
+def changes_report(c: Comparison) -> Report:
+    """Two calibrations of one arm: has it changed, how far does the tool move, and by what."""
+    model = c.old.model
+    title = title_of(model.chain.name, model.cell.name)
+    return Report("Comparison", title, _changes(c), model.backend_report())
+
+
+def _changes(c: Comparison) -> Iterator[Block]:
+    from elastocal.report.effect_names import size_of
+
+    rms, noise = (length(float(np.sqrt(np.mean(v**2)))) for v in (c.distance, c.chance))
+    most = length(float(c.distance.max()))
+    figures = [
+        ("the tool has moved, rms", rms), ("at most", most), ("noise alone", noise),
+        ("all parameters together", size_of(c.p)),
+    ]  # fmt: skip
+    yield Fold("", lambda: [KeyFigures(f"moved by {rms} (noise {noise})", figures)])
+    same = c.verdict == "no_change_shown" and not c.one_result
+    yield ShownVerdict("good" if same else "warn", _changed(c))
+    moved = (
+        f"Moved by {rms} rms for the same commands, {most} at most, at {len(c.distance)} random "
+        f"poses within the joint limits {_under(c)}; noise alone gives {noise} rms."
+    )
+    chance = (
+        f"All {len(c.changes)} parameters together: {size_of(c.p)}. Each alone by Holm's rule: if "
+        f"nothing has changed, the probability of any finding is {c.level:g} at most."
+    )
+    compared = [
+        "The arm itself. Base and markers are set up anew each time: a change that a motion of the "
+        "base or the markers also explains is not seen."
+    ]
+    if c.first_order:
+        compared.append(
+            "The sessions determined other parameters; the new ones are given in those of the old, "
+            "to first order."
+        )
+    steps = [
+        "Use the new calibration (elastocal compensate, elastocal export).",
+        "Look for the cause at the joints and links named. A missing effect can look like a change "
+        "if poses or loads differ (elastocal diagnose with the new data).",
+    ]
+    if c.one_result:
+        steps = ["Give the results of two sessions: this is one of them and its copy."]
+    elif same:
+        steps = ["Nothing: the old calibration still holds within the noise of both sessions."]
+    yield Lines([
+        ("Tool", moved), ("Chance", chance), *(("Compared", text) for text in compared),
+        *(("Next", step) for step in steps),
+    ])  # fmt: skip
+    yield Fold("", lambda: [_moves(c)], figures=("moved",))
+    yield _change_table(c)
+
+
+def _changed(c: Comparison) -> str:
+    """The verdict in a sentence."""
+    if c.one_result:
+        return (
+            f"Nothing is compared: {printable(c.old.source)} and {printable(c.new.source)} are the "
+            "same result, equal to the last digit."
+        )
+    if c.changed:
+        names = ", ".join(printable(change.name) for change in c.changed[:NAMED])
+        more = f" and {len(c.changed) - NAMED} more" if len(c.changed) > NAMED else ""
+        return f"The arm has changed: {names}{more}."
+    if c.verdict == "no_change_shown":
+        return "No significant change: the differences are within the noise."
+    return "The arm has changed, but no single parameter is significant."
+
+
+OF_LOADS = {
+    "": "as no load is stated",
+    "the option": "as asked for",
+    "the earlier campaign": "those of the earlier session",
+    "the later campaign": "those of the later session",
+    "the cell's plan": "those of the cell's plan",
+}
+
+
+def _under(c: Comparison) -> str:
+    """Under which loads the tool was compared, and whose they are."""
+    return f"under {loads_text(c.forces, '{}', '{} loads in turn')}, {OF_LOADS[c.loads_of]}"
+
+
+def _change_table(c: Comparison) -> ShownTable:
+    """A row for each parameter, the changed first, then by their effect at the tool."""
+    from elastocal.report.effect_names import p_value
+
+    heads = ("parameter", "old", "new", "change", "± std", "unit", "p (Holm)", "moves the tool", "")
+    rows = []
+    for one in sorted(c.changes, key=lambda x: (not x.changed, -x.moves)):
+        value, half, unit = estimate(one.change, one.std, one.unit)
+        old, new = (estimate(v, one.std, one.unit)[0] for v in (one.old, one.new))
+        told = "changed" if one.changed else ""
+        with_others = f" (with {listed(one.combined_with, 3)})" if one.combined_with else ""
+        rows.append(
+            (printable(one.name + with_others), old, new, value, half, unit, p_value(one.p_family),
+             length(one.moves), told)
+        )  # fmt: skip
+    note = (
+        "± std: standard deviation of the difference, of both sessions together. p (Holm): chance "
+        "of such a difference where nothing has changed, corrected for all parameters. Moves the "
+        "tool: rms over the poses, by this change alone."
+    )
+    table = ShownTable(heads, rows, (0, 5, 8), title="Parameter by parameter", note=note)
+    return table.when_narrow(1, 2)
+
+
+def _moves(c: Comparison) -> Figure:
+    """How far the tool moves by each change alone, the largest first."""
+    from elastocal.report.figures import NO_ENDS, rows_of_dots
+
+    most = sorted(c.changes, key=lambda change: -change.moves)[:MOST_DRAWN]
+    rows = [(one.name, one.moves * 1e6, NO_ENDS, length(one.moves)) for one in most]
+    noise = ("all by noise alone", 1e6 * float(np.sqrt(np.mean(c.chance**2))))
+    caption = "The largest changes by what each alone moves the tool, rms over the poses."
+    title = "How far each change moves the tool"
+    return rows_of_dots("moved", title, rows, "tool moved, rms", caption, noise, lengths=True)
+
+
+# Commands
+
+
+def compensation_report(c: Compensation) -> Report:
+    """Commands for targets: the predicted errors, the commands, what is not reached."""
+    return Report("Compensation", printable(c.chain.name), _compensated(c))
+
+
+def _compensated(c: Compensation) -> Iterator[Block]:
+    from elastocal.compensation.compensate import summary
+
+    yield from compensation_blocks({"commands": summary(c, c.chain.kinds, commands=False)})
+    yield Fold("", lambda: [_errors(c)], figures=("errors",))
+    yield Fold("Commands", lambda: [_commands(c)])
+
+
+def compensation_blocks(content: dict[str, Any]) -> Iterator[Block]:
+    """Errors before and after, uncertainty and warnings.
+
+    `content`: the summary of the `commands`, that of the correction `table`, or both.
+    """
+    commands, table = content.get("commands"), content.get("table")
+    if commands is not None:
+        rows = {
+            "nominal command": commands["error_before_um"],
+            "new command": commands["error_after_um"],
+            "standard uncertainty": commands["std_um"],
+            "within, at 95 %": commands["within95_um"],
+        }
+        yield _spreads("Position of the tool, predicted", rows)
+        for k, command in enumerate(commands.get("commands", ())):
+            joints = ", ".join(f"{n} {v:.6f}" for n, v in command.items() if n != "status")
+            yield Sentence(f"target {k + 1}: {joints or command['status']}")
+        yield Sentence(
+            f"{commands['reached']} of {commands['n']} targets reached by the {commands['point']}; "
+            f"targets in the {commands['frame']} frame."
+        )
+        yield Lines([(WARNING, text) for text in commands["warnings"]])
+    if table is not None:
+        rows = {"without the table": table["error_without_um"]}
+        rows["with it, interpolated"] = table["error_with_um"]
+        yield _spreads(
+            f"Position of the tool at {table['checked_between']} points between the grid's", rows
+        )
+        yield Sentence(
+            f"{table['points']} grid points: {table['exact']} exact, {table['first_order']} of "
+            "first order (beside singular postures or limits)."
+        )
+
+
+def _spreads(title: str, rows: dict[str, dict[str, Any]]) -> ShownTable:
+    def shown(um: float | None) -> str:
+        if um is None:
+            return "–"
+        return "< 0.01 µm" if um < 0.01 else length(um * 1e-6)
+
+    cells = [(name, *map(shown, values.values())) for name, values in rows.items()]
+    return ShownTable(("", "rms", "95 %", "max"), cells, title=title)
+
+
+def _commands(c: Compensation) -> ShownTable:
+    from elastocal.compensation.compensate import in_file_units, joint_columns
+
+    table, kinds = c.targets.table, c.chain.kinds
+    q, std = in_file_units(c.q, kinds), c.uncertainty.std * 1e6
+    rows = []
+    for i, status in enumerate(c.status[:MOST_ROWS]):
+        numbers = [f"{v:.4f}" if np.isfinite(v) else "–" for v in q[i]]
+        sure = f"{std[i]:.2f}" if np.isfinite(std[i]) else "–"
+        name = table.configuration_labels[table.configuration[i]]
+        rows.append((printable(name), *numbers, sure, printable(status)))
+    heads = ("configuration", *joint_columns(kinds), "std_um", "status")
+    more = len(c.status) - len(rows)
+    note = f"and {more} more in the file of commands" if more else ""
+    return ShownTable(heads, rows, (0, len(heads) - 1), note=note)
+
+
+def _errors(c: Compensation) -> Figure:
+    from elastocal.report.figures import NO_ENDS, rows_of_dots
+
+    table = c.targets.table
+    rows = [
+        (table.configuration_labels[table.configuration[i]], float(c.before[i]) * 1e6, NO_ENDS, "")
+        for i in np.flatnonzero(c.reached)[:MOST_ROWS]
+    ]
+    axis = "error at the nominal command"
+    return rows_of_dots("errors", f"Targets: {axis}", rows, axis, lengths=True)
+
+
+# Readings
+
+
+def readings_report(table: Measurements) -> Report:
+    """What a table has of each column: labels are counted, numbers from least to largest."""
+    return Report("Readings", printable(table.source), _of_readings(table))
+
+
+def _of_readings(table: Measurements) -> Iterator[Block]:
+    rows = [
+        (printable(name), str(len(np.unique(values.astype(str)))), "", "")
+        if values.dtype == object
+        else (name, str(len(np.unique(values))), f"{values.min():.6g}", f"{values.max():.6g}")
+        for name, values in table.columns().items() if len(values)
+    ]  # fmt: skip
+    heads = ("column", "different", "least", "largest")
+    yield ShownTable(heads, rows, title=f"{len(table)} rows of {printable(table.source)}")
+    yield Fold("", lambda: [_joints(table)], figures=("joints",))
+
+
+def _joints(table: Measurements) -> Figure:
+    """Where each joint stood: the middle of its values, and from end to end."""
+    from elastocal.compensation.compensate import in_file_units, joint_columns
+    from elastocal.report.figures import rows_of_dots
+
+    q = in_file_units(table.q, table.kinds)
+    low, high = (f(axis=0) if len(q) else np.zeros(q.shape[1]) for f in (q.min, q.max))
+    rows = [
+        (name, (a + b) / 2, (a, b), "")
+        for name, a, b in zip(joint_columns(table.kinds), low.tolist(), high.tolist(), strict=True)
+    ]
+    axis = "middle and ends of the values, in ° or mm"
+    return rows_of_dots("joints", "Where each joint stood", rows, axis)
+
+
+# The calibrated arm in a file
+
+WORTH_TELLING = 10e-6  # m, as for what compensate leaves open
+# At the start of a sentence and in a title.
+FORMATS = {
+    "urdf": ("The URDF", "a URDF"),
+    "mjcf": ("The MJCF", "this MJCF"),
+    **dict.fromkeys(("dh", "mdh"), ("The DH table", "a DH table")),
+    **dict.fromkeys(("yaml", "json", "corrections"), ("Geometry alone", "geometry alone")),
+}
+
+
+def export_blocks(done: Exported) -> Iterator[Block]:
+    """What the file holds and what not."""
+
+    def rounding(metres: float) -> str:  # what is below a nanometre is no number to read
+        return "< 0.001 µm" if metres < 1e-9 else length(metres)
+
+    cost, (name, in_title) = done.cost, FORMATS[done.format]
+    if cost.effects:
+        every = [(e.effect.replace("_", " "), e.difference, e.note) for e in cost.effects]
+        rows = []
+        for effect, d, note in [*every, ("all of it", cost.total, "")]:
+            sizes = () if d is None else (d.marker_rms, d.marker_max, d.flange_rms, d.flange_max)
+            rows.append((effect, *([length(size) for size in sizes] or [""] * 4), note))
+        heads = ("effect", "markers rms", "max", "flange rms", "max", "")
+        yield ShownTable(heads, rows, (0, 5), title=f"What {in_title} cannot hold")
+        yield Sentence(
+            f"Costs: differences from the calibrated model at {cost.poses} random poses within the "
+            f"joint {'ranges measured' if cost.measured else 'limits'} under "
+            f"{loads_text(cost.forces, 'a load of {}', 'the {} loads measured')}, each effect left "
+            "out alone."
+        )
+    else:
+        yield Sentence(f"{name} holds all of the calibrated model.")
+    if done.refit is not None:
+        yield Sentence(_fit(done.refit))
+    if done.checked is not None:
+        yield Sentence(f"Read back with {done.checked_with}: {rounding(done.checked)} at most.")
+    if done.without_beta is not None:
+        yield Sentence(f"Without the column beta_rad: {rounding(done.without_beta)} at most.")
+    if held := list(done.held):
+        more = f" and {len(held) - 8} more" if len(held) > 8 else ""
+        yield Sentence(
+            "Not determined by the data, at the values that the identification predicts with: "
+            f"{', '.join(held[:8])}{more}."
+        )
+    if done.of_the_measurement:
+        left = ", ".join(done.of_the_measurement)
+        yield Sentence(f"Left out, effects of the measurement: {left}.")
+    for warning in done.warnings:
+        yield Sentence(f"Note: {warning}.")
+    if cost.total.marker_rms > WORTH_TELLING:
+        yield Sentence(
+            "Next: if that matters, elastocal compensate corrects it with the same cell and result."
+        )
+
+
+def _fit(refit: Refit) -> str:
+    """How far the file is from the arm."""
+    told = f"the markers are {length(refit.after)} rms off"
+    if refit.correction is not None:
+        told = f"{told}, with its joint correction {length(refit.correction)}"
+    if refit.taken or refit.correction is not None:
+        told = (
+            f"Refitted to the calibrated arm at {refit.visits} measured visits: "
+            f"{told}, with the values identified {length(refit.before)}"
+        )
+    else:
+        told = f"Values as identified; no refit is better: {told}"
+    worse = "" if refit.after < refit.nominal else "; it is worse than the nominal file"
+    return f"{told}, the nominal file with base and tool placed {length(refit.nominal)}{worse}."
+
+
+# What an import understood
+
+FIRST_ROWS = 5
+MOST_COLUMNS = 14  # of the first rows, on a wide terminal
+ROLES = {"points": "points", "joints": "joint values", "both": "points and joint values"}
+
+
+def left_out(found: Imported) -> list[str]:
+    """What is not in the table, in lines: rows passed over, and what found no partner."""
+    lines = []
+    for observed in found.understood:
+        if n := len(observed.ignored):
+            rows = listed((f"line {line} ({reason})" for line, reason in observed.ignored), 8)
+            lines.append(f"{observed.path}: passed over {counted(n, 'line')}: {rows}")
+    if (joined := found.joined) is not None:
+        for told, names in (("left out, without joint values: %d points", joined.left_out),
+                            ("poses without a point: %d", joined.unused)):  # fmt: skip
+            lines += [f"{told % len(names)}: {listed(names, 12)}"] if names else []
+    return lines
+
+
+def import_blocks(found: Imported, width: int) -> Iterator[Block]:
+    """Files and their columns, the first rows, ranges, counts, what was left out, warnings.
+
+    `width`: columns of letters that there is room for.
+    """
+    for seen in found.understood:
+        preset = f"preset {seen.preset}, " if seen.preset else ""
+        decimals = ", decimal commas" if seen.decimal == "," else ""
+        yield Heading(
+            f"{seen.path}: {counted(seen.rows, 'row')} of {ROLES[seen.role]} "
+            f"({preset}{seen.encoding}, {seen.layout}{decimals})"
+        )
+        rows = [(name, column, unit or "–") for name, column, unit in seen.columns]
+        yield ShownTable(("in the file", "read as", "unit"), rows, (0, 1, 2))
+        yield Lines([("Not used", listed(seen.unused, 20))] if seen.unused else [])
+    columns = found.assembled.columns
+    most = max(4, min(MOST_COLUMNS, width // 10))
+    shown = [name for name in columns if name != "note_source"][:most]
+    rest = len(columns) - len(shown)
+    words = tuple(k for k, n in enumerate(shown) if not isinstance(columns[n], np.ndarray))
+    cells = [
+        tuple(_cell(columns[n], i) for n in shown)
+        for i in range(min(FIRST_ROWS, len(found.assembled)))
+    ]
+    title = "The first rows of the table" + (f", {rest} more columns" if rest else "")
+    yield ShownTable(tuple(shown), cells, words, title=title)
+    ranges = [
+        (name, f"{values.min():.6g}", f"{values.max():.6g}")
+        for name, values in columns.items()
+        if isinstance(values, np.ndarray) and name != "repeat"
+    ]
+    yield ShownTable(("column", "least", "largest"), ranges, title="Ranges")
+    yield Lines([
+        *_counts(found),
+        *(("Left out", text) for text in left_out(found)),
+        *((WARNING, text) for text in found.warnings),
+    ])  # fmt: skip
+
+
+def _cell(values: Sequence[str] | np.ndarray, i: int) -> str:
+    if not isinstance(values, np.ndarray):
+        return printable(values[i])
+    return f"{values[i]:d}" if values.dtype.kind == "i" else f"{values[i]:.6g}"
+
+
+def _counts(found: Imported) -> Iterator[tuple[str, str]]:
+    table, joined = found.table, found.joined
+    alike = np.column_stack([table.configuration, table.marker, table.force])
+    repeats = np.unique(alike, axis=0, return_counts=True)[1]
+    span = " to ".join(dict.fromkeys((str(repeats.min()), str(repeats.max()))))
+    poses = counted(len(table.configuration_labels), "configuration")
+    yield (
+        "Table",
+        (f"{counted(len(table), 'reading')} of {poses}, {span} per configuration, marker and load"),
+    )
+    yield "Markers", listed(table.marker_names, 20)
+    forces, sizes = np.unique(table.force, axis=0, return_counts=True)
+    loads = [
+        f"{load_text(force)}: {counted(int(n), 'reading')}"
+        for force, n in zip(forces, sizes, strict=True)
+    ]
+    yield "Loads", "; ".join(loads[:8] + [f"{len(loads) - 8} more"] * (len(loads) > 8))
+    if joined is not None:
+        remarks = [r for r in joined.remarks if not r.startswith("WARNING: ")]
+        yield "Joined", "; ".join([f"by {joined.how}", *remarks])
+    if table.time is not None:
+        yield "Time", f"{table.time.max():.6g} s from the first reading to the last"
+    if found.fit is not None:
+        error = f"{found.fit.error * 1e3:.3g} mm"
+        yield "Nominal arm", f"readings fit it to {error} (median, base and markers fitted)"
