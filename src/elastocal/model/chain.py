@@ -5,7 +5,7 @@ from __future__ import annotations
 import math
 import re
 from collections.abc import Callable, Mapping
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, replace
 from typing import Literal, TypeVar
 
 import numpy as np
@@ -47,7 +47,7 @@ class LinkMass:
     com: Array
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, eq=False)
 class Chain:
     """A serial chain base → joint 1 → … → joint n → flange.
 
@@ -60,8 +60,8 @@ class Chain:
     name: str
     joints: tuple[Joint, ...]
     flange_placement: Array
-    masses: tuple[LinkMass, ...] = field(default=())
-    notes: tuple[str, ...] = field(default=(), compare=False)
+    masses: tuple[LinkMass, ...] = ()
+    notes: tuple[str, ...] = ()
 
     @property
     def n_joints(self) -> int:

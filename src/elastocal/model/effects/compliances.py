@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable
+from typing import ClassVar
 
 import casadi as ca
 import numpy as np
@@ -187,7 +188,38 @@ class JointHardening(TorqueEffect):
         add_deflection(arm, index(place), f"{place}.hardening", lambda tau: k3 * tau**3)
 
 
-class OffAxisCompliance(LoadedEffect):
+class TiltingEffect(LoadedEffect):
+    """θ = k M about axes of a place, M the load's moments there; k in rad/(N m).
+
+    Typical: a `share` of the compliance of the joint that is, moves or stands at the place.
+    """
+
+    stage = "compliance"
+    elastic = True
+    formats = ("elastic",)
+    prefix: ClassVar[str] = ""  # of the parameters' keys, before the name of the axis
+    share: ClassVar[float]
+
+    def axes(self, place: str, chain: Chain) -> dict[str, Array]:
+        """Name → unit axis (3,) in the frame of the place."""
+        raise NotImplementedError
+
+    def parameters(self, place: str, chain: Chain, cell: Cell) -> tuple[ParameterSpec, ...]:
+        given, i = nominal_compliance(chain, cell), 0 if place == "base" else index(place)
+        known = given is not None and chain.kinds[i] == "revolute"
+        typical = self.share * given[i] or None if given and known else None
+        return tuple(
+            ParameterSpec(self.prefix + key, "rad/(N*m)", 0.0, typical, lower=0.0)
+            for key in sorted(self.axes(place, chain))
+        )
+
+    def shape(self, arm: Arm, place: str, p: Symbols) -> None:
+        for key, axis in self.axes(place, arm.chain).items():
+            k = p[self.prefix + key]
+            arm.add_spring(Spring.linear(f"{place}.{key}", place, "revolute", axis, k))
+
+
+class OffAxisCompliance(TiltingEffect):
     """Tilt of the joint about its two transverse axes, θ_x = k_x M_x and θ_y = k_y M_y.
 
     M_x, M_y are the transverse moments of the load at the joint; the axes are fixed to the
@@ -195,43 +227,17 @@ class OffAxisCompliance(LoadedEffect):
     """
 
     name = "off_axis_compliance"
-    stage = "compliance"
     at = "joints"
-    elastic = True
     sized_by_value = True
     rank = STIFFNESS
-    formats = ("elastic",)
+    prefix = "off_axis_compliance_"
+    share = 0.2
 
-    def parameters(self, place: str, chain: Chain, cell: Cell) -> tuple[ParameterSpec, ...]:
-        given = nominal_compliance(chain, cell)
-        typical = 0.2 * given[index(place)] if given else None
-        return tuple(
-            ParameterSpec(f"off_axis_compliance_{a}", "rad/(N*m)", 0.0, typical, lower=0.0)
-            for a in "xy"
-        )
-
-    def shape(self, arm: Arm, place: str, p: Symbols) -> None:
-        axes = transverse_axes(arm.chain.joints[index(place)].axis)
-        for name, axis in zip("xy", axes, strict=True):
-            k = p[f"off_axis_compliance_{name}"]
-            arm.add_spring(Spring.linear(f"{place}.{name}", place, "revolute", axis, k))
+    def axes(self, place: str, chain: Chain) -> dict[str, Array]:
+        return dict(zip("xy", transverse_axes(chain.joints[index(place)].axis), strict=True))
 
 
-def link_axes(chain: Chain, i: int) -> dict[str, Array]:
-    """Unit axes (3,) of link i's (0-based) torsion and bending, in the frame at its distal end.
-
-    Torsion is about the line from the link's joint frame to its distal frame, or about the
-    joint's axis where the link has no length.
-    """
-    T = link_ends(chain)[i]
-    length = np.linalg.norm(T[:3, 3])
-    along = T[:3, 3] / length if length > SHORTEST else chain.joints[i].axis
-    along = T[:3, :3].T @ along
-    y, z = transverse_axes(along)
-    return {"torsion": along, "bending_y": y, "bending_z": z}
-
-
-class LinkBending(LoadedEffect):
+class LinkBending(TiltingEffect):
     """θ = k M at the link's distal end: bending about two transverse axes, torsion about its own.
 
     M are the load's moments there, about axes fixed to the link; k in rad/(N m).  For a uniform
@@ -242,29 +248,21 @@ class LinkBending(LoadedEffect):
     """
 
     name = "link_bending"
-    stage = "compliance"
     at = "links"
-    elastic = True
-    formats = ("elastic",)
+    share = 0.15
 
-    def parameters(self, place: str, chain: Chain, cell: Cell) -> tuple[ParameterSpec, ...]:
-        given = nominal_compliance(chain, cell)
-        turning = given is not None and chain.kinds[index(place)] == "revolute"
-        typical = 0.15 * given[index(place)] or None if given and turning else None
-        return tuple(
-            ParameterSpec(key, "rad/(N*m)", 0.0, typical, lower=0.0)
-            for key in ("bending_y", "bending_z", "torsion")
-        )
-
-    def shape(self, arm: Arm, place: str, p: Symbols) -> None:
-        for key, axis in link_axes(arm.chain, index(place)).items():
-            arm.add_spring(Spring.linear(f"{place}.{key}", place, "revolute", axis, p[key]))
+    def axes(self, place: str, chain: Chain) -> dict[str, Array]:
+        """In the frame at the distal end; torsion about the line there from the joint's frame, or
+        about the joint's axis where the link has no length."""
+        T = link_ends(chain)[index(place)]
+        length = np.linalg.norm(T[:3, 3])
+        along = T[:3, 3] / length if length > SHORTEST else chain.joints[index(place)].axis
+        along = T[:3, :3].T @ along
+        y, z = transverse_axes(along)
+        return {"torsion": along, "bending_y": y, "bending_z": z}
 
 
-AXES = {"x": (1.0, 0.0, 0.0), "y": (0.0, 1.0, 0.0)}
-
-
-class BaseCompliance(LoadedEffect):
+class BaseCompliance(TiltingEffect):
     """Tilt of the base about its x and y axes, θ = k M, M the load's moment at the base origin.
 
     Pedestals, anchor bolts and floors give way under the overturning moment; k in rad/(N m).
@@ -272,31 +270,47 @@ class BaseCompliance(LoadedEffect):
     """
 
     name = "base_compliance"
-    stage = "compliance"
     at = "base"
-    elastic = True
     sized_by_value = True
     rank = STIFFNESS
-    formats = ("elastic",)
+    prefix = "tilt_compliance_"
+    share = 0.1
 
-    def parameters(self, place: str, chain: Chain, cell: Cell) -> tuple[ParameterSpec, ...]:
-        given = nominal_compliance(chain, cell)
-        typical = 0.1 * given[0] or None if given and chain.kinds[0] == "revolute" else None
-        return tuple(
-            ParameterSpec(f"tilt_compliance_{a}", "rad/(N*m)", 0.0, typical, lower=0.0)
-            for a in AXES
-        )
-
-    def shape(self, arm: Arm, place: str, p: Symbols) -> None:
-        for name, axis in AXES.items():
-            k = p[f"tilt_compliance_{name}"]
-            arm.add_spring(Spring.linear(f"base.{name}", "base", "revolute", axis, k))
+    def axes(self, place: str, chain: Chain) -> dict[str, Array]:
+        return {"x": np.eye(3)[0], "y": np.eye(3)[1]}
 
 
 # Couplings of joints by the torques that drive them.
 
 
-class TorqueCoupling(DrivenEffect):
+class TorqueDriven(DrivenEffect):
+    """u = Σ_i k_i τ_i a_i with the recorded torques τ_i of some joints, along given a_i."""
+
+    together = True
+    family = "torque"
+    needs = ("torque",)
+    prefix: ClassVar[str]  # of the parameters' keys
+
+    def ways(self, place: str, chain: Chain) -> dict[str, tuple[int, Array]]:
+        """What ends a parameter's key → index of the joint and direction a (entry.size,)."""
+        raise NotImplementedError
+
+    def parameters(self, place: str, chain: Chain, cell: Cell) -> tuple[ParameterSpec, ...]:
+        size = self.stated(place, chain, cell)[self.sized_by]
+        unit = motion_unit(place, chain) if place.startswith("joint") else "rad"
+        return tuple(
+            ParameterSpec(f"{self.prefix}_{key}", f"{unit}/(N*m)", 0.0, size, shrunk=True)
+            for key in self.ways(place, chain)
+        )
+
+    def drive(self, arm: Arm, place: str, p: Symbols) -> ca.SX:
+        torque, u = arm.input("torque", arm.chain.n_joints), ca.SX.zeros(self.entry.size)
+        for key, (joint, way) in self.ways(place, arm.chain).items():
+            u += p[f"{self.prefix}_{key}"] * torque[joint] * rigid.constant(way)
+        return u
+
+
+class TorqueCoupling(TorqueDriven):
     """δq_j = Σ_{i≠j} k_i τ_i with the recorded torques τ_i of the other joints; k_i in rad/(N m).
 
     Housings and bearings that two drives share, wrists with concentric shafts.  Setting: the
@@ -307,40 +321,15 @@ class TorqueCoupling(DrivenEffect):
     stage = "transmission"
     at = "joints"
     constants = (Setting("coupling_rad_per_Nm", "range", 3e-7, 1e-15, 1.0),)
-    together = True
-    family = "torque"
     sized_by = "coupling_rad_per_Nm"
-    needs = ("torque",)
+    prefix = "coupling"
     entry = JointMotion()
 
-    def parameters(self, place: str, chain: Chain, cell: Cell) -> tuple[ParameterSpec, ...]:
-        size = self.stated(place, chain, cell)[self.sized_by]
-        unit = motion_unit(place, chain)
-        return tuple(
-            ParameterSpec(f"coupling_{other}", f"{unit}/(N*m)", 0.0, size, shrunk=True)
-            for other in turning_joints(chain)
-            if other != place
-        )
-
-    def drive(self, arm: Arm, place: str, p: Symbols) -> ca.SX:
-        torque = arm.input("torque", arm.chain.n_joints)
-        others = (other for other in turning_joints(arm.chain) if other != place)
-        return sum((p[f"coupling_{i}"] * torque[index(i)] for i in others), ca.SX(0))
+    def ways(self, place: str, chain: Chain) -> dict[str, tuple[int, Array]]:
+        return {i: (index(i), np.ones(1)) for i in turning_joints(chain) if i != place}
 
 
-def tilt_axes(chain: Chain, i: int) -> dict[str, tuple[int, Array]]:
-    """Axes (3,) across that of a revolute joint at either end of link i (0-based), in the frame
-    at its distal end, with the joint's index."""
-    axes: dict[str, tuple[int, Array]] = {}
-    ends = {"own": (i, link_ends(chain)[i][:3, :3].T), "next": (i + 1, np.eye(3))}
-    for end, (joint, R) in ends.items():
-        if joint < chain.n_joints and chain.kinds[joint] == "revolute":
-            across = transverse_axes(chain.joints[joint].axis)
-            axes |= {f"{end}_{k}": (joint, R @ a) for k, a in zip("xy", across, strict=True)}
-    return axes
-
-
-class TorqueTilt(DrivenEffect):
+class TorqueTilt(TorqueDriven):
     """The link's end turns by k τ about axes across the joints at its ends; k in rad/(N m).
 
     τ is the recorded torque of the link's own joint (`own`) and of the next one (`next`), the
@@ -351,24 +340,20 @@ class TorqueTilt(DrivenEffect):
     name = "torque_tilt"
     stage = "geometry"
     constants = (Setting("tilt_rad_per_Nm", "range", 3e-7, 1e-15, 1.0),)
-    together = True
-    family = "torque"
     sized_by = "tilt_rad_per_Nm"
-    needs = ("torque",)
+    prefix = "tilt"
     entry = LinkFrame()
 
     def places(self, chain: Chain, cell: Cell) -> tuple[str, ...]:
-        return tuple(link for link in links(chain) if tilt_axes(chain, index(link)))
+        return tuple(link for link in links(chain) if self.ways(link, chain))
 
-    def parameters(self, place: str, chain: Chain, cell: Cell) -> tuple[ParameterSpec, ...]:
-        size = self.stated(place, chain, cell)[self.sized_by]
-        return tuple(
-            ParameterSpec(f"tilt_{key}", "rad/(N*m)", 0.0, size, shrunk=True)
-            for key in tilt_axes(chain, index(place))
-        )
-
-    def drive(self, arm: Arm, place: str, p: Symbols) -> ca.SX:
-        torque, turn = arm.input("torque", arm.chain.n_joints), ca.SX.zeros(3)
-        for key, (joint, axis) in tilt_axes(arm.chain, index(place)).items():
-            turn += p[f"tilt_{key}"] * torque[joint] * rigid.constant(axis)
-        return ca.vertcat(ca.SX.zeros(3), turn)
+    def ways(self, place: str, chain: Chain) -> dict[str, tuple[int, Array]]:
+        """Turns about the axes across revolute joints, in the frame at the link's distal end."""
+        found: dict[str, tuple[int, Array]] = {}
+        i = index(place)
+        ends = {"own": (i, link_ends(chain)[i][:3, :3].T), "next": (i + 1, np.eye(3))}
+        for end, (joint, R) in ends.items():
+            if joint < chain.n_joints and chain.kinds[joint] == "revolute":
+                for key, axis in zip("xy", transverse_axes(chain.joints[joint].axis), strict=True):
+                    found[f"{end}_{key}"] = joint, np.append(np.zeros(3), R @ axis)
+        return found

@@ -68,6 +68,7 @@ class GearHarmonic(DrivenEffect):
     entry = JointMotion()
     prefix: ClassVar[str]
     typical: ClassVar[float]
+    N: ClassVar[int | None] = None  # periods of the error in one turn; None: a setting says it
 
     def parameters(self, place: str, chain: Chain, cell: Cell) -> tuple[ParameterSpec, ...]:
         return tuple(
@@ -75,12 +76,8 @@ class GearHarmonic(DrivenEffect):
             for part in ("sin", "cos")
         )
 
-    def order(self, p: Symbols) -> ca.SX:
-        """N: periods of the error in one turn of the joint."""
-        raise NotImplementedError
-
     def drive(self, arm: Arm, place: str, p: Symbols) -> ca.SX:
-        phase = self.order(p) * arm.q_commanded[index(place)]
+        phase = (self.N or p["ripple_order"]) * arm.q_commanded[index(place)]
         return p[f"{self.prefix}_sin"] * ca.sin(phase) + p[f"{self.prefix}_cos"] * ca.cos(phase)
 
 
@@ -97,9 +94,7 @@ class GearEccentricity(GearHarmonic):
     name = "gear_eccentricity"
     prefix = "eccentricity"
     typical = 1e-4
-
-    def order(self, p: Symbols) -> ca.SX:
-        return ca.SX(1)
+    N = 1
 
 
 class GearSecondHarmonic(GearHarmonic):
@@ -113,9 +108,7 @@ class GearSecondHarmonic(GearHarmonic):
     name = "gear_second_harmonic"
     prefix = "harmonic2"
     typical = 5e-5
-
-    def order(self, p: Symbols) -> ca.SX:
-        return ca.SX(2)
+    N = 2
 
 
 class GearRipple(GearHarmonic):
@@ -140,9 +133,6 @@ class GearRipple(GearHarmonic):
         )
         default = orders[index(place) % len(orders)] if orders else None
         return (Setting("ripple_order", "order", default, 0.5, 1000.0),)
-
-    def order(self, p: Symbols) -> ca.SX:
-        return p["ripple_order"]
 
 
 MOST_LINES = 40

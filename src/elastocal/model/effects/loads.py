@@ -14,7 +14,7 @@ from elastocal.cell.work_cell import Cell
 from elastocal.errors import require
 from elastocal.model import rigid
 from elastocal.model.arm import Arm, ParameterSpec, Setting
-from elastocal.model.chain import Chain, Joint, finite_ranges
+from elastocal.model.chain import Chain, finite_ranges
 from elastocal.model.effects.base import (
     RECORD_TORQUES,
     REVOLUTE,
@@ -323,27 +323,11 @@ def weight_torques(chain: Chain, q: ca.SX, up: ca.SX, j: int) -> ca.SX:
     return -ca.jacobian(ca.vertcat(*heights), q)[:, j]
 
 
-Shape = tuple[tuple, ...]
-
-
-def _shape(chain: Chain) -> Shape:
-    """What of a chain decides its torques."""
-    return tuple(
-        (joint.kind, joint.placement.tobytes(), tuple(map(float, joint.axis)),
-         float(joint.lower), float(joint.upper))
-        for joint in chain.joints
-    )  # fmt: skip
-
-
+@lru_cache(maxsize=256)
 def independent(chain: Chain, j: int) -> tuple[tuple[int, ...], tuple[float, ...]]:
     """Which of `weight_torques` of joint j (0-based) make up all of them, and their rms over the
     joints' ranges and all directions of the vertical."""
-    return _independent(_shape(chain), j)
-
-
-@lru_cache(maxsize=256)
-def _independent(shape: Shape, j: int) -> tuple[tuple[int, ...], tuple[float, ...]]:
-    values = _torques(shape, j, None)
+    values = _torques(chain, j, None)
     R, pivot = qr(values, mode="r", pivoting=True)
     diagonal = np.abs(np.diag(R))
     chosen = np.sort(pivot[: int((diagonal > DEPENDENT * diagonal[0]).sum())])
@@ -352,26 +336,21 @@ def _independent(shape: Shape, j: int) -> tuple[tuple[int, ...], tuple[float, ..
 
 
 @lru_cache(maxsize=256)
-def carried(shape: Shape, j: int, up: tuple[float, ...]) -> float:
+def carried(chain: Chain, j: int, up: tuple[float, ...]) -> float:
     """Rms torque of weights on joint j with the vertical `up` in the base frame, over that of all
     directions of the vertical."""
-    upright, anyhow = (float((_torques(shape, j, of) ** 2).mean()) for of in (up, None))
+    upright, anyhow = (float((_torques(chain, j, of) ** 2).mean()) for of in (up, None))
     return float(np.sqrt(upright / anyhow)) if anyhow else 0.0
 
 
-def _torques(shape: Shape, j: int, up: tuple[float, ...] | None) -> Array:
+def _torques(chain: Chain, j: int, up: tuple[float, ...] | None) -> Array:
     """`weight_torques` of joint j (POSES, functions) in random poses under one vertical, or under
     as many random ones."""
-    joints = tuple(
-        Joint("", kind, np.frombuffer(placement).reshape(4, 4), np.array(axis), lower, upper)
-        for kind, placement, axis, lower, upper in shape
-    )
-    chain = Chain("", joints, np.eye(4))
-    q, height = ca.SX.sym("q", len(joints)), ca.SX.sym("height", 3)
+    q, height = ca.SX.sym("q", chain.n_joints), ca.SX.sym("height", 3)
     torques = ca.Function("torques", [q, height], [weight_torques(chain, q, height, j)])
     rng = np.random.default_rng(0)
-    limits = np.array([[joint.lower, joint.upper] for joint in joints]).T
-    at = rng.uniform(*finite_ranges(chain, *limits), (POSES, len(joints)))
+    limits = np.array([[joint.lower, joint.upper] for joint in chain.joints]).T
+    at = rng.uniform(*finite_ranges(chain, *limits), (POSES, chain.n_joints))
     upward = rng.normal(size=(POSES, 3)) if up is None else np.tile(up, (POSES, 1))
     upward /= np.linalg.norm(upward, axis=1, keepdims=True)
     values: Array = torques.map(POSES)(at.T, upward.T).full().T
@@ -409,7 +388,7 @@ class GravitySag(DrivenEffect):
     def acts(self, place: str, chain: Chain, cell: Cell) -> bool:
         turned = cell.model.nominal.base_rotation
         up = (0.0, 0.0, 1.0) if turned is None else tuple(np.asarray(turned)[2].tolist())
-        return carried(_shape(chain), index(place), up) > LEVELLED
+        return carried(chain, index(place), up) > LEVELLED
 
     def drive(self, arm: Arm, place: str, p: Symbols) -> ca.SX:
         chosen, rms = independent(arm.chain, index(place))

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import casadi as ca
 import numpy as np
 from scipy.spatial.transform import Rotation
@@ -20,10 +22,10 @@ from elastocal.model.effects.base import (
     DrivenEffect,
     Effect,
     JointMotion,
+    LinkFrame,
     LinkLength,
     MarkerMotion,
     Symbols,
-    index,
     links,
     motion_unit,
 )
@@ -107,10 +109,7 @@ class LinkGeometry(Effect):
     )
 
     def shape(self, arm: Arm, place: str, p: Symbols) -> None:
-        i = index(place)
-        shift = ca.vertcat(p["dx"], p["dy"], p["dz"])
-        turn = rigid.rotation_from_vector(ca.vertcat(p["rx"], p["ry"], p["rz"]))
-        arm.links[i] = arm.links[i] @ rigid.transform(turn, shift)
+        LinkFrame().enter(arm, place, ca.vertcat(*[p[spec.key] for spec in self.unknowns]))
 
 
 class MarkerPosition(Effect):
@@ -249,25 +248,6 @@ def _turned(a: ca.SX, b: ca.SX, angle: ca.SX) -> tuple[ca.SX, ca.SX]:
 TIME_CONSTANT = Setting("time_constant_s", "time_constant", 1800.0, 60.0, 1e6)
 
 
-def change_time(key: str) -> Setting:
-    """The moment in s at which something changed; nobody knows it beforehand."""
-    return Setting(key, "change_time", None, -np.inf, np.inf)
-
-
-def warm_up(arm: Arm, p: Symbols) -> ca.SX:
-    """1 − exp(−t/T) of the row's time t, T = `time_constant_s`: 0 at t = 0, 1 when warm.
-
-    The response of a body with one thermal time constant to a constant source of heat that is
-    switched on at t = 0.
-    """
-    return 1 - ca.exp(-arm.input("time", 1) / p["time_constant_s"])
-
-
-def after(arm: Arm, moment: ca.SX) -> ca.SX:
-    """1 in rows measured at `moment` (s) or later, else 0."""
-    return arm.input("time", 1) >= moment
-
-
 def pose_change(prefix: str, length: float) -> tuple[ParameterSpec, ...]:
     """`prefix`_x … `prefix`_rz with typical sizes `length` in m and 50 µrad."""
     units, sizes = ["m"] * 3 + ["rad"] * 3, [length] * 3 + [5e-5] * 3
@@ -277,7 +257,36 @@ def pose_change(prefix: str, length: float) -> tuple[ParameterSpec, ...]:
     )
 
 
-class JointDrift(DrivenEffect):
+class Drift(DrivenEffect):
+    """u = d (1 − exp(−t/T)), d all parameters of the place: 0 at t = 0, d when warm.
+
+    The response of a body with one thermal time constant T = `time_constant_s` to a constant source
+    of heat that is switched on at t = 0, the table's time.
+    """
+
+    constants = (TIME_CONSTANT,)
+    needs = ("time",)
+
+    def course(self, arm: Arm, p: Symbols) -> ca.SX:
+        return 1 - ca.exp(-arm.input("time", 1) / p["time_constant_s"])
+
+    def drive(self, arm: Arm, place: str, p: Symbols) -> ca.SX:
+        specs = self.parameters(place, arm.chain, arm.cell)
+        return ca.vertcat(*[p[spec.key] for spec in specs]) * self.course(arm, p)
+
+
+class Jump(Drift):
+    """u = d for t ≥ T, d all parameters of the place and T the one setting, in s: nobody knows
+    beforehand when something changed."""
+
+    def course(self, arm: Arm, p: Symbols) -> ca.SX:
+        return arm.input("time", 1) >= p[self.constants[0].key]
+
+
+JUMP_TIME = Setting("jump_time_s", "change_time", None, -np.inf, np.inf)
+
+
+class JointDrift(Drift):
     """δq = d (1 − exp(−t/T)): the joint's reference has moved by d (rad or m) once warm.
 
     Gears and encoder mounts warm up with the motor beside them and shift the joint's zero; t is
@@ -287,19 +296,14 @@ class JointDrift(DrivenEffect):
 
     name = "joint_drift"
     stage = "transmission"
-    constants = (TIME_CONSTANT,)
     formats = ("rigid", "elastic")
-    needs = ("time",)
     entry = JointMotion()
 
     def parameters(self, place: str, chain: Chain, cell: Cell) -> tuple[ParameterSpec, ...]:
         return (ParameterSpec("drift", motion_unit(place, chain), 0.0, 1e-4),)
 
-    def drive(self, arm: Arm, place: str, p: Symbols) -> ca.SX:
-        return p["drift"] * warm_up(arm, p)
 
-
-class EncoderJump(DrivenEffect):
+class EncoderJump(Jump):
     """δq = d for t ≥ T: the joint's reference jumps by d (rad or m) at T = `jump_time_s`.
 
     A belt that skips a tooth, a coupling that slips, an encoder that loses counts or is
@@ -308,19 +312,15 @@ class EncoderJump(DrivenEffect):
 
     name = "encoder_jump"
     stage = "transmission"
-    constants = (change_time("jump_time_s"),)
+    constants = (JUMP_TIME,)
     formats = ("rigid", "elastic")
-    needs = ("time",)
     entry = JointMotion()
 
     def parameters(self, place: str, chain: Chain, cell: Cell) -> tuple[ParameterSpec, ...]:
         return (ParameterSpec("jump", motion_unit(place, chain), 0.0, 1e-4),)
 
-    def drive(self, arm: Arm, place: str, p: Symbols) -> ca.SX:
-        return p["jump"] * after(arm, p["jump_time_s"])
 
-
-class BaseDrift(DrivenEffect):
+class BaseDrift(Drift):
     """The base moves by d (1 − exp(−t/T)), d = (drift_x … drift_rz) in m and rad.
 
     Along the axes of the tracker frame and about the base's origin; T is `time_constant_s`.  A
@@ -330,17 +330,12 @@ class BaseDrift(DrivenEffect):
 
     name = "base_drift"
     stage = "tracker"
-    constants = (TIME_CONSTANT,)
     remedy = MEASURE_MONUMENTS
-    needs = ("time",)
     entry = BaseMotion()
     unknowns = pose_change("drift", 5e-5)
 
-    def drive(self, arm: Arm, place: str, p: Symbols) -> ca.SX:
-        return ca.vertcat(*[p[f"drift_{k}"] for k in KEYS]) * warm_up(arm, p)
 
-
-class FrameJump(DrivenEffect):
+class FrameJump(Jump):
     """The base, as the tracker sees it, moves by (jump_x … jump_rz) for t ≥ T = `jump_time_s`.
 
     In m and rad, along the axes of the tracker frame and about the base's origin.  Somebody
@@ -351,21 +346,16 @@ class FrameJump(DrivenEffect):
     name = "frame_jump"
     stage = "tracker"
     at = "tracker"
-    constants = (change_time("jump_time_s"),)
+    constants = (JUMP_TIME,)
     remedy = MEASURE_MONUMENTS
-    needs = ("time",)
     entry = BaseMotion()
     unknowns = pose_change("jump", 1e-4)
 
     def entered_at(self, place: str, chain: Chain) -> tuple[str, ...]:
         return ("base",)
 
-    def drive(self, arm: Arm, place: str, p: Symbols) -> ca.SX:
-        jump = ca.vertcat(*[p[f"jump_{k}"] for k in KEYS])
-        return jump * after(arm, p["jump_time_s"])
 
-
-class MarkerSlip(DrivenEffect):
+class MarkerSlip(Jump):
     """One marker moves by (slip_x, slip_y, slip_z) in the flange frame for t ≥ T = `slip_time_s`.
 
     In m.  A reflector that was taken off its magnetic nest and put back, glue that gives way.
@@ -373,8 +363,7 @@ class MarkerSlip(DrivenEffect):
 
     name = "marker_slip"
     stage = "tool"
-    constants = (change_time("slip_time_s"),)
-    needs = ("time",)
+    constants = (replace(JUMP_TIME, key="slip_time_s"),)
     entry = MarkerMotion()
     unknowns = tuple(ParameterSpec(f"slip_{k}", "m", 0.0, 1.5e-4) for k in "xyz")
 
@@ -382,15 +371,11 @@ class MarkerSlip(DrivenEffect):
     def of_the_measurement(self) -> bool:
         return True  # the marker slipped during one campaign
 
-    def drive(self, arm: Arm, place: str, p: Symbols) -> ca.SX:
-        slip = ca.vertcat(*[p[f"slip_{k}"] for k in "xyz"])
-        return slip * after(arm, p["slip_time_s"])
-
 
 REFERENCE_C = 20.0  # ISO 1: lengths are stated at this temperature
 
 
-class ThermalExpansion(DrivenEffect):
+class ThermalExpansion(Drift):
     """Lengths of a link (or of all alike: place "all") ← (1 + ε) times themselves.
 
     ε = e (1 − exp(−t/T)) with the strain e at full warm-up (1) and the time constant T =
@@ -402,7 +387,6 @@ class ThermalExpansion(DrivenEffect):
     name = "thermal_expansion"
     stage = "geometry"
     formats = ("rigid", "elastic")
-    needs = ("time",)
     entry = LinkLength()
 
     def needed(self, cell: Cell) -> tuple[str, ...]:
@@ -424,9 +408,10 @@ class ThermalExpansion(DrivenEffect):
     def entered_at(self, place: str, chain: Chain) -> tuple[str, ...]:
         return links(chain) if place == "all" else (place,)
 
-    def drive(self, arm: Arm, place: str, p: Symbols) -> ca.SX:
+    def course(self, arm: Arm, p: Symbols) -> ca.SX:
         if arm.cell.model.thermal_driver == "temperature":
-            course = arm.input("temperature", 1) - REFERENCE_C
-        else:
-            course = warm_up(arm, p)
-        return ca.repmat(p["expansion"] * course, len(self.entered_at(place, arm.chain)))
+            return arm.input("temperature", 1) - REFERENCE_C
+        return super().course(arm, p)
+
+    def drive(self, arm: Arm, place: str, p: Symbols) -> ca.SX:
+        return ca.repmat(super().drive(arm, place, p), len(self.entered_at(place, arm.chain)))
