@@ -78,7 +78,7 @@ def joint_curves(dataset: DiagnosisData) -> Iterator[Component]:
         cell = cell_with(model.cell, where, tried)
         yield Component(
             "angle", effect, where, driven_columns(dataset, effect, where, tried) * CURVE, CURVE,
-            waves=effect.course(where, model.chain, cell).waves,
+            waves=effect.courses(where, model.chain, cell)[0].waves,
             lengths=(math.log(shortest), math.log(longest)), settings=tuple(measured.items()),
             fellows=len(joints),
         )  # fmt: skip

@@ -49,6 +49,7 @@ from elastocal.model.effects.base import (
     links,
     turning_joints,
 )
+from elastocal.model.evaluate import BatchFunction
 from elastocal.units import Array
 
 # Waves up to this many times 1/ℓ: what is beyond has 0.2 % of the variance.
@@ -118,22 +119,19 @@ class Waves:
 
     def at(self, x: Array) -> Array:
         """The same numbers (n, count) at x (n,)."""
-        x = x - self.low
-        phases = x[:, None] * self.frequency
-        waves = np.hstack([np.cos(phases), np.sin(phases)])
-        if math.isinf(self.fade):
-            return waves
-        t = np.clip(np.maximum(-x, x - self.span) / self.fade, 0.0, 1.0)[:, None]
-        w = (1 - t) ** 2 * (1 + 2 * t)
-        return np.hstack([w * waves, 1 - w])
+        symbol = ca.SX.sym("x")
+        waves = BatchFunction([symbol], [ca.vertcat(*self.values(symbol))])
+        return np.asarray(waves(x[:, None])[0][..., 0])
 
 
 @dataclass(frozen=True)
 class Course:
     """What a smooth function at a place follows, by the settings that say so: prior `size` in rad
-    or m, `length` ℓ and range in the unit of what it follows."""
+    or m, `length` ℓ and range in the unit of what it follows.  `components`: how the keys of each
+    component's coefficients begin → unit of its values."""
 
     name: str
+    components: Mapping[str, str]
     size: float
     length: float
     low: float
@@ -147,38 +145,58 @@ class Course:
     def waves(self) -> Waves:
         return Waves.over(self.low, self.high, self.length, self.turns)
 
-    def keys(self, components: Mapping[str, str]) -> tuple[tuple[str, ...], ...]:
-        """Those of the waves' coefficients for each of the `components`: how its keys begin → unit
-        of its values."""
+    @property
+    def keys(self) -> tuple[tuple[str, ...], ...]:
         numbers = range(1, self.waves.count + 1)
-        return tuple(tuple(f"{start}_{k}" for k in numbers) for start in components)
+        return tuple(tuple(f"{start}_{k}" for k in numbers) for start in self.components)
 
-    def parameters(self, components: Mapping[str, str]) -> list[ParameterSpec]:
+    @property
+    def parameters(self) -> list[ParameterSpec]:
         sd = np.sqrt(self.waves.variances(self.size, self.length)).tolist()
         return [
             ParameterSpec(key, unit, 0.0, size, shrunk=True)
-            for keys, unit in zip(self.keys(components), components.values(), strict=True)
+            for keys, unit in zip(self.keys, self.components.values(), strict=True)
             for key, size in zip(keys, sd, strict=True)
         ]
 
-    def function(self, components: Mapping[str, str]) -> SmoothFunction:
+    @property
+    def function(self) -> SmoothFunction:
         return SmoothFunction(
-            self.name, self.keys(components), tuple(components.values()), self.size, self.length,
+            self.name, self.keys, tuple(self.components.values()), self.size, self.length,
             self.low, self.high, self.waves.at,
         )  # fmt: skip
 
-    def values(self, arm: Arm, components: Mapping[str, str], p: Symbols) -> ca.SX:
+    def values(self, arm: Arm, p: Symbols) -> ca.SX:
         """The function (components,) of the row."""
         x = arm.q_commanded[index(self.name)] if self.turns else arm.input("time", 1)
         waves = ca.vertcat(*self.waves.values(x))
-        every = (ca.vertcat(*(p[key] for key in keys)) for keys in self.keys(components))
+        every = (ca.vertcat(*(p[key] for key in keys)) for keys in self.keys)
         return ca.vertcat(*(ca.dot(coefficients, waves) for coefficients in every))
 
 
-CURVE = {"curve": "rad"}
+class SmoothEffect(DrivenEffect):
+    """u = Σ_c f_c(x_c) in every component of the motion at a place; `courses` says the x_c."""
+
+    together = True
+
+    def courses(self, place: str, chain: Chain, cell: Cell) -> tuple[Course, ...]:
+        """What the function follows at this place."""
+        raise NotImplementedError
+
+    def parameters(self, place: str, chain: Chain, cell: Cell) -> tuple[ParameterSpec, ...]:
+        return tuple(spec for c in self.courses(place, chain, cell) for spec in c.parameters)
+
+    def functions(self, place: str, chain: Chain, cell: Cell) -> tuple[SmoothFunction, ...]:
+        return tuple(course.function for course in self.courses(place, chain, cell))
+
+    def drive(self, arm: Arm, place: str, p: Symbols) -> ca.SX:
+        u = ca.SX.zeros(self.entry_at(place).size)
+        for course in self.courses(place, arm.chain, arm.cell):
+            u += course.values(arm, p)
+        return u
 
 
-class JointCurve(DrivenEffect):
+class JointCurve(SmoothEffect):
     """δq = f(q), f a smooth function of the commanded joint angle q (see the module).
 
     The transmission error of a real gear: eccentricities, tooth errors and encoder errors of all
@@ -190,7 +208,6 @@ class JointCurve(DrivenEffect):
     name = "joint_curve"
     stage = "transmission"
     at = "turning joints"
-    together = True
     family = "angle"
     sized_by = "curve_size_rad"
     entry = JointMotion()
@@ -201,20 +218,11 @@ class JointCurve(DrivenEffect):
         Setting("curve_high_rad", "range", math.pi, -100.0, 100.0),
     )
 
-    def course(self, place: str, chain: Chain, cell: Cell) -> Course:
-        return Course(place, *self.stated(place, chain, cell).values())
-
-    def parameters(self, place: str, chain: Chain, cell: Cell) -> tuple[ParameterSpec, ...]:
-        return tuple(self.course(place, chain, cell).parameters(CURVE))
-
-    def functions(self, place: str, chain: Chain, cell: Cell) -> tuple[SmoothFunction, ...]:
-        return (self.course(place, chain, cell).function(CURVE),)
-
-    def drive(self, arm: Arm, place: str, p: Symbols) -> ca.SX:
-        return self.course(place, arm.chain, arm.cell).values(arm, CURVE, p)
+    def courses(self, place: str, chain: Chain, cell: Cell) -> tuple[Course, ...]:
+        return (Course(place, {"curve": "rad"}, *self.stated(place, chain, cell).values()),)
 
 
-class ResidualField(DrivenEffect):
+class ResidualField(SmoothEffect):
     """A place moves smoothly with joint angles or time, and nobody knows why.
 
     u = Σ_c f_c(x_c) in every component of the motion at the place: of "jointN" its angle, of
@@ -227,7 +235,6 @@ class ResidualField(DrivenEffect):
 
     name = "residual_field"
     stage = "geometry"
-    together = True
     family = "pose"
     entry = JointMotion()  # at a joint; see `entry_at`
 
@@ -236,7 +243,6 @@ class ResidualField(DrivenEffect):
         return (*joints(chain), *links(chain), "base", *markers)
 
     def entry_at(self, place: str) -> Entry:
-        """The motion that is meant by a place."""
         if place.startswith("joint"):
             return JointMotion()
         if place.startswith("link"):
@@ -256,11 +262,13 @@ class ResidualField(DrivenEffect):
             yield Setting(f"field_{name}_high", "range", half, -wide, wide)
 
     def courses(self, place: str, chain: Chain, cell: Cell) -> tuple[Course, ...]:
-        """What the field follows at this place."""
-        given = self.stated(place, chain, cell)
-        keys = ("size", "length", "low", "high")
+        given, units = self.stated(place, chain, cell), self.entry_at(place).units
         found = (
-            Course(name, *(given[f"field_{name}_{key}"] for key in keys))
+            Course(
+                name,
+                {f"field_{name}_{c}": unit for c, unit in enumerate(units, start=1)},
+                *(given[f"field_{name}_{key}"] for key in ("size", "length", "low", "high")),
+            )
             for name in (*turning_joints(chain), "time")
         )
         return tuple(course for course in found if course.size > 0)
@@ -269,23 +277,6 @@ class ResidualField(DrivenEffect):
         timed = any(s.get("field_time_size") for s in cell.model.nominal.settings.values())
         return ("time",) if timed else ()
 
-    def parameters(self, place: str, chain: Chain, cell: Cell) -> tuple[ParameterSpec, ...]:
-        return tuple(
-            spec
-            for course in self.courses(place, chain, cell)
-            for spec in course.parameters(self._components(place, course))
-        )
-
-    def functions(self, place: str, chain: Chain, cell: Cell) -> tuple[SmoothFunction, ...]:
-        return tuple(
-            course.function(self._components(place, course))
-            for course in self.courses(place, chain, cell)
-        )
-
-    def _components(self, place: str, course: Course) -> dict[str, str]:
-        units = self.entry_at(place).units
-        return {f"field_{course.name}_{c}": unit for c, unit in enumerate(units, start=1)}
-
     def lasting(self, cell: Cell) -> Cell:
         settings = {
             place: {key: value for key, value in given.items() if not key.startswith("field_time_")}
@@ -293,12 +284,3 @@ class ResidualField(DrivenEffect):
         }
         nominal = replace(cell.model.nominal, settings=settings)
         return replace(cell, model=replace(cell.model, nominal=nominal))
-
-    def drive(self, arm: Arm, place: str, p: Symbols) -> ca.SX:
-        u = ca.SX.zeros(self.entry_at(place).size)
-        for course in self.courses(place, arm.chain, arm.cell):
-            u += course.values(arm, self._components(place, course), p)
-        return u
-
-    def shape(self, arm: Arm, place: str, p: Symbols) -> None:
-        self.entry_at(place).enter(arm, place, self.drive(arm, place, p))
