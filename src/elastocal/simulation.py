@@ -9,16 +9,16 @@ from scipy.spatial.transform import Rotation
 
 from elastocal.errors import InputError, option
 from elastocal.measurements import Measurements, visits, with_moves
-from elastocal.model.chain import extent
 from elastocal.model.effects.compliances import JointCompliance
-from elastocal.model.effects.loads import STANDARD_GRAVITY
 from elastocal.model.manipulator import Model, check_equilibrium
 from elastocal.model.observations import available_noise, position_covariance
 from elastocal.text import did_you_mean, listed
 from elastocal.units import Array
 
 MOST_ROWS = 200  # of a plan, from which sizes are taken
-SHOWS = 1e-6  # of the largest slope that a force can have, of a parameter of such a unit
+# m per rad/(N m) or m/N: what moves a reading by less would move it by a mm only at 1000 rad/(N m),
+# and is rounding.  Loads of whole arms have slopes of 0.1 and more.
+SHOWS = 1e-6
 
 
 def values_from(model: Model, chosen: dict[str, float]) -> Array:
@@ -72,22 +72,9 @@ def _sizes_shown(model: Model, rows: Measurements) -> Array:
     B = seen.regressor(replace(some, position=np.zeros((len(some), 3))), None, columns).B
     moved = np.abs(B).max(axis=0)
     # A load on a joint's own axis leaves rounding, from which no size follows.
-    most = _largest_slopes(model, some)
-    least = SHOWS * np.array([most.get(seen.parameters[c].unit, 0.0) for c in columns])
-    size = np.divide(1e-3, moved, out=np.zeros(len(moved)), where=moved > least)
+    size = np.divide(1e-3, moved, out=np.zeros(len(moved)), where=moved > SHOWS)
     found = dict(zip(names, size, strict=True))
     return np.array([found.get(name, 0.0) for name in model.names])
-
-
-def _largest_slopes(model: Model, rows: Measurements) -> dict[str, float]:
-    """Unit → by how many m a unit of a compliance moves a reading at most: a force F, weights with
-    it, on levers of the arm's length L, turns by F L and moves by F L²."""
-    masses = model.chain.masses if model.cell.model.link_gravity else ()
-    weight = STANDARD_GRAVITY * sum(body.mass for body in masses)
-    F = float(np.linalg.norm(rows.force, axis=1).max(initial=0.0)) + weight
-    tool = [*model.cell.tool.markers.values(), model.cell.tool.load_point]
-    L = extent(model.chain) + max(float(np.linalg.norm(point)) for point in tool)
-    return {"rad/(N*m)": F * L**2, "m/N": F, "rad/(N*m)^3": F**3 * L**4}
 
 
 def expand_plan(

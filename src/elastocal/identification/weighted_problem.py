@@ -18,7 +18,6 @@ from elastocal.errors import InputError, option
 from elastocal.model.manipulator import Model, Regression
 from elastocal.model.observations import (
     Observations,
-    alone,
     available_noise,
     need,
     position_covariance,
@@ -314,7 +313,8 @@ def part_of(observed: Observations, weights: Weights, index: IntArray) -> Part:
     else:
         value = observed.value[_run(rows)]
         table = observed.table.take(_run(observed.lead[index]))
-        own = Observations(observed.kind, value, alone(len(index)), np.arange(len(index)), table)
+        every = sparse.eye_array(len(index), format="csr")
+        own = Observations(observed.kind, value, every, np.arange(len(index)), table)
     inside = None if weights.whiten is None else weights.whiten[_run(rows)][:, _run(rows)]
     mine = replace(weights, whiten=inside, low=None, common=None, together=None)
     if weights.common is not None and weights.together is not None:

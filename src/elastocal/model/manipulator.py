@@ -16,6 +16,7 @@ from elastocal.cell.arm_description import EffectChoice, ModelSpec
 from elastocal.cell.work_cell import Cell
 from elastocal.errors import InputError, option, require
 from elastocal.measurements import DEFAULT_MARKER, Measurements, read_measurements, read_plan
+from elastocal.measurements import table as table_of
 from elastocal.model.arm import Parameter, row_inputs
 from elastocal.model.chain import Chain, numbered, plausible
 from elastocal.model.effects.base import Effect, JointMotion, SmoothFunction, index
@@ -183,7 +184,7 @@ class Model:
     def table(
         self, q: ArrayLike, force: ArrayLike | None = None, position: ArrayLike | None = None
     ) -> Measurements:
-        """A table of readings that no file states, one configuration per row, of one marker.
+        """A table of readings of one marker that no file states; as `ec.table`.
 
         Args:
             q: Commanded joints (n, joints) or (joints,), in rad or m.
@@ -199,20 +200,13 @@ class Model:
             >>> model.deflection(table).shape
             (1, 6)
         """
-        joints = np.atleast_2d(
-            np.array(q, dtype=float)
-        )  # what the caller does to q later is not ours
-        n = len(joints)
+        found = np.shape(np.atleast_2d(q))
         require(
-            n > 0 and joints.shape == (n, self.chain.n_joints),
+            0 < len(found) <= 2 and found[0] > 0 and found[-1] == self.chain.n_joints,
             f"q takes {self.chain.n_joints} joints per row; found an array of shape {np.shape(q)}",
         )
-        pull = np.zeros(3) if force is None else _rows_of_three("force", force, n)
-        place = None if position is None else _rows_of_three("position", position, n)
         marker = next(iter(self.cell.tool.markers), DEFAULT_MARKER)
-        return Measurements.of_poses(
-            "table", joints, pull, marker, position=place, joint_kinds=self.chain.kinds
-        )
+        return table_of(q, position, force, marker, self.chain.kinds)
 
     @checked_arguments
     def pose(
@@ -489,17 +483,6 @@ def _with_markers(cell: Cell, names: tuple[str, ...]) -> Cell:
     return replace(cell, tool=replace(cell.tool, markers={name: np.zeros(3) for name in names}))
 
 
-def _rows_of_three(what: str, values: ArrayLike, n: int) -> Array:
-    """(n, 3) from one row or n of them."""
-    found = np.asarray(values, dtype=float)
-    require(
-        found.shape in ((3,), (n, 3)),
-        f"{what} takes three numbers, or three for each of {n} rows; found an array of shape "
-        f"{found.shape}",
-    )
-    return np.broadcast_to(found, (n, 3)).copy()
-
-
 def load_chain(cell: Cell) -> Chain:
     """The nominal chain of the cell's robot, from its URDF, MuJoCo model, DH table or factory
     calibration."""
@@ -508,18 +491,21 @@ def load_chain(cell: Cell) -> Chain:
     from elastocal.model.urdf import read_urdf
 
     robot = cell.robot
+    path = robot.mjcf or robot.urdf or robot.dh
+    if path is None:
+        raise InputError(f"{cell.path}: [robot] needs urdf, mjcf or dh")
     if robot.mjcf is not None:
-        return plausible(read_mjcf(robot.mjcf, robot.base, robot.flange), robot.mjcf)
-    if robot.urdf is not None:
-        return plausible(read_urdf(robot.urdf, robot.base, robot.flange), robot.urdf)
-    if robot.dh is not None and robot.dh.suffix.lower() in UR_ENDINGS:
-        if robot.masses is not None:
-            raise InputError(f"{robot.dh}: takes no [robot] masses; state the arm as a DH table")
-        return plausible(read_ur_table(robot.dh, robot.ur_model), robot.dh)
-    if robot.dh is not None:
-        chain = read_dh(robot.dh, convention=robot.dh_convention, masses_path=robot.masses)
-        return plausible(chain, robot.masses or robot.dh)
-    raise InputError(f"{cell.path}: [robot] needs urdf, mjcf or dh")
+        chain = read_mjcf(path, robot.base, robot.flange)
+    elif robot.urdf is not None:
+        chain = read_urdf(path, robot.base, robot.flange)
+    elif path.suffix.lower() in UR_ENDINGS:
+        require(
+            robot.masses is None, f"{path}: takes no [robot] masses; state the arm as a DH table"
+        )
+        chain = read_ur_table(path, robot.ur_model)
+    else:
+        chain = read_dh(path, robot.dh_convention, robot.masses)
+    return plausible(chain, robot.masses or path)
 
 
 # The shrunk parameters of a model in groups: one for each smooth function, whose size is one.
