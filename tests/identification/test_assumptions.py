@@ -15,8 +15,8 @@ from elastocal.identification.findings import judged
 from elastocal.identification.identify import identify
 from elastocal.model.manipulator import Model
 from elastocal.model.observations import observe
+from elastocal.report.identification_view import undetermined_lines
 from elastocal.report.judgement_view import judgement
-from elastocal.report.parameter_tables import undetermined_lines
 
 SIGMA = 1e-5
 MARKERS = {"M1": np.array([0.1, 0, 0.05]), "M2": np.array([-0.05, 0.1, 0.1])}

@@ -11,7 +11,7 @@ from rich.console import Console
 from support.diagnoses import VERDICTS
 
 from elastocal.report.blocks import ShownTable
-from elastocal.report.parameter_tables import bar, parameter_table, texts, undetermined_table
+from elastocal.report.identification_view import bar, parameter_table, texts, undetermined_table
 from elastocal.report.terminal import print_report
 
 

@@ -32,7 +32,7 @@ from elastocal.text import listed
 if TYPE_CHECKING:
     from elastocal.diagnosis.diagnosis import Diagnosis
     from elastocal.identification.result import Calibration
-    from elastocal.report.parameter_tables import Published, Truth
+    from elastocal.report.identification_view import Published, Truth
 
 
 @command(

@@ -214,49 +214,6 @@ METHODS = {
 }
 # What the weights are is said by the method itself, or by the line on the noise model.
 SAID = {"reml", "ols", "eq14", "eq14-residual"}
-HC = "every reading may have a variance of its own; they assume independent readings"
-CR = (
-    "readings of a configuration may be correlated in any way; they assume independent "
-    "configurations"
-)
-# Without correction for leverage: right in the limit of many rows or configurations.
-LARGE = " and that these are many"
-INTERVALS = {
-    "kenward-roger": (
-        "t intervals of Kenward and Roger, which account for estimated weights; they "
-        "assume the noise model and normal noise"
-    ),
-    "classical": (
-        "t intervals that assume independent readings (after weighting), with the noise level "
-        "from the residual, even if stated"
-    ),
-    "profile": (
-        "profile of the sum of squares, which follows the curvature of the model and may be "
-        "lopsided; assumes independent normal noise"
-    ),
-    "t under constraints": (
-        "t intervals that take equalities for exact and end at bounds; no bound is active, and "
-        "they assume the noise of the method"
-    ),
-    "posterior": (
-        "t intervals of readings and prior together, ending at bounds; they trust the "
-        "prior and assume the noise of the method"
-    ),
-    "constrained profile": (
-        "profile of the fit under the constraints: one-sided at a bound, and too wide rather than "
-        "too narrow near one; assumes normal noise"
-    ),
-    "eq13": (
-        "as published, eq. (13): weights taken as known although they come from the same "
-        "residuals, so the intervals are too narrow"
-    ),
-    "h1": "asymptotic covariance of the robust estimate (H1); assumes independent readings",
-    **{f"hc{k}": f"robust to unequal noise (HC{k}): {HC}{LARGE * (k < 2)}" for k in range(4)},
-    **{f"cr{k}": f"cluster-robust (CR{k}): {CR}{LARGE}" for k in (0, 1)},
-    **{f"cr{k}": f"cluster-robust (CR{k}): {CR}" for k in (2, 3)},
-}
-INTERVALS["cr0"] += ", ten or more per parameter"
-INTERVALS["cr1"] += ", ten or more per parameter"
 SIGNS = {"lower": "≥", "upper": "≤", "equality": "="}
 
 
@@ -281,11 +238,25 @@ def method_and_weights(result: Calibration) -> str:
     return f"{text}, {printable(noise.description)}"
 
 
+# What intervals of each kind assume, where their description does not say it.
+ASSUMED = {
+    "kenward-roger": "the noise model and normal noise",
+    "classical": "independent readings",
+    "profile": "normal noise",
+    "eq13": "weights known beforehand, so that it is too narrow",
+    "h1": "independent readings",
+    "hc": "independent readings",
+    "cr": "independent configurations",
+}
+
+
 def intervals_line(result: Calibration) -> str:
-    """Which kind of interval, and what it assumes."""
-    kind, description = result.noise.interval_kind.lower(), result.noise.interval_description
-    told = f"{kind}: {description}" if description else kind
-    return INTERVALS.get(kind, printable(told))
+    """Which kind of interval, how it was found, and what it assumes."""
+    kind, description = result.noise.interval_kind, result.noise.interval_description
+    name = kind.title() if "-" in kind else kind  # of two people
+    told = ": ".join(text for text in (name, description) if text)
+    assumed = ASSUMED.get(kind.lower()) or ASSUMED.get(kind.lower().rstrip("0123"))
+    return printable(f"{told}; assumes {assumed}" if assumed else told)
 
 
 def constraints_line(result: Calibration) -> str | None:
@@ -525,10 +496,7 @@ def _repeats_line(result: Calibration) -> str | None:
         return f"{text} The noise model has this common deviation; the intervals include it."
     if f.numbers["counted_by"] == "the intervals":
         return f"{text} The intervals take each configuration as a whole and include it."
-    return (
-        f"{text} The intervals do not include it and are too narrow: use the default method, whose "
-        "noise model has it, or intervals by cr2; measure more configurations, not more repeats."
-    )
+    return f"{text} The intervals do not include it and are too narrow."
 
 
 def shape_line(summary: ResidualSummary) -> str:
