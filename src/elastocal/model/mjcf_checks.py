@@ -15,7 +15,7 @@ import math
 import os
 import re
 import struct
-from collections.abc import Callable, Hashable, Iterable, Iterator, Mapping
+from collections.abc import Hashable, Iterable, Iterator
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, TypeVar
@@ -54,8 +54,7 @@ def check_bounds(path: Path, data: bytes) -> None:
     Counted are elements as often as they are replicated, sizes, and what files it names: included
     models stand in its folder, and all are regular files.  The message names file and element.
     """
-    model = _Model(path)
-    weight = model.weight_of(path, data)
+    weight = _Model(path).weight_of(path, data)
     require(
         weight <= MOST_ELEMENTS,
         f"{path}: makes {weight:.3g} elements of all it replicates and includes; more than "
@@ -69,46 +68,80 @@ class _Model:
     def __init__(self, path: Path) -> None:
         self._folder = path.parent
         # The folder as it is named, and that of the file where the name is a link.
-        self._roots = {os.path.realpath(path.parent), os.path.dirname(os.path.realpath(path))}
-        self._weights: dict[str, float] = {}
-        self._open: list[str] = []
+        self._roots = path.parent.resolve(), path.resolve().parent
+        self._weights: dict[Path, float] = {}
+        self._open: list[Path] = []
         self._text = self._bytes = self._cells = 0
 
     def weight_of(self, path: Path, data: bytes | None = None) -> float:
         """The weight of an XML file, which is read once."""
-        real = os.path.realpath(path)
+        real = path.resolve()
         require(real not in self._open, f"{path}: includes itself; take out the <include>")
         if real not in self._weights:
             self._open.append(real)
-            if data is None:
-                data = read_bytes(path, "included model", MAX_BYTES)
+            data = read_bytes(path, "included model", MAX_BYTES) if data is None else data
             self._text += len(data)
             check_size(path, "MuJoCo model with all it includes", self._text, MAX_BYTES)
             root = xml_tree(path, data, "an MJCF file")
-            self._weights[real] = _File(self, path, root).weight(root)
+            self._weights[real] = self._weight(path, root, root)
             self._open.pop()
         return self._weights[real]
 
-    def included(self, path: Path, name: str) -> Iterator[Path]:
+    def _weight(self, path: Path, root: ET.Element, element: ET.Element) -> float:
+        """How many elements MuJoCo makes of one of the file `path` and all within it."""
+        _check_sizes(path, element)
+        if element.tag == "hfield":
+            sides = (math.prod(_numbers(element.get(key, ""))) for key in ("nrow", "ncol"))
+            self._count_cells(path, math.prod(sides))
+        inside = 1 + sum(self._weight(path, root, child) for child in element)
+        return _count(element) * (inside + sum(self._named(path, root, element)))
+
+    def _named(self, path: Path, root: ET.Element, element: ET.Element) -> Iterator[float]:
+        """Weights of the files that it names: of a model its elements, of a grid its vertices."""
+        file = element.get("file", "")
+        if element.tag == "attach":
+            models = {one.get("name") or Path(one.get("file", "")).stem: one.get("file", "")
+                      for one in root.iter("model")}  # fmt: skip
+            file = models.get(element.get("model", ""), "")
+        if element.tag in ("include", "model", "attach"):
+            yield from map(self.weight_of, self._included(path, file) if file else ())
+            return
+        for key, name in element.attrib.items():
+            for found in self._places(path, root, name) if key.startswith("file") and name else ():
+                try:
+                    size = self._count_file(found)
+                except InputError as error:
+                    raise InputError(f"{path}: <{printable(element.tag)}> names {error}") from None
+                if element.tag == "flexcomp":
+                    yield size / VERTEX_BYTES
+                elif element.tag == "hfield":
+                    self._count_cells(path, _pixels(found))
+
+    def _included(self, path: Path, name: str) -> Iterator[Path]:
         """The files that an element of the file `path` includes by `name`: beside the model or
         beside the file itself, as versions of MuJoCo differ."""
         for found in {self._folder / name, path.parent / name}:
             if os.path.lexists(found):
-                inside = any(
-                    os.path.commonpath([root, os.path.realpath(found)]) == root
-                    for root in self._roots
-                )
                 require(
-                    inside,
+                    any(found.resolve().is_relative_to(root) for root in self._roots),
                     f"{path}: includes {printable(name)}, which is outside its folder; put a copy "
                     "there",
                 )
                 yield found
 
-    def count_file(self, path: Path, what: str) -> int:
+    def _places(self, path: Path, root: ET.Element, name: str) -> set[Path]:
+        """Where a file may stand; the last part of its name alone counts under `strippath`."""
+        stated = [compiler.get(f"{kind}dir", "") for compiler in root.iter("compiler")
+                  for kind in ("asset", "mesh", "texture")]  # fmt: skip
+        names = {name, re.split(r"[\\/]", name)[-1]} - {""}
+        places = {folder / place / each for folder in (path.parent, self._folder)
+                  for place in ("", *stated) for each in names}  # fmt: skip
+        return {place for place in places if os.path.lexists(place) and not place.is_dir()}
+
+    def _count_file(self, path: Path) -> int:
         """Size of a file that is named once more, in bytes."""
-        size = check_regular(path, what)
-        check_size(path, what, size, MOST_MESH_BYTES)
+        size = check_regular(path, "file")
+        check_size(path, "file", size, MOST_MESH_BYTES)
         self._bytes += size
         require(
             self._bytes <= MOST_FILES_BYTES,
@@ -117,7 +150,7 @@ class _Model:
         )
         return size
 
-    def count_cells(self, path: Path, cells: float) -> None:
+    def _count_cells(self, path: Path, cells: float) -> None:
         self._cells += int(min(cells, 1e18))
         require(
             self._cells <= MOST_CELLS,
@@ -125,76 +158,19 @@ class _Model:
         )
 
 
-class _File:
-    """One file of a model: its elements and where the files that they name may stand."""
-
-    def __init__(self, model: _Model, path: Path, root: ET.Element) -> None:
-        self._model, self._path = model, path
-        named = {
-            compiler.get(key, "")
-            for compiler in root.iter("compiler")
-            for key in ("assetdir", "meshdir", "texturedir")
-        }
-        folders = {path.parent, model._folder}
-        self._places = [folder / name for folder in folders for name in sorted({"", *named})]
-        self._models = {
-            one.get("name") or Path(one.get("file", "")).stem: one.get("file", "")
-            for one in root.iter("model")
-        }
-
-    def weight(self, element: ET.Element) -> float:
-        """How many elements MuJoCo makes of it and all within it."""
-        self._check_sizes(element)
-        inside = 1 + sum(self.weight(child) for child in element)
-        inside += sum(self._named(element))
-        return inside * _COUNTS.get(element.tag, _once)(element.attrib)
-
-    def _named(self, element: ET.Element) -> Iterator[float]:
-        """Weights of the files that it names: of a model its elements, of a grid its vertices."""
-        if element.tag in ("include", "model"):
-            for found in self._model.included(self._path, element.get("file", "")):
-                yield self._model.weight_of(found)
-            return
-        if element.tag == "attach":
-            name = self._models.get(element.get("model", ""), "")
-            for found in self._model.included(self._path, name) if name else ():
-                yield self._model.weight_of(found)
-        for key, name in element.attrib.items():
-            if key.startswith("file") and name:
-                for found in self._candidates(name):
-                    try:
-                        size = self._model.count_file(found, "file")
-                    except InputError as error:
-                        tag = printable(element.tag)
-                        raise InputError(f"{self._path}: <{tag}> names {error}") from None
-                    if element.tag == "flexcomp":
-                        yield size / VERTEX_BYTES
-                    elif element.tag == "hfield":
-                        self._model.count_cells(self._path, _pixels(found))
-
-    def _candidates(self, name: str) -> set[Path]:
-        """Where a file may stand; the last part of its name alone counts under `strippath`."""
-        names = {name, re.split(r"[\\/]", name)[-1]}
-        places = {place / each for place in self._places for each in names if each}
-        return {place for place in places if os.path.lexists(place) and not place.is_dir()}
-
-    def _check_sizes(self, element: ET.Element) -> None:
-        tag = element.tag
-        for key, text in element.attrib.items():
-            require(
-                key in NAMES or not re.search(r"(?i)(?<!\S)[-+]?nan(?!\S)", text),
-                f"{self._path}: <{printable(tag)} {printable(key)}={quoted(text)}> is no number; "
-                "correct it",
-            )
-        for key, largest in LARGEST.get(tag, {}).items():
-            if max(_numbers(element.get(key, "")), default=0.0) > largest:
-                raise InputError(
-                    f"{self._path}: <{tag} {key}={quoted(element.get(key, ''))}> asks for more "
-                    f"than {largest:g}, which no arm needs; take it out"
-                )
-        if tag == "hfield":
-            rows, columns = (math.prod(_numbers(element.get(k, ""))) for k in ("nrow", "ncol"))
-            self._model.count_cells(self._path, rows * columns)
+def _check_sizes(path: Path, element: ET.Element) -> None:
+    tag = printable(element.tag)
+    for key, text in element.attrib.items():
+        stated = f"{path}: <{tag} {printable(key)}={quoted(text)}>"
+        require(
+            key in NAMES or not re.search(r"(?i)(?<!\S)[-+]?nan(?!\S)", text),
+            f"{stated} is no number; correct it",
+        )
+        largest = LARGEST.get(element.tag, {}).get(key, math.inf)
+        require(
+            max(_numbers(text) if largest < math.inf else (), default=0.0) <= largest,
+            f"{stated} asks for more than {largest:g}, which no arm needs; take it out",
+        )
 
 
 def _numbers(text: str) -> list[float]:
@@ -203,28 +179,15 @@ def _numbers(text: str) -> list[float]:
     return [abs(float(m[0])) * _UNITS.get(text[m.end() : m.end() + 1].upper(), 1.0) for m in found]
 
 
-def _once(given: Mapping[str, str]) -> float:
-    return 1.0
-
-
-def _product(given: Mapping[str, str]) -> float:
-    """Of all numbers of `count`; a dimension that is 0 or not there counts as one."""
-    return math.prod(max(n, 1.0) for n in _numbers(given.get("count", "")))
-
-
-def _vertices(given: Mapping[str, str]) -> float:
-    """Each vertex of a flex is a body with three slides."""
-    return 5 * max(_product(given), len(given.get("point", "").split()) / 3, 1.0)
-
-
-def _segments(given: Mapping[str, str]) -> float:
-    """Each segment of a composite is a body with joints and a geom."""
-    return 5 * max(_product(given), len(given.get("vertex", "").split()) / 3, 1.0)
-
-
-_COUNTS: dict[str, Callable[[Mapping[str, str]], float]] = {
-    "replicate": _product, "composite": _segments, "flexcomp": _vertices,
-}  # fmt: skip
+def _count(element: ET.Element) -> float:
+    """How often MuJoCo makes what an element states; a dimension that is 0 or not there counts as
+    one, and a vertex or segment is a body with three joints and a geom."""
+    if element.tag not in ("replicate", "composite", "flexcomp"):
+        return 1.0
+    count = math.prod(max(n, 1.0) for n in _numbers(element.get("count", "")))
+    if element.tag == "replicate":
+        return count
+    return 5 * max(count, *(len(element.get(k, "").split()) / 3 for k in ("point", "vertex")))
 
 
 def _pixels(path: Path) -> float:
@@ -232,8 +195,7 @@ def _pixels(path: Path) -> float:
     with open_input(path, "file of <hfield>") as handle:
         head = handle.read(24)
     if head.startswith(b"\x89PNG") and len(head) == 24:
-        width, height = struct.unpack(">II", head[16:24])
-        return float(width) * float(height)
+        return math.prod(map(float, struct.unpack(">II", head[16:24])))
     return 0.0
 
 
