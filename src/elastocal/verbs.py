@@ -25,8 +25,8 @@ if TYPE_CHECKING:
 
     from elastocal.cell.plan_wishes import Freedom, Motion, TargetBox, TargetPath, TargetPose
     from elastocal.cell.work_cell import Cell
+    from elastocal.compensation.commands import Targets
     from elastocal.compensation.compensate import Compensation
-    from elastocal.compensation.targets import Targets
     from elastocal.diagnosis.diagnosis import Diagnosis
     from elastocal.identification.intervals import IntervalKind
     from elastocal.identification.knowledge import Constraints, GaussianPrior, Knowledge
@@ -662,7 +662,7 @@ def compensate(
 
 def check_frame(frame: str) -> None:
     """Raise InputError for a frame that targets cannot stand in."""
-    from elastocal.compensation.targets import FRAMES
+    from elastocal.compensation.commands import FRAMES
 
     told = f"{option('frame')} takes {' or '.join(FRAMES)}; found {quoted(frame)}"
     require(frame in FRAMES, told)
@@ -688,7 +688,7 @@ def _targets(
 ) -> Targets:
     import numpy as np
 
-    from elastocal.compensation.targets import Targets, read_targets, targets_at
+    from elastocal.compensation.commands import Targets, read_targets, targets_at
 
     if isinstance(targets, Targets):
         return targets

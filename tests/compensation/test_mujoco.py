@@ -10,8 +10,8 @@ from support.cells import COMPLIANCE, DOWN, LOAD_POINT, kr270_cell, kr270_chain
 from support.commands import calibrated
 from support.elastic_arms import MujocoArm
 
+from elastocal.compensation.commands import targets_at
 from elastocal.compensation.compensate import compensate
-from elastocal.compensation.targets import targets_at
 from elastocal.model.calibrated_tool import tool_point
 from elastocal.model.rigid import nominal_flanges
 

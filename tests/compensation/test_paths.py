@@ -8,9 +8,8 @@ import numpy as np
 from support.cells import DOWN, kr270_cell, kr270_chain
 from support.commands import calibrated
 
-from elastocal.compensation.commands import nominal_path
+from elastocal.compensation.commands import nominal_path, targets_at
 from elastocal.compensation.compensate import compensate
-from elastocal.compensation.targets import targets_at
 from elastocal.model.calibrated_tool import tool_point
 from elastocal.model.chain import joint_limits
 from elastocal.model.rigid import nominal_flanges

@@ -7,7 +7,7 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from elastocal.compensation.targets import one_target, read_targets
+from elastocal.compensation.commands import one_target, read_targets
 from elastocal.errors import ElastocalError, InputError
 from elastocal.model.calibrated_tool import share_of_levels
 

@@ -10,6 +10,7 @@ from scipy.spatial.transform import Rotation
 from support.cells import DOWN, kr270_cell, kr270_chain
 from support.commands import calibrated, erring, tool_errors
 
+from elastocal.compensation.commands import targets_at
 from elastocal.compensation.compensate import compensate
 from elastocal.compensation.correction_table import (
     EXACT,
@@ -17,7 +18,6 @@ from elastocal.compensation.correction_table import (
     correction_table,
     joint_grid,
 )
-from elastocal.compensation.targets import targets_at
 from elastocal.errors import InputError
 from elastocal.model.calibrated_tool import tool_point
 from elastocal.model.rigid import nominal_flanges

@@ -2,12 +2,17 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
+from pathlib import Path
+from typing import Literal
 
 import numpy as np
 from numpy.typing import NDArray
+from scipy.spatial.transform import Rotation
 
-from elastocal.model.calibrated_tool import CalibratedTool
+from elastocal.errors import InputError, option, require
+from elastocal.measurements import Measurements, read_measurements
+from elastocal.model.calibrated_tool import CalibratedTool, numbers
 from elastocal.model.chain import Chain
 from elastocal.model.inverse_kinematics import (
     ARM_LENGTH,
@@ -19,6 +24,104 @@ from elastocal.model.inverse_kinematics import (
 )
 from elastocal.model.inverse_kinematics import TOLERANCE as NOMINAL_TOLERANCE
 from elastocal.units import Array, IntArray
+
+Frame = Literal["base", "tracker"]
+FRAMES: tuple[Frame, ...] = ("base", "tracker")
+
+
+@dataclass(frozen=True)
+class Targets:
+    """n targets; `table` holds their force (n, 3) N and circumstances, one row each.
+
+    `position` (n, 3) m and `rotation` (n, 3, 3) of the tool, and the forces, stand in `frame`;
+    rotation None: any.  `q` (n, joints) is the nominal command, None where it is to be found;
+    without a position the tool is to be where the nominal arm has it at q.
+    """
+
+    table: Measurements
+    frame: Frame
+    position: Array | None
+    rotation: Array | None
+    q: Array | None
+
+    def __len__(self) -> int:
+        return len(self.table)
+
+    def place(self, i: int) -> str:
+        """Where row i stands, as messages begin: file and line."""
+        return f"{self.table.source}, line {self.table.row[i]}"
+
+
+def read_targets(
+    path: str | Path, joint_kinds: tuple[str, ...], frame: Frame, force: Array | None = None
+) -> Targets:
+    """Targets of a CSV or Parquet file whose columns are those of the measurement table.
+
+    x_mm, y_mm, z_mm with rx_deg … or qw … where the rotation is prescribed, or q1_deg … alone,
+    or both: joints are then the nominal command to start from.  force_x_N … and circumstances
+    (time_s, approach_1, temperature_C, torque_1_Nm) as far as the model needs them; `force`
+    (3,) N acts where the table states none.
+
+    Raises InputError that names file, line, column and the offending text.
+    """
+    table = read_measurements(path, joint_kinds=joint_kinds, observe="targets")
+    q = table.q if table.q.shape[1] else None
+    if table.position is None:
+        extra = (
+            "; a rotation alone is no target" if table.rotation is not None and q is None else ""
+        )
+        require(
+            q is not None and table.rotation is None,
+            f"{path}: the columns x_mm,y_mm,z_mm are missing; a target needs its position, or the "
+            f"nominal command q1_deg … alone{extra}",
+        )
+        require(
+            frame == "base",
+            f"{path}: targets by q1_deg … alone are where the nominal arm has the tool, which "
+            f"stands in the base frame; leave {option('frame', 'tracker')} away, or give "
+            "x_mm,y_mm,z_mm",
+        )
+    require(
+        len(table.marker_names) == 1,
+        f"{path}: targets of the markers {', '.join(table.marker_names[:4])} … in one table; the "
+        f"point of the tool is chosen by {option('point')}: split the table by marker",
+    )
+    if force is not None:
+        require(
+            not table.force.any(),
+            f"{path}: the table has forces of its own; leave {option('load')} away or drop them",
+        )
+        table = replace(table, force=np.tile(force, (len(table), 1)))
+    rotation = table.rotation
+    matrices = None if rotation is None else Rotation.from_rotvec(rotation).as_matrix()
+    return Targets(table, frame, table.position, matrices, q)
+
+
+def one_target(text: str, frame: Frame, force: Array | None = None) -> Targets:
+    """The target "x,y,z" in mm, or "x,y,z,rx,ry,rz" with a rotation vector in degrees."""
+    what = "x,y,z in mm, or x,y,z,rx,ry,rz in mm and degrees (rotation vector)"
+    values = numbers(option("target"), text, (3, 6), what)
+    position = values[None, :3] / 1e3
+    rotation = None
+    if len(values) == 6:
+        rotation = Rotation.from_rotvec(np.radians(values[None, 3:])).as_matrix()
+    return targets_at(option("target"), position, rotation, frame, force)
+
+
+def targets_at(
+    source: str, position: Array | None, rotation: Array | None, frame: Frame,
+    force: Array | None = None, q: Array | None = None,
+) -> Targets:  # fmt: skip
+    """Targets that no table states, all under one `force` (3,) N; errors name `source`."""
+    known = position if position is not None else q
+    if known is None:
+        raise InputError(f"{source}: neither positions nor joints")
+    pull = np.zeros(3) if force is None else force
+    table = Measurements.of_poses(source, np.zeros((len(known), 0)), pull)
+    return Targets(table, frame, position, rotation, q)
+
+
+# Targets: where the tool is to be, and in which frame that is stated.
 
 # What the robot would be commanded without calibration: nominal joints along a path.
 
@@ -145,8 +248,6 @@ def jumps(task: Reaching, q: Array, usable: NDArray[np.bool_]) -> NDArray[np.int
 # Commanded joints that put the calibrated tool at its targets, near nominal commands.
 
 TOLERANCE = 1e-8  # m and rad within which a target counts as reached
-POLISHES = 20
-SETTLED = 1e-13  # rad or m
 
 
 @dataclass(frozen=True)
@@ -185,8 +286,9 @@ class Solved:
 class Commanding(BoundedSearch):
     """r(q) of the calibrated tool against its goals, searched within the joint limits.
 
-    Levenberg–Marquardt of `BoundedSearch` with the derivative through the equilibrium; where the
-    arm has more joints than the task has equations, followed by `least_correction`.
+    Levenberg–Marquardt of `BoundedSearch` with the derivative through the equilibrium.  Its steps
+    have the least norm, so that from nominal commands, from which those wanted are a few
+    milliradians away, an arm with more joints than the task has equations stays next to them.
     """
 
     def __init__(
@@ -207,50 +309,8 @@ class Commanding(BoundedSearch):
 
     def commands(self, nominal: Array, target: IntArray) -> Solved:
         """Commands for the targets (R,) near nominal ones (R, joints) within the limits."""
-        q, _ = self.solve(nominal, target)
-        equations = 3 if self.goals.rotation is None else 6
-        if self.tool.chain.n_joints > equations:
-            q = self.least_correction(q, nominal, target)
-        return self.judged(q, target)
+        return self.judged(self.solve(nominal, target)[0], target)
 
     def judged(self, q: Array, target: IntArray) -> Solved:
         """Commands q with what they miss."""
         return Solved(q, *self.misses(q, target))
-
-    def least_correction(self, q: Array, nominal: Array, target: IntArray) -> Array:
-        """The least ‖q − q₀‖ with r(q) = 0 and limits kept, from commands q that reach.
-
-        Newton's method on the conditions of Karush, Kuhn and Tucker with the curvature of r left
-        out (corrections are of the size of the errors, so that it converges in few steps):
-        δ = Jᵀλ on free joints with J δ = J (q − q₀) − r; a joint is held at its limit while Jᵀλ
-        would take it beyond.  Commands that do not reach, and those that no step improves, stay.
-        """
-        started = q.copy()
-        q = q.copy()
-        free = np.ones_like(q, dtype=bool)
-        active = np.flatnonzero(np.isfinite(self.misses(q, target)[0]))
-        for _ in range(POLISHES):
-            r, J = self.residual(q[active], target[active])
-            reachable = np.isfinite(r).all(axis=1)
-            active, r, J = active[reachable], r[reachable], J[reachable]
-            if not len(active):
-                break
-            delta = q[active] - nominal[active]
-            J_free = J * free[active][:, None, :]
-            # J δ over the free joints alone: the held ones stay where they are.
-            wanted = (J_free @ delta[..., None])[..., 0] - r
-            multiplier = np.linalg.pinv(J_free @ J_free.transpose(0, 2, 1), rcond=1e-12)
-            wish = (J.transpose(0, 2, 1) @ (multiplier @ wanted[..., None]))[..., 0]
-            goal = nominal[active] + wish
-            free[active] = (goal >= self.lower) & (goal <= self.upper)
-            trial = np.clip(goal, self.lower, self.upper)
-            moved = np.abs(trial - q[active]).max(axis=1)
-            q[active] = trial
-            active = active[moved > SETTLED]
-            if not len(active):
-                break
-        # Row by row what reaches with the smaller correction.
-        now, before = (self.judged(v, target) for v in (q, started))
-        shorter = np.linalg.norm(q - nominal, axis=1) <= np.linalg.norm(started - nominal, axis=1)
-        take = now.reached & (shorter | ~before.reached)
-        return np.where(take[:, None], q, started)

@@ -10,8 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from elastocal.above import Result
-from elastocal.compensation.commands import Commanding, Goals, Solved, jumps, nominal_path
-from elastocal.compensation.targets import Targets
+from elastocal.compensation.commands import Commanding, Goals, Solved, Targets, jumps, nominal_path
 from elastocal.errors import InsufficientDataError, option
 from elastocal.identification.checks import check_limits
 from elastocal.identification.prediction import Uncertainty, uncertainty_at
@@ -228,7 +227,7 @@ def _uncertainty(
 
 # Sentences about commands that are right but that somebody should look at.
 
-AT_LIMIT = 1e-9  # rad or m
+AT_LIMIT = 1e-4  # rad or m; a controller stops before it
 FAR = 0.05  # m: a nominal command this far from its target belongs to another frame or tool
 LARGE_CORRECTION = np.radians(2.0)
 LEVEL_SLACK = 0.01  # rad or m

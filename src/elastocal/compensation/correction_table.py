@@ -10,9 +10,8 @@ from typing import Any
 import numpy as np
 from scipy.spatial.transform import Rotation
 
-from elastocal.compensation.commands import Goals
+from elastocal.compensation.commands import Goals, Targets, targets_at
 from elastocal.compensation.compensate import Compensation, compensate
-from elastocal.compensation.targets import Targets, targets_at
 from elastocal.errors import InputError, option
 from elastocal.model.calibrated import CalibratedArm, lasting
 from elastocal.model.calibrated_tool import CalibratedTool, ToolPoint
