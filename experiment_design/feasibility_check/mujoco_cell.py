@@ -14,7 +14,7 @@ from numpy.typing import ArrayLike
 from scipy.spatial.transform import Rotation
 
 from elastocal.cell.work_cell import Cell
-from elastocal.cell.workspace_rules import Solid
+from elastocal.cell.work_cell import Solid
 from elastocal.model.chain import Chain
 from elastocal.planning.bodies import HANGING, WORLD, Body, Pair, data_base
 

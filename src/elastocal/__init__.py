@@ -18,8 +18,7 @@ from typing import TYPE_CHECKING, Any
 if TYPE_CHECKING:
     from elastocal.above import effects
     from elastocal.cell.arm_description import Robot, Tool, Tracker
-    from elastocal.cell.work_cell import Cell, read_cell
-    from elastocal.cell.workspace_rules import Workspace
+    from elastocal.cell.work_cell import Cell, Workspace, read_cell
     from elastocal.compensation.compensate import Compensation
     from elastocal.diagnosis.changes import Comparison, compare
     from elastocal.diagnosis.diagnosis import Diagnosis

@@ -18,8 +18,7 @@ from elastocal.cell.arm_description import (
     Tracker,
 )
 from elastocal.cell.plan_wishes import DesignSpec, Motion, TargetBox, TargetPose
-from elastocal.cell.work_cell import Cell
-from elastocal.cell.workspace_rules import HalfSpace, Solid, Visibility, Workspace
+from elastocal.cell.work_cell import Cell, HalfSpace, Solid, Visibility, Workspace
 from elastocal.errors import InputError
 
 FILE = """

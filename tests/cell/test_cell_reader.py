@@ -9,8 +9,7 @@ from hypothesis import strategies as st
 
 from elastocal.cell.arm_description import CartesianNoise, EffectChoice, PolarNoise
 from elastocal.cell.plan_wishes import DesignSpec
-from elastocal.cell.work_cell import read_cell
-from elastocal.cell.workspace_rules import Workspace
+from elastocal.cell.work_cell import Workspace, read_cell
 from elastocal.errors import InputError
 
 ROBOT = '[robot]\nurdf = "arm.urdf"\n'

@@ -8,7 +8,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from elastocal.cell.file_keys import Spot, direction
-from elastocal.cell.workspace_rules import Workspace
+from elastocal.cell.work_cell import Workspace
 
 CELL = """
 [robot]

@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 from support.rivals import ECCENTRIC, SCALE, campaign, diagnosis_of, measured
 
-from elastocal.cell.workspace_rules import Workspace
+from elastocal.cell.work_cell import Workspace
 from elastocal.diagnosis.extra_poses import plan_extra
 from elastocal.errors import InputError
 from elastocal.measurements import Measurements, read_plan

@@ -11,7 +11,7 @@ from support.cells import DOWN, kr270_chain, random_poses
 from support.design_cells import plan_cell, setup_of
 
 from elastocal.cell.plan_wishes import Motion
-from elastocal.cell.workspace_rules import Solid, Workspace
+from elastocal.cell.work_cell import Solid, Workspace
 from elastocal.errors import InputError
 from elastocal.planning.checkpoint import Checkpoint
 from elastocal.planning.design import DesignOptions, _Design

@@ -15,8 +15,7 @@ from support.design_cells import plan_cell, setup_of
 from support.robots import KR270
 
 from elastocal.cell.plan_wishes import DesignSpec, Motion, TargetPose
-from elastocal.cell.work_cell import Cell, read_cell
-from elastocal.cell.workspace_rules import Solid, Workspace
+from elastocal.cell.work_cell import Cell, Solid, Workspace, read_cell
 from elastocal.errors import InputError
 from elastocal.planning import test_poses as target_poses
 from elastocal.planning.candidates import joint_space

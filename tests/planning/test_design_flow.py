@@ -18,8 +18,7 @@ from support.robots import packaged_urdf
 
 from elastocal.cell.arm_description import Robot
 from elastocal.cell.plan_wishes import Motion, TargetPose
-from elastocal.cell.work_cell import Cell
-from elastocal.cell.workspace_rules import CarriedBody, HalfSpace, HangingLoad, Solid, Workspace
+from elastocal.cell.work_cell import CarriedBody, Cell, HalfSpace, HangingLoad, Solid, Workspace
 from elastocal.model.chain import Chain, joint_limits
 from elastocal.model.urdf import read_urdf
 from elastocal.planning import design as design_module

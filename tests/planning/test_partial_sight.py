@@ -12,7 +12,7 @@ from support.cells import DOWN, TABLE_2
 
 import elastocal as ec
 from elastocal.cell.arm_description import Tool, Tracker
-from elastocal.cell.workspace_rules import Visibility, Workspace
+from elastocal.cell.work_cell import Visibility, Workspace
 from elastocal.model.observations import observe
 from elastocal.planning.information import observed_weights
 

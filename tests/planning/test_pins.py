@@ -12,7 +12,7 @@ from support.cells import DOWN
 from support.design_cells import plan_cell
 
 import elastocal as ec
-from elastocal.cell.workspace_rules import HalfSpace, Workspace
+from elastocal.cell.work_cell import HalfSpace, Workspace
 from elastocal.errors import InputError
 from elastocal.planning.feasibility import NEARBY
 from elastocal.planning.plan import Plan

@@ -11,7 +11,7 @@ from scipy.spatial.transform import Rotation
 from support.cells import TABLE_2, kr270_cell, kr270_chain, nominal_flanges, random_poses
 
 from elastocal.cell.arm_description import Nominal, Tracker
-from elastocal.cell.workspace_rules import HalfSpace, Solid, Workspace
+from elastocal.cell.work_cell import HalfSpace, Solid, Workspace
 from elastocal.report.arm_view import plan_figure, write_plan_picture
 
 PLACED = np.eye(4)

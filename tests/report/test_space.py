@@ -14,7 +14,7 @@ from support.cells import TABLE_2, kr270_cell, kr270_chain, nominal_flanges
 from support.robots import packaged_urdf
 
 from elastocal.cell.arm_description import Robot
-from elastocal.cell.workspace_rules import Solid, Workspace
+from elastocal.cell.work_cell import Solid, Workspace
 from elastocal.model.manipulator import load_chain
 from elastocal.report.arm_view import (
     frames_at,

@@ -26,7 +26,6 @@ from elastocal.export.exportable import (
     keep,
     link_inertias,
 )
-from elastocal.export.joint_correction import JointCorrection
 from elastocal.export.mjcf_file import (
     RIGID,
     HeldArm,
@@ -35,7 +34,7 @@ from elastocal.export.mjcf_file import (
     calibrated_mjcf,
     corrected_mjcf,
 )
-from elastocal.export.refit import Refit, refitted
+from elastocal.export.refit import JointCorrection, Refit, refitted
 from elastocal.export.urdf_file import (
     BASE,
     FLANGE,

@@ -12,8 +12,7 @@ from typing import Any, Literal, get_args
 import numpy as np
 from numpy.typing import NDArray
 
-from elastocal.cell.work_cell import Cell
-from elastocal.cell.workspace_rules import CarriedBody, HalfSpace, HangingLoad, Solid, Workspace
+from elastocal.cell.work_cell import CarriedBody, Cell, HalfSpace, HangingLoad, Solid, Workspace
 from elastocal.errors import InputError
 from elastocal.files import check_regular, check_size
 from elastocal.model.chain import Chain

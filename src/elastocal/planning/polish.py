@@ -19,8 +19,7 @@ from typing import Any
 import casadi as ca
 import numpy as np
 
-from elastocal.cell.work_cell import Cell
-from elastocal.cell.workspace_rules import HalfSpace, Solid
+from elastocal.cell.work_cell import Cell, HalfSpace, Solid
 from elastocal.model import rigid
 from elastocal.model.chain import Chain
 from elastocal.model.effects.loads import STANDARD_GRAVITY

@@ -14,8 +14,7 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from elastocal.cell.work_cell import Cell
-from elastocal.cell.workspace_rules import HalfSpace, Solid
+from elastocal.cell.work_cell import Cell, HalfSpace, Solid
 from elastocal.errors import ElastocalError, require
 from elastocal.files import atomic_write_bytes
 from elastocal.model.chain import Chain

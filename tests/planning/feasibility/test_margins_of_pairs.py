@@ -18,7 +18,7 @@ from planning.feasibility.small_cells import (
 )
 
 from elastocal.cell.arm_description import Tool
-from elastocal.cell.workspace_rules import CarriedBody, HalfSpace, HangingLoad, Solid, Workspace
+from elastocal.cell.work_cell import CarriedBody, HalfSpace, HangingLoad, Solid, Workspace
 from elastocal.errors import InputError
 from elastocal.planning.feasibility import POSE_SLACK, Feasibility
 

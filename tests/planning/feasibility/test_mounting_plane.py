@@ -9,7 +9,7 @@ import pytest
 from support.cells import kr270_chain
 from support.design_cells import plan_cell
 
-from elastocal.cell.workspace_rules import HalfSpace, Workspace
+from elastocal.cell.work_cell import HalfSpace, Workspace
 from elastocal.planning.feasibility import Feasibility
 
 CHAIN, CELL = kr270_chain(), plan_cell()

@@ -22,7 +22,7 @@ from planning.feasibility.small_cells import (
 from planning.feasibility.test_margins_of_pairs import kr270_cell
 
 from elastocal.cell.arm_description import EffectChoice, Tool, Tracker
-from elastocal.cell.workspace_rules import (
+from elastocal.cell.work_cell import (
     HalfSpace,
     HangingLoad,
     Visibility,

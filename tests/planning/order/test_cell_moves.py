@@ -8,7 +8,7 @@ from planning.feasibility.small_cells import breaking
 from support.cells import kr270_cell, kr270_chain, random_poses
 
 from elastocal.cell.plan_wishes import Motion
-from elastocal.cell.workspace_rules import CarriedBody, HalfSpace, HangingLoad, Solid, Workspace
+from elastocal.cell.work_cell import CarriedBody, HalfSpace, HangingLoad, Solid, Workspace
 from elastocal.errors import InsufficientDataError
 from elastocal.planning.execution import schedule
 from elastocal.planning.feasibility import Feasibility

@@ -13,7 +13,7 @@ from support.calibration import cell_of, planar_chain
 
 from elastocal.cell.arm_description import CartesianNoise, Nominal, Tracker
 from elastocal.cell.plan_wishes import DesignSpec
-from elastocal.cell.workspace_rules import Workspace
+from elastocal.cell.work_cell import Workspace
 from elastocal.model.manipulator import Model
 from elastocal.planning.candidates import Candidates, JointSpace, draw, joint_space
 from elastocal.planning.criteria import CRITERIA, CriterionInputs, ScenarioCriterion

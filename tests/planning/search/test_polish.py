@@ -8,7 +8,7 @@ from typing import Any
 import numpy as np
 import pytest
 
-from elastocal.cell.workspace_rules import HalfSpace, Solid, Workspace
+from elastocal.cell.work_cell import HalfSpace, Solid, Workspace
 from elastocal.planning.criteria import inverse
 from elastocal.planning.exchange import random_plan
 from elastocal.planning.polish import estimate, polish
