@@ -2,8 +2,6 @@
 
 import numpy as np
 import pytest
-from hypothesis import given
-from hypothesis import strategies as st
 from support.tracker_exports import MARKERS, imported, kr270_readings, krl
 
 from elastocal.errors import InputError
@@ -72,27 +70,6 @@ def test_every_unit_and_sense_gives_the_positions_back(
     found = brought_in(tmp_path, readings, polar, length, angle, height, extra)
     np.testing.assert_allclose(found.table.position * 1e3, points, rtol=0, atol=1e-6)
     assert found.warnings == ()
-
-
-@given(
-    st.floats(1e-3, 1e5), st.floats(0, 400), st.floats(0, 400), st.booleans(),
-    st.sampled_from(["deg", "gon", "rad"]),
-)  # fmt: skip
-def test_the_length_is_the_range_whatever_the_angles(d, az, zen, clockwise, unit):
-    from elastocal.importing.records import Records, Understood, with_positions
-
-    scale = TURN[unit] / 400
-    observed = Understood("p", None, "points", "utf-8", "", ".", (), (), 1, ())
-    numbers = {"range": np.array([d]), "azimuth": np.array([az * scale]),
-               "zenith": np.array([zen * scale * (1 - 1e-15)])}  # fmt: skip
-    units = {"range": "mm", "azimuth": unit, "zenith": unit}
-    records = Records(("p",), np.zeros(1, int), np.array([2]), numbers, units, {}, None, observed)
-    found = with_positions(records, clockwise)
-    assert set(found.numbers) == set(found.units) == set("xyz")
-    assert set(found.units.values()) == {"mm"}
-    assert np.hypot(np.hypot(*(found.numbers[k][0] for k in "xy")), found.numbers["z"][0]) == (
-        pytest.approx(d, rel=1e-12)
-    )
 
 
 def test_no_unit_of_an_angle_is_guessed(tmp_path, readings):

@@ -20,7 +20,6 @@ from elastocal.cell.work_cell import Cell
 from elastocal.errors import InputError
 from elastocal.identification.mistakes import NominalFit, nominal_fit
 from elastocal.importing.joining import (
-    DEFAULT,
     Joined,
     groups_alike,
     join,
@@ -49,7 +48,7 @@ from elastocal.model.chain import joint_limits
 from elastocal.model.manipulator import load_chain
 from elastocal.tables import Family, column, csv_text
 from elastocal.text import did_you_mean, listed, quoted
-from elastocal.units import Array, IntArray, convert, quantities
+from elastocal.units import Array, IntArray
 
 GRAVITY = 9.80665  # m/s², standard
 UNLOADED = ("none", "unloaded", "0")
@@ -167,7 +166,6 @@ def with_loads_of_names(
     return made, {name: np.array([0.0, 0.0, -size]) for name, size in known.items()}, told
 
 
-OWN_DEFAULT = {"sigma_cartesian": "um", "sigma_polar": "um"}
 WHOLE = re.compile(r"-?[0-9]{1,15}")
 LABELS = ("configuration", "repeat", "marker")
 
@@ -207,9 +205,7 @@ def assemble(where: str, points: Records, log: Records | None, joined: Joined | 
             f"{where}: no joint values; map q1_deg … in [source.columns], or add a [[source]] with "
             'role = "joints"'
         )
-    kinds = tuple(
-        "revolute" if "angle" in quantities(units[stem]) else "prismatic" for stem in stems
-    )
+    kinds = tuple("revolute" if units[stem] == "deg" else "prismatic" for stem in stems)
     forces = forces_of(where, points, loads)
     if forces is not None:
         for k, axis in enumerate("xyz"):
@@ -317,22 +313,10 @@ def _repeats(points: Records, rows: IntArray, keys: list[tuple]) -> IntArray:
 def _family(
     where: str, family: Family, numbers: dict[str, Array], units: dict[str, str]
 ) -> dict[str, Array]:
-    """The columns of a family in one unit that the table takes, {} where there is none."""
-    present = [stem for stem in family.units if stem in numbers]
-    if not present:
-        return {}
-    chosen: dict[tuple[str, ...], str] = {}
-    columns = {}
-    for stem in present:
-        taken = family.units[stem]
-        if taken not in chosen:
-            alike = {units[s] for s in present if family.units[s] == taken}
-            (only, *more) = sorted(alike)
-            general = OWN_DEFAULT.get(family.name) or DEFAULT[quantities(units[stem])[0]]
-            chosen[taken] = only if not more and only in taken else general
-        columns[column(stem, chosen[taken])] = convert(numbers[stem], units[stem], chosen[taken])
+    """The columns of a family, {} where there is none."""
+    columns = {column(s, units[s]): numbers[s] for s in family.units if s in numbers}
     missing = [stem for stem in family.units if stem not in numbers]
-    if missing:
+    if columns and missing:
         raise InputError(
             f"{where}: {listed(columns)} without {listed(missing)}; the table needs all columns of "
             f"the {family.meaning}: add them to [source.columns]"

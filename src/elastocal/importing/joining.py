@@ -13,7 +13,7 @@ from elastocal.errors import InputError, require
 from elastocal.importing.mapping_file import JoinTable, JointsTable
 from elastocal.importing.records import Records, joint_stems
 from elastocal.text import listed
-from elastocal.units import Array, IntArray, convert, quantities
+from elastocal.units import Array, IntArray
 
 
 def with_joints(
@@ -50,13 +50,11 @@ def with_joints(
     n = len(values)
     _check_lengths(where, joints, n)
     for j in range(n):
-        revolute = "angle" in quantities(units[j])
-        if joints.sign is not None and joints.sign[j] != 1:
+        if joints.sign is not None:
             values[j] = values[j] * joints.sign[j]
-        given = joints.offset_deg if revolute else joints.offset_mm
-        if given is not None and given[j] != 0:
-            offset = convert(np.array([given[j]]), "deg" if revolute else "mm", units[j])
-            values[j] = values[j] + offset
+        given = joints.offset_deg if units[j] == "deg" else joints.offset_mm
+        if given is not None:
+            values[j] = values[j] + given[j]
     before = list(values)
     for k, coupling in enumerate(joints.coupling or ()):
         for name in ("joint", "of"):
@@ -67,12 +65,12 @@ def with_joints(
                 "joints",
             )
         j, i = coupling.joint - 1, coupling.of - 1
-        if quantities(units[j]) != quantities(units[i]):
+        if units[j] != units[i]:
             raise InputError(
                 f"{where}: [joints] coupling no. {k + 1} joins a revolute and a prismatic joint; "
                 "give the factor in other units outside the mapping"
             )
-        values[j] = values[j] + coupling.factor * convert(before[i], units[i], units[j])
+        values[j] = values[j] + coupling.factor * before[i]
     numbers = {s: v for s, v in records.numbers.items() if s not in stems}
     own = {s: u for s, u in records.units.items() if s not in stems}
     for j in range(n):
@@ -131,13 +129,6 @@ def _check_lengths(where: str, joints: JointsTable, n: int) -> None:
         require(abs(value) == 1, f"{where}: [joints] sign takes 1 or -1 per joint; found {value:g}")
 
 
-# What columns whose files disagree, or whose unit the measurement table does not take, become.
-DEFAULT = {
-    "length": "mm", "angle": "deg", "time": "s", "force": "N", "torque": "Nm",
-    "temperature": "C", "number": "",
-}  # fmt: skip
-
-
 def pooled(records: Sequence[Records]) -> Records:
     """The rows of all files, in the order of the files.
 
@@ -150,17 +141,10 @@ def pooled(records: Sequence[Records]) -> Records:
         _same("labels", first, other, set(first.labels) - loads, set(other.labels) - loads)
         _same("times", first, other, {"time"} if first.time is not None else set(),
               {"time"} if other.time is not None else set())  # fmt: skip
-    units = {}
-    for stem in first.numbers:
-        unit = first.units[stem]
-        alike = all(r.units[stem] == unit for r in records)
-        units[stem] = unit if alike else DEFAULT[quantities(unit)[0]]
     loaded = any(r.load is not None or "load" in r.labels for r in records)
     return Records.stacked([
         replace(
             r,
-            units=units,
-            numbers={s: convert(r.numbers[s], r.units[s], unit) for s, unit in units.items()},
             labels={s: texts for s, texts in r.labels.items() if s != "load"}
             | ({"load": _loads(r)} if loaded else {}),
         )

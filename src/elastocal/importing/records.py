@@ -72,8 +72,9 @@ class Understood:
 class Records:
     """n rows of `files`; `file` (n,) and `line` (n,) say where each stands.
 
-    `numbers` stem → (n,) in `units[stem]`; `texts` and `labels` (configuration, marker, repeat,
-    load) → n texts; `time` (n,) s on the file's clock; `load` of all rows, where one is stated.
+    `numbers` stem → (n,) in `units[stem]`, the units of the table to be written; `texts` and
+    `labels` (configuration, marker, repeat, load) → n texts; `time` (n,) s on the file's clock;
+    `load` of all rows, where one is stated.
     """
 
     files: tuple[str, ...]
@@ -120,9 +121,7 @@ class Records:
 
     def spread(self, deg: float, mm: float) -> Array:
         """(joints,) these tolerances in the unit of each joint."""
-        ways = {True: (deg, "deg"), False: (mm, "mm")}
-        each = [(ways["angle" in quantities(u)], u) for u in self.q_units]
-        return np.array([convert(np.array([size]), unit, u)[0] for (size, unit), u in each])
+        return np.array([deg if unit == "deg" else mm for unit in self.q_units])
 
     def take(self, rows: IntArray) -> Records:
         """The rows of these numbers."""
@@ -161,6 +160,18 @@ def _taken(texts: dict[str, list[str]], rows: IntArray) -> dict[str, list[str]]:
 def _stacked(parts: Sequence[tuple[dict[str, list[str]], int]]) -> dict[str, list[str]]:
     stems = dict.fromkeys(stem for part, _ in parts for stem in part)
     return {s: [text for part, n in parts for text in part.get(s, [""] * n)] for s in stems}
+
+
+# Units of the measurement table that import writes.
+_UNITS = {
+    "length": "mm", "angle": "deg", "time": "s", "force": "N", "torque": "Nm",
+    "temperature": "C", "number": "",
+}  # fmt: skip
+
+
+def table_unit(stem: str, unit: str) -> str:
+    """The unit in which a column that a file has in `unit` is written."""
+    return "um" if stem.startswith("sigma_") else _UNITS[quantities(unit)[0]]
 
 
 def joint_stems(numbers: Iterable[str]) -> list[str]:
@@ -230,20 +241,21 @@ def _read(
     )
     line = np.array([number for number, _ in kept], dtype=np.int64)
     time: Array | None = None
-    numbers: dict[str, Array] = {}
+    numbers, of = dict[str, Array](), dict[str, str]()
     for c, own in zip(numeric, np.array(values).reshape(len(kept), -1).T, strict=True):
         if c.target.stem == "time":  # seconds and nanoseconds add up
             time = convert(own, c.unit, "s") + (0.0 if time is None else time)
         else:
-            spread = c.target.stem.startswith("sigma_") and source.coverage_factor
-            numbers[c.target.stem] = own / spread if spread else own
+            stem = c.target.stem
+            spread = stem.startswith("sigma_") and source.coverage_factor
+            of[stem] = table_unit(stem, c.unit)
+            numbers[stem] = convert(own, c.unit, of[stem]) / (spread or 1.0)
     texts = _texts([row for _, row in kept], columns)
     written = texts.pop("time_text", None)
     if written is not None and time is None:
         form = source.time_format or ()
         formats = [form] if isinstance(form, str) else form
         time = np.array(seconds_of(name, line.tolist(), written, formats))
-    of = {c.target.stem: c.unit for c in numeric if c.target.stem in numbers}
     file = np.zeros(len(line), dtype=np.int64)
     return Records((name,), file, line, numbers, of, texts, time, understood, source.load)
 
@@ -356,7 +368,7 @@ def is_spherical(records: Records) -> bool:
 
 
 def with_positions(records: Records, clockwise: bool = False) -> Records:
-    """The records with x, y, z in the unit of the range, where the file has spherical coordinates.
+    """The records with x, y, z, where the file has spherical coordinates.
 
     With range d, azimuth α and zenith angle ζ (π/2 − elevation), in a right-handed frame with z up
     and x at azimuth zero:
@@ -370,18 +382,16 @@ def with_positions(records: Records, clockwise: bool = False) -> Records:
     if not is_spherical(records):
         return records
     height = _height(records)
-    numbers, units = dict(records.numbers), dict(records.units)
+    numbers = dict(records.numbers)
     d = numbers.pop("range")
-    alpha = np.radians(convert(numbers.pop("azimuth"), units["azimuth"], "deg"))
-    angle = convert(numbers.pop(height), units[height], "deg")
+    alpha, angle = np.radians(numbers.pop("azimuth")), numbers.pop(height)
     _check_spherical(records, d, height, angle)
     zeta = np.radians(angle if height == "zenith" else 90.0 - angle)
     level = d * np.sin(zeta)
     y = level * np.sin(alpha)
     numbers |= {"x": level * np.cos(alpha), "y": -y if clockwise else y, "z": d * np.cos(zeta)}
-    unit = units["range"]
-    kept = {stem: u for stem, u in units.items() if stem not in SPHERICAL}
-    return replace(records, numbers=numbers, units=kept | dict.fromkeys("xyz", unit))
+    kept = {stem: unit for stem, unit in records.units.items() if stem not in SPHERICAL}
+    return replace(records, numbers=numbers, units=kept | dict.fromkeys("xyz", "mm"))
 
 
 def _height(records: Records) -> str:
@@ -414,7 +424,7 @@ def _check_spherical(records: Records, d: Array, height: str, angle: Array) -> N
     if not (d > 0).all():
         i = int(np.argmin(d > 0))
         raise InputError(
-            f"{records.where(i)}: a range of {d[i]:g} {records.units['range']}; a distance is "
+            f"{records.where(i)}: a range of {d[i]:g} mm; a distance is "
             "positive: correct the line, or the column of range in [source.columns]"
         )
     low, high, other = (0.0, 360.0, "elevation") if height == "zenith" else (-90.0, 90.0, "zenith")
@@ -423,7 +433,7 @@ def _check_spherical(records: Records, d: Array, height: str, angle: Array) -> N
         i = int(np.argmax(off))
         raise InputError(
             f"{records.where(i)}: {height} of {angle[i]:.6g}°, which lies beyond {low:g}° to "
-            f"{high:g}°; is it an angle of another unit, or {other}_{records.units[height]}?"
+            f"{high:g}°; is it an angle of another unit, or {other}_deg?"
         )
 
 
