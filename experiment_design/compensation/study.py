@@ -22,8 +22,8 @@ from joblib import Parallel, delayed
 from scipy.spatial.transform import Rotation
 from scipy.stats import chi2
 
-from elastocal.compensation.compensate import compensate
 from elastocal.compensation.commands import read_targets
+from elastocal.compensation.compensate import compensate
 from elastocal.model.calibrated import read_calibrated
 from elastocal.model.calibrated_tool import tool_point
 

@@ -19,8 +19,7 @@ import numpy as np
 import elastocal as ec
 from elastocal.cell.arm_description import CartesianNoise, ModelSpec, Nominal, Robot, Tool, Tracker
 from elastocal.cell.plan_wishes import DesignSpec, TargetPose
-from elastocal.cell.work_cell import Cell
-from elastocal.cell.work_cell import Workspace
+from elastocal.cell.work_cell import Cell, Workspace
 from elastocal.model.manipulator import Model
 from elastocal.planning.candidates import draw
 from elastocal.planning.choices import single_ways

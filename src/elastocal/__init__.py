@@ -43,8 +43,7 @@ __version__ = "0.1.0"
 ROOMS = {
     "above": "effects",
     "cell.arm_description": "Robot Tool Tracker",
-    "cell.work_cell": "Cell read_cell",
-    "cell.workspace_rules": "Workspace",
+    "cell.work_cell": "Cell Workspace read_cell",
     "compensation.compensate": "Compensation",
     "diagnosis.diagnosis": "Diagnosis",
     "diagnosis.changes": "Comparison compare",
