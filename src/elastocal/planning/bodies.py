@@ -43,11 +43,18 @@ def hull(solid: Solid) -> tuple[Array, float]:
 
 def few_points(solid: Solid) -> tuple[Array, float]:
     """As `hull`, but a mesh is the box around it, so that k ≤ 8."""
-    points, radius = hull(solid)
-    if len(points) > len(CORNERS):
-        low, high = points.min(axis=0), points.max(axis=0)
-        points = (low + high) / 2 + CORNERS * (high - low)
-    return points, radius
+    return hull(boxed(solid))
+
+
+def boxed(solid: Solid) -> Solid:
+    """A mesh as the box around it, along its own axes."""
+    if solid.shape != "mesh":
+        return solid
+    points = mesh_hull(solid)[0]
+    low, high = points.min(axis=0), points.max(axis=0)
+    middle = np.eye(4)
+    middle[:3, 3] = (low + high) / 2
+    return Solid(solid.name, "box", high - low, solid.placement @ middle)
 
 
 def support(solid: Solid, direction: Array) -> float:

@@ -313,12 +313,15 @@ class StaticTorque:
         tool = replace(cell.tool, markers={"tool": np.zeros(3)})
         symbolic = SymbolicArm(chain, replace(cell, tool=tool, model=model))
         arm = symbolic.arm
+        nominal = [p.nominal for p in symbolic.parameters]
         torque = ca.gradient(arm.potential, arm.q_commanded)
-        self._nominal = np.array([p.nominal for p in symbolic.parameters])
-        self._compiled = BatchFunction([arm.inputs["q"], arm.inputs["force"], symbolic.p], [torque])
+        torque = ca.substitute(torque, symbolic.p, ca.DM(nominal))
+        inputs = [arm.inputs["q"], arm.inputs["force"]]
+        self.symbolic = ca.Function("torque", inputs, [torque])
+        self._compiled = BatchFunction(inputs, [torque])
 
     def __call__(self, poses: Poses) -> Array:
-        return self._compiled(poses.q, poses.force, self._nominal)[0][..., 0]
+        return self._compiled(poses.q, poses.force)[0][..., 0]
 
 
 # How far a body can move during a part of a joint interpolation, at most.

@@ -22,11 +22,10 @@ import numpy as np
 from elastocal.cell.work_cell import Cell, HalfSpace, Solid
 from elastocal.model import rigid
 from elastocal.model.chain import Chain
-from elastocal.model.effects.loads import STANDARD_GRAVITY
 from elastocal.model.symbolic import SymbolicArm, configuration_rows
-from elastocal.planning.bodies import HANGING, WORLD, Body, Pair, data_base, few_points, mesh_hull
+from elastocal.planning.bodies import HANGING, WORLD, Body, Pair, boxed, data_base, few_points
 from elastocal.planning.candidates import CHUNK, JointSpace, sobol
-from elastocal.planning.collision import arm_frames
+from elastocal.planning.collision import StaticTorque, arm_frames
 from elastocal.planning.criteria import TangentBound, inverse
 from elastocal.planning.feasibility import POSE_SLACK, Feasibility
 from elastocal.planning.information import PoseInformation
@@ -59,7 +58,7 @@ def margins(cell: Cell, chain: Chain, pairs: Iterable[Pair], forces: Array) -> c
         *(_clearance(arm, pair) for pair in pairs if loaded or not pair.hangs),
         *(_rope_angle(cell, arm) if loaded else ()),
         *_sight(cell, arm),
-        *_torques(cell, chain, arm, q, forces),
+        *_torques(cell, chain, q, forces),
     ]
     if not found:
         return None
@@ -72,7 +71,6 @@ class _Frames:
 
     carriers: dict[int, ca.SX]
     flange: ca.SX
-    load_point: ca.SX
 
     @classmethod
     def of(cls, cell: Cell, chain: Chain, q: ca.SX) -> _Frames:
@@ -80,7 +78,7 @@ class _Frames:
         carriers = {WORLD: ca.SX.eye(4), **dict(enumerate(frames))}
         load_point = rigid.point(flange, rigid.constant(cell.tool.load_point))
         carriers[HANGING] = rigid.transform(translation=load_point)
-        return cls(carriers, flange, load_point)
+        return cls(carriers, flange)
 
     def point(self, body: Body, p: Array) -> ca.SX:
         return rigid.point(self.carriers[body.carrier], rigid.constant(p))
@@ -132,18 +130,11 @@ def _sight(cell: Cell, arm: _Frames) -> Iterator[ca.SX]:
             yield ca.dot(towards, sight) / distance - np.cos(rules.max_incidence)
 
 
-def _torques(cell: Cell, chain: Chain, arm: _Frames, q: ca.SX, forces: Array) -> Iterator[ca.SX]:
-    """1 − (τ/limit)² with τ = −∂V/∂q, V the potential of the load and, where known, the links."""
-    limits = np.array(cell.workspace.torque_limits)
-    if not len(limits):
-        return
-    weights = ca.SX(0)
-    for i, body in enumerate(chain.masses if cell.model.link_gravity else ()):
-        height = rigid.point(arm.carriers[i], rigid.constant(body.com))[2]
-        weights += body.mass * STANDARD_GRAVITY * height
-    for force in forces:
-        potential = weights - ca.dot(rigid.constant(force), arm.load_point)
-        yield 1 - (ca.gradient(potential, q) / limits) ** 2
+def _torques(cell: Cell, chain: Chain, q: ca.SX, forces: Array) -> Iterator[ca.SX]:
+    if cell.workspace.torque_limits:
+        torque = StaticTorque(cell, chain).symbolic
+        for force in forces:
+            yield 1 - (torque(q, force) / np.array(cell.workspace.torque_limits)) ** 2
 
 
 def sphere_cover(solid: Solid) -> tuple[Array, float]:
@@ -152,7 +143,7 @@ def sphere_cover(solid: Solid) -> tuple[Array, float]:
     A solid is cut into about cubic cells and a sphere put around each; a capsule's spheres
     stand on its axis, ends included.
     """
-    solid = _boxed(solid)
+    solid = boxed(solid)
     if solid.shape == "sphere":
         centres, radius = np.zeros((1, 3)), float(solid.size[0])
     elif solid.shape == "box":
@@ -173,9 +164,9 @@ def sphere_cover(solid: Solid) -> tuple[Array, float]:
 
 def excess(solid: Solid) -> float:
     """How much too thick the cover of a solid is, in m."""
-    radius = sphere_cover(solid)[1]
-    boxed = _boxed(solid)
-    return radius - float(boxed.size.min() / 2 if boxed.shape == "box" else boxed.size[0])
+    inner = boxed(solid)
+    thin = inner.size.min() / 2 if inner.shape == "box" else inner.size[0]
+    return sphere_cover(solid)[1] - float(thin)
 
 
 def signed_distance(solid: Solid, point: ca.SX) -> ca.SX:
@@ -185,7 +176,7 @@ def signed_distance(solid: Solid, point: ca.SX) -> ca.SX:
     Outside |max(p − h, 0)|, inside max(p − h), with h the half extents of a box, or the radius
     and half length of a cylinder; differentiable outside.
     """
-    solid = _boxed(solid)
+    solid = boxed(solid)
     T = np.linalg.inv(solid.placement)
     p = rigid.constant(T[:3, :3]) @ point + rigid.constant(T[:3, 3])
     if solid.shape == "sphere":
@@ -212,16 +203,6 @@ def _midpoints(count: int) -> Array:
     return (np.arange(count) + 0.5) / count - 0.5
 
 
-def _boxed(solid: Solid) -> Solid:
-    if solid.shape != "mesh":
-        return solid
-    points = mesh_hull(solid)[0]
-    low, high = points.min(axis=0), points.max(axis=0)
-    middle = np.eye(4)
-    middle[:3, 3] = (low + high) / 2
-    return Solid(solid.name, "box", high - low, solid.placement @ middle)
-
-
 ORDER = 30.0  # of the power means that stand for a criterion's kinks while IPOPT searches
 LEAST_GAIN = 1e-8  # relative improvement of Φ that counts as one
 # Shares of the way from a start to where its search ended that are tried, the rules permitting.
@@ -230,6 +211,7 @@ ROUNDS = 2  # of polish: the second with the poses held that the rules stopped o
 IPOPT_OPTIONS: dict[str, Any] = {
     "print_time": False,
     "error_on_fail": False,
+    "no_nlp_grad": True,
     "show_eval_warnings": False,
     "ipopt.print_level": 0,
     "ipopt.sb": "yes",
@@ -309,7 +291,7 @@ class JointSearch:
             self.maps.append((np.ix_(own, rows), B.map(len(own)), adjoint.map(len(own))))
         flat, self.margins = ca.MX.sym("z", q.size), None
         self.f = _Value(self, q.shape)
-        self.problem: dict[str, Any] = {"x": flat, "f": self.f(flat)}
+        self.problem: dict[str, Any] = {"x": flat, "f": self.f(flat, ca.DM(0, 1))[0]}
         if searches.margins is not None:
             g = ca.vec(searches.margins.map(len(q))(ca.reshape(flat, q.shape[1], len(q))))
             self.margins = ca.Function("g", [flat], [g])
@@ -329,10 +311,11 @@ class JointSearch:
         conservative, so a start that the exact rules allow may fall short of one: there it need
         only stay what it is.
         """
-        self.goal, self.T, self.f.last = goal, T, None
+        self.goal, self.T = goal, T
         self.whitener = inverse(self.searches.information.noise(q, self.readings)[1])
         if (most, fine) not in self.solvers:
-            options = IPOPT_OPTIONS | {"ipopt.max_iter": most} | (FINE if fine else {})
+            options = IPOPT_OPTIONS | {"ipopt.max_iter": most, "grad_f": self.f}
+            options |= FINE if fine else {}
             self.solvers[most, fine] = ca.nlpsol("polish", "ipopt", self.problem, options)
         bounds: dict[str, Any] = {"lbx": lower.ravel(), "ubx": upper.ravel()}
         if self.margins is not None:
@@ -365,55 +348,29 @@ class JointSearch:
 
 
 class _Value(ca.Callback):
-    """f(B(q)) for CasADi: evaluated by numpy, so that any criterion serves, with exact slopes."""
+    """f(B(q)) and ∂f/∂q for CasADi: evaluated by numpy, so that any criterion serves."""
 
     def __init__(self, search: JointSearch, shape: tuple[int, ...]) -> None:
         ca.Callback.__init__(self)
-        self.search, self.shape = search, shape
-        self.last: tuple[Array, float, Array] | None = None
+        self.search, self.shape, self.n = search, shape, int(np.prod(shape))
         self.construct("f", {})
 
-    def get_sparsity_in(self, i: int) -> ca.Sparsity:
-        return ca.Sparsity.dense(int(np.prod(self.shape)), 1)
-
-    def at(self, z: Any) -> tuple[float, Array]:
-        """f and ∂f/∂q (1, k n); IPOPT asks for both at the same point."""
-        q = z.full().reshape(self.shape)
-        if self.last is None or not np.array_equal(self.last[0], q):
-            value, W = self.search.goal(self.search.blocks(q))
-            self.last = q, value, self.search.slope(q, W).reshape(1, -1)
-        return self.last[1], self.last[2]
-
-    def eval(self, given: Sequence[ca.DM]) -> list:
-        return [self.at(given[0])[0]]
-
-    def has_jacobian(self) -> bool:
-        return True
-
-    def get_jacobian(self, name: str, inputs: Any, outputs: Any, options: Any) -> ca.Function:
-        self.jacobian_function = _Slope(self, name)
-        return self.jacobian_function
-
-
-class _Slope(ca.Callback):
-    """∂f/∂q (1, k n) of a `_Value`, as CasADi calls it: with q and f."""
-
-    def __init__(self, f: _Value, name: str) -> None:
-        ca.Callback.__init__(self)
-        self.f = f
-        self.construct(name, {})
-
     def get_n_in(self) -> int:
+        return 2  # q, and the parameters that a problem of CasADi has
+
+    def get_n_out(self) -> int:
         return 2
 
     def get_sparsity_in(self, i: int) -> ca.Sparsity:
-        return ca.Sparsity.dense(int(np.prod(self.f.shape)) if i == 0 else 1, 1)
+        return ca.Sparsity.dense(0 if i else self.n, 1)
 
     def get_sparsity_out(self, i: int) -> ca.Sparsity:
-        return ca.Sparsity.dense(1, int(np.prod(self.f.shape)))
+        return ca.Sparsity.dense(self.n if i else 1, 1)
 
     def eval(self, given: Sequence[ca.DM]) -> list:
-        return [ca.DM(self.f.at(given[0])[1])]
+        q = given[0].full().reshape(self.shape)
+        value, W = self.search.goal(self.search.blocks(q))
+        return [value, self.search.slope(q, W).ravel()]
 
 
 # All poses of a plan at once.
