@@ -12,15 +12,14 @@ from scipy import linalg, special
 
 from elastocal.above import Result
 from elastocal.cell.plan_wishes import TEST_POSE
-from elastocal.errors import InputError, require
 from elastocal.files import atomic_write_text
 from elastocal.measurements import DEFAULT_MARKER, Measurements, families
 from elastocal.model.manipulator import Model
-from elastocal.planning.criteria import ScenarioCriterion
+from elastocal.planning.criteria import ScenarioCriterion, inverse
 from elastocal.planning.execution import Execution, Stop
 from elastocal.planning.information import Estimable
 from elastocal.tables import column, csv_text
-from elastocal.text import is_label, json_text, quoted
+from elastocal.text import json_text
 from elastocal.units import Array, BoolArray, IntArray, to_si
 
 # What a plan promises, and why each pose is in it.
@@ -61,7 +60,7 @@ def predicted(model: Model, found: Estimable, M: Array, n_numbers: int) -> tuple
     `n_numbers` − p degrees of freedom, as identification will estimate the noise.
     """
     r, sizes = found.reduction, found.sizes
-    std = np.sqrt(np.diag(_inverse(M))) * sizes[r.kept]
+    std = np.sqrt(np.diag(inverse(M))) * sizes[r.kept]
     quantile = float(special.stdtrit(max(n_numbers - len(r.kept), 1), 0.975))
     return tuple(
         Predicted(
@@ -84,7 +83,7 @@ def reasons(
     `values` (N,): the criterion of the plan without that pose; `value`: with all.
     """
     M = prior + np.einsum("nri,nrj->ij", blocks, blocks)
-    V = _inverse(M)
+    V = inverse(M)
     names = [model.names[c] for c in found.columns]
     told = []
     for B, without in zip(blocks, values, strict=True):
@@ -100,10 +99,6 @@ def reasons(
         serves = tuple((names[k], float(growth[k])) for k in first if growth[k] > 1.005)
         told.append(Reason(float(without / value), serves))
     return tuple(told)
-
-
-def _inverse(M: Array) -> Array:
-    return np.asarray(linalg.cho_solve(linalg.cho_factor(M), np.eye(len(M))))
 
 
 # The plan on disk: plan.csv, which `simulate` takes and people measure by, and plan.json.
@@ -138,43 +133,19 @@ def plan_table(
     With `counts` (N, L), where not all poses are read in all load states, note_load and
     note_readings say what hangs and how often each marker is read.
     """
-    numbered = list(enumerate(execution.stops, start=1))
-    readings: dict[tuple[int, ...], list[tuple[int, Stop]]] = {}
-    for k, stop in sorted(
-        numbered,
-        key=lambda s: (s[1].again > 0, s[1].pose, s[1].again, s[1].side, s[1].part, s[1].load),
-    ):
-        key = (stop.pose, stop.again, stop.side, -1 if forces is None else stop.load)
-        readings.setdefault(key, []).append((k, stop))
-    rows = list(readings.values())
-    first = [row[0][1] for row in rows]
+    rows = _visits(execution.stops, by_load=forces is not None)
     sides = ("", "")
     if any(stop.side for stop in execution.stops) or execution.motion.both_directions:
         sides = ("+", "-")
-    most = max(len(row) for row in rows)
-    notes = {
-        f"note_order_{i + 1}": [str(row[i][0]) if i < len(row) else "" for row in rows]
-        for i in range(1, most)
-    }
-    if forces is None and carried is not None and carried.any():
-        names = [load_name(force) for force in carried]
-        notes |= {
-            "note_load" + (f"_{i + 1}" if i else ""): [
-                names[row[i][1].load] if i < len(row) else "" for row in rows
-            ]
-            for i in range(most)
-        }
-    if counts is not None and carried is not None:
-        notes["note_load"] = [load_name(carried[stop.load]) for stop in first]
-        notes["note_readings"] = [str(counts[stop.pose, stop.load]) for stop in first]
-    approach = [stop.approach for stop in first if stop.approach is not None]
     marker = None
     if seen is not None:
-        read = np.array([[each[stop.pose, stop.load] for each in seen.values()] for stop in first])
+        read = np.array(
+            [[each[stop.pose, stop.load] for each in seen.values()] for (_, stop), *_ in rows]
+        )
         of, marker = np.nonzero(read)
-        rows, first = [rows[k] for k in of], [first[k] for k in of]
-        approach = [approach[k] for k in of] if approach else []
-        notes = {name: [cells[k] for k in of] for name, cells in notes.items()}
+        rows = [rows[k] for k in of]
+    first = [row[0][1] for row in rows]
+    approach = [stop.approach for stop in first if stop.approach is not None]
     times = [[stop.time for _, stop in row if stop.time is not None] for row in rows]
     time = np.array([sum(each) / len(each) for each in times if each])
     names = [stop.name(configurations) + sides[stop.side] for stop in first]
@@ -198,8 +169,47 @@ def plan_table(
         time=np.round(time, 3) if len(time) else None,
         joint_kinds=tuple(kinds),
     )
-    levels = [str(level[stop.pose]) for stop in first]
-    return table, {"level": levels, "order": [str(row[0][0]) for row in rows], **notes}
+    beside = {"level": [str(level[stop.pose]) for stop in first]}
+    beside["order"] = [str(row[0][0]) for row in rows]
+    return table, beside | _notes(rows, forces is None, carried, counts)
+
+
+Visit = list[tuple[int, Stop]]  # stops in one row of the table, with their places in the order
+
+
+def _visits(stops: Sequence[Stop], by_load: bool) -> list[Visit]:
+    found: dict[tuple[int, ...], Visit] = {}
+    for k, stop in sorted(
+        enumerate(stops, start=1),
+        key=lambda s: (s[1].again > 0, s[1].pose, s[1].again, s[1].side, s[1].part, s[1].load),
+    ):
+        key = (stop.pose, stop.again, stop.side, stop.load if by_load else -1)
+        found.setdefault(key, []).append((k, stop))
+    return list(found.values())
+
+
+def _notes(
+    rows: list[Visit], loads: bool, carried: Array | None, counts: IntArray | None
+) -> dict[str, list[str]]:
+    """The places in the order behind the first, and with `loads` what hangs at each."""
+    most = range(max(len(row) for row in rows))
+    notes = {
+        f"note_order_{i + 1}": [str(row[i][0]) if i < len(row) else "" for row in rows]
+        for i in most[1:]
+    }
+    names = [] if carried is None else [load_name(force) for force in carried]
+    if loads and carried is not None and carried.any():
+        notes |= {
+            "note_load" + (f"_{i + 1}" if i else ""): [
+                names[row[i][1].load] if i < len(row) else "" for row in rows
+            ]
+            for i in most
+        }
+    if counts is not None and names:
+        first = [row[0][1] for row in rows]
+        notes["note_load"] = [names[stop.load] for stop in first]
+        notes["note_readings"] = [str(counts[stop.pose, stop.load]) for stop in first]
+    return notes
 
 
 def load_name(force: Array) -> str:
@@ -215,22 +225,10 @@ def write_plan(
     """Write plan.csv, whole or not at all; angles in degrees, travel in mm; with the forces of the
     rows or not, and `more` columns.
 
-    `measurements.read_plan` reads it back to 1e-11 rad.  Raises InputError for values that
-    are not finite, names that cannot stand in a table or repeat, and an unwritable place.
+    `measurements.read_plan` reads it back to 1e-11 rad.  Raises InputError for an unwritable place.
     """
     known = families(table.joint_kinds)
     names = [table.configuration_labels[k] for k in table.configuration]
-    for name in names:
-        if not is_label(name):
-            raise InputError(
-                f"{path}: configuration name {quoted(name)} cannot stand in a table; use one "
-                "line without blanks at its ends"
-            )
-    keys = list(zip(names, table.marker, *(table.force.T if forces else ()), strict=True))
-    require(len(set(keys)) == len(keys), f"{path}: two rows of the plan have the same name")
-    for values in (table.q, table.force):
-        if not np.isfinite(values).all():
-            raise InputError(f"{path}: the plan's joint values and forces must be finite")
     columns: dict[str, Sequence[str]] = {"configuration": names}
     if table.marker_names != (DEFAULT_MARKER,):
         columns["marker"] = [table.marker_names[k] for k in table.marker]
@@ -674,24 +672,19 @@ class Plan(Result):
                 "ascents": c.ascents,
                 "starts": list(c.starts),
             },
-            "random_plans": None if self.chance is None else asdict(self.chance),
-            "everywhere": None if self.everywhere is None else asdict(self.everywhere),
-            "gain": None if self.gain is None else asdict(self.gain),
+            "random_plans": _numbers(self.chance),
+            "everywhere": _numbers(self.everywhere),
+            "gain": _numbers(self.gain),
             "chosen": None if self.chosen is None else self.chosen.to_json(),
             "load_states": (
                 None
                 if self.states is None
                 else self.states.to_json(self.forces, self.readings, self.unit)
             ),
-            "drift": None if self.execution.drift is None else asdict(self.execution.drift),
+            "drift": _numbers(self.execution.drift),
             "predicted": [
-                {
-                    "name": p.name,
-                    "std": p.std,
-                    "unit": p.unit,
-                    "ci95_half_width": p.half_width,
-                    "combined_with": list(p.combined_with),
-                }
+                {"name": p.name, "std": p.std, "unit": p.unit, "ci95_half_width": p.half_width,
+                 "combined_with": list(p.combined_with)}
                 for p in self.predicted
             ],
             "poses": [
@@ -709,10 +702,14 @@ class Plan(Result):
                 }
                 for k, r in enumerate(self.reasons)
             ],
-            "scheduled": None if self.scheduled is None else asdict(self.scheduled),
+            "scheduled": _numbers(self.scheduled),
             "timed": [asdict(size) for size in self.timed],
             "minutes": self.execution.total / 60,
             "curve": [{"n_poses": s.poses, "value": s.value, "bound": s.bound} for s in self.curve],
             "warnings": list(self.warnings),
             "seed": self.seed,
         }  # fmt: skip
+
+
+def _numbers(record: Any) -> dict[str, Any] | None:
+    return None if record is None else asdict(record)

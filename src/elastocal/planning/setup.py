@@ -2,9 +2,9 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
 from contextlib import suppress
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, replace
+from functools import cached_property
 
 import numpy as np
 from numpy.typing import NDArray
@@ -15,7 +15,12 @@ from elastocal.identification.knowledge import GaussianPrior
 from elastocal.measurements import STILL
 from elastocal.model.manipulator import Model
 from elastocal.model.observations import observe
-from elastocal.planning.criteria import CriterionInputs, ScenarioCriterion, criterion_named
+from elastocal.planning.criteria import (
+    CriterionInputs,
+    ScenarioCriterion,
+    criterion_named,
+    triangular,
+)
 from elastocal.planning.execution import Execution
 from elastocal.planning.information import (
     Done,
@@ -39,7 +44,7 @@ from elastocal.planning.test_poses import (
     remaining_bias,
     unpredictable,
 )
-from elastocal.simulation import expand_plan, simulate, values_from
+from elastocal.simulation import expand_plan, simulate
 from elastocal.text import listed
 from elastocal.units import Array, IntArray, Progress
 
@@ -88,28 +93,49 @@ class FeasiblePool:
 
 @dataclass(frozen=True)
 class Setup:
-    """`information` over the kept parameters, `prior` (p, p) scaled, and the criterion.
+    """`information` over the kept parameters, `prior` (p, p) scaled, and what the criterion is made
+    of.
 
-    `target_rows` (r, p): |R x| is the rms error at the test poses in m, `elsewhere_rows` that over
-    all joint ranges; None where the criterion knows of none, or nothing can be said of them.
-    `share` of the criterion's weight lies on the latter, `weighed` makes the criterion of another.
-    `ways` (K, L): how a pose may be read, as readings in each load state; each candidate is one.
+    `inputs`: of the test poses alone.  `beyond`: ∂position/∂parameters (T, r, p) at poses all over
+    the joint ranges, and their weights (T,); None where nothing can be said of them.  `share` of
+    the criterion's weight lies on these.  `ways` (K, L): how a pose may be read, as readings in
+    each load state; each candidate is one.
     """
 
     information: PoseInformation
     found: Estimable
-    criterion: ScenarioCriterion
+    inputs: CriterionInputs
+    beyond: tuple[Array, Array] | None
     prior: Array
     warnings: tuple[str, ...]
-    weighed: Callable[[float], ScenarioCriterion]
-    target_rows: Array | None = None
-    elsewhere_rows: Array | None = None
+    ways: IntArray
     share: float = 0.0
-    ways: IntArray = field(kw_only=True)
+
+    @cached_property
+    def criterion(self) -> ScenarioCriterion:
+        inputs = self.inputs
+        if self.share and inputs.A is not None and self.beyond is not None:
+            own, others = inputs.target_weights(), self.beyond[1]
+            inputs = replace(
+                inputs,
+                A=np.concatenate([inputs.A, self.beyond[0]]),
+                weights=np.concatenate([(1 - self.share) * own, self.share * others]),
+            )
+        return criterion_named(inputs.criterion).of(inputs)
+
+    @cached_property
+    def target_rows(self) -> Array | None:
+        """R (r, p): |R x| is the rms error at the test poses in m, of a criterion that has some."""
+        return None if self.inputs.A is None else _root(self.inputs.A, self.inputs.target_weights())
+
+    @cached_property
+    def elsewhere_rows(self) -> Array | None:
+        """The same all over the joint ranges."""
+        return None if self.beyond is None else _root(*self.beyond)
 
     def sharing(self, share: float) -> Setup:
         """With this share of the weight on what lies beside the test poses."""
-        return replace(self, criterion=self.weighed(share), share=share)
+        return replace(self, share=share)
 
     def pool(self, q: Array, group: IntArray, readings: IntArray | None = None) -> FeasiblePool:
         """Candidates q (N, n) read as `readings` (N, L) say, or in each of the ways in turn."""
@@ -171,66 +197,56 @@ def set_up(
     found = estimable(information, q, free, prior, n_poses, stated)
     kept = found.columns
     information = replace(information, columns=kept, sizes=sizes[kept])
-    interest = interest_of(model, found)
+    # A sentence per free parameter that no feasible pose shows at all.
+    warnings = _unseen(model, found, [int(i) for i in found.structure.invisible if i in free])
     # The unit of [design] combination: that of its parameters, "" where they differ.
     units = {p.unit for p in model.parameters if p.name in spec.combination}
-    # A sentence per free parameter that no feasible pose shows at all.
-    unseen = [int(i) for i in found.structure.invisible if i in free]
-    A, beyond, warnings = None, None, _unseen(model, found, unseen)
-    own, share = None, 0.0
-    if "test_poses" in criterion_named(spec.criterion).needs:
-        T, share = len(targets.q), spec.elsewhere or 0.0
-        both = targets if region is None else targets.with_others(region, share)
-        at_work = model if work is None else work
-        rows, told = known_rows(model, at_work, both, x + (at_work.nominal - model.nominal), found)
-        warnings += told
-        A = on_kept(model, rows[:T], found)
-        if region is not None:
-            # None where no plan could make the position at all of them certain.
-            with suppress(InsufficientDataError):
-                beyond = on_kept(model, rows[T:], found)
-        if share and beyond is None:
-            raise InsufficientDataError(
-                f"{model.cell.path or model.cell.name}: [design] elsewhere asks for poses all over "
-                "the joint ranges, but the rules allow none, or no plan can make all of them "
-                "certain; leave it out"
-            )
-        own = _root(A, targets.weight)
-        warnings += _held(model, found, remaining_bias(rows, both.weight, found))
-    combination = _combination(model, found)
-    unit = units.pop() if len(units) == 1 else ""
-
-    def weighed(share: float) -> ScenarioCriterion:
-        rows, weights = A, targets.weight
-        if share and A is not None and beyond is not None and region is not None:
-            rows = np.concatenate([A, beyond])
-            weights = targets.with_others(region, share).weight
-        return criterion_named(spec.criterion).of(
-            CriterionInputs(
-                spec.criterion, len(kept), interest, rows, weights, combination,
-                unit, n_poses, information.names,
-                information.sizes,
-            )
-        )  # fmt: skip
-
-    return Setup(
+    setup = Setup(
         information,
         found,
-        weighed(share),
+        CriterionInputs(
+            spec.criterion, len(kept), interest_of(model, found),
+            combination=_combination(model, found), unit=units.pop() if len(units) == 1 else "",
+            n_poses=n_poses, names=information.names, sizes=information.sizes,
+        ),
+        None,
         prior[np.ix_(kept, kept)],
         warnings,
-        weighed,
-        own,
-        None if beyond is None or region is None else _root(beyond, region.weight),
-        share,
-        ways=information.everything,
-    )
+        information.everything,
+    )  # fmt: skip
+    if "test_poses" not in criterion_named(spec.criterion).needs:
+        return setup
+    return _aimed(setup, model if work is None else work, targets, region)
+
+
+def _aimed(setup: Setup, at_work: Model, targets: TargetPoses, region: TargetPoses | None) -> Setup:
+    """With what the criterion needs to know of the test poses."""
+    information, found = setup.information, setup.found
+    model, T = information.model, len(targets.q)
+    share = model.cell.design.elsewhere or 0.0
+    both = targets if region is None else targets.with_others(region, share)
+    x = information.x + (at_work.nominal - model.nominal)
+    rows, told = known_rows(model, at_work, both, x, found)
+    told += _held(model, found, remaining_bias(rows, both.weight, found))
+    inputs = replace(setup.inputs, A=on_kept(model, rows[:T], found), weights=targets.weight)
+    beyond = None
+    if region is not None:
+        # None where no plan could make the position at all of them certain.
+        with suppress(InsufficientDataError):
+            beyond = on_kept(model, rows[T:], found), region.weight
+    if share and beyond is None:
+        raise InsufficientDataError(
+            f"{model.cell.path or model.cell.name}: [design] elsewhere asks for poses all over "
+            "the joint ranges, but the rules allow none, or no plan can make all of them "
+            "certain; leave it out"
+        )
+    warnings = setup.warnings + told
+    return replace(setup, inputs=inputs, beyond=beyond, share=share, warnings=warnings)
 
 
 def _root(A: Array, weight: Array) -> Array:
     """R (r, p) with RᵀR = Σ_t w_t A_tᵀ A_t, A (T, r, p)."""
-    weighted = np.sqrt(weight)[:, None, None] * A
-    return np.asarray(np.linalg.qr(weighted.reshape(-1, A.shape[-1]), mode="r"))
+    return triangular((np.sqrt(weight)[:, None, None] * A).reshape(-1, A.shape[-1]))
 
 
 def _unseen(model: Model, found: Estimable, unseen: list[int]) -> tuple[str, ...]:
@@ -270,8 +286,7 @@ def _combination(model: Model, found: Estimable) -> Array | None:
     wanted = model.cell.design.combination
     if not wanted:
         return None
-    a = values_from(model, {name: 0.0 for name in wanted})  # names are checked there
-    a = np.zeros_like(a)
+    a = np.zeros(len(model.names))
     for name, factor in wanted.items():
         a[model.names.index(name)] = factor
     lost = unpredictable(a[None, None], found)
@@ -401,7 +416,6 @@ class ScheduledEffects:
             A = on_kept(model, known_rows(model, model, targets, x, found)[0], found)
         except InsufficientDataError:
             return replace(plan, predicted=shown, scheduled=Scheduled(tuple(names), None, None))
-        weight = np.sqrt(targets.weight)[:, None, None]
-        R = np.asarray((weight * A).reshape(-1, A.shape[-1]))
+        R = _root(A, targets.weight)
         errors = remaining_rms(R, M), remaining_rms(R[:, own], M[np.ix_(own, own)])
         return replace(plan, predicted=shown, scheduled=Scheduled(tuple(names), *errors))
