@@ -13,8 +13,7 @@ import numpy as np
 from scipy import linalg
 from scipy.special import expit, softmax
 
-from elastocal.diagnosis.component_draws import Draws, Unseen, drawn
-from elastocal.diagnosis.component_families import LINE
+from elastocal.diagnosis.component_draws import drawn
 from elastocal.diagnosis.component_search import Rivals, exchanged, size_of_fellows
 from elastocal.diagnosis.components import (
     Component,
@@ -36,7 +35,6 @@ from elastocal.diagnosis.diagnosis import (
     Verdict,
 )
 from elastocal.diagnosis.diagnosis_data import DiagnosisData
-from elastocal.diagnosis.line_orders import families_of, ripples
 from elastocal.diagnosis.model_set import spans_of
 from elastocal.diagnosis.noise_floor import NoisyData, Projection, Weighted, covariance, project
 from elastocal.diagnosis.shrinkage import NEW_POSES, Shrinkage, rms_with_interval
@@ -47,13 +45,12 @@ from elastocal.diagnosis.stated_floor import (
     supported_floor,
 )
 from elastocal.identification.error_budget import BudgetStep
-from elastocal.model.effects.base import Stage, index, turning_joints
+from elastocal.model.effects.base import Stage, index
 from elastocal.model.effects.gears import GearSpectrum
 from elastocal.model.effects.smooth import JointCurve
 from elastocal.units import Array, BoolArray, IntArray
 
-DRAWS, PARTS = 400, 10
-VISITS_AGAIN = 5  # for each joint: what it scatters by is known to 1/√10 then
+DRAWS = 400
 DETERMINED = 1e-4  # of the largest, singular value of columns of unit length
 MOST_POSES = 1500  # that a set of new poses is drawn from
 PROBABLE = 0.5
@@ -95,17 +92,6 @@ class SumAnswer:
         return Weighted.of(self._wide, self.found.noise)
 
     @cached_property
-    def _without_lines(self) -> tuple[str, ...]:
-        """Joints of which neither lines have been found nor a curve that may hold them; none where
-        visits again are too few to tell what repeats at a configuration from what does not."""
-        again = self.dataset.present.sum() - len(self.dataset.present)
-        if again < VISITS_AGAIN * self.dataset.data.G.shape[2]:
-            return ()
-        angular = (JointCurve, GearSpectrum)
-        seen = {c.where for c in self.found.components if isinstance(c.effect, angular)}
-        return tuple(h.where for h in ripples(self.dataset) if h.where not in seen)
-
-    @cached_property
     def _wide(self) -> NoisyData:
         """The data of the sum with the columns of what is hidden last."""
         data = self.found.data
@@ -139,34 +125,12 @@ class SumAnswer:
         return min(self.found.data.blocks.size, 3)
 
     @cached_property
-    def _drawn(self) -> Draws:
-        """Posterior draws of all coefficients, and of lines that are not seen in the place of what
-        their joints scatter by from configuration to configuration."""
-        wide, noise, joints = self._wide, self.found.noise, list(map(index, self._without_lines))
-        if not joints:
-            return drawn(self.found, self.hidden, self._weighted, wide.precision, DRAWS, self.rng)
-        columns = np.moveaxis(wide.masked(wide.G[:, :, joints]), 2, 0) * LINE
-        fellows = tuple(f.size + np.log(f.rms) for f in families_of(self.found))
-        unseen = Unseen(columns, fellows, len(turning_joints(self.dataset.base.model.chain)))
-        shared = noise.shared.copy()
-        shared[joints] = 0.0
-        at = Weighted.of(wide, replace(noise, shared=shared))
-        return drawn(self.found, self.hidden, at, wide.precision, DRAWS, self.rng, unseen)
-
-    @property
     def draws(self) -> Array:
         """Posterior draws (Σ k, draws) of the components' coefficients."""
-        return self._drawn.coefficients[self._own :]
-
-    @cached_property
-    def _unseen(self) -> dict[str, Array]:
-        """What the draws of lines that are not seen leave of the positions (rows, draws), at the
-        places of their joints, once the fitted parameters have followed."""
-        configuration, G = np.nonzero(self._rows)[0], self.found.data.G[self._rows] * LINE
-        return {
-            where: self._followed(G[:, [index(where)]] * errors[configuration])
-            for where, errors in zip(self._without_lines, self._drawn.unseen, strict=True)
-        }
+        every = drawn(
+            self.found, self.hidden, self._weighted, self._wide.precision, DRAWS, self.rng
+        )
+        return every[self._own :]
 
     @cached_property
     def moved(self) -> Array:
@@ -176,10 +140,8 @@ class SumAnswer:
         They follow in the directions that the readings determine, not in what rounding leaves of
         parallel axes; what is only uncertain of the load's point is no fitted parameter.
         """
-        return self._followed(self._wide.X[self._rows][:, self._own :])
-
-    def _followed(self, moved: Array) -> Array:
-        return np.asarray(moved - self._fitted_directions @ (self._fitted_directions.T @ moved))
+        moved, known = self._wide.X[self._rows][:, self._own :], self._fitted_directions
+        return np.asarray(moved - known @ (known.T @ moved))
 
     @cached_property
     def _fitted_directions(self) -> Array:
@@ -213,10 +175,7 @@ class SumAnswer:
         # What poses there are is known from the campaign's only (Bayesian bootstrap, Rubin 1981).
         share = self.rng.dirichlet(np.full(len(some), len(known) / len(some)), DRAWS)
         times = self.rng.multinomial(NEW_POSES, share).T.astype(np.float64)
-        left = self.moved[kept] @ self.draws
-        for u in self._unseen.values():
-            left += u[kept]
-        return kept, times, left
+        return kept, times, self.moved[kept] @ self.draws
 
     def _of_new_poses(self, left: Array) -> Array:
         """Mean square (draws,) per reading in a set of new poses of what is left (rows, draws)."""
@@ -227,39 +186,19 @@ class SumAnswer:
         count = np.diff(np.append(starts, len(rows))) / self._axes
         return np.asarray((drawn * each).sum(axis=0) / (drawn * count[:, None]).sum(axis=0))
 
-    def squares(self, members: Sequence[int], lines: Sequence[str] = ()) -> Array:
-        """Mean squares (draws,) in m² of what these components do together, with the lines that are
-        not seen of these joints."""
+    def squares(self, members: Sequence[int]) -> Array:
+        """Mean squares (draws,) in m² of what these components do together."""
         w = self.draws[index := self._index(members)]
-        if not (unseen := [self._unseen[where] for where in lines if where in self._unseen]):
-            return np.einsum("kd,kd->d", w, self.gram[np.ix_(index, index)] @ w)
-        left = self.moved[:, index] @ w + sum(unseen)
-        return np.asarray(np.einsum("nd,nd->d", left, left) / self._readings)
+        return np.einsum("kd,kd->d", w, self.gram[np.ix_(index, index)] @ w)
 
     def _index(self, members: Sequence[int]) -> IntArray:
         return np.r_[(slice(0, 0), *(self._spans[k] for k in members))]
 
-    def shares(self, members: Sequence[int], lines: Sequence[str] = ()) -> Array:
-        """The share (draws,) of the squared gap that goes when these components, and the lines that
-        are not seen of these joints, are added last: the mean square of what they do over that of
-        the whole and of what is unexplained.
-
-        The draws are as wide as a jackknife over PARTS of the configurations says, where that is
-        wider than the posterior, which takes model and sizes for true.
-        """
-        index, open_ = self._index(members), self.supported.unexplained**2
-        drawn = self.squares(members, lines) / np.maximum(self.total + open_, 1e-300)
-        own, whole = (
-            np.einsum("kd,kd->d", w, G @ w)
-            for w, G in (
-                (self.deleted[index], self.gram[np.ix_(index, index)]), (self.deleted, self.gram)
-            )
-        )  # fmt: skip
-        apart = own / np.maximum(whole + open_, 1e-300)
-        spread = np.sqrt((PARTS - 1) * np.mean((apart - apart.mean()) ** 2))
-        middle = np.median(drawn)
-        wider = middle + max(1.0, spread / max(drawn.std(), 1e-300)) * (drawn - middle)
-        return np.asarray(np.clip(wider, 0.0, None))
+    def shares(self, members: Sequence[int]) -> Array:
+        """The share (draws,) of the squared gap that goes when these components are added last: the
+        mean square of what they do over that of the whole and of what is unexplained."""
+        whole = self.total + self.supported.unexplained**2
+        return self.squares(members) / np.maximum(whole, 1e-300)
 
     @cached_property
     def supported(self) -> SupportedFloor:
@@ -294,22 +233,9 @@ class SumAnswer:
         return float(max((squares - expected).sum() / count.sum(), 0.0))
 
     @cached_property
-    def deleted(self) -> Array:
-        """The coefficients (Σ k, PARTS) without one part of the configurations after the other."""
-        all_ = self._weighted
-        prior = np.diag(all_.prior(self._wide.precision))
-        part, out = np.random.default_rng(0).permutation(len(all_.r)) % PARTS, []
-        for g in range(PARTS):
-            X, r = all_.X[part == g], all_.r[part == g]
-            X = X.reshape(-1, X.shape[2])
-            factor = linalg.cho_factor(all_.M - X.T @ X + prior)
-            out.append(linalg.cho_solve(factor, all_.z - X.T @ r.ravel())[self._own :])
-        return np.array(out).T
-
-    @cached_property
     def total(self) -> Array:
         """Mean squares (draws,) in m² of the whole."""
-        return self.squares(range(len(self._spans)), tuple(self._unseen))
+        return self.squares(range(len(self._spans)))
 
     @property
     def decided(self) -> SumAnswer:
@@ -376,11 +302,8 @@ class SumAnswer:
     @cached_property
     def components(self) -> tuple[ComponentShare, ...]:
         """One for each kind of dependence at each place, the largest first."""
-        groups = self._by(lambda c: (c.family, c.where))
-        for where in self._unseen:
-            if (self.squares([], [where]) >= SLIGHT**2 * self.total).mean() >= PROBABLE:
-                groups.setdefault(("angle", where), [])
-        rows = [self._share(family, where, own) for (family, where), own in groups.items()]
+        groups = self._by(lambda c: (c.family, c.where)).items()
+        rows = [self._share(family, where, own) for (family, where), own in groups]
         return tuple(sorted(rows, key=lambda row: -row.share))
 
     def _share(self, family: str, where: str, members: list[int]) -> ComponentShare:
@@ -389,16 +312,13 @@ class SumAnswer:
             k for k, c in enumerate(self.hidden, start=len(self.found.components))
             if (c.family, c.where) == (family, where)
         ]  # fmt: skip
-        everything, lines = [*members, *hidden], [where] * (family == "angle")
-        rms = np.sqrt(self.squares(everything, lines))
+        everything = [*members, *hidden]
+        rms = np.sqrt(self.squares(everything))
         low95, high95 = np.quantile(rms, [0.025, 0.975]).tolist()
-        names = (c.effect.name for c in chosen) if chosen else (JointCurve.name,)
-        enough = rms >= SLIGHT * np.sqrt(self.total)
-        matters = self._matters(members) if members else float(enough.mean())
         return ComponentShare(
-            family, where, tuple(dict.fromkeys(names)),
-            *self._share_with_ends(everything, lines), float(np.median(rms)), (low95, high95),
-            matters, any(c.named for c in chosen),
+            family, where, tuple(dict.fromkeys(c.effect.name for c in chosen)),
+            *self._share_with_ends(everything), float(np.median(rms)), (low95, high95),
+            self._matters(members), any(c.named for c in chosen),
         )  # fmt: skip
 
     @cached_property
@@ -414,19 +334,16 @@ class SumAnswer:
         chosen = [self.found.components[k] for k in members]
         places = tuple(sorted({c.where for c in chosen}))
         effects = tuple(dict.fromkeys(c.effect.name for c in chosen))
-        lines = tuple(self._unseen) if name == GEARS else ()
-        share, fall = self._share_with_ends(self._of_kind(name), lines), self._reduction(members)
+        share, fall = self._share_with_ends(self._of_kind(name)), self._reduction(members)
         return EffectGroup(name, places, effects, *share, fall.reduction, fall.ci90)
 
     def _of_kind(self, name: str) -> list[int]:
         every = (*self.found.components, *self.hidden)
         return [k for k, c in enumerate(every) if _kind(c) == name]
 
-    def _share_with_ends(
-        self, members: Sequence[int], lines: Sequence[str] = ()
-    ) -> tuple[float, Interval]:
+    def _share_with_ends(self, members: Sequence[int]) -> tuple[float, Interval]:
         """Median and 90 % interval of a share."""
-        share = self.shares(members, lines)
+        share = self.shares(members)
         low, high = np.quantile(share, [0.05, 0.95]).tolist()
         return float(np.median(share)), (low, high)
 
