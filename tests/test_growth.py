@@ -17,7 +17,7 @@ from elastocal.errors import ElastocalError
 from elastocal.files import read_json
 from elastocal.importing.assemble import import_files
 from elastocal.importing.mapping_file import read_mapping
-from elastocal.measurements import read_matrix, read_measurements, read_plan
+from elastocal.measurements import read_matrix, read_measurements
 from elastocal.model.dh import read_dh
 from elastocal.model.mjcf import read_mjcf
 from elastocal.model.urdf import read_urdf
@@ -36,7 +36,7 @@ READERS: dict[str, Callable[[Path], object]] = {
     "measurements": lambda path: read_measurements(
         path, joint_kinds=KINDS, marker_names=("M1",), observe="position"
     ),
-    "plan": lambda path: read_plan(path, joint_kinds=KINDS),
+    "plan": lambda path: read_measurements(path, joint_kinds=KINDS, observe="plan"),
     "matrix": lambda path: read_matrix(path, "covariance"),
     "dh": read_dh,
     "targets": lambda path: read_targets(path, KINDS, "base"),

@@ -10,7 +10,7 @@ from matplotlib.figure import Figure
 from style import ROOT, Colours, draw, plt
 
 from elastocal.cell.work_cell import read_cell
-from elastocal.measurements import read_plan
+from elastocal.measurements import read_measurements
 from elastocal.model.manipulator import Model
 from elastocal.simulation import expand_plan, simulate, values_from
 
@@ -26,7 +26,7 @@ BENT = np.deg2rad([22.96, 85.78, -125.42, 55.78, -74.89, 288.89])  # the pose th
 
 def misfit(model: Model, bent: bool) -> np.ndarray:
     """Information (2, 2) on the compliances of joints 4 and 6 where the others are fitted too."""
-    plan = read_plan(TUTORIAL / "poses.csv", joint_kinds=model.chain.kinds)
+    plan = read_measurements(TUTORIAL / "poses.csv", joint_kinds=model.chain.kinds, observe="plan")
     truth = values_from(model, TRUTH)
     found = np.zeros((len(truth), len(truth)))
     poses = [plan.take(np.arange(len(plan)))]

@@ -22,7 +22,7 @@ from worker import Worker
 from world import Visits
 from world_files import write_table, write_world
 
-from elastocal.measurements import read_plan
+from elastocal.measurements import read_measurements
 
 ANSWER, CELL, PLAN = "diagnosis.json", "extended.toml", "extra.csv"
 MOST_EXTRA = 20  # a third of the campaign
@@ -101,7 +101,9 @@ def with_extra_poses(world: World, visible: Path, plan: str, worker: Worker) -> 
 
 def read_visits(world: World, path: Path) -> Visits:
     """The visits that a plan asks for, after the campaign unless it states when."""
-    table = read_plan(path, joint_kinds=("revolute",) * world.spec.skeleton.n_joints)
+    table = read_measurements(
+        path, joint_kinds=("revolute",) * world.spec.skeleton.n_joints, observe="plan"
+    )
     rng = np.random.default_rng((*world.seed, 4))
     approach = rng.choice([-1.0, 1.0], table.q.shape) if table.approach is None else table.approach
     visits = Visits(

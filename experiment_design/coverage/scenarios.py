@@ -16,7 +16,7 @@ from campaign import DEMO, campaign
 from elastocal.cell.work_cell import read_cell
 from elastocal.demo.example import LOAD_N, published_compliances
 from elastocal.identification.noise_structure import Readings
-from elastocal.measurements import read_plan
+from elastocal.measurements import read_measurements
 from elastocal.model.manipulator import Model
 from elastocal.model.observations import polar_axes
 from elastocal.simulation import expand_plan, values_from
@@ -138,7 +138,7 @@ def _positions() -> np.ndarray:
     """Where the markers of the 270 readings stand (N, 3) in m in the robot's frame, loaded."""
     cell = read_cell(DEMO / "cell.toml")
     model = Model(cell)
-    plan = read_plan(DEMO / "plan.csv", joint_kinds=model.chain.kinds)
+    plan = read_measurements(DEMO / "plan.csv", joint_kinds=model.chain.kinds, observe="plan")
     rows = expand_plan(plan, tuple(cell.tool.markers), 6, np.array(LOAD_N))
     loaded = rows.take(np.any(rows.force != 0, axis=1))
     return model.target_poses(loaded, values_from(model, published_compliances(DEMO)[0]))[1]

@@ -15,7 +15,7 @@ from elastocal.cell.work_cell import Cell, read_cell
 from elastocal.demo.example import published_compliances
 from elastocal.identification.identify import identify
 from elastocal.identification.options import Options
-from elastocal.measurements import Measurements, read_plan
+from elastocal.measurements import Measurements, read_measurements
 from elastocal.model.manipulator import Model
 from elastocal.planning.candidates import draw, shares_of
 from elastocal.planning.checkpoint import Checkpoint
@@ -94,7 +94,7 @@ class Study:
 
 def table_2(model: Model) -> np.ndarray:
     """The poses (15, 6) of Table 2 of Klimchik et al. 2013."""
-    return read_plan(DEMO / "plan.csv", joint_kinds=model.chain.kinds).q
+    return read_measurements(DEMO / "plan.csv", joint_kinds=model.chain.kinds, observe="plan").q
 
 
 def realised(study: Study, q: np.ndarray, campaigns: int, jobs: int) -> np.ndarray:

@@ -10,7 +10,7 @@ import numpy as np
 
 from elastocal.cell.work_cell import read_cell
 from elastocal.demo.example import LOAD_N, REPEATS, published_compliances, reading_sigma
-from elastocal.measurements import read_plan
+from elastocal.measurements import read_measurements
 from elastocal.model.manipulator import Model
 from elastocal.model.observations import observe
 from elastocal.simulation import expand_plan, simulate, values_from
@@ -49,7 +49,7 @@ def campaign() -> Campaign:
     """The campaign at the true equilibrium; joint 1, which the load cannot show, is left out."""
     cell = read_cell(DEMO / "cell.toml")
     model = Model(cell)
-    plan = read_plan(DEMO / "plan.csv", joint_kinds=model.chain.kinds)
+    plan = read_measurements(DEMO / "plan.csv", joint_kinds=model.chain.kinds, observe="plan")
     rows = expand_plan(plan, tuple(cell.tool.markers), REPEATS, np.array(LOAD_N))
     named, _ = published_compliances(DEMO)
     x = values_from(model, named)

@@ -516,7 +516,8 @@ def read_measurements(
 
     `joint_kinds`: "revolute" or "prismatic" per joint of the robot; `marker_names`: the cell's
     markers, () if it names none; `observe`: "position", "deflection", "pose" or "distance",
-    which decides the columns that must be there, or "plan" or "targets", which ask for none.
+    which decides the columns that must be there, or "plan" or "targets", which ask for none; of a
+    plan `level` and `order`, which a designed one has, are passed over.
     Quaternions become rotation vectors.  With `text` the table is that CSV text, and `path` only
     its name.
 
@@ -561,28 +562,13 @@ def read_measurements(
         sigma_frame="cartesian" if polar is None else "polar",
         joint_kinds=() if q is None else joint_kinds,
         **{name: found.get(name) for name in columns},
-        **{name: _first(found.get(name)) for name in ("distance", "time", "temperature")},
+        **{
+            name: found[name][:, 0] for name in ("distance", "time", "temperature") if name in found
+        },
     )
     if observe != "targets":  # a path may pass a place twice
         _check_duplicates(raw, table)
     return with_moves(table)
-
-
-def _first(values: Array | None) -> Array | None:
-    return None if values is None else values[:, 0]
-
-
-def read_plan(
-    path: str | Path, *, joint_kinds: tuple[str, ...], marker_names: tuple[str, ...] = ()
-) -> Measurements:
-    """The poses of a plan: configuration, q1_deg …, and where the plan states them forces and
-    which of the cell's markers are read.
-
-    `level` and `order`, which a designed plan has, are passed over.  Errors as for measurements.
-    """
-    return read_measurements(
-        path, joint_kinds=joint_kinds, marker_names=marker_names, observe="plan"
-    )
 
 
 # Family → which of its values are right, and what a message says of others.

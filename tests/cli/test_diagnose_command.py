@@ -16,7 +16,7 @@ from typer.testing import CliRunner
 from elastocal.cell.work_cell import read_cell
 from elastocal.cli.main import app
 from elastocal.errors import InsufficientDataError
-from elastocal.measurements import read_plan
+from elastocal.measurements import read_measurements
 
 KINDS = ("revolute",) * 6
 
@@ -107,7 +107,7 @@ def test_extra_poses_are_designed_for_open_verdicts(name, campaign, engine):
     told = run(campaign, "--plan", plan, "--poses", 4, "--seed", 9)
     assert engine.planned == [{"most": 4, "seed": 9}]
     assert "2 poses, 3 visits" in told.stdout
-    back = read_plan(plan, joint_kinds=KINDS)
+    back = read_measurements(plan, joint_kinds=KINDS, observe="plan")
     assert back.q == pytest.approx(EXTRA.plan.q, abs=1e-10)
     assert np.array_equal(back.force, EXTRA.plan.force)
     assert np.array_equal(back.approach, EXTRA.plan.approach)

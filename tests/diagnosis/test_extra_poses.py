@@ -12,7 +12,7 @@ from support.rivals import ECCENTRIC, SCALE, campaign, diagnosis_of, measured
 from elastocal.cell.work_cell import Workspace
 from elastocal.diagnosis.extra_poses import plan_extra
 from elastocal.errors import InputError
-from elastocal.measurements import Measurements, read_plan
+from elastocal.measurements import Measurements, read_measurements
 from elastocal.model.chain import finite_ranges, joint_limits
 from elastocal.model.manipulator import Model
 from elastocal.simulation import expand_plan, simulate
@@ -65,7 +65,7 @@ def test_the_written_plan_can_be_measured(narrow, few, tmp_path) -> None:
     model, _ = narrow
     path = tmp_path / "extra.csv"
     save_extra_poses(path, few.plan, model.chain.kinds)
-    read = read_plan(path, joint_kinds=model.chain.kinds)
+    read = read_measurements(path, joint_kinds=model.chain.kinds, observe="plan")
     rows = expand_plan(read, tuple(model.cell.tool.markers))
     assert np.isfinite(simulate(model, rows, model.nominal, 0).position).all()
     np.testing.assert_allclose(read.q, few.plan.q, atol=1e-10)

@@ -34,8 +34,8 @@ def model_of(effects: tuple[str, ...], observe: str, **options: Any) -> Model:
 def both(model: Model, table: Measurements, x: Array, steps: int = 2) -> tuple[Array, Array]:
     """B of the table's single configuration: as an expression, and as the model has it."""
     columns = np.arange(len(model.names))
-    rows = configuration_rows(SymbolicArm(model.chain, model.cell), table, columns, steps)
-    return rows.function(table.q[0], x).full(), model.regressor(table, x).B
+    rows, _ = configuration_rows(SymbolicArm(model.chain, model.cell), table, columns, steps)
+    return rows(table.q[0], x).full(), model.regressor(table, x).B
 
 
 def somewhere(model: Model, seed: int) -> Array:
@@ -68,15 +68,12 @@ def test_adjoint_is_the_slope_of_the_weighted_sum() -> None:
     model = model_of((*GEOMETRY, "joint_compliance"), "position")
     table = table_of(random_poses(model.chain, 1, 6), DOWN, both=True)
     columns = np.arange(len(model.names))
-    rows = configuration_rows(SymbolicArm(model.chain, model.cell), table, columns)
-    W = np.random.default_rng(6).normal(size=rows.B.shape)
+    rows, adjoint = configuration_rows(SymbolicArm(model.chain, model.cell), table, columns)
+    W = np.random.default_rng(6).normal(size=rows.size_out(0))
     q, h = table.q[0], 1e-5
     slopes = [
-        (W * (rows.function(q + step, model.nominal) - rows.function(q - step, model.nominal)))
-        .full()
-        .sum()
-        / (2 * h)
+        (W * (rows(q + step, model.nominal) - rows(q - step, model.nominal))).full().sum() / (2 * h)
         for step in h * np.eye(len(q))
     ]
-    found = rows.adjoint(q, model.nominal, W).full().ravel()
+    found = adjoint(q, model.nominal, W).full().ravel()
     np.testing.assert_allclose(found, slopes, rtol=1e-6, atol=1e-6 * np.abs(slopes).max())

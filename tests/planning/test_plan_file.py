@@ -7,7 +7,7 @@ from hypothesis import strategies as st
 from support.cells import kr270_chain
 
 from elastocal.errors import InputError
-from elastocal.measurements import DEFAULT_MARKER, Measurements, read_plan
+from elastocal.measurements import DEFAULT_MARKER, Measurements, read_measurements
 from elastocal.planning.plan import write_plan
 from elastocal.text import is_label
 
@@ -46,7 +46,7 @@ def test_what_is_written_is_read_back(tmp_path_factory, data):
     rows = plan_of(names, q, kinds, force, approach)
     path = tmp_path_factory.mktemp("plan") / "plan.csv"
     write_plan(path, rows, {"note_order_2": ["x"] * n}, forces=force is not None)
-    plan = read_plan(path, joint_kinds=tuple(kinds))
+    plan = read_measurements(path, joint_kinds=tuple(kinds), observe="plan")
     assert np.allclose(plan.q, q, rtol=0, atol=1e-9)
     assert [plan.configuration_labels[k] for k in plan.configuration] == names
     assert np.array_equal(plan.force, rows.force)

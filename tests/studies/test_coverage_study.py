@@ -20,7 +20,7 @@ from elastocal.cell.work_cell import read_cell
 from elastocal.demo.example import LOAD_N, published_compliances
 from elastocal.identification.identify import identify
 from elastocal.identification.options import Options
-from elastocal.measurements import read_plan
+from elastocal.measurements import read_measurements
 from elastocal.model.manipulator import Model
 from elastocal.simulation import expand_plan, simulate, values_from
 
@@ -47,7 +47,7 @@ def test_the_study_estimates_what_the_tool_does():
     setting = scenarios.Setting(NAMES["table1_6_effect"])
     e, _ = setting.draw(0)
     rows = expand_plan(
-        read_plan(demo / "plan.csv", joint_kinds=model.chain.kinds),
+        read_measurements(demo / "plan.csv", joint_kinds=model.chain.kinds, observe="plan"),
         tuple(cell.tool.markers), 6, np.array(LOAD_N),
     )  # fmt: skip
     truth = values_from(model, published_compliances(demo)[0])

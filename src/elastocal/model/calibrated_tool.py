@@ -15,6 +15,7 @@ from elastocal.measurements import Measurements
 from elastocal.model import rigid
 from elastocal.model.arm import row_inputs
 from elastocal.model.calibrated import CalibratedArm
+from elastocal.model.effects.base import index
 from elastocal.model.evaluate import BatchFunction
 from elastocal.model.inverse_kinematics import ARM_LENGTH
 from elastocal.model.symbolic import SymbolicArm, Total
@@ -97,9 +98,6 @@ def share_of_levels(angle: Array, levels: Array) -> Array:
     return share
 
 
-LEVEL = "level:"
-
-
 class CalibratedTool:
     """p(q) and R(q) of the tool's point in the data's frame, at the static equilibrium.
 
@@ -131,7 +129,7 @@ class CalibratedTool:
         q = np.zeros((n, self.chain.n_joints))
         for name, values in levels.items():
             # Any level will do here: `_at` says how the commanded joint stands between them.
-            q[:, int(name.removeprefix("joint")) - 1] = values[0]
+            q[:, index(name)] = values[0]
         names = tuple(self._symbolic.arm.markers)
         bare = replace(
             table,
@@ -145,17 +143,11 @@ class CalibratedTool:
 
     def _at(self, rows: list[NDArray], q: Array) -> list[NDArray]:
         """The rows at commanded joints q (n, joints)."""
-        levels = self.cell.model.compliance_levels
-        found = []
-        for name, values in zip(self._symbolic.arm.inputs, rows, strict=True):
-            if name == "q":
-                values = q
-            elif name.startswith(LEVEL):
-                joint = name.removeprefix(LEVEL)
-                i = int(joint.removeprefix("joint")) - 1
-                values = share_of_levels(q[:, i], np.array(levels[joint]))
-            found.append(values)
-        return found
+        found = dict(zip(self._symbolic.arm.inputs, rows, strict=True)) | {"q": q}
+        for joint, levels in self.cell.model.compliance_levels.items():
+            if f"level:{joint}" in found:
+                found[f"level:{joint}"] = share_of_levels(q[:, index(joint)], np.array(levels))
+        return list(found.values())
 
     @cached_property
     def _pose(self) -> Total:
@@ -209,11 +201,5 @@ class CalibratedTool:
     def frames(self, rows: list[NDArray]) -> tuple[Array, Array, Array]:
         """T_tracker_base (n, 4, 4) as identified, with the drift that the rows' time asks for;
         the point (n, 3) m and the tool's rotation (n, 3, 3) in the flange frame."""
-        n = len(rows[0])
         T, place, turn = self._frames(*rows, self.x)
-        shape = (n, *T.shape[1:])
-        return (
-            np.broadcast_to(T, shape),
-            np.broadcast_to(place[..., 0], (n, 3)),
-            np.broadcast_to(turn, (n, 3, 3)),
-        )
+        return T, place[..., 0], turn

@@ -15,7 +15,7 @@ from elastocal.arguments import checked_arguments
 from elastocal.cell.arm_description import EffectChoice, ModelSpec
 from elastocal.cell.work_cell import Cell
 from elastocal.errors import InputError, option, require
-from elastocal.measurements import DEFAULT_MARKER, Measurements, read_measurements, read_plan
+from elastocal.measurements import DEFAULT_MARKER, Measurements, read_measurements
 from elastocal.measurements import table as table_of
 from elastocal.model.arm import Parameter, row_inputs
 from elastocal.model.chain import Chain, numbered, plausible
@@ -178,7 +178,9 @@ class Model:
             15
         """
         markers = tuple(self.cell.tool.markers) if self._markers_stated else ()
-        return read_plan(path, joint_kinds=self.chain.kinds, marker_names=markers)
+        return read_measurements(
+            path, joint_kinds=self.chain.kinds, marker_names=markers, observe="plan"
+        )
 
     @checked_arguments
     def table(

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass
 from functools import cached_property
 
 import casadi as ca
@@ -244,12 +243,14 @@ class SymbolicArm:
         self.backend = backend
         self.parameters = tuple(parameters)
         self.p = ca.vertcat(ca.SX.zeros(0, 1), *symbols)
-        self._reading = self._expression(cell.model.observe)
-        self._linear_model = cell.model.deflection_model == "linear"
+        # The reading h of one row (3, 6 or 1 components) in inputs, X and θ.
+        self.reading = self._expression(cell.model.observe)
+        # Deflections by eq. (3), or by the equilibrium F(θ) = 0.
+        self._linear = bool(arm.springs) and cell.model.deflection_model == "linear"
+        self.implicit = bool(arm.springs) and not self._linear
         self._functions: dict[str, BatchFunction] = {}
 
     def _expression(self, observe: str) -> ca.SX:
-        """The reading of one row (3, 6 or 1 components) as an expression."""
         arm = self.arm
         if observe == "distance":
             return arm.reading["distance"]
@@ -258,16 +259,6 @@ class SymbolicArm:
             relative = measured.T @ arm.reading["rotation"]
             return ca.vertcat(arm.reading["position"], rigid.vector_from_rotation(relative))
         return arm.reading["position"]
-
-    @cached_property
-    def _linear(self) -> bool:
-        """Deflections by eq. (3)."""
-        return bool(self.arm.springs) and self._linear_model
-
-    @cached_property
-    def implicit(self) -> bool:
-        """Deflections by the equilibrium F(θ) = 0."""
-        return bool(self.arm.springs) and not self._linear
 
     @cached_property
     def residual(self) -> ca.SX:
@@ -301,11 +292,6 @@ class SymbolicArm:
             settled = ca.substitute(law, theta, settled)
         return ca.substitute(expression, theta, settled)
 
-    @property
-    def reading(self) -> ca.SX:
-        """The reading h of one row (3, 6 or 1 components) in inputs, X and θ."""
-        return self._reading
-
     @cached_property
     def equilibrium(self) -> Equilibrium:
         inputs = list(self.arm.inputs.values())
@@ -316,7 +302,7 @@ class SymbolicArm:
         if name not in self._functions:
             arm = self.arm
             frames = [arm.T_tracker_flange, arm.reading["position"], arm.reading["rotation"]]
-            outputs = [self.settled(y) for y in ([self._reading] if name == "reading" else frames)]
+            outputs = [self.settled(y) for y in ([self.reading] if name == "reading" else frames)]
             inputs = [*arm.inputs.values(), self.p, arm.theta]
             self._functions[name] = BatchFunction(inputs, outputs, self.backend)
         return self._functions[name]
@@ -324,7 +310,7 @@ class SymbolicArm:
     @cached_property
     def regressor(self) -> Total:
         """The reading h of every row and B = dh/dX."""
-        return Total(self, self._reading, self.p)
+        return Total(self, self.reading, self.p)
 
     def settled(self, y: ca.SX) -> ca.SX:
         """y by eq. (3) where the model is linear, else in X and θ."""
@@ -427,39 +413,17 @@ def _check_names(parameters: Sequence[Parameter], cell: Cell) -> None:
 STEPS = 2
 
 
-@dataclass(frozen=True)
-class ConfigurationRows:
-    """B (rows, columns) = ∂prediction/∂X of one configuration, all its markers and load states.
-
-    `q` (n,) and `x` (parameters,) are its symbols; rows and their order are those of
-    `Model.regressor` on the table of that configuration.  Deflections are explicit functions of
-    q and X: eq. (3) for a linear model, `STEPS` fixed-point steps for the equilibrium.
-    """
-
-    q: ca.SX
-    x: ca.SX
-    B: ca.SX
-
-    @cached_property
-    def function(self) -> ca.Function:
-        """(q, x) → B."""
-        return ca.Function("B", [self.q, self.x], [self.B], {"cse": True})
-
-    @cached_property
-    def adjoint(self) -> ca.Function:
-        """(q, x, W) → ∇_q Σ_ij W_ij B_ij (n,), one reverse sweep, for W (rows, columns)."""
-        W = ca.SX.sym("W", *self.B.shape)
-        gradient = ca.gradient(ca.dot(W, self.B), self.q)
-        return ca.Function("adjoint", [self.q, self.x, W], [gradient], {"cse": True})
-
-
 def configuration_rows(
     symbolic: SymbolicArm, template: Measurements, columns: NDArray[np.int64], steps: int = STEPS
-) -> ConfigurationRows:
-    """B of the configuration whose rows `template` lists, as a function of q and X.
+) -> tuple[ca.Function, ca.Function]:
+    """B (rows, columns) = ∂prediction/∂X of the configuration whose rows `template` lists, all its
+    markers and load states, as a function of q (n,) and X (parameters,); and its adjoint,
+    (q, X, W) → ∇_q Σ_ij W_ij B_ij (n,), one reverse sweep, for W (rows, columns).
 
-    The template gives everything but q: markers, forces, the level of a split joint, time.  Where
-    poses are observed, the rotation is taken as measured without error, as in planning.
+    Rows and their order are those of `Model.regressor` on the template, which gives everything but
+    q: markers, forces, the level of a split joint, time.  Deflections are explicit functions of q
+    and X: eq. (3) for a linear model, `steps` fixed-point steps for the equilibrium.  Where poses
+    are observed, the rotation is taken as measured without error, as in planning.
 
     Raises InputError where the template lacks a column the model needs.
     """
@@ -477,7 +441,11 @@ def configuration_rows(
         sum((float(w) * rows[i] for i, w in zip(line.indices, line.data, strict=True)), ca.SX(0))
         for line in (observed.combine[[k]] for k in range(observed.combine.shape[0]))
     ]
-    return ConfigurationRows(q, x, ca.vertcat(*combined))
+    B = ca.vertcat(*combined)
+    W = ca.SX.sym("W", *B.shape)
+    gradient = ca.gradient(ca.dot(W, B), q)
+    cse = {"cse": True}
+    return ca.Function("B", [q, x], [B], cse), ca.Function("adjoint", [q, x, W], [gradient], cse)
 
 
 def _row(symbolic: SymbolicArm, columns: list[int], steps: int) -> ca.Function:

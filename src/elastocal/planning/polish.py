@@ -252,8 +252,7 @@ class Searches:
             info = self.information
             arm, table = SymbolicArm(info.model.chain, info.model.cell), info.rows(q[None])
             table = table.take(np.flatnonzero(np.repeat(read, len(table) // len(read))))
-            rows = configuration_rows(arm, table, info.columns)
-            self._rows[key] = rows.function, rows.adjoint
+            self._rows[key] = configuration_rows(arm, table, info.columns)
         return self._rows[key]
 
     @cached_property
