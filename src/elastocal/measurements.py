@@ -60,6 +60,7 @@ NUMBERS = (
     "repeat", "q", "force", "position", "rotation", "distance", "torque", "sigma", "time",
     "approach", "before", "temperature",
 )  # fmt: skip
+SINGLE = ("distance", "time", "temperature")  # one number in a row
 DEFAULT_MARKER = "M1"
 LEAST_FORCE, LARGEST_FORCE = 1e-6, 1e7  # N
 QUATERNION_NORM_TOLERANCE = 1e-3
@@ -562,9 +563,7 @@ def read_measurements(
         sigma_frame="cartesian" if polar is None else "polar",
         joint_kinds=() if q is None else joint_kinds,
         **{name: found.get(name) for name in columns},
-        **{
-            name: found[name][:, 0] for name in ("distance", "time", "temperature") if name in found
-        },
+        **{name: v[:, 0] for name in SINGLE if (v := found.get(name)) is not None},
     )
     if observe != "targets":  # a path may pass a place twice
         _check_duplicates(raw, table)

@@ -119,7 +119,7 @@ def plan_table(
     carried: Array | None = None,
     counts: IntArray | None = None,
 ) -> tuple[Measurements, dict[str, list[str]]]:
-    """An execution as the table that `read_plan` reads once it is written, and its columns beside:
+    """An execution as the table that is read of its plan, and its columns beside:
     level, order and notes.  Sorted by pose, then side of approach, then load state.
 
     With `forces` (L, 3) N of the load states one row per reading, under its force; without, one
@@ -225,7 +225,7 @@ def write_plan(
     """Write plan.csv, whole or not at all; angles in degrees, travel in mm; with the forces of the
     rows or not, and `more` columns.
 
-    `measurements.read_plan` reads it back to 1e-11 rad.  Raises InputError for an unwritable place.
+    `Model.read_plan` reads it back to 1e-11 rad.  Raises InputError for an unwritable place.
     """
     known = families(table.joint_kinds)
     names = [table.configuration_labels[k] for k in table.configuration]
