@@ -257,7 +257,7 @@ def pose_change(prefix: str, length: float) -> tuple[ParameterSpec, ...]:
     )
 
 
-class Drift(DrivenEffect):
+class WarmUp(DrivenEffect):
     """u = d (1 − exp(−t/T)), d all parameters of the place: 0 at t = 0, d when warm.
 
     The response of a body with one thermal time constant T = `time_constant_s` to a constant source
@@ -275,7 +275,7 @@ class Drift(DrivenEffect):
         return ca.vertcat(*[p[spec.key] for spec in specs]) * self.course(arm, p)
 
 
-class Jump(Drift):
+class Jump(WarmUp):
     """u = d for t ≥ T, d all parameters of the place and T the one setting, in s: nobody knows
     beforehand when something changed."""
 
@@ -286,7 +286,7 @@ class Jump(Drift):
 JUMP_TIME = Setting("jump_time_s", "change_time", None, -np.inf, np.inf)
 
 
-class JointDrift(Drift):
+class JointDrift(WarmUp):
     """δq = d (1 − exp(−t/T)): the joint's reference has moved by d (rad or m) once warm.
 
     Gears and encoder mounts warm up with the motor beside them and shift the joint's zero; t is
@@ -320,7 +320,7 @@ class EncoderJump(Jump):
         return (ParameterSpec("jump", motion_unit(place, chain), 0.0, 1e-4),)
 
 
-class BaseDrift(Drift):
+class BaseDrift(WarmUp):
     """The base moves by d (1 − exp(−t/T)), d = (drift_x … drift_rz) in m and rad.
 
     Along the axes of the tracker frame and about the base's origin; T is `time_constant_s`.  A
@@ -375,7 +375,7 @@ class MarkerSlip(Jump):
 REFERENCE_C = 20.0  # ISO 1: lengths are stated at this temperature
 
 
-class ThermalExpansion(Drift):
+class ThermalExpansion(WarmUp):
     """Lengths of a link (or of all alike: place "all") ← (1 + ε) times themselves.
 
     ε = e (1 − exp(−t/T)) with the strain e at full warm-up (1) and the time constant T =
