@@ -26,7 +26,7 @@ import elastocal as ec
 from elastocal.errors import ElastocalError
 from elastocal.export.export import export
 from elastocal.export.mjcf_file import MujocoRest
-from elastocal.export.urdf_file import urdf_flanges
+from elastocal.export.rigid_files import urdf_flanges
 from elastocal.measurements import Measurements
 from elastocal.model.chain import extent, finite_ranges, joint_limits
 from elastocal.model.dh import read_dh

@@ -152,7 +152,7 @@ def wish_of(
     Raises InputError that names the option that is wrong.
     """
     from elastocal.export.export import Wish, format_of
-    from elastocal.export.urdf_file import Frames
+    from elastocal.export.rigid_files import Frames
     from elastocal.model.calibrated import Conditions
 
     chosen = format_of(path, format)

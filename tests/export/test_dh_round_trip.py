@@ -15,7 +15,7 @@ from support.cells import nominal_flanges
 from support.exports import DH, GEOMETRY, exported, flanges_in_base, poses_of, write_result
 from support.robots import KR270, packaged_urdf, random_chain_urdf
 
-from elastocal.export.dh_table import NEARLY_PARALLEL, split
+from elastocal.export.rigid_files import NEARLY_PARALLEL, split
 from elastocal.model.dh import read_dh
 
 CONVENTIONS = {"dh": "standard", "mdh": "modified"}

@@ -11,7 +11,7 @@ from support.exports import DH, GEOMETRY, exported, flanges_in_base, poses_of, w
 from support.robots import KR270, PACKAGED, packaged_urdf, random_chain_urdf
 from support.urdf_text import arm
 
-from elastocal.export.urdf_file import Frames
+from elastocal.export.rigid_files import Frames
 from elastocal.model.calibrated import CalibratedArm
 from elastocal.model.urdf import check_urdf, read_urdf
 

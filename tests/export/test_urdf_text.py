@@ -15,7 +15,7 @@ from support.exports import GEOMETRY, exported, write_result
 from support.robots import KR270, packaged_urdf
 
 from elastocal.errors import InputError
-from elastocal.export.urdf_file import Frames
+from elastocal.export.rigid_files import Frames
 from elastocal.model.xml_file import XmlText
 from elastocal.units import rpy_from_rotation
 

@@ -11,7 +11,7 @@ import numpy as np
 from elastocal.cell.work_cell import read_cell
 from elastocal.export.export import Exported, Wish, export
 from elastocal.export.exportable import Conditions, random_table
-from elastocal.export.urdf_file import Frames
+from elastocal.export.rigid_files import Frames
 from elastocal.model.arm import Parameter
 from elastocal.model.calibrated import CalibratedArm, read_calibrated
 from elastocal.model.effects.catalogue import CATALOGUE

@@ -16,7 +16,6 @@ from typing import Any
 import numpy as np
 
 from elastocal.errors import ElastocalError, InputError, InsufficientDataError, option
-from elastocal.export.dh_table import CONVENTIONS, FORMULA, dh_csv, dh_lines, without_beta
 from elastocal.export.exportable import (
     Cost,
     ExportNumbers,
@@ -35,13 +34,18 @@ from elastocal.export.mjcf_file import (
     corrected_mjcf,
 )
 from elastocal.export.refit import JointCorrection, Refit, refitted
-from elastocal.export.urdf_file import (
+from elastocal.export.rigid_files import (
     BASE,
+    CONVENTIONS,
     FLANGE,
+    FORMULA,
     Frames,
     calibrated_urdf,
+    dh_csv,
+    dh_lines,
     new_urdf,
     urdf_flanges,
+    without_beta,
 )
 from elastocal.files import atomic_write_text, together
 from elastocal.identification.covariance import t_quantile

@@ -13,7 +13,7 @@ import numpy as np
 from elastocal.cell.arm_description import Robot
 from elastocal.errors import ElastocalError, InputError
 from elastocal.export.exportable import ExportNumbers, SpringValue, nothing, numbers, placed_body
-from elastocal.export.urdf_file import PREFIX, tool_frames
+from elastocal.export.rigid_files import PREFIX, tool_frames
 from elastocal.model.chain import Chain, Joint, LinkMass
 from elastocal.model.effects.loads import STANDARD_GRAVITY
 from elastocal.model.effects.placements import transverse_axes

@@ -29,7 +29,7 @@ from elastocal.model.chain import (
     LinkMass,
     check_angles,
 )
-from elastocal.model.xml_file import xacro_left, xml_tree
+from elastocal.model.xml_file import MAX_BYTES, xacro_left, xml_tree
 from elastocal.text import did_you_mean, listed
 from elastocal.units import Array
 
@@ -42,7 +42,6 @@ FLANGES = ("tool0", "flange", "ee_link", "tcp")
 MOST_IN_A_FINGER = 5  # joints
 # Links that `elastocal export` hangs on a flange; none of them is a flange itself.
 TOOL_FRAMES = ("elastocal_marker_", "elastocal_load_point")
-MAX_BYTES = 10_000_000
 MOST_LINKS = 2000
 ENDLESS_TEXT = re.compile(r"([+-]?)\.?inf(?:inity)?", re.IGNORECASE)
 # What xacro, roslaunch and launch files would put in.

@@ -7,9 +7,12 @@ white space.  Here a parser only says where the start tags stand; the text betwe
 from __future__ import annotations
 
 import codecs
+import math
+import os
 import re
+import struct
 import xml.etree.ElementTree as ET
-from collections.abc import Collection, Mapping
+from collections.abc import Collection, Iterator, Mapping
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
@@ -17,9 +20,10 @@ from xml.parsers import expat
 from xml.sax.saxutils import quoteattr
 
 from elastocal.errors import InputError, require
-from elastocal.files import DEEPEST
-from elastocal.text import SHOWN, printable
+from elastocal.files import DEEPEST, check_regular, check_size, open_input, read_bytes
+from elastocal.text import SHOWN, printable, quoted
 
+MAX_BYTES = 10_000_000
 UTF16 = (codecs.BOM_UTF16_LE, codecs.BOM_UTF16_BE)
 DECLARATION = re.compile(r"""(<\?xml[^>]*?\bencoding\s*=\s*)("[^"]*"|'[^']*')""")
 END_OF_TAG = re.compile(rb"""(?:[^"'>]|"[^"]*"|'[^']*')*>""")  # a > in quotes is none
@@ -267,3 +271,178 @@ def element(tag: str, stated: Mapping[str, str], *inside: str) -> str:
 def comment(text: str) -> str:
     """A comment of this text, in which two hyphens would end it."""
     return f"<!-- {text.replace('--', '- -').rstrip('-')} -->"
+
+
+# What an MJCF file asks of MuJoCo, counted before MuJoCo sees it.
+# DOC
+
+# A humanoid with hands and keyframes has 1500.  MuJoCo's compiler takes 1 s for so many bodies with
+# free joints; its time grows with their square, and that of 20 000 is beyond a minute.
+MOST_ELEMENTS = 5000
+MOST_MESH_BYTES = 100_000_000  # of a file
+MOST_FILES_BYTES = 300_000_000  # of all, each as often as it is named
+MOST_CELLS = 1_000_000  # of all height fields
+VERTEX_BYTES = 50  # of a mesh file, at least
+# The largest numbers of attributes that MuJoCo sets memory aside by.
+LARGEST: dict[str, dict[str, float]] = {
+    "size": {"nuserdata": 1e6, "nkey": 1e3, "njmax": 1e6, "nconmax": 1e6, "nstack": 1e8,
+             "memory": 4e9} | {f"nuser_{kind}": 1e3 for kind in
+             ("body", "jnt", "geom", "site", "cam", "tendon", "actuator", "sensor")},
+    "numeric": {"size": 1e5},
+    "mesh": {"params": 200, "octree_maxdepth": 8},
+    "composite": {"subgrid": 10},
+}  # fmt: skip
+NAMES = ("name", "class", "childclass", "model", "prefix", "file")
+_NUMBER = re.compile(r"[-+]?(?:\d+\.?\d*|\.\d+)(?:[eE][-+]?\d{1,3})?")
+_UNITS = {unit: 1024.0**k for k, unit in enumerate("KMGTPE", start=1)}
+
+
+def check_bounds(path: Path, data: bytes) -> None:
+    """Raise InputError where the MJCF `data` of the file `path` asks for more than an arm needs.
+
+    Counted are elements as often as they are replicated, sizes, and what files it names: included
+    models stand in its folder, and all are regular files.  The message names file and element.
+    """
+    weight = _Model(path).weight_of(path, data)
+    require(
+        weight <= MOST_ELEMENTS,
+        f"{path}: makes {weight:.3g} elements of all it replicates and includes; more than "
+        f"{MOST_ELEMENTS} are no arm, so keep the arm alone",
+    )
+
+
+class _Model:
+    """A model of several files; adds up what they ask for."""
+
+    def __init__(self, path: Path) -> None:
+        self._folder = path.parent
+        # The folder as it is named, and that of the file where the name is a link.
+        self._roots = path.parent.resolve(), path.resolve().parent
+        self._weights: dict[Path, float] = {}
+        self._open: list[Path] = []
+        self._text = self._bytes = self._cells = 0
+
+    def weight_of(self, path: Path, data: bytes | None = None) -> float:
+        """The weight of an XML file, which is read once."""
+        real = path.resolve()
+        require(real not in self._open, f"{path}: includes itself; take out the <include>")
+        if real not in self._weights:
+            self._open.append(real)
+            data = read_bytes(path, "included model", MAX_BYTES) if data is None else data
+            self._text += len(data)
+            check_size(path, "MuJoCo model with all it includes", self._text, MAX_BYTES)
+            root = xml_tree(path, data, "an MJCF file")
+            self._weights[real] = self._weight(path, root, root)
+            self._open.pop()
+        return self._weights[real]
+
+    def _weight(self, path: Path, root: ET.Element, element: ET.Element) -> float:
+        """How many elements MuJoCo makes of one of the file `path` and all within it."""
+        _check_sizes(path, element)
+        if element.tag == "hfield":
+            sides = (math.prod(_numbers(element.get(key, ""))) for key in ("nrow", "ncol"))
+            self._count_cells(path, math.prod(sides))
+        inside = 1 + sum(self._weight(path, root, child) for child in element)
+        return _count(element) * (inside + sum(self._named(path, root, element)))
+
+    def _named(self, path: Path, root: ET.Element, element: ET.Element) -> Iterator[float]:
+        """Weights of the files that it names: of a model its elements, of a grid its vertices."""
+        file = element.get("file", "")
+        if element.tag == "attach":
+            models = {one.get("name") or Path(one.get("file", "")).stem: one.get("file", "")
+                      for one in root.iter("model")}  # fmt: skip
+            file = models.get(element.get("model", ""), "")
+        if element.tag in ("include", "model", "attach"):
+            yield from map(self.weight_of, self._included(path, file) if file else ())
+            return
+        for key, name in element.attrib.items():
+            for found in self._places(path, root, name) if key.startswith("file") and name else ():
+                try:
+                    size = self._count_file(found)
+                except InputError as error:
+                    raise InputError(f"{path}: <{printable(element.tag)}> names {error}") from None
+                if element.tag == "flexcomp":
+                    yield size / VERTEX_BYTES
+                elif element.tag == "hfield":
+                    self._count_cells(path, _pixels(found))
+
+    def _included(self, path: Path, name: str) -> Iterator[Path]:
+        """The files that an element of the file `path` includes by `name`: beside the model or
+        beside the file itself, as versions of MuJoCo differ."""
+        for found in {self._folder / name, path.parent / name}:
+            if os.path.lexists(found):
+                require(
+                    any(found.resolve().is_relative_to(root) for root in self._roots),
+                    f"{path}: includes {printable(name)}, which is outside its folder; put a copy "
+                    "there",
+                )
+                yield found
+
+    def _places(self, path: Path, root: ET.Element, name: str) -> set[Path]:
+        """Where a file may stand; the last part of its name alone counts under `strippath`."""
+        stated = [compiler.get(f"{kind}dir", "") for compiler in root.iter("compiler")
+                  for kind in ("asset", "mesh", "texture")]  # fmt: skip
+        names = {name, re.split(r"[\\/]", name)[-1]} - {""}
+        places = {folder / place / each for folder in (path.parent, self._folder)
+                  for place in ("", *stated) for each in names}  # fmt: skip
+        return {place for place in places if os.path.lexists(place) and not place.is_dir()}
+
+    def _count_file(self, path: Path) -> int:
+        """Size of a file that is named once more, in bytes."""
+        size = check_regular(path, "file")
+        check_size(path, "file", size, MOST_MESH_BYTES)
+        self._bytes += size
+        require(
+            self._bytes <= MOST_FILES_BYTES,
+            f"{path}: with it the files that the model names have more than "
+            f"{MOST_FILES_BYTES / 1e6:g} MB; keep the arm alone",
+        )
+        return size
+
+    def _count_cells(self, path: Path, cells: float) -> None:
+        self._cells += int(min(cells, 1e18))
+        require(
+            self._cells <= MOST_CELLS,
+            f"{path}: <hfield> has more than {MOST_CELLS} points, which no arm needs; take it out",
+        )
+
+
+def _check_sizes(path: Path, element: ET.Element) -> None:
+    tag = printable(element.tag)
+    for key, text in element.attrib.items():
+        stated = f"{path}: <{tag} {printable(key)}={quoted(text)}>"
+        require(
+            key in NAMES or not re.search(r"(?i)(?<!\S)[-+]?nan(?!\S)", text),
+            f"{stated} is no number; correct it",
+        )
+        largest = LARGEST.get(element.tag, {}).get(key, math.inf)
+        require(
+            max(_numbers(text) if largest < math.inf else (), default=0.0) <= largest,
+            f"{stated} asks for more than {largest:g}, which no arm needs; take it out",
+        )
+
+
+def _numbers(text: str) -> list[float]:
+    """Sizes of the numbers in a text, of one with a unit ("2G") too."""
+    found = _NUMBER.finditer(text)
+    return [abs(float(m[0])) * _UNITS.get(text[m.end() : m.end() + 1].upper(), 1.0) for m in found]
+
+
+def _count(element: ET.Element) -> float:
+    """How often MuJoCo makes what an element states; a dimension that is 0 or not there counts as
+    one, and a vertex or segment is a body with three joints and a geom."""
+    if element.tag not in ("replicate", "composite", "flexcomp"):
+        return 1.0
+    count = math.prod(max(n, 1.0) for n in _numbers(element.get("count", "")))
+    if element.tag == "replicate":
+        return count
+    return 5 * max(count, *(len(element.get(k, "").split()) / 3 for k in ("point", "vertex")))
+
+
+def _pixels(path: Path) -> float:
+    """Points of a height field's file: a PNG says them where it begins, however small it is."""
+    with open_input(path, "file of <hfield>") as handle:
+        head = handle.read(24)
+    if head.startswith(b"\x89PNG") and len(head) == 24:
+        return math.prod(map(float, struct.unpack(">II", head[16:24])))
+    return 0.0
