@@ -55,7 +55,7 @@ def test_the_certificate_is_one_page_of_accuracy_data_and_verdict(
 
 def test_figures_are_well_formed_and_follow_the_page_colours(page: str) -> None:
     figures = re.findall(r"<svg xmlns=.*?</svg>", page, re.DOTALL)
-    assert len(figures) == 6
+    assert len(figures) == 5
     for figure in figures:
         ElementTree.fromstring(figure)
         assert "var(--ink)" in figure

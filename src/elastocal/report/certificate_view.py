@@ -2,7 +2,8 @@
 
 The entries of ISO/IEC 17025 (7.8.2) come from [certificate] of the cell; without them the document
 is called a report.  Uncertainty as the GUM has it (JCGM 100), conformity by ISO 14253-1, accuracy
-and repeatability of poses by ISO 9283.
+and repeatability of poses by ISO 9283.  As XML it is a digital one: DCC 3.2.1 of PTB, quantities by
+D-SI (schema: https://gitlab.com/ptb/dcc/xsd-dcc), filled into the `dcc.xml` beside this module.
 """
 
 from __future__ import annotations
@@ -10,10 +11,14 @@ from __future__ import annotations
 import math
 from collections.abc import Iterator
 from dataclasses import dataclass
-from typing import Any
+from string import Template
+from xml.etree import ElementTree
+from xml.sax.saxutils import escape
 
 import numpy as np
 
+from elastocal import __version__
+from elastocal.errors import InputError
 from elastocal.identification.error_budget import ErrorBudget, gap_budget, pose_accuracy
 from elastocal.identification.prediction import measured_loads
 from elastocal.identification.result import Calibration
@@ -242,7 +247,88 @@ def _stated_noise(result: Calibration) -> str:
     )
 
 
-def _each(value: Any) -> Array:
+def _each(value: float | Array) -> Array:
     """A number, the numbers of three axes, or the one that all have."""
     values: Array = np.atleast_1d(value)
     return values if np.ptp(values) else values[:1]
+
+
+# The certificate as XML
+
+UNITS = {
+    "m": "\\metre",
+    "rad": "\\radian",
+    "rad/(N*m)": "\\radian\\newton\\tothe{-1}\\metre\\tothe{-1}",
+    "m/N": "\\metre\\newton\\tothe{-1}",
+    "N/m": "\\newton\\metre\\tothe{-1}",
+    "N": "\\newton",
+    "kg": "\\kilogram",
+    "m/s": "\\metre\\second\\tothe{-1}",
+    "rad/s": "\\radian\\second\\tothe{-1}",
+    "1/K": "\\kelvin\\tothe{-1}",
+}
+ONE = "\\one"  # of a unit that is not listed
+NAMED = '<dcc:name><dcc:content lang="en">%s</dcc:content></dcc:name>'
+QUANTITY = f"{NAMED}<dcc:data><dcc:quantity>{NAMED}%s</dcc:quantity></dcc:data>"
+REAL = "<si:real><si:value>%.9g</si:value><si:unit>%s</si:unit>%s</si:real>"
+COVERED = (
+    "<si:measurementUncertaintyUnivariate><si:expandedMU>"
+    "<si:valueExpandedMU>%.3g</si:valueExpandedMU><si:coverageFactor>%g</si:coverageFactor>"
+    "<si:coverageProbability>0.95</si:coverageProbability><si:distribution>normal</si:distribution>"
+    "</si:expandedMU></si:measurementUncertaintyUnivariate>"
+)
+
+
+def dcc_text(result: Calibration) -> str:
+    """The XML document.
+
+    Raises InputError where [certificate] of the cell lacks entries: there is no DCC without them.
+    """
+    from elastocal.report.page import resource
+
+    c, name = result.model.cell.certificate, result.model.chain.name
+    if c.missing:
+        raise InputError(
+            "a digital calibration certificate needs [certificate] in the cell with "
+            f"{listed(c.missing)}; without them write the report as .html"
+        )
+    certified = certified_values(result, gap_budget(result))
+    statement, u = judgement(result).headline, certified.of_deviations
+    if c.limit is not None:
+        statement = f"{certified.conformity(c.limit)} {statement}"
+    found = [
+        ("root mean square position error at poses not fitted", result.heldout_rms, "m", u),
+        ("largest position error at places not fitted", certified.error, "m", u),
+        *((e.name, e.value, e.unit, K * e.std)
+          for e in result.ordinary if e.value is not None and e.std is not None),
+    ]  # fmt: skip
+    results = [
+        f"<dcc:result>{_quantity(name, value, UNITS.get(unit, ONE), expanded)}</dcc:result>"
+        for name, value, unit, expanded in found
+    ]
+    told = {
+        **vars(c), "version": __version__, "robot": name, "statement": statement,
+        "location": "customer" if c.place == c.customer else "other",
+    }  # fmt: skip
+    text = Template(resource("dcc.xml")).substitute(
+        {key: _xml("" if value is None else str(value)) for key, value in told.items()},
+        ambient=_quantity("temperature", c.temperature, "\\degreecelsius"),
+        results="".join(results),
+    )
+    for prefix in ("dcc", "si"):
+        ElementTree.register_namespace(prefix, f"https://ptb.de/{prefix}")
+    root = ElementTree.fromstring(text)
+    ElementTree.indent(root)
+    return ElementTree.tostring(root, encoding="unicode", xml_declaration=True) + "\n"
+
+
+def _xml(text: str) -> str:
+    return escape(printable(text))
+
+
+def _quantity(name: str, value: float | None, unit: str, expanded: float | None = None) -> str:
+    """A value with its expanded uncertainty, k = 2; none where there is no value."""
+    what, name = "<dcc:noQuantity/>", _xml(name)
+    if value is not None:
+        what = REAL % (value, unit, "" if expanded is None else COVERED % (expanded, K))
+    return QUANTITY % (name, name, what)

@@ -189,7 +189,7 @@ def _residuals(d: Diagnosis) -> Iterator[ShownArm | Block]:
     yield residual_arm(base.model, base.observed, base.x, base.residual)
     yield figures.over_configurations(residuals)
     yield figures.over_joints(base.model.chain.kinds, residuals)
-    yield figures.over_time(base.observed, residuals)
+    yield from figures.over_time(base.observed, residuals)
     yield figures.residual_table(base.observed, residuals)
 
 

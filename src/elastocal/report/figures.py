@@ -11,7 +11,7 @@ import io
 import math
 import re
 import textwrap
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 from contextlib import AbstractContextManager
 from dataclasses import dataclass, replace
 from itertools import pairwise
@@ -616,30 +616,27 @@ def running_mean(x: Array, y: Array, bins: int = 12) -> tuple[Array, Array, Arra
     return middle, mean, np.array([2 * y[p].std(ddof=1) / np.sqrt(len(p)) for p in parts])
 
 
-def over_time(observed: Observations, residuals: Residuals) -> Figure:
-    """Residual of every reading over time, or over the table's order where no time was recorded."""
-    table, lead = observed.table, observed.lead
-    if table.time is None:
-        at, label = np.arange(len(lead), dtype=float), "reading, in the order of the table"
-        when = "In the order of the table, which has no column time_s or time_min"
-    else:
-        hours = float(np.ptp(table.time[lead])) > 3 * 3600
-        at, label = table.time[lead] / (3600 if hours else 60), f"time in {'h' if hours else 'min'}"
-        when = "Over time"
+def over_time(observed: Observations, residuals: Residuals) -> Iterator[Figure]:
+    """Residual of every reading over time, where that was recorded."""
+    if observed.table.time is None:
+        return
+    at, unit = observed.table.time[observed.lead] / 60, "min"
+    if float(np.ptp(at)) > 180:
+        at, unit = at / 60, "h"
 
     def draw(figure: Drawing) -> None:
         axes = figure.subplots()
         _over(axes, at, residuals, residuals.shown, 1.5, ("-", "--", ":"))
-        axes.set_xlabel(label)
+        axes.set_xlabel(f"time in {unit}")
         axes.set_ylabel("residual in µm")
         figure.legend(loc="outside upper right", ncols=residuals.lengths.shape[1])
 
     caption = (
-        f"{when}; lines are means with twice their standard error. A slope is a drift, a step "
+        "Over time; lines are means with twice their standard error. A slope is a drift, a step "
         "something that moved."
     )
     caption += _thinned(residuals, len(residuals.shown))
-    return Figure("over_time", "Residuals over time", draw, 2.9, caption)
+    yield Figure("over_time", "Residuals over time", draw, 2.9, caption)
 
 
 CELLS = 6  # of the work space's longest side

@@ -204,7 +204,7 @@ def _residuals(result: Calibration) -> Iterator[Block]:
 
     residuals = residuals_by(result.observations, result.residual)
     yield residual_arm(result.model, result.observations, result.x, result.residual)
-    yield over_time(result.observations, residuals)
+    yield from over_time(result.observations, residuals)
     yield residual_table(result.observations, residuals)
 
 

@@ -55,7 +55,7 @@ def write_page(
     where an input cannot be read or `path` cannot be written.
     """
     if told.get("certificate") and path.suffix.lower() == ".xml":
-        from elastocal.report.dcc import dcc_text
+        from elastocal.report.certificate_view import dcc_text
 
         fit: Any = result
         return atomic_write_text(path, dcc_text(fit))
