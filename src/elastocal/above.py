@@ -98,7 +98,7 @@ class Result(Saved):
                 "waterfall", "sureness", "against_joints", "over_time", "smooth" and "space"; a
                 `Plan` "poses", "intervals" and "curve"; a `Diagnosis` "budget", "candidates",
                 "shares", "curves", "effects" and those of residuals; a `Compensation` "errors"; a
-                `Comparison` "moved"; `Measurements` "joints"; `NextPoses` "gain" and "doubts".
+                `Comparison` "moved"; `Measurements` "joints"; `NextPoses` "gain".
             interactive: The arm in space ("space", "poses") to be turned.
             ax: Axes of matplotlib's subplots, in whose place the figure is drawn.
 

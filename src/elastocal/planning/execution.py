@@ -480,18 +480,21 @@ class Execution:
         """Loads hung, exchanged or taken off; the arm begins and ends without."""
         return sum(stop.change_after is not None for stop in self.stops) + self.take_off
 
+    @property
+    def arrivals(self) -> Array:
+        """When (stops,) in s the readings of each stop begin."""
+        travel = np.array([stop.travel for stop in self.stops])
+        changed = np.array([stop.change_after is not None for stop in self.stops])
+        dwell = self.motion.dwell * np.arange(len(travel))
+        return np.cumsum(travel + self.motion.load_change * changed) + dwell
+
     def times(self, poses: int, states: int) -> Array:
         """When (poses, states) in s each pose is read in each load state; the mean of several, and
         of all where it is not."""
-        step = [
-            stop.travel + self.motion.dwell
-            + self.motion.load_change * (stop.change_after is not None)
-            for stop in self.stops
-        ]  # fmt: skip
         at = np.array([stop.pose * states + stop.load for stop in self.stops])
-        total = np.bincount(at, np.cumsum(step), poses * states)
+        total = np.bincount(at, self.arrivals, poses * states)
         count = np.bincount(at, minlength=poses * states)
-        mean = np.where(count > 0, total / np.maximum(count, 1), total.sum() / len(step))
+        mean = np.where(count > 0, total / np.maximum(count, 1), self.arrivals.mean())
         return np.asarray(mean).reshape(poses, states)
 
     @property
@@ -536,10 +539,8 @@ def _time(moves: Moves, way: list[int]) -> float:
 
 # The shortest tour through given costs, by simulated annealing too.
 
-PER_VISIT, FEW_PER_VISIT = (
-    6000,
-    600,
-)  # steps; the few while moves of the tour turn out to be blocked
+# Steps; the few while moves of the tour turn out to be blocked.
+PER_VISIT, FEW_PER_VISIT = 6000, 600
 FROM, TO = 0.15, 0.01  # temperatures, of the median move
 GAINED = 1e-6  # of the first temperature, that a tour must gain to be better
 PART = 3  # visits that are put elsewhere together, at most
@@ -653,11 +654,26 @@ def schedule(
     be approached as asked, and what is in the way if `blockers` can tell; InputError for
     arguments that do not fit together.
     """
-    q = np.asarray(q, dtype=float)
-    require(q.ndim == 2 and len(q) > 0, "there is no pose to put in order")
-    forces = np.zeros((1, 3)) if loads is None else np.asarray(loads, dtype=float)
+    forces = np.zeros((1, 3)) if loads is None else loads
     moves = Moves.of(q, motion, checker, forces, limits, via, read)
     Reach(moves, blockers).check()
+    tour, costs = _shortest(moves, seed, per_visit, progress)
+    Reach(moves, blockers).check_tour(tour, costs)
+    drift = None
+    if (alias is not None or motion.load_changes) and motion.longer > 0:
+        tour, moves, costs, drift = against_drift(moves, motion, tour, costs, alias, seed, progress)
+    order = [(node, 0) for node in tour]
+    if motion.reference_every:
+        order = with_references(tour, moves, costs, motion.reference_every, paired)
+        while moves.check([node for node, _ in order], costs):
+            costs = moves.costs()
+    Reach(moves, blockers).check_tour([node for node, _ in order], costs)
+    return _executed(moves, order, costs, motion, drift)
+
+
+def _shortest(
+    moves: Moves, seed: int, per_visit: int, progress: Progress
+) -> tuple[list[int], Costs]:
     costs = moves.costs()
     tour = greedy_tour(costs.cost)
     thorough, done, rounds = False, False, 0
@@ -672,33 +688,26 @@ def schedule(
                 moves.settle()
             costs = moves.costs()
         done, thorough = thorough and not blocked, not blocked
-    Reach(moves, blockers).check_tour(tour, costs)
-    drift = None
-    if (alias is not None or motion.load_changes) and motion.longer > 0:
-        tour, moves, costs, drift = against_drift(moves, motion, tour, costs, alias, seed, progress)
-    order = [(node, 0) for node in tour]
-    if motion.reference_every:
-        order = with_references(tour, moves, costs, motion.reference_every, paired)
-        while moves.check([node for node, _ in order], costs):
-            costs = moves.costs()
+    return tour, costs
+
+
+def _executed(
+    moves: Moves, order: list[tuple[int, int]], costs: Costs, motion: Motion, drift: Drifting | None
+) -> Execution:
+    """Of the nodes in their `order`, behind each how often it was visited for reference."""
     nodes = [node for node, _ in order]
-    Reach(moves, blockers).check_tour(nodes, costs)
-    stops = [
-        replace(stop, again=again)
-        for (u, (v, again)) in zip([0, *nodes], order, strict=False)
-        for stop in _stops(moves, u, v, costs)
-    ]
+    stops: list[Stop] = []
     visited: Counter[tuple[int, ...]] = Counter()
-    for k, stop in enumerate(stops):
-        key = (stop.pose, stop.load, stop.side, stop.again)
-        stops[k] = replace(stop, part=visited[key])
-        visited[key] += 1
+    for u, (v, again) in zip([0, *nodes], order, strict=False):
+        for stop in _stops(moves, u, v, costs):
+            key = (stop.pose, stop.load, stop.side, again)
+            stops.append(replace(stop, again=again, part=visited[key]))
+            visited[key] += 1
     _, home = moves.way(nodes[-1], 0, costs)  # empty without a home
-    home_travel = _time(moves, home)
     return Execution(
         stops=tuple(stops),
         home_via=moves.points[home[1:-1]],
-        home_travel=home_travel,
+        home_travel=_time(moves, home),
         take_off=bool(moves.loaded[stops[-1].load]),
         motion=motion,
         checked=moves.checked,

@@ -201,8 +201,7 @@ class Moves:
         leave = len(start) + pose
         between, signs, entry = np.zeros((0, n)), None, leave[:, None]
         if motion.both_directions:
-            if limits is None:
-                raise InputError("approaches from both sides need the joint limits")
+            assert limits is not None
             signs = approach_signs(q, *limits, motion.overshoot)
             between = (q[:, None] - signs * motion.overshoot).reshape(-1, n)
             entry = len(start) + n_poses + 2 * pose[:, None] + np.arange(2)

@@ -370,18 +370,16 @@ OPEN = frozenset({"time", "temperature", "approach"})
 def clocked(execution: Execution) -> Execution:
     """With the time of each stop, in s from the beginning to the middle of its readings, and the
     sign of each joint's last motion on the way to it, 0 where it has not moved yet."""
-    motion, now, stops = execution.motion, 0.0, []
+    motion, stops = execution.motion, []
     last = execution.stops[0].q if motion.home is None else motion.home
     sign = np.zeros(len(last), dtype=np.int64)
-    for stop in execution.stops:
+    for stop, begun in zip(execution.stops, execution.arrivals, strict=True):
         for q in (*stop.via, stop.q):
             step = q - last
             sign = np.where(np.abs(step) > STILL, np.sign(step), sign).astype(np.int64)
             last = q
-        now += stop.travel + (0.0 if stop.change_after is None else motion.load_change)
         came = sign if stop.approach is None else stop.approach
-        stops.append(replace(stop, time=now + motion.dwell / 2, approach=came))
-        now += motion.dwell
+        stops.append(replace(stop, time=float(begun) + motion.dwell / 2, approach=came))
     return replace(execution, stops=tuple(stops))
 
 

@@ -61,8 +61,6 @@ def plan_blocks(plan: Plan) -> Iterator[Block]:
     if plan.timed:
         yield Fold("Poses and readings within the time", lambda: [timed_table(plan)], printed=True)
     yield Fold("What the plan is worth", lambda: [Lines(plan_lines(plan))], printed=True)
-    yield Fold("How each stop is reached", lambda: [way_table(plan)])
-    yield Fold("Feasible candidates", lambda: [removal_table(plan)])
 
 
 def next_report(found: NextPoses) -> Report:
@@ -147,10 +145,6 @@ def _poses(plan: Plan, decimals: int) -> ShownTable:
     return ShownTable(tuple(heads), rows, words, title="Poses")
 
 
-def force_text(plan: Plan, load: int) -> str:
-    return " ".join(f"{f:g}" for f in plan.forces[load])
-
-
 def reason_table(plan: Plan) -> ShownTable:
     """What each pose is there for."""
     rows = [(name, served(r)) for name, r in zip(plan.configurations, plan.reasons, strict=True)]
@@ -203,46 +197,15 @@ def timed_table(plan: Plan) -> ShownTable:
     return ShownTable(heads, rows, (), title="Poses and readings within the time")
 
 
-def removed(plan: Plan) -> list[tuple[str, int]]:
-    """How many candidates each rule of the cell removed, the hardest rule first."""
-    items = sorted(plan.candidates.removed_by.items(), key=lambda item: -item[1])
-    return [(name.replace("_", " "), n) for name, n in items if n]
-
-
-def removal_table(plan: Plan) -> ShownTable:
-    """What became of the candidates, rule by rule."""
-    tried = max(plan.candidates.tried, 1)
-    counts = [*removed(plan), ("feasible", plan.candidates.feasible)]
-    rows: list[tuple[str, ...]] = [(name, str(n), f"{100 * n / tried:.1f} %") for name, n in counts]
-    note = "Rules are checked in order; a pose counts for the first it violates."
-    return ShownTable(("rule", "candidates", "share"), rows, note=note)
-
-
 def stop_table(plan: Plan) -> ShownTable:
     """The stops in the order of execution: what the operator does at each, with a box to tick."""
-    motion, rows, now = plan.execution.motion, [], 0.0
-    loads = len(plan.forces) > 1
-    for k, stop in enumerate(plan.execution.stops):
-        change = stop.change_after is not None
-        now += stop.travel + motion.load_change * change
-        load = [f"{force_text(plan, stop.load)}{', to change' * change}"] if loads else []
+    rows, loads, e = [], len(plan.forces) > 1, plan.execution
+    for k, (stop, now) in enumerate(zip(e.stops, e.arrivals, strict=True)):
+        change = ", to change" * (stop.change_after is not None)
+        load = [f"{' '.join(f'{f:g}' for f in plan.forces[stop.load])}{change}"] if loads else []
         rows.append((str(k + 1), stop.name(plan.configurations), *load, f"{now / 60:.0f}", "☐"))
-        now += motion.dwell
     heads = ("stop", "pose", *(["load in N"] if loads else []), "minute", "done")
     return ShownTable(heads, rows, (2,) if loads else (), title="Stops in order")
-
-
-def way_table(plan: Plan) -> ShownTable:
-    """How each stop is reached."""
-    kinds = plan.model.chain.kinds
-    rows = [
-        (str(k + 1), stop.name(plan.configurations), str(len(stop.via)), f"{stop.travel:.1f}",
-         *joint_texts(stop.q, kinds))
-        for k, stop in enumerate(plan.execution.stops)
-    ]  # fmt: skip
-    heads = ("stop", "pose", "via points", "travel s", *joint_heads(kinds))
-    note = "Via points lead around obstacles; nothing is measured there."
-    return ShownTable(heads, rows, (), note=note)
 
 
 APART = 0.02  # of the criterion, between starts of the search: more of them may find better
@@ -438,7 +401,8 @@ def _chance_lines(plan: Plan) -> list[tuple[str, str]]:
 
 def _candidate_line(plan: Plan) -> tuple[str, str]:
     c = plan.candidates
-    told = ", ".join(f"{name} {n}" for name, n in removed(plan))
+    hardest = sorted(c.removed_by.items(), key=lambda item: -item[1])
+    told = ", ".join(f"{name.replace('_', ' ')} {n}" for name, n in hardest if n)
     text = f"{c.feasible} feasible of {c.tried} tried"
     return "Candidates", text + (f"; removed by {told}." if told else "; no rule removed any.")
 
