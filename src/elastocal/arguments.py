@@ -217,7 +217,6 @@ def _kind(name: str) -> tuple[str, Check]:
 
 
 def _shown(value: Any) -> str:
-    """A value as a message shows it: numbers and texts themselves, all else by its type."""
     if value is None or isinstance(value, str | Real | list | tuple | Mapping):
         return quoted(value)
     shape = getattr(value, "shape", ())

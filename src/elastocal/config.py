@@ -190,7 +190,6 @@ class _Spot:
 
 
 def _complaint(root: type[BaseModel], data: dict[str, Any], error: ValidationError) -> str:
-    """The first problem that pydantic found in `data`, as a sentence."""
     problems = error.errors(include_url=False, include_context=False)
     # A misspelt key is the cause, the key then missing only its consequence.
     first = min(problems, key=lambda problem: problem["type"] != "extra_forbidden")
@@ -257,7 +256,6 @@ def _inside(kinds: Sequence[Any], part: str | int, stated: bool) -> Iterator[Any
 
 
 def is_table(kind: object) -> bool:
-    """Whether a type is a table of keys."""
     return isinstance(kind, type) and issubclass(kind, BaseModel)
 
 

@@ -142,7 +142,6 @@ class Measurements(Result):
 
     @property
     def kinds(self) -> tuple[str, ...]:
-        """Of every joint, "revolute" or "prismatic"."""
         return self.joint_kinds or ("revolute",) * self.q.shape[1]
 
     def to_dataframe(self) -> pd.DataFrame:

@@ -93,7 +93,6 @@ def is_plugin_file(module: str) -> bool:
 
 
 def load_installed() -> None:
-    """Run the entry points of installed packages."""
     from importlib.metadata import entry_points
 
     for point in entry_points(group=GROUP):
@@ -161,7 +160,6 @@ def _version(path: Path) -> tuple[int, int]:
 
 
 def _run(where: str, path: Path | None, run: Callable[[], None]) -> None:
-    """Run a plug-in; what goes wrong in it is an InputError that says where."""
     try:
         run()
     except InputError as error:

@@ -47,7 +47,6 @@ def save(result: Any, path: str | Path, **how: Any) -> None:
 
 
 def write_json(path: Path, content: Any) -> None:
-    """Strict JSON, ending with a newline."""
     atomic_write_text(path, json_text(content) + "\n")
 
 
@@ -99,7 +98,6 @@ def save_plan(plan: Plan, path: Path, command: str | None = None) -> None:
 
 
 def save_diagnosis(diagnosis: Diagnosis, path: Path) -> None:
-    """The diagnosis as JSON (schema elastocal/diagnosis/1)."""
     from elastocal.diagnosis.diagnosis import publish
 
     assert diagnosis.model is not None  # `diagnose` states it
@@ -210,7 +208,6 @@ def save_next(found: NextPoses, path: Path) -> None:
 
 
 def save_comparison(found: Comparison, path: Path) -> None:
-    """The comparison as JSON (schema elastocal/comparison/1)."""
     write_json(path, found.to_json())
 
 

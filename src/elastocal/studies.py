@@ -78,12 +78,10 @@ class Sources:
 
     @cached_property
     def digests(self) -> dict[str, str]:
-        """SHA-256 by file name."""
         return {name: hashlib.sha256(data).hexdigest() for name, data in self.contents.items()}
 
     @cached_property
     def digest(self) -> str:
-        """One SHA-256 of all names and contents."""
         lines = [f"{name} {value}" for name, value in sorted(self.digests.items())]
         return hashlib.sha256("\n".join(lines).encode()).hexdigest()
 
@@ -98,7 +96,6 @@ class StudyTask:
     hash: str
 
     def line(self) -> Row:
-        """The line of results of a task that gave none yet."""
         return {
             "task": self.index, "task_hash": self.hash, "values": json.loads(self.text),
             "rows": [], "task_seconds": 0.0, "elastocal": __version__, "task_error": None,
@@ -123,8 +120,6 @@ class Study:
 
 
 class StudyFile(Table):
-    """The keys of study.toml."""
-
     title: str = Field("", description="text")
     seed: int = Field(ge=0, description="a whole number from 0")
     files: list[str] = Field([], description='a list of names, as in files = ["cell.toml"]')
@@ -445,7 +440,6 @@ def result_lines(folder: Path) -> list[Row]:
 
 
 def write_statement(folder: Path, study: Study) -> None:
-    """Write down what the results are of: seed, options, hashes of the sources."""
     statement = {
         "schema": SCHEMA, "title": study.title, "seed": study.seed,
         "options": dict(study.options), "tasks": len(study.tasks),

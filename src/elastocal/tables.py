@@ -117,7 +117,6 @@ class CsvLines:
         return not bare or bare.startswith(b"#")
 
     def _checked(self, text: str) -> list[str]:
-        """The cells of a line, as many as the header has."""
         cells = self._cells(text) if '"' in text else text.split(self.delimiter)
         expected = len(self.header)
         if len(cells) != expected:
@@ -245,12 +244,10 @@ class Family:
     optional: Container[str] = ()
 
     def columns(self, stem: str) -> tuple[str, ...]:
-        """Every way to write the column `stem`."""
         return tuple(column(stem, unit) for unit in self.units[stem])
 
     @property
     def required(self) -> list[str]:
-        """The stems that must be there where the family is."""
         return [stem for stem in self.units if stem not in self.optional]
 
 
@@ -454,7 +451,6 @@ class RawTable:
     labels: Mapping[str, Labels]
 
     def where(self, i: int, *headers: str) -> str:
-        """File, line and columns of row i, as messages begin."""
         columns = f"column{'s' if len(headers) > 1 else ''} {' and '.join(headers)}"
         return f"{self.source}, {self.noun} {self.row[i]}, {columns}"
 

@@ -89,7 +89,6 @@ class Robot:
 
     @classmethod
     def from_keys(cls, table: Any, spot: Spot) -> dict[str, Any]:
-        """Checks that one robot is stated, with the keys that belong to it."""
         given = [name for name in SOURCES if getattr(table, name) is not None]
         told = f"[robot] takes exactly one of {listed(SOURCES)}; none is given"
         spot.require(bool(given), told)
@@ -208,7 +207,6 @@ class PolarNoise:
 
     @classmethod
     def from_keys(cls, table: Any, spot: Spot) -> dict[str, Any]:
-        """The parts per metre, which may be left out."""
         return {
             "range_per_m": to_si(table.range_ppm or 0.0, "ppm"),
             "transverse_per_m": to_si(table.transverse_ppm or 0.0, "ppm"),
@@ -240,7 +238,6 @@ class Tracker:
 
     @classmethod
     def from_keys(cls, table: Any, spot: Spot) -> dict[str, Any]:
-        """The noise, in the one style that the table has."""
         polar = [name for name in POLAR_KEYS if getattr(table, name) is not None]
         if table.sigma_um is not None:
             spot.require(

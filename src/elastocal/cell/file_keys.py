@@ -169,7 +169,6 @@ def record(cls: type[Record]) -> type[Record]:
 
 
 def _wrong_argument(cls: Any, error: ValidationError) -> str:
-    """What is wrong with the arguments of a record, as a sentence."""
     first = error.errors(include_url=False)[0]
     kind, name, own, fields = first["type"], first["loc"][0], cls.__name__, list(fields_of(cls))
     if kind == "unexpected_keyword_argument":
@@ -190,12 +189,10 @@ def _wrong_argument(cls: Any, error: ValidationError) -> str:
 
 @cache
 def _hints_of(cls: Any) -> dict[str, Any]:
-    """The types of a record's fields, with what is annotated."""
     return get_type_hints(cls, include_extras=True)
 
 
 def _fields_of(cls: Any) -> dict[str, tuple[Key, ...]]:
-    """The fields of a record by name, each with the keys that state it in a cell file."""
     hints = _hints_of(cls)
     found = {}
     for name, one in cls.__dataclass_fields__.items():
@@ -253,7 +250,6 @@ def keys_of(*records: Any, without: Sequence[str] = ()) -> list[Key]:
 
 
 def _form(hint: Any) -> Any:
-    """The type that a field has in the file: there are tables in place of records."""
     for note in _notes(hint):
         if isinstance(note, FromFile):
             return note.form
@@ -270,7 +266,6 @@ def _is_record(kind: Any) -> bool:
 
 
 def _table_of(cls: Any) -> type[RecordTable]:
-    """The table of the cell file that states a record: its keys, their types, what they take."""
     fields: dict[str, Any] = {
         k.name: (k.form, Field(... if k.required else None, description=k.takes))
         for k in keys_of(cls)
@@ -384,7 +379,6 @@ def joint_values(
 
 
 def _tuple(value: object) -> object:
-    """A list or an array as a tuple, whose members are then checked."""
     if isinstance(value, np.ndarray):
         value = value.tolist()
     return tuple(value) if isinstance(value, list) else value

@@ -107,7 +107,6 @@ class Solid:
 
     @classmethod
     def from_keys(cls, table: Any, spot: Spot) -> dict[str, Any]:
-        """Size and placement; the keys of the size are those of the shape."""
         needed = NEEDED[table.shape]
         for known in keys_of(cls):
             given = getattr(table, known.name, None) is not None
@@ -145,7 +144,6 @@ class CarriedBody:
 
     @classmethod
     def from_keys(cls, table: Any, spot: Spot) -> dict[str, Any]:
-        """The solid, whose keys stand beside the carrier's."""
         return {"solid": from_table(Solid, table, spot)}
 
 
@@ -184,7 +182,6 @@ class HangingLoad:
 
     @classmethod
     def from_keys(cls, table: Any, spot: Spot) -> dict[str, Any]:
-        """The solid, whose keys stand beside the rope's."""
         axis, angle = table.rope_axis is not None, table.max_angle_deg is not None
         given, other, takes = (
             ("rope_axis", "max_angle_deg", "the angle that it may deviate from the vertical")
@@ -291,7 +288,6 @@ class Workspace:
 
     @classmethod
     def from_keys(cls, table: Any, spot: Spot) -> dict[str, Any]:
-        """Checks names, and whether the geometry and the links' radii go together."""
         _check_names(table, spot)
         radius = stated(table, spot, fields_of(cls)["link_radius"])
         geometry = table.geometry or ("capsules" if radius else "none")
@@ -346,7 +342,6 @@ class PluginsTable(Table):
 
 
 def _modules(table: PluginsTable, spot: Spot, name: str) -> tuple[str, ...]:
-    """Files as paths that exist, modules as they are named."""
     modules = table.modules or ()
     for i, module in enumerate(modules):
         if is_plugin_file(module):

@@ -48,7 +48,6 @@ class Targets:
         return len(self.table)
 
     def place(self, i: int) -> str:
-        """Where row i stands, as messages begin: file and line."""
         return f"{self.table.source}, line {self.table.row[i]}"
 
 
@@ -258,7 +257,6 @@ class Goals:
     rotation: Array | None
 
     def in_base(self, T: Array) -> Goals:
-        """The same in the base frame, which stands at T (n, 4, 4) in the data's frame."""
         back = T[:, :3, :3].transpose(0, 2, 1)
         position = np.einsum("nij,nj->ni", back, self.position - T[:, :3, 3])
         return Goals(position, None if self.rotation is None else back @ self.rotation)
@@ -273,7 +271,6 @@ class Solved:
     turn: Array
 
     def replaced(self, rows: IntArray, other: Solved) -> Solved:
-        """The same with `other` in the rows named."""
         new = Solved(self.q.copy(), self.miss.copy(), self.turn.copy())
         new.q[rows], new.miss[rows], new.turn[rows] = other.q, other.miss, other.turn
         return new
@@ -312,5 +309,4 @@ class Commanding(BoundedSearch):
         return self.judged(self.solve(nominal, target)[0], target)
 
     def judged(self, q: Array, target: IntArray) -> Solved:
-        """Commands q with what they miss."""
         return Solved(q, *self.misses(q, target))

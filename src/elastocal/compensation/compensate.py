@@ -98,7 +98,6 @@ class Compensation(Result):
 
     @property
     def reached(self) -> NDArray[np.bool_]:
-        """(n,)"""
         return np.array([status == REACHED for status in self.status])
 
 
@@ -173,7 +172,6 @@ def compensate(
 
 
 def _goals(targets: Targets, chain: Chain, T: Array, place: Array, turn: Array) -> Goals:
-    """The targets in the data's frame."""
     position, rotation = targets.position, targets.rotation
     if position is None:
         assert targets.q is not None  # read_targets: positions or joints
@@ -391,7 +389,6 @@ def check_status(
 
 
 def in_file_units(values: Array, kinds: Sequence[str]) -> Array:
-    """Joints in rad or m as degrees or mm."""
     return values * np.where([kind == "revolute" for kind in kinds], 180 / np.pi, 1e3)
 
 
@@ -707,7 +704,6 @@ def _with_table(
 
 
 def _interpolated(grid: CorrectionGrid, points: Array, correction: Array, where: Array) -> Array:
-    """Multilinear interpolation of the table at `where` (M, axes)."""
     from scipy.interpolate import RegularGridInterpolator
 
     order = np.lexsort(points.T[::-1])

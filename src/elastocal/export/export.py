@@ -184,7 +184,6 @@ class Exported:
     correction: JointCorrection = field(default_factory=lambda: JointCorrection(()))
 
     def to_json(self) -> dict[str, Any]:
-        """The answer as a JSON-ready dictionary, lengths in µm."""
 
         def um(metres: float | None) -> float | None:
             return None if metres is None else metres * 1e6

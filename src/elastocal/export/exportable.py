@@ -78,7 +78,6 @@ class Difference:
     marker_max: float
 
     def to_json(self) -> dict[str, float]:
-        """The four numbers in µm."""
         return {f"{name}_um": value * 1e6 for name, value in vars(self).items()}
 
 
@@ -219,7 +218,6 @@ class ExportNumbers:
 
     @property
     def yielding(self) -> list[SpringValue]:
-        """The springs that yield."""
         return [s for s in self.springs if s.compliance > 0]
 
     def springs_at(self, site: str) -> list[SpringValue]:
@@ -350,7 +348,6 @@ class Cost:
     measured: bool
 
     def to_json(self) -> dict[str, Any]:
-        """JSON-ready, lengths in µm."""
         return {
             "poses": self.poses,
             "poses_without_equilibrium": self.unsettled,

@@ -550,7 +550,6 @@ class _MjcfText(XmlText):
 
 
 def _pose(T: Array) -> dict[str, str]:
-    """`pos` and `quat` of a transform (4, 4)."""
     placed = placed_body("", T)
     return {name: placed[name] for name in ("pos", "quat")}
 

@@ -173,7 +173,6 @@ class Refit:
         return self.after < self.before
 
     def to_json(self) -> dict[str, Any]:
-        """JSON-ready, lengths in µm."""
         sizes = {"before": self.before, "after": self.after, "nominal": self.nominal}
         told = {f"marker_rms_{name}_um": size * 1e6 for name, size in sizes.items()}
         corrected = None if self.correction is None else self.correction * 1e6
@@ -335,7 +334,6 @@ class _ArmFit:
         return x, start if curves is None else curves.correction(start, u[len(free) :])
 
     def _rows(self, poses: IntArray, names: tuple[str, ...]) -> Measurements:
-        """Of each pose a row for each marker."""
         at = np.repeat(poses, len(names))
         marker = np.tile(np.arange(len(names)), len(poses))
         return replace(

@@ -70,8 +70,6 @@ def calibrated_urdf(robot: Robot, pieces: ExportNumbers, frames: Frames, note: s
 
 
 class _UrdfText(XmlText):
-    """The text of a checked URDF, whose joints can be placed anew."""
-
     def __init__(self, tree: Tree) -> None:
         super().__init__(tree.path, urdf_bytes(tree.path))
         self.tree = tree
@@ -79,7 +77,6 @@ class _UrdfText(XmlText):
         self.joints: dict[str, Tag] = {tag.stated["name"].strip(): tag for tag in joints}
 
     def place(self, joint: str, T: Array) -> None:
-        """Let a joint's frame be at T (4, 4) in its parent link's."""
         self.set_in(self.joints[joint], "origin", origin_attributes(T))
 
     def fixed(self, new: str, parent: str, child: str, T: Array) -> list[str]:
@@ -277,7 +274,6 @@ class DhRow:
         return dh.product(shift, turn, dh.rotation(dh.Y, self.beta))
 
     def transform(self) -> Array:
-        """T (4, 4) of the row with its joint at zero."""
         return self.leading() @ self.trailing()
 
     def near(self, other: DhRow, tolerance: float = 1e-12) -> DhRow:

@@ -241,7 +241,6 @@ def assemble(where: str, points: Records, log: Records | None, joined: Joined | 
 def _numbers(
     points: Records, log: Records | None, joined: Joined | None, rows: IntArray
 ) -> tuple[dict[str, Array], dict[str, str]]:
-    """Columns of the points, and of the joint log those that the points do not have."""
     numbers = {stem: values[rows] for stem, values in points.numbers.items()}
     units = dict(points.units)
     if log is not None and joined is not None:

@@ -232,7 +232,6 @@ def loaded_joints(chain: Chain, turned: Array) -> list[int]:
 
 
 def _text(value: str) -> str:
-    """A TOML string."""
     import tomli_w
 
     return tomli_w.dumps({"x": value}).removeprefix("x = ").rstrip("\n")

@@ -286,7 +286,6 @@ class ColumnKey:
 
     @property
     def parts(self) -> list[str | int]:
-        """The places in the file; several only for texts."""
         return list(self.at) if isinstance(self.at, list) else [self.at]
 
     @property
@@ -300,7 +299,6 @@ class ColumnKey:
 
     @property
     def quantities(self) -> tuple[str, ...]:
-        """What its numbers measure."""
         return _QUANTITIES[re.sub(r"^(q|torque_|approach_)\d+$", r"\1#", self.stem)]
 
     @property

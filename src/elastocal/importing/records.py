@@ -93,7 +93,6 @@ class Records:
 
     @property
     def source(self) -> str:
-        """The first file, as messages begin."""
         return self.files[0]
 
     @property
@@ -101,7 +100,6 @@ class Records:
         return self.texts.get("name", [""] * len(self))
 
     def where(self, i: int) -> str:
-        """File and line of row i, as messages begin."""
         return f"{self.files[self.file[i]]}, line {self.line[i]}"
 
     def shown(self, i: int) -> str:
@@ -124,7 +122,6 @@ class Records:
         return np.array([deg if unit == "deg" else mm for unit in self.q_units])
 
     def take(self, rows: IntArray) -> Records:
-        """The rows of these numbers."""
         return replace(
             self,
             file=self.file[rows],
@@ -205,7 +202,6 @@ def _read(
     text: ForeignText, table: Rows, asked: Sequence[ColumnKey], source: SourceTable,
     units: UnitsTable, hint: str | None,
 ) -> Records:  # fmt: skip
-    """The rows of a table with these columns."""
     settings, name = source.text or TextSourceKeys(), text.source
     columns = resolve(name, asked, table.header, len(table.rows[0][1]), units, hint)
     numeric = [c for c in columns if not c.target.is_text]

@@ -148,12 +148,10 @@ class MjcfArm:
 
     @cached_property
     def joints(self) -> list[int]:
-        """The moving joints from base to flange."""
         return [j for body in self.way(self.flange) for j in self.joints_of(body)]
 
     @property
     def end_name(self) -> str:
-        """The name of the flange in the file, "" where it has none."""
         if self.site is not None:
             return str(self.model.site(self.site).name)
         return str(self.model.body(self.flange).name)
@@ -179,7 +177,6 @@ class MjcfArm:
 
     @cached_property
     def chain(self) -> Chain:
-        """The nominal chain; names as in the file."""
         joints: list[Joint] = []
         T = np.eye(4)
         for body in self.way(self.flange):
@@ -372,7 +369,6 @@ def transform(position: Sequence[float] | Array, quaternion: Sequence[float] | A
 
 
 def shift(position: Sequence[float] | Array) -> Array:
-    """Trans(p) (4, 4)."""
     return transform(position, (1.0, 0.0, 0.0, 0.0))
 
 
@@ -415,7 +411,6 @@ def _refusals(path: Path) -> Iterator[None]:
 
 @contextmanager
 def _quiet() -> Iterator[list[warnings.WarningMessage]]:
-    """In the `with` block warnings are collected, not shown."""
     with warnings.catch_warnings(record=True) as found:
         warnings.simplefilter("always")
         yield found
@@ -660,7 +655,6 @@ def _bodies(arm: Any, tie: Tie) -> list[tuple[int, int]]:
 
 
 def _floating(arm: Any) -> set[int]:
-    """Bodies that are free of their parent."""
     import mujoco
 
     model, free = arm.model, mujoco.mjtJoint.mjJNT_FREE

@@ -124,7 +124,6 @@ class _Bounded(ET.TreeBuilder):
         self._path, self._what, self._depth = path, what, 0
 
     def start(self, tag: Any, attributes: Any) -> Any:
-        """As inherited; raises InputError beyond DEEPEST."""
         self._depth += 1
         require(
             self._depth <= DEEPEST,
@@ -134,7 +133,6 @@ class _Bounded(ET.TreeBuilder):
         return super().start(tag, attributes)
 
     def end(self, tag: str) -> Any:
-        """As inherited."""
         self._depth -= 1
         return super().end(tag)
 
@@ -164,7 +162,6 @@ class Tag:
     inside: list[Tag] = field(default_factory=list)
 
     def all(self, *names: str) -> list[Tag]:
-        """Tags of these names that stand directly in this one."""
         return [tag for tag in self.inside if tag.name in names]
 
     def first(self, name: str) -> Tag | None:
@@ -216,7 +213,6 @@ class XmlText:
         self.insert(self._end(tag.start), text)
 
     def remove(self, tag: Tag) -> None:
-        """Take out an empty element."""
         self._inserted.append((tag.start, self._end(tag.start), b""))
 
     def set(self, tag: Tag, stated: Mapping[str, str], without: Collection[str] = ()) -> None:
@@ -232,7 +228,6 @@ class XmlText:
             self.set(inside, stated)
 
     def result(self) -> str:
-        """The text with all edits made."""
         parts, last = [], 0
         changed = [self._edit(start, stated) for start, stated in self._changed.items()]
         for start, end, new in sorted([*self._inserted, *changed], key=lambda edit: edit[:2]):
@@ -263,7 +258,6 @@ class XmlText:
 
 
 def element(tag: str, stated: Mapping[str, str], *inside: str) -> str:
-    """An element as text."""
     head = f"<{tag}{''.join(f' {k}={quoteattr(v)}' for k, v in stated.items())}"
     return f"{head}>{''.join(inside)}</{tag}>" if inside else f"{head}/>"
 
@@ -312,8 +306,6 @@ def check_bounds(path: Path, data: bytes) -> None:
 
 
 class _Model:
-    """A model of several files; adds up what they ask for."""
-
     def __init__(self, path: Path) -> None:
         self._folder = path.parent
         # The folder as it is named, and that of the file where the name is a link.
@@ -388,7 +380,6 @@ class _Model:
         return {place for place in places if os.path.lexists(place) and not place.is_dir()}
 
     def _count_file(self, path: Path) -> int:
-        """Size of a file that is named once more, in bytes."""
         size = check_regular(path, "file")
         check_size(path, "file", size, MOST_MESH_BYTES)
         self._bytes += size
