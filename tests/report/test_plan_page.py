@@ -15,7 +15,7 @@ from support.pages import Page
 
 from elastocal.errors import InputError
 from elastocal.planning.plan import PlanSize
-from elastocal.report.arm_view import plan_space
+from elastocal.report.arm_view import plan_arm
 from elastocal.report.page import page_of, write_page
 
 SCRIPT = "<script>alert(1)</script>"
@@ -33,7 +33,7 @@ def page(plan: Any) -> Page:
 
 def test_view_has_the_poses_of_the_plan(page: Page, plan: Any) -> None:
     (view,) = (json.loads(text) for text in page.data)
-    space = plan_space(plan)
+    space = plan_arm(plan).space
     assert [pose["name"] for pose in view["poses"]] == ["1", "2", "3", "4"]
     assert view["poses"][0]["names"][0] == SCRIPT
     assert not view["arrows"]

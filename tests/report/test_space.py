@@ -19,7 +19,7 @@ from elastocal.model.manipulator import load_chain
 from elastocal.report.arm_view import (
     frames_at,
     in_script,
-    residual_space,
+    residual_arm,
     shells_of,
     triangles_of,
 )
@@ -74,7 +74,7 @@ def test_no_name_ends_the_script_that_holds_it(content: Any) -> None:
 
 def test_arrows_are_mean_residuals_by_configuration_load_and_marker(case: Any) -> None:
     result = case.result
-    space = residual_space(result.model, result.observations, result.x, result.residual)
+    space = residual_arm(result.model, result.observations, result.x, result.residual).space
     observed = result.observations
     table = observed.table
     parts = result.residual.reshape(-1, 3)

@@ -156,7 +156,6 @@ def _unwritten(error: OSError) -> int:
 
 
 def console(stderr: bool = False) -> Console:
-    """A console; colours respect NO_COLOR and are off where the output is no terminal."""
     return safe_console(stderr=stderr)
 
 

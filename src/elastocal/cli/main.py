@@ -57,7 +57,6 @@ def options(
 
 
 def main() -> None:
-    """Entry point of the `elastocal` command."""
     gc.set_threshold(COLLECT_AFTER)
     # Where it keeps its list of fonts, and that there is no place for it, concerns nobody here.
     logging.getLogger("matplotlib").setLevel(logging.ERROR)

@@ -142,7 +142,6 @@ PICTURES = (".png", ".svg")
 
 
 def _target(text: str) -> float:
-    """--target in m."""
     try:
         target = float(text)
     except ValueError:
@@ -279,7 +278,6 @@ def _resumed(
 
 
 def _what_next(cell: Path, output: Path, augment: Path | None, plan: Plan) -> str:
-    """What to do with the plan."""
     from elastocal.planning.plan import load_name
 
     loads = plan.forces[(plan.forces != 0).any(axis=1)]
@@ -330,7 +328,6 @@ def _check_programs(cell: Cell, programs: list[Path]) -> None:
 
 
 def _write_all(plan: Plan, output: Path, programs: list[Path], picture: Path | None) -> None:
-    """plan.csv, plan.json, robot programs and picture."""
     from elastocal.files import atomic_write_text
     from elastocal.model.chain import joint_limits
     from elastocal.saving import save_plan
@@ -352,7 +349,6 @@ def _program(
     configurations: tuple[str, ...] = (), forces: Array | None = None,
     limits: tuple[Array, Array] | None = None,
 ) -> str:  # fmt: skip
-    """The robot program to write to `path`."""
     from elastocal.planning.programs import robot_program
 
     try:
@@ -564,7 +560,6 @@ def import_(
 
 
 def _understood(found: Imported, output: Path | None) -> dict[str, Any]:
-    """The preview as JSON."""
     table, joined = found.table, found.joined
     return {
         "schema": "elastocal/import/1",

@@ -148,7 +148,6 @@ GRID_REMEDIES = {
 
 
 def _posture(arm: CalibratedArm, text: str | None) -> Array | None:
-    """--near as joints (n,) in rad or m."""
     import numpy as np
 
     from elastocal.compensation.compensate import in_file_units
@@ -169,7 +168,6 @@ def _posture(arm: CalibratedArm, text: str | None) -> Array | None:
 
 
 def _grid(arm: CalibratedArm, grid: str, box: str | None, rotation: str | None) -> CorrectionGrid:
-    """The grid that --grid, --box and --rotation ask for."""
     import numpy as np
     from scipy.spatial.transform import Rotation
 

@@ -160,7 +160,6 @@ class Posed:
 
     @property
     def line(self) -> Array:
-        """Base, joints and flange (n + 2, 3)."""
         return np.vstack([self.frames[:, :3, 3], self.flange[None, :3, 3]])
 
 
@@ -217,35 +216,31 @@ class Space:
     @property
     def json(self) -> str:
         """For the page's script: lengths in m, arrows in µm; safe within a script element."""
+
+        def flat(points: Array | None, digits: int) -> list[Any] | None:
+            return None if points is None else points.round(digits).tolist()
+
+        def bodies(shells: Sequence[Shell]) -> list[dict[str, Any]]:
+            return [
+                {"carrier": s.carrier, "points": flat(s.points.ravel(), 4),
+                 "faces": s.faces.ravel().tolist()}
+                for s in shells
+            ]  # fmt: skip
+
         content = {
-            "what": self.what,
-            "first": self.first,
-            "scale": self.scale,
-            "arrows": self.has_arrows,
-            "range": self.extent.T.round(3).tolist(),
-            "tracker": None if self.tracker is None else self.tracker.round(3).tolist(),
-            "bodies": [_shell_json(s) for s in self.shells.arm],
-            "things": [_shell_json(s) for s in self.shells.around],
-            "poses": [_pose_json(p) for p in self.poses],
-        }
+            "what": self.what, "first": self.first, "scale": self.scale, "arrows": self.has_arrows,
+            "range": flat(self.extent.T, 3), "tracker": flat(self.tracker, 3),
+            "bodies": bodies(self.shells.arm), "things": bodies(self.shells.around),
+            "poses": [
+                {"name": printable(p.name), "about": printable(p.about),
+                 "frames": flat(p.frames[:, :3].reshape(len(p.frames), 12), 5),
+                 "line": flat(p.line, 4), "markers": flat(p.markers, 4),
+                 "names": [*map(printable, p.names)],
+                 "arrows": flat(None if p.arrows is None else p.arrows * 1e6, 2)}
+                for p in self.poses
+            ],
+        }  # fmt: skip
         return in_script(content)
-
-
-def _shell_json(s: Shell) -> dict[str, object]:
-    points, faces = s.points.round(4).ravel().tolist(), s.faces.ravel().tolist()
-    return {"carrier": s.carrier, "points": points, "faces": faces}
-
-
-def _pose_json(p: Posed) -> dict[str, object]:
-    return {
-        "name": printable(p.name),
-        "about": printable(p.about),
-        "frames": p.frames[:, :3].round(5).reshape(len(p.frames), 12).tolist(),
-        "line": p.line.round(4).tolist(),
-        "markers": p.markers.round(4).tolist(),
-        "names": [printable(name) for name in p.names],
-        "arrows": None if p.arrows is None else (p.arrows * 1e6).round(2).tolist(),
-    }
 
 
 def in_script(content: object) -> str:
@@ -296,24 +291,8 @@ WORST = 30
 def residual_arm(
     model: Model, observed: Observations, x: Array, residual: Array
 ) -> blocks.ShownArm:
-    """The arm with its residuals as arrows, and what they are."""
-    space = residual_space(model, observed, x, residual)
-    shown, several = len(space.poses), observed.n_configurations
-    text = (
-        f"Mean residual of each marker as an arrow, {space.scale:g} times as long as it is, in "
-        f"configuration {printable(space.poses[space.first].name)}, which has the largest, and in "
-        f"all of them. The arm is drawn as {space.shells.drawn_from}."
-    )
-    if shown < several:
-        text += (
-            f" {shown} poses of {several} configurations: those with the largest residuals, and a "
-            "random choice."
-        )
-    return blocks.ShownArm("space", space, "Residuals as arrows on the posed arm", text)
-
-
-def residual_space(model: Model, observed: Observations, x: Array, residual: Array) -> Space:
-    """One pose per configuration and load, its arrows the mean residual of each marker.
+    """The arm with its residuals as arrows: one pose per configuration and load, each arrow the
+    mean residual of a marker.
 
     `residual` (rows,) is observed minus predicted at parameter values x (parameters,); of a pose
     the position counts, a distance's residual lies along the line from its anchor.
@@ -337,8 +316,9 @@ def residual_space(model: Model, observed: Observations, x: Array, residual: Arr
     rms = np.sqrt(np.bincount(entry, (vectors**2).sum(axis=1)) / np.bincount(entry))
     chosen = _chosen(rms, np.argsort(first))
     rows = observed.lead[first[chosen]]
-    flanges = model.flange_poses(table.take(rows), x)
-    frames, flange = frames_at(model.cell, model.chain, table.q[rows], flanges)
+    frames, flange = frames_at(
+        model.cell, model.chain, table.q[rows], model.flange_poses(table.take(rows), x)
+    )
     several = len(np.unique(force, axis=0)) > 1
     poses = []
     for k, code in enumerate(chosen):
@@ -348,16 +328,28 @@ def residual_space(model: Model, observed: Observations, x: Array, residual: Arr
         name = table.configuration_labels[table.configuration[rows[k]]]
         poses.append(
             Posed(
-                name=f"{name}, {load_text(table.force[rows[k]])}" if several else name,
-                about=f"rms residual {length(float(rms[code]))} of {len(own)} readings",
-                frames=frames[k],
-                flange=flange[k],
-                markers=np.array([at[g].mean(axis=0) for g in groups]),
-                names=tuple(table.marker_names[m] for m in markers),
-                arrows=np.array([vectors[g].mean(axis=0) for g in groups]),
+                f"{name}, {load_text(table.force[rows[k]])}" if several else name,
+                f"rms residual {length(float(rms[code]))} of {len(own)} readings",
+                frames[k],
+                flange[k],
+                np.array([at[g].mean(axis=0) for g in groups]),
+                tuple(table.marker_names[m] for m in markers),
+                np.array([vectors[g].mean(axis=0) for g in groups]),
             )
         )
-    return space_of(model.cell, model.chain, poses, int(np.argmax(rms[chosen])), "configuration")
+    worst = int(np.argmax(rms[chosen]))
+    space = space_of(model.cell, model.chain, poses, worst, "configuration")
+    text = (
+        f"Mean residual of each marker as an arrow, {space.scale:g} times as long as it is, in "
+        f"configuration {printable(poses[worst].name)}, which has the largest, and in all of them. "
+        f"The arm is drawn as {space.shells.drawn_from}."
+    )
+    if len(poses) < observed.n_configurations:
+        text += (
+            f" {len(poses)} poses of {observed.n_configurations} configurations: those with the "
+            "largest residuals, and a random choice."
+        )
+    return blocks.ShownArm("space", space, "Residuals as arrows on the posed arm", text)
 
 
 def _chosen(rms: Array, order: IntArray) -> IntArray:
@@ -371,17 +363,6 @@ def _chosen(rms: Array, order: IntArray) -> IntArray:
 
 
 def plan_arm(plan: Plan) -> blocks.ShownArm:
-    """The arm in every pose of a plan."""
-    space = plan_space(plan)
-    caption = (
-        "The arm in the poses of the plan, numbered at the flange. The arm is drawn as "
-        f"{space.shells.drawn_from}."
-    )
-    return blocks.ShownArm("poses", space, "The arm in the poses of the plan", caption)
-
-
-def plan_space(plan: Plan) -> Space:
-    """The arm in every pose of the plan."""
     cell, chain = plan.model.cell, plan.model.chain
     frames, flange = frames_at(cell, chain, plan.q)
     local = np.array(list(cell.tool.markers.values())).reshape(-1, 3)
@@ -397,7 +378,12 @@ def plan_space(plan: Plan) -> Space:
             Posed(plan.configurations[k], "; ".join(about), frames[k], T, markers, names, None,
                   int(plan.group[k]))
         )  # fmt: skip
-    return space_of(cell, chain, poses, groups=plan.group_names)
+    space = space_of(cell, chain, poses, groups=plan.group_names)
+    caption = (
+        "The arm in the poses of the plan, numbered at the flange. The arm is drawn as "
+        f"{space.shells.drawn_from}."
+    )
+    return blocks.ShownArm("poses", space, "The arm in the poses of the plan", caption)
 
 
 # The still picture
@@ -456,7 +442,6 @@ def write_plan_picture(path: str | Path, plan: Plan) -> None:
 
 
 def plan_figure(plan: Plan) -> Any:
-    """The poses of a plan as matplotlib's Figure."""
     return figure_of(space_figure(plan_arm(plan)))
 
 
@@ -483,16 +468,16 @@ def _draw(axes: Axes, space: Space, view: Array, whole: bool) -> None:
             axes.quiver(at[:, 0], at[:, 1], step[:, 0], step[:, 1], angles="xy",
                         scale_units="xy", scale=1, color=SERIES[1], width=0.004, headwidth=3.5,
                         headlength=4, zorder=3)  # fmt: skip
+    drawn = [] if whole else space.bodies
     if space.tracker is not None:
         x, y, _ = view @ space.tracker
         axes.plot([x], [y], "D", color=SERIES[2], markersize=6)
         axes.annotate("tracker", (x, y), (6, 3), textcoords="offset points", fontsize=8)
+        drawn.append(space.tracker[None])
     axes.set_aspect("equal")
     # Limits that hold arms, arrows and tracker; of what stands around, what lies within.
-    drawn = [] if whole else space.bodies
     drawn += [points for p in poses for points in (p.line, p.markers)]
     drawn += [p.markers + space.scale * p.arrows for p in poses if p.arrows is not None]
-    drawn += [] if space.tracker is None else [space.tracker[None]]
     flat = (np.vstack(drawn) @ view.T)[:, :2]
     low, high = flat.min(axis=0), flat.max(axis=0)
     room = 0.09 * (high - low).max()
@@ -543,7 +528,6 @@ def _fill(axes: Axes, points: Array, colour: str, alpha: float) -> None:
 
 
 def turned(space: Space) -> Any:
-    """The poses as plotly's figure, to be turned."""
     import plotly.graph_objects as go
 
     def name(text: str) -> str:  # plotly reads some HTML in its texts

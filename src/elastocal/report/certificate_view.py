@@ -82,7 +82,6 @@ def _blocks(result: Calibration) -> Iterator[Block]:
 
 
 def entry_rows(result: Calibration) -> list[tuple[str, str]]:
-    """The entries of [certificate] as they are stated."""
     entries = result.model.cell.certificate
     rows = [
         (name.replace("_", " "), printable(value))
@@ -152,7 +151,6 @@ PARTS = {
 
 
 def certified_values(result: Calibration, budget: ErrorBudget | None) -> Certified:
-    """The numbers of the certificate."""
     parts, sources = result.uncertainty(), []
     for key, (name, kind) in PARTS.items() if parts is not None else ():
         sources.append((name, kind, getattr(parts, key) / SIDES))

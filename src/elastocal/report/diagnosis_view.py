@@ -194,7 +194,6 @@ def _residuals(d: Diagnosis) -> Iterator[ShownArm | Block]:
 
 
 def noise_floor_lines(noise: NoiseFloor, kinds: Iterable[str]) -> list[str]:
-    """What the data themselves say of the noise, a sentence each."""
     text = f"A reading scatters by {length(noise.reading_sigma)} rms per axis"
     if noise.stated:
         text += (
@@ -248,7 +247,6 @@ MATERIAL = 0.2  # of the noise: 2 % more in all
 
 
 def diagnosis_headline(d: Diagnosis) -> str:
-    """The verdict in one sentence."""
     if d.groups:
         return capital(headline_of_causes(d))
     if d.verdict == "explained":
@@ -287,14 +285,12 @@ def _unknown(d: Diagnosis) -> str:
 
 
 def location_text(location: Location) -> str:
-    """ "at joint 2, in the transmission (probability 0.97)"."""
     at, stage = place(location.where), STAGES[location.stage]
     where = f"at {at}, in the {stage}" if at != stage else f"at the {at}"
     return f"{where} (probability {probability(location.probability)})"
 
 
 def diagnosis_lines(d: Diagnosis) -> list[tuple[str, str]]:
-    """(label, sentence) on what was found."""
     lines = [("Error", text) for text in _error_lines(d)]
     if d.verdict == "unknown_effect":
         lines += [("Depends on", text) for text in _dependence(d)]
@@ -352,7 +348,6 @@ def _finding_line(d: Diagnosis, f: FoundEffect) -> tuple[str, str]:
 
 
 def settings_of(d: Diagnosis, settings: Mapping[str, float]) -> str:
-    """Constants of an effect in words."""
     table = None if d.calibrated is None else d.calibrated.observed.table
     lines = () if table is None or table.time is not None else np.unique(by_rows(table)).tolist()
     return settings_text(settings, lines)
@@ -369,7 +364,6 @@ def _dependence(d: Diagnosis) -> list[str]:
 
 
 def _shape(curve: Curve) -> str:
-    """How much the driver moves the entry, from its lowest to its highest point."""
     moved = f"{driver_name(curve.driver)} moves {driver_name(curve.entry)}"
     return f"{moved} by {curve_span(curve)} in all."
 
@@ -381,7 +375,6 @@ def _chance(d: Diagnosis) -> str:
 
 
 def sensitivity(d: Diagnosis) -> list[str]:
-    """How small an effect would have been seen."""
     if not d.candidates:
         return []
     lines = []
@@ -403,7 +396,6 @@ def sensitivity(d: Diagnosis) -> list[str]:
 
 
 def seen_from(c: Candidate) -> str:
-    """The size from which an effect would be seen, in typical sizes: "0.4"."""
     if not math.isfinite(c.seen_from):
         return "–"
     return f"> {ABSURD:.0f}" if c.seen_from > ABSURD else significant(c.seen_from, 2)
@@ -419,7 +411,6 @@ def diagnosis_steps(d: Diagnosis) -> list[str]:
 
 
 def extra_lines(extra: ExtraPlan) -> list[str]:
-    """What the extra poses promise, or that none would help."""
     rivals = together([name_of(name) for name in extra.rivals], "or")
     if not extra.separable:
         lines = [f"No pose that this cell allows separates {rivals}."]
@@ -437,7 +428,6 @@ def extra_lines(extra: ExtraPlan) -> list[str]:
 
 
 def gap_table(d: Diagnosis) -> ShownTable:
-    """The budget step by step, the noise last."""
     return budget_table(_named_steps(d), ("noise alone", d.gap.noise_floor))
 
 
@@ -471,7 +461,6 @@ def candidate_table(d: Diagnosis) -> ShownTable:
 
 
 def added_parameter_table(d: Diagnosis) -> ShownTable:
-    """Fitted parameters of the effects found, with 95 % half widths, and their settings."""
     rows: list[tuple[str, ...]] = []
     for f in d.effects:
         for p in f.parameters:
@@ -494,7 +483,6 @@ def structure_table(d: Diagnosis) -> ShownTable:
 
 
 def pair_table(d: Diagnosis) -> ShownTable:
-    """How far apart each pair of rivals is before and after the extra poses."""
     rows = [
         (
             f"{name_of(pair.first)} or {name_of(pair.second)}",
@@ -595,7 +583,6 @@ def causes(d: Diagnosis) -> list[Cause]:
 
 
 def family(c: ComponentShare) -> str:
-    """What an error goes with, in words."""
     return FAMILIES.get(c.family, plain_name(c.family))
 
 
@@ -648,7 +635,6 @@ def headline_of_causes(d: Diagnosis) -> str:
 
 
 def cause_table(d: Diagnosis) -> ShownTable:
-    """One row per finding: its share of the gap, and what it takes off the error of new poses."""
     rows = [
         (
             c.name, share_text(c.share), span_text(c.share_ci90, c.share),
@@ -667,7 +653,6 @@ def cause_table(d: Diagnosis) -> ShownTable:
 
 
 def place_table(d: Diagnosis) -> ShownTable:
-    """What acts at each place, below the finding that it belongs to."""
     rows: list[tuple[str, ...]] = []
     groups: dict[int, str] = {}
     told: list[ComponentShare] = []
@@ -705,7 +690,6 @@ def curve_span(curve: Curve) -> str:
 
 
 def curve_line(d: Diagnosis) -> str:
-    """How far the error curve of each joint goes from its lowest to its highest point."""
     told = [f"{curve_span(curve)} ({place(curve.entry)})" for curve in d.curves]
     return f"the joints' errors against their own angles span {together(told)}." if told else ""
 

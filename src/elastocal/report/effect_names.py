@@ -142,7 +142,6 @@ def size_of(p: float) -> str:
 
 
 def percent(fraction: float) -> str:
-    """ "75 %"; "none" where there is no number."""
     return f"{round(100 * fraction)} %" if math.isfinite(fraction) else "none"
 
 

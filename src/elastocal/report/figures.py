@@ -109,7 +109,6 @@ def figure_of(block: Figure, place: SubFigure | None = None) -> Drawing | SubFig
 
 
 def svg(block: Figure) -> str:
-    """The SVG element of a block, in the colours of the page."""
     from matplotlib.figure import Figure as Drawing
 
     with style():
@@ -137,7 +136,6 @@ def svg(block: Figure) -> str:
 
 
 def rendered(figure: Drawing) -> str:
-    """matplotlib's SVG file of a figure."""
     buffer = io.StringIO()
     nothing = {"Date": None, "Creator": None, "Format": None, "Type": None}
     figure.savefig(buffer, format="svg", metadata=nothing)
@@ -351,7 +349,6 @@ def effect_shapes(d: Diagnosis) -> list[EffectShape]:
 
 
 def effects_over_joints(d: Diagnosis) -> Figure | None:
-    """Every found effect of a joint over that joint's position, with the residuals behind it."""
     shapes = effect_shapes(d)
     if not shapes:
         return None
@@ -391,7 +388,6 @@ def _effect(axes: Axes, shape: EffectShape) -> None:
 
 
 def plan_curve(plan: Plan) -> Figure:
-    """The criterion of the best plan found against its number of poses, with its bound."""
     points = plan.curve
     bounded = [(s.poses, s.bound) for s in points if s.bound is not None]
 
@@ -446,7 +442,6 @@ class Residuals:
 
 
 def residuals_by(observed: Observations, residual: Array) -> Residuals:
-    """Residuals (rows,) in m (rad) by observation."""
     table, names = observed.table, COMPONENTS[observed.kind]
     codes, first, pose = np.unique(observed.configuration, return_index=True, return_inverse=True)
     order = np.argsort(first)
@@ -514,7 +509,6 @@ def _thinned(residuals: Residuals, most: int) -> str:
 
 
 def over_configurations(residuals: Residuals) -> Figure:
-    """Residual of every reading over its configuration, a panel per direction."""
     n = len(residuals.components)
     several = 1 < len(residuals.markers) <= len(SERIES)
 
@@ -617,7 +611,6 @@ def running_mean(x: Array, y: Array, bins: int = 12) -> tuple[Array, Array, Arra
 
 
 def over_time(observed: Observations, residuals: Residuals) -> Iterator[Figure]:
-    """Residual of every reading over time, where that was recorded."""
     if observed.table.time is None:
         return
     at, unit = observed.table.time[observed.lead] / 60, "min"

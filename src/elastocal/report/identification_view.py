@@ -297,7 +297,6 @@ def prediction_lines(result: Calibration) -> list[tuple[str, str]]:
 
 
 def at_new_poses(found: PredictedError) -> str:
-    """Expected error at new poses and its parts."""
     low, high = found.ci95
     parts = [f"parameters {length(found.parameters)}"]
     if found.open > 0:
@@ -311,7 +310,6 @@ def at_new_poses(found: PredictedError) -> str:
 
 
 def error_line(result: Calibration) -> str:
-    """All rms errors in one line: 3-D, and of poses the length of the rotation error."""
     sizes = {
         NOMINAL: result.nominal_rms,
         "fitted poses": result.residual_rms,
@@ -479,7 +477,6 @@ def inside(value: float | None, ci95: tuple[float, float] | None) -> str:
 
 
 def coverage(result: Calibration, truth: Truth) -> tuple[int, int]:
-    """How many 95 % intervals hold the true value, of how many that could be compared."""
     found = [inside(truth.get(e.name), e.ci95) for e in result.ordinary]
     found += [inside(combination_truth(result, c, truth), c.ci95) for c in result.combinations]
     return found.count("inside"), len(found) - found.count("")
@@ -568,7 +565,6 @@ def bar(value: float, ci95: tuple[float, float], reference: float, alike: bool) 
 def parameter_table(
     result: Calibration, truth: Truth | None = None, published: Published | None = None
 ) -> ShownTable:
-    """The parameters identified alone, by effect; `published`: what others found (SI)."""
     own = [e for e in result.ordinary if e.identifiable]
     effects = {p.name: p.effect.replace("_", " ") for p in result.model.parameters}
     known = [nominal_known(result, e.name) for e in own]
@@ -589,7 +585,6 @@ def parameter_table(
 
 
 def combination_table(result: Calibration, truth: Truth | None = None) -> ShownTable:
-    """Sums of parameters that the data determine although their members they do not."""
     found = result.combinations
     true = None if truth is None else [combination_truth(result, c, truth) for c in found]
     title = "Combinations (factors in SI units)"
@@ -633,7 +628,6 @@ def _numbers(
 
 
 def undetermined_table(result: Calibration, truth: Truth | None = None) -> ShownTable:
-    """Every parameter without a value of its own, and why."""
     heads = ["parameter", "nominal", "unit", *(["truth"] if truth else []), "why"]
     rows = []
     for e in result.ordinary:

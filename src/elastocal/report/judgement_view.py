@@ -342,7 +342,6 @@ SHAPES = {
 
 
 def noise_lines(result: Calibration) -> list[tuple[str, str]]:
-    """Label and sentence: estimated noise model, repeats, shape of the residuals."""
     summary = result.residual_summary
     found = {
         "Noise model": noise_model_line(result),
@@ -354,7 +353,6 @@ def noise_lines(result: Calibration) -> list[tuple[str, str]]:
 
 
 def does_noise_explain_it(result: Calibration) -> str:
-    """Residual against stated noise, as the finding has it."""
     # Whether the weights come from a noise model with estimated variances.
     estimated = method_of(result) in ("reml", "constrained") and result.noise.estimated
     f = result.finding(*COMPARED)
@@ -402,7 +400,6 @@ def _why_not_judged(result: Calibration) -> str:
 
 
 def noise_model_line(result: Calibration) -> str | None:
-    """The estimated noise model with its sizes, and why it was chosen."""
     noise = result.noise
     sizes, reason = size_table(noise).rows, noise.reason
     if not sizes and not reason:
@@ -526,7 +523,6 @@ def shape_line(summary: ResidualSummary) -> str:
 
 
 def deviating_table(summary: ResidualSummary) -> ShownTable:
-    """Groups of readings that scatter unlike the noise model."""
     rows = [(_group(by, g), str(g.n), _ratio(g), f"{g.p_holm:.1g}") for by, g in summary.deviating]
     heads = ("scatters unlike the noise model", "values", "observed / expected", "p (Holm)")
     return ShownTable(heads, rows)
@@ -537,7 +533,6 @@ def _group(by: str, group: GroupSummary) -> str:
 
 
 def _ratio(group: GroupSummary) -> str:
-    """Observed over expected standard deviation."""
     return significant(float(np.sqrt(group.mean_square)), 2)
 
 
@@ -575,7 +570,6 @@ PLACE = {
 
 
 def fault_lines(result: Calibration, most: int | None = None) -> list[str]:
-    """A sentence per group of readings beyond the noise, the largest first; of more, how many."""
     report = result.faulty_report
     groups = [] if report is None else [f for f in report.findings if f.level != "reading"]
     lines = [_fault(result, finding) for finding in groups[:most]]
@@ -617,7 +611,6 @@ def _fault(result: Calibration, finding: FaultyGroup) -> str:
 
 
 def smooth_table(result: Calibration) -> ShownTable:
-    """A row for each function and unit; what was left out has none."""
     rows = []
     for part in (part for part in result.smooth if part.scale):
         for unit, (rms, (low, high), half) in part.sizes.items():

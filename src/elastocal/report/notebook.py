@@ -77,7 +77,6 @@ def plot(result: object, kind: str | None, interactive: bool, ax: Any = None) ->
 
 
 def _instead(ax: Any) -> Any:
-    """A part of the figure in the place of these axes."""
     spot = getattr(ax, "get_subplotspec", lambda: None)()
     if spot is None:
         raise InputError("`ax` takes axes that plt.subplots or Figure.subplots made")
@@ -92,7 +91,6 @@ def _png(figure: Any) -> bytes:
 
 
 def frame(result: object) -> pd.DataFrame:
-    """A result's main table."""
     return FRAMES[type(result).__name__](result)
 
 
@@ -169,7 +167,6 @@ def _commands(c: Compensation) -> pd.DataFrame:
 
 
 def _changes(c: Comparison) -> pd.DataFrame:
-    """One row per parameter, SI units."""
     import pandas as pd
 
     return pd.DataFrame([vars(change) for change in c.changes])

@@ -294,7 +294,6 @@ def _digest(text: str) -> str:
 
 
 def sources(result: Any) -> list[Path]:
-    """The cell and the tables that a result came from, as far as they are files."""
     of_kind: dict[str, Callable[[Any], list[Any]]] = {
         "Comparison": lambda c: [c.old.model.cell.path, c.old.source, c.new.source],
         "Compensation": lambda c: [c.targets.table.source],

@@ -44,7 +44,6 @@ MOST_ROWS = 40  # drawn, and shown of tables
 
 
 def changes_report(c: Comparison) -> Report:
-    """Two calibrations of one arm: has it changed, how far does the tool move, and by what."""
     model = c.old.model
     title = title_of(model.chain.name, model.cell.name)
     return Report("Comparison", title, _changes(c), model.backend_report())
@@ -97,7 +96,6 @@ def _changes(c: Comparison) -> Iterator[Block]:
 
 
 def _changed(c: Comparison) -> str:
-    """The verdict in a sentence."""
     if c.one_result:
         return (
             f"Nothing is compared: {printable(c.old.source)} and {printable(c.new.source)} are the "
@@ -122,7 +120,6 @@ OF_LOADS = {
 
 
 def _under(c: Comparison) -> str:
-    """Under which loads the tool was compared, and whose they are."""
     return f"under {loads_text(c.forces, '{}', '{} loads in turn')}, {OF_LOADS[c.loads_of]}"
 
 
@@ -166,7 +163,6 @@ def _moves(c: Comparison) -> Figure:
 
 
 def compensation_report(c: Compensation) -> Report:
-    """Commands for targets: the predicted errors, the commands, what is not reached."""
     return Report("Compensation", printable(c.chain.name), _compensated(c))
 
 
@@ -255,7 +251,6 @@ def _errors(c: Compensation) -> Figure:
 
 
 def readings_report(table: Measurements) -> Report:
-    """What a table has of each column: labels are counted, numbers from least to largest."""
     return Report("Readings", printable(table.source), _of_readings(table))
 
 
@@ -299,8 +294,6 @@ FORMATS = {
 
 
 def export_blocks(done: Exported) -> Iterator[Block]:
-    """What the file holds and what not."""
-
     def rounding(metres: float) -> str:  # what is below a nanometre is no number to read
         return "< 0.001 µm" if metres < 1e-9 else length(metres)
 
@@ -345,7 +338,6 @@ def export_blocks(done: Exported) -> Iterator[Block]:
 
 
 def _fit(refit: Refit) -> str:
-    """How far the file is from the arm."""
     told = f"the markers are {length(refit.after)} rms off"
     if refit.correction is not None:
         told = f"{told}, with its joint correction {length(refit.correction)}"
