@@ -5,13 +5,12 @@ from __future__ import annotations
 import re
 from typing import Any
 
-import numpy as np
 import pytest
 from rich.console import Console
 from support.diagnoses import VERDICTS
 
 from elastocal.report.blocks import ShownTable
-from elastocal.report.identification_view import bar, parameter_table, texts, undetermined_table
+from elastocal.report.identification_view import parameter_table, texts, undetermined_table
 from elastocal.report.terminal import print_report
 
 
@@ -59,17 +58,6 @@ def test_names_are_not_markup_and_not_terminal_commands(hostile: Any) -> None:
     assert "\x1b" not in text
     assert "[red]$x^2$" in text
     assert "<script>alert(1)</script>" in text
-
-
-def test_bars_reach_where_the_interval_does() -> None:
-    found = bar(1.0, (1.0, 3.0), 1.0, alike=True)
-    assert found is not None and found.low == found.value == 0
-    assert found.high == pytest.approx(2 / 2.5)
-    found = bar(1.0, (-np.inf, 3.0), 1.0, alike=True)
-    assert found is not None and found.low == -1 < found.value < found.high < 1
-    assert bar(1.0, (-np.inf, np.inf), 1.0, alike=True) is None
-    found = bar(1.0, (1.0, 3.0), 2.0, alike=False)
-    assert found is not None and -found.low == found.high == pytest.approx(1 / 1.05)
 
 
 def test_digits_go_with_the_uncertainty(case: Any) -> None:

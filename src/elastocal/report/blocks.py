@@ -58,21 +58,11 @@ WARNING = "Warning"
 
 
 @dataclass(frozen=True)
-class Bar:
-    """Where interval and estimate lie on a bar from −1 to 1, the reference at 0."""
-
-    low: float
-    high: float
-    value: float
-
-
-@dataclass(frozen=True)
 class ShownTable:
     """A table of texts.  `words` are the columns that hold words; the others hold numbers.
 
-    `groups` names the rows that follow, by the index of the first: {0: "base frame", 6: …}; a page
-    shows them, and the `bars`, one a row, with a note `of_bars`.  `narrow` is the same with less,
-    for a terminal that is too narrow.
+    `groups` names the rows that follow, by the index of the first: {0: "base frame", 6: …}, for
+    a page.  `narrow` is the same with less, for a terminal that is too narrow.
     """
 
     heads: tuple[str, ...]
@@ -81,8 +71,6 @@ class ShownTable:
     groups: dict[int, str] = field(default_factory=dict)
     title: str = ""
     note: str = ""
-    bars: Sequence[Bar | None] = ()
-    of_bars: str = ""
     narrow: ShownTable | None = None
 
     def without(self, *columns: int) -> ShownTable:
@@ -90,7 +78,7 @@ class ShownTable:
         kept = [k for k in range(len(self.heads)) if k not in columns]
         heads, *rows = (tuple(row[k] for k in kept) for row in (self.heads, *self.rows))
         words = tuple(n for n, k in enumerate(kept) if k in self.words)
-        return replace(self, heads=heads, rows=rows, words=words, bars=(), narrow=None)
+        return replace(self, heads=heads, rows=rows, words=words, narrow=None)
 
     def when_narrow(self, *columns: int) -> ShownTable:
         """The table that loses some columns where there is no room for them."""

@@ -33,7 +33,6 @@ from elastocal.model.chain import names_told
 from elastocal.report import judgement_view as words
 from elastocal.report.blocks import (
     WARNING,
-    Bar,
     Block,
     Fold,
     KeyFigures,
@@ -534,32 +533,15 @@ def texts(e: Estimate | Combination, true: float | None) -> tuple[str, str, str,
     return value, half, unit, known
 
 
+ROUNDING = 1e-9  # sides of an interval this short beside the value are alike
+
+
 def is_lopsided(value: float, ci95: tuple[float, float]) -> bool:
     """Whether the interval needs both ends to be told: not symmetric, or without an end."""
     below, above = value - ci95[0], ci95[1] - value
     if not (math.isfinite(below) and math.isfinite(above)):
         return True
     return abs(above - below) > max(LOPSIDED * max(above, below), ROUNDING * abs(value))
-
-
-TRUTH_REACH = 2.5  # half widths from the true value to a bar's end
-ROUNDING = 1e-9  # sides of an interval this short beside the value are alike
-
-
-def bar(value: float, ci95: tuple[float, float], reference: float, alike: bool) -> Bar | None:
-    """The interval beside the reference; None where nothing has an end.
-
-    `alike`: as long as the bars of all others, so that one sees how many half widths the reference
-    is away; else on a scale of its own, which shows all.  An open end reaches the end of the bar.
-    """
-    far = [abs(x - reference) for x in (value, *ci95) if math.isfinite(x)]
-    sides = [side for side in (value - ci95[0], ci95[1] - value) if math.isfinite(side)]
-    half = (ci95[1] - ci95[0]) / 2 if len(sides) == 2 else max(sides, default=0.0)
-    reach = TRUTH_REACH * half if alike else 1.05 * max(far, default=0.0)
-    if not reach > 0 or not sides:
-        return None
-    low, high, middle = (min(max((x - reference) / reach, -1.0), 1.0) for x in (*ci95, value))
-    return Bar(low, high, middle)
 
 
 def parameter_table(
@@ -577,8 +559,7 @@ def parameter_table(
     if any(e.note for e in own):
         after["note"] = [printable(e.note) for e in own]
     true = None if truth is None else [truth.get(e.name) for e in own]
-    nominal = [e.nominal if k else None for e, k in zip(own, known, strict=True)]
-    table = _numbers("Parameters", [printable(e.name) for e in own], own, true, nominal, after)
+    table = _numbers("Parameters", [printable(e.name) for e in own], own, true, after)
     of = [effects[e.name] for e in own]
     groups = {k: name for k, name in enumerate(of) if not k or name != of[k - 1]}
     return replace(table, groups=groups)
@@ -588,43 +569,32 @@ def combination_table(result: Calibration, truth: Truth | None = None) -> ShownT
     found = result.combinations
     true = None if truth is None else [combination_truth(result, c, truth) for c in found]
     title = "Combinations (factors in SI units)"
-    return _numbers(title, [*map(shortened, found)], found, true, [None] * len(found), {})
+    return _numbers(title, [*map(shortened, found)], found, true, {})
 
 
 def _numbers(
     title: str, names: list[str], found: Sequence[Estimate | Combination],
-    truth: list[float | None] | None, nominal: list[float | None], after: dict[str, list[str]],
+    truth: list[float | None] | None, after: dict[str, list[str]],
 ) -> ShownTable:  # fmt: skip
-    """Names, values, intervals and units, with true values where known, and columns `after`.
-
-    Bars show the interval beside the true value, else beside the nominal one.
-    """
+    """Names, values, intervals and units, with true values where known, and columns `after`."""
     lopsided = any(
         e.value is not None and e.ci95 is not None and is_lopsided(e.value, e.ci95) for e in found
     )
     first, half = title.split()[0].lower().removesuffix("s"), "95 %" if lopsided else "± 95 %"
     of_truth = ["truth", "in 95 %"] if truth else []
     heads = (first, "value", half, "unit", *of_truth, *after)
-    rows, bars, brief = [], [], []
+    rows, brief = [], []
     for k, e in enumerate(found):
-        at = truth[k] if truth else nominal[k]
-        value, width, unit, known = texts(e, at if truth else None)
+        at = truth[k] if truth else None
+        value, width, unit, known = texts(e, at)
         signed = width if width.startswith(("[", "–")) else f"± {width}"
         held = [inside(at, e.ci95)] if truth else []
         rest = [*([known, *held] if truth else []), *(own[k] for own in after.values())]
         rows.append((names[k], value, signed if lopsided else width, unit, *rest))
         brief.append((names[k], f"{value} {signed} {unit}", *held))
-        drawn = None
-        if at is not None and e.value is not None and e.ci95 is not None:
-            drawn = bar(e.value, e.ci95, at, bool(truth))
-        bars.append(drawn)
     words = tuple(k for k, head in enumerate(heads) if head in (first, "unit", "in 95 %", "note"))
     narrow = ShownTable((first, f"value {half}", *of_truth[1:]), brief, (0, 1, 2), title=title)
-    note = "Bars are 95 % intervals beside the nominal value (upright line), each on its own scale."
-    if truth:
-        note = "Bars are 95 % intervals around the true value (upright line), all equally wide."
-    shown = ShownTable(heads, rows, words, title=title, narrow=narrow)
-    return replace(shown, bars=bars, of_bars=note) if any(bars) else shown
+    return ShownTable(heads, rows, words, title=title, narrow=narrow)
 
 
 def undetermined_table(result: Calibration, truth: Truth | None = None) -> ShownTable:

@@ -24,7 +24,6 @@ from elastocal import __version__
 from elastocal.files import atomic_write_text, open_input
 from elastocal.report.blocks import (
     WARNING,
-    Bar,
     Block,
     Figure,
     Fold,
@@ -208,8 +207,7 @@ def _lines(block: Lines) -> str:
 def _titled_table(t: ShownTable, deep: int, summary: str) -> str:
     told = not t.title or summary.startswith(t.title.partition(" (")[0])
     title = "" if told else f"<h{deep}>{text_of(t.title)}</h{deep}>\n"
-    notes = " ".join(note for note in (t.of_bars, t.note) if note)
-    below = f'\n<p class="soft">{text_of(notes)}</p>' if notes else ""
+    below = f'\n<p class="soft">{text_of(t.note)}</p>' if t.note else ""
     return f"{title}{_table(t)}{below}"
 
 
@@ -219,14 +217,12 @@ def _table(t: ShownTable) -> str:
         f'<th scope="col" class="{kind}">{text_of(head)}</th>'
         for kind, head in zip(kinds, t.heads, strict=True)
     ]
-    heads += ['<th class="drawn"></th>'] if t.bars else []
     rows = []
     for k, row in enumerate(t.rows):
         if k in t.groups:
             rows.append(f'<tr class="group"><th scope="colgroup" colspan="{len(heads)}">'
                         f"{text_of(t.groups[k])}</th></tr>")  # fmt: skip
         cells = [_cell(*each) for each in zip(kinds, t.heads, row, strict=True)]
-        cells += [f'<td class="drawn">{_bar(t.bars[k])}</td>'] if t.bars else []
         rows.append(f"<tr>{''.join(cells)}</tr>")
     body = "\n".join(rows)
     return (
@@ -245,20 +241,6 @@ def _cell(kind: str, head: str, text: str) -> str:
 def _slug(title: str) -> str:
     """ "Predicted intervals (95 %)" → "predicted-intervals"."""
     return "-".join(re.findall(r"[a-z0-9]+", re.split("[(,]", title)[0].lower()))
-
-
-def _bar(bar: Bar | None) -> str:
-    """The interval around a reference, in a box of 144 by 16."""
-    if bar is None:
-        return ""
-    low, high, value = (round(72 + 70 * x, 1) for x in (bar.low, bar.high, bar.value))
-    return (
-        '<svg class="bar" viewBox="0 0 144 16" aria-hidden="true">'
-        '<line class="axis" x1="2" x2="142" y1="8" y2="8"/>'
-        f'<line class="interval" x1="{low}" x2="{high}" y1="8" y2="8"/>'
-        f'<circle class="estimate" cx="{value}" cy="8" r="3.5"/>'
-        '<line class="reference" x1="72" x2="72" y1="1" y2="15"/></svg>'
-    )
 
 
 def _picture(block: Figure | ShownArm) -> str:

@@ -54,7 +54,7 @@ function csvCell(text) {
 }
 
 function csvOf(table) {
-  const heads = [...table.tHead.rows[0].cells].filter(cell => !cell.matches(".drawn"));
+  const heads = [...table.tHead.rows[0].cells];
   const line = row => heads.map(head => csvCell(row.cells[head.cellIndex].textContent)).join(",");
   const rows = [...table.tBodies[0].rows].filter(row => !row.matches(".group"));
   return [table.tHead.rows[0], ...rows].map(line).join("\r\n") + "\r\n";
@@ -63,7 +63,6 @@ function csvOf(table) {
 function prepareTable(table) {
   table.initial = [...table.tBodies[0].rows];
   for (const head of table.tHead.rows[0].cells) {
-    if (head.matches(".drawn")) continue;
     head.setAttribute("aria-sort", "none");
     const button = document.createElement("button");
     button.type = "button";
