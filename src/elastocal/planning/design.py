@@ -55,7 +55,7 @@ from elastocal.planning.plan import (
 )
 from elastocal.planning.polish import Searches
 from elastocal.planning.relaxation import DesignProblem
-from elastocal.planning.search import EFFORTS, POOL, Search, SearchEffort, Selection, ordered
+from elastocal.planning.search import EFFORTS, POOL, Search, Selection, ordered
 from elastocal.planning.setup import (
     OPEN,
     FeasiblePool,
@@ -98,7 +98,6 @@ class DesignOptions:
             f"effort '{self.effort}' is unknown{did_you_mean(self.effort, efforts)}; there are "
             f"{listed(efforts)}",
         )
-        require(self.seed >= 0, f"the seed must not be negative, found {self.seed}")
         require(
             self.jobs == -1 or self.jobs >= 1,
             f"jobs takes a number of processes, or -1 for all cores; found {self.jobs}",
@@ -257,7 +256,11 @@ class _Design:
         pinned = None
         if pins is not None and len(pins.q):
             pinned = setup.pool(pins.q, pinned_at)
-        setup = self._reading(setup, pinned, q, group, shares)
+        self.states: LoadStates | None = None
+        if self.cell.design.load_states == "chosen":
+            asked = setup.having(pinned)
+            ways, self.states = chosen_states(asked, q, group, shares, progress)
+            setup = replace(setup, ways=ways)
         pool = setup.pool(q, group)
         search = setup.having(pinned)
         if cap := self.cell.design.cap:
@@ -267,10 +270,12 @@ class _Design:
             setup = setup.sharing(float(state["share"]))
         search = setup.having(pinned)
         searches = Searches(setup.information, self.space, self.feasibility)
+        effort = EFFORTS[options.effort]
+        effort = effort.in_pool if self.cell.design.candidates is None else effort
 
         def sought(shares: IntArray, checkpoint: Checkpoint) -> tuple[Search, Selection]:
             seek = Search(
-                search, pool, searches, shares, self._effort(), options.seed, checkpoint, progress,
+                search, pool, searches, shares, effort, options.seed, checkpoint, progress,
                 setup,
             )  # fmt: skip
             return seek, seek.select(pool)
@@ -284,20 +289,6 @@ class _Design:
         progress("random plans beside it")
         drawn = random_information(search.problem(pool, seek.shares), options.seed)
         return self._plan(setup, seek, found, counts, targets.source, curve, known, drawn, pinned)
-
-    def _reading(
-        self, setup: Setup, pinned: FeasiblePool | None, q: Array, group: IntArray, shares: IntArray
-    ) -> Setup:
-        """The setup with the ways in which poses are read."""
-        self.states: LoadStates | None = None
-        if self.cell.design.load_states == "all":
-            return setup
-        ways, self.states = chosen_states(setup.having(pinned), q, group, shares, self.progress)
-        return replace(setup, ways=ways)
-
-    def _effort(self) -> SearchEffort:
-        effort = EFFORTS[self.options.effort]
-        return effort.in_pool if self.cell.design.candidates is None else effort
 
     def _shares(self, n_poses: int | None = None) -> IntArray:
         """Poses (L,) to choose per level, beside those that stay."""
@@ -399,11 +390,7 @@ class _Design:
                 lambda n: setup.problem(pool, self._shares(n)), self.options.curve,
                 self.options.seed, self.progress,
             )  # fmt: skip
-            # Bounds are NaN where there are none.
-            values = [
-                (value, np.nan if bound is None else bound) for value, bound in found.values()
-            ]
-            return {"n": list(found), "value": values}
+            return {"n": list(found), "value": list(found.values())}
 
         state, figure = self.checkpoint.finished("sizes", make), setup.criterion.figure
         return tuple(
@@ -514,7 +501,7 @@ class _Design:
                 model, setup.found, blocks, setup.prior,
                 values_without(problem, chosen), found.value,
             ),
-            targets=targets,
+            targets=f"test poses: {targets}",
             seed=self.options.seed,
             polished=found.polished,
             curve=curve,

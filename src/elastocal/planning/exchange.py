@@ -240,14 +240,14 @@ def _changed(problem: DesignProblem, plan: IntArray, rng: np.random.Generator) -
 def sized_plans(
     problem_of: Callable[[int], DesignProblem], numbers: Iterable[int], seed: int,
     progress: Progress,
-) -> dict[int, tuple[float, float | None]]:  # fmt: skip
-    """Φ of the best plan found by number of poses, and the bound on all such; None without one.
+) -> dict[int, tuple[float, float]]:  # fmt: skip
+    """Φ of the best plan found by number of poses, and the bound on all such; NaN without one.
 
     `problem_of(n)` states the problem of n poses, on the same candidates for all n.  Each plan is
     begun from the next smaller one: where no group's share falls with n, Φ does not rise.  Raises
     InsufficientDataError where no plan of one of `numbers` determines everything.
     """
-    found: dict[int, tuple[float, float | None]] = {}
+    found: dict[int, tuple[float, float]] = {}
     chosen, weights = None, None
     for n in sorted(numbers):
         whole = problem_of(n)
@@ -257,7 +257,7 @@ def sized_plans(
         chosen, _ = exact_plan(problem, relaxed, warm=chosen, seed=seed)
         value, weights = whole.value(chosen), relaxed.weights
         check_determined(whole, value)
-        found[n] = value, relaxed.bound if problem.criterion.certifiable else None
+        found[n] = value, relaxed.bound if problem.criterion.certifiable else np.nan
         progress(f"{n} poses: {value:.6g}")
     return found
 

@@ -30,6 +30,19 @@ from elastocal.units import Array, BoolArray
 # What a rule of the cell is, and those that bound a quantity of the pose.
 
 SAME = 1e-9  # rounding of a joint value that was set to its limit
+SHOWN = 3  # causes that a remedy names
+ADVICE = {
+    "struck": "; strike fewer poses",
+    "mounting_plane": (
+        "; where the arm may reach below z = 0 of its base, set [workspace] mounting_plane = false"
+    ),
+    "keep_out": "; move the boundary in [[workspace.keep_out]]",
+    "load_height": "; lower [workspace.load] min_height_m or shorten its rope",
+    "obstacle": "; move or shrink the obstacle",
+    "self_collision": "; shrink the bodies if they are modelled too large",
+    "line_of_sight": "; move the tracker or the markers",
+    "markers_seen": " not seen; move the tracker or the markers, or lower min_markers",
+}
 
 
 class Rule(ABC):
@@ -45,9 +58,12 @@ class Rule(ABC):
     def causes(self, poses: Poses) -> dict[str, BoolArray]:
         """By what: a joint, a marker, a pair of bodies → (N,)."""
 
-    @abstractmethod
     def remedy(self, poses: Poses) -> str:
         """What to relax for poses that break this rule and no other."""
+        counts = [(int(hit.sum()), name) for name, hit in self.causes(poses).items()]
+        counts.sort(key=lambda count: -count[0])
+        told = ", ".join(f"{name} ({n})" for n, name in counts[:SHOWN] if n)
+        return f"most often {told}{ADVICE[self.name]}"
 
 
 @dataclass(frozen=True)
@@ -110,26 +126,11 @@ class Struck(Rule):
     def causes(self, poses: Poses) -> dict[str, BoolArray]:
         return {"a pose struck out": self.broken(poses)}
 
-    def remedy(self, poses: Poses) -> str:
-        return "strike fewer poses"
-
 
 # Rules about bodies: keep-out, obstacles, self-collision, height of the load, line of sight.
 
 # A pose keeps every margin by this much more, so that a move that ends there can be certified.
 POSE_SLACK = 1e-4  # m
-SHOWN = 3  # causes that a remedy names
-
-ADVICE = {
-    "mounting_plane": (
-        "where the arm may reach below z = 0 of its base, set [workspace] mounting_plane = false"
-    ),
-    "keep_out": "move the boundary in [[workspace.keep_out]]",
-    "load_height": "lower [workspace.load] min_height_m or shorten its rope",
-    "obstacle": "move or shrink the obstacle",
-    "self_collision": "shrink the bodies if they are modelled too large",
-    "line_of_sight": "move the tracker or the markers",
-}
 
 
 class KeepApart(Rule):
@@ -149,7 +150,7 @@ class KeepApart(Rule):
         }
 
     def remedy(self, poses: Poses) -> str:
-        text = f"{most_frequent(self.causes(poses))}; {ADVICE[self.name]}"
+        text = super().remedy(poses)
         margin = max(pair.margin for pair in self._pairs)
         freed = int((~self._collisions.hits(poses, POSE_SLACK - margin)).sum()) if margin else 0
         key = {"obstacle": "clearance_mm", "self_collision": "self_clearance_mm"}.get(self.name)
@@ -193,9 +194,6 @@ class LineOfSight(Rule):
                 found[f"{name} behind {body.name}"] = sight.blocked(poses, marker)
         return found
 
-    def remedy(self, poses: Poses) -> str:
-        return f"{most_frequent(self.causes(poses))}; {ADVICE[self.name]}"
-
 
 class EnoughMarkers(Rule):
     """At least so many markers are in range, turned towards the tracker, and in its sight."""
@@ -226,16 +224,6 @@ class EnoughMarkers(Rule):
 
     def causes(self, poses: Poses) -> dict[str, BoolArray]:
         return dict(zip(self._markers, ~self.seen(poses).T, strict=True))
-
-    def remedy(self, poses: Poses) -> str:
-        told = most_frequent(self.causes(poses))
-        return f"{told} not seen; {ADVICE['line_of_sight']}, or lower min_markers"
-
-
-def most_frequent(causes: Mapping[str, BoolArray]) -> str:
-    """'most often link3 and wall (412), …': the causes met most."""
-    counts = sorted(((int(hit.sum()), name) for name, hit in causes.items()), key=lambda c: -c[0])
-    return "most often " + ", ".join(f"{name} ({n})" for n, name in counts[:SHOWN] if n)
 
 
 # What the rules say of a batch of candidates.

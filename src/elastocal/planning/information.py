@@ -8,7 +8,6 @@ from dataclasses import dataclass, replace
 from functools import cached_property
 
 import numpy as np
-from numpy.typing import NDArray
 from scipy import linalg, sparse
 
 from elastocal.cell.work_cell import Cell
@@ -59,20 +58,22 @@ def plan_forces(cell: Cell) -> Array:
     return np.vstack([np.zeros((1, 3)), forces[loaded]])
 
 
-def rows_of(q: Array, forces: Array, marker_names: tuple[str, ...]) -> Measurements:
-    """Table rows of poses q (N, n): for each of them, each of the forces (L, 3), each marker."""
-    n, L, markers = len(q), len(forces), len(marker_names)
-    pose = np.repeat(np.arange(n), L * markers)
+def readings_at(
+    q: Array, pose: IntArray, force: Array, marker: IntArray, marker_names: tuple[str, ...],
+    source: str = "plan",
+) -> Measurements:  # fmt: skip
+    """Table rows, not measured yet: of which `pose` (n,) of q (N, joints), under which `force`
+    (n, 3), of which `marker` (n,)."""
     return Measurements(
-        source="plan",
+        source=source,
         row=pose + 2,
         q=q[pose],
         configuration=pose,
-        configuration_labels=tuple(map(str, range(1, n + 1))),
+        configuration_labels=tuple(map(str, range(1, len(q) + 1))),
         repeat=np.zeros(len(pose), dtype=np.int64),
-        marker=np.tile(np.arange(markers), n * L),
+        marker=marker,
         marker_names=marker_names,
-        force=forces[np.tile(np.repeat(np.arange(L), markers), n)],
+        force=force,
     )
 
 
@@ -230,7 +231,11 @@ class PoseInformation:
 
     def rows(self, q: Array) -> Measurements:
         """The table of these poses as the arm would be read, without noise."""
-        table = rows_of(q, self.forces, tuple(self.model.cell.tool.markers))
+        names, L = tuple(self.model.cell.tool.markers), len(self.forces)
+        pose = np.repeat(np.arange(len(q)), L * len(names))
+        force = np.tile(np.repeat(self.forces, len(names), axis=0), (len(q), 1))
+        marker = np.tile(np.arange(len(names)), len(q) * L)
+        table = readings_at(q, pose, force, marker, names)
         table = simulate(self.model, table, self.x, 0, noise=False)
         return marker_sigmas(self.model.cell, table)
 
@@ -284,52 +289,26 @@ class Estimable:
         return self.reduction.kept
 
 
-def typical_sizes(information: PoseInformation, q: Array) -> Array:
-    """Typical deviation (parameters,) of each parameter, as identification takes them."""
-    model, table = information.model, information.rows(q[_sample(information.model, q)])
-    at = model.regressor(table, information.x, None, observe(table, model.observe))
-    return model.sizes(at.B)
-
-
-def estimable(
-    information: PoseInformation,
-    q: Array,
-    free: IntArray,
-    prior: Array,
-    n_poses: int,
-    stated: NDArray[np.bool_] | None = None,
-) -> Estimable:
-    """A minimal complete set of the `free` parameters for plans of `n_poses` of the poses q (N, n).
-
-    As identification chooses it, from a sample of the poses weighed as `n_poses` of them.  `prior`
-    (parameters, parameters): information known before, scaled by `information.sizes`; parameters
-    with a `stated` prior (parameters,) are kept whatever the poses show of them.
-    Raises InsufficientDataError where no pose shows anything.
-    """
-    model = information.model
-    blocks = information.blocks(q[_sample(model, q)])
-    B = np.zeros((blocks.shape[0] * blocks.shape[1], len(prior)))
-    own = np.searchsorted(information.columns, free)
-    B[:, free] = blocks.reshape(len(B), -1)[:, own] * np.sqrt(n_poses / len(blocks))
-    return minimal_set(model, B, free, information.sizes, prior, stated)
-
-
 def minimal_set(
     model: Model,
     B: Array,
     free: IntArray,
     sizes: Array,
     prior: Array,
-    stated: NDArray[np.bool_] | None = None,
+    stated: BoolArray,
 ) -> Estimable:
-    """A minimal complete set of the `free` parameters, from readings with B (rows, parameters),
-    whitened and scaled by `sizes`; `prior` and `stated` as of `estimable`."""
+    """A minimal complete set of the `free` parameters, as identification chooses it, from readings
+    with B (rows, parameters), whitened and scaled by `sizes`.
+
+    `prior` (parameters, parameters): information known before, scaled alike; parameters with a
+    `stated` prior (parameters,) are kept whatever the readings show of them.  Raises
+    InsufficientDataError where no reading shows anything.
+    """
     B, known = B[:, free], prior[np.ix_(free, free)]
     if known.any():
         values, vectors = linalg.eigh(known)
         B = np.vstack([B, np.sqrt(np.maximum(values, 0.0))[:, None] * vectors.T])
-    if stated is not None:
-        B = np.vstack([B, SURE * np.eye(len(free))[stated[free]]])
+    B = np.vstack([B, SURE * np.eye(len(free))[stated[free]]])
     structure, reduction = (
         _reduced(model, B, free, sizes, threshold) for threshold in (0.0, WORTH_A_COLUMN)
     )
@@ -403,7 +382,8 @@ def why(model: Model, found: Estimable, index: int) -> str:
     return f"{name} is held; drop it from {option('fixed')}"
 
 
-def _sample(model: Model, q: Array) -> IntArray:
+def sample_of(model: Model, q: Array) -> IntArray:
+    """Some of the poses q (N, n), as many at each level."""
     cell = model.cell
     held = [joint_index(cell, model.chain, name, "[design.levels]") for name in cell.design.levels]
     kinds, kind = np.unique(q[:, held], axis=0, return_inverse=True)

@@ -27,12 +27,11 @@ from elastocal.planning.information import (
     Estimable,
     PoseInformation,
     Sight,
-    estimable,
     interest_of,
     marker_sigmas,
     minimal_set,
     observed_weights,
-    typical_sizes,
+    sample_of,
     why,
 )
 from elastocal.planning.plan import Plan, Scheduled, predicted, remaining_rms
@@ -190,13 +189,16 @@ def set_up(
     x = model.nominal if known.done is None else known.done.x
     every = np.arange(len(model.parameters))
     raw = PoseInformation(model, x, every, np.ones(len(every)), sight)
-    sizes = typical_sizes(raw, q)
-    information = replace(raw, sizes=sizes)
+    some = q[sample_of(model, q)]
+    table = raw.rows(some)
+    sizes = model.sizes(model.regressor(table, x, None, observe(table, model.observe)).B)
     prior, stated = known_before(model, known, sizes)
     free = fixed_and_free(model, known.fixed)
-    found = estimable(information, q, free, prior, n_poses, stated)
+    # Some poses, which weigh as much as those of the plan.
+    B = raw.blocks(some).reshape(-1, len(sizes)) * sizes * np.sqrt(n_poses / len(some))
+    found = minimal_set(model, B, free, sizes, prior, stated)
     kept = found.columns
-    information = replace(information, columns=kept, sizes=sizes[kept])
+    information = replace(raw, columns=kept, sizes=sizes[kept])
     # A sentence per free parameter that no feasible pose shows at all.
     warnings = _unseen(model, found, [int(i) for i in found.structure.invisible if i in free])
     # The unit of [design] combination: that of its parameters, "" where they differ.

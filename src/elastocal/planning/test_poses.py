@@ -26,7 +26,7 @@ from elastocal.model.manipulator import Model
 from elastocal.planning.bodies import data_base
 from elastocal.planning.candidates import told
 from elastocal.planning.feasibility import Feasibility
-from elastocal.planning.information import Estimable, why
+from elastocal.planning.information import Estimable, readings_at, why
 from elastocal.tables import NO_UNIT, Family, Layout, RawTable, read_table
 from elastocal.text import listed, quoted
 from elastocal.units import Array, BoolArray, IntArray
@@ -299,17 +299,12 @@ DRAWN, LOT = 4096, 512
 
 
 @dataclass(frozen=True)
-class TargetPoses:
-    """T test poses: `q` (T, n) rad or m, `force` (T, 3) N in the data's frame, `weight` (T,) of
-    sum 1, `point` (T, 3) m in the flange frame, `stated` (T,) by the user or else the default;
-    `source` says where they come from."""
+class TargetPoses(NewPoses):
+    """T test poses, of `point` (T, 3) m in the flange frame, `stated` (T,) by the user or else the
+    default."""
 
-    q: Array
-    force: Array
-    weight: Array
     point: Array
     stated: BoolArray
-    source: str
 
     @classmethod
     def of(
@@ -324,9 +319,9 @@ class TargetPoses:
             np.repeat(q, each, axis=0),
             np.tile(loads, (len(q), 1)) if force is None else np.asarray(force),
             np.repeat(weight / each, each),
+            source,
             np.broadcast_to(point, (n, 3)),
             np.full(n, stated),
-            source,
         )
 
     @classmethod
@@ -336,7 +331,7 @@ class TargetPoses:
             for name in ("q", "force", "weight", "point", "stated")
         )
         weight = weight / weight.max()  # so that no sum overflows
-        return cls(q, force, weight / weight.sum(), point, stated, source)
+        return cls(q, force, weight / weight.sum(), source, point, stated)
 
     def with_others(self, others: TargetPoses, share: float) -> TargetPoses:
         """Both, of which `others` have `share` of the weight."""
@@ -376,16 +371,13 @@ def test_poses(
     if not groups:
         groups.append(_drawn(cell, chain, point, feasibility, seed))
     sources += [g.source for g in groups if g.source]
-    return TargetPoses.together(groups, "test poses: " + ", ".join(sources))
+    return TargetPoses.together(groups, ", ".join(sources))
 
 
 def where_used(model: Model) -> NewPoses | None:
     """Where the cell says that position must be right; None where it says nothing."""
-    spec = model.cell.design
-    if not spec.states_test_poses:
-        return None
-    found = test_poses(model.cell, model.chain)
-    return NewPoses(found.q, found.force, found.weight, found.source.removeprefix("test poses: "))
+    stated = model.cell.design.states_test_poses
+    return test_poses(model.cell, model.chain) if stated else None
 
 
 def everywhere(
@@ -596,19 +588,12 @@ def _carrying(cell: Cell, point: Array) -> Array:
 def _table(
     targets: TargetPoses, pose: IntArray, marker: IntArray, names: tuple[str, ...]
 ) -> Measurements:
-    n = len(pose)
-    return Measurements(
-        source="test poses",
-        row=pose + 1,
-        q=targets.q[pose],
-        configuration=pose,
-        configuration_labels=tuple(map(str, range(1, len(targets.q) + 1))),
-        repeat=np.zeros(n, dtype=np.int64),
-        marker=marker,
-        marker_names=names,
-        force=targets.force[pose],
+    n, force = len(pose), targets.force[pose]
+    # The arm as it is at first, its joints come from either side.
+    return replace(
+        readings_at(targets.q, pose, force, marker, names, "test poses"),
         position=np.zeros((n, 3)),
-        time=np.zeros(n),  # the arm as it is at first, its joints come from either side
+        time=np.zeros(n),
         approach=np.zeros((n, targets.q.shape[1])),
     )
 
