@@ -57,8 +57,8 @@ GOLDENS: dict[str, Golden] = {
     "identify_robust": Golden(CAMPAIGN, (
         door.spoil_three,
         f"{PLACED} -o auto.json",
-        f"{PLACED} --method huber -o huber.json --residuals residuals.csv",
-        f"{PLACED} --method l1",
+        *(f"{PLACED} --method {method} -o {method}.json --residuals residuals.csv"
+          for method in ("huber", "l1")),
         f"{PLACED} --outliers keep -o keep.json",
         f"{PLACED} --outliers drop -o drop.json",
     ), engine=True),

@@ -19,7 +19,7 @@ from support.cells import random_poses
 from elastocal.cell.arm_description import CartesianNoise, Tracker
 from elastocal.identification import published
 from elastocal.identification.identify import identify
-from elastocal.identification.options import METHODS, Options
+from elastocal.identification.options import METHODS, ROBUST, Options
 from elastocal.model.manipulator import Model
 from elastocal.model.observations import observe
 from elastocal.simulation import simulate
@@ -100,7 +100,7 @@ def test_the_published_methods_are_those_of_the_paper():
         np.testing.assert_allclose(np.sqrt(np.diag(stated)), std, rtol=1e-3)
 
 
-@pytest.mark.parametrize("method", ["huber", "reml"])
+@pytest.mark.parametrize("method", [*ROBUST, "reml"])
 @pytest.mark.parametrize("share", [0.05, 0.3])
 def test_gross_errors_do_not_bend_a_robust_fit(method, share):
     """The prediction stays within a tenth of the errors' size, within the noise but for the

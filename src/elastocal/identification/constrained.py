@@ -1,20 +1,22 @@
-"""Fits under constraints and with a prior: the minimum, its prices, and how far a value can go.
+"""Linear least squares under constraints: the minimum, its prices, and how far a value can go.
 
 After the equalities and the free minimum are taken out, x = centre + T u with the sum of squares
-rest + |u|², so that the constrained minimum is the point of a convex set nearest to u = 0, good to
-rounding under bounds.  A matrix inequality M(u) ⪰ 0 is vᵀM(u)v ≥ 0 of all v: those of the negative
-eigenvalues at the nearest point so far are added until there are none (Kelley 1960).
+rest + |u|², so that the constrained minimum is the point of a convex set nearest to u = 0.  A cone
+program (cvxpy with Clarabel) finds which constraints are active there.  Under bounds alone the
+point itself then comes from their equations, good to rounding; beside a matrix inequality it is the
+program's, good to some 1e-8 of a standard deviation.
 """
 
 from __future__ import annotations
 
-from collections.abc import Sequence
-from dataclasses import dataclass, field, replace
+import warnings
+from dataclasses import dataclass, replace
 from functools import cached_property
-from typing import Literal, NoReturn
+from types import ModuleType
+from typing import Any, Literal, NoReturn
 
 import numpy as np
-import scipy  # whose `optimize` loads where it is used
+import scipy
 from scipy import linalg
 
 from elastocal.errors import ElastocalError, InputError, InsufficientDataError
@@ -54,80 +56,9 @@ def equality_space(A: Array, b: Array) -> tuple[Array, Array, float]:
     return origin, Q[:, rank:], max(gap, float(np.max(np.abs(b[norms == 0]), initial=0.0)))
 
 
-# Linear inequalities, by the point that is nearest.
+# The answer.
 
 ON_BOUND = 1e-7  # in standard deviations: what is closer to a bound lies on it
-MOST_CHANGES = 20  # of what holds, for each row
-ALIKE = 1e-8  # what a row adds to those that hold, below which it can only take a place
-
-
-class Contradiction(Exception):
-    """No point satisfies the rows of these numbers together, but for any one of them left out."""
-
-    def __init__(self, rows: Sequence[int]) -> None:
-        super().__init__(rows)
-        self.rows = rows
-
-
-def nearest_point(
-    rows: Array, least: Array, held: Sequence[int] = ()
-) -> tuple[Array, Array]:  # fmt: skip
-    """u (q,) nearest to 0 of those with rows u ≥ least, rows (k, q) of unit length, and their
-    prices (k,): u = rowsᵀ prices.  The search starts with the rows `held`.
-
-    The row that is missed most joins those that hold, and drives out those whose price falls to
-    zero on the way (Goldfarb and Idnani 1983, Math. Program. 27, 1).
-    """
-    held = list(held)
-    while True:
-        u, prices = _on(rows, least, held)
-        if prices.min(initial=0.0) >= 0:
-            break
-        held.remove(int(prices.argmin()))
-    for _ in range(MOST_CHANGES * (len(rows) + 1)):
-        missed = least - rows @ u - ROUND_OFF * (1 + np.abs(least))
-        i = int(np.argmax(missed)) if len(rows) else 0
-        if not len(rows) or missed[i] <= 0 or i in held:
-            u, prices = _on(rows, least, held)
-            return u, np.maximum(prices, 0.0)
-        while True:
-            share = least_norm(rows[held].T, rows[i]) if held else np.zeros(0)
-            along = rows[i] - share @ rows[held]
-            free = float(along @ along) > ALIKE**2 and len(held) < len(u)
-            way = float(least[i] - rows[i] @ u) / float(along @ along) if free else np.inf
-            out = [k for k in range(len(held)) if share[k] > RANK]
-            first = min(out, key=lambda k: prices[held[k]] / share[k], default=None)
-            end = np.inf if first is None else prices[held[first]] / share[first]
-            if np.isinf(step := min(way, end)):
-                raise Contradiction([i, *(held[k] for k in np.flatnonzero(share < -RANK))])
-            prices[held] -= step * share
-            prices[i] += step
-            u = u + step * along if free else u
-            if way <= end:
-                held.append(i)
-                break
-            assert first is not None
-            prices[held.pop(first)] = 0.0
-    if missed[i] <= ON_BOUND:
-        return u, prices
-    raise ElastocalError(
-        "no certified minimum: constraints hold and let go in turn; state values that they pin "
-        "from two sides as equalities, and check the units of the bounds"
-    )
-
-
-def _on(rows: Array, least: Array, held: list[int]) -> tuple[Array, Array]:
-    """The point nearest to 0 with equality in the rows held, and all prices, to rounding."""
-    prices = np.zeros(len(rows))
-    if not held:
-        return np.zeros(rows.shape[1]), prices
-    Q, R = linalg.qr(rows[held].T, mode="economic")
-    way = linalg.solve_triangular(R, least[held], trans="T")
-    prices[held] = linalg.solve_triangular(R, way)
-    return Q @ way, prices
-
-
-# The answer.
 
 
 @dataclass(frozen=True)
@@ -177,7 +108,7 @@ class Region:
 
     The rows (k, q) are the finite bounds, lower ones first, of unit length: `sides` (k,) is 1 for
     a lower bound and −1 for an upper one of parameter `of` (k,), `lengths` (k,) what a row was
-    divided by.  `cuts`: of a matrix by its number vᵀM(u)v ≥ 0, with the length of its row.
+    divided by.
     """
 
     rows: Array
@@ -186,7 +117,6 @@ class Region:
     sides: Array
     lengths: Array
     matrices: tuple[Matrix, ...]
-    cuts: list[tuple[int, Array, float]] = field(default_factory=list)
 
     @classmethod
     def of_system(cls, system: System, T: Array) -> Region:
@@ -209,6 +139,21 @@ class Region:
             rows[moves] / lengths[moves, None], least[moves] / lengths[moves], of[moves],
             sides[moves], lengths[moves], matrices,
         )  # fmt: skip
+
+    def holds(self, u: Array) -> bool:
+        """Whether u lies in the region, matrices to round-off."""
+        for matrix in self.matrices:
+            values = np.linalg.eigvalsh(matrix.at(u))
+            if values[0] < -ROUND_OFF * max(np.abs(values).max(), 0.0):
+                return False
+        return bool((self.rows @ u >= self.least).all())
+
+    def distance(self) -> float:
+        """A lower bound of the way |u| from 0 into the region."""
+        # An eigenvalue of M changes by at most |u| √(Σ ‖slopes_i‖²).
+        parts = [m.shortfall(np.zeros(len(m.slopes))) / np.linalg.norm(m.slopes)
+                 for m in self.matrices if m.slopes.any()]  # fmt: skip
+        return max(0.0, float(np.max(self.least, initial=0.0)), *map(float, parts))
 
     def touched(self, found: Nearest) -> BoolArray:
         """Which rows (k,) the point lies on."""
@@ -237,48 +182,74 @@ class Region:
         stacked = np.vstack(rows)
         return equality_space(stacked, np.zeros(len(stacked)))[1]
 
-    def nearest(self, beside: Array | None = None, far: float = 0.0) -> Nearest:
-        """Raises Contradiction, of rows and cuts, where nothing satisfies all constraints, nor
-        `beside` · u ≥ far."""
-        first = np.zeros((0, self.rows.shape[1])) if beside is None else beside[None]
-        n, held = len(first), np.zeros(0, dtype=np.int64)
-        for _ in range(MOST_CUTS):
-            cut = [(self.matrices[k], v, length) for k, v, length in self.cuts]
-            rows = [v @ (m.slopes @ v).T / length for m, v, length in cut]
-            least = [-float(v @ m.constant @ v) / length for m, v, length in cut]
-            u, prices = nearest_point(
-                np.vstack([first, self.rows, *rows]),
-                np.concatenate([np.full(n, far), self.least, least]), held.tolist(),
-            )  # fmt: skip
-            held = np.flatnonzero(prices)
-            if not self._cut(u):
+    def nearest(self) -> Nearest | None:
+        """None where nothing satisfies all constraints."""
+        size = self.distance() or 1.0
+        for _ in range(5):
+            found = self._cone_program(size)
+            if found is None or np.linalg.norm(found.u) <= FAR * size:
                 break
-        k = n + len(self.rows)
-        Z = [np.zeros_like(m.constant) for m in self.matrices]
-        for (matrix, v, length), price in zip(self.cuts, prices[k:], strict=False):
-            Z[matrix] += price / length * np.outer(v, v)
-        self.cuts[:] = [cut for cut, price in zip(self.cuts, prices[k:], strict=False) if price]
-        return Nearest(u, prices[n:k], tuple(Z))
+            size = float(np.linalg.norm(found.u))
+        if found is None:
+            return None
+        allowed = INEXACT
+        if not any(N.shape[1] for N in self.nulls(found)):
+            held, allowed = found.rows > 0, CERTIFIED
+            u = equality_space(self.rows[held], self.least[held])[0]
+            prices = np.zeros(len(held))
+            if held.any():  # scipy's nnls of no column at all ends the process
+                prices[held] = scipy.optimize.nnls(self.rows[held].T, u)[0]
+            found = Nearest(u, prices, tuple(np.zeros_like(Z) for Z in found.matrices))
+        residual = self._breach(found) / max(float(np.linalg.norm(found.u)), size)
+        if not residual <= allowed:
+            raise ElastocalError(
+                f"no certified minimum: the KKT residual is {residual:.1e}; state values that the "
+                "constraints pin from two sides as equalities, and check the units of the bounds"
+            )
+        return found
 
-    def _cut(self, u: Array) -> bool:
-        """Add what u misses of matrices."""
-        before = len(self.cuts)
-        for k, m in enumerate(self.matrices):
-            M = m.at(u)
-            values, vectors = np.linalg.eigh(M)
-            for value, v in zip(values, vectors.T, strict=True):
-                length = float(np.linalg.norm((m.slopes @ v) @ v))
-                if -value > ENOUGH * (length + float(np.abs(M).max())):
-                    self.cuts.append((k, v, length or 1.0))
-        return len(self.cuts) > before
+    def _breach(self, found: Nearest) -> float:
+        """The largest breach of what Karush, Kuhn and Tucker ask of a nearest point."""
+        pull = self.rows.T @ found.rows
+        for matrix, Z in zip(self.matrices, found.matrices, strict=True):
+            pull = pull + np.tensordot(matrix.slopes, Z, axes=2)
+        missed = float(np.max(self.least - self.rows @ found.u, initial=0.0))
+        short = [m.shortfall(found.u) for m in self.matrices]
+        return max(float(np.linalg.norm(found.u - pull)), missed, *short)
+
+    def _cone_program(self, size: float) -> Nearest | None:
+        """The nearest point to a solver's accuracy, about `size` away, which is its unit."""
+        import cvxpy as cp
+
+        v = cp.Variable(self.rows.shape[1])
+        # No v of the length expected reaches a farther bound, whose size would cost digits.
+        near = self.least >= -FAR * size
+        bounds = [self.rows[near] @ v >= self.least[near] / size] if near.any() else []
+        matrices = [
+            _value(cp, replace(m, constant=m.constant / size), v) >> 0 for m in self.matrices
+        ]
+        status = _solve(cp.Problem(cp.Minimize(cp.sum_squares(v)), [*bounds, *matrices]))
+        if "infeasible" in status:
+            return None
+        if v.value is None:
+            raise _stopped(status)
+        u, prices = size * np.asarray(v.value), np.zeros(len(near))
+        if bounds:
+            # Active are those with slack < price (strict complementarity).
+            price, slack = size * bounds[0].dual_value / 2, self.rows[near] @ u - self.least[near]
+            prices[near] = np.where(slack < price, price, 0.0)
+        duals = tuple(size * (c.dual_value + c.dual_value.T) / 4 for c in matrices)
+        return Nearest(u, prices, duals)
 
 
 # The minimum.
 
 CONTRADICTION = 1e-9  # what equalities may miss each other by, of the size of x
-MOST_CUTS, ENOUGH = 300, 1e-11  # of matrices, and what they may be missed by
+CERTIFIED = 1e-6  # of |u|: KKT residual above which the point is no minimum
+INEXACT = 1e-4  # the same, of a point that is the cone program's own
 UNDETERMINED = 1e-11  # singular value of unit columns, of the largest
-CLOSE = 1e-12  # of an interval's half width: to where its ends are sought
+FAR = 10.0  # times the expected way: what is farther is out of reach
+STEEPEST = 1e7  # of an interval's 1/s: what it leaves across it is below 1e-7
 
 
 @dataclass(frozen=True)
@@ -321,10 +292,14 @@ class Reduced:
 
         Raises InputError where constraints contradict each other, which it names.
         """
-        region = self.region
-        try:
+        region, u = self.region, np.zeros(self.T.shape[1])
+        nearest: Nearest | None = Nearest(
+            u, np.zeros(len(region.least)),
+            tuple(np.zeros_like(m.constant) for m in region.matrices),
+        )  # fmt: skip
+        if not region.holds(u):
             nearest = region.nearest()
-        except Contradiction:
+        if nearest is None:
             raise_conflict(self.limits)
         x = self.unit * (self.centre + self.T @ nearest.u)
         for kind, side in (("lower", 1), ("upper", -1)):
@@ -388,29 +363,40 @@ class Reduced:
         length = float(np.linalg.norm(c))
         if s == 0 or length <= RANK * float(np.max(np.linalg.norm(self.T, axis=1), initial=0.0)):
             return found.x  # equalities leave a single value
-        farthest = u, 0.0
-
-        def beyond(way: float) -> float:
-            """What the objective has risen, over what it may, less one, that way from u along c."""
-            nonlocal farthest
-            try:
-                there = self.region.nearest(c / length, float(c @ u) / length + way).u
-            except Contradiction:
-                return 1.0
-            over = float((there - u) @ (there + u)) / s**2 - 1
-            if over <= ROUND_OFF and way > farthest[1]:
-                farthest = there, way
-            return over
-
-        if beyond(s) > ROUND_OFF:
-            end = scipy.optimize.brentq(beyond, 0.0, s, xtol=CLOSE * s)
-            beyond(end - 2 * CLOSE * s)  # where it has not risen so far yet
-        x = self.unit * (self.centre + self.T @ farthest[0])
+        v = c / length
+        if u.any() or not self.region.holds(s * v):
+            v = self._cone_end(v, u, s)
+        x = self.unit * (self.centre + self.T @ (u + s * v))
         bound = (self.system.lower if side < 0 else self.system.upper)[index]
         near = ON_BOUND * self.unit[index] * length * s
         if side * (bound - x[index]) <= near:
             x[index] = bound
         return x if side * (x[index] - found.x[index]) > 0 else found.x
+
+    def _cone_end(self, direction: Array, u: Array, s: float) -> Array:
+        """v farthest in the direction, where u + s v is allowed and |u + s v|² ≤ |u|² + s²."""
+        import cvxpy as cp
+
+        region, v = self.region, cp.Variable(len(u))
+        wanted = []
+        for m in region.matrices:  # u itself is allowed, whatever its rounding says
+            about = m.at(u) + m.shortfall(u) * np.eye(len(m.balance))
+            scaled = replace(m, constant=about, slopes=m.slopes * s).balanced(True)
+            wanted.append(_value(cp, scaled, v) >> 0)
+        # What is allowed lies where u·v ≥ 0.  A minimum far from the free one leaves next to
+        # nothing of that side.
+        if 2 * np.linalg.norm(u) < STEEPEST * s:
+            wanted.append(cp.sum_squares(v) + (2 / s) * u @ v <= 1)
+        else:
+            wanted += [cp.sum_squares(v) <= 1, u / np.linalg.norm(u) @ v <= 0]
+        least = (region.least - region.rows @ u) / s
+        near = least >= -FAR
+        if near.any():
+            wanted.append(region.rows[near] @ v >= np.minimum(least[near], 0.0))
+        status = _solve(cp.Problem(cp.Maximize(direction @ v), wanted))
+        if v.value is None:
+            raise _stopped(status)
+        return np.asarray(v.value)
 
 
 def minimise(J: Array, t: Array, system: System, stated: System | None = None) -> Minimum:
@@ -445,32 +431,86 @@ def _names(system: System, chosen: Array) -> tuple[str, ...]:
 
 # Which constraints contradict each other.
 
+MATTERS = 1e-6  # of the largest multiplier
+
 
 def raise_conflict(system: System) -> NoReturn:
-    """Raise InputError that names constraints which no x satisfies together, though any of them
-    could be dropped and the others would be satisfied."""
-    norms = np.linalg.norm(system.A, axis=1)
-    A, b = system.A / norms[:, None], system.b / norms
-    region = Region.of_system(replace(system, A=A[:0], b=b[:0]), np.eye(len(system.names)))
-    of = [
-        f"the {'lower' if side > 0 else 'upper'} bound of {system.names[i]}"
-        for i, side in zip(region.of, region.sides, strict=True)
+    """Raise InputError that names the constraints which no x satisfies together.
+
+    Every constraint is relaxed by one t, in the units of `system`, and t made as small as can be.
+    The constraints with a multiplier are a proof of the contradiction (Farkas); the others could
+    be dropped and it would remain.
+    """
+    found = _least_excess(system)
+    largest = max(found.values(), default=0.0)
+    guilty = [f"'{k}'" for k, v in found.items() if v > MATTERS * largest] or [
+        f"'{label}'" for label in found
     ]
-    of += 2 * list(system.equality_labels)
-    region = replace(
-        region, rows=np.vstack([region.rows, A, -A]),
-        least=np.concatenate([region.least, b, -b]), cuts=[],
-    )  # fmt: skip
-    guilty = [*system.equality_labels, *of[: len(region.of)], *(m.label for m in system.matrices)]
-    try:
-        region.nearest()
-    except Contradiction as found:
-        of += [system.matrices[k].label for k, _, _ in region.cuts]
-        guilty = [label for label in guilty if label in {of[k] for k in found.rows}]
-    named = listed([f"'{label}'" for label in guilty])
     raise InputError(
-        f"the constraints contradict each other: no values satisfy {named} together; relax or drop "
-        "one of them"
+        f"the constraints contradict each other: no values satisfy {listed(guilty)} together; "
+        "relax or drop one of them"
+    )
+
+
+def _least_excess(system: System) -> dict[str, float]:
+    """Multipliers by label of min t subject to every constraint relaxed by t ≥ 0."""
+    import cvxpy as cp
+
+    z, t = cp.Variable(len(system.names)), cp.Variable(nonneg=True)
+    norms = np.linalg.norm(system.A, axis=1)
+    norms = np.where(norms > 0, norms, 1.0)
+    named: list[tuple[str, Any]] = []
+    for k, label in enumerate(system.equality_labels):
+        named.append((label, cp.abs(system.A[k] / norms[k] @ z - system.b[k] / norms[k]) <= t))
+    for i, name in enumerate(system.names):
+        if np.isfinite(system.lower[i]):
+            named.append((f"the lower bound of {name}", z[i] >= system.lower[i] - t))
+        if np.isfinite(system.upper[i]):
+            named.append((f"the upper bound of {name}", z[i] <= system.upper[i] + t))
+    for m in system.matrices:
+        named.append((m.label, _value(cp, m, z) + t * np.eye(len(m.balance)) >> 0))
+    _solve(cp.Problem(cp.Minimize(t), [constraint for _, constraint in named]))
+    return {
+        label: 0.0 if c.dual_value is None else float(np.abs(c.dual_value).max())
+        for label, c in named
+    }
+
+
+# Cone programs.
+
+TOLERANCES = (1e-10, 1e-8, 1e-6)  # the next where the solver gives up
+
+
+def _value(cp: ModuleType, matrix: Matrix, x: Any) -> Any:
+    n = len(matrix.balance)
+    slopes = matrix.slopes.reshape(len(matrix.slopes), n * n).T
+    return matrix.constant + cp.reshape(slopes @ x, (n, n), order="C")
+
+
+def _solve(problem: Any) -> str:
+    """Solve the problem in place; its status."""
+    import cvxpy as cp
+
+    with warnings.catch_warnings():
+        # Inaccurate solutions only say what is active; the point is judged by its KKT residual.
+        warnings.simplefilter("ignore")
+        if problem.is_lp():  # by the simplex method: at a vertex as few multipliers as can be
+            problem.solve(solver="SCIPY", scipy_options={"method": "highs"})
+            return str(problem.status)
+        for tolerance in TOLERANCES:
+            options = {f"tol_{name}": tolerance for name in ("gap_abs", "gap_rel", "feas")}
+            try:
+                problem.solve(solver="CLARABEL", **options)
+            except cp.SolverError:
+                continue
+            return str(problem.status)
+    return "solver_error"
+
+
+def _stopped(status: str) -> ElastocalError:
+    return ElastocalError(
+        f"the cone solver stopped with '{status}'; the problem may be badly scaled: check the "
+        "units of the bounds and of the prior"
     )
 
 

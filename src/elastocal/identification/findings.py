@@ -561,7 +561,7 @@ def shape_of(summary: ResidualSummary) -> Finding:
     severity: Severity = "care" if whole.excess_kurtosis > HEAVY else "note"
     return Finding(
         "residuals_heavy_tailed", severity, numbers,
-        f"Compare with a robust fit ({option('method')} huber): where parameters "
+        f"Compare with a robust fit ({option('method')} huber or l1): where parameters "
         "differ by more than their intervals, far readings decide them; look for what makes single "
         "readings err (line of sight, vibration, a tracker that has not settled).",
     )  # fmt: skip

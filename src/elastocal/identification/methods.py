@@ -20,7 +20,7 @@ from elastocal.identification.noise_choice import (
     weights_of,
 )
 from elastocal.identification.noise_structure import Kind, Readings
-from elastocal.identification.options import Options
+from elastocal.identification.options import ROBUST, Options
 from elastocal.identification.outliers import NoiseAndOutliers, settle
 from elastocal.identification.residuals import held_out_residual, rms_3d
 from elastocal.identification.robust import robust_result
@@ -166,8 +166,8 @@ def run_method(
     method, exact = options.resolved, is_exact(sound)
     if method == "reml" and not every.problem.large and not exact:
         return _reml(every, sound, faulty, refit, options, progress)
-    if method == "huber":
-        return robust_result(every, sound, ~faulty, options.intervals)
+    if method in ROBUST:
+        return robust_result(method, every, sound, ~faulty, options.intervals)
     # As published, every reading counts; and at equal weights noisy readings look faulty.
     drop = options.sets_aside(faulty) and (method in ("wls", "reml") or options.faulty == "drop")
     solution, good = (sound if drop else every), ~faulty

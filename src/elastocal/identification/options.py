@@ -16,9 +16,10 @@ from elastocal.identification.noise_structure import Kind
 from elastocal.identification.weighted_problem import WeightKind
 from elastocal.text import did_you_mean, quoted
 
-Method = Literal["auto", "reml", "ols", "wls", "eq14", "eq14-residual", "huber"]
+Method = Literal["auto", "reml", "ols", "wls", "eq14", "eq14-residual", "huber", "l1"]
 FaultyReadings = Literal["auto", "drop", "keep"]
 METHODS = get_args(Method)
+ROBUST = ("huber", "l1")
 WITH_KNOWLEDGE = ("auto", "profile")
 # A larger share of readings beyond the noise is no accident of measuring: an effect that the model
 # lacks looks like that.  Setting them apart would hide it.
@@ -26,7 +27,7 @@ MOST_SET_ASIDE = 0.1
 # What there was once, or is looked for by this name: what does the same.
 SUCCESSORS = {
     "method": dict.fromkeys(
-        ("l1", "lts", "s", "mm", "tukey", "student-t"),
+        ("lts", "s", "mm", "tukey", "student-t"),
         "the default method, which excludes what the fit of the majority contradicts, or huber",
     ),
     "intervals": {
@@ -43,7 +44,7 @@ class Options:
 
     `method`: auto is reml, weights estimated by restricted likelihood, unless `weights` names
     stated ones; ols is eq. (6), wls eq. (10) with stated noise, eq14 and eq14-residual the
-    published weights with σ by group or from each residual; huber is robust.  `noise`: the
+    published weights with σ by group or from each residual; huber and l1 are robust.  `noise`: the
     model whose variances reml estimates (structure.noise_models).
     `weights`: auto, none, rows, axis, polar or covariance (then `covariance` (rows, rows) in m²).
     `intervals`: auto goes with the method.  `fixed`: names of parameters held at their start.
@@ -89,7 +90,7 @@ class Options:
         if self.method == "wls" and self.weights == "none":
             raise InputError("the method wls needs weights; for none, choose the method ols")
         stated = self.weights != "auto" or self.covariance is not None
-        if stated and self.weights != "none" and self.resolved not in ("wls", "huber"):
+        if stated and self.weights != "none" and self.resolved not in ("wls", *ROBUST):
             raise InputError(
                 f"the method {self.resolved} does not take stated weights; choose the method wls"
             )
@@ -97,9 +98,9 @@ class Options:
             self._check_knowledge()
 
     def _check_knowledge(self) -> None:
-        if self.resolved == "huber":
+        if self.resolved in ROBUST:
             raise InputError(
-                "the method huber takes neither constraints nor a prior; use the "
+                f"the method {self.resolved} takes neither constraints nor a prior; use the "
                 "default method, which sets faulty readings apart"
             )
         if self.intervals not in WITH_KNOWLEDGE:
@@ -131,7 +132,7 @@ class Options:
 
 def check_for_functions(options: Options) -> None:
     """Raise InputError for a method or intervals that take no prior, as smooth functions have."""
-    if options.resolved == "huber" or options.resolved.startswith("eq14"):
+    if options.resolved in ROBUST or options.resolved.startswith("eq14"):
         raise InputError(
             f"the method {options.resolved} takes no prior, which smooth functions have; use the "
             "default method, which sets faulty readings apart"

@@ -1,20 +1,22 @@
-"""A robust fit by name: Huber's loss, by reweighting.
+"""Robust fits by name: Huber's loss by reweighting, least absolute values as a cone program.
 
 An observation of `size` whitened rows (x, y, z of a tracker reading) is right or wrong as a whole:
 the loss ρ(d) sees the length d = |e_i|/σ of its scaled residual, and its rows share one weight
-ψ(d)/d, ψ = ρ′,
+ψ(d)/d, ψ = ρ′.  For size 1 these are the usual losses per row.
 
-    ρ = d²/2 up to c, c d − c²/2 beyond        (Huber 1964).
+    huber   ρ = d²/2 up to c, c d − c²/2 beyond        (Huber 1964)
+    l1      ρ = d, the least sum of Euclidean lengths
 
 The weights solve Σ B_iᵀ Ψ(e_i/σ) = 0, Ψ(r) = ψ(|r|) r/|r|; they are no inverse variances.
 """
 
 from __future__ import annotations
 
+import warnings
 from dataclasses import dataclass, replace
 
 import numpy as np
-from scipy import linalg, sparse
+from scipy import linalg, sparse, special
 
 from elastocal.errors import ElastocalError, InputError, InsufficientDataError
 from elastocal.identification.covariance import Covariance, cluster_robust, orthogonal
@@ -37,8 +39,9 @@ HUBER = (1.344997509, 1.501141084, 1.627987920, 1.731072513, 1.812018420, 1.8693
 @dataclass(frozen=True)
 class RobustEstimate:
     """x = V z (p,) of y (rows,) ≈ B x, B x = Q z with orthonormal Q, so that the parameters' units
-    do not matter; residual (rows,), scale σ, and c of the loss."""
+    do not matter; residual (rows,), scale σ, and c of Huber's loss, 0 for l1."""
 
+    Q: Array
     V: Array
     residual: Array
     size: int
@@ -46,6 +49,14 @@ class RobustEstimate:
     z: Array
     scale: float
     converged: bool
+
+    @property
+    def name(self) -> str:
+        return "huber" if self.c else "l1"
+
+    @property
+    def n(self) -> int:
+        return len(self.residual) // self.size
 
     @property
     def x(self) -> Array:
@@ -58,17 +69,48 @@ class RobustEstimate:
 
     def rho(self, d: Array) -> float:
         """Σ ρ."""
-        return float(np.where(d <= self.c, d**2 / 2, self.c * (d - self.c / 2)).sum())
+        c = self.c
+        return float((np.where(d <= c, d**2 / 2, c * (d - c / 2)) if c else d).sum())
 
     @property
     def weights(self) -> Array:
-        """ψ(d)/d (n,)."""
-        return self.c / np.maximum(self.distance, self.c)
+        """ψ(d)/d (n,), unbounded where an l1 fit meets an observation."""
+        return weights_of(self.distance, self.c)
+
+    def curvature(self) -> tuple[Array, Array]:
+        """Eigenvalues of every J_i: ψ′ along the error (n,) and ψ/d across it (n,).
+
+        ψ of l1 jumps at zero: for size 1 ψ′ = 2 f(0) is estimated from the density of the residuals
+        there, by the Siddiqui quotient with Hall and Sheather's bandwidth, without the p residuals
+        that the fit makes zero (Koenker 2005, section 3.4); for vectors ψ′ = 0 and ψ/d = 1/d
+        suffice, without observations that are met exactly.
+        """
+        d = self.distance
+        if self.c:
+            return (d <= self.c).astype(float), self.weights
+        if self.size > 1:
+            return np.zeros_like(d), np.divide(1, d, out=np.zeros_like(d), where=d >= EXACT)
+        kept = np.sort((self.residual / self.scale)[np.argsort(d)[len(self.z) :]])
+        h = len(kept) ** (-1 / 3) * special.ndtri(0.975) ** (2 / 3)
+        h = min(h * (1.5 / (2 * np.pi)) ** (1 / 3), 0.49)
+        low, high = np.quantile(kept, [0.5 - h, 0.5 + h])
+        level = np.full_like(d, 4 * h / max(high - low, np.finfo(float).tiny))
+        return level, level
 
 
 def lengths(residual: Array, size: int) -> Array:
     """|e_i| (n,) of each observation."""
     return np.linalg.norm(residual.reshape(-1, size), axis=1)
+
+
+def weights_of(d: Array, c: float) -> Array:
+    return c / np.maximum(d, c) if c else 1 / np.maximum(d, np.finfo(float).tiny)
+
+
+def _scale(residual: Array, size: int, y: Array) -> float:
+    """The median's scale, and no less than rounding of y lets it be."""
+    floor = float(np.finfo(float).eps * np.sqrt(np.mean(y**2)) + np.finfo(float).tiny)
+    return max(median_scale(lengths(residual, size), size), floor)
 
 
 TOLERANCE = 1e-11  # of the step |B δx| in units of the scale
@@ -82,23 +124,56 @@ def huber(B: Array, y: Array, size: int, c: float | None = None) -> RobustEstima
     It has one solution, and resists errors in y but not at leverage points.
     """
     factors, c = orthogonal(B), HUBER[size - 1] if c is None else c
-    # The scale is no less than rounding of y lets it be.
-    floor = float(np.finfo(float).eps * np.sqrt(np.mean(y**2)) + np.finfo(float).tiny)
     Q, z, converged = factors.Q, factors.Q.T @ y, False
     r = y - Q @ z
-    scale = max(median_scale(lengths(r, size), size), floor)
+    scale = _scale(r, size, y)
     for _ in range(MAX_ITER):
-        weighted = Q.T * np.repeat(c / np.maximum(lengths(r, size) / scale, c), size)
+        weighted = Q.T * np.repeat(weights_of(lengths(r, size) / scale, c), size)
         step = linalg.solve(weighted @ Q, weighted @ r, assume_a="pos")
         z, before = z + step, scale
         r = y - Q @ z
-        scale = max(median_scale(lengths(r, size), size), floor)
+        scale = _scale(r, size, y)
         moved = float(np.linalg.norm(step))
         still = moved <= 4 * np.finfo(float).eps * np.linalg.norm(z)  # no more digits in z
         same = abs(scale - before) <= TOLERANCE * scale
         if converged := bool((moved <= TOLERANCE * scale or still) and same):
             break
-    return RobustEstimate(factors.V, r, size, c, z, scale, converged)
+    return RobustEstimate(Q, factors.V, r, size, c, z, scale, converged)
+
+
+OPTIMAL = 5e-6  # relative duality gap that counts as solved
+EXACT = 1e-8  # scaled length below which an l1 fit passes through an observation
+ACCURATE = 1e-12  # asked of the cone solver, which ends where rounding allows no more
+
+
+def least_absolute(B: Array, y: Array, size: int) -> RobustEstimate:
+    """Minimise Σ |e_i| of y (n·size,) ≈ B x, from least squares on in units of its residual.
+
+    The median's scale is only reported: x does not depend on it.
+    """
+    import cvxpy as cp
+
+    factors = orthogonal(B)
+    Q, z = factors.Q, factors.Q.T @ y
+    first = y - Q @ z
+    unit = max(float(np.abs(first).mean()), _scale(first, size, y) * np.finfo(float).eps)
+    dz, e = cp.Variable(len(z)), cp.Variable((len(y) // size, size))
+    left = cp.reshape(first / unit - Q @ dz, e.shape, order="C")
+    total = cp.sum(cp.abs(e)) if size == 1 else cp.sum(cp.norm(e, 2, axis=1))
+    solved = cp.Problem(cp.Minimize(total), [e == left])
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore")  # of the accuracy, which the gap tells
+        solved.solve(
+            solver=cp.CLARABEL, accept_unknown=True,
+            tol_gap_abs=ACCURATE, tol_gap_rel=ACCURATE, tol_feas=ACCURATE,
+        )  # fmt: skip
+    z = z + unit * np.asarray(dz.value)
+    r = y - Q @ z
+    # Any λ with Qᵀλ = 0 and |λ_i| ≤ 1 bounds the minimum from below by Σ y_iᵀλ_i.
+    bound = abs(float(first @ np.ravel(solved.constraints[0].dual_value))) / unit
+    least = float(total.value)
+    converged = abs(least - bound) <= OPTIMAL * max(least, OPTIMAL)
+    return RobustEstimate(Q, factors.V, r, size, 0.0, z, _scale(r, size, y), bool(converged))
 
 
 # Covariance of an M-estimate: from ψ and ψ′, never from the weights of its iteration.
@@ -121,13 +196,14 @@ def covariance_of(found: RobustEstimate, B: Array, cluster: IntArray | None = No
     """Covariance (p, p) of x̂ of y ≈ B x.
 
     Of independent readings Huber's H1, k² σ² (b̂/â²) (BᵀB)⁻¹, with b̂ = Σψ²/(n·size − p) and his
-    small-sample factor k = 1 + (p/(n·size)) Var(eigenvalues)/â²; t intervals with rows less p as
-    dof.  Under any dependence within a `cluster` (n,), such as a configuration, CR3 of (σ/a) Ψ.
+    small-sample factor k = 1 + (p/(n·size)) Var(eigenvalues)/â² (k = 1 for l1); t intervals with
+    rows less p as dof.  Under any dependence within a `cluster` (n,), such as a configuration, CR3
+    of (σ/a) Ψ.
 
     Raises InsufficientDataError where nearly all readings lie far from the fit, or a cluster alone
     determines a combination of the parameters.
     """
-    along, across = (found.distance <= found.c).astype(float), found.weights
+    along, across = found.curvature()
     rows, p, size = len(found.residual), len(found.z), found.size
     a = float(np.mean(along + (size - 1) * across)) / size
     if not a > 0:
@@ -138,24 +214,25 @@ def covariance_of(found: RobustEstimate, B: Array, cluster: IntArray | None = No
     if cluster is not None:
         psi = np.repeat(found.weights, size) * found.residual / a
         return cluster_robust(B, psi, np.repeat(cluster, size), "CR3")
-    psi = np.minimum(found.distance, found.c)
+    psi = np.minimum(found.distance, found.c) if found.c else np.ones(found.n)
     square = float((along**2).sum() + (size - 1) * (across**2).sum()) / rows
-    k = 1 + p / rows * (square - a**2) / a**2
+    k = 1 + p / rows * (square - a**2) / a**2 if found.c else 1.0
     variance = (k * found.scale / a) ** 2 * float(psi @ psi) / (rows - p)
-    text = "asymptotic covariance H1 of the huber estimate, from ψ and ψ′"
+    text = f"asymptotic covariance H1 of the {found.name} estimate, from ψ and ψ′"
     return Covariance("H1", variance * found.V @ found.V.T, np.full(p, float(rows - p)), text)
 
 
 # Robust fit of the nonlinear model: linear robust steps on the exact B.
 
+METHODS = {"huber": huber, "l1": least_absolute}
 SETTLED = 1e-5  # |B δx| in units of the scale at which the steps have converged
 MOST_MOVES = 40
 
 
 def robust_result(
-    every: Solution, sound: Solution, good: BoolArray, intervals: str
-) -> MethodResult:  # fmt: skip
-    """Huber's fit of all readings in the parameters that the `good` ones (N,) determine.
+    method: str, every: Solution, sound: Solution, good: BoolArray, intervals: str
+) -> MethodResult:
+    """The robust fit of all readings in the parameters that the `good` ones (N,) determine.
 
     Minimises Σ ρ(|W (y − h(X))_i|/σ) over X[kept] by damped Gauss–Newton steps: each is the robust
     linear fit of the whitened residual to the whitened B at X, halved until Σ ρ at its σ falls.
@@ -169,19 +246,19 @@ def robust_result(
     problem, kept, x, steps = every.problem, sound.reduction.kept, sound.fit.x.copy(), 0
     if problem.large:
         raise InputError(
-            "the method huber takes no table of this size; use the default method, which sets "
-            "faulty readings apart"
+            f"the method {method} takes no table of this size; use the default "
+            "method, which sets faulty readings apart"
         )
     if intervals not in ("auto", "cr3"):
         raise InputError(
-            "the method huber has intervals of its own: 'auto' for independent readings, 'cr3' "
-            "where readings of a configuration depend on each other"
+            f"the method {method} has intervals of its own: 'auto' for independent readings, "
+            "'cr3' where readings of a configuration depend on each other"
         )
     observed, weights = problem.observations, problem.weights
     while True:
         at = problem.model.regressor(observed.table, x, kept, observed)
         B, e = weights.apply(at.B), weights.apply(at.residual)
-        found = huber(B, e, observed.size)
+        found = METHODS[method](B, e, observed.size)
         converged = bool(np.linalg.norm(found.z) <= SETTLED * found.scale * np.sqrt(len(kept)))
         share = 0.0 if converged or steps == MOST_MOVES else _damping(problem, x, kept, e, found)
         if share == 0.0:
@@ -194,9 +271,8 @@ def robust_result(
         reason=sound.fit.reason if converged else "the robust steps did not settle",
     )  # fmt: skip
     # Only for predicting left-out configurations do ψ(d)/d stand in as weights.
-    whiten = sparse.csr_array(
-        sparse.diags_array(np.sqrt(np.repeat(found.weights, observed.size)))
-    )  # fmt: skip
+    root = np.sqrt(np.repeat(np.minimum(found.weights, 1e6), observed.size))
+    whiten = sparse.csr_array(sparse.diags_array(root))
     if weights.whiten is not None:
         whiten = sparse.csr_array(whiten @ weights.whiten)
     heldout = held_out_residual(
@@ -207,7 +283,7 @@ def robust_result(
     cluster = None if intervals == "auto" else observed.configuration
     covariance = covariance_of(found, B, cluster)
     ends = covariance.interval(x[kept], LEVEL)
-    return MethodResult("huber", solution, Intervals(covariance, ends), None, good)
+    return MethodResult(method, solution, Intervals(covariance, ends), None, good)
 
 
 def _damping(

@@ -210,6 +210,7 @@ METHODS = {
         "it acts like a robust fit, and its stated intervals are far too narrow"
     ),
     "huber": "robust M-estimate with Huber's loss, which limits the weight of outliers",
+    "l1": "least sum of residual lengths (L1), robust like the median",
 }
 # What the weights are is said by the method itself, or by the line on the noise model.
 SAID = {"reml", "ols", "eq14", "eq14-residual"}
@@ -334,7 +335,7 @@ COMPARED = (
 SHAPES = {
     "residuals_skew": "errors are skewed, as with a missing effect.",
     "residuals_heavy_tailed": (
-        "large errors are more frequent. A robust fit (method huber) shows "
+        "large errors are more frequent. A robust method (huber, l1) shows "
         "whether the estimates depend on them."
     ),
     "residuals_light_tailed": "large errors are rarer, as with rounded or selected readings.",

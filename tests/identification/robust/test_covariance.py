@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 from support.calibration import binomial_band
 
-from elastocal.identification.robust import covariance_of, huber
+from elastocal.identification.robust import covariance_of, huber, least_absolute
 
 
 def tables(arm, share, count, seed=0):
@@ -18,20 +18,21 @@ def holds(x, covariance, truth):
     return (low < truth) & (truth < high)
 
 
-def coverage(arm, share, count, cluster=None):
+def coverage(arm, fit, share, count, cluster=None):
     return np.array(
         [
             holds(found.x, covariance_of(found, arm.B, cluster), arm.x)
-            for found in (huber(arm.B, y, 3) for y in tables(arm, share, count))
+            for found in (fit(arm.B, y, 3) for y in tables(arm, share, count))
         ]
     )
 
 
 @pytest.mark.parametrize("share", [0.0, 0.05])
-def test_intervals_hold_the_truth(arm, share):
+@pytest.mark.parametrize("fit", [huber, least_absolute], ids=["huber", "l1"])
+def test_intervals_hold_the_truth(arm, fit, share):
     """95 % of 30 tables × 9 parameters; parameters of a table are nearly independent (each level
     has its own column), and the band of 99.9 % is that of a third as many."""
-    held = coverage(arm, share, 30)
+    held = coverage(arm, fit, share, 30)
     low, high = binomial_band(held.size // 3, 0.95)
     assert low <= held.sum() / 3 <= high
 
