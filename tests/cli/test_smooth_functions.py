@@ -12,7 +12,7 @@ from support.robots import KR270
 from typer.testing import CliRunner, Result
 
 from elastocal.cli.main import app
-from elastocal.model.manipulator import Model
+from elastocal.model.manipulator import Model, smooth_groups
 
 CELL = """
 name = "curved"
@@ -122,11 +122,29 @@ def test_compensate_says_where_no_reading_shows_them(folder: Path) -> None:
     assert far > 2 * near
 
 
-def test_corrections_name_their_successors(folder: Path) -> None:
+def test_export_writes_them_as_corrections(folder: Path) -> None:
     out = folder / "corrections.csv"
-    asked = ("-o", out, "--format", "corrections")
-    done = run("export", folder / "cell.toml", folder / "result.json", *asked)
-    assert done.exit_code == 2 and not out.exists()
-    assert "--format corrections is gone: --joint-correction writes" in " ".join(
-        done.output.split()
-    )
+    done = run(
+        "export", folder / "cell.toml", folder / "result.json", "-o", out, "--format",
+        "corrections", "--poses", 20,
+    )  # fmt: skip
+    assert done.exit_code == 0, done.output
+    assert "joint curve" in done.output
+    lines = out.read_text().splitlines()
+    assert lines[0].startswith("# calibrated by elastocal")
+    rows = list(csv.DictReader(lines[1:]))
+    assert {row["where"] for row in rows} == {"joint1", "joint2"}
+    own = [row for row in rows if row["where"] == "joint2"]
+    assert float(own[0]["position_deg"]) == pytest.approx(np.degrees(-1.8), abs=1e-3)
+    assert float(own[-1]["position_deg"]) == pytest.approx(np.degrees(-0.4), abs=1e-3)
+    # Beside the truth, less what offsets stand for.
+    truth = json.loads((folder / "truth.json").read_text())
+    model = Model(folder / "cell.toml")
+    group = smooth_groups(model)[1]
+    x = np.radians([float(row["position_deg"]) for row in own])
+    assert group.basis is not None
+    true = group.basis(x) @ [truth[model.names[c]] for c in group.columns[0]] * 1e6
+    found = np.array([float(row["value"]) for row in own])
+    half = np.array([float(row["half95"]) for row in own])
+    assert (np.abs(found - true) < 1.5 * half).mean() > 0.9
+    assert all(row["unit"] == "urad" for row in rows)

@@ -281,8 +281,8 @@ def export(
 
     Args:
         output: File to write: .urdf, .xml or .mjcf, .csv (DH), .yaml, .json.
-        format: urdf, mjcf, dh, mdh (modified DH), yaml or json; default: by the
-            ending.
+        format: urdf, mjcf, dh, mdh (modified DH), yaml, json, or corrections (smooth functions
+            as CSV); default: by the ending.
         load: Force in N at the load point (tracker's axes) for costs and fit.
         frames: URDF: links for markers and load point.
         base_frame: Put the tracker's frame above the robot's base.

@@ -1,12 +1,13 @@
 """A calibrated arm written in one of the formats, read back, and with what that costs.
 
-The formats of geometry have rooms of their own; the parameters as YAML or JSON are written here.
+The formats of geometry have rooms of their own; the parameters as YAML or JSON and the smooth
+functions are written here.
 """
 
 from __future__ import annotations
 
 import tempfile
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
 from dataclasses import dataclass, field, replace
 from functools import partial
 from pathlib import Path
@@ -14,7 +15,7 @@ from typing import Any
 
 import numpy as np
 
-from elastocal.errors import ElastocalError, InputError, InsufficientDataError, option, require
+from elastocal.errors import ElastocalError, InputError, InsufficientDataError, option
 from elastocal.export.exportable import (
     Cost,
     ExportNumbers,
@@ -47,10 +48,13 @@ from elastocal.export.rigid_files import (
     without_beta,
 )
 from elastocal.files import atomic_write_text, together
+from elastocal.identification.covariance import t_quantile
 from elastocal.model.calibrated import CalibratedArm, Conditions, Valued, random_table
 from elastocal.model.chain import Chain
 from elastocal.model.effects.catalogue import effect_of
+from elastocal.model.manipulator import SmoothGroup, smooth_groups
 from elastocal.model.rigid import nominal_flanges
+from elastocal.tables import csv_text
 from elastocal.text import did_you_mean, json_text, listed, plain
 from elastocal.units import Array, rpy_from_rotation
 
@@ -108,13 +112,70 @@ def _yaml(data: Any) -> str:
     return text
 
 
+# Smooth functions as a table: what no format of geometry holds, for controllers of one's own.
+
+CORRECTIONS_HEADER = (
+    "effect", "where", "follows", "position_deg", "time_s", "component", "unit", "value", "half95",
+)  # fmt: skip
+LEVEL = 0.95
+PER_LENGTH = 10  # rows for each correlation length
+FEWEST, MOST = 21, 5001
+MICRO = {"rad": "urad", "m": "um"}
+
+
+def corrections_csv(calibrated: CalibratedArm, note: str) -> str:
+    """Every smooth function over its range, with the half width of its 95 % band.
+
+    A row says by how much (urad or um) the place has moved beyond its commanded or identified
+    position: of a joint its angle, of a link its end frame along and about its axes (components 1
+    to 6), of the base along and about the data's axes, of a marker its position in the flange
+    frame.  `position_deg` or `time_s` is what it follows.  A line that begins with # says where
+    the numbers come from.
+
+    Raises InputError where the arm has no such function.
+    """
+    groups = smooth_groups(calibrated.model)
+    rows = [row for group in groups for row in _correction_rows(calibrated, group)]
+    if not rows:
+        raise InputError(
+            f"{calibrated.source}: this arm has no smooth function to be written as corrections; "
+            "elastocal diagnose finds those that the readings show"
+        )
+    return csv_text(CORRECTIONS_HEADER, rows, [note])
+
+
+def _correction_rows(calibrated: CalibratedArm, group: SmoothGroup) -> Iterator[tuple[str, ...]]:
+    names, place = calibrated.model.names, {n: k for k, n in enumerate(calibrated.determined)}
+    if group.basis is None or not any(names[c] in place for c in group.columns.ravel()):
+        return
+    steps = int(np.ceil((group.high - group.low) / group.length * PER_LENGTH))
+    x = group.grid(min(max(steps + 1, FEWEST), MOST))
+    waves = group.basis(x)
+    quantile = float(t_quantile(LEVEL, np.array(np.inf)))
+    for component, (columns, unit) in enumerate(zip(group.columns, group.units, strict=True), 1):
+        known = np.array([names[c] in place for c in columns])
+        at = [place[names[c]] for c in columns[known]]
+        own = waves[:, known]
+        variance = np.einsum("nk,kl,nl->n", own, calibrated.covariance[np.ix_(at, at)], own)
+        half = quantile * np.sqrt(np.maximum(variance, 0.0))
+        value = waves @ calibrated.x[columns]
+        for position, *sizes in zip(x, value, half, strict=True):
+            angle, time = f"{np.degrees(position):.4f}", f"{position:.1f}"
+            micro = (f"{size * 1e6 + 0.0:.3f}" for size in sizes)
+            yield (
+                group.effect, group.where, group.follows,
+                *((angle, "") if group.lasting else ("", time)),
+                str(component), MICRO.get(unit, unit), *micro,
+            )  # fmt: skip
+
+
 # Which format a file is written in: by its ending, or as asked for.
 
 ENDINGS = {
     ".urdf": "urdf", ".xml": "mjcf", ".mjcf": "mjcf", ".csv": "dh", ".yaml": "yaml",
     ".yml": "yaml", ".json": "json",
 }  # fmt: skip
-FORMATS = ("urdf", "mjcf", "dh", "mdh", "yaml", "json")
+FORMATS = ("urdf", "mjcf", "dh", "mdh", "yaml", "json", "corrections")
 FITTED = ("urdf", "mjcf", "dh", "mdh")
 
 
@@ -124,11 +185,6 @@ def format_of(path: Path, asked: str | None) -> str:
     Raises InputError for an unknown format, and for an ending that tells none.
     """
     if asked is not None:
-        require(
-            asked != "corrections",
-            f"{option('format', asked)} is gone: {option('joint_correction')} writes what joints "
-            f"do besides, compensate with {option('table')} what targets are corrected by",
-        )
         if asked.lower() not in FORMATS:
             raise InputError(
                 f"{option('format')} takes one of {', '.join(FORMATS)}; found '{asked}'"
@@ -524,4 +580,12 @@ def _dh(calibrated: CalibratedArm, wish: Wish, kept: Kept, pieces: ExportNumbers
     return Written(text, apart, "elastocal's own reader of DH tables", (), beta)
 
 
-WRITERS = {"urdf": _urdf, "mjcf": _mjcf, "dh": _dh, "mdh": _dh}
+def _corrections(
+    calibrated: CalibratedArm, wish: Wish, kept: Kept, pieces: ExportNumbers
+) -> Written:
+    return Written(corrections_csv(calibrated, _note(calibrated, kept)))
+
+
+WRITERS = {
+    "urdf": _urdf, "mjcf": _mjcf, "dh": _dh, "mdh": _dh, "corrections": _corrections,
+}  # fmt: skip

@@ -289,7 +289,7 @@ FORMATS = {
     "urdf": ("The URDF", "a URDF"),
     "mjcf": ("The MJCF", "this MJCF"),
     **dict.fromkeys(("dh", "mdh"), ("The DH table", "a DH table")),
-    **dict.fromkeys(("yaml", "json"), ("Geometry alone", "geometry alone")),
+    **dict.fromkeys(("yaml", "json", "corrections"), ("Geometry alone", "geometry alone")),
 }
 
 
