@@ -14,14 +14,14 @@ import functools
 import inspect
 import math
 import re
-from collections.abc import Callable, Collection, Mapping, Sequence
+from collections.abc import Callable, Collection, Mapping
 from numbers import Integral, Real
 from pathlib import Path
 from typing import Any, TypeVar
 
 from elastocal.above import Saved
 from elastocal.errors import GONE, InputError, option, require
-from elastocal.text import did_you_mean, listed, quoted
+from elastocal.text import quoted
 
 # numpy is loaded where a value is looked at: the command line reads the kinds alone, for --help.
 
@@ -233,12 +233,3 @@ def whole(name: str, given: Any, least: int | None = None) -> int:
         f"{option(name)} takes a whole number{more}; found {quoted(given)}",
     )
     return int(given)
-
-
-def one_of(name: str, given: Any, valid: Sequence[str]) -> None:
-    """Raise InputError where a text is none of the `valid` ones."""
-    require(
-        given in valid,
-        f"{option(name)} {quoted(given)} is unknown{did_you_mean(str(given), valid)}; there are "
-        f"{listed(valid)}",
-    )

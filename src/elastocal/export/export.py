@@ -450,9 +450,7 @@ def _urdf(calibrated: CalibratedArm, wish: Wish, kept: Kept, pieces: ExportNumbe
     note = _note(calibrated, kept)
     if robot.urdf is not None:
         text = calibrated_urdf(robot, pieces, wish.frames, note)
-        tree = check_urdf(robot.urdf)
-        base = tree.root if robot.base is None else robot.base
-        flange = tree.only_flange(base) if robot.flange is None else robot.flange
+        base, flange = check_urdf(robot.urdf).ends(robot.base, robot.flange)
     else:
         text = new_urdf(pieces, wish.frames, note)
         base, flange = BASE, FLANGE

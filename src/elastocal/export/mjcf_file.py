@@ -9,6 +9,7 @@ from typing import Any
 from xml.etree import ElementTree as ET
 
 import numpy as np
+from scipy.optimize import root
 
 from elastocal.cell.arm_description import Robot
 from elastocal.errors import ElastocalError, InputError
@@ -220,12 +221,10 @@ def _compensate(
 
 # Where MuJoCo's arm of an exported MJCF comes to rest: the check that the file says the same.
 #
-# At rest the generalised force r(x) = passive + actuator − bias of all joints x is zero.  Newton's
-# method on C r, C the compliances, so that soft and stiff joints are found alike.
+# At rest the generalised force r(x) = passive + actuator − bias of all joints x is zero: a root of
+# C r, C the compliances, so that soft and stiff joints are found alike.
 
-MAX_STEPS = 30
-TOLERANCE = 1e-12  # last step, rad or m
-DIFFERENCE_STEP = 1e-6  # rad or m
+TOLERANCE, AT_REST = 1e-13, 1e-10  # rad or m: last step, and what may be left
 
 
 class MujocoRest:
@@ -284,18 +283,9 @@ def settle(residual: Callable[[Array], Array], x: Array, q: Array) -> None:
 
     Raises ElastocalError, which names the commanded q, where there is no such place.
     """
-    for _ in range(MAX_STEPS):
-        r = residual(x)
-        h = DIFFERENCE_STEP * np.eye(len(x))
-        slope = np.array([residual(x + dx) - residual(x - dx) for dx in h]).reshape(h.shape).T
-        step = np.linalg.solve(slope / (2 * DIFFERENCE_STEP), r)
-        x = x - step
-        if not np.isfinite(x).all():
-            break
-        if np.max(np.abs(step), initial=0.0) < TOLERANCE:
-            residual(x)
-            return
-    raise ElastocalError(f"MuJoCo finds no rest of the exported arm near q = {q.tolist()}")
+    found = root(residual, x, tol=TOLERANCE)
+    if not (np.abs(residual(found.x)) <= AT_REST).all():
+        raise ElastocalError(f"MuJoCo finds no rest of the exported arm near q = {q.tolist()}")
 
 
 # The calibrated arm in the user's own MJCF: bodies moved, springs added, masses corrected.

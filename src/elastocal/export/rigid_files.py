@@ -52,8 +52,7 @@ def calibrated_urdf(robot: Robot, pieces: ExportNumbers, frames: Frames, note: s
     """
     assert robot.urdf is not None
     tree = check_urdf(robot.urdf)
-    base = tree.root if robot.base is None else robot.base
-    flange = tree.only_flange(base) if robot.flange is None else robot.flange
+    base, flange = tree.ends(robot.base, robot.flange)
     text = _UrdfText(tree)
     added = [comment(note)]
     for i, joint in enumerate(tree.serial_chain(base, flange)):

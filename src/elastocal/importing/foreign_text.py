@@ -54,8 +54,8 @@ class ForeignText:
 def read_lines(path: str | Path, encoding: str = "auto") -> ForeignText:
     """The lines of a text file of at most 300 MB.
 
-    `encoding` "auto": by the byte order mark, else UTF-8 where the bytes allow, else UTF-16
-    where every other byte is zero, else Windows-1252 (Latin-1 where that has no character).
+    `encoding` "auto": by the byte order mark, else UTF-8 where the bytes allow, else Windows-1252
+    (Latin-1 where that has no character).
     Raises InputError where the file cannot be read, is empty, no text, or not in `encoding`.
     """
     source = str(path)
@@ -70,8 +70,8 @@ def read_lines(path: str | Path, encoding: str = "auto") -> ForeignText:
     text, name = _decode(source, data, encoding)
     if "\0" in text:
         line = text.count("\n", 0, text.index("\0")) + 1
-        raise InputError(f"{source}, line {line}: NUL characters, so this is no text; export it "
-                         "as text (CSV)")  # fmt: skip
+        raise InputError(f"{source}, line {line}: NUL characters, so this is no text, or UTF-16 "
+                         "without its mark; export it as text (CSV), or set encoding")  # fmt: skip
     # Not splitlines: a form feed or U+2028 in a comment ends no line for an editor.
     lines = text.replace("\r\n", "\n").replace("\r", "\n").split("\n")
     for number, content in enumerate(lines, start=1):
@@ -85,27 +85,15 @@ def _decode(source: str, data: bytes, encoding: str) -> tuple[str, str]:
     """The text, and what its encoding is called."""
     if encoding != "auto":
         codec = "utf-8-sig" if encoding == "utf-8" else encoding
-        if encoding == "utf-16" and not data.startswith(codecs.BOM_UTF16):
-            codec = _wide(data) or "utf-16-le"
         return decoded(source, data, SAVE_AS, codec, encoding), encoding
     for mark, codec, name in _MARKS:
         if data.startswith(mark):
             return decoded(source, data, SAVE_AS, codec, name), name
-    if codec := _wide(data):
-        return decoded(source, data, SAVE_AS, codec, "UTF-16"), "UTF-16"
     plain = "ASCII" if data.isascii() else "UTF-8"
     for codec, name in (("utf-8", plain), ("cp1252", "Windows-1252")):
         with suppress(UnicodeDecodeError):
             return data.decode(codec), name
     return data.decode("latin-1"), "Latin-1"
-
-
-def _wide(data: bytes) -> str:
-    """UTF-16 without a byte order mark shows by zeros at every other place."""
-    even, odd = (data[at:4000:2].count(0) for at in (0, 1))
-    if max(even, odd) <= max(0.2 * min(len(data), 4000), 4 * min(even, odd)):
-        return ""
-    return "utf-16-le" if odd > even else "utf-16-be"
 
 
 def unit_in_comments(where: str, pattern: str | None, comments: Sequence[str]) -> str | None:

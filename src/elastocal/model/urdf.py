@@ -63,8 +63,7 @@ def read_urdf(path: str | Path, base: str | None = None, flange: str | None = No
     Raises InputError, naming file, element and remedy, for anything `check_urdf` or `Tree` refuses.
     """
     tree = check_urdf(path)
-    base = tree.root if base is None else tree.find_link("base", base)
-    flange = tree.only_flange(base) if flange is None else tree.find_link("flange", flange)
+    base, flange = tree.ends(base, flange)
     moving = tree.serial_chain(base, flange)
     with np.errstate(over="ignore", invalid="ignore"):  # numbers of 1e308 are judged later
         placements, end = tree.frames(base, flange)
@@ -186,6 +185,11 @@ class Tree:
             f"links: {listed(self.links)}",
         )
         return name
+
+    def ends(self, base: str | None, flange: str | None) -> tuple[str, str]:
+        """The first and the last link, None for those that are found."""
+        base = self.root if base is None else self.find_link("base", base)
+        return base, self.only_flange(base) if flange is None else self.find_link("flange", flange)
 
     def last_link(self, base: str) -> str:
         """The link below `base` from which on fingers, or frames that none moves, branch off.
