@@ -139,7 +139,6 @@ def checked_arguments(function: F) -> F:
     """The function, whose arguments are checked by its annotations before it runs.
 
     In place of a `seed` it takes a numpy Generator, of which one is drawn.
-    Raises InputError that names the argument, what it takes and what was found.
     """
     signature = inspect.signature(function)
     kinds = {

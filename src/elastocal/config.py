@@ -104,11 +104,7 @@ Vector3 = Annotated[Array, numbers(3), Field(description="three numbers")]
 
 
 def read_toml(path: str | Path, what: str, max_bytes: int = MAX_BYTES) -> dict[str, Any]:
-    """Returns the parsed TOML file of at most `max_bytes`; `what` names it in messages.
-
-    Raises InputError where it cannot be read, is larger, is not UTF-8, nests too deep, or is no
-    TOML.
-    """
+    """Returns the parsed TOML file of at most `max_bytes`; `what` names it in messages."""
     return parsed_toml(path, read_text(path, what, max_bytes))
 
 
@@ -132,10 +128,7 @@ def parsed_toml(path: str | Path, text: str) -> dict[str, Any]:
 
 
 def checked(table: type[TableType], data: dict[str, Any], where: str | Path) -> TableType:
-    """Returns parsed TOML as a `table`; `where` names its source in messages.
-
-    Raises InputError that names the first wrong key, what it takes and what was found.
-    """
+    """Returns parsed TOML as a `table`; `where` names its source in messages."""
     try:
         return table.model_validate(data)
     except ValidationError as error:

@@ -2,7 +2,8 @@
 
 A message says what is wrong, where (file, row, column or key), what was found,
 and what to do.  The command line turns `InputError` into exit code 2 and
-`InsufficientDataError` into exit code 1, both without a traceback.
+`InsufficientDataError` into exit code 1, both without a traceback.  Whatever reads a file or takes
+an argument raises `InputError` for what is wrong with it; docstrings inside do not repeat that.
 
 A message that speaks of an option of a verb names it by `option`: in Python the keyword
 argument, on the command line the flag.

@@ -37,10 +37,7 @@ LONGEST_INTEGER = 18  # digits; a longer one is read as a float
 
 
 def check_regular(path: str | Path, what: str) -> int:
-    """The size in bytes of an existing regular file; `what` names it in messages.
-
-    Raises InputError where it is absent, a directory, a pipe or device, or cannot be reached.
-    """
+    """The size in bytes of an existing regular file; `what` names it in messages."""
     _check_path(path)
     with _read_errors(path, what):
         found = os.stat(path)
@@ -56,11 +53,7 @@ def check_regular(path: str | Path, what: str) -> int:
 
 @contextmanager
 def open_input(path: str | Path, what: str, max_bytes: int | None = None) -> Iterator[BinaryIO]:
-    """An existing regular file of at most `max_bytes`, opened for binary reading.
-
-    Raises InputError as `check_regular` does, where the file is larger, and where reading it
-    fails within the `with` block.
-    """
+    """An existing regular file of at most `max_bytes`, opened for binary reading."""
     check_size(path, what, check_regular(path, what), max_bytes)
     with _read_errors(path, what), open(path, "rb") as handle:
         yield handle
@@ -96,10 +89,7 @@ PIECE = 1 << 20  # bytes read at once
 
 
 def read_bytes(path: str | Path, what: str, max_bytes: int) -> bytes:
-    """The content of a regular file of at most `max_bytes`, sized before it is read.
-
-    Raises InputError as `open_input` does.
-    """
+    """The content of a regular file of at most `max_bytes`, sized before it is read."""
     data = bytearray()
     with open_input(path, what, max_bytes) as handle:
         # A file may grow, those of /proc tell no size, and read() takes memory for what it may get.
@@ -110,10 +100,7 @@ def read_bytes(path: str | Path, what: str, max_bytes: int) -> bytes:
 
 
 def read_text(path: str | Path, what: str, max_bytes: int) -> str:
-    """The text of a UTF-8 file (a byte order mark is dropped) of at most `max_bytes`.
-
-    Raises InputError where the file cannot be read, is larger, or is not UTF-8.
-    """
+    """The text of a UTF-8 file (a byte order mark is dropped) of at most `max_bytes`."""
     return decoded(str(path), read_bytes(path, what, max_bytes), f"save the {what} as UTF-8")
 
 
@@ -174,10 +161,7 @@ def decoded(
 
 
 def check_exists(path: Path, key: str, owner: Path) -> Path:
-    """`path`, which `key` of the file `owner` names, where it is an existing file.
-
-    Raises InputError that names the owner, the key and the path.
-    """
+    """`path`, which `key` of the file `owner` names, where it is an existing file."""
     try:
         _check_path(path)
         mode = os.stat(path).st_mode
@@ -330,10 +314,7 @@ def _write_errors(target: Path) -> Iterator[None]:
 
 
 def atomic_write_text(path: str | Path, text: str) -> None:
-    """Write `text` as UTF-8 under `path`, whole or not at all.
-
-    Raises InputError where the folder is missing or not writable, or the disk is full.
-    """
+    """Write `text` as UTF-8 under `path`, whole or not at all."""
     with atomic_writer(path) as handle:
         handle.write(text)
 

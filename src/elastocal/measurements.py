@@ -457,8 +457,6 @@ def layout_of(
 
     `joint_kinds`: "revolute" or "prismatic" per joint; `observe` decides what must be there;
     `extra`: families that this table may have besides.
-    Raises InputError for unnamed, repeated, unknown, unitless, missing columns, mixed units,
-    incomplete families and a joint count that is not the robot's.
     """
     known = families(joint_kinds) | {family.name: family for family in extra}
     present = match_columns(
@@ -660,11 +658,7 @@ def _check_duplicates(raw: RawTable, table: Measurements) -> None:
 
 
 def write_measurements(measurements: Measurements, path: str | Path) -> None:
-    """Write the table to a CSV that reads back bit for bit; whole or not at all.
-
-    Raises InputError where the folder is missing or not writable, and for values or labels that no
-    table can hold (NaN, infinite, control characters).
-    """
+    """Write the table to a CSV that reads back bit for bit; whole or not at all."""
     for name in (*measurements.configuration_labels, *measurements.marker_names):
         if not is_label(name):
             raise InputError(
@@ -697,10 +691,7 @@ def _rows(columns: Mapping[str, np.ndarray], n: int) -> Iterator[tuple]:
 
 
 def read_matrix(path: str | Path, what: str) -> Array:
-    """A matrix of finite numbers without a header: CSV, or numpy's .npy.
-
-    Raises InputError that names the file and, of a CSV, the line.
-    """
+    """A matrix of finite numbers without a header: CSV, or numpy's .npy."""
     if Path(path).suffix.lower() == ".npy":
         return _read_npy(path, what)
     lines = enumerate(read_text(path, what, MOST_BYTES).splitlines(), start=1)

@@ -58,8 +58,6 @@ def load_named(cell: Path, modules: Sequence[str], asked: bool, fresh: bool) -> 
     the environment variable TRUSTED.
 
     `fresh`: the cell has just been read, and a file that has changed is run again.
-
-    Raises InputError that names the first of them that would run unasked.
     """
     pending = [name for name in modules if not _has_run(name, fresh)]
     for name in pending:

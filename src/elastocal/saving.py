@@ -64,11 +64,7 @@ def save_residuals(fit: Calibration, path: Path) -> None:
 
 
 def beside(path: Path) -> Path:
-    """Where the summary (JSON) of the plan `path` is written, which nobody names.
-
-    Raises InputError where `path` ends in .json itself, or another file is there that no design
-    wrote.
-    """
+    """Where the summary (JSON) of the plan `path` is written, which nobody names."""
     require(path.suffix.lower() != ".json", f"{path}: name the plan .csv; .json goes beside it")
     summary = path.with_suffix(".json")
     if summary.exists():
@@ -146,8 +142,6 @@ def wish_of(
 ) -> Wish:
     """How to export an arm to `path`, checked; the others are the options of `elastocal export`:
     no format goes by the file's ending, costs are stated under `load` (3,) N at random `poses`.
-
-    Raises InputError that names the option that is wrong.
     """
     from elastocal.export.export import Wish, format_of
     from elastocal.export.rigid_files import Frames
@@ -182,7 +176,6 @@ def save_extra_poses(path: str | Path, plan: Measurements, kinds: Sequence[str])
 
     Angles in degrees, travel in mm, force, approach direction and time where the plan has them.  A
     pose that is visited again under the same force is a configuration of its own: 4, 4/2, ….
-    Raises InputError where the place cannot be written.
     """
     from elastocal.planning.plan import write_plan
 

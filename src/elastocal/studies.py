@@ -284,10 +284,7 @@ def _forget(folder: Path) -> None:
 
 
 def calling(folder: Path, what: str, call: Callable[[], Any]) -> Any:
-    """Returns the value of `call`, which is code of the study in `folder`.
-
-    Raises InputError that names the study's file and line where it raises anything.
-    """
+    """Returns the value of `call`, which is code of the study in `folder`."""
     try:
         return call()
     except InputError:
@@ -375,10 +372,7 @@ OURS = {RESULTS, STATEMENT, FAILURES, WRITTEN}
 
 @contextmanager
 def opened(folder: Path) -> Iterator[None]:
-    """The results in `folder`, made where absent, with no other process writing to it.
-
-    Raises InputError where the folder cannot be made, holds something else, or another run has it.
-    """
+    """The results in `folder`, made where absent, with no other process writing to it."""
     import fcntl
 
     try:
@@ -417,8 +411,6 @@ def as_text(line: Row) -> str:
 def result_lines(folder: Path) -> list[Row]:
     """Returns all whole lines in the order of their tasks: a killed run may leave the beginning of
     one.
-
-    Raises InputError where one is damaged, or a task has more than one.
     """
     path, found = folder / RESULTS, dict[int, Row]()
     text = read_text(path, "results", MOST_RESULTS) if path.exists() else ""

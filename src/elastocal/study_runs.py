@@ -272,11 +272,7 @@ def _security(
 
 
 def connect(address: str, **way: Any) -> Any:
-    """Returns a client of the scheduler at `address`, or in Dask's configuration ("config").
-
-    Raises InputError where distributed is not installed, the way there is not allowed, or there is
-    no scheduler.
-    """
+    """Returns a client of the scheduler at `address`, or in Dask's configuration ("config")."""
     try:
         import dask
         import distributed
@@ -382,10 +378,7 @@ def run_study(
 
 
 def _known(study: Study, folder: Path) -> list[Row]:
-    """The lines that the results hold.
-
-    Raises InputError where a task there is not the study's task of that index now.
-    """
+    """The lines that the results hold."""
     here = f"Run with {option('restart', True)} to discard them, or with {option('output', 'NEW')}"
     before, columns = statement_of(folder), dict(study.sources.columns)
     require(

@@ -84,11 +84,7 @@ class CsvLines:
         self.header = tuple(name.strip() for name in self._cells(text))
 
     def rows(self) -> Iterator[Row]:
-        """All data lines, each with as many cells as the header.
-
-        Raises InputError for NUL bytes, overlong lines, other encodings, stray carriage returns,
-        wrong numbers of cells, too many rows, and files without data.
-        """
+        """All data lines, each with as many cells as the header."""
         blank = b" \r\n" if self.delimiter == "\t" else b" \t\r\n"
         blanks = rows = 0
         while line := self._line():
@@ -294,7 +290,6 @@ def match_columns(
     """Which column of a header is which of the `known` families.
 
     `passed_over`: headers that mean nothing here; `explain`: what to say of an unknown one.
-    Raises InputError for unnamed, repeated, unknown and unitless columns, and for mixed units.
     """
     _check_names(source, header)
     meaning = {
@@ -337,7 +332,6 @@ def layout_of_columns(
 
     `needed`: of each entry one family must be there, because `needed_by` (as in "a DH table
     needs"); `exclusive`: pairs of families that say the same.
-    Raises InputError for incomplete and missing families, and for what is said twice.
     """
     for name, found in present.items():
         _check_complete(source, known[name], found, alone=(name,) in needed)
@@ -465,10 +459,7 @@ class RawTable:
         return "" if labels is None else labels.names[labels.codes[i]]
 
     def si(self, family: str) -> Array | None:
-        """The columns of a family side by side (n, k) in SI units, None where there are none.
-
-        Raises InputError for numbers that are not finite in SI units.
-        """
+        """The columns of a family side by side (n, k) in SI units, None where there are none."""
         if family not in self.layout.columns:
             return None
         with np.errstate(over="ignore"):

@@ -283,8 +283,6 @@ def from_table(cls: type[Record], table: RecordTable, spot: Spot, **values: Any)
 
     `cls.from_keys(table, spot)`, where there is one, gives the fields that several keys state
     together; each other field is stated by one of its keys.
-
-    Raises InputError for keys that do not go together and for files that do not exist.
     """
     known: Any = cls
     if hasattr(cls, "from_keys"):
@@ -299,10 +297,7 @@ def from_table(cls: type[Record], table: RecordTable, spot: Spot, **values: Any)
 
 
 def stated(table: Table, spot: Spot, keys: Sequence[Key]) -> tuple[Any, str] | None:
-    """The value in SI units and the name of the one of `keys` that the table states, None for none.
-
-    Raises InputError where two of them are given.
-    """
+    """The value in SI units and the name of the one of `keys` that the table states, None for none."""
     given = [known for known in keys if getattr(table, known.name, None) is not None]
     names = " and ".join(spot.key(known.name) for known in given)
     spot.require(len(given) < 2, f"{names} say the same in two units; keep one of them")
@@ -354,8 +349,6 @@ def joint_values(
 
     `others`: further keys of that table, which a misspelt one may have been meant for.  A joint may
     be named as in the robot's file, which `model.joint_names` looks into.
-
-    Raises InputError for keys without a unit, and a joint given in two units.
     """
     values: dict[str, tuple[float, ...]] = {}
     above = spot.key(name)

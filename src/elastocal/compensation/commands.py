@@ -60,8 +60,6 @@ def read_targets(
     or both: joints are then the nominal command to start from.  force_x_N … and circumstances
     (time_s, approach_1, temperature_C, torque_1_Nm) as far as the model needs them; `force`
     (3,) N acts where the table states none.
-
-    Raises InputError that names file, line, column and the offending text.
     """
     table = read_measurements(path, joint_kinds=joint_kinds, observe="targets")
     q = table.q if table.q.shape[1] else None

@@ -541,10 +541,7 @@ class CorrectionTable:
 
 
 def joint_grid(arm: CalibratedArm, counts: tuple[int, ...]) -> CorrectionGrid:
-    """`counts` levels per joint (one number for all) over the joint limits; one level: the middle.
-
-    Raises InputError for a wrong number of counts or too many points.
-    """
+    """`counts` levels per joint (one number for all) over the joint limits; one level: the middle."""
     chain = arm.model.chain
     n = chain.n_joints
     counts = _counts(counts, n, f"one number, or one per joint ({n})")

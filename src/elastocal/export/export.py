@@ -180,10 +180,7 @@ FITTED = ("urdf", "mjcf", "dh", "mdh")
 
 
 def format_of(path: Path, asked: str | None) -> str:
-    """The format `asked` for, else that of the file's ending.
-
-    Raises InputError for an unknown format, and for an ending that tells none.
-    """
+    """The format `asked` for, else that of the file's ending."""
     if asked is not None:
         if asked.lower() not in FORMATS:
             raise InputError(

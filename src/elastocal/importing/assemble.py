@@ -119,8 +119,6 @@ def with_loads_of_names(
 ) -> tuple[dict[str, list[Records]], dict[str, Any] | None, list[str]]:
     """The records with the loads that their files are named for, where nothing else states any,
     those loads by name, and what to tell.  They hang straight down.
-
-    Raises InputError where joint logs are named for several loads and the points for none.
     """
     every = [r for role in records.values() for r in role]
     stated = any(r.load is not None or "load" in r.labels for r in every)
@@ -486,7 +484,6 @@ def import_files(
 
     `cell`: the robot that the table must fit: number and kind of joints, markers, limits;
     `name`: what messages call the table.  Nothing is written.
-    Raises InputError that names file, line, column, what was found and what to do.
     """
     where, table = mapping.path, mapping.table
     names: tuple[str, ...] = ()

@@ -112,7 +112,6 @@ def robot_of(
     """The robot that a file describes: URDF, MuJoCo model or DH table, by its ending.
 
     Base and flange are those that are found where none are named, so that a cell states them.
-    Raises InputError for an ending that tells none, and for what the file's reader refuses.
     """
     path = Path(path)
     kind = ENDINGS.get(path.suffix.lower())
@@ -145,10 +144,7 @@ def robot_of(
 
 
 def first_cell(robot: Robot, folder: str | Path = ".") -> str:
-    """Text of a cell file for a robot, to stand in `folder`.
-
-    Raises InputError for what the reader of the robot's file refuses.
-    """
+    """Text of a cell file for a robot, to stand in `folder`."""
     kind, path = next((k, p) for k in SOURCES if (p := getattr(robot, k)) is not None)
     chain = load_chain(Cell(name=path.stem, robot=robot))
     arm = MjcfArm.read(path, robot.base, robot.flange) if kind == "mjcf" else None

@@ -56,7 +56,6 @@ def read_lines(path: str | Path, encoding: str = "auto") -> ForeignText:
 
     `encoding` "auto": by the byte order mark, else UTF-8 where the bytes allow, else Windows-1252
     (Latin-1 where that has no character).
-    Raises InputError where the file cannot be read, is empty, no text, or not in `encoding`.
     """
     source = str(path)
     data = read_bytes(path, "export", MAX_BYTES)
@@ -97,10 +96,7 @@ def _decode(source: str, data: bytes, encoding: str) -> tuple[str, str]:
 
 
 def unit_in_comments(where: str, pattern: str | None, comments: Sequence[str]) -> str | None:
-    """What the group `unit` of `pattern` finds in the first comment that it matches.
-
-    Raises InputError for a pattern that is no regular expression or has no such group.
-    """
+    """What the group `unit` of `pattern` finds in the first comment that it matches."""
     if pattern is None:
         return None
     expression = compiled(where, "unit_comment", pattern)
@@ -408,7 +404,6 @@ def program_rows(text: ForeignText, kind: str) -> Rows:
     RAPID: every jointtarget [[rax_1 … rax_6], [eax_a … eax_f]], an array's members named P{1},
     P{2} …; robtargets hold no joint values and o_jointtarget is the position before a correction:
     both are passed over.  What is passed over is named.
-    Raises InputError for a joint value that is no number and where there is none.
     """
     axes, mark, read, what = {
         "krl": (KRL_AXES, ";", _krl, "no {A1 …, A2 …} with joint values"),

@@ -28,7 +28,6 @@ def with_joints(
 
     The order is that of [joints] order, else the joint names of the file (columns joint1 …) are
     brought into the order of [joints] names, else of `model_names` where the file has them all.
-    Raises InputError for gaps in the joint numbers and for lists of another length.
     """
     stems = joint_stems(records.numbers)
     if not stems:
@@ -130,10 +129,7 @@ def _check_lengths(where: str, joints: JointsTable, n: int) -> None:
 
 
 def pooled(records: Sequence[Records]) -> Records:
-    """The rows of all files, in the order of the files.
-
-    Raises InputError where the files do not have the same columns.
-    """
+    """The rows of all files, in the order of the files."""
     first = records[0]
     for other in records[1:]:
         _same("columns", first, other, set(first.numbers), set(other.numbers))
@@ -253,11 +249,7 @@ class Joined:
 
 
 def join(where: str, points: Records, log: Records, settings: JoinTable | None) -> Joined:
-    """The joint values of every point.
-
-    Raises InputError where points have no partner and [join] unmatched is not "leave_out", where
-    the counts of an order do not agree, and where names or times are missing.
-    """
+    """The joint values of every point."""
     settings = settings or JoinTable()
     how = settings.by or _obvious(points, log)
     ways = {"order": _by_order, "name": _by_name, "time": _by_time, "standstill": _by_standstill}

@@ -183,7 +183,6 @@ def read_mapping(path: str | Path | None, presets: Sequence[str] = ()) -> Import
     """The mapping of a file, of presets (one source each), or of both.
 
     A mapping file without [[source]] tables says how to join and convert what `presets` read.
-    Raises InputError that names file, key, what the key takes and what was found.
     """
     where = option("presets") if path is None else str(path)
     data: dict[str, Any] = {} if path is None else read_toml(path, "mapping file", MAX_BYTES)
@@ -313,10 +312,7 @@ class ColumnKey:
 
 
 def column_key(where: str, key: str) -> ColumnKey:
-    """What a key of [source.columns] means.
-
-    Raises InputError for an unknown column, a missing unit and a unit that it cannot have.
-    """
+    """What a key of [source.columns] means."""
     numbered = _NUMBERED.fullmatch(key)
     if numbered:
         family, number, tail = numbered.groups()
@@ -364,10 +360,7 @@ class FileColumn:
 def wanted(
     where: str, required: Mapping[str, Where], optional: Mapping[str, Where]
 ) -> tuple[ColumnKey, ...]:
-    """The keys of [source.columns] (required) and [source.optional], checked.
-
-    Raises InputError for unknown columns and columns given twice.
-    """
+    """The keys of [source.columns] (required) and [source.optional], checked."""
     filled: dict[str, str] = {}
     result: list[ColumnKey] = []
     for part in (required, optional):
@@ -425,8 +418,6 @@ def lacking(asked: Sequence[ColumnKey], cells: Sequence[str]) -> list[str]:
 def markers_of_row(source: str, asked: Sequence[ColumnKey], header: Sequence[str]) -> list[str]:
     """The markers that have a column each in one row, as the file calls them; none where the
     mapping has no * in a place.
-
-    Raises InputError where a marker lacks one of its columns.
     """
     each = [target for target in asked if target.of_each_marker and target.required]
     found = {target.key: _marker_names(target, header) for target in each}
@@ -479,8 +470,6 @@ def resolve(
     `header`: names of the columns, () without a header; `width`: cells of the first row;
     `units`: for columns whose key ends in _auto where neither the header nor `hint`, the unit
     that a comment of the file states, says one.
-    Raises InputError for names and numbers that the file does not have, names that stand for
-    several columns, and units that contradict the header.
     """
     columns: list[FileColumn] = []
     for target in asked:

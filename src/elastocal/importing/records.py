@@ -181,7 +181,6 @@ def read_records(where: str, path: Path, source: SourceTable, units: UnitsTable)
     """The rows of `path` as `source` of the mapping `where` describes them.
 
     A row with an empty cell where a number belongs is passed over and listed.
-    Raises InputError that names file, line, column, what was found and what to do.
     """
     settings = source.text or TextSourceKeys()
     asked = wanted(where, source.columns or {}, source.optional or {})
@@ -373,7 +372,6 @@ def with_positions(records: Records, clockwise: bool = False) -> Records:
 
     α counts counterclockwise seen from above; where `clockwise`, as theodolites count, y has the
     other sign.  Readings in the second face, ζ beyond 180° with α turned by 180°, come out right.
-    Raises InputError where a coordinate is missing, given twice, or beyond what can be read.
     """
     if not is_spherical(records):
         return records
@@ -442,8 +440,6 @@ def with_labels(where: str, records: Records, names: NamesTable | None) -> Recor
 
     A group that a column gives too is taken from the column.  A name that no pattern matches is
     an error, or with unmatched = "ignore" passed over and listed.
-    Raises InputError for patterns that are no regular expressions or have none of the groups, and
-    for labels that no table can hold.
     """
     names = names or NamesTable()
     labels = {stem: records.texts[stem] for stem in GROUPS if stem in records.texts}

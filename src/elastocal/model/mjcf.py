@@ -58,8 +58,6 @@ def read_mjcf(path: str | Path, base: str | None = None, flange: str | None = No
     joint in kg of all that it carries, side branches and what lies beyond the flange included,
     with its centre in the joint's frame.  There are none where the file leaves them to meshes
     that are not there.
-
-    Raises InputError for anything `MjcfArm.read` refuses.
     """
     return MjcfArm.read(path, base, flange).chain
 

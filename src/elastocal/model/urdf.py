@@ -59,8 +59,6 @@ def read_urdf(path: str | Path, base: str | None = None, flange: str | None = No
     Bodies beyond the flange and on side branches count, those carried by the base do not.
 
     Everything off the path from base to flange is held at zero.
-
-    Raises InputError, naming file, element and remedy, for anything `check_urdf` or `Tree` refuses.
     """
     tree = check_urdf(path)
     base, flange = tree.ends(base, flange)
@@ -305,11 +303,7 @@ class Tree:
         return [j for j in self.joints_between(base, flange) or () if j.kind in MOVING]
 
     def serial_chain(self, base: str, flange: str) -> tuple[UrdfJoint, ...]:
-        """The moving joints between base and flange, in order.
-
-        Raises InputError if flange is not below base, if a joint on the path is floating, planar
-        or a mimic or has no usable limits, or if the count is outside 4…9.
-        """
+        """The moving joints between base and flange, in order."""
         joints = self.joints_between(base, flange)
         if joints is None:
             raise InputError(
@@ -361,11 +355,7 @@ def _check_on_path(joint: UrdfJoint, where: str) -> None:
 
 
 def check_urdf(path: str | Path) -> Tree:
-    """The links and joints of the URDF file at `path`, every name and number checked.
-
-    Raises InputError for a file that cannot be read or is not XML, for xacro macros left in,
-    and for elements with missing, duplicate or unknown names or with bad numbers.
-    """
+    """The links and joints of the URDF file at `path`, every name and number checked."""
     path = Path(path)
     root = _without_namespace(path, xml_tree(path, urdf_bytes(path), "a URDF"))
     links: dict[str, LinkMass] = {}

@@ -30,10 +30,7 @@ END_OF_TAG = re.compile(rb"""(?:[^"'>]|"[^"]*"|'[^']*')*>""")  # a > in quotes i
 
 
 def xml_tree(path: Path, data: bytes, what: str) -> ET.Element:
-    """The elements of an XML file; `what` it should be ("a URDF") stands in messages.
-
-    Raises InputError for what is not XML, nests too deep, declares entities or has xacro macros.
-    """
+    """The elements of an XML file; `what` it should be ("a URDF") stands in messages."""
     start = data[:300].lstrip(b"\xef\xbb\xbf \t\r\n").lower()
     require(
         not start.startswith(b"version https://git-lfs"),
@@ -95,10 +92,7 @@ def _undeclared(data: bytes) -> str:
 
 
 def as_utf8(path: Path, data: bytes) -> bytes:
-    """An XML file's content as UTF-8, its declaration with it.
-
-    Raises InputError where it cannot be decoded.
-    """
+    """An XML file's content as UTF-8, its declaration with it."""
     if data.startswith(UTF16):
         name = "utf-16"
     else:
