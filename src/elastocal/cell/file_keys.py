@@ -297,7 +297,7 @@ def from_table(cls: type[Record], table: RecordTable, spot: Spot, **values: Any)
 
 
 def stated(table: Table, spot: Spot, keys: Sequence[Key]) -> tuple[Any, str] | None:
-    """The value in SI units and the name of the one of `keys` that the table states, None for none."""
+    """The value in SI units and name of the one of `keys` that the table states, None for none."""
     given = [known for known in keys if getattr(table, known.name, None) is not None]
     names = " and ".join(spot.key(known.name) for known in given)
     spot.require(len(given) < 2, f"{names} say the same in two units; keep one of them")

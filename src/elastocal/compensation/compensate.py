@@ -541,7 +541,7 @@ class CorrectionTable:
 
 
 def joint_grid(arm: CalibratedArm, counts: tuple[int, ...]) -> CorrectionGrid:
-    """`counts` levels per joint (one number for all) over the joint limits; one level: the middle."""
+    """`counts` levels per joint (one for all) over the joint limits; one level: the middle."""
     chain = arm.model.chain
     n = chain.n_joints
     counts = _counts(counts, n, f"one number, or one per joint ({n})")
