@@ -63,8 +63,8 @@ class Setting:
     upper: float
 
 
-@dataclass(frozen=True)
-class Parameter:
+@dataclass(frozen=True, kw_only=True)
+class Parameter(ParameterSpec):
     """A parameter of the model, at its place: `name` is "joint2.compliance".
 
     Examples:
@@ -76,19 +76,13 @@ class Parameter:
     name: str
     effect: str
     where: str
-    unit: str
-    nominal: float
-    typical: float | None
-    lower: float = -np.inf
-    upper: float = np.inf
-    shrunk: bool = False
 
 
 # What a parameter of unknown typical size moves the readings by, rms in m.
 UNSIZED_SIGNAL = 2e-4
 
 
-def usual_sizes(specs: Sequence[Parameter | ParameterSpec], columns: Array) -> Array:
+def usual_sizes(specs: Sequence[ParameterSpec], columns: Array) -> Array:
     """Prior standard deviation (k,) of each parameter: its typical size.
 
     Where none is known, the value whose signal in the columns (…, k) is UNSIZED_SIGNAL rms.
@@ -254,18 +248,26 @@ def row_inputs(arm: Arm, table: Measurements) -> list[NDArray]:
 
     Raises InputError where the table lacks a column, or a row lies at none of a joint's levels.
     """
-    codes = _marker_codes(arm, table)
-    return [_one(arm, table, name, codes) for name in arm.inputs]
+    known = list(arm.markers)
+    strange = {table.marker_names[k] for k in np.unique(table.marker)} - set(known)
+    if strange:
+        raise InputError(
+            f"{table.source}: marker '{min(strange)}' is not one of the cell's markers: "
+            f"{', '.join(known)}"
+        )
+    return [_one(arm, table, name) for name in arm.inputs]
 
 
-def _one(arm: Arm, table: Measurements, name: str, marker: NDArray) -> NDArray:
+def _one(arm: Arm, table: Measurements, name: str) -> NDArray:
     if name == "marker":
-        return _one_hot(marker, len(arm.markers))
+        known = {marker: k for k, marker in enumerate(arm.markers)}
+        codes = np.array([known.get(marker, 0) for marker in table.marker_names])
+        return np.eye(len(known))[codes[table.marker]]
     if name.startswith("level:"):
         return _levels(arm, table, name.removeprefix("level:"))
     if name == "unmoved":
-        known = np.ones_like(table.q) if table.direction is None else table.direction
-        return (known == 0).astype(np.float64)
+        known_moves = np.ones_like(table.q) if table.direction is None else table.direction
+        return (known_moves == 0).astype(np.float64)
     if name in ("move", "direction") and getattr(table, name) is None:
         table = with_moves(table)
     value = getattr(table, name)
@@ -276,23 +278,6 @@ def _one(arm: Arm, table: Measurements, name: str, marker: NDArray) -> NDArray:
             f"{table.source}: the model needs the column {COLUMNS[name]}, which the table lacks"
         )
     return value[:, None] if value.ndim == 1 else value
-
-
-def _one_hot(codes: NDArray, size: int) -> NDArray:
-    return np.eye(size)[codes]
-
-
-def _marker_codes(arm: Arm, table: Measurements) -> NDArray:
-    known = {name: k for k, name in enumerate(arm.markers)}
-    missing = [name for name in table.marker_names if name not in known]
-    if missing:
-        used = {table.marker_names[k] for k in np.unique(table.marker)}
-        if used & set(missing):
-            raise InputError(
-                f"{table.source}: marker '{sorted(used & set(missing))[0]}' is not one of the "
-                f"cell's markers: {', '.join(known)}"
-            )
-    return np.array([known.get(name, 0) for name in table.marker_names])[table.marker]
 
 
 def _levels(arm: Arm, table: Measurements, joint: str) -> NDArray:
@@ -308,7 +293,7 @@ def _levels(arm: Arm, table: Measurements, joint: str) -> NDArray:
             "which is none of its levels in [model.compliance_levels]; add the level or drop the "
             "row"
         )
-    return _one_hot(nearest, len(levels))
+    return np.eye(len(levels))[nearest]
 
 
 def given_force(load: ArrayLike | None) -> NDArray[np.float64] | None:

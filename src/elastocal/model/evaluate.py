@@ -17,7 +17,7 @@ import casadi as ca
 import numpy as np
 from numpy.typing import NDArray
 
-from elastocal.errors import InputError
+from elastocal.errors import require
 from elastocal.text import did_you_mean
 
 # CasADi's scalar operations as numpy functions of arrays, real or complex.
@@ -298,16 +298,13 @@ FEW = 77  # rows of a block
 
 def checked(name: str, source: str) -> str:
     """`name` where it is a backend; InputError that says where it comes from otherwise."""
+    hint = f"unknown backend '{name}'{did_you_mean(name, BACKENDS)}; valid: {', '.join(BACKENDS)}"
     if name == "compiled":
-        raise InputError(
-            f"{source}: the backend 'compiled' is gone, as numpy evaluates tables nearly as fast; "
-            "take auto, or leave it out"
+        hint = (
+            "the backend 'compiled' is gone, as numpy evaluates tables nearly as fast; take auto, "
+            "or leave it out"
         )
-    if name not in BACKENDS:
-        raise InputError(
-            f"{source}: unknown backend '{name}'{did_you_mean(name, BACKENDS)}; "
-            f"valid: {', '.join(BACKENDS)}"
-        )
+    require(name in BACKENDS, f"{source}: {hint}")
     return name
 
 

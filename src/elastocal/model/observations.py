@@ -199,33 +199,29 @@ def position_covariance(table: Measurements, tracker: Tracker, kind: str) -> tup
 
     Raises InputError where the noise that `kind` names is not stated.
     """
-    n = len(table)
-    if kind == "rows":
-        need(table.sigma is not None, f"{table.source} has no sigma_… columns")
-        sigma = np.asarray(table.sigma)
-        text = f"per-row {table.sigma_frame} sigmas from the table"
-        polar = table.sigma_frame == "polar"
-    elif kind == "axis":
-        noise = tracker.noise
-        if not isinstance(noise, CartesianNoise):
-            raise InputError("these weights cannot be formed: the cell has no [tracker] sigma_um")
+    n, noise = len(table), tracker.noise
+    if kind == "axis":
+        need(isinstance(noise, CartesianNoise), "the cell has no [tracker] sigma_um")
+        assert isinstance(noise, CartesianNoise)
         text = f"tracker sigma {np.round(noise.sigma * 1e6, 3).tolist()} µm along x, y, z"
         return np.broadcast_to(np.eye(3) * noise.sigma**2, (n, 3, 3)), text
-    else:
-        noise = tracker.noise
-        if not isinstance(noise, PolarNoise):
-            raise InputError(
-                "these weights cannot be formed: the cell has no [tracker] range_um, range_ppm, "
-                "transverse_um, transverse_ppm"
-            )
-        reach = np.linalg.norm(_position(table) - tracker.position, axis=1)
+    if kind == "rows":
+        need(table.sigma is not None, f"{table.source} has no sigma_… columns")
+        sigma, text = np.asarray(table.sigma), f"per-row {table.sigma_frame} sigmas from the table"
+        if table.sigma_frame != "polar":
+            return np.eye(3) * (sigma**2)[:, None, :], text
+    need(table.position is not None, f"{table.source} has no positions")
+    sight = np.asarray(table.position) - tracker.position
+    if kind == "polar":
+        stated = "range_um, range_ppm, transverse_um, transverse_ppm"
+        need(isinstance(noise, PolarNoise), f"the cell has no [tracker] {stated}")
+        assert isinstance(noise, PolarNoise)
+        reach = np.linalg.norm(sight, axis=1)
         along = noise.range + noise.range_per_m * reach
         across = noise.transverse + noise.transverse_per_m * reach
-        sigma, polar = np.column_stack([along, across, across]), True
+        sigma = np.column_stack([along, across, across])
         text = "polar tracker noise (range and transverse) from the cell"
-    if not polar:
-        return np.eye(3) * (sigma**2)[:, None, :], text
-    axes = polar_axes(_position(table) - tracker.position)
+    axes = polar_axes(sight)
     return np.einsum("nki,nk,nkj->nij", axes, sigma**2, axes), text
 
 
@@ -239,11 +235,6 @@ def polar_axes(sight: Array) -> Array:
     # Straight above the tracker azimuth is undefined; any horizontal direction serves.
     azimuth = np.where(flat[:, None] > 1e-9, azimuth / np.maximum(flat, 1e-300)[:, None], [1, 0, 0])
     return np.stack([radial, azimuth, np.cross(radial, azimuth)], axis=1)
-
-
-def _position(table: Measurements) -> Array:
-    need(table.position is not None, f"{table.source} has no positions")
-    return np.asarray(table.position)
 
 
 def need(condition: bool, message: str) -> None:

@@ -226,10 +226,10 @@ class SymbolicArm:
             for spec in sized_parameters(effect, place, chain, cell):
                 own[spec.key] = ca.SX.sym(f"{place}.{spec.key}")
                 symbols.append(own[spec.key])
+                name = f"{place}.{spec.key}"
                 parameters.append(
-                    Parameter(f"{place}.{spec.key}", effect.name, place, spec.unit,
-                              spec.nominal, spec.typical, spec.lower, spec.upper, spec.shrunk)
-                )  # fmt: skip
+                    Parameter(**vars(spec), name=name, effect=effect.name, where=place)
+                )
             bound.append((effect, place, own))
         _check_names(parameters, cell)
         for effect, place, own in bound:

@@ -7,7 +7,6 @@ file of the user's own that calls `register`.
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping
 from dataclasses import replace
 from pathlib import Path
 
@@ -161,10 +160,21 @@ def check_settings(chain: Chain, cell: Cell) -> None:
     """InputError where the cell sets, or states the size of, what no effect of the catalogue has
     on this arm."""
     nominal = cell.model.nominal
-    if nominal.settings:
-        _check_keys("settings", "setting", nominal.settings, _keys_of_settings, chain, cell)
-    if nominal.sizes:
-        _check_keys("sizes", "parameter", nominal.sizes, _keys_of_sizes, chain, cell)
+    for table, what, given, keys_of in (
+        ("settings", "setting", nominal.settings, _keys_of_settings),
+        ("sizes", "parameter", nominal.sizes, _keys_of_sizes),
+    ):
+        known: dict[str, list[str]] = {}
+        for effect in CATALOGUE.values() if given else ():
+            for place in effect.places(chain, cell):
+                if keys := keys_of(effect, place, chain, cell):
+                    known.setdefault(place, []).extend(keys)
+        for place, values in given.items():
+            if place not in known:
+                raise InputError(_unknown(f"nominal.{table}", "place", place, list(known), cell))
+            for key in (key for key in values if key not in known[place]):
+                kind = f"{what} of {place}"
+                raise InputError(_unknown(f"nominal.{table}", kind, key, known[place], cell))
 
 
 def _keys_of_settings(effect: Effect, place: str, chain: Chain, cell: Cell) -> list[str]:
@@ -178,25 +188,6 @@ def _keys_of_sizes(effect: Effect, place: str, chain: Chain, cell: Cell) -> list
         return [p.key for p in effect.parameters(place, chain, cell) if not p.shrunk]
     except InputError:
         return []
-
-
-def _check_keys(
-    table: str, what: str, given: Mapping[str, Mapping[str, float]],
-    keys_of: Callable[[Effect, str, Chain, Cell], list[str]], chain: Chain, cell: Cell,
-) -> None:  # fmt: skip
-    """InputError where a key of [model.nominal.`table`] is not one that some effect has there."""
-    known: dict[str, list[str]] = {}
-    for effect in CATALOGUE.values():
-        for place in effect.places(chain, cell):
-            if keys := keys_of(effect, place, chain, cell):
-                known.setdefault(place, []).extend(keys)
-    for place, values in given.items():
-        if place not in known:
-            raise InputError(_unknown(f"nominal.{table}", "place", place, list(known), cell))
-        for key in values:
-            if key not in known[place]:
-                kind = f"{what} of {place}"
-                raise InputError(_unknown(f"nominal.{table}", kind, key, known[place], cell))
 
 
 def sized_parameters(
