@@ -12,7 +12,7 @@ from support.calibration import planar_chain
 from support.cells import kr270_cell, kr270_chain
 
 from elastocal.errors import InputError
-from elastocal.model.chain import Chain, finite_ranges, joint_index, joint_limits
+from elastocal.model.chain import Chain, finite_ranges, joint_limits, numbered
 
 
 def with_limits(**limits: tuple[float, float]):
@@ -20,10 +20,9 @@ def with_limits(**limits: tuple[float, float]):
 
 
 def test_a_joint_that_the_robot_lacks_is_named() -> None:
+    cell = replace(kr270_cell(), limits={"joint7": (0.0, 1.0)})
     with pytest.raises(InputError, match=r"\[limits\] names joint7.* has 6 joints"):
-        with_limits(joint7=(0.0, 1.0))
-    with pytest.raises(InputError, match=r"\[design.levels\] names joint9"):
-        joint_index(kr270_cell(), kr270_chain(), "joint9", "[design.levels]")
+        numbered(cell, kr270_chain())
 
 
 def test_limits_beyond_the_robots_own_leave_no_range() -> None:

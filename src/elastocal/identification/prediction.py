@@ -300,7 +300,7 @@ def over_the_workspace(cell: Cell, model: Model, table: Measurements) -> NewPose
     q = np.random.default_rng(0).uniform(low, high, (POSES, chain.n_joints))
     for name, levels in cell.model.compliance_levels.items():
         # Elsewhere the model has no compliance for that joint.
-        q[:, joint_index(cell, chain, name, "[model.compliance_levels]")] = np.resize(levels, POSES)
+        q[:, joint_index(name)] = np.resize(levels, POSES)
     forces = _loads(table.force, model.observe)
     source = f"{POSES} poses drawn over the joint limits, as the cell states no test poses"
     return NewPoses(q, np.resize(forces, (POSES, 3)), np.full(POSES, 1 / POSES), source)

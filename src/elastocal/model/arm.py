@@ -14,7 +14,7 @@ from elastocal.cell.work_cell import Cell
 from elastocal.errors import InputError, option
 from elastocal.measurements import LARGEST_FORCE, Measurements, by_rows, with_moves
 from elastocal.model import rigid
-from elastocal.model.chain import Chain
+from elastocal.model.chain import Chain, joint_index
 from elastocal.units import Array
 
 
@@ -282,7 +282,7 @@ def _one(arm: Arm, table: Measurements, name: str) -> NDArray:
 
 def _levels(arm: Arm, table: Measurements, joint: str) -> NDArray:
     levels = np.array(arm.cell.model.compliance_levels[joint])
-    q = table.q[:, int(joint.removeprefix("joint")) - 1]
+    q = table.q[:, joint_index(joint)]
     distance = np.abs(q[:, None] - levels[None, :])
     nearest = distance.argmin(axis=1)
     off = distance.min(axis=1) > LEVEL_TOLERANCE

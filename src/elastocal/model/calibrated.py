@@ -20,7 +20,7 @@ from elastocal.config import Table, checked, key, required
 from elastocal.errors import InputError, option, require
 from elastocal.files import read_json
 from elastocal.measurements import Measurements
-from elastocal.model.chain import Chain, finite_ranges, joint_limits
+from elastocal.model.chain import Chain, finite_ranges, joint_index, joint_limits
 from elastocal.model.effects.catalogue import CATALOGUE, cell_of, effect_of
 from elastocal.model.effects.loads import LinkGravity
 from elastocal.model.manipulator import Model, smooth_groups
@@ -501,7 +501,7 @@ def random_table(model: Model, conditions: Conditions, poses: int, seed: int) ->
         force = visits.force[np.arange(poses) % len(visits.force)]
     q = rng.uniform(low, high, (poses, chain.n_joints))
     for joint, levels in cell.model.compliance_levels.items():
-        q[:, int(joint.removeprefix("joint")) - 1] = rng.choice(levels, poses)
+        q[:, joint_index(joint)] = rng.choice(levels, poses)
     return table_at(model, conditions, q, force, rng)
 
 

@@ -80,13 +80,12 @@ NO_LIMIT = 100.0  # half turns, or m
 def joint_limits(cell: Cell, chain: Chain) -> tuple[Array, Array]:
     """Lower and upper joint limits (n,) in rad or m, infinite where there is none.
 
-    Raises InputError where the cell limits a joint that the robot does not have, or leaves a
-    joint no range at all.
+    Raises InputError where the cell leaves a joint no range at all.
     """
     lower = np.array([joint.lower for joint in chain.joints])
     upper = np.array([joint.upper for joint in chain.joints])
     for name, (low, high) in cell.limits.items():
-        i = joint_index(cell, chain, name, "[limits]")
+        i = joint_index(name)
         lower[i], upper[i] = max(lower[i], low), min(upper[i], high)
         if lower[i] >= upper[i]:
             raise InputError(
@@ -111,18 +110,9 @@ def finite_ranges(
     return low, np.where(np.isfinite(upper), upper, low + 2 * half)
 
 
-def joint_index(cell: Cell, chain: Chain, name: str, where: str) -> int:
-    """0-based index of "jointN", which the table `where` of the cell names.
-
-    Raises InputError where the robot has no such joint.
-    """
-    i = int(name.removeprefix("joint")) - 1
-    if i >= chain.n_joints:
-        raise InputError(
-            f"{cell.path or cell.name}: {where} names {name}, but robot '{chain.name}' has "
-            f"{chain.n_joints} joints"
-        )
-    return i
+def joint_index(name: str) -> int:
+    """0-based index of "jointN"."""
+    return int(name.removeprefix("joint")) - 1
 
 
 # Can a nominal chain be meant as its file states it?  One rule for URDF, MJCF and DH tables.

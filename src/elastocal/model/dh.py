@@ -193,15 +193,11 @@ def _plausible(table: RawTable, i: int, family: str, stem: str) -> float:
     return value
 
 
-def _too_much(
-    table: RawTable, i: int, column: Column, value: float, wrong: str
-) -> InputError:  # fmt: skip
+def _too_much(table: RawTable, i: int, column: Column, value: float, wrong: str) -> InputError:
     meant = {"rad": ("degrees", "deg"), "m": ("millimetres", "mm")}.get(column.unit)
-    remedy = (
-        f"if these are {meant[0]}, call the column {column.stem}_{meant[1]}"
-        if meant
-        else "correct it"
-    )
+    remedy = "correct it"
+    if meant:
+        remedy = f"if these are {meant[0]}, call the column {column.stem}_{meant[1]}"
     return InputError(f"{table.where(i, column.header)}: {value:g} {wrong}; {remedy}")
 
 
@@ -338,17 +334,15 @@ def _masses(path: Path, names: Sequence[str], after: Sequence[Array]) -> tuple[L
 
 
 def _link_index(table: RawTable, row: int, names: Sequence[str]) -> int:
-    text = table.text(row, "link")
-    if text in names:
-        return names.index(text)
-    numbered = [f"link{i + 1}" for i in range(len(names))]
-    for spelling in (text, f"link{text}", text.replace("joint", "link")):
-        if spelling in numbered:
-            return numbered.index(spelling)
-    valid = (*numbered, *names)
+    text, numbers = table.text(row, "link"), range(1, len(names) + 1)
+    known = {f"{what}{i}": i - 1 for what in ("link", "joint", "") for i in numbers}
+    known |= {name: i for i, name in enumerate(names)}
+    if text in known:
+        return known[text]
+    numbered = [f"link{i}" for i in numbers]
     raise InputError(
-        f"{table.where(row, 'link')}: unknown link '{text}'{did_you_mean(text, valid)}; "
-        f"valid: {listed(numbered)} or the joints' names"
+        f"{table.where(row, 'link')}: unknown link '{text}'"
+        f"{did_you_mean(text, (*numbered, *names))}; valid: {listed(numbered)} or the joints' names"
     )
 
 
@@ -500,12 +494,8 @@ def _six(path: Path, section: Mapping[str, str], key: str) -> list[float]:
     text = section.get(key)
     require(text is not None, f"{path}: {key} is missing; it takes six numbers in [ ]")
     words = str(text).strip().strip("[]").split(",")
-    return [_number(f"{path}: {key}", word.strip()) for word in _counted(path, key, words)]
-
-
-def _counted(path: Path, key: str, words: list[str]) -> list[str]:
     require(len(words) == 6, f"{path}: {key} has {len(words)} numbers; a UR has six joints")
-    return words
+    return [_number(f"{path}: {key}", word.strip()) for word in words]
 
 
 def _number(where: str, found: Any) -> float:

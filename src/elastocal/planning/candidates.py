@@ -67,7 +67,7 @@ def joint_space(cell: Cell, chain: Chain) -> JointSpace:
     for joint, levels in cell.model.compliance_levels.items():
         if joint in wanted:
             continue
-        i = joint_index(cell, chain, joint, "[model.compliance_levels]")
+        i = joint_index(joint)
         turns = chain.kinds[i] == "revolute"
         stated = ", ".join(f"{math.degrees(v) if turns else v:.6g}" for v in levels)
         instead = f" instead of {next(iter(wanted))}" if wanted else ""
@@ -79,7 +79,7 @@ def joint_space(cell: Cell, chain: Chain) -> JointSpace:
     if not wanted:
         return JointSpace(lower, upper)
     ((name, levels),) = wanted.items()
-    return JointSpace(lower, upper, joint_index(cell, chain, name, "[design.levels]"), levels)
+    return JointSpace(lower, upper, joint_index(name), levels)
 
 
 # Candidate poses: scrambled Sobol points within the limits that the cell allows.
@@ -385,7 +385,7 @@ class Pins:
         for k, (label, q) in enumerate(zip(self.names, self.q, strict=True)):
             where = f"{cell.path or cell.name}: pose {quoted(label)}, which is to be kept,"
             for joint, levels in cell.design.levels.items():
-                away = np.abs(np.array(levels) - q[joint_index(cell, chain, joint, "levels")])
+                away = np.abs(np.array(levels) - q[joint_index(joint)])
                 group[k] = int(away.argmin())
                 require(away.min() < LEVEL_SLACK, f"{where} is at no level of {joint}")
             for force in plan_forces(cell):

@@ -385,7 +385,7 @@ def why(model: Model, found: Estimable, index: int) -> str:
 def sample_of(model: Model, q: Array) -> IntArray:
     """Some of the poses q (N, n), as many at each level."""
     cell = model.cell
-    held = [joint_index(cell, model.chain, name, "[design.levels]") for name in cell.design.levels]
+    held = [joint_index(name) for name in cell.design.levels]
     kinds, kind = np.unique(q[:, held], axis=0, return_inverse=True)
     each = -(-SAMPLE // len(kinds))
     members = [np.flatnonzero(kind.ravel() == k) for k in range(len(kinds))]

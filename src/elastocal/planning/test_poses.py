@@ -93,7 +93,7 @@ def _check_revolute(cell: Cell, chain: Chain, key: str) -> None:
 def _check_levels(cell: Cell, chain: Chain) -> None:
     lower, upper = joint_limits(cell, chain)
     for joint, values in cell.design.levels.items():
-        i = joint_index(cell, chain, joint, "[design.levels]")
+        i = joint_index(joint)
         split = cell.model.compliance_levels.get(joint)
         for value in values:
             require(
@@ -486,7 +486,7 @@ def _drawn(
     q = low + (high - low) * _sobol(chain.n_joints, count, seed)
     for name, levels in cell.model.compliance_levels.items():
         # Elsewhere the model has no compliance for that joint.
-        q[:, joint_index(cell, chain, name, "[model.compliance_levels]")] = np.resize(levels, count)
+        q[:, joint_index(name)] = np.resize(levels, count)
     if rules is not None:
         found = [q[:0]]
         for part in np.split(q, range(LOT, count, LOT)):
@@ -627,7 +627,7 @@ def known_rows(
     """
     cell, chain = at_work.cell, at_work.chain
     for joint, levels in cell.model.compliance_levels.items():
-        j = joint_index(cell, chain, joint, "[model.compliance_levels]")
+        j = joint_index(joint)
         off = np.abs(targets.q[:, [j]] - np.array(levels)).min(axis=1) > LEVEL_TOLERANCE
         if off.any():
             k = int(off.argmax())
