@@ -384,23 +384,19 @@ class Model:
         x = self._at(x, several=True)
         inputs = row_inputs(self._symbolic.arm, table)
         observed = observations or observe(table, self.observe)
-        if x.ndim == 2:
-            # Together, as many as make up a block: a call for each takes several times as long.
-            blocks = row_blocks(len(x), CHUNK // max(len(table), 1))
-            h = np.concatenate([self._readings(inputs, x[some]) for some in blocks])
-            return observed.apply(h.transpose(1, 2, 0)).reshape(-1, len(x)).T
-        h = self._symbolic.function("reading")(*inputs, x, self._settle(inputs, x))[0][..., 0]
-        return observed.apply(h).ravel()
+        if x.ndim == 1:
+            return observed.apply(self._readings(inputs, x)).ravel()
+        n, found = len(table), []
+        # Together, as many as make up a block: a call for each takes several times as long.
+        for some in (x[block] for block in row_blocks(len(x), CHUNK // max(n, 1))):
+            rows = [np.tile(a, (len(some), 1)) for a in inputs]
+            h = self._readings(rows, np.repeat(some, n, axis=0))
+            found.append(h.reshape(len(some), n, -1))
+        return observed.apply(np.concatenate(found).transpose(1, 2, 0)).reshape(-1, len(x)).T
 
-    def _readings(self, inputs: list[NDArray], several: Array) -> Array:
-        """Readings (k, rows, size) of the rows at each of `several` parameter values (k, …)."""
-        symbolic, (k, n) = self._symbolic, (len(several), len(inputs[0]))
-        theta = np.zeros((k * n, len(symbolic.arm.springs)))
-        if symbolic.implicit:
-            theta = symbolic.equilibrium.solve_each(inputs, several).reshape(theta.shape)
-        rows = [np.tile(a, (k, 1)) for a in inputs]
-        (h,) = symbolic.function("reading")(*rows, np.repeat(several, n, axis=0), theta)
-        return h.reshape(k, n, -1)
+    def _readings(self, inputs: list[NDArray], x: NDArray) -> NDArray:
+        """Readings (rows, size) at values x (parameters,), or (rows, parameters) by row."""
+        return self._symbolic.function("reading")(*inputs, x, self._settle(inputs, x))[0][..., 0]
 
     @checked_arguments
     def B(self, table: Measurements, x: Array | None = None) -> NDArray:

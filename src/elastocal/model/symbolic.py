@@ -118,22 +118,15 @@ class Equilibrium:
         """θ (n, size) by Newton's method on all rows, and F_θ (n, size, size) there.
 
         Rows that do not settle become NaN, with F_θ = 1 so that it can still be solved with.  The
-        last answer is kept: readings are predicted and then differentiated at the same place.
+        last answer at one p is kept: readings are predicted and then differentiated there.
         """
-        return self._answers(*inputs, p)
+        return self._answers(*inputs, p) if p.ndim == 1 else self._settled(inputs, p)
 
     @cached_property
     def _asked(self) -> NDArray[np.bool_]:
         """Which numbers of a row's inputs F depends on: a marker is none of them."""
         *inputs, _, _ = self._symbols
         return np.array(ca.which_depends(self._expression, ca.vertcat(*inputs), 1, False), bool)
-
-    def solve_each(self, inputs: Sequence[NDArray], several: NDArray) -> NDArray:
-        """θ (k, n, size) of all rows at each of `several` parameter values (k, parameters)."""
-        state, first = self._states_of(inputs)
-        rows = [np.tile(a[first], (len(several), 1)) for a in inputs]
-        theta, _ = self._settled(rows, np.repeat(several, len(first), axis=0))
-        return theta.reshape(len(several), len(first), self.size)[:, state]
 
     def _solve(self, *given: NDArray) -> tuple[NDArray, NDArray]:
         """As `solve`, each state of the arm once: its markers' rows have the same answer."""
