@@ -348,7 +348,6 @@ class BatchFunction:
         self._function = f = ca.Function("rows", list(inputs), list(outputs))
         self.shapes = [f.size_out(k) for k in range(f.n_out())]
         self._sizes = [f.nnz_in(k) for k in range(f.n_in())]
-        self.n_instructions = int(f.n_instructions())
 
     def __getstate__(self) -> dict[str, Any]:
         """Without the instructions, which are made again where it goes."""

@@ -17,7 +17,7 @@ from elastocal.model.arm import Arm, Parameter, row_inputs
 from elastocal.model.chain import Chain
 from elastocal.model.effects.base import Effect
 from elastocal.model.effects.catalogue import choose_effects, set_constants, sized_parameters
-from elastocal.model.evaluate import BatchFunction, row_blocks
+from elastocal.model.evaluate import BatchFunction
 from elastocal.model.observations import observe
 from elastocal.units import Array, IntArray
 
@@ -25,12 +25,6 @@ from elastocal.units import Array, IntArray
 
 MAX_STEPS = 30
 LARGEST = 0.5  # rad or m
-# F_θ written out whole takes about half of F's instructions for every spring.  Beyond this many,
-# one derivative along a direction is evaluated in every direction first: with 56 springs and the
-# whole catalogue 15 000 instructions instead of 174 000, which are made and evaluated on a small
-# table in a fraction of the time; a row of a large one takes twice as long.
-LARGEST_JACOBIAN = 60_000
-AT_A_TIME = 16_384  # rows × directions evaluated together
 KEPT = 4_000_000  # numbers of F_θ up to which an answer is kept
 EVALUATIONS, KEPT_ROWS = 3, 12_000  # of y and dy/dz that are kept, each of so many rows at most
 TOLERANCE = 1e-14  # rad (m for prismatic springs); Newton converges quadratically past it
@@ -75,44 +69,15 @@ class Equilibrium:
         backend: str | None = None,
     ) -> None:
         self.size = theta.shape[0]
-        self._symbols, self._expression = [*inputs, p, theta], residual
-        self._backend = backend
-        self._value = BatchFunction(self._symbols, [residual], backend)
-        self._large = self._value.n_instructions * self.size / 2 > LARGEST_JACOBIAN
+        self._symbols, self._expression, self._backend = [*inputs, p, theta], residual, backend
         self._answers = LastAnswers(self._solve, 1, KEPT // max(self.size**2, 1))
         self._states: tuple[NDArray, IntArray, IntArray] | None = None
 
     @cached_property
-    def _whole(self) -> BatchFunction:
-        """F and F_θ."""
+    def _residual(self) -> BatchFunction:
+        """F (size, 1) and F_θ (size, size) of a row."""
         outputs = [self._expression, ca.jacobian(self._expression, self._symbols[-1])]
         return BatchFunction(self._symbols, outputs, self._backend)
-
-    @cached_property
-    def _along(self) -> BatchFunction:
-        """F_θ·d in a direction d, a further input."""
-        direction = ca.SX.sym("direction", self.size)
-        slope = ca.jtimes(self._expression, self._symbols[-1], direction)
-        return BatchFunction([*self._symbols, direction], [slope], self._backend)
-
-    def _residual(
-        self, inputs: Sequence[NDArray], p: NDArray, theta: NDArray
-    ) -> tuple[NDArray, NDArray]:
-        """F (n, size, 1) and F_θ (n, size, size); p (parameters,), or (n, parameters) by row."""
-        if not self._large:
-            F, F_theta = self._whole(*inputs, p, theta)
-            return F, F_theta
-        (F,) = self._value(*inputs, p, theta)
-        F_theta = np.empty((len(theta), self.size, self.size), dtype=F.dtype)
-        for block in row_blocks(len(theta), max(AT_A_TIME // self.size, 1)):
-            n = block.stop - block.start
-            rows = [
-                np.repeat(a[block], self.size, axis=0) if a.ndim == 2 else a
-                for a in (*inputs, p, theta)
-            ]
-            (slope,) = self._along(*rows, np.tile(np.eye(self.size), (n, 1)))
-            F_theta[block] = slope.reshape(n, self.size, self.size).transpose(0, 2, 1)
-        return F, F_theta
 
     def solve(self, inputs: Sequence[NDArray], p: NDArray) -> tuple[NDArray, NDArray]:
         """θ (n, size) by Newton's method on all rows, and F_θ (n, size, size) there.
@@ -173,7 +138,7 @@ class Equilibrium:
         active = np.arange(n)
         for _ in range(MAX_STEPS):
             *rows, at = [a[active] if a.ndim == 2 else a for a in (*inputs, p)]
-            F, F_theta = self._residual(rows, at, theta[active])
+            F, F_theta = self._residual(*rows, at, theta[active])
             finite = np.isfinite(F_theta).all(axis=(1, 2)) & np.isfinite(F[..., 0]).all(axis=1)
             theta[active[~finite]] = np.nan
             active, F, F_theta = active[finite], F[finite], F_theta[finite]
