@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import math
 from collections.abc import Iterable, Iterator, Mapping, Sequence
-from dataclasses import dataclass
 
 import numpy as np
 
@@ -117,17 +116,19 @@ def _blocks(d: Diagnosis, kinds: Sequence[str]) -> Iterator[Block]:
     yield added_parameter_table(d)
     places = place_table(d)
     yield Fold("Place by place", lambda: [places], printed=True)
-    yield Fold("Smooth corrections", lambda: _nameless(d), printed=True)
+    yield Fold("Smooth corrections", lambda: _smooth(d), printed=True)
     yield Fold("Error budget", lambda: [gap_table(d)], printed=True)
     best = candidate_table(d)
     yield Fold("Candidates", lambda: [best], printed=True)
     yield Fold("Rivals", lambda: [pair_table(d)], printed=True)
-    yield Fold("Where the error comes from", lambda: _where(d))
+    yield Fold("Where the error comes from", lambda: [location_table(d), structure_table(d)])
     yield Fold("Not tested", lambda: [untested_table(d)], printed=True)
     noise = [("Noise", text) for text in noise_floor_lines(d.noise, kinds)]
     yield Fold("Noise", lambda: [Lines(noise)], printed=True)
     if d.noise.faulty:
-        yield Fold("Outliers excluded", lambda: _outliers(d))
+        faulty = sorted(d.noise.faulty, key=lambda f: -f.sigmas)
+        found = outlier_blocks("", [(f, f.error, f.sigmas) for f in faulty])
+        yield Fold("Outliers excluded", lambda: found)
     if d.calibrated is not None:
         yield Fold("Residuals of the calibrated arm", lambda: _residuals(d),
                    figures=("space", "residuals", "against_joints", "over_time"))  # fmt: skip
@@ -162,20 +163,13 @@ def _shapes(d: Diagnosis) -> Iterator[Figure]:
         yield found
 
 
-def _nameless(d: Diagnosis) -> Iterator[Block]:
-    if text := slight_text(d):
-        yield Sentence(text)
+def _smooth(d: Diagnosis) -> Iterator[Block]:
+    if d.slight:
+        yield Sentence(
+            f"{added_text(d.slight)}: each probably moves the markers by less than a hundredth of "
+            "the remaining error. They correct the arm and are not findings."
+        )
     yield field_table(d)
-
-
-def _where(d: Diagnosis) -> Iterator[Block]:
-    yield location_table(d)
-    yield structure_table(d)
-
-
-def _outliers(d: Diagnosis) -> Iterable[Block]:
-    faulty = sorted(d.noise.faulty, key=lambda f: -f.sigmas)
-    return outlier_blocks("", [(f, f.error, f.sigmas) for f in faulty])
 
 
 def _residuals(d: Diagnosis) -> Iterator[ShownArm | Block]:
@@ -275,7 +269,7 @@ def _likely(d: Diagnosis) -> list[str]:
 
 
 def _unknown(d: Diagnosis) -> str:
-    where = f"{location_text(d.location)}" if d.location else ""
+    where = location_text(d.location) if d.location else ""
     if d.effects:
         verb = "cause" if len(d.effects) > 1 else "causes"
         text = f"{capital(together(_likely(d)))} {verb} part of the remaining error; an effect "
@@ -295,8 +289,13 @@ def diagnosis_lines(d: Diagnosis) -> list[tuple[str, str]]:
     if d.verdict == "unknown_effect":
         lines += [("Depends on", text) for text in _dependence(d)]
     if d.groups:
-        told = (("Curves", curve_line(d)), ("Assumed", assumed_order(d)), ("Chance", _chance(d)))
-        return lines + [(label, text) for label, text in told if text]
+        spans = [f"{curve_span(curve)} ({place(curve.entry)})" for curve in d.curves]
+        if spans:
+            text = "the joints' errors against their own angles span"
+            lines.append(("Curves", f"{text} {together(spans)}."))
+        if text := assumed_order(d):
+            lines.append(("Assumed", text))
+        return [*lines, ("Chance", _chance(d))]
     if d.verdict == "unknown_effect":
         lines += [("Shape", _shape(curve)) for curve in d.curves]
     if d.open:
@@ -549,41 +548,15 @@ def location_table(d: Diagnosis) -> ShownTable:
 # Many causes at once: findings, and their places below them.
 
 
-@dataclass(frozen=True)
-class Cause:
-    """One finding: its share of the gap, by how much the error of new poses falls with it, and
-    what it does at each place, the largest first.  `reduction` is None for what has no name."""
-
-    name: str
-    share: float
-    share_ci90: Interval
-    reduction: float | None
-    reduction_ci90: Interval
-    parts: tuple[ComponentShare, ...]
-    named: bool = True
-
-
-def causes(d: Diagnosis) -> list[Cause]:
-    """What the gap is made of, the largest first; what has no name last, each by itself."""
-    named = [c for c in d.components if c.named]
-    rows = [
-        Cause(
-            effect_at_places(g.name, g.places), g.share, g.share_ci90,
-            g.gap_reduction, g.gap_reduction_ci90,
-            tuple(c for c in named if c.where in g.places and set(c.effects) & set(g.effects)),
-        )
-        for g in d.groups
-    ]  # fmt: skip
-    for c in d.components:
-        if not c.named:
-            name = f"{NAMELESS}, {family(c)} at {place(c.where)}"
-            none = (math.nan, math.nan)
-            rows.append(Cause(name, c.share, c.share_ci90, None, none, (c,), named=False))
-    return rows
-
-
-def family(c: ComponentShare) -> str:
+def _error_of(c: ComponentShare) -> str:
     return FAMILIES.get(c.family, plain_name(c.family))
+
+
+def _unnamed(d: Diagnosis) -> list[tuple[str, ComponentShare]]:
+    """What has no name, each by itself."""
+    return [
+        (f"{NAMELESS}, {_error_of(c)} at {place(c.where)}", c) for c in d.components if not c.named
+    ]
 
 
 def share_text(fraction: float, fine: bool | None = None) -> str:
@@ -608,17 +581,17 @@ def span_text(ends: Interval, middle: float) -> str:
 
 def headline_of_causes(d: Diagnosis) -> str:
     """The largest causes with their shares, and what is left open."""
-    found = [c for c in causes(d) if c.named]
-    large = [c for k, c in enumerate(found[:MOST_IN_HEADLINE]) if k == 0 or c.share >= FINE]
+    large = [g for k, g in enumerate(d.groups[:MOST_IN_HEADLINE]) if k == 0 or g.share >= FINE]
     told = [
-        f"{c.name} ({share_text(c.share)}{' of the remaining error' * (k == 0)})"
-        for k, c in enumerate(large)
+        f"{effect_at_places(g.name, g.places)} "
+        f"({share_text(g.share)}{' of the remaining error' * (k == 0)})"
+        for k, g in enumerate(large)
     ]
-    if more := len(found) - len(told):
+    if more := len(d.groups) - len(told):
         told.append(counted(more, "smaller cause"))
     first = d.groups[0]
     plural = len(first.places) > 1 or first.name.endswith("errors")
-    text, several = together(told), len(found) > 1 or plural
+    text, several = together(told), len(d.groups) > 1 or plural
     if d.verdict == "explained":
         return f"{text} explain{'s' * (not several)} the remaining error."
     if d.verdict == "ambiguous":
@@ -637,12 +610,16 @@ def headline_of_causes(d: Diagnosis) -> str:
 def cause_table(d: Diagnosis) -> ShownTable:
     rows = [
         (
-            c.name, share_text(c.share), span_text(c.share_ci90, c.share),
-            "–" if c.reduction is None else share_text(c.reduction),
-            span_text(c.reduction_ci90, c.reduction or 0.0),
+            effect_at_places(g.name, g.places), share_text(g.share),
+            span_text(g.share_ci90, g.share), share_text(g.gap_reduction),
+            span_text(g.gap_reduction_ci90, g.gap_reduction),
         )
-        for c in causes(d)
+        for g in d.groups
     ]  # fmt: skip
+    rows += [
+        (name, share_text(c.share), span_text(c.share_ci90, c.share), "–", "–")
+        for name, c in _unnamed(d)
+    ]
     if d.gap.unexplained_share >= FINE**2:
         rows.append(("unexplained", share_text(d.gap.unexplained_share), "–", "–", "–"))
     heads = ("cause", "share", "90 %", "error falls by", "90 %")
@@ -653,17 +630,25 @@ def cause_table(d: Diagnosis) -> ShownTable:
 
 
 def place_table(d: Diagnosis) -> ShownTable:
+    """What acts at each place, below the finding that it belongs to."""
+    named = [c for c in d.components if c.named]
+    found = [
+        (effect_at_places(g.name, g.places),
+         [c for c in named if c.where in g.places and set(c.effects) & set(g.effects)])
+        for g in d.groups
+    ]  # fmt: skip
+    found += [(name, [c]) for name, c in _unnamed(d)]
     rows: list[tuple[str, ...]] = []
     groups: dict[int, str] = {}
     told: list[ComponentShare] = []
-    for cause in causes(d):
-        parts = [c for c in cause.parts if c not in told]
+    for name, of_it in found:
+        parts = [c for c in of_it if c not in told]
         if parts:
-            groups[len(rows)] = cause.name
+            groups[len(rows)] = name
         for c in parts:
             effects = ", ".join(map(plain_name, c.effects)) if c.named else NAMELESS
             rows.append((
-                place(c.where), family(c), effects, f"{length(c.rms)} ({lengths(c.rms_ci95)})",
+                place(c.where), _error_of(c), effects, f"{length(c.rms)} ({lengths(c.rms_ci95)})",
                 f"{share_text(c.share)} ({span_text(c.share_ci90, c.share).removesuffix(' %')})",
                 probability(c.probability),
             ))  # fmt: skip
@@ -689,11 +674,6 @@ def curve_span(curve: Curve) -> str:
     return f"{significant(shown)} {unit}"
 
 
-def curve_line(d: Diagnosis) -> str:
-    told = [f"{curve_span(curve)} ({place(curve.entry)})" for curve in d.curves]
-    return f"the joints' errors against their own angles span {together(told)}." if told else ""
-
-
 def assumed_order(d: Diagnosis) -> str:
     """That the moves between visits were taken from the order of the rows, where they matter."""
     matters = any(c.family == "move" for c in d.components) or "approach" in d.model_keys
@@ -702,16 +682,6 @@ def assumed_order(d: Diagnosis) -> str:
     return (
         "the last move is that from the visit before, in the order of the rows; if they were not "
         "measured so, do not rely on effects of the last move."
-    )
-
-
-def slight_text(d: Diagnosis) -> str:
-    """What is in the model and no finding; nothing where all matters."""
-    if not d.slight:
-        return ""
-    return (
-        f"{added_text(d.slight)}: each probably moves the markers by less than a hundredth of the "
-        "remaining error. They correct the arm and are not findings."
     )
 
 
