@@ -4,9 +4,8 @@ from __future__ import annotations
 
 from pydantic import BaseModel
 
-from elastocal.cell.file_keys import table_of
 from elastocal.cell.work_cell import Cell
-from elastocal.config import tables_in
+from elastocal.config import table_of, tables_in
 
 HEAD = """# Keys of the cell file
 

@@ -287,7 +287,7 @@ def _design_of(cell: Cell, asked: Mapping[str, Any]) -> Any:
 
 def _wish(record: Any, key: str, value: Any) -> Any:
     """A value as a record of the cell takes it.  Raises InputError that names the option."""
-    from elastocal.cell.file_keys import fields_of
+    from elastocal.config import fields_of
 
     try:
         return getattr(record(**{key: value}), key)

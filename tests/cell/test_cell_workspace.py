@@ -7,8 +7,8 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from elastocal.cell.file_keys import Spot, direction
 from elastocal.cell.work_cell import Workspace
+from elastocal.config import Spot, direction
 
 CELL = """
 [robot]

@@ -11,28 +11,26 @@ from typing import Annotated, Any, Literal
 import numpy as np
 from pydantic import BeforeValidator, Field
 
-from elastocal.cell.file_keys import (
+from elastocal.config import (
     AnyFloat,
     File,
     Many,
-    Rotation,
-    Spot,
-    from_table,
-    joint_values,
-    keyed,
-    keys_of,
-    record,
-)
-from elastocal.config import (
     NonNegative,
     Numbers,
     Positive,
+    Rotation,
+    Spot,
     Table,
     Text,
     Vector3,
     checked,
+    from_table,
+    joint_values,
     key,
+    keyed,
+    keys_of,
     numbers,
+    record,
     required,
 )
 from elastocal.errors import InputError, require

@@ -8,32 +8,30 @@ from typing import Annotated, Any, Literal
 import numpy as np
 from pydantic import ConfigDict, Field
 
-from elastocal.cell.file_keys import (
+from elastocal.config import (
     AS_PATH,
+    Count,
     File,
     Key,
     Many,
-    Rotation,
-    Spot,
-    existing_file,
-    fields_of,
-    joint_values,
-    keyed,
-    matrix,
-    record,
-    stated,
-)
-from elastocal.config import (
-    Count,
     NonNegative,
     Numbers,
     Positive,
+    Rotation,
+    Spot,
     Table,
     Text,
     Vector3,
+    existing_file,
+    fields_of,
     header,
+    joint_values,
     key,
+    keyed,
+    matrix,
     numbers,
+    record,
+    stated,
 )
 from elastocal.errors import require
 from elastocal.units import Array

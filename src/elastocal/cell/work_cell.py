@@ -13,40 +13,38 @@ import numpy as np
 from pydantic import Field
 
 from elastocal.cell.arm_description import ModelSpec, Robot, Tool, Tracker, Unsteadiness
-from elastocal.cell.file_keys import (
+from elastocal.cell.plan_wishes import DesignSpec
+from elastocal.config import (
     TUPLE,
     AnyFloat,
+    Count,
     Direction,
     File,
     Key,
     Many,
-    Spot,
-    Transform,
-    direction,
-    fields_of,
-    from_table,
-    joint_values,
-    keyed,
-    keys_of,
-    record,
-    stated,
-    table_of,
-)
-from elastocal.cell.plan_wishes import DesignSpec
-from elastocal.config import (
-    Count,
     NonNegative,
     Numbers,
     Positive,
+    Spot,
     Table,
     Text,
+    Transform,
     Vector2,
     Vector3,
     checked,
+    direction,
+    fields_of,
+    from_table,
     header,
+    joint_values,
     key,
+    keyed,
+    keys_of,
     numbers,
     read_toml,
+    record,
+    stated,
+    table_of,
 )
 from elastocal.errors import require
 from elastocal.files import check_exists
