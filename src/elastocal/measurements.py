@@ -417,6 +417,9 @@ def families(joint_kinds: Sequence[str]) -> dict[str, Family]:
     def same(units: tuple[str, ...], *stems: str) -> dict[str, tuple[str, ...]]:
         return dict.fromkeys(stems, units)
 
+    def sigmas(*axes: str) -> dict[str, tuple[str, ...]]:
+        return same(("um", "mm", "m"), *(f"sigma_{axis}" for axis in axes))
+
     known = (
         Family("configuration", "configuration", same(NO_UNIT, "configuration"), is_label=True),
         Family("repeat", "repeat", same(NO_UNIT, "repeat")),
@@ -428,16 +431,8 @@ def families(joint_kinds: Sequence[str]) -> dict[str, Family]:
         Family("quaternion", "quaternion", same(NO_UNIT, "qw", "qx", "qy", "qz")),
         Family("distance", "distances", same(LENGTH[:2], "distance")),
         Family("torque", "joint torques", per_joint("torque_{}", ("Nm",), ("N",))),
-        Family(
-            "sigma_cartesian",
-            "Cartesian sigmas",
-            same(("um", "mm", "m"), "sigma_x", "sigma_y", "sigma_z"),
-        ),
-        Family(
-            "sigma_polar",
-            "polar sigmas",
-            same(("um", "mm", "m"), "sigma_range", "sigma_azimuth", "sigma_elevation"),
-        ),
+        Family("sigma_cartesian", "Cartesian sigmas", sigmas("x", "y", "z")),
+        Family("sigma_polar", "polar sigmas", sigmas("range", "azimuth", "elevation")),
         Family("time", "time", same(TIME, "time")),
         Family("approach", "approach directions", per_joint("approach_{}", NO_UNIT, NO_UNIT)),
         Family("before", "joints of the pose before", per_joint("before_{}", ANGLE, LENGTH[:2])),

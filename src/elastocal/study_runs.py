@@ -23,26 +23,10 @@ from pathlib import Path
 from types import FrameType
 from typing import Any, Self
 
+from elastocal import studies
 from elastocal.errors import ElastocalError, InputError, option, require
 from elastocal.files import atomic_write_text, read_bytes
-from elastocal.studies import (
-    FAILURES,
-    RESULTS,
-    STATEMENT,
-    Row,
-    Study,
-    StudyTask,
-    add_line,
-    as_text,
-    calling,
-    execute,
-    opened,
-    read_results,
-    result_lines,
-    statement_of,
-    write_page,
-    write_statement,
-)
+from elastocal.studies import Row, Study, StudyTask
 from elastocal.text import printable, quoted
 
 GRACE = 30.0  # s that running tasks are waited for
@@ -201,7 +185,7 @@ def hand_out(
         while out or (waiting and not stop.asked):
             while waiting and not stop.asked and len(out) < crew.places:
                 task = waiting.popleft()
-                future = crew.submit(execute, study.sources, task)
+                future = crew.submit(studies.execute, study.sources, task)
                 out[future] = task
                 future.add_done_callback(ended.put)
             try:
@@ -240,7 +224,7 @@ def run_local(study: Study, tasks: Sequence[StudyTask], jobs: int | None, stop: 
     for task in tasks:
         if stop.asked:
             return
-        yield execute(study.sources, task)
+        yield studies.execute(study.sources, task)
 
 
 def _security(
@@ -343,7 +327,7 @@ def run_study(
     cluster cannot be reached; ClusterLostError where the scheduler goes away.
     """
     folder, stop = Path(output), stop or StudyStop()
-    with opened(folder):
+    with studies.opened(folder):
         known = [] if restart else _known(study, folder)
         kept = [line for line in known if not (retry_failed and line["task_error"])]
         there = {line["task"]: line["task_error"] is not None for line in kept}
@@ -355,11 +339,11 @@ def run_study(
             runner = lambda tasks: hand_out(crew, study, tasks, stop)  # noqa: E731
         elif runner is None:
             runner = partial(run_local, study, jobs=jobs, stop=stop)
-        for name in (RESULTS, STATEMENT, FAILURES) if restart else ():
+        for name in (studies.RESULTS, studies.STATEMENT, studies.FAILURES) if restart else ():
             (folder / name).unlink(missing_ok=True)
         if left:  # without the beginning of a line
-            atomic_write_text(folder / RESULTS, "".join(map(as_text, kept)))
-        write_statement(folder, study)
+            atomic_write_text(folder / studies.RESULTS, "".join(map(studies.as_text, kept)))
+        studies.write_statement(folder, study)
         total, before = len(wanted), len(wanted) - len(left)
         ended, failed = before, sum(there.get(task.index, False) for task in wanted)
         progress(total, ended, failed)
@@ -367,7 +351,7 @@ def run_study(
             with closing(runner(left)) as lines:
                 for line in lines:
                     stop.check()
-                    add_line(folder, line)
+                    studies.add_line(folder, line)
                     failed += line["task_error"] is not None
                     ended += 1
                     progress(total, ended, failed)
@@ -380,12 +364,12 @@ def run_study(
 def _known(study: Study, folder: Path) -> list[Row]:
     """The lines that the results hold."""
     here = f"Run with {option('restart', True)} to discard them, or with {option('output', 'NEW')}"
-    before, columns = statement_of(folder), dict(study.sources.columns)
+    before, columns = studies.statement_of(folder), dict(study.sources.columns)
     require(
         before.get("columns", columns) == columns,
         f"{folder}: has other columns, types or units than the study now. {here}",
     )
-    lines = result_lines(folder)
+    lines = studies.result_lines(folder)
     for line in lines:
         at = line["task"]
         if at < len(study.tasks) and study.tasks[at].hash != line["task_hash"]:
@@ -420,12 +404,12 @@ def summarise(study: Study, output: str | Path, page: str | Path) -> str | None:
     summary = getattr(study.module, "summary", None)
     if summary is None:
         return None
-    frame = read_results(output)
+    frame = studies.read_results(output)
     frame = frame[frame["task"] < len(study.tasks)]
-    text = calling(study.folder, "summary()", lambda: summary(frame))
+    text = studies.calling(study.folder, "summary()", lambda: summary(frame))
     if not isinstance(text, str):
         kind = type(text).__name__
         raise InputError(f"{study.folder / 'study.py'}: summary() returned {kind}; it returns text")
     lines = (printable(line).replace("\\t", "\t") for line in text.rstrip("\n").split("\n"))
-    write_page(Path(output), Path(page), "\n".join(lines) + "\n")
+    studies.write_page(Path(output), Path(page), "\n".join(lines) + "\n")
     return text

@@ -16,37 +16,11 @@ from typing import Any
 import numpy as np
 
 from elastocal.errors import ElastocalError, InputError, InsufficientDataError, option
-from elastocal.export.exportable import (
-    Cost,
-    ExportNumbers,
-    Kept,
-    cost_of,
-    evaluate_pieces,
-    keep,
-    link_inertias,
-)
-from elastocal.export.mjcf_file import (
-    RIGID,
-    HeldArm,
-    MujocoRest,
-    NotInPlace,
-    calibrated_mjcf,
-    corrected_mjcf,
-)
+from elastocal.export import exportable, mjcf_file, rigid_files
+from elastocal.export.exportable import Cost, ExportNumbers, Kept
+from elastocal.export.mjcf_file import HeldArm, MujocoRest, NotInPlace
 from elastocal.export.refit import JointCorrection, Refit, refitted
-from elastocal.export.rigid_files import (
-    BASE,
-    CONVENTIONS,
-    FLANGE,
-    FORMULA,
-    Frames,
-    calibrated_urdf,
-    dh_csv,
-    dh_lines,
-    new_urdf,
-    urdf_flanges,
-    without_beta,
-)
+from elastocal.export.rigid_files import Frames
 from elastocal.files import atomic_write_text, together
 from elastocal.identification.covariance import t_quantile
 from elastocal.model.calibrated import CalibratedArm, Conditions, Valued, random_table
@@ -270,14 +244,14 @@ def export(
     if visits is not None and (wish.load_stated or conditions.force.any()):
         visits = replace(visits, force=np.broadcast_to(conditions.force, visits.force.shape))
     conditions = replace(conditions, visits=visits)
-    kept = keep(calibrated, elastic=wish.format == "mjcf", conditions=conditions)
+    kept = exportable.keep(calibrated, elastic=wish.format == "mjcf", conditions=conditions)
     refit, correction = None, JointCorrection(())
     if wish.format in FITTED:
         progress("fitting what the format holds")
         kept, refit, correction = refitted(kept, wish.poses, wish.seed, wish.correct_joints)
-    pieces = evaluate_pieces(kept.exported, conditions)
+    pieces = exportable.evaluate_pieces(kept.exported, conditions)
     progress("what the format cannot hold")
-    cost = cost_of(kept, wish.poses, wish.seed)
+    cost = exportable.cost_of(kept, wish.poses, wish.seed)
     progress("writing and reading back")
     if wish.format in WRITERS:
         found = WRITERS[wish.format](calibrated, wish, kept, pieces)
@@ -446,18 +420,20 @@ def _urdf(calibrated: CalibratedArm, wish: Wish, kept: Kept, pieces: ExportNumbe
     robot = calibrated.model.cell.robot
     note = _note(calibrated, kept)
     if robot.urdf is not None:
-        text = calibrated_urdf(robot, pieces, wish.frames, note)
+        text = rigid_files.calibrated_urdf(robot, pieces, wish.frames, note)
         base, flange = check_urdf(robot.urdf).ends(robot.base, robot.flange)
     else:
-        text = new_urdf(pieces, wish.frames, note)
-        base, flange = BASE, FLANGE
+        text = rigid_files.new_urdf(pieces, wish.frames, note)
+        base, flange = rigid_files.BASE, rigid_files.FLANGE
     back = _read_back(text, ".urdf", partial(read_urdf, base=base, flange=flange))
     q = random_table(kept.full.model, kept.conditions, 100, wish.seed).q
     chain = pieces.calibrated_chain()
     expected = nominal_flanges(chain, q)
     apart = _apart(nominal_flanges(back, q), expected)
     try:
-        found = urdf_flanges(text, [joint.name for joint in chain.joints], base, flange, q)
+        found = rigid_files.urdf_flanges(
+            text, [joint.name for joint in chain.joints], base, flange, q
+        )
     except (ValueError, RuntimeError) as error:  # pinocchio's own
         told = (
             "pinocchio's own reader refuses this file, as it does without the corrections "
@@ -479,8 +455,8 @@ def _mjcf(calibrated: CalibratedArm, wish: Wish, kept: Kept, pieces: ExportNumbe
             )
     inertias: tuple[Array, ...] = ()
     if pieces.masses and robot.urdf is not None:
-        inertias = link_inertias(robot.urdf, pieces.chain)
-    text = calibrated_mjcf(
+        inertias = exportable.link_inertias(robot.urdf, pieces.chain)
+    text = mjcf_file.calibrated_mjcf(
         pieces, _note(calibrated, kept), inertias, _compensator(kept.exported), wish.frames.base
     )
     if not pieces.masses:
@@ -489,7 +465,7 @@ def _mjcf(calibrated: CalibratedArm, wish: Wish, kept: Kept, pieces: ExportNumbe
             "weights would deflect the arm a second time; set [model] link_gravity = true and "
             "identify anew for an arm with weights"
         )
-    warnings += _rigid_joints(pieces, f" (gain {RIGID:g})")
+    warnings += _rigid_joints(pieces, f" (gain {mjcf_file.RIGID:g})")
     try:
         import mujoco  # noqa: F401
     except ImportError:
@@ -511,7 +487,9 @@ def _corrected(calibrated: CalibratedArm, wish: Wish, kept: Kept, pieces: Export
         raise NotInPlace("it has no gravity compensator")
     if pieces.masses and not cell.model.link_gravity:
         raise NotInPlace("weights were identified without those of the file (link_gravity = false)")
-    text, warnings = corrected_mjcf(cell.robot, pieces, wish.frames.tool, _note(calibrated, kept))
+    text, warnings = mjcf_file.corrected_mjcf(
+        cell.robot, pieces, wish.frames.tool, _note(calibrated, kept)
+    )
     arm = HeldArm(text, cell.robot, pieces)
     distance = _check_rest(arm, pieces, kept, arm.T_world_base, wish.seed)
     if pieces.yielding and not pieces.masses:
@@ -553,8 +531,8 @@ def _compensator(part: Valued) -> dict[str, float] | None:
 def _dh(calibrated: CalibratedArm, wish: Wish, kept: Kept, pieces: ExportNumbers) -> Written:
     from elastocal.model.dh import read_dh
 
-    convention = CONVENTIONS[wish.format]
-    lines = dh_lines(calibrated.model.cell.robot, pieces, convention)
+    convention = rigid_files.CONVENTIONS[wish.format]
+    lines = rigid_files.dh_lines(calibrated.model.cell.robot, pieces, convention)
     q = random_table(kept.full.model, kept.conditions, 100, wish.seed).q
     expected = nominal_flanges(pieces.calibrated_chain(), q)
 
@@ -562,15 +540,15 @@ def _dh(calibrated: CalibratedArm, wish: Wish, kept: Kept, pieces: ExportNumbers
         back = _read_back(text, ".csv", partial(read_dh, convention=convention))
         return _apart(nominal_flanges(back, q), expected, largest)
 
-    apart, beta = checked(dh_csv(lines)), None
+    apart, beta = checked(rigid_files.dh_csv(lines)), None
     comments = [
-        f"{_note(calibrated, kept)}; {convention} convention: {FORMULA[convention]}",
+        f"{_note(calibrated, kept)}; {convention} convention: {rigid_files.FORMULA[convention]}",
         f"largest flange error of this table: {apart * 1e6:.2g} um",
     ]
     if any(line.row.beta for line in lines):
-        beta = checked(dh_csv(without_beta(lines)), largest=None)
+        beta = checked(rigid_files.dh_csv(rigid_files.without_beta(lines)), largest=None)
         comments.append(f"without the column beta_rad: {beta * 1e6:.3g} um")
-    text = dh_csv(lines, comments)
+    text = rigid_files.dh_csv(lines, comments)
     checked(text)
     return Written(text, apart, "elastocal's own reader of DH tables", (), beta)
 

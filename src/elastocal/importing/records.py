@@ -10,35 +10,9 @@ from pathlib import Path
 import numpy as np
 
 from elastocal.errors import ElastocalError, InputError
-from elastocal.importing.foreign_text import (
-    SAMPLE,
-    ForeignText,
-    NumberCells,
-    Rows,
-    bounded,
-    compiled,
-    program_rows,
-    read_lines,
-    seconds_of,
-    table_rows,
-    unit_in_comments,
-)
-from elastocal.importing.mapping_file import (
-    PRESETS,
-    ColumnKey,
-    FileColumn,
-    NamesTable,
-    SourceTable,
-    TextSourceKeys,
-    UnitsTable,
-    by_name,
-    lacking,
-    markers_of_row,
-    no_header,
-    read_mapping,
-    resolve,
-    wanted,
-)
+from elastocal.importing import foreign_text, mapping_file
+from elastocal.importing.foreign_text import ForeignText, NumberCells, Rows
+from elastocal.importing.mapping_file import ColumnKey, FileColumn, SourceTable, UnitsTable
 from elastocal.tables import column
 from elastocal.text import is_label, listed, quoted
 from elastocal.units import Array, IntArray, convert, quantities
@@ -182,14 +156,14 @@ def read_records(where: str, path: Path, source: SourceTable, units: UnitsTable)
 
     A row with an empty cell where a number belongs is passed over and listed.
     """
-    settings = source.text or TextSourceKeys()
-    asked = wanted(where, source.columns or {}, source.optional or {})
-    text = read_lines(path, settings.encoding or "auto")
+    settings = source.text or mapping_file.TextSourceKeys()
+    asked = mapping_file.wanted(where, source.columns or {}, source.optional or {})
+    text = foreign_text.read_lines(path, settings.encoding or "auto")
     table = _table(text, settings, asked)
     if len(table.rows) > MAX_ROWS:
         raise InputError(f"{text.source}: more than {MAX_ROWS:,} rows; thin the export out")
-    hint = unit_in_comments(where, settings.unit_comment, table.comments)
-    markers = markers_of_row(text.source, asked, table.header)
+    hint = foreign_text.unit_in_comments(where, settings.unit_comment, table.comments)
+    markers = mapping_file.markers_of_row(text.source, asked, table.header)
     parts = [
         _read(text, table, [c.of_marker(name) for c in asked], source, units, hint)
         for name in markers or [""]
@@ -201,8 +175,8 @@ def _read(
     text: ForeignText, table: Rows, asked: Sequence[ColumnKey], source: SourceTable,
     units: UnitsTable, hint: str | None,
 ) -> Records:  # fmt: skip
-    settings, name = source.text or TextSourceKeys(), text.source
-    columns = resolve(name, asked, table.header, len(table.rows[0][1]), units, hint)
+    settings, name = source.text or mapping_file.TextSourceKeys(), text.source
+    columns = mapping_file.resolve(name, asked, table.header, len(table.rows[0][1]), units, hint)
     numeric = [c for c in columns if not c.target.is_text]
     cells = NumberCells(
         settings.decimal or "auto",
@@ -250,7 +224,7 @@ def _read(
     if written is not None and time is None:
         form = source.time_format or ()
         formats = [form] if isinstance(form, str) else form
-        time = np.array(seconds_of(name, line.tolist(), written, formats))
+        time = np.array(foreign_text.seconds_of(name, line.tolist(), written, formats))
     file = np.zeros(len(line), dtype=np.int64)
     return Records((name,), file, line, numbers, of, texts, time, understood, source.load)
 
@@ -324,8 +298,8 @@ def _side_by_side(parts: Sequence[Records], markers: Sequence[str]) -> Records:
 def likely_presets(path: Path) -> list[str]:
     """The presets that read most rows of a file; none where no preset reads it."""
     rows = dict[str, int]()
-    for name in PRESETS:
-        mapping = read_mapping(None, [name])
+    for name in mapping_file.PRESETS:
+        mapping = mapping_file.read_mapping(None, [name])
         try:
             read = read_records(mapping.path, path, mapping.sources[0], UnitsTable())
         except ElastocalError:
@@ -334,22 +308,24 @@ def likely_presets(path: Path) -> list[str]:
     return [name for name, n in rows.items() if n == max(rows.values())]
 
 
-def _table(text: ForeignText, settings: TextSourceKeys, asked: Sequence[ColumnKey]) -> Rows:
+def _table(
+    text: ForeignText, settings: mapping_file.TextSourceKeys, asked: Sequence[ColumnKey]
+) -> Rows:
     if settings.format in ("krl", "rapid"):
-        return program_rows(text, settings.format)
+        return foreign_text.program_rows(text, settings.format)
     guess = NumberCells("auto", settings.thousands or "none", settings.missing or (), ())
-    named = by_name(asked)
+    named = mapping_file.by_name(asked)
     places = [c.at for c in asked if c.required and not c.is_text and isinstance(c.at, int)]
 
     def is_header(cells: Sequence[str]) -> bool:
-        return not lacking(asked, cells)
+        return not mapping_file.lacking(asked, cells)
 
     def is_data(cells: Sequence[str]) -> bool:
         return all(at <= len(cells) and guess.looks_numeric(cells[at - 1]) for at in places)
 
-    table = table_rows(text, settings, is_header if named else None, is_data)
+    table = foreign_text.table_rows(text, settings, is_header if named else None, is_data)
     if named and not table.header_line:
-        raise no_header(text.source, asked, table.rows[:SAMPLE])
+        raise mapping_file.no_header(text.source, asked, table.rows[: foreign_text.SAMPLE])
     return table
 
 
@@ -435,13 +411,13 @@ GROUPS = ("configuration", "marker", "repeat", "load")
 ADVICE = "write pattern in [source.names]"
 
 
-def with_labels(where: str, records: Records, names: NamesTable | None) -> Records:
+def with_labels(where: str, records: Records, names: mapping_file.NamesTable | None) -> Records:
     """The records with `labels` from their columns, and from their names where a pattern is given.
 
     A group that a column gives too is taken from the column.  A name that no pattern matches is
     an error, or with unmatched = "ignore" passed over and listed.
     """
-    names = names or NamesTable()
+    names = names or mapping_file.NamesTable()
     labels = {stem: records.texts[stem] for stem in GROUPS if stem in records.texts}
     named = records.texts.get("name")
     if names.pattern is not None and named is not None:
@@ -479,10 +455,10 @@ def with_labels(where: str, records: Records, names: NamesTable | None) -> Recor
 
 
 def _labels_of_names(
-    where: str, records: Records, names: NamesTable, named: list[str]
+    where: str, records: Records, names: mapping_file.NamesTable, named: list[str]
 ) -> tuple[dict[str, list[str]], list[int]]:
     patterns = [names.pattern] if isinstance(names.pattern, str) else list(names.pattern or ())
-    expressions = [compiled(where, "pattern", text) for text in patterns]
+    expressions = [foreign_text.compiled(where, "pattern", text) for text in patterns]
     for expression in expressions:
         if not set(expression.groupindex) & set(GROUPS):
             raise InputError(
@@ -491,7 +467,7 @@ def _labels_of_names(
             )
     found: dict[str, list[str]] = {stem: [] for stem in GROUPS}
     bad: list[int] = []
-    with bounded(where, named):
+    with foreign_text.bounded(where, named):
         for i, name in enumerate(named):
             match = next((m for e in expressions if (m := e.search(name))), None)
             if match is None:
