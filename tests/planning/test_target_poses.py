@@ -118,7 +118,7 @@ GOOD = "0,-90,90,0,30,0"
         ("q1_deg,q2_deg\n0,0", ["2 joint columns", "6 joints"]),
         ("weight\n1", ["q1_deg … or x_mm,y_mm,z_mm are missing"]),
         (f"{JOINTS},x_mm,y_mm,z_mm\n{GOOD},1,1,1", ["two ways", "keep the joints or"]),
-        (f"{JOINTS},rx_deg,ry_deg,rz_deg\n{GOOD},1,1,1", ["says the rotation too", "rx_deg"]),
+        (f"{JOINTS},rx_deg,ry_deg,rz_deg\n{GOOD},1,1,1", ["say the same in two ways", "rx_deg"]),
         ("x_mm,y_mm,z_mm,repeat\n1,1,1,1", ["'repeat' has no meaning in a path"]),
         ("x_mm,y_mm,z_mm,wieght\n1,1,1,1", ["unknown column 'wieght'"]),
         ("x_mm,y_mm,z_mm,qw,qx,qy,qz\n1500,0,1000,1,1,0,0", ["line 2, column qw", "norm"]),

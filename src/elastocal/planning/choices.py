@@ -10,6 +10,7 @@ neither does ∂Φ*/∂z = ∂Φ/∂z|_w (envelope theorem) vanishes or points o
 
 from __future__ import annotations
 
+from bisect import bisect_left
 from collections.abc import Callable
 from copy import copy
 from dataclasses import dataclass, replace
@@ -389,14 +390,12 @@ class _Budget:
         return found
 
     def _fitting(self, q: Array, repeats: int) -> int:
-        low, high = 0, len(q)
-        while low < high:
-            middle = (low + high + 1) // 2
-            sized = _sized(self.cell, middle, repeats)
-            everything = np.ones((middle, len(plan_forces(sized))), dtype=np.int64)
-            fits = _minutes(sized, q[:middle], everything) <= self.minutes
-            low, high = (middle, high) if fits else (low, middle - 1)
-        return low
+        def too_long(n: int) -> bool:
+            sized = _sized(self.cell, n, repeats)
+            everything = np.ones((n, len(plan_forces(sized))), dtype=np.int64)
+            return _minutes(sized, q[:n], everything) > self.minutes
+
+        return bisect_left(range(1, len(q) + 1), True, key=too_long)
 
 
 def _sized(cell: Cell, poses: int, repeats: int) -> Cell:

@@ -112,11 +112,14 @@ class Collisions:
 
     def __init__(self, kinematics: Kinematics, pairs: Sequence[Pair], free: int = 0) -> None:
         self.pairs = tuple(pairs)
+        self._margins = np.array([pair.margin for pair in pairs])
         model = arm_model(kinematics, free)
         geometry = geometry_of(kinematics, [item for p in pairs for item in (p.body, p.other)])
-        self._hangs = np.array([pair.hangs for pair in pairs], dtype=bool)
-        self._always = Batch(model, geometry, [p for p in pairs if not p.hangs])
-        self._loaded = Batch(model, geometry, [p for p in pairs if p.hangs])
+        hangs = np.array([pair.hangs for pair in pairs], dtype=bool)
+        self._always, self._loaded = (
+            (own, _pool(model, geometry, [pairs[k] for k in own]))
+            for own in (np.flatnonzero(~hangs), np.flatnonzero(hangs))
+        )
 
     def hits(
         self, poses: Poses, extra: float | Array = 0.0, placed: Array | None = None
@@ -125,41 +128,43 @@ class Collisions:
 
         `placed` (N, 7 free): position and quaternion (x, y, z, w) of every free body.
         """
+        import pinocchio as pin
+
         configuration = arm_configuration(poses)
         if placed is not None:
             configuration = np.hstack([configuration, placed])
-        extra = np.broadcast_to(extra, len(self.pairs))
-        found = self._always.hits(configuration, extra[~self._hangs])
-        left = np.flatnonzero(poses.loaded & ~found)
-        found[left] = self._loaded.hits(configuration[left], extra[self._hangs])
+        margins, found = self._margins + extra, np.zeros(len(poses), dtype=bool)
+        for (own, pool), counts in ((self._always, ~found), (self._loaded, poses.loaded)):
+            left = np.flatnonzero(counts & ~found)
+            if not len(own) or not len(left):
+                continue
+            requests = pool.getGeometryData(0).collisionRequests
+            for request, margin in zip(requests, margins[own], strict=True):
+                request.security_margin = margin
+            rows = configuration[left].T
+            found[left] = np.array(pin.computeCollisionsInParallel(1, pool, rows, True))
         return found
 
 
-class Batch:
-    """Pairs of a geometry model, tested for many configurations at once in C++."""
+def _pool(model: Any, geometry: Any, pairs: Sequence[Pair]) -> Any:
+    """Pairs of a geometry model, to be tested for many configurations at once in C++."""
+    import pinocchio as pin
 
-    def __init__(self, model: Any, geometry: Any, pairs: Sequence[Pair]) -> None:
-        import pinocchio as pin
+    geometry = geometry.copy()
+    for pair in pairs:
+        a, b = (geometry.getGeometryId(name) for name in pair.names)
+        geometry.addCollisionPair(pin.CollisionPair(a, b))
+    return pin.GeometryPool(model, geometry, 1)
 
-        self._margins = np.array([pair.margin for pair in pairs])
-        if not pairs:
-            return
-        geometry = geometry.copy()
-        for pair in pairs:
-            a, b = (geometry.getGeometryId(name) for name in pair.names)
-            geometry.addCollisionPair(pin.CollisionPair(a, b))
-        self._pool = pin.GeometryPool(model, geometry, 1)
 
-    def hits(self, configuration: Array, extra: Array) -> BoolArray:
-        """(N,) for configurations (N, nq); `extra` m is added to each pair's margin."""
-        import pinocchio as pin
-
-        if not len(self._margins) or not len(configuration):
-            return np.zeros(len(configuration), dtype=bool)
-        requests = self._pool.getGeometryData(0).collisionRequests
-        for request, margin in zip(requests, self._margins + extra, strict=True):
-            request.security_margin = margin
-        return np.array(pin.computeCollisionsInParallel(1, self._pool, configuration.T, True))
+def hits_by_pair(
+    kinematics: Kinematics, pairs: Sequence[Pair], poses: Poses, extra: float = 0.0
+) -> dict[str, BoolArray]:
+    """ "link3 and wall" → (N,): that pair is too near."""
+    return {
+        " and ".join(pair.names): Collisions(kinematics, [pair]).hits(poses, extra)
+        for pair in pairs
+    }
 
 
 def arm_model(kinematics: Kinematics, free: int = 0) -> Any:

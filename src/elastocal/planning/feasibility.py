@@ -21,6 +21,7 @@ from elastocal.planning.collision import (
     Poses,
     Sight,
     StaticTorque,
+    hits_by_pair,
     incidence,
     marker_positions,
     rope_angle,
@@ -144,10 +145,7 @@ class KeepApart(Rule):
         return self._collisions.hits(poses, POSE_SLACK)
 
     def causes(self, poses: Poses) -> dict[str, BoolArray]:
-        return {
-            " and ".join(pair.names): Collisions(self._kinematics, [pair]).hits(poses, POSE_SLACK)
-            for pair in self._pairs
-        }
+        return hits_by_pair(self._kinematics, self._pairs, poses, POSE_SLACK)
 
     def remedy(self, poses: Poses) -> str:
         text = super().remedy(poses)

@@ -13,7 +13,7 @@ from scipy.sparse import csgraph
 
 from elastocal.cell.plan_wishes import Motion
 from elastocal.errors import InputError, InsufficientDataError
-from elastocal.planning.collision import Collisions
+from elastocal.planning.collision import hits_by_pair
 from elastocal.planning.feasibility import LOADED, Feasibility
 from elastocal.units import Array, BoolArray, IntArray
 
@@ -369,12 +369,8 @@ def blockers_of(rules: Feasibility) -> BlockersOf:
     def met(q_from: Array, q_to: Array, loaded: bool) -> Sequence[str]:
         step = np.linspace(0.0, 1.0, SAMPLES)[:, None]
         poses = rules.kinematics.poses(q_from + step * (q_to - q_from), LOADED * loaded)
-        found = []
-        for pair in rules.pairs:
-            hits = Collisions(rules.kinematics, [pair]).hits(poses)
-            if hits.any():
-                found.append((int(np.argmax(hits)), " and ".join(pair.names)))
-        return [name for _, name in sorted(found)]
+        hits = hits_by_pair(rules.kinematics, rules.pairs, poses)
+        return sorted((name for name in hits if hits[name].any()), key=lambda n: hits[n].argmax())
 
     return met
 

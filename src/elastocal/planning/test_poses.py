@@ -179,15 +179,11 @@ def _layout(source: str, header: Sequence[str], joint_kinds: Sequence[str]) -> L
                 f"{source}: column {quoted(family[0].header)} has no meaning in a path; drop it, "
                 "or start its name with '#', '_' or 'note' to have it ignored"
             )
-    if in_joints and ("rotation" in columns or "quaternion" in columns):
-        other = columns["rotation" if "rotation" in columns else "quaternion"][0].header
+    others = [columns[name][0].header for name in TAKEN[1:4] if in_joints and name in columns]
+    if others:
         raise InputError(
-            f"{source}: {columns['q'][0].header} … says the rotation too; drop {other} …"
-        )
-    if in_joints and "position" in columns:
-        raise InputError(
-            f"{source}: {columns['q'][0].header} … and {columns['position'][0].header} … say the "
-            "same in two ways; keep the joints or the positions"
+            f"{source}: {columns['q'][0].header} … and {others[0]} … say the same in two ways; "
+            "keep the joints or the positions"
         )
     if not in_joints and "position" not in columns:
         joints = next(iter(families(joint_kinds)["q"].units), "q1")
