@@ -51,7 +51,7 @@ def all_values(problem):
 
 def by_cone(problem, name):
     """The relaxed optimum by clarabel (Boyd & Vandenberghe, Convex Optimization, ch. 7.5)."""
-    A, one = problem.matrices(np.arange(problem.n_candidates)), problem.criterion
+    A, one = problem.matrices(np.arange(len(problem.blocks))), problem.criterion
     w = cp.Variable(len(A), nonneg=True)
     p = A.shape[1]
     M = problem.prior + cp.reshape(A.reshape(len(A), -1).T @ w, (p, p), order="C")

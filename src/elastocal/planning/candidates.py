@@ -157,10 +157,11 @@ NO_LEVEL = "level"  # the rule that a pose brought along breaks where it stands 
 
 
 def brought(
-    cell: Cell, chain: Chain, forces: Array, checker: Feasibility, table: Measurements
-) -> tuple[Candidates, list[str], dict[str, str]]:
-    """The poses of a table that the cell allows, the name of each, and of those refused the rule
-    that each breaks first.  A pose that stands in several rows is one.
+    cell: Cell, chain: Chain, forces: Array, checker: Feasibility, table: Measurements,
+    pins: Pins | None,
+) -> tuple[Candidates, list[str], str]:  # fmt: skip
+    """The poses of a table that the cell allows, but for those that stay anyhow, the name of each,
+    and which are refused.  A pose that stands in several rows is one.
 
     Raises InsufficientDataError where none is allowed, with the rule to relax.
     """
@@ -169,36 +170,39 @@ def brought(
     order = np.argsort(first, kind="stable")
     q = table.q[first[order]].copy()
     names = [table.configuration_labels[k] for k in table.configuration[first[order]]]
-    group = np.zeros(len(q), dtype=np.int64)
-    refused: dict[str, str] = {}
+    group, off = np.zeros(len(q), dtype=np.int64), np.zeros(len(q))
     if space.held is not None:
         away = np.abs(q[:, [space.held]] - np.array(space.levels))
-        group = away.argmin(axis=1)
+        group, off = away.argmin(axis=1), away.min(axis=1)
         q[:, space.held] = np.array(space.levels)[group]
-        refused = {names[k]: NO_LEVEL for k in np.flatnonzero(away.min(axis=1) > LEVEL_SLACK)}
-    at_level = np.array([name not in refused for name in names], dtype=bool)
-    lots, verdicts, told = [], [], []
-    for level in range(space.n_groups):
-        own = np.flatnonzero(at_level & (group == level))
-        lot, verdict = _check(checker, forces, level, q[own])
-        lots.append(lot)
-        verdicts.append(verdict)
-        told += [names[i] for i in own[verdict.ok]]
-        for i, broken in zip(own[~verdict.ok], verdict.broken[~verdict.ok], strict=True):
-            refused[names[i]] = verdict.rules[int(broken.argmax())]
-    found = Candidates.join(lots)
-    found.removed_by[NO_LEVEL] = int((~at_level).sum())
-    found = replace(found, tried=found.tried + int((~at_level).sum()))
-    if not len(found.q):
-        where = f"{table.source}: the cell allows none of its {len(q)} poses"
-        if not at_level.any():
-            joint = f"joint{(space.held or 0) + 1}"
-            raise InsufficientDataError(
-                f"{where}, as none stands at a level of {joint}; bring poses at the levels of "
-                "[design.levels], or drop these"
-            )
-        raise InsufficientDataError(f"{where}; {checker.advice(PoseFeasibility.join(verdicts))}")
-    return found, told, refused
+    own = np.flatnonzero(off <= LEVEL_SLACK)
+    own = own[np.argsort(group[own], kind="stable")]
+    verdict = checker.under(q[own], forces)
+    where = f"{table.source}: the cell allows none of its {len(q)} poses"
+    if not len(own):
+        raise InsufficientDataError(
+            f"{where}, as none stands at a level of joint{(space.held or 0) + 1}; bring poses at "
+            "the levels of [design.levels], or drop these"
+        )
+    if not verdict.ok.any():
+        raise InsufficientDataError(f"{where}; {checker.advice(verdict)}")
+    refused = {NO_LEVEL: [names[k] for k in np.flatnonzero(off > LEVEL_SLACK)]}
+    for k, broken in zip(own[~verdict.ok], verdict.broken[~verdict.ok], strict=True):
+        rule = verdict.rules[int(broken.argmax())].replace("_", " ")
+        refused.setdefault(rule, []).append(names[k])
+    told = "; ".join(f"{rule} ({listed(by)})" for rule, by in refused.items() if by)
+    ok, removed = own[verdict.ok], verdict.removed_by | {NO_LEVEL: len(q) - len(own)}
+    if told:
+        told = (
+            f"{table.source}: {len(q) - len(ok)} of {len(q)} poses are refused, by the rule that "
+            f"each breaks first: {told}"
+        )
+    new = ok
+    if pins is not None and len(pins.q):
+        near = np.abs(q[ok, None] - pins.q[None]).max(axis=2).min(axis=1) < LEVEL_SLACK
+        new = ok[~near]
+    found = Candidates(q[new], group[new], len(q), len(ok), removed)
+    return found, [names[k] for k in new], told
 
 
 def sobol(space: JointSpace, group: int, stream: np.random.SeedSequence) -> Iterator[Array]:

@@ -2,10 +2,10 @@
 
 from __future__ import annotations
 
+import json
 from collections.abc import Callable
-from dataclasses import dataclass, field, replace
+from dataclasses import asdict, dataclass, field, replace
 from itertools import count
-from pathlib import Path
 from typing import Literal, get_args
 
 import numpy as np
@@ -19,7 +19,6 @@ from elastocal.measurements import Measurements
 from elastocal.model.effects.catalogue import effect_of
 from elastocal.model.manipulator import Model
 from elastocal.planning.candidates import (
-    LEVEL_SLACK,
     NO_LEVEL,
     Candidates,
     Pins,
@@ -323,62 +322,37 @@ class _Design:
 
     def _candidates(self) -> tuple[Array, IntArray, CandidateCounts]:
         state = self.checkpoint.finished("candidates", self._drawn)
-        tried, feasible = (int(v) for v in state["tried"])
-        removed = dict(zip(state["rules"].tolist(), state["removed"].tolist(), strict=True))
-        counts = CandidateCounts(tried, feasible, removed)
         names = zip(state["q"], state["names"], strict=False)  # of those brought, which come first
         self.taught = {q.tobytes(): str(name) for q, name in names}
         if told := str(state["told"]):
             self.warnings.append(told)
-        return state["q"], state["group"], counts
+        return state["q"], state["group"], CandidateCounts(**json.loads(str(state["counts"])))
 
     def _drawn(self) -> State:
         spec, asked = self.cell.design, (self.cell, self.chain, self.forces, self.feasibility)
         lots: list[Candidates] = []
         names: list[str] = []
-        told = ""
+        told, options = "", self.options
         if spec.taught is not None:
-            own, names, told = self._brought(spec.taught)
+            self.progress(f"checking the poses of {spec.taught}")
+            table = self.model.read_plan(spec.taught)
+            own, names, told = brought(*asked, table, options.pins)
             lots.append(own)
         if spec.taught is None or spec.candidates is not None:
             self.progress("drawing candidates")
-            options, n = self.options, spec.candidates or 1
+            n = spec.candidates or 1
             lots.append(draw(*asked, n, options.seed, options.jobs, self.progress))
         if len(lots) > 1:
             lots[1].removed_by[NO_LEVEL] = 0
         drawn = Candidates.join(lots)
+        counts = CandidateCounts(drawn.tried, drawn.feasible, drawn.removed_by)
         return {
-            "names": np.array(names, dtype=np.str_),
-            "told": np.array(told),
             "q": drawn.q,
             "group": drawn.group,
-            "tried": np.array([drawn.tried, drawn.feasible]),
-            "rules": np.array(list(drawn.removed_by), dtype=np.str_),
-            "removed": np.array(list(drawn.removed_by.values()), dtype=np.int64),
+            "names": np.array(names, dtype=np.str_),
+            "told": told,
+            "counts": json.dumps(asdict(counts)),
         }
-
-    def _brought(self, path: Path) -> tuple[Candidates, list[str], str]:
-        """The poses of a file that the cell allows, but for those that stay anyhow; their names;
-        which were refused."""
-        self.progress(f"checking the poses of {path}")
-        table = self.model.read_plan(path)
-        found, names, refused = brought(self.cell, self.chain, self.forces, self.feasibility, table)
-        by_rule: dict[str, list[str]] = {}
-        for name, rule in refused.items():
-            by_rule.setdefault(rule.replace("_", " "), []).append(name)
-        told = "; ".join(f"{rule} ({listed(own)})" for rule, own in by_rule.items())
-        if told:
-            told = (
-                f"{path}: {len(refused)} of {len(refused) + len(set(names))} poses are refused, by "
-                f"the rule that each breaks first: {told}"
-            )
-        pins = self.options.pins
-        if pins is not None and len(pins.q):
-            near = np.abs(found.q[:, None] - pins.q[None]).max(axis=2).min(axis=1) < LEVEL_SLACK
-            kept = np.flatnonzero(~near)
-            found = replace(found, q=found.q[kept], group=found.group[kept])
-            names = [names[k] for k in kept]
-        return found, names, told
 
     def _curve(self, setup: Setup, pool: FeasiblePool) -> tuple[PlanSize, ...]:
         """The criterion against the numbers of poses that are asked for."""

@@ -46,10 +46,6 @@ class DesignProblem:
     source: str = ""
 
     @property
-    def n_candidates(self) -> int:
-        return len(self.blocks)
-
-    @property
     def n_poses(self) -> int:
         return int(self.shares.sum())
 

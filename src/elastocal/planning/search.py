@@ -397,7 +397,7 @@ class _Ordering:
         some = np.setdiff1d(np.concatenate(pool), gone)
         if (np.bincount(problem.group[some], minlength=len(problem.shares)) < problem.shares).any():
             # It is said once all have gone.
-            some = np.setdiff1d(np.arange(problem.n_candidates), gone)
+            some = np.setdiff1d(np.arange(len(problem.blocks)), gone)
         part = problem.restricted(some)
         return {"chosen": some[exchange(part, fitted(part, np.searchsorted(some, kept)))[0]]}
 
