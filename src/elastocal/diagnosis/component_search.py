@@ -34,7 +34,6 @@ from elastocal.diagnosis.components import (
     log_odds,
     posed,
     presence_cost,
-    with_own_noise,
 )
 from elastocal.diagnosis.diagnosis_data import DiagnosisData
 from elastocal.diagnosis.effect_search import about
@@ -124,7 +123,7 @@ def search_components(
         found = wider
     progress("what can be left out")
     found = _swapped(full, with_own_axes(found), tried)
-    found = completed(with_shorter_drifts(full, _spared(found)), tried)
+    found = completed(with_shorter_drifts(full, found), tried)
     for _ in range(TWICE if few else 0):
         before = with_likelier_orders(full, with_expected_families(full, found))
         # Which of two laws the last move follows shows where the lines are right.
@@ -149,7 +148,7 @@ def _with_lines_first(
     if curved:
         alone = fit_sum(found.sums.data, others, instrument)
         first, pool = _swapped(dataset, alone, others), others
-    first = begun = _spared(completed(first, pool))
+    first = begun = completed(first, pool)
     for _ in range(TWICE):
         before = first
         first = completed(_with_lines(dataset, first), tried)
@@ -361,20 +360,6 @@ def size_of_fellows(found: FittedSum, c: Component) -> float:
 CHANCE = 0.05  # probability from which what is not shown is reckoned with
 
 
-def _spared(found: FittedSum) -> FittedSum:
-    """The sum without what the others can stand in for, once their sizes have followed."""
-    spared = 0
-    order = np.argsort(found.earned - found.costs)
-    for c in [found.components[k] for k in order[:SPARED]]:
-        if c.given or not any(c is other for other in found.components):
-            continue
-        fitted = exchanged(found, [c], refit_noise=False)
-        if fitted.score > found.score:
-            found, spared = fitted, spared + 1
-    return _refitted(found) if spared else found
-
-
-SPARED = 6  # components that are tried to be left out, those first that earn least
 TRIED = 3  # families that are tried, the best first, before a search is given up
 
 
@@ -583,7 +568,7 @@ def completed(found: FittedSum, components: Sequence[Component]) -> FittedSum:
             shown |= set(present)
         else:
             away = {n: more for n, more in away.items() if n in shown or present[n]}
-        better, wider = None, {}
+        better = None
         for name, more in away.items():
             for instead in (None, *(n for n in kinds if n != name and present[n])):
                 gone = [c for c in found.components if c.effect.name == instead]
@@ -592,33 +577,15 @@ def completed(found: FittedSum, components: Sequence[Component]) -> FittedSum:
                 if not more or hopeless or (gone and not alike) or any(c.given for c in gone):
                     continue
                 fitted = exchanged(found, gone, more, refit_noise=False)
-                if instead is None:
-                    wider[name] = fitted
                 if fitted.score > (found if better is None else better).score + GAINED:
                     better = fitted
         if better is None:
-            # What a kind does at all joints counts as their scatter as long as it is not there.
-            hidden = (name for name, more in away.items() if more and more[0].family in OF_JOINTS)
-            fits = (
-                wider.get(name) or exchanged(found, [], away[name], refit_noise=False)
-                for name in hidden
-            )
-            # Of many kinds nothing is left: the same sum, under the noise that it has.
-            ends: dict[frozenset[int], FittedSum] = {}
-            for fit in sorted(fits, key=lambda fit: fit.score):
-                ends[frozenset(map(id, fit.components))] = fit
-            ends.pop(frozenset(map(id, found.components)), None)
-            better = max(
-                map(with_own_noise, ends.values()), key=lambda fit: fit.score, default=found
-            )
-            if better.score <= found.score + GAINED:
-                break
+            break
         found = _refitted(better)
     return replace(found, complete=components)
 
 
 COMPLETED = 3
-OF_JOINTS = ("angle", "move")
 
 
 def _kinds_that_show(

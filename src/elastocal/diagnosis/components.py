@@ -575,10 +575,6 @@ def fit_sum(
     return _at_maximum(problem, at)
 
 
-def with_own_noise(found: FittedSum) -> FittedSum:
-    return _at_maximum(_under_own_noise(found.sums, found.sizes), found.sizes)
-
-
 def _under_own_noise(problem: SumOfComponents, at: Sizes) -> SumOfComponents:
     data = problem.data
     noise = _noise_beside(data, problem.components, at, problem.noise)

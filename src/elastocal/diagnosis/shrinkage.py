@@ -128,7 +128,6 @@ def _fitted_steps(dataset: DiagnosisData) -> Iterator[tuple[str, NoisyData]]:
 
 BOOTSTRAP_DRAWS = 400
 NEW_POSES = 100  # in the set that the intervals are for
-NUDGE = 0.01  # of a setting's grid step: a difference quotient in constants that are not parameters
 WORTH_A_DRAW = 0.01  # probability from which a rival may be drawn as true
 
 
@@ -265,13 +264,13 @@ class Confirmation:
         dataset, chosen, scales = self.dataset, self.chosen, self.chosen.scales
         predicted = self._before([n for n in self._known if n != k]), self._after
         truths = [
-            self._truth(self._instead(k, item), scales, k, rivals[0][1] * share)
+            self._truth(self._instead(k, item), scales, rivals[0][1] * share)
             for item, share in other_settings(dataset, chosen, k)
         ]
         for item, share in rivals[1:]:
             if share >= WORTH_A_DRAW and item.known:
                 rival = fit_set(dataset, self._instead(k, item), chosen.noise)
-                truths.append(self._truth(rival.items, rival.scales, k, share))
+                truths.append(self._truth(rival.items, rival.scales, share))
         pose, change = np.nonzero(self._used)[0], between_visits(dataset, chosen, k)
         return shrinkage(predicted, truths, pose, stays, change, rng)
 
@@ -318,16 +317,10 @@ class Confirmation:
         data = with_items(self.dataset, items, _wide([chosen.scales[n] for n in members]))
         return data, project(data, chosen.noise.of_instrument())
 
-    def _truth(
-        self, items: tuple[Item, ...], scales: Sequence[float], k: int, probability: float
-    ) -> Truth:
+    def _truth(self, items: tuple[Item, ...], scales: Sequence[float], probability: float) -> Truth:
         """If that set is true."""
         data, noise = with_items(self.dataset, items, _wide(scales)), self.chosen.noise
         at = project(data, noise)
-        slopes = self._by_constants(items[k], at.beta[self._span(items, k)])
-        if slopes.shape[2]:
-            data = data.with_columns(slopes, np.ones(slopes.shape[2]))
-            at = project(data, noise)
         # What has no name stays with both models, and is told by its size.
         own = np.ones(data.X.shape[2], dtype=bool)
         for n, other in enumerate(items):
@@ -353,25 +346,6 @@ class Confirmation:
     def _of_readings(self, variance: Array) -> Array:
         """Of packed covariances (C, m, m) the sum (readings,) over a reading's components."""
         return np.asarray(self._lengths(np.diagonal(variance, axis1=1, axis2=2)).sum(axis=1))
-
-    def _by_constants(self, item: Item, beta: Array) -> Array:
-        """Difference quotients (C, m, k) in the item's constants that vary smoothly, each by the
-        step of the grid it was searched on: it is not known better than the data tell."""
-        what, dataset, out = item.what, self.dataset, [np.zeros((*self.dataset.data.r.shape, 0))]
-        assert isinstance(what, Hypothesis)
-        for s, setting in enumerate(what.settings):
-            if setting.kind == "change_time":
-                continue
-            grid = dataset.grids[what.key]
-            step = float(grid.step[grid.nearest(item.settings), s])
-            # At a bound, where the search may well end, the quotient is one-sided.
-            near = item.settings[s] + NUDGE * step * np.array([1.0, -1.0])
-            near = np.clip(near, setting.lower, setting.upper)
-            up, down = np.tile(item.settings, (2, 1))
-            up[s], down[s] = near
-            moved = dataset.packed(what, up) @ beta - dataset.packed(what, down) @ beta
-            out.append(dataset.data.masked(moved)[:, :, None] * step / (near[0] - near[1]))
-        return np.concatenate(out, axis=2)
 
     @cached_property
     def unnamed(self) -> float:
