@@ -20,7 +20,6 @@ from elastocal.model.effects.loads import STANDARD_GRAVITY
 from elastocal.model.effects.placements import transverse_axes
 from elastocal.model.mjcf import SPRING, MjcfArm, import_mujoco, mjcf_bytes, transform
 from elastocal.model.xml_file import Tag, XmlText, comment, element
-from elastocal.text import listed
 from elastocal.units import Array
 
 # Each joint is a hinge or slide that a position actuator drives: its control is the commanded
@@ -456,12 +455,10 @@ class _MjcfText(XmlText):
         if np.abs(self.model.opt.gravity - wanted).max() >= SMALLEST:
             self.set_in(self.tags[0], "option", {"gravity": numbers(wanted)})
         told += self.enable("gravity")
-        moved = [b for b in range(1, self.model.nbody) if self.arm.carrier(b) is not None]
-        held = [b for b in moved if self.model.body_gravcomp[b]]
-        for b in held:
+        for b in (held := self.arm.weightless()):
             self.set(self.bodies[b], {"gravcomp": "0"})
         if held:
-            names = listed((self.model.body(b).name or f"body {b}" for b in held), 4)
+            names = self.arm.named(held)
             told.append(f"gravcomp of {names} is 0 in this file, so that weights bend the springs")
         return told
 

@@ -326,17 +326,9 @@ class NumberCells:
             if "." in text:
                 raise ValueError(cell)
             text = text.replace(",", ".")
-        try:
-            number = float(text)
-        except ValueError:
-            if text.casefold() in self.missing:
-                return None
-            raise
-        if "_" in text:  # float takes 1_000
-            raise ValueError(cell)
-        if math.isnan(number):
+        if text.casefold() in self.missing:
             return None
-        if math.isinf(number):
+        if not NUMBER.fullmatch(text) or math.isinf(number := float(text)):
             raise ValueError(cell)
         return number
 

@@ -158,6 +158,14 @@ class MjcfArm:
         """A joint's name, joint1 … in the order of the chain where the file gives none."""
         return self.model.joint(j).name or f"joint{self.joints.index(j) + 1}"
 
+    def named(self, bodies: Iterable[int]) -> str:
+        return listed((self.model.body(b).name or f"body {b}" for b in bodies), 4)
+
+    def weightless(self) -> list[int]:
+        """Moved bodies whose weight `gravcomp` of the file carries."""
+        bodies = range(1, self.model.nbody)
+        return [b for b in bodies if self.carrier(b) is not None and self.model.body_gravcomp[b]]
+
     def local(self, body: int) -> Array:
         """T_parent_body (4, 4) with all joints at `ref`."""
         return transform(self.model.body_pos[body], self.model.body_quat[body])
@@ -282,10 +290,8 @@ class MjcfArm:
                 f"the file's gravity is {size:.4g} m/s², while weights act here with "
                 f"{STANDARD_GRAVITY:.4g} m/s²"
             )
-        moved = [b for b in range(1, model.nbody) if self.carrier(b) is not None]
-        held = [b for b in moved if model.body_gravcomp[b]]
-        if held:
-            names = listed((model.body(b).name or f"body {b}" for b in held), 4)
+        if held := self.weightless():
+            names = self.named(held)
             found.append(
                 f"gravcomp of the file carries the weight of {names}: in MuJoCo nothing sags "
                 "there, while link_gravity = true bends the joints"
