@@ -4,7 +4,8 @@ import numpy as np
 import pytest
 from scipy import optimize, stats
 
-from elastocal.identification.smooth_functions import LinearRows, Scales, Sums
+from elastocal.identification.smooth_functions import LinearRows, Scales
+from elastocal.identification.weighted_problem import RFactor
 
 ROWS, FREE, SHRUNK = 80, 4, 15
 GROUP = np.repeat([0, 1, 2], 5)
@@ -23,7 +24,7 @@ def drawn(seed: int, scale: tuple[float, ...] = (1.0, 1.0, 1.0), sigma: float = 
 
 def linear(B, e, away=None) -> LinearRows:
     away = np.zeros(SHRUNK) if away is None else away
-    return LinearRows.summed(Sums.of(B, e, FREE), away, STD, GROUP)
+    return LinearRows.of(RFactor.of(B, e), away, STD, GROUP)
 
 
 def marginal(B, e, scales: Scales, kept: np.ndarray) -> tuple[np.ndarray, float]:

@@ -62,8 +62,8 @@ def held_out_by_parts(
     """The same with the model linearised at x, a part at a time, and the leverage (rows,) of each.
 
     `half` (columns, q) with half · halfᵀ the cofactor of the estimates: R⁻¹ of the whitened B, or
-    the directions in which constraints let them move.  `step` (columns,) is the Gauss–Newton step
-    to the linear model's minimum, where x is not it.
+    the directions in which constraints let them move.  `step` (parameters,) is the Gauss–Newton
+    step to the linear model's minimum, where x is not it.
     """
     held, leverage = np.empty((2, len(parts.observed.value)))
     together = parts.weights.together
@@ -71,7 +71,10 @@ def held_out_by_parts(
     def leave_out(span: Span) -> None:
         part = parts.part(span)
         at = regressor(model, part, x, columns)
-        residual = at.residual if step is None else at.residual - at.B @ step
+        residual = at.residual
+        if step is not None:
+            moved = np.flatnonzero(step)
+            residual = residual - regressor(model, part, x, moved).B @ step[moved]
         B = at.B @ half
         Q, e = part.weights.apply(B), part.weights.apply(residual)
         labels = part.observations.configuration if together is None else together

@@ -14,8 +14,6 @@ exactly under the model, the smooth functions as random as their prior says.
 from __future__ import annotations
 
 from dataclasses import dataclass, replace
-from functools import reduce
-from typing import NamedTuple
 
 import numpy as np
 from scipy import linalg, sparse, special
@@ -30,14 +28,12 @@ from elastocal.identification.noise_choice import NoiseFit, linearised, weights_
 from elastocal.identification.noise_structure import Readings
 from elastocal.identification.options import Options, check_for_functions
 from elastocal.identification.outliers import FALSE_ALARM, NoiseAndOutliers, settle
-from elastocal.identification.residuals import rms_3d
+from elastocal.identification.residuals import ALONE, held_out_by_parts, rms_3d
 from elastocal.identification.smooth_functions import (
     LinearRows,
     Scales,
     ShrunkPosterior,
-    ShrunkProblem,
     SmoothPart,
-    Sums,
 )
 from elastocal.identification.solve import (
     WORTH_A_COLUMN,
@@ -50,10 +46,10 @@ from elastocal.identification.solve import (
 from elastocal.identification.weighted_problem import (
     Part,
     Partition,
-    Span,
+    RFactor,
     Weights,
     each,
-    in_order,
+    evaluate,
     partition,
     regressor,
     same_size,
@@ -73,7 +69,6 @@ ROUNDS = 5
 # differ by less than this share of themselves.
 SAME_POSE, ALIKE = 0.8, 0.5
 STILL = 0.05  # relative change of the noise at which the rounds end
-ALONE = 1e-9  # share of a direction that other configurations and the prior must see
 # Logarithms of the likelihood ratio: below the first the readings do not show a function at all,
 # above the second no doubt is left that it is there.
 LEAST_GAIN, CERTAIN = 0.01, 50.0
@@ -161,7 +156,8 @@ class JointFit:
     def linear(self, scales: Scales) -> tuple[JointFit, Array]:
         """The posterior of other sizes, the model linearised at this x, and the step (parameters,)
         to its minimum."""
-        posterior = _shrunk(self.problem, self.free, self.reduction.kept).posterior(scales)
+        kept = np.searchsorted(self.problem.free, self.reduction.kept)
+        posterior = self.free.only(kept).posterior(scales)
         other = replace(self, scales=scales, posterior=posterior)
         return other, _moved(other, posterior)[0] - self.x
 
@@ -179,40 +175,42 @@ def joint_fit(
     """
     columns = np.concatenate([problem.free, functions.columns])
     parts = partition(problem.observations, problem.weights, len(columns))
+    stated = functions.std, functions.group
 
-    def at(x: Array) -> tuple[Array, Sums]:
-        return _summed(problem, parts, x, columns)
+    def at(x: Array) -> tuple[Array, RFactor, LinearRows]:
+        found = evaluate(problem.model, parts, x, columns)
+        away = x[functions.columns] - functions.nominal
+        return found.residual, found.r_factor, LinearRows.of(found.r_factor, away, *stated)
 
     x = _started(problem, functions, x, reduction)
     if scales is not None:
         gone = functions.columns[(scales.scale == 0)[functions.group]]
         x[gone] = problem.model.nominal[gone]
-    residual, sums = at(x)
+    residual, factor, free = at(x)
     rounds = CHOICES if scales is None else 1
     steps = 0
     while True:
-        free = _from_nominal(problem, functions, x, sums)
         while rounds > 0:
             rounds -= 1
-            scales = _shrunk(problem, free, reduction.kept).scales(scales)
+            scales = free.only(np.searchsorted(problem.free, reduction.kept)).scales(scales)
             if not choosing:
                 break
             again = _chosen(problem, sizes, free, scales)
             if np.array_equal(again.kept, reduction.kept):
                 break
             reduction, x = again, _started(problem, functions, x, again)
-            residual, sums = at(x)
-            free = _from_nominal(problem, functions, x, sums)
+            residual, factor, free = at(x)
         assert scales is not None
-        reduction = reduction.seen(problem.free, free.R, sizes)
-        posterior = _shrunk(problem, free, reduction.kept).posterior(scales)
+        reduction = reduction.seen(problem.free, free.factor.R, sizes)
+        kept = np.searchsorted(problem.free, reduction.kept)
+        posterior = free.only(kept).posterior(scales)
         now = JointFit(
             problem, parts, functions, reduction, x, residual, scales, posterior, free, False, steps
         )
         moved, gain = _moved(now, posterior)
         if gain <= SETTLED or steps >= STEPS:
             return replace(now, converged=gain <= SETTLED)
-        cost = _cost(now, x, sums)
+        cost = _cost(now, x, factor)
         for _ in range(HALVINGS):
             steps += 1
             try:
@@ -224,36 +222,13 @@ def joint_fit(
             moved = (x + moved) / 2
         else:
             return replace(now, converged=gain <= ROUGH)
-        x, (residual, sums) = moved, there
-
-
-def _summed(problem: Problem, parts: Partition, x: Array, columns: IntArray) -> tuple[Array, Sums]:
-    """Residual (rows,) at x, and the sums over whitened rows."""
-    residual = np.empty(len(problem.observations.value))
-
-    def summed(part: Part) -> Sums:
-        found = regressor(problem.model, part, x, columns)
-        residual[part.rows] = found.residual
-        apply = part.weights.apply
-        return Sums.of(apply(found.B), apply(found.residual), len(problem.free))
-
-    return residual, reduce(Sums.merged, each(parts, summed))
+        x, (residual, factor, free) = moved, there
 
 
 def _chosen(problem: Problem, sizes: Array, free: LinearRows, scales: Scales) -> Reduction:
     """The ordinary parameters that are worth a column beside the functions."""
-    marginal = free.only(np.arange(len(problem.free))).posterior(scales).marginal
+    marginal = free.posterior(scales).marginal
     return choose(problem, sizes, marginal, float(np.sqrt(scales.variance)), WORTH_A_COLUMN)
-
-
-def _shrunk(problem: Problem, free: LinearRows, kept: IntArray) -> ShrunkProblem:
-    return free.only(np.searchsorted(problem.free, kept))
-
-
-def _from_nominal(problem: Problem, functions: Functions, x: Array, sums: Sums) -> LinearRows:
-    """The linear problem whose residual is that of nominal functions."""
-    away = x[functions.columns] - functions.nominal
-    return LinearRows.summed(sums, away, functions.std, functions.group)
 
 
 def _started(problem: Problem, functions: Functions, x: Array, reduction: Reduction) -> Array:
@@ -283,73 +258,51 @@ def _moved(now: JointFit, posterior: ShrunkPosterior) -> tuple[Array, float]:
     return x, float(way @ way) / posterior.variance
 
 
-def _cost(now: JointFit, x: Array, sums: Sums) -> float:
+def _cost(now: JointFit, x: Array, factor: RFactor) -> float:
     """Sum of squares of readings and prior at x."""
     f, posterior = now.functions, now.posterior
     b = (x[f.columns] - f.nominal)[posterior.own]
-    return sums.own.rss + float(np.sum((posterior.prior * b) ** 2))
+    return factor.rss + float(np.sum((posterior.prior * b) ** 2))
 
 
-# What each configuration says beside the others: one pass over the table.
+# What each configuration says beside the others.
 
 
-class Crossed(NamedTuple):
-    """Of every row: the residual under a fit to the other configurations, in m or rad (infinite
-    where there is none), its leverage, and the residual free of the fit's part in it, in m or rad.
-    """
-
-    held_out: Array
-    leverage: Array
-    standard: Array
-
-
-def crossed(fit: JointFit, step: Array | None = None) -> Crossed:
-    """The configurations of the fit, left out one by one in closed form.
+def crossed(fit: JointFit, step: Array | None = None) -> tuple[Array, Array]:
+    """Residual (rows,) of each configuration under a fit to the others, in m or rad (infinite where
+    there is none), and leverage (rows,) of each.
 
     `step` (parameters,) leads from the fit's x to the minimum of the model linearised there,
     where x itself is none.
     """
-    return _seen(fit, fit.parts, -1, step)
+    half = linalg.lapack.dtrtri(fit.posterior.R)[0]
+    return held_out_by_parts(fit.problem.model, fit.parts, fit.x, fit.columns, half, step)
 
 
-def left_out(fit: JointFit, observed: Observations, weights: Weights) -> Array:
-    """Residuals (rows,) of observations that had no part in the fit, in m or rad, free of the
-    fit's uncertainty."""
-    return _seen(fit, partition(observed, weights, len(fit.columns)), 1, None).standard
+def standardised(fit: JointFit, others: Observations | None, weights: Weights) -> Array:
+    """Residuals (rows,) free of the fit's part in them, in m or rad: of the fit's own readings,
+    configuration by configuration, or of `others`, which vary by 1 + QQᵀ instead of 1 − QQᵀ."""
+    parts, side = fit.parts, -1
+    if others is not None:
+        parts, side = partition(others, weights, len(fit.columns)), 1
+    found, size = np.empty(len(parts.observed.value)), parts.observed.size
 
-
-def _seen(fit: JointFit, parts: Partition, side: int, step: Array | None) -> Crossed:
-    """Rows that vary by 1 + side · QQᵀ: of the fit (−1), by configurations, or others (1)."""
-    size = parts.observed.size
-    found = Crossed(*(np.empty(len(parts.observed.value)) for _ in range(3)))
-    moved = np.zeros(0, dtype=np.int64) if step is None else np.flatnonzero(step)
-
-    def one(span: Span) -> None:
-        part = parts.part(span)
-        at = regressor(fit.problem.model, part, fit.x, fit.columns)
-        residual = at.residual
-        if step is not None:
-            residual = residual - regressor(fit.problem.model, part, fit.x, moved).B @ step[moved]
-        e, Q = part.weights.apply(residual), _triangular(fit.posterior.R, part.weights.apply(at.B))
-        standard, growth, lost = np.empty(len(e)), np.empty(len(e)), np.zeros(len(e), dtype=bool)
-        own = part.observations
+    def one(part: Part) -> None:
+        at, own = regressor(fit.problem.model, part, fit.x, fit.columns), part.observations
+        e = part.weights.apply(at.residual)
+        Q, standard = _triangular(fit.posterior.R, part.weights.apply(at.B)), np.empty(len(e))
         labels = own.configuration if side < 0 else np.arange(len(own.lead))
         for rows in same_size(np.repeat(labels, size)):
             gap = np.eye(rows.shape[1]) + side * Q[rows] @ Q[rows].transpose(0, 2, 1)
             values, vectors = np.linalg.eigh(gap)
-            known = np.maximum(values, ALONE)
             turned = (vectors.transpose(0, 2, 1) @ e[rows][..., None])[..., 0]
-            standard[rows] = (vectors @ (turned / np.sqrt(known))[..., None])[..., 0]
-            growth[rows] = (vectors @ (turned / known)[..., None])[..., 0]
-            lost[rows[values[:, 0] < ALONE]] = True
-        # In the fit to the others the whitened residual is (1 − H_c)⁻¹ e_c.
-        held = _unwhitened(part.weights, growth)
-        held[lost] = np.inf
-        found.held_out[part.rows] = held
-        found.leverage[part.rows] = np.minimum((Q**2).sum(axis=1), 1.0)
-        found.standard[part.rows] = _unwhitened(part.weights, standard)
+            turned /= np.sqrt(np.maximum(values, ALONE))
+            standard[rows] = (vectors @ turned[..., None])[..., 0]
+        if part.weights.whiten is not None:
+            standard = sparse.linalg.spsolve(part.weights.whiten.tocsc(), standard)
+        found[part.rows] = standard
 
-    for _ in in_order(parts.spans, one):
+    for _ in each(parts, one):
         pass
     return found
 
@@ -358,12 +311,6 @@ def _triangular(R: Array, B: Array) -> Array:
     """B R⁻¹."""
     solved = linalg.solve_triangular(R, B.T, trans="T", check_finite=False)
     return np.ascontiguousarray(solved.T)
-
-
-def _unwhitened(weights: Weights, e: Array) -> Array:
-    if weights.whiten is None:
-        return e
-    return np.asarray(sparse.linalg.spsolve(weights.whiten.tocsc(), e))
 
 
 # The course: fit, noise and faulty readings in turn, then what else may change.
@@ -387,7 +334,7 @@ def fit_smooth(
         search = _Course(every, sound, Functions.of(model, free, sized), options, progress)
         fit, noise, good = search.settled(~faulty)
         fit, cross = search.without_those_that_harm(fit)
-        held = rms_3d(cross.held_out, size)
+        held = rms_3d(cross[0], size)
         tried.append((not fit.converged, held, search, (fit, cross, noise, good)))
         # A prior that leads astray predicts worse than the ordinary parameters alone.
         if not len(sized) or (fit.converged and held <= rms_3d(sound.heldout, size)):
@@ -484,10 +431,9 @@ class _Course:
         """Residuals (N, size) of all readings, free of the fit's part in them."""
         found = np.empty(self.standard.shape)
         shape = (-1, self.observed.size)
-        found[fitted] = crossed(fit).standard.reshape(shape)
-        if not fitted.all():
-            rest = subset(self.observed, ~fitted)
-            found[~fitted] = left_out(fit, rest, self.weights(noise, ~fitted)).reshape(shape)
+        for own in (fitted, ~fitted) if not fitted.all() else (fitted,):
+            rest = None if own is fitted else subset(self.observed, own)
+            found[own] = standardised(fit, rest, self.weights(noise, own)).reshape(shape)
         return found
 
     def judged(
@@ -534,7 +480,7 @@ class _Course:
         self.alike[suspects[alike.any(axis=1)]] = True
         return good | self.alike
 
-    def without_those_that_harm(self, fit: JointFit) -> tuple[JointFit, Crossed]:
+    def without_those_that_harm(self, fit: JointFit) -> tuple[JointFit, tuple[Array, Array]]:
         """Without the functions that the readings do not show, or that predict held-out
         configurations worse than none; the least supported is tried first."""
         size, scales, cross = self.observed.size, fit.scales, crossed(fit)
@@ -545,7 +491,7 @@ class _Course:
             scale[g] = 0.0
             there = crossed(*fit.linear(replace(scales, scale=scale)))
             shown = scales.gain[g] > LEAST_GAIN
-            if shown and rms_3d(there.held_out, size) > rms_3d(cross.held_out, size):
+            if shown and rms_3d(there[0], size) > rms_3d(cross[0], size):
                 continue
             if shown:
                 self.harmful.append(self.functions.groups[g].name)
@@ -559,7 +505,7 @@ class _Course:
         return fit, crossed(fit)
 
     def result(
-        self, fit: JointFit, cross: Crossed, noise: NoiseFit | None, good: BoolArray
+        self, fit: JointFit, cross: tuple[Array, Array], noise: NoiseFit | None, good: BoolArray
     ) -> tuple[MethodResult, FunctionPrior]:
         posterior, k = fit.posterior, fit.posterior.ordinary
         columns, effective = fit.columns, round(posterior.effective)
@@ -574,7 +520,7 @@ class _Course:
         mixing = np.zeros((len(columns), len(r.dropped)))
         mixing[:k] = r.mixing
         solution = replace(
-            self.sound, problem=fit.problem, fit=found, held=cross.held_out,
+            self.sound, problem=fit.problem, fit=found, held=cross[0],
             reduction=replace(
                 r, kept=columns, mixing=mixing, with_prior=fit.functions.columns
             ),
@@ -597,7 +543,7 @@ class _Course:
             method = "ols" if fit.problem.weights.kind == "none" else "wls"
         result = MethodResult(
             method, solution, intervals, noise, good, prior_share=self._shares(fit),
-            effective=effective, leverage=cross.leverage, warnings=self._warnings(fit),
+            effective=effective, leverage=cross[1], warnings=self._warnings(fit),
             smooth=self._parts(fit, covariance.matrix), standard=self.standard,
         )  # fmt: skip
         return result, self._prior(fit, spare)

@@ -5,8 +5,7 @@
 with whitened rows; α are the ordinary parameters, b the shrunk ones as deviations from nominal, s
 their standard deviations as declared and λ_g one scale for each group.  With [B_f B_s e] = QR the
 rows are needed no more: R_ss, below what the ordinary parameters take, holds all that decides σ²
-and λ (Patterson and Thompson 1971; Harville 1977).  Of the shrunk columns the products R_ssᵀR_ss
-suffice: their prior keeps every matrix well conditioned.
+and λ (Patterson and Thompson 1971; Harville 1977).
 """
 
 from __future__ import annotations
@@ -28,7 +27,6 @@ from elastocal.units import Array, IntArray
 # Scales λ beyond these are no longer told apart: nothing is left of the group, or of its prior.
 LEAST, MOST = 1e-3, 1e6
 SMALL = 0.05
-DEPENDENT = 1e-11  # singular value of unit columns, of the largest
 # Of log λ above 0: a function may be smaller than stated at no price, but ten times the size costs
 # what a likelihood ratio of 1e8 gains.  Data that hardly show a function know no upper limit.
 PRICE = 0.75
@@ -48,96 +46,44 @@ class Scales:
 
 
 @dataclass(frozen=True)
-class Sums:
-    """Sums over whitened rows: the R factor of [B_f e], `cross` B_fᵀB_s, `gram` B_sᵀB_s and
-    `right` B_sᵀe."""
-
-    own: RFactor
-    cross: Array
-    gram: Array
-    right: Array
-
-    @classmethod
-    def of(cls, B: Array, e: Array, ordinary: int) -> Sums:
-        """Of the rows [B_f B_s] and e."""
-        Bf, Bs = B[:, :ordinary], np.ascontiguousarray(B[:, ordinary:])
-        return cls(RFactor.of(Bf, e), Bf.T @ Bs, Bs.T @ Bs, Bs.T @ e)
-
-    def merged(self, other: Sums) -> Sums:
-        """Of the rows of both."""
-        return Sums(
-            self.own.merged(other.own), self.cross + other.cross, self.gram + other.gram,
-            self.right + other.right,
-        )  # fmt: skip
-
-
-@dataclass(frozen=True)
 class LinearRows:
-    """Rows linearised: [B_f B_s e] with all free ordinary columns and e at nominal functions.
+    """Rows linearised: the R factor of [B_f B_s e], e at nominal functions.
 
-    B_f = Q R, `across` QᵀB_s and `z` Qᵀe; `gram` (shrunk, shrunk), `right` (shrunk,) and `total`
-    are the products of B_s and e with Q projected out.  `std` (shrunk,) are the prior's standard
-    deviations as declared, `group` (shrunk,) the numbers of the groups.
+    `std` (shrunk,) are the prior's standard deviations as declared, `group` (shrunk,) the numbers
+    of the groups.
     """
 
-    R: Array
-    across: Array
-    z: Array
-    gram: Array
-    right: Array
-    total: float
-    rows: int
+    factor: RFactor
     std: Array
     group: IntArray
 
     @classmethod
-    def summed(cls, sums: Sums, away: Array, std: Array, group: IntArray) -> LinearRows:
-        """From sums over the rows, the functions `away` (shrunk,) from nominal."""
-        R = sums.own.R
-        # Directions in which the ordinary columns hold nothing but rounding take nothing.
-        norms = np.linalg.norm(R, axis=0)
-        norms[norms == 0] = 1.0
-        U, size, Vt = linalg.svd(R / norms)
-        known = size > DEPENDENT * size.max(initial=0.0)
-        turned = Vt[known] @ (sums.cross / norms[:, None]) / size[known, None]
-        across = U[:, known] @ turned
-        gram = sums.gram - turned.T @ turned
-        z = sums.own.projected
-        right = sums.right - across.T @ z
-        total = sums.own.rest**2 + 2 * float(right @ away) + float(away @ (gram @ away))
-        return cls(
-            R, across, z + across @ away, gram, right + gram @ away, max(total, 0.0),
-            sums.own.rows, std, group,
-        )  # fmt: skip
+    def of(cls, factor: RFactor, away: Array, std: Array, group: IntArray) -> LinearRows:
+        """From the R factor with the functions `away` (shrunk,) from nominal."""
+        rows = factor.augmented.copy()
+        rows[:, -1] += rows[:, len(rows) - 1 - len(away) : -1] @ away
+        return cls(RFactor(rows, factor.rows), std, group)
 
-    def only(self, kept: IntArray) -> ShrunkProblem:
+    def only(self, kept: IntArray) -> LinearRows:
         """With the ordinary columns `kept` alone: what the others took is the functions' again."""
-        k = len(kept)
-        Q, R = linalg.qr(self.R[:, kept])
-        across, z = Q.T @ self.across, Q.T @ self.z
-        free, left = across[k:], z[k:]
-        return ShrunkProblem(
-            R[:k], across[:k], z[:k], self.gram + free.T @ free, self.right + free.T @ left,
-            self.total + float(left @ left), self.rows, self.std, self.group,
-        )  # fmt: skip
-
-
-@dataclass(frozen=True)
-class ShrunkProblem(LinearRows):
-    """`LinearRows` of the ordinary columns that are fitted."""
+        chosen = np.append(kept, np.arange(self.ordinary, self.factor.columns))
+        return replace(self, factor=self.factor.of_columns(chosen))
 
     @property
     def ordinary(self) -> int:
-        return len(self.R)
+        return self.factor.columns - len(self.std)
 
     @property
     def n_groups(self) -> int:
         return int(self.group.max(initial=-1)) + 1
 
-    @property
-    def spare(self) -> int:
-        """Rows less ordinary parameters."""
-        return max(self.rows - self.ordinary, 1)
+    @cached_property
+    def products(self) -> Products:
+        """Those of B_s and e with the ordinary columns projected out."""
+        S, e = self.factor.augmented[self.ordinary :, self.ordinary : -1], self.factor.augmented
+        left = e[self.ordinary :, -1]
+        spare = max(self.factor.rows - self.ordinary, 1)
+        return Products(S.T @ S, S.T @ left, float(left @ left), spare)
 
     def scales(self, start: Scales | None = None) -> Scales:
         """λ and σ² of the largest restricted likelihood, where λ above 1 has its PRICE; what is 0
@@ -145,7 +91,8 @@ class ShrunkProblem(LinearRows):
         alive = np.ones(self.n_groups, dtype=bool) if start is None else start.scale > 0
         own = np.flatnonzero(alive[self.group])
         group = np.unique(self.group[own], return_inverse=True)[1].ravel()
-        products = Products(self.gram[np.ix_(own, own)], self.right[own], self.total, self.spare)
+        whole = self.products
+        products = replace(whole, M=whole.M[np.ix_(own, own)], z=whole.z[own])
         grown = 2.0 * (group[:, None] == np.arange(int(alive.sum())))
 
         def objective(theta: Array) -> tuple[float, Array, Array]:
@@ -160,16 +107,16 @@ class ShrunkProblem(LinearRows):
             information[at, at] += 8 / PRICE**2
             return value + float(over @ over), slope, information
 
-        whole, n = max(self.total / self.spare, 1e-300), grown.shape[1]
+        variance, n = max(whole.squares / whole.rows, 1e-300), grown.shape[1]
         size = 0.5 * np.log([LEAST, MOST])
-        noise = 0.5 * np.log(whole) + np.array([-20.0, 1.0])
+        noise = 0.5 * np.log(variance) + np.array([-20.0, 1.0])
         lower, upper = (np.concatenate([[noise[k]], np.full(n, size[k])]) for k in (0, 1))
 
         def found(theta: Array) -> Array:
             return climb(objective, np.clip(theta, lower, upper), lower, upper, ENOUGH, STEPS)[0]
 
         if start is None:
-            levels = 0.5 * np.log(whole * np.array(SHARES))
+            levels = 0.5 * np.log(variance * np.array(SHARES))
             begun = [np.concatenate([[level], np.zeros(n)]) for level in levels]
             theta = found(min(begun, key=lambda one: objective(one)[0]))
             small = theta[1:] < 0.5 * np.log(SMALL)
@@ -188,17 +135,16 @@ class ShrunkProblem(LinearRows):
 
     def posterior(self, scales: Scales) -> ShrunkPosterior:
         """The estimate and its covariance under these scales."""
-        root = np.sqrt(scales.scale / scales.variance)[self.group] * self.std
+        k, root = self.ordinary, np.sqrt(scales.scale / scales.variance)[self.group] * self.std
         own = np.flatnonzero(root > 0)
-        root, across = root[own], self.across[:, own]
-        at = Standardised.of(self.gram[np.ix_(own, own)], self.right[own], root)
-        b = root * at.b
+        root, whole = root[own], self.products
+        at = Standardised.of(whole.M[np.ix_(own, own)], whole.z[own], root)
+        R = self.factor.augmented[:k]
         # UᵀU = B_sᵀB_s + σ²/Λ, ordinary columns projected out.
         U = at.L.T / root
-        R = np.block([[self.R, across], [np.zeros((len(own), self.ordinary)), U]])
-        return ShrunkPosterior(
-            R, self.z, b, self.ordinary, own, 1 / root, scales.variance, self.rows
-        )
+        R = np.block([[R[:, :k], R[:, k + own]], [np.zeros((len(own), k)), U]])
+        z, rows = self.factor.augmented[:k, -1], self.factor.rows
+        return ShrunkPosterior(R, z, root * at.b, k, own, 1 / root, scales.variance, rows)
 
 
 @dataclass(frozen=True)

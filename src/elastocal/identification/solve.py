@@ -310,17 +310,16 @@ def prefer_wider(
         own = r_factor.of_columns(np.searchsorted(problem.free, wider.kept))
         if own.columns <= len(reduction.kept) or not fits_better(found.r_factor, own):
             continue
-        step = own.step(sizes[wider.kept])
+        step = np.zeros(len(found.x))
+        step[wider.kept] = own.step(sizes[wider.kept])
         linear = held_out_by_parts(
             problem.model, problem.parts, found.x, wider.kept, own.half, step
         )
         heldout = looked_at(problem, found)[0] if heldout is None else heldout
         if not wider_is_needed(problem, heldout, linear[0]):
             continue
-        x = found.x.copy()
-        x[wider.kept] += step
         try:
-            wide = fit_kept(problem, sizes, x, wider, max_steps=30, again=True)
+            wide = fit_kept(problem, sizes, found.x + step, wider, max_steps=30, again=True)
             wide_heldout = looked_at(problem, wide)[0]
         except (ElastocalError, np.linalg.LinAlgError, ValueError):
             # Along an undetermined direction the wide set may leave every valid arm, or come to
