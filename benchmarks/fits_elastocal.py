@@ -21,10 +21,11 @@ with clock.step("import"):
     import numpy as np
 
     from elastocal.identification.identify import identify
+    from elastocal.identification.least_squares import Problem
 
     # What reading would import when first called.
     from elastocal.identification.options import Options
-    from elastocal.identification.solve import Problem, settle, sizes_and_check
+    from elastocal.identification.solve import settle, sizes_and_check
     from elastocal.identification.start import start_values
     from elastocal.identification.weighted_problem import Weights
     from elastocal.measurements import Measurements

@@ -6,7 +6,7 @@ from support.cells import random_poses
 
 from elastocal.identification.covariance import cluster_robust
 from elastocal.identification.intervals import cluster_by_parts
-from elastocal.identification.least_squares import FitProblem, fit
+from elastocal.identification.least_squares import Problem, fit
 from elastocal.identification.weighted_problem import Partition, Weights
 from elastocal.model.manipulator import Model
 from elastocal.model.observations import observe
@@ -24,7 +24,8 @@ def fitted():
     columns = np.arange(len(model.parameters))
     weights = Weights("none", None, False, "")
     sizes = np.ones(len(columns))
-    return fit(FitProblem(model, observed, weights, truth, columns, sizes)), observed, weights
+    problem = Problem(model, observed, weights, truth, columns)
+    return fit(problem, columns, truth, sizes), observed, weights
 
 
 def test_equals_the_whole_table_however_it_is_cut():

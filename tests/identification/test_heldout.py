@@ -17,7 +17,7 @@ from support.cells import random_poses
 
 from elastocal.cell.arm_description import CartesianNoise, Nominal, Tracker
 from elastocal.identification.identify import identify
-from elastocal.identification.least_squares import FitProblem, fit
+from elastocal.identification.least_squares import Problem, fit
 from elastocal.identification.options import Options
 from elastocal.identification.residuals import held_out_residual, predicts_better
 from elastocal.identification.weighted_problem import Weights, weights_for
@@ -77,7 +77,8 @@ def test_equals_refits_of_an_arm(effects, stated):
     for c in range(0, 20, 4):
         others = subset(observed, observed.configuration != c)
         weights = weights_for(others, model.cell.tracker)
-        refit = fit(FitProblem(model, others, weights, result.x, kept, sizes))
+        problem = Problem(model, others, weights, result.x, kept)
+        refit = fit(problem, kept, result.x, sizes)
         mine = np.repeat(observed.configuration == c, 3)
         left_out = (observed.value - model.predict(table, refit.x, observed))[mine]
         np.testing.assert_allclose(result.held_out[mine], left_out, atol=0.01 * sigma)

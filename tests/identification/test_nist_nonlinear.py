@@ -15,7 +15,7 @@ import numpy as np
 import pytest
 from scipy import sparse
 
-from elastocal.identification.least_squares import FitProblem, fit
+from elastocal.identification.least_squares import Problem, fit
 from elastocal.identification.weighted_problem import Weights
 from elastocal.model.manipulator import Regression
 from elastocal.model.observations import Observations
@@ -73,7 +73,8 @@ def fitted(model, y, start, sizes, sigma=None):
     observed = Observations("distance", y, sparse.csr_array(np.eye(n)), np.arange(n), TABLE)
     whiten = None if sigma is None else sparse.csr_array(np.eye(n) / sigma)
     weights = Weights("test", whiten, sigma is not None, "")
-    found = fit(FitProblem(model, observed, weights, start, np.arange(p), sizes), max_steps=2000)
+    problem = Problem(model, observed, weights, start, np.arange(p))
+    found = fit(problem, problem.free, start, sizes, max_steps=2000)
     variance = found.whitened @ found.whitened / (n - p)
     return found, np.sqrt(variance * np.diag(found.cofactor()))
 

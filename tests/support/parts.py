@@ -13,8 +13,9 @@ from support.cells import random_poses
 
 from elastocal.cell.arm_description import CartesianNoise, Nominal, PolarNoise, Tracker
 from elastocal.identification.checks import fixed_and_free
+from elastocal.identification.least_squares import Problem
 from elastocal.identification.outliers import find_faulty
-from elastocal.identification.solve import Problem, Solution, solve
+from elastocal.identification.solve import Solution, solve
 from elastocal.identification.start import start_values
 from elastocal.identification.weighted_problem import weights_for
 from elastocal.measurements import Measurements

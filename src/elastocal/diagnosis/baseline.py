@@ -10,8 +10,8 @@ from weakref import WeakKeyDictionary
 import numpy as np
 from numpy.typing import NDArray
 
-from elastocal.identification.least_squares import LARGE_TOLERANCE
-from elastocal.identification.solve import PLACING, Problem, is_placed, sizes_and_check, tied_fit
+from elastocal.identification.least_squares import LARGE_TOLERANCE, Problem
+from elastocal.identification.solve import PLACING, is_placed, sizes_and_check, tied_fit
 from elastocal.identification.start import start_values
 from elastocal.identification.weighted_problem import (
     residual_at,

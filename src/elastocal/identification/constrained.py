@@ -28,7 +28,7 @@ from elastocal.identification.knowledge import (
     System,
     share_of_prior,
 )
-from elastocal.identification.least_squares import FitProblem
+from elastocal.identification.least_squares import Problem
 from elastocal.identification.weighted_problem import Evaluation, evaluate, least_norm, residual_at
 from elastocal.text import listed
 from elastocal.units import Array, BoolArray, IntArray
@@ -526,13 +526,16 @@ HALVINGS = 20
 
 @dataclass(frozen=True)
 class KnowledgeProblem:
-    """|W (y − h(X))|² + |target − P X|² over X[columns] under `system`, the others held.
+    """|W (y − h(X))|² + |target − P X|² over X[columns] under `system`, the others held at x.
 
     P (k, columns) and target (k,) are the prior's rows in units of the noise `sigma` of a whitened
     row; `system` holds the constraints on the columns.
     """
 
-    problem: FitProblem
+    problem: Problem
+    columns: IntArray
+    x: Array
+    sizes: Array
     P: Array
     target: Array
     system: System
@@ -540,43 +543,42 @@ class KnowledgeProblem:
 
     @classmethod
     def of(
-        cls, problem: FitProblem, constraints: Constraints, prior: GaussianPrior | None,
-        sigma: float,
+        cls, problem: Problem, columns: IntArray, x: Array, sizes: Array, constraints: Constraints,
+        prior: GaussianPrior | None, sigma: float,
     ) -> KnowledgeProblem:  # fmt: skip
         """Raises InputError where a held parameter alone breaks a constraint."""
-        columns, names = problem.columns, problem.model.names
+        names = problem.model.names
         P, target = np.zeros((0, len(columns))), np.zeros(0)
         if prior is not None:
             P, target = prior.rows(names)
-            held = np.setdiff1d(np.arange(len(problem.x)), columns)
-            target = sigma * (target - P[:, held] @ problem.x[held])
+            held = np.setdiff1d(np.arange(len(x)), columns)
+            target = sigma * (target - P[:, held] @ x[held])
             P = sigma * P[:, columns]
-        system = constraints.resolve(names).restricted(columns, problem.x)
-        return cls(problem, P, target, system, sigma)
+        system = constraints.resolve(names).restricted(columns, x)
+        return cls(problem, columns, x, sizes, P, target, system, sigma)
 
     def moved(self, x: Array, step: Array) -> Array:
         """x (parameters,) with `step` (columns,) added."""
         trial = x.astype(float)
-        trial[self.problem.columns] += step
+        trial[self.columns] += step
         return trial
 
     def limits(self, x: Array) -> System:
         """The constraints on a step from x."""
-        return self.system.moved(x[self.problem.columns], np.ones(len(self.problem.columns)))
+        return self.system.moved(x[self.columns], np.ones(len(self.columns)))
 
     def linearised(self, x: Array) -> tuple[Evaluation, Array, Array]:
         """The readings at x, and J and t with the objective |t − J step|²: their R factor and the
         prior's rows."""
-        problem = self.problem
-        at = evaluate(problem.model, problem.parts, x, problem.columns)
-        rows, lack = at.r_factor.augmented, self.target - self.P @ x[problem.columns]
+        at = evaluate(self.problem.model, self.problem.parts, x, self.columns)
+        rows, lack = at.r_factor.augmented, self.target - self.P @ x[self.columns]
         return at, np.vstack([rows[:, :-1], self.P]), np.concatenate([rows[:, -1], lack])
 
     def value(self, x: Array) -> float:
         """The objective at x; infinite where a pose has no equilibrium."""
         problem = self.problem
         e = problem.weights.apply(residual_at(problem.model, problem.parts, x))
-        lack = self.target - self.P @ x[problem.columns]
+        lack = self.target - self.P @ x[self.columns]
         value = float(e @ e + lack @ lack)
         return value if np.isfinite(value) else np.inf
 
@@ -604,7 +606,7 @@ class ConstrainedFit:
 
     @property
     def columns(self) -> IntArray:
-        return self.posed.problem.columns
+        return self.posed.columns
 
     @property
     def names(self) -> tuple[str, ...]:
@@ -661,10 +663,9 @@ def constrained_fit(posed: KnowledgeProblem, max_steps: int = 60) -> Constrained
     Raises InputError as `minimise` does; ElastocalError where the start has poses without
     equilibrium.
     """
-    problem = posed.problem
-    size = problem.sizes[problem.columns]
-    nearest = minimise(np.diag(1 / size), np.zeros(len(size)), posed.limits(problem.x)).x
-    x = posed.moved(problem.x, nearest)
+    size = posed.sizes[posed.columns]
+    nearest = minimise(np.diag(1 / size), np.zeros(len(size)), posed.limits(posed.x)).x
+    x = posed.moved(posed.x, nearest)
     at, J, t = posed.linearised(x)
     value, steps, converged = float(t @ t), 0, False
     while steps < max_steps and not converged:

@@ -23,6 +23,7 @@ from elastocal.identification.covariance import variance_of
 from elastocal.identification.faulty_readings import report_faulty
 from elastocal.identification.findings import judged, of_solution
 from elastocal.identification.intervals import MethodResult
+from elastocal.identification.least_squares import Problem
 from elastocal.identification.methods import (
     is_exact,
     run_method,
@@ -48,7 +49,7 @@ from elastocal.identification.residuals import (
 from elastocal.identification.result import Calibration, Combination, Estimate, TestErrors
 from elastocal.identification.scrutiny import MOST_NUMBERS
 from elastocal.identification.sentences import warning_sentences
-from elastocal.identification.solve import Problem, Solution, bent, residual_sigma, solve
+from elastocal.identification.solve import Solution, bent, residual_sigma, solve
 from elastocal.identification.start import start_values
 from elastocal.identification.weighted_problem import (
     Weights,

@@ -144,8 +144,8 @@ def _profiled(solution: Solution, classical: Covariance) -> Intervals:
     """{v: S(v) − Ŝ ≤ t² s²}, the fit being at its minimum."""
     fit = solution.fit
     sigma = residual_sigma(fit, len(fit.columns))
-    problem = solution.problem.fit_of(fit.columns, fit.x, solution.sizes)
-    found = constrained_fit(KnowledgeProblem.of(problem, Constraints(), None, sigma))
+    posed = solution.problem, fit.columns, fit.x, solution.sizes
+    found = constrained_fit(KnowledgeProblem.of(*posed, Constraints(), None, sigma))
     rises = (sigma * t_quantile(LEVEL, classical.dof)) ** 2
     ends = [
         [profile_end(found, k, float(rise), side) for side in (-1, 1)]

@@ -237,8 +237,9 @@ def fit_with_knowledge(
     prior = joined(options.prior, None if own is None else own.prior)
     sigma = residual_sigma(fit, len(fit.columns)) if own is None else own.sigma
     columns = fitted_columns(solution, before.intervals.covariance.std, constraints, prior)
-    stated = problem.fit_of(columns, fit.x, solution.sizes)
-    posed = KnowledgeProblem.of(stated, constraints, prior, sigma)
+    posed = KnowledgeProblem.of(
+        problem, columns, fit.x, solution.sizes, constraints, prior, sigma
+    )  # fmt: skip
     progress("fitting under constraints" if prior is None else "fitting with the prior")
     found = constrained_fit(posed)
     progress("intervals under constraints" if prior is None else "intervals with the prior")
@@ -316,7 +317,7 @@ def _as_fit(found: ConstrainedFit) -> Fit:
     factor = RFactor.of(np.vstack([reduced.J, equalities]), np.append(reduced.t, np.zeros(len(A))))
     return Fit(
         found.x, found.at.residual, problem.weights.apply(found.at.residual), factor,
-        found.converged, found.reason, found.steps, replace(problem, x=found.x),
+        found.converged, found.reason, found.steps, problem, found.columns, found.posed.sizes,
     )  # fmt: skip
 
 

@@ -16,6 +16,7 @@ from elastocal.identification.weighted_problem import (
     RFactor,
     Weights,
     evaluate,
+    is_large,
     is_reduced,
     least_norm,
     partition,
@@ -142,47 +143,27 @@ TOLERANCE, LARGE_TOLERANCE = 1e-12, 1e-8
 
 
 @dataclass(frozen=True)
-class FitProblem:
-    """min over X[columns] of |W (y − h(X))|² (eq. 9, nonlinear), the other parameters held at `x`.
-
-    `sizes` (parameters,) scale the variables.  `tie` (columns,), where given, adds
-    ((X − centre)/tie)² per column, in units of the noise: a weak tie, used only to keep
-    undetermined directions still before they are known to be undetermined.  `among` (ascending)
-    are columns of which those fitted are a choice: a large table's fit leaves their R factor too,
-    which else would take another pass.
-    """
+class Problem:
+    """Fit parameters among those that are `free` to the observations, the others held at x0
+    (parameters,)."""
 
     model: Model
     observations: Observations
     weights: Weights
-    x: Array
-    columns: NDArray[np.int64]
-    sizes: Array
-    tie: Array | None = None
-    centre: Array | None = None
-    # The table in parts, where whoever poses the problem has cut it already.
-    cut: Partition | None = None
-    among: NDArray[np.int64] | None = None
+    x0: Array
+    free: NDArray[np.int64]
 
     @cached_property
     def parts(self) -> Partition:
-        if self.cut is not None:
-            return self.cut
+        """The table cut into parts that can be worked on alone: one, unless it is large."""
         return partition(self.observations, self.weights, int((~self.model.shrunk).sum()))
 
     @property
-    def tied_to(self) -> Array:
-        """What `tie` ties the columns to."""
-        return (self.x if self.centre is None else self.centre)[self.columns]
-
-    def values(self, u: Array) -> Array:
-        """Parameters (parameters,) with the columns moved by u typical sizes."""
-        x = self.x.copy()
-        x[self.columns] += u * self.sizes[self.columns]
-        return x
+    def large(self) -> bool:
+        return is_large(self.observations, int((~self.model.shrunk).sum()))
 
     @property
-    def reduced(self) -> bool:
+    def many(self) -> bool:
         """Whether the readings are so many that an evaluation is dear."""
         return is_reduced(self.observations, int((~self.model.shrunk).sum()))
 
@@ -191,8 +172,8 @@ class FitProblem:
 class Fit:
     """Values x (parameters,), raw and whitened residual (rows,), R factor of whitened B and it.
 
-    `columns` (fitted,) index the parameters; `wide`, where there is one, is the R factor of the
-    columns that these were chosen among.
+    `columns` (fitted,) index the parameters, `sizes` (parameters,) their typical sizes; `wide`,
+    where there is one, is the R factor of the columns that these were chosen among.
     """
 
     x: Array
@@ -202,12 +183,10 @@ class Fit:
     converged: bool
     reason: str
     steps: int
-    problem: FitProblem = field(repr=False)
+    problem: Problem = field(repr=False)
+    columns: NDArray[np.int64]
+    sizes: Array
     wide: RFactor | None = field(default=None, repr=False)
-
-    @property
-    def columns(self) -> NDArray[np.int64]:
-        return self.problem.columns
 
     @cached_property
     def B(self) -> Array:
@@ -217,11 +196,22 @@ class Fit:
 
     def cofactor(self) -> Array:
         """(BᵀW²B)⁻¹ (fitted, fitted): covariance at unit variance (eq. 7 and 13)."""
-        return self.r_factor.cofactor(self.problem.sizes[self.columns])
+        return self.r_factor.cofactor(self.sizes[self.columns])
 
 
-def fit(problem: FitProblem, max_steps: int = 60, tolerance: float = LARGE_TOLERANCE) -> Fit:
-    """Levenberg–Marquardt from the problem's x, derivatives exact.
+def fit(
+    problem: Problem, columns: NDArray[np.int64], x: Array, sizes: Array, *,
+    tie: Array | None = None, among: NDArray[np.int64] | None = None, max_steps: int = 60,
+    tolerance: float = LARGE_TOLERANCE,
+) -> Fit:  # fmt: skip
+    """min over X[columns] of |W (y − h(X))|² (eq. 9, nonlinear), the other parameters held at x, by
+    Levenberg–Marquardt from there, derivatives exact.
+
+    `sizes` (parameters,) scale the variables.  `tie` (columns,), where given, adds
+    ((X − x0)/tie)² per column, in units of the noise: a weak tie, used only to keep undetermined
+    directions still before they are known to be undetermined.  `among` (ascending) are columns of
+    which those fitted are a choice: a large table's fit leaves their R factor too, which else would
+    take another pass.
 
     On R factors, with the cost and the gradient of all rows, until a step promises less than
     TOLERANCE of the cost, of many readings `tolerance`.  Every step starts from the residual of the
@@ -229,13 +219,16 @@ def fit(problem: FitProblem, max_steps: int = 60, tolerance: float = LARGE_TOLER
 
     Raises ElastocalError where the start has poses without equilibrium.
     """
-    columns = problem.columns
-    size = problem.sizes[columns]
-    tie = np.full(len(columns), np.inf) if problem.tie is None else problem.tie / size
-    centre = (problem.tied_to - problem.x[columns]) / size
+    size = sizes[columns]
+    tied = np.full(len(columns), np.inf) if tie is None else tie / size
+
+    def values(u: Array) -> Array:
+        moved = x.copy()
+        moved[columns] += u * size
+        return moved
 
     def evaluated(u: Array) -> Evaluation:
-        at = evaluate(problem.model, problem.parts, problem.values(u), columns)
+        at = evaluate(problem.model, problem.parts, values(u), columns)
         if not np.isfinite(at.r_factor.rss):
             raise ElastocalError(
                 f"{problem.observations.table.source}: the model predicts no finite numbers at the "
@@ -244,17 +237,18 @@ def fit(problem: FitProblem, max_steps: int = 60, tolerance: float = LARGE_TOLER
         return Evaluation(at.residual, at.r_factor.scaled(size))
 
     def among_others(u: Array) -> Evaluation:
-        among = columns if problem.among is None else problem.among
-        at = evaluate(problem.model, problem.parts, problem.values(u), among)
+        assert among is not None
+        at = evaluate(problem.model, problem.parts, values(u), among)
         own = at.r_factor.of_columns(np.searchsorted(among, columns))
         return Evaluation(at.residual, own.scaled(size), at.r_factor)
 
-    last = None if problem.among is None else among_others
-    objective = SumOfSquares(evaluated, tie, centre, last)
-    enough = tolerance if problem.reduced else TOLERANCE
+    objective = SumOfSquares(
+        evaluated, tied, (problem.x0 - x)[columns] / size, None if among is None else among_others
+    )
+    enough = tolerance if problem.many else TOLERANCE
     found = descend(objective, np.zeros(len(columns)), enough, max_steps)
     return Fit(
-        problem.values(found.u), found.at.residual, problem.weights.apply(found.at.residual),
+        values(found.u), found.at.residual, problem.weights.apply(found.at.residual),
         found.at.r_factor.scaled(1 / size), found.converged, found.reason, found.evaluations,
-        problem, found.at.wide,
+        problem, columns, sizes, found.at.wide,
     )  # fmt: skip

@@ -12,6 +12,7 @@ from elastocal.identification import published
 from elastocal.identification.covariance import Covariance
 from elastocal.identification.intervals import LEVEL, Intervals, MethodResult, intervals_of
 from elastocal.identification.knowledge_fit import fit_with_knowledge
+from elastocal.identification.least_squares import Problem
 from elastocal.identification.noise_choice import (
     NoiseFit,
     estimate_noise,
@@ -25,12 +26,7 @@ from elastocal.identification.outliers import NoiseAndOutliers, settle
 from elastocal.identification.residuals import held_out_residual, rms_3d
 from elastocal.identification.robust import robust_result
 from elastocal.identification.smooth_fit import fit_smooth
-from elastocal.identification.solve import (
-    Problem,
-    Solution,
-    chosen_again,
-    fit_kept,
-)
+from elastocal.identification.solve import Solution, chosen_again, fit_kept
 from elastocal.identification.weighted_problem import Weights
 from elastocal.model.manipulator import Model
 from elastocal.model.observations import Observations, subset

@@ -11,6 +11,7 @@ from numpy.typing import ArrayLike
 from scipy import linalg, special
 
 from elastocal.errors import ElastocalError
+from elastocal.identification.least_squares import Problem
 from elastocal.identification.noise_choice import (
     NoiseFit,
     NoisyReadings,
@@ -21,7 +22,7 @@ from elastocal.identification.noise_choice import (
 )
 from elastocal.identification.noise_structure import Readings
 from elastocal.identification.residuals import f_test
-from elastocal.identification.solve import PLACED, SAMPLE, Problem, Solution, is_placed
+from elastocal.identification.solve import PLACED, SAMPLE, Solution, is_placed
 from elastocal.identification.weighted_problem import (
     Part,
     each,

@@ -21,9 +21,10 @@ from scipy import linalg, sparse, special
 from elastocal.errors import ElastocalError, InputError, InsufficientDataError
 from elastocal.identification.covariance import Covariance, cluster_robust, orthogonal
 from elastocal.identification.intervals import LEVEL, Intervals, MethodResult
+from elastocal.identification.least_squares import Problem
 from elastocal.identification.outliers import median_scale
 from elastocal.identification.residuals import held_out_residual
-from elastocal.identification.solve import Problem, Solution
+from elastocal.identification.solve import Solution
 from elastocal.units import Array, BoolArray, IntArray
 
 # c of Huber's loss by the rows of an observation, 1 to 6: 95 % efficient.  Under normal noise d
@@ -267,7 +268,7 @@ def robust_result(
         steps += 1
     fit = replace(
         sound.fit, x=x, residual=at.residual, whitened=e, converged=converged, steps=steps,
-        problem=problem.fit_of(kept, x, sound.sizes),
+        problem=problem, columns=kept, sizes=sound.sizes,
         reason=sound.fit.reason if converged else "the robust steps did not settle",
     )  # fmt: skip
     # Only for predicting left-out configurations do ψ(d)/d stand in as weights.

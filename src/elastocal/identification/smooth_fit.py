@@ -23,7 +23,7 @@ from elastocal.identification.covariance import Covariance
 from elastocal.identification.intervals import LEVEL, Intervals, MethodResult
 from elastocal.identification.knowledge import GaussianPrior
 from elastocal.identification.knowledge_fit import FunctionPrior
-from elastocal.identification.least_squares import Fit
+from elastocal.identification.least_squares import Fit, Problem
 from elastocal.identification.noise_choice import NoiseFit, linearised, weights_of
 from elastocal.identification.noise_structure import Readings
 from elastocal.identification.options import Options, check_for_functions
@@ -35,14 +35,7 @@ from elastocal.identification.smooth_functions import (
     ShrunkPosterior,
     SmoothPart,
 )
-from elastocal.identification.solve import (
-    WORTH_A_COLUMN,
-    Problem,
-    Reduction,
-    Solution,
-    choose,
-    is_placed,
-)
+from elastocal.identification.solve import WORTH_A_COLUMN, Reduction, Solution, choose, is_placed
 from elastocal.identification.weighted_problem import (
     Part,
     Partition,
@@ -514,7 +507,7 @@ class _Course:
             fit.x, fit.residual, whitened, posterior.marginal, fit.converged,
             "the sum of squares no longer fell" if fit.converged
             else "the step limit was reached; the start may be far off", fit.steps,
-            fit.problem.fit_of(columns, fit.x, self.every.sizes),
+            fit.problem, columns, self.every.sizes,
         )  # fmt: skip
         r = fit.reduction
         mixing = np.zeros((len(columns), len(r.dropped)))

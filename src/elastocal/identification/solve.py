@@ -12,7 +12,7 @@ from scipy import linalg
 from elastocal.errors import ElastocalError, InsufficientDataError
 from elastocal.identification.checks import check_enough
 from elastocal.identification.covariance import root_of
-from elastocal.identification.least_squares import Fit, FitProblem, fit
+from elastocal.identification.least_squares import Fit, Problem, fit
 from elastocal.identification.residuals import (
     CHANCE,
     as_of_another_campaign,
@@ -24,16 +24,11 @@ from elastocal.identification.residuals import (
 )
 from elastocal.identification.weighted_problem import (
     Part,
-    Partition,
     RFactor,
-    Weights,
     each,
     evaluate,
-    is_large,
-    is_reduced,
     least_norm,
     merge,
-    partition,
     regressor,
     residual_at,
     residual_of,
@@ -42,7 +37,6 @@ from elastocal.identification.weighted_problem import (
 from elastocal.model.arm import Parameter
 from elastocal.model.effects.catalogue import effect_of
 from elastocal.model.manipulator import Model
-from elastocal.model.observations import Observations
 from elastocal.units import Array, IntArray, Progress
 
 # Which parameters the data determine: a minimal complete set, a wider one, and what combines.
@@ -173,32 +167,6 @@ WORTH_A_COLUMN = 1.0
 WIDER = (0.1, 0.01, 0.0)
 
 
-@dataclass(frozen=True)
-class Problem:
-    """Fit the parameters `free` of the model to the observations, from x0 (parameters,)."""
-
-    model: Model
-    observations: Observations
-    weights: Weights
-    x0: Array
-    free: NDArray[np.int64]
-
-    @cached_property
-    def parts(self) -> Partition:
-        """The table cut into parts that can be worked on alone: one, unless it is large."""
-        return partition(self.observations, self.weights, int((~self.model.shrunk).sum()))
-
-    @property
-    def large(self) -> bool:
-        return is_large(self.observations, int((~self.model.shrunk).sum()))
-
-    def fit_of(self, columns: NDArray[np.int64], x: Array, sizes: Array) -> FitProblem:
-        """The fit of `columns` from x, the other parameters held."""
-        return FitProblem(
-            self.model, self.observations, self.weights, x, columns, sizes, cut=self.parts
-        )  # fmt: skip
-
-
 def residual_sigma(found: Fit, n_parameters: int) -> float:
     """Standard deviation of a whitened row: √(rss / (rows − parameters))."""
     dof = max(len(found.whitened) - n_parameters, 1)
@@ -258,10 +226,10 @@ def fit_kept(
     # The share is a linear estimate: a soft arm may have no equilibrium so far out.
     for trial in (shifted, start):
         try:
-            return fit(replace(problem.fit_of(kept, trial, sizes), among=among), max_steps)
+            return fit(problem, kept, trial, sizes, among=among, max_steps=max_steps)
         except ElastocalError:
             continue
-    return fit(replace(problem.fit_of(kept, problem.x0, sizes), among=among), max_steps)
+    return fit(problem, kept, problem.x0, sizes, among=among, max_steps=max_steps)
 
 
 def looked_at(problem: Problem, found: Fit) -> tuple[Array, Array]:
@@ -401,7 +369,7 @@ def settle(
 
     Raises InsufficientDataError where the data determine nothing.
     """
-    model, started, exact = problem.model, problem.x0, not _many(problem)
+    model, started, exact = problem.model, problem.x0, not problem.many
     placed = problem.free[is_placed(model)[problem.free]]
     if len(placed):
         progress("placing base and markers")
@@ -515,7 +483,7 @@ def tied_fit(problem: Problem, sizes: Array, tolerance: float) -> Fit:
     Many readings start where such a fit to a sample of them ends.
     """
     x = problem.x0
-    if _many(problem):
+    if problem.many:
         rough = _sampled(problem)
         found = _tied_from(rough, sizes, x, _misfit(rough), tolerance)
         try:
@@ -525,13 +493,9 @@ def tied_fit(problem: Problem, sizes: Array, tolerance: float) -> Fit:
     return _tied_from(problem, sizes, x, _misfit(problem), tolerance)
 
 
-def _many(problem: Problem) -> bool:
-    return is_reduced(problem.observations, int((~problem.model.shrunk).sum()))
-
-
 def _sampled(problem: Problem) -> Problem:
     """The problem of a sample, where there are many readings."""
-    if not _many(problem):
+    if not problem.many:
         return problem
     part = sample(problem.parts, min(SAMPLE, len(problem.observations.lead) // 4))
     return replace(problem, observations=part.observations, weights=part.weights)
@@ -548,8 +512,8 @@ def _tied_from(problem: Problem, sizes: Array, x: Array, sigma: float, tolerance
     free = problem.free
     width = np.where(is_placed(problem.model), sizes, LOOSE * sizes)[free]
     while True:
-        tied = replace(problem.fit_of(free, x, sizes), tie=width / sigma, centre=problem.x0)
-        found = fit(tied, max_steps=25, tolerance=tolerance)
+        tied = width / sigma
+        found = fit(problem, free, x, sizes, tie=tied, max_steps=25, tolerance=tolerance)
         previous, sigma, x = sigma, residual_sigma(found, 0), found.x
         if sigma > 0.7 * previous or sigma <= 1e-12:
             return found

@@ -1,6 +1,5 @@
 """Constrained fits of a whole arm: the KR 270 at the poses of Table 2, nonlinear equilibrium."""
 
-from dataclasses import replace
 from functools import lru_cache
 
 import numpy as np
@@ -22,7 +21,7 @@ from elastocal.identification.knowledge import (
     SemidefiniteMatrix,
     physical_constraints,
 )
-from elastocal.identification.least_squares import FitProblem, fit
+from elastocal.identification.least_squares import Problem, fit
 from elastocal.identification.weighted_problem import Weights
 from elastocal.model.manipulator import Model
 from elastocal.model.observations import observe
@@ -38,7 +37,7 @@ def arm() -> Model:
     )
 
 
-def problem(seed: int, **values: float) -> FitProblem:
+def problem(seed: int, **values: float) -> tuple:
     """Readings of the arm with stiff bearings unless `values` say otherwise, start at nominal."""
     model = arm()
     truth = with_values(model, {"joint3.compliance": 5e-7} | values)
@@ -49,18 +48,19 @@ def problem(seed: int, **values: float) -> FitProblem:
     sizes = model.sizes(model.regressor(table, model.nominal, None, observed).B)
     columns = np.arange(len(model.names))
     weights = Weights("axis", whiten, True, "")
-    return FitProblem(model, observed, weights, model.nominal, columns, sizes)
+    problem = Problem(model, observed, weights, model.nominal, columns)
+    return problem, columns, model.nominal, sizes
 
 
-def fitted(stated: FitProblem, constraints: Constraints = NONE, prior=None) -> ConstrainedFit:
-    return constrained_fit(KnowledgeProblem.of(stated, constraints, prior, 1.0))
+def fitted(stated: tuple, constraints: Constraints = NONE, prior=None) -> ConstrainedFit:
+    return constrained_fit(KnowledgeProblem.of(*stated, constraints, prior, 1.0))
 
 
 @lru_cache
-def negative_bearing() -> FitProblem:
+def negative_bearing() -> tuple:
     """A problem whose unconstrained estimate of BEARING_X is negative."""
     found = problem(0)
-    assert fit(found).x[arm().names.index(BEARING_X)] < 0
+    assert fit(*found).x[arm().names.index(BEARING_X)] < 0
     return found
 
 
@@ -84,15 +84,16 @@ def test_a_coupled_matrix_binds_and_the_fit_stays_inside():
     assert x > 0 and y > 0
     assert x * y == pytest.approx(coupling**2, rel=1e-6)
     assert found.converged
-    free = fit(stated)
+    free = fit(*stated)
     assert found.objective > free.whitened @ free.whitened
 
 
 def test_an_infeasible_start_is_moved_inside():
     stated = negative_bearing()
-    start = stated.x.copy()
+    problem, columns, x, sizes = stated
+    start = x.copy()
     start[arm().names.index(BEARING_X)] = -3e-7
-    found = fitted(replace(stated, x=start), physical_constraints(arm()))
+    found = fitted((problem, columns, start, sizes), physical_constraints(arm()))
     expected = fitted(stated, physical_constraints(arm()))
     np.testing.assert_allclose(found.x, expected.x, rtol=1e-8, atol=1e-16)
 

@@ -8,7 +8,7 @@ from scipy import sparse, stats
 
 from elastocal.identification.constrained import KnowledgeProblem, constrained_fit, profile_end
 from elastocal.identification.knowledge import Bounds, Constraints
-from elastocal.identification.least_squares import FitProblem
+from elastocal.identification.least_squares import Problem
 from elastocal.identification.weighted_problem import Weights
 from elastocal.model.manipulator import Regression
 from elastocal.model.observations import Observations
@@ -41,11 +41,12 @@ def profile(y, constraints=()):
     (b1, b0), (rss,), *_ = np.polyfit(X, y, 1, full=True)
     observed = Observations("distance", y, sparse.eye_array(12, format="csr"), np.arange(12), TABLE)
     start = np.array([-b0 / b1, b1])
-    problem = FitProblem(
-        Crossing(), observed, Weights("none", None, False, ""), start, np.arange(2), np.ones(2)
-    )
+    weights = Weights("none", None, False, "")
+    problem = Problem(Crossing(), observed, weights, start, np.arange(2)), np.arange(2)
     sigma = float(np.sqrt(rss / 10))
-    found = constrained_fit(KnowledgeProblem.of(problem, Constraints(constraints), None, sigma))
+    found = constrained_fit(
+        KnowledgeProblem.of(*problem, start, np.ones(2), Constraints(constraints), None, sigma)
+    )
     return found.x[0], [profile_end(found, 0, F * sigma**2, side) for side in (-1, 1)]
 
 
