@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+from collections.abc import Iterable, Iterator
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -198,13 +198,14 @@ CLUSTER_DESCRIPTION = {
 }
 
 
+Rows = tuple[Array, Array, IntArray]  # Q_c and e_c of whole clusters, and the cluster of each
+
+
 def cluster_robust(B: Array, e: Array, cluster: IntArray, kind: str = "CR2") -> Covariance:
     """Covariance of x̂ that allows any correlation within a cluster (equations above).
 
     B (n, p) and e (n,) whitened, e = y − B x̂ the least-squares residual; `cluster` (n,) labels in
-    any order.  Degrees of freedom by Satterthwaite for every kind, each for its own
-    A_c (Pustejovsky & Tipton 2018); at most G, or G − 1 for CR0 and CR1, whose scores sum to zero
-    over the clusters, and far fewer where few clusters matter.
+    any order.
 
     Where a cluster alone determines a direction, I − Q_cQ_cᵀ is singular: CR2 takes the
     generalised inverse square root, which leaves parameters outside that direction unbiased
@@ -215,30 +216,41 @@ def cluster_robust(B: Array, e: Array, cluster: IntArray, kind: str = "CR2") -> 
     Cost: n p² + G p³ operations and 32 MB of temporaries; nothing of size n² is formed.
     """
     factors = orthogonal(B)
-    Q, V = factors.Q, factors.V
-    n, p = Q.shape
-    G = len(np.unique(cluster))
+    return clustered([(factors.Q, e, cluster)], factors.V, kind)
+
+
+def clustered(parts: Iterable[Rows], V: Array, kind: str) -> Covariance:
+    """The same of rows that come in parts, Q = B V with V Vᵀ = (BᵀB)⁻¹.
+
+    Degrees of freedom by Satterthwaite for every kind, each for its own A_c (Pustejovsky & Tipton
+    2018); at most G, or G − 1 for CR0 and CR1, whose scores sum to zero over the clusters, and far
+    fewer where few clusters matter.
+    """
+    p, n, G = len(V), 0, 0
+    meat, sums, alone = np.zeros((p, p)), SatterthwaiteSums(p), np.zeros(p, dtype=bool)
+    lone: list[int] = []
+    for Q, e, cluster in parts:
+        n, G = n + len(e), G + len(np.unique(cluster))
+        for rows in _blocks(cluster, p):
+            Qc = Q[rows]
+            adjusted, determined = _adjusted(Qc, kind)
+            lone += cluster[rows[determined][:1, 0]].tolist()
+            alone |= _depends(Qc[determined], V)
+            scores = (e[rows][:, None, :] @ adjusted)[:, 0]
+            meat += scores.T @ scores
+            a = adjusted @ V.T
+            sums.add(np.sum(a * a, axis=1), Qc.transpose(0, 2, 1) @ a)
     if G < 2:
         raise InsufficientDataError(
             "a cluster-robust covariance compares clusters, but all rows are in one;"
             " measure more configurations, or use a covariance of independent rows (HC3)"
         )
-    meat, sums, alone = np.zeros((p, p)), SatterthwaiteSums(p), np.zeros(p, dtype=bool)
-    for rows in _blocks(cluster, p):
-        Qc = Q[rows]
-        adjusted, determined = _adjusted(Qc, kind)
-        if determined.any() and kind == "CR3":
-            what, left = ("row", "HC") if n == G else ("cluster", "CR")
-            raise InsufficientDataError(
-                f"{what} {cluster[rows[determined][0, 0]]} alone determines a combination of the "
-                f"parameters: leaving it out, as {left}3 does, leaves no answer; fit fewer "
-                f"parameters or use {left}2"
-            )
-        alone |= _depends(Qc[determined], V)
-        scores = (e[rows][:, None, :] @ adjusted)[:, 0]
-        meat += scores.T @ scores
-        a = adjusted @ V.T
-        sums.add(np.sum(a * a, axis=1), Qc.transpose(0, 2, 1) @ a)
+    if lone and kind == "CR3":
+        what, left = ("row", "HC") if n == G else ("cluster", "CR")
+        raise InsufficientDataError(
+            f"{what} {lone[0]} alone determines a combination of the parameters: leaving it out, "
+            f"as {left}3 does, leaves no answer; fit fewer parameters or use {left}2"
+        )
     if kind == "CR1":
         meat *= G / (G - 1) * (n - 1) / (n - p)
     text = f"rows correlated within {G} clusters, {CLUSTER_DESCRIPTION[kind]}"
@@ -262,15 +274,13 @@ ROW_DESCRIPTION = {
 }
 
 
-def hc(B: Array, e: Array, kind: str = "HC3") -> Covariance:
-    """Covariance of x̂ with independent rows, each of its own variance: every row a cluster.
+def of_rows(found: Covariance, n: int, kind: str) -> Covariance:
+    """HC of n independent rows, each of its own variance: the CR where every row is a cluster.
 
-    B (n, p) and e (n,) whitened.  Degrees of freedom are n − p for HC0 and HC1.
+    Degrees of freedom are n − p for HC0 and HC1.
     """
-    n = len(e)
-    found = cluster_robust(B, e, np.arange(n), f"CR{kind[2]}")
-    plain = kind in ("HC0", "HC1")
-    dof = np.full(len(found.dof), float(n - len(found.dof))) if plain else found.dof
+    plain, p = kind in ("HC0", "HC1"), len(found.dof)
+    dof = np.full(p, float(n - p)) if plain else found.dof
     return replace(found, kind=kind, dof=dof, description=ROW_DESCRIPTION[kind])
 
 

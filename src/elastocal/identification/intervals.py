@@ -7,68 +7,27 @@ from typing import Literal, get_args
 
 import numpy as np
 
-from elastocal.errors import InputError, option
 from elastocal.identification.constrained import (
     ActiveConstraint,
     KnowledgeProblem,
     constrained_fit,
     profile_end,
 )
-from elastocal.identification.covariance import Covariance, cluster_robust, hc, t_quantile
+from elastocal.identification.covariance import Covariance, Rows, clustered, of_rows, t_quantile
 from elastocal.identification.knowledge import Constraints
 from elastocal.identification.least_squares import Fit
 from elastocal.identification.noise_choice import NoiseFit
 from elastocal.identification.smooth_functions import SmoothPart
 from elastocal.identification.solve import Solution, residual_sigma
 from elastocal.identification.weighted_problem import (
-    Partition,
-    Span,
-    in_order,
+    Part,
+    each,
     regressor,
-    same_size,
 )
 from elastocal.units import Array, BoolArray
 
-# Cluster-robust covariance of a fit to a table too large for its B to be formed.
-
-# Configurations per parameter from which the sandwich needs no correction for leverage: its bias
-# and the loss of degrees of freedom are then a few per cent.
+# Configurations per parameter from which the scatter of those of a large table counts.
 ENOUGH = 10
-
-
-def worth_clustering(parts: Partition, n_parameters: int) -> bool:
-    """Whether configurations hold several readings, and are enough for their scatter to count."""
-    configurations = parts.observed.n_configurations
-    return len(parts.observed.lead) > configurations >= ENOUGH * n_parameters
-
-
-def cluster_by_parts(fit: Fit, parts: Partition) -> Covariance:
-    """CR1 over configurations (Liang and Zeger 1986), in passes over the parts of the table.
-
-    C Σ_c (B_cᵀe_c)(B_cᵀe_c)ᵀ C · G/(G − 1) · (n − 1)/(n − p) with C = (BᵀB)⁻¹, whitened, G
-    configurations and n rows; t with G − 1 degrees of freedom.
-    """
-
-    def meat(span: Span) -> Array:
-        part = parts.part(span)
-        at = regressor(fit.problem.model, part, fit.x, fit.columns)
-        B, e = part.weights.apply(at.B), part.weights.apply(at.residual)
-        rows_of = np.repeat(part.observations.configuration, part.observations.size)
-        scores = [np.einsum("grp,gr->gp", B[rows], e[rows]) for rows in same_size(rows_of)]
-        S = np.concatenate(scores)
-        return np.asarray(S.T @ S)
-
-    p = len(fit.columns)
-    middle = sum(in_order(parts.spans, meat), np.zeros((p, p)))
-    n, G = len(parts.observed.value), parts.observed.n_configurations
-    factor = G / (G - 1) * (n - 1) / (n - p)
-    cofactor = fit.cofactor()
-    matrix = factor * cofactor @ middle @ cofactor
-    text = f"readings of a configuration may depend on each other ({G} configurations)"
-    return Covariance("CR1", matrix, np.full(p, float(G - 1)), text)
-
-
-# Standard deviations and 95 % intervals of the fitted parameters, by the method asked for.
 
 IntervalKind = Literal[
     "auto", "classical", "hc0", "hc1", "hc2", "hc3", "cr0", "cr1", "cr2", "cr3",
@@ -98,8 +57,7 @@ def intervals_of(solution: Solution, kind: IntervalKind, noise: NoiseFit | None)
     classical: s²(BᵀW²B)⁻¹ with t (eq. 7, 13); hc…, cr…: sandwich, clusters being configurations;
     profile: of the nonlinear sum of squares.
 
-    Raises InputError for a kind that the problem does not allow, InsufficientDataError where
-    the data cannot give it.
+    Raises InsufficientDataError where the data cannot give it.
     """
     fit, observed = solution.fit, solution.problem.observations
     x = fit.x[fit.columns]
@@ -110,24 +68,28 @@ def intervals_of(solution: Solution, kind: IntervalKind, noise: NoiseFit | None)
     if kind == "auto" and noise is not None:
         return by_t(noise.covariance)
     problem = solution.problem
-    clustered = problem.large and worth_clustering(problem.parts, len(x))
-    if (kind == "cr1" and problem.large) or (kind == "auto" and clustered):
-        return by_t(cluster_by_parts(fit, problem.parts))
-    classical = _classical(solution)
+    if kind == "auto" and problem.large:
+        configurations = observed.n_configurations
+        several = len(observed.lead) > configurations >= ENOUGH * len(x)
+        kind = "cr1" if several else kind
     if kind in ("auto", "classical"):
-        return by_t(classical)
-    if problem.large:
-        raise InputError(
-            f"{option('intervals', kind)} needs B as a whole, which a table of this size does not "
-            "allow; use cr1 or classical"
-        )
+        return by_t(_classical(solution))
     if kind == "profile":
-        return _profiled(solution, classical)
-    B, e = problem.weights.apply(fit.B), fit.whitened
-    if kind.startswith("hc"):
-        return by_t(hc(B, e, kind.upper()))
-    rows_of = np.repeat(observed.configuration, observed.size)
-    return by_t(cluster_robust(B, e, rows_of, kind.upper()))
+        return _profiled(solution, _classical(solution))
+    found = _clustered(fit, kind)
+    return by_t(of_rows(found, len(fit.whitened), kind.upper()) if kind[0] == "h" else found)
+
+
+def _clustered(fit: Fit, kind: str) -> Covariance:
+    """Over configurations, or rows by themselves, in passes over the parts of the table."""
+    problem, V = fit.problem, fit.r_factor.half
+
+    def rows(part: Part) -> Rows:
+        at, own = regressor(problem.model, part, fit.x, fit.columns), part.observations
+        labels = part.rows if kind[0] == "h" else np.repeat(own.configuration, own.size)
+        return part.weights.apply(at.B @ V), part.weights.apply(at.residual), labels
+
+    return clustered(each(problem.parts, rows), V, f"CR{kind[2]}")
 
 
 def _classical(solution: Solution) -> Covariance:

@@ -5,9 +5,13 @@ import pytest
 import statsmodels.api as sm
 
 from elastocal.errors import InputError, InsufficientDataError
-from elastocal.identification.covariance import cluster_robust, hc
+from elastocal.identification.covariance import cluster_robust, clustered, of_rows, orthogonal
 
 KINDS = ("CR0", "CR1", "CR2", "CR3")
+
+
+def hc(B, e, kind):
+    return of_rows(cluster_robust(B, e, np.arange(len(e)), f"CR{kind[2]}"), len(e), kind)
 
 
 def residual(B, y):
@@ -81,6 +85,17 @@ def test_a_row_of_leverage_one_leaves_its_parameter_unbounded():
     assert hc(B, residual(B, e), "HC2").dof[4] == 0
     with pytest.raises(InsufficientDataError, match=r"row 17 alone .* use HC2"):
         hc(B, residual(B, e), "HC3")
+
+
+@pytest.mark.parametrize("kind", KINDS)
+def test_rows_may_come_in_parts(kind):
+    B, e, cluster = problem(6)
+    whole, factors = cluster_robust(B, e, cluster, kind), orthogonal(B)
+    some = np.isin(cluster, np.unique(cluster)[:3])
+    parts = [(factors.Q[own], e[own], cluster[own]) for own in (some, ~some)]
+    found = clustered(parts, factors.V, kind)
+    np.testing.assert_allclose(found.matrix, whole.matrix, rtol=1e-9)
+    np.testing.assert_allclose(found.dof, whole.dof, rtol=1e-9)
 
 
 def test_bad_input_is_told():
