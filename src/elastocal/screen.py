@@ -210,7 +210,7 @@ def progress_line(quiet: bool, every: float = 0.0) -> Iterator[Callable[[str], N
     if quiet:
         yield lambda message: None
         return
-    from rich.progress import BarColumn, Progress, SpinnerColumn, TextColumn, TimeElapsedColumn
+    from rich.progress import BarColumn, Progress, TextColumn, TimeElapsedColumn
 
     screen = safe_console(stderr=True)
     if not screen.is_terminal:
@@ -226,14 +226,9 @@ def progress_line(quiet: bool, every: float = 0.0) -> Iterator[Callable[[str], N
         yield line
         return
 
-    class Share(BarColumn):
-        """The bar, where the share is known."""
-
-        def render(self, task: Any) -> Any:
-            return "" if task.total is None else super().render(task)
-
     text = TextColumn("{task.description}", markup=False)
-    columns = (SpinnerColumn("line"), TimeElapsedColumn(), text, Share(bar_width=20))
+    # A bar that only moves while nothing is known of the share.
+    columns = (TimeElapsedColumn(), text, BarColumn(bar_width=20))
     with Progress(*columns, console=screen, transient=True) as shown_line:
         task = shown_line.add_task("starting", total=None)
 

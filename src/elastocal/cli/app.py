@@ -60,13 +60,8 @@ class InOrder(TyperGroup):
             words = (args[0] if args else extra.get("args")) or sys.argv[1:]
             _refuse_empty(words)
             code = 0 if self._helped(words) else super().main(*args, **extra)
-        except InputError as error:
-            complain(str(error))
-            code = error.exit_code
-        except (typer.Abort, KeyboardInterrupt, EOFError):
-            code = INTERRUPTED
-        except OSError as error:  # of --help and --version
-            code = _unwritten(error)
+        except (ElastocalError, OSError, typer.Abort, KeyboardInterrupt, EOFError) as error:
+            code = _ended(error)
         except Exception as error:
             if not hasattr(error, "show"):
                 raise
@@ -122,13 +117,8 @@ def reporting_errors(command: Callable[..., None]) -> Callable[..., None]:
                 # numpy's, of overflows: what comes of them is judged where a number must be one.
                 warnings.simplefilter("ignore", RuntimeWarning)
                 command(*args, **kwargs)
-        except ElastocalError as error:
-            complain(str(error))
-            raise typer.Exit(error.exit_code) from None
-        except OSError as error:
-            raise typer.Exit(_unwritten(error)) from None
-        except KeyboardInterrupt:
-            raise typer.Exit(INTERRUPTED) from None
+        except (ElastocalError, OSError, KeyboardInterrupt) as error:
+            raise typer.Exit(_ended(error)) from None
         except (typer.Exit, typer.Abort):
             raise
         except Exception as error:
@@ -145,8 +135,13 @@ def reporting_errors(command: Callable[..., None]) -> Callable[..., None]:
     return run
 
 
-def _unwritten(error: OSError) -> int:
-    """Say what the system refuses; the exit code."""
+def _ended(error: BaseException) -> int:
+    """Say why a command ends; the exit code."""
+    if isinstance(error, ElastocalError):
+        complain(str(error))
+        return error.exit_code
+    if not isinstance(error, OSError):
+        return INTERRUPTED
     if isinstance(error, BrokenPipeError):
         # The reader of stdout went away (… | head): nothing is wrong with the input.
         return 0

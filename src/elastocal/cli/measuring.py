@@ -20,6 +20,7 @@ from elastocal.cli.signatures import (
     Run,
     Seed,
     command,
+    whole_numbers,
 )
 from elastocal.errors import InputError, require
 from elastocal.screen import interrupt_check, say
@@ -154,12 +155,7 @@ def _target(text: str) -> float:
 
 
 def _numbers(text: str) -> list[int]:
-    try:
-        return [int(part) for part in text.split(",")]
-    except ValueError:
-        raise InputError(
-            f"--curve takes numbers of poses, as in 10,15,20; found '{text}'"
-        ) from None
+    return whole_numbers(text, "--curve takes numbers of poses, as in 10,15,20")
 
 
 def _candidates(text: str) -> int | str | list[int | str]:
@@ -214,7 +210,7 @@ def design(
 
     summary = beside(output)
     programs = program or []
-    _check_suffixes(programs, picture)
+    _check_asked(programs, picture)
     run.writes(output, summary, *programs, picture, report, cell_out)
     check = interrupt_check()
     with run.progress() as tell:
@@ -298,18 +294,14 @@ def _what_next(cell: Path, output: Path, augment: Path | None, plan: Plan) -> st
     )
 
 
-def _check_suffixes(programs: list[Path], picture: Path | None) -> None:
+def _check_asked(programs: list[Path], picture: Path | None) -> None:
     """Refuse names that do not say which kind of file is wanted."""
+    kinds = " or ".join(f"{suffix} for {name}" for suffix, name in PROGRAMS.items())
     for path in programs:
-        require(
-            path.suffix.lower() in PROGRAMS,
-            f"--program {path}: the suffix says the language, "
-            + " or ".join(f"{suffix} for {name}" for suffix, name in PROGRAMS.items()),
-        )
-    require(
-        picture is None or picture.suffix.lower() in PICTURES,
-        f"--picture {picture}: name it {' or '.join(PICTURES)}",
-    )
+        told = f"--program {path}: the suffix says the language, {kinds}"
+        require(path.suffix.lower() in PROGRAMS, told)
+    known = picture is None or picture.suffix.lower() in PICTURES
+    require(known, f"--picture {picture}: name it {' or '.join(PICTURES)}")
 
 
 def _check_programs(cell: Cell, programs: list[Path]) -> None:

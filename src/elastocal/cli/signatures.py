@@ -25,7 +25,7 @@ import typer
 
 from elastocal.arguments import LARGEST_SEED, kinds_of
 from elastocal.cli.app import app, check_apart, check_outputs, console, reporting_errors
-from elastocal.errors import flag_of
+from elastocal.errors import InputError, flag_of
 from elastocal.screen import progress_line, say
 from elastocal.text import json_text
 
@@ -61,6 +61,14 @@ TAKEN: dict[str, Any] = {
     "Sequence[str]": list[str], "Path": Path, "str": str, "ArrayLike": FORCE,
     "bool": bool, "int": int, "float": float, "Sequence[int]": str,
 }  # fmt: skip
+
+
+def whole_numbers(text: str, takes: str) -> list[int]:
+    """Numbers between commas, for an option that `takes` such."""
+    try:
+        return [int(part) for part in text.split(",")]
+    except ValueError:
+        raise InputError(f"{takes}; found '{text}'") from None
 
 
 class Run:

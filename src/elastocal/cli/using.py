@@ -21,6 +21,7 @@ from elastocal.cli.signatures import (
     Run,
     Seed,
     command,
+    whole_numbers,
 )
 from elastocal.errors import InputError, InsufficientDataError, require
 from elastocal.screen import progress_line, say
@@ -174,12 +175,8 @@ def _grid(arm: CalibratedArm, grid: str, box: str | None, rotation: str | None) 
     from elastocal.compensation.compensate import box_grid, joint_grid
     from elastocal.model.calibrated_tool import numbers
 
-    try:
-        counts = tuple(int(part) for part in grid.split(","))
-    except ValueError:
-        raise InputError(
-            f"--grid takes whole numbers, as in 5 or 9,7,7,3,3,1; found '{grid}'"
-        ) from None
+    takes = "--grid takes whole numbers, as in 5 or 9,7,7,3,3,1"
+    counts = tuple(whole_numbers(grid, takes))
     if box is None:
         return joint_grid(arm, counts)
     corners = numbers("--box", box, (6,), "x0,y0,z0,x1,y1,z1 in mm in the base frame") / 1e3
