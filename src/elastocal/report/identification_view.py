@@ -215,9 +215,8 @@ def _method(result: Calibration) -> Iterator[Block]:
         *words.noise_lines(result),
         ("Intervals", sentence(words.intervals_line(result))),
     ])  # fmt: skip
-    for table in (words.size_table(result.noise), words.candidate_table(result.noise)):
-        if len(table.rows) > 1:
-            yield table
+    if len((tried := words.candidate_table(result.noise)).rows) > 1:
+        yield tried
     if result.residual_summary is not None:
         yield words.deviating_table(result.residual_summary)
 

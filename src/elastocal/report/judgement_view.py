@@ -402,13 +402,13 @@ def _why_not_judged(result: Calibration) -> str:
 
 def noise_model_line(result: Calibration) -> str | None:
     noise = result.noise
-    sizes, reason = size_table(noise).rows, noise.reason
+    sizes, reason = _sizes(noise), noise.reason
     if not sizes and not reason:
         return None
     text = printable(noise.description)
     text = text[:1].upper() + text[1:]
     if sizes:
-        text += ": " + "; ".join(f"{name} {size}" for name, size in sizes)
+        text += f": {'; '.join(sizes)}"
     candidates = candidate_table(noise).rows
     if len(candidates) > 1:
         second, _, gap = candidates[1]
@@ -417,7 +417,7 @@ def noise_model_line(result: Calibration) -> str | None:
     return f"{text}. Chosen: {printable(reason)}." if reason else f"{text}."
 
 
-def size_table(noise: Noise) -> ShownTable:
+def _sizes(noise: Noise) -> list[str]:
     """Name and standard deviation of every noise component; of many, the two extremes."""
     sizes = noise.sizes or ()
     shared = [s for s in sizes if s.shared or s.of_joints or s.drift]
@@ -426,8 +426,7 @@ def size_table(noise: Noise) -> ShownTable:
     if len(own) > FEW:
         named = [(f"median of {len(own)}", own[len(own) // 2])]
         named += [(f"smallest ({own[0].name})", own[0]), (f"largest ({own[-1].name})", own[-1])]
-    rows = [(printable(name), _size(s)) for name, s in [*named, *((s.name, s) for s in shared)]]
-    return ShownTable(("part", "size"), rows, title="Noise, standard deviations")
+    return [f"{printable(name)} {_size(s)}" for name, s in [*named, *((s.name, s) for s in shared)]]
 
 
 def _number(s: NoiseSize) -> float:

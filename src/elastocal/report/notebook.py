@@ -25,7 +25,6 @@ if TYPE_CHECKING:
     from elastocal.compensation.compensate import Compensation
     from elastocal.diagnosis.changes import Comparison
     from elastocal.diagnosis.diagnosis import Diagnosis
-    from elastocal.diagnosis.next_poses import NextPoses
     from elastocal.identification.result import Calibration
     from elastocal.planning.plan import Plan
 
@@ -110,10 +109,12 @@ def _estimates(result: Calibration) -> pd.DataFrame:
     return frame.astype(dict.fromkeys(numbers, float))
 
 
-def _plan_frame(plan: Plan) -> pd.DataFrame:
+def _plan_frame(plan: Plan | None) -> pd.DataFrame:
     """One row per pose: joints in ° or mm, place in the order, and the load where it states one."""
     import pandas as pd
 
+    if plan is None:
+        return pd.DataFrame()
     columns: dict[str, Any] = {"configuration": list(plan.configurations)}
     kinds = plan.model.chain.kinds
     columns |= dict(zip(joint_columns(kinds), in_file_units(plan.q, kinds).T, strict=True))
@@ -122,13 +123,6 @@ def _plan_frame(plan: Plan) -> pd.DataFrame:
     order = first_stops(plan)
     columns["order"] = [order.get(k) for k in range(len(plan.q))]
     return pd.DataFrame(columns)
-
-
-def _next_frame(found: NextPoses) -> pd.DataFrame:
-    """The poses, as of a plan; empty where none are needed."""
-    import pandas as pd
-
-    return pd.DataFrame() if found.plan is None else _plan_frame(found.plan)
 
 
 def _candidates(d: Diagnosis) -> pd.DataFrame:
@@ -175,7 +169,7 @@ def _changes(c: Comparison) -> pd.DataFrame:
 FRAMES: dict[str, Callable[[Any], pd.DataFrame]] = {
     "Calibration": _estimates,
     "Plan": _plan_frame,
-    "NextPoses": _next_frame,
+    "NextPoses": lambda found: _plan_frame(found.plan),
     "Diagnosis": _candidates,
     "Comparison": _changes,
     "Compensation": _commands,
