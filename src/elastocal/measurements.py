@@ -14,24 +14,12 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 from numpy.typing import NDArray
 
+from elastocal import tables
 from elastocal.above import Result
 from elastocal.arguments import checked_arguments
 from elastocal.errors import InputError, option
 from elastocal.files import atomic_writer, open_input, read_text
-from elastocal.tables import (
-    MOST_BYTES,
-    NO_UNIT,
-    Family,
-    Labels,
-    Layout,
-    RawTable,
-    column,
-    first_bad_cell,
-    layout_of_columns,
-    match_columns,
-    read_table,
-    write_csv,
-)
+from elastocal.tables import NO_UNIT, Family, Labels, Layout, RawTable, column
 from elastocal.text import did_you_mean, is_label, listed, quoted
 from elastocal.units import ANGLE, LENGTH, TIME, Array, IntArray
 
@@ -454,7 +442,7 @@ def layout_of(
     `extra`: families that this table may have besides.
     """
     known = families(joint_kinds) | {family.name: family for family in extra}
-    present = match_columns(
+    present = tables.match_columns(
         source,
         header,
         known,
@@ -465,7 +453,7 @@ def layout_of(
     if joint_kinds and stated and len(present.get("q", {})) != len(joint_kinds):
         raise InputError(f"{source}: {_wrong_count(header, known['q'])}")
     needed_by = f'observe = "{observe}" in the cell file needs'
-    return layout_of_columns(source, present, known, REQUIRED[observe], needed_by, EXCLUSIVE)
+    return tables.layout_of_columns(source, present, known, REQUIRED[observe], needed_by, EXCLUSIVE)
 
 
 def _wrong_joint(text: str, header: Sequence[str], known: Mapping[str, Family]) -> str | None:
@@ -526,7 +514,7 @@ def read_measurements(
             )
         return layout_of(str(path), header, joint_kinds, observe)
 
-    raw = read_table(path, choose, text=text)
+    raw = tables.read_table(path, choose, text=text)
     n = len(raw.row)
     found = {name: _values(raw, name) for name in raw.layout.columns}
     # A plan without the column is of all markers.
@@ -671,7 +659,7 @@ def write_measurements(measurements: Measurements, path: str | Path) -> None:
         if values.dtype != object and not np.isfinite(values).all():
             raise InputError(f"{path}: the {meaning[header]} to write are not all finite")
     with atomic_writer(path) as handle:
-        write_csv(handle, columns, _rows(columns, len(measurements)))
+        tables.write_csv(handle, columns, _rows(columns, len(measurements)))
 
 
 def _rows(columns: Mapping[str, np.ndarray], n: int) -> Iterator[tuple]:
@@ -689,7 +677,7 @@ def read_matrix(path: str | Path, what: str) -> Array:
     """A matrix of finite numbers without a header: CSV, or numpy's .npy."""
     if Path(path).suffix.lower() == ".npy":
         return _read_npy(path, what)
-    lines = enumerate(read_text(path, what, MOST_BYTES).splitlines(), start=1)
+    lines = enumerate(read_text(path, what, tables.MOST_BYTES).splitlines(), start=1)
     rows = [(n, [cell.strip() for cell in line.split(",")]) for n, line in lines if line.strip()]
     if not rows:
         raise InputError(f"{path}: empty file; a {what} is a square table of numbers")
@@ -701,14 +689,14 @@ def read_matrix(path: str | Path, what: str) -> Array:
                 f"{what} is a square table without a header"
             )
     columns = {i: f"no. {i + 1}" for i in range(width)}
-    if problem := first_bad_cell(str(path), rows, columns, False):
+    if problem := tables.first_bad_cell(str(path), rows, columns, False):
         raise problem
     return np.array([cells for _, cells in rows], dtype=np.float64)
 
 
 def _read_npy(path: str | Path, what: str) -> Array:
     remedy = "save the matrix with numpy.save, or as CSV"
-    with open_input(path, what, MOST_BYTES) as handle:
+    with open_input(path, what, tables.MOST_BYTES) as handle:
         try:
             # Mapped, so that a header which states more numbers than the file has reads nothing.
             found = np.lib.format.open_memmap(handle.name, mode="r")

@@ -19,13 +19,8 @@ from numpy.typing import NDArray
 from elastocal.cell.work_cell import Cell
 from elastocal.errors import InputError
 from elastocal.identification.mistakes import NominalFit, nominal_fit
-from elastocal.importing.joining import (
-    Joined,
-    groups_alike,
-    join,
-    pooled,
-    with_joints,
-)
+from elastocal.importing import joining, records
+from elastocal.importing.joining import Joined
 from elastocal.importing.mapping_file import (
     ImportMapping,
     JoinTable,
@@ -34,15 +29,7 @@ from elastocal.importing.mapping_file import (
     SourceTable,
     UnitsTable,
 )
-from elastocal.importing.records import (
-    Records,
-    Understood,
-    is_spherical,
-    joint_stems,
-    read_records,
-    with_labels,
-    with_positions,
-)
+from elastocal.importing.records import Records, Understood
 from elastocal.measurements import Measurements, families, read_measurements
 from elastocal.model.chain import joint_limits
 from elastocal.model.manipulator import load_chain
@@ -115,15 +102,15 @@ def load_in(text: str) -> tuple[str, float] | None:
 
 
 def with_loads_of_names(
-    records: Mapping[str, list[Records]], loads: Mapping[str, Any] | None
+    by_role: Mapping[str, list[Records]], loads: Mapping[str, Any] | None
 ) -> tuple[dict[str, list[Records]], dict[str, Any] | None, list[str]]:
     """The records with the loads that their files are named for, where nothing else states any,
     those loads by name, and what to tell.  They hang straight down.
     """
-    every = [r for role in records.values() for r in role]
+    every = [r for role in by_role.values() for r in role]
     stated = any(r.load is not None or "load" in r.labels for r in every)
     if loads or stated or any("force_x" in r.numbers for r in every):
-        return dict(records), dict(loads or {}) or None, []
+        return dict(by_role), dict(loads or {}) or None, []
     named = {id(r): load_in(Path(r.source).stem) for r in every}
     known = {found[0]: found[1] for found in named.values() if found}
     if not known:
@@ -134,27 +121,27 @@ def with_loads_of_names(
             for name in r.understood.unused
             if _WORD.search(name)
         ]
-        return dict(records), None, [
+        return dict(by_role), None, [
             f"{listed(told)}: named for a load that is not taken, and the rows are written "
             "unloaded; state it by load in [[source]] and [loads], or by load = \"…\" in "
             "[source.columns]"
         ] if told else []  # fmt: skip
     made = {}
-    for role, files in records.items():
+    for role, files in by_role.items():
         texts = [(named[id(r)] or ("unloaded", 0.0))[0] for r in files]
         made[role] = [replace(r, load=t) for r, t in zip(files, texts, strict=True)]
-    if all(named[id(r)] is None for r in records["points"]):
+    if all(named[id(r)] is None for r in by_role["points"]):
         # The points are those of the joint logs.
         only = {r.load for r in made["joints"]}
         if len(only) > 1:
             raise InputError(
-                f"{records['joints'][0].source}: joint logs are named for the loads "
+                f"{by_role['joints'][0].source}: joint logs are named for the loads "
                 f"{listed(sorted(map(str, only)))} and the points for none; give load in the "
                 "[[source]] of each file of points"
             )
-        made["points"] = [replace(r, load=next(iter(only))) for r in records["points"]]
-    elif all(named[id(r)] is None for r in records["joints"]):
-        made["joints"] = list(records["joints"])  # one log for every load
+        made["points"] = [replace(r, load=next(iter(only))) for r in by_role["points"]]
+    elif all(named[id(r)] is None for r in by_role["joints"]):
+        made["joints"] = list(by_role["joints"])  # one log for every load
     told = [
         f"{r.source}: taken as measured under {found[0]} by its name, hanging straight down "
         f"(0, 0, {0.0 - found[1]:.6g}) N; load in [[source]] states another"
@@ -197,7 +184,7 @@ def assemble(where: str, points: Records, log: Records | None, joined: Joined | 
     settings = mapping.join or JoinTable()
     rows = np.arange(len(points)) if joined is None else np.flatnonzero(joined.row >= 0)
     numbers, units = _numbers(points, log, joined, rows)
-    stems = joint_stems(numbers)
+    stems = records.joint_stems(numbers)
     if not stems:
         raise InputError(
             f"{where}: no joint values; map q1_deg … in [source.columns], or add a [[source]] with "
@@ -262,7 +249,7 @@ def _configurations(
         np.minimum.at(first, inverse.ravel(), np.arange(len(q)))
         order = np.argsort(first)
         codes = np.empty(len(kinds), dtype=np.int64)
-        codes[order] = groups_alike(kinds[order], spread)
+        codes[order] = joining.groups_alike(kinds[order], spread)
         return [str(code + 1) for code in codes[inverse.ravel()]], []
     names = [stated[i] for i in rows]
     _, code = np.unique(np.array(names, dtype=object).astype(str), return_inverse=True)
@@ -490,32 +477,34 @@ def import_files(
     if cell is not None:
         names = tuple(joint.name for joint in load_chain(cell).joints)
     units = table.units or UnitsTable()
-    records: dict[str, list[Records]] = {"points": [], "joints": []}
+    by_role: dict[str, list[Records]] = {"points": [], "joints": []}
     understood = []
     spherical = False
     for path, source in _assigned(where, files, mapping.sources):
-        found = with_labels(where, read_records(where, path, source, units), source.names)
-        spherical = spherical or is_spherical(found)
-        found = with_positions(found, clockwise=source.azimuth == "clockwise")
+        found = records.with_labels(
+            where, records.read_records(where, path, source, units), source.names
+        )
+        spherical = spherical or records.is_spherical(found)
+        found = records.with_positions(found, clockwise=source.azimuth == "clockwise")
         role = source.role or ("both" if "x" in found.numbers or "distance" in found.numbers
                                else "joints")  # fmt: skip
-        if role in ("joints", "both") and joint_stems(found.numbers):
-            found = with_joints(where, found, table.joints, names)
-        records["joints" if role == "joints" else "points"].append(found)
+        if role in ("joints", "both") and records.joint_stems(found.numbers):
+            found = joining.with_joints(where, found, table.joints, names)
+        by_role["joints" if role == "joints" else "points"].append(found)
         understood.append(found.understood)
-    if not records["points"]:
+    if not by_role["points"]:
         raise InputError(
             f"{where}: no file with points among {listed(map(str, files), 5)}; add the tracker's "
             'export, or set role = "points" in its [[source]]'
         )
-    records, loads, told = with_loads_of_names(records, table.loads)
-    points = pooled(records["points"])
-    log = pooled(records["joints"]) if records["joints"] else None
+    by_role, loads, told = with_loads_of_names(by_role, table.loads)
+    points = joining.pooled(by_role["points"])
+    log = joining.pooled(by_role["joints"]) if by_role["joints"] else None
     if log is not None and not log.q.shape[1]:
         raise InputError(
             f"{log.files[0]}: no joint values; map q1_deg … (or q#_deg) in its [source.columns]"
         )
-    joined = None if log is None else join(where, points, log, table.join)
+    joined = None if log is None else joining.join(where, points, log, table.join)
     made = assemble(where, points, log, joined, table, loads)
     text = table_text(made)
     measured = validated(text, name, made, cell)
