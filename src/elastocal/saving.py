@@ -144,7 +144,6 @@ def wish_of(
     no format goes by the file's ending, costs are stated under `load` (3,) N at random `poses`.
     """
     from elastocal.export.export import Wish, format_of
-    from elastocal.export.rigid_files import Frames
     from elastocal.model.calibrated import Conditions
 
     chosen = format_of(path, format)
@@ -162,7 +161,8 @@ def wish_of(
     )
     return Wish(
         format=chosen,
-        frames=Frames(tool=frames, base=base_frame),
+        frames=frames,
+        base_frame=base_frame,
         conditions=Conditions(np.zeros(3) if force is None else force, time_s, temperature_c),
         poses=poses,
         seed=seed,

@@ -11,7 +11,6 @@ from support.exports import DH, GEOMETRY, exported, flanges_in_base, poses_of, w
 from support.robots import KR270, PACKAGED, packaged_urdf, random_chain_urdf
 from support.urdf_text import arm
 
-from elastocal.export.rigid_files import Frames
 from elastocal.model.calibrated import CalibratedArm
 from elastocal.model.urdf import check_urdf, read_urdf
 
@@ -65,7 +64,7 @@ def test_branches_slides_and_joints_above_the_base(seed: int, tmp_path: Path) ->
     cell, result = write_result(
         tmp_path, 'urdf = "arm.urdf"\nbase = "base"\nflange = "flange"', GEOMETRY, seed=seed
     )
-    check(cell, result, "base", "flange", frames=Frames(tool=True, base=True))
+    check(cell, result, "base", "flange", base_frame=True)
 
 
 def test_a_flange_that_the_last_joint_moves_gets_a_mount(tmp_path: Path) -> None:
@@ -84,7 +83,7 @@ def test_an_arm_of_a_dh_table_gets_a_urdf(convention: str, tmp_path: Path) -> No
     (tmp_path / "dh.csv").write_text(DH)
     robot = f'dh = "dh.csv"\ndh_convention = "{convention}"'
     cell, result = write_result(tmp_path, robot, GEOMETRY)
-    text = check(cell, result, "base_link", "flange", frames=Frames(tool=True, base=True))
+    text = check(cell, result, "base_link", "flange", base_frame=True)
     assert text.count('type="continuous"') == 1  # a4 has no limits
     (tmp_path / "new.urdf").write_text(text)
     limits = [(j.lower, j.upper) for j in read_urdf(tmp_path / "new.urdf", "base_link").joints]
@@ -93,7 +92,7 @@ def test_an_arm_of_a_dh_table_gets_a_urdf(convention: str, tmp_path: Path) -> No
 
 def test_markers_load_point_and_tracker_stand_where_they_were_identified(tmp_path: Path) -> None:
     cell, result = write_result(tmp_path, f'urdf = "{KR270}"\nflange = "flange"', GEOMETRY)
-    calibrated, done = exported(cell, result, "urdf", frames=Frames(tool=True, base=True))
+    calibrated, done = exported(cell, result, "urdf", base_frame=True)
     q = poses_of(calibrated, 5, seed=2)
     for name in ("M1", "M2"):
         placed = frame_positions(done.text, calibrated, q, "flange", f"elastocal_marker_{name}")
@@ -110,14 +109,13 @@ def test_markers_load_point_and_tracker_stand_where_they_were_identified(tmp_pat
 
 def test_an_export_of_an_export_moves_its_frames(tmp_path: Path) -> None:
     cell, result = write_result(tmp_path, f'urdf = "{KR270}"\nflange = "flange"', GEOMETRY)
-    both = Frames(tool=True, base=True)
-    (tmp_path / "once.urdf").write_text(exported(cell, result, "urdf", frames=both)[1].text)
+    (tmp_path / "once.urdf").write_text(exported(cell, result, "urdf", base_frame=True)[1].text)
     robot = 'urdf = "once.urdf"\nbase = "base_link"'  # the flange is still found
     again = write_result(tmp_path, robot, GEOMETRY, seed=7)
-    text = check(*again, "base_link", "flange", frames=both)
+    text = check(*again, "base_link", "flange", base_frame=True)
     assert text.count('link name="elastocal_marker_M1"') == 1
     assert text.count('link name="elastocal_tracker"') == 1
-    calibrated, _ = exported(*again, "urdf", frames=both)
+    calibrated, _ = exported(*again, "urdf", base_frame=True)
     q = poses_of(calibrated, 2, seed=2)
     own = [calibrated.values[f"marker:M2.{k}"] for k in "xyz"]
     placed = frame_positions(text, calibrated, q, "flange", "elastocal_marker_M2")

@@ -15,7 +15,6 @@ from support.exports import GEOMETRY, exported, write_result
 from support.robots import KR270, packaged_urdf
 
 from elastocal.errors import InputError
-from elastocal.export.rigid_files import Frames
 from elastocal.model.xml_file import XmlText
 from elastocal.units import rpy_from_rotation
 
@@ -66,7 +65,7 @@ def changed_lines(old: str, new: str) -> list[str]:
 def test_only_origins_on_the_chain_change(tmp_path: Path) -> None:
     path, flange = packaged_urdf("UR5")
     written = write_result(tmp_path, f'urdf = "{path}"\nflange = "{flange}"', GEOMETRY)
-    _, done = exported(*written, "urdf", frames=Frames(tool=False))
+    _, done = exported(*written, "urdf", frames=False)
     changed = changed_lines(path.read_text(), done.text)
     removed = [line for line in changed if line.startswith("-")]
     assert removed and all("<origin" in line for line in removed)
@@ -85,7 +84,7 @@ def test_a_foreign_link_of_that_name_is_not_overwritten(tmp_path: Path) -> None:
     written = write_result(tmp_path, 'urdf = "arm.urdf"\nflange = "flange"', GEOMETRY)
     with pytest.raises(InputError, match="elastocal_marker_M1"):
         exported(*written, "urdf")
-    exported(*written, "urdf", frames=Frames(tool=False))
+    exported(*written, "urdf", frames=False)
 
 
 @given(

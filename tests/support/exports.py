@@ -11,7 +11,6 @@ import numpy as np
 from elastocal.cell.work_cell import read_cell
 from elastocal.export.export import Exported, Wish, export
 from elastocal.export.exportable import Conditions, random_table
-from elastocal.export.rigid_files import Frames
 from elastocal.model.arm import Parameter
 from elastocal.model.calibrated import CalibratedArm, read_calibrated
 from elastocal.model.effects.catalogue import CATALOGUE
@@ -78,11 +77,11 @@ def exported(
     format: str,
     force: Array | None = None,
     poses: int = 20,
-    frames: Frames | None = None,
+    **added: bool,
 ) -> tuple[CalibratedArm, Exported]:
     calibrated = read_calibrated(cell, result)
     conditions = Conditions(np.zeros(3) if force is None else force)
-    wish = Wish(format, frames or Frames(), conditions, poses=poses)
+    wish = Wish(format, conditions=conditions, poses=poses, **added)
     return calibrated, export(calibrated, wish)
 
 

@@ -20,7 +20,6 @@ from elastocal.export import exportable, mjcf_file, rigid_files
 from elastocal.export.exportable import Cost, ExportNumbers, Kept
 from elastocal.export.mjcf_file import HeldArm, MujocoRest, NotInPlace
 from elastocal.export.refit import JointCorrection, Refit, refitted
-from elastocal.export.rigid_files import Frames
 from elastocal.files import atomic_write_text, together
 from elastocal.identification.covariance import t_quantile
 from elastocal.model.calibrated import CalibratedArm, Conditions, Valued, random_table
@@ -180,7 +179,8 @@ class Wish:
     force of `conditions` though it is zero; `correct_joints`: with a joint correction."""
 
     format: str
-    frames: Frames = field(default_factory=Frames)
+    frames: bool = True
+    base_frame: bool = False
     conditions: Conditions = field(default_factory=Conditions)
     load_stated: bool = False
     correct_joints: bool = False
@@ -419,11 +419,12 @@ def _urdf(calibrated: CalibratedArm, wish: Wish, kept: Kept, pieces: ExportNumbe
 
     robot = calibrated.model.cell.robot
     note = _note(calibrated, kept)
+    added = wish.frames, wish.base_frame
     if robot.urdf is not None:
-        text = rigid_files.calibrated_urdf(robot, pieces, wish.frames, note)
+        text = rigid_files.calibrated_urdf(robot, pieces, *added, note)
         base, flange = check_urdf(robot.urdf).ends(robot.base, robot.flange)
     else:
-        text = rigid_files.new_urdf(pieces, wish.frames, note)
+        text = rigid_files.new_urdf(pieces, *added, note)
         base, flange = rigid_files.BASE, rigid_files.FLANGE
     back = _read_back(text, ".urdf", partial(read_urdf, base=base, flange=flange))
     q = random_table(kept.full.model, kept.conditions, 100, wish.seed).q
@@ -457,7 +458,7 @@ def _mjcf(calibrated: CalibratedArm, wish: Wish, kept: Kept, pieces: ExportNumbe
     if pieces.masses and robot.urdf is not None:
         inertias = exportable.link_inertias(robot.urdf, pieces.chain)
     text = mjcf_file.calibrated_mjcf(
-        pieces, _note(calibrated, kept), inertias, _compensator(kept.exported), wish.frames.base
+        pieces, _note(calibrated, kept), inertias, _compensator(kept.exported), wish.base_frame
     )
     if not pieces.masses:
         warnings.append(
@@ -472,7 +473,7 @@ def _mjcf(calibrated: CalibratedArm, wish: Wish, kept: Kept, pieces: ExportNumbe
         warnings.append("not read back: MuJoCo is not installed (pip install elastocal[mujoco])")
         return Written(text, warnings=tuple(warnings))
     names = ["flange", *(f"marker_{name}" for name in pieces.markers)]
-    placed = pieces.T_tracker_base if wish.frames.base else np.eye(4)
+    placed = pieces.T_tracker_base if wish.base_frame else np.eye(4)
     at_rest = partial(MujocoRest(text).sites, names=names)
     distance = _check_rest(at_rest, pieces, kept, placed, wish.seed)
     return Written(text, distance, "MuJoCo, at rest under the load", tuple(warnings))
@@ -481,14 +482,14 @@ def _mjcf(calibrated: CalibratedArm, wish: Wish, kept: Kept, pieces: ExportNumbe
 def _corrected(calibrated: CalibratedArm, wish: Wish, kept: Kept, pieces: ExportNumbers) -> Written:
     """The user's own MJCF; raises NotInPlace where it cannot take the corrections."""
     cell = calibrated.model.cell
-    if wish.frames.base:
+    if wish.base_frame:
         raise NotInPlace(f"{option('base_frame')} makes the tracker's frame the world")
     if _compensator(kept.exported) is not None:
         raise NotInPlace("it has no gravity compensator")
     if pieces.masses and not cell.model.link_gravity:
         raise NotInPlace("weights were identified without those of the file (link_gravity = false)")
     text, warnings = mjcf_file.corrected_mjcf(
-        cell.robot, pieces, wish.frames.tool, _note(calibrated, kept)
+        cell.robot, pieces, wish.frames, _note(calibrated, kept)
     )
     arm = HeldArm(text, cell.robot, pieces)
     distance = _check_rest(arm, pieces, kept, arm.T_world_base, wish.seed)

@@ -35,20 +35,14 @@ PREFIX = "elastocal_"
 MOUNT, TRACKER, LOAD_POINT = f"{PREFIX}flange_mount", f"{PREFIX}tracker", f"{PREFIX}load_point"
 
 
-@dataclass(frozen=True)
-class Frames:
-    """Which frames to add to the robot: markers and load point on the flange; the tracker's."""
-
-    tool: bool = True
-    base: bool = False
-
-
-def calibrated_urdf(robot: Robot, pieces: ExportNumbers, frames: Frames, note: str) -> str:
+def calibrated_urdf(
+    robot: Robot, pieces: ExportNumbers, tool: bool, base_frame: bool, note: str
+) -> str:
     """Text of the robot's URDF with the calibrated geometry; `note` becomes a comment in it.
 
-    Only origins that change are touched.  Frames: elastocal_marker_NAME and elastocal_load_point
-    as links on the flange, elastocal_tracker as the new root above the robot.  Raises InputError
-    where the file has a link or joint of such a name that is none of these.
+    Only origins that change are touched.  `tool` adds elastocal_marker_NAME and
+    elastocal_load_point as links on the flange, `base_frame` elastocal_tracker as the new root.
+    Raises InputError where the file has a link or joint of such a name that is none of these.
     """
     assert robot.urdf is not None
     tree = check_urdf(robot.urdf)
@@ -59,10 +53,10 @@ def calibrated_urdf(robot: Robot, pieces: ExportNumbers, frames: Frames, note: s
         if not nothing(correction := pieces.correction(i)):
             text.place(joint.name, joint.origin @ correction)
     added += _correct_flange(tree, text, pieces, flange)
-    if frames.tool:
+    if tool:
         for name, T in tool_frames(pieces).items():
             added += text.fixed(name, flange, name, T)
-    if frames.base:
+    if base_frame:
         added += _tracker_frame(tree, text, pieces, base)
     text.insert(text.end, "".join(f"  {line}\n" for line in added))
     return text.result()
@@ -153,7 +147,7 @@ BASE, FLANGE = "base_link", "flange"
 NO_LIMIT = 1e6  # m; a URDF's slide must have limits
 
 
-def new_urdf(pieces: ExportNumbers, frames: Frames, note: str) -> str:
+def new_urdf(pieces: ExportNumbers, tool: bool, base_frame: bool, note: str) -> str:
     """URDF text of links base_link, link_1 … link_n, flange with the calibrated placements.
 
     Joints bear the table's names and limits (continuous where one has none); masses stand with a
@@ -161,7 +155,7 @@ def new_urdf(pieces: ExportNumbers, frames: Frames, note: str) -> str:
     """
     chain = pieces.calibrated_chain()
     lines = []
-    if frames.base:
+    if base_frame:
         lines += fixed_link(TRACKER, TRACKER, BASE, pieces.T_tracker_base)
     lines += [element("link", {"name": BASE})]
     parent = BASE
@@ -170,7 +164,7 @@ def new_urdf(pieces: ExportNumbers, frames: Frames, note: str) -> str:
         lines += _joint(joint, parent, f"link_{i}")
         parent = f"link_{i}"
     lines += fixed_link(FLANGE, parent, FLANGE, chain.flange_placement)
-    if frames.tool:
+    if tool:
         for name, T in tool_frames(pieces).items():
             lines += fixed_link(name, FLANGE, name, T)
     head = ['<?xml version="1.0" encoding="UTF-8"?>', comment(note)]
