@@ -52,7 +52,6 @@ def test_what_fits_passes(good: Cell) -> None:
 @pytest.mark.parametrize(
     ("bad", "told"),
     [
-        (cell(levels={"joint7": (0.0,)}), ["[design.levels] names joint7", "6 joints"]),
         (cell(levels={"joint2": (-1.0, 0.2)}), ["joint2 at 11.4592°", "-146° to 0°"]),
         (
             cell(model={"compliance_levels": {"joint2": (-1.0,)}}, levels={"joint2": (-0.9,)}),

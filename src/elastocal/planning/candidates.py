@@ -343,43 +343,6 @@ class Pins:
     struck: Array
     taken: tuple[str, ...]
 
-    @classmethod
-    def of(
-        cls,
-        keep: tuple[Measurements, Sequence[str]] | None,
-        strike: tuple[Measurements, Sequence[str]] | None,
-    ) -> Pins | None:
-        """Of the plans' poses with these names: those to keep (all, where none is named), and
-        those to strike, of which plan all others are kept.  Raises InputError for a name that
-        the plan lacks, and where nothing is named to strike."""
-        names: list[str] = []
-        rows, struck, taken = [], [], dict[str, None]()
-        for given, stays in ((keep, True), (strike, False)):
-            if given is None:
-                continue
-            table, named = given
-            own = _poses(table)
-            for name in named:
-                require(
-                    name in own,
-                    f"{table.source}: there is no pose {quoted(name)}"
-                    f"{did_you_mean(name, list(own))}; there are {listed(list(own))}",
-                )
-            require(bool(named) or stays, f"{option('strike')} takes poses, as in plan.csv:3,7")
-            kept = [n for n in own if (n in named) == stays] if named else list(own)
-            gone = [] if stays else [own[n] for n in named]
-            struck += [table.q[row] for row in gone]
-            clash = [name for name in kept if name in names]
-            require(not clash, f"{table.source}: pose {listed(clash)} is to be kept twice")
-            names += kept
-            rows += [table.q[own[n]] for n in kept]
-            taken |= dict.fromkeys(own)
-        if not rows and not struck:
-            return None
-        n = len((struck or rows)[0])
-        kept_at, struck_at = (np.array(lot).reshape(-1, n) for lot in (rows, struck))
-        return cls(tuple(names), kept_at, struck_at, tuple(taken))
-
     def placed(self, cell: Cell, chain: Chain, rules: Feasibility) -> IntArray:
         """The level (k,) of each pose that stays.
 
@@ -407,24 +370,42 @@ class Pins:
 
 def read_pins(
     cell: Cell, model: Model, keep: str | Path | None, strike: str | Path | None, sized: bool
-) -> tuple[Cell, Pins | None]:
-    """What stays and what is struck by the names of files, as in "plan.csv:3,7"; and the cell,
-    which asks for as many poses as the plan had of which poses are struck, unless it is `sized`.
+) -> tuple[Cell, Pins]:
+    """What stays and what is struck, as in "plan.csv:3,7" (all stay, where none is named), of which
+    plan all others stay; and the cell, which asks for as many poses as the plan had of which poses
+    are struck, unless it is `sized`.
 
-    Raises InputError as `Pins.of` does, and for files that cannot be read.
+    Raises InputError for files that cannot be read, a name that the plan lacks or that stays twice,
+    and where nothing is named to strike.
     """
-
-    def read(text: str | Path) -> tuple[Measurements, tuple[str, ...]]:
-        path, names = plan_and_names(text)
-        return model.read_plan(path), names
-
-    repaired = None if strike is None else read(strike)
-    pins = Pins.of(None if keep is None else read(keep), repaired)
-    if repaired is not None and not sized and cell.design.target is None:
-        n = len(_poses(repaired[0]))
-        if n != int(shares_of(cell).sum()):
-            cell = replace(cell, design=replace(cell.design, poses=n, per_level=()))
-    return cell, pins
+    kept: dict[str, Array] = {}
+    struck: list[Array] = []
+    taken: dict[str, None] = {}
+    for text, stays in ((keep, True), (strike, False)):
+        if text is None:
+            continue
+        path, named = plan_and_names(text)
+        table = model.read_plan(path)
+        own = {name: table.q[row] for name, row in _poses(table).items()}
+        for name in named:
+            require(
+                name in own,
+                f"{table.source}: there is no pose {quoted(name)}{did_you_mean(name, list(own))}; "
+                f"there are {listed(list(own))}",
+            )
+        require(bool(named) or stays, f"{option('strike')} takes poses, as in plan.csv:3,7")
+        left = [name for name in own if not named or (name in named) == stays]
+        clash = [name for name in left if name in kept]
+        require(not clash, f"{table.source}: pose {listed(clash)} is to be kept twice")
+        kept |= {name: own[name] for name in left}
+        taken |= dict.fromkeys(own)
+        if not stays:
+            struck += [own[name] for name in named]
+            if not sized and cell.design.target is None and len(own) != shares_of(cell).sum():
+                cell = replace(cell, design=replace(cell.design, poses=len(own), per_level=()))
+    n, q = model.chain.n_joints, list(kept.values())
+    at, away = (np.array(lot).reshape(-1, n) for lot in (q, struck))
+    return cell, Pins(tuple(kept), at, away, tuple(taken))
 
 
 def plan_and_names(text: str | Path) -> tuple[Path, tuple[str, ...]]:

@@ -117,7 +117,7 @@ class Collisions:
         geometry = geometry_of(kinematics, [item for p in pairs for item in (p.body, p.other)])
         hangs = np.array([pair.hangs for pair in pairs], dtype=bool)
         self._always, self._loaded = (
-            (own, _pool(model, geometry, [pairs[k] for k in own]))
+            (own, _pool(model, geometry, [pairs[int(k)] for k in own]))
             for own in (np.flatnonzero(~hangs), np.flatnonzero(hangs))
         )
 

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 from collections.abc import Callable, Sequence, Sized
 from dataclasses import dataclass, replace
-from pathlib import Path
 
 import numpy as np
 from scipy.spatial.transform import Rotation
@@ -27,7 +26,7 @@ from elastocal.planning.bodies import data_base
 from elastocal.planning.candidates import told
 from elastocal.planning.feasibility import Feasibility
 from elastocal.planning.information import Estimable, readings_at, why
-from elastocal.tables import NO_UNIT, Family, Layout, RawTable, read_table
+from elastocal.tables import NO_UNIT, Family, Layout, read_table
 from elastocal.text import listed, quoted
 from elastocal.units import Array, BoolArray, IntArray
 
@@ -53,22 +52,23 @@ def check_posture(cell: Cell, chain: Chain, key: str, q: Array, degrees: bool) -
     _check_count(cell, chain, key, q)
     if degrees:
         _check_revolute(cell, chain, key)
-    problem = beyond_limits(cell, chain, q)
-    require(
-        problem is None,
-        f"{cell.path or cell.name}: key {key}: {problem}; correct the posture or the limits",
-    )
+    if (beyond := beyond_limits(cell, chain, q)) is not None:
+        raise InputError(
+            f"{cell.path or cell.name}: key {key}: {beyond[1]}; correct the posture or the limits"
+        )
 
 
-def beyond_limits(cell: Cell, chain: Chain, q: Array) -> str | None:
-    """Which joint of the posture q (n,) lies beyond its limits, as a sentence; None for none."""
+def beyond_limits(cell: Cell, chain: Chain, q: Array) -> tuple[int, str] | None:
+    """Which joint (0-based) of the posture q (n,) lies beyond its limits, and a sentence on it;
+    None for none."""
     lower, upper = joint_limits(cell, chain)
     beyond = np.flatnonzero((q < lower - LIMIT_SLACK) | (q > upper + LIMIT_SLACK))
     if not len(beyond):
         return None
     j = int(beyond[0])
     at, low, high = (told(chain, j, value) for value in (q[j], lower[j], upper[j]))
-    return f"joint{j + 1} ({chain.joints[j].name}) at {at} is beyond its limits, {low} to {high}"
+    name = f"joint{j + 1} ({chain.joints[j].name})"
+    return j, f"{name} at {at} is beyond its limits, {low} to {high}"
 
 
 def _check_count(cell: Cell, chain: Chain, key: str, found: Sized, one: bool = False) -> None:
@@ -127,45 +127,6 @@ def _check_motion(cell: Cell, chain: Chain) -> None:
 TAKEN = ("q", "position", "rotation", "quaternion", "force")
 WEIGHT = Family("weight", "weights", {"weight": NO_UNIT})
 MOST_POSES = 10_000
-
-
-@dataclass(frozen=True)
-class PathTable:
-    """N poses in SI units: joints `q` (N, n), or `position` (N, 3) in the data's frame and perhaps
-    `rotation` (N, 3), a rotation vector; `force` (N, 3), None where not stated; `weight` (N,).
-    `raw` tells where each row stands in the file."""
-
-    raw: RawTable
-    q: Array | None
-    position: Array | None
-    rotation: Array | None
-    force: Array | None
-    weight: Array
-
-    def columns(self, family: str) -> tuple[str, ...]:
-        return tuple(column.header for column in self.raw.layout.columns[family])
-
-
-def read_path(path: Path, joint_kinds: Sequence[str]) -> PathTable:
-    """The poses of a CSV or Parquet (.parquet, .pq) file; columns as in the measurement table.
-
-    q1_deg … for all joints, or x_mm, y_mm, z_mm with rx_deg … or qw … where the rotation is
-    prescribed; force_x_N … and weight may be added.  Raises InputError that names file, line,
-    column and the offending text.
-    """
-    raw = read_table(path, lambda header: _layout(str(path), header, joint_kinds))
-    require(
-        len(raw.row) <= MOST_POSES,
-        f"{raw.source}: {len(raw.row)} poses; a path takes at most {MOST_POSES}; thin it out: "
-        "neighbouring poses say the same",
-    )
-    weight = raw.si(WEIGHT.name)
-    if weight is not None:
-        raw.check(WEIGHT.name, weight > 0, "a weight must be positive")
-    weight = np.ones(len(raw.row)) if weight is None else weight[:, 0]
-    return PathTable(
-        raw, raw.si("q"), raw.si("position"), rotation_column(raw), raw.si("force"), weight
-    )
 
 
 def _layout(source: str, header: Sequence[str], joint_kinds: Sequence[str]) -> Layout:
@@ -398,29 +359,48 @@ def _point_of(cell: Cell) -> Array:
 def _along_path(
     cell: Cell, chain: Chain, spec: TargetPath, point: Array, rules: Feasibility | None, seed: int
 ) -> TargetPoses:
-    path = read_path(spec.file, chain.kinds)
+    """The poses of a CSV or Parquet (.parquet, .pq) file; columns as in the measurement table.
+
+    q1_deg … for all joints, or x_mm, y_mm, z_mm with rx_deg … or qw … where the rotation is
+    prescribed; force_x_N … and weight may be added.
+    """
+    raw = read_table(spec.file, lambda header: _layout(str(spec.file), header, chain.kinds))
+    columns, n, loads = raw.layout.columns, len(raw.row), working_loads(cell)
+    require(
+        n <= MOST_POSES,
+        f"{raw.source}: {n} poses; a path takes at most {MOST_POSES}; thin it out: neighbouring "
+        "poses say the same",
+    )
+    weight = np.ones((n, 1))
+    if (stated_weight := raw.si(WEIGHT.name)) is not None:
+        weight = stated_weight
+        raw.check(WEIGHT.name, weight > 0, "a weight must be positive")
     stated = spec.point is not None
     point = point if spec.point is None else spec.point
-    force = path.force
+    force = raw.si("force")
     if force is None and spec.force is not None:
-        force = np.broadcast_to(spec.force, (len(path.weight), 3))
-    if path.q is not None:
-        _check_path_limits(cell, chain, path, path.q)
-        source, loads = f"{len(path.q)} of {spec.file.name}", working_loads(cell)
-        return TargetPoses.of(path.q, force, path.weight, point, stated, loads, source)
-    assert path.position is not None  # read_path: joints or positions
-    rotation = None if path.rotation is None else Rotation.from_rotvec(path.rotation).as_matrix()
-    places = Places(path.position, rotation, point, force)
+        force = np.broadcast_to(spec.force, (n, 3))
+    q, position, turn = raw.si("q"), raw.si("position"), rotation_column(raw)
+    if q is not None:
+        for i, posture in enumerate(q):
+            if (beyond := beyond_limits(cell, chain, posture)) is not None:
+                where = raw.where(i, columns["q"][beyond[0]].header)
+                raise InputError(f"{where}: {beyond[1]}; correct the path or the limits")
+        source = f"{n} of {spec.file.name}"
+        return TargetPoses.of(q, force, weight[:, 0], point, stated, loads, source)
+    assert position is not None  # _layout: joints or positions
+    rotation = None if turn is None else Rotation.from_rotvec(turn).as_matrix()
+    places = Places(position, rotation, point, force)
 
     def missed(t: int, near: str) -> str:
-        raw, headers = path.raw, ", ".join(path.columns("position"))
+        headers = ", ".join(column.header for column in columns["position"])
         return (
             f"{raw.source}, {raw.noun} {raw.row[t]}, columns {headers}: the place is out of reach, "
             f"{near}; {remedy(cell)}"
         )
 
     source = f"of {spec.file.name}"
-    return _reached(cell, chain, places, path.weight, stated, rules, seed, source, missed)
+    return _reached(cell, chain, places, weight[:, 0], stated, rules, seed, source, missed)
 
 
 def _reached(
@@ -436,18 +416,6 @@ def _reached(
     told = f"{len(q)} {source}{lost}"
     loads = working_loads(cell)
     return TargetPoses.of(q, places.force, weight, places.point, stated, loads, told)
-
-
-def _check_path_limits(cell: Cell, chain: Chain, path: PathTable, q: Array) -> None:
-    lower, upper = joint_limits(cell, chain)
-    excess = np.maximum(lower - q, q - upper)
-    for i in np.flatnonzero((excess > 0).any(axis=1)):
-        problem = beyond_limits(cell, chain, q[i])
-        if problem is not None:
-            header = path.columns("q")[int(np.argmax(excess[i] > 0))]
-            raise InputError(
-                f"{path.raw.where(int(i), header)}: {problem}; correct the path or the limits"
-            )
 
 
 def _in_box(
