@@ -122,7 +122,7 @@ def _without(found: Any, folder: Path) -> Any:
             found = found.replace(here + os.sep, "").replace(here, "FOLDER")
         found = re.sub(r"(Python|numpy|scipy|casadi|pin) \d+(\.\d+)+", r"\1 VERSION", found)
         found = re.sub(r"\b\d{4}-\d\d-\d\d(?:[ T]\d\d:\d\d(?::\d\d)?(?: ?UTC|Z)?)?", "DATE", found)
-        found = re.sub(r"(?<=elastocal )\d+\.\d+\.\d+\S*|\b0\.\d+\.\d+\+g\S+", "VERSION", found)
+        found = re.sub(r"(?<=elastocal )\d+\.\d+\.\d+\S*|^0\.\d+\.\d+$", "VERSION", found)
         found = re.sub(r"\b[0-9a-f]{40,}\b", "DIGEST", found)
         return re.sub(r"\(\d+ threads?\)", "(N threads)", found)
     return found
