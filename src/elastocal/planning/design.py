@@ -59,8 +59,8 @@ from elastocal.planning.setup import (
     OPEN,
     FeasiblePool,
     Known,
-    ScheduledEffects,
     Setup,
+    promised,
     set_up,
     share_within,
 )
@@ -222,15 +222,16 @@ class _Design:
             "plan.csv: keep its order, and record times"
         )
         rest, fewer = _without(whole, late, options)
-        self.conditions = ScheduledEffects(whole, rest), options.fixed
+        self.conditions = whole, options.fixed
         return rest, fewer
 
     def run(self) -> Plan:
         plan = self._chosen()
         if self.conditions is None:
             return plan
-        conditions, fixed = self.conditions
-        return conditions.promised(plan, self.targets()[0], replace(self.known(), fixed=fixed))
+        whole, fixed = self.conditions
+        known = replace(self.known(), fixed=fixed)
+        return promised(whole, self.model, plan, self.targets()[0], known)
 
     def _chosen(self) -> Plan:
         progress, options = self.progress, self.options

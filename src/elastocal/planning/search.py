@@ -305,7 +305,13 @@ def ordered(
     plan, execution = order.reachable(found)
     if order.gone:
         plan, execution = order.polished(plan, execution)
-    return plan, execution, _warnings(order.gone, execution)
+    warnings = []
+    if order.gone:
+        warnings.append(f"{order.gone} better poses were left out, as no free move reaches them")
+    if execution.one_sided:
+        told = ", ".join(str(k + 1) for k in execution.one_sided)
+        warnings.append(f"approached from one side only, as the other is blocked: {told}")
+    return plan, execution, warnings
 
 
 class _Ordering:
@@ -474,13 +480,3 @@ def _unwound(setup: Setup, plan: Selection, feasibility: Feasibility) -> Selecti
     q = pool.q.copy()
     q[own] = np.where(off[:, None], was, near)
     return replace(plan, pool=replace(pool, q=q))
-
-
-def _warnings(lost: int, execution: Execution) -> list[str]:
-    warnings = []
-    if lost:
-        warnings.append(f"{lost} better poses were left out, as no free move reaches them")
-    if execution.one_sided:
-        told = ", ".join(str(k + 1) for k in execution.one_sided)
-        warnings.append(f"approached from one side only, as the other is blocked: {told}")
-    return warnings

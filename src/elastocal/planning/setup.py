@@ -385,37 +385,29 @@ def clocked(execution: Execution) -> Execution:
     return replace(execution, stops=tuple(stops))
 
 
-@dataclass(frozen=True)
-class ScheduledEffects:
-    """The model `whole` with its effects of time and approach, of which `without` lacks some."""
-
-    whole: Model
-    without: Model
-
-    def promised(self, plan: Plan, targets: TargetPoses, known: Known) -> Plan:
-        """The plan with times and sides, and what it promises of all parameters."""
-        model, spec = self.whole, self.whole.cell.design
-        plan = replace(plan, model=model, execution=clocked(plan.execution))
-        rows = expand_plan(plan.table(), tuple(model.cell.tool.markers), spec.repeats)
-        x = model.nominal
-        table = marker_sigmas(model.cell, simulate(model, rows, x, 0, noise=False))
-        observed = observe(table, model.observe)
-        at = model.regressor(table, x, None, observed)
-        sizes = model.sizes(at.B)
-        B = observed_weights(model, observed, x).apply(at.B) * sizes
-        prior, stated = known_before(model, known, sizes)
-        found = minimal_set(model, B, fixed_and_free(model, known.fixed), sizes, prior, stated)
-        kept = found.columns
-        M = B[:, kept].T @ B[:, kept] + prior[np.ix_(kept, kept)]
-        own = np.isin([model.names[c] for c in kept], self.without.names)
-        shown = predicted(model, found, M, len(B))
-        names = dict.fromkeys(
-            p.effect for p in model.parameters if p.name not in self.without.names
-        )
-        try:
-            A = on_kept(model, known_rows(model, model, targets, x, found)[0], found)
-        except InsufficientDataError:
-            return replace(plan, predicted=shown, scheduled=Scheduled(tuple(names), None, None))
-        R = _root(A, targets.weight)
-        errors = remaining_rms(R, M), remaining_rms(R[:, own], M[np.ix_(own, own)])
-        return replace(plan, predicted=shown, scheduled=Scheduled(tuple(names), *errors))
+def promised(model: Model, without: Model, plan: Plan, targets: TargetPoses, known: Known) -> Plan:
+    """The plan with times and sides, and what it promises of all parameters of the `model` with
+    effects of time and approach, of which the model `without` lacks some."""
+    spec = model.cell.design
+    plan = replace(plan, model=model, execution=clocked(plan.execution))
+    rows = expand_plan(plan.table(), tuple(model.cell.tool.markers), spec.repeats)
+    x = model.nominal
+    table = marker_sigmas(model.cell, simulate(model, rows, x, 0, noise=False))
+    observed = observe(table, model.observe)
+    at = model.regressor(table, x, None, observed)
+    sizes = model.sizes(at.B)
+    B = observed_weights(model, observed, x).apply(at.B) * sizes
+    prior, stated = known_before(model, known, sizes)
+    found = minimal_set(model, B, fixed_and_free(model, known.fixed), sizes, prior, stated)
+    kept = found.columns
+    M = B[:, kept].T @ B[:, kept] + prior[np.ix_(kept, kept)]
+    own = np.isin([model.names[c] for c in kept], without.names)
+    shown = predicted(model, found, M, len(B))
+    names = dict.fromkeys(p.effect for p in model.parameters if p.name not in without.names)
+    try:
+        A = on_kept(model, known_rows(model, model, targets, x, found)[0], found)
+    except InsufficientDataError:
+        return replace(plan, predicted=shown, scheduled=Scheduled(tuple(names), None, None))
+    R = _root(A, targets.weight)
+    errors = remaining_rms(R, M), remaining_rms(R[:, own], M[np.ix_(own, own)])
+    return replace(plan, predicted=shown, scheduled=Scheduled(tuple(names), *errors))

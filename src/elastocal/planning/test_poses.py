@@ -169,63 +169,47 @@ def working_loads(cell: Cell) -> Array:
     return loaded if len(loaded) else np.zeros((1, 3))
 
 
-@dataclass(frozen=True)
-class Places:
-    """`position` (T, 3) m in the data's frame for the `point` (3,) of the flange, `rotation`
-    (T, 3, 3) of the flange, None for any, and `force` (T, 3) N, None for the cell's loads."""
+def _reached(
+    cell: Cell, chain: Chain, position: Array, rotation: Array | None, point: Array,
+    force: Array | None, weight: Array, stated: bool, rules: Feasibility | None, seed: int,
+    source: str, missed: Callable[[int, str], str],
+) -> TargetPoses:  # fmt: skip
+    """Test poses with the `point` (3,) of the flange at places (T, 3) m of the data's frame, the
+    flange at `rotation` (T, 3, 3), None for any, under `force` (T, 3) N or, None, the cell's loads.
 
-    position: Array
-    rotation: Array | None
-    point: Array
-    force: Array | None
-
-    def take(self, index: IntArray) -> Places:
-        rotation, force = (None if v is None else v[index] for v in (self.rotation, self.force))
-        return replace(self, position=self.position[index], rotation=rotation, force=force)
-
-
-def reach(cell: Cell, chain: Chain, places: Places, seed: int, postures: int = FEW) -> Postures:
-    """Postures at the places: inverse kinematics with the cell's limits, base and home."""
-    return inverse_kinematics(
-        chain,
-        places.position,
-        joint_limits(cell, chain),
-        rotation=places.rotation,
-        point=places.point,
-        T_data_base=data_base(cell),
-        near=cell.design.motion.home,
-        postures=postures,
-        seed=seed,
-    )
-
-
-def preferred(
-    cell: Cell, chain: Chain, places: Places, found: Postures, rules: Feasibility | None, seed: int
-) -> tuple[Array, str]:
-    """Per place the first posture that the rules allow, and what to tell.
-
-    Where they allow none of those found, more are tried; where they allow none at all, it is the
-    first, and the text says of how many places that holds.
+    Each is the first posture found that the rules allow; where they allow none of many, the first
+    of all.  InputError with what `missed` says of the first place out of reach.
     """
-    q = found.q[:, 0].copy()
-    stuck = np.arange(0 if rules is None else len(q))
-    for postures in (FEW, MANY):
+
+    def postures(some: IntArray, count: int) -> Postures:
+        return inverse_kinematics(
+            chain, position[some], joint_limits(cell, chain),
+            rotation=None if rotation is None else rotation[some], point=point,
+            T_data_base=data_base(cell), near=cell.design.motion.home, postures=count, seed=seed,
+        )  # fmt: skip
+
+    loads, stuck = working_loads(cell), np.arange(len(position))
+    found = postures(stuck, FEW)
+    for t in found.out_of_reach[:1]:
+        far = f"{how_near(found, t)} ({len(found.out_of_reach)} of {len(position)} places)"
+        raise InputError(missed(int(t), far))
+    q, told = found.q[:, 0].copy(), f"{len(position)} {source}"
+    under = [np.broadcast_to(load, position.shape) for load in loads] if force is None else [force]
+    for count in (FEW, MANY):
         if rules is None or not len(stuck):
             break
-        some = places.take(stuck)
-        found = found if postures == FEW else reach(cell, chain, some, seed, postures)
+        found = found if count == FEW else postures(stuck, count)
         T, K, n = found.q.shape
         allowed = found.reached.copy()
-        loads = working_loads(cell)[:, None] if some.force is None else some.force[None]
-        for load in loads:
-            of_each = np.repeat(np.broadcast_to(load, (T, 3)), K, axis=0)
-            verdict = rules.check(found.q.reshape(T * K, n), of_each, every=False)
+        for load in under:
+            verdict = rules.check(found.q.reshape(T * K, n), np.repeat(load[stuck], K, 0), False)
             allowed &= np.asarray(verdict.ok).reshape(T, K)
-        some_allowed = allowed.any(axis=1)
-        q[stuck[some_allowed]] = found.q[some_allowed, allowed[some_allowed].argmax(axis=1)]
-        stuck = stuck[~some_allowed]
-    lost = f" ({len(stuck)} of them in no posture that the work cell allows)"
-    return q, lost if len(stuck) else ""
+        some = allowed.any(axis=1)
+        q[stuck[some]] = found.q[some, allowed[some].argmax(axis=1)]
+        stuck = stuck[~some]
+    if rules is not None and len(stuck):
+        told += f" ({len(stuck)} of them in no posture that the work cell allows)"
+    return TargetPoses.of(q, force, weight, point, stated, loads, told)
 
 
 def how_near(found: Postures, t: int) -> str:
@@ -390,7 +374,6 @@ def _along_path(
         return TargetPoses.of(q, force, weight[:, 0], point, stated, loads, source)
     assert position is not None  # _layout: joints or positions
     rotation = None if turn is None else Rotation.from_rotvec(turn).as_matrix()
-    places = Places(position, rotation, point, force)
 
     def missed(t: int, near: str) -> str:
         headers = ", ".join(column.header for column in columns["position"])
@@ -400,22 +383,10 @@ def _along_path(
         )
 
     source = f"of {spec.file.name}"
-    return _reached(cell, chain, places, weight[:, 0], stated, rules, seed, source, missed)
-
-
-def _reached(
-    cell: Cell, chain: Chain, places: Places, weight: Array, stated: bool,
-    rules: Feasibility | None, seed: int, source: str, missed: Callable[[int, str], str],
-) -> TargetPoses:  # fmt: skip
-    """Test poses at places; InputError with what `missed` says of the first out of reach."""
-    found = reach(cell, chain, places, seed)
-    for t in found.out_of_reach[:1]:
-        lost = f"{how_near(found, t)} ({len(found.out_of_reach)} of {len(weight)} places)"
-        raise InputError(missed(int(t), lost))
-    q, lost = preferred(cell, chain, places, found, rules, seed)
-    told = f"{len(q)} {source}{lost}"
-    loads = working_loads(cell)
-    return TargetPoses.of(q, places.force, weight, places.point, stated, loads, told)
+    return _reached(
+        cell, chain, position, rotation, point, force, weight[:, 0], stated, rules, seed, source,
+        missed,
+    )  # fmt: skip
 
 
 def _in_box(
@@ -427,7 +398,6 @@ def _in_box(
     each = (box.count, 3)
     force = None if box.force is None else np.broadcast_to(box.force, each)
     rotation = None if box.rotation is None else np.broadcast_to(box.rotation, (*each, 3))
-    places = Places(position, rotation, point, force)
 
     def missed(t: int, near: str) -> str:
         x, y, z = position[t]
@@ -438,7 +408,9 @@ def _in_box(
         )
 
     weight, source = np.ones(box.count), "in [design.test_box]"
-    return _reached(cell, chain, places, weight, stated, rules, seed, source, missed)
+    return _reached(
+        cell, chain, position, rotation, point, force, weight, stated, rules, seed, source, missed
+    )
 
 
 def _drawn(
