@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import contextvars
-import operator
 import os
 import threading
 from collections import deque
@@ -76,14 +75,6 @@ BINARY: dict[int, Any] = {
     ca.OP_AND: _as_number(np.logical_and), ca.OP_OR: _as_number(np.logical_or),
     ca.OP_IF_ELSE_ZERO: _if_else_zero, ca.OP_COPYSIGN: np.copysign,
 }  # fmt: skip
-# The same on single numbers, where Python's operators take a tenth of the time of a numpy function.
-# Not division: Python refuses to divide by zero.
-ON_NUMBERS: dict[Any, Any] = {
-    np.negative: operator.neg, np.add: operator.add, np.subtract: operator.sub,
-    np.multiply: operator.mul,
-}  # fmt: skip
-
-
 # CasADi's instructions of a function as arrays.
 
 CONSTANT, READ, WRITE, UNARY_OP, BINARY_OP = range(5)
@@ -213,8 +204,7 @@ def _steps_where(table: NDArray[np.int32], by_row: Sequence[bool]) -> Steps:
             varies[out] = by_row[first[k]]
         elif kind != WRITE:
             varies[out] = varies[first[k]] or (kind == BINARY_OP and varies[second[k]])
-            operation = BINARY[code] if kind == BINARY_OP else UNARY[code]
-            operations[k] = operation if varies[out] else ON_NUMBERS.get(operation, operation)
+            operations[k] = BINARY[code] if kind == BINARY_OP else UNARY[code]
             second[k] = second[k] if kind == BINARY_OP else -1
             kinds[k] = BY_ROW if varies[out] else IN_COMMON
     return kinds, operations, outs, first, second

@@ -396,7 +396,7 @@ class Model:
 
     def _readings(self, inputs: list[NDArray], x: NDArray) -> NDArray:
         """Readings (rows, size) at values x (parameters,), or (rows, parameters) by row."""
-        return self._symbolic.function("reading")(*inputs, x, self._settle(inputs, x))[0][..., 0]
+        return self._symbolic.readings(*inputs, x, self._settle(inputs, x))[0][..., 0]
 
     @checked_arguments
     def B(self, table: Measurements, x: Array | None = None) -> NDArray:
@@ -453,7 +453,7 @@ class Model:
     def _frames(self, table: Measurements, x: Array | None) -> list[NDArray]:
         x = self._at(x)
         inputs = row_inputs(self._symbolic.arm, table)
-        return self._symbolic.function("frames")(*inputs, x, self._settle(inputs, x))
+        return self._symbolic.frames(*inputs, x, self._settle(inputs, x))
 
 
 def _again(

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from functools import cached_property
 
 import casadi as ca
@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 
 from elastocal.cell.work_cell import Cell
 from elastocal.errors import require
-from elastocal.measurements import Measurements, firsts, numbered
+from elastocal.measurements import Measurements
 from elastocal.model import rigid
 from elastocal.model.arm import Arm, Parameter, row_inputs
 from elastocal.model.chain import Chain
@@ -19,38 +19,13 @@ from elastocal.model.effects.base import Effect
 from elastocal.model.effects.catalogue import choose_effects, set_constants, sized_parameters
 from elastocal.model.evaluate import BatchFunction
 from elastocal.model.observations import observe
-from elastocal.units import Array, IntArray
+from elastocal.units import Array
 
 # The static equilibrium of all poses at once, and the exact derivative through it.
 
 MAX_STEPS = 30
 LARGEST = 0.5  # rad or m
-KEPT = 4_000_000  # numbers of F_θ up to which an answer is kept
-EVALUATIONS, KEPT_ROWS = 3, 12_000  # of y and dy/dz that are kept, each of so many rows at most
 TOLERANCE = 1e-14  # rad (m for prismatic springs); Newton converges quadratically past it
-
-
-class LastAnswers:
-    """The last `number` pairs of arrays that a function gave for arrays of at most `rows` rows: a
-    fit is looked at from many sides, and each asks for the same where it ended."""
-
-    def __init__(
-        self, function: Callable[..., tuple[NDArray, NDArray]], number: int, rows: int
-    ) -> None:
-        self._function, self._number, self._rows = function, number, rows
-        self._kept: dict[tuple, tuple[NDArray, NDArray]] = {}
-
-    def __call__(self, *given: NDArray) -> tuple[NDArray, NDArray]:
-        """What the function gives, the caller's own to write to."""
-        if len(given[0]) > self._rows:
-            return self._function(*given)
-        key = tuple((a.dtype.char, a.shape, a.tobytes()) for a in given)
-        found = self._kept.pop(key, None) or self._function(*given)
-        self._kept[key] = found
-        for old in list(self._kept)[: -self._number]:
-            self._kept.pop(old, None)  # of threads one
-        one, other = found
-        return one.copy(), other.copy()
 
 
 class Equilibrium:
@@ -60,59 +35,19 @@ class Equilibrium:
     equilibrium with deflections below LARGEST counts: beyond that no arm is elastic any more.
     """
 
-    def __init__(
-        self,
-        inputs: Sequence[ca.SX],
-        p: ca.SX,
-        theta: ca.SX,
-        residual: ca.SX,
-        backend: str | None = None,
-    ) -> None:
+    def __init__(self, arm: SymbolicArm) -> None:
+        theta = arm.arm.theta
         self.size = theta.shape[0]
-        self._symbols, self._expression, self._backend = [*inputs, p, theta], residual, backend
-        self._answers = LastAnswers(self._solve, 1, KEPT // max(self.size**2, 1))
-        self._states: tuple[NDArray, IntArray, IntArray] | None = None
-
-    @cached_property
-    def _residual(self) -> BatchFunction:
-        """F (size, 1) and F_θ (size, size) of a row."""
-        outputs = [self._expression, ca.jacobian(self._expression, self._symbols[-1])]
-        return BatchFunction(self._symbols, outputs, self._backend)
+        outputs = [arm.residual, ca.jacobian(arm.residual, theta)]  # F and F_θ
+        inputs = [*arm.arm.inputs.values(), arm.p, theta]
+        self._residual = BatchFunction(inputs, outputs, arm.backend)
 
     def solve(self, inputs: Sequence[NDArray], p: NDArray) -> tuple[NDArray, NDArray]:
-        """θ (n, size) by Newton's method on all rows, and F_θ (n, size, size) there.
+        """θ (n, size) by Newton's method on all rows, and F_θ (n, size, size) there; p
+        (parameters,), or (n, parameters) by row.
 
-        Rows that do not settle become NaN, with F_θ = 1 so that it can still be solved with.  The
-        last answer at one p is kept: readings are predicted and then differentiated there.
+        Rows that do not settle become NaN, with F_θ = 1 so that it can still be solved with.
         """
-        return self._answers(*inputs, p) if p.ndim == 1 else self._settled(inputs, p)
-
-    @cached_property
-    def _asked(self) -> NDArray[np.bool_]:
-        """Which numbers of a row's inputs F depends on: a marker is none of them."""
-        *inputs, _, _ = self._symbols
-        return np.array(ca.which_depends(self._expression, ca.vertcat(*inputs), 1, False), bool)
-
-    def _solve(self, *given: NDArray) -> tuple[NDArray, NDArray]:
-        """As `solve`, each state of the arm once: its markers' rows have the same answer."""
-        *inputs, p = given
-        state, first = self._states_of(inputs)
-        if len(first) == len(state):
-            return self._settled(inputs, p)
-        theta, F_theta = self._settled([a[first] for a in inputs], p)
-        return theta[state], F_theta[state]
-
-    def _states_of(self, inputs: Sequence[NDArray]) -> tuple[IntArray, IntArray]:
-        """Number (n,) of each row's state of the arm, and the first row of each."""
-        asked = np.concatenate(inputs, axis=1)[:, self._asked]
-        known = self._states  # once: other threads solve other parts of a table
-        if known is None or not np.array_equal(known[0], asked):
-            state = numbered(np.zeros(len(asked)), *asked.T)
-            known = asked, state, firsts(state, int(state.max(initial=-1)) + 1)
-            self._states = known
-        return known[1:]
-
-    def _settled(self, inputs: Sequence[NDArray], p: NDArray) -> tuple[NDArray, NDArray]:
         theta, F_theta = self._stationary(inputs, p, len(inputs[0]))
         with np.errstate(invalid="ignore"):
             theta[(np.abs(theta.real) > LARGEST).any(axis=1)] = np.nan
@@ -137,24 +72,21 @@ class Equilibrium:
         slope = np.full((n, self.size, self.size), np.nan, dtype=theta.dtype)
         active = np.arange(n)
         for _ in range(MAX_STEPS):
+            if not len(active):
+                break
             *rows, at = [a[active] if a.ndim == 2 else a for a in (*inputs, p)]
             F, F_theta = self._residual(*rows, at, theta[active])
             finite = np.isfinite(F_theta).all(axis=(1, 2)) & np.isfinite(F[..., 0]).all(axis=1)
             theta[active[~finite]] = np.nan
             active, F, F_theta = active[finite], F[finite], F_theta[finite]
-            if not len(active):
-                return theta, slope
             try:
                 step = np.linalg.solve(F_theta, F)[..., 0]
             except np.linalg.LinAlgError:  # a pose at the verge of buckling
-                theta[active] = np.nan
-                return theta, slope
+                break
             theta[active] -= step
             slope[active] = F_theta
             settled = np.abs(step).max(axis=1) <= TOLERANCE + 1e-12 * np.abs(theta[active]).max(1)
             active = active[~settled]
-            if not len(active):
-                return theta, slope
         theta[active] = np.nan
         return theta, slope
 
@@ -206,7 +138,6 @@ class SymbolicArm:
         # Deflections by eq. (3), or by the equilibrium F(θ) = 0.
         self._linear = bool(arm.springs) and cell.model.deflection_model == "linear"
         self.implicit = bool(arm.springs) and not self._linear
-        self._functions: dict[str, BatchFunction] = {}
 
     def _expression(self, observe: str) -> ca.SX:
         arm = self.arm
@@ -252,18 +183,21 @@ class SymbolicArm:
 
     @cached_property
     def equilibrium(self) -> Equilibrium:
-        inputs = list(self.arm.inputs.values())
-        return Equilibrium(inputs, self.p, self.arm.theta, self.residual, self.backend)
+        return Equilibrium(self)
 
-    def function(self, name: str) -> BatchFunction:
-        """Built on first use: "reading", and "frames" of flange, marker and target."""
-        if name not in self._functions:
-            arm = self.arm
-            frames = [arm.T_tracker_flange, arm.reading["position"], arm.reading["rotation"]]
-            outputs = [self.settled(y) for y in ([self.reading] if name == "reading" else frames)]
-            inputs = [*arm.inputs.values(), self.p, arm.theta]
-            self._functions[name] = BatchFunction(inputs, outputs, self.backend)
-        return self._functions[name]
+    def _of_rows(self, *outputs: ca.SX) -> BatchFunction:
+        inputs = [*self.arm.inputs.values(), self.p, self.arm.theta]
+        return BatchFunction(inputs, [self.settled(y) for y in outputs], self.backend)
+
+    @cached_property
+    def readings(self) -> BatchFunction:
+        return self._of_rows(self.reading)
+
+    @cached_property
+    def frames(self) -> BatchFunction:
+        """Of flange, marker and target."""
+        reading = self.arm.reading
+        return self._of_rows(self.arm.T_tracker_flange, reading["position"], reading["rotation"])
 
     @cached_property
     def regressor(self) -> Total:
@@ -288,7 +222,6 @@ class Total:
         self._arm, self._y, self._z = arm, arm.settled(y), z
         self._inputs = [*arm.arm.inputs.values(), *extra, arm.p, arm.arm.theta]
         self._functions: dict[tuple[int, ...], BatchFunction] = {}
-        self._answers = LastAnswers(self._evaluated, EVALUATIONS, KEPT_ROWS)
 
     @cached_property
     def _derivative(self) -> tuple[ca.SX, ca.SX]:
@@ -303,12 +236,6 @@ class Total:
         """∂y/∂θ."""
         outputs = [ca.jacobian(self._y, self._arm.arm.theta)]
         return BatchFunction(self._inputs, outputs, self._arm.backend)
-
-    def _held(self, columns: tuple[int, ...]) -> tuple[int, ...]:
-        """The columns of the function that serves these: all, where there is one of all already
-        and they are most of them, else their own."""
-        every = tuple(range(self._z.shape[0]))
-        return every if every in self._functions and 2 * len(columns) >= len(every) else columns
 
     def _function(self, columns: tuple[int, ...]) -> BatchFunction:
         """A function of y and these columns of dy/dz."""
@@ -331,26 +258,18 @@ class Total:
         `columns` are those of z, by default all.
         """
         asked = tuple(range(self._z.shape[0])) if columns is None else columns
-        held = self._held(asked)
-        y, slope = self._answers(*inputs, *extra, x, np.array(held, dtype=np.int64))
-        return y[..., 0], slope if held == asked else slope[..., list(asked)]
-
-    def _evaluated(self, *arrays: NDArray) -> tuple[Array, Array]:
-        """y (n, m, 1) and dy/dz (n, m, k) of inputs, further ones and x, by the function of the
-        columns that stand last."""
-        *given, columns = arrays
-        arm, function = self._arm, self._function(tuple(columns.tolist()))
+        arm, function, given = self._arm, self._function(asked), [*inputs, *extra, x]
         if not arm.implicit:
-            y, slope = function(*given, np.zeros((len(given[0]), arm.arm.theta.shape[0])))
-            return y, slope
-        theta, F_theta = arm.equilibrium.solve(given[: len(arm.arm.inputs)], given[-1])
+            y, slope = function(*given, np.zeros((len(inputs[0]), arm.arm.theta.shape[0])))
+            return y[..., 0], slope
+        theta, F_theta = arm.equilibrium.solve(inputs, x)
         y_theta = self._slopes(*given, theta)[0]
         y_theta[~np.isfinite(y_theta).all(axis=(1, 2))] = 0.0
         adjoint = np.linalg.solve(F_theta.transpose(0, 2, 1), y_theta.transpose(0, 2, 1))
         adjoint = adjoint.transpose(0, 2, 1).reshape(len(theta), -1)
         y, slope = function(*given, theta, adjoint)
         y[~np.isfinite(theta).all(axis=1)] = np.nan
-        return y, slope
+        return y[..., 0], slope
 
 
 def _check_names(parameters: Sequence[Parameter], cell: Cell) -> None:
