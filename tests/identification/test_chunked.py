@@ -87,19 +87,6 @@ def test_in_parts_equals_whole(case, in_parts):
     assert np.array_equal(faulty_of(parts)[0], accused)
 
 
-def test_a_covariance_that_links_configurations_keeps_them_together(in_parts):
-    """Neighbouring observations are correlated in runs of five, across configurations."""
-    model, plan, truth, rng = arm(GEOMETRY, 7)
-    table = measured(model, plan, truth, SIGMA, rng)
-    run = np.exp(-np.abs(np.subtract.outer(np.arange(15), np.arange(15))) / 4)
-    covariance = SIGMA**2 * np.kron(np.eye(12), run)
-    whole = solved(model, table, covariance=covariance)
-    in_parts()
-    parts = solved(model, table, covariance=covariance)
-    assert len(parts.problem.parts.spans) > 3
-    assert_same_estimates(parts, whole)
-
-
 def test_faulty_readings_are_found_in_parts_too(in_parts):
     """A tenth of the readings off by 1 to 100 mm, as many in the sample as elsewhere."""
     model, plan, truth, rng = arm(GEOMETRY, 8, 120)

@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Callable, Iterable, Iterator, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass, replace
-from functools import cached_property, reduce
+from functools import reduce
 from typing import Literal, TypeVar
 
 import numpy as np
@@ -275,21 +275,13 @@ class Part:
 class Partition:
     """All observations in `spans` of `order` (None: as they stand in the table).
 
-    Correlated observations share a span, and so do those of one configuration.
+    Those of one configuration share a span, and with them what shares an unloaded reading.
     """
 
     observed: Observations
     weights: Weights
     order: IntArray | None
     spans: tuple[Span, ...]
-
-    @cached_property
-    def blocks(self) -> IntArray | None:
-        """Number of the block (observations,) that each observation is correlated within.
-
-        None where every observation is on its own.
-        """
-        return _correlated(self.observed, self.weights)
 
     def part(self, span: Span) -> Part:
         """The observations of a span, in the table's order."""
@@ -301,10 +293,8 @@ class Partition:
 
 
 def part_of(observed: Observations, weights: Weights, index: IntArray) -> Part:
-    """Observations `index` (n,), ascending, with the weights of these alone.
-
-    Exact where what is correlated is in `index` together.
-    """
+    """Observations `index` (n,), ascending, with the weights of these alone: exact where what is
+    correlated is in `index` together."""
     rows = (index[:, None] * observed.size + np.arange(observed.size)).ravel()
     if observed.kind == "deflection":
         chosen = np.zeros(len(observed.lead), dtype=bool)
@@ -331,80 +321,40 @@ def _run(index: IntArray) -> IntArray | slice:
 
 def sample(parts: Partition, n: int, seed: int = 0) -> Part:
     """About n observations at random, some of every marker, correlated ones together."""
-    observed, blocks = parts.observed, parts.blocks
+    observed = parts.observed
     order = np.random.default_rng(seed).permutation(len(observed.lead))
-    if blocks is not None:  # each brings the others of its block with it
-        n = -(-n * (int(blocks.max()) + 1) // len(blocks))
+    if observed.kind == "deflection":  # each brings the others of its configuration with it
+        n = -(-n * observed.n_configurations // len(order))
     marker = observed.table.marker[observed.lead[order]]
     some = [order[marker == code][:OF_A_MARKER] for code in np.unique(marker)]
     chosen = np.unique(np.concatenate([order[:n], *some]))
-    if blocks is not None:
-        chosen = np.flatnonzero(np.isin(blocks, blocks[chosen]))
+    if observed.kind == "deflection":
+        own = observed.configuration
+        chosen = np.flatnonzero(np.isin(own, own[chosen]))
+    if parts.weights.kind == "covariance":  # anything may be correlated
+        chosen = np.arange(len(order))
     return part_of(observed, parts.weights, chosen)
 
 
 def partition(observed: Observations, weights: Weights, n_parameters: int) -> Partition:
     """Cut the observations so that B of `n_parameters` has at most PART numbers in each part.
 
-    A table that is not large stays in one part; so do observations that are all correlated, and
-    those of one configuration.
+    A table that is not large stays in one part, and so does one whose covariance was given, where
+    anything may be correlated.
     """
     n = len(observed.lead)
-    if not is_large(observed, n_parameters):
+    if not is_large(observed, n_parameters) or weights.kind == "covariance":
         return Partition(observed, weights, None, ((0, n),))
-    blocks = _correlated(observed, weights)
-    limit = max(PART // (observed.size * n_parameters), 1)
-    unit = _units(observed.configuration, blocks)
-    order = np.lexsort((unit,) if blocks is None else (blocks, unit))
-    spans = _packed(_ends(unit[order]), 0, limit)
+    order = np.argsort(observed.configuration, kind="stable")
+    ends = np.append(np.flatnonzero(np.diff(observed.configuration[order])) + 1, n)
+    spans, start, limit = list[Span](), 0, max(PART // (observed.size * n_parameters), 1)
+    while start < n:  # as many configurations as keep within the limit, at least one
+        k = np.searchsorted(ends, start, side="right")
+        last = max(int(np.searchsorted(ends, start + limit, side="right")) - 1, int(k))
+        spans.append((start, int(ends[last])))
+        start = spans[-1][1]
     in_order = bool((np.diff(order) == 1).all())
     return Partition(observed, weights, None if in_order else order, tuple(spans))
-
-
-def _correlated(observed: Observations, weights: Weights) -> IntArray | None:
-    whiten = weights.whiten
-    if whiten is None:
-        return None
-    row = np.repeat(np.arange(whiten.shape[0], dtype=np.int32), np.diff(whiten.indptr))
-    row //= observed.size
-    column = whiten.indices // observed.size
-    if np.array_equal(row, column):
-        return None
-    n = len(observed.lead)
-    graph = sparse.csr_array((np.ones(len(row), dtype=bool), (row, column)), shape=(n, n))
-    return sparse.csgraph.connected_components(graph, directed=False)[1].astype(np.int64)
-
-
-def _units(configuration: IntArray, blocks: IntArray | None) -> IntArray:
-    """Number of the unit (observations,): configurations, joined where a block spans several."""
-    if blocks is None:
-        return configuration
-    of_block = np.zeros(blocks.max() + 1, dtype=np.int64)
-    of_block[blocks] = configuration
-    if np.array_equal(of_block[blocks], configuration):
-        return configuration
-    shape = (int(configuration.max()) + 1, len(of_block))
-    links = sparse.coo_array((np.ones(len(blocks)), (configuration, blocks)), shape=shape)
-    graph = sparse.block_array([[None, links], [links.T, None]], format="csr")
-    return sparse.csgraph.connected_components(graph, directed=False)[1][configuration]
-
-
-def _ends(sorted_codes: IntArray) -> IntArray:
-    """Where each run of equal codes ends (exclusive)."""
-    return np.append(np.flatnonzero(np.diff(sorted_codes)) + 1, len(sorted_codes))
-
-
-def _packed(ends: IntArray, start: int, limit: int) -> list[Span]:
-    """Consecutive runs that end at `ends`, as many to a span as keep it within `limit`.
-
-    A run that is longer than that is a span of its own.
-    """
-    spans, k = [], 0
-    while k < len(ends):
-        k = max(int(np.searchsorted(ends, start + limit, side="right")), k + 1)
-        spans.append((start, int(ends[k - 1])))
-        start = spans[-1][1]
-    return spans
 
 
 # A least-squares problem of any length as its R factor: what is left of B and e after QR.
