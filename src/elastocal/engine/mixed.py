@@ -16,7 +16,6 @@ from __future__ import annotations
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 from functools import cached_property
-from typing import Protocol, TypeGuard
 
 import numpy as np
 from scipy import linalg
@@ -32,54 +31,15 @@ ROUNDING = 1e-12
 # What V is made of: several K of every cluster, and the numbers of their variances there.
 
 
-class NoiseParts(Protocol):
-    """k parts K of each of C clusters; `of` (C, k) are the numbers of their variances."""
+@dataclass(frozen=True)
+class Full:
+    """k parts K (C, k, m, m) of each of C clusters; `of` (C, k) are their variances' numbers."""
 
-    @property
-    def of(self) -> IntArray: ...
+    of: IntArray
+    K: Array
 
     def add(self, V: Array, theta: Array) -> None:
         """Σ θ K (C, m, m) onto V, θ (C, k)."""
-
-    def times(self, u: Array) -> Array:
-        """K u (C, k, m)."""
-
-    def trace(self, P: Array) -> Array:
-        """tr P K (C, k)."""
-
-    def turned(self, root: Array) -> Array:
-        """root K rootᵀ (C, k, m, m)."""
-
-
-@dataclass(frozen=True)
-class Diagonal:
-    """K diagonal, (C, k, m)."""
-
-    of: IntArray
-    K: Array
-
-    def add(self, V: Array, theta: Array) -> None:
-        np.einsum("cii->ci", V)[:] += (theta[:, None] @ self.K)[:, 0]
-
-    def times(self, u: Array) -> Array:
-        return self.K * u[:, None]
-
-    def trace(self, P: Array) -> Array:
-        return np.asarray((self.K @ np.einsum("cii->ci", P)[..., None])[..., 0])
-
-    def turned(self, root: Array) -> Array:
-        own = root[:, None]
-        return np.asarray((own * self.K[:, :, None]) @ own.swapaxes(2, 3))
-
-
-@dataclass(frozen=True)
-class Full:
-    """Any K, (C, k, m, m)."""
-
-    of: IntArray
-    K: Array
-
-    def add(self, V: Array, theta: Array) -> None:
         V += (theta[:, None] @ self._flat).reshape(V.shape)
 
     @property
@@ -87,12 +47,15 @@ class Full:
         return self.K.reshape(*self.K.shape[:2], -1)
 
     def times(self, u: Array) -> Array:
+        """K u (C, k, m)."""
         return np.asarray((self.K @ u[:, None, :, None])[..., 0])
 
     def trace(self, P: Array) -> Array:
+        """tr P K (C, k)."""
         return np.asarray((self._flat @ P.reshape(len(P), -1, 1))[..., 0])
 
     def turned(self, root: Array) -> Array:
+        """root K rootᵀ (C, k, m, m)."""
         own = root[:, None]
         return np.asarray(own @ self.K @ own.swapaxes(2, 3))
 
@@ -119,6 +82,9 @@ class Common:
     def turned(self, root: Array) -> Array:
         own = root[:, None] @ self.loading
         return np.asarray(own @ own.swapaxes(2, 3))
+
+
+NoiseParts = Full | Common
 
 
 @dataclass(frozen=True)
@@ -202,7 +168,7 @@ class Whitened:
         for part in self.pack.parts:
             own = theta[:, n : n + part.of.shape[1], None, None]
             n += part.of.shape[1]
-            if _common(part):
+            if isinstance(part, Common):
                 W = (root @ part.loading) * np.sqrt(own)
                 rows.append((W, Q[:, None] @ W))
             else:
@@ -230,10 +196,6 @@ class Whitened:
                 out[:, here, there : there + k2] = square
                 there += k2
         return out
-
-
-def _common(part: NoiseParts) -> TypeGuard[Common]:
-    return isinstance(part, Common)
 
 
 @dataclass(frozen=True)
@@ -517,7 +479,7 @@ def fit(
     known: dict[bytes, tuple[float, Array, Array]] = {}
     lower, upper, ended = t + np.log(SMALLEST), t + np.log(LARGEST), False
     held = np.zeros(0, dtype=np.int64)
-    if any(_common(part) for pack in model.packs for part in pack.parts):
+    if any(isinstance(part, Common) for pack in model.packs for part in pack.parts):
         # Those that the columns could explain all of say nothing: they are none.
         told = model.told(model.state(start))
         held = np.array([k for k in may_vanish if not told[k]], dtype=np.int64)

@@ -11,7 +11,7 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy import linalg, sparse, special
 
-from elastocal.engine.mixed import ENOUGH, Diagonal, LogPrior, Mixed, MixedFit, Pack, fit
+from elastocal.engine.mixed import ENOUGH, Full, LogPrior, Mixed, MixedFit, Pack, fit
 from elastocal.errors import ElastocalError, InputError, InsufficientDataError
 from elastocal.identification.covariance import Covariance, orthogonal
 from elastocal.identification.noise_structure import (
@@ -167,8 +167,8 @@ class NoisyReadings:
         p, size = self.sets.B.shape[2], self.readings.size
         if held := p - self.readings.n_parameters:
             number = np.tile(self.own + np.arange(len(self.drifts)), (held // size, 1))
-            along = np.array([axes for _, axes in self.drifts])
-            parts = (Diagonal(number, np.tile(along, (held // size, 1, 1))),)
+            along = np.array([np.diag(axes) for _, axes in self.drifts])
+            parts = (Full(number, np.tile(along, (held // size, 1, 1, 1))),)
             B = np.eye(held, p, p - held).reshape(-1, size, p)
             packs.append(Pack(B, np.zeros(B.shape[:2]), parts, np.zeros(B.shape[:2], dtype=bool)))
         return Mixed(tuple(packs), len(self.names), np.zeros(p), prior)

@@ -10,7 +10,7 @@ from typing import ClassVar, NamedTuple
 import numpy as np
 from scipy import sparse, special
 
-from elastocal.engine.mixed import Common, Diagonal, Full, NoiseParts, Pack
+from elastocal.engine.mixed import Common, Full, NoiseParts, Pack
 from elastocal.errors import InputError, option, require
 from elastocal.measurements import Measurements, firsts, numbered, visits
 from elastocal.model.effects.base import JointMotion
@@ -764,8 +764,6 @@ def _own_parts(index: IntArray, matrix: Array, members: IntArray) -> NoiseParts:
     mine = place == np.arange(numbers)[:, None, None, None]  # (k, C, M, L)
     of = np.where(mine, own, 0).max(axis=(2, 3)).T
     block = np.einsum("kcml,cmlij->ckmij", mine, blocks)
-    if bool((blocks * (1 - np.eye(size)) == 0).all()):
-        return Diagonal(of, np.einsum("ckmii->ckmi", block).reshape(C, numbers, -1))
     K, at = np.zeros((C, numbers, M, size, M, size)), np.arange(M)
     K[:, :, at, :, at, :] = block.transpose(2, 0, 1, 3, 4)
     return Full(of, K.reshape(C, numbers, M * size, M * size))
