@@ -24,8 +24,7 @@ from scipy.stats import chi2
 
 from elastocal.compensation.commands import read_targets
 from elastocal.compensation.compensate import compensate
-from elastocal.model.calibrated import read_calibrated
-from elastocal.model.calibrated_tool import tool_point
+from elastocal.model.calibrated import read_calibrated, tool_point
 
 HERE = Path(__file__).resolve().parent
 sys.path.insert(0, str(HERE.parent / "blind_diagnosis"))

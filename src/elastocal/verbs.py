@@ -34,8 +34,7 @@ if TYPE_CHECKING:
     from elastocal.identification.result import Calibration
     from elastocal.identification.weighted_problem import WeightKind
     from elastocal.measurements import Measurements
-    from elastocal.model.calibrated import CalibratedArm
-    from elastocal.model.calibrated_tool import ToolPoint
+    from elastocal.model.calibrated import CalibratedArm, ToolPoint
     from elastocal.model.manipulator import Model
     from elastocal.planning.design import DesignOptions, Effort
     from elastocal.planning.plan import Plan
@@ -671,7 +670,7 @@ def check_frame(frame: str) -> None:
 def _tool_point(cell: Cell, point: str | ArrayLike | None) -> ToolPoint:
     import numpy as np
 
-    from elastocal.model.calibrated_tool import tool_point
+    from elastocal.model.calibrated import tool_point
 
     if point is None or isinstance(point, str):
         return tool_point(cell, point)

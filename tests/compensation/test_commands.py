@@ -30,8 +30,8 @@ from elastocal.model.calibrated import (
     OpenParameters,
     ShownPoses,
     random_table,
+    tool_point,
 )
-from elastocal.model.calibrated_tool import tool_point
 from elastocal.model.manipulator import Model
 from elastocal.model.rigid import nominal_flanges
 

@@ -12,7 +12,7 @@ from support.elastic_arms import MujocoArm
 
 from elastocal.compensation.commands import targets_at
 from elastocal.compensation.compensate import compensate
-from elastocal.model.calibrated_tool import tool_point
+from elastocal.model.calibrated import tool_point
 from elastocal.model.rigid import nominal_flanges
 
 POSTURES = np.radians(

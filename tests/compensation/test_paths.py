@@ -10,7 +10,7 @@ from support.commands import calibrated
 
 from elastocal.compensation.commands import nominal_path, targets_at
 from elastocal.compensation.compensate import compensate
-from elastocal.model.calibrated_tool import tool_point
+from elastocal.model.calibrated import tool_point
 from elastocal.model.chain import joint_limits
 from elastocal.model.rigid import nominal_flanges
 

@@ -9,7 +9,7 @@ from hypothesis import strategies as st
 
 from elastocal.compensation.commands import one_target, read_targets
 from elastocal.errors import ElastocalError, InputError
-from elastocal.model.calibrated_tool import share_of_levels
+from elastocal.model.calibrated import share_of_levels
 
 KINDS = ("revolute",) * 6
 

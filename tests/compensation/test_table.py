@@ -19,7 +19,7 @@ from elastocal.compensation.compensate import (
     joint_grid,
 )
 from elastocal.errors import InputError
-from elastocal.model.calibrated_tool import tool_point
+from elastocal.model.calibrated import tool_point
 from elastocal.model.rigid import nominal_flanges
 
 EFFECTS = ("joint_offset", "link_geometry", "joint_compliance")

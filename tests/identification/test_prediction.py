@@ -14,7 +14,7 @@ from elastocal.identification.findings import ENOUGH, judged, spare_equations
 from elastocal.identification.identify import identify
 from elastocal.identification.prediction import NewPoses
 from elastocal.identification.residuals import rms_3d, told_by_one
-from elastocal.model.calibrated_tool import CalibratedTool, tool_point
+from elastocal.model.calibrated import CalibratedTool, tool_point
 from elastocal.model.manipulator import Model
 from elastocal.model.observations import observe
 

@@ -95,7 +95,7 @@ def compensate(
                 texts[output] = text
         if table is not None and lines is not None:
             from elastocal.compensation.compensate import correction_table
-            from elastocal.model.calibrated_tool import tool_point
+            from elastocal.model.calibrated import tool_point
 
             where = tool_point(arm.model.cell, asked.get("point"))
             corrections = correction_table(arm, lines, where, force, start, asked["seed"], progress)
@@ -152,7 +152,7 @@ def _posture(arm: CalibratedArm, text: str | None) -> Array | None:
     import numpy as np
 
     from elastocal.compensation.compensate import in_file_units
-    from elastocal.model.calibrated_tool import numbers
+    from elastocal.model.calibrated import numbers
     from elastocal.model.chain import joint_limits
 
     if text is None:
@@ -173,7 +173,7 @@ def _grid(arm: CalibratedArm, grid: str, box: str | None, rotation: str | None) 
     from scipy.spatial.transform import Rotation
 
     from elastocal.compensation.compensate import box_grid, joint_grid
-    from elastocal.model.calibrated_tool import numbers
+    from elastocal.model.calibrated import numbers
 
     takes = "--grid takes whole numbers, as in 5 or 9,7,7,3,3,1"
     counts = tuple(whole_numbers(grid, takes))

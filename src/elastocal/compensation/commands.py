@@ -12,7 +12,7 @@ from scipy.spatial.transform import Rotation
 
 from elastocal.errors import InputError, option, require
 from elastocal.measurements import Measurements, read_measurements
-from elastocal.model.calibrated_tool import CalibratedTool, numbers
+from elastocal.model.calibrated import CalibratedTool, numbers
 from elastocal.model.chain import Chain
 from elastocal.model.inverse_kinematics import (
     ARM_LENGTH,

@@ -25,8 +25,7 @@ from elastocal.errors import InputError, InsufficientDataError, option
 from elastocal.identification.checks import check_limits
 from elastocal.identification.prediction import Uncertainty, uncertainty_at
 from elastocal.measurements import families
-from elastocal.model.calibrated import CalibratedArm, lasting
-from elastocal.model.calibrated_tool import CalibratedTool, ToolPoint
+from elastocal.model.calibrated import CalibratedArm, CalibratedTool, ToolPoint, lasting
 from elastocal.model.chain import Chain, finite_ranges, joint_limits
 from elastocal.model.effects.catalogue import effect_of
 from elastocal.model.inverse_kinematics import Reaching, inverse_kinematics

@@ -33,8 +33,7 @@ from elastocal.identification.solve import STRUCTURAL, Solution, free_r_factor
 from elastocal.identification.weighted_problem import least_norm
 from elastocal.measurements import Measurements
 from elastocal.model.arm import Parameter
-from elastocal.model.calibrated import CalibratedArm, MeasuredVisits, OpenParameters
-from elastocal.model.calibrated_tool import CalibratedTool
+from elastocal.model.calibrated import CalibratedArm, CalibratedTool, MeasuredVisits, OpenParameters
 from elastocal.model.chain import finite_ranges, joint_index, joint_limits
 from elastocal.model.manipulator import Model
 from elastocal.model.observations import Observations, observe

@@ -38,11 +38,12 @@ from elastocal.identification.weighted_problem import Weights
 from elastocal.measurements import Measurements
 from elastocal.model.calibrated import (
     CalibratedArm,
+    CalibratedTool,
     OpenParameters,
     ShownPoses,
     nominal_flange_rows,
+    tool_point,
 )
-from elastocal.model.calibrated_tool import CalibratedTool, tool_point
 from elastocal.model.manipulator import Model
 from elastocal.model.observations import COMPONENTS, Observations, observe
 from elastocal.units import Array, IntArray, microns

@@ -245,15 +245,12 @@ def run_blocks(
 
     Every thread runs in a copy of the caller's context, which holds `numpy.errstate`.
     """
-    threads = max(1, min(threads, len(blocks)))
-    if threads == 1:
-        work(blocks)
-        return
-    shares = [blocks[s] for s in row_blocks(len(blocks), -(-len(blocks) // threads))]
-    with ThreadPoolExecutor(threads, thread_name_prefix="rows") as pool:
-        running = [pool.submit(contextvars.copy_context().run, work, share) for share in shares]
-        for future in running:
-            future.result()
+    shares = (
+        (contextvars.copy_context(), blocks[share])
+        for share in row_blocks(len(blocks), -(-len(blocks) // threads))
+    )
+    for _ in ahead(lambda share: share[0].run(work, share[1]), shares, threads):
+        pass
 
 
 def ahead(work: Callable[[Item], Result], items: Iterable[Item], threads: int) -> Iterator[Result]:
