@@ -1,5 +1,6 @@
 """Results in a notebook: HTML without anybody's markup, figures, data frames."""
 
+import io
 import re
 from html.parser import HTMLParser
 
@@ -85,13 +86,16 @@ def test_diagnosis_as_html_and_frame(name):
 
 def test_figures_are_matplotlibs_and_hold_every_reading(case):
     from matplotlib.figure import Figure
+    from matplotlib.image import imread
 
     figure = case.result.plot()
     assert isinstance(figure, Figure)
     points = sum(len(patch.get_path().vertices) // 2 for patch in figure.axes[0].patches)
     assert points == len(case.result.observations.lead)
-    assert figure._repr_png_().startswith(b"\x89PNG")
-    figure.canvas.draw()
+    # In pixels too: a line of no length has no caps in a PNG.
+    image = imread(io.BytesIO(figure._repr_png_()), format="png")[::-1]
+    left, low, right, high = figure.axes[0].bbox.extents.astype(int)
+    assert (np.ptp(image[low:high, left:right, :3], axis=2) > 0.15).sum() > points
 
 
 def test_interactive_plan_shows_every_pose(plan):

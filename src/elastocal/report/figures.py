@@ -142,6 +142,9 @@ def rendered(figure: Drawing) -> str:
     return buffer.getvalue()
 
 
+NO_LENGTH = 1e-6  # of a line that is a dot: of none at all a PNG has no caps
+
+
 def dots(axes: Axes, x: Array, y: Array, colour: str, size: float, label: str = "") -> None:
     """Scatter as one path of round caps: a third of the bytes of a marker per point."""
     from matplotlib.patches import PathPatch
@@ -154,10 +157,10 @@ def dots(axes: Axes, x: Array, y: Array, colour: str, size: float, label: str = 
     if not len(points):
         return
     codes = np.tile([Path.MOVETO, Path.LINETO], len(points))
-    path = Path(np.repeat(points, 2, axis=0), codes)
-    axes.add_patch(
-        PathPatch(path, fill=False, edgecolor=colour, linewidth=size, capstyle="round", alpha=0.6)
-    )
+    ends = np.repeat(points, 2, axis=0)
+    ends[1::2] += NO_LENGTH * (np.ptp(points, axis=0) + np.abs(points).max())
+    how: dict[str, Any] = {"linewidth": size, "capstyle": "round", "snap": False, "alpha": 0.6}
+    axes.add_patch(PathPatch(Path(ends, codes), fill=False, edgecolor=colour, **how))
     axes.update_datalim(points)
     axes.autoscale_view()
 
