@@ -12,15 +12,8 @@ from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
 from elastocal.above import Result
-from elastocal.compensation.commands import (
-    Commanding,
-    Goals,
-    Solved,
-    Targets,
-    jumps,
-    nominal_path,
-    targets_at,
-)
+from elastocal.compensation import commands
+from elastocal.compensation.commands import Commanding, Goals, Solved, Targets
 from elastocal.errors import InputError, InsufficientDataError, option
 from elastocal.identification.checks import check_limits
 from elastocal.identification.prediction import Uncertainty, uncertainty_at
@@ -134,7 +127,7 @@ def compensate(
     flange = None if aimed.rotation is None else aimed.rotation @ turn.transpose(0, 2, 1)
     if targets.q is None:
         progress("nominal commands")
-        nominal = nominal_path(chain, in_base, flange, place[0], limits, near, seed)[0]
+        nominal = commands.nominal_path(chain, in_base, flange, place[0], limits, near, seed)[0]
     else:
         check_limits(arm.model, replace(targets.table, q=targets.q))
         nominal = np.clip(targets.q, *limits)
@@ -155,7 +148,7 @@ def compensate(
     progress("uncertainty")
     uncertainty = _uncertainty(tool, rows, found.q, reached)
     task = Reaching(chain, in_base, flange, place[0], None, *limits)
-    path = jumps(task, found.q, reached)
+    path = commands.jumps(task, found.q, reached)
     result = Compensation(
         chain, targets, point, found.q, nominal, before[0], found.miss,
         np.column_stack([before[1], found.turn]), status, goals, force, T, place, turn,
@@ -628,10 +621,10 @@ def correction_table(
 
 def _targets(grid: CorrectionGrid, points: Array, force: Array | None) -> Targets:
     if grid.joints:
-        return targets_at(option("table"), None, None, "base", force, q=points)
+        return commands.targets_at(option("table"), None, None, "base", force, q=points)
     rotation = grid.rotation
     turned = None if rotation is None else np.broadcast_to(rotation, (len(points), 3, 3))
-    return targets_at(option("table"), points, turned, "base", force)
+    return commands.targets_at(option("table"), points, turned, "base", force)
 
 
 def _corrections(tool: CalibratedTool, result: Compensation) -> tuple[Array, tuple[str, ...]]:

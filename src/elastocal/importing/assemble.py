@@ -19,16 +19,9 @@ from numpy.typing import NDArray
 from elastocal.cell.work_cell import Cell
 from elastocal.errors import InputError
 from elastocal.identification.mistakes import NominalFit, nominal_fit
-from elastocal.importing import joining, records
+from elastocal.importing import joining, mapping_file, records
 from elastocal.importing.joining import Joined
-from elastocal.importing.mapping_file import (
-    ImportMapping,
-    JoinTable,
-    LoadStatesTable,
-    MappingTable,
-    SourceTable,
-    UnitsTable,
-)
+from elastocal.importing.mapping_file import ImportMapping, MappingTable, SourceTable
 from elastocal.importing.records import Records, Understood
 from elastocal.measurements import Measurements, families, read_measurements
 from elastocal.model.chain import joint_limits
@@ -44,7 +37,7 @@ UNLOADED = ("none", "unloaded", "0")
 def forces_of(
     where: str,
     points: Records,
-    loads: Mapping[str, NDArray[np.float64] | LoadStatesTable] | None,
+    loads: Mapping[str, NDArray[np.float64] | mapping_file.LoadStatesTable] | None,
 ) -> NDArray[np.float64] | None:
     """(n, 3) N in the tracker's frame (z up) for each point; None where no load is told.
 
@@ -67,7 +60,7 @@ def forces_of(
         )
     known = {name: np.zeros(3) for name in UNLOADED}
     for name, stated in (loads or {}).items():
-        if isinstance(stated, LoadStatesTable):
+        if isinstance(stated, mapping_file.LoadStatesTable):
             stated = np.array([0.0, 0.0, -stated.mass_kg * GRAVITY])
         known[name] = stated + 0.0  # no -0.0
     for i, name in enumerate(named):
@@ -181,7 +174,7 @@ def assemble(where: str, points: Records, log: Records | None, joined: Joined | 
     there are no joint values or positions, for repeats that are no whole numbers or occur twice,
     and for unknown loads.
     """
-    settings = mapping.join or JoinTable()
+    settings = mapping.join or mapping_file.JoinTable()
     rows = np.arange(len(points)) if joined is None else np.flatnonzero(joined.row >= 0)
     numbers, units = _numbers(points, log, joined, rows)
     stems = records.joint_stems(numbers)
@@ -476,7 +469,7 @@ def import_files(
     names: tuple[str, ...] = ()
     if cell is not None:
         names = tuple(joint.name for joint in load_chain(cell).joints)
-    units = table.units or UnitsTable()
+    units = table.units or mapping_file.UnitsTable()
     by_role: dict[str, list[Records]] = {"points": [], "joints": []}
     understood = []
     spherical = False
