@@ -685,8 +685,8 @@ def _with_table(
     q = check.nominal.copy()
     q[known] = controller.solve(q[known], np.arange(len(known)))[0]
     errors = []
-    for commands in (check.nominal, q):
-        p, R = _achieved(tool, check, commands)
+    for joints in (check.nominal, q):
+        p, R = _achieved(tool, check, joints)
         off = _between(p, None if rotation is None else R, position, rotation)[known]
         errors.append(np.column_stack([np.linalg.norm(off[:, k : k + 3], axis=1) for k in (0, 3)]))
     return errors[0], errors[1]

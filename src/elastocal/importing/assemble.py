@@ -201,14 +201,12 @@ def assemble(where: str, points: Records, log: Records | None, joined: Joined | 
     )
     if marker is not None:
         columns["marker"] = markers
+    time = numbers.pop("time", None)
     for family in families(kinds).values():
         if family.name not in LABELS:
             columns |= _family(where, family, numbers, units)
-    time = points.time
-    if time is None and log is not None and joined is not None and log.time is not None:
-        time = log.time[joined.row]
     if time is not None:
-        columns["time_s"] = np.round(time[rows] - time[rows].min(), 6)
+        columns["time_s"] = np.round(time - time.min(), 6)
     if any(points.names):
         columns["note_point"] = [points.names[i] for i in rows]
     origin = [points.where(int(i)) for i in rows]

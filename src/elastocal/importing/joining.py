@@ -135,8 +135,6 @@ def pooled(records: Sequence[Records]) -> Records:
         _same("columns", first, other, set(first.numbers), set(other.numbers))
         loads = {"load"} if first.load is not None or other.load is not None else set()
         _same("labels", first, other, set(first.labels) - loads, set(other.labels) - loads)
-        _same("times", first, other, {"time"} if first.time is not None else set(),
-              {"time"} if other.time is not None else set())  # fmt: skip
     loaded = any(r.load is not None or "load" in r.labels for r in records)
     return Records.stacked([
         replace(

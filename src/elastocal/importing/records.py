@@ -47,8 +47,8 @@ class Records:
     """n rows of `files`; `file` (n,) and `line` (n,) say where each stands.
 
     `numbers` stem → (n,) in `units[stem]`, the units of the table to be written; `texts` and
-    `labels` (configuration, marker, repeat, load) → n texts; `time` (n,) s on the file's clock;
-    `load` of all rows, where one is stated.
+    `labels` (configuration, marker, repeat, load) → n texts; `load` of all rows, where one is
+    stated.
     """
 
     files: tuple[str, ...]
@@ -57,7 +57,6 @@ class Records:
     numbers: dict[str, Array]
     units: dict[str, str]
     texts: dict[str, list[str]]
-    time: Array | None
     understood: Understood
     load: str | None = None
     labels: dict[str, list[str]] = field(default_factory=dict)
@@ -82,6 +81,11 @@ class Records:
         return f"{name} (line {self.line[i]})" if name else f"line {self.line[i]}"
 
     @property
+    def time(self) -> Array | None:
+        """(n,) s on the file's clock."""
+        return self.numbers.get("time")
+
+    @property
     def q(self) -> Array:
         """(n, joints) joint values in the units of their columns."""
         stems = joint_stems(self.numbers)
@@ -103,13 +107,11 @@ class Records:
             numbers={stem: values[rows] for stem, values in self.numbers.items()},
             texts=_taken(self.texts, rows),
             labels=_taken(self.labels, rows),
-            time=None if self.time is None else self.time[rows],
         )
 
     @classmethod
     def stacked(cls, parts: Sequence[Records]) -> Records:
         """The rows of all parts, which have the same numbers in the same units."""
-        times = [part.time for part in parts if part.time is not None]
         sizes = [len(part.files) for part in parts]
         first = np.repeat(np.cumsum([0, *sizes[:-1]]), [len(part) for part in parts])
         return replace(
@@ -120,7 +122,6 @@ class Records:
             numbers={s: np.concatenate([p.numbers[s] for p in parts]) for s in parts[0].numbers},
             texts=_stacked([(part.texts, len(part)) for part in parts]),
             labels=_stacked([(part.labels, len(part)) for part in parts]),
-            time=np.concatenate(times) if times else None,
         )
 
 
@@ -209,24 +210,22 @@ def _read(
         ignored=tuple(sorted([*table.ignored, *ignored])),
     )
     line = np.array([number for number, _ in kept], dtype=np.int64)
-    time: Array | None = None
     numbers, of = dict[str, Array](), dict[str, str]()
     for c, own in zip(numeric, np.array(values).reshape(len(kept), -1).T, strict=True):
-        if c.target.stem == "time":  # seconds and nanoseconds add up
-            time = convert(own, c.unit, "s") + (0.0 if time is None else time)
-        else:
-            stem = c.target.stem
-            spread = stem.startswith("sigma_") and source.coverage_factor
-            of[stem] = table_unit(stem, c.unit)
-            numbers[stem] = convert(own, c.unit, of[stem]) / (spread or 1.0)
+        stem = c.target.stem
+        spread = stem.startswith("sigma_") and source.coverage_factor
+        of[stem] = table_unit(stem, c.unit)
+        found = convert(own, c.unit, of[stem]) / (spread or 1.0)
+        numbers[stem] = found + numbers.get(stem, 0.0)  # seconds and nanoseconds of a time add up
     texts = _texts([row for _, row in kept], columns)
     written = texts.pop("time_text", None)
-    if written is not None and time is None:
+    if written is not None and "time" not in numbers:
         form = source.time_format or ()
         formats = [form] if isinstance(form, str) else form
-        time = np.array(foreign_text.seconds_of(name, line.tolist(), written, formats))
+        seconds = foreign_text.seconds_of(name, line.tolist(), written, formats)
+        numbers["time"], of["time"] = np.array(seconds), "s"
     file = np.zeros(len(line), dtype=np.int64)
-    return Records((name,), file, line, numbers, of, texts, time, understood, source.load)
+    return Records((name,), file, line, numbers, of, texts, understood, source.load)
 
 
 def _rows(
