@@ -62,19 +62,14 @@ def draw_errors(
 
 def _sizes_shown(model: Model, rows: Measurements) -> Array:
     """A size (parameters,) that moves a reading by 1 mm where it moves one most; 0 for none."""
-    seen = model
-    if model.observe != "position":
-        spec = replace(model.cell.model, observe="position")
-        seen = Model.assembled(model.chain, replace(model.cell, model=spec))
-    names = [name for name in model.names if name in seen.names]
-    columns = np.array([seen.names.index(name) for name in names])
+    spec = replace(model.cell.model, observe="position")
+    seen = Model.assembled(model.chain, replace(model.cell, model=spec))
     some = rows.take(np.linspace(0, len(rows) - 1, min(len(rows), MOST_ROWS)).astype(int))
-    B = seen.regressor(replace(some, position=np.zeros((len(some), 3))), None, columns).B
-    moved = np.abs(B).max(axis=0)
+    B = seen.regressor(replace(some, position=np.zeros((len(some), 3)))).B
+    known = dict(zip(seen.names, np.abs(B).max(axis=0), strict=True))
+    moved = np.array([known.get(name, 0.0) for name in model.names])
     # A load on a joint's own axis leaves rounding, from which no size follows.
-    size = np.divide(1e-3, moved, out=np.zeros(len(moved)), where=moved > SHOWS)
-    found = dict(zip(names, size, strict=True))
-    return np.array([found.get(name, 0.0) for name in model.names])
+    return np.divide(1e-3, moved, out=np.zeros(len(moved)), where=moved > SHOWS)
 
 
 def expand_plan(
@@ -162,7 +157,6 @@ def _unsteady(model: Model, rows: Measurements, x: Array, rng: np.random.Generat
 def _read(
     model: Model, rows: Measurements, x: Array, rng: np.random.Generator, noise: bool
 ) -> Measurements:
-    """What the tracker reads at every row."""
     n = len(rows)
     if model.observe == "distance":
         length = model.predict(replace(rows, distance=np.ones(n)), x)

@@ -66,7 +66,6 @@ def run_demo(
 
 
 def _copy_example(folder: Path) -> tuple[Path, Path]:
-    """Copy the example's files; InputError where that is impossible or would lose others' work."""
     try:
         folder.mkdir(parents=True, exist_ok=True)
     except (FileExistsError, NotADirectoryError):

@@ -78,7 +78,6 @@ class ShownPoses:
         return float(np.prod((n - i) / (n + self.configurations - i)))
 
     def to_json(self) -> dict[str, float]:
-        """JSON-ready."""
         return {"largest_std_um": self.most * 1e6, "configurations": self.configurations}
 
 
@@ -673,13 +672,12 @@ class CalibratedTool:
 
     @cached_property
     def _errors(self) -> dict[bool, Total]:
-        goal, turned = ca.SX.sym("goal", 3), ca.SX.sym("turned", 9)
-        r = self._position - goal
+        turned, q = ca.SX.sym("turned", 9), self._symbolic.arm.q_commanded
         tilt = rigid.vector_from_rotation(ca.reshape(turned, 3, 3).T @ self._rotation)
-        q = self._symbolic.arm.q_commanded
+        y = ca.vertcat(self._position, ARM_LENGTH * tilt)
         return {
-            False: Total(self._symbolic, r, q, (goal,)),
-            True: Total(self._symbolic, ca.vertcat(r, ARM_LENGTH * tilt), q, (goal, turned)),
+            False: Total(self._symbolic, self._position, q),
+            True: Total(self._symbolic, y, q, (turned,)),
         }
 
     def errors(
@@ -689,10 +687,11 @@ class CalibratedTool:
 
         `position` (n, 3) m and `rotation` (n, 3, 3), or None for any, are in the data's frame.
         """
-        extra = [position]
-        if rotation is not None:
-            extra.append(rotation.transpose(0, 2, 1).reshape(-1, 9))
-        return self._errors[rotation is not None](self._at(rows, q), self.x, extra)
+        oriented = rotation is not None
+        extra = [rotation.transpose(0, 2, 1).reshape(-1, 9)] if rotation is not None else []
+        r, slope = self._errors[oriented](self._at(rows, q), self.x, extra)
+        r[:, :3] -= position
+        return r, slope
 
     @cached_property
     def _frames(self) -> BatchFunction:

@@ -177,7 +177,6 @@ def translation(axis: tuple[float, float, float], length: float) -> ca.SX:
 
 
 def product(*factors: ca.SX) -> Array:
-    """The product (4, 4) of constant transforms."""
     return np.array(ca.DM(reduce(matmul, factors)).full())
 
 

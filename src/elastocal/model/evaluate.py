@@ -354,7 +354,9 @@ class BatchFunction:
             return results
         engine = self._by_numpy
         blocks = row_blocks(n, min(chunk, engine.largest_block))
-        threads = max(1, min(len(blocks), _threads_here()))
+        # In a thread of the caller's own one: who started it has shared the work out already.
+        alone = threading.current_thread() is not threading.main_thread()
+        threads = 1 if alone else max(1, min(len(blocks), thread_count()))
         run_blocks(lambda share: engine.evaluate(arrays, results, share), blocks, threads)
         return results
 
@@ -377,8 +379,3 @@ class BatchFunction:
         if len(shapes) != len(self._sizes) or not all(fit):
             raise ValueError(f"inputs of shapes {shapes}; it takes {self._sizes} per row")
         return arrays, n
-
-
-def _threads_here() -> int:
-    """One in a thread of the caller's own: who started it has shared the work out already."""
-    return thread_count() if threading.current_thread() is threading.main_thread() else 1

@@ -192,7 +192,6 @@ class Postures:
 
     @property
     def reached(self) -> NDArray[np.bool_]:
-        """(T, K)"""
         return (self.miss <= TOLERANCE) & (self.turn <= TOLERANCE)
 
     @property

@@ -129,7 +129,7 @@ class Model:
     def __reduce__(self) -> tuple[Any, ...]:
         """Pickled by what it is made of; another process derives the functions again."""
         made_of = self.chain, self.cell, self._extra, self._symbolic.backend
-        return _again, (*made_of, self._markers_stated)
+        return Model.assembled, made_of, {"_markers_stated": self._markers_stated}
 
     def __repr__(self) -> str:
         effects = listed(dict.fromkeys(p.effect for p in self.parameters), 6) or "no effect"
@@ -250,7 +250,6 @@ class Model:
         return self._with(replace(self.cell.model, effects=effects))
 
     def _with(self, spec: ModelSpec, extra: Sequence[tuple[Effect, str]] = ()) -> Model:
-        """The same arm with another [model]."""
         cell = replace(self.cell, model=spec)
         return Model.assembled(self.chain, cell, extra, self._symbolic.backend)
 
@@ -456,15 +455,6 @@ class Model:
         return self._symbolic.frames(*inputs, x, self._settle(inputs, x))
 
 
-def _again(
-    chain: Chain, cell: Cell, extra: Sequence[tuple[Effect, str]], backend: str | None,
-    markers_stated: bool,
-) -> Model:  # fmt: skip
-    model = Model.assembled(chain, cell, extra, backend)
-    model._markers_stated = markers_stated
-    return model
-
-
 def check_equilibrium(table: Measurements, predicted: Array) -> None:
     """Raise InputError for the first row whose prediction (n_rows, k) is not finite."""
     bad = np.flatnonzero(~np.isfinite(predicted).all(axis=1))
@@ -477,7 +467,7 @@ def check_equilibrium(table: Measurements, predicted: Array) -> None:
 
 
 def _with_markers(cell: Cell, names: tuple[str, ...]) -> Cell:
-    """The cell with these markers, all nominally at the flange's origin."""
+    # All nominally at the flange's origin.
     return replace(cell, tool=replace(cell.tool, markers={name: np.zeros(3) for name in names}))
 
 
@@ -529,7 +519,6 @@ class SmoothGroup(SmoothFunction):
 
     @property
     def joint(self) -> int:
-        """Index of the joint that it follows."""
         return index(self.follows)
 
     def grid(self, n: int) -> Array:

@@ -48,7 +48,6 @@ class Observations:
 
     @cached_property
     def n_configurations(self) -> int:
-        """How many configurations there are."""
         return int(ranked(self.configuration).max(initial=-1)) + 1
 
     @property

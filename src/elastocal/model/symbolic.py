@@ -238,7 +238,6 @@ class Total:
         return BatchFunction(self._inputs, outputs, self._arm.backend)
 
     def _function(self, columns: tuple[int, ...]) -> BatchFunction:
-        """A function of y and these columns of dy/dz."""
         if columns not in self._functions:
             adjoint, slope = self._derivative
             inputs = [*self._inputs, *([ca.vec(adjoint.T)] if self._arm.implicit else [])]
@@ -273,7 +272,6 @@ class Total:
 
 
 def _check_names(parameters: Sequence[Parameter], cell: Cell) -> None:
-    """InputError where two effects call a parameter at a place alike."""
     known: dict[str, Parameter] = {}
     for p in parameters:
         other = known.setdefault(p.name, p)

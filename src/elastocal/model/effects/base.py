@@ -5,7 +5,7 @@ from __future__ import annotations
 import math
 from abc import abstractmethod
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import TYPE_CHECKING, Any, ClassVar, Literal, get_args
 
 import casadi as ca
@@ -29,6 +29,7 @@ Format = Literal["rigid", "elastic"]
 Symbols = Mapping[str, ca.SX]
 NEEDS = ("time", "approach", "temperature", "load", "torque")
 REVOLUTE = "revolute"
+MOTION = "rad or m"  # unit of a parameter of a joint's motion, as the joint turns or slides
 
 # Ranks of parameters: where a choice is free, a minimal complete set takes low ones first.
 STIFFNESS, STATION, MARKER, OFFSET, ORDINARY, LINK = range(6)
@@ -154,7 +155,10 @@ class Effect:
 
     def parameters(self, place: str, chain: Chain, cell: Cell) -> tuple[ParameterSpec, ...]:
         """The parameters at one place; loads may have none."""
-        return self.unknowns
+        return tuple(
+            replace(p, unit=motion_unit(place, chain)) if p.unit == MOTION else p
+            for p in self.unknowns
+        )
 
     def starts(self, place: str, chain: Chain, cell: Cell) -> tuple[dict[str, float], ...]:
         """Values of some parameters from which to look for the others, where nominal ones say

@@ -12,6 +12,7 @@ from elastocal.errors import require
 from elastocal.model.arm import Arm, ParameterSpec, Setting
 from elastocal.model.chain import Chain
 from elastocal.model.effects.base import (
+    MOTION,
     OFFSET,
     DrivenEffect,
     Effect,
@@ -19,7 +20,6 @@ from elastocal.model.effects.base import (
     Symbols,
     index,
     joints,
-    motion_unit,
 )
 from elastocal.model.effects.compliances import (
     TorqueEffect,
@@ -37,9 +37,7 @@ class JointOffset(Effect):
     at = "joints"
     rank = OFFSET
     formats = ("rigid", "elastic")
-
-    def parameters(self, place: str, chain: Chain, cell: Cell) -> tuple[ParameterSpec, ...]:
-        return (ParameterSpec("offset", motion_unit(place, chain), 0.0, 1e-3),)
+    unknowns = (ParameterSpec("offset", MOTION, 0.0, 1e-3),)
 
     def shape(self, arm: Arm, place: str, p: Symbols) -> None:
         arm.q[index(place)] += p["offset"]

@@ -17,6 +17,7 @@ from elastocal.model.effects.base import (
     MARKER,
     MEASURE_MONUMENTS,
     MEASURE_SCALE,
+    MOTION,
     STATION,
     BaseMotion,
     DrivenEffect,
@@ -27,7 +28,6 @@ from elastocal.model.effects.base import (
     MarkerMotion,
     Symbols,
     links,
-    motion_unit,
 )
 from elastocal.units import Array
 
@@ -238,7 +238,6 @@ class TrackerDistortion(Effect):
 
 
 def _turned(a: ca.SX, b: ca.SX, angle: ca.SX) -> tuple[ca.SX, ca.SX]:
-    """(a, b) turned by `angle` in their plane."""
     c, s = ca.cos(angle), ca.sin(angle)
     return c * a - s * b, s * a + c * b
 
@@ -298,9 +297,7 @@ class JointDrift(WarmUp):
     stage = "transmission"
     formats = ("rigid", "elastic")
     entry = JointMotion()
-
-    def parameters(self, place: str, chain: Chain, cell: Cell) -> tuple[ParameterSpec, ...]:
-        return (ParameterSpec("drift", motion_unit(place, chain), 0.0, 1e-4),)
+    unknowns = (ParameterSpec("drift", MOTION, 0.0, 1e-4),)
 
 
 class EncoderJump(Jump):
@@ -315,9 +312,7 @@ class EncoderJump(Jump):
     constants = (JUMP_TIME,)
     formats = ("rigid", "elastic")
     entry = JointMotion()
-
-    def parameters(self, place: str, chain: Chain, cell: Cell) -> tuple[ParameterSpec, ...]:
-        return (ParameterSpec("jump", motion_unit(place, chain), 0.0, 1e-4),)
+    unknowns = (ParameterSpec("jump", MOTION, 0.0, 1e-4),)
 
 
 class BaseDrift(WarmUp):

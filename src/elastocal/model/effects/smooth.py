@@ -90,7 +90,6 @@ class Waves:
 
     @property
     def count(self) -> int:
-        """How many coefficients a function has."""
         return 2 * len(self.frequency) + math.isfinite(self.fade)
 
     def variances(self, size: float, length: float) -> Array:
