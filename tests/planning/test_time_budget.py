@@ -16,7 +16,7 @@ from elastocal.errors import InputError, InsufficientDataError
 from elastocal.model.manipulator import Model
 from elastocal.planning import choices
 from elastocal.planning import test_poses as target_poses
-from elastocal.planning.choices import Choice, _Budget, _minutes, at_stops
+from elastocal.planning.choices import Choice, _minutes, _sizes, at_stops
 from elastocal.planning.plan import TimedSize
 from elastocal.planning.setup import Known
 
@@ -29,7 +29,7 @@ def sizes(cell: Cell, minutes: float) -> tuple[tuple[TimedSize, ...], TimedSize]
     model = Model.assembled(kr270_chain(), cell)
     targets = target_poses.test_poses(cell, kr270_chain())
     choice = Choice(model, targets, None, Known(), 0, lambda message: None)
-    return _Budget(choice, cell, minutes).sizes()[:2]
+    return _sizes(choice, cell, minutes)[:2]
 
 
 @pytest.fixture(autouse=True)

@@ -143,9 +143,11 @@ def draw(
         chunks = _checked(checker, forces, group, sobol(space, group, stream), jobs)
         lot, verdict = _fill(chunks, n // groups + (group < n % groups))
         if not len(lot.q):
-            every = checker.check(verdict.q, verdict.force)
+            every, at, j = checker.check(verdict.q, verdict.force), "", space.held
+            if j is not None:
+                at = f" with joint{j + 1} at {told(chain, j, space.levels[group])}"
             raise InsufficientDataError(
-                f"{cell.path or cell.name}: no feasible pose found{_at(chain, space, group)}; "
+                f"{cell.path or cell.name}: no feasible pose found{at}; "
                 f"{checker.advice(replace(every, broken=every.broken | verdict.broken))}"
             )
         drawn.append(lot)
@@ -252,12 +254,6 @@ def _fill(
     found = Candidates.join(lots)
     found = replace(found, q=found.q[:wanted], group=found.group[:wanted])
     return found, PoseFeasibility.join(verdicts)
-
-
-def _at(chain: Chain, space: JointSpace, group: int) -> str:
-    if space.held is None:
-        return ""
-    return f" with joint{space.held + 1} at {told(chain, space.held, space.levels[group])}"
 
 
 def told(chain: Chain, j: int, value: float) -> str:

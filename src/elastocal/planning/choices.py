@@ -304,7 +304,7 @@ def within(
     """
     asked = minutes
     for left in reversed(range(TRIES)):
-        sizes, best, poses = _Budget(choice, cell, asked).sizes()
+        sizes, best, poses = _sizes(choice, cell, asked)
         plan = plan_of(_sized(cell, poses, best.repeats))
         took = plan.execution.total / 60
         if took <= minutes or not left:
@@ -326,76 +326,72 @@ class _Fit(NamedTuple):
     read: BoolArray
 
 
-@dataclass(frozen=True)
-class _Budget:
-    choice: Choice
-    cell: Cell
-    minutes: float
+def _sizes(
+    choice: Choice, cell: Cell, minutes: float
+) -> tuple[tuple[TimedSize, ...], TimedSize, int]:
+    """What fits, by numbers of repeats, the best of them, and the number of poses in all load
+    states that has as many stops."""
+    spec, drawn, found = cell.design, choice.draw(cell), list[_Fit]()
+    # Where a reading takes no time nothing says how many of them there may be.
+    for repeats in REPEATS if spec.motion.reading > 0 else (spec.repeats,):
+        choice.progress(f"within {minutes:.4g} minutes: {repeats} readings each")
+        fit = _best(choice, cell, minutes, drawn, repeats, found[-1].read if found else None)
+        found += [] if fit is None else [fit]
+        least = min((fit.value for fit in found), default=np.inf)
+        if len(found) > WORSE and min(fit.value for fit in found[-WORSE:]) > least:
+            break
+    if not found:
+        raise InsufficientDataError(
+            f"{cell.path or cell.name}: no plan that determines the parameters takes "
+            f"{minutes:.4g} minutes or less; allow more time, or lower dwell_s, reading_s and "
+            "load_change_s of [design.motion] where they are too high"
+        )
+    # A plan that holds more parameters errs less in the others, but not in all.
+    most = max(fit.kept for fit in found)
+    whole = [fit for fit in found if fit.kept == most]
+    best = min(whole, key=lambda fit: fit.value)
+    return tuple(fit.size for fit in whole), best.size, best.poses
 
-    def sizes(self) -> tuple[tuple[TimedSize, ...], TimedSize, int]:
-        """What fits, by numbers of repeats, the best of them, and the number of poses in all load
-        states that has as many stops."""
-        spec = self.cell.design
-        # Where a reading takes no time nothing says how many of them there may be.
-        numbers = REPEATS if spec.motion.reading > 0 else (spec.repeats,)
-        drawn, found = self.choice.draw(self.cell), list[_Fit]()
-        for repeats in numbers:
-            self.choice.progress(f"within {self.minutes:.4g} minutes: {repeats} readings each")
-            fit = self._best(drawn, repeats, found[-1].read if found else None)
-            found += [] if fit is None else [fit]
-            least = min((fit.value for fit in found), default=np.inf)
-            if len(found) > WORSE and min(fit.value for fit in found[-WORSE:]) > least:
-                break
-        if not found:
-            raise InsufficientDataError(
-                f"{self.cell.path or self.cell.name}: no plan that determines the parameters takes "
-                f"{self.minutes:.4g} minutes or less; allow more time, or lower dwell_s, reading_s "
-                "and load_change_s of [design.motion] where they are too high"
-            )
-        # A plan that holds more parameters errs less in the others, but not in all.
-        most = max(fit.kept for fit in found)
-        whole = [fit for fit in found if fit.kept == most]
-        best = min(whole, key=lambda fit: fit.value)
-        return tuple(fit.size for fit in whole), best.size, best.poses
 
-    def _best(self, drawn: Candidates, repeats: int, read: BoolArray | None) -> _Fit | None:
-        """A plan of as many poses as fit, candidates being `read` in load states that were chosen
-        before; None where there is none."""
-        poses, found = self._fitting(drawn.q, repeats), None
-        while poses > 0:
-            cell = _sized(self.cell, poses, repeats)
-            try:
-                point = self.choice.relaxed(cell, drawn, read)
-                if point is None:
-                    return None
-                problem = point.setup.problem(point.pool, shares_of(cell))
-                check_enough(problem)
-                chosen, phi = exact_plan(balanced(problem)[0], point.relaxed)
-            except ElastocalError:
+def _best(
+    choice: Choice, whole: Cell, minutes: float, drawn: Candidates, repeats: int,
+    read: BoolArray | None,
+) -> _Fit | None:  # fmt: skip
+    """A plan of as many poses as fit, candidates being `read` in load states that were chosen
+    before; None where there is none."""
+
+    def too_long(n: int) -> bool:
+        sized = _sized(whole, n, repeats)
+        everything = np.ones((n, len(plan_forces(sized))), dtype=np.int64)
+        return _minutes(sized, drawn.q[:n], everything) > minutes
+
+    poses, found = bisect_left(range(1, len(drawn.q) + 1), True, key=too_long), None
+    while poses > 0:
+        cell = _sized(whole, poses, repeats)
+        try:
+            point = choice.relaxed(cell, drawn, read)
+            if point is None:
                 return None
-            took = _minutes(cell, point.pool.q[chosen], point.pool.readings[chosen])
-            fitting = int(poses * self.minutes / took)
-            if took <= self.minutes:
-                value = point.setup.criterion.figure(phi)
-                size, read = TimedSize(len(chosen), repeats, took, value), point.setup.ways > 0
-                found = _Fit(len(problem.prior), phi, size, poses, read)
-                # Where a load is not hung there is time for more.
-                if took > self.minutes - cell.design.motion.load_change / 60 or fitting <= poses:
-                    return found
-                poses = fitting
-            elif found is not None:
+            problem = point.setup.problem(point.pool, shares_of(cell))
+            check_enough(problem)
+            chosen, phi = exact_plan(balanced(problem)[0], point.relaxed)
+        except ElastocalError:
+            return None
+        took = _minutes(cell, point.pool.q[chosen], point.pool.readings[chosen])
+        fitting = int(poses * minutes / took)
+        if took <= minutes:
+            value = point.setup.criterion.figure(phi)
+            size, read = TimedSize(len(chosen), repeats, took, value), point.setup.ways > 0
+            found = _Fit(len(problem.prior), phi, size, poses, read)
+            # Where a load is not hung there is time for more.
+            if took > minutes - cell.design.motion.load_change / 60 or fitting <= poses:
                 return found
-            else:
-                poses = min(fitting, poses - 1)
-        return found
-
-    def _fitting(self, q: Array, repeats: int) -> int:
-        def too_long(n: int) -> bool:
-            sized = _sized(self.cell, n, repeats)
-            everything = np.ones((n, len(plan_forces(sized))), dtype=np.int64)
-            return _minutes(sized, q[:n], everything) > self.minutes
-
-        return bisect_left(range(1, len(q) + 1), True, key=too_long)
+            poses = fitting
+        elif found is not None:
+            return found
+        else:
+            poses = min(fitting, poses - 1)
+    return found
 
 
 def _sized(cell: Cell, poses: int, repeats: int) -> Cell:

@@ -264,10 +264,14 @@ def rule_book(
 ) -> tuple[Rule, ...]:
     """All rules of the cell.  Raises InputError where they do not fit the robot."""
     bounds = tuple(_visibility(cell))
-    sight = tuple(_line_of_sight(cell, kinematics, bodies))
-    least = None if cell.workspace.visibility is None else cell.workspace.visibility.min_markers
-    if least is not None and least < len(cell.tool.markers):
-        bounds, sight = (), (EnoughMarkers((*bounds, *sight), tuple(cell.tool.markers), least),)
+    sight: tuple[Rule, ...] = ()
+    stated, markers, least = cell.workspace.visibility, cell.tool.markers, None
+    if stated is not None:
+        least, eye = stated.min_markers, cell.tracker.position
+        if stated.line_of_sight:
+            sight = (LineOfSight(kinematics, bodies, eye, stated.beam_radius, markers),)
+    if least is not None and least < len(markers):
+        bounds, sight = (), (EnoughMarkers((*bounds, *sight), tuple(markers), least),)
     return (
         _joints(cell, chain),
         *bounds,
@@ -340,14 +344,6 @@ def _load(cell: Cell, chain: Chain) -> Iterator[Rule]:
             "torque", lambda p: np.abs(torque(p)), np.zeros(len(bound)), bound, labels,
             "a torque_limits_Nm", ("N m",),
         )  # fmt: skip
-
-
-def _line_of_sight(cell: Cell, kinematics: Kinematics, bodies: Sequence[Body]) -> Iterator[Rule]:
-    sight = cell.workspace.visibility
-    if sight is not None and sight.line_of_sight:
-        yield LineOfSight(
-            kinematics, bodies, cell.tracker.position, sight.beam_radius, cell.tool.markers
-        )
 
 
 # Which rule to relax when next to nothing is feasible.

@@ -367,7 +367,19 @@ class _Ordering:
         readings = plan.pool.readings[plan.chosen]
         alias = Alias.of(plain.information, q, blocks, M, plain.target_rows, readings)
         plan = replace(plan, alias=alias)
-        return plan, _execution(setup, plan, self.paths, search.seed, search.progress)
+        rules = self.paths.feasibility
+        execution = schedule(
+            q, at_stops(rules.cell), self.paths,
+            loads=setup.information.forces,
+            read=readings > 0,
+            limits=joint_limits(rules.cell, rules.chain),
+            via=plan.pool.q[:: max(len(plan.pool) // VIA, 1)],
+            blockers=blockers_of(rules),
+            alias=alias,
+            paired=rules.cell.model.observe == "deflection",
+            seed=search.seed, progress=search.progress,
+        )  # fmt: skip
+        return plan, execution
 
     def polished(self, plan: Selection, execution: Execution) -> tuple[Selection, Execution]:
         found, search = self.found, self.search
@@ -423,24 +435,6 @@ class _Paths:
             free = self.feasibility.paths_free(q_from[new], q_to[new], loaded)
             self.known.update((keys[k], bool(f)) for k, f in zip(new, free, strict=True))
         return np.array([self.known[key] for key in keys], dtype=bool)
-
-
-def _execution(
-    setup: Setup, plan: Selection, paths: _Paths, seed: int, progress: Progress
-) -> Execution:
-    feasibility, pool, chosen = paths.feasibility, plan.pool, plan.chosen
-    cell = feasibility.cell
-    return schedule(
-        pool.q[chosen], at_stops(cell), paths,
-        loads=setup.information.forces,
-        read=pool.readings[chosen] > 0,
-        limits=joint_limits(cell, feasibility.chain),
-        via=pool.q[:: max(len(pool) // VIA, 1)],
-        blockers=blockers_of(feasibility),
-        alias=plan.alias,
-        paired=cell.model.observe == "deflection",
-        seed=seed, progress=progress,
-    )  # fmt: skip
 
 
 def _apart(paths: _Paths, q: Array, there: Array) -> BoolArray:
