@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable
+from itertools import groupby
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
 
@@ -120,15 +121,13 @@ def _print_effects(screen: Console, cell: Any, entries: Any) -> None:
 
     from elastocal.model.chain import names_told
     from elastocal.model.manipulator import load_chain
-    from elastocal.report.effect_names import effect_lines
+    from elastocal.report.effect_names import STAGES, effect_head
 
-    stage = ""
-    for its_stage, head, what in effect_lines(entries):
-        if its_stage != stage:
-            stage = its_stage
-            screen.print(f"\n{stage.capitalize()}", style="bold")
-        screen.print(Padding(head, (0, 0, 0, 2)))
-        screen.print(Padding(what, (0, 0, 0, 6)), style="dim")
+    for stage, several in groupby(entries, lambda entry: entry["stage"]):
+        screen.print(f"\n{STAGES[stage].capitalize()}", style="bold")
+        for entry in several:
+            screen.print(Padding(effect_head(entry), (0, 0, 0, 2)))
+            screen.print(Padding(entry["what"], (0, 0, 0, 6)), style="dim")
     screen.print()
     if told := names_told(load_chain(cell)):
         screen.print(f"Joints: {told}")

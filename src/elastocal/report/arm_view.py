@@ -292,27 +292,13 @@ def residual_arm(
     model: Model, observed: Observations, x: Array, residual: Array
 ) -> blocks.ShownArm:
     """The arm with its residuals as arrows: one pose per configuration and load, each arrow the
-    mean residual of a marker.
-
-    `residual` (rows,) is observed minus predicted at parameter values x (parameters,); of a pose
-    the position counts, a distance's residual lies along the line from its anchor.
-    """
+    mean residual of a marker; `residual` (rows,) at parameter values x (parameters,)."""
     table, marker = observed.table, observed.table.marker[observed.lead]
     force = np.round(table.force[observed.lead], 3)
     key = np.column_stack([observed.configuration, force])
     _, first, entry = np.unique(key, axis=0, return_index=True, return_inverse=True)
     entry = entry.ravel()
-    # Where the markers (N, 3) were seen, or where the model puts them if only a distance was.
-    if table.position is None:
-        at = model.target_poses(table, x)[1][observed.lead]
-    else:
-        at = table.position[observed.lead]
-    vectors = residual.reshape(-1, observed.size)
-    if observed.kind == "distance":
-        anchor = model.cell.tracker.anchor
-        line = at - (np.zeros(3) if anchor is None else anchor)
-        vectors = vectors * line / np.linalg.norm(line, axis=1, keepdims=True)
-    vectors = vectors[:, :3]
+    at, vectors = _vectors(model, observed, x, residual)
     rms = np.sqrt(np.bincount(entry, (vectors**2).sum(axis=1)) / np.bincount(entry))
     chosen = _chosen(rms, np.argsort(first))
     rows = observed.lead[first[chosen]]
@@ -350,6 +336,21 @@ def residual_arm(
             "largest residuals, and a random choice."
         )
     return blocks.ShownArm("space", space, "Residuals as arrows on the posed arm", text)
+
+
+def _vectors(
+    model: Model, observed: Observations, x: Array, residual: Array
+) -> tuple[Array, Array]:
+    """Where markers (N, 3) were seen, or the model puts them if only a distance was, and residuals
+    (N, 3): of a pose the position's, of a distance along the line from its anchor."""
+    table, vectors = observed.table, residual.reshape(-1, observed.size)
+    places = model.target_poses(table, x)[1] if table.position is None else table.position
+    at = places[observed.lead]
+    if observed.kind == "distance":
+        anchor = model.cell.tracker.anchor
+        line = at - (np.zeros(3) if anchor is None else anchor)
+        vectors = vectors * line / np.linalg.norm(line, axis=1, keepdims=True)
+    return at, vectors[:, :3]
 
 
 def _chosen(rms: Array, order: IntArray) -> IntArray:

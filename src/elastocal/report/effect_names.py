@@ -266,18 +266,10 @@ def what_it_is(effect: Effect) -> str:
     return " ".join(first.split())
 
 
-def effect_lines(entries: list[dict[str, Any]]) -> list[tuple[str, str, str]]:
-    """For people, in order: stage, name with places and sizes (* where it is on), what it is."""
-    return [
-        (
-            STAGES[entry["stage"]],
-            f"{entry['name']}{' *' if entry['on'] else ''}: "
-            f"{places(entry['places'], runs=True) or 'nowhere here'}; "
-            f"{_sizes(entry['parameters'])}",
-            entry["what"],
-        )
-        for entry in entries
-    ]
+def effect_head(entry: dict[str, Any]) -> str:
+    """Name (* where it is on), places and sizes of an effect, for people."""
+    where = places(entry["places"], runs=True) or "nowhere here"
+    return f"{entry['name']}{' *' * entry['on']}: {where}; {_sizes(entry['parameters'])}"
 
 
 def _sizes(parameters: list[dict[str, Any]]) -> str:

@@ -163,15 +163,12 @@ def _moves(c: Comparison) -> Figure:
 
 
 def compensation_report(c: Compensation) -> Report:
-    return Report("Compensation", printable(c.chain.name), _compensated(c))
-
-
-def _compensated(c: Compensation) -> Iterator[Block]:
     from elastocal.compensation.compensate import summary
 
-    yield from compensation_blocks({"commands": summary(c, c.chain.kinds, commands=False)})
-    yield Fold("", lambda: [_errors(c)], figures=("errors",))
-    yield Fold("Commands", lambda: [_commands(c)])
+    told = compensation_blocks({"commands": summary(c, c.chain.kinds, commands=False)})
+    errors = Fold("", lambda: [_errors(c)], figures=("errors",))
+    commands = Fold("Commands", lambda: [_commands(c)])
+    return Report("Compensation", printable(c.chain.name), [*told, errors, commands])
 
 
 def compensation_blocks(content: dict[str, Any]) -> Iterator[Block]:
@@ -251,10 +248,6 @@ def _errors(c: Compensation) -> Figure:
 
 
 def readings_report(table: Measurements) -> Report:
-    return Report("Readings", printable(table.source), _of_readings(table))
-
-
-def _of_readings(table: Measurements) -> Iterator[Block]:
     rows = [
         (printable(name), str(len(np.unique(values.astype(str)))), "", "")
         if values.dtype == object
@@ -262,8 +255,10 @@ def _of_readings(table: Measurements) -> Iterator[Block]:
         for name, values in table.columns().items() if len(values)
     ]  # fmt: skip
     heads = ("column", "different", "least", "largest")
-    yield ShownTable(heads, rows, title=f"{len(table)} rows of {printable(table.source)}")
-    yield Fold("", lambda: [_joints(table)], figures=("joints",))
+    source = printable(table.source)
+    shown = ShownTable(heads, rows, title=f"{len(table)} rows of {source}")
+    joints = Fold("", lambda: [_joints(table)], figures=("joints",))
+    return Report("Readings", source, [shown, joints])
 
 
 def _joints(table: Measurements) -> Figure:
