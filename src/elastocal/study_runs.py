@@ -312,13 +312,12 @@ def run_study(
     stop: StudyStop | None = None,
     progress: Callable[[int, int, int], None] = lambda total, ended, failed: None,
     tell: Callable[[str], None] = print,
-    runner: Callable[[Sequence[StudyTask]], Lines] | None = None,
     **way: Any,
 ) -> Ending:
     """Run the tasks that have no result yet (of the first `only`) and record what comes.
 
     They run in `jobs` processes (by default one per core), on the Dask scheduler at `cluster`,
-    reached this `way` (tls_ca, tls_cert, tls_key, unencrypted), or as `runner` has it.  `restart`
+    reached this `way` (tls_ca, tls_cert, tls_key, unencrypted).  `restart`
     discards the results in the folder `output`, `retry_failed` those that are errors; `progress`
     takes the number of tasks, of those that ended and of those that failed.  However the run ends,
     what was done is written.
@@ -333,12 +332,11 @@ def run_study(
         there = {line["task"]: line["task_error"] is not None for line in kept}
         wanted = study.tasks[:only]
         left = [task for task in wanted if task.index not in there]
-        if runner is None and cluster is not None and left:
+        runner = partial(run_local, study, left, jobs, stop)
+        if cluster is not None and left:
             # Before results are discarded: one that cannot be reached must not cost them.
             crew = DaskWorkers(connect(cluster, **way), tell)
-            runner = lambda tasks: hand_out(crew, study, tasks, stop)  # noqa: E731
-        elif runner is None:
-            runner = partial(run_local, study, jobs=jobs, stop=stop)
+            runner = partial(hand_out, crew, study, left, stop)
         for name in (studies.RESULTS, studies.STATEMENT, studies.FAILURES) if restart else ():
             (folder / name).unlink(missing_ok=True)
         if left:  # without the beginning of a line
@@ -348,7 +346,7 @@ def run_study(
         ended, failed = before, sum(there.get(task.index, False) for task in wanted)
         progress(total, ended, failed)
         try:
-            with closing(runner(left)) as lines:
+            with closing(runner()) as lines:
                 for line in lines:
                     stop.check()
                     studies.add_line(folder, line)
