@@ -28,9 +28,8 @@ if TYPE_CHECKING:
     from elastocal.compensation.commands import Targets
     from elastocal.compensation.compensate import Compensation
     from elastocal.diagnosis.diagnosis import Diagnosis
-    from elastocal.identification.intervals import IntervalKind
     from elastocal.identification.knowledge import Constraints, GaussianPrior, Knowledge
-    from elastocal.identification.options import FaultyReadings, Method
+    from elastocal.identification.options import FaultyReadings, IntervalKind, Method
     from elastocal.identification.result import Calibration
     from elastocal.identification.weighted_problem import WeightKind
     from elastocal.measurements import Measurements

@@ -22,7 +22,6 @@ from elastocal.identification.checks import (
 from elastocal.identification.covariance import variance_of
 from elastocal.identification.faulty_readings import report_faulty
 from elastocal.identification.findings import judged, of_solution
-from elastocal.identification.intervals import MethodResult
 from elastocal.identification.least_squares import Problem
 from elastocal.identification.methods import (
     is_exact,
@@ -32,7 +31,7 @@ from elastocal.identification.methods import (
 )
 from elastocal.identification.mistakes import refuse_nonsense
 from elastocal.identification.noise_summary import noise_of, noise_parts
-from elastocal.identification.options import Options
+from elastocal.identification.options import MethodResult, Options
 from elastocal.identification.outliers import Outlier, describe, find_faulty
 from elastocal.identification.prediction import (
     NewPoses,
@@ -41,7 +40,6 @@ from elastocal.identification.prediction import (
     predicted_error,
 )
 from elastocal.identification.residuals import (
-    ResidualSummary,
     rms_3d,
     summarise_residuals,
     told_by_one,
@@ -237,7 +235,9 @@ def summarise(
     observed = solution.problem.observations
     set_apart = len(observed.lead) < len(every.problem.observations.lead)
     covariance = found.intervals.covariance.matrix
-    leverage = _leverage(found)
+    leverage = found.leverage  # None of a large table
+    if leverage is None and not solution.problem.large:
+        leverage = solution.leverage
     report = None
     if not is_exact(every):
         fitted = found.solution if set_apart or found.smooth else sound
@@ -265,7 +265,13 @@ def summarise(
         outliers=() if set_apart else faulty,
         excluded=faulty if set_apart else (),
         warnings=(),
-        residual_summary=_residual_summary(solution, leverage),
+        residual_summary=summarise_residuals(
+            observed,
+            final.whitened,
+            leverage,
+            solution.problem.weights.apply(solution.heldout),
+            absolute=solution.problem.weights.absolute,
+        ),
         faulty_report=report,
         active=found.active,
         prior_share=found.prior_share,
@@ -308,23 +314,6 @@ def _unchecked(result: Calibration) -> Array | None:
     B = result.B[:, kept]
     configuration = np.repeat(observed.configuration, observed.size)
     return told_by_one(weights.apply(B), np.where(lone, configuration, -1))
-
-
-def _leverage(found: MethodResult) -> Array | None:
-    """How much each row (rows,) draws the fit to itself; None of a large table."""
-    solution = found.solution
-    if found.leverage is None and not solution.problem.large:
-        return solution.leverage
-    return found.leverage
-
-
-def _residual_summary(solution: Solution, leverage: Array | None) -> ResidualSummary | None:
-    """The whitened residuals against what the noise model says of them."""
-    problem, fit = solution.problem, solution.fit
-    return summarise_residuals(
-        problem.observations, fit.whitened, leverage,
-        problem.weights.apply(solution.heldout), absolute=problem.weights.absolute,
-    )  # fmt: skip
 
 
 def uncertainty_of(

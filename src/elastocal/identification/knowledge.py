@@ -484,7 +484,8 @@ def read_knowledge(path: str | Path) -> Knowledge:
     path = Path(path)
     table = checked(KnowledgeTable, read_toml(path, "knowledge file"), path)
     try:
-        return Knowledge(table.physical, _constraints(table), _prior(table), str(path))
+        prior = GaussianPrior.from_dict(table.model_dump()["prior"]) if table.prior else None
+        return Knowledge(table.physical, _constraints(table), prior, str(path))
     except InputError as error:
         raise InputError(f"{path}: {error}") from None
 
@@ -504,7 +505,3 @@ def _constraints(table: KnowledgeTable) -> Constraints:
         for k, m in enumerate(table.semidefinite, start=1)
     ]
     return Constraints(tuple(bounds), tuple(equalities), tuple(matrices))
-
-
-def _prior(table: KnowledgeTable) -> GaussianPrior | None:
-    return GaussianPrior.from_dict(table.model_dump()["prior"]) if table.prior else None

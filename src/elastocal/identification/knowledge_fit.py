@@ -16,10 +16,9 @@ from elastocal.identification.constrained import (
     profile_end,
 )
 from elastocal.identification.covariance import Covariance, t_quantile
-from elastocal.identification.intervals import LEVEL, Intervals, MethodResult
 from elastocal.identification.knowledge import Constraints, GaussianPrior
 from elastocal.identification.least_squares import Fit
-from elastocal.identification.options import Options
+from elastocal.identification.options import LEVEL, Intervals, MethodResult, Options
 from elastocal.identification.residuals import held_out_by_parts
 from elastocal.identification.solve import (
     WORTH_A_COLUMN,

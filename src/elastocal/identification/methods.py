@@ -10,7 +10,6 @@ from scipy import sparse
 
 from elastocal.identification import published
 from elastocal.identification.covariance import Covariance
-from elastocal.identification.intervals import LEVEL, Intervals, MethodResult, intervals_of
 from elastocal.identification.knowledge_fit import fit_with_knowledge
 from elastocal.identification.least_squares import Problem
 from elastocal.identification.noise_choice import (
@@ -21,7 +20,14 @@ from elastocal.identification.noise_choice import (
     weights_of,
 )
 from elastocal.identification.noise_structure import Kind, Readings
-from elastocal.identification.options import ROBUST, Options
+from elastocal.identification.options import (
+    LEVEL,
+    ROBUST,
+    Intervals,
+    MethodResult,
+    Options,
+    intervals_of,
+)
 from elastocal.identification.outliers import NoiseAndOutliers, settle
 from elastocal.identification.residuals import held_out_residual, rms_3d
 from elastocal.identification.robust import robust_result

@@ -10,7 +10,6 @@ import numpy as np
 from scipy import special
 
 from elastocal.errors import InputError
-from elastocal.identification.intervals import MethodResult
 from elastocal.identification.noise_choice import (
     NoiseFit,
     NoiseTest,
@@ -20,6 +19,7 @@ from elastocal.identification.noise_choice import (
     own_noise,
 )
 from elastocal.identification.noise_structure import DRIFT, SHARED, Readings
+from elastocal.identification.options import MethodResult
 from elastocal.identification.outliers import kept_of
 from elastocal.identification.solve import Solution
 from elastocal.identification.weighted_problem import (

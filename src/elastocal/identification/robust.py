@@ -20,8 +20,8 @@ from scipy import linalg, sparse, special
 
 from elastocal.errors import ElastocalError, InputError, InsufficientDataError
 from elastocal.identification.covariance import Covariance, cluster_robust, orthogonal
-from elastocal.identification.intervals import LEVEL, Intervals, MethodResult
 from elastocal.identification.least_squares import Problem
+from elastocal.identification.options import LEVEL, Intervals, MethodResult
 from elastocal.identification.outliers import median_scale
 from elastocal.identification.residuals import held_out_residual
 from elastocal.identification.solve import Solution

@@ -20,13 +20,18 @@ from scipy import linalg, sparse, special
 
 from elastocal.errors import ElastocalError
 from elastocal.identification.covariance import Covariance
-from elastocal.identification.intervals import LEVEL, Intervals, MethodResult
 from elastocal.identification.knowledge import GaussianPrior
 from elastocal.identification.knowledge_fit import FunctionPrior
 from elastocal.identification.least_squares import Fit, Problem
 from elastocal.identification.noise_choice import NoiseFit, linearised, weights_of
 from elastocal.identification.noise_structure import Readings
-from elastocal.identification.options import Options, check_for_functions
+from elastocal.identification.options import (
+    LEVEL,
+    Intervals,
+    MethodResult,
+    Options,
+    check_for_functions,
+)
 from elastocal.identification.outliers import FALSE_ALARM, NoiseAndOutliers, settle
 from elastocal.identification.residuals import ALONE, held_out_by_parts, rms_3d
 from elastocal.identification.smooth_functions import (
