@@ -17,7 +17,7 @@ from pydantic_core import PydanticCustomError
 from elastocal.above import Saved
 from elastocal.arguments import checked_arguments
 from elastocal.cell.work_cell import Cell
-from elastocal.config import Table, checked, key, required
+from elastocal.config import Table, checked, is_number, key, required
 from elastocal.errors import InputError, option, require
 from elastocal.files import read_json
 from elastocal.measurements import Measurements
@@ -264,7 +264,7 @@ def read_calibrated(
     _check_same(model, held, cell_path, result_path)
     _check_robot(model, stated.nominal_flange, cell_path, result_path)
     determined = tuple(stated.covariance_of)
-    n, lack = len(determined), stated.predicted_new_poses_um
+    n, lacking = len(determined), (stated.predicted_new_poses_um or {}).get("lack_of_fit", 0.0)
     require(
         set(determined) <= set(held) and stated.covariance.size == n**2,
         f"{result_path}: covariance of {stated.covariance.size} numbers for {n} names in "
@@ -279,7 +279,7 @@ def read_calibrated(
         str(result_path),
         tuple(entries[name] for name in model.names),
         _left_open(stated.open, model, determined, result_path),
-        ((lack and lack.lack_of_fit) or 0.0) * 1e-6,
+        float(lacking if is_number(lacking) else 0.0) * 1e-6,
         stated.loads_N.reshape(-1, 3),
         _shown(stated.measured_poses),
         _visits(stated.measured_visits, model.chain.n_joints),
@@ -338,17 +338,13 @@ class _Visits(_Stated):
     force_N: Triples = required("forces, three numbers for each visit")
 
 
-class _Predicted(_Stated):
-    lack_of_fit: float | None = key("a number")
-
-
 class _Result(_Stated):
     parameters: list[_Entry] = required("a list of parameters")
     nominal_flange: Annotated[Array, _array(4)] | None = key("3 rows of 4 numbers")
     covariance_of: list[str] = key("a list of names", [])
     covariance: Matrix = key("a square table of finite numbers", NONE)
     open: _Open | None = key("a table of the parameters left open")
-    predicted_new_poses_um: _Predicted | None = key("a table")
+    predicted_new_poses_um: dict[str, Any] | None = key("a table")
     loads_N: Triples = key("a list of forces, three numbers each", NONE)
     measured_poses: _Shown | None = key("a table")
     measured_visits: _Visits | None = key("a table")

@@ -120,7 +120,6 @@ class Reaching(BoundedSearch):
         self._evaluate = BatchFunction([q], [value, ca.jacobian(value, q)])
 
     def residual(self, q: Array, target: IntArray) -> tuple[Array, Array]:
-        """r (R, m) and J (R, m, n) of postures q (R, n) for the targets (R,)."""
         value, J = self._evaluate(q)
         return value[..., 0] - self.goal[target], J
 

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from typing import ClassVar
 
 import casadi as ca
@@ -69,6 +69,10 @@ def nominal_compliance(chain: Chain, cell: Cell) -> tuple[float, ...] | None:
     return given
 
 
+def _of_levels(levels: Sequence[float]) -> list[str]:
+    return [f"compliance_level{n}" for n in range(1, len(levels) + 1)]
+
+
 class JointCompliance(TorqueEffect):
     """δq_j = k_j τ_j, k_j in rad/(N m) (m/N for a prismatic joint).
 
@@ -95,23 +99,17 @@ class JointCompliance(TorqueEffect):
         nominal = 0.0 if given is None else float(given[i])
         typical = abs(nominal) or None
         levels = cell.model.compliance_levels.get(place)
-        if levels is None:
-            return (ParameterSpec("compliance", unit, nominal, typical, lower=0.0),)
-        return tuple(
-            ParameterSpec(f"compliance_level{n + 1}", unit, nominal, typical, lower=0.0)
-            for n in range(len(levels))
-        )
+        keys = _of_levels(levels) if levels else ["compliance"]
+        return tuple(ParameterSpec(key, unit, nominal, typical, lower=0.0) for key in keys)
 
     def shape(self, arm: Arm, place: str, p: Symbols) -> None:
-        i = index(place)
         levels = arm.cell.model.compliance_levels.get(place)
-        if levels is None:
-            k = p["compliance"]
-        else:
+        if levels:
             chosen = arm.input(f"level:{place}", len(levels))
-            values = ca.vertcat(*[p[f"compliance_level{n + 1}"] for n in range(len(levels))])
-            k = ca.dot(chosen, values)
-        add_deflection(arm, i, place, lambda tau: k * tau)
+            k = ca.dot(chosen, ca.vertcat(*[p[key] for key in _of_levels(levels)]))
+        else:
+            k = p["compliance"]
+        add_deflection(arm, index(place), place, lambda tau: k * tau)
 
 
 RATED_WIND_UP = 3e-3  # rad; what a drive yields by at its largest torque, small or large
