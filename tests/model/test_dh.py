@@ -139,9 +139,9 @@ def test_limits_and_names(tmp_path: Path) -> None:
     header = HEADER + ",joint,type,lower_deg,upper_deg,lower_m,upper_m"
     rows: list = [(0, 0.1, 0.2, 0, f"A{i}", "", -90, 180, "", "") for i in range(4)]
     rows.append((0, 0.1, 0.2, 0, "rail", "prismatic", "", "", -0.5, ""))
-    chain = read_dh(write(tmp_path / "dh.csv", header, rows), name="robot")
+    chain = read_dh(write(tmp_path / "dh.csv", header, rows))
     first, rail = chain.joints[0], chain.joints[4]
-    assert (chain.name, first.name, rail.name) == ("robot", "A0", "rail")
+    assert (chain.name, first.name, rail.name) == ("dh", "A0", "rail")
     assert (first.lower, first.upper) == pytest.approx((-np.pi / 2, np.pi))
     assert (rail.lower, rail.upper) == (-0.5, np.inf)
 
@@ -223,5 +223,3 @@ def test_unreadable_files_and_convention(tmp_path: Path) -> None:
     binary.write_bytes(b"\xff\xfe\x00\x81")
     with pytest.raises(InputError, match="is UTF-16; save the table as CSV"):
         read_dh(binary)
-    with pytest.raises(InputError, match=r"did you mean 'modified'\?"):
-        read_dh(tmp_path / "dh.csv", convention="modifed")  # type: ignore[arg-type]

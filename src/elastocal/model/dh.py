@@ -80,7 +80,6 @@ def read_dh(
     path: str | Path,
     convention: Convention = "standard",
     masses_path: str | Path | None = None,
-    name: str | None = None,
 ) -> Chain:
     """The chain of a DH table in CSV, one row per joint.
 
@@ -97,11 +96,6 @@ def read_dh(
     Raises InputError, naming file, row and column.
     """
     path = Path(path)
-    if convention not in ("standard", "modified"):
-        raise InputError(
-            f"dh_convention '{convention}'{did_you_mean(str(convention), ('standard', 'modified'))}"
-            " is unknown; valid: standard, modified"
-        )
     table = read_dh_table(path)
     moving = [i for i in range(len(table.row)) if not _still(table, i)]
     if not MIN_JOINTS <= len(moving) <= MAX_JOINTS:
@@ -124,7 +118,7 @@ def read_dh(
         after.append(T_after)
     names = [joint.name for joint in joints]
     masses = () if masses_path is None else _masses(Path(masses_path), names, after)
-    chain = Chain(name or path.stem, tuple(joints), passed, masses)
+    chain = Chain(path.stem, tuple(joints), passed, masses)
     return _closer(table, chain) if extent(chain) > MAX_LENGTH else chain
 
 
