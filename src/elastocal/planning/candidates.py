@@ -321,14 +321,6 @@ def check_available(cell: Cell, available: IntArray, shares: IntArray) -> None:
     )
 
 
-def most_poses(cell: Cell, available: IntArray, limit: int) -> int:
-    """The most poses, `limit` at most, for which `available` (L,) candidates per level suffice."""
-    n = len(available)
-    while n < limit and (shares_of(cell, n + 1) <= available).all():
-        n += 1
-    return n
-
-
 @dataclass(frozen=True)
 class Pins:
     """Poses that stay, `names` (k,) and `q` (k, n); those `struck` (m, n), near which no other may

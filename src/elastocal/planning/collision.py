@@ -130,9 +130,10 @@ class Collisions:
         """
         import pinocchio as pin
 
-        configuration = arm_configuration(poses)
-        if placed is not None:
-            configuration = np.hstack([configuration, placed])
+        # The hanging joint undoes the rotation of the last link.
+        last = poses.frames[:, poses.q.shape[1] - 1, :3, :3]
+        upright = Rotation.from_matrix(last.transpose(0, 2, 1)).as_quat()
+        configuration = np.hstack([poses.q, upright, *([] if placed is None else [placed])])
         margins, found = self._margins + extra, np.zeros(len(poses), dtype=bool)
         for (own, pool), counts in ((self._always, ~found), (self._loaded, poses.loaded)):
             left = np.flatnonzero(counts & ~found)
@@ -186,13 +187,6 @@ def arm_model(kinematics: Kinematics, free: int = 0) -> Any:
     for i in range(free):
         model.addJoint(0, pin.JointModelFreeFlyer(), pin.SE3.Identity(), f"free{i + 1}")
     return model
-
-
-def arm_configuration(poses: Poses) -> Array:
-    """Configurations (N, n + 4): q, and the hanging joint's quaternion (x, y, z, w)."""
-    last = poses.frames[:, poses.q.shape[1] - 1, :3, :3]
-    upright = Rotation.from_matrix(last.transpose(0, 2, 1)).as_quat()
-    return np.hstack([poses.q, upright])
 
 
 def geometry_of(kinematics: Kinematics, items: Sequence[Body | HalfSpace]) -> Any:

@@ -26,7 +26,6 @@ from elastocal.planning.candidates import (
     check_available,
     draw,
     joint_space,
-    most_poses,
     shares_of,
 )
 from elastocal.planning.checkpoint import Checkpoint, State
@@ -385,7 +384,9 @@ class _Design:
         assert wanted is not None
         target, tried = self._target(setup, wanted), dict[int, PlanSize]()
         low = max(pool.n_groups, int(self.pinned.sum()) + 1)
-        most = most_poses(self.cell, np.bincount(pool.group), MOST_POSES)
+        most, available = pool.n_groups, np.bincount(pool.group)
+        while most < MOST_POSES and (shares_of(self.cell, most + 1) <= available).all():
+            most += 1
         best, high = None, most + 1  # the fewest are in [low, high), or high
 
         def problem_of(n: int) -> DesignProblem:

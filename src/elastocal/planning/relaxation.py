@@ -260,13 +260,14 @@ def relax(problem: DesignProblem, gap: float = GAP, start: Array | None = None) 
         w, tangent, value = newton(problem, support, w, accuracy)
         d = problem.prices(tangent.G)
         bound = tangent_bound(problem, tangent, d)
-        if best is None or bound > best.bound or value < best.value:
-            steepest = tangent if best is None or bound > best.bound else best.tangent
-            weights = np.zeros(len(d))
-            weights[support] = w
-            if best is not None and value > best.value:
-                weights, value = best.weights, best.value
-            best = Relaxed(weights, value, max(bound, best.bound if best else 0.0), steepest)
+        weights = np.zeros(len(d))
+        weights[support] = w
+        if best is None:
+            best = Relaxed(weights, value, bound, tangent)
+        elif value < best.value:
+            best = replace(best, weights=weights, value=value)
+        if bound > best.bound:
+            best = replace(best, bound=bound, tangent=tangent)
         if best.gap <= gap:
             break
         accuracy = min(accuracy, max(MASTER * best.gap, 0.3 * gap))
