@@ -197,9 +197,7 @@ def near_the_arm(chain: Chain) -> Chain:
             masses.append(replace(chain.masses[i], com=chain.masses[i].com - slid))
     flange = chain.flange_placement.copy()
     flange[:3, 3] -= slid
-    return replace(
-        chain, joints=tuple(joints), flange_placement=flange, masses=tuple(masses)
-    )  # fmt: skip
+    return replace(chain, joints=tuple(joints), flange_placement=flange, masses=tuple(masses))
 
 
 def _check_lengths(chain: Chain, source: object) -> None:
@@ -226,15 +224,12 @@ def _check_lengths(chain: Chain, source: object) -> None:
 
 def _check_masses(chain: Chain, source: object) -> None:
     for i, body in enumerate(chain.masses, start=1):
-        require(
-            body.mass <= MAX_MASS,
-            f"{source}: {body.mass:g} kg is too heavy for link {i}; correct it",
-        )
         offset = float(np.linalg.norm(body.com))
-        require(
-            offset <= MAX_LENGTH,
-            f"{source}: {offset:g} m to the centre of mass is too far for link {i}; correct it",
-        )
+        for found, most, told in (
+            (body.mass, MAX_MASS, "kg is too heavy"),
+            (offset, MAX_LENGTH, "m to the centre of mass is too far"),
+        ):
+            require(found <= most, f"{source}: {found:g} {told} for link {i}; correct it")
 
 
 def _limited(joint: Joint, where: str) -> Joint:

@@ -11,7 +11,7 @@ from typing import TYPE_CHECKING, Any, ClassVar, Literal, get_args
 import casadi as ca
 
 from elastocal.cell.work_cell import Cell
-from elastocal.errors import InputError
+from elastocal.errors import InputError, require
 from elastocal.model import rigid
 from elastocal.model.arm import ParameterSpec, Setting
 from elastocal.model.chain import Chain
@@ -233,16 +233,15 @@ def check(effect: object) -> None:
     """InputError where `effect` cannot stand in the catalogue, and what it lacks."""
     check_registered(effect, Effect, "an effect", "joint_offset")
     assert isinstance(effect, Effect)
-    kind, stage = type(effect), getattr(effect, "stage", None)
-    if stage not in get_args(Stage):
-        raise InputError(f"{kind.__name__}.stage takes {listed(get_args(Stage))}; found {stage!r}")
-    if not set(effect.formats) <= set(get_args(Format)):
-        raise InputError(
-            f"{kind.__name__}.formats takes {listed(get_args(Format))}; found {effect.formats!r}"
-        )
-    for need in effect.needs:
-        if need not in NEEDS:
-            raise InputError(f"{kind.__name__}.needs takes {listed(NEEDS)}; found {need!r}")
+    kind = type(effect)
+    for key, given, known in (
+        ("stage", (getattr(effect, "stage", None),), get_args(Stage)),
+        ("formats", effect.formats, get_args(Format)),
+        ("needs", effect.needs, NEEDS),
+    ):
+        for found in given:
+            told = f"{kind.__name__}.{key} takes {listed(known)}; found {found!r}"
+            require(found in known, told)
     hooks = ("shape", "load", "read")
     lacking = [] if kind.places is not Effect.places or kind.at else ["places"]
     lacking += [] if any(getattr(kind, h) is not getattr(Effect, h) for h in hooks) else ["a hook"]

@@ -25,7 +25,7 @@ A smooth function corrects the arm and explains nothing.
 from __future__ import annotations
 
 import math
-from collections.abc import Iterator, Mapping
+from collections.abc import Mapping
 from dataclasses import dataclass, replace
 
 import casadi as ca
@@ -249,16 +249,16 @@ class ResidualField(SmoothEffect):
         return BaseMotion() if place == "base" else MarkerMotion()
 
     def settings(self, place: str, chain: Chain, cell: Cell) -> tuple[Setting, ...]:
-        return tuple(self._settings(chain))
-
-    def _settings(self, chain: Chain) -> Iterator[Setting]:
+        found: list[Setting] = []
         for name in (*turning_joints(chain), "time"):
-            wide = 1e9 if name == "time" else 100.0
-            half = 3600.0 if name == "time" else math.pi
-            yield Setting(f"field_{name}_size", "range", 0.0, 0.0, 1.0)
-            yield Setting(f"field_{name}_length", "range", half / 3, 1e-3, wide)
-            yield Setting(f"field_{name}_low", "range", -half, -wide, wide)
-            yield Setting(f"field_{name}_high", "range", half, -wide, wide)
+            half, wide = (3600.0, 1e9) if name == "time" else (math.pi, 100.0)
+            found += [
+                Setting(f"field_{name}_size", "range", 0.0, 0.0, 1.0),
+                Setting(f"field_{name}_length", "range", half / 3, 1e-3, wide),
+                Setting(f"field_{name}_low", "range", -half, -wide, wide),
+                Setting(f"field_{name}_high", "range", half, -wide, wide),
+            ]
+        return tuple(found)
 
     def courses(self, place: str, chain: Chain, cell: Cell) -> tuple[Course, ...]:
         given, units = self.stated(place, chain, cell), self.entry_at(place).units
