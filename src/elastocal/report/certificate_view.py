@@ -23,7 +23,7 @@ from elastocal.identification.error_budget import ErrorBudget, gap_budget, pose_
 from elastocal.identification.prediction import measured_loads
 from elastocal.identification.result import Calibration
 from elastocal.report.blocks import Block, Heading, Report, Sentence, ShownTable, ShownVerdict
-from elastocal.report.formatting import length, newtons, sentence, title_of
+from elastocal.report.formatting import length, newtons, resource, sentence, title_of
 from elastocal.report.identification_view import (
     at_new_poses,
     before_and_after,
@@ -282,7 +282,6 @@ def dcc_text(result: Calibration) -> str:
 
     Raises InputError where [certificate] of the cell lacks entries: there is no DCC without them.
     """
-    from elastocal.report.page import resource
 
     c, name = result.model.cell.certificate, result.model.chain.name
     if c.missing:

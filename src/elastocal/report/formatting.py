@@ -5,6 +5,7 @@ from __future__ import annotations
 import math
 import re
 from collections.abc import Iterable, Sequence
+from importlib import resources
 from typing import TYPE_CHECKING, Any
 
 from elastocal.report.blocks import Sentence, ShownTable
@@ -240,3 +241,8 @@ def first_stops(plan: Plan) -> dict[int, int]:
     """Pose → its first place in the order of execution, from 1."""
     stops = reversed(list(enumerate(plan.execution.stops)))
     return {stop.pose: k + 1 for k, stop in stops if not stop.again}
+
+
+def resource(name: str) -> str:
+    """The text of a file beside this module."""
+    return (resources.files("elastocal.report") / name).read_text(encoding="utf-8")

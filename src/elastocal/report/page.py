@@ -15,7 +15,7 @@ from collections.abc import Callable, Iterable, Mapping
 from datetime import date
 from functools import cache
 from html import escape
-from importlib import metadata, resources
+from importlib import metadata
 from itertools import groupby
 from pathlib import Path
 from typing import Any
@@ -35,7 +35,7 @@ from elastocal.report.blocks import (
     ShownTable,
     ShownVerdict,
 )
-from elastocal.report.formatting import typeset
+from elastocal.report.formatting import resource, typeset
 from elastocal.report.terminal import report_of
 from elastocal.screen import shown
 
@@ -296,7 +296,3 @@ def digests(inputs: Inputs) -> dict[str, str]:
         with open_input(path, "input file") as handle:
             found[str(path)] = hashlib.file_digest(handle, "sha256").hexdigest()  # type: ignore[arg-type]
     return found
-
-
-def resource(name: str) -> str:
-    return (resources.files("elastocal.report") / name).read_text(encoding="utf-8")
