@@ -217,14 +217,6 @@ class Arm:
         chosen = self.input("marker", len(choices))
         return sum((chosen[k] * value for k, value in enumerate(choices.values())), ca.SX(0))
 
-    def generalised_forces(self) -> ca.SX:
-        """τ = −∂V/∂θ: the load's force on every spring, at the deflected pose."""
-        return -ca.gradient(self.potential, self.theta)
-
-    def deflection_laws(self, tau: ca.SX) -> ca.SX:
-        """θ = law(τ) of every spring, stacked."""
-        return ca.vertcat(*[s.law(tau[k]) for k, s in enumerate(self.springs)])
-
 
 # What the symbolic arm asks of a table row, as arrays.
 

@@ -153,7 +153,8 @@ class SymbolicArm:
     def residual(self) -> ca.SX:
         """F = θ − law(τ(θ)) (springs,), zero at the equilibrium."""
         arm = self.arm
-        return arm.theta - arm.deflection_laws(arm.generalised_forces())
+        tau = -ca.gradient(arm.potential, arm.theta)  # of the loads on each spring
+        return arm.theta - ca.vertcat(*[s.law(tau[k]) for k, s in enumerate(arm.springs)])
 
     def _linearised(self, expression: ca.SX) -> ca.SX:
         """Eq. (3): h(0) + ∂h/∂θ · law(τ(0)), loads and lever arms of the undeflected pose."""
