@@ -14,7 +14,7 @@ from pathlib import Path
 import numpy as np
 from compared import Study, realised, table_2
 
-from elastocal.planning.plan import Plan, plan_rows, write_plan
+from elastocal.planning.plan import Plan, write_plan
 from elastocal.report.arm_view import write_plan_picture
 
 HERE = Path(__file__).parent
@@ -94,9 +94,7 @@ def _removed(plan: Plan) -> str:
 
 
 def _keep(study: Study, plan: Plan, name: str) -> None:
-    chain = plan.model.chain
-    rows = plan_rows(plan.execution, plan.configurations, plan.group + 1, plan.stated_forces)
-    write_plan(HERE / f"plan_{name}.csv", rows, chain.kinds)
+    write_plan(HERE / f"plan_{name}.csv", *plan.rows, forces=plan.stated_forces is not None)
     write_plan_picture(HERE / f"poses_{name}.png", plan)
 
 

@@ -77,6 +77,13 @@ def readings_at(
     )
 
 
+def rows_of(q: Array, forces: Array, names: tuple[str, ...]) -> Measurements:
+    """For each of the poses q (N, n), each of the forces (L, 3), each marker a row."""
+    pose = np.repeat(np.arange(len(q)), len(forces) * len(names))
+    force = np.tile(np.repeat(forces, len(names), axis=0), (len(q), 1))
+    return readings_at(q, pose, force, np.resize(np.arange(len(names)), len(pose)), names)
+
+
 def marker_sigmas(cell: Cell, table: Measurements) -> Measurements:
     """The table with the cell's own σ per marker, where `[design] marker_sigma_um` states them.
 
@@ -231,11 +238,7 @@ class PoseInformation:
 
     def rows(self, q: Array) -> Measurements:
         """The table of these poses as the arm would be read, without noise."""
-        names, L = tuple(self.model.cell.tool.markers), len(self.forces)
-        pose = np.repeat(np.arange(len(q)), L * len(names))
-        force = np.tile(np.repeat(self.forces, len(names), axis=0), (len(q), 1))
-        marker = np.tile(np.arange(len(names)), len(q) * L)
-        table = readings_at(q, pose, force, marker, names)
+        table = rows_of(q, self.forces, tuple(self.model.cell.tool.markers))
         table = simulate(self.model, table, self.x, 0, noise=False)
         return marker_sigmas(self.model.cell, table)
 
