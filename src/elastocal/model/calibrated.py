@@ -382,7 +382,10 @@ def _read_result(path: Path) -> tuple[list[dict[str, Any]], _Result]:
     require(
         found == SCHEMA, f"{path}: schema is {quoted(found)}, and {SCHEMA!r} is needed; {remedy}"
     )
-    stated = checked(_Result, result, path)
+    try:
+        stated = checked(_Result, result, path)
+    except InputError as error:
+        raise InputError(f"{error}; {ANEW}") from None
     names = [entry.name for entry in stated.parameters]
     for name in names:
         require(names.count(name) == 1, f"{path}: parameter '{name}' is listed twice; {ANEW}")
