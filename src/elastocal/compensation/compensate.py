@@ -325,7 +325,7 @@ def _of_places(arm: CalibratedArm, c: Compensation) -> Iterator[str]:
     far = reached & (sure.std > shown.most)
     if shown.chance(int(far.sum()), int(reached.sum())) < UNLIKELY:
         yield (
-            f"{_rows(c.targets, far)}: what was measured tells less of this place (standard "
+            f"{_rows(c.targets, far)}: the measurements say less about this place (standard "
             f"deviation up to {sure.std[far].max() * 1e6:.0f} µm) than of any pose measured "
             f"({shown.most * 1e6:.0f} µm at most), so that it is extrapolated; measure poses there,"
             f" or choose a marker that was fitted ({option('point')})"

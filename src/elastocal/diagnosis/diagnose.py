@@ -420,7 +420,7 @@ def _searched(
         before = screened.faulty
         screened = screen_outliers(found.dataset, found.chosen.data.without(np.zeros_like(before)))
         if (screened.faulty != before).any():
-            progress("searching again without faulty readings")
+            progress("searching again without outliers")
             search, found = search_without(screened.faulty)
     return dataset.without(screened.faulty), search, found, screened
 

@@ -304,7 +304,7 @@ def _undecided_backlash(found: SelectedEffects) -> str:
         return ""
     places = " and ".join(named)
     return (
-        f"hardly a reading tells whether the play of {places} follows the load alone or also the "
+        f"hardly any reading shows whether the play of {places} follows the load alone or also the "
         "last motion, so the error left at new poses is uncertain: measure poses in which the "
         f"load hardly turns {places}, approached from both sides"
     )

@@ -164,7 +164,7 @@ def format_of(path: Path, asked: str | None) -> str:
     found = ENDINGS.get(path.suffix.lower())
     if found is None:
         raise InputError(
-            f"{path}: the ending '{path.suffix}' tells no format; use one of "
+            f"{path}: the ending '{path.suffix}' names no known format; use one of "
             f"{', '.join(ENDINGS)}, or name it by {option('format')}: {', '.join(FORMATS)}"
         )
     return found

@@ -140,7 +140,7 @@ def _fitted(
         chosen, own = _without(options, ~good, observed.size), ordinary(model, free)
         return _solution(model, subset(observed, good), x0, own, chosen, progress, not smooth)
 
-    progress("looking for faulty readings")
+    progress("looking for outliers")
     none = np.zeros(len(observed.lead), dtype=bool)
     faulty, sound = none if is_exact(every) else find_faulty(every), every
     if faulty.any():

@@ -266,8 +266,8 @@ def fitted(
     if kind.time and readings.visits is not None:
         if not readings.visits.drifts:
             raise InputError(
-                "no drift can be told in these readings: the model itself has what changes with "
-                "time, or successive poses are near each other; visit poses in random order"
+                "no drift can be recognised in these readings: the model itself has what changes "
+                "with time, or successive poses are near each other; visit poses in random order"
             )
         if lasting is None and (like is None or like.lasting is None):
             tried = [fitted(readings, kind, like, each, enough) for each in readings.visits.lasting]

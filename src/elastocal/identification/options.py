@@ -240,7 +240,7 @@ class Options:
         if self.resolved in ROBUST:
             raise InputError(
                 f"the method {self.resolved} takes neither constraints nor a prior; use the "
-                "default method, which sets faulty readings apart"
+                "default method, which excludes outliers"
             )
         if self.intervals not in WITH_KNOWLEDGE:
             raise InputError(
@@ -274,7 +274,7 @@ def check_for_functions(options: Options) -> None:
     if options.resolved in ROBUST or options.resolved.startswith("eq14"):
         raise InputError(
             f"the method {options.resolved} takes no prior, which smooth functions have; use the "
-            "default method, which sets faulty readings apart"
+            "default method, which excludes outliers"
         )
     if options.intervals not in ("auto", "classical"):
         raise InputError(

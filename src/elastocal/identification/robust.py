@@ -209,8 +209,8 @@ def covariance_of(found: RobustEstimate, B: Array, cluster: IntArray | None = No
     a = float(np.mean(along + (size - 1) * across)) / size
     if not a > 0:
         raise InsufficientDataError(
-            "so many readings lie far from the fit that its covariance cannot be told; use the "
-            "default method, or look for the cause of the outliers"
+            "so many readings lie far from the fit that its covariance cannot be determined; use "
+            "the default method, or look for the cause of the outliers"
         )
     if cluster is not None:
         psi = np.repeat(found.weights, size) * found.residual / a
@@ -248,7 +248,7 @@ def robust_result(
     if problem.large:
         raise InputError(
             f"the method {method} takes no table of this size; use the default "
-            "method, which sets faulty readings apart"
+            "method, which excludes outliers"
         )
     if intervals not in ("auto", "cr3"):
         raise InputError(

@@ -56,7 +56,7 @@ def forces_of(
         return None
     if "force_x" in points.numbers:
         raise InputError(
-            f"{points.files[0]}: the load is told by name and in columns force_x …; keep one"
+            f"{points.files[0]}: the load is stated by name and in columns force_x …; keep one"
         )
     known = {name: np.zeros(3) for name in UNLOADED}
     for name, stated in (loads or {}).items():

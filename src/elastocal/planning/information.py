@@ -379,8 +379,8 @@ def why(model: Model, found: Estimable, index: int) -> str:
         share = np.abs(r.mixing[:, list(r.dropped).index(index)]) / found.sizes[r.kept]
         partner = model.names[r.kept[int(share.argmax())]]
         return (
-            f"no set of poses tells {name} from others ({partner} moves the markers in the same "
-            f"way); ask for {partner} instead, or hold one of them ({option('fixed', name)})"
+            f"no set of poses separates {name} from others ({partner} moves the markers in the "
+            f"same way); ask for {partner} instead, or hold one of them ({option('fixed', name)})"
         )
     return f"{name} is held; drop it from {option('fixed')}"
 
