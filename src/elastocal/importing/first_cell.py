@@ -118,8 +118,8 @@ def robot_of(
     require(path.suffix.lower() != ".xacro", xacro_left(path, f"the ending '{path.suffix}'"))
     if kind is None:
         raise InputError(
-            f"{path}: the ending '{printable(path.suffix)}' names no robot file; give a URDF (.urdf), "
-            "a MuJoCo model (.xml, .mjcf), a DH table (.csv) or the factory calibration of a UR "
+            f"{path}: the ending '{printable(path.suffix)}' names no robot file; give a URDF "
+            "(.urdf), a MuJoCo model (.xml, .mjcf), a DH table (.csv) or the factory calibration of a UR "
             "(.conf, .yaml)"
         )
     require(
