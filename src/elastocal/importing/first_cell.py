@@ -119,8 +119,8 @@ def robot_of(
     if kind is None:
         raise InputError(
             f"{path}: the ending '{printable(path.suffix)}' names no robot file; give a URDF "
-            "(.urdf), a MuJoCo model (.xml, .mjcf), a DH table (.csv) or the factory calibration of a UR "
-            "(.conf, .yaml)"
+            "(.urdf), a MuJoCo model (.xml, .mjcf), a DH table (.csv) or the factory calibration "
+            "of a UR (.conf, .yaml)"
         )
     require(
         ur_model is None or path.suffix.lower() == ".conf",
