@@ -39,6 +39,9 @@ from elastocal.planning.plan import Gain, Plan
 from elastocal.planning.test_poses import where_used
 from elastocal.units import Progress
 
+# A hundred candidates that are less likely are together a doubt of a tenth at most.
+DOUBT = 1e-3
+
 NextVerdict = Literal["measure", "enough", "no_gain"]
 
 
@@ -201,7 +204,7 @@ def _error_now(fit: Calibration, unknown: float) -> PredictedError | None:
 def _in_doubt(why: Diagnosis) -> tuple[tuple[str, str, float], ...]:
     """What may be missing beside or instead of what was found: effect, place and probability."""
     found = {(f.effect, f.where) for f in why.effects}
-    left = [c for c in why.candidates if (c.effect, c.where) not in found and c.probability > 0]
+    left = [c for c in why.candidates if (c.effect, c.where) not in found and c.probability > DOUBT]
     left.sort(key=lambda c: -c.probability)
     return tuple((c.effect, c.where, c.probability) for c in left)
 
