@@ -9,13 +9,15 @@ from scipy.spatial.transform import Rotation
 
 from elastocal.errors import InputError, option
 from elastocal.measurements import Measurements, visits, with_moves
+from elastocal.model.calibrated import Conditions, random_table
 from elastocal.model.effects.compliances import JointCompliance
 from elastocal.model.manipulator import Model, check_equilibrium
 from elastocal.model.observations import available_noise, position_covariance
+from elastocal.model.rigid import reach_of, suitable_load
 from elastocal.text import did_you_mean, listed
 from elastocal.units import Array
 
-MOST_ROWS = 200  # of a plan, from which sizes are taken
+POSES = 50  # from which sizes are taken
 # m per rad/(N m) or m/N: what moves a reading by less would move it by a mm only at 1000 rad/(N m),
 # and is rounding.  Loads of whole arms have slopes of 0.1 and more.
 SHOWS = 1e-6
@@ -38,14 +40,12 @@ def values_from(model: Model, chosen: dict[str, float]) -> Array:
     return x
 
 
-def draw_errors(
-    model: Model, scale: float, rng: np.random.Generator, rows: Measurements | None = None
-) -> dict[str, float]:
-    """Random true values: nominal + scale · typical size · N(0, 1) for every parameter.
+def draw_errors(model: Model, scale: float, rng: np.random.Generator) -> dict[str, float]:
+    """Random true values: nominal + scale · typical size · N(0, 1) for every parameter, by the
+    cell and `rng` alone.
 
     Compliances vary by 20 % of their nominal value.  Those that have none are drawn positive, of
-    a size that the loads of `rows` show: where one moves a reading most, it moves it by a
-    millimetre.  Without rows, or a load in them, they stay at nominal.
+    the size that moves a reading by a millimetre where it moves one most (`_sizes_shown`).
     """
     drawn, shown = {}, None
     for k, p in enumerate(model.parameters):
@@ -53,20 +53,38 @@ def draw_errors(
         if p.effect == JointCompliance.name:
             size = 0.2 * abs(p.nominal)
         step = scale * float(rng.normal())
-        if size == 0.0 and p.typical is None and rows is not None and scale:
-            shown = _sizes_shown(model, rows) if shown is None else shown
+        if size == 0.0 and p.typical is None and scale:
+            shown = _sizes_shown(model) if shown is None else shown
             size, step = shown[k], abs(step)
         drawn[p.name] = p.nominal + step * size
     return drawn
 
 
-def _sizes_shown(model: Model, rows: Measurements) -> Array:
-    """A size (parameters,) that moves a reading by 1 mm where it moves one most; 0 for none."""
-    spec = replace(model.cell.model, observe="position")
-    seen = Model.assembled(model.chain, replace(model.cell, model=spec))
-    some = rows.take(np.linspace(0, len(rows) - 1, min(len(rows), MOST_ROWS)).astype(int))
-    B = seen.regressor(replace(some, position=np.zeros((len(some), 3)))).B
-    known = dict(zip(seen.names, np.abs(B).max(axis=0), strict=True))
+def _sizes_shown(model: Model) -> Array:
+    """A size (parameters,) that moves a reading by 1 mm where it moves one most; 0 for none.
+
+    Read at random poses within the joint limits, with the largest load of the cell (or the one that
+    suits an arm of this reach) along x, y and z: not in the plan's poses, so that two tables of one
+    cell are of one arm.
+    """
+    unsized = {p.effect for p in model.parameters if p.typical is None}
+    cell = model.cell
+    own = tuple(choice for choice in cell.model.effects if choice.name in unsized)
+    spec = replace(cell.model, observe="position", torque="computed", effects=own)
+    seen = Model.assembled(model.chain, replace(cell, model=spec))
+    loads = np.zeros((1, 3)) if cell.design.loads is None else np.asarray(cell.design.loads)
+    load = np.linalg.norm(loads, axis=1).max() or suitable_load(reach_of(model.chain))
+    markers = tuple(cell.tool.markers)
+    poses = random_table(seen, Conditions(), POSES, 0)
+    rows = poses.take(np.repeat(np.arange(POSES), 3 * len(markers)))
+    rows = replace(
+        rows,
+        marker_names=markers,
+        marker=np.tile(np.arange(len(markers)), 3 * POSES),
+        force=np.tile(np.repeat(load * np.eye(3), len(markers), axis=0), (POSES, 1)),
+        position=np.zeros((len(rows), 3)),
+    )
+    known = dict(zip(seen.names, np.abs(seen.regressor(rows).B).max(axis=0), strict=True))
     moved = np.array([known.get(name, 0.0) for name in model.names])
     # A load on a joint's own axis leaves rounding, from which no size follows.
     return np.divide(1e-3, moved, out=np.zeros(len(moved)), where=moved > SHOWS)

@@ -390,7 +390,7 @@ def simulated(
     check_limits(made, poses)
     rng = np.random.default_rng(seed)
     rows = expand_plan(poses, tuple(made.cell.tool.markers), repeats, force)
-    drawn = draw_errors(made, float(draw), rng, rows) if draw else {}
+    drawn = draw_errors(made, float(draw), rng) if draw else {}
     if values is None or isinstance(values, Mapping):
         x = values_from(made, drawn | dict(values or {}))
     else:

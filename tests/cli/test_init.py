@@ -57,6 +57,30 @@ def test_the_cell_it_writes_plans_and_simulates_as_it_is(arms):
     assert len(model.read("data.csv")) >= 12
 
 
+def test_an_arm_is_drawn_by_its_cell_and_seed_alone(arms):
+    """Whatever the plan and its load: a table kept back as a test is of the arm calibrated."""
+    run("init", "arms/arm.csv")
+    text = Path("cell.toml").read_text()
+    text = "\n".join(ln for ln in text.splitlines() if not ln.startswith("loads_N"))
+    Path("loadless.toml").write_text(text.replace('"joint_compliance:joint2",',
+                                                  '"joint_compliance",'))  # fmt: skip
+    heads = ",".join(f"q{i}_deg" for i in range(1, 7))
+    Path("one.csv").write_text(f"{heads}\n10,-60,50,5,20,5\n")
+    Path("two.csv").write_text(f"{heads}\n0,-70,40,0,0,0\n-50,-30,20,60,-70,30\n")
+    for cell in ("cell.toml", "loadless.toml"):
+        truths = []
+        for plan, load in (("one.csv", ()), ("two.csv", ("--load", 0, 0, -5)),
+                           ("two.csv", ("--load", 90, 0, 0))):  # fmt: skip
+            code, _, err = run("simulate", cell, plan, "-o", "data.csv", "--draw", 1, "--seed", 1,
+                               "--truth", "t.json", *load)  # fmt: skip
+            assert code == 0, err
+            truths.append(json.loads(Path("t.json").read_text()))
+        assert truths[0] == truths[1] == truths[2]
+        drawn = {n: v for n, v in truths[0].items() if n.endswith("compliance")}
+        # None below zero; none at zero but what turns about an axis that no load is off.
+        assert min(drawn.values()) > 1e-8, drawn
+
+
 def test_a_file_that_is_there_is_kept_unless_forced(arms):
     Path("cell.toml").write_text("mine")
     code, _, err = run("init", "arms/arm.csv")

@@ -68,8 +68,9 @@ def init(
     """
     from elastocal.cell.work_cell import read_cell
     from elastocal.importing.first_cell import init as write
-    from elastocal.importing.first_cell import notes_of, reach_of
+    from elastocal.importing.first_cell import notes_of
     from elastocal.model.manipulator import load_chain
+    from elastocal.model.rigid import reach_of
 
     run.writes(output)
     run.reads(robot)

@@ -26,7 +26,7 @@ from elastocal.model.effects.gears import JointOffset
 from elastocal.model.effects.placements import BaseFrame, LinkGeometry, MarkerPosition
 from elastocal.model.manipulator import load_chain
 from elastocal.model.mjcf import MjcfArm
-from elastocal.model.rigid import nominal_flanges
+from elastocal.model.rigid import nominal_flanges, reach_of, suitable_load
 from elastocal.model.urdf import MOVING, check_urdf
 from elastocal.model.xml_file import xacro_left
 from elastocal.text import listed, printable
@@ -37,9 +37,6 @@ ENDINGS |= dict.fromkeys(UR_ENDINGS, "dh")
 # Sites that are flanges by what MuJoCo users call them.
 FLANGE_SITES = ("attachment_site", "flange", "tool0", "ee_site")
 MOST_SITES = 8  # listed as markers; of more most are something else
-# Of the KR 270 of the demo, in m and N, from which loads are guessed by the fourth power of the
-# reach: small arms carry less for their size, and longer ones are no stronger.
-REACH, LOAD = 2.9, 2600.0
 THICKNESS = 15.0  # reach over a link's radius
 POSES, CANDIDATES = 20, 2000  # three markers read nine numbers in each pose and load state
 
@@ -192,21 +189,6 @@ def _mount(robot: Robot, arm: MjcfArm | None) -> tuple[Array, str]:
     return tree.placed(tree.root, base)[:3, :3], f"of '{base}' in the file's '{tree.root}', z up"
 
 
-def reach_of(chain: Chain) -> float:
-    """How far the flange gets from the first joint that turns, in m: the largest of 500 drawn
-    poses.  Slides before it, as a rail, stand still."""
-    limits = [np.array([getattr(j, end) for j in chain.joints]) for end in ("lower", "upper")]
-    low, high = finite_ranges(chain, *limits)
-    q = np.random.default_rng(0).uniform(low, high, (500, chain.n_joints))
-    turning = [i for i, kind in enumerate(chain.kinds) if kind == "revolute"]
-    first = turning[0] if turning else 0
-    q[:, :first] = (low + high)[:first] / 2
-    until = replace(chain, joints=chain.joints[:first], flange_placement=np.eye(4), masses=())
-    centre = nominal_flanges(until, q[:1, :first])[0] if first else np.eye(4)
-    centre = (centre @ chain.joints[first].placement)[:3, 3]
-    return float(np.linalg.norm(nominal_flanges(chain, q)[:, :3, 3] - centre, axis=1).max())
-
-
 def loaded_joints(chain: Chain, turned: Array) -> list[int]:
     """Numbers of the joints that a weight strains: those that turn about no axis that is upright
     in all poses, as the first of most arms and those of a SCARA do, and slides that are not level.
@@ -235,11 +217,6 @@ def _text(value: str) -> str:
 
 def _vector(values: Any) -> str:
     return "[" + ", ".join(f"{round(float(v), 4) + 0.0:g}" for v in values) + "]"
-
-
-def _one(value: float) -> float:
-    """A number with one digit: guesses should look like what they are."""
-    return float(f"{value:.1g}")
 
 
 def _robot(robot: Robot, kind: str, path: Path, folder: Path) -> Iterator[str]:
@@ -321,7 +298,7 @@ def _rest(chain: Chain, mount: tuple[Array, str], sites: dict[str, Array]) -> st
     # What stands on the mounting plane is no body that could strike it.
     if chain.joints[0].placement[2, 3] * 1e3 <= radii[0]:
         radii[0] = 0
-    load = max(_one(LOAD * min(reach / REACH, 1.0) ** 4), 5.0)
+    load = suitable_load(reach)
     return f"""\
 [tool]                                 # all in m, in the flange frame
 {hangs:<38} # guess: where a load hangs

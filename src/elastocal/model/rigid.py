@@ -1,22 +1,22 @@
 """Rigid motions as CasADi expressions: the only place where kinematics is written down.
 
-Every function takes and returns CasADi `SX` (or numbers, which CasADi promotes), but the last,
-which is of arrays.  Homogeneous transforms are (4, 4), rotations (3, 3), vectors (3, 1).
+Every function takes and returns CasADi `SX` (or numbers, which CasADi promotes), but the
+last three, which are of arrays and numbers.  Homogeneous transforms are (4, 4), rotations (3, 3),
+vectors (3, 1).
 """
 
 from __future__ import annotations
 
+from dataclasses import replace
 from functools import lru_cache
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import casadi as ca
 import numpy as np
 
+from elastocal.model.chain import Chain, finite_ranges
 from elastocal.model.evaluate import BatchFunction
 from elastocal.units import Array
-
-if TYPE_CHECKING:
-    from elastocal.model.chain import Chain
 
 # Added under square roots so that rotation-vector formulas are smooth at zero;
 # far below the rounding of any angle met in practice (1e-15 rad).
@@ -117,3 +117,28 @@ def nominal_flanges(chain: Chain, q: Array) -> Array:
     """T_base_flange (n, 4, 4) of the nominal chain at q (n, joints)."""
     symbol = ca.SX.sym("q", chain.n_joints)
     return np.asarray(BatchFunction([symbol], [nominal_flange(chain, symbol)])(q)[0])
+
+
+def reach_of(chain: Chain) -> float:
+    """How far the flange gets from the first joint that turns, in m: the largest of 500 drawn
+    poses.  Slides before it, as a rail, stand still."""
+    limits = [np.array([getattr(j, end) for j in chain.joints]) for end in ("lower", "upper")]
+    low, high = finite_ranges(chain, *limits)
+    q = np.random.default_rng(0).uniform(low, high, (500, chain.n_joints))
+    turning = [i for i, kind in enumerate(chain.kinds) if kind == "revolute"]
+    first = turning[0] if turning else 0
+    q[:, :first] = (low + high)[:first] / 2
+    until = replace(chain, joints=chain.joints[:first], flange_placement=np.eye(4), masses=())
+    centre = nominal_flanges(until, q[:1, :first])[0] if first else np.eye(4)
+    centre = (centre @ chain.joints[first].placement)[:3, 3]
+    return float(np.linalg.norm(nominal_flanges(chain, q)[:, :3, 3] - centre, axis=1).max())
+
+
+# Of the KR 270 of the demo, in m and N, from which loads are guessed by the fourth power of the
+# reach: small arms carry less for their size, and longer ones are no stronger.
+REACH, LOAD = 2.9, 2600.0
+
+
+def suitable_load(reach: float) -> float:
+    """A load in N for an arm of this `reach` in m, with one digit, as guesses have."""
+    return max(float(f"{LOAD * min(reach / REACH, 1.0) ** 4:.1g}"), 5.0)
