@@ -214,6 +214,11 @@ def test_diagnose_is_that_of_the_command_line(folder):
         why.save("front.json")
     assert Path("front.json").read_text() == Path("line.json").read_text()
     assert why.budget and why.verdict == "nothing_significant"  # nothing is missing in the demo
+    command("diagnose", "cell.toml", "data.csv", "--cell-out", "line.toml", "--seed", "1", "-q")
+    why.save("front.toml")
+    assert Path("front.toml").read_text() == Path("line.toml").read_text()
+    with pytest.raises(ec.InputError, match="not that of a cell file"):
+        replace(why, model=ec.Model(replace(why.model.cell, path=None))).save("built.toml")
 
 
 def test_the_arm_of_a_fit_is_that_of_its_file(fit):
@@ -443,6 +448,20 @@ def test_a_file_is_loaded_by_what_it_is(fit, tmp_path):
         ec.load(tmp_path / "copy.json")
     with pytest.raises(ec.InputError, match=r"kr270_2\.urdf: give a cell file"):
         ec.load("kr270_2.urdf")
+
+
+def test_the_ending_says_what_is_saved(fit, plan, tmp_path):
+    data = fit.model.read("data.csv")
+    data = replace(data, configuration_labels=("'=1", *data.configuration_labels[1:]))
+    data.save(tmp_path / "data.parquet")
+    again = fit.model.read(tmp_path / "data.parquet")
+    assert again.configuration_labels == data.configuration_labels
+    assert all(np.array_equal(getattr(again, k), getattr(data, k)) for k in ("q", "position"))
+    for result, name, allowed in ((fit, "y.parquet", ".json or .csv"), (plan, "x.xlsx", ".csv"),
+                                  (data, "d.csv.gz", ".csv or .parquet or .pq")):  # fmt: skip
+        with pytest.raises(ec.InputError, match=f"is saved as {allowed}; name the file so"):
+            result.save(tmp_path / name)
+        assert not (tmp_path / name).exists()
 
 
 def test_effects_are_a_data_frame():

@@ -32,17 +32,18 @@ class Saved:
         """Write it to a file as the command line does, whole or not at all.
 
         Args:
-            path: The file.  A `Calibration` becomes JSON, or where the name ends in .csv the table
-                of its residuals; a `Plan` a CSV and the JSON beside it; a `Diagnosis` JSON; a
-                `Compensation` the table of commands (CSV); `Measurements` their table (CSV);
-                `NextPoses` their plan, if any; a `CalibratedArm` what the ending says: .urdf, .xml
-                or .mjcf (MuJoCo), .csv (DH table), .yaml, .json.
+            path: The file, whose ending says what of it is written.  `Calibration`: .json, or
+                .csv for the table of its residuals.  `Plan`: .csv, and the JSON beside it.
+                `Diagnosis`: .json, or .toml for the cell with the effects found, which the next
+                `ec.identify` takes.  `Compensation`: .csv, the table of commands.  `Comparison`:
+                .json.  `Measurements`: .csv, .parquet.  `NextPoses`: .csv, their plan, if any.
+                `CalibratedArm`: .urdf, .xml or .mjcf (MuJoCo), .csv (DH table), .yaml, .json.
             **how: For an arm: `format` (as "mdh"), `load` (3,) N, `time_s`, `temperature_c`,
                 `frames`, `base_frame`, `joint_correction` (a path), `poses` and `seed`, as
                 `elastocal export` has them.
 
         Raises:
-            InputError: The file cannot be written, or not in this format.
+            InputError: The file cannot be written, or the result not under this ending.
 
         Examples:
             >>> arm = ec.identify("cell.toml", "data.csv").arm

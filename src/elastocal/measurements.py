@@ -641,7 +641,8 @@ def _check_duplicates(raw: RawTable, table: Measurements) -> None:
 
 
 def write_measurements(measurements: Measurements, path: str | Path) -> None:
-    """Write the table to a CSV that reads back bit for bit; whole or not at all."""
+    """Write the table as CSV, or Parquet where the ending says so (.parquet, .pq); it reads back
+    bit for bit.  Whole or not at all."""
     for name in (*measurements.configuration_labels, *measurements.marker_names):
         if not is_label(name):
             raise InputError(
@@ -658,6 +659,8 @@ def write_measurements(measurements: Measurements, path: str | Path) -> None:
     for header, values in columns.items():
         if values.dtype != object and not np.isfinite(values).all():
             raise InputError(f"{path}: the {meaning[header]} to write are not all finite")
+    if Path(path).suffix.lower() in tables.PARQUET:
+        return tables.write_parquet(path, columns)
     with atomic_writer(path) as handle:
         tables.write_csv(handle, columns, _rows(columns, len(measurements)))
 

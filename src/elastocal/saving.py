@@ -19,12 +19,13 @@ from elastocal.errors import InputError, option, require
 from elastocal.files import atomic_write_text, read_json
 from elastocal.measurements import DEFAULT_MARKER, Measurements, write_measurements
 from elastocal.model.arm import given_force
-from elastocal.tables import csv_text
+from elastocal.tables import PARQUET, csv_text
 from elastocal.text import json_text
 
 if TYPE_CHECKING:
     from numpy.typing import ArrayLike
 
+    from elastocal.cell.work_cell import Cell
     from elastocal.compensation.compensate import Compensation
     from elastocal.diagnosis.changes import Comparison
     from elastocal.diagnosis.diagnosis import Diagnosis
@@ -42,8 +43,16 @@ MOST_POSES = 1_000_000
 
 
 def save(result: Any, path: str | Path, **how: Any) -> None:
-    """Write a result or a calibrated arm; the class decides what, `how` are its options."""
-    WRITERS[type(result).__name__](result, Path(path), **how)
+    """Write a result or a calibrated arm; class and ending decide what, `how` are its options.
+
+    A name without ending is of the first kind that there is.
+    """
+    path, kind = Path(path), type(result).__name__
+    by_ending = WRITERS[kind]
+    write = by_ending.get(path.suffix.lower() or next(iter(by_ending)), by_ending.get(ANY))
+    if write is None:
+        raise InputError(f"{path}: {kind} is saved as {' or '.join(by_ending)}; name the file so")
+    write(result, path, **how)
 
 
 def write_json(path: Path, content: Any) -> None:
@@ -51,9 +60,7 @@ def write_json(path: Path, content: Any) -> None:
 
 
 def save_calibration(fit: Calibration, path: Path) -> None:
-    """The result as JSON (schema elastocal/identification/1), or its residuals as CSV."""
-    if path.suffix.lower() == ".csv":
-        return save_residuals(fit, path)
+    """The result as JSON (schema elastocal/identification/1)."""
     write_json(path, fit.to_json())
 
 
@@ -98,6 +105,26 @@ def save_diagnosis(diagnosis: Diagnosis, path: Path) -> None:
 
     assert diagnosis.model is not None  # `diagnose` states it
     write_json(path, publish(diagnosis, diagnosis.model, diagnosis.data))
+
+
+def save_found_cell(diagnosis: Diagnosis, path: Path) -> Cell:
+    """The cell file that was diagnosed with the effects found added; it is returned as written.
+
+    Raises InputError where the cell was built in Python or changed after it was read.
+    """
+    from elastocal.cell.work_cell import read_cell
+    from elastocal.diagnosis.diagnose import write_extended_cell
+    from elastocal.model.chain import numbered
+
+    assert diagnosis.model is not None  # `diagnose` states it
+    cell, chain = diagnosis.model.cell, diagnosis.model.chain
+    if cell.path is None or repr(numbered(read_cell(cell.path), chain).model) != repr(cell.model):
+        raise InputError(
+            f"{path}: the model diagnosed is not that of a cell file, which what was found could "
+            "join; write the cell as a file (TOML), and diagnose that"
+        )
+    extra = (*diagnosis.effects, *diagnosis.slight, *diagnosis.fields)
+    return write_extended_cell(cell.path, path, extra, diagnosis.model_keys)
 
 
 def save_compensation(found: Compensation, path: Path, partial: bool = False) -> None:
@@ -204,15 +231,16 @@ def save_comparison(found: Comparison, path: Path) -> None:
     write_json(path, found.to_json())
 
 
-WRITERS: dict[str, Callable[..., Any]] = {
-    "Comparison": save_comparison,
-    "Calibration": save_calibration,
-    "Plan": save_plan,
-    "Diagnosis": save_diagnosis,
-    "Compensation": save_compensation,
-    "CalibratedArm": save_arm,
-    "Measurements": write_measurements,
-    "NextPoses": save_next,
+ANY = "any ending"  # of an arm the formats know theirs
+WRITERS: dict[str, dict[str, Callable[..., Any]]] = {
+    "Comparison": {".json": save_comparison},
+    "Calibration": {".json": save_calibration, ".csv": save_residuals},
+    "Plan": {".csv": save_plan},
+    "Diagnosis": {".json": save_diagnosis, ".toml": save_found_cell},
+    "Compensation": {".csv": save_compensation},
+    "CalibratedArm": {ANY: save_arm},
+    "Measurements": dict.fromkeys((".csv", *PARQUET), write_measurements),
+    "NextPoses": {".csv": save_next},
 }
 
 

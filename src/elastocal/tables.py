@@ -22,7 +22,7 @@ from typing import TYPE_CHECKING, BinaryIO, TextIO
 import numpy as np
 
 from elastocal.errors import InputError
-from elastocal.files import check_size, decoded, open_input
+from elastocal.files import atomic_write_bytes, check_size, decoded, open_input
 from elastocal.text import (
     cell_meaning,
     cell_text,
@@ -488,6 +488,9 @@ class RawTable:
 # Sources
 
 
+PARQUET = (".parquet", ".pq")
+
+
 def read_table(
     path: str | Path,
     choose: ChooseLayout,
@@ -507,7 +510,7 @@ def read_table(
     if text is not None:
         lines = CsvLines(source, BytesIO(text.encode()), what, comments)
         table = _read(source, "line", lines.header, lines.rows(), choose, lines.delimiter != ",")
-    elif Path(path).suffix.lower() in (".parquet", ".pq"):
+    elif Path(path).suffix.lower() in PARQUET:
         frame = _parquet(source, what)
         table = _read(source, "row", list(frame.columns), _rows_of(frame), choose, False)
     else:
@@ -624,6 +627,21 @@ def write_csv(
     writer = csv.writer(handle, lineterminator="\n")
     writer.writerow(map(cell_text, header))
     writer.writerows(map(cell_text, row) for row in rows)
+
+
+def write_parquet(path: str | Path, columns: Mapping[str, np.ndarray]) -> None:
+    """Write a table as Parquet, which reads back bit for bit, where pandas finds an engine."""
+    import pandas as pd
+
+    texts = {name: map(cell_text, v) for name, v in columns.items() if v.dtype == object}
+    frame, packed = pd.DataFrame(dict(columns) | {n: list(v) for n, v in texts.items()}), BytesIO()
+    try:
+        frame.to_parquet(packed, index=False)
+    except ImportError:
+        raise InputError(
+            f"{path}: writing Parquet needs pyarrow; run 'pip install pyarrow', or save it .csv"
+        ) from None
+    atomic_write_bytes(path, packed.getvalue())
 
 
 def csv_text(

@@ -188,7 +188,7 @@ def diagnose(
             if plan is not None:
                 told.append(_write_extra_poses(plan, found, model.chain.kinds))
             if cell_out is not None:
-                told += _write_extended(cell_out, found, cell, data, run.plugins)
+                told += _write_extended(cell_out, found, data, run.plugins)
     if run.answer(
         lambda: publish(found, model, found.data),
         lambda screen: print_report(screen, found),
@@ -198,17 +198,14 @@ def diagnose(
             say(line)
 
 
-def _write_extended(
-    path: Path, found: Diagnosis, cell: Path, data: Path, plugins: bool
-) -> Iterator[str]:
+def _write_extended(path: Path, found: Diagnosis, data: Path, plugins: bool) -> Iterator[str]:
     """Write the cell with the effects found, and say so and what to do with it."""
-    from elastocal.diagnosis.diagnose import write_extended_cell
     from elastocal.model.manipulator import where_smooth_functions_end
     from elastocal.report.diagnosis_view import added_text
+    from elastocal.saving import save_found_cell
 
-    extra = (*found.effects, *found.slight, *found.fields)
-    extended = write_extended_cell(cell, path, extra, found.model_keys)
-    added = added_text(extra)
+    extended = save_found_cell(found, path)
+    added = added_text((*found.effects, *found.slight, *found.fields))
     yield f"wrote {path} with {added or 'no further effect'}"
     if ends := where_smooth_functions_end(extended):
         yield (
