@@ -15,7 +15,7 @@ from collections.abc import Callable, Sequence
 from functools import partial
 from pathlib import Path
 from types import CodeType, ModuleType
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 from elastocal.errors import InputError, option, require
 from elastocal.files import check_exists, read_text
@@ -69,6 +69,21 @@ def load_named(cell: Path, modules: Sequence[str], asked: bool, fresh: bool) -> 
             f"{TRUSTED}={cell.absolute().parent} for all cells of this folder",
         )
     load_plugins(cell, modules if pending else ())
+
+
+class Carried:
+    """The plug-ins of a cell that ran here; whoever opens its pickle runs them there too."""
+
+    def __init__(self, cell: Path, modules: Sequence[str]) -> None:
+        self.cell = cell
+        self.modules = tuple(
+            str(Path(name).resolve()) if is_plugin_file(name) else name
+            for name in modules
+            if _has_run(name, False)
+        )
+
+    def __reduce__(self) -> tuple[Any, ...]:
+        return load_named, (self.cell, self.modules, True, False)
 
 
 def _has_run(name: str, fresh: bool) -> bool:

@@ -3,7 +3,10 @@
 from __future__ import annotations
 
 import json
+import pickle
+import re
 import shutil
+import subprocess
 import sys
 from collections.abc import Iterator
 from dataclasses import replace
@@ -123,6 +126,25 @@ def test_diagnose_suspects_it_at_all_its_places_and_finds_it(folder: Path) -> No
     assert [(e["effect"], e["where"]) for e in why["effects"]] == [("three_lobes", "joint3")]
     # The extended cell, in another folder, finds the plug-in where it was.
     assert "three_lobes" in [choice.name for choice in read_cell(extended).model.effects]
+
+
+def test_a_model_with_it_travels_to_another_process(folder: Path) -> None:
+    """The plug-ins that ran go with a pickle; an effect that no file states cannot, and says so."""
+    model = Model(with_effect(folder, "three_lobes:joint3"), plugins=True)
+    here, built = pickle.dumps(model), pickle.dumps(Model(replace(model.cell, plugins=())))
+    opened = (
+        "import pickle, sys\nfor text in sys.argv[1:]:\n"
+        "    try: print(pickle.loads(bytes.fromhex(text)).names[-1])\n"
+        "    except Exception as error: print(type(error).__name__, error)"
+    )
+    for order, told in (
+        ((here,), [model.names[-1]]),
+        ((built,), ["three_lobes was registered where .* put it in a file that \\[plugins\\]"]),
+    ):
+        words = [sys.executable, "-c", opened, *(each.hex() for each in order)]
+        done = subprocess.run(words, check=True, capture_output=True, text=True, cwd="/")
+        for line, expected in zip(done.stdout.splitlines(), told, strict=True):
+            assert re.search(expected, line), line
 
 
 def noisy_days(folder: Path) -> Path:

@@ -20,10 +20,11 @@ from elastocal.measurements import table as table_of
 from elastocal.model.arm import Parameter, row_inputs
 from elastocal.model.chain import Chain, numbered, plausible
 from elastocal.model.effects.base import Effect, JointMotion, SmoothFunction, index
-from elastocal.model.effects.catalogue import cell_of, effect_of
+from elastocal.model.effects.catalogue import CATALOGUE, cell_of, effect_of
 from elastocal.model.evaluate import CHUNK, evaluated_by, row_blocks
 from elastocal.model.observations import Observations, observe
 from elastocal.model.symbolic import SymbolicArm
+from elastocal.plugin_loader import Carried
 from elastocal.text import listed
 from elastocal.units import Array, IntArray
 
@@ -128,8 +129,9 @@ class Model:
 
     def __reduce__(self) -> tuple[Any, ...]:
         """Pickled by what it is made of; another process derives the functions again."""
-        made_of = self.chain, self.cell, self._extra, self._symbolic.backend
-        return Model.assembled, made_of, {"_markers_stated": self._markers_stated}
+        plugins = Carried(self.cell.path or Path(self.cell.name), self.cell.plugins)  # run first
+        made_of = plugins, self.chain, self.cell, self._extra, self._symbolic.backend
+        return _arrived, made_of, {"_markers_stated": self._markers_stated}
 
     def __repr__(self) -> str:
         effects = listed(dict.fromkeys(p.effect for p in self.parameters), 6) or "no effect"
@@ -469,6 +471,17 @@ def check_equilibrium(table: Measurements, predicted: Array) -> None:
 def _with_markers(cell: Cell, names: tuple[str, ...]) -> Cell:
     # All nominally at the flange's origin.
     return replace(cell, tool=replace(cell.tool, markers={name: np.zeros(3) for name in names}))
+
+
+def _arrived(_: None, chain: Chain, cell: Cell, *more: Any) -> Model:
+    """The model of a pickle whose plug-ins have run."""
+    lost = [choice.name for choice in cell.model.effects if choice.name not in CATALOGUE]
+    require(
+        not lost,
+        f"{cell.path or cell.name}: the effect {listed(lost)} was registered where the model was "
+        "pickled and does not travel with it; put it in a file that [plugins] of the cell names",
+    )
+    return Model.assembled(chain, cell, *more)
 
 
 def load_chain(cell: Cell) -> Chain:
