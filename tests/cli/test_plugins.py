@@ -178,6 +178,11 @@ def test_the_noise_model_is_chosen_and_named(tmp_path: Path) -> None:
     assert sizes["day 2"] == pytest.approx(80, rel=0.2)
     assert sizes["day 1"] == pytest.approx(10, rel=0.2)
     assert "one variance per day" in page.read_text(encoding="utf-8")
+    timeless = tmp_path / "timeless.csv"
+    replace(Model(cell).read(tmp_path / "days.csv"), time=None).save(timeless)
+    refused = run("identify", cell, timeless, "--noise", "day+configuration", "-q")
+    assert refused.exit_code == 2
+    assert "this table does not support the noise model 'day'; add" in refused.output
 
 
 BAD = {

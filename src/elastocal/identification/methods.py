@@ -19,7 +19,7 @@ from elastocal.identification.noise_choice import (
     over_times,
     weights_of,
 )
-from elastocal.identification.noise_structure import Kind, Readings
+from elastocal.identification.noise_structure import Kind, Readings, check_supported
 from elastocal.identification.options import (
     LEVEL,
     ROBUST,
@@ -88,6 +88,7 @@ def _settled(
     model, observed = problem.model, problem.observations
     solution, everything = start, np.ones(len(observed.lead), dtype=bool)
     readings = _linearised(model, observed, start.fit.x, kept, kind)
+    check_supported(asked, readings)
     now = everything if good is None else good
     for left in reversed(range(ROUNDS)):
         before = now

@@ -527,6 +527,16 @@ class Kind(NamedTuple):
         return bool(self.joints) or self.time
 
 
+def check_supported(kind: str, readings: Readings) -> None:
+    """Raise InputError where a noise model of a plug-in lacks something in these readings."""
+    own = Kind.parsed(kind).own
+    require(
+        own not in REGISTERED or REGISTERED[own].supports(readings),
+        f"{option('noise', kind)}: this table does not support the noise model '{own}'; add the "
+        "columns that it needs, or take another one",
+    )
+
+
 # What readings have in common besides the model.
 
 PARTITIONS = (
