@@ -51,6 +51,27 @@ def test_sigma_by_group_is_the_standard_deviation_within():
         group_sigma(e[:3], np.array([0, 0, 1]))
 
 
+def test_a_fit_says_whether_it_settled_and_is_equal_to_itself_alone():
+    last, short = eq14(B, DP, GROUP.astype(str))[-1], eq14(B, DP, GROUP, iterations=3)[-1]
+    assert last.converged and not short.converged
+    assert last == last and last != eq14(B, DP, GROUP)[-1] and len({last, short}) == 2
+
+
+@pytest.mark.parametrize(
+    ("call", "told"),
+    [
+        (lambda: ols(B, DP[:-1]), r"^dp must have shape \(90,\).*got \(89,\)"),
+        (lambda: ols(B, 1.0), "^dp must be finite numbers"),
+        (lambda: ols(B, DP, SIGMA[:-1]), r"^sigma must be 90 .* got shape \(89,\)"),
+        (lambda: wls(B, DP, -SIGMA), "^weights must be 90 positive"),
+        (lambda: eq14(B, DP, GROUP[:-1]), r"^group takes a label per row of B, \(90,\)"),
+    ],
+)
+def test_a_wrong_argument_is_named(call, told):
+    with pytest.raises(InputError, match=told):
+        call()
+
+
 def test_iterating_on_each_residual_states_far_too_little():
     """The paper's gain: stated intervals shrink manifold, errors do not (see the study)."""
     B810 = np.random.default_rng(2).normal(size=(810, 9))

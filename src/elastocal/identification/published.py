@@ -7,7 +7,7 @@ is measured in experiment_design/kr270_reproduction.  Symbols as in the paper: B
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 from numpy.typing import NDArray
@@ -20,11 +20,12 @@ SMALLEST = 1e-9  # m, below any tracker's resolution: σ_i of zero has no invers
 SIGMA_0 = 10e-6  # m, the tracker's claimed precision, σ₀ of eq. (14)
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, eq=False)
 class PublishedFit:
     """X̂ (parameters,), its stated covariance (parameters, parameters) and the weights w (rows,).
 
-    `residual` (rows,) is Δp − B X̂.
+    `residual` (rows,) is Δp − B X̂.  `converged`: of `eq14`, whether values and intervals have
+    settled.
     """
 
     method: str
@@ -32,6 +33,7 @@ class PublishedFit:
     covariance: Array
     weights: Array
     residual: Array
+    converged: bool = True
 
     @property
     def std(self) -> Array:
@@ -45,13 +47,14 @@ def ols(B: Array, dp: Array, sigma: Array | None = None) -> PublishedFit:
     Covariance by eq. (7), s² (BᵀB)⁻¹ with s² = rss/(rows − parameters), or, where `sigma`
     (rows,) is given, by the sandwich of eq. (8), (BᵀB)⁻¹ BᵀΣ²B (BᵀB)⁻¹.
     """
+    B, dp = _given(B, dp)
     one = np.ones(len(dp))
     x, cofactor = _solve(B, dp, one)
     residual = dp - B @ x
     if sigma is None:
         covariance = float(residual @ residual) / (len(dp) - len(x)) * cofactor
     else:
-        covariance = _sandwich(B, one, _positive(sigma, len(dp)), cofactor)
+        covariance = _sandwich(B, one, _positive("sigma", sigma, len(dp)), cofactor)
     return PublishedFit("ols", x, covariance, one, residual)
 
 
@@ -61,10 +64,11 @@ def wls(B: Array, dp: Array, weights: Array, sigma: Array | None = None) -> Publ
     Covariance by eq. (11), (BᵀW²B)⁻¹ BᵀW²Σ²W²B (BᵀW²B)⁻¹, with the σ given; without σ by the
     corrected eq. (13), (BᵀΣ⁻²B)⁻¹ with σ = 1/w, which is what (11) becomes where WΣ = I.
     """
-    w = _positive(weights, len(dp))
+    B, dp = _given(B, dp)
+    w = _positive("weights", weights, len(dp))
     x, covariance = _solve(B, dp, w)
     if sigma is not None:
-        covariance = _sandwich(B, w, _positive(sigma, len(dp)), covariance)
+        covariance = _sandwich(B, w, _positive("sigma", sigma, len(dp)), covariance)
     return PublishedFit("wls", x, covariance, w, dp - B @ x)
 
 
@@ -101,6 +105,9 @@ def eq14(
 ) -> list[PublishedFit]:
     """WLS with the weights of eq. (14), iterated until values and intervals settle.
 
+    They have settled (`converged` of the last entry) where no value and no stated standard
+    deviation moves by a share of `tolerance`; after so many `iterations` it ends in any case.
+
     σ_i comes from the groups (`group` (rows,) given), or from each residual itself, σ_i = |e_i|,
     which is what the paper's figures need.  The first entry is OLS with eq. (8), each following
     one uses the residuals of its predecessor; the last is the result.  Stated covariance: eq. (13)
@@ -108,6 +115,13 @@ def eq14(
     pass through counts as known exactly, which is why they are far too small per residual.
     """
     first = ols(B, dp)
+    if group is not None:
+        if np.shape(group) != first.residual.shape:
+            raise InputError(
+                f"group takes a label per row of B, ({len(first.residual)},); got shape "
+                f"{np.shape(group)}"
+            )
+        group = np.unique(group, return_inverse=True)[1].ravel()
     sigma = _sigma(first.residual, group)
     history = [ols(B, dp, np.maximum(sigma, SMALLEST))]
     for _ in range(iterations):
@@ -115,12 +129,13 @@ def eq14(
         found = wls(B, dp, w)
         stated = wls(B, dp, 1 / np.maximum(sigma, SMALLEST)).covariance
         method = "eq14 per residual" if group is None else "eq14 by group"
-        history.append(PublishedFit(method, found.x, stated, w, found.residual))
+        history.append(PublishedFit(method, found.x, stated, w, found.residual, False))
         sigma = _sigma(found.residual, group)
         before, now = history[-2], history[-1]
         moved = np.abs(now.x - before.x) / np.maximum(np.abs(now.x), 1e-300)
         widened = np.abs(now.std - before.std) / now.std
         if len(history) > 2 and max(moved.max(), widened.max()) < tolerance:
+            history[-1] = replace(now, converged=True)
             break
     return history
 
@@ -131,14 +146,18 @@ def _sigma(residual: Array, group: NDArray[np.int64] | None) -> Array:
 
 def _solve(B: Array, dp: Array, w: Array) -> tuple[Array, Array]:
     """x with the least Σ (w_i (B x − Δp)_i)², refined twice, and (BᵀW²B)⁻¹."""
-    B, dp = _finite("B", B, 2), _finite("y", dp, 1)
-    if len(dp) != len(B):
-        raise InputError(f"y must have shape ({len(B)},), as B has {len(B)} rows; got {dp.shape}")
     factors = orthogonal(w[:, None] * B)
     x = np.zeros(B.shape[1])
     for _ in range(3):
         x = x + factors.V @ (factors.Q.T @ (w * (dp - B @ x)))
     return x, factors.V @ factors.V.T
+
+
+def _given(B: Array, dp: Array) -> tuple[Array, Array]:
+    B, dp = _finite("B", B, 2), _finite("dp", dp, 1)
+    if len(dp) != len(B):
+        raise InputError(f"dp must have shape ({len(B)},), as B has {len(B)} rows; got {dp.shape}")
+    return B, dp
 
 
 def _finite(name: str, values: Array, dimensions: int) -> Array:
@@ -154,8 +173,8 @@ def _sandwich(B: Array, w: Array, sigma: Array, cofactor: Array) -> Array:
     return cofactor @ (middle.T @ middle) @ cofactor
 
 
-def _positive(values: Array, n: int) -> Array:
+def _positive(name: str, values: Array, n: int) -> Array:
     checked = np.asarray(values, dtype=float)
     if checked.shape != (n,) or not (np.isfinite(checked) & (checked > 0)).all():
-        raise InputError(f"weights and sigmas must be {n} positive finite numbers")
+        raise InputError(f"{name} must be {n} positive finite numbers; got shape {checked.shape}")
     return checked
