@@ -105,7 +105,11 @@ def test_interest_names_parameters_places_or_effects(interest: Any, counted: Any
     [
         ("joint2.complience", InputError, ["did you mean 'joint2.compliance'", "interest"]),
         ("joint1.compliance", InsufficientDataError, ["no feasible pose shows", "fixed=['joint1"]),
-        ("joint1.offset", InsufficientDataError, ["no set of poses separates", "base.rz", "fixed=["]),
+        (
+            "joint1.offset",
+            InsufficientDataError,
+            ["no set of poses separates", "base.rz", "fixed=["],
+        ),
         ("joint4.compliance", InsufficientDataError, ["is held", "drop it from `fixed`"]),
     ],
 )

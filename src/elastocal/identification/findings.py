@@ -188,11 +188,15 @@ def _load_unit(result: Calibration) -> Iterator[Finding]:
     nearer = abs(abs(math.log(ratio)) - math.log(KILOGRAMS)) < math.log(KILOGRAMS) / 2
     if not nearer:
         return
-    unit = "kilograms" if ratio > 1 else "newtons times 9.81"
+    unit, cause, undo = (
+        ("kilograms", "the force columns hold kilograms", "multiply")
+        if ratio > 1
+        else ("newtons times 9.81", "newtons were multiplied by 9.81", "divide")
+    )
     yield Finding(
         "load_unit", "care" if by == CELL else "note", {"ratio": ratio, "by": by, "unit": unit},
-        f"Check the unit of the loads: the compliances are {ratio:.2g} times what {by} let expect, "
-        f"as where forces in N hold {unit}.",
+        f"Check the unit of the loads: the compliances are {ratio:.2g} times those expected from "
+        f"{by}, as where {cause}. If so, {undo} force_x_N, force_y_N and force_z_N by 9.81.",
     )  # fmt: skip
 
 

@@ -33,6 +33,7 @@ from elastocal.model.effects.compliances import (
     rated_torque,
     weight_torque,
 )
+from elastocal.model.effects.placements import link_ends
 from elastocal.model.manipulator import Model
 from elastocal.model.observations import Observations
 from elastocal.model.rigid import nominal_flanges
@@ -439,13 +440,14 @@ KILOGRAMS = 9.80665  # N, the weight of one
 
 
 def load_ratio(model: Model, known: dict[str, float]) -> tuple[float, str] | None:
-    """Geometric mean of the joints' compliances over what they should be about, and by what;
-    None where nothing says it.
+    """Median of the joints' compliances over what they should be about, and by what; None where
+    nothing says it.
 
     `known` (SI) are values by parameter name.  They should be those that the cell states, else
     what winds each revolute joint up by RATED_WIND_UP at its rated torque, by the links' weights.
     """
     given, rated = [], []
+    heavier = _usual_over_stated_mass(model.chain)
     for p in model.parameters:
         value = known.get(p.name, 0.0)
         if p.effect != JointCompliance.name or value <= 0:
@@ -454,15 +456,27 @@ def load_ratio(model: Model, known: dict[str, float]) -> tuple[float, str] | Non
         if p.nominal > 0:
             given.append(value / p.nominal)
         elif model.chain.kinds[i] == "revolute" and weight_torque(model.chain, i) > 0:
-            torque = rated_torque(model.chain, model.cell, i)
-            rated.append(value * (torque or 0.0) / RATED_WIND_UP)
-    for ratios, by in ((given, CELL), (rated, WEIGHTS)):
+            torque = rated_torque(model.chain, model.cell, i) or 0.0
+            rated.append(value * heavier * torque / RATED_WIND_UP)
+    for ratios, by in ((given, CELL), (rated, WEIGHTS if heavier == 1 else LENGTH)):
         if ratios:
-            return float(np.exp(np.mean(np.log(ratios)))), by
+            return float(np.median(ratios)), by
     return None
 
 
 CELL, WEIGHTS = "the cell's nominal compliances", "the weights of the links"
+LENGTH = "the length of the arm"
+# kg/m³, mass of the links over the cube of the arm's length: 9 (UR5, Panda), 33 (KR 270), 40
+# (KR 120).  Files of robots often state 1 or 2 kg for every link, which no arm of that size has.
+USUAL_MASS, OF_ANY_ARM = 30.0, 10.0
+
+
+def _usual_over_stated_mass(chain: Chain) -> float:
+    """What the masses are to be multiplied by; 1 where an arm of this length may have them."""
+    mass = sum(body.mass for body in chain.masses)
+    usual = USUAL_MASS * float(sum(np.linalg.norm(T[:3, 3]) for T in link_ends(chain))) ** 3
+    alike = usual <= OF_ANY_ARM * mass and mass <= OF_ANY_ARM * usual
+    return 1.0 if alike or mass == 0 else usual / mass
 
 
 # What no arm can be.

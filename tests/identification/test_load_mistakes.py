@@ -1,0 +1,65 @@
+"""Loads in a wrong unit or with a wrong sign leave no trace in the residual, but in compliances."""
+
+from __future__ import annotations
+
+import re
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+from support.robots import KR270
+
+import elastocal as ec
+
+CELL = """\
+[robot]
+urdf = "arm.urdf"
+[tool]
+load_point_m = [0.2, 0, 0.2]
+[tool.markers_m]
+M1 = [0.2, 0.05, 0.1]
+M2 = [-0.1, 0.2, 0.1]
+[tracker]
+sigma_um = 15
+[model]
+effects = ["base_frame", "marker_position", "joint_compliance:joint2",
+           "joint_compliance:joint3", "joint_compliance:joint4", "joint_compliance:joint5",
+           "joint_compliance:joint6"]
+"""
+TRUE = {"joint2": 3e-7, "joint3": 4e-7, "joint4": 3e-6, "joint5": 3.3e-6, "joint6": 2.4e-6}
+VALUES = {f"{joint}.compliance": k for joint, k in TRUE.items()}
+G = 9.80665
+
+
+@pytest.fixture(scope="module", params=[None, 2], ids=["true masses", "placeholders"])
+def made(request, tmp_path_factory) -> tuple[Path, ec.Measurements]:
+    """Many a robot's file states 2 kg for every link."""
+    folder = tmp_path_factory.mktemp("loads")
+    urdf = KR270.read_text(encoding="utf-8")
+    if request.param:
+        urdf = re.sub(r'<mass value="[^"]*"', f'<mass value="{request.param}"', urdf)
+    (folder / "arm.urdf").write_text(urdf, encoding="utf-8")
+    path = folder / "cell.toml"
+    path.write_text(CELL, encoding="utf-8")
+    q = np.random.default_rng(1).uniform(-1, 1, (25, 6)) * [2, 0.5, 0.5, 2, 1.5, 2]
+    q += [0, -1.2, 1.4, 0, 0, 0]
+    return path, ec.simulate(path, q, values=VALUES, load=(0, 0, -2000.0), seed=3)
+
+
+def fitted(made: tuple[Path, ec.Measurements], factor: float) -> ec.Calibration:
+    path, table = made
+    return ec.identify(path, replace(table, force=table.force * factor))
+
+
+def test_the_unit_of_the_loads_is_named_with_its_direction(made):
+    assert fitted(made, 1.0).finding("load_unit") is None
+    for factor, larger, mistake, undo in (
+        (1 / G, True, "kilograms", "multiply force_x_N"),
+        (G, False, "newtons were multiplied by 9.81", "divide force_x_N"),
+    ):
+        fit = fitted(made, factor)
+        found = fit.finding("load_unit")
+        assert (found.number("ratio") > 1) == larger
+        assert mistake in found.remedy and undo in found.remedy
+        assert found.remedy in "\n".join(fit.warnings)
