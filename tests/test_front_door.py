@@ -431,7 +431,10 @@ def test_what_a_user_guesses(tmp_path):
     table = fit.observations.table
     assert np.allclose(fit.predict(table), fit.observations.value.reshape(-1, 3) - fit.residuals)
     assert np.allclose(fit.predict(table.to_dataframe()), fit.predict(table), atol=1e-9)
-    assert str(fit["joint3.compliance"]) == "joint3.compliance = (4.167 ± 0.014)e-07 rad/(N*m)"
+    assert (
+        str(fit["joint3.compliance"])
+        == "joint3.compliance = (4.167 ± 0.014)e-07 rad/(N*m) (standard deviation)"
+    )
     assert str(fit["joint1.compliance"]) == "joint1.compliance: no value"
     with pytest.raises(ec.InputError, match="DataFrame"):
         model.read(frame.drop(columns=[c for c in frame if c.startswith("q1_")]))

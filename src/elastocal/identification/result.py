@@ -98,7 +98,7 @@ class Estimate:
         if self.value is None or self.std is None:
             others = ", ".join(self.combined_with)
             return f"{self.name}: no value" + (f", combined with {others}" if others else "")
-        return f"{self.name} = {with_std(self.value, self.std)} {self.unit}"
+        return f"{self.name} = {with_std(self.value, self.std)} {self.unit} (standard deviation)"
 
 
 @dataclass(frozen=True)
@@ -118,7 +118,9 @@ class Combination:
     held: dict[str, float] = field(default_factory=dict)
 
     def __str__(self) -> str:
-        return f"{self.expression} = {with_std(self.value, self.std)} {self.unit}"
+        return (
+            f"{self.expression} = {with_std(self.value, self.std)} {self.unit} (standard deviation)"
+        )
 
     @property
     def expression(self) -> str:
