@@ -298,7 +298,7 @@ def match_columns(
         if text.startswith(IGNORED) or passed_over(text):
             continue
         if text not in meaning:
-            raise InputError(f"{source}: {explain(text) or _unknown(text, known, list(meaning))}")
+            raise InputError(f"{source}: {explain(text) or _unknown(text, known, header)}")
         family, stem, unit = meaning[text]
         found = present.setdefault(family.name, {})
         if stem in found:
@@ -374,7 +374,18 @@ def _check_names(source: str, header: Sequence[str]) -> None:
             raise InputError(f"{source}: column {quoted(text)} appears {count} times; keep one")
 
 
-def _unknown(text: str, known: Mapping[str, Family], valid: Sequence[str]) -> str:
+NUMBERING = "(_?(id|no|nr|num|number|name))?"
+# What other people's tables call a column, without its unit and in small letters → its stem.
+CALLED = {
+    rf"(pose|conf|config|configuration|point|posture){NUMBERING}": "configuration",
+    rf"(marker|target|reflector|smr){NUMBERING}": "marker",
+    r"(?:j|joint|axis|a|theta)_?(\d+)": r"q\1",
+    r"(?:f|force)_?([xyz])": r"force_\1",
+    r"(?:m|tau|trq|torque)_?(\d+)": r"torque_\1",
+}
+
+
+def _unknown(text: str, known: Mapping[str, Family], header: Sequence[str]) -> str:
     ways: dict[str, list[str]] = {}
     for family in known.values():
         for stem in family.units:
@@ -387,10 +398,22 @@ def _unknown(text: str, known: Mapping[str, Family], valid: Sequence[str]) -> st
             f"column {quoted(text)}: the unit {unit} is not taken here; write "
             f"{' or '.join(ways[stem])}"
         )
+    meant = _meant(stem if unit in OTHER_UNITS else text)
+    valid = [way for way in ways.get(meant, []) if way.endswith(f"_{unit}")] or ways.get(meant, [])
+    hint = f" (did you mean '{valid[0]}'?)" if valid and not {*ways[meant]} & {*header} else ""
+    hint = hint or did_you_mean(text, [way for own in ways.values() for way in own])
     return (
-        f"unknown column {quoted(text)}{did_you_mean(text, valid)}; correct the name, or start "
+        f"unknown column {quoted(text)}{hint}; correct the name, or start "
         "it with '#', '_' or 'note' to have it ignored"
     )
+
+
+def _meant(name: str) -> str:
+    """The stem that other tables call `name`; empty where none is known."""
+    for pattern, stem in CALLED.items():
+        if found := re.fullmatch(pattern, name.lower()):
+            return found.expand(stem)
+    return ""
 
 
 def _check_complete(source: str, family: Family, found: Mapping[str, Column], alone: bool) -> None:
