@@ -123,9 +123,9 @@ def plan_table(
     level, order and notes.  Sorted by pose, then side of approach, then load state.
 
     With `forces` (L, 3) N of the load states one row per reading, under its force; without, one
-    row per pose and side, to be measured in every load state, `order` being its place in the
-    order in the first state, note_order_2 that in the second, …, and behind these that of what is
-    read in two parts.  note_load, note_load_2, … then say what hangs at each of these places, where
+    row per pose and side, to be measured in every load state.  `order` is the first of its stops,
+    as the list of stops counts them, note_order_2 the second, …; so is it of what is read in two
+    parts.  note_load, note_load_2, … then say what hangs at each of these places, where
     any of the load states `carried` (L, 3) N is one.  `configurations` and `level`: one per pose.
     A pose that is approached from both sides is two configurations, 7+ (joints moving up to it)
     and 7-: the difference between them is what such a plan is for, not noise of repeats.  With
@@ -179,13 +179,10 @@ Visit = list[tuple[int, Stop]]  # stops in one row of the table, with their plac
 
 def _visits(stops: Sequence[Stop], by_load: bool) -> list[Visit]:
     found: dict[tuple[int, ...], Visit] = {}
-    for k, stop in sorted(
-        enumerate(stops, start=1),
-        key=lambda s: (s[1].again > 0, s[1].pose, s[1].again, s[1].side, s[1].part, s[1].load),
-    ):
-        key = (stop.pose, stop.again, stop.side, stop.load if by_load else -1)
+    for k, stop in enumerate(stops, start=1):
+        key = (stop.again > 0, stop.pose, stop.again, stop.side, stop.load if by_load else -1)
         found.setdefault(key, []).append((k, stop))
-    return list(found.values())
+    return [found[key] for key in sorted(found)]
 
 
 def _notes(

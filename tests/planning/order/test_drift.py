@@ -74,6 +74,14 @@ def test_every_visit_once_in_turns_and_the_drift_does_little(changes, sequence):
     assert execution.drift.bias < 0.25 * execution.drift.shortest
     shortest = ordered(alias=None)
     assert execution.travel <= shortest.travel + 0.05 * shortest.total
+    # The file counts stops as their list does, whichever load comes first at a pose.
+    names, level = tuple(map(str, range(1, 13))), np.zeros(12, dtype=int)
+    _, more = plan_table(execution, names, level, ("revolute", "revolute"), carried=BOTH)
+    for pose in range(12):
+        own = [k for k, stop in enumerate(execution.stops, start=1) if stop.pose == pose]
+        assert [more["order"][pose], more["note_order_2"][pose]] == [str(k) for k in own]
+        hung = ["0 0 -100 N" if execution.stops[k - 1].load else "unloaded" for k in own]
+        assert [more["note_load"][pose], more["note_load_2"][pose]] == hung
 
 
 def test_where_there_is_time_poses_are_read_before_and_after_their_load():
