@@ -76,7 +76,7 @@ def test_no_unit_of_an_angle_is_guessed(tmp_path, readings):
     polar = read_by_a_tracker(readings[2].reshape(-1, 3))
     files = {"points.csv": written(polar, "Point;Range mm;Azimuth;Zenith"),
              "poses.dat": krl(readings[1])}  # fmt: skip
-    with pytest.raises(InputError, match=r"column 'Azimuth' states no unit; give angle_unit='deg'"):
+    with pytest.raises(InputError, match=r"'Zenith' state no unit; give angle_unit='deg'"):
         imported(tmp_path, files, presets=("spherical", "kuka"))
 
 

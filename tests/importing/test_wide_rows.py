@@ -129,3 +129,31 @@ def test_a_star_where_no_marker_stands_is_refused(tmp_path):
     (tmp_path / "map.toml").write_text('[[source]]\n[source.columns]\nname = "*_name"\n')
     done = run(tmp_path / "log.csv", "--map", tmp_path / "map.toml", "--preview")
     assert done.exit_code == 2 and "* stands for the markers of a row" in done.output
+
+
+def test_one_message_names_the_units_of_all_columns_that_state_none(tmp_path):
+    _, degrees, points = kr270_readings(tmp_path)
+    file = wide(tmp_path / "log.csv", degrees, points, "{marker}_{axis}", "")
+    file.write_text(file.read_text().replace("_deg", ""))
+    words = [file, "--preset", "wide", "-o", tmp_path / "data.csv"]
+    refused = run(*words)
+    assert refused.exit_code == 2
+    assert "'q1', 'q2'" in refused.output and "'M1_z' state no unit" in refused.output
+    assert "--angle-unit deg and --length-unit mm" in refused.output
+    half = run(*words, "--length-unit", "mm")
+    assert half.exit_code == 2 and "give --angle-unit deg;" in half.output
+    assert run(*words, "--length-unit", "mm", "--angle-unit", "deg").exit_code == 0
+    assert float(table(tmp_path / "data.csv")[0]["q1_deg"]) == degrees[0, 0]
+
+
+def test_a_lone_force_column_is_the_load_and_no_marker(tmp_path):
+    _, degrees, points = kr270_readings(tmp_path)
+    file = wide(tmp_path / "log.csv", degrees, points, "{marker}_{axis}")
+    head, *rows = file.read_text().splitlines()
+    text = [f"{head},force_z_N", *(f"{row},-{100 + i}" for i, row in enumerate(rows))]
+    file.write_text("\n".join(text) + "\n")
+    done = run(file, "--preset", "wide", "-o", tmp_path / "data.csv")
+    assert done.exit_code == 0, done.output
+    assert "force_x, force_y in no column: taken as 0 N beside force_z" in done.output
+    first = table(tmp_path / "data.csv")[0]
+    assert {first[f"force_{a}_N"] for a in "xy"} == {"0.0"} and first["force_z_N"] == "-100.0"

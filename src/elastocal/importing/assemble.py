@@ -31,6 +31,7 @@ from elastocal.text import did_you_mean, listed, quoted
 from elastocal.units import Array, IntArray
 
 GRAVITY = 9.80665  # m/s², standard
+FORCES = tuple(f"force_{axis}" for axis in "xyz")
 UNLOADED = ("none", "unloaded", "0")
 
 
@@ -48,15 +49,15 @@ def forces_of(
     """
     named = points.labels.get("load")
     if named is None:
-        if loads and "force_x" not in points.numbers:
+        if loads and not _forces(points.numbers):
             raise InputError(
                 f"{where}: [loads] names {listed(loads)}, but no file says which load it belongs "
                 "to; give load in [[source]], or a group (?P<load>…) in a pattern"
             )
         return None
-    if "force_x" in points.numbers:
+    if told := _forces(points.numbers):
         raise InputError(
-            f"{points.files[0]}: the load is stated by name and in columns force_x …; keep one"
+            f"{points.files[0]}: the load is stated by name and in columns {listed(told)}; keep one"
         )
     known = {name: np.zeros(3) for name in UNLOADED}
     for name, stated in (loads or {}).items():
@@ -73,6 +74,10 @@ def forces_of(
                 f"{name} = [0, 0, -1000] in N, or {name} = {{ mass_kg = 100 }}"
             )
     return np.array([known[name] for name in named])
+
+
+def _forces(numbers: Mapping[str, Array]) -> list[str]:
+    return [stem for stem in FORCES if stem in numbers]
 
 
 # A load in a file's name: log_2600N, payload_2p5kg, load2.6kN.  A number that follows a letter is a
@@ -102,7 +107,7 @@ def with_loads_of_names(
     """
     every = [r for role in by_role.values() for r in role]
     stated = any(r.load is not None or "load" in r.labels for r in every)
-    if loads or stated or any("force_x" in r.numbers for r in every):
+    if loads or stated or any(_forces(r.numbers) for r in every):
         return dict(by_role), dict(loads or {}) or None, []
     named = {id(r): load_in(Path(r.source).stem) for r in every}
     known = {found[0]: found[1] for found in named.values() if found}
@@ -186,16 +191,21 @@ def assemble(where: str, points: Records, log: Records | None, joined: Joined | 
     kinds = tuple("revolute" if units[stem] == "deg" else "prismatic" for stem in stems)
     forces = forces_of(where, points, loads)
     if forces is not None:
-        for k, axis in enumerate("xyz"):
-            numbers[f"force_{axis}"], units[f"force_{axis}"] = forces[rows, k], "N"
+        for k, stem in enumerate(FORCES):
+            numbers[stem], units[stem] = forces[rows, k], "N"
     q = np.column_stack([numbers[stem] for stem in stems])
     spread = (log or points).spread(settings.same_pose_deg, settings.same_pose_mm)
     configuration, warnings = _configurations(points, joined, rows, q, spread)
+    if (stated := _forces(numbers)) and len(stated) < len(FORCES):
+        absent = [stem for stem in FORCES if stem not in stated]
+        numbers |= dict.fromkeys(absent, np.zeros(len(rows)))
+        units |= dict.fromkeys(absent, "N")
+        warnings.append(f"{listed(absent)} in no column: taken as 0 N beside {listed(stated)}")
     columns: dict[str, Sequence[str] | NDArray] = {"configuration": configuration}
     marker = points.labels.get("marker")
     markers = [""] * len(rows) if marker is None else [marker[i] for i in rows]
     force = [tuple(row) for row in np.column_stack(
-        [numbers.get(f"force_{a}", np.zeros(len(rows))) for a in "xyz"])]  # fmt: skip
+        [numbers.get(stem, np.zeros(len(rows))) for stem in FORCES])]  # fmt: skip
     columns["repeat"] = _repeats(
         points, rows, list(zip(configuration, markers, force, strict=True))
     )

@@ -301,6 +301,11 @@ class ColumnKey:
         return _QUANTITIES[re.sub(r"^(q|torque_|approach_)\d+$", r"\1#", self.stem)]
 
     @property
+    def default(self) -> str:
+        """What it measures where no unit says so: joints are angles first."""
+        return self.quantities[0]
+
+    @property
     def is_template(self) -> bool:
         """q#: one column for each joint."""
         return self.stem.endswith("#")
@@ -344,6 +349,7 @@ def column_key(where: str, key: str) -> ColumnKey:
 
 
 MOST_JOINTS = 64
+USUAL = {"length": "mm", "angle": "deg"}  # the quantities whose unit an option states
 EACH = "*"  # in a place of [source.columns]: the name of a marker
 
 
@@ -403,9 +409,10 @@ def by_name(asked: Sequence[ColumnKey]) -> bool:
 def lacking(asked: Sequence[ColumnKey], cells: Sequence[str]) -> list[str]:
     """The required columns asked for by name that a line does not name, as the mapping has them."""
     absent = []
+    free = _unnamed(asked, cells)
     for target in (c for c in asked if c.required):
         if target.of_each_marker:
-            if not _marker_names(target, cells):
+            if not _marker_names(target, free):
                 absent.append(f"{target.key} = {quoted(str(target.at))}")
             continue
         first = target.numbered(1) if target.is_template else target
@@ -420,7 +427,8 @@ def markers_of_row(source: str, asked: Sequence[ColumnKey], header: Sequence[str
     mapping has no * in a place.
     """
     each = [target for target in asked if target.of_each_marker and target.required]
-    found = {target.key: _marker_names(target, header) for target in each}
+    free = _unnamed(asked, header)
+    found = {target.key: _marker_names(target, free) for target in each}
     names = list(dict.fromkeys(name for names in found.values() for name in names))
     for name in names:
         absent = [t for t in each if name not in found[t.key]]
@@ -431,6 +439,15 @@ def markers_of_row(source: str, asked: Sequence[ColumnKey], header: Sequence[str
                 "stands for the markers' names alone"
             )
     return names
+
+
+def _unnamed(asked: Sequence[ColumnKey], header: Sequence[str]) -> list[str]:
+    """The cells of a header without those that the mapping calls by their whole name, as force_z:
+    no marker is called force."""
+    named = [part for c in asked if not c.of_each_marker and not c.is_template
+             for part in c.parts if isinstance(part, str)]  # fmt: skip
+    taken = {i for part in named for name in part.split("|") for i in _find([name], header)}
+    return [cell for i, cell in enumerate(header) if i not in taken]
 
 
 def _marker_names(target: ColumnKey, header: Sequence[str]) -> list[str]:
@@ -479,7 +496,27 @@ def resolve(
             if found is None:
                 break
             columns.append(_with_unit(source, found, units, hint))
+    if unstated := [c for c in columns if c.unit == AUTO]:
+        raise _no_unit(source, unstated)
     return tuple(columns)
+
+
+def _no_unit(source: str, columns: Sequence[FileColumn]) -> InputError:
+    """What to say of columns that state no unit: all that is needed, at once."""
+    usual = {c: USUAL.get(q := c.target.default) or next(iter(FACTORS[q])) for c in columns}
+    keys = {c: f"{c.target.stem}_{unit}" for c, unit in usual.items()}
+    options = [option(f"{c.target.default}_unit", usual[c]) for c in columns
+               if c.target.default in USUAL]  # fmt: skip
+    by_key = [key for c, key in keys.items() if c.target.default not in USUAL]
+    needed = list(dict.fromkeys(options))
+    if by_key:
+        needed.append(f"{listed(by_key)} in [source.columns]")
+    several = len(columns) > 1
+    return InputError(
+        f"{source}: column{'s' * several} {listed((quoted(c.header) for c in columns), 12)} "
+        f"state{'s' * (not several)} no unit; give {' and '.join(needed)}; a mapping file says "
+        f"it by [units] or a key such as {keys[columns[0]]} in [source.columns]"
+    )
 
 
 def _column(source: str, target: ColumnKey, header: Sequence[str], width: int) -> FileColumn | None:
@@ -538,7 +575,8 @@ def _find(names: Sequence[str], header: Sequence[str]) -> list[int]:
 
 
 def _with_unit(source: str, column: FileColumn, units: UnitsTable, hint: str | None) -> FileColumn:
-    """The column with its unit found out, or compared with what the file says."""
+    """The column with its unit found out (AUTO where nothing says it), or compared with what the
+    file says."""
     target = column.target
     if target.is_text or target.unit == "":
         return column
@@ -553,15 +591,6 @@ def _with_unit(source: str, column: FileColumn, units: UnitsTable, hint: str | N
             )
         return column
     told = known_unit(hint) if hint else None
-    default = {"length": units.length, "angle": units.angle}
-    general = [default[q] for q in target.quantities if default.get(q)]
+    general = {"length": units.length, "angle": units.angle}.get(target.default)
     fitting = told if told and set(quantities(told)) & set(target.quantities) else None
-    unit = stated or fitting or (general[0] if general else None)
-    if unit is None:
-        quantity, usual = ("length", "mm") if "length" in target.quantities else ("angle", "deg")
-        raise InputError(
-            f"{source}: column {quoted(column.header)} states no unit; give "
-            f"{option(f'{quantity}_unit', usual)}, [units] in the mapping file, or "
-            f"{target.stem}_{usual} in [source.columns]"
-        )
-    return replace(column, unit=unit)
+    return replace(column, unit=stated or fitting or general or AUTO)
