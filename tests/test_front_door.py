@@ -160,6 +160,8 @@ def test_a_calibration_is_a_mapping_of_estimates(fit):
 def test_a_wrong_name_is_an_input_error_with_the_nearest(fit):
     with pytest.raises(ec.InputError, match=r"did you mean 'joint3\.compliance'") as caught:
         fit["joint3.complience"]
+    with pytest.raises(ec.InputError, match=r"did you mean 'joint2\.compliance_level1'"):
+        fit["joint2.compliance"]
     assert isinstance(caught.value, KeyError)
     assert not str(caught.value).startswith(("'", '"'))
 

@@ -14,10 +14,17 @@ SHOWN = 60
 
 
 def nearest(name: str, valid: Iterable[str], cutoff: float = 0.5) -> str | None:
-    """The valid name closest to `name`, upper and lower case alike; None where none is near."""
+    """The valid name closest to `name`, upper and lower case alike; None where none is near.
+
+    Names that begin with `name` come first, the shortest of them: it was not typed to its end.
+    """
     by_lower = {v.lower(): v for v in reversed(list(valid))}
     # difflib is quadratic, and a name this long is no typing error anyway.
-    near = get_close_matches(name[:SHOWN].lower(), by_lower, n=1, cutoff=cutoff)
+    typed = name[:SHOWN].lower()
+    begun = sorted(
+        (v for v in by_lower if typed and v.startswith(typed)), key=lambda v: (len(v), v)
+    )
+    near = begun or get_close_matches(typed, by_lower, n=1, cutoff=cutoff)
     return by_lower[near[0]] if near else None
 
 
