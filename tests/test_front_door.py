@@ -153,7 +153,14 @@ def test_a_calibration_is_a_mapping_of_estimates(fit):
     assert not fit["joint1.compliance"].identifiable
     assert list(fit) == list(fit.model.names) == fit._ipython_key_completions_()
     assert len(fit) == 10 and "joint2.compliance" not in fit
-    assert dict(fit)["joint3.compliance"] is found
+    assert dict(fit)["joint3.compliance"] is found is fit.get("joint3.compliance")
+    assert dict(fit.items()) == dict(fit) and fit.get("joint9.compliance") is None
+    rho = fit.correlation
+    assert rho.shape == (9, 9) and np.allclose(np.diag(rho), 1) and (np.abs(rho) < 1 + 1e-12).all()
+    assert all(
+        np.isclose(rho[fit.determined.index(a), fit.determined.index(b)], r)
+        for a, b, r in fit.correlations
+    )
     assert fit.covariance.shape == (9, 9) and fit.B.shape == (len(fit.residual), 10)
 
 
@@ -472,6 +479,18 @@ def test_the_ending_says_what_is_saved(fit, plan, tmp_path):
 def test_effects_are_a_data_frame():
     frame = ec.effects("cell.toml").set_index("name")
     assert frame.loc["joint_compliance", "on"] and "joint2" in frame.loc["backlash", "places"]
+
+
+def test_rows_are_taken_by_index(model):
+    data = model.read("data.csv")
+    first = data[data.marker == 0]
+    assert np.array_equal(first.position, data.take(data.marker == 0).position)
+    assert len(data[:90]) == 90 and np.array_equal(data[[3, 5]].row, data.row[[3, 5]])
+    for wrong in (3, "q", np.array([True]), [len(data)]):
+        with pytest.raises(ec.InputError, match="rows are taken by a mask or a slice of 540 rows"):
+            data[wrong]
+    with pytest.raises(TypeError, match="not iterable"):
+        iter(data)
 
 
 def test_arrays_of_many_markers_are_what_their_file_is(model):

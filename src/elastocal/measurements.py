@@ -17,7 +17,7 @@ from numpy.typing import NDArray
 from elastocal import tables
 from elastocal.above import Result
 from elastocal.arguments import checked_arguments
-from elastocal.errors import InputError, option
+from elastocal.errors import InputError, option, require
 from elastocal.files import atomic_writer, open_input, read_text
 from elastocal.tables import NO_UNIT, Family, Labels, Layout, RawTable, column
 from elastocal.text import did_you_mean, is_label, listed, quoted
@@ -169,12 +169,27 @@ class Measurements(Result):
             >>> data.take(data.marker == 0)
             <Measurements data.csv: 180 rows, 15 configurations, markers M1, M2, M3>
         """
+        try:
+            one = np.ndim(np.arange(len(self))[index]) != 1
+        except IndexError:
+            one = True
+        require(
+            not one,
+            f"rows are taken by a mask or a slice of {len(self)} rows, or by a list of their "
+            f"numbers from 0; found {quoted(index)}",
+        )
         changes = {
             f.name: getattr(self, f.name)[index]
             for f in fields(self)
             if isinstance(getattr(self, f.name), np.ndarray)
         }
         return replace(self, **changes)
+
+    def __getitem__(self, index: NDArray | slice) -> Measurements:
+        """The same as `take`: `data[data.marker == 0]`, `data[:90]`."""
+        return self.take(index)
+
+    __iter__ = None  # rows have no form of their own
 
 
 @checked_arguments

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Iterator, KeysView
+from collections.abc import ItemsView, Iterator, KeysView
 from dataclasses import dataclass, field
 from functools import cached_property
 from pathlib import Path
@@ -355,6 +355,12 @@ class Calibration(Result):
         return self.spread.matrix
 
     @property
+    def correlation(self) -> Array:
+        """(determined, determined), ρ of the same parameters: `covariance` over their `std`."""
+        std = np.sqrt(np.diag(self.covariance))
+        return self.covariance / np.outer(std, std)
+
+    @property
     def unsteadiness(self) -> Unsteadiness:
         """What the readings show of the cell's [noise]: `replace(cell, noise=fit.unsteadiness)` is
         a cell whose plans and simulations have it."""
@@ -474,6 +480,14 @@ class Calibration(Result):
     def keys(self) -> KeysView[str]:
         """The parameters' names; with `[]` it makes dict(fit)."""
         return self._by_name.keys()
+
+    def items(self) -> ItemsView[str, Estimate]:
+        """Name and estimate of each parameter."""
+        return self._by_name.items()
+
+    def get(self, name: str, default: Any = None) -> Any:
+        """The estimate of the parameter `name`, else `default`."""
+        return self._by_name.get(name, default)
 
     def _ipython_key_completions_(self) -> list[str]:
         return list(self._by_name)
