@@ -335,6 +335,9 @@ def test_every_option_of_the_packages_is_a_keyword(verb, kind, renamed):
     [
         ("design", {"poses": 0}, "`poses` takes a whole number >= 1; found 0"),
         ("design", {"criterion": "test_poes"}, "`criterion` .*did you mean 'test_pose'"),
+        ("design", {"poses": 1}, r"^poses=1: .*cell\.toml has 5 levels.* ask for 5 poses at least"),
+        ("design", {"curve": [10, 2]}, r"^curve=2: .*cell\.toml has 5 levels"),
+        ("next_poses", {"batch": 2}, r"^batch=2: .*cell\.toml has 5 levels"),
         ("design", {"poses": 3, "target": 1e-5}, "`poses` and `target`: a target"),
         ("design", {"effort": "fast"}, "effort 'fast' is unknown"),
         ("design", {"loads": [[0, 0, 1], [0, 0, 1]]}, "^`loads` repeats a load"),
@@ -364,6 +367,7 @@ def test_every_option_of_the_packages_is_a_keyword(verb, kind, renamed):
 def test_a_wrong_option_is_named_by_its_keyword(verb, options, named, model, fit):
     first = {
         "design": (model,), "identify": (model, "data.csv"), "diagnose": (model, "data.csv"),
+        "next_poses": (model, "data.csv"),
         "simulate": (model, "plan.csv"), "compensate": (fit, TARGETS),
     }[verb]  # fmt: skip
     with pytest.raises(ec.InputError, match=named) as caught:
@@ -385,6 +389,14 @@ def test_a_wrong_option_is_named_by_its_keyword(verb, options, named, model, fit
 def test_a_wrong_argument_is_named(call, named):
     with pytest.raises(ec.InputError, match=named):
         call()
+
+
+def test_a_load_of_another_shape_is_named(fit):
+    for load in ([0, 0], [[0, 0, 1], [0, 0, 2]]):
+        with pytest.raises(ec.InputError, match=r"^`load` takes a force \(3,\) in N, or one"):
+            fit.predict(np.zeros(6), load=load)
+    with pytest.raises(ec.InputError, match=r"^`load` takes"):
+        fit.position(np.zeros(6), load="down")
 
 
 def test_targets_of_another_shape_are_refused(fit):

@@ -172,7 +172,7 @@ def design_request(
     """
     from elastocal.model.effects.catalogue import cell_of
     from elastocal.model.manipulator import Model
-    from elastocal.planning.candidates import read_pins
+    from elastocal.planning.candidates import check_levels, read_pins
     from elastocal.planning.design import DesignOptions
 
     cell = model.cell if isinstance(model, Model) else cell_of(_checked_cell(model))
@@ -182,6 +182,11 @@ def design_request(
         asked["prior"], prior = prior, None
     cell = replace(cell, design=_design_of(cell, asked))
     cell.check()
+    asked_for = [("curve", whole("curve", n)) for n in curve]
+    if asked.get("poses") is not None:
+        asked_for.append(("poses", cell.design.poses or 0))
+    for name, number in asked_for:
+        check_levels(cell, name, number)
     files = (augment, knowledge, keep, strike)
     known = None if all(file is None for file in files) else Model(cell)
     done = None
@@ -203,7 +208,7 @@ def design_request(
         fixed=_names("fixed", fixed),
         prior=_gaussian(prior) if stated is None else stated,
         done=done,
-        curve=tuple(sorted({whole("curve", n) for n in curve})),
+        curve=tuple(sorted({n for name, n in asked_for if name == "curve"})),
         notes=notes,
         pins=pins,
     )

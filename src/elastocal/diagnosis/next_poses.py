@@ -34,6 +34,7 @@ from elastocal.identification.prediction import (
 from elastocal.identification.result import Calibration
 from elastocal.measurements import Measurements
 from elastocal.model.manipulator import Model
+from elastocal.planning.candidates import check_levels
 from elastocal.planning.design import DesignOptions, design
 from elastocal.planning.plan import Gain, Plan
 from elastocal.planning.test_poses import where_used
@@ -108,13 +109,13 @@ def next_poses(
     candidates: int = 400,
     seed: int = 0,
     jobs: int = 1,
-    progress: Progress = lambda message: None,
+    progress: Progress | None = None,
 ) -> NextPoses:
     """Which poses should I measure next, or are these enough?
 
     The data are diagnosed and identified, and effects found join the model.  The next poses make
-    the error at the test poses small.  Enough counts with what the model may lack: with what
-    configurations scatter beyond their noise, as probable as that something unknown is at work.
+    the error at the test poses small.  "Enough" includes possible model error: the scatter beyond
+    noise, times the probability of an unknown effect.
 
     Args:
         model: The model, or a cell, or the path of a cell file.
@@ -145,29 +146,32 @@ def next_poses(
         require is None or require > 0, f"{option('require')} takes an error in m, found {require}"
     )
     check(0 <= least_gain < 1, f"{option('least_gain')} takes a share from 0 to below 1")
+    tell: Progress = progress or (lambda message: None)
     model = model if isinstance(model, Model) else Model(model)
     table = data if isinstance(data, Measurements) else model.read(data)
     model = model.with_markers_of(table)
     required = model.cell.require.new_poses if require is None else require
+    spec = model.cell.design
+    # A joint whose compliance is known at its levels only can be nowhere else.
+    levels = spec.levels or model.cell.model.compliance_levels
+    check_levels(replace(model.cell, design=replace(spec, levels=levels)), "batch", batch)
     why = None
     if len(np.unique(table.configuration)) >= FEWEST:
-        progress("diagnosing")
-        why = diagnose(model, table, DiagnosisOptions(seed), progress)
+        tell("diagnosing")
+        why = diagnose(model, table, DiagnosisOptions(seed), tell)
         model = with_effects_of(model, why)
-    progress("identifying")
+    tell("identifying")
     error, fit = None, None
     with suppress(InsufficientDataError):  # then these are not enough
         fit = identify(model, table)
         error = _error_now(fit, 1.0 if why is None else why.probability_unknown)
-    spec = model.cell.design
     spec = replace(
         spec, poses=batch, per_level=(), target=None, criterion=TEST_POSE, candidates=candidates,
         loads=load_forces(table) if spec.loads is None else spec.loads,
-        # A joint whose compliance is known at its levels only can be nowhere else.
-        levels=spec.levels or model.cell.model.compliance_levels,
+        levels=levels,
     )  # fmt: skip
     cell = replace(model.cell, design=spec)
-    plan = design(cell, DesignOptions("batch", seed, jobs, done=table), progress=progress)
+    plan = design(cell, DesignOptions("batch", seed, jobs, done=table), progress=tell)
     assert plan.gain is not None  # the criterion has test poses
     reached = math.inf if error is None else max(plan.gain.sure, error.sure)
     lacking = 0.0 if error is None else error.lacking or 0.0

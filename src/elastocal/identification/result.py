@@ -13,8 +13,9 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from elastocal.above import Result, headline, write_page
+from elastocal.arguments import checked_arguments
 from elastocal.cell.arm_description import Unsteadiness
-from elastocal.errors import ElastocalError, UnknownNameError
+from elastocal.errors import ElastocalError, UnknownNameError, option, require
 from elastocal.identification import scrutiny
 from elastocal.identification.constrained import ActiveConstraint
 from elastocal.identification.covariance import Covariance
@@ -603,6 +604,7 @@ class Calibration(Result):
         rng = np.random.default_rng(0)
         return excess_of(self.observations, self.residual, self.dof, self.noise, rng)
 
+    @checked_arguments
     def position(
         self, q: ArrayLike, load: ArrayLike | None = None, point: str | None = None
     ) -> Position:
@@ -629,9 +631,16 @@ class Calibration(Result):
             ((1, 3), (1, 3, 3), True)
         """
         model = self.model
+        n, shape = len(model.table(q)), (3,) if load is None else np.shape(load)
+        require(
+            shape in ((3,), (n, 3)),
+            f"{option('load')} takes a force (3,) in N, or one for each pose ({n}, 3); found an "
+            f"array of shape {shape}",
+        )
         tool = CalibratedTool(self.arm, tool_point(model.cell, point))
         return position_at(tool, model.table(q, load), self.noise, self.spread)
 
+    @checked_arguments
     def predict(
         self, q: ArrayLike | Measurements | DataFrame, load: ArrayLike | None = None
     ) -> Array:

@@ -273,7 +273,7 @@ def shares_of(cell: Cell, n_poses: int | None = None) -> IntArray:
     Raises InputError where levels would be left without a pose, or `per_level` contradicts.
     """
     spec = cell.design
-    levels = max(max((len(v) for v in spec.levels.values()), default=1), 1)
+    levels = _levels(cell)
     where = f"{cell.path or cell.name}: [design]"
     if spec.per_level and n_poses is None:
         each = spec.per_level * levels if len(spec.per_level) == 1 else spec.per_level
@@ -289,6 +289,20 @@ def shares_of(cell: Cell, n_poses: int | None = None) -> IntArray:
         "levels",
     )
     return np.array([total // levels + (k < total % levels) for k in range(levels)], dtype=np.int64)
+
+
+def _levels(cell: Cell) -> int:
+    return max(max((len(v) for v in cell.design.levels.values()), default=1), 1)
+
+
+def check_levels(cell: Cell, name: str, poses: int) -> None:
+    """Raise InputError where the option `name` asks for fewer poses than the cell has levels."""
+    levels = _levels(cell)
+    require(
+        not 0 < poses < levels,
+        f"{option(name, poses)}: {cell.path or cell.name} has {levels} levels, each with a pose; "
+        f"ask for {levels} poses at least, or drop levels",
+    )
 
 
 def check_available(cell: Cell, available: IntArray, shares: IntArray) -> None:
