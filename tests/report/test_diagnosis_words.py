@@ -23,15 +23,18 @@ from elastocal.report.diagnosis_view import (
     noise_floor_lines,
     sensitivity,
 )
-from elastocal.report.effect_names import (
-    probability,
-)
+from elastocal.report.effect_names import probability, settings_text
 
 KINDS = ("revolute",) * 6
 
 
 def spoken(d):
     return " ".join(text for _, text in diagnosis_lines(d)) + " ".join(diagnosis_steps(d))
+
+
+def test_a_range_of_angles_has_one_unit():
+    told = settings_text({"curve_low_rad": 0.0, "curve_high_rad": 0.00391, "curve_size_rad": 1e-4})
+    assert told == "from 0° to 0.224°, size 0.100 mrad"
 
 
 def test_the_smallest_effect_that_shows_has_distance_five():

@@ -410,7 +410,9 @@ def _note(calibrated: CalibratedArm, kept: Kept) -> str:
         told += f", at {conditions.time:g} s"
     if kept.fitted and conditions.visits is not None:
         sizes = np.linalg.norm(conditions.visits.force, axis=1)
-        told += f", fitted where it was measured, under {sizes.min():.4g} to {sizes.max():.4g} N"
+        low, high = f"{sizes.min():.4g}", f"{sizes.max():.4g}"
+        span = high if low == high else f"{low} to {high}"
+        told += f", fitted where it was measured, under {span} N"
     return told
 
 

@@ -153,9 +153,6 @@ def reduction(f: FoundEffect) -> str:
     return f"{percent(f.gap_reduction)} ({round(100 * low)} to {percent(high)})"
 
 
-SMALL = 0.01  # rad, below which angles are told in mrad
-
-
 def settings_text(settings: Mapping[str, float], lines: Sequence[float] = ()) -> str:
     """Searched constants with their units: "jump time 12.0 min, ripple order 101"; for want of
     times a moment is one between the `lines` of the table at which visits begin."""
@@ -204,10 +201,10 @@ def _name_and_unit(key: str) -> tuple[str, str]:
 
 
 def setting_value(key: str, value: float) -> str:
-    """A searched constant in the unit that its key ends with: "12.0 min", "0.210 mrad", "5.7°"."""
+    """A searched constant in the unit that its key ends with: "12.0 min", "5.7°"; a size in mrad."""
     unit = _name_and_unit(key)[1]
     if unit == "rad":
-        if "size" in key or 0 < abs(value) < SMALL:
+        if "size" in key:
             return f"{significant(value * 1e3)} mrad"
         return f"{significant(math.degrees(value))}°"
     if unit != "s":
