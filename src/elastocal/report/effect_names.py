@@ -201,7 +201,7 @@ def _name_and_unit(key: str) -> tuple[str, str]:
 
 
 def setting_value(key: str, value: float) -> str:
-    """A searched constant in the unit of its key, "12.0 min" or "5.7°"; a size of angles in mrad."""
+    """A searched constant in the unit of its key, "12.0 min" or "5.7°"; a size in mrad."""
     unit = _name_and_unit(key)[1]
     if unit == "rad":
         if "size" in key:
