@@ -137,7 +137,7 @@ STATES = [[0, 0, 0], [200, 0, -400]]
 def test_a_parameter_beyond_its_bound():
     model = springs()
     truth = with_values(model, {"joint3.compliance": -1e-5})
-    result = identified(model, truth=truth, forces=STATES)
+    result = identified(model, truth=truth, forces=STATES, sigma=20 * SIGMA)
     assert kinds(result) == {"beyond bound"}
     assert text_of(result, "beyond bound").startswith("joint3.compliance = -1")
     assert "check load direction and torque signs" in text_of(result, "beyond bound")

@@ -64,3 +64,25 @@ def test_the_unit_of_the_loads_is_named_with_its_direction(made):
         assert (found.number("ratio") > 1) == larger
         assert mistake in found.remedy and undo in found.remedy
         assert found.remedy in "\n".join(fit.warnings)
+
+
+def test_a_load_in_the_opposite_direction_is_named_and_not_trusted(made):
+    """No spring is negative by many standard deviations, and nothing is hardly shown there."""
+    fit = fitted(made, -1.0)
+    verdict = fit.to_json()["verdict"]
+    assert verdict["tone"] == "poor" and fit.finding("hardly_shown") is None
+    assert "compliance of joints 2, 3, 4, 5 and 6 negative" in verdict["sentence"]
+    assert "most likely the sign of the force columns is wrong" in verdict["sentence"]
+    told = " ".join(str(fit).split())
+    assert "Check the sign of the force columns: where z points up, force_z_N" in told
+    assert "Beyond a physical bound, so without a value (95 %): joint2.compliance (-0.3" in told
+    assert "hardly shown" not in told.lower() and "fit with bounds" not in told
+
+
+def test_a_single_negative_compliance_calls_for_care(made):
+    path, _ = made
+    q = np.random.default_rng(1).uniform(-1, 1, (25, 6)) + [0, -1.2, 1.4, 0, 0, 0]
+    values = VALUES | {"joint4.compliance": -3e-6}
+    fit = ec.identify(path, ec.simulate(path, q, values=values, load=(0, 0, -2000.0), seed=3))
+    assert fit.finding("impossible_values").numbers["parameters"] == ("joint4.compliance",)
+    assert fit.verdict.tone == "care" and "most likely" not in fit.to_json()["verdict"]["sentence"]

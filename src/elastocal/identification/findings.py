@@ -10,6 +10,7 @@ import numpy as np
 from scipy import linalg, special
 
 from elastocal.errors import option
+from elastocal.identification.far_values import STATED_BY_FILE, far_values
 from elastocal.identification.mistakes import CELL, KILOGRAMS, load_ratio
 from elastocal.identification.noise_structure import JOINTS, TIME
 from elastocal.identification.noise_summary import Drift, NoiseSize
@@ -17,17 +18,14 @@ from elastocal.identification.outliers import kept_of
 from elastocal.identification.residuals import ResidualSummary
 from elastocal.identification.result import Calibration, Estimate, Finding, Number, Severity
 from elastocal.identification.solve import Solution
-from elastocal.identification.start import SCALED, linear_fits
 from elastocal.measurements import firsts, numbered
 from elastocal.model.arm import Parameter
 from elastocal.model.effects.catalogue import effect_of
 from elastocal.model.effects.compliances import JointCompliance
-from elastocal.model.effects.gears import JointOffset
-from elastocal.model.effects.placements import LinkGeometry, TrackerDistortion
 from elastocal.text import listed
 
 # Judged once: terminal, page, notebook and JSON print these findings and judge nothing of their
-# own.  A threshold stands here or nowhere.
+# own.  A threshold stands here, or with the values far from nominal.
 
 STATED = (0.005, 0.995)  # quantiles of χ² between which the residual agrees with the stated noise
 # Beside a stated variance of more than twice what the residual shows, an effect as large as all of
@@ -54,7 +52,7 @@ ILL_CONDITIONED = 1e3  # intervals this many times as wide as if each stood alon
 
 # How a parameter stands, in the order in which they are told.
 ALONE, COMBINED, ABSORBED, INVISIBLE, FIXED = "alone", "combined", "absorbed", "invisible", "fixed"
-WEAK = "weak"
+WEAK, BEYOND = "weak", "beyond"
 
 LACKING = (
     "Ask what the model lacks: elastocal diagnose with the same cell and data. Where it finds "
@@ -96,6 +94,7 @@ def judged(result: Calibration, of_solution: tuple[Finding, ...] | None = None) 
     visits = tuple(_visits(result))
     found = [
         *_spoilt(result),
+        *_impossible(result),
         *far_values(result, explained, _lacking(result)),
         *_copies(result),
         *_load_unit(result),
@@ -202,8 +201,52 @@ def _load_unit(result: Calibration) -> Iterator[Finding]:
     )  # fmt: skip
 
 
+# Standard deviations beyond a physical bound, by which no estimate errs by chance.
+SURELY = 5.0
+TURN_ROUND = (
+    "Check the sign of the force columns: where z points up, force_z_N of a hanging load is "
+    "negative. Turn the sign round in the table if it is wrong (torque columns too), and identify "
+    "again."
+)
+AT_BOUND = (
+    "Check load direction and torque signs, measure poses that load it more, or fit with bounds."
+)
+
+
+def impossible(result: Calibration) -> list[tuple[Parameter, Estimate]]:
+    """Those more than SURELY standard deviations beyond a physical bound (of the interval of 95 %,
+    half is 1.96 of them or more)."""
+    return [
+        (p, e)
+        for p, e in zip(result.model.parameters, result.estimates, strict=True)
+        if e.limits is not None
+        and max(p.lower - e.held, e.held - p.upper) > SURELY / 1.96 * np.ptp(e.limits) / 2
+    ]
+
+
+def _impossible(result: Calibration) -> Iterator[Finding]:
+    """Values that no arm has.  Where most compliances are among them, no missing effect explains
+    it, but loads in the opposite direction do, and no load is compensated rightly."""
+    found = impossible(result)
+    if not found:
+        return
+    springs = [p for p in result.model.parameters if p.effect == JointCompliance.name]
+    turned = [p for p, _ in found if p.effect == JointCompliance.name]
+    most = 2 * len(turned) > len(springs) > 0
+    signs = most and result.observations.table.force.any()
+    yield Finding(
+        "impossible_values", "poor" if most else "care",
+        {
+            "parameters": tuple(p.name for p, _ in found),
+            "values": tuple(e.held for _, e in found), "units": tuple(p.unit for p, _ in found),
+            "likely": "the sign of the force columns" if signs else "",
+        },
+        TURN_ROUND if signs else AT_BOUND,
+    )  # fmt: skip
+
+
 def _hardly_shown(result: Calibration) -> Iterator[Finding]:
-    names = tuple(e.name for e in result.ordinary if e.limits is not None)
+    names = tuple(name for name, standing in standings(result).items() if standing == WEAK)
     if names:
         yield Finding(
             "hardly_shown", "note", {"parameters": names},
@@ -523,12 +566,12 @@ def _prior(result: Calibration) -> Iterator[Finding]:
 
 def standings(result: Calibration) -> dict[str, str]:
     """Parameter name → ALONE, COMBINED (first of a combination), ABSORBED, WEAK (hardly shown),
-    INVISIBLE or FIXED."""
+    BEYOND (its physical bound), INVISIBLE or FIXED."""
     first = {next(iter(c.terms)) for c in result.combinations}
 
-    def standing(e: Estimate) -> str:
+    def standing(p: Parameter, e: Estimate) -> str:
         if e.limits is not None:
-            return WEAK
+            return BEYOND if p.beyond(e.limits) else WEAK
         if e.identifiable:
             return ALONE
         if e.name in first:
@@ -537,7 +580,8 @@ def standings(result: Calibration) -> dict[str, str]:
             return ABSORBED
         return FIXED if e.note.startswith("fixed") else INVISIBLE
 
-    return {e.name: standing(e) for e in result.estimates}
+    pairs = zip(result.model.parameters, result.estimates, strict=True)
+    return {p.name: standing(p, e) for p, e in pairs}
 
 
 def _shape(result: Calibration) -> Iterator[Finding]:
@@ -628,8 +672,9 @@ def _conditioning(result: Calibration, solution: Solution) -> Iterator[Finding]:
 
 def _bounds(result: Calibration) -> Iterator[Finding]:
     at = {name: k for k, name in enumerate(result.determined)}
+    told = {p.name for p, _ in impossible(result)}
     for e, p in zip(result.estimates, result.model.parameters, strict=True):
-        if e.limits is None or not (e.limits[1] < p.lower or e.limits[0] > p.upper):
+        if e.limits is None or not p.beyond(e.limits) or p.name in told:
             continue
         std = float(np.sqrt(result.covariance[at[e.name], at[e.name]]))
         yield Finding(
@@ -638,108 +683,8 @@ def _bounds(result: Calibration) -> Iterator[Finding]:
                 "parameter": e.name, "unit": e.unit,
                 "bound": p.lower if e.held <= p.lower else p.upper, "value": e.held, "std": std,
             },
-            "Check load direction and torque signs, measure poses that load it more, or fit "
-            "with bounds.",
+            AT_BOUND,
         )  # fmt: skip
-
-
-# Values far from nominal: a joint to remaster, a robot file of another arm, a missing effect.
-#
-# How large a value is says nothing by itself.  Where the noise explains what is left and held-out
-# poses agree, the value is what the arm has; where much is left, a value that no arm has stands in
-# for what the model lacks.
-
-LARGEST = 0.5  # beyond it the points hardly move, as of a tip that touches one, or do so otherwise
-NEARLY = 0.1  # share of the square that a scale leaves of what it explains
-SOME = 400  # readings that are enough for it
-FEWEST_POSES = 8
-FAR = 10.0  # typical deviations from nominal, beyond which an arm that works has no parameter
-# What the nominal arm states and a first cell fits.  Base and markers are guesses, and any other
-# effect is in the cell because someone named it: their sizes are findings, no evidence.
-STATED_BY_FILE = (JointOffset.name, LinkGeometry.name, JointCompliance.name)
-
-
-def far_values(result: Calibration, explained: bool, lacking: str) -> Iterator[Finding]:
-    """Values whose interval leaves nominal out, and which lie more than FAR typical deviations off.
-
-    `explained`: the noise explains the residual, and held-out poses agree; else such values are
-    doubted with the remedy `lacking`.
-    """
-    half = _half_widths(result)
-    zeros: list[tuple[Parameter, float]] = []
-    others: list[tuple[Parameter, float]] = []
-    sizes: dict[str, float] = {}
-    for p, value in zip(result.model.parameters, result.x, strict=True):
-        if p.effect not in STATED_BY_FILE or not p.typical or p.name not in half:
-            continue
-        off = float(value) - p.nominal
-        if abs(off) > max(FAR * p.typical, half[p.name]):
-            sizes[p.name] = abs(off) / p.typical
-            (zeros if p.effect == JointOffset.name else others).append((p, off))
-    if zeros:
-        told = [f"{p.where.replace('joint', 'joint ')} is off by {_size(off, p.unit)} (known to "
-                f"{_size(half[p.name], p.unit)})" for p, off in zeros]  # fmt: skip
-        yield Finding(
-            "joint_zero", "note",
-            {
-                "joints": tuple(p.where for p, _ in zeros), "values": tuple(v for _, v in zeros),
-                "units": tuple(p.unit for p, _ in zeros),
-                "ci95_half": tuple(half[p.name] for p, _ in zeros),
-            },
-            f"The zero of {listed(told)}: remaster it, or command the arm by this calibration.",
-        )  # fmt: skip
-    scale = scale_of(result)
-    if scale is not None:
-        yield Finding(
-            "scale", "care", {"readings_over_file": scale},
-            f"Look for what scales the readings: the size stated of a tag or scale bar, or a unit. "
-            f"Multiplied by {1 / scale:.4g} they have the lengths of the robot's file.",
-        )  # fmt: skip
-        return
-    others.sort(key=lambda found: -sizes[found[0].name])
-    if others:
-        told = [f"{p.name} by {_size(off, p.unit)} ({_size(half[p.name], p.unit)})"
-                for p, off in others]  # fmt: skip
-        yield Finding(
-            "far_from_nominal" if explained else "unheard_of", "note" if explained else "care",
-            {
-                "parameters": tuple(p.name for p, _ in others),
-                "typical_sizes": tuple(sizes[p.name] for p, _ in others),
-                "values": tuple(float(v) + p.nominal for p, v in others),
-                "units": tuple(p.unit for p, _ in others),
-                "readings_set_apart": len(result.excluded),
-            },
-            "The arm is not the one of the robot's file: compare its lengths and angles with the "
-            f"data sheet (off, and known to: {listed(told, 3)})."
-            if explained
-            else lacking,
-        )  # fmt: skip
-
-
-def scale_of(result: Calibration) -> float | None:
-    """By what factor all lengths that were read exceed those of the nominal arm; None where no such
-    scale shows.
-
-    The linear map A of the readings onto the nominal arm is a rotation with a scale where that is
-    wrong.  One that takes nine tenths of the square away, differs less between directions than from
-    one, and is larger than any arm's lengths err together, is one of the readings.
-    """
-    table = result.observations.table
-    own = any(p.effect == TrackerDistortion.name for p in result.model.parameters)
-    if table.position is None or own or len(np.unique(table.q, axis=0)) < FEWEST_POSES:
-        return None
-    extent = float(np.linalg.norm(np.ptp(table.position, axis=0)))
-    if not SCALED * extent / 10 < result.nominal_rms < math.inf:
-        return None
-    table = table.take(result.observations.lead[:: max(len(result.observations.lead) // SOME, 1)])
-    flange = result.model.rigid.flange_poses(table)
-    found = linear_fits(flange[None], np.asarray(table.position), table.marker)
-    if not 3 * found.left[0] ** 2 < NEARLY * result.nominal_rms**2:
-        return None
-    size = np.linalg.svd(found.matrix[0], compute_uv=False)
-    off = abs(float(found.scale[0]) - 1)
-    alike = found.determinant[0] > 0 and size[0] - size[-1] < off
-    return 1 / float(found.scale[0]) if alike and SCALED < off < LARGEST else None
 
 
 def only_placed(result: Calibration) -> bool:
@@ -749,18 +694,3 @@ def only_placed(result: Calibration) -> bool:
         effect_of(p.effect).registered or e.note.startswith("fixed")
         for p, e in zip(result.model.parameters, result.estimates, strict=True)
     )
-
-
-def _half_widths(result: Calibration) -> dict[str, float]:
-    """Half the 95 % interval of each value that was determined, alone or in a sum."""
-    ends = {e.name: e.ci95 for e in result.estimates if e.ci95 is not None}
-    ends |= {next(iter(c.terms)): c.ci95 for c in result.combinations}
-    return {name: (high - low) / 2 for name, (low, high) in ends.items()}
-
-
-def _size(value: float, unit: str) -> str:
-    """A length in mm, an angle in degrees, as mastering has them."""
-    number, unit = {"m": (value * 1e3, " mm"), "rad": (math.degrees(value), "°")}.get(
-        unit, (value, f" {unit}")
-    )
-    return f"{abs(number):.{2 if abs(number) < 10 else 3}g}{unit}"

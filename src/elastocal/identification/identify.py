@@ -381,7 +381,7 @@ def _estimates(
             note = "held: known only together with " + ", ".join(partners[int(d)])
         found[int(d)] = estimate(d, combined_with=tuple(partners[int(d)]), note=note)
     for i, limits in method.limits.items():
-        found[i] = estimate(i, limits=limits, note=_hardly_shown(model.parameters[i], x[i]))
+        found[i] = estimate(i, limits=limits, note=_not_stated(model.parameters[i], x[i], limits))
     for i in range(len(model.parameters)):
         if i not in found:
             zero = i in left_out
@@ -389,8 +389,10 @@ def _estimates(
     return tuple(found[i] for i in range(len(model.parameters))), tuple(combinations)
 
 
-def _hardly_shown(p: Parameter, held: float) -> str:
+def _not_stated(p: Parameter, held: float, limits: tuple[float, float]) -> str:
     """Why the readings' value of a parameter is not stated."""
+    if p.beyond(limits):
+        return f"beyond its physical bound {p.lower if held < p.lower else p.upper:g}"
     if held == p.nominal and held != 0:
         return "held at its nominal value: the readings hardly show it"
     return f"the readings do not tell it from {p.lower if held < p.upper else p.upper:g}"

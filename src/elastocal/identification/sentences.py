@@ -16,6 +16,10 @@ SENTENCES = {
         "{copies} readings repeat others to the last digit (lines {lines}) and were excluded: "
         "copies add no information and make intervals too narrow. {remedy}"
     ),
+    "impossible_values": (
+        "Impossible values: {parameters} beyond a physical bound by more than 5 standard "
+        "deviations."
+    ),
     "load_unit": "{remedy}",
     "scatter_not_counted": "{remedy}",
     "not_converged": "The fit did not converge: {reason}. {remedy}",

@@ -77,6 +77,10 @@ class Parameter(ParameterSpec):
     effect: str
     where: str
 
+    def beyond(self, interval: tuple[float, float]) -> bool:
+        """Whether all of an interval lies beyond a physical bound."""
+        return interval[1] < self.lower or interval[0] > self.upper
+
 
 # What a parameter of unknown typical size moves the readings by, rms in m.
 UNSIZED_SIGNAL = 2e-4

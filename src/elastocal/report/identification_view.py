@@ -14,6 +14,7 @@ from elastocal.identification.error_budget import ErrorBudget, gap_budget
 from elastocal.identification.findings import (
     ABSORBED,
     ALONE,
+    BEYOND,
     COMBINED,
     FIXED,
     INVISIBLE,
@@ -261,7 +262,7 @@ def what_was_identified(result: Calibration) -> str:
             f"({absorbed} held in exchange)"
         )
     told = {
-        WEAK: "hardly shown",
+        **NO_VALUE,
         INVISIBLE: "not visible in these data",
         FIXED: "fixed by the user",
     }
@@ -436,17 +437,23 @@ def why_without(result: Calibration, e: Estimate) -> str:
         several = len(e.combined_with) - 3
         names = ", ".join(printable(n) for n in e.combined_with[:3])
         return f"held: absorbed in {names}" + (f" + {several} more" if several > 0 else "")
-    if standing == WEAK:
-        return f"hardly shown: {limits(result, e)}"
+    if standing in (WEAK, BEYOND):
+        return f"{NO_VALUE[standing]}: {limits(result, e)}"
     if standing == INVISIBLE:
         return "held: not visible in these data"
     return "fixed by the user" if standing == FIXED else printable(e.note)
 
 
+NO_VALUE = {WEAK: "hardly shown", BEYOND: "beyond a physical bound"}
+
+
 def limits(result: Calibration, e: Estimate) -> str:
-    """What the readings say of a parameter that they hardly show, and what the model uses."""
+    """What the readings say of a parameter that has no value for it, and what the model uses."""
     assert e.limits is not None
     p = result.model.parameters[result.model.names.index(e.name)]
+    if p.beyond(e.limits):
+        value, half, unit = estimate(e.held, (e.limits[1] - e.limits[0]) / 2, e.unit)
+        return f"{value} ± {half} {unit}"
     low, high = (significant(display(end, e.unit)[0], 2) for end in e.limits)
     held, unit = display(e.held, e.unit)
     text = f"{low} to {high} {unit}"
@@ -488,11 +495,15 @@ def nominal_known(result: Calibration, name: str) -> bool:
 
 def undetermined_lines(result: Calibration, most: int | None = None) -> list[str]:
     """Which parameters have no number of their own, and why, one line per reason; `most` names."""
-    weak = [
-        f"{printable(e.name)} ({limits(result, e)})"
-        for e in result.ordinary
-        if e.limits is not None
-    ]
+    standing = standings(result)
+    limited = {
+        f"{why}, so without a value (95 %)": [
+            f"{printable(e.name)} ({limits(result, e)})"
+            for e in result.ordinary
+            if standing[e.name] == kind
+        ]
+        for kind, why in NO_VALUE.items()
+    }
     invisible, absorbed, fixed = (names_of(result, s) for s in (INVISIBLE, ABSORBED, FIXED))
     extra = {printable(name) for name in result.left.redundant} if result.left else set()
     held = {
@@ -502,8 +513,7 @@ def undetermined_lines(result: Calibration, most: int | None = None) -> list[str
             n for n in (*invisible, *absorbed) if n in extra
         ],
     }
-    found = {"hardly shown, so without a value (95 %)": weak}
-    found |= {f"{_held_where(result, names)}{why}": names for why, names in held.items()}
+    found = limited | {f"{_held_where(result, names)}{why}": names for why, names in held.items()}
     found["fixed by the user"] = fixed
     return [f"{why}: {listed(n, most or len(n))}" for why, n in found.items() if n]
 

@@ -21,7 +21,7 @@ from elastocal.identification.sentences import next_steps
 from elastocal.model.observations import available_noise
 from elastocal.report.blocks import ShownTable, Tone
 from elastocal.report.formatting import counted, display, estimate, length, plain, significant
-from elastocal.text import listed, printable
+from elastocal.text import gathered, listed, printable
 
 
 @dataclass(frozen=True)
@@ -54,7 +54,7 @@ def judgement(result: Calibration) -> Judgement:
 
 def warnings_beside(result: Calibration) -> list[str]:
     """The warnings that say more than the verdict, what to do next and the line on noise."""
-    told = {"residual_above_stated_noise", "scatter_not_counted"}
+    told = {"residual_above_stated_noise", "scatter_not_counted", "impossible_values"}
     said = {f.kind for f in result.verdict.missing} & told
     return [printable(str(w)) for w in result.warnings if getattr(w, "kind", "") not in said]
 
@@ -94,6 +94,7 @@ DOUBTS: dict[str, Callable[[Finding], str]] = {
         f"the compliances are {significant(f.number('ratio'), 2)} times those expected from "
         f"{f.numbers['by']}: the loads may be in another unit"
     ),
+    "impossible_values": lambda f: _impossible(f),
     "scatter_not_counted": lambda f: (
         "residuals scatter between visits, or drift, beyond the noise model"
     ),
@@ -140,6 +141,17 @@ DOUBTS: dict[str, Callable[[Finding], str]] = {
         f"{_length(f, 'fitted_std_um')} at measured ones)"
     ),
 }
+
+
+def _impossible(f: Finding) -> str:
+    """ "impossible values: compliance of joints 2 and 3 negative (-0.3, …); most likely …" """
+    values = [float(v) for v in f.listed("values")]
+    shown = [" ".join((significant(number), unit)) for number, unit in
+             map(display, values, map(str, f.listed("units")))]  # fmt: skip
+    how = "negative" if max(values) < 0 else "beyond the physical bound"
+    named = printable(gathered(map(str, f.listed("parameters"))))
+    likely = f"; most likely {f.numbers['likely']} is wrong" if f.numbers["likely"] else ""
+    return f"impossible values: {named} {how} ({listed(shown, 4)}){likely}"
 
 
 def _unheard_of(f: Finding) -> str:
