@@ -119,3 +119,26 @@ def test_a_softer_joint_is_seen_under_the_loads_of_the_campaigns(folder):
     assert found["tool"]["rms_um"] > 10 * found["tool"]["by_chance_rms_um"] > 0
     arms = [ec.read_calibrated("soft.toml", f"soft{k}.json") for k in (0, 1)]
     assert ec.compare(*arms, load=[0, 0, 0]).distance.max() < 1e-6
+
+
+@pytest.mark.parametrize("columns", [60, 80, 100])
+def test_no_column_of_the_table_is_cut(folder, monkeypatch, columns):
+    monkeypatch.setenv("COLUMNS", str(columns))
+    code, out, _ = run("cell.toml", "old.json", "bent.json")
+    (row,) = (line for line in out.splitlines() if line.startswith(f" {BENT}"))
+    assert code == 0 and row.rstrip().endswith(" changed") and len(row.rstrip()) <= columns
+
+
+def test_all_that_only_one_of_both_determines_is_named_at_once(folder):
+    model = ec.Model("cell.toml")
+    q = np.random.default_rng(1).uniform(-1.4, 1.0, (24, 6))
+    for name, fixed in (("first", ["link3", "link5.dx"]), ("second", ["link1", "link2", "link4"])):
+        ec.identify(model, ec.simulate(model, q, seed=3), fixed=fixed).save(f"{name}.json")
+    code, _, err = run("cell.toml", "first.json", "second.json")
+    assert code == 2
+    one, other = (f"{a}.json does not determine what {b}.json does: " for a, b in
+                  (("first", "second"), ("second", "first")))  # fmt: skip
+    told = " ".join(err.split()).partition("; identify both with these held (--fix)")[0]
+    first, second = told.partition(one)[2].split(f"; {other}")
+    assert first.startswith("link3.") and second.startswith("link1.")
+    assert second.count(",") == 4 and second.endswith(" more)")

@@ -26,7 +26,7 @@ from scipy import special
 from elastocal.above import Result
 from elastocal.arguments import checked_arguments
 from elastocal.cell.arm_description import Tool
-from elastocal.errors import InputError, InsufficientDataError, option, require
+from elastocal.errors import InsufficientDataError, option, require
 from elastocal.identification.result import Calibration
 from elastocal.measurements import Measurements
 from elastocal.model.arm import given_force
@@ -41,6 +41,7 @@ from elastocal.model.calibrated import (
 )
 from elastocal.model.effects.catalogue import CATALOGUE
 from elastocal.model.manipulator import Model
+from elastocal.text import listed
 from elastocal.units import Array
 
 SCHEMA = "elastocal/comparison/1"
@@ -49,6 +50,7 @@ SAME_SPACE = 1e-6  # of a column of B that others should hold
 RANK = 1e-9
 CENTRAL = 0.95
 POINT = "tool"
+NAMED = 4  # parameters in a message
 MOST_POSES = 100_000
 
 
@@ -334,9 +336,19 @@ def _difference(
         tables = [replace(t, marker_names=marked) for t in tables]
     B = np.vstack([before.model.regressor(t, x).B for t in tables])
     index = {name: k for k, name in enumerate(before.model.names)}
-    onto = _spanned(B, before.model.names, known, old, new)
     fitted = [n for n in before.model.names if n in new.determined]
-    _spanned(B, before.model.names, fitted, new, old)
+    onto, beyond = _spanned(B, before.model.names, known, fitted)
+    _, beyond_new = _spanned(B, before.model.names, fitted, known)
+    told = [
+        f"{by.source} does not determine what {other.source} does: {listed(hidden, NAMED)}"
+        for by, other, hidden in ((old, new, beyond), (new, old, beyond_new))
+        if hidden
+    ]
+    require(
+        not told,
+        f"{'; '.join(told)}; identify both with these held ({option('fixed')}), or from poses and "
+        "loads that show them in both",
+    )
     d = after.x - before.x
     M = onto[:, [index[n] for n in fitted]]
     V = _covariance(old, known) + M @ _covariance(new, fitted) @ M.T
@@ -345,13 +357,12 @@ def _difference(
 
 
 def _spanned(
-    B: Array, names: Sequence[str], basis: list[str], by: CalibratedArm, other: CalibratedArm
-) -> Array:
-    """M (basis, parameters) with B = B[:, basis] M for what the `other` campaign determined.
+    B: Array, names: Sequence[str], basis: list[str], wanted: list[str]
+) -> tuple[Array, list[str]]:
+    """M (basis, parameters) with B = B[:, basis] M, and which of the `wanted` it does not hold for.
 
-    `names` are those of B's columns, `basis` those of them that the campaign `by` determined.
-
-    Raises InputError where `by` has not determined all of that.
+    `names` are those of B's columns, `basis` those of them that a campaign determined, `wanted`
+    those that the other one did.
     """
     place = {name: k for k, name in enumerate(names)}
     chosen = B[:, [place[name] for name in basis]]
@@ -360,14 +371,8 @@ def _spanned(
     onto = np.linalg.pinv(chosen / scale, rcond=RANK) / scale[:, None] @ B
     whole = np.maximum(np.linalg.norm(B, axis=0), np.finfo(float).tiny)
     rest = np.linalg.norm(B - chosen @ onto, axis=0) / whole
-    wanted = [n for n in names if n in other.determined and n not in by.determined]
-    if hidden := [n for n in wanted if rest[place[n]] > SAME_SPACE]:
-        raise InputError(
-            f"{by.source} does not determine what {other.source} does: {', '.join(hidden[:4])}"
-            f"{' …' if len(hidden) > 4 else ''}; identify both with these held "
-            f"({option('fixed')}), or from poses and loads that show them in both"
-        )
-    return np.asarray(onto)
+    hidden = [n for n in wanted if n not in basis and rest[place[n]] > SAME_SPACE]
+    return np.asarray(onto), hidden
 
 
 def _tested(

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Iterator, Sequence
+from dataclasses import replace
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
@@ -144,7 +145,8 @@ def _change_table(c: Comparison) -> ShownTable:
         "tool: rms over the poses, by this change alone."
     )
     table = ShownTable(heads, rows, (0, 5, 8), title="Parameter by parameter", note=note)
-    return table.when_narrow(1, 2)
+    narrower = table.without(1, 2).when_narrow(2, 4)
+    return replace(table, narrow=narrower)
 
 
 def _moves(c: Comparison) -> Figure:

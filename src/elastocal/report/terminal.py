@@ -118,12 +118,15 @@ def _shown(console: Console, block: Block) -> Iterable[RenderableType]:
         yield Text(printable(block.text), style="dim" if block.soft else "")
     elif isinstance(block, ShownTable) and block.rows:
         shown, room = block, console.options.update(max_width=WIDEST)
+        marked = "" in shown.heads  # by a last column, which is cut unless the others give way
         while True:
-            table = table_of(shown)
+            table = table_of(shown, tight=marked)
             least = Measurement.get(console, room, table).minimum
             if shown.narrow is None or least <= console.width:
                 break
             shown = shown.narrow
+        if Measurement.get(console, room, wide := table_of(shown)).maximum <= console.width:
+            table = wide
         yield table
         if block.note:
             yield Text(printable(block.note), style="dim")
@@ -138,19 +141,20 @@ STYLES = {"inside": "green", "outside": "bold red", "changed": "bold yellow"}
 LONGEST_WHOLE = 28  # letters; a longer name breaks where its column ends
 
 
-def table_of(shown: ShownTable) -> Table:
+def table_of(shown: ShownTable, tight: bool = False) -> Table:
     """For the terminal: under its title, with a rule below its heads and no frame; words to the
-    left, numbers to the right."""
+    left, numbers to the right.  `tight`: only what is longer than a word gives way, and heads."""
     table = Table(title=shown.title or None, title_justify="left", title_style="bold",
                       box=SIMPLE_HEAD, pad_edge=False, collapse_padding=True)  # fmt: skip
     for k, head in enumerate(shown.heads):
-        words = k in shown.words
-        least = None
-        if words and (not k or head == "unit"):
-            longest = max((len(w) for row in shown.rows for w in row[k].split()), default=0)
-            least = longest if longest <= LONGEST_WHOLE else None
-        table.add_column(head, justify="left" if words else "right", min_width=least,
-                         overflow="fold")  # fmt: skip
+        words, cells = k in shown.words, [row[k] for row in shown.rows]
+        longest = max((len(w) for text in (head, *cells) for w in text.split()), default=0)
+        longest = longest if words else max([longest, *map(len, cells)])
+        whole = words and longest <= LONGEST_WHOLE and (not k or head in ("unit", ""))
+        gives_way = words and any(" " in cell for cell in cells)
+        table.add_column(head, justify="left" if words else "right", overflow="fold",
+                         min_width=longest if whole else None,
+                         width=longest if tight and not gives_way else None)  # fmt: skip
     for row in shown.rows:
         table.add_row(*(Text(printable(cell), STYLES.get(cell, "")) for cell in row))
     return table
