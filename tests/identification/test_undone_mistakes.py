@@ -136,6 +136,15 @@ def test_one_scale_of_all_lengths_is_named_and_not_trusted(tmp_path, effects, fa
     assert not fit.verdict.trusted and "a scale error" in fit.to_json()["verdict"]["sentence"]
 
 
+def test_the_cell_of_another_robot_is_named_before_a_scale(tmp_path):
+    """No target is wrong by a third: the arm of the cell is another one."""
+    path = cell(tmp_path)
+    table = ec.simulate(path, poses(40, 3), draw=0.1, seed=4)
+    fit = ec.identify(path, replace(table, position=1.35 * table.position))
+    assert "most likely the cell describes another robot" in fit.to_json()["verdict"]["sentence"]
+    assert fit.finding("scale").remedy.startswith("Check that the cell describes the robot")
+
+
 def test_a_longer_link_is_no_scale(tmp_path):
     path = cell(tmp_path)
     fit = ec.identify(path, ec.simulate(path, poses(40, 3), values={"link2.dx": 0.02}, seed=4))

@@ -8,7 +8,7 @@ from collections.abc import Iterator
 import numpy as np
 
 from elastocal.identification.result import Calibration, Finding
-from elastocal.identification.start import SCALED, linear_fits
+from elastocal.identification.start import OF_A_TARGET, SCALED, linear_fits
 from elastocal.model.arm import Parameter
 from elastocal.model.effects.compliances import JointCompliance
 from elastocal.model.effects.gears import JointOffset
@@ -60,10 +60,15 @@ def far_values(result: Calibration, explained: bool, lacking: str) -> Iterator[F
         )  # fmt: skip
     scale = scale_of(result)
     if scale is not None:
+        other = abs(scale - 1) > OF_A_TARGET
         yield Finding(
-            "scale", "care", {"readings_over_file": scale},
-            f"Look for what scales the readings: the size stated of a tag or scale bar, or a unit. "
-            f"Multiplied by {1 / scale:.4g} they have the lengths of the robot's file.",
+            "scale", "care",
+            {"readings_over_file": scale, "likely": "another robot" if other else "a scale error"},
+            "Check that the cell describes the robot that was measured ([robot]): no target or "
+            "scale bar is wrong by so much."
+            if other
+            else "Look for what scales the readings: the size stated of a tag or scale bar, or a "
+            f"unit. Multiplied by {1 / scale:.4g} they have the lengths of the robot's file.",
         )  # fmt: skip
         return
     others.sort(key=lambda found: -sizes[found[0].name])

@@ -92,12 +92,15 @@ def judged(result: Calibration, of_solution: tuple[Finding, ...] | None = None) 
     noise = (*_against_stated_noise(result), *_repeats(result))
     explained = _explained(result, {f.kind for f in noise})
     visits = tuple(_visits(result))
+    far = tuple(far_values(result, explained, _lacking(result)))
+    # Where all lengths are others than the cell's, so are the compliances to expect.
+    scaled = any(f.kind == "scale" for f in far)
     found = [
         *_spoilt(result),
         *_impossible(result),
-        *far_values(result, explained, _lacking(result)),
+        *far,
         *_copies(result),
-        *_load_unit(result),
+        *(() if scaled else _load_unit(result)),
         *_hardly_shown(result),
         *(f for f in visits if f.kind == "scatter_not_counted"),
         *_alike_in_time(result, explained),

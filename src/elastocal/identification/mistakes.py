@@ -17,6 +17,7 @@ from elastocal.cell.arm_description import ModelSpec, Tool
 from elastocal.cell.work_cell import Cell
 from elastocal.errors import InsufficientDataError
 from elastocal.identification.start import (
+    OF_A_TARGET,
     SCALED,
     LinearFits,
     Registration,
@@ -387,12 +388,14 @@ def _of_positions(
     if unit is not None:
         return position * unit[0], [f"if positions were {unit[1]}", *words]
     if abs(scale - 1) > SCALED:
-        words.append(f"with all positions {scale:.4g} times as far apart ({SCALE})")
+        cause = ANOTHER if abs(scale - 1) > OF_A_TARGET else SCALE
+        words.append(f"with all positions {scale:.4g} times as far apart ({cause})")
         return position * scale, words
     return position, words
 
 
 SCALE = "one scale of all lengths, as of a tag, a scale bar or a unit of another size"
+ANOTHER = f"most likely the cell describes another robot, else {SCALE}"
 
 
 def _slipped_words(table: Measurements, found: Slipped) -> str:

@@ -22,6 +22,8 @@ from elastocal.units import Array, BoolArray, IntArray
 UNSKEWED = 1.25  # largest over smallest singular value of an A that may be a rotation and a scale
 TOGETHER = 2**18  # rows at a time
 DIGITS = 1e-12
+# A tag, a target or a scale bar is wrong by a few per cent at most; another robot by any factor.
+OF_A_TARGET = 0.05
 SCALED = 0.005  # no arm's lengths are this far off together, relatively: the readings' are
 
 

@@ -104,7 +104,12 @@ DOUBTS: dict[str, Callable[[Finding], str]] = {
     ),
     "scale": lambda f: (
         f"all measured lengths are {significant(f.number('readings_over_file'), 4)} times those of "
-        "the robot's file: a scale error, as of a target or unit of another size"
+        "the robot's file: "
+        + (
+            "most likely the cell describes another robot"
+            if f.numbers["likely"] == "another robot"
+            else "a scale error, as of a target or unit of another size"
+        )
     ),
     "unheard_of": lambda f: _unheard_of(f),
     "little_gain": lambda f: "the error is hardly smaller than that of the nominal arm",
