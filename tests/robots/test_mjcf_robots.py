@@ -108,7 +108,7 @@ def test_a_missing_mesh_is_named_and_only_its_bodies_lose_their_mass(tmp_path):
     )
     head = '<asset><mesh name="x" file="x.stl"/></asset>'
     code, out, err = told_by_init(arm(tmp_path, head=head, at_end=fingers))
-    assert code == 0 and "x.stl is not there, which would state the mass of f1, f2" in out, err
+    assert code == 0 and "x.stl is missing, which would state the mass of f1, f2" in out, err
     chain = ec.Model(str(tmp_path / "cell.toml")).chain
     assert [body.mass for body in chain.masses][-1] == 4.0
 

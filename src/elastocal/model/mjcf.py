@@ -311,11 +311,12 @@ class MjcfArm:
         common = [b for b in (ends[0] if ends else []) if all(b in way for way in ends)]
         moved = sum(len(self.joints_of(b)) for b in common)
         if moved < MIN_JOINTS:
-            told = listed(model.body(way[-1]).name or f"body {way[-1]}" for way in ends) or "none"
+            most_of = [model.body(way[-1]).name or f"body {way[-1]}" for way in ends]
+            have = "have" if len(most_of) > 1 else "has"
+            told = f"; {listed(most_of)} {have} the most joints" if most_of else ""
             raise InputError(
                 f"{self.path}: no single arm of {MIN_JOINTS} joints or more is found below "
-                f"'{model.body(self.base).name}'; the bodies with the most joints are {told}. Name "
-                "base and flange, a body or a site"
+                f"'{model.body(self.base).name}'{told}. Name base and flange, a body or a site"
             )
         # Fingers of unequal length, as a thumb has: no body is common to those with most joints.
         for body in common[:-1]:
@@ -483,8 +484,11 @@ def _compiled(path: Path, spec: Any) -> tuple[Any, frozenset[int], list[str]]:
         unweighed = frozenset(b.id for b in open_)
         if unweighed:
             names = listed((b.name or f"body {b.id}" for b in open_), 4)
-            files = listed(missing.values(), 3) or "meshes that MuJoCo cannot read"
-            notes.append(f"{files} is not there, which would state the mass of {names}: taken as 0")
+            files = listed(missing.values(), 3) or "meshes that MuJoCo can read"
+            lack = "is" if len(missing) == 1 else "are"
+            notes.append(
+                f"{files} {lack} missing, which would state the mass of {names}: taken as 0"
+            )
         return model, unweighed, notes
     raise InputError(f"{path}: MuJoCo cannot read it: {_sentence(first or ValueError())}")
 
@@ -632,9 +636,11 @@ def _check_values(arm: Any, ties: list[Tie]) -> None:
         # joint1 of <joint> follows joint2, as a mimic does in a URDF.
         follows = [tie for tie in members if tie.kind == "joint" and tie.joints[0] in own]
         bound = names & own and len(members) > len(names - own)
+        coupled, several = sorted(names & own), len(names & own) > 1
         require(
             not follows and not bound,
-            f"{arm.path}: joint {listed(repr(n) for n in sorted(names & own))} is coupled by "
+            f"{arm.path}: joint{'s' * several} {listed(map(repr, coupled))} "
+            f"{'are' if several else 'is'} coupled by "
             f"{listed(map(str, follows or members))}; coupled joints are not supported between "
             "base and flange, remove the constraint or choose another flange",
         )

@@ -198,7 +198,8 @@ def urdf_bodies(cell: Cell, chain: Chain) -> list[tuple[Solid, int]]:
         )
     except Exception as error:  # missing files and unreadable ones alike
         raise InputError(
-            f"{where}: {path}: {' '.join(str(error).split())}; put the mesh files where the URDF "
+            f"{where}: {path}: {' '.join(str(error).split()).rstrip('.')}; put the mesh files "
+            "where the URDF "
             "looks for them (beside it, or in a package directory above it), or give "
             "link_radius_mm instead"
         ) from None
