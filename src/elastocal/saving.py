@@ -195,6 +195,7 @@ def wish_of(
         seed=seed,
         load_stated=force is not None,
         correct_joints=correct_joints,
+        folder=path.parent,
     )
 
 

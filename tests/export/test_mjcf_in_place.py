@@ -5,7 +5,9 @@ import numpy as np
 import pytest
 from support.exports import GEOMETRY, LOAD, SPRINGS, exported, poses_of, write_result
 from support.mjcf_text import ARM, LOADABLE, write_arm
+from typer.testing import CliRunner
 
+from elastocal.cli.main import app
 from elastocal.export.exportable import evaluate_pieces, keep
 from elastocal.model.calibrated import Conditions
 from elastocal.model.mjcf import MjcfArm
@@ -79,7 +81,31 @@ def test_meshes_need_not_be_there(tmp_path):
     _, done = corrected(tmp_path, 'base = "foot"', GEOMETRY, text=ARM)
     assert done.checked is not None and done.checked < MICROMETRE
     assert '<mesh name="hull" file="hull.stl"/>' in done.text
-    assert any("keep it in the folder of arm.xml" in w for w in done.warnings)
+    assert any("named relative to the file" in w for w in done.warnings)
+
+
+TETRAHEDRON = "v 0 0 0\nv 1 0 0\nv 0 1 0\nv 0 0 1\nf 1 3 2\nf 1 2 4\nf 1 4 3\nf 2 3 4\n"
+STATED = ' meshdir="nowhere"'
+
+
+@pytest.mark.parametrize("places", [STATED, ' assetdir="nowhere"', "", "no compiler"])
+def test_a_file_written_elsewhere_finds_its_meshes_from_there(places, tmp_path):
+    (model := tmp_path / "model").mkdir()
+    (out := tmp_path / "out" / "deep").mkdir(parents=True)
+    text = ARM.replace("hull.stl", "hull.obj").replace(STATED, places)
+    if places == "no compiler":
+        text = text.replace('<compiler angle="degree" eulerseq="zyx"no compiler/>', "")
+    place = model / "nowhere" if "nowhere" in places else model
+    place.mkdir(exist_ok=True)
+    (place / "hull.obj").write_text(TETRAHEDRON)
+    write_arm(model, text)
+    cell, result = write_result(model, 'mjcf = "arm.xml"\nbase = "foot"', GEOMETRY)
+    for folder in (model, out):
+        words = ["export", cell, result, "-o", folder / "new.xml", "--poses", "5", "-q"]
+        done = CliRunner().invoke(app, [*map(str, words)], env={"COLUMNS": "300"})
+        assert done.exit_code == 0 and "named relative to the file" in done.output, done.output
+        assert mujoco.MjModel.from_xml_path(str(folder / "new.xml")).nmesh == 1
+    assert str(tmp_path) not in (out / "new.xml").read_text()
 
 
 NEW = {

@@ -141,18 +141,27 @@ def test_with_its_joint_correction_mujoco_does_as_well_as_elastocal(folder):
     assert error_in_mujoco(folder, "corrected.xml") > 3 * found
 
 
-def test_a_joint_correction_needs_a_file_of_an_arm_and_says_so(folder):
+@pytest.mark.parametrize(
+    ("out", "option", "told"),
+    [
+        ("a.yaml", "--joint-correction", "goes with urdf, mjcf, dh"),
+        ("b.xml", "--joint-correction", "identify anew"),
+        ("a.yaml", "--base-frame", "--base-frame goes with urdf, mjcf; found format yaml"),
+        ("a.csv", "--base-frame", "--base-frame goes with urdf, mjcf; found format dh"),
+    ],
+)
+def test_what_a_format_cannot_take_is_refused(folder, out, option, told):
     cell, result = folder / "full.toml", folder / "full.json"
-    for out, more in (("a.yaml", "goes with urdf, mjcf, dh"), ("b.xml", "identify anew")):
-        if more == "identify anew":
-            content = json.loads(result.read_text())
-            del content["measured_visits"]
-            result = folder / "older.json"
-            result.write_text(json.dumps(content))
-        words = ["export", cell, result, "-o", folder / out, "--joint-correction", folder / "c.csv"]
-        done = CliRunner().invoke(app, [*map(str, words)], env={"COLUMNS": "400"})
-        assert done.exit_code == 2 and more in done.output
-        assert not (folder / out).exists() and not (folder / "c.csv").exists()
+    if told == "identify anew":
+        content = json.loads(result.read_text())
+        del content["measured_visits"]
+        result = folder / "older.json"
+        result.write_text(json.dumps(content))
+    more = [folder / "c.csv"] if option == "--joint-correction" else []
+    words = ["export", cell, result, "-o", folder / out, option, *more]
+    done = CliRunner().invoke(app, [*map(str, words)], env={"COLUMNS": "400"})
+    assert done.exit_code == 2 and told in done.output
+    assert not (folder / out).exists() and not (folder / "c.csv").exists()
 
 
 def test_what_is_no_joint_correction_is_refused(tmp_path):

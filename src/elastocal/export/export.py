@@ -17,6 +17,7 @@ import numpy as np
 
 from elastocal.errors import ElastocalError, InputError, InsufficientDataError, option
 from elastocal.export import exportable, mjcf_file, rigid_files
+from elastocal.export.elsewhere import moved
 from elastocal.export.exportable import Cost, ExportNumbers, Kept
 from elastocal.export.mjcf_file import HeldArm, MujocoRest, NotInPlace
 from elastocal.export.refit import JointCorrection, Refit, refitted
@@ -149,7 +150,8 @@ ENDINGS = {
     ".yml": "yaml", ".json": "json",
 }  # fmt: skip
 FORMATS = ("urdf", "mjcf", "dh", "mdh", "yaml", "json", "corrections")
-FITTED = ("urdf", "mjcf", "dh", "mdh")
+FRAMED = ("urdf", "mjcf")
+FITTED = (*FRAMED, "dh", "mdh")
 
 
 def format_of(path: Path, asked: str | None) -> str:
@@ -176,7 +178,8 @@ SCHEMA = "elastocal/export/1"
 @dataclass(frozen=True)
 class Wish:
     """How to export: `poses` random poses for the cost, drawn with `seed`; `load_stated`: under the
-    force of `conditions` though it is zero; `correct_joints`: with a joint correction."""
+    force of `conditions` though it is zero; `correct_joints`: with a joint correction; `folder`
+    that the file is for (None: that of the robot's own file)."""
 
     format: str
     frames: bool = True
@@ -186,6 +189,7 @@ class Wish:
     correct_joints: bool = False
     poses: int = 500
     seed: int = 0
+    folder: Path | None = None
 
 
 @dataclass(frozen=True)
@@ -237,8 +241,7 @@ def export(
     where no random pose has an equilibrium under the load, and ElastocalError where the text,
     read back, is another arm than the model.
     """
-    if wish.correct_joints:
-        _check_correctable(calibrated, wish)
+    _check_options(calibrated, wish)
     # The visits measured, where they are known, count under the load that was asked for.
     visits, conditions = calibrated.visits, wish.conditions
     if visits is not None and (wish.load_stated or conditions.force.any()):
@@ -282,14 +285,17 @@ def export(
     )  # fmt: skip
 
 
-def _check_correctable(calibrated: CalibratedArm, wish: Wish) -> None:
-    asked = option("joint_correction")
-    if wish.format not in FITTED:
-        raise InputError(f"{asked} goes with {listed(FITTED)}; found format {wish.format}")
-    if calibrated.visits is None:
+def _check_options(calibrated: CalibratedArm, wish: Wish) -> None:
+    for asked, given, formats in (
+        (option("base_frame"), wish.base_frame, FRAMED),
+        (option("joint_correction"), wish.correct_joints, FITTED),
+    ):
+        if given and wish.format not in formats:
+            raise InputError(f"{asked} goes with {listed(formats)}; found format {wish.format}")
+    if wish.correct_joints and calibrated.visits is None:
         raise InputError(
-            f"{calibrated.source} does not say where the arm was measured, which {asked} needs; "
-            "identify anew"
+            f"{calibrated.source} does not say where the arm was measured, which "
+            f"{option('joint_correction')} needs; identify anew"
         )
 
 
@@ -424,10 +430,17 @@ def _urdf(calibrated: CalibratedArm, wish: Wish, kept: Kept, pieces: ExportNumbe
     added = wish.frames, wish.base_frame
     if robot.urdf is not None:
         text = rigid_files.calibrated_urdf(robot, pieces, *added, note)
+        text, told = moved(robot.urdf, text, wish.folder)
         base, flange = check_urdf(robot.urdf).ends(robot.base, robot.flange)
     else:
         text = rigid_files.new_urdf(pieces, *added, note)
         base, flange = rigid_files.BASE, rigid_files.FLANGE
+        told = [
+            "inertia tensors are zero in this file: of the links masses and their centres alone "
+            "are known"
+            if pieces.nominal_masses
+            else "the links have no <inertial> in this file, as their masses are not known"
+        ]
     back = _read_back(text, ".urdf", partial(read_urdf, base=base, flange=flange))
     q = random_table(kept.full.model, kept.conditions, 100, wish.seed).q
     chain = pieces.calibrated_chain()
@@ -438,12 +451,12 @@ def _urdf(calibrated: CalibratedArm, wish: Wish, kept: Kept, pieces: ExportNumbe
             text, [joint.name for joint in chain.joints], base, flange, q
         )
     except (ValueError, RuntimeError) as error:  # pinocchio's own
-        told = (
+        refused = (
             "pinocchio's own reader refuses this file, as it does without the corrections "
             f"({str(error).strip().splitlines()[0]}); only elastocal's has read it back"
         )
-        return Written(text, apart, "elastocal's reader of URDF", (told,))
-    return Written(text, max(apart, _apart(found, expected)), "pinocchio")
+        return Written(text, apart, "elastocal's reader of URDF", (*told, refused))
+    return Written(text, max(apart, _apart(found, expected)), "pinocchio", tuple(told))
 
 
 def _mjcf(calibrated: CalibratedArm, wish: Wish, kept: Kept, pieces: ExportNumbers) -> Written:
@@ -507,12 +520,9 @@ def _corrected(calibrated: CalibratedArm, wish: Wish, kept: Kept, pieces: Export
             "the springs stand in series with the joints: hold those by stiff actuators, whose "
             "own error would come on top"
         )
-    if "file=" in text:
-        warnings.append(
-            "meshes and included files are named relative to the file: keep it in the folder of "
-            f"{cell.robot.mjcf.name if cell.robot.mjcf else 'the old one'}"
-        )
-    return Written(text, distance, "MuJoCo, at rest under the load", tuple(warnings))
+    assert cell.robot.mjcf is not None
+    text, told = moved(cell.robot.mjcf, text, wish.folder)
+    return Written(text, distance, "MuJoCo, at rest under the load", (*warnings, *told))
 
 
 def _rigid_joints(pieces: ExportNumbers, how: str) -> list[str]:
@@ -546,7 +556,7 @@ def _dh(calibrated: CalibratedArm, wish: Wish, kept: Kept, pieces: ExportNumbers
     apart, beta = checked(rigid_files.dh_csv(lines)), None
     comments = [
         f"{_note(calibrated, kept)}; {convention} convention: {rigid_files.FORMULA[convention]}",
-        f"largest flange error of this table: {apart * 1e6:.2g} um",
+        f"rounding of this table: {apart * 1e6:.2g} um at the flange",
     ]
     if any(line.row.beta for line in lines):
         beta = checked(rigid_files.dh_csv(rigid_files.without_beta(lines)), largest=None)

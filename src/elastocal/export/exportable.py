@@ -217,6 +217,11 @@ class ExportNumbers:
         return ca.DM(rigid.joint_motion(joint.kind, joint.axis, float(self.offsets[i]))).full()
 
     @property
+    def nominal_masses(self) -> tuple[LinkMass, ...]:
+        """`masses`, else those of the robot's description, where no weights act in the model."""
+        return self.masses or self.chain.masses
+
+    @property
     def yielding(self) -> list[SpringValue]:
         return [s for s in self.springs if s.compliance > 0]
 

@@ -141,7 +141,7 @@ def _correct_flange(tree: Tree, text: _UrdfText, pieces: ExportNumbers, flange: 
     return text.fixed(MOUNT, MOUNT, flange, error)
 
 
-# A URDF for an arm that has none: a robot described by a DH table.
+# A URDF for an arm that has none: a robot described by a DH table or a MuJoCo model.
 
 BASE, FLANGE = "base_link", "flange"
 NO_LIMIT = 1e6  # m; a URDF's slide must have limits
@@ -150,17 +150,17 @@ NO_LIMIT = 1e6  # m; a URDF's slide must have limits
 def new_urdf(pieces: ExportNumbers, tool: bool, base_frame: bool, note: str) -> str:
     """URDF text of links base_link, link_1 … link_n, flange with the calibrated placements.
 
-    Joints bear the table's names and limits (continuous where one has none); masses stand with a
-    zero inertia tensor, of which the table says nothing.
+    Joints bear the table's names and limits (continuous where one has none); masses that are known
+    stand with a zero inertia tensor.
     """
-    chain = pieces.calibrated_chain()
+    chain, masses = pieces.calibrated_chain(), pieces.nominal_masses
     lines = []
     if base_frame:
         lines += fixed_link(TRACKER, TRACKER, BASE, pieces.T_tracker_base)
     lines += [element("link", {"name": BASE})]
     parent = BASE
     for i, joint in enumerate(chain.joints, start=1):
-        lines += _link(f"link_{i}", chain.masses[i - 1] if chain.masses else None)
+        lines += _link(f"link_{i}", masses[i - 1] if masses else None)
         lines += _joint(joint, parent, f"link_{i}")
         parent = f"link_{i}"
     lines += fixed_link(FLANGE, parent, FLANGE, chain.flange_placement)
