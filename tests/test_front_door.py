@@ -275,6 +275,8 @@ def test_every_result_reports_plots_and_tabulates_itself(fit, plan):
     assert np.array_equal(ec.Model("cell.toml").read("saved.csv").position, readings.position)
     with pytest.raises(ec.InputError, match="no figure 'pose'"):
         plan.plot("pose")
+    with pytest.raises(ec.InputError, match=r"no figure 'curve'; there are poses$"):
+        plan.plot("curve")
 
 
 def test_whatever_a_verb_returns_is_a_result():

@@ -95,11 +95,13 @@ class Result(Saved):
         """A figure of the result.
 
         Args:
-            kind: Which of the result's figures.  A `Calibration` has "residuals" (the default),
-                "waterfall", "sureness", "against_joints", "over_time", "smooth" and "space"; a
-                `Plan` "poses", "intervals" and "curve"; a `Diagnosis` "budget", "candidates",
-                "shares", "curves", "effects" and those of residuals; a `Compensation` "errors"; a
-                `Comparison` "moved"; `Measurements` "joints"; `NextPoses` "gain".
+            kind: Which of the result's figures, the first being the default.  `Calibration`:
+                "residuals", "waterfall" (error budget), "sureness" (expected error over the
+                workspace), "against_joints", "space", "over_time" (with times).  `Diagnosis`:
+                "budget", "effects" and "curves" (of what was found), "space", "residuals",
+                "against_joints", "over_time".  `Plan`: "poses", "curve" (where asked for).
+                `NextPoses`: "gain" and those of its plan.  `Compensation`: "errors".
+                `Comparison`: "moved".  `Measurements`: "joints".
             interactive: The arm in space ("space", "poses") to be turned.
             ax: Axes of matplotlib's subplots, in whose place the figure is drawn.
 

@@ -3,12 +3,15 @@
 import io
 import re
 from html.parser import HTMLParser
+from pathlib import Path
 
 import numpy as np
 import pytest
 from support.cells import MARKERS, kr270_chain, random_table
 from support.diagnoses import VERDICTS
 
+import elastocal as ec
+from elastocal.above import Result
 from elastocal.errors import InputError
 from elastocal.measurements import read_measurements
 
@@ -121,3 +124,15 @@ def test_measurements_as_a_frame_are_what_is_written(tmp_path):
 
 
 # --- commands ------------------------------------------------------------------------------
+
+
+def test_the_figures_that_are_documented_are_those_there_are():
+    """Docstring and page name every figure that a result may have, and no other."""
+    sources = (Path(ec.__file__).parent / "report").glob("*.py")
+    made = " ".join(path.read_text(encoding="utf-8") for path in sources)
+    there = set(re.findall(r'"(\w+)"', " ".join(re.findall(r"figures=\(([^)]*)\)", made))))
+    told = Result.plot.__doc__.split("kind:")[1].split("interactive:")[0]
+    assert set(re.findall(r'"(\w+)"', told)) == there
+    page = (Path(__file__).parents[2] / "docs" / "notebooks.md").read_text(encoding="utf-8")
+    rows = [row.split("|")[2] for row in page.splitlines() if row.startswith("| `")]
+    assert set(re.findall(r"`(\w+)`", " ".join(rows))) == there

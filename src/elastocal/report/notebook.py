@@ -52,8 +52,10 @@ def plot(result: object, kind: str | None, interactive: bool, ax: Any = None) ->
     opened = unfolded(folds, lambda fold: chosen in fold.figures)
     found = [b for b in opened if isinstance(b, Figure | ShownArm) and b.name == chosen]
     if not found:
+        opened = unfolded(folds, lambda fold: bool(fold.figures))
+        there = [block.name for block in opened if isinstance(block, Figure | ShownArm)]
         raise InputError(
-            f"no figure {quoted(chosen)}{did_you_mean(chosen, every)}; there are {listed(every)}"
+            f"no figure {quoted(chosen)}{did_you_mean(chosen, there)}; there are {listed(there)}"
         )
     if interactive:
         if not isinstance(found[0], ShownArm):
