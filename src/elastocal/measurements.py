@@ -60,17 +60,27 @@ AT_A_TIME = 50_000  # rows
 class Measurements(Result):
     """n rows: one per pose, load state, repeat and marker.
 
-    `q` (n, joints) rad or m; `position` (n, 3) m in the tracker frame (z vertical);
-    `force` (n, 3) N in the tracker frame at the load point; `rotation` (n, 3) rotation
-    vector in rad; `distance` (n,) m; `torque` (n, joints) N m; `sigma` (n, 3) m along
-    x, y, z ("cartesian") or range, azimuth, elevation ("polar", transverse lengths);
-    `time` (n,) s; `approach` (n, joints) in {-1, 0, +1}; `before` (n, joints) the commanded joints
-    of the pose before; `temperature` (n,) °C.
-    `configuration` and `marker` are integer codes into their label tuples; `row` is the
-    line number in the source file, for messages.  `move` and `direction` (n, joints) are no
-    columns: they follow from `before`, or the order of the visits (`with_moves`), are found when a
-    table is read, and stay with the rows that are taken from it.  `joint_kinds` has "revolute" or
-    "prismatic" for each joint; none are all revolute.
+    Attributes:
+        source: The file's name; `row` (n,) the lines in it, for messages.
+        q: Commanded joints (n, joints), in rad or m.
+        configuration: Codes (n,) into `configuration_labels`.
+        repeat: Number (n,) of the repeat.
+        marker: Codes (n,) into `marker_names`.
+        force: (n, 3) in N at the load point, in the tracker's frame (z vertical).
+        position: (n, 3) in m, in the tracker's frame.
+        rotation: Rotation vectors (n, 3) in rad.
+        distance: (n,) in m.
+        torque: (n, joints) in N m.
+        sigma: (n, 3) in m, along what `sigma_frame` says: "cartesian" (x, y, z) or "polar" (range,
+            azimuth, elevation, as transverse lengths).
+        time: (n,) in s.
+        approach: Sides (n, joints) from which joints came, -1, 0 or +1.
+        before: Commanded joints (n, joints) of the pose before.
+        temperature: (n,) in °C.
+        move: Way (n, joints) from the visit before.  No column: found when a table is read, from
+            `before` or the order of the visits.
+        direction: Sign (n, joints) of each joint's last motion, found likewise.
+        joint_kinds: "revolute" or "prismatic" for each joint; none are all revolute.
 
     Examples:
         >>> data = ec.Model("cell.toml").read("data.csv")

@@ -49,6 +49,9 @@ def test_the_readme_s_first_screen_runs_and_its_numbers_are_those_found(tmp_path
     low, high = names["fit"]["joint3.compliance"].ci95
     assert f"({low:.3e}, {high:.3e})" in example and str(names["B"].shape) in example
     (efficiency,) = re.findall(r"efficiency_pool +# ([0-9.]+):", example)
+    assert f"{names['fit'].residuals.shape[0]} deflections × 3 directions" in example
+    (pool,) = re.findall(r"pool of ([0-9]+) poses", example)
+    assert names["plan"].certificate.pool == pytest.approx(int(pool), rel=0.02)
     # Which of several polished plans of nearly one worth is found, rounding decides.
     assert names["plan"].certificate.efficiency_pool == pytest.approx(float(efficiency), abs=2e-3)
     written = {path.name for path in tmp_path.iterdir()}

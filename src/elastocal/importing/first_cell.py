@@ -51,7 +51,7 @@ def init(
     ur_model: str | None = None,
     force: bool = False,
 ) -> str:
-    """How does a first cell for my arm look?
+    """Write a first cell file for an arm.
 
     What the robot's file says (joints, limits, flange, masses, a MuJoCo model's sites) and guesses
     of what it does not, marked as such: a cell file that `design` and `simulate` run with.

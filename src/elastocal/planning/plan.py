@@ -635,11 +635,9 @@ class Plan(Result):
 
     @property
     def stated_forces(self) -> Array | None:
-        """The load states where the plan must state them row by row.
+        """The load states (L, 3) in N where the plan's rows state them; else None.
 
-        Not where every pose is measured unloaded, or unloaded and under one load, which is what
-        `simulate` does with a load to a plan without forces; but where poses are visited again
-        for reference, as that is under one of the loads, or where the load hides a marker.
+        They do where there are several loads, poses are revisited, or a load hides a marker.
         """
         loaded = np.any(self.forces != 0, axis=1)
         usual = not loaded[0] and loaded[1:].all() and len(loaded) <= 2
