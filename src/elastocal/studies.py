@@ -366,8 +366,8 @@ MAX_BYTES = 100_000_000  # of the record
 MOST_RESULTS = 10_000_000_000  # bytes
 SCHEMA = "elastocal/study/1"
 RESULTS, STATEMENT, FAILURES, LOCK = "results.jsonl", "_study.json", "_failures.log", ".lock"
-WRITTEN = "_written.txt"  # digests of the pages that the study wrote
-OURS = {RESULTS, STATEMENT, FAILURES, WRITTEN}
+PAGE = "result.md"
+OURS = {RESULTS, STATEMENT, FAILURES, PAGE, "_written.txt"}  # the last was kept by earlier versions
 
 
 @contextmanager
@@ -449,26 +449,6 @@ def statement_of(folder: Path) -> dict[str, Any]:
     except InputError:
         return {}
     return found if isinstance(found, dict) else {}
-
-
-def check_page(folder: Path, page: Path) -> None:
-    """Raise InputError where `page` is there and not as a summary of the study wrote it."""
-    if not page.exists():
-        return
-    digest = hashlib.sha256(read_bytes(page, "page", MAX_BYTES)).hexdigest()
-    ledger = folder / WRITTEN
-    require(
-        ledger.exists() and digest in read_text(ledger, "record", MAX_BYTES).split(),
-        f"{page}: would be written over, and is not as the study left it; move it "
-        f"elsewhere, or name another folder with {option('output', 'NEW')}",
-    )
-
-
-def write_page(folder: Path, page: Path, text: str) -> None:
-    """Write the summary, and remember it: no other page is written over."""
-    with open(folder / WRITTEN, "a", encoding="utf-8") as ledger:
-        ledger.write(hashlib.sha256(text.encode()).hexdigest() + "\n")
-    atomic_write_text(page, text)
 
 
 def read_results(folder: str | Path, failed: bool = False) -> pandas.DataFrame:

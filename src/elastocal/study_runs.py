@@ -337,7 +337,9 @@ def run_study(
             # Before results are discarded: one that cannot be reached must not cost them.
             crew = DaskWorkers(connect(cluster, **way), tell)
             runner = partial(hand_out, crew, study, left, stop)
-        for name in (studies.RESULTS, studies.STATEMENT, studies.FAILURES) if restart else ():
+        for name in (
+            (studies.RESULTS, studies.STATEMENT, studies.FAILURES, studies.PAGE) if restart else ()
+        ):
             (folder / name).unlink(missing_ok=True)
         if left:  # without the beginning of a line
             atomic_write_text(folder / studies.RESULTS, "".join(map(studies.as_text, kept)))
@@ -409,5 +411,5 @@ def summarise(study: Study, output: str | Path, page: str | Path) -> str | None:
         kind = type(text).__name__
         raise InputError(f"{study.folder / 'study.py'}: summary() returned {kind}; it returns text")
     lines = (printable(line).replace("\\t", "\t") for line in text.rstrip("\n").split("\n"))
-    studies.write_page(Path(output), Path(page), "\n".join(lines) + "\n")
+    atomic_write_text(page, "\n".join(lines) + "\n")
     return text

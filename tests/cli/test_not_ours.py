@@ -62,21 +62,7 @@ def folder(tmp_path: Path) -> Path:
     return write_study(tmp_path / "study", SCRIPT + SUMMARY)
 
 
-def test_a_page_that_no_study_wrote(folder: Path, tmp_path: Path) -> None:
-    own, results = mine(tmp_path / "notes.md"), tmp_path / "notes"
-    done = elastocal("study", folder, "--jobs", 1, "-o", results)
-    assert done.exit_code == 2 and f"{own}: would be written over" in done.stderr
-    assert own.read_text() == MINE and not results.exists()
-    own.unlink()
-    for more in ((), (), ("--restart",)):
-        assert elastocal("study", folder, "--jobs", 1, "-o", results, *more).exit_code == 0
-        assert own.read_text() == "24 rows\n"
-    mine(own)  # by an editor, since then
-    assert elastocal("study", folder, "--jobs", 1, "-o", results).exit_code == 2
-    assert own.read_text() == MINE
-
-
-@pytest.mark.parametrize("name", ["results.jsonl", "_failures.log", "_study.json", "table.csv"])
+@pytest.mark.parametrize("name", ["results.jsonl", "_failures.log", "_study.json", "result.md"])
 @pytest.mark.parametrize("more", [(), ("--restart",)])
 def test_a_folder_that_no_study_made(folder: Path, name: str, more: tuple[str, ...]) -> None:
     own = mine(folder / "results" / name)

@@ -63,7 +63,9 @@ def test_a_summary_is_written_once_all_is_there(tmp_path):
     assert (folder / "result.md").read_text() == page
     assert told.stdout.endswith(page)
     study(folder, "--jobs", 1, "-o", tmp_path / "other")
-    assert (tmp_path / "other.md").read_text() == page
+    assert (tmp_path / "other" / "result.md").read_text() == page
+    study(folder, "--jobs", 1, "-o", tmp_path / "other", "--restart", "--only", 3)
+    assert not (tmp_path / "other" / "result.md").exists()  # it was of results discarded
 
 
 def test_a_missing_extra_is_named(folder, monkeypatch):

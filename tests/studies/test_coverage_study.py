@@ -70,4 +70,4 @@ def test_the_study_estimates_what_the_tool_does():
 def test_the_command_runs_from_nothing(tmp_path):
     command = [sys.executable, "-m", "elastocal", "study", str(FOLDER), "--set", "replicates=50"]
     subprocess.run([*command, "-o", str(tmp_path / "out")], check=True, capture_output=True)
-    assert "| table 1, 6 repeats |" in (tmp_path / "out.md").read_text(encoding="utf-8")
+    assert "| table 1, 6 repeats |" in (tmp_path / "out" / "result.md").read_text(encoding="utf-8")

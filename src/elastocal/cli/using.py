@@ -353,8 +353,8 @@ def study(
         unencrypted: Reach another host without TLS.
         seed: Seed; default: that of study.toml.
         set_ (KEY=VALUE): Option of the study; repeatable.
-        output: Folder of the results, with the summary in OUTPUT.md; default: FOLDER/results
-            and FOLDER/result.md.
+        output: Folder of the results, with the summary in its result.md; default:
+            FOLDER/results and FOLDER/result.md.
         progress: Rate and time left: the default.
         quiet: No progress.
         only: Run the first N tasks alone.
@@ -362,14 +362,11 @@ def study(
         retry_failed: Run tasks that failed again.
     """
     require(cluster is None or jobs is None, "--jobs is for this machine; leave it with --cluster")
-    from elastocal.studies import check_page, read_study
+    from elastocal.studies import PAGE, read_study
     from elastocal.study_runs import StudyStop, run_study, summarise
 
     results = folder / "results" if output is None else output
-    page = folder / "result.md"
-    if output is not None:
-        page = Path(f"{output if output.name else output.resolve()}.md")
-        check_page(results, page)
+    page = (output or folder) / PAGE
     prepared = read_study(folder, seed, set_ or ())
     with StudyStop() as stop, progress_line(quiet or not progress, EVERY) as tell:
         ending = run_study(
