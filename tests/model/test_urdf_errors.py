@@ -127,6 +127,10 @@ def test_base_and_flange_names_are_checked(tmp_path: Path) -> None:
         read(tmp_path, arm(), base="L0")
     with pytest.raises(InputError, match=r"flange link 'l44' is not there \(did you mean 'l4'"):
         read(tmp_path, arm(), flange="l44")
+    with pytest.raises(
+        InputError, match=r"flange link 'Flansch' .* \(usual here: 'l4'\); links: l0"
+    ):
+        read(tmp_path, arm(), flange="Flansch")
     with pytest.raises(InputError, match=r"flange 'l1' is not below base 'l3'; links.*: l4$"):
         read(tmp_path, arm(), base="l3", flange="l1")
     with pytest.raises(InputError, match=r"0 moving joints between 'l2' and 'l2' \(none\)"):

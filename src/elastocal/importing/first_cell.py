@@ -133,7 +133,7 @@ def robot_of(
     )
     if kind == "urdf":
         tree = check_urdf(path)
-        base = tree.root if base is None else tree.find_link("base", base)
+        base = tree.root if base is None else tree.find_link("base", base, tree.root)
         return Robot.from_urdf(path, base, flange or tree.last_link(base))
     arm = MjcfArm.read(path, base, flange)
     found = (site for site in FLANGE_SITES if flange is None and site in arm.sites())

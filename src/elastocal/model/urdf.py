@@ -10,6 +10,7 @@ import math
 import re
 import xml.etree.ElementTree as ET
 from collections.abc import Iterator, Mapping, Sequence
+from contextlib import suppress
 from dataclasses import dataclass
 from functools import cached_property
 from pathlib import Path
@@ -175,19 +176,27 @@ class Tree:
             link = joints[-1].parent
         return tuple(reversed(joints))
 
-    def find_link(self, role: str, name: str) -> str:
-        """`name`, or an InputError with the nearest name and all links if there is no such link."""
+    def find_link(self, role: str, name: str, usual: str) -> str:
+        """`name`, or an InputError with the nearest name, the `usual` one and all links if there
+        is no such link."""
+        hint = did_you_mean(name, self.links)
+        hint += f" (usual here: '{usual}')" if usual and f"'{usual}'" not in hint else ""
         require(
             name in self.links,
-            f"{self.path}: {role} link '{name}' is not there{did_you_mean(name, self.links)}; "
-            f"links: {listed(self.links)}",
+            f"{self.path}: {role} link '{name}' is not there{hint}; links: {listed(self.links)}",
         )
         return name
 
     def ends(self, base: str | None, flange: str | None) -> tuple[str, str]:
         """The first and the last link, None for those that are found."""
-        base = self.root if base is None else self.find_link("base", base)
-        return base, self.only_flange(base) if flange is None else self.find_link("flange", flange)
+        base = self.root if base is None else self.find_link("base", base, self.root)
+        if flange is None:
+            return base, self.only_flange(base)
+        usual = ""
+        if flange not in self.links:
+            with suppress(InputError):  # of several arms, each with an end of its own
+                usual = self.last_link(base)
+        return base, self.find_link("flange", flange, usual)
 
     def last_link(self, base: str) -> str:
         """The link below `base` from which on fingers, or frames that none moves, branch off.
