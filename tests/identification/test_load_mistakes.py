@@ -81,8 +81,18 @@ def test_a_load_in_the_opposite_direction_is_named_and_not_trusted(made):
 
 def test_a_single_negative_compliance_calls_for_care(made):
     path, _ = made
-    q = np.random.default_rng(1).uniform(-1, 1, (25, 6)) + [0, -1.2, 1.4, 0, 0, 0]
+    q = np.random.default_rng(1).uniform(-1, 1, (25, 6)) + np.array([0, -1.2, 1.4, 0, 0, 0])
     values = VALUES | {"joint4.compliance": -3e-6}
     fit = ec.identify(path, ec.simulate(path, q, values=values, load=(0, 0, -2000.0), seed=3))
     assert fit.finding("impossible_values").numbers["parameters"] == ("joint4.compliance",)
     assert fit.verdict.tone == "care" and "most likely" not in fit.to_json()["verdict"]["sentence"]
+
+
+def test_a_marker_without_readings_is_named(made):
+    path, table = made
+    fit = ec.identify(path, table.take(np.flatnonzero(table.marker == 0)))
+    told = " ".join(str(fit).split())
+    source = fit.observations.table.source
+    assert f"There is no reading of marker M2 in {source}: measure it, or delete it from" in told
+    assert "marker:M2.x" not in "".join(fit.left.redundant)
+    assert f"(no reading of marker M2 in {source}): marker:M2.x, marker:M2.y, marker:M2.z" in told

@@ -15,6 +15,7 @@ from elastocal.identification.mistakes import CELL, KILOGRAMS, load_ratio
 from elastocal.identification.noise_structure import JOINTS, TIME
 from elastocal.identification.noise_summary import Drift, NoiseSize
 from elastocal.identification.outliers import kept_of
+from elastocal.identification.prediction import unread_markers
 from elastocal.identification.residuals import ResidualSummary
 from elastocal.identification.result import Calibration, Estimate, Finding, Number, Severity
 from elastocal.identification.solve import Solution
@@ -52,7 +53,7 @@ ILL_CONDITIONED = 1e3  # intervals this many times as wide as if each stood alon
 
 # How a parameter stands, in the order in which they are told.
 ALONE, COMBINED, ABSORBED, INVISIBLE, FIXED = "alone", "combined", "absorbed", "invisible", "fixed"
-WEAK, BEYOND = "weak", "beyond"
+WEAK, BEYOND, UNREAD = "weak", "beyond", "unread"
 
 LACKING = (
     "Ask what the model lacks: elastocal diagnose with the same cell and data. Where it finds "
@@ -546,6 +547,12 @@ def _undetermined(result: Calibration) -> Iterator[Finding]:
     shown = [name for name in lacking if name not in redundant]
     if n := len(lacking) - len(shown):
         yield Finding("redundant", "good", {"parameters": n})
+    unread = tuple(name for name, standing in all_of_them.items() if standing == UNREAD)
+    if unread:
+        yield Finding(
+            "markers_not_read", "note", {"parameters": unread},
+            f"There is {no_reading(result)}: measure it, or delete it from [tool.markers_m].",
+        )  # fmt: skip
     if n := len(shown):
         yield Finding(
             "undetermined", "note", {"parameters": n, "names": tuple(shown)},
@@ -553,6 +560,20 @@ def _undetermined(result: Calibration) -> Iterator[Finding]:
             f"({listed(shown, 4)}). Predictions hold for poses and loads like those measured; for "
             "others, measure what shows them.",
         )  # fmt: skip
+
+
+def _unread(result: Calibration) -> list[str]:
+    """Places of the markers that the table has no reading of, not even one that was excluded."""
+    excluded = {f"marker:{o.marker}" for o in result.excluded}
+    places = unread_markers(result.model, result.observations.table)
+    return [place for place in places if place not in excluded]
+
+
+def no_reading(result: Calibration) -> str:
+    """ "no reading of marker M2 in data.csv" """
+    names = [place.removeprefix("marker:") for place in _unread(result)]
+    several, source = "s" * (len(names) > 1), result.observations.table.source
+    return f"no reading of marker{several} {listed(names, 4)} in {source}"
 
 
 def _prior(result: Calibration) -> Iterator[Finding]:
@@ -569,7 +590,8 @@ def _prior(result: Calibration) -> Iterator[Finding]:
 
 def standings(result: Calibration) -> dict[str, str]:
     """Parameter name → ALONE, COMBINED (first of a combination), ABSORBED, WEAK (hardly shown),
-    BEYOND (its physical bound), INVISIBLE or FIXED."""
+    BEYOND (its physical bound), UNREAD (of a marker without readings), INVISIBLE or FIXED."""
+    unread = _unread(result)
     first = {next(iter(c.terms)) for c in result.combinations}
 
     def standing(p: Parameter, e: Estimate) -> str:
@@ -581,7 +603,9 @@ def standings(result: Calibration) -> dict[str, str]:
             return COMBINED
         if e.combined_with:
             return ABSORBED
-        return FIXED if e.note.startswith("fixed") else INVISIBLE
+        if e.note.startswith("fixed"):
+            return FIXED
+        return UNREAD if p.where in unread else INVISIBLE
 
     pairs = zip(result.model.parameters, result.estimates, strict=True)
     return {p.name: standing(p, e) for p, e in pairs}

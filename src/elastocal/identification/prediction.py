@@ -168,6 +168,12 @@ def _redundant(solution: Solution, open_: IntArray, typical: Array) -> tuple[str
     noise = np.sqrt((parts**2).mean(axis=0))[:, None]
     B = (B / np.maximum(noise, EXACT)).reshape(-1, B.shape[2])
     B *= np.where(typical > 0, typical, 1.0) * np.sqrt(len(parts) * observed.size / len(B))
+    # A marker that nobody read is no matter of poses.
+    unread = unread_markers(model, observed.table)
+    read = np.array([model.parameters[c].where not in unread for c in open_], dtype=bool)
+    open_ = open_[read]
+    if not len(open_):
+        return ()
     known = B[:, kept[~model.shrunk[kept]]]
     basis = linalg.qr(known, mode="economic")[0]
     off = B[:, open_] - basis @ (basis.T @ B[:, open_])
@@ -178,6 +184,13 @@ def _redundant(solution: Solution, open_: IntArray, typical: Array) -> tuple[str
     pivot[: min(R.shape)] = np.abs(np.diag(R))
     none = pivot <= np.where(typical[open_[order]] > 0, max(least, NEVER_SHOWN), least)
     return tuple(model.names[d] for d in open_[order[none]])
+
+
+def unread_markers(model: Model, table: Measurements) -> tuple[str, ...]:
+    """Places "marker:M2" of the markers whose position is a parameter and that no row reads."""
+    read = {f"marker:{table.marker_names[m]}" for m in np.unique(table.marker)}
+    places = dict.fromkeys(p.where for p in model.parameters if p.where.startswith("marker:"))
+    return tuple(place for place in places if place not in read)
 
 
 def _shares(B_K: Array, B_D: Array, kept: Array, left: Array) -> Array:

@@ -18,7 +18,9 @@ from elastocal.identification.findings import (
     COMBINED,
     FIXED,
     INVISIBLE,
+    UNREAD,
     WEAK,
+    no_reading,
     standings,
 )
 from elastocal.identification.prediction import PredictedError
@@ -264,6 +266,7 @@ def what_was_identified(result: Calibration) -> str:
     told = {
         **NO_VALUE,
         INVISIBLE: "not visible in these data",
+        UNREAD: "of markers without a reading",
         FIXED: "fixed by the user",
     }
     for standing, why in told.items():
@@ -439,6 +442,8 @@ def why_without(result: Calibration, e: Estimate) -> str:
         return f"held: absorbed in {names}" + (f" + {several} more" if several > 0 else "")
     if standing in (WEAK, BEYOND):
         return f"{NO_VALUE[standing]}: {limits(result, e)}"
+    if standing == UNREAD:
+        return "held: no reading of this marker"
     if standing == INVISIBLE:
         return "held: not visible in these data"
     return "fixed by the user" if standing == FIXED else printable(e.note)
@@ -514,6 +519,8 @@ def undetermined_lines(result: Calibration, most: int | None = None) -> list[str
         ],
     }
     found = limited | {f"{_held_where(result, names)}{why}": names for why, names in held.items()}
+    if unread := names_of(result, UNREAD):
+        found[f"{_held_where(result, unread)} ({printable(no_reading(result))})"] = unread
     found["fixed by the user"] = fixed
     return [f"{why}: {listed(n, most or len(n))}" for why, n in found.items() if n]
 
