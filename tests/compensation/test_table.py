@@ -67,3 +67,14 @@ def test_corrected_targets_are_reached_by_the_nominal_arm() -> None:
 def test_a_grid_that_cannot_be_is_refused(counts, told) -> None:
     with pytest.raises(InputError, match=told):
         joint_grid(arm_and_point()[0], counts)
+
+
+def test_a_grid_in_singular_postures_is_told_with_the_joint_at_fault() -> None:
+    arm, point = arm_and_point()
+    axes = list(joint_box((2, 2, 2, 1, 1, 1)).axes)
+    assert correction_table(arm, CorrectionGrid(tuple(axes), True), point, DOWN).warnings == ()
+    axes[4] = np.zeros(1)
+    found = correction_table(arm, CorrectionGrid(tuple(axes), True), point, DOWN)
+    (told,) = found.warnings
+    assert told.startswith("only 0 of 8 grid points are exact")
+    assert "q5_deg = 0;" in told and "q4" not in told and "q6" not in told

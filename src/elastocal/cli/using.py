@@ -245,6 +245,7 @@ def _table(found: CorrectionTable, arm: CalibratedArm, partial: bool) -> tuple[d
         "checked_between": len(found.between),
         "error_without_um": spread(found.before[:, 0]),
         "error_with_um": spread(found.between[:, 0]),
+        "warnings": list(found.warnings),
     }
     if found.oriented:
         content["rotation_without_urad"] = spread(found.before[:, 1])

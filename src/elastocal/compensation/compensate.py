@@ -490,6 +490,8 @@ LEAST_STEP = 1e-9  # m between levels
 MOST_POINTS = 200_000
 BETWEEN = 512  # points between those of the grid, on which interpolation is measured
 EXACT, FIRST_ORDER = "exact", "first order"
+ASIDE = 5 * LARGE_CORRECTION  # rad or m: a joint's step away from a singular posture
+TRIED = 20  # points, at most
 NOMINAL_MISS = 1e-5  # m
 
 
@@ -520,7 +522,7 @@ class CorrectionTable:
     the target becomes p + d, exp([dr]×) R.  NaN where there is none; `status` (N,) says why, and
     which are EXACT or FIRST_ORDER.  `oriented`: whether rotations are corrected.
     `before` and `between` (M, 2) m and rad: errors of the tool at M points between the grid's,
-    without the table and with the correction interpolated in it.
+    without the table and with the correction interpolated in it.  `warnings` are sentences.
     """
 
     grid: CorrectionGrid
@@ -530,6 +532,7 @@ class CorrectionTable:
     oriented: bool
     before: Array
     between: Array
+    warnings: tuple[str, ...] = ()
 
 
 def joint_grid(arm: CalibratedArm, counts: tuple[int, ...]) -> CorrectionGrid:
@@ -616,7 +619,42 @@ def correction_table(
             near = result.nominal[0]
         check = compensate(arm, _targets(grid, some, force), point, near, seed)
         before, between = _with_table(tool, check, _interpolated(grid, points, correction, some))
-    return CorrectionTable(grid, points, correction, status, oriented, before, between)
+    told: tuple[str, ...] = ()
+    if status.count(EXACT) < len(status) / 2:
+        told = (_mostly_inexact(arm, grid, status, point, force, seed),)
+    return CorrectionTable(grid, points, correction, status, oriented, before, between, told)
+
+
+def _mostly_inexact(
+    arm: CalibratedArm, grid: CorrectionGrid, status: tuple[str, ...], point: ToolPoint,
+    force: Array | None, seed: int,
+) -> str:  # fmt: skip
+    """Why most points are not exact: a joint with one level is moved ASIDE to see if that helps."""
+    some = np.flatnonzero([s != EXACT for s in status])
+    some = some[:: -(-len(some) // TRIED)]
+    chain, singular = arm.model.chain, []
+    low, high = joint_limits(arm.model.cell, chain)
+    for k in (k for k, axis in enumerate(grid.axes) if grid.joints and len(axis) == 1):
+        points = grid.points()[some]
+        aside = ASIDE if high[k] - points[0, k] > ASIDE else -ASIDE
+        points[:, k] = np.clip(points[:, k] + aside, low[k], high[k])
+        tried = compensate(arm, _targets(grid, points, force), point, None, seed)
+        moved = _corrections(CalibratedTool(arm, point), tried)[1]
+        if moved.count(EXACT) > len(moved) / 2:
+            head = joint_columns(chain.kinds)[k]
+            level = in_file_units(grid.points()[:1], chain.kinds)[0, k]
+            singular.append(f"{head} = {level + 0.0:.4g}")
+    told = f"only {status.count(EXACT)} of {len(status)} grid points are exact: at most of them "
+    if singular:
+        return (
+            f"{told}the posture is singular, by the only level {listed(singular)}; give that joint "
+            f"2 levels or more by {option('grid')}"
+        )
+    return (
+        f"{told}the command is out of limits, or a joint would turn by more than "
+        f"{np.degrees(LARGE_CORRECTION):.0f}°, as beside singular postures; choose other levels by "
+        f"{option('grid')}"
+    )
 
 
 def _targets(grid: CorrectionGrid, points: Array, force: Array | None) -> Targets:

@@ -205,6 +205,7 @@ def compensation_blocks(content: dict[str, Any]) -> Iterator[Block]:
             f"{table['points']} grid points: {table['exact']} exact, {table['first_order']} of "
             "first order (beside singular postures or limits)."
         )
+        yield Lines([(WARNING, text) for text in table["warnings"]])
 
 
 def _spreads(title: str, rows: dict[str, dict[str, Any]]) -> ShownTable:
