@@ -15,7 +15,7 @@ from numpy.typing import ArrayLike
 from elastocal.above import Result, headline, write_page
 from elastocal.arguments import checked_arguments
 from elastocal.cell.arm_description import Unsteadiness
-from elastocal.errors import ElastocalError, UnknownNameError, option, require
+from elastocal.errors import ElastocalError, UnknownNameError
 from elastocal.identification import scrutiny
 from elastocal.identification.constrained import ActiveConstraint
 from elastocal.identification.covariance import Covariance
@@ -37,6 +37,7 @@ from elastocal.identification.scrutiny import MOST_NUMBERS
 from elastocal.identification.smooth_functions import SmoothPart
 from elastocal.identification.weighted_problem import Weights
 from elastocal.measurements import Measurements
+from elastocal.model.arm import check_loads
 from elastocal.model.calibrated import (
     CalibratedArm,
     CalibratedTool,
@@ -463,10 +464,9 @@ class Calibration(Result):
 
     def __getitem__(self, name: str) -> Estimate:
         """The estimate of the parameter `name`; UnknownNameError with the nearest name."""
-        found = self._by_name.get(name)
-        if found is None:
+        if name not in self:
             raise UnknownNameError.of("parameter", name, self._by_name)
-        return found
+        return self._by_name[name]
 
     def __iter__(self) -> Iterator[str]:
         """The parameters' names, in the model's order."""
@@ -631,12 +631,7 @@ class Calibration(Result):
             ((1, 3), (1, 3, 3), True)
         """
         model = self.model
-        n, shape = len(model.table(q)), (3,) if load is None else np.shape(load)
-        require(
-            shape in ((3,), (n, 3)),
-            f"{option('load')} takes a force (3,) in N, or one for each pose ({n}, 3); found an "
-            f"array of shape {shape}",
-        )
+        check_loads(load, len(model.table(q)))
         tool = CalibratedTool(self.arm, tool_point(model.cell, point))
         return position_at(tool, model.table(q, load), self.noise, self.spread)
 
@@ -668,11 +663,10 @@ class Calibration(Result):
 
     def combination(self, first: str) -> Combination:
         """The combination whose first member is `first`; UnknownNameError where there is none."""
-        for c in self.combinations:
-            if next(iter(c.terms)) == first:
-                return c
-        firsts = [next(iter(c.terms)) for c in self.combinations]
-        raise UnknownNameError.of("combination that starts with", first, firsts)
+        found = {next(iter(c.terms)): c for c in self.combinations}
+        if first not in found:
+            raise UnknownNameError.of("combination that starts with", first, found)
+        return found[first]
 
     def finding(self, *kinds: str) -> Finding | None:
         """The first finding of one of these kinds; None where there is none."""
@@ -680,18 +674,16 @@ class Calibration(Result):
 
     def residual_table(self) -> list[dict[str, Any]]:
         """One row per observation: line, configuration, repeat, marker, residuals in µm (µrad)."""
-        observed = self.observations
+        observed, table = self.observations, self.observations.table
         parts = self.residual.reshape(-1, observed.size)
         held = self.held_out.reshape(-1, observed.size)
         rows = []
         for k, i in enumerate(observed.lead):
             row: dict[str, Any] = {
-                "line": int(observed.table.row[i]),
-                "configuration": observed.table.configuration_labels[
-                    observed.table.configuration[i]
-                ],
-                "repeat": int(observed.table.repeat[i]),
-                "marker": observed.table.marker_names[observed.table.marker[i]],
+                "line": int(table.row[i]),
+                "configuration": table.configuration_labels[table.configuration[i]],
+                "repeat": int(table.repeat[i]),
+                "marker": table.marker_names[table.marker[i]],
             }
             for j, name in enumerate(COMPONENTS[observed.kind]):
                 unit = "urad" if name.startswith("r") else "um"

@@ -292,6 +292,16 @@ def _levels(arm: Arm, table: Measurements, joint: str) -> NDArray:
     return np.eye(len(levels))[nearest]
 
 
+def check_loads(load: ArrayLike | None, n: int) -> None:
+    """Raise InputError unless the option `load` has the shape of a force for n poses, or each."""
+    shape = (3,) if load is None else np.shape(load)
+    if shape not in ((3,), (n, 3)):
+        raise InputError(
+            f"{option('load')} takes a force (3,) in N, or one for each pose ({n}, 3); found an "
+            f"array of shape {shape}"
+        )
+
+
 def given_force(load: ArrayLike | None) -> NDArray[np.float64] | None:
     """The option `load` as a force (3,) in N, None where it is not given.
 
