@@ -387,14 +387,14 @@ def import_blocks(found: Imported, width: int) -> Iterator[Block]:
         yield ShownTable(("in the file", "read as", "unit"), rows, (0, 1, 2))
         yield Lines([("Not used", listed(seen.unused, 20))] if seen.unused else [])
     columns = found.assembled.columns
-    most = max(4, min(MOST_COLUMNS, width // 10))
-    shown = [name for name in columns if name != "note_source"][:most]
+    first = range(min(FIRST_ROWS, len(found.assembled)))
+    every = {n: [_cell(columns[n], i) for i in first] for n in columns if n != "note_source"}
+    # Whole columns, two blanks apart: a head is not broken.
+    ends = np.cumsum([max(map(len, (n, *texts))) + 2 for n, texts in every.items()])
+    shown = list(every)[: max(1, min(MOST_COLUMNS, int((ends <= width).sum())))]
     rest = len(columns) - len(shown)
     words = tuple(k for k, n in enumerate(shown) if not isinstance(columns[n], np.ndarray))
-    cells = [
-        tuple(_cell(columns[n], i) for n in shown)
-        for i in range(min(FIRST_ROWS, len(found.assembled)))
-    ]
+    cells = [tuple(every[n][i] for n in shown) for i in first]
     title = "The first rows of the table" + (f", {rest} more columns" if rest else "")
     yield ShownTable(tuple(shown), cells, words, title=title)
     ranges = [
