@@ -75,6 +75,8 @@ def test_a_plan_adds_to_the_measurements_done(tmp_path):
     assert added["value"] < alone["value"]
     smaller = deviations(alone)
     assert all(std < smaller[name] for name, std in deviations(added).items())
-    assert any("as identified from the measurements done" in text for text in added["warnings"])
+    # That is how it should be, and no warning.
+    assert added["made_for"] == "the arm as identified from the measurements done"
+    assert not any("measurements done" in text for text in added["warnings"])
     # Four poses are done: one more is a plan, although alone it could not tell the five apart.
     assert planned(cell, "--poses", "1", "--augment", done)["n_poses"] == 1

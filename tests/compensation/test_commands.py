@@ -206,13 +206,25 @@ def test_targets_far_from_what_was_measured_are_told():
     def told(most, configurations=30):
         shown = replace(arm, shown=ShownPoses(most, configurations))
         warned = compensate(shown, targets, tool_point(cell, "M1")).warnings
-        return [text for text in warned if "extrapolated" in text]
+        return [text for text in warned if "outside the measured" in text]
 
     std = compensate(arm, targets, tool_point(cell, "M1")).uncertainty.std
     assert not told(std.max())
     assert "line 1 and 3 more" in told(std.min() / 2)[0]
     # Of as few poses measured all may be surer than four others by chance.
     assert not told(std.min() / 2, configurations=2)
+
+
+def test_a_point_that_is_known_worse_than_the_markers_is_the_reason():
+    """Where the markers are known as well as at measured poses, it is not the poses."""
+    cell = kr270_cell(("joint_offset",))
+    arm = calibrated(kr270_chain(), cell, std=0.01)
+    targets = targets_at("t", None, None, "base", DOWN, q=POSTURES)
+    most = compensate(arm, targets, tool_point(cell, "M1")).uncertainty.std.max()
+    shown = replace(arm, shown=ShownPoses(most, 30))
+    text = " ".join(compensate(shown, targets, tool_point(cell, "6,0,0")).warnings)
+    assert "where the point 6,0,0 m in the flange frame lies on the tool is hardly known" in text
+    assert "outside the measured poses" not in text
 
 
 def _places(model: Model, found, x):

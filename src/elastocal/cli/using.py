@@ -110,8 +110,8 @@ def compensate(
     )
     if shown and output is not None:
         say(
-            f"Next: run the commands of {output.name} (its q columns) and measure some: 19 of 20 "
-            "should lie within within95_um of their targets, with the tracker's noise on top."
+            f"Next: Run {output.name} and measure some. 95 % of the targets should be reached "
+            "within within95_um, measurement noise excluded."
         )
 
 

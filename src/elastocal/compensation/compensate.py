@@ -18,7 +18,13 @@ from elastocal.errors import InputError, InsufficientDataError, option
 from elastocal.identification.checks import check_limits
 from elastocal.identification.prediction import Uncertainty, uncertainty_at
 from elastocal.measurements import families
-from elastocal.model.calibrated import CalibratedArm, CalibratedTool, ToolPoint, lasting
+from elastocal.model.calibrated import (
+    CalibratedArm,
+    CalibratedTool,
+    ToolPoint,
+    lasting,
+    tool_point,
+)
 from elastocal.model.chain import Chain, finite_ranges, joint_limits
 from elastocal.model.effects.catalogue import effect_of
 from elastocal.model.inverse_kinematics import Reaching, inverse_kinematics
@@ -323,13 +329,39 @@ def _of_places(arm: CalibratedArm, c: Compensation) -> Iterator[str]:
     if (shown := arm.shown) is None or arm.model.observe == "distance":
         return
     far = reached & (sure.std > shown.most)
-    if shown.chance(int(far.sum()), int(reached.sum())) < UNLIKELY:
+    if shown.chance(int(far.sum()), int(reached.sum())) >= UNLIKELY:
+        return
+    outside = far.copy()
+    outside[far] = _std_of_markers(arm, c, far) > shown.most
+    said = f" µm at most, at measured poses {shown.most * 1e6:.0f} µm)"
+    if (some := far & ~outside).any():
         yield (
-            f"{_rows(c.targets, far)}: the measurements say less about this place (standard "
-            f"deviation up to {sure.std[far].max() * 1e6:.0f} µm) than of any pose measured "
-            f"({shown.most * 1e6:.0f} µm at most), so that it is extrapolated; measure poses there,"
-            f" or choose a marker that was fitted ({option('point')})"
+            f"{_rows(c.targets, some)}: where the {c.point.told} lies on the tool is hardly known "
+            f"(standard deviation {sure.std[some].max() * 1e6:.0f}{said}; measure a marker there, "
+            f"or choose a marker that was fitted ({option('point')})"
         )
+    if outside.any():
+        several = outside.sum() > 1
+        yield (
+            f"{_rows(c.targets, outside)}: {'these targets are' if several else 'this target is'} "
+            f"outside the measured poses (standard deviation "
+            f"{sure.std[outside].max() * 1e6:.0f}{said}; measure poses there"
+        )
+
+
+MARKERS_ASKED = 3  # of those on one tool one is as good as another
+
+
+def _std_of_markers(arm: CalibratedArm, c: Compensation, rows: NDArray[np.bool_]) -> Array:
+    """Standard deviation (k,) in m at the given rows of the marker that is known best there: what
+    the arm's pose alone leaves unknown."""
+    found = np.full(int(rows.sum()), np.inf)
+    for name in list(arm.model.cell.tool.markers)[:MARKERS_ASKED]:
+        tool = CalibratedTool(arm, tool_point(arm.model.cell, name))
+        values = tool.rows(replace(c.targets.table, force=c.force))
+        sure = uncertainty_at(tool, [v[rows] for v in values], c.q[rows])
+        found = np.minimum(found, sure.std)
+    return found
 
 
 def _rows(targets: Targets, which: NDArray) -> str:
@@ -370,12 +402,14 @@ def check_status(
     lost = [(row, s) for row, s in zip(rows, status, strict=True) if s != good]
     if not lost:
         return
-    named = ", ".join(f"{row} ({s})" for row, s in lost[:NAMED])
-    more = f" and {len(lost) - NAMED} more" if len(lost) > NAMED else ""
     kinds = dict.fromkeys(s for _, s in lost)
+    # That they are not reached has been said; why is told of each where the reasons differ.
+    same = len(kinds) == 1
+    named = ", ".join(row if same else f"{row} ({s})" for row, s in lost[:NAMED])
+    more = f" and {len(lost) - NAMED} more" if len(lost) > NAMED else ""
     raise InsufficientDataError(
-        f"{what % (len(lost), len(status))} are not reached: {named}{more}. "
-        + "; ".join(f"{kind}: {remedies[kind]}" for kind in kinds)
+        f"{what % (len(lost), len(status))} are not reached: {named}{more}{': ' if same else '. '}"
+        + (remedies[lost[0][1]] if same else "; ".join(f"{k}: {remedies[k]}" for k in kinds))
         + f". Nothing was written; {option('partial', True)} writes the others"
     )
 

@@ -58,7 +58,7 @@ RECORD = {
     "station": (
         "the readings do not tell where the instrument stands: they are deflections, or lie around "
         "the origin of their frame",
-        "state where it stands, [tracker] position_m",
+        "state the tracker position ([tracker] position_m)",
     ),
     "torque": ("the table has no torque columns", "record torque_1_Nm … of every joint"),
 }

@@ -693,7 +693,7 @@ def _conditioning(result: Calibration, solution: Solution) -> Iterator[Finding]:
             "condition_number": float(singular[0] / singular[-1]),
             "parameters": tuple(result.determined[i] for i in worst),
         },
-        "Measure poses in which the joints differ more, or fix one of them.",
+        "Measure poses in which the joints differ more, or fix one of these parameters.",
     )  # fmt: skip
 
 

@@ -38,7 +38,13 @@ from elastocal.planning.exchange import (
     values_without,
 )
 from elastocal.planning.feasibility import Feasibility
-from elastocal.planning.information import Done, measured, next_number, plan_forces
+from elastocal.planning.information import (
+    IDENTIFIED,
+    Done,
+    measured,
+    next_number,
+    plan_forces,
+)
 from elastocal.planning.moves import blockers_of
 from elastocal.planning.plan import (
     CandidateCounts,
@@ -306,7 +312,8 @@ class _Design:
         if options.done is not None and self.done is None:
             self.progress("information of the measurements done")
             self.done = measured(self.model, options.done, options.fixed)
-            self.warnings.append(f"B is taken at {self.done.note}")
+            if self.done.note != IDENTIFIED:
+                self.warnings.append(f"the plan is made for {self.done.note}")
         return Known(options.fixed, options.prior, self.done)
 
     def targets(self) -> tuple[TargetPoses, TargetPoses | None]:
@@ -483,6 +490,7 @@ class _Design:
             curve=curve,
             bound_reported=None if bound is None else setup.criterion.reported(bound)[0],
             warnings=tuple(self.warnings),
+            made_for="" if known.done is None else known.done.note,
             first=next_number(self.options.done.configuration_labels if self.options.done else ()),
             names=self._names(found),
             chance=Chance.of(phi, found.value, setup.criterion),

@@ -409,6 +409,9 @@ class Done:
     note: str
 
 
+IDENTIFIED = "the arm as identified from the measurements done"
+
+
 def measured(model: Model, table: Measurements, fixed: tuple[str, ...]) -> Done:
     """Information BᵀΣ⁻¹B of a table of measurements, at the parameters it identifies.
 
@@ -419,7 +422,7 @@ def measured(model: Model, table: Measurements, fixed: tuple[str, ...]) -> Done:
         table = marker_sigmas(model.cell, table)
     try:
         x = identify(model, table, Options(method="wls", fixed=fixed)).x
-        note = "the arm as identified from the measurements done"
+        note = IDENTIFIED
     except InsufficientDataError as error:
         x, note = model.nominal, f"the nominal arm, as the measurements do not suffice ({error})"
     observed = observe(table, model.observe)

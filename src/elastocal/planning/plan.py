@@ -511,6 +511,7 @@ class Plan(Result):
         curve: The criterion against the number of poses, where it was asked for.
         bound_reported: The certificate's bound, in `unit`.
         warnings: What to know before one measures, in sentences.
+        made_for: Beside measurements done, the arm that the plan is made for, in words.
         first: Number of the first configuration: after those that were measured already.
         chance: What as many random poses would reach.
         everywhere: The error at the test poses and over all joint ranges, in m.
@@ -555,6 +556,7 @@ class Plan(Result):
     curve: tuple[PlanSize, ...] = ()
     bound_reported: float | None = None
     warnings: tuple[str, ...] = field(default=())
+    made_for: str = ""
     first: int = 1
     chance: Chance | None = None
     everywhere: Everywhere | None = None
@@ -702,6 +704,7 @@ class Plan(Result):
             "minutes": self.execution.total / 60,
             "curve": [{"n_poses": s.poses, "value": s.value, "bound": s.bound} for s in self.curve],
             "warnings": list(self.warnings),
+            "made_for": self.made_for or None,
             "seed": self.seed,
         }  # fmt: skip
 

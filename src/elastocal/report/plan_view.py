@@ -267,6 +267,8 @@ def plan_steps(plan: Plan) -> list[str]:
 def plan_lines(plan: Plan) -> list[tuple[str, str]]:
     """What the plan is worth, as (label, sentence)."""
     lines = [*_chosen_lines(plan), *_state_lines(plan), _criterion_line(plan)]
+    if plan.made_for:
+        lines.append(("Made for", f"{printable(plan.made_for)}."))
     lines += [*_everywhere_lines(plan), *_chance_lines(plan)]
     lines.append(_candidate_line(plan))
     lines += _certificate_lines(plan)
