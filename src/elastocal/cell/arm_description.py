@@ -282,6 +282,11 @@ class Unsteadiness:
             "has no standard deviation, which is what [tracker] states; take a number > 2, as 3",
         )
 
+    @property
+    def shared(self) -> bool:
+        """Whether readings have some of it in common."""
+        return bool(self.joints.any() or self.drift or self.configuration)
+
     def of_joints(self, n: int) -> Array:
         """Standard deviations (n,) of n joints; InputError where there are others."""
         require(

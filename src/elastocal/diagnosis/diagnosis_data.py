@@ -32,6 +32,7 @@ from elastocal.diagnosis.noise_floor import NoiseValues, NoisyData, fit_noise
 from elastocal.errors import InsufficientDataError
 from elastocal.identification.checks import as_placed
 from elastocal.identification.noise_structure import along_axes, faster_course, visit_record
+from elastocal.identification.stated_noise import stated_lasting
 from elastocal.measurements import Measurements, numbered
 from elastocal.model.arm import usual_sizes
 from elastocal.model.effects.catalogue import CATALOGUE
@@ -311,9 +312,7 @@ def _stated_drift(base: Baseline) -> tuple[Array, Array | float]:
     record = visit_record(base.model, some, base.x) if noise.drift and size > 1 else None
     if record is None:
         return np.zeros((n, size, 0)), 0.0
-    # Without times a visit takes as long as the arm stands still, as in a simulation.
-    span = record.span * (1.0 if record.timed else base.model.cell.design.motion.dwell)
-    lasting = noise.lasting / span
+    lasting = stated_lasting(base.model, record)
     along = np.where(np.arange(size) < 3, noise.drift, 0.0)
     waves = along_axes(record.waves(lasting), along)
     drift = np.concatenate([waves, np.zeros((n - base.n_measured, *waves.shape[1:]))])

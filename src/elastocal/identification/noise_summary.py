@@ -22,6 +22,7 @@ from elastocal.identification.noise_structure import DRIFT, SHARED, Readings
 from elastocal.identification.options import MethodResult
 from elastocal.identification.outliers import kept_of
 from elastocal.identification.solve import Solution
+from elastocal.identification.stated_noise import with_stated_sharing
 from elastocal.identification.weighted_problem import (
     inverse_factor,
     stated_by_observation,
@@ -66,10 +67,10 @@ class SingleReadings:
 
 
 def single_readings(
-    observed: Observations, residual: Array, stated: Array, spent: int
+    observed: Observations, residual: Array, stated: Array, spent: int, repeats: bool = True
 ) -> SingleReadings | None:
     """From the `residual` (N·3,) of positions, the noise `stated` (N, 3, 3) for each, and how many
-    parameters were `spent` on them; None where neither repeats nor markers tell."""
+    parameters were `spent` on them; None where neither markers nor, if asked, `repeats` tell."""
     n = len(observed.lead)
     if observed.kind != "position" or n > MOST:
         return None
@@ -78,7 +79,7 @@ def single_readings(
     table, lead = observed.table, observed.lead
     visit = numbered(observed.configuration, observed.load, table.repeat[lead])
     square, dof, by = *_of_bodies(observed, root, e, visit), "markers of one pose"
-    if dof < FEWEST:
+    if dof < FEWEST and repeats:
         square, dof = pure_error(observed.place, e)
         by = "repeats"
     rest = residual.size - spent - dof
@@ -383,31 +384,44 @@ def _bare(solution: Solution) -> Readings:
 
 def _ratio_to_stated(found: MethodResult, sigma: float) -> float | None:
     """Root mean square of the residual in units of the stated noise, per degree of freedom; of
-    stated tails, in units of what is left of that noise where far readings are set apart."""
+    stated tails, in units of what is left of that noise where far readings are set apart.
+
+    Readings that share some of it are weighted as they share it, and what the parameters take of
+    the residual at these weights is taken: only then does it have the expectation 1.
+    """
     solution = found.solution
-    observed, dof = solution.problem.observations, solution.problem.model.cell.noise.tails
-    unit = 1.0
-    if dof is not None and not found.good.all():
-        unit = kept_of(dof, len(found.good) * observed.size, observed.size).sigma
-    if found.method == "wls" and solution.problem.weights.absolute:
+    problem, fit = solution.problem, solution.fit
+    observed, model, unit = problem.observations, problem.model, 1.0
+    noise = model.cell.noise
+    if noise.tails is not None and not found.good.all():
+        unit = kept_of(noise.tails, len(found.good) * observed.size, observed.size).sigma
+    shared = noise.shared and not problem.large
+    if found.method == "wls" and problem.weights.absolute and not shared:
         return sigma / unit
     try:
-        stated = weights_for(solution.problem.observations, solution.problem.model.cell.tracker)
+        stated = weights_for(observed, model.cell.tracker)
     except InputError:
         return None
     if not stated.absolute:
         return None
-    e = stated.apply(solution.fit.residual)
+    if shared and stated.whiten is not None:
+        stated = replace(stated, whiten=stated.whiten / unit)
+        stated, unit = with_stated_sharing(stated, model, observed, fit.x), 1.0
+    e = stated.apply(fit.residual)
+    if shared:
+        Q, _ = np.linalg.qr(stated.apply(fit.B))
+        e = e - Q @ (Q.T @ e)
     return float(np.sqrt(e @ e / max(len(e) - _spent(found), 1))) / unit
 
 
 def _single(found: MethodResult) -> SingleReadings | None:
     solution = found.solution
     observed, tracker = solution.problem.observations, solution.problem.model.cell.tracker
-    stated = stated_by_observation(observed, tracker)
-    if stated is None or solution.problem.model.cell.noise.tails is not None:
+    stated, noise = stated_by_observation(observed, tracker), solution.problem.model.cell.noise
+    if stated is None or noise.tails is not None:
         return None
-    return single_readings(observed, solution.fit.residual, stated, _spent(found))
+    told = not noise.shared  # else repeats scatter by more than the instrument
+    return single_readings(observed, solution.fit.residual, stated, _spent(found), told)
 
 
 def _spent(found: MethodResult) -> int:

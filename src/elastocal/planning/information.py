@@ -13,10 +13,11 @@ from scipy import linalg, sparse
 from elastocal.cell.work_cell import Cell
 from elastocal.errors import InputError, InsufficientDataError, option, require
 from elastocal.identification.identify import identify
-from elastocal.identification.noise_structure import VISIT, SharedEffect, visit_record
+from elastocal.identification.noise_structure import SharedEffect, visit_record
 from elastocal.identification.options import Options
 from elastocal.identification.outliers import kept_of
 from elastocal.identification.solve import WORTH_A_COLUMN, Reduction, reduce
+from elastocal.identification.stated_noise import settling_joints
 from elastocal.identification.weighted_problem import (
     Weights,
     stated_covariance,
@@ -163,7 +164,7 @@ def pose_covariance(
         moved = np.diag(np.arange(size) < 3).astype(float)
         covariance = covariance + spec.repeatability**2 * np.kron(same, moved)
     if model.cell.noise.joints.any():
-        settling = settling_joints(model, observed, x)
+        settling = _settling(model, observed, x)
         members = np.arange(len(observed.lead)).reshape(n_poses, -1)
         loading = settling.packed(members)
         covariance = covariance + loading @ loading.transpose(0, 2, 1)
@@ -175,12 +176,10 @@ def pose_covariance(
     return covariance
 
 
-def settling_joints(model: Model, observed: Observations, x: Array) -> SharedEffect:
-    """What the joints' own scatter of `[noise]` puts on each visit's readings, of variance one."""
+def _settling(model: Model, observed: Observations, x: Array) -> SharedEffect:
     record = visit_record(model, observed, x)
     assert record is not None
-    loading = record.motion * model.cell.noise.of_joints(model.chain.n_joints)
-    return SharedEffect("joints", (VISIT,), record.visit, loading)
+    return settling_joints(model, record)
 
 
 # From the symbolic model to information: whitened B of any pose.
@@ -457,6 +456,6 @@ def observed_weights(model: Model, observed: Observations, x: Array) -> Weights:
     )
     covariance = told * (inverse @ inverse.T) + tau**2 * sparse.kron(same @ same.T, moved)
     if scatters:
-        Z = settling_joints(model, observed, x).columns()
+        Z = _settling(model, observed, x).columns()
         covariance = covariance + Z @ Z.T
     return Weights(stated.kind, whitener(sparse.csr_array(covariance)), True, stated.description)
