@@ -12,6 +12,7 @@ from elastocal.identification import noise_structure
 from elastocal.identification.findings import judged
 from elastocal.identification.identify import identify
 from elastocal.identification.noise_structure import in_random_order
+from elastocal.identification.options import Options
 from elastocal.identification.result import Calibration
 from elastocal.model.manipulator import Model
 from elastocal.report.judgement_view import noise_model_line
@@ -21,7 +22,9 @@ SIGMA, SCATTER, DRIFT, LASTING = 2e-5, 1e-4, 1e-4, 0.2
 MARKERS = {"M1": np.array([0.3, 0, 0.1]), "M2": np.array([-0.2, 0.2, 0.1])}
 
 
-def identified(scatter=0.0, drift=0.0, timed=True, ordered=False, stated=True, seed=0):
+def identified(
+    scatter=0.0, drift=0.0, timed=True, ordered=False, stated=True, seed=0, repeats=1, options=None
+):
     """36 poses of an arm whose base and markers are unknown."""
     rng = np.random.default_rng(seed)
     tracker, span = Tracker(noise=CartesianNoise(np.full(3, SIGMA))), 60.0 * 35
@@ -35,11 +38,13 @@ def identified(scatter=0.0, drift=0.0, timed=True, ordered=False, stated=True, s
         q = np.clip(np.cumsum(0.4 * rng.normal(size=q.shape), axis=0), -2.4, 2.4)
     table = table_at(q, markers=tuple(MARKERS))
     truth = true_values(model, rng, anywhere=False)
-    time = np.repeat(60.0 * np.arange(len(q)), len(MARKERS))
+    table = table.take(np.repeat(np.arange(len(table)).reshape(-1, 2), repeats, axis=0).ravel())
+    table = replace(table, repeat=np.tile(np.repeat(np.arange(repeats), 2), len(q)))
+    time = np.repeat(60.0 / repeats * np.arange(len(q) * repeats), len(MARKERS))
     read = simulate(model, replace(table, time=time), truth, rng)
     if not stated:
         model = Model.assembled(model.chain, replace(cell, noise=Unsteadiness()))
-    return identify(model, replace(read, time=time if timed else None))
+    return identify(model, replace(read, time=time if timed else None), options)
 
 
 @cache
@@ -116,3 +121,36 @@ def test_without_times_the_order_of_the_rows_stands_for_them_unless_it_is_one_of
     assert not in_random_order(along.observations.table)
     # Whoever states one knows that it is there.
     assert identified(drift=DRIFT, timed=False, ordered=True).finding("drift") is not None
+
+
+def test_the_stated_noise_is_all_that_the_cell_states():
+    """Its scatter of joints and drift are in the data: nothing is missing, nothing to be stated."""
+    for options in (None, Options(method="wls")):
+        fit = identified(scatter=SCATTER, drift=DRIFT, repeats=3, options=options)
+        assert fit.finding("residual_agrees_with_stated_noise") is not None
+        assert 0.85 < fit.noise.ratio_to_stated < 1.15
+        assert not any("State it" in w or "an effect is missing" in w for w in told(fit))
+    fit = identified(scatter=SCATTER, drift=DRIFT)
+    assert (
+        "It agrees with [noise] joints_urad of the cell (100)"
+        in fit.finding("joint_scatter").remedy
+    )
+
+
+def told(fit: Calibration) -> list[str]:
+    """Its warnings but that on wls, whose intervals do not count what readings share."""
+    return [w for w in fit.warnings if w.kind != "lack_of_fit"]
+
+
+def test_scatter_that_the_cell_does_not_state_stays_above_the_stated_noise():
+    fit = identified(scatter=SCATTER, stated=False)
+    assert fit.finding("residual_above_stated_noise") is not None
+    assert "State it as [noise] joints_urad" in fit.finding("joint_scatter").remedy
+
+
+def test_a_drift_that_repeats_share_is_counted_by_the_noise_model():
+    fit = identified(drift=2 * DRIFT, scatter=SCATTER, repeats=3, seed=4)
+    assert fit.noise.kind.endswith("+time")
+    assert fit.finding("lack_of_fit").numbers["counted_by"] == "the noise model"
+    assert fit.finding("lack_of_fit").severity == "note"
+    assert not any("default method" in w or "too narrow" in w for w in fit.warnings)

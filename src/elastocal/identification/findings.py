@@ -12,7 +12,7 @@ from scipy import linalg, special
 from elastocal.errors import option
 from elastocal.identification.far_values import STATED_BY_FILE, far_values
 from elastocal.identification.mistakes import CELL, KILOGRAMS, load_ratio
-from elastocal.identification.noise_structure import JOINTS, TIME
+from elastocal.identification.noise_structure import JOINTS, TIME, Kind
 from elastocal.identification.noise_summary import Drift, NoiseSize
 from elastocal.identification.outliers import kept_of
 from elastocal.identification.prediction import unread_markers
@@ -90,9 +90,11 @@ def judged(result: Calibration, of_solution: tuple[Finding, ...] | None = None) 
     """
     if of_solution is None:
         of_solution = tuple(f for f in result.findings if f.kind in OF_SOLUTION)
-    noise = (*_against_stated_noise(result), *_repeats(result))
-    explained = _explained(result, {f.kind for f in noise})
-    visits = tuple(_visits(result))
+    compared = tuple(_against_stated_noise(result))
+    fits = any(f.kind == "residual_agrees_with_stated_noise" for f in compared)
+    noise = (*compared, *_repeats(result, fits))
+    explained = _explained(result, noise)
+    visits = tuple(_visits(result, fits))
     far = tuple(far_values(result, explained, _lacking(result)))
     # Where all lengths are others than the cell's, so are the compliances to expect.
     scaled = any(f.kind == "scale" for f in far)
@@ -148,11 +150,13 @@ def _spoilt(result: Calibration) -> Iterator[Finding]:
         yield Finding("no_better_than_nominal", "poor", numbers)
 
 
-def _explained(result: Calibration, told: set[str]) -> bool:
-    """Whether the noise explains what is left, by what is `told` of it, and held-out poses agree.
+def _explained(result: Calibration, noise: tuple[Finding, ...]) -> bool:
+    """Whether the noise explains what is left, by the findings on it, and held-out poses agree.
 
     Of n equations for p parameters the held-out error is that of the fit times n / (n - p) or more.
     """
+    told = {f.kind for f in noise}
+    lacking = any(f.kind == "lack_of_fit" and f.severity == "care" for f in noise)
     stated = told & {
         "residual_agrees_with_stated_noise", "residual_below_stated_noise",
         "residual_agrees_with_readings",
@@ -160,7 +164,7 @@ def _explained(result: Calibration, told: set[str]) -> bool:
     agrees = bool(stated) or ("noise_not_compared" in told and "repeats_agree" in told)
     n, held = len(result.observations.value), result.heldout_rms
     expected = result.residual_rms * n / max(result.dof, 1)
-    return agrees and "lack_of_fit" not in told and held <= FLATTERS * expected
+    return agrees and not lacking and held <= FLATTERS * expected
 
 
 # What an identification takes for granted.
@@ -371,17 +375,24 @@ def _lacks_fit(result: Calibration) -> bool:
     return found is not None and found.p < LACK_OF_FIT
 
 
-def _repeats(result: Calibration) -> Iterator[Finding]:
-    """Do configurations scatter more than their repeats, and does anything count with it?"""
+def _repeats(result: Calibration, fits: bool) -> Iterator[Finding]:
+    """Do configurations scatter more than their repeats, and does anything count with it?
+
+    Where the residual `fits` a stated noise of which readings share some, nothing is missing.
+    """
     noise, test = result.noise, result.noise.lack_of_fit
     if test is not None:
         counted = "the intervals" if noise.intervals_by_configuration else "nothing"
+        if noise.shared or noise.drift is not None:
+            counted = "the noise model"
         numbers: dict[str, Number] = {
             "F": test.F, "dof_between": test.dof_between, "dof_pure": test.dof_pure, "p": test.p,
-            "counted_by": "the noise model" if noise.shared else counted,
+            "counted_by": counted,
         }  # fmt: skip
         if _lacks_fit(result):
-            yield Finding("lack_of_fit", "care", numbers, _lacking(result))
+            known = fits and result.model.cell.noise.shared and counted == "the noise model"
+            severity: Severity = "note" if known else "care"
+            yield Finding("lack_of_fit", severity, numbers, "" if known else _lacking(result))
         else:
             yield Finding("repeats_agree", "good", numbers)
     shared = [s for s in noise.sizes or () if s.shared and s.sigma is not None]
@@ -395,10 +406,13 @@ def _repeats(result: Calibration) -> Iterator[Finding]:
         )  # fmt: skip
 
 
-def _visits(result: Calibration) -> Iterator[Finding]:
+def _visits(result: Calibration, fits: bool) -> Iterator[Finding]:
     """Joints that settle anew at each visit, and a drift: what a test of false-alarm rate SCATTERS
-    finds, whether the noise model has it or not."""
+    finds, whether the noise model has it or not.  `fits`: the residual agrees with the stated
+    noise."""
     noise, sizes = result.noise, result.noise.sizes or ()
+    stated = result.model.cell.noise
+    scatter = stated.of_joints(result.model.chain.n_joints)
     for test in noise.tests:
         if test.p >= SCATTERS or test.part not in (JOINTS, TIME):
             continue
@@ -411,36 +425,55 @@ def _visits(result: Calibration) -> Iterator[Finding]:
                     "sigma_urad": tuple(_um(s.sigma or 0.0) for s in joints),
                 },
                 "Measure more poses, not more repeats, and approach each from the same side: the "
-                "joints settle anew at every visit. State it as [noise] joints_urad in the cell "
-                "for design and simulate.",
+                "joints settle anew at every visit. "
+                + _beside_stated("joints_urad", [
+                    (s, float(np.sqrt((scatter[list(s.joints)] ** 2).mean()))) for s in joints
+                ], fits),
             )  # fmt: skip
         elif test.part == TIME and noise.drift is not None:
-            yield from _drift(noise.drift, [s for s in sizes if s.drift and s.sigma], test.p)
+            drifts = [s for s in sizes if s.drift and s.sigma]
+            if drifts:
+                remedy = _beside_stated("drift_um", [(drifts[0], stated.drift)], fits)
+                yield _drift(noise.drift, drifts[0], test.p, remedy)
         else:
+            known = scatter.any() if test.part == JOINTS else stated.drift > 0
             yield Finding(
                 "scatter_not_counted", "care",
                 {"part": "joints" if test.part == JOINTS else "time", "p": test.p},
-                "Ask what the model lacks (elastocal diagnose): residuals change from visit to "
-                "visit or in time, and noise that does so does not predict poses better.",
+                "Fit with the scatter that [noise] of the cell states: "
+                f"{option('noise', Kind.parsed(noise.kind).with_stated(stated).name)}."
+                if known
+                else "Ask what the model lacks (elastocal diagnose): residuals change from visit "
+                "to visit or in time, and noise that does so does not predict poses better.",
             )  # fmt: skip
 
 
-def _drift(drift: Drift, sizes: list[NoiseSize], p: float) -> Iterator[Finding]:
-    if sizes:
-        timed = drift.seconds is not None
-        yield Finding(
-            "drift", "care",
-            {
-                "sigma_um": _um(sizes[0].sigma or 0.0), "p": p,
-                "lasting_s": drift.seconds, "lasting_share": drift.share,
-                "by": "times" if timed else "order of the rows",
-            },
-            "Measure poses and loads in random order, return to a reference pose every ten poses, "
-            + ("" if timed else "record times, ")
-            + "and let arm and tracker warm up. State it as [noise] drift_um in the cell for "
-            "design and simulate."
-            + ("" if drift.ends else WANDERS),
-        )  # fmt: skip
+def _beside_stated(key: str, found: list[tuple[NoiseSize, float]], fits: bool) -> str:
+    """What to do about `key` of [noise], by the sizes found and stated (m or rad)."""
+    said = listed([f"{_um(size):.3g}" for _, size in found if size])
+    if not said:
+        return f"State it as [noise] {key} in the cell for design and simulate."
+    if all(size.agrees_with(stated) for size, stated in found):
+        return f"It agrees with [noise] {key} of the cell ({said})."
+    if fits:  # parts of the noise that are alike have their sum alone told
+        return f"The cell states it: [noise] {key} ({said})."
+    return f"Correct [noise] {key} of the cell ({said}) for design and simulate."
+
+
+def _drift(drift: Drift, size: NoiseSize, p: float, remedy: str) -> Finding:
+    timed = drift.seconds is not None
+    return Finding(
+        "drift", "care",
+        {
+            "sigma_um": _um(size.sigma or 0.0), "p": p,
+            "lasting_s": drift.seconds, "lasting_share": drift.share,
+            "by": "times" if timed else "order of the rows",
+        },
+        "Measure poses and loads in random order, return to a reference pose every ten poses, "
+        + ("" if timed else "record times, ")
+        + f"and let arm and tracker warm up. {remedy}"
+        + ("" if drift.ends else WANDERS),
+    )  # fmt: skip
 
 
 def _prediction(result: Calibration, explained: bool) -> Iterator[Finding]:

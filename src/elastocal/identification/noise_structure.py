@@ -10,6 +10,7 @@ from typing import ClassVar, NamedTuple
 import numpy as np
 from scipy import sparse, special
 
+from elastocal.cell.arm_description import Unsteadiness
 from elastocal.engine.mixed import Common, Full, NoiseParts, Pack
 from elastocal.errors import InputError, option, require
 from elastocal.measurements import Measurements, firsts, numbered, visits
@@ -520,6 +521,11 @@ class Kind(NamedTuple):
     @property
     def name(self) -> str:
         return self.own + SHARED * self.shared + self.joints + TIME * self.time
+
+    def with_stated(self, noise: Unsteadiness) -> Kind:
+        """With what `[noise]` of a cell states of visits."""
+        joints = self.joints or JOINTS * bool(noise.joints.any())
+        return self._replace(joints=joints, time=self.time or noise.drift > 0)
 
     @property
     def by_visit(self) -> bool:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 import re
 from dataclasses import asdict, dataclass, replace
 from typing import Any
@@ -160,12 +161,21 @@ TOO_LARGE = (
 @dataclass(frozen=True)
 class NoiseSize:
     """An estimated standard deviation `sigma` in m (rad), or the `factor` on the stated noise;
-    `joints` are those whose scatter it is."""
+    `joints` are those whose scatter it is, `relative` the standard error of σ² over σ²."""
 
     name: str
     sigma: float | None
     factor: float | None = None
     joints: tuple[int, ...] = ()
+    relative: float = 0.0
+
+    def agrees_with(self, stated: float) -> bool:
+        """Whether it is the `stated` standard deviation within its 99 % interval, that of log σ²;
+        a variance whose uncertainty is not known contradicts nothing."""
+        if not self.sigma or not stated:
+            return False
+        off = abs(2 * math.log(self.sigma / stated))
+        return not self.relative or off <= float(special.ndtri(0.995)) * self.relative
 
     @property
     def of_joints(self) -> bool:
@@ -332,6 +342,8 @@ def _estimated(noise: Noise, found: NoiseFit, table: Measurements) -> Noise:
 
     own, sigma = fit.noisy.own, np.sqrt(fit.theta).tolist()
     sizes = tuple(map(size, range(len(sigma)), fit.noisy.names, sigma))
+    error = np.sqrt(np.diagonal(fit.fit.covariance)) / np.maximum(fit.theta, 1e-300)
+    sizes = tuple(replace(s, relative=float(r)) for s, r in zip(sizes, error, strict=True))
     drift = None
     if found.lasting is not None and found.course is not None:
         drift = Drift(

@@ -43,9 +43,8 @@ SENTENCES = {
     "lack_of_fit": (
         "Configurations scatter more than their repeats (lack of fit: F = {F:.2f} on {dof_between} "
         "and {dof_pure} degrees of freedom, p = {p:.1g}): the arm does not return to the same "
-        "place, or an effect is missing. The intervals assume independent readings and are too "
-        "narrow: use the default method, whose noise model has this scatter, or intervals by cr2; "
-        "measure more configurations rather than more repeats."
+        "place, or an effect is missing. The intervals do not include it and are too narrow: "
+        "use {count}intervals by cr2; measure more configurations rather than more repeats."
     ),
     "drift": (
         "Base or tracker drift during the session ({sigma_um:.3g} µm in each direction, by the "
@@ -102,6 +101,8 @@ def _told(result: Calibration, same: list[Finding]) -> Iterator[str]:
         words = {k: ", ".join(map(_word, v)) if isinstance(v, tuple) else v
                  for k, v in f.numbers.items()}  # fmt: skip
         within = f.kind == "beyond_bound"  # there the remedy ends a sentence
+        default = "the default method, whose noise model has this scatter, or "
+        words["count"] = "" if result.noise.estimated else default
         words["remedy"] = f.remedy[:1].lower() + f.remedy[1:] if within else f.remedy
         if f.kind == "copied_readings":
             words["lines"] = _runs(result.copies)
