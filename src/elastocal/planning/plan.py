@@ -704,7 +704,7 @@ class Plan(Result):
             "minutes": self.execution.total / 60,
             "curve": [{"n_poses": s.poses, "value": s.value, "bound": s.bound} for s in self.curve],
             "warnings": list(self.warnings),
-            "made_for": self.made_for or None,
+            **({"made_for": self.made_for} if self.made_for else {}),
             "seed": self.seed,
         }  # fmt: skip
 
