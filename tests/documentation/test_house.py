@@ -25,10 +25,15 @@ def uses(house):
     return house.uses()
 
 
-def test_every_package_has_a_room_and_a_line_of_text(house):
-    packages = {path.parent.name for path in (ROOT / "src" / "elastocal").glob("*/__init__.py")}
-    told = set(re.findall(r"`(\w+)`", PAGE))
-    assert packages - {"demo"} <= set(house.ROOMS) & told
+def test_every_package_and_module_has_a_line_of_the_table_and_packages_a_room(house):
+    source = ROOT / "src" / "elastocal"
+    packages = {path.parent.name for path in source.glob("*/__init__.py")}
+    modules = {path.name for path in source.glob("*.py") if not path.name.startswith("__")}
+    table = PAGE.split("## Packages and modules")[1].split("\n## ")[0]
+    cells = [line.split("|")[1] for line in table.splitlines() if line.startswith("| `")]
+    told = re.findall(r"`([\w.]+)`", " ".join(cells))
+    assert sorted(told) == sorted(packages | modules)
+    assert packages - {"demo"} <= set(house.ROOMS)
 
 
 def test_every_arrow_leads_downwards(house, uses):
