@@ -87,3 +87,19 @@ def test_names_of_markers_are_no_markup(folder):
     outcome = run(folder, folder / "targets.csv", "--point", "[bold]M2")
     assert outcome.exit_code == 0, outcome.stderr
     assert "[bold]M2" in " ".join(outcome.stdout.split())
+
+
+def test_why_targets_are_not_reached_is_said_once(folder):
+    far = folder / "far.csv"
+    far.write_text("x_m,y_m,z_m\n1.8,0,0.9\n9,0,0.9\n")
+    outcome = run(folder, far, "-o", folder / "commands.csv", "--point", "M1")
+    assert outcome.exit_code == 1
+    assert "1 of 2 targets are not reached: line 3: out of reach" in outcome.stderr
+    assert "(not reached)" not in outcome.stderr
+
+
+def test_the_step_after_commands_is_told(folder):
+    files = [str(folder / name) for name in ("cell.toml", "result.json", "targets.csv")]
+    out = str(folder / "commands.csv")
+    outcome = CliRunner().invoke(app, ["compensate", *files, "-o", out, "--point", "M2"])
+    assert "Next: Run commands.csv and measure some. 95 % of the targets" in outcome.output
