@@ -31,7 +31,7 @@ ROOMS = {
     "measurements": (5.25, 1, 1.0, "the table of\nreadings"),
 }
 MISSION = ("model", "engine", "identification", "planning", "diagnosis")
-COMMON = "units · errors · text · files · config · tables"
+COMMON = "arguments · config · errors · files · screen · tables · text · units"
 HEIGHT, STEP = 0.72, 1.14
 
 
