@@ -44,6 +44,7 @@ FEWEST = 35  # degrees of freedom, from which a scatter is known to a factor of 
 BEYOND = 0.005  # chance that so much scatter has the stated noise
 REST = 0.01  # p-value below which the rest of the residual is more than single readings explain
 MOST = 20_000  # readings that are looked at
+MOST_NUMBERS = 30_000_000  # of B held at once, to weight readings by what they share
 
 
 @dataclass(frozen=True)
@@ -407,7 +408,7 @@ def _ratio_to_stated(found: MethodResult, sigma: float) -> float | None:
     noise = model.cell.noise
     if noise.tails is not None and not found.good.all():
         unit = kept_of(noise.tails, len(found.good) * observed.size, observed.size).sigma
-    shared = noise.shared and not problem.large
+    shared = noise.shared and len(fit.residual) * len(fit.columns) <= MOST_NUMBERS
     if found.method == "wls" and problem.weights.absolute and not shared:
         return sigma / unit
     try:
