@@ -107,7 +107,7 @@ def test_ill_conditioned():
     assert "ill" in kinds(result)
     warning = text_of(result, "ill")
     assert "the data barely separate" in warning
-    assert "Measure poses in which the joints differ more, or fix one of these parameters" in warning
+    assert "in which the joints differ more, or fix one of these parameters" in warning
     named = warning.split("barely separate ")[1].split(". Measure")[0].split(", ")
     assert len(named) == 3 and set(named) <= set(result.determined)
 
