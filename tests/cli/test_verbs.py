@@ -22,6 +22,13 @@ def test_help_lists_every_verb_in_the_order_of_the_work_with_a_whole_sentence():
         assert len(line.split()) > 3 and not line.endswith("..."), line
 
 
+def test_an_option_without_effect_is_taken_and_not_offered() -> None:
+    assert "--jobs" not in run("identify", "--help").stdout
+    assert "--jobs" in run("design", "--help").stdout
+    done = run("identify", "no.toml", "no.csv", "--jobs", "2")
+    assert done.exit_code == 2 and "no.toml: no such file" in done.stderr
+
+
 @pytest.mark.parametrize("verb", VERBS)
 def test_no_help_text_shows_what_only_a_programmer_knows(verb: str) -> None:
     options = run(verb, "--help").stdout.partition("Options:")[2]

@@ -165,7 +165,8 @@ def _offered(
             default, metavar, help = None, "NAME", f"{help.removesuffix('.')}; repeatable."
         elif taken == FORCE:
             metavar = "X Y Z"
-        option = typer.Option(flag_of(name), metavar=metavar, help=help)
+        idle = help.startswith("Has no effect")  # taken where scripts give it
+        option = typer.Option(flag_of(name), metavar=metavar, help=help, hidden=idle)
         kind = taken | None if default is None else taken
         yield name, _parameter(name, kind, default, SEED if name == "seed" else option)
 
