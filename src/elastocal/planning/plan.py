@@ -289,6 +289,12 @@ class Certificate:
     ascents: int = 0
     starts: tuple[float, ...] = ()
 
+    @property
+    def better_pool(self) -> float | None:
+        """The share of the error (√Φ, as people know it) by which a plan of the pool may be
+        better."""
+        return None if self.efficiency_pool is None else 1 - float(np.sqrt(self.efficiency_pool))
+
 
 @dataclass(frozen=True)
 class Chance:
@@ -570,8 +576,8 @@ class Plan(Result):
     scheduled: Scheduled | None = None
 
     def __repr__(self) -> str:
-        sure = self.certificate.efficiency_pool
-        told = "" if sure is None else f", at least {100 * sure:.1f} % of the best of its pool"
+        away = self.certificate.better_pool
+        told = "" if away is None else f", none of its pool is over {100 * away:.1f} % better"
         return (
             f"<Plan {self.model.chain.name}: {len(self)} poses by {self.criterion}, "
             f"{self.reported:.4g} {self.unit}{told}>"

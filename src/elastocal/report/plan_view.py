@@ -221,13 +221,19 @@ def plan_headline(plan: Plan) -> str:
         )
     else:
         text = f"{n}: {plan.criterion} = {plan.reported:.4g} {plan.unit}".rstrip()
-    found = plan.certificate.efficiency_pool
-    if found is None or found < VAIN:
+    found, better = plan.certificate.efficiency_pool, plan.certificate.better_pool
+    if found is None or better is None or found < VAIN:
         return f"{text}; no bound on the best plan is known."
-    away = 100 * (1 - found)
+    away = 100 * better
     text += "; no other plan from these candidates is "
     text += "better" if away < 0.05 else f"more than {away:.1f} % better"
+    text += " by the weighted error" if _weighted(plan) else ""
     return f"{text} (certified)."
+
+
+def _weighted(plan: Plan) -> bool:
+    """Was the error at the test poses minimised together with that elsewhere?"""
+    return plan.everywhere is not None and plan.everywhere.share > 0
 
 
 def _rho(plan: Plan) -> float:
@@ -368,7 +374,8 @@ def _everywhere_lines(plan: Plan) -> list[tuple[str, str]]:
             f"{e.drifting_test_poses * 1e6:.4g} and {e.drifting_elsewhere * 1e6:.4g} µm"
         )
     if e.share:
-        text += f"; the joint ranges have {100 * e.share:.0f} % of the criterion's weight"
+        text += f"; minimised is the weighted error, {plan.reported:.4g} µm, in which the joint "
+        text += f"ranges count {100 * e.share:.0f} %"
         text += f", with ρ₀ at most {100 * e.cap:g} % above its minimum" if e.cap else ""
     elif plan.of_test_poses:
         text += (
@@ -387,9 +394,7 @@ def _chance_lines(plan: Plan) -> list[tuple[str, str]]:
     lost = f"{open_} of {whole} do not determine all parameters of this plan"
     if c.median is None or c.best is None:
         return [("Chance", f"{lost}.")]
-    name = "ρ₀" if plan.of_test_poses else plan.criterion
-    if plan.everywhere is not None and plan.everywhere.share:
-        name = "the weighted error"
+    name = _criterion(plan)
     unit = f" {plan.unit}" if plan.unit else ""
     worst = "no value" if c.worst is None else f"{c.worst:.4g}"
     text = (
@@ -399,6 +404,13 @@ def _chance_lines(plan: Plan) -> list[tuple[str, str]]:
     if c.efficiency is not None:
         text += f", an efficiency of {c.efficiency:.2f} against this plan"
     return [("Chance", f"{text}; {lost}." if open_ else f"{text}.")]
+
+
+def _criterion(plan: Plan) -> str:
+    """The name of what the search made small, which starts and bound are figures of."""
+    if _weighted(plan):
+        return "weighted error"
+    return "ρ₀" if plan.of_test_poses else plan.criterion
 
 
 def _candidate_line(plan: Plan) -> tuple[str, str]:
@@ -414,12 +426,14 @@ def _certificate_lines(plan: Plan) -> list[tuple[str, str]]:
     if c.efficiency_pool is None:
         reason = CRITERIA[plan.criterion].without_bound
         return [("Certificate", f"none: {plan.criterion} {reason}, so no bound is known.")]
-    told = "" if plan.bound_reported is None else f" (bound {plan.bound_reported:.4g} {plan.unit})"
+    told = ""
+    if plan.bound_reported is not None:
+        told = f" (bound {_criterion(plan)} = {plan.bound_reported:.4g} {plan.unit})"
     lines = [
         (
             "Certificate",
-            f"certified on the pool: efficiency {_share(c.efficiency_pool)} against the best "
-            f"subset of the {c.pool} candidates with the same number per level"
+            f"certified on the pool: efficiency {_share(c.efficiency_pool)} (in readings) against "
+            f"the best subset of the {c.pool} candidates with the same number per level"
             f"{told.replace(' )', ')')}.",
         )
     ]
@@ -448,15 +462,13 @@ def _starts_lines(plan: Plan) -> list[tuple[str, str]]:
         return []
     unit = f" {plan.unit}" if plan.unit else ""
     low, high = f"{min(ends):.4g}", f"{max(ends):.4g}"
-    told = f"at {low}{unit}" if low == high else f"between {low} and {high}{unit}"
-    return [
-        (
-            "Certificate",
-            f"{counted(len(ends), 'start')} of the search ended {told}, the bound is "
-            f"{bound:.4g}{unit}. The difference is what no start found, or what only weights can "
-            "reach: the fewer poses, the more of the latter.",
-        )
-    ]
+    told = f"{low if low == high else f'{low} to {high}'}{unit}"
+    text = (
+        f"{counted(len(ends), 'start')} of the search ended with {_criterion(plan)} = {told}, the "
+        f"bound is {bound:.4g}{unit}. The difference is what no start found, or what only weights "
+        "can reach: the fewer poses, the more of the latter."
+    )
+    return [("Certificate", text)]
 
 
 def _share(value: float) -> str:
