@@ -103,3 +103,24 @@ def test_the_step_after_commands_is_told(folder):
     out = str(folder / "commands.csv")
     outcome = CliRunner().invoke(app, ["compensate", *files, "-o", out, "--point", "M2"])
     assert "Next: Run commands.csv and measure some. 95 % of the targets" in outcome.output
+
+
+def test_targets_in_another_unit_are_told_so(folder):
+    """1.8 mm from the base's origin no tool works; 1.8 m from it one does."""
+    metres = TARGETS.replace("1800,300,1500", "1.8,0.3,1.5").replace("1810,300", "1.81,0.3")
+    metres = metres.replace("1820,300", "1.82,0.3").replace(",1500,", ",1.5,")
+    (folder / "targets.csv").write_text(metres)
+    for words in (("--target", "1.8,0.3,1.5"), ("--target=1.8,0.3,1.5,0,120,0",),
+                  (str(folder / "targets.csv"),),
+                  ("--table", str(folder / "t.csv"), "--grid", "2", "--box", "1.7,-.1,.6,1.8,.1,1"),
+                  ("--target", "3.8,0.3,1.5", "--frame", "tracker")):  # fmt: skip
+        done = run(folder, *words)
+        assert done.exit_code == 2, words
+        assert "wrong unit?" in done.stderr and "in m where mm are asked for" in done.stderr
+        assert not (folder / "t.csv").exists()
+    (folder / "targets.csv").write_text(TARGETS.replace("_mm", "_m"))
+    done = run(folder, str(folder / "targets.csv"), "-o", str(folder / "out.csv"))
+    assert done.exit_code == 2 and "in mm where m are asked for" in done.stderr
+    # What is near the origin and would be nowhere in another unit is taken as it is.
+    done = run(folder, "--target", "20,3,9")
+    assert "wrong unit" not in done.stderr

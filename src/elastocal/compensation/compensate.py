@@ -29,7 +29,7 @@ from elastocal.model.chain import Chain, finite_ranges, joint_limits
 from elastocal.model.effects.catalogue import effect_of
 from elastocal.model.inverse_kinematics import Reaching, inverse_kinematics
 from elastocal.model.manipulator import smooth_groups
-from elastocal.model.rigid import nominal_flanges
+from elastocal.model.rigid import nominal_flanges, reach_of
 from elastocal.tables import column, csv_text
 from elastocal.text import listed, plain
 from elastocal.units import Array, IntArray
@@ -127,6 +127,8 @@ def compensate(
     if targets.frame == "base":
         force = np.einsum("nij,nj->ni", T[:, :3, :3], force)
     rows = tool.rows(replace(targets.table, force=force))
+    if targets.position is not None:
+        _check_unit(targets, targets.position, chain, T)
     goals = _goals(targets, chain, T, place, turn)
     aimed = goals.in_base(T)
     in_base = aimed.position
@@ -167,6 +169,28 @@ def compensate(
             "one campaign and no part of these commands."
         )
     return replace(result, warnings=tuple(told))
+
+
+NOWHERE = 100.0  # of the reach nearer to the origin, or as many reaches away: no tool works there
+
+
+def _check_unit(targets: Targets, position: Array, chain: Chain, T: Array) -> None:
+    """Raise InputError where all targets lie at the origin of their frame or far beyond the arm,
+    and 1000 times as far, or as near, within its reach (twice, for tool and a rail)."""
+    reach, far = reach_of(chain), np.linalg.norm(position, axis=1)
+    for out, factor, told in (
+        (far < reach / NOWHERE, 1e3, "small; are they in m where mm are asked for?"),
+        (far > reach * NOWHERE, 1e-3, "large; are they in mm where m are asked for?"),
+    ):
+        meant = factor * position
+        if targets.frame == "tracker":
+            meant = np.einsum("nji,nj->ni", T[:, :3, :3], meant - T[:, :3, 3])
+        if far.any() and (out & (np.linalg.norm(meant, axis=1) < 2 * reach)).all():
+            raise InputError(
+                f"{targets.table.source}: wrong unit? All targets ({len(far)}) lie up to "
+                f"{1e3 * far.max():.4g} mm from the origin of the {targets.frame} frame, and the "
+                f"arm reaches {1e3 * reach:.4g} mm: the numbers seem 1000 times too {told}"
+            )
 
 
 def _goals(targets: Targets, chain: Chain, T: Array, place: Array, turn: Array) -> Goals:
