@@ -240,10 +240,9 @@ def _impossible(result: Calibration) -> Iterator[Finding]:
         return
     springs = [p for p in result.model.parameters if p.effect == JointCompliance.name]
     turned = [p for p, _ in found if p.effect == JointCompliance.name]
-    most = 2 * len(turned) > len(springs) > 0
-    signs = most and result.observations.table.force.any()
+    signs = 2 * len(turned) > len(springs) and bool(result.observations.table.force.any())
     yield Finding(
-        "impossible_values", "poor" if most else "care",
+        "impossible_values", "poor" if signs else "care",
         {
             "parameters": tuple(p.name for p, _ in found),
             "values": tuple(e.held for _, e in found), "units": tuple(p.unit for p, _ in found),
