@@ -77,4 +77,4 @@ def test_a_grid_in_singular_postures_is_told_with_the_joint_at_fault() -> None:
     found = correction_table(arm, CorrectionGrid(tuple(axes), True), point, DOWN)
     (told,) = found.warnings
     assert told.startswith("only 0 of 8 grid points are exact")
-    assert "q5_deg = 0;" in told and "q4" not in told and "q6" not in told
+    assert "singular by the levels of q5_deg = 0;" in told and "q4" not in told and "q6" not in told

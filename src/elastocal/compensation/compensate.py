@@ -32,7 +32,7 @@ from elastocal.model.manipulator import smooth_groups
 from elastocal.model.rigid import nominal_flanges, reach_of
 from elastocal.tables import column, csv_text
 from elastocal.text import listed, plain
-from elastocal.units import Array, IntArray
+from elastocal.units import Array, BoolArray, IntArray
 
 REACHED, LIMIT, NO_EQUILIBRIUM, NOT_REACHED = "reached", "limit", "no equilibrium", "not reached"
 
@@ -548,8 +548,9 @@ LEAST_STEP = 1e-9  # m between levels
 MOST_POINTS = 200_000
 BETWEEN = 512  # points between those of the grid, on which interpolation is measured
 EXACT, FIRST_ORDER = "exact", "first order"
-ASIDE = 5 * LARGE_CORRECTION  # rad or m: a joint's step away from a singular posture
+ASIDE = np.radians(30.0)  # or m: from a singular posture to one half as good as the best (sin 30°)
 TRIED = 20  # points, at most
+HELPS = 0.25  # of them, as other joints may stand at singular levels too
 NOMINAL_MISS = 1e-5  # m
 
 
@@ -687,31 +688,39 @@ def _mostly_inexact(
     arm: CalibratedArm, grid: CorrectionGrid, status: tuple[str, ...], point: ToolPoint,
     force: Array | None, seed: int,
 ) -> str:  # fmt: skip
-    """Why most points are not exact: a joint with one level is moved ASIDE to see if that helps."""
-    some = np.flatnonzero([s != EXACT for s in status])
-    some = some[:: -(-len(some) // TRIED)]
-    chain, singular = arm.model.chain, []
-    low, high = joint_limits(arm.model.cell, chain)
-    for k in (k for k, axis in enumerate(grid.axes) if grid.joints and len(axis) == 1):
-        points = grid.points()[some]
-        aside = ASIDE if high[k] - points[0, k] > ASIDE else -ASIDE
-        points[:, k] = np.clip(points[:, k] + aside, low[k], high[k])
-        tried = compensate(arm, _targets(grid, points, force), point, None, seed)
-        moved = _corrections(CalibratedTool(arm, point), tried)[1]
-        if moved.count(EXACT) > len(moved) / 2:
-            head = joint_columns(chain.kinds)[k]
-            level = in_file_units(grid.points()[:1], chain.kinds)[0, k]
-            singular.append(f"{head} = {level + 0.0:.4g}")
-    told = f"only {status.count(EXACT)} of {len(status)} grid points are exact: at most of them "
-    if singular:
-        return (
-            f"{told}the posture is singular, by the only level {listed(singular)}; give that joint "
-            f"2 levels or more by {option('grid')}"
-        )
+    """Why most points are not exact: some of them are tried again away from the joint limits, and
+    then with one joint moved, to see what helps."""
+    told = f"only {status.count(EXACT)} of {len(status)} grid points are exact: for most others "
+    chain, beyond = arm.model.chain, "the command is out of the joint limits"
+    if grid.joints:
+        tool = CalibratedTool(arm, point)
+
+        def exact(q: Array) -> BoolArray:
+            tried = compensate(arm, _targets(grid, q, force), point, None, seed)
+            return np.array(_corrections(tool, tried)[1]) == EXACT
+
+        some = np.flatnonzero([s != EXACT for s in status])
+        low, high = finite_ranges(chain, *joint_limits(arm.model.cell, chain))
+        aside = np.minimum(ASIDE, (high - low) / 4)
+        inside = np.clip(grid.points()[some[:: -(-len(some) // TRIED)]], low + aside, high - aside)
+        helped = exact(inside)
+        if helped.mean() > 0.5:
+            return f"{told}{beyond}, where the grid ends; first order is all there is"
+        q, heads = inside[~helped], joint_columns(chain.kinds)
+        levels = in_file_units(q[:1], chain.kinds)[0]
+        singular = [
+            heads[k] + (f" = {levels[k] + 0.0:.4g}" if len(axis) == 1 else "")
+            for k, axis in enumerate(grid.axes)
+            if exact(q + aside[k] * np.eye(len(heads))[k]).mean() > HELPS
+        ]
+        if singular:
+            return (
+                f"{told}the posture is singular by the levels of {listed(singular)}; give other "
+                f"levels, for a joint in its middle 2 or more, by {option('grid')}"
+            )
     return (
-        f"{told}the command is out of limits, or a joint would turn by more than "
-        f"{np.degrees(LARGE_CORRECTION):.0f}°, as beside singular postures; choose other levels by "
-        f"{option('grid')}"
+        f"{told}{beyond}, or a joint would turn by more than {np.degrees(LARGE_CORRECTION):.0f}°, "
+        f"as beside singular postures; choose other levels by {option('grid')}"
     )
 
 
