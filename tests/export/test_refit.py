@@ -130,6 +130,18 @@ def test_the_file_of_the_diagnosed_arm_is_no_worse_than_one_without_a_diagnosis(
     assert told["marker_rms_before_um"] < told["marker_rms_nominal_um"]
 
 
+def test_one_load_is_told_as_one_and_several_as_a_range(folder):
+    export(folder, "full", "both.urdf")
+    assert ", under 0 to 1500 N" in (folder / "both.urdf").read_text()
+    content = json.loads((folder / "full.json").read_text())
+    visits = content["measured_visits"]
+    visits["force_N"] = [[0, 0, -1500]] * len(visits["q"])
+    (folder / "loaded.json").write_text(json.dumps(content))
+    (folder / "loaded.toml").write_text((folder / "full.toml").read_text())
+    export(folder, "loaded", "loaded.urdf", "--load", 0, 0, -1500)
+    assert ", under 1500 N" in (folder / "loaded.urdf").read_text()
+
+
 def test_with_its_joint_correction_mujoco_does_as_well_as_elastocal(folder):
     (folder / "joints.csv").unlink(missing_ok=True)
     correction = ("--joint-correction", folder / "joints.csv")
