@@ -11,7 +11,8 @@ import pytest
 
 from elastocal.identification.findings import judged
 from elastocal.identification.noise_summary import LackOfFit
-from elastocal.identification.result import TestErrors
+from elastocal.identification.result import Finding, TestErrors
+from elastocal.identification.sentences import Told
 from elastocal.report import judgement_view
 from elastocal.report.formatting import length
 from elastocal.report.page import page_of
@@ -111,3 +112,11 @@ def test_what_is_no_better_than_nominal_must_not_be_used(fine: Any) -> None:
     assert useless.tone == lost.tone == "poor"
     assert "is not below that of the nominal arm" in useless.headline
     assert "did not converge (100 steps)" in lost.headline
+
+
+def test_what_is_only_a_note_is_not_called_a_warning(fine: Any) -> None:
+    found = (Finding("ill_conditioned", "note"), Finding("not_held_out", "care"))
+    told = (Told("a", "ill_conditioned"), Told("b", "not_held_out"), "of the table")
+    result = replace(fine, findings=(*fine.findings, *found), warnings=told)
+    labels = [("Note", "a"), ("Warning", "b"), ("Warning", "of the table")]
+    assert judgement_view.warnings_beside(result) == labels

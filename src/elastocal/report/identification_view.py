@@ -35,7 +35,6 @@ from elastocal.identification.scrutiny import stage_of
 from elastocal.model.chain import names_told
 from elastocal.report import judgement_view as words
 from elastocal.report.blocks import (
-    WARNING,
     Block,
     Fold,
     KeyFigures,
@@ -100,7 +99,7 @@ def _blocks(
     yield Lines([
         ("Error (rms)", error_line(result)), *new,
         *(("Next", step) for step in verdict.steps),
-        *((WARNING, text) for text in warnings_beside(result)),
+        *warnings_beside(result),
     ])  # fmt: skip
     yield Fold("", lambda: _error_figures(result, budget()), figures=("waterfall", "sureness"))
     yield parameter_table(result, truth, published)

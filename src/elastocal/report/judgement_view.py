@@ -19,7 +19,7 @@ from elastocal.identification.residuals import GroupSummary, ResidualSummary
 from elastocal.identification.result import Calibration, Finding
 from elastocal.identification.sentences import next_steps
 from elastocal.model.observations import available_noise
-from elastocal.report.blocks import ShownTable, Tone
+from elastocal.report.blocks import WARNING, ShownTable, Tone
 from elastocal.report.formatting import counted, display, estimate, length, plain, significant
 from elastocal.text import gathered, listed, printable
 
@@ -52,11 +52,14 @@ def judgement(result: Calibration) -> Judgement:
     return Judgement("good", f"This calibration can be used. {told}{noise}", steps)
 
 
-def warnings_beside(result: Calibration) -> list[str]:
-    """The warnings that say more than the verdict, what to do next and the line on noise."""
+def warnings_beside(result: Calibration) -> list[tuple[str, str]]:
+    """The warnings that say more than the verdict, what to do next and the line on noise, each
+    with its label: what is only a note does not call for attention."""
     told = {"residual_above_stated_noise", "scatter_not_counted", "impossible_values"}
     said = {f.kind for f in result.verdict.missing} & told
-    return [printable(str(w)) for w in result.warnings if getattr(w, "kind", "") not in said]
+    notes = {f.kind for f in result.findings if f.severity == "note"}
+    kinds = [(getattr(w, "kind", ""), printable(str(w))) for w in result.warnings]
+    return [("Note" if kind in notes else WARNING, w) for kind, w in kinds if kind not in said]
 
 
 def _length(f: Finding, name: str) -> str:
