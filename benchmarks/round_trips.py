@@ -93,7 +93,7 @@ def trip(name: str, path: Path, folder: Path, seed: int = 0) -> Trip:
     for form in FORMATS:
         # A rigid file says nothing of the load, which its stated loss is without.
         acting = force if form == "mjcf" else np.zeros(3)
-        wish = wish_of(folder / f"out{ENDINGS[form]}", form, acting, True, form != "mjcf",
+        wish = wish_of(folder / f"out{ENDINGS[form]}", form, acting, True, form == "urdf",
                        None, None, 500, seed)  # fmt: skip
         done = export(fit.arm, wish)
         rows = left if form == "mjcf" else left.take(np.flatnonzero(~left.force.any(axis=1)))

@@ -11,10 +11,10 @@ from support.cells import DOWN, kr270_cell, kr270_chain
 from support.commands import calibrated, erring, tool_errors
 
 from elastocal.compensation.commands import targets_at
-from elastocal.compensation.compensate import (
+from elastocal.compensation.compensate import compensate
+from elastocal.compensation.correction_table import (
     EXACT,
     CorrectionGrid,
-    compensate,
     correction_table,
     joint_grid,
 )

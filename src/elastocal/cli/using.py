@@ -27,7 +27,8 @@ from elastocal.errors import InputError, InsufficientDataError, require
 from elastocal.screen import progress_line, say
 
 if TYPE_CHECKING:
-    from elastocal.compensation.compensate import Compensation, CorrectionGrid, CorrectionTable
+    from elastocal.compensation.compensate import Compensation
+    from elastocal.compensation.correction_table import CorrectionGrid, CorrectionTable
     from elastocal.model.calibrated import CalibratedArm
     from elastocal.study_runs import Ending
     from elastocal.units import Array
@@ -94,7 +95,7 @@ def compensate(
             if output is not None:
                 texts[output] = text
         if table is not None and lines is not None:
-            from elastocal.compensation.compensate import correction_table
+            from elastocal.compensation.correction_table import correction_table
             from elastocal.model.calibrated import tool_point
 
             where = tool_point(arm.model.cell, asked.get("point"))
@@ -172,7 +173,7 @@ def _grid(arm: CalibratedArm, grid: str, box: str | None, rotation: str | None) 
     import numpy as np
     from scipy.spatial.transform import Rotation
 
-    from elastocal.compensation.compensate import box_grid, joint_grid
+    from elastocal.compensation.correction_table import box_grid, joint_grid
     from elastocal.model.calibrated import numbers
 
     takes = "--grid takes whole numbers, as in 5 or 9,7,7,3,3,1"
@@ -205,13 +206,12 @@ def _table(found: CorrectionTable, arm: CalibratedArm, partial: bool) -> tuple[d
     import numpy as np
 
     from elastocal.compensation.compensate import (
-        EXACT,
-        FIRST_ORDER,
         check_status,
         in_file_units,
         joint_columns,
         spread,
     )
+    from elastocal.compensation.correction_table import EXACT, FIRST_ORDER
     from elastocal.tables import csv_text
 
     kinds = arm.model.chain.kinds

@@ -2,14 +2,12 @@
 
 from __future__ import annotations
 
-import math
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
 from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy.spatial.transform import Rotation
 
 from elastocal.above import Result
 from elastocal.compensation import commands
@@ -25,14 +23,14 @@ from elastocal.model.calibrated import (
     lasting,
     tool_point,
 )
-from elastocal.model.chain import Chain, finite_ranges, joint_limits
+from elastocal.model.chain import Chain, joint_limits
 from elastocal.model.effects.catalogue import effect_of
 from elastocal.model.inverse_kinematics import Reaching, inverse_kinematics
 from elastocal.model.manipulator import smooth_groups
 from elastocal.model.rigid import nominal_flanges, reach_of
 from elastocal.tables import column, csv_text
 from elastocal.text import listed, plain
-from elastocal.units import Array, BoolArray, IntArray
+from elastocal.units import Array, IntArray
 
 REACHED, LIMIT, NO_EQUILIBRIUM, NOT_REACHED = "reached", "limit", "no equilibrium", "not reached"
 
@@ -540,270 +538,3 @@ def spread(values: Array) -> dict[str, float | None]:
         "p95": float(np.quantile(known, 0.95)),
         "max": float(known.max()),
     }
-
-
-# A correction table: what a controller adds to its nominal targets, on a grid.
-
-LEAST_STEP = 1e-9  # m between levels
-MOST_POINTS = 200_000
-BETWEEN = 512  # points between those of the grid, on which interpolation is measured
-EXACT, FIRST_ORDER = "exact", "first order"
-ASIDE = np.radians(30.0)  # or m: from a singular posture to one half as good as the best (sin 30°)
-TRIED = 20  # points, at most
-HELPS = 0.25  # of them, as other joints may stand at singular levels too
-NOMINAL_MISS = 1e-5  # m
-
-
-@dataclass(frozen=True)
-class CorrectionGrid:
-    """Levels of each joint (rad or m), or of x, y, z (m, base frame) with one `rotation` (3, 3) of
-    the tool, None for any."""
-
-    axes: tuple[Array, ...]
-    joints: bool
-    rotation: Array | None = None
-
-    def points(self) -> Array:
-        """(N, axes), neighbours one step apart, so that a posture can be followed through."""
-        points = self.axes[0][:, None]
-        for axis in self.axes[1:]:
-            n = len(points)
-            turns = [axis if i % 2 == 0 else axis[::-1] for i in range(n)]
-            points = np.column_stack([np.repeat(points, len(axis), axis=0), np.concatenate(turns)])
-        return points
-
-
-@dataclass(frozen=True)
-class CorrectionTable:
-    """`correction` (N, 6) m and rad to add to nominal targets at grid `points` (N, axes).
-
-    Position (dx, dy, dz) and rotation vector (drx, dry, drz) along the axes of the base frame:
-    the target becomes p + d, exp([dr]×) R.  NaN where there is none; `status` (N,) says why, and
-    which are EXACT or FIRST_ORDER.  `oriented`: whether rotations are corrected.
-    `before` and `between` (M, 2) m and rad: errors of the tool at M points between the grid's,
-    without the table and with the correction interpolated in it.  `warnings` are sentences.
-    """
-
-    grid: CorrectionGrid
-    points: Array
-    correction: Array
-    status: tuple[str, ...]
-    oriented: bool
-    before: Array
-    between: Array
-    warnings: tuple[str, ...] = ()
-
-
-def joint_grid(arm: CalibratedArm, counts: tuple[int, ...]) -> CorrectionGrid:
-    """`counts` levels per joint (one for all) over the joint limits; one level: the middle."""
-    chain = arm.model.chain
-    n = chain.n_joints
-    counts = _counts(counts, n, f"one number, or one per joint ({n})")
-    low, high = finite_ranges(chain, *joint_limits(arm.model.cell, chain))
-    return CorrectionGrid(
-        tuple(_levels(a, b, k) for a, b, k in zip(low, high, counts, strict=True)), True
-    )
-
-
-def box_grid(
-    lower: Array, upper: Array, counts: tuple[int, ...], rotation: Array | None
-) -> CorrectionGrid:
-    """`counts` levels of x, y, z in a box of the base frame from `lower` to `upper` (3,) m."""
-    if not (lower <= upper).all():
-        raise InputError(
-            f"{option('box')} takes the lower corner first: x0,y0,z0,x1,y1,z1 with x0 <= x1 …"
-        )
-    counts = _counts(counts, 3, "one number, or one each for x, y and z")
-    flat = [name for name, a, b, k in zip("xyz", lower, upper, counts, strict=True)
-            if k > 1 and b - a < LEAST_STEP * k]  # fmt: skip
-    if flat:
-        raise InputError(
-            f"{option('box')}: both corners have the same {' and '.join(flat)}; give a box, or one "
-            f"level there by {option('grid')}"
-        )
-    axes = tuple(_levels(a, b, k) for a, b, k in zip(lower, upper, counts, strict=True))
-    return CorrectionGrid(axes, False, rotation)
-
-
-def _counts(counts: tuple[int, ...], n: int, what: str) -> tuple[int, ...]:
-    told = ",".join(map(str, counts))
-    if len(counts) not in (1, n) or min(counts) < 1:
-        raise InputError(f"{option('grid')} takes {what}, 1 or more; found '{told}'")
-    counts = counts * n if len(counts) == 1 else counts
-    size = math.prod(counts)
-    if size > MOST_POINTS:
-        raise InputError(
-            f"{option('grid', told)}: {size:,} points, and {MOST_POINTS:,} is the "
-            "most; give fewer levels to the joints that matter least (1 holds one in the middle)"
-        )
-    return counts
-
-
-def _levels(low: float, high: float, count: int) -> Array:
-    return np.linspace(low, high, count) if count > 1 else np.array([(low + high) / 2])
-
-
-def correction_table(
-    arm: CalibratedArm,
-    grid: CorrectionGrid,
-    point: ToolPoint,
-    force: Array | None = None,
-    near: Array | None = None,
-    seed: int = 0,
-    progress: Callable[[str], None] = lambda message: None,
-) -> CorrectionTable:
-    """The correction of every grid point under one `force` (3,) N in the base frame.
-
-    The command q_c that puts the calibrated tool at the nominal target is, for the controller's
-    nominal arm, the target T_nominal(q_c): the correction is what lies between the two (EXACT).
-    Beside singular postures and limits, where q_c is far from the nominal command or beyond
-    reach, it is the tool's error there with its sign changed (FIRST_ORDER).
-    """
-    from scipy.stats import qmc
-
-    arm = lasting(arm)[0]
-    points = grid.points()
-    progress(f"{len(points)} grid points")
-    result = compensate(arm, _targets(grid, points, force), point, near, seed, progress)
-    tool = CalibratedTool(arm, point)
-    correction, status = _corrections(tool, result)
-    oriented = result.goals.rotation is not None
-    before = between = np.zeros((0, 2))
-    if any(len(axis) > 1 for axis in grid.axes):
-        progress("between the grid points")
-        low, high = (np.array([axis[k] for axis in grid.axes]) for k in (0, -1))
-        some = low + (high - low) * qmc.Sobol(len(low), scramble=True, seed=seed).random(BETWEEN)
-        if not grid.joints:  # as a path, in the posture of the grid
-            some = some[np.argsort(some[:, 0])]
-            near = result.nominal[0]
-        check = compensate(arm, _targets(grid, some, force), point, near, seed)
-        before, between = _with_table(tool, check, _interpolated(grid, points, correction, some))
-    told: tuple[str, ...] = ()
-    if status.count(EXACT) < len(status) / 2:
-        told = (_mostly_inexact(arm, grid, status, point, force, seed),)
-    return CorrectionTable(grid, points, correction, status, oriented, before, between, told)
-
-
-def _mostly_inexact(
-    arm: CalibratedArm, grid: CorrectionGrid, status: tuple[str, ...], point: ToolPoint,
-    force: Array | None, seed: int,
-) -> str:  # fmt: skip
-    """Why most points are not exact: some of them are tried again away from the joint limits, and
-    then with one joint moved, to see what helps."""
-    told = f"only {status.count(EXACT)} of {len(status)} grid points are exact: for most others "
-    chain, beyond = arm.model.chain, "the command is out of the joint limits"
-    if grid.joints:
-        tool = CalibratedTool(arm, point)
-
-        def exact(q: Array) -> BoolArray:
-            tried = compensate(arm, _targets(grid, q, force), point, None, seed)
-            return np.array(_corrections(tool, tried)[1]) == EXACT
-
-        some = np.flatnonzero([s != EXACT for s in status])
-        low, high = finite_ranges(chain, *joint_limits(arm.model.cell, chain))
-        aside = np.minimum(ASIDE, (high - low) / 4)
-        inside = np.clip(grid.points()[some[:: -(-len(some) // TRIED)]], low + aside, high - aside)
-        helped = exact(inside)
-        if helped.mean() > 0.5:
-            return f"{told}{beyond}, where the grid ends; first order is all there is"
-        q, heads = inside[~helped], joint_columns(chain.kinds)
-        levels = in_file_units(q[:1], chain.kinds)[0]
-        singular = [
-            heads[k] + (f" = {levels[k] + 0.0:.4g}" if len(axis) == 1 else "")
-            for k, axis in enumerate(grid.axes)
-            if exact(q + aside[k] * np.eye(len(heads))[k]).mean() > HELPS
-        ]
-        if singular:
-            return (
-                f"{told}the posture is singular by the levels of {listed(singular)}; give other "
-                f"levels, for a joint in its middle 2 or more, by {option('grid')}"
-            )
-    return (
-        f"{told}{beyond}, or a joint would turn by more than {np.degrees(LARGE_CORRECTION):.0f}°, "
-        f"as beside singular postures; choose other levels by {option('grid')}"
-    )
-
-
-def _targets(grid: CorrectionGrid, points: Array, force: Array | None) -> Targets:
-    if grid.joints:
-        return commands.targets_at(option("table"), None, None, "base", force, q=points)
-    rotation = grid.rotation
-    turned = None if rotation is None else np.broadcast_to(rotation, (len(points), 3, 3))
-    return commands.targets_at(option("table"), points, turned, "base", force)
-
-
-def _corrections(tool: CalibratedTool, result: Compensation) -> tuple[Array, tuple[str, ...]]:
-    """(N, 6) along the axes of the base frame, and how each was found."""
-    aimed = result.goals.in_base(result.T_data_base)
-    position, rotation = aimed.position, aimed.rotation
-    flange = nominal_flanges(tool.chain, result.q)
-    there = flange[:, :3, 3] + np.einsum("nij,nj->ni", flange[:, :3, :3], result.place)
-    exact = _between(position, rotation, there, flange[:, :3, :3] @ result.turned)
-    p, R = _achieved(tool, result, result.nominal)
-    first_order = _between(p, R if rotation is not None else None, position, rotation)
-    step = np.abs(result.q - result.nominal).max(axis=1)
-    close = result.reached & (step <= LARGE_CORRECTION)
-    # A nominal command that misses its own target is none that a correction could start from.
-    usable = np.isfinite(p).all(axis=1) & (result.nominal_miss <= NOMINAL_MISS)
-    correction = np.where(close[:, None], exact, first_order)
-    correction[~(close | usable)] = np.nan
-    status = tuple(
-        EXACT if close[i] else FIRST_ORDER if usable[i] else result.status[i]
-        for i in range(len(close))
-    )
-    return correction, status
-
-
-def _achieved(tool: CalibratedTool, result: Compensation, q: Array) -> tuple[Array, Any]:
-    """Position (n, 3) and rotation (n, 3, 3) of the calibrated tool in the base frame at q."""
-    rows = tool.rows(replace(result.targets.table, force=result.force))
-    there = Goals(*tool.poses(rows, q)).in_base(result.T_data_base)
-    return there.position, there.rotation
-
-
-def _between(p: Array, R: Array | None, p_new: Array, R_new: Array | None) -> Array:
-    """(n, 6) from pose (p, R) to pose (p_new, R_new): p_new − p, rotation vector of R_new Rᵀ."""
-    turned = np.zeros_like(p)
-    if R is not None and R_new is not None:
-        good = np.isfinite(R).all(axis=(1, 2)) & np.isfinite(R_new).all(axis=(1, 2))
-        change = R_new[good] @ R[good].transpose(0, 2, 1)
-        turned[good] = Rotation.from_matrix(change).as_rotvec()
-    return np.hstack([p_new - p, turned])
-
-
-def _with_table(
-    tool: CalibratedTool, check: Compensation, correction: Array
-) -> tuple[Array, Array]:
-    """Errors (M, 2) of the tool at the nominal commands, and at those of the corrected targets."""
-    aimed = check.goals.in_base(check.T_data_base)
-    position, rotation = aimed.position, aimed.rotation
-    known = np.flatnonzero(
-        np.isfinite(correction).all(axis=1) & (check.nominal_miss <= NOMINAL_MISS)
-    )
-    moved = position + correction[:, :3]
-    flange = None
-    if rotation is not None:
-        turned = Rotation.from_rotvec(np.nan_to_num(correction[:, 3:])).as_matrix() @ rotation
-        flange = (turned @ check.turned.transpose(0, 2, 1))[known]
-    limits = np.full(tool.chain.n_joints, -np.inf), np.full(tool.chain.n_joints, np.inf)
-    controller = Reaching(tool.chain, moved[known], flange, check.place[0], None, *limits)
-    q = check.nominal.copy()
-    q[known] = controller.solve(q[known], np.arange(len(known)))[0]
-    errors = []
-    for joints in (check.nominal, q):
-        p, R = _achieved(tool, check, joints)
-        off = _between(p, None if rotation is None else R, position, rotation)[known]
-        errors.append(np.column_stack([np.linalg.norm(off[:, k : k + 3], axis=1) for k in (0, 3)]))
-    return errors[0], errors[1]
-
-
-def _interpolated(grid: CorrectionGrid, points: Array, correction: Array, where: Array) -> Array:
-    from scipy.interpolate import RegularGridInterpolator
-
-    order = np.lexsort(points.T[::-1])
-    shape = tuple(len(axis) for axis in grid.axes)
-    values = correction[order].reshape(*shape, 6)
-    wide = [k for k, size in enumerate(shape) if size > 1]
-    values = values.reshape(*(shape[k] for k in wide), 6)
-    follow = RegularGridInterpolator([grid.axes[k] for k in wide], values)
-    return np.asarray(follow(where[:, wide]))
