@@ -224,6 +224,8 @@ def test_diagnose_is_that_of_the_command_line(folder):
     assert Path("front.json").read_text() == Path("line.json").read_text()
     assert why.budget and why.verdict == "nothing_significant"  # nothing is missing in the demo
     command("diagnose", "cell.toml", "data.csv", "--cell-out", "line.toml", "--seed", "1", "-q")
+    with pytest.raises(ec.InputError, match="is the cell that was diagnosed"):
+        why.save(why.model.cell.path)
     why.save("front.toml")
     assert Path("front.toml").read_text() == Path("line.toml").read_text()
     with pytest.raises(ec.InputError, match="not that of a cell file"):

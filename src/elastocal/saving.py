@@ -123,6 +123,10 @@ def save_found_cell(diagnosis: Diagnosis, path: Path) -> Cell:
             f"{path}: the model diagnosed is not that of a cell file, which what was found could "
             "join; write the cell as a file (TOML), and diagnose that"
         )
+    require(
+        path.resolve() != cell.path.resolve(),
+        f"{path} is the cell that was diagnosed; write the cell found to another file",
+    )
     extra = (*diagnosis.effects, *diagnosis.slight, *diagnosis.fields)
     return write_extended_cell(cell.path, path, extra, diagnosis.model_keys)
 
