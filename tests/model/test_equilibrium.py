@@ -237,3 +237,12 @@ def test_no_joint_deflects_by_a_turn() -> None:
     table = table_of(random_poses(kr270_chain(), 40, seed=1), np.array([0, 0, -1e7]), ("M1",))
     theta = kr270(nominal=SOFT).deflection(table)
     assert not np.any(np.abs(theta) > np.pi)
+
+
+def test_what_a_caller_does_to_deflections_changes_no_later_answer():
+    model, table = kr270(), table_of(np.zeros((2, 6)), np.array([0.0, 0.0, -2600.0]), ("M1",))
+    x = np.full(len(model.names), 1e-7)
+    first = model.deflection(table, x)
+    kept = first.copy()
+    first[:] = 1.0
+    assert np.array_equal(model.deflection(table, x), kept) and kept.any()

@@ -337,7 +337,8 @@ class Model:
             True
         """
         x = self._at(x)
-        return self._settle(row_inputs(self._symbolic.arm, table), x)
+        # A copy: what the caller does to it must not change the answer that is kept.
+        return self._settle(row_inputs(self._symbolic.arm, table), x).copy()
 
     def _at(self, x: ArrayLike | None, several: bool = False) -> NDArray:
         """Parameter values (parameters,), the nominal ones by default; or `several` (k, …)."""
