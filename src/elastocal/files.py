@@ -14,7 +14,7 @@ import secrets
 import signal
 import stat
 import threading
-from collections.abc import Iterable, Iterator
+from collections.abc import Collection, Iterable, Iterator
 from contextlib import contextmanager, suppress
 from pathlib import Path
 from typing import Any, BinaryIO, TextIO
@@ -75,6 +75,16 @@ def _check_place(path: str | Path, what: str) -> None:
         raise InputError(
             f"{path}: ends in {ending}, where the {what} is to stand; the cell file (.toml) comes "
             "first, tables and results after it"
+        )
+
+
+def check_ending(path: Path, endings: Collection[str]) -> None:
+    """Raise InputError where a file to write has the ending of something else; a name without one
+    may stand for anything."""
+    ending = path.suffix.lower()
+    if ending and ending not in endings:
+        raise InputError(
+            f"{path}: ends in {ending}; this output is written as {' or '.join(endings)}, name it so"
         )
 
 

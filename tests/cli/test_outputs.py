@@ -15,6 +15,7 @@ from fuzz import campaign
 from fuzz.campaign import COMMANDS
 from typer.testing import CliRunner
 
+import elastocal as ec
 from elastocal.cli.main import app
 
 WRITING = [c for c in COMMANDS if c.outputs and not any(
@@ -51,6 +52,36 @@ def test_no_output_goes_over_an_input(inputs, monkeypatch, tmp_path, command, ho
     done = CliRunner().invoke(app, [command.verb, *words])
     assert done.exit_code == 2 and target.read_bytes() == content
     assert sorted(os.listdir(inputs)) == before
+
+
+# Of every verb each option that names a file to write, once: verb, words, where the name stands.
+NAMES = ("-o", "--report", "--certificate", "--residuals", "--truth", "--plan", "--cell-out",
+         "--table", "--joint-correction", "--picture", "--program")  # fmt: skip
+EVERY = {
+    (command.verb, option): (words := shlex.split(command.line), words.index(option) + 1)
+    for command in COMMANDS if command.verb not in ("study", "demo")
+    for option in NAMES if option in shlex.split(command.line)
+}  # fmt: skip
+
+
+@pytest.mark.parametrize("spoil", [lambda path: path.with_suffix(".bak"), lambda path: "no" / path])
+@pytest.mark.parametrize("verb, option", EVERY, ids=" ".join)
+def test_an_output_is_refused_before_anything_is_read(tmp_path, monkeypatch, verb, option, spoil):
+    """By an ending that tells of something else, or a folder that is not there; the cell, of which
+    a run complains first, is not there either."""
+    words, at = EVERY[verb, option]
+    spoilt = str(spoil(Path(words[at])))
+    monkeypatch.chdir(tmp_path)
+    done = CliRunner().invoke(app, [verb, *words[:at], spoilt, *words[at + 1 :]])
+    assert (done.exit_code, os.listdir(tmp_path)) == (2, [])
+    assert spoilt in done.stderr and words[0] not in done.stderr.replace(spoilt, "")
+
+
+def test_a_page_is_named_as_one_from_python_too(inputs, tmp_path):
+    fit = ec.identify(inputs / "deflecting.toml", inputs / "data.csv")
+    with pytest.raises(ec.InputError, match=r"ends in .txt; this output is written as .html"):
+        fit.report(tmp_path / "page.txt")
+    assert not list(tmp_path.iterdir())
 
 
 def test_a_hard_link_to_an_input_is_parted_from_it(inputs, monkeypatch, tmp_path):

@@ -19,6 +19,7 @@ import typer
 from typer.core import TyperGroup
 
 from elastocal.errors import TRACEBACK, ElastocalError, InputError, explained, options_as_flags
+from elastocal.files import check_ending
 from elastocal.screen import complain, interrupts, safe_console, say
 
 if TYPE_CHECKING:
@@ -162,10 +163,11 @@ def repeated() -> str:
     return shlex.join(["elastocal", *sys.argv[1:]])
 
 
-def check_outputs(*paths: Path | None) -> list[Path]:
-    """The outputs asked for; one that cannot be written is refused before the work starts."""
-    wanted = [path for path in paths if path is not None]
-    for path in wanted:
+def check_outputs(*asked: tuple[Path | None, str]) -> list[Path]:
+    """The outputs asked for, each with the endings that it may have, between blanks; one that
+    cannot be written, or is named as something else, is refused before the work starts."""
+    wanted = [(path, endings.split()) for path, endings in asked if path is not None]
+    for path, endings in wanted:
         folder = path.absolute().parent
         if path.is_dir():
             raise InputError(f"{path} is a directory; name a file to write")
@@ -173,7 +175,9 @@ def check_outputs(*paths: Path | None) -> list[Path]:
             raise InputError(f"{path}: the folder {folder} does not exist; create it first")
         if not os.access(folder, os.W_OK):
             raise InputError(f"{path}: no permission to write in {folder}")
-    return wanted
+        if endings:
+            check_ending(path, endings)
+    return [path for path, _ in wanted]
 
 
 def check_apart(written: list[Path], read: Iterable[Path | None], cell: Cell | None = None) -> None:

@@ -15,6 +15,7 @@ from elastocal import verbs
 from elastocal.cli.app import repeated
 from elastocal.cli.signatures import (
     FORCE,
+    PAGES,
     Asked,
     CellFile,
     DataFile,
@@ -67,7 +68,9 @@ def identify(
     from elastocal.model.effects.catalogue import cell_of
     from elastocal.report.terminal import print_report
 
-    run.writes(output, report, residuals, certificate)
+    run.writes(
+        (output, ".json"), (report, PAGES), (residuals, ".csv"), (certificate, f"{PAGES} .xml")
+    )
     limits = limits_of(require or [])
     known = cell_of(cell, run.plugins)  # its plug-ins may have the noise model
     files = (asked.get(name) for name in ("test", "covariance", "knowledge"))
@@ -169,7 +172,7 @@ def diagnose(
         poses is None or plan is not None,
         f"--poses {poses} has no meaning without --plan; name the file for the extra poses",
     )
-    run.writes(output, report, plan, cell_out)
+    run.writes((output, ".json"), (report, PAGES), (plan, ".csv"), (cell_out, ".toml"))
     known = cell_of(cell, run.plugins)  # its plug-ins may have the effect
     run.reads(cell, data, cell=known)
     most = None if plan is None else poses or MOST_POSES
@@ -272,7 +275,7 @@ def next_command(
     from elastocal.saving import beside, save_plan
 
     summary = beside(output)
-    run.writes(output, summary)
+    run.writes((output, ".csv"), (summary, ".json"))
     limits = limits_of([] if required is None else [required], ("new_poses",))
     known = cell_of(cell, run.plugins)
     run.reads(cell, data, cell=known)
@@ -329,7 +332,7 @@ def compare(
 
     if old_order := new is None:
         cell, old, new = _in_old_order(cell, old, cell_of_old)
-    run.writes(output, report)
+    run.writes((output, ".json"), (report, PAGES))
     inputs = run.reads(cell, old, new)
     with run.progress() as progress:
         progress("reading")

@@ -13,6 +13,7 @@ import typer
 from elastocal import verbs
 from elastocal.cli.app import console, files_of, repeated
 from elastocal.cli.signatures import (
+    PAGES,
     AnyOutput,
     Asked,
     CellFile,
@@ -72,7 +73,7 @@ def init(
     from elastocal.model.manipulator import load_chain
     from elastocal.model.rigid import reach_of
 
-    run.writes(output)
+    run.writes((output, ".toml"))
     run.reads(robot)
     write(robot, output, base=base, flange=flange, convention=convention,  # type: ignore[arg-type]
           ur_model=ur_model, force=force)  # fmt: skip
@@ -139,7 +140,6 @@ def _print_effects(screen: Console, cell: Any, entries: Any) -> None:
 # init and effects: how to begin, and what there is to fit.
 
 PROGRAMS = {".src": "KUKA KRL", ".script": "URScript"}
-PICTURES = (".png", ".svg")
 
 
 def _target(text: str) -> float:
@@ -211,7 +211,10 @@ def design(
     summary = beside(output)
     programs = program or []
     _check_asked(programs, picture)
-    run.writes(output, summary, *programs, picture, report, cell_out)
+    run.writes(
+        (output, ".csv"), (summary, ".json"), *((path, "") for path in programs),
+        (picture, ".png .svg"), (report, PAGES), (cell_out, ".toml"),
+    )  # fmt: skip
     check = interrupt_check()
     with run.progress() as tell:
 
@@ -300,8 +303,7 @@ def _check_asked(programs: list[Path], picture: Path | None) -> None:
     for path in programs:
         told = f"--program {path}: the suffix says the language, {kinds}"
         require(path.suffix.lower() in PROGRAMS, told)
-    known = picture is None or picture.suffix.lower() in PICTURES
-    require(known, f"--picture {picture}: name it {' or '.join(PICTURES)}")
+    require(picture is None or picture.suffix != "", f"--picture {picture}: name it .png or .svg")
 
 
 def _check_programs(cell: Cell, programs: list[Path]) -> None:
@@ -385,9 +387,10 @@ def simulate(
     """
     from elastocal.files import together
     from elastocal.model.manipulator import Model
-    from elastocal.saving import write_json
+    from elastocal.saving import WRITERS, write_json
 
-    run.writes(output, truth)
+    tables = " ".join(WRITERS["Measurements"])
+    run.writes((output, tables), (truth, ".json"))
     model = Model(cell, plugins=run.plugins)
     run.reads(cell, plan, cell=model.cell)
     poses = model.read_plan(plan)
@@ -520,7 +523,7 @@ def import_(
         raise InputError(
             f"import needs --map mapping.toml, or --preset: {PRESET_NAMES}{_suggestion(paths)}"
         )
-    run.writes(output)
+    run.writes((output, ".csv"))
     run.reads(*paths, mapping, cell)
     read = with_units(read_mapping(mapping, preset or ()), length_unit, angle_unit)
     known = None if cell is None else read_cell(cell)

@@ -43,6 +43,7 @@ CellFile = Annotated[Path, typer.Argument(help="Cell file (TOML): robot, tool, t
 DataFile = Annotated[Path, typer.Argument(help="Measurements (CSV or Parquet).")]
 ResultFile = Annotated[Path, typer.Argument(help="Result of identify -o (JSON).")]
 ReportFile = Annotated[Path | None, typer.Option(help="Write a report (one HTML page).")]
+PAGES = ".html .htm"  # endings
 Output = Annotated[Path, typer.Option("-o", "--output")]
 AnyOutput = Annotated[Path | None, typer.Option("-o", "--output")]
 JsonFile = Annotated[Path | None, typer.Option("-o", "--output", help="Write the result as JSON.")]
@@ -78,9 +79,10 @@ class Run:
         self.plugins, self.json, self._quiet = plugins, json, quiet
         self.written: list[Path] = []
 
-    def writes(self, *paths: Path | None) -> None:
-        """The outputs asked for; refused before the work where one cannot be written."""
-        self.written = check_outputs(*paths)
+    def writes(self, *asked: tuple[Path | None, str]) -> None:
+        """The outputs asked for, each with its endings; refused before the work where one cannot
+        be written or is named as something else."""
+        self.written = check_outputs(*asked)
 
     def reads(self, *paths: Path | None, cell: Cell | None = None) -> list[Path]:
         """The inputs that are given, none of which, nor a file of the cell, is written over."""

@@ -80,7 +80,7 @@ def compensate(
     verbs.check_frame(asked["frame"])
     force = given_force(asked.get("load"))
     _check(targets, target, output, table, (grid, box, rotation))
-    run.writes(output, table)
+    run.writes((output, ".csv"), (table, ".csv"))
     content, texts = {}, {}
     with run.progress() as progress:
         progress("reading")
@@ -297,7 +297,7 @@ def export(
     from elastocal.report.terminal import print_blocks
     from elastocal.saving import wish_of
 
-    run.writes(output, joint_correction)
+    run.writes((output, ""), (joint_correction, ".csv"))
     wish = wish_of(
         output, format, load, frames, base_frame, temperature_c, time_s, poses, seed,
         joint_correction is not None,

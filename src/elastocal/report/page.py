@@ -21,7 +21,7 @@ from pathlib import Path
 from typing import Any
 
 from elastocal import __version__
-from elastocal.files import atomic_write_text, open_input
+from elastocal.files import atomic_write_text, check_ending, open_input
 from elastocal.report.blocks import (
     WARNING,
     Block,
@@ -51,13 +51,14 @@ def write_page(
     whose name ends in .xml is a digital one (DCC).
 
     Where no `inputs` are named, they are the files that the result came from.  Raises InputError
-    where an input cannot be read or `path` cannot be written.
+    where an input cannot be read or `path` cannot be written, or names no page.
     """
     if told.get("certificate") and path.suffix.lower() == ".xml":
         from elastocal.report.certificate_view import dcc_text
 
         fit: Any = result
         return atomic_write_text(path, dcc_text(fit))
+    check_ending(path, (".html", ".htm"))
     inputs = sources(result) if inputs is None else inputs
     atomic_write_text(path, page_of(result, inputs, command, seed, **told))
 
