@@ -84,7 +84,8 @@ def check_ending(path: Path, endings: Collection[str]) -> None:
     ending = path.suffix.lower()
     if ending and ending not in endings:
         raise InputError(
-            f"{path}: ends in {ending}; this output is written as {' or '.join(endings)}, name it so"
+            f"{path}: ends in {ending}; this output is written as {' or '.join(endings)}, "
+            "name it so"
         )
 
 
