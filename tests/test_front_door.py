@@ -5,6 +5,8 @@ import inspect
 import json
 import subprocess
 import sys
+import typing
+from collections.abc import Iterator
 from dataclasses import fields, replace
 from pathlib import Path
 
@@ -13,6 +15,7 @@ import pytest
 from typer.testing import CliRunner
 
 import elastocal as ec
+from elastocal import plugins
 from elastocal.cell.plan_wishes import DesignSpec
 from elastocal.cli.main import app
 from elastocal.demo.example import LOAD_N, run_demo
@@ -538,3 +541,27 @@ def test_a_figure_is_drawn_in_axes_of_the_users_own(fit):
     figure.savefig("both.png")
     with pytest.raises(ec.InputError, match="`ax` takes axes"):
         fit.plot(ax=Figure())
+
+
+def spoken_for(name: str, what: object) -> Iterator[tuple[str, object]]:
+    """A name of the door and, of a class, its public methods and properties."""
+    yield name, what
+    own = [c for c in getattr(what, "__mro__", ()) if c.__module__.startswith("elastocal")]
+    for key, value in ((k, v) for c in own for k, v in vars(c).items() if not k.startswith("_")):
+        plain = next(
+            (f for f in (getattr(value, a, None) for a in ("fget", "func", "__func__")) if f), value
+        )
+        if inspect.isfunction(plain) and plain.__module__.startswith("elastocal"):
+            yield f"{name}.{key}", plain
+
+
+@pytest.mark.parametrize("door", [ec, plugins], ids=["elastocal", "elastocal.plugins"])
+def test_type_hints_of_all_that_is_public_are_resolved(door):
+    """As tools for documentation and validation ask for them."""
+    for name in door.__all__:
+        for told, what in spoken_for(name, getattr(door, name)):
+            hints = typing.get_type_hints(what)
+            unresolved = [k for k, v in hints.items() if "ForwardRef" in repr(v)]
+            assert not unresolved, f"{told}: {unresolved}"
+    assert typing.get_type_hints(ec.identify)["return"] is ec.Calibration
+    assert ec.Knowledge in typing.get_args(typing.get_type_hints(ec.design)["knowledge"])

@@ -10,12 +10,25 @@ from __future__ import annotations
 
 from importlib import import_module
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, ForwardRef
 
 from elastocal.errors import InputError, option
 
 if TYPE_CHECKING:
-    import pandas as pd
+    from pandas import DataFrame
+
+
+def later(*rooms: str) -> dict[str, Any]:
+    """Names that annotations alone need, by "module name name …": references, of which each loads
+    its module only when `typing.get_type_hints` of a public function asks for it."""
+    found = {}
+    for module, *names in map(str.split, rooms):
+        for name in names:
+            found[name] = ForwardRef(f"import_module('{module}').{name}", module="importlib")
+    return found
+
+
+globals().update(later("pandas DataFrame"))
 
 VIEWS = "elastocal.report.notebook"
 TEXTS = "elastocal.report.terminal"
@@ -119,7 +132,7 @@ class Result(Saved):
         """
         return import_module(VIEWS).plot(self, kind, interactive, ax)
 
-    def to_dataframe(self) -> pd.DataFrame:
+    def to_dataframe(self) -> DataFrame:
         """The result's main table as a pandas data frame; units stand in the column names.
 
         Examples:
@@ -143,7 +156,7 @@ def headline(result: object) -> str:
     return str(import_module(WORDS).judgement(result).headline)
 
 
-def effects(cell: Any = None) -> pd.DataFrame:
+def effects(cell: Any = None) -> DataFrame:
     """The physical effects that can be fitted.
 
     Args:

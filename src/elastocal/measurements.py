@@ -15,7 +15,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from elastocal import tables
-from elastocal.above import Result
+from elastocal.above import Result, later
 from elastocal.arguments import checked_arguments
 from elastocal.errors import InputError, option, require
 from elastocal.files import atomic_writer, open_input, read_text
@@ -24,8 +24,10 @@ from elastocal.text import did_you_mean, is_label, listed, quoted
 from elastocal.units import ANGLE, LENGTH, TIME, Array, IntArray
 
 if TYPE_CHECKING:
-    import pandas as pd
     from numpy.typing import ArrayLike
+    from pandas import DataFrame
+else:
+    globals().update(later("numpy.typing ArrayLike", "pandas DataFrame"))
 
 
 SI_UNITS = ("m", "rad", "s", "N", "Nm", "C", "")
@@ -142,7 +144,7 @@ class Measurements(Result):
     def kinds(self) -> tuple[str, ...]:
         return self.joint_kinds or ("revolute",) * self.q.shape[1]
 
-    def to_dataframe(self) -> pd.DataFrame:
+    def to_dataframe(self) -> DataFrame:
         """The table with the columns of the canonical CSV, one row per reading, in SI units."""
         import pandas as pd
 

@@ -14,6 +14,7 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
+from elastocal.above import later
 from elastocal.arguments import checked_arguments
 from elastocal.errors import InputError, option, require
 from elastocal.files import atomic_write_text, read_json
@@ -35,6 +36,11 @@ if TYPE_CHECKING:
     from elastocal.model.calibrated import CalibratedArm
     from elastocal.model.manipulator import Model
     from elastocal.planning.plan import Plan
+else:
+    globals().update(later(
+        "numpy.typing ArrayLike", "elastocal.model.calibrated CalibratedArm",
+        "elastocal.model.manipulator Model",
+    ))  # fmt: skip
 
 LARGEST_SUMMARY = 200_000_000  # bytes
 MOST_POSES = 1_000_000

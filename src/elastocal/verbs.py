@@ -14,12 +14,13 @@ from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Literal, TypeAlias, cast
 
+from elastocal.above import later
 from elastocal.arguments import checked_arguments, whole
 from elastocal.errors import InputError, option, require
 from elastocal.text import quoted
 
 if TYPE_CHECKING:
-    import numpy as np
+    from numpy.random import Generator
     from numpy.typing import ArrayLike
     from pandas import DataFrame
 
@@ -38,14 +39,35 @@ if TYPE_CHECKING:
     from elastocal.planning.design import DesignOptions, Effort
     from elastocal.planning.plan import Plan
     from elastocal.units import Array
+else:
+    globals().update(later(
+        "numpy.typing ArrayLike",
+        "pandas DataFrame",
+        "elastocal.cell.plan_wishes Freedom Motion TargetBox TargetPath TargetPose",
+        "elastocal.cell.work_cell Cell",
+        "elastocal.compensation.commands Targets",
+        "elastocal.compensation.compensate Compensation",
+        "elastocal.diagnosis.diagnosis Diagnosis",
+        "elastocal.identification.knowledge Constraints GaussianPrior Knowledge",
+        "elastocal.identification.options FaultyReadings IntervalKind Method",
+        "elastocal.identification.result Calibration",
+        "elastocal.identification.weighted_problem WeightKind",
+        "elastocal.measurements Measurements",
+        "elastocal.model.calibrated CalibratedArm ToolPoint",
+        "elastocal.model.manipulator Model",
+        "elastocal.planning.design DesignOptions Effort",
+        "elastocal.planning.plan Plan",
+        "elastocal.units Array",
+        "numpy.random Generator",
+    ))  # fmt: skip
 
 # Each verb imports what it calls: one should not load another, and --help none of them.
 
-AnyModel: TypeAlias = "Model | Cell | str | Path"
-Table: TypeAlias = "Measurements | str | Path | DataFrame"
-Prior: TypeAlias = "Mapping[str, Mapping[str, float]] | GaussianPrior"
+AnyModel: TypeAlias = Model | Cell | str | Path
+Table: TypeAlias = Measurements | str | Path | DataFrame
+Prior: TypeAlias = Mapping[str, Mapping[str, float]] | GaussianPrior
 Progress: TypeAlias = Callable[[str], None]
-Seed: TypeAlias = "int | np.random.Generator"  # a number has been drawn before a verb runs
+Seed: TypeAlias = int | Generator  # a number has been drawn before a verb runs
 
 
 @checked_arguments

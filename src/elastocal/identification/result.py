@@ -12,7 +12,7 @@ from typing import TYPE_CHECKING, Any, Literal
 import numpy as np
 from numpy.typing import ArrayLike
 
-from elastocal.above import Result, headline, write_page
+from elastocal.above import Result, headline, later, write_page
 from elastocal.arguments import checked_arguments
 from elastocal.cell.arm_description import Unsteadiness
 from elastocal.errors import ElastocalError, UnknownNameError
@@ -52,6 +52,8 @@ from elastocal.units import Array, IntArray, microns
 
 if TYPE_CHECKING:
     from pandas import DataFrame
+else:
+    globals().update(later("pandas DataFrame"))
 
 SCHEMA = "elastocal/identification/1"
 FEW_POSES = 64  # of those over the workspace, for an rms

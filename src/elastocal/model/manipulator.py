@@ -11,6 +11,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
+from elastocal.above import later
 from elastocal.arguments import checked_arguments
 from elastocal.cell.arm_description import EffectChoice, ModelSpec
 from elastocal.cell.work_cell import Cell
@@ -30,6 +31,8 @@ from elastocal.units import Array, IntArray
 
 if TYPE_CHECKING:
     from pandas import DataFrame
+else:
+    globals().update(later("pandas DataFrame"))
 
 
 @dataclass(frozen=True)

@@ -10,6 +10,7 @@ from typing import TYPE_CHECKING, Any, ClassVar, Literal, get_args
 
 import casadi as ca
 
+from elastocal.above import later
 from elastocal.cell.work_cell import Cell
 from elastocal.errors import InputError, require
 from elastocal.model import rigid
@@ -21,6 +22,8 @@ from elastocal.units import Array
 
 if TYPE_CHECKING:
     from elastocal.model.arm import Arm
+else:
+    globals().update(later("elastocal.model.arm Arm"))
 
 
 Stage = Literal["transmission", "geometry", "load", "compliance", "tool", "tracker"]
