@@ -2,10 +2,10 @@
 
 from __future__ import annotations
 
-from pydantic import BaseModel
+from typing import Any
 
 from elastocal.cell.work_cell import Cell
-from elastocal.config import table_of, tables_in
+from elastocal.config import keys_of, tables_in
 
 HEAD = """# Keys of the cell file
 
@@ -20,24 +20,24 @@ def page() -> str:
     parts = [HEAD]
     for title, table in tables():
         parts += [f"## `{title}`\n", "| key | takes |", "|---|---|"]
-        for name, field in table.model_fields.items():
-            required = " (required)" if field.is_required() else ""
-            description = (field.description or "").replace("|", "\\|")
-            parts.append(f"| `{name}`{required} | {description} |")
+        for key in keys_of(table):
+            required = " (required)" if key.required else ""
+            takes = key.takes.replace("|", "\\|")
+            parts.append(f"| `{key.name}`{required} | {takes} |")
         parts.append("")
     return "\n".join(parts)
 
 
-def tables() -> list[tuple[str, type[BaseModel]]]:
+def tables() -> list[tuple[str, Any]]:
     """Each table of the file as it is headed there, with its schema; the file itself first."""
-    return [("cell.toml", table_of(Cell)), *_inside(table_of(Cell), "")]
+    return [("cell.toml", Cell), *_inside(Cell, "")]
 
 
-def _inside(table: type[BaseModel], above: str) -> list[tuple[str, type[BaseModel]]]:
+def _inside(table: Any, above: str) -> list[tuple[str, Any]]:
     found = []
-    for name, field in table.model_fields.items():
-        for inner, many in tables_in(field.annotation):
-            path = f"{above}{name}"
+    for key in keys_of(table):
+        for inner, many in tables_in(key.kind):
+            path = f"{above}{key.name}"
             found.append((f"[[{path}]]" if many else f"[{path}]", inner))
             found += _inside(inner, f"{path}.")
     return found

@@ -1,8 +1,9 @@
-"""TOML files that users write: read with a bound on their size, and checked against tables of keys.
+"""TOML files that users write: read with a bound on their size, and checked key by key.
 
-A table of the file is a `Table`, a pydantic model whose fields are its keys; the description of a
-key says what it takes.  What pydantic finds wrong is told as one sentence: file, key, what the key
-takes, what was found, and the nearest valid name.
+A table of a file is a `record`, a frozen dataclass in SI units that Python code may build as well,
+or a `Table`, a pydantic model of what only files state.  Either says of each key what it takes, and
+`checked` reads a table by walking through its keys.  What is wrong is told as one sentence: file,
+key, what the key takes, what was found, and the nearest valid name.
 """
 
 from __future__ import annotations
@@ -19,7 +20,6 @@ from types import UnionType
 from typing import (
     Annotated,
     Any,
-    ClassVar,
     Literal,
     TypeVar,
     Union,
@@ -27,7 +27,7 @@ from typing import (
     get_args,
     get_origin,
     get_type_hints,
-)
+)  # fmt: skip
 
 import numpy as np
 from pydantic import (
@@ -37,9 +37,9 @@ from pydantic import (
     ConfigDict,
     Field,
     PlainValidator,
+    TypeAdapter,
     ValidationError,
-    create_model,
-)
+)  # fmt: skip
 from pydantic.dataclasses import dataclass as pydantic_dataclass
 from pydantic_core import PydanticCustomError
 
@@ -49,293 +49,12 @@ from elastocal.text import did_you_mean, listed, nearest, quoted
 from elastocal.units import Array, rotation_from_rpy, to_si
 
 MAX_BYTES = 1_000_000
-STRICT = ConfigDict(extra="forbid", strict=True, allow_inf_nan=False)
+STRICT = ConfigDict(extra="forbid", strict=True, allow_inf_nan=False, arbitrary_types_allowed=True)
+FARTHEST = 1e4  # m; no cell is as large, and a move of a tool that long is checked for minutes
 UNIT_SUFFIX = re.compile(
     r"_(um|mm|cm|m|deg|rad|urad|mrad|ppm|N|kN|Nm|N_per_m|N_per_mm|s|min|si"
     r"|deg_per_s|rad_per_s|m_per_s|mm_per_s)$"
 )
-
-Keys = Sequence[str | int]
-
-
-class Table(BaseModel):
-    """A table of a TOML file; its fields are its keys."""
-
-    model_config = STRICT | ConfigDict(frozen=True)
-
-
-TableType = TypeVar("TableType", bound=Table)
-
-
-def key(takes: str, default: Any = None) -> Any:
-    """An optional key; `takes` completes the sentence 'key … takes …' in messages."""
-    return Field(default=default, description=takes)
-
-
-def required(takes: str) -> Any:
-    """A key that must be there; `takes` as for `key`."""
-    return Field(description=takes)
-
-
-# --- What keys take ------------------------------------------------------------------------------
-
-
-def numbers(
-    count: int | None = None,
-    *,
-    least: float = -np.inf,
-    above: float = -np.inf,
-    one_for_all: bool = False,
-) -> PlainValidator:
-    """The validator of a list of finite numbers, which becomes an array (count,).
-
-    None counts any number of them but zero.  `one_for_all` takes a single number too: as `count`
-    equal ones, or as an array (1,).  Each is at least `least` and greater than `above`.
-    """
-
-    def check(value: object) -> Array:
-        listing = value.tolist() if isinstance(value, np.ndarray) else value
-        if one_for_all and is_number(listing):
-            listing = [listing] * (count or 1)
-        if isinstance(listing, list | tuple) and all(map(is_number, listing)):
-            found = np.array(listing, dtype=float)
-            right = len(found) == count if count else len(found) > 0
-            if right and (found >= least).all() and (found > above).all():
-                return found
-        sign = "positive " if above == 0 else ""
-        raise PydanticCustomError("numbers", f"{count or 'a list of'} {sign}numbers")
-
-    return PlainValidator(check)
-
-
-def is_number(value: object) -> bool:
-    """Whether `value` is a finite number; true and false are none."""
-    number = isinstance(value, int | float | np.integer | np.floating)
-    return number and not isinstance(value, bool) and abs(value) <= sys.float_info.max  # type: ignore[arg-type]
-
-
-Text = Annotated[str, Field(min_length=1, description="a text")]
-Positive = Annotated[float, Field(gt=0, description="a positive number")]
-NonNegative = Annotated[float, Field(ge=0, description="a number >= 0")]
-Count = Annotated[int, Field(ge=1, le=10_000_000, description="a whole number >= 1")]
-Numbers = Annotated[Array, numbers(), Field(description="a list of numbers")]
-Vector2 = Annotated[Array, numbers(2), Field(description="two numbers")]
-Vector3 = Annotated[Array, numbers(3), Field(description="three numbers")]
-
-
-# --- Reading -------------------------------------------------------------------------------------
-
-
-def read_toml(path: str | Path, what: str, max_bytes: int = MAX_BYTES) -> dict[str, Any]:
-    """Returns the parsed TOML file of at most `max_bytes`; `what` names it in messages."""
-    return parsed_toml(path, read_text(path, what, max_bytes))
-
-
-def parsed_toml(path: str | Path, text: str) -> dict[str, Any]:
-    """The same of the `text` of a file."""
-    check_nesting(path, text)
-    try:
-        return tomllib.loads(text)
-    except RecursionError:
-        raise InputError(f"{path}: nested without end; check its brackets") from None
-    except ValueError as error:
-        reason = str(error)
-        if "(at end of document)" in reason:
-            lines = text.split("\n")
-            end = f"(at line {len(lines)}, column {len(lines[-1]) + 1}, the end of the file)"
-            reason = reason.replace("(at end of document)", end)
-        if long := re.search(r"(?<!\d)\d{4300}", text):  # what Python refuses to read
-            line = text.count("\n", 0, long.start()) + 1
-            reason = f"a number of thousands of digits (at line {line})"
-        raise InputError(f"{path}: not valid TOML: {reason}") from None
-
-
-def checked(table: type[TableType], data: dict[str, Any], where: str | Path) -> TableType:
-    """Returns parsed TOML as a `table`; `where` names its source in messages."""
-    try:
-        return table.model_validate(data)
-    except ValidationError as error:
-        raise InputError(f"{where}: {_complaint(table, data, error)}") from None
-
-
-# --- How messages name keys ----------------------------------------------------------------------
-
-
-def dotted(keys: Sequence[str]) -> str:
-    """Keys as TOML writes them: joined by dots, quoted where they are no bare keys."""
-    return ".".join(k if re.fullmatch(r"[\w-]+", k, re.ASCII) else quoted(k) for k in keys)
-
-
-def header(keys: Keys) -> str:
-    """A table as a message names it: [design], or [[design.test_pose]] no. 2.
-
-    A number (from 0) after a key says which of its tables [[…]] is meant.
-    """
-    names = dotted([k for k in keys if isinstance(k, str)])
-    if keys and isinstance(keys[-1], int):
-        return f"[[{names}]] no. {keys[-1] + 1}"
-    return f"[{names}]"
-
-
-def place(*keys: str | int) -> str:
-    """A key as a message names it: design.poses, or q_deg of [[design.test_pose]] no. 2."""
-    last = max((i for i, k in enumerate(keys) if isinstance(k, int)), default=-1)
-    rest = dotted([k for k in keys[last + 1 :] if isinstance(k, str)])
-    if last < 0:
-        return rest
-    table = header(keys[: last + 1])
-    return f"{rest} of {table}" if rest else table
-
-
-# --- Complaints ----------------------------------------------------------------------------------
-
-
-@dataclass(frozen=True)
-class _Spot:
-    """Where pydantic complains: the keys of the file that lead there and what stands there.
-
-    `tables` may hold the last key, which takes `takes`; `name_above`: the key before the last is
-    a name that the user chose.
-    """
-
-    keys: list[str | int]
-    found: Any
-    tables: list[type[BaseModel]]
-    takes: str
-    name_above: bool
-
-
-def _complaint(root: type[BaseModel], data: dict[str, Any], error: ValidationError) -> str:
-    problems = error.errors(include_url=False, include_context=False)
-    # A misspelt key is the cause, the key then missing only its consequence.
-    first = min(problems, key=lambda problem: problem["type"] != "extra_forbidden")
-    spot = _spot(root, data, first["loc"])
-    here = place(*spot.keys)
-    if first["type"] == "extra_forbidden" and here in GONE:
-        return f"key {here} is gone: {GONE[here]}"
-    if first["type"] == "extra_forbidden":
-        return f"unknown key {here}{_advice(spot, root)}"
-    if first["type"] == "missing" and spot.found is None:
-        return f"key {here} is missing; it takes {spot.takes}"
-    hint = ""
-    if first["type"] == "literal_error" and isinstance(spot.found, str):
-        hint = did_you_mean(spot.found, re.findall(r'"(\w+)"', spot.takes))
-    for table in spot.tables:
-        if table.model_config.get("extra") == "allow" and spot.keys[-1] not in table.model_fields:
-            hint = did_you_mean(str(spot.keys[-1]), table.model_fields)
-    return f"key {here} takes {spot.takes}; found {shown(spot.found)}{hint}"
-
-
-def shown(found: object) -> str:
-    """`found` as a message shows it, true and false as TOML writes them."""
-    return str(found).lower() if isinstance(found, bool) else quoted(found)
-
-
-def _spot(root: type[BaseModel], data: Any, loc: Keys) -> _Spot:
-    spot = _Spot([], data, [root], "a table", False)
-    kinds: list[Any] = [root]
-    chosen = False
-    for part in loc:
-        stated = part in spot.found if isinstance(spot.found, dict) else isinstance(part, int)
-        tables = [kind for kind in kinds if is_table(kind)]
-        fields = [t.model_fields[part] for t in tables if part in t.model_fields]
-        inner = list(_inside(kinds, part, stated))
-        if isinstance(part, int) and not any(map(is_table, inner)):
-            break  # a number in a list: the list is shown whole
-        if chosen and not tables:
-            break  # a name in a table of the user's own: that table is shown whole
-        if not (fields or inner or (stated and tables)):
-            continue  # pydantic's name for a branch of a union
-        takes = spot.takes
-        if isinstance(part, int):
-            takes = "a table"
-        elif fields:
-            takes = fields[0].description or takes
-        found = spot.found[part] if stated else None
-        spot = _Spot([*spot.keys, part], found, tables, takes, chosen)
-        kinds, chosen = inner, isinstance(part, str) and not fields
-    return spot
-
-
-def _inside(kinds: Sequence[Any], part: str | int, stated: bool) -> Iterator[Any]:
-    """What may stand under the key or number `part` of what is one of `kinds`."""
-    for kind in kinds:
-        inner: Any = ()
-        if is_table(kind):
-            inner = part in kind.model_fields and kind.model_fields[part].annotation
-        elif get_origin(kind) is dict and isinstance(part, str) and stated:
-            inner = get_args(kind)[1]
-        elif get_origin(kind) is list and isinstance(part, int):
-            inner = get_args(kind)[0]
-        if inner:
-            yield from alternatives(inner)
-
-
-def is_table(kind: object) -> bool:
-    return isinstance(kind, type) and issubclass(kind, BaseModel)
-
-
-def alternatives(kind: Any) -> Iterator[Any]:
-    """The members of a union, without their validators; the type itself where it is none."""
-    if get_origin(kind) is Annotated:
-        yield from alternatives(get_args(kind)[0])
-    elif get_origin(kind) in (Union, UnionType):
-        for member in get_args(kind):
-            yield from alternatives(member)
-    else:
-        yield kind
-
-
-def tables_in(kind: Any) -> list[tuple[type[BaseModel], bool]]:
-    """The tables that a type holds, and whether as a list of them, [[…]]."""
-    found: list[tuple[type[BaseModel], bool]] = []
-    for member in alternatives(kind):
-        if is_table(member):
-            found.append((member, False))
-        else:
-            many = get_origin(member) is list
-            found += [(t, many) for inner in get_args(member) for t, _ in tables_in(inner)]
-    return found
-
-
-def _advice(spot: _Spot, root: type[BaseModel]) -> str:
-    name, above = str(spot.keys[-1]), spot.keys[:-1]
-    if spot.name_above and isinstance(spot.found, dict):
-        table, full = [str(k) for k in above[:-1]], f"{above[-1]}.{name}"
-        return f'; write a full name in quotes: [{dotted(table)}."{full}"]'
-    valid = [field for table in spot.tables for field in table.model_fields]
-    where = header(above).split(" no. ")[0] if above else "the top level"
-    takes = f"{where} takes {listed(valid)}"
-    for what, stem in (("missing", name), ("other", UNIT_SUFFIX.sub("", name))):
-        stated = [v for v in valid if v.startswith(stem + "_") and UNIT_SUFFIX.sub("", v) == stem]
-        if stated:
-            return f"; {what} unit: did you mean {' or '.join(stated)}? {takes}"
-    if homes := list(_homes_of(name, root, ())):
-        return f"; did you mean it in {' or '.join(homes[:4])}? {takes}"
-    near = nearest(name, valid)
-    return f"; did you mean {near}? {takes}" if near else f"; {takes}"
-
-
-def _homes_of(name: str, table: type[BaseModel], above: tuple[str, ...]) -> Iterator[str]:
-    """The headers of the tables below the top level that take the key `name`."""
-    for one, known in table.model_fields.items():
-        for inner, many in tables_in(known.annotation):
-            names = dotted((*above, one))
-            if name in inner.model_fields:
-                yield f"[[{names}]]" if many else f"[{names}]"
-            yield from _homes_of(name, inner, (*above, one))
-
-
-# --- Records -------------------------------------------------------------------------------------
-#
-# A class of the cell is a `record`: a frozen dataclass in SI units whose fields pydantic checks.  A
-# field that a file may state is `keyed`: its name and unit there, and what it takes.  From these
-# keys come the table that a file is checked against (`table_of`), the record of a checked table
-# (`from_table`), and what is said of a wrong argument in Python.
-
-Record = TypeVar("Record")
-Member = TypeVar("Member")
-FARTHEST = 1e4  # m; no cell is as large, and a move of a tool that long is checked for minutes
 JOINT_UNITS = ("deg", "rad", "m", "mm")
 JOINT_KEY = re.compile(r"(.+)_(deg|rad|mm|m)", re.ASCII)
 # Units that key names end with, in words, and the SI unit in its place in Python.
@@ -350,39 +69,45 @@ UNITS = {
     "deg_per_s": ("°/s", "rad/s"),
 }
 
+Record = TypeVar("Record")
+Member = TypeVar("Member")
+Into = Callable[[Any, "Spot", str], Any]
 
-@dataclass(frozen=True)
-class Spot:
-    """A table of the cell file `path`: the keys that lead to it."""
 
-    path: Path
-    keys: tuple[str | int, ...] = ()
+# --- What a file may state -----------------------------------------------------------------------
 
-    def __truediv__(self, part: str | int) -> Spot:
-        return Spot(self.path, (*self.keys, part))
 
-    def key(self, name: str) -> str:
-        """The key `name` of this table as a message names it."""
-        return place(*self.keys, name)
+class Table(BaseModel):
+    """A table of a TOML file; its fields are its keys."""
 
-    def require(self, condition: object, sentence: str) -> None:
-        """Raises InputError with the file and `sentence` unless `condition` holds."""
-        require(bool(condition), f"{self.path}: {sentence}")
+    model_config = STRICT | ConfigDict(frozen=True)
+
+
+def key(takes: str, default: Any = None) -> Any:
+    """An optional key of a `Table`; `takes` completes the sentence 'key … takes …'."""
+    return Field(default=default, description=takes)
+
+
+def required(takes: str) -> Any:
+    """A key that must be there; `takes` as for `key`."""
+    return Field(description=takes)
 
 
 @dataclass(frozen=True)
 class Key:
-    """A key of the cell file; `takes` completes the sentence 'key … takes …'.
+    """A key of a file; `takes` completes the sentence 'key … takes …'.
 
     `form`: the type of its value there, None where it is the field's.  `into`: makes the field's
     value of it, its table and its name; None converts from the unit that the name ends with.
+    `kind`: the type that is checked, as `fields_of` finds it.
     """
 
     name: str
     takes: str
     form: Any = None
-    into: Callable[[Any, Spot, str], Any] | None = None
+    into: Into | None = None
     required: bool = False
+    kind: Any = None
 
     @property
     def unit(self) -> str:
@@ -395,19 +120,14 @@ class FromFile:
     """In the Annotated of a type: the `form` and `into` of its keys, as of `Key`."""
 
     form: Any
-    into: Callable[[Any, Spot, str], Any]
+    into: Into
 
 
 def keyed(
-    takes: str = "",
-    *names: str,
-    form: Any = None,
-    into: Callable[[Any, Spot, str], Any] | None = None,
-    keys: Sequence[Key] = (),
-    required: bool = False,
-    **default: Any,
-) -> Any:
-    """A field of a record that a cell file states; `default` or `default_factory` as of `field`.
+    takes: str = "", *names: str, form: Any = None, into: Into | None = None,
+    keys: Sequence[Key] = (), required: bool = False, **default: Any,
+) -> Any:  # fmt: skip
+    """A field of a record that a file states; `default` or `default_factory` as of `field`.
 
     `names` of its key, which end with their unit, {} in `takes`; none is the field's own name, and
     of several the user chooses one.  Without `takes` it is one of a Literal, or true or false.
@@ -418,17 +138,13 @@ def keyed(
     return field(metadata={"keys": tuple(keys or own)}, **default)
 
 
-# Arrays in a union; each is checked by a validator of its own.
-CONFIG = STRICT | ConfigDict(arbitrary_types_allowed=True)
-
-
 @dataclass_transform(frozen_default=True, field_specifiers=(field, keyed))
 def record(cls: type[Record]) -> type[Record]:
     """Make a class a frozen dataclass whose fields are checked, in SI units.
 
     A wrong argument is an InputError that names class, field, what it takes and what was found.
     """
-    made: Any = pydantic_dataclass(frozen=True, config=CONFIG)(cls)
+    made: Any = pydantic_dataclass(frozen=True, config=STRICT)(cls)
     checked_init = made.__init__
 
     @wraps(checked_init)
@@ -468,6 +184,11 @@ def _hints_of(cls: Any) -> dict[str, Any]:
 
 def _fields_of(cls: Any) -> dict[str, tuple[Key, ...]]:
     hints = _hints_of(cls)
+    if issubclass(cls, BaseModel):
+        return {
+            name: (Key(name, of.description or "", None, None, of.is_required(), hints[name]),)
+            for name, of in cls.model_fields.items()
+        }
     found = {}
     for name, one in cls.__dataclass_fields__.items():
         how = next((note for note in _notes(hints[name]) if isinstance(note, FromFile)), None)
@@ -478,13 +199,21 @@ def _fields_of(cls: Any) -> dict[str, tuple[Key, ...]]:
                 takes=known.takes.replace("{}", UNITS[known.unit][0] if known.unit else "")
                 or _choice(known.form or hints[name]),
                 into=known.into or (how and how.into),
+                kind=known.kind or known.form or (how.form if how else hints[name]),
             )
             for known in one.metadata.get("keys", ())
         )
     return found
 
 
+# Field of a table or record → the keys that state it.
 fields_of: Callable[[Any], dict[str, tuple[Key, ...]]] = cache(_fields_of)
+
+
+def keys_of(*classes: Any, without: Sequence[str] = ()) -> list[Key]:
+    """The keys that state tables or records in a file."""
+    every = (known for one in classes for keys in fields_of(one).values() for known in keys)
+    return [known for known in every if known.name not in without]
 
 
 def _choice(hint: Any) -> str:
@@ -503,64 +232,149 @@ def _notes(hint: Any) -> Iterator[Any]:
             yield from _notes(member)
 
 
-# --- From the file -------------------------------------------------------------------------------
+def is_table(kind: object) -> bool:
+    records = hasattr(kind, "__dataclass_fields__")
+    return isinstance(kind, type) and (records or issubclass(kind, BaseModel))
 
 
-class RecordTable(Table):
-    """A table of the cell file from which a record is built."""
-
-    record: ClassVar[Any]
-
-
-def keys_of(*records: Any, without: Sequence[str] = ()) -> list[Key]:
-    """The keys that state records in a cell file, each with its type there."""
-    return [
-        replace(known, form=known.form or _form(_hints_of(one)[name]))
-        for one in records
-        for name, keys in fields_of(one).items()
-        for known in keys
-        if known.name not in without
-    ]
+def alternatives(kind: Any) -> Iterator[Any]:
+    """The members of a union, without their validators; the type itself where it is none."""
+    if get_origin(kind) is Annotated:
+        yield from alternatives(get_args(kind)[0])
+    elif get_origin(kind) in (Union, UnionType):
+        for member in get_args(kind):
+            yield from alternatives(member)
+    else:
+        yield kind
 
 
-def _form(hint: Any) -> Any:
-    for note in _notes(hint):
-        if isinstance(note, FromFile):
-            return note.form
-    for kind in alternatives(hint):
-        if _is_record(kind):
-            return table_of(kind)
-        if get_origin(kind) is tuple and _is_record(get_args(kind)[0]):
-            return list[table_of(get_args(kind)[0])]  # type: ignore[misc]
-    return hint
+def tables_in(kind: Any) -> list[tuple[Any, bool]]:
+    """The tables and records that a type holds, and whether as a list of them, [[…]]."""
+    found: list[tuple[Any, bool]] = []
+    for member in alternatives(kind):
+        if is_table(member):
+            found.append((member, False))
+        else:
+            many = get_origin(member) in (list, tuple)
+            found += [(t, many) for inner in get_args(member) for t, _ in tables_in(inner)]
+    return found
 
 
-def _is_record(kind: Any) -> bool:
-    return hasattr(kind, "__dataclass_fields__")
+# --- Reading -------------------------------------------------------------------------------------
 
 
-def _table_of(cls: Any) -> type[RecordTable]:
-    fields: dict[str, Any] = {
-        k.name: (k.form, Field(... if k.required else None, description=k.takes))
-        for k in keys_of(cls)
-    }
-    made = create_model(f"{cls.__name__}Table", __base__=RecordTable, **fields)
-    made.record = cls
-    return made
+def read_toml(path: str | Path, what: str, max_bytes: int = MAX_BYTES) -> dict[str, Any]:
+    """The parsed TOML file of at most `max_bytes`; `what` names it in messages."""
+    text = read_text(path, what, max_bytes)
+    check_nesting(path, text)
+    try:
+        return tomllib.loads(text)
+    except RecursionError:
+        raise InputError(f"{path}: nested without end; check its brackets") from None
+    except ValueError as error:
+        reason = str(error)
+        if "(at end of document)" in reason:
+            lines = text.split("\n")
+            end = f"(at line {len(lines)}, column {len(lines[-1]) + 1}, the end of the file)"
+            reason = reason.replace("(at end of document)", end)
+        if long := re.search(r"(?<!\d)\d{4300}", text):  # what Python refuses to read
+            line = text.count("\n", 0, long.start()) + 1
+            reason = f"a number of thousands of digits (at line {line})"
+        raise InputError(f"{path}: not valid TOML: {reason}") from None
 
 
-table_of: Callable[[Any], type[RecordTable]] = cache(_table_of)
+@dataclass(frozen=True)
+class Spot:
+    """A table of the file `path`, whose top level is `root`: the keys that lead to it.
+
+    `named`: the last of them is a name that the user chose.
+    """
+
+    path: Any
+    keys: tuple[str | int, ...] = ()
+    root: Any = None
+    named: bool = False
+
+    def __truediv__(self, part: str | int) -> Spot:
+        return replace(self, keys=(*self.keys, part), named=False)
+
+    def key(self, name: str) -> str:
+        """The key `name` of this table as a message names it."""
+        return place(*self.keys, name)
+
+    def require(self, condition: object, sentence: str) -> None:
+        """Raises InputError with the file and `sentence` unless `condition` holds."""
+        require(bool(condition), f"{self.path}: {sentence}")
 
 
-def from_table(cls: type[Record], table: RecordTable, spot: Spot, **values: Any) -> Record:
-    """The record that a checked table states, in SI units; `values` are known otherwise.
+def checked(table: type[Record], data: Mapping[str, Any], where: str | Path) -> Record:
+    """Parsed TOML as a table or record; `where` names its source in messages."""
+    found: Record = _table(table, data, Spot(where, root=table), "a table")
+    return found
+
+
+def _table(cls: Any, data: Mapping[str, Any], spot: Spot, takes: str) -> Any:
+    known, found = {one.name: one for one in keys_of(cls)}, {}
+    more = cls.model_config.get("extra") if issubclass(cls, BaseModel) else "forbid"
+    others = [name for name in data if name not in known]
+    for name in others if more == "forbid" else ():
+        raise InputError(f"{spot.path}: {_unknown(cls, name, data[name], spot)}")
+    for name in others if more == "allow" else ():
+        kind = get_args(_hints_of(cls)["__pydantic_extra__"])[1]
+        found[name] = _value(kind, data[name], spot / name, takes, did_you_mean(name, known))
+    for name, one in known.items():
+        if name in data:
+            found[name] = _value(one.kind, data[name], spot / name, one.takes)
+        else:
+            missing = f"key {spot.key(name)} is missing; it takes {one.takes}"
+            spot.require(not one.required, missing)
+    if issubclass(cls, BaseModel):
+        return cls.model_construct(**found)
+    return from_table(cls, found, spot)
+
+
+_adapters: dict[int, tuple[Any, TypeAdapter[Any]]] = {}  # by what is kept beside them
+
+
+def _value(kind: Any, found: Any, spot: Spot, takes: str, hint: str = "") -> Any:
+    """What stands at a spot as a `kind`: tables within it are read one by one."""
+    members = list(alternatives(kind))
+    for member in members:
+        inner, origin = get_args(member), get_origin(member)
+        if is_table(member) and isinstance(found, dict):
+            return _table(member, found, spot, takes)
+        if inner and tables_in(member) and isinstance(found, dict) and origin is dict:
+            found = {
+                name: _value(inner[1], value, replace(spot / name, named=True), takes)
+                for name, value in found.items()
+            }
+        elif inner and tables_in(member) and isinstance(found, list) and origin in (list, tuple):
+            found = [_value(inner[0], v, spot / i, "a table") for i, v in enumerate(found)]
+    keys, problem = spot.keys, ""
+    if not is_table(members[0]):
+        try:
+            if id(kind) not in _adapters:
+                _adapters[id(kind)] = kind, TypeAdapter(kind, config=STRICT)
+            return _adapters[id(kind)][1].validate_python(found)
+        except ValidationError as error:
+            first = error.errors(include_url=False, include_context=False)[0]
+            problem, path = first["type"], first["loc"]
+            # A name in a table of the user's own; what stands below it is shown whole.
+            for name in [p for p in path if isinstance(found, dict) and p in found][:1]:
+                keys, found = (*keys, name), found[name]
+    if problem == "literal_error" and isinstance(found, str):
+        hint = did_you_mean(found, re.findall(r'"(\w+)"', takes))
+    raise InputError(f"{spot.path}: key {place(*keys)} takes {takes}; found {shown(found)}{hint}")
+
+
+def from_table(cls: type[Record], table: Mapping[str, Any], spot: Spot, **values: Any) -> Record:
+    """The record that the checked values of a table state, in SI units; `values` are known.
 
     `cls.from_keys(table, spot)`, where there is one, gives the fields that several keys state
     together; each other field is stated by one of its keys.
     """
     known: Any = cls
-    if hasattr(cls, "from_keys"):
-        values |= known.from_keys(table, spot)
+    values |= known.from_keys(table, spot) if hasattr(cls, "from_keys") else {}
     for name, keys in fields_of(known).items():
         if name not in values and (given := stated(table, spot, keys)):
             values[name] = given[0]
@@ -570,50 +384,26 @@ def from_table(cls: type[Record], table: RecordTable, spot: Spot, **values: Any)
         raise InputError(f"{spot.path}: {error}") from None
 
 
-def stated(table: Table, spot: Spot, keys: Sequence[Key]) -> tuple[Any, str] | None:
+def stated(table: Mapping[str, Any], spot: Spot, keys: Sequence[Key]) -> tuple[Any, str] | None:
     """The value in SI units and name of the one of `keys` that the table states, None for none."""
-    given = [known for known in keys if getattr(table, known.name, None) is not None]
+    given = [known for known in keys if known.name in table]
     names = " and ".join(spot.key(known.name) for known in given)
     spot.require(len(given) < 2, f"{names} say the same in two units; keep one of them")
-    for known in given:
-        return _value(getattr(table, known.name), known, spot), known.name
-    return None
-
-
-def _value(found: Any, known: Key, spot: Spot) -> Any:
-    if isinstance(found, RecordTable):
-        return from_table(found.record, found, spot / known.name)
-    if isinstance(found, list) and found and isinstance(found[0], RecordTable):
-        tables = enumerate(found)
-        return tuple(from_table(t.record, t, spot / known.name / i) for i, t in tables)
+    if not given:
+        return None
+    known = given[0]
+    found, unit = table[known.name], known.unit
     if known.into is not None:
-        return known.into(found, spot, known.name)
-    if not known.unit:
-        return found
+        return known.into(found, spot, known.name), known.name
+    if not unit:
+        return found, known.name
     several = isinstance(found, Mapping)
-    values = {k: to_si(v, known.unit) for k, v in (found if several else {"": found}).items()}
-    if UNITS[known.unit][1] == "m":
-        for name, value in values.items():
-            far = float(np.max(np.abs(value), initial=0.0))
-            key = spot.key(known.name) + (f".{dotted((name,))}" if several else "")
-            spot.require(
-                far <= FARTHEST, f"key {key}: {far:g} m reaches beyond any cell; correct it"
-            )
-    return values if several else values[""]
-
-
-def existing_file(found: str, spot: Spot, name: str) -> Path:
-    """The file that a key names relative to the cell file; raises InputError where it is none."""
-    return check_exists(spot.path.parent / found, spot.key(name), spot.path)
-
-
-def direction(vector: Array, spot: Spot, name: str) -> Array:
-    """A vector (3,) at unit length; raises InputError that names the key where it is zero."""
-    unit = _unit_vector(np.asarray(vector, dtype=float))
-    if unit is None:
-        what = f"key {spot.key(name)} is zero; give a direction, as in [0, 0, 1]"
-        raise InputError(f"{spot.path}: {what}")
-    return unit
+    values = {k: to_si(v, unit) for k, v in (found if several else {"": found}).items()}
+    for name, value in values.items() if UNITS[unit][1] == "m" else ():
+        far = float(np.max(np.abs(value), initial=0.0))
+        here = spot.key(known.name) + (f".{dotted((name,))}" if several else "")
+        spot.require(far <= FARTHEST, f"key {here}: {far:g} m reaches beyond any cell; correct it")
+    return values if several else values[""], known.name
 
 
 def joint_values(
@@ -642,13 +432,101 @@ def joint_values(
     return values
 
 
-# --- What fields take ----------------------------------------------------------------------------
+# --- How messages name keys ----------------------------------------------------------------------
 
 
-def _tuple(value: object) -> object:
-    if isinstance(value, np.ndarray):
-        value = value.tolist()
-    return tuple(value) if isinstance(value, list) else value
+def shown(found: object) -> str:
+    """`found` as a message shows it, true and false as TOML writes them."""
+    return str(found).lower() if isinstance(found, bool) else quoted(found)
+
+
+def dotted(keys: Sequence[str]) -> str:
+    """Keys as TOML writes them: joined by dots, quoted where they are no bare keys."""
+    return ".".join(k if re.fullmatch(r"[\w-]+", k, re.ASCII) else quoted(k) for k in keys)
+
+
+def header(keys: Sequence[str | int]) -> str:
+    """A table as a message names it: [design], or [[design.test_pose]] no. 2.
+
+    A number (from 0) after a key says which of its tables [[…]] is meant.
+    """
+    names = dotted([k for k in keys if isinstance(k, str)])
+    if keys and isinstance(keys[-1], int):
+        return f"[[{names}]] no. {keys[-1] + 1}"
+    return f"[{names}]"
+
+
+def place(*keys: str | int) -> str:
+    """A key as a message names it: design.poses, or q_deg of [[design.test_pose]] no. 2."""
+    last = max((i for i, k in enumerate(keys) if isinstance(k, int)), default=-1)
+    rest = dotted([k for k in keys[last + 1 :] if isinstance(k, str)])
+    if last < 0:
+        return rest
+    table = header(keys[: last + 1])
+    return f"{rest} of {table}" if rest else table
+
+
+def _unknown(cls: Any, name: str, found: Any, spot: Spot) -> str:
+    here, above, valid = spot.key(name), spot.keys, [one.name for one in keys_of(cls)]
+    if here in GONE:
+        return f"key {here} is gone: {GONE[here]}"
+    if spot.named and isinstance(found, dict):
+        table, full = [str(k) for k in above[:-1]], f"{above[-1]}.{name}"
+        return f'unknown key {here}; write a full name in quotes: [{dotted(table)}."{full}"]'
+    where = header(above).split(" no. ")[0] if above else "the top level"
+    hint = ""
+    for what, stem in (("other", UNIT_SUFFIX.sub("", name)), ("missing", name)):
+        units = [v for v in valid if v.startswith(stem + "_") and UNIT_SUFFIX.sub("", v) == stem]
+        hint = f"{what} unit: did you mean {' or '.join(units)}? " if units else hint
+    if not hint and (homes := list(_homes_of(name, spot.root, ()))):
+        hint = f"did you mean it in {' or '.join(homes[:4])}? "
+    elif not hint and (near := nearest(name, valid)):
+        hint = f"did you mean {near}? "
+    return f"unknown key {here}; {hint}{where} takes {listed(valid)}"
+
+
+def _homes_of(name: str, table: Any, above: tuple[str, ...]) -> Iterator[str]:
+    """The headers of the tables below the top level that take the key `name`."""
+    for one in keys_of(table):
+        for inner, many in tables_in(one.kind):
+            names = dotted((*above, one.name))
+            if name in [known.name for known in keys_of(inner)]:
+                yield f"[[{names}]]" if many else f"[{names}]"
+            yield from _homes_of(name, inner, (*above, one.name))
+
+
+# --- What keys and fields take -------------------------------------------------------------------
+
+
+def is_number(value: object) -> bool:
+    """Whether `value` is a finite number; true and false are none."""
+    number = isinstance(value, int | float | np.integer | np.floating)
+    return number and not isinstance(value, bool) and abs(value) <= sys.float_info.max  # type: ignore[arg-type]
+
+
+def numbers(
+    count: int | None = None, *, least: float = -np.inf, above: float = -np.inf,
+    one_for_all: bool = False,
+) -> PlainValidator:  # fmt: skip
+    """The validator of a list of finite numbers, which becomes an array (count,).
+
+    None counts any number of them but zero.  `one_for_all` takes a single number too: as `count`
+    equal ones, or as an array (1,).  Each is at least `least` and greater than `above`.
+    """
+
+    def check(value: object) -> Array:
+        listing = value.tolist() if isinstance(value, np.ndarray) else value
+        if one_for_all and is_number(listing):
+            listing = [listing] * (count or 1)
+        if isinstance(listing, list | tuple) and all(map(is_number, listing)):
+            found = np.array(listing, dtype=float)
+            right = len(found) == count if count else len(found) > 0
+            if right and (found >= least).all() and (found > above).all():
+                return found
+        sign = "positive " if above == 0 else ""
+        raise PydanticCustomError("numbers", f"{count or 'a list of'} {sign}numbers")
+
+    return PlainValidator(check)
 
 
 def matrix(rows: int | None, columns: int) -> PlainValidator:
@@ -675,6 +553,15 @@ def _unit_vector(vector: Array) -> Array | None:
     return np.asarray(scaled / np.linalg.norm(scaled))
 
 
+def direction(vector: Array, spot: Spot, name: str) -> Array:
+    """A vector (3,) at unit length; raises InputError that names the key where it is zero."""
+    unit = _unit_vector(np.asarray(vector, dtype=float))
+    if unit is None:
+        what = f"key {spot.key(name)} is zero; give a direction, as in [0, 0, 1]"
+        raise InputError(f"{spot.path}: {what}")
+    return unit
+
+
 def _direction(value: object) -> Array:
     check: Any = numbers(3).func
     vector: Array = check(value)
@@ -685,6 +572,23 @@ def _direction(value: object) -> Array:
     return vector if np.abs(vector - unit).max() < 1e-12 else unit
 
 
+def _tuple(value: object) -> object:
+    listing = value.tolist() if isinstance(value, np.ndarray) else value
+    return tuple(listing) if isinstance(listing, list) else listing
+
+
+def existing_file(found: str, spot: Spot, name: str) -> Path:
+    """The file that a key names relative to the cell file; raises InputError where it is none."""
+    return check_exists(spot.path.parent / found, spot.key(name), spot.path)
+
+
+Text = Annotated[str, Field(min_length=1, description="a text")]
+Positive = Annotated[float, Field(gt=0, description="a positive number")]
+NonNegative = Annotated[float, Field(ge=0, description="a number >= 0")]
+Count = Annotated[int, Field(ge=1, le=10_000_000, description="a whole number >= 1")]
+Numbers = Annotated[Array, numbers(), Field(description="a list of numbers")]
+Vector2 = Annotated[Array, numbers(2), Field(description="two numbers")]
+Vector3 = Annotated[Array, numbers(3), Field(description="three numbers")]
 TUPLE = BeforeValidator(_tuple)
 AnyFloat = Annotated[float, AllowInfNan(True)]
 Many = Annotated[tuple[Member, ...], TUPLE]

@@ -87,16 +87,14 @@ class Robot:
 
     @classmethod
     def from_keys(cls, table: Any, spot: Spot) -> dict[str, Any]:
-        given = [name for name in SOURCES if getattr(table, name) is not None]
+        given = [name for name in SOURCES if name in table]
         told = f"[robot] takes exactly one of {listed(SOURCES)}; none is given"
         spot.require(bool(given), told)
         of_a_table = ("dh_convention", "masses", "ur_model")
         other = {"urdf": of_a_table, "mjcf": of_a_table, "dh": ("base", "flange")}
         for name in other[given[0]] if len(given) == 1 else ():
-            spot.require(
-                getattr(table, name) is None,
-                f"key robot.{name} has no meaning beside {given[0]}; drop it",
-            )
+            told = f"key robot.{name} has no meaning beside {given[0]}; drop it"
+            spot.require(name not in table, told)
         return {}
 
     @classmethod
@@ -206,8 +204,8 @@ class PolarNoise:
     @classmethod
     def from_keys(cls, table: Any, spot: Spot) -> dict[str, Any]:
         return {
-            "range_per_m": to_si(table.range_ppm or 0.0, "ppm"),
-            "transverse_per_m": to_si(table.transverse_ppm or 0.0, "ppm"),
+            "range_per_m": to_si(table.get("range_ppm", 0.0), "ppm"),
+            "transverse_per_m": to_si(table.get("transverse_ppm", 0.0), "ppm"),
         }
 
 
@@ -236,8 +234,8 @@ class Tracker:
 
     @classmethod
     def from_keys(cls, table: Any, spot: Spot) -> dict[str, Any]:
-        polar = [name for name in POLAR_KEYS if getattr(table, name) is not None]
-        if table.sigma_um is not None:
+        polar = [name for name in POLAR_KEYS if name in table]
+        if "sigma_um" in table:
             spot.require(
                 not polar,
                 f"keys tracker.sigma_um and tracker.{''.join(polar[:1])} are two styles of noise; "
@@ -248,7 +246,7 @@ class Tracker:
             return {"noise": None}
         for name in ("range_um", "transverse_um"):
             spot.require(
-                getattr(table, name) is not None,
+                name in table,
                 f"key tracker.{name} is missing; beside tracker.{polar[0]} it takes a positive "
                 "number in µm",
             )

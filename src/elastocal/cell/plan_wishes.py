@@ -80,11 +80,11 @@ class TargetPose:
     def from_keys(cls, table: Any, spot: Spot) -> dict[str, Any]:
         """The joints, in one of two units."""
         spot.require(
-            table.q_deg is not None or table.q_si is not None,
+            "q_deg" in table or "q_si" in table,
             f"key {spot.key('q_deg')} is missing; it takes one number per joint, in degrees "
             "(q_si: in rad or m)",
         )
-        return {"degrees": table.q_deg is not None}
+        return {"degrees": "q_deg" in table}
 
 
 @record
@@ -331,10 +331,10 @@ class DesignSpec:
     @classmethod
     def from_keys(cls, table: Any, spot: Spot) -> dict[str, Any]:
         """The levels and their numbers of poses; where poses is not given, it is their sum."""
-        given = table.levels or LevelsTable()
+        given = table.get("levels") or LevelsTable()
         levels = joint_values(given.model_extra or {}, spot, "levels", ("poses_per_level",))
         per_level = _per_level(given.poses_per_level, levels, spot)
-        poses = table.poses
+        poses = table.get("poses")
         if per_level:
             spot.require(
                 poses in (None, sum(per_level)),
@@ -350,11 +350,10 @@ class DesignSpec:
                 "levels",
             )
         known = {"levels": levels, "per_level": per_level, "poses": poses}
-        if table.candidates is not None:
-            found = of_candidates(table.candidates)
-            where = spot.key("candidates")
-            spot.require(found, f"key {where} takes {CANDIDATES}; found {table.candidates}")
-            assert found is not None
+        if "candidates" in table:
+            found = of_candidates(table["candidates"]) or (None, None)
+            told = f"takes {CANDIDATES}; found {table['candidates']}"
+            spot.require(any(found), f"key {spot.key('candidates')} {told}")
             known["candidates"] = found[0]
             if found[1] is not None:
                 known["taught"] = existing_file(str(found[1]), spot, "candidates")

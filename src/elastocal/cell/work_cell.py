@@ -44,7 +44,6 @@ from elastocal.config import (
     read_toml,
     record,
     stated,
-    table_of,
 )
 from elastocal.errors import require
 from elastocal.files import check_exists
@@ -105,29 +104,27 @@ class Solid:
 
     @classmethod
     def from_keys(cls, table: Any, spot: Spot) -> dict[str, Any]:
-        needed = NEEDED[table.shape]
+        shape = table["shape"]
+        needed = NEEDED[shape]
         for known in keys_of(cls):
-            given = getattr(table, known.name, None) is not None
-            meant = known in SIZE_KEYS or known.name == "file"
-            allowed = known.name in needed or (known.name == "scale" and table.shape == "mesh")
+            name = known.name
+            of_shapes = name == "file" or name in [one.name for one in SIZE_KEYS]
+            allowed = name in needed or (name == "scale" and shape == "mesh")
             spot.require(
-                allowed or not (given and meant),
-                f"key {spot.key(known.name)} has no meaning for a {table.shape}, which takes "
+                allowed or not (of_shapes and name in table),
+                f"key {spot.key(name)} has no meaning for a {shape}, which takes "
                 f"{' and '.join(needed)}; drop it",
             )
             spot.require(
-                given or known.name not in needed,
-                f"key {spot.key(known.name)} is missing; for a {table.shape} it takes "
-                f"{known.takes}",
+                name in table or name not in needed,
+                f"key {spot.key(name)} is missing; for a {shape} it takes {known.takes}",
             )
-        size = np.ones(3) if table.scale is None else table.scale
-        if table.shape != "mesh":
-            size = np.hstack([getattr(table, name) for name in needed])
+        size = table.get("scale", np.ones(3))
+        if shape != "mesh":
+            size = np.hstack([table[name] for name in needed])
         T = np.eye(4)
-        if getattr(table, "rpy_deg", None) is not None:
-            T[:3, :3] = rotation_from_rpy(np.radians(table.rpy_deg))
-        if getattr(table, "position_m", None) is not None:
-            T[:3, 3] = table.position_m
+        T[:3, :3] = rotation_from_rpy(np.radians(table.get("rpy_deg", (0, 0, 0))))
+        T[:3, 3] = table.get("position_m", (0, 0, 0))
         return {"size": size, "placement": T}
 
 
@@ -180,7 +177,7 @@ class HangingLoad:
 
     @classmethod
     def from_keys(cls, table: Any, spot: Spot) -> dict[str, Any]:
-        axis, angle = table.rope_axis is not None, table.max_angle_deg is not None
+        axis, angle = "rope_axis" in table, "max_angle_deg" in table
         given, other, takes = (
             ("rope_axis", "max_angle_deg", "the angle that it may deviate from the vertical")
             if axis
@@ -288,7 +285,7 @@ class Workspace:
     def from_keys(cls, table: Any, spot: Spot) -> dict[str, Any]:
         _check_names(table, spot)
         radius = stated(table, spot, fields_of(cls)["link_radius"])
-        geometry = table.geometry or ("capsules" if radius else "none")
+        geometry = table.get("geometry", "capsules" if radius else "none")
         spot.require(
             bool(radius) or geometry != "capsules",
             'key workspace.link_radius_mm is missing; beside geometry = "capsules" it takes a '
@@ -306,24 +303,24 @@ def _check_names(table: Any, spot: Spot) -> None:
     """Names of solids and half-spaces can stand in messages and plans, each only once."""
     places: dict[str, str] = {}
     for kind in ("obstacle", "body", "keep_out"):
-        for i, entry in enumerate(getattr(table, kind) or ()):
-            here = (spot / kind / i).key("name")
+        for i, entry in enumerate(table.get(kind, ())):
+            here, name = (spot / kind / i).key("name"), getattr(entry, "solid", entry).name
             spot.require(
-                is_label(entry.name),
+                is_label(name),
                 f"key {here} takes a text on one line without blanks at its ends; found "
-                f"{quoted(entry.name)}",
+                f"{quoted(name)}",
             )
             spot.require(
-                not PARTS.fullmatch(entry.name),
-                f"key {here} is {quoted(entry.name)}, which names a part of the arm or its load; "
+                not PARTS.fullmatch(name),
+                f"key {here} is {quoted(name)}, which names a part of the arm or its load; "
                 "choose another",
             )
             spot.require(
-                entry.name not in places,
-                f"key {here} repeats {quoted(entry.name)}, already {places.get(entry.name)}; give "
-                "every one a name of its own",
+                name not in places,
+                f"key {here} repeats {quoted(name)}, already {places.get(name)}; give every one "
+                "a name of its own",
             )
-            places[entry.name] = here
+            places[name] = here
 
 
 # The space around the arm: bodies, obstacles, keep-out, sight, load (DESIGN: [workspace]).
@@ -494,11 +491,13 @@ class Cell:
             >>> cell.model.observe, tuple(cell.tool.markers)
             ('deflection', ('M1', 'M2', 'M3'))
         """
-        path = Path(path)
-        table: Any = checked(table_of(cls), read_toml(path, "cell file"), path)
-        cell = from_table(cls, table, Spot(path), path=path, name=table.name or path.stem)
+        cell = checked(cls, read_toml(path, "cell file"), Path(path))
         cell.check(known_effects)
         return cell
+
+    @classmethod
+    def from_keys(cls, table: Any, spot: Spot) -> dict[str, Any]:
+        return {"path": spot.path, "name": table.get("name") or spot.path.stem}
 
     def check(self, known_effects: KnownEffects | None = None) -> None:
         """Checks that the parts of the cell fit together, which `replace` may leave otherwise.
