@@ -15,7 +15,7 @@ from typing import TYPE_CHECKING, Any, ForwardRef
 from elastocal.errors import InputError, option
 
 if TYPE_CHECKING:
-    from pandas import DataFrame
+    from pandas import DataFrame as DataFrame  # for those who import it from here
 
 
 def later(*rooms: str) -> dict[str, Any]:

@@ -15,7 +15,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from elastocal import tables
-from elastocal.above import Result, later
+from elastocal.above import DataFrame, Result, later
 from elastocal.arguments import checked_arguments
 from elastocal.errors import InputError, option, require
 from elastocal.files import atomic_writer, open_input, read_text
@@ -25,9 +25,8 @@ from elastocal.units import ANGLE, LENGTH, TIME, Array, IntArray
 
 if TYPE_CHECKING:
     from numpy.typing import ArrayLike
-    from pandas import DataFrame
 else:
-    globals().update(later("numpy.typing ArrayLike", "pandas DataFrame"))
+    globals().update(later("numpy.typing ArrayLike"))
 
 
 SI_UNITS = ("m", "rad", "s", "N", "Nm", "C", "")

@@ -7,12 +7,12 @@ from collections.abc import ItemsView, Iterator, KeysView
 from dataclasses import dataclass, field
 from functools import cached_property
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, Literal
+from typing import Any, Literal
 
 import numpy as np
 from numpy.typing import ArrayLike
 
-from elastocal.above import Result, headline, later, write_page
+from elastocal.above import DataFrame, Result, headline, write_page
 from elastocal.arguments import checked_arguments
 from elastocal.cell.arm_description import Unsteadiness
 from elastocal.errors import ElastocalError, UnknownNameError
@@ -49,11 +49,6 @@ from elastocal.model.calibrated import (
 from elastocal.model.manipulator import Model
 from elastocal.model.observations import COMPONENTS, Observations, observe
 from elastocal.units import Array, IntArray, microns
-
-if TYPE_CHECKING:
-    from pandas import DataFrame
-else:
-    globals().update(later("pandas DataFrame"))
 
 SCHEMA = "elastocal/identification/1"
 FEW_POSES = 64  # of those over the workspace, for an rms

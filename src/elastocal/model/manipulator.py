@@ -6,12 +6,12 @@ from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from elastocal.above import later
+from elastocal.above import DataFrame
 from elastocal.arguments import checked_arguments
 from elastocal.cell.arm_description import EffectChoice, ModelSpec
 from elastocal.cell.work_cell import Cell
@@ -28,11 +28,6 @@ from elastocal.model.symbolic import SymbolicArm
 from elastocal.plugin_loader import Carried
 from elastocal.text import listed
 from elastocal.units import Array, IntArray
-
-if TYPE_CHECKING:
-    from pandas import DataFrame
-else:
-    globals().update(later("pandas DataFrame"))
 
 
 @dataclass(frozen=True)
