@@ -34,16 +34,14 @@ from elastocal.identification.robust import robust_result
 from elastocal.identification.smooth_fit import fit_smooth
 from elastocal.identification.solve import Solution, chosen_again, fit_kept
 from elastocal.identification.weighted_problem import Weights
-from elastocal.model.manipulator import Model
-from elastocal.model.observations import Observations, subset
+from elastocal.model.observations import subset
 from elastocal.units import Array, BoolArray, IntArray, Progress
 
 # The default method: noise estimated from the residuals, faulty readings judged by that noise.
 
 Refit = Callable[[BoolArray], Solution]  # of these observations
 
-ROUNDS = 6
-RESTARTS = 3
+ROUNDS, RESTARTS = 14, 2
 # Of a standard deviation: what relinearising may still move an estimate by at the end, and where
 # the kind of noise is chosen.
 SETTLED, LINEAR = 0.01, 1.0
@@ -51,80 +49,71 @@ SETTLED, LINEAR = 0.01, 1.0
 # A fit to the good observations (N,), the noise found from them, and which they are.
 Adapted = tuple[Solution, NoiseFit, BoolArray]
 
-
-def _adapted(
-    every: Solution, sound: Solution, faulty: BoolArray, refit: Refit, kind: str,
-    progress: Progress, known: NoiseAndOutliers | None = None,
-) -> Adapted:  # fmt: skip
-    """Fit with weights that the residuals tell, from a fit that faulty readings do not bend.
-
-    `every` holds all observations, `sound` the fit to those that are not `faulty` (N,) at equal or
-    stated weights.  At its values readings are screened, noise model and faulty readings settled
-    (`noise_choice.settle`) and the kept parameters fitted anew with the weights found, until
-    neither changes nor more parameters show under these weights.  Where other readings turn out
-    good than `sound` was fitted to, its parameters are chosen again for these.
-    """
-    start, good = sound, ~faulty
-    for _ in range(RESTARTS):
-        solution, noise, judged = _settled(every, start, good, kind, progress, known)
-        if np.array_equal(judged, good):
-            break
-        good, known = judged, NoiseAndOutliers(noise, judged)
-        start = every if good.all() else refit(good)
-    return solution, noise, judged
-
-
-def _settled(
-    every: Solution, start: Solution, good: BoolArray | None, kind: str, progress: Progress,
-    known: NoiseAndOutliers | None = None,
-) -> Adapted:  # fmt: skip
-    """The noise and the fit in turn, from `start`; all observations where `good` is None.
-
-    The kind of noise is chosen once, unless it is `known`, and again where other readings turn out
-    good, more parameters show or the fit has moved.
-    """
-    asked = "auto" if kind == OF_READINGS else kind
-    problem, kept = every.problem, start.reduction.kept
-    model, observed = problem.model, problem.observations
-    solution, everything = start, np.ones(len(observed.lead), dtype=bool)
-    readings = _linearised(model, observed, start.fit.x, kept, kind)
-    check_supported(asked, readings)
-    now = everything if good is None else good
-    for left in reversed(range(ROUNDS)):
-        before = now
-        if good is None:
-            like = None if known is None else known.noise
-            noise = estimate_noise(readings, asked if like is None else like.kind, like)
-        else:
-            noise, now = settle(readings, asked, now, known)
-        progress(f"fitting with the noise found ({noise.kind})")
-        expected = solution.fit.x[kept] + noise.x
-        solution = refined(every, start, solution.fit.x, now, weights_of(noise, readings.take(now)))
-        readings = _linearised(model, observed, solution.fit.x, kept, kind)
-        moved = np.abs(solution.fit.x[kept] - expected) / noise.covariance.std
-        # What relinearising moves by more may have looked like some noise: it is chosen again.
-        near = moved.max(initial=0.0) < LINEAR
-        known = NoiseAndOutliers(noise, now if near else np.zeros_like(now))
-        if moved.max(initial=0.0) < SETTLED and np.array_equal(now, before):
-            # Weights that make light of what is noisy may show more than those of the first fit.
-            other = noise.kind not in FIRST and left > 0
-            more = chosen_again(solution) if other else start.reduction
-            if len(more.kept) <= len(kept):
-                break
-            start, kept = replace(start, reduction=more), more.kept
-            readings = _linearised(model, observed, solution.fit.x, kept, kind)
-    fitted = readings.take(now)
-    return solution, over_times(estimate_noise(fitted, noise.kind, noise), fitted), now
-
-
 FIRST = ("independent", "stated")  # noise whose weights are those of the first fit
 OF_READINGS = "auto, of readings"  # the best noise model but those that know the arm's visits
 
 
-def _linearised(
-    model: Model, observed: Observations, x: Array, kept: IntArray, kind: str
-) -> Readings:
-    readings = linearised(model, observed, x, kept)
+def _adapted(
+    every: Solution, start: Solution, good: BoolArray, kind: str, progress: Progress,
+    refit: Refit | None, known: NoiseAndOutliers | None = None,
+) -> Adapted:  # fmt: skip
+    """Fit with weights that the residuals tell, from a fit that faulty readings do not bend.
+
+    `every` holds all observations, `start` the fit to the `good` (N,) ones.  Noise and good
+    readings are settled at its values and the kept parameters fitted anew with these weights, until
+    neither changes.  Then what was chosen on the way is chosen again by what is there now:
+    the parameters, if other readings are good or the weights show more, and the kind of noise,
+    unless it is `known`.  Without `refit` no reading is judged.
+    """
+    asked = "auto" if kind == OF_READINGS else kind
+    problem, solution, now, fitted = every.problem, start, good, good
+    readings = _linearised(problem, start.fit.x, start.reduction.kept, kind)
+    check_supported(asked, readings)
+    sure, restarts = False, 0
+    for left in reversed(range(ROUNDS)):
+        before, kept = now, start.reduction.kept
+        like = None if known is None else known.noise
+        name = asked if like is None else like.kind
+        if refit is None:
+            noise = estimate_noise(readings, name, like)
+        else:
+            noise, now = settle(readings, name, now, known)
+        progress(f"fitting with the noise found ({noise.kind})")
+        expected = solution.fit.x[kept] + noise.x
+        solution = refined(every, start, solution.fit.x, now, weights_of(noise, readings.take(now)))
+        readings = _linearised(problem, solution.fit.x, kept, kind)
+        moved = np.abs(solution.fit.x[kept] - expected) / noise.covariance.std
+        same = np.array_equal(now, before)
+        # What relinearising moves by more may have looked like some noise.
+        sure = sure or (known is None and same and moved.max(initial=0.0) < LINEAR)
+        known = NoiseAndOutliers(noise, now)
+        if moved.max(initial=0.0) >= SETTLED or not same:
+            continue
+        others = refit is not None and restarts < RESTARTS and not np.array_equal(now, fitted)
+        if others and refit is not None:
+            start, fitted, restarts = every if now.all() else refit(now), now, restarts + 1
+            solution, more = start, start.reduction
+        else:
+            # Weights that make light of what is noisy may show more than those of the first fit.
+            heavy = noise.kind not in FIRST and left > 0
+            more = chosen_again(solution) if heavy else start.reduction
+        if others or len(more.kept) > len(kept):
+            start, sure = replace(start, reduction=more), False
+            readings = _linearised(problem, solution.fit.x, more.kept, kind)
+            continue
+        if sure:
+            break
+        again, sure = estimate_noise(readings.take(now), asked), True
+        known = NoiseAndOutliers(again, now)
+        if again.kind == noise.kind:
+            noise = again
+            break
+    final = readings.take(now)
+    return solution, over_times(estimate_noise(final, noise.kind, noise), final), now
+
+
+def _linearised(problem: Problem, x: Array, kept: IntArray, kind: str) -> Readings:
+    readings = linearised(problem.model, problem.observations, x, kept)
     return replace(readings, visits=None) if kind == OF_READINGS else readings
 
 
@@ -300,20 +289,24 @@ def _reml(
     options: Options,
     progress: Progress,
 ) -> MethodResult:
-    def found(kind: str, known: NoiseAndOutliers | None = None) -> Adapted:
-        solution, noise, good = _adapted(every, sound, faulty, refit, kind, progress, known)
+    def found(
+        start: Solution, good: BoolArray, kind: str, known: NoiseAndOutliers | None = None
+    ) -> Adapted:
+        solution, noise, good = _adapted(every, start, good, kind, progress, refit, known)
         if not good.all() and not options.sets_aside(~good):
             # So many faulty readings look like anything that scatters or drifts.
-            plainly = OF_READINGS if kind == "auto" else kind
-            solution, noise, _ = _settled(every, every, None, plainly, progress)
+            plainly, everything = OF_READINGS if kind == "auto" else kind, np.ones_like(good)
+            solution, noise, _ = _adapted(every, every, everything, plainly, progress, None)
         return solution, noise, good
 
-    solution, noise, good = found(options.noise)
+    solution, noise, good = found(sound, ~faulty, options.noise)
     if options.noise == "auto" and Kind.of(noise.kind).by_visit:
         # What the model lacks looks like scatter of the joints as well.  That is no noise: weights
         # which make light of it let the fit go where poses left out are predicted worse.
         progress("comparing with noise of the readings alone")
-        plain = found(OF_READINGS, NoiseAndOutliers(noise.of_readings(), good))
+        known = NoiseAndOutliers(noise.of_readings(), good)
+        agreed = sound if np.array_equal(good, ~faulty) else every if good.all() else refit(good)
+        plain = found(agreed, good, OF_READINGS, known)
         if _held_out_rms(solution, solution) > WORSE * _held_out_rms(plain[0], solution):
             tests = noise.tests
             solution, noise, good = plain

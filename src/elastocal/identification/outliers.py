@@ -502,8 +502,8 @@ def settle(
 ) -> NoiseAndOutliers:  # fmt: skip
     """Noise and good readings that agree with each other, starting from `good` (default all).
 
-    A kind of noise that is `known` from such readings is only chosen again where those that turn
-    out good are not those that it was chosen from, or have other columns.
+    The search begins with the noise that is `known`, and keeps the kind of noise that it begins
+    with.
 
     The noise model is fitted to the good readings, every reading is judged by the error of its
     prediction from them (false-alarm rate 1 % for the whole table), and so on.  Starting from
@@ -522,8 +522,6 @@ def settle(
     except ElastocalError:
         good = np.ones(len(readings), dtype=bool)  # the others alone do not show all parameters
         noise = estimate_noise(readings, first, like)
-    chosen_from = good if known is None else known.good
-    anew = known is not None and len(known.noise.x) != readings.n_parameters
     own = np.asarray(np.linalg.inv(own_noise(noise.fit, readings)[0]), dtype=np.float64)
     visited = [(_misfit(noise, readings, own), good, noise)]
     for _ in range(ROUNDS):
@@ -547,8 +545,6 @@ def settle(
     if last[0] > best[0] * special.fdtri(half, half, 1 - FALSE_ALARM):
         last = best
     _, good, noise = last
-    if kind == "auto" and (anew or not np.array_equal(good, chosen_from)):
-        noise = estimate_noise(readings.take(good), kind)
     return NoiseAndOutliers(noise, good)
 
 
