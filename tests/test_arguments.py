@@ -47,7 +47,7 @@ def poses(model: ec.Model) -> np.ndarray:
 ABSURD = [10**12, -1.5, float("nan"), 1e300, "", b"x", [], [[]], {}, {1: 2}, object(), 1j, len]
 CALLS: dict[str, Any] = {
     "table": (["q", "force", "position"], lambda m, d, f, **k: m.table(**{"q": d.q[:2]} | k)),
-    "pose": (["q", "x", "force"], lambda m, d, f, **k: m.pose(**{"q": d.q[0]} | k)),
+    "pose": (["q", "x", "load"], lambda m, d, f, **k: m.pose(**{"q": d.q[0]} | k)),
     "predict": (["table", "x"], lambda m, d, f, **k: m.predict(**{"table": d} | k)),
     "B": (["table", "x"], lambda m, d, f, **k: m.B(**{"table": d} | k)),
     "simulate": (

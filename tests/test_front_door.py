@@ -406,6 +406,20 @@ def test_a_load_of_another_shape_is_named(fit):
         fit.position(np.zeros(6), load="down")
 
 
+def test_a_load_is_given_by_either_name(model, fit):
+    """`load`, as an argument; `force`, as the column of a table is called."""
+    q = [0.1, -1.0, 1.0, 0.0, 0.5, 0.2]
+    for call in (model.pose, fit.arm.pose, fit.predict,
+                 lambda q, **given: model.table(q, **given).force,
+                 lambda q, **given: ec.table(q, **given).force):  # fmt: skip
+        assert np.array_equal(call(q, load=LOAD), call(q, force=LOAD))
+        assert call == model.pose or not np.array_equal(call(q, load=LOAD), call(q))
+        with pytest.raises(TypeError, match=r"force|load"):
+            call(q, load=LOAD, force=LOAD)
+    with pytest.raises(ec.InputError, match=r"^`load` takes .* found numbers beyond all measure"):
+        model.pose(q, force=[0, 0, np.nan])
+
+
 def test_targets_of_another_shape_are_refused(fit):
     with pytest.raises(ec.InputError, match=r"`targets` takes positions \(n, 3\)"):
         ec.compensate(fit, [[1.0, 2.0]])

@@ -132,13 +132,15 @@ ALIASES = {
         ("Effort", "Method", "WeightKind", "IntervalKind", "FaultyReadings", "Convention"), "str"
     ),
 }
+# A load is the argument `load`, and in a table its column `force`; each is taken for the other.
+SAME = {"force": "load", "load": "force"}
 SEED = (f"a whole number from 0 to {LARGEST_SEED}, or a numpy Generator", _seed)
 
 
 def checked_arguments(function: F) -> F:
     """The function, whose arguments are checked by its annotations before it runs.
 
-    In place of a `seed` it takes a numpy Generator, of which one is drawn.
+    In place of a `seed` it takes a numpy Generator, of which one is drawn, and what SAME says.
     """
     signature = inspect.signature(function)
     kinds = {
@@ -146,6 +148,8 @@ def checked_arguments(function: F) -> F:
         for name, given in signature.parameters.items()
         if isinstance(given.annotation, str) and name != "self"
     }
+
+    renamed = {o: n for o, n in SAME.items() if n in kinds and o not in kinds}
 
     def check(given: Mapping[str, Any], names: Collection[str]) -> None:
         for name in names:
@@ -162,6 +166,9 @@ def checked_arguments(function: F) -> F:
 
     @functools.wraps(function)
     def run(*args: Any, **kwargs: Any) -> Any:
+        for other, name in renamed.items():
+            if other in kwargs and name not in kwargs:
+                kwargs[name] = kwargs.pop(other)
         for name in kwargs:
             key = f"{function.__name__}.{name}"
             require(key not in GONE, f"{option(name)} is gone: {GONE.get(key)}")

@@ -293,12 +293,19 @@ def _levels(arm: Arm, table: Measurements, joint: str) -> NDArray:
 
 
 def check_loads(load: ArrayLike | None, n: int) -> None:
-    """Raise InputError unless the option `load` has the shape of a force for n poses, or each."""
-    shape = (3,) if load is None else np.shape(load)
-    if shape not in ((3,), (n, 3)):
+    """Raise InputError unless the option `load` is a force for n poses, or one for each."""
+    if load is None:
+        return
+    try:
+        force = np.asarray(load, dtype=float)
+    except (TypeError, ValueError):
+        force = np.zeros(())
+    known = force.shape in ((3,), (n, 3))
+    if not (known and (np.abs(force) <= LARGEST_FORCE).all()):
+        found = "numbers beyond all measure" if known else f"an array of shape {force.shape}"
         raise InputError(
-            f"{option('load')} takes a force (3,) in N, or one for each pose ({n}, 3); found an "
-            f"array of shape {shape}"
+            f"{option('load')} takes a force (3,) in N, or one for each pose ({n}, 3); found "
+            f"{found}"
         )
 
 

@@ -151,7 +151,7 @@ class CalibratedArm(Valued, Saved):
 
     Examples:
         >>> arm = ec.identify("cell.toml", "data.csv").arm
-        >>> arm.pose([0.0, -1.0, 1.0, 0.0, 0.5, 0.0], force=[0, 0, -2600]).shape
+        >>> arm.pose([0.0, -1.0, 1.0, 0.0, 0.5, 0.0], load=[0, 0, -2600]).shape
         (4, 4)
         >>> arm.values["joint3.compliance"]
         4.1...e-07
@@ -174,27 +174,27 @@ class CalibratedArm(Valued, Saved):
         )
 
     @checked_arguments
-    def pose(self, q: ArrayLike, force: ArrayLike | None = None) -> NDArray:
+    def pose(self, q: ArrayLike, load: ArrayLike | None = None) -> NDArray:
         """The flange's pose in the data's frame, deflections included.
 
         Args:
             q: Commanded joints (joints,) or (n, joints), in rad or m.
-            force: Forces (3,) or (n, 3) in N at the load point, in the data's frame; default none.
+            load: Force (3,) or (n, 3) in N at the load point, in the data's frame; default none.
 
         Returns:
             T_tracker_flange (4, 4), or (n, 4, 4) where q has rows; NaN without an equilibrium.
 
         Raises:
-            InputError: A shape does not fit, or an effect needs more than joints and force.
+            InputError: A shape does not fit, or an effect needs more than joints and load.
 
         Examples:
             >>> arm = ec.identify("cell.toml", "data.csv").arm
             >>> q = [0.0, -1.0, 1.0, 0.0, 0.5, 0.0]
-            >>> sag = arm.pose(q, force=[0, 0, -2600])[2, 3] - arm.pose(q)[2, 3]
+            >>> sag = arm.pose(q, load=[0, 0, -2600])[2, 3] - arm.pose(q)[2, 3]
             >>> bool(-0.01 < sag < 0)
             True
         """
-        return self.model.pose(q, self.x, force)
+        return self.model.pose(q, self.x, load)
 
 
 def given_arm(name: str, given: Any) -> CalibratedArm:

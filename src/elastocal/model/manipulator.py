@@ -18,7 +18,7 @@ from elastocal.cell.work_cell import Cell
 from elastocal.errors import InputError, option, require
 from elastocal.measurements import DEFAULT_MARKER, Measurements, read_measurements
 from elastocal.measurements import table as table_of
-from elastocal.model.arm import Parameter, row_inputs
+from elastocal.model.arm import Parameter, check_loads, row_inputs
 from elastocal.model.chain import Chain, numbered, plausible
 from elastocal.model.effects.base import Effect, JointMotion, SmoothFunction, index
 from elastocal.model.effects.catalogue import CATALOGUE, cell_of, effect_of
@@ -212,27 +212,28 @@ class Model:
 
     @checked_arguments
     def pose(
-        self, q: ArrayLike, x: ArrayLike | None = None, force: ArrayLike | None = None
+        self, q: ArrayLike, x: ArrayLike | None = None, load: ArrayLike | None = None
     ) -> NDArray:
         """The flange's pose in the data's frame, T_tracker_flange, deflections included.
 
         Args:
             q: Commanded joints (joints,) or (n, joints), in rad or m.
             x: Parameter values (parameters,) in SI units; default the nominal ones.
-            force: As for `table`.
+            load: Force (3,) or (n, 3) in N at the load point, in the data's frame; default none.
 
         Returns:
             (4, 4), or (n, 4, 4) where q has rows; NaN where there is no static equilibrium.
 
         Raises:
             InputError: A shape does not fit, or an active effect needs more than joints and
-                force (a time, a temperature): then `flange_poses` takes a table.
+                load (a time, a temperature): then `flange_poses` takes a table.
 
         Examples:
             >>> ec.Model("cell.toml").pose([0.0, -1.0, 1.0, 0.0, 0.5, 0.0]).shape
             (4, 4)
         """
-        poses = self.flange_poses(self.table(q, force), self._at(x))
+        check_loads(load, len(np.atleast_2d(q)))
+        poses = self.flange_poses(self.table(q, load), self._at(x))
         return poses[0] if np.ndim(q) == 1 else poses
 
     def with_markers_of(self, *tables: Measurements) -> Model:
