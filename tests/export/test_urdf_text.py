@@ -15,7 +15,7 @@ from support.exports import GEOMETRY, exported, write_result
 from support.robots import KR270, packaged_urdf
 
 from elastocal.errors import InputError
-from elastocal.model.xml_file import XmlText
+from elastocal.model.xml_file import XmlFile
 from elastocal.units import rpy_from_rotation
 
 ODD = """<?xml version='1.0'?>
@@ -33,7 +33,7 @@ ODD = """<?xml version='1.0'?>
 
 def text_of(tmp_path: Path, content: str | bytes):
     data = content if isinstance(content, bytes) else content.encode()
-    return XmlText(tmp_path / "arm.urdf", data)
+    return XmlFile(tmp_path / "arm.urdf", data, "a URDF")
 
 
 def test_an_origin_is_changed_where_it_stands(tmp_path: Path) -> None:

@@ -47,7 +47,7 @@ def test_the_flange_is_where_mujoco_has_it(base, flange, kind, tmp_path):
 
 def test_fingers_leave_the_hand_as_the_flange(tmp_path):
     arm = MjcfArm.read(write_arm(tmp_path))
-    assert arm.end_name == "hand"
+    assert arm.flange == "hand"
     chain = arm.chain
     assert [j.name for j in chain.joints] == ["a1", "a2", "a3", "a4", "joint5"]
     assert chain.kinds == ("revolute", "revolute", "prismatic", "revolute", "revolute")
@@ -86,14 +86,14 @@ REFUSED = {
         ARM.replace('<body name="foot"', '<body name="b5"><joint/></body><body name="foot"'),
         {}, "mass and inertia of moving bodies.*'b5'",
     ),
-    "no arm": ("<mujoco><worldbody/></mujoco>", {}, "no single arm of 4 joints"),
+    "no arm": ("<mujoco><worldbody/></mujoco>", {}, "0 moving joints between"),
     "unknown": (ARM, {"flange": "hend"}, "flange 'hend' is not there.*did you mean 'hand'"),
     "above": (ARM, {"base": "hand", "flange": "l1"}, "'l1' is not below base 'hand'"),
-    "few": (ARM, {"flange": "l3"}, "3 joints between 'world' and 'l3'"),
+    "few": (ARM, {"flange": "l3"}, "3 moving joints between 'world' and 'l3'"),
     "free": (
         ARM.replace('<body name="foot" pos="0.2 -0.1 0.3" euler="30 0 0">',
                     '<body name="foot"><freejoint name="float"/>'),
-        {}, "'float' is free joint between base and flange",
+        {}, "'float' is free and lies between base and flange",
     ),
     "coupled": (ARM.replace('joint1="f1" joint2="f2"', 'joint1="a4" joint2="a2"'), {}, "coupled"),
     "loop": (

@@ -123,13 +123,11 @@ def test_wrong_files_are_explained(tmp_path: Path, capfd, text: str, message: st
 
 
 def test_base_and_flange_names_are_checked(tmp_path: Path) -> None:
-    with pytest.raises(InputError, match=r"base link 'L0' is not there.*links: l0, l1, l2, l3"):
+    with pytest.raises(InputError, match=r"base 'L0' is not there.*links: l0, l1, l2, l3"):
         read(tmp_path, arm(), base="L0")
-    with pytest.raises(InputError, match=r"flange link 'l44' is not there \(did you mean 'l4'"):
+    with pytest.raises(InputError, match=r"flange 'l44' is not there \(did you mean 'l4'"):
         read(tmp_path, arm(), flange="l44")
-    with pytest.raises(
-        InputError, match=r"flange link 'Flansch' .* \(usual here: 'l4'\); links: l0"
-    ):
+    with pytest.raises(InputError, match=r"flange 'Flansch' .* \(usual here: 'l4'\); links: l0"):
         read(tmp_path, arm(), flange="Flansch")
     with pytest.raises(InputError, match=r"flange 'l1' is not below base 'l3'; links.*: l4$"):
         read(tmp_path, arm(), base="l3", flange="l1")

@@ -32,7 +32,6 @@ LOOPS = {
     "by a joint beside": '<joint joint1="jr" joint2="j2"/><joint joint1="jr" joint2="j3"/>',
     "fixed tendon": '<tendon tendon1="t2"/>',
     "two tendons": '<tendon tendon1="tr" tendon2="t3"/><joint joint1="jr" joint2="j2"/>',
-    "spatial tendon": '<tendon tendon1="rope"/>',
     "by a free body": '<weld body1="cup" body2="l3"/><weld body1="cup" body2="l6"/>',
 }
 OPEN = {
@@ -42,6 +41,7 @@ OPEN = {
     "weld to the world": '<weld body1="l6"/>',
     "weld to the base": '<weld body1="l6" body2="base"/>',
     "a held cup": '<weld body1="l6" body2="cup"/>',
+    "a rope to a passive rod": '<tendon tendon1="rope"/>',
     "a passive rod follows": '<joint joint1="jr" joint2="j2"/>',
     "inactive": '<connect site1="rodtip" site2="s3" active="false"/>',
 }

@@ -17,7 +17,6 @@ import numpy as np
 
 from elastocal.errors import ElastocalError, InputError, InsufficientDataError, option
 from elastocal.export import exportable, mjcf_file, rigid_files
-from elastocal.export.elsewhere import moved
 from elastocal.export.exportable import Cost, ExportNumbers, Kept
 from elastocal.export.mjcf_file import HeldArm, MujocoRest, NotInPlace
 from elastocal.export.refit import JointCorrection, Refit, refitted
@@ -430,8 +429,8 @@ def _urdf(calibrated: CalibratedArm, wish: Wish, kept: Kept, pieces: ExportNumbe
     added = wish.frames, wish.base_frame
     if robot.urdf is not None:
         text = rigid_files.calibrated_urdf(robot, pieces, *added, note)
-        text, told = moved(robot.urdf, text, wish.folder)
-        base, flange = check_urdf(robot.urdf).ends(robot.base, robot.flange)
+        text, told = rigid_files.moved(robot.urdf, text, wish.folder)
+        base, flange = check_urdf(robot.urdf).ends(robot.base, robot.flange, choose=False)
     else:
         text = rigid_files.new_urdf(pieces, *added, note)
         base, flange = rigid_files.BASE, rigid_files.FLANGE
@@ -521,7 +520,7 @@ def _corrected(calibrated: CalibratedArm, wish: Wish, kept: Kept, pieces: Export
             "own error would come on top"
         )
     assert cell.robot.mjcf is not None
-    text, told = moved(cell.robot.mjcf, text, wish.folder)
+    text, told = rigid_files.moved(cell.robot.mjcf, text, wish.folder)
     return Written(text, distance, "MuJoCo, at rest under the load", (*warnings, *told))
 
 

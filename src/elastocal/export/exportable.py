@@ -6,7 +6,6 @@ from collections import defaultdict
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
-from xml.etree import ElementTree as ET
 
 import casadi as ca
 import numpy as np
@@ -32,7 +31,7 @@ from elastocal.model.effects.compliances import JointCompliance
 from elastocal.model.effects.placements import link_ends
 from elastocal.model.manipulator import Model
 from elastocal.model.symbolic import SymbolicArm
-from elastocal.model.urdf import urdf_bytes
+from elastocal.model.urdf import urdf_file
 from elastocal.units import Array, rpy_from_rotation
 
 
@@ -321,12 +320,12 @@ def link_inertias(path: Path, chain: Chain) -> tuple[Array, ...]:
     """
     import pinocchio as pin
 
-    root, moving = ET.fromstring(urdf_bytes(path)), {joint.name for joint in chain.joints}
-    for joint in root.iter("joint"):
-        if joint.get("name", "").strip() not in moving:
-            joint.set("type", "fixed")
+    file, moving = urdf_file(path), {joint.name for joint in chain.joints}
+    for joint in file.root.all("joint"):
+        if joint.get("name").strip() not in moving:
+            file.set(joint, {"type": "fixed"})
     try:
-        model = pin.buildModelFromXML(ET.tostring(root, encoding="unicode"))
+        model = pin.buildModelFromXML(file.result().removeprefix("\ufeff"))
     except (ValueError, RuntimeError):
         return ()
     tensors = [np.array(inertia.inertia) for inertia in model.inertias[1:]]

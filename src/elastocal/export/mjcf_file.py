@@ -15,11 +15,13 @@ from elastocal.cell.arm_description import Robot
 from elastocal.errors import ElastocalError, InputError
 from elastocal.export.exportable import ExportNumbers, SpringValue, nothing, numbers, placed_body
 from elastocal.export.rigid_files import PREFIX, tool_frames
+from elastocal.files import read_bytes
 from elastocal.model.chain import Chain, Joint, LinkMass
 from elastocal.model.effects.loads import STANDARD_GRAVITY
 from elastocal.model.effects.placements import transverse_axes
-from elastocal.model.mjcf import SPRING, MjcfArm, import_mujoco, mjcf_bytes, transform
-from elastocal.model.xml_file import Tag, XmlText, comment, element
+from elastocal.model.mjcf import SPRING, MjcfArm, before, import_mujoco, joints_of, local, transform
+from elastocal.model.xml_file import MAX_BYTES, Tag, XmlFile, comment, element
+from elastocal.text import listed
 from elastocal.units import Array
 
 # Each joint is a hinge or slide that a position actuator drives: its control is the commanded
@@ -230,20 +232,17 @@ class MujocoRest:
     """An exported MJCF in MuJoCo.  Raises InputError where MuJoCo is missing or refuses it."""
 
     def __init__(self, text: str) -> None:
-        self._mujoco = mujoco = import_mujoco("the check")
+        mujoco = import_mujoco("the check")
         try:
             self.model = mujoco.MjModel.from_xml_string(text)
         except ValueError as error:
             raise InputError(f"MuJoCo refuses the exported MJCF: {error}") from None
-        self._data = mujoco.MjData(self.model)
         joint, kinds = mujoco.mjtTrn.mjTRN_JOINT, self.model.actuator_trntype
         self._drives = [k for k in range(self.model.nu) if kinds[k] == joint]
-        self._driven = [
-            int(self.model.jnt_dofadr[self.model.actuator_trnid[k, 0]]) for k in self._drives
-        ]
+        self._driven = self.model.actuator_trnid[self._drives, 0]
         stiffness = joint_stiffness(self.model)
         stiffness[self._driven] = self.model.actuator_gainprm[self._drives, 0]
-        self._compliance = 1.0 / stiffness
+        self._rest = Rest(self.model, np.arange(self.model.njnt), stiffness)
 
     def sites(self, q: Array, force: Array, names: Sequence[str]) -> Array:
         """Positions (len(names), 3) in m in the MJCF's world, at rest: commanded to q (n,) under
@@ -255,21 +254,11 @@ class MujocoRest:
         control[self._drives] = q
         for axis, value in zip("xyz", force, strict=True):
             control[self.model.actuator(f"load_{axis}").id] = value
-        self._data.ctrl[:] = control
+        self._rest.data.ctrl[:] = control
         x = np.zeros(self.model.nv)
         x[self._driven] = q
-        settle(self._residual, x, q)
-        return np.array([self._data.site(name).xpos.copy() for name in names])
-
-    def _residual(self, x: Array) -> Array:
-        data = self._data
-        data.qpos[:] = x
-        data.qvel[:] = 0.0
-        self._mujoco.mj_fwdPosition(self.model, data)
-        self._mujoco.mj_fwdVelocity(self.model, data)
-        self._mujoco.mj_fwdActuation(self.model, data)
-        force = data.qfrc_passive + data.qfrc_actuator - data.qfrc_bias
-        return np.asarray(self._compliance * force)
+        self._rest.settle(x, q)
+        return np.array([self._rest.data.site(name).xpos.copy() for name in names])
 
 
 def joint_stiffness(model: Any) -> Array:
@@ -277,14 +266,32 @@ def joint_stiffness(model: Any) -> Array:
     return np.array(model.jnt_stiffness, dtype=float).reshape(model.njnt, -1)[:, 0]
 
 
-def settle(residual: Callable[[Array], Array], x: Array, q: Array) -> None:
-    """Find where `residual` of joints (n,) is zero, from x on, and evaluate it there last.
+class Rest:
+    """A model in MuJoCo in which the `springs`, numbers of joints, yield by their `stiffness`."""
 
-    Raises ElastocalError, which names the commanded q, where there is no such place.
-    """
-    found = root(residual, x, tol=TOLERANCE)
-    if not (np.abs(residual(found.x)) <= AT_REST).all():
-        raise ElastocalError(f"MuJoCo finds no rest of the exported arm near q = {q.tolist()}")
+    def __init__(self, model: Any, springs: Any, stiffness: Array) -> None:
+        self.model, self.data = model, import_mujoco().MjData(model)
+        self._at, self._dofs = model.jnt_qposadr[springs], model.jnt_dofadr[springs]
+        self._compliance = 1.0 / stiffness
+
+    def settle(self, x: Array, q: Array, load: Callable[[], Any] = lambda: 0.0) -> None:
+        """Let the springs come to rest, from x on, under what actuators and `load` make.
+
+        Raises ElastocalError, which names the commanded q, where there is no such place.
+        """
+        mujoco, model, data = import_mujoco(), self.model, self.data
+
+        def residual(x: Array) -> Array:
+            data.qpos[self._at] = x
+            mujoco.mj_fwdPosition(model, data)
+            mujoco.mj_fwdVelocity(model, data)
+            mujoco.mj_fwdActuation(model, data)
+            force = data.qfrc_passive + data.qfrc_actuator + load() - data.qfrc_bias
+            return np.asarray(self._compliance * force[self._dofs])
+
+        found = root(residual, x, tol=TOLERANCE)
+        if not (np.abs(residual(found.x)) <= AT_REST).all():
+            raise ElastocalError(f"MuJoCo finds no rest of the exported arm near q = {q.tolist()}")
 
 
 # The calibrated arm in the user's own MJCF: bodies moved, springs added, masses corrected.
@@ -340,23 +347,24 @@ def corrected_mjcf(
     return text.result(), told
 
 
-class _MjcfText(XmlText):
+class _MjcfText(XmlFile):
     """The text of an MJCF that MuJoCo reads, and what is to be changed in it; `bodies` in MuJoCo's
     order, the world first."""
 
     def __init__(self, arm: MjcfArm, pieces: ExportNumbers) -> None:
-        super().__init__(arm.path, mjcf_bytes(arm.path))
+        path = arm.tree.path
+        super().__init__(path, read_bytes(path, "MuJoCo model", MAX_BYTES), "an MJCF file")
         self.arm, self.model, self.pieces = arm, arm.model, pieces
         below = [tag for tag in self.tags if tag.name == "body" and tag.within("worldbody")]
         self.bodies = [*self.anywhere("worldbody")[:1], *below]
         names = [arm.model.body(i).name for i in range(1, arm.model.nbody)]
-        if [body.stated.get("name", "") for body in below] != names:
+        if [body.get("name") for body in below] != names:
             raise NotInPlace(
                 "its bodies do not all stand in the file itself (<include>, <replicate>, <attach>)"
             )
-        for b in arm.way(arm.flange):
+        for b in arm.model.jnt_bodyid[arm.joints]:
             if len(self.joints(b)) != arm.model.body_jntnum[b]:
-                raise NotInPlace(f"joints of body '{arm.model.body(b).name}' stand in a <frame>")
+                raise NotInPlace(f"joints of body '{arm.bodies[b]}' stand in a <frame>")
 
     def joints(self, body: int) -> list[Tag]:
         return self.bodies[body].all("joint", "freejoint")
@@ -374,11 +382,11 @@ class _MjcfText(XmlText):
     def move(self, body: int, error: Array) -> None:
         """T ← T · error for the body's own attributes, whatever frames stand around it, and in
         MuJoCo's model of the file."""
-        tag, own = self.bodies[body], self.arm.local(body)
+        tag, own = self.bodies[body], local(self.model, body)
         if tag.above is not None and tag.above.name == "frame":
             own = self.stated(tag)
         self.place(tag, own @ error)
-        for name, value in _pose(self.arm.local(body) @ error).items():
+        for name, value in _pose(local(self.model, body) @ error).items():
             getattr(self.model, f"body_{name}")[body] = np.array(value.split(), dtype=float)
 
     def stated(self, tag: Tag) -> Array:
@@ -395,19 +403,19 @@ class _MjcfText(XmlText):
         if nothing(correction := self.pieces.correction(i)):
             return
         body = int(self.model.jnt_bodyid[j])
-        if self.arm.joints_of(body)[0] != j:
+        if joints_of(self.model, body)[0] != j:
+            name = self.pieces.chain.joints[i].name
             raise NotInPlace(
-                f"joint '{self.arm.joint_name(j)}' shares its body with another; give it a body of "
-                "its own"
+                f"joint '{name}' shares its body with another; give it a body of its own"
             )
-        X = self.arm.before(j)
+        X = before(self.model, j)
         self.move(body, X @ correction @ np.linalg.inv(X))
 
     def add_springs(self, i: int, j: int) -> int:
         """Put the springs between link i and joint i before the joint; returns how many."""
         pieces, model = self.pieces, self.model
-        before = pieces.springs_at(f"link{i}" if i else "base")
-        springs = [*before, *pieces.springs_at(f"joint{i + 1}")]
+        proximal = pieces.springs_at(f"link{i}" if i else "base")
+        springs = [*proximal, *pieces.springs_at(f"joint{i + 1}")]
         body = int(model.jnt_bodyid[j])
         first = int(model.body_jntadr[body])
         tags = self.joints(body)
@@ -416,12 +424,12 @@ class _MjcfText(XmlText):
             self.remove(tags[k - first])
         if old and not springs:
             raise NotInPlace("springs of an earlier export would be lost")
-        count = len(self.arm.joints_of(body)) + len(springs)
+        count = len(joints_of(model, body)) + len(springs)
         if springs and count > MOST_JOINTS:
             told = f"{count} joints would stand on one body, and MuJoCo takes {MOST_JOINTS}"
             raise NotInPlace(told)
         # The springs' frame in that of the moved body: before the joint turns by its offset.
-        F = self.arm.before(j) @ np.linalg.inv(pieces.offset_motion(i))
+        F = before(model, j) @ np.linalg.inv(pieces.offset_motion(i))
         base = F if i else F @ np.linalg.inv(pieces.placement(0))  # the base's frame there
         placed = [(s, base if s.site == "base" else F) for s in springs]
         joints = (element("joint", spring_joint(SPRING, *one) | WITHOUT_DEFAULTS) for one in placed)
@@ -450,7 +458,7 @@ class _MjcfText(XmlText):
         if not self.pieces.masses:
             return told
         # Gravity along the vertical that was identified, where the file has another.
-        up = self.arm.placed(self.arm.base)[:3, :3] @ self.pieces.T_tracker_base[:3, :3].T
+        up = self.arm.tree.placed(self.arm.base)[:3, :3] @ self.pieces.T_tracker_base[:3, :3].T
         wanted = up @ [0.0, 0.0, -STANDARD_GRAVITY]
         if np.abs(self.model.opt.gravity - wanted).max() >= SMALLEST:
             self.set_in(self.tags[0], "option", {"gravity": numbers(wanted)})
@@ -458,7 +466,7 @@ class _MjcfText(XmlText):
         for b in (held := self.arm.weightless()):
             self.set(self.bodies[b], {"gravcomp": "0"})
         if held:
-            names = self.arm.named(held)
+            names = listed((self.arm.bodies[b] for b in held), 4)
             told.append(f"gravcomp of {names} is 0 in this file, so that weights bend the springs")
         return told
 
@@ -481,22 +489,22 @@ class _MjcfText(XmlText):
     def correct_flange(self, frames: bool) -> list[str]:
         arm, pieces = self.arm, self.pieces
         error = pieces.error(pieces.chain.n_joints - 1)
-        body, told, T = arm.flange, [], np.eye(4)
-        sites = {tag.stated.get("name", ""): tag for tag in self.bodies[body].all("site")}
+        body, told, T = arm.flange_body, [], np.eye(4)
+        sites = {tag.get("name"): tag for tag in self.bodies[body].all("site")}
         extra: dict[str, Array] = {}
-        if arm.site is not None:
+        if arm.flange_is_site:
             T = arm.flange_in_body @ error
             if not nothing(error):
-                if arm.end_name not in sites:
-                    raise NotInPlace(f"site '{arm.end_name}' stands in a <frame>")
-                self.place(sites[arm.end_name], T)
+                if arm.flange not in sites:
+                    raise NotInPlace(f"site '{arm.flange}' stands in a <frame>")
+                self.place(sites[arm.flange], T)
         elif not nothing(error) and arm.model.body_jntnum[body] == 0:
             self.move(body, error)
         elif not nothing(error):
             T, extra = error, {FLANGE: error}
             told.append(
                 f"the flange is the body that the last joint moves: the calibrated one is site "
-                f"'{FLANGE}', and what hangs on '{arm.end_name}' stays where it was"
+                f"'{FLANGE}', and what hangs on '{arm.flange}' stays where it was"
             )
         tool = tool_frames(pieces) if frames else {}
         for name, place in (extra | {n: T @ P for n, P in tool.items()}).items():
@@ -513,7 +521,9 @@ class _MjcfText(XmlText):
         model = self.model
         told = [tag.stated.get("inertiafromgeom") for tag in self.anywhere("compiler")]
         from_geoms = "true" in [value for value in told if value][-1:]
-        masses = zip(self.arm.joints, self.arm.masses(), self.pieces.masses, strict=False)
+        masses = zip(
+            self.arm.joints, self.arm.anew().chain.masses, self.pieces.masses, strict=False
+        )
         for j, old, new in masses:
             mass = new.mass - old.mass
             moment = new.mass * new.com - old.mass * old.com
@@ -557,19 +567,17 @@ class HeldArm:
             model.opt.gravity[:] = 0.0
         # No contacts are sought: nothing touches a spring.
         model.opt.disableflags |= int(self._mujoco.mjtDisableBit.mjDSBL_CONSTRAINT)
-        self._data = self._mujoco.MjData(model)
         springs = [j for j in range(model.njnt) if model.joint(j).name.startswith(SPRING)]
-        self._moved = model.jnt_qposadr[springs]
-        self._turned = model.jnt_dofadr[springs]
+        self._springs = len(springs)
+        self._rest = Rest(model, springs, joint_stiffness(model)[springs])
         self._held = model.jnt_qposadr[arm.joints]
-        self._compliance = 1.0 / joint_stiffness(model)[springs]
-        self.T_world_base = arm.placed(arm.base)
+        self.T_world_base = arm.tree.placed(arm.base)
 
     def __call__(self, q: Array, force: Array) -> Array:
         """Positions (k, 3) of `pieces.points` in the file's world: commanded to q (n,), under
         `force` (3,) N in the tracker's axes.  Raises ElastocalError where no rest is found."""
-        model, data, mujoco = self._arm.model, self._data, self._mujoco
-        pieces, flange = self._pieces, self._arm.flange
+        model, data, mujoco = self._arm.model, self._rest.data, self._mujoco
+        pieces, flange = self._pieces, self._arm.flange_body
         R = self.T_world_base[:3, :3] @ pieces.T_tracker_base[:3, :3].T
         load = pieces.load_scale * R @ force
         data.qpos[:] = model.qpos0
@@ -579,15 +587,10 @@ class HeldArm:
             T = transform(data.xpos[flange], data.xquat[flange]) @ self._arm.flange_in_body
             return np.asarray(points @ T[:3, :3].T + T[:3, 3])
 
-        def residual(x: Array) -> Array:
-            data.qpos[self._moved] = x
-            mujoco.mj_fwdPosition(model, data)
-            mujoco.mj_fwdVelocity(model, data)
-            applied = np.zeros(model.nv)
-            at = placed(pieces.load_point)
-            mujoco.mj_applyFT(model, data, load, np.zeros(3), at, flange, applied)
-            acting = data.qfrc_passive + applied - data.qfrc_bias
-            return np.asarray(self._compliance * acting[self._turned])
+        def applied() -> Array:
+            found, at = np.zeros(model.nv), placed(pieces.load_point)
+            mujoco.mj_applyFT(model, data, load, np.zeros(3), at, flange, found)
+            return found
 
-        settle(residual, np.zeros(len(self._compliance)), q)
+        self._rest.settle(np.zeros(self._springs), q, applied)
         return placed(pieces.points)

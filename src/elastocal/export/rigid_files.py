@@ -3,8 +3,10 @@
 from __future__ import annotations
 
 import math
+import os
 from collections.abc import Sequence
 from dataclasses import astuple, dataclass, replace
+from pathlib import Path
 from typing import Literal
 
 import numpy as np
@@ -16,8 +18,9 @@ from elastocal.model import dh
 from elastocal.model.chain import Chain, Joint, LinkMass
 from elastocal.model.dh import UR_ENDINGS
 from elastocal.model.effects.placements import transverse_axes
-from elastocal.model.urdf import Tree, check_urdf, urdf_bytes
-from elastocal.model.xml_file import Tag, XmlText, comment, element
+from elastocal.model.mjcf import parsed
+from elastocal.model.urdf import tree_of, urdf_file
+from elastocal.model.xml_file import Tag, XmlFile, comment, element
 from elastocal.tables import csv_text
 from elastocal.units import Array
 
@@ -45,32 +48,28 @@ def calibrated_urdf(
     Raises InputError where the file has a link or joint of such a name that is none of these.
     """
     assert robot.urdf is not None
-    tree = check_urdf(robot.urdf)
-    base, flange = tree.ends(robot.base, robot.flange)
-    text = _UrdfText(tree)
-    added = [comment(note)]
-    for i, joint in enumerate(tree.serial_chain(base, flange)):
+    text = _UrdfText(urdf_file(robot.urdf))
+    base, flange = text.tree.ends(robot.base, robot.flange, choose=False)
+    for i, joint in enumerate(text.tree.serial_chain(base, flange)):
         if not nothing(correction := pieces.correction(i)):
             text.place(joint.name, joint.origin @ correction)
-    added += _correct_flange(tree, text, pieces, flange)
+    lines = [comment(note), *text.correct_flange(pieces, flange)]
     if tool:
         for name, T in tool_frames(pieces).items():
-            added += text.fixed(name, flange, name, T)
+            lines += text.fixed(name, flange, name, T)
     if base_frame:
-        added += _tracker_frame(tree, text, pieces, base)
-    text.insert(text.end, "".join(f"  {line}\n" for line in added))
-    return text.result()
+        lines += text.tracker_frame(pieces, base)
+    text.file.insert(text.file.end, "".join(f"  {line}\n" for line in lines))
+    return text.file.result()
 
 
-class _UrdfText(XmlText):
-    def __init__(self, tree: Tree) -> None:
-        super().__init__(tree.path, urdf_bytes(tree.path))
-        self.tree = tree
-        joints = self.tags[0].all("joint")
-        self.joints: dict[str, Tag] = {tag.stated["name"].strip(): tag for tag in joints}
+class _UrdfText:
+    def __init__(self, file: XmlFile) -> None:
+        self.file, self.tree = file, tree_of(file)
+        self._joints = {tag.get("name").strip(): tag for tag in file.root.all("joint")}
 
     def place(self, joint: str, T: Array) -> None:
-        self.set_in(self.joints[joint], "origin", origin_attributes(T))
+        self.file.set_in(self._joints[joint], "origin", origin_attributes(T))
 
     def fixed(self, new: str, parent: str, child: str, T: Array) -> list[str]:
         """Lines of link `new` and the fixed joint parent → child, one of which is `new`.
@@ -78,7 +77,7 @@ class _UrdfText(XmlText):
         A frame of an earlier export is moved instead.
         """
         tree, name = self.tree, f"{new}_joint"
-        old = tree.joints.get(name)
+        old = next((joint for joint in tree.joints if joint.name == name), None)
         if old is not None and (old.kind, old.parent, old.child) == ("fixed", parent, child):
             self.place(name, T)
             return []
@@ -90,19 +89,31 @@ class _UrdfText(XmlText):
             )
         return fixed_link(new, parent, child, T)
 
+    def correct_flange(self, pieces: ExportNumbers, flange: str) -> list[str]:
+        error = pieces.error(pieces.chain.n_joints - 1)
+        if nothing(error):
+            return []
+        last = self.tree.parent_joint[flange]
+        if last.kind == "fixed":
+            self.place(last.name, last.origin @ error)
+            return []
+        # The flange is the link that the last joint moves: a link in between takes the correction.
+        self.file.set_in(self._joints[last.name], "child", {"link": MOUNT})
+        return self.fixed(MOUNT, MOUNT, flange, error)
 
-def _tracker_frame(tree: Tree, text: _UrdfText, pieces: ExportNumbers, base: str) -> list[str]:
-    if base == TRACKER:
-        raise InputError(
-            f"{tree.path}: the cell's base is {TRACKER}, the tracker's frame of an earlier export; "
-            "name the robot's own base link as [robot] base"
-        )
-    T = pieces.T_tracker_base @ np.linalg.inv(tree.placed(tree.root, base))
-    if tree.root != TRACKER:
-        return text.fixed(TRACKER, TRACKER, tree.root, T)
-    below = next(joint for joint in tree.joints.values() if joint.parent == TRACKER)
-    text.place(below.name, T @ below.origin)
-    return []
+    def tracker_frame(self, pieces: ExportNumbers, base: str) -> list[str]:
+        tree = self.tree
+        if base == TRACKER:
+            raise InputError(
+                f"{tree.path}: the cell's base is {TRACKER}, the tracker's frame of an earlier "
+                "export; name the robot's own base link as [robot] base"
+            )
+        T = pieces.T_tracker_base @ np.linalg.inv(tree.placed(base))
+        if tree.root != TRACKER:
+            return self.fixed(TRACKER, TRACKER, tree.root, T)
+        below = next(joint for joint in tree.joints if joint.parent == TRACKER)
+        self.place(below.name, T @ below.origin)
+        return []
 
 
 def tool_frames(pieces: ExportNumbers) -> dict[str, Array]:
@@ -126,19 +137,6 @@ def fixed_link(new: str, parent: str, child: str, T: Array) -> list[str]:
         element("link", {"name": new}),
         element("joint", joint, *ends, element("origin", origin_attributes(T))),
     ]
-
-
-def _correct_flange(tree: Tree, text: _UrdfText, pieces: ExportNumbers, flange: str) -> list[str]:
-    error = pieces.error(pieces.chain.n_joints - 1)
-    if nothing(error):
-        return []
-    last = tree.parent_joint[flange]
-    if last.kind == "fixed":
-        text.place(last.name, last.origin @ error)
-        return []
-    # The flange is the link that the last joint moves: a link in between takes the correction.
-    text.set_in(text.joints[last.name], "child", {"link": MOUNT})
-    return text.fixed(MOUNT, MOUNT, flange, error)
 
 
 # A URDF for an arm that has none: a robot described by a DH table or a MuJoCo model.
@@ -200,6 +198,63 @@ def _joint(joint: Joint, parent: str, child: str) -> list[str]:
 def _nested(tag: str, stated: dict[str, str], lines: Sequence[str]) -> list[str]:
     head, end = element(tag, stated, "|").split("|")
     return [head, *(f"  {line}" for line in lines), end]
+
+
+# The user's own file, of either kind, written into another folder: its meshes are found from there.
+
+# Files that MuJoCo looks for beside the main file, whatever directories the compiler states.
+BESIDE = ("include", "model")
+
+
+def moved(path: Path, text: str, folder: Path | None) -> tuple[str, list[str]]:
+    """The `text` of a file that lies at `path`, to be written into `folder`, and what to know.
+
+    A file without names of others, or that stays where it was, is as before to the byte.
+    """
+    xml = XmlFile(path, text.encode("utf-8"), "a file")
+    named = [tag for tag in xml.tags if any(_is_file(tag, key) for key in tag.stated)]
+    if not named:
+        return text, []
+    home, there = path.parent.resolve(), path.parent if folder is None else folder
+    beside = [tag for tag in named if tag.name in BESIDE]
+    if there.resolve() != home:
+        if beside:
+            return text, [f"copy it beside {path.name}: the files that it includes are there"]
+        if xml.root.name == "mujoco":
+            _set_directories(xml, path, there.resolve())
+        for tag in (tag for tag in named if "filename" in tag.stated):
+            place = home / tag.stated["filename"]
+            if place.is_file():  # others are found in packages
+                xml.set(tag, {"filename": _from(there.resolve(), place)})
+    told = "meshes and other files are named relative to the file: to have it elsewhere, export it"
+    return xml.result(), [f"{told} there"]
+
+
+def _is_file(tag: Tag, key: str) -> bool:
+    name = tag.stated[key]
+    if key == "filename":  # of a URDF
+        relative = "://" not in name and not Path(name).is_absolute()
+        return tag.name in ("mesh", "texture") and relative
+    return key.startswith("file") and bool(name)
+
+
+def _set_directories(xml: XmlFile, path: Path, folder: Path) -> None:
+    """Let the last <compiler> name the directories of meshes and textures from `folder`."""
+    stated = parsed(path).compiler
+    places = {key: _from(folder, path.parent.resolve() / (getattr(stated, key) or ""))
+              for key in ("meshdir", "texturedir")}  # fmt: skip
+    compilers = [tag for tag in xml.tags if tag.name == "compiler"]
+    if compilers:
+        xml.set(compilers[-1], places)
+    else:
+        xml.insert_in(xml.root, f"\n  {element('compiler', places)}")
+
+
+def _from(folder: Path, place: Path) -> str:
+    try:
+        return Path(os.path.relpath(place, folder)).as_posix()
+    except ValueError:  # on another drive
+        return place.as_posix()
 
 
 # The written file as others read it: pinocchio's own reader on all of the text, not elastocal's.

@@ -27,8 +27,7 @@ from elastocal.model.effects.placements import BaseFrame, LinkGeometry, MarkerPo
 from elastocal.model.manipulator import load_chain
 from elastocal.model.mjcf import MjcfArm
 from elastocal.model.rigid import nominal_flanges, reach_of, suitable_load
-from elastocal.model.urdf import MOVING, check_urdf
-from elastocal.model.xml_file import xacro_left
+from elastocal.model.urdf import check_urdf, xacro_left
 from elastocal.text import listed, printable
 from elastocal.units import Array, rpy_from_rotation
 
@@ -132,12 +131,10 @@ def robot_of(
         f"{option('convention')} is for DH tables; leave it out for {path}",
     )
     if kind == "urdf":
-        tree = check_urdf(path)
-        base = tree.root if base is None else tree.find_link("base", base, tree.root)
-        return Robot.from_urdf(path, base, flange or tree.last_link(base))
+        return Robot.from_urdf(path, *check_urdf(path).ends(base, flange or None))
     arm = MjcfArm.read(path, base, flange)
     found = (site for site in FLANGE_SITES if flange is None and site in arm.sites())
-    return Robot.from_mjcf(path, base, next(found, arm.end_name) or None)
+    return Robot.from_mjcf(path, base, next(found, arm.flange))
 
 
 def first_cell(robot: Robot, folder: str | Path = ".") -> str:
@@ -173,7 +170,7 @@ def notes_of(robot: Robot, chain: Chain) -> list[str]:
     moved = ""
     if robot.urdf is not None and robot.flange is not None:
         last = check_urdf(robot.urdf).parent_joint[robot.flange]
-        moved = robot.flange if last.kind in MOVING else ""
+        moved = robot.flange if last.moves else ""
     return found + jaw_told(chain, moved)
 
 
@@ -181,12 +178,12 @@ def _mount(robot: Robot, arm: MjcfArm | None) -> tuple[Array, str]:
     """Rotation (3, 3) of the base in a frame whose z is up, as the file has it, and who says so."""
     if arm is not None:
         up, told = arm.upright()
-        return up @ arm.placed(arm.base)[:3, :3], told
+        return up @ arm.tree.placed(arm.base)[:3, :3], told
     if robot.urdf is None:
         return np.eye(3), "guess: the base stands upright"
     tree = check_urdf(robot.urdf)
     base = tree.root if robot.base is None else robot.base
-    return tree.placed(tree.root, base)[:3, :3], f"of '{base}' in the file's '{tree.root}', z up"
+    return tree.placed(base)[:3, :3], f"of '{base}' in the file's '{tree.root}', z up"
 
 
 def loaded_joints(chain: Chain, turned: Array) -> list[int]:

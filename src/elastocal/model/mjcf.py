@@ -1,4 +1,4 @@
-"""MuJoCo model (MJCF) → nominal chain: what MuJoCo's own compiler makes of the file.
+"""MuJoCo model (MJCF) → the links and joints of a robot: what MuJoCo's own compiler makes of it.
 
 The compiler resolves angles, defaults, frames and included files; here only bodies, joints, sites
 and masses are taken from it.  Meshes are loaded where a mass follows from one, and nowhere else.
@@ -6,40 +6,34 @@ With T_b the frame of body b in its parent's, p, a and r position, axis and `ref
 
     T_parent_body(q) = T_b Π_j Trans(p_j) J(a_j, q_j − r_j) Trans(−p_j)
 
-which is a chain whose joint frames are T_b … Trans(p_j) J(a_j, −r_j).
+so that X_j = Trans(p_j) J(a_j, −r_j) is the frame of joint j at zero in its body's.  Behind each
+joint stands a link without mass, and the body on the last one.
 """
 
 from __future__ import annotations
 
+import copy
 import math
 import re
 import warnings
-from collections.abc import Hashable, Iterable, Iterator, Sequence
-from contextlib import contextmanager
-from dataclasses import dataclass
+from collections.abc import Iterable, Sequence
+from dataclasses import dataclass, replace
 from functools import cached_property
 from pathlib import Path
-from typing import Any, TypeVar
+from typing import Any
 
 import casadi as ca
 import numpy as np
+from scipy.linalg import null_space
 
 from elastocal.errors import InputError, require
-from elastocal.files import read_bytes
 from elastocal.model import rigid
-from elastocal.model.chain import (
-    MAX_JOINTS,
-    MIN_JOINTS,
-    Chain,
-    Joint,
-    JointKind,
-    LinkMass,
-    check_angles,
-)
+from elastocal.model.chain import Chain, JointKind, LinkMass, check_angles
 from elastocal.model.effects.loads import STANDARD_GRAVITY
-from elastocal.model.urdf import MOST_IN_A_FINGER
-from elastocal.model.xml_file import MAX_BYTES, as_utf8, check_bounds, xml_tree
-from elastocal.text import did_you_mean, listed, printable
+from elastocal.model.mjcf_bounds import check_bounds
+from elastocal.model.robot_tree import FileJoint, Tree
+from elastocal.model.xml_file import XmlFile
+from elastocal.text import listed, printable
 from elastocal.units import Array
 
 WORLD = 0  # MuJoCo's number of the world body
@@ -53,32 +47,28 @@ SMALLEST_GRAVITY = 1e-3  # m/s²; below it there is none
 def read_mjcf(path: str | Path, base: str | None = None, flange: str | None = None) -> Chain:
     """The serial chain of a MuJoCo model from the frame of `base` to that of `flange`.
 
-    base: a body, default the world; flange: a body or a site, default as of `MjcfArm.read`.
-    Placements in m, unit axes, limits in rad or m (infinite where a joint has none); one mass per
-    joint in kg of all that it carries, side branches and what lies beyond the flange included,
-    with its centre in the joint's frame.  There are none where the file leaves them to meshes
-    that are not there.
+    base: a body, default the world; flange: a body or a site, default as of `MjcfArm.read`.  There
+    are no masses where the file leaves them to meshes that are not there.
     """
     return MjcfArm.read(path, base, flange).chain
 
 
 @dataclass(frozen=True)
 class MjcfArm:
-    """A compiled MuJoCo model and the way through it from `base` to `flange`.
+    """A compiled MuJoCo model, its links and joints, and the names of base and flange.
 
-    `base`: number of a body.  `flange`: number of the body that is the flange, or has the site
-    `site` that is (None: the body).  `unweighed`: bodies whose masses meshes that are not there
-    would state.  `notes`: what MuJoCo and the reader say of the file.
+    `bodies`: names of links by the number of the body, which for one without a name is
+    "body 5".  `unweighed`: numbers of those whose masses meshes that are not there would state.
+    `told`: what MuJoCo and the reader say of the file.
     """
 
-    path: Path
-    name: str
     model: Any
-    base: int
-    flange: int
-    site: int | None
-    unweighed: frozenset[int] = frozenset()
-    notes: tuple[str, ...] = ()
+    tree: Tree
+    base: str
+    flange: str
+    bodies: tuple[str, ...]
+    unweighed: frozenset[int]
+    told: tuple[str, ...]
 
     @classmethod
     def read(
@@ -90,186 +80,99 @@ class MjcfArm:
     ) -> MjcfArm:
         """The arm of an MJCF file, or of a `text` that is to stand in its place.
 
-        Without `flange` it is the body from which on the bodies with the most joints branch off,
-        as fingers do from a hand.  Raises InputError where MuJoCo is not installed or cannot read
-        the file, where a name is unknown or a choice open, and where the joints on the way are
-        none that a chain has.
+        Without `flange` it is `Tree.last_link`.  Raises InputError where MuJoCo is not installed or
+        cannot read the file, where a name is unknown or a choice open, and where the joints on the
+        way are none that a chain has.
         """
         path = Path(path)
-        data = mjcf_bytes(path) if text is None else text.encode("utf-8")
-        root = xml_tree(path, data, "an MJCF file")
-        if text is None and (path.suffix.lower() != ".xml" or as_utf8(path, data) != data):
-            # MuJoCo's reader takes .xml in UTF-8 alone.
-            text = as_utf8(path, data).decode("utf-8-sig")
-        hint = '; this is a URDF, give it as urdf = "…"' if root.tag == "robot" else ""
+        if text is None:
+            file = mjcf_file(path)
+            if path.suffix.lower() != ".xml" or file.data != path.read_bytes():
+                # MuJoCo's reader takes .xml in UTF-8 alone.
+                text = file.data.decode("utf-8-sig")
+        else:
+            file = XmlFile(path, text.encode("utf-8"), "an MJCF file")
+        root = file.root.name
+        hint = '; this is a URDF, give it as urdf = "…"' if root == "robot" else ""
         require(
-            root.tag == "mujoco",
-            f"{path}: the root element is <{printable(root.tag)}>, an MJCF file has <mujoco>{hint}",
+            root == "mujoco",
+            f"{path}: the root element is <{printable(root)}>, an MJCF file has <mujoco>{hint}",
         )
-        check_bounds(path, data)
+        check_bounds(file)
         spec = parsed(path, text)
         _check_units(path, spec)
-        ties = ties_of(spec)
-        model, unweighed, notes = _compiled(path, spec)
-        names = {model.body(i).name: i for i in range(model.nbody) if model.body(i).name}
-        start = WORLD if base is None else _find(path, "base body", base, names)
-        if flange is None:
-            arm = cls(path, spec.modelname or path.stem, model, start, start, None)
-            end, site = arm._last_body(), None
-        else:
-            sites = {model.site(i).name: i for i in range(model.nsite) if model.site(i).name}
-            found = _find(path, "flange", flange, names | {n: -1 for n in sites if n not in names})
-            site = sites[flange] if found < 0 else None
-            end = found if site is None else int(model.site_bodyid[site])
-        arm = cls(
-            path, spec.modelname or path.stem, model, start, end, site, unweighed, tuple(notes)
-        )
-        arm._check()
-        check_open(arm, ties)
+        model, unweighed, told = _compiled(path, spec)
+        bodies = tuple(model.body(b).name or f"body {b}" for b in range(model.nbody))
+        tree = _tree(path, spec.modelname or path.stem, model, bodies, unweighed)
+        ends = tree.ends(base, flange)
+        arm = cls(model, tree, *ends, bodies, unweighed, tuple(told))
+        arm.check_open()
         return arm
 
-    def way(self, body: int) -> list[int]:
-        """Bodies from below the base to `body`; none where it is not below the base."""
-        found: list[int] = []
-        while body != self.base:
-            if body == WORLD:
-                return []
-            found.append(body)
-            body = int(self.model.body_parentid[body])
-        return found[::-1]
-
-    def joints_of(self, body: int) -> list[int]:
-        """The joints of a body in their order, without springs of an earlier export."""
-        first = int(self.model.body_jntadr[body])
-        own = range(first, first + int(self.model.body_jntnum[body]))
-        return [j for j in own if not self.model.joint(j).name.startswith(SPRING)]
+    def anew(self) -> MjcfArm:
+        """The same with what is now in `model`."""
+        tree = _tree(self.tree.path, self.tree.name, self.model, self.bodies, self.unweighed)
+        return replace(self, tree=tree)
 
     @cached_property
-    def joints(self) -> list[int]:
-        return [j for body in self.way(self.flange) for j in self.joints_of(body)]
+    def moving(self) -> tuple[FileJoint, ...]:
+        return self.tree.serial_chain(self.base, self.flange)
 
     @property
-    def end_name(self) -> str:
-        if self.site is not None:
-            return str(self.model.site(self.site).name)
-        return str(self.model.body(self.flange).name)
-
-    def joint_name(self, j: int) -> str:
-        """A joint's name, joint1 … in the order of the chain where the file gives none."""
-        return self.model.joint(j).name or f"joint{self.joints.index(j) + 1}"
-
-    def named(self, bodies: Iterable[int]) -> str:
-        return listed((self.model.body(b).name or f"body {b}" for b in bodies), 4)
-
-    def weightless(self) -> list[int]:
-        """Moved bodies whose weight `gravcomp` of the file carries."""
-        bodies = range(1, self.model.nbody)
-        return [b for b in bodies if self.carrier(b) is not None and self.model.body_gravcomp[b]]
-
-    def local(self, body: int) -> Array:
-        """T_parent_body (4, 4) with all joints at `ref`."""
-        return transform(self.model.body_pos[body], self.model.body_quat[body])
-
-    def placed(self, body: int) -> Array:
-        """T_world_body (4, 4) with all joints at `ref`."""
-        return self._world()[body]
-
-    def before(self, j: int) -> Array:
-        """X (4, 4): the chain's frame of joint j in its body's, Trans(p) J(a, −r)."""
-        kind, axis = self._kind(j), np.array(self.model.jnt_axis[j])
-        ref = float(self.model.qpos0[self.model.jnt_qposadr[j]])
-        turned = ca.DM(rigid.joint_motion(kind, axis, -ref)).full()
-        return np.asarray(shift(self.model.jnt_pos[j]) @ turned)
+    def joints(self) -> list[int]:
+        return [joint.number for joint in self.moving]
 
     @cached_property
-    def chain(self) -> Chain:
-        joints: list[Joint] = []
-        T = np.eye(4)
-        for body in self.way(self.flange):
-            T = T @ self.local(body)
-            for j in self.joints_of(body):
-                lower, upper = self._limits(j)
-                axis = np.array(self.model.jnt_axis[j])
-                placement = T @ self.before(j)
-                joints.append(
-                    Joint(self.joint_name(j), self._kind(j), placement, axis, lower, upper)
-                )
-                T = shift(-self.model.jnt_pos[j])
-        masses = self.masses()
-        notes = (*self.notes, *(self._weights_told() if masses else ()))
-        return Chain(self.name, tuple(joints), T @ self.flange_in_body, masses, notes)
+    def _carriers(self) -> dict[str, tuple[int, Array]]:
+        return self.tree.carriers(self.moving)
+
+    @property
+    def flange_body(self) -> int:
+        """The body that is the flange or has the site that is."""
+        return self.bodies.index(self.tree.link_of(self.flange)[0])
+
+    @property
+    def flange_is_site(self) -> bool:
+        return self.flange in self.tree.frames
 
     @property
     def flange_in_body(self) -> Array:
-        """T_body_flange (4, 4): of a site its place in its body."""
-        if self.site is None:
-            return np.eye(4)
-        return transform(self.model.site_pos[self.site], self.model.site_quat[self.site])
+        """T_body_flange (4, 4)."""
+        return self.tree.link_of(self.flange)[1]
+
+    def weightless(self) -> list[int]:
+        """Moved bodies whose weight `gravcomp` of the file carries."""
+        moved = (b for b, name in enumerate(self.bodies) if name in self._carriers)
+        return [b for b in moved if self.model.body_gravcomp[b]]
+
+    @cached_property
+    def chain(self) -> Chain:
+        found = self.tree.chain(self.base, self.flange)
+        way = self.tree.joints_between(self.base, self.flange) or ()
+        if any(self.bodies[b] in {joint.child for joint in way} for b in self.unweighed):
+            found = replace(found, masses=())
+        told = self._weights_told() if found.masses else ()
+        return replace(found, notes=(*self.told, *told))
 
     def sites(self) -> dict[str, Array]:
         """Name → place (3,) in m in the flange frame of every site that moves with the flange."""
-        world = self._world()
-        T = world[self.flange] @ self.flange_in_body
-        found = {}
-        for i in range(self.model.nsite):
-            body, name = int(self.model.site_bodyid[i]), self.model.site(i).name
-            if i != self.site and name and self.carrier(body) == self.joints[-1]:
-                place = world[body] @ [*self.model.site_pos[i], 1.0]
-                found[name] = np.linalg.solve(T, place)[:3]
-        return found
+        last = len(self.moving) - 1
 
-    def _kind(self, j: int) -> JointKind:
-        import mujoco
+        def place(link: str, T: Array) -> Array:
+            return np.asarray(self._carriers[link][1] @ T)
 
-        slides = self.model.jnt_type[j] == mujoco.mjtJoint.mjJNT_SLIDE
-        return "prismatic" if slides else "revolute"
-
-    def _limits(self, j: int) -> tuple[float, float]:
-        if not self.model.jnt_limited[j]:
-            return -np.inf, np.inf
-        lower, upper = map(float, self.model.jnt_range[j])
-        return lower, upper
-
-    def _world(self) -> list[Array]:
-        """`placed` for every body."""
-        found = [np.eye(4)]
-        for body in range(1, self.model.nbody):
-            found.append(found[int(self.model.body_parentid[body])] @ self.local(body))
-        return found
-
-    def carrier(self, body: int) -> int | None:
-        """The last joint of the chain that moves a body, None where none does."""
-        while body != WORLD:
-            own = [j for j in self.joints_of(body) if j in self.joints]
-            if own:
-                return own[-1]
-            body = int(self.model.body_parentid[body])
-        return None
-
-    def masses(self) -> tuple[LinkMass, ...]:
-        """What each joint carries, in its frame; none where meshes that are not there would state
-        the mass of a body between base and flange."""
-        if self.unweighed.intersection(self.way(self.flange)):
-            return ()
-        world = self._world()
-        mass, moment = dict.fromkeys(self.joints, 0.0), dict.fromkeys(self.joints, np.zeros(3))
-        for body in range(1, self.model.nbody):
-            if body not in self.unweighed and (j := self.carrier(body)) is not None:
-                m = float(self.model.body_mass[body])
-                place = world[body] @ [*self.model.body_ipos[body], 1.0]
-                frame = world[int(self.model.jnt_bodyid[j])] @ shift(self.model.jnt_pos[j])
-                mass[j] += m
-                moment[j] = moment[j] + m * np.linalg.solve(frame, place)[:3]
-        if not any(mass.values()):
-            return ()
-        both = [(mass[j], moment[j]) for j in self.joints]
-        return tuple(LinkMass(m, s / m if m > 0 else np.zeros(3)) for m, s in both)
+        end = place(*self.tree.link_of(self.flange))
+        return {
+            name: np.asarray(np.linalg.solve(end, place(link, T))[:3, 3])
+            for name, (link, T) in self.tree.frames.items()
+            if name != self.flange and self._carriers.get(link, (-1,))[0] == last
+        }
 
     def upright(self) -> tuple[Array, str]:
         """Rotation (3, 3) of the file's world that turns its gravity down, and who says so."""
         gravity = np.array(self.model.opt.gravity)
         size = float(np.linalg.norm(gravity))
-        base = f"body '{self.model.body(self.base).name}'"
+        base = f"body '{self.base}'"
         if size < SMALLEST_GRAVITY:
             return np.eye(3), "guess: the file has no gravity; its z is taken as up"
         up = -gravity / size
@@ -291,76 +194,148 @@ class MjcfArm:
                 f"{STANDARD_GRAVITY:.4g} m/s²"
             )
         if held := self.weightless():
-            names = self.named(held)
+            names = listed((self.bodies[b] for b in held), 4)
             found.append(
                 f"gravcomp of the file carries the weight of {names}: in MuJoCo nothing sags "
                 "there, while link_gravity = true bends the joints"
             )
         return found
 
-    def _last_body(self) -> int:
-        """The last body that all bodies with the most joints on their way have in common."""
-        model = self.model
-        ways = [self.way(body) for body in range(1, model.nbody)]
-        counts = [sum(len(self.joints_of(b)) for b in way) for way in ways]
-        most = max(counts, default=0)
-        leaves = [w for w, n in zip(ways, counts, strict=True) if n == most and w]
-        # A body that others go on from is on their ways and decides nothing.
-        inner = {b for way in leaves for b in way[:-1]}
-        ends = [way for way in leaves if way[-1] not in inner] if most else []
-        common = [b for b in (ends[0] if ends else []) if all(b in way for way in ends)]
-        moved = sum(len(self.joints_of(b)) for b in common)
-        if moved < MIN_JOINTS:
-            most_of = [model.body(way[-1]).name or f"body {way[-1]}" for way in ends]
-            have = "have" if len(most_of) > 1 else "has"
-            told = f"; {listed(most_of)} {have} the most joints" if most_of else ""
-            raise InputError(
-                f"{self.path}: no single arm of {MIN_JOINTS} joints or more is found below "
-                f"'{model.body(self.base).name}'{told}. Name base and flange, a body or a site"
-            )
-        # Fingers of unequal length, as a thumb has: no body is common to those with most joints.
-        for body in common[:-1]:
-            after = sum(len(self.joints_of(b)) for b in common[common.index(body) + 1 :])
-            beside = {way[way.index(body) + 1] for way in ways if body in way[:-1]} - {*common}
-            fingers = [b for b in beside if any(b in w and n > moved - after
-                       for w, n in zip(ways, counts, strict=True))]  # fmt: skip
-            if moved - after >= MIN_JOINTS and 0 < after <= MOST_IN_A_FINGER and len(fingers) > 1:
-                return body
-        return common[-1]
+    def check_open(self) -> None:
+        """Raise InputError, naming joints and constraints, where <equality> of the file makes
+        joints of the arm depend on each other: a chain of independent joints is read from it.
 
-    def _check(self) -> None:
-        """Raise InputError unless the way is one of 4 to 9 hinges and slides of their own."""
+        J of all constraints has columns of the arm's joints and of others, as those of free bodies
+        and passive rods.  With N the left null space of J_others, N J_arm is what no motion of
+        these makes good: zero where the arm is an open chain.
+        """
         import mujoco
 
-        base, end = self.model.body(self.base).name, self.end_name
-        way = self.way(self.flange)
-        require(
-            bool(way),
-            f"{self.path}: flange '{end}' is not below base '{base}'; name a body that carries it, "
-            "or leave base out for the world",
+        model, own = copy.copy(self.model), self.model.jnt_dofadr[self.joints]
+        model.opt.jacobian = mujoco.mjtJacobian.mjJAC_DENSE
+        data = mujoco.MjData(model)
+        mujoco.mj_fwdPosition(model, data)
+        rows = data.efc_type == mujoco.mjtConstraint.mjCNSTR_EQUALITY
+        rows &= ~np.isin(data.efc_id, [e for e in range(model.neq) if self._drags(e)])
+        J, which = data.efc_J.reshape(-1, model.nv)[rows], data.efc_id[rows]
+        springs = [j for j in range(model.njnt) if model.joint(j).name.startswith(SPRING)]
+        others = np.delete(J, [*own, *model.jnt_dofadr[springs]], axis=1)
+        N = null_space(np.hstack([others, np.zeros((len(J), 1))]).T).T if len(J) else J[:0, :0]
+        left = N @ J[:, own] if len(J) else np.zeros((0, len(own)))
+        if np.abs(left).max(initial=0.0) < BOUND:
+            return
+        names = [joint.name for joint in self.chain.joints]
+        tied = [repr(names[k]) for k in np.flatnonzero(np.abs(left).max(axis=0) >= BOUND)]
+        weight = np.abs(N[np.abs(left).max(axis=1) >= BOUND]).max(axis=0)
+        told = listed(_constraint(model, e) for e in dict.fromkeys(which[weight >= BOUND]))
+        raise InputError(
+            f"{self.tree.path}: joint{'s' * (len(tied) > 1)} {listed(tied)} "
+            f"{'are' if len(tied) > 1 else 'is'} bound by {told}; coupled joints and closed loops "
+            "are not supported between base and flange, remove the constraint or choose another "
+            "flange"
         )
-        for j in self.joints:
-            where = f"{self.path}: joint '{self.joint_name(j)}'"
-            kind = mujoco.mjtJoint(int(self.model.jnt_type[j]))
-            simple = kind in (mujoco.mjtJoint.mjJNT_HINGE, mujoco.mjtJoint.mjJNT_SLIDE)
-            word = "free" if kind == mujoco.mjtJoint.mjJNT_FREE else "a ball"
-            require(
-                simple,
-                f"{where} is {word} joint between base and flange; only hinges and slides can be, "
-                "name a base below it",
-            )
-            lower, upper = self._limits(j)
-            require(
-                lower < upper,
-                f"{where}: range {lower:g} {upper:g} leaves no room to move; correct it",
-            )
-        names = [self.joint_name(j) for j in self.joints]
-        require(
-            MIN_JOINTS <= len(names) <= MAX_JOINTS,
-            f"{self.path}: {len(names)} joints between '{base}' and '{end}' "
-            f"({listed(names) or 'none'}); {MIN_JOINTS} to {MAX_JOINTS} are supported, name base "
-            "and flange accordingly",
-        )
+
+    def _drags(self, e: int) -> bool:
+        """Whether a constraint holds what the last joint carries, or any body, to where people
+        drag it: a mocap body, and by a weld the world."""
+        import mujoco
+
+        model, kinds = self.model, mujoco.mjtEq
+        kind = kinds(int(model.eq_type[e]))
+        if kind not in (kinds.mjEQ_CONNECT, kinds.mjEQ_WELD):
+            return False
+        ends = [int(model.eq_obj1id[e]), int(model.eq_obj2id[e])]
+        if model.eq_objtype[e] == mujoco.mjtObj.mjOBJ_SITE:
+            ends = [int(model.site_bodyid[site]) for site in ends]
+        last = [self._carriers.get(self.bodies[b], (-1,))[0] == len(self.joints) - 1 for b in ends]
+        still = [model.body_weldid[b] == WORLD for b in ends]
+        held = (last[0] and still[1]) or (last[1] and still[0])
+        dragged = any(model.body_mocapid[b] >= 0 for b in ends)
+        return dragged or (held and kind == kinds.mjEQ_WELD)
+
+
+BOUND = 1e-6  # of m or rad per rad or m; what is less is rounding
+
+
+def _constraint(model: Any, e: int) -> str:
+    """ "<equality><weld> 'name' of body 'a' and body 'b'"."""
+    import mujoco
+
+    kind = mujoco.mjtEq(int(model.eq_type[e])).name.removeprefix("mjEQ_").lower()
+    sites = model.eq_objtype[e] == mujoco.mjtObj.mjOBJ_SITE
+    what = kind if kind in ("joint", "tendon") else "site" if sites else "body"
+    names = [getattr(model, what)(int(i)).name for i in (model.eq_obj1id[e], model.eq_obj2id[e])
+             if i >= 0]  # fmt: skip
+    own = f" '{name}'" if (name := model.equality(e).name) else ""
+    return f"<equality><{kind}>{own} of {' and '.join(f'{what} {name!r}' for name in names)}"
+
+
+def _tree(
+    path: Path, name: str, model: Any, bodies: Sequence[str], unweighed: Iterable[int]
+) -> Tree:
+    """The links of all bodies and the joints between them, without springs of an export."""
+    links = {bodies[WORLD]: LinkMass(0.0, np.zeros(3))}
+    joints = []
+    for b in range(1, model.nbody):
+        parent, T = bodies[int(model.body_parentid[b])], local(model, b)
+        for j in joints_of(model, b):
+            child = f"{bodies[b]} after joint {j}"
+            links[child] = LinkMass(0.0, np.zeros(3))
+            joints.append(_joint(model, j, parent, child, T))
+            parent, T = child, shift(-model.jnt_pos[j])
+        joints.append(FileJoint("", "fixed", parent, bodies[b], T, np.zeros(3)))
+        mass = 0.0 if b in unweighed else float(model.body_mass[b])
+        links[bodies[b]] = LinkMass(mass, np.array(model.body_ipos[b]))
+    frames = {
+        site: (bodies[model.site_bodyid[i]], transform(model.site_pos[i], model.site_quat[i]))
+        for i in range(model.nsite)
+        if (site := model.site(i).name) and site not in links
+    }
+    return Tree(path, name, links, tuple(joints), "bodies and sites", frames)
+
+
+def _joint(model: Any, j: int, parent: str, child: str, T: Array) -> FileJoint:
+    import mujoco
+
+    kinds = mujoco.mjtJoint
+    own = kinds(int(model.jnt_type[j]))
+    kind = {kinds.mjJNT_FREE: "free", kinds.mjJNT_BALL: "a ball joint"}.get(own)
+    if kind is not None:
+        return FileJoint(model.joint(j).name, kind, parent, child, T, np.zeros(3), number=j)
+    lower, upper = map(float, model.jnt_range[j] if model.jnt_limited[j] else (-np.inf, np.inf))
+    return FileJoint(
+        model.joint(j).name, motion_of(model, j), parent, child, T @ before(model, j),
+        np.array(model.jnt_axis[j]), (lower, upper), rest=_ref(model, j), number=j,
+    )  # fmt: skip
+
+
+def motion_of(model: Any, j: int) -> JointKind:
+    import mujoco
+
+    slides = model.jnt_type[j] == mujoco.mjtJoint.mjJNT_SLIDE
+    return "prismatic" if slides else "revolute"
+
+
+def joints_of(model: Any, body: int) -> list[int]:
+    """The joints of a body in their order, without springs of an earlier export."""
+    first = int(model.body_jntadr[body])
+    own = range(first, first + int(model.body_jntnum[body]))
+    return [j for j in own if not model.joint(j).name.startswith(SPRING)]
+
+
+def local(model: Any, body: int) -> Array:
+    """T_parent_body (4, 4) with all joints at `ref`."""
+    return transform(model.body_pos[body], model.body_quat[body])
+
+
+def before(model: Any, j: int) -> Array:
+    """X (4, 4): the frame of joint j at zero in its body's, Trans(p) J(a, −r)."""
+    turned = rigid.joint_motion(motion_of(model, j), model.jnt_axis[j], -_ref(model, j))
+    return np.asarray(shift(model.jnt_pos[j]) @ ca.DM(turned).full())
+
+
+def _ref(model: Any, j: int) -> float:
+    return float(model.qpos0[model.jnt_qposadr[j]])
 
 
 def transform(position: Sequence[float] | Array, quaternion: Sequence[float] | Array) -> Array:
@@ -388,42 +363,32 @@ def import_mujoco(what: str = "a MuJoCo model") -> Any:
     return mujoco
 
 
-def mjcf_bytes(path: Path) -> bytes:
-    """The content of an MJCF file.  Raises InputError where it cannot be read or is too large."""
-    return read_bytes(path, "MuJoCo model", MAX_BYTES)
+def mjcf_file(path: Path) -> XmlFile:
+    return XmlFile.read(path, "MuJoCo model", "an MJCF file")
 
 
 def parsed(path: Path, text: str | None = None) -> Any:
     """MuJoCo's MjSpec of a file, or of a `text` that is to stand in its place."""
     mujoco = import_mujoco()
-    with _quiet(), _refusals(path):
-        if text is None:
-            return mujoco.MjSpec.from_file(str(path))
-        names = re.findall(r"""<include\s[^>]*?file\s*=\s*["']([^"']+)["']""", text)
-        inside = {n: mjcf_bytes(path.parent / n) for n in names if (path.parent / n).is_file()}
-        spec = mujoco.MjSpec.from_string(text, include=inside)
-        spec.modelfiledir = f"{path.parent}/"
-        return spec
-
-
-@contextmanager
-def _refusals(path: Path) -> Iterator[None]:
     try:
-        yield
+        with warnings.catch_warnings():
+            warnings.simplefilter("ignore")
+            if text is None:
+                return mujoco.MjSpec.from_file(str(path))
+            names = re.findall(r"""<include\s[^>]*?file\s*=\s*["']([^"']+)["']""", text)
+            named = {name: path.parent / name for name in names}
+            inside = {name: each.read_bytes() for name, each in named.items() if each.is_file()}
+            spec = mujoco.MjSpec.from_string(text, include=inside)
+            spec.modelfiledir = f"{path.parent}/"
+            return spec
     except ValueError as error:
         raise InputError(f"{path}: MuJoCo cannot read it: {_sentence(error)}") from None
 
 
-@contextmanager
-def _quiet() -> Iterator[list[warnings.WarningMessage]]:
-    with warnings.catch_warnings(record=True) as found:
-        warnings.simplefilter("always")
-        yield found
-
-
 def compiled(spec: Any) -> tuple[Any, list[str]]:
     """MuJoCo's model of a spec, and its warnings.  Raises ValueError as it does."""
-    with _quiet() as found:
+    with warnings.catch_warnings(record=True) as found:
+        warnings.simplefilter("always")
         model = spec.compile()
     return model, [f"MuJoCo warns: {str(one.message).splitlines()[0]}" for one in found]
 
@@ -505,14 +470,24 @@ def _missing_meshes(path: Path, spec: Any) -> dict[str, str]:
 
 
 def strip(spec: Any, geoms: Iterable[Any]) -> None:
-    """Take out geoms, and all that frames and masses do without."""
+    """Take out geoms, and all that frames, masses and constraints between joints do without."""
+    import mujoco
+
+    eq = mujoco.mjtEq
+    ties = [one for one in spec.equalities if one.type == eq.mjEQ_TENDON]
+    tied = {name for one in ties for name in (one.name1, one.name2)}
+    kept = (eq.mjEQ_CONNECT, eq.mjEQ_WELD, eq.mjEQ_JOINT, eq.mjEQ_TENDON)
+    for one in [e for e in spec.equalities if e.type not in kept]:
+        spec.delete(one)
+    for tendon in [t for t in spec.tendons if t.name not in tied]:
+        spec.delete(tendon)
     for geom in geoms:
         spec.delete(geom)
     for one in (*spec.geoms, *spec.sites):
         one.material = ""
     meshes = {geom.meshname for geom in spec.geoms}
     for kind in (
-        "keys", "sensors", "actuators", "tendons", "equalities", "pairs", "excludes", "tuples",
+        "keys", "sensors", "actuators", "pairs", "excludes", "tuples",
         "skins", "flexes", "materials", "textures",
     ):  # fmt: skip
         for one in list(getattr(spec, kind)):
@@ -520,153 +495,3 @@ def strip(spec: Any, geoms: Iterable[Any]) -> None:
     for mesh in list(spec.meshes):
         if mesh.name not in meshes:
             spec.delete(mesh)
-
-
-def _find(path: Path, role: str, name: str, there: dict[str, int]) -> int:
-    require(
-        name in there,
-        f"{path}: {role} '{name}' is not there{did_you_mean(name, there)}; there are "
-        f"{listed(there)}",
-    )
-    return there[name]
-
-
-# Closed loops: <equality> that ties joints of the arm to each other.
-#
-# A chain of independent joints is read from the file, so none of them may depend on another.
-# Bodies that constraints tie, directly or over bodies that float (<freejoint>, mocap), have to be
-# carried by the same joint of the arm: otherwise those between are part of a loop.  Constraints on
-# joint values (joint, fixed tendon) take one degree of freedom each: they bind the arm where a
-# group of joints has more of them than joints beside the arm.
-
-Tied = TypeVar("Tied", bound=Hashable)
-
-
-@dataclass(frozen=True)
-class Tie:
-    """A constraint: pairs of `ends`, each (body or site, name), or the `joints` that it ties."""
-
-    kind: str
-    name: str
-    ends: tuple[tuple[tuple[str, str], tuple[str, str]], ...] = ()
-    joints: tuple[str, ...] = ()
-
-    def __str__(self) -> str:
-        tied = listed(f"'{name}'" for name in self.joints) or " and ".join(
-            dict.fromkeys(f"{k} '{name or 'world'}'" for pair in self.ends for k, name in pair)
-        )
-        name = f" '{self.name}'" if self.name else ""
-        return f"<equality><{self.kind}>{name} of {tied}"
-
-
-def ties_of(spec: Any) -> list[Tie]:
-    """The active constraints of a file, from MuJoCo's MjSpec of it."""
-    import mujoco
-
-    eq, found = mujoco.mjtEq, []
-    tendons = {tendon.name: tendon for tendon in spec.tendons}
-    for one in spec.equalities:
-        names = [name for name in (one.name1, one.name2) if name]
-        if not one.active:
-            continue
-        if one.type in (eq.mjEQ_CONNECT, eq.mjEQ_WELD):
-            kind = "connect" if one.type == eq.mjEQ_CONNECT else "weld"
-            what = "site" if one.objtype == mujoco.mjtObj.mjOBJ_SITE else "body"
-            found.append(Tie(kind, one.name, (((what, one.name1), (what, one.name2)),)))
-        elif one.type == eq.mjEQ_JOINT:
-            found.append(Tie("joint", one.name, joints=tuple(names)))
-        elif one.type == eq.mjEQ_TENDON:
-            found += _of_tendons(one.name, [tendons[name] for name in names])
-    return found
-
-
-def _of_tendons(name: str, tendons: list[Any]) -> list[Tie]:
-    """A tendon over joints ties these, one between sites their bodies."""
-    import mujoco
-
-    joints, ends = [], []
-    for tendon in tendons:
-        before = ""
-        for wrap in getattr(tendon, "path", ()):
-            if wrap.type == mujoco.mjtWrap.mjWRAP_JOINT:
-                joints.append(wrap.target.name)
-            elif wrap.type == mujoco.mjtWrap.mjWRAP_SITE:
-                if before:
-                    ends.append((("site", before), ("site", wrap.target.name)))
-                before = wrap.target.name
-    ties = [Tie("tendon", name, joints=tuple(joints))] if joints else []
-    return ties + ([Tie("tendon", name, ends=tuple(ends))] if ends else [])
-
-
-def check_open(arm: Any, ties: list[Tie]) -> None:
-    """Raise InputError, naming constraint and joints, where an `MjcfArm` is no open chain.
-
-    A weld of what the last joint carries to the world or to a mocap body is no loop of the arm's:
-    people drag the flange by it.
-    """
-    _check_values(arm, [tie for tie in ties if tie.joints])
-    free, order = _floating(arm), {None: -1} | {j: k for k, j in enumerate(arm.joints)}
-    tied = ((pair, tie) for tie in ties for pair in _bodies(arm, tie))
-    for bodies, members in _groups(tied):
-        carriers = {order[arm.carrier(body)] for body in bodies - free}
-        if len(carriers) > 1:
-            joint = arm.joint_name(arm.joints[min(carriers) + 1])
-            raise InputError(
-                f"{arm.path}: joint '{joint}' is part of a closed loop, by "
-                f"{listed(map(str, dict.fromkeys(members)))}; loops are not supported between base "
-                "and flange, remove the constraint or choose another flange"
-            )
-
-
-def _groups(ties: Iterable[tuple[Iterable[Tied], Tie]]) -> list[tuple[set[Tied], list[Tie]]]:
-    """What constraints tie to each other, with the constraints that do."""
-    groups: list[tuple[set[Tied], list[Tie]]] = []
-    for what, tie in ties:
-        names, members = set(what), [tie]
-        for other in [g for g in groups if g[0] & names]:
-            groups.remove(other)
-            names, members = names | other[0], other[1] + members
-        groups.append((names, members))
-    return groups
-
-
-def _check_values(arm: Any, ties: list[Tie]) -> None:
-    own = {arm.model.joint(j).name for j in arm.joints} - {""}
-    for names, members in _groups((tie.joints, tie) for tie in ties):
-        # joint1 of <joint> follows joint2, as a mimic does in a URDF.
-        follows = [tie for tie in members if tie.kind == "joint" and tie.joints[0] in own]
-        bound = names & own and len(members) > len(names - own)
-        coupled, several = sorted(names & own), len(names & own) > 1
-        require(
-            not follows and not bound,
-            f"{arm.path}: joint{'s' * several} {listed(map(repr, coupled))} "
-            f"{'are' if several else 'is'} coupled by "
-            f"{listed(map(str, follows or members))}; coupled joints are not supported between "
-            "base and flange, remove the constraint or choose another flange",
-        )
-
-
-def _bodies(arm: Any, tie: Tie) -> list[tuple[int, int]]:
-    """The pairs of bodies that a constraint ties, without those that leave the arm open."""
-    model, found = arm.model, []
-    for ends in tie.ends:
-        a, b = (
-            WORLD if not name
-            else int(model.site_bodyid[model.site(name).id]) if kind == "site"
-            else int(model.body(name).id)
-            for kind, name in ends
-        )  # fmt: skip
-        at_end = [arm.carrier(body) == arm.joints[-1] for body in (a, b)]
-        still = [model.body_weldid[body] == WORLD for body in (a, b)]
-        dragged = (at_end[0] and still[1]) or (at_end[1] and still[0])
-        if not (tie.kind == "weld" and dragged):
-            found.append((a, b))
-    return found
-
-
-def _floating(arm: Any) -> set[int]:
-    import mujoco
-
-    model, free = arm.model, mujoco.mjtJoint.mjJNT_FREE
-    loose = {int(model.jnt_bodyid[j]) for j in range(model.njnt) if model.jnt_type[j] == free}
-    return loose | {b for b in range(model.nbody) if model.body_mocapid[b] >= 0}

@@ -7,141 +7,21 @@ white space.  Here a parser only says where the start tags stand; the text betwe
 from __future__ import annotations
 
 import codecs
-import math
-import os
 import re
-import struct
-import xml.etree.ElementTree as ET
-from collections.abc import Collection, Iterator, Mapping
+from collections.abc import Collection, Mapping
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import Any
 from xml.parsers import expat
 from xml.sax.saxutils import quoteattr
 
 from elastocal.errors import InputError, require
-from elastocal.files import DEEPEST, check_regular, check_size, open_input, read_bytes
-from elastocal.text import SHOWN, printable, quoted
+from elastocal.files import DEEPEST, read_bytes
+from elastocal.text import SHOWN, printable
 
 MAX_BYTES = 10_000_000
 UTF16 = (codecs.BOM_UTF16_LE, codecs.BOM_UTF16_BE)
 DECLARATION = re.compile(r"""(<\?xml[^>]*?\bencoding\s*=\s*)("[^"]*"|'[^']*')""")
 END_OF_TAG = re.compile(rb"""(?:[^"'>]|"[^"]*"|'[^']*')*>""")  # a > in quotes is none
-
-
-def xml_tree(path: Path, data: bytes, what: str) -> ET.Element:
-    """The elements of an XML file; `what` it should be ("a URDF") stands in messages."""
-    start = data[:300].lstrip(b"\xef\xbb\xbf \t\r\n").lower()
-    require(
-        not start.startswith(b"version https://git-lfs"),
-        f"{path}: is a pointer of Git LFS, not {what}; run git lfs pull, or download the file",
-    )
-    require(
-        not start.startswith((b"<!doctype html", b"<html")),
-        f"{path}: is a web page, not {what}; download the file itself (on GitHub: Raw)",
-    )
-    try:
-        return ET.fromstring(data, ET.XMLParser(target=_Bounded(path, what)))
-    except ET.ParseError as error:
-        if "unbound prefix" in str(error) and b"<xacro:" in data:
-            raise InputError(xacro_left(path, "<xacro:…> elements")) from None
-        line, column = error.position
-        reason = (
-            _around(data)
-            or _undeclared(data)
-            or (
-                f"{str(error).split(': line')[0]} in line {line}, column {column + 1}; {what} is "
-                "an XML file"
-            )
-        )
-        raise InputError(f"{path}: not XML: {reason}") from None
-    except (LookupError, ValueError) as error:
-        raise InputError(f"{path}: not XML: {error}; save it as UTF-8") from None
-
-
-def _around(data: bytes) -> str:
-    """What to say of text before or after the elements, "" where there is none."""
-    head = re.search(rb"<\?xml\b|<(?:robot|mujoco)\b", data)
-    before = data[: head.start()].removeprefix(b"\xef\xbb\xbf") if head else b""
-    if before.strip() or (before and head is not None and head[0] == b"<?xml"):
-        first = printable(before.strip().decode("utf-8", "replace").partition("\n")[0][:SHOWN])
-        told = f"'{first}' stands" if first else "blanks stand"
-        return f"{told} before {'<?xml …?>' if head and head[0] == b'<?xml' else 'it'}; remove that"
-    tail = re.search(rb"</(?:robot|mujoco)\s*>", data)
-    after = data[tail.end() :] if tail else b""
-    if re.sub(rb"<!--.*?-->", b"", after, flags=re.DOTALL).strip():
-        first = printable(after.strip().decode("utf-8", "replace").partition("\n")[0][:SHOWN])
-        return f"'{first}' stands after the end of the robot; remove that"
-    return ""
-
-
-def _undeclared(data: bytes) -> str:
-    """What to say of bytes that are no UTF-8 in a file that declares no encoding, else ""."""
-    if data.startswith(UTF16) or DECLARATION.search(data[:200].decode("ascii", "replace")):
-        return ""
-    try:
-        data.decode("utf-8")
-    except UnicodeDecodeError as error:
-        line = data.count(b"\n", 0, error.start) + 1
-        return (
-            f"line {line} has the byte 0x{data[error.start]:02x}, which is not UTF-8, and no "
-            'encoding is declared; save it as UTF-8, or declare it: <?xml version="1.0" '
-            'encoding="latin-1"?>'
-        )
-    return ""
-
-
-def as_utf8(path: Path, data: bytes) -> bytes:
-    """An XML file's content as UTF-8, its declaration with it."""
-    if data.startswith(UTF16):
-        name = "utf-16"
-    else:
-        declared = DECLARATION.search(data[:200].decode("ascii", "replace"))
-        name = declared.group(2).strip("\"'") if declared else "utf-8"
-    if name.lower() in ("utf-8", "utf8"):
-        return data
-    try:
-        text = data.decode(name)
-    except (LookupError, UnicodeDecodeError) as error:
-        raise InputError(f"{path}: cannot be read as {name} ({error}); save it as UTF-8") from None
-    return DECLARATION.sub(r'\g<1>"UTF-8"', text, count=1).encode("utf-8")
-
-
-class _Bounded(ET.TreeBuilder):
-    """The tree of a file that nests no deeper than a robot does and declares no entities.
-
-    A parser that calls itself, as those of other libraries do, would end with the stack.
-    """
-
-    def __init__(self, path: Path, what: str) -> None:
-        super().__init__()
-        self._path, self._what, self._depth = path, what, 0
-
-    def start(self, tag: Any, attributes: Any) -> Any:
-        self._depth += 1
-        require(
-            self._depth <= DEEPEST,
-            f"{self._path}: <{printable(tag)}> is nested more than {DEEPEST} deep, which no robot "
-            "needs",
-        )
-        return super().start(tag, attributes)
-
-    def end(self, tag: str) -> Any:
-        self._depth -= 1
-        return super().end(tag)
-
-    def doctype(self, name: str, public: str | None, system: str | None) -> None:
-        """Raise InputError: entities may stand for more text than memory holds."""
-        raise InputError(f"{self._path}: has a <!DOCTYPE>, which {self._what} does not; remove it")
-
-
-def xacro_left(path: Path, what: str) -> str:
-    """The message that `what` of the file shows that it is still to be expanded."""
-    plain = path.name.removesuffix(".xacro")
-    plain = plain if plain.endswith(".urdf") and plain != path.name else "expanded.urdf"
-    return (
-        f"{path}: xacro macros are left in ({what}); run xacro first: xacro {path.name} > {plain}"
-    )
 
 
 @dataclass(eq=False)
@@ -150,10 +30,14 @@ class Tag:
     stand in it and the one that it stands in."""
 
     name: str
+    prefix: str
     start: int
     stated: dict[str, str]
     above: Tag | None
     inside: list[Tag] = field(default_factory=list)
+
+    def get(self, key: str, default: str = "") -> str:
+        return self.stated.get(key, default)
 
     def all(self, *names: str) -> list[Tag]:
         return [tag for tag in self.inside if tag.name in names]
@@ -166,25 +50,55 @@ class Tag:
         return self.above is not None and (self.above.name == name or self.above.within(name))
 
 
-class XmlText:
-    """The text of an XML file that is known to be right, and the edits to make in it.
+class XmlFile:
+    """The tags of an XML file, and the edits to make in its text.
 
-    `tags` in the order of the file, the root first; `end`: where the root's end tag starts.
+    `tags` in the order of the file, the root first; `end`: where the root's end tag starts.  `what`
+    it should be ("a URDF") stands in messages.  It nests no deeper than a robot does and declares
+    no entities, which may stand for more text than memory holds.
     """
 
-    def __init__(self, path: Path, data: bytes) -> None:
+    def __init__(self, path: Path, data: bytes, what: str) -> None:
+        start = data[:300].lstrip(b"\xef\xbb\xbf \t\r\n").lower()
+        require(
+            not start.startswith(b"version https://git-lfs"),
+            f"{path}: is a pointer of Git LFS, not {what}; run git lfs pull, or download the file",
+        )
+        require(
+            not start.startswith((b"<!doctype html", b"<html")),
+            f"{path}: is a web page, not {what}; download the file itself (on GitHub: Raw)",
+        )
+        self.path, self.what = path, what
         # A carriage return by itself ends a line in XML, and is a control character elsewhere.
         self.data = re.sub(rb"\r(?!\n)", b"\n", as_utf8(path, data))
         self.tags: list[Tag] = []
         self.end = len(self.data)
         self._inserted: list[tuple[int, int, bytes]] = []
         self._changed: dict[int, dict[str, str | None]] = {}
-        parser = expat.ParserCreate()
+        self._parse()
+
+    @classmethod
+    def read(cls, path: Path, file: str, what: str) -> XmlFile:
+        """The file of that path; `file` it is called where it cannot be read or is too large."""
+        return cls(path, read_bytes(path, file, MAX_BYTES), what)
+
+    @property
+    def root(self) -> Tag:
+        return self.tags[0]
+
+    def _parse(self) -> None:
+        parser = expat.ParserCreate("utf-8")
         open_: list[Tag] = []
 
         def start(name: str, stated: dict[str, str]) -> None:
+            require(
+                len(open_) < DEEPEST,
+                f"{self.path}: <{printable(name)}> is nested more than {DEEPEST} deep, which no "
+                "robot needs",
+            )
+            prefix, _, bare = name.rpartition(":")
             above = open_[-1] if open_ else None
-            tag = Tag(name.rpartition(":")[2], parser.CurrentByteIndex, stated, above)
+            tag = Tag(bare, prefix, parser.CurrentByteIndex, stated, above)
             self.tags.append(tag)
             open_.append(tag)
             if above is not None:
@@ -195,8 +109,22 @@ class XmlText:
             if not open_:
                 self.end = parser.CurrentByteIndex
 
+        def doctype(*_: object) -> None:
+            raise InputError(
+                f"{self.path}: has a <!DOCTYPE>, which {self.what} does not; remove it"
+            )
+
         parser.StartElementHandler, parser.EndElementHandler = start, end
-        parser.Parse(self.data, True)
+        parser.StartDoctypeDeclHandler = doctype
+        try:
+            parser.Parse(self.data, True)
+        except expat.ExpatError as error:
+            told = str(error).partition(": line")[0]
+            reason = _around(self.data) or _undeclared(self.data) or (
+                f"{told} in line {error.lineno}, column {error.offset + 1}; {self.what} is an XML "
+                "file"
+            )  # fmt: skip
+            raise InputError(f"{self.path}: not XML: {reason}") from None
 
     def insert(self, at: int, text: str) -> None:
         """Put text at an offset, behind what was put there before."""
@@ -261,173 +189,45 @@ def comment(text: str) -> str:
     return f"<!-- {text.replace('--', '- -').rstrip('-')} -->"
 
 
-# What an MJCF file asks of MuJoCo, counted before MuJoCo sees it.
-# DOC
-
-# A humanoid with hands and keyframes has 1500.  MuJoCo's compiler takes 1 s for so many bodies with
-# free joints; its time grows with their square, and that of 20 000 is beyond a minute.
-MOST_ELEMENTS = 5000
-MOST_MESH_BYTES = 100_000_000  # of a file
-MOST_FILES_BYTES = 300_000_000  # of all, each as often as it is named
-MOST_CELLS = 1_000_000  # of all height fields
-VERTEX_BYTES = 50  # of a mesh file, at least
-# The largest numbers of attributes that MuJoCo sets memory aside by.
-LARGEST: dict[str, dict[str, float]] = {
-    "size": {"nuserdata": 1e6, "nkey": 1e3, "njmax": 1e6, "nconmax": 1e6, "nstack": 1e8,
-             "memory": 4e9} | {f"nuser_{kind}": 1e3 for kind in
-             ("body", "jnt", "geom", "site", "cam", "tendon", "actuator", "sensor")},
-    "numeric": {"size": 1e5},
-    "mesh": {"params": 200, "octree_maxdepth": 8},
-    "composite": {"subgrid": 10},
-}  # fmt: skip
-NAMES = ("name", "class", "childclass", "model", "prefix", "file")
-_NUMBER = re.compile(r"[-+]?(?:\d+\.?\d*|\.\d+)(?:[eE][-+]?\d{1,3})?")
-_UNITS = {unit: 1024.0**k for k, unit in enumerate("KMGTPE", start=1)}
+def as_utf8(path: Path, data: bytes) -> bytes:
+    """An XML file's content as UTF-8, its declaration with it."""
+    declared = DECLARATION.search(data[:200].decode("ascii", "replace"))
+    name = declared.group(2).strip("\"'") if declared else "utf-8"
+    name = "utf-16" if data.startswith(UTF16) else name
+    if name.lower() in ("utf-8", "utf8"):
+        return data
+    try:
+        text = data.decode(name)
+    except (LookupError, UnicodeDecodeError) as error:
+        raise InputError(f"{path}: cannot be read as {name} ({error}); save it as UTF-8") from None
+    return DECLARATION.sub(r'\g<1>"UTF-8"', text, count=1).encode("utf-8")
 
 
-def check_bounds(path: Path, data: bytes) -> None:
-    """Raise InputError where the MJCF `data` of the file `path` asks for more than an arm needs.
+def _around(data: bytes) -> str:
+    """What to say of text before or after the elements, "" where there is none."""
+    head = re.search(rb"<\?xml\b|<(?:robot|mujoco)\b", data)
+    before = data[: head.start()].removeprefix(b"\xef\xbb\xbf") if head else b""
+    if before.strip() or (before and head is not None and head[0] == b"<?xml"):
+        first = printable(before.strip().decode("utf-8", "replace").partition("\n")[0][:SHOWN])
+        told = f"'{first}' stands" if first else "blanks stand"
+        return f"{told} before {'<?xml …?>' if head and head[0] == b'<?xml' else 'it'}; remove that"
+    tail = re.search(rb"</(?:robot|mujoco)\s*>", data)
+    after = data[tail.end() :] if tail else b""
+    if re.sub(rb"<!--.*?-->", b"", after, flags=re.DOTALL).strip():
+        first = printable(after.strip().decode("utf-8", "replace").partition("\n")[0][:SHOWN])
+        return f"'{first}' stands after the end of the robot; remove that"
+    return ""
 
-    Counted are elements as often as they are replicated, sizes, and what files it names: included
-    models stand in its folder, and all are regular files.  The message names file and element.
-    """
-    weight = _Model(path).weight_of(path, data)
-    require(
-        weight <= MOST_ELEMENTS,
-        f"{path}: makes {weight:.3g} elements of all it replicates and includes; more than "
-        f"{MOST_ELEMENTS} are no arm, so keep the arm alone",
-    )
 
-
-class _Model:
-    def __init__(self, path: Path) -> None:
-        self._folder = path.parent
-        # The folder as it is named, and that of the file where the name is a link.
-        self._roots = path.parent.resolve(), path.resolve().parent
-        self._weights: dict[Path, float] = {}
-        self._open: list[Path] = []
-        self._text = self._bytes = self._cells = 0
-
-    def weight_of(self, path: Path, data: bytes | None = None) -> float:
-        """The weight of an XML file, which is read once."""
-        real = path.resolve()
-        require(real not in self._open, f"{path}: includes itself; take out the <include>")
-        if real not in self._weights:
-            self._open.append(real)
-            data = read_bytes(path, "included model", MAX_BYTES) if data is None else data
-            self._text += len(data)
-            check_size(path, "MuJoCo model with all it includes", self._text, MAX_BYTES)
-            root = xml_tree(path, data, "an MJCF file")
-            self._weights[real] = self._weight(path, root, root)
-            self._open.pop()
-        return self._weights[real]
-
-    def _weight(self, path: Path, root: ET.Element, element: ET.Element) -> float:
-        """How many elements MuJoCo makes of one of the file `path` and all within it."""
-        _check_sizes(path, element)
-        if element.tag == "hfield":
-            sides = (math.prod(_numbers(element.get(key, ""))) for key in ("nrow", "ncol"))
-            self._count_cells(path, math.prod(sides))
-        inside = 1 + sum(self._weight(path, root, child) for child in element)
-        return _count(element) * (inside + sum(self._named(path, root, element)))
-
-    def _named(self, path: Path, root: ET.Element, element: ET.Element) -> Iterator[float]:
-        """Weights of the files that it names: of a model its elements, of a grid its vertices."""
-        file = element.get("file", "")
-        if element.tag == "attach":
-            models = {one.get("name") or Path(one.get("file", "")).stem: one.get("file", "")
-                      for one in root.iter("model")}  # fmt: skip
-            file = models.get(element.get("model", ""), "")
-        if element.tag in ("include", "model", "attach"):
-            yield from map(self.weight_of, self._included(path, file) if file else ())
-            return
-        for key, name in element.attrib.items():
-            for found in self._places(path, root, name) if key.startswith("file") and name else ():
-                try:
-                    size = self._count_file(found)
-                except InputError as error:
-                    raise InputError(f"{path}: <{printable(element.tag)}> names {error}") from None
-                if element.tag == "flexcomp":
-                    yield size / VERTEX_BYTES
-                elif element.tag == "hfield":
-                    self._count_cells(path, _pixels(found))
-
-    def _included(self, path: Path, name: str) -> Iterator[Path]:
-        """The files that an element of the file `path` includes by `name`: beside the model or
-        beside the file itself, as versions of MuJoCo differ."""
-        for found in {self._folder / name, path.parent / name}:
-            if os.path.lexists(found):
-                require(
-                    any(found.resolve().is_relative_to(root) for root in self._roots),
-                    f"{path}: includes {printable(name)}, which is outside its folder; put a copy "
-                    "there",
-                )
-                yield found
-
-    def _places(self, path: Path, root: ET.Element, name: str) -> set[Path]:
-        """Where a file may stand; the last part of its name alone counts under `strippath`."""
-        stated = [compiler.get(f"{kind}dir", "") for compiler in root.iter("compiler")
-                  for kind in ("asset", "mesh", "texture")]  # fmt: skip
-        names = {name, re.split(r"[\\/]", name)[-1]} - {""}
-        places = {folder / place / each for folder in (path.parent, self._folder)
-                  for place in ("", *stated) for each in names}  # fmt: skip
-        return {place for place in places if os.path.lexists(place) and not place.is_dir()}
-
-    def _count_file(self, path: Path) -> int:
-        size = check_regular(path, "file")
-        check_size(path, "file", size, MOST_MESH_BYTES)
-        self._bytes += size
-        require(
-            self._bytes <= MOST_FILES_BYTES,
-            f"{path}: with it the files that the model names have more than "
-            f"{MOST_FILES_BYTES / 1e6:g} MB; keep the arm alone",
+def _undeclared(data: bytes) -> str:
+    """What to say of bytes that are no UTF-8 in a file that declares no encoding, else ""."""
+    try:
+        data.decode("utf-8")
+    except UnicodeDecodeError as error:
+        line = data.count(b"\n", 0, error.start) + 1
+        return (
+            f"line {line} has the byte 0x{data[error.start]:02x}, which is not UTF-8, and no "
+            'encoding is declared; save it as UTF-8, or declare it: <?xml version="1.0" '
+            'encoding="latin-1"?>'
         )
-        return size
-
-    def _count_cells(self, path: Path, cells: float) -> None:
-        self._cells += int(min(cells, 1e18))
-        require(
-            self._cells <= MOST_CELLS,
-            f"{path}: <hfield> has more than {MOST_CELLS} points, which no arm needs; take it out",
-        )
-
-
-def _check_sizes(path: Path, element: ET.Element) -> None:
-    tag = printable(element.tag)
-    for key, text in element.attrib.items():
-        stated = f"{path}: <{tag} {printable(key)}={quoted(text)}>"
-        require(
-            key in NAMES or not re.search(r"(?i)(?<!\S)[-+]?nan(?!\S)", text),
-            f"{stated} is no number; correct it",
-        )
-        largest = LARGEST.get(element.tag, {}).get(key, math.inf)
-        require(
-            max(_numbers(text) if largest < math.inf else (), default=0.0) <= largest,
-            f"{stated} asks for more than {largest:g}, which no arm needs; take it out",
-        )
-
-
-def _numbers(text: str) -> list[float]:
-    """Sizes of the numbers in a text, of one with a unit ("2G") too."""
-    found = _NUMBER.finditer(text)
-    return [abs(float(m[0])) * _UNITS.get(text[m.end() : m.end() + 1].upper(), 1.0) for m in found]
-
-
-def _count(element: ET.Element) -> float:
-    """How often MuJoCo makes what an element states; a dimension that is 0 or not there counts as
-    one, and a vertex or segment is a body with three joints and a geom."""
-    if element.tag not in ("replicate", "composite", "flexcomp"):
-        return 1.0
-    count = math.prod(max(n, 1.0) for n in _numbers(element.get("count", "")))
-    if element.tag == "replicate":
-        return count
-    return 5 * max(count, *(len(element.get(k, "").split()) / 3 for k in ("point", "vertex")))
-
-
-def _pixels(path: Path) -> float:
-    """Points of a height field's file: a PNG says them where it begins, however small it is."""
-    with open_input(path, "file of <hfield>") as handle:
-        head = handle.read(24)
-    if head.startswith(b"\x89PNG") and len(head) == 24:
-        return math.prod(map(float, struct.unpack(">II", head[16:24])))
-    return 0.0
+    return ""
