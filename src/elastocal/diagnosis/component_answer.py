@@ -40,7 +40,7 @@ from elastocal.diagnosis.noise_floor import NoisyData, Projection, Weighted, cov
 from elastocal.diagnosis.shrinkage import NEW_POSES, Shrinkage, rms_with_interval
 from elastocal.diagnosis.stated_floor import (
     SupportedFloor,
-    left_out_residual,
+    each_left_out,
     squared_lengths,
     supported_floor,
 )
@@ -58,7 +58,6 @@ NAMED = 0.9  # probability from which a named effect needs no rivals beside it
 CHANCE = 0.05  # probability from which a rival is told
 PAYS = 0.01  # of the error of left-out configurations, by which a name has to lower it
 HARM = 2.0  # standard errors by which they are predicted worse with what is taken out of the sum
-MOST_LEFT_OUT = 1000  # configurations that show whether it does
 TOLD = 0.02  # share of the gap from which it matters which of several effects it is
 SLIGHT = 0.01  # of the gap's rms: what moves the markers by less is next to nothing
 
@@ -225,10 +224,9 @@ class SumAnswer:
     def _left_by_names(self) -> float:
         """Mean square (m²) by which the names alone err at left-out configurations, beyond what
         noise and the uncertainty of their fit make of it: r_c − X_c β̂₋c has covariance P_cc⁻¹."""
-        data = _thinned(self._without_these(self._unnamed))
-        at = project(data, self.found.noise)
-        squares, count = squared_lengths(data, left_out_residual(at))
-        variance = np.diagonal(np.linalg.inv(at.P), axis1=1, axis2=2)
+        data, (P, u) = self.found.data, self._fitted_without(self._unnamed)
+        squares, count = squared_lengths(data, each_left_out(P, u))
+        variance = np.diagonal(np.linalg.inv(P), axis1=1, axis2=2)
         expected, _ = squared_lengths(data, np.sqrt(variance))
         return float(max((squares - expected).sum() / count.sum(), 0.0))
 
@@ -287,15 +285,18 @@ class SumAnswer:
     def _left_out_without(self, gone: Sequence[int]) -> tuple[Array, Array]:
         """Σ of squared errors (C,) in m² of left-out configurations, these components not in the
         fit, and the number of readings."""
-        data = _thinned(self._without_these(gone))
-        return squared_lengths(data, left_out_residual(project(data, self.found.noise)))
+        return squared_lengths(self.found.data, each_left_out(*self._fitted_without(gone)))
 
-    def _without_these(self, gone: Sequence[int]) -> NoisyData:
-        data = self.found.data
-        keep = np.ones(data.X.shape[2], dtype=bool)
-        for k in gone:
-            keep[self.found.spans[k]] = False
-        return replace(data, X=data.X[:, :, keep], precision=data.precision[keep])
+    def _fitted_without(self, gone: Sequence[int]) -> tuple[Array, Array]:
+        """P (C, m, m) of each configuration and u = P r (C, m) without these components.
+
+        With S the posterior covariance of their coefficients, β̂ the mean, and Y = HL⁻¹ there, P
+        grows by Y S⁻¹Yᵀ and u by Y S⁻¹β̂.
+        """
+        at, index = self._fitted, self._index(gone) + self._own
+        D = at.beta_deviation[:, index]
+        Y, W = at.H @ D, np.linalg.inv(D.T @ D)
+        return at.P + Y @ W @ Y.transpose(0, 2, 1), at.u + Y @ (W @ at.beta[index])
 
     # Shares.
 
@@ -616,11 +617,9 @@ class SumAnswer:
         return tuple(steps)
 
     def _step(self, name: str, members: list[int]) -> BudgetStep:
-        part = self._without_these(
-            [k for k in range(len(self.found.components)) if k not in members]
-        )
-        left = left_out_residual(project(part, self.found.noise))
-        return BudgetStep(name, *rms_with_interval(part, left, self.rng))
+        gone = [k for k in range(len(self.found.components)) if k not in members]
+        left = each_left_out(*self._fitted_without(gone))
+        return BudgetStep(name, *rms_with_interval(self.found.data, left, self.rng))
 
     def curves(self) -> tuple[Curve, ...]:
         out = []
@@ -660,8 +659,3 @@ def _kind(c: Component) -> str:
 
 def _of_gear(c: Component) -> bool:
     return c.family == "angle" and c.where.startswith("joint")
-
-
-def _thinned(data: NoisyData) -> NoisyData:
-    """Of many configurations only so many as show whether a name pays."""
-    return data.every(-(-len(data.r) // MOST_LEFT_OUT))

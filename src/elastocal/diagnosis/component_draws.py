@@ -20,7 +20,7 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 
 import numpy as np
-from scipy import linalg, special
+from scipy import linalg
 
 from elastocal.diagnosis.components import (
     GONE,
@@ -29,9 +29,7 @@ from elastocal.diagnosis.components import (
     Component,
     FittedSum,
     Pool,
-    given_fellows,
     indices,
-    precision_of_sizes,
     presence_cost,
 )
 from elastocal.diagnosis.evidence import at_scales
@@ -108,8 +106,7 @@ class _Kind:
     ) -> float:  # fmt: skip
         """A size of `key` beside `sizes`, to which it is added, by its log evidence at those on the
         GRID and at none; the logarithm, −∞ of none."""
-        log_p = evidence + self.log_prior(key, sizes, spread)
-        chosen = int(rng.choice(len(log_p), p=special.softmax(log_p)))
+        chosen = _one_of(evidence + self.log_prior(key, sizes, spread), rng)
         if chosen == len(GRID):
             return -np.inf
         sizes[key] = float(GRID[chosen])
@@ -120,16 +117,17 @@ class _Kind:
 
     def spread(self, sizes: Mapping[Key, float], rng: np.random.Generator) -> float:
         """One of SPREADS, any of them as probable beforehand."""
-        logs = self._logs(sizes)
-        log_p = [_log_density(logs, a) for a in SPREADS.tolist()]
-        return float(SPREADS[rng.choice(len(SPREADS), p=special.softmax(log_p))])
+        return float(SPREADS[_one_of(_log_density(self._logs(sizes), SPREADS), rng)])
 
     def log_prior(self, key: Key, sizes: Mapping[Key, float], spread: float) -> Array:
         """Of another size on the GRID beside `sizes`, and of none."""
         others = self._logs(sizes)
-        m, (mean, precision) = len(others), given_fellows(others.tolist(), spread)
-        out = 0.5 * np.log(precision / (2 * np.pi)) - 0.5 * precision * (GRID - mean) ** 2
-        out += np.log(GRID[1] - GRID[0])
+        # Of m that have spread² their own and the rest of SPREAD² in common, the next one.
+        m, common = len(others), SPREAD**2 - spread**2
+        known = common / (spread**2 + m * common)
+        mean, variance = known * others.sum(), spread**2 * (1 + known)
+        out = np.log((GRID[1] - GRID[0]) / np.sqrt(2 * np.pi * variance))
+        out = out - 0.5 * (GRID - mean) ** 2 / variance
         if self.places is None:
             return np.append(out, -np.inf)
         cost = presence_cost(self.places, m + 1) - presence_cost(self.places, m)
@@ -160,11 +158,22 @@ def _alike(c: Component) -> list[IntArray]:
     return [np.flatnonzero(words == word) for word in np.unique(words)]
 
 
-def _log_density(logs: Array, spread: float) -> float:
-    """Of the logarithms (k,) of sizes, but for a constant: k − 1 times they vary on their own."""
-    k = len(logs)
-    log_det = -2 * (k - 1) * np.log(spread) - np.log(k * SPREAD**2 - (k - 1) * spread**2)
-    return 0.5 * float(log_det - logs @ precision_of_sizes(k, spread) @ logs) if k else 0.0
+def _one_of(log_p: Array, rng: np.random.Generator) -> int:
+    """One of so many, each as probable as exp log_p: the largest with Gumbel noise on it."""
+    return int(np.argmax(log_p + rng.gumbel(size=len(log_p))))
+
+
+def _log_density(logs: Array, spread: Array) -> Array:
+    """Of the logarithms (k,) of sizes at each spread of their own, but for a constant: k − 1 times
+    they vary by it, their mean by what it leaves of SPREAD."""
+    k, own = len(logs), spread**2
+    if k == 0:
+        return np.zeros_like(spread)
+    mean = own + k * (SPREAD**2 - own)
+    squares = (logs**2).sum() - logs.sum() ** 2 / k
+    return np.asarray(
+        -0.5 * ((k - 1) * np.log(own) + np.log(mean) + squares / own + logs.sum() ** 2 / k / mean)
+    )
 
 
 def _at_sizes(S: Array, t: Array, sized: Array, span: slice) -> Array:

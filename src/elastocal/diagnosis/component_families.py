@@ -294,38 +294,6 @@ def sharpened(dataset: DiagnosisData, found: FittedSum) -> list[Component] | Non
 SHARPENINGS, SHARP = 6, 0.05  # nats that another step must gain
 
 
-def sought_anew(dataset: DiagnosisData, found: FittedSum, c: Component) -> Component | None:
-    """The family of lines that stands out most at the joint of `c` beside all others, where it is
-    another one than c and more probable."""
-    if not isinstance(c.effect, GearSpectrum):
-        return None
-    h = next(h for h in dataset.hypotheses if h.key == (GearRipple.name, c.where))
-    grams = beside(dataset, found, found.noise, (c,))
-    best = _best(grams, h, 0.0, (0.0, 0.0), ())
-    given = dict(c.settings)
-    own = family_evidence(grams, h, np.array([given["order_1"]]), c.width // 4)[0]
-    near = abs(best.order - given["order_1"]) < best.sd + given["order_sd_1"]
-    if near or best.gain <= own - c.search:
-        return None
-    return family_component(dataset, best)
-
-
-def with_multiples(dataset: DiagnosisData, c: Component) -> dict[int, Component]:
-    """A family of lines with any other number of them; none of another component."""
-    if not isinstance(c.effect, GearSpectrum):
-        return {}
-    given = dict(c.settings)
-    m, order, sd = len(given) // 2, given["order_1"], given["order_sd_1"]
-    return {
-        n: replace(
-            family_component(dataset, LineFamily(c.where, order, n, 0.0, sd, c.search)),
-            given=c.given,
-        )
-        for n in MULTIPLES
-        if n != m and n * order <= HIGHEST
-    }
-
-
 def refined_order(
     grams: Grams, h: Hypothesis, order: float, m: int, width: float, scales: Array = LINE_SCALES
 ) -> tuple[float, float, float]:

@@ -5,8 +5,10 @@ from __future__ import annotations
 from collections import Counter
 from collections.abc import Container, Mapping, Sequence
 from dataclasses import replace
+from functools import cached_property
 
 import numpy as np
+from scipy import linalg
 from scipy.special import expit
 
 from elastocal.diagnosis.baseline import from_centre, prior_deviations
@@ -20,8 +22,6 @@ from elastocal.diagnosis.component_families import (
     line_families,
     sharpened,
     shorter,
-    sought_anew,
-    with_multiples,
     with_scatter,
 )
 from elastocal.diagnosis.components import (
@@ -55,7 +55,7 @@ from elastocal.diagnosis.noise_floor import (
     project,
 )
 from elastocal.engine.mixed import ROUNDING
-from elastocal.engine.sizes import beside
+from elastocal.engine.sizes import Standardised, beside
 from elastocal.model.effects.base import index
 from elastocal.model.effects.gears import GearRipple, GearSpectrum
 from elastocal.model.effects.loads import GravitySag, LinkWeights
@@ -228,7 +228,7 @@ def _with_lines(dataset: DiagnosisData, found: FittedSum) -> FittedSum:
         if wider is None:
             break
         found = wider if many else _tuned(dataset, wider)
-    return found if many else _reviewed(dataset, found)
+    return found
 
 
 def with_shorter_drifts(dataset: DiagnosisData, found: FittedSum) -> FittedSum:
@@ -268,22 +268,6 @@ def _tuned(dataset: DiagnosisData, found: FittedSum) -> FittedSum:
     if components is None:
         return found
     return fit_sum(found.sums.data, components, found.noise, found.sizes, refit_noise=False)
-
-
-def _reviewed(dataset: DiagnosisData, found: FittedSum) -> FittedSum:
-    """The sum with other orders of a joint's lines, or one multiple more or less, where that is
-    better beside all that has been found since."""
-    changed = False
-    for c in found.components:
-        anew = sought_anew(dataset, found, c)
-        m, others = len(c.settings) // 2, with_multiples(dataset, c)
-        near = [other for n in (m + 1, m - 1) if (other := others.get(n)) is not None]
-        for other in near if anew is None else [anew, *near]:
-            fitted = exchanged(found, [c], [other], refit_noise=False)
-            if fitted.score > found.score:
-                found, changed = fitted, True
-                break
-    return _tuned(dataset, found) if changed else found
 
 
 PROBABLE = 0.5
@@ -424,30 +408,46 @@ BETTER, SWAPS = 1.0, 6
 
 
 class Beside:
-    """Log evidence of other columns beside a sum, by sums over the rows."""
+    """Log evidence of other columns beside a sum, by sums over the rows.
+
+    Columns t are left A_t = M_tt − UᵀA U and b_t = z_t − Uᵀb of their normal matrix and right side,
+    with A and b of the sum's coefficients in units of their prior and U = A⁻¹ M_xt.  Where those of
+    a component c are gone, UᵀA U is less by U_cᵀ W U_c and Uᵀb by U_cᵀ W b_c, W the inverse of
+    (A⁻¹)_cc; and c itself is left W − 1 and W b_c.
+    """
 
     def __init__(self, found: FittedSum, columns: Sequence[Array]) -> None:
-        sums, p = found.sums, len(found.sums.weighted.z)
-        products = sums.products(columns)
-        total = p + sum(len(each.z) for each in products)
-        self.spans = spans_of([len(each.z) for each in products], total)
-        self.z = np.concatenate([sums.weighted.z, *(each.z for each in products)])
-        self.M = np.zeros((total, total))
-        self.M[:p, :p] = sums.weighted.M
-        for each, span in zip(products, self.spans, strict=True):
-            self.M[:p, span], self.M[span, :p] = each.beside, each.beside.T
-            self.M[span, span] = each.own
-        self.prior = sums.weighted.prior(np.concatenate([sums.data.precision, 1 / found.variances]))
+        sums = found.sums
+        w, products = sums.weighted, sums.products(columns)
+        self.root = w.prior(np.concatenate([sums.data.precision, 1 / found.variances])) ** -0.5
+        self.sum = Standardised.of(w.M, w.z, self.root)
+        own = [self.root[:, None] * each.beside for each in products]
+        self.halves = [linalg.solve_triangular(self.sum.L, t, lower=True) for t in own]
+        half = self.sum.L.T @ self.sum.b
+        self.left = [
+            (each.own - t.T @ t, each.z - t.T @ half)
+            for each, t in zip(products, self.halves, strict=True)
+        ]
 
-    def evidence(
-        self, gone: slice, tried: Sequence[slice], scales: Array = WIDE,
-        scalings: Sequence[Array] | None = None,
-    ) -> list[float]:  # fmt: skip
-        """Of each of the columns `tried`, over none, beside all of the sum but those that are
-        `gone`; times its `scalings` (L, k) where given, at the best of these."""
-        others = np.r_[0 : gone.start, gone.stop : len(self.prior)]
-        groups = beside(self.M, self.z, self.prior, others, tried)
-        return evidence_of_groups(groups, scales, scalings)
+    @cached_property
+    def _moved(self) -> list[Array]:
+        L = self.sum.L
+        return [linalg.solve_triangular(L, t, lower=True, trans="T") for t in self.halves]
+
+    def evidence(self, scales: Array, scalings: Sequence[Array]) -> list[float]:
+        """Of each of the columns over none, times its `scalings` (L, k), at the best of these."""
+        return evidence_of_groups(self.left, scales, scalings)
+
+    def evidence_instead(self, gone: slice) -> list[float]:
+        """Over none, of what is `gone` beside all others of the sum and of each of the columns."""
+        S = np.tril(self.sum.covariance[gone, gone])
+        W = np.linalg.inv(S + np.tril(S, -1).T)
+        b, per = W @ self.sum.b[gone], 1 / self.root[gone]
+        groups = [((W - np.eye(len(W))) * per[:, None] * per, b * per)]
+        for (A, z), moved in zip(self.left, self._moved, strict=True):
+            own = moved[gone]
+            groups.append((A + own.T @ W @ own, z + own.T @ b))
+        return evidence_of_groups(groups, WIDE)
 
 
 def promised(chosen: ModelSet, components: Sequence[Component]) -> float:
@@ -481,9 +481,8 @@ def evidence_beside(
 ) -> list[float]:  # fmt: skip
     """Log evidence of each component beside the sum, of a smooth one at its best length; or times
     its `scalings`."""
-    known = Beside(found, [c.columns for c in components])
     scalings = scalings or [c.scalings for c in components]
-    return known.evidence(slice(0, 0), known.spans, scales, scalings)
+    return Beside(found, [c.columns for c in components]).evidence(scales, scalings)
 
 
 class Rivals:
@@ -498,8 +497,7 @@ class Rivals:
 
     def of(self, k: int) -> tuple[float, dict[tuple[str, str], float]]:
         """Log evidence of component k over none in its place, and of every other hypothesis."""
-        span = self.own[k]
-        own, *others = self.beside.evidence(span, [span, *self.beside.spans])
+        own, *others = self.beside.evidence_instead(self.own[k])
         return own, dict(zip(self.keys, others, strict=True))
 
 

@@ -140,16 +140,10 @@ class Sizes:
 
 
 @cache
-def precision_of_sizes(k: int, alone: float = ALONE) -> Array:
-    """Of the logarithms of k sizes of a kind (k, k), which have SPREAD in all, `alone` of it their
-    own: the inverse of alone² I + (SPREAD² − alone²) 11ᵀ."""
-    return np.asarray(np.linalg.inv(alone**2 * np.eye(k) + SPREAD**2 - alone**2))
-
-
-def given_fellows(sizes: Sequence[float], alone: float = ALONE) -> tuple[float, float]:
-    """Mean and precision of the logarithm of a size where those (k,) of its kind are known."""
-    own, *others = precision_of_sizes(len(sizes) + 1, alone)[0]
-    return float(-np.dot(others, sizes) / own), float(own)
+def precision_of_sizes(k: int) -> Array:
+    """Of the logarithms of k sizes of a kind (k, k), which have SPREAD in all, ALONE of it their
+    own: the inverse of ALONE² I + COMMON² 11ᵀ."""
+    return np.asarray(np.linalg.inv(ALONE**2 * np.eye(k) + COMMON**2))
 
 
 class Pool:

@@ -26,7 +26,7 @@ from elastocal.diagnosis.diagnosis import (
     StructureTest,
 )
 from elastocal.diagnosis.diagnosis_data import DiagnosisData, diagnosis_data_of
-from elastocal.diagnosis.effect_search import ForwardSelection, SelectedEffects
+from elastocal.diagnosis.effect_search import MANY, ForwardSelection, SelectedEffects
 from elastocal.diagnosis.evidence import exceedance
 from elastocal.diagnosis.hypotheses import (
     BY_LAST_MOVE,
@@ -312,10 +312,6 @@ def chance_of_noise(found: SelectedEffects, nats: float) -> tuple[float, float]:
     if nats <= 0:
         return p, nothing
     return max(min(p, math.exp(-nats)), SMALLEST_P), min(nothing, float(expit(-nats)))
-
-
-# Causes from which on a sum is a sum: of one or two the forward search is the better judge.
-MANY = 3
 
 
 def _sum_of_all(

@@ -171,7 +171,8 @@ LARGEST_SET = 3  # effects that one claim names: more are no answer
 CLOSE_BLOCKS = 3
 CLEARLY = 10.0  # nats by which several named effects must beat fewer without a name
 PART = 0.3
-MOST_EFFECTS, MOST_BESIDE_UNKNOWN = 4, 2
+# Causes from which on a sum of all that may act is the better judge: of fewer this search is.
+MANY = 3
 KEPT = 4  # scans that are kept, the last ones
 
 
@@ -203,8 +204,7 @@ class ForwardSelection:
         p_values: list[float] = []
         while True:
             best, slot = self._best_addition(current, scanned)
-            most = MOST_BESIDE_UNKNOWN if current.unknown else MOST_EFFECTS
-            if best is None or len(current.items) >= most:
+            if best is None or len(current.items) + 1 >= MANY:
                 break
             # Score all again under the noise beside the winner: an effect that is still missing
             # looks like noise, and hides others with it.

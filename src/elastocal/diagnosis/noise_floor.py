@@ -210,7 +210,7 @@ class Projection:
     marginal: float
     factor: Array
 
-    @property
+    @cached_property
     def P(self) -> Array:
         """P (C, m, m) of each configuration by itself."""
         return self.inverse - self.H @ self.H.transpose(0, 2, 1)
@@ -225,7 +225,7 @@ class Projection:
         e = _power(self.inverse, -0.5) @ (_power(self.P, -0.5) @ self.u[..., None])
         return np.asarray(e[..., 0])
 
-    @property
+    @cached_property
     def beta_deviation(self) -> Array:
         """L⁻¹ (p, p): the posterior covariance of β is L⁻ᵀL⁻¹."""
         return linalg.solve_triangular(self.factor, np.eye(len(self.factor)), lower=True)

@@ -321,7 +321,7 @@ def left_out_residual(at: Projection, together: IntArray | None = None) -> Array
         P⁻¹u = V u + V H (I − HᵀVH)⁻¹ HᵀV u.
     """
     if together is None:
-        return np.asarray(np.linalg.solve(at.P, at.u[..., None])[..., 0])
+        return each_left_out(at.P, at.u)
     Vu, VH = (np.linalg.solve(at.inverse, b) for b in (at.u[..., None], at.H))
     out = Vu[..., 0]
     for g in np.unique(together):
@@ -331,6 +331,11 @@ def left_out_residual(at: Projection, together: IntArray | None = None) -> Array
         z = np.linalg.solve(inner, np.einsum("cmp,cm->p", H, Vu[own, :, 0]))
         out[own] += VH[own] @ z
     return np.asarray(out)
+
+
+def each_left_out(P: Array, u: Array) -> Array:
+    """The same of each configuration by itself, from P (C, m, m) and u (C, m)."""
+    return np.asarray(np.linalg.solve(P, u[..., None])[..., 0])
 
 
 def blocks_of_time(blocks: Blocks, time: Array) -> IntArray:
