@@ -30,12 +30,12 @@ def later(*rooms: str) -> dict[str, Any]:
 
 globals().update(later("pandas DataFrame"))
 
-VIEWS = "elastocal.report.notebook"
-TEXTS = "elastocal.report.terminal"
+VIEWS = "elastocal.report.page"
+TEXTS = "elastocal.report.blocks"
 PAGES = "elastocal.report.page"
 WORDS = "elastocal.report.judgement_view"
 WRITERS = "elastocal.saving"
-NAMES = "elastocal.report.effect_names"
+NAMES = "elastocal.report.formatting"
 
 
 class Saved:

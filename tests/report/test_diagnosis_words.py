@@ -23,7 +23,7 @@ from elastocal.report.diagnosis_view import (
     noise_floor_lines,
     sensitivity,
 )
-from elastocal.report.effect_names import probability, settings_text
+from elastocal.report.formatting import probability, settings_text
 
 KINDS = ("revolute",) * 6
 

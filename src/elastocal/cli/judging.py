@@ -66,7 +66,7 @@ def identify(
         details: Also method, noise, residuals, intervals, all lists.
     """
     from elastocal.model.effects.catalogue import cell_of
-    from elastocal.report.terminal import print_report
+    from elastocal.report.blocks import print_report
 
     run.writes(
         (output, ".json"), (report, PAGES), (residuals, ".csv"), (certificate, f"{PAGES} .xml")
@@ -164,8 +164,8 @@ def diagnose(
     from elastocal.diagnosis.diagnosis import publish
     from elastocal.files import together
     from elastocal.model.effects.catalogue import cell_of
+    from elastocal.report.blocks import print_report
     from elastocal.report.page import write_page
-    from elastocal.report.terminal import print_report
     from elastocal.saving import save_diagnosis
 
     require(
@@ -271,7 +271,7 @@ def next_command(
     from elastocal.diagnosis.next_poses import next_poses
     from elastocal.files import together
     from elastocal.model.effects.catalogue import cell_of
-    from elastocal.report.terminal import print_report
+    from elastocal.report.blocks import print_report
     from elastocal.saving import beside, save_plan
 
     summary = beside(output)
@@ -327,7 +327,7 @@ def compare(
     from elastocal.diagnosis.changes import compare as compared
     from elastocal.files import together
     from elastocal.model.calibrated import read_calibrated
-    from elastocal.report.terminal import print_report
+    from elastocal.report.blocks import print_report
     from elastocal.saving import write_json
 
     if old_order := new is None:

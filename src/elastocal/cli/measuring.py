@@ -108,7 +108,7 @@ def effects(
     """
     from elastocal.demo import example
     from elastocal.model.effects.catalogue import cell_of
-    from elastocal.report.effect_names import effect_entries
+    from elastocal.report.formatting import effect_entries
 
     known = cell_of(cell or Path(example.__file__).parent / "cell.toml", run.plugins)
     entries = effect_entries(known)
@@ -123,7 +123,7 @@ def _print_effects(screen: Console, cell: Any, entries: Any) -> None:
 
     from elastocal.model.chain import names_told
     from elastocal.model.manipulator import load_chain
-    from elastocal.report.effect_names import STAGES, effect_head
+    from elastocal.report.formatting import STAGES, effect_head
 
     for stage, several in groupby(entries, lambda entry: entry["stage"]):
         screen.print(f"\n{STAGES[stage].capitalize()}", style="bold")
@@ -205,7 +205,7 @@ def design(
     from elastocal.files import together
     from elastocal.model.effects.catalogue import cell_of
     from elastocal.planning.candidates import plan_and_names
-    from elastocal.report.terminal import print_report
+    from elastocal.report.blocks import print_report
     from elastocal.saving import beside
 
     summary = beside(output)
@@ -441,7 +441,7 @@ def demo(
     """
     from elastocal.cli.judging import write_results
     from elastocal.demo.example import run_demo
-    from elastocal.report.terminal import print_report
+    from elastocal.report.blocks import print_report
 
     with run.progress() as progress:
         done = run_demo(folder, seed, progress)
@@ -504,8 +504,8 @@ def import_(
     from elastocal.cell.work_cell import read_cell
     from elastocal.importing.assemble import import_files
     from elastocal.importing.mapping_file import preset_text, read_mapping, with_units
+    from elastocal.report.blocks import print_blocks
     from elastocal.report.smaller_views import import_blocks, left_out
-    from elastocal.report.terminal import print_blocks
 
     if show_preset is not None:
         say(preset_text(show_preset), end="")

@@ -73,8 +73,8 @@ def compensate(
     from elastocal.files import atomic_write_text, together
     from elastocal.model.arm import given_force
     from elastocal.model.calibrated import read_calibrated
+    from elastocal.report.blocks import print_blocks
     from elastocal.report.smaller_views import compensation_blocks
-    from elastocal.report.terminal import print_blocks
 
     # What can be wrong with the options is told before any file is read.
     verbs.check_frame(asked["frame"])
@@ -293,8 +293,8 @@ def export(
     from elastocal.export.export import export as exported
     from elastocal.export.export import write
     from elastocal.model.calibrated import read_calibrated
+    from elastocal.report.blocks import print_blocks
     from elastocal.report.smaller_views import export_blocks
-    from elastocal.report.terminal import print_blocks
     from elastocal.saving import wish_of
 
     run.writes((output, ""), (joint_correction, ".csv"))

@@ -32,16 +32,22 @@ from elastocal.report.blocks import (
     Lines,
     Report,
     Sentence,
-    ShownArm,
     ShownTable,
     ShownVerdict,
 )
-from elastocal.report.effect_names import (
+from elastocal.report.formatting import (
     STAGES,
+    budget_table,
+    capital,
+    counted,
+    display,
     driver_name,
     effect_at,
     effect_at_places,
+    estimate,
+    length,
     name_of,
+    outlier_blocks,
     p_value,
     place,
     places,
@@ -50,17 +56,8 @@ from elastocal.report.effect_names import (
     reduction,
     setting_value,
     settings_text,
-    size_of,
-)
-from elastocal.report.formatting import (
-    budget_table,
-    capital,
-    counted,
-    display,
-    estimate,
-    length,
-    outlier_blocks,
     significant,
+    size_of,
     title_of,
     together,
 )
@@ -136,15 +133,11 @@ def _blocks(d: Diagnosis, kinds: Sequence[str]) -> Iterator[Block]:
 
 def _key(d: Diagnosis) -> KeyFigures:
     """The error before and after the effects found, and the noise in both."""
-    gap = d.gap
-    calibrated, floor = length(gap.calibrated), length(gap.noise_floor)
-    figures = [("calibrated arm, held out", calibrated)]
-    headline = calibrated
+    figures = [("calibrated arm, held out", length(d.gap.calibrated))]
     if d.effects:
-        headline += f" → {length(gap.explained)}"
-        figures.append(("with the effects found", length(gap.explained)))
-    figures += [("noise alone", floor), ("readings", str(d.n_readings))]
-    return KeyFigures(f"{headline} (noise {floor})", figures)
+        figures.append(("with the effects found", length(d.gap.explained)))
+    noise = ("noise alone", length(d.gap.noise_floor))
+    return KeyFigures([*figures, noise, ("readings", str(d.n_readings))])
 
 
 def _figures(d: Diagnosis) -> Iterator[Figure]:
@@ -172,19 +165,18 @@ def _smooth(d: Diagnosis) -> Iterator[Block]:
     yield field_table(d)
 
 
-def _residuals(d: Diagnosis) -> Iterator[ShownArm | Block]:
-    from elastocal.report import figures
+def _residuals(d: Diagnosis) -> Iterator[Block]:
     from elastocal.report.arm_view import residual_arm
+    from elastocal.report.figures import Residuals
 
     base = d.calibrated
     assert base is not None
-    residuals = figures.residuals_by(base.observed, base.residual)
+    residuals = Residuals(base.model, base.observed, base.residual)
     yield Sentence("What the model leaves before the effects found are added.")
     yield residual_arm(base.model, base.observed, base.x, base.residual)
-    yield figures.over_configurations(residuals)
-    yield figures.over_joints(base.model.chain.kinds, residuals)
-    yield from figures.over_time(base.observed, residuals)
-    yield figures.residual_table(base.observed, residuals)
+    yield from residuals.figures()
+    yield from residuals.over_time()
+    yield residuals.table()
 
 
 def noise_floor_lines(noise: NoiseFloor, kinds: Iterable[str]) -> list[str]:

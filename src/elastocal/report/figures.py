@@ -19,7 +19,7 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from elastocal.diagnosis.diagnosis import Curve, Diagnosis
+from elastocal.diagnosis.diagnosis import Diagnosis
 from elastocal.errors import ElastocalError
 from elastocal.identification.prediction import over_the_workspace
 from elastocal.identification.residuals import groupings
@@ -29,8 +29,15 @@ from elastocal.model.manipulator import Model
 from elastocal.model.observations import COMPONENTS, Observations
 from elastocal.model.rigid import nominal_flanges
 from elastocal.report.blocks import Figure, ShownTable
-from elastocal.report.effect_names import driver_name, effect_at
-from elastocal.report.formatting import length, short_name, signed, significant, typeset
+from elastocal.report.formatting import (
+    driver_name,
+    effect_at,
+    length,
+    short_name,
+    signed,
+    significant,
+    typeset,
+)
 from elastocal.text import printable
 from elastocal.units import Array, IntArray
 
@@ -145,44 +152,6 @@ def rendered(figure: Drawing) -> str:
 NO_LENGTH = 1e-6  # of a line that is a dot: of none at all a PNG has no caps
 
 
-def dots(axes: Axes, x: Array, y: Array, colour: str, size: float, label: str = "") -> None:
-    """Scatter as one path of round caps: a third of the bytes of a marker per point."""
-    from matplotlib.patches import PathPatch
-    from matplotlib.path import Path
-
-    finite = np.isfinite(x) & np.isfinite(y)
-    points = np.column_stack([x[finite], y[finite]])
-    if label:
-        axes.plot([], [], "o", color=colour, markersize=size + 1, label=label)
-    if not len(points):
-        return
-    codes = np.tile([Path.MOVETO, Path.LINETO], len(points))
-    ends = np.repeat(points, 2, axis=0)
-    ends[1::2] += NO_LENGTH * (np.ptp(points, axis=0) + np.abs(points).max())
-    how: dict[str, Any] = {"linewidth": size, "capstyle": "round", "snap": False, "alpha": 0.6}
-    axes.add_patch(PathPatch(Path(ends, codes), fill=False, edgecolor=colour, **how))
-    axes.update_datalim(points)
-    axes.autoscale_view()
-
-
-def reach(values: Array) -> float:
-    """Half height of an axis: all values, or 8 robust deviations where some lie far beyond."""
-    size = np.abs(values[np.isfinite(values)])
-    if not len(size) or size.max() == 0:
-        return 1.0
-    robust = 8 * 1.4826 * float(np.median(size))
-    largest = 1.08 * float(size.max())
-    return robust if 0 < robust < largest / 1.5 else largest
-
-
-def panels_of(figure: Drawing, n: int, across: int, **how: Any) -> list[Axes]:
-    """The first `n` axes of a grid `across` wide; the others are not seen."""
-    grid = figure.subplots(max(-(-n // across), 1), across, squeeze=False, **how).ravel()
-    for axes in grid[n:]:
-        axes.set_visible(False)
-    return list(grid[:n])
-
-
 ROW = 0.27  # inches per line of a name
 LONGEST = 25  # letters of a name, which has two lines at most
 # Lengths that span more than this are drawn on a logarithmic axis.
@@ -258,7 +227,132 @@ def waterfall(
     return rows_of_dots(name, title, rows, "held-out rms error", caption, line, lengths=True)
 
 
-# Of a diagnosis
+# Panels of points, lines and bands
+
+
+@dataclass(frozen=True)
+class Series:
+    """What a panel shows over x (n,): "dots"; the "mean" of y in bins of x, with twice its standard
+    error; a "band" between the two rows of y; else a line or marks as matplotlib writes them."""
+
+    how: str
+    x: Array
+    y: Array
+    colour: str = SERIES[0]
+    label: str = ""
+    size: float = 1.6
+    line: str = "-"
+
+
+@dataclass(frozen=True)
+class Panel:
+    """Axes with labels; where `height` is given they reach as far above zero, which has a line, as
+    below it.  `ticks` are places of x and their names."""
+
+    x: str
+    y: str
+    series: Sequence[Series]
+    height: float | None = None
+    title: str = ""
+    note: str = ""
+    ticks: tuple[Sequence[float], Sequence[str]] | None = None
+
+
+def panelled(
+    name: str, title: str, panels: Sequence[Panel], caption: str, height: float,
+    across: int = 1, columns: int = 2, **share: Any,
+) -> Figure:  # fmt: skip
+    """Panels in a grid `across` wide, under one legend of `columns`."""
+
+    def draw(figure: Drawing) -> None:
+        rows = max(-(-len(panels) // across), 1)
+        grid = figure.subplots(rows, across, squeeze=False, **share).ravel()
+        for axes in grid[len(panels) :]:
+            axes.set_visible(False)
+        for axes, panel in zip(grid, panels, strict=False):
+            _panel(axes, panel)
+        legends = [axes.get_legend_handles_labels() for axes in grid]
+        handles, labels = max(legends, key=lambda each: len(each[1]))
+        if labels:
+            figure.legend(handles, labels, loc="outside upper right", ncols=columns)
+
+    return Figure(name, title, draw, height, caption)
+
+
+def _panel(axes: Axes, panel: Panel) -> None:
+    if panel.height is not None:
+        axes.axhline(0, color=FAINT, linewidth=0.8)
+        axes.set_ylim(-panel.height, panel.height)
+    for s in panel.series:
+        if s.how == "dots":
+            dots(axes, s.x, s.y, s.colour, s.size, s.label)
+        elif s.how == "band":
+            axes.fill_between(s.x, *s.y, color=s.colour, alpha=0.25, linewidth=0, label=s.label)
+        elif s.how == "mean":
+            axes.errorbar(*running_mean(s.x, s.y), color=s.colour, linewidth=1.4, elinewidth=0.8,
+                          linestyle=s.line, label=s.label)  # fmt: skip
+        else:
+            axes.plot(s.x, s.y, s.how, color=s.colour, linewidth=1.4, markersize=s.size,
+                      markeredgewidth=1.8, label=s.label)  # fmt: skip
+    axes.set(xlabel=panel.x, ylabel=panel.y)
+    axes.set_title(panel.title)
+    axes.text(0.01, 0.97, panel.note, transform=axes.transAxes, va="top", fontsize=8)
+    if panel.ticks is not None:
+        places, names = panel.ticks
+        axes.set_xticks(places, names, rotation=90 if max(map(len, names)) > 2 else 0)
+
+
+def dots(axes: Axes, x: Array, y: Array, colour: str, size: float, label: str = "") -> None:
+    """Scatter as one path of round caps: a third of the bytes of a marker per point."""
+    from matplotlib.patches import PathPatch
+    from matplotlib.path import Path
+
+    finite = np.isfinite(x) & np.isfinite(y)
+    points = np.column_stack([x[finite], y[finite]])
+    if label:
+        axes.plot([], [], "o", color=colour, markersize=size + 1, label=label)
+    if not len(points):
+        return
+    codes = np.tile([Path.MOVETO, Path.LINETO], len(points))
+    ends = np.repeat(points, 2, axis=0)
+    ends[1::2] += NO_LENGTH * (np.ptp(points, axis=0) + np.abs(points).max())
+    how: dict[str, Any] = {"linewidth": size, "capstyle": "round", "snap": False, "alpha": 0.6}
+    axes.add_patch(PathPatch(Path(ends, codes), fill=False, edgecolor=colour, **how))
+    axes.update_datalim(points)
+    axes.autoscale_view(scaley=axes.get_autoscaley_on())
+
+
+def running_mean(x: Array, y: Array, bins: int = 12) -> tuple[Array, Array, Array]:
+    """Mean x, mean y and twice its standard error in bins of equally many x.
+
+    Where x takes few different values, each is a bin.
+    """
+    order = np.argsort(x, kind="stable")
+    steps = np.flatnonzero(np.diff(x[order]) > 1e-9 * (np.abs(x).max(initial=0.0) + 1e-300)) + 1
+    if len(steps) >= 1.5 * bins:
+        parts = np.array_split(order, min(bins, max(len(x) // 8, 1)))
+    else:
+        parts = np.split(order, steps)
+    parts = [p for p in parts if len(p) > 1]
+    middle, mean = (np.array([v[p].mean() for p in parts]) for v in (x, y))
+    return middle, mean, np.array([2 * y[p].std(ddof=1) / np.sqrt(len(p)) for p in parts])
+
+
+def reach(values: Array) -> float:
+    """Half height of an axis: all values, or 8 robust deviations where some lie far beyond."""
+    size = np.abs(values[np.isfinite(values)])
+    if not len(size) or size.max() == 0:
+        return 1.0
+    robust = 8 * 1.4826 * float(np.median(size))
+    largest = 1.08 * float(size.max())
+    return robust if 0 < robust < largest / 1.5 else largest
+
+
+def _in_unit(kind: str, q: Array) -> tuple[Array, str]:
+    return (np.degrees(q), "°") if kind == "revolute" else (q * 1e3, "mm")
+
+
+# Of a diagnosis and a plan
 
 LONGEST_ENTRY = 24  # what moves, written along the height of a small panel
 # Unit of a curve's axis → (factor, unit shown).
@@ -273,34 +367,26 @@ ORDINATE = {"m": (1e6, "µm"), "rad": (1e6, "µrad"), "1": (1e6, "ppm")}
 
 def unknown_curves(d: Diagnosis) -> Figure:
     """How the unknown effect depends on what drives it: smooth curves with bands of 2 sd."""
-    across = min(2, len(d.curves))
-
-    def draw(figure: Drawing) -> None:
-        panels = panels_of(figure, len(d.curves), across)
-        for axes, curve in zip(panels, d.curves, strict=True):
-            _curve(axes, curve)
-        handles = panels[0].get_legend_handles_labels()
-        figure.legend(*handles, loc="outside upper right", ncols=2)
-
+    panels = []
+    for curve in d.curves:
+        wide, x_unit = ABSCISSA.get(curve.x_unit, (1.0, curve.x_unit))
+        high, y_unit = ORDINATE.get(curve.y_unit, (1.0, curve.y_unit))
+        x, y, sd = wide * np.array(curve.x), high * np.array(curve.y), high * np.array(curve.sd)
+        band = np.stack([y - 2 * sd, y + 2 * sd])
+        panels.append(Panel(
+            f"{short_name(driver_name(curve.driver), LONGEST_ENTRY)} in {x_unit}",
+            f"{short_name(driver_name(curve.entry), LONGEST_ENTRY)} in {y_unit}",
+            [Series("-", x, np.zeros(len(x)), FAINT),
+             Series("band", x, band, label="± 2 standard deviations"),
+             Series("-", x, y, INK, "estimated shape")],
+        ))  # fmt: skip
     title = "Error curves of the joints" if d.groups else "Shape of the unknown dependence"
     caption = (
         "Motion of the arm beyond the model, as a smooth function of its driver. If the band "
         "includes zero, the data show nothing."
     )
-    height = 0.5 + 2.1 * -(-len(d.curves) // across)
-    return Figure("curves", title, draw, height, caption)
-
-
-def _curve(axes: Axes, curve: Curve) -> None:
-    wide, x_unit = ABSCISSA.get(curve.x_unit, (1.0, curve.x_unit))
-    high, y_unit = ORDINATE.get(curve.y_unit, (1.0, curve.y_unit))
-    x, y, sd = (np.array(v) for v in (curve.x, curve.y, curve.sd))
-    axes.axhline(0, color=FAINT, linewidth=0.8)
-    axes.fill_between(x * wide, (y - 2 * sd) * high, (y + 2 * sd) * high, color=SERIES[0],
-                      alpha=0.25, linewidth=0, label="± 2 standard deviations")  # fmt: skip
-    axes.plot(x * wide, y * high, color=INK, linewidth=1.4, label="estimated shape")
-    axes.set_xlabel(f"{short_name(driver_name(curve.driver), LONGEST_ENTRY)} in {x_unit}")
-    axes.set_ylabel(f"{short_name(driver_name(curve.entry), LONGEST_ENTRY)} in {y_unit}")
+    across = min(2, len(panels))
+    return panelled("curves", title, panels, caption, 0.5 + 2.1 * -(-len(panels) // across), across)
 
 
 MOST_SHAPES = 6
@@ -352,64 +438,42 @@ def effect_shapes(d: Diagnosis) -> list[EffectShape]:
 
 
 def effects_over_joints(d: Diagnosis) -> Figure | None:
-    shapes = effect_shapes(d)
-    if not shapes:
+    panels = []
+    for name, kind, at, seen, explained, side in effect_shapes(d):
+        (q, unit), series = _in_unit(kind, at), list[Series]()
+        sides = np.unique(np.sign(side))
+        for k, one in enumerate(sides):
+            own = np.sign(side) == one
+            told = "" if len(sides) == 1 else f" ({'from below' if one > 0 else 'from above'})"
+            series += [
+                Series("dots", q[own], 1e6 * seen[own], SERIES[k], f"readings{told}", 1.8),
+                Series("_", q[own], 1e6 * explained[own], SERIES[k], f"effect{told}", 9),
+            ]
+        height = reach(1e6 * np.concatenate([seen, explained]))
+        motion = "µrad" if kind == "revolute" else "µm"
+        panels.append(Panel(f"joint in {unit}", f"motion in {motion}", series, height, name))
+    if not panels:
         return None
-
-    def draw(figure: Drawing) -> None:
-        panels = panels_of(figure, len(shapes), 1)
-        for axes, shape in zip(panels, shapes, strict=True):
-            _effect(axes, shape)
-        found = [axes.get_legend_handles_labels() for axes in panels]
-        handles, labels = max(found, key=lambda each: len(each[1]))
-        figure.legend(handles, labels, loc="outside upper right", ncols=2, fontsize=8.5)
-
     caption = (
         "Dashes: the effect found, as a motion of its joint. Dots: the same with what is left of "
         "each reading when all is fitted."
     )
     title = "Found effects over the joints they act at"
-    return Figure("effects", title, draw, 0.6 + 2.2 * len(shapes), caption)
-
-
-def _effect(axes: Axes, shape: EffectShape) -> None:
-    name, kind, q, seen, explained, side = shape
-    revolute = kind == "revolute"
-    q = np.degrees(q) if revolute else q * 1e3
-    sides = np.unique(np.sign(side))
-    for k, one in enumerate(sides):
-        own = np.sign(side) == one
-        told = "" if len(sides) == 1 else f" ({'from below' if one > 0 else 'from above'})"
-        dots(axes, q[own], 1e6 * seen[own], SERIES[k], 1.8, f"readings{told}")
-        axes.plot(q[own], 1e6 * explained[own], "_", color=SERIES[k], markersize=9,
-                  markeredgewidth=1.8, label=f"effect{told}")  # fmt: skip
-    axes.set_title(name, loc="left")
-    axes.set_xlabel(f"joint in {'°' if revolute else 'mm'}")
-    axes.set_ylabel(f"motion in {'µrad' if revolute else 'µm'}")
-    height = reach(1e6 * np.concatenate([seen, explained]))
-    axes.set_ylim(-height, height)
+    return panelled("effects", title, panels, caption, 0.6 + 2.2 * len(panels))
 
 
 def plan_curve(plan: Plan) -> Figure:
-    points = plan.curve
-    bounded = [(s.poses, s.bound) for s in points if s.bound is not None]
-
-    def draw(figure: Drawing) -> None:
-        axes = figure.subplots()
-        axes.plot([s.poses for s in points], [s.value for s in points], "o-", color=SERIES[0],
-                  markersize=6, label="best plan found")  # fmt: skip
-        if bounded:
-            axes.plot([n for n, _ in bounded], [bound for _, bound in bounded], "_--",
-                      color=SERIES[1], markersize=12,
-                      label="no plan can be better (on the pool)")  # fmt: skip
-        axes.set_xticks([s.poses for s in points])
-        axes.set_xlabel("poses")
-        name = "ρ₀" if plan.of_test_poses else plan.criterion
-        axes.set_ylabel(f"{name} in {plan.unit}" if plan.unit else name)
-        axes.set_ylim(bottom=0)
-        axes.legend()
-
-    return Figure("curve", "Criterion against the number of poses", draw, 3.0)
+    n, value = (np.array([getattr(s, name) for s in plan.curve]) for name in ("poses", "value"))
+    bound = np.array([math.nan if s.bound is None else s.bound for s in plan.curve])
+    series = [
+        Series("_--", n, bound, SERIES[1], "no plan can be better (on the pool)", 12),
+        Series("o-", n, value, label="best plan found", size=6),
+        Series("", n[:1], np.zeros(1)),  # zero is seen
+    ]
+    name = "ρ₀" if plan.of_test_poses else plan.criterion
+    unit = f" in {plan.unit}" if plan.unit else ""
+    panel = Panel("poses", f"{name}{unit}", series, ticks=(n.tolist(), [*map(str, n)]))
+    return panelled("curve", "Criterion against the number of poses", [panel], "", 3.0)
 
 
 # Of residuals
@@ -417,55 +481,6 @@ def plan_curve(plan: Plan) -> Figure:
 MOST_DRAWN = 5000  # observations; figures of larger tables show a random choice of them
 MOST_LABELS = 20
 MOST_JOINT_DOTS = 2000  # per joint; the running mean uses every reading
-
-
-@dataclass(frozen=True)
-class Residuals:
-    """Residuals (observations, components) in µm (µrad for rotations) and where they belong.
-
-    `pose` (observations,) counts configurations from 0 in the table's order, `labels` names
-    them; `marker` indexes `markers`; `q` (observations, joints) in rad or m; `shown` are the
-    observations to draw, all or a random choice.
-    """
-
-    components: tuple[str, ...]
-    units: tuple[str, ...]
-    value: Array
-    pose: IntArray
-    labels: tuple[str, ...]
-    marker: IntArray
-    markers: tuple[str, ...]
-    q: Array
-    shown: IntArray
-
-    @property
-    def lengths(self) -> Array:
-        """The components that are lengths (observations, 3 or 1); they come first."""
-        return self.value[:, : self.units.count("µm")]
-
-
-def residuals_by(observed: Observations, residual: Array) -> Residuals:
-    table, names = observed.table, COMPONENTS[observed.kind]
-    codes, first, pose = np.unique(observed.configuration, return_index=True, return_inverse=True)
-    order = np.argsort(first)
-    used, marker = np.unique(table.marker[observed.lead], return_inverse=True)
-    n = len(observed.lead)
-    shown = np.arange(n)
-    if n > MOST_DRAWN:
-        shown = np.sort(np.random.default_rng(0).choice(n, MOST_DRAWN, replace=False))
-    return Residuals(
-        components=names,
-        units=tuple("µrad" if name.startswith("r") else "µm" for name in names),
-        value=residual.reshape(-1, observed.size) * 1e6,
-        pose=np.argsort(order)[pose],
-        labels=tuple(table.configuration_labels[codes[k]] for k in order),
-        marker=marker,
-        markers=tuple(table.marker_names[k] for k in used),
-        q=table.q[observed.lead],
-        shown=shown,
-    )
-
-
 OF_RESIDUALS = (
     "Of a direction, mean and largest are signed. Of all others the length of the 3-D residual is "
     "given, and the mean is the length of the mean vector: near the rms, the residual is a common "
@@ -474,166 +489,141 @@ OF_RESIDUALS = (
 MOST_CONFIGURATIONS = 200
 
 
-def residual_table(observed: Observations, residuals: Residuals) -> ShownTable:
-    """Mean, rms and largest residual of every direction, marker, load state and configuration.
+class Residuals:
+    """Residuals (observations, components) of a model in µm (µrad for rotations) as figures and a
+    table; `shown` are the observations to draw, all or a random choice."""
 
-    Of a direction they are signed; else lengths of the 3-D residual, and of its mean vector.
-    """
-    rows: list[tuple[str, ...]] = []
+    def __init__(self, model: Model, observed: Observations, residual: Array) -> None:
+        self.kinds, self.observed = model.chain.kinds, observed
+        self.components = COMPONENTS[observed.kind]
+        self.units = ["µrad" if name.startswith("r") else "µm" for name in self.components]
+        self.value = residual.reshape(-1, observed.size) * 1e6
+        self.lengths = self.value[:, : self.units.count("µm")]  # they come first
+        n = len(observed.lead)
+        self.shown = np.arange(n)
+        if n > MOST_DRAWN:
+            chosen = np.random.default_rng(0).choice(n, MOST_DRAWN, replace=False)
+            self.shown = np.sort(chosen)
 
-    def add(name: str, sizes: Array, mean: str, largest: str, unit: str = "µm") -> None:
-        rms = significant(float(np.sqrt((sizes**2).mean())))
-        rows.append((name, str(len(sizes)), mean, rms, largest, unit))
+    def figures(self) -> Iterator[Figure]:
+        yield self.by_configuration()
+        yield self.over_joints()
 
-    groups = {0: "direction"}
-    columns = residuals.value.T
-    for name, unit, value in zip(residuals.components, residuals.units, columns, strict=True):
-        largest = float(value[np.argmax(np.abs(value))])
-        add(name, value, signed(float(value.mean())), signed(largest), unit)
-    every = np.ones(len(observed.value), dtype=bool)
-    for by, code, names in groupings(observed, every):
-        if by == "component":
-            continue
-        groups[len(rows)] = by
-        for k, name in enumerate(names[:MOST_CONFIGURATIONS]):
-            own = residuals.lengths[code[:: observed.size] == k]
-            sizes, mean = np.linalg.norm(own, axis=1), float(np.linalg.norm(own.mean(axis=0)))
-            add(printable(name), sizes, significant(mean), significant(float(sizes.max())))
-    heads = ("readings of", "number", "mean", "rms", "largest", "unit")
-    return ShownTable(heads, rows, (0, 5), groups, title="Residuals", note=OF_RESIDUALS)
+    def _thinned(self, drawn: int) -> str:
+        """That the dots are a choice, where they are."""
+        total = len(self.value)
+        if drawn >= total:
+            return ""
+        return f" Dots are a random choice of {drawn} of {total} readings; all else uses all."
 
+    def by_configuration(self) -> Figure:
+        table, shown = self.observed.table, self.shown
+        codes, first, own = np.unique(
+            self.observed.configuration, return_index=True, return_inverse=True
+        )
+        order = np.argsort(first)  # as the table has them
+        labels = [table.configuration_labels[codes[k]] for k in order]
+        used, marker = np.unique(table.marker[self.observed.lead], return_inverse=True)
+        many = len(used)
+        x = np.argsort(order)[own] + 0.6 * (marker - (many - 1) / 2) / many
+        several = 1 < many <= len(SERIES)
+        every = range(0, len(labels), -(-len(labels) // MOST_LABELS))
+        ticks = list(every), [short_name(labels[i]) for i in every]
+        panels = []
+        for name, unit, values in zip(self.components, self.units, self.value.T, strict=True):
+            series = [
+                Series("dots", x[at], values[at], SERIES[m],
+                       short_name(table.marker_names[used[m]]) if several else "",
+                       2.6 if len(shown) <= 1500 else 1.6)
+                for m in range(many if several else 1)
+                for at in (shown[marker[shown] == m] if several else shown,)
+            ]  # fmt: skip
+            height = reach(self.value[:, [u == unit for u in self.units]])
+            beyond = int((np.abs(values) > height).sum())
+            note, last = f"{beyond} beyond this axis" * bool(beyond), name == self.components[-1]
+            axis = "configuration" if last else ""
+            panels.append(Panel(axis, f"{name} in {unit}", series, height, note=note, ticks=ticks))
+        caption = "Observed minus predicted, by configuration" + " and marker" * several + "."
+        return panelled(
+            "residuals", "Residuals by configuration, marker and direction", panels,
+            caption + self._thinned(len(shown)), 0.7 + 1.3 * len(panels), columns=6, sharex=True,
+        )  # fmt: skip
 
-def _thinned(residuals: Residuals, most: int) -> str:
-    """That the dots are a choice, where they are."""
-    total, shown = len(residuals.value), min(len(residuals.shown), most)
-    if shown == total:
-        return ""
-    return f" Dots are a random choice of {shown} of {total} readings; all else uses all of them."
+    def _over(self, x: Array, shown: IntArray, size: float, *lines: str) -> list[Series]:
+        """Of positions over x (observations,): dots of the `shown`, running means of all."""
+        each = list(enumerate(self.lengths.T))
+        return [
+            *(Series("dots", x[shown], v[shown], SERIES[k], size=size) for k, v in each),
+            *(Series("mean", x, v, SERIES[k], self.components[k], line=lines[k % len(lines)])
+              for k, v in each),
+        ]  # fmt: skip
 
+    def over_joints(self) -> Figure:
+        n, shown, height = self.lengths.shape[1], self.shown, reach(self.lengths)
+        if len(shown) * n > MOST_JOINT_DOTS:
+            shown = np.random.default_rng(0).choice(shown, MOST_JOINT_DOTS // n, replace=False)
+        panels = []
+        for j, kind in enumerate(self.kinds):
+            q, unit = _in_unit(kind, self.observed.table.q[self.observed.lead, j])
+            label = "" if j % 2 else "residual in µm"
+            series = self._over(q, shown, 1.3, "-")
+            panels.append(Panel(f"joint {j + 1} in {unit}", label, series, height))
+        caption = (
+            "Over joint positions; lines are means of equally many readings with twice their "
+            "standard error. A wave or slope is an effect that the model lacks."
+        )
+        return panelled(
+            "against_joints", "Residuals against joint positions", panels,
+            caption + self._thinned(len(shown)), 0.5 + 1.75 * -(-len(panels) // 2), 2, n,
+            sharey=True,
+        )  # fmt: skip
 
-def over_configurations(residuals: Residuals) -> Figure:
-    n = len(residuals.components)
-    several = 1 < len(residuals.markers) <= len(SERIES)
+    def over_time(self) -> Iterator[Figure]:
+        if self.observed.table.time is None:
+            return
+        at, unit = self.observed.table.time[self.observed.lead] / 60, "min"
+        if float(np.ptp(at)) > 180:
+            at, unit = at / 60, "h"
+        series = self._over(at, self.shown, 1.5, "-", "--", ":")
+        panel = Panel(f"time in {unit}", "residual in µm", series, reach(self.lengths))
+        caption = (
+            "Over time; lines are means with twice their standard error. A slope is a drift, a "
+            "step something that moved."
+        )
+        yield panelled(
+            "over_time", "Residuals over time", [panel], caption + self._thinned(len(self.shown)),
+            2.9, columns=3,
+        )  # fmt: skip
 
-    def draw(figure: Drawing) -> None:
-        panels = figure.subplots(n, 1, sharex=True, squeeze=False)[:, 0]
-        for k, axes in enumerate(panels):
-            _configuration_panel(axes, residuals, k)
-        panels[-1].set_xlabel("configuration")
-        every = range(0, len(residuals.labels), -(-len(residuals.labels) // MOST_LABELS))
-        names = [short_name(residuals.labels[i]) for i in every]
-        turn = 90 if max(map(len, names)) > 2 else 0
-        panels[-1].set_xticks(list(every), names, rotation=turn)
-        if several:
-            found = panels[0].get_legend_handles_labels()
-            figure.legend(*found, loc="outside upper right", ncols=6)
+    def table(self) -> ShownTable:
+        """Mean, rms and largest residual of every direction, marker, load state and configuration.
 
-    caption = "Observed minus predicted, by configuration" + " and marker" * several + "."
-    caption += _thinned(residuals, len(residuals.shown))
-    title = "Residuals by configuration, marker and direction"
-    return Figure("residuals", title, draw, 0.7 + 1.3 * n, caption)
+        Of a direction they are signed; else lengths of the 3-D residual, and of its mean vector.
+        """
+        rows: list[tuple[str, ...]] = []
 
+        def add(name: str, sizes: Array, mean: str, largest: str, unit: str = "µm") -> None:
+            rms = significant(float(np.sqrt((sizes**2).mean())))
+            rows.append((name, str(len(sizes)), mean, rms, largest, unit))
 
-def _configuration_panel(axes: Axes, residuals: Residuals, k: int) -> None:
-    many, shown, values = len(residuals.markers), residuals.shown, residuals.value[:, k]
-    size = 2.6 if len(shown) <= 1500 else 1.6
-    x = residuals.pose + 0.6 * (residuals.marker - (many - 1) / 2) / many
-    axes.axhline(0, color=FAINT, linewidth=0.8)
-    if many > len(SERIES):
-        dots(axes, x[shown], values[shown], SERIES[0], size)
-    else:
-        for m, name in enumerate(residuals.markers):
-            at = shown[residuals.marker[shown] == m]
-            dots(axes, x[at], values[at], SERIES[m], size, short_name(name))
-    axes.grid(axis="x", visible=False)
-    axes.set_xlim(-0.7, len(residuals.labels) - 0.3)
-    unit = residuals.units[k]
-    axes.set_ylabel(f"{residuals.components[k]} in {unit}")
-    height = reach(residuals.value[:, [u == unit for u in residuals.units]])
-    axes.set_ylim(-height, height)
-    if beyond := int((np.abs(values) > height).sum()):
-        told = f"{beyond} beyond this axis"
-        axes.text(0.01, 0.97, told, transform=axes.transAxes, va="top", fontsize=8)
-
-
-def over_joints(kinds: Sequence[str], residuals: Residuals) -> Figure:
-    """Residual over the position of each joint, of `kinds`, with the running mean by direction."""
-    n, shown = residuals.lengths.shape[1], residuals.shown
-    if len(shown) * n > MOST_JOINT_DOTS:
-        shown = np.random.default_rng(0).choice(shown, MOST_JOINT_DOTS // n, replace=False)
-
-    def draw(figure: Drawing) -> None:
-        panels = panels_of(figure, len(kinds), 2, sharey=True)
-        for j, (axes, kind) in enumerate(zip(panels, kinds, strict=True)):
-            q = np.degrees(residuals.q[:, j]) if kind == "revolute" else residuals.q[:, j] * 1e3
-            _over(axes, q, residuals, shown, 1.3)
-            axes.set_xlabel(f"joint {j + 1} in {'°' if kind == 'revolute' else 'mm'}")
-        figure.supylabel("residual in µm", fontsize=10)
-        found = panels[0].get_legend_handles_labels()
-        figure.legend(*found, loc="outside upper right", ncols=n)
-
-    caption = (
-        "Over joint positions; lines are means of equally many readings with twice their standard "
-        "error. A wave or slope is an effect that the model lacks."
-    )
-    caption += _thinned(residuals, MOST_JOINT_DOTS // n)
-    height = 0.5 + 1.75 * -(-len(kinds) // 2)
-    return Figure("against_joints", "Residuals against joint positions", draw, height, caption)
-
-
-def _over(
-    axes: Axes, x: Array, residuals: Residuals, shown: IntArray, size: float,
-    styles: Sequence[str] = ("-",),
-) -> None:  # fmt: skip
-    """Residuals of positions over x (observations,): dots of the `shown`, running means of all."""
-    axes.axhline(0, color=FAINT, linewidth=0.8)
-    for k, own in enumerate(residuals.lengths.T):
-        dots(axes, x[shown], own[shown], SERIES[k], size)
-    for k, own in enumerate(residuals.lengths.T):
-        axes.errorbar(*running_mean(x, own), color=SERIES[k], linewidth=1.4, elinewidth=0.8,
-                      linestyle=styles[k % len(styles)],
-                      label=residuals.components[k])  # fmt: skip
-    height = reach(residuals.lengths)
-    axes.set_ylim(-height, height)
-
-
-def running_mean(x: Array, y: Array, bins: int = 12) -> tuple[Array, Array, Array]:
-    """Mean x, mean y and twice its standard error in bins of equally many x.
-
-    Where x takes few different values, each is a bin.
-    """
-    order = np.argsort(x, kind="stable")
-    steps = np.flatnonzero(np.diff(x[order]) > 1e-9 * (np.abs(x).max(initial=0.0) + 1e-300)) + 1
-    if len(steps) >= 1.5 * bins:
-        parts = np.array_split(order, min(bins, max(len(x) // 8, 1)))
-    else:
-        parts = np.split(order, steps)
-    parts = [p for p in parts if len(p) > 1]
-    middle, mean = (np.array([v[p].mean() for p in parts]) for v in (x, y))
-    return middle, mean, np.array([2 * y[p].std(ddof=1) / np.sqrt(len(p)) for p in parts])
+        groups = {0: "direction"}
+        for name, unit, value in zip(self.components, self.units, self.value.T, strict=True):
+            largest = float(value[np.argmax(np.abs(value))])
+            add(name, value, signed(float(value.mean())), signed(largest), unit)
+        every = np.ones(len(self.observed.value), dtype=bool)
+        for by, code, names in groupings(self.observed, every):
+            if by == "component":
+                continue
+            groups[len(rows)] = by
+            for k, name in enumerate(names[:MOST_CONFIGURATIONS]):
+                own = self.lengths[code[:: self.observed.size] == k]
+                sizes, mean = np.linalg.norm(own, axis=1), float(np.linalg.norm(own.mean(axis=0)))
+                add(printable(name), sizes, significant(mean), significant(float(sizes.max())))
+        heads = ("readings of", "number", "mean", "rms", "largest", "unit")
+        return ShownTable(heads, rows, (0, 5), groups, title="Residuals", note=OF_RESIDUALS)
 
 
-def over_time(observed: Observations, residuals: Residuals) -> Iterator[Figure]:
-    if observed.table.time is None:
-        return
-    at, unit = observed.table.time[observed.lead] / 60, "min"
-    if float(np.ptp(at)) > 180:
-        at, unit = at / 60, "h"
-
-    def draw(figure: Drawing) -> None:
-        axes = figure.subplots()
-        _over(axes, at, residuals, residuals.shown, 1.5, ("-", "--", ":"))
-        axes.set_xlabel(f"time in {unit}")
-        axes.set_ylabel("residual in µm")
-        figure.legend(loc="outside upper right", ncols=residuals.lengths.shape[1])
-
-    caption = (
-        "Over time; lines are means with twice their standard error. A slope is a drift, a step "
-        "something that moved."
-    )
-    caption += _thinned(residuals, len(residuals.shown))
-    yield Figure("over_time", "Residuals over time", draw, 2.9, caption)
-
+# Over the work space
 
 CELLS = 6  # of the work space's longest side
 FEWEST = 3  # readings from which on a cell is told

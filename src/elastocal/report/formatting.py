@@ -1,18 +1,28 @@
-"""Numbers, names and tables as text: the units people think in, the digits that are known."""
+"""Numbers, names and tables as text: the units people think in, the digits that are known; effects
+in words, their places, drivers, probabilities and settings, and the catalogue as rows."""
 
 from __future__ import annotations
 
+import inspect
 import math
 import re
-from collections.abc import Iterable, Sequence
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from importlib import resources
+from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
+from elastocal.errors import InputError
+from elastocal.model.chain import numbered
+from elastocal.model.effects.catalogue import CATALOGUE, cell_of
+from elastocal.model.manipulator import load_chain
 from elastocal.report.blocks import Sentence, ShownTable
 from elastocal.text import printable
 from elastocal.units import Array
 
 if TYPE_CHECKING:
+    from elastocal.cell.work_cell import Cell
+    from elastocal.diagnosis.diagnosis import Candidate, EffectAt, FoundEffect
+    from elastocal.model.effects.base import Effect
     from elastocal.planning.plan import Plan
 
 # SI unit → (factor, unit shown).
@@ -58,8 +68,7 @@ def with_uncertainty(value: float, half: float) -> tuple[str, str]:
     if decimals > MOST_DECIMALS:
         size = math.floor(math.log10(abs(value))) if value else exponent
         return f"{value:.{min(max(size + decimals, 0), 15)}e}", f"{half:.{digits - 1}e}"
-    shown = max(decimals, 0)
-    return f"{_round(value, decimals):.{shown}f}", f"{_round(half, decimals):.{shown}f}"
+    return _fixed(value, decimals), _fixed(half, decimals)
 
 
 def estimate(value: float, half: float, unit: str) -> tuple[str, str, str]:
@@ -71,7 +80,9 @@ def estimate(value: float, half: float, unit: str) -> tuple[str, str, str]:
 def with_ends(value: float, low: float, high: float) -> tuple[str, str]:
     """Value and interval with the digits that `resolution` allows: "0.000", "[0.000, 0.013]"."""
     size = resolution(value, low, high)
-    return rounded_alike(value, size), f"[{_end(low, size)}, {_end(high, size)}]"
+    ends = ("∞" if v == math.inf else "-∞" if v == -math.inf else rounded_alike(v, size)
+            for v in (low, high))  # fmt: skip
+    return rounded_alike(value, size), f"[{', '.join(ends)}]"
 
 
 def resolution(value: float, low: float, high: float) -> float:
@@ -103,7 +114,7 @@ def significant(value: float, digits: int = 3) -> str:
     if value == 0 or not 1e-5 < abs(value) < 1e7:
         return f"{value:.{digits}g}"
     decimals = digits - 1 - math.floor(math.log10(abs(float(f"{value:.{digits - 1}e}"))))
-    return f"{_round(value, decimals):.{max(decimals, 0)}f}"
+    return _fixed(value, decimals)
 
 
 def length(metres: float) -> str:
@@ -134,15 +145,9 @@ def loads_text(forces: Array, one: str, several: str) -> str:
     return f"{several.format(len(sizes))}, {min(sizes):.4g} to {max(sizes):.4g} N"
 
 
-def _end(value: float, half: float) -> str:
-    if math.isinf(value):
-        return "∞" if value > 0 else "-∞"
-    return rounded_alike(value, half)
-
-
-def _round(value: float, decimals: int) -> float:
-    """Rounded, and never -0."""
-    return round(value, decimals) + 0.0
+def _fixed(value: float, decimals: int) -> str:
+    """Rounded, also to tens, and never -0."""
+    return f"{round(value, decimals) + 0.0:.{max(decimals, 0)}f}"
 
 
 def short_name(name: str, most: int = 12) -> str:
@@ -156,12 +161,8 @@ def counted(n: int, one: str, many: str | None = None) -> str:
     return f"{n} {one if n == 1 else many or one + 's'}"
 
 
-def signed(value: float) -> str:
-    return f"{'-' if value < 0 else '+'}{significant(abs(value))}"
-
-
-def signed_change(metres: float) -> str:
-    return f"{'-' if metres < 0 else '+'}{length(abs(metres))}"
+def signed(value: float, told: Callable[[float], str] = significant) -> str:
+    return f"{'-' if value < 0 else '+'}{told(abs(value))}"
 
 
 MINUS = re.compile(r"(?<![\w.)\]-])-(?=[\d.∞])|(?<= )-(?= )")
@@ -217,7 +218,7 @@ def budget_table(
     """Steps (name, held-out rms in m, its 95 % interval) and what each changes; `floor` last."""
     rows: list[tuple[str, ...]] = []
     for k, (name, rms, ci95) in enumerate(steps):
-        change = signed_change(rms - steps[k - 1][1]) if k else ""
+        change = signed(rms - steps[k - 1][1], length) if k else ""
         rows.append((name, length(rms), " to ".join(map(length, ci95)), change))
     if floor is not None:
         rows.append((floor[0], length(floor[1]), "", ""))
@@ -246,3 +247,242 @@ def first_stops(plan: Plan) -> dict[int, int]:
 def resource(name: str) -> str:
     """The text of a file beside this module."""
     return (resources.files("elastocal.report") / name).read_text(encoding="utf-8")
+
+
+# Effects in words
+
+# Places that are the only one their effects have: "base drift", not "base drift at base".
+SINGLE = ("base", "wrist", "load", "tracker", "arm")
+STAGES = {
+    "transmission": "transmission",
+    "geometry": "links",
+    "load": "loads",
+    "compliance": "compliance",
+    "tool": "tool and markers",
+    "tracker": "tracker",
+}
+LONG_TIME = 120.0  # s, from which on times are told in minutes
+
+
+def plain_name(name: str) -> str:
+    """ "gear_eccentricity" → "gear eccentricity"."""
+    return printable(name).replace("_", " ")
+
+
+def place(where: str) -> str:
+    """ "joint2" → "joint 2", "marker:M_1" → "marker M_1", "all" → "all links"."""
+    if where.startswith("marker:"):
+        return f"marker {printable(where.removeprefix('marker:'))}"
+    if where == "all":
+        return "all links"
+    return re.sub(r"^([a-z]+)([0-9]+)$", r"\1 \2", printable(where))
+
+
+def effect_at(e: EffectAt | FoundEffect | Candidate) -> str:
+    """ "gear eccentricity at joint 2", "base drift", "marker slip of marker M1"."""
+    return effect_at_places(e.effect, [e.where])
+
+
+KINDS_OF_PLACE = re.compile(r"(joint|link)([0-9]+)")
+# Steps of a budget that are no effects.
+STEPS = {"unknown": "what has no name", "rest": "the smaller causes"}
+
+
+def places(where: Iterable[str], runs: bool = False) -> str:
+    """ "joints 1, 2 and 5", "link 3 and base"; with `runs` "joints 1 to 4 and 6"."""
+    numbers: dict[str, list[int]] = {}
+    told = []
+    for one in where:
+        if match := KINDS_OF_PLACE.fullmatch(one):
+            numbers.setdefault(match[1], []).append(int(match[2]))
+        else:
+            told.append(place(one))
+    for kind, found in reversed(numbers.items()):
+        each: list[list[int]] = []  # numbers that follow each other
+        for n in sorted(found):
+            if runs and each and n == each[-1][-1] + 1:
+                each[-1].append(n)
+            else:
+                each.append([n])
+        texts = ([f"{r[0]} to {r[-1]}"] if len(r) > 2 else map(str, r) for r in each)
+        several = together([text for run in texts for text in run])
+        told.insert(0, f"{kind}{'s' * (len(found) > 1)} {several}")
+    return together(told)
+
+
+def effect_at_places(effect: str, where: Sequence[str]) -> str:
+    """ "gear errors at joints 1, 2 and 5", "thermal expansion of links 2 and 3"."""
+    name = STEPS.get(effect, plain_name(effect))
+    if effect not in STEPS and len(where) == 1 and where[0] in SINGLE:
+        return name
+    of_what = all(w == "all" or w.startswith(("marker:", "link")) for w in where)
+    return f"{name} {'of' if of_what and effect not in STEPS else 'at'} {places(where)}"
+
+
+def name_of(text: str) -> str:
+    """A step of the budget or a rival: "base_frame", "link_bending at link2", "backlash:joint3",
+    "gear_errors:joint1+joint2"."""
+    effect, colon, where = text.replace(" at ", ":", 1).partition(":")
+    if not colon:
+        return STEPS.get(text) or driver_name(plain_name(text))
+    several = where.split("+")
+    # A marker may be called "M+1".
+    known = all(
+        KINDS_OF_PLACE.fullmatch(w) or w in ("all", *SINGLE) or w.startswith("marker:")
+        for w in several
+    )
+    return effect_at_places(effect, several if known else [where])
+
+
+def driver_name(driver: str) -> str:
+    """ "joint2 angle" → "joint 2 angle"."""
+    return re.sub(r"\b(joint|link)([0-9]+)\b", r"\1 \2", printable(driver))
+
+
+def probability(p: float) -> str:
+    """Two decimals, and never a certainty."""
+    if not math.isfinite(p):
+        return "–"
+    if p > 0.995:
+        return "> 0.99"
+    return "< 0.01" if p < 0.005 else f"{p:.2f}"
+
+
+def p_value(p: float) -> str:
+    """Two digits, or that it is below the smallest that is told."""
+    from elastocal.diagnosis.diagnosis import SMALLEST_P
+
+    if not math.isfinite(p):
+        return "–"
+    return f"< {SMALLEST_P:.4f}" if p <= SMALLEST_P else significant(p, 2)
+
+
+def size_of(p: float) -> str:
+    """ "p = 0.02", "p < 0.0001"."""
+    text = p_value(p)
+    return f"p {text}" if text.startswith("<") else f"p = {text}"
+
+
+def percent(fraction: float) -> str:
+    return f"{round(100 * fraction)} %" if math.isfinite(fraction) else "none"
+
+
+def reduction(f: FoundEffect) -> str:
+    """ "75 % (63 to 84 %)"."""
+    low, high = f.gap_reduction_ci95
+    if not (math.isfinite(low) and math.isfinite(high)):
+        return percent(f.gap_reduction)
+    return f"{percent(f.gap_reduction)} ({round(100 * low)} to {percent(high)})"
+
+
+def settings_text(settings: Mapping[str, float], lines: Sequence[float] = ()) -> str:
+    """Searched constants with their units: "jump time 12.0 min, ripple order 101"; for want of
+    times a moment is one between the `lines` of the table at which visits begin."""
+    ends = {key: key.replace("_low_", "_high_") for key in settings if "_low_" in key}
+    pairs = {low: high for low, high in ends.items() if high in settings}
+    # What all names begin with says nothing.
+    first = {key.partition("_")[0] + "_" for key in settings}
+    begin = first.pop() if len(first) == 1 < len(settings) else ""
+    texts = []
+    for key, value in settings.items():
+        if LINE.fullmatch(key) or key.endswith(REFERENCE):
+            continue
+        if lines and key.endswith("_time_s"):
+            later = min((line for line in lines if line > value), default=value)
+            texts.append(f"before line {later:.0f} of the table, by the order of its rows")
+        elif key in pairs:
+            high = setting_value(pairs[key], settings[pairs[key]])
+            texts.append(f"from {setting_value(key, value)} to {high}")
+        elif key not in pairs.values():
+            name = plain_name(_name_and_unit(key)[0].removeprefix(begin))
+            texts.append(f"{name} {setting_value(key, value)}")
+    return ", ".join([*texts, *_orders(settings)])
+
+
+LINE = re.compile(r"order_(sd_)?[0-9]+")  # of a spectrum: an order and how uncertain it is
+REFERENCE = "_centre_rad"  # where phases count from says nothing
+MOST_ORDERS = 6
+
+
+def _orders(settings: Mapping[str, float]) -> list[str]:
+    """ "orders 1.000 ± 0.002, 18.52 ± 0.03 and 4 more", with 95 % half widths."""
+    told = []
+    orders = [key for key in settings if (line := LINE.fullmatch(key)) and not line[1]]
+    for key in orders[:MOST_ORDERS]:
+        sd = settings.get(key.replace("_", "_sd_"), 0.0)
+        value, half = with_uncertainty(settings[key], 1.96 * sd)
+        told.append(f"{value} ± {half}" if sd > 0 else significant(settings[key], 4))
+    if more := len(orders) - len(told):
+        told.append(f"{more} more")
+    return [f"order{'s' * (len(orders) > 1)} {together(told)}"] if told else []
+
+
+def _name_and_unit(key: str) -> tuple[str, str]:
+    name, _, unit = key.rpartition("_")
+    return (name, unit) if unit in ("s", "rad") and name else (key, "")
+
+
+def setting_value(key: str, value: float) -> str:
+    """A searched constant in the unit of its key, "12.0 min" or "5.7°"; a size in mrad."""
+    unit = _name_and_unit(key)[1]
+    if unit == "rad":
+        if "size" in key:
+            return f"{significant(value * 1e3)} mrad"
+        return f"{significant(math.degrees(value))}°"
+    if unit != "s":
+        return significant(value, 4)
+    if abs(value) < LONG_TIME:
+        return f"{significant(value)} s"
+    return f"{significant(value / 60)} min"
+
+
+# What can be fitted, as rows: each effect of the catalogue with its unit, size, places, words.
+
+
+def effect_entries(cell: Cell | str | Path) -> list[dict[str, Any]]:
+    """Per effect, in the catalogue's order: name, stage, what it is, places, parameters.
+
+    Places and sizes are those of the cell's arm.  An effect that the cell fits is `on`.  A
+    parameter's typical size is null where only the readings say it.
+    """
+    given = cell_of(cell)
+    chain = load_chain(given)
+    given = numbered(given, chain)
+    on, entries = {choice.name for choice in given.model.effects}, []
+    for effect in CATALOGUE.values():
+        where = effect.places(chain, given)
+        try:
+            parameters = effect.parameters(where[0], chain, given) if where else ()
+        except InputError:  # of link weights without masses: settings of the cell make them
+            parameters = ()
+        entries.append({
+            "name": effect.name, "stage": effect.stage,
+            "on": effect.name in on or effect.acts_unasked(given), "what": what_it_is(effect),
+            "places": list(where), "needs": list(effect.needed(given)),
+            "parameters": [
+                {"key": p.key, "unit": p.unit, "nominal": p.nominal, "typical": p.typical}
+                for p in parameters
+            ],
+        })  # fmt: skip
+    return entries
+
+
+def what_it_is(effect: Effect) -> str:
+    """The first paragraph of the effect's own text, on one line."""
+    first = inspect.cleandoc(type(effect).__doc__ or "").split("\n\n")[0]
+    return " ".join(first.split())
+
+
+def effect_head(entry: dict[str, Any]) -> str:
+    """Name (* where it is on), places and typical sizes by unit of an effect, for people."""
+    sizes: dict[str, list[float]] = {}
+    for p in entry["parameters"]:
+        value, unit = display(p["typical"] or 0.0, p["unit"])
+        sizes.setdefault(unit, []).append(float(f"{value:.2g}"))
+    told = []
+    for unit, found in sizes.items():
+        ends = dict.fromkeys(f"{v:g}" for v in (min(found), max(found)))
+        told.append(f"{' to '.join(ends)} {unit}" if max(found) else f"{unit}, as the readings say")
+    where = places(entry["places"], runs=True) or "nowhere here"
+    what = ", ".join(told) or "no size of its own"
+    return f"{entry['name']}{' *' * entry['on']}: {where}; {what}"

@@ -3,9 +3,10 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import replace
 from functools import cache
+from typing import TYPE_CHECKING
 
 import numpy as np
 
@@ -62,6 +63,9 @@ from elastocal.report.formatting import (
 from elastocal.report.judgement_view import judgement, warnings_beside
 from elastocal.text import listed, printable
 from elastocal.units import Array
+
+if TYPE_CHECKING:
+    from elastocal.report.figures import Residuals
 
 Truth = dict[str, float]
 Published = Mapping[str, tuple[float, float]]
@@ -124,21 +128,8 @@ def _blocks(
         *([("Truth", held)] if truth else []),
         *(("Outliers", text) for text in words.fault_lines(result, MOST_GROUPS)),
     ])  # fmt: skip
-    yield Fold("", lambda: _residual_figures(result), figures=("residuals", "against_joints"))
+    yield Fold("", lambda: _residuals(result).figures(), figures=("residuals", "against_joints"))
     yield _open_if_few(words.smooth_table(result), "Smooth functions")
-    yield from _folds(result, truth, budget)
-
-
-def _open_if_few(table: ShownTable, summary: str) -> Block:
-    if len(table.rows) <= FEW:
-        return table
-    return Fold(f"{summary} ({len(table.rows)})", lambda: [table], printed=True)
-
-
-def _folds(
-    result: Calibration, truth: Truth | None, budget: Callable[[], ErrorBudget | None]
-) -> Iterator[Block]:
-    """What stands behind the answer."""
     yield Fold("Method, noise and intervals", lambda: _method(result), printed=True)
     missing = undetermined_table(result, truth)
     if missing.rows:
@@ -154,32 +145,34 @@ def _folds(
         yield Fold("Correlations over 0.9", lambda: [_correlation_table(result)], printed=True)
     yield Fold("Errors in numbers", lambda: _errors(result, budget()))
     yield Fold(
-        "Residuals on the arm, over time and by group",
-        lambda: _residuals(result),
+        "Residuals on the arm, over time and by group", lambda: _on_the_arm(result),
         figures=("space", "over_time"),
-    )
+    )  # fmt: skip
     single = len(result.outliers) + len(result.excluded)
     if single or words.fault_lines(result):
         yield Fold(f"Outliers ({single})", lambda: _outliers(result))
     yield Fold("Which configurations decide the fit", lambda: [_influence_table(result)])
 
 
+def _open_if_few(table: ShownTable, summary: str) -> Block:
+    if len(table.rows) <= FEW:
+        return table
+    return Fold(f"{summary} ({len(table.rows)})", lambda: [table], printed=True)
+
+
 def _key(result: Calibration, budget: ErrorBudget | None) -> KeyFigures:
     """The error before and after, and the noise that is in both."""
-    floor = None if budget is None else budget.floor
     held = math.isfinite(result.heldout_rms)
     after = result.heldout_rms if held else result.residual_rms
-    headline = f"{length(result.nominal_rms)} → {length(after)}"
-    headline += "" if floor is None else f" (noise {length(floor)})"
     figures = [(NOMINAL, length(result.nominal_rms))]
     figures.append(("held-out poses" if held else "fitted poses, not held out", length(after)))
     if result.test is not None:
         figures.append(("test data", length(result.test.rms)))
     if (at := result.verdict.at) is not None:
         figures.append(("new poses, without noise", f"≤ {length(at)}"))
-    if floor is not None and budget is not None:
-        figures.append((f"noise ({budget.floor_name})", length(floor)))
-    return KeyFigures(headline, figures)
+    if budget is not None and budget.floor is not None:
+        figures.append((f"noise ({budget.floor_name})", length(budget.floor)))
+    return KeyFigures(figures)
 
 
 def _error_figures(result: Calibration, budget: ErrorBudget | None) -> Iterator[Block]:
@@ -191,22 +184,19 @@ def _error_figures(result: Calibration, budget: ErrorBudget | None) -> Iterator[
         yield found
 
 
-def _residual_figures(result: Calibration) -> Iterator[Block]:
-    from elastocal.report.figures import over_configurations, over_joints, residuals_by
+def _residuals(result: Calibration) -> Residuals:
+    from elastocal.report.figures import Residuals
 
-    residuals = residuals_by(result.observations, result.residual)
-    yield over_configurations(residuals)
-    yield over_joints(result.model.chain.kinds, residuals)
+    return Residuals(result.model, result.observations, result.residual)
 
 
-def _residuals(result: Calibration) -> Iterator[Block]:
+def _on_the_arm(result: Calibration) -> Iterator[Block]:
     from elastocal.report.arm_view import residual_arm
-    from elastocal.report.figures import over_time, residual_table, residuals_by
 
-    residuals = residuals_by(result.observations, result.residual)
+    residuals = _residuals(result)
     yield residual_arm(result.model, result.observations, result.x, result.residual)
-    yield from over_time(result.observations, residuals)
-    yield residual_table(result.observations, residuals)
+    yield from residuals.over_time()
+    yield residuals.table()
 
 
 def _method(result: Calibration) -> Iterator[Block]:

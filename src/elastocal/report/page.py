@@ -1,6 +1,7 @@
-"""The blocks of a result as HTML: pages that need no network and no other file.
+"""The blocks of a result as HTML: pages that need no network and no other file, and what a notebook
+shows of itself, with figures and data frames.
 
-Every text is escaped by `_text`; what is not text was made here.  The style sheet and the script
+Every text is escaped by `text_of`; what is not text was made here.  The style sheet and the script
 lie beside this module.
 """
 
@@ -13,15 +14,21 @@ import platform
 import re
 from collections.abc import Callable, Iterable, Mapping
 from datetime import date
-from functools import cache
+from functools import cache, partial
 from html import escape
 from importlib import metadata
+from io import BytesIO, StringIO
 from itertools import groupby
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
 
 from elastocal import __version__
+from elastocal.compensation.compensate import commands_csv, in_file_units, joint_columns
+from elastocal.errors import InputError, require
 from elastocal.files import atomic_write_text, check_ending, open_input
+from elastocal.model.effects.catalogue import effect_of
 from elastocal.report.blocks import (
     WARNING,
     Block,
@@ -34,10 +41,20 @@ from elastocal.report.blocks import (
     ShownArm,
     ShownTable,
     ShownVerdict,
+    report_of,
+    unfolded,
 )
-from elastocal.report.formatting import resource, typeset
-from elastocal.report.terminal import report_of
+from elastocal.report.formatting import first_stops, resource, typeset
 from elastocal.screen import shown
+from elastocal.text import cell_meaning, did_you_mean, listed, quoted
+
+if TYPE_CHECKING:
+    import pandas as pd
+
+    from elastocal.compensation.compensate import Compensation
+    from elastocal.diagnosis.diagnosis import Diagnosis
+    from elastocal.identification.result import Calibration
+    from elastocal.planning.plan import Plan
 
 LIBRARIES = ("numpy", "scipy", "casadi")  # that the numbers depend on
 Inputs = Mapping[str, str] | Iterable[str | Path] | None
@@ -157,9 +174,17 @@ def html_of(
 
 def _html(block: Block, deep: int, pictures: bool, summary: str) -> str:
     if isinstance(block, ShownVerdict):
-        return _verdict(block)
+        tone = '<span class="tone" aria-hidden="true"></span>'
+        return (
+            f'<section class="judgement {block.tone}" aria-label="Verdict"><p class="headline">'
+            f"{tone} {text_of(block.sentence)}</p></section>"
+        )
     if isinstance(block, KeyFigures):
-        return _key(block)
+        figures = "".join(
+            f"<div><dt>{text_of(name)}</dt><dd>{text_of(number)}</dd></div>"
+            for name, number in block.figures
+        )
+        return f'<dl class="key">{figures}</dl>'
     if isinstance(block, Heading):
         return f"<h{deep}>{text_of(block.text)}</h{deep}>"
     if isinstance(block, Sentence):
@@ -167,7 +192,7 @@ def _html(block: Block, deep: int, pictures: bool, summary: str) -> str:
     if isinstance(block, Lines):
         return _lines(block)
     if isinstance(block, ShownTable):
-        return _titled_table(block, deep, summary) if block.rows else ""
+        return _table(block, deep, summary) if block.rows else ""
     if isinstance(block, Fold):
         if not (pictures or block.printed):
             return ""
@@ -176,22 +201,6 @@ def _html(block: Block, deep: int, pictures: bool, summary: str) -> str:
             return inside
         return f"<details><summary>{text_of(block.summary)}</summary>\n{inside}</details>"
     return _picture(block) if pictures else ""
-
-
-def _verdict(v: ShownVerdict) -> str:
-    tone = '<span class="tone" aria-hidden="true"></span>'
-    return (
-        f'<section class="judgement {v.tone}" aria-label="Verdict"><p class="headline">{tone} '
-        f"{text_of(v.sentence)}</p></section>"
-    )
-
-
-def _key(key: KeyFigures) -> str:
-    figures = "".join(
-        f"<div><dt>{text_of(name)}</dt><dd>{text_of(number)}</dd></div>"
-        for name, number in key.figures
-    )
-    return f'<p class="change">{text_of(key.headline)}</p><dl class="key">{figures}</dl>'
 
 
 def _lines(block: Lines) -> str:
@@ -205,14 +214,11 @@ def _lines(block: Lines) -> str:
     return f'<dl class="lines">{"".join(parts)}</dl>' if parts else ""
 
 
-def _titled_table(t: ShownTable, deep: int, summary: str) -> str:
+def _table(t: ShownTable, deep: int, summary: str) -> str:
     told = not t.title or summary.startswith(t.title.partition(" (")[0])
     title = "" if told else f"<h{deep}>{text_of(t.title)}</h{deep}>\n"
     below = f'\n<p class="soft">{text_of(t.note)}</p>' if t.note else ""
-    return f"{title}{_table(t)}{below}"
-
-
-def _table(t: ShownTable) -> str:
+    slug = re.findall(r"[a-z0-9]+", re.split("[(,]", t.title or t.heads[0])[0].lower())
     kinds = ["name" if k in t.words else "number" for k in range(len(t.heads))]
     heads = [
         f'<th scope="col" class="{kind}">{text_of(head)}</th>'
@@ -227,8 +233,8 @@ def _table(t: ShownTable) -> str:
         rows.append(f"<tr>{''.join(cells)}</tr>")
     body = "\n".join(rows)
     return (
-        f'<table class="data" data-name="{_slug(t.title or t.heads[0])}"><thead>'
-        f"<tr>{''.join(heads)}</tr></thead>\n<tbody>{body}</tbody></table>"
+        f'{title}<table class="data" data-name="{"-".join(slug)}"><thead>'
+        f"<tr>{''.join(heads)}</tr></thead>\n<tbody>{body}</tbody></table>{below}"
     )
 
 
@@ -239,19 +245,13 @@ def _cell(kind: str, head: str, text: str) -> str:
     return f'<td class="{kind}{tone}" data-head="{before}">{text_of(text)}</td>'
 
 
-def _slug(title: str) -> str:
-    """ "Predicted intervals (95 %)" → "predicted-intervals"."""
-    return "-".join(re.findall(r"[a-z0-9]+", re.split("[(,]", title)[0].lower()))
-
-
 def _picture(block: Figure | ShownArm) -> str:
+    from elastocal.report.figures import svg
+
     caption = f"<figcaption>{text_of(block.caption)}</figcaption>" if block.caption else ""
     if isinstance(block, Figure):
-        from elastocal.report.figures import svg
-
         return f"<figure>{svg(block)}{caption}</figure>"
     from elastocal.report.arm_view import space_figure
-    from elastocal.report.figures import svg
 
     return (
         f'<figure class="view"><div class="still">{svg(space_figure(block))}</div>'
@@ -297,3 +297,148 @@ def digests(inputs: Inputs) -> dict[str, str]:
         with open_input(path, "input file") as handle:
             found[str(path)] = hashlib.file_digest(handle, "sha256").hexdigest()  # type: ignore[arg-type]
     return found
+
+
+# In a notebook (found by elastocal.above): HTML, figures and data frames
+
+# What `plot` draws where nothing else is asked for, if not the first figure.
+DEFAULTS = {"Calibration": "residuals", "Diagnosis": "budget"}
+
+
+def html(result: object) -> str:
+    """A result as HTML; every text is escaped."""
+    return html_of(report_of(result).blocks, 4, pictures=False)
+
+
+def plot(result: object, kind: str | None, interactive: bool, ax: Any = None) -> Any:
+    """The figure `kind` of a result: matplotlib's, in the place of `ax` where that is given, or of
+    the arm plotly's where `interactive`.
+
+    Raises InputError for a kind that the result does not have, and one that cannot be turned.
+    """
+    folds = [block for block in report_of(result).blocks if isinstance(block, Fold)]
+    every = [name for fold in folds for name in fold.figures]
+    arms = [name for name in every if name in ("space", "poses")]
+    chosen = kind or DEFAULTS.get(type(result).__name__, every[0])
+    if interactive and kind is None and arms:
+        chosen = arms[0]
+    opened = unfolded(folds, lambda fold: chosen in fold.figures)
+    found = [b for b in opened if isinstance(b, Figure | ShownArm) and b.name == chosen]
+    if not found:
+        opened = unfolded(folds, lambda fold: bool(fold.figures))
+        there = [block.name for block in opened if isinstance(block, Figure | ShownArm)]
+        raise InputError(
+            f"no figure {quoted(chosen)}{did_you_mean(chosen, there)}; there are {listed(there)}"
+        )
+    if interactive:
+        if not isinstance(found[0], ShownArm):
+            told = f"; interactive=True turns the arm: {listed(arms)}" if arms else ""
+            raise InputError(f"the figure {quoted(chosen)} stands still{told}")
+        from elastocal.report.arm_view import turned
+
+        return turned(found[0].space)
+    from elastocal.report.arm_view import space_figure
+    from elastocal.report.figures import figure_of
+
+    block = found[0]
+    drawn = space_figure(block) if isinstance(block, ShownArm) else block
+    if ax is not None:
+        spot = getattr(ax, "get_subplotspec", lambda: None)()
+        require(spot is not None, "`ax` takes axes that plt.subplots or Figure.subplots made")
+        ax.remove()
+        return figure_of(drawn, spot.get_gridspec().figure.add_subfigure(spot))
+    figure: Any = figure_of(drawn)
+    # So that a notebook shows it although pyplot, whose hooks do so, is not loaded.
+    figure._repr_png_ = partial(_png, figure)
+    return figure
+
+
+def _png(figure: Any) -> bytes:
+    picture = BytesIO()
+    figure.savefig(picture, format="png", dpi=100, facecolor="white")
+    return picture.getvalue()
+
+
+def frame(result: Any) -> pd.DataFrame:
+    import pandas as pd
+
+    kind = type(result).__name__
+    if kind == "Comparison":
+        return pd.DataFrame([vars(change) for change in result.changes])
+    return result.to_dataframe() if kind == "Measurements" else FRAMES[kind](result)
+
+
+def _estimates(result: Calibration) -> pd.DataFrame:
+    """One row per parameter, SI units: NaN where the data do not determine it alone."""
+    import pandas as pd
+
+    rows = [
+        {"parameter": e.name, "unit": e.unit, "value": e.value, "std": e.std}
+        | dict(zip(("ci95_low", "ci95_high"), e.ci95 or (None, None), strict=True))
+        | {"nominal": e.nominal, "held": e.held, "identifiable": e.identifiable}
+        | {"combined_with": ", ".join(e.combined_with), "note": e.note}
+        for e in result.estimates
+    ]
+    frame = pd.DataFrame(rows)
+    numbers = ["value", "std", "ci95_low", "ci95_high", "nominal", "held"]
+    return frame.astype(dict.fromkeys(numbers, float))
+
+
+def _plan_frame(plan: Plan | None) -> pd.DataFrame:
+    """One row per pose: joints in ° or mm, place in the order, and the load where it states one."""
+    import pandas as pd
+
+    if plan is None:
+        return pd.DataFrame()
+    columns: dict[str, Any] = {"configuration": list(plan.configurations)}
+    kinds = plan.model.chain.kinds
+    columns |= dict(zip(joint_columns(kinds), in_file_units(plan.q, kinds).T, strict=True))
+    if plan.level_joint is not None:
+        columns["level"] = plan.group + 1
+    order = first_stops(plan)
+    columns["order"] = [order.get(k) for k in range(len(plan.q))]
+    return pd.DataFrame(columns)
+
+
+def _candidates(d: Diagnosis) -> pd.DataFrame:
+    """One row per hypothesis, best first; whether it is held to be real; `score` in nats.
+
+    What was found only where all causes are judged together comes first, without a score.
+    """
+    import pandas as pd
+
+    found = {(f.effect, f.where): f for f in d.effects}
+    tried = {(c.effect, c.where): c for c in d.candidates}
+    rows = []
+    for key in dict.fromkeys([*(key for key in found if key not in tried), *tried]):
+        f, c = found.get(key), tried.get(key)
+        rows.append(
+            {
+                "effect": key[0], "where": key[1], "stage": effect_of(key[0]).stage,
+                "probability": getattr(c or f, "probability", np.nan),
+                "score": getattr(c, "score", np.nan),
+                "detectable": getattr(c, "detectable", np.nan), "found": f is not None,
+                "gap_reduction": getattr(f, "gap_reduction", np.nan),
+            }
+        )  # fmt: skip
+    return pd.DataFrame(rows)
+
+
+def _commands(c: Compensation) -> pd.DataFrame:
+    """One row per target: the columns of the commands file, NaN where a target is not reached."""
+    import pandas as pd
+
+    text = StringIO(commands_csv(c, c.chain.kinds))
+    frame = pd.read_csv(text, dtype={"configuration": str}, keep_default_na=False, na_values=[""])
+    if "configuration" in frame:
+        frame["configuration"] = frame["configuration"].map(cell_meaning, na_action="ignore")
+    return frame
+
+
+FRAMES: dict[str, Callable[[Any], pd.DataFrame]] = {
+    "Calibration": _estimates,
+    "Plan": _plan_frame,
+    "NextPoses": lambda found: _plan_frame(found.plan),
+    "Diagnosis": _candidates,
+    "Compensation": _commands,
+}

@@ -76,18 +76,16 @@ def _next_blocks(found: NextPoses) -> Iterator[Block]:
 
 
 def _key(plan: Plan) -> KeyFigures:
-    n, minutes = counted(len(plan.q), "pose"), f"{plan.execution.total / 60:.0f} min"
     worth = f"{plan.criterion} = {plan.reported:.4g} {plan.unit}".rstrip()
-    figures = [("poses", str(len(plan.q)))]
+    figures = [("poses", str(len(plan.q))), ("criterion", worth)]
     if plan.of_test_poses:
-        worth = f"{_rho(plan):.3g} µm"
-        figures.append(("error at the test poses", worth))
+        figures[1] = ("error at the test poses", f"{_rho(plan):.3g} µm")
     if (e := plan.everywhere) is not None:
         figures.append(("error over the joint ranges", f"{e.elsewhere * 1e6:.3g} µm"))
-    figures.append(("time", minutes))
+    figures.append(("time", f"{plan.execution.total / 60:.0f} min"))
     if len(figures) < 4:
         figures.append(("load states", str(len(plan.forces))))
-    return KeyFigures(f"{n} → {worth}, {minutes}", figures)
+    return KeyFigures(figures)
 
 
 def _arm(plan: Plan) -> Block:

@@ -51,7 +51,7 @@ def changes_report(c: Comparison) -> Report:
 
 
 def _changes(c: Comparison) -> Iterator[Block]:
-    from elastocal.report.effect_names import size_of
+    from elastocal.report.formatting import size_of
 
     rms, noise = (length(float(np.sqrt(np.mean(v**2)))) for v in (c.distance, c.chance))
     most = length(float(c.distance.max()))
@@ -59,7 +59,7 @@ def _changes(c: Comparison) -> Iterator[Block]:
         ("the tool has moved, rms", rms), ("at most", most), ("noise alone", noise),
         ("all parameters together", size_of(c.p)),
     ]  # fmt: skip
-    yield Fold("", lambda: [KeyFigures(f"moved by {rms} (noise {noise})", figures)])
+    yield Fold("", lambda: [KeyFigures(figures)])
     same = c.verdict == "no_change_shown" and not c.one_result
     yield ShownVerdict("good" if same else "warn", _changed(c))
     moved = (
@@ -126,7 +126,7 @@ def _under(c: Comparison) -> str:
 
 def _change_table(c: Comparison) -> ShownTable:
     """A row for each parameter, the changed first, then by their effect at the tool."""
-    from elastocal.report.effect_names import p_value
+    from elastocal.report.formatting import p_value
 
     heads = ("parameter", "old", "new", "change", "± std", "unit", "p (Holm)", "moves the tool", "")
     rows = []
