@@ -182,8 +182,7 @@ class Space:
     @property
     def bodies(self) -> list[Array]:
         """Points (k, 3) m of the arm's bodies in the first pose."""
-        frames = self.poses[self.first].frames
-        placed = [(s.points, frames[s.carrier]) for s in self.shells.arm]
+        placed = [(s.points, self.poses[self.first].frames[s.carrier]) for s in self.shells.arm]
         return [points @ T[:3, :3].T + T[:3, 3] for points, T in placed]
 
     @cached_property
@@ -227,7 +226,7 @@ class Space:
                 for s in shells
             ]  # fmt: skip
 
-        content = {
+        return in_script({
             "what": self.what, "first": self.first, "scale": self.scale, "arrows": self.has_arrows,
             "range": flat(self.extent.T, 3), "tracker": flat(self.tracker, 3),
             "bodies": bodies(self.shells.arm), "things": bodies(self.shells.around),
@@ -239,8 +238,7 @@ class Space:
                  "arrows": flat(None if p.arrows is None else p.arrows * 1e6, 2)}
                 for p in self.poses
             ],
-        }  # fmt: skip
-        return in_script(content)
+        })  # fmt: skip
 
 
 def in_script(content: object) -> str:
@@ -298,9 +296,23 @@ def residual_arm(
     key = np.column_stack([observed.configuration, force])
     _, first, entry = np.unique(key, axis=0, return_index=True, return_inverse=True)
     entry = entry.ravel()
-    at, vectors = _vectors(model, observed, x, residual)
+    # Where markers were seen, or the model puts them if only a distance was; of a residual of a
+    # pose the position's, of a distance's along the line from its anchor.
+    vectors = residual.reshape(-1, observed.size)
+    places = model.target_poses(table, x)[1] if table.position is None else table.position
+    at = places[observed.lead]
+    if observed.kind == "distance":
+        anchor = model.cell.tracker.anchor
+        line = at - (np.zeros(3) if anchor is None else anchor)
+        vectors = vectors * line / np.linalg.norm(line, axis=1, keepdims=True)
+    vectors = vectors[:, :3]
     rms = np.sqrt(np.bincount(entry, (vectors**2).sum(axis=1)) / np.bincount(entry))
-    chosen = _chosen(rms, np.argsort(first))
+    chosen = np.argsort(first)  # in the table's order
+    if len(rms) > MOST_POSES:
+        worst = np.argsort(-rms)[:WORST]
+        rest = np.setdiff1d(chosen, worst)
+        drawn = np.random.default_rng(0).choice(rest, MOST_POSES - WORST, replace=False)
+        chosen = chosen[np.isin(chosen, np.concatenate([worst, drawn]))]
     rows = observed.lead[first[chosen]]
     frames, flange = frames_at(
         model.cell, model.chain, table.q[rows], model.flange_poses(table.take(rows), x)
@@ -312,22 +324,19 @@ def residual_arm(
         markers = np.unique(marker[own])
         groups = [own[marker[own] == m] for m in markers]
         name = table.configuration_labels[table.configuration[rows[k]]]
-        poses.append(
-            Posed(
-                f"{name}, {load_text(table.force[rows[k]])}" if several else name,
-                f"rms residual {length(float(rms[code]))} of {len(own)} readings",
-                frames[k],
-                flange[k],
-                np.array([at[g].mean(axis=0) for g in groups]),
-                tuple(table.marker_names[m] for m in markers),
-                np.array([vectors[g].mean(axis=0) for g in groups]),
-            )
-        )
-    worst = int(np.argmax(rms[chosen]))
-    space = space_of(model.cell, model.chain, poses, worst, "configuration")
+        poses.append(Posed(
+            f"{name}, {load_text(table.force[rows[k]])}" if several else name,
+            f"rms residual {length(float(rms[code]))} of {len(own)} readings", frames[k], flange[k],
+            np.array([at[g].mean(axis=0) for g in groups]),
+            tuple(table.marker_names[m] for m in markers),
+            np.array([vectors[g].mean(axis=0) for g in groups]),
+        ))  # fmt: skip
+    first_shown = int(np.argmax(rms[chosen]))
+    space = space_of(model.cell, model.chain, poses, first_shown, "configuration")
     text = (
         f"Mean residual of each marker as an arrow, {space.scale:g} times as long as it is, in "
-        f"configuration {printable(poses[worst].name)}, which has the largest, and in all of them. "
+        f"configuration {printable(poses[first_shown].name)}, which has the largest, and in all of "
+        "them. "
         f"The arm is drawn as {space.shells.drawn_from}."
     )
     if len(poses) < observed.n_configurations:
@@ -336,31 +345,6 @@ def residual_arm(
             "largest residuals, and a random choice."
         )
     return blocks.ShownArm("space", space, "Residuals as arrows on the posed arm", text)
-
-
-def _vectors(
-    model: Model, observed: Observations, x: Array, residual: Array
-) -> tuple[Array, Array]:
-    """Where markers (N, 3) were seen, or the model puts them if only a distance was, and residuals
-    (N, 3): of a pose the position's, of a distance along the line from its anchor."""
-    table, vectors = observed.table, residual.reshape(-1, observed.size)
-    places = model.target_poses(table, x)[1] if table.position is None else table.position
-    at = places[observed.lead]
-    if observed.kind == "distance":
-        anchor = model.cell.tracker.anchor
-        line = at - (np.zeros(3) if anchor is None else anchor)
-        vectors = vectors * line / np.linalg.norm(line, axis=1, keepdims=True)
-    return at, vectors[:, :3]
-
-
-def _chosen(rms: Array, order: IntArray) -> IntArray:
-    """The entries to show, in the table's order."""
-    if len(rms) <= MOST_POSES:
-        return order
-    worst = np.argsort(-rms)[:WORST]
-    rest = np.setdiff1d(order, worst)
-    drawn = np.random.default_rng(0).choice(rest, MOST_POSES - WORST, replace=False)
-    return order[np.isin(order, np.concatenate([worst, drawn]))]
 
 
 def plan_arm(plan: Plan) -> blocks.ShownArm:
@@ -457,8 +441,19 @@ def _draw(axes: Axes, space: Space, view: Array, whole: bool) -> None:
     if not whole:  # the furthest first
         for points in sorted((b @ view.T for b in space.bodies), key=lambda p: p[:, 2].mean()):
             _fill(axes, points, ARM, 1.0)
-    elif not space.has_arrows:
-        _tips(axes, space, view)
+    elif not space.has_arrows:  # the flange of each pose: its group by colour and sign, its name
+        tips = np.array([pose.line[-1] for pose in space.poses]) @ view.T
+        group = np.array([pose.group for pose in space.poses])
+        for k in np.unique(group):
+            own = tips[group == k]
+            name = f"{printable(space.groups[k])} ({len(own)})" if space.groups else ""
+            axes.plot(own[:, 0], own[:, 1], SIGNS[(k + k // len(SERIES)) % len(SIGNS)], label=name,
+                      color=SERIES[k % len(SERIES)], markersize=4.5, markeredgecolor="white",
+                      markeredgewidth=0.5)  # fmt: skip
+        for pose, (x, y, _) in zip(space.poses[:MOST_NUMBERED], tips, strict=False):
+            if len(space.poses) <= MOST_NUMBERED:
+                axes.annotate(short_name(pose.name, 6), (x, y), (3, 2),
+                              textcoords="offset points", fontsize=7)  # fmt: skip
     for pose in poses if whole else (space.poses[space.first],):
         at, tip = pose.markers @ view.T, pose.line[-1] @ view.T
         for marker in () if whole else at:
@@ -499,22 +494,6 @@ def _draw_around(axes: Axes, space: Space, view: Array, whole: bool) -> None:
         if abs(float(np.linalg.norm(normal)) - 1) < 1e-6:
             beyond = (float(at[0] - normal[1]), float(at[1] + normal[0]))
             axes.axline((float(at[0]), float(at[1])), beyond, color=FAINT, linestyle="--")
-
-
-def _tips(axes: Axes, space: Space, view: Array) -> None:
-    """The flange of each pose, its group by colour and sign, and its name."""
-    tips = np.array([pose.line[-1] for pose in space.poses]) @ view.T
-    group = np.array([pose.group for pose in space.poses])
-    for k in np.unique(group):
-        own = tips[group == k]
-        name = f"{printable(space.groups[k])} ({len(own)})" if space.groups else ""
-        axes.plot(own[:, 0], own[:, 1], SIGNS[(k + k // len(SERIES)) % len(SIGNS)], label=name,
-                  color=SERIES[k % len(SERIES)], markersize=4.5, markeredgecolor="white",
-                  markeredgewidth=0.5)  # fmt: skip
-    for pose, tip in zip(space.poses, tips, strict=True):
-        if len(space.poses) <= MOST_NUMBERED:
-            axes.annotate(short_name(pose.name, 6), (tip[0], tip[1]), (3, 2),
-                          textcoords="offset points", fontsize=7)  # fmt: skip
 
 
 def _fill(axes: Axes, points: Array, colour: str, alpha: float) -> None:

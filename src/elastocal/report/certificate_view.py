@@ -54,9 +54,15 @@ def _blocks(result: Calibration) -> Iterator[Block]:
     entries, budget = result.model.cell.certificate, gap_budget(result)
     verdict, certified = judgement(result), certified_values(result, budget)
     yield ShownVerdict(verdict.tone, verdict.headline)
-    told = entry_rows(result)
-    if told:
-        yield ShownTable(("entry", ""), told, (0, 1), title="Entries")
+    told = [
+        (name.replace("_", " "), printable(value))
+        for name, value in vars(entries).items() if isinstance(value, str)
+    ]  # fmt: skip
+    if entries.temperature is not None:
+        told.append(("temperature", f"{entries.temperature:g} °C"))
+    if (own := entries.instrument_uncertainty) is not None:
+        told.append(("instrument's expanded uncertainty, k = 2", length(own)))
+    yield ShownTable(("entry", ""), told, (0, 1), title="Entries")
     if told and entries.missing:
         yield Sentence(
             f"Not a certificate: [certificate] of the cell lacks {listed(entries.missing)}.",
@@ -67,10 +73,18 @@ def _blocks(result: Calibration) -> Iterator[Block]:
         yield Sentence(certified.conformity(entries.limit))
     yield from _uncertainty(certified)
     yield from _poses(result, budget, certified)
+    stated = result.model.cell.tracker.noise
+    noise = "none stated" if result.observations.table.sigma is None else "stated with each reading"
+    if stated is not None:
+        noise = ", ".join(
+            f"{name.replace('_', ' ')} {', '.join(map(length, _each(value)))}"
+            + (" per m" if name.endswith("per_m") else "")
+            for name, value in vars(stated).items()
+        )
     facts = [
         ("Robot", printable(result.model.chain.name)),
         *joint_lines(result),
-        ("Instrument, standard deviations", _stated_noise(result)),
+        ("Instrument, standard deviations", noise),
         ("Readings", readings(result)),
         ("Loads", "; ".join(newtons(f) for f in measured_loads(result.observations))),
         ("Identified", what_was_identified(result)),
@@ -81,17 +95,9 @@ def _blocks(result: Calibration) -> Iterator[Block]:
     yield ShownTable(("what", ""), facts, (0, 1), title="What was calibrated, and by what")
 
 
-def entry_rows(result: Calibration) -> list[tuple[str, str]]:
-    entries = result.model.cell.certificate
-    rows = [
-        (name.replace("_", " "), printable(value))
-        for name, value in vars(entries).items() if isinstance(value, str)
-    ]  # fmt: skip
-    if entries.temperature is not None:
-        rows.append(("temperature", f"{entries.temperature:g} °C"))
-    if (own := entries.instrument_uncertainty) is not None:
-        rows.append(("instrument's expanded uncertainty, k = 2", length(own)))
-    return rows
+def _each(value: float | Array) -> list[float]:
+    """A number, the numbers of three axes, or the one that all have."""
+    return [float(v) for v in dict.fromkeys(np.atleast_1d(value).tolist())]
 
 
 @dataclass(frozen=True)
@@ -206,15 +212,13 @@ def _uncertainty(certified: Certified) -> Iterator[Block]:
 def _poses(
     result: Calibration, budget: ErrorBudget | None, certified: Certified
 ) -> Iterator[Block]:
-    errors = before_and_after(result, budget)
     if budget is not None and len(budget.steps) > 1:
         ends = (budget.steps[0], budget.steps[-1])
         found = {
             name: pose_accuracy(result.observations, step.errors)
-            for name, step in zip(errors, ends, strict=False)
+            for name, step in zip(before_and_after(result, budget), ends, strict=False)
         }
-        table = spread_table(found, "places", "Pose accuracy before and after")
-        yield table
+        yield spread_table(found, "places", "Pose accuracy before and after")
         yield Sentence(
             "In the sense of ISO 9283: the distance between the place that was meant and the mean "
             "of what was read there, at every configuration, marker and load. “Calibrated” is what "
@@ -231,24 +235,6 @@ def _poses(
             f"{len(rp)} places read {FEWEST} times or more, {length(float(rp.max()))} at most; the "
             "instrument's noise is included."
         )
-
-
-def _stated_noise(result: Calibration) -> str:
-    stated = result.model.cell.tracker.noise
-    if stated is None:
-        given = result.observations.table.sigma is not None
-        return "stated with each reading" if given else "none stated"
-    return ", ".join(
-        f"{name.replace('_', ' ')} {', '.join(length(float(v)) for v in _each(value))}"
-        + (" per m" if name.endswith("per_m") else "")
-        for name, value in vars(stated).items()
-    )
-
-
-def _each(value: float | Array) -> Array:
-    """A number, the numbers of three axes, or the one that all have."""
-    values: Array = np.atleast_1d(value)
-    return values if np.ptp(values) else values[:1]
 
 
 # The certificate as XML

@@ -10,12 +10,10 @@ import numpy as np
 from elastocal.diagnosis.diagnosis import (
     NORMAL_95,
     STRUCTURE,
-    Candidate,
     ComponentShare,
     Curve,
     Diagnosis,
     EffectAt,
-    ExtraPlan,
     FoundEffect,
     Interval,
     Location,
@@ -65,6 +63,15 @@ from elastocal.text import printable
 
 MOST_CANDIDATES = 8
 MOST_TESTS = 12
+MOST_PLACES = 8
+MOST_NAMED = 6
+MOST_IN_HEADLINE = 3
+FEW = 2  # effects whose shapes stand open
+FINE = 0.1  # fraction below which a tenth of a percent is told
+MATERIAL = 0.2  # of the noise: 2 % more in all
+ABSURD = 100.0  # typical sizes: no arm has an effect that large, whatever the readings could show
+MOMENTS = ("jump_time_s", "slip_time_s")
+NAMELESS = "without a name"
 # What an error of each family goes with.
 FAMILIES = {
     "angle": "against its own angle",
@@ -77,11 +84,6 @@ FAMILIES = {
     "pose": "with the pose",
     "tool": "of the tool",
 }
-NAMELESS = "without a name"
-MOST_IN_HEADLINE = 3
-FINE = 0.1  # fraction below which a tenth of a percent is told
-FEW = 2  # effects whose shapes stand open
-MOST_PLACES = 8
 
 
 def diagnosis_report(d: Diagnosis) -> Report:
@@ -90,18 +92,17 @@ def diagnosis_report(d: Diagnosis) -> Report:
     if d.model is not None:
         title = title_of(d.model.chain.name, d.model.cell.name)
         backend = d.model.backend_report()
-    return Report("Diagnosis", title, _blocks(d, _kinds(d)), backend)
+    return Report("Diagnosis", title, _blocks(d), backend)
 
 
-def _kinds(d: Diagnosis) -> Sequence[str]:
-    return ("revolute",) * len(d.noise.repeatability) if d.model is None else d.model.chain.kinds
-
-
-def _blocks(d: Diagnosis, kinds: Sequence[str]) -> Iterator[Block]:
-    yield Fold("", lambda: [_key(d)])
-    yield ShownVerdict(
-        TONES[d.findings[0].severity] if d.findings else "good", diagnosis_headline(d)
-    )
+def _blocks(d: Diagnosis) -> Iterator[Block]:
+    figures = [("calibrated arm, held out", length(d.gap.calibrated))]
+    if d.effects:
+        figures.append(("with the effects found", length(d.gap.explained)))
+    figures += [("noise alone", length(d.gap.noise_floor)), ("readings", str(d.n_readings))]
+    yield Fold("", lambda: [KeyFigures(figures)])
+    tone = TONES[d.findings[0].severity] if d.findings else "good"
+    yield ShownVerdict(tone, diagnosis_headline(d))
     lines = [(label, capital(text)) for label, text in diagnosis_lines(d)]
     lines += [("Not separable", capital(f"{text}.")) for text in alike(d)]
     lines += [("Next", text) for text in diagnosis_steps(d)]
@@ -120,6 +121,8 @@ def _blocks(d: Diagnosis, kinds: Sequence[str]) -> Iterator[Block]:
     yield Fold("Rivals", lambda: [pair_table(d)], printed=True)
     yield Fold("Where the error comes from", lambda: [location_table(d), structure_table(d)])
     yield Fold("Not tested", lambda: [untested_table(d)], printed=True)
+    revolute = ("revolute",) * len(d.noise.repeatability)
+    kinds = revolute if d.model is None else d.model.chain.kinds
     noise = [("Noise", text) for text in noise_floor_lines(d.noise, kinds)]
     yield Fold("Noise", lambda: [Lines(noise)], printed=True)
     if d.noise.faulty:
@@ -129,15 +132,6 @@ def _blocks(d: Diagnosis, kinds: Sequence[str]) -> Iterator[Block]:
     if d.calibrated is not None:
         yield Fold("Residuals of the calibrated arm", lambda: _residuals(d),
                    figures=("space", "residuals", "against_joints", "over_time"))  # fmt: skip
-
-
-def _key(d: Diagnosis) -> KeyFigures:
-    """The error before and after the effects found, and the noise in both."""
-    figures = [("calibrated arm, held out", length(d.gap.calibrated))]
-    if d.effects:
-        figures.append(("with the effects found", length(d.gap.explained)))
-    noise = ("noise alone", length(d.gap.noise_floor))
-    return KeyFigures([*figures, noise, ("readings", str(d.n_readings))])
 
 
 def _figures(d: Diagnosis) -> Iterator[Figure]:
@@ -156,15 +150,6 @@ def _shapes(d: Diagnosis) -> Iterator[Figure]:
         yield found
 
 
-def _smooth(d: Diagnosis) -> Iterator[Block]:
-    if d.slight:
-        yield Sentence(
-            f"{added_text(d.slight)}: each probably moves the markers by less than a hundredth of "
-            "the remaining error. They correct the arm and are not findings."
-        )
-    yield field_table(d)
-
-
 def _residuals(d: Diagnosis) -> Iterator[Block]:
     from elastocal.report.arm_view import residual_arm
     from elastocal.report.figures import Residuals
@@ -179,95 +164,100 @@ def _residuals(d: Diagnosis) -> Iterator[Block]:
     yield residuals.table()
 
 
-def noise_floor_lines(noise: NoiseFloor, kinds: Iterable[str]) -> list[str]:
-    text = f"A reading scatters by {length(noise.reading_sigma)} rms per axis"
+def noise_floor_lines(noise: NoiseFloor, kinds: Iterable[str]) -> Iterator[str]:
+    text = "; nothing was stated"
     if noise.stated:
-        text += (
+        text = (
             f", {significant(noise.stated_factor, 2)} times what is stated, and "
-            f"{significant(noise.ratio_to_stated)} times with the scatter of the joints."
+            f"{significant(noise.ratio_to_stated)} times with the scatter of the joints"
         )
-    else:
-        text += "; nothing was stated."
+    yield f"A reading scatters by {length(noise.reading_sigma)} rms per axis{text}."
     joints = [
         f"joint {i + 1} {significant(value * 1e6, 2)} {'µrad' if kind == 'revolute' else 'µm'}"
         for i, (value, kind) in enumerate(zip(noise.repeatability, kinds, strict=True))
         if value > 0
     ]
-    lines = [text, f"Repeatability from visit to visit: {', '.join(joints) or 'none found'}."]
+    yield f"Repeatability from visit to visit: {', '.join(joints) or 'none found'}."
     if noise.shared > 0:
-        lines.append(
-            "Visits of a configuration have a common scatter of "
-            f"{significant(noise.shared, 2)} times that."
-        )
+        times = significant(noise.shared, 2)
+        yield f"Visits of a configuration have a common scatter of {times} times that."
     if noise.drift > 0:
-        lines.append(
-            f"The drift of {length(noise.drift)} that [noise] of the cell states counts as noise."
-        )
+        drift = length(noise.drift)
+        yield f"The drift of {drift} that [noise] of the cell states counts as noise."
     if noise.pure_error is None:
-        lines.append("No repeats: the noise is estimated from residuals only.")
+        yield "No repeats: the noise is estimated from residuals only."
     else:
-        lines.append(f"Repeats scatter by {length(noise.pure_error)} rms per axis.")
+        yield f"Repeats scatter by {length(noise.pure_error)} rms per axis."
     if (near := noise.near_repeats) is not None:
-        text = (
-            f"Readings at nearly the same pose ({counted(near.pairs, 'pair')}) scatter by "
-            f"{length(near.scatter)} rms per axis"
-        )
+        times = ""
         if near.soon is not None and near.later is not None:
-            text += (
+            times = (
                 f" (measured soon after each other {length(near.soon)}, in other parts of the "
                 f"session {length(near.later)})"
             )
-        lines.append(f"{text}.")
-    if n := len(noise.faulty):
-        lines.append(
-            f"{counted(n, 'outlier was', 'outliers were')} excluded, the worst "
-            f"{length(max(f.error for f in noise.faulty))} off."
+        yield (
+            f"Readings at nearly the same pose ({counted(near.pairs, 'pair')}) scatter by "
+            f"{length(near.scatter)} rms per axis{times}."
         )
-    return lines
+    if n := len(noise.faulty):
+        worst = length(max(f.error for f in noise.faulty))
+        yield f"{counted(n, 'outlier was', 'outliers were')} excluded, the worst {worst} off."
 
 
-ABSURD = 100.0  # typical sizes: no arm has an effect that large, whatever the readings could show
-MOST_NAMED = 6
-MOMENTS = ("jump_time_s", "slip_time_s")
-MATERIAL = 0.2  # of the noise: 2 % more in all
+# The verdict, and what beside it
 
 
 def diagnosis_headline(d: Diagnosis) -> str:
     if d.groups:
         return capital(headline_of_causes(d))
+    likely = []  # each effect with its probability and, where it happened once, when
+    for f in d.effects:
+        moments = {k: v for k, v in f.settings.items() if k in MOMENTS}
+        when = f"; {settings_of(d, moments)}" if moments else ""
+        likely.append(f"{effect_at(f)} (probability {probability(f.probability)}{when})")
     if d.verdict == "explained":
-        named = together(_likely(d))
-        return f"{capital(named)} explain{'s' * (len(d.effects) == 1)} the remaining error."
+        one = "s" * (len(d.effects) == 1)
+        return f"{capital(together(likely))} explain{one} the remaining error."
     if d.verdict == "ambiguous":
         sets = [f"either {together([effect_at(e) for e in s], 'or')}" for s in d.indistinguishable]
         verb = "causes" if len(sets) == 1 else "cause"
         return f"{capital(together(sets))} {verb} the remaining error; these data cannot decide."
-    if d.verdict == "unknown_effect":
-        return _unknown(d)
-    return (
-        "No further effect exceeds the noise; probability of none: "
-        f"{probability(d.probability_nothing)}."
-    )
-
-
-def _likely(d: Diagnosis) -> list[str]:
-    """Each effect with its probability and, where it happened once, when."""
-    told = []
-    for f in d.effects:
-        moments = {k: v for k, v in f.settings.items() if k in MOMENTS}
-        when = f"; {settings_of(d, moments)}" if moments else ""
-        told.append(f"{effect_at(f)} (probability {probability(f.probability)}{when})")
-    return told
-
-
-def _unknown(d: Diagnosis) -> str:
+    if d.verdict != "unknown_effect":
+        none = probability(d.probability_nothing)
+        return f"No further effect exceeds the noise; probability of none: {none}."
     where = location_text(d.location) if d.location else ""
-    if d.effects:
-        verb = "cause" if len(d.effects) > 1 else "causes"
-        text = f"{capital(together(_likely(d)))} {verb} part of the remaining error; an effect "
+    if likely:
+        verb = "cause" if len(likely) > 1 else "causes"
+        text = f"{capital(together(likely))} {verb} part of the remaining error; an effect "
         return f"{text}outside the catalogue acts{f' {where}' if where else ''}."
     text = "An effect outside the catalogue causes the remaining error"
     return f"{text}, {where}." if where else f"{text}; the data do not show where."
+
+
+def headline_of_causes(d: Diagnosis) -> str:
+    """The largest causes with their shares, and what is left open."""
+    large = [g for k, g in enumerate(d.groups[:MOST_IN_HEADLINE]) if k == 0 or g.share >= FINE]
+    told = [
+        f"{effect_at_places(g.name, g.places)} "
+        f"({share_text(g.share)}{' of the remaining error' * (k == 0)})"
+        for k, g in enumerate(large)
+    ]
+    if more := len(d.groups) - len(told):
+        told.append(counted(more, "smaller cause"))
+    first = d.groups[0]
+    several = len(d.groups) > 1 or len(first.places) > 1 or first.name.endswith("errors")
+    text, one = together(told), "s" * (not several)
+    if d.verdict == "explained":
+        return f"{text} explain{one} the remaining error."
+    if d.verdict == "ambiguous":
+        n = len(d.indistinguishable)
+        names = "one effect" if n == 1 else f"{n} effects"
+        return f"{text} cause{one} the remaining error; these data leave {names} of it open."
+    at = places(dict.fromkeys(c.where for c in d.components if not c.named))
+    return (
+        f"{text} cause{one} part of the remaining error; an effect outside the catalogue acts"
+        f"{f' at {at}' if at else ''}."
+    )
 
 
 def location_text(location: Location) -> str:
@@ -276,93 +266,78 @@ def location_text(location: Location) -> str:
     return f"{where} (probability {probability(location.probability)})"
 
 
-def diagnosis_lines(d: Diagnosis) -> list[tuple[str, str]]:
-    lines = [("Error", text) for text in _error_lines(d)]
-    if d.verdict == "unknown_effect":
-        lines += [("Depends on", text) for text in _dependence(d)]
-    if d.groups:
-        spans = [f"{curve_span(curve)} ({place(curve.entry)})" for curve in d.curves]
-        if spans:
-            text = "the joints' errors against their own angles span"
-            lines.append(("Curves", f"{text} {together(spans)}."))
-        if text := assumed_order(d):
-            lines.append(("Assumed", text))
-        return [*lines, ("Chance", _chance(d))]
-    if d.verdict == "unknown_effect":
-        lines += [("Shape", _shape(curve)) for curve in d.curves]
-    if d.open:
-        lines += [_finding_line(d, f) for f in d.effects]
-    if d.verdict == "nothing_significant":
-        lines += [("Sensitivity", text) for text in sensitivity(d)]
-    elif d.verdict == "ambiguous" and d.location is not None:
-        lines.append(("Location", f"{location_text(d.location)}."))
-    lines.append(("Chance", _chance(d)))
-    return lines
-
-
-def _error_lines(d: Diagnosis) -> list[str]:
-    """Error on held-out poses before and after, and the part of it that the effects remove."""
-    calibrated, floor = length(d.gap.calibrated), length(d.gap.noise_floor)
-    rest = []
+def diagnosis_lines(d: Diagnosis) -> Iterator[tuple[str, str]]:
+    """What stands beside the verdict, as (label, sentence)."""
+    yield "Error", _error_line(d)
     if d.gap.unexplained > MATERIAL * d.gap.noise_floor:  # what looks like noise and is none
-        rest.append(
+        yield (
+            "Error",
             f"{length(d.gap.unexplained)} rms are unexplained: they look like scatter of the arm, "
             "but repeats do not show them, neighbours in pose or time share them, or joints do not "
-            "scatter that much."
+            "scatter that much.",
         )
+    unknown = d.verdict == "unknown_effect"
+    if unknown:
+        told = [f"{driver_name(t.driver)} ({size_of(t.p_family)})" for t in d.dependences]
+        more = len(told) - MOST_NAMED
+        named = together(told[:MOST_NAMED]) + (f" and {more} more" if more > 0 else "")
+        named = named or "no single driver that was tested shows it; see the curves for its shape"
+        yield "Depends on", f"{named}."
+    chance = " after correction for all candidates."
+    if not d.effects and d.p_value > STRUCTURE:
+        chance = " for the strongest candidate, corrected for all candidates."
+    if d.groups:
+        if spans := [f"{curve_span(curve)} ({place(curve.entry)})" for curve in d.curves]:
+            text = "the joints' errors against their own angles span"
+            yield "Curves", f"{text} {together(spans)}."
+        matters = any(c.family == "move" for c in d.components) or "approach" in d.model_keys
+        if matters and d.calibrated and d.calibrated.observed.table.time is None:
+            yield (
+                "Assumed",
+                "the last move is that from the visit before, in the order of the rows; if they "
+                "were not measured so, do not rely on effects of the last move.",
+            )
+        yield "Chance", f"{size_of(d.p_value)}{chance}"
+        return
+    for curve in d.curves if unknown else ():
+        moved = f"{driver_name(curve.driver)} moves {driver_name(curve.entry)}"
+        yield "Shape", f"{moved} by {curve_span(curve)} in all."
+    open_sets = {(e.effect, e.where) for rivals in d.indistinguishable for e in rivals}
+    for f in d.effects if d.open else ():  # beside the open question, or its likeliest answer
+        text = f"{effect_at(f)} (probability {probability(f.probability)}"
+        text += f"; {settings_of(d, f.settings)})." if f.settings else ")."
+        yield "Likeliest" if (f.effect, f.where) in open_sets else "Besides", text
+    if d.verdict == "nothing_significant":
+        for text in sensitivity(d):
+            yield "Sensitivity", text
+    elif d.verdict == "ambiguous" and d.location is not None:
+        yield "Location", f"{location_text(d.location)}."
+    yield "Chance", f"{size_of(d.p_value)}{chance}"
+
+
+def _error_line(d: Diagnosis) -> str:
+    """Error on held-out poses before and after, and the part of it that the effects remove."""
+    calibrated, floor = length(d.gap.calibrated), length(d.gap.noise_floor)
     if not d.effects:
-        return [f"Held-out error: {calibrated} rms (noise alone: {floor}).", *rest]
+        return f"Held-out error: {calibrated} rms (noise alone: {floor})."
     text = (
         f"Held-out error: {calibrated} rms, with the effects found {length(d.gap.explained)} rms "
         f"(noise alone: {floor})."
     )
-    nameless = [s for s in d.budget if s.step.startswith("unknown:")]
-    if d.groups and nameless:
-        left = length(nameless[-1].heldout_rms)
-        text += f" With unnamed smooth corrections: {left}."
     if d.groups:  # the table of causes says what each takes away
-        return [text, *rest]
+        nameless = [length(s.heldout_rms) for s in d.budget if s.step.startswith("unknown:")]
+        told = [f"With unnamed smooth corrections: {left}." for left in nameless[-1:]]
+        return " ".join([text, *told])
     if len(d.effects) == 1:
-        shrinks = f"The noise-free error at new poses falls by {reduction(d.effects[0])}."
-        return [f"{text} {shrinks}", *rest]
+        return f"{text} The noise-free error at new poses falls by {reduction(d.effects[0])}."
     each = [f"{effect_at(f)} removes {reduction(f)}" for f in d.effects]
-    last = f"Added last, {together(each)} of the noise-free error at new poses."
-    return [f"{text} {last}", *rest]
-
-
-def _finding_line(d: Diagnosis, f: FoundEffect) -> tuple[str, str]:
-    """An effect beside the open question, or the likeliest answer to it."""
-    open_sets = {(e.effect, e.where) for rivals in d.indistinguishable for e in rivals}
-    text = f"{effect_at(f)} (probability {probability(f.probability)}"
-    text += f"; {settings_of(d, f.settings)})." if f.settings else ")."
-    return "Likeliest" if (f.effect, f.where) in open_sets else "Besides", text
+    return f"{text} Added last, {together(each)} of the noise-free error at new poses."
 
 
 def settings_of(d: Diagnosis, settings: Mapping[str, float]) -> str:
     table = None if d.calibrated is None else d.calibrated.observed.table
     lines = () if table is None or table.time is not None else np.unique(by_rows(table)).tolist()
     return settings_text(settings, lines)
-
-
-def _dependence(d: Diagnosis) -> list[str]:
-    """The drivers that the residual depends on, the strongest first."""
-    if not d.dependences:
-        return ["no single driver that was tested shows it; see the curves for its shape."]
-    told = d.dependences[:MOST_NAMED]
-    named = [f"{driver_name(t.driver)} ({size_of(t.p_family)})" for t in told]
-    more = len(d.dependences) - len(named)
-    return [together(named) + (f" and {more} more" if more else "") + "."]
-
-
-def _shape(curve: Curve) -> str:
-    moved = f"{driver_name(curve.driver)} moves {driver_name(curve.entry)}"
-    return f"{moved} by {curve_span(curve)} in all."
-
-
-def _chance(d: Diagnosis) -> str:
-    if not d.effects and d.p_value > STRUCTURE:
-        return f"{size_of(d.p_value)} for the strongest candidate, corrected for all candidates."
-    return f"{size_of(d.p_value)} after correction for all candidates."
 
 
 def sensitivity(d: Diagnosis) -> list[str]:
@@ -378,44 +353,48 @@ def sensitivity(d: Diagnosis) -> list[str]:
     faint = [c for c in d.candidates if c.hidden]
     text = f"of {len(d.candidates)} candidates {len(visible)} would have been found at typical size"
     if faint:
-        by_effect = dict.fromkeys(plain_name(c.effect) for c in faint)
-        names = list(by_effect)[:MOST_NAMED]
-        more = len(by_effect) - len(names)
-        text += f"; below the noise even then: {len(faint)} ({', '.join(names)}"
-        text += f" and {more} more kinds)" if more else ")"
+        names = list(dict.fromkeys(plain_name(c.effect) for c in faint))
+        more = len(names) - MOST_NAMED
+        text += f"; below the noise even then: {len(faint)} ({', '.join(names[:MOST_NAMED])}"
+        text += f" and {more} more kinds)" if more > 0 else ")"
     return [*lines, f"{text}."]
-
-
-def seen_from(c: Candidate) -> str:
-    if not math.isfinite(c.seen_from):
-        return "–"
-    return f"> {ABSURD:.0f}" if c.seen_from > ABSURD else significant(c.seen_from, 2)
 
 
 def diagnosis_steps(d: Diagnosis) -> list[str]:
     """What to do now: the remedies of the findings, what extra poses promise, what to record."""
     steps = [f.remedy for f in d.findings if f.remedy]
-    if d.extra is not None:
-        steps += extra_lines(d.extra)
+    if (extra := d.extra) is not None:
+        rivals, n = together([name_of(name) for name in extra.rivals], "or"), extra.n_poses
+        if not extra.separable:
+            steps.append(f"No pose that this cell allows separates {rivals}.")
+        else:
+            steps.append(
+                f"{counted(n, 'more pose')} to separate {rivals}: the probability of the right "
+                f"answer rises from {probability(extra.probability_before)} to "
+                f"{probability(extra.probability_after)} (as many random poses: "
+                f"{probability(extra.probability_random)})."
+            )
+            for group in extra.inseparable:
+                names = together([name_of(name) for name in group])
+                steps.append(f"{capital(names)} count as one.")
+        steps += [capital(printable(text)) for text in extra.advice]
     # One piece of advice serves many effects.
     return steps + list(dict.fromkeys(capital(printable(u.advice)) for u in d.untested))
 
 
-def extra_lines(extra: ExtraPlan) -> list[str]:
-    rivals = together([name_of(name) for name in extra.rivals], "or")
-    if not extra.separable:
-        lines = [f"No pose that this cell allows separates {rivals}."]
-    else:
-        n = extra.n_poses
-        lines = [
-            f"{n} more pose{'s' if n != 1 else ''} to separate {rivals}: the probability of "
-            f"the right answer rises from {probability(extra.probability_before)} to "
-            f"{probability(extra.probability_after)} (as many random poses: "
-            f"{probability(extra.probability_random)})."
-        ]
-        for group in extra.inseparable:
-            lines.append(f"{capital(together([name_of(name) for name in group]))} count as one.")
-    return lines + [capital(printable(text)) for text in extra.advice]
+def alike(d: Diagnosis) -> list[str]:
+    """Sets of effects that these data cannot tell apart; beside many causes, the one that was
+    taken with its probability."""
+    taken = {(f.effect, f.where): f.probability for f in d.effects} if d.groups else {}
+
+    def told(e: EffectAt) -> str:
+        p = taken.get((e.effect, e.where))
+        return effect_at(e) + ("" if p is None else f" (probability {probability(p)})")
+
+    return [together([told(e) for e in rivals]) for rivals in d.indistinguishable]
+
+
+# Tables
 
 
 def gap_table(d: Diagnosis) -> ShownTable:
@@ -427,27 +406,28 @@ def _named_steps(d: Diagnosis) -> list[tuple[str, float, tuple[float, float]]]:
     return [(name_of(step.step), step.heldout_rms, step.ci95) for step in models]
 
 
-OF_CANDIDATES = (
-    "evidence: log marginal likelihood over that of no further effect. d: standard deviations by "
-    "which the typical size moves the data; below 3 it is below the noise. seen from: smallest "
-    "detectable size, in typical sizes."
-)
-
-
 def candidate_table(d: Diagnosis) -> ShownTable:
     """The likeliest candidates; an unknown effect and none are candidates as well."""
-    rows = [
-        (effect_at(c), probability(c.probability), f"{c.score:+.1f}",
-         significant(c.detectable, 2), seen_from(c), settings_of(d, c.settings))
-        for c in d.candidates[:MOST_CANDIDATES]
-    ]  # fmt: skip
+    rows = []
+    for c in d.candidates[:MOST_CANDIDATES]:
+        seen = "–"
+        if math.isfinite(c.seen_from):
+            seen = f"> {ABSURD:.0f}" if c.seen_from > ABSURD else significant(c.seen_from, 2)
+        rows.append(
+            (effect_at(c), probability(c.probability), f"{c.score:+.1f}",
+             significant(c.detectable, 2), seen, settings_of(d, c.settings))
+        )  # fmt: skip
     title = f"Candidates{' one at a time' if d.groups else ''}"
     title += f", rank 1 to {len(rows)} of {len(d.candidates)}"
     none = ("", "", "", "")
     rows.append(("an effect outside the catalogue", probability(d.probability_unknown), *none))
     rows.append(("no further effect", probability(d.probability_nothing), *none))
     heads = ("candidate", "probability", "evidence", "d", "seen from", "settings")
-    table = ShownTable(heads, rows, (0, 5), title=title, note=OF_CANDIDATES)
+    table = ShownTable(heads, rows, (0, 5), title=title, note=(
+        "evidence: log marginal likelihood over that of no further effect. d: standard deviations "
+        "by which the typical size moves the data; below 3 it is below the noise. seen from: "
+        "smallest detectable size, in typical sizes."
+    ))  # fmt: skip
     return table.when_narrow(5) if any(row[5] for row in rows) else table.without(5)
 
 
@@ -466,28 +446,23 @@ def structure_table(d: Diagnosis) -> ShownTable:
     """Tests that name no effect, the most conspicuous first."""
     tests = sorted(d.structure, key=lambda t: (t.p_family, t.p_value))[:MOST_TESTS]
     rows = [(driver_name(t.driver), p_value(t.p_value), p_value(t.p_family)) for t in tests]
-    note = (
+    return ShownTable(("depends on", "p", "p, all tests"), rows, note=(
         "Does the residual depend on it at all? These tests name no effect: whole configurations "
         f"change sign, and the last column counts all {len(d.structure)}."
-    )
-    return ShownTable(("depends on", "p", "p, all tests"), rows, note=note)
+    ))  # fmt: skip
 
 
 def pair_table(d: Diagnosis) -> ShownTable:
     rows = [
-        (
-            f"{name_of(pair.first)} or {name_of(pair.second)}",
-            significant(pair.distance_before, 2),
-            significant(pair.distance_after, 2),
-        )
+        (f"{name_of(pair.first)} or {name_of(pair.second)}",
+         significant(pair.distance_before, 2), significant(pair.distance_after, 2))
         for pair in (() if d.extra is None else d.extra.pairs)
-    ]
-    note = (
+    ]  # fmt: skip
+    heads = ("rivals", "d so far", "d with the extra poses")
+    return ShownTable(heads, rows, title="Rivals", note=(
         "d is the distance of the two in standard deviations of the data; the best test between "
         "them is right with probability Φ(d/2)."
-    )
-    heads = ("rivals", "d so far", "d with the extra poses")
-    return ShownTable(heads, rows, title="Rivals", note=note)
+    ))  # fmt: skip
 
 
 def untested_table(d: Diagnosis) -> ShownTable:
@@ -503,38 +478,24 @@ def untested_table(d: Diagnosis) -> ShownTable:
     return ShownTable(("effect", "why", "record or measure"), rows, (0, 1, 2), title="Not tested")
 
 
-def alike(d: Diagnosis) -> list[str]:
-    """Sets of effects that these data cannot tell apart; beside many causes, the one that was
-    taken with its probability."""
-    taken = {(f.effect, f.where): f.probability for f in d.effects} if d.groups else {}
-
-    def told(e: EffectAt) -> str:
-        p = taken.get((e.effect, e.where))
-        return effect_at(e) + ("" if p is None else f" (probability {probability(p)})")
-
-    return [together([told(e) for e in rivals]) for rivals in d.indistinguishable]
-
-
 def location_table(d: Diagnosis) -> ShownTable:
     """The stages of the chain from commanded joints to tracker with the evidence for each, and the
     likeliest places."""
     location = d.location
     if location is None:
         return ShownTable((), [])
-    shared = bool(location.shares)
     found = location.shares or location.stages
     rows = [
-        (name, share_text(min(value, 1.0)) if shared else probability(value))
+        (name, share_text(min(value, 1.0)) if location.shares else probability(value))
         for stage, name in STAGES.items()
         for value in (found.get(stage, 0.0),)
     ]
-    groups = {0: "stages"}
-    if not shared:
-        groups[len(rows)] = "places"
-        order = sorted(location.places.items(), key=lambda item: -item[1])
-        rows += [(place(where), probability(p)) for where, p in order[:MOST_PLACES]]
-    heads = ("where", "share of the error" if shared else "probability")
-    return ShownTable(heads, rows, groups=groups)
+    if location.shares:
+        return ShownTable(("where", "share of the error"), rows, groups={0: "stages"})
+    groups = {0: "stages", len(rows): "places"}
+    order = sorted(location.places.items(), key=lambda item: -item[1])
+    rows += [(place(where), probability(p)) for where, p in order[:MOST_PLACES]]
+    return ShownTable(("where", "probability"), rows, groups=groups)
 
 
 # Many causes at once: findings, and their places below them.
@@ -569,34 +530,6 @@ def span_text(ends: Interval, middle: float) -> str:
         return "–"
     fine = abs(middle) < FINE
     return f"{share_text(low, fine).removesuffix(' %')} to {share_text(high, fine)}"
-
-
-def headline_of_causes(d: Diagnosis) -> str:
-    """The largest causes with their shares, and what is left open."""
-    large = [g for k, g in enumerate(d.groups[:MOST_IN_HEADLINE]) if k == 0 or g.share >= FINE]
-    told = [
-        f"{effect_at_places(g.name, g.places)} "
-        f"({share_text(g.share)}{' of the remaining error' * (k == 0)})"
-        for k, g in enumerate(large)
-    ]
-    if more := len(d.groups) - len(told):
-        told.append(counted(more, "smaller cause"))
-    first = d.groups[0]
-    plural = len(first.places) > 1 or first.name.endswith("errors")
-    text, several = together(told), len(d.groups) > 1 or plural
-    if d.verdict == "explained":
-        return f"{text} explain{'s' * (not several)} the remaining error."
-    if d.verdict == "ambiguous":
-        n = len(d.indistinguishable)
-        names = "one effect" if n == 1 else f"{n} effects"
-        verb = "cause" if several else "causes"
-        return f"{text} {verb} the remaining error; these data leave {names} of it open."
-    at = places(dict.fromkeys(c.where for c in d.components if not c.named))
-    where = f" at {at}" if at else ""
-    return (
-        f"{text} cause{'s' * (not several)} part of the remaining error; an effect outside the "
-        f"catalogue acts{where}."
-    )
 
 
 def cause_table(d: Diagnosis) -> ShownTable:
@@ -638,9 +571,12 @@ def place_table(d: Diagnosis) -> ShownTable:
         if parts:
             groups[len(rows)] = name
         for c in parts:
-            effects = ", ".join(map(plain_name, c.effects)) if c.named else NAMELESS
+            low, high = map(length, c.rms_ci95)
+            low = low.removesuffix(high[high.rfind(" ") :])  # "266 to 293 µm"
             rows.append((
-                place(c.where), _error_of(c), effects, f"{length(c.rms)} ({lengths(c.rms_ci95)})",
+                place(c.where), _error_of(c),
+                ", ".join(map(plain_name, c.effects)) if c.named else NAMELESS,
+                f"{length(c.rms)} ({low} to {high})",
                 f"{share_text(c.share)} ({span_text(c.share_ci90, c.share).removesuffix(' %')})",
                 probability(c.probability),
             ))  # fmt: skip
@@ -648,13 +584,6 @@ def place_table(d: Diagnosis) -> ShownTable:
     heads = ("place", "error", "as", "rms (95 %)", "share (90 %)", "probability")
     table = ShownTable(heads, rows, (0, 1, 2), groups, title="Place by place")
     return table.when_narrow(2)  # what it is as effects stands in the table of parameters too
-
-
-def lengths(ends: Interval) -> str:
-    """ "266 to 293 µm", "0.90 µm to 1.20 mm"."""
-    low, high = map(length, ends)
-    unit = high[high.rfind(" ") :]
-    return f"{low.removesuffix(unit)} to {high}" if low.endswith(unit) else f"{low} to {high}"
 
 
 def curve_span(curve: Curve) -> str:
@@ -666,35 +595,29 @@ def curve_span(curve: Curve) -> str:
     return f"{significant(shown)} {unit}"
 
 
-def assumed_order(d: Diagnosis) -> str:
-    """That the moves between visits were taken from the order of the rows, where they matter."""
-    matters = any(c.family == "move" for c in d.components) or "approach" in d.model_keys
-    if not matters or d.calibrated is None or d.calibrated.observed.table.time is not None:
-        return ""
-    return (
-        "the last move is that from the visit before, in the order of the rows; if they were not "
-        "measured so, do not rely on effects of the last move."
-    )
-
-
 # Corrections that have no name.
 
 
-def field_table(d: Diagnosis) -> ShownTable:
-    """The smooth corrections without a name: where, what they follow, how large and how smooth."""
+def _smooth(d: Diagnosis) -> Iterator[Block]:
+    """Where the corrections without a name are, what they follow, how large and how smooth."""
+    if d.slight:
+        yield Sentence(
+            f"{added_text(d.slight)}: each probably moves the markers by less than a hundredth of "
+            "the remaining error. They correct the arm and are not findings."
+        )
     rows = [row for f in d.fields for row in _followed(f)]
     heads = ("correction at", "follows", "size", "over", "error falls by", "95 %")
-    note = (
+    yield ShownTable(heads, rows, (0, 1), title="Smooth corrections", note=(
         "Smooth functions without a physical name; they hold where the arm was measured: size "
         "(standard deviation) and the length over which they change."
-    )
-    return ShownTable(heads, rows, (0, 1), title="Smooth corrections", note=note)
+    ))  # fmt: skip
 
 
 def _followed(f: FoundEffect) -> Iterable[tuple[str, ...]]:
     """A row for everything that a field follows; the last columns in the first row only."""
-    fall = f.gap_reduction
+    fall, kind = f.gap_reduction, f.where.partition(":")[0].rstrip("0123456789")
     told: Sequence[str] = (share_text(fall), span_text(f.gap_reduction_ci95, fall))
+    unit = {"joint": "mrad", "marker": "mm"}.get(kind, "mm, mrad")
     for key, value in f.settings.items():
         name, _, rest = key.rpartition("size")
         if not name or rest not in ("", "_rad"):
@@ -702,24 +625,14 @@ def _followed(f: FoundEffect) -> Iterable[tuple[str, ...]]:
         over = f.settings.get(f"{name}length{rest}", math.nan)
         of = name.rstrip("_").partition("_")[2]
         timed = of == "time"
-        suffix = "s" if timed else "rad"
         yield (
             place(f.where),
             "the time" if timed else f"the angle of {place(of)}" if of else "its own angle",
-            _motion(f.where, value),
-            setting_value(f"over_{suffix}", over) if math.isfinite(over) else "–",
+            f"{significant(value * 1e3, 2)} {unit}",
+            setting_value("over_s" if timed else "over_rad", over) if math.isfinite(over) else "–",
             *told,
         )
         told = ("", "")
-
-
-def _motion(where: str, size: float) -> str:
-    """A size that is m and rad, or one of them, by the place that moves."""
-    if where.startswith("joint"):
-        return f"{significant(size * 1e3, 2)} mrad"
-    if where.startswith("marker:"):
-        return f"{significant(size * 1e3, 2)} mm"
-    return f"{significant(size * 1e3, 2)} mm, mrad"
 
 
 def added_text(found: Sequence[FoundEffect]) -> str:

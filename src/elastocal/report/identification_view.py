@@ -33,6 +33,7 @@ from elastocal.identification.result import (
     deviation,
 )
 from elastocal.identification.scrutiny import stage_of
+from elastocal.model.arm import Parameter
 from elastocal.model.chain import names_told
 from elastocal.report import judgement_view as words
 from elastocal.report.blocks import (
@@ -222,7 +223,10 @@ def _errors(result: Calibration, budget: ErrorBudget | None) -> Iterator[Block]:
 def _outliers(result: Calibration) -> Iterator[Block]:
     if groups := words.fault_lines(result):
         yield Lines([("Groups", text) for text in groups])
-        yield Sentence(words.false_alarm_line(result) or "", soft=True)
+        assert result.faulty_report is not None  # which the groups are of
+        share = 100 * result.faulty_report.false_alarm
+        told = f"False-alarm rate: at most {share:g} % of tables without outliers."
+        yield Sentence(told, soft=True)
     kept = f"Kept in the fit; {option('outliers', 'drop')} excludes them"
     for title, found in ((kept, result.outliers), ("Excluded from the fit", result.excluded)):
         if found:
@@ -253,17 +257,18 @@ def what_was_identified(result: Calibration) -> str:
             f"({absorbed} held in exchange)"
         )
     told = {
-        **NO_VALUE,
-        INVISIBLE: "not visible in these data",
-        UNREAD: "of markers without a reading",
-        FIXED: "fixed by the user",
-    }
+        **NO_VALUE, INVISIBLE: "not visible in these data",
+        UNREAD: "of markers without a reading", FIXED: "fixed by the user",
+    }  # fmt: skip
     for standing, why in told.items():
         if found := len(names_of(result, standing)):
             text += f"; {found} {why}"
     if (far := result.finding("unheard_of")) is not None:
         text += f"; {len(far.listed('parameters'))} with implausible values"
-    return text + words.counted_functions(result) + "."
+    if smooth := [part.coefficients for part in result.smooth if part.scale]:
+        many = counted(len(smooth), "smooth function")
+        text += f"; and {many} of {sum(smooth)} coefficients"
+    return f"{text}."
 
 
 def prediction_lines(result: Calibration) -> list[tuple[str, str]]:
@@ -420,25 +425,18 @@ def shortened(combination: Combination, most: int = LARGEST_TERMS) -> str:
     return f"{text} + {more} more" if more else text
 
 
-def why_without(result: Calibration, e: Estimate) -> str:
-    """Why a parameter has no number of its own, in a few words; else what is noted of it."""
-    standing = standings(result)[e.name]
-    if standing == COMBINED:
-        return f"only as {shortened(result.combination(e.name))}"
-    if standing == ABSORBED:
-        several = len(e.combined_with) - 3
-        names = ", ".join(printable(n) for n in e.combined_with[:3])
-        return f"held: absorbed in {names}" + (f" + {several} more" if several > 0 else "")
-    if standing in (WEAK, BEYOND):
-        return f"{NO_VALUE[standing]}: {limits(result, e)}"
-    if standing == UNREAD:
-        return "held: no reading of this marker"
-    if standing == INVISIBLE:
-        return "held: not visible in these data"
-    return "fixed by the user" if standing == FIXED else printable(e.note)
-
-
 NO_VALUE = {WEAK: "hardly shown", BEYOND: "beyond a physical bound"}
+REDUNDANT = "redundant"
+HELD = {
+    INVISIBLE: " (not visible in these data)",
+    ABSORBED: ", absorbed in a combination",
+    REDUNDANT: ", not identifiable with these loads (expected)",
+}
+WITHOUT = {
+    UNREAD: "held: no reading of this marker",
+    INVISIBLE: "held: not visible in these data",
+    FIXED: "fixed by the user",
+}
 
 
 def limits(result: Calibration, e: Estimate) -> str:
@@ -481,44 +479,57 @@ def coverage(result: Calibration, truth: Truth) -> tuple[int, int]:
     return found.count("inside"), len(found) - found.count("")
 
 
-def nominal_known(result: Calibration, name: str) -> bool:
+def stated(parameter: Parameter) -> bool:
     """False for a zero that only stands for "no nominal value stated", as of a compliance."""
-    parameter = result.model.parameters[result.model.names.index(name)]
     return parameter.nominal != 0 or parameter.typical is not None
 
 
 def undetermined_lines(result: Calibration, most: int | None = None) -> list[str]:
     """Which parameters have no number of their own, and why, one line per reason; `most` names."""
-    standing = standings(result)
-    limited = {
-        f"{why}, so without a value (95 %)": [
-            f"{printable(e.name)} ({limits(result, e)})"
-            for e in result.ordinary
-            if standing[e.name] == kind
-        ]
-        for kind, why in NO_VALUE.items()
-    }
-    invisible, absorbed, fixed = (names_of(result, s) for s in (INVISIBLE, ABSORBED, FIXED))
-    extra = {printable(name) for name in result.left.redundant} if result.left else set()
-    held = {
-        " (not visible in these data)": [n for n in invisible if n not in extra],
-        ", absorbed in a combination": [n for n in absorbed if n not in extra],
-        ", not identifiable with these loads (expected)": [
-            n for n in (*invisible, *absorbed) if n in extra
-        ],
-    }
-    found = limited | {f"{_held_where(result, names)}{why}": names for why, names in held.items()}
-    if unread := names_of(result, UNREAD):
-        found[f"{_held_where(result, unread)} ({printable(no_reading(result))})"] = unread
-    found["fixed by the user"] = fixed
-    return [f"{why}: {listed(n, most or len(n))}" for why, n in found.items() if n]
+    standing, known = standings(result), {p.name: p for p in result.model.parameters}
+    redundant = result.left.redundant if result.left else ()
+    groups: dict[str, list[Estimate]] = {}
+    for e in result.ordinary:
+        kind = standing[e.name]
+        extra = kind in HELD and e.name in redundant
+        groups.setdefault(REDUNDANT if extra else kind, []).append(e)
+    lines = []
+    for kind in (*NO_VALUE, *HELD, UNREAD, FIXED):
+        found = groups.get(kind, [])
+        at_nominal = all(e.held == e.nominal and stated(known[e.name]) for e in found)
+        why = "held at nominal" if at_nominal else "held at the start value"
+        why += HELD.get(kind, f" ({printable(no_reading(result))})" if kind == UNREAD else "")
+        why = "fixed by the user" if kind == FIXED else why
+        names = [printable(e.name) for e in found]
+        if kind in NO_VALUE:
+            why = f"{NO_VALUE[kind]}, so without a value (95 %)"
+            names = [f"{n} ({limits(result, e)})" for n, e in zip(names, found, strict=True)]
+        lines += [f"{why}: {listed(names, most or len(names))}"] if names else []
+    return lines
 
 
-def _held_where(result: Calibration, names: list[str]) -> str:
-    """Where all of `names` are held: at nominal, or at a start value that is none."""
-    chosen = [e for e in result.estimates if printable(e.name) in names]
-    at_nominal = all(e.held == e.nominal and nominal_known(result, e.name) for e in chosen)
-    return "held at nominal" if at_nominal else "held at the start value"
+def undetermined_table(result: Calibration, truth: Truth | None = None) -> ShownTable:
+    heads = ["parameter", "nominal", "unit", *(["truth"] if truth else []), "why"]
+    rows, standing = list[tuple[str, ...]](), standings(result)
+    known = {p.name: p for p in result.model.parameters}
+    for e in result.ordinary:
+        if e.identifiable:
+            continue
+        kind, why = standing[e.name], printable(e.note)
+        if kind == COMBINED:
+            why = f"only as {shortened(result.combination(e.name))}"
+        elif kind == ABSORBED:
+            several = len(e.combined_with) - 3
+            names = ", ".join(printable(n) for n in e.combined_with[:3])
+            why = f"held: absorbed in {names}" + (f" + {several} more" if several > 0 else "")
+        elif kind in NO_VALUE:
+            why = f"{NO_VALUE[kind]}: {limits(result, e)}"
+        else:
+            why = WITHOUT.get(kind, why)
+        nominal = plain(display(e.nominal, e.unit)[0]) if stated(known[e.name]) else "–"
+        true = [texts(e, truth.get(e.name))[3]] if truth else []
+        rows.append((printable(e.name), nominal, display(0.0, e.unit)[1], *true, why))
+    return ShownTable(tuple(heads), rows, (0, 2, len(heads) - 1))
 
 
 def texts(e: Estimate | Combination, true: float | None) -> tuple[str, str, str, str]:
@@ -553,10 +564,9 @@ def parameter_table(
     result: Calibration, truth: Truth | None = None, published: Published | None = None
 ) -> ShownTable:
     own = [e for e in result.ordinary if e.identifiable]
-    effects = {p.name: p.effect.replace("_", " ") for p in result.model.parameters}
-    known = [nominal_known(result, e.name) for e in own]
-    shown = [plain(display(e.nominal, e.unit)[0]) for e in own]
-    after = {"nominal": [n if k else "–" for n, k in zip(shown, known, strict=True)]}
+    known = {p.name: p for p in result.model.parameters}
+    shown = [plain(display(e.nominal, e.unit)[0]) if stated(known[e.name]) else "–" for e in own]
+    after = {"nominal": shown}
     if published:
         given = [(published.get(e.name), e.unit) for e in own]
         after["published"] = ["–" if v is None else " ± ".join(estimate(*v, unit)[:2])
@@ -565,7 +575,7 @@ def parameter_table(
         after["note"] = [printable(e.note) for e in own]
     true = None if truth is None else [truth.get(e.name) for e in own]
     table = _numbers("Parameters", [printable(e.name) for e in own], own, true, after)
-    of = [effects[e.name] for e in own]
+    of = [known[e.name].effect.replace("_", " ") for e in own]
     groups = {k: name for k, name in enumerate(of) if not k or name != of[k - 1]}
     return replace(table, groups=groups)
 
@@ -600,16 +610,3 @@ def _numbers(
     words = tuple(k for k, head in enumerate(heads) if head in (first, "unit", "in 95 %", "note"))
     narrow = ShownTable((first, f"value {half}", *of_truth[1:]), brief, (0, 1, 2), title=title)
     return ShownTable(heads, rows, words, title=title, narrow=narrow)
-
-
-def undetermined_table(result: Calibration, truth: Truth | None = None) -> ShownTable:
-    heads = ["parameter", "nominal", "unit", *(["truth"] if truth else []), "why"]
-    rows = []
-    for e in result.ordinary:
-        if e.identifiable:
-            continue
-        nominal = plain(display(e.nominal, e.unit)[0]) if nominal_known(result, e.name) else "–"
-        known = [texts(e, truth.get(e.name))[3]] if truth else []
-        unit = display(0.0, e.unit)[1]
-        rows.append((printable(e.name), nominal, unit, *known, why_without(result, e)))
-    return ShownTable(tuple(heads), rows, (0, 2, len(heads) - 1))

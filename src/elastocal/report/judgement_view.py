@@ -15,7 +15,7 @@ from elastocal.identification.faulty_readings import FaultyGroup
 from elastocal.identification.findings import only_placed, shape_of
 from elastocal.identification.noise_structure import EACH, JOINTS, REGISTERED, Kind
 from elastocal.identification.noise_summary import SLIDES, Noise, NoiseSize
-from elastocal.identification.residuals import GroupSummary, ResidualSummary
+from elastocal.identification.residuals import ResidualSummary
 from elastocal.identification.result import Calibration, Finding
 from elastocal.identification.sentences import next_steps
 from elastocal.model.observations import available_noise
@@ -427,8 +427,7 @@ def noise_model_line(result: Calibration) -> str | None:
         return None
     text = printable(noise.description)
     text = text[:1].upper() + text[1:]
-    if sizes:
-        text += f": {'; '.join(sizes)}"
+    text += f": {'; '.join(sizes)}" if sizes else ""
     candidates = candidate_table(noise).rows
     if len(candidates) > 1:
         second, _, gap = candidates[1]
@@ -439,51 +438,44 @@ def noise_model_line(result: Calibration) -> str | None:
 
 def _sizes(noise: Noise) -> list[str]:
     """Name and standard deviation of every noise component; of many, the two extremes."""
+
+    def number(s: NoiseSize) -> float:
+        return (s.factor or 0.0) if s.sigma is None else s.sigma
+
+    def size(s: NoiseSize) -> str:
+        of_joint = s.of_joints and not s.name.endswith(SLIDES)
+        if s.sigma is None:
+            return significant(number(s))
+        if of_joint or s.name in TURNED or s.name.endswith("(rotation)"):
+            return f"{significant(s.sigma * 1e6)} µrad"
+        return length(s.sigma)
+
     sizes = noise.sizes or ()
     shared = [s for s in sizes if s.shared or s.of_joints or s.drift]
-    own = sorted((s for s in sizes if s not in shared), key=_number)
+    own = sorted((s for s in sizes if s not in shared), key=number)
     named = [(s.name, s) for s in sizes if s in own]
     if len(own) > FEW:
         named = [(f"median of {len(own)}", own[len(own) // 2])]
         named += [(f"smallest ({own[0].name})", own[0]), (f"largest ({own[-1].name})", own[-1])]
-    return [f"{printable(name)} {_size(s)}" for name, s in [*named, *((s.name, s) for s in shared)]]
-
-
-def _number(s: NoiseSize) -> float:
-    return (s.factor or 0.0) if s.sigma is None else s.sigma
-
-
-def _size(s: NoiseSize) -> str:
-    if s.sigma is None:
-        return significant(_number(s))
-    of_joint = s.of_joints and not s.name.endswith(SLIDES)
-    if of_joint or s.name in TURNED or s.name.endswith("(rotation)"):
-        return f"{significant(s.sigma * 1e6)} µrad"
-    return length(s.sigma)
+    return [f"{printable(n)} {size(s)}" for n, s in [*named, *((s.name, s) for s in shared)]]
 
 
 def candidate_table(noise: Noise) -> ShownTable:
     """Noise models that were tried, best first: words, variances, criterion above the best."""
     tried = sorted(noise.tried or (), key=lambda t: t.criterion)
-    rows = [
-        (_kind_in_words(t.kind), str(t.n_variances), f"{t.criterion - tried[0].criterion:.1f}")
-        for t in tried
-    ]
+    known, rows = KINDS | {name: model.description for name, model in REGISTERED.items()}, []
+    for t in tried:
+        parts = Kind.parsed(t.kind)
+        text = printable(known.get(parts.own, parts.own))
+        text += " + deviations of a configuration" if parts.shared else ""
+        text += SCATTERS.get(parts.joints, "") + " + drift in time" * bool(parts.time)
+        rows.append((text, str(t.n_variances), f"{t.criterion - tried[0].criterion:.1f}"))
     heads = ("noise model", "variances", "criterion over best")
     note = (
         "The information criterion: twice the loss in log-likelihood and a price per variance; 10 "
         "above the best is practically no support."
     )
     return ShownTable(heads, rows, title="Noise models tried", note=note)
-
-
-def _kind_in_words(kind: str) -> str:
-    parts = Kind.parsed(kind)
-    known = KINDS | {name: model.description for name, model in REGISTERED.items()}
-    text = printable(known.get(parts.own, parts.own))
-    text += " + deviations of a configuration" if parts.shared else ""
-    text += SCATTERS.get(parts.joints, "")
-    return f"{text} + drift in time" if parts.time else text
 
 
 def _repeats_line(result: Calibration) -> str | None:
@@ -495,24 +487,24 @@ def _repeats_line(result: Calibration) -> str | None:
         f"lack of fit: F = {f.number('F'):.2f} on {f.numbers['dof_between']} and "
         f"{f.numbers['dof_pure']} degrees of freedom, {_p(f.number('p'))}"
     )
-    by_model = f.numbers["counted_by"] == "the noise model"
+    by = str(f.numbers["counted_by"])
     if f.kind == "repeats_agree":
         text = f"Repeats agree with the scatter between configurations ({numbers})"
-        if by_model:
+        if by == "the noise model":
             return (
                 f"{text}: the test shows no common deviation. The noise model, chosen by its "
                 "criterion, has one; the intervals include it."
             )
         return f"{text}: readings of one configuration have no common deviation."
-    text = (
-        f"Configurations scatter more than their repeats ({numbers}): the arm does not "
-        "return to the same place, or an effect is missing."
+    counted = {
+        "the noise model": "The noise model has this common deviation; the intervals include it.",
+        "the intervals": "The intervals take each configuration as a whole and include it.",
+    }
+    return (
+        f"Configurations scatter more than their repeats ({numbers}): the arm does not return to "
+        "the same place, or an effect is missing. "
+        + counted.get(by, "The intervals do not include it and are too narrow.")
     )
-    if by_model:
-        return f"{text} The noise model has this common deviation; the intervals include it."
-    if f.numbers["counted_by"] == "the intervals":
-        return f"{text} The intervals take each configuration as a whole and include it."
-    return f"{text} The intervals do not include it and are too narrow."
 
 
 def shape_line(summary: ResidualSummary) -> str:
@@ -533,27 +525,22 @@ def shape_line(summary: ResidualSummary) -> str:
             f" In held-out configurations the scatter is {significant(scatter**0.5)} times that of "
             "the noise model."
         )
-    found = sum(g.n_deviating for g in summary.groupings)
-    if not found:
+    groups = [f"{row[0]} {row[2]} times" for row in deviating_table(summary).rows[:MOST_GROUPS]]
+    if not groups:
         return f"{text} No group of readings deviates from the noise model."
-    named = [f"{_group(by, g)} {_ratio(g)} times" for by, g in summary.deviating[:MOST_GROUPS]]
-    more = found - len(named)
+    more = sum(g.n_deviating for g in summary.groupings) - len(groups)
     tail = f", and {more} more" if more else ""
-    return f"{text} Scatter unlike the noise model: {', '.join(named)}{tail}."
+    return f"{text} Scatter unlike the noise model: {', '.join(groups)}{tail}."
 
 
 def deviating_table(summary: ResidualSummary) -> ShownTable:
-    rows = [(_group(by, g), str(g.n), _ratio(g), f"{g.p_holm:.1g}") for by, g in summary.deviating]
+    rows = [
+        (f"{by} {printable(g.name)}", str(g.n), significant(float(np.sqrt(g.mean_square)), 2),
+         f"{g.p_holm:.1g}")
+        for by, g in summary.deviating
+    ]  # fmt: skip
     heads = ("scatters unlike the noise model", "values", "observed / expected", "p (Holm)")
     return ShownTable(heads, rows)
-
-
-def _group(by: str, group: GroupSummary) -> str:
-    return f"{by} {printable(group.name)}"
-
-
-def _ratio(group: GroupSummary) -> str:
-    return significant(float(np.sqrt(group.mean_square)), 2)
 
 
 def _in_time_line(result: Calibration) -> str | None:
@@ -595,15 +582,6 @@ def fault_lines(result: Calibration, most: int | None = None) -> list[str]:
     lines = [_fault(result, finding) for finding in groups[:most]]
     more = len(groups) - len(lines)
     return [*lines, f"And {more} more."] if more else lines
-
-
-def false_alarm_line(result: Calibration) -> str | None:
-    """How often the search would accuse readings of a table in which nothing is wrong."""
-    report = result.faulty_report
-    if report is None or not fault_lines(result):
-        return None
-    share = 100 * report.false_alarm
-    return f"False-alarm rate: at most {share:g} % of tables without outliers."
 
 
 def _fault(result: Calibration, finding: FaultyGroup) -> str:
@@ -649,12 +627,3 @@ def smooth_table(result: Calibration) -> ShownTable:
     )
     heads = ("smooth function", "rms", "95 %", "known to ±", "unit", "coefficients' worth")
     return ShownTable(heads, rows, (0, 4), title="Smooth functions", note=note)
-
-
-def counted_functions(result: Calibration) -> str:
-    """ "; and 6 smooth functions of 648 coefficients", "" where there are none."""
-    found = [part for part in result.smooth if part.scale]
-    if not found:
-        return ""
-    n = sum(part.coefficients for part in found)
-    return f"; and {counted(len(found), 'smooth function')} of {n} coefficients"

@@ -343,7 +343,7 @@ def plot(result: object, kind: str | None, interactive: bool, ax: Any = None) ->
     block = found[0]
     drawn = space_figure(block) if isinstance(block, ShownArm) else block
     if ax is not None:
-        spot = getattr(ax, "get_subplotspec", lambda: None)()
+        spot: Any = getattr(ax, "get_subplotspec", lambda: None)()
         require(spot is not None, "`ax` takes axes that plt.subplots or Figure.subplots made")
         ax.remove()
         return figure_of(drawn, spot.get_gridspec().figure.add_subfigure(spot))

@@ -11,7 +11,7 @@ from elastocal.errors import option
 from elastocal.planning.bodies import mounting_plane
 from elastocal.planning.criteria import CRITERIA
 from elastocal.planning.execution import DRIFT
-from elastocal.planning.plan import Plan, Predicted, Reason, load_name
+from elastocal.planning.plan import Plan, Reason, load_name
 from elastocal.report.blocks import (
     WARNING,
     Block,
@@ -47,32 +47,54 @@ def plan_report(plan: Plan) -> Report:
 
 
 def plan_blocks(plan: Plan) -> Iterator[Block]:
+    def curve() -> Iterator[Block]:
+        from elastocal.report.figures import plan_curve
+
+        yield curve_table(plan)
+        yield plan_curve(plan)
+
+    def arm() -> Iterator[Block]:
+        from elastocal.report.arm_view import plan_arm
+
+        yield Lines([("Next", text) for text in plan_steps(plan)])
+        yield stop_table(plan)
+        yield plan_arm(plan)
+
     yield Fold("", lambda: [_key(plan)])
     # A gap to the bound is no fault of the plan's: with few poses much of it is the bound's.
     yield ShownVerdict("warn" if plan.warnings else "good", plan_headline(plan))
     yield Lines([(WARNING, printable(text)) for text in plan.warnings])
-    steps = Lines([("Next", text) for text in plan_steps(plan)])
-    yield Fold("", lambda: [steps, stop_table(plan), _arm(plan)], figures=("poses",))
-    yield Fold("Poses", lambda: [pose_table(plan)], printed=True)
-    yield Fold("Why each pose", lambda: [reason_table(plan)], printed=True)
+    yield Fold("", arm, figures=("poses",))
+    # Less digits where there is no room.
+    two, one, none = (pose_table(plan, decimals) for decimals in (2, 1, 0))
+    poses = replace(two, narrow=replace(one, narrow=none))
+    yield Fold("Poses", lambda: [poses], printed=True)
+    why = [(name, served(r)) for name, r in zip(plan.configurations, plan.reasons, strict=True)]
+    reasons = ShownTable(("pose", SERVES), why, (1,), title="Why each pose")
+    yield Fold("Why each pose", lambda: [reasons], printed=True)
     yield Fold("Predicted intervals", lambda: [interval_table(plan)], printed=True)
     if plan.curve:
-        yield Fold("Number of poses", lambda: _curve(plan), printed=True, figures=("curve",))
+        yield Fold("Number of poses", curve, printed=True, figures=("curve",))
     if plan.timed:
-        yield Fold("Poses and readings within the time", lambda: [timed_table(plan)], printed=True)
-    yield Fold("What the plan is worth", lambda: [Lines(plan_lines(plan))], printed=True)
+        title = "Poses and readings within the time"
+        heads = ("poses", "readings each", "minutes", f"{plan.criterion} {plan.unit}".strip())
+        rows = [
+            (str(s.poses), str(s.repeats), f"{s.minutes:.0f}", f"{s.value:.4g}") for s in plan.timed
+        ]
+        yield Fold(title, lambda: [ShownTable(heads, rows, (), title=title)], printed=True)
+    yield Fold("What the plan is worth", lambda: [Lines([*plan_lines(plan)])], printed=True)
 
 
 def next_report(found: NextPoses) -> Report:
     """Whether to measure more, what it brings, and the poses."""
-    return Report("Next poses", printable(found.source), _next_blocks(found))
 
+    def blocks() -> Iterator[Block]:
+        yield Lines([*next_lines(found)])
+        yield Fold("", lambda: [_gain(found)], figures=("gain",))
+        if found.plan is not None:
+            yield from plan_blocks(found.plan)
 
-def _next_blocks(found: NextPoses) -> Iterator[Block]:
-    yield Lines(next_lines(found))
-    yield Fold("", lambda: _next_figures(found), figures=("gain",))
-    if found.plan is not None:
-        yield from plan_blocks(found.plan)
+    return Report("Next poses", printable(found.source), blocks())
 
 
 def _key(plan: Plan) -> KeyFigures:
@@ -88,20 +110,7 @@ def _key(plan: Plan) -> KeyFigures:
     return KeyFigures(figures)
 
 
-def _arm(plan: Plan) -> Block:
-    from elastocal.report.arm_view import plan_arm
-
-    return plan_arm(plan)
-
-
-def _curve(plan: Plan) -> Iterator[Block]:
-    from elastocal.report.figures import plan_curve
-
-    yield curve_table(plan)
-    yield plan_curve(plan)
-
-
-def _next_figures(found: NextPoses) -> Iterator[Figure]:
+def _gain(found: NextPoses) -> Figure:
     """The error before and after the batch."""
     from elastocal.report.figures import NO_ENDS, rows_of_dots
 
@@ -114,20 +123,15 @@ def _next_figures(found: NextPoses) -> Iterator[Figure]:
         for name, value in zip(names, values, strict=True) if math.isfinite(value)
     ]  # fmt: skip
     axis = "rms error at the test poses"
-    yield rows_of_dots("gain", "Error before and after the batch", rows, axis, lengths=True)
+    return rows_of_dots("gain", "Error before and after the batch", rows, axis, lengths=True)
 
 
 TOLD = 2  # parameters that a pose serves, in the table
 SERVES = "most affected if dropped (standard deviation)"
 
 
-def pose_table(plan: Plan) -> ShownTable:
-    """Joint values and place in the order of execution; less digits where there is no room."""
-    two, one, none = (_poses(plan, decimals) for decimals in (2, 1, 0))
-    return replace(two, narrow=replace(one, narrow=none))
-
-
-def _poses(plan: Plan, decimals: int) -> ShownTable:
+def pose_table(plan: Plan, decimals: int = 2) -> ShownTable:
+    """Joint values and place in the order of execution."""
     kinds = plan.model.chain.kinds
     heads = ["pose", *joint_heads(kinds), "order"]
     heads += [] if plan.crossed else ["load"]
@@ -143,12 +147,6 @@ def _poses(plan: Plan, decimals: int) -> ShownTable:
     return ShownTable(tuple(heads), rows, words, title="Poses")
 
 
-def reason_table(plan: Plan) -> ShownTable:
-    """What each pose is there for."""
-    rows = [(name, served(r)) for name, r in zip(plan.configurations, plan.reasons, strict=True)]
-    return ShownTable(("pose", SERVES), rows, (1,), title="Why each pose")
-
-
 def served(reason: Reason) -> str:
     """The parameters that a pose serves most: "joint3.compliance +38 %"."""
     parts = [
@@ -160,20 +158,15 @@ def served(reason: Reason) -> str:
 
 def interval_table(plan: Plan) -> ShownTable:
     """Predicted half widths of the 95 % intervals."""
-    combined = any(p.combined_with for p in plan.predicted)
     rows: list[tuple[str, ...]] = []
     for p in plan.predicted:
         shown, unit = display(p.half_width, p.unit)
-        row = (printable(p.name), significant(shown, 2), unit)
-        rows.append((*row, _partners(p)) if combined else row)
-    heads: tuple[str, ...] = ("parameter", "± 95 %", "unit")
-    heads = (*heads, "together with") if combined else heads
-    return ShownTable(heads, rows, (0, 2, 3), title="Predicted intervals")
-
-
-def _partners(p: Predicted) -> str:
-    names = [printable(name) for name in p.combined_with]
-    return ", ".join(names[:3]) + (f" and {len(names) - 3} more" if len(names) > 3 else "")
+        names = [printable(name) for name in p.combined_with]
+        more = f" and {len(names) - 3} more" if len(names) > 3 else ""
+        rows.append((printable(p.name), significant(shown, 2), unit, ", ".join(names[:3]) + more))
+    heads = ("parameter", "± 95 %", "unit", "together with")
+    table = ShownTable(heads, rows, (0, 2, 3), title="Predicted intervals")
+    return table if any(p.combined_with for p in plan.predicted) else table.without(3)
 
 
 def curve_table(plan: Plan) -> ShownTable:
@@ -184,15 +177,6 @@ def curve_table(plan: Plan) -> ShownTable:
         for s in plan.curve
     ]
     return ShownTable(heads, rows, (), title="Number of poses")
-
-
-def timed_table(plan: Plan) -> ShownTable:
-    """The criterion against numbers of poses and of readings that the time allows."""
-    heads = ("poses", "readings each", "minutes", f"{plan.criterion} {plan.unit}".strip())
-    rows = [
-        (str(s.poses), str(s.repeats), f"{s.minutes:.0f}", f"{s.value:.4g}") for s in plan.timed
-    ]
-    return ShownTable(heads, rows, (), title="Poses and readings within the time")
 
 
 def stop_table(plan: Plan) -> ShownTable:
@@ -212,13 +196,11 @@ VAIN = 0.1  # below which the bound says nothing: so few poses cannot be spread 
 
 def plan_headline(plan: Plan) -> str:
     """What the plan is worth and how far from the best it is, in one sentence."""
-    n = counted(len(plan.q), "pose")
+    text = f"{counted(len(plan.q), 'pose')}: "
     if plan.of_test_poses:
-        text = (
-            f"{n}: position error ρ₀ = {_rho(plan):.3g} µm rms at the test poses after compensation"
-        )
+        text += f"position error ρ₀ = {_rho(plan):.3g} µm rms at the test poses after compensation"
     else:
-        text = f"{n}: {plan.criterion} = {plan.reported:.4g} {plan.unit}".rstrip()
+        text += f"{plan.criterion} = {plan.reported:.4g} {plan.unit}".rstrip()
     found, better = plan.certificate.efficiency_pool, plan.certificate.better_pool
     if found is None or better is None or found < VAIN:
         return f"{text}; no bound on the best plan is known."
@@ -240,10 +222,11 @@ def _rho(plan: Plan) -> float:
     return plan.reported if e is None or not e.share else e.test_poses * 1e6
 
 
-def _apart(plan: Plan) -> bool:
-    """Did the starts of the search end so far apart that more of them may find a better plan?"""
-    ends = plan.certificate.starts
-    return len(ends) > 1 and max(ends) - min(ends) > APART * max(abs(end) for end in ends)
+def _criterion(plan: Plan) -> str:
+    """The name of what the search made small, which starts and bound are figures of."""
+    if _weighted(plan):
+        return "weighted error"
+    return "ρ₀" if plan.of_test_poses else plan.criterion
 
 
 def plan_steps(plan: Plan) -> list[str]:
@@ -256,7 +239,8 @@ def plan_steps(plan: Plan) -> list[str]:
             f"If ρ₀ is not small enough: {option('target')} finds the fewest poses for a value, "
             f"{option('curve')} compares numbers of poses."
         )
-    if _apart(plan):
+    ends = plan.certificate.starts
+    if len(ends) > 1 and max(ends) - min(ends) > APART * max(abs(end) for end in ends):
         steps.append(f"For a better plan: {option('effort', 'thorough')}, which has more starts.")
     together = sum(bool(p.combined_with) for p in plan.predicted)
     if together:
@@ -264,97 +248,98 @@ def plan_steps(plan: Plan) -> list[str]:
             f"{counted(together, 'parameter')} will be determined only in sums: more "
             "markers or load states separate them, more poses like these do not."
         )
-    steps.append("Then: elastocal identify with the same cell and the measurements.")
-    return steps
+    return [*steps, "Then: elastocal identify with the same cell and the measurements."]
 
 
-def plan_lines(plan: Plan) -> list[tuple[str, str]]:
-    """What the plan is worth, as (label, sentence)."""
-    lines = [*_chosen_lines(plan), *_state_lines(plan), _criterion_line(plan)]
+Told = Iterator[tuple[str, str]]  # label, sentence
+
+
+def plan_lines(plan: Plan) -> Told:
+    """What the plan is worth."""
+    yield from _chosen_lines(plan)
+    if not plan.of_test_poses:
+        yield "Criterion", f"{plan.criterion} = {plan.reported:.6g} {plan.unit}".rstrip() + "."
+    else:
+        yield (
+            "Criterion",
+            f"ρ₀ = {_rho(plan):.4g} µm rms position error at the test poses after compensation "
+            f"({printable(plan.targets)}).",
+        )
     if plan.made_for:
-        lines.append(("Made for", f"{printable(plan.made_for)}."))
-    lines += [*_everywhere_lines(plan), *_chance_lines(plan)]
-    lines.append(_candidate_line(plan))
-    lines += _certificate_lines(plan)
-    lines += [_execution_line(plan), *_drift_lines(plan)]
+        yield "Made for", f"{printable(plan.made_for)}."
+    yield from _everywhere_lines(plan)
+    yield from _chance_lines(plan)
+    c = plan.candidates
+    hardest = sorted(c.removed_by.items(), key=lambda item: -item[1])
+    told = ", ".join(f"{name.replace('_', ' ')} {n}" for name, n in hardest if n)
+    rules = f"; removed by {told}." if told else "; no rule removed any."
+    yield "Candidates", f"{c.feasible} feasible of {c.tried} tried{rules}"
+    yield from _certificate_lines(plan)
+    yield from _execution_lines(plan)
     s = plan.scheduled
     if s is not None and s.test_poses is not None and s.without is not None:
-        text = (
+        yield (
+            "In time",
             f"{s.test_poses * 1e6:.4g} µm at the test poses with {listed(s.effects)} identified "
-            f"too, {s.without * 1e6:.4g} µm if they were known"
+            f"too, {s.without * 1e6:.4g} µm if they were known.",
         )
-        lines.append(("In time", f"{text}."))
     if plan.timed:
         spec, took = plan.model.cell.design, plan.execution.total / 60
         text = f"{took:.0f} minutes with {counted(spec.repeats, 'reading')} of each marker"
-        lines.append(("Time", f"{text}, moves and changes of load included."))
+        yield "Time", f"{text}, moves and changes of load included."
     if plan.polished:
         text = f"{plan.polished} of {len(plan.q)} poses come from local searches between the drawn"
-        lines.append(("Polish", f"{text} candidates."))
-    return lines
+        yield "Polish", f"{text} candidates."
 
 
-def _chosen_lines(plan: Plan) -> list[tuple[str, str]]:
-    """What was chosen besides the poses, and what it is worth."""
-    c = plan.chosen
-    if c is None:
-        return []
+def _chosen_lines(plan: Plan) -> Told:
+    """What was chosen besides the poses, in which load states they are measured, and what that is
+    worth."""
+    c, s, unit = plan.chosen, plan.states, f" {plan.unit}" if plan.unit else ""
 
     def at(place: Any) -> str:
         return f"[{', '.join(f'{v:.4g}' for v in place)}]"
 
-    told = [
-        f"{printable(name)} at {at(after)} m instead of {at(before)}"
-        for name, (before, after) in c.places.items()
-    ]
-    if c.loads is not None:
-        told.append(f"loads {', '.join(at(load) for load in c.loads)} N")
-    stood = "no plan" if c.before is None else f"{c.before:.4g}"
-    seen = "none" if c.share[0] is None else f"{100 * c.share[0]:.1f} %"
-    worth = (
-        f"best possible value of any plan from {stood} to {c.after:.4g} {c.unit}".rstrip()
-        + f" (relaxed, {c.candidates} candidates each), feasible poses from {seen} to "
-        f"{100 * c.share[1]:.1f} %"
-    )
-    return [("Chosen", f"{'; '.join(told)}."), ("Chosen", f"{worth}.")]
-
-
-def _state_lines(plan: Plan) -> list[tuple[str, str]]:
-    """In which load states poses are measured, and what that is worth."""
-    s = plan.states
+    if c is not None:
+        told = [
+            f"{printable(name)} at {at(after)} m instead of {at(before)}"
+            for name, (before, after) in c.places.items()
+        ]
+        if c.loads is not None:
+            told.append(f"loads {', '.join(at(load) for load in c.loads)} N")
+        yield "Chosen", f"{'; '.join(told)}."
+        stood = "no plan" if c.before is None else f"{c.before:.4g}"
+        seen = "none" if c.share[0] is None else f"{100 * c.share[0]:.1f} %"
+        worth = f"best possible value of any plan from {stood} to {c.after:.4g} {c.unit}".rstrip()
+        yield (
+            "Chosen",
+            f"{worth} (relaxed, {c.candidates} candidates each), feasible poses from {seen} to "
+            f"{100 * c.share[1]:.1f} %.",
+        )
     if s is None:
-        return []
-    worth, unit = "", f" {plan.unit}" if plan.unit else ""
+        return
+    worth = ""
     if s.crossed is not None and s.chosen is not None:
         worth = (
             f" (relaxed on candidates, in the same time: in all load states {s.crossed:.4g}{unit}, "
             f"chosen for each pose {s.chosen:.4g}{unit})"
         )
-    if s.used == "all":
-        return [("Loads", f"every pose in every load state, as {s.why}{worth}.")]
-    counts = (plan.readings > 0).sum(axis=0)
-    told = [
-        f"{counted(int(n), 'pose')} {'' if name == 'unloaded' else 'under '}{name}"
-        for n, name in zip(counts, map(load_name, plan.forces), strict=True)
-        if n
-    ]
-    return [("Loads", f"{listed(told)}{worth}.")]
+    text = f"every pose in every load state, as {s.why}"
+    if s.used != "all":
+        counts = (plan.readings > 0).sum(axis=0)
+        text = listed(
+            f"{counted(int(n), 'pose')} {'' if name == 'unloaded' else 'under '}{name}"
+            for n, name in zip(counts, map(load_name, plan.forces), strict=True)
+            if n
+        )
+    yield "Loads", f"{text}{worth}."
 
 
-def _criterion_line(plan: Plan) -> tuple[str, str]:
-    if not plan.of_test_poses:
-        return "Criterion", f"{plan.criterion} = {plan.reported:.6g} {plan.unit}".rstrip() + "."
-    return "Criterion", (
-        f"ρ₀ = {_rho(plan):.4g} µm rms position error at the test poses after compensation "
-        f"({printable(plan.targets)})."
-    )
-
-
-def _everywhere_lines(plan: Plan) -> list[tuple[str, str]]:
+def _everywhere_lines(plan: Plan) -> Told:
     """The error at the test poses and all over the joint ranges, beside a random plan's."""
     e = plan.everywhere
     if e is None:
-        return []
+        return
 
     def micrometres(error: float | None) -> str:
         return "none" if error is None else f"{error * 1e6:.4g}"
@@ -379,116 +364,81 @@ def _everywhere_lines(plan: Plan) -> list[tuple[str, str]]:
         text += (
             f"; {option('elsewhere_cap', 0.05)} minimises it, allowing 5 % more at the test poses"
         )
-    return [("Elsewhere", f"{text}.")]
+    yield "Elsewhere", f"{text}."
 
 
-def _chance_lines(plan: Plan) -> list[tuple[str, str]]:
+def _chance_lines(plan: Plan) -> Told:
     """What as many random poses would have given."""
     c = plan.chance
     if c is None:
-        return []
-    whole = f"{c.n} random plans of as many feasible poses"
-    open_ = c.n - c.determined
-    lost = f"{open_} of {whole} do not determine all parameters of this plan"
-    if c.median is None or c.best is None:
-        return [("Chance", f"{lost}.")]
-    name = _criterion(plan)
-    unit = f" {plan.unit}" if plan.unit else ""
-    worst = "no value" if c.worst is None else f"{c.worst:.4g}"
-    text = (
-        f"the median of {whole} has {name} = {c.median:.4g}{unit} (best {c.best:.4g}, worst "
-        f"{worst})"
-    )
-    if c.efficiency is not None:
-        text += f", an efficiency of {c.efficiency:.2f} against this plan"
-    return [("Chance", f"{text}; {lost}." if open_ else f"{text}.")]
-
-
-def _criterion(plan: Plan) -> str:
-    """The name of what the search made small, which starts and bound are figures of."""
-    if _weighted(plan):
-        return "weighted error"
-    return "ρ₀" if plan.of_test_poses else plan.criterion
-
-
-def _candidate_line(plan: Plan) -> tuple[str, str]:
-    c = plan.candidates
-    hardest = sorted(c.removed_by.items(), key=lambda item: -item[1])
-    told = ", ".join(f"{name.replace('_', ' ')} {n}" for name, n in hardest if n)
-    text = f"{c.feasible} feasible of {c.tried} tried"
-    return "Candidates", text + (f"; removed by {told}." if told else "; no rule removed any.")
-
-
-def _certificate_lines(plan: Plan) -> list[tuple[str, str]]:
-    c = plan.certificate
-    if c.efficiency_pool is None:
-        reason = CRITERIA[plan.criterion].without_bound
-        return [("Certificate", f"none: {plan.criterion} {reason}, so no bound is known.")]
-    told = ""
-    if plan.bound_reported is not None:
-        told = f" (bound {_criterion(plan)} = {plan.bound_reported:.4g} {plan.unit})"
-    lines = [
-        (
-            "Certificate",
-            f"certified on the pool: efficiency {_share(c.efficiency_pool)} (in readings) against "
-            f"the best subset of the {c.pool} candidates with the same number per level"
-            f"{told.replace(' )', ')')}.",
-        )
-    ]
-    if c.efficiency_pool < VAIN:
+        return
+    whole, unit = f"{c.n} random plans of as many feasible poses", f" {plan.unit}".rstrip()
+    lost = f"{c.n - c.determined} of {whole} do not determine all parameters of this plan"
+    text = ""
+    if c.median is not None and c.best is not None:
+        worst = "no value" if c.worst is None else f"{c.worst:.4g}"
         text = (
-            "with so few poses the bound says nothing: the relaxation spreads weights over many "
-            "candidates"
+            f"the median of {whole} has {_criterion(plan)} = {c.median:.4g}{unit} (best "
+            f"{c.best:.4g}, worst {worst})"
         )
-        return [*lines, ("Certificate", f"{text}.")]
-    if c.efficiency_continuum is not None:
-        lines.append(
-            (
-                "Certificate",
-                f"estimated on the continuum: efficiency {c.efficiency_continuum:.4f}, after "
-                f"{c.searched} more poses and {c.ascents} local searches; a better pose may "
-                "have been missed.",
-            )
-        )
-    return lines + _starts_lines(plan)
+        if c.efficiency is not None:
+            text += f", an efficiency of {c.efficiency:.2f} against this plan"
+    yield "Chance", "; ".join([text] * bool(text) + [lost] * (not text or c.n > c.determined)) + "."
 
 
-def _starts_lines(plan: Plan) -> list[tuple[str, str]]:
-    """Where the starts of the search ended, and what lies between the best plan and the bound."""
-    ends, bound = plan.certificate.starts, plan.bound_reported
-    if not ends or bound is None:
-        return []
-    unit = f" {plan.unit}" if plan.unit else ""
-    low, high = f"{min(ends):.4g}", f"{max(ends):.4g}"
-    told = f"{low if low == high else f'{low} to {high}'}{unit}"
-    text = (
-        f"{counted(len(ends), 'start')} of the search ended with {_criterion(plan)} = {told}, the "
-        f"bound is {bound:.4g}{unit}. The difference is what no start found, or what only weights "
-        "can reach: the fewer poses, the more of the latter."
+def _certificate_lines(plan: Plan) -> Told:
+    """How far from the best the plan is: on the pool, on the continuum, by its starts."""
+    c, name, unit = plan.certificate, _criterion(plan), f" {plan.unit}" if plan.unit else ""
+    found, bound = c.efficiency_pool, plan.bound_reported
+    if found is None:
+        reason = CRITERIA[plan.criterion].without_bound
+        yield "Certificate", f"none: {plan.criterion} {reason}, so no bound is known."
+        return
+    told = "" if bound is None else f" (bound {name} = {bound:.4g}{unit})"
+    efficiency = f"{found:.4f}" if found >= VAIN else f"{found:.1g}"
+    yield (
+        "Certificate",
+        f"certified on the pool: efficiency {efficiency} (in readings) against the best subset of "
+        f"the {c.pool} candidates with the same number per level{told}.",
     )
-    return [("Certificate", text)]
+    if found < VAIN:
+        yield (
+            "Certificate",
+            "with so few poses the bound says nothing: the relaxation spreads weights over many "
+            "candidates.",
+        )
+        return
+    if c.efficiency_continuum is not None:
+        yield (
+            "Certificate",
+            f"estimated on the continuum: efficiency {c.efficiency_continuum:.4f}, after "
+            f"{c.searched} more poses and {c.ascents} local searches; a better pose may "
+            "have been missed.",
+        )
+    if c.starts and bound is not None:
+        ends = " to ".join(dict.fromkeys(f"{e:.4g}" for e in (min(c.starts), max(c.starts))))
+        yield (
+            "Certificate",
+            f"{counted(len(c.starts), 'start')} of the search ended with {name} = {ends}{unit}, "
+            f"the bound is {bound:.4g}{unit}. The difference is what no start found, or what only "
+            "weights can reach: the fewer poses, the more of the latter.",
+        )
 
 
-def _share(value: float) -> str:
-    return f"{value:.4f}" if value >= VAIN else f"{value:.1g}"
-
-
-def _execution_line(plan: Plan) -> tuple[str, str]:
-    e = plan.execution
-    stops, changes = len(e.stops), e.load_changes
-    text = f"{stops} stops, {e.travel:.0f} s of travel"
+def _execution_lines(plan: Plan) -> Told:
+    """The way, how far it was checked, and what a steady drift does in this order and in the
+    shortest."""
+    e, space = plan.execution, plan.model.cell.workspace
     again = sum(stop.again > 0 for stop in e.stops)
-    if again:
-        text = f"{stops} stops, {again} of them at reference poses, {e.travel:.0f} s of travel"
+    visits = f", {again} of them at reference poses" if again else ""
+    text = f"{len(e.stops)} stops{visits}, {e.travel:.0f} s of travel"
     parts = sum(stop.part > 0 for stop in e.stops)
     if parts:
         text += f"; {parts} poses are measured unloaded at start and end (half the readings each)"
-    if changes:
-        text += f", {changes} load change{'s' if changes > 1 else ''} by hand"
+    if e.load_changes:
+        text += f", {counted(e.load_changes, 'load change')} by hand"
     via = sum(len(stop.via) for stop in e.stops) + len(e.home_via)
-    if via:
-        text += f", {via} via points around obstacles"
-    space = plan.model.cell.workspace
+    text += f", {via} via points around obstacles" if via else ""
     if len(space.link_radius) > 0 or space.urdf_geometry or len(space.bodies) > 0:
         checked = "every move checked"
     elif mounting_plane(plan.model.cell, plan.model.chain) is not None:
@@ -501,28 +451,21 @@ def _execution_line(plan: Plan) -> tuple[str, str]:
             "no move was checked, as [workspace] states no bodies, and poses may reach below the "
             "mounting plane"
         )
-    return "Execution", f"{text}, {e.total / 60:.0f} min in all; {checked}."
-
-
-def _drift_lines(plan: Plan) -> list[tuple[str, str]]:
-    """What a steady drift does in this order, and what it would do in the shortest."""
-    d = plan.execution.drift
-    if d is None:
-        return []
-    size = f"a steady drift of {DRIFT * 1e6:g} µm"
+    yield "Execution", f"{text}, {e.total / 60:.0f} min in all; {checked}."
+    if (d := e.drift) is None:
+        return
+    text = f"a steady drift of {DRIFT * 1e6:g} µm changes "
     if d.at_test_poses:
-        text = f"{size} changes the result by at most {d.bias * 1e6:.2g} µm at the test poses"
+        text += f"the result by at most {d.bias * 1e6:.2g} µm at the test poses"
         other = f"{d.shortest * 1e6:.2g} µm"
     else:
-        text = f"{size} changes parameters by at most {d.bias:.2g} standard deviations"
+        text += f"parameters by at most {d.bias:.2g} standard deviations"
         other = f"{d.shortest:.2g}"
-    if d.bias < d.shortest:
-        text += f" (in the shortest order {other})"
-    return [("Drift", f"{text}.")]
+    yield "Drift", f"{text}{f' (in the shortest order {other})' * (d.bias < d.shortest)}."
 
 
-def next_lines(found: NextPoses) -> list[tuple[str, str]]:
-    """Whether to measure more, what it brings, and what may be missing, as (label, sentence)."""
+def next_lines(found: NextPoses) -> Told:
+    """Whether to measure more, what it brings, and what may be missing."""
     g, n = found.gain, counted(found.batch, "pose")
     limit = "" if found.required is None else f" (required: {found.required * 1e6:.3g} µm)"
     verdicts = {
@@ -540,21 +483,19 @@ def next_lines(found: NextPoses) -> list[tuple[str, str]]:
         begun = f"{before * 1e6:.3g} µm" if math.isfinite(before) else "an unknown error"
         return f"{begun} to {after * 1e6:.3g} µm"
 
-    lines = [("Next", verdicts[found.verdict] + "."), ("Error now", now + ".")]
-    lines.append(
-        (
-            "Gain",
-            f"{n} lower the rms error at the test poses from {both(g.before, g.after)} with what "
-            f"the model may lack; from {both(g.model_before, g.model_after)} if it is right.",
-        )
+    yield "Next", f"{verdicts[found.verdict]}."
+    yield "Error now", f"{now}."
+    yield (
+        "Gain",
+        f"{n} lower the rms error at the test poses from {both(g.before, g.after)} with what "
+        f"the model may lack; from {both(g.model_before, g.model_after)} if it is right.",
     )
     named = [f"{f.effect} at {f.where} ({f.probability:.2f})" for f in found.found]
     if named:
         text = f"{', '.join(named)}, added to the model here; write the cell with it"
-        lines.append(("Found", printable(f"{text} (diagnose, {option('cell_out')}).")))
+        yield "Found", printable(f"{text} (diagnose, {option('cell_out')}).")
     doubts = [f"{e} at {w} ({p:.2g})" for e, w, p in found.doubts[:3]]
     if doubts:
         rivals = found.diagnosis is not None and found.diagnosis.open
         apart = f"; poses that tell them apart: diagnose {option('plan')}" if rivals else ""
-        lines.append(("In doubt", printable(f"likeliest {', '.join(doubts)}{apart}.")))
-    return lines
+        yield "In doubt", printable(f"likeliest {', '.join(doubts)}{apart}.")

@@ -64,7 +64,8 @@ def _changes(c: Comparison) -> Iterator[Block]:
     yield ShownVerdict("good" if same else "warn", _changed(c))
     moved = (
         f"Moved by {rms} rms for the same commands, {most} at most, at {len(c.distance)} random "
-        f"poses within the joint limits {_under(c)}; noise alone gives {noise} rms."
+        f"poses within the joint limits under {loads_text(c.forces, '{}', '{} loads in turn')}, "
+        f"{OF_LOADS[c.loads_of]}; noise alone gives {noise} rms."
     )
     chance = (
         f"All {len(c.changes)} parameters together: {size_of(c.p)}. Each alone by Holm's rule: if "
@@ -118,10 +119,6 @@ OF_LOADS = {
     "the later campaign": "those of the later session",
     "the cell's plan": "those of the cell's plan",
 }
-
-
-def _under(c: Comparison) -> str:
-    return f"under {loads_text(c.forces, '{}', '{} loads in turn')}, {OF_LOADS[c.loads_of]}"
 
 
 def _change_table(c: Comparison) -> ShownTable:
