@@ -62,8 +62,8 @@ def test_writing_is_whole_or_not_at_all(plan: Any, tmp_path: Any) -> None:
 
 def test_design_writes_its_report_and_checks_the_place_first(tmp_path: Any) -> None:
     cell = write_cell(tmp_path)
-    for place, complaint in ((tmp_path, "is a directory"), (cell, "would be written over"),
-                             (tmp_path / "plan.json", "two outputs")):  # fmt: skip
+    for place, complaint in ((tmp_path, "is a directory"), (cell, "ends in .toml"),
+                             (tmp_path / "plan.json", "ends in .json")):  # fmt: skip
         refused = design_command(cell, "--report", place)
         assert refused.exit_code == 2
         assert complaint in refused.stderr
