@@ -15,7 +15,7 @@ def objective_of(residual, jacobian, p, tie=np.inf):
             raise ElastocalError("no equilibrium")
         return Evaluation(e, RFactor.of(-jacobian(u), e))
 
-    return SumOfSquares(evaluate, np.full(p, float(tie)), np.zeros(p))
+    return SumOfSquares(evaluate, np.eye(p) / tie, np.zeros(p))
 
 
 def rosenbrock(u):

@@ -74,7 +74,7 @@ def fitted(model, y, start, sizes, sigma=None):
     whiten = None if sigma is None else sparse.csr_array(np.eye(n) / sigma)
     weights = Weights("test", whiten, sigma is not None, "")
     problem = Problem(model, observed, weights, start, np.arange(p))
-    found = fit(problem, problem.free, start, sizes, max_steps=2000)
+    found = fit(problem, problem.free, start, sizes, max_steps=2000, tolerance=1e-13)
     variance = found.whitened @ found.whitened / (n - p)
     return found, np.sqrt(variance * np.diag(found.cofactor()))
 

@@ -10,7 +10,7 @@ from weakref import WeakKeyDictionary
 import numpy as np
 from numpy.typing import NDArray
 
-from elastocal.identification.least_squares import LARGE_TOLERANCE, Problem
+from elastocal.identification.least_squares import TOLERANCE, Problem
 from elastocal.identification.solve import PLACING, is_placed, sizes_and_check, tied_fit
 from elastocal.identification.start import start_values
 from elastocal.identification.weighted_problem import (
@@ -181,7 +181,7 @@ def fit_baseline(
         base = tied_fit(replace(problem, free=placed), sizes, PLACING)
         problem, nominal = replace(problem, x0=base.x), base.residual
     if len(free):
-        found = tied_fit(problem, sizes, LARGE_TOLERANCE)
+        found = tied_fit(problem, sizes, TOLERANCE)
         x, residual = found.x, found.residual
     else:
         x, residual = x0, residual_at(model, problem.parts, x0)

@@ -11,7 +11,6 @@ from __future__ import annotations
 
 import warnings
 from dataclasses import dataclass, replace
-from functools import cached_property
 from types import ModuleType
 from typing import Any, Literal, NoReturn
 
@@ -22,14 +21,10 @@ from scipy import linalg
 from elastocal.errors import ElastocalError, InputError, InsufficientDataError
 from elastocal.identification.knowledge import (
     ROUND_OFF,
-    Constraints,
-    GaussianPrior,
     Matrix,
     System,
-    share_of_prior,
 )
-from elastocal.identification.least_squares import Problem
-from elastocal.identification.weighted_problem import Evaluation, evaluate, least_norm, residual_at
+from elastocal.identification.weighted_problem import least_norm
 from elastocal.text import listed
 from elastocal.units import Array, BoolArray, IntArray
 
@@ -184,60 +179,37 @@ class Region:
 
     def nearest(self) -> Nearest | None:
         """None where nothing satisfies all constraints."""
-        size = self.distance() or 1.0
-        for _ in range(5):
-            found = self._cone_program(size)
-            if found is None or np.linalg.norm(found.u) <= FAR * size:
-                break
-            size = float(np.linalg.norm(found.u))
-        if found is None:
-            return None
-        allowed = INEXACT
-        if not any(N.shape[1] for N in self.nulls(found)):
-            held, allowed = found.rows > 0, CERTIFIED
-            u = equality_space(self.rows[held], self.least[held])[0]
-            prices = np.zeros(len(held))
-            if held.any():  # scipy's nnls of no column at all ends the process
-                prices[held] = scipy.optimize.nnls(self.rows[held].T, u)[0]
-            found = Nearest(u, prices, tuple(np.zeros_like(Z) for Z in found.matrices))
-        residual = self._breach(found) / max(float(np.linalg.norm(found.u)), size)
-        if not residual <= allowed:
-            raise ElastocalError(
-                f"no certified minimum: the KKT residual is {residual:.1e}; state values that the "
-                "constraints pin from two sides as equalities, and check the units of the bounds"
-            )
-        return found
-
-    def _breach(self, found: Nearest) -> float:
-        """The largest breach of what Karush, Kuhn and Tucker ask of a nearest point."""
-        pull = self.rows.T @ found.rows
-        for matrix, Z in zip(self.matrices, found.matrices, strict=True):
-            pull = pull + np.tensordot(matrix.slopes, Z, axes=2)
-        missed = float(np.max(self.least - self.rows @ found.u, initial=0.0))
-        short = [m.shortfall(found.u) for m in self.matrices]
-        return max(float(np.linalg.norm(found.u - pull)), missed, *short)
+        if self.holds(u := np.zeros(self.rows.shape[1])):
+            nothing = tuple(np.zeros_like(m.constant) for m in self.matrices)
+            return Nearest(u, np.zeros(len(self.least)), nothing)
+        found = self._cone_program(self.distance() or 1.0)
+        if found is None or any(N.shape[1] for N in self.nulls(found)):
+            return found
+        held = found.rows > 0
+        u, prices = equality_space(self.rows[held], self.least[held])[0], np.zeros(len(held))
+        if held.any():  # scipy's nnls of no column at all ends the process
+            prices[held] = scipy.optimize.nnls(self.rows[held].T, u)[0]
+        return Nearest(u, prices, tuple(np.zeros_like(Z) for Z in found.matrices))
 
     def _cone_program(self, size: float) -> Nearest | None:
-        """The nearest point to a solver's accuracy, about `size` away, which is its unit."""
+        """The nearest point to a solver's accuracy, at least `size` away, which is its unit."""
         import cvxpy as cp
 
         v = cp.Variable(self.rows.shape[1])
-        # No v of the length expected reaches a farther bound, whose size would cost digits.
-        near = self.least >= -FAR * size
-        bounds = [self.rows[near] @ v >= self.least[near] / size] if near.any() else []
+        wanted = [self.rows @ v >= self.least / size] if len(self.rows) else []
         matrices = [
             _value(cp, replace(m, constant=m.constant / size), v) >> 0 for m in self.matrices
         ]
-        status = _solve(cp.Problem(cp.Minimize(cp.sum_squares(v)), [*bounds, *matrices]))
+        status = _solve(cp.Problem(cp.Minimize(cp.sum_squares(v)), [*wanted, *matrices]))
         if "infeasible" in status:
             return None
         if v.value is None:
             raise _stopped(status)
-        u, prices = size * np.asarray(v.value), np.zeros(len(near))
-        if bounds:
+        u, prices = size * np.asarray(v.value), np.zeros(len(self.rows))
+        if wanted:
             # Active are those with slack < price (strict complementarity).
-            price, slack = size * bounds[0].dual_value / 2, self.rows[near] @ u - self.least[near]
-            prices[near] = np.where(slack < price, price, 0.0)
+            price, slack = size * wanted[0].dual_value / 2, self.rows @ u - self.least
+            prices = np.where(slack < price, price, 0.0)
         duals = tuple(size * (c.dual_value + c.dual_value.T) / 4 for c in matrices)
         return Nearest(u, prices, duals)
 
@@ -245,11 +217,7 @@ class Region:
 # The minimum.
 
 CONTRADICTION = 1e-9  # what equalities may miss each other by, of the size of x
-CERTIFIED = 1e-6  # of |u|: KKT residual above which the point is no minimum
-INEXACT = 1e-4  # the same, of a point that is the cone program's own
 UNDETERMINED = 1e-11  # singular value of unit columns, of the largest
-FAR = 10.0  # times the expected way: what is farther is out of reach
-STEEPEST = 1e7  # of an interval's 1/s: what it leaves across it is below 1e-7
 
 
 @dataclass(frozen=True)
@@ -292,13 +260,7 @@ class Reduced:
 
         Raises InputError where constraints contradict each other, which it names.
         """
-        region, u = self.region, np.zeros(self.T.shape[1])
-        nearest: Nearest | None = Nearest(
-            u, np.zeros(len(region.least)),
-            tuple(np.zeros_like(m.constant) for m in region.matrices),
-        )  # fmt: skip
-        if not region.holds(u):
-            nearest = region.nearest()
+        region, nearest = self.region, self.region.nearest()
         if nearest is None:
             raise_conflict(self.limits)
         x = self.unit * (self.centre + self.T @ nearest.u)
@@ -383,16 +345,9 @@ class Reduced:
             about = m.at(u) + m.shortfall(u) * np.eye(len(m.balance))
             scaled = replace(m, constant=about, slopes=m.slopes * s).balanced(True)
             wanted.append(_value(cp, scaled, v) >> 0)
-        # What is allowed lies where u·v ≥ 0.  A minimum far from the free one leaves next to
-        # nothing of that side.
-        if 2 * np.linalg.norm(u) < STEEPEST * s:
-            wanted.append(cp.sum_squares(v) + (2 / s) * u @ v <= 1)
-        else:
-            wanted += [cp.sum_squares(v) <= 1, u / np.linalg.norm(u) @ v <= 0]
-        least = (region.least - region.rows @ u) / s
-        near = least >= -FAR
-        if near.any():
-            wanted.append(region.rows[near] @ v >= np.minimum(least[near], 0.0))
+        wanted.append(cp.sum_squares(v) + (2 / s) * u @ v <= 1)
+        if len(region.rows):
+            wanted.append(region.rows @ v >= np.minimum((region.least - region.rows @ u) / s, 0.0))
         status = _solve(cp.Problem(cp.Maximize(direction @ v), wanted))
         if v.value is None:
             raise _stopped(status)
@@ -512,219 +467,3 @@ def _stopped(status: str) -> ElastocalError:
         f"the cone solver stopped with '{status}'; the problem may be badly scaled: check the "
         "units of the bounds and of the prior"
     )
-
-
-# A fit of the nonlinear model under constraints and with a prior, and its profile.
-
-# Constrained fit of the nonlinear model: Gauss–Newton on the exact B, steps halved.
-
-# Predicted fall of the objective, relative to it, below which the step is the last one.
-TOLERANCE = 1e-10  # a solver's, where a matrix is active
-LEAST = 1e-12  # in typical sizes of the parameters: a step that moves nothing
-HALVINGS = 20
-
-
-@dataclass(frozen=True)
-class KnowledgeProblem:
-    """|W (y − h(X))|² + |target − P X|² over X[columns] under `system`, the others held at x.
-
-    P (k, columns) and target (k,) are the prior's rows in units of the noise `sigma` of a whitened
-    row; `system` holds the constraints on the columns.
-    """
-
-    problem: Problem
-    columns: IntArray
-    x: Array
-    sizes: Array
-    P: Array
-    target: Array
-    system: System
-    sigma: float
-
-    @classmethod
-    def of(
-        cls, problem: Problem, columns: IntArray, x: Array, sizes: Array, constraints: Constraints,
-        prior: GaussianPrior | None, sigma: float,
-    ) -> KnowledgeProblem:  # fmt: skip
-        """Raises InputError where a held parameter alone breaks a constraint."""
-        names = problem.model.names
-        P, target = np.zeros((0, len(columns))), np.zeros(0)
-        if prior is not None:
-            P, target = prior.rows(names)
-            held = np.setdiff1d(np.arange(len(x)), columns)
-            target = sigma * (target - P[:, held] @ x[held])
-            P = sigma * P[:, columns]
-        system = constraints.resolve(names).restricted(columns, x)
-        return cls(problem, columns, x, sizes, P, target, system, sigma)
-
-    def moved(self, x: Array, step: Array) -> Array:
-        """x (parameters,) with `step` (columns,) added."""
-        trial = x.astype(float)
-        trial[self.columns] += step
-        return trial
-
-    def limits(self, x: Array) -> System:
-        """The constraints on a step from x."""
-        return self.system.moved(x[self.columns], np.ones(len(self.columns)))
-
-    def linearised(self, x: Array) -> tuple[Evaluation, Array, Array]:
-        """The readings at x, and J and t with the objective |t − J step|²: their R factor and the
-        prior's rows."""
-        at = evaluate(self.problem.model, self.problem.parts, x, self.columns)
-        rows, lack = at.r_factor.augmented, self.target - self.P @ x[self.columns]
-        return at, np.vstack([rows[:, :-1], self.P]), np.concatenate([rows[:, -1], lack])
-
-    def value(self, x: Array) -> float:
-        """The objective at x; infinite where a pose has no equilibrium."""
-        problem = self.problem
-        e = problem.weights.apply(residual_at(problem.model, problem.parts, x))
-        lack = self.target - self.P @ x[self.columns]
-        value = float(e @ e + lack @ lack)
-        return value if np.isfinite(value) else np.inf
-
-
-# What equalities leave of a parameter that they fix, of unit columns.
-PINNED = 1e-12
-
-
-@dataclass(frozen=True)
-class ConstrainedFit:
-    """The minimum x (parameters,), the readings `at` it, and the model linearised there.
-
-    `reduced` is the linear problem of the step δ (columns,) from x, |e − B δ|² + |lack − P δ|² with
-    the whitened B and residual e, and `best` its minimum, δ = 0 to rounding.
-    """
-
-    posed: KnowledgeProblem
-    x: Array
-    at: Evaluation
-    reduced: Reduced
-    best: Minimum
-    converged: bool
-    reason: str
-    steps: int
-
-    @property
-    def columns(self) -> IntArray:
-        return self.posed.columns
-
-    @property
-    def names(self) -> tuple[str, ...]:
-        return self.posed.system.names
-
-    @property
-    def objective(self) -> float:
-        return float(self.reduced.t @ self.reduced.t)
-
-    @cached_property
-    def face(self) -> Array:
-        """Directions (columns, q), orthonormal by J, in which active constraints let x move."""
-        return self.reduced.unit[:, None] * self.reduced.T @ self.reduced.face(self.best)
-
-    @cached_property
-    def cofactor(self) -> Array:
-        """(NᵀBᵀB N + NᵀPᵀP N)⁻¹ in the directions N that the equalities leave."""
-        return self._pinned(self.reduced.unit[:, None] * self.reduced.T)
-
-    @cached_property
-    def on_face(self) -> Array:
-        """The same with every active constraint taken for an equality."""
-        return self._pinned(self.face)
-
-    @property
-    def covariance(self) -> Array:
-        """Posterior covariance (columns, columns), equalities exact, inequalities left out."""
-        return self.posed.sigma**2 * self.cofactor
-
-    @property
-    def prior_share(self) -> Array:
-        """Share (columns,) of each estimate's information that is the prior's; NaN where fixed."""
-        return share_of_prior(self.cofactor, self.posed.P)
-
-    @property
-    def effective(self) -> float:
-        """How many parameters' worth the readings determine: tr(cofactor BᵀB) on the face."""
-        return self.face.shape[1] - float(((self.posed.P @ self.face) ** 2).sum())
-
-    def _pinned(self, half: Array) -> Array:
-        fixed = np.linalg.norm(half, axis=1) <= PINNED * self.reduced.unit
-        half = np.where(fixed[:, None], 0.0, half)
-        return np.asarray(half @ half.T)
-
-
-def constrained_fit(posed: KnowledgeProblem, max_steps: int = 60) -> ConstrainedFit:
-    """Minimise the objective under its constraints.
-
-    Each step goes to the minimum of the linearised model under the constraints, which are convex
-    and kept as they are; it is halved until the true objective falls too.  Every iterate satisfies
-    the constraints; at the limit no step improves the linearised model, which is the condition of
-    Karush, Kuhn and Tucker of the nonlinear problem.
-
-    Raises InputError as `minimise` does; ElastocalError where the start has poses without
-    equilibrium.
-    """
-    size = posed.sizes[posed.columns]
-    nearest = minimise(np.diag(1 / size), np.zeros(len(size)), posed.limits(posed.x)).x
-    x = posed.moved(posed.x, nearest)
-    at, J, t = posed.linearised(x)
-    value, steps, converged = float(t @ t), 0, False
-    while steps < max_steps and not converged:
-        steps += 1
-        found = minimise(J, t, posed.limits(x))
-        length = float(np.max(np.abs(found.x) / size, initial=0.0))
-        converged = value - found.objective <= TOLERANCE * value or length <= LEAST
-        # The last step cannot be judged by a fall that drowns in round-off.
-        enough = value * (1 + TOLERANCE) if converged else value
-        shares = (0.5**k for k in range(1 if converged else HALVINGS))
-        trials = (posed.moved(x, share * found.x) for share in shares)
-        better = next((trial for trial in trials if posed.value(trial) <= enough), None)
-        if better is None:
-            converged = True
-            break
-        x = better
-        at, J, t = posed.linearised(x)
-        value = float(t @ t)
-    reason = (
-        "no step within the constraints improves the fit" if converged
-        else "the step limit was reached; the start may be far off"
-    )  # fmt: skip
-    reduced = Reduced.of(J, t, posed.limits(x))
-    best = reduced.minimum(posed.system)
-    return ConstrainedFit(posed, x, at, reduced, best, converged, reason, steps)
-
-
-# Ends of profile intervals: how far a parameter can move before the fit becomes too bad.
-#
-# With S(v) the least objective where the parameter is held at v and the others are refitted, and Ŝ
-# its minimum, the interval is {v: S(v) − Ŝ ≤ rise} (Bates and Watts 1988, chapter 6): in a linear
-# model the t interval, and the same under any transformation of the parameter.
-
-PRECISION = 1e-7  # of an interval: a step that short is the last
-MOST_STEPS = 40
-ASTRAY = 0.5  # of the rise: how far the nonlinear objective may lie beyond it on the way
-ENDLESS = 1000.0  # times as far as in the linear model: there is no end
-
-
-def profile_end(found: ConstrainedFit, index: int, rise: float, side: int) -> float:
-    """The least (side −1) or largest (1) value of the fitted parameter no. `index` with the
-    nonlinear objective at most `rise` above its minimum; infinite where there is no end.
-
-    Each step goes to that end of the model linearised where the last one ended, and is halved
-    until the objective there is near what is allowed.  An end may also be where poses have no
-    equilibrium any more.  Steps that do not settle lead to none.
-    """
-    posed, limit, x, c = found.posed, found.objective + rise, found.x, found.columns[index]
-    far = ENDLESS * abs(float(found.reduced.farthest(index, found.best, rise, side)[index]))
-    for _ in range(MOST_STEPS):
-        _, J, t = posed.linearised(x)
-        reduced = Reduced.of(J, t, posed.limits(x))
-        best = reduced.minimum()
-        step = reduced.farthest(index, best, max(limit - best.objective, 0.0), side)
-        while not posed.value(posed.moved(x, step)) <= limit + ASTRAY * rise:
-            step = step / 2
-        x = posed.moved(x, step)
-        if np.linalg.norm(J @ step) <= PRECISION * np.sqrt(rise):
-            return float(x[c])
-        if abs(x[c] - found.x[c]) > far:
-            break
-    return side * np.inf

@@ -5,120 +5,71 @@ from __future__ import annotations
 from dataclasses import dataclass, replace
 
 import numpy as np
-from numpy.typing import NDArray
 from scipy import special
 
 from elastocal.errors import InsufficientDataError, option, require
-from elastocal.identification.constrained import (
-    ConstrainedFit,
-    KnowledgeProblem,
-    constrained_fit,
-    profile_end,
-)
 from elastocal.identification.covariance import Covariance, t_quantile
 from elastocal.identification.knowledge import Constraints, GaussianPrior
-from elastocal.identification.least_squares import Fit
+from elastocal.identification.least_squares import Fit, Known, KnownFit, profile_end
+from elastocal.identification.least_squares import fit as least_squares
 from elastocal.identification.options import LEVEL, Intervals, MethodResult, Options
 from elastocal.identification.residuals import held_out_by_parts
 from elastocal.identification.solve import (
     WORTH_A_COLUMN,
     Reduction,
     Solution,
+    reduce,
     residual_sigma,
 )
 from elastocal.identification.weighted_problem import (
     RFactor,
     evaluate,
-    least_norm,
 )
 from elastocal.text import listed, quoted
 from elastocal.units import Array, IntArray, Progress
 
-# Which parameters a fit with constraints and a prior has, and its constraints on these alone.
-
-# Share of a column that others must leave over: B is exact to 1e-15, but a base that is tilted by
-# some µrad already tells its turn from that of joint 1.
-TOLD_APART = 1e-6
+# Which parameters a fit with constraints and a prior has.
 
 
 def fitted_columns(
-    solution: Solution, std: Array, constraints: Constraints, prior: GaussianPrior | None
+    solution: Solution, constraints: Constraints, prior: GaussianPrior | None, sigma: float
 ) -> IntArray:
     """Indices of the parameters to fit under the constraints and the prior, ascending.
 
     These are the kept parameters of the solution; the free ones that the prior or an equality
-    names, for that is knowledge of themselves; and, of the parameters that are known only together
-    with one of these, as many as can now be told apart from it: with a prior on k, readings of
-    k + d are knowledge of d.  Told apart is what readings, prior and
-    equalities determine better than its typical size, as in the choice of the kept parameters.
-    Bounds and matrices make nothing known: they act on the fitted parameters, with all others
-    held where the fit held them.
+    names, for that is knowledge of themselves; and what else the choice of the kept parameters
+    finds worth a column with the prior and the equalities as further rows: with a prior on k,
+    readings of k + d are knowledge of d.  Bounds and matrices make nothing known: they act on the
+    fitted parameters, with all others held where the fit held them.
 
-    `std` (kept,) is that of the solution's estimates.  Raises InputError for a name that is no
-    parameter, or a prior on a parameter that is held fixed; InsufficientDataError where an
-    equality names a parameter that stays undetermined.
+    Raises InputError for a name that is no parameter, or a prior on a parameter that is held fixed;
+    InsufficientDataError where an equality names a parameter that stays undetermined.
     """
-    problem, reduction = solution.problem, solution.reduction
-    names, free = problem.model.names, set(problem.free.tolist())
-    constraints.resolve(names)
-    tied = {name for e in constraints.equalities for name, factor in e.terms.items() if factor}
-    priors = set() if prior is None else set(prior.names)
-    if prior is not None:
-        prior.rows(names)
-    fixed = [quoted(n) for n in sorted(priors) if names.index(n) not in free]
+    problem, kept, model = solution.problem, solution.reduction.kept, solution.problem.model
+    names, free, A = model.names, problem.free, constraints.resolve(model.names).A
+    P = np.zeros((0, len(names))) if prior is None else sigma * prior.rows(names)[0]
+    known, tied = (np.flatnonzero(rows.any(axis=0)) for rows in (P, A))
+    fixed = [quoted(names[c]) for c in np.setdiff1d(known, free)]
     require(
         not fixed,
         f"a prior is stated for {listed(fixed)}, which is held fixed; drop the prior or the fixing",
     )
-    named = {names.index(n) for n in tied | priors} & free
-    columns = {*reduction.kept.tolist(), *named}
-    R = np.zeros((len(problem.free), len(names)))
-    at = evaluate(problem.model, problem.parts, solution.fit.x, problem.free)
-    R[:, problem.free] = at.r_factor.R
-
-    def told_apart(c: int) -> bool:
-        chosen = np.array([*sorted(columns - {c}), c])
-        return _told_apart(solution, R[:, chosen], chosen, constraints, prior)
-
-    new = {names.index(n) for n in tied - priors} & free - set(reduction.kept.tolist())
-    unknown = [quoted(names[c]) for c in sorted(new) if not told_apart(c)]
+    named = np.intersect1d(np.union1d(known, tied), free)
+    R = evaluate(problem.model, problem.parts, solution.fit.x, free).r_factor.R
+    # An equality is exact: it counts as much as the most that anything else tells.
+    A = A[:, free][A[:, free].any(axis=1)]
+    most = np.linalg.norm(np.vstack([R, P[:, free]]) * solution.sizes[free], axis=0).max()
+    A = A * most / np.linalg.norm(A * solution.sizes[free], axis=1)[:, None]
+    rank = np.where(np.isin(free, kept), 0, np.where(np.isin(free, named), 1, 2))
+    rows = np.vstack([R, P[:, free], A])
+    told = free[reduce(rows, solution.sizes[free], (), sigma, WORTH_A_COLUMN, rank).kept]
+    unknown = [quoted(names[c]) for c in np.setdiff1d(np.intersect1d(tied, named), [*told, *known])]
     if unknown:
         raise InsufficientDataError(
             f"readings, prior and equalities do not determine {listed(unknown)}, which an equality "
             f"names; hold it ({option('fixed')}) or state a prior for it, or drop the equality"
         )
-    partners: dict[int, None] = {}
-    for k, c in enumerate(reduction.kept.tolist()):
-        if c in named:
-            partners |= dict.fromkeys(reduction.terms(k, solution.sizes, std[k]))
-    for d in partners:
-        if d not in columns and told_apart(d):
-            columns.add(d)
-    return np.array(sorted(columns), dtype=np.int64)
-
-
-def _told_apart(
-    solution: Solution, R: Array, chosen: IntArray, constraints: Constraints,
-    prior: GaussianPrior | None,
-) -> bool:  # fmt: skip
-    """Whether readings (their R), prior and equalities tell the last of the columns `chosen` from
-    the others."""
-    e = solution.fit.whitened
-    size, names = solution.sizes[chosen], solution.problem.model.names
-    sigma = max(float(np.sqrt(e @ e / len(e))), 1e-12)
-    J = R * size / sigma
-    if prior is not None:
-        J = np.vstack([J, prior.rows(names)[0][:, chosen] * size])
-    A = constraints.resolve(names).A[:, chosen] * size
-    A = A[A.any(axis=1)]
-    # An equality is exact: it counts as much as the most that anything else tells.
-    A *= np.linalg.norm(J, axis=0).max() / np.linalg.norm(A, axis=1)[:, None]
-    J = np.vstack([J, A])
-    lengths = np.linalg.norm(J, axis=0)
-    J = J / np.where(lengths > 0, lengths, 1.0)
-    left = J[:, -1] - J[:, :-1] @ least_norm(J[:, :-1], J[:, -1])
-    off = float(np.linalg.norm(left))
-    return off > TOLD_APART and off * lengths[-1] > WORTH_A_COLUMN
+    return np.unique(np.concatenate([kept, named, told]))
 
 
 # Intervals of a fit under constraints or with a prior.
@@ -135,7 +86,7 @@ ONE_SIDED = "one-sided at a bound, and wide rather than narrow near one"
 
 
 def intervals_with_knowledge(
-    found: ConstrainedFit, of_readings: Array, kind: str, many: set[str]
+    found: KnownFit, of_readings: Array, kind: str, many: set[str]
 ) -> Intervals:
     """95 % intervals of the constrained fit's columns, and their covariance.
 
@@ -147,26 +98,27 @@ def intervals_with_knowledge(
     says, no estimate is farther off.  `of_readings` (columns,) are the method's degrees of freedom.
     Parameters that are `many`, those of smooth functions, have t intervals in any case.
     """
-    posed, matrix = found.posed, found.covariance
+    known, x, matrix = found.known, found.fit.x[found.fit.columns], found.covariance
+    assert known.system is not None
     # A posterior variance V moves with the noise's variance s² by the readings' share of it,
     # d log V = (1 − share) d log s²: by Satterthwaite it has dof/(1 − share)² where s² has dof.
     left = 1 - np.nan_to_num(found.prior_share, nan=1.0)
     full = np.full(len(left), np.inf)
     dof = np.divide(of_readings, left**2, out=full, where=left > 1e-6)
     inside = not any(a.kind != "equality" for a in found.best.active)
-    plain = Covariance("t", matrix, dof, "").interval(found.x[found.columns], LEVEL)
+    plain = Covariance("t", matrix, dof, "").interval(x, LEVEL)
     if kind == "auto" and inside:
         name, text = ("t under constraints", "equalities taken for exact, bounds cut off")
-        if len(posed.P):
+        if len(known.P):
             name, text = ("posterior", "readings and prior together, the prior taken at its word")
-        lower, upper = posed.system.lower[:, None], posed.system.upper[:, None]
+        lower, upper = known.system.lower[:, None], known.system.upper[:, None]
         covariance = Covariance(name, matrix, dof, f"{text}; assumes normal noise")
         return Intervals(covariance, np.clip(plain, lower, upper))
-    ends = np.repeat(found.x[found.columns][:, None], 2, axis=1)
+    ends = np.repeat(x[:, None], 2, axis=1)
     of_functions = np.array([name in many for name in found.names])
     ends[of_functions] = plain[of_functions]
     # Prior and noise are widened alike, by t for the normal quantile, so that their ratio stays.
-    rises = (posed.sigma * t_quantile(LEVEL, np.maximum(dof, 1.0))) ** 2
+    rises = (found.sigma * t_quantile(LEVEL, np.maximum(dof, 1.0))) ** 2
     for k, name in enumerate(found.names):
         for end, side in enumerate((-1, 1)) if name not in many else ():
             rise = float(rises[k])
@@ -235,12 +187,12 @@ def fit_with_knowledge(
     constraints = options.constraints or Constraints()
     prior = joined(options.prior, None if own is None else own.prior)
     sigma = residual_sigma(fit, len(fit.columns)) if own is None else own.sigma
-    columns = fitted_columns(solution, before.intervals.covariance.std, constraints, prior)
-    posed = KnowledgeProblem.of(
-        problem, columns, fit.x, solution.sizes, constraints, prior, sigma
-    )  # fmt: skip
+    columns = fitted_columns(solution, constraints, prior, sigma)
+    stated = Known.stated(problem.model.names, columns, fit.x, constraints, prior, sigma)
     progress("fitting under constraints" if prior is None else "fitting with the prior")
-    found = constrained_fit(posed)
+    found = KnownFit(
+        least_squares(problem, columns, fit.x, solution.sizes, known=stated), stated, sigma
+    )
     progress("intervals under constraints" if prior is None else "intervals with the prior")
     dof = np.full(len(columns), own.dof) if own else _dof(solution, before.intervals, columns)
     many = set() if own is None else set(own.prior.names)
@@ -255,7 +207,7 @@ def fit_with_knowledge(
     # Linearised, with the active constraints kept active: directions of the face are orthonormal by
     # the rows of readings and prior together.
     heldout, leverage = held_out_by_parts(
-        problem.model, problem.parts, found.x, columns, found.face
+        problem.model, problem.parts, found.fit.x, columns, found.face
     )
     known = replace(solution, fit=fitted, reduction=_reduction(solution, found), held=heldout)
     told = _contradiction(solution, before.intervals, found, own)
@@ -268,22 +220,22 @@ def fit_with_knowledge(
 
 
 def _contradiction(
-    solution: Solution, before: Intervals, found: ConstrainedFit, own: FunctionPrior | None
+    solution: Solution, before: Intervals, found: KnownFit, own: FunctionPrior | None
 ) -> tuple[str, ...]:
     """A sentence where the objective grew by more than noise explains (F-test).
 
     Rows of the prior and active constraints count as degrees of freedom, less the parameters they
     made estimable.  At active bounds the true distribution is smaller (χ̄²): the test is cautious.
     """
-    rows = len(found.posed.P) - (0 if own is None else len(own.prior.names))
-    stated = rows + len(found.best.active) - (len(found.columns) - len(solution.fit.columns))
+    rows = len(found.known.P) - (0 if own is None else len(own.prior.names))
+    stated = rows + len(found.best.active) - (len(found.names) - len(solution.fit.columns))
     if stated < 1:
         return ()
     grown = found.objective - float(solution.fit.whitened @ solution.fit.whitened)
     dof = max(float(before.covariance.dof.min()), 1.0)
     if own is not None:
         grown, dof = grown - own.stands, own.dof
-    F = max(grown, 0.0) / (stated * found.posed.sigma**2)
+    F = max(grown, 0.0) / (stated * found.sigma**2)
     known = np.isinf(dof)
     p = float(special.chdtrc(stated, F * stated) if known else special.fdtrc(stated, dof, F))
     if p > CONTRADICTED:
@@ -297,39 +249,36 @@ def _contradiction(
     )
 
 
-def _dof(solution: Solution, before: Intervals, columns: NDArray[np.int64]) -> Array:
+def _dof(solution: Solution, before: Intervals, columns: IntArray) -> Array:
     """The method's degrees of freedom (columns,); its fewest for a parameter that it held."""
     known = dict(zip(solution.fit.columns.tolist(), before.covariance.dof.tolist(), strict=True))
     fewest = min(known.values())
     return np.array([known.get(c, fewest) for c in columns.tolist()])
 
 
-def _as_fit(found: ConstrainedFit) -> Fit:
+def _as_fit(found: KnownFit) -> Fit:
     """As the fit of a method; its R factor has prior and equalities as further rows.
 
     Without them a parameter that no reading shows would leave it singular; equalities weigh as
     much as the readings of a parameter do.
     """
-    reduced, problem = found.reduced, found.posed.problem
+    reduced = found.reduced
     A = reduced.system.A * reduced.unit
     equalities = A / np.linalg.norm(A, axis=1)[:, None] / reduced.unit
-    factor = RFactor.of(np.vstack([reduced.J, equalities]), np.append(reduced.t, np.zeros(len(A))))
-    return Fit(
-        found.x, found.at.residual, problem.weights.apply(found.at.residual), factor,
-        found.converged, found.reason, found.steps, problem, found.columns, found.posed.sizes,
-    )  # fmt: skip
+    rows = np.vstack([reduced.J, equalities])
+    return replace(found.fit, r_factor=RFactor.of(rows, np.append(reduced.t, np.zeros(len(A)))))
 
 
-def _reduction(solution: Solution, found: ConstrainedFit) -> Reduction:
+def _reduction(solution: Solution, found: KnownFit) -> Reduction:
     """What is fitted, what is held, and how a held parameter's error would move the estimates.
 
     A parameter that an active constraint holds back does not move: it stands for itself.
     """
     before, problem = solution.reduction, solution.problem
-    columns, k = found.columns, len(found.columns)
+    columns, k = found.fit.columns, len(found.fit.columns)
     dropped = np.setdiff1d(before.dropped, columns)
     both = np.concatenate([columns, dropped])
-    R = evaluate(problem.model, problem.parts, found.x, both).r_factor.R
+    R = evaluate(problem.model, problem.parts, found.fit.x, both).r_factor.R
     mixing = found.on_face @ (R[:, :k].T @ R[:, k:])
     share = np.abs(mixing) * solution.sizes[dropped] / solution.sizes[columns][:, None]
     mixing[share < ROUNDING] = 0.0

@@ -1,4 +1,10 @@
-"""Nonlinear weighted least squares on the exact B: Levenberg–Marquardt, and the fit it ends in."""
+"""Nonlinear weighted least squares on the exact B, with what else is known of the parameters:
+
+    |W (y − h(X))|² + |target − P X|²   over X[columns],   lower ≤ X ≤ upper,  A X = b,  M(X) ⪰ 0
+
+A weak tie to the start, the prior of random coefficients and stated knowledge are all of them rows
+P; every fit is the same descent by Levenberg and Marquardt on R factors.
+"""
 
 from __future__ import annotations
 
@@ -10,6 +16,13 @@ import numpy as np
 from numpy.typing import NDArray
 
 from elastocal.errors import ElastocalError
+from elastocal.identification.constrained import Minimum, Reduced, minimise
+from elastocal.identification.knowledge import (
+    Constraints,
+    GaussianPrior,
+    System,
+    share_of_prior,
+)
 from elastocal.identification.weighted_problem import (
     Evaluation,
     Partition,
@@ -23,9 +36,7 @@ from elastocal.identification.weighted_problem import (
 )
 from elastocal.model.manipulator import Model
 from elastocal.model.observations import Observations
-from elastocal.units import Array
-
-# Levenberg–Marquardt on R factors, where one evaluation is a pass over a large table.
+from elastocal.units import Array, IntArray
 
 SETTLED = "the sum of squares no longer fell"
 NEGLIGIBLE = "the steps became negligible"
@@ -49,32 +60,38 @@ class Descent:
 
 @dataclass(frozen=True)
 class SumOfSquares:
-    """|e(u)|² + |(u − centre)/tie|², B = −∂e/∂u.
+    """|e(u)|² + |target − P u|² under the `limits` on u, B = −∂e/∂u.
 
     `evaluate` gives the R factor of e and of B per unit of u, (p,) in typical sizes; it raises
-    ElastocalError where the model has no prediction.  A `tie` (p,) of infinity is none.
-    `evaluate_last`, where given, evaluates in its place where the descent means to end: for what
-    else is wanted there.
+    ElastocalError where the model has no prediction.  `evaluate_last`, where given, evaluates in
+    its place where the descent means to end: for what else is wanted there.
     """
 
     evaluate: Callable[[Array], Evaluation]
-    tie: Array
-    centre: Array
+    P: Array
+    target: Array
+    limits: System | None = None
     evaluate_last: Callable[[Array], Evaluation] | None = None
 
+    def rows(self, u: Array, at: Evaluation) -> tuple[Array, Array]:
+        """A and b of the linearised cost |b − A step|²."""
+        rows = at.r_factor.augmented
+        A, b = np.vstack([rows[:, :-1], self.P]), self.target - self.P @ u
+        return A, np.concatenate([rows[:, -1], b])
+
     def cost(self, u: Array, at: Evaluation) -> float:
-        """The sum of squares, ties included."""
-        return at.r_factor.rss + float(np.sum(((u - self.centre) / self.tie) ** 2))
+        """The sum of squares of readings and prior."""
+        return at.r_factor.rss + float(np.sum((self.target - self.P @ u) ** 2))
 
     def step(self, u: Array, at: Evaluation, damping: float) -> tuple[Array, float]:
         """Minimiser of the linearised cost + damping · |step|², and by how much the cost falls."""
-        p = len(u)
-        A = np.vstack([at.r_factor.R, np.diag(1 / self.tie)])
-        b = np.concatenate([at.r_factor.projected, (self.centre - u) / self.tie])
-        damped = np.vstack([A, np.sqrt(damping) * np.eye(p)])
-        target = np.concatenate([b, np.zeros(p)])
-        cond = max(at.r_factor.rows, p) * np.finfo(float).eps
-        step = least_norm(damped, target, cond=cond)
+        p, (A, b) = len(u), self.rows(u, at)
+        damped, target = np.vstack([A, np.sqrt(damping) * np.eye(p)]), np.append(b, np.zeros(p))
+        if self.limits is None:
+            cond = max(at.r_factor.rows, p) * np.finfo(float).eps
+            step = least_norm(damped, target, cond=cond)
+        else:
+            step = minimise(damped, target, self.limits.moved(u, np.ones(p))).x
         left = b - A @ step
         return step, float(b @ b - left @ left)
 
@@ -134,12 +151,9 @@ def _steepest(at: Evaluation) -> float:
     return float((at.r_factor.R**2).sum(axis=0).max(initial=0.0))
 
 
-# Nonlinear weighted least squares on the exact B.
-
-# What a step promises of the cost where the descent ends.  The last step is taken: at a million
-# rows of a large table, whose evaluations are dear, it is a tenth of a standard deviation, and what
-# it leaves behind is smaller by orders.
-TOLERANCE, LARGE_TOLERANCE = 1e-12, 1e-8
+# What a step promises of the cost where a descent ends.  The last step is taken: at a million rows
+# it is a tenth of a standard deviation, and what it leaves behind is smaller by orders.
+TOLERANCE = 1e-8
 
 
 @dataclass(frozen=True)
@@ -199,56 +213,225 @@ class Fit:
         return self.r_factor.cofactor(self.sizes[self.columns])
 
 
-def fit(
-    problem: Problem, columns: NDArray[np.int64], x: Array, sizes: Array, *,
-    tie: Array | None = None, among: NDArray[np.int64] | None = None, max_steps: int = 60,
-    tolerance: float = LARGE_TOLERANCE,
-) -> Fit:  # fmt: skip
-    """min over X[columns] of |W (y − h(X))|² (eq. 9, nonlinear), the other parameters held at x, by
-    Levenberg–Marquardt from there, derivatives exact.
+@dataclass(frozen=True)
+class Known:
+    """What a fit knows of its columns besides the readings: P (k, columns) and target (k,) with
+    |target − P X|² beside whitened rows, and constraints on them."""
 
-    `sizes` (parameters,) scale the variables.  `tie` (columns,), where given, adds
-    ((X − x0)/tie)² per column, in units of the noise: a weak tie, used only to keep undetermined
-    directions still before they are known to be undetermined.  `among` (ascending) are columns of
-    which those fitted are a choice: a large table's fit leaves their R factor too, which else would
-    take another pass.
+    P: Array
+    target: Array
+    system: System | None = None
 
-    On R factors, with the cost and the gradient of all rows, until a step promises less than
-    TOLERANCE of the cost, of many readings `tolerance`.  Every step starts from the residual of the
-    exact model, so that the rounding of one is taken back by the next.
+    @classmethod
+    def near(cls, centre: Array, width: Array) -> Known:
+        """X ~ N(centre, width²) in units of the noise, (columns,) each."""
+        return cls(np.diag(1 / width), centre / width)
 
-    Raises ElastocalError where the start has poses without equilibrium.
-    """
+    @classmethod
+    def stated(
+        cls, names: tuple[str, ...], columns: IntArray, x: Array, constraints: Constraints,
+        prior: GaussianPrior | None, sigma: float,
+    ) -> Known:  # fmt: skip
+        """Constraints and prior on the `columns`, the others held at x (parameters,), beside rows
+        of noise `sigma`.  Raises InputError where a held parameter alone breaks a constraint."""
+        P, target = np.zeros((0, len(columns))), np.zeros(0)
+        if prior is not None:
+            P, target = prior.rows(names)
+            held = np.setdiff1d(np.arange(len(x)), columns)
+            P, target = sigma * P[:, columns], sigma * (target - P[:, held] @ x[held])
+        return cls(P, target, constraints.resolve(names).restricted(columns, x))
+
+    def on_bounds(self, values: Array, unit: Array) -> Array:
+        """Values (columns,) with what lies at its bound but for rounding on it."""
+        if self.system is None:
+            return values
+        for bound in (self.system.lower, self.system.upper):
+            values = np.where(np.abs(values - bound) <= ROUNDING * unit, bound, values)
+        return np.clip(values, self.system.lower, self.system.upper)
+
+
+def objective_of(
+    problem: Problem, columns: IntArray, x: Array, sizes: Array, known: Known | None,
+    among: IntArray | None = None,
+) -> SumOfSquares:  # fmt: skip
+    """The objective over u with X[columns] = x[columns] + sizes[columns] · u."""
     size = sizes[columns]
-    tied = np.full(len(columns), np.inf) if tie is None else tie / size
+    known = known or Known(np.zeros((0, len(columns))), np.zeros(0))
 
-    def values(u: Array) -> Array:
-        moved = x.copy()
-        moved[columns] += u * size
-        return moved
-
-    def evaluated(u: Array) -> Evaluation:
-        at = evaluate(problem.model, problem.parts, values(u), columns)
+    def evaluated(u: Array, asked: IntArray = columns) -> Evaluation:
+        at = evaluate(problem.model, problem.parts, moved(x, columns, size * u), asked)
         if not np.isfinite(at.r_factor.rss):
             raise ElastocalError(
                 f"{problem.observations.table.source}: the model predicts no finite numbers at the "
                 "start values; look in the cell for a length, force or compliance far too large"
             )
-        return Evaluation(at.residual, at.r_factor.scaled(size))
+        own = at.r_factor if asked is columns else at.r_factor.of_columns(_places(columns, asked))
+        wide = None if asked is columns else at.r_factor
+        return Evaluation(at.residual, own.scaled(size), wide)
 
-    def among_others(u: Array) -> Evaluation:
-        assert among is not None
-        at = evaluate(problem.model, problem.parts, values(u), among)
-        own = at.r_factor.of_columns(np.searchsorted(among, columns))
-        return Evaluation(at.residual, own.scaled(size), at.r_factor)
+    target = known.target - known.P @ x[columns]
+    limits = None if known.system is None else known.system.moved(x[columns], size)
+    last = None if among is None else lambda u: evaluated(u, among)
+    return SumOfSquares(evaluated, known.P * size, target, limits, last)
 
-    objective = SumOfSquares(
-        evaluated, tied, (problem.x0 - x)[columns] / size, None if among is None else among_others
-    )
-    enough = tolerance if problem.many else TOLERANCE
-    found = descend(objective, np.zeros(len(columns)), enough, max_steps)
+
+def moved(x: Array, columns: IntArray, step: Array) -> Array:
+    """x (parameters,) with `step` added to these columns."""
+    out = x.astype(float)
+    out[columns] += step
+    return out
+
+
+def _places(columns: IntArray, among: IntArray) -> IntArray:
+    order = np.argsort(among)
+    return np.asarray(order[np.searchsorted(among, columns, sorter=order)])
+
+
+def fit(
+    problem: Problem, columns: IntArray, x: Array, sizes: Array, *, known: Known | None = None,
+    among: IntArray | None = None, max_steps: int = 60, tolerance: float = TOLERANCE,
+) -> Fit:  # fmt: skip
+    """min over X[columns] of |W (y − h(X))|² (eq. 9, nonlinear) with what is `known` of them, the
+    other parameters held at x, by Levenberg–Marquardt from there, derivatives exact.
+
+    `sizes` (parameters,) scale the variables.  `among` are columns of which those fitted are a
+    choice: the fit leaves their R factor too, which else would take another pass.
+
+    On R factors, with the cost and the gradient of all rows, until a step promises less than
+    `tolerance` of the cost.  Every step starts from the residual of the
+    exact model, so that the rounding of one is taken back by the next.  Constraints are convex and
+    kept in every step: where none improves the fit, the conditions of Karush, Kuhn and Tucker hold.
+
+    Raises ElastocalError where the start has poses without equilibrium, InputError for constraints
+    that contradict each other, InsufficientDataError where they leave something undetermined.
+    """
+    objective, size = objective_of(problem, columns, x, sizes, known, among), sizes[columns]
+    u = np.zeros(len(columns))
+    if objective.limits is not None:  # the nearest that is allowed
+        u = minimise(np.eye(len(u)), u, objective.limits).x
+    found = descend(objective, u, tolerance, max_steps)
+    at, values = found.at, moved(x, columns, size * found.u)
+    if known is not None:
+        values[columns] = known.on_bounds(values[columns], size)
     return Fit(
-        values(found.u), found.at.residual, problem.weights.apply(found.at.residual),
-        found.at.r_factor.scaled(1 / size), found.converged, found.reason, found.evaluations,
-        problem, columns, sizes, found.at.wide,
+        values, at.residual, problem.weights.apply(at.residual), at.r_factor.scaled(1 / size),
+        found.converged, found.reason, found.evaluations, problem, columns, sizes, at.wide,
     )  # fmt: skip
+
+
+# A fit with knowledge: where its constraints let it go, and how far.
+
+PINNED = 1e-12  # of unit columns: what equalities leave of a parameter that they fix
+
+
+@dataclass(frozen=True)
+class KnownFit:
+    """A fit at its minimum with what is known, beside rows of noise `sigma`: the linear problem of
+    the step δ (columns,) from there, |e − B δ|² + |lack − P δ|², and its minimum δ = 0."""
+
+    fit: Fit
+    known: Known
+    sigma: float
+
+    @cached_property
+    def reduced(self) -> Reduced:
+        assert self.known.system is not None
+        x, rows = self.fit.x[self.fit.columns], self.fit.r_factor.augmented
+        J, lack = np.vstack([rows[:, :-1], self.known.P]), self.known.target - self.known.P @ x
+        limits = self.known.system.moved(x, np.ones(len(x)))
+        return Reduced.of(J, np.concatenate([rows[:, -1], lack]), limits)
+
+    @cached_property
+    def best(self) -> Minimum:
+        return self.reduced.minimum(self.known.system)
+
+    @property
+    def names(self) -> tuple[str, ...]:
+        return self.reduced.system.names
+
+    @property
+    def objective(self) -> float:
+        return float(self.reduced.t @ self.reduced.t)
+
+    @cached_property
+    def face(self) -> Array:
+        """Directions (columns, q), orthonormal by J, in which active constraints let x move."""
+        return self.reduced.unit[:, None] * self.reduced.T @ self.reduced.face(self.best)
+
+    @cached_property
+    def cofactor(self) -> Array:
+        """(NᵀBᵀB N + NᵀPᵀP N)⁻¹ in the directions N that the equalities leave."""
+        return self._pinned(self.reduced.unit[:, None] * self.reduced.T)
+
+    @cached_property
+    def on_face(self) -> Array:
+        """The same with every active constraint taken for an equality."""
+        return self._pinned(self.face)
+
+    @property
+    def covariance(self) -> Array:
+        """Posterior covariance (columns, columns), equalities exact, inequalities left out."""
+        return self.sigma**2 * self.cofactor
+
+    @property
+    def prior_share(self) -> Array:
+        """Share (columns,) of each estimate's information that is the prior's; NaN where fixed."""
+        return share_of_prior(self.cofactor, self.known.P)
+
+    @property
+    def effective(self) -> float:
+        """How many parameters' worth the readings determine: tr(cofactor BᵀB) on the face."""
+        return self.face.shape[1] - float(((self.known.P @ self.face) ** 2).sum())
+
+    def _pinned(self, half: Array) -> Array:
+        fixed = np.linalg.norm(half, axis=1) <= PINNED * self.reduced.unit
+        half = np.where(fixed[:, None], 0.0, half)
+        return np.asarray(half @ half.T)
+
+
+# Ends of profile intervals: how far a parameter can move before the fit becomes too bad.
+#
+# With S(v) the least objective where the parameter is held at v and the others are refitted, and Ŝ
+# its minimum, the interval is {v: S(v) − Ŝ ≤ rise} (Bates and Watts 1988, chapter 6): in a linear
+# model the t interval, and the same under any transformation of the parameter.
+
+PRECISION = 1e-7  # of an interval: a step that short is the last
+MOST_STEPS = 40
+ASTRAY = 0.5  # of the rise: how far the nonlinear objective may lie beyond it on the way
+ENDLESS = 1000.0  # times as far as in the linear model: there is no end
+
+
+def profile_end(found: KnownFit, index: int, rise: float, side: int) -> float:
+    """The least (side −1) or largest (1) value of the fitted parameter no. `index` with the
+    nonlinear objective at most `rise` above its minimum; infinite where there is no end.
+
+    Each step goes to that end of the model linearised where the last one ended, and is halved
+    until the objective there is near what is allowed.  An end may also be where poses have no
+    equilibrium any more.  Steps that do not settle lead to none.
+    """
+    fit, limit, size = found.fit, found.objective + rise, found.fit.sizes[found.fit.columns]
+    objective = objective_of(fit.problem, fit.columns, fit.x, fit.sizes, found.known)
+    assert objective.limits is not None
+    far = ENDLESS * abs(float(found.reduced.farthest(index, found.best, rise, side)[index]))
+    u = np.zeros(len(size))
+    at = objective.evaluate(u)
+    for _ in range(MOST_STEPS):
+        A, b = objective.rows(u, at)
+        reduced = Reduced.of(A, b, objective.limits.moved(u, np.ones(len(u))))
+        best = reduced.minimum()
+        step = reduced.farthest(index, best, max(limit - best.objective, 0.0), side)
+        while True:
+            try:
+                at = objective.evaluate(u + step)
+                if objective.cost(u + step, at) <= limit + ASTRAY * rise:
+                    break
+            except ElastocalError:
+                pass  # no equilibrium so far out
+            step = step / 2
+        u = u + step
+        if np.linalg.norm(A @ step) <= PRECISION * np.sqrt(rise):
+            values = fit.x[fit.columns] + size * u
+            return float(found.known.on_bounds(values, size)[index])
+        if abs(size[index] * u[index]) > far:
+            break
+    return side * np.inf

@@ -9,15 +9,10 @@ import numpy as np
 from numpy.typing import NDArray
 
 from elastocal.errors import InputError, option
-from elastocal.identification.constrained import (
-    ActiveConstraint,
-    KnowledgeProblem,
-    constrained_fit,
-    profile_end,
-)
+from elastocal.identification.constrained import ActiveConstraint
 from elastocal.identification.covariance import Covariance, Rows, clustered, of_rows, t_quantile
 from elastocal.identification.knowledge import Constraints, GaussianPrior
-from elastocal.identification.least_squares import Fit
+from elastocal.identification.least_squares import Fit, Known, KnownFit, profile_end
 from elastocal.identification.noise_choice import NoiseFit
 from elastocal.identification.noise_structure import Kind
 from elastocal.identification.smooth_functions import SmoothPart
@@ -110,9 +105,9 @@ def _classical(solution: Solution) -> Covariance:
 def _profiled(solution: Solution, classical: Covariance) -> Intervals:
     """{v: S(v) − Ŝ ≤ t² s²}, the fit being at its minimum."""
     fit = solution.fit
-    sigma = residual_sigma(fit, len(fit.columns))
-    posed = solution.problem, fit.columns, fit.x, solution.sizes
-    found = constrained_fit(KnowledgeProblem.of(*posed, Constraints(), None, sigma))
+    sigma, names = residual_sigma(fit, len(fit.columns)), solution.problem.model.names
+    known = Known.stated(names, fit.columns, fit.x, Constraints(), None, sigma)
+    found = KnownFit(fit, known, sigma)
     rises = (sigma * t_quantile(LEVEL, classical.dof)) ** 2
     ends = [
         [profile_end(found, k, float(rise), side) for side in (-1, 1)]

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass, field, replace
 from functools import cached_property
 
@@ -12,7 +13,7 @@ from scipy import linalg
 from elastocal.errors import ElastocalError, InsufficientDataError
 from elastocal.identification.checks import check_enough
 from elastocal.identification.covariance import root_of
-from elastocal.identification.least_squares import Fit, Problem, fit
+from elastocal.identification.least_squares import Fit, Known, Problem, fit
 from elastocal.identification.residuals import (
     CHANCE,
     as_of_another_campaign,
@@ -109,15 +110,18 @@ class Reduction:
 
 
 def reduce(
-    B: Array, sizes: Array, parameters: tuple[Parameter, ...], sigma: float, threshold: float
-) -> Reduction:
+    B: Array, sizes: Array, parameters: Sequence[Parameter], sigma: float, threshold: float,
+    ranks: IntArray | None = None,
+) -> Reduction:  # fmt: skip
     """Choose a minimal complete set of columns of the whitened B (rows, parameters), or of its R.
 
     Columns are scaled by typical size and by the noise `sigma` of a whitened row, so that the
     length of a column off the span of the kept ones counts how many standard deviations a
     typical deviation moves the data: a parameter below `threshold` is not worth a column (at 1
     the variance it would add equals the squared bias it would remove).  Pivoted QR in the order
-    of the effects' ranks; `threshold` 0 keeps everything that is structurally independent.
+    of `ranks` (columns,), by default the effects': first what a user asks for by name; link
+    geometry takes the rest.
+    `threshold` 0 keeps everything that is structurally independent.
     """
     # The triangular factor has the same geometry as B at any number of rows.
     R = linalg.qr(B * sizes, mode="r")[0][: B.shape[1]] / sigma
@@ -125,8 +129,10 @@ def reduce(
     visible = length > max(threshold, STRUCTURAL * length.max(initial=0.0), 1e-300)
     basis = np.zeros((len(R), 0))
     kept: list[int] = []
-    for group in _groups(parameters):
-        candidates = [c for c in group if visible[c]]
+    if ranks is None:
+        ranks = np.array([effect_of(p.effect).rank for p in parameters])
+    for rank in np.unique(ranks):
+        candidates = np.flatnonzero(visible & (ranks == rank)).tolist()
         if not candidates:
             continue
         off = R[:, candidates] - basis @ (basis.T @ R[:, candidates])
@@ -150,13 +156,6 @@ def reduce(
     unseen = np.array([d for d in dropped if not visible[d]], dtype=np.int64)
     return Reduction(np.array(kept, dtype=np.int64), np.array(dropped, dtype=np.int64),
                      mixing, unseen, threshold=threshold)  # fmt: skip
-
-
-def _groups(parameters: tuple[Parameter, ...]) -> list[list[int]]:
-    """Indices of the parameters by rank: first what a user asks for by name; link geometry takes
-    the rest."""
-    ranks = [effect_of(p.effect).rank for p in parameters]
-    return [[i for i, own in enumerate(ranks) if own == rank] for rank in sorted(set(ranks))]
 
 
 # Which parameters are fitted: a minimal complete set, a wider one.
@@ -305,9 +304,9 @@ def prefer_wider(
 # Width of the weak tie that keeps undetermined directions still before they are recognised:
 # in typical sizes for deviations from nominal, in m and rad for what registration placed.
 LOOSE, PLACED = 3.0, 0.3
-# Relative change of the cost at which the tied fits of many readings end: what is placed, where a
-# parameter of it gets dropped and is held for good, and where the choice and the fit only begin.
-PLACING, CHOOSING = 1e-14, 1e-2
+# What a step promises of the cost where tied fits end: what is placed, where a parameter of it gets
+# dropped and is held for good, and where the choice and the fit only begin.
+PLACING, CHOOSING = 1e-12, 1e-2
 # Observations that a large table's fit starts from.
 SAMPLE = 5000
 
@@ -369,7 +368,7 @@ def settle(
 
     Raises InsufficientDataError where the data determine nothing.
     """
-    model, started, exact = problem.model, problem.x0, not problem.many
+    model, started, exact = problem.model, problem.x0, False
     placed = problem.free[is_placed(model)[problem.free]]
     if len(placed):
         progress("placing base and markers")
@@ -512,8 +511,8 @@ def _tied_from(problem: Problem, sizes: Array, x: Array, sigma: float, tolerance
     free = problem.free
     width = np.where(is_placed(problem.model), sizes, LOOSE * sizes)[free]
     while True:
-        tied = width / sigma
-        found = fit(problem, free, x, sizes, tie=tied, max_steps=25, tolerance=tolerance)
+        tie = Known.near(problem.x0[free], width / sigma)
+        found = fit(problem, free, x, sizes, known=tie, max_steps=25, tolerance=tolerance)
         previous, sigma, x = sigma, residual_sigma(found, 0), found.x
         if sigma > 0.7 * previous or sigma <= 1e-12:
             return found

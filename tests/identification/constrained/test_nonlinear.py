@@ -9,19 +9,13 @@ from support.calibration import measured, with_values
 from support.cells import SLANTED, TABLE_2, kr270_cell, table_of
 from support.constrained import NONE, non_negative
 
-from elastocal.identification.constrained import (
-    ConstrainedFit,
-    KnowledgeProblem,
-    constrained_fit,
-    profile_end,
-)
 from elastocal.identification.knowledge import (
     Bounds,
     Constraints,
     SemidefiniteMatrix,
     physical_constraints,
 )
-from elastocal.identification.least_squares import Problem, fit
+from elastocal.identification.least_squares import Known, KnownFit, Problem, fit, profile_end
 from elastocal.identification.weighted_problem import Weights
 from elastocal.model.manipulator import Model
 from elastocal.model.observations import observe
@@ -52,8 +46,10 @@ def problem(seed: int, **values: float) -> tuple:
     return problem, columns, model.nominal, sizes
 
 
-def fitted(stated: tuple, constraints: Constraints = NONE, prior=None) -> ConstrainedFit:
-    return constrained_fit(KnowledgeProblem.of(*stated, constraints, prior, 1.0))
+def fitted(stated: tuple, constraints: Constraints = NONE, prior=None) -> KnownFit:
+    problem, columns, x, _ = stated
+    known = Known.stated(problem.model.names, columns, x, constraints, prior, 1.0)
+    return KnownFit(fit(*stated, known=known), known, 1.0)
 
 
 @lru_cache
@@ -80,10 +76,10 @@ def test_a_coupled_matrix_binds_and_the_fit_stays_inside():
     coupling = 2e-8
     K = SemidefiniteMatrix("bearing", ((BEARING_X, coupling), (coupling, BEARING_Y)))
     found = fitted(stated, Constraints(matrices=(K,)))
-    x, y = (found.x[arm().names.index(n)] for n in (BEARING_X, BEARING_Y))
+    x, y = (found.fit.x[arm().names.index(n)] for n in (BEARING_X, BEARING_Y))
     assert x > 0 and y > 0
     assert x * y == pytest.approx(coupling**2, rel=1e-6)
-    assert found.converged
+    assert found.fit.converged
     free = fit(*stated)
     assert found.objective > free.whitened @ free.whitened
 
@@ -95,7 +91,7 @@ def test_an_infeasible_start_is_moved_inside():
     start[arm().names.index(BEARING_X)] = -3e-7
     found = fitted((problem, columns, start, sizes), physical_constraints(arm()))
     expected = fitted(stated, physical_constraints(arm()))
-    np.testing.assert_allclose(found.x, expected.x, rtol=1e-8, atol=1e-16)
+    np.testing.assert_allclose(found.fit.x, expected.fit.x, rtol=1e-8, atol=1e-16)
 
 
 @pytest.mark.parametrize("name", [BEARING_X, "joint3.compliance"])
@@ -107,7 +103,7 @@ def test_ends_of_a_profile_are_where_the_objective_has_risen_as_far_as_allowed(n
         if name == BEARING_X and side < 0:
             assert end == 0
             continue
-        assert side * (end - found.x[i]) > 0
+        assert side * (end - found.fit.x[i]) > 0
         at_end = Constraints((Bounds(name, end, end),))
         rise = fitted(stated, physics + at_end).objective - found.objective
         assert rise == pytest.approx(3.84, abs=1e-5)

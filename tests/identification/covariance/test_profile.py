@@ -6,9 +6,8 @@ import numpy as np
 import pytest
 from scipy import sparse, stats
 
-from elastocal.identification.constrained import KnowledgeProblem, constrained_fit, profile_end
 from elastocal.identification.knowledge import Bounds, Constraints
-from elastocal.identification.least_squares import Problem
+from elastocal.identification.least_squares import Known, KnownFit, Problem, fit, profile_end
 from elastocal.identification.weighted_problem import Weights
 from elastocal.model.manipulator import Regression
 from elastocal.model.observations import Observations
@@ -44,10 +43,10 @@ def profile(y, constraints=()):
     weights = Weights("none", None, False, "")
     problem = Problem(Crossing(), observed, weights, start, np.arange(2)), np.arange(2)
     sigma = float(np.sqrt(rss / 10))
-    found = constrained_fit(
-        KnowledgeProblem.of(*problem, start, np.ones(2), Constraints(constraints), None, sigma)
-    )
-    return found.x[0], [profile_end(found, 0, F * sigma**2, side) for side in (-1, 1)]
+    stated = Crossing.names, np.arange(2), start, Constraints(constraints), None, sigma
+    known = Known.stated(*stated)
+    found = KnownFit(fit(*problem, start, np.ones(2), known=known), known, sigma)
+    return found.fit.x[0], [profile_end(found, 0, F * sigma**2, side) for side in (-1, 1)]
 
 
 def fieller(y):
