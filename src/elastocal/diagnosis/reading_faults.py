@@ -1,25 +1,26 @@
-"""Faulty readings: found one by one against all others, before anything is blamed on the arm."""
+"""Faulty readings: each judged against all others, before anything is blamed on the arm."""
 
 from __future__ import annotations
 
 from dataclasses import dataclass
 
 import numpy as np
-import scipy
 from scipy import special
 from scipy.spatial import cKDTree
 
 from elastocal.diagnosis.diagnosis_data import DiagnosisData
 from elastocal.diagnosis.noise_floor import NoiseValues, NoisyData, project
+from elastocal.identification.outliers import deleted
+from elastocal.identification.weighted_problem import same_size
 from elastocal.units import Array, BoolArray, IntArray
 
-# A reading i left out has the error e = P_ii⁻¹u_i with covariance P_ii⁻¹ (u = P r), so uᵢᵀP_ii⁻¹u_i
-# follows χ² with as many degrees of freedom as it has components, if the model is right.  Where it
-# is not, an arm's own error is larger than any χ² allows, and only what no arm can do is a fault:
+# A reading i left out has an error d whose square dᵀP_ii d follows χ², if the model is right.
+# Where it is not, an arm's own error is larger than any χ² allows, and only what no arm can do is
+# a fault.  That others show beside which the arm's error is a part of the noise, as large as need
+# be:
 #
-#   - the other markers of the same visit: no error of an arm changes their distances on the flange.
-#     With the flange free to move, the reading's part w of what is left of its visit follows χ²;
-#   - repeats of the same pose and load: the arm does there what it did;
+#   - the other markers of the same visit: the flange may be anywhere;
+#   - repeats of the same pose, marker and load: the place may be anywhere;
 #   - without either, neighbours in the joints: an error that they share is the arm's.
 #
 # An error that one of the first two would have shown and does not is none of the reading's.
@@ -29,9 +30,10 @@ LEVEL = 0.01  # chance that any of all good readings is taken for faulty
 MOST = 0.1  # share of readings from which on "faulty" is no accident of measuring
 RUN = 3  # so many neighbours in a row, of one marker, are no accident either
 ACCIDENT = 1e-3  # chance below which suspects stand together by more than accident
-NEIGHBOURS = 3  # poses whose errors a reading's is compared with
 TINY = 1e-300
-HEAVIEST, LIGHTEST = 2.0, 1e3  # degrees of freedom of a tail
+TAILS = np.geomspace(2.0, 1e3, 200)  # degrees of freedom that a tail may have
+NEIGHBOURS = 3  # poses whose errors a reading's is compared with
+APART = 1e6  # deviations of a joint, between those that are no neighbours
 SEEN = 0.02  # share of an error's square below which the flange's own motion hides it
 
 
@@ -54,11 +56,11 @@ def screen_outliers(dataset: DiagnosisData, data: NoisyData) -> OutlierScreening
     something happened to it; and where suspects prefer one marker, load state or half of the
     campaign, all are kept, for the same reason.
     """
-    blocks, check = dataset.blocks, DirectChecks(dataset)
+    blocks = dataset.blocks
     faulty = np.zeros(blocks.n, dtype=bool)
     conspicuous = faulty.copy()
     for _ in range(ROUNDS):
-        excess = check.excess(data.without(faulty))
+        excess = excess_of(dataset, data.without(faulty))
         suspect = excess > 1
         conspicuous |= suspect
         suspect &= ~in_a_run(dataset, suspect)
@@ -74,158 +76,106 @@ def screen_outliers(dataset: DiagnosisData, data: NoisyData) -> OutlierScreening
         # A good reading may have looked wrong beside a faulty one that was still there.
         others = faulty.copy()
         others[k] = False
-        faulty[k] = check.excess(data.without(others))[k] > 1
+        faulty[k] = excess_of(dataset, data.without(others))[k] > 1
     if faulty.mean() > MOST or not accidental(dataset, faulty):
         faulty[:] = False
     return OutlierScreening(faulty, conspicuous & ~faulty)
 
 
-class DirectChecks:
-    """How far a reading is beyond what its model, its visit, its repeats and its neighbours
-    allow."""
+def excess_of(dataset: DiagnosisData, data: NoisyData) -> Array:
+    """Squared error (N,) of every reading over what is allowed; 0 where it is left out.
 
-    def __init__(self, dataset: DiagnosisData) -> None:
-        self.dataset, blocks = dataset, dataset.blocks
-        self.size = size = blocks.size
-        self.usual = NoiseValues.usual(dataset.data.G.shape[2])
-        last = f"link{dataset.base.model.chain.n_joints}"
-        rigid = blocks.unpack(dataset.entry(("link_frame", (last,))))
-        same = np.broadcast_to(np.eye(size), (blocks.n, size, size))
-        root = np.linalg.inv(np.linalg.cholesky(blocks.unpack_square(dataset.data.covariance)))
-        self.root = np.asarray(root, dtype=np.float64)
-        self.shared = [(_groups(blocks.visit), rigid), (_groups(dataset.repeated), same)]
-        self.scales: list[dict[int, float]] = [{}, {}]
-
-    def excess(self, data: NoisyData) -> Array:
-        """Squared error (N,) of every reading over what is allowed; 0 where it is left out.
-
-        By the model, or less where visit, repeats or neighbours speak for the reading.
-        """
-        at, used, blocks = project(data, self.usual), ~data.faulty, self.dataset.blocks
-        weight = np.where(used[:, None, None], blocks.unpack_square(at.P), 0.0)
-        trace = np.trace(weight, axis1=1, axis2=2)[:, None, None]
-        u = np.where(used[:, None], blocks.unpack(at.u[..., None])[:, :, 0], 0.0)
-        regular = weight + (1e-12 * trace + ~used[:, None, None]) * np.eye(self.size)
-        error = np.linalg.solve(regular, u[..., None])[..., 0]
-        squared = (u * error).sum(axis=1)
-        chi2 = float(special.chdtri(self.size, LEVEL / len(used)))
-        median = max(float(np.median(squared[used])), TINY)
-        out = squared / (chi2 * median / float(special.chdtri(self.size, 0.5)))
-        suspect = out > 1
-        if not suspect.any():
-            return out
-        e = blocks.unpack((data.r - data.X @ at.beta)[..., None])[:, :, 0]
-        direct = np.full(len(out), np.nan)
-        for (groups, shared), scales in zip(self.shared, self.scales, strict=True):
-            found, would = self._beside(groups, shared, scales, e, error, used, suspect)
-            told = suspect & (would > 1)
-            direct[told] = np.fmax(direct[told], found[told])
-        told = ~np.isnan(direct)
-        out[told] = np.minimum(out[told], direct[told])
-        alone = np.flatnonzero(suspect & ~told)
-        near = self._unlike_neighbours(error, weight, alone, used)
-        out[alone] = np.minimum(squared[alone], near) / self._tail(squared[used])
+    By the model, or less where visit or repeats, else neighbours, speak for the reading.
+    """
+    blocks, used = dataset.blocks, np.flatnonzero(~data.faulty)
+    size, level, out = blocks.size, LEVEL / blocks.n, np.zeros(blocks.n)
+    at = project(data, NoiseValues.usual(data.G.shape[2]))
+    P, own = blocks.unpack_square(at.P)[used], blocks.unpack_square(data.covariance)[used]
+    error = deleted(P, blocks.unpack(at.u[..., None])[used, :, 0], own, np.zeros(len(used)))[0]
+    squared = np.einsum("ni,nij,nj->n", error, P, error)
+    half, limit = special.chdtri(size, [0.5, level])
+    out[used] = squared / (limit / half * max(float(np.median(squared)), TINY))
+    if not (out > 1).any():
         return out
-
-    def _tail(self, squared: Array) -> float:
-        """Limit of statistics (n,) that follow a scaled F(size, ν), χ² where ν → ∞.
-
-        The scale is set by the median.  Where more lie beyond the ninth decile of χ² than chance
-        allows, ν is the one whose ninth decile is theirs: errors of a model that is not right
-        have heavy tails, and what lies in a tail that begins among the good ones is no fault.
-        """
-        k, n, median = self.size, len(squared), max(float(np.median(squared)), TINY)
-        level, ninth = LEVEL / self.dataset.blocks.n, float(np.quantile(squared, 0.9))
-        tenth, half, limit = special.chdtri(k, [0.1, 0.5, level])
-        beyond = int((squared > tenth * median / half).sum())
-        by_chi2 = float(limit / half) * median
-        if special.bdtrc(beyond - 1, n, 0.1) > ACCIDENT:
-            return by_chi2
-
-        def too_heavy(log_dof: float) -> float:
-            high, half = special.fdtri(k, np.exp(log_dof), [0.9, 0.5])
-            return float(high / half - ninth / median)
-
-        low, high = float(np.log(HEAVIEST)), float(np.log(LIGHTEST))
-        if too_heavy(high) >= 0:
-            return by_chi2
-        nu = np.exp(low if too_heavy(low) <= 0 else scipy.optimize.brentq(too_heavy, low, high))
-        limit, half = special.fdtri(k, nu, [1 - level, 0.5])
-        return float(limit / half) * median
-
-    def _beside(
-        self, groups: list[IntArray], shared: Array, scales: dict[int, float], e: Array,
-        error: Array, used: BoolArray, suspect: BoolArray,
-    ) -> tuple[Array, Array]:  # fmt: skip
-        """What the others of a reading's group allow, of the residuals e (N, size), and whether
-        they would have shown the reading's `error` (N, size): both over their limits.
-
-        With the group's rows whitened, e and the motions A that its readings have in common
-        (`shared`), is Q = I − AA⁺ and w = Q e; of a reading alone, wᵢᵀQ_ii⁺wᵢ and, as it would be,
-        errorᵀQ_ii error follow χ², their scale set by the median when they are first looked at.
-        """
-        n, k = len(used), self.size
-        squared, power, dof = np.zeros(n), np.zeros(n), np.zeros(n, dtype=np.int64)
-        for group in groups:
-            rows = group[used[group]]
-            # All are looked at once, for the scale, then those with suspects.
-            if len(rows) < 2 or (scales and not suspect[rows].any()):
-                continue
-            root = self.root[rows]
-            A = (root @ shared[rows]).reshape(len(rows) * k, -1)
-            U, s, _ = np.linalg.svd(A, full_matrices=False)
-            U = U[:, s > 1e-6 * s[0]]
-            Q = np.eye(len(A)) - U @ U.T
-            w = (Q @ (root @ e[rows][..., None]).ravel()).reshape(-1, k)
-            own = (root @ error[rows][..., None])[..., 0]
-            at = np.arange(len(rows))
-            Q = Q.reshape(len(rows), k, len(rows), k)[at, :, at]
-            values, vectors = np.linalg.eigh(Q)
-            seen = values > SEEN
-            along = np.einsum("nij,ni->nj", vectors, w) ** 2
-            squared[rows] = np.where(seen, along / np.where(seen, values, 1.0), 0.0).sum(axis=1)
-            power[rows] = np.einsum("ni,nij,nj->n", own, Q, own)
-            dof[rows] = seen.sum(axis=1)
-        for number in np.unique(dof[dof > 0]):
-            mine = dof == number
-            half, limit = special.chdtri(number, [0.5, LEVEL / n])
+    root = np.linalg.inv(np.linalg.cholesky(own))
+    e = root @ blocks.unpack((data.r - data.X @ at.beta)[..., None])[used]
+    last = f"link{dataset.base.model.chain.n_joints}"
+    moved = root @ blocks.unpack(dataset.entry(("link_frame", (last,))))[used]
+    told = np.full(len(used), np.nan)
+    for group, shared in ((blocks.visit, moved), (dataset.repeated, root)):
+        found, would, dof = _beside(group[used], shared, e, root @ error[..., None])
+        for k in np.unique(dof[dof > 0]):
+            mine = dof == k
+            half, limit = special.chdtri(k, [0.5, level])
             # Readings better than stated are not faulty yet.
-            least = 1.0 if self.dataset.data.stated else TINY
-            scale = max(float(np.median(squared[mine]) / half), least)
-            limit *= scales.setdefault(int(number), scale)
-            squared[mine] /= limit
-            power[mine] /= limit
-        return squared, np.where(dof > 0, power, 0.0)
-
-    def _unlike_neighbours(
-        self, error: Array, weight: Array, chosen: IntArray, used: BoolArray
-    ) -> Array:
-        """Squared difference (k,) of the `chosen` readings' errors from the mean error of the
-        nearest poses, as if that were exact; `weight` (N, size, size) is P_ii."""
-        kind, repeats = self.dataset.kind, self.dataset.repeated
-        q = self.dataset.table.q[self.dataset.lead]
-        q = q / np.maximum(q.std(axis=0), 1e-12)
-        out = np.full(len(chosen), np.inf)
-        for own in np.unique(kind[chosen]):
-            mine = np.flatnonzero((kind == own) & used)
-            mine = mine[np.unique(repeats[mine], return_index=True)[1]]
-            if len(mine) <= NEIGHBOURS + 1:
-                continue
-            tree = cKDTree(q[mine])
-            for place in np.flatnonzero(kind[chosen] == own):
-                i = chosen[place]
-                near = mine[tree.query(q[i], k=NEIGHBOURS + 1)[1]]
-                near = near[repeats[near] != repeats[i]][:NEIGHBOURS]
-                off = error[i] - error[near].mean(axis=0)
-                out[place] = float(off @ weight[i] @ off) / (1 + 1 / len(near))
-        return out
+            least = 1.0 if data.stated else TINY
+            limit *= max(float(np.median(found[mine]) / half), least)
+            told = np.where(mine & (would > limit), np.fmax(told, found / limit), told)
+    alone = np.minimum(squared, _unlike_neighbours(dataset, used, error, P))
+    alone /= _tail(squared, size, level)
+    told = np.where(np.isnan(told), alone, np.minimum(told, out[used]))
+    out[used] = np.where(out[used] > 1, told, out[used])
+    return out
 
 
-def _groups(number: IntArray) -> list[IntArray]:
-    """Members of each group of more than one."""
-    order = np.argsort(number, kind="stable")
-    ends = np.flatnonzero(np.diff(number[order])) + 1
-    return [group for group in np.split(order, ends) if len(group) > 1]
+def _unlike_neighbours(dataset: DiagnosisData, used: IntArray, error: Array, P: Array) -> Array:
+    """Squared difference (n,) of the errors (n, size) of the readings `used` from the mean error of
+    the nearest poses, of the same marker and load, as if that were exact."""
+    q = dataset.table.q[dataset.lead[used]]
+    place = np.column_stack([q / np.maximum(q.std(axis=0), 1e-12), APART * dataset.kind[used]])
+    first = np.unique(dataset.repeated[used], return_index=True)[1]
+    if len(first) <= NEIGHBOURS:
+        return np.full(len(used), np.inf)
+    distance, near = cKDTree(place[first]).query(place, k=NEIGHBOURS + 1)
+    off = error - error[first[near[:, 1:]]].mean(axis=1)  # the first is its own pose
+    squared = np.einsum("ni,nij,nj->n", off, P, off) / (1 + 1 / NEIGHBOURS)
+    return np.where(distance[:, -1] < APART / 2, squared, np.inf)
+
+
+def _tail(squared: Array, size: int, level: float) -> float:
+    """Limit at this `level` of statistics (n,) that follow a scaled F(size, ν), χ² where ν → ∞.
+
+    The scale is set by the median.  Where more lie beyond the ninth decile of χ² than chance
+    allows, ν is the one whose ninth decile is theirs: errors of a model that is not right have
+    heavy tails, and what lies in a tail that begins among the good ones is no fault.
+    """
+    median, ninth = np.maximum(np.quantile(squared, [0.5, 0.9]), TINY)
+    tenth, half, limit = special.chdtri(size, [0.1, 0.5, level])
+    beyond = int((squared > tenth * median / half).sum())
+    if special.bdtrc(beyond - 1, len(squared), 0.1) <= ACCIDENT:
+        ratio = special.fdtri(size, TAILS, 0.9) / special.fdtri(size, TAILS, 0.5)
+        nu = np.exp(np.interp(-ninth / median, -ratio, np.log(TAILS)))
+        half, limit = special.fdtri(size, nu, [0.5, 1 - level])
+    return float(limit / half * median)
+
+
+def _beside(
+    group: IntArray, shared: Array, e: Array, error: Array
+) -> tuple[Array, Array, IntArray]:
+    """What the others of a reading's group make of it, of whitened residuals `e` (n, size, 1) and
+    motions `shared` (n, size, k) that a group has in common: its squared error (n,), what that
+    would be of its `error` (n, size, 1), and the directions (n,) that they show.
+
+    With A the motions of a group and Q = I − AA⁺, w = Q e: wᵢᵀQ_ii⁺wᵢ and errorᵀQ_ii error.
+    """
+    (n, size, k), dof = shared.shape, np.zeros(len(e), dtype=np.int64)
+    squared, would = np.zeros(n), np.zeros(n)
+    for rows in same_size(group):
+        if rows.shape[1] < 2:
+            continue
+        U, s, _ = np.linalg.svd(shared[rows].reshape(len(rows), -1, k), full_matrices=False)
+        U = U * (s > 1e-6 * s[:, :1])[:, None]
+        w = e[rows].reshape(len(rows), -1, 1)
+        w = (w - U @ (U.transpose(0, 2, 1) @ w)).reshape(*rows.shape, size, 1)
+        U = U.reshape(*rows.shape, size, -1)
+        Q = np.eye(size) - U @ U.swapaxes(2, 3)
+        values, vectors = np.linalg.eigh(Q)
+        seen = values > SEEN
+        along = (vectors.swapaxes(2, 3) @ w)[..., 0] ** 2
+        squared[rows] = np.where(seen, along / np.where(seen, values, 1.0), 0.0).sum(axis=2)
+        would[rows] = (error[rows].swapaxes(2, 3) @ Q @ error[rows])[..., 0, 0]
+        dof[rows] = seen.sum(axis=2)
+    return squared, would, dof
 
 
 def accidental(dataset: DiagnosisData, faulty: BoolArray) -> bool:

@@ -734,10 +734,12 @@ def linearised(
     )  # fmt: skip
 
 
-def weights_of(noise: NoiseFit, readings: Readings) -> Weights:
-    """Weights of the readings (N,) under an estimated noise; whitened residuals have size 1."""
+def weights_of(noise: NoiseFit, readings: Readings, more: Array | float = 0.0) -> Weights:
+    """Weights of the readings (N,) under an estimated noise; whitened residuals have size 1.
+
+    `more` (N, size, size) comes to the covariance of single readings."""
     n, size = len(readings), readings.size
-    covariance = block_diagonal(own_noise(noise.fit, readings)[0])
+    covariance = block_diagonal(own_noise(noise.fit, readings)[0] + more)
     for effect, variance in deviations_of(noise.fit, readings):
         Z = effect.columns()
         covariance = covariance + variance * (Z @ Z.T)

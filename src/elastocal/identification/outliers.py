@@ -2,9 +2,10 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass, replace
+from collections.abc import Callable
+from dataclasses import dataclass
 from functools import lru_cache
-from typing import NamedTuple
+from typing import NamedTuple, TypeVar
 
 import numpy as np
 from numpy.typing import ArrayLike
@@ -14,11 +15,9 @@ from elastocal.errors import ElastocalError
 from elastocal.identification.least_squares import Problem
 from elastocal.identification.noise_choice import (
     NoiseFit,
-    NoisyReadings,
-    covariance_of,
     estimate_noise,
     own_noise,
-    variances_of,
+    weights_of,
 )
 from elastocal.identification.noise_structure import Readings
 from elastocal.identification.residuals import f_test
@@ -26,13 +25,15 @@ from elastocal.identification.solve import PLACED, SAMPLE, Solution, is_placed
 from elastocal.identification.weighted_problem import (
     Part,
     each,
-    least_norm,
     regressor,
     residual_at,
     sample,
 )
 from elastocal.model.manipulator import Model
-from elastocal.units import Array, BoolArray, IntArray
+from elastocal.units import Array, BoolArray
+
+FALSE_ALARM = 0.01  # chance that a clean table yields any faulty reading at all
+TINY = np.finfo(float).tiny
 
 
 def median_scale(length: Array, size: int) -> float:
@@ -43,95 +44,66 @@ def median_scale(length: Array, size: int) -> float:
     return float(np.median(length) / np.sqrt(special.chdtri(size, 0.5)))
 
 
-FALSE_ALARM = 0.01  # chance that a clean table yields any faulty reading at all
+# The majority: errors that follow Student's t, of a scale that the median observation sets.
+#
+#     w_i = (ν + size)/(ν + |e_i|²/s²),   s² = med|e_i|² / median of χ²(size)
+#
+# Reweighting from one start ends in one of several optima; where half of the observations lie
+# nearest is the majority's.  Starts: all observations, and many sets of a few.
 
-STARTS, FINALISTS = 500, 10
-SWEEPS, MOST_SWEEPS = 2, 30  # of every start before the best are chosen, and of these
-TOGETHER = 100  # starts whose residuals are held at a time
-RIDGE = 1e-12  # keeps a direction that some observations do not show where it is
+NU = 1.0  # degrees of freedom: far errors weigh as good as nothing
+STARTS, FINALISTS = 300, 10
+SWEEPS, MOST_SWEEPS = 3, 30  # of every start before the best are chosen, and of these
+MOST_NUMBERS = 3e8  # sums of a sweep over all starts
 INSIDE = 0.01  # chance of a clean observation to lie outside
 
 
-def trimmed_fit(Q: Array, e: Array, seed: int = 0) -> Array:
-    """z (p,) minimising the sum of the smaller half of |e_i − Q_i z|², Q (n, size, p) orthonormal.
-
-    Up to half of the observations e (n, size) may be arbitrarily wrong.  FAST-LTS (Rousseeuw and
-    Van Driessen 2006): many smallest possible random subsets and z = 0, refits to the half with the
-    smallest residuals, the best few run to the end.
-
-    Student's t with the median's scale needs no subsets and resists scattered errors as well, but
-    follows a block of two fifths of the readings that err alike: in 11 of 24 tables of distances
-    with one degree of freedom, in 3 with 0.3; this in none.
-    """
-    n, size, p = Q.shape
-    half = (n + p // size + 1) // 2
-    # The normal equations of any choice of observations are a sum of those of single ones.
-    products = Q.transpose(0, 2, 1) @ np.concatenate([Q, e[..., None]], axis=2)
-    products = products.reshape(n, -1)
-
-    def squares(z: Array) -> Array:
-        left = e[..., None] - Q @ z.T
-        return np.asarray((left**2).sum(axis=1).T)
-
-    def concentrated(chosen: IntArray, steps: int) -> tuple[Array, Array]:
-        """Fits (starts, p) `steps` from the `chosen` (starts, k), and their trimmed costs."""
-        for step in range(steps + 1):
-            inside = np.zeros((len(chosen), n))
-            np.put_along_axis(inside, chosen, 1.0, axis=1)
-            summed = (inside @ products).reshape(-1, p, p + 1)
-            summed[:, np.arange(p), np.arange(p)] += RIDGE
-            z = np.linalg.solve(summed[..., :p], summed[..., p:])[..., 0]
-            squared = squares(z)
-            if step < steps:
-                chosen = np.argpartition(squared, half - 1, axis=1)[:, :half]
-        return z, np.partition(squared, half - 1, axis=1)[:, :half].sum(axis=1)
-
-    rng, need = np.random.default_rng(seed), min(-(-p // size) + 1, n)
-    subsets = np.array([rng.choice(n, need, replace=False) for _ in range(STARTS)])
-    found = [concentrated(subsets[k : k + TOGETHER], SWEEPS) for k in range(0, STARTS, TOGETHER)]
-    z, cost = (np.concatenate(parts) for parts in zip(*found, strict=True))
-    best = np.vstack([z[np.argsort(cost, kind="stable")[:FINALISTS]], np.zeros(p)])
-    nearest = np.argpartition(squares(best), half - 1, axis=1)[:, :half]
-    z, cost = concentrated(nearest, MOST_SWEEPS)
-    return np.asarray(z[int(np.argmin(cost))], dtype=np.float64)
-
-
 def majority(B: Array, e: Array, seed: int = 0) -> tuple[BoolArray, float]:
-    """Observations (n,) that agree with the least trimmed squares fit of the majority, B (n, size,
-    p) and e (n, size), and the variance of their rows.
+    """Observations (n,) that agree with the fit of the majority to e (n, size) ≈ B z, z ~ N(0, 1),
+    and the variance of their rows; B (n, size, p).
 
-    Reweighted LTS, repeated: fit to the observations inside the 99 % limit of χ²(size), scale
-    from those corrected for the cut, new limit.  Up to one in a hundred clean observations is
-    left outside, so this is a suspicion, not a verdict; nobody is, where none lies farther out
-    than chance would have it of the whole table.
+    Up to one in a hundred clean observations is left outside, so this is a suspicion, not a
+    verdict; nobody is, where none lies farther out than chance would have it of the whole table.
     """
     n, size, p = B.shape
-    limit, Q, z = special.chdtri(size, INSIDE), B, np.zeros(0)
-    if p:
-        flat = B.reshape(-1, p)
-        scale = np.linalg.norm(flat, axis=0)
-        U, values, _ = linalg.svd(flat / np.where(scale > 0, scale, 1.0), full_matrices=False)
-        Q = U[:, values > 1e-10 * values[0]].reshape(n, size, -1)
-        z = trimmed_fit(Q, e, seed)
+    products = (B.transpose(0, 2, 1) @ np.concatenate([B, e[..., None]], axis=2)).reshape(n, -1)
+
+    def squares(weight: Array, variance: Array) -> Array:
+        """Squared lengths (starts, n) beside the fits with these weights (starts, n)."""
+        summed = (weight @ products).reshape(len(weight), p, p + 1)
+        summed[:, np.arange(p), np.arange(p)] += variance[:, None]
+        z = np.linalg.solve(summed[..., :p], summed[..., p:])[..., 0]
+        return np.asarray(((e[..., None] - B @ z.T) ** 2).sum(axis=1).T)
+
+    half, few = special.chdtri(size, 0.5), min(-(-p // size) + 1, n)
+    starts = int(np.clip(MOST_NUMBERS / (n * p * p + 1), FINALISTS, STARTS))
+    subsets = np.random.default_rng(seed).random((starts, n)).argpartition(few - 1, axis=1)[:, :few]
+    weight = np.vstack([np.ones(n), np.zeros((starts, n))])
+    np.put_along_axis(weight[1:], subsets, 1.0, axis=1)
+    variance = np.full(len(weight), max(median_scale(np.linalg.norm(e, axis=1), size) ** 2, TINY))
+    for sweep in range(SWEEPS + MOST_SWEEPS):
+        q = squares(weight, variance)
+        variance = np.maximum(np.median(q, axis=1) / half, TINY)
+        if sweep == SWEEPS:
+            best = np.argsort(variance, kind="stable")[:FINALISTS]
+            q, variance = q[best], variance[best]
+        weight = (NU + size) / (NU + q / variance[:, None])
+    k = int(np.argmin(variance))
+    squared, s2 = q[k], float(variance[k])
     # Mean of a χ² variable cut at its 99 % point, per degree of freedom.
+    limit = special.chdtri(size, INSIDE)
     cut = special.chdtr(size + 2, limit) / (1 - INSIDE)
-    squared = ((e - Q @ z) ** 2).sum(axis=1)
-    variance = median_scale(np.sqrt(squared), size) ** 2
-    good = squared <= limit * variance
-    for _ in range(50):
-        if p:
-            z = least_norm(Q[good].reshape(-1, Q.shape[2]), e[good].ravel())
-        squared = ((e - Q @ z) ** 2).sum(axis=1)
-        variance = float(squared[good].mean() / (size * cut))
-        updated = squared <= limit * variance
+    good = squared <= limit * s2
+    for _ in range(MOST_SWEEPS):
+        squared = squares(good[None].astype(float), np.array([s2]))[0]
+        rows = size * int(good.sum())
+        s2 = max(float(squared[good].sum()) / (cut * max(rows - p, rows / 2)), TINY)
+        updated = squared <= limit * s2
         if np.array_equal(updated, good) or updated.sum() <= n // 2:
             break
         good = updated
-    far = squared > special.chdtri(size, FALSE_ALARM / n) * variance
-    return np.asarray(good if far.any() else np.ones(n, dtype=bool)), variance
-
-
-# Readings that the others contradict: each judged as if left out of the fit to the majority.
+    far = squared > special.chdtri(size, FALSE_ALARM / n) * s2
+    return np.asarray(good if far.any() else np.ones(n, dtype=bool)), s2
 
 
 @dataclass(frozen=True)
@@ -158,7 +130,6 @@ def blocks(lines: list[int], gap: int = 3) -> list[tuple[int, int]]:
 
 # What a linear fit to some of the readings says of all of them.
 
-TINY = np.finfo(float).tiny
 ALONE = 1e-9  # share of an observation's direction that the other observations must see
 
 
@@ -206,32 +177,99 @@ class FitToGood:
         return np.where(dof < 1, 1.0, f_test(squared, size, rest, np.maximum(dof, 1))[1])
 
 
-# Which observations does a fit of the others contradict?  Judged in turns until it stands.
+# Which observations does a fit of the others contradict?  Fitted and judged until the set stands.
+
+ROUNDS = 12
+Found = TypeVar("Found")
+
+
+def until_it_stands(
+    good: BoolArray,
+    fitted: Callable[[BoolArray], Found],
+    judged: Callable[[Found, BoolArray], tuple[Array, BoolArray]],
+    size: int,
+) -> tuple[Found, BoolArray]:
+    """Fit and good observations (n,) that agree with each other, starting from `good`.
+
+    `fitted` fits to the good ones and `judged` gives squared errors (n,) beside a fit and which
+    observations it does not contradict.  A set that comes back after others ends the search: those
+    good at any time of that round are kept.  So does a fit that no majority agrees with: it cannot
+    judge.  Observations that are taken back bend the fit, so that more of them seem to fit: where
+    the better half of all is left worse explained than by an earlier set, beyond what chance
+    allows, that set stands.
+
+    Raises ElastocalError where the first fit fails.
+    """
+    half, ended = len(good) // 2 + 1, False
+    visited: list[tuple[float, BoolArray, Found]] = []
+    for _ in range(ROUNDS):
+        try:
+            found = fitted(good)
+        except ElastocalError:
+            if not visited:
+                raise
+            break  # so few cannot judge the others
+        squared, agrees = judged(found, good)
+        visited.append((float(np.partition(squared, half - 1)[:half].sum()), good, found))
+        if ended or np.array_equal(agrees, good) or 2 * agrees.sum() <= len(agrees):
+            break
+        masks = [mask for _, mask, _ in visited]
+        again = next((k for k, mask in enumerate(masks) if np.array_equal(mask, agrees)), None)
+        ended = again is not None
+        good = np.logical_or.reduce(masks[again:]) if ended else agrees
+    last, best = visited[-1], min(visited, key=lambda one: one[0])
+    if last[0] > best[0] * special.fdtri(half * size, half * size, 1 - FALSE_ALARM):
+        last = best
+    return last[2], last[1]
+
 
 # Typical sizes in a deviation of the prior: readings of an arm whose errors are five typical sizes
 # must not be taken for faulty because they move its parameters.
 WEAK = 10.0
-ROUNDS = 12
-SETTLED = 0.1  # of its deviation: what a round may still move an estimate by
+STEPS = 4  # to a set's values, from those of the set before
+SETTLED = 0.1  # of its deviation: what a step may still move an estimate by at the end
 
 
 def find_faulty(solution: Solution) -> BoolArray:
-    """Which observations (N,) are faulty.
+    """Which observations (N,) are faulty, by all free parameters, tied weakly to the start, and
+    noise of one variance; at a Bonferroni limit for the whole table.
 
-    The majority's fit of base, markers and cable to the nominal arm shows the suspects.  Then all
-    free parameters, tied weakly to the start, are fitted to the others, every observation is
-    judged at a Bonferroni limit for the whole table, which makes new good ones, and so on.  Of a
-    large table a sample does so, and its fit judges the others.
+    Of a large table a sample is judged so, and its fit judges the others.
     """
     problem, n = solution.problem, len(solution.problem.observations.lead)
     part = sample(problem.parts, SAMPLE) if problem.large else problem.parts.part((0, n))
     width = prior_widths(problem.model, solution.sizes)[problem.free]
-    good, fit = _agreeing(solution, part, width, FALSE_ALARM / n)
+    x0, free, size = problem.x0, problem.free, part.observations.size
+    placed = is_placed(problem.model)[free].any()
+    x = x0.copy() if placed else solution.fit.x.copy()
+    B, y = _whitened(problem, part, x)
+    B, y = B * width, y + B @ (x - x0)[free]
+    good, variance = majority(B, y)
+
+    def fitted(good: BoolArray) -> FitToGood:
+        nonlocal B, y, variance
+        fit = FitToGood(B, y, good, variance)
+        for _ in range(STEPS):
+            x, z = x0.copy(), fit.z
+            x[free] += width * z
+            B, e = _whitened(problem, part, x)
+            B, y, variance = B * width, e + B @ (width * z), fit.variance
+            fit = FitToGood(B, y, good, variance)
+            if np.linalg.norm(fit.R @ (fit.z - z)) <= SETTLED * np.sqrt(fit.variance):
+                break
+        return fit
+
+    def judged(fit: FitToGood, good: BoolArray) -> tuple[Array, BoolArray]:
+        return (fit.e**2).sum(axis=1), fit.p_values(fit.T, fit.e, good) >= FALSE_ALARM / n
+
     faulty = np.zeros(n, dtype=bool)
+    try:
+        fit, good = until_it_stands(good, fitted, judged, size)
+    except ElastocalError:
+        return faulty  # so far out the arm has no equilibrium
     faulty[part.index[~good]] = True
-    if not problem.large or fit is None:
-        return faulty
-    faulty |= _contradicting(problem, fit, width, part)
+    if problem.large:
+        faulty |= _contradicting(problem, fit, width, part)
     return faulty if 2 * faulty.sum() < n else np.zeros(n, dtype=bool)
 
 
@@ -239,47 +277,6 @@ def prior_widths(model: Model, sizes: Array) -> Array:
     """Deviations (parameters,) of the weak prior about a start: what the readings do not show stays
     there, and is not known any better."""
     return np.where(is_placed(model), PLACED, WEAK * sizes)
-
-
-def _agreeing(
-    solution: Solution, part: Part, width: Array, level: float
-) -> tuple[BoolArray, FitToGood | None]:
-    """Observations (n,) of the part that a fit does not contradict at this level, and the fit.
-
-    Where taking readings back in has bent the fit away from the majority, an earlier verdict
-    stands: the sum of the smaller half of the squared lengths tells.
-    """
-    problem, size = solution.problem, part.observations.size
-    x0, free, n = problem.x0, problem.free, len(part.index)
-    placed = is_placed(problem.model)[free]
-    x = x0 if placed.any() else solution.fit.x
-    B, e = _whitened(problem, part, x)
-    good, variance = majority(B[:, :, placed], e)
-    masks: list[BoolArray] = []
-    none: tuple[float, BoolArray, FitToGood | None] = np.inf, np.ones(n, dtype=bool), None
-    final = best = none
-    for _ in range(ROUNDS):
-        z = (x - x0)[free] / width
-        fit = FitToGood(B * width, e + B @ (x - x0)[free], good, max(variance, TINY))
-        agrees = fit.p_values(fit.T, fit.e, good) >= level
-        if 2 * agrees.sum() <= n:
-            break  # no majority agrees with this fit: it cannot judge
-        lengths = (fit.e**2).sum(axis=1)
-        final = float(np.partition(lengths, n // 2)[: n // 2 + 1].sum()), good, fit
-        best = min(best, final, key=lambda one: one[0])
-        masks.append(good)
-        settled = np.linalg.norm(fit.R @ (fit.z - z)) <= SETTLED * np.sqrt(fit.variance)
-        if settled and any(np.array_equal(agrees, before) for before in masks):
-            break
-        good, variance, x = agrees, fit.variance, x0.copy()
-        x[free] += width * fit.z
-        try:
-            B, e = _whitened(problem, part, x)
-        except ElastocalError:
-            break  # so far out the arm has no equilibrium
-    half = n * size // 2
-    bent = final[0] > best[0] * special.fdtri(half, half, 1 - FALSE_ALARM)
-    return best[1:] if bent else final[1:]
 
 
 def _whitened(problem: Problem, part: Part, x: Array) -> tuple[Array, Array]:
@@ -393,9 +390,26 @@ def kept_of(dof: float, values: int, size: int) -> TrimmedNoise:
 #
 # The error of predicting reading i from all others, its configuration's shared deviation included,
 # is d_i = P_ii⁻¹ (P e)_i with covariance P_ii⁻¹ (Haslett and Hayes 1998, J. R. Stat. Soc. B 60,
-# 201): one evaluation judges every reading of the fit.  A reading outside it, of the covariance k
-# with those inside, errs by d = e − BΔx − kᵀV⁻¹r, which varies by Σ − kᵀV⁻¹k + FΦ_AFᵀ with
-# F = B − kᵀV⁻¹B_fit.
+# 201), P = V⁻¹ − V⁻¹BΦBᵀV⁻¹: one evaluation judges all.  A reading that is not to be relied on has
+# a very large noise of its own, which is taken off again.
+
+APART = 1e8  # times its own: it then moves nothing, and taking it off again leaves digits
+
+
+def deleted(P: Array, u: Array, own: Array, apart: Array) -> tuple[Array, Array, Array]:
+    """Errors (N, size) of predicting observations from all others, of blocks P_ii (N, size, size)
+    and u = P e; axes (N, size, size) and variances (N, size) along them.
+
+    Observations have the noise `own` (N, size, size) and `apart` (N,) times more of it, which the
+    variances are without.  Along a direction that an observation alone determines all are zero.
+    """
+    root = np.linalg.cholesky(own) * np.sqrt(1 + apart)[:, None, None]
+    values, vectors = np.linalg.eigh(root.transpose(0, 2, 1) @ P @ root)
+    inverse = np.where(values > ALONE, 1 / np.maximum(values, ALONE), 0.0)
+    axes = root @ vectors
+    d = (axes * inverse[:, None, :]) @ (axes.transpose(0, 2, 1) @ u[..., None])
+    left = np.where(values > ALONE, inverse - (apart / (1 + apart))[:, None], 0.0)
+    return d[..., 0], axes, np.maximum(left, 0.0)
 
 
 def unexplained_readings(
@@ -403,90 +417,38 @@ def unexplained_readings(
 ) -> BoolArray:
     """Readings (N,) that the noise does not explain, at `level` for the whole table (Bonferroni).
 
-    `found` was estimated from the `good` readings (N,); each component of a reading's
-    `standard_errors` is compared with t on the degrees of freedom behind it.
+    `found` was estimated from the `good` readings (N,).  Each component of a reading's error is
+    compared with t on the degrees of freedom behind its noise; a reading that was fitted has a part
+    in the variance it is measured with, and is left out there as well.
     """
-    size, dof = standard_errors(found, readings, good)
-    return np.asarray((size > rejection_point(size.size, dof, level)).any(axis=1))
-
-
-def standard_errors(found: NoiseFit, readings: Readings, good: BoolArray) -> tuple[Array, Array]:
-    """Errors (N, size) of predicting each reading from the `good` ones (N,) that are not it, in
-    units of their own deviation, and the degrees of freedom (N, size) behind that."""
     own, dof = own_noise(found.fit, readings)
-    t = _predicted(found, readings, good, own)
-    # A fitted reading has a part in the variance it is measured with: leave it out there as well.
-    squared = np.minimum(t**2, dof * (1 - 1e-12))
-    outside = np.maximum(dof - 1, 1.0)
-    deleted = np.sqrt(squared * outside / (dof - squared))
-    fitted_too = good[:, None]
-    return np.where(fitted_too, deleted, np.abs(t)), np.where(fitted_too, outside, dof)
+    t = prediction_errors(found, readings, good, own)
+    squared, outside = np.minimum(t**2, dof * (1 - 1e-12)), np.maximum(dof - 1, 1.0)
+    t = np.where(good[:, None], np.sqrt(squared * outside / (dof - squared)), np.abs(t))
+    dof = np.where(good[:, None], outside, dof)
+    return np.asarray((t > rejection_point(t.size, dof, level)).any(axis=1))
 
 
-def _predicted(found: NoiseFit, readings: Readings, good: BoolArray, own: Array) -> Array:
-    """Errors (N, size) of predicting each reading from the others, each over its deviation."""
-    structure, theta, _ = variances_of(found.fit, readings)
-    basis = found.basis[: readings.n_parameters, : readings.n_parameters]
-    turned = replace(readings, B=readings.B @ basis)
-    noisy = NoisyReadings(turned, found.fit.noisy.kind, found.lasting, structure, ~good)
-    known = dict(zip(found.fit.noisy.names, found.fit.theta, strict=True))
-    rest = [known.get(name, 0.0) for name in noisy.names[len(theta) :]]
-    state = noisy.model().state(np.concatenate([theta, rest]))
-    spread = covariance_of(found.fit, np.eye(len(state.x)))[0]
-    size, sets = readings.size, noisy.sets
-    P, variance = np.zeros((2, sets.n, size, size))
-    Pe, d = np.zeros((2, sets.n, size))
-    for (members, _), w, (pack, inside, u) in zip(
-        noisy.packs, state.packs, state.projected(), strict=False
-    ):
-        here, M = members >= 0, members.shape[1]
-        P[members[here]] = _blocks(inside, M)[here]
-        Pe[members[here]] = u.reshape(-1, M, size)[here]
-        some = (pack.absent & np.repeat(here, size, axis=1)).any(axis=1)
-        if some.any():
-            # R⁻¹k of every row with those that count, F and d.
-            V = pack.V(state.theta)[some]
-            k = w.root[some] @ V
-            back, own_sets = k.transpose(0, 2, 1), members[some]
-            F = sets.B[own_sets].reshape(*V.shape[:2], -1) - back @ w.B[some]
-            off = sets.e[own_sets].reshape(V.shape[:2]) - (back @ w.e[some][..., None])[..., 0]
-            left = _blocks(V - back @ k + F @ spread @ F.transpose(0, 2, 1), M)
-            d[own_sets[here[some]]] = (off - F @ state.x).reshape(-1, M, size)[here[some]]
-            variance[own_sets[here[some]]] = left[here[some]]
-    out = _deleted(noisy, P, Pe, own)
-    outside = d / np.sqrt(np.maximum(np.diagonal(variance, axis1=1, axis2=2), 1e-300))
-    out[~good] = outside[sets.of[~good]]
-    return out
-
-
-def _blocks(V: Array, M: int) -> Array:
-    """The blocks (C, M, size, size) along the diagonal of V (C, M·size, M·size)."""
-    size, at = V.shape[1] // M, np.arange(M)
-    return V.reshape(-1, M, size, M, size)[:, at, :, at, :].transpose(1, 0, 2, 3)
-
-
-def _deleted(noisy: NoisyReadings, P: Array, Pe: Array, own: Array) -> Array:
-    """d_i over its deviation (N, size), of P (S, size, size) and Pe (S, size) of sets of repeats,
-    whose contrasts have their own noise alone."""
-    sets, of, e = noisy.sets, noisy.sets.of, noisy.readings.e
-    precision = np.linalg.inv(sets.mean(own))[of]
-    share = (1 / sets.root**2)[of, None, None]
-    mean = (sets.e / sets.root[:, None])[of]
-    inside = share * P[of] + (1 - share) * precision
-    right = Pe[of] / sets.root[of, None] + (precision @ (e - mean)[..., None])[..., 0]
-    # A direction that this reading alone determines has no deletion residual.
-    values, vectors = np.linalg.eigh(inside)
-    smallest = 1e-9 * np.linalg.eigvalsh(precision)[:, -1:]
-    inverse = np.where(values > smallest, 1 / np.maximum(values, smallest), 0.0)
-    spread = (vectors * inverse[:, None, :]) @ vectors.transpose(0, 2, 1)
-    d = (spread @ right[..., None])[..., 0]
-    deviation = np.sqrt(np.diagonal(spread, axis1=1, axis2=2))
+def prediction_errors(found: NoiseFit, readings: Readings, good: BoolArray, own: Array) -> Array:
+    """Errors (N, size) of predicting each reading from the `good` ones (N,) that are not it, over
+    their deviations; `own` (N, size, size) is the noise of single readings."""
+    n, size = len(readings), readings.size
+    apart = np.where(good, 0.0, APART)
+    weights = weights_of(found, readings, apart[:, None, None] * own)
+    assert weights.whiten is not None
+    rows, e = weights.beside_common(readings.B.reshape(n * size, -1), readings.e.ravel())
+    Q, back = np.linalg.qr(rows)[0], weights.whiten.T
+    u = (back @ (e - Q @ (Q.T @ e))[: n * size]).reshape(n, size)
+    H = (back @ Q[: n * size]).reshape(n, size, -1)
+    at = np.arange(n * size).reshape(n, size)
+    i, j = np.broadcast_arrays(at[:, :, None], at[:, None, :])
+    inverse = np.asarray((back @ weights.whiten).tocsr()[i.ravel(), j.ravel()]).reshape(i.shape)
+    d, axes, left = deleted(inverse - H @ H.transpose(0, 2, 1), u, own, apart)
+    deviation = np.sqrt((axes**2 @ left[..., None])[..., 0])
     return np.divide(d, deviation, out=np.zeros_like(d), where=deviation > 0)
 
 
 # The default estimate: faulty readings set apart, noise model chosen, x by its weights.
-
-FEWEST_GOOD = 0.5
 
 
 class NoiseAndOutliers(NamedTuple):
@@ -502,54 +464,32 @@ def settle(
 ) -> NoiseAndOutliers:  # fmt: skip
     """Noise and good readings that agree with each other, starting from `good` (default all).
 
+    The noise model is fitted to the good readings, and every reading judged by the error of its
+    prediction from them (false-alarm rate 1 % for the whole table), in turn.  Starting from all,
+    errors that hide each other may stay: start from the majority.
+
     The search begins with the noise that is `known`, and keeps the kind of noise that it begins
     with.
-
-    The noise model is fitted to the good readings, every reading is judged by the error of its
-    prediction from them (false-alarm rate 1 % for the whole table), and so on.  Starting from
-    all, errors that hide each other may stay: start from a robust fit.  A set that comes back
-    after others ends the search: readings that were good at any time of that round are kept.
-
-    Faulty readings that are taken back bend the fit, so that more of them seem to fit.  Where the
-    better half of all readings is left worse explained than by an earlier set, beyond what chance
-    allows, that set stands.
     """
-    good = np.ones(len(readings), dtype=bool) if good is None else good
-    like = None if known is None else known.noise
-    first = kind if like is None else like.kind
+    every = np.ones(len(readings), dtype=bool)
+    good = every if good is None else good
+    noise = None if known is None else known.noise
+    precision: list[Array] = []  # of single readings, by the first noise
+
+    def fitted(chosen: BoolArray) -> NoiseFit:
+        nonlocal noise
+        own = kind if noise is None else noise.kind
+        noise = estimate_noise(readings.take(chosen), own, noise)
+        return noise
+
+    def judged(found: NoiseFit, chosen: BoolArray) -> tuple[Array, BoolArray]:
+        if not precision:
+            precision.append(np.asarray(np.linalg.inv(own_noise(found.fit, readings)[0])))
+        r = readings.e - readings.B @ found.x
+        agrees = ~unexplained_readings(found, readings, chosen, FALSE_ALARM)
+        return np.einsum("ni,nij,nj->n", r, precision[0], r), agrees
+
     try:
-        noise = estimate_noise(readings.take(good), first, like)
-    except ElastocalError:
-        good = np.ones(len(readings), dtype=bool)  # the others alone do not show all parameters
-        noise = estimate_noise(readings, first, like)
-    own = np.asarray(np.linalg.inv(own_noise(noise.fit, readings)[0]), dtype=np.float64)
-    visited = [(_misfit(noise, readings, own), good, noise)]
-    for _ in range(ROUNDS):
-        updated = ~unexplained_readings(noise, readings, good, FALSE_ALARM)
-        if np.array_equal(updated, good) or updated.mean() < FEWEST_GOOD:
-            break
-        masks = [mask for _, mask, _ in visited]
-        again = next((k for k, mask in enumerate(masks) if np.array_equal(mask, updated)), None)
-        if again is not None:
-            updated = np.logical_or.reduce(masks[again:])
-        try:
-            noise = estimate_noise(readings.take(updated), noise.kind, noise)
-        except ElastocalError:
-            break  # so few readings cannot judge the others
-        good = updated
-        visited.append((_misfit(noise, readings, own), good, noise))
-        if again is not None:
-            break
-    last, best = visited[-1], min(visited, key=lambda v: v[0])
-    half = (len(readings) // 2 + 1) * readings.size
-    if last[0] > best[0] * special.fdtri(half, half, 1 - FALSE_ALARM):
-        last = best
-    _, good, noise = last
-    return NoiseAndOutliers(noise, good)
-
-
-def _misfit(noise: NoiseFit, readings: Readings, precision: Array) -> float:
-    """Sum of the smaller half of the squared residuals, in units of `precision` (N, size, size)."""
-    r = readings.e - readings.B @ noise.x
-    squared = np.einsum("ni,nij,nj->n", r, precision, r)
-    return float(np.sort(squared)[: len(squared) // 2 + 1].sum())
+        return NoiseAndOutliers(*until_it_stands(good, fitted, judged, readings.size))
+    except ElastocalError:  # the good ones alone do not show all parameters
+        return NoiseAndOutliers(*until_it_stands(every, fitted, judged, readings.size))
