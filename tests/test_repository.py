@@ -341,7 +341,7 @@ def test_imports_are_recognised() -> None:
     """Guard of the guard: absolute, relative and function-level imports are all seen."""
     assert "errors" in imports()["files"]
     assert {"cell.work_cell", "errors", "measurements"} <= imports()["model.manipulator"]
-    assert rank("model.manipulator") < rank("identification.solve") < rank("cli.judging")
+    assert rank("model.manipulator") < rank("identification.solve") < rank("cli.using")
     assert rank("cell") == rank("measurements") == rank("errors") == rank("files") == 0
 
 

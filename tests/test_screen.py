@@ -130,7 +130,7 @@ def test_an_interrupt_that_a_library_swallows_still_ends_with_one_line():
     program = """
 import signal, sys
 from elastocal.screen import noting_interrupts
-from elastocal.cli.signatures import command
+from elastocal.cli.app import command
 from elastocal.cli.main import app
 signal.signal(signal.SIGINT, signal.default_int_handler)
 def library():
@@ -194,7 +194,7 @@ import os, signal, sys, time
 signal.signal(signal.SIGINT, signal.default_int_handler)
 {SWALLOWED[how]}
 from elastocal.__main__ import main
-from elastocal.cli.signatures import command
+from elastocal.cli.app import command
 command("attacked")(run)
 sys.argv = ["elastocal", "attacked"]
 main()

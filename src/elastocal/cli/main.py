@@ -19,7 +19,7 @@ import typer
 from elastocal import __version__
 
 # Importing a command registers it.
-from elastocal.cli import judging, measuring, using  # noqa: F401
+from elastocal.cli import measuring, using  # noqa: F401
 from elastocal.cli.app import app, reporting_errors
 from elastocal.screen import close_streams, complain, prepare_streams, say
 

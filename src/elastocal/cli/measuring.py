@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable
+from functools import partial
 from itertools import groupby
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
@@ -11,8 +12,7 @@ from typing import TYPE_CHECKING, Annotated, Any
 import typer
 
 from elastocal import verbs
-from elastocal.cli.app import console, files_of, repeated
-from elastocal.cli.signatures import (
+from elastocal.cli.app import (
     PAGES,
     AnyOutput,
     Asked,
@@ -22,6 +22,9 @@ from elastocal.cli.signatures import (
     Run,
     Seed,
     command,
+    console,
+    files_of,
+    repeated,
     whole_numbers,
 )
 from elastocal.errors import InputError, require
@@ -33,12 +36,10 @@ if TYPE_CHECKING:
 
     from elastocal.cell.work_cell import Cell
     from elastocal.importing.assemble import Imported
-    from elastocal.model.chain import Chain
     from elastocal.planning.checkpoint import Checkpoint
     from elastocal.planning.design import DesignOptions
-    from elastocal.planning.execution import Execution
     from elastocal.planning.plan import Plan
-    from elastocal.units import Array, Progress
+    from elastocal.units import Progress
 
 
 @command(short_help="Write a working cell file for my arm", flags="")
@@ -142,6 +143,9 @@ def _print_effects(screen: Console, cell: Any, entries: Any) -> None:
 PROGRAMS = {".src": "KUKA KRL", ".script": "URScript"}
 
 
+CURVE = "--curve takes numbers of poses, as in 10,15,20"
+
+
 def _target(text: str) -> float:
     try:
         target = float(text)
@@ -152,10 +156,6 @@ def _target(text: str) -> float:
         f"--target takes a positive number of µm; found {text}",
     )
     return target * 1e-6
-
-
-def _numbers(text: str) -> list[int]:
-    return whole_numbers(text, "--curve takes numbers of poses, as in 10,15,20")
 
 
 def _candidates(text: str) -> int | str | list[int | str]:
@@ -172,7 +172,7 @@ def _candidates(text: str) -> int | str | list[int | str]:
     "effort elsewhere elsewhere_cap load_states load_changes reference_every jobs seed",
     texts={
         "target": ("µm", _target),
-        "curve": ("N,N,…", _numbers),
+        "curve": ("N,N,…", partial(whole_numbers, takes=CURVE)),
         "keep": ("PLAN[:3,7]", str),
         "strike": ("PLAN:3,7", str),
         "candidates": ("N|FILE[,N]", _candidates),
@@ -202,15 +202,19 @@ def design(
         picture: Picture of the poses to write (PNG, SVG).
         cell_out: Cell file to write, with what [design.choose] has chosen.
     """
-    from elastocal.files import together
+    from elastocal.files import atomic_write_text, together
     from elastocal.model.effects.catalogue import cell_of
     from elastocal.planning.candidates import plan_and_names
     from elastocal.report.blocks import print_report
-    from elastocal.saving import beside
+    from elastocal.saving import beside, save_plan
 
     summary = beside(output)
     programs = program or []
-    _check_asked(programs, picture)
+    kinds = " or ".join(f"{suffix} for {name}" for suffix, name in PROGRAMS.items())
+    for path in programs:
+        told = f"--program {path}: the suffix says the language, {kinds}"
+        require(path.suffix.lower() in PROGRAMS, told)
+    require(picture is None or picture.suffix != "", f"--picture {picture}: name it .png or .svg")
     run.writes(
         (output, ".csv"), (summary, ".json"), *((path, "") for path in programs),
         (picture, ".png .svg"), (report, PAGES), (cell_out, ".toml"),
@@ -224,7 +228,7 @@ def design(
 
         progress("reading")
         wanted, options = verbs.design_request(cell_of(cell, run.plugins), **asked)
-        _check_programs(wanted, programs)
+        _programs(programs, wanted)
         require(
             cell_out is None or wanted.design.choose is not None,
             f"--cell-out {cell_out}: nothing is chosen; state [design.choose] in {cell}",
@@ -234,7 +238,13 @@ def design(
         files = run.reads(cell, *stated, *pinned, *files_of(wanted))
         plan, checkpoint = _resumed(wanted, options, output, files, asked, check, progress)
         with together(run.written):
-            _write_all(plan, output, programs, picture)
+            save_plan(plan, output, repeated())
+            for path, text in _programs(programs, plan.model.cell, plan).items():
+                atomic_write_text(path, text)
+            if picture is not None:
+                from elastocal.report.arm_view import write_plan_picture
+
+                write_plan_picture(picture, plan)
             if cell_out is not None:
                 from elastocal.diagnosis.diagnose import write_extended_cell
 
@@ -297,60 +307,29 @@ def _what_next(cell: Path, output: Path, augment: Path | None, plan: Plan) -> st
     )
 
 
-def _check_asked(programs: list[Path], picture: Path | None) -> None:
-    """Refuse names that do not say which kind of file is wanted."""
-    kinds = " or ".join(f"{suffix} for {name}" for suffix, name in PROGRAMS.items())
-    for path in programs:
-        told = f"--program {path}: the suffix says the language, {kinds}"
-        require(path.suffix.lower() in PROGRAMS, told)
-    require(picture is None or picture.suffix != "", f"--picture {picture}: name it .png or .svg")
-
-
-def _check_programs(cell: Cell, programs: list[Path]) -> None:
-    """Can these robot programs be written for this arm?  Told before the work, not after it."""
+def _programs(paths: list[Path], cell: Cell, plan: Plan | None = None) -> dict[Path, str]:
+    """Robot programs of a plan by their paths; without one only whether they can be written for
+    this arm, which is told before the work and not after it."""
     import numpy as np
 
     from elastocal.cell.plan_wishes import Motion
+    from elastocal.model.chain import joint_limits
     from elastocal.model.manipulator import load_chain
     from elastocal.planning.execution import Execution
-
-    if programs:
-        chain = load_chain(cell)
-        nothing = Execution((), np.zeros((0, chain.n_joints)), 0.0, False, Motion(), 0, 0)
-        for path in programs:
-            _program(path, nothing, chain)
-
-
-def _write_all(plan: Plan, output: Path, programs: list[Path], picture: Path | None) -> None:
-    from elastocal.files import atomic_write_text
-    from elastocal.model.chain import joint_limits
-    from elastocal.saving import save_plan
-
-    chain = plan.model.chain
-    limits = joint_limits(plan.model.cell, chain)
-    save_plan(plan, output, repeated())
-    for path in programs:
-        text = _program(path, plan.execution, chain, plan.configurations, plan.forces, limits)
-        atomic_write_text(path, text)
-    if picture is not None:
-        from elastocal.report.arm_view import write_plan_picture
-
-        write_plan_picture(picture, plan)
-
-
-def _program(
-    path: Path, execution: Execution, chain: Chain,
-    configurations: tuple[str, ...] = (), forces: Array | None = None,
-    limits: tuple[Array, Array] | None = None,
-) -> str:  # fmt: skip
     from elastocal.planning.programs import robot_program
 
-    try:
-        return robot_program(
-            path.suffix, execution, chain, configurations, forces, name=path.stem, limits=limits
-        )
-    except InputError as error:
-        raise InputError(f"--program {path}: {error}") from None
+    written, chain = {}, load_chain(cell)
+    nothing = Execution((), np.zeros((0, chain.n_joints)), 0.0, False, Motion(), 0, 0)
+    told = (nothing, chain, (), None) if plan is None else (
+        plan.execution, chain, plan.configurations, plan.forces
+    )  # fmt: skip
+    limits = None if plan is None else joint_limits(cell, chain)
+    for path in paths:
+        try:
+            written[path] = robot_program(path.suffix, *told, name=path.stem, limits=limits)
+        except InputError as error:
+            raise InputError(f"--program {path}: {error}") from None
+    return written
 
 
 # simulate and demo: measurements of a plan that were never made; the example.
@@ -394,7 +373,14 @@ def simulate(
     model = Model(cell, plugins=run.plugins)
     run.reads(cell, plan, cell=model.cell)
     poses = model.read_plan(plan)
-    values = dict(_assignment(text) for text in set_ or ())
+    values: dict[str, float] = {}
+    for text in set_ or ():
+        name, _, value = text.partition("=")
+        try:
+            values[name.strip()] = float(value)
+        except ValueError:
+            told = f"--set takes NAME=VALUE with a number in SI units; found '{text}'"
+            raise InputError(told) from None
     table, x = verbs.simulated(model, poses, **asked, values=values, noise=not no_noise)
     planned = model.cell.design.loads
     if "load" not in asked and not table.force.any() and planned is not None and planned.any():
@@ -415,16 +401,6 @@ def simulate(
     )
 
 
-def _assignment(text: str) -> tuple[str, float]:
-    name, _, value = text.partition("=")
-    try:
-        return name.strip(), float(value)
-    except ValueError:
-        raise InputError(
-            f"--set takes NAME=VALUE with a number in SI units; found '{text}'"
-        ) from None
-
-
 @command(short_help="Simulate and calibrate a KR 270 (Klimchik et al. 2013)", flags="json quiet")
 def demo(
     folder: Output = Path("demo_out"),
@@ -439,7 +415,7 @@ def demo(
     Args:
         folder: Folder for the example's files, data, result and report.
     """
-    from elastocal.cli.judging import write_results
+    from elastocal.cli.using import write_results
     from elastocal.demo.example import run_demo
     from elastocal.report.blocks import print_report
 
@@ -504,6 +480,7 @@ def import_(
     from elastocal.cell.work_cell import read_cell
     from elastocal.importing.assemble import import_files
     from elastocal.importing.mapping_file import preset_text, read_mapping, with_units
+    from elastocal.importing.records import likely_presets
     from elastocal.report.blocks import print_blocks
     from elastocal.report.smaller_views import import_blocks, left_out
 
@@ -520,9 +497,12 @@ def import_(
         "import needs -o data.csv to write to, or --preview to only look",
     )
     if mapping is None and not preset:
-        raise InputError(
-            f"import needs --map mapping.toml, or --preset: {PRESET_NAMES}{_suggestion(paths)}"
-        )
+        likely = {path: likely_presets(path) for path in paths if path.is_file()}
+        read_by = [
+            f"{path} as --preset {' or '.join(found)}" for path, found in likely.items() if found
+        ]
+        hint = f"; what reads your files: {', '.join(read_by)}" if read_by else ""
+        raise InputError(f"import needs --map mapping.toml, or --preset: {PRESET_NAMES}{hint}")
     run.writes((output, ".csv"))
     run.reads(*paths, mapping, cell)
     read = with_units(read_mapping(mapping, preset or ()), length_unit, angle_unit)
@@ -583,14 +563,3 @@ def _understood(found: Imported, output: Path | None) -> dict[str, Any]:
         "warnings": list(found.warnings),
         "refused": found.refused or None,
     }  # fmt: skip
-
-
-def _suggestion(paths: list[Path]) -> str:
-    """The presets that read the files, as a hint."""
-    from elastocal.importing.records import likely_presets
-
-    told = []
-    for path in paths:
-        if path.is_file() and (found := likely_presets(path)):
-            told.append(f"{path} as --preset {' or '.join(found)}")
-    return f"; what reads your files: {', '.join(told)}" if told else ""
