@@ -96,17 +96,21 @@ class SumOfSquares:
         return step, float(b @ b - left @ left)
 
 
-def descend(objective: SumOfSquares, u: Array, tolerance: float, max_evaluations: int) -> Descent:
+def descend(
+    objective: SumOfSquares, u: Array, tolerance: float, max_evaluations: int,
+    at: Evaluation | None = None,
+) -> Descent:  # fmt: skip
     """Full Gauss–Newton steps while they lower the cost, damped ones where they do not.
 
     Ends where the linearised cost promises less than `tolerance` of itself: that last step is
     still taken, and leaves an error smaller than itself by the factor with which Gauss–Newton
     converges.  Steps are judged by the cost itself, so no rounding of it can keep it from ending.
+    `at` is the evaluation at u, where it is known.
 
     Raises ElastocalError where the start has no prediction.
     """
     ending = objective.evaluate_last or objective.evaluate
-    at = objective.evaluate(u)
+    at = at or objective.evaluate(u)
     cost, damping, evaluations = objective.cost(u, at), 0.0, 1
     failed = -1.0  # the damping that was too little a step ago
     while evaluations < max_evaluations:
@@ -170,7 +174,8 @@ class Problem:
     @cached_property
     def parts(self) -> Partition:
         """The table cut into parts that can be worked on alone: one, unless it is large."""
-        return partition(self.observations, self.weights, int((~self.model.shrunk).sum()))
+        columns = max(int((~self.model.shrunk).sum()), len(self.free))
+        return partition(self.observations, self.weights, columns)
 
     @property
     def large(self) -> bool:
@@ -265,9 +270,7 @@ def objective_of(
                 f"{problem.observations.table.source}: the model predicts no finite numbers at the "
                 "start values; look in the cell for a length, force or compliance far too large"
             )
-        own = at.r_factor if asked is columns else at.r_factor.of_columns(_places(columns, asked))
-        wide = None if asked is columns else at.r_factor
-        return Evaluation(at.residual, own.scaled(size), wide)
+        return at.chosen(columns, asked, size)
 
     target = known.target - known.P @ x[columns]
     limits = None if known.system is None else known.system.moved(x[columns], size)
@@ -280,11 +283,6 @@ def moved(x: Array, columns: IntArray, step: Array) -> Array:
     out = x.astype(float)
     out[columns] += step
     return out
-
-
-def _places(columns: IntArray, among: IntArray) -> IntArray:
-    order = np.argsort(among)
-    return np.asarray(order[np.searchsorted(among, columns, sorter=order)])
 
 
 def fit(

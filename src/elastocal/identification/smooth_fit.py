@@ -18,11 +18,17 @@ from dataclasses import dataclass, replace
 import numpy as np
 from scipy import linalg, sparse, special
 
-from elastocal.errors import ElastocalError
 from elastocal.identification.covariance import Covariance
 from elastocal.identification.knowledge import GaussianPrior
 from elastocal.identification.knowledge_fit import FunctionPrior
-from elastocal.identification.least_squares import Fit, Problem
+from elastocal.identification.least_squares import (
+    Fit,
+    Known,
+    Problem,
+    descend,
+    moved,
+    objective_of,
+)
 from elastocal.identification.noise_choice import NoiseFit, linearised, weights_of
 from elastocal.identification.noise_structure import Readings
 from elastocal.identification.options import (
@@ -42,6 +48,7 @@ from elastocal.identification.smooth_functions import (
 )
 from elastocal.identification.solve import WORTH_A_COLUMN, Reduction, Solution, choose, is_placed
 from elastocal.identification.weighted_problem import (
+    Evaluation,
     Part,
     Partition,
     RFactor,
@@ -57,10 +64,8 @@ from elastocal.model.observations import Observations, subset
 from elastocal.text import listed
 from elastocal.units import Array, BoolArray, IntArray, Progress
 
-STEPS, HALVINGS = 25, 8
+STEPS = 25
 SETTLED = 1e-4  # of a χ²: what the last step may still gain
-ROUGH = 1e-2  # the same, where rounding allows no better step
-ROUNDING = 1e-12
 CHOICES = 3  # of the ordinary parameters, each under the sizes found with the one before
 ROUNDS = 5
 # Two readings say the same where what the fit knows of them is that correlated, and their errors
@@ -101,6 +106,10 @@ class Functions:
         every = np.concatenate(columns)
         std = np.array([model.parameters[c].typical for c in every], dtype=float)
         return cls(tuple(own), sized, every, group, std, model.nominal[every])
+
+    def rows(self, factor: RFactor, x: Array) -> LinearRows:
+        """From the R factor of the free ordinary columns and these at x."""
+        return LinearRows.of(factor, x[self.columns] - self.nominal, self.std, self.group)
 
 
 def sized_of(model: Model, free: IntArray) -> IntArray:
@@ -155,72 +164,65 @@ class JointFit:
         """The posterior of other sizes, the model linearised at this x, and the step (parameters,)
         to its minimum."""
         kept = np.searchsorted(self.problem.free, self.reduction.kept)
-        posterior = self.free.only(kept).posterior(scales)
-        other = replace(self, scales=scales, posterior=posterior)
-        return other, _moved(other, posterior)[0] - self.x
+        posterior, f = self.free.only(kept).posterior(scales), self.functions
+        # α is a step; b counts from nominal.
+        step, b = np.zeros(len(self.x)), np.zeros(len(f.columns))
+        step[self.reduction.kept] = posterior.step[: posterior.ordinary]
+        b[posterior.own] = posterior.step[posterior.ordinary :]
+        step[f.columns] = f.nominal + b - self.x[f.columns]
+        return replace(self, scales=scales, posterior=posterior), step
 
 
 def joint_fit(
     problem: Problem, sizes: Array, functions: Functions, x: Array, reduction: Reduction,
     scales: Scales | None = None, *, choosing: bool = True,
 ) -> JointFit:  # fmt: skip
-    """Gauss–Newton on readings and prior from x.
+    """The fit to readings and prior from x.
 
     The sizes of the functions are estimated on the way, from `scales` on; which ordinary parameters
     are fitted is chosen anew beside them, from `reduction` on, unless `choosing` is False.
 
     Raises ElastocalError where the start has poses without equilibrium.
     """
-    columns = np.concatenate([problem.free, functions.columns])
-    parts = partition(problem.observations, problem.weights, len(columns))
-    stated = functions.std, functions.group
-
-    def at(x: Array) -> tuple[Array, RFactor, LinearRows]:
-        found = evaluate(problem.model, parts, x, columns)
-        away = x[functions.columns] - functions.nominal
-        return found.residual, found.r_factor, LinearRows.of(found.r_factor, away, *stated)
-
-    x = _started(problem, functions, x, reduction)
+    model, among = problem.model, np.concatenate([problem.free, functions.columns])
+    every = replace(problem, free=among)
+    x, steps = _started(problem, functions, x, reduction), 0
     if scales is not None:
         gone = functions.columns[(scales.scale == 0)[functions.group]]
-        x[gone] = problem.model.nominal[gone]
-    residual, factor, free = at(x)
-    rounds = CHOICES if scales is None else 1
-    steps = 0
-    while True:
-        while rounds > 0:
-            rounds -= 1
-            scales = free.only(np.searchsorted(problem.free, reduction.kept)).scales(scales)
-            if not choosing:
-                break
-            again = _chosen(problem, sizes, free, scales)
-            if np.array_equal(again.kept, reduction.kept):
-                break
+        x[gone] = model.nominal[gone]
+    at = evaluate(model, every.parts, x, among)
+    for left in reversed(range(CHOICES if scales is None else 1)):
+        free = functions.rows(at.wide or at.r_factor, x)
+        scales = free.only(np.searchsorted(problem.free, reduction.kept)).scales(scales)
+        again = _chosen(problem, sizes, free, scales) if choosing else reduction
+        if not np.array_equal(again.kept, reduction.kept):
             reduction, x = again, _started(problem, functions, x, again)
-            residual, factor, free = at(x)
-        assert scales is not None
+            at = evaluate(model, every.parts, x, among)
+            free = functions.rows(at.r_factor, x)
+            if left:
+                continue
         reduction = reduction.seen(problem.free, free.factor.R, sizes)
-        kept = np.searchsorted(problem.free, reduction.kept)
-        posterior = free.only(kept).posterior(scales)
-        now = JointFit(
-            problem, parts, functions, reduction, x, residual, scales, posterior, free, False, steps
-        )
-        moved, gain = _moved(now, posterior)
-        if gain <= SETTLED or steps >= STEPS:
-            return replace(now, converged=gain <= SETTLED)
-        cost = _cost(now, x, factor)
-        for _ in range(HALVINGS):
-            steps += 1
-            try:
-                there = at(moved)
-                if _cost(now, moved, there[1]) <= cost * (1 + ROUNDING):
-                    break
-            except ElastocalError:
-                pass  # a soft arm may have no equilibrium so far out
-            moved = (x + moved) / 2
-        else:
-            return replace(now, converged=gain <= ROUGH)
-        x, (residual, factor, free) = moved, there
+        posterior = free.only(np.searchsorted(problem.free, reduction.kept)).posterior(scales)
+        own = functions.columns[posterior.own]
+        columns = np.concatenate([reduction.kept, own])
+        P = np.diag(posterior.prior) @ np.eye(len(own), len(columns), len(reduction.kept))
+        known = Known(P, P[:, len(reduction.kept) :] @ model.nominal[own])
+        objective = objective_of(every, columns, x, sizes, known, among)
+        assert objective.evaluate_last is not None
+        objective = replace(objective, evaluate=objective.evaluate_last)
+        begun = Evaluation(at.residual, at.wide or at.r_factor)
+        begun = begun.chosen(columns, among, sizes[columns])
+        # While there is another choice, a single step.
+        most = 2 if left else STEPS
+        found = descend(objective, np.zeros(len(columns)), SETTLED / len(at.residual), most, begun)
+        x, at, steps = moved(x, columns, sizes[columns] * found.u), found.at, found.evaluations
+    assert scales is not None
+    free = functions.rows(at.wide or at.r_factor, x)
+    posterior = free.only(np.searchsorted(problem.free, reduction.kept)).posterior(scales)
+    return JointFit(
+        problem, every.parts, functions, reduction, x, at.residual, scales, posterior, free,
+        found.converged, steps,
+    )  # fmt: skip
 
 
 def _chosen(problem: Problem, sizes: Array, free: LinearRows, scales: Scales) -> Reduction:
@@ -239,28 +241,6 @@ def _started(problem: Problem, functions: Functions, x: Array, reduction: Reduct
     out[functions.columns] = False
     moved[out] = problem.x0[out]
     return moved
-
-
-def _moved(now: JointFit, posterior: ShrunkPosterior) -> tuple[Array, float]:
-    """x at the minimum of the linear problem, and what going there gains, as a χ²."""
-    k, f = posterior.ordinary, now.functions
-    before = now.x[f.columns] - f.nominal
-    # α is a step; b counts from nominal.
-    after = np.zeros(len(f.columns))
-    after[posterior.own] = posterior.step[k:]
-    x = now.x.copy()
-    x[now.reduction.kept] += posterior.step[:k]
-    x[f.columns] = f.nominal + after
-    change = np.concatenate([posterior.step[:k], (after - before)[posterior.own]])
-    way = posterior.R @ change
-    return x, float(way @ way) / posterior.variance
-
-
-def _cost(now: JointFit, x: Array, factor: RFactor) -> float:
-    """Sum of squares of readings and prior at x."""
-    f, posterior = now.functions, now.posterior
-    b = (x[f.columns] - f.nominal)[posterior.own]
-    return factor.rss + float(np.sum((posterior.prior * b) ** 2))
 
 
 # What each configuration says beside the others.

@@ -516,6 +516,14 @@ class Evaluation:
     r_factor: RFactor
     wide: RFactor | None = None
 
+    def chosen(self, columns: IntArray, among: IntArray, size: Array) -> Evaluation:
+        """Of the `columns` among those evaluated, each per `size` of it."""
+        if columns is among:
+            return Evaluation(self.residual, self.r_factor.scaled(size))
+        order = np.argsort(among)
+        own = self.r_factor.of_columns(order[np.searchsorted(among, columns, sorter=order)])
+        return Evaluation(self.residual, own.scaled(size), self.r_factor)
+
 
 def evaluate(model: Model, parts: Partition, x: Array, columns: NDArray[np.integer]) -> Evaluation:
     """B of the `columns` at x and the residual, whitened and reduced to their R factor.
