@@ -43,6 +43,7 @@ from pydantic import (
 from pydantic.dataclasses import dataclass as pydantic_dataclass
 from pydantic_core import PydanticCustomError
 
+from elastocal.above import ByValue
 from elastocal.errors import GONE, InputError, require
 from elastocal.files import check_exists, check_nesting, read_text
 from elastocal.text import did_you_mean, listed, nearest, quoted
@@ -143,8 +144,11 @@ def record(cls: type[Record]) -> type[Record]:
     """Make a class a frozen dataclass whose fields are checked, in SI units.
 
     A wrong argument is an InputError that names class, field, what it takes and what was found.
+    Records are compared as `ByValue` does.
     """
-    made: Any = pydantic_dataclass(frozen=True, config=STRICT)(cls)
+    made: Any = pydantic_dataclass(frozen=True, eq=False, config=STRICT)(cls)
+    for name in ("_compared", "__eq__", "__hash__"):
+        setattr(made, name, vars(ByValue)[name])
     checked_init = made.__init__
 
     @wraps(checked_init)

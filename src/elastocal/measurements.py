@@ -7,7 +7,7 @@ from __future__ import annotations
 
 import re
 from collections.abc import Callable, Iterator, Mapping, Sequence
-from dataclasses import dataclass, fields, replace
+from dataclasses import dataclass, field, fields, replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -91,8 +91,8 @@ class Measurements(Result):
         (36, 3)
     """
 
-    source: str
-    row: IntArray
+    source: str = field(compare=False)
+    row: IntArray = field(compare=False)
     q: Array
     configuration: IntArray
     configuration_labels: tuple[str, ...]
@@ -134,6 +134,13 @@ class Measurements(Result):
 
     def __len__(self) -> int:
         return len(self.row)
+
+    def _compared(self) -> Mapping[str, Any]:
+        """What a file of it would say, and which kinds its joints are."""
+        return self.columns() | {"": self.kinds}
+
+    def __hash__(self) -> int:
+        return hash((len(self), self.q.shape[1], self.marker_names[:1]))
 
     def __repr__(self) -> str:
         said = f"{len(self)} rows, {len(self.configuration_labels)} configurations"

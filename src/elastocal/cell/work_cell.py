@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import re
 from collections.abc import Collection, Iterable
+from dataclasses import field
 from datetime import date
 from functools import partial
 from pathlib import Path
@@ -442,7 +443,7 @@ class Cell:
     """
 
     name: str = keyed("a text", form=Text)
-    path: File | None = None
+    path: File | None = field(default=None, compare=False)
     robot: Robot = keyed(
         'a table with urdf = "arm.urdf", mjcf = "arm.xml" or dh = "dh.csv"',
         required=True,

@@ -5,7 +5,6 @@ from __future__ import annotations
 from collections.abc import Callable, Hashable
 from dataclasses import dataclass, replace
 from functools import cached_property
-from weakref import WeakKeyDictionary
 
 import numpy as np
 from numpy.typing import NDArray
@@ -274,8 +273,6 @@ def _first_of_each(table: Measurements) -> NDArray[np.bool_]:
 
 MOST = 12  # models that are kept of each; those asked for last
 
-_kept: WeakKeyDictionary[Model, dict[Hashable, Model]] = WeakKeyDictionary()
-
 
 def made_once(model: Model, key: Hashable, make: Callable[[], Model]) -> Model:
     """What `make` derives from the model, or what it derived under the same `key` before.
@@ -283,7 +280,7 @@ def made_once(model: Model, key: Hashable, make: Callable[[], Model]) -> Model:
     A diagnosis comes back to the same few models, and to write and differentiate an arm takes
     longer than to evaluate it at sixty poses.
     """
-    known = _kept.setdefault(model, {})
+    known: dict[Hashable, Model] = vars(model).setdefault("_derived", {})
     known[key] = known.pop(key) if key in known else make()
     while len(known) > MOST:
         known.pop(next(iter(known)))

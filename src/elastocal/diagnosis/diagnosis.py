@@ -384,7 +384,7 @@ class Diagnosis(Result):
     model_keys: dict[str, str] = field(default_factory=dict)
     # What was diagnosed: the model as it was given, and the name of its measurements.
     model: Model | None = field(default=None, repr=False, compare=False)
-    data: str = ""
+    data: str = field(default="", compare=False)
     # The arm as it was fitted before any effect was added, and its residuals.
     calibrated: Baseline | None = field(default=None, repr=False, compare=False)
 

@@ -13,6 +13,7 @@ from numpy.typing import NDArray
 from pydantic import Field
 from scipy import linalg
 
+from elastocal.above import ByValue
 from elastocal.config import Positive, Table, Text, checked, read_toml, required
 from elastocal.errors import InputError, option, require
 from elastocal.model.manipulator import Model
@@ -438,8 +439,8 @@ class KnowledgeTable(Table):
     )
 
 
-@dataclass(frozen=True)
-class Knowledge:
+@dataclass(frozen=True, eq=False)
+class Knowledge(ByValue):
     """What is known of the parameters besides the readings, in SI units.
 
     Attributes:

@@ -23,6 +23,7 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy import linalg, special
 
+from elastocal.above import ByValue
 from elastocal.cell.work_cell import Cell
 from elastocal.errors import ElastocalError
 from elastocal.identification.covariance import Covariance, root_of, variance_of
@@ -222,8 +223,8 @@ def typical_sizes(parameters: tuple[Parameter, ...], x: Array, kept: IntArray) -
 # The position of the tool at a pose, with its region.
 
 
-@dataclass(frozen=True)
-class Position:
+@dataclass(frozen=True, eq=False)
+class Position(ByValue):
     """Where the tool is at n poses, and how sure that is; lengths in m, in the data's frame.
 
     `position` (n, 3).  `covariance` (n, 3, 3) of the place about which visits scatter: estimates,

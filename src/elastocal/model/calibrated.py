@@ -97,7 +97,7 @@ class MeasuredVisits:
         }
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, eq=False)
 class Valued:
     """A model and the values x (parameters,) to evaluate it at."""
 
@@ -159,13 +159,13 @@ class CalibratedArm(Valued, Saved):
 
     determined: tuple[str, ...]
     covariance: Array
-    source: str
+    source: str = field(compare=False)
     entries: tuple[Mapping[str, Any], ...] = ()
     left: OpenParameters | None = None
     lacking: float = 0.0
     loads: Array = field(default_factory=lambda: np.zeros((0, 3)))
     shown: ShownPoses | None = None
-    visits: MeasuredVisits | None = None
+    visits: MeasuredVisits | None = field(default=None, compare=False)  # rounded in files
 
     def __repr__(self) -> str:
         return (
@@ -457,7 +457,7 @@ class Conditions:
     force: Array = field(default_factory=lambda: np.zeros(3))
     time: float | None = None
     temperature: float | None = None
-    visits: MeasuredVisits | None = None
+    visits: MeasuredVisits | None = field(default=None, compare=False)  # rounded in files
 
     def state(self, need: str) -> bool:
         """Is what an effect needs ("time", "temperature", …) stated here?"""

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property
 from pathlib import Path
@@ -11,7 +11,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from elastocal.above import DataFrame
+from elastocal.above import ByValue, DataFrame
 from elastocal.arguments import checked_arguments
 from elastocal.cell.arm_description import EffectChoice, ModelSpec
 from elastocal.cell.work_cell import Cell
@@ -48,7 +48,7 @@ class Regression:
         return self.observations.value - self.prediction
 
 
-class Model:
+class Model(ByValue):
     """p_i = h(q_i, f_i, …; X) for an arm with effects; CasADi differentiates it exactly.
 
     Attributes:
@@ -130,6 +130,15 @@ class Model:
         plugins = Carried(self.cell.path or Path(self.cell.name), self.cell.plugins)  # run first
         made_of = plugins, self.chain, self.cell, self._extra, self._symbolic.backend
         return _arrived, made_of, {"_markers_stated": self._markers_stated}
+
+    def _compared(self) -> Mapping[str, Any]:
+        """The robot's numbers and all that the cell says, but for names and places of files."""
+        cell = {k: v for k, v in vars(self.cell).items() if k not in ("name", "path", "robot")}
+        extra = [(effect.name, place) for effect, place in self._extra]
+        return cell | {"chain": self.chain, "extra": extra, "backend": self._symbolic.backend}
+
+    def __hash__(self) -> int:
+        return hash((self.chain.name, self.names))
 
     def __repr__(self) -> str:
         effects = listed(dict.fromkeys(p.effect for p in self.parameters), 6) or "no effect"
