@@ -24,7 +24,7 @@ COUPLED = "coupling { joint = 3, of = 2, factor = -1 }"
         ("sweeps_raw", f"with the sign of joints 3, 4, 5, 6 turned round and with {COUPLED}"),
         (
             "rows_closed_up",
-            "configurations 1 to 20 fit the nominal arm to 1.44 mm; from 21 on the points belong "
+            "configurations 1 to 20 fit the nominal arm to 2.02 mm; from 21 on the points belong "
             "to joint values one later, from 27 two later",
         ),
     ],

@@ -1,13 +1,14 @@
-"""Mistakes that are often made with a table of readings, found by undoing each.
+"""Mistakes that are often made with a table of readings: each an alternative reading of it.
 
-Units, signs, swapped columns, shifted rows: whether the nominal arm, its base and markers fitted,
-explains the readings at all, and what would have to be otherwise for it to do so.  A calibration
-whose residuals no arm could have ends here, with the likely cause.
+Units, signs, swapped columns, shifted rows: with base and markers fitted, the nominal arm is far
+from the readings as they stand, and near them as an alternative reads them.  Of n readings whose
+errors have one unknown size, that is a likelihood ratio of 3n log(far/near).  A calibration whose
+residuals no arm could have ends here, with the likely cause.
 """
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator
+from collections.abc import Iterator
 from dataclasses import dataclass, replace
 from itertools import combinations
 
@@ -41,6 +42,242 @@ from elastocal.model.rigid import nominal_flanges
 from elastocal.text import listed
 from elastocal.units import Array, IntArray
 
+FEWEST_POSES = 8  # base (6) and a marker (3) from fewer fit anything
+POOR = 0.03  # m: no nominal arm is this wrong, wrong signs and units are far more
+MOST = 80  # % of the readings, which what they fit to is told of
+# What an alternative must bring the error down by.  Of 8 readings it is a likelihood ratio of 38
+# nats, against 8 for the choice among all the alternatives.
+BETTER = 5.0
+FARTHEST = 1e5  # m; beyond it no fit is worth its overflows, and plausibility speaks
+SAMPLE = 80
+CONFIRMED = 6  # alternatives of joints and positions that are tried in earnest
+
+
+@dataclass(frozen=True)
+class Alternative:
+    """The table as it would read without a mistake; `words` say what is otherwise, {} being what it
+    then fits to."""
+
+    words: str
+    table: Measurements
+
+
+@dataclass(frozen=True)
+class NominalFit:
+    """Median distance `error` (m) of the readings from the nominal arm with base and markers
+    fitted; `warning` names what would make them fit, "" where they do; `mended`: a mistake undone
+    makes them."""
+
+    error: float
+    warning: str
+    mended: bool = False
+
+
+def nominal_fit(
+    chain: Chain, cell: Cell, table: Measurements, spherical: bool = False
+) -> NominalFit | None:
+    """How well readings fit the nominal arm, and which mistake undone would mend it; None where
+    they hold no positions, too few poses, or numbers beyond all measure.
+
+    `spherical`: positions were read as distance and angles, which invites mistakes of their own.
+    """
+    poses = len(np.unique(table.q, axis=0))
+    if table.position is None or poses < FEWEST_POSES or np.abs(table.position).max() > FARTHEST:
+        return None
+    # The nominal arm without effects, its markers at the flange.
+    tool = Tool(cell.tool.load_point, {name: np.zeros(3) for name in table.marker_names})
+    rigid = Model.assembled(chain, replace(cell, tool=tool, model=ModelSpec()))
+    error, far = _errors(rigid, table)
+    if far <= POOR:
+        return NominalFit(error, "")
+    near, best = far, ""
+    # The simplest that mends it, else what does most.
+    for other in _alternatives(rigid, table, spherical):
+        left = _errors(rigid, other.table)[1]
+        if left < near:
+            near, best = left, other.words.format(_mm(left))
+        if near <= POOR:
+            break
+    if near >= far / BETTER:
+        best = (
+            "and neither another unit or scale, signs, couplings, offsets or an exchange of "
+            "columns, one or two of them, nor rows that have shifted mend that: check the robot of "
+            "the cell, offsets of joints, and which joint values belong to which point"
+        )
+    said = f"the readings fit the nominal arm only to {_mm(far)}"
+    mark = "," if best.startswith("and neither") else ";"
+    return NominalFit(error, f"{said}{mark} {best}", near <= min(POOR, far / BETTER))
+
+
+def _mm(metres: float) -> str:
+    return f"{metres * 1e3:.3g} mm"
+
+
+def _some(table: Measurements) -> Measurements:
+    """As many readings as tell it, without load where these are enough."""
+    light = np.flatnonzero(~np.any(table.force != 0, axis=1))
+    rows = light if len(light) >= FEWEST_POSES else np.arange(len(table))
+    if len(rows) > SAMPLE:
+        rows = np.sort(np.random.default_rng(0).choice(rows, SAMPLE, replace=False))
+    return table.take(rows)
+
+
+def _errors(model: Model, table: Measurements) -> tuple[float, float]:
+    """Distance (m) from the nominal arm that half of the readings keep to, and that MOST do."""
+    problem = nominal_problem(model, _some(table))
+    found = register(problem)
+    place = found.places(problem.flange_rotation, problem.flange_position, problem.marker)
+    distance = np.linalg.norm(problem.points - place, axis=1)
+    return found.error, float(np.percentile(distance, MOST))
+
+
+def _alternatives(model: Model, table: Measurements, spherical: bool) -> Iterator[Alternative]:
+    yield from _of_columns(model.chain, _some(table), spherical)
+    yield from _of_rows(model, table)
+
+
+# Joint values as a controller may count them.  Its c become the model's q by signs, offsets, an
+# exchange of columns, and a coupling of neighbouring joints (Fanuc displays joint 3 against the
+# floor), as `[joints]` of a mapping has it:
+#
+#     q = (1 + κ E_{j,j±1}) (D P c + o),  D a matrix of signs, P an exchange of two columns.
+
+MOST_SIGNS = 7  # joints of which every choice of signs is tried; of more, up to two
+TURNS = (90, -90, 180)
+
+
+@dataclass(frozen=True)
+class JointMap:
+    """q = c · matrixᵀ + offset (joints,), of so many `mistakes` in `words`; of two that do the same
+    (half a turn of joint 4 and a sign of joint 5) an offset counts a little more."""
+
+    words: tuple[str, ...]
+    matrix: Array
+    offset: Array | float = 0.0
+    mistakes: float = 1.0
+
+    def of(self, c: Array) -> Array:
+        return c @ self.matrix.T + self.offset
+
+    def after(self, first: JointMap) -> JointMap:
+        """This map of what `first` gives."""
+        return JointMap(
+            first.words + self.words, self.matrix @ first.matrix,
+            self.matrix @ np.broadcast_to(first.offset, len(self.matrix)) + self.offset,
+            first.mistakes + self.mistakes,
+        )  # fmt: skip
+
+
+def joint_maps(chain: Chain) -> list[JointMap]:
+    """Single mistakes, all signs with each coupling, and pairs of the others."""
+    signs, couplings, others = (list(some(chain)) for some in (_signs, _couplings, _others))
+    single = [sign for sign in signs if sign.mistakes == 1]
+    pairs = [
+        *((a, b) for a in signs for b in couplings), *combinations(couplings, 2),
+        *combinations(others, 2), *((a, b) for a in others for b in (*single, *couplings)),
+    ]  # fmt: skip
+    none = JointMap((), np.eye(chain.n_joints), mistakes=0)
+    return [none, *signs, *couplings, *others, *(b.after(a) for a, b in pairs)]
+
+
+def _signs(chain: Chain) -> Iterator[JointMap]:
+    n = chain.n_joints
+    for k in range(1, (n if n <= MOST_SIGNS else 2) + 1):
+        for turned in combinations(range(n), k):
+            D = np.eye(n)
+            D[turned, turned] = -1.0
+            names = f"joint{'s' * (k > 1)} {listed([str(j + 1) for j in turned])}"
+            yield JointMap((f"with the sign of {names} turned round",), D, mistakes=k)
+
+
+def _couplings(chain: Chain) -> Iterator[JointMap]:
+    for j in range(1, chain.n_joints):
+        for factor in (1.0, -1.0) if chain.kinds[j] == chain.kinds[j - 1] else ():
+            C = np.eye(chain.n_joints)
+            C[j, j - 1] = factor
+            words = f"with coupling {{ joint = {j + 1}, of = {j}, factor = {factor:g} }}"
+            yield JointMap((words,), C)
+
+
+def _others(chain: Chain) -> Iterator[JointMap]:
+    eye = np.eye(chain.n_joints)
+    turning = np.array([kind == "revolute" for kind in chain.kinds])
+    for factor, words in ((np.pi / 180, "degrees read as radians"),
+                          (180 / np.pi, "radians read as degrees")):  # fmt: skip
+        yield JointMap((f"if joints were {words}",), np.diag(np.where(turning, factor, 1.0)))
+    for j in np.flatnonzero(turning):
+        for degrees in TURNS:
+            words = f"with offset_deg {degrees} at joint {j + 1}"
+            yield JointMap((words,), eye, np.radians(degrees) * eye[j], 1.1)
+    for a, b in combinations(range(chain.n_joints), 2):
+        order = np.arange(chain.n_joints)
+        order[[a, b]] = b, a
+        yield JointMap((f"with the columns of joints {a + 1} and {b + 1} exchanged",), eye[order])
+
+
+# The linear map of positions onto the arm tells their unit, scale and handedness.
+
+UNITS = ((1e-3, "mm read as m"), (1e3, "m read as mm"), (25.4, "inches read as mm"),
+         (1 / 25.4, "mm read as inches"))  # fmt: skip
+OF_A_UNIT = 0.25  # a unit in the place of another is told from the arm's length to a quarter
+SCALE = "one scale of all lengths, as of a tag, a scale bar or a unit of another size"
+ANOTHER = f"most likely the cell describes another robot, else {SCALE}"
+
+
+def _of_columns(chain: Chain, table: Measurements, spherical: bool) -> Iterator[Alternative]:
+    """Joint values and positions read otherwise; those first of which few have to be undone."""
+    position, maps = np.asarray(table.position), joint_maps(chain)
+    q = np.stack([joint_map.of(table.q) for joint_map in maps])
+    flange = nominal_flanges(chain, q.reshape(-1, q.shape[2])).reshape(*q.shape[:2], 4, 4)
+    points: list[tuple[Array, tuple[str, ...]]] = [(position, ())]
+    if spherical:
+        level = np.hypot(*position[:, :2].T)
+        turned = np.where(level > 0, position[:, 2] / np.where(level > 0, level, 1.0), 0.0)
+        swapped = np.column_stack([position[:, :2] * turned[:, None], level])
+        points += [(swapped, ("with zenith angles read as elevations or the other way round",))]
+    found: list[tuple[float, float, Alternative]] = []
+    for place, of_angles in points:
+        fits = linear_fits(flange, place, table.marker)
+        for k in np.flatnonzero(np.isfinite(fits.left)):
+            undone, more = _of_positions(place, fits, int(k), spherical)
+            words = [*maps[k].words, *of_angles, *more]
+            # To mirror the frame beside turned signs is no simpler than to turn others.
+            count = maps[k].mistakes + len(more) + (0 < len(more) < len(words))
+            if words:
+                told = " and ".join(words).replace("{", "{{").replace("}", "}}")
+                changed = replace(table, q=q[k], position=undone)
+                other = Alternative(f"{told} they would fit to {{}}", changed)
+                found.append((float(fits.left[k]), count, other))
+    found.sort(key=lambda one: one[0])
+    likely = [one for one in found if one[0] <= POOR] or found[:2]
+    likely.sort(key=lambda one: one[1])  # of equally many mistakes the better fit stays first
+    yield from (other for _, _, other in likely[:CONFIRMED])
+
+
+def _of_positions(
+    position: Array, fits: LinearFits, k: int, spherical: bool
+) -> tuple[Array, list[str]]:
+    """The positions as the k-th fit asks for: in which unit, in a right-handed frame."""
+    words, scale = [], float(fits.scale[k])
+    # The base is fitted: every swap of two axes and every turned sign is the same mirror image.
+    if fits.determinant[k] < 0:
+        position = position[:, [1, 0, 2]]
+        words.append(
+            "with azimuths counted the other way (azimuth = … in [[source]])"
+            if spherical
+            else "with two columns of the positions swapped, or the sign of one turned round (now "
+            "they make a left-handed frame),"
+        )
+    unit = next((u for u in UNITS if abs(scale / u[0] - 1) < OF_A_UNIT), None)
+    if unit is not None:
+        return position * unit[0], [f"if positions were {unit[1]}", *words]
+    if abs(scale - 1) > SCALED:
+        cause = ANOTHER if abs(scale - 1) > OF_A_TARGET else SCALE
+        words.append(f"with all positions {scale:.4g} times as far apart ({cause})")
+        return position * scale, words
+    return position, words
+
+
 # Readings that have slipped against the joint values beside them, from some rows on.
 #
 # A reading that is missing lets all later ones close up.  Row r then holds the reading of row
@@ -56,61 +293,43 @@ CHANGE = 1.5  # λ: a block is there from two rows on, and one stray row makes n
 FARTHEST_ROW = 6  # visits that readings are looked for away from their row
 BLOCK, WINDOWS = 8, 16  # visits that place base and markers, and how many such blocks are tried
 PLACED = 6  # of these, tried in earnest
-FITS = 0.8  # share of the rows that must fit, so that it is an explanation
 FEWEST = 4  # visits to a block, on average
 MOST_ROWS = 20_000
-Place = Callable[[Measurements], Registration]
 
 
-@dataclass(frozen=True)
-class Slipped:
-    """Blocks of rows, each by its first row and the shift of its readings in rows and in visits
-    (None where it differs), and the median distance `error` in m of readings from the nominal arm
-    then."""
-
-    starts: tuple[int, ...]
-    rows: tuple[int, ...]
-    visits: tuple[int | None, ...]
-    error: float
-
-
-def slipped(chain: Chain, table: Measurements, place: Place) -> Slipped | None:
-    """Where readings slipped, in the order of the rows; None where no few shifts explain them.
-
-    `place` finds base and markers by a table.
-    """
+def _of_rows(model: Model, table: Measurements) -> Iterator[Alternative]:
+    """Joint values of the rows to which the readings have slipped, where few blocks explain it."""
     visit = np.cumsum(np.r_[0, np.any(np.diff(table.q, axis=0) != 0, axis=1)])
-    visits = int(visit[-1]) + 1
+    visits, rows = int(visit[-1]) + 1, np.arange(len(table))
     if visits < BLOCK or len(table) > MOST_ROWS:
-        return None
+        return
     most = FARTHEST_ROW * max(round(len(table) / visits), 1)
-    shifts = np.arange(-most, most + 1)
-    flange, rows = nominal_flanges(chain, table.q), np.arange(len(table))
-    for block, s in _blocks(table, flange, visit, shifts):
-        found = place(_moved(table, block, s))
-        if found.error <= NEAR / 2:
-            break
-    else:
-        return None
-    path = np.zeros(0, dtype=np.int64)
+    shifts, flange = np.arange(-most, most + 1), nominal_flanges(model.chain, table.q)
+    placed = (_placed_by(model, table, block, s) for block, s in
+              _blocks(table, flange, visit, shifts))  # fmt: skip
+    found = next((one for one in placed if one.error <= NEAR / 2), None)
+    if found is None:
+        return
     for _ in range(3):
         distance = _distances(found, table, flange, shifts)
         path = _path(distance / np.clip(6 * found.error, NEAREST, NEAR))
         moved = shifts[path]
-        inside = (rows + moved >= 0) & (rows + moved < len(rows))
-        found = place(_moved(table, rows[inside], moved[inside]))
-    own, moved = distance[rows, path], shifts[path]
+        inside = np.flatnonzero((rows + moved >= 0) & (rows + moved < len(rows)))
+        found = _placed_by(model, table, inside, moved[inside])
     starts = np.flatnonzero(np.r_[True, np.diff(moved) != 0])
-    good = own <= NEAR
-    if good.mean() < FITS or len(starts) * FEWEST > visits or not moved.any():
-        return None
+    if len(starts) * FEWEST > visits or not moved.any():
+        return
+    good = distance[rows, path] <= NEAR
     later = visit[np.clip(rows + moved, 0, len(rows) - 1)] - visit
-    blocks = np.split(rows, starts[1:])
-    by_visits = [np.unique(later[b[good[b]]]) for b in blocks]
-    return Slipped(
-        tuple(starts.tolist()), tuple(moved[starts].tolist()),
-        tuple(int(v[0]) if len(v) == 1 else None for v in by_visits), float(np.median(own)),
-    )  # fmt: skip
+    blocks = [(b, np.unique(later[b[good[b]]])) for b in np.split(rows, starts[1:])]
+    words = _slipped_words(table, moved, blocks)
+    yield Alternative(words, _moved(table, inside, moved[inside]))
+
+
+def _placed_by(
+    model: Model, table: Measurements, rows: IntArray, shift: IntArray | int
+) -> Registration:
+    return register(nominal_problem(model, _moved(table, rows, shift)))
 
 
 def _moved(table: Measurements, rows: IntArray, shift: IntArray | int) -> Measurements:
@@ -141,14 +360,10 @@ def _distances(found: Registration, table: Measurements, flange: Array, shifts: 
     """Distance (n, shifts) in m of every reading from the nominal place of the row that many
     further on; infinite beyond the table."""
     place = found.places(flange[:, :3, :3], flange[:, :3, 3], table.marker)
-    n, points = len(table), np.asarray(table.position)
-    distance = np.full((n, len(shifts)), np.inf)
-    for k, s in enumerate(shifts):
-        low, high = max(0, -s), min(n, n - s)
-        if low < high:
-            off = points[low:high] - place[low + s : high + s]
-            distance[low:high, k] = np.linalg.norm(off, axis=1)
-    return distance
+    to = np.arange(len(table))[:, None] + shifts
+    off = np.asarray(table.position)[:, None] - place[np.clip(to, 0, len(table) - 1)]
+    inside = (to >= 0) & (to < len(table))
+    return np.where(inside, np.linalg.norm(off, axis=2), np.inf)
 
 
 def _path(cost: Array) -> IntArray:
@@ -168,270 +383,39 @@ def _path(cost: Array) -> IntArray:
     return path
 
 
-# Joint values as a controller may count them.  Its c become the model's q by signs, offsets, an
-# exchange of columns, and a coupling of neighbouring joints (Fanuc displays joint 3 against the
-# floor), as `[joints]` of a mapping has it:
-#
-#     q = (1 + κ E_{j,j±1}) (D P c + o),  D a matrix of signs, P an exchange of two columns.
-
-MOST_SIGNS = 7  # joints of which every choice of signs is tried; of more, up to two
-TURNS = (90, -90, 180)
-
-
-@dataclass(frozen=True)
-class JointMap:
-    """q = c · matrixᵀ + offset (joints,), of so many `mistakes` in `words`; of two that do the same
-    (half a turn of joint 4 and a sign of joint 5) an offset counts a little more."""
-
-    matrix: Array
-    offset: Array
-    words: tuple[str, ...]
-    mistakes: float
-
-    def of(self, c: Array) -> Array:
-        return c @ self.matrix.T + self.offset
-
-    def after(self, first: JointMap) -> JointMap:
-        """This map of what `first` gives."""
-        return JointMap(
-            self.matrix @ first.matrix, self.matrix @ first.offset + self.offset,
-            first.words + self.words, first.mistakes + self.mistakes,
-        )  # fmt: skip
-
-
-def joint_maps(chain: Chain) -> list[JointMap]:
-    """Single mistakes, all signs with each coupling, and pairs of the others."""
-    n = chain.n_joints
-    none = JointMap(np.eye(n), np.zeros(n), (), 0)
-    signs, couplings, others = list(_signs(n)), list(_couplings(chain)), list(_others(chain))
-    found = [none, *signs, *couplings, *others]
-    found += [coupling.after(sign) for sign in signs for coupling in couplings]
-    found += [b.after(a) for a, b in combinations(couplings, 2)]
-    found += [b.after(a) for a, b in combinations(others, 2)]
-    single = [sign for sign in signs if sign.mistakes == 1]
-    found += [b.after(a) for a in others for b in (*single, *couplings)]
-    return found
-
-
-def _signs(n: int) -> Iterator[JointMap]:
-    for k in range(1, (n if n <= MOST_SIGNS else 2) + 1):
-        for turned in combinations(range(n), k):
-            D = np.eye(n)
-            D[turned, turned] = -1.0
-            names = listed([str(j + 1) for j in turned])
-            joints = "joint" if k == 1 else "joints"
-            words = f"with the sign of {joints} {names} turned round"
-            yield JointMap(D, np.zeros(n), (words,), k)
-
-
-def _couplings(chain: Chain) -> Iterator[JointMap]:
-    n = chain.n_joints
-    for j in range(1, n):
-        for factor in (1.0, -1.0) if chain.kinds[j] == chain.kinds[j - 1] else ():
-            C = np.eye(n)
-            C[j, j - 1] = factor
-            words = f"with coupling {{ joint = {j + 1}, of = {j}, factor = {factor:g} }}"
-            yield JointMap(C, np.zeros(n), (words,), 1)
-
-
-def _others(chain: Chain) -> Iterator[JointMap]:
-    n = chain.n_joints
-    turning = np.array([kind == "revolute" for kind in chain.kinds])
-    for factor, words in ((np.pi / 180, "degrees read as radians"),
-                          (180 / np.pi, "radians read as degrees")):  # fmt: skip
-        unit = np.diag(np.where(turning, factor, 1.0))
-        yield JointMap(unit, np.zeros(n), (f"if joints were {words}",), 1)
-    for j in np.flatnonzero(turning):
-        for degrees in TURNS:
-            offset = np.radians(degrees) * (np.arange(n) == j)
-            yield JointMap(np.eye(n), offset, (f"with offset_deg {degrees} at joint {j + 1}",), 1.1)
-    for first, second in combinations(range(n), 2):
-        order = np.arange(n)
-        order[[first, second]] = second, first
-        words = f"with the columns of joints {first + 1} and {second + 1} exchanged"
-        yield JointMap(np.eye(n)[order], np.zeros(n), (words,), 1)
-
-
-# Which of these, and which units, would make the readings fit the nominal arm.
-
-FEWEST_POSES = 8  # base (6) and a marker (3) from fewer fit anything
-POOR = 0.03  # m: no nominal arm is this wrong, wrong signs and units are far more
-MOST = 80  # % of the readings, which what they fit to is told of
-BETTER = 5.0  # a correction must reduce the error by this factor to be named
-FARTHEST = 1e5  # m; beyond it no fit is worth its overflows, and plausibility speaks
-SAMPLE = 80
-CONFIRMED = 6  # corrections that are tried in earnest
-UNITS = ((1e-3, "mm read as m"), (1e3, "m read as mm"), (25.4, "inches read as mm"),
-         (1 / 25.4, "mm read as inches"))  # fmt: skip
-OF_A_UNIT = 0.25  # a unit in the place of another is told from the arm's length to a quarter
-
-
-@dataclass(frozen=True)
-class NominalFit:
-    """Median distance `error` (m) of the readings from the nominal arm with base and markers
-    fitted; `warning` names what would make them fit, "" where they do; `mended`: a mistake undone
-    makes them."""
-
-    error: float
-    warning: str
-    mended: bool = False
-
-
-def nominal_fit(
-    chain: Chain, cell: Cell, table: Measurements, spherical: bool = False
-) -> NominalFit | None:
-    """How well readings fit the nominal arm, and which mistake undone would mend it; None where
-    they hold no positions, too few poses, or numbers beyond all measure.
-
-    `spherical`: positions were read as distance and angles, which invites mistakes of their own.
-    """
-    poses = len(np.unique(table.q, axis=0))
-    if table.position is None or poses < FEWEST_POSES or np.abs(table.position).max() > FARTHEST:
-        return None
-    # The nominal arm without effects, its markers at the flange.
-    tool = Tool(cell.tool.load_point, {name: np.zeros(3) for name in table.marker_names})
-    rigid = Model.assembled(chain, replace(cell, tool=tool, model=ModelSpec()))
-    light = np.flatnonzero(~np.any(table.force != 0, axis=1))
-    rows = light if len(light) >= FEWEST_POSES else np.arange(len(table))
-    if len(rows) > SAMPLE:
-        rows = np.sort(np.random.default_rng(0).choice(rows, SAMPLE, replace=False))
-    used = table.take(rows)
-    error, far = _errors(rigid, used)
-    if far <= POOR:
-        return NominalFit(error, "")
-    said = f"the readings fit the nominal arm only to {far * 1e3:.3g} mm"
-    tried = [(_errors(rigid, changed)[1], words)
-             for words, changed in _corrections(chain, used, spherical)]  # fmt: skip
-    # The simplest that mends it, else what does most.
-    best, words = next((t for t in tried if t[0] <= POOR), min(tried, default=(far, "")))
-    if best < far / BETTER:
-        return NominalFit(error, f"{said}; {words} they would fit to {best * 1e3:.3g} mm",
-                          best <= POOR)  # fmt: skip
-    found = slipped(chain, table, lambda some: register(nominal_problem(rigid, some)))
-    if found is not None:
-        return NominalFit(error, f"{said}; {_slipped_words(table, found)}", True)
-    return NominalFit(
-        error,
-        f"{said}, and neither another unit or scale, signs, couplings, offsets or an exchange of "
-        "columns, one or two of them, nor rows that have shifted mend that: check the robot of the "
-        "cell, offsets of joints, and which joint values belong to which point",
-    )
-
-
-def _errors(model: Model, table: Measurements) -> tuple[float, float]:
-    """Distance (m) from the nominal arm that half of the readings keep to, and that MOST do."""
-    problem = nominal_problem(model, table)
-    found = register(problem)
-    place = found.places(problem.flange_rotation, problem.flange_position, table.marker)
-    distance = np.linalg.norm(problem.points - place, axis=1)
-    return found.error, float(np.percentile(distance, MOST))
-
-
-def _placed(model: Model, table: Measurements) -> bool:
-    """Whether positions, if there are any, agree with the nominal arm at first sight."""
-    if table.position is None or np.abs(table.position).max() > FARTHEST:
-        return True
-    some = table.take(np.arange(min(len(table), SAMPLE)))
-    flange = model.rigid.flange_poses(some)
-    found = linear_fits(flange[None], np.asarray(some.position), some.marker)
-    rigid = found.determinant[0] > 0 and abs(found.scale[0] - 1) < OF_A_UNIT
-    return bool(rigid and found.left[0] <= POOR)
-
-
-def _corrections(
-    chain: Chain, table: Measurements, spherical: bool
-) -> Iterator[tuple[str, Measurements]]:
-    """Mistakes that are often made, each undone; first those of which few have to be undone."""
-    position = np.asarray(table.position)
-    maps = joint_maps(chain)
-    q = np.stack([joint_map.of(table.q) for joint_map in maps])
-    flange = nominal_flanges(chain, q.reshape(-1, q.shape[2])).reshape(*q.shape[:2], 4, 4)
-    found: list[tuple[float, float, str, Measurements]] = []
-    points = [(position, "")]
-    if spherical:
-        level = np.hypot(*position[:, :2].T)
-        turned = np.where(level > 0, position[:, 2] / np.where(level > 0, level, 1.0), 0.0)
-        swapped = np.column_stack([position[:, :2] * turned[:, None], level])
-        points += [(swapped, "with zenith angles read as elevations or the other way round")]
-    for place, of_angles in points:
-        fits = linear_fits(flange, place, table.marker)
-        for k in np.flatnonzero(np.isfinite(fits.left)):
-            words = [*maps[k].words, *([of_angles] if of_angles else [])]
-            undone, more = _of_positions(place, fits, int(k), spherical)
-            # To mirror the frame beside turned signs is no simpler than to turn others.
-            count = maps[k].mistakes + (len(words) > 0 and len(more) > 0) + len(more)
-            words += more
-            if words:
-                changed = replace(table, q=q[k], position=undone)
-                found.append((float(fits.left[k]), count, " and ".join(words), changed))
-    found.sort(key=lambda one: one[0])
-    likely = [one for one in found if one[0] <= POOR] or found[:2]
-    likely.sort(key=lambda one: one[1])  # of equally many mistakes the better fit stays first
-    yield from ((words, changed) for _, _, words, changed in likely[:CONFIRMED])
-
-
-def _of_positions(
-    position: Array, fits: LinearFits, k: int, spherical: bool
-) -> tuple[Array, list[str]]:
-    """The positions as the k-th fit asks for: in which unit, in a right-handed frame."""
-    words, scale = [], float(fits.scale[k])
-    # The base is fitted: every swap of two axes and every turned sign is the same mirror image.
-    if fits.determinant[k] < 0:
-        position = position[:, [1, 0, 2]]
-        words.append(
-            "with azimuths counted the other way (azimuth = … in [[source]])"
-            if spherical
-            else "with two columns of the positions swapped, or the sign of one turned round (now "
-            "they make a left-handed frame),"
-        )
-    unit = next((u for u in UNITS if abs(scale / u[0] - 1) < OF_A_UNIT), None)
-    if unit is not None:
-        return position * unit[0], [f"if positions were {unit[1]}", *words]
-    if abs(scale - 1) > SCALED:
-        cause = ANOTHER if abs(scale - 1) > OF_A_TARGET else SCALE
-        words.append(f"with all positions {scale:.4g} times as far apart ({cause})")
-        return position * scale, words
-    return position, words
-
-
-SCALE = "one scale of all lengths, as of a tag, a scale bar or a unit of another size"
-ANOTHER = f"most likely the cell describes another robot, else {SCALE}"
-
-
-def _slipped_words(table: Measurements, found: Slipped) -> str:
+def _slipped_words(
+    table: Measurements, moved: IntArray, blocks: list[tuple[IntArray, IntArray]]
+) -> str:
     """ "configurations 1 to 20 fit the nominal arm to 1 mm; from 21 on the points belong to joint
-    values one later, from 27 two later" """
-    by_rows = None in found.visits
-    labels = [
-        f"line {table.row[i]}" if by_rows else table.configuration_labels[table.configuration[i]]
-        for i in found.starts
-    ]
+    values one later, from 27 two later", of blocks of rows with the visits that they are off by."""
+    by_rows = any(len(visits) != 1 for _, visits in blocks)
+
+    def label(row: int) -> str:
+        return str(
+            table.row[row] if by_rows else table.configuration_labels[table.configuration[row]]
+        )
+
     fits: list[str] = []
-    moved: list[str] = []
-    for k, (label, rows, visits) in enumerate(zip(labels, found.rows, found.visits, strict=True)):
-        shift = rows if by_rows or visits is None else visits
+    later: list[str] = []
+    for rows, visits in blocks:
+        shift = int(moved[rows[0]] if by_rows else visits[0])
         size = {1: "one", 2: "two"}.get(abs(shift), str(abs(shift)))
-        size += "" if not by_rows else " row" if abs(shift) == 1 else " rows"
+        unit = "row" if by_rows else "pose"
+        unit = f" {unit}{'s' * (abs(shift) > 1)}"
         side = "later" if shift > 0 else "earlier"
+        if len(blocks) == 1:
+            return f"with the joint values of {size}{unit} {side} they would fit to {{}}"
+        first, last = label(int(rows[0])), label(int(rows[-1]))
         if shift:
-            on = "" if moved else " on the points belong to joint values"
-            moved.append(f"from {label}{on} {size} {side}")
-        elif k + 1 < len(labels):
-            last = found.starts[k + 1] - 1
-            end = table.configuration_labels[table.configuration[last]]
-            fits.append(f"{label} to {table.row[last] if by_rows else end}")
+            on = "" if later else " on the points belong to joint values"
+            size += unit * by_rows
+            later.append(f"from {'line ' * by_rows}{first}{on} {size} {side}")
         else:
-            fits.append(f"{label} and later")
-    if len(labels) == 1:
-        poses = "" if by_rows else " poses" if abs(shift) > 1 else " pose"
-        return f"with the joint values of {size}{poses} {side} they would fit to {_mm(found)}"
+            end = "and later" if rows[-1] == len(table) - 1 else f"to {last}"
+            fits.append(f"{'line ' * by_rows}{first} {end}")
     what = "" if by_rows else "configurations "
-    own = f"{what}{listed(fits)} fit the nominal arm to {_mm(found)}; " if fits else ""
-    return f"{own}{listed(moved)}"
-
-
-def _mm(found: Slipped) -> str:
-    return f"{found.error * 1e3:.3g} mm"
+    own = f"{what}{listed(fits)} fit the nominal arm to {{}}; " if fits else ""
+    return f"{own}{listed(later)}"
 
 
 # Loads in another unit.
@@ -489,6 +473,17 @@ def _usual_over_stated_mass(chain: Chain) -> float:
 # thousandth of it, those of hobbyists by a hundredth; wrong columns by a third.
 POOREST, FEW = 0.05, 0.2
 LARGEST = 10.0  # a fitted length, over that of the arm and the distance of the readings
+
+
+def _placed(model: Model, table: Measurements) -> bool:
+    """Whether positions, if there are any, agree with the nominal arm at first sight."""
+    if table.position is None or np.abs(table.position).max() > FARTHEST:
+        return True
+    some = table.take(np.arange(min(len(table), SAMPLE)))
+    flange = model.rigid.flange_poses(some)
+    found = linear_fits(flange[None], np.asarray(some.position), some.marker)
+    rigid = found.determinant[0] > 0 and abs(found.scale[0] - 1) < OF_A_UNIT
+    return bool(rigid and found.left[0] <= POOR)
 
 
 def refuse_nonsense(
