@@ -51,15 +51,6 @@ def check_regular(path: str | Path, what: str) -> int:
         return found.st_size
 
 
-@contextmanager
-def open_input(path: str | Path, what: str, max_bytes: int | None = None) -> Iterator[BinaryIO]:
-    """An existing regular file of at most `max_bytes`, opened for binary reading."""
-    _check_place(path, what)
-    check_size(path, what, check_regular(path, what), max_bytes)
-    with _read_errors(path, what), open(path, "rb") as handle:
-        yield handle
-
-
 # What is read by place → endings that tell of a file in another's place.
 OTHERS = {
     "cell file": (".csv", ".tsv", ".parquet", ".pq", ".json"),
@@ -68,14 +59,18 @@ OTHERS = {
 }
 
 
-def _check_place(path: str | Path, what: str) -> None:
-    """Raise InputError where the ending tells that arguments stand in each other's place."""
+@contextmanager
+def open_input(path: str | Path, what: str, max_bytes: int | None = None) -> Iterator[BinaryIO]:
+    """An existing regular file of at most `max_bytes`, opened for binary reading."""
     ending = Path(path).suffix.lower()
-    if ending in OTHERS.get(what, ()):
+    if ending in OTHERS.get(what, ()):  # arguments stand in each other's place
         raise InputError(
             f"{path}: ends in {ending}, where the {what} is to stand; the cell file (.toml) comes "
             "first, tables and results after it"
         )
+    check_size(path, what, check_regular(path, what), max_bytes)
+    with _read_errors(path, what), open(path, "rb") as handle:
+        yield handle
 
 
 def check_ending(path: Path, endings: Collection[str]) -> None:

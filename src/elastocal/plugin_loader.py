@@ -111,15 +111,15 @@ def load_installed() -> None:
     for point in entry_points(group=GROUP):
         if point.value not in _installed:
             source = f" of the package {point.dist.name}" if point.dist else ""
-            _run(f"plug-in '{point.name}'{source}", None, partial(_enter, point))
+
+            def enter(point: EntryPoint = point) -> None:
+                """A module registers when it is imported, a function when it is called."""
+                found = point.load()
+                if not isinstance(found, ModuleType):
+                    found()
+
+            _run(f"plug-in '{point.name}'{source}", None, enter)
             _installed.append(point.value)
-
-
-def _enter(point: EntryPoint) -> None:
-    """A module registers when it is imported, a function when it is called."""
-    found = point.load()
-    if not isinstance(found, ModuleType):
-        found()
 
 
 def _import(name: str) -> None:
@@ -144,6 +144,11 @@ def _import(name: str) -> None:
 def _run_file(path: Path, where: str) -> None:
     import zlib
 
+    try:
+        from cloudpickle import register_pickle_by_value
+    except ImportError:  # joblib before 1.6 carries its own
+        from joblib.externals.cloudpickle import register_pickle_by_value
+
     path = path.resolve()
     version = _version(path)
     if _files.get(path) == version:
@@ -163,7 +168,9 @@ def _run_file(path: Path, where: str) -> None:
     except InputError:
         del sys.modules[module.__name__]
         raise
-    _send_by_value(module)
+    register_pickle_by_value(
+        module
+    )  # worker processes, which have not run it, are sent its classes
     _files[path] = version
 
 
@@ -193,15 +200,6 @@ def _told(error: BaseException, path: Path | None) -> str:
         own = own or [f for f in frames if not f.filename.startswith((OURS, "<frozen"))] or frames
         file, line, text = own[-1].filename, own[-1].lineno, str(error)
     return f"{file}, line {line}: {type(error).__name__}: {text}; correct the plug-in"
-
-
-def _send_by_value(module: ModuleType) -> None:
-    """Worker processes, which have not run the file, are sent its classes themselves."""
-    try:
-        from cloudpickle import register_pickle_by_value
-    except ImportError:  # joblib before 1.6 carries its own
-        from joblib.externals.cloudpickle import register_pickle_by_value
-    register_pickle_by_value(module)
 
 
 # What may be registered, whatever it is.

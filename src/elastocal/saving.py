@@ -28,9 +28,7 @@ if TYPE_CHECKING:
 
     from elastocal.cell.work_cell import Cell
     from elastocal.compensation.compensate import Compensation
-    from elastocal.diagnosis.changes import Comparison
     from elastocal.diagnosis.diagnosis import Diagnosis
-    from elastocal.diagnosis.next_poses import NextPoses
     from elastocal.export.export import Wish
     from elastocal.identification.result import Calibration
     from elastocal.model.calibrated import CalibratedArm
@@ -65,9 +63,9 @@ def write_json(path: Path, content: Any) -> None:
     atomic_write_text(path, json_text(content) + "\n")
 
 
-def save_calibration(fit: Calibration, path: Path) -> None:
-    """The result as JSON (schema elastocal/identification/1)."""
-    write_json(path, fit.to_json())
+def save_published(result: Any, path: Path) -> None:
+    """What the result publishes of itself, as JSON."""
+    write_json(path, result.to_json())
 
 
 def save_residuals(fit: Calibration, path: Path) -> None:
@@ -232,26 +230,16 @@ def save_extra_poses(path: str | Path, plan: Measurements, kinds: Sequence[str])
     write_plan(path, table, {"level": ["1"] * len(plan), "order": list(order)})
 
 
-def save_next(found: NextPoses, path: Path) -> None:
-    """The poses to measure next as a plan; nothing where none are to be."""
-    if found.plan is not None:
-        save_plan(found.plan, path)
-
-
-def save_comparison(found: Comparison, path: Path) -> None:
-    write_json(path, found.to_json())
-
-
 ANY = "any ending"  # of an arm the formats know theirs
 WRITERS: dict[str, dict[str, Callable[..., Any]]] = {
-    "Comparison": {".json": save_comparison},
-    "Calibration": {".json": save_calibration, ".csv": save_residuals},
+    "Comparison": {".json": save_published},
+    "Calibration": {".json": save_published, ".csv": save_residuals},
     "Plan": {".csv": save_plan},
     "Diagnosis": {".json": save_diagnosis, ".toml": save_found_cell},
     "Compensation": {".csv": save_compensation},
     "CalibratedArm": {ANY: save_arm},
     "Measurements": dict.fromkeys((".csv", *PARQUET), write_measurements),
-    "NextPoses": {".csv": save_next},
+    "NextPoses": {".csv": lambda found, path: save_plan(found.plan, path) if found.plan else None},
 }
 
 

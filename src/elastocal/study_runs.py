@@ -51,7 +51,9 @@ class StudyStop:
 
     def __init__(self, grace: float = GRACE, tell: Callable[[str], None] | None = None) -> None:
         self.asked = self._now = False
-        self._grace, self._tell = grace, tell or _write
+        # In a signal handler the buffer of sys.stderr may be in use by what was interrupted.
+        self._tell = tell or (lambda text: os.write(2, f"\nelastocal: {text}\n".encode()) and None)
+        self._grace = grace
         self._before: dict[int, Any] = {}
 
     def check(self) -> None:
@@ -81,11 +83,6 @@ class StudyStop:
             f"stopping: the running tasks have {self._grace:.0f} s to end (Ctrl-C again: at once)"
         )
         signal.setitimer(signal.ITIMER_REAL, self._grace)
-
-
-def _write(message: str) -> None:
-    # In a signal handler: the buffer of sys.stderr may be in use by what was interrupted.
-    os.write(2, f"\nelastocal: {message}\n".encode())
 
 
 class Processes:

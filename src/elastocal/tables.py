@@ -329,7 +329,15 @@ def layout_of_columns(
     needs"); `exclusive`: pairs of families that say the same.
     """
     for name, found in present.items():
-        _check_complete(source, known[name], found, alone=(name,) in needed)
+        family, unit = known[name], next(iter(found.values())).unit
+        absent = [column(s, unit if unit in family.units[s] else family.units[s][0])
+                  for s in family.required if s not in found]  # fmt: skip
+        if absent:
+            raise InputError(
+                f"{source}: {listed(c.header for c in found.values())} without {listed(absent)}; "
+                f"the table needs all columns of the {family.meaning}"
+                f"{'' if (name,) in needed else ', or none'}"
+            )
     for one, other in exclusive:
         if one in present and other in present:
             pair = [next(iter(present[name].values())).header for name in (one, other)]
@@ -414,18 +422,6 @@ def _meant(name: str) -> str:
         if found := re.fullmatch(pattern, name.lower()):
             return found.expand(stem)
     return ""
-
-
-def _check_complete(source: str, family: Family, found: Mapping[str, Column], alone: bool) -> None:
-    missing = [stem for stem in family.required if stem not in found]
-    if missing:
-        unit = next(iter(found.values())).unit
-        absent = [column(s, unit if unit in family.units[s] else family.units[s][0])
-                  for s in missing]  # fmt: skip
-        raise InputError(
-            f"{source}: {listed(c.header for c in found.values())} without {listed(absent)}; "
-            f"the table needs all columns of the {family.meaning}{'' if alone else ', or none'}"
-        )
 
 
 # What a table holds
@@ -535,7 +531,9 @@ def read_table(
         table = _read(source, "line", lines.header, lines.rows(), choose, lines.delimiter != ",")
     elif Path(path).suffix.lower() in PARQUET:
         frame = _parquet(source, what)
-        table = _read(source, "row", list(frame.columns), _rows_of(frame), choose, False)
+        cells = frame.astype(object).where(frame.notna(), "")
+        texts = (list(map(str, row)) for row in cells.itertuples(index=False, name=None))
+        table = _read(source, "row", list(frame.columns), enumerate(texts, start=1), choose, False)
     else:
         with open_input(path, what, most) as handle:
             lines = CsvLines(source, handle, what, comments)
@@ -612,13 +610,6 @@ def _parquet(source: str, what: str) -> pd.DataFrame:
     if not len(frame):
         raise InputError(f"{source}: has columns but no rows; add measurements")
     return frame
-
-
-def _rows_of(frame: pd.DataFrame) -> Iterator[Row]:
-    """Rows from 1 of a data frame as texts, with all digits of its numbers."""
-    cells = frame.astype(object).where(frame.notna(), "")
-    for i, row in enumerate(cells.itertuples(index=False, name=None), start=1):
-        yield i, [str(cell) for cell in row]
 
 
 def _check_unpacked(source: str, what: str) -> None:

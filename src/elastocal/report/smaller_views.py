@@ -27,6 +27,8 @@ from elastocal.report.formatting import (
     length,
     load_text,
     loads_text,
+    p_value,
+    size_of,
     title_of,
 )
 from elastocal.text import listed, printable
@@ -35,13 +37,19 @@ if TYPE_CHECKING:
     from elastocal.compensation.compensate import Compensation
     from elastocal.diagnosis.changes import Comparison
     from elastocal.export.export import Exported
-    from elastocal.export.refit import Refit
     from elastocal.importing.assemble import Imported
     from elastocal.measurements import Measurements
 
 NAMED = 3  # parameters in a headline
 MOST_DRAWN = 20  # parameters
 MOST_ROWS = 40  # drawn, and shown of tables
+OF_LOADS = {
+    "": "as no load is stated",
+    "the option": "as asked for",
+    "the earlier campaign": "those of the earlier session",
+    "the later campaign": "those of the later session",
+    "the cell's plan": "those of the cell's plan",
+}
 
 
 def changes_report(c: Comparison) -> Report:
@@ -51,8 +59,6 @@ def changes_report(c: Comparison) -> Report:
 
 
 def _changes(c: Comparison) -> Iterator[Block]:
-    from elastocal.report.formatting import size_of
-
     rms, noise = (length(float(np.sqrt(np.mean(v**2)))) for v in (c.distance, c.chance))
     most = length(float(c.distance.max()))
     figures = [
@@ -61,7 +67,27 @@ def _changes(c: Comparison) -> Iterator[Block]:
     ]  # fmt: skip
     yield Fold("", lambda: [KeyFigures(figures)])
     same = c.verdict == "no_change_shown" and not c.one_result
-    yield ShownVerdict("good" if same else "warn", _changed(c))
+    names = ", ".join(printable(change.name) for change in c.changed[:NAMED])
+    names += f" and {len(c.changed) - NAMED} more" if len(c.changed) > NAMED else ""
+    verdict = f"The arm has changed: {names}."
+    steps = [
+        "Use the new calibration (elastocal compensate, elastocal export).",
+        "Look for the cause at the joints and links named. A missing effect can look like a change "
+        "if poses or loads differ (elastocal diagnose with the new data).",
+    ]
+    if c.one_result:
+        verdict = (
+            f"Nothing is compared: {printable(c.old.source)} and {printable(c.new.source)} are the "
+            "same result, equal to the last digit."
+        )
+        steps = ["Give the results of two sessions: this is one of them and its copy."]
+    elif same:
+        steps = ["Nothing: the old calibration still holds within the noise of both sessions."]
+    if not c.changed and not c.one_result:
+        verdict = "The arm has changed, but no single parameter is significant."
+        if c.verdict == "no_change_shown":
+            verdict = "No significant change: the differences are within the noise."
+    yield ShownVerdict("good" if same else "warn", verdict)
     moved = (
         f"Moved by {rms} rms for the same commands, {most} at most, at {len(c.distance)} random "
         f"poses within the joint limits under {loads_text(c.forces, '{}', '{} loads in turn')}, "
@@ -80,15 +106,6 @@ def _changes(c: Comparison) -> Iterator[Block]:
             "The sessions determined other parameters; the new ones are given in those of the old, "
             "to first order."
         )
-    steps = [
-        "Use the new calibration (elastocal compensate, elastocal export).",
-        "Look for the cause at the joints and links named. A missing effect can look like a change "
-        "if poses or loads differ (elastocal diagnose with the new data).",
-    ]
-    if c.one_result:
-        steps = ["Give the results of two sessions: this is one of them and its copy."]
-    elif same:
-        steps = ["Nothing: the old calibration still holds within the noise of both sessions."]
     yield Lines([
         ("Tool", moved), ("Chance", chance), *(("Compared", text) for text in compared),
         *(("Next", step) for step in steps),
@@ -97,44 +114,17 @@ def _changes(c: Comparison) -> Iterator[Block]:
     yield _change_table(c)
 
 
-def _changed(c: Comparison) -> str:
-    if c.one_result:
-        return (
-            f"Nothing is compared: {printable(c.old.source)} and {printable(c.new.source)} are the "
-            "same result, equal to the last digit."
-        )
-    if c.changed:
-        names = ", ".join(printable(change.name) for change in c.changed[:NAMED])
-        more = f" and {len(c.changed) - NAMED} more" if len(c.changed) > NAMED else ""
-        return f"The arm has changed: {names}{more}."
-    if c.verdict == "no_change_shown":
-        return "No significant change: the differences are within the noise."
-    return "The arm has changed, but no single parameter is significant."
-
-
-OF_LOADS = {
-    "": "as no load is stated",
-    "the option": "as asked for",
-    "the earlier campaign": "those of the earlier session",
-    "the later campaign": "those of the later session",
-    "the cell's plan": "those of the cell's plan",
-}
-
-
 def _change_table(c: Comparison) -> ShownTable:
     """A row for each parameter, the changed first, then by their effect at the tool."""
-    from elastocal.report.formatting import p_value
-
     heads = ("parameter", "old", "new", "change", "± std", "unit", "p (Holm)", "moves the tool", "")
     rows = []
     for one in sorted(c.changes, key=lambda x: (not x.changed, -x.moves)):
         value, half, unit = estimate(one.change, one.std, one.unit)
         old, new = (estimate(v, one.std, one.unit)[0] for v in (one.old, one.new))
-        told = "changed" if one.changed else ""
         with_others = f" (with {listed(one.combined_with, 3)})" if one.combined_with else ""
         rows.append(
             (printable(one.name + with_others), old, new, value, half, unit, p_value(one.p_family),
-             length(one.moves), told)
+             length(one.moves), "changed" * one.changed)
         )  # fmt: skip
     note = (
         "± std: standard deviation of the difference, of both sessions together. p (Holm): chance "
@@ -142,8 +132,7 @@ def _change_table(c: Comparison) -> ShownTable:
         "tool: rms over the poses, by this change alone."
     )
     table = ShownTable(heads, rows, (0, 5, 8), title="Parameter by parameter", note=note)
-    narrower = table.without(1, 2).when_narrow(2, 4)
-    return replace(table, narrow=narrower)
+    return replace(table, narrow=table.without(1, 2).when_narrow(2, 4))
 
 
 def _moves(c: Comparison) -> Figure:
@@ -162,12 +151,32 @@ def _moves(c: Comparison) -> Figure:
 
 
 def compensation_report(c: Compensation) -> Report:
-    from elastocal.compensation.compensate import summary
+    from elastocal.compensation.compensate import in_file_units, joint_columns, summary
+    from elastocal.report.figures import NO_ENDS, rows_of_dots
 
-    told = compensation_blocks({"commands": summary(c, c.chain.kinds, commands=False)})
-    errors = Fold("", lambda: [_errors(c)], figures=("errors",))
-    commands = Fold("Commands", lambda: [_commands(c)])
-    return Report("Compensation", printable(c.chain.name), [*told, errors, commands])
+    table, kinds = c.targets.table, c.chain.kinds
+    names = [table.configuration_labels[k] for k in table.configuration]
+    axis = "error at the nominal command"
+    dots = [
+        (names[i], float(c.before[i]) * 1e6, NO_ENDS, "")
+        for i in np.flatnonzero(c.reached)[:MOST_ROWS]
+    ]
+    q, std, rows = in_file_units(c.q, kinds), c.uncertainty.std * 1e6, []
+    for i, status in enumerate(c.status[:MOST_ROWS]):
+        numbers = [f"{v:.4f}" if np.isfinite(v) else "–" for v in q[i]]
+        sure = f"{std[i]:.2f}" if np.isfinite(std[i]) else "–"
+        rows.append((printable(names[i]), *numbers, sure, printable(status)))
+    heads = ("configuration", *joint_columns(kinds), "std_um", "status")
+    more = len(c.status) - len(rows)
+    note = f"and {more} more in the file of commands" if more else ""
+    commands = ShownTable(heads, rows, (0, len(heads) - 1), note=note)
+    told = compensation_blocks({"commands": summary(c, kinds, commands=False)})
+    errors = Fold(
+        "", lambda: [rows_of_dots("errors", f"Targets: {axis}", dots, axis, lengths=True)],
+        figures=("errors",),
+    )  # fmt: skip
+    blocks = [*told, errors, Fold("Commands", lambda: [commands])]
+    return Report("Compensation", printable(c.chain.name), blocks)
 
 
 def compensation_blocks(content: dict[str, Any]) -> Iterator[Block]:
@@ -215,39 +224,13 @@ def _spreads(title: str, rows: dict[str, dict[str, Any]]) -> ShownTable:
     return ShownTable(("", "rms", "95 %", "max"), cells, title=title)
 
 
-def _commands(c: Compensation) -> ShownTable:
-    from elastocal.compensation.compensate import in_file_units, joint_columns
-
-    table, kinds = c.targets.table, c.chain.kinds
-    q, std = in_file_units(c.q, kinds), c.uncertainty.std * 1e6
-    rows = []
-    for i, status in enumerate(c.status[:MOST_ROWS]):
-        numbers = [f"{v:.4f}" if np.isfinite(v) else "–" for v in q[i]]
-        sure = f"{std[i]:.2f}" if np.isfinite(std[i]) else "–"
-        name = table.configuration_labels[table.configuration[i]]
-        rows.append((printable(name), *numbers, sure, printable(status)))
-    heads = ("configuration", *joint_columns(kinds), "std_um", "status")
-    more = len(c.status) - len(rows)
-    note = f"and {more} more in the file of commands" if more else ""
-    return ShownTable(heads, rows, (0, len(heads) - 1), note=note)
-
-
-def _errors(c: Compensation) -> Figure:
-    from elastocal.report.figures import NO_ENDS, rows_of_dots
-
-    table = c.targets.table
-    rows = [
-        (table.configuration_labels[table.configuration[i]], float(c.before[i]) * 1e6, NO_ENDS, "")
-        for i in np.flatnonzero(c.reached)[:MOST_ROWS]
-    ]
-    axis = "error at the nominal command"
-    return rows_of_dots("errors", f"Targets: {axis}", rows, axis, lengths=True)
-
-
 # Readings
 
 
 def readings_report(table: Measurements) -> Report:
+    from elastocal.compensation.compensate import in_file_units, joint_columns
+    from elastocal.report.figures import rows_of_dots
+
     rows = [
         (printable(name), str(len(np.unique(values.astype(str)))), "", "")
         if values.dtype == object
@@ -257,23 +240,15 @@ def readings_report(table: Measurements) -> Report:
     heads = ("column", "different", "least", "largest")
     source = printable(table.source)
     shown = ShownTable(heads, rows, title=f"{len(table)} rows of {source}")
-    joints = Fold("", lambda: [_joints(table)], figures=("joints",))
-    return Report("Readings", source, [shown, joints])
-
-
-def _joints(table: Measurements) -> Figure:
-    """Where each joint stood: the middle of its values, and from end to end."""
-    from elastocal.compensation.compensate import in_file_units, joint_columns
-    from elastocal.report.figures import rows_of_dots
-
     q = in_file_units(table.q, table.kinds)
-    low, high = (f(axis=0) if len(q) else np.zeros(q.shape[1]) for f in (q.min, q.max))
-    rows = [
+    ends = [(float(v.min()), float(v.max())) if len(v) else (0.0, 0.0) for v in q.T]
+    dots = [
         (name, (a + b) / 2, (a, b), "")
-        for name, a, b in zip(joint_columns(table.kinds), low.tolist(), high.tolist(), strict=True)
+        for name, (a, b) in zip(joint_columns(table.kinds), ends, strict=True)
     ]
-    axis = "middle and ends of the values, in ° or mm"
-    return rows_of_dots("joints", "Where each joint stood", rows, axis)
+    axis, title = "middle and ends of the values, in ° or mm", "Where each joint stood"
+    joints = Fold("", lambda: [rows_of_dots("joints", title, dots, axis)], figures=("joints",))
+    return Report("Readings", source, [shown, joints])
 
 
 # The calibrated arm in a file
@@ -292,7 +267,7 @@ def export_blocks(done: Exported) -> Iterator[Block]:
     def rounding(metres: float) -> str:  # what is below a nanometre is no number to read
         return "< 0.001 µm" if metres < 1e-9 else length(metres)
 
-    cost, (name, in_title) = done.cost, FORMATS[done.format]
+    cost, (name, in_title), refit = done.cost, FORMATS[done.format], done.refit
     if cost.effects:
         every = [(e.effect.replace("_", " "), e.difference, e.note) for e in cost.effects]
         rows = []
@@ -309,8 +284,20 @@ def export_blocks(done: Exported) -> Iterator[Block]:
         )
     else:
         yield Sentence(f"{name} holds all of the calibrated model.")
-    if done.refit is not None:
-        yield Sentence(_fit(done.refit))
+    if refit is not None:
+        told = f"the markers are {length(refit.after)} rms off"
+        if refit.correction is not None:
+            told += f", with its joint correction {length(refit.correction)}"
+        if refit.taken or refit.correction is not None:
+            told = (
+                f"Refitted to the calibrated arm at {refit.visits} measured visits: {told}, with "
+                f"the values identified {length(refit.before)}"
+            )
+        else:
+            told = f"Values as identified; no refit is better: {told}"
+        worse = "" if refit.after < refit.nominal else "; it is worse than the nominal file"
+        nominal = length(refit.nominal)
+        yield Sentence(f"{told}, the nominal file with base and tool placed {nominal}{worse}.")
     if done.checked is not None:
         yield Sentence(f"Read back with {done.checked_with}: {rounding(done.checked)} at most.")
     if done.without_beta is not None:
@@ -330,21 +317,6 @@ def export_blocks(done: Exported) -> Iterator[Block]:
         yield Sentence(
             "Next: if that matters, elastocal compensate corrects it with the same cell and result."
         )
-
-
-def _fit(refit: Refit) -> str:
-    told = f"the markers are {length(refit.after)} rms off"
-    if refit.correction is not None:
-        told = f"{told}, with its joint correction {length(refit.correction)}"
-    if refit.taken or refit.correction is not None:
-        told = (
-            f"Refitted to the calibrated arm at {refit.visits} measured visits: "
-            f"{told}, with the values identified {length(refit.before)}"
-        )
-    else:
-        told = f"Values as identified; no refit is better: {told}"
-    worse = "" if refit.after < refit.nominal else "; it is worse than the nominal file"
-    return f"{told}, the nominal file with base and tool placed {length(refit.nominal)}{worse}."
 
 
 # What an import understood
