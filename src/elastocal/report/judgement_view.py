@@ -39,17 +39,13 @@ def judgement(result: Calibration) -> Judgement:
     if trust.severity == "poor":
         why = next(f for f in result.findings if f.severity == "poor" and f is not trust)
         return Judgement("poor", f"Do not use this calibration: {DOUBTS[why.kind](why)}.", steps)
-    told = _accuracy(result)
-    verdict = result.verdict
     if trust.severity == "care":
-        named = "; and ".join(DOUBTS[f.kind](f) for f in verdict.missing)
-        return Judgement("warn", f"Use this calibration with care: {named}. {told}", steps)
-    compared = result.finding(
-        "residual_agrees_with_stated_noise", "residual_below_stated_noise",
-        "residual_agrees_with_readings",
-    )  # fmt: skip
+        named = "; and ".join(DOUBTS[f.kind](f) for f in result.verdict.missing)
+        told = f"Use this calibration with care: {named}. {_accuracy(result)}"
+        return Judgement("warn", told, steps)
+    compared = result.finding(*COMPARED[1:])
     noise = "" if compared is None else " The residual is consistent with noise."
-    return Judgement("good", f"This calibration can be used. {told}{noise}", steps)
+    return Judgement("good", f"This calibration can be used. {_accuracy(result)}{noise}", steps)
 
 
 def warnings_beside(result: Calibration) -> list[tuple[str, str]]:
@@ -182,8 +178,8 @@ def _unheard_of(f: Finding) -> str:
 
 
 def _accuracy(result: Calibration) -> str:
-    """The arm's own error where nobody measured, and that of readings, which has their noise;
-    that the load point is known worse than the markers."""
+    """The arm's own error where nobody measured, and that of readings, which has their noise; where
+    markers were placed alone, their places; that the load point is known worse than the markers."""
     kind = result.observations.kind
     of = f" of {kind}s" if kind in ("deflection", "distance") else ""
     own = "Expected error at new poses: not known."
@@ -193,7 +189,15 @@ def _accuracy(result: Calibration) -> str:
     if not math.isfinite(result.heldout_rms):
         text = f"{own} Residual{of}: {length(result.residual_rms)} rms; no held-out error"
     elif only_placed(result):
-        text += _placed_markers(result)
+        found: dict[str, list[str]] = {}
+        for e in result.ordinary:
+            name, _, axis = e.name.rpartition(".")
+            if axis in ("x", "y", "z") and e.value is not None and e.ci95 is not None:
+                value, half, unit = estimate(e.value, (e.ci95[1] - e.ci95[0]) / 2, e.unit)
+                found.setdefault(name, []).append(f"{axis} = {value} ± {half} {unit}")
+        told = [f"{printable(name.removeprefix('marker:'))} lies at {', '.join(axes)}"
+                for name, axes in found.items() if len(axes) == 3]  # fmt: skip
+        text += f"; {listed(told, 3)} (95 %)" if told else ""
     else:
         text += f" (nominal arm {length(result.nominal_rms)})"
     if result.load_point_error is None:
@@ -204,19 +208,6 @@ def _accuracy(result: Calibration) -> str:
         f"{length(result.load_point_error)} rms: measure a marker there, or state "
         f"{option('point')} {marker}."
     )
-
-
-def _placed_markers(result: Calibration) -> str:
-    """ "; TCP lies at x = 30.24 ± 0.13, … mm of the flange (95 %)": what such a fit is made for."""
-    found: dict[str, list[str]] = {}
-    for e in result.ordinary:
-        name, _, axis = e.name.rpartition(".")
-        if axis in ("x", "y", "z") and e.value is not None and e.ci95 is not None:
-            value, half, unit = estimate(e.value, (e.ci95[1] - e.ci95[0]) / 2, e.unit)
-            found.setdefault(name, []).append(f"{axis} = {value} ± {half} {unit}")
-    told = [f"{printable(name.removeprefix('marker:'))} lies at {', '.join(axes)}"
-            for name, axes in found.items() if len(axes) == 3]  # fmt: skip
-    return f"; {listed(told, 3)} (95 %)" if told else ""
 
 
 MOST_NAMED = 6
@@ -285,9 +276,19 @@ def constraints_line(result: Calibration) -> str | None:
     if not active:
         return None
     units = {p.name: p.unit for p in result.model.parameters}
-    texts = [_constraint(a, units) for a in active[:MOST_NAMED]]
-    more = len(active) - len(texts)
-    text = "; ".join([*texts, *([f"and {more} more"] if more else [])])
+
+    def told(a: ActiveConstraint) -> str:
+        """ "joint2.compliance ≥ 0 µrad/(N·m)"; a label of the user's own stays as it is."""
+        if a.kind == "semidefinite":
+            return f"{printable(a.label)} (semidefinite)"
+        own = a.kind == "equality" and a.label != f"{a.names[0]} = {a.value:.6g}"
+        if len(a.names) != 1 or own or a.names[0] not in units:
+            return printable(a.label)
+        value, unit = display(a.value, units[a.names[0]])
+        return f"{printable(a.names[0])} {SIGNS[a.kind]} {plain(value)} {unit}"
+
+    more = len(active) - MOST_NAMED
+    text = "; ".join([*map(told, active[:MOST_NAMED]), *([f"and {more} more"] * (more > 0))])
     bound = any(a.kind != "equality" for a in active)
     want = "; the readings alone would go beyond the bounds" if bound else ""
     held = "Intervals take these for exact"
@@ -296,39 +297,25 @@ def constraints_line(result: Calibration) -> str | None:
     return f"Active: {text}. {held}{want}."
 
 
-def _constraint(a: ActiveConstraint, units: dict[str, str]) -> str:
-    """ "joint2.compliance ≥ 0 µrad/(N·m)"; a label of the user's own stays as it is."""
-    label = printable(a.label)
-    if a.kind == "semidefinite":
-        return f"{label} (semidefinite)"
-    own = a.kind == "equality" and a.label != f"{a.names[0]} = {a.value:.6g}"
-    if len(a.names) != 1 or own or a.names[0] not in units:
-        return label
-    value, unit = display(a.value, units[a.names[0]])
-    return f"{printable(a.names[0])} {SIGNS[a.kind]} {plain(value)} {unit}"
-
-
 def prior_line(result: Calibration) -> str | None:
     """Parameters that owe more than half of their information to the prior."""
-    shares = result.prior_share
+    shares, found = result.prior_share, result.finding("mostly_prior")
     if not shares:
         return None
-    found = result.finding("mostly_prior")
+
+    def percent(share: float) -> str:  # never 100 % where the data say anything
+        return f"{min(100 * share, 99.9):.3g} %" if share < 1 else "100 %"
+
     if found is None:
         largest = max((s for s in shares.values() if s == s), default=0.0)  # NaN: constrained
-        return f"No estimate is mostly prior (largest share {_percent(largest)})."
+        return f"No estimate is mostly prior (largest share {percent(largest)})."
     mostly = [str(name) for name in found.listed("parameters")]
-    named = ", ".join(f"{printable(n)} {_percent(shares[n])}" for n in mostly[:MOST_NAMED])
+    named = ", ".join(f"{printable(n)} {percent(shares[n])}" for n in mostly[:MOST_NAMED])
     more = len(mostly) - MOST_NAMED
     tail = f", and {more} more" if more > 0 else ""
     return (
         f"Mostly prior, share of the information: {named}{tail}. Measure poses that load them more."
     )
-
-
-def _percent(share: float) -> str:
-    """Never 100 % where the data say anything."""
-    return f"{min(100 * share, 99.9):.3g} %" if share < 1 else "100 %"
 
 
 FEW = 6  # sizes that are named one by one; of more, the range and the extremes
@@ -346,7 +333,7 @@ SCATTERS = {
     JOINTS: " + joints that settle anew at each visit",
     EACH: " + joints that settle anew at each visit, each by its own size",
 }
-COMPARED = (
+COMPARED = (  # the first is against the noise that is stated
     "residual_above_stated_noise",
     "residual_agrees_with_stated_noise",
     "residual_below_stated_noise",
@@ -377,13 +364,21 @@ def does_noise_explain_it(result: Calibration) -> str:
     # Whether the weights come from a noise model with estimated variances.
     estimated = method_of(result) in ("reml", "constrained") and result.noise.estimated
     f = result.finding(*COMPARED)
-    if f is None:
-        sigma, size = result.noise.sigma, ""
-        if sigma is not None and method_of(result) == "ols":
-            size = f"; the residual amounts to {length(sigma)} per coordinate"
-        elif estimated:
-            size = "; the noise level was estimated from the readings"
-        return f"{_why_not_judged(result)}{size}."
+    if f is None:  # what is missing for a comparison of the residual with stated noise
+        observed, tracker = result.observations, result.model.cell.tracker
+        stated = available_noise(observed.table, tracker) != "none"
+        if observed.kind == "distance":
+            stated = tracker.distance_sigma is not None
+        text = "No noise was stated, so the residual cannot be judged"
+        if observed.kind == "pose" and stated != (tracker.rotation_sigma is not None):
+            which = "positions" if stated else "rotations"
+            text = f"Noise was stated for {which} only, so the residual cannot be judged"
+        elif stated or result.noise.kind == "covariance":
+            text = "The residual was not compared with the stated noise"
+        if result.noise.sigma is not None and method_of(result) == "ols":
+            return f"{text}; the residual amounts to {length(result.noise.sigma)} per coordinate."
+        level = "; the noise level was estimated from the readings"
+        return f"{text}{level * estimated}."
     size = (
         f"{significant(f.number('ratio'))} times the stated noise; chance alone gives "
         f"{f.number('by_chance_from'):.2f} to {f.number('by_chance_to'):.2f}"
@@ -404,20 +399,6 @@ def does_noise_explain_it(result: Calibration) -> str:
     else:
         text = f"The residual is smaller than the stated noise ({size}), which is too large."
     return text + " Weights and intervals use the estimated noise." * estimated
-
-
-def _why_not_judged(result: Calibration) -> str:
-    """What is missing for a comparison of the residual with stated noise."""
-    observed, tracker = result.observations, result.model.cell.tracker
-    stated = available_noise(observed.table, tracker) != "none"
-    if observed.kind == "distance":
-        stated = tracker.distance_sigma is not None
-    if observed.kind == "pose" and stated != (tracker.rotation_sigma is not None):
-        which = "positions" if stated else "rotations"
-        return f"Noise was stated for {which} only, so the residual cannot be judged"
-    if stated or result.noise.kind == "covariance":
-        return "The residual was not compared with the stated noise"
-    return "No noise was stated, so the residual cannot be judged"
 
 
 def noise_model_line(result: Calibration) -> str | None:
@@ -579,9 +560,8 @@ PLACE = {
 def fault_lines(result: Calibration, most: int | None = None) -> list[str]:
     report = result.faulty_report
     groups = [] if report is None else [f for f in report.findings if f.level != "reading"]
-    lines = [_fault(result, finding) for finding in groups[:most]]
-    more = len(groups) - len(lines)
-    return [*lines, f"And {more} more."] if more else lines
+    more = len(groups) - len(groups[:most])
+    return [_fault(result, f) for f in groups[:most]] + [f"And {more} more."] * bool(more)
 
 
 def _fault(result: Calibration, finding: FaultyGroup) -> str:
