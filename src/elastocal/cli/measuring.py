@@ -210,11 +210,7 @@ def design(
 
     summary = beside(output)
     programs = program or []
-    kinds = " or ".join(f"{suffix} for {name}" for suffix, name in PROGRAMS.items())
-    for path in programs:
-        told = f"--program {path}: the suffix says the language, {kinds}"
-        require(path.suffix.lower() in PROGRAMS, told)
-    require(picture is None or picture.suffix != "", f"--picture {picture}: name it .png or .svg")
+    _check_names(programs, picture)
     run.writes(
         (output, ".csv"), (summary, ".json"), *((path, "") for path in programs),
         (picture, ".png .svg"), (report, PAGES), (cell_out, ".toml"),
@@ -305,6 +301,15 @@ def _what_next(cell: Path, output: Path, augment: Path | None, plan: Plan) -> st
         f"To try it without an arm: elastocal simulate {cell} {output} -o data.csv --draw 1"
         f"{carried}"
     )
+
+
+def _check_names(programs: list[Path], picture: Path | None) -> None:
+    """Refuse names that do not say which kind of file is wanted."""
+    kinds = " or ".join(f"{suffix} for {name}" for suffix, name in PROGRAMS.items())
+    for path in programs:
+        told = f"--program {path}: the suffix says the language, {kinds}"
+        require(path.suffix.lower() in PROGRAMS, told)
+    require(picture is None or picture.suffix != "", f"--picture {picture}: name it .png or .svg")
 
 
 def _programs(paths: list[Path], cell: Cell, plan: Plan | None = None) -> dict[Path, str]:
