@@ -286,9 +286,7 @@ MOST_POSES = 80  # in the page; of more, those with the largest residuals and a 
 WORST = 30
 
 
-def residual_arm(
-    model: Model, observed: Observations, x: Array, residual: Array
-) -> blocks.ShownArm:
+def residual_arm(model: Model, observed: Observations, x: Array, residual: Array) -> blocks.Figure:
     """The arm with its residuals as arrows: one pose per configuration and load, each arrow the
     mean residual of a marker; `residual` (rows,) at parameter values x (parameters,)."""
     table, marker = observed.table, observed.table.marker[observed.lead]
@@ -344,10 +342,10 @@ def residual_arm(
             f" {len(poses)} poses of {observed.n_configurations} configurations: those with the "
             "largest residuals, and a random choice."
         )
-    return blocks.ShownArm("space", space, "Residuals as arrows on the posed arm", text)
+    return posed("space", "Residuals as arrows on the posed arm", text, space)
 
 
-def plan_arm(plan: Plan) -> blocks.ShownArm:
+def plan_arm(plan: Plan) -> blocks.Figure:
     cell, chain = plan.model.cell, plan.model.chain
     frames, flange = frames_at(cell, chain, plan.q)
     local = np.array(list(cell.tool.markers.values())).reshape(-1, 3)
@@ -368,7 +366,7 @@ def plan_arm(plan: Plan) -> blocks.ShownArm:
         "The arm in the poses of the plan, numbered at the flange. The arm is drawn as "
         f"{space.shells.drawn_from}."
     )
-    return blocks.ShownArm("poses", space, "The arm in the poses of the plan", caption)
+    return posed("poses", "The arm in the poses of the plan", caption, space)
 
 
 # The still picture
@@ -389,26 +387,25 @@ TOP = np.eye(3)
 SIDE = np.array([[1.0, 0, 0], [0, 0, 1.0], [0, -1.0, 0]])
 
 
-def space_figure(arm: blocks.ShownArm) -> blocks.Figure:
+def posed(name: str, title: str, caption: str, space: Space) -> blocks.Figure:
     """The first pose seen obliquely, and all poses from above and from the side."""
-    space = arm.space
 
     def draw(figure: Figure) -> None:
         grid = figure.add_gridspec(2, 2, height_ratios=(1.5, 1.0))
         large = figure.add_subplot(grid[0, :])
         _draw(large, space, OBLIQUE, whole=False)
         large.set_axis_off()
-        for k, (view, name, up) in enumerate(((TOP, "from above", "y"), (SIDE, "side", "z"))):
+        for k, (view, told, up) in enumerate(((TOP, "from above", "y"), (SIDE, "side", "z"))):
             axes = figure.add_subplot(grid[1, k])
             _draw(axes, space, view, whole=True)
-            axes.set_title(name)
+            axes.set_title(told)
             axes.set_xlabel("x in m")
             axes.set_ylabel(f"{up} in m")
         if space.groups:
             handles = axes.get_legend_handles_labels()
             figure.legend(*handles, loc="outside lower center", ncols=4)
 
-    return blocks.Figure(arm.name, arm.title, draw, 7.0, arm.caption)
+    return blocks.Figure(name, title, draw, 7.0, caption, space=space)
 
 
 def write_plan_picture(path: str | Path, plan: Plan) -> None:
@@ -427,7 +424,7 @@ def write_plan_picture(path: str | Path, plan: Plan) -> None:
 
 
 def plan_figure(plan: Plan) -> Any:
-    return figure_of(space_figure(plan_arm(plan)))
+    return figure_of(plan_arm(plan))
 
 
 def _draw(axes: Axes, space: Space, view: Array, whole: bool) -> None:

@@ -101,7 +101,8 @@ class ShownTable:
 class Figure:
     """What `draw` puts on matplotlib's figure of `width` by `height` inches.
 
-    `name` is what `plot` calls it, `title` says what it shows to those who cannot see it.
+    `name` is what `plot` calls it, `title` says what it shows to those who cannot see it.  With a
+    `space` (arm_view.Space) it is the arm, which a page lets be turned.
     """
 
     name: str
@@ -110,16 +111,7 @@ class Figure:
     height: float
     caption: str = ""
     width: float = 5.6
-
-
-@dataclass(frozen=True)
-class ShownArm:
-    """The arm in a `space` (arm_view.Space): to be turned on a page, a picture elsewhere."""
-
-    name: str
-    space: Any
-    title: str
-    caption: str
+    space: Any = None
 
 
 @dataclass(frozen=True)
@@ -135,9 +127,7 @@ class Fold:
     figures: tuple[str, ...] = ()
 
 
-Block = (
-    ShownVerdict | KeyFigures | Heading | Sentence | Lines | ShownTable | Figure | ShownArm | Fold
-)
+Block = ShownVerdict | KeyFigures | Heading | Sentence | Lines | ShownTable | Figure | Fold
 
 
 @dataclass(frozen=True)

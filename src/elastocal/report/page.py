@@ -38,7 +38,6 @@ from elastocal.report.blocks import (
     KeyFigures,
     Lines,
     Sentence,
-    ShownArm,
     ShownTable,
     ShownVerdict,
     report_of,
@@ -164,9 +163,9 @@ def html_of(
     repeat the `summary` that they stand behind.
     """
     parts = []
-    for kind, several in groupby(blocks, type):
+    for flat, several in groupby(blocks, lambda b: isinstance(b, Figure) and b.space is None):
         found = [_html(block, deep, pictures, summary) for block in several]
-        if kind is Figure and pictures:
+        if flat and pictures:
             found = [f'<div class="figures">{"".join(found)}</div>']
         parts += found
     return "\n".join(part for part in parts if part)
@@ -245,17 +244,15 @@ def _cell(kind: str, head: str, text: str) -> str:
     return f'<td class="{kind}{tone}" data-head="{before}">{text_of(text)}</td>'
 
 
-def _picture(block: Figure | ShownArm) -> str:
+def _picture(block: Figure) -> str:
     from elastocal.report.figures import svg
 
     caption = f"<figcaption>{text_of(block.caption)}</figcaption>" if block.caption else ""
-    if isinstance(block, Figure):
+    if block.space is None:
         return f"<figure>{svg(block)}{caption}</figure>"
-    from elastocal.report.arm_view import space_figure
-
     return (
-        f'<figure class="view"><div class="still">{svg(space_figure(block))}</div>'
-        f'<div class="live" hidden></div>{VIEW}{block.space.json}</script>{caption}</figure>'
+        f'<figure class="view"><div class="still">{svg(block)}</div><div class="live" hidden></div>'
+        f"{VIEW}{block.space.json}</script>{caption}</figure>"
     )
 
 
@@ -323,31 +320,28 @@ def plot(result: object, kind: str | None, interactive: bool, ax: Any = None) ->
     if interactive and kind is None and arms:
         chosen = arms[0]
     opened = unfolded(folds, lambda fold: chosen in fold.figures)
-    found = [b for b in opened if isinstance(b, Figure | ShownArm) and b.name == chosen]
+    found = [b for b in opened if isinstance(b, Figure) and b.name == chosen]
     if not found:
         opened = unfolded(folds, lambda fold: bool(fold.figures))
-        there = [block.name for block in opened if isinstance(block, Figure | ShownArm)]
+        there = [block.name for block in opened if isinstance(block, Figure)]
         raise InputError(
             f"no figure {quoted(chosen)}{did_you_mean(chosen, there)}; there are {listed(there)}"
         )
     if interactive:
-        if not isinstance(found[0], ShownArm):
+        if found[0].space is None:
             told = f"; interactive=True turns the arm: {listed(arms)}" if arms else ""
             raise InputError(f"the figure {quoted(chosen)} stands still{told}")
         from elastocal.report.arm_view import turned
 
         return turned(found[0].space)
-    from elastocal.report.arm_view import space_figure
     from elastocal.report.figures import figure_of
 
-    block = found[0]
-    drawn = space_figure(block) if isinstance(block, ShownArm) else block
     if ax is not None:
         spot: Any = getattr(ax, "get_subplotspec", lambda: None)()
         require(spot is not None, "`ax` takes axes that plt.subplots or Figure.subplots made")
         ax.remove()
-        return figure_of(drawn, spot.get_gridspec().figure.add_subfigure(spot))
-    figure: Any = figure_of(drawn)
+        return figure_of(found[0], spot.get_gridspec().figure.add_subfigure(spot))
+    figure: Any = figure_of(found[0])
     # So that a notebook shows it although pyplot, whose hooks do so, is not loaded.
     figure._repr_png_ = partial(_png, figure)
     return figure
