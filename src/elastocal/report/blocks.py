@@ -9,9 +9,8 @@ from __future__ import annotations
 
 from collections.abc import Callable, Iterable, Iterator, Sequence
 from dataclasses import dataclass, field, replace
-from importlib import import_module
 from io import StringIO
-from typing import TYPE_CHECKING, Any, Literal
+from typing import TYPE_CHECKING, Any, Literal, cast
 
 from rich.box import SIMPLE_HEAD
 from rich.console import Console
@@ -155,24 +154,27 @@ def unfolded(blocks: Iterable[Block], which: Callable[[Fold], bool]) -> Iterator
             yield from unfolded(block.blocks(), which)
 
 
-# Where each kind of result is put into blocks; no other is loaded for it.
-HOMES = {
-    "Calibration": "identification_view.calibration_report",
-    "Certificate": "certificate_view.certificate_report",
-    "Diagnosis": "diagnosis_view.diagnosis_report",
-    "Plan": "plan_view.plan_report",
-    "NextPoses": "plan_view.next_report",
-    "Comparison": "smaller_views.changes_report",
-    "Compensation": "smaller_views.compensation_report",
-    "Measurements": "smaller_views.readings_report",
-}
-
-
 def report_of(result: object, certificate: bool = False, **told: Any) -> Report:
-    """What is to be said of a result.  KeyError for a kind without a report."""
-    home, _, name = HOMES["Certificate" if certificate else type(result).__name__].partition(".")
-    report: Report = getattr(import_module(f"elastocal.report.{home}"), name)(result, **told)
-    return report
+    """What is to be said of a result.  Each kind has its view, which no other result loads."""
+    kind, report = type(result).__name__, cast(Any, None)
+    if certificate:
+        from elastocal.report.certificate_view import certificate_report as report
+    elif kind == "Calibration":
+        from elastocal.report.identification_view import calibration_report as report
+    elif kind == "Diagnosis":
+        from elastocal.report.diagnosis_view import diagnosis_report as report
+    elif kind == "Plan":
+        from elastocal.report.plan_view import plan_report as report
+    elif kind == "NextPoses":
+        from elastocal.report.plan_view import next_report as report
+    elif kind == "Comparison":
+        from elastocal.report.smaller_views import changes_report as report
+    elif kind == "Compensation":
+        from elastocal.report.smaller_views import compensation_report as report
+    else:
+        from elastocal.report.smaller_views import readings_report as report
+    found: Report = report(result, **told)
+    return found
 
 
 # In a terminal
