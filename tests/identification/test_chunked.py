@@ -41,6 +41,7 @@ def in_parts(monkeypatch):
         monkeypatch.setattr(partition, "LARGE", 0)
         monkeypatch.setattr(partition, "PART", numbers)
         monkeypatch.setattr(solve, "SAMPLE", sample)
+        monkeypatch.setattr(solve, "MANY", sample)
         monkeypatch.setattr(outliers, "SAMPLE", sample)
 
     return switch

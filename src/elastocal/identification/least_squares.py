@@ -30,7 +30,6 @@ from elastocal.identification.weighted_problem import (
     Weights,
     evaluate,
     is_large,
-    is_reduced,
     least_norm,
     partition,
 )
@@ -180,11 +179,6 @@ class Problem:
     @property
     def large(self) -> bool:
         return is_large(self.observations, int((~self.model.shrunk).sum()))
-
-    @property
-    def many(self) -> bool:
-        """Whether the readings are so many that an evaluation is dear."""
-        return is_reduced(self.observations, int((~self.model.shrunk).sum()))
 
 
 @dataclass(frozen=True)

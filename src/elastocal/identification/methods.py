@@ -250,17 +250,11 @@ def _holding(
 ) -> MethodResult | None:
     """The result of a fit that holds some of its parameters; None where there is none."""
     solution, noise = found.solution, found.noise
-    reduction, x0 = solution.reduction, solution.problem.x0.copy()
-    stays = ~np.isin(reduction.kept, list(held))
-    if not stays.any():
+    x0, lost = solution.problem.x0.copy(), np.isin(solution.reduction.kept, list(held))
+    if lost.all():
         return None
     x0[list(held)] = list(held.values())
-    lost = reduction.kept[~stays]
-    mixing = np.hstack([reduction.mixing[stays], np.zeros((int(stays.sum()), len(lost)))])
-    reduction = replace(
-        reduction, kept=reduction.kept[stays], dropped=np.append(reduction.dropped, lost),
-        mixing=mixing,
-    )  # fmt: skip
+    reduction = solution.reduction.without(lost)
     problem = replace(solution.problem, x0=x0)
     fit = fit_kept(problem, solution.sizes, solution.fit.x, reduction)
     if not fit.converged:

@@ -13,7 +13,7 @@ from scipy import linalg
 from elastocal.errors import ElastocalError, InsufficientDataError
 from elastocal.identification.checks import check_enough
 from elastocal.identification.covariance import root_of
-from elastocal.identification.least_squares import Fit, Known, Problem, fit
+from elastocal.identification.least_squares import Fit, Known, Problem, fit, moved
 from elastocal.identification.residuals import (
     CHANCE,
     as_of_another_campaign,
@@ -38,9 +38,7 @@ from elastocal.identification.weighted_problem import (
 from elastocal.model.arm import Parameter
 from elastocal.model.effects.catalogue import effect_of
 from elastocal.model.manipulator import Model
-from elastocal.units import Array, IntArray, Progress
-
-# Which parameters the data determine: a minimal complete set, a wider one, and what combines.
+from elastocal.units import Array, BoolArray, IntArray, Progress
 
 # Which parameters the data determine: a minimal complete set, and what the rest combine with.
 
@@ -67,20 +65,22 @@ class Reduction:
     with_prior: NDArray[np.int64] = field(default_factory=lambda: np.zeros(0, dtype=np.int64))
     threshold: float = 0.0
 
+    def without(self, lost: BoolArray, *, invisible: bool = False) -> Reduction:
+        """With these kept parameters (kept,) among the dropped ones, for which nothing stands."""
+        kept, gone = self.kept[~lost], self.kept[lost]
+        return replace(
+            self, kept=kept, dropped=np.append(self.dropped, gone),
+            mixing=np.hstack([self.mixing[~lost], np.zeros((len(kept), len(gone)))]),
+            invisible=np.append(self.invisible, gone) if invisible else self.invisible,
+        )  # fmt: skip
+
     def seen(self, free: IntArray, R: Array, sizes: Array) -> Reduction:
         """Without the kept parameters that move nothing any more, R (…, free) being that of the
         `free` columns: those of a product vanish where its other factor is held at zero."""
         length = np.linalg.norm(R[:, : len(free)], axis=0) * sizes[free]
         own = length[np.searchsorted(free, self.kept)]
         gone = own <= STRUCTURAL * length.max(initial=0.0)
-        if not gone.any():
-            return self
-        lost = self.kept[gone]
-        mixing = np.hstack([self.mixing[~gone], np.zeros((int((~gone).sum()), len(lost)))])
-        return replace(
-            self, kept=self.kept[~gone], dropped=np.append(self.dropped, lost), mixing=mixing,
-            invisible=np.append(self.invisible, lost),
-        )  # fmt: skip
+        return self.without(gone, invisible=True) if gone.any() else self
 
     def terms(self, k: int, sizes: Array, std: float) -> dict[int, float]:
         """Parameters combined with kept parameter number k, and their factors.
@@ -246,12 +246,6 @@ def looked_at(problem: Problem, found: Fit) -> tuple[Array, Array]:
     return held, leverage
 
 
-def wider_is_needed(problem: Problem, narrow: Array, wide: Array) -> bool:
-    """Do the held-out residuals (rows,) of a wider set show that the narrow one lacks something?"""
-    observed = problem.observations
-    return predicts_better(narrow, wide, problem.weights, observed.configuration, observed.size)
-
-
 def fits_better(narrow: RFactor, wide: RFactor) -> bool:
     """Does the wider set fit the readings better than chance alone in CHANCE of all cases (F)?
 
@@ -267,35 +261,33 @@ def prefer_wider(
     """A wider set, up to full rank, where held-out configurations show that it is needed.
 
     Typical sizes are prior knowledge and may be wrong for this arm; a test on held-out data
-    decides, first on the linearised model, then on the refitted one.  `r_factor` is that of the
-    free columns.
+    decides.  `r_factor` is that of the free columns.
     """
-    heldout: Array | None = None
+    observed, heldout = problem.observations, list[Array]()
     for threshold in WIDER:
         sigma = residual_sigma(found, len(reduction.kept))
         wider = choose(problem, sizes, r_factor, sigma, threshold)
         own = r_factor.of_columns(np.searchsorted(problem.free, wider.kept))
         if own.columns <= len(reduction.kept) or not fits_better(found.r_factor, own):
             continue
-        step = np.zeros(len(found.x))
-        step[wider.kept] = own.step(sizes[wider.kept])
-        linear = held_out_by_parts(
-            problem.model, problem.parts, found.x, wider.kept, own.half, step
-        )
-        heldout = looked_at(problem, found)[0] if heldout is None else heldout
-        if not wider_is_needed(problem, heldout, linear[0]):
-            continue
+        start = moved(found.x, wider.kept, own.step(sizes[wider.kept]))
         try:
-            wide = fit_kept(problem, sizes, found.x + step, wider, max_steps=30, again=True)
-            wide_heldout = looked_at(problem, wide)[0]
+            wide = fit_kept(problem, sizes, start, wider, max_steps=30, again=True)
+            after = looked_at(problem, wide)[0]
         except (ElastocalError, np.linalg.LinAlgError, ValueError):
             # Along an undetermined direction the wide set may leave every valid arm, or come to
             # rest where it is singular.
             continue
-        needed = wide.converged and fits_better(found.r_factor, wide.r_factor)
-        if needed and wider_is_needed(problem, heldout, wide_heldout):
-            found, reduction, heldout = wide, wider, wide_heldout
-            r_factor = free_r_factor(problem, found)
+        before = heldout[-1] if heldout else looked_at(problem, found)[0]
+        if (
+            wide.converged
+            and fits_better(found.r_factor, wide.r_factor)
+            and predicts_better(
+                before, after, problem.weights, observed.configuration, observed.size
+            )
+        ):
+            found, reduction, r_factor = wide, wider, free_r_factor(problem, wide)
+            heldout.append(after)
     return found, reduction
 
 
@@ -307,8 +299,8 @@ LOOSE, PLACED = 3.0, 0.3
 # What a step promises of the cost where tied fits end: what is placed, where a parameter of it gets
 # dropped and is held for good, and where the choice and the fit only begin.
 PLACING, CHOOSING = 1e-12, 1e-2
-# Observations that a large table's fit starts from.
-SAMPLE = 5000
+# Observations from which on a fit starts from a sample, and how many there are in it.
+MANY, SAMPLE = 2000, 5000
 
 
 @dataclass(frozen=True)
@@ -482,8 +474,8 @@ def tied_fit(problem: Problem, sizes: Array, tolerance: float) -> Fit:
     Many readings start where such a fit to a sample of them ends.
     """
     x = problem.x0
-    if problem.many:
-        rough = _sampled(problem)
+    rough = _sampled(problem)
+    if rough is not problem:
         found = _tied_from(rough, sizes, x, _misfit(rough), tolerance)
         try:
             return _tied_from(problem, sizes, found.x, residual_sigma(found, 0), tolerance)
@@ -494,9 +486,10 @@ def tied_fit(problem: Problem, sizes: Array, tolerance: float) -> Fit:
 
 def _sampled(problem: Problem) -> Problem:
     """The problem of a sample, where there are many readings."""
-    if not problem.many:
+    n = len(problem.observations.lead)
+    if n <= MANY:
         return problem
-    part = sample(problem.parts, min(SAMPLE, len(problem.observations.lead) // 4))
+    part = sample(problem.parts, min(SAMPLE, n // 4))
     return replace(problem, observations=part.observations, weights=part.weights)
 
 

@@ -172,8 +172,7 @@ def _available(observed: Observations, tracker: Tracker) -> str:
 
 def _given(observed: Observations, covariance: Array | None) -> Weights:
     need(covariance is not None, f"weights 'covariance' need a matrix ({option('covariance')})")
-    matrix = np.asarray(covariance, dtype=float)
-    n = len(observed.value)
+    matrix, n = np.asarray(covariance, dtype=float), len(observed.value)
     need(
         matrix.shape == (n, n),
         f"the covariance is {matrix.shape}, but there are {n} rows (observations × components)",
@@ -242,20 +241,12 @@ Span = tuple[int, int]
 # part keeps the evaluation of B at full speed, and the copies that QR makes small.
 LARGE = 2**21
 PART = 2**21
-# From here on a fit steps on R factors, whose digits suffice: what they leave of a step is 1e-9 of
-# a standard deviation, and the exact solver costs more than all else.
-MANY = 2**18
 OF_A_MARKER = 30  # observations of each marker at least, where there are as many, in a sample
 
 
 def is_large(observed: Observations, n_parameters: int) -> bool:
     """Whether B of all parameters is too large to be formed at once."""
     return len(observed.value) * n_parameters > LARGE
-
-
-def is_reduced(observed: Observations, n_parameters: int) -> bool:
-    """Whether a fit works on the R factor of B."""
-    return len(observed.value) * n_parameters > min(MANY, LARGE)
 
 
 @dataclass(frozen=True)
@@ -273,14 +264,14 @@ class Part:
 
 @dataclass(frozen=True)
 class Partition:
-    """All observations in `spans` of `order` (None: as they stand in the table).
+    """All observations in `spans` of `order` (N,).
 
     Those of one configuration share a span, and with them what shares an unloaded reading.
     """
 
     observed: Observations
     weights: Weights
-    order: IntArray | None
+    order: IntArray
     spans: tuple[Span, ...]
 
     def part(self, span: Span) -> Part:
@@ -288,8 +279,7 @@ class Partition:
         if len(self.spans) == 1:
             n, rows = len(self.observed.lead), len(self.observed.value)
             return Part(np.arange(n), np.arange(rows), self.observed, self.weights)
-        index = np.arange(*span) if self.order is None else np.sort(self.order[slice(*span)])
-        return part_of(self.observed, self.weights, index)
+        return part_of(self.observed, self.weights, np.sort(self.order[slice(*span)]))
 
 
 def part_of(observed: Observations, weights: Weights, index: IntArray) -> Part:
@@ -344,7 +334,7 @@ def partition(observed: Observations, weights: Weights, n_parameters: int) -> Pa
     """
     n = len(observed.lead)
     if not is_large(observed, n_parameters) or weights.kind == "covariance":
-        return Partition(observed, weights, None, ((0, n),))
+        return Partition(observed, weights, np.arange(n), ((0, n),))
     order = np.argsort(observed.configuration, kind="stable")
     ends = np.append(np.flatnonzero(np.diff(observed.configuration[order])) + 1, n)
     spans, start, limit = list[Span](), 0, max(PART // (observed.size * n_parameters), 1)
@@ -353,8 +343,7 @@ def partition(observed: Observations, weights: Weights, n_parameters: int) -> Pa
         last = max(int(np.searchsorted(ends, start + limit, side="right")) - 1, int(k))
         spans.append((start, int(ends[last])))
         start = spans[-1][1]
-    in_order = bool((np.diff(order) == 1).all())
-    return Partition(observed, weights, None if in_order else order, tuple(spans))
+    return Partition(observed, weights, order, tuple(spans))
 
 
 # A least-squares problem of any length as its R factor: what is left of B and e after QR.
@@ -367,10 +356,8 @@ def partition(observed: Observations, weights: Weights, n_parameters: int) -> Pa
 # backward stable like a QR of all rows at once: the condition number enters once, not squared as
 # in BᵀB.
 
-# Numbers of [B e] formed and factorised at once where there are more rows: 2 MB, and in these the
-# rows of a leaf, 16 for every column.  A leaf stays in the second level of cache, where LAPACK's
-# panels, which go over all rows column by column, take half the time (docs/performance.md).
-BLOCK = 2**18
+# Rows of a leaf for every column: it stays in the second level of cache, where LAPACK's panels,
+# which go over all rows column by column, take half the time (docs/performance.md).
 LEAF, SMALLEST_LEAF = 16, 512
 
 
@@ -384,12 +371,7 @@ class RFactor:
     @classmethod
     def of(cls, B: Array, e: Array) -> RFactor:
         """The R factor of the whitened B (rows, p) and residual e (rows,)."""
-        step = _leaf(B.shape[1] + 1, BLOCK)
-        if len(e) <= step:
-            return cls(_factor(np.column_stack([B, e])), len(e))
-        blocks = (slice(first, first + step) for first in range(0, len(e), step))
-        leaves = [_leaves(np.column_stack([B[block], e[block]])) for block in blocks]
-        return cls(_factor(np.vstack(leaves)), len(e))
+        return cls(_factor(np.column_stack([B, e])), len(e))
 
     def merged(self, other: RFactor) -> RFactor:
         """The R factor of the rows of both."""
@@ -468,28 +450,14 @@ def merge(factors: Iterable[RFactor]) -> RFactor:
     return reduce(RFactor.merged, factors)
 
 
-def _leaf(k: int, numbers: int = 0) -> int:
-    """Rows of a leaf of `k` columns, or of as many leaves as `numbers` take."""
-    rows = max(LEAF * k, SMALLEST_LEAF)
-    return max(numbers // (rows * k), 1) * rows
-
-
-def _leaves(rows: Array) -> Array:
-    """The R factors of the leaves of `rows` (n, k) on top of each other."""
-    k = rows.shape[1]
-    leaf = _leaf(k)
-    whole = len(rows) // leaf * leaf
-    if not whole:
-        return rows
-    factors = np.asarray(np.linalg.qr(rows[:whole].reshape(-1, leaf, k), mode="r"))
-    return np.vstack([factors.reshape(-1, k), rows[whole:]])
-
-
 def _factor(rows: Array) -> Array:
     """R factor (k, k) of `rows` (n, k), filled up with zeros where n < k."""
     k = rows.shape[1]
-    while rows.size > BLOCK and len(rows) >= 2 * _leaf(k):
-        rows = _leaves(rows)
+    leaf = max(LEAF * k, SMALLEST_LEAF)
+    while (n := len(rows)) >= 2 * leaf:
+        whole = n // leaf * leaf
+        leaves = np.asarray(np.linalg.qr(rows[:whole].reshape(-1, leaf, k), mode="r"))
+        rows = np.vstack([leaves.reshape(-1, k), rows[whole:]])
     # Not scipy's qr, whose R has all n rows: kept as a factor it would hold a part of the table.
     R = np.asarray(np.linalg.qr(rows, mode="r"), dtype=np.float64)
     return R if len(R) == k else np.vstack([R, np.zeros((k - len(R), k))])
