@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass, replace
+from itertools import product
 
 import numpy as np
 import scipy  # whose `optimize` loads where it is used: it takes as long as a small fit
@@ -248,9 +249,6 @@ def _rotation_between(body: Array, points: Array, weight: Array) -> Array:
 
 # Starting values found from the data: base, markers and target orientation, or cable geometry.
 
-DISTANCE_STARTS = 64
-DISTANCE_SAMPLE = 300
-
 
 def start_values(
     model: Model, table: Measurements, seed: int = 0, free: IntArray | None = None
@@ -263,7 +261,10 @@ def start_values(
     x = model.nominal.copy()
     movable = set(range(len(x)) if free is None else free.tolist())
     if model.observe == "distance":
-        return _distance_start(model, table, x, seed, movable)
+        if len(table) > SAMPLE:
+            chosen = np.random.default_rng(seed).choice(len(table), SAMPLE, replace=False)
+            table = table.take(np.sort(chosen))
+        return _distance_start(model, table, x, movable)
     if table.position is None:
         return x
     places = {
@@ -319,51 +320,44 @@ def _target_rotations(
     return values
 
 
-def _distance_start(
-    model: Model, table: Measurements, x: Array, seed: int, movable: set[int]
-) -> Array:
-    """Anchor, offset and attachment by robust least squares from many anchors.
+def _distance_start(model: Model, table: Measurements, x: Array, movable: set[int]) -> Array:
+    """Anchor, offset and attachment by robust least squares.
 
-    A distance tells the side of the robot on which the anchor lies only through all poses
-    together, so anchors are tried on a sphere around the poses; the best robust cost wins.
+    With p the nominal flange, d the reading, a the anchor and o the offset, |p − a| = d − o is
+    linear in a, o and |a|² − o².  Which side of the robot the anchor is on shows only in all poses
+    together: mirror images of that solution are tried too, and the best robust cost wins.
     """
-    from scipy.stats import qmc  # slow to import, seldom asked for
-
     columns = np.array(
         [i for i, p in enumerate(model.parameters)
          if i in movable and p.effect in (DistanceSensor.name, MarkerPosition.name)]
     )  # fmt: skip
     if not len(columns):
         return x
-    rng = np.random.default_rng(seed)
-    if len(table) > DISTANCE_SAMPLE:
-        table = table.take(np.sort(rng.choice(len(table), DISTANCE_SAMPLE, replace=False)))
-    distance = np.asarray(table.distance)
-    centre = model.rigid.flange_poses(table)[:, :3, 3].mean(axis=0)
+    d, place = np.asarray(table.distance), model.rigid.flange_poses(table)[:, :3, 3]
     anchor = [i for i in columns if "anchor" in model.parameters[i].name]
-    directions = qmc.Sobol(3, rng=seed).random(DISTANCE_STARTS) * 2 - 1
-    best, best_cost = x, np.inf
-    given = model.cell.tracker.anchor is not None
+    starts = [x]
+    if anchor:
+        centre = place.mean(axis=0)
+        p, ones = place - centre, np.ones(len(d))
+        linear = np.column_stack([-2 * p, -2 * d, ones])
+        found = np.linalg.lstsq(linear, d**2 - (p**2).sum(axis=1))[0][:3]
+        axes = np.linalg.svd(p, full_matrices=False)[2]
+        for side in product((1, -1), repeat=3):
+            trial = x.copy()
+            trial[anchor] = centre + axes.T @ (side * (axes @ found))
+            starts.append(trial)
 
     def values(z: Array) -> Array:
         y = x.copy()
         y[columns] = z
         return y
 
-    def residual(z: Array) -> Array:
-        return model.predict(table, values(z)) - distance
-
-    def jacobian(z: Array) -> Array:
-        return model.regressor(table, values(z), columns).B
-
-    for k, direction in enumerate(directions):
-        trial = x.copy()
-        if anchor and not (given and k == 0):
-            unit = direction / np.linalg.norm(direction)
-            trial[anchor] = centre + unit * np.median(distance)
-        found = scipy.optimize.least_squares(
-            residual, trial[columns], jacobian, loss="soft_l1", f_scale=2e-3, max_nfev=60
+    tried = [
+        scipy.optimize.least_squares(
+            lambda z: model.predict(table, values(z)) - d, start[columns],
+            lambda z: model.regressor(table, values(z), columns).B,
+            loss="soft_l1", f_scale=2e-3, max_nfev=60,
         )
-        if found.cost < best_cost:
-            best, best_cost = values(found.x), found.cost
-    return best
+        for start in starts
+    ]  # fmt: skip
+    return values(min(tried, key=lambda one: float(one.cost)).x)
