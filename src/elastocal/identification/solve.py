@@ -261,9 +261,17 @@ def prefer_wider(
     """A wider set, up to full rank, where held-out configurations show that it is needed.
 
     Typical sizes are prior knowledge and may be wrong for this arm; a test on held-out data
-    decides.  `r_factor` is that of the free columns.
+    decides, first on the linearised model, then on the refitted one.  `r_factor` is that of the
+    free columns.
     """
     observed, heldout = problem.observations, list[Array]()
+
+    def predicts(wide: Array) -> bool:
+        if not heldout:
+            heldout.append(looked_at(problem, found)[0])
+        own = observed.configuration, observed.size
+        return predicts_better(heldout[-1], wide, problem.weights, *own)
+
     for threshold in WIDER:
         sigma = residual_sigma(found, len(reduction.kept))
         wider = choose(problem, sizes, r_factor, sigma, threshold)
@@ -271,6 +279,11 @@ def prefer_wider(
         if own.columns <= len(reduction.kept) or not fits_better(found.r_factor, own):
             continue
         start = moved(found.x, wider.kept, own.step(sizes[wider.kept]))
+        linear = held_out_by_parts(
+            problem.model, problem.parts, found.x, wider.kept, own.half, start - found.x
+        )
+        if not predicts(linear[0]):
+            continue
         try:
             wide = fit_kept(problem, sizes, start, wider, max_steps=30, again=True)
             after = looked_at(problem, wide)[0]
@@ -278,14 +291,7 @@ def prefer_wider(
             # Along an undetermined direction the wide set may leave every valid arm, or come to
             # rest where it is singular.
             continue
-        before = heldout[-1] if heldout else looked_at(problem, found)[0]
-        if (
-            wide.converged
-            and fits_better(found.r_factor, wide.r_factor)
-            and predicts_better(
-                before, after, problem.weights, observed.configuration, observed.size
-            )
-        ):
+        if wide.converged and fits_better(found.r_factor, wide.r_factor) and predicts(after):
             found, reduction, r_factor = wide, wider, free_r_factor(problem, wide)
             heldout.append(after)
     return found, reduction
