@@ -55,6 +55,7 @@ NU = 1.0  # degrees of freedom: far errors weigh as good as nothing
 STARTS, FINALISTS = 300, 10
 SWEEPS, MOST_SWEEPS = 3, 30  # of every start before the best are chosen, and of these
 MOST_NUMBERS = 3e8  # sums of a sweep over all starts
+ENOUGH = 1500  # observations that the sweeps are over
 INSIDE = 0.01  # chance of a clean observation to lie outside
 
 
@@ -66,19 +67,29 @@ def majority(B: Array, e: Array, seed: int = 0) -> tuple[BoolArray, float]:
     verdict; nobody is, where none lies farther out than chance would have it of the whole table.
     """
     n, size, p = B.shape
-    products = (B.transpose(0, 2, 1) @ np.concatenate([B, e[..., None]], axis=2)).reshape(n, -1)
+    rng, half = np.random.default_rng(seed), special.chdtri(size, 0.5)
+    # So many tell where the majority lies; all of them then have their say.
+    some = np.arange(n) if n <= ENOUGH else rng.choice(n, ENOUGH, replace=False)
+    near, own, m, few = B[some], e[some], len(some), min(-(-p // size) + 1, len(some))
+    products = near.transpose(0, 2, 1) @ np.concatenate([near, own[..., None]], axis=2)
+    products, flat = products.reshape(m, -1), B.reshape(-1, p)
 
     def squares(weight: Array, variance: Array) -> Array:
-        """Squared lengths (starts, n) beside the fits with these weights (starts, n)."""
+        """Squared lengths (starts, m) beside the fits with these weights (starts, m)."""
         summed = (weight @ products).reshape(len(weight), p, p + 1)
         summed[:, np.arange(p), np.arange(p)] += variance[:, None]
         z = np.linalg.solve(summed[..., :p], summed[..., p:])[..., 0]
-        return np.asarray(((e[..., None] - B @ z.T) ** 2).sum(axis=1).T)
+        return np.asarray(((own[..., None] - near @ z.T) ** 2).sum(axis=1).T)
 
-    half, few = special.chdtri(size, 0.5), min(-(-p // size) + 1, n)
-    starts = int(np.clip(MOST_NUMBERS / (n * p * p + 1), FINALISTS, STARTS))
-    subsets = np.random.default_rng(seed).random((starts, n)).argpartition(few - 1, axis=1)[:, :few]
-    weight = np.vstack([np.ones(n), np.zeros((starts, n))])
+    def of_all(weight: Array, variance: float) -> Array:
+        """The same (n,) of all observations, with weights (n,)."""
+        weighted = flat * np.repeat(weight, size)[:, None]
+        z = np.linalg.solve(weighted.T @ flat + variance * np.eye(p), weighted.T @ e.ravel())
+        return np.asarray(((e - B @ z) ** 2).sum(axis=1))
+
+    starts = int(np.clip(MOST_NUMBERS / (m * p * p + 1), FINALISTS, STARTS))
+    subsets = rng.random((starts, m)).argpartition(few - 1, axis=1)[:, :few]
+    weight = np.vstack([np.ones(m), np.zeros((starts, m))])
     np.put_along_axis(weight[1:], subsets, 1.0, axis=1)
     variance = np.full(len(weight), max(median_scale(np.linalg.norm(e, axis=1), size) ** 2, TINY))
     for sweep in range(SWEEPS + MOST_SWEEPS):
@@ -89,13 +100,15 @@ def majority(B: Array, e: Array, seed: int = 0) -> tuple[BoolArray, float]:
             q, variance = q[best], variance[best]
         weight = (NU + size) / (NU + q / variance[:, None])
     k = int(np.argmin(variance))
-    squared, s2 = q[k], float(variance[k])
+    s2, told = float(variance[k]), np.zeros(n)
+    told[some] = weight[k]
+    squared = of_all(told, s2)
     # Mean of a χ² variable cut at its 99 % point, per degree of freedom.
     limit = special.chdtri(size, INSIDE)
     cut = special.chdtr(size + 2, limit) / (1 - INSIDE)
     good = squared <= limit * s2
     for _ in range(MOST_SWEEPS):
-        squared = squares(good[None].astype(float), np.array([s2]))[0]
+        squared = of_all(good.astype(float), s2)
         rows = size * int(good.sum())
         s2 = max(float(squared[good].sum()) / (cut * max(rows - p, rows / 2)), TINY)
         updated = squared <= limit * s2
