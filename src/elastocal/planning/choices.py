@@ -27,7 +27,7 @@ from elastocal.model.manipulator import Model
 from elastocal.planning.candidates import Candidates, draw, shares_of
 from elastocal.planning.criteria import CRITERIA
 from elastocal.planning.exchange import exact_plan, prospects
-from elastocal.planning.execution import at_stops, greedy_tour, tour_cost
+from elastocal.planning.execution import at_stops, nearest_first
 from elastocal.planning.feasibility import Feasibility
 from elastocal.planning.information import PoseInformation, plan_forces
 from elastocal.planning.moves import travel_times
@@ -414,7 +414,8 @@ def _minutes(cell: Cell, q: Array, readings: IntArray) -> float:
     travel = 0.0
     for visited, states in zip(*np.unique(read.T, axis=0, return_counts=True), strict=True):
         cost = travel_times(np.vstack([home, q[visited]]), motion.speed)
-        travel += states * tour_cost(cost, greedy_tour(cost))
+        ring = [0, *nearest_first(cost), 0]
+        travel += states * cost[ring[:-1], ring[1:]].sum()
     total = waiting + travel + changes * motion.load_change
     return float(total * (1 + motion.longer) / 60)
 

@@ -9,7 +9,6 @@ from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property
 from itertools import pairwise
-from random import Random
 
 import numpy as np
 from scipy import linalg
@@ -147,13 +146,16 @@ def in_turns(tour: list[int], load: IntArray, sequence: list[int]) -> list[int]:
     return [int(v) for s in sequence for v in parts[s].pop(0)]
 
 
-# The order: first little bias, then little travel, by simulated annealing.
+# The order, by simulated annealing (Kirkpatrick, Gelatt & Vecchi 1983): the shortest first, then
+# one of little bias and little travel.
 
-# Temperatures in units of a bias that is as good as none: the searches begin at those of HOT, the
-# first three from anywhere, the others near the best found; an order that is nearly good, by its
-# making or but for moves that turn out to be blocked, is bettered from WARM.
-HOT, WARM, COLD = (4.0, 4.0, 4.0, 1.0, 0.25), 0.06, 1e-3
-STEPS, FEW, MENDING = 40_000, 10_000, 2_500  # from HOT, from WARM, and of blocked moves
+# Temperatures, where a drift counts in units of a bias that is as good as none, else of a move's
+# part of the way: the searches begin at those of HOT, the first three from anywhere, the others
+# near the best found; the shortest order from SHORT; an order that is nearly good, by its making or
+# but for moves that turn out to be blocked, is bettered from WARM.
+HOT, SHORT, WARM, COLD = (4.0, 4.0, 4.0, 1.0, 0.25), 0.15, 0.06, 1e-3
+# Steps from HOT, from WARM, of blocked moves, and of the shortest order per visit.
+STEPS, FEW, MENDING, PER_VISIT = 40_000, 10_000, 2_500, 4000
 ROUNDS = 12  # of blocked moves found and the order mended, before the ways around are taken
 HOPED = 0.5  # of its bias is left by a whole search, at best, to an order that is nearly good
 
@@ -163,40 +165,39 @@ class VisitTimes:
     """When each visit of an order is read, and what a drift then does.
 
     `change` (V + 1, V + 1) s where a move changes the load, `visit` s of reading at a node; `share`
-    (V, m·3) of each visit.  Of travel `longest` s are allowed; a bias of `enough` per m of drift is
-    as good as none.
+    (V, m·3) of each visit, None where no drift counts.  Of travel `longest` s are allowed and
+    `usual` s usual; a bias of `enough` per m of drift is as good as none.
     """
 
     moves: Moves
     costs: Costs
     change: Array
     visit: float
-    share: Array
-    longest: float
-    enough: float
+    share: Array | None
+    usual: float
+    longest: float = np.inf
+    enough: float = 1.0
 
     @classmethod
-    def of(
-        cls, moves: Moves, motion: Motion, costs: Costs, alias: Alias | None, shortest: list[int]
-    ) -> VisitTimes:
-        """Allows so much more travel than in the `shortest` tour as `motion` has extra time."""
-        share = np.zeros((1 + moves.pose.max(), 1 + moves.load.max(), 1, 3))
-        if alias is not None:
-            share = alias.share
-        times = np.zeros(share.shape[:2])  # that each is read; each time with a part of it
-        np.add.at(times, (moves.pose, moves.load), 1.0)
-        share = share / np.maximum(times, 1.0)[..., None, None]
-        made = cls(
-            moves,
-            costs,
-            change=np.where(costs.changed, motion.load_change, 0.0),
-            visit=motion.dwell * (1 if moves.signs is None else 2),
-            share=share[moves.pose, moves.load].reshape(len(moves.pose), -1),
-            longest=np.inf,
-            enough=1.0 if alias is None else HARMLESS * alias.noise / DRIFT,
-        )
-        longest = made.driving(shortest) + motion.longer * made.time(shortest)
-        return replace(made, longest=longest)
+    def of(cls, moves: Moves, motion: Motion, begun: list[int]) -> VisitTimes:
+        """Of orders about as long as the one `begun`."""
+        carried = np.array([moves.carries(node) for node in range(len(moves.pose) + 1)])
+        change = np.where(carried[:, None] != carried[None], motion.load_change, 0.0)
+        visit = motion.dwell * (1 if moves.signs is None else 2)
+        made = cls(moves, moves.costs(), change, visit, None, 1.0)
+        return replace(made, usual=max(made.driving(begun), np.finfo(float).tiny))
+
+    def drifting(self, alias: Alias | None, longest: float) -> VisitTimes:
+        """Where a drift does what `alias` says, and so much travel is allowed."""
+        made = replace(self, longest=longest)
+        if alias is None:
+            return made
+        pose, load = self.moves.pose, self.moves.load
+        times = np.zeros(alias.share.shape[:2])  # that each is read; each time with a part of it
+        np.add.at(times, (pose, load), 1.0)
+        share = alias.share[pose, load] / times[pose, load][:, None, None]
+        enough = HARMLESS * alias.noise / DRIFT
+        return replace(made, share=share.reshape(len(pose), -1), enough=enough)
 
     def known(self) -> VisitTimes:
         return replace(self, costs=self.moves.costs())
@@ -206,8 +207,12 @@ class VisitTimes:
         return self.driving(tour) <= self.longest
 
     def driving(self, tour: list[int]) -> float:
-        ring = np.array([0, *tour, 0])
-        return float(self.costs.travel[ring[:-1], ring[1:]].sum())
+        travel = self._travel
+        return sum(travel[u][v] for u, v in pairwise([0, *tour, 0]))
+
+    @cached_property
+    def _travel(self) -> list[list[float]]:
+        return self.costs.travel.tolist()
 
     @cached_property
     def _step(self) -> Array:
@@ -218,40 +223,41 @@ class VisitTimes:
         changing = float(self.change[ring[:-1], ring[1:]].sum())
         return self.driving(tour) + self.visit * len(tour) + changing
 
-    def _errors(self, ring: IntArray) -> Array:
-        """(m, 3) error per m of drift in x, y, z, counted from the readings' mean time; the visits
-        with a node 0 before and after them."""
-        there = ring[1:-1]
-        time = self._step[ring[:-2], there].cumsum()
+    def _errors(self, tour: list[int]) -> Array:
+        """(m, 3) error per m of drift in x, y, z, counted from the readings' mean time."""
+        there = np.array([0, *tour])
+        time = self._step[there[:-1], there[1:]].cumsum()
         at = np.zeros(len(self._step))
-        at[there] = time - np.add.reduce(time) / len(time)
+        at[there[1:]] = time - np.add.reduce(time) / len(time)
         errors = at[1:] @ self.share / max(float(time[-1] - time[0]), 1e-300)
         return np.asarray(errors.reshape(-1, 3))
 
     def bias(self, tour: list[int]) -> float:
         """Error per m of drift in its worst direction."""
-        return float(np.linalg.norm(self._errors(np.array([0, *tour, 0])), ord=2))
+        return 0.0 if self.share is None else float(np.linalg.norm(self._errors(tour), ord=2))
 
     def price(self, tour: list[int]) -> float:
         """What annealing makes small: bias beyond `enough`, travel beyond `longest`, travel."""
-        ring = np.array([0, *tour, 0])
-        errors = self._errors(ring)
-        across = errors.T @ errors
-        # Between rms and worst direction, which is what counts: Schatten's norm of order 4.
-        bias = math.sqrt(math.sqrt(np.vdot(across, across))) / self.enough
-        driving = float(np.add.reduce(self.costs.travel[ring[:-1], ring[1:]])) / self.longest
-        return max(bias - 1, 0.0) + 100 * max(driving - 1, 0.0) + 0.1 * driving
+        driving, bias = self.driving(tour), 0.0
+        if self.share is not None:
+            errors = self._errors(tour)
+            across = errors.T @ errors
+            # Between rms and worst direction, which is what counts: Schatten's norm of order 4.
+            bias = math.sqrt(math.sqrt(np.vdot(across, across))) / self.enough
+        over = max(driving - self.longest, 0.0)
+        return max(bias - 1, 0.0) + (100 * over + 0.1 * driving) / self.usual
 
     def annealed(self, tour: list[int], seed: int, steps: int, hot: float) -> list[int]:
         """The tour with its visits exchanged and moved between blocks of the same load state,
         never more changes of load, by annealing the price from `hot` down to COLD."""
-        if len(tour) < 3 or not steps:
+        if len(tour) < 3:
             return tour
         rng = np.random.default_rng(seed)
         here, price = list(tour), self.price(tour)
         best, least = here, price
         loads = [-1, *self.moves.load.tolist()]  # by node
-        cooling, temperature = (COLD / hot) ** (1 / steps), hot
+        unit = 1.0 if self.share is not None else 0.1 / len(tour)
+        cooling, temperature = (COLD / hot) ** (1 / steps), hot * unit
         for kind, a, b, luck in rng.random((steps, 4)).tolist():
             temperature *= cooling
             new = _moved(here, loads, kind, int(a * len(here)), int(b * len(here)))
@@ -260,50 +266,55 @@ class VisitTimes:
             found = self.price(new)
             if found <= price or luck < math.exp((price - found) / temperature):
                 here, price = new, found
-                if price < least:
+                if price < least - 1e-9 * unit:
                     best, least = here, price
         return best
 
-    def searched(
-        self, near: list[int], seed: int, progress: Progress
+    def cleared(
+        self, tour: list[int], seed: int, progress: Progress
     ) -> tuple[list[int], VisitTimes]:
+        """The order once its blocked moves are found and gone round."""
+        clock, moves, rounds = self, self.moves, 0
+        while moves.check(tour, clock.costs):
+            progress(f"order of execution: {moves.checked} moves checked, {moves.blocked} blocked")
+            rounds += 1
+            if moves.crowded or rounds == ROUNDS:
+                moves.settle()
+            clock = clock.known()
+            if rounds <= ROUNDS:
+                tour = clock.annealed(tour, seed + rounds, MENDING, WARM)
+        return tour, clock
+
+    def searched(
+        self, near: list[int], seed: int, progress: Progress,
+        hot: Sequence[float], steps: int,
+    ) -> tuple[list[int], VisitTimes]:  # fmt: skip
         """The order of least price found from one that is `near` a good one."""
-        best, clock, moves = near, self, self.moves
-        for k, hot in enumerate((None, *HOT)):
-            new = near if hot is None else clock.annealed(best, seed + k, STEPS, hot)
-            rounds = 0
-            while moves.check(new, clock.costs):
-                progress(f"order of execution against drift: {moves.checked} moves checked")
-                rounds += 1
-                if moves.crowded or rounds == ROUNDS:
-                    moves.settle()
-                clock = clock.known()
-                if rounds <= ROUNDS:
-                    new = clock.annealed(new, seed + rounds, MENDING, WARM)
-            best = min(best, new, key=clock.price)
-            # Enough where a drift does no harm any more; without an alias the way alone counts.
-            if clock.possible(best) and clock.share.any() and clock.bias(best) <= clock.enough:
+        best, clock = self.cleared(near, seed, progress)
+        for k, temperature in enumerate(hot, start=1):
+            # Enough where a drift does no harm any more; without one the way alone counts.
+            drifts = clock.share is not None
+            if drifts and clock.possible(best) and clock.bias(best) <= clock.enough:
                 break
+            new = clock.annealed(best, seed + k, steps, temperature)
+            new, clock = clock.cleared(new, seed, progress)
+            best = min(best, new, key=clock.price)
         return best, clock
 
 
 def against_drift(
-    moves: Moves,
-    motion: Motion,
-    tour: list[int],
-    costs: Costs,
-    alias: Alias | None,
-    seed: int,
+    plain: VisitTimes, motion: Motion, tour: list[int], alias: Alias | None, seed: int,
     progress: Progress,
-) -> tuple[list[int], Moves, Costs, Drifting | None]:
-    """The visits of the shortest `tour` in the order that a drift harms least, with the moves and
-    costs that they are nodes of, and what the drift does to it; the shortest tour itself where no
-    other is better.  Where there is time for it, all poses are read twice without load; where no
+) -> tuple[list[int], VisitTimes, Drifting | None]:  # fmt: skip
+    """The visits of the shortest `tour` in the order that a drift harms least, with the clock that
+    they are nodes of, and what the drift does to it; the shortest tour itself where no other is
+    better.  Where there is time for it, all poses are read twice without load; where no
     extra time is stated, if (ρ² + b²) t falls, of the error at the test poses ρ, the drift's
     part of it b and the time t: if more readings, by which ρ² falls as 1/t, would give less."""
+    moves = plain.moves
     used = [int(s) for s in dict.fromkeys(moves.load[np.array(tour) - 1])]
     sequence = turns(moves.loaded.tolist(), used, motion.load_changes)
-    clock = VisitTimes.of(moves, motion, costs, alias, tour)
+    clock = plain.drifting(alias, plain.driving(tour) + motion.longer * plain.time(tour))
     before, noise = clock.bias(tour), 0.0 if alias is None else alias.noise
     as_pays = motion.extra_time is None
 
@@ -312,23 +323,21 @@ def against_drift(
         return squared * time if as_pays else max(bias, clock.enough)
 
     once = clock.annealed(in_turns(tour, moves.load, sequence), seed, FEW, WARM)
-    (spread, again), twice = moves.unloaded_twice(tour), None
+    once_bias, once_time = clock.bias(once), clock.time(once)
+    twice, twice_harms = None, np.inf
+    spread, again = moves.unloaded_twice(tour)
     longer = len(again) * clock.visit
     left = clock.longest - (0.0 if as_pays else longer)
-    once_harms = clock.bias(once), clock.time(once)
     # Can it pay, if no drift is left at all?
-    pays = harm(0.0, clock.time(tour) + longer) < harm(*once_harms)
+    pays = harm(0.0, clock.time(tour) + longer) < harm(once_bias, once_time)
     if alias is not None and len(again) and pays and left >= clock.driving(tour):
-        own = replace(VisitTimes.of(spread, motion, spread.costs(), alias, tour), longest=left)
+        own = VisitTimes.of(spread, motion, tour).drifting(alias, left)
         begun = own.annealed(in_turns([*tour, *again], spread.load, sequence), seed, FEW, WARM)
-        found, own = own.searched(begun, seed, progress)
+        found, own = own.searched(begun, seed, progress, HOT, STEPS)
         if own.possible(found):
-            twice = found, own
-    twice_harms = (
-        np.inf if twice is None else harm(twice[1].bias(twice[0]), twice[1].time(twice[0]))
-    )
-    if harm(HOPED * once_harms[0], once_harms[1]) <= twice_harms:
-        once, clock = clock.known().searched(once, seed, progress)
+            twice, twice_harms = (found, own), harm(own.bias(found), own.time(found))
+    if harm(HOPED * once_bias, once_time) <= twice_harms:
+        once, clock = clock.known().searched(once, seed, progress, HOT, STEPS)
         more = bool(motion.load_changes) and alias is None
         if not clock.possible(once) or not (more or clock.bias(once) < before):
             once = tour
@@ -339,7 +348,7 @@ def against_drift(
     drift = None
     if alias is not None:
         drift = Drifting(DRIFT * clock.bias(once), DRIFT * before, noise, alias.at_test_poses)
-    return once, clock.moves, clock.costs, drift
+    return once, clock, drift
 
 
 def _moved(tour: list[int], load: list[int], kind: float, i: int, j: int) -> list[int] | None:
@@ -349,11 +358,11 @@ def _moved(tour: list[int], load: list[int], kind: float, i: int, j: int) -> lis
     if i == j or here != load[tour[j]]:
         return None
     new = tour.copy()
-    if kind < 0.5:
+    if kind < 0.2:
         new[i], new[j] = new[j], new[i]
         return new
     low, high = min(i, j), max(i, j)
-    if kind < 0.7:
+    if kind < 0.6:
         if any(load[node] != here for node in tour[low : high + 1]):
             return None
         new[low : high + 1] = new[low : high + 1][::-1]
@@ -537,23 +546,8 @@ def _time(moves: Moves, way: list[int]) -> float:
     return float(sum(moves.times[i, j] for i, j in pairwise(way)))
 
 
-# The shortest tour through given costs, by simulated annealing too.
-
-# Steps; the few while moves of the tour turn out to be blocked.
-PER_VISIT, FEW_PER_VISIT = 6000, 600
-FROM, TO = 0.15, 0.01  # temperatures, of the median move
-GAINED = 1e-6  # of the first temperature, that a tour must gain to be better
-PART = 3  # visits that are put elsewhere together, at most
-
-
-def tour_cost(cost: Array, tour: list[int]) -> float:
-    """Cost of depot 0 → tour → depot 0 under `cost` (V + 1, V + 1)."""
-    ring = [0, *tour, 0]
-    return float(cost[ring[:-1], ring[1:]].sum())
-
-
-def greedy_tour(cost: Array) -> list[int]:
-    """From the depot 0 always on to the nearest node not yet visited."""
+def nearest_first(cost: Array) -> list[int]:
+    """From the beginning, node 0, always on to the nearest node not yet visited."""
     left = cost.copy()
     left[:, 0] = np.inf
     tour, here = [], 0
@@ -565,54 +559,7 @@ def greedy_tour(cost: Array) -> list[int]:
     return tour
 
 
-def shortest_tour(cost: Array, start: list[int], seed: int, per_visit: int) -> list[int]:
-    """A short tour 0 → every node → 0, never worse than `start`.
-
-    `cost` (V + 1, V + 1), finite and not negative, need not be symmetric.  Stretches are turned
-    round (2-opt) or put elsewhere (Or-opt), as Metropolis' rule takes them (Kirkpatrick, Gelatt &
-    Vecchi 1983), `per_visit` V times.  The same seed gives the same tour on any machine.
-    """
-    ring, n, c = [0, *start, 0], len(start), cost.tolist()
-    steps, best, now, least = per_visit * n, list(start), 0.0, 0.0
-    if n < 2 or not steps:
-        return start
-    rng, even = Random(seed), bool((cost == cost.T).all())
-    hot = FROM * max(float(np.median(cost[ring[:-1], ring[1:]])), np.finfo(float).tiny)
-    for k in range(steps):
-        temperature = hot * (TO / FROM) ** (k / steps)
-        i, j = int(rng.random() * n) + 1, int(rng.random() * n) + 1
-        turned = rng.random() < 0.5
-        size = abs(j - i) + 1 if turned else min(int(rng.random() * PART) + 1, n - i + 1)
-        i = min(i, j) if turned else i
-        before, first, last, after = ring[i - 1], ring[i], ring[i + size - 1], ring[i + size]
-        gain = c[before][first] + c[last][after]
-        if turned:
-            worse = c[before][last] + c[first][after] - gain
-            if not even:
-                worse += sum(c[v][u] - c[u][v] for u, v in pairwise(ring[i : i + size]))
-        elif i - 1 <= j < i + size:
-            continue
-        else:
-            u, v = ring[j], ring[j + 1]
-            worse = c[before][after] + c[u][first] + c[last][v] - c[u][v] - gain
-        if worse > 0 and rng.random() >= math.exp(-worse / temperature):
-            continue
-        part = ring[i : i + size]
-        if turned:
-            ring[i : i + size] = part[::-1]
-        else:
-            del ring[i : i + size]
-            at = j + 1 if j < i else j + 1 - size
-            ring[at:at] = part
-        now += worse
-        if now < least - GAINED * hot:
-            best, least = ring[1:-1], now
-    return best
-
-
 # The shortest execution of a plan: every pose in its load states, by collision-free moves.
-
-PATIENT = 5  # times, before all ways are checked
 
 
 def schedule(
@@ -628,7 +575,6 @@ def schedule(
     alias: Alias | None = None,
     paired: bool = False,
     seed: int = 0,
-    per_visit: int = PER_VISIT,
     progress: Progress = lambda message: None,
 ) -> Execution:
     """The order of `q` (N, n) with the least travel time found, from and to `motion.home`.
@@ -656,39 +602,24 @@ def schedule(
     """
     forces = np.zeros((1, 3)) if loads is None else loads
     moves = Moves.of(q, motion, checker, forces, limits, via, read)
-    Reach(moves, blockers).check()
-    tour, costs = _shortest(moves, seed, per_visit, progress)
-    Reach(moves, blockers).check_tour(tour, costs)
-    drift = None
+    reach = Reach(moves, blockers)
+    reach.check()
+    # Load states one after the other, without load first.
+    used = sorted(set(moves.load.tolist()), key=lambda state: (moves.loaded[state], state))
+    begun = in_turns(nearest_first(moves.costs().travel), moves.load, used)
+    clock, drift = VisitTimes.of(moves, motion, begun), None
+    steps = PER_VISIT * len(begun)
+    tour, clock = clock.searched(begun, seed, progress, (SHORT,), steps)
+    reach.check_tour(tour, clock.costs)
     if (alias is not None or motion.load_changes) and motion.longer > 0:
-        tour, moves, costs, drift = against_drift(moves, motion, tour, costs, alias, seed, progress)
-    order = [(node, 0) for node in tour]
+        tour, clock, drift = against_drift(clock, motion, tour, alias, seed, progress)
+    moves, costs, order = clock.moves, clock.costs, [(node, 0) for node in tour]
     if motion.reference_every:
         order = with_references(tour, moves, costs, motion.reference_every, paired)
         while moves.check([node for node, _ in order], costs):
             costs = moves.costs()
     Reach(moves, blockers).check_tour([node for node, _ in order], costs)
     return _executed(moves, order, costs, motion, drift)
-
-
-def _shortest(
-    moves: Moves, seed: int, per_visit: int, progress: Progress
-) -> tuple[list[int], Costs]:
-    costs = moves.costs()
-    tour = greedy_tour(costs.cost)
-    thorough, done, rounds = False, False, 0
-    while not done:
-        effort = per_visit if thorough else min(per_visit, FEW_PER_VISIT)
-        tour = shortest_tour(costs.cost, tour, seed, effort)
-        tour = _unloaded_first(tour, costs.cost, moves)
-        blocked = moves.check(tour, costs)
-        progress(f"order of execution: {moves.checked} moves checked, {moves.blocked} blocked")
-        if blocked:
-            if moves.crowded or (rounds := rounds + 1) > PATIENT:
-                moves.settle()
-            costs = moves.costs()
-        done, thorough = thorough and not blocked, not blocked
-    return tour, costs
 
 
 def _executed(
@@ -714,17 +645,3 @@ def _executed(
         blocked=moves.blocked,
         drift=drift,
     )
-
-
-def _unloaded_first(tour: list[int], cost: Array, moves: Moves) -> list[int]:
-    """The tour or its reverse: the cheaper one, else the one that begins without load, else
-    with the lower pose, so that the answer does not hang on the solver's whim."""
-    there, back = tour_cost(cost, tour), tour_cost(cost, tour[::-1])
-    if not np.isclose(there, back, rtol=1e-12):
-        return tour if there < back else tour[::-1]
-
-    def key(order: list[int]) -> tuple[bool, int]:
-        first = order[0] - 1
-        return bool(moves.loaded[moves.load[first]]), int(moves.pose[first])
-
-    return min(tour, tour[::-1], key=key)

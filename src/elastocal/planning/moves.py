@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass, replace
 from itertools import pairwise, product
-from typing import Protocol
+from typing import NamedTuple, Protocol
 
 import numpy as np
 from numpy.typing import NDArray
@@ -144,15 +144,11 @@ class Roadmap:
 FEW = 2000  # pairs of visits: so many ways are checked at once where orders need them one by one
 
 
-@dataclass(frozen=True)
-class Costs:
-    """`cost` (V + 1, V + 1) of going from one visit through the next one, node 0 being the
-    beginning and the end: `travel` in s, and more for changing what hangs on the arm (`changed`);
-    `side` (V + 1, V): the entry taken."""
+class Costs(NamedTuple):
+    """`travel` (V + 1, V + 1) s from one visit through the next one, node 0 being the beginning and
+    the end; `side` (V + 1, V): the entry taken."""
 
-    cost: Array
     travel: Array
-    changed: BoolArray
     side: IntArray
 
 
@@ -249,13 +245,8 @@ class Moves:
         return more, (len(self.pose) + 1 + np.arange(len(again))).tolist()
 
     def costs(self) -> Costs:
-        """Costs between visits as known so far.
-
-        Load states are kept together and changed as rarely as can be: going to another one costs
-        more than all travelling, and twice that if what hangs on the arm changes.  The arm begins
-        and ends without load, at home or, where there is none, anywhere.  What cannot be reached
-        costs more than everything else together.
-        """
+        """Costs between visits as known so far; what cannot be reached costs more than everything
+        else together.  The arm begins and ends without load, at home or, without one, anywhere."""
         n, home = len(self.pose), self.home
         # The load is on the arm during a move only if it is before and after: it is hung and taken
         # off where the arm stands for a loaded reading.
@@ -277,14 +268,8 @@ class Moves:
         np.fill_diagonal(travel, 0.0)
         finite = np.isfinite(travel)
         # Any tour travels less than this in all, if it needs no unreachable move.
-        change = max(float(travel[finite].max()) * (n + 1), 1.0)
-        travel[~finite] = 4 * change * (n + 1)
-        states = np.append(-1, self.load)
-        # The beginning is a state of its own; the unloaded states carry the same as it: nothing.
-        carried = np.append(-1, np.where(self.loaded[self.load], self.load, -1))
-        changed = carried[:, None] != carried[None]
-        cost = travel + change * (states[:, None] != states[None]) + change * changed
-        return Costs(cost, travel, changed, side)
+        travel[~finite] = max(float(travel[finite].max()) * (n + 1), 1.0)
+        return Costs(travel, side)
 
     def way(self, u: int, v: int, costs: Costs) -> tuple[Roadmap, list[int]]:
         """The roadmap and the points from node u to the entry of node v, both included.

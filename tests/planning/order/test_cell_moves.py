@@ -46,7 +46,7 @@ def test_every_move_keeps_clear_with_and_without_the_load(feasibility):
     assert len(q) > 60
     via = q[8:60]
     motion = Motion(home=HOME, speed=np.radians([90.0]))
-    execution = schedule(q[:8], motion, feasibility, loads=LOADS, via=via, per_visit=600)
+    execution = schedule(q[:8], motion, feasibility, loads=LOADS, via=via)
     assert execution.load_changes == 2
     here, force = HOME, LOADS[0]
     step = np.linspace(0, 1, 60)[:, None]

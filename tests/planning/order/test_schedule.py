@@ -81,9 +81,7 @@ def test_every_move_driven_is_free_and_every_reading_is_made_once(seed, at_home,
     home = np.array([-2.0, -2.0]) if at_home else None
     motion = Motion(home=home, both_directions=both, overshoot=0.03, speed=np.array([0.5, 2.0]))
     try:
-        execution = schedule(
-            q, motion, checker, loads=forces, limits=LIMITS, via=CORNERS, per_visit=600
-        )
+        execution = schedule(q, motion, checker, loads=forces, limits=LIMITS, via=CORNERS)
     except Unreachable:
         assume(False)  # discs all around a pose: rare, or hypothesis complains
     moves = driven(execution, q, forces)

@@ -38,7 +38,7 @@ def chain():
 def execution_of(chain, **motion):
     q = random_poses(chain, 5, seed=1)
     limits = np.full(6, -9.0), np.full(6, 9.0)
-    return schedule(q, Motion(**motion), Discs(), loads=FORCES, limits=limits, per_visit=600)
+    return schedule(q, Motion(**motion), Discs(), loads=FORCES, limits=limits)
 
 
 def planned(execution):
