@@ -24,22 +24,12 @@ def cell(tmp_path: Path) -> Path:
     return write_cell(tmp_path, altered(DEFLECTION, poses="2", candidates="20"))
 
 
-@pytest.mark.parametrize(
-    "name", ["plan.csv.resume", "plan.csv.resume/notes.md", "plan.csv.resume/old/x.npz"]
-)
-def test_a_folder_of_the_name_of_a_designs_own(cell: Path, name: str) -> None:
+@pytest.mark.parametrize("name", ["plan.csv.resume", "plan.csv.resume/notes.md"])
+def test_what_has_the_name_of_a_designs_own(cell: Path, name: str) -> None:
     own = mine(cell.parent / name)
     done = design(cell)
     assert done.exit_code == 2 and "plan.csv.resume" in done.stderr
     assert own.read_text() == MINE and not (cell.parent / "plan.csv").exists()
-
-
-def test_what_was_put_among_a_designs_own_stays(cell: Path) -> None:
-    folder = cell.parent / "plan.csv.resume" / ("0" * 32)
-    own = [mine(folder / name) for name in ("notes.md", "readings.npz")]
-    assert design(cell).exit_code == 0
-    assert [path.read_text() for path in own] == [MINE] * 2
-    assert [path.name for path in folder.parent.iterdir()] == ["0" * 32]
 
 
 @pytest.mark.parametrize("text", [MINE, "[]", '{"schema": "mine/1"}'])

@@ -28,7 +28,7 @@ from fuzz.harness import WALL, Case, apart, be_child, execute, malformed, old, s
 
 OPERATIONS = ("open", "os.rename", "os.remove", "os.mkdir", "os.rmdir", "shutil.rmtree")
 # What a killed run may leave for the next one to go on from, or to sweep up.
-BEGUN = re.compile(r"\.resume/|^results(/|\.md$)|(^|/)\.[^/]+\.tmp$")
+BEGUN = re.compile(r"\.resume$|^results(/|\.md$)|(^|/)\.[^/]+\.tmp$")
 INTERRUPTED = 128 + signal.SIGINT
 KILLED = ("identify", "design", "diagnose", "simulate", "export", "study")
 

@@ -276,7 +276,7 @@ def _resumed(
         check()
         if not isinstance(error, OSError):
             # The same input ends here again: there is nothing to go on with.
-            checkpoint.drop()
+            checkpoint.clear()
         raise
     check()
     return plan, checkpoint

@@ -6,6 +6,7 @@ on the pool is one on what was found between its candidates too.
 
 from __future__ import annotations
 
+from contextlib import suppress
 from dataclasses import asdict, dataclass, replace
 
 import numpy as np
@@ -25,7 +26,7 @@ from elastocal.planning.exchange import (
 )
 from elastocal.planning.execution import Alias, Execution, at_stops, schedule
 from elastocal.planning.feasibility import Feasibility
-from elastocal.planning.moves import Unreachable, blockers_of
+from elastocal.planning.moves import Roadmap, Unreachable, blockers_of, travel_times
 from elastocal.planning.plan import Certificate
 from elastocal.planning.polish import Continuum, Searches, estimate, polish
 from elastocal.planning.relaxation import (
@@ -286,10 +287,10 @@ class Search:
 # The order of a plan that moves can follow; poses that none reaches are replaced, and polished.
 
 ROUNDING = 1e-9  # of the largest number of the blocks: rounding
-MOST_REPLACED = 50  # poses that cannot be reached, before that is said instead
-TRIED = 6  # poses of a plan one of which a pose put into it must be able to reach
+TRIED = 6  # poses of the hub one of which a pose put into a plan must be able to reach
 LIKELY = 400  # candidates that gain most, of which that is found out
 VIA = 200  # candidates through which a blocked move may go
+REPLACED = 10  # times at most
 
 
 def ordered(
@@ -301,12 +302,10 @@ def ordered(
     `pinned`, and all poses then polished again, as far as moves reach them there.  Raises
     InsufficientDataError where that does not end.
     """
-    order = _Ordering(search, _Paths(search.searches.checker), pinned)
-    plan, execution = order.reachable(found)
+    order, warnings = _Ordering(search, found, pinned), []
+    plan, execution = order.reachable()
     if order.gone:
         plan, execution = order.polished(plan, execution)
-    warnings = []
-    if order.gone:
         warnings.append(f"{order.gone} better poses were left out, as no free move reaches them")
     if execution.one_sided:
         told = ", ".join(str(k + 1) for k in execution.one_sided)
@@ -315,109 +314,131 @@ def ordered(
 
 
 class _Ordering:
-    """Plans put in order; `gone` poses of them were unreachable so far."""
+    """A plan `found` put in order; `gone` poses of it were unreachable so far.
 
-    def __init__(self, search: Search, paths: _Paths, pinned: FeasiblePool | None) -> None:
-        self.search, self.paths, self.pinned, self.gone = search, paths, pinned, 0
-        self.unwound = False
-        self.found: Selection | None = None
+    The `hub` (k, n): home, and poses of the pool, which free moves join; blocked moves may go
+    through them.
+    """
 
-    def reachable(self, found: Selection) -> tuple[Selection, Execution]:
+    def __init__(self, search: Search, found: Selection, pinned: FeasiblePool | None) -> None:
+        self.search, self.found, self.pinned, self.gone = search, found, pinned, 0
+        self.paths = _Paths(search.searches.checker)
+        self.hub = found.pool.q[:: max(len(found.pool) // VIA, 1)]
+
+    def reachable(self) -> tuple[Selection, Execution]:
         """The plan, or that with others in the place of unreachable poses, in an order."""
-        shares = self.search.problem(found.pool).shares
-        while True:
+        for k in range(REPLACED):
             try:
-                plan, execution = self.put(found)
+                return self.put(self.found)
             except Unreachable as error:
-                if not self.unwound:
-                    self.unwound = True
-                    continue
-                pool, whole = found.pool, found.whole(self.pinned)
-                gone = np.unique(whole.chosen[error.poses])
-                others = np.delete(pool.group, gone[gone < len(pool)])
-                few = np.bincount(others, minlength=len(shares)) < shares
-                if self.gone >= MOST_REPLACED or (gone >= len(pool)).any() or few.any():
-                    raise
-                self.gone += len(error.poses)
-                self.search.progress(
-                    f"{self.gone} poses that no free move reaches are replaced by the best others"
-                )
-                there = whole.pool.q[np.setdiff1d(whole.chosen, gone)]
-                chosen = self.search.checkpoint.finished(
-                    f"replaced{self.gone}",
-                    lambda: self._replaced(found, gone, there),  # noqa: B023
-                )["chosen"]
-                kept = np.setdiff1d(np.arange(len(pool)), gone)
-                value = self.search.value(pool, chosen)
-                first = found.first - int((gone < found.first).sum())
-                found = found.exchanged(pool.take(kept), np.searchsorted(kept, chosen), value)
-                certificate = replace(found.certificate, pool=len(kept))
-                found = replace(found, first=first, certificate=certificate)
-                continue
-            self.found = found
-            return plan, execution
+                if k == 0:
+                    self.found = self._unwound()
+                else:
+                    self._replace(error)
+        return self.put(self.found)
 
     def put(self, found: Selection) -> tuple[Selection, Execution]:
         search, plan = self.search, found.whole(self.pinned)
-        setup = search.setup
-        if self.unwound:
-            plan = _unwound(setup, plan, self.paths.feasibility)
+        setup, plain = search.setup, search.plain
         q, blocks = plan.pool.q[plan.chosen], plan.pool.blocks[plan.chosen]
-        plain, M = search.plain, search.plain.gathered(blocks)
         readings = plan.pool.readings[plan.chosen]
+        M = plain.gathered(blocks)
         alias = Alias.of(plain.information, q, blocks, M, plain.target_rows, readings)
-        plan = replace(plan, alias=alias)
         rules = self.paths.feasibility
         execution = schedule(
             q, at_stops(rules.cell), self.paths,
             loads=setup.information.forces,
             read=readings > 0,
             limits=joint_limits(rules.cell, rules.chain),
-            via=plan.pool.q[:: max(len(plan.pool) // VIA, 1)],
+            via=self.hub,
             blockers=blockers_of(rules),
             alias=alias,
             paired=rules.cell.model.observe == "deflection",
             seed=search.seed, progress=search.progress,
         )  # fmt: skip
-        return plan, execution
+        return replace(plan, alias=alias), execution
 
     def polished(self, plan: Selection, execution: Execution) -> tuple[Selection, Execution]:
         found, search = self.found, self.search
-        if found is None or not search.effort.starts:
+        if not search.effort.starts:
             return plan, execution
         pool, chosen = search.polished(found.pool, found.chosen, "replaced")
         value = search.value(pool, chosen)
-        if value >= found.value:
-            return plan, execution
-        try:
-            return self.put(found.exchanged(pool, chosen, value))
-        except Unreachable:
-            return plan, execution
+        with suppress(Unreachable):
+            if value < found.value:
+                return self.put(found.exchanged(pool, chosen, value))
+        return plan, execution
 
-    def _replaced(self, found: Selection, gone: IntArray, there: Array) -> State:
-        """What is `chosen` instead of the plan `found` without the candidates `gone`.
+    def _unwound(self) -> Selection:
+        """The same postures, whole turns nearer to home, or to the middle of the joint ranges.
 
-        In their place, and by exchange in that of others, come those of the LIKELY candidates of a
-        level that a free move joins, as postures, to poses of the plan that are `there`.
+        Between an arm's posture and the same a turn on, there is often no way: the floor, or the
+        arm itself.  Poses whose information would be another are left as they are.
         """
-        problem, were = self.search.problem(found.pool), found.chosen
-        q = _nearer(self.paths.feasibility, found.pool.q)
-        kept, pool = np.setdiff1d(were, gone), [were]
-        V = inverse(problem.information(were))
+        rules, pool = self.paths.feasibility, self.found.pool
+        chain, home = rules.chain, rules.cell.design.motion.home
+        lower, upper = finite_ranges(chain, *joint_limits(rules.cell, chain))
+        turn = np.where([kind == "revolute" for kind in chain.kinds], 2 * np.pi, np.inf)
+        q = pool.q - np.nan_to_num(
+            turn * np.round((pool.q - ((lower + upper) / 2 if home is None else home)) / turn)
+        )
+        q = np.where((q >= lower) & (q <= upper), q, pool.q)
+        off = np.abs(self.search.setup.information.blocks(q, pool.readings) - pool.blocks)
+        same = off.max(axis=(1, 2)) <= ROUNDING * np.abs(pool.blocks).max()
+        pool = replace(pool, q=np.where(same[:, None], q, pool.q))
+        self.hub = pool.q[:: max(len(pool) // VIA, 1)]
+        return replace(self.found, pool=pool)
+
+    def _replace(self, error: Unreachable) -> None:
+        """In the place of the poses that cannot be reached, and by exchange in that of others, come
+        those of the LIKELY candidates of a level that a free move joins to the hub."""
+        search, found, pool = self.search, self.found, self.found.pool
+        problem, gone = search.problem(pool), found.whole(self.pinned).chosen[error.poses]
+        if (gone >= len(pool)).any():
+            raise error
+        self.gone += len(gone)
+        search.progress(f"{self.gone} poses that no free move reaches are replaced by others")
+        kept = np.setdiff1d(found.chosen, gone)
+        self.hub = self._joined(np.vstack([self.hub, pool.q[kept]]))
+        V = inverse(problem.information(found.chosen))
         worth = problem.prices(V @ problem.criterion.slope(V)[1] @ V)
+        some = [kept]
         for level, share in enumerate(problem.shares):
-            own = np.setdiff1d(np.flatnonzero(problem.group == level), were)
+            own = np.setdiff1d(np.flatnonzero(problem.group == level), found.chosen)
             ranked, n = own[np.argsort(-worth[own], kind="stable")], 0
             while len(ranked) and n < share:
                 tried, ranked = ranked[:LIKELY], ranked[LIKELY:]
-                pool.append(tried[~_apart(self.paths, q[tried], there)])
-                n += len(pool[-1])
-        some = np.setdiff1d(np.concatenate(pool), gone)
-        if (np.bincount(problem.group[some], minlength=len(problem.shares)) < problem.shares).any():
-            # It is said once all have gone.
-            some = np.setdiff1d(np.arange(len(problem.blocks)), gone)
-        part = problem.restricted(some)
-        return {"chosen": some[exchange(part, fitted(part, np.searchsorted(some, kept)))[0]]}
+                some.append(tried[self._reached(pool.q[tried])])
+                n += len(some[-1])
+        left = np.sort(np.concatenate(some))
+        if (np.bincount(problem.group[left], minlength=len(problem.shares)) < problem.shares).any():
+            raise error
+        part = problem.restricted(left)
+        begun = fitted(part, np.searchsorted(left, kept))
+        chosen = left[exchange(part, begun)[0]]
+        self.found = found.exchanged(pool, chosen, search.value(pool, chosen))
+
+    @property
+    def _loaded(self) -> bool:
+        return bool(np.any(self.paths.feasibility.cell.design.loads))
+
+    def _joined(self, q: Array) -> Array:
+        """Those of q (N, n) that free moves join, with home where there is one."""
+        motion = self.paths.feasibility.cell.design.motion
+        points = q if motion.home is None else np.vstack([motion.home, q])
+        roadmap = Roadmap(points, travel_times(points, motion.speed), self._loaded, self.paths)
+        parts = roadmap.parts(list(range(len(points))))
+        return points[parts[0] if motion.home is None else next(p for p in parts if 0 in p)]
+
+    def _reached(self, q: Array) -> BoolArray:
+        """(N,): a free move joins the posture q (N, n) to one of the TRIED next to it of the
+        hub."""
+        next_to = np.argsort(np.abs(q[:, None] - self.hub).max(axis=2), axis=1)
+        alone = np.arange(len(q))
+        for k in range(min(TRIED, len(self.hub))):
+            there = self.hub[next_to[alone, k]]
+            alone = alone[~self.paths.paths_free(q[alone], there, self._loaded)]
+        return ~np.isin(np.arange(len(q)), alone)
 
 
 class _Paths:
@@ -435,42 +456,3 @@ class _Paths:
             free = self.feasibility.paths_free(q_from[new], q_to[new], loaded)
             self.known.update((keys[k], bool(f)) for k, f in zip(new, free, strict=True))
         return np.array([self.known[key] for key in keys], dtype=bool)
-
-
-def _apart(paths: _Paths, q: Array, there: Array) -> BoolArray:
-    """(N,): no free move joins the posture q (N, n) to one of the TRIED next to it of those that
-    are `there` (k, n)."""
-    loaded = bool(np.any(paths.feasibility.cell.design.loads))
-    next_to = np.argsort(np.abs(q[:, None] - there).max(axis=2), axis=1)
-    alone = np.arange(len(q))
-    for k in range(min(TRIED, len(there))):
-        alone = alone[~paths.paths_free(q[alone], there[next_to[alone, k]], loaded)]
-    return np.isin(np.arange(len(q)), alone)
-
-
-def _nearer(feasibility: Feasibility, q: Array) -> Array:
-    """Postures q (N, n) whole turns nearer to home, or to the middle of the joint ranges."""
-    chain = feasibility.chain
-    lower, upper = finite_ranges(chain, *joint_limits(feasibility.cell, chain))
-    home = feasibility.cell.design.motion.home
-    middle = (lower + upper) / 2 if home is None else home
-    turning = np.array([kind == "revolute" for kind in chain.kinds])
-    near = q - np.where(turning, 2 * np.pi * np.round((q - middle) / (2 * np.pi)), 0.0)
-    return np.where((near >= lower) & (near <= upper), near, q)
-
-
-def _unwound(setup: Setup, plan: Selection, feasibility: Feasibility) -> Selection:
-    """The same postures, whole turns nearer to home, or to the middle of the joint ranges.
-
-    Between an arm's posture and the same a turn on, there is often no way: the floor, or the arm
-    itself.  Poses whose information would be another, and those that stay, are left as they are.
-    """
-    pool = plan.pool
-    own = plan.chosen[plan.chosen < len(pool) - plan.pinned]
-    was = pool.q[own]
-    near = _nearer(feasibility, was)
-    blocks, before = setup.information.blocks(near, pool.readings[own]), pool.blocks[own]
-    off = np.abs(blocks - before).max(axis=(1, 2)) > ROUNDING * np.abs(before).max()
-    q = pool.q.copy()
-    q[own] = np.where(off[:, None], was, near)
-    return replace(plan, pool=replace(pool, q=q))
