@@ -18,13 +18,31 @@ from elastocal.identification.noise_structure import (
 from elastocal.identification.weighted_problem import Weights, whitener
 from elastocal.model.manipulator import Model
 from elastocal.model.observations import Observations
-from elastocal.units import Array
+from elastocal.units import Array, IntArray
 
 
-def settling_joints(model: Model, record: VisitRecord) -> SharedEffect:
+def settled(model: Model, record: VisitRecord | None) -> list[SharedEffect]:
     """What the joints' own scatter of `[noise]` puts on each visit's readings, of variance one."""
-    loading = record.motion * model.cell.noise.of_joints(model.chain.n_joints)
-    return SharedEffect("joints", (VISIT,), record.visit, loading)
+    noise = model.cell.noise
+    if record is None or not noise.joints.any():
+        return []
+    loading = record.motion * noise.of_joints(model.chain.n_joints)
+    return [SharedEffect("joints", (VISIT,), record.visit, loading)]
+
+
+def configured(model: Model, observed: Observations) -> list[SharedEffect]:
+    """What `[noise]` says that configurations are off by as a whole, likewise."""
+    off = model.cell.noise.configuration
+    if not off or observed.kind not in ("position", "pose"):
+        return []
+    return [moved_together("configuration", observed, observed.configuration, off)]
+
+
+def moved_together(name: str, observed: Observations, unit: IntArray, off: float) -> SharedEffect:
+    """A deviation of `off` m in each direction common to the positions of each `unit` (N,)."""
+    axes = np.eye(observed.size)[:, : min(observed.size, 3)] * off
+    loading = np.broadcast_to(axes, (len(unit), 1, *axes.shape))
+    return SharedEffect(name, (name,), unit[:, None], loading)
 
 
 def stated_lasting(model: Model, record: VisitRecord) -> float:
@@ -44,15 +62,8 @@ def with_stated_sharing(own: Weights, model: Model, observed: Observations, x: A
     if not noise.shared or own.whiten is None or not own.absolute:
         return own
     record = visit_record(model, observed, x)
-    effects: list[SharedEffect] = []
-    if record is not None and noise.joints.any():
-        effects.append(settling_joints(model, record))
+    effects = [*settled(model, record), *configured(model, observed)]
     position = np.arange(size) < 3
-    if noise.configuration and observed.kind in ("position", "pose"):
-        off = np.diag(np.where(position, noise.configuration, 0.0))[:, position]
-        unit = observed.configuration[:, None]
-        loading = np.broadcast_to(off, (len(unit), 1, *off.shape))
-        effects.append(SharedEffect("configuration", ("configuration",), unit, loading))
     waves = None
     if record is not None and noise.drift and size > 1:
         along, lasting = np.where(position, noise.drift, 0.0), stated_lasting(model, record)

@@ -316,7 +316,6 @@ class StaticTorque:
         torque = ca.gradient(arm.potential, arm.q_commanded)
         torque = ca.substitute(torque, symbolic.p, ca.DM(nominal))
         inputs = [arm.inputs["q"], arm.inputs["force"]]
-        self.symbolic = ca.Function("torque", inputs, [torque])
         self._compiled = BatchFunction(inputs, [torque])
 
     def __call__(self, poses: Poses) -> Array:

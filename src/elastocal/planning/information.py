@@ -13,18 +13,18 @@ from scipy import linalg, sparse
 from elastocal.cell.work_cell import Cell
 from elastocal.errors import InputError, InsufficientDataError, option, require
 from elastocal.identification.identify import identify
-from elastocal.identification.noise_structure import SharedEffect, visit_record
+from elastocal.identification.noise_structure import VISIT, visit_record
 from elastocal.identification.options import Options
 from elastocal.identification.outliers import kept_of
 from elastocal.identification.solve import WORTH_A_COLUMN, Reduction, reduce
-from elastocal.identification.stated_noise import settling_joints
+from elastocal.identification.stated_noise import configured, moved_together, settled
 from elastocal.identification.weighted_problem import (
     Weights,
+    block_diagonal,
     stated_covariance,
-    weights_for,
     whitener,
 )
-from elastocal.measurements import Measurements
+from elastocal.measurements import Measurements, load_states, numbered
 from elastocal.model.chain import joint_index
 from elastocal.model.effects.catalogue import effect_of
 from elastocal.model.manipulator import Model
@@ -131,55 +131,54 @@ def _told(cell: Cell, readings: int, size: int) -> float:
     return 1.0 if dof is None else kept_of(dof, readings * size, size).variance
 
 
+def reading_noise(
+    model: Model, observed: Observations, x: Array, readings: Array | float = 1.0, visits: int = 1
+) -> sparse.csr_array:
+    """Covariance (rows, rows) of the observations, means of so many `readings` (n,) of each table
+    row, and of so many `visits`.
+
+    Σ = (T Σ_rows Tᵀ / readings + τ² per visit and direction + J diag(s²) Jᵀ) / visits + s_c² per
+    configuration: deflections share their unloaded reading; what the arm does not repeat, τ of
+    `[design] repeatability_um` and s of the joints of `[noise]`, is common to the markers of a
+    visit, and what a configuration is off by as a whole to all of its visits.  J is that of the
+    arm x (parameters,).
+    """
+    cell, table = model.cell, observed.table
+    single = reading_covariance(model, observed) / np.asarray(readings).reshape(-1, 1, 1)
+    T = sparse.kron(observed.combine, sparse.eye_array(observed.size), format="csr")
+    covariance = T @ block_diagonal(single) @ T.T
+    shared = []
+    if (tau := cell.design.repeatability) > 0:
+        force = load_states(table.force[observed.lead])
+        shared.append(moved_together(VISIT, observed, numbered(observed.configuration, force), tau))
+    if cell.noise.joints.any():
+        shared += settled(model, visit_record(model, observed, x))
+    for effect in shared:
+        Z = effect.columns()
+        covariance = covariance + Z @ Z.T
+    covariance = covariance / visits
+    for effect in configured(model, observed):
+        Z = effect.columns()
+        covariance = covariance + Z @ Z.T
+    return sparse.csr_array(covariance)
+
+
 def pose_covariance(
     model: Model, observed: Observations, n_poses: int, x: Array, readings: IntArray | None = None
 ) -> Array:
-    """Covariance (N, r, r) of a pose's observations, means of `readings` (N, L) each in the load
-    states, `[design] repeats` where these are None.
-
-    Σ = T Σ_rows Tᵀ / repeats + τ² per load state and direction + J diag(s²) Jᵀ: deflections share
-    their unloaded reading; what the arm does not repeat, τ of `[design] repeatability_um` and s of
-    the joints of `[noise]`, is common to the markers of a visit.  A pose that is approached from
-    both sides is visited twice, but what its readings share by `[noise]` remains; deflections do
-    not have that.  J is that of the arm x (parameters,).
-    """
-    spec = model.cell.design
-    visits = 2 if spec.motion.both_directions else 1
-    single = reading_covariance(model, observed)
-    size, rows = single.shape[1], len(observed.table) // n_poses
+    """Covariance (N, r, r) of the observations of each pose, means of `readings` (N, L) in the load
+    states, `[design] repeats` where these are None.  A pose that is approached from both sides is
+    visited twice."""
+    spec, rows = model.cell.design, len(observed.table)
     each = np.full((n_poses, 1), spec.repeats) if readings is None else np.maximum(readings, 1)
-    single = single.reshape(n_poses, rows, size, size)
-    single = single / np.repeat(each, rows // each.shape[1], axis=1)[:, :, None, None]
-    full = np.zeros((n_poses, rows, size, rows, size))
-    index = np.arange(rows)
-    full[:, index, :, index, :] = single.transpose(1, 0, 2, 3)
-    # Rows combine to observations in the same way at every pose.
-    T = observed.combine[: len(observed.lead) // n_poses, :rows].toarray()
-    covariance = np.einsum("ak,nkilj,bl->naibj", T, full, T, optimize=True)
-    r = T.shape[0] * size
-    covariance = covariance.reshape(n_poses, r, r)
-    if spec.repeatability > 0:
-        force = observed.table.force[observed.lead[: T.shape[0]]]
-        same = (force[:, None] == force[None]).all(axis=2).astype(float)
-        moved = np.diag(np.arange(size) < 3).astype(float)
-        covariance = covariance + spec.repeatability**2 * np.kron(same, moved)
-    if model.cell.noise.joints.any():
-        settling = _settling(model, observed, x)
-        members = np.arange(len(observed.lead)).reshape(n_poses, -1)
-        loading = settling.packed(members)
-        covariance = covariance + loading @ loading.transpose(0, 2, 1)
-    covariance = covariance / visits
-    if model.cell.noise.configuration and observed.kind != "deflection":
-        moved = np.diag(np.arange(size) < 3).astype(float)
-        same = np.ones((T.shape[0], T.shape[0]))
-        covariance = covariance + model.cell.noise.configuration**2 * np.kron(same, moved)
-    return covariance
-
-
-def _settling(model: Model, observed: Observations, x: Array) -> SharedEffect:
-    record = visit_record(model, observed, x)
-    assert record is not None
-    return settling_joints(model, record)
+    each = np.repeat(each.ravel(), rows // each.size).astype(float)
+    visits = 2 if spec.motion.both_directions else 1
+    found = reading_noise(model, observed, x, each, visits).tocoo()
+    r = found.shape[0] // n_poses
+    blocks = np.zeros((n_poses, r, r))
+    i, j = found.coords
+    blocks[i // r, i % r, j % r] = found.data
+    return blocks
 
 
 # From the symbolic model to information: whitened B of any pose.
@@ -438,24 +437,5 @@ def next_number(labels: Iterable[str]) -> int:
 
 
 def observed_weights(model: Model, observed: Observations, x: Array) -> Weights:
-    """The stated noise, and with it what readings of one visit share."""
-    stated = weights_for(observed, model.cell.tracker)
-    tau, scatters = model.cell.design.repeatability, model.cell.noise.joints.any()
-    told = _told(model.cell, len(observed.lead), observed.size)
-    if (tau == 0 and not scatters and told == 1) or stated.whiten is None:
-        return stated
-    inverse = sparse.linalg.inv(sparse.csc_array(stated.whiten))
-    key = np.column_stack(
-        [observed.configuration, np.round(observed.table.force[observed.lead], 6)]
-    )
-    visit = np.unique(key, axis=0, return_inverse=True)[1].ravel()
-    same = sparse.csr_array((np.ones(len(visit)), (np.arange(len(visit)), visit)))
-    moved = sparse.dia_array(
-        (np.where(np.arange(observed.size) < 3, 1.0, 0.0)[None], [0]),
-        shape=(observed.size, observed.size),
-    )
-    covariance = told * (inverse @ inverse.T) + tau**2 * sparse.kron(same @ same.T, moved)
-    if scatters:
-        Z = _settling(model, observed, x).columns()
-        covariance = covariance + Z @ Z.T
-    return Weights(stated.kind, whitener(sparse.csr_array(covariance)), True, stated.description)
+    """The stated noise, and with it what readings of one visit or configuration share."""
+    return Weights("stated", whitener(reading_noise(model, observed, x)), True, "noise as stated")

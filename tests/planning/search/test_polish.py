@@ -82,7 +82,7 @@ def test_a_polished_plan_is_better_and_keeps_limits_levels_and_rules(
     after = value_of(arm, whole, end)
     assert after < 0.9 * before
     assert arm.searches.feasible(end).all()
-    lower, upper = arm.searches.bounds(group)
+    lower, upper = arm.searches.bounds(group, q, np.full(len(q), np.inf))
     assert (end >= lower - 1e-12).all() and (end <= upper + 1e-12).all()
 
 
