@@ -54,7 +54,7 @@ def walled(wall: float) -> Walled:
 
 def search(setup: Any, found: Selection, cell: Walled, effort: str) -> Search:
     space = joint_space(CELL, CHAIN)
-    searches = Searches(setup.information, space, cell)
+    searches = Searches(setup, space, cell)
     return Search(
         setup, found.pool, searches, SHARES, EFFORTS[effort], 0, Checkpoint(), lambda text: None,
         setup,

@@ -274,7 +274,7 @@ class _Design:
             )
             setup = setup.sharing(float(state["share"]))
         search = setup.having(pinned)
-        searches = Searches(setup.information, self.space, self.feasibility)
+        searches = Searches(search, self.space, self.feasibility)
         effort = EFFORTS[options.effort]
         effort = effort.in_pool if self.cell.design.candidates is None else effort
 

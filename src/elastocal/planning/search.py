@@ -7,7 +7,7 @@ on the pool is one on what was found between its candidates too.
 from __future__ import annotations
 
 from contextlib import suppress
-from dataclasses import asdict, dataclass, replace
+from dataclasses import dataclass, replace
 
 import numpy as np
 
@@ -43,7 +43,7 @@ from elastocal.units import Array, BoolArray, IntArray, Progress
 
 POOL = 2000  # candidates where nobody asks for a number
 CLOSE, FINE = 1e-3, 1e-4  # gap of the relaxations that lead to the next one, and of the last
-# Of Φ: what starts differ by less is where IPOPT stops, and mirrored poses tell apart by rounding.
+# Of Φ: by less do starts differ that end alike, and mirrored poses, which rounding tells apart.
 SAME = 1e-4
 NEAR = 0.97  # of the bound on the pool: a continuum as near as that is not searched again
 REFINED = 3  # times at most
@@ -200,18 +200,19 @@ class Search:
     def polished(
         self, pool: FeasiblePool, chosen: IntArray, name: str, fine: bool = False
     ) -> tuple[FeasiblePool, IntArray]:
-        were, of, read = pool.q[chosen], pool.group[chosen], pool.readings[chosen]
+        plan = pool.take(chosen)
 
         def make() -> State:
-            return {"q": polish(self.problem(pool), self.searches, self.T, were, of, read, fine)}
+            return {"q": polish(self.problem(pool), self.searches, self.T, plan, fine)}
 
         q = self.checkpoint.finished(name, make)["q"]
-        moved = (q != were).any(axis=1)
+        moved = (q != plan.q).any(axis=1)
         if not moved.any():
             return pool, chosen
         now = chosen.copy()
         now[moved] = len(pool) + np.arange(moved.sum())
-        return pool.joined(self.setup.pool(q[moved], of[moved], read[moved])), now
+        more = self.setup.pool(q[moved], plan.group[moved], plan.readings[moved])
+        return pool.joined(more), now
 
     def _better(self, pool: FeasiblePool, best: IntArray, other: IntArray) -> IntArray:
         return other if self.value(pool, other) < self.value(pool, best) * (1 - SAME) else best
@@ -223,21 +224,25 @@ class Search:
 
     def _continuum(self, pool: FeasiblePool, relaxed: Relaxed, seed: int) -> Continuum:
         return estimate(
-            self.problem(pool), relaxed.tangent, self.searches, self.T, pool.q, pool.readings,
-            ways=self.setup.ways, seed=self.seed + seed, progress=self.progress,
+            self.problem(pool), relaxed.tangent, self.searches, self.T, pool, self.seed + seed,
+            self.progress,
         )  # fmt: skip
 
     def _widened(
         self, pool: FeasiblePool, relaxed: Relaxed, k: int, found: list[Continuum]
     ) -> FeasiblePool:
         """The pool with the poses of the continuum that the relaxed optimum lacks."""
-        state = self.checkpoint.finished(
-            f"continuum{k}", lambda: asdict(self._continuum(pool, relaxed, k))
-        )
-        at = state["q"], state["group"], state["readings"]
-        counts = (int(state[name]) for name in ("searched", "ascents"))
-        found.append(Continuum(float(state["bound"]), *at, *counts))
-        return pool.joined(self.setup.pool(*at)) if len(at[0]) else pool
+
+        def make() -> State:
+            c = self._continuum(pool, relaxed, k)
+            at = {name: getattr(c.found, name) for name in ("q", "group", "readings")}
+            return at | {"figures": [c.bound, c.searched, c.ascents]}
+
+        state = self.checkpoint.finished(f"continuum{k}", make)
+        bound, searched, ascents = state["figures"]
+        more = self.setup.pool(state["q"], state["group"], state["readings"])
+        found.append(Continuum(float(bound), more, int(searched), int(ascents)))
+        return pool.joined(more)
 
     def _bettered(
         self, pool: FeasiblePool, best: IntArray, relaxed: Relaxed, k: int
@@ -267,9 +272,9 @@ class Search:
         found = [*found, self._continuum(pool, relaxed, ROUND)]
         for k in range(REFINED):
             new = found[-1]
-            if new.bound >= NEAR * relaxed.bound or not len(new.q):
+            if new.bound >= NEAR * relaxed.bound or not len(new.found):
                 break
-            pool = pool.joined(self.setup.pool(new.q, new.group, new.readings))
+            pool = pool.joined(new.found)
             relaxed = self._again(pool, relaxed)
             found.append(self._continuum(pool, relaxed, (k + 2) * ROUND))
         beyond = min(found[-1].bound, bound)

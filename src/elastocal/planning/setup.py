@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from contextlib import suppress
 from dataclasses import dataclass, replace
 from functools import cached_property
@@ -45,7 +46,7 @@ from elastocal.planning.test_poses import (
 )
 from elastocal.simulation import expand_plan, simulate
 from elastocal.text import listed
-from elastocal.units import Array, IntArray, Progress
+from elastocal.units import Array, BoolArray, IntArray, Progress
 
 # Everything a design knows before it chooses: parameters, criterion, information known before.
 
@@ -78,16 +79,16 @@ class FeasiblePool:
     def n_groups(self) -> int:
         return int(self.group.max()) + 1
 
-    def take(self, kept: IntArray) -> FeasiblePool:
+    def take(self, kept: IntArray | BoolArray) -> FeasiblePool:
         return FeasiblePool(self.q[kept], self.group[kept], self.readings[kept], self.blocks[kept])
 
+    @classmethod
+    def join(cls, lots: Sequence[FeasiblePool]) -> FeasiblePool:
+        names = ("q", "group", "readings", "blocks")
+        return cls(*(np.concatenate([getattr(lot, name) for lot in lots]) for name in names))
+
     def joined(self, other: FeasiblePool) -> FeasiblePool:
-        return FeasiblePool(
-            np.vstack([self.q, other.q]),
-            np.append(self.group, other.group),
-            np.vstack([self.readings, other.readings]),
-            np.concatenate([self.blocks, other.blocks]),
-        )
+        return FeasiblePool.join([self, other])
 
 
 @dataclass(frozen=True)

@@ -21,6 +21,7 @@ from elastocal.planning.feasibility import Feasibility
 from elastocal.planning.information import PoseInformation
 from elastocal.planning.polish import Searches
 from elastocal.planning.relaxation import DesignProblem
+from elastocal.planning.setup import FeasiblePool, Setup
 
 EFFECTS = tuple(f"joint_compliance:joint{i}" for i in (2, 3, 4))
 LOAD = np.array([[0.0, 0.0, -200.0]])
@@ -50,7 +51,17 @@ class Case:
 
     @cached_property
     def searches(self) -> Searches:
-        return Searches(self.information, self.space, self.rules)
+        return Searches(self.setup, self.space, self.rules)
+
+    @cached_property
+    def setup(self) -> Setup:
+        """What polish asks of one: how poses are read."""
+        nothing: Any = None
+        ways = self.information.everything
+        return Setup(self.information, nothing, nothing, None, np.zeros(0), (), ways)
+
+    def pool(self, q: Any, group: Any) -> FeasiblePool:
+        return self.setup.pool(q, group)
 
     def draw(self, n: int, seed: int = 0, jobs: int = 1) -> Candidates:
         model = self.model

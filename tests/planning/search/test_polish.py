@@ -9,9 +9,8 @@ import numpy as np
 import pytest
 
 from elastocal.cell.work_cell import HalfSpace, Solid, Workspace
-from elastocal.planning.criteria import inverse
 from elastocal.planning.exchange import random_plan
-from elastocal.planning.polish import estimate, polish
+from elastocal.planning.polish import JointSearch, estimate, polish
 from elastocal.planning.relaxation import RIDGE, balancing, in_terms, relax
 
 Build = Callable[..., Any]
@@ -44,10 +43,6 @@ def posed(case: Build, name: str, criterion: str = "test_pose", n: int = 5, seed
     return arm, pool, whole, problem, T, chosen
 
 
-def everything(arm: Any, q: Any) -> Any:
-    return np.repeat(arm.information.everything, len(q), axis=0)
-
-
 def value_of(arm: Any, whole: Any, q: Any) -> float:
     B = arm.information.blocks(q)
     M = whole.prior + np.einsum("nri,nrj->ij", B, B)
@@ -58,8 +53,7 @@ def value_of(arm: Any, whole: Any, q: Any) -> float:
 def test_slopes_are_those_of_the_blocks(case: Build, name: str) -> None:
     arm, pool, _, _, T, chosen = posed(case, name)
     q, group = pool.q[chosen], pool.group[chosen]
-    search = arm.searches.joint(q, group, everything(arm, q))
-    search.T, search.whitener = T, inverse(arm.information.noise(q)[1])
+    search = JointSearch(arm.searches, T, arm.pool(q, group))
     exact = arm.information.blocks(q) @ T
     np.testing.assert_allclose(search.blocks(q), exact, rtol=1e-9, atol=1e-9 * np.abs(exact).max())
     rng = np.random.default_rng(1)
@@ -78,38 +72,35 @@ def test_a_polished_plan_is_better_and_keeps_limits_levels_and_rules(
     arm, pool, whole, problem, T, chosen = posed(case, name, criterion)
     q, group = pool.q[chosen], pool.group[chosen]
     before = whole.value(chosen)
-    end = polish(problem, arm.searches, T, q, group, everything(arm, q))
+    end = polish(problem, arm.searches, T, arm.pool(q, group))
     after = value_of(arm, whole, end)
     assert after < 0.9 * before
     assert arm.searches.feasible(end).all()
-    lower, upper = arm.searches.bounds(group, q, np.full(len(q), np.inf))
+    lower, upper = (np.array(side) for side in zip(*map(arm.space.bounds, group), strict=True))
     assert (end >= lower - 1e-12).all() and (end <= upper + 1e-12).all()
 
 
 def test_the_bound_on_the_continuum_is_below_that_on_the_pool(case: Build) -> None:
     arm, pool, whole, problem, T, _ = posed(case, "clutter")
     relaxed = relax(problem)
-    found = estimate(
-        problem, relaxed.tangent, arm.searches, T, pool.q, everything(arm, pool.q),
-        ways=arm.information.everything,
-    )  # fmt: skip
+    found = estimate(problem, relaxed.tangent, arm.searches, T, arm.pool(pool.q, pool.group))
     assert 0 < found.bound <= relaxed.bound * (1 + 1e-9)
-    assert len(found.q) and arm.searches.feasible(found.q).all()
-    B = arm.information.blocks(found.q) @ T
+    assert len(found.found) and arm.searches.feasible(found.found.q).all()
+    B = found.found.blocks @ T
     d = np.einsum("nri,ij,nrj->n", B, relaxed.tangent.G, B)
     assert (d > problem.prices(relaxed.tangent.G).max()).all()
     # Their tangent bounds plans of poses anywhere, as those of a polish.
     for seed in range(2):
         plan = random_plan(problem, np.random.default_rng(seed))
         q = pool.q[plan]
-        end = polish(problem, arm.searches, T, q, pool.group[plan], everything(arm, q))
+        end = polish(problem, arm.searches, T, arm.pool(q, pool.group[plan]))
         assert value_of(arm, whole, end) >= found.bound * (1 - 1e-3)
 
 
 def test_a_plan_of_local_optimum_stays(case: Build) -> None:
     arm, pool, whole, problem, T, chosen = posed(case, "free")
     group = pool.group[chosen]
-    q = polish(problem, arm.searches, T, pool.q[chosen], group, everything(arm, chosen), fine=True)
-    again = polish(problem, arm.searches, T, q, group, everything(arm, q), fine=True)
+    q = polish(problem, arm.searches, T, arm.pool(pool.q[chosen], group), fine=True)
+    again = polish(problem, arm.searches, T, arm.pool(q, group), fine=True)
     phi, same = (value_of(arm, whole, at) for at in (q, again))
     assert same == pytest.approx(phi, rel=1e-4) and same <= phi
