@@ -80,7 +80,7 @@ def test_an_edited_cell_starts_anew(tmp_path, monkeypatch):
 
 
 def test_an_interrupt_that_a_solver_catches_is_not_lost(tmp_path, monkeypatch):
-    """CasADi catches it inside IPOPT and returns a search cut short, which must not be kept."""
+    """A library may catch it and return a search cut short, which must not be kept."""
     polish = search.polish
 
     def interrupted_polish(*arguments, **options):

@@ -283,7 +283,7 @@ class _Design:
                 search, pool, searches, shares, effort, options.seed, checkpoint, progress,
                 setup,
             )  # fmt: skip
-            return seek, seek.select(pool)
+            return seek, seek.select()
 
         curve = self._curve(search, pool)
         if self.cell.design.target is None:

@@ -32,7 +32,6 @@ from elastocal.planning.polish import Continuum, Searches, estimate, polish
 from elastocal.planning.relaxation import (
     RIDGE,
     DesignProblem,
-    Relaxed,
     balancing,
     check_enough,
     efficiency,
@@ -122,7 +121,8 @@ class Selection:
 
 
 class Search:
-    """What a plan is sought with: the setup, whose parameters y = T z are balanced.
+    """What a plan is sought with: the setup, whose parameters y = T z are balanced, and the `pool`,
+    which grows by what polish and ascents find.
 
     `plain`: the setup without the poses that stay, where there are some.  Raises
     InsufficientDataError where no plan can determine all parameters.
@@ -133,159 +133,145 @@ class Search:
         effort: SearchEffort, seed: int, checkpoint: Checkpoint, progress: Progress, plain: Setup,
     ) -> None:  # fmt: skip
         self.setup, self.searches, self.shares, self.plain = setup, searches, shares, plain
-        self.effort, self.seed = effort, seed
+        self.effort, self.seed, self.pool = effort, seed, pool
         self.checkpoint, self.progress = checkpoint, progress
         whole = setup.problem(pool, shares)
         check_enough(whole)
         self.T = balancing(whole)
-        self._last: tuple[FeasiblePool, DesignProblem] | None = None
+        self._of: tuple[FeasiblePool, DesignProblem] | None = None
 
-    def problem(self, pool: FeasiblePool) -> DesignProblem:
-        if self._last is None or self._last[0] is not pool:
-            self._last = pool, in_terms(self.setup.problem(pool, self.shares), self.T, RIDGE)
-        return self._last[1]
+    @property
+    def problem(self) -> DesignProblem:
+        if self._of is None or self._of[0] is not self.pool:
+            whole = self.setup.problem(self.pool, self.shares)
+            self._of = self.pool, in_terms(whole, self.T, RIDGE)
+        return self._of[1]
 
-    def value(self, pool: FeasiblePool, chosen: IntArray) -> float:
-        return self.setup.problem(pool, self.shares).value(chosen)
+    def value(self, chosen: IntArray) -> float:
+        return self.setup.problem(self.pool, self.shares).value(chosen)
 
-    def select(self, pool: FeasiblePool) -> Selection:
+    def select(self) -> Selection:
         """The best plan found and its certificate."""
-        first, efforts = len(pool), self.effort
-        self.progress(f"relaxation over {len(pool)} candidates")
-        relaxed = prospects(self.problem(pool), CLOSE if efforts.starts else FINE)
-        begins = self._begins(pool, relaxed)
-        best, least, ends = begins[0], np.inf, list[float]()
-        for k, chosen in enumerate(begins[: efforts.starts]):
-            pool, end = self.polished(pool, chosen, f"start{k}")
-            ends.append(self.value(pool, end))
-            self.progress(f"start {k + 1} of {efforts.starts}: {min(ends):.6g}")
-            if ends[-1] < least * (1 - SAME):
-                best, least = end, ends[-1]
-        continuum: list[Continuum] = []
-        for k in range(efforts.rounds):
-            relaxed = self._again(pool, relaxed)
-            if self.problem(pool).criterion.certifiable:
-                pool = self._widened(pool, relaxed, k + 1, continuum)
-            pool, best = self._bettered(pool, best, relaxed, k)
-        if efforts.starts:
-            relaxed = self._again(pool, relaxed, CLOSE if efforts.rounds else FINE)
-            mixed, _ = exact_plan(self.problem(pool), relaxed, warm=best, starts=2, seed=self.seed)
-            best = self._better(pool, best, mixed)
-        if efforts.rounds:
-            pool, best = self.polished(pool, best, "last", fine=True)
-        value = self.value(pool, best)
+        first, effort, seed = len(self.pool), self.effort, self.seed
+        self.progress(f"relaxation over {first} candidates")
+        self.relaxed = prospects(self.problem, CLOSE if effort.starts else FINE)
+        best, ends = self._started()
+        continuum = []
+        for k in range(effort.rounds):
+            self._relax()
+            if self.problem.criterion.certifiable:
+                continuum.append(self._widened(k + 1))
+            self._relax()
+            # One begun from the plan, one from the relaxation.
+            for name, warm in ((f"warm{k}", best), (f"anew{k}", None)):
+                new, _ = exact_plan(self.problem, self.relaxed, warm=warm, patience=0)
+                best = self._better(best, self.polished(new, name))
+        if effort.starts:
+            self._relax(CLOSE if effort.rounds else FINE)
+            mixed, _ = exact_plan(self.problem, self.relaxed, warm=best, starts=2, seed=seed)
+            best = self._better(best, mixed)
+        if effort.rounds:
+            best = self.polished(best, "last", fine=True)
+        value, pool = self.value(best), self.pool
         check_determined(self.setup.problem(pool, self.shares), value)
-        certificate = self._certificate(pool, relaxed, value, continuum)
-        certificate = replace(certificate, starts=tuple(ends))
-        return Selection(pool, best, value, certificate, first)
+        return Selection(pool, best, value, self._certificate(value, ends, continuum), first)
 
-    def _begins(self, pool: FeasiblePool, relaxed: Relaxed) -> list[IntArray]:
-        """Plans to polish: that of exchange, then roundings and random plans in turn."""
-        problem, rng = self.problem(pool), np.random.default_rng(self.seed)
+    def _started(self) -> tuple[IntArray, list[float]]:
+        """The best of plans begun from exchange, from roundings and random plans in turn, each
+        polished, and where these ended."""
+        problem, rng, effort = self.problem, np.random.default_rng(self.seed), self.effort
 
         def make() -> State:
             # Where plans are polished, other starts better them more than a longer search here.
-            patience = 0 if self.effort.starts else PATIENCE
+            patience = 0 if effort.starts else PATIENCE
             found = exact_plan(
-                problem, relaxed, starts=self.effort.exchanges, seed=self.seed, patience=patience
+                problem, self.relaxed, starts=effort.exchanges, seed=self.seed, patience=patience
             )
             return {"chosen": found[0]}
 
-        found = [self.checkpoint.finished("exchange", make)["chosen"]]
-        for k in range(1, self.effort.starts):
-            new = random_plan(problem, rng) if k % 2 else rounded(problem, relaxed.weights, rng)
-            found.append(new)
-        return found
+        best, least, ends = self.checkpoint.finished("exchange", make)["chosen"], np.inf, []
+        begins = [best]
+        for k in range(1, effort.starts):
+            new = (
+                random_plan(problem, rng) if k % 2 else rounded(problem, self.relaxed.weights, rng)
+            )
+            begins.append(new)
+        for k, chosen in enumerate(begins[: effort.starts]):
+            end = self.polished(chosen, f"start{k}")
+            ends.append(self.value(end))
+            self.progress(f"start {k + 1} of {effort.starts}: {min(ends):.6g}")
+            if ends[-1] < least * (1 - SAME):
+                best, least = end, ends[-1]
+        return best, ends
 
-    def polished(
-        self, pool: FeasiblePool, chosen: IntArray, name: str, fine: bool = False
-    ) -> tuple[FeasiblePool, IntArray]:
-        plan = pool.take(chosen)
+    def polished(self, chosen: IntArray, name: str, fine: bool = False) -> IntArray:
+        """The plan (k,) polished; poses that moved join the pool."""
+        plan = self.pool.take(chosen)
 
         def make() -> State:
-            return {"q": polish(self.problem(pool), self.searches, self.T, plan, fine)}
+            return {"q": polish(self.problem, self.searches, self.T, plan, fine)}
 
         q = self.checkpoint.finished(name, make)["q"]
-        moved = (q != plan.q).any(axis=1)
-        if not moved.any():
-            return pool, chosen
-        now = chosen.copy()
-        now[moved] = len(pool) + np.arange(moved.sum())
-        more = self.setup.pool(q[moved], plan.group[moved], plan.readings[moved])
-        return pool.joined(more), now
+        moved, now = (q != plan.q).any(axis=1), chosen.copy()
+        if moved.any():
+            now[moved] = len(self.pool) + np.arange(moved.sum())
+            more = self.setup.pool(q[moved], plan.group[moved], plan.readings[moved])
+            self.pool = self.pool.joined(more)
+        return now
 
-    def _better(self, pool: FeasiblePool, best: IntArray, other: IntArray) -> IntArray:
-        return other if self.value(pool, other) < self.value(pool, best) * (1 - SAME) else best
+    def _better(self, best: IntArray, other: IntArray) -> IntArray:
+        return other if self.value(other) < self.value(best) * (1 - SAME) else best
 
-    def _again(self, pool: FeasiblePool, relaxed: Relaxed, gap: float = CLOSE) -> Relaxed:
+    def _relax(self, gap: float = CLOSE) -> None:
         """The relaxation on a pool that has grown since."""
-        start = np.concatenate([relaxed.weights, np.zeros(len(pool) - len(relaxed.weights))])
-        return prospects(self.problem(pool), gap, start)
+        were = self.relaxed.weights
+        start = np.concatenate([were, np.zeros(len(self.pool) - len(were))])
+        self.relaxed = prospects(self.problem, gap, start)
 
-    def _continuum(self, pool: FeasiblePool, relaxed: Relaxed, seed: int) -> Continuum:
-        return estimate(
-            self.problem(pool), relaxed.tangent, self.searches, self.T, pool, self.seed + seed,
-            self.progress,
-        )  # fmt: skip
-
-    def _widened(
-        self, pool: FeasiblePool, relaxed: Relaxed, k: int, found: list[Continuum]
-    ) -> FeasiblePool:
-        """The pool with the poses of the continuum that the relaxed optimum lacks."""
+    def _widened(self, k: int) -> Continuum:
+        """What the relaxed optimum lacks of the continuum, whose poses join the pool."""
 
         def make() -> State:
-            c = self._continuum(pool, relaxed, k)
+            c = estimate(
+                self.problem, self.relaxed.tangent, self.searches, self.T, self.pool,
+                self.seed + k, self.progress,
+            )  # fmt: skip
             at = {name: getattr(c.found, name) for name in ("q", "group", "readings")}
             return at | {"figures": [c.bound, c.searched, c.ascents]}
 
         state = self.checkpoint.finished(f"continuum{k}", make)
         bound, searched, ascents = state["figures"]
         more = self.setup.pool(state["q"], state["group"], state["readings"])
-        found.append(Continuum(float(bound), more, int(searched), int(ascents)))
-        return pool.joined(more)
-
-    def _bettered(
-        self, pool: FeasiblePool, best: IntArray, relaxed: Relaxed, k: int
-    ) -> tuple[FeasiblePool, IntArray]:
-        """The pool and the better of the plan and those exchanged on the grown pool and polished:
-        one begun from the plan, one from the relaxation."""
-        problem, relaxed = self.problem(pool), self._again(pool, relaxed)
-        plans = [exact_plan(problem, relaxed, warm=w, patience=0)[0] for w in (best, None)]
-        for name, chosen in zip((f"warm{k}", f"anew{k}"), plans, strict=True):
-            pool, chosen = self.polished(pool, chosen, name)
-            best = self._better(pool, best, chosen)
-        return pool, best
+        self.pool = self.pool.joined(more)
+        return Continuum(float(bound), more, int(searched), int(ascents))
 
     def _certificate(
-        self, pool: FeasiblePool, relaxed: Relaxed, value: float, found: list[Continuum]
+        self, value: float, ends: list[float], continuum: list[Continuum]
     ) -> Certificate:
-        problem = self.problem(pool)
-        if not problem.criterion.certifiable:
-            return Certificate(len(pool), None, None)
-        if len(relaxed.weights) < len(pool):
-            relaxed = self._again(pool, relaxed, FINE)
-        bound, size = relaxed.bound, len(pool)
+        size, starts = len(self.pool), tuple(ends)
+        if not self.problem.criterion.certifiable:
+            return Certificate(size, None, None, starts=starts)
+        if len(self.relaxed.weights) < size:
+            self._relax(FINE)
+        bound = self.relaxed.bound
+        own = Certificate(size, bound, efficiency(value, bound), starts=starts)
         if not self.effort.starts:
-            return Certificate(size, bound, efficiency(value, bound))
+            return own
         # The tangent of the pool's optimum says little of poses far better than the pool's: they
         # join it, and that of the new optimum says more.
-        found = [*found, self._continuum(pool, relaxed, ROUND)]
-        for k in range(REFINED):
-            new = found[-1]
-            if new.bound >= NEAR * relaxed.bound or not len(new.found):
+        for k in range(1 + REFINED):
+            continuum = [*continuum, self._widened((k + 1) * ROUND)]
+            new = continuum[-1]
+            if new.bound >= NEAR * self.relaxed.bound or not len(new.found) or k == REFINED:
                 break
-            pool = pool.joined(new.found)
-            relaxed = self._again(pool, relaxed)
-            found.append(self._continuum(pool, relaxed, (k + 2) * ROUND))
-        beyond = min(found[-1].bound, bound)
-        return Certificate(
-            pool=size,
-            bound_pool=bound,
-            efficiency_pool=efficiency(value, bound),
+            self._relax()
+        beyond = min(new.bound, bound)
+        return replace(
+            own,
             bound_continuum=beyond,
             efficiency_continuum=efficiency(value, beyond),
-            searched=sum(c.searched for c in found),
-            ascents=sum(c.ascents for c in found),
+            searched=sum(c.searched for c in continuum),
+            ascents=sum(c.ascents for c in continuum),
         )
 
 
@@ -367,11 +353,12 @@ class _Ordering:
         found, search = self.found, self.search
         if not search.effort.starts:
             return plan, execution
-        pool, chosen = search.polished(found.pool, found.chosen, "replaced")
-        value = search.value(pool, chosen)
+        search.pool = found.pool
+        chosen = search.polished(found.chosen, "replaced")
+        value = search.value(chosen)
         with suppress(Unreachable):
             if value < found.value:
-                return self.put(found.exchanged(pool, chosen, value))
+                return self.put(found.exchanged(search.pool, chosen, value))
         return plan, execution
 
     def _unwound(self) -> Selection:
@@ -398,7 +385,8 @@ class _Ordering:
         """In the place of the poses that cannot be reached, and by exchange in that of others, come
         those of the LIKELY candidates of a level that a free move joins to the hub."""
         search, found, pool = self.search, self.found, self.found.pool
-        problem, gone = search.problem(pool), found.whole(self.pinned).chosen[error.poses]
+        search.pool = pool
+        problem, gone = search.problem, found.whole(self.pinned).chosen[error.poses]
         if (gone >= len(pool)).any():
             raise error
         self.gone += len(gone)
@@ -421,7 +409,7 @@ class _Ordering:
         part = problem.restricted(left)
         begun = fitted(part, np.searchsorted(left, kept))
         chosen = left[exchange(part, begun)[0]]
-        self.found = found.exchanged(pool, chosen, search.value(pool, chosen))
+        self.found = found.exchanged(pool, chosen, search.value(chosen))
 
     @property
     def _loaded(self) -> bool:
