@@ -156,7 +156,9 @@ def in_turns(tour: list[int], load: IntArray, sequence: list[int]) -> list[int]:
 HOT, SHORT, WARM, COLD = (4.0, 4.0, 4.0, 1.0, 0.25), 0.15, 0.06, 1e-3
 # Steps from HOT, from WARM, of blocked moves, and of the shortest order per visit.
 STEPS, FEW, MENDING, PER_VISIT = 40_000, 10_000, 2_500, 4000
-ROUNDS = 12  # of blocked moves found and the order mended, before the ways around are taken
+# Rounds of blocked moves found and the order mended, before all ways are looked at, and before the
+# ways around are taken.
+PATIENT, ROUNDS = 4, 12
 HOPED = 0.5  # of its bias is left by a whole search, at best, to an order that is nearly good
 
 
@@ -278,7 +280,7 @@ class VisitTimes:
         while moves.check(tour, clock.costs):
             progress(f"order of execution: {moves.checked} moves checked, {moves.blocked} blocked")
             rounds += 1
-            if moves.crowded or rounds == ROUNDS:
+            if rounds == PATIENT:
                 moves.settle()
             clock = clock.known()
             if rounds <= ROUNDS:

@@ -107,41 +107,35 @@ class Roadmap:
     def parts(self, needed: list[int]) -> list[list[int]]:
         """`needed` points by what is connected through free moves, the largest part first.
 
-        Only as many moves are checked as it takes, first among `needed`, then through all points.
+        Only as many moves are checked as it takes, first among `needed`, then through all points:
+        every part tries its shortest ways out, twice as many each time (Borůvka).
         """
-        part = np.arange(len(self.points))
-        for among in (needed, list(range(len(self.points)))):
-            self._join(part, np.array(among), needed)
-        labels = part[needed]
-        found = [[p for p in needed if part[p] == label] for label in dict.fromkeys(labels)]
+        every = np.arange(len(self.points))
+        for among, tries in ((np.array(needed), 1), (every, 1)):
+            while len(set((label := self._joined())[needed])) > 1:
+                new: list[tuple[int, int]] = []
+                for part in set(label[among]):
+                    own, others = among[label[among] == part], among[label[among] != part]
+                    out = self.direct[np.ix_(own, others)]
+                    first = np.argsort(out, axis=None, kind="stable")[:tries]
+                    i, j = np.unravel_index(first[np.isfinite(out.ravel()[first])], out.shape)
+                    new += zip(own[i].tolist(), others[j].tolist(), strict=True)
+                if not new:
+                    break
+                self.check(new)
+                tries *= 2
+        found = [[p for p in needed if label[p] == part] for part in dict.fromkeys(label[needed])]
         return sorted(found, key=len, reverse=True)
 
-    def _join(self, part: IntArray, among: IntArray, needed: list[int]) -> None:
-        """Relabel `part` (m,) by free moves between points of `among`, until all of `needed` are
-        of one part or no move is left (Borůvka: every part tries its shortest ways out, twice as
-        many each time)."""
-        tries = 1
-        while len(set(part[needed])) > 1:
-            new: list[tuple[int, int]] = []
-            for label in set(part[among]):
-                own, others = among[part[among] == label], among[part[among] != label]
-                out = self.direct[np.ix_(own, others)]
-                for k in np.argsort(out, axis=None, kind="stable")[:tries]:
-                    i, j = np.unravel_index(k, out.shape)
-                    if np.isfinite(out[i, j]):
-                        new.append((int(own[i]), int(others[j])))
-            if not new:
-                return
-            self.check(new)
-            for i, j in new:
-                if np.isfinite(self.direct[i, j]):
-                    part[part == part[j]] = part[i]
-            tries *= 2
+    def _joined(self) -> IntArray:
+        """A label (m,) for each part that is known to hang together."""
+        free = np.zeros(self.direct.shape, dtype=bool)
+        for (i, j), verdict in self.verdict.items():
+            free[i, j] = verdict
+        return np.asarray(csgraph.connected_components(free)[1])
 
 
 # The points of a schedule, its visits, and the moves between them, checked when needed.
-
-FEW = 2000  # pairs of visits: so many ways are checked at once where orders need them one by one
 
 
 class Costs(NamedTuple):
@@ -222,10 +216,6 @@ class Moves:
     def blocked(self) -> int:
         return sum(not free for roadmap in self.maps for free in roadmap.verdict.values())
 
-    @property
-    def crowded(self) -> bool:
-        return 2 * self.blocked > self.checked
-
     def carries(self, node: int) -> int:
         """The load state on the arm at a node of a tour, −1 for none; node 0 is without."""
         state = -1 if node == 0 else int(self.load[node - 1])
@@ -294,18 +284,18 @@ class Moves:
         return not all([self.maps[k].check(wanted[k]) for k in (0, 1)])
 
     def settle(self) -> None:
-        """Check the ways between all visits, where these are few or most moves are blocked: many
-        at once take less time than a few again and again."""
-        pairs: list[set[tuple[int, int]]] = []
-        for here in (np.ones(len(self.load), dtype=bool), self.loaded[self.load]):
-            ends = self.entry[here][np.isfinite(self.inside[here])].tolist()
-            starts = self.leave[here].tolist()
-            if not pairs and self.home is not None:
-                starts, ends = [self.home, *starts], [self.home, *ends]
-            pairs.append({(min(m), max(m)) for m in product(starts, ends) if m[0] != m[1]})
-        if self.crowded or sum(map(len, pairs)) <= FEW:
-            for roadmap, wanted in zip(self.maps, pairs, strict=True):
-                roadmap.settle(sorted(wanted))
+        """Check the ways between all visits: many at once take less time than a few again and
+        again."""
+        home = [] if self.home is None else [self.home]
+        for roadmap in self.maps:
+            here = self.loaded[self.load] | (not roadmap.loaded)
+            ends = (
+                home * (not roadmap.loaded)
+                + self.entry[here][np.isfinite(self.inside[here])].tolist()
+            )
+            starts = home * (not roadmap.loaded) + self.leave[here].tolist()
+            pairs = {(min(m), max(m)) for m in product(starts, ends) if m[0] != m[1]}
+            roadmap.settle(sorted(pairs))
 
 
 def approach_signs(q: Array, lower: Array, upper: Array, overshoot: float) -> IntArray:

@@ -21,8 +21,6 @@ from elastocal.errors import InsufficientDataError, require
 from elastocal.planning.criteria import ScenarioCriterion, TangentBound, covariance, inverse
 from elastocal.units import Array, BoolArray, IntArray
 
-# Packed information larger than this (bytes) is not stored; pricing then goes through the blocks.
-PACKED_BYTES = 1_500_000_000
 BATCH = 512  # candidates whose products are formed at once
 # Of the information of even weights, added to every plan's: none is singular, and the bound holds
 # all the same, since more information lowers Φ.
@@ -50,16 +48,13 @@ class DesignProblem:
         return int(self.shares.sum())
 
     @cached_property
-    def packed(self) -> Array | None:
+    def packed(self) -> Array:
         """B_iᵀB_i as its upper triangle, √2 off the diagonal (N, p(p+1)/2), so that ⟨G, B_iᵀB_i⟩
-        is a product of rows; None where that takes too much memory."""
-        N, _, p = self.blocks.shape
-        rows, columns, factor = triangle(p)
-        if 8 * N * len(rows) > PACKED_BYTES:
-            return None
-        found = np.empty((N, len(rows)))
-        for k in range(0, N, BATCH):
-            A = self.matrices(np.arange(k, min(k + BATCH, N)))
+        is a product of rows."""
+        rows, columns, factor = triangle(len(self.prior))
+        found = np.empty((len(self.blocks), len(rows)))
+        for k in range(0, len(found), BATCH):
+            A = self.matrices(np.arange(k, min(k + BATCH, len(found))))
             found[k : k + BATCH] = A[:, rows, columns] * factor
         return found
 
@@ -70,8 +65,6 @@ class DesignProblem:
 
     def prices(self, G: Array) -> Array:
         """d (N,): d_i = tr(B_i G B_iᵀ) = −∂Φ/∂w_i for G (p, p)."""
-        if self.packed is None:
-            return block_prices(self.blocks, G)
         rows, columns, factor = triangle(len(G))
         return np.asarray(self.packed @ (G[rows, columns] * factor))
 
@@ -85,9 +78,6 @@ class DesignProblem:
 
     def at(self, weights: Array) -> Array:
         """M (p, p) at weights w (N,)."""
-        used = np.flatnonzero(weights)
-        if self.packed is None or 4 * len(used) < len(weights):
-            return self.information(used, weights[used])
         rows, columns, factor = triangle(len(self.prior))
         M = np.empty_like(self.prior)
         M[rows, columns] = M[columns, rows] = weights @ self.packed / factor
@@ -103,10 +93,7 @@ class DesignProblem:
         return float(self.criterion.of_information(self.information(chosen)))
 
     def restricted(self, kept: IntArray) -> DesignProblem:
-        part = replace(self, blocks=self.blocks[kept], group=self.group[kept])
-        if "packed" in self.__dict__ and self.packed is not None:
-            part.__dict__["packed"] = self.packed[kept]
-        return part
+        return replace(self, blocks=self.blocks[kept], group=self.group[kept])
 
     def judged_by(self, criterion: ScenarioCriterion) -> DesignProblem:
         other = replace(self, criterion=criterion)
@@ -133,7 +120,7 @@ def balancing(problem: DesignProblem) -> Array:
     that an update of Φ by one pose would keep no digits otherwise.  Raises InsufficientDataError
     where all candidates together leave something open, as then every plan does.
     """
-    M = problem.at(problem.even())
+    M = problem.information(np.arange(len(problem.blocks)), problem.even())
     size = np.sqrt(np.maximum(np.diagonal(M), 0.0))
     scale = 1 / np.where(size > 0, size, 1.0)
     if not covariance(M)[1]:

@@ -241,7 +241,9 @@ class Search:
 
         state = self.checkpoint.finished(f"continuum{k}", make)
         bound, searched, ascents = state["figures"]
-        more = self.setup.pool(state["q"], state["group"], state["readings"])
+        more = self.pool.take(np.zeros(0, dtype=np.int64))
+        if len(state["q"]):
+            more = self.setup.pool(state["q"], state["group"], state["readings"])
         self.pool = self.pool.joined(more)
         return Continuum(float(bound), more, int(searched), int(ascents))
 
