@@ -19,7 +19,7 @@ from elastocal.cell.work_cell import Cell
 from elastocal.errors import require
 from elastocal.identification.noise_structure import course_waves
 from elastocal.planning.information import PoseInformation
-from elastocal.planning.moves import BlockersOf, Costs, Moves, PathChecker, Reach
+from elastocal.planning.moves import BlockersOf, Moves, PathChecker, Reach
 from elastocal.units import Array, BoolArray, IntArray, Progress
 
 
@@ -172,7 +172,7 @@ class VisitTimes:
     """
 
     moves: Moves
-    costs: Costs
+    travel: Array
     change: Array
     visit: float
     share: Array | None
@@ -186,7 +186,7 @@ class VisitTimes:
         carried = np.array([moves.carries(node) for node in range(len(moves.pose) + 1)])
         change = np.where(carried[:, None] != carried[None], motion.load_change, 0.0)
         visit = motion.dwell * (1 if moves.signs is None else 2)
-        made = cls(moves, moves.costs(), change, visit, None, 1.0)
+        made = cls(moves, moves.travel(), change, visit, None, 1.0)
         return replace(made, usual=max(made.driving(begun), np.finfo(float).tiny))
 
     def drifting(self, alias: Alias | None, longest: float) -> VisitTimes:
@@ -202,7 +202,7 @@ class VisitTimes:
         return replace(made, share=share.reshape(len(pose), -1), enough=enough)
 
     def known(self) -> VisitTimes:
-        return replace(self, costs=self.moves.costs())
+        return replace(self, travel=self.moves.travel())
 
     def possible(self, tour: list[int]) -> bool:
         """Has every move a way, within the time allowed?"""
@@ -214,11 +214,11 @@ class VisitTimes:
 
     @cached_property
     def _travel(self) -> list[list[float]]:
-        return self.costs.travel.tolist()
+        return self.travel.tolist()
 
     @cached_property
     def _step(self) -> Array:
-        return self.costs.travel + self.change + self.visit
+        return self.travel + self.change + self.visit
 
     def time(self, tour: list[int]) -> float:
         ring = np.array([0, *tour, 0])
@@ -277,7 +277,7 @@ class VisitTimes:
     ) -> tuple[list[int], VisitTimes]:
         """The order once its blocked moves are found and gone round."""
         clock, moves, rounds = self, self.moves, 0
-        while moves.check(tour, clock.costs):
+        while moves.check(tour):
             progress(f"order of execution: {moves.checked} moves checked, {moves.blocked} blocked")
             rounds += 1
             if rounds == PATIENT:
@@ -345,7 +345,7 @@ def against_drift(
             once = tour
     if twice is not None and twice_harms < harm(clock.bias(once), clock.time(once)):
         once, clock = twice
-    while clock.moves.check(once, clock.costs):
+    while clock.moves.check(once):
         clock = clock.known()
     drift = None
     if alias is not None:
@@ -382,7 +382,7 @@ def _moved(tour: list[int], load: list[int], kind: float, i: int, j: int) -> lis
 
 
 def with_references(
-    tour: list[int], moves: Moves, costs: Costs, every: int, paired: bool
+    tour: list[int], moves: Moves, travel: Array, every: int, paired: bool
 ) -> list[tuple[int, int]]:
     """The tour's nodes, 0 behind each, with one pose of each load state visited again before the
     first, after `every` visits, and at the end, under the load that hangs there, its number
@@ -392,7 +392,7 @@ def with_references(
     is visited in all.  Where readings are `paired`, loaded with unloaded, it is visited loaded no
     more often than without load.
     """
-    mean = costs.travel[1:, 1:].mean(axis=0)
+    mean = travel[1:, 1:].mean(axis=0)
     states = [int(s) for s in dict.fromkeys(moves.load[np.array(tour) - 1])]
     common = set.intersection(*(set(moves.pose[moves.load == s].tolist()) for s in states))
     if common:
@@ -518,12 +518,12 @@ class Execution:
 # From a tour over visits to the stops of an execution.
 
 
-def _stops(moves: Moves, u: int, v: int, costs: Costs) -> list[Stop]:
+def _stops(moves: Moves, u: int, v: int) -> list[Stop]:
     """The reading of node v after node u, or two where it is approached from both sides."""
-    _, way = moves.way(u, v, costs)
+    _, way = moves.way(u, v)
     node = v - 1
     pose, load, leave = int(moves.pose[node]), int(moves.load[node]), int(moves.leave[node])
-    q, side = moves.points[leave], int(costs.side[u, node])
+    q, side = moves.points[leave], int(moves.side[node])
     before, after = moves.carries(u), moves.carries(v)
     if moves.signs is None:
         passed = way[1:-1] if len(way) > 1 else []
@@ -536,9 +536,9 @@ def _stops(moves: Moves, u: int, v: int, costs: Costs) -> list[Stop]:
     signs, opposite = moves.signs[pose], 1 - side
     time = _time(moves, [*way, leave])
     first = Stop(pose, load, q, moves.points[passed], time, change, signs[side], side)
-    if not np.isfinite(moves.inside[node, opposite]):
+    if not moves.free[node, opposite]:
         return [first]
-    other = int(moves.entry[node, opposite])
+    other = int(moves.sides[node, opposite])
     time = _time(moves, [leave, other, leave])
     via = moves.points[[other]]
     return [first, Stop(pose, load, q, via, time, None, signs[opposite], opposite)]
@@ -608,35 +608,35 @@ def schedule(
     reach.check()
     # Load states one after the other, without load first.
     used = sorted(set(moves.load.tolist()), key=lambda state: (moves.loaded[state], state))
-    begun = in_turns(nearest_first(moves.costs().travel), moves.load, used)
+    begun = in_turns(nearest_first(moves.travel()), moves.load, used)
     clock, drift = VisitTimes.of(moves, motion, begun), None
     steps = PER_VISIT * len(begun)
     tour, clock = clock.searched(begun, seed, progress, (SHORT,), steps)
-    reach.check_tour(tour, clock.costs)
+    reach.check_tour(tour)
     if (alias is not None or motion.load_changes) and motion.longer > 0:
         tour, clock, drift = against_drift(clock, motion, tour, alias, seed, progress)
-    moves, costs, order = clock.moves, clock.costs, [(node, 0) for node in tour]
+    moves, order = clock.moves, [(node, 0) for node in tour]
     if motion.reference_every:
-        order = with_references(tour, moves, costs, motion.reference_every, paired)
-        while moves.check([node for node, _ in order], costs):
-            costs = moves.costs()
-    Reach(moves, blockers).check_tour([node for node, _ in order], costs)
-    return _executed(moves, order, costs, motion, drift)
+        order = with_references(tour, moves, clock.travel, motion.reference_every, paired)
+        while moves.check([node for node, _ in order]):
+            pass
+    Reach(moves, blockers).check_tour([node for node, _ in order])
+    return _executed(moves, order, motion, drift)
 
 
 def _executed(
-    moves: Moves, order: list[tuple[int, int]], costs: Costs, motion: Motion, drift: Drifting | None
+    moves: Moves, order: list[tuple[int, int]], motion: Motion, drift: Drifting | None
 ) -> Execution:
     """Of the nodes in their `order`, behind each how often it was visited for reference."""
     nodes = [node for node, _ in order]
     stops: list[Stop] = []
     visited: Counter[tuple[int, ...]] = Counter()
     for u, (v, again) in zip([0, *nodes], order, strict=False):
-        for stop in _stops(moves, u, v, costs):
+        for stop in _stops(moves, u, v):
             key = (stop.pose, stop.load, stop.side, again)
             stops.append(replace(stop, again=again, part=visited[key]))
             visited[key] += 1
-    _, home = moves.way(nodes[-1], 0, costs)  # empty without a home
+    _, home = moves.way(nodes[-1], 0)  # empty without a home
     return Execution(
         stops=tuple(stops),
         home_via=moves.points[home[1:-1]],

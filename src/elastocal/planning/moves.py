@@ -4,8 +4,9 @@ from __future__ import annotations
 
 from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass, replace
+from functools import cached_property
 from itertools import pairwise, product
-from typing import NamedTuple, Protocol
+from typing import Protocol
 
 import numpy as np
 from numpy.typing import NDArray
@@ -138,14 +139,6 @@ class Roadmap:
 # The points of a schedule, its visits, and the moves between them, checked when needed.
 
 
-class Costs(NamedTuple):
-    """`travel` (V + 1, V + 1) s from one visit through the next one, node 0 being the beginning and
-    the end; `side` (V + 1, V): the entry taken."""
-
-    travel: Array
-    side: IntArray
-
-
 @dataclass(frozen=True)
 class Moves:
     """Home, poses, points of approach and via points in one list, and the visits among them.
@@ -154,10 +147,9 @@ class Moves:
     `home`: its point or None; `signs` (N, 2, n) where poses are approached from both sides;
     `loaded` (L,): which load states have a load.
 
-    V visits, each of `pose` (V,) in the load state `load` (V,): entered at one of `entry` (V, O),
-    taking `inside` (V, O) s from there on, inf where that entry is blocked, and left from `leave`
-    (V,), where the pose is.  Entry o is the side from which the pose is approached first; without
-    approaches the pose itself is the one entry.
+    V visits, each of `pose` (V,) in the load state `load` (V,), left from `leave` (V,), where the
+    pose is.  `sides` (V, 2) are the points from which it is approached, and which of them are
+    `free` (V, 2); without approaches the pose itself.
     """
 
     points: Array
@@ -169,8 +161,8 @@ class Moves:
     pose: IntArray
     load: IntArray
     leave: IntArray
-    entry: IntArray
-    inside: Array
+    sides: IntArray
+    free: BoolArray
 
     @classmethod
     def of(
@@ -189,24 +181,41 @@ class Moves:
         home = None if motion.home is None else 0
         start = np.zeros((0, n)) if motion.home is None else motion.home[None]
         leave = len(start) + pose
-        between, signs, entry = np.zeros((0, n)), None, leave[:, None]
+        between, signs, sides = np.zeros((0, n)), None, leave[:, None]
         if motion.both_directions:
             assert limits is not None
             signs = approach_signs(q, *limits, motion.overshoot)
             between = (q[:, None] - signs * motion.overshoot).reshape(-1, n)
-            entry = len(start) + n_poses + 2 * pose[:, None] + np.arange(2)
+            sides = len(start) + n_poses + 2 * pose[:, None] + np.arange(2)
         points = np.vstack([start, q, between, np.zeros((0, n)) if via is None else via])
         times = travel_times(points, motion.speed)
         maps = (Roadmap(points, times, False, checker), Roadmap(points, times, True, checker))
-        loaded = (forces != 0).any(axis=1)
-        inside = times[leave[:, None], entry]
-        if signs is not None:
-            # From the first entry on: the approach, then to the other side and back, where that
-            # is free; inf where this side is not.
-            free = _free_sides(maps, loaded[load], leave, entry)
-            back = np.where(free, 2 * inside, 0.0)[:, ::-1]
-            inside = np.where(free, inside + back, np.inf)
-        return cls(points, times, maps, loaded, home, signs, pose, load, leave, entry, inside)
+        loaded, free = (forces != 0).any(axis=1), np.ones(sides.shape, dtype=bool)
+        for roadmap in maps if signs is not None else ():
+            own = np.flatnonzero(loaded[load] == roadmap.loaded)
+            stretches = [[(int(side), int(leave[v])) for side in sides[v]] for v in own]
+            roadmap.check(move for both in stretches for move in both)
+            for v, both in zip(own, stretches, strict=True):
+                free[v] = [roadmap.check([move]) for move in both]
+        return cls(points, times, maps, loaded, home, signs, pose, load, leave, sides, free)
+
+    @cached_property
+    def side(self) -> IntArray:
+        """(V,): the side from which a visit begins; then comes the other, where that is free."""
+        return np.asarray(self.free.argmax(axis=1))
+
+    @cached_property
+    def entry(self) -> IntArray:
+        """(V,): the point by which a visit is entered."""
+        return np.asarray(self.sides[np.arange(len(self.pose)), self.side])
+
+    @cached_property
+    def inside(self) -> Array:
+        """(V,) s from there on: the approach, and to the other side and back; inf where blocked."""
+        to = self.times[self.leave[:, None], self.sides]
+        first = to[np.arange(len(to)), self.side]
+        both = np.where(self.free.all(axis=1), 2 * to[:, -1], 0.0) if self.signs is not None else 0
+        return np.where(self.free.any(axis=1), first + both, np.inf)
 
     @property
     def checked(self) -> int:
@@ -227,58 +236,51 @@ class Moves:
         if not self.loaded[self.load].any():
             return self, []
         again = np.array([v - 1 for v in tour[::-1] if not self.loaded[self.load[v - 1]]], int)
-        pose, load, leave, entry, inside = (
-            np.concatenate([of, of[again]])
-            for of in (self.pose, self.load, self.leave, self.entry, self.inside)
-        )
-        more = replace(self, pose=pose, load=load, leave=leave, entry=entry, inside=inside)
-        return more, (len(self.pose) + 1 + np.arange(len(again))).tolist()
+        names = ("pose", "load", "leave", "sides", "free")
+        own = {name: getattr(self, name) for name in names}
+        more = {name: np.concatenate([of, of[again]]) for name, of in own.items()}
+        return replace(self, **more), (len(self.pose) + 1 + np.arange(len(again))).tolist()
 
-    def costs(self) -> Costs:
-        """Costs between visits as known so far; what cannot be reached costs more than everything
-        else together.  The arm begins and ends without load, at home or, without one, anywhere."""
+    def travel(self) -> Array:
+        """Times (V + 1, V + 1) from one visit through the next one as known so far, node 0 being
+        the beginning and the end; what cannot be reached takes more than everything else together.
+        The arm begins and ends without load, at home or, without one, anywhere."""
         n, home = len(self.pose), self.home
         # The load is on the arm during a move only if it is before and after: it is hung and taken
         # off where the arm stands for a loaded reading.
         carries = np.append(False, self.loaded[self.load])
         with_load = carries[:, None] & carries[None, :]
-        travel, side = np.zeros((n + 1, n + 1)), np.zeros((n + 1, n), dtype=np.int64)
-        for layer, roadmap in enumerate(self.maps):
-            between = roadmap.costs()
-            leave = self.leave if home is None else np.append(home, self.leave)
-            ways = between[leave[:, None, None], self.entry[None]]
-            back = np.zeros(n) if home is None else between[self.leave, home]
-            if home is None:
-                ways = np.concatenate([np.zeros((1, *ways.shape[1:])), ways])
-            ways = ways + self.inside
-            here = with_load == bool(layer)
-            side = np.where(here[:, 1:], ways.argmin(axis=2), side)
-            travel[:, 1:] = np.where(here[:, 1:], ways.min(axis=2), travel[:, 1:])
-            travel[1:, 0] = np.where(here[1:, 0], back, travel[1:, 0])
-        np.fill_diagonal(travel, 0.0)
-        finite = np.isfinite(travel)
+        plain, loaded = (roadmap.costs() for roadmap in self.maps)
+        found = np.zeros((n + 1, n + 1))
+        ways = np.ix_(self.leave, self.entry)
+        found[1:, 1:] = np.where(with_load[1:, 1:], loaded[ways], plain[ways])
+        if home is not None:
+            found[0, 1:], found[1:, 0] = plain[home, self.entry], plain[self.leave, home]
+        found[:, 1:] += self.inside
+        np.fill_diagonal(found, 0.0)
+        finite = np.isfinite(found)
         # Any tour travels less than this in all, if it needs no unreachable move.
-        travel[~finite] = max(float(travel[finite].max()) * (n + 1), 1.0)
-        return Costs(travel, side)
+        found[~finite] = max(float(found[finite].max()) * (n + 1), 1.0)
+        return found
 
-    def way(self, u: int, v: int, costs: Costs) -> tuple[Roadmap, list[int]]:
+    def way(self, u: int, v: int) -> tuple[Roadmap, list[int]]:
         """The roadmap and the points from node u to the entry of node v, both included.
 
         Only the last point where u is the beginning and there is no home; none where v is the
         end; the ends alone where no way is known.
         """
         roadmap = self.maps[int(self.carries(u) >= 0 and self.carries(v) >= 0)]
-        goal = self.home if v == 0 else int(self.entry[v - 1, costs.side[u, v - 1]])
+        goal = self.home if v == 0 else int(self.entry[v - 1])
         start = self.home if u == 0 else int(self.leave[u - 1])
         if goal is None:
             return roadmap, []
         return roadmap, [goal] if start is None else [start, *roadmap.way(start, goal)]
 
-    def check(self, tour: list[int], costs: Costs) -> bool:
+    def check(self, tour: list[int]) -> bool:
         """Check every straight move of the tour not yet checked; is one of them news, blocked?"""
         wanted: list[list[tuple[int, int]]] = [[], []]
         for u, v in pairwise([0, *tour, 0]):
-            roadmap, way = self.way(u, v, costs)
+            roadmap, way = self.way(u, v)
             # Where no way is left, every move has been checked: nothing to be learnt.
             wanted[roadmap.loaded] += [m for m in pairwise(way) if np.isfinite(roadmap.direct[m])]
         return not all([self.maps[k].check(wanted[k]) for k in (0, 1)])
@@ -286,14 +288,11 @@ class Moves:
     def settle(self) -> None:
         """Check the ways between all visits: many at once take less time than a few again and
         again."""
-        home = [] if self.home is None else [self.home]
         for roadmap in self.maps:
             here = self.loaded[self.load] | (not roadmap.loaded)
-            ends = (
-                home * (not roadmap.loaded)
-                + self.entry[here][np.isfinite(self.inside[here])].tolist()
-            )
-            starts = home * (not roadmap.loaded) + self.leave[here].tolist()
+            home = [] if self.home is None or roadmap.loaded else [self.home]
+            ends = home + self.entry[here & np.isfinite(self.inside)].tolist()
+            starts = home + self.leave[here].tolist()
             pairs = {(min(m), max(m)) for m in product(starts, ends) if m[0] != m[1]}
             roadmap.settle(sorted(pairs))
 
@@ -315,18 +314,6 @@ def approach_signs(q: Array, lower: Array, upper: Array, overshoot: float) -> In
             "limits"
         )
     return np.stack([np.where(below, 1, -1), np.where(above, -1, 1)], axis=1)
-
-
-def _free_sides(
-    maps: tuple[Roadmap, Roadmap], loaded: BoolArray, leave: IntArray, entry: IntArray
-) -> BoolArray:
-    stretch = np.stack([entry, np.broadcast_to(leave[:, None], entry.shape)], axis=2)
-    for roadmap in maps:
-        roadmap.check(stretch[loaded == roadmap.loaded].reshape(-1, 2).tolist())
-    free = np.zeros(entry.shape, dtype=bool)
-    for v, side in np.ndindex(*entry.shape):
-        free[v, side] = maps[int(loaded[v])].check([(int(entry[v, side]), int(leave[v]))])
-    return free
 
 
 # Poses that no collision-free move reaches, told before and after the routing.
@@ -386,16 +373,16 @@ class Reach:
                 clear = len(most) > len(every) and moves.home not in every
                 raise self._unreachable(roadmap, every if clear else lost[0])
 
-    def check_tour(self, tour: list[int], costs: Costs) -> None:
+    def check_tour(self, tour: list[int]) -> None:
         for u, v in pairwise([0, *tour, 0]):
-            roadmap, way = self.moves.way(u, v, costs)
+            roadmap, way = self.moves.way(u, v)
             if len(way) > 1 and not np.isfinite(roadmap.direct[way[:-1], way[1:]]).all():
                 raise self._unreachable(roadmap, [int(self.moves.leave[(v or u) - 1])])
 
     def _check_approaches(self, roadmap: Roadmap, here: BoolArray) -> None:
         moves = self.moves
-        for v in np.flatnonzero(here & ~np.isfinite(moves.inside).any(axis=1)):
-            pose, (below, above) = int(moves.leave[v]), moves.entry[v].tolist()
+        for v in np.flatnonzero(here & ~moves.free.any(axis=1)):
+            pose, (below, above) = int(moves.leave[v]), moves.sides[v].tolist()
             raise Unreachable(
                 f"{self._name(pose)} cannot be approached{_carrying(roadmap)}, neither from below"
                 f"{self._in_the_way(roadmap, below, pose)} nor from above"
