@@ -231,6 +231,7 @@ class VisitTimes:
         time = self._step[there[:-1], there[1:]].cumsum()
         at = np.zeros(len(self._step))
         at[there[1:]] = time - np.add.reduce(time) / len(time)
+        assert self.share is not None
         errors = at[1:] @ self.share / max(float(time[-1] - time[0]), 1e-300)
         return np.asarray(errors.reshape(-1, 3))
 

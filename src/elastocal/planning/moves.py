@@ -6,7 +6,7 @@ from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property
 from itertools import pairwise, product
-from typing import Protocol
+from typing import Any, Protocol
 
 import numpy as np
 from numpy.typing import NDArray
@@ -238,7 +238,7 @@ class Moves:
         again = np.array([v - 1 for v in tour[::-1] if not self.loaded[self.load[v - 1]]], int)
         names = ("pose", "load", "leave", "sides", "free")
         own = {name: getattr(self, name) for name in names}
-        more = {name: np.concatenate([of, of[again]]) for name, of in own.items()}
+        more: dict[str, Any] = {n: np.concatenate([of, of[again]]) for n, of in own.items()}
         return replace(self, **more), (len(self.pose) + 1 + np.arange(len(again))).tolist()
 
     def travel(self) -> Array:
