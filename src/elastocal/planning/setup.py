@@ -9,6 +9,7 @@ from functools import cached_property
 
 import numpy as np
 from numpy.typing import NDArray
+from scipy import optimize
 
 from elastocal.errors import InsufficientDataError, option
 from elastocal.identification.checks import fixed_and_free
@@ -318,8 +319,7 @@ def _held(model: Model, found: Estimable, bias: float) -> tuple[str, ...]:
 # Φ_elsewhere(w(s)) falling with s; all that can be had lies on this curve (both are convex).  Near
 # s = 0, where Φ_test is least, it rises with the square of u = s/(1 − s).
 
-FIRST, MOST = 0.3, 0.9  # shares tried first, and at most
-TRIES = 8
+MOST = 0.9  # share at most
 CLOSE = 0.05  # of the price under the limit: a better share would not be noticed
 LOOSE = 1e-3  # gap of the relaxations
 SOME = 4000  # candidates that tell the share: it hangs on where poses are, not on each of them
@@ -336,24 +336,21 @@ def share_within(
     problem = _some(setup.sharing(0.0).problem(pool, shares))
     own, T = problem.criterion, balancing(problem)
     alone = relax(in_terms(problem, T), LOOSE)
-    least, limit = alone.value, (1 + cap) ** 2 * alone.value
-    low, high, share, weights = 0.0, MOST, FIRST, alone.weights
-    for _ in range(TRIES):
-        other = replace(problem, criterion=setup.sharing(share).criterion)
+    weights, price = alone.weights, ((1 + cap) ** 2 - 1) * alone.value
+
+    def over(u: float) -> float:
+        """What the test poses pay more than they should, of the price; near enough is 0."""
+        nonlocal weights
+        other = replace(problem, criterion=setup.sharing(u / (1 + u)).criterion)
         weights = relax(in_terms(other, T), LOOSE, weights).weights
-        value = float(own.of_information(problem.at(weights)))
-        if value <= limit:
-            low = share
-            if share == MOST or limit - value < CLOSE * (limit - least):
-                break
-        else:
-            high = share
-        aim = (1 - CLOSE / 2) * (limit - least)
-        u = share / (1 - share) * np.sqrt(aim / max(value - least, 1e-3 * least))
-        share = u / (1 + u)
-        if not low < share < high:
-            share = high if high == MOST and low else (low + high) / 2
-    return low
+        paid = (float(own.of_information(problem.at(weights))) - alone.value) / price
+        return 0.0 if 1 - CLOSE <= paid <= 1 else paid - 1 + CLOSE / 2
+
+    most = MOST / (1 - MOST)
+    if over(most) <= 0:
+        return MOST
+    u = optimize.brentq(over, 0.0, most)
+    return float(u / (1 + u))
 
 
 def _some(problem: DesignProblem) -> DesignProblem:
