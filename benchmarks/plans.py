@@ -22,7 +22,6 @@ ARMS = {
     "UR10": ("example-robot-data", "ur_description/urdf/ur10_robot.urdf", "tool0"),
     "Panda": ("example-robot-data", "panda_description/urdf/panda.urdf", "panda_hand_tcp"),
     "IRB140": ("rtb-data", "abb_irb140_description/urdf/irb140.urdf", ""),
-    "KR210": ("rtb-data", "kuka_kr210/urdf/kr210l150.urdf", ""),
     "iiwa14": ("rtb-data", "kuka_lbr_iiwa/urdf/lbr_iiwa_14_r820.urdf", ""),
 }
 CELL = """
@@ -72,8 +71,6 @@ CELLS: dict[str, tuple[str, str, int, tuple[str, ...]]] = {
     "UR10, rules": ("UR10", RULES, 20, ()),
     "Panda, limits": ("Panda", LIMITS, 20, ()),
     "IRB 140, limits": ("IRB140", LIMITS, 20, ()),
-    "IRB 140, rules": ("IRB140", RULES, 20, ()),
-    "KR 210, rules": ("KR210", RULES, 20, ()),
     "iiwa 14, limits": ("iiwa14", LIMITS, 20, ()),
     "UR10, limits, 10 poses": ("UR10", LIMITS, 10, ()),
     "UR10, limits, D": ("UR10", LIMITS, 20, ("--criterion", "D")),
