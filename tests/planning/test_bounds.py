@@ -97,7 +97,7 @@ def test_no_plan_is_better_than_the_bound_and_the_search_finds_the_best(name):
         turned, _ = balanced(problem)
         relaxed = relax(turned)
         assert relaxed.bound <= values.min() * (1 + 1e-8)
-        plan, value = exact_plan(turned, relaxed, starts=4)
+        plan, value = exact_plan(turned, relaxed, starts=20)
         assert value == pytest.approx(values.min(), rel=1e-6)
         assert problem.value(plan) == pytest.approx(value, rel=1e-6)
         assert 0 < efficiency(value, relaxed.bound) <= 1

@@ -30,8 +30,6 @@ LEAST = 1e-9
 # Candidates evaluated at first for a place, each further batch being larger by GROWTH; and at most
 # by a search that looks at the most promising alone.
 FIRST, GROWTH, LOOKS = 8, 4, 64
-# Poses that a change of an exchange optimum moves at most, and changes in vain that end a search.
-MOVED, PATIENCE = 8, 6
 # Candidates of a group near in price, to which the search keeps before it looks at all of them: so
 # many per pose of its share, of many poses fewer.
 NEAR_PER_POSE, NEAR_PER_MANY, NEAR_AT_LEAST = 50, 12, 240
@@ -170,20 +168,14 @@ def prospects(problem: DesignProblem, gap: float = 1e-4, start: Array | None = N
 
 
 def exact_plan(
-    problem: DesignProblem,
-    relaxed: Relaxed,
-    *,
-    starts: int = 1,
-    seed: int = 0,
+    problem: DesignProblem, relaxed: Relaxed, *, starts: int = 2, seed: int = 0,
     warm: IntArray | None = None,
-    patience: int = PATIENCE,
-) -> tuple[IntArray, float]:
+) -> tuple[IntArray, float]:  # fmt: skip
     """The plan (n,) of least Φ found from `starts` starts, and Φ, of a `balanced` problem.
 
     The first start is `warm`, a plan that may have other shares, or the rounded relaxation; others
-    are roundings drawn at random.  Each is improved by exchange and by iterated local search
-    (Lourenço, Martin & Stützle 2003) among the candidates near in price; the best at last by
-    exchange against all.
+    are roundings drawn at random.  Each is improved by exchange among the candidates near in price;
+    the best at last by exchange against all.
     """
     rng, d = np.random.default_rng(seed), problem.prices(relaxed.tangent.G)
     shares = problem.shares
@@ -195,28 +187,10 @@ def exact_plan(
         first = fitted(problem, warm)
         near = np.union1d(near, first)
     some, weights = problem.restricted(near), relaxed.weights[near]
-    plans = [
-        _searched(some, rounded(some, weights, rng) if k else np.searchsorted(near, first), rng,
-                  patience)
-        for k in range(starts)
-    ]  # fmt: skip
-    plan, _ = min(plans, key=lambda found: found[1])
+    begins = [np.searchsorted(near, first)]
+    begins += [rounded(some, weights, rng) for _ in range(starts - 1)]
+    plan, _ = min((_descended(some, plan) for plan in begins), key=lambda found: found[1])
     return exchange(problem, near[plan])
-
-
-def _searched(
-    problem: DesignProblem, plan: IntArray, rng: np.random.Generator, patience: int
-) -> tuple[IntArray, float]:
-    """The best plan so far is changed in two to MOVED poses and exchanged anew, until `patience`
-    changes in a row led to nothing better."""
-    plan, value = _descended(problem, plan)
-    failed = 0
-    while failed < patience:
-        found, phi = _descended(problem, _changed(problem, plan, rng))
-        failed += 1
-        if phi < value * (1 - LEAST):
-            plan, value, failed = found, phi, 0
-    return plan, value
 
 
 def _descended(problem: DesignProblem, plan: IntArray) -> tuple[IntArray, float]:
@@ -225,13 +199,6 @@ def _descended(problem: DesignProblem, plan: IntArray) -> tuple[IntArray, float]
     if problem.criterion.kinked:
         plan, _ = exchange(problem.judged_by(problem.criterion.softened(SOFT)), plan, LOOKS)
     return exchange(problem, plan, LOOKS if problem.criterion.certifiable else None)
-
-
-def _changed(problem: DesignProblem, plan: IntArray, rng: np.random.Generator) -> IntArray:
-    new, n = plan.copy(), len(plan)
-    for j in rng.choice(n, min(int(rng.integers(2, MOVED + 1)), n), replace=False):
-        new[j] = rng.choice(_free(problem, np.delete(new, j), problem.group[new[j]]))
-    return np.sort(new)
 
 
 # How many poses: a curve of sizes, and the fewest that the bound allows.

@@ -15,7 +15,6 @@ from elastocal.model.chain import finite_ranges, joint_limits
 from elastocal.planning.checkpoint import Checkpoint, State
 from elastocal.planning.criteria import inverse
 from elastocal.planning.exchange import (
-    PATIENCE,
     check_determined,
     exact_plan,
     exchange,
@@ -65,7 +64,7 @@ class SearchEffort:
 
 
 EFFORTS = {
-    "batch": SearchEffort(starts=0, rounds=0, exchanges=2),
+    "batch": SearchEffort(starts=0, rounds=0, exchanges=4),
     "quick": SearchEffort(starts=5, rounds=0),
     "normal": SearchEffort(starts=8, rounds=2),
     "thorough": SearchEffort(starts=40, rounds=4),
@@ -164,11 +163,11 @@ class Search:
             self._relax()
             # One begun from the plan, one from the relaxation.
             for name, warm in ((f"warm{k}", best), (f"anew{k}", None)):
-                new, _ = exact_plan(self.problem, self.relaxed, warm=warm, patience=0)
+                new, _ = exact_plan(self.problem, self.relaxed, warm=warm, starts=1)
                 best = self._better(best, self.polished(new, name))
         if effort.starts:
             self._relax(CLOSE if effort.rounds else FINE)
-            mixed, _ = exact_plan(self.problem, self.relaxed, warm=best, starts=2, seed=seed)
+            mixed, _ = exact_plan(self.problem, self.relaxed, warm=best, seed=seed)
             best = self._better(best, mixed)
         if effort.rounds:
             best = self.polished(best, "last", fine=True)
@@ -182,11 +181,7 @@ class Search:
         problem, rng, effort = self.problem, np.random.default_rng(self.seed), self.effort
 
         def make() -> State:
-            # Where plans are polished, other starts better them more than a longer search here.
-            patience = 0 if effort.starts else PATIENCE
-            found = exact_plan(
-                problem, self.relaxed, starts=effort.exchanges, seed=self.seed, patience=patience
-            )
+            found = exact_plan(problem, self.relaxed, starts=effort.exchanges, seed=self.seed)
             return {"chosen": found[0]}
 
         best, least, ends = self.checkpoint.finished("exchange", make)["chosen"], np.inf, []
