@@ -33,7 +33,7 @@ def later(*rooms: str) -> dict[str, Any]:
 globals().update(later("pandas DataFrame"))
 
 VIEWS = "elastocal.report.page"
-TEXTS = "elastocal.report.blocks"
+TEXTS = "elastocal.report.terminal"
 PAGES = "elastocal.report.page"
 WORDS = "elastocal.report.judgement_view"
 WRITERS = "elastocal.saving"

@@ -10,8 +10,8 @@ from support.pages import Page
 from elastocal.identification.findings import judged
 from elastocal.identification.noise_choice import Trial
 from elastocal.identification.noise_summary import NoiseSize
-from elastocal.report.blocks import printed_text
 from elastocal.report.page import page_of
+from elastocal.report.terminal import printed_text
 
 
 def test_names_from_the_result_are_text(case: Any, no_figures: None) -> None:

@@ -7,7 +7,7 @@ import pytest
 from rich.cells import cell_len
 from rich.console import Console
 
-from elastocal.report.blocks import print_report
+from elastocal.report.terminal import print_report
 
 
 def printed(plan, width):

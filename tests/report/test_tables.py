@@ -9,8 +9,9 @@ import pytest
 from rich.console import Console
 from support.diagnoses import VERDICTS
 
-from elastocal.report.blocks import ShownTable, print_report
+from elastocal.report.blocks import ShownTable
 from elastocal.report.identification_view import parameter_table, texts, undetermined_table
+from elastocal.report.terminal import print_report
 
 
 def cells(table: ShownTable) -> list[dict[str, str]]:

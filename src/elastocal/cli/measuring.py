@@ -205,7 +205,7 @@ def design(
     from elastocal.files import atomic_write_text, together
     from elastocal.model.effects.catalogue import cell_of
     from elastocal.planning.candidates import plan_and_names
-    from elastocal.report.blocks import print_report
+    from elastocal.report.terminal import print_report
     from elastocal.saving import beside, save_plan
 
     summary = beside(output)
@@ -422,7 +422,7 @@ def demo(
     """
     from elastocal.cli.using import write_results
     from elastocal.demo.example import run_demo
-    from elastocal.report.blocks import print_report
+    from elastocal.report.terminal import print_report
 
     with run.progress() as progress:
         done = run_demo(folder, seed, progress)
@@ -486,8 +486,8 @@ def import_(
     from elastocal.importing.assemble import import_files
     from elastocal.importing.mapping_file import preset_text, read_mapping, with_units
     from elastocal.importing.records import likely_presets
-    from elastocal.report.blocks import print_blocks
     from elastocal.report.smaller_views import import_blocks, left_out
+    from elastocal.report.terminal import print_blocks
 
     if show_preset is not None:
         say(preset_text(show_preset), end="")

@@ -40,10 +40,10 @@ from elastocal.report.blocks import (
     Sentence,
     ShownTable,
     ShownVerdict,
-    report_of,
     unfolded,
 )
 from elastocal.report.formatting import first_stops, resource, typeset
+from elastocal.report.terminal import report_of
 from elastocal.screen import shown
 from elastocal.text import cell_meaning, did_you_mean, listed, quoted
 
