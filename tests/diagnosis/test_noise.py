@@ -18,7 +18,6 @@ from elastocal.diagnosis.noise_floor import (
     NoisyData,
     covariance,
     fit_noise,
-    likelihood,
     log_prior,
     project,
 )
@@ -39,16 +38,16 @@ def test_the_marginal_likelihood_is_that_of_the_dense_gaussian(seed: int) -> Non
     expected += len(rows) * np.log(1e5)
     assert project(data, NOISE).marginal == pytest.approx(expected, rel=1e-9)
     prior = log_prior(data.stated, NOISE)
-    assert likelihood(data, NOISE.logs())[0] == pytest.approx(-2 * expected + prior, rel=1e-9)
+    assert data.model.objective(NOISE.logs())[0] == pytest.approx(-2 * expected + prior, rel=1e-9)
 
 
 @pytest.mark.parametrize("stated", [True, False])
 @pytest.mark.parametrize("seed", SEEDS)
 def test_the_slope_is_that_of_finite_differences(seed: int, stated: bool) -> None:
     data, at, h = random_data(seed, stated=stated), NOISE.logs(), 1e-5
-    slope = likelihood(data, NOISE.logs())[1]
+    slope = data.model.objective(NOISE.logs())[1]
     for k, step in enumerate(h * np.eye(len(at))):
-        up, down = (likelihood(data, at + s * step)[0] for s in (1, -1))
+        up, down = (data.model.objective(at + s * step)[0] for s in (1, -1))
         assert slope[k] == pytest.approx((up - down) / (2 * h), rel=1e-5, abs=1e-5)
 
 
@@ -80,10 +79,10 @@ def test_the_noise_that_made_the_readings_is_found() -> None:
     # No search from it or from the true noise finds a twentieth of −2 log posterior more.
     for start in (found, true_noise):
         further = optimize.minimize(
-            lambda t: likelihood(data, t)[:2], start.logs(), jac=True,
+            lambda t: data.model.objective(t)[:2], start.logs(), jac=True,
             method="BFGS",
         )  # fmt: skip
-        assert likelihood(data, found.logs())[0] < further.fun + 0.05
+        assert data.model.objective(found.logs())[0] < further.fun + 0.05
 
 
 def test_a_stated_drift_is_noise_that_readings_have_in_common_by_their_times() -> None:

@@ -115,7 +115,7 @@ def test_an_effect_that_the_parameters_explain_is_left_out():
         B[r.configuration == c, :, 3 * c : 3 * c + 3] = np.eye(3)
     r = replace(r, B=B @ np.random.default_rng(1).normal(size=(12, 12)))
     found, plain = (estimate_noise(r, "independent" + more) for more in ("+configuration", ""))
-    assert not found.fit.common.any() and found.fit.fit.converged
+    assert not found.fit.common.any() and found.fit.converged
     np.testing.assert_allclose(found.covariance.std, plain.covariance.std, rtol=1e-5)
 
 
@@ -185,7 +185,9 @@ def test_readings_are_judged_as_if_each_were_deleted(own, shared):
     found = estimate_noise(r.take(good), own + shared)
     t = prediction_errors(found, r, good, own_noise(found.fit, r)[0])
     fit = found.fit
-    parts = own_parts(own, r, fit.structure.names) + [shared_part(e.name, r) for e in fit.shared]
+    parts = own_parts(own, r, fit.structure.names) + [
+        shared_part(d.name, r) for d in fit.noisy.deviations
+    ]
     V = sum(v * part for v, part in zip(fit.theta, parts, strict=True))
     for i in range(len(r)):
         others = np.flatnonzero(good & (np.arange(len(r)) != i))

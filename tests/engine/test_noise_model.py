@@ -73,7 +73,8 @@ def test_repeats_share_the_mean_of_what_each_says() -> None:
         def components(self, readings: Readings) -> Mapping[str, np.ndarray]:
             return {"growing": 1.0 + np.arange(len(readings))}
 
-    noisy = NoisyReadings(UNBALANCED, Kind("growing"), structure=Growing().structure(UNBALANCED))
+    register_noise_model(Growing())
+    noisy = NoisyReadings(UNBALANCED, Kind("growing"))
     sets, number = noisy.sets, 1.0 + np.arange(len(UNBALANCED))
     for c, S in enumerate(sets.mean(noisy.structure.matrix)):
         np.testing.assert_allclose(S[0], number[sets.of == c].mean() * np.eye(3))

@@ -5,7 +5,8 @@ import pytest
 from scipy import linalg, stats
 
 from elastocal.identification.noise_choice import NoiseFit, estimate_noise
-from elastocal.identification.noise_structure import Readings, VisitRecord
+from elastocal.identification.noise_structure import Readings
+from elastocal.identification.visit_record import VisitRecord
 
 SIGMA, SCATTER, DRIFT, LASTING = 2e-5, 2e-5, 4e-5, 0.2
 
@@ -76,7 +77,7 @@ def test_likelihood_and_estimate_are_those_of_dense_matrices(kind):
     if found.lasting is None:
         V += found.fit.common[0] / SCATTER**2 * (covariance(r, SCATTER) - covariance(r))
     else:
-        V += found.fit.drift[0] * np.kron(course(r, found.lasting), np.eye(3))
+        V += found.fit.common[0] * np.kron(course(r, found.lasting), np.eye(3))
     B, e = r.B.reshape(3 * len(r), -1), r.e.ravel()
     value, x, Phi = restricted(V, B, e)
     # B is orthonormal in the fit, which shifts ℓ by ½ log|BᵀB|.
@@ -84,19 +85,19 @@ def test_likelihood_and_estimate_are_those_of_dense_matrices(kind):
     assert found.fit.log_likelihood == pytest.approx(value + shift, rel=1e-9)
     assert np.allclose(found.x, x, atol=1e-6 * np.sqrt(np.diag(Phi)).min())
     p = len(x)
-    plain = found.basis @ found.fit.fit.state.Phi @ found.basis.T
+    plain = found.basis @ found.fit.state.Phi @ found.basis.T
     assert np.allclose(plain[:p, :p], Phi, rtol=1e-6)
     # No other variances are likelier.
-    assert np.abs(found.fit.fit.model.objective(np.log(found.fit.theta))[1]).max() < 1e-2
+    assert np.abs(found.fit.model.objective(np.log(found.fit.theta))[1]).max() < 1e-2
 
 
 @pytest.mark.parametrize(
-    ("joints", "drift", "part"), [(SCATTER, 0.0, "+joints"), (0.0, DRIFT, "+time")]
+    ("joints", "drift", "part"), [(SCATTER, 0.0, "joints"), (0.0, DRIFT, "time")]
 )
 def test_what_is_there_is_chosen_and_its_size_found(joints, drift, part):
     r, rng = readings(), np.random.default_rng(3)
     kinds: list[NoiseFit] = [estimate_noise(drawn(r, rng, joints, drift)) for _ in range(5)]
-    assert all(part in k.kind or (part == "+joints" and "joint" in k.kind) for k in kinds)
+    assert all(part in k.kind or (part == "joints" and "joint" in k.kind) for k in kinds)
     assert all({t.part: t.p for t in k.tests}[part] < 0.01 for k in kinds)
     if joints:
         sizes = [np.sqrt(k.fit.common[-1]) for k in kinds]
@@ -116,5 +117,5 @@ def test_tests_of_either_alarm_falsely_once_in_a_hundred_times():
 
 def test_kenward_roger_widens_for_a_drift_and_knows_few_degrees_of_freedom():
     found = estimate_noise(drawn(readings(), np.random.default_rng(6), 0.0, DRIFT), "axis+time")
-    plain = (found.basis @ found.fit.fit.state.Phi @ found.basis.T).diagonal()[:5]
+    plain = (found.basis @ found.fit.state.Phi @ found.basis.T).diagonal()[:5]
     assert (found.covariance.matrix.diagonal() >= plain).all()

@@ -8,12 +8,12 @@ from support.calibration import PLACED, cell_of, random_chain, table_at, true_va
 from support.cells import random_poses
 
 from elastocal.cell.arm_description import CartesianNoise, Tracker, Unsteadiness
-from elastocal.identification import noise_structure
 from elastocal.identification.findings import judged
 from elastocal.identification.identify import identify
-from elastocal.identification.noise_structure import in_random_order
 from elastocal.identification.options import Options
 from elastocal.identification.result import Calibration
+from elastocal.identification.visit_record import LASTING as TRIED
+from elastocal.identification.visit_record import in_random_order
 from elastocal.model.manipulator import Model
 from elastocal.report.judgement_view import noise_model_line
 from elastocal.simulation import simulate
@@ -95,7 +95,7 @@ def test_how_long_a_drift_lasts_is_not_taken_for_known_unless_the_cell_states_it
     assert drift is not None and drift.ends and drift.seconds == LASTING * 60 * 35
     np.testing.assert_allclose(only, stated.spread.matrix)
     # In an order without times no seconds can be told.
-    assert identified(drift=DRIFT, timed=False).noise.drift.share in noise_structure.LASTING
+    assert identified(drift=DRIFT, timed=False).noise.drift.share in TRIED
     result = identified(drift=DRIFT, stated=False)
     spread, names = result.spread, result.determined
     weights, matrices = zip(*spread.among, strict=True)

@@ -40,9 +40,7 @@ def write_example(folder: Path, file: str) -> Path:
 @contextmanager
 def forgotten() -> Iterator[None]:
     """Catalogue, noise models, criteria and files that were run are afterwards as before."""
-    registries = (
-        CATALOGUE, structure.STRUCTURES, structure.REGISTERED, CRITERIA, plugin_loader._files
-    )  # fmt: skip
+    registries = (CATALOGUE, structure.STRUCTURES, CRITERIA, plugin_loader._files)
     before = [dict(each) for each in registries]
     try:
         yield

@@ -31,8 +31,7 @@ from elastocal.diagnosis.hypotheses import (
 from elastocal.diagnosis.noise_floor import NoiseValues, NoisyData, fit_noise
 from elastocal.errors import InsufficientDataError
 from elastocal.identification.checks import as_placed
-from elastocal.identification.noise_structure import along_axes, faster_course, visit_record
-from elastocal.identification.stated_noise import stated_lasting
+from elastocal.identification.noise_structure import TIME, stated_deviations
 from elastocal.measurements import Measurements, numbered
 from elastocal.model.arm import usual_sizes
 from elastocal.model.effects.catalogue import CATALOGUE
@@ -306,18 +305,17 @@ def _stated_drift(base: Baseline) -> tuple[Array, Array | float]:
     It is noise that neighbours in time have in common: left out, it passes for an effect that goes
     with time.
     """
-    observed, blocks, noise = base.observed, base.blocks, base.model.cell.noise
-    n, size = len(observed.lead), observed.size
-    some = subset(observed, np.arange(n) < base.n_measured)
-    record = visit_record(base.model, some, base.x) if noise.drift and size > 1 else None
-    if record is None:
+    observed, blocks = base.observed, base.blocks
+    n, size, found = len(observed.lead), observed.size, []
+    if base.model.cell.noise.drift:
+        some = subset(observed, np.arange(n) < base.n_measured)
+        found = stated_deviations(base.model, some, base.x, (TIME,))
+    if not found:
         return np.zeros((n, size, 0)), 0.0
-    lasting = stated_lasting(base.model, record)
-    along = np.where(np.arange(size) < 3, noise.drift, 0.0)
-    waves = along_axes(record.waves(lasting), along)
+    waves = found[0].waves
+    assert waves is not None
     drift = np.concatenate([waves, np.zeros((n - base.n_measured, *waves.shape[1:]))])
-    members = np.where(blocks.member < base.n_measured, blocks.member, -1)
-    loading = faster_course(record, lasting, along).packed(members)
+    loading = found[0].packed(np.where(blocks.member < base.n_measured, blocks.member, -1))
     return drift, loading @ loading.transpose(0, 2, 1)
 
 

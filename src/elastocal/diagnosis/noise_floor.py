@@ -72,13 +72,14 @@ class NoiseValues:
         configuration, of each at a visit."""
         return np.concatenate([[self.factor**2], (self.joint * self.shared) ** 2, self.joint**2])
 
-    def logs(self) -> Array:
-        return np.log(np.concatenate([[self.factor], self.shared, self.joint]))
-
     @classmethod
-    def of_logs(cls, theta: Array) -> NoiseValues:
-        factor, values = float(np.exp(theta[0])), np.exp(theta[1:])
-        return cls(factor, values[len(values) // 2 :], values[: len(values) // 2])
+    def of(cls, theta: Array) -> NoiseValues:
+        deviation, J = np.sqrt(theta), len(theta) // 2
+        joint = deviation[1 + J :]
+        return cls(float(deviation[0]), joint, deviation[1 : 1 + J] / joint)
+
+    def logs(self) -> Array:
+        return np.log(self.theta)
 
 
 @dataclass(frozen=True)
@@ -136,7 +137,7 @@ class NoisyData:
 
     @cached_property
     def model(self) -> Mixed:
-        """Of the variances `NoiseValues.theta`."""
+        """Of the variances `NoiseValues.theta`, with their prior."""
         (C, _, J), visit = self.G.shape, self.blocks.places.one_hot
         G = np.ascontiguousarray(self.G.transpose(0, 2, 1))[..., None]  # (C, joints, m, 1)
 
@@ -148,7 +149,7 @@ class NoisyData:
             Common(numbers(1 + J, J), G * visit[:, None]),
         )  # fmt: skip
         pack = Pack(self.X, self.r, parts, self.left_out)
-        return Mixed((pack,), 1 + 2 * J, self.precision)
+        return Mixed((pack,), 1 + 2 * J, self.precision, log_prior_of(self.stated, J))
 
 
 def covariance(data: NoisyData, noise: NoiseValues) -> Array:
@@ -161,21 +162,28 @@ def covariance(data: NoisyData, noise: NoiseValues) -> Array:
 
 @cache
 def log_prior_of(stated: bool, joints: int) -> LogPrior:
-    """Prior of the logarithms (1 + 2 joints,).
+    """Prior of the logarithms of θ (1 + 2 joints,), from that of a, c and s.
 
     The joints' own have a common mean that is itself uncertain.
     """
-    spread = STATED_SPREAD if stated else UNSTATED_SPREAD
-    mean = [0.0, *[np.log(SHARED)] * joints, *[np.log(REPEATABILITY)] * joints]
     own = (
-        _precision(1, spread, 0.0), _precision(joints, SHARED_SPREAD, 0.0),
+        _precision(1, STATED_SPREAD if stated else UNSTATED_SPREAD, 0.0),
+        _precision(joints, SHARED_SPREAD, 0.0),
         _precision(joints, JOINT_SPREAD, REPEATABILITY_SPREAD),
-    )  # fmt: skip
-    return LogPrior(np.array(mean), linalg.block_diag(*own))
+    )
+    back = np.linalg.inv(doubled(joints))
+    return LogPrior(NoiseValues.usual(joints).logs(), back.T @ linalg.block_diag(*own) @ back)
+
+
+def doubled(joints: int) -> Array:
+    """log θ = 2 (log a, log c + log s, log s) as a product with log a, log c and log s."""
+    out = 2 * np.eye(1 + 2 * joints)
+    out[1 : 1 + joints, 1 + joints :] = 2 * np.eye(joints)
+    return out
 
 
 def log_prior(stated: bool, noise: NoiseValues) -> float:
-    """−2 log prior of the logarithms, but for its constant."""
+    """−2 log prior of the noise, but for its constant."""
     return log_prior_of(stated, len(noise.joint)).penalty(noise.logs())[0]
 
 
@@ -303,20 +311,7 @@ def posterior(data: NoisyData, noise: NoiseValues) -> float:
     return -2 * Weighted.of(data, noise).marginal(data.precision) + log_prior(data.stated, noise)
 
 
-def likelihood(data: NoisyData, theta: Array) -> tuple[float, Array, Array]:
-    """−2 log of marginal likelihood times prior at logarithms θ (1 + 2 joints,), its slope, and its
-    average information."""
-    J = data.G.shape[2]
-    # The logarithms of the variances: twice those of factor, of c and s, of s.
-    to = 2 * np.eye(1 + 2 * J)
-    to[1 : 1 + J, 1 + J :] = 2 * np.eye(J)
-    value, slope, information = data.model.objective(to @ theta)
-    prior = log_prior_of(data.stated, J)
-    penalty, more = prior.penalty(theta)
-    return value + penalty, to.T @ slope + more, to.T @ information @ to + 2 * prior.precision
-
-
-STEPS = 200  # by the expected curvature; a few of them do mostly
+STEPS = 200  # a few of them do mostly
 SOME = 250  # configurations that show where the optimum is
 ENOUGH = 1e-3  # change of −2ℓ at which a search ends
 
@@ -324,18 +319,19 @@ ENOUGH = 1e-3  # change of −2ℓ at which a search ends
 def fit_noise(
     data: NoisyData, start: NoiseValues | None = None, enough: float = ENOUGH
 ) -> NoiseValues:
-    """The most probable noise values, by steps of the expected curvature in their logarithms.
+    """The most probable noise values.
 
     Where nothing is stated it starts from two ends, unless a start is given; with many
     configurations it comes from some of them to all.  The search ends where −2ℓ changes by less
     than `enough`.
     """
+    if start is None and len(data.r) >= 2 * SOME:
+        start = fit_noise(data.every(len(data.r) // SOME))
     if start is not None:
         return _climbed(data, start, enough)
-    if len(data.r) >= 2 * SOME:
-        return _climbed(data, fit_noise(data.every(len(data.r) // SOME)), enough)
     starts = [NoiseValues.usual(data.G.shape[2]), *([] if data.stated else [balanced(data)])]
-    return min((_climbed(data, s, enough) for s in starts), key=lambda end: posterior(data, end))
+    ends = [fit_noise(data, one, enough) for one in starts]
+    return min(ends, key=lambda end: posterior(data, end))
 
 
 def balanced(data: NoisyData) -> NoiseValues:
@@ -352,19 +348,15 @@ def balanced(data: NoisyData) -> NoiseValues:
 
 
 def _climbed(data: NoisyData, start: NoiseValues, enough: float) -> NoiseValues:
-    lower, upper = _limits(data)
-    begin = np.clip(start.logs(), lower, upper)
-    return NoiseValues.of_logs(
-        climb(lambda at: likelihood(data, at), begin, lower, upper, enough, STEPS)[0]
-    )
+    """By steps in log a, log c and log s: the latter are known apart from each other."""
+    J, wide = data.G.shape[2], 4 * (STATED_SPREAD if data.stated else UNSTATED_SPREAD)
+    upper = np.array([wide, *[5.0] * J, *[np.log(LARGEST)] * J])
+    lower = np.array([-wide, *[-5.0] * J, *[np.log(SMALLEST_NOISE)] * J])
+    to = doubled(J)
 
+    def objective(logs: Array) -> tuple[float, Array, Array]:
+        value, slope, information = data.model.objective(to @ logs)
+        return value, to.T @ slope, to.T @ information @ to
 
-def _limits(data: NoisyData) -> tuple[Array, Array]:
-    """Least and largest logarithms (1 + 2 joints,) that are tried."""
-    n = data.G.shape[2]
-    spread = STATED_SPREAD if data.stated else UNSTATED_SPREAD
-    least, most = np.log(SMALLEST_NOISE), np.log(LARGEST)
-    return (
-        np.array([-4 * spread, *[-5.0] * n, *[least] * n]),
-        np.array([4 * spread, *[5.0] * n, *[most] * n]),
-    )
+    begin = np.clip(np.linalg.solve(to, start.logs()), lower, upper)
+    return NoiseValues.of(np.exp(to @ climb(objective, begin, lower, upper, enough, STEPS)[0]))

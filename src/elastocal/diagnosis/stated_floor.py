@@ -26,20 +26,21 @@ from elastocal.diagnosis.noise_floor import (
     covariance,
     project,
 )
-from elastocal.model.observations import pure_error as pure_error_of
+from elastocal.model.observations import pure_error
 from elastocal.units import Array, BoolArray, IntArray
 
 
 def noise_floor(dataset: DiagnosisData, data: NoisyData, noise: NoiseValues) -> NoiseFloor:
     """Tracker noise, repeatability, shared scatter, (near-)repeats and faulty readings."""
-    used = ~data.left_out
+    used, (square, dof) = ~data.left_out, repeats(dataset)
     variance = np.diagonal(data.covariance, axis1=1, axis2=2)[used]
     ratio = noise_rms(data, noise) / np.sqrt(
         _per_reading(data, np.diagonal(data.covariance, axis1=1, axis2=2))
     )
     return NoiseFloor(
         data.stated, noise.factor, float(ratio), float(noise.factor * np.sqrt(variance.mean())),
-        tuple(noise.joint.tolist()), noise.shared_by_all, pure_error(dataset),
+        tuple(noise.joint.tolist()), noise.shared_by_all,
+        float(np.sqrt(square / dof)) if dof else None,
         tuple(noise.shared.tolist()), describe_faulty(dataset, data, noise),
         near_repeats(dataset, data, project(data, noise)), dataset.drift,
     )  # fmt: skip
@@ -69,18 +70,23 @@ def describe_faulty(
     )
 
 
-def pure_error(dataset: DiagnosisData) -> float | None:
-    """Scatter in m per axis among repeats of the same pose, load and marker; None without any."""
-    square, dof = pure_error_of(*_repeats(dataset, ~dataset.data.faulty))
-    return float(np.sqrt(square / dof)) if dof else None
+def repeats(dataset: DiagnosisData, come_back: bool = False) -> tuple[float, int]:
+    """Sum of squares (m²) per axis among repeats of pose, load and marker, and degrees of freedom.
 
-
-def _repeats(dataset: DiagnosisData, good: BoolArray) -> tuple[IntArray, Array]:
-    """Of the `good` observations (N,) the number of their pose, load and marker (n,), and what was
-    read in m (n, 1 or 3)."""
-    observed = dataset.base.observed
+    `come_back`: of those for which the arm was elsewhere in between, in the order of times or rows.
+    Readings one after the other, the arm standing still, show the tracker's noise alone.
+    """
+    good, observed = ~dataset.data.faulty, dataset.base.observed
     values = observed.value.reshape(-1, observed.size)[good][:, : min(observed.size, 3)]
-    return dataset.repeated[good], values
+    group = dataset.repeated[good]
+    if come_back:
+        order = np.argsort(dataset.moment[good], kind="stable")
+        moved = np.diff(dataset.table.configuration[dataset.lead[good]][order], prepend=-1) != 0
+        stay = np.empty(len(order), dtype=np.int64)
+        stay[order] = np.cumsum(moved)
+        first = np.unique(np.column_stack([group, stay]), axis=0, return_index=True)[1]
+        group, values = group[first], values[first]
+    return pure_error(group, values)
 
 
 # Near-repeats: readings of the same marker under the same load at poses that nearly coincide.
@@ -158,26 +164,6 @@ def _independent(pairs: IntArray) -> int:
     known, at = np.unique(pairs, return_inverse=True)
     n, (i, j) = len(known), at.reshape(pairs.shape).T
     return n - int(connected_components(sparse.csr_array((np.ones(len(i)), (i, j)), (n, n)))[0])
-
-
-# Repeats to which the arm came back: it was elsewhere in between, in the order of times or rows.
-
-
-def returned(dataset: DiagnosisData) -> tuple[float, int]:
-    """Mean square (m²) per axis among repeats that the arm came back for, and degrees of freedom.
-
-    Readings one after the other, the arm standing still, show the tracker's noise alone.
-    """
-    good = ~dataset.data.faulty
-    order = np.argsort(dataset.moment[good], kind="stable")
-    moved = np.diff(dataset.table.configuration[dataset.lead[good]][order], prepend=-1) != 0
-    stay = np.empty(len(order), dtype=np.int64)
-    stay[order] = np.cumsum(moved)
-    group, values = _repeats(dataset, good)
-    # The first reading of each stay.
-    first = np.unique(np.column_stack([group, stay]), axis=0, return_index=True)[1]
-    square, dof = pure_error_of(group[first], values[first])
-    return square / max(dof, 1), dof
 
 
 # Scatter of a joint that goes with pose or time is no scatter.
@@ -291,8 +277,7 @@ def supported_floor(
     stated = np.diagonal(data.covariance, axis1=1, axis2=2)
     beyond = _per_reading(data, (data.G**2) @ smooth + above * stated)
     variance = max(fitted**2 - beyond, 0.0)
-    mean, dof = returned(dataset)
-    total = mean * dof
+    total, dof = repeats(dataset, come_back=True)
     near = near_repeats(dataset, data, at)
     if near is not None:
         total += near.scatter**2 * near.independent * size

@@ -158,45 +158,6 @@ class Whitened:
         """R⁻ᵀ times rows (C, m, …)."""
         return np.asarray(self.root.transpose(0, 2, 1) @ rows)
 
-    def local_information(self, Q: Array, theta: Array) -> Array:
-        """θ_kθ_l tr P K_k P K_l (C, k, k) of each cluster by itself, P = R⁻ᵀQR⁻¹, θ (C, k).
-
-        Of what is common by its loadings: with W = R⁻¹ℓ, the squares of WᵀQW.
-        """
-        root, n = self.root[:, None], 0
-        whole, rows = [], []
-        for part in self.pack.parts:
-            own = theta[:, n : n + part.of.shape[1], None, None]
-            n += part.of.shape[1]
-            if isinstance(part, Common):
-                W = (root @ part.loading) * np.sqrt(own)
-                rows.append((W, Q[:, None] @ W))
-            else:
-                whole.append(part.turned(self.root) * own)
-        out, first = np.zeros((*theta.shape, theta.shape[1])), 0
-        if whole:
-            A = np.concatenate(whole, axis=1)
-            first = A.shape[1]
-            QA = Q[:, None] @ A
-            flat = QA.reshape(*QA.shape[:2], -1)
-            out[:, :first, :first] = flat @ QA.swapaxes(2, 3).reshape(flat.shape).swapaxes(1, 2)
-        at = first
-        for i, (W, _) in enumerate(rows):
-            here, (C, k, m, r) = slice(at, at + W.shape[1]), W.shape
-            at, there = here.stop, first
-            left = W.swapaxes(2, 3).reshape(C, k * r, m)
-            if whole:
-                Y = rows[i][1].swapaxes(1, 2).reshape(C, 1, m, k * r)
-                both = ((A @ Y) * Y).sum(axis=2).reshape(C, first, k, r).sum(axis=3)
-                out[:, :first, here], out[:, here, :first] = both, both.swapaxes(1, 2)
-            for other in rows:
-                k2, r2 = other[1].shape[1], other[1].shape[3]
-                right = other[1].swapaxes(1, 2).reshape(C, m, k2 * r2)
-                square = ((left @ right) ** 2).reshape(C, k, r, k2, r2).sum(axis=(2, 4))
-                out[:, here, there : there + k2] = square
-                there += k2
-        return out
-
 
 @dataclass(frozen=True)
 class State:
@@ -229,12 +190,6 @@ class State:
                 yield w, (flat @ self.inverse.T).reshape(w.B.shape), w.e - w.B @ self.x
             else:
                 yield w, w.B, w.e
-
-    def projected(self) -> Iterator[tuple[Pack, Array, Array]]:
-        """The packs with P (C, m, m) of each cluster by itself and Pe (C, m)."""
-        for w, H, z in self.each():
-            P = w.back((np.eye(H.shape[1]) - H @ H.transpose(0, 2, 1)) @ w.root)
-            yield w.pack, P, w.back(z[..., None])[..., 0]
 
 
 @dataclass(frozen=True)
@@ -297,35 +252,29 @@ class Mixed:
         return State(theta, packs, x, L, value)
 
     def objective(self, t: Array) -> tuple[float, Array, Array]:
-        """−2 log posterior at logarithms t (K,), its slope, and the curvature to expect of each
-        cluster by itself, tr P K_k P K_l."""
+        """−2 log posterior at logarithms t (K,), its slope, and its average information: of θ_k and
+        θ_l the mean of observed and expected curvature, eᵀPK_kPK_lPe (Gilmour, Thompson and Cullis
+        1995, Biometrics 51, 1440)."""
         state, K = self.state(np.exp(t)), self.K
         slope, information = np.zeros(K), np.zeros((K, K))
+        seen = np.zeros((K, len(state.x)))  # of K_l P e by x
         for w, H, z in state.each():
-            pack, u = w.pack, w.back(z[..., None])[..., 0]
-            Q = np.eye(z.shape[1]) - H @ H.transpose(0, 2, 1)
-            P, theta = w.back(Q @ w.root), state.theta[pack.of]
-            squares = np.concatenate([part.times(u) @ u[..., None] for part in pack.parts], axis=1)
+            pack, u, theta = w.pack, w.back(z[..., None])[..., 0], state.theta[w.pack.of]
+            P = w.back((np.eye(z.shape[1]) - H @ H.transpose(0, 2, 1)) @ w.root)
             trace = np.concatenate([part.trace(P) for part in pack.parts], axis=1)
-            slope += pack.added(theta * (trace - squares[..., 0]), K)
-            information += pack.pairs(w.local_information(Q, theta), K)
-        value = state.value
+            Ku = np.concatenate([part.times(u) for part in pack.parts], axis=1)
+            slope += pack.added(theta * (trace - (Ku @ u[..., None])[..., 0]), K)
+            own = theta[..., None] * (Ku @ w.root.transpose(0, 2, 1))
+            information += pack.pairs(own @ own.transpose(0, 2, 1), K)
+            if H.shape[2]:
+                seen += pack.added(own @ H, K)
+        value, information = state.value, information - seen @ seen.T
         if self.prior is not None:
             penalty, more = self.prior.penalty(t)
             value += penalty
             slope[: len(more)] += more
             information = 2 * self.prior.curved(information / 2)
         return value, slope, information
-
-    def told(self, state: State) -> BoolArray:
-        """Which θ_k (K,) the readings say anything of: not those that x could explain all of, which
-        then is so in every cluster by itself."""
-        left, whole = np.zeros(self.K), np.zeros(self.K)
-        for w, H, _ in state.each():
-            theta, one = state.theta[w.pack.of], np.broadcast_to(np.eye(H.shape[1]), w.root.shape)
-            for out, Q in ((left, one - H @ H.transpose(0, 2, 1)), (whole, one)):
-                out += np.diag(w.pack.pairs(w.local_information(Q, theta), self.K))
-        return left > LEAST_TOLD * whole
 
     def expected(self, state: State) -> Expected:
         """The expected information on θ at a state, and what Kenward and Roger need."""
@@ -415,18 +364,18 @@ FLAT, NEAR = 1.0, 0.1  # curvature and slope in it below which it may be none
 
 @dataclass(frozen=True)
 class MixedFit:
-    """θ (K,) at the maximum, the state there, and whether the search ended.
+    """θ (K,) at the maximum, and whether the search ended.
 
     `log_likelihood` is the restricted one, with a prior the marginal one by Laplace's method.
     """
 
     model: Mixed
-    state: State
+    theta: Array
     converged: bool
 
-    @property
-    def theta(self) -> Array:
-        return self.state.theta
+    @cached_property
+    def state(self) -> State:
+        return self.model.state(self.theta)
 
     @cached_property
     def expected(self) -> Expected:
@@ -455,6 +404,10 @@ class MixedFit:
             )
         return out
 
+    def kenward_roger(self, rows: Array) -> tuple[Array, Array]:
+        """Covariance (k, k) and degrees of freedom (k,) of combinations `rows` (k, p) of x."""
+        return self.expected.kenward_roger(self.covariance, rows)
+
     @cached_property
     def log_likelihood(self) -> float:
         found, prior = self.state.log_likelihood, self.model.prior
@@ -478,11 +431,6 @@ def fit(
     t = np.log(start)
     known: dict[bytes, tuple[float, Array, Array]] = {}
     lower, upper, ended = t + np.log(SMALLEST), t + np.log(LARGEST), False
-    held = np.zeros(0, dtype=np.int64)
-    if any(isinstance(part, Common) for pack in model.packs for part in pack.parts):
-        # Those that the columns could explain all of say nothing: they are none.
-        told = model.told(model.state(start))
-        held = np.array([k for k in may_vanish if not told[k]], dtype=np.int64)
 
     def evaluated(t: Array) -> tuple[float, Array, Array]:
         if (key := t.tobytes()) not in known:
@@ -494,6 +442,9 @@ def fit(
                 known[key] = np.inf, np.zeros(len(t)), np.eye(len(t))
         return known[key]
 
+    # Those that the columns could explain all of say nothing: they are none.
+    told = np.diag(evaluated(t)[2]) > LEAST_TOLD
+    held = np.array([k for k in may_vanish if not told[k]], dtype=np.int64)
     for _ in range(ROUNDS):
         t[held], lower[held], upper[held] = -np.inf, -np.inf, -np.inf
         before, (t, ended) = t, _climbed(evaluated, t, lower, upper, enough)
@@ -508,7 +459,7 @@ def fit(
         if not gone and (ended or np.array_equal(t, before)):
             break
         held = np.append(held, gone).astype(np.int64)
-    return MixedFit(model, model.state(np.exp(t)), ended)
+    return MixedFit(model, np.exp(t), ended)
 
 
 def _climbed(

@@ -143,30 +143,6 @@ def orthogonal(B: Array) -> Orthogonal:
 #
 # only p-dimensional quantities are summed over clusters; neither Γ nor I − QQᵀ is formed.
 
-
-class SatterthwaiteSums:
-    """The sums over clusters for all p parameters at once, added block by block."""
-
-    def __init__(self, p: int) -> None:
-        self._size, self._trace, self._square = np.zeros(p), np.zeros(p), np.zeros(p)
-        self._outer = np.zeros((p, p, p))
-
-    def add(self, aa: Array, b: Array) -> None:
-        """Add clusters: aa (clusters, p) with a_cᵀa_c, b (clusters, p of Q, p) with b_c."""
-        bb = np.sum(b * b, axis=1)
-        self._size += aa.sum(axis=0)
-        self._trace += (aa - bb).sum(axis=0)
-        self._square += (aa * (aa - 2 * bb)).sum(axis=0)
-        by_parameter = b.transpose(2, 1, 0)
-        self._outer += by_parameter @ by_parameter.transpose(0, 2, 1)
-
-    def dof(self) -> Array:
-        """Degrees of freedom (p,); 0 where the residual says nothing of the variance."""
-        square = self._square + np.sum(self._outer**2, axis=(1, 2))
-        told = (self._trace > 1e-9 * self._size) & (square > 0)
-        return np.where(told, self._trace**2 / np.where(told, square, 1.0), 0.0)
-
-
 # Cluster-robust covariance: rows of a cluster may be correlated in any way (CR0 to CR3).
 #
 # A cluster is what shares an error: the readings of one configuration share the arm's
@@ -227,8 +203,9 @@ def clustered(parts: Iterable[Rows], V: Array, kind: str) -> Covariance:
     fewer where few clusters matter.
     """
     p, n, G = len(V), 0, 0
-    meat, sums, alone = np.zeros((p, p)), SatterthwaiteSums(p), np.zeros(p, dtype=bool)
+    meat, outer, alone = np.zeros((p, p)), np.zeros((p, p, p)), np.zeros(p, dtype=bool)
     lone: list[int] = []
+    size, trace, square = np.zeros((3, p))  # Σ aᵀa, tr Γ and tr Γ²
     for Q, e, cluster in parts:
         n, G = n + len(e), G + len(np.unique(cluster))
         for rows in _blocks(cluster, p):
@@ -239,7 +216,11 @@ def clustered(parts: Iterable[Rows], V: Array, kind: str) -> Covariance:
             scores = (e[rows][:, None, :] @ adjusted)[:, 0]
             meat += scores.T @ scores
             a = adjusted @ V.T
-            sums.add(np.sum(a * a, axis=1), Qc.transpose(0, 2, 1) @ a)
+            aa, b = (a * a).sum(axis=1), Qc.transpose(0, 2, 1) @ a
+            bb, by_parameter = (b * b).sum(axis=1), b.transpose(2, 1, 0)
+            size, trace = size + aa.sum(axis=0), trace + (aa - bb).sum(axis=0)
+            square = square + (aa * (aa - 2 * bb)).sum(axis=0)
+            outer += by_parameter @ by_parameter.transpose(0, 2, 1)
     if G < 2:
         raise InsufficientDataError(
             "a cluster-robust covariance compares clusters, but all rows are in one;"
@@ -256,7 +237,10 @@ def clustered(parts: Iterable[Rows], V: Array, kind: str) -> Covariance:
     text = f"rows correlated within {G} clusters, {CLUSTER_DESCRIPTION[kind]}"
     if alone.any():
         text += f"; parameters {np.flatnonzero(alone).tolist()} hang on a single cluster"
-    return Covariance(kind, V @ ((meat + meat.T) / 2) @ V.T, np.where(alone, 0.0, sums.dof()), text)
+    square = square + (outer**2).sum(axis=(1, 2))
+    told = (trace > 1e-9 * size) & (square > 0) & ~alone  # the residual says something of it
+    dof = np.where(told, trace**2 / np.where(told, square, 1.0), 0.0)
+    return Covariance(kind, V @ ((meat + meat.T) / 2) @ V.T, dof, text)
 
 
 def _blocks(cluster: IntArray, columns: int) -> Iterator[IntArray]:

@@ -12,7 +12,7 @@ from scipy import linalg, special
 from elastocal.errors import option
 from elastocal.identification.far_values import STATED_BY_FILE, far_values
 from elastocal.identification.mistakes import CELL, KILOGRAMS, load_ratio
-from elastocal.identification.noise_structure import JOINTS, TIME, Kind
+from elastocal.identification.noise_structure import CONFIGURATION, JOINTS, TIME, Kind
 from elastocal.identification.noise_summary import Drift, NoiseSize
 from elastocal.identification.outliers import kept_of
 from elastocal.identification.prediction import unread_markers
@@ -380,9 +380,10 @@ def _repeats(result: Calibration, fits: bool) -> Iterator[Finding]:
     Where the residual `fits` a stated noise of which readings share some, nothing is missing.
     """
     noise, test = result.noise, result.noise.lack_of_fit
+    shared = [s for s in noise.sizes or () if s.part == CONFIGURATION and s.sigma is not None]
     if test is not None:
         counted = "the intervals" if noise.intervals_by_configuration else "nothing"
-        if noise.shared or noise.drift is not None:
+        if shared or noise.drift is not None:
             counted = "the noise model"
         numbers: dict[str, Number] = {
             "F": test.F, "dof_between": test.dof_between, "dof_pure": test.dof_pure, "p": test.p,
@@ -394,7 +395,6 @@ def _repeats(result: Calibration, fits: bool) -> Iterator[Finding]:
             yield Finding("lack_of_fit", severity, numbers, "" if known else _lacking(result))
         else:
             yield Finding("repeats_agree", "good", numbers)
-    shared = [s for s in noise.sizes or () if s.shared and s.sigma is not None]
     if shared:
         yield Finding(
             "common_deviation", "note",
@@ -413,9 +413,9 @@ def _visits(result: Calibration, fits: bool) -> Iterator[Finding]:
     stated = result.model.cell.noise
     scatter = stated.of_joints(result.model.chain.n_joints)
     for test in noise.tests:
-        if test.p >= SCATTERS or test.part not in (JOINTS, TIME):
+        if test.p >= SCATTERS:
             continue
-        joints = [s for s in sizes if s.of_joints and s.sigma]
+        joints = [s for s in sizes if s.joints and s.sigma]
         if test.part == JOINTS and joints:
             yield Finding(
                 "joint_scatter", "note",
@@ -430,7 +430,7 @@ def _visits(result: Calibration, fits: bool) -> Iterator[Finding]:
                 ], fits),
             )  # fmt: skip
         elif test.part == TIME and noise.drift is not None:
-            drifts = [s for s in sizes if s.drift and s.sigma]
+            drifts = [s for s in sizes if s.part == TIME and s.sigma]
             if drifts:
                 remedy = _beside_stated("drift_um", [(drifts[0], stated.drift)], fits)
                 yield _drift(noise.drift, drifts[0], test.p, remedy)
@@ -438,7 +438,7 @@ def _visits(result: Calibration, fits: bool) -> Iterator[Finding]:
             known = scatter.any() if test.part == JOINTS else stated.drift > 0
             yield Finding(
                 "scatter_not_counted", "care",
-                {"part": "joints" if test.part == JOINTS else "time", "p": test.p},
+                {"part": test.part, "p": test.p},
                 "Fit with the scatter that [noise] of the cell states: "
                 f"{option('noise', Kind.parsed(noise.kind).with_stated(stated).name)}."
                 if known

@@ -1,73 +1,123 @@
-"""Which noise model the readings support, and its weights."""
+"""Which noise model the readings support, its variances and its weights."""
 
 from __future__ import annotations
 
 import math
+from collections.abc import Sequence
 from contextlib import suppress
 from dataclasses import dataclass, replace
-from functools import cached_property
+from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
 from scipy import linalg, sparse, special
 
-from elastocal.engine.mixed import ENOUGH, Full, LogPrior, Mixed, MixedFit, Pack, fit
+from elastocal.engine.mixed import (
+    ENOUGH,
+    Common,
+    Full,
+    LogPrior,
+    Mixed,
+    MixedFit,
+    NoiseParts,
+    Pack,
+    fit,
+)
 from elastocal.errors import ElastocalError, InputError, InsufficientDataError
 from elastocal.identification.covariance import Covariance, orthogonal
 from elastocal.identification.noise_structure import (
+    CONFIGURATION,
     EACH,
+    EACH_HAS,
     JOINTS,
-    LONGEST,
-    REGISTERED,
-    SHARED,
+    PARTS,
     STRUCTURES,
     TIME,
+    Deviation,
     Kind,
     Readings,
-    Sets,
-    SharedEffect,
     Structure,
-    VisitRecord,
-    along_axes,
-    contrasts_of,
-    drifts_of,
-    faster_course,
-    joint_effects,
-    like,
-    packs_of,
-    shared_effects,
-    visit_record,
+    ranked_within,
+    stated_deviations,
 )
+from elastocal.identification.visit_record import LONGEST, visit_record
 from elastocal.identification.weighted_problem import (
     Weights,
     block_diagonal,
+    inverse_factor,
     least_norm,
     stated_by_observation,
     whitener,
 )
+from elastocal.measurements import firsts, numbered
 from elastocal.model.manipulator import Model
 from elastocal.model.observations import Observations, polar_axes
-from elastocal.units import Array, BoolArray, IntArray
+from elastocal.units import Array, IntArray
 
 TINY = 1e-100  # stands for the variance of perfect data: its square is still a number
 LEAST_START = 1e-6  # of the largest: a variance smaller than that of a former fit is no start
 FEWEST_TELLING = 10  # degrees of freedom of repeats, from which on they tell the noise
 
+# Readings as rows.  Of R repeats the mean, times √R, holds all of Δx and of what they share; R − 1
+# contrasts between them hold their own noise alone.  Rows so turned are as good as those read: the
+# turn is orthogonal.
+
+
+class Sets:
+    """Readings as sets of repeats: `of` (N,) the set of a reading, `root` (S,) √R, and the rows
+    B (S, size, p), e (S, size) of their means times that; `contrasts` (N − S, size) of `sets`."""
+
+    def __init__(self, readings: Readings, B: Array, apart: Sequence[IntArray]) -> None:
+        self.of = numbered(readings.configuration, readings.load, readings.marker, *apart)
+        self.n = int(self.of.max(initial=-1)) + 1
+        self.first = firsts(self.of, self.n)
+        repeats = np.bincount(self.of, minlength=self.n)
+        self.root = np.sqrt(repeats)
+        self.B = self.mean(B) * self.root[:, None, None]
+        self.e = self.mean(readings.e) * self.root[:, None]
+        order = np.argsort(self.of, kind="stable")
+        starts = np.concatenate([[0], np.cumsum(repeats)])[:-1]
+        e, set_of = readings.e[order], self.of[order]
+        before = np.cumsum(e, axis=0) - e
+        before -= before[starts][set_of]
+        j = (np.arange(len(e)) - starts[set_of])[:, None]
+        self.contrasts = ((before - j * e) / np.sqrt(np.maximum(j * (j + 1), 1)))[j[:, 0] > 0]
+        self.sets = set_of[j[:, 0] > 0]
+
+    def mean(self, values: Array) -> Array:
+        """Of each set (S, …) of values (N, …)."""
+        if self.n == len(self.of):
+            out = np.empty_like(values)
+            out[self.of] = values
+            return out
+        total = np.zeros((self.n, *values.shape[1:]))
+        np.add.at(total, self.of, values)
+        return total / (self.root**2).reshape(-1, *[1] * (values.ndim - 1))
+
+    def clusters(self, together: IntArray | None) -> list[IntArray]:
+        """Sets (C, M) of clusters, −1 for none, in packs of clusters that differ by less than two
+        in size: those of one label `together` (S,), or each set by itself."""
+        label = np.arange(self.n) if together is None else numbered(together)
+        count = np.bincount(label)
+        order, starts = np.argsort(label, kind="stable"), np.concatenate([[0], np.cumsum(count)])
+        found, rank = [], np.ceil(np.log2(count)).astype(int)
+        for size in np.unique(rank):
+            of = np.flatnonzero(rank == size)
+            place = np.arange(count[of].max())
+            last = np.minimum(starts[of][:, None] + place, self.n - 1)
+            found.append(np.where(place < count[of][:, None], order[last], -1))
+        return found
+
 
 class NoisyReadings:
-    """Readings under a kind of noise: its structure, what is shared, a course that is `lasting` so
-    long, and all of that as a mixed model.
+    """Readings under a kind of noise, where what drifts is `lasting` so long, as a mixed model.
 
-    Variances θ: those of single readings, of what drifts, of what is shared.  `whole` are the
-    readings that the model is of, of which those `silent` (N,) are only there to be judged.
+    Variances θ: those of single readings, then one for each of the `deviations` that they share.
     """
 
-    def __init__(
-        self, readings: Readings, kind: Kind, lasting: float | None = None,
-        structure: Structure | None = None, silent: BoolArray | None = None,
-    ) -> None:  # fmt: skip
+    def __init__(self, readings: Readings, kind: Kind, lasting: float | None = None) -> None:
         self.readings, self.kind, self.lasting = readings, kind, lasting
-        self.structure = structure or STRUCTURES[kind.own](readings)
+        self.structure = STRUCTURES[kind.own].structure(readings)
         apart = []
         if kind.by_visit:
             if readings.visits is None:
@@ -78,18 +128,24 @@ class NoisyReadings:
         if kind.own == "stated":  # repeats that are stated alike
             stated = self.structure.matrix.reshape(len(readings), -1)
             apart.append(np.unique(stated, axis=0, return_inverse=True)[1].ravel())
-        if silent is not None:
-            apart.append(np.where(silent, 1 + np.arange(len(readings)), 0))  # each by itself
-        self.sets = Sets(readings, self.columns(readings), apart)
-        self.drifts = drifts_of(readings.size) if lasting is not None else ()
-        self.silent = None if silent is None else silent[self.sets.first]
+        found = kind.deviations(readings, lasting)
+        waves = [d.waves for d in found if d.waves is not None]
+        self.sets = Sets(readings, np.concatenate([readings.B, *waves], axis=2), apart)
+        self.deviations = self._telling(found)
 
-    def columns(self, readings: Readings) -> Array:
-        """B of the readings (N, size, p + k) with the columns of what drifts."""
-        if self.lasting is None or readings.visits is None:
-            return readings.B
-        waves = readings.visits.waves(self.lasting)
-        return np.concatenate([readings.B, along_axes(waves, np.ones(readings.size))], axis=2)
+    def _telling(self, found: list[Deviation]) -> list[Deviation]:
+        """Nothing but repeats tells a deviation of each set from the noise of single readings, and
+        a few of them may agree by chance."""
+        own = [d for d in found if d.part == CONFIGURATION]
+        if CONFIGURATION in self.kind.parts and not own:
+            raise InputError(
+                f"'{self.kind.own}+{CONFIGURATION}' needs repeats or several markers in a "
+                "configuration; this table has one reading in each"
+            )
+        if len(self.sets.contrasts) * self.readings.size < FEWEST_TELLING:
+            fewer = [d for d in own if len(np.unique(d.unit)) < self.sets.n]
+            own = fewer or own
+        return [d for d in found if d.part != CONFIGURATION or d in own]
 
     @property
     def own(self) -> int:
@@ -97,80 +153,58 @@ class NoisyReadings:
         return len(self.structure.names)
 
     @property
-    def spare(self) -> list[int]:
-        """Own variances that may be none together, the others still giving every reading noise in
-        every direction: the last that can be spared first."""
-        theta = np.ones(self.own)
-        found: list[int] = []
-        if self.structure.index.shape[1] == 1 or self.structure.shrunk:
-            return found
-        for k in reversed(range(self.own)):
-            theta[k] = 0.0
-            if np.linalg.eigvalsh(self.structure.covariance(theta)).min() > 0:
-                found.append(k)
-            else:
-                theta[k] = 1.0
-        return found
-
-    @cached_property
-    def shared(self) -> tuple[SharedEffect, ...]:
-        readings = self.readings
-        found: tuple[SharedEffect, ...] = ()
-        if self.kind.shared:
-            found = shared_effects(readings)
-            if len(self.sets.contrasts) * readings.size < FEWEST_TELLING:
-                # Nothing but repeats tells a deviation of each set from the noise of single
-                # readings, and a few of them may agree by chance.
-                n = self.sets.n
-                found = tuple(e for e in found if len(np.unique(e.unit)) < n) or found
-            if not found:
-                raise InputError(
-                    f"'{self.kind.own}{SHARED}' needs repeats or several markers in a "
-                    "configuration; this table has one reading in each"
-                )
-        if self.kind.joints:
-            assert readings.visits is not None
-            found += joint_effects(readings.visits, self.kind.joints == EACH)
-        return found
-
-    @property
     def names(self) -> tuple[str, ...]:
         """Of all variances."""
-        return (
-            *self.structure.names, *(name for name, _ in self.drifts),
-            *(e.name for e in self.shared),
-        )  # fmt: skip
+        return (*self.structure.names, *(d.name for d in self.deviations))
 
-    @cached_property
-    def deviations(self) -> list[tuple[int, SharedEffect]]:
-        """All that readings share beside a course's waves, with the numbers of its variance."""
-        first = self.own + len(self.drifts)
-        found = list(enumerate(self.shared, first))
-        if self.lasting is not None and self.readings.visits is not None:
-            for k, (_, axes) in enumerate(self.drifts, self.own):
-                found.append((k, faster_course(self.readings.visits, self.lasting, axes)))
-        return found
-
-    @cached_property
-    def packs(self) -> list[tuple[IntArray, Pack]]:
-        numbers, effects = zip(*self.deviations, strict=True) if self.deviations else ((), ())
-        together = self.readings.configuration[self.sets.first] if effects else None
-        return packs_of(self.sets, self.structure, effects, numbers, together, self.silent)
+    @property
+    def may_vanish(self) -> list[int]:
+        """Variances that may be none: own ones together, the others still giving every reading
+        noise in every direction, and what is shared; without what drifts its waves have no prior.
+        """
+        theta = np.ones(self.own)
+        found: list[int] = []
+        if self.structure.index.shape[1] > 1 and not shrunk(self.kind):
+            for k in reversed(range(self.own)):  # the last that can be spared first
+                theta[k] = 0.0
+                if np.linalg.eigvalsh(self.structure.covariance(theta)).min() > 0:
+                    found.append(k)
+                else:
+                    theta[k] = 1.0
+        return found + [k for k, d in enumerate(self.deviations, self.own) if d.waves is None]
 
     def model(self, prior: LogPrior | None = None) -> Mixed:
-        """With a course in time: its coefficients are columns of B, which readings of zero with the
+        """Packs of clusters of the sets: readings of a configuration that share anything are one.
+
+        With a course in time its coefficients are columns of B, which readings of zero with the
         unknown variance hold.  Restricted likelihood is then that of the course taken for noise
         (Henderson 1975), and nothing as large as the table squared is formed."""
-        packs = [pack for _, pack in self.packs]
-        if len(self.sets.contrasts):
-            packs.append(contrasts_of(self.sets, self.structure))
-        p, size = self.sets.B.shape[2], self.readings.size
-        if held := p - self.readings.n_parameters:
-            number = np.tile(self.own + np.arange(len(self.drifts)), (held // size, 1))
-            along = np.array([np.diag(axes) for _, axes in self.drifts])
-            parts = (Full(number, np.tile(along, (held // size, 1, 1, 1))),)
-            B = np.eye(held, p, p - held).reshape(-1, size, p)
-            packs.append(Pack(B, np.zeros(B.shape[:2]), parts, np.zeros(B.shape[:2], dtype=bool)))
+        sets, packs = self.sets, []
+        matrix, index = sets.mean(self.structure.matrix), self.structure.index[sets.first]
+        scale, (size, p) = sets.root[:, None, None, None], sets.B.shape[1:]
+        turned = [
+            replace(d, unit=d.unit[sets.first], loading=d.loading[sets.first] * scale)
+            for d in self.deviations
+        ]
+        for members in sets.clusters(self.readings.configuration[sets.first] if turned else None):
+            (C, M), here = members.shape, (members >= 0)[..., None]
+            parts = [_own_parts(index, matrix, members)]
+            for k, d in enumerate(turned, self.own):
+                parts.append(Common(np.full((C, 1), k), d.packed(members)[:, None]))
+            B = np.where(here[..., None], sets.B[members], 0.0).reshape(C, M * size, p)
+            e = np.where(here, sets.e[members], 0.0).reshape(C, M * size)
+            packs.append(Pack(B, e, tuple(parts), np.repeat(members < 0, size, axis=1)))
+        if len(e := sets.contrasts):
+            own = _own_parts(index, matrix, sets.sets[:, None])
+            packs.append(Pack(np.zeros((*e.shape, 0)), e, (own,), np.zeros(e.shape, dtype=bool)))
+        held = np.repeat(
+            np.arange(self.own, len(self.names)),
+            [0 if d.waves is None else d.waves.shape[2] for d in self.deviations],
+        )[:, None]
+        if k := len(held):
+            own, none = Full(held, np.ones((k, 1, 1, 1))), np.zeros((k, 1))
+            B = np.eye(k, p, p - k)[:, None]
+            packs.append(Pack(B, none, (own,), none.astype(bool)))
         return Mixed(tuple(packs), len(self.names), np.zeros(p), prior)
 
     def start(self, like: Fitted | None = None) -> Array:
@@ -184,14 +218,8 @@ class NoisyReadings:
             # A few repeats may agree by rounding: from near zero the search does not come back.
             own = max((float((sets.contrasts**2).sum()) + own / dof) / (dof + 1 / dof), 1e-9 * own)
         share = 0.1 * float((self.readings.e**2).mean())
-        moved = [
-            float((e.loading**2).sum(axis=(1, 3)).mean()) if e.joints else 1.0 for e in self.shared
-        ]
-        theta = np.concatenate([
-            np.full(self.own, own), np.full(len(self.drifts), share),
-            share / np.array(moved),
-        ])  # fmt: skip
-        theta = np.maximum(theta, TINY)
+        shared = [share * size / d.mean_square(size) for d in self.deviations]
+        theta = np.maximum(np.concatenate([np.full(self.own, own), shared]), TINY)
         if like is None:
             return theta
         known = dict(zip(like.noisy.names, like.theta, strict=True))
@@ -203,56 +231,70 @@ class NoisyReadings:
         return theta
 
 
+def _own_parts(index: IntArray, matrix: Array, members: IntArray) -> NoiseParts:
+    """The parts of single readings: those of the k-th of a cluster's different variances, each."""
+    (C, M), (L, size) = members.shape, matrix.shape[1:3]
+    here = members >= 0
+    own = np.where(here[..., None], index[members], -1)  # (C, M, L)
+    blocks = np.where(here[..., None, None, None], matrix[members], 0.0)
+    place = ranked_within(own.reshape(C, -1)).reshape(C, M, L)
+    numbers = int(place.max()) + 1
+    mine = place == np.arange(numbers)[:, None, None, None]  # (k, C, M, L)
+    of = np.where(mine, own, 0).max(axis=(2, 3)).T
+    block = np.einsum("kcml,cmlij->ckmij", mine, blocks)
+    K, at = np.zeros((C, numbers, M, size, M, size)), np.arange(M)
+    K[:, :, at, :, at, :] = block.transpose(2, 0, 1, 3, 4)
+    return Full(of, K.reshape(C, numbers, M * size, M * size))
+
+
+def shrunk(kind: Kind) -> bool:
+    """Whether the variances of single readings are many, and share a prior."""
+    return bool(getattr(STRUCTURES[kind.own], "shrunk", False))
+
+
+# A kind of noise fitted to readings.
+
+
 @dataclass(frozen=True)
-class Fitted:
+class Fitted(MixedFit):
     """A kind of noise fitted to readings."""
 
     noisy: NoisyReadings
-    fit: MixedFit
 
     @property
     def structure(self) -> Structure:
         return self.noisy.structure
 
     @property
-    def shared(self) -> tuple[SharedEffect, ...]:
-        return self.noisy.shared
-
-    @property
-    def theta(self) -> Array:
-        return self.fit.theta
-
-    @property
     def own(self) -> Array:
+        """Variances of single readings."""
         return self.theta[: self.noisy.own]
 
     @property
-    def drift(self) -> Array:
-        return self.theta[self.noisy.own : self.noisy.own + len(self.noisy.drifts)]
-
-    @property
     def common(self) -> Array:
-        return self.theta[self.noisy.own + len(self.noisy.drifts) :]
+        """Variances of the deviations that readings share."""
+        return self.theta[self.noisy.own :]
 
     @property
     def lasting(self) -> float | None:
         return self.noisy.lasting
 
     @property
-    def log_likelihood(self) -> float:
-        return self.fit.log_likelihood
+    def found(self) -> list[tuple[Deviation, float]]:
+        """The deviations that are not none, and their variances."""
+        each = zip(self.noisy.deviations, self.common.tolist(), strict=True)
+        return [(d, v) for d, v in each if v > 0 or d.waves is not None]
 
     @property
-    def told(self) -> list[SharedEffect]:
-        """What is shared and was found."""
-        return [e for e, v in zip(self.shared, self.common, strict=True) if v > 0]
+    def kind(self) -> Kind:
+        """The kind without what was not found, with which it is the same model."""
+        return self.noisy.kind.having(*(d.part for d, _ in self.found))
 
-    @property
-    def found(self) -> Kind:
-        """The kind without what is shared and was not found, with which it is the same model."""
-        joints = self.noisy.kind.joints if any(e.joints for e in self.told) else ""
-        shared = self.noisy.kind.shared and any(not e.joints for e in self.told)
-        return self.noisy.kind._replace(shared=shared, joints=joints)
+    def of(self, readings: Readings) -> list[tuple[Deviation, float]]:
+        """The deviations that these readings share, be they those fitted or others."""
+        known = {d.name: v for d, v in self.found}
+        others = self.kind.deviations(readings, self.lasting, every=True)
+        return [(d, known[d.name]) for d in others if d.name in known]
 
 
 def fitted(
@@ -263,27 +305,28 @@ def fitted(
 
     What drifts is `lasting` so long, as in `like`, or as is the most likely.
     """
-    if kind.time and readings.visits is not None:
-        if not readings.visits.drifts:
+    if TIME not in kind.parts:
+        lasting = None
+    elif (record := readings.visits) is not None:
+        if not record.drifts:
             raise InputError(
                 "no drift can be recognised in these readings: the model itself has what changes "
                 "with time, or successive poses are near each other; visit poses in random order"
             )
-        if lasting is None and (like is None or like.lasting is None):
-            tried = [fitted(readings, kind, like, each, enough) for each in readings.visits.lasting]
+        lasting = lasting or (None if like is None else like.lasting)
+        if lasting is None:
+            tried = [fitted(readings, kind, like, each, enough) for each in record.lasting]
             return max(tried, key=lambda one: one.log_likelihood)
-        lasting = lasting if lasting is not None or like is None else like.lasting
-    noisy, prior = NoisyReadings(readings, kind, lasting if kind.time else None), None
+    noisy, prior = NoisyReadings(readings, kind, lasting), None
     start = noisy.start(like)
-    if noisy.structure.shrunk:
-        if kind.time:
+    if shrunk(kind):
+        if TIME in kind.parts:
             raise InputError(f"'{kind.own}' has a prior, with which no drift can be estimated")
         prior = prior_of_groups(noisy)
         if like is None or like.structure.names != noisy.structure.names:
             start[: noisy.own] = np.exp(prior.mean)
-    # Without what drifts its waves have no prior.
-    shared = range(noisy.own + len(noisy.drifts), len(start))
-    return Fitted(noisy, fit(noisy.model(prior), start, (*noisy.spare, *shared), enough))
+    found = fit(noisy.model(prior), start, noisy.may_vanish, enough)
+    return Fitted(found.model, found.theta, found.converged, noisy)
 
 
 # Many variances from few readings each: shrink their logarithms towards one another.
@@ -338,54 +381,21 @@ def prior_of_groups(noisy: NoisyReadings) -> LogPrior:
     return LogPrior(np.tile(mean, configurations), precision)
 
 
-def covariance_of(found: Fitted, rows: Array) -> tuple[Array, Array]:
-    """Covariance and degrees of freedom of combinations `rows` of the fit's parameters."""
-    return found.fit.expected.kenward_roger(found.fit.covariance, rows)
-
-
-# The same noise of other readings.
-
-
-def variances_of(found: Fitted, readings: Readings) -> tuple[Structure, Array, Array]:
-    """The structure of these readings, its variances, and the variance of each of these.
-
-    One that no reading of the fit has is the mean of all.
-    """
-    structure = like(found.structure, readings)
-    place = {name: k for k, name in enumerate(found.structure.names)}
-    known = np.array([place.get(name, -1) for name in structure.names])
-    W = np.diag(found.fit.covariance)[: found.noisy.own]
-    theta = np.where(known >= 0, found.own[known], found.own.mean())
-    return structure, theta, np.where(known >= 0, W[known], W.max())
-
-
 def own_noise(found: Fitted, readings: Readings) -> tuple[Array, Array]:
-    """Covariance (N, size, size) of single readings, and degrees of freedom (N, size) behind it."""
-    structure, theta, W = variances_of(found, readings)
-    covariance = structure.covariance(theta)
+    """Covariance (N, size, size) of single readings, be they those fitted or others, and degrees of
+    freedom (N, size) behind it.  A variance that no reading of the fit has is the mean of all."""
+    names = found.structure.names
+    structure = found.structure.model.structure(readings, names)
+    place = {name: k for k, name in enumerate(names)}
+    known = np.array([place.get(name, -1) for name in structure.names])
+    W = np.diag(found.covariance)[: found.noisy.own]
+    covariance = structure.covariance(np.where(known >= 0, found.own[known], found.own.mean()))
+    W = np.where(known >= 0, W[known], W.max())
     parts = np.diagonal(structure.matrix, axis1=2, axis2=3)  # (N, L, size)
     variance = np.einsum("nl,nla->na", W[structure.index], parts**2)
     diagonal = np.diagonal(covariance, axis1=1, axis2=2)
     return covariance, np.maximum(2 * diagonal**2 / np.maximum(variance, 1e-300), 2.0)
 
-
-def deviations_of(found: Fitted, readings: Readings) -> list[tuple[SharedEffect, float]]:
-    """What these readings share beside the waves of a course, of variances that are not none."""
-    record, told = readings.visits, {e.name for e in found.told}
-    shared = shared_effects(readings, every=True) if found.noisy.kind.shared else ()
-    if found.noisy.kind.joints and record is not None:
-        shared += joint_effects(record, found.noisy.kind.joints == EACH)
-    known = dict(zip(found.noisy.names, found.theta.tolist(), strict=True))
-    out = [(e, known[e.name]) for e in shared if e.name in told]
-    if found.lasting is not None and record is not None:
-        out += [
-            (faster_course(record, found.lasting, axes), known[name])
-            for name, axes in found.noisy.drifts
-        ]
-    return out
-
-
-# Which noise model the readings support, and its weights.
 
 # Which noise model: what the readings allow is tried, and an information criterion decides.
 #
@@ -396,8 +406,6 @@ def deviations_of(found: Fitted, readings: Readings) -> list[tuple[SharedEffect,
 # shared effects it is Akaike's (AIC): one that is left out wrongly makes intervals too narrow.
 
 ROUGHLY = 1e-2  # of −2ℓ: what decides between models need not be finer
-ROWS_PER_VARIANCE = 5  # degrees of freedom that a variance needs before it is worth trying
-MOST_GROUPS = 1000  # configurations: their information matrix has (3 · 1000)² entries
 # Readings, and those per parameter, that the choice is made from: so many tell a variance to 3 %.
 CHOSEN_FROM, PER_PARAMETER = 2000, 20
 # Scatter of the joints and a drift are added where a test finds a trace of them: a part that a test
@@ -407,8 +415,7 @@ MOST_TOGETHER = 300  # rows of a configuration, whose covariance is formed
 FEWEST_VISITS, SEVERAL = 8, 2
 
 
-@dataclass(frozen=True)
-class Trial:
+class Trial(NamedTuple):
     """One noise model that was tried: how many variances it has, and its criterion."""
 
     kind: str
@@ -416,10 +423,9 @@ class Trial:
     criterion: float
 
 
-@dataclass(frozen=True)
-class NoiseTest:
-    """A further part of the noise that was looked for: JOINTS or TIME, and the p-value of its being
-    none, beside the model that was chosen without it."""
+class NoiseTest(NamedTuple):
+    """A further part of the noise that was looked for, JOINTS or TIME, and the p-value of its being
+    none beside the model that was chosen without it."""
 
     part: str
     p: float
@@ -430,9 +436,9 @@ class NoiseFit:
     """The noise model that was chosen, the estimate under it, and what else was tried.
 
     `x` (p,) is the generalised least-squares estimate of the readings' Δx, `covariance` that of
-    Kenward and Roger; `kind` is a name of `noise_models` other than auto.  `fit` is in orthonormal
-    parameters: Δx = basis · its x, which shifts all its log-likelihoods by one constant.  Where the
-    noise has a course in time, the basis (p + k, p + k) has the course's coefficients last.
+    Kenward and Roger; `kind` is the name of a `Kind`.  `fit` is in orthonormal parameters: Δx =
+    basis · its x, which shifts all its log-likelihoods by one constant.  Where the noise has a
+    course in time, the basis (p + k, p + k) has the course's coefficients last.
     """
 
     kind: str
@@ -443,19 +449,19 @@ class NoiseFit:
     reason: str
     basis: Array
     tests: tuple[NoiseTest, ...] = ()
-    course: VisitRecord | None = None  # whose times those of what drifts are
     to_longest: float = 0.0  # log-likelihood that the longest time tried is short of the best
 
     @property
     def description(self) -> str:
         """The model in words."""
-        text = self.fit.structure.description
-        found = [e.name for e in self.fit.told if not e.joints]
-        if found:
-            text += f", and a deviation common to each {' / '.join(found)}"
-        if any(e.joints for e in self.fit.told):
-            text += ", joints that settle anew at each visit"
-        return text + (", and a drift in time" if self.lasting else "")
+        names: dict[str, list[str]] = {}
+        for d, _ in self.fit.found:
+            names.setdefault(d.part, []).append(d.name)
+        text = self.fit.structure.model.description
+        for part, own in names.items():
+            named = " / ".join([own[0], *(name.removeprefix(EACH_HAS) for name in own[1:])])
+            text += PARTS[part].clause.format(named)
+        return text
 
     @property
     def lasting(self) -> float | None:
@@ -464,9 +470,9 @@ class NoiseFit:
 
     def of_readings(self) -> NoiseFit:
         """Named as the best of what was tried that knows nothing of the arm's visits."""
-        tried = tuple(t for t in self.trials if not Kind.of(t.kind).by_visit)
+        tried = [t for t in self.trials if not Kind.parsed(t.kind).by_visit]
         kind = min(tried, key=lambda t: t.criterion).kind
-        return replace(self, kind=kind, trials=tried, reason=_reason(kind, list(tried)))
+        return replace(self, kind=kind, trials=tuple(tried), reason=_reason(kind, tried))
 
 
 def estimate_noise(
@@ -474,12 +480,10 @@ def estimate_noise(
 ) -> NoiseFit:
     """Variances of the chosen noise model by REML, and the estimate under it.
 
-    `kind`: a structure (independent, axis, marker, groups, polar, stated), with "+configuration"
-    for effects that readings of a configuration share, "+joints" or "+each-joint" for joints that
-    settle anew at each visit, "+time" for a drift, or "auto".  Auto tries every structure
-    that the table has the labels and the readings for, each with shared effects, takes the one
-    with the smallest criterion, and leaves the shared effects out where it is smaller without;
-    scatter of the joints and drift are tried where a test finds a trace of them.
+    `kind`: the name of a `Kind`, or "auto".  Auto takes the noise of single readings with the
+    smallest criterion that the table has the labels and the readings for, each with what a
+    configuration may share, and then changes by one part what makes the criterion smaller, until
+    nothing does; scatter of the joints and drift are tried where a test finds a trace of them.
     `like`, a fit of nearly the same readings, is where the search of a named kind starts; how it
     was chosen there holds here.
 
@@ -487,9 +491,9 @@ def estimate_noise(
     """
     asked, (basis, T) = Kind.of(kind), _orthonormal(readings)
     if kind == "auto":
-        return replace(_chosen(basis, T), course=readings.visits)
+        return _chosen(basis, T)
     found = fitted(basis, asked, None if like is None else like.fit)
-    made = replace(_result(kind, found, T, (), "as asked for"), course=readings.visits)
+    made = _result(kind, found, T, (), "as asked for")
     if like is None or like.kind != kind:
         return made
     return replace(made, trials=like.trials, reason=like.reason, tests=like.tests)
@@ -498,160 +502,132 @@ def estimate_noise(
 def _chosen(readings: Readings, T: Array) -> NoiseFit:
     """The model with the smallest criterion; of many readings a sample chooses it, and all of them
     tell its variances."""
-    names = _supported(readings)
     some = readings.sample(max(CHOSEN_FROM, PER_PARAMETER * readings.n_parameters))
     if some is readings:
-        return _Choice(readings, names).result(T)
+        return _Choice(readings).result(T)
     try:
-        found = _Choice(some, names).result(T)
-        again = fitted(readings, Kind.of(found.kind), found.fit, found.lasting)
+        found = _Choice(some, supported(readings)).result(T)
+        again = fitted(readings, Kind.parsed(found.kind), found.fit, found.lasting)
     except ElastocalError:  # the sample does not show all parameters, or not all labels
-        return _Choice(readings, names).result(T)
+        return _Choice(readings).result(T)
     why = f"{found.reason}; chosen from {len(some)} readings at random, estimated from all"
-    return _result(again.found.name, again, T, found.trials, why, found.tests)
+    return _result(again.kind.name, again, T, found.trials, why, found.tests)
+
+
+def supported(readings: Readings) -> list[str]:
+    """Structures whose variances the table can tell.  What is stated is believed until something
+    else is better."""
+    names = [name for name, model in STRUCTURES.items() if model.supports(readings)]
+    return sorted(names, key=lambda name: name != "stated")
 
 
 class _Choice:
-    """The search for the model with the smallest criterion; parts that know of visits join where a
-    test finds a trace of them."""
+    """The search for the model with the smallest criterion: the noise of single readings first,
+    then one part more or less as long as the criterion falls."""
 
-    def __init__(self, readings: Readings, names: list[str]) -> None:
-        self.readings, self.names = readings, names
-        self.trials: list[Trial] = []
+    def __init__(self, readings: Readings, names: list[str] | None = None) -> None:
+        self.readings, self.names = readings, names or supported(readings)
         self.price = float(np.log(max(readings.e.size - readings.n_parameters, 3)))
-        self.best: tuple[float, Kind, Fitted] | None = None
-        self.tests: list[NoiseTest] = []
+        self.trials: dict[tuple[Kind, float | None], Trial] = {}
+        self.tests: dict[str, NoiseTest] = {}
+        self.looked_for: set[Kind] = set()
+        self.best: Fitted | None = None
+        self.least = math.inf
 
     def result(self, T: Array) -> NoiseFit:
-        readings = self.readings
-        could_share = bool(shared_effects(readings))
+        could_share = any(Kind("", (CONFIGURATION,)).deviations(self.readings, None))
         for name in self.names:
-            self.attempt(Kind(name, could_share))
+            self.attempt(Kind(name, (CONFIGURATION,) * could_share))
         if self.best is None:
             raise InsufficientDataError(
                 "there are too few readings to estimate any noise from; measure more poses"
             )
-        if self.best[1].shared:
-            self.attempt(self.best[1]._replace(shared=False))
-        record = readings.visits
-        if record is not None and self._knows(record):
-            if record.per_visit >= SEVERAL:
-                self._with_joints()
-            if record.drifts:
-                self._with_time(record.lasting)
-        _, kind, best = self.best
-        reason, trials = _reason(kind.name, self.trials), tuple(self.trials)
-        best = fitted(readings, kind, best, best.lasting)
-        return _result(kind.name, best, T, trials, reason, tuple(self.tests))
+        while self._changed():
+            pass
+        best = self.best
+        trials, kind = tuple(self.trials.values()), best.kind.name
+        reason, tests = _reason(kind, trials), tuple(self.tests.values())
+        again = fitted(self.readings, best.kind, best, best.lasting)
+        return _result(kind, again, T, trials, reason, tests)
 
     def attempt(
         self, kind: Kind, lasting: float | None = None, found: Fitted | None = None
     ) -> None:
         """Fit a kind of noise, unless it is `found`, and keep it where it is better than what there
         is."""
+        if (kind, lasting) in self.trials:
+            return
         try:
-            like = self.best[2] if self.best else None
-            found = found or fitted(self.readings, kind, like, lasting, ROUGHLY)
+            found = found or fitted(self.readings, kind, self.best, lasting, ROUGHLY)
         except InsufficientDataError:
             return
-        kind, own, common = found.found, found.noisy.own, len(found.told)
-        if found.structure.shrunk:
+        own = found.noisy.own
+        if shrunk(kind):
             own = self.readings.size + 2  # means of log θ and its two variances
-        if kind.joints == EACH:  # what tells their sizes apart, those found to be none included
-            common += 1 - sum(bool(e.joints) for e in found.told)
-            own += sum(bool(e.joints) for e in found.shared) - 1
-        spent = common + len(found.drift) + kind.time
-        criterion = own * self.price + 2 * spent - 2 * found.log_likelihood
-        self.trials.append(Trial(kind.name, own + spent, float(criterion)))
-        if self.best is None or criterion < self.best[0]:
-            self.best = (float(criterion), kind, found)
+        spent = len(found.found) + (found.lasting is not None)
+        if EACH in found.kind.parts:  # what tells their sizes apart, none of them included
+            there = sum(d.part == EACH for d, _ in found.found)
+            spent += 1 - there
+            own += sum(d.part == EACH for d in found.noisy.deviations) - 1
+        criterion = float(own * self.price + 2 * spent - 2 * found.log_likelihood)
+        self.trials[kind, lasting] = Trial(found.kind.name, own + spent, criterion)
+        if criterion < self.least:
+            self.least, self.best = criterion, found
 
-    def _knows(self, record: VisitRecord) -> bool:
+    def _changed(self) -> bool:
+        """Whether one part more or less is better than what there is."""
+        before, record = self.least, self.readings.visits
         together = np.unique(self.readings.configuration, return_counts=True)[1]
         rows = int(together.max()) * self.readings.size
-        return record.n_visits >= FEWEST_VISITS and rows <= MOST_TOGETHER
+        known = record is not None and record.n_visits >= FEWEST_VISITS and rows <= MOST_TOGETHER
+        for part in PARTS:
+            assert self.best is not None
+            kind = self.best.kind
+            if part in kind.parts:
+                self.attempt(kind.without(part), self.best.lasting if part != TIME else None)
+            elif not known or record is None or part == CONFIGURATION:
+                continue
+            elif part == EACH:
+                if JOINTS in kind.parts:
+                    self.attempt(kind.with_part(EACH), self.best.lasting)
+            elif part == JOINTS and EACH not in kind.parts and record.per_visit >= SEVERAL:
+                self._look_for(part, kind, (self.best.lasting,))
+            elif part == TIME and record.drifts:
+                self._look_for(part, kind, record.lasting)
+        return self.least < before
 
-    def _plain(self) -> list[str]:
-        """Structures to add to: the best one, and the first one where that has a prior."""
-        assert self.best is not None
-        _, kind, found = self.best
-        return [kind.own, self.names[0]] if found.structure.shrunk else [kind.own]
-
-    def _with_joints(self) -> None:
-        assert self.best is not None
-        kind = self.best[1]
-        first = self._trace(JOINTS, kind._replace(joints=JOINTS), None)
-        if first is None:
-            return
-        self.attempt(kind._replace(joints=JOINTS), found=first)
-        for own in self._plain():
-            for shared in (True, False) if kind.shared else (False,):
-                if (own, shared) != (kind.own, kind.shared):
-                    self.attempt(self.best[1]._replace(own=own, shared=shared, joints=JOINTS))
-        if self.best[1].joints:
-            self.attempt(self.best[1]._replace(joints=EACH))
-
-    def _with_time(self, lasting: tuple[float, ...]) -> None:
-        assert self.best is not None
-        name = next((own for own in self._plain() if own != "groups"), self.names[0])
-        kind = self.best[1]._replace(own=name, time=True)
-        first = self._trace(TIME, kind, lasting[0])
-        if first is None:
-            return
-        self.attempt(kind, found=first)
-        for each in lasting[1:]:
-            self.attempt(kind, each)
-        if self.best[1].time:
-            longest = self.best[2].lasting
-            for less in (kind._replace(shared=False), kind._replace(joints="")):
-                if less != kind:
-                    self.attempt(less, longest)
-
-    def _trace(self, part: str, kind: Kind, lasting: float | None) -> Fitted | None:
-        """The fit of a kind with this part, where the likelihood shows a trace of it beside what
-        there is.
+    def _look_for(self, part: str, kind: Kind, lasting: Sequence[float | None]) -> None:
+        """Try a part, with each of these times of what drifts, where the likelihood shows a trace
+        of it beside what there is; many variances imitate it, and none knows a drift beside them.
 
         Twice what it gains, against a mixture of χ² with as many degrees of freedom as of the k
         variances of the part are not at zero, a half of them on average (Self and Liang 1987, J.
         Am. Stat. Assoc. 82, 605).
         """
-        assert self.best is not None
-        less = self.best[2]
-        if less.structure.name != kind.own:
-            without = kind._replace(time=False, joints="" if part == JOINTS else kind.joints)
-            less = fitted(self.readings, without, less, None, ROUGHLY)
-        more = fitted(self.readings, kind, less, lasting, ROUGHLY)
-        joints = sum(bool(e.joints) for e in more.shared)
-        k = np.arange(1, 1 + (joints if part == JOINTS else len(more.drift)))
+        less = self.best
+        assert less is not None
+        if shrunk(kind) and part == TIME:
+            kind = kind._replace(own=self.names[0])
+            less = fitted(self.readings, kind, less, None, ROUGHLY)
+        wanted = kind.with_part(part)
+        if wanted in self.looked_for:
+            return
+        self.looked_for.add(wanted)
+        more = fitted(self.readings, wanted, less, lasting[0], ROUGHLY)
+        k = np.arange(1, 1 + sum(d.part == part for d in more.noisy.deviations))
         gain = 2 * (more.log_likelihood - less.log_likelihood)
         share = special.binom(len(k), k) / 2 ** len(k)
         p = float(share @ special.chdtrc(k, gain)) if gain > ROUGHLY else 1.0
-        self.tests.append(NoiseTest(part, p))
-        return more if p < TRACE else None
+        self.tests[part] = NoiseTest(part, p)
+        if p < TRACE:
+            self.attempt(wanted, lasting[0], more)
+            for each in lasting[1:]:
+                self.attempt(wanted, each)
+            if shrunk(kind):
+                self.attempt(wanted._replace(own=self.names[0]), lasting[0])
 
 
-def _supported(readings: Readings) -> list[str]:
-    """Structures whose variances the table can tell: labels, number of readings."""
-    size, rows = readings.size, readings.e.size
-    spare = (rows - readings.n_parameters) // ROWS_PER_VARIANCE
-    # What is stated is believed until something else is better, and is nothing else where it is one
-    # number for all.
-    S = readings.stated
-    even = S is None or (size <= 3 and np.allclose(S, S[0, 0, 0] * np.eye(size), rtol=1e-9, atol=0))
-    names = ["independent"] if even else ["stated", "independent"]
-    if size > 1 and spare >= size:
-        names.append("axis")
-    if size == 3 and 1 < len(np.unique(readings.marker)) <= spare:
-        names.append("marker")
-    if size == 3 and readings.sight is not None and spare >= 3:
-        names.append("polar")
-    groups = len(np.unique(np.column_stack([readings.configuration, readings.load]), axis=0))
-    if 3 <= groups <= MOST_GROUPS and 3 * groups <= len(readings) - readings.n_parameters / size:
-        names.append("groups")
-    return names + [name for name, model in REGISTERED.items() if model.supports(readings)]
-
-
-def _reason(label: str, trials: list[Trial]) -> str:
+def _reason(label: str, trials: Sequence[Trial]) -> str:
     others = sorted((t for t in trials if t.kind != label), key=lambda t: t.criterion)
     mine = min(t.criterion for t in trials if t.kind == label)
     if not others:
@@ -668,18 +644,17 @@ def _orthonormal(readings: Readings) -> tuple[Readings, Array]:
     Neither the units of the parameters nor their correlation then cost digits, and columns that
     depend on each other are found out.
     """
-    n, size, p = readings.B.shape
-    factors = orthogonal(readings.B.reshape(-1, p))
-    return replace(readings, B=factors.Q.reshape(n, size, p)), factors.V
+    factors = orthogonal(readings.B.reshape(-1, readings.n_parameters))
+    return replace(readings, B=factors.Q.reshape(readings.B.shape)), factors.V
 
 
 def _result(
     label: str, found: Fitted, T: Array, trials: tuple[Trial, ...], reason: str,
     tests: tuple[NoiseTest, ...] = (),
 ) -> NoiseFit:  # fmt: skip
-    p, x = len(T), found.fit.state.x
+    p, x = len(T), found.state.x
     basis = linalg.block_diag(T, np.eye(len(x) - p))
-    matrix, dof = covariance_of(found, basis[:p])
+    matrix, dof = found.kenward_roger(basis[:p])
     text = "weights estimated by restricted likelihood; covariance of Kenward and Roger"
     covariance = Covariance("kenward-roger", matrix, dof, text)
     return NoiseFit(label, found, basis[:p] @ x, covariance, trials, reason, basis, tests)
@@ -699,12 +674,12 @@ def over_times(found: NoiseFit, readings: Readings) -> NoiseFit:
     for lasting in readings.visits.lasting:
         if lasting != found.lasting:
             with suppress(ElastocalError, np.linalg.LinAlgError):
-                fits.append(fitted(basis, Kind.of(found.kind), found.fit, lasting))
+                fits.append(fitted(basis, Kind.parsed(found.kind), found.fit, lasting))
     level = np.array([one.log_likelihood for one in fits])
     longest = [v for one, v in zip(fits, level, strict=True) if one.lasting == LONGEST]
     weight = np.exp(level - level.max()) / np.exp(level - level.max()).sum()
-    rows = [np.pad(T, ((0, 0), (0, len(one.fit.state.x) - len(T)))) for one in fits]
-    each = [covariance_of(one, own) for one, own in zip(fits, rows, strict=True)]
+    rows = [np.pad(T, ((0, 0), (0, len(one.state.x) - len(T)))) for one in fits]
+    each = [one.kenward_roger(own) for one, own in zip(fits, rows, strict=True)]
     matrices, dof = (np.array(part) for part in zip(*each, strict=True))
     among = tuple(zip(weight.tolist(), matrices, strict=True))
     mean = replace(found.covariance, matrix=np.tensordot(weight, matrices, 1), among=among)
@@ -738,22 +713,38 @@ def weights_of(noise: NoiseFit, readings: Readings, more: Array | float = 0.0) -
     """Weights of the readings (N,) under an estimated noise; whitened residuals have size 1.
 
     `more` (N, size, size) comes to the covariance of single readings."""
-    n, size = len(readings), readings.size
-    covariance = block_diagonal(own_noise(noise.fit, readings)[0] + more)
-    for effect, variance in deviations_of(noise.fit, readings):
-        Z = effect.columns()
-        covariance = covariance + variance * (Z @ Z.T)
-    whiten = whitener(sparse.csr_array(covariance))
+    whiten = block_diagonal(inverse_factor(own_noise(noise.fit, readings)[0] + more))
     weights = Weights(noise.kind, whiten, True, noise.description)
-    if noise.lasting is None or readings.visits is None:
-        return weights
-    k = readings.n_parameters
-    columns = noise.fit.noisy.columns(readings)[:, :, k:].reshape(n * size, -1)
-    kinds = noise.fit.drift[np.arange(size) // 3 if size == 6 else np.zeros(size, int)]
-    deviation = np.tile(np.sqrt(kinds), columns.shape[1] // size)
-    return weights.with_common(
-        columns * deviation, readings.visits.blocks(readings.configuration, noise.lasting)
-    )
+    together, record = readings.configuration, readings.visits
+    if noise.lasting is not None and record is not None:
+        together = record.blocks(together, noise.lasting)
+    return weights_sharing(weights, noise.fit.of(readings), together)
+
+
+def weights_sharing(
+    own: Weights, deviations: Sequence[tuple[Deviation, float]], together: IntArray
+) -> Weights:
+    """The weights `own` of single readings where these share deviations of such variances besides,
+    Σ = Σ_own + Σ_k τ_k² Z_k Z_kᵀ; where all share waves, readings are judged by those that are not
+    `together` (N,) with them."""
+    if not deviations or own.whiten is None:
+        return own
+    Z = own.whiten @ sparse.hstack([np.sqrt(v) * d.columns() for d, v in deviations], format="csr")
+    beside = whitener(sparse.csr_array(sparse.eye_array(Z.shape[0]) + Z @ Z.T))
+    own = replace(own, whiten=sparse.csr_array(beside @ own.whiten))
+    waves = [np.sqrt(v) * d.waves for d, v in deviations if d.waves is not None]
+    if not waves:
+        return own
+    return own.with_common(np.concatenate(waves, axis=2).reshape(Z.shape[0], -1), together)
+
+
+def with_stated_sharing(own: Weights, model: Model, observed: Observations, x: Array) -> Weights:
+    """The weights `own` of single readings with what `[noise]` of the cell says that they share, as
+    a simulation draws it."""
+    if not model.cell.noise.shared or own.whiten is None or not own.absolute:
+        return own
+    stated = [(d, 1.0) for d in stated_deviations(model, observed, x)]
+    return weights_sharing(own, stated, observed.configuration)
 
 
 def _sight(model: Model, observed: Observations) -> tuple[Array | None, Array | None]:

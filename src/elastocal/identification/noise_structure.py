@@ -1,199 +1,34 @@
-"""How the noise of readings may be built: one variance or several, and what readings share."""
+"""The parts that noise is made of: what single readings scatter by, and deviations that they share.
+
+    V = Σ_k θ_k K_k
+
+A `NoiseModel` says how the noise of a single reading is built, a `Part` what readings have in
+common besides; a `Kind` is one of the former with some of the latter.
+"""
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass, replace
-from functools import cached_property, lru_cache
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from dataclasses import dataclass, fields, replace
+from functools import cached_property, partial
 from typing import ClassVar, NamedTuple
 
 import numpy as np
-from scipy import sparse, special
+from scipy import sparse
 
 from elastocal.cell.arm_description import Unsteadiness
-from elastocal.engine.mixed import Common, Full, NoiseParts, Pack
 from elastocal.errors import InputError, option, require
-from elastocal.measurements import Measurements, firsts, numbered, visits
-from elastocal.model.effects.base import JointMotion
+from elastocal.identification.visit_record import VisitRecord, visit_record
+from elastocal.measurements import Measurements, numbered
 from elastocal.model.manipulator import Model
 from elastocal.model.observations import Observations
 from elastocal.plugin_loader import check_registered, same_class
 from elastocal.text import did_you_mean, quoted
 from elastocal.units import Array, BoolArray, IntArray
 
-# The visits behind each reading: what a joint that settles elsewhere there, or a base that has
-# drifted by then, would do to it.
-
-# Correlation times of a drift that are tried, as shares of the campaign; whether there is any is
-# tested with the first.
-LASTING = (0.2, 0.1, 0.4, 0.05, 0.8)
-LONGEST = max(LASTING)
-FEWEST_BLOCKS, MOST_BLOCKS = 5, 10  # of time
-
-
-@dataclass(frozen=True)
-class VisitRecord:
-    """The rows of the table behind each of N readings: m of them, one but for deflections.
-
-    `visit` (N, m) numbers the arm's visits to a pose (−1: no such row), `motion` (N, m, size,
-    joints) is ∂(reading)/∂q there, `share` (N, m) the row's factor in the reading, `place` (N, m)
-    its time as a share of the campaign's `span` in s; where the table has no times (`timed`), the
-    order of the rows stands for them.  `turning` (joints,) says which joints are revolute.  No
-    drift of the noise is looked for (`drifts`) where the model itself has what changes with time,
-    and, unless the cell states one, where readings follow each other from pose to neighbouring
-    pose: they err alike because of what the model lacks, and a drift in its place would leave the
-    base as uncertain as it is large.  `lasting`: the correlation times of a drift that may be, as
-    shares of the span; the cell's own alone, where it states a drift and the table has times.
-    """
-
-    visit: IntArray
-    motion: Array
-    share: Array
-    place: Array
-    turning: BoolArray
-    timed: bool
-    span: float
-    drifts: bool = True
-    lasting: tuple[float, ...] = LASTING
-
-    def take(self, chosen: BoolArray | IntArray) -> VisitRecord:
-        """That of the `chosen` readings."""
-        names = ("visit", "motion", "share", "place")
-        return replace(self, **{name: getattr(self, name)[chosen] for name in names})
-
-    @cached_property
-    def n_visits(self) -> int:
-        return len(np.unique(self.visit[self.visit >= 0]))
-
-    @property
-    def per_visit(self) -> float:
-        """Readings to a visit, at the median.  A single one tells the joints' scatter from its own
-        noise by nothing but how both change from pose to pose, as the model's own errors do."""
-        return float(np.median(np.unique(self.visit[self.visit >= 0], return_counts=True)[1]))
-
-    def waves(self, lasting: float) -> Array:
-        """Loadings (N, k) on independent deviations of variance 1, which add up to a random course
-        of correlation exp(−|t − t′|/`lasting`), times as shares of the span."""
-        return np.asarray(np.einsum("nm,nmk->nk", self.share, self._each(lasting)))
-
-    def faster(self, lasting: float) -> Array:
-        """Loadings (N, m) on what the waves leave of the course's variance at each row's time."""
-        left = 1 - (self._each(lasting) ** 2).sum(axis=2)
-        return self.share * np.sqrt(np.maximum(left, 0.0))
-
-    def blocks(self, configuration: IntArray, lasting: float) -> IntArray:
-        """Blocks (N,) of whole configurations that follow each other in time, as long as what
-        drifts is `lasting`, if that makes neither too few nor too many."""
-        number = int(np.clip(round(1 / lasting), FEWEST_BLOCKS, MOST_BLOCKS))
-        _, code = np.unique(configuration, return_inverse=True)
-        when = np.bincount(code, self.place[:, 0]) / np.bincount(code)
-        rank = np.argsort(np.argsort(when, kind="stable"))
-        return np.asarray((rank * min(number, len(when)) // len(when))[code], dtype=np.int64)
-
-    def _each(self, lasting: float) -> Array:
-        return course_waves(self.place.ravel(), lasting).reshape(*self.place.shape, -1)
-
-
-def visit_record(model: Model, observed: Observations, x: Array) -> VisitRecord | None:
-    """The visits of the observations of a fit at x (parameters,); None for an arm that no joint
-    moves."""
-    table, n = observed.table, len(observed.lead)
-    if not model.chain.n_joints:
-        return None
-    combine = observed.combine
-    count = np.diff(combine.indptr)
-    m = int(count.max(initial=1))
-    place = np.arange(m) < count[:, None]
-    row, share = np.zeros((n, m), dtype=np.int64), np.zeros((n, m))
-    row[place], share[place] = combine.indices, combine.data
-    moved = _joint_motion(model, table, x)[row] * share[:, :, None, None]
-    when, span, timed = _when(table)
-    turning = np.array([kind != "prismatic" for kind in model.chain.kinds])
-    visit = np.where(place, visits(table)[row], -1)
-    noise = model.cell.noise
-    stated = noise.drift > 0
-    drifts = stated or in_random_order(table.take(np.argsort(when, kind="stable")))
-    lasting = (noise.lasting / span,) if stated and timed else LASTING
-    return VisitRecord(visit, moved, share, when[row], turning, timed, span, drifts, lasting)
-
-
-SYSTEMATIC = 0.01
-
-
-def in_random_order(table: Measurements) -> bool:
-    """Whether poses that follow each other in the table are no nearer than chance allows at 1 %.
-
-    Σ |q_i+1 − q_i|² / Σ |q_i − q̄|² has the mean 2 and the variance 4 (n − 2)/(n² − 1) for each
-    joint (von Neumann 1941), poses that only the load or a repeat tells apart counted once.
-    """
-    moves = np.abs(np.diff(table.q, axis=0)).max(axis=1, initial=0.0) > 0
-    q = table.q[np.concatenate([[True], moves])] if len(table) else table.q
-    n, spread = len(q), q.std(axis=0)
-    q = q[:, spread > 0] / spread[spread > 0]
-    if n < 3 or not q.shape[1]:
-        return False
-    ratio = (np.diff(q, axis=0) ** 2).sum(axis=0) / n
-    deviation = np.sqrt(4 * (n - 2) / (n**2 - 1) / q.shape[1])
-    return bool(ratio.mean() - 2 > special.ndtri(SYSTEMATIC) * deviation)
-
-
-def _joint_motion(model: Model, table: Measurements, x: Array) -> Array:
-    """∂(reading)/∂q (rows, size, joints) of the nominal arm, base and markers where x has them."""
-    moving = model.moving
-    at = dict(zip(model.names, x.tolist(), strict=True))
-    here = np.array([at.get(p.name, p.nominal) for p in moving.parameters])
-    joints = np.flatnonzero([p.effect == JointMotion.name for p in moving.parameters])
-    B = moving.regressor(table, here, joints).B
-    return B.reshape(len(table), -1, len(joints))
-
-
-def _when(table: Measurements) -> tuple[Array, float, bool]:
-    """Time (rows,) of each row as a share of the campaign, its length, and whether it was recorded:
-    without times the visits, in the order of the rows, take equally long."""
-    if table.time is not None and np.isfinite(table.time).all() and np.ptp(table.time) > 0:
-        span = float(np.ptp(table.time))
-        return (table.time - table.time.min()) / span, span, True
-    _, first, visit = np.unique(visits(table), return_index=True, return_inverse=True)
-    order = np.argsort(np.argsort(first))[visit.ravel()].astype(float)
-    span = max(float(order.max(initial=0.0)), 1.0)
-    return order / span, span, False
-
-
-# A course in time as a sum of waves.
-#
-# The eigenfunctions φ of the correlation exp(−|t − t′|/lasting) on [0, 1], of eigenvalues λ
-# (Karhunen and Loève; Ghanem and Spanos 1991, section 2.3), on the middles of GRID intervals and
-# from there by √λ φ(t) = ∫ exp(−|t − s|/lasting) φ(s) ds/√λ (Nyström).  Those left out are what
-# changes faster than the k-th wave: noise of single visits, of the same variance
-# (`VisitRecord.faster`).  Without it a long course and a deviation of each configuration look more
-# likely than the short course that there is.
-
-GRID, MOST_WAVES = 400, 20
-# Of the variance.  A course that lasts longer than the campaign is nearly a constant, which the
-# base takes over, and varies about it by little more than the inverse of how much longer.
-LEFT = 0.03
-
-
-def course_waves(t: Array, lasting: float) -> Array:
-    """Waves (n, k) at t (n,) in 0 … 1, their products summing to nearly exp(−|t − t′|/lasting)."""
-    middles, loading = _eigenfunctions(lasting)
-    return np.asarray(np.exp(-np.abs(t[:, None] - middles) / lasting) @ loading)
-
-
-@lru_cache(maxsize=16)
-def _eigenfunctions(lasting: float) -> tuple[Array, Array]:
-    middles = (np.arange(GRID) + 0.5) / GRID
-    value, vector = np.linalg.eigh(np.exp(-np.abs(middles[:, None] - middles) / lasting) / GRID)
-    value, vector = value[::-1], vector[:, ::-1]
-    left = 1 - np.cumsum(value)
-    k = int(np.argmax(left < LEFT * min(1 / lasting, 1.0))) + 1
-    own = slice(0, min(k, MOST_WAVES))
-    return middles, vector[:, own] / np.sqrt(GRID * value[own])
-
-
-# What readings share because the arm came to them at one visit, or was read at nearby times.
-
 # Residuals and B per reading, with the labels that say what readings have in common.
+
+ROWS_PER_VARIANCE = 5  # degrees of freedom that a variance needs before it is worth trying
 
 
 @dataclass(frozen=True)
@@ -238,12 +73,16 @@ class Readings:
         assert self.table is not None and self.lead is not None
         return self.table.take(self.lead)
 
+    @property
+    def spare(self) -> int:
+        """How many variances they may tell."""
+        return (self.e.size - self.n_parameters) // ROWS_PER_VARIANCE
+
     def take(self, chosen: BoolArray) -> Readings:
         """Only the readings where `chosen` (N,) holds."""
-        names = ("B", "e", "configuration", "load", "marker", "sight", "reach", "stated", "lead")
-        parts = {name: getattr(self, name) for name in names}
+        parts = {f.name: getattr(self, f.name) for f in fields(self)}
+        parts = {k: v[chosen] for k, v in parts.items() if isinstance(v, np.ndarray)}
         own = None if self.visits is None else self.visits.take(chosen)
-        parts = {k: v[chosen] for k, v in parts.items() if v is not None}
         return replace(self, **parts, visits=own)
 
     def sample(self, n: int) -> Readings:
@@ -259,9 +98,7 @@ class Readings:
         return replace(self, e=e)
 
 
-# How the noise of a single reading may be built: one variance, or several.
-#
-# Besides the built-in structures there are those that a `NoiseModel` of the user's own describes.
+# What single readings scatter by: one variance, or several.
 
 
 @dataclass(frozen=True)
@@ -269,133 +106,21 @@ class Structure:
     """Covariance of reading i alone: Σ_l θ[index[i, l]] · matrix[i, l].
 
     `index` (N, L) into the `names` of the variances θ, in m² (rad²); `matrix` (N, L, size, size).
-    `shrunk` says that the variances are many and share a prior.
     """
 
-    name: str
-    description: str
+    model: NoiseModel
     names: tuple[str, ...]
     index: IntArray
     matrix: Array
-    shrunk: bool = False
 
     def covariance(self, theta: Array) -> Array:
         """Of each reading (N, size, size)."""
         return np.einsum("nl,nlij->nij", theta[self.index], self.matrix)
 
 
-def _alike(
-    name: str, text: str, names: Sequence[str], n: int, index: IntArray, matrix: Array,
-    shrunk: bool = False,
-) -> Structure:  # fmt: skip
-    """`index` (N, L), or (L,) the same for all readings; `matrix` likewise."""
-    index = np.broadcast_to(index, (n, index.shape[-1]))
-    matrix = np.broadcast_to(matrix, (n, *matrix.shape[-3:]))
-    return Structure(name, text, tuple(names), index, matrix, shrunk)
-
-
-def _axes(size: int) -> Array:
-    return np.eye(size)[:, :, None] * np.eye(size)[:, None, :]
-
-
-def independent(readings: Readings) -> Structure:
-    """One variance for all readings (positions, and one for rotations)."""
-    size = readings.size
-    names = ("position", "rotation")[: max(size // 3, 1)] if size > 1 else ("distance",)
-    parts = np.array([_axes(size)[3 * k : 3 * k + 3].sum(axis=0) for k in range(len(names))])
-    return _alike(
-        "independent", "one variance for all readings", names, len(readings),
-        np.arange(len(names)), parts,
-    )  # fmt: skip
-
-
-def by_axis(readings: Readings) -> Structure:
-    """One variance for each component of a reading."""
-    size = readings.size
-    names = ("x", "y", "z", "rx", "ry", "rz")[:size] if size > 1 else ("distance",)
-    return _alike(
-        "axis", "one variance per axis", names, len(readings), np.arange(size), _axes(size)
-    )
-
-
-def by_marker(readings: Readings) -> Structure:
-    """One variance for each marker."""
-    require(readings.size == 3, "variances per marker are for positions and deflections")
-    labels, index = np.unique(readings.marker, return_inverse=True)
-    names = [f"marker {m}" for m in labels]
-    return _alike(
-        "marker", "one variance per marker", names, len(readings), index.reshape(-1, 1),
-        np.eye(3)[None],
-    )  # fmt: skip
-
-
-def by_group(readings: Readings) -> Structure:
-    """One variance for each configuration (under each load) in each direction.
-
-    The group of Klimchik et al. 2013, section 4: its markers and repeats share one σ.
-    """
-    size = readings.size
-    key = np.column_stack([readings.configuration, readings.load])
-    groups, number = np.unique(key, axis=0, return_inverse=True)
-    names = [
-        f"configuration {c}, load {load}, component {a}" for c, load in groups for a in range(size)
-    ]
-    text = "a variance per configuration and direction, shrunk towards the others"
-    index = number.ravel()[:, None] * size + np.arange(size)
-    return _alike("groups", text, names, len(readings), index, _axes(size), shrunk=True)
-
-
-def polar(readings: Readings, angular: bool | None = None) -> Structure:
-    """Variances along the line of sight, across it, and across it growing with the distance.
-
-    Σ = θ_r u uᵀ + (θ_t + θ_a d²)(I − u uᵀ) with u the line of sight and d its length in m: range
-    noise, transverse noise of the target, angular noise of the tracker.  `angular` says whether
-    θ_a is there; by default where the distances differ enough to tell it from θ_t.
-    """
-    require(
-        readings.sight is not None and readings.size == 3,
-        "polar noise needs positions and the tracker's position",
-    )
-    u, d = np.asarray(readings.sight)[:, 0, :], np.asarray(readings.reach)
-    along = u[:, :, None] * u[:, None, :]
-    parts, names = [along, np.eye(3) - along], ["range", "transverse"]
-    if angular if angular is not None else np.ptp(d) > 0.2 * d.mean():
-        parts.append(parts[1] * d[:, None, None] ** 2)
-        names.append("angular")
-    text = "range and transverse variances of the tracker"
-    return _alike(
-        "polar", text, names, len(readings), np.arange(len(names)), np.stack(parts, axis=1)
-    )
-
-
-def as_stated(readings: Readings) -> Structure:
-    """The stated noise times one factor, which the residuals tell."""
-    require(readings.stated is not None, "no noise is stated that could be used")
-    matrix = np.asarray(readings.stated)[:, None]
-    text = "the stated noise times one factor"
-    return _alike("stated", text, ("factor",), len(readings), np.zeros(1, np.int64), matrix)
-
-
-STRUCTURES: dict[str, Callable[[Readings], Structure]] = {
-    "independent": independent,
-    "axis": by_axis,
-    "marker": by_marker,
-    "groups": by_group,
-    "polar": polar,
-    "stated": as_stated,
-}
-
-
-def like(structure: Structure, readings: Readings) -> Structure:
-    """The same noise of these `readings`, be they those that it is of or others; their variances
-    are numbered as they come."""
-    if structure.name == "polar":
-        return polar(readings, "angular" in structure.names)
-    return STRUCTURES[structure.name](readings)
-
-
-SHARED = "+configuration"
-JOINTS, EACH, TIME = "+joints", "+each-joint", "+time"
+# The variances' names; and of each term which of them a reading has, (N,) or one for all, and S,
+# (N, size, size) or (size, size).
+Terms = tuple[Sequence[str], Sequence[tuple[IntArray | int, Array]]]
 
 
 class NoiseModel:
@@ -423,19 +148,31 @@ class NoiseModel:
         """Whether these readings have what the model needs; where not, it is not tried."""
         return True
 
-    def structure(self, readings: Readings) -> Structure:
-        """The model for the likelihood; InputError where `components` are not as they should be."""
+    @property
+    def words(self) -> str:
+        """The model in a list of others."""
+        return self.description
+
+    def structure(self, readings: Readings, names: Sequence[str] = ()) -> Structure:
+        """The model for the likelihood, of the variances `names` where it may have several sets;
+        InputError where `components` are not as they should be, or readings lack what it needs."""
+        n, size = readings.e.shape
+        own, terms = self._terms(readings, names)
+        index = np.stack([np.broadcast_to(number, n) for number, _ in terms], axis=1)
+        matrix = np.stack([np.broadcast_to(S, (n, size, size)) for _, S in terms], axis=1)
+        return Structure(self, tuple(own), index, matrix)
+
+    def _terms(self, readings: Readings, names: Sequence[str]) -> Terms:
         found = self.components(readings)
         require(bool(found), f"the noise model '{self.name}' has no components")
-        matrix = np.stack([self._matrices(name, S, readings) for name, S in found.items()], axis=1)
-        smallest = np.linalg.eigvalsh(matrix.sum(axis=1))[:, 0]
+        each = {name: self._matrices(name, S, readings) for name, S in found.items()}
+        smallest = np.linalg.eigvalsh(np.sum(list(each.values()), axis=0))[:, 0]
         require(
             bool((smallest > 0).all()),
             f"the noise model '{self.name}' leaves a reading without noise in some direction: its "
             "components add up to a singular matrix",
         )
-        n, names = len(readings), tuple(found)
-        return _alike(self.name, self.description, names, n, np.arange(len(names)), matrix)
+        return _a_term_each(each)
 
     def _matrices(self, name: str, S: Array, readings: Readings) -> Array:
         """S (N, size, size) of one component, checked."""
@@ -458,7 +195,142 @@ class NoiseModel:
         return full
 
 
-REGISTERED: dict[str, NoiseModel] = {}
+class BuiltIn(NoiseModel):
+    """A model of this package, in `words` for a list of others; its variances may be many that
+    share a prior (`shrunk`).  `supports` says whether the table can tell its variances."""
+
+    words: ClassVar[str] = ""
+    shrunk: ClassVar[bool] = False
+
+
+def _a_term_each(components: Mapping[str, Array]) -> Terms:
+    return tuple(components), list(enumerate(components.values()))
+
+
+def _axes(size: int) -> Array:
+    """E_a (size, size, size), 1 at a, a and 0 elsewhere."""
+    return np.eye(size)[:, :, None] * np.eye(size)[:, None, :]
+
+
+class Independent(BuiltIn):
+    """One variance for positions, and one for rotations."""
+
+    name, words = "independent", "equal noise"
+    description = "one variance for all readings"
+
+    def _terms(self, readings: Readings, names: Sequence[str]) -> Terms:
+        axes = _axes(readings.size)
+        if readings.size == 1:
+            return _a_term_each({"distance": axes[0]})
+        own = {"position": axes[:3].sum(axis=0), "rotation": axes[3:].sum(axis=0)}
+        return _a_term_each({name: S for name, S in own.items() if S.any()})
+
+
+class ByAxis(BuiltIn):
+    """One variance for each component of a reading."""
+
+    name, description, words = "axis", "one variance per axis", "one size per axis"
+
+    def supports(self, readings: Readings) -> bool:
+        return 1 < readings.size <= readings.spare
+
+    def _terms(self, readings: Readings, names: Sequence[str]) -> Terms:
+        own = ("x", "y", "z", "rx", "ry", "rz") if readings.size > 1 else ("distance",)
+        return _a_term_each(dict(zip(own, _axes(readings.size), strict=False)))
+
+
+class ByMarker(BuiltIn):
+    name, description, words = "marker", "one variance per marker", "one size per marker"
+
+    def supports(self, readings: Readings) -> bool:
+        return readings.size == 3 and 1 < len(np.unique(readings.marker)) <= readings.spare
+
+    def _terms(self, readings: Readings, names: Sequence[str]) -> Terms:
+        require(readings.size == 3, "variances per marker are for positions and deflections")
+        labels, number = np.unique(readings.marker, return_inverse=True)
+        return [f"marker {m}" for m in labels], [(number.ravel(), np.eye(3))]
+
+
+class ByGroup(BuiltIn):
+    """One variance for each configuration (under each load) in each direction.
+
+    The group of Klimchik et al. 2013, section 4: its markers and repeats share one σ.
+    """
+
+    name, shrunk = "groups", True
+    description = "a variance per configuration and direction, shrunk towards the others"
+    words = "one size per configuration and direction"
+
+    def supports(self, readings: Readings) -> bool:
+        groups = int(numbered(readings.configuration, readings.load).max(initial=-1)) + 1
+        left = len(readings) - readings.n_parameters / readings.size
+        return 3 <= groups <= MOST_GROUPS and 3 * groups <= left
+
+    def _terms(self, readings: Readings, names: Sequence[str]) -> Terms:
+        size = readings.size
+        key = np.column_stack([readings.configuration, readings.load])
+        groups, number = np.unique(key, axis=0, return_inverse=True)
+        own = [
+            f"configuration {c}, load {load}, component {a}"
+            for c, load in groups for a in range(size)
+        ]  # fmt: skip
+        return own, [(size * number.ravel() + a, E) for a, E in enumerate(_axes(size))]
+
+
+MOST_GROUPS = 1000  # configurations: their information matrix has (3 · 1000)² entries
+
+
+class Polar(BuiltIn):
+    """Variances along the line of sight, across it, and across it growing with the distance.
+
+    Σ = θ_r u uᵀ + (θ_t + θ_a d²)(I − u uᵀ) with u the line of sight and d its length in m: range
+    noise, transverse noise of the target, angular noise of the tracker.  θ_a is there where the
+    distances differ enough to tell it from θ_t.
+    """
+
+    name, description = "polar", "range and transverse variances of the tracker"
+    words = "range and transverse sizes of the tracker"
+
+    def supports(self, readings: Readings) -> bool:
+        return readings.size == 3 and readings.sight is not None and readings.spare >= 3
+
+    def _terms(self, readings: Readings, names: Sequence[str]) -> Terms:
+        require(
+            readings.sight is not None and readings.size == 3,
+            "polar noise needs positions and the tracker's position",
+        )
+        u, d = np.asarray(readings.sight)[:, 0, :], np.asarray(readings.reach)
+        along = u[:, :, None] * u[:, None, :]
+        own = {"range": along, "transverse": np.eye(3) - along}
+        if "angular" in names if names else np.ptp(d) > 0.2 * d.mean():
+            own["angular"] = own["transverse"] * d[:, None, None] ** 2
+        return _a_term_each(own)
+
+
+class AsStated(BuiltIn):
+    """The stated noise times one factor, which the residuals tell."""
+
+    name, description = "stated", "the stated noise times one factor"
+    words = "stated noise × factor"
+
+    def supports(self, readings: Readings) -> bool:
+        # What is one number for all readings is nothing else than equal noise.
+        S, size = readings.stated, readings.size
+        return S is not None and not (
+            size <= 3 and np.allclose(S, S[0, 0, 0] * np.eye(size), rtol=1e-9, atol=0)
+        )
+
+    def _terms(self, readings: Readings, names: Sequence[str]) -> Terms:
+        require(readings.stated is not None, "no noise is stated that could be used")
+        return _a_term_each({"factor": np.asarray(readings.stated)})
+
+
+STRUCTURES: dict[str, NoiseModel] = {
+    model.name: model
+    for model in (Independent(), ByAxis(), ByMarker(), ByGroup(), Polar(), AsStated())
+}
+# Names of the variances whose square roots are in rad, where not of a joint or a rotation.
+TURNED = ("rx", "ry", "rz", "rotation", "angular")
 
 
 def register(model: NoiseModel) -> None:
@@ -471,103 +343,35 @@ def register(model: NoiseModel) -> None:
     kind, name, text = type(model), model.name, getattr(model, "description", None)
     require(isinstance(text, str) and bool(text), f"{kind.__name__}.description takes a short text")
     require(kind.components is not NoiseModel.components, f"{kind.__name__} lacks components")
-    known = REGISTERED.get(name)
+    known = STRUCTURES.get(name)
     require(
-        (known is not None and same_class(known, model)) or name not in (*STRUCTURES, "auto"),
+        name != "auto" and (known is None or same_class(known, model)),
         f"there is a noise model '{name}' already; choose another name",
     )
-    REGISTERED[name] = model
-    STRUCTURES[name] = model.structure
+    STRUCTURES[name] = model
 
 
-def noise_models() -> tuple[str, ...]:
-    """Every name that `noise` takes: auto, the structures, and those with shared deviations.
-
-    Those but auto may have the scatter of the joints (JOINTS or EACH) and a course in TIME added.
-    """
-    return ("auto", *STRUCTURES, *(name + SHARED for name in STRUCTURES))
-
-
-class Kind(NamedTuple):
-    """A noise model by its parts: a structure, deviations of a configuration, scatter of the joints
-    at each visit (JOINTS, EACH or none), a course in time."""
-
-    own: str
-    shared: bool = False
-    joints: str = ""
-    time: bool = False
-
-    @classmethod
-    def parsed(cls, name: str) -> Kind:
-        """The parts that a name has, as "axis+configuration+joints+time", known or not."""
-        rest, time = name.removesuffix(TIME), name.endswith(TIME)
-        joints = next((part for part in (EACH, JOINTS) if rest.endswith(part)), "")
-        rest = rest.removesuffix(joints)
-        return cls(rest.removesuffix(SHARED), rest.endswith(SHARED), joints, time)
-
-    @classmethod
-    def of(cls, name: str) -> Kind:
-        """The same; InputError where there is no such noise model."""
-        found = cls.parsed(name)
-        rest = found.own + SHARED * found.shared
-        if rest not in noise_models() or (rest == "auto" and rest != name):
-            raise InputError(
-                f"{option('noise')} takes one of {', '.join(noise_models())}, with {JOINTS}, "
-                f"{EACH} or {TIME} after it; found {quoted(name)}"
-                f"{did_you_mean(rest, noise_models())}"
-            )
-        return found
-
-    @property
-    def name(self) -> str:
-        return self.own + SHARED * self.shared + self.joints + TIME * self.time
-
-    def with_stated(self, noise: Unsteadiness) -> Kind:
-        """With what `[noise]` of a cell states of visits."""
-        joints = self.joints or JOINTS * bool(noise.joints.any())
-        return self._replace(joints=joints, time=self.time or noise.drift > 0)
-
-    @property
-    def by_visit(self) -> bool:
-        """Whether it matters at which visit a reading was made."""
-        return bool(self.joints) or self.time
-
-
-def check_supported(kind: str, readings: Readings) -> None:
-    """Raise InputError where a noise model of a plug-in lacks something in these readings."""
-    own = Kind.parsed(kind).own
-    require(
-        own not in REGISTERED or REGISTERED[own].supports(readings),
-        f"{option('noise', kind)}: this table does not support the noise model '{own}'; add the "
-        "columns that it needs, or take another one",
-    )
-
-
-# What readings have in common besides the model.
-
-PARTITIONS = (
-    ("configuration",),
-    ("configuration", "load"),
-    ("configuration", "marker"),
-    ("configuration", "load", "marker"),
-)
+# What readings have in common besides.
 
 
 @dataclass(frozen=True)
-class SharedEffect:
+class Deviation:
     """A deviation common to all readings of one `unit` (N, m): covariance τ² Σ ℓ ℓᵀ of those that
     share it, with the loadings ℓ of each reading on its units, `loading` (N, m, size, r).
 
-    Readings are of one unit where they agree in the labels `by`; at an unit of −1 there is nothing.
-    A joint that settles elsewhere at each visit is the deviation of a visit with ℓ = ∂(reading)/∂q
-    of the `joints`; what is left of a course in time, one along the axes.
+    At an unit of −1 there is nothing.  A joint that settles elsewhere at each visit is the
+    deviation of a visit with ℓ = ∂(reading)/∂q of the `joints`.  What all readings have in common,
+    as a drift, are loadings on coefficients of the same variance besides, the `waves` (N, size, k).
+    `part` names what it is one of; τ is in rad where it `turns`, else in m.
     """
 
+    part: str
     name: str
-    by: tuple[str, ...]
     unit: IntArray
     loading: Array
     joints: tuple[int, ...] = ()
+    waves: Array | None = None
+    turns: bool = False
 
     def columns(self) -> sparse.csr_array:
         """Z (N·size, units·r) of the loadings: the covariance of all is τ² Z Zᵀ."""
@@ -581,6 +385,12 @@ class SharedEffect:
         Z = sparse.csr_array(place, shape=(n * size, len(units) * r))
         Z.eliminate_zeros()
         return Z
+
+    def mean_square(self, components: int) -> float:
+        """What τ = 1 adds to the variance of a reading's first components together, at the mean."""
+        own = self.loading[:, :, :components] * (self.unit >= 0)[:, :, None, None]
+        waves = 0.0 if self.waves is None else (self.waves[:, :components] ** 2).sum()
+        return float((own**2).sum() + waves) / len(self.unit)
 
     def packed(self, members: IntArray) -> Array:
         """Loadings (C, M·size, units·r) of the readings `members` (C, M), −1 for none, on the units
@@ -604,8 +414,16 @@ def ranked_within(codes: IntArray) -> IntArray:
     return np.where(codes < 0, -1, out)
 
 
-def shared_effects(readings: Readings, every: bool = False) -> tuple[SharedEffect, ...]:
-    """The shared effects that these readings can tell apart; or `every` one that there may be.
+PARTITIONS: tuple[tuple[str, ...], ...] = (
+    ("configuration",),
+    ("configuration", "load"),
+    ("configuration", "marker"),
+    ("configuration", "load", "marker"),
+)
+
+
+def of_configurations(readings: Readings, _lasting: float, every: bool) -> Iterator[Deviation]:
+    """Deviations that these readings can tell apart; or `every` one that there may be.
 
     An arm does not come back to quite the same place: a deviation per configuration; per
     configuration and load; per configuration and marker; and per set, common to its repeats.
@@ -613,173 +431,216 @@ def shared_effects(readings: Readings, every: bool = False) -> tuple[SharedEffec
     Rotations, in rad, have variances of their own.
     """
     kept: dict[tuple[str, ...], IntArray] = {}
-    by: tuple[str, ...]
     for by in PARTITIONS:
         unit = numbered(*(getattr(readings, label) for label in by))
         # Alone in its unit, a reading's own noise covers it.
         told = (np.bincount(unit) > 1).any() and not any(
             np.array_equal(unit, other) for other in kept.values()
         )
-        if not (told or every):
-            continue
-        kept[by] = unit
-    size, found = readings.size, []
+        if told or every:
+            kept[by] = unit
+    size = readings.size
     for k, kind in enumerate(("", " (rotation)")[: max(size // 3, 1)]):
         axes = np.eye(size)[:, 3 * k : 3 * k + 3]
         for by, unit in kept.items():
-            name = (" and ".join([", ".join(by[:-1]), by[-1]]) if by[1:] else by[0]) + kind
-            loading = np.broadcast_to(axes, (len(readings), 1, *axes.shape))
-            found.append(SharedEffect(name, by, unit[:, None], loading))
-    return tuple(found)
+            *first, last = by
+            name = f"{EACH_HAS}{', '.join(first)}{' and ' if first else ''}{last}{kind}"
+            yield common_to(unit, axes, name, turns=bool(k))
 
 
-# Joints that settle anew at each visit, and a base or tracker that drifts.
+def common_to(unit: IntArray, axes: Array, name: str, turns: bool = False) -> Deviation:
+    """A deviation along `axes` (size, r) common to the readings of each `unit` (N,)."""
+    loading = np.broadcast_to(axes, (len(unit), 1, *axes.shape))
+    return Deviation(CONFIGURATION, name, unit[:, None], loading, turns=turns)
 
-VISIT = "visit"
+
 ALIKE = 1e-9  # m per rad: joints that move no reading more than this have no scatter to be seen
 
 
-def joint_effects(record: VisitRecord, each: bool) -> tuple[SharedEffect, ...]:
-    """The scatter of the joints from visit to visit, as a diagnosis has it too: a standard
-    deviation for each joint, or one for all that turn and one for all that slide."""
+def of_joints(
+    readings: Readings, _lasting: float, _every: bool, each: bool = False
+) -> Iterator[Deviation]:
+    """The scatter of the joints from visit to visit: of all that turn and of all that slide, or of
+    `each` by itself."""
+    record = _visits(readings)
     seen = np.abs(record.motion).max(axis=(0, 1, 2), initial=0.0) > ALIKE
-    groups: list[tuple[str, tuple[int, ...]]]
+    groups = [("each joint", seen & record.turning), ("each slide", seen & ~record.turning)]
     if each:
-        groups = [(f"joint{j + 1}", (int(j),)) for j in np.flatnonzero(seen)]
-    else:
-        both = ("each joint", record.turning), ("each slide", ~record.turning)
-        groups = [(name, tuple(np.flatnonzero(seen & kind).tolist())) for name, kind in both]
-    return tuple(
-        SharedEffect(name, (VISIT,), record.visit, record.motion[..., list(joints)], joints)
-        for name, joints in groups
-        if joints
+        groups = [(f"joint{j + 1}", np.arange(len(seen)) == j) for j in np.flatnonzero(seen)]
+    for name, joints in groups:
+        if joints.any():
+            yield _settling(record, EACH if each else JOINTS, name, np.flatnonzero(joints))
+
+
+def _settling(record: VisitRecord, part: str, name: str, joints: IntArray) -> Deviation:
+    loading, turns = record.motion[..., joints], bool(record.turning[joints[0]])
+    name = f"scatter of {name} from visit to visit"
+    return Deviation(part, name, record.visit, loading, tuple(joints.tolist()), turns=turns)
+
+
+def of_time(readings: Readings, lasting: float, _every: bool) -> Iterator[Deviation]:
+    """A drift of positions, and one of rotations."""
+    position = np.arange(readings.size) < 3
+    for name, along in ((DRIFT, position), (f"{DRIFT} (rotation)", ~position)):
+        if along.any():
+            yield _drift(_visits(readings), name, lasting, along.astype(float))
+
+
+def _drift(record: VisitRecord, name: str, lasting: float, along: Array) -> Deviation:
+    """A course in time of the deviations `along` (size,): its waves, and, common to a visit, what
+    they leave of its variance."""
+    axes = np.diag(along)[:, along > 0]
+    faster = record.faster(lasting)[:, :, None, None] * axes
+    waves = record.waves(lasting)[:, None, :, None] * axes[:, None, :]
+    waves = waves.reshape(*waves.shape[:2], -1)
+    turns = not along[:3].any()
+    return Deviation(TIME, name, record.visit, faster, waves=waves, turns=turns)
+
+
+def _visits(readings: Readings) -> VisitRecord:
+    assert readings.visits is not None
+    return readings.visits
+
+
+CONFIGURATION, JOINTS, EACH, TIME = "configuration", "joints", "each-joint", "time"
+DRIFT, EACH_HAS = "drift in time", "common to each "
+OF_CONFIGURATION = f"{EACH_HAS}configuration"
+
+
+class Part(NamedTuple):
+    """What readings may have in common: its `deviations` of the readings, how long what drifts
+    lasts, and whether those are asked for that these readings do not tell; a `clause` for the
+    description of a noise that has them, and `words` for a list of models."""
+
+    deviations: Callable[[Readings, float, bool], Iterator[Deviation]]
+    clause: str
+    words: str
+
+
+SETTLE = "joints that settle anew at each visit"
+PARTS = {
+    CONFIGURATION: Part(
+        of_configurations, ", and a deviation {}", "deviations of a configuration"
+    ),
+    JOINTS: Part(of_joints, f", {SETTLE}", SETTLE),
+    EACH: Part(
+        partial(of_joints, each=True), f", {SETTLE}", f"{SETTLE}, each by its own size"
+    ),
+    TIME: Part(of_time, ", and a drift in time", "drift in time"),
+}  # fmt: skip
+BY_VISIT = (JOINTS, EACH, TIME)
+
+
+class Kind(NamedTuple):
+    """A noise model: the `own` noise of single readings, and PARTS that they share, in order."""
+
+    own: str
+    parts: tuple[str, ...] = ()
+
+    @classmethod
+    def parsed(cls, name: str) -> Kind:
+        """That of a name, as "axis+configuration+joints+time", known or not."""
+        own, *parts = name.split("+")
+        return cls(own, tuple(parts))
+
+    @classmethod
+    def of(cls, name: str) -> Kind:
+        """The same; InputError where there is no such noise model."""
+        found, known = cls.parsed(name), noise_models()
+        alone = found.own + f"+{CONFIGURATION}" * (CONFIGURATION in found.parts)
+        fits = found == found.having(*found.parts) and not {JOINTS, EACH} <= {*found.parts}
+        if not fits or alone not in known or (found.own == "auto" and found.parts):
+            more = ", ".join(f"+{part}" for part in BY_VISIT[:-1])
+            raise InputError(
+                f"{option('noise')} takes one of {', '.join(known)}, with {more} or "
+                f"+{TIME} after it; found {quoted(name)}{did_you_mean(alone, known)}"
+            )
+        return found
+
+    @property
+    def name(self) -> str:
+        return "+".join((self.own, *self.parts))
+
+    def having(self, *parts: str) -> Kind:
+        """With these parts alone; the joints' scatter either way."""
+        return self._replace(parts=tuple(part for part in PARTS if part in parts))
+
+    def with_part(self, part: str) -> Kind:
+        """With this part besides, in place of another for the joints."""
+        others = (p for p in self.parts if not {p, part} <= {JOINTS, EACH})
+        return self.having(part, *others)
+
+    def without(self, part: str) -> Kind:
+        return self._replace(parts=tuple(p for p in self.parts if p != part))
+
+    def with_stated(self, noise: Unsteadiness) -> Kind:
+        """With what `[noise]` of a cell states of visits."""
+        found = self if EACH in self.parts or not noise.joints.any() else self.with_part(JOINTS)
+        return found.with_part(TIME) if noise.drift > 0 else found
+
+    @property
+    def by_visit(self) -> bool:
+        """Whether it matters at which visit a reading was made."""
+        return any(part in BY_VISIT for part in self.parts)
+
+    @property
+    def words(self) -> str:
+        """The kind in a list of others."""
+        model = STRUCTURES.get(self.own)
+        own = self.own if model is None else model.words
+        return " + ".join([own, *(PARTS[part].words for part in self.parts if part in PARTS)])
+
+    def deviations(
+        self, readings: Readings, lasting: float | None, every: bool = False
+    ) -> list[Deviation]:
+        """What these readings share, where a drift is `lasting` so long; `every` one that there
+        may be, or those that the readings tell apart."""
+        each = (PARTS[part].deviations(readings, lasting or 0.0, every) for part in self.parts)
+        return [deviation for own in each for deviation in own]
+
+
+def noise_models() -> tuple[str, ...]:
+    """Every name that `noise` takes: auto, the structures, and those with shared deviations.
+
+    Those but auto may have the scatter of the joints (JOINTS or EACH) and a course in TIME added.
+    """
+    return ("auto", *STRUCTURES, *(f"{name}+{CONFIGURATION}" for name in STRUCTURES))
+
+
+def check_supported(kind: str, readings: Readings) -> None:
+    """Raise InputError where a noise model of a plug-in lacks something in these readings."""
+    own = Kind.parsed(kind).own
+    model = STRUCTURES.get(own)
+    require(
+        model is None or isinstance(model, BuiltIn) or model.supports(readings),
+        f"{option('noise', kind)}: this table does not support the noise model '{own}'; add the "
+        "columns that it needs, or take another one",
     )
 
 
-DRIFT = "drift in time"
+def stated_deviations(
+    model: Model, observed: Observations, x: Array, parts: Sequence[str] = tuple(PARTS)
+) -> list[Deviation]:
+    """What `[noise]` of the cell says that the readings share, of the `parts` asked for, each with
+    τ = 1: joints that settle anew at each visit, configurations that are off as a whole, a drift.
 
-
-def drifts_of(size: int) -> tuple[tuple[str, Array], ...]:
-    """Names and axes (size,) of what drifts apart: positions, and rotations."""
-    both = ((DRIFT, np.arange(size) < 3), (f"{DRIFT} (rotation)", np.arange(size) >= 3))
-    return tuple((name, axes.astype(float)) for name, axes in both if axes.any())
-
-
-def faster_course(record: VisitRecord, lasting: float, axes: Array) -> SharedEffect:
-    """What of a course in time changes faster than its waves, of deviations `axes` (size,)."""
-    loading = record.faster(lasting)[:, :, None, None] * np.diag(axes)[:, axes > 0]
-    return SharedEffect(DRIFT, (VISIT,), record.visit, loading)
-
-
-def along_axes(waves: Array, axes: Array) -> Array:
-    """Columns (N, size, k·r) of a course's coefficients, from `waves` (N, k) and its deviations
-    `axes` (size,), r of which are not zero."""
-    each = waves[:, None, :, None] * np.diag(axes)[:, None, axes > 0]
-    return np.asarray(each.reshape(len(waves), len(axes), -1))
-
-
-# The same as packs of rows.  Of R repeats the mean, times √R, holds all of Δx and of what they
-# share; R − 1 contrasts between them hold their own noise alone.  Rows so turned are as good as
-# those read: the turn is orthogonal.
-
-
-class Sets:
-    """Readings as sets of repeats: `of` (N,) the set of a reading, `root` (S,) √R, and the rows
-    B (S, size, p), e (S, size) of their means times that; `contrasts` (N − S, size) of `sets`."""
-
-    def __init__(self, readings: Readings, B: Array, apart: Sequence[IntArray]) -> None:
-        labels = (readings.configuration, readings.load, readings.marker, *apart)
-        self.of = numbered(*labels)
-        self.n = int(self.of.max(initial=-1)) + 1
-        self.first = firsts(self.of, self.n)
-        repeats = np.bincount(self.of, minlength=self.n)
-        self.root = np.sqrt(repeats)
-        self.B = self.mean(B) * self.root[:, None, None]
-        self.e = self.mean(readings.e) * self.root[:, None]
-        order = np.argsort(self.of, kind="stable")
-        starts = np.concatenate([[0], np.cumsum(repeats)])[:-1]
-        e, set_of = readings.e[order], self.of[order]
-        before = np.cumsum(e, axis=0) - e
-        before -= before[starts][set_of]
-        j = (np.arange(len(e)) - starts[set_of])[:, None]
-        self.contrasts = ((before - j * e) / np.sqrt(np.maximum(j * (j + 1), 1)))[j[:, 0] > 0]
-        self.sets = set_of[j[:, 0] > 0]
-
-    def mean(self, values: Array) -> Array:
-        """Of each set (S, …) of values (N, …)."""
-        if self.n == len(self.of):
-            out = np.empty_like(values)
-            out[self.of] = values
-            return out
-        total = np.zeros((self.n, *values.shape[1:]))
-        np.add.at(total, self.of, values)
-        return total / (self.root**2).reshape(-1, *[1] * (values.ndim - 1))
-
-
-def packs_of(
-    sets: Sets, structure: Structure, shared: Sequence[SharedEffect], numbers: Sequence[int],
-    together: IntArray | None, silent: BoolArray | None = None,
-) -> list[tuple[IntArray, Pack]]:  # fmt: skip
-    """Packs of the sets, and the sets (C, M) that their clusters are of, −1 for none.
-
-    Sets of one label `together` (S,) are a cluster, without labels each by itself; deviations
-    `shared` by the readings have the variances of these `numbers`.  Those `silent` (S,) are absent.
+    Without times a visit takes as long as the arm stands still, as in a simulation.
     """
-    matrix, index = sets.mean(structure.matrix), structure.index[sets.first]
-    label = np.arange(sets.n) if together is None else numbered(together)
-    count = np.bincount(label)
-    order, starts = np.argsort(label, kind="stable"), np.concatenate([[0], np.cumsum(count)])
-    scale = sets.root[:, None, None, None]
-    turned = [
-        replace(e, unit=e.unit[sets.first], loading=e.loading[sets.first] * scale) for e in shared
-    ]
-    found = []
-    # Clusters that differ by less than two in size share a pack.
-    for size in np.unique(rank := np.ceil(np.log2(count)).astype(int)):
-        of = np.flatnonzero(rank == size)
-        place = np.arange(count[of].max())
-        members = np.where(
-            place < count[of][:, None],
-            order[np.minimum(starts[of][:, None] + place, sets.n - 1)], -1,
-        )  # fmt: skip
-        out = members < 0 if silent is None else (members < 0) | silent[members]
-        parts = [_own_parts(index, matrix, members)]
-        for k, effect in zip(numbers, turned, strict=True):
-            number = np.full((len(members), 1), k)
-            parts.append(Common(number, effect.packed(members)[:, None]))
-        found.append((members, _pack(sets.B, sets.e, members, parts, out)))
+    noise, size, found = model.cell.noise, observed.size, list[Deviation]()
+    position, record = np.arange(size) < 3, None
+    scatters = JOINTS in parts and bool(noise.joints.any())
+    drifts = TIME in parts and noise.drift > 0 and size > 1
+    if scatters or drifts:
+        record = visit_record(model, observed, x)
+    if scatters and record is not None:
+        settling = _settling(record, JOINTS, "joints", np.arange(model.chain.n_joints))
+        scatter = noise.of_joints(model.chain.n_joints)
+        found.append(replace(settling, loading=settling.loading * scatter))
+    if CONFIGURATION in parts and noise.configuration and observed.kind in ("position", "pose"):
+        axes = noise.configuration * np.eye(size)[:, :3]
+        found.append(common_to(observed.configuration, axes, OF_CONFIGURATION))
+    if drifts and record is not None:
+        span = record.span * (1.0 if record.timed else model.cell.design.motion.dwell)
+        along = np.where(position, noise.drift, 0.0)
+        found.append(_drift(record, DRIFT, noise.lasting / span, along))
     return found
-
-
-def contrasts_of(sets: Sets, structure: Structure) -> Pack:
-    """The contrasts between repeats, which hold their own noise alone."""
-    matrix = sets.mean(structure.matrix)
-    own = _own_parts(structure.index[sets.first], matrix, sets.sets[:, None])
-    e = sets.contrasts
-    return Pack(np.zeros((*e.shape, 0)), e, (own,), np.zeros(e.shape, dtype=bool))
-
-
-def _pack(B: Array, e: Array, members: IntArray, parts: list[NoiseParts], out: BoolArray) -> Pack:
-    (C, M), (size, p) = members.shape, B.shape[1:]
-    here = ~out[..., None]
-    return Pack(
-        np.where(here[..., None], B[members], 0.0).reshape(C, M * size, p),
-        np.where(here, e[members], 0.0).reshape(C, M * size),
-        tuple(parts), np.repeat(out, size, axis=1),
-    )  # fmt: skip
-
-
-def _own_parts(index: IntArray, matrix: Array, members: IntArray) -> NoiseParts:
-    """The parts of single readings: those of the k-th of a cluster's different variances, each."""
-    (C, M), (L, size) = members.shape, matrix.shape[1:3]
-    here = members >= 0
-    own = np.where(here[..., None], index[members], -1)  # (C, M, L)
-    blocks = np.where(here[..., None, None, None], matrix[members], 0.0)
-    place = ranked_within(own.reshape(C, -1)).reshape(C, M, L)
-    numbers = int(place.max()) + 1
-    mine = place == np.arange(numbers)[:, None, None, None]  # (k, C, M, L)
-    of = np.where(mine, own, 0).max(axis=(2, 3)).T
-    block = np.einsum("kcml,cmlij->ckmij", mine, blocks)
-    K, at = np.zeros((C, numbers, M, size, M, size)), np.arange(M)
-    K[:, :, at, :, at, :] = block.transpose(2, 0, 1, 3, 4)
-    return Full(of, K.reshape(C, numbers, M * size, M * size))

@@ -15,15 +15,14 @@ from elastocal.identification.noise_choice import (
     NoiseFit,
     NoiseTest,
     Trial,
-    deviations_of,
     linearised,
     own_noise,
+    with_stated_sharing,
 )
-from elastocal.identification.noise_structure import DRIFT, SHARED, Readings
+from elastocal.identification.noise_structure import CONFIGURATION, TURNED, Readings
 from elastocal.identification.options import MethodResult
 from elastocal.identification.outliers import kept_of
 from elastocal.identification.solve import Solution
-from elastocal.identification.stated_noise import with_stated_sharing
 from elastocal.identification.weighted_problem import (
     inverse_factor,
     stated_by_observation,
@@ -150,9 +149,6 @@ def lack_of_fit(observed: Observations, whitened: Array, n_parameters: int) -> L
 # The noise of a result: which model, its size, why, and whether repeats agree.
 
 NUMBERED = re.compile(r"^(marker|configuration) (\d+)")
-COMMON = "common to each"
-SCATTER = "scatter of {} from visit to visit"
-SLIDES = SCATTER.format("each slide")
 TOO_LARGE = (
     "the table is too large for a choice among noise models; stated noise, or equal noise "
     "where none is stated, is scaled to the residual"
@@ -161,13 +157,16 @@ TOO_LARGE = (
 
 @dataclass(frozen=True)
 class NoiseSize:
-    """An estimated standard deviation `sigma` in m (rad), or the `factor` on the stated noise;
-    `joints` are those whose scatter it is, `relative` the standard error of σ² over σ²."""
+    """An estimated standard deviation `sigma` in m, or rad where it `turns`, or the `factor` on the
+    stated noise.  `part` says what of PARTS it is, "" for single readings, `joints` are those whose
+    scatter it is, `relative` is the standard error of σ² over σ²."""
 
     name: str
     sigma: float | None
     factor: float | None = None
+    part: str = ""
     joints: tuple[int, ...] = ()
+    turns: bool = False
     relative: float = 0.0
 
     def agrees_with(self, stated: float) -> bool:
@@ -178,27 +177,8 @@ class NoiseSize:
         off = abs(2 * math.log(self.sigma / stated))
         return not self.relative or off <= float(special.ndtri(0.995)) * self.relative
 
-    @property
-    def of_joints(self) -> bool:
-        return bool(self.joints)
-
-    @property
-    def shared(self) -> bool:
-        """Whether it is a deviation that readings have in common, as those of a configuration."""
-        return self.name.startswith(COMMON)
-
-    @property
-    def of_configuration(self) -> bool:
-        """Whether all readings of a configuration have it in common, whatever load and marker."""
-        return self.name == f"{COMMON} configuration"
-
-    @property
-    def drift(self) -> bool:
-        """Whether it is what changes in the course of the campaign."""
-        return self.name.startswith(DRIFT)
-
     def to_json(self) -> dict[str, Any]:
-        unit = "sigma_urad" if self.of_joints and not self.name.endswith(SLIDES) else "sigma_um"
+        unit = "sigma_urad" if self.joints and self.turns else "sigma_um"
         size: dict[str, Any] = {"name": self.name, unit: microns(self.sigma)}
         return size if self.factor is None else size | {"factor": self.factor}
 
@@ -250,18 +230,13 @@ class Noise:
         """Whether the weights come from a noise model with estimated variances."""
         return bool(self.sizes)
 
-    @property
-    def shared(self) -> bool:
-        """Whether the noise model has a deviation common to the readings of a configuration."""
-        return SHARED in self.kind
-
     def scatter(self, n_joints: int) -> tuple[Array, float]:
         """What a visit scatters by: joints (joints,) in rad or m, and m on each axis in common."""
         joints, common = np.zeros(n_joints), 0.0
         for size in self.sizes or ():
-            if size.of_joints:
+            if size.joints:
                 joints[list(size.joints)] = size.sigma
-            elif size.shared and size.sigma is not None:
+            elif size.part == CONFIGURATION and size.sigma is not None:
                 common = float(np.hypot(common, size.sigma))
         return joints, common
 
@@ -294,7 +269,7 @@ class Noise:
         if self.sizes is not None:
             content["variances"] = [size.to_json() for size in self.sizes]
         if self.tests:
-            content["tests"] = [{"part": t.part.strip("+"), "p": t.p} for t in self.tests]
+            content["tests"] = [t._asdict() for t in self.tests]
         if self.drift is not None:
             content["drift"] = asdict(self.drift)
         if self.tried is not None:
@@ -324,42 +299,30 @@ def noise_of(found: MethodResult, sigma: float) -> Noise:
 
 
 def _estimated(noise: Noise, found: NoiseFit, table: Measurements) -> Noise:
-    fit = found.fit
+    fit, own, sigma = found.fit, found.fit.noisy.own, np.sqrt(found.fit.theta).tolist()
     labels = {"marker": table.marker_names, "configuration": table.configuration_labels}
 
     def label(numbered: re.Match[str]) -> str:
         return f"{numbered[1]} {labels[numbered[1]][int(numbered[2])]}"
 
-    def size(k: int, name: str, sigma: float) -> NoiseSize:
-        if k < own + len(fit.drift):
-            # The structure numbers markers and configurations; the user knows their names.
-            name = NUMBERED.sub(label, name)
-            stated = fit.structure.name == "stated" and k < own
-            return NoiseSize(name, None, sigma) if stated else NoiseSize(name, sigma)
-        effect = fit.shared[k - own - len(fit.drift)]
-        if effect.joints:
-            return NoiseSize(SCATTER.format(name), sigma, None, effect.joints)
-        return NoiseSize(f"{COMMON} {name}", sigma)
-
-    own, sigma = fit.noisy.own, np.sqrt(fit.theta).tolist()
-    sizes = tuple(map(size, range(len(sigma)), fit.noisy.names, sigma))
-    error = np.sqrt(np.diagonal(fit.fit.covariance)) / np.maximum(fit.theta, 1e-300)
-    sizes = tuple(replace(s, relative=float(r)) for s, r in zip(sizes, error, strict=True))
-    drift = None
-    if found.lasting is not None and found.course is not None:
-        drift = Drift(
-            found.lasting,
-            found.lasting * found.course.span if found.course.timed else None,
-            found.to_longest > LIKELY,
-        )
-    alone = fit.structure.name == "independent" and own == 1
+    kind, sizes = fit.structure.model.name, list[NoiseSize]()
+    for name, s in zip(fit.structure.names, sigma[:own], strict=True):
+        one = NoiseSize(NUMBERED.sub(label, name), s, turns=name in TURNED)
+        sizes.append(replace(one, sigma=None, factor=s) if kind == "stated" else one)
+    for d, s in zip(fit.noisy.deviations, sigma[own:], strict=True):
+        sizes.append(NoiseSize(d.name, s, None, d.part, d.joints, d.turns))
+    error = np.sqrt(np.diagonal(fit.covariance)) / np.maximum(fit.theta, 1e-300)
+    drift, record = None, fit.noisy.readings.visits
+    if found.lasting is not None and record is not None:
+        seconds = found.lasting * record.span if record.timed else None
+        drift = Drift(found.lasting, seconds, found.to_longest > LIKELY)
     return replace(
         noise,
         kind=found.kind,
         description=found.description,
         reason=found.reason,
-        sigma=float(np.sqrt(fit.own[0])) if alone else None,
-        sizes=sizes,
+        sigma=sigma[0] if kind == "independent" and own == 1 else None,
+        sizes=tuple(replace(s, relative=float(r)) for s, r in zip(sizes, error, strict=True)),
         tried=found.trials,
         tests=found.tests,
         drift=drift,
@@ -380,12 +343,8 @@ def noise_parts(found: MethodResult) -> dict[str, float]:
         return {"readings": float(squared.sum()) / n * len(fit.residual) / spare}
     readings, noise = _bare(solution), found.noise.fit
     own = np.diagonal(own_noise(noise, readings)[0], axis1=1, axis2=2)[:, :3].sum(axis=1).mean()
-    visits = float(noise.drift[:1].sum()) * min(size, 3)
-    for effect, variance in deviations_of(noise, readings):
-        loading = np.where(effect.unit[:, :, None, None] >= 0, effect.loading, 0.0)
-        if effect.name != DRIFT:
-            visits += variance * float((loading[:, :, :3] ** 2).sum(axis=(1, 2, 3)).mean())
-    return {"readings": float(own), "visits": visits}
+    visits = sum(variance * d.mean_square(3) for d, variance in noise.of(readings))
+    return {"readings": float(own), "visits": float(visits)}
 
 
 def _bare(solution: Solution) -> Readings:
@@ -448,7 +407,7 @@ def _lack_of_fit(found: MethodResult) -> LackOfFit | None:
     solution = found.solution
     problem, residual = solution.problem, solution.fit.residual
     noise, whitened = found.noise, problem.weights.apply(residual)
-    if noise is not None and (noise.fit.common.any() or noise.lasting is not None):
+    if noise is not None and noise.fit.common.any():
         own = inverse_factor(own_noise(noise.fit, _bare(solution))[0])
         whitened = (own @ residual.reshape(*own.shape[:2], 1)).ravel()
     return lack_of_fit(problem.observations, whitened, _spent(found))

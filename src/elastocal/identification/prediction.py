@@ -415,7 +415,7 @@ def excess_of(
         between = test.F * _chi2(test.dof_between, rng)
         within = _chi2(test.dof_pure, rng)
         beyond = np.maximum(between - within, 0.0)
-        visits = any(s.shared or s.of_joints or s.drift for s in noise.sizes or ())
+        visits = any(s.part for s in noise.sizes or ())
         return Excess(beyond / n * pure, one if visits else 1 + beyond / within)
     single = noise.single
     if noise.ratio_to_stated and single is not None and single.above:

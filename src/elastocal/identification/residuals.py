@@ -22,6 +22,7 @@ from elastocal.identification.weighted_problem import (
 from elastocal.measurements import firsts, numbered, ranked
 from elastocal.model.manipulator import Model
 from elastocal.model.observations import COMPONENTS, Observations
+from elastocal.text import plain
 from elastocal.units import Array, IntArray
 
 # Held-out residuals: cross-validation over configurations in closed form.
@@ -40,19 +41,21 @@ def held_out_residual(
     determines a parameter has no held-out residual: its rows are infinite.
 
     B (rows, columns) and residual (rows,) raw; `configuration` (observations,), `size` rows each.
-    Where all readings are correlated, those of `weights.together` are left out at a time.
+    Where all readings are correlated, as by a drift, those of `weights.together` are left out at a
+    time.
     """
-    if weights.together is not None:
-        block = np.repeat(weights.together, size)
-        return residual + _growth_of_blocks(B, residual, weights, block)
-    Q, R = linalg.qr(weights.apply(B), mode="economic")
-    rows_of = np.repeat(configuration, size)
-    return residual + growth(_orthonormal(B, R), Q, weights.apply(residual), rows_of)
-
-
-def _orthonormal(B: Array, R: Array) -> Array:
-    """B R⁻¹."""
-    return np.asarray(linalg.solve_triangular(R, B.T, trans="T").T)
+    rows, e = weights.beside_common(B, residual)
+    Q, R = linalg.qr(rows, mode="economic")
+    n, k = len(B), len(rows) - len(B)
+    code = np.repeat(configuration if weights.together is None else weights.together, size)
+    if k:
+        # What all have in common are columns beside B, held by rows of their own that never go out;
+        # what is predicted is without them.
+        e = e - Q @ (Q.T @ e)
+        B = np.pad(B, ((0, k), (0, k)))
+        code = np.concatenate([code, code.max() + 1 + np.arange(k)])
+    seen = np.asarray(linalg.solve_triangular(R, B.T, trans="T").T)
+    return residual + growth(seen, Q, e, code)[:n]
 
 
 def held_out_by_parts(
@@ -118,24 +121,6 @@ def told_by_one(B: Array, configuration: IntArray) -> Array:
         found.append(direction[:, share > 1 - ALONE])
     U = np.hstack(found)
     return np.asarray(linalg.solve_triangular(R, U) @ (U.T @ R))
-
-
-def _growth_of_blocks(B: Array, residual: Array, weights: Weights, block: IntArray) -> Array:
-    """By how much (rows,) the residual grows where its block is left out, readings being correlated
-    by the noise FFᵀ that they have in common.
-
-    Its coefficients are columns beside B, held by rows of their own that never go out; what is
-    predicted is without them.
-    """
-    F = weights.common
-    assert F is not None
-    (n, p), k = B.shape, F.shape[1]
-    rows, e = weights.beside_common(B, residual)
-    Q, R = linalg.qr(rows, mode="economic")
-    e = e - Q @ (Q.T @ e)
-    seen = np.hstack([np.vstack([B, np.zeros((k, p))]), np.zeros((n + k, k))])
-    labels = np.concatenate([block, block.max() + 1 + np.arange(k)])
-    return growth(_orthonormal(seen, R), Q, e, labels)[:n]
 
 
 def as_of_another_campaign(B: Array, weights: Weights, size: int) -> Array:
@@ -264,14 +249,7 @@ class NormalScores:
     observed: Array
     low: Array
     high: Array
-
-    @property
-    def inside(self) -> bool:
-        return bool(((self.low <= self.observed) & (self.observed <= self.high)).all())
-
-    def to_json(self) -> dict[str, Any]:
-        points = {k: getattr(self, k).tolist() for k in ("expected", "observed", "low", "high")}
-        return {"n": self.n, "inside": self.inside, **points}
+    inside: bool
 
 
 def normal_scores(z: Array, most: int) -> NormalScores:
@@ -286,14 +264,13 @@ def normal_scores(z: Array, most: int) -> NormalScores:
         share = special.ndtr(np.linspace(-end, end, most))
         rank = np.unique(np.clip(np.rint(share * (n + 0.25) + 0.375), 1, n).astype(np.int64))
     half = simultaneous_level(n) / 2
-    return NormalScores(
-        n=n,
-        expected=special.ndtri((rank - 0.375) / (n + 0.25)),
-        observed=np.partition(z, rank - 1)[rank - 1] if n > most else np.sort(z),
-        low=special.ndtri(special.betaincinv(rank, n + 1 - rank, half)),
-        # The complement of the mirrored point: 1 − u near one has no digits to spare.
-        high=-special.ndtri(special.betaincinv(n + 1 - rank, rank, half)),
-    )
+    observed = np.partition(z, rank - 1)[rank - 1] if n > most else np.sort(z)
+    low = special.ndtri(special.betaincinv(rank, n + 1 - rank, half))
+    # The complement of the mirrored point: 1 − u near one has no digits to spare.
+    high = -special.ndtri(special.betaincinv(n + 1 - rank, rank, half))
+    inside = bool(((low <= observed) & (observed <= high)).all())
+    expected = special.ndtri((rank - 0.375) / (n + 0.25))
+    return NormalScores(n, expected, observed, low, high, inside)
 
 
 def simultaneous_level(n: int) -> float:
@@ -398,11 +375,6 @@ class GroupSummary:
         """Whether the group scatters more or less than the model says, at 5 % over all groups."""
         return self.p_holm < SIGNIFICANT
 
-    def to_json(self) -> dict[str, Any]:
-        plain = dict(vars(self))
-        plain["counts"], plain["expected"] = self.counts.tolist(), self.expected.tolist()
-        return plain | {"scores": self.scores.to_json()}
-
 
 @dataclass(frozen=True)
 class Grouping:
@@ -418,10 +390,6 @@ class Grouping:
     n_groups: int
     n_small: int
     n_deviating: int
-
-    def to_json(self) -> dict[str, Any]:
-        groups = [g.to_json() for g in self.groups]
-        return vars(self) | {"edges": self.edges.tolist(), "groups": groups}
 
 
 @dataclass(frozen=True)
@@ -449,10 +417,7 @@ class ResidualSummary:
         return tuple(sorted(found, key=lambda pair: pair[1].p))
 
     def to_json(self) -> dict[str, Any]:
-        return {
-            "absolute": self.absolute, "n_alone": self.n_alone, "edges": self.edges.tolist(),
-            "whole": self.whole.to_json(), "groupings": [g.to_json() for g in self.groupings],
-        }  # fmt: skip
+        return dict(plain(self))
 
 
 def summarise_residuals(

@@ -20,6 +20,7 @@ from elastocal.identification import scrutiny
 from elastocal.identification.constrained import ActiveConstraint
 from elastocal.identification.covariance import Covariance
 from elastocal.identification.faulty_readings import OutlierReport
+from elastocal.identification.noise_structure import DRIFT, OF_CONFIGURATION
 from elastocal.identification.noise_summary import Noise
 from elastocal.identification.outliers import Outlier
 from elastocal.identification.prediction import (
@@ -363,12 +364,12 @@ class Calibration(Result):
     def unsteadiness(self) -> Unsteadiness:
         """What the readings show of the cell's [noise]: `replace(cell, noise=fit.unsteadiness)` is
         a cell whose plans and simulations have it."""
-        drift = next((s.sigma for s in self.noise.sizes or () if s.drift), None) or 0.0
+        sizes = {s.name: s.sigma or 0.0 for s in self.noise.sizes or ()}
         lasting = None if self.noise.drift is None else self.noise.drift.seconds
         joints, _ = self.noise.scatter(self.model.chain.n_joints)
         if not joints.any():
             joints = np.zeros(1)
-        own = next((s.sigma for s in self.noise.sizes or () if s.of_configuration), None) or 0.0
+        own, drift = (sizes.get(name, 0.0) for name in (OF_CONFIGURATION, DRIFT))
         lasting, drift = (lasting, drift) if lasting else (Unsteadiness.lasting, 0.0)
         return Unsteadiness(joints, drift, lasting, own)
 

@@ -13,11 +13,15 @@ from scipy import linalg, sparse
 from elastocal.cell.work_cell import Cell
 from elastocal.errors import InputError, InsufficientDataError, option, require
 from elastocal.identification.identify import identify
-from elastocal.identification.noise_structure import VISIT, visit_record
+from elastocal.identification.noise_structure import (
+    CONFIGURATION,
+    JOINTS,
+    common_to,
+    stated_deviations,
+)
 from elastocal.identification.options import Options
 from elastocal.identification.outliers import kept_of
 from elastocal.identification.solve import WORTH_A_COLUMN, Reduction, reduce
-from elastocal.identification.stated_noise import configured, moved_together, settled
 from elastocal.identification.weighted_problem import (
     Weights,
     block_diagonal,
@@ -150,14 +154,14 @@ def reading_noise(
     shared = []
     if (tau := cell.design.repeatability) > 0:
         force = load_states(table.force[observed.lead])
-        shared.append(moved_together(VISIT, observed, numbered(observed.configuration, force), tau))
-    if cell.noise.joints.any():
-        shared += settled(model, visit_record(model, observed, x))
+        visit, axes = numbered(observed.configuration, force), np.eye(observed.size)[:, :3]
+        shared.append(common_to(visit, tau * axes, "visit"))
+    shared += stated_deviations(model, observed, x, (JOINTS,))
     for effect in shared:
         Z = effect.columns()
         covariance = covariance + Z @ Z.T
     covariance = covariance / visits
-    for effect in configured(model, observed):
+    for effect in stated_deviations(model, observed, x, (CONFIGURATION,)):
         Z = effect.columns()
         covariance = covariance + Z @ Z.T
     return sparse.csr_array(covariance)

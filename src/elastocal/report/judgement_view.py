@@ -13,8 +13,8 @@ from elastocal.errors import option
 from elastocal.identification.constrained import ActiveConstraint
 from elastocal.identification.faulty_readings import FaultyGroup
 from elastocal.identification.findings import only_placed, shape_of
-from elastocal.identification.noise_structure import EACH, JOINTS, REGISTERED, Kind
-from elastocal.identification.noise_summary import SLIDES, Noise, NoiseSize
+from elastocal.identification.noise_structure import Kind
+from elastocal.identification.noise_summary import Noise, NoiseSize
 from elastocal.identification.residuals import ResidualSummary
 from elastocal.identification.result import Calibration, Finding
 from elastocal.identification.sentences import next_steps
@@ -320,19 +320,6 @@ def prior_line(result: Calibration) -> str | None:
 
 FEW = 6  # sizes that are named one by one; of more, the range and the extremes
 MOST_GROUPS = 4
-TURNED = ("rx", "ry", "rz", "rotation", "angular")  # sizes in rad
-KINDS = {
-    "independent": "equal noise",
-    "axis": "one size per axis",
-    "marker": "one size per marker",
-    "groups": "one size per configuration and direction",
-    "polar": "range and transverse sizes of the tracker",
-    "stated": "stated noise × factor",
-}
-SCATTERS = {
-    JOINTS: " + joints that settle anew at each visit",
-    EACH: " + joints that settle anew at each visit, each by its own size",
-}
 COMPARED = (  # the first is against the noise that is stated
     "residual_above_stated_noise",
     "residual_agrees_with_stated_noise",
@@ -424,15 +411,12 @@ def _sizes(noise: Noise) -> list[str]:
         return (s.factor or 0.0) if s.sigma is None else s.sigma
 
     def size(s: NoiseSize) -> str:
-        of_joint = s.of_joints and not s.name.endswith(SLIDES)
         if s.sigma is None:
             return significant(number(s))
-        if of_joint or s.name in TURNED or s.name.endswith("(rotation)"):
-            return f"{significant(s.sigma * 1e6)} µrad"
-        return length(s.sigma)
+        return f"{significant(s.sigma * 1e6)} µrad" if s.turns else length(s.sigma)
 
     sizes = noise.sizes or ()
-    shared = [s for s in sizes if s.shared or s.of_joints or s.drift]
+    shared = [s for s in sizes if s.part]
     own = sorted((s for s in sizes if s not in shared), key=number)
     named = [(s.name, s) for s in sizes if s in own]
     if len(own) > FEW:
@@ -444,13 +428,11 @@ def _sizes(noise: Noise) -> list[str]:
 def candidate_table(noise: Noise) -> ShownTable:
     """Noise models that were tried, best first: words, variances, criterion above the best."""
     tried = sorted(noise.tried or (), key=lambda t: t.criterion)
-    known, rows = KINDS | {name: model.description for name, model in REGISTERED.items()}, []
-    for t in tried:
-        parts = Kind.parsed(t.kind)
-        text = printable(known.get(parts.own, parts.own))
-        text += " + deviations of a configuration" if parts.shared else ""
-        text += SCATTERS.get(parts.joints, "") + " + drift in time" * bool(parts.time)
-        rows.append((text, str(t.n_variances), f"{t.criterion - tried[0].criterion:.1f}"))
+    words = (printable(Kind.parsed(t.kind).words) for t in tried)
+    rows = [
+        (text, str(t.n_variances), f"{t.criterion - tried[0].criterion:.1f}")
+        for text, t in zip(words, tried, strict=True)
+    ]
     heads = ("noise model", "variances", "criterion over best")
     note = (
         "The information criterion: twice the loss in log-likelihood and a price per variance; 10 "
