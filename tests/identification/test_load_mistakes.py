@@ -79,6 +79,13 @@ def test_a_load_in_the_opposite_direction_is_named_and_not_trusted(made):
     assert "hardly shown" not in told.lower() and "fit with bounds" not in told
 
 
+def test_of_kilograms_with_the_wrong_sign_both_are_told(made):
+    told = " ".join(str(fitted(made, -1 / G)).split())
+    assert told.count("Check the sign of the force columns") == 1
+    assert told.count("kilograms. If so, multiply force_x_N, force_y_N and force_z_N by 9.81") == 1
+    assert "kilograms" not in str(fitted(made, -1.0))
+
+
 def test_a_single_negative_compliance_calls_for_care(made):
     path, _ = made
     q = np.random.default_rng(1).uniform(-1, 1, (25, 6)) + np.array([0, -1.2, 1.4, 0, 0, 0])

@@ -11,6 +11,7 @@ from scipy import linalg, special
 
 from elastocal.errors import option
 from elastocal.identification.far_values import STATED_BY_FILE, far_values
+from elastocal.identification.marker_names import exchanged
 from elastocal.identification.mistakes import CELL, KILOGRAMS, load_ratio
 from elastocal.identification.noise_structure import CONFIGURATION, JOINTS, TIME, Kind
 from elastocal.identification.noise_summary import Drift, NoiseSize
@@ -19,7 +20,7 @@ from elastocal.identification.prediction import unread_markers
 from elastocal.identification.residuals import ResidualSummary
 from elastocal.identification.result import Calibration, Estimate, Finding, Number, Severity
 from elastocal.identification.solve import Solution
-from elastocal.measurements import firsts, numbered
+from elastocal.measurements import Measurements, firsts, numbered
 from elastocal.model.arm import Parameter
 from elastocal.model.effects.catalogue import effect_of
 from elastocal.model.effects.compliances import JointCompliance
@@ -80,7 +81,7 @@ USE = (
     "Use it (elastocal compensate, elastocal export) where poses and loads are like those measured."
 )
 # These come from the solver and stay when a result is judged anew.
-OF_SOLUTION = ("ill_conditioned", "beyond_bound")
+OF_SOLUTION = ("ill_conditioned", "beyond_bound", "exchanged_markers")
 
 
 def judged(result: Calibration, of_solution: tuple[Finding, ...] | None = None) -> Calibration:
@@ -100,6 +101,7 @@ def judged(result: Calibration, of_solution: tuple[Finding, ...] | None = None) 
     scaled = any(f.kind == "scale" for f in far)
     found = [
         *_spoilt(result),
+        *(f for f in of_solution if f.kind == "exchanged_markers"),
         *_impossible(result),
         *far,
         *_copies(result),
@@ -113,7 +115,7 @@ def judged(result: Calibration, of_solution: tuple[Finding, ...] | None = None) 
         *(f for f in visits if f.kind != "scatter_not_counted"),
         *_prediction(result, explained),
         *_new_poses(result, explained),
-        *(f for f in of_solution if f.kind != "ill_conditioned"),
+        *(f for f in of_solution if f.kind == "beyond_bound"),
         *_faulty(result),
         *_undetermined(result),
         *_prior(result),
@@ -191,6 +193,8 @@ def _load_unit(result: Calibration) -> Iterator[Finding]:
     if not result.observations.table.force.any():
         return
     known = {e.name: e.value for e in result.ordinary if e.value is not None}
+    # Turned round, the loads may be in another unit as well: then the sizes tell.
+    known |= {p.name: abs(e.held) for p, e in impossible(result)}
     found = load_ratio(result.model, known)
     if found is None:
         return
@@ -705,9 +709,25 @@ def _test(result: Calibration) -> Iterator[Finding]:
 # What only the solver can tell.
 
 
-def of_solution(result: Calibration, solution: Solution) -> tuple[Finding, ...]:
-    """Conditioning of the fit, and parameters beyond their physical bounds."""
-    return (*_conditioning(result, solution), *_bounds(result))
+def of_solution(
+    result: Calibration, solution: Solution, whole: Measurements
+) -> tuple[Finding, ...]:
+    """Conditioning of the fit, parameters beyond their physical bounds, and in the `whole` table
+    readings with another marker's name."""
+    return (*_conditioning(result, solution), *_bounds(result), *_exchanged(result, whole))
+
+
+def _exchanged(result: Calibration, whole: Measurements) -> Iterator[Finding]:
+    """Names of markers that are exchanged: a note where the readings were set apart."""
+    found = exchanged(result.model, whole)
+    if found is not None:
+        lines = whole.row[found.rows]
+        fitted = np.isin(lines, result.observations.table.row).any()
+        yield Finding(
+            "exchanged_markers", "care" if fitted else "note",
+            {"markers": found.markers, "rows": len(lines), "lines": tuple(lines.tolist())},
+            found.words,
+        )  # fmt: skip
 
 
 def _conditioning(result: Calibration, solution: Solution) -> Iterator[Finding]:

@@ -282,12 +282,13 @@ def summarise(
         noise_parts=noise_parts(found),
         shown=_shown(solution, covariance, leverage),
     )
-    return _judged(
-        result, found, new_poses or over_the_workspace(model.cell, model, observed.table)
-    )
+    poses = new_poses or over_the_workspace(model.cell, model, observed.table)
+    return _judged(result, found, poses, every.problem.observations.table)
 
 
-def _judged(result: Calibration, found: MethodResult, poses: NewPoses) -> Calibration:
+def _judged(
+    result: Calibration, found: MethodResult, poses: NewPoses, whole: Measurements
+) -> Calibration:
     """The result with the error expected at those poses, findings and warnings."""
     solution = found.solution
     predicted = predicted_error(
@@ -295,7 +296,7 @@ def _judged(result: Calibration, found: MethodResult, poses: NewPoses) -> Calibr
         np.random.default_rng(0), _unchecked(result),
     )  # fmt: skip
     result = replace(result, predicted=predicted)
-    result = judged(result, of_solution(result, solution))
+    result = judged(result, of_solution(result, solution, whole))
     told = tuple(f"The robot's file: {note}." for note in result.model.chain.notes)
     return replace(result, warnings=(*found.warnings, *warning_sentences(result), *told))
 

@@ -17,6 +17,7 @@ import numpy as np
 from elastocal.cell.arm_description import ModelSpec, Tool
 from elastocal.cell.work_cell import Cell
 from elastocal.errors import InsufficientDataError
+from elastocal.identification.marker_names import FEWEST_POSES, exchanged
 from elastocal.identification.start import (
     OF_A_TARGET,
     SCALED,
@@ -42,7 +43,6 @@ from elastocal.model.rigid import nominal_flanges
 from elastocal.text import listed
 from elastocal.units import Array, IntArray
 
-FEWEST_POSES = 8  # base (6) and a marker (3) from fewer fit anything
 POOR = 0.03  # m: no nominal arm is this wrong, wrong signs and units are far more
 MOST = 80  # % of the readings, which what they fit to is told of
 # What an alternative must bring the error down by.  Of 8 readings it is a likelihood ratio of 38
@@ -88,6 +88,10 @@ def nominal_fit(
     tool = Tool(cell.tool.load_point, {name: np.zeros(3) for name in table.marker_names})
     rigid = Model.assembled(chain, replace(cell, tool=tool, model=ModelSpec()))
     error, far = _errors(rigid, table)
+    if len(table.marker_names) > 1:
+        mixed = exchanged(Model.assembled(chain, replace(cell, model=ModelSpec())), table)
+        if mixed is not None:
+            return NominalFit(error, mixed.words.removesuffix("."), True)
     if far <= POOR:
         return NominalFit(error, "")
     near, best = far, ""

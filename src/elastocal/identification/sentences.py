@@ -21,6 +21,7 @@ SENTENCES = {
         "deviations."
     ),
     "load_unit": "{remedy}",
+    "exchanged_markers": "{remedy}",
     "scatter_not_counted": "{remedy}",
     "not_converged": "The fit did not converge: {reason}. {remedy}",
     "few_degrees_of_freedom": (

@@ -89,6 +89,9 @@ DOUBTS: dict[str, Callable[[Finding], str]] = {
         f"{f.number('excess_kurtosis'):+.2g})"
     ),
     "autocorrelated": lambda f: "residuals of successive visits are correlated, as under a drift",
+    "exchanged_markers": lambda f: (
+        f"the names of markers {listed(map(str, f.listed('markers')))} are exchanged"
+    ),
     "load_unit": lambda f: (
         f"the compliances are {significant(f.number('ratio'), 2)} times those expected from "
         f"{f.numbers['by']}: the loads may be in another unit"
