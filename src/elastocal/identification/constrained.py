@@ -97,45 +97,84 @@ class Minimum:
     nearest: Nearest
 
 
-@dataclass(frozen=True)
-class Region:
-    """{u: rows u ≥ least, every matrix ⪰ 0} in the coordinates u (q,) of a `Reduced`.
+CONTRADICTION = 1e-9  # what equalities may miss each other by, of the size of x
+UNDETERMINED = 1e-11  # singular value of unit columns, of the largest
 
-    The rows (k, q) are the finite bounds, lower ones first, of unit length: `sides` (k,) is 1 for
-    a lower bound and −1 for an upper one of parameter `of` (k,), `lengths` (k,) what a row was
-    divided by.
+
+@dataclass(frozen=True)
+class Reduced:
+    """|t − J x|² = constant + |u|² on x = unit · (centre + T u), all x that the equalities allow,
+    where rows u ≥ least and every matrix ⪰ 0.
+
+    `unit` (p,) makes the columns of J unit length, so that slacks and tolerances do not depend on
+    a parameter's physical unit; `limits` are the constraints on x/unit − centre.  The rows (k, q)
+    are the finite bounds, lower ones first, of unit length: `sides` (k,) is 1 for a lower bound and
+    −1 for an upper one of parameter `of` (k,), `lengths` (k,) what a row was divided by.
     """
 
+    J: Array
+    t: Array
+    system: System
+    unit: Array
+    centre: Array
+    T: Array
+    limits: System
     rows: Array
     least: Array
-    of: IntArray
+    of_row: IntArray
     sides: Array
     lengths: Array
     matrices: tuple[Matrix, ...]
 
     @classmethod
-    def of_system(cls, system: System, T: Array) -> Region:
-        """Bounds and matrices of a system on x = T u."""
-        below, above = (np.flatnonzero(np.isfinite(b)) for b in (system.lower, system.upper))
+    def of(cls, J: Array, t: Array, system: System) -> Reduced:
+        """Raises InputError where equalities contradict each other, which it names, and
+        InsufficientDataError where they and J (rows, p) leave a direction undetermined."""
+        norms = np.linalg.norm(J, axis=0)
+        unit = 1 / np.where(norms > 0, norms, 1.0)
+        zero = np.zeros(len(unit))
+        limits = system.moved(zero, unit)
+        origin, basis, gap = equality_space(limits.A, limits.b)
+        if gap > CONTRADICTION * max(1.0, float(np.max(np.abs(origin), initial=0.0))):
+            raise_conflict(limits)
+        centre, T = _free_minimum(J * unit, t, origin, basis, system.names)
+        # About the free minimum numbers are as small as the constraints allow.
+        limits = limits.moved(centre, zero + 1)
+        below, above = (np.flatnonzero(np.isfinite(b)) for b in (limits.lower, limits.upper))
         of, sides = np.append(below, above), np.repeat([1.0, -1.0], [len(below), len(above)])
-        rows = sides[:, None] * T[of]
-        least = np.append(system.lower[below], -system.upper[above])
+        rows, least = sides[:, None] * T[of], np.append(limits.lower[below], -limits.upper[above])
         lengths = np.linalg.norm(rows, axis=1)
         # What the equalities pin does not move; a bound on it holds, or nothing can meet it.
-        lengths[lengths <= RANK * np.max(np.linalg.norm(T, axis=1), initial=0.0)] = 0.0
-        if np.max(least[lengths == 0], initial=0.0) > RANK:
-            raise_conflict(system)
-        moves = lengths > 0
+        moves = lengths > RANK * np.max(np.linalg.norm(T, axis=1), initial=0.0)
+        if np.max(least[~moves], initial=0.0) > RANK:
+            raise_conflict(limits)
         matrices = tuple(
             replace(m, slopes=np.tensordot(T.T, m.slopes, axes=1)).balanced()
-            for m in system.matrices
+            for m in limits.matrices
         )
+        rows, least, lengths = rows[moves], least[moves], lengths[moves]
         return cls(
-            rows[moves] / lengths[moves, None], least[moves] / lengths[moves], of[moves],
-            sides[moves], lengths[moves], matrices,
+            J, t, system, unit, centre, T, limits, rows / lengths[:, None], least / lengths,
+            of[moves], sides[moves], lengths, matrices,
         )  # fmt: skip
 
-    def holds(self, u: Array) -> bool:
+    def minimum(self, stated: System | None = None) -> Minimum:
+        """The minimum under all constraints; `active` in the terms of `stated`, if given, where x
+        is a step and `stated` the constraints on the parameters themselves.
+
+        Raises InputError where constraints contradict each other, which it names.
+        """
+        found = self._nearest()
+        if found is None:
+            raise_conflict(self.limits)
+        x = self.unit * (self.centre + self.T @ found.u)
+        held = self.of_row[found.rows > 0]
+        above = self.sides[found.rows > 0] > 0
+        x[held] = np.where(above, self.system.lower[held], self.system.upper[held])
+        left = self.t - self.J @ x
+        return Minimum(x, float(left @ left), self._named(stated or self.system, found), found)
+
+    def _holds(self, u: Array) -> bool:
         """Whether u lies in the region, matrices to round-off."""
         for matrix in self.matrices:
             values = np.linalg.eigvalsh(matrix.at(u))
@@ -143,47 +182,13 @@ class Region:
                 return False
         return bool((self.rows @ u >= self.least).all())
 
-    def distance(self) -> float:
-        """A lower bound of the way |u| from 0 into the region."""
-        # An eigenvalue of M changes by at most |u| √(Σ ‖slopes_i‖²).
-        parts = [m.shortfall(np.zeros(len(m.slopes))) / np.linalg.norm(m.slopes)
-                 for m in self.matrices if m.slopes.any()]  # fmt: skip
-        return max(0.0, float(np.max(self.least, initial=0.0)), *map(float, parts))
-
-    def touched(self, found: Nearest) -> BoolArray:
-        """Which rows (k,) the point lies on."""
-        slack = (self.rows @ found.u - self.least) * self.lengths
-        return np.asarray((found.rows > 0) | (slack <= ON_BOUND))
-
-    def nulls(self, found: Nearest) -> list[Array]:
-        """A null-space basis (n, ·) of each matrix at the point.
-
-        M and its price Z share eigenvectors and M Z = 0, so that the negative eigenvalues of M − Z
-        are those of −Z, and belong to the null space.
-        """
-        out = []
-        for matrix, Z in zip(self.matrices, found.matrices, strict=True):
-            values, vectors = np.linalg.eigh(matrix.at(found.u) - Z)
-            out.append(vectors[:, values <= ON_BOUND])
-        return out
-
-    def face(self, found: Nearest) -> Array:
-        """Orthonormal directions (q, ·) in which the constraints that the point lies on let u go:
-        of a matrix those with Nᵀ dM N = 0."""
-        rows = [self.rows[self.touched(found)]]
-        for matrix, N in zip(self.matrices, self.nulls(found), strict=True):
-            i, j = np.tril_indices(N.shape[1])
-            rows.append((N.T @ matrix.slopes @ N)[:, i, j].T)
-        stacked = np.vstack(rows)
-        return equality_space(stacked, np.zeros(len(stacked)))[1]
-
-    def nearest(self) -> Nearest | None:
+    def _nearest(self) -> Nearest | None:
         """None where nothing satisfies all constraints."""
-        if self.holds(u := np.zeros(self.rows.shape[1])):
+        if self._holds(u := np.zeros(self.T.shape[1])):
             nothing = tuple(np.zeros_like(m.constant) for m in self.matrices)
             return Nearest(u, np.zeros(len(self.least)), nothing)
-        found = self._cone_program(self.distance() or 1.0)
-        if found is None or any(N.shape[1] for N in self.nulls(found)):
+        found = self._cone_program()
+        if found is None or any(N.shape[1] for N in self._nulls(found)):
             return found
         held = found.rows > 0
         u, prices = equality_space(self.rows[held], self.least[held])[0], np.zeros(len(held))
@@ -191,11 +196,17 @@ class Region:
             prices[held] = scipy.optimize.nnls(self.rows[held].T, u)[0]
         return Nearest(u, prices, tuple(np.zeros_like(Z) for Z in found.matrices))
 
-    def _cone_program(self, size: float) -> Nearest | None:
-        """The nearest point to a solver's accuracy, at least `size` away, which is its unit."""
+    def _cone_program(self) -> Nearest | None:
+        """The nearest point to a solver's accuracy, in units of the least that it can be away.
+
+        An eigenvalue of M changes by at most |u| √(Σ ‖slopes_i‖²).
+        """
         import cvxpy as cp
 
-        v = cp.Variable(self.rows.shape[1])
+        parts = [float(m.shortfall(np.zeros(len(m.slopes))) / np.linalg.norm(m.slopes))
+                 for m in self.matrices if m.slopes.any()]  # fmt: skip
+        size = max(float(np.max(self.least, initial=0.0)), *parts, 0.0) or 1.0
+        v = cp.Variable(self.T.shape[1])
         wanted = [self.rows @ v >= self.least / size] if len(self.rows) else []
         matrices = [
             _value(cp, replace(m, constant=m.constant / size), v) >> 0 for m in self.matrices
@@ -213,73 +224,42 @@ class Region:
         duals = tuple(size * (c.dual_value + c.dual_value.T) / 4 for c in matrices)
         return Nearest(u, prices, duals)
 
+    def _touched(self, found: Nearest) -> BoolArray:
+        """Which rows (k,) the point lies on."""
+        slack = (self.rows @ found.u - self.least) * self.lengths
+        return np.asarray((found.rows > 0) | (slack <= ON_BOUND))
 
-# The minimum.
+    def _nulls(self, found: Nearest) -> list[Array]:
+        """A null-space basis (n, ·) of each matrix at the point.
 
-CONTRADICTION = 1e-9  # what equalities may miss each other by, of the size of x
-UNDETERMINED = 1e-11  # singular value of unit columns, of the largest
-
-
-@dataclass(frozen=True)
-class Reduced:
-    """|t − J x|² = constant + |u|² on x = unit · (centre + T u), all x that the equalities allow.
-
-    `unit` (p,) makes the columns of J unit length, so that slacks and tolerances do not depend on
-    a parameter's physical unit; `limits` are the constraints on x/unit − centre.
-    """
-
-    J: Array
-    t: Array
-    system: System
-    unit: Array
-    centre: Array
-    T: Array
-    limits: System
-    region: Region
-
-    @classmethod
-    def of(cls, J: Array, t: Array, system: System) -> Reduced:
-        """Raises InputError where equalities contradict each other, which it names, and
-        InsufficientDataError where they and J (rows, p) leave a direction undetermined."""
-        norms = np.linalg.norm(J, axis=0)
-        unit = 1 / np.where(norms > 0, norms, 1.0)
-        zero = np.zeros(len(unit))
-        limits = system.moved(zero, unit)
-        origin, basis, gap = equality_space(limits.A, limits.b)
-        if gap > CONTRADICTION * max(1.0, float(np.max(np.abs(origin), initial=0.0))):
-            raise_conflict(limits)
-        centre, T = _free_minimum(J * unit, t, origin, basis, system.names)
-        # About the free minimum numbers are as small as the constraints allow.
-        limits = limits.moved(centre, zero + 1)
-        region = Region.of_system(limits, T)
-        return cls(J, t, system, unit, centre, T, limits, region)
-
-    def minimum(self, stated: System | None = None) -> Minimum:
-        """The minimum under all constraints; `active` in the terms of `stated`, if given, where x
-        is a step and `stated` the constraints on the parameters themselves.
-
-        Raises InputError where constraints contradict each other, which it names.
+        M and its price Z share eigenvectors and M Z = 0, so that the negative eigenvalues of M − Z
+        are those of −Z, and belong to the null space.
         """
-        region, nearest = self.region, self.region.nearest()
-        if nearest is None:
-            raise_conflict(self.limits)
-        x = self.unit * (self.centre + self.T @ nearest.u)
-        for kind, side in (("lower", 1), ("upper", -1)):
-            held = region.of[(nearest.rows > 0) & (region.sides == side)]
-            x[held] = getattr(self.system, kind)[held]
-        left = self.t - self.J @ x
-        named = self._named(stated or self.system, nearest)
-        return Minimum(x, float(left @ left), named, nearest)
+        out = []
+        for matrix, Z in zip(self.matrices, found.matrices, strict=True):
+            values, vectors = np.linalg.eigh(matrix.at(found.u) - Z)
+            out.append(vectors[:, values <= ON_BOUND])
+        return out
+
+    def face(self, at: Minimum) -> Array:
+        """Orthonormal directions (q, ·) in which the constraints that the point lies on let u go:
+        of a matrix those with Nᵀ dM N = 0."""
+        found = at.nearest
+        rows = [self.rows[self._touched(found)]]
+        for matrix, N in zip(self.matrices, self._nulls(found), strict=True):
+            i, j = np.tril_indices(N.shape[1])
+            rows.append((N.T @ matrix.slopes @ N)[:, i, j].T)
+        stacked = np.vstack(rows)
+        return equality_space(stacked, np.zeros(len(stacked)))[1]
 
     def _named(self, stated: System, found: Nearest) -> tuple[ActiveConstraint, ...]:
         """Equalities, then bounds, then matrices on which u lies, prices in the units of x."""
-        region, limits, z = self.region, self.limits, self.T @ found.u
-        prices = np.zeros(len(z))
-        np.add.at(prices, region.of, region.sides * found.rows / region.lengths)
+        limits, each = self.limits, self.sides * found.rows / self.lengths
         # What they leave of the gradient of half the objective is the equalities'.
-        J = self.J * self.unit
-        pull = J.T @ (self.J @ (self.unit * (self.centre + z)) - self.t) - prices
-        for own, in_u, Z in zip(limits.matrices, region.matrices, found.matrices, strict=True):
+        J, z = self.J * self.unit, self.T @ found.u
+        pull = J.T @ (self.J @ (self.unit * (self.centre + z)) - self.t)
+        np.subtract.at(pull, self.of_row, each)
+        for own, in_u, Z in zip(limits.matrices, self.matrices, found.matrices, strict=True):
             both = in_u.balance / own.balance
             pull -= np.tensordot(own.slopes, np.outer(both, both) * Z, axes=2)
         shares = least_norm(limits.A.T, pull) if len(limits.b) else np.zeros(0)
@@ -291,28 +271,21 @@ class Reduced:
                 stated.A, stated.equality_labels, stated.b, shares, strict=True
             )
         ]
-        sides: tuple[tuple[Literal["lower", "upper"], str, Array, int], ...] = (
-            ("lower", ">=", z - limits.lower, 1), ("upper", "<=", limits.upper - z, -1),
-        )  # fmt: skip
-        for kind, sign, slack, side in sides:
-            held = region.of[(found.rows > 0) & (region.sides == side)]
-            for i in np.union1d(held, np.flatnonzero(slack <= ON_BOUND)):
-                name, value = stated.names[i], float(getattr(stated, kind)[i])
-                price = 2 * float(prices[i] / self.unit[i]) if i in held else 0.0
-                label = f"{name} {sign} {value:.6g}"
-                active.append(ActiveConstraint(label, kind, (name,), value, price))
+        for k in np.flatnonzero(self._touched(found)):
+            i, low = self.of_row[k], self.sides[k] > 0
+            name, value = stated.names[i], float((stated.lower if low else stated.upper)[i])
+            label = f"{name} {'>=' if low else '<='} {value:.6g}"
+            price = 2 * float(each[k] / self.unit[i])
+            kind: Literal["lower", "upper"] = "lower" if low else "upper"
+            active.append(ActiveConstraint(label, kind, (name,), value, price))
         for in_x, matrix, N, Z in zip(
-            limits.matrices, region.matrices, region.nulls(found), found.matrices, strict=True
+            limits.matrices, self.matrices, self._nulls(found), found.matrices, strict=True
         ):
             if N.shape[1]:
                 names = _names(stated, np.abs(in_x.slopes).sum(axis=(1, 2)))
                 price = 2 * float(matrix.balance**2 @ np.diag(Z))
                 active.append(ActiveConstraint(matrix.label, "semidefinite", names, 0.0, price))
         return tuple(active)
-
-    def face(self, found: Minimum) -> Array:
-        """Orthonormal directions (q, ·) in which the constraints on which `found` lies let u go."""
-        return self.region.face(found.nearest)
 
     def farthest(self, index: int, found: Minimum, rise: float, side: int) -> Array:
         """x (p,) with the least (side −1) or largest (1) x[index] where the objective is at most
@@ -326,7 +299,7 @@ class Reduced:
         if s == 0 or length <= RANK * float(np.max(np.linalg.norm(self.T, axis=1), initial=0.0)):
             return found.x  # equalities leave a single value
         v = c / length
-        if u.any() or not self.region.holds(s * v):
+        if u.any() or not self._holds(s * v):
             v = self._cone_end(v, u, s)
         x = self.unit * (self.centre + self.T @ (u + s * v))
         bound = (self.system.lower if side < 0 else self.system.upper)[index]
@@ -339,15 +312,14 @@ class Reduced:
         """v farthest in the direction, where u + s v is allowed and |u + s v|² ≤ |u|² + s²."""
         import cvxpy as cp
 
-        region, v = self.region, cp.Variable(len(u))
-        wanted = []
-        for m in region.matrices:  # u itself is allowed, whatever its rounding says
+        v = cp.Variable(len(u))
+        wanted = [cp.sum_squares(v) + (2 / s) * u @ v <= 1]
+        for m in self.matrices:  # u itself is allowed, whatever its rounding says
             about = m.at(u) + m.shortfall(u) * np.eye(len(m.balance))
             scaled = replace(m, constant=about, slopes=m.slopes * s).balanced(True)
             wanted.append(_value(cp, scaled, v) >> 0)
-        wanted.append(cp.sum_squares(v) + (2 / s) * u @ v <= 1)
-        if len(region.rows):
-            wanted.append(region.rows @ v >= np.minimum((region.least - region.rows @ u) / s, 0.0))
+        if len(self.rows):
+            wanted.append(self.rows @ v >= np.minimum((self.least - self.rows @ u) / s, 0.0))
         status = _solve(cp.Problem(cp.Maximize(direction @ v), wanted))
         if v.value is None:
             raise _stopped(status)
