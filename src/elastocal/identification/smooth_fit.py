@@ -22,6 +22,7 @@ from elastocal.identification.covariance import Covariance
 from elastocal.identification.knowledge import GaussianPrior
 from elastocal.identification.knowledge_fit import FunctionPrior
 from elastocal.identification.least_squares import (
+    EXHAUSTED,
     Fit,
     Known,
     Problem,
@@ -29,6 +30,7 @@ from elastocal.identification.least_squares import (
     moved,
     objective_of,
 )
+from elastocal.identification.least_squares import SETTLED as REASON
 from elastocal.identification.noise_choice import NoiseFit, linearised, weights_of
 from elastocal.identification.noise_structure import Readings
 from elastocal.identification.options import (
@@ -52,15 +54,15 @@ from elastocal.identification.weighted_problem import (
     Part,
     Partition,
     RFactor,
-    Weights,
     each,
     evaluate,
+    part_of,
     partition,
     regressor,
     same_size,
 )
 from elastocal.model.manipulator import Model, SmoothGroup, smooth_groups
-from elastocal.model.observations import Observations, subset
+from elastocal.model.observations import Observations
 from elastocal.text import listed
 from elastocal.units import Array, BoolArray, IntArray, Progress
 
@@ -257,12 +259,12 @@ def crossed(fit: JointFit, step: Array | None = None) -> tuple[Array, Array]:
     return held_out_by_parts(fit.problem.model, fit.parts, fit.x, fit.columns, half, step)
 
 
-def standardised(fit: JointFit, others: Observations | None, weights: Weights) -> Array:
+def standardised(fit: JointFit, others: Part | None) -> Array:
     """Residuals (rows,) free of the fit's part in them, in m or rad: of the fit's own readings,
     configuration by configuration, or of `others`, which vary by 1 + QQᵀ instead of 1 − QQᵀ."""
     parts, side = fit.parts, -1
     if others is not None:
-        parts, side = partition(others, weights, len(fit.columns)), 1
+        parts, side = partition(others.observations, others.weights, len(fit.columns)), 1
     found, size = np.empty(len(parts.observed.value)), parts.observed.size
 
     def one(part: Part) -> None:
@@ -353,9 +355,8 @@ class _Course:
         self, every: Solution, sound: Solution, functions: Functions, options: Options,
         progress: Progress,
     ) -> None:  # fmt: skip
-        self.every, self.options = every, options
-        self.sound = _without(sound, functions.sized)
-        self.functions, self.progress = functions, progress
+        self.every, self.options, self.progress = every, options, progress
+        self.sound, self.functions = _without(sound, functions.sized), functions
         self.model, self.observed = every.problem.model, every.problem.observations
         self.harmful: list[str] = []
         self.estimating = options.resolved == "reml" and not every.problem.large
@@ -365,35 +366,35 @@ class _Course:
         column = np.random.default_rng(0).normal(size=(*bare.e.shape, 1))
         visits = None if bare.visits is None else replace(bare.visits, drifts=False)
         self.readings: Readings = replace(bare, B=column, visits=visits)
-        self.standard = np.zeros(bare.e.shape)
+        self.standard = np.zeros(bare.e.shape)  # residuals free of the fit's part in them
         self.alike = np.zeros(len(bare), dtype=bool)  # as readings of other configurations
 
-    def problem_of(self, good: BoolArray, weights: Weights) -> Problem:
-        observed = self.observed if good.all() else subset(self.observed, good)
-        return replace(self.sound.problem, observations=observed, weights=weights)
-
-    def weights(self, noise: NoiseFit | None, good: BoolArray) -> Weights:
-        """Of the good readings; without an estimated noise those that the problem has."""
+    def chosen(self, noise: NoiseFit | None, good: BoolArray) -> Part:
+        """The good readings, weighted by the noise, or as they are without one."""
+        part = part_of(self.observed, self.every.problem.weights, np.flatnonzero(good))
         if noise is not None:
-            return weights_of(noise, self.readings.take(good))
-        whiten = self.every.problem.weights
-        if whiten.whiten is None or good.all():
-            return whiten
-        rows = np.flatnonzero(np.repeat(good, self.observed.size))
-        return replace(whiten, whiten=sparse.csr_array(whiten.whiten[rows][:, rows]))
+            part = replace(part, weights=weights_of(noise, self.readings.take(good)))
+        return part if not good.all() else replace(part, observations=self.observed)
 
     def settled(self, good: BoolArray) -> tuple[JointFit, NoiseFit | None, BoolArray]:
         """Fit, noise and good readings that agree with each other."""
         noise: NoiseFit | None = None
         x, reduction, scales = self.sound.fit.x, self.sound.reduction, None
-        level = np.inf
+        level, shape = np.inf, (-1, self.observed.size)
         for k in range(ROUNDS):
             fitted = good if self.options.sets_aside(~good) else np.ones_like(good)
-            problem = self.problem_of(fitted, self.weights(noise, fitted))
+            part = self.chosen(noise, fitted)
+            problem = replace(
+                self.sound.problem, observations=part.observations, weights=part.weights
+            )
             fit = joint_fit(problem, self.every.sizes, self.functions, x, reduction, scales)
             x, reduction, scales = fit.x, fit.reduction, fit.scales
             still, level = abs(scales.variance - level) < STILL, scales.variance
-            self.standard = self._standard(fit, noise, fitted)
+            self.standard[fitted] = standardised(fit, None).reshape(shape)
+            if not fitted.all():
+                self.standard[~fitted] = standardised(fit, self.chosen(noise, ~fitted)).reshape(
+                    shape
+                )
             before, kind = good, None if noise is None else noise.kind
             noise, good = self.judged(noise, good, k)
             good = self.corroborated(fit, noise, fitted, good)
@@ -405,32 +406,21 @@ class _Course:
                 self.progress(f"fitting with the noise found ({noise.kind})")
         return fit, noise, good
 
-    def _standard(self, fit: JointFit, noise: NoiseFit | None, fitted: BoolArray) -> Array:
-        """Residuals (N, size) of all readings, free of the fit's part in them."""
-        found = np.empty(self.standard.shape)
-        shape = (-1, self.observed.size)
-        for own in (fitted, ~fitted) if not fitted.all() else (fitted,):
-            rest = None if own is fitted else subset(self.observed, own)
-            found[own] = standardised(fit, rest, self.weights(noise, own)).reshape(shape)
-        return found
-
     def judged(
         self, noise: NoiseFit | None, good: BoolArray, k: int
     ) -> tuple[NoiseFit | None, BoolArray]:
         """The noise of the standardised residuals in the k-th round, and which readings it
         explains."""
-        if not self.estimating:
-            e = self.every.problem.weights.apply(self.standard.ravel())
-            squared = (e.reshape(self.standard.shape) ** 2).sum(axis=1)
-            n, size = len(self.standard), self.observed.size
-            s2 = squared[good].mean() / size
-            dof = max(int(good.sum()) * size, 1)
-            limit = size * s2 * special.fdtri(size, dof, 1 - FALSE_ALARM / n)
-            return None, np.asarray(squared <= limit)
-        readings = self.readings.moved(self.standard)
-        # From the second round on, whose fit has such weights, the kind of noise is known.
-        known = NoiseAndOutliers(noise, good) if noise is not None and k > 1 else None
-        return settle(readings, self.options.noise, good, known)
+        if self.estimating:
+            # From the second round on, whose fit has such weights, the kind of noise is known.
+            known = NoiseAndOutliers(noise, good) if noise is not None and k > 1 else None
+            kind = self.options.noise if known is None else known.noise.kind
+            return settle(self.readings.moved(self.standard), kind, good, known)
+        n, size = len(self.standard), self.observed.size
+        e = self.every.problem.weights.apply(self.standard.ravel()).reshape(n, size)
+        squared, dof = (e**2).sum(axis=1), max(int(good.sum()) * size, 1)
+        limit = squared[good].mean() * special.fdtri(size, dof, 1 - FALSE_ALARM / n)
+        return None, np.asarray(squared <= limit)
 
     def corroborated(
         self, fit: JointFit, noise: NoiseFit | None, fitted: BoolArray, good: BoolArray
@@ -444,17 +434,14 @@ class _Course:
         suspects = np.flatnonzero(~good & ~fitted)
         if len(suspects) < 2:
             return good | self.alike
-        outside = np.isin(np.arange(len(good)), suspects)
-        rest, model = subset(self.observed, outside), self.model
-        at = model.regressor(rest.table, fit.x, fit.columns, rest)
-        Q = _triangular(fit.posterior.R, self.weights(noise, outside).apply(at.B))
-        Q = Q.reshape(len(suspects), -1)
+        rest = self.chosen(noise, np.isin(np.arange(len(good)), suspects))
+        B = regressor(self.model, rest, fit.x, fit.columns).B
+        Q = _triangular(fit.posterior.R, rest.weights.apply(B)).reshape(len(suspects), -1)
         Q = Q / np.linalg.norm(Q, axis=1, keepdims=True)
-        e = self.standard[suspects]
-        length = np.linalg.norm(e, axis=1)
-        apart = np.linalg.norm(e[:, None] - e[None], axis=2)
+        e, own = self.standard[suspects], rest.observations.configuration
+        length, apart = np.linalg.norm(e, axis=1), np.linalg.norm(e[:, None] - e[None], axis=2)
         alike = (Q @ Q.T > SAME_POSE) & (apart < ALIKE * np.minimum.outer(length, length))
-        alike &= rest.configuration[:, None] != rest.configuration[None]
+        alike &= own[:, None] != own[None]
         self.alike[suspects[alike.any(axis=1)]] = True
         return good | self.alike
 
@@ -485,81 +472,62 @@ class _Course:
     def result(
         self, fit: JointFit, cross: tuple[Array, Array], noise: NoiseFit | None, good: BoolArray
     ) -> tuple[MethodResult, FunctionPrior]:
-        posterior, k = fit.posterior, fit.posterior.ordinary
-        columns, effective = fit.columns, round(posterior.effective)
+        posterior, columns, f, r = fit.posterior, fit.columns, fit.functions, fit.reduction
         whitened = fit.problem.weights.apply(fit.residual)
         found = Fit(
             fit.x, fit.residual, whitened, posterior.marginal, fit.converged,
-            "the sum of squares no longer fell" if fit.converged
-            else "the step limit was reached; the start may be far off", fit.steps,
-            fit.problem, columns, self.every.sizes,
+            REASON if fit.converged else EXHAUSTED, fit.steps, fit.problem, columns,
+            self.every.sizes,
         )  # fmt: skip
-        r = fit.reduction
-        mixing = np.zeros((len(columns), len(r.dropped)))
-        mixing[:k] = r.mixing
+        mixing = np.vstack([r.mixing, np.zeros((len(posterior.own), len(r.dropped)))])
         solution = replace(
             self.sound, problem=fit.problem, fit=found, held=cross[0],
-            reduction=replace(
-                r, kept=columns, mixing=mixing, with_prior=fit.functions.columns
-            ),
+            reduction=replace(r, kept=columns, mixing=mixing, with_prior=f.columns),
             nominal_rms=self.every.nominal_rms,
         )  # fmt: skip
-        rows = len(whitened)
-        spare = max(rows - posterior.effective, 1.0)
+        spare = max(len(whitened) - posterior.effective, 1.0)
         # The noise's variance is known as well as the readings that the fit has left over say.
         dof = spare / np.maximum(1 - posterior.prior_share, 1e-3) ** 2
-        dof[:k] = spare
-        matrix = posterior.variance * posterior.cofactor
+        dof[: posterior.ordinary] = spare
         text = (
             "of readings and smooth functions together, the functions as random as their sizes "
             "say; assumes the noise model and normal noise"
         )
+        matrix = posterior.variance * posterior.cofactor
         covariance = Covariance("posterior", (matrix + matrix.T) / 2, dof, text)
         intervals = Intervals(covariance, covariance.interval(fit.x[columns], LEVEL))
+        shares = zip(columns.tolist(), posterior.prior_share.tolist(), strict=True)
         method = self.options.resolved
         if not self.estimating:
             method = "ols" if fit.problem.weights.kind == "none" else "wls"
         result = MethodResult(
-            method, solution, intervals, noise, good, prior_share=self._shares(fit),
-            effective=effective, leverage=cross[1], warnings=self._warnings(fit),
-            smooth=self._parts(fit, covariance.matrix), standard=self.standard,
+            method, solution, intervals, noise, good, leverage=cross[1], standard=self.standard,
+            prior_share={self.model.names[c]: s for c, s in shares if c in f.sized},
+            effective=round(posterior.effective), warnings=self._warnings(fit),
+            smooth=self._parts(fit, covariance.matrix),
         )  # fmt: skip
-        return result, self._prior(fit, spare)
+        own = f.columns[posterior.own]
+        names, nominal = tuple(self.model.names[c] for c in own), f.nominal[posterior.own]
+        prior = GaussianPrior.independent(names, nominal, fit.sigma / posterior.prior)
+        stands = float((((fit.x[own] - nominal) * posterior.prior) ** 2).sum())
+        return result, FunctionPrior(prior, fit.sigma, spare, stands)
 
     def _parts(self, fit: JointFit, covariance: Array) -> tuple[SmoothPart, ...]:
-        f = fit.functions
-        paid = np.zeros(len(f.columns))
+        f, paid = fit.functions, np.zeros(len(fit.functions.columns))
         paid[fit.posterior.own] = fit.posterior.effective_of
-        found = []
-        for g, group in enumerate(f.groups):
-            empty = np.zeros((group.columns.size, group.columns.size))
-            part = SmoothPart(
+        return tuple(
+            SmoothPart(
                 group, float(fit.scales.scale[g]), float(paid[f.group == g].sum()),
-                fit.x[group.columns], empty, _followed(fit.problem.observations, group),
-            )  # fmt: skip
-            found.append(part.refitted(fit.x, fit.columns, covariance))
-        return tuple(found)
-
-    def _prior(self, fit: JointFit, dof: float) -> FunctionPrior:
-        f, own = fit.functions, fit.posterior.own
-        std = fit.sigma / fit.posterior.prior
-        columns = f.columns[own]
-        names = tuple(self.model.names[c] for c in columns)
-        b = (fit.x[columns] - f.nominal[own]) * fit.posterior.prior
-        prior = GaussianPrior.independent(names, f.nominal[own], std)
-        return FunctionPrior(prior, fit.sigma, dof, float(b @ b))
-
-    def _shares(self, fit: JointFit) -> dict[str, float]:
-        sized = set(self.functions.sized.tolist())
-        shares = zip(fit.columns.tolist(), fit.posterior.prior_share.tolist(), strict=True)
-        return {self.model.names[c]: share for c, share in shares if c in sized}
+                fit.x[group.columns], np.zeros((group.columns.size,) * 2),
+                _followed(fit.problem.observations, group),
+            ).refitted(fit.x, fit.columns, covariance)
+            for g, group in enumerate(f.groups)
+        )  # fmt: skip
 
     def _warnings(self, fit: JointFit) -> tuple[str, ...]:
-        told = []
-        scales = fit.scales.scale[: len(self.functions.groups)]
+        scales, told = fit.scales.scale[: len(self.functions.groups)], []
         gone = [g.name for g, s in zip(self.functions.groups, scales, strict=True) if s == 0]
-        unseen = [name for name in gone if name not in self.harmful]
-        if unseen:
+        if unseen := [name for name in gone if name not in self.harmful]:
             told.append(
                 f"The readings show nothing of the {listed(unseen, 6)}: held at zero. Leave "
                 f"{'it' if len(unseen) == 1 else 'them'} out of [model] effects."

@@ -207,9 +207,8 @@ class ShrunkPosterior:
         return self.ordinary + float(self.effective_of.sum())
 
 
-# What an identification says of a smooth function: its size, how sure, and its course.
+# What an identification says of a smooth function: its size, and how sure.
 
-GRID = 200
 PLACES = 500
 DRAWS = 400
 LEVEL = 0.95
@@ -251,47 +250,23 @@ class SmoothPart:
         matrix[np.ix_(there, there)] = covariance[np.ix_(at[there], at[there])]
         return replace(self, value=x[mine], covariance=matrix)
 
-    def course(self, x: Array) -> tuple[Array, Array]:
-        """Values and half widths of their 95 % band (components, n) at x (n,); NaN where the
-        parameters are no function of one quantity."""
-        if self.group.basis is None:
-            nothing = np.full((len(self.value), len(x)), np.nan)
-            return nothing, nothing
-        return self._course(self.group.basis(x))
-
-    def shape(self) -> tuple[Array, Array, Array]:
-        """Places x (GRID,) over its range, values and half widths of the 95 % band (components,
-        GRID) of what is left of the function without its mean and its wave of one period per
-        turn (of a time, its slope), for which offsets, lengths and tilts of the arm can stand."""
-        if self.group.basis is None:
-            nothing = np.zeros((len(self.value), 0))
-            return np.zeros(0), nothing, nothing
-        x = self.group.grid(GRID)
-        return x, *self._course(self._own_waves(x))
-
     def _own_waves(self, x: Array) -> Array:
+        """The waves at x (n,) without their mean and their wave of one period per turn (of a time,
+        its slope), for which offsets, lengths and tilts of the arm can stand."""
         assert self.group.basis is not None
         alike = [np.ones(len(x)), *((np.cos(x), np.sin(x)) if self.group.lasting else (x - x[0],))]
         Q, _ = np.linalg.qr(np.column_stack(alike))
         waves = self.group.basis(x)
         return np.asarray(waves - Q @ (Q.T @ waves))
 
-    def _course(self, waves: Array) -> tuple[Array, Array]:
-        k = self.value.shape[1]
-        half = float(t_quantile(LEVEL, np.array(np.inf)))
-        width = [
-            np.sqrt(np.maximum(((waves @ self._block(c, k)) * waves).sum(axis=1), 0.0))
-            for c in range(len(self.value))
-        ]
-        return self.value @ waves.T, half * np.array(width)
-
     def _block(self, c: int, k: int) -> Array:
         return self.covariance[c * k : (c + 1) * k, c * k : (c + 1) * k]
 
     @cached_property
     def sizes(self) -> dict[str, tuple[float, tuple[float, float], float]]:
-        """By unit, over all components and the places of the readings: rms of the function's
-        `shape`, the 95 % interval of that, and the rms half width of the 95 % band.
+        """By unit, over all components and the places of the readings: rms of what is left of the
+        function without what the arm can stand for, the 95 % interval of that, and the rms half
+        width of its 95 % band.
 
         Of parameters that are no function of one quantity, the root of their sum of squares.
         """
