@@ -207,8 +207,7 @@ def test_quick_plans_of_a_whole_geometry_are_certified_on_the_continuum() -> Non
     assert 0.85 < c.efficiency_continuum <= c.efficiency_pool
 
 
-@pytest.mark.long
-@pytest.mark.parametrize("make", [plan_cell, work_cell])
+@pytest.mark.parametrize("make", [plan_cell, pytest.param(work_cell, marks=pytest.mark.long)])
 def test_normal_effort_polishes_off_the_pool_and_stays_inside_the_rules(
     make: Callable[..., Cell],
 ) -> None:

@@ -365,33 +365,25 @@ def _best(
         everything = np.ones((n, len(plan_forces(sized))), dtype=np.int64)
         return _minutes(sized, drawn.q[:n], everything) > minutes
 
-    poses, found = bisect_left(range(1, len(drawn.q) + 1), True, key=too_long), None
-    while poses > 0:
-        cell = _sized(whole, poses, repeats)
-        try:
-            point = choice.relaxed(cell, drawn, read)
-            if point is None:
-                return None
-            problem = point.setup.problem(point.pool, shares_of(cell))
-            check_enough(problem)
-            chosen, phi = exact_plan(balanced(problem)[0], point.relaxed)
-        except ElastocalError:
+    poses = bisect_left(range(1, len(drawn.q) + 1), True, key=too_long)
+    if not poses:
+        return None
+    cell = _sized(whole, poses, repeats)
+    try:
+        point = choice.relaxed(cell, drawn, read)
+        if point is None:
             return None
-        took = _minutes(cell, point.pool.q[chosen], point.pool.readings[chosen])
-        fitting = int(poses * minutes / took)
-        if took <= minutes:
-            value = point.setup.criterion.figure(phi)
-            size, read = TimedSize(len(chosen), repeats, took, value), point.setup.ways > 0
-            found = _Fit(len(problem.prior), phi, size, poses, read)
-            # Where a load is not hung there is time for more.
-            if took > minutes - cell.design.motion.load_change / 60 or fitting <= poses:
-                return found
-            poses = fitting
-        elif found is not None:
-            return found
-        else:
-            poses = min(fitting, poses - 1)
-    return found
+        problem = point.setup.problem(point.pool, shares_of(cell))
+        check_enough(problem)
+        chosen, phi = exact_plan(balanced(problem)[0], point.relaxed)
+    except ElastocalError:
+        return None
+    took = _minutes(cell, point.pool.q[chosen], point.pool.readings[chosen])
+    # Where a load is not hung there is time for more; Φ goes about as one over their number.
+    more = max(int(poses * minutes / took), 1) / poses
+    value = point.setup.criterion.figure(phi / more)
+    size = TimedSize(round(len(chosen) * more), repeats, took * more, value)
+    return _Fit(len(problem.prior), phi / more, size, round(poses * more), point.setup.ways > 0)
 
 
 def _sized(cell: Cell, poses: int, repeats: int) -> Cell:

@@ -162,9 +162,9 @@ class Search:
                 continuum.append(self._widened(k + 1))
             self._relax()
             # One begun from the plan, one from the relaxation.
-            for name, warm in ((f"warm{k}", best), (f"anew{k}", None)):
-                new, _ = exact_plan(self.problem, self.relaxed, warm=warm, starts=1)
-                best = self._better(best, self.polished(new, name))
+            plans = [exact_plan(self.problem, self.relaxed, warm=w, starts=1) for w in (best, None)]
+            for name, (plan, _) in zip((f"warm{k}", f"anew{k}"), plans, strict=True):
+                best = self._better(best, self.polished(plan, name))
         if effort.starts:
             self._relax(CLOSE if effort.rounds else FINE)
             mixed, _ = exact_plan(self.problem, self.relaxed, warm=best, seed=seed)
