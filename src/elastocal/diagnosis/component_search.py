@@ -98,7 +98,7 @@ def search_components(
         if not (weighed or chosen.unknown or promised(chosen, tried) > PROMISING):
             return None
         progress(f"sizes of {len(tried)} components at once")
-        found = _swapped(full, fit_sum(data, tried, instrument), tried)
+        found = fit_sum(data, tried, instrument)
         if weighed or not any(isinstance(c.effect, LinkWeights) for c in found.components):
             break
         # A compliance that was fitted without weights is wrong, and so are their columns by it.
@@ -122,8 +122,7 @@ def search_components(
             break
         found = wider
     progress("what can be left out")
-    found = _swapped(full, with_own_axes(found), tried)
-    found = completed(with_shorter_drifts(full, found), tried)
+    found = completed(with_shorter_drifts(full, with_own_axes(found)), tried)
     for _ in range(TWICE if few else 0):
         before = with_likelier_orders(full, with_expected_families(full, found))
         # Which of two laws the last move follows shows where the lines are right.
@@ -146,8 +145,7 @@ def _with_lines_first(
     curved = any(c is curve for c in found.components for curve in curves)
     first, pool = found, tried
     if curved:
-        alone = fit_sum(found.sums.data, others, instrument)
-        first, pool = _swapped(dataset, alone, others), others
+        first, pool = fit_sum(found.sums.data, others, instrument), others
     first = begun = completed(first, pool)
     for _ in range(TWICE):
         before = first
@@ -402,9 +400,7 @@ def compared_score(dataset: DiagnosisData, found: FittedSum, chosen: ModelSet) -
 
 # What else could stand in a component's place, the others given.
 
-# Sizes that are tried, in typical ones, and nats by which a rival must be better to be tried.
-WIDE = np.exp(np.linspace(-3.0, 5.0, 9))
-BETTER, SWAPS = 1.0, 6
+WIDE = np.exp(np.linspace(-3.0, 5.0, 9))  # sizes that are tried, in typical ones
 
 
 class Beside:
@@ -499,47 +495,6 @@ class Rivals:
         """Log evidence of component k over none in its place, and of every other hypothesis."""
         own, *others = self.beside.evidence_instead(self.own[k])
         return own, dict(zip(self.keys, others, strict=True))
-
-
-def _swapped(
-    dataset: DiagnosisData, found: FittedSum, components: Sequence[Component]
-) -> FittedSum:
-    """The sum with every named component that another one beats replaced by it.
-
-    Of several causes that these poses hardly tell apart, the sizes that are estimated at once end
-    with any.
-    """
-    known = {(c.effect.name, c.where): c for c in components if c.hypothesis is not None}
-    tried: set[tuple[tuple[str, str], tuple[str, str]]] = set()
-    swapped = False
-    for _ in range(SWAPS):
-        best, rivals = None, Rivals(dataset, found)
-        for k, c in enumerate(found.components):
-            if c.hypothesis is None or c.settings or c.given:
-                continue
-            own, others = rivals.of(k)
-            several = sum(o.effect.name == c.effect.name for o in found.components) > 1
-            for key, evidence in others.items():
-                pair = (c.hypothesis.key, key)
-                # Two of a kind with opposite signs may stand for a third, and cost more.
-                spared = found.costs[k] if several and key[0] == c.effect.name else 0.0
-                better = evidence + spared - own
-                if pair in tried or key not in known or better <= BETTER:
-                    continue
-                if best is None or better > best[0]:
-                    best = better, k, pair
-        if best is None:
-            break
-        _, k, pair = best
-        tried.add(pair)
-        rival, c = known[pair[1]], found.components[k]
-        alike = [o for o in found.components if o.effect.name == c.effect.name]
-        instead = [[c], alike] if len(alike) > 1 and rival.effect.name == c.effect.name else [[c]]
-        fits = (exchanged(found, gone, [rival], refit_noise=False) for gone in instead)
-        other = max(fits, key=lambda fit: fit.score)
-        if other.score > found.score:
-            found, swapped = other, True
-    return _refitted(found) if swapped else found
 
 
 def completed(found: FittedSum, components: Sequence[Component]) -> FittedSum:

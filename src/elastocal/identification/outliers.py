@@ -44,14 +44,14 @@ def median_scale(length: Array, size: int) -> float:
     return float(np.median(length) / np.sqrt(special.chdtri(size, 0.5)))
 
 
-# The majority: errors that follow Student's t, of a scale that the median observation sets.
+# The majority: least trimmed squares, the sum of the smaller half of the squared lengths (FAST-LTS,
+# Rousseeuw and Van Driessen 2006).
 #
-#     w_i = (ν + size)/(ν + |e_i|²/s²),   s² = med|e_i|² / median of χ²(size)
-#
-# Reweighting from one start ends in one of several optima; where half of the observations lie
-# nearest is the majority's.  Starts: all observations, and many sets of a few.
+# Refits to the half that lies nearest from many starts, all observations and sets of a few, the
+# best of them run to the end.  Student's t with the median's scale resists scattered errors as
+# well, but follows a block of two fifths of the readings that err alike: in 11 of 24 tables of
+# distances with one degree of freedom, in 3 with 0.3, this in none.
 
-NU = 1.0  # degrees of freedom: far errors weigh as good as nothing
 STARTS, FINALISTS = 300, 10
 SWEEPS, MOST_SWEEPS = 3, 30  # of every start before the best are chosen, and of these
 MOST_NUMBERS = 3e8  # sums of a sweep over all starts
@@ -94,12 +94,13 @@ def majority(B: Array, e: Array, seed: int = 0) -> tuple[BoolArray, float]:
     variance = np.full(len(weight), max(median_scale(np.linalg.norm(e, axis=1), size) ** 2, TINY))
     for sweep in range(SWEEPS + MOST_SWEEPS):
         q = squares(weight, variance)
-        variance = np.maximum(np.median(q, axis=1) / half, TINY)
+        nearest = np.partition(q, m // 2, axis=1)[:, : m // 2 + 1]
+        variance, cost = np.maximum(nearest.max(axis=1) / half, TINY), nearest.sum(axis=1)
         if sweep == SWEEPS:
-            best = np.argsort(variance, kind="stable")[:FINALISTS]
-            q, variance = q[best], variance[best]
-        weight = (NU + size) / (NU + q / variance[:, None])
-    k = int(np.argmin(variance))
+            best = np.argsort(cost, kind="stable")[:FINALISTS]
+            q, variance, cost, nearest = q[best], variance[best], cost[best], nearest[best]
+        weight = (q <= nearest.max(axis=1)[:, None]).astype(float)
+    k = int(np.argmin(cost))
     s2, told = float(variance[k]), np.zeros(n)
     told[some] = weight[k]
     squared = of_all(told, s2)
@@ -253,11 +254,11 @@ def find_faulty(solution: Solution) -> BoolArray:
     part = sample(problem.parts, SAMPLE) if problem.large else problem.parts.part((0, n))
     width = prior_widths(problem.model, solution.sizes)[problem.free]
     x0, free, size = problem.x0, problem.free, part.observations.size
-    placed = is_placed(problem.model)[free].any()
-    x = x0.copy() if placed else solution.fit.x.copy()
+    placed = is_placed(problem.model)[free]
+    x = x0.copy() if placed.any() else solution.fit.x.copy()
     B, y = _whitened(problem, part, x)
     B, y = B * width, y + B @ (x - x0)[free]
-    good, variance = majority(B, y)
+    good, variance = majority(B[:, :, placed], y)
 
     def fitted(good: BoolArray) -> FitToGood:
         nonlocal B, y, variance
