@@ -252,54 +252,46 @@ def _design_of(cell: Cell, asked: Mapping[str, Any]) -> Any:
     )
     from elastocal.planning.criteria import criterion_named
 
+    def test_poses(given: Any) -> tuple[TargetPose, ...]:
+        require(np.ndim(given) > 0, f"{option('test_poses')} takes joints by pose; found {given}")
+        if all(isinstance(pose, TargetPose) for pose in given):
+            return tuple(given)
+        return tuple(TargetPose(q) for q in np.atleast_2d(np.asarray(given, dtype=float)))
+
+    made: dict[str, Callable[[Any], Any]] = {
+        "criterion": lambda name: criterion_named(name, option("criterion")) and name,
+        "interest": lambda names: _names("interest", names),
+        "loads": lambda forces: np.atleast_2d(np.asarray(forces, dtype=float)),
+        "test_poses": test_poses,
+        "test_path": lambda path: TargetPath(Path(path)) if isinstance(path, str | Path) else path,
+        "test_box": lambda box: box if isinstance(box, TargetBox) else TargetBox(*box),
+    }
     chosen = {key: _plain(value) for key, value in asked.items() if value is not None}
+    chosen = {key: made[key](v) if key in made else v for key, v in chosen.items()}
     if "candidates" in chosen:
-        given, taught = of_candidates(chosen["candidates"]) or (None, None)
-        if given is None and taught is None:
-            raise InputError(
-                f"{option('candidates')} takes {CANDIDATES}; found {quoted(chosen['candidates'])}"
-            )
+        told = f"takes {CANDIDATES}; found {quoted(chosen['candidates'])}"
+        found = of_candidates(chosen["candidates"])
+        require(found is not None, f"{option('candidates')} {told}")
+        given, taught = found or (None, None)
         given = None if given is None else whole("candidates", given, 1)
         chosen |= {"candidates": given, "taught": None if taught is None else Path(taught)}
-    if "criterion" in chosen:
-        criterion_named(chosen["criterion"], option("criterion"))
     wishes = [key for key in ("poses", "target", "minutes") if key in chosen]
-    require(
-        len(wishes) < 2,
-        f"{' and '.join(map(option, wishes))}: a target or a time asks for the number of poses; "
-        "drop one",
-    )
+    told = "a target or a time asks for the number of poses; drop one"
+    require(len(wishes) < 2, f"{' and '.join(map(option, wishes))}: {told}")
     if "levels" in chosen:
         require(len(chosen["levels"]) == 1, f"{option('levels')} takes the values of one joint")
         chosen.setdefault("per_level", ())
     for key, other in (("elsewhere", "elsewhere_cap"), ("elsewhere_cap", "elsewhere")):
         if key in chosen:
-            require(
-                not (chosen[key] and chosen.get(other)),
-                f"{option(key)} and {option(other)} both say what the rest is worth; drop one",
-            )
+            told = f"{option(key)} and {option(other)} both say what the rest is worth; drop one"
+            require(not (chosen[key] and chosen.get(other)), told)
             chosen.setdefault(other, None)
     motion = {
         key: _wish(Motion, key, chosen.pop(key))
-        for key in ("load_changes", "reference_every")
-        if key in chosen
-    }
+        for key in ("load_changes", "reference_every") if key in chosen
+    }  # fmt: skip
     if motion:
         chosen["motion"] = replace(chosen.get("motion", cell.design.motion), **motion)
-    if "interest" in chosen:
-        chosen["interest"] = _names("interest", chosen["interest"])
-    if "loads" in chosen:
-        chosen["loads"] = np.atleast_2d(np.asarray(chosen["loads"], dtype=float))
-    if "test_poses" in chosen:
-        poses = chosen["test_poses"]
-        require(np.ndim(poses) > 0, f"{option('test_poses')} takes joints by pose; found {poses}")
-        if not all(isinstance(pose, TargetPose) for pose in poses):
-            poses = [TargetPose(q) for q in np.atleast_2d(np.asarray(poses, dtype=float))]
-        chosen["test_poses"] = tuple(poses)
-    if isinstance(chosen.get("test_path"), str | Path):
-        chosen["test_path"] = TargetPath(Path(chosen["test_path"]))
-    if "test_box" in chosen and not isinstance(chosen["test_box"], TargetBox):
-        chosen["test_box"] = TargetBox(*chosen["test_box"])
     chosen = {key: _wish(DesignSpec, key, value) for key, value in chosen.items()}
     # What the cell says of the number of poses gives way to what is asked for here.
     number: dict[str, Any] = {"minutes": None} if wishes else {}
