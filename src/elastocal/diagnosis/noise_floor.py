@@ -13,14 +13,13 @@ from elastocal.engine.climb import climb
 from elastocal.engine.mixed import (
     LOG_2PI,
     ROUNDING,
-    Common,
-    Full,
     LogPrior,
     Mixed,
     Pack,
+    Parts,
     Whitened,
 )
-from elastocal.engine.sizes import inverse_triangle
+from elastocal.engine.sizes import Products, Standardised
 from elastocal.model.evaluate import thread_count
 from elastocal.units import Array, BoolArray, IntArray
 
@@ -144,9 +143,11 @@ class NoisyData:
         def numbers(first: int, k: int) -> IntArray:
             return np.tile(np.arange(first, first + k), (C, 1))
 
+        absent = self.blocks.absent[:, None] * np.eye(self.r.shape[1])
+        stated = np.asarray(np.linalg.cholesky(self.covariance + absent), dtype=np.float64)
         parts = (
-            Full(numbers(0, 1), self.covariance[:, None]), Common(numbers(1, J), G),
-            Common(numbers(1 + J, J), G * visit[:, None]),
+            Parts(numbers(0, 1), stated[:, None]),
+            Parts(numbers(1, J), G), Parts(numbers(1 + J, J), G * visit[:, None]),
         )  # fmt: skip
         pack = Pack(self.X, self.r, parts, self.left_out)
         return Mixed((pack,), 1 + 2 * J, self.precision, log_prior_of(self.stated, J))
@@ -272,34 +273,27 @@ class Weighted:
         another column is large."""
         return precision + ROUNDING * np.diag(self.M)
 
-    def factored(self, precision: Array) -> tuple[Array, Array, float]:
-        """L of LLᵀ = M + Λ, L⁻¹z, and ℓ, for a prior of precision Λ (p,)."""
-        M = self.M.copy()
-        M[np.diag_indices_from(M)] += self.prior(precision)
-        # Symmetric, and LAPACK's own way round: nothing is copied.
-        L: Array = linalg.cholesky(M.T, lower=True, overwrite_a=True, check_finite=False)
-        z = linalg.solve_triangular(L, self.z, lower=True, check_finite=False)
-        log_det = 2 * float(np.log(np.diag(L)).sum()) - float(np.log(precision).sum())
-        return L, z, -0.5 * (self.alone + log_det - float(z @ z))
+    def factored(self, precision: Array) -> tuple[Standardised, float]:
+        """The coefficients under a prior of precision Λ (p,), and ℓ."""
+        products = Products(self.M, self.z, 0.0, 0)
+        at = products.at(1 / precision)
+        return at, -0.5 * (self.alone + products.value(at))
 
     def marginal(self, precision: Array) -> float:
-        return self.factored(precision)[2]
+        return self.factored(precision)[1]
 
     def projection(self, precision: Array) -> Projection:
-        L, z, marginal = self.factored(precision)
-        back = self.root.transpose(0, 2, 1)
+        at, marginal = self.factored(precision)
+        back, scaled = self.root.transpose(0, 2, 1), at.inverse * at.root
         # As one product: a small one for each configuration waits for memory.
-        turned = linalg.blas.dtrmm(
-            1.0, inverse_triangle(L), self.X.reshape(-1, len(L)).T, lower=1
-        ).T
+        turned = linalg.blas.dtrmm(1.0, scaled, self.X.reshape(-1, len(at.L)).T, lower=1).T
         H = back @ turned.reshape(self.X.shape)
-        u = (back @ self.r[..., None])[..., 0] - H @ z
-        beta = linalg.solve_triangular(L, z, lower=True, trans="T", check_finite=False)
+        u = (back @ self.r[..., None])[..., 0] - H @ (at.L.T @ at.b)
         inverse = back @ self.root
         # What does not count has a unit variance of its own.
         diagonal = np.einsum("cii->ci", inverse)
         diagonal[diagonal == 0] = 1.0
-        return Projection(inverse, H, u, beta, marginal, L)
+        return Projection(inverse, H, u, at.root * at.b, marginal, at.L / at.root[:, None])
 
 
 def project(data: NoisyData, noise: NoiseValues) -> Projection:

@@ -28,63 +28,33 @@ LOG_2PI = float(np.log(2 * np.pi))
 ROUNDING = 1e-12
 
 
-# What V is made of: several K of every cluster, and the numbers of their variances there.
-
-
 @dataclass(frozen=True)
-class Full:
-    """k parts K (C, k, m, m) of each of C clusters; `of` (C, k) are their variances' numbers."""
-
-    of: IntArray
-    K: Array
-
-    def add(self, V: Array, theta: Array) -> None:
-        """Σ θ K (C, m, m) onto V, θ (C, k)."""
-        V += (theta[:, None] @ self._flat).reshape(V.shape)
-
-    @property
-    def _flat(self) -> Array:
-        return self.K.reshape(*self.K.shape[:2], -1)
-
-    def times(self, u: Array) -> Array:
-        """K u (C, k, m)."""
-        return np.asarray((self.K @ u[:, None, :, None])[..., 0])
-
-    def trace(self, P: Array) -> Array:
-        """tr P K (C, k)."""
-        return np.asarray((self._flat @ P.reshape(len(P), -1, 1))[..., 0])
-
-    def turned(self, root: Array) -> Array:
-        """root K rootᵀ (C, k, m, m)."""
-        own = root[:, None]
-        return np.asarray(own @ self.K @ own.swapaxes(2, 3))
-
-
-@dataclass(frozen=True)
-class Common:
-    """K = ℓℓᵀ of deviations that rows have in common, with their loadings ℓ (C, k, m, r)."""
+class Parts:
+    """Parts K = ℓℓᵀ of every one of C clusters, with loadings ℓ (C, k, m, r); `of` (C, k) are the
+    numbers of their variances."""
 
     of: IntArray
     loading: Array
 
     def add(self, V: Array, theta: Array) -> None:
+        """Σ θ K (C, m, m) onto V, θ (C, k)."""
         own = self.loading * np.sqrt(theta)[:, :, None, None]
         own = own.swapaxes(1, 2).reshape(*V.shape[:2], -1)
         V += own @ own.swapaxes(1, 2)
 
     def times(self, u: Array) -> Array:
+        """K u (C, k, m)."""
         along = u[:, None, None] @ self.loading
         return np.asarray((self.loading @ along.swapaxes(2, 3))[..., 0])
 
     def trace(self, P: Array) -> Array:
+        """tr P K (C, k)."""
         return np.asarray(((P[:, None] @ self.loading) * self.loading).sum(axis=(2, 3)))
 
     def turned(self, root: Array) -> Array:
+        """root K rootᵀ (C, k, m, m)."""
         own = root[:, None] @ self.loading
         return np.asarray(own @ own.swapaxes(2, 3))
-
-
-NoiseParts = Full | Common
 
 
 @dataclass(frozen=True)
@@ -92,12 +62,11 @@ class Pack:
     """C clusters of m rows: B (C, m, p), p = 0 where they hold nothing of x; e (C, m); parts of V.
 
     Rows that are `absent` (C, m) do not count: padding, or readings that only are to be judged.
-    `parts` that are common come last.
     """
 
     B: Array
     e: Array
-    parts: tuple[NoiseParts, ...]
+    parts: tuple[Parts, ...]
     absent: BoolArray
 
     @cached_property

@@ -73,9 +73,9 @@ def variance_of(rows: Array, covariance: Array) -> Array:
 
 
 def root_of(covariance: Array) -> Array:
-    """L (p, p) with L Lᵀ = covariance, which may be singular."""
+    """L (…, p, p) with L Lᵀ = covariance, which may be singular."""
     value, axes = np.linalg.eigh(covariance)
-    return np.asarray(axes * np.sqrt(np.maximum(value, 0.0)))
+    return np.asarray(axes * np.sqrt(np.maximum(value, 0.0))[..., None, :])
 
 
 def t_quantile(level: float, dof: Array) -> Array:

@@ -14,17 +14,15 @@ from scipy import linalg, sparse, special
 
 from elastocal.engine.mixed import (
     ENOUGH,
-    Common,
-    Full,
     LogPrior,
     Mixed,
     MixedFit,
-    NoiseParts,
     Pack,
+    Parts,
     fit,
 )
 from elastocal.errors import ElastocalError, InputError, InsufficientDataError
-from elastocal.identification.covariance import Covariance, orthogonal
+from elastocal.identification.covariance import Covariance, orthogonal, root_of
 from elastocal.identification.noise_structure import (
     CONFIGURATION,
     EACH,
@@ -180,7 +178,7 @@ class NoisyReadings:
         unknown variance hold.  Restricted likelihood is then that of the course taken for noise
         (Henderson 1975), and nothing as large as the table squared is formed."""
         sets, packs = self.sets, []
-        matrix, index = sets.mean(self.structure.matrix), self.structure.index[sets.first]
+        root, index = root_of(sets.mean(self.structure.matrix)), self.structure.index[sets.first]
         scale, (size, p) = sets.root[:, None, None, None], sets.B.shape[1:]
         turned = [
             replace(d, unit=d.unit[sets.first], loading=d.loading[sets.first] * scale)
@@ -188,21 +186,21 @@ class NoisyReadings:
         ]
         for members in sets.clusters(self.readings.configuration[sets.first] if turned else None):
             (C, M), here = members.shape, (members >= 0)[..., None]
-            parts = [_own_parts(index, matrix, members)]
+            parts = [_own_parts(index, root, members)]
             for k, d in enumerate(turned, self.own):
-                parts.append(Common(np.full((C, 1), k), d.packed(members)[:, None]))
+                parts.append(Parts(np.full((C, 1), k), d.packed(members)[:, None]))
             B = np.where(here[..., None], sets.B[members], 0.0).reshape(C, M * size, p)
             e = np.where(here, sets.e[members], 0.0).reshape(C, M * size)
             packs.append(Pack(B, e, tuple(parts), np.repeat(members < 0, size, axis=1)))
         if len(e := sets.contrasts):
-            own = _own_parts(index, matrix, sets.sets[:, None])
+            own = _own_parts(index, root, sets.sets[:, None])
             packs.append(Pack(np.zeros((*e.shape, 0)), e, (own,), np.zeros(e.shape, dtype=bool)))
         held = np.repeat(
             np.arange(self.own, len(self.names)),
             [0 if d.waves is None else d.waves.shape[2] for d in self.deviations],
         )[:, None]
         if k := len(held):
-            own, none = Full(held, np.ones((k, 1, 1, 1))), np.zeros((k, 1))
+            own, none = Parts(held, np.ones((k, 1, 1, 1))), np.zeros((k, 1))
             B = np.eye(k, p, p - k)[:, None]
             packs.append(Pack(B, none, (own,), none.astype(bool)))
         return Mixed(tuple(packs), len(self.names), np.zeros(p), prior)
@@ -231,20 +229,19 @@ class NoisyReadings:
         return theta
 
 
-def _own_parts(index: IntArray, matrix: Array, members: IntArray) -> NoiseParts:
+def _own_parts(index: IntArray, root: Array, members: IntArray) -> Parts:
     """The parts of single readings: those of the k-th of a cluster's different variances, each."""
-    (C, M), (L, size) = members.shape, matrix.shape[1:3]
+    (C, M), (L, size) = members.shape, root.shape[1:3]
     here = members >= 0
     own = np.where(here[..., None], index[members], -1)  # (C, M, L)
-    blocks = np.where(here[..., None, None, None], matrix[members], 0.0)
+    blocks = np.where(here[..., None, None, None], root[members], 0.0)
     place = ranked_within(own.reshape(C, -1)).reshape(C, M, L)
     numbers = int(place.max()) + 1
     mine = place == np.arange(numbers)[:, None, None, None]  # (k, C, M, L)
     of = np.where(mine, own, 0).max(axis=(2, 3)).T
-    block = np.einsum("kcml,cmlij->ckmij", mine, blocks)
-    K, at = np.zeros((C, numbers, M, size, M, size)), np.arange(M)
-    K[:, :, at, :, at, :] = block.transpose(2, 0, 1, 3, 4)
-    return Full(of, K.reshape(C, numbers, M * size, M * size))
+    loading, at = np.zeros((C, numbers, M, size, M, size)), np.arange(M)
+    loading[:, :, at, :, at, :] = np.einsum("kcml,cmlij->mckij", mine, blocks)
+    return Parts(of, loading.reshape(C, numbers, M * size, M * size))
 
 
 def shrunk(kind: Kind) -> bool:
