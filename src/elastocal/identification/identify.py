@@ -210,8 +210,6 @@ def _test_errors(model: Model, result: Calibration, table: Measurements) -> Test
     )  # fmt: skip
 
 
-# From a solution to estimates: covariance, t intervals, combinations, correlations.
-
 CORRELATED = 0.9
 NOT_SHOWN = "held: the readings do not show the smooth function that it is part of"
 

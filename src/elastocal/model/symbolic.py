@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Callable, Hashable, Sequence
 from functools import cached_property
 
 import casadi as ca
@@ -26,7 +26,28 @@ from elastocal.units import Array
 MAX_STEPS = 30
 LARGEST = 0.5  # rad or m
 TOLERANCE = 1e-14  # rad (m for prismatic springs); Newton converges quadratically past it
-KEPT, FEW = 4, 20_000  # answers that are kept, of so many numbers: fits come back to half of them
+KEPT, FEW = 6, 20_000  # answers that are kept, of so many numbers: fits come back to half of them
+
+
+class Recent:
+    """The last answers to questions of few numbers; what a caller does to one changes no other."""
+
+    def __init__(self) -> None:
+        self._kept: dict[tuple[Hashable, ...], tuple[NDArray, NDArray]] = {}
+
+    def __call__(
+        self, asked: Sequence[Hashable], given: Sequence[NDArray],
+        answer: Callable[[], tuple[NDArray, NDArray]],
+    ) -> tuple[NDArray, NDArray]:  # fmt: skip
+        if sum(x.size for x in given) > FEW:
+            return answer()
+        key = (*asked, *(x.tobytes() for x in given))
+        found = self._kept.get(key)
+        if found is None:
+            found = answer()
+            # Bound anew, not changed: threads may look it up at the same time.
+            self._kept = dict([*self._kept.items()][1 - KEPT :]) | {key: found}
+        return found[0].copy(), found[1].copy()
 
 
 class Equilibrium:
@@ -42,7 +63,7 @@ class Equilibrium:
         outputs = [arm.residual, ca.jacobian(arm.residual, theta)]  # F and F_θ
         inputs = [*arm.arm.inputs.values(), arm.p, theta]
         self._residual = BatchFunction(inputs, outputs, arm.backend)
-        self._kept: dict[tuple[bytes, ...], tuple[NDArray, NDArray]] = {}
+        self._recent = Recent()
 
     def solve(self, inputs: Sequence[NDArray], p: NDArray) -> tuple[NDArray, NDArray]:
         """θ (n, size) by Newton's method on all rows, and F_θ (n, size, size) there; p
@@ -50,15 +71,7 @@ class Equilibrium:
 
         Rows that do not settle become NaN, with F_θ = 1 so that it can still be solved with.
         """
-        if sum(x.size for x in inputs) > FEW:
-            return self._settled(inputs, p)
-        key = (p.tobytes(), *(x.tobytes() for x in inputs))
-        found = self._kept.get(key)
-        if found is None:
-            found = self._settled(inputs, p)
-            # Bound anew, not changed: threads may look it up at the same time.
-            self._kept = dict([*self._kept.items()][1 - KEPT :]) | {key: found}
-        return found
+        return self._recent((), [p, *inputs], lambda: self._settled(inputs, p))
 
     def _settled(self, inputs: Sequence[NDArray], p: NDArray) -> tuple[NDArray, NDArray]:
         theta, F_theta = self._stationary(inputs, p, len(inputs[0]))
@@ -236,6 +249,7 @@ class Total:
         self._arm, self._y, self._z = arm, arm.settled(y), z
         self._inputs = [*arm.arm.inputs.values(), *extra, arm.p, arm.arm.theta]
         self._functions: dict[tuple[int, ...], BatchFunction] = {}
+        self._recent = Recent()
 
     @cached_property
     def _derivative(self) -> tuple[ca.SX, ca.SX]:
@@ -271,6 +285,12 @@ class Total:
         `columns` are those of z, by default all.
         """
         asked = tuple(range(self._z.shape[0])) if columns is None else columns
+        given = [*inputs, *extra, x]
+        return self._recent(asked, given, lambda: self._evaluated(inputs, x, extra, asked))
+
+    def _evaluated(
+        self, inputs: list[NDArray], x: Array, extra: Sequence[NDArray], asked: tuple[int, ...]
+    ) -> tuple[Array, Array]:
         arm, function, given = self._arm, self._function(asked), [*inputs, *extra, x]
         if not arm.implicit:
             y, slope = function(*given, np.zeros((len(inputs[0]), arm.arm.theta.shape[0])))
