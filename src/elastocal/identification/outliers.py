@@ -72,7 +72,7 @@ def majority(B: Array, e: Array, seed: int = 0) -> tuple[BoolArray, float]:
     some = np.arange(n) if n <= ENOUGH else rng.choice(n, ENOUGH, replace=False)
     near, own, m, few = B[some], e[some], len(some), min(-(-p // size) + 1, len(some))
     products = near.transpose(0, 2, 1) @ np.concatenate([near, own[..., None]], axis=2)
-    products, flat = products.reshape(m, -1), B.reshape(-1, p)
+    products, flat = products.reshape(m, p * (p + 1)), B.reshape(n * size, p)
 
     def squares(weight: Array, variance: Array) -> Array:
         """Squared lengths (starts, m) beside the fits with these weights (starts, m)."""
