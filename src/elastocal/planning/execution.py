@@ -19,7 +19,7 @@ from elastocal.cell.work_cell import Cell
 from elastocal.errors import require
 from elastocal.identification.visit_record import course_waves
 from elastocal.planning.information import PoseInformation
-from elastocal.planning.moves import BlockersOf, Moves, PathChecker, Reach
+from elastocal.planning.moves import BlockersOf, Moves, PathChecker
 from elastocal.units import Array, BoolArray, IntArray, Progress
 
 
@@ -604,16 +604,15 @@ def schedule(
     arguments that do not fit together.
     """
     forces = np.zeros((1, 3)) if loads is None else loads
-    moves = Moves.of(q, motion, checker, forces, limits, via, read)
-    reach = Reach(moves, blockers)
-    reach.check()
+    moves = Moves.of(q, motion, checker, forces, limits, via, read, blockers)
+    moves.check_reach()
     # Load states one after the other, without load first.
     used = sorted(set(moves.load.tolist()), key=lambda state: (moves.loaded[state], state))
     begun = in_turns(nearest_first(moves.travel()), moves.load, used)
     clock, drift = VisitTimes.of(moves, motion, begun), None
     steps = PER_VISIT * len(begun)
     tour, clock = clock.searched(begun, seed, progress, (SHORT,), steps)
-    reach.check_tour(tour)
+    moves.check_tour(tour)
     if (alias is not None or motion.load_changes) and motion.longer > 0:
         tour, clock, drift = against_drift(clock, motion, tour, alias, seed, progress)
     moves, order = clock.moves, [(node, 0) for node in tour]
@@ -621,7 +620,7 @@ def schedule(
         order = with_references(tour, moves, clock.travel, motion.reference_every, paired)
         while moves.check([node for node, _ in order]):
             pass
-    Reach(moves, blockers).check_tour([node for node, _ in order])
+    moves.check_tour([node for node, _ in order])
     return _executed(moves, order, motion, drift)
 
 

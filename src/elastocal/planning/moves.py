@@ -136,6 +136,39 @@ class Roadmap:
         return np.asarray(csgraph.connected_components(free)[1])
 
 
+# Poses that no collision-free move reaches, told before and after the routing.
+
+SAMPLES = 200  # of a way, in which bodies that come too close are sought
+MOST_NAMED = 3
+
+# The bodies in the way of the straight move between two joint vectors (n,), with or without load.
+BlockersOf = Callable[[Array, Array, bool], Sequence[str]]
+
+
+def blockers_of(rules: Feasibility) -> BlockersOf:
+    """The pairs of bodies that come too close on a way, "link3 and pillar", …, as they are met."""
+
+    def met(q_from: Array, q_to: Array, loaded: bool) -> Sequence[str]:
+        step = np.linspace(0.0, 1.0, SAMPLES)[:, None]
+        poses = rules.kinematics.poses(q_from + step * (q_to - q_from), LOADED * loaded)
+        hits = hits_by_pair(rules.kinematics, rules.pairs, poses)
+        return sorted((name for name in hits if hits[name].any()), key=lambda n: hits[n].argmax())
+
+    return met
+
+
+class Unreachable(InsufficientDataError):
+    """Some poses of a plan cannot be reached: `poses` are their indices."""
+
+    def __init__(self, message: str, poses: IntArray) -> None:
+        super().__init__(message)
+        self.poses = poses
+
+
+def _carrying(roadmap: Roadmap) -> str:
+    return " with the load" if roadmap.loaded else ""
+
+
 # The points of a schedule, its visits, and the moves between them, checked when needed.
 
 
@@ -163,6 +196,7 @@ class Moves:
     leave: IntArray
     sides: IntArray
     free: BoolArray
+    blockers: BlockersOf | None = None
 
     @classmethod
     def of(
@@ -174,6 +208,7 @@ class Moves:
         limits: tuple[Array, Array] | None,
         via: Array | None,
         read: BoolArray | None = None,
+        blockers: BlockersOf | None = None,
     ) -> Moves:
         n_poses, n = q.shape
         read = np.ones((n_poses, len(forces)), dtype=bool) if read is None else read
@@ -197,7 +232,8 @@ class Moves:
             roadmap.check(move for both in stretches for move in both)
             for v, both in zip(own, stretches, strict=True):
                 free[v] = [roadmap.check([move]) for move in both]
-        return cls(points, times, maps, loaded, home, signs, pose, load, leave, sides, free)
+        here = pose, load, leave, sides, free
+        return cls(points, times, maps, loaded, home, signs, *here, blockers)
 
     @cached_property
     def side(self) -> IntArray:
@@ -296,6 +332,71 @@ class Moves:
             pairs = {(min(m), max(m)) for m in product(starts, ends) if m[0] != m[1]}
             roadmap.settle(sorted(pairs))
 
+    # What no move reaches is Unreachable, with what is in the way where `blockers` can tell.
+
+    def check_reach(self) -> None:
+        """Can each pose be approached from one side at least, where it has to be, and does a chain
+        of free moves join it to the others (and home) of its load state?"""
+        for roadmap in self.maps:
+            here = self.loaded[self.load] == roadmap.loaded
+            if self.signs is not None:
+                self._check_approaches(roadmap, here)
+            needed = [int(point) for point in dict.fromkeys(self.leave[here])]
+            if self.home is not None and len(needed) and not roadmap.loaded:
+                needed.insert(0, self.home)
+            if len(needed) < 2:
+                continue
+            most, *lost = roadmap.parts(needed)
+            if lost:
+                every = [point for part in lost for point in part]
+                # Where most hang together, all others are told at once.
+                clear = len(most) > len(every) and self.home not in every
+                raise self._unreachable(roadmap, every if clear else lost[0])
+
+    def check_tour(self, tour: list[int]) -> None:
+        for u, v in pairwise([0, *tour, 0]):
+            roadmap, way = self.way(u, v)
+            if len(way) > 1 and not np.isfinite(roadmap.direct[way[:-1], way[1:]]).all():
+                raise self._unreachable(roadmap, [int(self.leave[(v or u) - 1])])
+
+    def _check_approaches(self, roadmap: Roadmap, here: BoolArray) -> None:
+        for v in np.flatnonzero(here & ~self.free.any(axis=1)):
+            pose, (below, above) = int(self.leave[v]), self.sides[v].tolist()
+            raise Unreachable(
+                f"{self._name(pose)} cannot be approached{_carrying(roadmap)}, neither from below"
+                f"{self._in_the_way(roadmap, below, pose)} nor from above"
+                f"{self._in_the_way(roadmap, above, pose)}; lower overshoot_deg in "
+                "[design.motion], or raise clearance_mm in [workspace]",
+                self.pose[[v]],
+            )
+
+    def _unreachable(self, roadmap: Roadmap, lost: list[int]) -> Unreachable:
+        named = ", ".join(self._name(point) for point in lost[:MOST_NAMED])
+        more = f" and {len(lost) - MOST_NAMED} more" if len(lost) > MOST_NAMED else ""
+        others = np.setdiff1d(np.arange(len(self.points)), lost)
+        between = self.times[lost][:, others]
+        i, j = np.unravel_index(int(np.argmin(between)), between.shape)
+        by = self._in_the_way(roadmap, int(others[j]), lost[int(i)])
+        return Unreachable(
+            f"{named}{more} cannot be reached{_carrying(roadmap)} by collision-free joint moves, "
+            f"neither directly nor through home and other poses{by}; give "
+            "another home in [design.motion], free the way, or narrow [limits] to exclude such "
+            "poses",
+            np.unique(self.pose[np.isin(self.leave, lost)]),
+        )
+
+    def _name(self, point: int) -> str:
+        joints = ", ".join(f"{value:.3f}" for value in self.points[point])
+        if point == self.home:
+            return f"home (joints {joints})"
+        return f"pose {point + (self.home is None)} (joints {joints})"
+
+    def _in_the_way(self, roadmap: Roadmap, i: int, j: int) -> str:
+        if self.blockers is None:
+            return ""
+        names = self.blockers(roadmap.points[i], roadmap.points[j], roadmap.loaded)
+        return f" (in the way: {', '.join(names)})" if names else ""
+
 
 def approach_signs(q: Array, lower: Array, upper: Array, overshoot: float) -> IntArray:
     """Directions (N, 2, n) of the last motion of each joint: first upwards (+1), then down (−1), so
@@ -314,111 +415,3 @@ def approach_signs(q: Array, lower: Array, upper: Array, overshoot: float) -> In
             "limits"
         )
     return np.stack([np.where(below, 1, -1), np.where(above, -1, 1)], axis=1)
-
-
-# Poses that no collision-free move reaches, told before and after the routing.
-
-SAMPLES = 200  # of a way, in which bodies that come too close are sought
-MOST_NAMED = 3
-
-# The bodies in the way of the straight move between two joint vectors (n,), with or without load.
-BlockersOf = Callable[[Array, Array, bool], Sequence[str]]
-
-
-def blockers_of(rules: Feasibility) -> BlockersOf:
-    """The pairs of bodies that come too close on a way, "link3 and pillar", …, as they are met."""
-
-    def met(q_from: Array, q_to: Array, loaded: bool) -> Sequence[str]:
-        step = np.linspace(0.0, 1.0, SAMPLES)[:, None]
-        poses = rules.kinematics.poses(q_from + step * (q_to - q_from), LOADED * loaded)
-        hits = hits_by_pair(rules.kinematics, rules.pairs, poses)
-        return sorted((name for name in hits if hits[name].any()), key=lambda n: hits[n].argmax())
-
-    return met
-
-
-class Unreachable(InsufficientDataError):
-    """Some poses of a plan cannot be reached: `poses` are their indices."""
-
-    def __init__(self, message: str, poses: IntArray) -> None:
-        super().__init__(message)
-        self.poses = poses
-
-
-@dataclass(frozen=True)
-class Reach:
-    """Raises Unreachable where moves lack a way, and names what is in the way where `blockers` can
-    tell."""
-
-    moves: Moves
-    blockers: BlockersOf | None
-
-    def check(self) -> None:
-        """Can each pose be approached from one side at least, where it has to be, and does a chain
-        of free moves join it to the others (and home) of its load state?"""
-        moves = self.moves
-        for roadmap in moves.maps:
-            here = moves.loaded[moves.load] == roadmap.loaded
-            if moves.signs is not None:
-                self._check_approaches(roadmap, here)
-            needed = [int(point) for point in dict.fromkeys(moves.leave[here])]
-            if moves.home is not None and len(needed) and not roadmap.loaded:
-                needed.insert(0, moves.home)
-            if len(needed) < 2:
-                continue
-            most, *lost = roadmap.parts(needed)
-            if lost:
-                every = [point for part in lost for point in part]
-                # Where most hang together, all others are told at once.
-                clear = len(most) > len(every) and moves.home not in every
-                raise self._unreachable(roadmap, every if clear else lost[0])
-
-    def check_tour(self, tour: list[int]) -> None:
-        for u, v in pairwise([0, *tour, 0]):
-            roadmap, way = self.moves.way(u, v)
-            if len(way) > 1 and not np.isfinite(roadmap.direct[way[:-1], way[1:]]).all():
-                raise self._unreachable(roadmap, [int(self.moves.leave[(v or u) - 1])])
-
-    def _check_approaches(self, roadmap: Roadmap, here: BoolArray) -> None:
-        moves = self.moves
-        for v in np.flatnonzero(here & ~moves.free.any(axis=1)):
-            pose, (below, above) = int(moves.leave[v]), moves.sides[v].tolist()
-            raise Unreachable(
-                f"{self._name(pose)} cannot be approached{_carrying(roadmap)}, neither from below"
-                f"{self._in_the_way(roadmap, below, pose)} nor from above"
-                f"{self._in_the_way(roadmap, above, pose)}; lower overshoot_deg in "
-                "[design.motion], or raise clearance_mm in [workspace]",
-                moves.pose[[v]],
-            )
-
-    def _unreachable(self, roadmap: Roadmap, lost: list[int]) -> Unreachable:
-        moves = self.moves
-        named = ", ".join(self._name(point) for point in lost[:MOST_NAMED])
-        more = f" and {len(lost) - MOST_NAMED} more" if len(lost) > MOST_NAMED else ""
-        others = np.setdiff1d(np.arange(len(moves.points)), lost)
-        between = moves.times[lost][:, others]
-        i, j = np.unravel_index(int(np.argmin(between)), between.shape)
-        by = self._in_the_way(roadmap, int(others[j]), lost[int(i)])
-        return Unreachable(
-            f"{named}{more} cannot be reached{_carrying(roadmap)} by collision-free joint moves, "
-            f"neither directly nor through home and other poses{by}; give "
-            "another home in [design.motion], free the way, or narrow [limits] to exclude such "
-            "poses",
-            np.unique(moves.pose[np.isin(moves.leave, lost)]),
-        )
-
-    def _name(self, point: int) -> str:
-        joints = ", ".join(f"{value:.3f}" for value in self.moves.points[point])
-        if point == self.moves.home:
-            return f"home (joints {joints})"
-        return f"pose {point + (self.moves.home is None)} (joints {joints})"
-
-    def _in_the_way(self, roadmap: Roadmap, i: int, j: int) -> str:
-        if self.blockers is None:
-            return ""
-        names = self.blockers(roadmap.points[i], roadmap.points[j], roadmap.loaded)
-        return f" (in the way: {', '.join(names)})" if names else ""
-
-
-def _carrying(roadmap: Roadmap) -> str:
-    return " with the load" if roadmap.loaded else ""
