@@ -22,18 +22,6 @@ from elastocal.text import did_you_mean
 # CasADi's scalar operations as numpy functions of arrays, real or complex.
 
 
-def _filling(n: int, of: Callable) -> Callable:
-    """`of` n arrays with a place for its result behind them, as numpy's own functions have it."""
-
-    def evaluate(*given: Any) -> Any:
-        if len(given) == n:
-            return of(*given)
-        given[n][:] = of(*given[:n])
-        return given[n]
-
-    return evaluate
-
-
 def _abs(x: Any) -> Any:
     # On complex numbers the analytic continuation, so that complex steps stay derivatives.
     return x * np.where(np.real(x) < 0, -1.0, 1.0) if np.iscomplexobj(x) else np.abs(x)
@@ -41,11 +29,11 @@ def _abs(x: Any) -> Any:
 
 def _if_else_zero(condition: Any, value: Any) -> Any:
     # np.where and not a product: the branch not taken may be infinite or NaN.
-    return np.where(np.not_equal(condition, 0), value, 0.0)[()]
+    return np.where(np.not_equal(condition, 0), value, 0.0)
 
 
 def _as_number(compare: Callable) -> Callable:
-    return _filling(2, lambda a, b: compare(a, b) * 1.0)
+    return lambda *given: compare(*given) * 1.0
 
 
 UNARY: dict[int, Any] = {
@@ -54,10 +42,10 @@ UNARY: dict[int, Any] = {
     ca.OP_ASIN: np.arcsin, ca.OP_ACOS: np.arccos, ca.OP_ATAN: np.arctan,
     ca.OP_SINH: np.sinh, ca.OP_COSH: np.cosh, ca.OP_TANH: np.tanh, ca.OP_INV: np.reciprocal,
     ca.OP_LOG1P: np.log1p, ca.OP_EXPM1: np.expm1, ca.OP_FLOOR: np.floor, ca.OP_CEIL: np.ceil,
-    ca.OP_ASSIGN: np.positive, ca.OP_FABS: _filling(1, _abs),
-    ca.OP_SIGN: _filling(1, lambda x: np.sign(np.real(x)) * 1.0),
-    ca.OP_TWICE: _filling(1, lambda x: 2.0 * x),
-    ca.OP_NOT: _filling(1, lambda x: np.logical_not(x) * 1.0),
+    ca.OP_ASSIGN: np.positive, ca.OP_FABS: _abs,
+    ca.OP_SIGN: lambda x: np.sign(np.real(x)),
+    ca.OP_TWICE: lambda x: 2.0 * x,
+    ca.OP_NOT: _as_number(np.logical_not),
 }  # fmt: skip
 BINARY: dict[int, Any] = {
     ca.OP_ADD: np.add, ca.OP_SUB: np.subtract, ca.OP_MUL: np.multiply, ca.OP_DIV: np.divide,
@@ -66,33 +54,75 @@ BINARY: dict[int, Any] = {
     ca.OP_LT: _as_number(np.less), ca.OP_LE: _as_number(np.less_equal),
     ca.OP_EQ: _as_number(np.equal), ca.OP_NE: _as_number(np.not_equal),
     ca.OP_AND: _as_number(np.logical_and), ca.OP_OR: _as_number(np.logical_or),
-    ca.OP_IF_ELSE_ZERO: _filling(2, _if_else_zero), ca.OP_COPYSIGN: np.copysign,
+    ca.OP_IF_ELSE_ZERO: _if_else_zero, ca.OP_COPYSIGN: np.copysign,
 }  # fmt: skip
-# CasADi's instructions of a function as arrays.
+# CasADi's instructions, carried out on numpy arrays.
+#
+# A CasADi `SX` function is a list of scalar instructions.  Carrying out each once on an
+# array of all poses costs one numpy call per instruction and block instead of one CasADi call per
+# pose, and the same runs on complex arrays, which complex-step checks use.
 
 CONSTANT, READ, WRITE, UNARY_OP, BINARY_OP = range(5)
 # Finding common subexpressions takes 7 µs per instruction.  It saves 2 to 14 % of the instructions
 # of B and 1 % of a Jacobian of 170 000, where it would take longer than all the rest.
 LARGEST_REDUCED = 60_000
+LARGEST_BUFFER = 2**23  # numbers in the registers and outputs of one block
 
 
-def instructions(function: ca.Function) -> tuple[NDArray[np.int32], NDArray, int]:
-    """Instructions (m, 5), constants (c,) and number of registers of a function.
+class NumpyFunction:
+    """A function's instructions, and `evaluate`, which carries them out on whole blocks of rows.
 
-    An instruction is kind, operation or constant's index, register, first and second operand;
-    of READ the operands are input and component, of WRITE output and place row by row.
+    Results stand in the registers that CasADi gave the instructions, each as long as a block: few
+    are in use at a time, and these stay in cache.  What is the same in all rows is one number.
+    Raises NotImplementedError for a CasADi operation that numpy has no counterpart for.
+    """
+
+    def __init__(self, function: ca.Function) -> None:
+        self._steps, self.n_registers = instructions(function)
+        width = self.n_registers + sum(function.numel_out(k) for k in range(function.n_out()))
+        self.largest_block = max(LARGEST_BUFFER // max(width, 1), 1)
+
+    def evaluate(
+        self, inputs: Sequence[NDArray], results: Sequence[NDArray], blocks: Sequence[slice]
+    ) -> None:
+        """Rows of `blocks` of `results` (n, rows, columns), all of one type."""
+        flat = [r.reshape(len(r), r.shape[1] * r.shape[2]) for r in results]
+        held: list[Any] = [None] * self.n_registers
+        for block in blocks:
+            given = [a[block].T.copy() if a.ndim == 2 else a.tolist() for a in inputs]
+            outputs = [np.zeros((f.shape[1], block.stop - block.start), f.dtype) for f in flat]
+            for kind, what, out, a, b in zip(*self._steps, strict=True):
+                if kind == BINARY_OP:
+                    held[out] = what(held[a], held[b])
+                elif kind == UNARY_OP:
+                    held[out] = what(held[a])
+                elif kind == READ:
+                    held[out] = given[a][b]
+                elif kind == CONSTANT:
+                    held[out] = what
+                else:
+                    outputs[a][b] = held[out]
+            for f, output in zip(flat, outputs, strict=True):
+                f[block] = output.T
+
+
+def instructions(function: ca.Function) -> tuple[tuple[list[Any], ...], int]:
+    """`_steps` of a function as five lists, and its number of registers.
+
+    Not a tuple for every step: thousands of these would have Python look for garbage in all that
+    is loaded, 0.07 s each time.
     """
     if function.n_instructions() <= LARGEST_REDUCED:
         # The derivative code repeats the chain's products many times over.
         symbols = function.sx_in()
         function = ca.Function("rows", symbols, function.call(symbols), {"cse": True})
-    constants: list[float] = []
-    steps = list(_steps(function, constants))
-    table = np.array(steps, dtype=np.int32).reshape(-1, 5)
-    return table, np.array(constants), int(function.sz_w())
+    columns = tuple([*column] for column in zip(*_steps(function), strict=True))
+    return columns, int(function.sz_w())
 
 
-def _steps(f: ca.Function, constants: list[float]) -> Iterator[tuple[int, int, int, int, int]]:
+def _steps(f: ca.Function) -> Iterator[tuple[int, Any, int, int, int]]:
+    """Kind, operation or constant, register, first and second operand of each instruction: of READ
+    input and component, of WRITE output and place row by row."""
     # Where each nonzero of an output, in CasADi's order, stands in its matrix written row by row.
     outputs = [f.sparsity_out(k) for k in range(f.n_out())]
     places = [
@@ -101,106 +131,21 @@ def _steps(f: ca.Function, constants: list[float]) -> Iterator[tuple[int, int, i
     for k in range(f.n_instructions()):
         code = f.instruction_id(k)
         if code == ca.OP_CONST:
-            constants.append(f.instruction_constant(k))
-            yield CONSTANT, len(constants) - 1, f.instruction_output(k)[0], 0, 0
+            yield CONSTANT, f.instruction_constant(k), f.instruction_output(k)[0], 0, 0
         elif code in BINARY:
             a, b = f.instruction_input(k)
-            yield BINARY_OP, code, f.instruction_output(k)[0], a, b
+            yield BINARY_OP, BINARY[code], f.instruction_output(k)[0], a, b
         elif code in UNARY:
-            yield UNARY_OP, code, f.instruction_output(k)[0], f.instruction_input(k)[0], 0
+            (a,) = f.instruction_input(k)
+            yield UNARY_OP, UNARY[code], f.instruction_output(k)[0], a, 0
         elif code == ca.OP_OUTPUT:
             output, nonzero = f.instruction_output(k)
-            yield WRITE, 0, f.instruction_input(k)[0], output, places[output][nonzero]
+            yield WRITE, None, f.instruction_input(k)[0], output, places[output][nonzero]
         elif code == ca.OP_INPUT:
             source, component = f.instruction_input(k)
-            yield READ, 0, f.instruction_output(k)[0], source, component
+            yield READ, None, f.instruction_output(k)[0], source, component
         else:
             raise NotImplementedError(f"CasADi operation {code} has no numpy counterpart")
-
-
-LARGEST_BUFFER = 2**23  # numbers in the registers and outputs of one block
-
-# Instructions carried out on numpy arrays, one call per instruction and block of rows.
-#
-# A CasADi `SX` function is a list of scalar instructions.  Carrying out each once on an
-# array of all poses costs one numpy call per instruction and block instead of one CasADi call per
-# pose, and the same runs on complex arrays, which complex-step checks use.
-
-
-class NumpyFunction:
-    """Instructions, and `evaluate`, which carries them out on whole blocks of rows.
-
-    Results stand in the `n_registers` registers that CasADi gave the instructions, each as long as
-    a block: few are in use at a time, and these stay in cache.  What is the same in all rows is
-    one number.  Raises NotImplementedError for a CasADi operation that numpy has no counterpart
-    for.
-    """
-
-    def __init__(self, function: ca.Function) -> None:
-        self._table, self._constants, self.n_registers = instructions(function)
-        width = self.n_registers + sum(function.numel_out(k) for k in range(function.n_out()))
-        self.largest_block = max(LARGEST_BUFFER // max(width, 1), 1)
-        self._steps: dict[tuple[bool, ...], Steps] = {}
-
-    def evaluate(
-        self, inputs: Sequence[NDArray], results: Sequence[NDArray], blocks: Sequence[slice]
-    ) -> None:
-        """Rows of `blocks` of `results` (n, rows, columns), all of one type."""
-        if not results:
-            return
-        by_row = tuple(a.ndim == 2 for a in inputs)
-        if by_row not in self._steps:
-            self._steps[by_row] = _steps_where(self._table, by_row)
-        size = max((block.stop - block.start for block in blocks), default=0)
-        registers = np.empty((self.n_registers, size), dtype=results[0].dtype)
-        flat = [r.reshape(len(r), r.shape[1] * r.shape[2]) for r in results]
-        stage = [np.zeros((f.shape[1], size), dtype=f.dtype) for f in flat]
-        for block in blocks:
-            m = block.stop - block.start
-            given = [a[block].T.copy() if a.ndim == 2 else a.tolist() for a in inputs]
-            given.append(self._constants.tolist())
-            outputs, rows = [s[:, :m] for s in stage], list(registers[:, :m])
-            held: list[Any] = [None] * self.n_registers
-            for kind, operation, out, a, b in zip(*self._steps[by_row], strict=True):
-                if kind == BY_ROW:
-                    if b >= 0:
-                        held[out] = operation(held[a], held[b], rows[out])
-                    else:
-                        held[out] = operation(held[a], rows[out])
-                elif kind == IN_COMMON:
-                    held[out] = operation(held[a], held[b]) if b >= 0 else operation(held[a])
-                elif kind == READ:
-                    held[out] = given[a][b]
-                else:
-                    outputs[a][b] = held[out]
-            for f, output in zip(flat, outputs, strict=True):
-                f[block] = output.T
-
-
-# Kind, function, register, first and second operand of every step (−1: no second).  Five lists and
-# not a tuple for every step: thousands of these would have Python look for garbage in all that is
-# loaded, 0.07 s each time.
-Steps = tuple[list[int], list[Any], list[int], list[int], list[int]]
-BY_ROW, IN_COMMON = UNARY_OP, BINARY_OP
-
-
-def _steps_where(table: NDArray[np.int32], by_row: Sequence[bool]) -> Steps:
-    """The instructions where the inputs `by_row` vary by row and the others do not."""
-    kinds, codes, outs, first, second = (column.tolist() for column in table.T)
-    operations: list[Any] = [None] * len(kinds)
-    varies = [False] * (1 + max(outs, default=0))  # what a register holds now
-    for k, (kind, code, out) in enumerate(zip(kinds, codes, outs, strict=True)):
-        if kind == CONSTANT:  # as if they were one more input
-            kinds[k], first[k], second[k] = READ, len(by_row), code
-            varies[out] = False
-        elif kind == READ:
-            varies[out] = by_row[first[k]]
-        elif kind != WRITE:
-            varies[out] = varies[first[k]] or (kind == BINARY_OP and varies[second[k]])
-            operations[k] = BINARY[code] if kind == BINARY_OP else UNARY[code]
-            second[k] = second[k] if kind == BINARY_OP else -1
-            kinds[k] = BY_ROW if varies[out] else IN_COMMON
-    return kinds, operations, outs, first, second
 
 
 # Rows and threads, and the choice between CasADi and numpy.
