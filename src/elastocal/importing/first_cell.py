@@ -19,14 +19,15 @@ from elastocal.cell.arm_description import SOURCES, Convention, Robot
 from elastocal.cell.work_cell import Cell, read_cell
 from elastocal.errors import InputError, option, require
 from elastocal.files import atomic_writer
-from elastocal.model.chain import Chain, Joint, clashing, finite_ranges, jaw_told, names_told
+from elastocal.model.chain import Chain, Joint, clashing, jaw_told, names_told
 from elastocal.model.dh import UR_ENDINGS
 from elastocal.model.effects.compliances import JointCompliance
 from elastocal.model.effects.gears import JointOffset
+from elastocal.model.effects.loads import feels_weight
 from elastocal.model.effects.placements import BaseFrame, LinkGeometry, MarkerPosition
 from elastocal.model.manipulator import load_chain
 from elastocal.model.mjcf import MjcfArm
-from elastocal.model.rigid import nominal_flanges, reach_of, suitable_load
+from elastocal.model.rigid import reach_of, suitable_load
 from elastocal.model.urdf import check_urdf, xacro_left
 from elastocal.text import listed, printable
 from elastocal.units import Array, rpy_from_rotation
@@ -186,26 +187,6 @@ def _mount(robot: Robot, arm: MjcfArm | None) -> tuple[Array, str]:
     return tree.placed(base)[:3, :3], f"of '{base}' in the file's '{tree.root}', z up"
 
 
-def loaded_joints(chain: Chain, turned: Array) -> list[int]:
-    """Numbers of the joints that a weight strains: those that turn about no axis that is upright
-    in all poses, as the first of most arms and those of a SCARA do, and slides that are not level.
-
-    `turned` (3, 3): the base in a frame whose z is up.
-    """
-    limits = [np.array([getattr(j, end) for j in chain.joints]) for end in ("lower", "upper")]
-    low, high = finite_ranges(chain, *limits)
-    q = np.random.default_rng(0).uniform(low, high, (50, chain.n_joints))
-    found = []
-    for i, joint in enumerate(chain.joints):
-        before = replace(chain, joints=chain.joints[:i], flange_placement=joint.placement)
-        frames = nominal_flanges(before, q[:, :i]) if i else joint.placement[None]
-        upright = np.abs((turned @ frames[:, :3, :3] @ joint.axis)[:, 2])
-        strained = 1 - upright if joint.kind == "revolute" else upright
-        if strained.max() > 1e-6:
-            found.append(i + 1)
-    return found
-
-
 def _text(value: str) -> str:
     import tomli_w
 
@@ -282,7 +263,8 @@ def _rest(chain: Chain, mount: tuple[Array, str], sites: dict[str, Array]) -> st
         " ".join(f'"{effect.name}",' for effect in pair)
         for pair in ((BaseFrame, MarkerPosition), (JointOffset, LinkGeometry))
     )
-    sprung = [f'"{JointCompliance.name}:joint{i}",' for i in loaded_joints(chain, turned)]
+    loaded = [j + 1 for j in range(n) if feels_weight(chain, j, turned[2])]
+    sprung = [f'"{JointCompliance.name}:joint{i}",' for i in loaded]
     springs = "\n    ".join(" ".join(sprung[k : k + 2]) for k in range(0, len(sprung), 2))
     weighed = bool(chain.masses)
     told = "masses of the robot's file bend the joints" if weighed else "the file has no masses"

@@ -250,8 +250,10 @@ def join(where: str, points: Records, log: Records, settings: JoinTable | None) 
     """The joint values of every point."""
     settings = settings or JoinTable()
     how = settings.by or _obvious(points, log)
-    ways = {"order": _by_order, "name": _by_name, "time": _by_time, "standstill": _by_standstill}
-    found = ways[how](where, points, log, settings)
+    if how in ("time", "standstill"):
+        found = _by_clock(points, log, settings, how)
+    else:
+        found = (_by_name if how == "name" else _by_order)(points, log, settings)
     if found.left_out and settings.unmatched != "leave_out":
         raise InputError(
             f"{points.files[0]}: {len(found.left_out)} of {len(points)} points have no joint "
@@ -283,16 +285,11 @@ def _likely_offset(points: Records, log: Records, settings: JoinTable, how: str)
     first, last, _ = dwells(clock, log.q[order], still, settings.still_s)
     if not len(first) or len(at) * len(first) > MOST_PAIRS:
         return ""
-    ends = np.column_stack([clock[first], clock[last]])
-    middle = ends.mean(axis=1)
-    tried = np.unique(np.round(at[:, None] - middle, 1))
-    joined = np.zeros(len(tried), dtype=int)
-    for k, offset in enumerate(tried):
-        t = at - offset
-        nearest = np.abs(t[:, None] - middle).argmin(axis=1)
-        joined[k] = ((t >= ends[nearest, 0]) & (t <= ends[nearest, 1])).sum()
+    ends = np.array([clock[first], clock[last]])
+    tried = np.unique(np.round(at[:, None] - ends.mean(axis=0), 1))
+    joined = np.array([(_nearest(at - offset, *ends)[1] == 0).sum() for offset in tried])
     best = tried[joined == joined.max()]
-    if joined.max() < MOST_POINTS_JOINED * len(at) or np.ptp(best) > np.ptp(ends, axis=1).max():
+    if joined.max() < MOST_POINTS_JOINED * len(at) or np.ptp(best) > np.ptp(ends, axis=0).max():
         return ""
     offset = float(np.median(best)) + settings.offset_s
     return (
@@ -376,7 +373,7 @@ def _visits(points: Records, chosen: IntArray, per_pose: int | None) -> IntArray
     return np.array(codes)
 
 
-def _by_order(where: str, points: Records, log: Records, settings: JoinTable) -> Joined:
+def _by_order(points: Records, log: Records, settings: JoinTable) -> Joined:
     row = np.full(len(points), -1)
     for load, chosen, rows in _loads_apart(points, log):
         visits = _visits(points, chosen, settings.points_per_pose)
@@ -403,7 +400,7 @@ def _by_order(where: str, points: Records, log: Records, settings: JoinTable) ->
     return Joined("order", row, log.q[row], pose, (), (), ())
 
 
-def _by_name(where: str, points: Records, log: Records, settings: JoinTable) -> Joined:
+def _by_name(points: Records, log: Records, settings: JoinTable) -> Joined:
     names = _names_of(log)
     for pool, has in ((log, bool(names)), (points, "configuration" in points.labels)):
         if not has:
@@ -450,61 +447,65 @@ def _clocks(
     return points.time, log.time[order] + settings.offset_s, order
 
 
-def _by_time(where: str, points: Records, log: Records, settings: JoinTable) -> Joined:
-    at, clock, order = _clocks(points, log, settings, "time")
-    after = np.clip(np.searchsorted(clock, at), 1, max(len(clock) - 1, 1))
-    after = np.minimum(after, len(clock) - 1)
+def _nearest(at: Array, first: Array, last: Array) -> tuple[IntArray, Array]:
+    """Number of the stop, from `first` to `last` (k,) s, one after the other, that is nearest to
+    each time `at` (n,), and the time to its nearer end, 0 within it."""
+
+    def apart(stop: IntArray) -> Array:
+        return np.maximum(np.maximum(first[stop] - at, at - last[stop]), 0.0)
+
+    after = np.clip(np.searchsorted(first, at), 0, len(first) - 1)
     before = np.maximum(after - 1, 0)
-    nearest = np.where(np.abs(at - clock[before]) <= np.abs(clock[after] - at), before, after)
-    apart = np.abs(clock[nearest] - at)
-    row = np.where(apart <= settings.tolerance_s, order[nearest], -1)
-    good = row >= 0
-    remarks = []
-    if good.any():
-        remarks.append(
+    nearest = np.where(apart(before) <= apart(after), before, after)
+    return nearest, apart(nearest)
+
+
+def _by_clock(points: Records, log: Records, settings: JoinTable, how: str) -> Joined:
+    """Each point with the stop nearest to it: a row of the log, or where the arm stood still."""
+    at, clock, order = _clocks(points, log, settings, how)
+    still, shortest = log.spread(settings.still_deg, settings.still_mm), settings.still_s
+    q = log.q[order]
+    first, last, standing = np.arange(len(q)), np.arange(len(q)), q
+    if how == "standstill":
+        first, last, standing = dwells(clock, q, still, shortest)
+        require(
+            len(first) > 0,
+            f"{log.files[0]}: the arm never stood still for {shortest:g} s; correct still_s and "
+            "still_deg in [join], or join by time",
+        )
+    stop, apart = _nearest(at, clock[first], clock[last])
+    good = apart <= settings.tolerance_s
+    unused: tuple[str, ...] = ()
+    if how == "standstill":
+        remarks = [f"{len(first)} standstills of {shortest:g} s or more in {len(log)} rows"]
+        empty = np.setdiff1d(np.arange(len(first)), stop[good])
+        unused = tuple(f"standstill {k + 1} (from line {log.line[order[first[k]]]})" for k in empty)
+    else:
+        moving = np.flatnonzero(good & _moved(at, stop, clock, q, still, 2 * settings.tolerance_s))
+        remarks = [
             f"clocks differ by {apart[good].max():.3g} s at most, {np.median(apart[good]):.3g} s "
             "in the median"
-        )
-        still = log.spread(settings.still_deg, settings.still_mm)
-        q = log.q[order]
-        # Rows of other stops say nothing of this one.
-        ends = [np.clip(nearest + step, 0, len(q) - 1) for step in (-1, 1)]
-        soon = [np.where(np.abs(clock[k] - at) <= 2 * settings.tolerance_s, k, nearest)
-                for k in ends]  # fmt: skip
-        moving = np.flatnonzero(good & (np.abs(q[soon[1]] - q[soon[0]]) > still).any(axis=1))
+        ] if good.any() else []  # fmt: skip
         if len(moving):
             remarks.append(
                 f"WARNING: the arm moved while {len(moving)} points were measured: "
                 f"{listed((points.shown(int(i)) for i in moving), SHOWN)}; set offset_s, or join "
                 "by standstill"
             )
+    what = " standstill" * (how == "standstill")
     left_out = tuple(
-        f"{points.shown(int(i))}, {apart[i]:.3g} s from the nearest"
+        f"{points.shown(int(i))}, {apart[i]:.3g} s from the nearest{what}"
         for i in np.flatnonzero(~good)
-    )  # fmt: skip
-    return Joined("time", row, log.q[row], None, left_out, (), tuple(remarks))
+    )
+    row = np.where(good, order[first[stop]], -1)
+    return Joined(how, row, standing[stop], None, left_out, unused, tuple(remarks))
 
 
-def _by_standstill(where: str, points: Records, log: Records, settings: JoinTable) -> Joined:
-    at, clock, order = _clocks(points, log, settings, "standstill")
-    still, shortest = log.spread(settings.still_deg, settings.still_mm), settings.still_s
-    starts, ends, standing = dwells(clock, log.q[order], still, shortest)
-    if not len(starts):
-        raise InputError(
-            f"{log.files[0]}: the arm never stood still for {shortest:g} s; correct still_s and "
-            "still_deg in [join], or join by time"
-        )
-    first, last = clock[starts], clock[ends]
-    # 0 within a dwell, else the time to its nearer end.
-    best = np.array([np.argmin(np.maximum(np.maximum(first - t, t - last), 0.0)) for t in at])
-    apart = np.maximum(np.maximum(first[best] - at, at - last[best]), 0.0)
-    good = apart <= settings.tolerance_s
-    row = np.where(good, order[starts[best]], -1)
-    left_out = tuple(
-        f"{points.shown(int(i))}, {apart[i]:.3g} s from the nearest standstill"
-        for i in np.flatnonzero(~good)
-    )  # fmt: skip
-    empty = np.setdiff1d(np.arange(len(starts)), best[good])
-    unused = tuple(f"standstill {k + 1} (from line {log.line[order[starts[k]]]})" for k in empty)
-    remarks = (f"{len(starts)} standstills of {shortest:g} s or more in {len(log)} rows",)
-    return Joined("standstill", row, standing[best], None, left_out, unused, remarks)
+def _moved(
+    at: Array, row: IntArray, clock: Array, q: Array, still: Array, soon: float
+) -> NDArray[np.bool_]:
+    """(n,) whether the arm moved from the row before to the one after each point, of those that are
+    `soon` enough: rows of other stops say nothing of this one."""
+    ends = [np.clip(row + step, 0, len(q) - 1) for step in (-1, 1)]
+    before, after = (np.where(np.abs(clock[k] - at) <= soon, k, row) for k in ends)
+    return np.asarray((np.abs(q[after] - q[before]) > still).any(axis=1))

@@ -496,25 +496,28 @@ def _arrived(_: None, chain: Chain, cell: Cell, *more: Any) -> Model:
 def load_chain(cell: Cell) -> Chain:
     """The nominal chain of the cell's robot, from its URDF, MuJoCo model, DH table or factory
     calibration."""
-    from elastocal.model.dh import UR_ENDINGS, read_dh, read_ur_table
-    from elastocal.model.mjcf import read_mjcf
-    from elastocal.model.urdf import read_urdf
-
     robot = cell.robot
     path = robot.mjcf or robot.urdf or robot.dh
     if path is None:
         raise InputError(f"{cell.path}: [robot] needs urdf, mjcf or dh")
+    # Each reader loads what its kind of file needs.
     if robot.mjcf is not None:
+        from elastocal.model.mjcf import read_mjcf
+
         chain = read_mjcf(path, robot.base, robot.flange)
     elif robot.urdf is not None:
+        from elastocal.model.urdf import read_urdf
+
         chain = read_urdf(path, robot.base, robot.flange)
-    elif path.suffix.lower() in UR_ENDINGS:
-        require(
-            robot.masses is None, f"{path}: takes no [robot] masses; state the arm as a DH table"
-        )
-        chain = read_ur_table(path, robot.ur_model)
     else:
-        chain = read_dh(path, robot.dh_convention, robot.masses)
+        from elastocal.model.dh import UR_ENDINGS, read_dh, read_ur_table
+
+        if path.suffix.lower() in UR_ENDINGS:
+            told = f"{path}: takes no [robot] masses; state the arm as a DH table"
+            require(robot.masses is None, told)
+            chain = read_ur_table(path, robot.ur_model)
+        else:
+            chain = read_dh(path, robot.dh_convention, robot.masses)
     return plausible(chain, robot.masses or path)
 
 

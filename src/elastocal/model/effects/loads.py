@@ -8,7 +8,6 @@ from typing import Any
 
 import casadi as ca
 import numpy as np
-from scipy.linalg import qr
 
 from elastocal.cell.work_cell import Cell
 from elastocal.errors import require
@@ -282,87 +281,68 @@ class GravityCompensator(Effect):
 
 # Joints that yield under the links' own weights, where nobody knows the weights.
 #
-# Joint j's torque from weights is linear in the bodies' masses m_k and first moments s_k,
+# A mass at the origin of link k's frame stands on link k − 1, and of a first moment the part along
+# a joint's axis does not turn with it.  So the potential of any masses is
 #
-#     τ_j = −g Σ_{k ≥ j} [m_k ∂(u·o_k)/∂q_j + Σ_c s_kc ∂(u·R_k e_c)/∂q_j],
+#     V = g u · Σ_k w_k,   w_k = R_k (x_k S_kx + y_k S_ky) of a joint that turns,
+#                          w_k = R_k a_k M_k q_k           of one that slides,
 #
-# with o_k and R_k the origin and axes of link k's frame and u the vertical, and with a compliance
-# it is a deflection of the same form in the unknown products of compliance, mass and g.  Most of
-# these functions depend on each other: what two joints about parallel axes carry, masses on an
-# axis.  A largest independent set of them is chosen once for a chain (QR with column pivoting;
-# Golub and Van Loan, Matrix Computations, section 5.4), numerically, as base inertial parameters
-# are (Gautier 1991, J. Robotic Systems 8, 485).
-#
-# Where the model has the joints' compliances the same weights make all joints yield, and what is
-# unknown are the arm's moments alone.  For all joints together the independent ones have a closed
-# form: a mass at the origin of link k's frame stands on link k − 1, and of a first moment the part
-# along a joint's axis does not turn with it, so that
-#
-#     V = g u · [Σ_turning R_k (x_k S_kx + y_k S_ky) + Σ_sliding R_k a_k M_k q_k],
-#
-# x_k, y_k across the axis a_k of joint k, with all that stands further out counted in: M_k is the
-# mass that joint k carries, and S_k the first moment of link k with it at the link's end.
+# u the vertical and x_k, y_k across the axis a_k of joint k, with all that stands further out
+# counted in: M_k is the mass that joint k carries, and S_k the first moment of link k with it at
+# the link's end (base inertial parameters; Gautier 1991, J. Robotic Systems 8, 485).  Joint j's
+# torque −∂V/∂q_j has the terms k ≥ j alone.  With a compliance it is a deflection of the same form
+# in the unknown products of compliance, mass and g; where the model has the joints' compliances
+# the same weights make all joints yield, and what is unknown are the arm's moments alone.
 
-POSES = 400  # random ones, in which the functions are compared
+POSES = 400  # random ones, over which sizes are taken
+DEPENDENT = 1e-8  # of the largest; what is less is rounding
 LEVELLED = 0.1  # share of a weight's torque that an axis feels which stands 6° off the vertical
-DEPENDENT = 1e-8  # of the largest; what is left of a function that others make up
 
 
-def weight_torques(chain: Chain, q: ca.SX, up: ca.SX, j: int) -> ca.SX:
-    """−∂(height)/∂q_j of joint j (0-based) for each function that its links' weights bring.
-
-    For each link k ≥ j four: the height of its frame's origin in m, and those of the ends of its
-    three unit axes.  `q` (joints,) are symbols, `up` (3,) is the vertical in the base frame.
-    """
-    T, heights = ca.SX.eye(4), []
+def levers(chain: Chain, q: ca.SX, j: int) -> ca.SX:
+    """−∂w_k/∂q_j of joint j (0-based), k ≥ j, for unit moments in turn (functions, 3); with u it is
+    the torque.  `q` (joints,) are symbols."""
+    T, arms = ca.SX.eye(4), []
     for k, joint in enumerate(chain.joints):
         motion = rigid.joint_motion(joint.kind, joint.axis, q[k])
         T = T @ rigid.constant(joint.placement) @ motion
+        turns = joint.kind == REVOLUTE
+        own = transverse_axes(joint.axis) if turns else (joint.axis,)
         if k >= j:
-            heights += [ca.dot(up, T[:3, 3]), *ca.vertsplit(T[:3, :3].T @ up)]
-    return -ca.jacobian(ca.vertcat(*heights), q)[:, j]
+            arms += [T[:3, :3] @ rigid.constant(way) * (1 if turns else q[k]) for way in own]
+    return -ca.vertcat(*[ca.jacobian(arm, q)[:, j].T for arm in arms])
 
 
 @lru_cache(maxsize=256)
-def independent(chain: Chain, j: int) -> tuple[tuple[int, ...], tuple[float, ...]]:
-    """Which of `weight_torques` of joint j (0-based) make up all of them, and their rms over the
-    joints' ranges and all directions of the vertical."""
-    values = _torques(chain, j, None)
-    R, pivot = qr(values, mode="r", pivoting=True)
-    diagonal = np.abs(np.diag(R))
-    chosen = np.sort(pivot[: int((diagonal > DEPENDENT * diagonal[0]).sum())])
-    rms = np.sqrt((values[:, chosen] ** 2).mean(axis=0))
-    return tuple(map(int, chosen)), tuple(map(float, rms))
-
-
-@lru_cache(maxsize=256)
-def carried(chain: Chain, j: int, up: tuple[float, ...]) -> float:
-    """Rms torque of weights on joint j with the vertical `up` in the base frame, over that of all
-    directions of the vertical."""
-    upright, anyhow = (float((_torques(chain, j, of) ** 2).mean()) for of in (up, None))
-    return float(np.sqrt(upright / anyhow)) if anyhow else 0.0
-
-
-def _torques(chain: Chain, j: int, up: tuple[float, ...] | None) -> Array:
-    """`weight_torques` of joint j (POSES, functions) in random poses under one vertical, or under
-    as many random ones."""
-    q, height = ca.SX.sym("q", chain.n_joints), ca.SX.sym("height", 3)
-    torques = ca.Function("torques", [q, height], [weight_torques(chain, q, height, j)])
-    rng = np.random.default_rng(0)
+def _levers_at(chain: Chain, j: int) -> Array:
+    """`levers` of joint j in random poses (POSES, functions, 3)."""
+    q = ca.SX.sym("q", chain.n_joints)
     limits = np.array([[joint.lower, joint.upper] for joint in chain.joints]).T
-    at = rng.uniform(*finite_ranges(chain, *limits), (POSES, chain.n_joints))
-    upward = rng.normal(size=(POSES, 3)) if up is None else np.tile(up, (POSES, 1))
-    upward /= np.linalg.norm(upward, axis=1, keepdims=True)
-    values: Array = torques.map(POSES)(at.T, upward.T).full().T
-    return values
+    low, high = finite_ranges(chain, *limits)
+    at = np.random.default_rng(0).uniform(low, high, (POSES, chain.n_joints))
+    return np.asarray(BatchFunction([q], [levers(chain, q, j)])(at)[0])
+
+
+def _sizes(chain: Chain, j: int) -> dict[int, float]:
+    """Number of each function that joint j moves → rms of its torque over the poses and all
+    directions of the vertical.  A slide along the joint's axis is none."""
+    sizes = np.sqrt((_levers_at(chain, j) ** 2).sum(axis=2).mean(axis=0) / 3)
+    return {k: size for k, size in enumerate(sizes.tolist()) if size > DEPENDENT * max(sizes)}
+
+
+def feels_weight(chain: Chain, j: int, up: Array) -> bool:
+    """Whether weights load joint j (0-based) with the vertical `up` (3,) in the base frame: not
+    where it turns about an upright axis in all poses or slides level."""
+    arms = _levers_at(chain, j)
+    return bool(((arms @ up) ** 2).sum() > LEVELLED**2 * (arms**2).sum() / 3)
 
 
 class GravitySag(DrivenEffect):
     """δq_j = Σ_i a_i φ_i(q), φ_i the torques of unknown weights about joint j; a_i in rad.
 
-    φ_i are −∂(height)/∂q_j of points on the links that the joint carries, as many as are
-    independent of each other, at the commanded joints, each divided by its rms over the joints'
-    ranges: so a_i is how far the joint gives way on average.  The vertical is z of the tracker
+    φ_i are −∂(u·w)/∂q_j of unit moments of the links that the joint carries, at the commanded
+    joints, each divided by its rms over the joints' ranges: so a_i is how far the joint gives way
+    on average.  The vertical u is z of the tracker
     frame, seen from the base wherever that stands.  It needs no masses: a_i is compliance times
     g times a sum of masses and first moments.  Setting: the prior size `sag_size_rad` of each a_i.
     Where compliances are known, `link_weights` says more with less, and so does `link_gravity`
@@ -382,23 +362,20 @@ class GravitySag(DrivenEffect):
         size = self.stated(place, chain, cell)[self.sized_by]
         return tuple(
             ParameterSpec(f"sag_{k + 1}", "rad", 0.0, size, shrunk=True)
-            for k in range(len(independent(chain, index(place))[0]))
+            for k in range(len(_sizes(chain, index(place))))
         )
 
     def acts(self, place: str, chain: Chain, cell: Cell) -> bool:
         turned = cell.model.nominal.base_rotation
-        up = (0.0, 0.0, 1.0) if turned is None else tuple(np.asarray(turned)[2].tolist())
-        return carried(chain, index(place), up) > LEVELLED
+        return feels_weight(chain, index(place), (np.eye(3) if turned is None else turned)[2])
 
     def drive(self, arm: Arm, place: str, p: Symbols) -> ca.SX:
-        chosen, rms = independent(arm.chain, index(place))
-        up = arm.T_tracker_base[2, :3].T
-        torques = weight_torques(arm.chain, arm.q_commanded, up, index(place))
-        terms = (
-            p[f"sag_{k + 1}"] * torques[i] / r
-            for k, (i, r) in enumerate(zip(chosen, rms, strict=True))
+        up, j = arm.T_tracker_base[2, :3].T, index(place)
+        torques = levers(arm.chain, arm.q_commanded, j) @ up
+        terms = _sizes(arm.chain, j).items()
+        return sum(
+            (p[f"sag_{n}"] * torques[k] / size for n, (k, size) in enumerate(terms, 1)), ca.SX(0)
         )
-        return sum(terms, ca.SX(0))
 
 
 # Kilograms of an arm of one metre: arms of 0.6 to 1.4 m weigh 15 to 40 kg per square metre of their
