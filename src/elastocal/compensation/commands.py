@@ -203,7 +203,6 @@ class _Walk:
         self._keep(i, q[:1], good[:1])
 
     def _many(self, i: int, near: Array | None) -> Postures:
-        """Postures of place i and of some that follow: who leaps once will leap again."""
         if self._ahead is None or not 0 <= i - self._ahead_from < len(self._ahead.q):
             self._leaps = min(2 * self._leaps, LONGEST_PIECE) if self._ahead is not None else 1
             rows = slice(i, i + self._leaps)

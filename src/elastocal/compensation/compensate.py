@@ -229,7 +229,6 @@ def _other_postures(
 
 
 def _status(search: Commanding, found: Solved, nominal: Array) -> tuple[str, ...]:
-    """What became of every row; LIMIT where joints without limits would reach the target."""
     reached, lost = found.reached, ~np.isfinite(found.miss)
     status = np.where(reached, REACHED, np.where(lost, NO_EQUILIBRIUM, NOT_REACHED)).astype(object)
     left = np.flatnonzero(~reached & ~lost)
@@ -304,7 +303,6 @@ def _of_joints(c: Compensation, limits: tuple[Array, Array], jumps: IntArray) ->
 
 
 def _of_loads(arm: CalibratedArm, c: Compensation) -> Iterator[str]:
-    """A load that was forgotten, joints beyond the levels of their compliance."""
     spec, targets = arm.model.cell.model, c.targets
     elastic = any(effect_of(choice.name).elastic for choice in spec.effects)
     acts = targets.table.force.any() or spec.link_gravity or spec.torque != "computed"

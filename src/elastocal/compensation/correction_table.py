@@ -221,7 +221,6 @@ def _targets(grid: CorrectionGrid, points: Array, force: Array | None) -> Target
 
 
 def _corrections(tool: CalibratedTool, result: Compensation) -> tuple[Array, tuple[str, ...]]:
-    """(N, 6) along the axes of the base frame, and how each was found."""
     aimed = result.goals.in_base(result.T_data_base)
     position, rotation = aimed.position, aimed.rotation
     flange = nominal_flanges(tool.chain, result.q)
@@ -243,7 +242,6 @@ def _corrections(tool: CalibratedTool, result: Compensation) -> tuple[Array, tup
 
 
 def _achieved(tool: CalibratedTool, result: Compensation, q: Array) -> tuple[Array, Any]:
-    """Position (n, 3) and rotation (n, 3, 3) of the calibrated tool in the base frame at q."""
     rows = tool.rows(replace(result.targets.table, force=result.force))
     there = Goals(*tool.poses(rows, q)).in_base(result.T_data_base)
     return there.position, there.rotation

@@ -78,7 +78,6 @@ def _placed(T: Array) -> dict[str, list[float]]:
 
 
 def _yaml(data: Any) -> str:
-    """`data` as YAML; lists of plain values stand on one line."""
     import yaml
 
     text: str = yaml.safe_dump(data, sort_keys=False, default_flow_style=None, width=np.inf)
@@ -404,7 +403,6 @@ def _check_rest(
 
 
 def _note(calibrated: CalibratedArm, kept: Kept) -> str:
-    """One line for a comment in the file: where its numbers come from, what they hold for."""
     conditions = kept.conditions
     cell = calibrated.model.cell
     source = Path(calibrated.source).name
@@ -494,7 +492,6 @@ def _mjcf(calibrated: CalibratedArm, wish: Wish, kept: Kept, pieces: ExportNumbe
 
 
 def _corrected(calibrated: CalibratedArm, wish: Wish, kept: Kept, pieces: ExportNumbers) -> Written:
-    """The user's own MJCF; raises NotInPlace where it cannot take the corrections."""
     cell = calibrated.model.cell
     if wish.base_frame:
         raise NotInPlace(f"{option('base_frame')} makes the tracker's frame the world")

@@ -213,7 +213,7 @@ class ExportNumbers:
     def offset_motion(self, i: int) -> Array:
         """Motion (4, 4) of joint i (0-based) by its offset: what stands at encoder zero."""
         joint = self.chain.joints[i]
-        return ca.DM(rigid.joint_motion(joint.kind, joint.axis, float(self.offsets[i]))).full()
+        return rigid.moved(joint.kind, joint.axis, float(self.offsets[i]))
 
     @property
     def nominal_masses(self) -> tuple[LinkMass, ...]:

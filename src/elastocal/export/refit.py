@@ -216,7 +216,6 @@ def refitted(
 
 
 def _with(part: Valued, effects: Iterable[EffectChoice], tool: Tool | None = None) -> Valued:
-    """The arm with other effects, at its own values or the nominal ones."""
     cell, values, chosen = part.model.cell, part.values, tuple(effects)
     spec = replace(cell.model, effects=chosen)
     if not any(effect_of(choice.name).elastic for choice in chosen):

@@ -314,12 +314,11 @@ class DhRow:
 
     def leading(self) -> Array:
         """Rz(θ) Tz(d) (4, 4): what belongs to the joint's own axis."""
-        return dh.product(dh.rotation(dh.Z, self.theta), dh.translation(dh.Z, self.d))
+        return dh.turn(dh.Z, self.theta) @ dh.shift(dh.Z, self.d)
 
     def trailing(self) -> Array:
         """Tx(a) Rx(α) Ry(β) (4, 4)."""
-        shift, turn = dh.translation(dh.X, self.a), dh.rotation(dh.X, self.alpha)
-        return dh.product(shift, turn, dh.rotation(dh.Y, self.beta))
+        return dh.shift(dh.X, self.a) @ dh.turn(dh.X, self.alpha) @ dh.turn(dh.Y, self.beta)
 
     def transform(self) -> Array:
         return self.leading() @ self.trailing()

@@ -298,7 +298,6 @@ def _repeats(points: Records, rows: IntArray, keys: list[tuple]) -> IntArray:
 def _family(
     where: str, family: Family, numbers: dict[str, Array], units: dict[str, str]
 ) -> dict[str, Array]:
-    """The columns of a family, {} where there is none."""
     columns = {column(s, units[s]): numbers[s] for s in family.units if s in numbers}
     missing = [stem for stem in family.units if stem not in numbers]
     if columns and missing:

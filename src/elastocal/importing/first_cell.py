@@ -222,7 +222,6 @@ def _joints(chain: Chain) -> Iterator[str]:
 
 
 def _range(joint: Joint) -> tuple[float, float, bool]:
-    """Limits in rad or m, and whether they are guessed."""
     half = math.pi if joint.kind == "revolute" else 0.5
     low, high = joint.lower, joint.upper
     guessed = not (math.isfinite(low) and math.isfinite(high))
@@ -231,7 +230,6 @@ def _range(joint: Joint) -> tuple[float, float, bool]:
 
 
 def _markers(side: float, sites: dict[str, Array]) -> str:
-    """The table of markers: the model's sites where they may be, else a guess."""
     stub = {
         "M1": np.array([side, 0.0, side / 3]),
         "M2": np.array([-side / 2, side * 0.9, side / 2]),
@@ -251,7 +249,6 @@ def _key(name: str) -> str:
 
 
 def _rest(chain: Chain, mount: tuple[Array, str], sites: dict[str, Array]) -> str:
-    """Tool, tracker, model, workspace and wishes for a plan."""
     reach = max(reach_of(chain), 0.05)
     side, n = reach / 12, chain.n_joints
     turned, whose = mount

@@ -81,7 +81,6 @@ def read_lines(path: str | Path, encoding: str = "auto") -> ForeignText:
 
 
 def _decode(source: str, data: bytes, encoding: str) -> tuple[str, str]:
-    """The text, and what its encoding is called."""
     if encoding != "auto":
         codec = "utf-8-sig" if encoding == "utf-8" else encoding
         return decoded(source, data, SAVE_AS, codec, encoding), encoding

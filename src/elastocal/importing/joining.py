@@ -80,7 +80,6 @@ def with_joints(
 def _order(
     where: str, records: Records, joints: JointsTable, model_names: Sequence[str], n: int
 ) -> np.ndarray | None:
-    """(rows, joints) which of the file's values is each joint; None for their own order."""
     if joints.order is not None:
         order = joints.order
         if max(order) > n or len(set(order)) < len(order):
@@ -147,7 +146,6 @@ def pooled(records: Sequence[Records]) -> Records:
 
 
 def _loads(records: Records) -> list[str]:
-    """The load of each row: what its name or column says, else what its file is said to be."""
     named = records.labels.get("load")
     require(
         named is not None or records.load is not None,
@@ -341,7 +339,6 @@ def _keys(ours: list[str], theirs: list[str]) -> Callable[[str], str] | None:
 
 
 def _loads_apart(points: Records, log: Records) -> list[tuple[str, IntArray, IntArray]]:
-    """(load, points, rows of the log): a log without loads serves every load state."""
     if "load" not in points.labels:
         return [("", np.arange(len(points)), np.arange(len(log)))]
     loads = np.array(points.labels["load"], dtype=object)
@@ -461,7 +458,6 @@ def _nearest(at: Array, first: Array, last: Array) -> tuple[IntArray, Array]:
 
 
 def _by_clock(points: Records, log: Records, settings: JoinTable, how: str) -> Joined:
-    """Each point with the stop nearest to it: a row of the log, or where the arm stood still."""
     at, clock, order = _clocks(points, log, settings, how)
     still, shortest = log.spread(settings.still_deg, settings.still_mm), settings.still_s
     q = log.q[order]

@@ -253,7 +253,6 @@ _NUMBERED = re.compile(r"(q|torque_|approach_|joint)([1-9]\d?|#)((?:_[A-Za-z]+)?
 
 
 def _quantities() -> dict[str, tuple[str, ...]]:
-    """What each column of the measurement table, and each that becomes some of them, measures."""
     found: dict[str, tuple[str, ...]] = {"range": ("length",)}
     found |= dict.fromkeys(("azimuth", "zenith", "elevation"), ("angle",))
     for kind in ("revolute", "prismatic"):

@@ -231,7 +231,6 @@ def _read(
 def _rows(
     name: str, table: Rows, columns: Sequence[FileColumn], cells: NumberCells
 ) -> tuple[list[tuple[int, list[str]]], list[list[float]], list[tuple[int, str]]]:
-    """The complete rows, their numbers, and the lines of the others with what is missing."""
     numeric = [c for c in columns if not c.target.is_text]
     widest = max(columns, key=lambda c: max(c.index))
     kept, values, ignored = [], [], []
@@ -364,7 +363,6 @@ def with_positions(records: Records, clockwise: bool = False) -> Records:
 
 
 def _height(records: Records) -> str:
-    """Which of zenith and elevation the file has, all else being there too."""
     found = [stem for stem in SPHERICAL if stem in records.numbers]
     both = [stem for stem in "xyz" if stem in records.numbers]
     if both:
@@ -389,7 +387,6 @@ def _height(records: Records) -> str:
 
 
 def _check_spherical(records: Records, d: Array, height: str, angle: Array) -> None:
-    """Refuse distances and angles that no tracker reads; `angle` (n,) in degrees."""
     if not (d > 0).all():
         i = int(np.argmin(d > 0))
         raise InputError(

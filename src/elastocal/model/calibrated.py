@@ -375,7 +375,6 @@ def _check_robot(model: Model, stated: Array | None, cell: str | Path, result: s
 
 
 def _read_result(path: Path) -> tuple[list[dict[str, Any]], _Result]:
-    """The entries of the parameters as they stand in the file, and the file checked."""
     remedy = "give the file that identify wrote"
     result = read_json(path, "result of identify", MOST_BYTES, remedy)
     found = result.get("schema") if isinstance(result, dict) else None

@@ -233,7 +233,6 @@ def _check_masses(chain: Chain, source: object) -> None:
 
 
 def _limited(joint: Joint, where: str) -> Joint:
-    """The joint without limits that stand for none; InputError for those in another unit."""
     turns = joint.kind == "revolute"
     most, none = (MAX_LIMIT, MOST_DEGREES) if turns else (MAX_LENGTH, MAX_LENGTH * 1000)
     ends = [joint.lower, joint.upper]

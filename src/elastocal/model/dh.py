@@ -6,12 +6,10 @@ import configparser
 import math
 from collections.abc import Mapping, Sequence
 from dataclasses import replace
-from functools import partial, reduce
-from operator import matmul
+from functools import partial
 from pathlib import Path
 from typing import Any, Literal
 
-import casadi as ca
 import numpy as np
 
 from elastocal.errors import InputError, option, require
@@ -155,23 +153,14 @@ def link(
     theta0: float, d: float, a: float, alpha: float, beta: float = 0.0, convention: str = "standard"
 ) -> tuple[Array, Array]:
     """T_{i-1,i}(q_i) = before · motion(q_i) · after: the two constant factors (4, 4)."""
-    Rz_theta, Tz_d = rotation(Z, theta0), translation(Z, d)
-    Tx_a, Rx_alpha, Ry_beta = translation(X, a), rotation(X, alpha), rotation(Y, beta)
+    Rz_theta, Tz_d = turn(Z, theta0), shift(Z, d)
+    Tx_a, Rx_alpha, Ry_beta = shift(X, a), turn(X, alpha), turn(Y, beta)
     if convention == "standard":
-        return product(Rz_theta), product(Tz_d, Tx_a, Rx_alpha, Ry_beta)
-    return product(Rx_alpha, Tx_a, Ry_beta, Rz_theta, Tz_d), np.eye(4)
+        return Rz_theta, Tz_d @ Tx_a @ Rx_alpha @ Ry_beta
+    return Rx_alpha @ Tx_a @ Ry_beta @ Rz_theta @ Tz_d, np.eye(4)
 
 
-def rotation(axis: tuple[float, float, float], angle: float) -> ca.SX:
-    return rigid.joint_motion("revolute", axis, angle)
-
-
-def translation(axis: tuple[float, float, float], length: float) -> ca.SX:
-    return rigid.joint_motion("prismatic", axis, length)
-
-
-def product(*factors: ca.SX) -> Array:
-    return np.array(ca.DM(reduce(matmul, factors)).full())
+turn, shift = partial(rigid.moved, "revolute"), partial(rigid.moved, "prismatic")
 
 
 def _plausible(table: RawTable, i: int, family: str, stem: str) -> float:
@@ -195,7 +184,6 @@ def _too_much(table: RawTable, i: int, column: Column, value: float, wrong: str)
 
 
 def _closer(table: RawTable, chain: Chain) -> Chain:
-    """The chain with its frames near the arm; InputError where it is as long all the same."""
     closer = near_the_arm(chain)
     d = np.array([dh_number(table, i, "length", "d") for i in range(len(table.row))])
     i, column = int(np.argmax(np.abs(d))), table.column("length", "d")
@@ -417,7 +405,6 @@ def _of_deviations(path: Path, text: str, ur_model: str | None) -> Chain:
 
 
 def _apart(path: Path, delta: Array, nominal: Array) -> tuple[Chain, float]:
-    """The calibrated chain, and its largest distance in m from the nominal one over some poses."""
     chains = []
     for deviation in (np.zeros_like(delta), delta):
         T, joints = np.eye(4), []
@@ -433,14 +420,12 @@ def _apart(path: Path, delta: Array, nominal: Array) -> tuple[Chain, float]:
 
 
 def _fitting(path: Path, delta: Array) -> str:
-    """The robots whose nominal table a calibration counts from, by how near it is."""
     near = {name: _apart(path, delta, _published(name))[1] for name in NOMINAL}
     fits = sorted((name for name in near if near[name] <= FARTHEST), key=near.__getitem__)
     return listed(f"{name} ({near[name] * 1e3:.0f} mm)" for name in fits)
 
 
 def _published(name: str) -> Array:
-    """a₀, d₀ and α₀ (3, 6) of a robot."""
     d1, a2, a3, d4, d5, d6 = NOMINAL[name]
     return np.array([(0, a2, a3, 0, 0, 0), (d1, 0, 0, d4, d5, d6), ALPHA])
 
@@ -448,7 +433,6 @@ def _published(name: str) -> Array:
 def _nominal(
     path: Path, sections: Mapping[str, Mapping[str, str]], model: str | None, delta: Array
 ) -> Array:
-    """a₀, d₀ and α₀ (3, 6)."""
     if model is not None:
         by_name = {name.lower(): name for name in NOMINAL}
         known = by_name.get(model.lower().replace(" ", ""))

@@ -307,7 +307,6 @@ class BatchFunction:
                 result[:] = value.full().reshape(rows, -1, columns).transpose(1, 0, 2)
 
     def _rows(self, inputs: Sequence[NDArray]) -> tuple[list[NDArray], int]:
-        """The inputs as arrays of the right shapes, and the number of rows."""
         arrays = [np.asarray(a) for a in inputs]
         arrays = [a if a.dtype.kind == "c" else a.astype(np.float64, copy=False) for a in arrays]
         n = max((len(a) for a in arrays if a.ndim == 2), default=1)

@@ -243,7 +243,6 @@ def inverse_kinematics(
 def _postures(
     chain: Chain, task: Reaching, targets: IntArray, starts: list[Array], near: Array
 ) -> Array:
-    """The best postures (targets, K, n) of some targets, from the `starts` in turn."""
     T, K, n = len(targets), len(starts[-1]) // ROUNDS[-1], len(near)
     q, cost = np.zeros((T, K, n)), np.full((T, K), np.inf)
     left = np.arange(T)

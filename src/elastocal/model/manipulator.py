@@ -483,7 +483,6 @@ def _with_markers(cell: Cell, names: tuple[str, ...]) -> Cell:
 
 
 def _arrived(_: None, chain: Chain, cell: Cell, *more: Any) -> Model:
-    """The model of a pickle whose plug-ins have run."""
     lost = [choice.name for choice in cell.model.effects if choice.name not in CATALOGUE]
     require(
         not lost,

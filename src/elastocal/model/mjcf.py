@@ -22,7 +22,6 @@ from functools import cached_property
 from pathlib import Path
 from typing import Any
 
-import casadi as ca
 import numpy as np
 from scipy.linalg import null_space
 
@@ -181,7 +180,6 @@ class MjcfArm:
         return _turn(up), f"of {base}, up against the file's gravity"
 
     def _weights_told(self) -> list[str]:
-        """Sentences on weights that the file does not state, or does not let act."""
         import mujoco
 
         model, found = self.model, []
@@ -273,7 +271,6 @@ def _constraint(model: Any, e: int) -> str:
 def _tree(
     path: Path, name: str, model: Any, bodies: Sequence[str], unweighed: Iterable[int]
 ) -> Tree:
-    """The links of all bodies and the joints between them, without springs of an export."""
     links = {bodies[WORLD]: LinkMass(0.0, np.zeros(3))}
     joints = []
     for b in range(1, model.nbody):
@@ -330,8 +327,8 @@ def local(model: Any, body: int) -> Array:
 
 def before(model: Any, j: int) -> Array:
     """X (4, 4): the frame of joint j at zero in its body's, Trans(p) J(a, −r)."""
-    turned = rigid.joint_motion(motion_of(model, j), model.jnt_axis[j], -_ref(model, j))
-    return np.asarray(shift(model.jnt_pos[j]) @ ca.DM(turned).full())
+    turned = rigid.moved(motion_of(model, j), model.jnt_axis[j], -_ref(model, j))
+    return shift(model.jnt_pos[j]) @ turned
 
 
 def _ref(model: Any, j: int) -> float:
@@ -459,7 +456,6 @@ def _compiled(path: Path, spec: Any) -> tuple[Any, frozenset[int], list[str]]:
 
 
 def _missing_meshes(path: Path, spec: Any) -> dict[str, str]:
-    """Meshes that geoms use and whose files are not there: name → file."""
     used = {geom.meshname for geom in spec.geoms}
     folder = path.parent / (spec.compiler.meshdir or "")
     return {

@@ -145,20 +145,19 @@ def pair_loaded_with_unloaded(table: Measurements) -> tuple[NDArray[np.int64], s
             f"{table.source}: observe = 'deflection' needs loaded rows, but force_x_N, force_y_N, "
             "force_z_N are zero or missing in every row"
         )
-    lead, rest = np.flatnonzero(loaded), np.flatnonzero(~loaded)
+    lead, unloaded = np.flatnonzero(loaded), sparse.diags_array((~loaded).astype(float))
 
-    def partners(*keys: NDArray[np.int64]) -> tuple[NDArray, NDArray, NDArray]:
-        """Unloaded rows by their keys; where those of each loaded row begin, and how many."""
+    def partners(*keys: NDArray[np.int64]) -> sparse.csr_array:
+        """1 (N, n) where an unloaded row has the keys of a loaded one."""
         group = numbered(*keys)
-        count = np.bincount(group[rest], minlength=len(table))
-        own = rest[np.argsort(group[rest], kind="stable")]
-        return own, (count.cumsum() - count)[group[lead]], count[group[lead]]
+        of = sparse.csr_array((np.ones(len(table)), (np.arange(len(table)), group)))
+        return sparse.csr_array(of[lead] @ (of.T @ unloaded))
 
-    rows, first, number = partners(table.configuration, table.repeat, table.marker)
-    if not number.all():
-        more, begin, count = partners(table.configuration, table.marker)
-        first = np.where(number == 0, len(rows) + begin, first)
-        rows, number = np.append(rows, more), np.where(number == 0, count, number)
+    found = partners(table.configuration, table.repeat, table.marker)
+    if not (number := found.sum(axis=1)).all():
+        alone = sparse.diags_array((number == 0).astype(float))
+        found = found + alone @ partners(table.configuration, table.marker)
+        number = found.sum(axis=1)
     if not number.all():
         i = lead[number.argmin()]
         raise InputError(
@@ -167,13 +166,8 @@ def pair_loaded_with_unloaded(table: Measurements) -> tuple[NDArray[np.int64], s
             f"{table.marker_names[table.marker[i]]} has no unloaded reading to subtract; measure "
             "it without load, or use observe = 'position'"
         )
-    each = 1 + number  # the loaded row itself and its partners
-    ends = np.append(0, each.cumsum())
-    place = np.arange(ends[-1]) - np.repeat(ends[:-1], each)
-    columns = np.repeat(lead, each)
-    columns[place > 0] = rows[(np.repeat(first, each) + place - 1)[place > 0]]
-    values = np.where(place == 0, 1.0, np.repeat(-1.0 / number, each))
-    combine = sparse.csr_array((values, columns, ends), shape=(len(lead), len(table)))
+    own = sparse.eye_array(len(table), format="csr")[lead]
+    combine = sparse.csr_array(own - sparse.diags_array(1 / number) @ found)
     combine.sort_indices()
     return lead, combine
 

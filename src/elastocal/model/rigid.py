@@ -100,6 +100,11 @@ def joint_motion(kind: str, axis: Any, value: Any) -> ca.SX:
     return transform(translation=ca.SX(ca.DM(np.asarray(axis, dtype=float))) * value)
 
 
+def moved(kind: str, axis: Any, value: float) -> Array:
+    """`joint_motion` of a number (4, 4)."""
+    return np.asarray(ca.DM(joint_motion(kind, axis, value)).full())
+
+
 def point(T: ca.SX, p: Any) -> ca.SX:
     """T applied to the point p (3,)."""
     return T[:3, :3] @ ca.SX(p) + T[:3, 3]

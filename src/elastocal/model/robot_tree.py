@@ -11,7 +11,6 @@ from dataclasses import dataclass, field
 from functools import cached_property
 from pathlib import Path
 
-import casadi as ca
 import numpy as np
 
 from elastocal.errors import InputError, require
@@ -69,8 +68,7 @@ class FileJoint:
         """T (4, 4) from the child's frame to the parent's where it stands still."""
         if not self.rest:
             return self.origin
-        turned = ca.DM(rigid.joint_motion(self.motion, self.axis, self.rest)).full()
-        return np.asarray(self.origin @ turned)
+        return self.origin @ rigid.moved(self.motion, self.axis, self.rest)
 
 
 @dataclass(frozen=True)
@@ -237,7 +235,6 @@ class Tree:
         return common[-1]
 
     def _moves(self, link: str) -> bool:
-        """Whether the joint before a link, or one below it, moves."""
         return any(self.parent_joint[below].moves for below in self._below(link))
 
     def _is_finger(self, link: str) -> bool:

@@ -261,7 +261,6 @@ class Total:
 
     @cached_property
     def _slopes(self) -> BatchFunction:
-        """∂y/∂θ."""
         outputs = [ca.jacobian(self._y, self._arm.arm.theta)]
         return BatchFunction(self._inputs, outputs, self._arm.backend)
 

@@ -185,7 +185,6 @@ def _vector(
 
 
 def _limit(what: str, text: str) -> float:
-    """A number, or infinite: no limit."""
     endless = ENDLESS_TEXT.fullmatch(text.strip())
     if endless is None:
         return _number(what, text)
