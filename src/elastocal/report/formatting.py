@@ -291,13 +291,13 @@ STEPS = {"unknown": "what has no name", "rest": "the smaller causes"}
 def places(where: Iterable[str], runs: bool = False) -> str:
     """ "joints 1, 2 and 5", "link 3 and base"; with `runs` "joints 1 to 4 and 6"."""
     numbers: dict[str, list[int]] = {}
-    told = []
+    told, others = [], []
     for one in where:
         if match := KINDS_OF_PLACE.fullmatch(one):
             numbers.setdefault(match[1], []).append(int(match[2]))
         else:
-            told.append(place(one))
-    for kind, found in reversed(numbers.items()):
+            others.append(place(one))
+    for kind, found in numbers.items():
         each: list[list[int]] = []  # numbers that follow each other
         for n in sorted(found):
             if runs and each and n == each[-1][-1] + 1:
@@ -306,8 +306,8 @@ def places(where: Iterable[str], runs: bool = False) -> str:
                 each.append([n])
         texts = ([f"{r[0]} to {r[-1]}"] if len(r) > 2 else map(str, r) for r in each)
         several = together([text for run in texts for text in run])
-        told.insert(0, f"{kind}{'s' * (len(found) > 1)} {several}")
-    return together(told)
+        told.append(f"{kind}{'s' * (len(found) > 1)} {several}")
+    return together([*told, *others])
 
 
 def effect_at_places(effect: str, where: Sequence[str]) -> str:
