@@ -15,7 +15,7 @@ from elastocal.errors import InputError, InsufficientDataError, option, require
 from elastocal.measurements import Measurements
 from elastocal.model.chain import Chain, finite_ranges, joint_index, joint_limits
 from elastocal.model.manipulator import Model
-from elastocal.planning.feasibility import Feasibility, PoseFeasibility, Struck
+from elastocal.planning.feasibility import Feasibility, Struck
 from elastocal.planning.information import plan_forces
 from elastocal.text import did_you_mean, listed, quoted
 from elastocal.units import Array, IntArray, Progress
@@ -141,14 +141,15 @@ def draw(
     for group, stream in enumerate(np.random.SeedSequence(seed).spawn(groups)):
         progress(f"drawing candidates, level {group + 1} of {groups}")
         chunks = _checked(checker, forces, group, sobol(space, group, stream), jobs)
-        lot, verdict = _fill(chunks, n // groups + (group < n % groups))
+        lot = _fill(chunks, n // groups + (group < n % groups))
         if not len(lot.q):
-            every, at, j = checker.check(verdict.q, verdict.force), "", space.held
+            some = np.concatenate([*islice(sobol(space, group, stream), PER_TASK)])
+            at, j = "", space.held
             if j is not None:
                 at = f" with joint{j + 1} at {told(chain, j, space.levels[group])}"
             raise InsufficientDataError(
                 f"{cell.path or cell.name}: no feasible pose found{at}; "
-                f"{checker.advice(replace(every, broken=every.broken | verdict.broken))}"
+                f"{checker.advice(checker.every(some, forces))}"
             )
         drawn.append(lot)
     return Candidates.join(drawn)
@@ -217,18 +218,15 @@ def sobol(space: JointSpace, group: int, stream: np.random.SeedSequence) -> Iter
         yield space.poses(engine.random(CHUNK), group)
 
 
-def _check(
-    checker: Feasibility, forces: Array, group: int, q: Array
-) -> tuple[Candidates, PoseFeasibility]:
+def _check(checker: Feasibility, forces: Array, group: int, q: Array) -> Candidates:
     verdict = checker.under(q, forces)
-    ok = verdict.ok
-    n = int(ok.sum())
-    return Candidates(q[ok], np.full(n, group), len(ok), n, verdict.removed_by), verdict
+    n = int(verdict.ok.sum())
+    return Candidates(q[verdict.ok], np.full(n, group), len(q), n, verdict.removed_by)
 
 
 def _checked(
     checker: Feasibility, forces: Array, group: int, chunks: Iterator[Array], jobs: int
-) -> Iterator[tuple[Candidates, PoseFeasibility]]:
+) -> Iterator[Candidates]:
     if jobs == 1:
         yield from (_check(checker, forces, group, q) for q in chunks)
     from joblib import Parallel, delayed, effective_n_jobs
@@ -239,21 +237,13 @@ def _checked(
             yield from pool([delayed(_check)(checker, forces, group, q) for q in wave])
 
 
-def _fill(
-    chunks: Iterator[tuple[Candidates, PoseFeasibility]], wanted: int
-) -> tuple[Candidates, PoseFeasibility]:
-    lots: list[Candidates] = []
-    verdicts: list[PoseFeasibility] = []
-    count = tried = 0
-    while count < wanted and tried < max(TRIES * wanted if count else 0, GIVE_UP):
-        lot, verdict = next(chunks)
-        lots.append(lot)
-        if count == 0:
-            verdicts.append(verdict)
-        count, tried = count + len(lot.q), tried + CHUNK
+def _fill(chunks: Iterator[Candidates], wanted: int) -> Candidates:
+    lots, count = list[Candidates](), 0
+    while count < wanted and len(lots) * CHUNK < max(TRIES * wanted if count else 0, GIVE_UP):
+        lots.append(next(chunks))
+        count += len(lots[-1].q)
     found = Candidates.join(lots)
-    found = replace(found, q=found.q[:wanted], group=found.group[:wanted])
-    return found, PoseFeasibility.join(verdicts)
+    return replace(found, q=found.q[:wanted], group=found.group[:wanted])
 
 
 def told(chain: Chain, j: int, value: float) -> str:
@@ -351,22 +341,20 @@ class Pins:
         Raises InputError where one is at no level of the cell, or breaks a rule.
         """
         group = np.zeros(len(self.q), dtype=np.int64)
+        verdict = rules.every(self.q, plan_forces(cell))
+        # That it stands near one struck out is the user's choice.
+        broken = verdict.broken & (np.array(verdict.rules) != Struck.name)
         for k, (label, q) in enumerate(zip(self.names, self.q, strict=True)):
             where = f"{cell.path or cell.name}: pose {quoted(label)}, which is to be kept,"
             for joint, levels in cell.design.levels.items():
                 away = np.abs(np.array(levels) - q[joint_index(joint)])
                 group[k] = int(away.argmin())
                 require(away.min() < LEVEL_SLACK, f"{where} is at no level of {joint}")
-            for force in plan_forces(cell):
-                verdict = rules.check(q, force)
-                # That it stands near one struck out is the user's choice.
-                rules_of = zip(verdict.rules, verdict.broken[0], strict=True)
-                broken = [name for name, hit in rules_of if hit and name != Struck.name]
-                if broken:
-                    raise InputError(
-                        f"{where} breaks {broken[0]}; strike it ({option('strike')}), or relax the "
-                        "rule in the cell"
-                    )
+            require(
+                not broken[k].any(),
+                f"{where} breaks {verdict.rules[int(broken[k].argmax())]}; strike it "
+                f"({option('strike')}), or relax the rule in the cell",
+            )
         return group
 
 

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from abc import ABC, abstractmethod
 from collections.abc import Callable, Iterator, Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import cached_property
 from typing import Any
 
@@ -247,14 +247,6 @@ class PoseFeasibility:
         first = (self.broken & (self.broken.cumsum(axis=1) == 1)).sum(axis=0)
         return dict(zip(self.rules, first.tolist(), strict=True))
 
-    @classmethod
-    def join(cls, verdicts: Sequence[PoseFeasibility]) -> PoseFeasibility:
-        broken, q, force = (
-            np.concatenate([getattr(verdict, name) for verdict in verdicts])
-            for name in ("broken", "q", "force")
-        )
-        return cls(verdicts[0].rules, broken, q, force)
-
 
 # The rules that a cell states, in the order of checking: cheap ones first.
 
@@ -416,6 +408,13 @@ class Feasibility:
             broken[left, k] = hit = rule.broken(poses.take(left))
             left = left if every else left[~hit]
         return PoseFeasibility(tuple(r.name for r in self.rules), broken, poses.q, poses.force)
+
+    def every(self, q: Array, forces: Array) -> PoseFeasibility:
+        """Every rule that each pose q (N, n) breaks under any of the `forces` (k, 3)."""
+        ranked = forces[np.argsort(np.linalg.norm(forces, axis=1), kind="stable")]
+        verdicts = [self.check(q, force) for force in ranked]
+        broken = np.any([verdict.broken for verdict in verdicts], axis=0)
+        return replace(verdicts[-1], broken=broken)
 
     def under(self, q: Array, forces: Array) -> PoseFeasibility:
         """The first rule that each pose q (N, n) breaks under the first of `forces` (k, 3) that
