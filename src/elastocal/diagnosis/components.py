@@ -39,7 +39,7 @@ from elastocal.diagnosis.noise_floor import (
     log_prior,
     posterior,
 )
-from elastocal.engine.climb import climb
+from elastocal.engine.mixed import climb
 from elastocal.engine.sizes import Products, Standardised
 from elastocal.model.effects.base import Effect
 from elastocal.model.effects.smooth import ResidualField, Waves

@@ -9,7 +9,6 @@ import numpy as np
 from scipy import linalg
 
 from elastocal.diagnosis.baseline import Blocks
-from elastocal.engine.climb import climb
 from elastocal.engine.mixed import (
     LOG_2PI,
     ROUNDING,
@@ -18,6 +17,7 @@ from elastocal.engine.mixed import (
     Pack,
     Parts,
     Whitened,
+    climb,
 )
 from elastocal.engine.sizes import Products, Standardised
 from elastocal.model.evaluate import thread_count
@@ -38,7 +38,8 @@ STATED_SPREAD, UNSTATED_SPREAD = 0.5, 3.0
 REPEATABILITY, REPEATABILITY_SPREAD = 8e-6, 1.5
 JOINT_SPREAD = 0.7
 SHARED, SHARED_SPREAD = 0.2, 1.5
-SMALLEST_NOISE, LARGEST = 1e-9, 2e-2  # rad or m: a joint that is exact
+SMALLEST_NOISE, LARGEST = 1e-9, 2e-2  # rad or m: a joint that is exact, and one that is loose
+FARTHEST = 17.0  # logarithms from a start, from an exact joint to a loose one
 LARGE = 2**19  # numbers of a data's columns; below, threads would wait for each other
 
 
@@ -343,14 +344,12 @@ def balanced(data: NoisyData) -> NoiseValues:
 
 def _climbed(data: NoisyData, start: NoiseValues, enough: float) -> NoiseValues:
     """By steps in log a, log c and log s: the latter are known apart from each other."""
-    J, wide = data.G.shape[2], 4 * (STATED_SPREAD if data.stated else UNSTATED_SPREAD)
-    upper = np.array([wide, *[5.0] * J, *[np.log(LARGEST)] * J])
-    lower = np.array([-wide, *[-5.0] * J, *[np.log(SMALLEST_NOISE)] * J])
-    to = doubled(J)
+    to = doubled(data.G.shape[2])
 
     def objective(logs: Array) -> tuple[float, Array, Array]:
         value, slope, information = data.model.objective(to @ logs)
         return value, to.T @ slope, to.T @ information @ to
 
-    begin = np.clip(np.linalg.solve(to, start.logs()), lower, upper)
-    return NoiseValues.of(np.exp(to @ climb(objective, begin, lower, upper, enough, STEPS)[0]))
+    begin: Array = linalg.solve(to, start.logs())
+    found = climb(objective, begin, begin - FARTHEST, begin + FARTHEST, enough, STEPS)[0]
+    return NoiseValues.of(np.exp(to @ found))

@@ -416,7 +416,7 @@ class Trial(NamedTuple):
     """One noise model that was tried: how many variances it has, and its criterion."""
 
     kind: str
-    n_variances: int
+    variances: int
     criterion: float
 
 

@@ -273,10 +273,7 @@ class Noise:
         if self.drift is not None:
             content["drift"] = asdict(self.drift)
         if self.tried is not None:
-            content["tried"] = [
-                {"kind": t.kind, "variances": t.n_variances, "criterion": t.criterion}
-                for t in self.tried
-            ]
+            content["tried"] = [t._asdict() for t in self.tried]
         return content
 
 

@@ -433,7 +433,7 @@ def candidate_table(noise: Noise) -> ShownTable:
     tried = sorted(noise.tried or (), key=lambda t: t.criterion)
     words = (printable(Kind.parsed(t.kind).words) for t in tried)
     rows = [
-        (text, str(t.n_variances), f"{t.criterion - tried[0].criterion:.1f}")
+        (text, str(t.variances), f"{t.criterion - tried[0].criterion:.1f}")
         for text, t in zip(words, tried, strict=True)
     ]
     heads = ("noise model", "variances", "criterion over best")
