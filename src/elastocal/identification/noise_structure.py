@@ -2,7 +2,7 @@
 
     V = Σ_k θ_k K_k
 
-A `NoiseModel` says how the noise of a single reading is built, a `Part` what readings have in
+A `NoiseModel` says how the noise of a single reading is built, a `NoisePart` what readings have in
 common besides; a `Kind` is one of the former with some of the latter.
 """
 
@@ -507,7 +507,7 @@ DRIFT, EACH_HAS = "drift in time", "common to each "
 OF_CONFIGURATION = f"{EACH_HAS}configuration"
 
 
-class Part(NamedTuple):
+class NoisePart(NamedTuple):
     """What readings may have in common: its `deviations` of the readings, how long what drifts
     lasts, and whether those are asked for that these readings do not tell; a `clause` for the
     description of a noise that has them, and `words` for a list of models."""
@@ -519,14 +519,14 @@ class Part(NamedTuple):
 
 SETTLE = "joints that settle anew at each visit"
 PARTS = {
-    CONFIGURATION: Part(
+    CONFIGURATION: NoisePart(
         of_configurations, ", and a deviation {}", "deviations of a configuration"
     ),
-    JOINTS: Part(of_joints, f", {SETTLE}", SETTLE),
-    EACH: Part(
+    JOINTS: NoisePart(of_joints, f", {SETTLE}", SETTLE),
+    EACH: NoisePart(
         partial(of_joints, each=True), f", {SETTLE}", f"{SETTLE}, each by its own size"
     ),
-    TIME: Part(of_time, ", and a drift in time", "drift in time"),
+    TIME: NoisePart(of_time, ", and a drift in time", "drift in time"),
 }  # fmt: skip
 BY_VISIT = (JOINTS, EACH, TIME)
 
