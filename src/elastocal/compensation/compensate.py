@@ -112,9 +112,6 @@ def compensate(
     first place in the posture nearest to `near` (joints,).  The new command solves the
     calibrated model for the target within the joint limits, nearest to the nominal one where
     joints or a free rotation leave a choice.
-
-    Raises InputError where the table lacks a column that the model needs, or a nominal command
-    lies beyond the limits.
     """
     arm, of_one_campaign = lasting(arm)
     tool = CalibratedTool(arm, point)

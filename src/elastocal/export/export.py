@@ -103,8 +103,6 @@ def corrections_csv(calibrated: CalibratedArm, note: str) -> str:
     to 6), of the base along and about the data's axes, of a marker its position in the flange
     frame.  `position_deg` or `time_s` is what it follows.  A line that begins with # says where
     the numbers come from.
-
-    Raises InputError where the arm has no such function.
     """
     groups = smooth_groups(calibrated.model)
     rows = [row for group in groups for row in _correction_rows(calibrated, group)]

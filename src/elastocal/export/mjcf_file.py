@@ -229,7 +229,7 @@ TOLERANCE, AT_REST = 1e-13, 1e-10  # rad or m: last step, and what may be left
 
 
 class MujocoRest:
-    """An exported MJCF in MuJoCo.  Raises InputError where MuJoCo is missing or refuses it."""
+    """An exported MJCF in MuJoCo."""
 
     def __init__(self, text: str) -> None:
         mujoco = import_mujoco("the check")

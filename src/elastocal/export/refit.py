@@ -109,7 +109,7 @@ class JointCorrection:
 
 
 def read_joint_correction(path: str | Path) -> JointCorrection:
-    """The correction that `export --joint-correction` wrote.  Raises InputError for other files."""
+    """The correction that `export --joint-correction` wrote."""
     lines = [
         line
         for line in read_text(path, "joint correction", MOST_BYTES).splitlines()

@@ -45,7 +45,6 @@ def calibrated_urdf(
 
     Only origins that change are touched.  `tool` adds elastocal_marker_NAME and
     elastocal_load_point as links on the flange, `base_frame` elastocal_tracker as the new root.
-    Raises InputError where the file has a link or joint of such a name that is none of these.
     """
     assert robot.urdf is not None
     text = _UrdfText(urdf_file(robot.urdf))

@@ -43,9 +43,8 @@ def forces_of(
     """(n, 3) N in the tracker's frame (z up) for each point; None where no load is told.
 
     A mass m hangs straight down: force (0, 0, -9.80665 m); so does a load whose name is a size, as
-    "2600 N" or "2.5 kg", unless [loads] has it.  The names none, unloaded and 0 mean no
-    force unless [loads] says otherwise.  Raises InputError for a load that [loads] does not have,
-    and where loads are told both by name and in columns.
+    "2600 N" or "2.5 kg", unless [loads] has it.  The names none, unloaded and 0 mean no force
+    unless [loads] says otherwise.
     """
     named = points.labels.get("load")
     if named is None:
@@ -174,10 +173,8 @@ def assemble(where: str, points: Records, log: Records | None, joined: Joined | 
     """One row per point that has joint values, in the points' order.
 
     Configurations are those of the names, else of the joint log, else joint values that agree
-    within same_pose_deg.  Repeats are numbered in order where the file does not number them.
-    Times are counted from the first reading; `loads` are forces by name.  Raises InputError where
-    there are no joint values or positions, for repeats that are no whole numbers or occur twice,
-    and for unknown loads.
+    within same_pose_deg.  Repeats are numbered in order where the file does not number them.  Times
+    are counted from the first reading; `loads` are forces by name.
     """
     settings = mapping.join or mapping_file.JoinTable()
     rows = np.arange(len(points)) if joined is None else np.flatnonzero(joined.row >= 0)
@@ -320,8 +317,7 @@ def table_text(made: Assembled) -> str:
 def validated(text: str, name: str, made: Assembled, cell: Cell | None) -> Measurements:
     """The table as the reader of `identify` reads it.
 
-    With `cell`, joints, markers and columns must be those that it asks for.  Raises InputError
-    as the reader does, about the table `name`.
+    With `cell`, joints, markers and columns must be those that it asks for.
     """
     observe = "position" if any(c.startswith("x_") for c in made.columns) else "distance"
     try:

@@ -110,7 +110,7 @@ def unit_in_comments(where: str, pattern: str | None, comments: Sequence[str]) -
 
 
 def compiled(where: str, key: str, pattern: str) -> re.Pattern[str]:
-    """A regular expression of the mapping.  Raises InputError that names its key."""
+    """A regular expression of the mapping."""
     try:
         return re.compile(pattern)
     except re.error as error:
@@ -126,8 +126,8 @@ PER_LETTER, PER_TEXT = 2e-6, 2e-5  # s, twenty times what such expressions take
 @contextmanager
 def bounded(where: str, texts: Sequence[str]) -> Iterator[None]:
     """In a `with` block, expressions of a mapping, which may be exponential, are looked for in
-    these texts.  Raises InputError where that takes longer than any number of them may: in the main
-    thread, and where the system has a timer."""
+    these texts, for no longer than any number of them may take; in the main thread, and where the
+    system has a timer."""
     main = threading.current_thread() is threading.main_thread()
     if not (texts and main and hasattr(signal, "SIGVTALRM")):
         yield
@@ -170,10 +170,9 @@ def table_rows(
     """The rows of a delimited table.
 
     `is_header` recognises the header where columns are asked for by name; without it the table
-    begins at the first line that `is_data`, and the line before it is its header if it has as
-    many cells.  Lines above the table, repeated headers and lines that match `ignore` are passed
-    over and listed.  Raises InputError where there is no header or no data, and where quotation
-    marks do not match.
+    begins at the first line that `is_data`, and the line before it is its header if it has as many
+    cells.  Lines above the table, repeated headers and lines that match `ignore` are passed over
+    and listed.
     """
     marks = tuple(settings.comments or ())
     skip = None if settings.ignore is None else compiled(text.source, "ignore", settings.ignore)

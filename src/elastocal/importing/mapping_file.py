@@ -170,7 +170,7 @@ class ImportMapping:
 
 
 def preset_text(name: str) -> str:
-    """The TOML of a preset.  Raises InputError for an unknown name."""
+    """The TOML of a preset."""
     if name not in PRESETS:
         raise InputError(
             f"no preset {quoted(name)}{did_you_mean(name, PRESETS)}; there are {listed(PRESETS)}"

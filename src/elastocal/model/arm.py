@@ -240,10 +240,7 @@ LEVEL_TOLERANCE = 0.01
 
 
 def row_inputs(arm: Arm, table: Measurements) -> list[NDArray]:
-    """One (n, size) array per input the arm declared, in its order.
-
-    Raises InputError where the table lacks a column, or a row lies at none of a joint's levels.
-    """
+    """One (n, size) array per input the arm declared, in its order."""
     known = list(arm.markers)
     strange = {table.marker_names[k] for k in np.unique(table.marker)} - set(known)
     if strange:
@@ -310,10 +307,7 @@ def check_loads(load: ArrayLike | None, n: int) -> None:
 
 
 def given_force(load: ArrayLike | None) -> NDArray[np.float64] | None:
-    """The option `load` as a force (3,) in N, None where it is not given.
-
-    Raises InputError unless it is three finite numbers.
-    """
+    """The option `load` as a force (3,) in N, None where it is not given."""
     if load is None:
         return None
     try:

@@ -536,7 +536,6 @@ def tool_point(cell: Cell, text: str | None) -> ToolPoint:
     """The point that `text` names: a marker, or "x,y,z" in m in the flange frame.
 
     Without a text the cell's `load_point_m`, or where that is not stated its only marker.
-    Raises InputError for an unknown marker, and where the cell leaves the choice open.
     """
     markers = cell.tool.markers
     if text is None:
@@ -620,10 +619,7 @@ class CalibratedTool:
         self._rotation = own.T_tracker_flange[:3, :3] @ turn
 
     def rows(self, table: Measurements) -> list[NDArray]:
-        """What the model asks of the table's rows, one array per input; joints are put in later.
-
-        Raises InputError where the table lacks a column that the model needs.
-        """
+        """What the model asks of the table's rows, one array per input; joints are put in later."""
         n = len(table)
         levels = self.cell.model.compliance_levels
         q = np.zeros((n, self.chain.n_joints))

@@ -78,10 +78,7 @@ NO_LIMIT = 100.0  # half turns, or m
 
 
 def joint_limits(cell: Cell, chain: Chain) -> tuple[Array, Array]:
-    """Lower and upper joint limits (n,) in rad or m, infinite where there is none.
-
-    Raises InputError where the cell leaves a joint no range at all.
-    """
+    """Lower and upper joint limits (n,) in rad or m, infinite where there is none."""
     lower = np.array([joint.lower for joint in chain.joints])
     upper = np.array([joint.upper for joint in chain.joints])
     for name, (low, high) in cell.limits.items():
@@ -138,8 +135,7 @@ TILT = math.radians(0.75), math.radians(2 * math.pi + 0.01)
 
 def plausible(chain: Chain, source: object) -> Chain:
     """The chain of the file `source`, with limits that stand for none taken out and notes of what
-    is doubtful.  Raises InputError where it is longer, shorter or heavier than any arm, or has
-    limits that only another unit explains."""
+    is doubtful."""
     _check_lengths(chain, source)
     _check_masses(chain, source)
     joints = tuple(_limited(joint, f"{source}: joint '{joint.name}'") for joint in chain.joints)
@@ -312,8 +308,6 @@ def numbered(cell: Cell, chain: Chain) -> Cell:
 
     A joint may be named as in the robot's file wherever jointN may stand.  Where the file calls
     another than the Nth joint jointN, `[robot] joint_names` says which is meant.
-
-    Raises InputError for such a name without it, and for a joint that there is not.
     """
     one = _resolver(cell, chain)
     loose = _resolver(cell, chain, others=True)

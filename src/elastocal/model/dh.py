@@ -90,8 +90,6 @@ def read_dh(
 
     Where axes are nearly parallel their common normal lies far away, and d of hundreds of metres
     cancel (factory calibrations): such frames are taken near the arm, see `near_the_arm`.
-
-    Raises InputError, naming file, row and column.
     """
     path = Path(path)
     table = read_dh_table(path)
@@ -367,8 +365,6 @@ def read_ur_table(path: Path, ur_model: str | None = None) -> Chain:
 
     `ur_model`: whose nominal table a calibration.conf counts from; None: that of [DH] in the file,
     or in urcontrol.conf beside it.  Frames are taken near the arm, see `near_the_arm`.
-
-    Raises InputError, naming file and key.
     """
     text = read_text(path, "robot's calibration", MOST_BYTES)
     if path.suffix.lower() == ".conf":

@@ -234,10 +234,7 @@ def checked(name: str, source: str) -> str:
 
 
 def chosen_backend(name: str | None = None) -> str:
-    """`name`, else ELASTOCAL_BACKEND, else "auto".
-
-    Raises InputError for an unknown name.
-    """
+    """`name`, else ELASTOCAL_BACKEND, else "auto"."""
     if name is not None:
         return checked(name, "backend")
     return checked(os.environ.get(VARIABLE, "").strip() or "auto", f"{VARIABLE} in the environment")

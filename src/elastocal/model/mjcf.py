@@ -79,9 +79,7 @@ class MjcfArm:
     ) -> MjcfArm:
         """The arm of an MJCF file, or of a `text` that is to stand in its place.
 
-        Without `flange` it is `Tree.last_link`.  Raises InputError where MuJoCo is not installed or
-        cannot read the file, where a name is unknown or a choice open, and where the joints on the
-        way are none that a chain has.
+        Without `flange` it is `Tree.last_link`.
         """
         path = Path(path)
         if text is None:

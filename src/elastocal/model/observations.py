@@ -74,9 +74,6 @@ def observe(table: Measurements, kind: str) -> Observations:
 
     A pose's rotation is observed relative to the measured one, so its value is zero and the
     prediction is the rotation vector of R_measuredᵀ R_model.
-
-    Raises InputError where the table lacks what `kind` needs or a loaded row has no unloaded
-    partner.
     """
     n = len(table)
     if kind == "deflection":
@@ -136,8 +133,6 @@ def pair_loaded_with_unloaded(table: Measurements) -> tuple[NDArray[np.int64], s
 
     Where that repeat was not measured unloaded, the mean of all unloaded repeats of the same
     configuration and marker serves.  Returns the loaded rows (N,) and the combination (N, n).
-
-    Raises InputError where a loaded row has no partner at all, or nothing is loaded.
     """
     loaded = np.any(table.force != 0, axis=1)
     if not loaded.any():
@@ -189,8 +184,6 @@ def position_covariance(table: Measurements, tracker: Tracker, kind: str) -> tup
 
     `kind`: "rows", "axis" or "polar".  Polar noise lies along the line of sight and across it:
     Σ = Σ_k s_k² e_k e_kᵀ over range, azimuth and elevation direction.
-
-    Raises InputError where the noise that `kind` names is not stated.
     """
     n, noise = len(table), tracker.noise
     if kind == "axis":

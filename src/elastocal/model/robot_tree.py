@@ -186,8 +186,7 @@ class Tree:
         """The link below `base` from which on fingers, or frames that none moves, branch off.
 
         Of the links that no other hangs on, those with the most moving joints on their way have it
-        in common; among frames at its end one with a usual name is taken.  Raises InputError, with
-        what each arm would end in, where there are several arms.
+        in common; among frames at its end one with a usual name is taken.
         """
         arms: dict[tuple[FileJoint, ...], list[str]] = {}
         for leaf in self._leaves(base):

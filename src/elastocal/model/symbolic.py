@@ -332,8 +332,6 @@ def configuration_rows(
     q: markers, forces, the level of a split joint, time.  Deflections are explicit functions of q
     and X: eq. (3) for a linear model, `steps` fixed-point steps for the equilibrium.  Where poses
     are observed, the rotation is taken as measured without error, as in planning.
-
-    Raises InputError where the template lacks a column the model needs.
     """
     arm = symbolic.arm
     observed = observe(template, arm.cell.model.observe)
