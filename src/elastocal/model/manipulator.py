@@ -574,17 +574,11 @@ def smooth_groups(model: Model) -> tuple[SmoothGroup, ...]:
 def where_smooth_functions_end(cell: Cell) -> str:
     """Up to where the cell's smooth functions correct the arm, "joint1 from -85.9° to 85.9°, …";
     empty where none ends."""
-    chosen = [(effect_of(choice.name), choice.where) for choice in cell.model.effects]
-    chosen = [each for each in chosen if type(each[0]).functions is not Effect.functions]
-    chain = load_chain(cell) if chosen else None
     ends: dict[str, tuple[float, float]] = {}
-    for effect, place in chosen:
-        assert chain is not None
-        for where in [place] if place else effect.places(chain, cell):
-            for f in effect.functions(where, chain, cell):
-                if not f.whole_turn:
-                    low, high = ends.get(f.follows, (f.low, f.high))
-                    ends[f.follows] = min(low, f.low), max(high, f.high)
+    for group in smooth_groups(Model(cell, plugins=None)):
+        if group.basis is not None and not group.whole_turn:
+            low, high = ends.get(group.follows, (group.low, group.high))
+            ends[group.follows] = min(low, group.low), max(high, group.high)
     return ", ".join(
         f"{name} from {low:.0f} s to {high:.0f} s" if name == "time"
         else f"{name} from {np.degrees(low):.1f}° to {np.degrees(high):.1f}°"
