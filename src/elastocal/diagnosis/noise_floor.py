@@ -276,9 +276,10 @@ class Weighted:
 
     def factored(self, precision: Array) -> tuple[Standardised, float]:
         """The coefficients under a prior of precision Λ (p,), and ℓ."""
-        products = Products(self.M, self.z, 0.0, 0)
-        at = products.at(1 / precision)
-        return at, -0.5 * (self.alone + products.value(at))
+        products, least = Products(self.M, self.z, 0.0, 0), self.prior(precision)
+        at = products.at(1 / least)
+        spared = float(np.log(least / precision).sum())
+        return at, -0.5 * (self.alone + products.value(at) + spared)
 
     def marginal(self, precision: Array) -> float:
         return self.factored(precision)[1]
