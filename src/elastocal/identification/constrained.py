@@ -99,6 +99,7 @@ class Minimum:
 
 CONTRADICTION = 1e-9  # what equalities may miss each other by, of the size of x
 UNDETERMINED = 1e-11  # singular value of unit columns, of the largest
+STEEPEST = 1e7  # deviations from the free minimum: across them an interval has no width left
 
 
 @dataclass(frozen=True)
@@ -313,7 +314,10 @@ class Reduced:
         import cvxpy as cp
 
         v = cp.Variable(len(u))
-        wanted = [cp.sum_squares(v) + (2 / s) * u @ v <= 1]
+        # A minimum far from the free one leaves next to nothing of the side where u·v < 0.
+        steep = float(np.linalg.norm(u)) > STEEPEST * s
+        wanted = [cp.sum_squares(v) + (0.0 if steep else 2 / s) * u @ v <= 1]
+        wanted += [u / np.linalg.norm(u) @ v <= 0] if steep else []
         for m in self.matrices:  # u itself is allowed, whatever its rounding says
             about = m.at(u) + m.shortfall(u) * np.eye(len(m.balance))
             scaled = replace(m, constant=about, slopes=m.slopes * s).balanced(True)
