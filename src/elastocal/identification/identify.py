@@ -23,12 +23,7 @@ from elastocal.identification.covariance import variance_of
 from elastocal.identification.faulty_readings import report_faulty
 from elastocal.identification.findings import judged, of_solution
 from elastocal.identification.least_squares import Problem
-from elastocal.identification.methods import (
-    is_exact,
-    run_method,
-    with_limits,
-    with_smooth,
-)
+from elastocal.identification.methods import is_exact, run_method
 from elastocal.identification.mistakes import refuse_nonsense
 from elastocal.identification.noise_summary import noise_of, noise_parts
 from elastocal.identification.options import MethodResult, Options
@@ -152,10 +147,7 @@ def _fitted(
         model, sound.problem.observations, sound.fit.x, sound.fit.residual, table,
         subset(observed, faulty) if faulty.any() and sound is not every else None,
     )  # fmt: skip
-    if smooth:
-        return every, sound, with_smooth(every, sound, faulty, free, options, progress)
-    found = run_method(every, sound, faulty, refit, options, progress)
-    return every, sound, with_limits(every, found, options)
+    return every, sound, run_method(every, sound, faulty, free, refit, options, progress)
 
 
 def _without(options: Options, left_out: NDArray[np.bool_], size: int) -> Options:

@@ -139,22 +139,31 @@ COMPUTED = (
 
 
 def run_method(
-    every: Solution,
-    sound: Solution,
-    faulty: BoolArray,
-    refit: Refit,
-    options: Options,
-    progress: Progress,
-) -> MethodResult:
+    every: Solution, sound: Solution, faulty: BoolArray, free: IntArray, refit: Refit,
+    options: Options, progress: Progress,
+) -> MethodResult:  # fmt: skip
     """Carry out `options.method` from the fit to all observations and that to the good ones.
 
-    `sound` is the fit to the observations that are not `faulty` (N,), `refit` makes another such.
-    Constraints and prior come last, on the weights and the readings that the method ends with.
+    `sound` is the fit to the observations that are not `faulty` (N,), `refit` makes another such;
+    they know nothing of smooth functions among the parameters `free`.  Constraints and prior come
+    last, on the weights and the readings that the method ends with.
     """
-    if options.knows:
+    own = None
+    if every.problem.model.shrunk[free].any():
+        found, own = fit_smooth(every, sound, faulty, free, options, progress)
+    elif options.knows:
         alone = replace(options, constraints=None, prior=None, intervals="auto")
-        found = run_method(every, sound, faulty, refit, alone, progress)
-        return fit_with_knowledge(found, options, progress)
+        found = _by_method(every, sound, faulty, refit, alone, progress)
+    else:
+        found = _by_method(every, sound, faulty, refit, options, progress)
+        return with_limits(every, found, options)
+    return fit_with_knowledge(found, options, progress, own) if options.knows else found
+
+
+def _by_method(
+    every: Solution, sound: Solution, faulty: BoolArray, refit: Refit, options: Options,
+    progress: Progress,
+) -> MethodResult:  # fmt: skip
     method, exact = options.resolved, is_exact(sound)
     if method == "reml" and not every.problem.large and not exact:
         return _reml(every, sound, faulty, refit, options, progress)
@@ -169,22 +178,6 @@ def run_method(
     intervals = intervals_of(solution, options.intervals, None)
     warnings = (COMPUTED,) if exact else ()
     return MethodResult(kind, solution, intervals, None, good, warnings=warnings)
-
-
-def with_smooth(
-    every: Solution,
-    sound: Solution,
-    faulty: BoolArray,
-    free: IntArray,
-    options: Options,
-    progress: Progress,
-) -> MethodResult:
-    """Carry out `options.method` where smooth functions are among the parameters `free`.
-
-    `every` and `sound` are fits of the ordinary ones alone.
-    """
-    found, prior = fit_smooth(every, sound, faulty, free, options, progress)
-    return fit_with_knowledge(found, options, progress, prior) if options.knows else found
 
 
 # Parameters that the readings hardly show.
@@ -220,8 +213,6 @@ def with_limits(every: Solution, found: MethodResult, options: Options) -> Metho
     squares all stay fitted; where bounds or knowledge were given, these say what the readings do
     not, and nothing is held.
     """
-    if options.knows:
-        return found
     fitted = found.method in ("reml", "wls", "ols")
     limits: dict[int, tuple[float, float]] = {}
     while True:
