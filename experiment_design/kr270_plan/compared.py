@@ -73,10 +73,11 @@ class Study:
         return np.logical_and.reduce([self.feasibility.check(q, f).ok for f in self.forces])
 
     def planned(self, criterion: str, effort: str, jobs: int) -> Plan:
-        """Our plan; what an interrupted run had finished is taken up again."""
+        """Our plan; what an interrupted run had finished is taken from runs/."""
         cell = replace(self.cell, design=replace(self.cell.design, criterion=criterion))
         options = DesignOptions(effort=effort, seed=SEED, jobs=jobs, fixed=("joint1.compliance",))
-        done = Checkpoint.beside(HERE / f"{self.name}-{criterion}-{effort}", f"{SEED}")
+        (HERE / "runs").mkdir(exist_ok=True)
+        done = Checkpoint.beside(HERE / "runs" / f"{self.name}-{criterion}-{effort}", f"{SEED}")
         return design(cell, options, done, lambda text: print(f"  {text}", flush=True))
 
     def random_plan(self, rng: np.random.Generator) -> np.ndarray:

@@ -118,28 +118,13 @@ def random_information(problem: DesignProblem, seed: int, n: int = DRAWN) -> Arr
 
 
 def fitted(problem: DesignProblem, plan: IntArray) -> IntArray:
-    """A plan (n,), sorted, of the problem's shares from one of others.
-
-    Where a group holds more than its share, the poses that Φ misses least go; then the best are
-    added.  Where no share is smaller than before the result is therefore never worse.
+    """A plan (n,), sorted, of the problem's shares from one of others: of each group those of the
+    plan first, and by price.  Where no share is smaller than before it is therefore never worse.
     """
-    plan, L = np.sort(plan), len(problem.shares)
-    while True:
-        surplus = np.bincount(problem.group[plan], minlength=L) > problem.shares
-        out = np.flatnonzero(surplus[problem.group[plan]])
-        if not len(out):
-            break
-        plan = np.delete(plan, out[np.argmin(values_without(problem, plan)[out])])
-    while len(plan) < problem.n_poses:
-        taken = np.bincount(problem.group[plan], minlength=L)
-        lacking = np.flatnonzero(problem.shares > taken)
-        free = np.sort(np.concatenate([_free(problem, plan, g) for g in lacking]))
-        V = inverse(problem.information(plan))
-        _, C = problem.criterion.slope(V)
-        near = free[np.argsort(-problem.prices(V @ C @ V)[free], kind="stable")[:LOOKS]]
-        phis = problem.criterion.value(with_poses(V, problem.blocks[near]))
-        plan = np.sort(np.append(plan, near[phis.argmin()]))
-    return plan
+    V = inverse(problem.information(plan))
+    price = problem.prices(V @ problem.criterion.slope(V)[1] @ V)
+    price[plan] += price.max()
+    return np.sort(best_of(price, problem.group, problem.shares))
 
 
 def values_without(problem: DesignProblem, chosen: IntArray) -> Array:
