@@ -30,9 +30,6 @@ LEAST = 1e-9
 # Candidates evaluated at first for a place, each further batch being larger by GROWTH; and at most
 # by a search that looks at the most promising alone.
 FIRST, GROWTH, LOOKS = 8, 4, 64
-# Candidates of a group near in price, to which the search keeps before it looks at all of them: so
-# many per pose of its share, of many poses fewer.
-NEAR_PER_POSE, NEAR_PER_MANY, NEAR_AT_LEAST = 50, 12, 240
 SOFT = 30.0  # order of the power mean that stands for a maximum: smooth, and near it
 DRAWN = 20  # plans of chance
 STREAM = 10_000  # of the seed's children, beyond those that draw candidates
@@ -159,23 +156,14 @@ def exact_plan(
     """The plan (n,) of least Φ found from `starts` starts, and Φ, of a `balanced` problem.
 
     The first start is `warm`, a plan that may have other shares, or the rounded relaxation; others
-    are roundings drawn at random.  Each is improved by exchange among the candidates near in price;
-    the best at last by exchange against all.
+    are roundings drawn at random.  Each is improved by exchange with the most promising candidates,
+    the best at last with all.
     """
-    rng, d = np.random.default_rng(seed), problem.prices(relaxed.tangent.G)
-    shares = problem.shares
-    sizes = np.minimum(NEAR_PER_POSE * shares, np.maximum(NEAR_PER_MANY * shares, NEAR_AT_LEAST))
-    near = best_of(d, problem.group, sizes)
-    first = rounded(problem, relaxed.weights)
-    near = np.union1d(near, first)
-    if warm is not None:
-        first = fitted(problem, warm)
-        near = np.union1d(near, first)
-    some, weights = problem.restricted(near), relaxed.weights[near]
-    begins = [np.searchsorted(near, first)]
-    begins += [rounded(some, weights, rng) for _ in range(starts - 1)]
-    plan, _ = min((_descended(some, plan) for plan in begins), key=lambda found: found[1])
-    return exchange(problem, near[plan])
+    rng, weights = np.random.default_rng(seed), relaxed.weights
+    begins = [rounded(problem, weights) if warm is None else fitted(problem, warm)]
+    begins += [rounded(problem, weights, rng) for _ in range(starts - 1)]
+    plan, _ = min((_descended(problem, plan) for plan in begins), key=lambda found: found[1])
+    return exchange(problem, plan)
 
 
 def _descended(problem: DesignProblem, plan: IntArray) -> tuple[IntArray, float]:
@@ -183,7 +171,7 @@ def _descended(problem: DesignProblem, plan: IntArray) -> tuple[IntArray, float]
     out wherever two of its arguments are equal and each exchange raises one of them."""
     if problem.criterion.kinked:
         plan, _ = exchange(problem.judged_by(problem.criterion.softened(SOFT)), plan, LOOKS)
-    return exchange(problem, plan, LOOKS if problem.criterion.certifiable else None)
+    return exchange(problem, plan, LOOKS)
 
 
 # How many poses: a curve of sizes, and the fewest that the bound allows.
