@@ -44,6 +44,7 @@ from elastocal.identification.weighted_problem import (
     block_diagonal,
     inverse_factor,
     least_norm,
+    same_size,
     stated_by_observation,
     whitener,
 )
@@ -91,20 +92,6 @@ class Sets:
         total = np.zeros((self.n, *values.shape[1:]))
         np.add.at(total, self.of, values)
         return total / (self.root**2).reshape(-1, *[1] * (values.ndim - 1))
-
-    def clusters(self, together: IntArray | None) -> list[IntArray]:
-        """Sets (C, M) of clusters, −1 for none, in packs of clusters that differ by less than two
-        in size: those of one label `together` (S,), or each set by itself."""
-        label = np.arange(self.n) if together is None else numbered(together)
-        count = np.bincount(label)
-        order, starts = np.argsort(label, kind="stable"), np.concatenate([[0], np.cumsum(count)])
-        found, rank = [], np.ceil(np.log2(count)).astype(int)
-        for size in np.unique(rank):
-            of = np.flatnonzero(rank == size)
-            place = np.arange(count[of].max())
-            last = np.minimum(starts[of][:, None] + place, self.n - 1)
-            found.append(np.where(place < count[of][:, None], order[last], -1))
-        return found
 
 
 class NoisyReadings:
@@ -184,14 +171,14 @@ class NoisyReadings:
             replace(d, unit=d.unit[sets.first], loading=d.loading[sets.first] * scale)
             for d in self.deviations
         ]
-        for members in sets.clusters(self.readings.configuration[sets.first] if turned else None):
-            (C, M), here = members.shape, (members >= 0)[..., None]
+        label = numbered(self.readings.configuration[sets.first]) if turned else np.arange(sets.n)
+        for members in same_size(label):
+            C, M = members.shape
             parts = [_own_parts(index, root, members)]
             for k, d in enumerate(turned, self.own):
                 parts.append(Parts(np.full((C, 1), k), d.packed(members)[:, None]))
-            B = np.where(here[..., None], sets.B[members], 0.0).reshape(C, M * size, p)
-            e = np.where(here, sets.e[members], 0.0).reshape(C, M * size)
-            packs.append(Pack(B, e, tuple(parts), np.repeat(members < 0, size, axis=1)))
+            B, e = sets.B[members].reshape(C, M * size, p), sets.e[members].reshape(C, M * size)
+            packs.append(Pack(B, e, tuple(parts), np.zeros(e.shape, dtype=bool)))
         if len(e := sets.contrasts):
             own = _own_parts(index, root, sets.sets[:, None])
             packs.append(Pack(np.zeros((*e.shape, 0)), e, (own,), np.zeros(e.shape, dtype=bool)))
@@ -232,15 +219,13 @@ class NoisyReadings:
 def _own_parts(index: IntArray, root: Array, members: IntArray) -> Parts:
     """The parts of single readings: those of the k-th of a cluster's different variances, each."""
     (C, M), (L, size) = members.shape, root.shape[1:3]
-    here = members >= 0
-    own = np.where(here[..., None], index[members], -1)  # (C, M, L)
-    blocks = np.where(here[..., None, None, None], root[members], 0.0)
+    own = index[members]  # (C, M, L)
     place = ranked_within(own.reshape(C, -1)).reshape(C, M, L)
     numbers = int(place.max()) + 1
     mine = place == np.arange(numbers)[:, None, None, None]  # (k, C, M, L)
     of = np.where(mine, own, 0).max(axis=(2, 3)).T
     loading, at = np.zeros((C, numbers, M, size, M, size)), np.arange(M)
-    loading[:, :, at, :, at, :] = np.einsum("kcml,cmlij->mckij", mine, blocks)
+    loading[:, :, at, :, at, :] = np.einsum("kcml,cmlij->mckij", mine, root[members])
     return Parts(of, loading.reshape(C, numbers, M * size, M * size))
 
 
