@@ -100,34 +100,25 @@ def load_in(text: str) -> tuple[str, float] | None:
 
 def with_loads_of_names(
     by_role: Mapping[str, list[Records]], loads: Mapping[str, Any] | None
-) -> tuple[dict[str, list[Records]], dict[str, Any] | None, list[str]]:
-    """The records with the loads that their files are named for, where nothing else states any,
-    those loads by name, and what to tell.  They hang straight down.
-    """
-    every = [r for role in by_role.values() for r in role]
-    stated = any(r.load is not None or "load" in r.labels for r in every)
-    if loads or stated or any(_forces(r.numbers) for r in every):
-        return dict(by_role), dict(loads or {}) or None, []
-    named = {id(r): load_in(Path(r.source).stem) for r in every}
-    known = {found[0]: found[1] for found in named.values() if found}
-    if not known:
+) -> tuple[dict[str, list[Records]], list[str]]:
+    """The records with the loads that their files are named for, where nothing else states any, and
+    what to tell.  They hang straight down."""
+    made, every = dict(by_role), [r for role in by_role.values() for r in role]
+    if loads or any(r.load or "load" in r.labels or _forces(r.numbers) for r in every):
+        return made, []
+    named = {r.source: load_in(Path(r.source).stem) for r in every}
+    if not any(named.values()):
         told = [r.source for r in every if _WORD.search(Path(r.source).stem)]
-        told += [
-            f"column {name} of {r.source}"
-            for r in every
-            for name in r.understood.unused
-            if _WORD.search(name)
-        ]
-        return dict(by_role), None, [
+        told += [f"column {name} of {r.source}" for r in every
+                 for name in r.understood.unused if _WORD.search(name)]  # fmt: skip
+        return made, [
             f"{listed(told)}: named for a load that is not taken, and the rows are written "
             "unloaded; state it by load in [[source]] and [loads], or by load = \"…\" in "
             "[source.columns]"
         ] if told else []  # fmt: skip
-    made = {}
     for role, files in by_role.items():
-        texts = [(named[id(r)] or ("unloaded", 0.0))[0] for r in files]
-        made[role] = [replace(r, load=t) for r, t in zip(files, texts, strict=True)]
-    if all(named[id(r)] is None for r in by_role["points"]):
+        made[role] = [replace(r, load=(named[r.source] or UNLOADED[1:])[0]) for r in files]
+    if not any(named[r.source] for r in by_role["points"]):
         # The points are those of the joint logs.
         only = {r.load for r in made["joints"]}
         if len(only) > 1:
@@ -137,15 +128,14 @@ def with_loads_of_names(
                 "[[source]] of each file of points"
             )
         made["points"] = [replace(r, load=next(iter(only))) for r in by_role["points"]]
-    elif all(named[id(r)] is None for r in by_role["joints"]):
+    elif not any(named[r.source] for r in by_role["joints"]):
         made["joints"] = list(by_role["joints"])  # one log for every load
-    told = [
+    return made, [
         f"{r.source}: taken as measured under {found[0]} by its name, hanging straight down "
         f"(0, 0, {0.0 - found[1]:.6g}) N; load in [[source]] states another"
         for r in every
-        if (found := named[id(r)])
+        if (found := named[r.source])
     ]
-    return made, {name: np.array([0.0, 0.0, -size]) for name, size in known.items()}, told
 
 
 WHOLE = re.compile(r"-?[0-9]{1,15}")
@@ -169,12 +159,12 @@ class Assembled:
 
 
 def assemble(where: str, points: Records, log: Records | None, joined: Joined | None,
-             mapping: MappingTable, loads: Mapping[str, Any] | None) -> Assembled:  # fmt: skip
+             mapping: MappingTable) -> Assembled:  # fmt: skip
     """One row per point that has joint values, in the points' order.
 
     Configurations are those of the names, else of the joint log, else joint values that agree
     within same_pose_deg.  Repeats are numbered in order where the file does not number them.  Times
-    are counted from the first reading; `loads` are forces by name.
+    are counted from the first reading.
     """
     settings = mapping.join or mapping_file.JoinTable()
     rows = np.arange(len(points)) if joined is None else np.flatnonzero(joined.row >= 0)
@@ -186,7 +176,7 @@ def assemble(where: str, points: Records, log: Records | None, joined: Joined | 
             'role = "joints"'
         )
     kinds = tuple("revolute" if units[stem] == "deg" else "prismatic" for stem in stems)
-    forces = forces_of(where, points, loads)
+    forces = forces_of(where, points, mapping.loads)
     if forces is not None:
         for k, stem in enumerate(FORCES):
             numbers[stem], units[stem] = forces[rows, k], "N"
@@ -493,7 +483,7 @@ def import_files(
             f"{where}: no file with points among {listed(map(str, files), 5)}; add the tracker's "
             'export, or set role = "points" in its [[source]]'
         )
-    by_role, loads, told = with_loads_of_names(by_role, table.loads)
+    by_role, told = with_loads_of_names(by_role, table.loads)
     points = joining.pooled(by_role["points"])
     log = joining.pooled(by_role["joints"]) if by_role["joints"] else None
     if log is not None and not log.q.shape[1]:
@@ -501,7 +491,7 @@ def import_files(
             f"{log.files[0]}: no joint values; map q1_deg … (or q#_deg) in its [source.columns]"
         )
     joined = None if log is None else joining.join(where, points, log, table.join)
-    made = assemble(where, points, log, joined, table, loads)
+    made = assemble(where, points, log, joined, table)
     text = table_text(made)
     measured = validated(text, name, made, cell)
     fit, refused = against_cell(cell, measured, made, spherical) if cell is not None else (None, "")
