@@ -189,24 +189,31 @@ class Wish:
 
 
 @dataclass(frozen=True)
-class Exported:
-    """`text` to write; `checked`: largest distance in m when read back, None where it was not.
-
-    `held`: parameters that the data did not determine, with the values used; `without_beta`: of a
-    DH table with a column beta_rad, the largest distance in m for who reads four columns only;
-    `refit`: how far the file is from the arm before and after what it holds was fitted to it;
-    `correction`: where its joints are to be commanded besides, empty where nothing was asked for.
-    """
+class Written:
+    """A text, its largest distance in m when read back and with what (None where it was not), what
+    to know of it, and of a DH table with a column beta_rad the largest distance in m for who reads
+    four columns only."""
 
     text: str
+    checked: float | None = None
+    checked_with: str = ""
+    warnings: tuple[str, ...] = ()
+    without_beta: float | None = None
+
+
+@dataclass(frozen=True, kw_only=True)
+class Exported(Written):
+    """What was written, and at which cost.
+
+    `held`: parameters that the data did not determine, with the values used; `refit`: how far the
+    file is from the arm before and after what it holds was fitted to it; `correction`: where its
+    joints are to be commanded besides, empty where nothing was asked for.
+    """
+
     format: str
     cost: Cost
-    checked: float | None
-    checked_with: str
     held: dict[str, float]
     of_the_measurement: tuple[str, ...]
-    warnings: tuple[str, ...]
-    without_beta: float | None = None
     refit: Refit | None = None
     correction: JointCorrection = field(default_factory=lambda: JointCorrection(()))
 
@@ -265,17 +272,14 @@ def export(
     # Smooth functions are zero where nothing shows them: no values that are held.
     model, entries = calibrated.model, calibrated.entries
     each = zip(model.names, entries, model.shrunk, strict=True)
+    told = (*_warnings(calibrated, kept, cost), *found.warnings)
     return Exported(
-        text=found.text,
+        **vars(found) | {"warnings": told},
         format=wish.format,
         cost=cost,
-        checked=found.checked,
-        checked_with=found.tool,
         held={n: plain(e.get("held")) for n, e, shrunk in each
               if not shrunk and e.get("identifiable") is not True},
         of_the_measurement=kept.of_the_measurement,
-        warnings=(*_warnings(calibrated, kept, cost), *found.warnings),
-        without_beta=found.without_beta,
         refit=refit,
         correction=correction,
     )  # fmt: skip
@@ -337,18 +341,6 @@ LARGEST_AT_REST = 1e-6  # m
 POSES_AT_REST = 20
 # Origin and points 0.1 m along the flange's axes, homogeneous (4, 4).
 CORNERS = np.vstack([np.hstack([np.zeros((3, 1)), 0.1 * np.eye(3)]), np.ones((1, 4))])
-
-
-@dataclass(frozen=True)
-class Written:
-    """A text, its largest distance in m when read back by which tool, what to know of it, and of a
-    DH table the distance without β."""
-
-    text: str
-    checked: float | None = None
-    tool: str = ""
-    warnings: tuple[str, ...] = ()
-    without_beta: float | None = None
 
 
 def _apart(found: Array, expected: Array, largest: float | None = LARGEST) -> float:

@@ -261,7 +261,7 @@ class Tree:
         for joint in joints:
             _check_on_path(joint, f"{self.path}: joint '{joint.name}'")
         moving = self._moving(base, flange)
-        names = listed(joint.name or "joint without a name" for joint in moving) or "none"
+        names = listed(j.name or f"joint{k}" for k, j in enumerate(moving, start=1)) or "none"
         require(
             MIN_JOINTS <= len(moving) <= MAX_JOINTS,
             f"{self.path}: {len(moving)} moving joints between '{base}' and '{flange}' "
