@@ -69,11 +69,14 @@ def test_lack_of_fit_has_one_threshold(result, above):
 
 def test_every_kind_is_on_the_page():
     text = PAGE.read_text(encoding="utf-8")
-    kinds = set()
+    kinds, makers = set(), {"Finding", "_good", "_note", "_care", "_poor"}
     for source in (module, diagnosis_result):
         for node in ast.walk(ast.parse(Path(source.__file__).read_text(encoding="utf-8"))):
-            called = isinstance(node, ast.Call) and getattr(node.func, "id", "") == "Finding"
-            if called and isinstance(node.args[0], ast.Constant):
-                kinds.add(node.args[0].value)
+            given = []
+            if isinstance(node, ast.Call) and getattr(node.func, "id", "") in makers:
+                given = node.args[:1]
+            elif isinstance(node, ast.Assign) and "kind" in ast.unparse(node.targets[0]):
+                given = [part for part in ast.walk(node.value) if isinstance(part, ast.Constant)]
+            kinds |= {k.value for k in given if isinstance(k, ast.Constant) and k.value}
     assert len(kinds) > 20
     assert not {kind for kind in kinds if f"`{kind}`" not in text}

@@ -5,12 +5,12 @@ from __future__ import annotations
 import math
 from collections.abc import Iterator
 from dataclasses import replace
+from functools import partial
 
 import numpy as np
 from scipy import linalg, special
 
 from elastocal.errors import option
-from elastocal.identification.far_values import STATED_BY_FILE, far_values
 from elastocal.identification.marker_names import exchanged
 from elastocal.identification.mistakes import CELL, KILOGRAMS, load_ratio
 from elastocal.identification.noise_structure import CONFIGURATION, JOINTS, TIME, Kind
@@ -18,16 +18,30 @@ from elastocal.identification.noise_summary import Drift, NoiseSize
 from elastocal.identification.outliers import kept_of
 from elastocal.identification.prediction import unread_markers
 from elastocal.identification.residuals import ResidualSummary
-from elastocal.identification.result import Calibration, Estimate, Finding, Number, Severity
+from elastocal.identification.result import Calibration, Estimate, Finding, Severity
+from elastocal.identification.sentences import (
+    AT_BOUND,
+    LACKING,
+    NAMED,
+    STATE_NOISE,
+    TURN_ROUND,
+    USE,
+    WANDERS,
+    made,
+    more_poses,
+)
 from elastocal.identification.solve import Solution
+from elastocal.identification.start import OF_A_TARGET, SCALED, linear_fits
 from elastocal.measurements import Measurements, firsts, numbered
 from elastocal.model.arm import Parameter
 from elastocal.model.effects.catalogue import effect_of
 from elastocal.model.effects.compliances import JointCompliance
+from elastocal.model.effects.gears import JointOffset
+from elastocal.model.effects.placements import LinkGeometry, TrackerDistortion
 from elastocal.text import listed
 
 # Judged once: terminal, page, notebook and JSON print these findings and judge nothing of their
-# own.  A threshold stands here, or with the values far from nominal.
+# own.  A threshold stands here.
 
 STATED = (0.005, 0.995)  # quantiles of χ² between which the residual agrees with the stated noise
 # Beside a stated variance of more than twice what the residual shows, an effect as large as all of
@@ -42,6 +56,7 @@ WORSE, CHANCE = 1.25, 0.01
 # Factor to which the compliances of an arm are known before: those of the KR 270 are 0.8 times what
 # its links' weights let expect, and 1.5 times what its length does.
 EXPECTED_TO = 2.0
+SURELY = 5.0  # standard deviations beyond a physical bound, by which no estimate errs by chance
 MANY = 0.05  # share of the readings fitted, above which those beyond the noise are no accidents
 SCATTERS = 0.01  # p-value below which joints settle anew at each visit, or something drifts
 NOT_NORMAL = 0.01  # p-value below which standardised residuals are not normal
@@ -51,35 +66,19 @@ HEAVY = 1.0
 FEW_DOF_PER_PARAMETER = 1.0
 MOSTLY = 0.5  # share of its information from which an estimate owes more to the prior
 ILL_CONDITIONED = 1e3  # intervals this many times as wide as if each stood alone
+# Equations left between configurations from which their scatter says to a factor of 1.25, with
+# 95 % probability, what errors there are beyond the parameters: √(ν/χ²_ν(5 %)) ≤ 1.25; and from
+# which it says it to a factor of 1.5.
+ENOUGH, COARSE = (
+    next(n for n in range(1, 1000) if n <= factor**2 * special.chdtri(n, 0.95))
+    for factor in (1.25, 1.5)
+)
 
 # How a parameter stands, in the order in which they are told.
 ALONE, COMBINED, ABSORBED, INVISIBLE, FIXED = "alone", "combined", "absorbed", "invisible", "fixed"
 WEAK, BEYOND, UNREAD = "weak", "beyond", "unread"
 
-LACKING = (
-    "Ask what the model lacks: elastocal diagnose with the same cell and data. Where it finds "
-    "nothing, the excess is the robot's repeatability, or noise larger than stated ([tracker])."
-)
-NAMED = (
-    "The cell has {} already. If diagnose named that, it has no name for what is left: repeat some "
-    "poses, which tell noise and repeatability from what the model lacks."
-)
-STATE_NOISE = (
-    "State the tracker's noise ([tracker] sigma_um, or range_um and transverse_um): only beside "
-    "it does the residual say whether the model lacks something. elastocal diagnose looks for "
-    "that either way."
-)
-COMPARE = (
-    "Compare the test poses with those fitted: where they lie elsewhere (joints, load), fit some "
-    "like them; where they do not, the arm or the tracker has changed in between."
-)
-WANDERS = (
-    " It may last as long as the campaign: these readings do not tell it from a random walk, "
-    "nor where the base is on another day; measure for longer, or on several days."
-)
-USE = (
-    "Use it (elastocal compensate, elastocal export) where poses and loads are like those measured."
-)
+_good, _note, _care, _poor = (partial(made, s) for s in ("good", "note", "care", "poor"))
 # These come from the solver and stay when a result is judged anew.
 OF_SOLUTION = ("ill_conditioned", "beyond_bound", "exchanged_markers")
 
@@ -96,7 +95,7 @@ def judged(result: Calibration, of_solution: tuple[Finding, ...] | None = None) 
     noise = (*compared, *_repeats(result, fits))
     explained = _explained(result, noise)
     visits = tuple(_visits(result, fits))
-    far = tuple(far_values(result, explained, _lacking(result)))
+    far = tuple(_far_values(result, explained))
     # Where all lengths are others than the cell's, so are the compliances to expect.
     scaled = any(f.kind == "scale" for f in far)
     found = [
@@ -132,24 +131,16 @@ def _trust(found: list[Finding]) -> Finding:
         if any(f.severity == severity for f in found):
             worst = severity
     doubts = tuple(f.kind for f in found if f.severity == worst) if worst != "good" else ()
-    return Finding("trust", worst, {"because": doubts}, USE if worst == "good" else "")
-
-
-def _um(metres: float) -> float:
-    return float(metres) * 1e6
+    return made(worst, "trust", USE if worst == "good" else "", because=doubts)
 
 
 def _spoilt(result: Calibration) -> Iterator[Finding]:
     """What makes the result worthless."""
     if not result.converged:
-        yield Finding(
-            "not_converged", "poor", {"reason": result.reason},
-            "Give start hints in [model.nominal], fit fewer effects, or measure more poses.",
-        )  # fmt: skip
+        yield _poor("not_converged", reason=result.reason)
     held, nominal = result.heldout_rms, result.nominal_rms
     if held < math.inf and nominal < math.inf and held >= nominal and not only_placed(result):
-        numbers: dict[str, Number] = {"heldout_rms_um": _um(held), "nominal_rms_um": _um(nominal)}
-        yield Finding("no_better_than_nominal", "poor", numbers)
+        yield _poor("no_better_than_nominal", heldout_rms_um=held, nominal_rms_um=nominal)
 
 
 def _explained(result: Calibration, noise: tuple[Finding, ...]) -> bool:
@@ -173,14 +164,9 @@ def _explained(result: Calibration, noise: tuple[Finding, ...]) -> bool:
 
 
 def _copies(result: Calibration) -> Iterator[Finding]:
-    if result.copies:
-        n = len(result.copies)
-        yield Finding(
-            "copied_readings", "note",
-            {"copies": n, "fitted": len(result.observations.lead), "lines": result.copies},
-            "Find out how lines came to be in the table twice; readings that were rounded until "
-            "they agree should be given with all their digits.",
-        )  # fmt: skip
+    if copies := result.copies:
+        fitted = len(result.observations.lead)
+        yield _note("copied_readings", copies=len(copies), fitted=fitted, lines=copies)
 
 
 def _load_unit(result: Calibration) -> Iterator[Finding]:
@@ -190,12 +176,11 @@ def _load_unit(result: Calibration) -> Iterator[Finding]:
     differ from what is expected of them (EXPECTED_TO).  By the links' weights alone, a rule of
     thumb, it is worth a look, and no more.
     """
-    if not result.observations.table.force.any():
-        return
     known = {e.name: e.value for e in result.ordinary if e.value is not None}
     # Turned round, the loads may be in another unit as well: then the sizes tell.
     known |= {p.name: abs(e.held) for p, e in impossible(result)}
-    found = load_ratio(result.model, known)
+    loaded = result.observations.table.force.any()
+    found = load_ratio(result.model, known) if loaded else None
     if found is None:
         return
     ratio, by = found
@@ -206,23 +191,12 @@ def _load_unit(result: Calibration) -> Iterator[Finding]:
         if ratio > 1
         else ("newtons times 9.81", "newtons were multiplied by 9.81", "divide")
     )
-    yield Finding(
-        "load_unit", "care" if by == CELL else "note", {"ratio": ratio, "by": by, "unit": unit},
+    remedy = (
         f"Check the unit of the loads: the compliances are {ratio:.2g} times those expected from "
-        f"{by}, as where {cause}. If so, {undo} force_x_N, force_y_N and force_z_N by 9.81.",
-    )  # fmt: skip
-
-
-# Standard deviations beyond a physical bound, by which no estimate errs by chance.
-SURELY = 5.0
-TURN_ROUND = (
-    "Check the sign of the force columns: where z points up, force_z_N of a hanging load is "
-    "negative. Turn the sign round in the table if it is wrong (torque columns too), and identify "
-    "again."
-)
-AT_BOUND = (
-    "Check load direction and torque signs, measure poses that load it more, or fit with bounds."
-)
+        f"{by}, as where {cause}. If so, {undo} force_x_N, force_y_N and force_z_N by 9.81."
+    )
+    say = _care if by == CELL else _note
+    yield say("load_unit", remedy, ratio=ratio, by=by, unit=unit)
 
 
 def impossible(result: Calibration) -> list[tuple[Parameter, Estimate]]:
@@ -245,25 +219,127 @@ def _impossible(result: Calibration) -> Iterator[Finding]:
     springs = [p for p in result.model.parameters if p.effect == JointCompliance.name]
     turned = [p for p, _ in found if p.effect == JointCompliance.name]
     signs = 2 * len(turned) > len(springs) and bool(result.observations.table.force.any())
-    yield Finding(
-        "impossible_values", "poor" if signs else "care",
-        {
-            "parameters": tuple(p.name for p, _ in found),
-            "values": tuple(e.held for _, e in found), "units": tuple(p.unit for p, _ in found),
-            "likely": "the sign of the force columns" if signs else "",
-        },
-        TURN_ROUND if signs else AT_BOUND,
+    parameters, estimates = zip(*found, strict=True)
+    yield (_poor if signs else _care)(
+        "impossible_values", TURN_ROUND if signs else AT_BOUND,
+        parameters=tuple(p.name for p in parameters), values=tuple(e.held for e in estimates),
+        units=tuple(p.unit for p in parameters),
+        likely="the sign of the force columns" if signs else "",
     )  # fmt: skip
 
 
 def _hardly_shown(result: Calibration) -> Iterator[Finding]:
     names = tuple(name for name, standing in standings(result).items() if standing == WEAK)
     if names:
-        yield Finding(
-            "hardly_shown", "note", {"parameters": names},
-            "Measure poses and loads that strain what the readings hardly show (elastocal design "
-            "plans them), or give it a prior.",
+        yield _note("hardly_shown", parameters=names)
+
+
+# Values far from nominal: a joint to remaster, a robot file of another arm, a missing effect.
+#
+# How large a value is says nothing by itself.  Where the noise explains what is left and held-out
+# poses agree, the value is what the arm has; where much is left, a value that no arm has stands in
+# for what the model lacks.
+
+LARGEST = 0.5  # beyond it the points hardly move, as of a tip that touches one, or do so otherwise
+NEARLY = 0.1  # share of the square that a scale leaves of what it explains
+SOME = 400  # readings that are enough for it
+FEWEST_POSES = 8
+FAR = 10.0  # typical deviations from nominal, beyond which an arm that works has no parameter
+# What the nominal arm states and a first cell fits.  Base and markers are guesses, and any other
+# effect is in the cell because someone named it: their sizes are findings, no evidence.
+STATED_BY_FILE = (JointOffset.name, LinkGeometry.name, JointCompliance.name)
+
+
+def _far_values(result: Calibration, explained: bool) -> Iterator[Finding]:
+    """Values whose interval leaves nominal out, and which lie more than FAR typical deviations off;
+    doubted unless the noise explains the residual, and held-out poses agree (`explained`)."""
+    ends = {e.name: e.ci95 for e in result.estimates if e.ci95 is not None}
+    ends |= {next(iter(c.terms)): c.ci95 for c in result.combinations}
+    half = {name: (high - low) / 2 for name, (low, high) in ends.items()}
+    far = [
+        (p, float(x) - p.nominal)
+        for p, x in zip(result.model.parameters, result.x, strict=True)
+        if p.effect in STATED_BY_FILE and p.typical and p.name in half
+        and abs(float(x) - p.nominal) > max(FAR * p.typical, half[p.name])
+    ]  # fmt: skip
+    zeros = [(p, off) for p, off in far if p.effect == JointOffset.name]
+    if zeros:
+        told = [f"{p.where.replace('joint', 'joint ')} is off by {_size(off, p.unit)} (known to "
+                f"{_size(half[p.name], p.unit)})" for p, off in zeros]  # fmt: skip
+        yield _note(
+            "joint_zero",
+            f"The zero of {listed(told)}: remaster it, or command the arm by this calibration.",
+            joints=tuple(p.where for p, _ in zeros), values=tuple(v for _, v in zeros),
+            units=tuple(p.unit for p, _ in zeros), ci95_half=tuple(half[p.name] for p, _ in zeros),
         )  # fmt: skip
+    scale = scale_of(result)
+    if scale is not None:
+        other = abs(scale - 1) > OF_A_TARGET
+        likely = "another robot" if other else "a scale error"
+        remedy = (
+            "Check that the cell describes the robot that was measured ([robot]): no target or "
+            "scale bar is wrong by so much."
+            if other
+            else "Look for what scales the readings: the size stated of a tag or scale bar, or a "
+            f"unit. Multiplied by {1 / scale:.4g} they have the lengths of the robot's file."
+        )
+        yield _care("scale", remedy, readings_over_file=scale, likely=likely)
+        return
+    sizes = {p.name: abs(off) / (p.typical or 1.0) for p, off in far}
+    others = [(p, off) for p, off in far if p.effect != JointOffset.name]
+    others.sort(key=lambda found: -sizes[found[0].name])
+    if others:
+        told = [f"{p.name} by {_size(off, p.unit)} ({_size(half[p.name], p.unit)})"
+                for p, off in others]  # fmt: skip
+        compare = (
+            "The arm is not the one of the robot's file: compare its lengths and angles with the "
+            f"data sheet (off, and known to: {listed(told, 3)})."
+        )
+        yield (_note if explained else _care)(
+            "far_from_nominal" if explained else "unheard_of",
+            compare if explained else _lacking(result),
+            parameters=tuple(p.name for p, _ in others),
+            typical_sizes=tuple(sizes[p.name] for p, _ in others),
+            values=tuple(float(v) + p.nominal for p, v in others),
+            units=tuple(p.unit for p, _ in others), readings_set_apart=len(result.excluded),
+        )  # fmt: skip
+
+
+def scale_of(result: Calibration) -> float | None:
+    """By what factor all lengths that were read exceed those of the nominal arm; None where no such
+    scale shows.
+
+    The linear map A of the readings onto the nominal arm is a rotation with a scale where that is
+    wrong.  One that takes nine tenths of the square away, differs less between directions than from
+    one, and is larger than any arm's lengths err together, is one of the readings.
+    """
+    table = result.observations.table
+    own = any(p.effect == TrackerDistortion.name for p in result.model.parameters)
+    if table.position is None or own or len(np.unique(table.q, axis=0)) < FEWEST_POSES:
+        return None
+    extent = float(np.linalg.norm(np.ptp(table.position, axis=0)))
+    if not SCALED * extent / 10 < result.nominal_rms < math.inf:
+        return None
+    table = table.take(result.observations.lead[:: max(len(result.observations.lead) // SOME, 1)])
+    flange = result.model.rigid.flange_poses(table)
+    found = linear_fits(flange[None], np.asarray(table.position), table.marker)
+    if not 3 * found.left[0] ** 2 < NEARLY * result.nominal_rms**2:
+        return None
+    size = np.linalg.svd(found.matrix[0], compute_uv=False)
+    off = abs(float(found.scale[0]) - 1)
+    alike = found.determinant[0] > 0 and size[0] - size[-1] < off
+    return 1 / float(found.scale[0]) if alike and SCALED < off < LARGEST else None
+
+
+def _size(value: float, unit: str) -> str:
+    """A length in mm, an angle in degrees, as mastering has them."""
+    number, unit = {"m": (value * 1e3, " mm"), "rad": (math.degrees(value), "°")}.get(
+        unit, (value, f" {unit}")
+    )
+    return f"{abs(number):.{2 if abs(number) < 10 else 3}g}{unit}"
+
+
+# Noise, repeats, and what changes with time.
 
 
 def _alike_in_time(result: Calibration, explained: bool) -> Iterator[Finding]:
@@ -276,81 +352,58 @@ def _alike_in_time(result: Calibration, explained: bool) -> Iterator[Finding]:
     if found is None or found.p >= SCATTERS:
         return
     counted = result.noise.drift is not None
-    yield Finding(
-        "autocorrelated", "note" if counted or explained else "care",
-        {
-            "lag1": found.correlations[0], "p": found.p, "visits": found.visits, "by": found.by,
-            "counted": "yes" if counted else "no",
-        },
-        ""
-        if counted
-        else "Visit poses and loads in random order and return to a reference pose every ten "
-        "poses: residuals of visits that follow each other are alike, as where something drifts, "
-        "or where the model lacks what neighbouring poses have in common.",
+    yield (_note if counted or explained else _care)(
+        "autocorrelated", "" if counted else None, lag1=found.correlations[0], p=found.p,
+        visits=found.visits, by=found.by, counted="yes" if counted else "no",
     )  # fmt: skip
 
 
 def _few_poses(result: Calibration) -> Iterator[Finding]:
     n = len(result.observations.value) - result.dof
     if result.dof < FEW_DOF_PER_PARAMETER * n:
-        yield Finding(
-            "few_degrees_of_freedom", "note", {"dof": result.dof, "parameters": n},
-            "Measure more poses.",
-        )  # fmt: skip
+        yield _note("few_degrees_of_freedom", dof=result.dof, parameters=n)
     if not math.isfinite(result.heldout_rms):
         # Test data check it; it matters little where it is the smaller part of the error.
-        found, numbers = result.predicted, dict[str, Number]()
+        found, numbers = result.predicted, {}
         if found is not None and math.isfinite(found.unchecked):
-            numbers = {"unchecked_um": _um(found.unchecked), "rms_um": _um(found.rms)}
+            numbers = {"unchecked_um": found.unchecked, "rms_um": found.rms}
         little = found is not None and found.unchecked**2 <= MOSTLY * found.rms**2
-        severity: Severity = "note" if little or result.test is not None else "care"
-        yield Finding(
-            "not_held_out", severity, numbers, _more_poses() if severity == "care" else ""
-        )
-
-
-def _more_poses() -> str:
-    return (
-        f"Measure more poses: elastocal design with {option('augment')} plans what these data lack."
-    )
+        if little or result.test is not None:
+            yield _note("not_held_out", **numbers)
+        else:
+            yield _care("not_held_out", more_poses(), **numbers)
 
 
 def _against_stated_noise(result: Calibration) -> Iterator[Finding]:
     """The residual's mean square against the stated noise, by its χ² distribution."""
     ratio = result.noise.ratio_to_stated
     if ratio is None:
-        remedy = "" if _lacks_fit(result) else STATE_NOISE
-        yield Finding("noise_not_compared", "note", {}, remedy)
+        yield _note("noise_not_compared", "" if _lacks_fit(result) else STATE_NOISE)
         return
     # A mean square varies by (2 + excess kurtosis) / n.
     told = result.dof / (1 + max(_stated_kurtosis(result), 0.0) / 2)
-    low, high = np.sqrt(special.chdtri(told, 1 - np.array(STATED)) / told)
-    numbers: dict[str, Number] = {
-        "ratio": float(ratio), "by_chance_from": float(low), "by_chance_to": float(high),
-        "dof": result.dof,
-    }  # fmt: skip
+    low, high = np.sqrt(special.chdtri(told, 1 - np.array(STATED)) / told).tolist()
     single = result.noise.single
     if single is not None and single.above:
         times = ratio if single.explains else single.ratio
-        yield Finding(
-            "stated_noise_too_small", "note",
-            {"ratio": single.ratio, "dof": single.dof, "by": single.by, "p_rest": single.rest},
+        remedy = (
             f"Correct [tracker]: by {single.by} single readings scatter {times:.2g} times as much "
-            "as cell or table state.",
+            "as cell or table state."
+        )
+        yield _note(
+            "stated_noise_too_small", remedy,
+            ratio=single.ratio, dof=single.dof, by=single.by, p_rest=single.rest,
         )  # fmt: skip
+    say, kind, doing = _good, "residual_agrees_with_stated_noise", None
     if ratio > high and not (single is not None and single.explains):
-        yield Finding("residual_above_stated_noise", "care", numbers, _lacking(result))
+        say, kind, doing = _care, "residual_above_stated_noise", _lacking(result)
     elif ratio > high:
-        yield Finding("residual_agrees_with_readings", "good", numbers)
+        kind = "residual_agrees_with_readings"
     elif ratio < low:
-        severity: Severity = "care" if ratio < FAR_TOO_LARGE else "note"
-        yield Finding(
-            "residual_below_stated_noise", severity, numbers,
-            "State the tracker's true noise: with noise stated too large, a missing effect does "
-            "not show.",
-        )  # fmt: skip
-    else:
-        yield Finding("residual_agrees_with_stated_noise", "good", numbers)
+        say = _care if ratio < FAR_TOO_LARGE else _note
+        kind = "residual_below_stated_noise"
+    chance = {"by_chance_from": low, "by_chance_to": high}
+    yield say(kind, doing, ratio=float(ratio), **chance, dof=result.dof)
 
 
 def _stated_kurtosis(result: Calibration) -> float:
@@ -364,12 +417,9 @@ def _stated_kurtosis(result: Calibration) -> float:
 
 def _lacking(result: Calibration) -> str:
     """What to do where much is left: ask diagnose, unless the cell has what it names."""
-    usual = set(STATED_BY_FILE)
-    named = {
-        p.effect.replace("_", " "): None
-        for p in result.model.parameters
-        if p.effect not in usual and not effect_of(p.effect).registered
-    }
+    effects = dict.fromkeys(p.effect for p in result.model.parameters)
+    named = [e.replace("_", " ") for e in effects
+             if e not in STATED_BY_FILE and not effect_of(e).registered]  # fmt: skip
     return NAMED.format(listed(named, 3)) if named else LACKING
 
 
@@ -384,29 +434,21 @@ def _repeats(result: Calibration, fits: bool) -> Iterator[Finding]:
     Where the residual `fits` a stated noise of which readings share some, nothing is missing.
     """
     noise, test = result.noise, result.noise.lack_of_fit
-    shared = [s for s in noise.sizes or () if s.part == CONFIGURATION and s.sigma is not None]
+    sizes = [s for s in noise.sizes or () if s.part == CONFIGURATION]
+    shared = {s.name: s.sigma for s in sizes if s.sigma is not None}
     if test is not None:
         counted = "the intervals" if noise.intervals_by_configuration else "nothing"
         if shared or noise.drift is not None:
             counted = "the noise model"
-        numbers: dict[str, Number] = {
-            "F": test.F, "dof_between": test.dof_between, "dof_pure": test.dof_pure, "p": test.p,
-            "counted_by": counted,
-        }  # fmt: skip
+        say, kind, doing = _good, "repeats_agree", ""
         if _lacks_fit(result):
             known = fits and result.model.cell.noise.shared and counted == "the noise model"
-            severity: Severity = "note" if known else "care"
-            yield Finding("lack_of_fit", severity, numbers, "" if known else _lacking(result))
-        else:
-            yield Finding("repeats_agree", "good", numbers)
+            say, kind = _note if known else _care, "lack_of_fit"
+            doing = "" if known else _lacking(result)
+        dofs = {"dof_between": test.dof_between, "dof_pure": test.dof_pure}
+        yield say(kind, doing, F=test.F, **dofs, p=test.p, counted_by=counted)
     if shared:
-        yield Finding(
-            "common_deviation", "note",
-            {
-                "of": tuple(s.name for s in shared),
-                "sigma_um": tuple(_um(s.sigma) for s in shared if s.sigma is not None),
-            },
-        )  # fmt: skip
+        yield _note("common_deviation", of=tuple(shared), sigma_um=tuple(shared.values()))
 
 
 def _visits(result: Calibration, fits: bool) -> Iterator[Finding]:
@@ -416,44 +458,38 @@ def _visits(result: Calibration, fits: bool) -> Iterator[Finding]:
     noise, sizes = result.noise, result.noise.sizes or ()
     stated = result.model.cell.noise
     scatter = stated.of_joints(result.model.chain.n_joints)
+    joints = [s for s in sizes if s.joints and s.sigma]
+    drifts = [s for s in sizes if s.part == TIME and s.sigma]
     for test in noise.tests:
         if test.p >= SCATTERS:
             continue
-        joints = [s for s in sizes if s.joints and s.sigma]
         if test.part == JOINTS and joints:
-            yield Finding(
-                "joint_scatter", "note",
-                {
-                    "of": tuple(s.name for s in joints), "p": test.p,
-                    "sigma_urad": tuple(_um(s.sigma or 0.0) for s in joints),
-                },
+            said = [(s, float(np.sqrt((scatter[list(s.joints)] ** 2).mean()))) for s in joints]
+            remedy = (
                 "Measure more poses, not more repeats, and approach each from the same side: the "
-                "joints settle anew at every visit. "
-                + _beside_stated("joints_urad", [
-                    (s, float(np.sqrt((scatter[list(s.joints)] ** 2).mean()))) for s in joints
-                ], fits),
-            )  # fmt: skip
+                f"joints settle anew at every visit. {_beside_stated('joints_urad', said, fits)}"
+            )
+            of, sizes_of = zip(*((s.name, s.sigma or 0.0) for s in joints), strict=True)
+            yield _note("joint_scatter", remedy, of=of, p=test.p, sigma_urad=sizes_of)
         elif test.part == TIME and noise.drift is not None:
-            drifts = [s for s in sizes if s.part == TIME and s.sigma]
             if drifts:
                 remedy = _beside_stated("drift_um", [(drifts[0], stated.drift)], fits)
                 yield _drift(noise.drift, drifts[0], test.p, remedy)
         else:
             known = scatter.any() if test.part == JOINTS else stated.drift > 0
-            yield Finding(
-                "scatter_not_counted", "care",
-                {"part": test.part, "p": test.p},
+            remedy = (
                 "Fit with the scatter that [noise] of the cell states: "
                 f"{option('noise', Kind.parsed(noise.kind).with_stated(stated).name)}."
                 if known
                 else "Ask what the model lacks (elastocal diagnose): residuals change from visit "
-                "to visit or in time, and noise that does so does not predict poses better.",
-            )  # fmt: skip
+                "to visit or in time, and noise that does so does not predict poses better."
+            )
+            yield _care("scatter_not_counted", remedy, part=test.part, p=test.p)
 
 
 def _beside_stated(key: str, found: list[tuple[NoiseSize, float]], fits: bool) -> str:
     """What to do about `key` of [noise], by the sizes found and stated (m or rad)."""
-    said = listed([f"{_um(size):.3g}" for _, size in found if size])
+    said = listed([f"{1e6 * size:.3g}" for _, size in found if size])
     if not said:
         return f"State it as [noise] {key} in the cell for design and simulate."
     if all(size.agrees_with(stated) for size, stated in found):
@@ -465,18 +501,17 @@ def _beside_stated(key: str, found: list[tuple[NoiseSize, float]], fits: bool) -
 
 def _drift(drift: Drift, size: NoiseSize, p: float, remedy: str) -> Finding:
     timed = drift.seconds is not None
-    return Finding(
-        "drift", "care",
-        {
-            "sigma_um": _um(size.sigma or 0.0), "p": p,
-            "lasting_s": drift.seconds, "lasting_share": drift.share,
-            "by": "times" if timed else "order of the rows",
-        },
+    return _care(
+        "drift",
         "Measure poses and loads in random order, return to a reference pose every ten poses, "
         + ("" if timed else "record times, ")
-        + f"and let arm and tracker warm up. {remedy}"
-        + ("" if drift.ends else WANDERS),
+        + f"and let arm and tracker warm up. {remedy}" + ("" if drift.ends else WANDERS),
+        sigma_um=size.sigma or 0.0, p=p, lasting_s=drift.seconds, lasting_share=drift.share,
+        by="times" if timed else "order of the rows",
     )  # fmt: skip
+
+
+# Poses that were not fitted.
 
 
 def _prediction(result: Calibration, explained: bool) -> Iterator[Finding]:
@@ -486,11 +521,9 @@ def _prediction(result: Calibration, explained: bool) -> Iterator[Finding]:
     # Of base and tool alone, what each point takes of the fit is all that it can flatter by.
     flatters = math.isfinite(held) and held > FLATTERS * fitted and not (placed and explained)
     if flatters and result.noise.drift is None:
-        numbers: dict[str, Number] = {"heldout_rms_um": _um(held), "residual_rms_um": _um(fitted)}
-        yield Finding("fit_flatters", "care", numbers, _more_poses())
+        yield _care("fit_flatters", heldout_rms_um=held, residual_rms_um=fitted)
     if held < nominal < LITTLE * held < math.inf and not placed:
-        numbers = {"heldout_rms_um": _um(held), "nominal_rms_um": _um(nominal)}
-        yield Finding("little_gain", "care", numbers)
+        yield _care("little_gain", heldout_rms_um=held, nominal_rms_um=nominal)
 
 
 def _new_poses(result: Calibration, explained: bool) -> Iterator[Finding]:
@@ -501,43 +534,24 @@ def _new_poses(result: Calibration, explained: bool) -> Iterator[Finding]:
     placed = explained and only_placed(result)
     left, wanted = spare_equations(result), COARSE if placed else ENOUGH
     if left < wanted:
-        numbers: dict[str, Number] = {
-            "configurations": result.observations.n_configurations,
-            "parameters": len(result.observations.value) - result.dof,
-            "equations_left": left, "needed": wanted,
-        }  # fmt: skip
-        yield Finding("few_configurations", "care", numbers, _more_poses())
+        yield _care(
+            "few_configurations", configurations=result.observations.n_configurations,
+            parameters=len(result.observations.value) - result.dof,
+            equations_left=left, needed=wanted,
+        )  # fmt: skip
     if result.excess is None:
-        yield Finding("noise_unknown", "care", {}, STATE_NOISE)
+        yield _care("noise_unknown")
     found = result.predicted
     if found is None:
         return
-    numbers = {
-        "rms_um": _um(found.rms), "from_um": _um(found.ci95[0]), "to_um": _um(found.ci95[1]),
-        "poses": found.poses, "source": found.source,
-    }  # fmt: skip
-    yield Finding("new_poses", "note", numbers)
+    low, high = found.ci95
+    numbers = {"from_um": low, "to_um": high, "poses": found.poses, "source": found.source}
+    yield _note("new_poses", rms_um=found.rms, **numbers)
     if found.open**2 > MOSTLY * found.rms**2:
-        yield Finding(
-            "new_poses_not_shown", "care",
-            {
-                "open_um": _um(found.open), "heldout_rms_um": _um(result.heldout_rms),
-                "parameters": found.blamed,
-            },
-            f"{_more_poses()} For a part of the joint ranges alone, state test poses in the cell.",
-        )  # fmt: skip
+        numbers = {"open_um": found.open, "heldout_rms_um": result.heldout_rms}
+        yield _care("new_poses_not_shown", **numbers, parameters=found.blamed)
     if found.rms > result.nominal_rms / LITTLE and not only_placed(result):
-        numbers = {"rms_um": _um(found.rms), "nominal_rms_um": _um(result.nominal_rms)}
-        yield Finding("new_poses_no_gain", "care", numbers, _more_poses())
-
-
-# Equations left between configurations from which their scatter says to a factor of 1.25, with
-# 95 % probability, what errors there are beyond the parameters: √(ν/χ²_ν(5 %)) ≤ 1.25; and from
-# which it says it to a factor of 1.5.
-ENOUGH, COARSE = (
-    next(n for n in range(1, 1000) if n <= factor**2 * special.chdtri(n, 0.95))
-    for factor in (1.25, 1.5)
-)
+        yield _care("new_poses_no_gain", rms_um=found.rms, nominal_rms_um=result.nominal_rms)
 
 
 def spare_equations(result: Calibration) -> int:
@@ -557,22 +571,16 @@ def spare_equations(result: Calibration) -> int:
 
 
 def _faulty(result: Calibration) -> Iterator[Finding]:
-    n, fitted = len(result.faulty), len(result.observations.lead)
+    n, fitted, kept = len(result.faulty), len(result.observations.lead), len(result.outliers)
     if n:
-        named = "1 reading" if n == 1 else f"{n} readings"
-        yield Finding(
-            "faulty_readings", "note",
-            {
-                "fitted": len(result.outliers), "left_out": len(result.excluded),
-                "heldout_all_rms_um": _um(result.heldout_all_rms),
-            },
-            f"Check the {named} beyond the noise.",
-        )  # fmt: skip
-    if len(result.outliers) > MANY * fitted:
-        yield Finding(
-            "many_faulty_readings", "care", {"faulty": len(result.outliers), "fitted": fitted},
-            "Check where they lie before excluding any.",
-        )  # fmt: skip
+        remedy = f"Check the {n} reading{'s' * (n > 1)} beyond the noise."
+        numbers = {"left_out": len(result.excluded), "heldout_all_rms_um": result.heldout_all_rms}
+        yield _note("faulty_readings", remedy, fitted=kept, **numbers)
+    if kept > MANY * fitted:
+        yield _care("many_faulty_readings", faulty=kept, fitted=fitted)
+
+
+# What the readings do not tell of the parameters.
 
 
 def _undetermined(result: Calibration) -> Iterator[Finding]:
@@ -580,22 +588,20 @@ def _undetermined(result: Calibration) -> Iterator[Finding]:
     all_of_them = standings(result)
     lacking = [e.name for e in result.ordinary if all_of_them[e.name] in (INVISIBLE, ABSORBED)]
     redundant = () if result.left is None else result.left.redundant
-    shown = [name for name in lacking if name not in redundant]
+    shown = tuple(name for name in lacking if name not in redundant)
     if n := len(lacking) - len(shown):
-        yield Finding("redundant", "good", {"parameters": n})
+        yield _good("redundant", parameters=n)
     unread = tuple(name for name, standing in all_of_them.items() if standing == UNREAD)
     if unread:
-        yield Finding(
-            "markers_not_read", "note", {"parameters": unread},
-            f"There is {no_reading(result)}: measure it, or delete it from [tool.markers_m].",
-        )  # fmt: skip
+        remedy = f"There is {no_reading(result)}: measure it, or delete it from [tool.markers_m]."
+        yield _note("markers_not_read", remedy, parameters=unread)
     if n := len(shown):
-        yield Finding(
-            "undetermined", "note", {"parameters": n, "names": tuple(shown)},
+        remedy = (
             f"{n} parameter{'' if n == 1 else 's'} cannot be determined from these data "
             f"({listed(shown, 4)}). Predictions hold for poses and loads like those measured; for "
-            "others, measure what shows them.",
-        )  # fmt: skip
+            "others, measure what shows them."
+        )
+        yield _note("undetermined", remedy, parameters=n, names=shown)
 
 
 def _unread(result: Calibration) -> list[str]:
@@ -617,11 +623,7 @@ def _prior(result: Calibration) -> Iterator[Finding]:
     shares = result.prior_share
     names = sorted((n for n, s in shares.items() if s > MOSTLY), key=lambda n: -shares[n])
     if names:
-        yield Finding(
-            "mostly_prior", "note",
-            {"parameters": tuple(names), "share": tuple(shares[n] for n in names)},
-            "Measure poses that load them more.",
-        )  # fmt: skip
+        yield _note("mostly_prior", parameters=tuple(names), share=tuple(shares[n] for n in names))
 
 
 def standings(result: Calibration) -> dict[str, str]:
@@ -652,32 +654,24 @@ def _shape(result: Calibration) -> Iterator[Finding]:
         yield shape_of(result.residual_summary)
         n = sum(g.n_deviating for g in result.residual_summary.groupings)
         if n:
-            yield Finding("scatter_unlike_noise_model", "note", {"groups": n})
+            yield _note("scatter_unlike_noise_model", groups=n)
 
 
 def shape_of(summary: ResidualSummary) -> Finding:
     """Are the standardised residuals normal?"""
-    whole = summary.whole
-    numbers: dict[str, Number] = {
-        "skewness": whole.skewness, "excess_kurtosis": whole.excess_kurtosis,
-        "p": whole.normality_p,
-    }  # fmt: skip
-    if whole.normality_p is None:
-        return Finding("residuals_too_few", "note", numbers)
-    if whole.normality_p >= NOT_NORMAL:
-        return Finding("residuals_normal", "good", numbers)
-    # Of a normal sample, kurtosis has twice the standard deviation of skewness.
-    if abs(whole.skewness) > abs(whole.excess_kurtosis) / 2:
-        return Finding("residuals_skew", "note", numbers)
-    if whole.excess_kurtosis <= 0:
-        return Finding("residuals_light_tailed", "note", numbers)
-    severity: Severity = "care" if whole.excess_kurtosis > HEAVY else "note"
-    return Finding(
-        "residuals_heavy_tailed", severity, numbers,
-        f"Compare with a robust fit ({option('method')} huber or l1): where parameters "
-        "differ by more than their intervals, far readings decide them; look for what makes single "
-        "readings err (line of sight, vibration, a tracker that has not settled).",
+    skew, kurtosis, p = (
+        summary.whole.skewness, summary.whole.excess_kurtosis, summary.whole.normality_p
     )  # fmt: skip
+    say, kind = _note, "residuals_too_few"
+    if p is not None and p >= NOT_NORMAL:
+        say, kind = _good, "residuals_normal"
+    elif p is not None:
+        # Of a normal sample, kurtosis has twice the standard deviation of skewness.
+        skewed = abs(skew) > abs(kurtosis) / 2
+        tails = "residuals_heavy_tailed" if kurtosis > 0 else "residuals_light_tailed"
+        kind = "residuals_skew" if skewed else tails
+        say = _care if kind == "residuals_heavy_tailed" and kurtosis > HEAVY else _note
+    return say(kind, skewness=skew, excess_kurtosis=kurtosis, p=p)
 
 
 def _test(result: Calibration) -> Iterator[Finding]:
@@ -685,24 +679,16 @@ def _test(result: Calibration) -> Iterator[Finding]:
     reading count as one."""
     test, held = result.test, result.heldout_rms
     if test is None:
-        yield Finding(
-            "untested", "note", {},
-            "Validate on independent poses: measure some that are not fitted, and give them with "
-            f"{option('test')}.",
-        )  # fmt: skip
-    elif math.isfinite(held):
+        yield _note("untested")
+        return
+    if math.isfinite(held):
         allowed = math.sqrt(special.fdtri(test.n, result.dof, 1 - CHANCE))
         if test.rms > max(WORSE, allowed) * held:
-            numbers: dict[str, Number] = {"test_rms_um": _um(test.rms), "heldout_rms_um": _um(held)}
-            yield Finding("test_data_worse", "care", numbers, COMPARE)
-    if test is not None and test.p_far < CHANCE:
-        yield Finding(
-            "test_data_far", "care",
-            {
-                "far": test.far, "configurations": test.configurations, "p": test.p_far,
-                "predicted_std_um": _um(test.std), "fitted_std_um": _um(test.most_fitted),
-            },
-            "Measure poses there: the fit extrapolates.",
+            yield _care("test_data_worse", test_rms_um=test.rms, heldout_rms_um=held)
+    if test.p_far < CHANCE:
+        yield _care(
+            "test_data_far", far=test.far, configurations=test.configurations, p=test.p_far,
+            predicted_std_um=test.std, fitted_std_um=test.most_fitted,
         )  # fmt: skip
 
 
@@ -723,30 +709,22 @@ def _exchanged(result: Calibration, whole: Measurements) -> Iterator[Finding]:
     if found is not None:
         lines = whole.row[found.rows]
         fitted = np.isin(lines, result.observations.table.row).any()
-        yield Finding(
-            "exchanged_markers", "care" if fitted else "note",
-            {"markers": found.markers, "rows": len(lines), "lines": tuple(lines.tolist())},
-            found.words,
+        yield (_care if fitted else _note)(
+            "exchanged_markers", found.words, markers=found.markers, rows=len(lines),
+            lines=tuple(lines.tolist()),
         )  # fmt: skip
 
 
 def _conditioning(result: Calibration, solution: Solution) -> Iterator[Finding]:
-    kept = solution.reduction.kept
     # Unit columns: what is judged is how far they are from parallel, not their units.
     scaled = solution.fit.r_factor.R
     scaled = scaled / np.linalg.norm(scaled, axis=0)
-    _, singular, Vt = linalg.svd(scaled[: min(len(kept), scaled.shape[1])])
-    if singular[0] <= ILL_CONDITIONED * singular[-1]:
-        return
-    worst = np.argsort(-np.abs(Vt[-1]))[:3]
-    yield Finding(
-        "ill_conditioned", "note",
-        {
-            "condition_number": float(singular[0] / singular[-1]),
-            "parameters": tuple(result.determined[i] for i in worst),
-        },
-        "Measure poses in which the joints differ more, or fix one of these parameters.",
-    )  # fmt: skip
+    kept = min(len(solution.reduction.kept), scaled.shape[1])
+    _, singular, Vt = linalg.svd(scaled[:kept])
+    if singular[0] > ILL_CONDITIONED * singular[-1]:
+        worst = tuple(result.determined[i] for i in np.argsort(-np.abs(Vt[-1]))[:3])
+        condition = float(singular[0] / singular[-1])
+        yield _note("ill_conditioned", condition_number=condition, parameters=worst)
 
 
 def _bounds(result: Calibration) -> Iterator[Finding]:
@@ -756,14 +734,9 @@ def _bounds(result: Calibration) -> Iterator[Finding]:
         if e.limits is None or not p.beyond(e.limits) or p.name in told:
             continue
         std = float(np.sqrt(result.covariance[at[e.name], at[e.name]]))
-        yield Finding(
-            "beyond_bound", "note",
-            {
-                "parameter": e.name, "unit": e.unit,
-                "bound": p.lower if e.held <= p.lower else p.upper, "value": e.held, "std": std,
-            },
-            AT_BOUND,
-        )  # fmt: skip
+        bound = p.lower if e.held <= p.lower else p.upper
+        numbers = {"unit": e.unit, "bound": bound, "value": e.held, "std": std}
+        yield _note("beyond_bound", parameter=e.name, **numbers)
 
 
 def only_placed(result: Calibration) -> bool:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable
+from contextlib import suppress
 from dataclasses import dataclass
 from functools import lru_cache
 from typing import NamedTuple, TypeVar
@@ -214,7 +215,7 @@ def until_it_stands(
 
     Raises ElastocalError where the first fit fails.
     """
-    half, ended = len(good) // 2 + 1, False
+    ended = False
     visited: list[tuple[float, BoolArray, Found]] = []
     for _ in range(ROUNDS):
         try:
@@ -224,7 +225,7 @@ def until_it_stands(
                 raise
             break  # so few cannot judge the others
         squared, agrees = judged(found, good)
-        visited.append((float(np.partition(squared, half - 1)[:half].sum()), good, found))
+        visited.append((better_half(squared), good, found))
         if ended or np.array_equal(agrees, good) or 2 * agrees.sum() <= len(agrees):
             break
         masks = [mask for _, mask, _ in visited]
@@ -232,9 +233,21 @@ def until_it_stands(
         ended = again is not None
         good = np.logical_or.reduce(masks[again:]) if ended else agrees
     last, best = visited[-1], min(visited, key=lambda one: one[0])
-    if last[0] > best[0] * special.fdtri(half * size, half * size, 1 - FALSE_ALARM):
+    if last[0] > best[0] * chance_of_half(len(good), size):
         last = best
     return last[2], last[1]
+
+
+def better_half(squared: Array) -> float:
+    """Sum of the smaller half of the squared errors (n,)."""
+    half = len(squared) // 2 + 1
+    return float(np.partition(squared, half - 1)[:half].sum())
+
+
+def chance_of_half(n: int, size: int) -> float:
+    """Beyond which ratio two such sums, of n observations, differ by more than chance."""
+    rows = (n // 2 + 1) * size
+    return float(special.fdtri(rows, rows, 1 - FALSE_ALARM))
 
 
 # Typical sizes in a deviation of the prior: readings of an arm whose errors are five typical sizes
@@ -255,10 +268,15 @@ def find_faulty(solution: Solution) -> BoolArray:
     width = prior_widths(problem.model, solution.sizes)[problem.free]
     x0, free, size = problem.x0, problem.free, part.observations.size
     placed = is_placed(problem.model)[free]
-    x = x0.copy() if placed.any() else solution.fit.x.copy()
+    x = (x0 if placed.any() else solution.fit.x).copy()
     B, y = _whitened(problem, part, x)
     B, y = B * width, y + B @ (x - x0)[free]
-    good, variance = majority(B[:, :, placed], y)
+    starts = [majority(B[:, :, placed], y)]
+    # An arm's own errors hide what all parameters show; half of few readings shows nothing.
+    rows = B.reshape(-1, B.shape[2])
+    if len(rows) >= 4 * np.linalg.matrix_rank(rows / np.maximum(np.abs(rows).max(axis=0), TINY)):
+        starts.append(majority(B, y))
+    good, variance = starts[0]
 
     def fitted(good: BoolArray) -> FitToGood:
         nonlocal B, y, variance
@@ -276,12 +294,17 @@ def find_faulty(solution: Solution) -> BoolArray:
     def judged(fit: FitToGood, good: BoolArray) -> tuple[Array, BoolArray]:
         return (fit.e**2).sum(axis=1), fit.p_values(fit.T, fit.e, good) >= FALSE_ALARM / n
 
-    faulty = np.zeros(n, dtype=bool)
-    try:
-        fit, good = until_it_stands(good, fitted, judged, size)
-    except ElastocalError:
-        return faulty  # so far out the arm has no equilibrium
-    faulty[part.index[~good]] = True
+    faulty, best = np.zeros(n, dtype=bool), np.inf
+    for start in starts:
+        good, variance = start
+        with suppress(ElastocalError):  # so far out the arm has no equilibrium
+            other, agrees = until_it_stands(good, fitted, judged, size)
+            left = better_half((other.e**2).sum(axis=1))
+            if left * chance_of_half(len(agrees), size) < best:
+                best, fit, chosen = left, other, agrees
+    if np.isinf(best):
+        return faulty
+    faulty[part.index[~chosen]] = True
     if problem.large:
         faulty |= _contradicting(problem, fit, width, part)
     return faulty if 2 * faulty.sum() < n else np.zeros(n, dtype=bool)

@@ -1,14 +1,107 @@
-"""Findings in sentences: the warnings of a result, and the steps that are left to be told."""
+"""Findings in sentences: what to do about each, the warnings of a result, the steps left."""
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Iterator
+from collections.abc import Callable, Iterable, Iterator
 from typing import Any
 
 from elastocal.errors import option
 from elastocal.identification.outliers import Outlier, blocks
-from elastocal.identification.result import Calibration, Finding
+from elastocal.identification.result import Calibration, Finding, Severity
 from elastocal.text import gathered, listed
+
+# What to do about a finding.
+
+LACKING = (
+    "Ask what the model lacks: elastocal diagnose with the same cell and data. Where it finds "
+    "nothing, the excess is the robot's repeatability, or noise larger than stated ([tracker])."
+)
+NAMED = (
+    "The cell has {} already. If diagnose named that, it has no name for what is left: repeat some "
+    "poses, which tell noise and repeatability from what the model lacks."
+)
+STATE_NOISE = (
+    "State the tracker's noise ([tracker] sigma_um, or range_um and transverse_um): only beside "
+    "it does the residual say whether the model lacks something. elastocal diagnose looks for "
+    "that either way."
+)
+WANDERS = (
+    " It may last as long as the campaign: these readings do not tell it from a random walk, "
+    "nor where the base is on another day; measure for longer, or on several days."
+)
+TURN_ROUND = (
+    "Check the sign of the force columns: where z points up, force_z_N of a hanging load is "
+    "negative. Turn the sign round in the table if it is wrong (torque columns too), and identify "
+    "again."
+)
+AT_BOUND = (
+    "Check load direction and torque signs, measure poses that load it more, or fit with bounds."
+)
+USE = (
+    "Use it (elastocal compensate, elastocal export) where poses and loads are like those measured."
+)
+
+
+def more_poses() -> str:
+    return (
+        f"Measure more poses: elastocal design with {option('augment')} plans what these data lack."
+    )
+
+
+# What to do about findings of a kind; of others it depends on more.
+REMEDIES: dict[str, str | Callable[[], str]] = {
+    "autocorrelated": "Visit poses and loads in random order and return to a reference pose every "
+    "ten poses: residuals of visits that follow each other are alike, as where something drifts, "
+    "or where the model lacks what neighbouring poses have in common.",
+    "beyond_bound": AT_BOUND,
+    "copied_readings": "Find out how lines came to be in the table twice; readings that were "
+    "rounded until they agree should be given with all their digits.",
+    "few_configurations": more_poses,
+    "few_degrees_of_freedom": "Measure more poses.",
+    "fit_flatters": more_poses,
+    "hardly_shown": "Measure poses and loads that strain what the readings hardly show (elastocal "
+    "design plans them), or give it a prior.",
+    "ill_conditioned": "Measure poses in which the joints differ more, or fix one of these "
+    "parameters.",
+    "many_faulty_readings": "Check where they lie before excluding any.",
+    "mostly_prior": "Measure poses that load them more.",
+    "new_poses_no_gain": more_poses,
+    "new_poses_not_shown": lambda: (
+        f"{more_poses()} For a part of the joint ranges alone, state test poses in the cell."
+    ),
+    "noise_unknown": STATE_NOISE,
+    "not_converged": "Give start hints in [model.nominal], fit fewer effects, or measure more "
+    "poses.",
+    "residual_below_stated_noise": "State the tracker's true noise: with noise stated too large, a "
+    "missing effect does not show.",
+    "residuals_heavy_tailed": lambda: (
+        f"Compare with a robust fit ({option('method')} huber or l1): where parameters differ by "
+        "more than their intervals, far readings decide them; look for what makes single readings "
+        "err (line of sight, vibration, a tracker that has not settled)."
+    ),
+    "test_data_far": "Measure poses there: the fit extrapolates.",
+    "test_data_worse": "Compare the test poses with those fitted: where they lie elsewhere "
+    "(joints, load), fit some like them; where they do not, the arm or the tracker has changed in "
+    "between.",
+    "untested": lambda: (
+        "Validate on independent poses: measure some that are not fitted, and give "
+        f"them with {option('test')}."
+    ),
+}
+
+
+def made(severity: Severity, kind: str, remedy: str | None = None, /, **numbers: Any) -> Finding:
+    """A finding with the remedy of its kind unless one is given; numbers whose names end in _um or
+    _urad are given in m and rad."""
+    if remedy is None:
+        known = REMEDIES.get(kind, "")
+        remedy = known if isinstance(known, str) else known()
+    for name, value in numbers.items():
+        if name.endswith(("_um", "_urad")):
+            several = isinstance(value, tuple)
+            numbers[name] = tuple(v * 1e6 for v in value) if several else float(value) * 1e6
+    return Finding(kind, severity, numbers, remedy)
+
 
 # What a warning says of a finding: its numbers and its remedy by name.
 SENTENCES = {
