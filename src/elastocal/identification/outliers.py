@@ -198,25 +198,43 @@ ROUNDS = 12
 Found = TypeVar("Found")
 
 
+class BetterHalf(NamedTuple):
+    """How well a fit explains the half of all observations that lies nearest: their mean square,
+    over the degrees of freedom of a fit to so many."""
+
+    variance: float
+    dof: float
+
+    @classmethod
+    def of(cls, squared: Array, dof: float, good: BoolArray) -> BetterHalf:
+        half = len(squared) // 2 + 1
+        dof = max(dof, 1.0) * half / max(int(good.sum()), 1)
+        return cls(float(np.partition(squared, half - 1)[:half].sum()) / dof, dof)
+
+    def explains_more(self, other: BetterHalf) -> bool:
+        """Beyond what chance allows."""
+        limit = special.fdtri(other.dof, self.dof, 1 - FALSE_ALARM)
+        return bool(other.variance > limit * self.variance)
+
+
 def until_it_stands(
     good: BoolArray,
     fitted: Callable[[BoolArray], Found],
-    judged: Callable[[Found, BoolArray], tuple[Array, BoolArray]],
-    size: int,
-) -> tuple[Found, BoolArray]:
+    judged: Callable[[Found, BoolArray], tuple[Array, float, BoolArray]],
+) -> tuple[Found, BoolArray, BetterHalf]:
     """Fit and good observations (n,) that agree with each other, starting from `good`.
 
-    `fitted` fits to the good ones and `judged` gives squared errors (n,) beside a fit and which
-    observations it does not contradict.  A set that comes back after others ends the search: those
-    good at any time of that round are kept.  So does a fit that no majority agrees with: it cannot
-    judge.  Observations that are taken back bend the fit, so that more of them seem to fit: where
-    the better half of all is left worse explained than by an earlier set, beyond what chance
-    allows, that set stands.
+    `fitted` fits to the good ones and `judged` gives squared errors (n,) beside a fit, its degrees
+    of freedom and which observations it does not contradict.  A set that comes back after others
+    ends the search: those good at any time of that round are kept.  So does a fit that no majority
+    agrees with: it cannot judge.  Observations that are taken back bend the fit, so that more of
+    them seem to fit: where the better half of all is left worse explained than by an earlier set,
+    beyond what chance allows, that set stands.
 
     Raises ElastocalError where the first fit fails.
     """
     ended = False
-    visited: list[tuple[float, BoolArray, Found]] = []
+    visited: list[tuple[Found, BoolArray, BetterHalf]] = []
     for _ in range(ROUNDS):
         try:
             found = fitted(good)
@@ -224,30 +242,16 @@ def until_it_stands(
             if not visited:
                 raise
             break  # so few cannot judge the others
-        squared, agrees = judged(found, good)
-        visited.append((better_half(squared), good, found))
+        squared, dof, agrees = judged(found, good)
+        visited.append((found, good, BetterHalf.of(squared, dof, good)))
         if ended or np.array_equal(agrees, good) or 2 * agrees.sum() <= len(agrees):
             break
         masks = [mask for _, mask, _ in visited]
         again = next((k for k, mask in enumerate(masks) if np.array_equal(mask, agrees)), None)
         ended = again is not None
         good = np.logical_or.reduce(masks[again:]) if ended else agrees
-    last, best = visited[-1], min(visited, key=lambda one: one[0])
-    if last[0] > best[0] * chance_of_half(len(good), size):
-        last = best
-    return last[2], last[1]
-
-
-def better_half(squared: Array) -> float:
-    """Sum of the smaller half of the squared errors (n,)."""
-    half = len(squared) // 2 + 1
-    return float(np.partition(squared, half - 1)[:half].sum())
-
-
-def chance_of_half(n: int, size: int) -> float:
-    """Beyond which ratio two such sums, of n observations, differ by more than chance."""
-    rows = (n // 2 + 1) * size
-    return float(special.fdtri(rows, rows, 1 - FALSE_ALARM))
+    last, best = visited[-1], min(visited, key=lambda one: one[2].variance)
+    return best if best[2].explains_more(last[2]) else last
 
 
 # Typical sizes in a deviation of the prior: readings of an arm whose errors are five typical sizes
@@ -266,7 +270,7 @@ def find_faulty(solution: Solution) -> BoolArray:
     problem, n = solution.problem, len(solution.problem.observations.lead)
     part = sample(problem.parts, SAMPLE) if problem.large else problem.parts.part((0, n))
     width = prior_widths(problem.model, solution.sizes)[problem.free]
-    x0, free, size = problem.x0, problem.free, part.observations.size
+    x0, free = problem.x0, problem.free
     placed = is_placed(problem.model)[free]
     x = (x0 if placed.any() else solution.fit.x).copy()
     B, y = _whitened(problem, part, x)
@@ -291,20 +295,20 @@ def find_faulty(solution: Solution) -> BoolArray:
                 break
         return fit
 
-    def judged(fit: FitToGood, good: BoolArray) -> tuple[Array, BoolArray]:
-        return (fit.e**2).sum(axis=1), fit.p_values(fit.T, fit.e, good) >= FALSE_ALARM / n
+    def judged(fit: FitToGood, good: BoolArray) -> tuple[Array, float, BoolArray]:
+        agrees = fit.p_values(fit.T, fit.e, good) >= FALSE_ALARM / n
+        return (fit.e**2).sum(axis=1), fit.dof, agrees
 
-    faulty, best = np.zeros(n, dtype=bool), np.inf
+    ends = []
     for start in starts:
         good, variance = start
         with suppress(ElastocalError):  # so far out the arm has no equilibrium
-            other, agrees = until_it_stands(good, fitted, judged, size)
-            left = better_half((other.e**2).sum(axis=1))
-            if left * chance_of_half(len(agrees), size) < best:
-                best, fit, chosen = left, other, agrees
-    if np.isinf(best):
+            ends.append(until_it_stands(good, fitted, judged))
+    faulty = np.zeros(n, dtype=bool)
+    if not ends:
         return faulty
-    faulty[part.index[~chosen]] = True
+    fit, good, _ = ends[-1] if ends[-1][2].explains_more(ends[0][2]) else ends[0]
+    faulty[part.index[~good]] = True
     if problem.large:
         faulty |= _contradicting(problem, fit, width, part)
     return faulty if 2 * faulty.sum() < n else np.zeros(n, dtype=bool)
@@ -519,14 +523,16 @@ def settle(
         noise = estimate_noise(readings.take(chosen), own, noise)
         return noise
 
-    def judged(found: NoiseFit, chosen: BoolArray) -> tuple[Array, BoolArray]:
+    def judged(found: NoiseFit, chosen: BoolArray) -> tuple[Array, float, BoolArray]:
         if not precision:
             precision.append(np.asarray(np.linalg.inv(own_noise(found.fit, readings)[0])))
         r = readings.e - readings.B @ found.x
         agrees = ~unexplained_readings(found, readings, chosen, FALSE_ALARM)
-        return np.einsum("ni,nij,nj->n", r, precision[0], r), agrees
+        dof = readings.size * int(chosen.sum()) - readings.n_parameters
+        return np.einsum("ni,nij,nj->n", r, precision[0], r), dof, agrees
 
     try:
-        return NoiseAndOutliers(*until_it_stands(good, fitted, judged, readings.size))
+        found, good, _ = until_it_stands(good, fitted, judged)
     except ElastocalError:  # the good ones alone do not show all parameters
-        return NoiseAndOutliers(*until_it_stands(every, fitted, judged, readings.size))
+        found, good, _ = until_it_stands(every, fitted, judged)
+    return NoiseAndOutliers(found, good)
