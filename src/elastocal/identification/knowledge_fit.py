@@ -10,7 +10,7 @@ from scipy import special
 from elastocal.errors import InsufficientDataError, option, require
 from elastocal.identification.covariance import Covariance, t_quantile
 from elastocal.identification.knowledge import Constraints, GaussianPrior
-from elastocal.identification.least_squares import Fit, Known, KnownFit, profile_end
+from elastocal.identification.least_squares import Fit, KnownFit, PriorRows, profile_end
 from elastocal.identification.least_squares import fit as least_squares
 from elastocal.identification.options import LEVEL, Intervals, MethodResult, Options
 from elastocal.identification.residuals import held_out_by_parts
@@ -188,7 +188,7 @@ def fit_with_knowledge(
     prior = joined(options.prior, None if own is None else own.prior)
     sigma = residual_sigma(fit, len(fit.columns)) if own is None else own.sigma
     columns = fitted_columns(solution, constraints, prior, sigma)
-    stated = Known.stated(problem.model.names, columns, fit.x, constraints, prior, sigma)
+    stated = PriorRows.stated(problem.model.names, columns, fit.x, constraints, prior, sigma)
     progress("fitting under constraints" if prior is None else "fitting with the prior")
     found = KnownFit(
         least_squares(problem, columns, fit.x, solution.sizes, known=stated), stated, sigma

@@ -213,7 +213,7 @@ class Fit:
 
 
 @dataclass(frozen=True)
-class Known:
+class PriorRows:
     """What a fit knows of its columns besides the readings: P (k, columns) and target (k,) with
     |target − P X|² beside whitened rows, and constraints on them."""
 
@@ -222,7 +222,7 @@ class Known:
     system: System | None = None
 
     @classmethod
-    def near(cls, centre: Array, width: Array) -> Known:
+    def near(cls, centre: Array, width: Array) -> PriorRows:
         """X ~ N(centre, width²) in units of the noise, (columns,) each."""
         return cls(np.diag(1 / width), centre / width)
 
@@ -230,7 +230,7 @@ class Known:
     def stated(
         cls, names: tuple[str, ...], columns: IntArray, x: Array, constraints: Constraints,
         prior: GaussianPrior | None, sigma: float,
-    ) -> Known:  # fmt: skip
+    ) -> PriorRows:  # fmt: skip
         """Constraints and prior on the `columns`, the others held at x (parameters,), beside rows
         of noise `sigma`.  Raises InputError where a held parameter alone breaks a constraint."""
         P, target = np.zeros((0, len(columns))), np.zeros(0)
@@ -250,12 +250,12 @@ class Known:
 
 
 def objective_of(
-    problem: Problem, columns: IntArray, x: Array, sizes: Array, known: Known | None,
+    problem: Problem, columns: IntArray, x: Array, sizes: Array, known: PriorRows | None,
     among: IntArray | None = None,
 ) -> SumOfSquares:  # fmt: skip
     """The objective over u with X[columns] = x[columns] + sizes[columns] · u."""
     size = sizes[columns]
-    known = known or Known(np.zeros((0, len(columns))), np.zeros(0))
+    known = known or PriorRows(np.zeros((0, len(columns))), np.zeros(0))
 
     def evaluated(u: Array, asked: IntArray = columns) -> Evaluation:
         at = evaluate(problem.model, problem.parts, moved(x, columns, size * u), asked)
@@ -280,7 +280,7 @@ def moved(x: Array, columns: IntArray, step: Array) -> Array:
 
 
 def fit(
-    problem: Problem, columns: IntArray, x: Array, sizes: Array, *, known: Known | None = None,
+    problem: Problem, columns: IntArray, x: Array, sizes: Array, *, known: PriorRows | None = None,
     among: IntArray | None = None, max_steps: int = 60, tolerance: float = TOLERANCE,
 ) -> Fit:  # fmt: skip
     """min over X[columns] of |W (y − h(X))|² (eq. 9, nonlinear) with what is `known` of them, the
@@ -322,7 +322,7 @@ class KnownFit:
     the step δ (columns,) from there, |e − B δ|² + |lack − P δ|², and its minimum δ = 0."""
 
     fit: Fit
-    known: Known
+    known: PriorRows
     sigma: float
 
     @cached_property

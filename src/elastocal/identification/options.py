@@ -12,7 +12,7 @@ from elastocal.errors import InputError, option
 from elastocal.identification.constrained import ActiveConstraint
 from elastocal.identification.covariance import Covariance, Rows, clustered, of_rows, t_quantile
 from elastocal.identification.knowledge import Constraints, GaussianPrior
-from elastocal.identification.least_squares import Fit, Known, KnownFit, profile_end
+from elastocal.identification.least_squares import Fit, KnownFit, PriorRows, profile_end
 from elastocal.identification.noise_choice import NoiseFit
 from elastocal.identification.noise_structure import Kind
 from elastocal.identification.smooth_functions import SmoothPart
@@ -106,7 +106,7 @@ def _profiled(solution: Solution, classical: Covariance) -> Intervals:
     """{v: S(v) − Ŝ ≤ t² s²}, the fit being at its minimum."""
     fit = solution.fit
     sigma, names = residual_sigma(fit, len(fit.columns)), solution.problem.model.names
-    known = Known.stated(names, fit.columns, fit.x, Constraints(), None, sigma)
+    known = PriorRows.stated(names, fit.columns, fit.x, Constraints(), None, sigma)
     found = KnownFit(fit, known, sigma)
     rises = (sigma * t_quantile(LEVEL, classical.dof)) ** 2
     ends = [

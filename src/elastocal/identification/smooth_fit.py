@@ -24,7 +24,7 @@ from elastocal.identification.knowledge_fit import FunctionPrior
 from elastocal.identification.least_squares import (
     EXHAUSTED,
     Fit,
-    Known,
+    PriorRows,
     Problem,
     descend,
     moved,
@@ -208,7 +208,7 @@ def joint_fit(
         own = functions.columns[posterior.own]
         columns = np.concatenate([reduction.kept, own])
         P = np.diag(posterior.prior) @ np.eye(len(own), len(columns), len(reduction.kept))
-        known = Known(P, P[:, len(reduction.kept) :] @ model.nominal[own])
+        known = PriorRows(P, P[:, len(reduction.kept) :] @ model.nominal[own])
         objective = objective_of(every, columns, x, sizes, known, among)
         assert objective.evaluate_last is not None
         objective = replace(objective, evaluate=objective.evaluate_last)

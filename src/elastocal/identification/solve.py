@@ -13,7 +13,7 @@ from scipy import linalg
 from elastocal.errors import ElastocalError, InsufficientDataError
 from elastocal.identification.checks import check_enough
 from elastocal.identification.covariance import root_of
-from elastocal.identification.least_squares import Fit, Known, Problem, fit, moved
+from elastocal.identification.least_squares import Fit, PriorRows, Problem, fit, moved
 from elastocal.identification.residuals import (
     CHANCE,
     as_of_another_campaign,
@@ -510,7 +510,7 @@ def _tied_from(problem: Problem, sizes: Array, x: Array, sigma: float, tolerance
     free = problem.free
     width = np.where(is_placed(problem.model), sizes, LOOSE * sizes)[free]
     while True:
-        tie = Known.near(problem.x0[free], width / sigma)
+        tie = PriorRows.near(problem.x0[free], width / sigma)
         found = fit(problem, free, x, sizes, known=tie, max_steps=25, tolerance=tolerance)
         previous, sigma, x = sigma, residual_sigma(found, 0), found.x
         if sigma > 0.7 * previous or sigma <= 1e-12:

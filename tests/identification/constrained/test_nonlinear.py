@@ -15,7 +15,7 @@ from elastocal.identification.knowledge import (
     SemidefiniteMatrix,
     physical_constraints,
 )
-from elastocal.identification.least_squares import Known, KnownFit, Problem, fit, profile_end
+from elastocal.identification.least_squares import KnownFit, PriorRows, Problem, fit, profile_end
 from elastocal.identification.weighted_problem import Weights
 from elastocal.model.manipulator import Model
 from elastocal.model.observations import observe
@@ -48,7 +48,7 @@ def problem(seed: int, **values: float) -> tuple:
 
 def fitted(stated: tuple, constraints: Constraints = NONE, prior=None) -> KnownFit:
     problem, columns, x, _ = stated
-    known = Known.stated(problem.model.names, columns, x, constraints, prior, 1.0)
+    known = PriorRows.stated(problem.model.names, columns, x, constraints, prior, 1.0)
     return KnownFit(fit(*stated, known=known), known, 1.0)
 
 

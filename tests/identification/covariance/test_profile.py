@@ -7,7 +7,7 @@ import pytest
 from scipy import sparse, stats
 
 from elastocal.identification.knowledge import Bounds, Constraints
-from elastocal.identification.least_squares import Known, KnownFit, Problem, fit, profile_end
+from elastocal.identification.least_squares import KnownFit, PriorRows, Problem, fit, profile_end
 from elastocal.identification.weighted_problem import Weights
 from elastocal.model.manipulator import Regression
 from elastocal.model.observations import Observations
@@ -44,7 +44,7 @@ def profile(y, constraints=()):
     problem = Problem(Crossing(), observed, weights, start, np.arange(2)), np.arange(2)
     sigma = float(np.sqrt(rss / 10))
     stated = Crossing.names, np.arange(2), start, Constraints(constraints), None, sigma
-    known = Known.stated(*stated)
+    known = PriorRows.stated(*stated)
     found = KnownFit(fit(*problem, start, np.ones(2), known=known), known, sigma)
     return found.fit.x[0], [profile_end(found, 0, F * sigma**2, side) for side in (-1, 1)]
 
