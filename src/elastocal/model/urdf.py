@@ -9,14 +9,16 @@ from __future__ import annotations
 import math
 import re
 from collections.abc import Collection
+from functools import lru_cache
 from pathlib import Path
 
 import numpy as np
 
 from elastocal.errors import InputError, require
+from elastocal.files import read_bytes
 from elastocal.model.chain import Chain, LinkMass, check_angles
 from elastocal.model.robot_tree import MOVING, FileJoint, Tree
-from elastocal.model.xml_file import Tag, XmlFile
+from elastocal.model.xml_file import MAX_BYTES, Tag, XmlFile
 from elastocal.text import did_you_mean
 from elastocal.units import rotation_from_rpy
 
@@ -41,10 +43,18 @@ def read_urdf(path: str | Path, base: str | None = None, flange: str | None = No
 
 def check_urdf(path: str | Path) -> Tree:
     """The links and joints of the URDF file at `path`, every name and number checked."""
-    return tree_of(urdf_file(Path(path)))
+    file = Path(path)
+    return _known(file, read_bytes(file, "URDF file", MAX_BYTES))
+
+
+@lru_cache(maxsize=8)
+def _known(path: Path, data: bytes) -> Tree:
+    # A cell's model, its first cell, an export each ask for the same file.
+    return tree_of(XmlFile(path, data, "a URDF"))
 
 
 def urdf_file(path: Path) -> XmlFile:
+    """The file to be edited."""
     return XmlFile.read(path, "URDF file", "a URDF")
 
 
