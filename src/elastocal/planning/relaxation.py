@@ -190,8 +190,7 @@ def efficiency(value: float, bound: float) -> float:
 # Column generation.
 
 GAP = 1e-4  # 1 − bound/Φ at which the relaxation ends
-PASSES = 8  # multiplicative steps that show where the support lies
-EVEN = 0.05  # part of even weights in them
+EVEN = 0.05  # part of even weights in those that show where the support lies
 PER_PARAMETER = 4  # candidates of the first support per parameter, shared among the groups
 MOST_ROUNDS = 60
 # Of a round's gap that the master may leave: more would be lost on candidates that will change.
@@ -287,24 +286,15 @@ def _around(problem: DesignProblem, full: BoolArray, gap: float, start: Array | 
 
 
 def _first_weights(problem: DesignProblem, start: Array | None) -> Array:
-    """Multiplicative steps w_i ∝ w_i √d_i from even weights or `start`: where the support lies.
+    """Even weights, or `start` with a part of them, times √d_i: where the support lies.
 
     Silvey, Titterington & Torsney, Commun. Stat. Theory Methods 7 (1978) 1379.
     """
-    even, L = problem.even(), len(problem.shares)
-
-    def mixed(w: Array) -> Array:
-        total = np.bincount(problem.group, w, minlength=L)
-        w = w * (problem.shares / np.where(total > 0, total, np.inf))[problem.group]
-        return EVEN * even + (1 - EVEN) * np.minimum(w, 1.0)
-
-    w = even if start is None else mixed(start)
-    criterion = problem.criterion.softened(1.0)  # on a kink these steps would swing
-    for _ in range(PASSES):
-        V = inverse(problem.at(w))
-        _, C = criterion.slope(V)
-        w = mixed(w * np.sqrt(np.maximum(problem.prices(V @ C @ V), 0.0)))
-    return w
+    even = problem.even()
+    w = even if start is None else EVEN * even + (1 - EVEN) * start
+    V = inverse(problem.at(w))
+    _, C = problem.criterion.softened(1.0).slope(V)  # of a kink all sides count
+    return np.asarray(w * np.sqrt(np.maximum(problem.prices(V @ C @ V), 0.0)))
 
 
 def best_of(score: Array, group: IntArray, counts: IntArray) -> IntArray:
