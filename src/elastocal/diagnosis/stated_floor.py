@@ -32,31 +32,25 @@ from elastocal.units import Array, BoolArray, IntArray
 
 def noise_floor(dataset: DiagnosisData, data: NoisyData, noise: NoiseValues) -> NoiseFloor:
     """Tracker noise, repeatability, shared scatter, (near-)repeats and faulty readings."""
-    used, (square, dof) = ~data.left_out, repeats(dataset)
-    variance = np.diagonal(data.covariance, axis1=1, axis2=2)[used]
-    ratio = noise_rms(data, noise) / np.sqrt(
-        _per_reading(data, np.diagonal(data.covariance, axis1=1, axis2=2))
-    )
+    (square, dof), at = repeats(dataset), project(data, noise)
+    variance = np.diagonal(data.covariance, axis1=1, axis2=2)
+    ratio = noise_rms(data, noise) / np.sqrt(_per_reading(data, variance))
+    variance = variance[~data.left_out]
     return NoiseFloor(
         data.stated, noise.factor, float(ratio), float(noise.factor * np.sqrt(variance.mean())),
         tuple(noise.joint.tolist()), noise.shared_by_all,
         float(np.sqrt(square / dof)) if dof else None,
-        tuple(noise.shared.tolist()), describe_faulty(dataset, data, noise),
-        near_repeats(dataset, data, project(data, noise)), dataset.drift,
+        tuple(noise.shared.tolist()), describe_faulty(dataset, data, noise, at),
+        near_repeats(dataset, data, at), dataset.drift,
     )  # fmt: skip
 
 
 def describe_faulty(
-    dataset: DiagnosisData, data: NoisyData, noise: NoiseValues
+    dataset: DiagnosisData, data: NoisyData, noise: NoiseValues, at: Projection
 ) -> tuple[FaultyReading, ...]:
     """The readings left out, with their error against the fit to the others."""
-    blocks, size = dataset.blocks, dataset.blocks.size
-    out = data.faulty
-    if not out.any():
-        return ()
-    at = project(data, noise)
-    e = blocks.unpack((data.r - data.X @ at.beta)[..., None])[:, :, 0]
-    sigma = np.sqrt(np.einsum("nii->ni", blocks.unpack_square(data.covariance)) * noise.factor**2)
+    e, stated = _left_over(data, at), data.blocks.unpack_square(data.covariance)
+    sigma = noise.factor * np.sqrt(np.einsum("nii->ni", stated))
     table, lead = dataset.table, dataset.lead
     return tuple(
         FaultyReading(
@@ -64,10 +58,15 @@ def describe_faulty(
             table.configuration_labels[table.configuration[lead[k]]],
             table.marker_names[table.marker[lead[k]]],
             float(np.linalg.norm(e[k, :3])),
-            float(np.linalg.norm(e[k, :size] / sigma[k])),
+            float(np.linalg.norm(e[k] / sigma[k])),
         )
-        for k in np.flatnonzero(out)
+        for k in np.flatnonzero(data.faulty)
     )
+
+
+def _left_over(data: NoisyData, at: Projection) -> Array:
+    """r − Xβ̂ (N, size) of each observation."""
+    return data.blocks.unpack((data.r - data.X @ at.beta)[..., None])[:, :, 0]
 
 
 def repeats(dataset: DiagnosisData, come_back: bool = False) -> tuple[float, int]:
@@ -113,8 +112,7 @@ def near_repeats(dataset: DiagnosisData, data: NoisyData, at: Projection) -> Nea
     pairs = near_pairs(dataset, ~data.faulty)
     if not len(pairs):
         return None
-    size = min(dataset.blocks.size, 3)
-    e = dataset.blocks.unpack((data.r - data.X @ at.beta)[..., None])[:, :size, 0]
+    e = _left_over(data, at)[:, :3]
     squares = ((e[pairs[:, 0]] - e[pairs[:, 1]]) ** 2).mean(axis=1) / 2
     moment = dataset.moment
     apart = np.abs(moment[pairs[:, 0]] - moment[pairs[:, 1]]) > SOON * np.ptp(moment)
