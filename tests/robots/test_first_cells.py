@@ -6,6 +6,7 @@ from pathlib import Path
 
 import pytest
 from support.robot_files import told_by_init, urdf
+from support.robots import KR270
 from typer.testing import CliRunner
 
 import elastocal as ec
@@ -82,3 +83,25 @@ def test_levels_of_the_compliance_are_asked_for_in_words_that_can_be_pasted(tmp_
     cell.write_text(head)
     code, _, err = run("design", cell, "-o", tmp_path / "other.csv", "--effort", "quick")
     assert code == 2 and f"add [design.levels] {levels.strip()[:-3]}]" in err
+
+
+@pytest.mark.parametrize(
+    ("new", "told"),
+    [
+        (lambda mass: "2", "Note: the file states 2 kg for 6 of 6 links, which looks like"),
+        (lambda mass: f"{mass / 40:g}", "links weigh 20.8 kg together, where arms of that length"),
+        (lambda mass: f"{mass:g}", ""),
+    ],
+    ids=["all alike", "far too light", "of the data sheet"],
+)
+def test_masses_that_nobody_weighed_do_not_bend_the_joints(tmp_path, new, told):
+    """It is said in the terminal, in the head of the cell, and beside the key."""
+    text = KR270.read_text(encoding="utf-8")
+    text = re.sub(r'mass value="([^"]*)"', lambda m: f'mass value="{new(float(m[1]))}"', text)
+    (tmp_path / "arm.urdf").write_text(text, encoding="utf-8")
+    code, said, _ = run("init", tmp_path / "arm.urdf", "-o", tmp_path / "cell.toml")
+    cell = (tmp_path / "cell.toml").read_text(encoding="utf-8")
+    assert code == 0 and told in said and told in " ".join(cell.split())
+    assert ("link_gravity is off; put in the masses of the data sheet" in said) == bool(told)
+    assert ("the file's masses look like placeholders" in cell) == bool(told)
+    assert ec.read_cell(tmp_path / "cell.toml").model.link_gravity == (not told)

@@ -424,7 +424,9 @@ def _urdf(calibrated: CalibratedArm, wish: Wish, kept: Kept, pieces: ExportNumbe
         base, flange = rigid_files.BASE, rigid_files.FLANGE
         told = [
             "inertia tensors are zero in this file: of the links masses and their centres alone "
-            "are known"
+            "are known. Its kinematics and weights are right; before simulating motion put in "
+            "tensors"
+            + ("" if robot.mjcf is None else ", or export as .xml, which keeps those of the model")
             if pieces.nominal_masses
             else "the links have no <inertial> in this file, as their masses are not known"
         ]

@@ -438,7 +438,7 @@ def load_ratio(model: Model, known: dict[str, float]) -> tuple[float, str] | Non
     what winds each revolute joint up by RATED_WIND_UP at its rated torque, by the links' weights.
     """
     given, rated = [], []
-    heavier = _usual_over_stated_mass(model.chain)
+    heavier = usual_over_stated_mass(model.chain)
     for p in model.parameters:
         value = known.get(p.name, 0.0)
         if p.effect != JointCompliance.name or value <= 0:
@@ -462,7 +462,7 @@ LENGTH = "the length of the arm"
 USUAL_MASS, OF_ANY_ARM = 30.0, 10.0
 
 
-def _usual_over_stated_mass(chain: Chain) -> float:
+def usual_over_stated_mass(chain: Chain) -> float:
     """What the masses are to be multiplied by; 1 where an arm of this length may have them."""
     mass = sum(body.mass for body in chain.masses)
     usual = USUAL_MASS * float(sum(np.linalg.norm(T[:3, 3]) for T in link_ends(chain))) ** 3

@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import math
 import os
+from collections import Counter
 from collections.abc import Iterator
 from dataclasses import replace
 from pathlib import Path
@@ -19,6 +20,7 @@ from elastocal.cell.arm_description import SOURCES, Convention, Robot
 from elastocal.cell.work_cell import Cell, read_cell
 from elastocal.errors import InputError, option, require
 from elastocal.files import atomic_writer
+from elastocal.identification.mistakes import usual_over_stated_mass
 from elastocal.model.chain import Chain, Joint, clashing, jaw_told, names_told
 from elastocal.model.dh import UR_ENDINGS
 from elastocal.model.effects.compliances import JointCompliance
@@ -172,7 +174,32 @@ def notes_of(robot: Robot, chain: Chain) -> list[str]:
     if robot.urdf is not None and robot.flange is not None:
         last = check_urdf(robot.urdf).parent_joint[robot.flange]
         moved = robot.flange if last.moves else ""
+    if doubt := placeholder_masses(chain):
+        found.append(
+            f"{doubt}, which looks like placeholders. Weights would bend the joints wrongly, so "
+            "link_gravity is off; put in the masses of the data sheet and switch it on"
+        )
     return found + jaw_told(chain, moved)
+
+
+FEW_KINDS = 3  # links of each mass, on average, from which on nobody has weighed them
+
+
+def placeholder_masses(chain: Chain) -> str:
+    """What speaks against the masses of the robot's file: many links of one mass, or all together
+    far from what an arm of that length weighs; "" where nothing does."""
+    masses = [f"{body.mass:.4g}" for body in chain.masses]
+    if masses and len(set(masses)) * FEW_KINDS <= len(masses):
+        mass, k = Counter(masses).most_common(1)[0]
+        return f"the file states {mass} kg for {k} of {len(masses)} links"
+    ratio = usual_over_stated_mass(chain)
+    if ratio == 1:
+        return ""
+    whole = sum(body.mass for body in chain.masses)
+    return (
+        f"the file's links weigh {whole:.3g} kg together, where arms of that length weigh about "
+        f"{whole * ratio:.2g} kg"
+    )
 
 
 def _mount(robot: Robot, arm: MjcfArm | None) -> tuple[Array, str]:
@@ -263,8 +290,10 @@ def _rest(chain: Chain, mount: tuple[Array, str], sites: dict[str, Array]) -> st
     loaded = [j + 1 for j in range(n) if feels_weight(chain, j, turned[2])]
     sprung = [f'"{JointCompliance.name}:joint{i}",' for i in loaded]
     springs = "\n    ".join(" ".join(sprung[k : k + 2]) for k in range(0, len(sprung), 2))
-    weighed = bool(chain.masses)
+    weighed = bool(chain.masses) and not placeholder_masses(chain)
     told = "masses of the robot's file bend the joints" if weighed else "the file has no masses"
+    if chain.masses and not weighed:
+        told = "the file's masses look like placeholders"
     if any("gravity" in note or "mass of" in note for note in chain.notes):
         told = "a choice: see the notes above"
     # In mm, fives; the links get thinner towards the wrist.
