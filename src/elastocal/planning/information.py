@@ -120,19 +120,15 @@ def reading_covariance(model: Model, observed: Observations) -> Array:
         "range_um and transverse_um, or distance_um, as the instrument's data sheet says",
     )
     single, spec = stated_covariance(observed, cell.tracker, kind)[0], cell.design
+    if (dof := cell.noise.tails) is None:
+        return single
+    # Identification sets the far readings of such tails apart.
     states = 1 if spec.loads is None else len(spec.loads)
     readings = (spec.poses or TYPICAL) * len(cell.tool.markers) * states * spec.repeats
-    return single * _told(cell, readings, single.shape[1])
+    return single * kept_of(dof, readings * single.shape[1], single.shape[1]).variance
 
 
 TYPICAL = 30  # poses of a plan that states none: what is set apart hardly depends on how many
-
-
-def _told(cell: Cell, readings: int, size: int) -> float:
-    """The factor on the variance of a reading that has the tails of `[noise]`, since
-    identification sets the far ones apart."""
-    dof = cell.noise.tails
-    return 1.0 if dof is None else kept_of(dof, readings * size, size).variance
 
 
 def reading_noise(
