@@ -42,19 +42,12 @@ def hull(solid: Solid) -> tuple[Array, float]:
 
 
 def few_points(solid: Solid) -> tuple[Array, float]:
-    """As `hull`, but a mesh is the box around it, so that k ≤ 8."""
-    return hull(boxed(solid))
-
-
-def boxed(solid: Solid) -> Solid:
-    """A mesh as the box around it, along its own axes."""
+    """As `hull`, but of a mesh the box around it, along its own axes, so that k ≤ 8."""
     if solid.shape != "mesh":
-        return solid
-    points = mesh_hull(solid)[0]
-    low, high = points.min(axis=0), points.max(axis=0)
-    middle = np.eye(4)
-    middle[:3, 3] = (low + high) / 2
-    return Solid(solid.name, "box", high - low, solid.placement @ middle)
+        return hull(solid)
+    low, high = (side(mesh_hull(solid)[0], axis=0) for side in (np.min, np.max))
+    points = (low + high) / 2 + CORNERS * (high - low)
+    return points @ solid.placement[:3, :3].T + solid.placement[:3, 3], 0.0
 
 
 def support(solid: Solid, direction: Array) -> float:
