@@ -51,6 +51,7 @@ if TYPE_CHECKING:
     import pandas as pd
 
     from elastocal.compensation.compensate import Compensation
+    from elastocal.diagnosis.changes import Comparison
     from elastocal.diagnosis.diagnosis import Diagnosis
     from elastocal.identification.result import Calibration
     from elastocal.planning.plan import Plan
@@ -353,13 +354,8 @@ def _png(figure: Any) -> bytes:
     return picture.getvalue()
 
 
-def frame(result: Any) -> pd.DataFrame:
-    import pandas as pd
-
-    kind = type(result).__name__
-    if kind == "Comparison":
-        return pd.DataFrame([vars(change) for change in result.changes])
-    return result.to_dataframe() if kind == "Measurements" else FRAMES[kind](result)
+def frame(result: object) -> pd.DataFrame:
+    return FRAMES[type(result).__name__](result)
 
 
 def _estimates(result: Calibration) -> pd.DataFrame:
@@ -429,10 +425,18 @@ def _commands(c: Compensation) -> pd.DataFrame:
     return frame
 
 
+def _changes(c: Comparison) -> pd.DataFrame:
+    import pandas as pd
+
+    return pd.DataFrame([vars(change) for change in c.changes])
+
+
 FRAMES: dict[str, Callable[[Any], pd.DataFrame]] = {
     "Calibration": _estimates,
     "Plan": _plan_frame,
     "NextPoses": lambda found: _plan_frame(found.plan),
     "Diagnosis": _candidates,
+    "Comparison": _changes,
     "Compensation": _commands,
+    "Measurements": lambda table: table.to_dataframe(),
 }
