@@ -107,21 +107,7 @@ class OutlierReport:
         }  # fmt: skip
 
 
-# Groups of readings that may share an error: tests, which of them to blame, and in what order.
-
-
-class GroupTest(NamedTuple):
-    """The p-value of a group, 1 where it cannot be tested, what telling it apart takes off the sum
-    of squares beyond what noise would, and the error (size,) common to its readings, None where
-    they err in different directions."""
-
-    p_value: float
-    gain: float
-    shift: Array | None
-
-
-@dataclass(frozen=True)
-class Group:
+class Group(NamedTuple):
     """Observations `members` (n,) that may share an error, and whether that may be one shift,
     common to all.
 
@@ -134,39 +120,44 @@ class Group:
     members: BoolArray
     may_shift: bool = True
 
-    def test(self, fit: FitToGood, used: BoolArray) -> GroupTest:
-        """The smaller p-value of two F-tests of the members that are `used` (n,): of one common
-        error, where there may be one, and of any.
 
-        With A = Σ T_iᵀT_i over the good ones less or plus the members, the model is fitted with
-        them (rss₁), without them (rss₀), and with them and a common shift (rss₁ − gain):
+def group_test(
+    fit: FitToGood, used: BoolArray, may_shift: bool
+) -> tuple[float, float, Array | None]:
+    """The smaller p-value of two F-tests of the `used` (n,) members of a group, of one common
+    error, where there may be one, and of any, 1 where neither can be made; what telling the group
+    apart takes off the sum of squares beyond what noise would; and the error (size,) common to its
+    readings, None where they err in different directions.
 
-            F_common = (gain/size)/((rss₁ − gain)/dof),   F_any = ((rss₁ − rss₀)/m)/(rss₀/dof₀)
+    With A = Σ T_iᵀT_i over the good ones less or plus the members, the model is fitted with
+    them (rss₁), without them (rss₀), and with them and a common shift (rss₁ − gain):
 
-        A common error that the model's own parameters can follow is not tested, nor any where the
-        others do not determine what the members touch.
-        """
-        size, n = fit.e.shape[1], int(used.sum())
-        rss_with, dof_with, G, c = _changed(fit, used & ~fit.good, 1)
-        S, e = fit.T[used].sum(axis=0), fit.e[used].sum(axis=0)
-        solved = np.linalg.solve(G, np.column_stack([S.T, c]))
-        M = n * np.eye(size) - S @ solved[:, :size]
-        shift, gain, p_common = np.zeros(size), 0.0, 1.0
-        if self.may_shift and dof_with > size and np.linalg.eigvalsh(M)[0] > ABSORBED * n:
-            b = e - S @ solved[:, size]
-            shift = np.linalg.solve(M, b)
-            gain = float(b @ shift)
-            rest = max(rss_with - gain, TINY)
-            p_common = float(f_test(gain, size, rest, dof_with - size)[1])
-        excess, p_any = 0.0, 1.0
-        rss_without, dof_without, G, _ = _changed(fit, used & fit.good, -1)
-        if dof_without > 0 and np.linalg.eigvalsh(G)[0] > ABSORBED:
-            drop, rest = max(rss_with - rss_without, 0.0), max(rss_without, TINY)
-            p_any = float(f_test(drop, n * size, rest, dof_without)[1])
-            excess = drop - n * size * rest / dof_without
-        common = self.may_shift and gain >= excess / 2
-        p = min(1.0, 2 * min(p_common, p_any))
-        return GroupTest(p, max(gain, excess), shift if common else None)
+        F_common = (gain/size)/((rss₁ − gain)/dof),   F_any = ((rss₁ − rss₀)/m)/(rss₀/dof₀)
+
+    A common error that the model's own parameters can follow is not tested, nor any where the
+    others do not determine what the members touch.
+    """
+    size, n = fit.e.shape[1], int(used.sum())
+    rss_with, dof_with, G, c = _changed(fit, used & ~fit.good, 1)
+    S, e = fit.T[used].sum(axis=0), fit.e[used].sum(axis=0)
+    solved = np.linalg.solve(G, np.column_stack([S.T, c]))
+    M = n * np.eye(size) - S @ solved[:, :size]
+    shift, gain, p_common = np.zeros(size), 0.0, 1.0
+    if may_shift and dof_with > size and np.linalg.eigvalsh(M)[0] > ABSORBED * n:
+        b = e - S @ solved[:, size]
+        shift = np.linalg.solve(M, b)
+        gain = float(b @ shift)
+        rest = max(rss_with - gain, TINY)
+        p_common = float(f_test(gain, size, rest, dof_with - size)[1])
+    excess, p_any = 0.0, 1.0
+    rss_without, dof_without, G, _ = _changed(fit, used & fit.good, -1)
+    if dof_without > 0 and np.linalg.eigvalsh(G)[0] > ABSORBED:
+        drop, rest = max(rss_with - rss_without, 0.0), max(rss_without, TINY)
+        p_any = float(f_test(drop, n * size, rest, dof_without)[1])
+        excess = drop - n * size * rest / dof_without
+    common = may_shift and gain >= excess / 2
+    p = min(1.0, 2 * min(p_common, p_any))
+    return p, max(gain, excess), shift if common else None
 
 
 def _changed(fit: FitToGood, members: BoolArray, sign: int) -> tuple[float, float, Array, Array]:
@@ -191,40 +182,41 @@ def groups_of(
     return [Group(level, str(names[k]), code == k, names[k] not in without_shift) for k in testable]
 
 
-def _runs(fit: FitToGood, active: BoolArray, lines: IntArray) -> list[Group]:
-    """Runs of lines at least half of whose readings lie beyond the noise, and three or more."""
-    beyond = active & ~fit.good
-    found = []
+def _runs(beyond: BoolArray, active: BoolArray, lines: IntArray) -> Iterator[Group]:
+    """Runs of active lines at least half of whose readings lie `beyond` the noise, and three or
+    more."""
     for first, last in blocks([int(k) for k in lines[beyond]]):
         run = active & (lines >= first) & (lines <= last)
         if (beyond & run).sum() >= max(SMALLEST_BLOCK, run.sum() / 2):
-            found.append(Group("block", f"{first} to {last}", run))
-    return found
+            yield Group("block", f"{first} to {last}", run)
 
 
-def _tested(
-    fit: FitToGood, active: BoolArray, groups: list[Group], adjust: dict[Level, int]
-) -> Iterator[tuple[Group, GroupTest]]:
-    """Tests of all groups still active, on all of their readings where most are beyond the noise
-    and that is no chance, else on those that are not."""
-    beyond = active & ~fit.good
-    for group in groups:
+def _blamed(
+    fit: FitToGood, active: BoolArray, groups: list[Group], lines: IntArray,
+    adjust: dict[Level, int],
+) -> tuple[Group, float] | None:  # fmt: skip
+    """The group that explains most, with its adjusted p-value; None where none is beyond noise.
+
+    Tested is all that is active of a group where most of it is beyond the noise and that is no
+    chance, else what is not.
+    """
+    beyond, found = active & ~fit.good, []
+    for group in (*groups, *_runs(beyond, active, lines)):
         present = active & group.members
         inside, outside = int((beyond & present).sum()), int((beyond & ~present).sum())
         count, others = int(present.sum()), int((active & ~present).sum())
         rate = (outside + 1) / (others + 1)
         chance = float(special.bdtrc(inside - 1, count, rate)) if inside else 1.0
         whole = 2 * inside >= count and chance * adjust[group.level] < FALSE_ALARM
-        if group.level == "block" and not whole:
-            continue
         used = present if whole else present & fit.good
-        if used.sum() > 1:
-            yield replace(group, members=present), group.test(fit, used)
-
-
-def _weight(candidate: tuple[Group, GroupTest]) -> float:
-    group, test = candidate
-    return test.gain / (WORTH_A_BLOCK if group.level == "block" else 1.0)
+        if used.sum() < 2 or (group.level == "block" and not whole):
+            continue
+        p, gain, _ = group_test(fit, used, group.may_shift)
+        if p * adjust[group.level] < FALSE_ALARM:
+            gain /= WORTH_A_BLOCK if group.level == "block" else 1.0
+            own = group._replace(members=present)
+            found.append((gain, own, min(1.0, p * adjust[group.level])))
+    return max(found, key=lambda one: one[0])[1:] if found else None
 
 
 def outlier_report(
@@ -260,12 +252,10 @@ def outlier_report(
     active, accepted = np.ones(n, dtype=bool), []
     while True:
         fit = FitToGood(B, y, good & active, variance)
-        tested = _tested(fit, active, groups + _runs(fit, active, lines), adjust)
-        beyond = [t for t in tested if t[1].p_value * adjust[t[0].level] < FALSE_ALARM]
-        group, test = max(beyond, key=_weight, default=(Group("block", "", active), None))
-        if test is None or 2 * (active & ~group.members).sum() <= n:
+        blamed = _blamed(fit, active, groups, lines, adjust)
+        if blamed is None or 2 * (active & ~blamed[0].members).sum() <= n:
             break
-        p = min(1.0, test.p_value * adjust[group.level])
+        group, p = blamed
         accepted.append((group, p, int((group.members & ~fit.good).sum())))
         active = active & ~group.members
     alone = fit.p_values(fit.T, fit.e, fit.good)
@@ -285,7 +275,9 @@ def _finding(
     move = np.abs(_move(fit, group.members))
     column = int(np.argmax(move))
     chosen = np.flatnonzero(group.members)
-    shift = None if group.level == "reading" else group.test(fit, group.members).shift
+    shift = None
+    if group.level != "reading":
+        shift = group_test(fit, group.members, group.may_shift)[2]
     pattern: Pattern = "single" if group.level == "reading" else "scatter"
     own, error = (float(np.sqrt((e[chosen] ** 2).sum(axis=1).mean())) for e in (fit.e, off))
     if shift is not None:
