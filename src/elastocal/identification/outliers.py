@@ -257,6 +257,7 @@ def until_it_stands(
 # Typical sizes in a deviation of the prior: readings of an arm whose errors are five typical sizes
 # must not be taken for faulty because they move its parameters.
 WEAK = 10.0
+FEW = 0.1  # of the readings: a larger share beyond the noise is no accident of measuring
 STEPS = 4  # to a set's values, from those of the set before
 SETTLED = 0.1  # of its deviation: what a step may still move an estimate by at the end
 
@@ -307,7 +308,9 @@ def find_faulty(solution: Solution) -> BoolArray:
     faulty = np.zeros(n, dtype=bool)
     if not ends:
         return faulty
-    fit, good, _ = ends[-1] if ends[-1][2].explains_more(ends[0][2]) else ends[0]
+    # What all parameters say against so many is noise that readings share, or a missing effect.
+    last = ends[-1] if (~ends[-1][1]).mean() <= FEW else ends[0]
+    fit, good, _ = last if last[2].explains_more(ends[0][2]) else ends[0]
     faulty[part.index[~good]] = True
     if problem.large:
         faulty |= _contradicting(problem, fit, width, part)
