@@ -48,7 +48,8 @@ STATED = (0.005, 0.995)  # quantiles of χ² between which the residual agrees w
 # the noise would pass for noise.
 FAR_TOO_LARGE = math.sqrt(0.5)
 LACK_OF_FIT = 0.01  # p-value below which configurations scatter more than their repeats
-FLATTERS = 1.2  # held-out over fitted error, above which the fit flatters itself
+# Held-out over fitted error above which the fit flatters itself: as expected, or over what is.
+FLATTERS = 1.2
 LITTLE = 1.25  # times better than the nominal arm, below which little was gained
 # Test data lie where the calibration was not made, or the arm has changed, where their errors are
 # this much larger than held-out poses' and chance allows for it in one table of a hundred.
@@ -155,9 +156,13 @@ def _explained(result: Calibration, noise: tuple[Finding, ...]) -> bool:
         "residual_agrees_with_readings",
     }  # fmt: skip
     agrees = bool(stated) or ("noise_not_compared" in told and "repeats_agree" in told)
-    n, held = len(result.observations.value), result.heldout_rms
-    expected = result.residual_rms * n / max(result.dof, 1)
-    return agrees and not lacking and held <= FLATTERS * expected
+    expected = result.residual_rms * _overfitted(result)
+    return agrees and not lacking and result.heldout_rms <= FLATTERS * expected
+
+
+def _overfitted(result: Calibration) -> float:
+    """n / (n - p)"""
+    return len(result.observations.value) / max(result.dof, 1)
 
 
 # What an identification takes for granted.
@@ -519,8 +524,11 @@ def _prediction(result: Calibration, explained: bool) -> Iterator[Finding]:
     placed = only_placed(result)
     # Under a drift the held-out error is that of another day, which more poses make no better.
     # Of base and tool alone, what each point takes of the fit is all that it can flatter by.
-    flatters = math.isfinite(held) and held > FLATTERS * fitted and not (placed and explained)
-    if flatters and result.noise.drift is None:
+    # What n and p let expect decides, so that the noise of a campaign does not; and what exceeds
+    # it: at 25 poses held / (fitted · expected) has a standard deviation of 0.04.
+    expected = _overfitted(result)
+    flatters = expected > FLATTERS or held > FLATTERS * expected * fitted
+    if flatters and held < math.inf and result.noise.drift is None and not (placed and explained):
         yield _care("fit_flatters", heldout_rms_um=held, residual_rms_um=fitted)
     if held < nominal < LITTLE * held < math.inf and not placed:
         yield _care("little_gain", heldout_rms_um=held, nominal_rms_um=nominal)

@@ -266,7 +266,7 @@ def summarise(
         active=found.active,
         prior_share=found.prior_share,
         smooth=found.smooth,
-        left=left_open(solution),
+        left=left_open(solution, found.limits),
         copies=copies,
         weights=solution.problem.weights,
         noise_parts=noise_parts(found),

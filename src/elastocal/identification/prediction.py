@@ -16,6 +16,7 @@ the readings of a configuration have in common.
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from dataclasses import dataclass, replace
 from typing import Any
 
@@ -131,8 +132,13 @@ def _blamed(left: OpenParameters, harm: Array) -> tuple[str, ...]:
     return tuple(left.names[int(i)] for i in np.argsort(-size, kind="stable") if harm[i] > 0)
 
 
-def left_open(solution: Solution) -> OpenParameters:
-    """What a fit left open, from its weighted B_K and B_D at the values found."""
+def left_open(
+    solution: Solution, limits: Mapping[int, tuple[float, float]] | None = None
+) -> OpenParameters:
+    """What a fit left open, from its weighted B_K and B_D at the values found.
+
+    A parameter held at its bound is no more open than its 95 % `limits`, by parameter, leave it.
+    """
     model, reduction = solution.problem.model, solution.reduction
     free, x = solution.problem.free, solution.fit.x
     kept = reduction.kept
@@ -146,7 +152,10 @@ def left_open(solution: Solution) -> OpenParameters:
         columns, rest = np.searchsorted(free, kept[own]), np.searchsorted(free, open_)
         mixing[own] = _shares(R[:, columns], R[:, rest], typical[kept[own]], typical[open_])
     names = tuple(model.names[d] for d in open_)
-    return OpenParameters(names, mixing, typical[open_], _redundant(solution, open_, typical))
+    redundant = _redundant(solution, open_, typical)
+    for i, (low, high) in (limits or {}).items():
+        typical[i] = min(typical[i], (high - low) / (2 * special.ndtri(0.975)))
+    return OpenParameters(names, mixing, typical[open_], redundant)
 
 
 def _redundant(solution: Solution, open_: IntArray, typical: Array) -> tuple[str, ...]:
