@@ -500,20 +500,20 @@ def refuse_nonsense(
     `every` reading is looked at for the cause, since few may be left in `observed`.  Deflections
     are small whatever the mistake: there positions that a mistake undone makes fit are enough.
     """
-    off = np.linalg.norm(residual.reshape(-1, observed.size)[:, :3], axis=1)
+    off = every_off = np.linalg.norm(residual.reshape(-1, observed.size)[:, :3], axis=1)
     if apart is not None:
-        left = apart.value - model.predict(apart.table, x, apart)
-        apart_off = np.linalg.norm(left.reshape(-1, apart.size)[:, :3], axis=1)
-    with np.errstate(over="ignore"):
-        error, rms = (float(np.median(off)), float(np.sqrt((off**2).mean()))) if len(off) else NONE
-    table = observed.table
-    length = _length(model, table)
+        left = (apart.value - model.predict(apart.table, x, apart)).reshape(-1, apart.size)
+        every_off = np.append(off, np.linalg.norm(left[:, :3], axis=1))
+    error = rms = share = 0.0
+    table, length = observed.table, _length(model, observed.table)
+    if len(off):
+        with np.errstate(over="ignore"):
+            error, rms = float(np.median(off)), float(np.sqrt((off**2).mean()))
+        share = float((every_off > POOREST * length).mean())
     reach = 0.0 if table.position is None else float(np.abs(table.position).max())
-    lengths = np.array([p.unit == "m" for p in model.parameters], dtype=bool)
-    beyond = np.flatnonzero(lengths & ~(np.abs(x) <= LARGEST * (length + reach)))
-    every_off = off if apart is None else np.append(off, apart_off)
-    share = float((every_off > POOREST * length).mean()) if len(every_off) else 0.0
-    sane = max(error, rms) <= POOREST * length and share <= FEW and not len(beyond)
+    beyond = [(p.name, v) for p, v in zip(model.parameters, x, strict=True)
+              if p.unit == "m" and not abs(v) <= LARGEST * (length + reach)]  # fmt: skip
+    sane = max(error, rms) <= POOREST * length and share <= FEW and not beyond
     if sane and (observed.kind != "deflection" or _placed(model, every)):
         return
     fit = nominal_fit(model.chain, model.cell, every)
@@ -523,19 +523,13 @@ def refuse_nonsense(
                 f"{table.source}: no deflections of this arm: {fit.warning}"
             )
         return
-    what = f"after the fit the readings are {error:.3g} m (median) and {rms:.3g} m (rms)"
-    if share > FEW:
-        what += f", {share:.0%} of them more than {POOREST * length:.2g} m,"
-    what += " from the model"
-    if len(beyond):
-        k = int(beyond[0])
-        what += f", whose {model.parameters[k].name} is {x[k]:.3g} m"
+    most = f", {share:.0%} of them more than {POOREST * length:.2g} m," if share > FEW else ""
+    value = f", whose {beyond[0][0]} is {beyond[0][1]:.3g} m" if beyond else ""
     raise InsufficientDataError(
-        f"{table.source}: {what}, which no arm of {length:.3g} m could be; {_cause(every, fit)}"
+        f"{table.source}: after the fit the readings are {error:.3g} m (median) and {rms:.3g} m "
+        f"(rms){most} from the model{value}, which no arm of {length:.3g} m could be; "
+        f"{_cause(every, fit)}"
     )
-
-
-NONE = (0.0, 0.0)
 
 
 def _length(model: Model, table: Measurements) -> float:
