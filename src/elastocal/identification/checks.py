@@ -339,37 +339,27 @@ class Fallen:
     def axis(self) -> str | None:
         """The axis that points up, "−y" say; None where none does within FALLEN."""
         k = int(np.argmax(np.abs(self.up)))
-        if np.arccos(min(abs(self.up[k]), 1.0)) > FALLEN:
-            return None
-        return ("−" if self.up[k] < 0 else "") + AXES[k]
+        near = np.arccos(min(abs(self.up[k]), 1.0)) <= FALLEN
+        return ("−" if self.up[k] < 0 else "") + AXES[k] if near else None
 
     @property
     def turn(self) -> Array:
         """R (3, 3) from the readings' frame to one whose z is that axis."""
-        k = int(np.argmax(np.abs(self.up)))
-        axis = np.sign(self.up[k]) * np.eye(3)[k]
-        if axis[2] < 0:  # half a turn about x
-            return np.diag([1.0, -1.0, -1.0])
-        across = np.eye(3)[(k + 1) % 3] if k < 2 else np.eye(3)[0]
+        k, eye = int(np.argmax(np.abs(self.up))), np.eye(3)
+        if k == 2:  # at most half a turn about x
+            return eye if self.up[k] > 0 else np.diag([1.0, -1.0, -1.0])
+        axis, across = np.sign(self.up[k]) * eye[k], eye[(k + 1) % 3]
         return np.round(np.stack([across, np.cross(axis, across), axis]))
 
     def turned(self, table: Measurements) -> Measurements:
         """The table in that frame; forces stay, which are down by the cell's own word."""
-        R = self.turn
-        position = None if table.position is None else table.position @ R.T
-        rotation = table.rotation
+        R, rotation, sigma = self.turn, table.rotation, table.sigma
         if rotation is not None:
             rotation = (Rotation.from_matrix(R) * Rotation.from_rotvec(rotation)).as_rotvec()
-        sigma = table.sigma
         if sigma is not None and table.sigma_frame == "cartesian":
             sigma = sigma @ np.abs(R).T
+        position = None if table.position is None else table.position @ R.T
         return replace(table, position=position, rotation=rotation, sigma=sigma)
-
-    @property
-    def columns(self) -> str:
-        """What the table's x, y, z would have to be: "x, −z, y"."""
-        rows = [(int(np.argmax(np.abs(row))), row.sum() < 0) for row in self.turn]
-        return ", ".join(("−" if minus else "") + AXES[k] for k, minus in rows)
 
     def __str__(self) -> str:
         text = (
@@ -378,9 +368,12 @@ class Fallen:
         )
         if self.axis is None:
             return f"{text}. State how the arm is mounted, [model.nominal] base_rpy_deg"
+        # What the table's x, y, z would have to be: "x, −z, y".
+        columns = ", ".join(("−" if row.sum() < 0 else "") + AXES[int(np.argmax(np.abs(row)))]
+                            for row in self.turn)  # fmt: skip
         return (
             f"{text}. If it is mounted as stated, {self.axis} of that frame points up: write the "
-            f"columns {self.columns} as x, y, z; else state [model.nominal] base_rpy_deg"
+            f"columns {columns} as x, y, z; else state [model.nominal] base_rpy_deg"
         )
 
 
