@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from dataclasses import replace
 
 import numpy as np
@@ -9,8 +10,16 @@ from scipy.spatial.transform import Rotation
 
 from elastocal.errors import InputError, option
 from elastocal.measurements import Measurements, visits, with_moves
+from elastocal.model.arm import Parameter
 from elastocal.model.calibrated import Conditions, random_table
-from elastocal.model.effects.compliances import JointCompliance
+from elastocal.model.effects.base import index
+from elastocal.model.effects.compliances import (
+    RATED_WIND_UP,
+    JointCompliance,
+    rated_torque,
+    usual_over_stated_mass,
+    weight_torque,
+)
 from elastocal.model.manipulator import Model, check_equilibrium
 from elastocal.model.observations import available_noise, position_covariance
 from elastocal.model.rigid import reach_of, suitable_load
@@ -44,8 +53,9 @@ def draw_errors(model: Model, scale: float, rng: np.random.Generator) -> dict[st
     """Random true values: nominal + scale · typical size · N(0, 1) for every parameter, by the
     cell and `rng` alone.
 
-    Compliances vary by 20 % of their nominal value.  Those that have none are drawn positive, of
-    the size that moves a reading by a millimetre where it moves one most (`_sizes_shown`).
+    Compliances vary by 20 % of their nominal value.  Those that have none vary about what winds a
+    joint up by RATED_WIND_UP at its rated torque, and where nothing tells that are drawn positive,
+    of the size that moves a reading by a millimetre where it moves one most (`_sizes_shown`).
     """
     drawn, shown = {}, None
     for k, p in enumerate(model.parameters):
@@ -53,11 +63,23 @@ def draw_errors(model: Model, scale: float, rng: np.random.Generator) -> dict[st
         if p.effect == JointCompliance.name:
             size = 0.2 * abs(p.nominal)
         step = scale * float(rng.normal())
+        if p.effect == JointCompliance.name and size == 0.0 and (usual := _usual(model, p)):
+            drawn[p.name] = scale * usual * math.exp(0.2 * step / scale) if scale else 0.0
+            continue
         if size == 0.0 and p.typical is None and scale:
             shown = _sizes_shown(model) if shown is None else shown
             size, step = shown[k], abs(step)
         drawn[p.name] = p.nominal + step * size
     return drawn
+
+
+def _usual(model: Model, p: Parameter) -> float:
+    """The compliance that arms have where `identify` expects one (`load_ratio`); 0 elsewhere."""
+    i = index(p.where)
+    if model.chain.kinds[i] != "revolute" or not weight_torque(model.chain, i) > 0:
+        return 0.0
+    torque = usual_over_stated_mass(model.chain) * (rated_torque(model.chain, model.cell, i) or 0.0)
+    return RATED_WIND_UP / torque
 
 
 def _sizes_shown(model: Model) -> Array:

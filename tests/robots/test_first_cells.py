@@ -4,6 +4,7 @@ import re
 import shutil
 from pathlib import Path
 
+import numpy as np
 import pytest
 from support.robot_files import told_by_init, urdf
 from support.robots import KR270
@@ -105,3 +106,16 @@ def test_masses_that_nobody_weighed_do_not_bend_the_joints(tmp_path, new, told):
     assert ("link_gravity is off; put in the masses of the data sheet" in said) == bool(told)
     assert ("the file's masses look like placeholders" in cell) == bool(told)
     assert ec.read_cell(tmp_path / "cell.toml").model.link_gravity == (not told)
+
+
+def test_drawn_compliances_are_those_that_identify_expects(tmp_path):
+    """Else the first simulation that `init` proposes is told that its loads are in another unit."""
+    (tmp_path / "arm.urdf").write_text(KR270.read_text(encoding="utf-8"), encoding="utf-8")
+    ec.init(tmp_path / "arm.urdf", tmp_path / "cell.toml")
+    model, rng = ec.Model(tmp_path / "cell.toml"), np.random.default_rng(0)
+    q = rng.uniform([-1, -2, 0.5, -1, -1, -1], [1, -0.5, 2, 1, 1, 1], (20, 6))
+    for seed in range(2):
+        made = ec.simulate(model, q, draw=1.0, load=[0, 0, -3000], seed=seed)
+        fit = ec.identify(model, made)
+        assert fit.finding("load_unit") is None
+        assert 1e-7 < fit.params["joint2.compliance"] < 1e-6  # of the KR 270: 2.9e-7

@@ -34,9 +34,9 @@ from elastocal.model.effects.compliances import (
     RATED_WIND_UP,
     JointCompliance,
     rated_torque,
+    usual_over_stated_mass,
     weight_torque,
 )
-from elastocal.model.effects.placements import link_ends
 from elastocal.model.manipulator import Model
 from elastocal.model.observations import Observations
 from elastocal.model.rigid import nominal_flanges
@@ -457,17 +457,6 @@ def load_ratio(model: Model, known: dict[str, float]) -> tuple[float, str] | Non
 
 CELL, WEIGHTS = "the cell's nominal compliances", "the weights of the links"
 LENGTH = "the length of the arm"
-# kg/m³, mass of the links over the cube of the arm's length: 9 (UR5, Panda), 33 (KR 270), 40
-# (KR 120).  Files of robots often state 1 or 2 kg for every link, which no arm of that size has.
-USUAL_MASS, OF_ANY_ARM = 30.0, 10.0
-
-
-def usual_over_stated_mass(chain: Chain) -> float:
-    """What the masses are to be multiplied by; 1 where an arm of this length may have them."""
-    mass = sum(body.mass for body in chain.masses)
-    usual = USUAL_MASS * float(sum(np.linalg.norm(T[:3, 3]) for T in link_ends(chain))) ** 3
-    alike = usual <= OF_ANY_ARM * mass and mass <= OF_ANY_ARM * usual
-    return 1.0 if alike or mass == 0 else usual / mass
 
 
 # What no arm can be.

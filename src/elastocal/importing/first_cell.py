@@ -20,10 +20,9 @@ from elastocal.cell.arm_description import SOURCES, Convention, Robot
 from elastocal.cell.work_cell import Cell, read_cell
 from elastocal.errors import InputError, option, require
 from elastocal.files import atomic_writer
-from elastocal.identification.mistakes import usual_over_stated_mass
 from elastocal.model.chain import Chain, Joint, clashing, jaw_told, names_told
 from elastocal.model.dh import UR_ENDINGS
-from elastocal.model.effects.compliances import JointCompliance
+from elastocal.model.effects.compliances import JointCompliance, usual_over_stated_mass
 from elastocal.model.effects.gears import JointOffset
 from elastocal.model.effects.loads import feels_weight
 from elastocal.model.effects.placements import BaseFrame, LinkGeometry, MarkerPosition

@@ -153,6 +153,19 @@ def rated_torque(chain: Chain, cell: Cell, i: int) -> float | None:
     return max(weight_torque(chain, i), WRIST_SHARE * strongest, wound) or None
 
 
+# kg/m³, mass of the links over the cube of the arm's length: 9 (UR5, Panda), 33 (KR 270), 40
+# (KR 120).  Files of robots often state 1 or 2 kg for every link, which no arm of that size has.
+USUAL_MASS, OF_ANY_ARM = 30.0, 10.0
+
+
+def usual_over_stated_mass(chain: Chain) -> float:
+    """What the masses are to be multiplied by; 1 where an arm of this length may have them."""
+    mass = sum(body.mass for body in chain.masses)
+    usual = USUAL_MASS * float(sum(np.linalg.norm(T[:3, 3]) for T in link_ends(chain))) ** 3
+    alike = usual <= OF_ANY_ARM * mass and mass <= OF_ANY_ARM * usual
+    return 1.0 if alike or mass == 0 else usual / mass
+
+
 def torque_scale(chain: Chain, cell: Cell, i: int) -> float:
     """τ_s in N m: torques below it are so small that friction and play blur their sign.
 
