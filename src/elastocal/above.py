@@ -8,6 +8,7 @@ wanted, as one asks for a plug-in.  Import order, start-up time and the layers s
 
 from __future__ import annotations
 
+import math
 from collections.abc import Mapping
 from dataclasses import fields, is_dataclass
 from importlib import import_module
@@ -60,6 +61,9 @@ class ByValue:
         return hash((type(self).__name__, *plain))
 
 
+ROUNDED = 1e-15  # of a number: what is left of it when it has been to a file in µm
+
+
 def same(a: Any, b: Any) -> bool:
     """Whether two values are the same, arrays and records by what they hold."""
     if a is b:
@@ -76,7 +80,9 @@ def same(a: Any, b: Any) -> bool:
         return len(a) == len(b) and all(map(same, a, b))
     if is_dataclass(a) and type(a) is type(b) and not isinstance(a, ByValue):
         return all(same(getattr(a, f.name), getattr(b, f.name)) for f in fields(a) if f.compare)
-    return bool(a == b or (a != a and b != b))
+    if isinstance(a, float) and isinstance(b, float):
+        return a == b or (a != a and b != b) or math.isclose(a, b, rel_tol=ROUNDED)
+    return bool(a == b)
 
 
 class Saved(ByValue):

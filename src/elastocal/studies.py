@@ -32,7 +32,7 @@ from importlib.util import module_from_spec, spec_from_loader
 from itertools import islice
 from pathlib import Path, PurePosixPath
 from types import ModuleType
-from typing import TYPE_CHECKING, Any, cast
+from typing import TYPE_CHECKING, Annotated, Any, cast
 
 import numpy as np
 from pydantic import Field
@@ -121,11 +121,10 @@ class Study:
 
 class StudyFile(Table):
     title: str = Field("", description="text")
-    seed: int = Field(ge=0, description="a whole number from 0")
+    seed: Annotated[int, Field(ge=0)] = Field(description="a whole number from 0")
     files: list[str] = Field([], description='a list of names, as in files = ["cell.toml"]')
     options: dict[str, Any] = Field({}, description="a table: write [options]")
-    columns: dict[str, str] = Field(
-        min_length=1,
+    columns: Annotated[dict[str, str], Field(min_length=1)] = Field(
         description='the unit of what run() returns, as in rms_um = "µm" ("" for none, or text, '
         "yes/no, count)",
     )

@@ -574,6 +574,9 @@ def smooth_groups(model: Model) -> tuple[SmoothGroup, ...]:
 def where_smooth_functions_end(cell: Cell) -> str:
     """Up to where the cell's smooth functions correct the arm, "joint1 from -85.9° to 85.9°, …";
     empty where none ends."""
+    effects = (type(effect_of(choice.name)) for choice in cell.model.effects)
+    if all(effect.functions is Effect.functions for effect in effects):
+        return ""  # the robot need not be read
     ends: dict[str, tuple[float, float]] = {}
     for group in smooth_groups(Model(cell, plugins=None)):
         if group.basis is not None and not group.whole_turn:

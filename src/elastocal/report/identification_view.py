@@ -495,7 +495,7 @@ def undetermined_lines(result: Calibration, most: int | None = None) -> list[str
         groups.setdefault(REDUNDANT if extra else kind, []).append(e)
     lines = []
     for kind in (*NO_VALUE, *HELD, UNREAD, FIXED):
-        found = sorted(groups.get(kind, []), key=lambda e: standing[e.name] == ABSORBED)
+        found = groups.get(kind, [])
         at_nominal = all(e.held == e.nominal and stated(known[e.name]) for e in found)
         why = "held at nominal" if at_nominal else "held at the start value"
         why += HELD.get(kind, f" ({printable(no_reading(result))})" if kind == UNREAD else "")
