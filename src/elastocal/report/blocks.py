@@ -26,8 +26,10 @@ class ShownVerdict:
 
 @dataclass(frozen=True)
 class KeyFigures:
-    """The numbers that count (what it is, number); a terminal has them in sentences."""
+    """What came out in one line of numbers, and the four that count (what it is, number); a
+    terminal has both in sentences."""
 
+    headline: str
     figures: Sequence[tuple[str, str]]
 
 

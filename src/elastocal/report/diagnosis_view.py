@@ -96,11 +96,13 @@ def diagnosis_report(d: Diagnosis) -> Report:
 
 
 def _blocks(d: Diagnosis) -> Iterator[Block]:
-    figures = [("calibrated arm, held out", length(d.gap.calibrated))]
+    headline, floor = length(d.gap.calibrated), length(d.gap.noise_floor)
+    figures = [("calibrated arm, held out", headline)]
     if d.effects:
+        headline += f" → {length(d.gap.explained)}"
         figures.append(("with the effects found", length(d.gap.explained)))
-    figures += [("noise alone", length(d.gap.noise_floor)), ("readings", str(d.n_readings))]
-    yield Fold("", lambda: [KeyFigures(figures)])
+    figures += [("noise alone", floor), ("readings", str(d.n_readings))]
+    yield Fold("", lambda: [KeyFigures(f"{headline} (noise {floor})", figures)])
     tone = TONES[d.findings[0].severity] if d.findings else "good"
     yield ShownVerdict(tone, diagnosis_headline(d))
     lines = [(label, capital(text)) for label, text in diagnosis_lines(d)]

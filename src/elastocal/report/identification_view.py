@@ -171,9 +171,11 @@ def _key(result: Calibration, budget: ErrorBudget | None) -> KeyFigures:
         figures.append(("test data", length(result.test.rms)))
     if (at := result.verdict.at) is not None:
         figures.append(("new poses, without noise", f"≤ {length(at)}"))
+    headline = f"{length(result.nominal_rms)} → {length(after)}"
     if budget is not None and budget.floor is not None:
         figures.append((f"noise ({budget.floor_name})", length(budget.floor)))
-    return KeyFigures(figures)
+        headline += f" (noise {length(budget.floor)})"
+    return KeyFigures(headline, figures)
 
 
 def _error_figures(result: Calibration, budget: ErrorBudget | None) -> Iterator[Block]:

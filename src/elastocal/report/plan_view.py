@@ -98,16 +98,18 @@ def next_report(found: NextPoses) -> Report:
 
 
 def _key(plan: Plan) -> KeyFigures:
+    n, minutes = counted(len(plan.q), "pose"), f"{plan.execution.total / 60:.0f} min"
     worth = f"{plan.criterion} = {plan.reported:.4g} {plan.unit}".rstrip()
     figures = [("poses", str(len(plan.q))), ("criterion", worth)]
     if plan.of_test_poses:
-        figures[1] = ("error at the test poses", f"{_rho(plan):.3g} µm")
+        worth = f"{_rho(plan):.3g} µm"
+        figures[1] = ("error at the test poses", worth)
     if (e := plan.everywhere) is not None:
         figures.append(("error over the joint ranges", f"{e.elsewhere * 1e6:.3g} µm"))
-    figures.append(("time", f"{plan.execution.total / 60:.0f} min"))
+    figures.append(("time", minutes))
     if len(figures) < 4:
         figures.append(("load states", str(len(plan.forces))))
-    return KeyFigures(figures)
+    return KeyFigures(f"{n} → {worth}, {minutes}", figures)
 
 
 def _gain(found: NextPoses) -> Figure:

@@ -65,7 +65,7 @@ def _changes(c: Comparison) -> Iterator[Block]:
         ("the tool has moved, rms", rms), ("at most", most), ("noise alone", noise),
         ("all parameters together", size_of(c.p)),
     ]  # fmt: skip
-    yield Fold("", lambda: [KeyFigures(figures)])
+    yield Fold("", lambda: [KeyFigures(f"moved by {rms} (noise {noise})", figures)])
     same = c.verdict == "no_change_shown" and not c.one_result
     names = ", ".join(printable(change.name) for change in c.changed[:NAMED])
     names += f" and {len(c.changed) - NAMED} more" if len(c.changed) > NAMED else ""
