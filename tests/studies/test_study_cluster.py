@@ -45,15 +45,23 @@ def run(task, rng):
 """
 
 
+def local_cluster(**options):
+    """A cluster here; its event loop has ten seconds to start, which may pass on a busy machine."""
+    for _ in range(2):
+        try:
+            return distributed.LocalCluster(dashboard_address=":0", **options)
+        except AssertionError:
+            continue
+    return distributed.LocalCluster(dashboard_address=":0", **options)
+
+
 @pytest.fixture(scope="module")
 def cluster():
     """Two worker processes that are replaced when they die; a task may be killed twice."""
     settings = {"distributed.scheduler.allowed-failures": 2}
     with (
         dask.config.set(settings),
-        distributed.LocalCluster(
-            n_workers=2, threads_per_worker=1, processes=True, dashboard_address=":0"
-        ) as cluster,
+        local_cluster(n_workers=2, threads_per_worker=1, processes=True) as cluster,
     ):
         yield cluster
 
@@ -125,9 +133,7 @@ def test_no_scheduler_beyond_this_host_is_reached_in_the_clear(address, allowed)
 
 def test_a_scheduler_that_goes_away_ends_the_run_and_keeps_what_is_done(tmp_path):
     folder, marks = marked(tmp_path, count=200, sleep=0.05)
-    cluster = distributed.LocalCluster(
-        n_workers=1, threads_per_worker=1, processes=False, dashboard_address=":0"
-    )
+    cluster = local_cluster(n_workers=1, threads_per_worker=1, processes=False)
 
     def close():
         while len(list(marks.iterdir())) < 5:
