@@ -35,7 +35,6 @@ globals().update(later("pandas DataFrame"))
 
 VIEWS = "elastocal.report.page"
 TEXTS = "elastocal.report.terminal"
-PAGES = "elastocal.report.page"
 WORDS = "elastocal.report.judgement_view"
 WRITERS = "elastocal.saving"
 NAMES = "elastocal.report.formatting"
@@ -195,7 +194,7 @@ def write_page(
     **told: Any,
 ) -> None:  # fmt: skip
     """Write a result's page; `told` is what its kind of page takes besides."""
-    import_module(PAGES).write_page(result, Path(path), inputs, command, seed, **told)
+    import_module(VIEWS).write_page(result, Path(path), inputs, command, seed, **told)
 
 
 def headline(result: object) -> str:

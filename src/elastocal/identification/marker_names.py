@@ -16,7 +16,7 @@ import numpy as np
 from scipy import special
 
 from elastocal.cell.arm_description import Tool
-from elastocal.identification.outliers import FALSE_ALARM, blocks
+from elastocal.identification.outliers import FALSE_ALARM, named_runs
 from elastocal.identification.start import nominal_problem, register
 from elastocal.measurements import Measurements
 from elastocal.model.manipulator import Model
@@ -96,8 +96,7 @@ def _in_all(markers: tuple[str, ...]) -> str:
 
 
 def _in_some(table: Measurements, rows: IntArray, markers: tuple[str, ...]) -> str:
-    runs = blocks(table.row[rows].tolist())
-    lines = [str(a) if a == b else f"{a}–{b}" for a, b in runs]
+    lines = named_runs(table.row[rows].tolist())
     labels = dict.fromkeys(table.configuration_labels[c] for c in table.configuration[rows])
     several = "s" * (len(labels) > 1)
     return (

@@ -143,6 +143,11 @@ def blocks(lines: list[int], gap: int = 3) -> list[tuple[int, int]]:
     return runs
 
 
+def named_runs(lines: list[int]) -> list[str]:
+    """The same in words: "142–507", "610"."""
+    return [str(a) if a == b else f"{a}–{b}" for a, b in blocks(lines)]
+
+
 # What a linear fit to some of the readings says of all of them.
 
 ALONE = 1e-9  # share of an observation's direction that the other observations must see

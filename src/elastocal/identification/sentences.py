@@ -6,7 +6,7 @@ from collections.abc import Callable, Iterable, Iterator
 from typing import Any
 
 from elastocal.errors import option
-from elastocal.identification.outliers import Outlier, blocks
+from elastocal.identification.outliers import Outlier, named_runs
 from elastocal.identification.result import Calibration, Finding, Severity
 from elastocal.text import gathered, listed
 
@@ -235,9 +235,8 @@ def _lines(readings: tuple[Outlier, ...]) -> str:
 
 def _runs(lines: Iterable[int]) -> str:
     """ "142–507, 610 …": runs of lines, the first eight."""
-    runs = blocks(list(lines))
-    shown = ", ".join(str(a) if a == b else f"{a}–{b}" for a, b in runs[:8])
-    return f"{shown}{' …' if len(runs) > 8 else ''}"
+    runs = named_runs(list(lines))
+    return f"{', '.join(runs[:8])}{' …' if len(runs) > 8 else ''}"
 
 
 def _count(readings: tuple[Outlier, ...], one: str, many: str) -> str:
