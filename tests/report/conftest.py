@@ -37,24 +37,17 @@ def make_case(
     names: tuple[str, ...] = ("M1", "M2"),
     effects: tuple[str, ...] = EFFECTS,
     poses: int = 8,
-    sigma: float | None = SIGMA,
     faulty: int = 0,
     drop: bool = False,
-    observe: str = "position",
     method: Method = "auto",
     shifted: slice | None = None,
 ) -> Case:
     """Readings with 30 µm noise of an arm whose base and joints are off by about 1 mm, 1 mrad."""
-    cell = kr270_cell(effects, observe)
+    cell = kr270_cell(effects)
     points = dict(zip(names, MARKERS.values(), strict=False))
-    noise = None if sigma is None else CartesianNoise(np.full(3, sigma))
     tool = replace(cell.tool)
     object.__setattr__(tool, "markers", points)  # names that no cell takes: pages escape them too
-    cell = replace(
-        cell,
-        tool=tool,
-        tracker=Tracker(noise=noise, rotation_sigma=3e-5 if observe == "pose" else None),
-    )
+    cell = replace(cell, tool=tool, tracker=Tracker(noise=CartesianNoise(np.full(3, SIGMA))))
     model = Model.assembled(kr270_chain(), cell)
     rng = np.random.default_rng(7)
     table = table_of(
@@ -66,17 +59,13 @@ def make_case(
         else float(p.nominal)
         for p in model.parameters
     }
-    table = replace(table, rotation=np.zeros((len(table), 3)))
     table = simulate(model, table, values_from(model, truth), rng, noise=False)
     position = np.asarray(table.position) + SIGMA * rng.normal(size=(len(table), 3))
     position[3 : 3 + 5 * faulty : 5] += 0.03
     if shifted is not None:
         position[shifted] += [4e-3, 1e-3, 0.0]
-    table = replace(table, position=position)
-    rotation = np.asarray(table.rotation) + 3e-5 * rng.normal(size=(len(table), 3))
-    table = replace(table, rotation=rotation)
     options = Options(faulty="drop" if drop else "keep", method=method)
-    return Case(identify(model, table, options), truth)
+    return Case(identify(model, replace(table, position=position), options), truth)
 
 
 @pytest.fixture(scope="session")
@@ -96,18 +85,6 @@ def hostile() -> Case:
     """Marker names with markup."""
     effects = ("base_frame", "marker_position")
     return make_case((SCRIPT, MARKUP), effects, faulty=1, drop=True)
-
-
-@pytest.fixture(scope="session")
-def pose() -> Case:
-    """Position and orientation of one marker; everything determined but base and joint 1."""
-    return make_case(("M1",), ("base_frame", "joint_offset"), observe="pose")
-
-
-@pytest.fixture(scope="session")
-def bare() -> Case:
-    """Base frame only, from one marker without stated noise, one reading faulty."""
-    return make_case(("M1",), ("base_frame",), sigma=None, faulty=1)
 
 
 @pytest.fixture(scope="session")

@@ -100,17 +100,14 @@ def show(browser: Any, file: Path, text: str) -> Opened:
 
 
 @pytest.mark.parametrize("kind", KINDS)
-def test_no_complaint_and_no_request(opened: dict[str, Opened], kind: str) -> None:
-    found = opened[kind]
+def test_every_figure_is_drawn_without_complaint_or_request(
+    opened: dict[str, Opened], kind: str
+) -> None:
+    found, page = opened[kind], opened[kind].page
     mild = [text for text in found.complaints if "willReadFrequently" not in text]
     assert mild == []
     assert [url for url in found.requests if not url.startswith("blob:")] == [found.file.as_uri()]
     assert found.file.stat().st_size < 6e6
-
-
-@pytest.mark.parametrize("kind", KINDS)
-def test_every_figure_is_drawn(opened: dict[str, Opened], kind: str) -> None:
-    page = opened[kind].page
     boxes = page.evaluate(
         """[...document.querySelectorAll('figure')].map(figure => {
           const shown = [...figure.querySelectorAll('.still > svg, .plot, figure > svg, svg')]
@@ -132,37 +129,31 @@ def test_every_figure_is_drawn(opened: dict[str, Opened], kind: str) -> None:
     assert canvas["width"] > 300 and canvas["height"] > 200
 
 
-def test_another_pose_moves_arm_and_arrows(opened: dict[str, Opened]) -> None:
+def test_another_pose_moves_arm_and_arrows_and_the_view_keeps_its_turn(
+    opened: dict[str, Opened],
+) -> None:
     page = opened["identification"].page
-    before = page.evaluate("[...document.querySelector('.plot').data].map(t => t.x[0])")
-    told = page.locator(".controls output").inner_text()
-    first = page.locator("select.pose").input_value()
-    other = "0" if first != "0" else "1"
-    page.select_option("select.pose", other)
-    after = page.evaluate("[...document.querySelector('.plot').data].map(t => t.x[0])")
-    assert before != after
-    assert page.locator(".controls output").inner_text() != told
-    assert "arrows drawn" in told
-    page.select_option("select.pose", first)
-
-
-def test_the_view_keeps_its_turn_and_the_wheel_scrolls_the_page(opened: dict[str, Opened]) -> None:
-    page = opened["identification"].page
+    drawn = "[...document.querySelector('.plot').data].map(t => t.x[0])"
     camera = "document.querySelector('.plot').layout.scene.camera.eye.x"
+    before, told = page.evaluate(drawn), page.locator(".controls output").inner_text()
+    assert "arrows drawn" in told
     page.evaluate(
         """Plotly.relayout(document.querySelector('.plot'),
           {'scene.camera': {eye: {x: 0.3, y: 0.4, z: 1.5}}})"""
     )
     first = page.locator("select.pose").input_value()
     page.select_option("select.pose", "0" if first != "0" else "1")
+    assert page.evaluate(drawn) != before
+    assert page.locator(".controls output").inner_text() != told
     assert page.evaluate(camera) == pytest.approx(0.3)
     page.select_option("select.pose", first)
+    # The wheel scrolls the page.
     canvas = page.locator(".plot canvas").first
     canvas.scroll_into_view_if_needed()
-    box, before = canvas.bounding_box(), page.evaluate("scrollY")
+    box, above = canvas.bounding_box(), page.evaluate("scrollY")
     page.mouse.move(box["x"] + box["width"] / 2, box["y"] + box["height"] / 2)
     page.mouse.wheel(0, 200)
-    page.wait_for_function("was => scrollY > was", arg=before)
+    page.wait_for_function("was => scrollY > was", arg=above)
     assert page.evaluate(camera) == pytest.approx(0.3)
 
 
@@ -196,11 +187,8 @@ def test_tables_are_filled_and_sorted_by_click_and_key(
     assert cells.all_inner_texts() == initial
 
 
-@pytest.mark.parametrize("kind", KINDS)
-def test_a_table_saved_as_csv_has_its_rows(opened: dict[str, Opened], kind: str) -> None:
-    page = opened[kind].page
-    name = {"identification": "excluded-from-the-fit", "diagnosis": "error-budget",
-            "plan": "predicted-intervals"}[kind]  # fmt: skip
+def test_a_table_saved_as_csv_has_its_rows(opened: dict[str, Opened]) -> None:
+    page, name = opened["diagnosis"].page, "error-budget"
     table = page.locator(f"table[data-name='{name}']")
     shown = [
         row.locator("td").all_inner_texts() for row in table.locator("tbody tr:not(.group)").all()
@@ -216,13 +204,12 @@ def test_a_table_saved_as_csv_has_its_rows(opened: dict[str, Opened], kind: str)
 
 
 def test_names_with_markup_stay_text(opened: dict[str, Opened]) -> None:
-    for kind in ("identification", "diagnosis"):
-        page = opened[kind].page
-        assert "<script>alert(1)</script>" in page.locator("body").inner_text()
-        traces = page.evaluate(
-            "document.querySelector('.plot').data.find(t => t.name === 'markers').text.join()"
-        )
-        assert "<" not in traces and "&lt;script>" in traces
+    page = opened["identification"].page
+    assert "<script>alert(1)</script>" in page.locator("body").inner_text()
+    traces = page.evaluate(
+        "document.querySelector('.plot').data.find(t => t.name === 'markers').text.join()"
+    )
+    assert "<" not in traces and "&lt;script>" in traces
 
 
 @pytest.mark.parametrize("kind", KINDS)
@@ -256,19 +243,9 @@ def test_dark_print_and_narrow(opened: dict[str, Opened], kind: str) -> None:
               parseFloat(getComputedStyle(e).fontSize) * e.getScreenCTM().a)"""
         )
         assert min([s for s in sizes if s > 0], default=7) >= 7
-    finally:
-        page.emulate_media(color_scheme="light", media="screen")
-        page.set_viewport_size({"width": 1100, "height": 800})
-
-
-@pytest.mark.parametrize("kind", KINDS)
-def test_page_breaks_cut_no_short_table_and_heads_are_repeated(
-    opened: dict[str, Opened], kind: str
-) -> None:
-    page = opened[kind].page
-    try:
+        # On paper, A4 without margins of 1 cm: no short table is cut, heads are repeated.
         page.emulate_media(media="print")
-        page.set_viewport_size({"width": 718, "height": 1000})  # A4 without margins of 1 cm
+        page.set_viewport_size({"width": 718, "height": 1000})
         tables = page.locator("table.data").all()
         lengths = [table.locator("tbody tr").count() for table in tables]
         for table, rows in zip(tables, lengths, strict=True):
@@ -282,7 +259,7 @@ def test_page_breaks_cut_no_short_table_and_heads_are_repeated(
         assert set(shown) == {"contents"}
         assert page.evaluate("document.documentElement.scrollWidth") <= 718
     finally:
-        page.emulate_media(media="screen")
+        page.emulate_media(color_scheme="light", media="screen")
         page.set_viewport_size({"width": 1100, "height": 800})
 
 
@@ -303,22 +280,17 @@ def test_without_script_everything_else_is_there(browser: Any, opened: dict[str,
     context.close()
 
 
-def test_cells_of_a_csv_are_numbers_or_harmless_text(opened: dict[str, Opened]) -> None:
+def test_cells_of_a_csv_are_harmless_and_lengths_are_sorted_whatever_their_unit(
+    opened: dict[str, Opened],
+) -> None:
+    page = opened["plan"].page
     cells = {
-        "−0.5": "-0.5",
-        "=HYPERLINK(1)": "'=HYPERLINK(1)",
-        "@x": "'@x",
-        "+name": "'+name",
-        "+0.5": "+0.5",
-        'a "b", c': '"a ""b"", c"',
-    }
-    found = opened["plan"].page.evaluate("names => names.map(csvCell)", list(cells))
-    assert found == list(cells.values())
-
-
-def test_lengths_are_sorted_by_size_whatever_their_unit(opened: dict[str, Opened]) -> None:
+        "−0.5": "-0.5", "=HYPERLINK(1)": "'=HYPERLINK(1)", "@x": "'@x", "+name": "'+name",
+        "+0.5": "+0.5", 'a "b", c': '"a ""b"", c"',
+    }  # fmt: skip
+    assert page.evaluate("names => names.map(csvCell)", list(cells)) == list(cells.values())
     expected = ["< 0.001 µm", "53.0 µm", "424 µm", "1.98 mm", "1.2 m", "word", "–"]
-    found = opened["plan"].page.evaluate(
+    found = page.evaluate(
         """texts => texts.map(t => [sortKey(t), t]).sort((a, b) => compare(a[0], b[0], 1))
           .map(pair => pair[1])""",
         sorted(expected),

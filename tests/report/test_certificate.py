@@ -14,13 +14,14 @@ from support.pages import Page
 
 from elastocal.cell.work_cell import CertificateEntries
 from elastocal.errors import InputError
-from elastocal.identification.error_budget import gap_budget
+from elastocal.identification.error_budget import gap_budget, pose_accuracy
 from elastocal.report.certificate_view import (
     Certified,
     certified_values,
     pose_repeatability,
 )
 from elastocal.report.formatting import length
+from elastocal.report.judgement_view import judgement
 
 ENTRIES = CertificateEntries(
     number="<b>17</b>", laboratory="Laboratory", country="DE", customer="Customer",
@@ -59,19 +60,27 @@ def test_without_entries_it_is_a_report_and_a_missing_one_is_named(case: Any, tm
     assert not (tmp_path / "c.xml").exists()
 
 
-def test_u_is_twice_the_root_sum_of_squares_of_its_budget(case: Any, tmp_path: Path) -> None:
+def test_it_is_one_page_of_accuracy_data_verdict_and_u(case: Any, tmp_path: Path) -> None:
+    """U is twice the root sum of squares of its budget."""
     result = stated(case.result)
-    found, parts = certified_values(result, gap_budget(result)), result.uncertainty()
+    budget, parts = gap_budget(result), result.uncertainty()
     one = np.sqrt(sum(p**2 for p in parts.parts.values()) / 3 + (12e-6 / 2) ** 2)
-    assert found.expanded == pytest.approx(2 * one)
-    rows = Page(written(result, tmp_path / "c.html")).named_rows()
+    assert certified_values(result, budget).expanded == pytest.approx(2 * one)
+    page = Page(written(result, tmp_path / "c.html"))
+    rows = page.named_rows()
     assert rows["expanded, U with k = 2"][2] == length(float(2 * one))
+    n = len(np.unique(result.observations.place))
+    accuracy = pose_accuracy(result.observations, budget.steps[-1].errors)
+    assert rows["calibrated"][1:3] == [str(n), length(float(accuracy.mean()))]
+    assert rows["d.csv"][1] == "SHA-256 abc" and rows["made on"][1]
+    assert "µm" in rows["Instrument, standard deviations"][1]
+    assert judgement(result).headline in page.text and "ISO 9283" in page.text
+    assert not page.tags["svg"]
 
 
 @pytest.mark.parametrize(
     ("limit", "words"),
-    [(130e-6, "Conforms"), (105e-6, "No statement"), (95e-6, "No statement"),
-     (70e-6, "Does not conform")],
+    [(130e-6, "Conforms"), (95e-6, "No statement"), (70e-6, "Does not conform")],
 )  # fmt: skip
 def test_a_limit_within_the_guard_band_gives_no_statement(limit: float, words: str) -> None:
     u = 20e-6 / 2 / np.sqrt(3)  # U of a distance is 20 µm

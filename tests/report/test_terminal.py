@@ -1,0 +1,152 @@
+"""What is printed: nothing undetermined looks known, nothing is cut off, names stay names, and no
+sentence says more than is known."""
+
+from __future__ import annotations
+
+import math
+import re
+from dataclasses import replace
+from itertools import pairwise
+from typing import Any
+
+import numpy as np
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+from rich.cells import cell_len
+from rich.console import Console
+from support.diagnoses import EXPLAINED, MANY, MANY_UNKNOWN, NOTHING, VERDICTS
+
+from elastocal.report.blocks import ShownTable
+from elastocal.report.diagnosis_view import gap_table, place_table, sensitivity
+from elastocal.report.formatting import probability, settings_text
+from elastocal.report.identification_view import parameter_table, texts, undetermined_table
+from elastocal.report.terminal import print_report
+
+
+def printed(width: int, *arguments: Any, **how: Any) -> str:
+    console = Console(width=width, force_terminal=False, highlight=False)
+    with console.capture() as capture:
+        print_report(console, *arguments, **how)
+    text = capture.get()
+    assert max(map(cell_len, text.splitlines())) <= width
+    assert "\x1b" not in text
+    return text
+
+
+def cells(table: ShownTable) -> list[dict[str, str]]:
+    """Rows of a table, column header → text."""
+    return [dict(zip(table.heads, row, strict=True)) for row in table.rows]
+
+
+def test_every_parameter_has_a_row_and_a_number_only_where_determined(case: Any) -> None:
+    known = {row["parameter"]: row for row in cells(parameter_table(case.result))}
+    others = {row["parameter"]: row for row in cells(undetermined_table(case.result))}
+    assert set(known) | set(others) == set(case.result.model.names)
+    for e in case.result.estimates:
+        assert (e.name in known) == e.identifiable != (e.name in others)
+        if e.identifiable:
+            assert float(known[e.name]["value"]) == pytest.approx(float(texts(e, None)[0]))
+            assert float(known[e.name]["± 95 %"]) > 0
+        else:
+            assert others[e.name]["why"].startswith(("held", "only as", "fixed"))
+
+
+@pytest.mark.parametrize("width", [40, 60, 120])
+def test_no_number_is_cut_off_at_any_width(case: Any, width: int) -> None:
+    text = printed(width, case.result, truth=case.truth)
+    beginning = text[: text.index("Readings")]
+    assert "…" not in beginning
+    joined = "".join(beginning.split())
+    for e in case.result.estimates if width >= 60 else ():
+        # Nothing breaks inside a name.
+        assert not e.identifiable or (texts(e, None)[0] in joined and e.name in text)
+
+
+def test_names_are_not_markup_and_not_terminal_commands(hostile: Any) -> None:
+    text = printed(160, hostile.result, truth=hostile.truth)
+    assert "[red]$x^2$" in text and "<script>alert(1)</script>" in text
+
+
+def test_digits_go_with_the_uncertainty(case: Any) -> None:
+    """The last digit of a value is that of its half width, of which one or two are told."""
+    found = re.findall(r"^ ?joint\d\.\S+ +(-?[\d.]+) +([\d.]+) +m?", str(case.result), re.MULTILINE)
+    assert found
+    for value, half in found:
+        assert len(value.partition(".")[2]) == len(half.partition(".")[2])
+        assert len(half.replace(".", "").lstrip("0")) <= 2
+
+
+@pytest.mark.parametrize("width", [60, 140])
+def test_every_key_figure_of_a_plan_is_told_within_the_width(plan: Any, width: int) -> None:
+    told = " ".join(printed(width, plan).split())
+    c = plan.certificate
+    for part in (
+        f"ρ₀ = {1e6 * plan.everywhere.test_poses:.4g} µm",
+        f"{1e6 * plan.everywhere.elsewhere:.4g} µm rms over the joint ranges",
+        f"certified on the pool: efficiency {c.efficiency_pool:.4f}",
+        f"estimated on the continuum: efficiency {c.efficiency_continuum:.4f}",
+        f"{plan.candidates.feasible} feasible of {plan.candidates.tried} tried",
+        "no feasible pose shows joint1.compliance",
+        f"{len(plan.execution.stops)} stops",
+        *(p.name for p in plan.predicted),
+    ):
+        assert part in told
+    for q in np.degrees(plan.q).ravel():
+        assert f"{q:.2f}" in told or (width == 60 and f"{q:.1f}" in told)
+
+
+@pytest.mark.parametrize("name", VERDICTS)
+def test_a_diagnosis_fits_and_tells_no_raw_names(name: str) -> None:
+    text = printed(60, VERDICTS[name])
+    words = " ".join(text.split())
+    for part in ("Verdict:", "Error budget", "rank 1 to 8 of 10", "Noise:", "Next:"):
+        assert part in words
+    assert not re.search(r"\b(joint|link)[0-9](?!\.)|gear_", words)
+
+
+def test_the_smallest_effect_that_shows_has_distance_five():
+    """d of a displacement field of the told size, computed from readings, is 5."""
+    (line, _) = sensitivity(NOTHING)
+    (told,) = re.findall(r"above about ([\d.]+) µm", line)
+    field = np.random.default_rng(1).normal(size=(NOTHING.n_configurations, 3))
+    field *= float(told) * 1e-6 / math.sqrt((field**2).sum(axis=1).mean())
+    sigma = NOTHING.gap.noise_floor / math.sqrt(3)
+    assert np.linalg.norm(field / sigma) == pytest.approx(5, rel=0.02)
+
+
+@given(st.floats(0, 1))
+def test_a_probability_is_never_told_as_certain(p):
+    text = probability(p)
+    assert text not in ("0.00", "1.00")
+    assert abs(float(text.strip("<> ")) - p) <= 0.0101
+
+
+def test_a_range_of_angles_has_one_unit():
+    told = settings_text({"curve_low_rad": 0.0, "curve_high_rad": 0.00391, "curve_size_rad": 1e-4})
+    assert told == "from 0° to 0.224°, size 0.100 mrad"
+
+
+def test_budget_changes_add_up():
+    """Change of every step, read back from its text, is the difference of the errors."""
+    table = gap_table(EXPLAINED).rows
+    assert table[-1][:2] == ("noise alone", "19.0 µm")
+
+    def read(text):
+        number, unit = text.split()
+        return float(number) * {"mm": 1e-3, "µm": 1e-6}[unit]
+
+    for before, after in pairwise(table[:-1]):
+        assert read(after[3]) == pytest.approx(read(after[1]) - read(before[1]), rel=0.01)
+
+
+def test_a_finding_has_its_places_below_it_and_every_part_once():
+    rows = place_table(MANY_UNKNOWN)
+    assert len(rows.rows) == len(MANY_UNKNOWN.components)
+    assert list(rows.groups) == [0, 3, 5]
+    at = ["joint 2", "joint 1", "joint 5", "joint 3", "joint 2", "base"]
+    assert [row[0] for row in rows.rows] == at
+    # An effect that two findings share a place with stands below one of them only.
+    both = replace(MANY, groups=(MANY.groups[0], replace(MANY.groups[0], name="other")))
+    kept = [c for c in MANY.components if c.family == "angle"]
+    assert len(place_table(both).rows) == len(kept)
